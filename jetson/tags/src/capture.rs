@@ -27,7 +27,7 @@ pub use pipe::Pipe;
 #[cfg(target_os = "linux")]
 pub use v4l2::Camera;
 pub use watch::CameraWatch;
-pub use y4m::Y4m;
+pub use y4m::{Colours, Y4m};
 
 use crate::image::Gray;
 

@@ -14,6 +14,7 @@ use glam::{DVec3, IVec3};
 use crate::body::BodyShape;
 use crate::collision::sweep;
 use crate::config::{ArenaConfig, StageConfig};
+use crate::grid::Grid;
 use crate::obstacles::Obstacles;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
@@ -96,18 +97,58 @@ impl Checker<'_> {
         let from_m = start_m + DVec3::Z * self.body.radius_m();
         let straight = sweep(&self.obstacles.still, &self.body, &at(from_m), &at(top_m));
         if let Some(contact) = straight.contact {
+            let (what, advice) = self.touched(contact.p_world_m, "move the start or the obstacle");
             let text = format!(
-                "the climb to {} m touches an obstacle at {:.2} m; move the start or the obstacle",
+                "the climb to {} m touches {what} at {:.2} m; {advice}",
                 self.config.takeoff_height_m, contact.p_world_m
             );
             self.found("spawn.position_m", text);
         }
+        self.check_seen();
         for (index, name) in self.obstacles.objects.names().enumerate() {
             if self.longest_free_s(from_m, top_m, index) < WINDOW_S {
                 let text = format!("'{name}' leaves no {WINDOW_S} s to climb; move one of the two");
                 self.checked.findings.push(Finding { key: "spawn.position_m".into(), text });
                 return;
             }
+        }
+    }
+
+    /// Returns what a body touches at a place, and what to do: `otherwise`, if it is a known obstacle.
+    fn touched(&self, p_m: DVec3, otherwise: &'static str) -> (&'static str, &'static str) {
+        let still = &self.obstacles.still;
+        let reach_m = self.body.radius_m() + 2.0 * still.grid().voxel_m;
+        if still.is_unseen_nearest(p_m, reach_m) {
+            ("unseen space", FILM)
+        } else {
+            ("an obstacle", otherwise)
+        }
+    }
+
+    /// Where the vehicle may start and where it shall end must have been seen.
+    fn check_seen(&mut self) {
+        let still = self.obstacles.still.clone();
+        if still.unseen_voxels() == 0 {
+            return;
+        }
+        let is_unseen =
+            |p_m: DVec3| still.obstacle_distance_m(p_m) < 0.0 && still.is_unseen_nearest(p_m, 0.0);
+        if let Some(start) = self.config.rules.start_box {
+            let grid = Grid::covering(start.min_m, start.max_m, still.grid().voxel_m.max(START_M));
+            let [nx, ny, nz] = grid.size;
+            let all = (0..nx * ny * nz).map(|n| [n / (ny * nz), n / nz % ny, n % nz]);
+            let unseen = all.filter(|voxel| is_unseen(grid.center_m(*voxel))).count();
+            if unseen > 0 {
+                let share = 100.0 * unseen as f64 / grid.voxels() as f64;
+                let text =
+                    format!("{share:.0} % of the start box was not seen by the capture; {FILM}");
+                self.found("rules.start_box", text);
+            }
+        }
+        if let Some(goal) = self.config.goal.filter(|goal| is_unseen(goal.position_m)) {
+            let text =
+                format!("the goal at {:.2} m was not seen by the capture; {FILM}", goal.position_m);
+            self.found("goal.position_m", text);
         }
     }
 
@@ -140,9 +181,10 @@ impl Checker<'_> {
         let through = sweep(&self.obstacles.still, &self.body, &at(before_m), &at(after_m));
         self.checked.least_room_m = self.checked.least_room_m.min(through.clearance_m);
         if let Some(contact) = through.contact {
+            let otherwise = "move the gate, or correct center_m and normal";
+            let (what, advice) = self.touched(contact.p_world_m, otherwise);
             let text = format!(
-                "straight through '{}' the vehicle touches an obstacle at {:.2} m; move the gate, or \
-                 correct center_m and normal",
+                "straight through '{}' the vehicle touches {what} at {:.2} m; {advice}",
                 stage.name, contact.p_world_m
             );
             self.found(key("center_m"), text);
@@ -325,6 +367,10 @@ const LOOKS: u32 = 1200;
 const LOOK_NS: i64 = 50_000_000;
 /// Places along a straight way: closer than a body's radius.
 const POINTS: u32 = 7;
+/// The start box is looked at this closely. [m]
+const START_M: f64 = 0.1;
+/// What to do about unseen space.
+const FILM: &str = "film there, train and carve again, or move it into what was seen";
 const UNSEEN: u32 = u32::MAX;
 const BLOCKED: u32 = u32::MAX - 1;
 
@@ -332,7 +378,6 @@ const BLOCKED: u32 = u32::MAX - 1;
 mod tests {
     use super::*;
     use crate::distance::DistanceField;
-    use crate::grid::Grid;
     use crate::occupancy::occupancy_of;
     use crate::referee::tests::arena;
     use vizflyt_protocol::geometry::Volume;

@@ -146,6 +146,27 @@ pub struct Occupancy {
     /// What hangs in the air with fewer splats in its volume is a floater of training; 0 keeps
     /// all. [1/m^3]
     pub min_splats_per_m3: f64,
+    /// What space is that no ray of the capture has passed, as the file beside the scene says.
+    #[serde(skip_serializing_if = "Unseen::is_free")]
+    pub unseen: Unseen,
+}
+
+/// What a referee takes unseen space for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Unseen {
+    /// Free, where no splat stands: nothing is known of what the capture has seen, or it is not asked.
+    #[default]
+    Free,
+    /// Solid: who flies where nobody has looked has collided.
+    Solid,
+}
+
+impl Unseen {
+    #[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+    fn is_free(&self) -> bool {
+        *self == Self::Free
+    }
 }
 
 impl Default for Occupancy {
@@ -153,7 +174,13 @@ impl Default for Occupancy {
     /// above what trained haze has; the floor is the world's z = 0. A surface of splats as large as
     /// 0.2 m still has 300 in a cubic metre of its voxels, a blob of haze fewer than 5.
     fn default() -> Self {
-        Self { voxel_m: 0.05, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 }
+        Self {
+            voxel_m: 0.05,
+            min_opacity: 0.3,
+            floor_z_m: 0.0,
+            min_splats_per_m3: 30.0,
+            unseen: Unseen::Free,
+        }
     }
 }
 

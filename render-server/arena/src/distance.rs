@@ -24,18 +24,20 @@ pub struct DistanceField {
     /// Steps of [`STEP_VOXELS`] from [`CODE_ZERO`].
     codes: Vec<u8>,
     floor_z_m: f64,
+    /// One bit a voxel, low bit first: solid only as nobody has seen it free. Empty if none is.
+    unseen: Vec<u8>,
 }
 
 impl DistanceField {
     /// Computes the field of a grid, in the grid's own memory.
     pub fn of(occupancy: OccupancyGrid) -> Self {
-        let OccupancyGrid { grid, cells: mut codes, floor_z_m, .. } = occupancy;
+        let OccupancyGrid { grid, cells: mut codes, floor_z_m, unseen, .. } = occupancy;
         sweep_along_x(&mut codes, grid.plane());
         let tables = Tables::new();
         codes.par_chunks_mut(grid.plane()).for_each_init(Scratch::default, |scratch, plane| {
             finish_plane(plane, grid.size[1], grid.size[2], &tables, scratch);
         });
-        Self { grid, codes, floor_z_m }
+        Self { grid, codes, floor_z_m, unseen }
     }
 
     /// Returns the voxels' places.
@@ -55,12 +57,44 @@ impl DistanceField {
 
     /// Returns the bytes the field occupies.
     pub fn memory_bytes(&self) -> usize {
-        self.codes.len()
+        self.codes.len() + self.unseen.len()
     }
 
     /// Returns the number of voxels that are part of an obstacle.
     pub fn occupied_voxels(&self) -> usize {
         self.codes.iter().filter(|&&code| f64::from(code) < CODE_ZERO).count()
+    }
+
+    /// Returns the number of voxels that are solid only as nobody has seen them free.
+    pub fn unseen_voxels(&self) -> usize {
+        self.unseen.iter().map(|byte| byte.count_ones() as usize).sum()
+    }
+
+    /// Whether the solid voxel nearest to a point, within `reach_m`, is solid only as nobody has seen it free: what
+    /// a body there meets is no obstacle that anybody knows. [m, world]
+    pub fn is_unseen_nearest(&self, p_m: DVec3, reach_m: f64) -> bool {
+        if self.unseen.is_empty() || !p_m.is_finite() {
+            return false;
+        }
+        let size = DVec3::from(self.grid.size.map(|n| n as f64));
+        let place = |p_m: DVec3| {
+            let at = ((p_m - self.grid.min_m) / self.grid.voxel_m).clamp(DVec3::ZERO, size - 1.0);
+            [at.x as usize, at.y as usize, at.z as usize]
+        };
+        let (low, high) = (place(p_m - reach_m), place(p_m + reach_m));
+        let mut nearest = (f64::INFINITY, false);
+        for x in low[0]..=high[0] {
+            for y in low[1]..=high[1] {
+                for z in low[2]..=high[2] {
+                    let index = self.grid.index([x, y, z]);
+                    let away_m = self.grid.center_m([x, y, z]).distance(p_m);
+                    if f64::from(self.codes[index]) < CODE_ZERO && away_m < nearest.0 {
+                        nearest = (away_m, self.unseen[index / 8] >> (index % 8) & 1 == 1);
+                    }
+                }
+            }
+        }
+        nearest.1
     }
 
     /// Returns the signed distance from a point to the nearest obstacle, the floor not counted:

@@ -3,6 +3,7 @@
 //!
 //! Read in this order:
 //! - [`config`]: `arena.toml` as validated types; also what the runtime gets of the arena;
+//! - [`seen`]: space that a capture has seen to be free;
 //! - [`occupancy`], [`distance`]: splats baked into voxels, and the distance to them;
 //! - [`objects`]: where what moves by itself is at any instant;
 //! - [`obstacles`], [`neighbours`]: what must not be touched: still, moving, other vehicles;
@@ -28,6 +29,7 @@ pub mod obstacles;
 pub mod occupancy;
 pub mod pose;
 pub mod referee;
+pub mod seen;
 pub mod verdict;
 
 pub use body::BodyShape;
@@ -37,3 +39,4 @@ pub use objects::MovingObjects;
 pub use obstacles::Obstacles;
 pub use occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
 pub use referee::Referee;
+pub use seen::SeenSpace;

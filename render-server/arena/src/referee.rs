@@ -32,10 +32,14 @@ pub(crate) const AIRBORNE_M: f64 = 0.3;
 /// A descent faster than this onto the floor is a crash; ArduCopter lands with 0.5 m/s. [m/s]
 const CRASH_MPS: f64 = 1.5;
 
+/// A contact's voxel lies this far beyond the body's surface at most.
+const NEAREST_VOXELS: f64 = 2.0;
+
 /// What a body met; by number where there are several.
 #[derive(Clone, Copy, Debug)]
 enum Met {
     Still,
+    Unseen,
     Floor,
     Object(usize),
     Vehicle(usize),
@@ -207,6 +211,10 @@ impl Referee {
         self.obstacles.still.obstacle_slice(z_m)
     }
 
+    fn voxel_m(&self) -> f64 {
+        self.obstacles.still.grid().voxel_m
+    }
+
     fn since_epoch_ns(&self, at: ServerTime) -> i64 {
         at.as_ns().wrapping_sub(self.epoch.as_ns()).cast_signed()
     }
@@ -266,7 +274,14 @@ impl Referee {
         let floor_m = self.body.clearance_m(to, f64::INFINITY, |p_m| p_m.z - floor_z_m);
         let descent_mps = -sample.twist.linear_mps.z;
         let contact = match found.contact {
-            Some(touch) => Some((touch.p_world_m, touch.clearance_m, met)),
+            Some(touch) => {
+                let reach_m = self.body.radius_m() + NEAREST_VOXELS * self.voxel_m();
+                let still = &self.obstacles.still;
+                if matches!(met, Met::Still) && still.is_unseen_nearest(touch.p_world_m, reach_m) {
+                    met = Met::Unseen;
+                }
+                Some((touch.p_world_m, touch.clearance_m, met))
+            }
             None if floor_m <= 0.0 && descent_mps > CRASH_MPS => Some((to_m, floor_m, Met::Floor)),
             None => None,
         };
@@ -281,6 +296,7 @@ impl Referee {
     fn obstacle(&self, met: Met) -> Obstacle {
         match met {
             Met::Still => Obstacle::Scene,
+            Met::Unseen => Obstacle::Unseen,
             Met::Floor => Obstacle::Floor,
             Met::Object(index) => {
                 let name = self.obstacles.objects.names().nth(index);

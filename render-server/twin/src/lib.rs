@@ -1,9 +1,11 @@
 //! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor.
 
 pub mod adam;
+pub mod adjust;
 pub mod align;
 mod bin;
 mod blend;
+pub mod carve;
 pub mod dataset;
 pub mod gaussians;
 pub mod loss;
@@ -17,6 +19,7 @@ mod render;
 mod smooth;
 mod ssim;
 pub mod train;
+pub mod verdict;
 mod view;
 
 pub use dataset::Dataset;

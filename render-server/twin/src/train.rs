@@ -98,6 +98,17 @@ pub struct Quality {
     pub ssim: f64,
 }
 
+/// A photo beside its rendering.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Comparison {
+    /// Peak signal-to-noise ratio. [dB]
+    pub psnr_db: f64,
+    /// Structural similarity, to 1.
+    pub ssim: f64,
+    /// The rendering in the photo's size, H x W x 3, sRGB.
+    pub rgb: Vec<u8>,
+}
+
 impl<'a> Trainer<'a> {
     /// Begins a training.
     ///
@@ -197,25 +208,48 @@ impl<'a> Trainer<'a> {
     /// Returns how well held-out photos are rendered, each exposed as fits it best; `None` if none is
     /// held out.
     pub fn judge(&mut self) -> Option<Quality> {
-        let held_out: Vec<usize> =
-            (0..self.dataset.photos.len()).filter(|&i| self.is_held_out(i)).collect();
+        let held_out = self.held_out();
         let (mut psnr_db, mut ssim) = (0.0, 0.0);
-        for &i in &held_out {
-            let Photo { view, target, .. } = &self.dataset.photos[i];
-            let style = Style { degree: self.options.degree, ..self.style() };
-            let image = self.renderer.forward(&self.gaussians, view, style);
-            let exposure = if self.options.exposure {
-                Exposure::fitting(image, target)
-            } else {
-                Exposure::default()
-            };
-            let (psnr, similarity) = self.loss.quality(image, target, &exposure);
-            psnr_db += psnr;
-            ssim += similarity;
+        for &photo in &held_out {
+            let comparison = self.compare(photo);
+            psnr_db += comparison.psnr_db;
+            ssim += comparison.ssim;
         }
         let photos = held_out.len();
         let share = 1.0 / photos as f64;
         (photos > 0).then_some(Quality { photos, psnr_db: psnr_db * share, ssim: ssim * share })
+    }
+
+    /// Returns which photos of the dataset are held out.
+    pub fn held_out(&self) -> Vec<usize> {
+        (0..self.dataset.photos.len()).filter(|&i| self.is_held_out(i)).collect()
+    }
+
+    /// Renders what a photo of the dataset shows, exposed as fits it best.
+    ///
+    /// # Panics
+    /// If there is no such photo.
+    pub fn compare(&mut self, photo: usize) -> Comparison {
+        let Photo { view, target, .. } = &self.dataset.photos[photo];
+        let style = Style { degree: self.options.degree, ..self.style() };
+        let image = self.renderer.forward(&self.gaussians, view, style);
+        let exposure = if self.options.exposure {
+            Exposure::fitting(image, target)
+        } else {
+            Exposure::default()
+        };
+        let (psnr_db, ssim) = self.loss.quality(image, target, &exposure);
+        let level = |c: usize, value: f32| {
+            let exposed = value * exposure.gain[c] + exposure.offset[c];
+            (exposed.clamp(0.0, 1.0) * 255.0).round() as u8
+        };
+        let mut rgb = Vec::with_capacity(3 * image.width * image.height);
+        for y in 0..image.height {
+            for x in 0..image.width {
+                rgb.extend((0..3).map(|c| level(c, image.at(c, x, y))));
+            }
+        }
+        Comparison { psnr_db, ssim, rgb }
     }
 
     fn is_held_out(&self, photo: usize) -> bool {
@@ -278,7 +312,7 @@ impl<'a> Trainer<'a> {
 }
 
 /// Keeps the items, `width` numbers each, that `keep` says.
-fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
+pub(crate) fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
     let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
     *list = kept.flat_map(|(_, item)| item.iter().copied()).collect();
 }

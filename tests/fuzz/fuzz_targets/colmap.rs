@@ -14,6 +14,7 @@ fn check_images(images: &[SparseImage], bytes: usize) {
         assert!(
             image.world_from_cam.translation_m.is_finite() && image.intrinsics.validate().is_ok()
         );
+        assert!(image.seen.iter().all(|seen| seen.pixel.is_finite()));
     }
 }
 

@@ -80,7 +80,7 @@ fn check_all(args: &CheckArgs) -> Result<ExitCode> {
 fn check_seed(project: &CourseProject, seed: u64) -> bool {
     // Levels differ in sensors, variants in light: neither changes where one can fly.
     let generated = project.generate(seed, Level::default(), Variant::default());
-    let still = Arc::new(scene::bake(&generated.splats, &generated.arena));
+    let still = Arc::new(scene::bake(&generated.splats, &generated.arena, None));
     let obstacles = scene::obstacles(&generated.arena, &generated.objects, still, seed);
     let checked = check(&generated.arena, &obstacles);
     print_summary(
@@ -104,7 +104,7 @@ fn check_file(path: &Path) -> Result<bool> {
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
     let scene = scene::load(&file, &BareArgs::default())?;
-    let still = Arc::new(scene::bake(&scene.splats, &scene.arena));
+    let still = Arc::new(scene::bake(&scene.splats, &scene.arena, scene.seen.as_ref()));
     let mut findings = scene::check_fit(&scene.splats, &scene.arena, &still);
     let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);
     let mut checked = check(&scene.arena, &obstacles);

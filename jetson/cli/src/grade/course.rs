@@ -47,7 +47,8 @@ impl CourseInstance {
     ) -> Result<Self> {
         let generated = project.generate(seed, level, variant);
         // Not kept for later: on disk it would be a map for the next plugin.
-        let baked = bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, &|_| ());
+        let baked =
+            bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, None, &|_| ());
         // Light and fog belong to what cameras see.
         let environment = generated.arena.environment;
         let rules =

@@ -81,7 +81,8 @@ pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
         "something moves in {}, and a log does not tell where it was: such a flight is judged by its server alone",
         scene.arena.name
     );
-    let baked = bake_with(&scene.splats, &BakeSpec::of(&scene.arena), None, &|_| ());
+    let baked =
+        bake_with(&scene.splats, &BakeSpec::of(&scene.arena), scene.seen.as_ref(), None, &|_| ());
     let still = obstacles(&scene.arena, &[], Arc::new(baked.field), lab.seed());
     let verdict = judge_track(&scene.arena, still, track);
     if args.json {

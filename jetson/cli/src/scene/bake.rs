@@ -59,6 +59,8 @@ struct Report {
 #[derive(Debug, Serialize)]
 struct Counts {
     occupied: usize,
+    /// Of the occupied, those that no ray of the capture has passed.
+    unseen: usize,
     floating: usize,
     enclosed: usize,
     splats_left_out: usize,
@@ -74,10 +76,11 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     let spec = BakeSpec::of(&scene.arena);
     let cache = BakeCache::of_user();
     if let (Some(cache), true) = (&cache, args.force) {
-        cache.forget(&scene.splats, &spec)?;
+        cache.forget(&scene.splats, &spec, scene.seen.as_ref())?;
     }
     let bar = Bar::default();
-    let baked = bake_with(&scene.splats, &spec, cache.as_ref(), &|share| bar.show(share));
+    let seen = scene.seen.as_ref();
+    let baked = bake_with(&scene.splats, &spec, seen, cache.as_ref(), &|share| bar.show(share));
     Bar::clear();
     let report = Report::of(&baked, scene.splats.len(), &spec);
     if args.json {
@@ -120,6 +123,7 @@ impl Report {
             seconds: baked.took.as_secs_f64(),
             counts: baked.counts.map(|counts| Counts {
                 occupied: counts.occupied,
+                unseen: counts.unseen,
                 floating: counts.floating,
                 enclosed: counts.enclosed,
                 splats_left_out: counts.splats_left_out,
@@ -140,9 +144,13 @@ impl Report {
         ));
         if let Some(counts) = &self.counts {
             print_line(format!(
-                "obstacles    {} voxels solid, of which {} were voids; {} floating voxels and {} \
-                 faint or outside splats left out",
-                counts.occupied, counts.enclosed, counts.floating, counts.splats_left_out
+                "obstacles    {} voxels solid, of which {} are unseen and {} were voids; {} floating voxels \
+                 and {} faint or outside splats left out",
+                counts.occupied,
+                counts.unseen,
+                counts.enclosed,
+                counts.floating,
+                counts.splats_left_out
             ));
         }
         if let Some(file) = &self.file {

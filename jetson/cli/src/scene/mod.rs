@@ -1,12 +1,15 @@
-//! `vizflyt scene`: makes, trains, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, captures, trains, bakes, inspects and renders scenes.
 
 mod align;
 mod bake;
 pub(crate) mod camera;
+mod capture;
+mod carve;
 mod convert;
 mod generate;
 mod inspect;
 mod npy;
+mod progress;
 mod render;
 mod train;
 
@@ -29,6 +32,8 @@ enum SceneCommand {
     Generate(generate::GenerateArgs),
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
+    Capture(capture::CaptureArgs),
+    Carve(carve::CarveArgs),
     Convert(convert::ConvertArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
@@ -40,8 +45,10 @@ enum SceneCommand {
 pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
     match args.command {
         SceneCommand::Align(args) => return align::run(&args),
+        SceneCommand::Capture(args) => return capture::run(&args),
         SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
+        SceneCommand::Carve(args) => carve::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,

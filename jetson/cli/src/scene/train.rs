@@ -1,8 +1,7 @@
 //! `vizflyt scene train`: a scene from photos with known poses.
 
-use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -11,6 +10,7 @@ use vizflyt_splat::format::{self, Format};
 use vizflyt_twin::train::Quality;
 use vizflyt_twin::{Dataset, Options, Trainer};
 
+use super::progress::Progress;
 use crate::terminal::print_fmt;
 
 /// Trains a scene from photos with known poses, on the processor.
@@ -124,12 +124,15 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         ..Options::default()
     };
     let mut trainer = Trainer::new(&dataset, options);
-    let mut progress = Progress::new(args.steps);
+    let mut progress = Progress::new("");
     while trainer.steps() < args.steps {
         let parts = trainer.step();
-        progress.show(trainer.steps(), trainer.gaussians().len(), parts.l1);
+        let (step, splats) = (trainer.steps(), trainer.gaussians().len());
+        progress.show(f64::from(step) / f64::from(args.steps), || {
+            format!("step {step} of {}, {splats} splats, error {:.4}", args.steps, parts.l1)
+        });
     }
-    Progress::clear();
+    drop(progress);
     let held_out = trainer.judge();
     let mut splats = trainer.splats();
     splats.antialiased = args.antialiased;
@@ -178,50 +181,4 @@ fn check_output(output: &Path, force: bool) -> Result<()> {
         bail!("the folder {} is not there; make it first", folder.display());
     }
     Ok(())
-}
-
-/// What is done and how long the rest takes, on standard error: a line that changes where people
-/// watch, else a line every half minute.
-#[derive(Debug)]
-struct Progress {
-    steps: u32,
-    start: Instant,
-    next: Duration,
-}
-
-impl Progress {
-    fn new(steps: u32) -> Self {
-        Self { steps, start: Instant::now(), next: Duration::ZERO }
-    }
-
-    fn show(&mut self, step: u32, splats: usize, error: f64) {
-        let elapsed = self.start.elapsed();
-        if elapsed < self.next {
-            return;
-        }
-        let mut stderr = std::io::stderr();
-        let watched = stderr.is_terminal();
-        self.next = elapsed + Duration::from_millis(if watched { 250 } else { 30_000 });
-        // Later steps render more splats: a little longer than so far.
-        let left_s = elapsed.as_secs_f64() / f64::from(step) * f64::from(self.steps - step) * 1.1;
-        let line = format!(
-            "step {step} of {}, {splats} splats, error {error:.4}, {}:{:02} left",
-            self.steps,
-            left_s as u64 / 60,
-            left_s as u64 % 60
-        );
-        // A terminal that is gone is no reason to stop.
-        let _ = if watched {
-            write!(stderr, "\r{line:<78}").and_then(|()| stderr.flush())
-        } else {
-            writeln!(stderr, "{line}")
-        };
-    }
-
-    fn clear() {
-        let mut stderr = std::io::stderr();
-        if stderr.is_terminal() {
-            let _ = write!(stderr, "\r{:<78}\r", "").and_then(|()| stderr.flush());
-        }
-    }
 }

@@ -1,5 +1,5 @@
 //! YUV4MPEG2, raw images on a pipe: what `ffmpeg -f yuv4mpegpipe` and GStreamer's `y4menc` print
-//! (mjpegtools, yuv4mpeg(5)). Of it, the brightness; chroma is skipped.
+//! (mjpegtools, yuv4mpeg(5)). Of it, the brightness; colours for those who ask.
 
 use super::decode::check;
 use crate::image::Gray;
@@ -35,6 +35,30 @@ struct Head {
     rate_hz: Option<f64>,
 }
 
+impl Head {
+    fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+}
+
+/// An image with its colours.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Colours {
+    /// Width. [px]
+    pub width_px: u32,
+    /// Height. [px]
+    pub height_px: u32,
+    /// Y, then Cb, then Cr, H x W bytes each.
+    pub planes: Vec<u8>,
+}
+
+impl Colours {
+    /// Returns the plane of brightness, H x W.
+    pub fn luma(&self) -> &[u8] {
+        &self.planes[..self.planes.len() / 3]
+    }
+}
+
 impl Y4m {
     /// Takes bytes.
     pub fn push(&mut self, bytes: &[u8]) {
@@ -51,6 +75,27 @@ impl Y4m {
     /// # Errors
     /// What is wrong, in words; the stream cannot be followed further.
     pub fn poll(&mut self) -> Result<Option<(Option<u64>, Gray)>, String> {
+        let Some((head, stamp_ns, mut planes)) = self.planes()? else { return Ok(None) };
+        planes.truncate(head.pixels());
+        let image = Gray::new(head.width, head.height, planes);
+        Ok(image.map(|image| (stamp_ns, image)))
+    }
+
+    /// Returns the next whole image with its colours, of a stream of `C444`: one plane each of Y, Cb and Cr, H x W;
+    /// `None` if bytes are missing. An image is taken by this or by [`Self::poll`].
+    ///
+    /// # Errors
+    /// As of [`Self::poll`], and another stream than `C444`.
+    pub fn poll_colours(&mut self) -> Result<Option<Colours>, String> {
+        let Some((head, _, planes)) = self.planes()? else { return Ok(None) };
+        if head.chroma != 2 * head.pixels() {
+            return Err("the stream's colours are coarser than its pixels; write yuv444p".into());
+        }
+        Ok(Some(Colours { width_px: head.width, height_px: head.height, planes }))
+    }
+
+    /// Takes the bytes of the next image.
+    fn planes(&mut self) -> Result<Option<(Head, Option<u64>, Vec<u8>)>, String> {
         let head = match self.head {
             Some(head) => head,
             None => match self.line()? {
@@ -65,15 +110,13 @@ impl Y4m {
                 None => return Ok(None),
             },
         };
-        let count = head.width as usize * head.height as usize;
-        if self.bytes.len() < count + head.chroma {
+        let count = head.pixels() + head.chroma;
+        if self.bytes.len() < count {
             return Ok(None);
         }
-        let pixels = self.bytes[..count].to_vec();
-        self.bytes.drain(..count + head.chroma);
+        let planes = self.bytes.drain(..count).collect();
         self.image = None;
-        let image = Gray::new(head.width, head.height, pixels);
-        Ok(image.map(|image| (stamp_ns, image)))
+        Ok(Some((head, stamp_ns, planes)))
     }
 
     /// Takes a line, without its end.

@@ -128,6 +128,8 @@ pub enum Obstacle {
     Object(Name),
     /// Another vehicle, by its name.
     Vehicle(Name),
+    /// Space that no ray of the scene's capture has passed, which its arena takes for solid.
+    Unseen,
 }
 
 /// A boundary left, or one before which the vehicle can no longer stop.

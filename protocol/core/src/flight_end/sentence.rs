@@ -89,6 +89,7 @@ impl fmt::Display for Obstacle {
             Self::Floor => f.write_str("the floor"),
             Self::Object(name) => write!(f, "'{name}'"),
             Self::Vehicle(name) => write!(f, "vehicle '{name}'"),
+            Self::Unseen => f.write_str("space that the capture has not seen"),
         }
     }
 }

@@ -131,6 +131,8 @@ fn a_reason_has_one_sentence() {
     check(hit(Obstacle::Scene), &format!("collision with an obstacle {place}"));
     check(hit(Obstacle::Floor), &format!("collision with the floor {place}"));
     check(hit(Obstacle::Object(bounded("door"))), &format!("collision with 'door' {place}"));
+    let unseen = format!("collision with space that the capture has not seen {place}");
+    check(hit(Obstacle::Unseen), &unseen);
     check(hit(Obstacle::Vehicle(bounded("bee"))), &format!("collision with vehicle 'bee' {place}"));
     let left = |margin_m, boundary| EndReason::Geofence(breach(margin_m, boundary));
     check(left(-0.1, Boundary::Ceiling), "beyond the ceiling by 0.10 m");

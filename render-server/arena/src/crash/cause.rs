@@ -94,6 +94,12 @@ fn of_collision(
                  not yet where it would be"
             );
         }
+        Obstacle::Unseen => {
+            return format!(
+                "it flew where nobody has looked, at {speed_mps:.1} m/s: no ray of the capture has passed there, \
+                 and the arena takes unseen space for solid"
+            );
+        }
         Obstacle::Scene => {}
     }
     let asked = flight.asked.unwrap_or_default();

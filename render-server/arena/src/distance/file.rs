@@ -1,4 +1,5 @@
-//! A distance field as bytes, for caches: a header, then one byte a voxel.
+//! A distance field as bytes, for caches: a header, then one byte a voxel, then one bit a voxel where some are
+//! unseen.
 //!
 //! Read with suspicion: a field that is wrong is a vehicle that hits something. Whoever keeps the
 //! bytes guards them with a checksum of their own.
@@ -30,10 +31,10 @@ pub enum FieldError {
 }
 
 impl DistanceField {
-    /// Returns the bytes that [`Self::from_bytes`] reads: the header, and the voxels apart from it,
-    /// as they may be hundreds of megabytes.
-    pub fn as_bytes(&self) -> ([u8; FIELD_HEADER], &[u8]) {
-        let Self { grid, codes, floor_z_m } = self;
+    /// Returns the bytes that [`Self::from_bytes`] reads: the header, the voxels apart from it, as they may be
+    /// hundreds of megabytes, and which of them are unseen, if any is.
+    pub fn as_bytes(&self) -> ([u8; FIELD_HEADER], &[u8], &[u8]) {
+        let Self { grid, codes, floor_z_m, unseen } = self;
         let mut header = [0; FIELD_HEADER];
         let numbers = [grid.min_m.x, grid.min_m.y, grid.min_m.z, grid.voxel_m, *floor_z_m];
         let sizes = grid.size.map(|n| n as u64);
@@ -42,7 +43,7 @@ impl DistanceField {
         for (place, word) in header[8..].chunks_exact_mut(8).zip(words) {
             place.copy_from_slice(&word);
         }
-        (header, codes)
+        (header, codes, unseen)
     }
 
     /// Reads what [`Self::as_bytes`] returned, joined.
@@ -50,7 +51,8 @@ impl DistanceField {
     /// # Errors
     /// [`FieldError`] for anything else. Allocates no more than `bytes` holds.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, FieldError> {
-        let (header, codes) = bytes.split_first_chunk::<FIELD_HEADER>().ok_or(FieldError::Other)?;
+        let (header, voxels) =
+            bytes.split_first_chunk::<FIELD_HEADER>().ok_or(FieldError::Other)?;
         let (magic, words) = header.split_at(8);
         if magic != MAGIC {
             return Err(FieldError::Other);
@@ -75,12 +77,15 @@ impl DistanceField {
         let expected = nx.checked_mul(ny).and_then(|plane| plane.checked_mul(nz));
         match expected {
             None | Some(0) => Err(FieldError::Number("number of voxels")),
-            Some(expected) if expected != codes.len() => {
-                Err(FieldError::Length { found: codes.len(), expected })
-            }
-            Some(_) => {
+            Some(expected) => {
+                // All of one, or of the other too.
+                let rest = voxels.len().checked_sub(expected);
+                if rest.is_none_or(|rest| rest > 0 && rest != expected.div_ceil(8)) {
+                    return Err(FieldError::Length { found: voxels.len(), expected });
+                }
+                let (codes, unseen) = voxels.split_at(expected);
                 let grid = Grid { min_m, voxel_m, size: [nx, ny, nz] };
-                Ok(Self { grid, codes: codes.to_vec(), floor_z_m })
+                Ok(Self { grid, codes: codes.to_vec(), floor_z_m, unseen: unseen.to_vec() })
             }
         }
     }
@@ -108,8 +113,8 @@ mod tests {
     }
 
     fn bytes(field: &DistanceField) -> Vec<u8> {
-        let (header, codes) = field.as_bytes();
-        [&header[..], codes].concat()
+        let (header, codes, unseen) = field.as_bytes();
+        [&header[..], codes, unseen].concat()
     }
 
     #[test]

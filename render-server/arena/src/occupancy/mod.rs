@@ -10,7 +10,8 @@
 //! 3. Floaters of training go: small isolated components, and those that hang in the air with few
 //!    splats for their volume (a blob of haze). Small enclosed voids (the inside of a trunk) become
 //!    solid.
-//! 4. The band above the floor takes what stands above it: grass and litter vanish, trunks keep
+//! 4. Space that the capture has not seen becomes solid, where the arena wants it.
+//! 5. The band above the floor takes what stands above it: grass and litter vanish, trunks keep
 //!    their feet. The floor itself is a plane, no voxels.
 //!
 //! Where the surface comes to lie: for a wall of discs of standard deviation s across, the field
@@ -26,6 +27,7 @@ use rayon::prelude::*;
 
 use crate::config::ArenaConfig;
 use crate::grid::Grid;
+use crate::seen::SeenAt;
 
 mod components;
 mod object;
@@ -87,6 +89,8 @@ pub struct BakeCounts {
     pub floating: usize,
     /// Voxels of enclosed voids made solid.
     pub enclosed: usize,
+    /// Of the occupied, those that are as nobody has seen them free.
+    pub unseen: usize,
 }
 
 /// Occupied and free voxels. The floor is not among them.
@@ -96,19 +100,23 @@ pub struct OccupancyGrid {
     /// 1 is occupied, 0 is free; in [`Grid::index`] order.
     pub(crate) cells: Vec<u8>,
     pub(crate) floor_z_m: f64,
+    /// One bit a voxel, low bit first: occupied, but by nothing that was seen. Empty if nothing is.
+    pub(crate) unseen: Vec<u8>,
     counts: BakeCounts,
 }
 
 impl OccupancyGrid {
-    /// Bakes splats.
+    /// Bakes splats; what was not seen is free.
     pub fn bake(ellipsoids: impl IntoIterator<Item = Ellipsoid>, spec: &BakeSpec) -> Self {
-        Self::bake_with(ellipsoids, spec, &|_| ())
+        Self::bake_with(ellipsoids, spec, None, &|_| ())
     }
 
-    /// Bakes splats; `progress` is called with the share that is done, 0 to 1, from any thread.
+    /// Bakes splats; what is not `seen`, if that is given, is solid. `progress` is called with the share that is
+    /// done, 0 to 1, from any thread.
     pub fn bake_with(
         ellipsoids: impl IntoIterator<Item = Ellipsoid>,
         spec: &BakeSpec,
+        seen: Option<SeenAt<'_>>,
         progress: &(dyn Fn(f64) + Sync),
     ) -> Self {
         let grid = spec.grid;
@@ -138,14 +146,23 @@ impl OccupancyGrid {
         counts.floating =
             runs.overwrite(&mut cells, 0, |component| floaters.contain(component, &grid));
         progress(FLOATERS_GONE);
+        // A pocket within the unseen is as unknown as what is around it.
+        let void = if seen.is_some() { UNSEEN } else { OCCUPIED };
+        if let Some(seen) = seen {
+            fill_unseen(&mut cells, &grid, seen);
+        }
         stand_on_floor(&mut cells, spec);
         let void_voxels = (VOID_M3 / grid.voxel_m.powi(3)) as usize;
-        counts.enclosed =
-            Runs::of(&cells, &grid, 0, Connectivity::Faces)
-                .overwrite(&mut cells, 1, |component| component.voxels < void_voxels);
+        counts.enclosed = Runs::of(&cells, &grid, 0, Connectivity::Faces).overwrite(
+            &mut cells,
+            void,
+            |component| component.voxels < void_voxels,
+        );
+        let unseen = if seen.is_some() { take_unseen(&mut cells) } else { Vec::new() };
+        counts.unseen = unseen.iter().map(|byte| byte.count_ones() as usize).sum();
         counts.occupied = cells.iter().map(|&cell| usize::from(cell)).sum();
         progress(1.0);
-        Self { grid, cells, floor_z_m: spec.floor_z_m, counts }
+        Self { grid, cells, floor_z_m: spec.floor_z_m, unseen, counts }
     }
 
     /// Returns the voxels' places.
@@ -342,6 +359,33 @@ fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8], progress: &(dy
     );
 }
 
+/// Fills what is free and was not seen.
+fn fill_unseen(cells: &mut [u8], grid: &Grid, seen: SeenAt<'_>) {
+    let [_, ny, nz] = grid.size;
+    cells.par_chunks_mut(grid.plane()).enumerate().for_each(|(x, plane)| {
+        for y in 0..ny {
+            for z in 0..nz {
+                let cell = &mut plane[y * nz + z];
+                if *cell == 0 && !seen.is_seen(grid.center_m([x, y, z])) {
+                    *cell = UNSEEN;
+                }
+            }
+        }
+    });
+}
+
+/// Makes the unseen occupied like all else; returns which they were, one bit a voxel, low bit first.
+fn take_unseen(cells: &mut [u8]) -> Vec<u8> {
+    let mut bits = vec![0; cells.len().div_ceil(8)];
+    bits.par_iter_mut().zip(cells.par_chunks_mut(8)).for_each(|(bits, cells)| {
+        for (n, cell) in cells.iter_mut().enumerate().filter(|(_, cell)| **cell == UNSEEN) {
+            *cell = OCCUPIED;
+            *bits |= 1 << n;
+        }
+    });
+    bits
+}
+
 /// Gives the band above the floor what stands right above the band.
 fn stand_on_floor(cells: &mut [u8], spec: &BakeSpec) {
     let layers = floor_layers(spec);
@@ -359,6 +403,10 @@ fn floor_layers(spec: &BakeSpec) -> usize {
     layers.min(grid.size[2] - 1)
 }
 
+/// A voxel with something in it.
+const OCCUPIED: u8 = 1;
+/// While baking: one that is solid as nobody has seen it.
+const UNSEEN: u8 = 2;
 /// Standard deviation by which splats are widened, so that a thin surface leaves no holes between
 /// voxel centres; see the module's text. [voxels]
 const WIDENING: f32 = 0.35;
@@ -396,7 +444,8 @@ pub fn occupancy_of(grid: Grid, floor_z_m: f64, solid: impl Fn(DVec3) -> bool) -
         }
     }
     let occupied = cells.iter().map(|&cell| usize::from(cell)).sum();
-    OccupancyGrid { grid, cells, floor_z_m, counts: BakeCounts { occupied, ..Default::default() } }
+    let counts = BakeCounts { occupied, ..Default::default() };
+    OccupancyGrid { grid, cells, floor_z_m, unseen: Vec::new(), counts }
 }
 
 #[cfg(test)]

@@ -33,7 +33,7 @@ impl OccupancyGrid {
                 sides.into_iter().all(|((low, high), size)| inside(low, high, size))
             });
         counts.occupied = cells.iter().map(|&cell| usize::from(cell)).sum();
-        Self { grid, cells, floor_z_m, counts }
+        Self { grid, cells, floor_z_m, unseen: Vec::new(), counts }
     }
 }
 

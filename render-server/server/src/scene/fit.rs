@@ -191,7 +191,7 @@ mod tests {
     }
 
     fn keys(splats: &Splats, arena: &ArenaConfig) -> Vec<String> {
-        let field = bake_with(splats, &BakeSpec::of(arena), None, &|_| ()).field;
+        let field = bake_with(splats, &BakeSpec::of(arena), None, None, &|_| ()).field;
         let findings = check_fit(splats, arena, &field);
         findings.into_iter().map(|finding| finding.key).collect()
     }

@@ -3,6 +3,7 @@
 //! ```text
 //! arena.toml --> ArenaConfig ------------> [scene]: file, placement -> Splats --> renderer
 //! scene file --> ArenaConfig (made up) -/                                  \---> occupancy -> referee, map
+//! scene.ply.seen -----------------------> what the capture saw, if asked for --/
 //! ```
 //! Splats are placed here and nowhere else: whoever loads an arena sees its scene in the world.
 //! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
@@ -17,6 +18,7 @@ mod fit;
 mod floor;
 mod objects;
 mod placement;
+mod seen;
 
 pub use antialiased::Antialiased;
 pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
@@ -26,6 +28,7 @@ pub use core::{bounds, core};
 pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
 pub use placement::{Placement, WorldFromScene};
+pub use seen::{Seen, scene_hash, seen_path};
 pub use vizflyt_arena::config::Up;
 
 use std::path::{Path, PathBuf};
@@ -50,6 +53,8 @@ pub struct Scene {
     /// From the frame that `CAM.json` files are in: the world itself in an arena; of a bare scene, its
     /// file's frame.
     pub world_from_scene: WorldFromScene,
+    /// What the capture has seen, where the arena takes all else for solid.
+    pub seen: Option<Seen>,
 }
 
 /// What a path on the command line names.
@@ -168,9 +173,10 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
 fn with_arena(path: &Path) -> Result<Scene> {
     let (arena, scene) = parse_arena(path)?;
     let objects = read_objects(&arena, path)?;
+    let seen = seen::read(&arena, &scene)?;
     let mut splats = read(&scene)?.splats;
     put(&arena, &mut splats)?;
-    Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY })
+    Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY, seen })
 }
 
 /// Puts splats, as their file has them, where an arena wants them.
@@ -210,7 +216,7 @@ fn without_arena(path: &Path, bare: &BareArgs) -> Result<Scene> {
     if let Some(guessed) = bare.guessed(&arena.scene) {
         warn!("{} has no arena, so this is guessed: {guessed}", path.display());
     }
-    Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene })
+    Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene, seen: None })
 }
 
 /// Reads a scene file of any format; how far it has come goes to the log, if it takes long.

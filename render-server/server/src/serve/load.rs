@@ -34,14 +34,14 @@ pub(super) struct LoadedScene {
 /// # Errors
 /// A scene or an arena that cannot be used, no such renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
-    let Scene { arena, mut splats, mut objects, .. } = scene::load(&args.arena, &args.bare)?;
+    let Scene { arena, mut splats, mut objects, seen, .. } = scene::load(&args.arena, &args.bare)?;
     args.antialiased.apply(&mut splats);
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
         .iter()
         .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
         .collect();
-    let field = Arc::new(scene::bake(&splats, &arena));
+    let field = Arc::new(scene::bake(&splats, &arena, seen.as_ref()));
     for finding in scene::check_fit(&splats, &arena, &field) {
         warn!("{finding}");
     }

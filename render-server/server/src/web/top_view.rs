@@ -209,7 +209,8 @@ fn below(splats: &Splats, ceiling_m: f32) -> Splats {
 }
 
 /// Returns RFC 4648 base64 with padding.
-fn base64(bytes: &[u8]) -> String {
+/// Returns bytes in base64 (RFC 4648), for data within a page.
+pub fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
     for chunk in bytes.chunks(3) {

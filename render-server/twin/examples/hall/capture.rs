@@ -3,6 +3,7 @@
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World, body_from_forward_cam};
+use vizflyt_scenes::walk::Walk;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Splats};
 use vizflyt_twin::random::Random;
 
@@ -27,8 +28,6 @@ pub(crate) struct Point {
     pub(crate) seen: Vec<(usize, [f32; 2])>,
 }
 
-/// Photos of the walk.
-const PHOTOS: usize = 80;
 const WIDTH: u32 = 320;
 const HEIGHT: u32 = 240;
 /// As a phone's wide camera.
@@ -40,9 +39,19 @@ const POINT_NOISE_M: f32 = 0.01;
 /// Noise of the photos. [8-bit steps]
 const PIXEL_NOISE: f32 = 2.0;
 
-/// Walks an 11 x 4.5 m room: a loop, the camera swaying from side to side and up and down.
-fn pose(i: usize) -> Pose<World, Cam> {
-    let t = i as f64 / PHOTOS as f64 * std::f64::consts::TAU;
+/// Returns the poses of a walk as people film: over free floor, at eye level, looking to one side and the other.
+pub(crate) fn walked(walk: &Walk, photos: usize) -> Vec<Pose<World, Cam>> {
+    (0..photos).map(|i| walk.world_from_cam(walk.seconds() * i as f64 / photos as f64)).collect()
+}
+
+/// Returns the poses of a harder one around an 11 x 4.5 m room: a loop, the camera swaying far from side to side and up
+/// and down.
+pub(crate) fn looped(photos: usize) -> Vec<Pose<World, Cam>> {
+    (0..photos).map(|i| pose(i as f64 / photos as f64)).collect()
+}
+
+fn pose(turn: f64) -> Pose<World, Cam> {
+    let t = turn * std::f64::consts::TAU;
     let position = DVec3::new(5.5 + 4.3 * t.cos(), 1.2 * t.sin(), 1.5 + 0.5 * (3.0 * t).sin());
     let ahead = (1.2 * t.cos()).atan2(-4.3 * t.sin());
     let yaw = ahead + 1.1 * (10.0 * t).sin();
@@ -72,17 +81,18 @@ pub(crate) fn depth_m(image: &RgbdImage) -> Vec<f32> {
 }
 
 /// Captures a scene.
-pub(crate) fn capture(splats: &Splats, seed: u64) -> Capture {
+pub(crate) fn capture(splats: &Splats, poses: &[Pose<World, Cam>], seed: u64) -> Capture {
     let mut random = Random::new(seed);
     let mut intrinsics = Intrinsics::from_horizontal_fov(WIDTH, HEIGHT, 1.0);
     (intrinsics.fx_px, intrinsics.fy_px) = (FOCAL_PX, FOCAL_PX);
     let mut renderer = CpuRenderer::new(splats);
-    let photos: Vec<Photo> = (0..PHOTOS)
-        .map(|i| {
-            let image = render(&mut renderer, intrinsics, pose(i));
+    let photos: Vec<Photo> = poses
+        .iter()
+        .map(|&world_from_cam| {
+            let image = render(&mut renderer, intrinsics, world_from_cam);
             let noisy = |v: &f32| (v * 255.0 + PIXEL_NOISE * random.normal()).round() as u8;
             Photo {
-                world_from_cam: pose(i),
+                world_from_cam,
                 rgb: image.rgb.iter().map(noisy).collect(),
                 true_depth_m: depth_m(&image),
             }

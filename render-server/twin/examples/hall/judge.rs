@@ -1,7 +1,11 @@
 //! A rebuilt room against the true one: depths as cameras see them, obstacles as the referee bakes them.
 
+use glam::{DQuat, DVec3};
 use vizflyt_arena::{ArenaConfig, BakeSpec, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::{CpuRenderer, Splats};
+use vizflyt_twin::Dataset;
+use vizflyt_twin::align::Similarity;
+use vizflyt_twin::carve::{CarveOptions, Carved, Voxels};
 
 use crate::capture::{Capture, depth_m, render};
 
@@ -17,7 +21,22 @@ pub(crate) struct Verdict {
     /// Occupied voxels within the fence, where vehicles fly, and those baked from the true splats.
     pub(crate) within_fence: usize,
     pub(crate) truly_within_fence: usize,
+    /// Occupied voxels in which the camera itself has been.
+    pub(crate) on_way: usize,
+    /// Of the photos' truth, without exposure.
+    pub(crate) psnr_db: f64,
 }
+
+/// Carves a rebuilt room by its capture, within the arena's own voxels.
+pub(crate) fn carve(dataset: &Dataset, splats: &Splats, arena: &ArenaConfig) -> Carved {
+    let grid = BakeSpec::of(arena).grid;
+    let voxels = Voxels { min_m: grid.min_m, side_m: grid.voxel_m, size: grid.size };
+    vizflyt_twin::carve::carve(dataset, splats, &IN_WORLD, voxels, &CarveOptions::default())
+}
+
+/// The room's poses are the world's.
+const IN_WORLD: Similarity =
+    Similarity { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
 
 /// Judges; `only` says by which photos.
 pub(crate) fn judge(
@@ -29,8 +48,13 @@ pub(crate) fn judge(
 ) -> Verdict {
     let mut renderer = CpuRenderer::new(splats);
     let mut errors = Vec::new();
+    let mut squares = (0.0, 0usize);
     for (_, photo) in capture.photos.iter().enumerate().filter(|(i, _)| only(*i)) {
         let image = render(&mut renderer, capture.intrinsics, photo.world_from_cam);
+        squares.0 += (image.rgb.iter().zip(&photo.rgb))
+            .map(|(v, t)| f64::from(v.clamp(0.0, 1.0) - f32::from(*t) / 255.0).powi(2))
+            .sum::<f64>();
+        squares.1 += photo.rgb.len();
         let pairs = depth_m(&image).into_iter().zip(&photo.true_depth_m);
         errors.extend(pairs.filter(|(_, t)| **t > 0.0).map(|(d, t)| (d / t - 1.0).abs()));
     }
@@ -49,17 +73,55 @@ pub(crate) fn judge(
     };
     let (rebuilt, right) = (bake(splats), bake(truth));
     let fence = &arena.geofence;
+    let [across, deep, high] = spec.grid.size;
+    let voxels = |grid: &OccupancyGrid| {
+        let all = (0..across * deep * high).map(|n| [n / (deep * high), n / high % deep, n % high]);
+        all.filter(|voxel| grid.is_occupied(*voxel)).collect::<Vec<_>>().into_iter()
+    };
     let within = |grid: &OccupancyGrid| {
-        let [across, deep, high] = spec.grid.size;
-        let voxels =
-            (0..across * deep * high).map(|n| [n / (deep * high), n / high % deep, n % high]);
         let inside = |voxel: &[usize; 3]| {
             let center_m = spec.grid.center_m(*voxel);
             center_m.cmpge(fence.min_m).all() && center_m.cmple(fence.max_m).all()
         };
-        voxels.filter(|voxel| grid.is_occupied(*voxel) && inside(voxel)).count()
+        voxels(grid).filter(inside).count()
     };
+    if std::env::var_os("LAYERS").is_some() {
+        for z in (0..high).step_by(2) {
+            let n = |g: &OccupancyGrid| voxels(g).filter(|v| v[2] / 2 == z / 2).count();
+            let near = |v: &[usize; 3], r: isize| {
+                (-r..=r).any(|a| {
+                    (-r..=r).any(|b| {
+                        (-r..=r).any(|c| {
+                            let w = [v[0] as isize + a, v[1] as isize + b, v[2] as isize + c];
+                            w.iter().zip(spec.grid.size).all(|(w, s)| *w >= 0 && (*w as usize) < s)
+                                && right.is_occupied(w.map(|w| w as usize))
+                        })
+                    })
+                })
+            };
+            let far =
+                |r: isize| voxels(&rebuilt).filter(|v| v[2] / 2 == z / 2 && !near(v, r)).count();
+            println!(
+                "z {:.2}: true {:6} rebuilt {:6} beyond 1 voxel {:6} beyond 3 {:6}",
+                spec.grid.center_m([0, 0, z]).z,
+                n(&right),
+                n(&rebuilt),
+                far(1),
+                far(3)
+            );
+        }
+    }
+    let near_m = CarveOptions::default().camera_radius_m;
+    let on_way = voxels(&rebuilt)
+        .filter(|voxel| {
+            let center_m = spec.grid.center_m(*voxel);
+            (capture.photos.iter())
+                .any(|photo| photo.world_from_cam.translation_m.distance(center_m) < near_m)
+        })
+        .count();
     Verdict {
+        on_way,
+        psnr_db: -10.0 * (squares.0 / squares.1.max(1) as f64).log10(),
         depth_median: f64::from(errors[errors.len() / 2]),
         within_tenth: share,
         occupied: rebuilt.counts().occupied as f64 / right.counts().occupied as f64,

@@ -4,7 +4,7 @@
 //! cargo run --release -p vizflyt-twin --example hall
 //! cargo run --release -p vizflyt-twin --example hall -- steps=1000 splats=40000 folder=hall sheet=hall.png
 //! ```
-//! `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
+//! `race=SEED` takes a race hall on a usual walk of `seconds` instead of the room. `scene` judges and carves what was trained before, instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
 //! the depths of both. Other keys are those of [`Options`].
 
 mod capture;
@@ -14,13 +14,15 @@ mod judge;
 use std::error::Error;
 use std::path::PathBuf;
 
-use vizflyt_scenes::{SceneKind, generate};
-use vizflyt_splat::CpuRenderer;
+use vizflyt_scenes::{SceneKind, film_set, generate};
+use vizflyt_splat::{CpuRenderer, Splats};
+use vizflyt_twin::carve::CarveCounts;
 use vizflyt_twin::{Dataset, Options, Trainer};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut options = Options::default();
-    let (mut kept, mut sheet) = (None, None);
+    let (mut kept, mut sheet, mut trained, mut race) = (None, None, None, None);
+    let (mut photos, mut seconds) = (80, 50.0);
     for arg in std::env::args().skip(1) {
         let (key, value) = arg.split_once('=').ok_or("options are KEY=VALUE")?;
         let number = || value.parse::<f32>();
@@ -38,13 +40,23 @@ fn main() -> Result<(), Box<dyn Error>> {
             "thickness" => options.tolls.thickness = number()?,
             "needle" => options.tolls.needle = number()?,
             "antialiased" => options.antialiased = number()? > 0.0,
+            "scene" => trained = Some(PathBuf::from(value)),
+            "race" => race = Some(value.parse()?),
+            "photos" => photos = value.parse()?,
+            "seconds" => seconds = value.parse()?,
             "folder" => kept = Some(PathBuf::from(value)),
             "sheet" => sheet = Some(PathBuf::from(value)),
             _ => return Err(format!("no option is called '{key}'").into()),
         }
     }
-    let scene = generate(SceneKind::Room, 3);
-    let capture = capture::capture(&scene.splats, 1);
+    let (scene, poses) = match race {
+        Some(seed) => {
+            let set = film_set(SceneKind::Race, seed, seconds, false)?;
+            (set.scene, capture::walked(&set.walk, photos))
+        }
+        None => (generate(SceneKind::Room, 3), capture::looped(photos)),
+    };
+    let capture = capture::capture(&scene.splats, &poses, 1);
     let scratch = tempfile::tempdir()?;
     let folder = kept.as_deref().unwrap_or(scratch.path());
     folder::write(&capture, folder)?;
@@ -56,8 +68,32 @@ fn main() -> Result<(), Box<dyn Error>> {
         dataset.points.len()
     );
 
+    let splats = match trained {
+        Some(path) => vizflyt_splat::format::read(&path)?.splats,
+        None => train(&dataset, options)?,
+    };
+    let only = |i: usize| i.is_multiple_of(options.hold_out);
+    let judge = |splats: &Splats| judge::judge(splats, &scene.splats, &scene.arena, &capture, only);
+    print(&judge(&splats));
+    let carved = judge::carve(&dataset, &splats, &scene.arena);
+    let CarveCounts { looked_through, on_path, seen, voxels, seconds, .. } = carved.counts;
+    println!(
+        "carved       {looked_through} splats looked through, {on_path} on the way; {:.0} % of the voxels seen, in \
+         {seconds:.1} s",
+        100.0 * seen as f64 / voxels as f64
+    );
+    let splats = carved.splats;
+    print(&judge(&splats));
+    if let Some(path) = sheet {
+        draw(&splats, &capture, &path)?;
+    }
+    Ok(())
+}
+
+/// Trains, and says how it goes.
+fn train(dataset: &Dataset, options: Options) -> Result<Splats, Box<dyn Error>> {
     let start_s = cpu_s();
-    let mut trainer = Trainer::new(&dataset, options);
+    let mut trainer = Trainer::new(dataset, options);
     while trainer.steps() < options.steps {
         let parts = trainer.step();
         if trainer.steps().is_multiple_of(500) {
@@ -76,28 +112,27 @@ fn main() -> Result<(), Box<dyn Error>> {
     let took_s = cpu_s() - start_s;
     let quality = trainer.judge().ok_or("no photo was held out")?;
     let splats = trainer.splats();
-    let only = |i: usize| i.is_multiple_of(options.hold_out);
-    let verdict = judge::judge(&splats, &scene.splats, &scene.arena, &capture, only);
     println!("processor    {took_s:.0} s for {} steps, {} splats", options.steps, splats.len());
     println!("held out     PSNR {:.2} dB, SSIM {:.3}", quality.psnr_db, quality.ssim);
+    Ok(splats)
+}
+
+fn print(verdict: &judge::Verdict) {
     println!(
-        "depth        median error {:.2} %, {:.1} % of pixels within 10 %",
+        "depth        median error {:.2} %, {:.1} % of pixels within 10 %, PSNR {:.2} dB",
         verdict.depth_median * 100.0,
-        verdict.within_tenth * 100.0
+        verdict.within_tenth * 100.0,
+        verdict.psnr_db
     );
     println!(
-        "obstacles    {:.2} times the true voxels; within the fence {} where {} are true",
-        verdict.occupied, verdict.within_fence, verdict.truly_within_fence
+        "obstacles    {:.2} times the true voxels; within the fence {} where {} are true; {} on the way",
+        verdict.occupied, verdict.within_fence, verdict.truly_within_fence, verdict.on_way
     );
-    if let Some(path) = sheet {
-        draw(&splats, &capture, &path)?;
-    }
-    Ok(())
 }
 
 /// Writes truth and twin next to each other, colour and depth, of some held-out photos.
 fn draw(
-    splats: &vizflyt_splat::Splats,
+    splats: &Splats,
     capture: &capture::Capture,
     path: &std::path::Path,
 ) -> Result<(), Box<dyn Error>> {

@@ -12,6 +12,7 @@
 pub mod corners;
 mod eigen;
 pub mod floor;
+pub mod level;
 pub mod points;
 pub mod track;
 

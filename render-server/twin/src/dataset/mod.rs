@@ -23,7 +23,7 @@ use crate::loss::{SeenPoint, Target};
 use crate::view::View;
 
 pub use error::DatasetError;
-pub use sparse::{SparseImage, SparseModel, SparsePoint};
+pub use sparse::{SparseImage, SparseModel, SparsePoint, SparseSighting};
 
 /// A capture whose poses are known. All lengths are in units of the dataset, in its own frame.
 #[derive(Clone, Debug, Default)]
@@ -79,6 +79,29 @@ impl Dataset {
         } else {
             return Err(DatasetError::NotADataset(folder.to_owned()));
         };
+        Self::of_plans(folder, plans, points, width_px)
+    }
+
+    /// Reads the photos of a model that is known already, from the folder of images that its names are below; photos
+    /// become at most `width_px` wide.
+    ///
+    /// # Errors
+    /// [`DatasetError`] says which photo is wrong, and what to do.
+    pub fn of_model(
+        model: &SparseModel,
+        images: &Path,
+        width_px: Option<u32>,
+    ) -> Result<Self, DatasetError> {
+        let (plans, points) = plans(model, images, None);
+        Self::of_plans(images, plans, points, width_px)
+    }
+
+    fn of_plans(
+        folder: &Path,
+        plans: Vec<Plan>,
+        points: Points,
+        width_px: Option<u32>,
+    ) -> Result<Self, DatasetError> {
         if plans.len() < 2 {
             return Err(DatasetError::TooFew(folder.to_owned(), plans.len()));
         }
@@ -119,24 +142,29 @@ fn of_colmap(folder: &Path, model: &Path) -> Result<(Vec<Plan>, Points), Dataset
     // Beside the model where it stands alone.
     let images = [folder.join("images"), model.join("images"), folder.to_owned()];
     let images = images.iter().find(|path| path.is_dir()).unwrap_or(&images[0]);
+    Ok(plans(&sparse, images, Some(&folder.join("masks"))))
+}
+
+/// Returns the photos of a model, not read yet, and its points.
+fn plans(sparse: &SparseModel, images: &Path, masks: Option<&Path>) -> (Vec<Plan>, Points) {
     let well_seen = |id: &u64| sparse.points.get(id).is_some_and(|p| p.track >= WELL_SEEN);
     let plans = sparse.images.iter().map(|image| {
-        let mask = folder.join("masks").join(format!("{}.png", image.name));
+        let mask = masks.map(|masks| masks.join(format!("{}.png", image.name)));
         Plan {
             name: image.name.clone(),
             image: images.join(&image.name),
-            mask: mask.is_file().then_some(mask),
+            mask: mask.filter(|mask| mask.is_file()),
             depth: None,
             intrinsics: Ok(image.intrinsics),
             world_from_cam: image.world_from_cam,
-            seen: image.seen.iter().copied().filter(well_seen).collect(),
+            seen: image.seen.iter().map(|seen| seen.point).filter(well_seen).collect(),
         }
     });
     let points = sparse
         .points
         .iter()
         .map(|(&id, point)| (id, Point { position: point.position.as_vec3(), rgb: point.rgb }));
-    Ok((plans.collect(), points.collect()))
+    (plans.collect(), points.collect())
 }
 
 fn of_nerfstudio(folder: &Path, file: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 /// Cameras, poses and points.
@@ -23,8 +23,17 @@ pub struct SparseImage {
     pub intrinsics: Intrinsics,
     /// Where it was taken from. [units of the dataset]
     pub world_from_cam: Pose<World, Cam>,
-    /// Ids of the points that it saw.
-    pub seen: Vec<u64>,
+    /// The points that it saw.
+    pub seen: Vec<SparseSighting>,
+}
+
+/// A point that was found in an image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SparseSighting {
+    /// The point's id.
+    pub point: u64,
+    /// Where in the image. [px]
+    pub pixel: DVec2,
 }
 
 /// A point that images saw.

@@ -15,6 +15,8 @@ use ring::digest::{Context, SHA256, SHA256_OUTPUT_LEN};
 use vizflyt_arena::{BakeSpec, DistanceField};
 use vizflyt_splat::Splats;
 
+use super::super::seen::Seen;
+
 /// A folder of baked obstacles.
 #[derive(Clone, Debug)]
 pub struct BakeCache {
@@ -36,7 +38,7 @@ pub(super) enum CachedField {
 
 impl BakeKey {
     /// Returns the key of a scene baked like this.
-    pub fn of(splats: &Splats, spec: &BakeSpec) -> Self {
+    pub fn of(splats: &Splats, spec: &BakeSpec, seen: Option<&Seen>) -> Self {
         let mut hash = Context::new(&SHA256);
         hash.update(BAKER);
         let BakeSpec { grid, min_opacity, floor_z_m, min_splats_per_m3 } = spec;
@@ -49,6 +51,13 @@ impl BakeKey {
         }
         for number in [min_opacity, min_splats_per_m3] {
             hash.update(&number.to_le_bytes());
+        }
+        if let Some(Seen { space, place }) = seen {
+            hash.update(&space.to_bytes());
+            let numbers = place.rotation.to_array().into_iter().chain([place.metres_per_unit]);
+            for number in numbers.chain(place.origin_m.to_array()) {
+                hash.update(&number.to_le_bytes());
+            }
         }
         // A block of splats at a time: a call for each costs more than the hash.
         let mut block = Vec::with_capacity(SPLATS_AT_ONCE * SPLAT_BYTES);
@@ -102,8 +111,8 @@ impl BakeCache {
     ///
     /// # Errors
     /// A file that is there and cannot be removed.
-    pub fn forget(&self, splats: &Splats, spec: &BakeSpec) -> io::Result<()> {
-        match fs::remove_file(self.path(&BakeKey::of(splats, spec))) {
+    pub fn forget(&self, splats: &Splats, spec: &BakeSpec, seen: Option<&Seen>) -> io::Result<()> {
+        match fs::remove_file(self.path(&BakeKey::of(splats, spec, seen))) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
             _ => Ok(()),
         }
@@ -131,11 +140,12 @@ impl BakeCache {
         fs::create_dir_all(&self.folder)?;
         let path = self.path(key);
         let aside = path.with_extension(format!("{}.part", std::process::id()));
-        let (header, codes) = field.as_bytes();
+        let (header, codes, unseen) = field.as_bytes();
         let written = File::create(&aside).and_then(|mut file| {
-            file.write_all(&checksum(&[&header, codes]))?;
+            file.write_all(&checksum(&[&header, codes, unseen]))?;
             file.write_all(&header)?;
             file.write_all(codes)?;
+            file.write_all(unseen)?;
             fs::rename(&aside, &path)
         });
         if written.is_err() {

@@ -12,6 +12,8 @@ use vizflyt_arena::occupancy::BakeCounts;
 use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::Splats;
 
+use super::seen::Seen;
+
 use cache::CachedField;
 pub use cache::{BakeCache, BakeKey, parse as parse_kept};
 
@@ -29,18 +31,19 @@ pub struct Baked {
 }
 
 /// Returns the obstacles of a scene as its arena asks: those kept by an earlier start, else baked
-/// and kept.
-pub fn bake(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
+/// and kept. What is not `seen`, if that is given, is solid.
+pub fn bake(splats: &Splats, arena: &ArenaConfig, seen: Option<&Seen>) -> DistanceField {
     let spec = BakeSpec::of(arena);
     info!("baking obstacles: {} splats into {} voxels", splats.len(), spec.grid.voxels());
-    let baked = bake_with(splats, &spec, BakeCache::of_user().as_ref(), &|_| ());
+    let baked = bake_with(splats, &spec, seen, BakeCache::of_user().as_ref(), &|_| ());
     let took_ms = baked.took.as_secs_f64() * 1e3;
     match (&baked.counts, &baked.kept_at) {
         (None, Some(path)) => info!("obstacles read in {took_ms:.0} ms from {}", path.display()),
         (Some(counts), _) => info!(
-            "obstacles baked in {took_ms:.0} ms: {} voxels solid, {:.1} MB; left out {} faint or \
-             outside splats and {} floating voxels",
+            "obstacles baked in {took_ms:.0} ms: {} voxels solid, {} of them unseen, {:.1} MB; left out {} \
+             faint or outside splats and {} floating voxels",
             counts.occupied,
+            counts.unseen,
             baked.field.memory_bytes() as f64 / 1e6,
             counts.splats_left_out,
             counts.floating
@@ -50,16 +53,17 @@ pub fn bake(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     baked.field
 }
 
-/// Returns the obstacles of splats: from `cache`, else baked and put there. `progress` receives the
-/// share that is done, 0 to 1, from any thread.
+/// Returns the obstacles of splats: from `cache`, else baked and put there. What is not `seen`, if that is given, is
+/// solid. `progress` receives the share that is done, 0 to 1, from any thread.
 pub fn bake_with(
     splats: &Splats,
     spec: &BakeSpec,
+    seen: Option<&Seen>,
     cache: Option<&BakeCache>,
     progress: &(dyn Fn(f64) + Sync),
 ) -> Baked {
     let start = Instant::now();
-    let key = cache.map(|cache| (cache, BakeKey::of(splats, spec)));
+    let key = cache.map(|cache| (cache, BakeKey::of(splats, spec, seen)));
     if let Some((cache, key)) = &key {
         match cache.read(key) {
             CachedField::Field(field) => {
@@ -79,7 +83,9 @@ pub fn bake_with(
         rotation: splats.rotations[k],
         opacity: splats.opacities[k],
     });
-    let grid = OccupancyGrid::bake_with(ellipsoids, spec, &|share| progress(GRID_SHARE * share));
+    let seen = seen.map(|seen| seen.space.at(&seen.place));
+    let progress_of_grid = |share| progress(GRID_SHARE * share);
+    let grid = OccupancyGrid::bake_with(ellipsoids, spec, seen, &progress_of_grid);
     let counts = Some(grid.counts());
     let field = DistanceField::of(grid);
     let kept_at = key.and_then(|(cache, key)| match cache.write(&key, &field) {

@@ -28,8 +28,9 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
     let cache = BakeCache::at(folder.path().join("a/b"));
     let (splats, spec) = scene(0.9);
     let reported = Mutex::new(Vec::new());
-    let first =
-        bake_with(&splats, &spec, Some(&cache), &|share| reported.lock().unwrap().push(share));
+    let first = bake_with(&splats, &spec, None, Some(&cache), &|share| {
+        reported.lock().unwrap().push(share)
+    });
     assert!(first.counts.unwrap().occupied > 0);
     assert!(first.field.obstacle_distance_m(DVec3::new(1.0, 1.0, 0.5)) < 0.0);
     let mut reported = reported.into_inner().unwrap();
@@ -37,15 +38,15 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
     reported.sort_by(f64::total_cmp);
     assert!(reported.len() > 3 && reported[0] >= 0.0, "{reported:?}");
 
-    let again = bake_with(&splats, &spec, Some(&cache), &|_| ());
+    let again = bake_with(&splats, &spec, None, Some(&cache), &|_| ());
     assert_eq!((again.counts, &again.field), (None, &first.field));
     assert_eq!(again.kept_at, first.kept_at);
     // Another scene, and another way of baking, are other files.
     let (fainter, _) = scene(0.8);
-    assert_ne!(BakeKey::of(&fainter, &spec), BakeKey::of(&splats, &spec));
+    assert_ne!(BakeKey::of(&fainter, &spec, None), BakeKey::of(&splats, &spec, None));
     let coarse = BakeSpec { min_opacity: 0.4, ..spec };
-    assert_ne!(BakeKey::of(&splats, &coarse), BakeKey::of(&splats, &spec));
-    assert!(bake_with(&splats, &coarse, Some(&cache), &|_| ()).counts.is_some());
+    assert_ne!(BakeKey::of(&splats, &coarse, None), BakeKey::of(&splats, &spec, None));
+    assert!(bake_with(&splats, &coarse, None, Some(&cache), &|_| ()).counts.is_some());
     let names = fs::read_dir(folder.path().join("a/b")).unwrap();
     assert!(
         names.map(|entry| entry.unwrap().path()).all(|path| path.extension().unwrap() == "field")
@@ -57,14 +58,14 @@ fn damaged_cache_file_is_baked_again() {
     let folder = tempfile::tempdir().unwrap();
     let cache = BakeCache::at(folder.path());
     let (splats, spec) = scene(0.9);
-    let first = bake_with(&splats, &spec, Some(&cache), &|_| ());
+    let first = bake_with(&splats, &spec, None, Some(&cache), &|_| ());
     let path = first.kept_at.unwrap();
     let good = fs::read(&path).unwrap();
     let mut flipped = good.clone();
     flipped[good.len() / 2] ^= 1;
     for bad in [&good[..good.len() - 1], &good[..20], &[], &flipped, &[0; 200]] {
         fs::write(&path, bad).unwrap();
-        let again = bake_with(&splats, &spec, Some(&cache), &|_| ());
+        let again = bake_with(&splats, &spec, None, Some(&cache), &|_| ());
         assert!(again.counts.is_some(), "baked, not read");
         assert_eq!(again.field, first.field);
         assert_eq!(fs::read(&path).unwrap(), good, "and mended");
@@ -74,11 +75,11 @@ fn damaged_cache_file_is_baked_again() {
 #[test]
 fn without_a_place_to_keep_it_it_is_baked_all_the_same() {
     let (splats, spec) = scene(0.9);
-    let bare = bake_with(&splats, &spec, None, &|_| ());
+    let bare = bake_with(&splats, &spec, None, None, &|_| ());
     assert!(bare.kept_at.is_none() && bare.counts.is_some());
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("file"), "in the way").unwrap();
     let cache = BakeCache::at(folder.path().join("file/below"));
-    let baked = bake_with(&splats, &spec, Some(&cache), &|_| ());
+    let baked = bake_with(&splats, &spec, None, Some(&cache), &|_| ());
     assert_eq!((baked.kept_at, &baked.field), (None, &bare.field));
 }

@@ -144,7 +144,7 @@ async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<
 }
 
 fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, mut splats, objects, world_from_scene } =
+    let Scene { arena, mut splats, objects, world_from_scene, .. } =
         scene::load(&args.scene, &args.bare)?;
     args.antialiased.apply(&mut splats);
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };

@@ -2,10 +2,10 @@
 
 use std::collections::HashMap;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::{Cameras, ColmapError, lens};
-use crate::dataset::sparse::{SparseImage, SparsePoint, pose};
+use crate::dataset::sparse::{SparseImage, SparsePoint, SparseSighting, pose};
 
 /// Bytes still to read.
 struct Bytes<'a> {
@@ -117,10 +117,11 @@ pub fn images(bytes: &[u8], cameras: &Cameras) -> Result<Vec<SparseImage>, Colma
         };
         let mut seen = Vec::new();
         for _ in 0..bytes.count(24)? {
-            bytes.f64s::<2>()?;
+            let pixel = DVec2::from_array(bytes.f64s()?);
             // All ones is no point.
-            let id = bytes.u64()?;
-            seen.extend((id != u64::MAX).then_some(id));
+            let point = bytes.u64()?;
+            let is_point = point != u64::MAX && pixel.is_finite();
+            seen.extend(is_point.then_some(SparseSighting { point, pixel }));
         }
         images.push(SparseImage { name, intrinsics, world_from_cam, seen });
     }

@@ -50,6 +50,9 @@ pub(super) fn intrinsics(
         ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
             ([fx, fy], [cx, cy], brown(k1, k2, p1, p2))
         }
+        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) => {
+            ([fx, fy], [cx, cy], Distortion::BrownConrady { k1, k2, p1, p2, k3 })
+        }
         ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
             ([fx, fy], [cx, cy], fisheye(k1, k2, k3, k4))
         }
@@ -59,7 +62,9 @@ pub(super) fn intrinsics(
     };
     let distortion = match distortion {
         // No bend is no lens.
-        Distortion::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, .. } => Distortion::None,
+        Distortion::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 } => {
+            Distortion::None
+        }
         bent => bent,
     };
     let side = |v: u64| u32::try_from(v).unwrap_or(u32::MAX);
@@ -74,4 +79,54 @@ pub(super) fn intrinsics(
     };
     intrinsics.validate().map_err(|error| ColmapError::Damaged(error.to_string()))?;
     Ok(intrinsics)
+}
+
+/// Returns COLMAP's name of a lens, and its parameters.
+///
+/// ```
+/// use vizflyt_protocol::geometry::Intrinsics;
+/// let k = Intrinsics::from_horizontal_fov(640, 480, std::f64::consts::FRAC_PI_2);
+/// let (model, numbers) = vizflyt_twin::dataset::colmap::parameters(&k);
+/// assert_eq!((model, numbers.len(), numbers[2]), ("PINHOLE", 4, 320.0));
+/// ```
+pub fn parameters(k: &Intrinsics) -> (&'static str, Vec<f64>) {
+    let mut numbers = vec![k.fx_px, k.fy_px, k.cx_px, k.cy_px];
+    let model = match k.distortion {
+        Distortion::None => "PINHOLE",
+        Distortion::BrownConrady { k1, k2, p1, p2, k3: 0.0 } => {
+            numbers.extend([k1, k2, p1, p2]);
+            "OPENCV"
+        }
+        Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
+            numbers.extend([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]);
+            "FULL_OPENCV"
+        }
+        Distortion::KannalaBrandt { k1, k2, k3, k4 } => {
+            numbers.extend([k1, k2, k3, k4]);
+            "OPENCV_FISHEYE"
+        }
+    };
+    (model, numbers)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_told_of_a_lens_is_read_back() {
+        let plain = Intrinsics::from_horizontal_fov(640, 480, 1.2);
+        for distortion in [
+            Distortion::None,
+            Distortion::BrownConrady { k1: -0.1, k2: 0.02, p1: 0.001, p2: -0.002, k3: 0.0 },
+            Distortion::BrownConrady { k1: -0.1, k2: 0.02, p1: 0.001, p2: -0.002, k3: 0.03 },
+            Distortion::KannalaBrandt { k1: 0.01, k2: 0.02, k3: -0.01, k4: 0.001 },
+        ] {
+            let k = Intrinsics { distortion, ..plain };
+            let (model, numbers) = parameters(&k);
+            assert_eq!(intrinsics(model, 640, 480, &numbers), Ok(k));
+        }
+        let bent = [500.0, 500.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0];
+        assert!(intrinsics("FULL_OPENCV", 640, 480, &bent).is_err(), "k4 is not understood");
+    }
 }

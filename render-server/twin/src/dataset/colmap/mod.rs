@@ -3,12 +3,15 @@
 pub mod binary;
 mod lens;
 pub mod text;
+mod write;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use vizflyt_protocol::geometry::Intrinsics;
 
+pub use self::lens::parameters;
+pub use self::write::write;
 use super::error::{DatasetError, read_file};
 use super::sparse::SparseModel;
 
@@ -27,7 +30,7 @@ pub enum ColmapError {
 pub type Cameras = HashMap<u32, Intrinsics>;
 
 /// Returns the folder of a dataset that holds a model, if one does.
-pub(super) fn find(folder: &Path) -> Option<PathBuf> {
+pub fn find(folder: &Path) -> Option<PathBuf> {
     let places = ["sparse/0", "sparse", "colmap/sparse/0", ""];
     let has = |path: &Path| {
         ["bin", "txt"].iter().any(|kind| path.join(format!("cameras.{kind}")).is_file())
@@ -35,8 +38,11 @@ pub(super) fn find(folder: &Path) -> Option<PathBuf> {
     places.iter().map(|place| folder.join(place)).find(|path| has(path))
 }
 
-/// Reads the model in a folder.
-pub(super) fn read(folder: &Path) -> Result<SparseModel, DatasetError> {
+/// Reads the model in a folder: of the files of either kind, the binary ones.
+///
+/// # Errors
+/// [`DatasetError`] says which file is wrong, and what to do.
+pub fn read(folder: &Path) -> Result<SparseModel, DatasetError> {
     let is_binary = folder.join("cameras.bin").is_file();
     let kind = if is_binary { "bin" } else { "txt" };
     let load = |name: &str| {

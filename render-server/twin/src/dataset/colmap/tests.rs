@@ -5,10 +5,13 @@ use proptest::prelude::*;
 use vizflyt_protocol::geometry::Distortion;
 
 use super::*;
+use crate::dataset::{SparsePoint, SparseSighting};
 
 const CAMERAS: &str = "# comment\n1 OPENCV 640 480 400 401 320 240 0.1 -0.05 0.001 0.002\n\n2 SIMPLE_PINHOLE 640 480 400 320 240\n";
 const IMAGES: &str =
     "# comment\n3 0.5 0.5 0.5 0.5 1 2 3 1 a b.png\n10 20 7 30 40 -1\n4 1 0 0 0 0 0 0 2 c.jpg\n\n";
+const SEEN: [SparseSighting; 1] =
+    [SparseSighting { point: 7, pixel: glam::DVec2::new(10.0, 20.0) }];
 const POINTS: &str = "7 1.5 2.5 3.5 10 20 30 0.4 3 0 4 1\n";
 
 #[test]
@@ -20,7 +23,7 @@ fn text_is_read() {
     assert_eq!(cameras[&2].distortion, Distortion::None);
     let images = text::images(IMAGES, &cameras).unwrap();
     assert_eq!((images[0].name.as_str(), images[1].name.as_str()), ("a b.png", "c.jpg"));
-    assert_eq!((images[0].seen.as_slice(), images[1].seen.len()), (&[7u64][..], 0));
+    assert_eq!((images[0].seen.as_slice(), images[1].seen.len()), (&SEEN[..], 0));
     // The rotation (1, 1, 1, 1) / 2 takes x to y to z to x: COLMAP's is cam_from_world.
     let p_cam = images[0].world_from_cam.inverse().transform_point(DVec3::X);
     assert!((p_cam - DVec3::new(1.0, 3.0, 3.0)).length() < 1e-12);
@@ -35,7 +38,7 @@ fn text_says_what_is_wrong() {
         let error = result.unwrap_err().to_string();
         assert!(error.contains(says), "{error}");
     };
-    check(text::cameras("1 FULL_OPENCV 6 4 1 1 1 1 0 0 0 0 0 0 0 0").map(drop), "FULL_OPENCV");
+    check(text::cameras("1 FULL_OPENCV 6 4 1 1 1 1 0 0 0 0 0 0.1 0 0").map(drop), "FULL_OPENCV");
     check(text::cameras("1 BALLOON 6 4 1").map(drop), "BALLOON");
     check(
         text::cameras("1 PINHOLE 640 480 400 400 320").map(drop),
@@ -91,7 +94,7 @@ fn binary_is_read_and_every_cut_is_noticed() {
     let images = binary::images(&image_bytes, &cameras).unwrap();
     let points = binary::points(&point_bytes).unwrap();
     let text_points = text::points(POINTS).unwrap();
-    assert_eq!((&points, &images[0].seen[..]), (&text_points, &[7][..]));
+    assert_eq!((&points, &images[0].seen[..]), (&text_points, &SEEN[..]));
     let p_cam = images[0].world_from_cam.inverse().transform_point(DVec3::X);
     assert!((p_cam - DVec3::new(1.0, 3.0, 3.0)).length() < 1e-12);
     for len in 0..camera_bytes.len() {
@@ -127,4 +130,31 @@ proptest! {
         let text = String::from_utf8_lossy(&bytes);
         let _ = (text::cameras(&text), text::images(&text, &cameras), text::points(&text));
     }
+}
+
+#[test]
+fn a_model_that_is_written_is_read_back() {
+    let cameras = text::cameras(CAMERAS).unwrap();
+    let images = text::images(IMAGES, &cameras).unwrap();
+    let points = HashMap::from([(
+        7,
+        SparsePoint { position: DVec3::new(1.5, -2.5, 1.0 / 3.0), rgb: [1, 2, 255], track: 1 },
+    )]);
+    let model = SparseModel { images, points };
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path().join("sparse/0");
+    write(&place, &model).unwrap();
+    let back = read(&place).unwrap();
+    assert_eq!(back.points, model.points);
+    for (back, image) in back.images.iter().zip(&model.images) {
+        assert_eq!(
+            (&back.name, back.intrinsics, &back.seen),
+            (&image.name, image.intrinsics, &image.seen)
+        );
+        let off = back.world_from_cam.translation_m - image.world_from_cam.translation_m;
+        assert!(off.length() < 1e-12, "{off}");
+        assert!(back.world_from_cam.rotation.angle_between(image.world_from_cam.rotation) < 1e-7);
+    }
+    assert_eq!(back.images.len(), 2);
+    assert!(write(&folder.path().join("sparse/0/images.txt/x"), &model).is_err());
 }

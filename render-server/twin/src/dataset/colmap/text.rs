@@ -4,10 +4,10 @@
 use std::collections::HashMap;
 use std::str::{FromStr, SplitWhitespace};
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::{Cameras, ColmapError, lens};
-use crate::dataset::sparse::{SparseImage, SparsePoint, pose};
+use crate::dataset::sparse::{SparseImage, SparsePoint, SparseSighting, pose};
 
 /// Fields of a line, with its number for messages.
 struct Line<'a> {
@@ -94,10 +94,11 @@ pub fn images(text: &str, cameras: &Cameras) -> Result<Vec<SparseImage>, ColmapE
         let mut seen = Vec::new();
         if let Some(mut points) = lines.next() {
             while points.fields.clone().next().is_some() {
-                let _ = points.values::<2>("a point's pixel")?;
+                let pixel = DVec2::from_array(points.values("a point's pixel")?);
                 // -1 is no point.
                 let id: i64 = points.value("a point's id")?;
-                seen.extend(u64::try_from(id));
+                let point = u64::try_from(id).ok().filter(|_| pixel.is_finite());
+                seen.extend(point.map(|point| SparseSighting { point, pixel }));
             }
         }
         images.push(SparseImage { name, intrinsics, world_from_cam, seen });

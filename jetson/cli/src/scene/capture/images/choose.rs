@@ -1,0 +1,157 @@
+//! Which pictures of a video are taken, and what is to be said of them.
+
+use super::{Choice, FRAMES, Pictures, clock};
+
+/// Parts of a video's time, of each of which the sharpest picture is taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Buckets {
+    count: usize,
+    bucket_s: f64,
+}
+
+impl Buckets {
+    pub(super) fn new(duration_s: f64, choice: Choice) -> Self {
+        let usual = (PER_SECOND * duration_s).round() as usize;
+        let count = choice.frames.unwrap_or(usual.clamp(*FRAMES.start(), *FRAMES.end())).max(1);
+        Self { count, bucket_s: duration_s.max(1e-3) / count as f64 }
+    }
+
+    /// Returns which part a time lies in; `None` near its ends, so that no two pictures come from one instant, and
+    /// none are two parts apart.
+    pub(super) fn find(&self, at_s: f64) -> Option<usize> {
+        let place = at_s / self.bucket_s;
+        let bucket = (place.max(0.0) as usize).min(self.count - 1);
+        ((place - bucket as f64 - 0.5).abs() <= MIDDLE / 2.0).then_some(bucket)
+    }
+}
+
+/// Returns what a person should know of the pictures.
+pub(super) fn remarks(of: &Pictures) -> Vec<String> {
+    let pictures = &of.pictures;
+    let mut remarks = Vec::new();
+    let place = |i: usize| {
+        if of.of_video { clock(pictures[i].at_s) } else { pictures[i].name.clone() }
+    };
+    let mut blurs: Vec<f64> = pictures.iter().map(|picture| picture.blur).collect();
+    blurs.sort_by(f64::total_cmp);
+    let usual = blurs.get(blurs.len() / 2).copied().unwrap_or(0.0);
+    let blurred: Vec<usize> =
+        (0..pictures.len()).filter(|&i| pictures[i].blur > usual + BLURRED).collect();
+    if !blurred.is_empty() {
+        remarks.push(format!(
+            "{} of {} pictures are blurred ({}): turn more slowly, or switch on more light",
+            blurred.len(),
+            pictures.len(),
+            spans(&blurred, place)
+        ));
+    }
+    let jumps: Vec<usize> = (1..pictures.len())
+        .filter(|&i| {
+            let ratio = (pictures[i].grey + 1.0) / (pictures[i - 1].grey + 1.0);
+            !(1.0 / JUMP..=JUMP).contains(&ratio)
+        })
+        .collect();
+    if !jumps.is_empty() {
+        remarks.push(format!(
+            "the brightness jumps {} times ({}): lock the exposure, and keep windows out of the picture",
+            jumps.len(),
+            spans(&jumps, place)
+        ));
+    }
+    remarks
+}
+
+/// Returns runs of numbers as places: "0:07 to 0:09, 0:31".
+fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
+    let mut runs: Vec<[usize; 2]> = Vec::new();
+    for &number in numbers {
+        match runs.last_mut() {
+            Some(run) if run[1] + 1 == number => run[1] = number,
+            _ => runs.push([number; 2]),
+        }
+    }
+    let more = runs.len().saturating_sub(MOST_SPANS);
+    runs.truncate(MOST_SPANS);
+    let text = |&[first, last]: &[usize; 2]| {
+        let (first, last) = (place(first), place(last));
+        if first == last { first } else { format!("{first} to {last}") }
+    };
+    let mut text = runs.iter().map(text).collect::<Vec<_>>().join(", ");
+    if more > 0 {
+        text += &format!(", and {more} more");
+    }
+    text
+}
+
+/// Pictures of a video, without being told. At two a second, in the turns of the generated hall's walk (60 degrees a second),
+/// the chain from picture to picture broke in four places; at three, in none.
+const PER_SECOND: f64 = 3.0;
+/// Share of a part that is looked at.
+const MIDDLE: f64 = 2.0 / 3.0;
+/// So much more than usual is more blur than texture tells: 8 px of drag at 320 px of width add 0.15
+/// (`blur::tests`).
+const BLURRED: f64 = 0.12;
+/// More light from one picture to the next than people walk through.
+const JUMP: f64 = 1.6;
+/// Longer lists are not read.
+const MOST_SPANS: usize = 6;
+
+#[cfg(test)]
+mod tests {
+    use super::super::Picture;
+    use super::*;
+
+    fn choice(frames: Option<usize>) -> Choice {
+        Choice { frames, width_px: 1920 }
+    }
+
+    #[test]
+    fn every_part_of_the_time_has_its_picture() {
+        assert_eq!(Buckets::new(50.0, choice(None)).count, 150);
+        assert_eq!(Buckets::new(5.0, choice(None)).count, 80);
+        assert_eq!(Buckets::new(900.0, choice(None)).count, 300);
+        let buckets = Buckets::new(10.0, choice(Some(5)));
+        for (at_s, bucket) in [
+            (0.0, None),
+            (0.5, Some(0)),
+            (1.5, Some(0)),
+            (1.9, None),
+            (2.1, None),
+            (3.0, Some(1)),
+            (9.5, Some(4)),
+            // Longer than it said it was.
+            (10.9, None),
+            (-1.0, None),
+        ] {
+            assert_eq!(buckets.find(at_s), bucket, "at {at_s} s");
+        }
+    }
+
+    #[test]
+    fn blur_and_jumps_are_told_by_their_time() {
+        let picture = |number: usize| Picture {
+            name: format!("{number}.jpg"),
+            at_s: number as f64 * 2.0,
+            blur: if (4..=6).contains(&number) { 0.6 } else { 0.3 + 0.001 * number as f64 },
+            grey: if number >= 8 { 200.0 } else { 80.0 },
+        };
+        let mut pictures = Pictures {
+            folder: "images".into(),
+            size_px: [640, 480],
+            of_video: true,
+            pictures: (0..12).map(picture).collect(),
+        };
+        let remarks = super::remarks(&pictures);
+        assert!(
+            remarks[0].starts_with("3 of 12 pictures are blurred (0:08 to 0:12)"),
+            "{remarks:?}"
+        );
+        assert!(remarks[1].contains("jumps 1 times (0:16)"), "{remarks:?}");
+        pictures.of_video = false;
+        assert!(super::remarks(&pictures)[1].contains("(8.jpg)"));
+        pictures.pictures.truncate(4);
+        assert!(super::remarks(&pictures).is_empty());
+        pictures.pictures.clear();
+        assert!(super::remarks(&pictures).is_empty());
+    }
+}

@@ -1,0 +1,305 @@
+//! The third stage: the largest model in metres, upright, with what is known of both; and the verdict on it.
+
+mod ground;
+
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use vizflyt_protocol::geometry::Intrinsics;
+use vizflyt_tags::layout::{LayoutFrame, TagLayout};
+use vizflyt_twin::adjust::{self, Adjusted, Capture, Options, Tag, TagSighting};
+use vizflyt_twin::align::Similarity;
+use vizflyt_twin::dataset::{SparseModel, colmap};
+use vizflyt_twin::verdict::{self, Evidence, Given, Severity};
+
+use self::ground::Ground;
+use super::images::{Pictures, clock};
+use super::poses::Poses;
+use super::prints::Seen;
+
+/// What is known of the room.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Room {
+    /// Where tags stand.
+    pub(super) layout: Option<TagLayout>,
+    /// Edge of all tags, where nobody measured their places. [m]
+    pub(super) tag_size_m: Option<f64>,
+    /// How far apart the middles of two tags are.
+    pub(super) length: Option<Length>,
+    /// Whether the lens was calibrated.
+    pub(super) lens_is_known: bool,
+}
+
+/// A length that was measured between the middles of two tags.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub(super) struct Length {
+    pub(super) ids: [u32; 2],
+    pub(super) metres: f64,
+}
+
+/// What the stage leaves, beside the model in `sparse/0`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct Metric {
+    /// Whether there is a model.
+    pub(super) has_model: bool,
+    /// What the metres are from, in words.
+    pub(super) scale_from: String,
+    /// Whether nothing measured tells the metres.
+    pub(super) scale_is_guessed: bool,
+    /// What the vertical is from, in words.
+    pub(super) up_from: String,
+    /// Three sigmas, as a share of it.
+    pub(super) scale_bound: Option<f64>,
+    /// Three sigmas. [degrees]
+    pub(super) tilt_bound_deg: Option<f64>,
+    /// How far points are from where pictures saw them, root mean square. [px]
+    pub(super) points_rms_px: Option<f64>,
+    pub(super) tags: Vec<TagFact>,
+    pub(super) findings: Vec<FindingFact>,
+    /// What was looked at, a line each.
+    pub(super) checked: Vec<String>,
+    /// Whether nothing refuses it.
+    pub(super) fit_to_fly: bool,
+    /// Placed pictures, in the order of time.
+    pub(super) way: Vec<Placed>,
+}
+
+/// A picture that was placed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Placed {
+    pub(super) name: String,
+    pub(super) at_s: f64,
+    /// [m, world]
+    pub(super) position_m: DVec3,
+    /// Where it looks. [world]
+    pub(super) ahead: DVec3,
+}
+
+/// How a tag fits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct TagFact {
+    pub(super) name: String,
+    /// Its middle; absent where too few pictures saw it. [m, world]
+    pub(super) position_m: Option<DVec3>,
+    pub(super) sightings: usize,
+    pub(super) contradicting: usize,
+    /// From where pictures saw it. [px]
+    pub(super) rms_px: Option<f64>,
+    /// From where it was measured to be, by all others. [m]
+    pub(super) held_out_off_m: Option<f64>,
+    /// Its edges by all others, as a share of what they were measured to be, less 1.
+    pub(super) held_out_size_error: Option<f64>,
+}
+
+/// What a person should know.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct FindingFact {
+    pub(super) refused: bool,
+    /// Whether it is of scale and vertical alone: what is seen is right.
+    pub(super) of_metres: bool,
+    pub(super) what: String,
+    pub(super) remedy: String,
+    /// First and last of each run of pictures that are meant.
+    pub(super) images: Vec<[usize; 2]>,
+}
+
+impl Metric {
+    /// Returns what a person is told in a line.
+    pub(super) fn summary(&self) -> String {
+        if !self.has_model {
+            return "not metric".to_owned();
+        }
+        let scale = self
+            .scale_bound
+            .map_or("guessed".to_owned(), |share| format!("to {:.2} %", 100.0 * share));
+        let tilt =
+            self.tilt_bound_deg.map_or("unknown".to_owned(), |deg| format!("to {deg:.2} degrees"));
+        format!("scale {scale} by {}; up {tilt} by {}", self.scale_from, self.up_from)
+    }
+
+    /// Whether splats that are trained from it show the room as it is, however large.
+    pub(super) fn is_fit_to_train(&self) -> bool {
+        self.has_model && self.findings.iter().all(|f| !f.refused || f.of_metres)
+    }
+}
+
+/// Makes the first of the models metric, and judges it.
+///
+/// # Errors
+/// A model that cannot be read; what is wrong with the capture is no error.
+pub(super) fn make(
+    pictures: &Pictures,
+    seen: &Seen,
+    poses: &Poses,
+    room: &Room,
+    folder: &Path,
+) -> Result<Metric> {
+    if let Some(layout) = &room.layout {
+        ensure!(
+            layout.frame == LayoutFrame::World,
+            "the layout of --tags is of tags on a vehicle (frame = \"body\"); give that of the room's"
+        );
+    }
+    let read = |folder: &Path| -> Result<SparseModel> {
+        let mut model = colmap::read(folder)?;
+        for image in &mut model.images {
+            // Below other folders in other programs.
+            if let Some(name) = Path::new(&image.name).file_name().and_then(|name| name.to_str()) {
+                image.name = name.to_owned();
+            }
+        }
+        let is_ours = |name: &str| pictures.pictures.iter().any(|picture| picture.name == name);
+        model.images.retain(|image| is_ours(&image.name));
+        Ok(model)
+    };
+    let capture = |model: &SparseModel| -> Result<Capture> {
+        let mut capture = Capture::new(model, |name| pictures.at_s(name))?;
+        add_tags(&mut capture, pictures, seen, room);
+        Ok(capture)
+    };
+    let model = read(&poses.models[0].folder)?;
+    let first = capture(&model)
+        .with_context(|| format!("the model in {}", poses.models[0].folder.display()))?;
+    // A small one may be of other pictures altogether.
+    let others =
+        poses.models[1..].iter().filter_map(|other| capture(&read(&other.folder).ok()?).ok());
+    let others: Vec<Capture> = others.collect();
+    let given: Vec<Given> = pictures
+        .pictures
+        .iter()
+        .map(|picture| Given { name: picture.name.clone(), at_s: picture.at_s })
+        .collect();
+    let options = Options { refine_lens: !room.lens_is_known, ..Options::default() };
+    let adjusted = adjust::adjust(&first, options);
+    let ground = adjusted.as_ref().ok().map(|adjusted| Ground::of(&first, adjusted, seen, room));
+    let verdict = verdict::judge(&Evidence {
+        given: &given,
+        capture: &first,
+        adjusted: adjusted.as_ref(),
+        others: &others,
+        aligned: ground.as_ref().and_then(|ground| ground.fit.as_ref()),
+    });
+    let mut metric = Metric { checked: verdict.checked.clone(), ..Metric::default() };
+    metric.fit_to_fly = verdict.is_fit_to_fly();
+    metric.findings = verdict.findings.iter().map(|finding| fact(finding, pictures)).collect();
+    if let (Ok(adjusted), Some(ground)) = (&adjusted, &ground) {
+        describe(&mut metric, &first, adjusted, ground);
+        let metres = placed(&model, &first, adjusted, ground);
+        colmap::write(&folder.join("sparse/0"), &metres)?;
+        metric.has_model = true;
+    }
+    Ok(metric)
+}
+
+/// Adds the tags whose size or place is known, and where pictures saw them.
+fn add_tags(capture: &mut Capture, pictures: &Pictures, seen: &Seen, room: &Room) {
+    let mut number = vec![None; seen.tags.len()];
+    for (index, print) in seen.tags.iter().enumerate() {
+        let surveyed = room.layout.as_ref().and_then(|layout| layout.find(print.family, print.id));
+        let (size_m, corners_m) = match (surveyed, room.tag_size_m) {
+            (Some(tag), _) => (tag.size_m, Some(tag.corners_m())),
+            (None, Some(size_m)) => (size_m, None),
+            (None, None) => continue,
+        };
+        number[index] = Some(capture.tags.len());
+        let name = format!("{} {}", print.family.name(), print.id);
+        capture.tags.push(Tag { name, size_m, corners_m });
+    }
+    for image in &mut capture.images {
+        let place = pictures.pictures.iter().position(|picture| picture.name == image.name);
+        let sightings = place.and_then(|place| seen.pictures.get(place));
+        image.tags = sightings
+            .into_iter()
+            .flatten()
+            .filter_map(|s| Some(TagSighting { tag: number[s.tag]?, corners_px: s.corners() }))
+            .collect();
+    }
+}
+
+fn fact(finding: &verdict::Finding, pictures: &Pictures) -> FindingFact {
+    let mut what = finding.what.clone();
+    if pictures.of_video && !finding.images.is_empty() {
+        let time = |i: usize| pictures.pictures.get(i).map_or(0.0, |picture| picture.at_s);
+        let runs = finding.images.iter().take(MANY).map(|run| {
+            format!("{} to {}", clock(time(run.start)), clock(time(run.end.saturating_sub(1))))
+        });
+        what += &format!("; in the video from {}", runs.collect::<Vec<_>>().join(", from "));
+    }
+    FindingFact {
+        refused: finding.severity == Severity::Refused,
+        of_metres: finding.check == verdict::Check::Metric,
+        what,
+        remedy: finding.remedy.clone(),
+        images: finding.images.iter().map(|run| [run.start, run.end.saturating_sub(1)]).collect(),
+    }
+}
+
+fn describe(metric: &mut Metric, capture: &Capture, adjusted: &Adjusted, ground: &Ground) {
+    metric.scale_from = ground.scale_from.clone();
+    metric.scale_is_guessed = ground.scale_is_guessed;
+    metric.up_from = ground.up_from.clone();
+    let fit = ground.fit.as_ref();
+    let scale_sigma = adjusted.scale_sigma.or(fit.map(|fit| fit.scale_sigma));
+    metric.scale_bound = scale_sigma.filter(|_| !ground.scale_is_guessed).map(|sigma| 3.0 * sigma);
+    let tilt_sigma_rad = adjusted.tilt_sigma_rad.or(fit.map(|fit| fit.tilt_sigma_rad));
+    metric.tilt_bound_deg = tilt_sigma_rad.map(|sigma| (3.0 * sigma).to_degrees());
+    metric.points_rms_px = Some(adjusted.points_rms_px);
+    for (tag, result) in capture.tags.iter().zip(&adjusted.tags) {
+        let held_out = result.and_then(|result| result.held_out);
+        metric.tags.push(TagFact {
+            name: tag.name.clone(),
+            position_m: result.map(|result| {
+                ground.place.transform_point(result.corners_m.iter().sum::<DVec3>() / 4.0)
+            }),
+            sightings: result.map_or(0, |result| result.sightings),
+            contradicting: result.map_or(0, |result| result.contradicting),
+            rms_px: result.map(|result| result.rms_px),
+            held_out_off_m: held_out.and_then(|held_out| held_out.off_m),
+            held_out_size_error: held_out.map(|held_out| held_out.size_error),
+        });
+    }
+    for (image, pose) in capture.images.iter().zip(&adjusted.world_from_cam) {
+        let Similarity { rotation, .. } = ground.place;
+        metric.way.push(Placed {
+            name: image.name.clone(),
+            at_s: image.at_s,
+            position_m: ground.place.transform_point(pose.translation_m),
+            ahead: rotation * (pose.rotation * DVec3::Z),
+        });
+    }
+}
+
+/// Returns the model as it was adjusted, in metres and upright.
+fn placed(
+    model: &SparseModel,
+    capture: &Capture,
+    adjusted: &Adjusted,
+    ground: &Ground,
+) -> SparseModel {
+    let mut placed = model.clone();
+    let lens: Intrinsics = adjusted.lens;
+    for image in &mut placed.images {
+        image.intrinsics = lens;
+        let index = capture.images.iter().position(|of| of.name == image.name);
+        if let Some(index) = index {
+            let mut pose = adjusted.world_from_cam[index];
+            pose.translation_m = ground.place.transform_point(pose.translation_m);
+            pose.rotation = (ground.place.rotation * pose.rotation).normalize();
+            image.world_from_cam = pose;
+        }
+    }
+    // In the order of their ids, as the capture has them.
+    let mut ids: Vec<u64> = placed.points.keys().copied().collect();
+    ids.sort_unstable();
+    for (id, &p_m) in ids.iter().zip(&adjusted.points_m) {
+        if let Some(point) = placed.points.get_mut(id) {
+            point.position = ground.place.transform_point(p_m);
+        }
+    }
+    placed
+}
+
+/// Longer lists are not read.
+const MANY: usize = 6;

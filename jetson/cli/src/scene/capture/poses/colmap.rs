@@ -1,0 +1,93 @@
+//! COLMAP as a program in the PATH, 3.8 and later.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::Result;
+
+use super::tool::ask;
+use super::{Finder, Job, Phase, Tool, UNKNOWN_LENS};
+
+/// The program.
+pub(super) struct Colmap {
+    program: PathBuf,
+    name: String,
+    /// "Sift" until 3.12, "Feature" since: what options of features begin with.
+    prefix: &'static str,
+}
+
+impl Colmap {
+    /// Asks the program for its version; `None` if it is not installed.
+    pub(super) fn open(program: &Path) -> Result<Option<Self>> {
+        let Some(help) = ask(Command::new(program).arg("help")) else { return Ok(None) };
+        let options =
+            ask(Command::new(program).args(["feature_extractor", "-h"])).unwrap_or_default();
+        let name = version(&help).unwrap_or_else(|| "COLMAP".to_owned());
+        let is_new = options.contains("FeatureExtraction.use_gpu");
+        let prefix = if is_new { "Feature" } else { "Sift" };
+        Ok(Some(Self { program: program.to_owned(), name, prefix }))
+    }
+}
+
+/// Returns "COLMAP 3.8" of what `colmap help` prints first.
+fn version(help: &str) -> Option<String> {
+    let line = help.lines().find(|line| line.starts_with("COLMAP "))?;
+    let mut words = line.split_whitespace();
+    Some(format!("{} {}", words.next()?, words.next()?))
+}
+
+impl Finder for Colmap {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn find(&self, job: &Job<'_>, progress: &mut dyn FnMut(Phase)) -> Result<()> {
+        let log = job.folder.join("log.txt");
+        let tool = Tool { name: &self.name, log: &log };
+        let database = job.folder.join("database.db");
+        let command = |what: &str| {
+            let mut command = Command::new(&self.program);
+            command.arg(what).arg("--database_path").arg(&database);
+            // Without a desktop: Qt needs none then.
+            command.env("QT_QPA_PLATFORM", "offscreen");
+            command
+        };
+        let mut features = command("feature_extractor");
+        features.arg("--image_path").arg(job.images).args(["--ImageReader.single_camera", "1"]);
+        let (model, parameters) = job.lens.clone().unwrap_or((UNKNOWN_LENS, String::new()));
+        features.args(["--ImageReader.camera_model", model]);
+        if job.lens.is_some() {
+            features.args(["--ImageReader.camera_params", &parameters]);
+        }
+        features.args([&format!("--{}Extraction.use_gpu", self.prefix), "0"]);
+        features.args(["--SiftExtraction.max_num_features", "4096"]);
+        tool.run(&mut features, progress)?;
+
+        let mut matching = command("matches_importer");
+        matching.arg("--match_list_path").arg(job.pairs).args(["--match_type", "pairs"]);
+        matching.args([&format!("--{}Matching.use_gpu", self.prefix), "0"]);
+        tool.run(&mut matching, progress)?;
+
+        let mut mapping = command("mapper");
+        mapping.arg("--image_path").arg(job.images).arg("--output_path").arg(job.models);
+        if job.lens.is_some() {
+            for what in ["focal_length", "extra_params"] {
+                mapping.args([&format!("--Mapper.ba_refine_{what}"), "0"]);
+            }
+        }
+        tool.run(&mut mapping, progress)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_version_is_in_the_first_line() {
+        let help =
+            "COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n  (Commit Unknown)\n";
+        assert_eq!(version(help).as_deref(), Some("COLMAP 3.8"));
+        assert_eq!(version("colmap: command not found"), None);
+    }
+}

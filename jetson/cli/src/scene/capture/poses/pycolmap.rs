@@ -1,0 +1,52 @@
+//! COLMAP as a package of Python: `pip install pycolmap`, 3.11 and later.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, Result};
+
+use super::tool::ask;
+use super::{Finder, Job, Phase, Tool, UNKNOWN_LENS};
+
+/// A Python that has it.
+pub(super) struct Pycolmap {
+    python: PathBuf,
+    name: String,
+}
+
+impl Pycolmap {
+    /// Asks a Python for its pycolmap.
+    ///
+    /// # Errors
+    /// It has none.
+    pub(super) fn open(python: &Path) -> Result<Self> {
+        let version =
+            ask(Command::new(python).args(["-c", "import pycolmap; print(pycolmap.__version__)"]));
+        let version = version.with_context(|| {
+            format!(
+                "{} has no pycolmap: {} -m pip install pycolmap",
+                python.display(),
+                python.display()
+            )
+        })?;
+        Ok(Self { python: python.to_owned(), name: format!("pycolmap {}", version.trim()) })
+    }
+}
+
+impl Finder for Pycolmap {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn find(&self, job: &Job<'_>, progress: &mut dyn FnMut(Phase)) -> Result<()> {
+        let script = job.folder.join("find_poses.py");
+        std::fs::write(&script, SCRIPT)?;
+        let (model, parameters) = job.lens.clone().unwrap_or((UNKNOWN_LENS, String::new()));
+        let mut command = Command::new(&self.python);
+        command.arg(&script).arg(job.images).arg(job.pairs).arg(job.folder).arg(job.models);
+        command.args([model, &parameters]);
+        Tool { name: &self.name, log: &job.folder.join("log.txt") }.run(&mut command, progress)
+    }
+}
+
+const SCRIPT: &str = include_str!("find_poses.py");

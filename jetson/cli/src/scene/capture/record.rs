@@ -1,0 +1,82 @@
+//! `capture.json`: how a twin was made, and how well it is known.
+
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use glam::DVec3;
+use serde::Serialize;
+use vizflyt_twin::dataset::colmap;
+
+use super::finish::Finished;
+use super::images::Pictures;
+use super::metric::Metric;
+use super::page;
+use super::poses::Poses;
+use super::training::Trained;
+use super::work::{Stage, StageTime, Work};
+
+/// What is known of a capture; what did not come is absent.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Record {
+    /// 1; another where a field changes its meaning.
+    pub(super) version: u32,
+    /// The program and its version.
+    pub(super) made_by: String,
+    /// What was filmed.
+    pub(super) source: String,
+    /// Whether it can be flown.
+    pub(super) fit_to_fly: bool,
+    pub(super) stages: Vec<StageTime>,
+    pub(super) remarks: Vec<String>,
+    pub(super) pictures: Option<Pictures>,
+    pub(super) poses: Option<Poses>,
+    pub(super) metric: Option<Metric>,
+    pub(super) trained: Option<Trained>,
+    pub(super) finished: Option<Finished>,
+}
+
+impl Record {
+    /// Begins with nothing.
+    pub(super) fn new(input: &Path) -> Self {
+        Self {
+            version: 1,
+            made_by: format!("vizflyt {}", env!("CARGO_PKG_VERSION")),
+            source: input.display().to_string(),
+            fit_to_fly: false,
+            stages: Vec::new(),
+            remarks: Vec::new(),
+            pictures: None,
+            poses: None,
+            metric: None,
+            trained: None,
+            finished: None,
+        }
+    }
+
+    /// Writes `capture.json` and `report.html`.
+    pub(super) fn write(&mut self, output: &Path, work: &Work) -> Result<()> {
+        self.fit_to_fly =
+            self.finished.is_some() && self.metric.as_ref().is_some_and(|metric| metric.fit_to_fly);
+        let points = self.points(work)?;
+        let page = page::html(self, &points, &work.folder(Stage::Train));
+        for (name, text) in
+            [("capture.json", serde_json::to_string_pretty(self)? + "\n"), ("report.html", page)]
+        {
+            let path = output.join(name);
+            std::fs::write(&path, text)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Returns the points of the metric model. [m, world]
+    fn points(&self, work: &Work) -> Result<Vec<DVec3>> {
+        if !self.metric.as_ref().is_some_and(|metric| metric.has_model) {
+            return Ok(Vec::new());
+        }
+        let model = colmap::read(&work.folder(Stage::Metric).join("sparse/0"))?;
+        let mut points: Vec<_> = model.points.into_iter().collect();
+        points.sort_by_key(|(id, _)| *id);
+        Ok(points.into_iter().map(|(_, point)| point.position).collect())
+    }
+}

@@ -1,0 +1,80 @@
+//! Tags that had no say: where the images see them once they no longer pull.
+
+use glam::DVec3;
+
+use super::capture::Capture;
+use super::solve::{self, Solved};
+use super::state::{State, TagPlace};
+use super::{HeldOut, Known, Options};
+use crate::align::corners::{Ray, meet};
+
+/// Returns what each tag says that was held out, in the order of the capture's; `None` where too few others are left to
+/// place it, or too few images saw it.
+pub(super) fn held_out(
+    capture: &Capture,
+    state: &State,
+    solved: &Solved,
+    options: Options,
+    known: Known,
+) -> Vec<Option<HeldOut>> {
+    let mut results = vec![None; capture.tags.len()];
+    let is_placed = |tag: &usize| !matches!(state.tags[*tag], TagPlace::Nowhere);
+    let is_given = |tag: &usize| matches!(state.tags[*tag], TagPlace::Given(_));
+    let placed: Vec<usize> = (0..capture.tags.len()).filter(is_placed).collect();
+    // Measured places and sizes alone are held to different things; what has both goes by its place.
+    let any_given = placed.iter().any(is_given);
+    let anchors: Vec<usize> = placed.into_iter().filter(|tag| is_given(tag) == any_given).collect();
+    if anchors.len() < 2 {
+        return results;
+    }
+    let parts = anchors.len().min(PARTS);
+    for part in 0..parts {
+        let without: Vec<usize> = anchors.iter().copied().skip(part).step_by(parts).collect();
+        let mut state = state.clone();
+        if solve::settle(capture, &mut state, options, known, solved.noise, &without).is_err() {
+            continue;
+        }
+        for &tag in &without {
+            results[tag] = look(capture, &state, tag);
+        }
+    }
+    results
+}
+
+/// Returns where images alone have a tag.
+fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
+    let mut rays: [Vec<Ray>; 4] = Default::default();
+    for (image, pose) in capture.images.iter().zip(&state.cameras) {
+        for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
+            for (rays, &pixel) in rays.iter_mut().zip(&seen.corners_px) {
+                let direction = pose.rotation * state.lens.slope(pixel)?.extend(1.0);
+                rays.push(Ray { origin: pose.translation_m, direction: direction.normalize() });
+            }
+        }
+    }
+    let mut corners_m = [DVec3::ZERO; 4];
+    for (corner, rays) in corners_m.iter_mut().zip(&rays) {
+        *corner = meet(rays)?.position;
+    }
+    let round_m: f64 = (0..4).map(|k| corners_m[k].distance(corners_m[(k + 1) % 4])).sum();
+    let middle = |corners: &[DVec3; 4]| corners.iter().sum::<DVec3>() / 4.0;
+    let given = capture.tags[tag].corners_m;
+    let expected = given.unwrap_or(corners_m);
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (camera, image) in capture.images.iter().enumerate() {
+        for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
+            if let Some(off_px) = state.tag_off_px(camera, &expected, seen) {
+                sum += off_px * off_px;
+                count += 1.0;
+            }
+        }
+    }
+    Some(HeldOut {
+        off_m: given.map(|given| middle(&given).distance(middle(&corners_m))),
+        size_error: round_m / (4.0 * capture.tags[tag].size_m) - 1.0,
+        rms_px: if count > 0.0 { (sum / count).sqrt() } else { return None },
+    })
+}
+
+/// Each takes some rounds of the whole adjustment.
+const PARTS: usize = 5;

@@ -1,0 +1,163 @@
+//! Symmetric positive definite systems, dense, and small inverses.
+
+use glam::DMat3;
+
+/// A symmetric matrix; its lower triangle, row by row.
+#[derive(Clone, Debug)]
+pub(super) struct Symmetric {
+    size: usize,
+    lower: Vec<f64>,
+}
+
+/// The lower triangular matrix whose product with its transpose was given (A.-L. Cholesky).
+#[derive(Clone, Debug)]
+pub(super) struct Factor(Symmetric);
+
+impl Symmetric {
+    pub(super) fn zero(size: usize) -> Self {
+        Self { size, lower: vec![0.0; size * (size + 1) / 2] }
+    }
+
+    pub(super) fn size(&self) -> usize {
+        self.size
+    }
+
+    /// Returns an element of the diagonal.
+    pub(super) fn diagonal(&self, i: usize) -> f64 {
+        self.lower[i * (i + 1) / 2 + i]
+    }
+
+    /// Adds to an element of the lower triangle.
+    pub(super) fn add(&mut self, row: usize, column: usize, value: f64) {
+        debug_assert!(column <= row);
+        self.lower[row * (row + 1) / 2 + column] += value;
+    }
+
+    /// Adds a block whose first element is at (`row`, `column`), of which the part in the lower triangle counts.
+    pub(super) fn add_block<const R: usize, const C: usize>(
+        &mut self,
+        row: usize,
+        column: usize,
+        block: &[[f64; C]; R],
+    ) {
+        for (i, values) in block.iter().enumerate() {
+            let at = row + i;
+            let start = at * (at + 1) / 2 + column;
+            let count = C.min((at + 1).saturating_sub(column));
+            let target = &mut self.lower[start..start + count];
+            target.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+        }
+    }
+
+    /// Adds another one.
+    pub(super) fn add_all(&mut self, other: &Self) {
+        self.lower.iter_mut().zip(&other.lower).for_each(|(x, y)| *x += y);
+    }
+
+    /// Makes the diagonal larger by this share (Marquardt 1963).
+    pub(super) fn damp(&mut self, share: f64) {
+        for i in 0..self.size {
+            self.lower[i * (i + 1) / 2 + i] *= 1.0 + share;
+        }
+    }
+
+    /// Returns its factor; `None` if it is not positive definite.
+    pub(super) fn factor(mut self) -> Option<Factor> {
+        for i in 0..self.size {
+            let start = i * (i + 1) / 2;
+            let (before, row) = self.lower.split_at_mut(start);
+            let greatest = row[i];
+            for j in 0..i {
+                let other = &before[j * (j + 1) / 2..][..=j];
+                row[j] = (row[j] - dot(&row[..j], &other[..j])) / other[j];
+            }
+            let value = row[i] - dot(&row[..i], &row[..i]);
+            // What is left of the diagonal after subtraction must be more than rounding.
+            if !(value > 1e-13 * greatest && value > 0.0) {
+                return None;
+            }
+            row[i] = value.sqrt();
+        }
+        Some(Factor(self))
+    }
+}
+
+impl Factor {
+    /// Solves for one right side.
+    pub(super) fn solve(&self, mut x: Vec<f64>) -> Vec<f64> {
+        let Symmetric { size, lower } = &self.0;
+        for i in 0..*size {
+            let row = &lower[i * (i + 1) / 2..][..=i];
+            x[i] = (x[i] - dot(&row[..i], &x[..i])) / row[i];
+        }
+        for i in (0..*size).rev() {
+            let row = &lower[i * (i + 1) / 2..][..=i];
+            x[i] /= row[i];
+            let (before, value) = (&mut x[..=i], row);
+            let known = before[i];
+            before[..i].iter_mut().zip(value).for_each(|(sum, a)| *sum -= a * known);
+        }
+        x
+    }
+}
+
+/// Four sums at once: one waits for itself.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; 8];
+    let (a_eights, a_rest) = a.as_chunks::<8>();
+    let (b_eights, b_rest) = b.as_chunks::<8>();
+    for (x, y) in a_eights.iter().zip(b_eights) {
+        for k in 0..8 {
+            sums[k] += x[k] * y[k];
+        }
+    }
+    let rest: f64 = a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum();
+    sums.iter().sum::<f64>() + rest
+}
+
+/// Returns the inverse of a symmetric matrix; `None` if it is not positive definite beyond rounding.
+pub(super) fn inverse(m: &DMat3) -> Option<DMat3> {
+    let determinant = m.determinant();
+    let product = m.x_axis.x * m.y_axis.y * m.z_axis.z;
+    (determinant > 1e-9 * product && product > 0.0).then(|| m.inverse())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn solutions_solve(
+            rows in prop::collection::vec(prop::collection::vec(-1.0..1.0f64, 19), 22),
+            right in prop::collection::vec(-1.0..1.0f64, 19),
+        ) {
+            let full = |i: usize, j: usize| {
+                let product: f64 = rows.iter().map(|row| row[i] * row[j]).sum();
+                product + if i == j { 0.1 } else { 0.0 }
+            };
+            let mut matrix = Symmetric::zero(19);
+            for i in 0..19 {
+                for j in 0..=i {
+                    matrix.add(i, j, full(i, j));
+                }
+            }
+            let x = matrix.factor().unwrap().solve(right.clone());
+            for i in 0..19 {
+                let back: f64 = (0..19).map(|j| full(i, j) * x[j]).sum();
+                prop_assert!((back - right[i]).abs() < 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn blocks_keep_to_the_lower_triangle_and_flat_systems_are_refused() {
+        let mut matrix = Symmetric::zero(3);
+        matrix.add_block(1, 1, &[[1.0, 9.0], [1.0, 1.0]]);
+        matrix.add_block(0, 0, &[[2.0]]);
+        assert_eq!(matrix.lower, [2.0, 0.0, 1.0, 0.0, 1.0, 1.0]);
+        assert!(matrix.factor().is_none());
+        assert!(inverse(&DMat3::from_diagonal(glam::DVec3::new(1.0, 0.0, 1.0))).is_none());
+    }
+}

@@ -1,0 +1,341 @@
+//! Levenberg and Marquardt's iteration, and what sightings weigh in it.
+
+use glam::{DQuat, DVec2, DVec3};
+use rayon::prelude::*;
+use vizflyt_protocol::geometry::Pose;
+
+use super::capture::{Capture, TagSighting};
+use super::matrix::Factor;
+use super::normal::{Layout, Normal, normal, points_step};
+use super::project::{LENS, moved};
+use super::state::{State, TagPlace};
+use super::{AdjustError, Known, Options};
+
+/// What is minimised.
+pub(super) struct Problem<'a> {
+    pub(super) capture: &'a Capture,
+    pub(super) layout: Layout,
+    pub(super) noise: Noise,
+    /// Sightings of points, those of one after the other: (camera, pixel).
+    seen: Vec<(usize, DVec2)>,
+    /// Where each point's begin.
+    starts: Vec<usize>,
+    /// Sightings of tags that count.
+    pub(super) tags: Vec<(usize, &'a TagSighting)>,
+}
+
+/// How far sightings are off along an axis, one sigma, as they are found to be. Losses are Cauchy's: what is farther off
+/// than three sigmas hardly pulls.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Noise {
+    pub(super) point_px: f64,
+    pub(super) tag_px: f64,
+    /// By how much places are worse than they claim; at least 1.
+    pub(super) place_factor: f64,
+}
+
+/// What was found.
+pub(super) struct Solved {
+    pub(super) noise: Noise,
+    pub(super) rounds: usize,
+    pub(super) layout: Layout,
+    /// Of the normal equations at the end, with held what nothing tells.
+    pub(super) factor: Factor,
+}
+
+impl Noise {
+    const START: Self = Self { point_px: 1.0, tag_px: 0.5, place_factor: 1.0 };
+
+    /// Returns 1 / sigma^2, less for what is far off. [1/px^2]
+    pub(super) fn point_weight(&self, off_px: DVec2) -> f64 {
+        weight(off_px.length(), self.point_px)
+    }
+
+    pub(super) fn tag_weight(&self, rms_px: f64) -> f64 {
+        weight(rms_px, self.tag_px)
+    }
+
+    pub(super) fn place_weight(&self, off_m: f64, sigma_m: f64) -> f64 {
+        weight(off_m, sigma_m * self.place_factor)
+    }
+
+    pub(super) fn up_weight(&self, off_rad: f64, sigma_rad: f64) -> f64 {
+        weight(off_rad, sigma_rad)
+    }
+}
+
+fn weight(off: f64, sigma: f64) -> f64 {
+    let share = (off / (LOSS_SIGMAS * sigma)).powi(2);
+    1.0 / (sigma * sigma * (1.0 + share))
+}
+
+fn loss(off: f64, sigma: f64) -> f64 {
+    let c2 = LOSS_SIGMAS * LOSS_SIGMAS;
+    c2 * ((off / sigma).powi(2) / c2).ln_1p()
+}
+
+impl<'a> Problem<'a> {
+    /// `without` are tags whose sightings do not count.
+    pub(super) fn new(
+        capture: &'a Capture,
+        state: &State,
+        refine_lens: bool,
+        without: &[usize],
+    ) -> Self {
+        let mut starts = vec![0usize; state.points.len() + 1];
+        for seen in capture.images.iter().flat_map(|image| &image.seen) {
+            starts[seen.point + 1] += 1;
+        }
+        for point in 0..state.points.len() {
+            starts[point + 1] += starts[point];
+        }
+        let mut next = starts.clone();
+        let mut seen = vec![(0, DVec2::ZERO); starts[state.points.len()]];
+        let mut tags = Vec::new();
+        for (camera, image) in capture.images.iter().enumerate() {
+            for one in &image.seen {
+                seen[next[one.point]] = (camera, one.pixel);
+                next[one.point] += 1;
+            }
+            let counts = |seen: &&TagSighting| {
+                !without.contains(&seen.tag) && !matches!(state.tags[seen.tag], TagPlace::Nowhere)
+            };
+            tags.extend(image.tags.iter().filter(counts).map(|seen| (camera, seen)));
+        }
+        // A tag that nothing sees any more has no place to be found.
+        let layout = Layout::new(state, refine_lens).without(without);
+        Self { capture, layout, noise: Noise::START, seen, starts, tags }
+    }
+
+    pub(super) fn sightings(&self, point: usize) -> &[(usize, DVec2)] {
+        &self.seen[self.starts[point]..self.starts[point + 1]]
+    }
+
+    fn point_cost(&self, state: &State, point: usize) -> f64 {
+        let sightings = self.sightings(point);
+        let one = |&(camera, pixel): &(usize, DVec2)| {
+            let off = state.off_px(camera, state.points[point], pixel);
+            loss(off.map_or(BEHIND_PX, DVec2::length), self.noise.point_px)
+        };
+        if sightings.len() < 2 { 0.0 } else { sightings.iter().map(one).sum() }
+    }
+
+    /// Returns what a state costs.
+    fn cost(&self, state: &State) -> f64 {
+        let points: Vec<f64> = (0..state.points.len())
+            .into_par_iter()
+            .map(|point| self.point_cost(state, point))
+            .collect();
+        let mut sum: f64 = points.iter().sum();
+        for &(camera, seen) in &self.tags {
+            let corners = state.corners_m(self.capture, seen.tag);
+            let off = corners.and_then(|corners| state.tag_off_px(camera, &corners, seen));
+            // Four corners.
+            sum += 4.0 * loss(off.unwrap_or(BEHIND_PX), self.noise.tag_px);
+        }
+        for (image, pose) in self.capture.images.iter().zip(&state.cameras) {
+            if let Some(place) = image.place {
+                let at_m = pose.transform_point(self.capture.tracked_in_cam_m);
+                let sigma_m = place.sigma_m * self.noise.place_factor;
+                sum += loss(at_m.distance(place.position_m), sigma_m);
+            }
+            if let Some(up) = image.up {
+                let off = (pose.rotation * up.direction).truncate().length();
+                sum += loss(off, up.sigma_rad);
+            }
+        }
+        sum
+    }
+
+    /// Returns how far off sightings are: by medians, which a few that are wrong do not move.
+    fn noise_of(&self, state: &State) -> Noise {
+        let points = (0..state.points.len()).flat_map(|point| {
+            let sightings = self.sightings(point);
+            let many = if sightings.len() < 3 { &[] } else { sightings };
+            many.iter().filter_map(move |&(camera, pixel)| {
+                Some(state.off_px(camera, state.points[point], pixel)?.length())
+            })
+        });
+        let tags = self.tags.iter().filter_map(|&(camera, seen)| {
+            state.tag_off_px(camera, &state.corners_m(self.capture, seen.tag)?, seen)
+        });
+        let places = self.capture.images.iter().zip(&state.cameras).filter_map(|(image, pose)| {
+            let place = image.place?;
+            let at_m = pose.transform_point(self.capture.tracked_in_cam_m);
+            Some(at_m.distance(place.position_m) / place.sigma_m)
+        });
+        Noise {
+            // The median length of two normal numbers is 1.18 sigmas, of three 1.54; that of the root mean square of
+            // four corners' 1.35.
+            point_px: median(points).map_or(1.0, |px| (px / 1.18).max(LEAST_PX)),
+            tag_px: median(tags).map_or(0.5, |px| (px / 1.35).max(LEAST_PX)),
+            place_factor: median(places).map_or(1.0, |share| (share / 1.54).max(1.0)),
+        }
+    }
+}
+
+/// Finds the nearest minimum, and leaves it in the state.
+pub(super) fn solve(
+    capture: &Capture,
+    state: &mut State,
+    options: Options,
+    known: Known,
+) -> Result<Solved, AdjustError> {
+    let mut problem = Problem::new(capture, state, options.refine_lens, &[]);
+    let mut rounds = 0;
+    // What weighs how much is known only once it fits.
+    for settle in [1e-3, 1e-4, 1e-6] {
+        rounds += iterate(&problem, state, known, settle)?;
+        problem.noise = problem.noise_of(state);
+    }
+    rounds += iterate(&problem, state, known, 1e-8)?;
+    let Normal { mut matrix, .. } = held(normal(&problem, state, ALMOST_NONE), state, known);
+    matrix.damp(ALMOST_NONE);
+    let factor = matrix.factor().ok_or(AdjustError::Undetermined)?;
+    Ok(Solved { noise: problem.noise, rounds, layout: problem.layout, factor })
+}
+
+/// Goes on from a solution without the sightings of some tags.
+pub(super) fn settle(
+    capture: &Capture,
+    state: &mut State,
+    options: Options,
+    known: Known,
+    noise: Noise,
+    without: &[usize],
+) -> Result<usize, AdjustError> {
+    let problem = Problem { noise, ..Problem::new(capture, state, options.refine_lens, without) };
+    iterate(&problem, state, known, 1e-6)
+}
+
+/// Goes on until a round gains less than a share of the cost; returns rounds.
+fn iterate(
+    problem: &Problem,
+    state: &mut State,
+    known: Known,
+    settle: f64,
+) -> Result<usize, AdjustError> {
+    let mut cost = problem.cost(state);
+    let mut damping = 1e-4;
+    for round in 1..=MAX_ROUNDS {
+        let Normal { matrix, gradient } = held(normal(problem, state, damping), state, known);
+        let mut damped = matrix;
+        damped.damp(damping);
+        let tried = damped.factor().map(|factor| {
+            let change = factor.solve(gradient.iter().map(|g| -g).collect());
+            let points = points_step(problem, state, &change, damping);
+            let next = stepped(state, &problem.layout, &change, &points);
+            let cost = problem.cost(&next);
+            (next, cost)
+        });
+        match tried {
+            Some((next, less)) if less <= cost => {
+                let settled = cost - less <= settle * less;
+                *state = next;
+                cost = less;
+                damping = (damping * 0.2).max(1e-9);
+                if settled {
+                    return Ok(round);
+                }
+            }
+            _ => {
+                damping *= 8.0;
+                if damping > GIVE_UP {
+                    // Where no step helps is a minimum, unless no step could be made.
+                    return if tried.is_some() {
+                        Ok(round)
+                    } else {
+                        Err(AdjustError::Undetermined)
+                    };
+                }
+            }
+        }
+    }
+    Ok(MAX_ROUNDS)
+}
+
+/// Adds what nothing tells: all may be shifted, turned and scaled at no cost, and is held where it is.
+fn held(mut normal: Normal, state: &State, known: Known) -> Normal {
+    if known.place {
+        return normal;
+    }
+    let mean: f64 = (0..normal.matrix.size()).map(|i| normal.matrix.diagonal(i)).sum();
+    for direction in free_directions(state, normal.matrix.size(), known) {
+        let length2: f64 = direction.iter().map(|x| x * x).sum();
+        normal.hold(&direction, mean / length2 / normal.matrix.size() as f64);
+    }
+    normal
+}
+
+/// Returns changes of all unknowns that change nothing in the images.
+fn free_directions(state: &State, size: usize, known: Known) -> Vec<Vec<f64>> {
+    let middle = middle_m(state);
+    let make = |shift: &dyn Fn(DVec3) -> DVec3, turn: DVec3| {
+        let mut direction = vec![0.0; size];
+        for (pose, block) in state.cameras.iter().zip(direction.chunks_mut(6)) {
+            let by = shift(pose.translation_m - middle);
+            let turned = pose.rotation.conjugate() * turn;
+            block.copy_from_slice(&[by.x, by.y, by.z, turned.x, turned.y, turned.z]);
+        }
+        direction
+    };
+    let mut all: Vec<Vec<f64>> =
+        DVec3::AXES.into_iter().map(|axis| make(&|_| axis, DVec3::ZERO)).collect();
+    let axes: &[DVec3] = if known.up { &[DVec3::Z] } else { &DVec3::AXES };
+    all.extend(axes.iter().map(|&axis| make(&|arm| axis.cross(arm), axis)));
+    if !known.scale {
+        all.push(make(&|arm| arm, DVec3::ZERO));
+    }
+    all
+}
+
+/// Returns the middle of all cameras. [m, world]
+pub(super) fn middle_m(state: &State) -> DVec3 {
+    let sum: DVec3 = state.cameras.iter().map(|pose| pose.translation_m).sum();
+    sum / state.cameras.len() as f64
+}
+
+fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[DVec3]) -> State {
+    let turned =
+        |q: DQuat, by: &[f64]| (q * DQuat::from_scaled_axis(DVec3::from_slice(by))).normalize();
+    let cameras = state.cameras.iter().zip(change.chunks(6)).map(|(pose, by)| {
+        Pose::new(pose.translation_m + DVec3::from_slice(by), turned(pose.rotation, &by[3..]))
+    });
+    let tags = state.tags.iter().zip(&layout.tags).map(|(tag, at)| match (*tag, *at) {
+        (TagPlace::Found(t, q), Some(at)) => {
+            TagPlace::Found(t + DVec3::from_slice(&change[at..]), turned(q, &change[at + 3..]))
+        }
+        (tag, _) => tag,
+    });
+    let lens = layout.lens.map_or(state.lens, |at| {
+        let by: [f64; LENS] = std::array::from_fn(|i| change[at + i]);
+        moved(&state.lens, &by)
+    });
+    State {
+        lens,
+        cameras: cameras.collect(),
+        points: state.points.iter().zip(points).map(|(p, by)| *p + *by).collect(),
+        tags: tags.collect(),
+        reach: state.reach,
+    }
+}
+
+/// Returns the median; `None` of nothing.
+pub(super) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.collect();
+    let middle = sorted.len() / 2;
+    (!sorted.is_empty()).then(|| *sorted.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Far more than any problem that converges takes.
+const MAX_ROUNDS: usize = 60;
+/// Damping beyond which no step will help.
+const GIVE_UP: f64 = 1e8;
+/// Bounds what nothing determines, such as an image of few points; what is determined it does not touch.
+const ALMOST_NONE: f64 = 1e-8;
+/// What is behind its camera counts as. [px]
+const BEHIND_PX: f64 = 1e4;
+/// Where Cauchy's loss bends: of sigmas.
+const LOSS_SIGMAS: f64 = 3.0;
+/// Nothing is found in an image better than this. [px]
+const LEAST_PX: f64 = 0.02;

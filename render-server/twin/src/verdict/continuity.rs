@@ -1,0 +1,119 @@
+//! The way from image to image: a hand that films neither leaps nor spins.
+//!
+//! Each step between two images that follow each other is a speed and a rate of turn. What is far beyond the others'
+//! is no step: one of the two images, or all that follow, is in the wrong place. That needs no scale.
+
+use super::walk::Walk;
+use super::{Check, Finding, Severity, Verdict};
+
+/// A step of the walk.
+struct Step {
+    /// The image it leads to; the one before comes from.
+    to: usize,
+    speed: f64,
+    turn_radps: f64,
+    length: f64,
+    turn_rad: f64,
+}
+
+/// Adds leaps and spins.
+pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
+    let steps = steps(walk);
+    if steps.len() < FEW {
+        verdict.checked.push("continuity: too few images with a time".to_owned());
+        return;
+    }
+    let usual_speed = quantile(steps.iter().map(|step| step.speed), USUAL);
+    let usual_turn = quantile(steps.iter().map(|step| step.turn_radps), USUAL);
+    let most_turn = (TIMES * usual_turn).max(LEAST_SPIN_RADPS);
+    let mut most_speed = TIMES * usual_speed;
+    if walk.is_metric {
+        most_speed = most_speed.clamp(LEAST_LEAP_MPS, MOST_MPS.max(LEAST_LEAP_MPS));
+    }
+    let (unit, per_second) = if walk.is_metric { ("m", "m/s") } else { ("units", "units/s") };
+    let fastest = steps.iter().map(|step| step.speed).fold(0.0, f64::max);
+    let quickest = steps.iter().map(|step| step.turn_radps).fold(0.0, f64::max);
+    verdict.checked.push(format!(
+        "continuity: {usual_speed:.2} {per_second} at three of four steps and {fastest:.2} at most, {:.0} and {:.0} \
+         degrees/s",
+        usual_turn.to_degrees(),
+        quickest.to_degrees()
+    ));
+    let mut found: Vec<(f64, &Step, bool)> = steps
+        .iter()
+        .filter_map(|step| {
+            let leap = step.speed / most_speed;
+            let spin = step.turn_radps / most_turn;
+            (leap.max(spin) > 1.0).then_some((leap.max(spin), step, leap >= spin))
+        })
+        .collect();
+    if found.is_empty() {
+        return;
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let name = |image: usize| &walk.evidence.capture.images[image].name;
+    let tell = |&(_, step, is_leap): &(f64, &Step, bool)| {
+        let (from, to) = (name(step.to - 1), name(step.to));
+        if is_leap {
+            let times = step.speed / usual_speed;
+            format!("{:.1} {unit} from {from} to {to}, {times:.0} times the usual", step.length)
+        } else {
+            format!("a turn of {:.0} degrees from {from} to {to}", step.turn_rad.to_degrees())
+        }
+    };
+    let told: Vec<String> = found.iter().take(TOLD).map(tell).collect();
+    let rest = found.len().saturating_sub(TOLD);
+    let more = if rest > 0 { format!(", and {rest} more") } else { String::new() };
+    let images = walk.runs(found.iter().flat_map(|(_, step, _)| [step.to - 1, step.to]));
+    let when = walk.spans(&images);
+    verdict.findings.push(Finding {
+        severity: Severity::Refused,
+        check: Check::Continuity,
+        what: format!("the walk leaps where no hand can: {}{more}", told.join("; ")),
+        remedy: format!(
+            "film that part again in one go, slowly, with more of what is particular to the place in view: {when}"
+        ),
+        images,
+    });
+}
+
+fn steps(walk: &Walk<'_>) -> Vec<Step> {
+    let images = &walk.evidence.capture.images;
+    (1..images.len())
+        .filter_map(|to| {
+            let seconds = images[to].at_s - images[to - 1].at_s;
+            let (a, b) = (&walk.poses[to - 1], &walk.poses[to]);
+            let length = a.translation_m.distance(b.translation_m);
+            let turn_rad = 2.0 * a.rotation.dot(b.rotation).abs().min(1.0).acos();
+            (seconds > 0.0).then(|| Step {
+                to,
+                speed: length / seconds,
+                turn_radps: turn_rad / seconds,
+                length,
+                turn_rad,
+            })
+        })
+        .collect()
+}
+
+/// Returns the value that a share of the values is below.
+fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_by(f64::total_cmp);
+    sorted[((sorted.len() - 1) as f64 * share) as usize]
+}
+
+/// Fewer steps have no usual speed.
+const FEW: usize = 6;
+/// A walk that stops to look around has half of its steps short.
+const USUAL: f64 = 0.75;
+/// Beyond so many times the usual speed is no step.
+const TIMES: f64 = 4.0;
+/// Whoever films slowly may still take a quick step. [m/s]
+const LEAST_LEAP_MPS: f64 = 1.5;
+/// Nobody films at a run. [m/s]
+const MOST_MPS: f64 = 5.0;
+/// A hand turns a phone so fast that nothing is sharp. [rad/s]
+const LEAST_SPIN_RADPS: f64 = 2.5;
+/// More than this nobody reads.
+const TOLD: usize = 3;

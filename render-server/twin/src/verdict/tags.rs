@@ -1,0 +1,154 @@
+//! Tags against the images: a tag stands in one place, and where others say it is.
+
+use glam::DVec3;
+
+use super::walk::Walk;
+use super::{Check, Finding, Severity, Verdict};
+use crate::adjust::{Adjusted, TagResult};
+
+/// Adds tags that contradict the images, or each other.
+pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
+    let Ok(adjusted) = walk.evidence.adjusted else { return };
+    let tags = &walk.evidence.capture.tags;
+    if tags.is_empty() {
+        return;
+    }
+    for tag in 0..tags.len() {
+        match &adjusted.tags[tag] {
+            Some(result) => somewhere_else(walk, tag, result, verdict),
+            None => nowhere(walk, tag, verdict),
+        }
+    }
+    held_out(walk, adjusted, verdict);
+    in_one_place(walk, adjusted, verdict);
+}
+
+fn images_of(walk: &Walk<'_>, tag: usize) -> Vec<usize> {
+    let images = walk.evidence.capture.images.iter().enumerate();
+    let sees = images.filter(|(_, image)| image.tags.iter().any(|seen| seen.tag == tag));
+    sees.map(|(index, _)| index).collect()
+}
+
+fn add(walk: &Walk<'_>, verdict: &mut Verdict, tags: &[usize], what: String, remedy: &str) {
+    let images = walk.runs(tags.iter().flat_map(|tag| images_of(walk, *tag)));
+    verdict.findings.push(Finding {
+        severity: Severity::Refused,
+        check: Check::Tags,
+        what: format!("{what}: {}", walk.spans(&images)),
+        remedy: remedy.to_owned(),
+        images,
+    });
+}
+
+fn somewhere_else(walk: &Walk<'_>, tag: usize, result: &TagResult, verdict: &mut Verdict) {
+    let TagResult { sightings, contradicting, .. } = *result;
+    if contradicting < CONTRADICTING || (contradicting as f64) < SHARE * sightings as f64 {
+        return;
+    }
+    let name = &walk.evidence.capture.tags[tag].name;
+    let what = if contradicting == sightings {
+        format!("{name} is not where it was measured to be, in all {sightings} images that show it")
+    } else {
+        format!("{name} is in two places: {contradicting} of {sightings} images see it elsewhere")
+    };
+    let remedy = "if it hangs where the layout says and no other tag has its number, these images are in the wrong \
+                  place: film there again, with more of what is particular to the place in view";
+    add(walk, verdict, &[tag], what, remedy);
+}
+
+/// Rays that should meet and do not.
+fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
+    let images = images_of(walk, tag);
+    let places = || images.iter().map(|image| walk.poses[*image].translation_m);
+    let apart = places().flat_map(|a| places().map(move |b| a.distance(b))).fold(0.0, f64::max);
+    let middle = walk.poses.iter().map(|pose| pose.translation_m).sum::<DVec3>();
+    let middle = middle / walk.poses.len() as f64;
+    let reach2: f64 = walk.poses.iter().map(|p| p.translation_m.distance_squared(middle)).sum();
+    let reach = (reach2 / walk.poses.len() as f64).sqrt();
+    if images.len() < CONTRADICTING + 1 || apart < NEAR * reach {
+        return;
+    }
+    let name = &walk.evidence.capture.tags[tag].name;
+    let what = format!("{name} is nowhere: the {} images that show it point apart", images.len());
+    let remedy = "look for another tag of the same number; if there is none, these images are in the wrong place: \
+                  film there again, with more of what is particular to the place in view";
+    add(walk, verdict, &[tag], what, remedy);
+}
+
+fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
+    let results = || {
+        adjusted
+            .tags
+            .iter()
+            .enumerate()
+            .filter_map(|(tag, result)| Some((tag, (*result)?.held_out?)))
+    };
+    let off_m: Vec<f64> = results().filter_map(|(_, held)| held.off_m).collect();
+    let size: Vec<f64> = results().map(|(_, held)| held.size_error).collect();
+    let rms = |values: &[f64]| {
+        (values.iter().map(|x| x * x).sum::<f64>() / values.len().max(1) as f64).sqrt()
+    };
+    let (line, wrong): (String, Vec<usize>) = if off_m.is_empty() {
+        if size.is_empty() {
+            verdict.checked.push("tags: fewer than two could be held out".to_owned());
+            return;
+        }
+        let line = format!("tags held out: {} edges, {:.2} % rms", size.len(), 100.0 * rms(&size));
+        let is_wrong = |held: &crate::adjust::HeldOut| held.size_error.abs() > MOST_SIZE;
+        (line, results().filter(|(_, held)| is_wrong(held)).map(|(tag, _)| tag).collect())
+    } else {
+        let line = format!(
+            "tags held out: {} are off by {:.1} cm rms, {:.1} cm at worst",
+            off_m.len(),
+            100.0 * rms(&off_m),
+            100.0 * off_m.iter().copied().fold(0.0, f64::max)
+        );
+        let is_wrong = |held: &crate::adjust::HeldOut| held.off_m.is_some_and(|m| m > MOST_OFF_M);
+        (line, results().filter(|(_, held)| is_wrong(held)).map(|(tag, _)| tag).collect())
+    };
+    verdict.checked.push(line.clone());
+    if wrong.is_empty() {
+        return;
+    }
+    let names: Vec<&str> =
+        wrong.iter().map(|tag| walk.evidence.capture.tags[*tag].name.as_str()).collect();
+    let what = format!("{line}; {} are where the others do not have them", names.join(", "));
+    let remedy = "measure again where these tags stand; if that is right, the images around them are in the wrong \
+                  place: film there again, each tag from several sides";
+    add(walk, verdict, &wrong, what, remedy);
+}
+
+/// Two tags that stand in each other.
+fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
+    let tags = &walk.evidence.capture.tags;
+    let found: Vec<(usize, DVec3)> = adjusted
+        .tags
+        .iter()
+        .enumerate()
+        .filter_map(|(tag, result)| Some((tag, (*result)?.corners_m.iter().sum::<DVec3>() / 4.0)))
+        .collect();
+    for (i, &(a, at_a)) in found.iter().enumerate() {
+        for &(b, at_b) in &found[i + 1..] {
+            let size_m = tags[a].size_m.min(tags[b].size_m);
+            if at_a.distance(at_b) < ONE_PLACE * size_m {
+                let what = format!("{} and {} are in one place", tags[a].name, tags[b].name);
+                let remedy = "two places that look alike were put on one another; film both again, and the way from one to \
+                              the other in one go, with what differs between them in view";
+                add(walk, verdict, &[a, b], what, remedy);
+            }
+        }
+    }
+}
+
+/// A misread tag is one image's.
+const CONTRADICTING: usize = 3;
+/// And few of them.
+const SHARE: f64 = 0.25;
+/// Of the reach of the walk: from places closer together rays are too parallel to meet.
+const NEAR: f64 = 0.1;
+/// Beyond this a tag and the images around it contradict each other; good captures have a few centimetres. [m]
+const MOST_OFF_M: f64 = 0.15;
+/// Beyond this an edge is not what it was printed as.
+const MOST_SIZE: f64 = 0.1;
+/// Of an edge: no two tags hang closer together.
+const ONE_PLACE: f64 = 0.7;

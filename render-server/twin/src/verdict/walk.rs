@@ -1,0 +1,72 @@
+//! The walk as it was placed: by the adjustment, or as structure from motion left it.
+
+use std::collections::HashMap;
+use std::ops::Range;
+
+use glam::DVec3;
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+
+use super::{Evidence, Given, words};
+
+/// Poses and points in one frame, and which image is which.
+pub(super) struct Walk<'a> {
+    pub(super) evidence: &'a Evidence<'a>,
+    pub(super) lens: Intrinsics,
+    pub(super) poses: Vec<Pose<World, Cam>>,
+    pub(super) points: &'a [DVec3],
+    /// Which of the given images each is.
+    pub(super) index: Vec<usize>,
+    /// Whether lengths are metres.
+    pub(super) is_metric: bool,
+}
+
+impl<'a> Walk<'a> {
+    pub(super) fn new(evidence: &'a Evidence<'a>) -> Self {
+        let capture = evidence.capture;
+        let number: HashMap<&str, usize> = evidence
+            .given
+            .iter()
+            .enumerate()
+            .map(|(index, given)| (given.name.as_str(), index))
+            .collect();
+        // One that was never given stands after all others.
+        let find = |name: &str| number.get(name).copied().unwrap_or(evidence.given.len());
+        let index = capture.images.iter().map(|image| find(&image.name)).collect();
+        match evidence.adjusted {
+            Ok(adjusted) => Self {
+                evidence,
+                lens: adjusted.lens,
+                poses: adjusted.world_from_cam.clone(),
+                points: &adjusted.points_m,
+                index,
+                is_metric: adjusted.known.scale,
+            },
+            Err(_) => Self {
+                evidence,
+                lens: capture.lens,
+                poses: capture.images.iter().map(|image| image.scene_from_cam).collect(),
+                points: &capture.points,
+                index,
+                is_metric: false,
+            },
+        }
+    }
+
+    pub(super) fn given(&self) -> &'a [Given] {
+        self.evidence.given
+    }
+
+    /// Returns runs of given images, of images of the capture in any order.
+    pub(super) fn runs(&self, images: impl IntoIterator<Item = usize>) -> Vec<Range<usize>> {
+        let mut given: Vec<usize> = images.into_iter().map(|image| self.index[image]).collect();
+        given.retain(|index| *index < self.given().len());
+        given.sort_unstable();
+        given.dedup();
+        words::runs(&given)
+    }
+
+    /// Returns them in words.
+    pub(super) fn spans(&self, runs: &[Range<usize>]) -> String {
+        words::spans(self.given(), runs)
+    }
+}
