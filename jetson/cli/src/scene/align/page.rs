@@ -128,7 +128,7 @@ impl Aligner for Clicked {
 /// Turns and moves a place, whose first point of the floor is the origin, to where it is wanted.
 fn in_room(mut fit: Fit, picks: &Picks) -> Fit {
     let turn = DQuat::from_rotation_z(picks.yaw_deg.to_radians());
-    let by_m = picks.origin_at_m.extend(0.0);
+    let by_m = picks.origin_at_m;
     let Similarity { rotation, translation_m, .. } = &mut fit.world_from_scene;
     *rotation = (turn * *rotation).normalize();
     *translation_m = turn * *translation_m + by_m;
@@ -148,7 +148,6 @@ fn in_words(error: anyhow::Error) -> String {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec2;
     use vizflyt_arena::config::{Geofence, Spawn};
     use vizflyt_server::web::Length;
 
@@ -174,7 +173,7 @@ mod tests {
                 ends: [scene(1.0, 1.0, 0.0), scene(1.0, 1.0, 2.0)],
                 metres: 2.0,
             }),
-            origin_at_m: DVec2::new(0.5, -0.25),
+            origin_at_m: DVec3::new(0.5, -0.25, 0.7),
             yaw_deg: 90.0,
             geofence: Geofence {
                 min_m: DVec3::new(-3.0, -1.0, -0.5),
@@ -193,7 +192,7 @@ mod tests {
         let (fit, has_scale) = clicked.fit(&picks()).unwrap();
         // The second point lies 4 m along y from where the first was said to be.
         let second_m = fit.world_from_scene.transform_point(picks().floor[1]);
-        assert!(has_scale && second_m.distance(DVec3::new(0.5, 3.75, 0.0)) < 1e-9, "{second_m}");
+        assert!(has_scale && second_m.distance(DVec3::new(0.5, 3.75, 0.7)) < 1e-9, "{second_m}");
         let solved = clicked.solve(&picks()).unwrap();
         assert_eq!(solved.go, Some(true), "{solved:?}");
         assert!(solved.lines.iter().any(|line| line.key == "residual"));

@@ -56,8 +56,8 @@ pub struct Picks {
     pub above: DVec3,
     /// What is known to be how long; without, the scene keeps the size that it has.
     pub length: Option<Length>,
-    /// Where the first point of the floor lies. [m, world]
-    pub origin_at_m: DVec2,
+    /// Where the first point of the floor lies; above z = 0, if it is a table's. [m, world]
+    pub origin_at_m: DVec3,
     /// The direction from the first to the second, counter-clockwise from x. [deg]
     pub yaw_deg: f64,
     /// Within it, the twin must not be off. [m, world]

@@ -69,7 +69,7 @@ fn headers(origin: &'static str) -> HeaderMap {
 }
 
 const OURS: &str = "http://127.0.0.1:80";
-const PICKS: &str = r#"{"floor": [[0,0,0], [1,0,0], [0,1,0]], "above": [0,0,1], "length": null, "origin_at_m": [0,0],
+const PICKS: &str = r#"{"floor": [[0,0,0], [1,0,0], [0,1,0]], "above": [0,0,1], "length": null, "origin_at_m": [0,0,0],
     "yaw_deg": 0, "geofence": {"min_m": [0,0,0], "max_m": [1,1,1]}, "rough_m": 0}"#;
 
 fn wish() -> String {

@@ -8,7 +8,7 @@ const FLOOR = "#7df09a", LENGTH = "#ffd166", ABOVE = "#b9c7ff";
 
 /** A clicked point: {p_scene, rough_m}, and the camera that clicked, of the scene's file as well. */
 const picks = { floor: [], above: null, ends: [null, null] };
-const settings = { metres: "", originAt: [0, 0], yaw: 0 };
+const settings = { metres: "", originAt: [0, 0, 0], yaw: 0 };
 /** What the next click is: {kind: "floor" | "above" | "end" | "start", index}. */
 let wanted = { kind: "floor", index: null };
 let setup = null, room = null, place = null, solved = null, shown = null;
@@ -180,14 +180,18 @@ function number(value, set, label, step = 0.1) {
 }
 
 const HINTS = {
-  floor: () => `click points of the floor, far apart: ${picks.floor.length} of at least 3`,
+  floor: (index) => index != null
+    ? `click where point ${index + 1} should be`
+    : picks.floor.length < 3
+      ? `click points of the floor, far apart: ${picks.floor.length} of at least 3`
+      : `${picks.floor.length} points; a fourth and more show how level the floor is. Then measure a length`,
   above: () => "click something that stands above the floor",
   end: (index) => `click ${index === 0 ? "one end" : "the other end"} of a length that you have measured`,
   start: () => "click the floor where flights begin; the vehicle looks the way you do",
 };
 
 function floorList() {
-  const off = (pick) => (solved ? `${(toWorld(place, pick.p_scene)[2] * 100).toFixed(1)} cm` : `± ${(pick.rough_m * 1000).toFixed(0)} mm`);
+  const off = (pick) => (solved && picks.floor.length > 3 ? `${((toWorld(place, pick.p_scene)[2] - settings.originAt[2]) * 100).toFixed(1)} cm off` : `± ${(pick.rough_m * 1000).toFixed(0)} mm`);
   const items = picks.floor.map((pick, k) => make("li", {},
     make("b", { textContent: String(k + 1) }),
     make("span", { textContent: `${off(pick)}${k === 0 ? " · origin" : k === 1 ? " · x axis" : ""}` }),
@@ -225,7 +229,7 @@ function roomRows() {
     make("div", { className: "row" }, make("span", { textContent: "x axis" }), button("↶ 90°", turned(90)), button("↷ 90°", turned(-90)),
       number(settings.yaw, (value) => (settings.yaw = value), "heading of points 1 to 2 in degrees", 1), "°"),
     make("div", { className: "row" }, make("span", { textContent: "point 1 is" }),
-      ...[0, 1].map((k) => number(settings.originAt[k], (value) => (settings.originAt[k] = value), `${axes[k]} of point 1 in metres`)), "m"),
+      ...axes.map((axis, k) => number(settings.originAt[k], (value) => (settings.originAt[k] = value), `${axis} of point 1 in metres`))),
     make("h2", {}, "Fence and net [m]", button("carry along", carry, { title: "fence and start stay about the same part of the scene" })),
     corner("from", "min_m"),
     corner("to", "max_m"),
