@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use glam::DVec3;
 use vizflyt_tags::capture::parse_stamps;
 use vizflyt_twin::align::track::{self, CameraPose, TrackFit, Tracked};
-use vizflyt_twin::align::{Fit, recording};
+use vizflyt_twin::align::{AlignError, Fit, recording};
 use vizflyt_twin::dataset;
 
 use crate::terminal::print_fmt;
@@ -25,6 +25,15 @@ pub(super) struct ClockArgs {
     /// What the two clocks may differ by, at most [default: 2, or 30 where they begin far apart]
     #[arg(long, value_name = "SECONDS", requires = "track")]
     max_offset_s: Option<f64>,
+    /// Where what is tracked sits: right of the lens, below it, ahead of it, measured; solved unless given [m]
+    #[arg(
+        long,
+        value_name = "X,Y,Z",
+        requires = "track",
+        value_parser = super::point,
+        allow_hyphen_values = true
+    )]
+    tracked_at: Option<DVec3>,
     /// The axis of the track that points up: z, or y as Motive has it unless told otherwise
     #[arg(long, value_enum, value_name = "AXIS", requires = "track", default_value_t)]
     track_up: TrackUp,
@@ -57,7 +66,8 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
     cameras.iter_mut().for_each(|camera| camera.at_s -= begin);
     let max_offset_s = clocks.max_offset_s.unwrap_or(if is_shared { 2.0 } else { 30.0 });
     let TrackFit { fit, offset_s, point_in_cam_m: p } =
-        track::fit(&cameras, &track, max_offset_s, sigma_m)?;
+        track::fit(&cameras, &track, max_offset_s, sigma_m, clocks.tracked_at)
+            .map_err(with_advice)?;
     print_fmt!("clocks      {:+.3} s from the images' to the track's", offset_s + start_s - begin);
     print_fmt!(
         "tracked     {:.3}, {:.3}, {:.3} m from the lens: right, down, ahead",
@@ -71,6 +81,17 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
         "the clocks differ by {offset_s:+.2} s, the most that was tried; give more by --max-offset-s"
     );
     Ok(fit)
+}
+
+fn with_advice(error: AlignError) -> anyhow::Error {
+    let is_level = matches!(error, AlignError::HardlyMoved(_));
+    let error = anyhow::Error::from(error);
+    if is_level {
+        return error.context(
+            "where the tracked point sits beside the lens cannot be seen; measure it, and give it by --tracked-at",
+        );
+    }
+    error
 }
 
 /// A similarity fits any two paths somehow: what is left says whether they are one.
@@ -211,7 +232,7 @@ mod tests {
     use super::*;
 
     fn clocks(rate: Option<f64>) -> ClockArgs {
-        ClockArgs { times: None, rate, max_offset_s: None, track_up: TrackUp::Z }
+        ClockArgs { times: None, rate, max_offset_s: None, tracked_at: None, track_up: TrackUp::Z }
     }
 
     #[test]

@@ -62,7 +62,7 @@ pub struct Picks {
     pub yaw_deg: f64,
     /// Within it, the twin must not be off. [m, world]
     pub geofence: Geofence,
-    /// How rough what was clicked at is, at worst. [m]
+    /// How rough what was clicked at is, root mean square. [m]
     pub rough_m: f64,
 }
 

@@ -45,6 +45,7 @@ async function order(path, body) {
   return JSON.parse(text);
 }
 
+const roughness = (all) => Math.hypot(...all.map((pick) => pick.rough_m)) / Math.sqrt(all.length);
 const rooms = () => ({
   floor: picks.floor.map((pick) => pick.p_scene),
   above: picks.above?.p_scene ?? picks.floor.at(-1).eye_scene,
@@ -54,7 +55,7 @@ const rooms = () => ({
   origin_at_m: settings.originAt,
   yaw_deg: settings.yaw,
   geofence: room.geofence,
-  rough_m: Math.max(0, ...[...picks.floor, ...picks.ends].map((pick) => pick?.rough_m ?? 0)),
+  rough_m: roughness([...picks.floor, ...picks.ends].filter(Boolean)),
 });
 
 async function solve() {
@@ -191,7 +192,9 @@ const HINTS = {
 };
 
 function floorList() {
-  const off = (pick) => (solved && picks.floor.length > 3 ? `${((toWorld(place, pick.p_scene)[2] - settings.originAt[2]) * 100).toFixed(1)} cm off` : `± ${(pick.rough_m * 1000).toFixed(0)} mm`);
+  // Three points are a plane, however wrong they are.
+  const off_cm = (pick) => Math.round((toWorld(place, pick.p_scene)[2] - settings.originAt[2]) * 1000) / 10 + 0;
+  const off = (pick) => (solved && picks.floor.length > 3 ? `${off_cm(pick).toFixed(1)} cm` : `± ${(pick.rough_m * 1000).toFixed(0)} mm`);
   const items = picks.floor.map((pick, k) => make("li", {},
     make("b", { textContent: String(k + 1) }),
     make("span", { textContent: `${off(pick)}${k === 0 ? " · origin" : k === 1 ? " · x axis" : ""}` }),
@@ -241,19 +244,19 @@ function roomRows() {
 
 function resultRows() {
   const rows = [];
+  const end = make("div", { className: "end" });
   if (solved) {
     const words = { true: "GO", false: "NO GO", null: "size not known yet" };
     const verdict = make("div", { className: "verdict", id: "verdict", textContent: words[String(solved.go)] });
     verdict.dataset.go = String(solved.go);
     const line = ({ key, text }) => make("tr", {}, make("th", { textContent: key }), make("td", { textContent: text }));
-    rows.push(make("h2", {}, "Result"), verdict, make("table", { id: "result" }, ...solved.lines.map(line)));
+    rows.push(make("h2", {}, "Result"), make("table", { id: "result" }, ...solved.lines.map(line)));
+    end.append(verdict);
   }
-  const end = make("div", { className: "end" },
-    button("save into arena.toml", () => save(false), { className: "main", id: "save", disabled: solved?.go == null }));
+  end.append(button("save into arena.toml", () => save(false), { className: "main", id: "save", disabled: solved?.go == null }));
   if (solved?.go === false) end.append(button("save anyway", () => save(true), { id: "force" }));
-  rows.push(end);
-  if (report) rows.push(make("p", { id: "saved" }, report.map(({ key, text }) => `${key} ${text}`).join(" · ")));
-  return rows;
+  if (report) end.append(make("p", { id: "saved" }, report.map(({ key, text }) => `${key} ${text}`).join(" · ")));
+  return [...rows, end];
 }
 
 const panel = make("aside", { id: "align" });
@@ -301,7 +304,11 @@ function drawOverlay() {
   const at = shown.request.place ?? place;
   if (solved) drawRoom(drawing, room);
   const ends = picks.ends.map((pick) => pick && toWorld(at, pick.p_scene));
-  if (ends.every(Boolean)) drawing.line(ends, { color: LENGTH, width: 2.5, hidden: 0.5 });
+  if (ends.every(Boolean)) {
+    drawing.line(ends, { color: LENGTH, width: 2.5, hidden: 0.5 });
+    const middle = ends[0].map((value, k) => (value + ends[1][k]) / 2);
+    if (+settings.metres > 0) drawing.label(middle, `${settings.metres} m`, LENGTH);
+  }
   for (const [k, end] of ends.entries()) if (end) drawing.marker(end, "AB"[k], LENGTH);
   for (const [k, pick] of picks.floor.entries()) drawing.marker(toWorld(at, pick.p_scene), String(k + 1), FLOOR);
   if (picks.above) drawing.marker(toWorld(at, picks.above.p_scene), "↑", ABOVE);

@@ -10,7 +10,7 @@ let playing = false; // The clock of what moves runs.
 let start = null, info = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
-let asked = null, tool = null;
+let asked = null;
 
 /** What a tool beside the view may use of it (align.js). */
 export const view = {
@@ -48,7 +48,7 @@ function handleMessage(message) {
       start = { p: message.start_m, yaw: message.yaw_rad };
       home();
     }
-    if (message.tool) tool ??= import(message.tool);
+    if (message.tool) import(message.tool).catch((error) => announce(error.message, true));
     waiting = false;
     stale = true;
     return;
