@@ -378,6 +378,70 @@ async function leaderboard(browser) {
   assert.equal(await server.ended, 0);
 }
 
+/** A captured scene, tilted by 5 degrees and a tenth too small, is put into its room by clicks, and its place is written. */
+async function align(browser) {
+  const at = (name) => path.join(scratch, `align-${name}`);
+  command("scene", "generate", "room", "--seed", "3", "-o", at("room"));
+  const file = at("room/arena.toml");
+  const place = 'scene = { file = "scene.ply", rotation = [0.0436, 0, 0, 0.99905], metres_per_unit = 0.9 }';
+  fs.writeFileSync(file, `# Captured by hand.\n${fs.readFileSync(file, "utf8").replace(/^scene = .*$/m, place)}`);
+  const server = start("scene", "align", at("room"), "--no-browser", "--renderer", "cpu");
+  const [, url] = await server.line(/page\s+(http:\S+)/);
+  const page = await open(browser, url);
+  const press = (name) => page.getByRole("button", { name, exact: true }).click();
+  /** Clicks into a picture that shows where the camera is now; returns the server's answer. */
+  const pick = async (x, y) => {
+    const answer = page.waitForResponse((response) => response.url().endsWith("/pick"));
+    await page.mouse.click(x, y);
+    const { p_scene, ...rest } = await (await answer).json().catch(() => ({ refused: true }));
+    await page.waitForFunction(() => document.getElementById("hint").textContent !== "looking …");
+    return { p_scene, ...rest };
+  };
+  await page.waitForFunction(() => document.body.dataset.pictures > 0);
+  await until(page, "hint", /: 0 of at least 3/);
+  // The edge of a window in the far wall is no point of a floor.
+  const windowed = await page.evaluate(async () => {
+    const request = { p_m: [0.9, 0, 1.2], yaw_rad: 0, pitch_rad: 0, fov_deg: 75, width_px: 640, height_px: 400, depth: false };
+    const answer = await fetch("/api/align/pick", { method: "POST", body: JSON.stringify({ request, px: [1000, 10] }) });
+    return `${answer.status} ${await answer.text()}`;
+  });
+  assert.match(windowed, /^422 the click lies outside/);
+  for (const [x, y] of [[420, 780], [860, 780], [560, 640]]) assert.ok((await pick(x, y)).p_scene, `no floor at ${x}, ${y}`);
+  await until(page, "verdict", /size not known yet/);
+  assert.ok((await pick(840, 640)).p_scene);
+  await until(page, "hint", /^4 points/);
+  assert.ok(await page.locator("#save").isDisabled(), "without a length nothing is saved");
+  await press("one end");
+  const one = await pick(420, 780);
+  const other = await pick(840, 640);
+  // The scene's file is in metres: the truth that a tape would tell.
+  const metres = Math.hypot(...one.p_scene.map((value, k) => value - other.p_scene[k]));
+  await page.locator("#metres").fill(metres.toFixed(4));
+  await page.locator("#metres").press("Tab");
+  await until(page, "verdict", /GO/);
+  assert.match(await text(page, "result"), /residual[\s\S]*cm rms[\s\S]*bound[\s\S]*within the fence/);
+  await shot(page, "align");
+  await page.getByLabel("fence to z in metres").fill("3.1");
+  await page.getByLabel("fence to z in metres").press("Tab");
+  await press("↶ 90°");
+  await press("carry along");
+  await until(page, "verdict", /GO/);
+  const forced = await page.locator("#force").count();
+  await page.locator(forced ? "#force" : "#save").click();
+  await until(page, "saved", /written .*arena.toml/);
+  const written = fs.readFileSync(file, "utf8");
+  assert.ok(written.startsWith("# Captured by hand.\n"), written);
+  assert.ok(Math.abs(+written.match(/metres_per_unit = ([\d.]+)/)[1] - 1) < 0.01, written);
+  const [x, y, z, w] = written.match(/rotation = \[(.*?)\]/)[1].split(",").map(Number);
+  // The file's z, where it points now.
+  const up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+  assert.ok(up[2] > Math.cos((0.7 * Math.PI) / 180), `tilted still: ${up}`);
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  server.child.kill("SIGINT");
+  await server.ended;
+}
+
 async function main() {
   if (shots) fs.mkdirSync(shots, { recursive: true });
   const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
@@ -385,7 +449,7 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  const wanted = [lab, flight, crash, leaderboard].filter(({ name }) => !only || name === only);
+  const wanted = [lab, flight, crash, leaderboard, align].filter(({ name }) => !only || name === only);
   for (const test of wanted) {
     const began = Date.now();
     try {

@@ -80,7 +80,7 @@ pub struct ServeArgs {
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
 

@@ -1,5 +1,5 @@
 //! `vizflyt scene align`: photos of a walk, taken by a phone's lens with a rolling shutter, whose poses are in a frame of
-//! no room; printed tags that stand in it; out comes where the scene lies.
+//! no room; printed tags that stand in it, or a motion capture that followed the phone; out comes where the scene lies.
 
 use std::fs;
 use std::path::Path;
@@ -28,10 +28,21 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect()
 }
 
+/// Returns where an image was taken. [m, world]
+fn pose(image: &Value) -> (DVec3, DQuat) {
+    let pose = &image["world_from_cam"];
+    let p_m = DVec3::from_slice(&numbers(&pose["position_m"]));
+    (p_m, DQuat::from_slice(&numbers(&pose["rotation_xyzw"])))
+}
+
+fn truth(capture: &Path) -> Value {
+    serde_json::from_slice(&fs::read(capture.join("truth.json")).unwrap()).unwrap()
+}
+
 /// Writes nerfstudio's `transforms.json` beside the photos: the true poses, seen from the capture's own frame.
-fn write_transforms(capture: &Path, shaken_m: f64) {
-    let truth: Value =
-        serde_json::from_slice(&fs::read(capture.join("truth.json")).unwrap()).unwrap();
+/// Of the images every `step`th.
+fn write_transforms(capture: &Path, shaken_m: f64, step: usize) {
+    let truth = truth(capture);
     let camera = &truth["camera"];
     let lens = &camera["distortion"];
     let back = world_from_scene().conjugate();
@@ -39,11 +50,10 @@ fn write_transforms(capture: &Path, shaken_m: f64) {
         .as_array()
         .unwrap()
         .iter()
+        .step_by(step)
         .enumerate()
         .map(|(index, image)| {
-            let pose = &image["world_from_cam"];
-            let p_m = DVec3::from_slice(&numbers(&pose["position_m"]));
-            let q = DQuat::from_slice(&numbers(&pose["rotation_xyzw"]));
+            let (p_m, q) = pose(image);
             // A structure from motion is off by so much, each time elsewhere.
             let phase = index as f64 * 2.4;
             let off_m = DVec3::new(phase.sin(), phase.cos(), (1.7 * phase).sin()) * shaken_m;
@@ -64,6 +74,22 @@ fn write_transforms(capture: &Path, shaken_m: f64) {
         "frames": frames,
     });
     fs::write(capture.join("transforms.json"), transforms.to_string()).unwrap();
+}
+
+/// The bars of a metric twin: 0.3 %, 0.2 degrees, 2 cm.
+fn check_place(arena: &str) {
+    let scene = ArenaConfig::parse(arena).unwrap().scene;
+    let scale = scene.metres_per_unit / SCALE - 1.0;
+    let turn = scene.rotation() * world_from_scene().conjugate();
+    let tilt_deg = (turn * DVec3::Z).angle_between(DVec3::Z).to_degrees();
+    println!("scale {:.3} %, tilt {tilt_deg:.3} degrees", scale * 1e2);
+    assert!(scale.abs() < 0.003, "{scale}");
+    assert!(tilt_deg < 0.2, "{tilt_deg}");
+    let p_m = DVec3::new(3.0, 0.0, 1.0);
+    let p_scene = world_from_scene().conjugate() * (p_m - TRANSLATION_M) / SCALE;
+    let found_m = scene.rotation() * p_scene * scene.metres_per_unit + scene.origin_m;
+    println!("{:.1} mm off", found_m.distance(p_m) * 1e3);
+    assert!(found_m.distance(p_m) < 0.02, "{found_m}");
 }
 
 #[test]
@@ -89,7 +115,7 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
     );
     assert!(ok, "{said}");
     let capture = home.join("walk");
-    write_transforms(&capture, 0.01);
+    write_transforms(&capture, 0.01, 1);
     let arena = home.join("hall/arena.toml");
     let before = fs::read_to_string(&arena).unwrap();
     fs::write(&arena, format!("# Ours.\n{before}")).unwrap();
@@ -100,25 +126,72 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
     assert!(ok && said.contains("\ngo  "), "{said}");
     let text = fs::read_to_string(&arena).unwrap();
     assert!(text.starts_with("# Ours.\n"), "{text}");
-    let scene = ArenaConfig::parse(&text).unwrap().scene;
-    let scale = scene.metres_per_unit / SCALE - 1.0;
-    let turn = scene.rotation() * world_from_scene().conjugate();
-    let tilt_deg = (turn * DVec3::Z).angle_between(DVec3::Z).to_degrees();
-    println!("scale {:.3} %, tilt {tilt_deg:.3} degrees", scale * 1e2);
-    // The bars of a metric twin: 0.3 % and 0.2 degrees.
-    assert!(scale.abs() < 0.003, "{scale}");
-    assert!(tilt_deg < 0.2, "{tilt_deg}");
-    let p_scene =
-        world_from_scene().conjugate() * (DVec3::new(3.0, 0.0, 1.0) - TRANSLATION_M) / SCALE;
-    let found_m = scene.rotation() * p_scene * scene.metres_per_unit + scene.origin_m;
-    assert!(found_m.distance(DVec3::new(3.0, 0.0, 1.0)) < 0.02, "{found_m}");
+    check_place(&text);
 
     // Poses of a poor reconstruction: the place is not known, nothing is written, and it says why.
-    write_transforms(&capture, 0.25);
+    write_transforms(&capture, 0.25, 1);
     let (ok, said) = run(home, &align);
     assert!(!ok, "{said}");
     assert!(["NO GO", "contradict", "no tag of"].iter().any(|word| said.contains(word)), "{said}");
     assert_eq!(fs::read_to_string(&arena).unwrap(), text);
+}
+
+/// A motion capture at the video's 30 Hz, its millimetre of noise, its own clock, a marker beside the lens.
+#[test]
+fn a_track_of_the_phone_finds_its_place_in_the_room() {
+    let folder = tempfile::tempdir().unwrap();
+    let home = folder.path();
+    let film = "--capture walk --frames 900 --seconds 30 --size 80x64 -o hall";
+    let generate = "scene generate room --seed 3";
+    let words: Vec<&str> = generate.split(' ').chain(film.split(' ')).collect();
+    let (ok, said) = run(home, &words);
+    assert!(ok, "{said}");
+    let capture = home.join("walk");
+    write_transforms(&capture, 0.005, 10);
+    let truth = truth(&capture);
+    let images = truth["images"].as_array().unwrap();
+    let beside_m = DVec3::new(0.03, -0.09, -0.02);
+    let offset_s = 1.237;
+    let (mut track, mut mirrored, mut stamps) = (String::new(), String::new(), String::new());
+    for (k, image) in images.iter().enumerate() {
+        let (p_m, q) = pose(image);
+        let noise = |axis: f64| (((k as f64 + axis) * 12.9898).sin() * 43758.547).fract() * 0.002;
+        let p = p_m + q * beside_m + DVec3::new(noise(0.1), noise(0.4), noise(0.7));
+        let stamp_ns = image["stamp_ns"].as_u64().unwrap();
+        let at_s = stamp_ns as f64 * 1e-9 + offset_s;
+        // TUM's columns.
+        track += &format!("{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1\n", p.x, p.y, p.z);
+        mirrored += &format!("{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1\n", -p.x, p.y, p.z);
+        stamps += &format!("{},{stamp_ns}\n", image["file"].as_str().unwrap());
+    }
+    fs::write(home.join("track.txt"), track).unwrap();
+    fs::write(home.join("mirrored.txt"), mirrored).unwrap();
+    fs::write(home.join("times.csv"), stamps).unwrap();
+    let arena = home.join("hall/arena.toml");
+    let before = fs::read_to_string(&arena).unwrap();
+    let beside = ["--tracked-at", "0.03,-0.092,-0.02"];
+    let align = |track: &str, more: &[&str]| {
+        let align = ["scene", "align", "hall", "--capture", "walk", "--track", track];
+        run(home, &[&align[..], more].concat())
+    };
+    // Carried level: how high the marker sits above the lens must be measured (here 2 mm wrong).
+    let (ok, said) = align("track.txt", &["--times", "times.csv"]);
+    assert!(!ok && said.contains("--tracked-at"), "{said}");
+    let align = |track: &str, times: &[&str]| align(track, &[&beside, times].concat());
+    // When the images were taken nobody has said.
+    let (ok, said) = align("track.txt", &[]);
+    assert!(!ok && said.contains("--times"), "{said}");
+    // Not this walk.
+    let (ok, said) = align("mirrored.txt", &["--times", "times.csv"]);
+    assert!(!ok && (said.contains("is not the track") || said.contains("contradict")), "{said}");
+    // Its own times, but the images' twice as fast.
+    let (ok, said) = align("track.txt", &["--rate", "60"]);
+    assert!(!ok, "{said}");
+    assert_eq!(fs::read_to_string(&arena).unwrap(), before);
+    let (ok, said) = align("track.txt", &["--times", "times.csv"]);
+    println!("{said}");
+    assert!(ok && said.contains("\ngo  ") && said.contains("clocks      +1.2"), "{said}");
+    check_place(&fs::read_to_string(&arena).unwrap());
 }
 
 #[test]
@@ -133,7 +206,8 @@ fn what_cannot_be_aligned_is_explained() {
     for (arena, more, word) in [
         ("room.ply", &floor[..], "make one around the scene"),
         ("nowhere", &floor[..], "no arena"),
-        ("nowhere", &[][..], "--tags"),
+        ("nowhere", &[][..], "no arena"),
+        ("nowhere", &["--track", "t.csv"][..], "--capture"),
         ("nowhere", &["--tags", "t.toml"][..], "--capture"),
         ("nowhere", &["--floor", "0,0"][..], "no point"),
     ] {

@@ -86,7 +86,7 @@ pub(crate) struct LabArgs {
     /// How much of a large scene the processor renders; a graphics card renders all of it.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says.
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
     /// Opens no browser.

@@ -63,7 +63,7 @@ pub(crate) struct RenderArgs {
     /// How much of a large scene the processor renders; adaptive is what it does in flight
     #[arg(long, value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
     detail: DetailKind,
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     antialiased: Antialiased,
 }

@@ -8,6 +8,7 @@
 //! metres_per_unit = 0.176
 //! origin = [0.3, -1.2, 1.4]       # where the file's own origin comes to lie [m, world]
 //! crop = { min_m = [-4, -3, -0.5], max_m = [4, 3, 3] }    # what lies outside is left out [m, world]
+//! antialiased = true              # trained so (mip-splatting), whatever the file says
 //! ```
 //! `scene = "kitchen.ply"` is the short form of a scene that lies in the world already, as generated
 //! ones do.
@@ -40,6 +41,8 @@ pub struct SceneConfig {
     pub origin_m: DVec3,
     /// What is kept of it, by the splats' centres; all, if absent. [m, world]
     pub crop: Option<Geofence>,
+    /// Whether it was trained with anti-aliasing (mip-splatting); as the file says, if absent.
+    pub antialiased: Option<bool>,
 }
 
 impl SceneConfig {
@@ -53,6 +56,7 @@ impl SceneConfig {
             metres_per_unit: 1.0,
             origin_m: DVec3::ZERO,
             crop: None,
+            antialiased: None,
         }
     }
 
@@ -227,6 +231,8 @@ struct Table {
     origin: DVec3,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     crop: Option<Geofence>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    antialiased: Option<bool>,
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
@@ -243,8 +249,10 @@ impl Serialize for SceneConfig {
         if self.is_in_world() {
             return serializer.serialize_str(&self.file);
         }
-        let Self { file, up, yaw_deg, rotation, metres_per_unit, origin_m, crop } = self.clone();
-        Table { file, up, yaw_deg, rotation, metres_per_unit, origin: origin_m, crop }
+        let Self { file, up, yaw_deg, rotation, metres_per_unit, origin_m, crop, antialiased } =
+            self.clone();
+        let origin = origin_m;
+        Table { file, up, yaw_deg, rotation, metres_per_unit, origin, crop, antialiased }
             .serialize(serializer)
     }
 }
@@ -266,9 +274,26 @@ impl<'de> Deserialize<'de> for SceneConfig {
 
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<SceneConfig, A::Error> {
                 let table = Table::deserialize(MapAccessDeserializer::new(map))?;
-                let Table { file, up, yaw_deg, rotation, metres_per_unit, origin, crop } = table;
-                let origin_m = origin;
-                Ok(SceneConfig { file, up, yaw_deg, rotation, metres_per_unit, origin_m, crop })
+                let Table {
+                    file,
+                    up,
+                    yaw_deg,
+                    rotation,
+                    metres_per_unit,
+                    origin: origin_m,
+                    crop,
+                    antialiased,
+                } = table;
+                Ok(SceneConfig {
+                    file,
+                    up,
+                    yaw_deg,
+                    rotation,
+                    metres_per_unit,
+                    origin_m,
+                    crop,
+                    antialiased,
+                })
             }
         }
         deserializer.deserialize_any(Either)
@@ -305,7 +330,8 @@ mod tests {
             "scene = \"a.ply\"\nafter = 1\n"
         );
         let long = "[scene]\nfile = \"a.ply\"\nup = \"-y\"\nyaw_deg = 30\nmetres_per_unit = 0.2\n\
-                    origin = [1, 2, 3]\ncrop = { min_m = [0, 0, 0], max_m = [4, 5, 6] }";
+                    origin = [1, 2, 3]\ncrop = { min_m = [0, 0, 0], max_m = [4, 5, 6] }\n\
+                    antialiased = false";
         let file = parse(long).unwrap();
         file.scene.check().unwrap();
         assert!(!file.scene.is_in_world());
@@ -324,6 +350,11 @@ mod tests {
         refused("[scene]\nfile = \"a\"\nscale = 2", &["line 4", "scale"]);
         refused("[scene]\nup = \"z\"", &["file"]);
         refused("[scene]\nfile = \"a\"\nup = \"w\"", &["line 4", "'w' is no axis", "-z"]);
+        refused(
+            "[scene]\nfile = \"a\"\nantialiased = \"on\"",
+            &["line 4", "antialiased", "boolean"],
+        );
+        refused("scene = \"a\"\nantialiased = true", &["antialiased"]);
         refused("scene = 3", &["line 2", "a scene file's name, or a table"]);
         let invalid = |text: &str, expected: &str| {
             let error = scene(&format!("[scene]\nfile = \"a\"\n{text}")).check().unwrap_err();

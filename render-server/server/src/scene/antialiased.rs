@@ -8,7 +8,7 @@ use vizflyt_splat::Splats;
 /// Values of `--antialiased`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Antialiased {
-    /// As the scene's file says; many do not.
+    /// As `scene.antialiased` of the arena says, else the scene's file; many do not.
     #[default]
     Auto,
     /// Trained with anti-aliasing: mip-splatting, splatfacto's and gsplat's `antialiased`, brush's `mip`.

@@ -179,8 +179,9 @@ fn with_arena(path: &Path) -> Result<Scene> {
     Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY, seen })
 }
 
-/// Puts splats, as their file has them, where an arena wants them.
+/// Puts splats, as their file has them, where an arena wants them, to be rendered as it says.
 fn put(arena: &ArenaConfig, splats: &mut Splats) -> Result<()> {
+    splats.antialiased = arena.scene.antialiased.unwrap_or(splats.antialiased);
     let cropped = Placement::of(&arena.scene).apply(splats);
     if cropped > 0 {
         info!("{}: {cropped} splats lie outside scene.crop and are left out", arena.scene.file);
@@ -292,6 +293,33 @@ mod tests {
         let arena = default_arena(&dot(), "gone.ply").unwrap();
         std::fs::write(at("arena.toml"), arena.to_toml().unwrap()).unwrap();
         check(&at("arena.toml"), "names the scene 'gone.ply', but there is no");
+    }
+
+    #[test]
+    fn the_arena_overrules_what_the_file_says_of_anti_aliasing() {
+        let folder = tempfile::tempdir().unwrap();
+        // No PLY of ours says it; brush's comment does.
+        let at = |name: &str| folder.path().join(name);
+        ply::write(at("classic.ply"), &dot()).unwrap();
+        let text = std::fs::read(at("classic.ply")).unwrap();
+        let head = text.iter().position(|byte| *byte == b'\n').unwrap() + 1;
+        let mut mip = text[..head].to_vec();
+        let line = text[head..].iter().position(|byte| *byte == b'\n').unwrap() + head + 1;
+        mip.extend(&text[head..line]);
+        mip.extend(b"comment SplatRenderMode: mip\n");
+        mip.extend(&text[line..]);
+        std::fs::write(at("mip.ply"), mip).unwrap();
+        for (file, says) in [("classic.ply", false), ("mip.ply", true)] {
+            for (key, expected) in [(None, says), (Some(true), true), (Some(false), false)] {
+                let mut arena = default_arena(&dot(), file).unwrap();
+                arena.scene.antialiased = key;
+                std::fs::write(at("arena.toml"), arena.to_toml().unwrap()).unwrap();
+                let scene = load(folder.path(), &BareArgs::default()).unwrap();
+                assert_eq!(scene.splats.antialiased, expected, "{file}, {key:?}");
+                let (_, as_it_is) = load_as_it_is(folder.path()).unwrap();
+                assert_eq!(as_it_is.splats.antialiased, expected, "{file}, {key:?}");
+            }
+        }
     }
 
     #[test]

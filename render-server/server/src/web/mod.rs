@@ -64,7 +64,8 @@ pub use access::{Access, Login, Logins, PageKeys, Takes};
 pub use login::set_password;
 pub use routes::list as routes;
 pub use stats::{ServerStages, VehicleStats};
-pub use view::{ViewArgs, view};
+pub use view::align::{Aligner, Length, Line, Picks, Solved, Wish};
+pub use view::{Place, ViewArgs, align, view};
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};

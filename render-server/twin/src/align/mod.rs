@@ -4,7 +4,7 @@
 //! floor    three points of the floor, one known length ------------------------------.
 //! corners  rays from posed images to printed tags -> points -.                        |
 //!                                                            +-> points (matched) -> Fit -> go or no-go
-//! track    the camera's places by motion capture ------------'
+//! track    the camera's places by motion capture (recording) '
 //! ```
 //! A scene's own units and axes are arbitrary. What comes out is the similarity that takes them to the `world` frame,
 //! with bounds on what matters to a vehicle: how far a wall may be from where the twin has it.
@@ -14,6 +14,7 @@ mod eigen;
 pub mod floor;
 pub mod level;
 pub mod points;
+pub mod recording;
 pub mod track;
 
 #[cfg(test)]

@@ -1,7 +1,8 @@
 //! A scene's place by a motion capture that followed the camera.
 //!
-//! The tracked point is not the lens: it sits beside it, at a place in the camera's axes that nobody has measured. Nor
-//! do two recordings begin at one instant. Both are solved with the scene's place.
+//! The tracked point is not the lens: it sits beside it, at a place in the camera's axes that hardly anybody has measured.
+//! Nor do two recordings begin at one instant. Both are solved with the scene's place; but a camera that is carried level,
+//! however it turns, does not show how high the point sits above it. Then it must be measured.
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -39,7 +40,8 @@ pub struct TrackFit {
     pub point_in_cam_m: DVec3,
 }
 
-/// Finds the scene's place by cameras and a track, ascending in time, whose clocks differ by at most `max_offset_s`.
+/// Finds the scene's place by cameras and a track, ascending in time, whose clocks differ by at most `max_offset_s`. Where
+/// the tracked point was measured, `measured_m` [m, cam], it is not solved.
 ///
 /// # Errors
 /// Too few cameras within the track, a camera that hardly moved or turned, or as [`points::fit`].
@@ -48,7 +50,11 @@ pub fn fit(
     track: &[Tracked],
     max_offset_s: f64,
     sigma_m: f64,
+    measured_m: Option<DVec3>,
 ) -> Result<TrackFit, AlignError> {
+    if !measured_m.is_none_or(DVec3::is_finite) {
+        return Err(AlignError::BadNumber("the place of the tracked point"));
+    }
     if !(max_offset_s >= 0.0 && max_offset_s.is_finite()) {
         return Err(AlignError::BadNumber("the greatest offset of the clocks"));
     }
@@ -59,7 +65,9 @@ pub fn fit(
     {
         return Err(AlignError::BadNumber("a pose's coordinate"));
     }
-    check_turns(cameras)?;
+    if measured_m.is_none() {
+        check_turns(cameras)?;
+    }
     // Coarse first: the motion of a hand has a period of a second, and a search must not step over its best place.
     let count = (max_offset_s / COARSE_S).ceil().min(MAX_STEPS) as i64;
     let step_s = if count == 0 { 0.0 } else { max_offset_s / count as f64 };
@@ -70,6 +78,7 @@ pub fn fit(
         track,
         offset_s,
         sigma_m,
+        measured_m,
         points::fit_all,
     ) {
         Ok((cost, found)) if best.is_none_or(|(least, _)| cost < least) => {
@@ -90,7 +99,12 @@ pub fn fit(
         }
     }
     let (_, rough) = best.ok_or(last_error)?;
-    at_offset(cameras, track, rough.offset_s, sigma_m, points::fit).map(|(_, found)| found)
+    let (_, mut found) =
+        at_offset(cameras, track, rough.offset_s, sigma_m, measured_m, points::fit)?;
+    if measured_m.is_some() {
+        found.fit.place_sigma_m = found.fit.place_sigma_m.hypot(RULER_M);
+    }
+    Ok(found)
 }
 
 /// Returns the mean square of what is left [m^2], and the place, for one offset of the clocks.
@@ -99,6 +113,7 @@ fn at_offset(
     track: &[Tracked],
     offset_s: f64,
     sigma_m: f64,
+    measured_m: Option<DVec3>,
     place: fn(&[Pair], f64) -> Result<Fit, AlignError>,
 ) -> Result<(f64, TrackFit), AlignError> {
     let seen: Vec<(CameraPose, DVec3)> = cameras
@@ -124,6 +139,16 @@ fn at_offset(
             .collect();
         let fit = place(&pairs, sigma_m)?;
         let back = fit.world_from_scene;
+        if let Some(measured_m) = measured_m {
+            // Known in metres; the scene's unit is not.
+            let before = point;
+            point = measured_m / back.scale;
+            found = Some(fit);
+            if !(point.distance(before) * back.scale >= CONVERGED_M) {
+                break;
+            }
+            continue;
+        }
         let (mut change, mut used) = (DVec3::ZERO, 0.0);
         // What is left, in the camera's axes, whose mean the point's place explains; but for what a shift of the whole
         // scene explains as well, which is the mean in the scene's axes.
@@ -197,6 +222,8 @@ const MAX_STEPS: f64 = 2000.0;
 const ROUNDS: usize = 30;
 /// The tracked point moves by less than this. [m]
 const CONVERGED_M: f64 = 1e-7;
+/// How well the tracked point's place is measured by hand, one sigma. [m]
+const RULER_M: f64 = 0.005;
 /// A motion capture that loses the point for longer says nothing in between. [s]
 const MAX_GAP_S: f64 = 0.1;
 /// Of each axis' direction, one less the square of its mean: turns of 8 degrees to each side.
@@ -256,7 +283,7 @@ mod tests {
             for camera in &mut cameras {
                 camera.position += gauss(&mut random) * (0.005 / truth.scale);
             }
-            let found = fit(&cameras, &track, 2.0, 0.002).unwrap();
+            let found = fit(&cameras, &track, 2.0, 0.002, None).unwrap();
             assert!((found.offset_s - offset_s).abs() < 0.01, "{found:?}");
             assert!(found.point_in_cam_m.distance(beside_m) < 0.01, "{found:?}");
             let scale = found.fit.world_from_scene.scale / truth.scale;
@@ -272,13 +299,40 @@ mod tests {
     #[test]
     fn a_walk_that_shows_nothing_is_refused() {
         let (mut cameras, track) = walk(&truth(), 0.0, DVec3::ZERO);
-        let few = fit(&cameras[..4], &track, 1.0, 0.002);
+        let few = fit(&cameras[..4], &track, 1.0, 0.002, None);
         assert_eq!(few, Err(AlignError::TooFew { given: 4, needed: 6 }));
         for camera in &mut cameras {
             camera.rotation = DQuat::IDENTITY;
         }
-        assert!(matches!(fit(&cameras, &track, 1.0, 0.002), Err(AlignError::HardlyMoved(_))));
+        let still = fit(&cameras, &track, 1.0, 0.002, None);
+        assert!(matches!(still, Err(AlignError::HardlyMoved(_))));
         let (cameras, _) = walk(&truth(), 0.0, DVec3::ZERO);
-        assert!(matches!(fit(&cameras, &track[..20], 0.0, 0.002), Err(AlignError::TooFew { .. })));
+        let short = fit(&cameras, &track[..20], 0.0, 0.002, None);
+        assert!(matches!(short, Err(AlignError::TooFew { .. })));
+        let nowhere = fit(&cameras, &track, 0.0, 0.002, Some(DVec3::NAN));
+        assert!(matches!(nowhere, Err(AlignError::BadNumber(_))));
+    }
+
+    /// Carried level, as people do: only a ruler tells how high above the lens the marker sits.
+    #[test]
+    fn a_level_camera_needs_a_measured_point() {
+        let truth = truth();
+        let beside_m = DVec3::new(0.02, -0.08, -0.03);
+        let (mut cameras, mut track) = walk(&truth, 0.3, DVec3::ZERO);
+        for (k, camera) in (1..).zip(&mut cameras) {
+            let level = DQuat::from_rotation_z(0.6 * f64::from(k) * 0.4);
+            camera.rotation = truth.rotation.conjugate() * level;
+        }
+        for tracked in &mut track {
+            let level = DQuat::from_rotation_z(0.6 * (tracked.at_s - 0.3));
+            tracked.position_m += level * beside_m;
+        }
+        let unmeasured = fit(&cameras, &track, 1.0, 0.002, None);
+        assert!(matches!(unmeasured, Err(AlignError::HardlyMoved(_))), "{unmeasured:?}");
+        let found = fit(&cameras, &track, 1.0, 0.002, Some(beside_m)).unwrap();
+        assert!(found.point_in_cam_m.distance(beside_m) < 1e-6, "{found:?}");
+        let p = DVec3::new(3.0, 1.0, -2.0);
+        let found_m = found.fit.world_from_scene.transform_point(p);
+        assert!(found_m.distance(truth.transform_point(p)) < 0.002, "{found:?}");
     }
 }

@@ -65,20 +65,36 @@ impl Dataset {
     }
 }
 
+/// Returns the names of a folder's photos and where each was taken from, in the order of their names; no photo is opened.
+///
+/// # Errors
+/// As [`Dataset::read`], of the poses.
+pub fn read_poses(folder: &Path) -> Result<Vec<(String, Pose<World, Cam>)>, DatasetError> {
+    let (plans, _) = of_folder(folder)?;
+    let mut poses: Vec<_> =
+        plans.into_iter().map(|plan| (plan.name, plan.world_from_cam)).collect();
+    poses.sort_by(|a, b| a.0.cmp(&b.0));
+    Ok(poses)
+}
+
+fn of_folder(folder: &Path) -> Result<(Vec<Plan>, Points), DatasetError> {
+    let transforms = folder.join("transforms.json");
+    if transforms.is_file() {
+        of_nerfstudio(folder, &transforms)
+    } else if let Some(model) = colmap::find(folder) {
+        of_colmap(folder, &model)
+    } else {
+        Err(DatasetError::NotADataset(folder.to_owned()))
+    }
+}
+
 impl Dataset {
     /// Reads a folder; photos become at most `width_px` wide.
     ///
     /// # Errors
     /// [`DatasetError`] says which file is wrong, and what to do.
     pub fn read(folder: &Path, width_px: Option<u32>) -> Result<Self, DatasetError> {
-        let transforms = folder.join("transforms.json");
-        let (plans, points) = if transforms.is_file() {
-            of_nerfstudio(folder, &transforms)?
-        } else if let Some(model) = colmap::find(folder) {
-            of_colmap(folder, &model)?
-        } else {
-            return Err(DatasetError::NotADataset(folder.to_owned()));
-        };
+        let (plans, points) = of_folder(folder)?;
         Self::of_plans(folder, plans, points, width_px)
     }
 

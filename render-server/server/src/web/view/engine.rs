@@ -1,13 +1,15 @@
 //! One picture: where the page's camera is in, JPEG out.
 
 use anyhow::{Context, Result};
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Atmosphere, Camera, DepthKind, Rasterizer, RgbdImage};
 
+use super::pick::{self, PickError, Picked};
+use super::place::{self, Place};
 use crate::scene::WorldFromScene;
 use crate::web::previews::depth_colour;
 
@@ -32,6 +34,12 @@ pub(super) struct Request {
     /// On the clock of what moves. [s]
     #[serde(default)]
     at_s: f64,
+    /// Where the scene's file lies in the world that `p_m` is of; where it was loaded to, if absent.
+    #[serde(default)]
+    place: Option<Place>,
+    /// Sends depths along, for what the page draws over the picture.
+    #[serde(default)]
+    grid: bool,
 }
 
 /// The description of a picture, sent before it.
@@ -42,6 +50,17 @@ pub(super) struct PictureInfo {
     /// Median depth in the middle of the picture; none where nothing is hit. [m]
     middle_m: Option<f32>,
     camera: OracleCamera,
+    grid: Option<DepthGrid>,
+}
+
+/// Median depths at the middles of square cells, row by row.
+#[derive(Debug, Serialize)]
+struct DepthGrid {
+    columns: u32,
+    /// Side of a cell. [px]
+    cell_px: u32,
+    /// 0 where nothing is. [mm, cam]
+    depth_mm: Vec<u16>,
 }
 
 /// The camera in the frame of the scene's file, as `vizflyt scene render` reads it.
@@ -68,7 +87,10 @@ pub(super) struct Picture {
 pub(super) struct Engine {
     rasterizer: Box<dyn Rasterizer>,
     moving: MovingObjects,
+    /// From the frame that `CAM.json` files are in.
     world_from_scene: WorldFromScene,
+    /// From the frame of the scene's file.
+    world_from_file: WorldFromScene,
     image: [RgbdImage; 1],
     rgb: Vec<u8>,
     depth_mm: Vec<u16>,
@@ -79,13 +101,55 @@ impl Engine {
         rasterizer: Box<dyn Rasterizer>,
         moving: MovingObjects,
         world_from_scene: WorldFromScene,
+        world_from_file: WorldFromScene,
     ) -> Self {
         let (image, rgb, depth_mm) = ([RgbdImage::default()], Vec::new(), Vec::new());
-        Self { rasterizer, moving, world_from_scene, image, rgb, depth_mm }
+        Self { rasterizer, moving, world_from_scene, world_from_file, image, rgb, depth_mm }
+    }
+
+    /// Returns the camera in the world that the scene was loaded into, and how much longer a metre is there.
+    fn loaded_camera(&self, request: &Request) -> Result<(Camera, f64)> {
+        let camera = request.camera();
+        let Some(place) = &request.place else { return Ok((camera, 1.0)) };
+        let shown = place.world_from_scene();
+        let shown =
+            shown.context("the place is none: give a unit quaternion and finite numbers")?;
+        let by = place::between(&self.world_from_file, &shown);
+        Ok((place::moved(&camera, &by), by.scale))
+    }
+
+    /// Finds the point of the scene at a pixel of what `request` shows.
+    pub(super) fn pick(
+        &mut self,
+        request: &Request,
+        px: DVec2,
+    ) -> Result<Result<Picked, PickError>> {
+        let camera = request.camera();
+        let Some((window, px_of_window)) = pick::window(&camera.intrinsics, px) else {
+            return Ok(Err(PickError::Outside));
+        };
+        let (loaded, unit) = self.loaded_camera(request)?;
+        let looking = Camera { intrinsics: window, ..loaded.clone() };
+        let placements = self.moving.placements((request.at_s * 1e9) as i64);
+        self.rasterizer.render(&placements, &[looking], &mut self.image)?;
+        let (depth_m, rough_m) = match pick::surface(&self.image[0].depth_median_m, px_of_window) {
+            Ok(found) => found,
+            Err(PickError::Edge { near_m, far_m }) => {
+                return Ok(Err(PickError::Edge { near_m: near_m / unit, far_m: far_m / unit }));
+            }
+            Err(error) => return Ok(Err(error)),
+        };
+        let p_cam = window.unproject(px_of_window, depth_m).context("the lens shows nothing")?;
+        let p_loaded = loaded.world_from_cam.transform_point(p_cam);
+        let file = &self.world_from_file;
+        let p_scene = file.rotation.conjugate() * (p_loaded - file.translation_m) / file.scale;
+        let p_world = camera.world_from_cam.transform_point(p_cam / unit);
+        let (depth_m, rough_m) = (depth_m / unit, rough_m / unit);
+        Ok(Ok(Picked { p_scene, p_world, depth_m, rough_m }))
     }
 
     pub(super) fn render(&mut self, request: &Request) -> Result<Picture> {
-        let camera = request.camera();
+        let (camera, unit) = self.loaded_camera(request)?;
         // A time beyond the clock's range shows the start.
         let placements = self.moving.placements((request.at_s * 1e9) as i64);
         let times = self.rasterizer.render(&placements, &[camera], &mut self.image)?;
@@ -105,10 +169,28 @@ impl Engine {
         let info = PictureInfo {
             ms: times.total_ms,
             visible: self.rasterizer.workload().visible,
-            middle_m: (middle_m > 0.0).then_some(middle_m),
+            middle_m: (middle_m > 0.0).then_some(middle_m / unit as f32),
             camera: in_scene(&camera, &self.world_from_scene),
+            grid: request.grid.then(|| DepthGrid::of(image, unit)),
         };
         Ok(Picture { info, jpeg })
+    }
+}
+
+impl DepthGrid {
+    fn of(image: &RgbdImage, unit: f64) -> Self {
+        let cell_px = (image.width_px.max(image.height_px) / GRID).max(1);
+        let [columns, rows] = [image.width_px, image.height_px].map(|side| side.div_ceil(cell_px));
+        let middle = |cell: u32, side: u32| (cell * cell_px + cell_px / 2).min(side - 1) as usize;
+        let at = |column, row| {
+            let k = middle(row, image.height_px) * image.width_px as usize
+                + middle(column, image.width_px);
+            // Saturates: what is farther than 65 m hides nothing nearer.
+            (f64::from(image.depth_median_m[k]) / unit * 1e3) as u16
+        };
+        let depth_mm = (0..rows).flat_map(|row| (0..columns).map(move |column| (column, row)));
+        let depth_mm = depth_mm.map(|(column, row)| at(column, row)).collect();
+        Self { columns, cell_px, depth_mm }
     }
 }
 
@@ -162,6 +244,8 @@ const NEAR_M: f32 = 0.05;
 /// Full HD on a screen that is wider than high.
 const MAX_SIDE_PX: u32 = 1920;
 const QUALITY: u8 = 85;
+/// Cells along the longer side: 100 kB of text at most.
+const GRID: u32 = 180;
 
 #[cfg(test)]
 mod tests {
@@ -192,12 +276,19 @@ mod tests {
             height_px: 48,
             depth: false,
             at_s: 0.0,
+            place: None,
+            grid: false,
         }
     }
 
     fn still(splats: &Splats) -> Engine {
         let renderer = Box::new(CpuRenderer::new(splats));
-        Engine::new(renderer, MovingObjects::default(), WorldFromScene::IDENTITY)
+        Engine::new(
+            renderer,
+            MovingObjects::default(),
+            WorldFromScene::IDENTITY,
+            WorldFromScene::IDENTITY,
+        )
     }
 
     #[test]
@@ -220,7 +311,8 @@ mod tests {
         let scene = Scene { splats: &empty, objects: &objects };
         let renderer = Box::new(CpuRenderer::new(scene));
         let moving = MovingObjects::of(&[authorizer], 0);
-        let mut engine = Engine::new(renderer, moving, WorldFromScene::IDENTITY);
+        let mut engine =
+            Engine::new(renderer, moving, WorldFromScene::IDENTITY, WorldFromScene::IDENTITY);
         let mut middle_m = |p_y_m: f64, at_s: f64| {
             let looking = Request { p_m: [0.0, p_y_m, 1.0], at_s, ..request() };
             engine.render(&looking).unwrap().info.middle_m
@@ -243,6 +335,46 @@ mod tests {
         assert!(engine.render(&lost).is_err());
         let huge = Request { width_px: u32::MAX, height_px: 0, ..request() };
         assert_eq!(huge.camera().intrinsics.pixels(), 1920 * 16);
+    }
+
+    /// Turned, moved and of another unit: the same picture, distances in the new unit, and clicks that find the file's point.
+    #[test]
+    fn a_scene_shown_elsewhere_is_the_same_to_a_camera_moved_along() {
+        let splats = ball();
+        let mut engine = still(&splats);
+        let here = engine.render(&request()).unwrap();
+        // Turned by a right angle about z, twice as large, 1 m up: the camera looks along y.
+        let half = std::f64::consts::FRAC_PI_2;
+        let turned = WorldFromScene {
+            scale: 2.0,
+            rotation: DQuat::from_rotation_z(half),
+            translation_m: DVec3::Z,
+        };
+        let elsewhere = Request {
+            p_m: [-1.0, 0.0, 3.0],
+            yaw_rad: half,
+            place: Some(Place::new(&turned)),
+            grid: true,
+            ..request()
+        };
+        let there = engine.render(&elsewhere).unwrap();
+        assert_eq!(there.info.middle_m, Some(6.0));
+        let grid = there.info.grid.unwrap();
+        assert_eq!((grid.columns, grid.cell_px, grid.depth_mm.len()), (64, 1, 64 * 48));
+        assert_eq!(grid.depth_mm[24 * 64 + 32], 6000);
+        assert!(there.jpeg == here.jpeg && here.info.grid.is_none());
+        // The ball is 4 px wide, smaller than the window; seen closely it fills it.
+        let middle = DVec2::new(32.0, 24.0);
+        assert_eq!(engine.pick(&elsewhere, middle).unwrap(), Err(PickError::Nothing));
+        let close = Request { fov_deg: 5.0, ..elsewhere };
+        let picked = engine.pick(&close, middle).unwrap().unwrap();
+        assert!(picked.p_scene.distance(DVec3::new(3.0, 0.5, 1.0)) < 1e-3, "{picked:?}");
+        assert!(picked.p_world.distance(DVec3::new(-1.0, 6.0, 3.0)) < 1e-3, "{picked:?}");
+        let no_place = serde_json::from_str::<Place>(
+            r#"{"rotation": [0, 0, 0, 0], "metres_per_unit": 1, "origin": [0, 0, 0]}"#,
+        );
+        let lost = Request { place: Some(no_place.unwrap()), ..request() };
+        assert!(engine.render(&lost).is_err());
     }
 
     /// A point of the file lands on the same pixel, by either way.

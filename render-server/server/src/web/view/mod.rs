@@ -8,7 +8,10 @@
 //! picture has come: the newest wins by itself, however slow the machine. One renderer serves all
 //! viewers in turn.
 
+pub(crate) mod align;
 mod engine;
+mod pick;
+mod place;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -30,10 +33,12 @@ use tracing::debug;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
+use self::align::{Aligner, Panel, Setup};
 use self::engine::{Engine, Picture, Request};
+pub use self::place::Place;
 use crate::lock::lock;
 use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
-use crate::scene::{self, Antialiased, BareArgs, Scene};
+use crate::scene::{self, Antialiased, BareArgs, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::{self, origin};
 
@@ -65,7 +70,7 @@ pub struct ViewArgs {
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its file says
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
 
@@ -88,13 +93,34 @@ pub struct ViewArgs {
 /// A scene that cannot be used, an address that cannot be bound, no such renderer.
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+    serve_view(&args, None, open)
+}
+
+/// As [`view`], with the panel that aligns the arena's scene.
+///
+/// # Errors
+/// As [`view`].
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
+pub fn align(
+    args: ViewArgs,
+    aligner: Arc<dyn Aligner>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
+    serve_view(&args, Some(aligner), open)
+}
+
+fn serve_view(
+    args: &ViewArgs,
+    aligner: Option<Arc<dyn Aligner>>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("net")
         .enable_all()
         .build()
         .context("cannot start tokio")?;
-    let result = runtime.block_on(run(&args, open));
+    let result = runtime.block_on(run(args, aligner, open));
     // Not awaited: a picture under way must not hold up the end.
     runtime.shutdown_background();
     result
@@ -104,6 +130,7 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
 struct ViewState {
     engine: Mutex<Engine>,
     welcome: Welcome,
+    align: Option<Panel>,
     stop: Stop,
 }
 
@@ -121,35 +148,53 @@ struct Welcome {
     fence_m: [[f64; 3]; 2],
     /// How many objects move in it.
     objects: usize,
+    /// A script of ours that adds to the page.
+    tool: Option<&'static str>,
 }
 
-async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+async fn run(
+    args: &ViewArgs,
+    aligner: Option<Arc<dyn Aligner>>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
     let stop = Stop::default();
     stop.on_signals(false)?;
     // First: a taken port is reported before the scene is loaded.
     let listener = web::bind(args.http, None, true)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
-    let load = tokio::task::spawn_blocking(move || prepare(&loading));
-    let (engine, welcome) = tokio::select! {
+    let aligning = aligner.is_some();
+    let load = tokio::task::spawn_blocking(move || prepare(&loading, aligning));
+    let (engine, mut welcome, setup) = tokio::select! {
         prepared = load => prepared.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
-    let view = Arc::new(ViewState { engine: Mutex::new(engine), welcome, stop: stop.clone() });
+    let align = aligner.map(|aligner| Panel { aligner, setup });
+    welcome.tool = align.as_ref().map(|_| "/align.js");
+    let (engine, stopping) = (Mutex::new(engine), stop.clone());
+    let view = Arc::new(ViewState { engine, welcome, align, stop: stopping });
+    let router = router(view).into_make_service_with_connect_info::<SocketAddr>();
     tokio::select! {
-        served = axum::serve(listener, router(view)) => served.context("the page's server failed"),
+        served = axum::serve(listener, router) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
     }
 }
 
-fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, mut splats, objects, world_from_scene, .. } =
+fn prepare(args: &ViewArgs, aligning: bool) -> Result<(Engine, Welcome, Setup)> {
+    let Scene { mut arena, mut splats, mut objects, world_from_scene, .. } =
         scene::load(&args.scene, &args.bare)?;
+    if aligning {
+        // What moves stands in the room: it is no part of the scene, and does not move along with it.
+        arena.objects.clear();
+        objects.clear();
+    }
     args.antialiased.apply(&mut splats);
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
     let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
     let moving = MovingObjects::new(&arena, args.seed);
+    let world_from_file = Placement::of(&arena.scene).world_from_scene;
+    let setup = Setup::new(&arena, Place::new(&world_from_file));
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;
     let welcome = Welcome {
@@ -160,8 +205,10 @@ fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
         yaw_rad: arena.spawn.yaw_deg.to_radians(),
         fence_m: [arena.geofence.min_m.to_array(), arena.geofence.max_m.to_array()],
         objects: moving.len(),
+        tool: None,
     };
-    Ok((Engine::new(rasterizer, moving, world_from_scene), welcome))
+    let engine = Engine::new(rasterizer, moving, world_from_scene, world_from_file);
+    Ok((engine, welcome, setup))
 }
 
 fn router(view: Arc<ViewState>) -> Router {
@@ -172,6 +219,7 @@ fn router(view: Arc<ViewState>) -> Router {
         .route("/view.js", get(async || file("text/javascript; charset=utf-8", SCRIPT)))
         .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
         .route("/ws", get(watch))
+        .merge(align::routes())
         .with_state(view)
 }
 

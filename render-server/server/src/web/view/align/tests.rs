@@ -1,0 +1,142 @@
+use std::sync::Mutex;
+
+use axum::http::HeaderValue;
+use glam::{Quat, Vec3};
+use vizflyt_arena::objects::MovingObjects;
+use vizflyt_splat::{CpuRenderer, Splats};
+
+use super::super::engine::Engine;
+use super::super::{RendererInfo, Welcome};
+use super::*;
+use crate::scene::{WorldFromScene, default_arena};
+use crate::stop::Stop;
+
+/// Says yes to three points, and remembers nothing.
+struct Yes;
+
+impl Aligner for Yes {
+    fn solve(&self, picks: &Picks) -> Result<Solved, String> {
+        if picks.floor.len() < 3 {
+            return Err("too few".to_owned());
+        }
+        let place = Place::new(&WorldFromScene::IDENTITY);
+        Ok(Solved { place, lines: Vec::new(), go: Some(true) })
+    }
+
+    fn save(&self, _: &Wish) -> Result<Vec<Line>, String> {
+        Ok(vec![Line { key: "written", text: "arena.toml".to_owned() }])
+    }
+}
+
+/// A wall 3 m ahead of the origin, and its page, with the panel or without.
+fn view(panel: bool) -> State<Arc<ViewState>> {
+    let wall = Splats {
+        means_m: vec![Vec3::new(3.0, 0.0, 1.0)],
+        scales_m: vec![Vec3::new(0.001, 1.0, 1.0)],
+        rotations: vec![Quat::IDENTITY],
+        opacities: vec![1.0],
+        sh_degree: 0,
+        sh: vec![1.0; 3],
+        antialiased: false,
+    };
+    let arena = default_arena(&wall, "wall.ply").unwrap();
+    let one = WorldFromScene::IDENTITY;
+    let renderer = Box::new(CpuRenderer::new(&wall));
+    let setup = Setup::new(&arena, Place::new(&one));
+    let welcome = Welcome {
+        name: arena.name,
+        renderer: RendererInfo { name: "cpu".to_owned(), reason: "a test".to_owned() },
+        splats: 1,
+        start_m: [0.0; 3],
+        yaw_rad: 0.0,
+        fence_m: [[0.0; 3]; 2],
+        objects: 0,
+        tool: None,
+    };
+    State(Arc::new(ViewState {
+        engine: Mutex::new(Engine::new(renderer, MovingObjects::default(), one, one)),
+        welcome,
+        align: panel.then(|| Panel { aligner: Arc::new(Yes), setup }),
+        stop: Stop::default(),
+    }))
+}
+
+fn headers(origin: &'static str) -> HeaderMap {
+    let mut headers = HeaderMap::new();
+    headers.insert("host", HeaderValue::from_static("127.0.0.1:80"));
+    headers.insert("origin", HeaderValue::from_static(origin));
+    headers
+}
+
+const OURS: &str = "http://127.0.0.1:80";
+const PICKS: &str = r#"{"floor": [[0,0,0], [1,0,0], [0,1,0]], "above": [0,0,1], "length": null, "origin_at_m": [0,0,0],
+    "yaw_deg": 0, "geofence": {"min_m": [0,0,0], "max_m": [1,1,1]}, "rough_m": 0}"#;
+
+fn wish() -> String {
+    format!(
+        r#"{{"picks": {PICKS}, "spawn": {{"position_m": [0,0,0], "yaw_deg": 0}}, "force": false}}"#
+    )
+}
+
+fn click(px: [f64; 2], yaw_rad: f64) -> Bytes {
+    let [x, y] = px;
+    let request = format!(
+        r#"{{"p_m": [0,0,1], "yaw_rad": {yaw_rad}, "pitch_rad": 0, "fov_deg": 40, "width_px": 160, "height_px": 120, "depth": false}}"#
+    );
+    format!(r#"{{"request": {request}, "px": [{x}, {y}]}}"#).into()
+}
+
+async fn words(response: Response) -> (u16, String) {
+    let status = response.status().as_u16();
+    let body = axum::body::to_bytes(response.into_body(), 1 << 20).await.unwrap();
+    (status, String::from_utf8(body.to_vec()).unwrap())
+}
+
+#[tokio::test]
+async fn a_click_finds_the_wall_or_says_why_not() {
+    let pick = async |px, yaw| {
+        words(super::pick(view(true), headers(OURS), Ok(click(px, yaw))).await).await
+    };
+    let (status, text) = pick([80.0, 60.0], 0.0).await;
+    assert_eq!(status, 200, "{text}");
+    let found: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert!((found["p_scene"][0].as_f64().unwrap() - 3.0).abs() < 0.02, "{text}");
+    for (px, yaw, expected) in [
+        ([80.0, 60.0], 3.0, "nothing solid"),
+        ([-1.0, 0.0], 0.0, "outside"),
+        ([1e300, 0.0], 0.0, "outside"),
+    ] {
+        let (status, text) = pick(px, yaw).await;
+        assert!(status == 422 && text.contains(expected), "{status} {text}");
+    }
+    let garbage = super::pick(view(true), headers(OURS), Ok("{".into())).await;
+    assert_eq!(words(garbage).await.0, 400);
+}
+
+#[tokio::test]
+async fn only_our_page_on_this_computer_writes() {
+    let save = async |from: &str, origin| {
+        let from = ConnectInfo(from.parse::<SocketAddr>().unwrap());
+        words(super::save(view(true), from, headers(origin), Ok(wish().into())).await).await
+    };
+    assert_eq!(save("127.0.0.1:9", OURS).await.0, 200);
+    assert_eq!(save("[::1]:9", OURS).await.0, 200);
+    assert_eq!(save("[::ffff:127.0.0.1]:9", OURS).await.0, 200);
+    let (status, text) = save("192.168.1.4:9", OURS).await;
+    assert!(status == 403 && text.contains("this computer"), "{text}");
+    assert_eq!(save("127.0.0.1:9", "http://evil.example").await.0, 403);
+}
+
+#[tokio::test]
+async fn picks_are_solved_for_our_page_alone() {
+    let solve = async |panel, origin, picks: String| {
+        words(super::solve(view(panel), headers(origin), Ok(picks.into())).await).await
+    };
+    assert_eq!(solve(true, OURS, PICKS.to_owned()).await.0, 200);
+    assert_eq!(solve(true, "http://evil.example", PICKS.to_owned()).await.0, 403);
+    assert_eq!(solve(false, OURS, PICKS.to_owned()).await.0, 404);
+    let few = PICKS.replace(", [0,1,0]]", "]");
+    assert_eq!(solve(true, OURS, few).await, (422, "too few".to_owned()));
+    let many = PICKS.replace("[[0,0,0]", &format!("[[0,0,0]{}", ", [0,0,0]".repeat(MAX_POINTS)));
+    assert!(solve(true, OURS, many).await.1.contains("plenty"));
+}
