@@ -18,6 +18,8 @@ mod start;
 mod state;
 
 #[cfg(test)]
+pub(crate) mod synthetic;
+#[cfg(test)]
 mod tests;
 
 use glam::DVec3;

@@ -46,6 +46,22 @@ pub(super) struct Solved {
 impl Noise {
     const START: Self = Self { point_px: 1.0, tag_px: 0.5, place_factor: 1.0 };
 
+    /// Returns it, with sigmas that are at most a few times smaller than the last.
+    fn no_sharper_than(self, last: Self) -> Self {
+        Self {
+            point_px: self.point_px.max(SHARPER * last.point_px),
+            tag_px: self.tag_px.max(SHARPER * last.tag_px),
+            place_factor: self.place_factor.max(SHARPER * last.place_factor),
+        }
+    }
+
+    fn is_like(self, last: Self) -> bool {
+        let near = |a: f64, b: f64| (a / b - 1.0).abs() < 0.1;
+        near(self.point_px, last.point_px)
+            && near(self.tag_px, last.tag_px)
+            && near(self.place_factor, last.place_factor)
+    }
+
     /// Returns 1 / sigma^2, less for what is far off. [1/px^2]
     pub(super) fn point_weight(&self, off_px: DVec2) -> f64 {
         weight(off_px.length(), self.point_px)
@@ -121,7 +137,7 @@ impl<'a> Problem<'a> {
     }
 
     /// Returns what a state costs.
-    fn cost(&self, state: &State) -> f64 {
+    pub(super) fn cost(&self, state: &State) -> f64 {
         let points: Vec<f64> = (0..state.points.len())
             .into_par_iter()
             .map(|point| self.point_cost(state, point))
@@ -152,8 +168,11 @@ impl<'a> Problem<'a> {
         let points = (0..state.points.len()).flat_map(|point| {
             let sightings = self.sightings(point);
             let many = if sightings.len() < 3 { &[] } else { sightings };
+            // Of what its sightings say, three numbers went into the point.
+            let numbers = 2.0 * sightings.len() as f64;
+            let went_in = (numbers / (numbers - 3.0)).sqrt();
             many.iter().filter_map(move |&(camera, pixel)| {
-                Some(state.off_px(camera, state.points[point], pixel)?.length())
+                Some(went_in * state.off_px(camera, state.points[point], pixel)?.length())
             })
         });
         let tags = self.tags.iter().filter_map(|&(camera, seen)| {
@@ -183,10 +202,15 @@ pub(super) fn solve(
 ) -> Result<Solved, AdjustError> {
     let mut problem = Problem::new(capture, state, options.refine_lens, &[]);
     let mut rounds = 0;
-    // What weighs how much is known only once it fits.
-    for settle in [1e-3, 1e-4, 1e-6] {
-        rounds += iterate(&problem, state, known, settle)?;
-        problem.noise = problem.noise_of(state);
+    // What weighs how much is known only once it fits; weights that sharpen at once would leave behind what is not there
+    // yet.
+    for _ in 0..MAX_NOISES {
+        rounds += iterate(&problem, state, known, 1e-5)?;
+        let last = problem.noise;
+        problem.noise = problem.noise_of(state).no_sharper_than(last);
+        if problem.noise.is_like(last) {
+            break;
+        }
     }
     rounds += iterate(&problem, state, known, 1e-8)?;
     let Normal { mut matrix, .. } = held(normal(&problem, state, ALMOST_NONE), state, known);
@@ -295,7 +319,7 @@ pub(super) fn middle_m(state: &State) -> DVec3 {
     sum / state.cameras.len() as f64
 }
 
-fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[DVec3]) -> State {
+pub(super) fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[DVec3]) -> State {
     let turned =
         |q: DQuat, by: &[f64]| (q * DQuat::from_scaled_axis(DVec3::from_slice(by))).normalize();
     let cameras = state.cameras.iter().zip(change.chunks(6)).map(|(pose, by)| {
@@ -327,6 +351,9 @@ pub(super) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     (!sorted.is_empty()).then(|| *sorted.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
+/// From a pixel to the least sigma, and some more.
+const MAX_NOISES: usize = 8;
+const SHARPER: f64 = 0.4;
 /// Far more than any problem that converges takes.
 const MAX_ROUNDS: usize = 60;
 /// Damping beyond which no step will help.

@@ -5,7 +5,7 @@ use glam::{DQuat, DVec3};
 use super::capture::Capture;
 use super::state::TagPlace;
 use super::{AdjustError, Known};
-use crate::align::corners::{Ray, meet};
+use crate::align::corners::{Ray, meet_within};
 use crate::align::points::{self, Pair};
 use crate::align::{AlignError, Similarity};
 
@@ -53,7 +53,7 @@ pub(super) fn triangulated(capture: &Capture, tag: usize) -> Option<[DVec3; 4]> 
     }
     let mut corners = [DVec3::ZERO; 4];
     for (corner, rays) in corners.iter_mut().zip(&rays) {
-        *corner = meet(rays)?.position;
+        *corner = meet_within(rays, START_RAD)?.position;
     }
     let edges = (0..4).map(|k| corners[k].distance(corners[(k + 1) % 4]));
     let (least, greatest) =
@@ -174,5 +174,7 @@ fn check(capture: &Capture) -> Result<(), AdjustError> {
 
 /// Before the adjustment, a pose is off by about this in a room. [m]
 const START_SIGMA_M: f64 = 0.02;
+/// And turned by about this. [rad]
+const START_RAD: f64 = 0.02;
 /// The lever of the tracked point needs the scale, and the other way round.
 const LEVER_ROUNDS: usize = 3;

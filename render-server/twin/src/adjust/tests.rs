@@ -1,1 +1,228 @@
 //! A synthetic hall: what is exact is found exactly, and bounds hold for what is not.
+
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Distortion, Pose};
+
+use super::normal::normal;
+use super::solve::Problem;
+use super::start::start;
+use super::state::{State, TagPlace, slopes};
+use super::synthetic::{Hall, hall};
+use super::*;
+use crate::align::points::{self, Pair};
+
+/// Returns the scale of the adjusted walk less 1, its tilt [rad], and how far cameras are off, root mean square [m].
+fn errors(hall: &Hall, adjusted: &Adjusted) -> (f64, f64, f64) {
+    let pairs: Vec<Pair> = adjusted
+        .world_from_cam
+        .iter()
+        .zip(&hall.poses)
+        .map(|(found, truth)| Pair { scene: truth.translation_m, world_m: found.translation_m })
+        .collect();
+    let to = points::fit(&pairs, 1e3).unwrap().world_from_scene;
+    let off2: f64 = pairs.iter().map(|pair| pair.scene.distance_squared(pair.world_m)).sum();
+    // How cameras are turned on the whole: their places, on a walk of a few metres, tell it worse.
+    let turns = adjusted.world_from_cam.iter().zip(&hall.poses).map(|(found, truth)| {
+        let turn = found.rotation * truth.rotation.conjugate();
+        (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
+    });
+    let tilt = (turns.sum::<DVec3>() / pairs.len() as f64).truncate().length();
+    (to.scale - 1.0, tilt, (off2 / pairs.len() as f64).sqrt())
+}
+
+#[test]
+fn exact_sightings_lead_back_to_the_truth() {
+    let hall = hall(1, 24, 2500, 0.0).as_found(2, 0.02);
+    let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+    let (scale, tilt, off_m) = errors(&hall, &adjusted);
+    assert!(scale.abs() < 1e-6 && tilt < 1e-6 && off_m < 1e-5, "{scale} {tilt} {off_m}");
+    assert!((adjusted.lens.fx_px / hall.lens.fx_px - 1.0).abs() < 1e-6, "{:?}", adjusted.lens);
+    let Distortion::BrownConrady { k1, k2, .. } = adjusted.lens.distortion else { panic!() };
+    assert!((k1 + 0.06).abs() < 1e-5 && (k2 - 0.02).abs() < 1e-5, "{k1} {k2}");
+    assert_eq!(adjusted.known, Known { scale: true, up: true, place: true });
+    for tag in adjusted.tags.iter().flatten() {
+        let held = tag.held_out.unwrap();
+        assert!(held.off_m.unwrap() < 1e-4 && tag.contradicting == 0, "{tag:?}");
+    }
+}
+
+#[test]
+fn bounds_hold_under_noise() {
+    let (mut outside, mut scales, mut sigmas) = (0, 0.0, 0.0);
+    for seed in 0..12 {
+        let hall = hall(seed, 24, 2000, 0.6).as_found(seed + 50, 0.01);
+        let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+        let (scale, tilt, off_m) = errors(&hall, &adjusted);
+        let (by_scale, by_tilt) = (adjusted.scale_sigma.unwrap(), adjusted.tilt_sigma_rad.unwrap());
+        outside += usize::from(scale.abs() > 3.0 * by_scale || tilt > 3.0 * by_tilt);
+        println!("{seed}: {:.2} {:.2}", scale / by_scale, tilt / by_tilt);
+        (scales, sigmas) = (scales + scale * scale, sigmas + by_scale * by_scale);
+        assert!(off_m < 0.02, "{seed}: {off_m}");
+        assert!((0.5..1.1).contains(&adjusted.points_rms_px), "{}", adjusted.points_rms_px);
+    }
+    assert!(outside <= 1, "{outside} of 12 beyond three sigmas");
+    // Not bounds that hold because they say nothing.
+    assert!(sigmas < 25.0 * scales, "sigma^2 {sigmas} for error^2 {scales}");
+}
+
+#[test]
+fn sizes_alone_give_metres_but_no_vertical() {
+    let mut hall = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    hall.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
+    let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+    assert_eq!(adjusted.known, Known { scale: true, up: false, place: false });
+    let (scale, _, _) = errors(&hall, &adjusted);
+    assert!(scale.abs() < 3.0 * adjusted.scale_sigma.unwrap() && scale.abs() < 0.01, "{scale}");
+    assert_eq!(adjusted.tilt_sigma_rad, None);
+    assert!(adjusted.tags.iter().flatten().all(|tag| tag.held_out.unwrap().off_m.is_none()));
+}
+
+#[test]
+fn a_vertical_and_tracked_places_are_held_to() {
+    let mut upright = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    upright.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
+    for (image, pose) in upright.capture.images.iter_mut().zip(&upright.poses) {
+        let direction = pose.rotation.conjugate() * DVec3::Z;
+        image.up = Some(Up { direction, sigma_rad: 0.01 });
+    }
+    let adjusted = adjust(&upright.capture, Options::default()).unwrap();
+    assert_eq!(adjusted.known, Known { scale: true, up: true, place: false });
+    let (_, tilt, _) = errors(&upright, &adjusted);
+    assert!(tilt < 3.0 * adjusted.tilt_sigma_rad.unwrap() && tilt < 0.01, "{tilt}");
+
+    let mut tracked = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    tracked.capture.tags.clear();
+    tracked.capture.tracked_in_cam_m = DVec3::new(0.05, -0.1, 0.02);
+    let lever_m = tracked.capture.tracked_in_cam_m;
+    for (number, (image, pose)) in tracked.capture.images.iter_mut().zip(&tracked.poses).enumerate()
+    {
+        image.tags.clear();
+        let mut position_m = pose.transform_point(lever_m);
+        // One that the motion capture lost.
+        position_m.x += if number == 7 { 0.5 } else { 0.0 };
+        image.place = Some(Place { position_m, sigma_m: 0.002 });
+    }
+    let adjusted = adjust(&tracked.capture, Options::default()).unwrap();
+    assert_eq!(adjusted.known, Known { scale: true, up: true, place: true });
+    let (scale, tilt, off_m) = errors(&tracked, &adjusted);
+    assert!(scale.abs() < 2e-3 && tilt < 2e-3 && off_m < 0.01, "{scale} {tilt} {off_m}");
+}
+
+#[test]
+fn without_anything_it_has_no_metres() {
+    let mut hall = hall(5, 24, 2500, 0.2).as_found(6, 0.01);
+    hall.capture.tags.clear();
+    hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
+    let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+    assert_eq!(adjusted.known, Known::default());
+    assert_eq!((adjusted.scale_sigma, adjusted.tilt_sigma_rad), (None, None));
+    assert!(adjusted.points_rms_px < 0.4, "{}", adjusted.points_rms_px);
+}
+
+#[test]
+fn the_same_on_any_number_of_threads() {
+    let hall = hall(7, 20, 600, 0.5).as_found(8, 0.01);
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| adjust(&hall.capture, Options::default()).unwrap())
+    };
+    assert_eq!(with(1), with(5));
+}
+
+#[test]
+fn what_cannot_be_meant_is_refused() {
+    let good = hall(9, 20, 600, 0.2).as_found(10, 0.01).capture;
+    let refused = |change: &dyn Fn(&mut Capture)| {
+        let mut capture = good.clone();
+        change(&mut capture);
+        adjust(&capture, Options::default()).unwrap_err()
+    };
+    let bad = |error| matches!(error, AdjustError::BadNumber(_));
+    assert!(bad(refused(&|c| c.points[3].x = f64::NAN)));
+    assert!(bad(refused(&|c| c.images[2].seen[0].point = 600)));
+    assert!(bad(refused(&|c| c.images[2].seen[0].pixel.y = f64::INFINITY)));
+    assert!(bad(refused(
+        &|c| c.images[1].scene_from_cam.rotation = DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0)
+    )));
+    assert!(bad(refused(&|c| c.tags[0].size_m = 0.0)));
+    assert!(bad(refused(&|c| c.lens.fx_px = -1.0)));
+    let few = refused(&|c| c.images.truncate(2));
+    assert!(matches!(few, AdjustError::TooLittle { images: 2, .. }), "{few}");
+    let empty = refused(&|c| c.images.iter_mut().for_each(|image| image.seen.clear()));
+    assert_eq!(empty, AdjustError::TooLittle { images: 20, points: 0 });
+}
+
+#[test]
+fn derivatives_by_poses_are_the_slopes_of_the_projection() {
+    let hall = hall(11, 20, 300, 0.0);
+    let (begin, _) = start(&hall.capture).unwrap();
+    let state = State::new(&hall.capture, &begin);
+    let h = 1e-6;
+    for (camera, image) in hall.capture.images.iter().enumerate() {
+        for seen in image.seen.iter().take(5) {
+            let p = state.points[seen.point];
+            let (here, p_cam) = state.see(camera, p).unwrap();
+            let found = slopes(&state.cameras[camera], &here.by_point, p_cam);
+            for axis in 0..3 {
+                let by = DVec3::AXES[axis] * h;
+                let along = |p: DVec3| state.see(camera, p).unwrap().0.pixel;
+                let slope = (along(p + by) - along(p - by)) / (2.0 * h);
+                assert!((slope - found.by_point[axis]).length() < 1e-3);
+                let moved = |shift: DVec3, turn: DVec3| {
+                    let mut state = state.clone();
+                    let pose = &mut state.cameras[camera];
+                    let q = pose.rotation * DQuat::from_scaled_axis(turn);
+                    *pose = Pose::new(pose.translation_m + shift, q);
+                    state.see(camera, p).unwrap().0.pixel
+                };
+                let zero = DVec3::ZERO;
+                let shift = (moved(by, zero) - moved(-by, zero)) / (2.0 * h);
+                assert!((shift - found.by_camera[axis]).length() < 1e-3);
+                let turn = (moved(zero, by) - moved(zero, -by)) / (2.0 * h);
+                assert!((turn - found.by_camera[3 + axis]).length() < 1e-3);
+            }
+        }
+    }
+}
+
+/// The gradient of tags, places and verticals by every unknown, against differences of what they cost.
+#[test]
+fn the_gradient_is_the_slope_of_the_cost() {
+    let mut hall = hall(12, 16, 300, 2.0);
+    hall.capture.tags.iter_mut().step_by(2).for_each(|tag| tag.corners_m = None);
+    hall.capture.tracked_in_cam_m = DVec3::new(0.1, 0.05, -0.2);
+    for image in &mut hall.capture.images {
+        image.place = Some(Place {
+            position_m: image.scene_from_cam.translation_m + DVec3::new(0.1, -0.02, 0.05),
+            sigma_m: 0.05,
+        });
+        let direction =
+            (image.scene_from_cam.rotation.conjugate() * DVec3::new(0.1, -0.05, 1.0)).normalize();
+        image.up = Some(Up { direction, sigma_rad: 0.05 });
+    }
+    let (begin, _) = start(&hall.capture).unwrap();
+    // Points would follow: without them, nothing is eliminated.
+    hall.capture.images.iter_mut().for_each(|image| image.seen.clear());
+    let mut state = State::new(&hall.capture, &begin);
+    for tag in &mut state.tags {
+        if let TagPlace::Found(t, q) = tag {
+            *t += DVec3::new(0.01, -0.02, 0.01);
+            *q *= DQuat::from_scaled_axis(DVec3::new(0.05, 0.1, -0.1));
+        }
+    }
+    let problem = Problem::new(&hall.capture, &state, true, &[]);
+    let found = normal(&problem, &state, 0.0).gradient;
+    assert!(problem.layout.tags.iter().any(Option::is_some));
+    let no_points = vec![DVec3::ZERO; state.points.len()];
+    let h = 1e-6;
+    for unknown in 0..problem.layout.size {
+        let cost = |by: f64| {
+            let mut change = vec![0.0; problem.layout.size];
+            change[unknown] = by;
+            problem.cost(&super::solve::stepped(&state, &problem.layout, &change, &no_points))
+        };
+        let slope = (cost(h) - cost(-h)) / (4.0 * h);
+        let off = (slope - found[unknown]).abs();
+        assert!(off < 1e-4 * (1.0 + slope.abs()), "{unknown}: {slope} {}", found[unknown]);
+    }
+}

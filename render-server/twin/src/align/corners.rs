@@ -34,12 +34,17 @@ pub struct Corner {
 /// Returns where rays meet; `None` where fewer than two do, or all look along one line. Rays that pass by where the
 /// others meet are left out.
 pub fn meet(rays: &[Ray]) -> Option<Corner> {
+    meet_within(rays, PASSES_BY_RAD)
+}
+
+/// As [`meet`], by rays that are known to an angle. [rad]
+pub fn meet_within(rays: &[Ray], passes_by_rad: f64) -> Option<Corner> {
     let mut used = rays.to_vec();
     loop {
         let position = nearest(&used)?;
         let worst = used.iter().map(|ray| ray.off_rad(position)).enumerate();
         let (index, off_rad) = worst.max_by(|(_, a), (_, b)| a.total_cmp(b))?;
-        if off_rad <= PASSES_BY_RAD {
+        if off_rad <= passes_by_rad {
             let squares: f64 = used.iter().map(|ray| ray.off_rad(position).powi(2)).sum();
             let rms_rad = (squares / used.len() as f64).sqrt();
             return Some(Corner { position, rms_rad, used: used.len() });

@@ -115,7 +115,7 @@ fn weakest(shared: &Shared, least: usize) -> Option<Vec<bool>> {
 
 /// Fewer images are not a part.
 const PART: usize = 3;
-/// Three points fix a similarity; of ten times as many, outliers among them, it is known well.
-const FEW: usize = 30;
+/// Three points fix a similarity; of several times as many, outliers among them, it is known well.
+const FEW: usize = 20;
 /// Known, though not as well as within the parts.
-const SOME: usize = 100;
+const SOME: usize = 60;

@@ -16,8 +16,23 @@ struct Step {
     turn_rad: f64,
 }
 
-/// Adds leaps and spins.
+/// Adds leaps and spins: of the walk as structure from motion left it, and if that has none, as tags have bent it.
 pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
+    let as_found = walk.as_found();
+    if !check_one(&as_found, verdict) && walk.evidence.adjusted.is_ok() {
+        verdict.checked.pop();
+        check_one(walk, verdict);
+    }
+}
+
+/// Returns whether it found any.
+fn check_one(walk: &Walk<'_>, verdict: &mut Verdict) -> bool {
+    let before = verdict.findings.len();
+    leaps(walk, verdict);
+    verdict.findings.len() > before
+}
+
+fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
     let steps = steps(walk);
     if steps.len() < FEW {
         verdict.checked.push("continuity: too few images with a time".to_owned());
@@ -48,7 +63,7 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
         })
         .collect();
     if found.is_empty() {
-        return;
+        return stands_out(walk, &steps, usual_speed, verdict);
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let name = |image: usize| &walk.evidence.capture.images[image].name;
@@ -73,6 +88,30 @@ pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
         remedy: format!(
             "film that part again in one go, slowly, with more of what is particular to the place in view: {when}"
         ),
+        images,
+    });
+}
+
+/// Adds steps that no step around them is like: a model that came apart and was put together again a little off.
+fn stands_out(walk: &Walk<'_>, steps: &[Step], usual_speed: f64, verdict: &mut Verdict) {
+    let alone: Vec<&Step> = steps
+        .windows(3)
+        .filter(|three| {
+            let around = three[0].speed.max(three[2].speed).max(usual_speed);
+            three[1].speed > ALONE * around
+        })
+        .map(|three| &three[1])
+        .collect();
+    if alone.is_empty() {
+        return;
+    }
+    let images = walk.runs(alone.iter().flat_map(|step| [step.to - 1, step.to]));
+    verdict.findings.push(Finding {
+        severity: Severity::Warning,
+        check: Check::Continuity,
+        what: format!("a step is much longer than those around it: {}", walk.spans(&images)),
+        remedy: "if nobody stepped out there, the walk was torn and joined again: film that part again, slowly"
+            .to_owned(),
         images,
     });
 }
@@ -109,6 +148,8 @@ const FEW: usize = 6;
 const USUAL: f64 = 0.75;
 /// Beyond so many times the usual speed is no step.
 const TIMES: f64 = 4.0;
+/// A step that is none of one's gait.
+const ALONE: f64 = 1.6;
 /// Whoever films slowly may still take a quick step. [m/s]
 const LEAST_LEAP_MPS: f64 = 1.5;
 /// Nobody films at a run. [m/s]

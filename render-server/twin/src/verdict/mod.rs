@@ -117,3 +117,6 @@ pub fn judge(evidence: &Evidence<'_>) -> Verdict {
     verdict.findings.sort_by_key(|finding| (finding.severity, finding.check));
     verdict
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,10 +1,11 @@
 //! Tags against the images: a tag stands in one place, and where others say it is.
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 use crate::adjust::{Adjusted, TagResult};
+use crate::align::corners::Ray;
 
 /// Adds tags that contradict the images, or each other.
 pub(super) fn check(walk: &Walk<'_>, verdict: &mut Verdict) {
@@ -59,20 +60,54 @@ fn somewhere_else(walk: &Walk<'_>, tag: usize, result: &TagResult, verdict: &mut
 /// Rays that should meet and do not.
 fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
     let images = images_of(walk, tag);
-    let places = || images.iter().map(|image| walk.poses[*image].translation_m);
-    let apart = places().flat_map(|a| places().map(move |b| a.distance(b))).fold(0.0, f64::max);
-    let middle = walk.poses.iter().map(|pose| pose.translation_m).sum::<DVec3>();
-    let middle = middle / walk.poses.len() as f64;
-    let reach2: f64 = walk.poses.iter().map(|p| p.translation_m.distance_squared(middle)).sum();
-    let reach = (reach2 / walk.poses.len() as f64).sqrt();
-    if images.len() < CONTRADICTING + 1 || apart < NEAR * reach {
+    let rays: Vec<Ray> = images
+        .iter()
+        .filter_map(|&image| {
+            let seen =
+                walk.evidence.capture.images[image].tags.iter().find(|seen| seen.tag == tag)?;
+            let middle_px = seen.corners_px.iter().sum::<DVec2>() / 4.0;
+            let slope = walk.lens.slope(middle_px)?;
+            let pose = &walk.poses[image];
+            let direction = (pose.rotation * slope.extend(1.0)).normalize();
+            Some(Ray { origin: pose.translation_m, direction })
+        })
+        .collect();
+    let (mut meet, mut pass) = (0usize, 0usize);
+    for (i, a) in rays.iter().enumerate() {
+        for b in &rays[i + 1..] {
+            match passes_by(a, b) {
+                Some(true) => pass += 1,
+                Some(false) => meet += 1,
+                None => {}
+            }
+        }
+    }
+    if images.len() < CONTRADICTING || pass == 0 || pass < meet / 4 {
         return;
     }
     let name = &walk.evidence.capture.tags[tag].name;
-    let what = format!("{name} is nowhere: the {} images that show it point apart", images.len());
+    let what = format!(
+        "{name} is nowhere: the {} images that show it point to different places",
+        images.len()
+    );
     let remedy = "look for another tag of the same number; if there is none, these images are in the wrong place: \
                   film there again, with more of what is particular to the place in view";
     add(walk, verdict, &[tag], what, remedy);
+}
+
+/// Whether two rays pass each other by, or would have met behind a camera; `None` of rays too parallel to tell.
+fn passes_by(a: &Ray, b: &Ray) -> Option<bool> {
+    let across = a.direction.cross(b.direction);
+    let sine2 = across.length_squared();
+    if sine2 < PARALLEL * PARALLEL {
+        return None;
+    }
+    let between = b.origin - a.origin;
+    // How far along each is nearest to the other.
+    let along_a = between.cross(b.direction).dot(across) / sine2;
+    let along_b = between.cross(a.direction).dot(across) / sine2;
+    let apart = between.dot(across).abs() / sine2.sqrt();
+    Some(along_a <= 0.0 || along_b <= 0.0 || apart > PASSES_BY * along_a.max(along_b))
 }
 
 fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
@@ -107,6 +142,19 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
         (line, results().filter(|(_, held)| is_wrong(held)).map(|(tag, _)| tag).collect())
     };
     verdict.checked.push(line.clone());
+    let mut sizes = size.clone();
+    sizes.sort_by(f64::total_cmp);
+    let usual = sizes[sizes.len() / 2];
+    if usual.abs() > MOST_USUAL_SIZE && sizes.len() >= CONTRADICTING {
+        let (much, how) = (100.0 * usual.abs(), if usual < 0.0 { "smaller" } else { "larger" });
+        let what = format!(
+            "tags are {much:.1} % {how} than they should be for the distances between them, in the middle of {}",
+            sizes.len()
+        );
+        let remedy = "measure the black edge of a print, and the distance between two tags: a printer that fits to the \
+                      page makes tags smaller";
+        add(walk, verdict, &results().map(|(tag, _)| tag).collect::<Vec<_>>(), what, remedy);
+    }
     if wrong.is_empty() {
         return;
     }
@@ -144,11 +192,15 @@ fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
 const CONTRADICTING: usize = 3;
 /// And few of them.
 const SHARE: f64 = 0.25;
-/// Of the reach of the walk: from places closer together rays are too parallel to meet.
-const NEAR: f64 = 0.1;
+/// Five degrees: rays that are more parallel do not say where they meet. [rad]
+const PARALLEL: f64 = 0.09;
+/// Of the distance: poses of a good capture are known ten times better. [rad]
+const PASSES_BY: f64 = 0.05;
 /// Beyond this a tag and the images around it contradict each other; good captures have a few centimetres. [m]
 const MOST_OFF_M: f64 = 0.15;
 /// Beyond this an edge is not what it was printed as.
 const MOST_SIZE: f64 = 0.1;
+/// Corners of tags that are 20 px wide are found to be 1 to 2 % too close together.
+const MOST_USUAL_SIZE: f64 = 0.04;
 /// Of an edge: no two tags hang closer together.
 const ONE_PLACE: f64 = 0.7;

@@ -52,6 +52,27 @@ impl<'a> Walk<'a> {
         }
     }
 
+    /// Returns it as structure from motion left it, in metres if they are known.
+    pub(super) fn as_found(&self) -> Self {
+        let evidence = self.evidence;
+        let scale = match evidence.adjusted {
+            Ok(adjusted) if self.is_metric => adjusted.world_from_scene.scale,
+            _ => 1.0,
+        };
+        let poses = evidence.capture.images.iter().map(|image| {
+            let pose = &image.scene_from_cam;
+            Pose::new(pose.translation_m * scale, pose.rotation)
+        });
+        Self {
+            evidence,
+            lens: evidence.capture.lens,
+            poses: poses.collect(),
+            points: &evidence.capture.points,
+            index: self.index.clone(),
+            is_metric: self.is_metric,
+        }
+    }
+
     pub(super) fn given(&self) -> &'a [Given] {
         self.evidence.given
     }
