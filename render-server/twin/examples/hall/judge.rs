@@ -85,32 +85,6 @@ pub(crate) fn judge(
         };
         voxels(grid).filter(inside).count()
     };
-    if std::env::var_os("LAYERS").is_some() {
-        for z in (0..high).step_by(2) {
-            let n = |g: &OccupancyGrid| voxels(g).filter(|v| v[2] / 2 == z / 2).count();
-            let near = |v: &[usize; 3], r: isize| {
-                (-r..=r).any(|a| {
-                    (-r..=r).any(|b| {
-                        (-r..=r).any(|c| {
-                            let w = [v[0] as isize + a, v[1] as isize + b, v[2] as isize + c];
-                            w.iter().zip(spec.grid.size).all(|(w, s)| *w >= 0 && (*w as usize) < s)
-                                && right.is_occupied(w.map(|w| w as usize))
-                        })
-                    })
-                })
-            };
-            let far =
-                |r: isize| voxels(&rebuilt).filter(|v| v[2] / 2 == z / 2 && !near(v, r)).count();
-            println!(
-                "z {:.2}: true {:6} rebuilt {:6} beyond 1 voxel {:6} beyond 3 {:6}",
-                spec.grid.center_m([0, 0, z]).z,
-                n(&right),
-                n(&rebuilt),
-                far(1),
-                far(3)
-            );
-        }
-    }
     let near_m = CarveOptions::default().camera_radius_m;
     let on_way = voxels(&rebuilt)
         .filter(|voxel| {
