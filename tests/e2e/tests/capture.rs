@@ -89,11 +89,11 @@ fn write_model(
         "1 OPENCV {} {} {} {} {} {} {k1} {k2} {p1} {p2}\n",
         k.width_px, k.height_px, k.fx_px, k.fy_px, k.cx_px, k.cy_px
     );
-    let points_m: Vec<DVec3> = (0..1500)
+    let points_m: Vec<DVec3> = (0..6000)
         .map(|i| {
             DVec3::new(
-                6.0 + 9.0 * noise(3 * i),
-                5.0 * noise(3 * i + 1),
+                6.0 + 11.0 * noise(3 * i),
+                7.0 * noise(3 * i + 1),
                 1.5 + 1.5 * noise(3 * i + 2),
             )
         })
@@ -113,7 +113,7 @@ fn write_model(
         for (id, &p_m) in points_m.iter().enumerate() {
             // The room bends with the poses, as it does where structure from motion errs.
             let p_cam = pose.inverse().transform_point(p_m);
-            let far = !(0.3..6.0).contains(&p_cam.z);
+            let far = !(0.3..7.0).contains(&p_cam.z);
             let Some(pixel) = k.project(p_cam).filter(|_| !far) else { continue };
             let size = DVec2::new(f64::from(k.width_px), f64::from(k.height_px));
             if pixel.cmplt(DVec2::ZERO).any() || pixel.cmpgt(size).any() {
@@ -255,7 +255,7 @@ fn what_cannot_be_captured_is_explained() {
         "--frames",
         "3",
         "--size",
-        "64x48",
+        "64x64",
     ];
     let (ok, said) = run(home, &film);
     assert!(ok, "{said}");
