@@ -8,8 +8,8 @@ use serde::Serialize;
 use toml_edit::{DocumentMut, Item, Table, value};
 use vizflyt_arena::check::check_start;
 use vizflyt_arena::seen::ScenePlace;
-use vizflyt_arena::{ArenaConfig, BakeSpec, Obstacles, SeenSpace};
-use vizflyt_server::scene::{Placement, Seen, bake_with, scene_hash, seen_path};
+use vizflyt_arena::{ArenaConfig, BakeSpec, Obstacles};
+use vizflyt_server::scene::{Placement, Seen, bake_with, write_seen};
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{self, Format};
 use vizflyt_twin::Dataset;
@@ -165,11 +165,7 @@ pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
         keep_first(&scene)?;
         format::write(&scene, &carved.splats)?;
     }
-    let hash = scene_hash(&scene).with_context(|| format!("cannot read {}", scene.display()))?;
-    let space = SeenSpace::new(grid, place, hash, carved.seen.bits);
-    let seen_file = seen_path(&scene);
-    std::fs::write(&seen_file, space.to_bytes())
-        .with_context(|| format!("cannot write {}", seen_file.display()))?;
+    let seen = write_seen(&scene, grid, place, carved.seen.bits)?;
     let solid = with_unseen_solid(&text)?;
     ArenaConfig::parse(&solid).context("the arena would not be read again")?;
     std::fs::write(&file, solid).with_context(|| format!("cannot write {}", file.display()))?;
@@ -179,7 +175,6 @@ pub(crate) fn carve_arena(args: &CarveArgs) -> Result<CarveReport> {
         Placement::of(&arena.scene).apply(&mut placed);
         placed
     };
-    let seen = Seen { space, place };
     let seen_of_fence = seen_of_fence(&seen, &arena);
     let before = bake_with(&placed(&splats), &spec, None, None, &|_| ());
     let after = bake_with(&placed(&carved.splats), &spec, Some(&seen), None, &|_| ());

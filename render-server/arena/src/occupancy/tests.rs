@@ -142,3 +142,57 @@ proptest! {
         prop_assert!(field.obstacle_distance_m(DVec3::ZERO).is_finite());
     }
 }
+
+#[test]
+fn unseen_space_is_solid_where_it_is_asked_for() {
+    use crate::config::SceneConfig;
+    use crate::seen::{ScenePlace, SeenSpace};
+
+    let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
+    // West of x = 1 all was seen, but a pocket; east of it nothing but a bubble.
+    let is_seen = |p: DVec3| {
+        let (pocket, bubble) = (DVec3::new(-1.0, 0.0, 1.5), DVec3::new(1.5, 0.0, 1.5));
+        if p.x < 1.0 { p.distance(pocket) > 0.3 } else { p.distance(bubble) < 0.2 }
+    };
+    let [_, ny, nz] = grid.size;
+    let mut bits = vec![0u8; grid.voxels().div_ceil(8)];
+    for n in 0..grid.voxels() {
+        let center_m = grid.center_m([n / (ny * nz), n / nz % ny, n % nz]);
+        bits[n / 8] |= u8::from(is_seen(center_m)) << (n % 8);
+    }
+    let place = ScenePlace::of(&SceneConfig::in_world("a.ply"));
+    let seen = SeenSpace::new(grid, place, [0; 32], bits);
+    // A post that reaches into what was not seen, east of x = 1.
+    let post: Vec<Ellipsoid> = (0..60)
+        .flat_map(|layer| {
+            let at = DVec3::new(0.9, 1.0, f64::from(layer) * 0.05 + 0.025);
+            [disc(at, DVec3::X, 0.05), disc(at + DVec3::X * 0.2, DVec3::X, 0.05)]
+        })
+        .collect();
+    let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
+    let without = OccupancyGrid::bake(post.iter().copied(), &spec).counts();
+    assert_eq!(without.unseen, 0);
+    let baked = OccupancyGrid::bake_with(post, &spec, Some(seen.at(&place)), &|_| ());
+    let counts = baked.counts();
+    // What splats occupy stays theirs; a seen bubble within the unseen is as good as unseen.
+    assert_eq!(counts.occupied - counts.unseen, without.occupied);
+    assert!(counts.enclosed > 100, "{counts:?}");
+    let field = DistanceField::of(baked);
+    assert_eq!(field.unseen_voxels(), counts.unseen);
+    let at = |x: f64, y: f64, z: f64| {
+        let p_m = DVec3::new(x, y, z);
+        (field.obstacle_distance_m(p_m) < 0.0, field.is_unseen_nearest(p_m, 0.3))
+    };
+    assert_eq!(at(-1.0, 0.0, 1.5), (true, true), "the pocket");
+    assert_eq!(at(1.5, 0.0, 1.5), (true, true), "the bubble");
+    assert_eq!(at(0.9, 1.0, 1.5), (true, false), "the post");
+    assert_eq!(at(0.0, -1.0, 1.5), (false, false), "seen, and far from all");
+    assert_eq!(at(0.9, 0.0, 1.5), (false, true), "seen, beside the unseen");
+    // The band above the floor is as what is above it.
+    assert_eq!((at(0.0, -1.0, 0.1).0, at(1.5, -1.0, 0.1)), (false, (true, true)));
+    // Bytes keep it.
+    let (header, codes, unseen) = field.as_bytes();
+    let bytes = [&header[..], codes, unseen].concat();
+    assert_eq!(DistanceField::from_bytes(&bytes), Ok(field.clone()));
+    assert!(DistanceField::from_bytes(&bytes[..bytes.len() - 1]).is_err());
+}

@@ -351,3 +351,48 @@ fn an_imu_left_out_is_put_down_to_a_turned_frame_or_to_shaking() {
     assert!(told.contains("turned against the autopilot"), "{told}");
     assert!(told.ends_with("or does the vehicle shake?"), "it fits: {told}");
 }
+
+/// The room without a post, of which only what lies west of x = 6 m was seen.
+fn half_seen(config: &ArenaConfig) -> DistanceField {
+    use crate::seen::{ScenePlace, SeenSpace};
+    let spec = BakeSpec::of(config);
+    let (grid, [_, ny, nz]) = (spec.grid, spec.grid.size);
+    let mut bits = vec![0u8; grid.voxels().div_ceil(8)];
+    for n in 0..grid.voxels() {
+        let center_m = grid.center_m([n / (ny * nz), n / nz % ny, n % nz]);
+        bits[n / 8] |= u8::from(center_m.x < 6.0) << (n % 8);
+    }
+    let place = ScenePlace::of(&config.scene);
+    let seen = SeenSpace::new(grid, place, [0; 32], bits);
+    DistanceField::of(OccupancyGrid::bake_with([], &spec, Some(seen.at(&place)), &|_| ()))
+}
+
+#[test]
+fn who_flies_where_nobody_has_looked_has_hit_unseen_space() {
+    let config = arena();
+    let mut referee = Referee::new(&config, half_seen(&config));
+    let events = fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [8., 0., 1.]], 2.0, 1.0);
+    let [Event { kind: EventKind::Collision(collision), text, .. }] = &events[..] else {
+        panic!("{events:?}");
+    };
+    assert_eq!(collision.with, Obstacle::Unseen);
+    assert!((collision.p_world_m.x - (6.0 - 0.12)).abs() < 0.1, "{collision:?}");
+    assert!(text.contains("space that the capture has not seen"), "{text}");
+}
+
+#[test]
+fn a_goal_and_a_start_box_that_nobody_has_seen_are_found() {
+    let mut config = arena();
+    config.rules.start_box = Some(crate::config::Geofence {
+        min_m: DVec3::new(5.5, -0.5, 0.4),
+        max_m: DVec3::new(6.5, 0.5, 1.0),
+    });
+    let checked = crate::check::check(&config, &half_seen(&config).into());
+    let keys: Vec<&str> = checked.findings.iter().map(|finding| finding.key.as_str()).collect();
+    assert_eq!(keys, ["rules.start_box", "goal.position_m"]);
+    assert!(checked.findings[0].text.starts_with("50 % of the start box"), "{checked:?}");
+    // And so is a start.
+    config.spawn.position_m.x = 7.0;
+    let checked = crate::check::check(&config, &half_seen(&config).into());
+    assert!(checked.findings[0].text.contains("touches unseen space"), "{checked:?}");
+}

@@ -28,7 +28,7 @@ pub use core::{bounds, core};
 pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
 pub use placement::{Placement, WorldFromScene};
-pub use seen::{Seen, scene_hash, seen_path};
+pub use seen::{Seen, scene_hash, seen_path, write_seen};
 pub use vizflyt_arena::config::Up;
 
 use std::path::{Path, PathBuf};

@@ -5,7 +5,7 @@ use vizflyt_arena::{ArenaConfig, BakeSpec, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::{CpuRenderer, Splats};
 use vizflyt_twin::Dataset;
 use vizflyt_twin::align::Similarity;
-use vizflyt_twin::carve::{CarveOptions, Carved, Voxels};
+use vizflyt_twin::carve::{CarveOptions, Carved, Seen, Voxels};
 
 use crate::capture::{Capture, depth_m, render};
 
@@ -21,6 +21,8 @@ pub(crate) struct Verdict {
     /// Occupied voxels within the fence, where vehicles fly, and those baked from the true splats.
     pub(crate) within_fence: usize,
     pub(crate) truly_within_fence: usize,
+    /// As `occupied`, of those beside what was seen to be free, which a vehicle can meet; NaN before carving.
+    pub(crate) beside_seen: f64,
     /// Occupied voxels in which the camera itself has been.
     pub(crate) on_way: usize,
     /// Of the photos' truth, without exposure.
@@ -44,6 +46,7 @@ pub(crate) fn judge(
     truth: &Splats,
     arena: &ArenaConfig,
     capture: &Capture,
+    seen: Option<&Seen>,
     only: impl Fn(usize) -> bool,
 ) -> Verdict {
     let mut renderer = CpuRenderer::new(splats);
@@ -85,32 +88,17 @@ pub(crate) fn judge(
         };
         voxels(grid).filter(inside).count()
     };
-    if std::env::var_os("LAYERS").is_some() {
-        for z in (0..high).step_by(2) {
-            let n = |g: &OccupancyGrid| voxels(g).filter(|v| v[2] / 2 == z / 2).count();
-            let near = |v: &[usize; 3], r: isize| {
-                (-r..=r).any(|a| {
-                    (-r..=r).any(|b| {
-                        (-r..=r).any(|c| {
-                            let w = [v[0] as isize + a, v[1] as isize + b, v[2] as isize + c];
-                            w.iter().zip(spec.grid.size).all(|(w, s)| *w >= 0 && (*w as usize) < s)
-                                && right.is_occupied(w.map(|w| w as usize))
-                        })
-                    })
+    let beside_seen = |grid: &OccupancyGrid| {
+        let beside = |voxel: &[usize; 3]| {
+            let around = (0..27).map(|n| [n / 9, n / 3 % 3, n % 3]).map(|offset| {
+                std::array::from_fn::<usize, 3, _>(|k| {
+                    (voxel[k] + offset[k]).saturating_sub(1).min(spec.grid.size[k] - 1)
                 })
-            };
-            let far =
-                |r: isize| voxels(&rebuilt).filter(|v| v[2] / 2 == z / 2 && !near(v, r)).count();
-            println!(
-                "z {:.2}: true {:6} rebuilt {:6} beyond 1 voxel {:6} beyond 3 {:6}",
-                spec.grid.center_m([0, 0, z]).z,
-                n(&right),
-                n(&rebuilt),
-                far(1),
-                far(3)
-            );
-        }
-    }
+            });
+            seen.is_some_and(|seen| around.clone().any(|near| seen.is_seen(near)))
+        };
+        voxels(grid).filter(beside).count() as f64
+    };
     let near_m = CarveOptions::default().camera_radius_m;
     let on_way = voxels(&rebuilt)
         .filter(|voxel| {
@@ -121,6 +109,7 @@ pub(crate) fn judge(
         .count();
     Verdict {
         on_way,
+        beside_seen: beside_seen(&rebuilt) / beside_seen(&right),
         psnr_db: -10.0 * (squares.0 / squares.1.max(1) as f64).log10(),
         depth_median: f64::from(errors[errors.len() / 2]),
         within_tenth: share,

@@ -16,7 +16,7 @@ use std::path::PathBuf;
 
 use vizflyt_scenes::{SceneKind, film_set, generate};
 use vizflyt_splat::{CpuRenderer, Splats};
-use vizflyt_twin::carve::CarveCounts;
+use vizflyt_twin::carve::{CarveCounts, Seen};
 use vizflyt_twin::{Dataset, Options, Trainer};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -73,8 +73,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         None => train(&dataset, options)?,
     };
     let only = |i: usize| i.is_multiple_of(options.hold_out);
-    let judge = |splats: &Splats| judge::judge(splats, &scene.splats, &scene.arena, &capture, only);
-    print(&judge(&splats));
+    let judge = |splats: &Splats, seen: Option<&Seen>| {
+        judge::judge(splats, &scene.splats, &scene.arena, &capture, seen, only)
+    };
+    print(&judge(&splats, None));
     let carved = judge::carve(&dataset, &splats, &scene.arena);
     let CarveCounts { looked_through, on_path, seen, voxels, seconds, .. } = carved.counts;
     println!(
@@ -83,7 +85,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         100.0 * seen as f64 / voxels as f64
     );
     let splats = carved.splats;
-    print(&judge(&splats));
+    print(&judge(&splats, Some(&carved.seen)));
     if let Some(path) = sheet {
         draw(&splats, &capture, &path)?;
     }
@@ -125,8 +127,13 @@ fn print(verdict: &judge::Verdict) {
         verdict.psnr_db
     );
     println!(
-        "obstacles    {:.2} times the true voxels; within the fence {} where {} are true; {} on the way",
-        verdict.occupied, verdict.within_fence, verdict.truly_within_fence, verdict.on_way
+        "obstacles    {:.2} times the true voxels, {:.2} of those beside what was seen; within the fence {} where {} are \
+         true; {} on the way",
+        verdict.occupied,
+        verdict.beside_seen,
+        verdict.within_fence,
+        verdict.truly_within_fence,
+        verdict.on_way
     );
 }
 

@@ -6,8 +6,9 @@
 //! $ cargo run --release -p vizflyt-twin --example verdict -- room3/ room3/sparse/0 room3/sparse/1
 //! ```
 //! The first model is judged, the others are second opinions. `--tags none|sizes|layout` (the default) says what is
-//! known of the tags; `--record FILE` writes sightings of tags, as tests read them.
+//! known of the tags; `--record FOLDER` writes the capture, thinned, as tests read it.
 
+mod record;
 mod truth;
 
 use std::collections::BTreeMap;
@@ -60,10 +61,10 @@ fn main() -> Result<ExitCode, Failure> {
     if mode != "none" {
         let layout = TagLayout::read(&folder.join("tags.toml"))?;
         let sightings = sightings(folder, &layout, &given, &capture.lens)?;
-        if let Some(path) = record {
-            std::fs::write(path, serde_json::to_string(&sightings)?)?;
-        }
         add_tags(capture, &layout, &sightings, mode == "layout");
+    }
+    if let Some(folder) = record {
+        record::record(Path::new(&folder), capture, &truth)?;
     }
     let begun = Instant::now();
     let adjusted = adjust::adjust(capture, Options::default());

@@ -19,6 +19,13 @@ pub(crate) struct TrueImage {
     pose: Pose<World, Cam>,
 }
 
+impl TrueImage {
+    /// Returns where it was taken from, to a millimetre. [m, world]
+    pub(crate) fn position_m(&self) -> [f64; 3] {
+        self.pose.translation_m.to_array().map(|x| (x * 1e3).round() / 1e3)
+    }
+}
+
 #[derive(Deserialize)]
 struct File {
     images: Vec<Row>,

@@ -153,3 +153,6 @@ fn keep(splats: &mut Splats, stays: &[bool]) {
 const LEAST_PIXELS: f32 = 1.0;
 /// Behind a floater may be another.
 const ROUNDS: usize = 3;
+
+#[cfg(test)]
+mod tests;

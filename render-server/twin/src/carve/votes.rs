@@ -17,6 +17,9 @@ pub(super) fn looked_through(
     depth_error: f32,
 ) -> Vec<bool> {
     let vote = |i: usize| {
+        let [a, b, c] = splats.scales_m[i].to_array();
+        // Of the middle axis: the shorter side of what it looks like, from one deviation to the other.
+        let width = 2.0 * a.max(b).min(a.max(c)).min(b.max(c));
         let (mut through, mut stopped) = (0u32, 0u32);
         for (photo, depths) in dataset.photos.iter().zip(&depths.photos) {
             let view = &photo.view;
@@ -26,7 +29,8 @@ pub(super) fn looked_through(
             }
             let pixel = y as usize * view.width + x as usize;
             if depths.free[pixel] > z + slack {
-                through += 1;
+                // Rays pass beside what is thinner than a pixel.
+                through += u32::from(width * view.focal[0] >= z);
             } else if (depths.surface[pixel] - z).abs() <= slack + depth_error * z {
                 stopped += 1;
             }

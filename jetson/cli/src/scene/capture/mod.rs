@@ -244,6 +244,7 @@ fn make(
     for finding in &finished.findings {
         print_fmt!("warning     {finding}");
     }
+    let can_start = finished.findings.is_empty();
     record.finished = Some(finished);
     let files = work.folder(Stage::Finish);
     for name in ["scene.ply", "scene.ply.seen"] {
@@ -258,7 +259,15 @@ fn make(
             args.output.join("scene.ply").display()
         );
     }
-    Ok(fit_to_fly)
+    if fit_to_fly && !can_start {
+        let arena = args.output.join("arena.toml");
+        print_fmt!(
+            "by hand     correct {}, then: vizflyt arena check {}",
+            arena.display(),
+            args.output.display()
+        );
+    }
+    Ok(fit_to_fly && can_start)
 }
 
 /// Copies what a stage made to where people look for it.

@@ -38,6 +38,9 @@ fn verdict(page: &mut String, record: &Record) {
     let (class, word) = match (record.fit_to_fly, &record.metric) {
         (true, _) => ("go", "It can be flown."),
         (false, Some(metric)) if !metric.fit_to_fly => ("no", "It is refused."),
+        (false, Some(_)) if record.finished.is_some() => {
+            ("no", "Its place is right, its start is not: correct arena.toml.")
+        }
         _ => ("no", "It is not done."),
     };
     let _ = write!(page, "<p class=\"verdict {class}\">{word}</p>");

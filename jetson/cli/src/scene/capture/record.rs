@@ -55,8 +55,9 @@ impl Record {
 
     /// Writes `capture.json` and `report.html`.
     pub(super) fn write(&mut self, output: &Path, work: &Work) -> Result<()> {
-        self.fit_to_fly =
-            self.finished.is_some() && self.metric.as_ref().is_some_and(|metric| metric.fit_to_fly);
+        let is_right = self.metric.as_ref().is_some_and(|metric| metric.fit_to_fly);
+        let can_start = self.finished.as_ref().is_some_and(|f| f.findings.is_empty());
+        self.fit_to_fly = is_right && can_start;
         let points = self.points(work)?;
         let page = page::html(self, &points, &work.folder(Stage::Train));
         for (name, text) in

@@ -8,8 +8,8 @@ use std::collections::VecDeque;
 
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_race::Race;
-use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{CourseProject, Level};
+use vizflyt_scenes::{Generated, Variant};
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::protocol::geometry::Object;
 use vizflyt_sdk::{
@@ -42,14 +42,24 @@ impl Outcome {
 
 /// Flies a project's course of a seed: through its last stage, into something, or for `limit_s`.
 /// `watch` is given every image, its time [s] and where its camera was [m, home].
+#[allow(dead_code, reason = "the rehearsal takes a place of its own")]
 pub(crate) fn fly(
     project: &str,
     seed: u64,
     limit_s: f64,
-    mut watch: impl FnMut(f64, &Race, DVec3, &RgbdImage),
+    watch: impl FnMut(f64, &Race, DVec3, &RgbdImage),
 ) -> Outcome {
     let project = CourseProject::named(project).expect("a project of the course");
-    let mut generated = project.generate(seed, Level::Ug, Variant::DAY);
+    fly_in(project.generate(seed, Level::Ug, Variant::DAY), seed, limit_s, watch)
+}
+
+/// As [`fly`], in any place; its splats may be others than those that its truth was made for.
+pub(crate) fn fly_in(
+    mut generated: Generated,
+    seed: u64,
+    limit_s: f64,
+    mut watch: impl FnMut(f64, &Race, DVec3, &RgbdImage),
+) -> Outcome {
     let movers = MovingObjects::new(&generated.arena, seed);
     generated.truth.retain(is_near);
     let scene = Scene { splats: &generated.splats, objects: &generated.objects };

@@ -4,8 +4,8 @@
 //! perceptual blur metric", SPIE 6492, 2007: what is sharp loses much of its differences between neighbours when it is
 //! blurred again, what is blurred already loses little.
 
-/// Returns how blurred an image of H x W grey levels is along the direction in which it is more so, from 0 (sharp) to
-/// 1; 1 of an image of one grey.
+/// Returns how blurred an image of H x W grey levels is, the mean of across and down, from 0 (sharp) to 1; 1 of an image
+/// of one grey. The paper takes the greater of both, which hides a drag across what is less sharp down by itself.
 pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
     assert_eq!(grey.len(), width * height, "an image of another size");
     // Noise differs from pixel to pixel, as no edge does: the mean over squares keeps edges, and less of it.
@@ -27,7 +27,7 @@ pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
     }
     let across = along(small_width, small_height, |x, y| small[y * small_width + x]);
     let down = along(small_height, small_width, |y, x| small[y * small_width + x]);
-    across.max(down)
+    (across + down) / 2.0
 }
 
 /// Returns the blur along the first coordinate, of `length` values in each of `lines`.

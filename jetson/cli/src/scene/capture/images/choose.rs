@@ -88,9 +88,9 @@ fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
 const PER_SECOND: f64 = 3.0;
 /// Share of a part that is looked at.
 const MIDDLE: f64 = 2.0 / 3.0;
-/// So much more than usual is more blur than texture tells: 8 px of drag at 320 px of width add 0.15
+/// So much more than usual is more blur than texture tells: 8 px of drag at 320 px of width add 0.09 to 0.16
 /// (`blur::tests`).
-const BLURRED: f64 = 0.12;
+const BLURRED: f64 = 0.1;
 /// More light from one picture to the next than people walk through.
 const JUMP: f64 = 1.6;
 /// Longer lists are not read.

@@ -2,8 +2,8 @@
 
     python find_poses.py IMAGES PAIRS FOLDER MODELS LENS PARAMETERS
 
-IMAGES is a folder; PAIRS a file with two names a line. FOLDER takes the database, MODELS a folder 0, 1, ... of each model
-that was found. LENS is COLMAP's name of one, PARAMETERS its numbers with commas, or '' to find them.
+IMAGES is a folder; PAIRS a file with two names a line. FOLDER takes the database, MODELS a folder 0, 1, ... of each
+model that was found. LENS is COLMAP's name of one, PARAMETERS its numbers with commas, or '' to find them.
 """
 
 import sys
@@ -18,13 +18,12 @@ def main(images: str, pairs: str, folder: str, models: str, lens: str, parameter
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = lens
     reader.camera_params = parameters
-    extraction = pycolmap.FeatureExtractionOptions() if hasattr(pycolmap, "FeatureExtractionOptions") else None
-    options = {}
-    if extraction is not None:
-        extraction.sift.max_num_features = 4096
-        options["extraction_options"] = extraction
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = 4096
     single = pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(database, images, camera_mode=single, reader_options=reader, **options)
+    pycolmap.extract_features(
+        database, images, camera_mode=single, reader_options=reader, extraction_options=extraction
+    )
 
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pairs

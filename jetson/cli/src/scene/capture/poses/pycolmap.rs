@@ -1,4 +1,4 @@
-//! COLMAP as a package of Python: `pip install pycolmap`, 3.11 and later.
+//! COLMAP as a package of Python: `pip install pycolmap`, 4.0 and later; 3.x has other names for what is asked here.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,11 +20,10 @@ impl Pycolmap {
     /// # Errors
     /// It has none.
     pub(super) fn open(python: &Path) -> Result<Self> {
-        let version =
-            ask(Command::new(python).args(["-c", "import pycolmap; print(pycolmap.__version__)"]));
+        let version = ask(Command::new(python).args(["-c", VERSION]));
         let version = version.with_context(|| {
             format!(
-                "{} has no pycolmap: {} -m pip install pycolmap",
+                "{} has no pycolmap of version 4: {} -m pip install pycolmap",
                 python.display(),
                 python.display()
             )
@@ -49,4 +48,7 @@ impl Finder for Pycolmap {
     }
 }
 
+/// Names that the script needs are asked for too.
+const VERSION: &str = "import pycolmap; pycolmap.FeatureExtractionOptions, pycolmap.match_image_pairs; \
+                       print(pycolmap.__version__)";
 const SCRIPT: &str = include_str!("find_poses.py");
