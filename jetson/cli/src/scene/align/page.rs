@@ -156,7 +156,7 @@ mod tests {
     const ARENA: &str = "name = \"hall\"\nscene = \"a.ply\" # captured\nbody_radius_m = 0.12\ntakeoff_height_m = 1.0\n\
         spawn = { position_m = [1, 1, 0] }\ngeofence = { min_m = [-1, -1, -0.5], max_m = [5, 4, 3] } # the net\n\
         limits = { max_speed_mps = 2.0, max_acceleration_mps2 = 4.0 }\n\
-        cameras = [{ name = \"front\", size_px = [64, 48], horizontal_fov_deg = 90, offset_m = [0, 0, 0] }]\n";
+        cameras = [{ name = \"front\", width_px = 64, height_px = 48, horizontal_fov_deg = 90, position_m = [0, 0, 0] }]\n";
 
     /// A floor of 4 by 3 m in a file of 2 m a unit, y down.
     fn picks() -> Picks {

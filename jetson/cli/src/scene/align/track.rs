@@ -76,6 +76,14 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
         p.z
     );
     check(&fit, p, path, capture)?;
+    // Of images whose lower edge was held downwards this is -1.
+    let down =
+        |camera: &CameraPose| (fit.world_from_scene.rotation * (camera.rotation * DVec3::Y)).z;
+    if cameras.iter().map(down).sum::<f64>() > -0.3 * cameras.len() as f64 {
+        print_fmt!(
+            "note        so the camera was held on its side; or is another axis of the track up (--track-up)?"
+        );
+    }
     ensure!(
         offset_s.abs() < max_offset_s - 0.05 || max_offset_s < 0.1,
         "the clocks differ by {offset_s:+.2} s, the most that was tried; give more by --max-offset-s"
@@ -221,7 +229,7 @@ fn counted(name: &str) -> String {
 }
 
 /// Structure from motion and a motion capture agree within 2 cm of a walk. [m]
-const MOST_LEFT_M: f64 = 0.06;
+const MOST_LEFT_M: f64 = 0.04;
 /// What is tracked is fixed to the camera, or to who carries it. [m]
 const ARM_M: f64 = 1.5;
 /// An hour at 1 kHz.

@@ -37,7 +37,7 @@ impl Place {
         let translation_m = DVec3::from_array(self.origin);
         let is_one = METRES_PER_UNIT.contains(&self.metres_per_unit)
             && (rotation.length() - 1.0).abs() < 1e-3
-            && translation_m.abs().max_element() <= FARTHEST_M;
+            && translation_m.abs().cmple(DVec3::splat(FARTHEST_M)).all();
         let rotation = rotation.normalize();
         is_one.then_some(WorldFromScene { scale: self.metres_per_unit, rotation, translation_m })
     }
