@@ -64,7 +64,7 @@ pub use access::{Access, Login, Logins, PageKeys, Takes};
 pub use login::set_password;
 pub use routes::list as routes;
 pub use stats::{ServerStages, VehicleStats};
-pub use view::{ViewArgs, view};
+pub use view::{ViewArgs, edit, view};
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};

@@ -8,6 +8,7 @@
 //! picture has come: the newest wins by itself, however slow the machine. One renderer serves all
 //! viewers in turn.
 
+mod edit;
 mod engine;
 
 use std::net::SocketAddr;
@@ -30,10 +31,11 @@ use tracing::debug;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
+use self::edit::{Panel, Session};
 use self::engine::{Engine, Picture, Request};
 use crate::lock::lock;
 use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
-use crate::scene::{self, Antialiased, BareArgs, Scene};
+use crate::scene::{self, Antialiased, BareArgs, Editor, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::{self, origin};
 
@@ -88,13 +90,35 @@ pub struct ViewArgs {
 /// A scene that cannot be used, an address that cannot be bound, no such renderer.
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+    serve_view(&args, None, open)
+}
+
+/// As [`view`], with the panel that edits the scene; it is saved to `output`.
+///
+/// # Errors
+/// As [`view`].
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
+pub fn edit(
+    args: ViewArgs,
+    editor: Editor,
+    output: PathBuf,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
+    serve_view(&args, Some((editor, output)), open)
+}
+
+fn serve_view(
+    args: &ViewArgs,
+    editing: Option<(Editor, PathBuf)>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("net")
         .enable_all()
         .build()
         .context("cannot start tokio")?;
-    let result = runtime.block_on(run(&args, open));
+    let result = runtime.block_on(run(args, editing, open));
     // Not awaited: a picture under way must not hold up the end.
     runtime.shutdown_background();
     result
@@ -104,6 +128,7 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
 struct ViewState {
     engine: Mutex<Engine>,
     welcome: Welcome,
+    edit: Option<Panel>,
     stop: Stop,
 }
 
@@ -121,35 +146,50 @@ struct Welcome {
     fence_m: [[f64; 3]; 2],
     /// How many objects move in it.
     objects: usize,
+    /// A script of ours that adds to the page.
+    tool: Option<&'static str>,
 }
 
-async fn run(args: &ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
+async fn run(
+    args: &ViewArgs,
+    editing: Option<(Editor, PathBuf)>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
     let stop = Stop::default();
     stop.on_signals(false)?;
     // First: a taken port is reported before the scene is loaded.
     let listener = web::bind(args.http, None, true)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
-    let load = tokio::task::spawn_blocking(move || prepare(&loading));
-    let (engine, welcome) = tokio::select! {
+    let load = tokio::task::spawn_blocking(move || prepare(&loading, editing));
+    let (engine, welcome, edit) = tokio::select! {
         prepared = load => prepared.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
-    let view = Arc::new(ViewState { engine: Mutex::new(engine), welcome, stop: stop.clone() });
+    let (engine, stopping) = (Mutex::new(engine), stop.clone());
+    let view = Arc::new(ViewState { engine, welcome, edit, stop: stopping });
+    let router = router(view).into_make_service_with_connect_info::<SocketAddr>();
     tokio::select! {
-        served = axum::serve(listener, router(view)) => served.context("the page's server failed"),
+        served = axum::serve(listener, router) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
     }
 }
 
-fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
-    let Scene { arena, mut splats, objects, world_from_scene } =
-        scene::load(&args.scene, &args.bare)?;
+fn prepare(
+    args: &ViewArgs,
+    editing: Option<(Editor, PathBuf)>,
+) -> Result<(Engine, Welcome, Option<Panel>)> {
+    let scene = match &editing {
+        Some((editor, _)) => scene::load_with(&args.scene, &args.bare, editor.splats().clone()),
+        None => scene::load(&args.scene, &args.bare),
+    };
+    let Scene { arena, mut splats, objects, world_from_scene } = scene?;
     args.antialiased.apply(&mut splats);
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
     let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
     let moving = MovingObjects::new(&arena, args.seed);
+    let placement = Placement::of(&arena.scene);
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;
     let welcome = Welcome {
@@ -160,8 +200,12 @@ fn prepare(args: &ViewArgs) -> Result<(Engine, Welcome)> {
         yaw_rad: arena.spawn.yaw_deg.to_radians(),
         fence_m: [arena.geofence.min_m.to_array(), arena.geofence.max_m.to_array()],
         objects: moving.len(),
+        tool: editing.is_some().then_some("/edit.js"),
     };
-    Ok((Engine::new(rasterizer, moving, world_from_scene), welcome))
+    let edit = editing.map(|(editor, output)| Panel {
+        session: Mutex::new(Session::new(editor, output, args.clone(), placement, objects)),
+    });
+    Ok((Engine::new(rasterizer, moving, world_from_scene), welcome, edit))
 }
 
 fn router(view: Arc<ViewState>) -> Router {
@@ -172,6 +216,7 @@ fn router(view: Arc<ViewState>) -> Router {
         .route("/view.js", get(async || file("text/javascript; charset=utf-8", SCRIPT)))
         .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
         .route("/ws", get(watch))
+        .merge(edit::routes())
         .with_state(view)
 }
 

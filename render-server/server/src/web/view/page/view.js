@@ -10,6 +10,16 @@ let playing = false; // The clock of what moves runs.
 let start = null, info = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
+let asked = null, hasTool = false;
+
+/** What a tool beside the view may use of it (edit.js). */
+export const view = {
+  canvas, eye, changed, announce,
+  /** Goes into every request. */
+  extra: {},
+  /** Each is called with a request and the description of its picture, once that is shown. */
+  listeners: [],
+};
 
 // ---- the connection --------------------------------------------------------------------------
 function connect() {
@@ -38,6 +48,8 @@ function handleMessage(message) {
       start = { p: message.start_m, yaw: message.yaw_rad };
       home();
     }
+    if (message.tool && !hasTool) import(message.tool);
+    hasTool ||= !!message.tool;
     waiting = false;
     stale = true;
     return;
@@ -60,6 +72,7 @@ async function show(data) {
   const middle = info.middle_m == null ? "" : ` · ${info.middle_m.toFixed(2)} m ahead`;
   $("where").textContent = `x ${eye.p[0].toFixed(2)}  y ${eye.p[1].toFixed(2)}  z ${eye.p[2].toFixed(2)} m${middle}`;
   $("figures").textContent = `${info.camera.w} × ${info.camera.h} in ${info.ms.toFixed(1)} ms · ${info.visible.toLocaleString("en")} splats in sight`;
+  for (const listener of view.listeners) listener(asked, info);
   document.body.dataset.pictures = +(document.body.dataset.pictures ?? 0) + 1;
   if (moving()) {
     // Some 20 pictures a second, as sharp as that allows.
@@ -76,10 +89,11 @@ function ask() {
   if (!start || waiting || socket?.readyState !== WebSocket.OPEN) return;
   if (!stale && wanted <= shownShare) return;
   const side = (length) => Math.max(16, Math.round(length * ratio() * wanted));
-  socket.send(JSON.stringify({
+  asked = {
     p_m: eye.p, yaw_rad: eye.yaw, pitch_rad: eye.pitch, fov_deg: eye.fov,
-    width_px: side(innerWidth), height_px: side(innerHeight), depth: eye.depth, at_s: eye.at_s,
-  }));
+    width_px: side(innerWidth), height_px: side(innerHeight), depth: eye.depth, at_s: eye.at_s, ...view.extra,
+  };
+  socket.send(JSON.stringify(asked));
   [waiting, stale, shownShare] = [true, false, wanted];
 }
 
