@@ -1,9 +1,10 @@
-//! `vizflyt scene`: makes, trains, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, trains, edits, bakes, inspects and renders scenes.
 
 mod align;
 mod bake;
 pub(crate) mod camera;
 mod convert;
+mod edit;
 mod generate;
 mod inspect;
 mod npy;
@@ -17,7 +18,7 @@ use clap::{Args, Subcommand};
 
 use crate::terminal::{open_browser, print_line};
 
-/// Makes, trains, bakes, inspects and renders scenes.
+/// Makes, trains, edits, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -30,6 +31,8 @@ enum SceneCommand {
     Align(align::AlignArgs),
     Bake(bake::BakeArgs),
     Convert(convert::ConvertArgs),
+    // Boxed: it has a flag for every kind of step.
+    Edit(Box<edit::EditArgs>),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
     Train(train::TrainArgs),
@@ -43,6 +46,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Generate(args) => generate::run(&args)?,
         SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
+        SceneCommand::Edit(args) => edit::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::Train(args) => train::run(&args)?,
