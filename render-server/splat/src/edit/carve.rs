@@ -60,13 +60,16 @@ impl Carve {
     /// Marks the splats that stay.
     ///
     /// # Errors
-    /// [`EditError::TooManyCells`], [`EditError::NoRoom`].
+    /// [`EditError::TooManyCells`], [`EditError::NothingAround`], [`EditError::NoRoom`].
     pub(super) fn seen(&self, splats: &Splats) -> Result<Vec<bool>, EditError> {
         let grid = Grid::of(self)?;
         let on_path = self.cells_of_path(&grid);
         let around_path = grid.grown(&on_path, grid.steps(self.radius));
         let mut occupied = grid.covered(splats);
         occupied.iter_mut().zip(&around_path).for_each(|(cell, free)| *cell &= !free);
+        if !occupied.contains(&1) {
+            return Err(EditError::NothingAround(self.path[0], self.reach));
+        }
         let blocked = grid.grown(&occupied, grid.steps(self.radius));
         let flooded = grid.flooded(&on_path, &blocked);
         if flooded.iter().zip(&around_path).all(|(free, known)| free <= known) {
@@ -170,27 +173,25 @@ impl Grid {
         let [nx, ny, nz] = self.size;
         let mut grown = field.to_vec();
         for (length, stride) in [(nz, 1), (ny, nz), (nx, ny * nz)] {
-            let mut line = vec![0; length];
-            for start in 0..self.len() / length {
-                // Lines start where the axis's coordinate is 0.
-                let start = start / stride * stride * length + start % stride;
-                let mut left = 0;
-                // Forth, then back: how far the last marked cell still counts.
-                for (k, cell) in line.iter_mut().enumerate() {
-                    left = if grown[start + k * stride] == 1 { steps + 1 } else { left };
-                    *cell = u8::from(left > 0);
-                    left = left.saturating_sub(1);
-                }
-                left = 0;
-                for k in (0..length).rev() {
-                    left = if grown[start + k * stride] == 1 { steps + 1 } else { left };
-                    line[k] |= u8::from(left > 0);
-                    left = left.saturating_sub(1);
-                }
-                for (k, cell) in line.iter().enumerate() {
-                    grown[start + k * stride] = *cell;
-                }
-            }
+            grown.par_chunks_exact_mut(length * stride).for_each(|block| {
+                // What is marked already is 1, what is marked now 2.
+                let mark = |row: &mut [u8], left: &mut [u32]| {
+                    for (cell, left) in row.iter_mut().zip(left) {
+                        if *cell == 1 {
+                            *left = steps as u32;
+                        } else if *left > 0 {
+                            *left -= 1;
+                            *cell = 2;
+                        }
+                    }
+                };
+                // Forth, then back: how far the last marked cell still counts, for each line along the axis.
+                let mut left = vec![0; stride];
+                block.chunks_exact_mut(stride).for_each(|row| mark(row, &mut left));
+                left.fill(0);
+                block.chunks_exact_mut(stride).rev().for_each(|row| mark(row, &mut left));
+                block.iter_mut().for_each(|cell| *cell = u8::from(*cell > 0));
+            });
         }
         grown
     }

@@ -26,11 +26,13 @@ impl Cells {
         let mut show = |p: DVec3| self.of(p).into_iter().for_each(&mut visit);
         show(center);
         let scales = splats.scales_m[index].as_dvec3();
-        // A third of a cell further the neighbour's splats are met.
-        if !(scales.max_element() > self.side / 3.0) {
+        if !(scales.max_element() > self.side / 2.0) {
             return;
         }
-        let steps = (scales / self.side * 1.5).ceil();
+        // A cell apart at most: no cell between two of them is left out.
+        let across =
+            |scale: f64| if scale > self.side / 2.0 { (scale / self.side).ceil() } else { 0.0 };
+        let steps = DVec3::from(scales.to_array().map(across));
         if !((steps * 2.0 + 1.0).element_product() <= MOST_COVERED) {
             return;
         }

@@ -102,6 +102,11 @@ pub enum EditError {
     /// A grid that takes too much memory.
     #[error(transparent)]
     TooManyCells(#[from] TooManyCells),
+    /// Nothing to be seen from the path.
+    #[error(
+        "carve: nothing solid is within {1} of {0:?}; points are in the scene's own axes and unit: compare `vizflyt scene inspect`"
+    )]
+    NothingAround([f64; 3], f64),
     /// No free space around the path.
     #[error(
         "carve: nothing can be reached from {0:?}: solid splats are all around; give a place with more room, or a smaller \

@@ -130,6 +130,8 @@ fn what_cannot_be_carved_is_said() {
     let said =
         |carve: Carve, scene: &mut Splats| Step::Carve(carve).apply(scene).unwrap_err().to_string();
     assert!(said(within, &mut scene).contains("more room"));
+    let elsewhere = carve(&[[100.0, 3.0, 1.5]]);
+    assert!(said(elsewhere, &mut scene).contains("nothing solid is within 10"));
     let fine = Carve { cell: 1e-3, ..carve(&[[4.0, 3.0, 1.0]]) };
     assert!(said(fine, &mut scene).contains("larger cells"));
     let nowhere = Carve { path: Vec::new(), ..carve(&[]) };

@@ -64,16 +64,16 @@ pub(crate) struct EditArgs {
     no_browser: bool,
     #[command(flatten)]
     steps: Requests,
-    /// How wide --carve's free space must be around the path, and in gaps [default: 4 cells]
+    /// How wide --carve's free space must be around the path, and in gaps [default: 2 cells]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_radius: Option<f64>,
-    /// How much --carve leaves of a wall, behind its face [default: 6 cells]
+    /// How much --carve leaves of a wall, behind its face [default: 3 cells]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_depth: Option<f64>,
-    /// Side of --carve's cells [default: a 60th of the core's shortest side]
+    /// Side of --carve's cells [default: a 30th of the core's shortest side]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_cell: Option<f64>,
-    /// How far --carve looks [default: the core's diagonal]
+    /// How far --carve looks [default: the core's longest side]
     #[arg(long, value_name = "LENGTH", requires = "carve")]
     carve_reach: Option<f64>,
 }

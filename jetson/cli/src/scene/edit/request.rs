@@ -41,7 +41,8 @@ impl Request {
             max - min
         };
         // A captured room is about 3 m high: cells of 5 cm.
-        let usual_cell = || rounded((size().min_element() / 60.0).max(1e-6));
+        let cell_of = |share: f64| rounded((size().min_element() / share).max(1e-6));
+        let usual_cell = || cell_of(60.0);
         match self {
             Self::Step(step) => step.clone(),
             Self::Floaters(cell, least) => {
@@ -51,13 +52,14 @@ impl Request {
                 Step::Parts { cell: cell.unwrap_or_else(usual_cell), keep: *keep }
             }
             Self::Carve(path) => {
-                let cell = carve.cell.unwrap_or_else(usual_cell);
+                // Coarser: a room takes two million.
+                let cell = carve.cell.unwrap_or_else(|| cell_of(30.0));
                 Step::Carve(Carve {
                     path: path.clone(),
-                    radius: carve.radius.unwrap_or_else(|| rounded(4.0 * cell)),
-                    depth: carve.depth.unwrap_or_else(|| rounded(6.0 * cell)),
+                    radius: carve.radius.unwrap_or_else(|| rounded(2.0 * cell)),
+                    depth: carve.depth.unwrap_or_else(|| rounded(3.0 * cell)),
                     cell,
-                    reach: carve.reach.unwrap_or_else(|| rounded(size().length())),
+                    reach: carve.reach.unwrap_or_else(|| rounded(size().max_element())),
                 })
             }
             Self::Share(share) => {

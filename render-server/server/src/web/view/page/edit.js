@@ -59,7 +59,7 @@ function show() {
   orders.undo.disabled = busy || !report?.steps.length;
   orders.save.disabled = busy || !report || report.saved;
   steps.replaceChildren(...(report?.steps ?? []).map((text) => make("li", { textContent: text })));
-  output.textContent = report ? `${report.saved ? "saved as" : "not saved yet:"} ${report.output}` : "";
+  output.textContent = report ? `${!report.saved ? "not saved yet:" : report.steps.length ? "saved as" : "saves to"} ${report.output}` : "";
 }
 
 // ---- the server ------------------------------------------------------------------------------
