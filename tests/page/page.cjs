@@ -443,6 +443,82 @@ async function align(browser) {
   await server.ended;
 }
 
+/** A scene is edited by hand: box and lasso, inverted, deleted, taken back, saved; its own file stays as it is. */
+async function edit(browser) {
+  const folder = path.join(scratch, "edited");
+  command("scene", "generate", "room", "--seed", "3", "-o", folder);
+  const scene = path.join(folder, "scene.ply"), original = fs.readFileSync(scene);
+  const server = start("scene", "edit", folder, "--page", "--no-browser", "--renderer", "cpu");
+  const [, url] = await server.line(/^page\s+(http\S+)/);
+  const page = await open(browser, url);
+  const counts = async () => (await text(page, "edit-counts")).match(/[\d,]+/g).map((word) => +word.replaceAll(",", ""));
+  /** Waits until the share of the picture that has about the colour of what is selected lies between two bounds; returns it. */
+  const orange = async (least, most) => {
+    const found = await page.waitForFunction(([least, most]) => {
+      const canvas = document.getElementById("picture");
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      let count = 0;
+      for (let k = 0; k < data.length; k += 4) count += data[k] > data[k + 2] + 60 && data[k] > data[k + 1] + 25;
+      const share = (count * 4) / data.length;
+      return share >= least && share <= most && [share];
+    }, [least, most], { polling: 200 });
+    return (await found.jsonValue())[0];
+  };
+  /** Does something, and waits until it is counted. */
+  const after = async (act, pattern) => {
+    await act();
+    await until(page, "edit-counts", pattern);
+  };
+  const drag = async (...corners) => {
+    await page.mouse.move(...corners[0]);
+    await page.mouse.down();
+    for (const corner of corners.slice(1)) await page.mouse.move(...corner, { steps: 8 });
+    await page.mouse.up();
+  };
+  await until(page, "edit-counts", /^0 of/);
+  await isPainted(page, "picture");
+  const [, all] = await counts();
+  // Posters and boxes have it, too.
+  const before = await orange(0, 0.1);
+  await page.locator("#edit-box").click();
+  await after(() => drag([420, 250], [900, 650]), /^[1-9]/);
+  const [boxed] = await counts();
+  assert.ok(boxed > 100 && boxed < all / 2, `${boxed} of ${all}`);
+  // The box is 0.15 of the picture; the floor and the walls in it are seen as selected, and nothing else is.
+  await orange(before + 0.08, before + 0.16);
+  await shot(page, "edit-box");
+  await after(() => page.locator("#edit-invert").click(), new RegExp(`^${(all - boxed).toLocaleString("en")} of`));
+  await after(() => page.locator("#edit-invert").click(), new RegExp(`^${boxed.toLocaleString("en")} of`));
+  await after(() => page.locator("#edit-delete").click(), /^0 of/);
+  assert.deepEqual(await counts(), [0, all - boxed]);
+  await orange(0, before + 0.03);
+  assert.ok(!fs.existsSync(`${scene}.edits.toml`), "nothing is written before it is saved");
+  await page.locator("#edit-lasso").click();
+  await after(() => drag([600, 300], [800, 320], [820, 500], [640, 520]), /^[1-9]/);
+  const [lassoed] = await counts();
+  await shot(page, "edit-lasso");
+  await page.keyboard.press("Delete");
+  await until(page, "edit-counts", new RegExp(`^0 of ${(all - boxed - lassoed).toLocaleString("en")} `));
+  await page.locator("#edit-undo").click();
+  await until(page, "edit-counts", new RegExp(`^0 of ${(all - boxed).toLocaleString("en")} `));
+  assert.equal(await page.locator("#edit-steps li").count(), 1);
+  await page.locator("#edit-save").click();
+  await until(page, "edit-output", /^saved/);
+  await shot(page, "edit-saved");
+  assert.ok(fs.readFileSync(scene).equals(original), "the original has changed");
+  assert.match(command("scene", "edit", folder, "--list"), new RegExp(`remove-lasso.*: ${boxed} splats away`));
+  const again = path.join(folder, "again.ply");
+  command("scene", "edit", folder, "--apply", "-o", again);
+  assert.ok(fs.readFileSync(path.join(folder, "scene.edited.ply")).equals(fs.readFileSync(again)));
+  // No other page edits.
+  const foreign = await fetch(`${url}/api/edit`, { method: "POST", body: '"undo"', headers: { origin: "http://evil.example" } });
+  assert.equal(foreign.status, 403);
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  server.child.kill("SIGTERM");
+  assert.equal(await server.ended, 0);
+}
+
 async function main() {
   if (shots) fs.mkdirSync(shots, { recursive: true });
   const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
@@ -450,7 +526,7 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  const wanted = [lab, flight, crash, leaderboard, align].filter(({ name }) => !only || name === only);
+  const wanted = [edit, lab, flight, crash, leaderboard, align].filter(({ name }) => !only || name === only);
   for (const test of wanted) {
     const began = Date.now();
     try {

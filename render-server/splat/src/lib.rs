@@ -38,6 +38,7 @@ mod blocks;
 pub mod builtin_models;
 mod camera;
 mod cpu;
+pub mod edit;
 mod fallback;
 pub mod format;
 #[cfg(feature = "gpu")]

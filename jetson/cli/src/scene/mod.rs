@@ -1,4 +1,4 @@
-//! `vizflyt scene`: makes, captures, trains, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, captures, trains, edits, bakes, inspects and renders scenes.
 
 mod align;
 mod bake;
@@ -6,6 +6,7 @@ pub(crate) mod camera;
 mod capture;
 mod carve;
 mod convert;
+mod edit;
 mod generate;
 mod inspect;
 mod npy;
@@ -20,7 +21,7 @@ use clap::{Args, Subcommand};
 
 use crate::terminal::{open_browser, print_line};
 
-/// Makes, trains, bakes, inspects and renders scenes.
+/// Makes, trains, edits, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -35,6 +36,8 @@ enum SceneCommand {
     Capture(capture::CaptureArgs),
     Carve(carve::CarveArgs),
     Convert(convert::ConvertArgs),
+    // Boxed: it has a flag for every kind of step.
+    Edit(Box<edit::EditArgs>),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
     Train(train::TrainArgs),
@@ -50,6 +53,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Bake(args) => bake::run(&args)?,
         SceneCommand::Carve(args) => carve::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
+        SceneCommand::Edit(args) => edit::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::Train(args) => train::run(&args)?,

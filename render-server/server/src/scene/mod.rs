@@ -14,6 +14,7 @@ mod bake;
 mod bare;
 mod choose;
 mod core;
+mod edit;
 mod fit;
 mod floor;
 mod objects;
@@ -25,6 +26,7 @@ pub use bake::{BakeCache, BakeKey, Baked, bake, bake_with, parse_kept};
 pub use bare::{BareArgs, default_arena, parse_scale, place};
 pub use choose::Scenes;
 pub use core::{bounds, core};
+pub use edit::{DoneStep, EditList, EditListError, Editor, list_path, read_list, result_path};
 pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
 pub use placement::{Placement, WorldFromScene};
@@ -74,6 +76,33 @@ pub fn load(path: &Path, bare: &BareArgs) -> Result<Scene> {
             with_arena(&path)
         }
         Named::Scene(path) => without_arena(&path, bare),
+    }
+}
+
+/// As [`load`], with splats in the place of those in the scene's file.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_with(path: &Path, bare: &BareArgs, splats: Splats) -> Result<Scene> {
+    match named(path)? {
+        Named::Arena(path) => {
+            bare.check_unused(&path)?;
+            let (arena, _) = parse_arena(&path)?;
+            // What was seen was seen of the scene's own file.
+            in_arena(arena, &path, splats, None)
+        }
+        Named::Scene(path) => in_the_open(&path, bare, splats),
+    }
+}
+
+/// Returns the scene file that a path names: an arena's, or itself.
+///
+/// # Errors
+/// There is none.
+pub fn scene_file(path: &Path) -> Result<PathBuf> {
+    match named(path)? {
+        Named::Arena(path) => Ok(parse_arena(&path)?.1),
+        Named::Scene(path) => Ok(path),
     }
 }
 
@@ -172,9 +201,18 @@ fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
 
 fn with_arena(path: &Path) -> Result<Scene> {
     let (arena, scene) = parse_arena(path)?;
-    let objects = read_objects(&arena, path)?;
     let seen = seen::read(&arena, &scene)?;
-    let mut splats = read(&scene)?.splats;
+    let splats = read(&scene)?.splats;
+    in_arena(arena, path, splats, seen)
+}
+
+fn in_arena(
+    arena: ArenaConfig,
+    path: &Path,
+    mut splats: Splats,
+    seen: Option<Seen>,
+) -> Result<Scene> {
+    let objects = read_objects(&arena, path)?;
     put(&arena, &mut splats)?;
     Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY, seen })
 }
@@ -201,7 +239,10 @@ fn read_objects(arena: &ArenaConfig, arena_toml: &Path) -> Result<Vec<RigidObjec
 }
 
 fn without_arena(path: &Path, bare: &BareArgs) -> Result<Scene> {
-    let mut splats = read(path)?.splats;
+    in_the_open(path, bare, read(path)?.splats)
+}
+
+fn in_the_open(path: &Path, bare: &BareArgs, mut splats: Splats) -> Result<Scene> {
     let file = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy();
     let scene = place(&splats, &file, bare);
     let world_from_scene = Placement::of(&scene).world_from_scene;

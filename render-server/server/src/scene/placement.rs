@@ -7,7 +7,7 @@
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::config::{Geofence, SceneConfig};
 use vizflyt_splat::Splats;
-use vizflyt_splat::harmonics::Turn;
+use vizflyt_splat::edit::transform;
 
 /// How a scene comes to lie in the world: moved there, then cropped.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,23 +48,8 @@ fn keep_within(splats: &mut Splats, crop: &Geofence) -> usize {
     };
     let keep: Vec<bool> = splats.means_m.iter().map(within).collect();
     let before = splats.len();
-    let numbers = splats.sh_coefficients() * 3;
-    retain(&mut splats.sh, &keep, numbers);
-    retain(&mut splats.means_m, &keep, 1);
-    retain(&mut splats.scales_m, &keep, 1);
-    retain(&mut splats.rotations, &keep, 1);
-    retain(&mut splats.opacities, &keep, 1);
+    splats.keep(&keep);
     before - splats.len()
-}
-
-/// Keeps the blocks of `width` values that are to be kept, in order.
-fn retain<T: Copy>(values: &mut Vec<T>, keep: &[bool], width: usize) {
-    let mut end = 0;
-    for (block, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
-        values.copy_within(block * width..(block + 1) * width, end);
-        end += width;
-    }
-    values.truncate(end);
 }
 
 /// A similarity: `p_world = scale * (rotation * p_scene) + translation`.
@@ -88,22 +73,7 @@ impl WorldFromScene {
         if *self == Self::IDENTITY {
             return;
         }
-        let rotation = self.rotation.as_quat();
-        for mean in &mut splats.means_m {
-            let p = self.rotation * mean.as_dvec3() * self.scale + self.translation_m;
-            *mean = p.as_vec3();
-        }
-        for scale in &mut splats.scales_m {
-            *scale *= self.scale as f32;
-        }
-        for axes in &mut splats.rotations {
-            *axes = (rotation * *axes).normalize();
-        }
-        let turn = Turn::new(self.rotation, splats.sh_degree);
-        let width = (usize::from(splats.sh_degree) + 1).pow(2) * 3;
-        for sh in splats.sh.chunks_exact_mut(width) {
-            turn.apply(sh);
-        }
+        transform(splats, self.scale, self.rotation, self.translation_m);
     }
 }
 

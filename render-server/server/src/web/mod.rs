@@ -65,7 +65,7 @@ pub use login::set_password;
 pub use routes::list as routes;
 pub use stats::{ServerStages, VehicleStats};
 pub use view::align::{Aligner, Length, Line, Picks, Solved, Wish};
-pub use view::{Place, ViewArgs, align, view};
+pub use view::{Place, ViewArgs, align, edit, view};
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};

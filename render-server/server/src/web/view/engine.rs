@@ -148,6 +148,11 @@ impl Engine {
         Ok(Ok(Picked { p_scene, p_world, depth_m, rough_m }))
     }
 
+    /// Shows another scene from now on, in the same place.
+    pub(super) fn replace(&mut self, rasterizer: Box<dyn Rasterizer>) {
+        self.rasterizer = rasterizer;
+    }
+
     pub(super) fn render(&mut self, request: &Request) -> Result<Picture> {
         let (camera, unit) = self.loaded_camera(request)?;
         // A time beyond the clock's range shows the start.
@@ -196,7 +201,7 @@ impl DepthGrid {
 
 impl Request {
     /// Returns the camera, its size held to what a page can show.
-    fn camera(&self) -> Camera {
+    pub(super) fn camera(&self) -> Camera {
         let [width, height] =
             [self.width_px, self.height_px].map(|side| side.clamp(16, MAX_SIDE_PX));
         let fov_rad = self.fov_deg.clamp(5.0, 150.0).to_radians();

@@ -9,6 +9,7 @@
 //! viewers in turn.
 
 pub(crate) mod align;
+mod edit;
 mod engine;
 mod pick;
 mod place;
@@ -33,12 +34,13 @@ use tracing::debug;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
-use self::align::{Aligner, Panel, Setup};
+use self::align::{Aligner, Setup};
+use self::edit::Session;
 use self::engine::{Engine, Picture, Request};
 pub use self::place::Place;
 use crate::lock::lock;
 use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
-use crate::scene::{self, Antialiased, BareArgs, Placement, Scene};
+use crate::scene::{self, Antialiased, BareArgs, Editor, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::{self, origin};
 
@@ -96,6 +98,13 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
     serve_view(&args, None, open)
 }
 
+/// What is done with the scene, beside looking at it.
+enum Work {
+    Align(Arc<dyn Aligner>),
+    /// What is saved goes to the path.
+    Edit(Editor, PathBuf),
+}
+
 /// As [`view`], with the panel that aligns the arena's scene.
 ///
 /// # Errors
@@ -106,12 +115,26 @@ pub fn align(
     aligner: Arc<dyn Aligner>,
     open: impl FnOnce(&str, &RendererInfo),
 ) -> Result<()> {
-    serve_view(&args, Some(aligner), open)
+    serve_view(&args, Some(Work::Align(aligner)), open)
+}
+
+/// As [`view`], with the panel that edits the scene; it is saved to `output`.
+///
+/// # Errors
+/// As [`view`].
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
+pub fn edit(
+    args: ViewArgs,
+    editor: Editor,
+    output: PathBuf,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
+    serve_view(&args, Some(Work::Edit(editor, output)), open)
 }
 
 fn serve_view(
     args: &ViewArgs,
-    aligner: Option<Arc<dyn Aligner>>,
+    work: Option<Work>,
     open: impl FnOnce(&str, &RendererInfo),
 ) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -120,7 +143,7 @@ fn serve_view(
         .enable_all()
         .build()
         .context("cannot start tokio")?;
-    let result = runtime.block_on(run(args, aligner, open));
+    let result = runtime.block_on(run(args, work, open));
     // Not awaited: a picture under way must not hold up the end.
     runtime.shutdown_background();
     result
@@ -130,7 +153,8 @@ fn serve_view(
 struct ViewState {
     engine: Mutex<Engine>,
     welcome: Welcome,
-    align: Option<Panel>,
+    align: Option<align::Panel>,
+    edit: Option<edit::Panel>,
     stop: Stop,
 }
 
@@ -154,7 +178,7 @@ struct Welcome {
 
 async fn run(
     args: &ViewArgs,
-    aligner: Option<Arc<dyn Aligner>>,
+    work: Option<Work>,
     open: impl FnOnce(&str, &RendererInfo),
 ) -> Result<()> {
     let stop = Stop::default();
@@ -163,17 +187,14 @@ async fn run(
     let listener = web::bind(args.http, None, true)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
-    let aligning = aligner.is_some();
-    let load = tokio::task::spawn_blocking(move || prepare(&loading, aligning));
-    let (engine, mut welcome, setup) = tokio::select! {
+    let load = tokio::task::spawn_blocking(move || prepare(&loading, work));
+    let (engine, welcome, align, edit) = tokio::select! {
         prepared = load => prepared.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
-    let align = aligner.map(|aligner| Panel { aligner, setup });
-    welcome.tool = align.as_ref().map(|_| "/align.js");
     let (engine, stopping) = (Mutex::new(engine), stop.clone());
-    let view = Arc::new(ViewState { engine, welcome, align, stop: stopping });
+    let view = Arc::new(ViewState { engine, welcome, align, edit, stop: stopping });
     let router = router(view).into_make_service_with_connect_info::<SocketAddr>();
     tokio::select! {
         served = axum::serve(listener, router) => served.context("the page's server failed"),
@@ -181,10 +202,17 @@ async fn run(
     }
 }
 
-fn prepare(args: &ViewArgs, aligning: bool) -> Result<(Engine, Welcome, Setup)> {
-    let Scene { mut arena, mut splats, mut objects, world_from_scene, .. } =
-        scene::load(&args.scene, &args.bare)?;
-    if aligning {
+type Prepared = (Engine, Welcome, Option<align::Panel>, Option<edit::Panel>);
+
+fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<Prepared> {
+    let scene = match &work {
+        Some(Work::Edit(editor, _)) => {
+            scene::load_with(&args.scene, &args.bare, editor.splats().clone())
+        }
+        _ => scene::load(&args.scene, &args.bare),
+    };
+    let Scene { mut arena, mut splats, mut objects, world_from_scene, .. } = scene?;
+    if let Some(Work::Align(_)) = work {
         // What moves stands in the room: it is no part of the scene, and does not move along with it.
         arena.objects.clear();
         objects.clear();
@@ -193,7 +221,8 @@ fn prepare(args: &ViewArgs, aligning: bool) -> Result<(Engine, Welcome, Setup)> 
     let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
     let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
     let moving = MovingObjects::new(&arena, args.seed);
-    let world_from_file = Placement::of(&arena.scene).world_from_scene;
+    let placement = Placement::of(&arena.scene);
+    let world_from_file = placement.world_from_scene;
     let setup = Setup::new(&arena, Place::new(&world_from_file));
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;
@@ -205,10 +234,21 @@ fn prepare(args: &ViewArgs, aligning: bool) -> Result<(Engine, Welcome, Setup)> 
         yaw_rad: arena.spawn.yaw_deg.to_radians(),
         fence_m: [arena.geofence.min_m.to_array(), arena.geofence.max_m.to_array()],
         objects: moving.len(),
-        tool: None,
+        tool: work.as_ref().map(|work| match work {
+            Work::Align(_) => "/align.js",
+            Work::Edit(..) => "/edit.js",
+        }),
     };
     let engine = Engine::new(rasterizer, moving, world_from_scene, world_from_file);
-    Ok((engine, welcome, setup))
+    let (align, edit) = match work {
+        None => (None, None),
+        Some(Work::Align(aligner)) => (Some(align::Panel { aligner, setup }), None),
+        Some(Work::Edit(editor, output)) => {
+            let session = Session::new(editor, output, args.clone(), placement, objects);
+            (None, Some(edit::Panel { session: Mutex::new(session) }))
+        }
+    };
+    Ok((engine, welcome, align, edit))
 }
 
 fn router(view: Arc<ViewState>) -> Router {
@@ -220,6 +260,7 @@ fn router(view: Arc<ViewState>) -> Router {
         .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
         .route("/ws", get(watch))
         .merge(align::routes())
+        .merge(edit::routes())
         .with_state(view)
 }
 

@@ -57,6 +57,7 @@ fn view(panel: bool) -> State<Arc<ViewState>> {
         engine: Mutex::new(Engine::new(renderer, MovingObjects::default(), one, one)),
         welcome,
         align: panel.then(|| Panel { aligner: Arc::new(Yes), setup }),
+        edit: None,
         stop: Stop::default(),
     }))
 }

@@ -10,9 +10,9 @@ let playing = false; // The clock of what moves runs.
 let start = null, info = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
-let asked = null;
+let asked = null, hasTool = false;
 
-/** What a tool beside the view may use of it (align.js). */
+/** What a tool beside the view may use of it (align.js, edit.js). */
 export const view = {
   canvas, eye, changed, announce,
   /** Goes into every request. */
@@ -48,7 +48,8 @@ function handleMessage(message) {
       start = { p: message.start_m, yaw: message.yaw_rad };
       home();
     }
-    if (message.tool) import(message.tool).catch((error) => announce(error.message, true));
+    if (message.tool && !hasTool) import(message.tool).catch((error) => announce(error.message, true));
+    hasTool ||= !!message.tool;
     waiting = false;
     stale = true;
     return;
