@@ -135,6 +135,7 @@ fn report(truth: &Truth, capture: &Capture, adjusted: &adjust::Adjusted) {
         adjusted.scale_sigma.map(|s| 100.0 * s),
         adjusted.tilt_sigma_rad.map(f64::to_degrees)
     );
+    println!("  corners of tags {:.3} px inside", adjusted.inset_px);
     for (tag, result) in capture.tags.iter().zip(&adjusted.tags) {
         if let Some(r) = result {
             println!(

@@ -95,4 +95,4 @@ fn tenth(x: f64) -> f64 {
 }
 
 /// Enough for a pose, and for parts to hang together.
-const PER_IMAGE: usize = 14;
+const PER_IMAGE: usize = 40;

@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::capture::Capture;
 use super::solve::{self, Solved};
-use super::state::{State, TagPlace};
+use super::state::{State, TagPlace, inwards};
 use super::{HeldOut, Known, Options};
 use crate::align::corners::{Ray, meet};
 
@@ -46,7 +46,8 @@ fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     let mut rays: [Vec<Ray>; 4] = Default::default();
     for (image, pose) in capture.images.iter().zip(&state.cameras) {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
-            for (rays, &pixel) in rays.iter_mut().zip(&seen.corners_px) {
+            for (k, rays) in rays.iter_mut().enumerate() {
+                let pixel = seen.corners_px[k] - inwards(seen)[k] * state.inset_px;
                 let direction = pose.rotation * state.lens.slope(pixel)?.extend(1.0);
                 rays.push(Ray { origin: pose.translation_m, direction: direction.normalize() });
             }

@@ -65,6 +65,9 @@ pub struct Adjusted {
     pub places_rms_m: Option<f64>,
     /// Tags, in the order of the capture's; `None` of one that too few images saw.
     pub tags: Vec<Option<TagResult>>,
+    /// How far inside tags their corners are found: white bleeds into black. More than half a pixel is no bleeding, but
+    /// prints of another size. [px]
+    pub inset_px: f64,
     /// Of the scale, as a share of it, one sigma; `None` if nothing tells it.
     pub scale_sigma: Option<f64>,
     /// Of the vertical, the worse direction, one sigma; `None` if nothing tells it. [rad]
@@ -156,5 +159,5 @@ pub fn adjust(capture: &Capture, options: Options) -> Result<Adjusted, AdjustErr
     } else {
         vec![None; capture.tags.len()]
     };
-    Ok(known::describe(capture, &state, &solved, known, start, &held_out))
+    Ok(known::describe(capture, &state, &solved, known, &start, &held_out))
 }

@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use super::capture::Capture;
 use super::matrix::{Symmetric, inverse};
 use super::project::{LENS, Projected};
-use super::solve::Problem;
-use super::state::{Slopes, State, TagPlace, slopes};
+use super::solve::{INSET_PX, Problem, weight};
+use super::state::{Slopes, State, TagPlace, inwards, slopes};
 
 /// Matrix and gradient, and what it all costs.
 pub(super) struct Normal {
@@ -21,6 +21,8 @@ pub(super) struct Normal {
 pub(super) struct Layout {
     /// `None` if the lens is given.
     pub(super) lens: Option<usize>,
+    /// `None` if there are no tags.
+    pub(super) inset: Option<usize>,
     /// Of each tag; `None` of one that is not to be found.
     pub(super) tags: Vec<Option<usize>>,
     pub(super) size: usize,
@@ -31,6 +33,9 @@ impl Layout {
         let mut size = 6 * state.cameras.len();
         let lens = refine_lens.then_some(size);
         size += if refine_lens { LENS } else { 0 };
+        let has_tags = state.tags.iter().any(|tag| !matches!(tag, TagPlace::Nowhere));
+        let inset = has_tags.then_some(size);
+        size += usize::from(has_tags);
         let tags = state.tags.iter().map(|tag| {
             matches!(tag, TagPlace::Found(..)).then(|| {
                 size += 6;
@@ -38,7 +43,7 @@ impl Layout {
             })
         });
         let tags = tags.collect();
-        Self { lens, tags, size }
+        Self { lens, inset, tags, size }
     }
 
     /// Returns it without the unknowns of some tags.
@@ -228,7 +233,8 @@ fn add_tags(sum: &mut Normal, problem: &Problem, state: &State) {
         let weight = problem.noise.tag_weight(off_px.unwrap_or(f64::MAX));
         for (k, (&corner_m, &pixel)) in corners_m.iter().zip(&seen.corners_px).enumerate() {
             let Some((projected, p_cam)) = state.see(camera, corner_m) else { continue };
-            let residual = projected.pixel - pixel;
+            let inwards = inwards(seen)[k];
+            let residual = projected.pixel + inwards * state.inset_px - pixel;
             let by = slopes(&state.cameras[camera], &projected.by_point, p_cam);
             let by_tag = match state.tags[seen.tag] {
                 TagPlace::Found(_, q) => {
@@ -250,6 +256,10 @@ fn add_tags(sum: &mut Normal, problem: &Problem, state: &State) {
                 if let Some(lens) = problem.layout.lens {
                     blocks.push((lens, &by_lens));
                 }
+                let by_inset = [inwards[axis]];
+                if let Some(inset) = problem.layout.inset {
+                    blocks.push((inset, &by_inset));
+                }
                 if let (Some(at), Some(by_tag)) = (problem.layout.tags[seen.tag], &by_tag) {
                     blocks.push((at, by_tag));
                 }
@@ -260,6 +270,9 @@ fn add_tags(sum: &mut Normal, problem: &Problem, state: &State) {
 }
 
 fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &State) {
+    if let Some(inset) = problem.layout.inset {
+        sum.add(&[(inset, &[1.0])], state.inset_px, INSET_PX.powi(-2));
+    }
     for (camera, (image, pose)) in capture.images.iter().zip(&state.cameras).enumerate() {
         if let Some(place) = image.place {
             let lever = capture.tracked_in_cam_m;
@@ -275,7 +288,7 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
         }
         if let Some(up) = image.up {
             let residual = pose.rotation * up.direction;
-            let weight = problem.noise.up_weight(residual.truncate().length(), up.sigma_rad);
+            let weight = weight(residual.truncate().length(), up.sigma_rad);
             let turn = DVec3::AXES.map(|axis| pose.rotation * axis.cross(up.direction));
             for axis in 0..2 {
                 let mut by = [0.0; 6];

@@ -15,6 +15,8 @@ pub(super) struct State {
     pub(super) cameras: Vec<Pose<World, Cam>>,
     pub(super) points: Vec<DVec3>,
     pub(super) tags: Vec<TagPlace>,
+    /// How far inside a tag its corners are found: white bleeds into black, in lenses and in sensors. [px]
+    pub(super) inset_px: f64,
     /// Slopes beyond this are not seen.
     pub(super) reach: f64,
 }
@@ -43,6 +45,7 @@ impl State {
             cameras: cameras.collect(),
             points: capture.points.iter().map(|&p| to.transform_point(p)).collect(),
             tags: start.tags.clone(),
+            inset_px: 0.0,
             reach: reach(&capture.lens),
         }
     }
@@ -76,11 +79,18 @@ impl State {
         seen: &TagSighting,
     ) -> Option<f64> {
         let mut sum = 0.0;
-        for (&corner, &pixel) in corners_m.iter().zip(&seen.corners_px) {
+        for (k, &corner) in corners_m.iter().enumerate() {
+            let pixel = seen.corners_px[k] - inwards(seen)[k] * self.inset_px;
             sum += self.off_px(camera, corner, pixel)?.length_squared();
         }
         Some((sum / 4.0).sqrt())
     }
+}
+
+/// Returns the directions from a tag's corners to its middle, as they were found.
+pub(super) fn inwards(seen: &TagSighting) -> [DVec2; 4] {
+    let middle = seen.corners_px.iter().sum::<DVec2>() / 4.0;
+    seen.corners_px.map(|corner| (middle - corner).normalize_or_zero())
 }
 
 /// Derivatives of a pixel by a camera's place and its turn about its own axes, by the point, and by the lens.

@@ -124,7 +124,7 @@ fn see(lens: &Intrinsics, pose: &Pose<World, Cam>, p: DVec3) -> Option<DVec2> {
 impl Hall {
     /// Returns it as structure from motion leaves it: in a frame of its own, everything a little off, a wrong focal
     /// length.
-    pub(crate) fn as_found(mut self, seed: u64, off_m: f64) -> Self {
+    pub(crate) fn found(mut self, seed: u64, off_m: f64) -> Self {
         let mut random = Random::new(seed);
         let mut gauss = |sigma: f64| {
             DVec3::from_array(std::array::from_fn(|_| sigma * f64::from(random.normal())))

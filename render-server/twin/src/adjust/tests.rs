@@ -32,7 +32,7 @@ fn errors(hall: &Hall, adjusted: &Adjusted) -> (f64, f64, f64) {
 
 #[test]
 fn exact_sightings_lead_back_to_the_truth() {
-    let hall = hall(1, 24, 2500, 0.0).as_found(2, 0.02);
+    let hall = hall(1, 24, 2500, 0.0).found(2, 0.02);
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
     let (scale, tilt, off_m) = errors(&hall, &adjusted);
     assert!(scale.abs() < 1e-6 && tilt < 1e-6 && off_m < 1e-5, "{scale} {tilt} {off_m}");
@@ -50,7 +50,7 @@ fn exact_sightings_lead_back_to_the_truth() {
 fn bounds_hold_under_noise() {
     let (mut outside, mut scales, mut sigmas) = (0, 0.0, 0.0);
     for seed in 0..12 {
-        let hall = hall(seed, 24, 2000, 0.6).as_found(seed + 50, 0.01);
+        let hall = hall(seed, 24, 2000, 0.6).found(seed + 50, 0.01);
         let adjusted = adjust(&hall.capture, Options::default()).unwrap();
         let (scale, tilt, off_m) = errors(&hall, &adjusted);
         let (by_scale, by_tilt) = (adjusted.scale_sigma.unwrap(), adjusted.tilt_sigma_rad.unwrap());
@@ -62,12 +62,29 @@ fn bounds_hold_under_noise() {
     }
     assert!(outside <= 1, "{outside} of 12 beyond three sigmas");
     // Not bounds that hold because they say nothing.
-    assert!(sigmas < 25.0 * scales, "sigma^2 {sigmas} for error^2 {scales}");
+    assert!(sigmas < 50.0 * scales, "sigma^2 {sigmas} for error^2 {scales}");
+}
+
+/// White that bleeds into black makes every edge shorter: distances between tags tell by how much.
+#[test]
+fn corners_that_are_found_inside_do_not_shrink_the_hall() {
+    let mut hall = hall(13, 24, 2500, 0.2).found(14, 0.01);
+    for seen in hall.capture.images.iter_mut().flat_map(|image| &mut image.tags) {
+        let middle = seen.corners_px.iter().sum::<glam::DVec2>() / 4.0;
+        seen.corners_px = seen.corners_px.map(|px| px + (middle - px).normalize() * 0.3);
+    }
+    let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+    let (scale, _, off_m) = errors(&hall, &adjusted);
+    assert!(scale.abs() < 2e-3 && off_m < 0.01, "{scale} {off_m}");
+    assert!((adjusted.inset_px - 0.3).abs() < 0.05, "{}", adjusted.inset_px);
+    let held = adjusted.tags.iter().flatten().filter_map(|tag| tag.held_out);
+    let sizes: Vec<f64> = held.map(|held| held.size_error).collect();
+    assert!(sizes.iter().sum::<f64>().abs() / (sizes.len() as f64) < 3e-3, "{sizes:?}");
 }
 
 #[test]
 fn sizes_alone_give_metres_but_no_vertical() {
-    let mut hall = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    let mut hall = hall(3, 24, 2500, 0.3).found(4, 0.01);
     hall.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
     assert_eq!(adjusted.known, Known { scale: true, up: false, place: false });
@@ -79,7 +96,7 @@ fn sizes_alone_give_metres_but_no_vertical() {
 
 #[test]
 fn a_vertical_and_tracked_places_are_held_to() {
-    let mut upright = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    let mut upright = hall(3, 24, 2500, 0.3).found(4, 0.01);
     upright.capture.tags.iter_mut().for_each(|tag| tag.corners_m = None);
     for (image, pose) in upright.capture.images.iter_mut().zip(&upright.poses) {
         let direction = pose.rotation.conjugate() * DVec3::Z;
@@ -90,7 +107,7 @@ fn a_vertical_and_tracked_places_are_held_to() {
     let (_, tilt, _) = errors(&upright, &adjusted);
     assert!(tilt < 3.0 * adjusted.tilt_sigma_rad.unwrap() && tilt < 0.01, "{tilt}");
 
-    let mut tracked = hall(3, 24, 2500, 0.3).as_found(4, 0.01);
+    let mut tracked = hall(3, 24, 2500, 0.3).found(4, 0.01);
     tracked.capture.tags.clear();
     tracked.capture.tracked_in_cam_m = DVec3::new(0.05, -0.1, 0.02);
     let lever_m = tracked.capture.tracked_in_cam_m;
@@ -110,7 +127,7 @@ fn a_vertical_and_tracked_places_are_held_to() {
 
 #[test]
 fn without_anything_it_has_no_metres() {
-    let mut hall = hall(5, 24, 2500, 0.2).as_found(6, 0.01);
+    let mut hall = hall(5, 24, 2500, 0.2).found(6, 0.01);
     hall.capture.tags.clear();
     hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
     let adjusted = adjust(&hall.capture, Options::default()).unwrap();
@@ -121,7 +138,7 @@ fn without_anything_it_has_no_metres() {
 
 #[test]
 fn the_same_on_any_number_of_threads() {
-    let hall = hall(7, 20, 600, 0.5).as_found(8, 0.01);
+    let hall = hall(7, 20, 600, 0.5).found(8, 0.01);
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| adjust(&hall.capture, Options::default()).unwrap())
@@ -131,7 +148,7 @@ fn the_same_on_any_number_of_threads() {
 
 #[test]
 fn what_cannot_be_meant_is_refused() {
-    let good = hall(9, 20, 600, 0.2).as_found(10, 0.01).capture;
+    let good = hall(9, 20, 600, 0.2).found(10, 0.01).capture;
     let refused = |change: &dyn Fn(&mut Capture)| {
         let mut capture = good.clone();
         change(&mut capture);
@@ -204,6 +221,7 @@ fn the_gradient_is_the_slope_of_the_cost() {
     // Points would follow: without them, nothing is eliminated.
     hall.capture.images.iter_mut().for_each(|image| image.seen.clear());
     let mut state = State::new(&hall.capture, &begin);
+    state.inset_px = 0.2;
     for tag in &mut state.tags {
         if let TagPlace::Found(t, q) = tag {
             *t += DVec3::new(0.01, -0.02, 0.01);

@@ -30,7 +30,7 @@ fn images_of(walk: &Walk<'_>, tag: usize) -> Vec<usize> {
     sees.map(|(index, _)| index).collect()
 }
 
-fn add(walk: &Walk<'_>, verdict: &mut Verdict, tags: &[usize], what: String, remedy: &str) {
+fn add(walk: &Walk<'_>, verdict: &mut Verdict, tags: &[usize], what: &str, remedy: &str) {
     let images = walk.runs(tags.iter().flat_map(|tag| images_of(walk, *tag)));
     verdict.findings.push(Finding {
         severity: Severity::Refused,
@@ -54,7 +54,7 @@ fn somewhere_else(walk: &Walk<'_>, tag: usize, result: &TagResult, verdict: &mut
     };
     let remedy = "if it hangs where the layout says and no other tag has its number, these images are in the wrong \
                   place: film there again, with more of what is particular to the place in view";
-    add(walk, verdict, &[tag], what, remedy);
+    add(walk, verdict, &[tag], &what, remedy);
 }
 
 /// Rays that should meet and do not.
@@ -92,7 +92,7 @@ fn nowhere(walk: &Walk<'_>, tag: usize, verdict: &mut Verdict) {
     );
     let remedy = "look for another tag of the same number; if there is none, these images are in the wrong place: \
                   film there again, with more of what is particular to the place in view";
-    add(walk, verdict, &[tag], what, remedy);
+    add(walk, verdict, &[tag], &what, remedy);
 }
 
 /// Whether two rays pass each other by, or would have met behind a camera; `None` of rays too parallel to tell.
@@ -142,18 +142,18 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
         (line, results().filter(|(_, held)| is_wrong(held)).map(|(tag, _)| tag).collect())
     };
     verdict.checked.push(line.clone());
-    let mut sizes = size.clone();
-    sizes.sort_by(f64::total_cmp);
-    let usual = sizes[sizes.len() / 2];
-    if usual.abs() > MOST_USUAL_SIZE && sizes.len() >= CONTRADICTING {
-        let (much, how) = (100.0 * usual.abs(), if usual < 0.0 { "smaller" } else { "larger" });
+    let inset_px = adjusted.inset_px;
+    if inset_px.abs() > MOST_INSET_PX {
+        let how = if inset_px > 0.0 { "smaller" } else { "larger" };
         let what = format!(
-            "tags are {much:.1} % {how} than they should be for the distances between them, in the middle of {}",
-            sizes.len()
+            "tags are {how} than they should be for the distances between them: their corners are found {:.1} px {} \
+             where they belong",
+            inset_px.abs(),
+            if inset_px > 0.0 { "inside" } else { "outside" }
         );
         let remedy = "measure the black edge of a print, and the distance between two tags: a printer that fits to the \
                       page makes tags smaller";
-        add(walk, verdict, &results().map(|(tag, _)| tag).collect::<Vec<_>>(), what, remedy);
+        add(walk, verdict, &results().map(|(tag, _)| tag).collect::<Vec<_>>(), &what, remedy);
     }
     if wrong.is_empty() {
         return;
@@ -163,7 +163,7 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
     let what = format!("{line}; {} are where the others do not have them", names.join(", "));
     let remedy = "measure again where these tags stand; if that is right, the images around them are in the wrong \
                   place: film there again, each tag from several sides";
-    add(walk, verdict, &wrong, what, remedy);
+    add(walk, verdict, &wrong, &what, remedy);
 }
 
 /// Two tags that stand in each other.
@@ -182,7 +182,7 @@ fn in_one_place(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
                 let what = format!("{} and {} are in one place", tags[a].name, tags[b].name);
                 let remedy = "two places that look alike were put on one another; film both again, and the way from one to \
                               the other in one go, with what differs between them in view";
-                add(walk, verdict, &[a, b], what, remedy);
+                add(walk, verdict, &[a, b], &what, remedy);
             }
         }
     }
@@ -200,7 +200,7 @@ const PASSES_BY: f64 = 0.05;
 const MOST_OFF_M: f64 = 0.15;
 /// Beyond this an edge is not what it was printed as.
 const MOST_SIZE: f64 = 0.1;
-/// Corners of tags that are 20 px wide are found to be 1 to 2 % too close together.
-const MOST_USUAL_SIZE: f64 = 0.04;
+/// White bleeds into black by a tenth or two, in images of our own captures. [px]
+const MOST_INSET_PX: f64 = 0.6;
 /// Of an edge: no two tags hang closer together.
 const ONE_PLACE: f64 = 0.7;
