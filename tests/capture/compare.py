@@ -2,8 +2,9 @@
 
     python compare.py VIZFLYT [FOLDER]
 
-FOLDER, if given, keeps what is made. The bars are those of a metric twin: 95 % of the pictures placed, scale within 0.3 %,
-up within 0.2 degrees; but for camera centres: the rolling shutter, which no adjustment here knows, moves them by 2 to 4 cm.
+FOLDER, if given, keeps what is made. The bars are those of a metric twin: 95 % of the pictures placed, scale within
+0.3 %, up within 0.2 degrees; but for camera centres: the rolling shutter, which no adjustment here knows, moves them by
+2 to 4 cm.
 """
 
 import json
