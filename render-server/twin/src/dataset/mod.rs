@@ -95,7 +95,7 @@ impl Dataset {
     /// [`DatasetError`] says which file is wrong, and what to do.
     pub fn read(folder: &Path, width_px: Option<u32>) -> Result<Self, DatasetError> {
         let (plans, points) = of_folder(folder)?;
-        Self::of_plans(folder, plans, points, width_px)
+        Self::of_plans(folder, &plans, points, width_px)
     }
 
     /// Reads the photos of a model that is known already, from the folder of images that its names are below; photos
@@ -109,19 +109,19 @@ impl Dataset {
         width_px: Option<u32>,
     ) -> Result<Self, DatasetError> {
         let (plans, points) = plans(model, images, None);
-        Self::of_plans(images, plans, points, width_px)
+        Self::of_plans(images, &plans, points, width_px)
     }
 
     fn of_plans(
         folder: &Path,
-        plans: Vec<Plan>,
+        plans: &[Plan],
         points: Points,
         width_px: Option<u32>,
     ) -> Result<Self, DatasetError> {
         if plans.len() < 2 {
             return Err(DatasetError::TooFew(folder.to_owned(), plans.len()));
         }
-        check_memory(&plans, width_px)?;
+        check_memory(plans, width_px)?;
         let mut photos = plans
             .par_iter()
             .map(|plan| plan.load(width_px, &points))
