@@ -95,6 +95,7 @@ impl Y4m {
     }
 
     /// Takes the bytes of the next image.
+    #[allow(clippy::type_complexity)] // Why: private, and taken apart at once.
     fn planes(&mut self) -> Result<Option<(Head, Option<u64>, Vec<u8>)>, String> {
         let head = match self.head {
             Some(head) => head,

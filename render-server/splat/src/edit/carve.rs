@@ -190,7 +190,9 @@ impl Grid {
                 block.chunks_exact_mut(stride).for_each(|row| mark(row, &mut left));
                 left.fill(0);
                 block.chunks_exact_mut(stride).rev().for_each(|row| mark(row, &mut left));
-                block.iter_mut().for_each(|cell| *cell = u8::from(*cell > 0));
+                for cell in block {
+                    *cell = u8::from(*cell > 0);
+                }
             });
         }
         grown

@@ -27,7 +27,9 @@ pub(super) fn largest(splats: &Splats, side: f64, keep: usize) -> Vec<bool> {
     order.sort_by_key(|part| (std::cmp::Reverse(counts[*part as usize]), *part));
     order.truncate(keep);
     let mut kept = vec![false; counts.len()];
-    order.iter().for_each(|part| kept[*part as usize] = true);
+    for part in order {
+        kept[part as usize] = true;
+    }
     parts.marks(|part| kept[part as usize])
 }
 

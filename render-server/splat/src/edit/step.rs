@@ -175,7 +175,9 @@ impl Step {
             Self::Crop { within } => select(within, splats),
             Self::Remove { within } => {
                 let mut keep = select(within, splats);
-                keep.iter_mut().for_each(|keep| *keep = !*keep);
+                for keep in &mut keep {
+                    *keep = !*keep;
+                }
                 keep
             }
             Self::Faint { below } => {
@@ -204,6 +206,7 @@ fn by_size(splats: &Splats, wanted: impl Fn(f64) -> bool + Sync) -> Vec<bool> {
     splats.scales_m.par_iter().map(|scales| wanted(f64::from(scales.max_element()))).collect()
 }
 
+#[allow(clippy::needless_pass_by_value)] // Why: most values are made for it.
 pub(super) fn invalid(
     key: &'static str,
     value: impl ToString,

@@ -381,7 +381,7 @@ proptest! {
     /// A crop and the removal of the same regions share the splats between them.
     #[test]
     fn what_is_not_kept_is_removed(whole in anything(), within in prop::collection::vec(region(), 1..3)) {
-        let left = |step: Step| step.apply(&mut whole.clone()).map(|taken| whole.len() - taken).unwrap_or(0);
+        let left = |step: Step| step.apply(&mut whole.clone()).map_or(0, |taken| whole.len() - taken);
         let [kept, rest] = [Step::Crop { within: within.clone() }, Step::Remove { within }].map(left);
         prop_assert_eq!(kept + rest, whole.len());
     }

@@ -65,11 +65,14 @@ impl Dataset {
     }
 }
 
+/// The name of a photo, and where it was taken from.
+pub type PhotoPose = (String, Pose<World, Cam>);
+
 /// Returns the names of a folder's photos and where each was taken from, in the order of their names; no photo is opened.
 ///
 /// # Errors
 /// As [`Dataset::read`], of the poses.
-pub fn read_poses(folder: &Path) -> Result<Vec<(String, Pose<World, Cam>)>, DatasetError> {
+pub fn read_poses(folder: &Path) -> Result<Vec<PhotoPose>, DatasetError> {
     let (plans, _) = of_folder(folder)?;
     let mut poses: Vec<_> =
         plans.into_iter().map(|plan| (plan.name, plan.world_from_cam)).collect();

@@ -221,7 +221,10 @@ fn hash(path: &Path) -> std::io::Result<String> {
         let length = file.read(&mut block)?;
         if length == 0 {
             let bytes = hash.finish();
-            return Ok(bytes.as_ref().iter().map(|byte| format!("{byte:02x}")).collect());
+            return Ok(bytes
+                .as_ref()
+                .iter()
+                .fold(String::new(), |text, byte| text + &format!("{byte:02x}")));
         }
         hash.update(&block[..length]);
     }

@@ -190,7 +190,9 @@ impl Session {
             return vec![false; self.editor.splats().len()];
         }
         let mut marks = select(&self.regions, self.editor.splats());
-        marks.iter_mut().for_each(|mark| *mark ^= self.is_inverted);
+        for mark in &mut marks {
+            *mark ^= self.is_inverted;
+        }
         marks
     }
 

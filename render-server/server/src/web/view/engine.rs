@@ -129,7 +129,7 @@ impl Engine {
             return Ok(Err(PickError::Outside));
         };
         let (loaded, unit) = self.loaded_camera(request)?;
-        let looking = Camera { intrinsics: window, ..loaded.clone() };
+        let looking = Camera { intrinsics: window, ..loaded };
         let placements = self.moving.placements((request.at_s * 1e9) as i64);
         self.rasterizer.render(&placements, &[looking], &mut self.image)?;
         let (depth_m, rough_m) = match pick::surface(&self.image[0].depth_median_m, px_of_window) {

@@ -99,6 +99,7 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
 }
 
 /// What is done with the scene, beside looking at it.
+#[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
 enum Work {
     Align(Arc<dyn Aligner>),
     /// What is saved goes to the path.

@@ -62,7 +62,7 @@ pub(super) fn moved(camera: &Camera, by: &WorldFromScene) -> Camera {
     Camera {
         world_from_cam: Pose::new(to_world(by, pose.translation_m), by.rotation * pose.rotation),
         near_m: camera.near_m * by.scale as f32,
-        ..camera.clone()
+        ..*camera
     }
 }
 
