@@ -1,6 +1,7 @@
 //! `vizflyt scene align`: photos of a walk, taken by a phone's lens with a rolling shutter, whose poses are in a frame of
 //! no room; printed tags that stand in it, or a motion capture that followed the phone; out comes where the scene lies.
 
+use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -160,9 +161,9 @@ fn a_track_of_the_phone_finds_its_place_in_the_room() {
         let stamp_ns = image["stamp_ns"].as_u64().unwrap();
         let at_s = stamp_ns as f64 * 1e-9 + offset_s;
         // TUM's columns.
-        track += &format!("{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1\n", p.x, p.y, p.z);
-        mirrored += &format!("{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1\n", -p.x, p.y, p.z);
-        stamps += &format!("{},{stamp_ns}\n", image["file"].as_str().unwrap());
+        writeln!(track, "{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1", p.x, p.y, p.z).unwrap();
+        writeln!(mirrored, "{at_s:.6} {:.5} {:.5} {:.5} 0 0 0 1", -p.x, p.y, p.z).unwrap();
+        writeln!(stamps, "{},{stamp_ns}", image["file"].as_str().unwrap()).unwrap();
     }
     fs::write(home.join("track.txt"), track).unwrap();
     fs::write(home.join("mirrored.txt"), mirrored).unwrap();

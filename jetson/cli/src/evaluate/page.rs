@@ -72,9 +72,8 @@ fn table(figures: &Figures) -> String {
             number(figures.rpe_rot_rmse_deg, &format!("deg over {}", figures.delta)),
         ),
     ];
-    let rows: String =
-        rows.iter().map(|(name, value)| format!("<tr><th>{name}<td>{value}\n")).collect();
-    format!("<table>\n{rows}</table>\n")
+    let rows = rows.map(|(name, value)| format!("<tr><th>{name}<td>{value}\n"));
+    format!("<table>\n{}</table>\n", rows.concat())
 }
 
 fn drift(figures: &Figures) -> String {
@@ -176,7 +175,8 @@ fn ticks((low, high): (f64, f64)) -> Vec<f64> {
         .find(|&step| step >= rough)
         .unwrap_or(rough);
     let first = (low / step).ceil() as i64;
-    (first..).map(|k| k as f64 * step).take_while(|&value| value <= high).collect()
+    let last = (high / step).floor() as i64;
+    (first..=last).map(|k| k as f64 * step).collect()
 }
 
 fn label(value: f64) -> String {

@@ -35,6 +35,9 @@ struct Head {
     rate_hz: Option<f64>,
 }
 
+/// An image's head, its stamp [ns], and its bytes.
+type Planes = (Head, Option<u64>, Vec<u8>);
+
 impl Head {
     fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
@@ -95,8 +98,7 @@ impl Y4m {
     }
 
     /// Takes the bytes of the next image.
-    #[allow(clippy::type_complexity)] // Why: private, and taken apart at once.
-    fn planes(&mut self) -> Result<Option<(Head, Option<u64>, Vec<u8>)>, String> {
+    fn planes(&mut self) -> Result<Option<Planes>, String> {
         let head = match self.head {
             Some(head) => head,
             None => match self.line()? {

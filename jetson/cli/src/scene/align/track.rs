@@ -62,8 +62,12 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
         );
     }
     let start_s = if is_shared { begin } else { first };
-    track.iter_mut().for_each(|tracked| tracked.at_s -= start_s);
-    cameras.iter_mut().for_each(|camera| camera.at_s -= begin);
+    for tracked in &mut track {
+        tracked.at_s -= start_s;
+    }
+    for camera in &mut cameras {
+        camera.at_s -= begin;
+    }
     let max_offset_s = clocks.max_offset_s.unwrap_or(if is_shared { 2.0 } else { 30.0 });
     let TrackFit { fit, offset_s, point_in_cam_m: p } =
         track::fit(&cameras, &track, max_offset_s, sigma_m, clocks.tracked_at)

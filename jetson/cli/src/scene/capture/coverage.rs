@@ -59,7 +59,7 @@ pub(super) fn svg(metric: &Metric, pictures: &Pictures, points: &[DVec3]) -> Str
         );
         if let Some((first, last)) = missing {
             let text = format!("not placed {}", span(pictures, first, last));
-            label(&mut svg, (x0 + x1) / 2.0, (y0 + y1) / 2.0, "#d22", &text);
+            label(&mut svg, f64::midpoint(x0, x1), f64::midpoint(y0, y1), "#d22", &text);
         }
     }
     for placed in way {

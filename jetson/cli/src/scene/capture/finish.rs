@@ -60,7 +60,7 @@ pub(super) fn finish(
         carve(dataset, &splats, &IDENTITY, region(&splats, &ways), &CarveOptions::default());
     let floor_m = floor(dataset, metric);
     let mut arena = default_arena(&carved.splats, "scene.ply")?;
-    arena.name = name.to_owned();
+    name.clone_into(&mut arena.name);
     arena.occupancy.floor_z_m = to_cm(floor_m);
     let [min_m, max_m] = fence(&carved.seen, floor_m, &ways);
     arena.geofence.min_m = min_m;

@@ -225,7 +225,8 @@ fn fact(finding: &verdict::Finding, pictures: &Pictures) -> FindingFact {
         let runs = finding.images.iter().take(MANY).map(|run| {
             format!("{} to {}", clock(time(run.start)), clock(time(run.end.saturating_sub(1))))
         });
-        what += &format!("; in the video from {}", runs.collect::<Vec<_>>().join(", from "));
+        what.push_str("; in the video from ");
+        what.push_str(&runs.collect::<Vec<_>>().join(", from "));
     }
     FindingFact {
         refused: finding.severity == Severity::Refused,
@@ -237,9 +238,9 @@ fn fact(finding: &verdict::Finding, pictures: &Pictures) -> FindingFact {
 }
 
 fn describe(metric: &mut Metric, capture: &Capture, adjusted: &Adjusted, ground: &Ground) {
-    metric.scale_from = ground.scale_from.clone();
+    metric.scale_from.clone_from(&ground.scale_from);
     metric.scale_is_guessed = ground.scale_is_guessed;
-    metric.up_from = ground.up_from.clone();
+    metric.up_from.clone_from(&ground.up_from);
     let fit = ground.fit.as_ref();
     let scale_sigma = adjusted.scale_sigma.or(fit.map(|fit| fit.scale_sigma));
     metric.scale_bound = scale_sigma.filter(|_| !ground.scale_is_guessed).map(|sigma| 3.0 * sigma);

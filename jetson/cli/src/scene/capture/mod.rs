@@ -35,7 +35,7 @@ use self::images::{Choice, Source};
 use self::metric::{Length, Room};
 use self::record::Record;
 use self::training::Schedule;
-use self::work::{Fingerprint, Stage, Work};
+use self::work::{Fingerprint, Stage, Work, hex};
 use crate::terminal::print_fmt;
 
 /// Makes a twin that can be flown from a video of a room, or from photos of it.
@@ -314,7 +314,7 @@ fn is_ours(path: &Path, work: &Work) -> bool {
 /// Returns the hash of a file; of one that cannot be read, nothing.
 fn digest(path: &Path) -> String {
     let hash = std::fs::read(path).map(Sha256::digest);
-    hash.map_or(String::new(), |hash| hash.iter().map(|byte| format!("{byte:02x}")).collect())
+    hash.map_or(String::new(), |hash| hex(&hash))
 }
 
 /// Returns the folder's name as an arena's.

@@ -78,7 +78,7 @@ pub(super) fn train(
     drop(progress);
     let held_out = trainer.judge();
     let splats = trainer.splats();
-    format::write(&folder.join("scene.ply"), &splats)?;
+    format::write(folder.join("scene.ply"), &splats)?;
     let view = &dataset.photos[0].view;
     Ok(Trained {
         photos: dataset.photos.len(),

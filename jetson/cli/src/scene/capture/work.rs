@@ -152,7 +152,7 @@ impl Work {
             hash.update((part.len() as u64).to_le_bytes());
             hash.update(part);
         }
-        self.key = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+        self.key = hex(&hash.finalize());
         let file = self.folder.join(format!("{stage}.json"));
         if self.from.is_none_or(|from| stage < from)
             && let Some(kept) = kept::<T>(&file, &self.key)
@@ -229,7 +229,7 @@ impl Fingerprint {
                 path: path.to_owned(),
                 bytes: metadata.len(),
                 modified_ns: modified.map_or(0, |time| time.as_nanos()),
-                ends_sha256: hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect(),
+                ends_sha256: hex(&hash.finalize()),
             })
         };
         read().with_context(|| format!("cannot read {}", path.display()))
@@ -253,6 +253,17 @@ impl Fingerprint {
         }
         Ok(all)
     }
+}
+
+/// Returns bytes as hexadecimal digits.
+pub(super) fn hex(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    let mut text = String::with_capacity(2 * bytes.len());
+    for byte in bytes {
+        // Writing to a string does not fail.
+        let _ = write!(text, "{byte:02x}");
+    }
+    text
 }
 
 /// Of a file's begin and end.

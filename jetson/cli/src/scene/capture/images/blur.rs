@@ -27,7 +27,7 @@ pub(super) fn blur(width: usize, height: usize, grey: &[u8]) -> f64 {
     }
     let across = along(small_width, small_height, |x, y| small[y * small_width + x]);
     let down = along(small_height, small_width, |y, x| small[y * small_width + x]);
-    (across + down) / 2.0
+    f64::midpoint(across, down)
 }
 
 /// Returns the blur along the first coordinate, of `length` values in each of `lines`.

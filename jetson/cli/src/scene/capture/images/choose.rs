@@ -78,7 +78,9 @@ fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
     };
     let mut text = runs.iter().map(text).collect::<Vec<_>>().join(", ");
     if more > 0 {
-        text += &format!(", and {more} more");
+        text.push_str(", and ");
+        text.push_str(&more.to_string());
+        text.push_str(" more");
     }
     text
 }

@@ -96,7 +96,8 @@ pub(in super::super) fn probe(file: &Path) -> Result<f64> {
     let mut command = Command::new("ffprobe");
     command.args(["-v", "error", "-select_streams", "v:0"]);
     command.args(["-show_entries", "stream=duration:format=duration", "-of", "json"]).arg(file);
-    let output = command.stdin(Stdio::null()).output().map_err(|error| absent("ffprobe", error))?;
+    let output =
+        command.stdin(Stdio::null()).output().map_err(|error| absent("ffprobe", &error))?;
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr);
         bail!("{} is no video that ffmpeg reads: {}", file.display(), said.trim());
@@ -114,7 +115,7 @@ fn duration_s(json: &[u8]) -> Option<f64> {
     found.filter(|seconds| *seconds > 0.0 && *seconds < 1e6)
 }
 
-fn absent(program: &str, error: std::io::Error) -> anyhow::Error {
+fn absent(program: &str, error: &std::io::Error) -> anyhow::Error {
     if error.kind() == ErrorKind::NotFound {
         return anyhow!(
             "a video is read by the program {program}, which is not installed; `apt-get install ffmpeg` brings it, \
@@ -141,7 +142,7 @@ impl Decoder {
         ));
         command.args(["-f", "yuv4mpegpipe", "-strict", "-1", "-"]);
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let ffmpeg = command.spawn().map_err(|error| absent("ffmpeg", error))?;
+        let ffmpeg = command.spawn().map_err(|error| absent("ffmpeg", &error))?;
         Ok(Self { ffmpeg, stream: Y4m::default(), buffer: vec![0; 1 << 18] })
     }
 

@@ -18,14 +18,14 @@ pub(super) struct Colmap {
 
 impl Colmap {
     /// Asks the program for its version; `None` if it is not installed.
-    pub(super) fn open(program: &Path) -> Result<Option<Self>> {
-        let Some(help) = ask(Command::new(program).arg("help")) else { return Ok(None) };
+    pub(super) fn open(program: &Path) -> Option<Self> {
+        let help = ask(Command::new(program).arg("help"))?;
         let options =
             ask(Command::new(program).args(["feature_extractor", "-h"])).unwrap_or_default();
         let name = version(&help).unwrap_or_else(|| "COLMAP".to_owned());
         let is_new = options.contains("FeatureExtraction.use_gpu");
         let prefix = if is_new { "Feature" } else { "Sift" };
-        Ok(Some(Self { program: program.to_owned(), name, prefix }))
+        Some(Self { program: program.to_owned(), name, prefix })
     }
 }
 

@@ -147,7 +147,7 @@ fn installed(python: Option<&Path>) -> Result<Box<dyn Finder>> {
             return Ok(Box::new(found));
         }
     }
-    if let Some(found) = colmap::Colmap::open(Path::new("colmap"))? {
+    if let Some(found) = colmap::Colmap::open(Path::new("colmap")) {
         return Ok(Box::new(found));
     }
     bail!(
