@@ -88,7 +88,7 @@ impl PhotoDepths {
 
 fn camera(photo: &Photo) -> Camera {
     let view = &photo.view;
-    let [right, down, ahead] = view.rows.map(|row| row.as_dvec3());
+    let [right, down, ahead] = view.rows.map(glam::Vec3::as_dvec3);
     let rotation = glam::DQuat::from_mat3(&glam::DMat3::from_cols(right, down, ahead));
     let pose = Pose::new(view.position.as_dvec3(), rotation.normalize());
     Camera::new(view.intrinsics(), pose, view.near)
