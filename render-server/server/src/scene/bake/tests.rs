@@ -29,7 +29,7 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
     let (splats, spec) = scene(0.9);
     let reported = Mutex::new(Vec::new());
     let first = bake_with(&splats, &spec, None, Some(&cache), &|share| {
-        reported.lock().unwrap().push(share)
+        reported.lock().unwrap().push(share);
     });
     assert!(first.counts.unwrap().occupied > 0);
     assert!(first.field.obstacle_distance_m(DVec3::new(1.0, 1.0, 0.5)) < 0.0);
