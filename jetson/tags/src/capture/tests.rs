@@ -207,3 +207,17 @@ fn a_video_is_read_through_ffmpeg() {
     let error = source.next().unwrap_err().to_string();
     assert!(error.contains("damaged.mkv") && error.contains("ended"), "{error}");
 }
+
+#[test]
+fn colours_are_three_planes_and_nothing_coarser() {
+    let mut stream = Y4m::default();
+    stream.push(b"YUV4MPEG2 W2 H1 F30:1 C444\nFRAME\n\x01\x02\x03\x04\x05");
+    assert_eq!(stream.poll_colours(), Ok(None), "a byte is missing");
+    stream.push(b"\x06");
+    let image = stream.poll_colours().unwrap().unwrap();
+    assert_eq!((image.width_px, image.height_px, image.luma()), (2, 1, &[1, 2][..]));
+    assert_eq!(image.planes, [1, 2, 3, 4, 5, 6]);
+    let mut coarse = Y4m::default();
+    coarse.push(b"YUV4MPEG2 W2 H1 F30:1 C420jpeg\nFRAME\n\x01\x02\x03\x04");
+    assert!(coarse.poll_colours().unwrap_err().contains("yuv444p"));
+}
