@@ -114,10 +114,11 @@ impl EditList {
 
     /// Returns the file's text.
     pub fn to_toml(&self) -> String {
-        let file = &self.scene.file;
+        // A comment holds no control characters; a name may.
+        let file = self.scene.file.replace(char::is_control, " ");
         let head =
             format!("# Edits of {file}: vizflyt scene edit {file} --list, --undo, --apply\n\n");
         // Strings, finite numbers and tables of a known shape: TOML holds them all.
-        head.replace(['\r', '\u{7f}'], " ") + &toml::to_string(self).unwrap_or_default()
+        head + &toml::to_string(self).unwrap_or_default()
     }
 }

@@ -106,7 +106,7 @@ fn what_is_wrong_in_a_list_is_said() {
     };
     assert_eq!(EditList::parse(&scene).unwrap().steps, []);
     check("[[steps]]\ntaken = 1\nedit.faint.below = 2\n", "step 1: below = 2");
-    check("[[steps]]\ntaken = 1\nedit.faint.bellow = 0.1\n", "did you mean 'below'");
+    check("[[steps]]\ntaken = 1\nedit.faint.bellow = 0.1\n", "available keys: below");
     check("[[steps]]\ntaken = -1\nedit.faint.below = 0.1\n", "line 6");
     check("[[steps]]\ntaken = 1\nedit.vanish = 0.1\n", "vanish");
     check("[[step]]\n", "did you mean 'steps'");
