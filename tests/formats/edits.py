@@ -3,9 +3,9 @@
 
     edits.py --tools DIR VIZFLYT
 
-DIR holds node_modules/ (tests/formats/run installs it). Scenes of known splats, of every degree of harmonics, are turned, scaled,
-moved and cropped by both; the results are matched splat by splat. splat-transform edits in its own axes, half a turn about z
-from the file's: x and y change sign. A line each; the last reports how many passed.
+DIR holds node_modules/ (tests/formats/run installs it). Scenes of known splats, of every degree of harmonics, are
+turned, scaled, moved and cropped by both; the results are matched splat by splat. splat-transform edits in its own
+axes, half a turn about z from the file's: x and y change sign. A line each; the last reports how many passed.
 """
 import argparse
 import pathlib
@@ -14,7 +14,6 @@ import sys
 import tempfile
 
 import numpy as np
-
 from parity import errors, known, read_ply, write_ply
 
 # A few roundings of f32; turned harmonics are sums of up to seven products.
@@ -61,10 +60,12 @@ def main():
                     run('node', cli, '-q', '-w', source, *theirs, judged)
                     truth, found = read_ply(judged), read_ply(edited)
                     worst = errors(truth, found, degree)
-                    over = [f'{part} {e:.2g} > {limit:.2g}' for part, e, limit in zip(PARTS, worst, LOSS) if not e <= limit]
+                    judgements = zip(PARTS, worst, LOSS)
+                    over = [f'{part} {e:.2g} > {limit:.2g}' for part, e, limit in judgements if not e <= limit]
                     if not least <= len(found['mean']) <= most:
                         over.append(f"{len(found['mean'])} splats left")
-                    if not np.array_equal(*(np.argsort(scene['opacity'], kind='stable') for scene in (truth, found))):
+                    wanted, given = (np.argsort(scene['opacity'], kind='stable') for scene in (truth, found))
+                    if not np.array_equal(wanted, given):
                         over.append('another order')
                     failure = '; '.join(over)
                     figures = ', '.join(f'{part} {e:.2g}' for part, e in zip(PARTS, worst))

@@ -1,4 +1,4 @@
-"""Holds `vizflyt evaluate` against evo: random trajectories and those of flights, every alignment, both associations."""
+"""Holds `vizflyt evaluate` against evo: random trajectories and those of flights, by every alignment."""
 
 import json
 import pathlib
@@ -14,7 +14,9 @@ from evo.tools import file_interface
 TOLERANCE = 1e-6
 
 
-def wanted(truth: PoseTrajectory3D, estimate: PoseTrajectory3D, align: str, how: str, metres: float) -> dict[str, float]:
+def wanted(
+    truth: PoseTrajectory3D, estimate: PoseTrajectory3D, align: str, how: str, metres: float
+) -> dict[str, float]:
     method = {"nearest": sync.SyncMethod.nearest_time, "interpolate": sync.SyncMethod.interpolation}[how]
     truth, estimate = sync.associate_trajectories(truth, estimate, sync_method=method, max_diff=0.01)
     scale = 1.0
@@ -65,12 +67,13 @@ def compare(vizflyt: str, truth: pathlib.Path, estimate: pathlib.Path, metres: f
         for how in ("nearest", "interpolate"):
             read = [file_interface.read_tum_trajectory_file(file) for file in (truth, estimate)]
             expected = wanted(read[0], read[1], align, how, metres)
-            command = [vizflyt, "evaluate", truth, estimate, "--json", "--align", align, "--associate", how]
+            command = [vizflyt, "evaluate", str(truth), str(estimate), "--json", "--align", align, "--associate", how]
             printed = subprocess.run([*command, "--delta", f"{metres}m"], check=True, capture_output=True, text=True)
             found = json.loads(printed.stdout)
             for name, value in expected.items():
                 off = abs(found[name] - value)
-                assert off <= TOLERANCE * max(1.0, abs(value)), f"{truth} {align} {how} {name}: {found[name]}, evo {value}"
+                same = off <= TOLERANCE * max(1.0, abs(value))
+                assert same, f"{truth} {align} {how} {name}: {found[name]}, evo {value}"
                 compared += 1
     return compared
 

@@ -178,7 +178,11 @@ pub fn replay(
         log_is_cut: plan.is_cut,
         ..ReplayReport::default()
     };
-    let failed = run(log, plan, options, line, &mut report, &mut answers)?;
+    let mut feeder = Feeder::new(options);
+    let failed = run(log, plan, options, &mut feeder, line, &mut report, &mut answers);
+    // What it printed last is on its way, also of one that failed.
+    feeder.stop(line);
+    let failed = failed?;
     answers.flush().map_err(lost)?;
     report.plugin_failed = failed;
     report.seconds = started.elapsed().as_secs_f64();
@@ -189,12 +193,12 @@ fn run(
     log: &Path,
     mut plan: ReplayPlan,
     options: &ReplayOptions,
+    feeder: &mut Feeder<'_>,
     line: &mut dyn FnMut(Stream, &str),
     report: &mut ReplayReport,
     answers: &mut impl Write,
 ) -> Result<Option<String>, ReplayError> {
     let mut flight = RecordedFlight::new(LogReader::open(log)?, true);
-    let mut feeder = Feeder::new(options);
     let mut pace: Option<(HostTime, Instant)> = None;
     while let Some(recorded) = flight.next()? {
         let Recorded::Observation(observation) = recorded else { continue };
@@ -236,7 +240,6 @@ fn run(
         }
     }
     report.images_missing += plan.unfed();
-    feeder.stop(line);
     Ok(None)
 }
 
