@@ -30,6 +30,17 @@ pub fn run(args: &[&str]) -> Output {
     Command::new(vizflyt()).args(args).output().expect("vizflyt starts")
 }
 
+/// Runs `vizflyt ARGS` in a folder; returns whether it succeeded, and all that it printed.
+///
+/// # Panics
+/// If it cannot be started.
+pub fn run_in(folder: &Path, args: &[&str]) -> (bool, String) {
+    let output =
+        Command::new(vizflyt()).current_dir(folder).args(args).output().expect("vizflyt starts");
+    let text = [output.stdout, output.stderr].concat();
+    (output.status.success(), String::from_utf8_lossy(&text).into_owned())
+}
+
 /// Runs `vizflyt ARGS`, and returns standard output.
 ///
 /// # Panics

@@ -4,12 +4,11 @@
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 
 use glam::{DQuat, DVec3};
 use serde_json::{Value, json};
 use vizflyt_arena::ArenaConfig;
-use vizflyt_e2e::vizflyt;
+use vizflyt_e2e::run_in;
 
 /// Metres per unit of the capture.
 const SCALE: f64 = 0.37;
@@ -17,12 +16,6 @@ const TRANSLATION_M: DVec3 = DVec3::new(0.8, -1.9, 0.6);
 
 fn world_from_scene() -> DQuat {
     DQuat::from_scaled_axis(DVec3::new(1.3, -0.4, 0.9))
-}
-
-fn run(folder: &Path, args: &[&str]) -> (bool, String) {
-    let output = Command::new(vizflyt()).current_dir(folder).args(args).output().unwrap();
-    let text = [output.stdout, output.stderr].concat();
-    (output.status.success(), String::from_utf8_lossy(&text).into_owned())
 }
 
 fn numbers(value: &Value) -> Vec<f64> {
@@ -97,7 +90,7 @@ fn check_place(arena: &str) {
 fn a_capture_with_tags_finds_its_place_in_the_room() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
-    let (ok, said) = run(
+    let (ok, said) = run_in(
         home,
         &[
             "scene",
@@ -122,7 +115,7 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
     fs::write(&arena, format!("# Ours.\n{before}")).unwrap();
 
     let align = ["scene", "align", "hall", "--tags", "walk/tags.toml", "--capture", "walk"];
-    let (ok, said) = run(home, &align);
+    let (ok, said) = run_in(home, &align);
     println!("{said}");
     assert!(ok && said.contains("\ngo  "), "{said}");
     let text = fs::read_to_string(&arena).unwrap();
@@ -131,7 +124,7 @@ fn a_capture_with_tags_finds_its_place_in_the_room() {
 
     // Poses of a poor reconstruction: the place is not known, nothing is written, and it says why.
     write_transforms(&capture, 0.25, 1);
-    let (ok, said) = run(home, &align);
+    let (ok, said) = run_in(home, &align);
     assert!(!ok, "{said}");
     assert!(["NO GO", "contradict", "no tag of"].iter().any(|word| said.contains(word)), "{said}");
     assert_eq!(fs::read_to_string(&arena).unwrap(), text);
@@ -145,7 +138,7 @@ fn a_track_of_the_phone_finds_its_place_in_the_room() {
     let film = "--capture walk --frames 900 --seconds 30 --size 80x64 -o hall";
     let generate = "scene generate room --seed 3";
     let words: Vec<&str> = generate.split(' ').chain(film.split(' ')).collect();
-    let (ok, said) = run(home, &words);
+    let (ok, said) = run_in(home, &words);
     assert!(ok, "{said}");
     let capture = home.join("walk");
     write_transforms(&capture, 0.005, 10);
@@ -173,7 +166,7 @@ fn a_track_of_the_phone_finds_its_place_in_the_room() {
     let beside = ["--tracked-at", "0.03,-0.092,-0.02"];
     let align = |track: &str, more: &[&str]| {
         let align = ["scene", "align", "hall", "--capture", "walk", "--track", track];
-        run(home, &[&align[..], more].concat())
+        run_in(home, &[&align[..], more].concat())
     };
     // Carried level: how high the marker sits above the lens must be measured (here 2 mm wrong).
     let (ok, said) = align("track.txt", &["--times", "times.csv"]);
@@ -203,7 +196,7 @@ fn what_cannot_be_aligned_is_explained() {
     let floor =
         ["--floor", "0,0,0", "--floor", "4,0,0", "--above", "0,0,1", "--length", "0,0,0:0,0,1=1"];
     let align =
-        |arena: &str, more: &[&str]| run(home, &[&["scene", "align", arena], more].concat());
+        |arena: &str, more: &[&str]| run_in(home, &[&["scene", "align", arena], more].concat());
     for (arena, more, word) in [
         ("room.ply", &floor[..], "make one around the scene"),
         ("nowhere", &floor[..], "no arena"),

@@ -5,13 +5,12 @@
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 use std::time::SystemTime;
 
 use glam::{DQuat, DVec2, DVec3};
 use serde_json::Value;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_e2e::vizflyt;
+use vizflyt_e2e::run_in;
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 
 /// Metres per unit of the model.
@@ -20,12 +19,6 @@ const TRANSLATION_M: DVec3 = DVec3::new(0.8, -1.9, 0.6);
 
 fn world_from_scene() -> DQuat {
     DQuat::from_scaled_axis(DVec3::new(1.3, -0.4, 0.9))
-}
-
-fn run(folder: &Path, args: &[&str]) -> (bool, String) {
-    let output = Command::new(vizflyt()).current_dir(folder).args(args).output().unwrap();
-    let text = [output.stdout, output.stderr].concat();
-    (output.status.success(), String::from_utf8_lossy(&text).into_owned())
 }
 
 fn numbers<const N: usize>(value: &Value) -> [f64; N] {
@@ -159,7 +152,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
         "--frames",
         "60",
     ];
-    let (ok, said) = run(home, &film);
+    let (ok, said) = run_in(home, &film);
     assert!(ok, "{said}");
     let truth = truth(&home.join("walk"));
     write_model(&home.join("model"), &truth, |_| DVec3::ZERO, |_| true);
@@ -177,7 +170,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
         ];
         let small =
             ["--camera", "walk/camera.toml", "--steps", "40", "--splats", "4000", "--width", "80"];
-        run(home, &[&start[..], &small, more].concat())
+        run_in(home, &[&start[..], &small, more].concat())
     };
     // So little training leaves floaters where the start should be: whether it can be flown is not asked here.
     let (_, said) = capture(&[]);
@@ -213,8 +206,8 @@ fn photos_with_poses_become_a_twin_in_metres() {
     assert!(page.matches("data:image/jpeg;base64,").count() >= 8);
 
     // Again: nothing is done again, but what is asked for.
-    let metric = home.join("hall/work/metric.json");
-    let trained = home.join("hall/work/train.json");
+    let metric = home.join("hall/stages/metric.json");
+    let trained = home.join("hall/stages/train.json");
     let before = (modified(&metric), modified(&trained));
     let (_, said) = capture(&[]);
     assert_eq!(said.matches("(kept)").count(), 6, "{said}");
@@ -256,7 +249,7 @@ fn what_cannot_be_captured_is_explained() {
         "--size",
         "64x64",
     ];
-    let (ok, said) = run(home, &film);
+    let (ok, said) = run_in(home, &film);
     assert!(ok, "{said}");
     for (args, says) in [
         (&["nothing.mp4", "-o", "out"][..], "neither a video nor a folder"),
@@ -269,7 +262,7 @@ fn what_cannot_be_captured_is_explained() {
         (&["walk", "-o", "out", "--tags", "a.toml", "--tag-size", "0.2"], "cannot be used with"),
         (&["walk", "-o", "out", "--tags", "a.toml"], "a.toml"),
     ] {
-        let (ok, said) = run(home, &[&["scene", "capture"], args].concat());
+        let (ok, said) = run_in(home, &[&["scene", "capture"], args].concat());
         assert!(!ok && said.contains(says), "{args:?}: {said}");
     }
 }

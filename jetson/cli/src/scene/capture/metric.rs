@@ -15,7 +15,7 @@ use vizflyt_twin::dataset::{SparseModel, colmap};
 use vizflyt_twin::verdict::{self, Evidence, Given, Severity};
 
 use self::ground::Ground;
-use super::images::{Pictures, clock};
+use super::images::Pictures;
 use super::poses::Poses;
 use super::prints::Seen;
 
@@ -183,7 +183,7 @@ pub(super) fn make(
     });
     let mut metric = Metric { checked: verdict.checked.clone(), ..Metric::default() };
     metric.fit_to_fly = verdict.is_fit_to_fly();
-    metric.findings = verdict.findings.iter().map(|finding| fact(finding, pictures)).collect();
+    metric.findings = verdict.findings.iter().map(fact).collect();
     if let (Ok(adjusted), Some(ground)) = (&adjusted, &ground) {
         describe(&mut metric, &first, adjusted, ground);
         let metres = placed(&model, &first, adjusted, ground);
@@ -218,20 +218,11 @@ fn add_tags(capture: &mut Capture, pictures: &Pictures, seen: &Seen, room: &Room
     }
 }
 
-fn fact(finding: &verdict::Finding, pictures: &Pictures) -> FindingFact {
-    let mut what = finding.what.clone();
-    if pictures.of_video && !finding.images.is_empty() {
-        let time = |i: usize| pictures.pictures.get(i).map_or(0.0, |picture| picture.at_s);
-        let runs = finding.images.iter().take(MANY).map(|run| {
-            format!("{} to {}", clock(time(run.start)), clock(time(run.end.saturating_sub(1))))
-        });
-        what.push_str("; in the video from ");
-        what.push_str(&runs.collect::<Vec<_>>().join(", from "));
-    }
+fn fact(finding: &verdict::Finding) -> FindingFact {
     FindingFact {
         refused: finding.severity == Severity::Refused,
         of_metres: finding.check == verdict::Check::Metric,
-        what,
+        what: finding.what.clone(),
         remedy: finding.remedy.clone(),
         images: finding.images.iter().map(|run| [run.start, run.end.saturating_sub(1)]).collect(),
     }
@@ -301,6 +292,3 @@ fn placed(
     }
     placed
 }
-
-/// Longer lists are not read.
-const MANY: usize = 6;

@@ -8,7 +8,7 @@
 //! train    splats, photos held out                                -> scene.ply
 //! finish   carved by the capture's rays; fence, start             -> scene.ply, arena.toml
 //! ```
-//! Each keeps its result in `work/` (`work.rs`); `capture.json` and `report.html` are written at the end, however it ends.
+//! Each keeps its result in `stages/` (`work.rs`); `capture.json` and `report.html` are written at the end, however it ends.
 
 mod coverage;
 mod finish;
@@ -45,7 +45,7 @@ use crate::terminal::print_fmt;
   arena.toml     a fence around what was seen, a start on the walk; only if the capture can be trusted
   report.html    the walk from above, what was found, photos beside what they are rendered as
   capture.json   the same for programs: scale and its bound, residuals, times
-  work/          what each stage made; a stage whose inputs are the same is not done again
+  stages/        what each stage made; a stage whose inputs are the same is not done again
 
 A video is read by the program ffmpeg. Where the camera was is found by COLMAP: `pip install pycolmap`, or the
 program colmap. Put up printed tags before you film: they make it metric, and they tell alike places apart.

@@ -2,8 +2,8 @@
 //! again as long as that is the same.
 //!
 //! ```text
-//! my-hall/work/images/          files of the stage `images`
-//! my-hall/work/images.json      its key, how long it took, its result; written last
+//! my-hall/stages/images/          files of the stage `images`
+//! my-hall/stages/images.json      its key, how long it took, its result; written last
 //! ```
 //! A stage's key holds the keys of those before it: one that is done again lets all after it be done again.
 
@@ -90,7 +90,7 @@ impl Work {
     /// # Errors
     /// A folder that holds something else.
     pub(super) fn open(output: &Path, from: Option<Stage>) -> Result<Self> {
-        let folder = output.join("work");
+        let folder = output.join("stages");
         let is_new = !folder.is_dir();
         if is_new && output.exists() {
             let mut entries = std::fs::read_dir(output)
@@ -306,7 +306,7 @@ mod tests {
         assert_eq!(run(&output, [2, 2], Some(Poses)), [Poses]);
         assert_eq!(run(&output, [2, 2], Some(Images)), [Images, Poses]);
         // A damaged result is none.
-        std::fs::write(output.join("work/images.json"), "{").unwrap();
+        std::fs::write(output.join("stages/images.json"), "{").unwrap();
         assert_eq!(run(&output, [2, 2], None), [Images]);
     }
 
