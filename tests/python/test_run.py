@@ -132,6 +132,10 @@ FAILURES = {
         "v_mps must be three numbers [x, y, z], not a numpy.ndarray of shape (48, 64)",
     ),
     "an unknown camera": ("return obs.camera('fornt')", "there is no camera 'fornt'; this vehicle has 'front'"),
+    "a name that is not there": (
+        "return obs.position",
+        "'vizflyt.Observation' object has no attribute 'position'; it has battery, camera, cameras, imu,",
+    ),
     "exit": ("import sys; sys.exit(0)", "my_plugin.py:6 in on_image: the plugin called exit: status 0"),
 }
 

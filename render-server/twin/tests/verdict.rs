@@ -61,7 +61,7 @@ fn recorded(name: &str) -> Recorded {
     }
     let adjusted = adjust(&capture, Options::default()).unwrap();
     let given: Vec<Given> =
-        walk.given.iter().map(|i| Given { name: i.name.clone(), at_s: i.at_s }).collect();
+        walk.given.iter().map(|i| Given { name: i.name.clone(), at_s: Some(i.at_s) }).collect();
     let verdict = judge(&Evidence {
         given: &given,
         capture: &capture,

@@ -228,6 +228,46 @@ fn photos_with_poses_become_a_twin_in_metres() {
     assert!(page.contains("It is refused."), "{page}");
 }
 
+/// Photos without a tag, and a motion capture's 15 Hz of a marker beside the lens, on its own clock.
+#[test]
+fn a_motion_capture_gives_photos_metres_and_their_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let home = folder.path();
+    let film = "scene generate room --seed 3 --capture walk --frames 120 --seconds 8 --size 80x64";
+    let (ok, said) = run_in(home, &film.split(' ').collect::<Vec<_>>());
+    assert!(ok, "{said}");
+    let truth = truth(&home.join("walk"));
+    write_model(&home.join("model"), &truth, |_| DVec3::ZERO, |_| true);
+    let beside_m = DVec3::new(0.03, -0.09, -0.02);
+    let (mut track, mut times) = (String::new(), String::new());
+    for (n, (name, pose)) in truth.images.iter().enumerate() {
+        let p = pose.transform_point(beside_m) + 0.001 * DVec3::splat(noise(n));
+        writeln!(track, "{:.4} {:.5} {:.5} {:.5} 0 0 0 1", 7.25 + n as f64 / 15.0, p.x, p.y, p.z)
+            .unwrap();
+        writeln!(times, "{name},{}", n as u64 * 1_000_000_000 / 15).unwrap();
+    }
+    fs::write(home.join("track.txt"), track).unwrap();
+    fs::write(home.join("times.csv"), times).unwrap();
+    let capture = |more: &str| {
+        let words = "scene capture walk -o hall --poses model --track track.txt --steps 1 --splats 1000 --width 40";
+        run_in(home, &words.split(' ').chain(more.split_whitespace()).collect::<Vec<_>>())
+    };
+    let (ok, said) = capture("--tracked-at 0.03,-0.09,-0.02");
+    assert!(!ok && said.contains("--times"), "{said}");
+    let (_, said) = capture("--tracked-at 0.03,-0.09,-0.02 --times times.csv");
+    println!("{said}");
+    assert!(said.contains("by the motion capture's track"), "{said}");
+    let record: Value =
+        serde_json::from_slice(&fs::read(home.join("hall/capture.json")).unwrap()).unwrap();
+    assert_eq!(record["metric"]["scale_is_guessed"], false);
+    for placed in record["metric"]["way"].as_array().unwrap() {
+        let (_, pose) =
+            truth.images.iter().find(|(name, _)| placed["name"] == name.as_str()).unwrap();
+        let off_m = DVec3::from_array(numbers(&placed["position_m"])).distance(pose.translation_m);
+        assert!(off_m < 0.03, "{placed} is {off_m} m off");
+    }
+}
+
 #[test]
 fn what_cannot_be_captured_is_explained() {
     let folder = tempfile::tempdir().unwrap();
@@ -261,6 +301,7 @@ fn what_cannot_be_captured_is_explained() {
         (&["walk", "-o", "out", "--length", "3=2"], "3,8=4.52"),
         (&["walk", "-o", "out", "--tags", "a.toml", "--tag-size", "0.2"], "cannot be used with"),
         (&["walk", "-o", "out", "--tags", "a.toml"], "a.toml"),
+        (&["walk", "-o", "out", "--times", "a.csv"], "--track"),
     ] {
         let (ok, said) = run_in(home, &[&["scene", "capture"], args].concat());
         assert!(!ok && said.contains(says), "{args:?}: {said}");

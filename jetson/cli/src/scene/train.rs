@@ -107,6 +107,10 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         dataset.points.len(),
         start.elapsed().as_secs_f64()
     );
+    if let Some(first) = dataset.absent.first() {
+        let absent = dataset.absent.len();
+        print_fmt!("absent       {absent} photos that have a pose are not there, such as {first}");
+    }
     let observed: usize = dataset.photos.iter().map(|photo| photo.target.points.len()).sum();
     if observed == 0 && dataset.photos.iter().all(|photo| photo.target.depth.is_empty()) {
         print_fmt!(

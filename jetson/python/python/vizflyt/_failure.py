@@ -30,6 +30,8 @@ def sentence(error: BaseException, method: str) -> str:
     if isinstance(error, SyntaxError) and error.filename:
         # Its own place says more than the import that met it.
         return f"{os.path.basename(error.filename)}:{error.lineno}: {what}: {error.msg}"
+    if isinstance(error, AttributeError):
+        detail += _what_it_has(getattr(error, "obj", None))
     message = f"{what}: {detail}" if detail else what
     own = _own_line(error.__traceback__)
     if own is None:
@@ -47,6 +49,14 @@ def without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
         at = at.tb_next
     # Where there is nothing but ours, ours says what there is to say.
     return at or traceback
+
+
+def _what_it_has(thing: object) -> str:
+    """Returns what a wrong name of one of our types may have meant: all names that there are."""
+    if not type(thing).__module__.startswith("vizflyt"):
+        return ""
+    names = [name for name in dir(type(thing)) if not name.startswith("_")]
+    return f"; it has {', '.join(names)}"
 
 
 def _own_line(traceback: TracebackType | None) -> tuple[str, int, str] | None:

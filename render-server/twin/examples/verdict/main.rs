@@ -50,11 +50,12 @@ fn main() -> Result<ExitCode, Failure> {
     let given: Vec<Given> = truth
         .images
         .iter()
-        .map(|image| Given { name: image.name.clone(), at_s: image.at_s })
+        .map(|image| Given { name: image.name.clone(), at_s: Some(image.at_s) })
         .collect();
     let mut captures = Vec::new();
     for model in models {
-        let at_s = |name: &str| given.iter().find(|g| g.name == name).map_or(0.0, |g| g.at_s);
+        let at_s =
+            |name: &str| given.iter().find(|g| g.name == name).and_then(|g| g.at_s).unwrap_or(0.0);
         captures.push(Capture::new(&colmap::read(Path::new(model))?, at_s)?);
     }
     let (capture, others) = captures.split_first_mut().ok_or("give a model's folder")?;

@@ -40,7 +40,7 @@ fn dataset() -> Dataset {
         let target = Target { width: 96, height: 72, rgb, ..Target::default() };
         Photo { name: n.to_string(), view, target }
     };
-    Dataset { photos: (0..9).map(photo).collect(), points: Vec::new() }
+    Dataset { photos: (0..9).map(photo).collect(), ..Dataset::default() }
 }
 
 /// From behind the camera to behind the wall, in the frame of the photos.

@@ -57,6 +57,19 @@ pub enum DatasetError {
     /// Too few images to train with.
     #[error("{} has {} images with a pose; at least 2 are needed", .0.display(), .1)]
     TooFew(PathBuf, usize),
+    /// Most photos of the poses are not there.
+    #[error(
+        "{absent} of the {images} photos that have a pose are not there, such as {}; are these the poses of these photos?",
+        first.display()
+    )]
+    Absent {
+        /// One of them.
+        first: PathBuf,
+        /// How many.
+        absent: usize,
+        /// Of so many.
+        images: usize,
+    },
     /// All images together would not fit.
     #[error(
         "{images} images take {megabytes} MB of memory, more than {limit} MB; give a smaller --width"

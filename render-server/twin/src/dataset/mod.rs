@@ -32,6 +32,8 @@ pub struct Dataset {
     pub photos: Vec<Photo>,
     /// Points of structure from motion; may be none.
     pub points: Vec<Point>,
+    /// Photos that have a pose and are not there: public datasets are thinned out so. At most half of all.
+    pub absent: Vec<String>,
 }
 
 /// A photo, undistorted.
@@ -121,17 +123,27 @@ impl Dataset {
         points: Points,
         width_px: Option<u32>,
     ) -> Result<Self, DatasetError> {
+        let (plans, absent): (Vec<&Plan>, Vec<&Plan>) =
+            plans.iter().partition(|plan| plan.image.exists());
+        if absent.len() > plans.len() {
+            return Err(DatasetError::Absent {
+                first: absent[0].image.clone(),
+                absent: absent.len(),
+                images: absent.len() + plans.len(),
+            });
+        }
         if plans.len() < 2 {
             return Err(DatasetError::TooFew(folder.to_owned(), plans.len()));
         }
-        check_memory(plans, width_px)?;
+        check_memory(&plans, width_px)?;
+        let absent = absent.iter().map(|plan| plan.name.clone()).collect();
         let mut photos = plans
             .par_iter()
             .map(|plan| plan.load(width_px, &points))
             .collect::<Result<Vec<_>, _>>()?;
         photos.sort_by(|a, b| a.name.cmp(&b.name));
         let points = points.into_values().collect();
-        let mut dataset = Self { photos, points };
+        let mut dataset = Self { photos, points, absent };
         let near = NEAR * dataset.extent();
         for photo in &mut dataset.photos {
             photo.view.near = near;
@@ -224,8 +236,8 @@ fn of_nerfstudio(folder: &Path, file: &Path) -> Result<(Vec<Plan>, Points), Data
 }
 
 /// Checks that all photos fit into memory together.
-fn check_memory(plans: &[Plan], width_px: Option<u32>) -> Result<(), DatasetError> {
-    let bytes = |plan: &Plan| {
+fn check_memory(plans: &[&Plan], width_px: Option<u32>) -> Result<(), DatasetError> {
+    let bytes = |plan: &&Plan| {
         // Where the size waits for the image, the width alone bounds it.
         let side = u64::from(width_px.unwrap_or(1920));
         let pixels = plan

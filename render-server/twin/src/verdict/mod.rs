@@ -39,8 +39,8 @@ pub struct Evidence<'a> {
 pub struct Given {
     /// Its file's name.
     pub name: String,
-    /// When it was taken, from the start of the video. [s]
-    pub at_s: f64,
+    /// When it was taken, from the start of the video; photos have no times. [s]
+    pub at_s: Option<f64>,
 }
 
 /// What came out.

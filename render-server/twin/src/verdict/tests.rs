@@ -15,7 +15,11 @@ fn good(seed: u64) -> Hall {
 
 fn given(hall: &Hall) -> Vec<Given> {
     let images = hall.capture.images.iter();
-    images.map(|image| Given { name: image.name.clone(), at_s: image.at_s }).collect()
+    images.map(|image| Given { name: image.name.clone(), at_s: Some(image.at_s) }).collect()
+}
+
+fn photos(hall: &Hall) -> Vec<Given> {
+    given(hall).into_iter().map(|image| Given { at_s: None, ..image }).collect()
 }
 
 fn judged(given: &[Given], capture: &Capture, others: &[Capture]) -> Verdict {
@@ -84,6 +88,11 @@ proptest! {
         let found = refused(&verdict, Check::Continuity);
         prop_assert!(found.images.iter().any(|run| run.contains(&first)), "{found:?}");
         refused(&verdict, Check::Connected);
+        // Of photos nobody knows how soon one followed the other: what they share tells it all the same.
+        let verdict = judged(&photos(&hall), &hall.capture, &[]);
+        prop_assert!(!verdict.findings.iter().any(|f| f.check == Check::Continuity), "{verdict:#?}");
+        let found = refused(&verdict, Check::Connected);
+        prop_assert!(!found.what.contains(" s)"), "no time is made up: {}", found.what);
     }
 
     #[test]
@@ -98,6 +107,8 @@ proptest! {
         refused(&verdict, Check::Continuity);
         let tags = verdict.findings.iter().any(|f| f.check == Check::Tags || f.check == Check::Metric);
         prop_assert!(tags, "{verdict:#?}");
+        let verdict = judged(&photos(&hall), &hall.capture, &[]);
+        prop_assert!(!verdict.is_fit_to_fly(), "{verdict:#?}");
     }
 
     #[test]

@@ -16,14 +16,18 @@ pub(super) fn runs(ascending: &[usize]) -> Vec<Range<usize>> {
     runs
 }
 
-/// Returns runs of images with their times: "12 to 20 (7.4 s to 12.4 s), 31 (19.2 s)".
+/// Returns runs of images, with their times where they have any: "12 to 20 (7.4 s to 12.4 s), 31 (19.2 s)".
 pub(super) fn spans(given: &[Given], runs: &[Range<usize>]) -> String {
     let one = |run: &Range<usize>| {
         let (first, last) = (&given[run.start], &given[run.end - 1]);
-        if run.len() == 1 {
-            format!("{} ({:.1} s)", first.name, first.at_s)
-        } else {
-            format!("{} to {} ({:.1} s to {:.1} s)", first.name, last.name, first.at_s, last.at_s)
+        let names = match run.len() {
+            1 => first.name.clone(),
+            _ => format!("{} to {}", first.name, last.name),
+        };
+        match (first.at_s, last.at_s) {
+            (Some(at_s), _) if run.len() == 1 => format!("{names} ({at_s:.1} s)"),
+            (Some(from_s), Some(to_s)) => format!("{names} ({from_s:.1} s to {to_s:.1} s)"),
+            _ => names,
         }
     };
     let mut longest: Vec<&Range<usize>> = runs.iter().collect();

@@ -4,7 +4,7 @@
 mod page;
 mod report;
 mod tags;
-mod track;
+pub(super) mod track;
 mod write;
 
 use std::net::SocketAddr;
@@ -19,6 +19,7 @@ use vizflyt_server::render::RendererKind;
 use vizflyt_twin::align::floor::{self, Floor};
 
 use self::report::Report;
+pub(super) use self::track::ClockArgs;
 use self::write::Changes;
 use crate::terminal::print_fmt;
 

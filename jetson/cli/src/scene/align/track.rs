@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use clap::{Args, ValueEnum};
 use glam::DVec3;
+use serde::Serialize;
 use vizflyt_tags::capture::parse_stamps;
 use vizflyt_twin::align::track::{self, CameraPose, TrackFit, Tracked};
 use vizflyt_twin::align::{AlignError, Fit, recording};
@@ -14,8 +15,8 @@ use vizflyt_twin::dataset;
 use crate::terminal::print_fmt;
 
 /// When images and track were taken.
-#[derive(Args, Clone, Debug)]
-pub(super) struct ClockArgs {
+#[derive(Args, Clone, Debug, Default, PartialEq, Serialize)]
+pub(in crate::scene) struct ClockArgs {
     /// When each image was taken: lines of name,stamp_ns [default: stamps.csv of the capture, or the images' names]
     #[arg(long, value_name = "CSV", requires = "track")]
     times: Option<PathBuf>,
@@ -39,26 +40,49 @@ pub(super) struct ClockArgs {
     track_up: TrackUp,
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
 enum TrackUp {
     #[default]
     Z,
     Y,
 }
 
-/// Finds the place by a recording.
+impl ClockArgs {
+    /// Whether it is said when images were taken.
+    pub(in crate::scene) fn has_times(&self) -> bool {
+        self.times.is_some() || self.rate.is_some()
+    }
+}
+
+/// Finds the place of a dataset by a recording.
 pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64) -> Result<Fit> {
+    fit(clocks, path, cameras(clocks, capture)?, capture, sigma_m)
+}
+
+/// Finds the place of cameras by a recording of what they filmed, `capture`.
+///
+/// # Errors
+/// A recording that cannot be read, or that is not of these cameras.
+pub(in crate::scene) fn fit(
+    clocks: &ClockArgs,
+    path: &Path,
+    mut cameras: Vec<CameraPose>,
+    capture: &Path,
+    sigma_m: f64,
+) -> Result<Fit> {
     let mut track = read_track(path, clocks.track_up)?;
-    let mut cameras = cameras(clocks, capture)?;
+    ensure!(!cameras.is_empty(), "{} has no camera with a pose", capture.display());
+    cameras.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
     let span = |from: f64, to: f64| format!("{:.1} s", to - from);
     let [first, last] = [track[0].at_s, track[track.len() - 1].at_s];
     let [begin, end] = [cameras[0].at_s, cameras[cameras.len() - 1].at_s];
     print_fmt!("track       {} poses of {}", track.len(), span(first, last));
     print_fmt!("images      {} of {}", cameras.len(), span(begin, end));
-    let is_shared = begin < last && first < end;
+    // By chance two clocks may have a moment in common.
+    let is_shared = 2.0 * (last.min(end) - first.max(begin)) > end - begin;
     if !is_shared {
         print_fmt!(
-            "note        the clocks have nothing in common: both are taken to begin together"
+            "note        the clocks have little in common: both are taken to begin together"
         );
     }
     let start_s = if is_shared { begin } else { first };
@@ -71,7 +95,7 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
     let max_offset_s = clocks.max_offset_s.unwrap_or(if is_shared { 2.0 } else { 30.0 });
     let TrackFit { fit, offset_s, point_in_cam_m: p } =
         track::fit(&cameras, &track, max_offset_s, sigma_m, clocks.tracked_at)
-            .map_err(with_advice)?;
+            .map_err(|error| with_advice(error, max_offset_s))?;
     print_fmt!("clocks      {:+.3} s from the images' to the track's", offset_s + start_s - begin);
     print_fmt!(
         "tracked     {:.3}, {:.3}, {:.3} m from the lens: right, down, ahead",
@@ -95,15 +119,19 @@ pub(super) fn find(clocks: &ClockArgs, path: &Path, capture: &Path, sigma_m: f64
     Ok(fit)
 }
 
-fn with_advice(error: AlignError) -> anyhow::Error {
-    let is_level = matches!(error, AlignError::HardlyMoved(_));
-    let error = anyhow::Error::from(error);
-    if is_level {
-        return error.context(
-            "where the tracked point sits beside the lens cannot be seen; measure it, and give it by --tracked-at",
-        );
-    }
-    error
+fn with_advice(error: AlignError, max_offset_s: f64) -> anyhow::Error {
+    let advice = match &error {
+        AlignError::HardlyMoved(_) => {
+            "where the tracked point sits beside the lens cannot be seen; measure it, and give it by --tracked-at"
+                .to_owned()
+        }
+        AlignError::TooFew { .. } => format!(
+            "the recording covers too few of the images, or the clocks differ by more than {max_offset_s} s \
+             (--max-offset-s)"
+        ),
+        _ => return error.into(),
+    };
+    anyhow::Error::from(error).context(advice)
 }
 
 /// A similarity fits any two paths somehow: what is left says whether they are one.
@@ -157,7 +185,7 @@ fn cameras(clocks: &ClockArgs, capture: &Path) -> Result<Vec<CameraPose>> {
     let poses = dataset::read_poses(capture)?;
     let names: Vec<&str> = poses.iter().map(|(name, _)| name.as_str()).collect();
     let times_s = times(clocks, capture, &names)?;
-    let mut cameras: Vec<_> = poses
+    let cameras = poses
         .iter()
         .zip(times_s)
         .map(|((_, pose), at_s)| CameraPose {
@@ -166,12 +194,15 @@ fn cameras(clocks: &ClockArgs, capture: &Path) -> Result<Vec<CameraPose>> {
             rotation: pose.rotation,
         })
         .collect();
-    cameras.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
     Ok(cameras)
 }
 
 /// Returns when images were taken. [s]
-fn times(clocks: &ClockArgs, capture: &Path, names: &[&str]) -> Result<Vec<f64>> {
+pub(in crate::scene) fn times(
+    clocks: &ClockArgs,
+    capture: &Path,
+    names: &[&str],
+) -> Result<Vec<f64>> {
     let beside = [capture.join("stamps.csv"), capture.join("images/stamps.csv")];
     let beside = beside.into_iter().find(|path| path.is_file() && clocks.rate.is_none());
     if let Some(path) = clocks.times.clone().or(beside) {

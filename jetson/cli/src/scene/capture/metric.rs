@@ -2,7 +2,7 @@
 
 mod ground;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
 use glam::DVec3;
@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_tags::layout::{LayoutFrame, TagLayout};
 use vizflyt_twin::adjust::{self, Adjusted, Capture, Options, Tag, TagSighting};
-use vizflyt_twin::align::Similarity;
+use vizflyt_twin::align::track::CameraPose;
+use vizflyt_twin::align::{Fit, Similarity};
 use vizflyt_twin::dataset::{SparseModel, colmap};
 use vizflyt_twin::verdict::{self, Evidence, Given, Severity};
 
@@ -18,6 +19,8 @@ use self::ground::Ground;
 use super::images::Pictures;
 use super::poses::Poses;
 use super::prints::Seen;
+use super::work::Fingerprint;
+use crate::scene::align::{self, ClockArgs};
 
 /// What is known of the room.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -28,6 +31,8 @@ pub(super) struct Room {
     pub(super) tag_size_m: Option<f64>,
     /// How far apart the middles of two tags are.
     pub(super) length: Option<Length>,
+    /// What a motion capture saw of the camera.
+    pub(super) track: Option<Track>,
     /// Whether the lens was calibrated.
     pub(super) lens_is_known: bool,
 }
@@ -37,6 +42,44 @@ pub(super) struct Room {
 pub(super) struct Length {
     pub(super) ids: [u32; 2],
     pub(super) metres: f64,
+}
+
+/// A motion capture's recording of the camera.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct Track {
+    file: PathBuf,
+    fingerprint: Fingerprint,
+    clocks: ClockArgs,
+}
+
+impl Track {
+    pub(super) fn of(file: &Path, clocks: &ClockArgs) -> Result<Self> {
+        let fingerprint = Fingerprint::of(file)?;
+        Ok(Self { file: file.to_owned(), fingerprint, clocks: clocks.clone() })
+    }
+
+    /// Finds where the adjusted cameras are.
+    fn fit(&self, pictures: &Pictures, capture: &Capture, adjusted: &Adjusted) -> Result<Fit> {
+        let names: Vec<&str> = capture.images.iter().map(|image| image.name.as_str()).collect();
+        let times_s = if pictures.of_video {
+            capture.images.iter().map(|image| image.at_s).collect()
+        } else {
+            align::track::times(&self.clocks, &pictures.folder, &names)?
+        };
+        let cameras = times_s.into_iter().zip(&adjusted.world_from_cam);
+        let cameras = cameras.map(|(at_s, pose)| CameraPose {
+            at_s,
+            position: pose.translation_m,
+            rotation: pose.rotation,
+        });
+        align::track::fit(
+            &self.clocks,
+            &self.file,
+            cameras.collect(),
+            &pictures.folder,
+            TRACK_SIGMA_M,
+        )
+    }
 }
 
 /// What the stage leaves, beside the model in `sparse/0`.
@@ -169,11 +212,21 @@ pub(super) fn make(
     let given: Vec<Given> = pictures
         .pictures
         .iter()
-        .map(|picture| Given { name: picture.name.clone(), at_s: picture.at_s })
+        .map(|picture| Given {
+            name: picture.name.clone(),
+            at_s: pictures.of_video.then_some(picture.at_s),
+        })
         .collect();
     let options = Options { refine_lens: !room.lens_is_known, ..Options::default() };
     let adjusted = adjust::adjust(&first, options);
-    let ground = adjusted.as_ref().ok().map(|adjusted| Ground::of(&first, adjusted, seen, room));
+    let tracked = match (&room.track, &adjusted) {
+        (Some(track), Ok(adjusted)) => Some(track.fit(pictures, &first, adjusted)?),
+        _ => None,
+    };
+    let ground = adjusted.as_ref().ok().map(|adjusted| match tracked {
+        Some(fit) => Ground::of_track(fit),
+        None => Ground::of(&first, adjusted, seen, room),
+    });
     let verdict = verdict::judge(&Evidence {
         given: &given,
         capture: &first,
@@ -292,3 +345,6 @@ fn placed(
     }
     placed
 }
+
+/// What a motion capture and a hand-held marker's place are good for. [m]
+const TRACK_SIGMA_M: f64 = 0.005;

@@ -32,10 +32,11 @@ use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::TagLayout;
 
 use self::images::{Choice, Source};
-use self::metric::{Length, Room};
+use self::metric::{Length, Room, Track};
 use self::record::Record;
 use self::training::Schedule;
 use self::work::{Fingerprint, Stage, Work, hex};
+use crate::scene::align::ClockArgs;
 use crate::terminal::print_fmt;
 
 /// Makes a twin that can be flown from a video of a room, or from photos of it.
@@ -54,6 +55,7 @@ Examples:
   vizflyt scene capture hall.mp4 -o my-hall --tags hall.tags.toml
   vizflyt scene capture hall.mp4 -o my-hall --tag-size 0.2 --camera phone.toml
   vizflyt scene capture hall.mp4 -o my-hall --length 3,8=4.52
+  vizflyt scene capture hall.mp4 -o my-hall --track phone.csv --tracked-at 0.03,-0.09,0
   vizflyt scene capture my-photos -o my-hall --poses my-colmap --tags hall.tags.toml
   vizflyt scene capture hall.mp4 -o my-hall --tags hall.tags.toml --from train --steps 7000 --width 640
   vizflyt demo --scene my-hall")]
@@ -72,6 +74,11 @@ pub(crate) struct CaptureArgs {
     /// Two tags, by number, and how far apart their middles are [m]
     #[arg(long, value_name = "A,B=METRES", value_parser = length)]
     length: Option<Length>,
+    /// A motion capture's track of something fixed to the camera while it filmed; gives metres, up and the room's frame
+    #[arg(long, value_name = "CSV", conflicts_with_all = ["tags", "tag_size", "length"])]
+    track: Option<PathBuf>,
+    #[command(flatten)]
+    clocks: ClockArgs,
     /// The camera's lens, as `vizflyt tags calibrate` writes it; found from the pictures where it is absent
     #[arg(long, value_name = "CAMERA")]
     camera: Option<PathBuf>,
@@ -113,6 +120,10 @@ pub(crate) fn run(args: &CaptureArgs) -> Result<ExitCode> {
     ensure!(
         args.poses.is_none() || matches!(source, Source::Folder(_)),
         "--poses are of photos: give the folder of the pictures in place of the video"
+    );
+    ensure!(
+        !args.clocks.has_times() || matches!(source, Source::Folder(_)),
+        "--times and --rate are of photos; a video has its own times"
     );
     if let Source::Video(file) = &source {
         images::probe(file)?;
@@ -194,6 +205,7 @@ fn make(
         layout,
         tag_size_m: args.tag_size,
         length: args.length,
+        track: args.track.as_deref().map(|file| Track::of(file, &args.clocks)).transpose()?,
         lens_is_known: known.is_some(),
     };
     let metric = work.stage(Stage::Metric, &room, |folder| {

@@ -1,5 +1,5 @@
 //! Where a capture stands whose tags nobody measured: upright by its floor, to size by a tape or the tags' own, else
-//! guessed.
+//! guessed; or by the motion capture that followed the camera.
 
 use glam::{DQuat, DVec3};
 use vizflyt_twin::adjust::{Adjusted, Capture};
@@ -23,6 +23,18 @@ pub(super) struct Ground {
 }
 
 impl Ground {
+    /// Takes what a motion capture says.
+    pub(super) fn of_track(fit: Fit) -> Self {
+        let track = "the motion capture's track".to_owned();
+        Self {
+            place: fit.world_from_scene,
+            scale_from: track.clone(),
+            scale_is_guessed: false,
+            up_from: track,
+            fit: Some(fit),
+        }
+    }
+
     /// Finds what the adjustment leaves open.
     pub(super) fn of(capture: &Capture, adjusted: &Adjusted, seen: &Seen, room: &Room) -> Self {
         if adjusted.known.place {
@@ -61,10 +73,13 @@ impl Ground {
             }
             (None, false, Some(level)) => {
                 let height = hand_height - level.height;
-                let from = format!("a GUESS: the camera was carried {HAND_M} m above the floor");
+                let from =
+                    format!("taking it that the camera was carried {HAND_M} m above the floor");
                 (HAND_M / height.max(1e-9), GUESS_SHARE, from)
             }
-            (None, false, None) => (1.0, GUESS_SHARE, "a GUESS: nothing tells it".to_owned()),
+            (None, false, None) => {
+                (1.0, GUESS_SHARE, "taking a unit of the model for a metre".to_owned())
+            }
         };
         let upright = DQuat::from_rotation_arc(up, DVec3::Z);
         // The first picture looks along x, from above the origin.
