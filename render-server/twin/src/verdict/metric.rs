@@ -27,17 +27,18 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     let tilt_sigma_rad = adjusted.tilt_sigma_rad.or(aligned.map(|fit| fit.tilt_sigma_rad));
     let Some(scale) = scale_sigma else {
         verdict.checked.push("metric: nothing in it has a known length".to_owned());
-        let remedy = "put up printed tags (`vizflyt tags print`) and film again, give the camera's track, or give a \
-                      length that you measure";
         let what = "it has no metres: nothing in it has a known length";
-        return refuse(verdict, Severity::Refused, what.to_owned(), remedy);
+        return refuse(verdict, Severity::Refused, what.to_owned(), PUT_UP_TAGS);
     };
+    let has_tags = !evidence.capture.tags.is_empty();
     let scale = 3.0 * scale;
     verdict.checked.push(format!("metric: scale known to {:.2} % (three sigmas)", 100.0 * scale));
     if scale > MOST_SCALE {
         let what = format!("its scale is known to no better than {:.1} %", 100.0 * scale);
-        let remedy =
-            "put up more tags, far apart from each other, and film each from several sides";
+        let remedy = match has_tags {
+            true => "put up more tags, far apart from each other, and film each from several sides",
+            false => PUT_UP_TAGS,
+        };
         refuse(verdict, Severity::Refused, what, remedy);
     }
     let Some(tilt) = tilt_sigma_rad.map(|sigma| (3.0 * sigma).to_degrees()) else {
@@ -49,11 +50,18 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     verdict.checked.push(format!("metric: up known to {tilt:.2} degrees (three sigmas)"));
     if tilt > MOST_TILT_DEG {
         let what = format!("which way is up is known to no better than {tilt:.1} degrees");
-        let remedy = "put tags farther apart, or measure their places again";
+        let remedy = match has_tags {
+            true => "put tags farther apart, or measure their places again",
+            false => {
+                "measure where tags stand, or pick three points of the floor (`vizflyt scene align`)"
+            }
+        };
         refuse(verdict, Severity::Refused, what, remedy);
     }
 }
 
+const PUT_UP_TAGS: &str = "put up printed tags (`vizflyt tags print`) and film again, give the camera's track \
+                           (--track), or give a length that you measure";
 /// 15 cm of error across a room of 10 m: more than a vehicle keeps clear of a wall by.
 const MOST_SCALE: f64 = 0.015;
 /// The same on its height.

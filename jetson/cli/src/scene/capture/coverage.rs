@@ -6,10 +6,16 @@ use glam::{DVec2, DVec3};
 
 use super::images::{Pictures, clock};
 use super::metric::Metric;
+use super::unseen::{Area, CELL_M};
 
 /// Returns a picture of the walk, as SVG: the way in the colours of time, points of the room, tags, and a broken line
-/// with its times where pictures are missing. Empty where nothing was placed.
-pub(super) fn svg(metric: &Metric, pictures: &Pictures, points: &[DVec3]) -> String {
+/// with its times where pictures are missing; what was not seen is shaded. Empty where nothing was placed.
+pub(super) fn svg(
+    metric: &Metric,
+    pictures: &Pictures,
+    points: &[DVec3],
+    unseen: &[Area],
+) -> String {
     let way = &metric.way;
     if way.is_empty() {
         return String::new();
@@ -31,6 +37,21 @@ pub(super) fn svg(metric: &Metric, pictures: &Pictures, points: &[DVec3]) -> Str
     );
     // Writing to a string does not fail.
     let every = points.len().div_ceil(MOST_POINTS).max(1);
+    for area in unseen {
+        for &[from, to, y] in &area.rows_m {
+            let (start, end) = (DVec2::new(from, y).max(low), DVec2::new(to, y + CELL_M).min(high));
+            if start.cmplt(end).all() {
+                let ((x0, y1), (x1, y0)) = (at(start), at(end));
+                let _ = write!(
+                    svg,
+                    "<rect class=unseen x=\"{x0:.1}\" y=\"{y0:.1}\" width=\"{:.1}\" height=\"{:.1}\" \
+                     fill=\"#e6d9c8\"/>",
+                    x1 - x0,
+                    y1 - y0
+                );
+            }
+        }
+    }
     svg += "<g fill=\"#8a94a6\">";
     for p in points.iter().step_by(every).map(|p| top(*p)) {
         if p.cmpgt(low).all() && p.cmplt(high).all() {
@@ -159,14 +180,21 @@ mod tests {
             ahead: DVec3::X,
         };
         let mut metric = Metric { way: (0..9).map(place).collect(), ..Metric::default() };
-        let whole = svg(&metric, &pictures, &[DVec3::new(1.0, 0.2, 0.0), DVec3::NAN]);
+        let whole = svg(&metric, &pictures, &[DVec3::new(1.0, 0.2, 0.0), DVec3::NAN], &[]);
         assert!(!whole.contains("not placed"), "{whole}");
         metric.way.retain(|placed| !(4..=5).contains(&(placed.position_m.x as usize)));
-        let broken = svg(&metric, &pictures, &[]);
+        let unseen = Area {
+            min_m: DVec2::new(2.0, 0.0),
+            max_m: DVec2::new(3.0, 0.25),
+            area_m2: 0.25,
+            rows_m: vec![[2.0, 3.0, 0.0], [90.0, 91.0, 0.0]],
+        };
+        let broken = svg(&metric, &pictures, &[], &[unseen]);
+        assert_eq!(broken.matches("class=unseen").count(), 1, "only what is on the map: {broken}");
         assert!(broken.contains("not placed 0:12 to 0:15"), "{broken}");
         assert_eq!(broken.matches("<line").count(), 6);
         metric.way.clear();
-        assert_eq!(svg(&metric, &pictures, &[]), "");
+        assert_eq!(svg(&metric, &pictures, &[], &[]), "");
         assert_eq!(escaped("<a \"b\" & c>"), "&lt;a &quot;b&quot; &amp; c&gt;");
     }
 }

@@ -21,6 +21,7 @@ use vizflyt_twin::align::level::{self, Held};
 use vizflyt_twin::carve::{CarveOptions, Seen, Voxels, carve};
 
 use super::metric::{Metric, Placed};
+use super::unseen::{Area, areas};
 
 /// What the stage leaves, beside `scene.ply` and `arena.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -31,6 +32,8 @@ pub(super) struct Finished {
     pub(super) carved: usize,
     /// Share of the fence that photos looked through.
     pub(super) seen_share: f64,
+    /// Where they did not at the heights of flight, the largest first.
+    pub(super) unseen: Vec<Area>,
     /// Voxels that are solid, and their side. [m]
     pub(super) solid_voxels: usize,
     pub(super) voxel_m: f64,
@@ -109,6 +112,11 @@ pub(super) fn finish(
         splats: carved.splats.len(),
         carved: carved.kept.iter().filter(|kept| !**kept).count(),
         seen_share: share_within(&carved.seen, min_m, max_m),
+        unseen: {
+            let top_m = max_m.z.min(floor_m + HIGH_M);
+            let (low_m, high_m) = (min_m.with_z(floor_m + LOW_M), max_m.with_z(top_m));
+            areas(low_m, high_m, |low, high| share_within(&carved.seen, low, high))
+        },
         solid_voxels,
         voxel_m: arena.occupancy.voxel_m,
         solid_on_way: on_way,

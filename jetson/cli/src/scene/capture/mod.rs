@@ -20,6 +20,7 @@ mod poses;
 mod prints;
 mod record;
 mod training;
+mod unseen;
 mod work;
 
 use std::path::{Path, PathBuf};
@@ -253,6 +254,17 @@ fn make(
         finished.splats,
         100.0 * finished.seen_share
     ));
+    if let Some(largest) = finished.unseen.first() {
+        let (low, high) = (largest.min_m, largest.max_m);
+        let all_m2: f64 = finished.unseen.iter().map(|area| area.area_m2).sum();
+        print_fmt!(
+            "unseen      {all_m2:.0} m2 from above, solid to the referee; most within {:.1}, {:.1} to {:.1}, {:.1}",
+            low.x,
+            low.y,
+            high.x,
+            high.y
+        );
+    }
     for finding in &finished.findings {
         print_fmt!("warning     {finding}");
     }

@@ -18,12 +18,14 @@ pub(super) fn html(record: &Record, points: &[DVec3], trained: &Path) -> String 
     verdict(&mut page, record);
     facts(&mut page, record);
     if let (Some(metric), Some(pictures)) = (&record.metric, &record.pictures) {
-        let map = svg(metric, pictures, points);
+        let unseen = record.finished.as_ref().map_or(&[][..], |finished| &finished.unseen);
+        let map = svg(metric, pictures, points, unseen);
         if !map.is_empty() {
             let _ = write!(
                 page,
                 "<h2>The walk from above</h2><p>Blue at its beginning, red at its end; short lines show where the camera \
-                 looked, squares are tags, grey are points of the room. Broken red lines: nothing was placed there.</p>\
+                 looked, squares are tags, grey are points of the room. Broken red lines: nothing was placed there. Brown: within the fence and not seen \
+                 at the heights of flight; solid to the referee, film there too.</p>\
                  <div class=map>{map}</div>"
             );
         }
