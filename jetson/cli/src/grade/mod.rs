@@ -134,6 +134,9 @@ struct FlyArgs {
         hide_possible_values = true
     )]
     log: GradeLog,
+    /// Writes depth into them a second time so that any viewer shows it (16UC1)
+    #[arg(long, requires = "report")]
+    log_depth: bool,
     /// Writes JUnit XML there
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -366,6 +369,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
             let log = file.as_ref().zip(images).map(|(file, (_, images))| TrialLog {
                 file,
                 images,
+                depth: args.log_depth,
                 plugin: typed,
             });
             let reached = &reached;

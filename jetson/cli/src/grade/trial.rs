@@ -103,6 +103,8 @@ pub(crate) struct TrialLog<'a> {
     pub file: &'a File,
     /// Which images it keeps.
     pub images: LoggedImages,
+    /// Whether depth is written for viewers, too.
+    pub depth: bool,
     /// The plugin as the command line names it.
     pub plugin: &'a OsString,
 }
@@ -325,11 +327,11 @@ impl<'a> Flight<'a> {
         hash.update(renderer.name().as_bytes());
         let mut lockstep =
             Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns);
-        if let Some(TrialLog { file, images, plugin }) = &trial.log {
+        if let Some(TrialLog { file, images, depth, plugin }) = &trial.log {
             let log = file
                 .try_clone()
                 .map_err(anyhow::Error::from)
-                .and_then(|file| Ok(VirtualLog::new(file, *images, plugin, now)?));
+                .and_then(|file| Ok(VirtualLog::new(file, *images, plugin, *depth, now)?));
             lockstep.set_log(log.context("the flight's log cannot be written")?);
         }
         Ok(Self {
@@ -423,7 +425,14 @@ impl<'a> Flight<'a> {
     /// Poses from the motion capture through filter and rules.
     fn localize(&mut self) {
         let (referee, companion) = (&mut self.referee, &mut self.lockstep.companion);
-        companion.drain_imu(|reading| referee.handle_imu(&reading));
+        let mut readings = Vec::new();
+        companion.drain_imu(|sample, reading| {
+            referee.handle_imu(&reading);
+            readings.push(*sample);
+        });
+        if let Some(log) = self.lockstep.log() {
+            readings.iter().for_each(|sample| log.imu(sample));
+        }
         while let Some(sight) = self.simulation.poll_mocap() {
             let stamp = ServerTime::from_ns(START_NS + sight.at.as_ns());
             let arrival = self.server_now();

@@ -199,8 +199,11 @@ impl ControlLoop {
         match input {
             ControlInput::Mavlink(bytes) => {
                 self.companion.handle_mavlink(now, &bytes);
-                let to_server = &self.control.to_server;
-                self.companion.drain_imu(|reading| to_server.imu(reading));
+                let (to_server, log) = (&self.control.to_server, &self.control.log);
+                self.companion.drain_imu(|sample, reading| {
+                    to_server.imu(reading);
+                    log.imu(sample);
+                });
                 self.share_senses();
             }
             ControlInput::Stream(event) => self.handle_stream(now, event),

@@ -69,12 +69,25 @@ pub struct LoggedImage {
     pub name: String,
     /// What came before the bitstream.
     pub header: ImageHeader,
-    /// When the pose that it shows was measured. [host]
+    /// When the newest pose behind it was measured. [host]
     pub pose: HostTime,
     /// When its last byte had come. [host]
     pub received: HostTime,
     /// The bitstream's header and slices.
     pub pieces: Vec<Vec<u8>>,
+}
+
+impl LoggedImage {
+    /// Returns the instant that the image shows. [host]
+    pub(super) fn shown(&self) -> HostTime {
+        shown(&self.header, self.pose)
+    }
+}
+
+/// Returns the instant that an image shows, the newest pose behind which was measured at `pose`. [host]
+pub(super) fn shown(header: &ImageHeader, pose: HostTime) -> HostTime {
+    let ahead_ns = header.exposure_ns.get().wrapping_sub(header.pose_ns.get());
+    pose.plus_ns(ahead_ns.cast_signed())
 }
 
 /// What was dropped so far.

@@ -320,8 +320,8 @@ impl<R: Read> RecordedPoses<R> {
             if *message.topic != *self.topic {
                 continue;
             }
-            if let Some(world_from_body) = pose_of(&message) {
-                return Ok(Some(RecordedPose { at_ns: message.log_time_ns, world_from_body }));
+            if let Some((at_ns, world_from_body)) = pose_of(&message) {
+                return Ok(Some(RecordedPose { at_ns, world_from_body }));
             }
         }
         Ok(None)
@@ -350,7 +350,7 @@ impl RecordedTrack {
         while let Some(entry) = reader.next()? {
             let Entry::Message(message) = entry else { continue };
             if *message.topic == *of_poses {
-                poses.extend(pose_of(&message).map(|pose| (message.log_time_ns, pose)));
+                poses.extend(pose_of(&message));
             } else if *message.topic == *of_plugin
                 && let Ok(plugin) = PluginMessage::decode(&*message.data)
                 && plugin.is_to_plugin
@@ -369,12 +369,17 @@ impl RecordedTrack {
     }
 }
 
-/// Returns the pose of a message of the channel of poses.
-fn pose_of(message: &LogMessage) -> Option<Pose<World, Body>> {
+/// Returns the pose of a message of a channel of poses, and the instant that it is of. [ns, since 1970]
+fn pose_of(message: &LogMessage) -> Option<(u64, Pose<World, Body>)> {
     let logged = PoseInFrame::decode(&*message.data).ok()?;
+    let stamp = logged.timestamp.as_ref();
+    let at_ns = stamp.map_or(message.log_time_ns, |at| {
+        u64::from(at.sec()) * 1_000_000_000 + u64::from(at.nsec())
+    });
     let (p, q) = logged.pose.and_then(|pose| pose.position.zip(pose.orientation))?;
     let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
-    Some(Pose::new(DVec3::new(p.x, p.y, p.z), rotation)).filter(Pose::is_valid)
+    let pose = Some(Pose::new(DVec3::new(p.x, p.y, p.z), rotation)).filter(Pose::is_valid)?;
+    Some((at_ns, pose))
 }
 
 /// What replay needs of a log.
