@@ -177,6 +177,10 @@ class Observation:
         """The images there are, in the order of the arena's cameras."""
 
     @property
+    def pose_at_image(self) -> Pose | None:
+        """x"""
+
+    @property
     def vehicle(self) -> Vehicle | None:
         """What is known of the vehicle; None before anything is."""
 
@@ -252,6 +256,10 @@ class CameraImage:
     @property
     def intrinsics(self) -> Intrinsics:
         """Size, focal lengths, principal point, lens."""
+
+    @property
+    def pose_at_image(self) -> Pose | None:
+        """x"""
 
     @property
     def body_from_cam(self) -> Pose:
@@ -636,6 +644,9 @@ class ObservationBuffer:
         returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
         """
 
+    def set_pose_at_image(self, name: str, world_from_body: Pose) -> None:
+        """x"""
+
     def observation(self) -> Observation:
         """Returns what a plugin would see."""
 
@@ -671,7 +682,7 @@ class Rehearsal:
 
     def receive(
         self, timeout_s: float = 10.0
-    ) -> tuple[Literal["ready", "answer", "failed"], int, Any, int] | None:
+    ) -> tuple[Literal["ready", "odometry", "answer", "failed"], int, Any, int] | None:
         """Waits for a message of the plugin: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
         ('failed', 0, reason, 0); None if none comes within this time. [s]
         """
@@ -708,6 +719,14 @@ class PluginEnd:
 
     def failed(self, reason: str) -> None:
         """Reports that the plugin has failed, with the reason."""
+
+def publish_odometry(stamp_ns: int, p_odom_m: _Vector, rotation_xyzw: npt.ArrayLike) -> None:
+    """x"""
+
+def decode_image(
+    bitstream: bytes, jpeg: bytes | None = None
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
+    """x"""
 
 def waiting_services() -> list[str]:
     """Returns the services of this user's runtimes that wait for a plugin, the longest waiting first."""

@@ -318,6 +318,8 @@ impl Companion {
         let state = self.link.state();
         let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
         senses.vehicle = self.vehicle;
+        // Before the course is known, no pose is let out.
+        senses.gives_pose = self.ground_truth() == Some(true);
         senses.battery = Battery {
             fraction: (fraction >= 0.0).then_some(fraction),
             voltage_v: (voltage_v > 0.0).then_some(voltage_v),

@@ -22,6 +22,8 @@ pub enum Channel {
     PoseAtImage,
     /// The autopilot's accelerometer and gyroscope.
     Imu,
+    /// Where the plugin thinks it is: foxglove.PoseInFrame.
+    Odometry,
     /// What the plugin asked for.
     Requested,
     /// What the guard sent on.
@@ -63,12 +65,13 @@ pub(super) struct Description {
 
 impl Channel {
     /// Those that every log has; cameras come when their first image does.
-    pub(super) const FIXED: [Self; 15] = [
+    pub(super) const FIXED: [Self; 16] = [
         Self::Pose,
         Self::Transform,
         Self::Motion,
         Self::PoseAtImage,
         Self::Imu,
+        Self::Odometry,
         Self::Requested,
         Self::Sent,
         Self::Event,
@@ -89,6 +92,7 @@ impl Channel {
             Self::Motion => "/motion".into(),
             Self::PoseAtImage => "/pose_at_image".into(),
             Self::Imu => "/imu".into(),
+            Self::Odometry => "/odometry".into(),
             Self::Requested => "/setpoint/asked".into(),
             Self::Sent => "/setpoint/sent".into(),
             Self::Event => "/event".into(),
@@ -110,7 +114,7 @@ impl Channel {
     pub(super) fn describe(self, camera: &str) -> Description {
         let topic = self.topic(camera);
         let foxglove = match self {
-            Self::Pose | Self::PoseAtImage => fox::PoseInFrame::get_schema(),
+            Self::Pose | Self::PoseAtImage | Self::Odometry => fox::PoseInFrame::get_schema(),
             Self::Transform => fox::FrameTransform::get_schema(),
             Self::Event | Self::PluginOutput => fox::Log::get_schema(),
             Self::Color(_) => fox::CompressedImage::get_schema(),

@@ -14,8 +14,10 @@
 
 mod budget;
 mod channels;
+pub mod data;
 mod depth;
 mod file;
+mod head;
 #[cfg(feature = "foxglove")]
 mod live;
 #[cfg(not(feature = "foxglove"))]
@@ -42,7 +44,9 @@ use serde_json::json;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
-use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin, YawTarget};
+use vizflyt_protocol::messages::{
+    Event, EventKind, FromPlugin, Odometry, PoseSample, ToPlugin, YawTarget,
+};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::HostTime;
@@ -200,6 +204,12 @@ impl FlightLog {
     pub fn pose(&self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         let Some(queue) = &self.queue else { return };
         queue.push(Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs the plugin's own estimate, which came at `at`.
+    pub fn odometry(&self, at: HostTime, odometry: &Odometry) {
+        let Some(queue) = &self.queue else { return };
+        queue.push(Record::Odometry { at, odometry: *odometry });
     }
 
     /// Logs a reading of the IMU.

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::messages::{Odometry, PoseSample};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 
@@ -24,6 +24,8 @@ pub(super) enum Record {
     Json { channel: Channel, at: HostTime, json: Vec<u8> },
     /// The vehicle was localized.
     Pose { at: HostTime, stamp: HostTime, sample: PoseSample },
+    /// The plugin's own estimate.
+    Odometry { at: HostTime, odometry: Odometry },
     /// A line for people.
     Text { channel: Channel, at: HostTime, level: Level, name: String, text: String },
     /// A message to or from the plugin.

@@ -14,7 +14,7 @@ use foxglove::messages as fox;
 use mcap::McapResult;
 use prost::Message;
 use serde::Serialize;
-use vizflyt_protocol::messages::{Event, FromPlugin, PoseSample, ToPlugin};
+use vizflyt_protocol::messages::{Event, FromPlugin, Odometry, PoseSample, ToPlugin};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, encode_jpeg};
@@ -95,6 +95,11 @@ impl VirtualLog {
     /// Logs a pose that came at `at` and was true at `stamp`.
     pub fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         self.take(at, Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs the plugin's own estimate, which came at `at`.
+    pub fn odometry(&mut self, at: HostTime, odometry: &Odometry) {
+        self.take(at, Record::Odometry { at, odometry: *odometry });
     }
 
     /// Logs a reading of the IMU.

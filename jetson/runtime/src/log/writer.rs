@@ -333,6 +333,11 @@ impl<D: Disk> LogWriter<D> {
                 self.sinks.put(channel, "", self.wall_ns(at), &json)
             }
             Record::Pose { at, stamp, sample } => self.pose(at, stamp, &sample),
+            Record::Odometry { at, odometry } => {
+                let stamp_ns = self.wall_ns(odometry.stamp);
+                let pose = pose_in_frame(stamp_ns, ODOM, &odometry.odom_from_body);
+                self.sinks.put(Channel::Odometry, "", self.wall_ns(at), &pose.encode_to_vec())
+            }
             Record::Text { channel, at, level, name, text } => {
                 let at_ns = self.wall_ns(at);
                 let log = fox::Log {
@@ -431,8 +436,7 @@ impl<D: Disk> LogWriter<D> {
             if before.replace(shown_ns) == Some(shown_ns) {
                 continue;
             }
-            let body_from_cam = image.header.body_from_cam();
-            let world_from_body = image.header.world_from_cam() * body_from_cam.inverse();
+            let world_from_body = image.header.world_from_body();
             let pose = pose_in_frame(shown_ns, WORLD, &world_from_body);
             self.sinks.put(Channel::PoseAtImage, "", at_ns, &pose.encode_to_vec())?;
         }
@@ -554,6 +558,7 @@ impl<D: Disk> LogWriter<D> {
 
 const WORLD: &str = "world";
 const BODY: &str = "body";
+const ODOM: &str = "odom";
 
 /// Whether images are to be logged with so much room on the disk.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
