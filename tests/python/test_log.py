@@ -200,3 +200,88 @@ def test_the_lag_between_images_and_the_way_flown_is_none(graded):
         errors.append(np.sqrt(np.mean(np.sum((truth - shown.p_m[moving]) ** 2, axis=1))))
     best = lags[int(np.argmin(errors))]
     assert abs(best) <= 4, f"images are off by {best} ms"
+
+
+def test_a_published_estimate_is_logged_and_graded(request, tmp_path):
+    program = request.config.getoption("--vizflyt")
+    if program is None:
+        pytest.skip("no --vizflyt given")
+    tmp_path.chmod(0o755)
+    plugin = tmp_path / "plugin"
+    plugin.mkdir()
+    # Knows where it is, in a frame of its own, and drifts by 5 cm a second to the side.
+    (plugin / "drifts.py").write_text(
+        "import numpy as np\n"
+        "import vizflyt\n"
+        "\n"
+        "\n"
+        "class Drifts(vizflyt.Plugin):\n"
+        "    start_ns = None\n"
+        "    def on_image(self, obs):\n"
+        "        front, pose = obs.camera('front'), obs.pose_at_image\n"
+        "        if front is None or pose is None:\n"
+        "            return None\n"
+        "        self.start_ns = self.start_ns or front.shown_ns\n"
+        "        odom_from_world = vizflyt.Pose('odom', 'world', [3, 1, 0], [0, 0, 0.6, 0.8])\n"
+        "        odom_from_body = odom_from_world @ pose\n"
+        "        drift = np.array([0, 0, 0.05]) * (front.shown_ns - self.start_ns) * 1e-9\n"
+        "        p_odom_m = odom_from_body.translation_m + drift\n"
+        "        vizflyt.publish_odometry(front.shown_ns, p_odom_m, odom_from_body.rotation_xyzw)\n"
+        "        return vizflyt.Setpoint.velocity([1.0, 0, 0], axes='heading')\n"
+        "\n"
+        "\n"
+        "if __name__ == '__main__':\n"
+        "    vizflyt.run(Drifts)\n"
+    )
+    command = [program, "grade", plugin / "drifts.py", "--project", "p2", "--seeds", "1", "--json"]
+    command += ["--log", "full", "--report", tmp_path / "r", "--keys", tmp_path / "keys"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    odometry = json.loads(done.stdout)["runs"][0]["odometry"]
+    assert odometry["poses"] > 50, odometry
+    assert 0.01 < odometry["ate_rmse_m"] < 0.5, odometry
+    assert abs(odometry["rpe_trans_rmse_m"] - 0.05) < 0.02, odometry
+    log = tmp_path / "r/logs/day-1.mcap"
+    published = vizflyt.Log(log).odometry
+    assert published.frame == "odom" and len(published.at_ns) >= odometry["poses"]
+    command = [program, "evaluate", f"{log}#/pose", f"{log}#/odometry", "--align", "yaw", "--delta", "1s", "--json"]
+    found = json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+    assert abs(found["ate_rmse_m"] - odometry["ate_rmse_m"]) < 0.01, found
+    assert "its odometry was off by" in (tmp_path / "r/index.html").read_text()
+
+
+def test_an_estimate_that_is_no_pose_is_refused():
+    with pytest.raises(vizflyt.NotFiniteError):
+        vizflyt.publish_odometry(1, [0, float("nan"), 0], [0, 0, 0, 1])
+    with pytest.raises(ValueError):
+        vizflyt.publish_odometry(1, [0, 0, 0], [0, 0, 0, 2])
+    with pytest.raises(ValueError, match="within 100 km"):
+        vizflyt.publish_odometry(1, [1e7, 0, 0], [0, 0, 0, 1])
+
+
+def test_an_estimate_leaves_with_the_answer_and_a_fifth_is_refused(stage):
+    faults = []
+
+    class Publishes(vizflyt.Plugin):
+        def on_image(self, obs):
+            shown_ns = obs.camera("front").shown_ns
+            assert obs.pose_at_image.translation_m.tolist() == [1, 2, 3]
+            for n in range(5):
+                try:
+                    vizflyt.publish_odometry(shown_ns + n, [n, 0, 0], [0, 0, 0, 1])
+                except ValueError as error:
+                    faults.append(str(error))
+            return vizflyt.Setpoint.hold()
+
+    runner = stage.attach(Publishes)
+    stage.buffer.clear(1)
+    stage.buffer.set_image("front", seq=1, stamp_ns=100)
+    stage.buffer.set_pose_at_image("front", vizflyt.Pose("world", "body", [1, 2, 3]))
+    stage.rehearsal.publish(stage.buffer)
+    received = [stage.rehearsal.receive() for _ in range(5)]
+    assert [what for what, *_ in received] == ["odometry"] * 4 + ["answer"]
+    assert [stamp_ns for *_, stamp_ns in received[:4]] == [100, 101, 102, 103]
+    assert received[2][2].translation_m.tolist() == [2, 0, 0]
+    assert len(faults) == 1 and "more than 4 estimates" in faults[0]
+    stage.rehearsal.stop()
+    assert runner.ended() is None

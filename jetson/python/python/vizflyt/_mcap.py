@@ -64,7 +64,10 @@ class McapFile:
             at += 9
             if length > end - at:
                 self.is_cut = True
-                return
+                if opcode != CHUNK:
+                    return
+                # The messages that are there are whole.
+                length = end - at
             if opcode == MESSAGE and length >= 22:
                 channel, _, log_time_ns = struct.unpack_from("<HIQ", data, at)
                 topic = self._topics.get(channel)
