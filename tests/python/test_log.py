@@ -178,7 +178,8 @@ def test_a_graded_flight_is_read_in_five_lines(graded):
         truth = log.poses.at(image.shown_ns)
         if truth is not None:
             off.append(np.linalg.norm(truth.translation_m - image.world_from_body.translation_m))
-        np.testing.assert_allclose(log.pose_at_image.at(image.shown_ns).translation_m, image.world_from_body.translation_m)
+        at_image = log.pose_at_image.at(image.shown_ns)
+        np.testing.assert_allclose(at_image.translation_m, image.world_from_body.translation_m)
     # What a forecast over 30 ms is off by; by the pose's stamp it would be centimetres.
     assert np.median(off) < 0.01, off
     assert abs(np.median(log.imu.accel_mps2[:, 2]) - 9.8) < 0.5
@@ -187,7 +188,7 @@ def test_a_graded_flight_is_read_in_five_lines(graded):
 
 
 def test_the_lag_between_images_and_the_way_flown_is_none(graded):
-    """By how much images would have to be moved in time to fit the way flown best: 0, not the 48 ms of their forecast."""
+    """By how much images would have to be moved in time to fit the way flown best: 0, not the age of their pose."""
     log = vizflyt.Log(graded)
     shown, poses = log.pose_at_image, log.poses
     speed = np.linalg.norm(np.gradient(shown.p_m, axis=0), axis=1)

@@ -9,7 +9,8 @@ use vizflyt_rgbd::{DecodeError, Decoder, join_jpeg, peek};
 /// What an image decodes to.
 type Arrays<'py> = (Bound<'py, PyArray3<u8>>, Bound<'py, PyArray2<u16>>);
 
-/// Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be apart.
+/// Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be
+/// apart.
 ///
 /// Raises ValueError for what does not decode.
 #[pyfunction]

@@ -6,12 +6,12 @@ use vizflyt_sdk::{HostTime, Pose};
 
 use crate::arguments::{quaternion, vector};
 
-/// Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is `image.shown_ns`.
-/// It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how far off it was.
-/// Nothing is flown by it.
+/// Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is
+/// `image.shown_ns`. It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how
+/// far off it was. Nothing is flown by it.
 ///
-/// `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to odom
-/// axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
+/// `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to
+/// odom axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
 ///
 /// Raises NotFiniteError or ValueError for what is no pose, ValueError for more than four in one `on_image`.
 #[pyfunction]

@@ -172,8 +172,9 @@ class Log:
             print(image.shown_ns, image.rgb.shape, image.depth.max(), pose.translation_m)
         print(log.imu.accel_mps2.mean(axis=0), log.poses.p_m[-1], log.sent.v_world_mps.max())
 
-    Times are nanoseconds since 1970, on the clock of the vehicle's computer; of graded flights, on their virtual clock.
-    Logs of earlier versions, in which an image is stamped with its pose's instant, are read as well, from protocol 6 on.
+    Times are nanoseconds since 1970, on the clock of the vehicle's computer; of graded flights, on their virtual
+    clock. Logs of earlier versions, in which an image is stamped with its pose's instant, are read as well, from
+    protocol 6 on.
 
     Raises OSError if it cannot be read, ValueError if it is no log, or of a version that is not known here.
     """
@@ -251,7 +252,8 @@ class Log:
                 found[one.shown_ns] = _body(numbers)
         stamps = sorted(found)
         p_m = np.array([found[stamp].translation_m for stamp in stamps]).reshape(-1, 3)
-        return Poses(np.array(stamps, np.int64), p_m, np.array([found[at].rotation_xyzw for at in stamps]).reshape(-1, 4))
+        q_xyzw = np.array([found[stamp].rotation_xyzw for stamp in stamps]).reshape(-1, 4)
+        return Poses(np.array(stamps, np.int64), p_m, q_xyzw)
 
     @property
     def odometry(self) -> Poses:

@@ -725,12 +725,12 @@ class PluginEnd:
         """Reports that the plugin has failed, with the reason."""
 
 def publish_odometry(stamp_ns: int, p_odom_m: _Vector, rotation_xyzw: npt.ArrayLike) -> None:
-    """Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is `image.shown_ns`.
-    It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how far off it was.
-    Nothing is flown by it.
+    """Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is
+    `image.shown_ns`. It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how
+    far off it was. Nothing is flown by it.
 
-    `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to odom
-    axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
+    `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to
+    odom axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
 
     Raises NotFiniteError or ValueError for what is no pose, ValueError for more than four in one `on_image`.
     """
@@ -738,7 +738,8 @@ def publish_odometry(stamp_ns: int, p_odom_m: _Vector, rotation_xyzw: npt.ArrayL
 def decode_image(
     bitstream: bytes, jpeg: bytes | None = None
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be apart.
+    """Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be
+    apart.
 
     Raises ValueError for what does not decode.
     """

@@ -254,3 +254,104 @@ fn stamped<A: Frame>(message: &LogMessage) -> Option<StampedPose<A>> {
     let (at_ns, pose) = pose_of(message)?;
     Some(StampedPose { at_ns, from_body: Pose::new(pose.translation_m, pose.rotation) })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use glam::DQuat;
+    use mcap::records::MessageHeader;
+    use prost::Message as _;
+    use vizflyt_protocol::geometry::Intrinsics;
+    use vizflyt_protocol::time::ServerTime;
+    use zerocopy::IntoBytes;
+
+    use super::*;
+
+    /// From the clock of the computer that flew to 1970. [ns]
+    const OFFSET_NS: u64 = 1_700_000_000_000_000_000;
+
+    /// An observation as protocol 11 had it: its head names instants, its image none.
+    fn old_observation(n: u64) -> Observation {
+        let pose_ns = n * 33_000_000;
+        let mut head = vec![0; 152 + 32 * 64 + 176 * 8];
+        head[12..16].copy_from_slice(&2u32.to_le_bytes());
+        for (k, stamp_ns) in [pose_ns - 10_000_000, pose_ns].into_iter().enumerate() {
+            head[152 + 32 * k..][..8].copy_from_slice(&stamp_ns.to_le_bytes());
+        }
+        // The second camera.
+        head[2200 + 176..][..8].copy_from_slice(&pose_ns.to_le_bytes());
+        head[2200 + 176 + 172..][..4].copy_from_slice(&48_000_000i32.to_le_bytes());
+        let k = Intrinsics::from_horizontal_fov(8, 6, 1.5);
+        let body = Pose::new(DVec3::X * n as f64, DQuat::IDENTITY);
+        let (stamp, mount) = (ServerTime::from_ns(1), Pose::IDENTITY);
+        let mut header = ImageHeader::new(n, 1, stamp, &k, &mount, &body).as_bytes().to_vec();
+        header[4..6].copy_from_slice(&11u16.to_le_bytes());
+        let image = ObservedImage {
+            camera: 1,
+            name: "down".into(),
+            header,
+            received_ns: pose_ns + 1,
+            bitstream: vec![7],
+            ..ObservedImage::default()
+        };
+        let published_ns = pose_ns + 20_000_000;
+        Observation { seq: n, protocol: 11, published_ns, head, images: vec![image] }
+    }
+
+    fn log(observations: &[Observation]) -> Vec<u8> {
+        let mut file = Cursor::new(Vec::new());
+        let mut writer = mcap::WriteOptions::new().compression(None).create(&mut file).unwrap();
+        let id =
+            writer.add_channel(0, "/observation", "protobuf", &std::collections::BTreeMap::new());
+        let channel_id = id.unwrap();
+        for observation in observations {
+            let log_time = OFFSET_NS + observation.published_ns;
+            let header =
+                MessageHeader { channel_id, sequence: 1, log_time, publish_time: log_time };
+            writer.write_to_known_channel(&header, &observation.encode_to_vec()).unwrap();
+        }
+        writer.finish().unwrap();
+        drop(writer);
+        file.into_inner()
+    }
+
+    fn read(bytes: Vec<u8>) -> Vec<FlightDatum> {
+        let mut data = FlightData::new(LogReader::new(Cursor::new(bytes)).unwrap(), true);
+        std::iter::from_fn(|| data.next().unwrap()).collect()
+    }
+
+    #[test]
+    fn a_log_of_form_1_has_the_instants_that_its_images_show() {
+        let observations: Vec<_> = (1..20).map(old_observation).collect();
+        let found = read(log(&observations));
+        let images = found.iter().filter_map(|datum| match datum {
+            FlightDatum::Image(image) => Some(image),
+            _ => None,
+        });
+        for (image, n) in images.clone().zip(1..) {
+            let pose_ns = OFFSET_NS + n * 33_000_000;
+            assert_eq!((image.pose_ns, image.shown_ns), (pose_ns, pose_ns + 48_000_000));
+            assert_eq!((image.received_ns, &*image.camera, image.seq), (pose_ns + 1, "down", n));
+            assert_eq!(image.header.world_from_body().translation_m, DVec3::X * n as f64);
+        }
+        assert_eq!(images.count(), 19);
+        let imu = found.iter().filter_map(|datum| match datum {
+            FlightDatum::Imu(reading) => Some(reading.at_ns),
+            _ => None,
+        });
+        let imu: Vec<u64> = imu.collect();
+        assert_eq!(imu.len(), 38);
+        assert!(imu.is_sorted_by(|a, b| a < b), "each once, though heads repeat them");
+    }
+
+    #[test]
+    fn images_of_a_protocol_that_is_not_known_are_said_to_be() {
+        let mut observation = old_observation(1);
+        observation.protocol = 99;
+        observation.images[0].shown_ns = 5;
+        assert_eq!(read(log(&[observation])), [FlightDatum::Foreign { protocol: 99 }]);
+        let left_out = Observation { images: Vec::new(), ..old_observation(1) };
+        assert_eq!(read(log(&[left_out]))[0], FlightDatum::LeftOut);
+    }
+}
