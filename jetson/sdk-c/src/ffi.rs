@@ -365,5 +365,5 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
 }
 
 // What `vizflyt.h` asserts on its side.
-const _: () = assert!(size_of::<ObservationHeader>() == 3608);
+const _: () = assert!(size_of::<ObservationHeader>() == 4056);
 const _: () = assert!(std::mem::offset_of!(ObservationHeader, cameras) == 2200);

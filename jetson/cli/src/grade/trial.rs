@@ -444,7 +444,9 @@ impl<'a> Flight<'a> {
             readings.push(*sample);
         });
         if let Some(log) = self.lockstep.log() {
-            readings.iter().for_each(|sample| log.imu(sample));
+            for sample in &readings {
+                log.imu(sample);
+            }
         }
         while let Some(sight) = self.simulation.poll_mocap() {
             let stamp = ServerTime::from_ns(START_NS + sight.at.as_ns());

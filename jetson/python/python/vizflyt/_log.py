@@ -7,7 +7,7 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,7 @@ class Poses(NamedTuple):
     """The body's position, shape (N, 3). [m]"""
     q_xyzw: _F64
     """Unit quaternions from body axes to those of the frame, shape (N, 4)."""
-    frame: str = "world"
+    frame: Literal["world", "odom"] = "world"
     """The frame that they are in."""
 
     def at(self, at_ns: int) -> Pose | None:
@@ -156,7 +156,7 @@ class Images(Sequence[LogImage]):
 
 class _Found(NamedTuple):
     place: Place
-    index: int
+    nth: int
     camera: str
     shown_ns: int
 
@@ -294,7 +294,7 @@ class Log:
         counts = ", ".join(f"{len(found)} of {camera}" for camera, found in self._found.items())
         return f"Log({str(self.path)!r}, images: {counts or 'none'})"
 
-    def _poses(self, topic: str, frame: str = "world") -> Poses:
+    def _poses(self, topic: str, frame: Literal["world", "odom"] = "world") -> Poses:
         rows = []
         for place in self._file.messages.get(topic, []):
             try:
@@ -319,7 +319,7 @@ class Log:
 
     def _header(self, found: _Found) -> tuple[tuple[float, ...], dict[int, list[Any]], dict[int, list[Any]]]:
         observation = fields(self._file.data(found.place))
-        image = fields(observation[5][found.index])
+        image = fields(observation[5][found.nth])
         header = _first(image, 3, b"")
         if len(header) < HEADER or header[:4] != b"VZIM":
             raise ValueError(f"{self.path}: the image of observation {_first(observation, 1, 0)} has no header")

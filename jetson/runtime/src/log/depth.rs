@@ -18,7 +18,9 @@ impl DepthReader {
     /// decode. [mm, cam]
     pub(super) fn read(&mut self, pieces: &[Vec<u8>]) -> Option<&[u16]> {
         self.bitstream.clear();
-        pieces.iter().for_each(|piece| self.bitstream.extend_from_slice(piece));
+        for piece in pieces {
+            self.bitstream.extend_from_slice(piece);
+        }
         let info = peek(&self.bitstream).ok()?;
         let pixels = info.width as usize * info.height as usize;
         self.rgb.resize(3 * pixels, 0);
