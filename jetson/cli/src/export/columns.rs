@@ -37,6 +37,7 @@ impl Table {
     }
 
     /// Adds `NAME_x` to `NAME_z`; what is not known is NaN.
+    #[allow(clippy::needless_pass_by_value)] // Why: an iterator, walked once for each axis.
     pub(super) fn vectors(
         &mut self,
         name: &str,
@@ -49,6 +50,7 @@ impl Table {
     }
 
     /// Adds `NAME_qx` to `NAME_qw`; what is not known is NaN.
+    #[allow(clippy::needless_pass_by_value)] // Why: an iterator, walked once for each axis.
     pub(super) fn rotations(
         &mut self,
         name: &str,

@@ -278,7 +278,7 @@ fn replaced_image_is_not_mixed_with_its_successor() {
 fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
     // Numbers that nothing else in an observation has.
     let body =
-        Pose::new(DVec3::new(12.345_678, -3.141_592, 2.718_281), DQuat::from_rotation_z(0.7));
+        Pose::new(DVec3::new(12.345_678, -3.456_789, 2.345_678), DQuat::from_rotation_z(0.7));
     for gives_pose in [true, false] {
         let mut rig = Rig::new(&["front", "down"]);
         rig.publisher.senses.lock().unwrap().gives_pose = gives_pose;
