@@ -26,6 +26,7 @@ from PIL import Image
 
 FOXGLOVE = {
     "/pose": "foxglove.PoseInFrame",
+    "/pose_at_image": "foxglove.PoseInFrame",
     "/tf": "foxglove.FrameTransform",
     "/event": "foxglove.Log",
     "/plugin/output": "foxglove.Log",
@@ -33,7 +34,7 @@ FOXGLOVE = {
     "/camera/front/calibration": "foxglove.CameraCalibration",
 }
 OURS = ["/setpoint/asked", "/setpoint/sent", "/timing", "/image/timing", "/observation",
-        "/plugin/messages", "/telemetry", "/motion", "/log"]
+        "/plugin/messages", "/telemetry", "/motion", "/log", "/imu", "/camera/front/stamps"]
 checks = 0
 
 
@@ -110,7 +111,7 @@ def read(path, is_whole, is_full):
                        if record.name == "vizflyt.flight"]
             images = "full" if is_full else "reduced"
             check([flight["images"] for flight in flights] == [images], f"{flights}")
-    size = None
+    size, shown = None, {}
     with path.open("rb") as file:
         for schema, channel, message in messages(file, is_cut):
             topic = channel.topic
@@ -124,6 +125,8 @@ def read(path, is_whole, is_full):
                 check(isinstance(json.loads(message.data), dict), f"{topic} is an object")
                 check(schema.encoding == "jsonschema", f"{topic} has its schema")
                 json.loads(schema.data)
+                if topic == "/camera/front/stamps":
+                    shown[message.log_time] = json.loads(message.data)
                 continue
             check((channel.message_encoding, schema.encoding) == ("protobuf", "protobuf"), topic)
             decoded = DecoderFactory().decoder_for("protobuf", schema)(message.data)
@@ -131,6 +134,9 @@ def read(path, is_whole, is_full):
                 size = (decoded.width, decoded.height)
                 check(len(decoded.K) == 9 and decoded.K[0] > 0, "the camera matrix is there")
             elif topic == "/camera/front/image" and found[topic] % 20 == 1:
+                at = decoded.timestamp.seconds * 10**9 + decoded.timestamp.nanos
+                stamps = shown[message.log_time]
+                check(at == stamps["shown_ns"] > stamps["pose_ns"], f"the instant that it shows: {at} {stamps}")
                 image = Image.open(io.BytesIO(decoded.data))
                 image.load()
                 check(image.format == "JPEG" and image.size == size, f"{image} {size}")

@@ -18,6 +18,7 @@ mod doctor;
 #[cfg(test)]
 mod endings;
 mod evaluate;
+mod export;
 mod fly;
 mod grade;
 mod lab;
@@ -96,6 +97,7 @@ enum Command {
     /// Latency of images, stage by stage, and why images were skipped.
     Stats(stats::StatsArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Export(export::ExportArgs),
     /// Feeds a flight's recorded images to a plugin and reports where its answers differ.
     Replay(replay::ReplayArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
@@ -181,6 +183,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Bench(args) => bench::run(args),
         Command::Stats(args) => stats::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Export(args) => export::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
         Command::Guardian { mavlink } => Ok(vizflyt_guardian::run(&mavlink)),

@@ -12,6 +12,7 @@ use vizflyt_sdk::{
 
 use crate::arena::CameraInfo;
 use crate::arguments::wrong_type;
+use crate::geometry::Pose;
 use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 use crate::shared_memory::Memory;
 
@@ -108,6 +109,17 @@ impl ObservationBuffer {
                 None => planes.depth_mm.fill(0),
             }
         });
+        Ok(())
+    }
+
+    /// Fills in where the body was at the instant that a camera's image shows.
+    fn set_pose_at_image(&self, name: &str, world_from_body: Pose) -> PyResult<()> {
+        let index = self.cameras.iter().position(|camera| camera.name == name);
+        let index = index.ok_or_else(|| {
+            PyLookupError::new_err(format!("this buffer was made without a camera '{name}'"))
+        })?;
+        let pose = world_from_body.typed("world", "body")?;
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_pose_at_image(index, &pose);
         Ok(())
     }
 

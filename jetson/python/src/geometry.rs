@@ -67,7 +67,7 @@ impl Pose {
             if !FRAMES.contains(&frame.as_str()) {
                 return Err(PyValueError::new_err(format!(
                     "'{frame}' is no frame; there are 'world' (x east, y north, z up), 'body' (x \
-                     forward, y left, z up) and 'cam' (x right, y down, z forward)"
+                     forward, y left, z up) and 'cam' (x right, y down, z forward) and 'odom' (a plugin's own, z up)"
                 )));
             }
         }
@@ -174,7 +174,7 @@ impl Pose {
     }
 }
 
-const FRAMES: [&str; 3] = ["world", "body", "cam"];
+const FRAMES: [&str; 4] = ["world", "body", "cam", "odom"];
 
 /// Size, focal lengths, principal point and lens of a camera.
 ///

@@ -10,7 +10,9 @@ mod arguments;
 mod buffer;
 mod event;
 mod geometry;
+mod log;
 mod observation;
+mod odometry;
 mod plugin_end;
 mod rehearsal;
 mod setpoint;
@@ -30,7 +32,11 @@ mod _vizflyt {
     #[pymodule_export]
     use crate::geometry::{Intrinsics, Pose, Volume};
     #[pymodule_export]
+    use crate::log::decode_image;
+    #[pymodule_export]
     use crate::observation::{Battery, CameraImage, ImuSample, Observation, Vehicle};
+    #[pymodule_export]
+    use crate::odometry::publish_odometry;
     #[pymodule_export]
     use crate::plugin_end::{PluginEnd, waiting_services};
     #[pymodule_export]

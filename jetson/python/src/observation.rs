@@ -63,6 +63,7 @@ pub(crate) struct CameraImage {
     ready_ns: u64,
     intrinsics: SdkIntrinsics,
     body_from_cam: SdkPose<Body, Cam>,
+    pose_at_image: Option<SdkPose<World, Body>>,
     /// Made when asked for the first time.
     depth: PyOnceLock<Py<PyArray2<f32>>>,
 }
@@ -126,6 +127,14 @@ impl Observation {
         self.images.iter().map(|image| image.clone_ref(py)).collect()
     }
 
+    /// Where the body was at the instant that the newest image shows: the pose that belongs to its pixels. None
+    /// without an image, and where the course withholds the pose. [m, world]
+    #[getter]
+    fn pose_at_image(&self) -> Option<Pose> {
+        let newest = self.images.iter().max_by_key(|image| image.get().shown_ns)?;
+        newest.get().pose_at_image()
+    }
+
     /// What is known of the vehicle; None before anything is.
     #[getter]
     fn vehicle(&self, py: Python<'_>) -> Option<Py<Vehicle>> {
@@ -178,6 +187,7 @@ impl CameraImage {
             ready_ns: image.ready.as_ns(),
             intrinsics: image.intrinsics,
             body_from_cam: image.body_from_cam,
+            pose_at_image: image.pose_at_image,
             depth: PyOnceLock::new(),
         }
     }
@@ -265,6 +275,13 @@ impl CameraImage {
     #[getter]
     fn intrinsics(&self) -> Intrinsics {
         Intrinsics(self.intrinsics)
+    }
+
+    /// Where the body was at the instant that the image shows: what it was rendered from; None where the course
+    /// withholds the pose. [m, world]
+    #[getter]
+    fn pose_at_image(&self) -> Option<Pose> {
+        self.pose_at_image.map(|pose| Pose::new("world", "body", &pose))
     }
 
     /// How the camera is mounted.

@@ -92,6 +92,9 @@ impl PluginEnd {
     /// Sends the answer to one observation.
     #[pyo3(signature = (seq, entered_ns, setpoint))]
     fn answer(&self, seq: u64, entered_ns: u64, setpoint: Option<Setpoint>) -> PyResult<()> {
+        for odometry in vizflyt_sdk::take_odometry() {
+            self.send(&FromPlugin::Odometry(odometry))?;
+        }
         self.send(&FromPlugin::Reply {
             seq,
             entered: HostTime::from_ns(entered_ns),

@@ -6,13 +6,14 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use vizflyt_sdk::ipc::{IpcError, Offer, RuntimeEnd};
 use vizflyt_sdk::protocol::messages::{
-    Event as SdkEvent, EventKind, FromPlugin, ToPlugin, bounded,
+    Event as SdkEvent, EventKind, FromPlugin, Odometry, ToPlugin, bounded,
 };
 use vizflyt_sdk::protocol::time::ServerTime;
 use vizflyt_sdk::{ObservationWriter, host_now};
 
 use crate::arena::{ArenaInfo, CameraInfo};
 use crate::buffer::ObservationBuffer;
+use crate::geometry::Pose;
 use crate::setpoint::Setpoint;
 
 /// A runtime without a flight: plays the runtime's part for a plugin that runs on another thread, or in
@@ -87,8 +88,8 @@ impl Rehearsal {
         self.end.publish(loan).map_err(|error| failed(&error))
     }
 
-    /// Waits for a message of the plugin: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
-    /// ('failed', 0, reason, 0); None if none comes within this time. [s]
+    /// Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns),
+    /// ('answer', seq, setpoint, entered_ns) or ('failed', 0, reason, 0); None if none comes within this time. [s]
     #[pyo3(signature = (timeout_s = 10.0))]
     fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<PluginMessage>> {
         let deadline =
@@ -124,6 +125,10 @@ fn to_python(py: Python<'_>, message: FromPlugin) -> PyResult<PluginMessage> {
                 None => py.None(),
             };
             ("answer", seq, setpoint, entered.as_ns())
+        }
+        FromPlugin::Odometry(Odometry { stamp, odom_from_body }) => {
+            let pose = Py::new(py, Pose::new("odom", "body", &odom_from_body))?.into_any();
+            ("odometry", 0, pose, stamp.as_ns())
         }
         FromPlugin::Failed { reason } => {
             ("failed", 0, reason.into_pyobject(py)?.into_any().unbind(), 0)

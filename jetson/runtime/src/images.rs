@@ -91,6 +91,8 @@ struct UnderWay {
     /// Bit per camera that the server sends together with the first one.
     expected: u8,
     published: Published,
+    /// Of the images that are there.
+    headers: heapless::Vec<ImageHeader, MAX_CAMERAS>,
     /// For the log; empty without one.
     logged: Vec<LoggedImage>,
 }
@@ -243,6 +245,7 @@ impl ImagePublisher {
         let stamps = Stamps::of(&arrival.header, &whole.trailer, arrival.pose, own);
         // One image of each camera at most, so there is room.
         let _ = published.images.push(stamps);
+        let _ = under_way.headers.push(arrival.header);
         if self.log.is_some() {
             under_way.logged.push(LoggedImage {
                 camera,
@@ -316,7 +319,11 @@ impl ImagePublisher {
             return Ok(());
         }
         if let Ok(mut writer) = ObservationWriter::resume(done.memory.memory(), &self.cameras) {
-            self.senses.lock().unwrap_or_else(PoisonError::into_inner).write(&mut writer);
+            let senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
+            senses.write(&mut writer);
+            for header in &done.headers {
+                senses.write_pose_at_image(&mut writer, header);
+            }
         }
         let logged =
             self.log.as_ref().map(|log| (log, observation_head(done.memory.bytes()).to_vec()));
@@ -372,7 +379,8 @@ impl UnderWay {
             ready: HostTime::ZERO,
             images: heapless::Vec::new(),
         };
-        Ok(Self { tick, home, memory, there: 0, expected, published, logged: Vec::new() })
+        let (headers, logged) = (heapless::Vec::new(), Vec::new());
+        Ok(Self { tick, home, memory, there: 0, expected, published, headers, logged })
     }
 }
 

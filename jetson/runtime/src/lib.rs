@@ -13,7 +13,7 @@
 //! drivers, [`control`] (wall clock) and [`lockstep`] (virtual clock, for grades). The companion joins
 //! [`flight`] (phases and outcome), [`trajectory`] (follows paths), [`guard`] (the last word),
 //! [`link`] (MAVLink) and [`steering`] (when setpoints leave), all sans-IO. Then [`stats`] and
-//! [`waterfall`] (ages by stage), [`log`], [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it
+//! [`waterfall`] (ages by stage), [`log`], `odometry` (the plugin's own estimate), [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it
 //! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight.
 
 pub mod airframe;
@@ -31,6 +31,7 @@ pub mod images;
 pub mod link;
 pub mod lockstep;
 pub mod log;
+mod odometry;
 pub mod replay;
 mod replies;
 pub mod report;

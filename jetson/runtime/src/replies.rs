@@ -1,5 +1,5 @@
 //! The plugin's messages, from shared memory to the control loop, rate-limited: a plugin that replies to
-//! images has no more to send.
+//! images has no more to send but, with each reply, its own estimate of where it is.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -20,13 +20,15 @@ const WINDOW: Duration = Duration::from_millis(250);
 struct RateLimiter {
     window_start: Instant,
     count: u32,
+    /// Of estimates, which are dropped beyond the limit.
+    odometry: u32,
     /// A fault was reported; the process's further messages are dropped.
     has_failed: bool,
 }
 
 impl RateLimiter {
     fn new(now: Instant) -> Self {
-        Self { window_start: now, count: 0, has_failed: false }
+        Self { window_start: now, count: 0, odometry: 0, has_failed: false }
     }
 
     /// Returns the message to pass on for what was received.
@@ -35,10 +37,14 @@ impl RateLimiter {
             return None;
         }
         if now.saturating_duration_since(self.window_start) >= WINDOW {
-            (self.window_start, self.count) = (now, 0);
+            (self.window_start, self.count, self.odometry) = (now, 0, 0);
+        }
+        let max = MAX_PER_SECOND * WINDOW.as_millis() as u32 / 1000;
+        if let Ok(FromPlugin::Odometry(_)) = received {
+            self.odometry += 1;
+            return received.ok().filter(|_| self.odometry <= max);
         }
         self.count += 1;
-        let max = MAX_PER_SECOND * WINDOW.as_millis() as u32 / 1000;
         let fault = match received {
             Ok(message) if self.count <= max => return Some(message),
             Ok(_) => format!(
@@ -113,7 +119,8 @@ impl PluginReplies {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use vizflyt_protocol::messages::Setpoint;
+    use vizflyt_protocol::geometry::Pose;
+    use vizflyt_protocol::messages::{Odometry, Setpoint};
     use vizflyt_protocol::time::HostTime;
 
     fn reply(seq: u64) -> FromPlugin {
@@ -146,6 +153,18 @@ mod tests {
         let (passed, failure) = second(10_000);
         assert_eq!(passed, 100);
         assert!(failure.unwrap().contains("more than 400 setpoints a second"));
+    }
+
+    #[test]
+    fn estimates_beyond_the_limit_are_dropped_and_replies_go_on() {
+        let now = Instant::now();
+        let mut limiter = RateLimiter::new(now);
+        let estimate = Odometry { stamp: HostTime::ZERO, odom_from_body: Pose::IDENTITY };
+        let taken = (0..5000)
+            .filter(|_| limiter.take(now, Ok(FromPlugin::Odometry(estimate))).is_some())
+            .count();
+        assert_eq!(taken, 100);
+        assert_eq!(limiter.take(now, Ok(reply(1))), Some(reply(1)));
     }
 
     #[test]

@@ -28,7 +28,7 @@
 extern "C" {
 #endif
 
-#define VIZFLYT_PROTOCOL_VERSION 6
+#define VIZFLYT_PROTOCOL_VERSION 12
 #define VIZFLYT_MAX_CAMERAS 8
 #define VIZFLYT_MAX_IMU 64
 #define VIZFLYT_MAX_WAYPOINTS 32
@@ -52,6 +52,8 @@ typedef struct VizflytCamera {
     uint32_t depth_offset;
     uint32_t distortion_model; /* 0 none, 1 Brown-Conrady, 2 Kannala-Brandt */
     int32_t ahead_ns;          /* by how much later than pose_ns the instant is that the image shows */
+    double body_position_m[3];    /* of the body at that instant, world; zero where the course withholds it */
+    double body_rotation_xyzw[4]; /* body to world at that instant; likewise: no rotation is all zero */
 } VizflytCamera;
 
 typedef struct VizflytImu {
@@ -197,15 +199,20 @@ typedef struct VizflytPlugin {
     void (*on_stop)(void *user);
 } VizflytPlugin;
 
+/* Publishes where the plugin thinks the vehicle was at stamp_ns (of an estimate from an image: pose_ns + ahead_ns).
+ * It is logged, and vizflyt grade reports how far off it was; nothing is flown by it. z of its frame is up; origin
+ * and heading are yours. Call it in on_image, four times at most. Returns 1, or 0 for what is no pose or too many. */
+int vizflyt_publish_odometry(uint64_t stamp_ns, const double p_odom_m[3], const double rotation_xyzw[4]);
+
 /* Attaches to the runtime that started this program and runs to the end of the flight. Returns the
  * exit status for main: 0 after a flight, 1 if the runtime vanished, 2 if there is none. */
 int vizflyt_run(const VizflytPlugin *plugin);
 
 #ifdef __cplusplus
 }
-static_assert(sizeof(VizflytCamera) == 176, "layout of the shared memory");
+static_assert(sizeof(VizflytCamera) == 232, "layout of the shared memory");
 static_assert(sizeof(VizflytImu) == 32, "layout of the shared memory");
-static_assert(sizeof(VizflytObservation) == 3608, "layout of the shared memory");
+static_assert(sizeof(VizflytObservation) == 4056, "layout of the shared memory");
 static_assert(offsetof(VizflytObservation, cameras) == 2200, "layout of the shared memory");
 #endif
 

@@ -9,8 +9,8 @@ use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_NO_FLY, MAX_PIECES, MAX_WAYPOINTS};
 use vizflyt_sdk::protocol::packet::ObservationHeader;
 use vizflyt_sdk::{
-    ArenaInfo, Autonomy, Axes, Event, Observation, Path, PathYaw, Piece, Setpoint, SetpointKind,
-    Trajectory, Volume, Waypoint, YawTarget,
+    ArenaInfo, Autonomy, Axes, Event, HostTime, Observation, Path, PathYaw, Piece, Pose, Setpoint,
+    SetpointKind, Trajectory, Volume, Waypoint, YawTarget,
 };
 
 /// A point to pass.
@@ -168,6 +168,25 @@ pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
     let code = vizflyt_sdk::run(CPlugin(callbacks));
     // `ExitCode` does not give its number.
     [0, 1, 2, 101].into_iter().find(|&n| ExitCode::from(n) == code).unwrap_or(1).into()
+}
+
+/// Publishes where the plugin thinks the vehicle was; returns 1, or 0 for what is no pose or too many.
+///
+/// # Safety
+/// `p_odom_m` points to three numbers and `rotation_xyzw` to four, or either is null.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn vizflyt_publish_odometry(
+    stamp_ns: u64,
+    p_odom_m: *const [f64; 3],
+    rotation_xyzw: *const [f64; 4],
+) -> c_int {
+    // SAFETY: the caller promises it, or passes null.
+    let given = unsafe { p_odom_m.as_ref().zip(rotation_xyzw.as_ref()) };
+    let published = given.map(|(&p_m, &xyzw)| {
+        let pose = Pose::new(DVec3::from(p_m), DQuat::from_array(xyzw));
+        vizflyt_sdk::publish_odometry(HostTime::from_ns(stamp_ns), pose)
+    });
+    matches!(published, Some(Ok(()))).into()
 }
 
 const NOT_ATTACHED: c_int = 2;
@@ -346,5 +365,5 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
 }
 
 // What `vizflyt.h` asserts on its side.
-const _: () = assert!(size_of::<ObservationHeader>() == 3608);
+const _: () = assert!(size_of::<ObservationHeader>() == 4056);
 const _: () = assert!(std::mem::offset_of!(ObservationHeader, cameras) == 2200);

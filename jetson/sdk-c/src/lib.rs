@@ -7,5 +7,6 @@
 mod ffi;
 
 pub use ffi::{
-    VizflytArena, VizflytPiece, VizflytPlugin, VizflytSetpoint, VizflytWaypoint, vizflyt_run,
+    VizflytArena, VizflytPiece, VizflytPlugin, VizflytSetpoint, VizflytWaypoint,
+    vizflyt_publish_odometry, vizflyt_run,
 };

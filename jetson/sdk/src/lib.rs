@@ -35,6 +35,7 @@ mod map;
 mod mat;
 mod memory;
 mod observation;
+mod odometry;
 mod run;
 
 pub use glam;
@@ -42,10 +43,10 @@ pub use glam;
 pub use opencv;
 pub use vizflyt_protocol as protocol;
 
-pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World};
+pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Odom, Pose, Twist, Volume, World};
 pub use vizflyt_protocol::messages::{
-    ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Path, PathYaw, Piece,
-    Setpoint, SetpointKind, SetpointKinds, Trajectory, Waypoint, YawTarget,
+    ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Odometry, Path, PathYaw,
+    Piece, Setpoint, SetpointKind, SetpointKinds, Trajectory, Waypoint, YawTarget,
 };
 pub use vizflyt_protocol::time::HostTime;
 
@@ -56,6 +57,7 @@ pub use memory::{
     ImageStamps, ObservationBuffer, ObservationTooLarge, ObservationWriter, PlanesMut,
 };
 pub use observation::{Battery, CameraImage, ImuSample, Observation, Vehicle};
+pub use odometry::{OdometryError, publish_odometry, take_odometry};
 pub use run::{attach, run};
 
 /// The plugin in the project's README compiles.

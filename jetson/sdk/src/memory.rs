@@ -1,6 +1,7 @@
 //! Writes observations: into shared memory for the runtime, into owned memory for tests and
 //! replays. The mirror of [`observation`](crate::Observation).
 
+use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Name};
 use vizflyt_protocol::packet::{ImuRecord, MAX_IMU, ObservationHeader, ObservationLayout};
 use vizflyt_protocol::time::HostTime;
@@ -185,6 +186,15 @@ impl<'m> ObservationWriter<'m> {
         Some(PlanesMut { rgb, depth_mm })
     }
 
+    /// Fills in where the body was at the instant that camera `index`'s image shows: only where the course gives the
+    /// pose.
+    pub fn pose_at_image(&mut self, index: usize, world_from_body: &Pose<World, Body>) {
+        let count = usize::from(self.header().camera_count);
+        if let Some(head) = self.header().cameras[..count].get_mut(index) {
+            head.set_pose_at_image(world_from_body);
+        }
+    }
+
     /// Declares the planes of camera `index` filled in; only then does a plugin see them.
     pub fn image_ready(&mut self, index: usize, camera: &CameraInfo, stamps: ImageStamps) {
         let count = usize::from(self.header().camera_count);
@@ -289,6 +299,11 @@ impl ObservationBuffer {
             fill(planes);
             writer.image_ready(index, &camera, stamps);
         }
+    }
+
+    /// Fills in where the body was at the instant that camera `index`'s image shows.
+    pub fn set_pose_at_image(&mut self, index: usize, world_from_body: &Pose<World, Body>) {
+        self.writer().pose_at_image(index, world_from_body);
     }
 
     /// Returns the bytes in the layout of [`ObservationHeader`], aligned to 64.

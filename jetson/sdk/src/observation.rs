@@ -84,6 +84,9 @@ pub struct CameraImage<'a> {
     pub intrinsics: Intrinsics,
     /// Extrinsics.
     pub body_from_cam: Pose<Body, Cam>,
+    /// Where the body was at the instant that the image shows: what the image was rendered from. `None` where the
+    /// course withholds the pose. [m, world]
+    pub pose_at_image: Option<Pose<World, Body>>,
 }
 
 impl<'a> Observation<'a> {
@@ -120,6 +123,12 @@ impl<'a> Observation<'a> {
             .map(|camera| camera.stamp)
             .max()
             .unwrap_or(HostTime::from_ns(self.header.vehicle_ns))
+    }
+
+    /// Returns where the body was at the instant that the newest image shows: the pose that belongs to its pixels.
+    /// `None` without an image, and where the course withholds the pose. [m, world]
+    pub fn pose_at_image(&self) -> Option<Pose<World, Body>> {
+        self.cameras().max_by_key(|camera| camera.shown)?.pose_at_image
     }
 
     /// Returns the image of the camera of this name; `None` if there is no such camera or it has
@@ -202,6 +211,7 @@ fn image<'a>(
         depth_mm: <[u16]>::ref_from_bytes(bytes.get(depth_at..depth_at + 2 * pixels)?).ok()?,
         intrinsics: camera.intrinsics(),
         body_from_cam: camera.body_from_cam(),
+        pose_at_image: camera.pose_at_image(),
     })
 }
 

@@ -15,6 +15,7 @@ use crate::autonomy::Autonomy;
 use crate::clock::host_now;
 use crate::ipc::{IpcError, PluginEnd, SERVICE_OPTION, offers};
 use crate::observation::Observation;
+use crate::odometry::take_odometry;
 
 /// Runs a plugin to the end of the flight; call it from `main`.
 ///
@@ -131,6 +132,9 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
         let entered = host_now();
         let setpoint = plugin.on_image(&observation.with_imu_after(imu_had));
         imu_had = observation.newest_imu().unwrap_or(imu_had);
+        for odometry in take_odometry() {
+            end.send(&FromPlugin::Odometry(odometry))?;
+        }
         let seq = observation.seq();
         end.send(&FromPlugin::Reply { seq, entered, returned: host_now(), setpoint })?;
     }

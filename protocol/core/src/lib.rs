@@ -30,4 +30,4 @@ pub mod time;
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first
 /// ([`packet::Preamble`]) and refuse a mismatch by name.
-pub const PROTOCOL_VERSION: u16 = 11;
+pub const PROTOCOL_VERSION: u16 = 12;

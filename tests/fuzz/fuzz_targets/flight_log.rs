@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::io::Cursor;
 
 use libfuzzer_sys::fuzz_target;
+use vizflyt_runtime::log::data::FlightData;
 use vizflyt_runtime::log::read::{LogReader, Recorded, RecordedFlight};
 use vizflyt_runtime::log::{Observation, ObservedImage};
 use vizflyt_runtime::replay::{ReplayPlan, decode, observation_len};
@@ -32,6 +33,9 @@ fuzz_target!(|bytes: &[u8]| {
     }
     let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
     let _ = ReplayPlan::read(RecordedFlight::new(reader, false));
+    let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
+    let mut data = FlightData::new(reader, true);
+    while let Ok(Some(_)) = data.next() {}
     let Ok(reader) = LogReader::new(Cursor::new(bytes)) else { return };
     let mut flight = RecordedFlight::new(reader, true);
     while let Ok(Some(recorded)) = flight.next() {

@@ -12,8 +12,11 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
-use self::errors::{Alignment, Delta, Error, Statistics};
-use self::pairs::{Association, Pair};
+pub(crate) use self::errors::{Alignment, Delta};
+use self::errors::{Error, Statistics};
+use self::pairs::Pair;
+pub(crate) use self::pairs::{Association, associate};
+pub(crate) use self::trajectory::Stamped;
 use crate::terminal::print_line;
 
 /// Measures how far an estimated trajectory is from the true one: absolute and relative errors.
@@ -21,7 +24,7 @@ use crate::terminal::print_line;
 #[command(after_help = "Examples:
   vizflyt evaluate truth.tum odometry.tum --align se3
   vizflyt evaluate flight.mcap odometry.tum --align yaw --delta 1s --html drift.html
-  vizflyt evaluate flight.mcap:/pose flight.mcap:/odometry --json
+  vizflyt evaluate flight.mcap#/pose flight.mcap#/odometry --align yaw --json
 
 A trajectory is TUM's text (stamp tx ty tz qx qy qz qw), EuRoC's CSV, or a flight's log with a topic of poses
 (/pose without). The numbers are those of evo_ape and evo_rpe: docs/guides/logs.md.")]
@@ -59,7 +62,7 @@ pub(crate) fn run(args: &EvaluateArgs) -> Result<ExitCode> {
         "--max-diff is a time of 0 s or more"
     );
     let (truth, estimate) = (trajectory::read(&args.truth)?, trajectory::read(&args.estimate)?);
-    let pairs = pairs::associate(&truth, &estimate, args.associate, args.max_diff);
+    let pairs = associate(&truth, &estimate, args.associate, args.max_diff);
     ensure!(
         !pairs.is_empty(),
         "no two poses are within {} s of each other: {} is from {:.3} to {:.3} s, {} from {:.3} to {:.3} s; are they \
@@ -103,44 +106,44 @@ fn delta(text: &str) -> Result<Delta, String> {
 }
 
 /// An estimate, held against the truth.
-struct Evaluation {
+pub(crate) struct Evaluation {
     /// The estimate in the truth's frame.
     pairs: Vec<Pair>,
     absolute: Vec<Error>,
-    figures: Figures,
+    pub(crate) figures: Figures,
 }
 
 /// What `--json` prints. Null is what these trajectories do not say.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-struct Figures {
+pub(crate) struct Figures {
     align: String,
     delta: String,
     /// Poses of both that were compared.
-    pairs: usize,
+    pub(crate) pairs: usize,
     /// From the first to the last of them. [s]
     seconds: f64,
     /// The truth's way. [m]
     path_m: f64,
     /// By which the estimate was multiplied.
     scale: f64,
-    ate_rmse_m: f64,
+    pub(crate) ate_rmse_m: f64,
     ate_mean_m: f64,
     ate_median_m: f64,
-    ate_max_m: f64,
+    pub(crate) ate_max_m: f64,
     ate_rot_rmse_deg: f64,
     ate_rot_max_deg: f64,
     /// Steps of `delta` that relative errors are of.
     rpe_pairs: usize,
-    rpe_trans_rmse_m: Option<f64>,
+    pub(crate) rpe_trans_rmse_m: Option<f64>,
     rpe_trans_max_m: Option<f64>,
-    rpe_rot_rmse_deg: Option<f64>,
+    pub(crate) rpe_rot_rmse_deg: Option<f64>,
     rpe_rot_max_deg: Option<f64>,
     /// The same over longer and longer ways.
     by_distance: Vec<ByDistance>,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize)]
-struct ByDistance {
+pub(crate) struct ByDistance {
     distance_m: f64,
     steps: usize,
     trans_rmse_m: f64,
@@ -153,8 +156,12 @@ struct ByDistance {
 const DISTANCES_M: [f64; 7] = [0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
 
 impl Evaluation {
-    /// Of at least one pair.
-    fn of(pairs: &[Pair], alignment: Alignment, delta: Delta) -> Result<Self> {
+    /// Measures at least one pair.
+    ///
+    /// # Errors
+    /// If there is none, or they cannot be aligned.
+    pub(crate) fn of(pairs: &[Pair], alignment: Alignment, delta: Delta) -> Result<Self> {
+        ensure!(!pairs.is_empty(), "no pose to compare");
         let place = errors::align(pairs, alignment)?;
         let pairs = errors::aligned(pairs, &place);
         let absolute = errors::absolute(&pairs);

@@ -17,12 +17,13 @@ pub(crate) struct Stamped {
     pub(crate) rotation: DQuat,
 }
 
-/// Reads a trajectory, ascending in time: TUM's text, EuRoC's CSV, or `FLIGHT.mcap:TOPIC` (`/pose` without).
+/// Reads a trajectory, ascending in time: TUM's text, EuRoC's CSV, or `FLIGHT.mcap#TOPIC` (`/pose` without).
 ///
 /// # Errors
 /// What is wrong with the file, with its line.
 pub(crate) fn read(source: &str) -> Result<Vec<Stamped>> {
-    let (path, topic) = match source.split_once(".mcap:") {
+    let topic_at = [".mcap#", ".mcap:"].iter().find_map(|mark| source.split_once(mark));
+    let (path, topic) = match topic_at {
         Some((name, topic)) => (format!("{name}.mcap"), topic),
         None => (source.to_owned(), "/pose"),
     };
@@ -55,7 +56,7 @@ fn of_log(path: &Path, topic: &str) -> Result<Vec<Stamped>> {
     }
     ensure!(
         !found.is_empty(),
-        "there is no pose on {topic}; give a topic of poses as FLIGHT.mcap:TOPIC"
+        "there is no pose on {topic}; give a topic of poses as FLIGHT.mcap#/pose, #/pose_at_image or #/odometry"
     );
     found.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
     found.dedup_by_key(|pose| pose.at_s);

@@ -10,6 +10,7 @@ use sha2::{Digest, Sha256};
 use vizflyt_arena::verdict::StageVerdict;
 use vizflyt_protocol::messages::OutcomeKind;
 
+use super::odometry::OdometryScore;
 use super::statistics::{Interval, mean_interval, share_interval};
 
 /// What the first field holds; another layout is another number.
@@ -128,6 +129,9 @@ pub(crate) struct Run {
     pub path_m: f64,
     /// Images that the plugin answered.
     pub images: u64,
+    /// How far off the plugin's own estimate was; absent if it published none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub odometry: Option<OdometryScore>,
     /// SHA-256 of the scene: its splats.
     pub scene_sha256: String,
     /// SHA-256 of its rules: `arena.toml`.
@@ -357,6 +361,9 @@ impl Run {
         for number in numbers.into_iter().chain(others).chain(optional) {
             *number = millionth(*number);
         }
+        if let Some(odometry) = &mut self.odometry {
+            odometry.round();
+        }
     }
 }
 
@@ -400,7 +407,7 @@ fn hash_of(runs: &[Run]) -> String {
 }
 
 /// Rounds to a millionth.
-fn millionth(number: f64) -> f64 {
+pub(super) fn millionth(number: f64) -> f64 {
     (number * 1e6).round() / 1e6
 }
 

@@ -18,6 +18,7 @@ mod judge;
 mod junit;
 mod keys;
 mod merge;
+mod odometry;
 mod pool;
 mod progress;
 mod record;
@@ -50,6 +51,7 @@ use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
 use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, hex};
 use self::folder::{FLIGHTS, ReportFolder};
+use self::odometry::OdometryScore;
 use self::progress::Progress;
 use self::record::{FlightRecord, FlownWith, SealingKey};
 use self::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
@@ -134,6 +136,9 @@ struct FlyArgs {
         hide_possible_values = true
     )]
     log: GradeLog,
+    /// Writes depth into them a second time so that any viewer shows it (16UC1)
+    #[arg(long, requires = "report")]
+    log_depth: bool,
     /// Writes JUnit XML there
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -366,6 +371,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
             let log = file.as_ref().zip(images).map(|(file, (_, images))| TrialLog {
                 file,
                 images,
+                depth: args.log_depth,
                 plugin: typed,
             });
             let reached = &reached;
@@ -669,6 +675,7 @@ fn run_of(
         max_speed_mps: verdict.max_speed_mps,
         path_m: verdict.path_m,
         images: flown.images,
+        odometry: OdometryScore::of(&flown.truth, &flown.odometry),
         scene_sha256: course.scene_sha256.clone(),
         rules_sha256: course.rules_sha256.clone(),
         hash: hex(&flown.hash),

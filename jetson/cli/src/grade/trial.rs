@@ -19,7 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use sha2::{Digest, Sha256};
 use vizflyt_arena::crash::{ClearanceAhead, Flight as Record, TimedSetpoint, ahead_m};
 use vizflyt_arena::pose::{Measured, Predict};
@@ -28,7 +28,7 @@ use vizflyt_arena::{ArenaConfig, Referee};
 use vizflyt_protocol::flight_end::FlightEnd;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::MAX_PACKET;
-use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Setpoint};
+use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Odometry, Setpoint};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
@@ -44,6 +44,7 @@ use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
 use super::course::CourseInstance;
+use crate::evaluate::Stamped;
 
 /// How long things take in a graded flight, always the same.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -103,6 +104,8 @@ pub(crate) struct TrialLog<'a> {
     pub file: &'a File,
     /// Which images it keeps.
     pub images: LoggedImages,
+    /// Whether depth is written for viewers, too.
+    pub depth: bool,
     /// The plugin as the command line names it.
     pub plugin: &'a OsString,
 }
@@ -141,6 +144,10 @@ pub(crate) struct TrialResult {
     pub lines: VecDeque<String>,
     /// Images that the plugin answered.
     pub images: u64,
+    /// Where the plugin thought it was.
+    pub odometry: Vec<Odometry>,
+    /// Where the simulated vehicle truly was, 200 a second, while a plugin publishes.
+    pub truth: Vec<Stamped>,
     /// Virtual time. [s]
     pub virtual_s: f64,
 }
@@ -177,6 +184,10 @@ const SHOT_PERIOD_S: f64 = 0.1;
 const KEYFRAMES: usize = 16;
 /// Two of them are at least so far apart. [s]
 const KEYFRAME_PERIOD_S: f64 = 0.25;
+/// Between two poses of the truth. [s]
+const TRUTH_PERIOD_S: f64 = 4e-3;
+/// So many are kept before the first estimate: more than 10 s, the age that one may have.
+const TRUTH_BEFORE_FIRST: usize = 2500;
 /// Lines of the plugin that are kept.
 const LINES: usize = 200;
 
@@ -295,6 +306,8 @@ struct Flight<'a> {
     keyframes: Keyframes,
     lines: Lines,
     answered: u64,
+    odometry: Vec<Odometry>,
+    truth: VecDeque<Stamped>,
     /// How it ends, by all that happened so far.
     end: FlightEnd,
 }
@@ -325,11 +338,11 @@ impl<'a> Flight<'a> {
         hash.update(renderer.name().as_bytes());
         let mut lockstep =
             Lockstep::new(now, &info, settings, Some(process), trial.delays.answer_ns);
-        if let Some(TrialLog { file, images, plugin }) = &trial.log {
+        if let Some(TrialLog { file, images, depth, plugin }) = &trial.log {
             let log = file
                 .try_clone()
                 .map_err(anyhow::Error::from)
-                .and_then(|file| Ok(VirtualLog::new(file, *images, plugin, now)?));
+                .and_then(|file| Ok(VirtualLog::new(file, *images, plugin, *depth, now)?));
             lockstep.set_log(log.context("the flight's log cannot be written")?);
         }
         Ok(Self {
@@ -357,6 +370,8 @@ impl<'a> Flight<'a> {
             keyframes: Keyframes::default(),
             lines: Lines::default(),
             answered: 0,
+            odometry: Vec::new(),
+            truth: VecDeque::new(),
             end: FlightEnd::default(),
         })
     }
@@ -423,7 +438,16 @@ impl<'a> Flight<'a> {
     /// Poses from the motion capture through filter and rules.
     fn localize(&mut self) {
         let (referee, companion) = (&mut self.referee, &mut self.lockstep.companion);
-        companion.drain_imu(|reading| referee.handle_imu(&reading));
+        let mut readings = Vec::new();
+        companion.drain_imu(|sample, reading| {
+            referee.handle_imu(&reading);
+            readings.push(*sample);
+        });
+        if let Some(log) = self.lockstep.log() {
+            for sample in &readings {
+                log.imu(sample);
+            }
+        }
         while let Some(sight) = self.simulation.poll_mocap() {
             let stamp = ServerTime::from_ns(START_NS + sight.at.as_ns());
             let arrival = self.server_now();
@@ -535,6 +559,10 @@ impl<'a> Flight<'a> {
         let reply = self.lockstep.show(now, seq, cameras, write, &images, &mut line)?;
         drop(line);
         self.log_lines();
+        for odometry in self.lockstep.take_odometry() {
+            self.hash.update(format!("{odometry:?}").as_bytes());
+            self.odometry.push(odometry);
+        }
         let Some(reply) = reply else { return Ok(()) };
         self.answered += 1;
         self.hash.update(format!("{:?}", reply.setpoint).as_bytes());
@@ -601,6 +629,7 @@ impl<'a> Flight<'a> {
 
     fn hash_state(&mut self) {
         let state = self.simulation.state();
+        let (position_m, rotation) = (state.p_world_m, state.world_from_body);
         let hash_vector = |hash: &mut Sha256, v: DVec3| {
             for value in v.to_array() {
                 hash.update(value.to_le_bytes());
@@ -611,6 +640,20 @@ impl<'a> Flight<'a> {
         for value in state.world_from_body.to_array() {
             self.hash.update(value.to_le_bytes());
         }
+        self.keep_truth(position_m, rotation);
+    }
+
+    /// Keeps where the vehicle truly is, for estimates that the plugin may publish.
+    fn keep_truth(&mut self, position_m: DVec3, rotation: DQuat) {
+        let at_s = self.now.as_ns() as f64 * 1e-9;
+        if self.truth.back().is_some_and(|last| at_s - last.at_s < TRUTH_PERIOD_S) {
+            return;
+        }
+        // Of a plugin that has published nothing, only what its first estimate may be of.
+        if self.odometry.is_empty() && self.truth.len() >= TRUTH_BEFORE_FIRST {
+            self.truth.pop_front();
+        }
+        self.truth.push_back(Stamped { at_s, position_m, rotation });
     }
 
     fn server_now(&self) -> ServerTime {
@@ -636,6 +679,8 @@ impl<'a> Flight<'a> {
             keyframes: self.keyframes.images,
             lines: self.lines.kept,
             images: self.answered,
+            odometry: self.odometry,
+            truth: self.truth.into(),
             virtual_s,
         }
     }

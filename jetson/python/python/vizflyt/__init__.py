@@ -23,6 +23,7 @@ Images are read-only numpy arrays that lie in shared memory: nothing is copied. 
 to keep it for long, take a ``.copy()``.
 """
 
+from ._log import Images, Imu, Log, LogImage, Motion, Poses, Sent
 from ._plugin import Plugin
 from ._run import HeldImagesWarning, run
 from ._vizflyt import (
@@ -44,6 +45,7 @@ from ._vizflyt import (
     Volume,
     __version__,
     course_map,
+    publish_odometry,
 )
 
 __all__ = [
@@ -53,19 +55,27 @@ __all__ = [
     "CameraInfo",
     "Event",
     "HeldImagesWarning",
+    "Images",
+    "Imu",
     "ImuSample",
     "Intrinsics",
     "Limits",
+    "Log",
+    "LogImage",
+    "Motion",
     "NotFiniteError",
     "Observation",
     "ObservationBuffer",
     "Plugin",
     "Pose",
+    "Poses",
     "Rehearsal",
+    "Sent",
     "Setpoint",
     "Vehicle",
     "Volume",
     "__version__",
     "course_map",
+    "publish_odometry",
     "run",
 ]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 __version__: Final[str]
 PROTOCOL_VERSION: Final[int]
-_Frame = Literal["world", "body", "cam"]
+_Frame = Literal["world", "body", "cam", "odom"]
 _Axes = Literal["world", "heading", "body"]
 _Vector = npt.ArrayLike
 _F64 = npt.NDArray[np.float64]
@@ -177,6 +177,12 @@ class Observation:
         """The images there are, in the order of the arena's cameras."""
 
     @property
+    def pose_at_image(self) -> Pose | None:
+        """Where the body was at the instant that the newest image shows: the pose that belongs to its pixels. None
+        without an image, and where the course withholds the pose. [m, world]
+        """
+
+    @property
     def vehicle(self) -> Vehicle | None:
         """What is known of the vehicle; None before anything is."""
 
@@ -252,6 +258,12 @@ class CameraImage:
     @property
     def intrinsics(self) -> Intrinsics:
         """Size, focal lengths, principal point, lens."""
+
+    @property
+    def pose_at_image(self) -> Pose | None:
+        """Where the body was at the instant that the image shows: what it was rendered from; None where the course
+        withholds the pose. [m, world]
+        """
 
     @property
     def body_from_cam(self) -> Pose:
@@ -636,6 +648,9 @@ class ObservationBuffer:
         returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
         """
 
+    def set_pose_at_image(self, name: str, world_from_body: Pose) -> None:
+        """Fills in where the body was at the instant that a camera's image shows."""
+
     def observation(self) -> Observation:
         """Returns what a plugin would see."""
 
@@ -671,9 +686,9 @@ class Rehearsal:
 
     def receive(
         self, timeout_s: float = 10.0
-    ) -> tuple[Literal["ready", "answer", "failed"], int, Any, int] | None:
-        """Waits for a message of the plugin: ('ready', 0, name, 0), ('answer', seq, setpoint, entered_ns) or
-        ('failed', 0, reason, 0); None if none comes within this time. [s]
+    ) -> tuple[Literal["ready", "odometry", "answer", "failed"], int, Any, int] | None:
+        """Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns),
+        ('answer', seq, setpoint, entered_ns) or ('failed', 0, reason, 0); None if none comes within this time. [s]
         """
 
 class NotFiniteError(ValueError):
@@ -708,6 +723,26 @@ class PluginEnd:
 
     def failed(self, reason: str) -> None:
         """Reports that the plugin has failed, with the reason."""
+
+def publish_odometry(stamp_ns: int, p_odom_m: _Vector, rotation_xyzw: npt.ArrayLike) -> None:
+    """Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is
+    `image.shown_ns`. It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how
+    far off it was. Nothing is flown by it.
+
+    `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to
+    odom axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
+
+    Raises NotFiniteError or ValueError for what is no pose, ValueError for more than four in one `on_image`.
+    """
+
+def decode_image(
+    bitstream: bytes, jpeg: bytes | None = None
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
+    """Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be
+    apart.
+
+    Raises ValueError for what does not decode.
+    """
 
 def waiting_services() -> list[str]:
     """Returns the services of this user's runtimes that wait for a plugin, the longest waiting first."""

@@ -302,12 +302,12 @@ impl Companion {
 
     /// Calls `push` with each of the autopilot's IMU readings that is new, oldest first. Readings that
     /// cannot be placed on the server's clock yet are left out.
-    pub fn drain_imu(&mut self, mut push: impl FnMut(ImuReading)) {
+    pub fn drain_imu(&mut self, mut push: impl FnMut(&ImuSample, ImuReading)) {
         for sample in self.link.imu().iter().filter(|sample| sample.stamp > self.imu_drained) {
             let stamp = self.clock.to_server(sample.stamp);
             if stamp > ServerTime::ZERO {
                 let ImuSample { accel_mps2, gyro_radps, .. } = *sample;
-                push(ImuReading { stamp, accel_mps2, gyro_radps });
+                push(sample, ImuReading { stamp, accel_mps2, gyro_radps });
             }
         }
         self.imu_drained = self.link.imu().back().map_or(self.imu_drained, |newest| newest.stamp);
@@ -318,6 +318,8 @@ impl Companion {
         let state = self.link.state();
         let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
         senses.vehicle = self.vehicle;
+        // Before the course is known, no pose is let out.
+        senses.gives_pose = self.ground_truth() == Some(true);
         senses.battery = Battery {
             fraction: (fraction >= 0.0).then_some(fraction),
             voltage_v: (voltage_v > 0.0).then_some(voltage_v),

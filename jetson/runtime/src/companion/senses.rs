@@ -1,5 +1,6 @@
 //! What a plugin may know beside images.
 
+use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle};
 
 /// The vehicle's state as the plugin may know it. What the course withholds is never in it.
@@ -11,6 +12,8 @@ pub struct Senses {
     pub battery: Battery,
     /// The newest IMU samples, oldest first.
     pub imu: Vec<ImuSample>,
+    /// Whether the course lets the plugin know where the vehicle is.
+    pub gives_pose: bool,
 }
 
 impl Senses {
@@ -21,5 +24,12 @@ impl Senses {
         }
         writer.battery(&self.battery);
         writer.imu(&self.imu);
+    }
+
+    /// Writes where an image was rendered from into an observation, where the course gives the pose.
+    pub fn write_pose_at_image(&self, writer: &mut ObservationWriter<'_>, header: &ImageHeader) {
+        if self.gives_pose {
+            writer.pose_at_image(header.camera.into(), &header.world_from_body());
+        }
     }
 }

@@ -1,10 +1,11 @@
 //! The companion against inputs of an autopilot and a server, and what it lets a plugin know.
 
 use vizflyt_protocol::flight_end::{Collision, Obstacle};
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
 use vizflyt_protocol::messages::{FlightPhase, Limits};
+use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_sdk::glam::{DQuat, DVec3};
-use vizflyt_sdk::{Observation, ObservationWriter};
+use vizflyt_sdk::{ImageStamps, Observation, ObservationWriter};
 
 use super::*;
 
@@ -50,6 +51,11 @@ fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
     (companion, messages)
 }
 
+/// Where an image was rendered from.
+fn at_image() -> Pose<World, Body> {
+    Pose::new(DVec3::new(4.0, 5.0, 6.0), DQuat::IDENTITY)
+}
+
 fn observed<T>(companion: &Companion, look: impl FnOnce(&Observation<'_>) -> T) -> T {
     let cameras = companion.arena().unwrap().cameras.to_vec();
     let mut blocks = vec![0u64; ObservationWriter::len_for(&cameras).div_ceil(8)];
@@ -58,6 +64,10 @@ fn observed<T>(companion: &Companion, look: impl FnOnce(&Observation<'_>) -> T) 
     let mut senses = Senses::default();
     companion.update_senses(&mut senses);
     senses.write(&mut writer);
+    let k = &cameras[0].intrinsics;
+    let header = ImageHeader::new(1, 0, ServerTime::ZERO, k, &Pose::IDENTITY, &at_image());
+    writer.image_ready(0, &cameras[0], ImageStamps::default());
+    senses.write_pose_at_image(&mut writer, &header);
     let names = [cameras[0].name.clone()];
     look(&Observation::from_bytes(memory, &names).unwrap())
 }
@@ -80,13 +90,19 @@ fn plugin_never_gets_what_the_course_withholds() {
     let (companion, messages) = after_collision(true);
     let text = "collision with an obstacle at (1.00, 2.00, 3.00) m, at 1.0 m/s";
     assert_eq!(event(&messages), (DVec3::new(1.0, 2.0, 3.0), text.to_owned()));
-    observed(&companion, |observation| assert!(observation.vehicle().is_some()));
+    observed(&companion, |observation| {
+        assert!(observation.vehicle().is_some());
+        assert_eq!(observation.camera("front").unwrap().pose_at_image, Some(at_image()));
+    });
 
     let (companion, messages) = after_collision(false);
     let text = "collision with an obstacle at (withheld) m, at 1.0 m/s";
     assert_eq!(event(&messages), (DVec3::ZERO, text.to_owned()));
     // No attitude of the autopilot's has come, and the pose is not let out.
-    observed(&companion, |observation| assert!(observation.vehicle().is_none()));
+    observed(&companion, |observation| {
+        assert!(observation.vehicle().is_none());
+        assert_eq!(observation.camera("front").unwrap().pose_at_image, None);
+    });
 }
 
 #[test]

@@ -39,6 +39,7 @@ use crate::flight::{FlightSettings, Views};
 use crate::images::{Published, SharedSenses};
 use crate::link::{LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
+use crate::odometry::OdometryGate;
 use crate::report::Counters;
 use crate::stats::ImageTimes;
 use crate::stream::{Outbox, Shared, StreamEvent};
@@ -141,6 +142,7 @@ struct ControlLoop {
     restarts: u32,
     /// Lines that went to the page in this second of ticks.
     page_lines: u64,
+    odometry_gate: OdometryGate,
     /// The companion's ticks so far.
     ticks: u64,
 }
@@ -190,6 +192,7 @@ impl ControlLoop {
             overruns: 0,
             restarts: 0,
             page_lines: 0,
+            odometry_gate: OdometryGate::default(),
             ticks: 0,
         }
     }
@@ -199,8 +202,11 @@ impl ControlLoop {
         match input {
             ControlInput::Mavlink(bytes) => {
                 self.companion.handle_mavlink(now, &bytes);
-                let to_server = &self.control.to_server;
-                self.companion.drain_imu(|reading| to_server.imu(reading));
+                let (to_server, log) = (&self.control.to_server, &self.control.log);
+                self.companion.drain_imu(|sample, reading| {
+                    to_server.imu(reading);
+                    log.imu(sample);
+                });
                 self.share_senses();
             }
             ControlInput::Stream(event) => self.handle_stream(now, event),
@@ -374,6 +380,11 @@ impl ControlLoop {
                         "returned_ns": returned.as_ns(), "age_ms": age_ms
                     }),
                 );
+            }
+            FromPlugin::Odometry(odometry) => {
+                if counts && self.odometry_gate.takes(now, &odometry) {
+                    self.control.log.odometry(now, &odometry);
+                }
             }
             FromPlugin::Failed { reason } => {
                 self.plugin_failed(now, format!("the plugin failed: {reason}"));

@@ -273,3 +273,44 @@ fn replaced_image_is_not_mixed_with_its_successor() {
     assert_eq!(rig.mailbox.replaced(), 1);
     assert!(!rig.mailbox.push(ticket, &mut vec![0]), "its receiver learns it");
 }
+
+#[test]
+fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
+    // Numbers that nothing else in an observation has.
+    let body =
+        Pose::new(DVec3::new(12.345_678, -3.456_789, 2.345_678), DQuat::from_rotation_z(0.7));
+    for gives_pose in [true, false] {
+        let mut rig = Rig::new(&["front", "down"]);
+        rig.publisher.senses.lock().unwrap().gives_pose = gives_pose;
+        let mut arriving = image(1, 7, 2000);
+        let k = Intrinsics::from_horizontal_fov(32, 24, 1.5);
+        let mount = Pose::new(DVec3::new(0.1, 0.0, 0.0), DQuat::from_rotation_y(0.3));
+        arriving.header = ImageHeader::new(7, 1, ServerTime::ZERO, &k, &mount, &body);
+        arriving.header.together = 0b10.into();
+        let ticket = rig.open(&arriving).unwrap();
+        rig.push(ticket, &arriving, 0..99);
+        rig.end(ticket, &arriving);
+        while rig.publisher.step(&rig.mailbox, Duration::ZERO, &mut |_| ()).unwrap() {}
+        let sample = rig.plugin.observation().unwrap().unwrap();
+        let observation = Observation::from_bytes(sample.bytes(), &rig.names).unwrap();
+        let found = observation.pose_at_image();
+        assert_eq!(found, observation.camera("down").unwrap().pose_at_image);
+        let bytes = sample.bytes();
+        let holds = |number: f64| {
+            // The last bits are lost on the way over the camera's pose.
+            bytes
+                .as_chunks::<8>()
+                .0
+                .iter()
+                .any(|eight| (f64::from_le_bytes(*eight) - number).abs() < 1e-9)
+        };
+        assert_eq!(found.is_some(), gives_pose);
+        for number in body.translation_m.to_array() {
+            assert_eq!(holds(number), gives_pose, "{number}");
+        }
+        if let Some(pose) = found {
+            assert!(pose.translation_m.distance(body.translation_m) < 1e-12);
+            assert!(pose.rotation.angle_between(body.rotation) < 1e-7);
+        }
+    }
+}

@@ -19,7 +19,7 @@ mod tests;
 use std::collections::VecDeque;
 
 use serde_json::json;
-use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, FromPlugin, Setpoint};
+use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, FromPlugin, Odometry, Setpoint};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
 
@@ -27,6 +27,7 @@ use crate::companion::{Companion, Senses};
 use crate::flight::{FlightSettings, Views};
 use crate::link::LinkSettings;
 use crate::log::{Channel, GivenImage, VirtualLog, observation_head, sent_message};
+use crate::odometry::OdometryGate;
 use crate::stream::ServerClock;
 
 pub use process::{LineSink, PluginProcess, ProcessError};
@@ -52,6 +53,9 @@ pub struct Lockstep {
     /// Replies on their way to the companion, and when they count.
     replies: VecDeque<(HostTime, Reply)>,
     log: Option<VirtualLog>,
+    odometry_gate: OdometryGate,
+    /// Estimates of the plugin that nobody has taken yet.
+    odometry: Vec<Odometry>,
 }
 
 impl Lockstep {
@@ -69,7 +73,17 @@ impl Lockstep {
         companion.handle_arena(now, Box::new(arena.clone()));
         companion.greet_plugin(now);
         let (senses, replies) = (Senses::default(), VecDeque::new());
-        Self { companion, process, senses, reply_after_ns, replies, log: None }
+        let (odometry_gate, odometry) = (OdometryGate::default(), Vec::new());
+        Self {
+            companion,
+            process,
+            senses,
+            reply_after_ns,
+            replies,
+            log: None,
+            odometry_gate,
+            odometry,
+        }
     }
 
     /// Logs this flight from now on.
@@ -85,6 +99,11 @@ impl Lockstep {
     /// Returns the log, to be finished.
     pub fn take_log(&mut self) -> Option<VirtualLog> {
         self.log.take()
+    }
+
+    /// Returns the estimates that the plugin has published since the last call.
+    pub fn take_odometry(&mut self) -> Vec<Odometry> {
+        std::mem::take(&mut self.odometry)
     }
 
     /// Greets the plugin and waits until it is ready. One that fails ends the flight.
@@ -135,6 +154,9 @@ impl Lockstep {
         self.companion.update_senses(&mut self.senses);
         self.senses.write(&mut writer);
         write(&mut writer);
+        for image in images {
+            self.senses.write_pose_at_image(&mut writer, image.header);
+        }
         if let Some(log) = &mut self.log {
             log.observation(now, seq, observation_head(memory.memory()), images);
         }
@@ -146,6 +168,13 @@ impl Lockstep {
         }
         self.companion.published(now, seq, views);
         let result = process.ask(seq, memory, line);
+        let published = process.take_odometry();
+        for odometry in published.into_iter().filter(|one| self.odometry_gate.takes(now, one)) {
+            if let Some(log) = &mut self.log {
+                log.odometry(now, &odometry);
+            }
+            self.odometry.push(odometry);
+        }
         let reply = self.unless_failed(now, result, line)?.map(|setpoint| Reply { seq, setpoint });
         if let Some(reply) = &reply {
             self.log_reply(now, reply);

@@ -6,7 +6,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use vizflyt_protocol::flight_end::PluginFault;
-use vizflyt_protocol::messages::{FromPlugin, Setpoint, ToPlugin};
+use vizflyt_protocol::messages::{
+    FromPlugin, MAX_ODOMETRY_PER_REPLY, Odometry, Setpoint, ToPlugin,
+};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_sdk::ObservationTooLarge;
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
@@ -51,6 +53,8 @@ pub struct PluginProcess {
     events: Receiver<PluginEvent>,
     /// An answer, or the reading of an event, that takes more of the plugin's own time is a failure.
     within: Duration,
+    /// Estimates that it has published and nobody has taken yet.
+    odometry: Vec<Odometry>,
 }
 
 impl PluginProcess {
@@ -76,7 +80,7 @@ impl PluginProcess {
             let program = command.first().map(|program| program.to_string_lossy().into_owned());
             ProcessError::Start(program.unwrap_or_default(), error)
         })?;
-        Ok(Self { ipc, supervisor, events, within })
+        Ok(Self { ipc, supervisor, events, within, odometry: Vec::new() })
     }
 
     /// Returns the process id.
@@ -106,7 +110,7 @@ impl PluginProcess {
             match self.next(line)? {
                 Some(FromPlugin::Ready { .. }) => return Ok(()),
                 Some(FromPlugin::Failed { reason }) => return Err(failed(reason.as_str())),
-                Some(FromPlugin::Reply { .. }) | None => {
+                Some(FromPlugin::Reply { .. } | FromPlugin::Odometry(_)) | None => {
                     if self.has_taken(&mut time, READY_WITHIN)? {
                         return Err(failed("`on_start` did not return within five minutes"));
                     }
@@ -170,6 +174,11 @@ impl PluginProcess {
                 Some(FromPlugin::Failed { reason }) => {
                     return Err(failed(&format!("the plugin failed: {reason}")));
                 }
+                Some(FromPlugin::Odometry(odometry))
+                    if self.odometry.len() < MAX_ODOMETRY_PER_REPLY =>
+                {
+                    self.odometry.push(odometry);
+                }
                 // Also one that sends anything but the answer.
                 Some(_) | None => {
                     if self.has_taken(&mut time, self.within)? {
@@ -180,6 +189,11 @@ impl PluginProcess {
                 }
             }
         }
+    }
+
+    /// Returns what the plugin has published of where it is, four estimates an observation at most.
+    pub fn take_odometry(&mut self) -> Vec<Odometry> {
+        std::mem::take(&mut self.odometry)
     }
 
     /// Ends the plugin in order.

@@ -124,7 +124,7 @@ fn logged(path: &Path, images: LoggedImages) {
     let mut lockstep = Lockstep::new(at(0), &arena(), settings, Some(process), 10_000_000);
     let file = File::create(path).unwrap();
     let plugin = &"misbehave".into();
-    lockstep.set_log(VirtualLog::new(file, images, plugin, at(0)).unwrap());
+    lockstep.set_log(VirtualLog::new(file, images, plugin, false, at(0)).unwrap());
     lockstep.begin(at(0), &mut { NO_LINES }).unwrap();
     let cameras = [camera()];
     for seq in 1..=20 {

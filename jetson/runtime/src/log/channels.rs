@@ -18,6 +18,12 @@ pub enum Channel {
     Transform,
     /// Localized velocity and the pose's age.
     Motion,
+    /// Where an image was rendered from, at the instant that it shows: foxglove.PoseInFrame.
+    PoseAtImage,
+    /// The autopilot's accelerometer and gyroscope.
+    Imu,
+    /// Where the plugin thinks it is: foxglove.PoseInFrame.
+    Odometry,
     /// What the plugin asked for.
     Requested,
     /// What the guard sent on.
@@ -42,6 +48,10 @@ pub enum Channel {
     Color(u8),
     /// How a camera's images are rendered: foxglove.CameraCalibration.
     Calibration(u8),
+    /// Each instant of a camera's image.
+    Stamps(u8),
+    /// A camera's depth for viewers, if it is wanted: foxglove.RawImage.
+    Depth(u8),
 }
 
 /// How a channel presents itself in a file or to a viewer.
@@ -55,10 +65,13 @@ pub(super) struct Description {
 
 impl Channel {
     /// Those that every log has; cameras come when their first image does.
-    pub(super) const FIXED: [Self; 13] = [
+    pub(super) const FIXED: [Self; 16] = [
         Self::Pose,
         Self::Transform,
         Self::Motion,
+        Self::PoseAtImage,
+        Self::Imu,
+        Self::Odometry,
         Self::Requested,
         Self::Sent,
         Self::Event,
@@ -77,6 +90,9 @@ impl Channel {
             Self::Pose => "/pose".into(),
             Self::Transform => "/tf".into(),
             Self::Motion => "/motion".into(),
+            Self::PoseAtImage => "/pose_at_image".into(),
+            Self::Imu => "/imu".into(),
+            Self::Odometry => "/odometry".into(),
             Self::Requested => "/setpoint/asked".into(),
             Self::Sent => "/setpoint/sent".into(),
             Self::Event => "/event".into(),
@@ -89,6 +105,8 @@ impl Channel {
             Self::Plugin => "/plugin/messages".into(),
             Self::Color(_) => format!("/camera/{camera}/image"),
             Self::Calibration(_) => format!("/camera/{camera}/calibration"),
+            Self::Stamps(_) => format!("/camera/{camera}/stamps"),
+            Self::Depth(_) => format!("/camera/{camera}/depth"),
         }
     }
 
@@ -96,11 +114,12 @@ impl Channel {
     pub(super) fn describe(self, camera: &str) -> Description {
         let topic = self.topic(camera);
         let foxglove = match self {
-            Self::Pose => fox::PoseInFrame::get_schema(),
+            Self::Pose | Self::PoseAtImage | Self::Odometry => fox::PoseInFrame::get_schema(),
             Self::Transform => fox::FrameTransform::get_schema(),
             Self::Event | Self::PluginOutput => fox::Log::get_schema(),
             Self::Color(_) => fox::CompressedImage::get_schema(),
             Self::Calibration(_) => fox::CameraCalibration::get_schema(),
+            Self::Depth(_) => fox::RawImage::get_schema(),
             Self::Observation => Some(messages::schema("Observation")),
             Self::Plugin => Some(messages::schema("PluginMessage")),
             _ => None,
@@ -125,6 +144,15 @@ impl Channel {
                     "omega_body_radps": vector, "position_sigma_m": vector,
                     "rotation_sigma_rad": vector, "age_ms": number});
                 ("vizflyt.Motion", properties)
+            }
+            Self::Imu => {
+                let properties =
+                    json!({"stamp_ns": number, "accel_mps2": vector, "gyro_radps": vector});
+                ("vizflyt.Imu", properties)
+            }
+            Self::Stamps(_) => {
+                let properties = json!({"seq": number, "shown_ns": number, "pose_ns": number, "received_ns": number});
+                ("vizflyt.ImageStamps", properties)
             }
             Self::Requested => ("vizflyt.Setpoint", json!({"seq": number, "setpoint": {}})),
             Self::Sent => {

@@ -48,6 +48,12 @@ pub struct ObservedImage {
     /// The colour is the camera's `/camera/NAME/image` of the same log time.
     #[prost(bool, tag = "6")]
     pub is_color_apart: bool,
+    /// When the newest pose behind it was measured; 0 in logs of form 1. [ns, host]
+    #[prost(uint64, tag = "7")]
+    pub pose_ns: u64,
+    /// The instant that it shows; 0 in logs of form 1. [ns, host]
+    #[prost(uint64, tag = "8")]
+    pub shown_ns: u64,
 }
 
 /// A message between runtime and plugin.
@@ -110,6 +116,8 @@ pub(super) fn schema(name: &str) -> Schema {
                     field("received_ns", 4, Type::Uint64),
                     field("bitstream", 5, Type::Bytes),
                     field("is_color_apart", 6, Type::Bool),
+                    field("pose_ns", 7, Type::Uint64),
+                    field("shown_ns", 8, Type::Uint64),
                 ],
             ),
             message(

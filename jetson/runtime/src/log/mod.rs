@@ -14,7 +14,10 @@
 
 mod budget;
 mod channels;
+pub mod data;
+mod depth;
 mod file;
+mod head;
 #[cfg(feature = "foxglove")]
 mod live;
 #[cfg(not(feature = "foxglove"))]
@@ -41,10 +44,13 @@ use serde_json::json;
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
-use vizflyt_protocol::messages::{Event, EventKind, FromPlugin, PoseSample, ToPlugin, YawTarget};
+use vizflyt_protocol::messages::{
+    Event, EventKind, FromPlugin, Odometry, PoseSample, ToPlugin, YawTarget,
+};
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::ImuSample;
 
 use self::budget::Budget;
 pub use self::channels::Channel;
@@ -89,6 +95,8 @@ pub struct LogSettings {
     pub folder: PathBuf,
     /// Which images are kept.
     pub images: LoggedImages,
+    /// Whether depth is also written so that any viewer shows it.
+    pub depth: bool,
     /// How long logs are kept.
     pub retention: Retention,
 }
@@ -97,7 +105,7 @@ impl LogSettings {
     /// Keeps every image and every log of `folder`.
     pub fn full(folder: impl Into<PathBuf>) -> Self {
         let (images, retention) = (LoggedImages::Full, Retention::FOREVER);
-        Self { folder: folder.into(), images, retention }
+        Self { folder: folder.into(), images, depth: false, retention }
     }
 }
 
@@ -113,7 +121,7 @@ impl FlightLog {
     /// Opens a log, named by the time of day (UTC), shows it to `live`'s viewers, and deletes logs
     /// that are no longer to be kept. If it cannot be written, logs a warning and writes nothing.
     pub fn open(settings: &LogSettings, live: Option<Live>) -> Self {
-        let LogSettings { folder, images, retention } = settings;
+        let LogSettings { folder, images, depth, retention } = settings;
         let now = SystemTime::now();
         let path = folder.join(format!("{}.mcap", utc_name(now)));
         let file = create_dir_all(folder).and_then(|()| File::create(&path));
@@ -130,7 +138,7 @@ impl FlightLog {
         }
         let path = disk.is_ok().then(|| path.clone());
         let (probe, disk) = disk.ok().unzip();
-        match Self::start(disk, probe, live, *images) {
+        match Self::start(disk, probe, live, *images, *depth) {
             Ok((queue, writer)) => {
                 // Nothing to delete from a folder that cannot be listed.
                 let deleted = retention::delete_old(folder, *retention, now).unwrap_or_default();
@@ -149,12 +157,16 @@ impl FlightLog {
         probe: Option<File>,
         live: Option<Live>,
         images: LoggedImages,
+        depth: bool,
     ) -> mcap::McapResult<(Arc<Queue>, JoinHandle<()>)> {
         let budget = (images == LoggedImages::Reduced).then(Budget::default);
         let sinks = LogSinks::new(disk, live, budget)?;
         let (queue, records) = Queue::new();
         let free_bytes = move || probe.as_ref().and_then(file::free_bytes);
-        let writer = LogWriter::new(sinks, Arc::clone(&queue), Box::new(free_bytes));
+        let mut writer = LogWriter::new(sinks, Arc::clone(&queue), Box::new(free_bytes));
+        if depth {
+            writer.show_depth();
+        }
         let handle =
             thread::Builder::new().name("flight-log".into()).spawn(move || writer.run(&records))?;
         Ok((queue, handle))
@@ -192,6 +204,17 @@ impl FlightLog {
     pub fn pose(&self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         let Some(queue) = &self.queue else { return };
         queue.push(Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs the plugin's own estimate, which came at `at`.
+    pub fn odometry(&self, at: HostTime, odometry: &Odometry) {
+        let Some(queue) = &self.queue else { return };
+        queue.push(Record::Odometry { at, odometry: *odometry });
+    }
+
+    /// Logs a reading of the IMU.
+    pub fn imu(&self, sample: &ImuSample) {
+        self.write(Channel::Imu, sample.stamp, &imu_message(sample));
     }
 
     /// Logs an event.
@@ -263,12 +286,27 @@ impl ImageLog {
     }
 }
 
+/// The key of a flight's metadata that says how its log is written, and what is written now. 1, or none: `timestamp` of
+/// an image is when the newest pose behind it was measured. 2: it is the instant that the image shows; `/imu`,
+/// `/pose_at_image` and `/camera/NAME/stamps` are there.
+pub const LOG_FORM: (&str, u32) = ("log_form", 2);
+
+/// Returns what the log says of a reading of the IMU.
+fn imu_message(sample: &ImuSample) -> serde_json::Value {
+    json!({
+        "stamp_ns": sample.stamp.as_ns(),
+        "accel_mps2": sample.accel_mps2.to_array(),
+        "gyro_radps": sample.gyro_radps.to_array()
+    })
+}
+
 /// Returns the record of which flight this is.
 fn flight_record(plugin: &OsString, arguments: &[OsString]) -> Record {
     let arguments: Vec<_> = arguments.iter().map(|text| text.to_string_lossy()).collect();
     Record::Flight(vec![
         ("program", concat!("vizflyt ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("protocol", PROTOCOL_VERSION.to_string()),
+        (LOG_FORM.0, LOG_FORM.1.to_string()),
         ("plugin", plugin.to_string_lossy().into_owned()),
         ("arguments", json!(arguments).to_string()),
     ])

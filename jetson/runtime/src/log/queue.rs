@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::messages::{Odometry, PoseSample};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 
@@ -24,6 +24,8 @@ pub(super) enum Record {
     Json { channel: Channel, at: HostTime, json: Vec<u8> },
     /// The vehicle was localized.
     Pose { at: HostTime, stamp: HostTime, sample: PoseSample },
+    /// The plugin's own estimate.
+    Odometry { at: HostTime, odometry: Odometry },
     /// A line for people.
     Text { channel: Channel, at: HostTime, level: Level, name: String, text: String },
     /// A message to or from the plugin.
@@ -69,12 +71,25 @@ pub struct LoggedImage {
     pub name: String,
     /// What came before the bitstream.
     pub header: ImageHeader,
-    /// When the pose that it shows was measured. [host]
+    /// When the newest pose behind it was measured. [host]
     pub pose: HostTime,
     /// When its last byte had come. [host]
     pub received: HostTime,
     /// The bitstream's header and slices.
     pub pieces: Vec<Vec<u8>>,
+}
+
+impl LoggedImage {
+    /// Returns the instant that the image shows. [host]
+    pub(super) fn shown(&self) -> HostTime {
+        shown(&self.header, self.pose)
+    }
+}
+
+/// Returns the instant that an image shows, the newest pose behind which was measured at `pose`. [host]
+pub(super) fn shown(header: &ImageHeader, pose: HostTime) -> HostTime {
+    let ahead_ns = header.exposure_ns.get().wrapping_sub(header.pose_ns.get());
+    pose.plus_ns(ahead_ns.cast_signed())
 }
 
 /// What was dropped so far.

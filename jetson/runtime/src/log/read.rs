@@ -320,8 +320,8 @@ impl<R: Read> RecordedPoses<R> {
             if *message.topic != *self.topic {
                 continue;
             }
-            if let Some(world_from_body) = pose_of(&message) {
-                return Ok(Some(RecordedPose { at_ns: message.log_time_ns, world_from_body }));
+            if let Some((at_ns, world_from_body)) = pose_of(&message) {
+                return Ok(Some(RecordedPose { at_ns, world_from_body }));
             }
         }
         Ok(None)
@@ -350,7 +350,7 @@ impl RecordedTrack {
         while let Some(entry) = reader.next()? {
             let Entry::Message(message) = entry else { continue };
             if *message.topic == *of_poses {
-                poses.extend(pose_of(&message).map(|pose| (message.log_time_ns, pose)));
+                poses.extend(pose_of(&message));
             } else if *message.topic == *of_plugin
                 && let Ok(plugin) = PluginMessage::decode(&*message.data)
                 && plugin.is_to_plugin
@@ -369,12 +369,17 @@ impl RecordedTrack {
     }
 }
 
-/// Returns the pose of a message of the channel of poses.
-fn pose_of(message: &LogMessage) -> Option<Pose<World, Body>> {
+/// Returns the pose of a message of a channel of poses, and the instant that it is of. [ns, since 1970]
+pub(super) fn pose_of(message: &LogMessage) -> Option<(u64, Pose<World, Body>)> {
     let logged = PoseInFrame::decode(&*message.data).ok()?;
+    let stamp = logged.timestamp.as_ref();
+    let at_ns = stamp.map_or(message.log_time_ns, |at| {
+        u64::from(at.sec()) * 1_000_000_000 + u64::from(at.nsec())
+    });
     let (p, q) = logged.pose.and_then(|pose| pose.position.zip(pose.orientation))?;
     let rotation = DQuat::from_xyzw(q.x, q.y, q.z, q.w);
-    Some(Pose::new(DVec3::new(p.x, p.y, p.z), rotation)).filter(Pose::is_valid)
+    let pose = Some(Pose::new(DVec3::new(p.x, p.y, p.z), rotation)).filter(Pose::is_valid)?;
+    Some((at_ns, pose))
 }
 
 /// What replay needs of a log.
@@ -388,6 +393,14 @@ pub enum Recorded {
     Observation(Observation),
     /// An observation that the log has only in part; its number.
     Broken(u64),
+}
+
+/// The next thing of a log.
+pub(super) enum Next {
+    /// What replay needs.
+    Recorded(Recorded),
+    /// Another message; none of a camera's channels.
+    Other(LogMessage),
 }
 
 /// Reads from a log what replay needs.
@@ -418,20 +431,37 @@ impl<R: Read> RecordedFlight<R> {
     /// As [`LogReader::next`].
     #[allow(clippy::should_implement_trait)] // Why: as `LogReader::next`.
     pub fn next(&mut self) -> Result<Option<Recorded>, LogError> {
+        while let Some((_, next)) = self.next_of_all()? {
+            if let Next::Recorded(recorded) = next {
+                return Ok(Some(recorded));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns the next thing, wanted by replay or not, and when it was logged; `None` at the end. [ns, since 1970]
+    pub(super) fn next_of_all(&mut self) -> Result<Option<(u64, Next)>, LogError> {
         while let Some(entry) = self.reader.next()? {
             let message = match entry {
-                Entry::Flight(values) => return Ok(Some(Recorded::Flight(values))),
+                Entry::Flight(values) => {
+                    return Ok(Some((0, Next::Recorded(Recorded::Flight(values)))));
+                }
                 Entry::Message(message) => message,
             };
+            let at_ns = message.log_time_ns;
             let [observation, plugin] = &self.topics;
             if *message.topic == **observation {
-                return Ok(Some(self.observation(&message)));
+                return Ok(Some((at_ns, Next::Recorded(self.observation(&message)))));
             } else if *message.topic == **plugin {
                 if let Ok(decoded) = PluginMessage::decode(&*message.data) {
-                    return Ok(Some(Recorded::Plugin(decoded)));
+                    return Ok(Some((at_ns, Next::Recorded(Recorded::Plugin(decoded)))));
                 }
-            } else if self.with_images && is_color(&message.topic) {
-                self.colors.insert(message.topic, (message.log_time_ns, message.data));
+            } else if is_color(&message.topic) {
+                if self.with_images {
+                    self.colors.insert(message.topic, (at_ns, message.data));
+                }
+            } else {
+                return Ok(Some((at_ns, Next::Other(message))));
             }
         }
         Ok(None)

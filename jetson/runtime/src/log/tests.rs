@@ -6,8 +6,9 @@ use std::io::{self, Cursor, ErrorKind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, UNIX_EPOCH};
 
+use glam::{DQuat, DVec3};
 use proptest::prelude::*;
-use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World, body_from_forward_cam};
 use vizflyt_protocol::messages::{Arrivals, Setpoint, Timing, bounded};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::ServerTime;
@@ -15,7 +16,9 @@ use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, peek, slice_len}
 use vizflyt_sdk::host_now;
 
 use super::file::{Disk, SafeFile};
-use super::read::{Entry, LogMessage, LogReader, Recorded, RecordedFlight};
+use super::read::{
+    Entry, LogMessage, LogReader, Recorded, RecordedFlight, RecordedPose, RecordedPoses,
+};
 use super::*;
 
 fn messages(path: &Path) -> (Vec<LogMessage>, bool) {
@@ -142,6 +145,126 @@ fn images_are_logged_as_they_came_and_their_memory_goes_back() {
     assert_eq!(calibrations, 1, "once while it stays the same");
     let spares: Vec<Vec<u8>> = std::iter::from_fn(|| home.spare()).collect();
     assert_eq!(spares.len(), 4 * image(1, ColorMode::Jpeg444).pieces.len());
+}
+
+/// Where a vehicle is that flies a curve at some 1.5 m/s. [ns]
+fn on_the_curve(at_ns: u64) -> Pose<World, Body> {
+    let turn = 1.2 * at_ns as f64 * 1e-9;
+    let place = DVec3::new(1.25 * turn.cos(), 1.25 * turn.sin(), 1.0);
+    Pose::new(place, DQuat::from_rotation_z(turn))
+}
+
+/// By how much later an image's instant is than the newest pose behind it. [ns]
+const AHEAD_NS: u64 = 48_000_000;
+
+/// An image on the curve whose newest pose was measured at `pose_ns`, and what is known of it. [ns]
+fn image_on_the_curve(seq: u64, pose_ns: u64) -> LoggedImage {
+    let mut image = image(seq, ColorMode::Jpeg444);
+    let k = Intrinsics::from_horizontal_fov(64, 96, 1.5);
+    let mount = body_from_forward_cam(DVec3::new(0.1, 0.0, 0.02), 0.2);
+    let world_from_body = on_the_curve(pose_ns + AHEAD_NS);
+    image.header =
+        ImageHeader::new(seq, 0, ServerTime::from_ns(pose_ns), &k, &mount, &world_from_body);
+    image.header.exposure_ns = (pose_ns + AHEAD_NS).into();
+    image.pose = HostTime::from_ns(pose_ns);
+    image.received = HostTime::from_ns(pose_ns + 40_000_000);
+    image
+}
+
+/// Checks that each image of a log stands at the instant that it shows, by its clock's zero. [ns]
+fn check_instants(path: &Path, expected: usize) {
+    let (found, _) = messages(path);
+    let of =
+        |topic: &str| found.iter().filter(|message| &*message.topic == topic).collect::<Vec<_>>();
+    let stamped = |message: &LogMessage, at: Option<foxglove::messages::Timestamp>| {
+        let at = at.unwrap();
+        assert!(message.log_time_ns > 0);
+        u64::from(at.sec()) * 1_000_000_000 + u64::from(at.nsec())
+    };
+    let mut poses = RecordedPoses::new(LogReader::open(path).unwrap());
+    let poses: Vec<RecordedPose> = std::iter::from_fn(|| poses.next().unwrap()).collect();
+    let mut shown = RecordedPoses::of_topic(LogReader::open(path).unwrap(), "/pose_at_image");
+    let images = of("/camera/front/image");
+    assert_eq!(images.len(), expected);
+    let stamps = of("/camera/front/stamps");
+    for (image, stamps) in images.iter().zip(stamps) {
+        let color =
+            <foxglove::messages::CompressedImage as prost::Message>::decode(&*image.data).unwrap();
+        let at_ns = stamped(image, color.timestamp);
+        // Where the vehicle truly was then, by the poses of the flight.
+        let next = poses.partition_point(|pose| pose.at_ns < at_ns);
+        let (a, b) = (&poses[next - 1], &poses[next]);
+        let share = (at_ns - a.at_ns) as f64 / (b.at_ns - a.at_ns) as f64;
+        let truth = a.world_from_body.interpolate(&b.world_from_body, share);
+        let at_image = shown.next().unwrap().unwrap();
+        assert_eq!(at_image.at_ns, at_ns);
+        let off_m = truth.translation_m.distance(at_image.world_from_body.translation_m);
+        assert!(off_m < 1e-4, "{:.1} mm from where it was rendered", 1e3 * off_m);
+        assert!(truth.rotation.angle_between(at_image.world_from_body.rotation) < 1e-4);
+        // It came before the instant that it shows, and its pose was measured before that.
+        let stamps: serde_json::Value = serde_json::from_slice(&stamps.data).unwrap();
+        let ns = |key: &str| stamps[key].as_u64().unwrap();
+        assert_eq!((ns("shown_ns"), ns("pose_ns")), (at_ns, at_ns - AHEAD_NS));
+        assert_eq!(ns("received_ns"), at_ns - AHEAD_NS + 40_000_000);
+    }
+}
+
+#[test]
+fn an_image_is_stamped_with_the_instant_that_it_shows() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = FlightLog::open(&LogSettings::full(folder.path()), None);
+    let path = log.path().unwrap().to_owned();
+    let images = log.images(&Arc::default()).unwrap();
+    let start_ns = host_now().as_ns();
+    for n in 0..60 {
+        let at_ns = start_ns + n * 10_000_000;
+        let sample = PoseSample::still(ServerTime::from_ns(at_ns), on_the_curve(at_ns));
+        log.pose(HostTime::from_ns(at_ns), HostTime::from_ns(at_ns), &sample);
+        if n % 4 == 1 && n < 50 {
+            let image = image_on_the_curve(n, at_ns);
+            images.observation(image.received, n, vec![0; 8], vec![image]);
+        }
+    }
+    drop((log, images));
+    check_instants(&path, 13);
+}
+
+#[test]
+fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("virtual.mcap");
+    let file = File::create(&path).unwrap();
+    let start_ns = 10_000_000_000;
+    let now = HostTime::from_ns(start_ns);
+    let mut log = VirtualLog::new(file, LoggedImages::Full, &"x".into(), true, now).unwrap();
+    let depth_mm: Vec<u16> = (0..64 * 96).map(|n| n * 7).collect();
+    for n in 0..60 {
+        let at_ns = start_ns + n * 10_000_000;
+        let at = HostTime::from_ns(at_ns);
+        let sample = PoseSample::still(ServerTime::from_ns(at_ns), on_the_curve(at_ns));
+        log.pose(at, at, &sample);
+        log.imu(&ImuSample { stamp: at, accel_mps2: DVec3::Z * 9.8, gyro_radps: DVec3::X });
+        if n % 4 == 1 && n < 50 {
+            let LoggedImage { header, pose, received, .. } = image_on_the_curve(n, at_ns);
+            let rgb = vec![n as u8; 64 * 96 * 3];
+            let (header, name) = (&header, "front");
+            let image = GivenImage { header, name, pose, rgb: &rgb, depth_mm: &depth_mm };
+            log.observation(received, n, &[0; 8], &[image]);
+        }
+    }
+    log.finish().unwrap();
+    check_instants(&path, 13);
+    let (found, _) = messages(&path);
+    let depth = found.iter().find(|message| &*message.topic == "/camera/front/depth").unwrap();
+    let depth = <foxglove::messages::RawImage as prost::Message>::decode(&*depth.data).unwrap();
+    assert_eq!((depth.width, depth.height, depth.step), (64, 96, 128));
+    assert_eq!(depth.encoding, "16UC1");
+    let bytes: Vec<u8> = depth_mm.iter().flat_map(|mm| mm.to_le_bytes()).collect();
+    assert!(depth.data == bytes, "millimetres, row by row");
+    let imu = found.iter().filter(|message| &*message.topic == "/imu").nth(1).unwrap();
+    assert_eq!(imu.log_time_ns, start_ns + 10_000_000);
+    let imu: serde_json::Value = serde_json::from_slice(&imu.data).unwrap();
+    assert_eq!(imu["accel_mps2"], json!([0.0, 0.0, 9.8]));
 }
 
 #[test]

@@ -14,16 +14,19 @@ use foxglove::messages as fox;
 use mcap::McapResult;
 use prost::Message;
 use serde::Serialize;
-use vizflyt_protocol::messages::{Event, FromPlugin, PoseSample, ToPlugin};
+use vizflyt_protocol::messages::{Event, FromPlugin, Odometry, PoseSample, ToPlugin};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, encode_jpeg};
+use vizflyt_sdk::ImuSample;
 
 use super::budget::Budget;
 use super::file::{self, Disk};
-use super::queue::{LoggedImage, Queue, Record};
+use super::queue::{LoggedImage, Queue, Record, shown};
 use super::writer::{LogSinks, LogWriter, timestamp};
-use super::{Channel, LoggedImages, event_record, flight_record, line_record, plugin_record};
+use super::{
+    Channel, LoggedImages, event_record, flight_record, imu_message, line_record, plugin_record,
+};
 
 /// A chunk is closed this often. [s]
 const CHUNK_PERIOD_S: f64 = 1.0;
@@ -37,7 +40,7 @@ pub struct GivenImage<'a> {
     pub header: &'a ImageHeader,
     /// The camera's name.
     pub name: &'a str,
-    /// When the pose that it shows was measured. [host]
+    /// When the newest pose behind it was measured. [host]
     pub pose: HostTime,
     /// H x W x 3.
     pub rgb: &'a [u8],
@@ -55,7 +58,7 @@ pub struct VirtualLog {
 }
 
 impl VirtualLog {
-    /// Begins the log of a flight by `plugin` at `now` in `file`, which is empty.
+    /// Begins the log of a flight by `plugin` at `now` in `file`, which is empty; with `depth` for viewers.
     ///
     /// # Errors
     /// If the file cannot be written.
@@ -63,6 +66,7 @@ impl VirtualLog {
         file: File,
         images: LoggedImages,
         plugin: &OsString,
+        depth: bool,
         now: HostTime,
     ) -> McapResult<Self> {
         let budget = (images == LoggedImages::Reduced).then(Budget::default);
@@ -70,7 +74,10 @@ impl VirtualLog {
         let sinks = LogSinks::new(Some(PlainFile(file)), None, budget)?;
         let (queue, _) = Queue::of(0);
         let free_bytes = Box::new(move || file::free_bytes(&probe));
-        let writer = LogWriter::since(0, sinks, Arc::clone(&queue), free_bytes);
+        let mut writer = LogWriter::since(0, sinks, Arc::clone(&queue), free_bytes);
+        if depth {
+            writer.show_depth();
+        }
         let options = EncodeOptions { color_mode: ColorMode::Lossless, ..EncodeOptions::default() };
         let encoder = Encoder::new(options);
         let mut log = Self { writer, closed_at: now, encoder, failed: None };
@@ -88,6 +95,16 @@ impl VirtualLog {
     /// Logs a pose that came at `at` and was true at `stamp`.
     pub fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         self.take(at, Record::Pose { at, stamp, sample: *sample });
+    }
+
+    /// Logs the plugin's own estimate, which came at `at`.
+    pub fn odometry(&mut self, at: HostTime, odometry: &Odometry) {
+        self.take(at, Record::Odometry { at, odometry: *odometry });
+    }
+
+    /// Logs a reading of the IMU.
+    pub fn imu(&mut self, sample: &ImuSample) {
+        self.write(Channel::Imu, sample.stamp, &imu_message(sample));
     }
 
     /// Logs an event.
@@ -158,7 +175,7 @@ impl VirtualLog {
         let mut jpeg = Vec::new();
         encode_jpeg(image.rgb, width, height, QUALITY, &mut jpeg).map_err(io::Error::other)?;
         let color = fox::CompressedImage {
-            timestamp: Some(timestamp(image.pose.as_ns())),
+            timestamp: Some(timestamp(shown(image.header, image.pose).as_ns())),
             frame_id: image.name.to_owned(),
             data: jpeg.into(),
             format: "jpeg".into(),

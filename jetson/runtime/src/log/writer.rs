@@ -24,6 +24,7 @@ use zerocopy::IntoBytes;
 
 use super::budget::Budget;
 use super::channels::Channel;
+use super::depth::DepthReader;
 use super::file::{Disk, SafeFile};
 use super::live::Live;
 use super::messages::{Observation, ObservedImage, PluginMessage};
@@ -191,6 +192,8 @@ pub(super) struct LogWriter<D: Disk> {
     reported: Dropped,
     calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
     rest: Vec<u8>,
+    /// Decodes depth for viewers, if that is wanted.
+    depth: Option<DepthReader>,
 }
 
 impl<D: Disk> LogWriter<D> {
@@ -223,7 +226,13 @@ impl<D: Disk> LogWriter<D> {
             reported: Dropped::default(),
             calibrations: BTreeMap::new(),
             rest: Vec::new(),
+            depth: None,
         }
+    }
+
+    /// Writes depth so that any viewer shows it, from now on.
+    pub(super) fn show_depth(&mut self) {
+        self.depth = Some(DepthReader::default());
     }
 
     /// Writes until the flight is over. A disk that refuses ends the file, not this: viewers go on,
@@ -324,6 +333,11 @@ impl<D: Disk> LogWriter<D> {
                 self.sinks.put(channel, "", self.wall_ns(at), &json)
             }
             Record::Pose { at, stamp, sample } => self.pose(at, stamp, &sample),
+            Record::Odometry { at, odometry } => {
+                let stamp_ns = self.wall_ns(odometry.stamp);
+                let pose = pose_in_frame(stamp_ns, ODOM, &odometry.odom_from_body);
+                self.sinks.put(Channel::Odometry, "", self.wall_ns(at), &pose.encode_to_vec())
+            }
             Record::Text { channel, at, level, name, text } => {
                 let at_ns = self.wall_ns(at);
                 let log = fox::Log {
@@ -360,12 +374,7 @@ impl<D: Disk> LogWriter<D> {
     fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) -> McapResult<()> {
         let at_ns = self.wall_ns(stamp);
         let (world_from_body, twist) = (&sample.world_from_body, &sample.twist);
-        let (position, orientation) = parts(world_from_body);
-        let pose = fox::PoseInFrame {
-            timestamp: Some(timestamp(at_ns)),
-            frame_id: WORLD.into(),
-            pose: Some(fox::Pose { position: Some(position), orientation: Some(orientation) }),
-        };
+        let pose = pose_in_frame(at_ns, WORLD, world_from_body);
         self.sinks.put(Channel::Pose, "", at_ns, &pose.encode_to_vec())?;
         let transform = transform(at_ns, WORLD, BODY, world_from_body);
         self.sinks.put(Channel::Transform, "", at_ns, &transform.encode_to_vec())?;
@@ -406,6 +415,7 @@ impl<D: Disk> LogWriter<D> {
         let at_ns = self.wall_ns(at);
         let mut images = Vec::new();
         if is_kept {
+            self.poses_at_images(at_ns, logged)?;
             for image in logged {
                 images.push(self.image(at_ns, image)?);
             }
@@ -416,6 +426,21 @@ impl<D: Disk> LogWriter<D> {
         let protocol = PROTOCOL_VERSION.into();
         let observation = Observation { seq, protocol, published_ns: at.as_ns(), head, images };
         self.sinks.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
+    }
+
+    /// Writes where images were rendered from, once for all of the same instant.
+    fn poses_at_images(&mut self, at_ns: u64, images: &[LoggedImage]) -> McapResult<()> {
+        let mut before = None;
+        for image in images {
+            let shown_ns = self.wall_ns(image.shown());
+            if before.replace(shown_ns) == Some(shown_ns) {
+                continue;
+            }
+            let world_from_body = image.header.world_from_body();
+            let pose = pose_in_frame(shown_ns, WORLD, &world_from_body);
+            self.sinks.put(Channel::PoseAtImage, "", at_ns, &pose.encode_to_vec())?;
+        }
+        Ok(())
     }
 
     /// Shows images that are not written to viewers.
@@ -436,6 +461,8 @@ impl<D: Disk> LogWriter<D> {
     /// Writes an image's colour and calibration; returns what is left of it.
     fn image(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<ObservedImage> {
         self.calibration(at_ns, image)?;
+        self.stamps(at_ns, image)?;
+        self.depth(at_ns, image)?;
         let color = self.color(image);
         let is_color_apart = color.is_some();
         let bitstream = match color {
@@ -453,7 +480,40 @@ impl<D: Disk> LogWriter<D> {
             received_ns: image.received.as_ns(),
             bitstream,
             is_color_apart,
+            pose_ns: image.pose.as_ns(),
+            shown_ns: image.shown().as_ns(),
         })
+    }
+
+    /// Writes each instant of an image.
+    fn stamps(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
+        let stamps = json!({
+            "seq": image.header.seq.get(),
+            "shown_ns": self.wall_ns(image.shown()),
+            "pose_ns": self.wall_ns(image.pose),
+            "received_ns": self.wall_ns(image.received)
+        });
+        let channel = Channel::Stamps(image.camera as u8);
+        self.sinks.put(channel, &image.name, at_ns, stamps.to_string().as_bytes())
+    }
+
+    /// Writes an image's depth for viewers, if that is wanted; one that does not decode is left out.
+    fn depth(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
+        let shown_ns = self.wall_ns(image.shown());
+        let Some(reader) = &mut self.depth else { return Ok(()) };
+        let Some(depth_mm) = reader.read(&image.pieces) else { return Ok(()) };
+        let (width, height) = (image.header.width_px.get(), image.header.height_px.get());
+        let raw = fox::RawImage {
+            timestamp: Some(timestamp(shown_ns)),
+            frame_id: image.name.clone(),
+            width,
+            height,
+            encoding: "16UC1".into(),
+            step: 2 * width,
+            data: depth_mm.iter().flat_map(|mm| mm.to_le_bytes()).collect::<Vec<u8>>().into(),
+        };
+        let channel = Channel::Depth(image.camera as u8);
+        self.sinks.put(channel, &image.name, at_ns, &raw.encode_to_vec())
     }
 
     /// Returns an image's colour as viewers open it, and leaves what else it holds in `rest`; `None`
@@ -466,7 +526,7 @@ impl<D: Disk> LogWriter<D> {
             return None;
         }
         let color = fox::CompressedImage {
-            timestamp: Some(timestamp(self.wall_ns(image.pose))),
+            timestamp: Some(timestamp(self.wall_ns(image.shown()))),
             frame_id: image.name.clone(),
             data: jpeg.into(),
             format: "jpeg".into(),
@@ -498,6 +558,7 @@ impl<D: Disk> LogWriter<D> {
 
 const WORLD: &str = "world";
 const BODY: &str = "body";
+const ODOM: &str = "odom";
 
 /// Whether images are to be logged with so much room on the disk.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
@@ -513,6 +574,15 @@ pub(super) fn timestamp(at_ns: u64) -> fox::Timestamp {
 fn parts<A, B>(pose: &Pose<A, B>) -> (fox::Vector3, fox::Quaternion) {
     let (p, q) = (pose.translation_m, pose.rotation);
     (fox::Vector3 { x: p.x, y: p.y, z: p.z }, fox::Quaternion { x: q.x, y: q.y, z: q.z, w: q.w })
+}
+
+fn pose_in_frame<A, B>(at_ns: u64, frame: &str, pose: &Pose<A, B>) -> fox::PoseInFrame {
+    let (position, orientation) = parts(pose);
+    fox::PoseInFrame {
+        timestamp: Some(timestamp(at_ns)),
+        frame_id: frame.into(),
+        pose: Some(fox::Pose { position: Some(position), orientation: Some(orientation) }),
+    }
 }
 
 fn transform<A, B>(

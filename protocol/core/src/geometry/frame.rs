@@ -26,6 +26,8 @@ frames! {
     Cam = "cam";
     /// A splat scene as trained, before `world_from_scene` is baked in.
     Scene = "scene";
+    /// Where a plugin's own estimate begins: z up, origin and heading as it likes.
+    Odom = "odom";
     /// A rigid part of a scene that moves: a door, a clock's hand, another vehicle.
     Object = "object";
 }

@@ -32,7 +32,7 @@ mod trajectory;
 pub use event::{Event, EventKind};
 pub use kinds::{SetpointKind, SetpointKinds};
 pub use pairing::{Grant, MAX_GRANTED, PairingProof, PairingReply, PairingRequest, PairingShare};
-pub use plugin::{FromPlugin, ToPlugin};
+pub use plugin::{FromPlugin, MAX_ODOMETRY_PER_REPLY, Odometry, ToPlugin};
 pub use session::{
     ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, Hello, ImuReading, Limits,
     MAX_ALLOWANCE_S, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ReceivedEvents, ToRuntime,

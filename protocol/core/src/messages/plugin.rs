@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{ArenaInfo, Event, Setpoint, Text};
+use crate::geometry::{Body, Odom, Pose};
 use crate::time::HostTime;
 
 /// Runtime to plugin. Ordered, never lost.
@@ -42,4 +43,30 @@ pub enum FromPlugin {
         /// One sentence.
         reason: Text,
     },
+    /// Where the plugin thinks it is. It is logged and evaluated; nothing is flown by it.
+    Odometry(Odometry),
+}
+
+/// A pose that a plugin has estimated by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Odometry {
+    /// The instant that it is of: of an estimate from an image, the one that the image shows.
+    pub stamp: HostTime,
+    /// Where the vehicle was. z of the frame is up; origin and heading are the plugin's choice.
+    pub odom_from_body: Pose<Odom, Body>,
+}
+
+/// Estimates that a plugin may publish with one reply: of each of a few cameras, say.
+pub const MAX_ODOMETRY_PER_REPLY: usize = 4;
+
+impl Odometry {
+    /// No estimate is farther from its origin. [m]
+    pub const FARTHEST_M: f64 = 1e5;
+
+    /// Whether every number is finite, the quaternion of unit length within 1e-3, and the place within
+    /// [`Self::FARTHEST_M`].
+    pub fn is_valid(&self) -> bool {
+        let pose = &self.odom_from_body;
+        pose.is_valid() && pose.translation_m.abs().max_element() <= Self::FARTHEST_M
+    }
 }

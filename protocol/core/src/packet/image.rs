@@ -83,6 +83,8 @@ impl ImageHeader {
     /// Bytes on the wire.
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZIM";
+    /// The first protocol version whose images had this layout.
+    const SINCE: u16 = 6;
 
     /// Makes a header of an image that shows the instant of its pose, with all other stamps zero.
     pub fn new(
@@ -120,9 +122,16 @@ impl ImageHeader {
 
     /// Reads and validates a header at the start of `bytes`; returns it with what follows.
     pub fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), InvalidImageHeader> {
+        Self::parse_logged(bytes, PROTOCOL_VERSION.into())
+    }
+
+    /// As [`Self::parse`], of a header that a log of another protocol version holds: the layout has been the same since
+    /// version 6.
+    pub fn parse_logged(bytes: &[u8], protocol: u32) -> Result<(Self, &[u8]), InvalidImageHeader> {
         let (header, rest) =
             Self::read_from_prefix(bytes).map_err(|_| InvalidImageHeader::Short(bytes.len()))?;
-        if header.magic != Self::MAGIC || header.version.get() != PROTOCOL_VERSION {
+        let is_known = (Self::SINCE.into()..=PROTOCOL_VERSION.into()).contains(&protocol);
+        if header.magic != Self::MAGIC || !is_known || u32::from(header.version.get()) != protocol {
             return Err(InvalidImageHeader::Foreign);
         }
         if Distortion::from_wire(header.distortion_model, [0.0; 5]).is_none() {
@@ -173,6 +182,11 @@ impl ImageHeader {
             DVec3::from_array(self.mount_m.map(F64::get)),
             DQuat::from_array(self.mount_xyzw.map(F64::get)),
         )
+    }
+
+    /// Returns where the body was at the instant that the image shows.
+    pub fn world_from_body(&self) -> Pose<World, Body> {
+        self.world_from_cam() * self.body_from_cam().inverse()
     }
 
     /// Returns the instant that the image shows.

@@ -46,6 +46,10 @@ pub struct CameraHeader {
     pub distortion_model: u32,
     /// By how much later than `pose_ns` the instant is that the image shows. [ns]
     pub ahead_ns: i32,
+    /// Where the body was at that instant; zero where the course withholds it. [m, world]
+    pub body_position_m: [f64; 3],
+    /// Body to world rotation at that instant, xyzw; zero where the course withholds it.
+    pub body_rotation_xyzw: [f64; 4],
 }
 
 /// Most IMU samples in one observation: 0.6 s at 100 Hz, so that a plugin that skips images for as
@@ -102,9 +106,9 @@ pub struct ObservationHeader {
 }
 
 // The layout is a contract with other languages and processes.
-const _: () = assert!(size_of::<CameraHeader>() == 176);
+const _: () = assert!(size_of::<CameraHeader>() == 232);
 const _: () = assert!(size_of::<ImuRecord>() == 32);
-const _: () = assert!(size_of::<ObservationHeader>() == 152 + 32 * MAX_IMU + 176 * MAX_CAMERAS);
+const _: () = assert!(size_of::<ObservationHeader>() == 152 + 32 * MAX_IMU + 232 * MAX_CAMERAS);
 
 /// Where the planes of a set of images lie.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -251,6 +255,18 @@ impl CameraHeader {
             cy_px,
             distortion: Distortion::from_wire(model, self.distortion).unwrap_or_default(),
         }
+    }
+
+    /// Returns where the body was at the instant that the image shows, if the course lets the plugin know it.
+    pub fn pose_at_image(&self) -> Option<Pose<World, Body>> {
+        let rotation = DQuat::from_array(self.body_rotation_xyzw);
+        Some(Pose::new(DVec3::from(self.body_position_m), rotation)).filter(Pose::is_valid)
+    }
+
+    /// Writes it.
+    pub fn set_pose_at_image(&mut self, world_from_body: &Pose<World, Body>) {
+        self.body_position_m = world_from_body.translation_m.to_array();
+        self.body_rotation_xyzw = world_from_body.rotation.to_array();
     }
 
     /// Returns the camera's extrinsics.

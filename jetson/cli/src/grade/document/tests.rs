@@ -34,6 +34,7 @@ pub(crate) fn run(seed: u64, outcome: OutcomeKind) -> Run {
         max_speed_mps: 2.9,
         path_m: 21.7,
         images: 300,
+        odometry: None,
         scene_sha256: "33".repeat(32),
         rules_sha256: "44".repeat(32),
         hash: "55".repeat(32),

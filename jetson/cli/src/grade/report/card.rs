@@ -162,10 +162,11 @@ fn head(run: &Run) -> String {
         0 => String::new(),
         stages => format!(", {} of {stages} stages", run.stages_passed),
     };
+    let odometry = run.odometry.map_or(String::new(), |odometry| format!("; {}", odometry.text()));
     format!(
         "<section class=\"card\" id=\"{variant}-{seed}\"><h3>Seed {seed}, {variant}: \
          <span class=\"outcome {outcome}\">{}</span></h3>{cause}\
-         <p class=\"faint\">{}; {:.1} s after take-off{stages}</p>",
+         <p class=\"faint\">{}; {:.1} s after take-off{stages}{odometry}</p>",
         outcome.name().replace('_', " "),
         escape(&run.reason),
         run.seconds

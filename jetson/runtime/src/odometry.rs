@@ -1,0 +1,65 @@
+//! What a plugin publishes of where it is: checked, then logged. Nothing is flown by it.
+
+use vizflyt_protocol::messages::Odometry;
+use vizflyt_protocol::time::HostTime;
+
+/// An estimate may be so old when it comes: a plugin that closes loops takes its time. [s]
+const OLDEST_S: f64 = 10.0;
+/// And of an instant so far ahead: images show where the vehicle will be when they are seen. [s]
+const AHEAD_S: f64 = 1.0;
+
+/// Lets through poses that are valid, of about now, and in the order of their instants.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct OdometryGate {
+    newest: Option<HostTime>,
+    refused: u64,
+}
+
+impl OdometryGate {
+    /// Whether an estimate that came at `now` counts.
+    pub(crate) fn takes(&mut self, now: HostTime, odometry: &Odometry) -> bool {
+        let age_s = now.seconds_since(odometry.stamp);
+        let is_next = self.newest.is_none_or(|newest| odometry.stamp > newest);
+        if !(odometry.is_valid() && is_next && (-AHEAD_S..=OLDEST_S).contains(&age_s)) {
+            self.refused += 1;
+            // The first, then ever fewer.
+            if self.refused.is_power_of_two() {
+                tracing::warn!(
+                    "odometry is dropped: an estimate is no pose, not newer than the one before, or not of \
+                     these {OLDEST_S} s ({} so far)",
+                    self.refused
+                );
+            }
+            return false;
+        }
+        self.newest = Some(odometry.stamp);
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DQuat, DVec3};
+    use vizflyt_protocol::geometry::Pose;
+
+    #[test]
+    fn poses_of_about_now_pass_in_their_order() {
+        let mut gate = OdometryGate::default();
+        let now = HostTime::from_ns(100_000_000_000);
+        let mut takes = |ms: i64, x_m: f64| {
+            let stamp = now.plus_ns(ms * 1_000_000);
+            let odom_from_body = Pose::new(DVec3::X * x_m, DQuat::IDENTITY);
+            gate.takes(now, &Odometry { stamp, odom_from_body })
+        };
+        assert!(!takes(-10_001, 0.0), "too old");
+        assert!(takes(-30, 0.0));
+        assert!(!takes(-30, 0.0), "the same instant again");
+        assert!(!takes(-20, f64::NAN));
+        assert!(!takes(-20, 1e6), "nowhere");
+        assert!(takes(-20, 1.0));
+        assert!(!takes(-25, 1.0), "before the last");
+        assert!(!takes(1001, 1.0), "far ahead");
+        assert!(takes(48, 1.0));
+    }
+}

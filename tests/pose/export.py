@@ -1,0 +1,141 @@
+"""Reads what `vizflyt export` writes by programs that nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow.
+
+    export.py VIZFLYT
+
+A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly.
+"""
+
+import json
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import numpy as np
+import pandas as pd
+import yaml
+from evo.core import sync
+from evo.tools import file_interface
+from PIL import Image
+
+
+def run(*command):
+    return subprocess.run([str(part) for part in command], check=True, capture_output=True, text=True).stdout
+
+
+def check_tum(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
+    run(vizflyt, "export", log, "--format", "tum", "-o", folder)
+    truth = file_interface.read_tum_trajectory_file(folder / "groundtruth.txt")
+    shown = file_interface.read_tum_trajectory_file(folder / "groundtruth_images.txt")
+    assert truth.check()[0] and shown.check()[0]
+    # Images stand at the instants that they show: there the camera's own way passes where they were rendered from.
+    truth_at, shown_at = sync.associate_trajectories(truth, shown, sync_method=sync.SyncMethod.interpolation)
+    moving = np.linalg.norm(np.gradient(shown_at.positions_xyz, shown_at.timestamps, axis=0), axis=1) > 0.5
+    off = np.linalg.norm(truth_at.positions_xyz - shown_at.positions_xyz, axis=1)[moving]
+    assert moving.sum() > 50 and np.median(off) < 0.005, np.median(off)
+    # By 40 ms, the age of the poses behind them, they would be off by more.
+    late = truth.timestamps - 0.040
+    wrong = np.stack([np.interp(shown_at.timestamps, late, axis) for axis in truth.positions_xyz.T], axis=1)
+    assert np.median(np.linalg.norm(wrong - shown_at.positions_xyz, axis=1)[moving]) > 3 * np.median(off)
+    rows = [line.split() for line in (folder / "associations.txt").read_text().splitlines()]
+    assert len(rows) > 100
+    log_images = pd.read_csv(folder / "images.csv")
+    for (rgb_at, rgb, depth_at, depth), row in list(zip(rows, log_images.itertuples()))[::40]:
+        assert rgb_at == depth_at and abs(float(rgb_at) * 1e9 - row.timestamp_ns) < 1000
+        color, metres = Image.open(folder / rgb), np.asarray(Image.open(folder / depth))
+        assert color.mode == "RGB" and color.size == (row.width_px, row.height_px)
+        assert metres.dtype == np.uint16 and metres.shape == color.size[::-1]
+        # 5000 a metre: whole millimetres are multiples of 5.
+        assert (metres % 5 == 0).all() and 0.1 < np.median(metres[metres > 0]) / 5000 < 13.2
+    assert np.abs(np.loadtxt(folder / "accelerometer.txt")[:, 3].mean() - 9.8) < 0.5
+
+
+def check_euroc(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
+    run(vizflyt, "export", log, "--format", "euroc", "-o", folder)
+    mav = folder / "mav0"
+    truth_csv = mav / "state_groundtruth_estimate0/data.csv"
+    truth = file_interface.read_euroc_csv_trajectory(truth_csv)
+    assert truth.check()[0] and truth.num_poses > 500
+    info = run(pathlib.Path(sys.executable).with_name("evo_traj"), "euroc", truth_csv)
+    assert f"{truth.num_poses} poses" in info, info
+    # The same as what `evaluate` reads of the log itself.
+    same = json.loads(run(vizflyt, "evaluate", f"{log}#/pose", truth_csv, "--json"))
+    assert same["pairs"] == truth.num_poses and same["ate_max_m"] < 1e-9, same
+    sensor = yaml.safe_load((mav / "cam0/sensor.yaml").read_text())
+    body_from_cam = np.array(sensor["T_BS"]["data"]).reshape(4, 4)
+    assert np.allclose(body_from_cam[:3, :3] @ body_from_cam[:3, :3].T, np.eye(3), atol=1e-9)
+    # A camera's z is body x for one that looks ahead.
+    assert body_from_cam[0, 2] > 0.9, body_from_cam
+    names = pd.read_csv(mav / "cam0/data.csv").iloc[:, 1]
+    assert sorted(names) == sorted(path.name for path in (mav / "cam0/data").iterdir())
+    assert Image.open(mav / "cam0/data" / names[0]).size == tuple(sensor["resolution"])
+    imu = np.loadtxt(mav / "imu0/data.csv", delimiter=",")
+    assert imu.shape[1] == 7 and (np.diff(imu[:, 0]) > 0).all()
+    # What a gyroscope says is how the truth turns.
+    yaw = np.unwrap(np.arctan2(*truth_yaw(truth)))
+    turned = np.trapezoid(imu[:, 3], imu[:, 0] * 1e-9)
+    assert abs(turned - (yaw[-1] - yaw[0])) < 0.1, (turned, yaw[-1] - yaw[0])
+
+
+def truth_yaw(truth):
+    w, x, y, z = truth.orientations_quat_wxyz.T
+    return 2 * (w * z + x * y), 1 - 2 * (y * y + z * z)
+
+
+def check_parquet(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
+    run(vizflyt, "export", log, "--format", "parquet", "-o", folder)
+    tables = {path.stem: pd.read_parquet(path, engine="pyarrow") for path in folder.glob("*.parquet")}
+    assert {"images", "poses", "imu", "setpoints_asked", "setpoints_sent", "odometry"} == set(tables)
+    csv = folder.with_name("beside")
+    run(vizflyt, "export", log, "--format", "euroc", "-o", csv)
+    # Of images, what does not name files.
+    for name, first in (("images", 4), ("setpoints_sent", 0), ("setpoints_asked", 0)):
+        of_csv = pd.read_csv(csv / f"{name}.csv")
+        # CSV writes 1.0 as 1.
+        table, of_csv = tables[name].iloc[:, first:], of_csv.iloc[:, first:]
+        pd.testing.assert_frame_equal(table, of_csv, check_dtype=False, rtol=1e-12)
+    images = tables["images"]
+    assert images.timestamp_ns.dtype == np.int64 and set(images.camera) == {"front", "down"}
+    assert (folder / images.file[0]).exists() and (folder / images.depth_file[0]).exists()
+    known = images.dropna(subset=["pose_x"])
+    assert (known.position_sigma_x > 0).all() and len(known) > 100
+    assert json.loads(tables["setpoints_asked"].setpoint[0]) is not None
+
+
+def check_refusals(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
+    def refused(*command):
+        done = subprocess.run([str(part) for part in command], capture_output=True, text=True)
+        assert done.returncode != 0
+        return done.stderr
+
+    there = folder / "there"
+    there.mkdir()
+    assert "nothing is overwritten" in refused(vizflyt, "export", log, "--format", "tum", "-o", there)
+    out = folder / "out"
+    assert "camera 'nose'" in refused(vizflyt, "export", log, "--format", "tum", "--camera", "nose", "-o", out)
+    text = folder / "text.mcap"
+    text.write_text("hello")
+    assert "no MCAP file" in refused(vizflyt, "export", text, "--format", "tum", "-o", out)
+    # Cut before its first image, as that of a flight that was killed on the ground.
+    cut = folder / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:3000])
+    assert "no image" in refused(vizflyt, "export", cut, "--format", "euroc", "-o", out) or out.exists() is False
+    assert not out.exists() and not out.with_name("out.part").exists()
+
+
+def main() -> None:
+    vizflyt = sys.argv[1]
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        report = folder / "report"
+        run(vizflyt, "grade", "avoid", "--project", "p2", "--seeds", "1", "--log", "full", "--report", report,
+            "--keys", folder / "keys")  # fmt: skip
+        log = report / "logs/day-1.mcap"
+        check_tum(vizflyt, log, folder / "tum")
+        check_euroc(vizflyt, log, folder / "euroc")
+        check_parquet(vizflyt, log, folder / "parquet")
+        check_refusals(vizflyt, log, folder)
+    print("vizflyt export: evo, Pillow, PyYAML and pandas read what it writes")
+
+
+main()
