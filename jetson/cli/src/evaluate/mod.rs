@@ -5,10 +5,10 @@ mod page;
 mod pairs;
 mod trajectory;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use serde::Serialize;
 
@@ -25,9 +25,11 @@ use crate::terminal::print_line;
   vizflyt evaluate truth.tum odometry.tum --align se3
   vizflyt evaluate flight.mcap odometry.tum --align yaw --delta 1s --html drift.html
   vizflyt evaluate flight.mcap#/pose flight.mcap#/odometry --align yaw --json
+  vizflyt evaluate their-capture my-capture --align sim3
 
 A trajectory is TUM's text (stamp tx ty tz qx qy qz qw), EuRoC's CSV, or a flight's log with a topic of poses
-(/pose without). The numbers are those of evo_ape and evo_rpe: docs/guides/logs.md.")]
+(/pose without); or both are folders of photos with poses (COLMAP, transforms.json): photos of one name are compared, a
+second apart. The numbers are those of evo_ape and evo_rpe: docs/guides/logs.md.")]
 pub(crate) struct EvaluateArgs {
     /// Where it was
     #[arg(value_name = "TRUTH")]
@@ -61,7 +63,16 @@ pub(crate) fn run(args: &EvaluateArgs) -> Result<ExitCode> {
         args.max_diff >= 0.0 && args.max_diff.is_finite(),
         "--max-diff is a time of 0 s or more"
     );
-    let (truth, estimate) = (trajectory::read(&args.truth)?, trajectory::read(&args.estimate)?);
+    let are_photos = [&args.truth, &args.estimate].map(|source| Path::new(source).is_dir());
+    let (truth, estimate) = match are_photos {
+        [true, true] => trajectory::of_photos(&args.truth, &args.estimate)?,
+        [false, false] => (trajectory::read(&args.truth)?, trajectory::read(&args.estimate)?),
+        _ => bail!(
+            "one of {} and {} is a folder of photos, the other is not",
+            args.truth,
+            args.estimate
+        ),
+    };
     let pairs = associate(&truth, &estimate, args.associate, args.max_diff);
     ensure!(
         !pairs.is_empty(),

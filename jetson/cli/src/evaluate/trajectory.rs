@@ -1,10 +1,13 @@
 //! A trajectory: poses and their instants, from a file or from a topic of a flight's log.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Cam, Pose, World};
 use vizflyt_runtime::log::read::{LogReader, RecordedPoses};
+use vizflyt_twin::dataset;
 
 /// Where something was at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,6 +44,34 @@ pub(crate) fn read(source: &str) -> Result<Vec<Stamped>> {
     );
     let text = std::fs::read(path).with_context(context)?;
     parse(&String::from_utf8_lossy(&text)).with_context(context)
+}
+
+/// Reads where the photos of two datasets were taken from: those of one name, in its order, a second apart.
+///
+/// # Errors
+/// A folder that is no dataset, or two without a photo in common.
+pub(crate) fn of_photos(truth: &str, estimate: &str) -> Result<(Vec<Stamped>, Vec<Stamped>)> {
+    let read = |folder: &str| -> Result<BTreeMap<String, _>> {
+        let poses = dataset::read_poses(Path::new(folder))?;
+        // Folders differ from program to program.
+        let file = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
+        Ok(poses.into_iter().map(|(name, pose)| (file(&name), pose)).collect())
+    };
+    let (truths, mut estimates) = (read(truth)?, read(estimate)?);
+    let mut both = (Vec::new(), Vec::new());
+    for (name, of_truth) in truths {
+        let Some(of_estimate) = estimates.remove(&name) else { continue };
+        let stamped = |pose: Pose<World, Cam>| Stamped {
+            at_s: both.0.len() as f64,
+            position_m: pose.translation_m,
+            rotation: pose.rotation.normalize(),
+        };
+        let (of_truth, of_estimate) = (stamped(of_truth), stamped(of_estimate));
+        both.0.push(of_truth);
+        both.1.push(of_estimate);
+    }
+    ensure!(!both.0.is_empty(), "no photo of {truth} has the name of one of {estimate}");
+    Ok(both)
 }
 
 fn of_log(path: &Path, topic: &str) -> Result<Vec<Stamped>> {
@@ -173,6 +204,36 @@ mod tests {
             let error = format!("{:#}", parse(text).unwrap_err());
             assert!(error.contains(told), "{text:?}: {error}");
         }
+    }
+
+    #[test]
+    fn photos_of_one_name_are_compared() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, frames: &[(&str, f64)]| {
+            let path = folder.path().join(name);
+            std::fs::create_dir(&path).unwrap();
+            let frames: Vec<_> = frames
+                .iter()
+                .map(|(file, x)| {
+                    let pose = [[1.0, 0.0, 0.0, *x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+                    let rows = [pose[0], pose[1], pose[2], [0.0, 0.0, 0.0, 1.0]];
+                    serde_json::json!({"file_path": file, "transform_matrix": rows})
+                })
+                .collect();
+            let text = serde_json::json!({"camera_angle_x": 1.0, "frames": frames}).to_string();
+            std::fs::write(path.join("transforms.json"), text).unwrap();
+            path.to_str().unwrap().to_owned()
+        };
+        let truth = write("truth", &[("images/b.png", 2.0), ("images/a.png", 1.0), ("c.png", 3.0)]);
+        let estimate = write("estimate", &[("a.png", 10.0), ("b.png", 20.0), ("d.png", 40.0)]);
+        let (truths, estimates) = of_photos(&truth, &estimate).unwrap();
+        let x = |poses: &[Stamped]| -> Vec<[f64; 2]> {
+            poses.iter().map(|pose| [pose.at_s, pose.position_m.x]).collect()
+        };
+        assert_eq!(x(&truths), [[0.0, 1.0], [1.0, 2.0]]);
+        assert_eq!(x(&estimates), [[0.0, 10.0], [1.0, 20.0]]);
+        let other = write("other", &[("e.png", 0.0), ("f.png", 1.0)]);
+        assert!(of_photos(&truth, &other).unwrap_err().to_string().contains("no photo of"));
     }
 
     proptest! {
