@@ -180,7 +180,9 @@ def replay(program, log, name):
 def follow_guide(log):
     """Runs the Python of the guide on a log."""
     guide = (pathlib.Path(__file__).parents[2] / "docs/guides/logs.md").read_text()
-    [script] = re.findall(r"^```python\n(.*?)^```$", guide, re.M | re.S)
+    scripts = re.findall(r"^```python\n(.*?)^```$", guide, re.M | re.S)
+    # The other one needs our own package: tests/python runs it.
+    [script] = [script for script in scripts if "from mcap" in script]
     done = subprocess.run([sys.executable, "-c", script.replace("flight.mcap", str(log))],
                           capture_output=True, text=True)
     check(done.returncode == 0, f"the guide's script runs: {done.stderr}")

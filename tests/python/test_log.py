@@ -1,8 +1,10 @@
 """`vizflyt.Log`: what a flight's log holds, as arrays; and logs of the earlier form."""
 
 import json
+import re
 import struct
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,6 +187,14 @@ def test_a_graded_flight_is_read_in_five_lines(graded):
     assert abs(np.median(log.imu.accel_mps2[:, 2]) - 9.8) < 0.5
     assert len(log.imu.at_ns) > 500 and (np.diff(log.imu.at_ns) > 0).all()
     assert len(log.asked) > 100 and np.isfinite(log.sent.v_world_mps).all()
+
+
+def test_the_guides_lines_run(graded, capsys):
+    guide = (Path(__file__).parents[2] / "docs/guides/logs.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```$", guide, re.M | re.S)
+    [block] = [block for block in blocks if "vizflyt.Log" in block]
+    exec(compile(block.replace("flight.mcap", str(graded)), "logs.md", "exec"), {})
+    assert len(capsys.readouterr().out.splitlines()) > 100
 
 
 def test_the_lag_between_images_and_the_way_flown_is_none(graded):
