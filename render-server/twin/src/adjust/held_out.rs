@@ -44,10 +44,11 @@ pub(super) fn held_out(
 /// Returns where images alone have a tag.
 fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     let mut rays: [Vec<Ray>; 4] = Default::default();
-    for (image, pose) in capture.images.iter().zip(&state.cameras) {
+    for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
             for (k, rays) in rays.iter_mut().enumerate() {
                 let pixel = seen.corners_px[k] - inwards(seen)[k] * state.inset_px;
+                let pose = state.pose_at(camera, pixel);
                 let direction = pose.rotation * state.lens.slope(pixel)?.extend(1.0);
                 rays.push(Ray { origin: pose.translation_m, direction: direction.normalize() });
             }

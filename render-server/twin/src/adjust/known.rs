@@ -6,7 +6,7 @@ use super::capture::Capture;
 use super::solve::{Problem, Solved, middle_m};
 use super::start::Start;
 use super::state::State;
-use super::{Adjusted, HeldOut, Known, TagResult};
+use super::{Adjusted, HeldOut, Known, Readout, TagResult};
 
 /// Puts the result together.
 pub(super) fn describe(
@@ -24,6 +24,7 @@ pub(super) fn describe(
         known,
         world_from_scene: start.world_from_scene,
         lens: state.lens,
+        readout: readout(state, solved),
         world_from_cam: state.cameras.clone(),
         points_m: state.points.clone(),
         points_rms_px,
@@ -61,7 +62,7 @@ fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     let size = solved.layout.size;
     let (mut scale, mut turns) = (vec![0.0; size], [vec![0.0; size], vec![0.0; size]]);
     for (camera, (pose, arm)) in state.cameras.iter().zip(arms()).enumerate() {
-        let at = 6 * camera;
+        let at = solved.layout.camera * camera;
         scale[at..at + 3].copy_from_slice(&(arm / reach2).to_array());
         for (axis, turn) in [DVec3::X, DVec3::Y].into_iter().zip(&mut turns) {
             // back * (arm x change + lever^2 turn), along the axis.
@@ -79,6 +80,15 @@ fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     let (a, b, c) = (product(x, &by_x), product(x, &by_y), product(y, &by_y));
     let worse = 0.5 * (a + c) + (0.25 * (a - c).powi(2) + b * b).sqrt();
     (scale_variance.max(0.0).sqrt(), worse.max(0.0).sqrt())
+}
+
+/// Returns the rows' readout and its sigma, if it was asked.
+fn readout(state: &State, solved: &Solved) -> Option<Readout> {
+    let at = solved.layout.readout()?;
+    let mut one = vec![0.0; solved.layout.size];
+    one[at] = 1.0;
+    let sigma_s = solved.factor.solve(one)[at].max(0.0).sqrt();
+    Some(Readout { seconds: state.rolling.readout_s, sigma_s })
 }
 
 /// Returns by what share of the distance between them tags that were held out are off, for as many as there are: the
@@ -106,7 +116,7 @@ fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
 }
 
 fn fit_of_points(capture: &Capture, state: &State, solved: &Solved) -> (f64, f64) {
-    let problem = Problem::new(capture, state, false, &[]);
+    let problem = Problem::new(capture, state, false, false, &[]);
     let limit_px = OUTLIER_SIGMAS * solved.noise.point_px;
     let (mut sum, mut good, mut all) = (0.0, 0.0f64, 0.0f64);
     for point in 0..state.points.len() {

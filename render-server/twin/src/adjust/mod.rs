@@ -13,6 +13,7 @@ mod known;
 mod matrix;
 mod normal;
 mod project;
+mod rolling;
 mod solve;
 mod start;
 mod state;
@@ -36,11 +37,13 @@ pub struct Options {
     pub refine_lens: bool,
     /// Whether tags are held out, which takes about as long again for each of a few parts.
     pub hold_out: bool,
+    /// Whether rows may have been exposed one after the other: by images whose times are true.
+    pub rolling: bool,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { refine_lens: true, hold_out: true }
+        Self { refine_lens: true, hold_out: true, rolling: true }
     }
 }
 
@@ -53,7 +56,9 @@ pub struct Adjusted {
     pub world_from_scene: Similarity,
     /// The lens.
     pub lens: Intrinsics,
-    /// Poses, in the order of the images. [m, world]
+    /// How long it took to expose all rows of an image; `None` if that was not asked.
+    pub readout: Option<Readout>,
+    /// Poses, of an image's middle row, in the order of the images. [m, world]
     pub world_from_cam: Vec<Pose<World, Cam>>,
     /// Points, in the order of the capture's. [m, world]
     pub points_m: Vec<DVec3>,
@@ -85,6 +90,15 @@ pub struct Known {
     pub up: bool,
     /// The place in the room, heading too.
     pub place: bool,
+}
+
+/// How long rows take.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Readout {
+    /// From the first row's exposure to the last one's; negative of a phone held upside down. [s]
+    pub seconds: f64,
+    /// One sigma. [s]
+    pub sigma_s: f64,
 }
 
 /// How a tag fits.

@@ -94,6 +94,9 @@ fn facts(page: &mut String, record: &Record) {
         if let Some(rms_px) = metric.points_rms_px {
             row("points", format!("{rms_px:.2} px from where pictures saw them (rms)"));
         }
+        if let Some(shutter) = metric.rolling_shutter {
+            row("shutter", shutter.in_words());
+        }
         for line in &metric.checked {
             row("checked", line.clone());
         }
