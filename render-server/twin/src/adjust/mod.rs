@@ -33,7 +33,7 @@ pub use capture::{Capture, CaptureError, Image, Place, Sighting, Tag, TagSightin
 /// How to adjust.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Whether focal length, k1 and k2 are found too: not for a lens that was calibrated.
+    /// Whether focal length, k1, k2 and principal point are found too: not for a lens that was calibrated.
     pub refine_lens: bool,
     /// Whether tags are held out, which takes about as long again for each of a few parts.
     pub hold_out: bool,

@@ -61,10 +61,15 @@ impl Layout {
         self.shared.filter(|_| self.free[LENS]).map(|at| at + LENS)
     }
 
+    /// Returns where the principal point stands, if it is found.
+    pub(super) fn middle(&self) -> Vec<usize> {
+        let at = self.shared.filter(|_| self.free[LENS - 1]);
+        at.map_or(Vec::new(), |at| vec![at + LENS - 2, at + LENS - 1])
+    }
+
     /// Returns derivatives by what is shared, none by what is given.
     fn by_shared(&self, by_lens: [DVec2; LENS], by_readout: DVec2) -> [DVec2; SHARED] {
-        let [a, b, c] = by_lens;
-        let mut by = [a, b, c, by_readout];
+        let mut by = std::array::from_fn(|i| if i < LENS { by_lens[i] } else { by_readout });
         by.iter_mut().zip(self.free).filter(|(_, free)| !free).for_each(|(d, _)| *d = DVec2::ZERO);
         by
     }
@@ -320,6 +325,10 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
             // What is given stays.
             sum.matrix.add(shared + i, shared + i, 1.0);
         }
+    }
+    for (at, off_px) in problem.layout.middle().into_iter().zip(state.off_middle_px().to_array()) {
+        let sigma_px = state.middle_sigma_px();
+        sum.add(&[(at, &[1.0])], off_px, sigma_px.powi(-2));
     }
     if let Some(readout) = problem.layout.readout() {
         sum.add(&[(readout, &[1.0])], state.rolling.readout_s, READOUT_S.powi(-2));

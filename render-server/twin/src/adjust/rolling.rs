@@ -174,9 +174,9 @@ fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<Motion> {
 pub(super) const READOUT_S: f64 = 0.03;
 /// An image is read while the next one waits: 24 a second are the fewest that phones film. [s]
 pub(super) const MOST_READOUT_S: f64 = 0.042;
-/// A hand that walks turns by this beyond what pictures a third of a second apart show: 2 degrees at a step's 1.8 Hz, root
-/// mean square. [rad/s]
-const HAND_RADPS: f64 = 0.25;
+/// A hand that walks turns by this beyond what pictures a third of a second apart show, about each axis: in generated
+/// walks 0.03 to 0.07, root mean square; people are less steady. [rad/s]
+const HAND_RADPS: f64 = 0.15;
 /// Less is nothing. [rad]
 const LEAST_BEND_RAD: f64 = 1e-6;
 /// Images farther apart do not tell how the camera moves. [s]

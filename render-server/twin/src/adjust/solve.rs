@@ -149,6 +149,9 @@ impl<'a> Problem<'a> {
             .collect();
         let mut sum: f64 = points.iter().sum();
         sum += (state.inset_px / INSET_PX).powi(2);
+        if !self.layout.middle().is_empty() {
+            sum += (state.off_middle_px() / state.middle_sigma_px()).length_squared();
+        }
         if self.layout.readout().is_some() {
             sum += (state.rolling.readout_s / READOUT_S).powi(2);
             let bends = state.rolling.bends_rad.iter();
@@ -371,6 +374,7 @@ pub(super) fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[
         points: state.points.iter().zip(points).map(|(p, by)| *p + *by).collect(),
         tags: tags.collect(),
         inset_px: state.inset_px + layout.inset.map_or(0.0, |at| change[at]),
+        middle_px: state.middle_px,
         reach: state.reach,
     }
 }

@@ -19,6 +19,8 @@ pub(super) struct State {
     pub(super) tags: Vec<TagPlace>,
     /// How far inside a tag its corners are found: white bleeds into black, in lenses and in sensors. [px]
     pub(super) inset_px: f64,
+    /// The principal point that it began with. [px]
+    pub(super) middle_px: DVec2,
     /// Slopes beyond this are not seen.
     pub(super) reach: f64,
 }
@@ -49,6 +51,7 @@ impl State {
             rolling: Rolling::new(&capture.lens, capture.images.len()),
             tags: start.tags.clone(),
             inset_px: 0.0,
+            middle_px: DVec2::new(capture.lens.cx_px, capture.lens.cy_px),
             reach: reach(&capture.lens),
         }
     }
@@ -72,6 +75,16 @@ impl State {
     ) -> Option<(Projected, InRow)> {
         let seen = self.rolling.row(camera, seen_px).see(&self.cameras[camera], p_world);
         Some((project(&self.lens, self.reach, seen.p_cam)?, seen))
+    }
+
+    /// Returns how far the principal point has come from where it began.
+    pub(super) fn off_middle_px(&self) -> DVec2 {
+        DVec2::new(self.lens.cx_px, self.lens.cy_px) - self.middle_px
+    }
+
+    /// Returns one sigma of that: phones' are off the middle by up to a hundredth of the image.
+    pub(super) fn middle_sigma_px(&self) -> f64 {
+        0.01 * f64::from(self.lens.width_px)
     }
 
     /// Returns a camera's pose when the row of a pixel is exposed.
