@@ -100,7 +100,9 @@ fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
         .zip(held_out)
         .filter_map(|(tag, held)| {
             let corners = tag.corners_m?;
-            Some((corners.iter().sum::<DVec3>() / 4.0, (*held)?.off_m?))
+            // One that its own sightings place badly says nothing of the others.
+            let held = (*held).filter(|held| held.by_pixel_m <= MOST_BY_PIXEL_M)?;
+            Some((corners.iter().sum::<DVec3>() / 4.0, held.off_m?))
         })
         .collect();
     let count = placed.len() as f64;
@@ -155,8 +157,12 @@ fn fit_of_tag(
     for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
             sightings += 1;
+            // Near by, a blurred corner is many pixels off and still in its place.
+            let ahead_m = state.cameras[camera].rotation.conjugate()
+                * (corners_m[0] - state.cameras[camera].translation_m);
+            let near_px = CONTRADICTS_M * state.lens.fx_px / ahead_m.z.max(1e-3);
             match state.tag_off_px(camera, &corners_m, seen) {
-                Some(off_px) if off_px <= limit_px => sum += off_px * off_px,
+                Some(off_px) if off_px <= limit_px.max(near_px) => sum += off_px * off_px,
                 _ => contradicting += 1,
             }
         }
@@ -167,6 +173,8 @@ fn fit_of_tag(
     Some(TagResult { sightings, contradicting, corners_m, rms_px, held_out })
 }
 
+/// By a pixel in each image. [m]
+const MOST_BY_PIXEL_M: f64 = 0.03;
 /// Tags near each other are off together, where the walk between them drifted: so many count as fewer, by half. Without
 /// it, scales of recorded captures were off by 0.5 to 3 sigmas.
 const TOGETHER: f64 = 1.5;
@@ -174,3 +182,5 @@ const TOGETHER: f64 = 1.5;
 const OUTLIER_SIGMAS: f64 = 3.0;
 /// A rolling shutter and blur move corners by less than this; what is somewhere else is farther off. [px]
 const CONTRADICTS_PX: f64 = 4.0;
+/// Of good captures, places are off by less; those that are mistaken for others, by far more. [m]
+const CONTRADICTS_M: f64 = 0.05;

@@ -121,6 +121,8 @@ pub struct TagResult {
 pub struct HeldOut {
     /// From where it was measured to be: its middle. `None` if that was not measured. [m]
     pub off_m: Option<f64>,
+    /// How far its middle may be off by a pixel in each image that saw it: much, where few saw it, or from one side. [m]
+    pub by_pixel_m: f64,
     /// Its edges, as a share of what they were measured to be, less 1.
     pub size_error: f64,
     /// How far it is from where images saw it, root mean square. [px]

@@ -159,10 +159,10 @@ fn a_rolling_shutter_is_found_and_moves_nothing() {
         let (_, _, unmodelled_m) = off(false);
         let (adjusted, scale, off_m) = off(true);
         assert!(
-            unmodelled_m > 0.015 && off_m < 0.4 * unmodelled_m,
+            unmodelled_m > 0.01 && off_m < 0.4 * unmodelled_m,
             "{unmodelled_m} m, then {off_m}"
         );
-        assert!(scale.abs() < 1e-3 && adjusted.points_rms_px < 0.5, "{scale}");
+        assert!(scale.abs() < 2e-3 && adjusted.points_rms_px < 0.5, "{scale}");
         let Readout { seconds, sigma_s } = adjusted.readout.unwrap();
         let off_s = (seconds - 0.022).abs();
         assert!(off_s < 3.0 * sigma_s && sigma_s < 2e-3, "{seconds} {sigma_s}");
