@@ -139,16 +139,18 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
             100.0 * off_m.iter().copied().fold(0.0, f64::max)
         );
         let is_off = |held: &crate::adjust::HeldOut| held.off_m.is_some_and(|m| m > MOST_OFF_M);
-        // Seen flat, or from one side alone, rays meet far from where they should, though each passes near by.
-        let is_wrong = |held: &crate::adjust::HeldOut| is_off(held) && held.rms_px > MOST_OFF_PX;
+        // Seen flat, seldom or from one side, rays meet far from where they should.
+        let is_wrong = |held: &crate::adjust::HeldOut| {
+            let doubt_m = (DOUBT_PX * held.by_pixel_m).min(MOST_DOUBT_M);
+            is_off(held) && held.rms_px > MOST_OFF_PX && held.off_m.is_some_and(|m| m > doubt_m)
+        };
         let unclear: Vec<&str> = results()
             .filter(|(_, held)| is_off(held) && !is_wrong(held))
             .map(|(tag, _)| walk.evidence.capture.tags[tag].name.as_str())
             .collect();
         if !unclear.is_empty() {
             verdict.checked.push(format!(
-                "tags held out: {} too few sides are seen of to say where they stand; the images that show them agree \
-                 with where they were measured to, to {MOST_OFF_PX:.0} px",
+                "tags held out: {} were seen too seldom, or from too few sides, to say where they stand",
                 unclear.join(", ")
             ));
         }
@@ -214,6 +216,10 @@ const MOST_OFF_M: f64 = 0.15;
 /// And beyond this images see them elsewhere: what blur and a rolling shutter do to corners is less; a tag that is 15 cm off
 /// is 20 px off at 4 m. [px]
 const MOST_OFF_PX: f64 = 4.0;
+/// Corners, and the poses around a tag that had no say, are off by this together. [px]
+const DOUBT_PX: f64 = 4.0;
+/// And no doubt excuses more. [m]
+const MOST_DOUBT_M: f64 = 0.4;
 /// Beyond this an edge is not what it was printed as.
 const MOST_SIZE: f64 = 0.1;
 /// White bleeds into black by a tenth or two, in images of our own captures. [px]
