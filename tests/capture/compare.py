@@ -3,8 +3,7 @@
     python compare.py VIZFLYT [FOLDER]
 
 FOLDER, if given, keeps what is made. The bars are those of a metric twin: 95 % of the pictures placed, scale within
-0.3 %, up within 0.2 degrees; but for camera centres: the rolling shutter, which no adjustment here knows, moves them by
-2 to 4 cm.
+0.3 %, up within 0.2 degrees, camera centres within 2 cm; of a fifth of the pictures, unchosen, half a centimetre more.
 """
 
 import json
@@ -83,7 +82,7 @@ def main(vizflyt: str, home: Path) -> None:
     off = compare(made, truth)
     print(off)
     check(f"{100 * off['placed']:.1f} % of the pictures are placed", off["placed"] >= 0.95)
-    check(f"camera centres are off by {100 * off['off_m']:.2f} cm in the room", off["off_m"] <= 0.04)
+    check(f"camera centres are off by {100 * off['off_m']:.2f} cm in the room", off["off_m"] <= 0.025)
     check(f"the scale is off by {100 * off['scale']:.3f} %", off["scale"] <= 0.003)
     check(f"up is off by {off['up_deg']:.3f} degrees", off["up_deg"] <= 0.2)
     bound = made["metric"]["scale_bound"]

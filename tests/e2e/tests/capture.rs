@@ -305,5 +305,71 @@ fn what_cannot_be_captured_is_explained() {
     ] {
         let (ok, said) = run_in(home, &[&["scene", "capture"], args].concat());
         assert!(!ok && said.contains(says), "{args:?}: {said}");
+        let report = home.join("out/report.html");
+        // What was asked wrongly is no capture; what stopped has a report.
+        if report.exists() {
+            let page = fs::read_to_string(&report).unwrap();
+            assert!(
+                page.contains("It stopped ") && page.contains("What to do"),
+                "{args:?}: {page}"
+            );
+            fs::remove_file(report).unwrap();
+        } else {
+            assert!(!STOPS.iter().any(|stop| says.contains(stop)), "{args:?} left no report");
+        }
     }
+}
+
+/// What is said where a stage, or what it needs, fails.
+const STOPS: [&str; 3] = ["no video", "holds no poses", "pip install"];
+
+/// Programs that are found here, and fail as those do that people have.
+#[test]
+fn a_stage_that_fails_leaves_a_report() {
+    let folder = tempfile::tempdir().unwrap();
+    let home = folder.path();
+    let film = [
+        "scene",
+        "generate",
+        "room",
+        "--seed",
+        "3",
+        "--capture",
+        "walk",
+        "--frames",
+        "8",
+        "--size",
+        "64x64",
+    ];
+    let (ok, said) = run_in(home, &film);
+    assert!(ok, "{said}");
+    // A Python whose pycolmap places nothing.
+    let python = home.join("python");
+    fs::write(&python, "#!/bin/sh\ncase \"$*\" in *version*) echo 4.2.1;; esac\n").unwrap();
+    fs::set_permissions(&python, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let capture = |more: &[&str]| {
+        let start = ["scene", "capture", "walk", "-o", "hall"];
+        let (ok, said) = run_in(home, &[&start[..], more].concat());
+        assert!(!ok, "{said}");
+        let record: Value =
+            serde_json::from_slice(&fs::read(home.join("hall/capture.json")).unwrap()).unwrap();
+        assert_eq!(record["fit_to_fly"], false);
+        (said, record, fs::read_to_string(home.join("hall/report.html")).unwrap())
+    };
+    let (said, record, page) = capture(&["--python", python.to_str().unwrap()]);
+    assert!(said.contains("places no pictures"), "{said}");
+    assert_eq!(record["failure"]["stage"], "poses");
+    assert!(record["failure"]["what"].as_str().unwrap().contains("places no pictures"), "{record}");
+    assert_eq!(record["pictures"]["pictures"].as_array().unwrap().len(), 8);
+    assert!(
+        page.contains("It stopped in its stage poses.") && page.contains("film slowly"),
+        "{page}"
+    );
+    assert!(page.contains("8 of 64 x 64 px"), "what is known is there: {page}");
+
+    // Poses that are of other pictures altogether.
+    fs::create_dir(home.join("other")).unwrap();
+    let (_, record, page) = capture(&["--poses", "other"]);
+    assert_eq!(record["failure"]["stage"], "poses");
+    assert!(page.contains("holds no poses"), "{page}");
 }

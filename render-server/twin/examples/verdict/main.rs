@@ -137,6 +137,9 @@ fn report(truth: &Truth, capture: &Capture, adjusted: &adjust::Adjusted) {
         adjusted.tilt_sigma_rad.map(f64::to_degrees)
     );
     println!("  corners of tags {:.3} px inside", adjusted.inset_px);
+    if let Some(readout) = adjusted.readout {
+        println!("  rows over {:.2} ms, sigma {:.2}", 1e3 * readout.seconds, 1e3 * readout.sigma_s);
+    }
     for (tag, result) in capture.tags.iter().zip(&adjusted.tags) {
         if let Some(r) = result {
             println!(

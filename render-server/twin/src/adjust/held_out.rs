@@ -1,6 +1,6 @@
 //! Tags that had no say: where the images see them once they no longer pull.
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 
 use super::capture::Capture;
 use super::solve::{self, Solved};
@@ -44,10 +44,11 @@ pub(super) fn held_out(
 /// Returns where images alone have a tag.
 fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     let mut rays: [Vec<Ray>; 4] = Default::default();
-    for (image, pose) in capture.images.iter().zip(&state.cameras) {
+    for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
             for (k, rays) in rays.iter_mut().enumerate() {
                 let pixel = seen.corners_px[k] - inwards(seen)[k] * state.inset_px;
+                let pose = state.pose_at(camera, pixel);
                 let direction = pose.rotation * state.lens.slope(pixel)?.extend(1.0);
                 rays.push(Ray { origin: pose.translation_m, direction: direction.normalize() });
             }
@@ -62,15 +63,25 @@ fn look(capture: &Capture, state: &State, tag: usize) -> Option<HeldOut> {
     let given = capture.tags[tag].corners_m;
     let expected = given.unwrap_or(corners_m);
     let (mut sum, mut count) = (0.0, 0.0);
+    let mut information = DMat3::ZERO;
+    let middle_m = middle(&corners_m);
     for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
+            let ray_m = middle_m - state.cameras[camera].translation_m;
+            let (reach_m, along) = (ray_m.length().max(1e-3), ray_m.normalize_or_zero());
+            let across = DMat3::IDENTITY
+                - DMat3::from_cols(along * along.x, along * along.y, along * along.z);
+            information += across * (state.lens.fx_px / reach_m).powi(2);
             if let Some(off_px) = state.tag_off_px(camera, &expected, seen) {
                 sum += off_px * off_px;
                 count += 1.0;
             }
         }
     }
+    let variance = information.inverse();
+    let by_pixel_m = (variance.x_axis.x + variance.y_axis.y + variance.z_axis.z).max(0.0).sqrt();
     Some(HeldOut {
+        by_pixel_m: if by_pixel_m.is_finite() { by_pixel_m } else { f64::MAX },
         off_m: given.map(|given| middle(&given).distance(middle(&corners_m))),
         size_error: round_m / (4.0 * capture.tags[tag].size_m) - 1.0,
         rms_px: if count > 0.0 { (sum / count).sqrt() } else { return None },

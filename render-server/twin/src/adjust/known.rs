@@ -6,7 +6,7 @@ use super::capture::Capture;
 use super::solve::{Problem, Solved, middle_m};
 use super::start::Start;
 use super::state::State;
-use super::{Adjusted, HeldOut, Known, TagResult};
+use super::{Adjusted, HeldOut, Known, Readout, TagResult};
 
 /// Puts the result together.
 pub(super) fn describe(
@@ -24,6 +24,7 @@ pub(super) fn describe(
         known,
         world_from_scene: start.world_from_scene,
         lens: state.lens,
+        readout: readout(state, solved),
         world_from_cam: state.cameras.clone(),
         points_m: state.points.clone(),
         points_rms_px,
@@ -61,7 +62,7 @@ fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     let size = solved.layout.size;
     let (mut scale, mut turns) = (vec![0.0; size], [vec![0.0; size], vec![0.0; size]]);
     for (camera, (pose, arm)) in state.cameras.iter().zip(arms()).enumerate() {
-        let at = 6 * camera;
+        let at = solved.layout.camera * camera;
         scale[at..at + 3].copy_from_slice(&(arm / reach2).to_array());
         for (axis, turn) in [DVec3::X, DVec3::Y].into_iter().zip(&mut turns) {
             // back * (arm x change + lever^2 turn), along the axis.
@@ -81,6 +82,15 @@ fn sigmas(state: &State, solved: &Solved) -> (f64, f64) {
     (scale_variance.max(0.0).sqrt(), worse.max(0.0).sqrt())
 }
 
+/// Returns the rows' readout and its sigma, if it was asked.
+fn readout(state: &State, solved: &Solved) -> Option<Readout> {
+    let at = solved.layout.readout()?;
+    let mut one = vec![0.0; solved.layout.size];
+    one[at] = 1.0;
+    let sigma_s = solved.factor.solve(one)[at].max(0.0).sqrt();
+    Some(Readout { seconds: state.rolling.readout_s, sigma_s })
+}
+
 /// Returns by what share of the distance between them tags that were held out are off, for as many as there are: the
 /// normal equations believe that a layout is exact.
 fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
@@ -90,7 +100,9 @@ fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
         .zip(held_out)
         .filter_map(|(tag, held)| {
             let corners = tag.corners_m?;
-            Some((corners.iter().sum::<DVec3>() / 4.0, (*held)?.off_m?))
+            // One that its own sightings place badly says nothing of the others.
+            let held = (*held).filter(|held| held.by_pixel_m <= MOST_BY_PIXEL_M)?;
+            Some((corners.iter().sum::<DVec3>() / 4.0, held.off_m?))
         })
         .collect();
     let count = placed.len() as f64;
@@ -106,7 +118,7 @@ fn tags_disagree(capture: &Capture, held_out: &[Option<HeldOut>]) -> f64 {
 }
 
 fn fit_of_points(capture: &Capture, state: &State, solved: &Solved) -> (f64, f64) {
-    let problem = Problem::new(capture, state, false, &[]);
+    let problem = Problem::new(capture, state, false, false, &[]);
     let limit_px = OUTLIER_SIGMAS * solved.noise.point_px;
     let (mut sum, mut good, mut all) = (0.0, 0.0f64, 0.0f64);
     for point in 0..state.points.len() {
@@ -145,8 +157,12 @@ fn fit_of_tag(
     for (camera, image) in capture.images.iter().enumerate() {
         for seen in image.tags.iter().filter(|seen| seen.tag == tag) {
             sightings += 1;
+            // Near by, a blurred corner is many pixels off and still in its place.
+            let ahead_m = state.cameras[camera].rotation.conjugate()
+                * (corners_m[0] - state.cameras[camera].translation_m);
+            let near_px = CONTRADICTS_M * state.lens.fx_px / ahead_m.z.max(1e-3);
             match state.tag_off_px(camera, &corners_m, seen) {
-                Some(off_px) if off_px <= limit_px => sum += off_px * off_px,
+                Some(off_px) if off_px <= limit_px.max(near_px) => sum += off_px * off_px,
                 _ => contradicting += 1,
             }
         }
@@ -157,6 +173,8 @@ fn fit_of_tag(
     Some(TagResult { sightings, contradicting, corners_m, rms_px, held_out })
 }
 
+/// By a pixel in each image. [m]
+const MOST_BY_PIXEL_M: f64 = 0.03;
 /// Tags near each other are off together, where the walk between them drifted: so many count as fewer, by half. Without
 /// it, scales of recorded captures were off by 0.5 to 3 sigmas.
 const TOGETHER: f64 = 1.5;
@@ -164,3 +182,5 @@ const TOGETHER: f64 = 1.5;
 const OUTLIER_SIGMAS: f64 = 3.0;
 /// A rolling shutter and blur move corners by less than this; what is somewhere else is farther off. [px]
 const CONTRADICTS_PX: f64 = 4.0;
+/// Of good captures, places are off by less; those that are mistaken for others, by far more. [m]
+const CONTRADICTS_M: f64 = 0.05;

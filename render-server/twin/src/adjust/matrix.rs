@@ -18,10 +18,6 @@ impl Symmetric {
         Self { size, lower: vec![0.0; size * (size + 1) / 2] }
     }
 
-    pub(super) fn size(&self) -> usize {
-        self.size
-    }
-
     /// Returns an element of the diagonal.
     pub(super) fn diagonal(&self, i: usize) -> f64 {
         self.lower[i * (i + 1) / 2 + i]

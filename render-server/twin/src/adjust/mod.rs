@@ -13,6 +13,7 @@ mod known;
 mod matrix;
 mod normal;
 mod project;
+mod rolling;
 mod solve;
 mod start;
 mod state;
@@ -32,15 +33,17 @@ pub use capture::{Capture, CaptureError, Image, Place, Sighting, Tag, TagSightin
 /// How to adjust.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Options {
-    /// Whether focal length, k1 and k2 are found too: not for a lens that was calibrated.
+    /// Whether focal length, k1, k2 and principal point are found too: not for a lens that was calibrated.
     pub refine_lens: bool,
     /// Whether tags are held out, which takes about as long again for each of a few parts.
     pub hold_out: bool,
+    /// Whether rows may have been exposed one after the other: by images whose times are true.
+    pub rolling: bool,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { refine_lens: true, hold_out: true }
+        Self { refine_lens: true, hold_out: true, rolling: true }
     }
 }
 
@@ -53,7 +56,9 @@ pub struct Adjusted {
     pub world_from_scene: Similarity,
     /// The lens.
     pub lens: Intrinsics,
-    /// Poses, in the order of the images. [m, world]
+    /// How long it took to expose all rows of an image; `None` if that was not asked.
+    pub readout: Option<Readout>,
+    /// Poses, of an image's middle row, in the order of the images. [m, world]
     pub world_from_cam: Vec<Pose<World, Cam>>,
     /// Points, in the order of the capture's. [m, world]
     pub points_m: Vec<DVec3>,
@@ -87,6 +92,15 @@ pub struct Known {
     pub place: bool,
 }
 
+/// How long rows take.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Readout {
+    /// From the first row's exposure to the last one's; negative of a phone held upside down. [s]
+    pub seconds: f64,
+    /// One sigma. [s]
+    pub sigma_s: f64,
+}
+
 /// How a tag fits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TagResult {
@@ -107,6 +121,8 @@ pub struct TagResult {
 pub struct HeldOut {
     /// From where it was measured to be: its middle. `None` if that was not measured. [m]
     pub off_m: Option<f64>,
+    /// How far its middle may be off by a pixel in each image that saw it: much, where few saw it, or from one side. [m]
+    pub by_pixel_m: f64,
     /// Its edges, as a share of what they were measured to be, less 1.
     pub size_error: f64,
     /// How far it is from where images saw it, root mean square. [px]

@@ -7,8 +7,9 @@ use rayon::prelude::*;
 use super::capture::Capture;
 use super::matrix::{Symmetric, inverse};
 use super::project::{LENS, Projected};
+use super::rolling::{READOUT_S, Slopes};
 use super::solve::{INSET_PX, Problem, weight};
-use super::state::{Slopes, State, TagPlace, inwards, slopes};
+use super::state::{State, TagPlace, inwards};
 
 /// Matrix and gradient, and what it all costs.
 pub(super) struct Normal {
@@ -16,11 +17,18 @@ pub(super) struct Normal {
     pub(super) gradient: Vec<f64>,
 }
 
+/// What all images share: the lens's numbers, and the readout of their rows.
+pub(super) const SHARED: usize = LENS + 1;
+
 /// Where the unknowns stand.
 #[derive(Clone, Debug)]
 pub(super) struct Layout {
-    /// `None` if the lens is given.
-    pub(super) lens: Option<usize>,
+    /// Unknowns of a camera: place, turn, and the bend of one whose shutter rolls.
+    pub(super) camera: usize,
+    /// `None` if all of it is given.
+    pub(super) shared: Option<usize>,
+    /// Which of it is found.
+    free: [bool; SHARED],
     /// `None` if there are no tags.
     pub(super) inset: Option<usize>,
     /// Of each tag; `None` of one that is not to be found.
@@ -29,10 +37,12 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    pub(super) fn new(state: &State, refine_lens: bool) -> Self {
-        let mut size = 6 * state.cameras.len();
-        let lens = refine_lens.then_some(size);
-        size += if refine_lens { LENS } else { 0 };
+    pub(super) fn new(state: &State, refine_lens: bool, rolling: bool) -> Self {
+        let camera = if rolling { ROLLING } else { STILL };
+        let mut size = camera * state.cameras.len();
+        let free = std::array::from_fn(|i| if i < LENS { refine_lens } else { rolling });
+        let shared = (refine_lens || rolling).then_some(size);
+        size += if shared.is_some() { SHARED } else { 0 };
         let has_tags = state.tags.iter().any(|tag| !matches!(tag, TagPlace::Nowhere));
         let inset = has_tags.then_some(size);
         size += usize::from(has_tags);
@@ -43,7 +53,25 @@ impl Layout {
             })
         });
         let tags = tags.collect();
-        Self { lens, inset, tags, size }
+        Self { camera, shared, free, inset, tags, size }
+    }
+
+    /// Returns where the readout stands, if it is found.
+    pub(super) fn readout(&self) -> Option<usize> {
+        self.shared.filter(|_| self.free[LENS]).map(|at| at + LENS)
+    }
+
+    /// Returns where the principal point stands, if it is found.
+    pub(super) fn middle(&self) -> Vec<usize> {
+        let at = self.shared.filter(|_| self.free[LENS - 1]);
+        at.map_or(Vec::new(), |at| vec![at + LENS - 2, at + LENS - 1])
+    }
+
+    /// Returns derivatives by what is shared, none by what is given.
+    fn by_shared(&self, by_lens: [DVec2; LENS], by_readout: DVec2) -> [DVec2; SHARED] {
+        let mut by = std::array::from_fn(|i| if i < LENS { by_lens[i] } else { by_readout });
+        by.iter_mut().zip(self.free).filter(|(_, free)| !free).for_each(|(d, _)| *d = DVec2::ZERO);
+        by
     }
 
     /// Returns it without the unknowns of some tags.
@@ -91,36 +119,45 @@ impl Normal {
 }
 
 /// One sighting of a point, with its derivatives times the root of its weight.
-struct Seen {
+struct Seen<const N: usize> {
     camera: usize,
-    by_camera: [DVec2; 6],
-    by_lens: [DVec2; LENS],
+    by_camera: [DVec2; N],
+    by_shared: [DVec2; SHARED],
     by_point: [DVec2; 3],
     residual: DVec2,
 }
 
 /// A point's own part of the equations.
-struct PointPart {
+struct PointPart<const N: usize> {
     inverse: DMat3,
     gradient: DVec3,
-    seen: Vec<Seen>,
+    seen: Vec<Seen<N>>,
 }
 
 /// Returns it; `None` where its sightings do not place it, or it is seen by fewer than two.
-fn part(problem: &Problem, state: &State, point: usize, damping: f64) -> Option<PointPart> {
+fn part<const N: usize>(
+    problem: &Problem,
+    state: &State,
+    point: usize,
+    damping: f64,
+) -> Option<PointPart<N>> {
     let sightings = problem.sightings(point);
     let mut seen = Vec::with_capacity(sightings.len());
     let (mut matrix, mut gradient) = (DMat3::ZERO, DVec3::ZERO);
     for &(camera, pixel) in sightings {
-        let Some((projected, p_cam)) = state.see(camera, state.points[point]) else { continue };
+        let Some((projected, in_row)) = state.see(camera, state.points[point], pixel) else {
+            continue;
+        };
         let residual = projected.pixel - pixel;
         let root = problem.noise.point_weight(residual).sqrt();
         let Projected { by_point, by_lens, .. } = projected;
-        let Slopes { by_camera, by_point } = slopes(&state.cameras[camera], &by_point, p_cam);
+        let Slopes { by_camera, by_point, by_readout } =
+            in_row.slopes(&state.cameras[camera], &by_point);
+        let by_shared = problem.layout.by_shared(by_lens, by_readout);
         let one = Seen {
             camera,
-            by_camera: by_camera.map(|d| d * root),
-            by_lens: by_lens.map(|d| d * root),
+            by_camera: std::array::from_fn(|i| by_camera[i] * root),
+            by_shared: by_shared.map(|d| d * root),
             by_point: by_point.map(|d| d * root),
             residual: residual * root,
         };
@@ -156,15 +193,17 @@ fn outer<const R: usize, const C: usize>(a: &[DVec2; R], b: &[DVec2; C]) -> [[f6
 /// Returns the normal equations at a state, points eliminated with this damping of their own.
 pub(super) fn normal(problem: &Problem, state: &State, damping: f64) -> Normal {
     let layout = &problem.layout;
+    let add = if layout.camera == STILL { add_point::<STILL> } else { add_point::<ROLLING> };
     // Parts whose number does not depend on threads: sums are the same on any machine.
-    let size = state.points.len().div_ceil(PARTS).max(1);
-    let parts: Vec<Normal> = (0..PARTS)
+    let parts = (PARTS_BYTES / (4 * layout.size * layout.size).max(1)).clamp(1, PARTS);
+    let size = state.points.len().div_ceil(parts).max(1);
+    let parts: Vec<Normal> = (0..parts)
         .into_par_iter()
         .map(|part| {
             let mut sum = Normal::zero(layout.size);
             let end = ((part + 1) * size).min(state.points.len());
             for point in (part * size).min(end)..end {
-                add_point(&mut sum, problem, state, point, damping);
+                add(&mut sum, problem, state, point, damping);
             }
             sum
         })
@@ -179,11 +218,17 @@ pub(super) fn normal(problem: &Problem, state: &State, damping: f64) -> Normal {
     sum
 }
 
-fn add_point(sum: &mut Normal, problem: &Problem, state: &State, point: usize, damping: f64) {
-    let Some(part) = part(problem, state, point, damping) else { return };
-    let lens = problem.layout.lens;
-    let mut lens_across = [DVec3::ZERO; LENS];
-    let crossed: Vec<([DVec3; 6], [DVec3; 6])> = part
+fn add_point<const N: usize>(
+    sum: &mut Normal,
+    problem: &Problem,
+    state: &State,
+    point: usize,
+    damping: f64,
+) {
+    let Some(part) = part::<N>(problem, state, point, damping) else { return };
+    let shared = problem.layout.shared;
+    let mut shared_across = [DVec3::ZERO; SHARED];
+    let crossed: Vec<([DVec3; N], [DVec3; N])> = part
         .seen
         .iter()
         .map(|seen| {
@@ -192,8 +237,8 @@ fn add_point(sum: &mut Normal, problem: &Problem, state: &State, point: usize, d
         })
         .collect();
     for (one, (_, solved)) in part.seen.iter().zip(&crossed) {
-        let row = 6 * one.camera;
-        for i in 0..6 {
+        let row = N * one.camera;
+        for i in 0..N {
             sum.gradient[row + i] +=
                 one.by_camera[i].dot(one.residual) - solved[i].dot(part.gradient);
         }
@@ -201,27 +246,27 @@ fn add_point(sum: &mut Normal, problem: &Problem, state: &State, point: usize, d
         for (other, (across_b, _)) in part.seen.iter().zip(&crossed) {
             // The lower triangle of the matrix.
             if other.camera <= one.camera {
-                sum.matrix.add_block(row, 6 * other.camera, &products(solved, across_b));
+                sum.matrix.add_block(row, N * other.camera, &products(solved, across_b));
             }
         }
-        if let Some(lens) = lens {
-            sum.matrix.add_block(lens, row, &outer(&one.by_lens, &one.by_camera));
-            sum.matrix.add_block(lens, lens, &outer(&one.by_lens, &one.by_lens));
-            for i in 0..LENS {
-                sum.gradient[lens + i] += one.by_lens[i].dot(one.residual);
+        if let Some(shared) = shared {
+            sum.matrix.add_block(shared, row, &outer(&one.by_shared, &one.by_camera));
+            sum.matrix.add_block(shared, shared, &outer(&one.by_shared, &one.by_shared));
+            for i in 0..SHARED {
+                sum.gradient[shared + i] += one.by_shared[i].dot(one.residual);
             }
-            let across = across(&one.by_lens, &one.by_point);
-            lens_across.iter_mut().zip(across).for_each(|(sum, row)| *sum += row);
+            let across = across(&one.by_shared, &one.by_point);
+            shared_across.iter_mut().zip(across).for_each(|(sum, row)| *sum += row);
         }
     }
-    if let Some(lens) = lens {
-        let solved = lens_across.map(|row| part.inverse * row);
-        for i in 0..LENS {
-            sum.gradient[lens + i] -= solved[i].dot(part.gradient);
+    if let Some(shared) = shared {
+        let solved = shared_across.map(|row| part.inverse * row);
+        for i in 0..SHARED {
+            sum.gradient[shared + i] -= solved[i].dot(part.gradient);
         }
-        sum.matrix.add_block(lens, lens, &products(&solved, &lens_across));
+        sum.matrix.add_block(shared, shared, &products(&solved, &shared_across));
         for (one, (across, _)) in part.seen.iter().zip(&crossed) {
-            sum.matrix.add_block(lens, 6 * one.camera, &products(&solved, across));
+            sum.matrix.add_block(shared, N * one.camera, &products(&solved, across));
         }
     }
 }
@@ -232,10 +277,11 @@ fn add_tags(sum: &mut Normal, problem: &Problem, state: &State) {
         let off_px = state.tag_off_px(camera, &corners_m, seen);
         let weight = problem.noise.tag_weight(off_px.unwrap_or(f64::MAX));
         for (k, (&corner_m, &pixel)) in corners_m.iter().zip(&seen.corners_px).enumerate() {
-            let Some((projected, p_cam)) = state.see(camera, corner_m) else { continue };
             let inwards = inwards(seen)[k];
+            let Some((projected, in_row)) = state.see(camera, corner_m, pixel) else { continue };
             let residual = projected.pixel + inwards * state.inset_px - pixel;
-            let by = slopes(&state.cameras[camera], &projected.by_point, p_cam);
+            let by = in_row.slopes(&state.cameras[camera], &projected.by_point);
+            let by_shared = problem.layout.by_shared(projected.by_lens, by.by_readout);
             let by_tag = match state.tags[seen.tag] {
                 TagPlace::Found(_, q) => {
                     let corner = problem.capture.square_m(seen.tag)[k];
@@ -250,11 +296,12 @@ fn add_tags(sum: &mut Normal, problem: &Problem, state: &State) {
             };
             for axis in 0..2 {
                 let by_camera = by.by_camera.map(|d| d[axis]);
-                let by_lens = projected.by_lens.map(|d| d[axis]);
+                let by_shared = by_shared.map(|d| d[axis]);
                 let by_tag = by_tag.map(|by| by.map(|d| d[axis]));
-                let mut blocks: Vec<(usize, &[f64])> = vec![(6 * camera, &by_camera)];
-                if let Some(lens) = problem.layout.lens {
-                    blocks.push((lens, &by_lens));
+                let mut blocks: Vec<(usize, &[f64])> =
+                    vec![(problem.layout.camera * camera, &by_camera[..problem.layout.camera])];
+                if let Some(shared) = problem.layout.shared {
+                    blocks.push((shared, &by_shared));
                 }
                 let by_inset = [inwards[axis]];
                 if let Some(inset) = problem.layout.inset {
@@ -273,6 +320,26 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
     if let Some(inset) = problem.layout.inset {
         sum.add(&[(inset, &[1.0])], state.inset_px, INSET_PX.powi(-2));
     }
+    for (i, free) in problem.layout.free.iter().enumerate() {
+        if let Some(shared) = problem.layout.shared.filter(|_| !free) {
+            // What is given stays.
+            sum.matrix.add(shared + i, shared + i, 1.0);
+        }
+    }
+    for (at, off_px) in problem.layout.middle().into_iter().zip(state.off_middle_px().to_array()) {
+        let sigma_px = state.middle_sigma_px();
+        sum.add(&[(at, &[1.0])], off_px, sigma_px.powi(-2));
+    }
+    if let Some(readout) = problem.layout.readout() {
+        sum.add(&[(readout, &[1.0])], state.rolling.readout_s, READOUT_S.powi(-2));
+        for (camera, bend_rad) in state.rolling.bends_rad.iter().enumerate() {
+            for axis in 0..3 {
+                let at = problem.layout.camera * camera + STILL + axis;
+                sum.add(&[(at, &[1.0])], bend_rad[axis], problem.noise.bend_rad.powi(-2));
+            }
+        }
+    }
+    let stride = problem.layout.camera;
     for (camera, (image, pose)) in capture.images.iter().zip(&state.cameras).enumerate() {
         if let Some(place) = image.place {
             let lever = capture.tracked_in_cam_m;
@@ -283,7 +350,7 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
                 let mut by = [0.0; 6];
                 by[axis] = 1.0;
                 (0..3).for_each(|k| by[3 + k] = turn[k][axis]);
-                sum.add(&[(6 * camera, &by)], residual_m[axis], weight);
+                sum.add(&[(stride * camera, &by)], residual_m[axis], weight);
             }
         }
         if let Some(up) = image.up {
@@ -293,7 +360,7 @@ fn add_priors(sum: &mut Normal, capture: &Capture, problem: &Problem, state: &St
             for axis in 0..2 {
                 let mut by = [0.0; 6];
                 (0..3).for_each(|k| by[3 + k] = turn[k][axis]);
-                sum.add(&[(6 * camera, &by)], residual[axis], weight);
+                sum.add(&[(stride * camera, &by)], residual[axis], weight);
             }
         }
     }
@@ -306,26 +373,45 @@ pub(super) fn points_step(
     change: &[f64],
     damping: f64,
 ) -> Vec<DVec3> {
-    let step = |point: usize| {
-        let Some(part) = part(problem, state, point, damping) else { return DVec3::ZERO };
-        let mut right = part.gradient;
-        for seen in &part.seen {
-            let mut off = DVec2::ZERO;
-            for (d, by) in seen.by_camera.iter().zip(&change[6 * seen.camera..]) {
-                off += *d * *by;
-            }
-            if let Some(lens) = problem.layout.lens {
-                for (d, by) in seen.by_lens.iter().zip(&change[lens..]) {
-                    off += *d * *by;
-                }
-            }
-            let [x, y, z] = seen.by_point;
-            right += DVec3::new(x.dot(off), y.dot(off), z.dot(off));
-        }
-        -(part.inverse * right)
-    };
-    (0..state.points.len()).into_par_iter().map(step).collect()
+    let step =
+        if problem.layout.camera == STILL { point_step::<STILL> } else { point_step::<ROLLING> };
+    (0..state.points.len())
+        .into_par_iter()
+        .map(|point| step(problem, state, point, change, damping))
+        .collect()
 }
 
-/// More threads than any machine of a lab, less memory than the images took: each has a matrix.
+fn point_step<const N: usize>(
+    problem: &Problem,
+    state: &State,
+    point: usize,
+    change: &[f64],
+    damping: f64,
+) -> DVec3 {
+    let Some(part) = part::<N>(problem, state, point, damping) else { return DVec3::ZERO };
+    let mut right = part.gradient;
+    for seen in &part.seen {
+        let mut off = DVec2::ZERO;
+        for (d, by) in seen.by_camera.iter().zip(&change[N * seen.camera..]) {
+            off += *d * *by;
+        }
+        if let Some(shared) = problem.layout.shared {
+            for (d, by) in seen.by_shared.iter().zip(&change[shared..]) {
+                off += *d * *by;
+            }
+        }
+        let [x, y, z] = seen.by_point;
+        right += DVec3::new(x.dot(off), y.dot(off), z.dot(off));
+    }
+    -(part.inverse * right)
+}
+
+/// Place and turn.
+const STILL: usize = 6;
+/// And a bend.
+const ROLLING: usize = 9;
+
+/// More threads than most machines of a lab have: each has a matrix of half of size^2 numbers.
 const PARTS: usize = 16;
+/// Of all matrices: 300 images take 30 MB each.
+const PARTS_BYTES: usize = 1 << 29;

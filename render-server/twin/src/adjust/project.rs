@@ -3,9 +3,10 @@
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
-/// Numbers of a lens that are found: the logarithm of both focal lengths, the first two radial coefficients. A walk does
-/// not tell the principal point from a turn of the camera.
-pub(super) const LENS: usize = 3;
+/// Numbers of a lens that are found: the logarithm of both focal lengths, the first two radial coefficients, the principal
+/// point. That is hard to tell from a turn of the camera; held where structure from motion supposes it, in the image's
+/// middle, it passes for a shutter that rolls slower or faster.
+pub(super) const LENS: usize = 5;
 
 /// A point in an image.
 pub(super) struct Projected {
@@ -43,14 +44,14 @@ pub(super) fn project(k: &Intrinsics, reach: f64, p_cam: DVec3) -> Option<Projec
             [3, 5].map(|power| unit * r.atan().powi(power))
         }
     };
-    let by_lens = [bent * focal, radial[0] * focal, radial[1] * focal];
+    let by_lens = [bent * focal, radial[0] * focal, radial[1] * focal, DVec2::X, DVec2::Y];
     let pixel = bent * focal + DVec2::new(k.cx_px, k.cy_px);
     pixel.is_finite().then_some(Projected { pixel, by_point, by_lens })
 }
 
 /// Returns the lens with its numbers changed.
 pub(super) fn moved(k: &Intrinsics, change: &[f64; LENS]) -> Intrinsics {
-    let [zoom, by1, by2] = *change;
+    let [zoom, by1, by2, x_px, y_px] = *change;
     let distortion = match k.distortion {
         Distortion::None => {
             Distortion::BrownConrady { k1: by1, k2: by2, p1: 0.0, p2: 0.0, k3: 0.0 }
@@ -63,7 +64,8 @@ pub(super) fn moved(k: &Intrinsics, change: &[f64; LENS]) -> Intrinsics {
         }
     };
     let (fx_px, fy_px) = (k.fx_px * zoom.exp(), k.fy_px * zoom.exp());
-    Intrinsics { fx_px, fy_px, distortion, ..*k }
+    let (cx_px, cy_px) = (k.cx_px + x_px, k.cy_px + y_px);
+    Intrinsics { fx_px, fy_px, cx_px, cy_px, distortion, ..*k }
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use super::capture::{Capture, TagSighting};
 use super::matrix::Factor;
 use super::normal::{Layout, Normal, normal, points_step};
 use super::project::{LENS, moved};
+use super::rolling::{MOST_READOUT_S, READOUT_S};
 use super::state::{State, TagPlace};
 use super::{AdjustError, Known, Options};
 
@@ -32,6 +33,8 @@ pub(super) struct Noise {
     pub(super) tag_px: f64,
     /// By how much places are worse than they claim; at least 1.
     pub(super) place_factor: f64,
+    /// What a camera turns from the first row to the last, beyond what its neighbours tell. [rad]
+    pub(super) bend_rad: f64,
 }
 
 /// What was found.
@@ -44,7 +47,10 @@ pub(super) struct Solved {
 }
 
 impl Noise {
-    const START: Self = Self { point_px: 1.0, tag_px: 0.5, place_factor: 1.0 };
+    fn start(state: &State) -> Self {
+        let bend_rad = state.rolling.bend_sigma_rad();
+        Self { point_px: 1.0, tag_px: 0.5, place_factor: 1.0, bend_rad }
+    }
 
     /// Returns it, with sigmas that are at most a few times smaller than the last.
     fn no_sharper_than(self, last: Self) -> Self {
@@ -52,6 +58,7 @@ impl Noise {
             point_px: self.point_px.max(SHARPER * last.point_px),
             tag_px: self.tag_px.max(SHARPER * last.tag_px),
             place_factor: self.place_factor.max(SHARPER * last.place_factor),
+            bend_rad: self.bend_rad,
         }
     }
 
@@ -60,6 +67,7 @@ impl Noise {
         near(self.point_px, last.point_px)
             && near(self.tag_px, last.tag_px)
             && near(self.place_factor, last.place_factor)
+            && near(self.bend_rad, last.bend_rad)
     }
 
     /// Returns 1 / sigma^2, less for what is far off. [1/px^2]
@@ -92,6 +100,7 @@ impl<'a> Problem<'a> {
         capture: &'a Capture,
         state: &State,
         refine_lens: bool,
+        rolling: bool,
         without: &[usize],
     ) -> Self {
         let mut starts = vec![0usize; state.points.len() + 1];
@@ -115,8 +124,8 @@ impl<'a> Problem<'a> {
             tags.extend(image.tags.iter().filter(counts).map(|seen| (camera, seen)));
         }
         // A tag that nothing sees any more has no place to be found.
-        let layout = Layout::new(state, refine_lens).without(without);
-        Self { capture, layout, noise: Noise::START, seen, starts, tags }
+        let layout = Layout::new(state, refine_lens, rolling).without(without);
+        Self { capture, layout, noise: Noise::start(state), seen, starts, tags }
     }
 
     pub(super) fn sightings(&self, point: usize) -> &[(usize, DVec2)] {
@@ -140,6 +149,14 @@ impl<'a> Problem<'a> {
             .collect();
         let mut sum: f64 = points.iter().sum();
         sum += (state.inset_px / INSET_PX).powi(2);
+        if !self.layout.middle().is_empty() {
+            sum += (state.off_middle_px() / state.middle_sigma_px()).length_squared();
+        }
+        if self.layout.readout().is_some() {
+            sum += (state.rolling.readout_s / READOUT_S).powi(2);
+            let bends = state.rolling.bends_rad.iter();
+            sum += bends.map(|rad| (*rad / self.noise.bend_rad).length_squared()).sum::<f64>();
+        }
         for &(camera, seen) in &self.tags {
             let corners = state.corners_m(self.capture, seen.tag);
             let off = corners.and_then(|corners| state.tag_off_px(camera, &corners, seen));
@@ -186,6 +203,7 @@ impl<'a> Problem<'a> {
             point_px: median(points).map_or(1.0, |px| (px / 1.18).max(LEAST_PX)),
             tag_px: median(tags).map_or(0.5, |px| (px / 1.35).max(LEAST_PX)),
             place_factor: median(places).map_or(1.0, |share| (share / 1.54).max(1.0)),
+            bend_rad: state.rolling.bend_sigma_rad(),
         }
     }
 }
@@ -197,11 +215,12 @@ pub(super) fn solve(
     options: Options,
     known: Known,
 ) -> Result<Solved, AdjustError> {
-    let mut problem = Problem::new(capture, state, options.refine_lens, &[]);
+    let mut problem = Problem::new(capture, state, options.refine_lens, options.rolling, &[]);
     let mut rounds = 0;
     // What weighs how much is known only once it fits; weights that sharpen at once would leave behind what is not there
     // yet.
     for _ in 0..MAX_NOISES {
+        state.rolling.follow(capture, &state.cameras);
         rounds += iterate(&problem, state, known, 1e-5)?;
         let last = problem.noise;
         problem.noise = problem.noise_of(state).no_sharper_than(last);
@@ -210,7 +229,8 @@ pub(super) fn solve(
         }
     }
     rounds += iterate(&problem, state, known, 1e-8)?;
-    let Normal { mut matrix, .. } = held(normal(&problem, state, ALMOST_NONE), state, known);
+    let Normal { mut matrix, .. } =
+        held(normal(&problem, state, ALMOST_NONE), state, &problem.layout, known);
     matrix.damp(ALMOST_NONE);
     let factor = matrix.factor().ok_or(AdjustError::Undetermined)?;
     Ok(Solved { noise: problem.noise, rounds, layout: problem.layout, factor })
@@ -225,7 +245,10 @@ pub(super) fn settle(
     noise: Noise,
     without: &[usize],
 ) -> Result<usize, AdjustError> {
-    let problem = Problem { noise, ..Problem::new(capture, state, options.refine_lens, without) };
+    let problem = Problem {
+        noise,
+        ..Problem::new(capture, state, options.refine_lens, options.rolling, without)
+    };
     iterate(&problem, state, known, 1e-6)
 }
 
@@ -239,7 +262,8 @@ fn iterate(
     let mut cost = problem.cost(state);
     let mut damping = 1e-4;
     for round in 1..=MAX_ROUNDS {
-        let Normal { matrix, gradient } = held(normal(problem, state, damping), state, known);
+        let Normal { matrix, gradient } =
+            held(normal(problem, state, damping), state, &problem.layout, known);
         let mut damped = matrix;
         damped.damp(damping);
         let tried = damped.factor().map(|factor| {
@@ -276,27 +300,29 @@ fn iterate(
 }
 
 /// Adds what nothing tells: all may be shifted, turned and scaled at no cost, and is held where it is.
-fn held(mut normal: Normal, state: &State, known: Known) -> Normal {
+fn held(mut normal: Normal, state: &State, layout: &Layout, known: Known) -> Normal {
     if known.place {
         return normal;
     }
-    let mean: f64 = (0..normal.matrix.size()).map(|i| normal.matrix.diagonal(i)).sum();
-    for direction in free_directions(state, normal.matrix.size(), known) {
+    // Of places and turns: what else there is may be held by far more.
+    let cameras = (0..state.cameras.len()).map(|camera| layout.camera * camera);
+    let mean: f64 = cameras.flat_map(|at| at..at + 6).map(|i| normal.matrix.diagonal(i)).sum();
+    for direction in free_directions(state, layout, known) {
         let length2: f64 = direction.iter().map(|x| x * x).sum();
-        normal.hold(&direction, mean / length2 / normal.matrix.size() as f64);
+        normal.hold(&direction, mean / length2 / (6 * state.cameras.len()) as f64);
     }
     normal
 }
 
 /// Returns changes of all unknowns that change nothing in the images.
-fn free_directions(state: &State, size: usize, known: Known) -> Vec<Vec<f64>> {
+fn free_directions(state: &State, layout: &Layout, known: Known) -> Vec<Vec<f64>> {
     let middle = middle_m(state);
     let make = |shift: &dyn Fn(DVec3) -> DVec3, turn: DVec3| {
-        let mut direction = vec![0.0; size];
-        for (pose, block) in state.cameras.iter().zip(direction.chunks_mut(6)) {
+        let mut direction = vec![0.0; layout.size];
+        for (pose, block) in state.cameras.iter().zip(direction.chunks_mut(layout.camera)) {
             let by = shift(pose.translation_m - middle);
             let turned = pose.rotation.conjugate() * turn;
-            block.copy_from_slice(&[by.x, by.y, by.z, turned.x, turned.y, turned.z]);
+            block[..6].copy_from_slice(&[by.x, by.y, by.z, turned.x, turned.y, turned.z]);
         }
         direction
     };
@@ -319,25 +345,36 @@ pub(super) fn middle_m(state: &State) -> DVec3 {
 pub(super) fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[DVec3]) -> State {
     let turned =
         |q: DQuat, by: &[f64]| (q * DQuat::from_scaled_axis(DVec3::from_slice(by))).normalize();
-    let cameras = state.cameras.iter().zip(change.chunks(6)).map(|(pose, by)| {
-        Pose::new(pose.translation_m + DVec3::from_slice(by), turned(pose.rotation, &by[3..]))
+    let cameras = state.cameras.iter().zip(change.chunks(layout.camera)).map(|(pose, by)| {
+        Pose::new(pose.translation_m + DVec3::from_slice(by), turned(pose.rotation, &by[3..6]))
     });
     let tags = state.tags.iter().zip(&layout.tags).map(|(tag, at)| match (*tag, *at) {
-        (TagPlace::Found(t, q), Some(at)) => {
-            TagPlace::Found(t + DVec3::from_slice(&change[at..]), turned(q, &change[at + 3..]))
-        }
+        (TagPlace::Found(t, q), Some(at)) => TagPlace::Found(
+            t + DVec3::from_slice(&change[at..]),
+            turned(q, &change[at + 3..at + 6]),
+        ),
         (tag, _) => tag,
     });
-    let lens = layout.lens.map_or(state.lens, |at| {
+    let mut rolling = state.rolling.clone();
+    if let Some(at) = layout.readout() {
+        let next_s = rolling.readout_s + change[at];
+        rolling.readout_s = next_s.clamp(-MOST_READOUT_S, MOST_READOUT_S);
+        for (bend, by) in rolling.bends_rad.iter_mut().zip(change.chunks(layout.camera)) {
+            *bend += DVec3::from_slice(&by[6..]);
+        }
+    }
+    let lens = layout.shared.map_or(state.lens, |at| {
         let by: [f64; LENS] = std::array::from_fn(|i| change[at + i]);
         moved(&state.lens, &by)
     });
     State {
         lens,
         cameras: cameras.collect(),
+        rolling,
         points: state.points.iter().zip(points).map(|(p, by)| *p + *by).collect(),
         tags: tags.collect(),
         inset_px: state.inset_px + layout.inset.map_or(0.0, |at| change[at]),
+        middle_px: state.middle_px,
         reach: state.reach,
     }
 }

@@ -1,10 +1,11 @@
 //! Everything that is found, and how far sightings are from it.
 
-use glam::{DMat3, DQuat, DVec2, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 use super::capture::{Capture, TagSighting};
 use super::project::{Projected, project};
+use super::rolling::{InRow, Rolling};
 use super::start::Start;
 
 /// The unknowns, in metres.
@@ -14,9 +15,12 @@ pub(super) struct State {
     /// World from camera.
     pub(super) cameras: Vec<Pose<World, Cam>>,
     pub(super) points: Vec<DVec3>,
+    pub(super) rolling: Rolling,
     pub(super) tags: Vec<TagPlace>,
     /// How far inside a tag its corners are found: white bleeds into black, in lenses and in sensors. [px]
     pub(super) inset_px: f64,
+    /// The principal point that it began with. [px]
+    pub(super) middle_px: DVec2,
     /// Slopes beyond this are not seen.
     pub(super) reach: f64,
 }
@@ -44,8 +48,10 @@ impl State {
             lens: capture.lens,
             cameras: cameras.collect(),
             points: capture.points.iter().map(|&p| to.transform_point(p)).collect(),
+            rolling: Rolling::new(&capture.lens, capture.images.len()),
             tags: start.tags.clone(),
             inset_px: 0.0,
+            middle_px: DVec2::new(capture.lens.cx_px, capture.lens.cy_px),
             reach: reach(&capture.lens),
         }
     }
@@ -59,16 +65,36 @@ impl State {
         }
     }
 
-    /// Returns where a point of the world appears in an image, and its place in the camera.
-    pub(super) fn see(&self, camera: usize, p_world: DVec3) -> Option<(Projected, DVec3)> {
-        let pose = &self.cameras[camera];
-        let p_cam = pose.rotation.conjugate() * (p_world - pose.translation_m);
-        Some((project(&self.lens, self.reach, p_cam)?, p_cam))
+    /// Returns where a point of the world appears in an image, and its place in the camera when the row of `seen_px` is
+    /// exposed.
+    pub(super) fn see(
+        &self,
+        camera: usize,
+        p_world: DVec3,
+        seen_px: DVec2,
+    ) -> Option<(Projected, InRow)> {
+        let seen = self.rolling.row(camera, seen_px).see(&self.cameras[camera], p_world);
+        Some((project(&self.lens, self.reach, seen.p_cam)?, seen))
+    }
+
+    /// Returns how far the principal point has come from where it began.
+    pub(super) fn off_middle_px(&self) -> DVec2 {
+        DVec2::new(self.lens.cx_px, self.lens.cy_px) - self.middle_px
+    }
+
+    /// Returns one sigma of that: phones' are off the middle by up to a hundredth of the image.
+    pub(super) fn middle_sigma_px(&self) -> f64 {
+        0.01 * f64::from(self.lens.width_px)
+    }
+
+    /// Returns a camera's pose when the row of a pixel is exposed.
+    pub(super) fn pose_at(&self, camera: usize, seen_px: DVec2) -> Pose<World, Cam> {
+        self.rolling.row(camera, seen_px).pose(&self.cameras[camera])
     }
 
     /// Returns how far a point is from where an image saw it; `None` where it cannot be seen. [px]
     pub(super) fn off_px(&self, camera: usize, p_world: DVec3, pixel: DVec2) -> Option<DVec2> {
-        Some(self.see(camera, p_world)?.0.pixel - pixel)
+        Some(self.see(camera, p_world, pixel)?.0.pixel - pixel)
     }
 
     /// Returns how far a tag's corners are from where an image saw them, root mean square. [px]
@@ -81,7 +107,8 @@ impl State {
         let mut sum = 0.0;
         for (k, &corner) in corners_m.iter().enumerate() {
             let pixel = seen.corners_px[k] - inwards(seen)[k] * self.inset_px;
-            sum += self.off_px(camera, corner, pixel)?.length_squared();
+            let seen = self.see(camera, corner, seen.corners_px[k])?.0;
+            sum += seen.pixel.distance_squared(pixel);
         }
         Some((sum / 4.0).sqrt())
     }
@@ -91,23 +118,6 @@ impl State {
 pub(super) fn inwards(seen: &TagSighting) -> [DVec2; 4] {
     let middle = seen.corners_px.iter().sum::<DVec2>() / 4.0;
     seen.corners_px.map(|corner| (middle - corner).normalize_or_zero())
-}
-
-/// Derivatives of a pixel by a camera's place and its turn about its own axes, by the point, and by the lens.
-pub(super) struct Slopes {
-    pub(super) by_camera: [DVec2; 6],
-    pub(super) by_point: [DVec2; 3],
-}
-
-/// Returns them, given the derivatives by the point in the camera.
-pub(super) fn slopes(camera: &Pose<World, Cam>, by_cam: &[DVec2; 3], p_cam: DVec3) -> Slopes {
-    let through = |v: DVec3| by_cam[0] * v.x + by_cam[1] * v.y + by_cam[2] * v.z;
-    let cam_from_world = DMat3::from_quat(camera.rotation.conjugate());
-    let by_point = DVec3::AXES.map(|axis| through(cam_from_world * axis));
-    // The camera turned by a small w sees the point turned by -w: p + p x w.
-    let by_turn = DVec3::AXES.map(|axis| through(p_cam.cross(axis)));
-    let by_camera = [-by_point[0], -by_point[1], -by_point[2], by_turn[0], by_turn[1], by_turn[2]];
-    Slopes { by_camera, by_point }
 }
 
 /// Returns the greatest slope that an image's corner has, with a margin for a lens that is still found; at most the

@@ -21,27 +21,59 @@ pub(crate) struct Hall {
 /// Half the hall's sides. [m]
 const HALF: DVec3 = DVec3::new(5.0, 3.0, 1.6);
 const EDGE_M: f64 = 0.3;
+const IMAGE_S: f64 = 0.5;
+const STEP_HZ: f64 = 1.8;
 
 /// Returns a hall; `noise_px` is that of sightings.
 pub(crate) fn hall(seed: u64, images: usize, points: usize, noise_px: f64) -> Hall {
+    filmed(seed, images, points, noise_px, Shutter { readout_s: 0.0, hand_rad: 0.0 })
+}
+
+/// How images of a hall are exposed, row after row.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Shutter {
+    pub(crate) readout_s: f64,
+    /// How far the hand nods and rolls at each step, faster than images show.
+    pub(crate) hand_rad: f64,
+}
+
+/// Returns a hall that a rolling shutter has filmed, two images a second.
+pub(crate) fn filmed(
+    seed: u64,
+    images: usize,
+    points: usize,
+    noise_px: f64,
+    shutter: Shutter,
+) -> Hall {
     let mut random = Random::new(seed);
     let lens = Intrinsics {
         distortion: Distortion::BrownConrady { k1: -0.06, k2: 0.02, p1: 0.0, p2: 0.0, k3: 0.0 },
         ..Intrinsics::from_horizontal_fov(640, 480, 1.2)
     };
-    let poses: Vec<Pose<World, Cam>> = (0..images)
-        .map(|image| {
-            let around = TAU * image as f64 / images as f64;
-            let at_m =
-                DVec3::new(1.8 * around.cos(), 0.9 * around.sin(), 0.1 * (5.0 * around).sin());
-            // Outwards, and a little ahead; x right, y down, z forward.
-            let yaw = around + 0.3 + 0.05 * f64::from(random.normal());
-            let ahead = DVec3::new(yaw.cos(), yaw.sin(), 0.1 * (3.0 * around).cos()).normalize();
-            let right = ahead.cross(DVec3::Z).normalize();
-            let axes = glam::DMat3::from_cols(right, ahead.cross(right), ahead);
-            Pose::new(at_m, DQuat::from_mat3(&axes).normalize())
-        })
-        .collect();
+    let wander: Vec<f64> = (0..images).map(|_| 0.05 * f64::from(random.normal())).collect();
+    let pose_at = |image: usize, after_s: f64| {
+        let at_s = IMAGE_S * image as f64 + after_s;
+        let around = TAU * at_s / (IMAGE_S * images as f64);
+        let at_m = DVec3::new(1.8 * around.cos(), 0.9 * around.sin(), 0.1 * (5.0 * around).sin());
+        // Outwards, and a little ahead; x right, y down, z forward.
+        let yaw = around + 0.3 + wander[image];
+        let ahead = DVec3::new(yaw.cos(), yaw.sin(), 0.1 * (3.0 * around).cos()).normalize();
+        let right = ahead.cross(DVec3::Z).normalize();
+        let axes = glam::DMat3::from_cols(right, ahead.cross(right), ahead);
+        let step = shutter.hand_rad * (TAU * STEP_HZ * at_s).sin();
+        let hand = DQuat::from_scaled_axis(DVec3::new(step, 0.0, -0.5 * step));
+        Pose::<World, Cam>::new(at_m, (DQuat::from_mat3(&axes) * hand).normalize())
+    };
+    let poses: Vec<Pose<World, Cam>> = (0..images).map(|image| pose_at(image, 0.0)).collect();
+    // The row that sees a point is that where it appears.
+    let see = |image: usize, p: DVec3| {
+        let mut pixel = see(&lens, &poses[image], p)?;
+        for _ in 0..if shutter.readout_s == 0.0 { 0 } else { 5 } {
+            let share = pixel.y / f64::from(lens.height_px) - 0.5;
+            pixel = see(&lens, &pose_at(image, share * shutter.readout_s), p)?;
+        }
+        Some(pixel)
+    };
     let on_wall = |random: &mut Random| {
         let mut p = DVec3::from_array(std::array::from_fn(|k| {
             f64::from(random.within(-1.0, 1.0)) * HALF[k]
@@ -85,7 +117,7 @@ pub(crate) fn hall(seed: u64, images: usize, points: usize, noise_px: f64) -> Ha
         };
         let mut image = Image {
             name: format!("{number:03}.jpg"),
-            at_s: 0.5 * number as f64,
+            at_s: IMAGE_S * number as f64,
             scene_from_cam: *pose,
             seen: Vec::new(),
             tags: Vec::new(),
@@ -93,14 +125,14 @@ pub(crate) fn hall(seed: u64, images: usize, points: usize, noise_px: f64) -> Ha
             up: None,
         };
         for (point, &p) in points.iter().enumerate() {
-            if let Some(pixel) = see(&lens, pose, p)
+            if let Some(pixel) = see(number, p)
                 && random.unit() < 0.8
             {
                 image.seen.push(Sighting { point, pixel: noisy(pixel, &mut random, noise_px) });
             }
         }
         for (tag, corners) in tags.iter().enumerate() {
-            let seen = corners.map(|corner| see(&lens, pose, corner));
+            let seen = corners.map(|corner| see(number, corner));
             if let [Some(a), Some(b), Some(c), Some(d)] = seen
                 && a.distance(c) > 25.0
             {

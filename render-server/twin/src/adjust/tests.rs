@@ -6,8 +6,8 @@ use vizflyt_protocol::geometry::{Distortion, Pose};
 use super::normal::normal;
 use super::solve::Problem;
 use super::start::start;
-use super::state::{State, TagPlace, slopes};
-use super::synthetic::{Hall, hall};
+use super::state::{State, TagPlace};
+use super::synthetic::{Hall, Shutter, filmed, hall};
 use super::*;
 use crate::align::points::{self, Pair};
 
@@ -136,6 +136,58 @@ fn without_anything_it_has_no_metres() {
     assert!(adjusted.points_rms_px < 0.4, "{}", adjusted.points_rms_px);
 }
 
+/// Rows that follow each other over a fiftieth of a second, held by a hand that nods: what no shutter that opens at once
+/// explains.
+#[test]
+fn a_rolling_shutter_is_found_and_moves_nothing() {
+    let shutter = Shutter { readout_s: 0.022, hand_rad: 0.015 };
+    for seed in [21, 22] {
+        let hall = filmed(seed, 36, 2500, 0.3, shutter).found(seed + 10, 0.01);
+        let off = |rolling| {
+            let adjusted =
+                adjust(&hall.capture, Options { rolling, ..Options::default() }).unwrap();
+            let (scale, _, off_m) = errors(&hall, &adjusted);
+            println!(
+                "rolling {rolling}: scale {scale:.5}, {:.1} mm, {:.2} px, readout {:?}, scale sigma {:.5}",
+                off_m * 1e3,
+                adjusted.points_rms_px,
+                adjusted.readout,
+                adjusted.scale_sigma.unwrap()
+            );
+            (adjusted, scale, off_m)
+        };
+        let (_, _, unmodelled_m) = off(false);
+        let (adjusted, scale, off_m) = off(true);
+        assert!(
+            unmodelled_m > 0.01 && off_m < 0.4 * unmodelled_m,
+            "{unmodelled_m} m, then {off_m}"
+        );
+        assert!(scale.abs() < 2e-3 && adjusted.points_rms_px < 0.5, "{scale}");
+        let Readout { seconds, sigma_s } = adjusted.readout.unwrap();
+        let off_s = (seconds - 0.022).abs();
+        assert!(off_s < 3.0 * sigma_s && sigma_s < 2e-3, "{seconds} {sigma_s}");
+    }
+}
+
+#[test]
+fn a_shutter_that_opens_at_once_is_found_to_do_so() {
+    for seed in 0..3 {
+        let shutter = Shutter { readout_s: 0.0, hand_rad: 0.02 };
+        let hall = filmed(seed, 36, 2500, 0.5, shutter).found(seed + 30, 0.01);
+        let off = |rolling| {
+            let adjusted =
+                adjust(&hall.capture, Options { rolling, ..Options::default() }).unwrap();
+            let (_, _, off_m) = errors(&hall, &adjusted);
+            (adjusted, off_m)
+        };
+        let ((_, without_m), (adjusted, off_m)) = (off(false), off(true));
+        let Readout { seconds, sigma_s } = adjusted.readout.unwrap();
+        println!("{:.2} mm, then {:.2}; {seconds} +- {sigma_s}", without_m * 1e3, off_m * 1e3);
+        assert!(seconds.abs() < 3.0 * sigma_s && sigma_s < 2e-3, "{seconds} {sigma_s}");
+        assert!(off_m < 1.1 * without_m + 5e-4, "{without_m} {off_m}");
+    }
+}
+
 #[test]
 fn the_same_on_any_number_of_threads() {
     let hall = hall(7, 20, 600, 0.5).found(8, 0.01);
@@ -173,16 +225,29 @@ fn what_cannot_be_meant_is_refused() {
 fn derivatives_by_poses_are_the_slopes_of_the_projection() {
     let hall = hall(11, 20, 300, 0.0);
     let (begin, _) = start(&hall.capture).unwrap();
-    let state = State::new(&hall.capture, &begin);
+    let mut state = State::new(&hall.capture, &begin);
+    state.rolling.readout_s = 0.03;
+    state.rolling.follow(&hall.capture, &state.cameras);
+    for (camera, bend) in state.rolling.bends_rad.iter_mut().enumerate() {
+        *bend = DVec3::new(0.01, -0.02, 0.015) * (1.0 + 0.1 * camera as f64);
+    }
     let h = 1e-6;
     for (camera, image) in hall.capture.images.iter().enumerate() {
         for seen in image.seen.iter().take(5) {
             let p = state.points[seen.point];
-            let (here, p_cam) = state.see(camera, p).unwrap();
-            let found = slopes(&state.cameras[camera], &here.by_point, p_cam);
+            let px = seen.pixel;
+            let (here, in_row) = state.see(camera, p, px).unwrap();
+            let found = in_row.slopes(&state.cameras[camera], &here.by_point);
+            let at_readout = |readout_s: f64| {
+                let mut state = state.clone();
+                state.rolling.readout_s = readout_s;
+                state.see(camera, p, px).unwrap().0.pixel
+            };
+            let slope = (at_readout(0.03 + h) - at_readout(0.03 - h)) / (2.0 * h);
+            assert!((slope - found.by_readout).length() < 1e-3, "{slope} {}", found.by_readout);
             for axis in 0..3 {
                 let by = DVec3::AXES[axis] * h;
-                let along = |p: DVec3| state.see(camera, p).unwrap().0.pixel;
+                let along = |p: DVec3| state.see(camera, p, px).unwrap().0.pixel;
                 let slope = (along(p + by) - along(p - by)) / (2.0 * h);
                 assert!((slope - found.by_point[axis]).length() < 1e-3);
                 let moved = |shift: DVec3, turn: DVec3| {
@@ -190,13 +255,20 @@ fn derivatives_by_poses_are_the_slopes_of_the_projection() {
                     let pose = &mut state.cameras[camera];
                     let q = pose.rotation * DQuat::from_scaled_axis(turn);
                     *pose = Pose::new(pose.translation_m + shift, q);
-                    state.see(camera, p).unwrap().0.pixel
+                    state.see(camera, p, px).unwrap().0.pixel
                 };
                 let zero = DVec3::ZERO;
                 let shift = (moved(by, zero) - moved(-by, zero)) / (2.0 * h);
                 assert!((shift - found.by_camera[axis]).length() < 1e-3);
                 let turn = (moved(zero, by) - moved(zero, -by)) / (2.0 * h);
                 assert!((turn - found.by_camera[3 + axis]).length() < 1e-3);
+                let bent = |bend: DVec3| {
+                    let mut state = state.clone();
+                    state.rolling.bends_rad[camera] += bend;
+                    state.see(camera, p, px).unwrap().0.pixel
+                };
+                let bend = (bent(by) - bent(-by)) / (2.0 * h);
+                assert!((bend - found.by_camera[6 + axis]).length() < 1e-3);
             }
         }
     }
@@ -222,13 +294,16 @@ fn the_gradient_is_the_slope_of_the_cost() {
     hall.capture.images.iter_mut().for_each(|image| image.seen.clear());
     let mut state = State::new(&hall.capture, &begin);
     state.inset_px = 0.2;
+    state.rolling.readout_s = 0.02;
+    state.rolling.follow(&hall.capture, &state.cameras);
+    state.rolling.bends_rad.iter_mut().for_each(|bend| *bend = DVec3::new(2e-3, -1e-3, 3e-3));
     for tag in &mut state.tags {
         if let TagPlace::Found(t, q) = tag {
             *t += DVec3::new(0.01, -0.02, 0.01);
             *q *= DQuat::from_scaled_axis(DVec3::new(0.05, 0.1, -0.1));
         }
     }
-    let problem = Problem::new(&hall.capture, &state, true, &[]);
+    let problem = Problem::new(&hall.capture, &state, true, true, &[]);
     let found = normal(&problem, &state, 0.0).gradient;
     assert!(problem.layout.tags.iter().any(Option::is_some));
     let no_points = vec![DVec3::ZERO; state.points.len()];

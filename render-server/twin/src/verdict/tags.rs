@@ -138,7 +138,22 @@ fn held_out(walk: &Walk<'_>, adjusted: &Adjusted, verdict: &mut Verdict) {
             100.0 * rms(&off_m),
             100.0 * off_m.iter().copied().fold(0.0, f64::max)
         );
-        let is_wrong = |held: &crate::adjust::HeldOut| held.off_m.is_some_and(|m| m > MOST_OFF_M);
+        let is_off = |held: &crate::adjust::HeldOut| held.off_m.is_some_and(|m| m > MOST_OFF_M);
+        // Seen flat, seldom or from one side, rays meet far from where they should.
+        let is_wrong = |held: &crate::adjust::HeldOut| {
+            let doubt_m = (DOUBT_PX * held.by_pixel_m).min(MOST_DOUBT_M);
+            is_off(held) && held.rms_px > MOST_OFF_PX && held.off_m.is_some_and(|m| m > doubt_m)
+        };
+        let unclear: Vec<&str> = results()
+            .filter(|(_, held)| is_off(held) && !is_wrong(held))
+            .map(|(tag, _)| walk.evidence.capture.tags[tag].name.as_str())
+            .collect();
+        if !unclear.is_empty() {
+            verdict.checked.push(format!(
+                "tags held out: {} were seen too seldom, or from too few sides, to say where they stand",
+                unclear.join(", ")
+            ));
+        }
         (line, results().filter(|(_, held)| is_wrong(held)).map(|(tag, _)| tag).collect())
     };
     verdict.checked.push(line.clone());
@@ -198,6 +213,13 @@ const PARALLEL: f64 = 0.09;
 const PASSES_BY: f64 = 0.05;
 /// Beyond this a tag and the images around it contradict each other; good captures have a few centimetres. [m]
 const MOST_OFF_M: f64 = 0.15;
+/// And beyond this images see them elsewhere: what blur and a rolling shutter do to corners is less; a tag that is 15 cm off
+/// is 20 px off at 4 m. [px]
+const MOST_OFF_PX: f64 = 4.0;
+/// Corners, and the poses around a tag that had no say, are off by this together. [px]
+const DOUBT_PX: f64 = 4.0;
+/// And no doubt excuses more. [m]
+const MOST_DOUBT_M: f64 = 0.4;
 /// Beyond this an edge is not what it was printed as.
 const MOST_SIZE: f64 = 0.1;
 /// White bleeds into black by a tenth or two, in images of our own captures. [px]

@@ -10,7 +10,7 @@ use crate::adjust::{Options, TagSighting, adjust};
 
 /// A walk of 40 images.
 fn good(seed: u64) -> Hall {
-    hall(seed, 40, 2000, 0.4).found(seed + 77, 0.01)
+    hall(seed, 40, 2400, 0.4).found(seed + 77, 0.01)
 }
 
 fn given(hall: &Hall) -> Vec<Given> {
@@ -150,6 +150,46 @@ proptest! {
         }
         refused(&judged(&given(&hall), &hall.capture, &[]), Check::Tags);
     }
+}
+
+/// A tag that three images see from one side, blurred: by their rays it stands elsewhere, though each sees it where it
+/// stands, to two pixels.
+#[test]
+fn a_tag_that_few_images_see_badly_refuses_nothing() {
+    for seed in [8, 9, 10] {
+        let mut hall = good(seed);
+        let sees = |hall: &Hall, tag| -> Vec<usize> {
+            let images = hall.capture.images.iter().enumerate();
+            images.filter(|(_, i)| i.tags.iter().any(|s| s.tag == tag)).map(|(n, _)| n).collect()
+        };
+        let images = sees(&hall, 4);
+        let kept = &images[images.len() / 2 - 1..images.len() / 2 + 2];
+        for (number, image) in hall.capture.images.iter_mut().enumerate() {
+            image.tags.retain(|seen| seen.tag != 4 || kept.contains(&number));
+            let Some(place) = kept.iter().position(|kept| *kept == number) else { continue };
+            for seen in image.tags.iter_mut().filter(|seen| seen.tag == 4) {
+                seen.corners_px.iter_mut().for_each(|px| px.x += 3.2 * (place as f64 - 1.0));
+            }
+        }
+        let adjusted = adjust(&hall.capture, Options::default()).unwrap();
+        let held = adjusted.tags[4].unwrap().held_out.unwrap();
+        println!("{held:?}");
+        assert!(held.off_m.unwrap() > 0.15, "it would not have been refused: {held:?}");
+        let verdict = judged(&given(&hall), &hall.capture, &[]);
+        assert!(verdict.is_fit_to_fly(), "{verdict:#?}");
+        assert!(verdict.checked.iter().any(|line| line.contains("too few sides")), "{verdict:#?}");
+    }
+}
+
+/// Two centimetres, near by: more pixels than any corner is found wrong by, and no other place.
+#[test]
+fn a_tag_that_was_measured_a_little_wrong_is_in_its_place() {
+    let mut hall = good(11);
+    for corner in hall.capture.tags[3].corners_m.as_mut().unwrap() {
+        corner.z += 0.025;
+    }
+    let verdict = judged(&given(&hall), &hall.capture, &[]);
+    assert!(verdict.is_fit_to_fly(), "{verdict:#?}");
 }
 
 #[test]

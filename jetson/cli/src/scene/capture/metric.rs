@@ -99,6 +99,9 @@ pub(super) struct Metric {
     pub(super) tilt_bound_deg: Option<f64>,
     /// How far points are from where pictures saw them, root mean square. [px]
     pub(super) points_rms_px: Option<f64>,
+    /// Of a video: how rows were exposed one after the other.
+    #[serde(default)]
+    pub(super) rolling_shutter: Option<RollingShutter>,
     pub(super) tags: Vec<TagFact>,
     pub(super) findings: Vec<FindingFact>,
     /// What was looked at, a line each.
@@ -118,6 +121,37 @@ pub(super) struct Placed {
     pub(super) position_m: DVec3,
     /// Where it looks. [world]
     pub(super) ahead: DVec3,
+}
+
+/// How long it took to expose all rows of a picture, one after the other.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct RollingShutter {
+    /// From the first row to the last; negative of a phone held upside down. [ms]
+    pub(super) readout_ms: f64,
+    /// Three sigmas. [ms]
+    pub(super) bound_ms: f64,
+}
+
+impl RollingShutter {
+    /// Returns it in words.
+    pub(super) fn in_words(self) -> String {
+        let Self { readout_ms, bound_ms } = self;
+        if readout_ms.abs() <= bound_ms {
+            return format!(
+                "none was found: rows are exposed together, to {bound_ms:.1} ms (three sigmas)"
+            );
+        }
+        let order = if readout_ms < 0.0 {
+            "from the lowest to the uppermost"
+        } else {
+            "from the uppermost to the lowest"
+        };
+        format!(
+            "rows are exposed one after the other, {order} over {:.1} ms, to {bound_ms:.1} ms (three sigmas); places are \
+             those of the middle row",
+            readout_ms.abs()
+        )
+    }
 }
 
 /// How a tag fits.
@@ -217,7 +251,12 @@ pub(super) fn make(
             at_s: pictures.of_video.then_some(picture.at_s),
         })
         .collect();
-    let options = Options { refine_lens: !room.lens_is_known, ..Options::default() };
+    // Only a video's times say how the camera moved.
+    let options = Options {
+        refine_lens: !room.lens_is_known,
+        rolling: pictures.of_video,
+        ..Options::default()
+    };
     let adjusted = adjust::adjust(&first, options);
     let tracked = match (&room.track, &adjusted) {
         (Some(track), Ok(adjusted)) => Some(track.fit(pictures, &first, adjusted)?),
@@ -291,6 +330,10 @@ fn describe(metric: &mut Metric, capture: &Capture, adjusted: &Adjusted, ground:
     let tilt_sigma_rad = adjusted.tilt_sigma_rad.or(fit.map(|fit| fit.tilt_sigma_rad));
     metric.tilt_bound_deg = tilt_sigma_rad.map(|sigma| (3.0 * sigma).to_degrees());
     metric.points_rms_px = Some(adjusted.points_rms_px);
+    metric.rolling_shutter = adjusted.readout.map(|readout| RollingShutter {
+        readout_ms: 1e3 * readout.seconds,
+        bound_ms: 3e3 * readout.sigma_s,
+    });
     for (tag, result) in capture.tags.iter().zip(&adjusted.tags) {
         let held_out = result.and_then(|result| result.held_out);
         metric.tags.push(TagFact {

@@ -34,7 +34,7 @@ use vizflyt_tags::layout::TagLayout;
 
 use self::images::{Choice, Source};
 use self::metric::{Length, Room, Track};
-use self::record::Record;
+use self::record::{Failure, Record};
 use self::training::Schedule;
 use self::work::{Fingerprint, Stage, Work, hex};
 use crate::scene::align::ClockArgs;
@@ -126,25 +126,41 @@ pub(crate) fn run(args: &CaptureArgs) -> Result<ExitCode> {
         !args.clocks.has_times() || matches!(source, Source::Folder(_)),
         "--times and --rate are of photos; a video has its own times"
     );
-    if let Source::Video(file) = &source {
-        images::probe(file)?;
-    }
     let layout = args.tags.as_deref().map(TagLayout::read).transpose()?;
     let mut work = Work::open(&args.output, args.from)?;
-    if args.poses.is_none() && !work.has(Stage::Poses) {
-        // Not only after the video was read.
-        poses::check_installed(args.python.as_deref())?;
-    }
     let mut record = Record::new(&args.input);
-    let made = make(args, &source, layout, &mut work, &mut record);
+    let made = check_programs(args, &source, &work)
+        .and_then(|()| make(args, &source, layout, &mut work, &mut record));
     record.stages = work.times().to_vec();
-    let made = made?;
+    let made = match made {
+        Ok(made) => made,
+        Err(error) => {
+            record.failure = Some(Failure::new(&error, &args.output, &work));
+            // Why it stopped is said in any case: by the error itself.
+            match record.write(&args.output, &work) {
+                Ok(()) => print_fmt!("report      {}", args.output.join("report.html").display()),
+                Err(cause) => print_fmt!("no report   {cause:#}"),
+            }
+            return Err(error);
+        }
+    };
     record.write(&args.output, &work)?;
     print_fmt!("report      {}", args.output.join("report.html").display());
     if made {
         print_fmt!("next        vizflyt demo --scene {}", args.output.display());
     }
     Ok(if made { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Checks that what reads the video and finds poses is installed: not only after the video was read.
+fn check_programs(args: &CaptureArgs, source: &Source, work: &Work) -> Result<()> {
+    if let Source::Video(file) = source {
+        images::probe(file)?;
+    }
+    if args.poses.is_none() && !work.has(Stage::Poses) {
+        poses::check_installed(args.python.as_deref())?;
+    }
+    Ok(())
 }
 
 /// Does the stages; returns whether all of them were, and the result can be flown.

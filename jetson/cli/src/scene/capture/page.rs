@@ -37,6 +37,17 @@ pub(super) fn html(record: &Record, points: &[DVec3], trained: &Path) -> String 
 }
 
 fn verdict(page: &mut String, record: &Record) {
+    if let Some(failure) = &record.failure {
+        let stage = failure
+            .stage
+            .map_or("before its first stage".to_owned(), |stage| format!("in its stage {stage}"));
+        let (what, remedy) = (escaped(&failure.what), escaped(&failure.remedy));
+        let _ = write!(
+            page,
+            "<p class=\"verdict no\">It stopped {stage}.</p><ul class=findings><li class=no><b class=said>{what}</b><br>\
+             What to do: {remedy}.</li></ul>"
+        );
+    }
     let (class, word) = match (record.fit_to_fly, &record.metric) {
         (true, _) => ("go", "It can be flown."),
         (false, Some(metric)) if !metric.fit_to_fly => ("no", "It is refused."),
@@ -45,7 +56,9 @@ fn verdict(page: &mut String, record: &Record) {
         }
         _ => ("no", "It is not done."),
     };
-    let _ = write!(page, "<p class=\"verdict {class}\">{word}</p>");
+    if record.failure.is_none() {
+        let _ = write!(page, "<p class=\"verdict {class}\">{word}</p>");
+    }
     let metric = record.metric.iter();
     let findings: Vec<_> = metric.flat_map(|metric| &metric.findings).collect();
     let warnings = record.finished.iter().flat_map(|finished| &finished.findings);
@@ -77,12 +90,15 @@ fn facts(page: &mut String, record: &Record) {
     let mut row = |name: &str, text: String| {
         let _ = write!(page, "<tr><th>{name}</th><td>{}</td></tr>", escaped(&text));
     };
+    if let Some(pictures) = &record.pictures {
+        let of = pictures.pictures.len();
+        row("pictures", format!("{of} of {} x {} px", pictures.size_px[0], pictures.size_px[1]));
+    }
     if let (Some(pictures), Some(poses)) = (&record.pictures, &record.poses) {
         let of = pictures.pictures.len();
         let placed = record.metric.as_ref().map_or(poses.models[0].placed, |metric| {
             if metric.has_model { metric.way.len() } else { poses.models[0].placed }
         });
-        row("pictures", format!("{of} of {} x {} px", pictures.size_px[0], pictures.size_px[1]));
         let share = 100.0 * placed as f64 / of.max(1) as f64;
         row("placed", format!("{placed} of {of}, {share:.1} %, by {}", poses.tool));
     }
@@ -95,6 +111,9 @@ fn facts(page: &mut String, record: &Record) {
         row("up", format!("{}, by {}", bound(tilt, "unknown"), metric.up_from));
         if let Some(rms_px) = metric.points_rms_px {
             row("points", format!("{rms_px:.2} px from where pictures saw them (rms)"));
+        }
+        if let Some(shutter) = metric.rolling_shutter {
+            row("shutter", shutter.in_words());
         }
         for line in &metric.checked {
             row("checked", line.clone());
@@ -204,7 +223,7 @@ h1{font-size:22px;margin:0 0 8px}h2{font-size:17px;margin:28px 0 6px}\
 .verdict{font-size:18px;font-weight:600;padding:10px 14px;border-radius:6px;color:#fff}\
 .go{background:#1b7f3b}.verdict.no{background:#b3261e}\
 .findings{padding-left:0;list-style:none}.findings li{border-left:4px solid #d99a00;background:#fff;margin:6px 0;\
-padding:6px 10px}.findings li.no{border-color:#b3261e}\
+padding:6px 10px}.findings li.no{border-color:#b3261e}.said{white-space:pre-wrap}\
 table{border-collapse:collapse;background:#fff;width:100%}th,td{text-align:left;padding:4px 10px;\
 border-bottom:1px solid #e3e6eb;vertical-align:top}table:not(.grid) th{width:7em;font-weight:500;color:#596273}\
 .map svg{width:100%;background:#fff;border:1px solid #e3e6eb}\
@@ -214,6 +233,8 @@ figcaption,.at{color:#596273;font-size:13px}</style>";
 #[cfg(test)]
 mod tests {
     use super::super::metric::{FindingFact, Metric};
+    use super::super::record::Failure;
+    use super::super::work::Stage;
     use super::*;
 
     #[test]
@@ -233,5 +254,16 @@ mod tests {
         assert!(!page.contains("http://") && !page.contains("https://"), "it asks nobody");
         record.metric = None;
         assert!(html(&record, &[], Path::new("nowhere")).contains("It is not done."));
+        record.failure = Some(Failure {
+            stage: Some(Stage::Poses),
+            what: "pycolmap <failed>".to_owned(),
+            remedy: "film slowly".to_owned(),
+        });
+        let page = html(&record, &[], Path::new("nowhere"));
+        assert!(
+            page.contains("It stopped in its stage poses.") && page.contains("film slowly."),
+            "{page}"
+        );
+        assert!(!page.contains("<failed>") && !page.contains("It is not done."), "{page}");
     }
 }

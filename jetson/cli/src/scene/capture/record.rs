@@ -26,6 +26,8 @@ pub(super) struct Record {
     pub(super) source: String,
     /// Whether it can be flown.
     pub(super) fit_to_fly: bool,
+    /// What stopped it.
+    pub(super) failure: Option<Failure>,
     pub(super) stages: Vec<StageTime>,
     pub(super) remarks: Vec<String>,
     pub(super) pictures: Option<Pictures>,
@@ -33,6 +35,43 @@ pub(super) struct Record {
     pub(super) metric: Option<Metric>,
     pub(super) trained: Option<Trained>,
     pub(super) finished: Option<Finished>,
+}
+
+/// What stopped a capture, and what to do.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(super) struct Failure {
+    /// Which stage; absent if none had begun.
+    pub(super) stage: Option<Stage>,
+    pub(super) what: String,
+    pub(super) remedy: String,
+}
+
+impl Failure {
+    /// Describes an error, given what has come so far.
+    pub(super) fn new(error: &anyhow::Error, output: &Path, work: &Work) -> Self {
+        let stage = work.running();
+        let advice = match stage {
+            None => "nothing was begun: mend this, then give the same command again",
+            Some(Stage::Images) => {
+                "look whether the video plays to its end, or give a folder of photos of one camera"
+            }
+            Some(Stage::Poses) => {
+                "what the program said is in stages/poses/log.txt; if it places too little, film slowly, sideways past \
+                 what has texture, with tags in view"
+            }
+            Some(Stage::Tags | Stage::Metric | Stage::Train | Stage::Finish) => {
+                "mend this, then give the same command again"
+            }
+        };
+        let mut remedy = advice.to_owned();
+        if work.times().iter().any(|time| time.stage != Stage::Images) {
+            remedy += "; the stages before are kept, and not done again";
+        }
+        if output.join("arena.toml").exists() {
+            remedy += "; scene.ply and arena.toml in this folder are of an earlier run";
+        }
+        Self { stage, what: format!("{error:#}"), remedy }
+    }
 }
 
 impl Record {
@@ -43,6 +82,7 @@ impl Record {
             made_by: format!("vizflyt {}", env!("CARGO_PKG_VERSION")),
             source: input.display().to_string(),
             fit_to_fly: false,
+            failure: None,
             stages: Vec::new(),
             remarks: Vec::new(),
             pictures: None,
@@ -57,7 +97,7 @@ impl Record {
     pub(super) fn write(&mut self, output: &Path, work: &Work) -> Result<()> {
         let is_right = self.metric.as_ref().is_some_and(|metric| metric.fit_to_fly);
         let can_start = self.finished.as_ref().is_some_and(|f| f.findings.is_empty());
-        self.fit_to_fly = is_right && can_start;
+        self.fit_to_fly = is_right && can_start && self.failure.is_none();
         let points = self.points(work)?;
         let page = page::html(self, &points, &work.folder(Stage::Train));
         for (name, text) in

@@ -74,6 +74,8 @@ pub(super) struct Work {
     /// Of the last stage.
     key: String,
     times: Vec<StageTime>,
+    /// The stage that is being done.
+    running: Option<Stage>,
 }
 
 /// A stage's file.
@@ -103,7 +105,7 @@ impl Work {
         }
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;
-        Ok(Self { folder, from, key: String::new(), times: Vec::new() })
+        Ok(Self { folder, from, key: String::new(), times: Vec::new(), running: None })
     }
 
     /// Returns the folder of a stage's files.
@@ -130,6 +132,11 @@ impl Work {
         }
     }
 
+    /// Returns the stage that began last and has not come; that which has failed, after an error.
+    pub(super) fn running(&self) -> Option<Stage> {
+        self.running
+    }
+
     /// Returns how long each stage took that has come.
     pub(super) fn times(&self) -> &[StageTime] {
         &self.times
@@ -146,6 +153,7 @@ impl Work {
         inputs: &impl Serialize,
         run: impl FnOnce(&Path) -> Result<T>,
     ) -> Result<T> {
+        self.running = Some(stage);
         let text = serde_json::to_string(inputs)?;
         let mut hash = Sha256::new();
         for part in [env!("CARGO_PKG_VERSION"), stage.name(), &self.key, &text] {
@@ -158,6 +166,7 @@ impl Work {
             && let Some(kept) = kept::<T>(&file, &self.key)
         {
             self.times.push(StageTime { stage, seconds: kept.seconds, kept: true });
+            self.running = None;
             return Ok(kept.result);
         }
         let files = self.folder(stage);
@@ -176,6 +185,7 @@ impl Work {
         std::fs::write(&part, serde_json::to_string(&kept)?)
             .and_then(|()| std::fs::rename(&part, &file))
             .with_context(|| format!("cannot write {}", file.display()))?;
+        self.running = None;
         Ok(kept.result)
     }
 }
@@ -316,8 +326,10 @@ mod tests {
         let mut work = Work::open(folder.path(), None).unwrap();
         let failed: Result<u32> = work.stage(Stage::Images, &1, |_| anyhow::bail!("no"));
         assert!(failed.is_err());
+        assert_eq!(work.running(), Some(Stage::Images));
         let mut work = Work::open(folder.path(), None).unwrap();
         assert_eq!(work.stage(Stage::Images, &1, |_| Ok(7)).unwrap(), 7);
+        assert_eq!(work.running(), None);
     }
 
     #[test]

@@ -17,11 +17,12 @@ impl Buckets {
     }
 
     /// Returns which part a time lies in; `None` near its ends, so that no two pictures come from one instant, and
-    /// none are two parts apart.
-    pub(super) fn find(&self, at_s: f64) -> Option<usize> {
+    /// none are two parts apart. Of a video with few pictures a second, all are looked at.
+    pub(super) fn find(&self, at_s: f64, rate_hz: f64) -> Option<usize> {
         let place = at_s / self.bucket_s;
         let bucket = (place.max(0.0) as usize).min(self.count - 1);
-        ((place - bucket as f64 - 0.5).abs() <= MIDDLE / 2.0).then_some(bucket)
+        let is_sparse = self.bucket_s * rate_hz < SPARSE;
+        (is_sparse || (place - bucket as f64 - 0.5).abs() <= MIDDLE / 2.0).then_some(bucket)
     }
 }
 
@@ -90,6 +91,8 @@ fn spans(numbers: &[usize], place: impl Fn(usize) -> String) -> String {
 const PER_SECOND: f64 = 3.0;
 /// Share of a part that is looked at.
 const MIDDLE: f64 = 2.0 / 3.0;
+/// Pictures to a part: of fewer, its middle may hold none.
+const SPARSE: f64 = 3.0;
 /// So much more than usual is more blur than texture tells: 8 px of drag at 320 px of width add 0.09 to 0.16
 /// (`blur::tests`).
 const BLURRED: f64 = 0.1;
@@ -125,8 +128,11 @@ mod tests {
             (10.9, None),
             (-1.0, None),
         ] {
-            assert_eq!(buckets.find(at_s), bucket, "at {at_s} s");
+            assert_eq!(buckets.find(at_s, 30.0), bucket, "at {at_s} s");
         }
+        // Three pictures a second lie between the middles of their parts.
+        let sparse = Buckets::new(50.0, choice(None));
+        assert!((0..150).all(|n| sparse.find(f64::from(n) / 3.0 + 1e-9, 3.0) == Some(n as usize)));
     }
 
     #[test]

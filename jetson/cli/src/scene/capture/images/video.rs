@@ -37,7 +37,7 @@ pub(super) fn take(file: &Path, choice: Choice, folder: &Path) -> Result<Picture
         progress.show(at_s / duration_s, || {
             format!("looking at {at_s:.0} of {duration_s:.0} s of the video")
         });
-        let Some(bucket) = buckets.find(at_s) else { continue };
+        let Some(bucket) = buckets.find(at_s, rate_hz) else { continue };
         size_px = [image.width_px, image.height_px];
         let blur = blur(size_px[0] as usize, size_px[1] as usize, image.luma());
         match &mut best {

@@ -1,0 +1,187 @@
+//! A rolling shutter: rows are exposed one after the other, from poses that the camera passes meanwhile.
+//!
+//! An image's pose is that of its middle row. Another row's follows from how the camera moves, which its neighbours in
+//! time tell: the mean of the speeds to the one before and to the one after. A hand's step and tremor are faster than
+//! that, so each image has a turn of its own besides, which costs what a hand turns (Albl et al. 2016, "Degeneracies in
+//! rolling shutter SfM": with free turns, rooms would collapse to a plane).
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+
+use super::capture::Capture;
+use super::solve::median;
+
+/// How rows follow each other, and how the camera moves meanwhile.
+#[derive(Clone, Debug)]
+pub(super) struct Rolling {
+    /// From the first row's exposure to the last one's; negative of a phone held upside down. [s]
+    pub(super) readout_s: f64,
+    /// By how much each camera turns from the first row to the last beyond what its neighbours tell. [rad, cam]
+    pub(super) bends_rad: Vec<DVec3>,
+    /// Of each camera.
+    motions: Vec<Motion>,
+    height_px: f64,
+}
+
+/// How a camera moves.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Motion {
+    /// [1/s of the state's lengths, world]
+    v_world: DVec3,
+    /// [rad/s, cam]
+    omega_cam: DVec3,
+}
+
+/// How far a camera has come when a row is exposed.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Row {
+    /// Of the image's height, from its middle: -0.5 to 0.5.
+    pub(super) share: f64,
+    shift_world: DVec3,
+    turn_rad: DVec3,
+    motion: Motion,
+}
+
+/// A point in the camera, as a row sees it.
+pub(super) struct InRow {
+    pub(super) p_cam: DVec3,
+    /// Before the camera turned on.
+    p_middle: DVec3,
+    row: Row,
+}
+
+impl Rolling {
+    /// Returns a shutter that is not known to roll.
+    pub(super) fn new(lens: &Intrinsics, images: usize) -> Self {
+        Self {
+            readout_s: 0.0,
+            bends_rad: vec![DVec3::ZERO; images],
+            motions: vec![Motion::default(); images],
+            height_px: f64::from(lens.height_px),
+        }
+    }
+
+    /// Takes motions anew from where cameras are now.
+    pub(super) fn follow(&mut self, capture: &Capture, cameras: &[Pose<World, Cam>]) {
+        self.motions = motions(capture, cameras);
+    }
+
+    /// Returns how far a camera has come when this pixel is exposed.
+    pub(super) fn row(&self, camera: usize, pixel: DVec2) -> Row {
+        let share = (pixel.y / self.height_px - 0.5).clamp(-0.5, 0.5);
+        let motion = self.motions[camera];
+        let at_s = self.readout_s * share;
+        Row {
+            share,
+            shift_world: motion.v_world * at_s,
+            turn_rad: motion.omega_cam * at_s + self.bends_rad[camera] * share,
+            motion,
+        }
+    }
+
+    /// Returns one sigma of the bends: by what a hand turns. [rad]
+    pub(super) fn bend_sigma_rad(&self) -> f64 {
+        (self.readout_s.abs() * HAND_RADPS).max(LEAST_BEND_RAD)
+    }
+}
+
+impl Row {
+    /// Returns the camera's pose when the row is exposed.
+    pub(super) fn pose(&self, middle: &Pose<World, Cam>) -> Pose<World, Cam> {
+        let turned = middle.rotation * DQuat::from_scaled_axis(self.turn_rad);
+        Pose::new(middle.translation_m + self.shift_world, turned)
+    }
+
+    /// Returns where a point of the world is in the camera.
+    pub(super) fn see(self, middle: &Pose<World, Cam>, p_world: DVec3) -> InRow {
+        let p_middle =
+            middle.rotation.conjugate() * (p_world - middle.translation_m - self.shift_world);
+        let p_cam = if self.turn_rad == DVec3::ZERO {
+            p_middle
+        } else {
+            DQuat::from_scaled_axis(-self.turn_rad) * p_middle
+        };
+        InRow { p_cam, p_middle, row: self }
+    }
+}
+
+/// Derivatives of a pixel by a camera's place, its turn about its own axes and its bend; by the point; by the readout.
+pub(super) struct Slopes {
+    pub(super) by_camera: [DVec2; 9],
+    pub(super) by_point: [DVec2; 3],
+    pub(super) by_readout: DVec2,
+}
+
+impl InRow {
+    /// Returns them, given the derivatives by the point in the camera.
+    pub(super) fn slopes(&self, middle: &Pose<World, Cam>, by_cam: &[DVec2; 3]) -> Slopes {
+        let through = |v: DVec3| by_cam[0] * v.x + by_cam[1] * v.y + by_cam[2] * v.z;
+        let Row { share, turn_rad, motion, .. } = self.row;
+        let on = DMat3::from_quat(DQuat::from_scaled_axis(-turn_rad));
+        let cam_from_world = on * DMat3::from_quat(middle.rotation.conjugate());
+        let [x, y, z] = DVec3::AXES.map(|axis| through(cam_from_world * axis));
+        // The camera turned by a small w sees the point turned by -w: p + p x w.
+        let turn = DVec3::AXES.map(|axis| through(on * self.p_middle.cross(axis)));
+        // A turn by phi and a small d after one another, of phi + d: the right Jacobian (Solà et al. 2018, eq. 143).
+        let jacobian = |d: DVec3| {
+            let once = turn_rad.cross(d);
+            d - once / 2.0 + turn_rad.cross(once) / 6.0
+        };
+        let by_turn_on = |d: DVec3| through(self.p_cam.cross(jacobian(d)));
+        let bend = DVec3::AXES.map(|axis| by_turn_on(axis * share));
+        let by_readout = by_turn_on(motion.omega_cam * share)
+            - through(cam_from_world * (motion.v_world * share));
+        let by_camera = [-x, -y, -z, turn[0], turn[1], turn[2], bend[0], bend[1], bend[2]];
+        Slopes { by_camera, by_point: [x, y, z], by_readout }
+    }
+}
+
+/// Returns how cameras move: the mean of the speeds from the image before and to the image after, as far as these are
+/// near in time; nothing of what stands alone, or leaps.
+fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<Motion> {
+    let between = |a: usize| -> Option<Motion> {
+        let (before, after) = (cameras[a], *cameras.get(a + 1)?);
+        let took_s = capture.images[a + 1].at_s - capture.images[a].at_s;
+        if !(took_s > 0.0 && took_s <= GAP_S) {
+            return None;
+        }
+        let turn = before.rotation.conjugate() * after.rotation;
+        let turn_rad = (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis();
+        Some(Motion {
+            v_world: (after.translation_m - before.translation_m) / took_s,
+            omega_cam: turn_rad / took_s,
+        })
+    };
+    let steps: Vec<Option<Motion>> = (0..cameras.len()).map(between).collect();
+    let usual = median(steps.iter().flatten().map(|motion| motion.v_world.length())).unwrap_or(0.0);
+    let is_walk = |motion: &Motion| {
+        motion.v_world.length() <= LEAP * usual && motion.omega_cam.length() <= MOST_RADPS
+    };
+    let walked = |step: usize| steps.get(step).copied().flatten().filter(is_walk);
+    (0..cameras.len())
+        .map(|camera| match (camera.checked_sub(1).and_then(walked), walked(camera)) {
+            (Some(a), Some(b)) => Motion {
+                v_world: 0.5 * (a.v_world + b.v_world),
+                omega_cam: 0.5 * (a.omega_cam + b.omega_cam),
+            },
+            (Some(one), None) | (None, Some(one)) => one,
+            (None, None) => Motion::default(),
+        })
+        .collect()
+}
+
+/// How readouts are spread, before anything is seen: phones take 10 to 33 ms. [s]
+pub(super) const READOUT_S: f64 = 0.03;
+/// An image is read while the next one waits: 24 a second are the fewest that phones film. [s]
+pub(super) const MOST_READOUT_S: f64 = 0.042;
+/// A hand that walks turns by this beyond what pictures a third of a second apart show, about each axis: in generated
+/// walks 0.03 to 0.07, root mean square; people are less steady. [rad/s]
+const HAND_RADPS: f64 = 0.15;
+/// Less is nothing. [rad]
+const LEAST_BEND_RAD: f64 = 1e-6;
+/// Images farther apart do not tell how the camera moves. [s]
+const GAP_S: f64 = 1.5;
+/// Of the usual speed: more is no walk, but a place that is wrong.
+const LEAP: f64 = 5.0;
+/// No hand that films turns faster. [rad/s]
+const MOST_RADPS: f64 = 3.0;
