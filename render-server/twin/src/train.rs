@@ -4,7 +4,10 @@
 //! stays translucent), compared, and every Gaussian it shows moves once. The same dataset, options and
 //! kind of processor give the same twin, whatever the number of threads.
 
+mod checkpoint;
 mod start;
+
+pub use checkpoint::{Checkpoint, CheckpointError};
 
 use vizflyt_splat::Splats;
 use vizflyt_splat::simd::InstructionSet;
@@ -79,7 +82,7 @@ pub struct Trainer<'a> {
 }
 
 /// A photo's exposure and its moments, gain then offset.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct ExposureState {
     exposure: Exposure,
     first: [f32; 6],

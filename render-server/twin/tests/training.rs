@@ -9,6 +9,7 @@ use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 use vizflyt_splat::gpu::{Adapter, Budget};
 use vizflyt_splat::{Camera, Splats, render_reference};
 use vizflyt_twin::random::Random;
+use vizflyt_twin::train::{Checkpoint, CheckpointError};
 use vizflyt_twin::{Dataset, Options, Passes, Trainer};
 
 const PHOTOS: usize = 6;
@@ -200,6 +201,35 @@ fn a_graphics_card_trains_as_the_processor_does() {
             assert!((ratio - 1.0).abs() < 0.03, "{what}, steps from {}: {ratio}", 30 * i);
         }
     }
+}
+
+#[test]
+fn a_training_that_was_interrupted_ends_as_one_that_was_not() {
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path());
+    let dataset = Dataset::read(folder.path(), None).unwrap();
+    let whole = train(&dataset);
+    let mut trainer = Trainer::new(&dataset, options());
+    // In the middle of the photos, of a move, and before either; each time by way of bytes.
+    for stop in [7, 50, 51, 99, 150] {
+        while trainer.steps() < stop {
+            trainer.step();
+        }
+        let bytes = trainer.checkpoint().to_bytes();
+        let checkpoint = Checkpoint::from_bytes(&bytes).unwrap();
+        assert_eq!(checkpoint.steps(), stop);
+        trainer = Trainer::resume(&dataset, options(), Passes::cpu(), checkpoint).unwrap();
+        assert!(trainer.checkpoint().to_bytes() == bytes);
+    }
+    assert!((trainer.judge().unwrap().psnr_db, trainer.splats()) == whole);
+
+    let checkpoint = trainer.checkpoint();
+    let other = Options { seed: 2, ..options() };
+    let refused = Trainer::resume(&dataset, other, Passes::cpu(), checkpoint.clone());
+    assert_eq!(refused.err(), Some(CheckpointError::Training));
+    let small = Dataset::read(folder.path(), Some(24)).unwrap();
+    let refused = Trainer::resume(&small, options(), Passes::cpu(), checkpoint);
+    assert_eq!(refused.err(), Some(CheckpointError::Training));
 }
 
 #[test]
