@@ -1,4 +1,4 @@
-//! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor.
+//! Images with known poses -> a twin: 3D Gaussian splats, trained on any processor, or any graphics card.
 
 pub mod adam;
 pub mod adjust;
@@ -8,8 +8,10 @@ mod blend;
 pub mod carve;
 pub mod dataset;
 pub mod gaussians;
+mod gpu;
 pub mod loss;
 mod neighbours;
+pub mod passes;
 pub mod planes;
 mod project;
 pub mod random;
@@ -24,6 +26,7 @@ mod view;
 
 pub use dataset::Dataset;
 pub use gaussians::Gaussians;
+pub use passes::Passes;
 pub use planes::Planes;
 pub use project::Style;
 pub use render::{Renderer, channel};

@@ -269,7 +269,7 @@ fn colour(sh: &[f32], basis: &[f32; 16], degree: u8) -> [f32; 3] {
 
 /// Returns the basis functions up to a degree, along a unit direction; 0 above.
 #[inline(always)]
-fn basis(direction: Vec3, degree: u8) -> [f32; 16] {
+pub(crate) fn basis(direction: Vec3, degree: u8) -> [f32; 16] {
     let mut out = [0.0; 16];
     let Vec3 { x, y, z } = direction;
     let (c1, c2, c3) = (C1 as f32, C2.map(|c| c as f32), C3.map(|c| c as f32));

@@ -17,6 +17,11 @@ impl Random {
         mixed
     }
 
+    /// Returns the seed of the numbers still to come.
+    pub(crate) fn state(&self) -> u64 {
+        self.0
+    }
+
     /// Returns 64 random bits.
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e3779b97f4a7c15);

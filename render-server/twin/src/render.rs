@@ -64,6 +64,11 @@ impl Renderer {
         }
     }
 
+    /// Returns `cpu` and the instruction set.
+    pub(crate) fn name(&self) -> &'static str {
+        self.instructions.name()
+    }
+
     /// Renders the image of a view; its channels are [`channel`]'s.
     pub fn forward(&mut self, gaussians: &Gaussians, view: &View, style: Style) -> &Planes {
         let instructions = self.instructions;
@@ -219,4 +224,4 @@ impl Kernel for Unproject<'_> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -4,7 +4,10 @@
 //! stays translucent), compared, and every Gaussian it shows moves once. The same dataset, options and
 //! kind of processor give the same twin, whatever the number of threads.
 
+mod checkpoint;
 mod start;
+
+pub use checkpoint::{Checkpoint, CheckpointError};
 
 use vizflyt_splat::Splats;
 use vizflyt_splat::simd::InstructionSet;
@@ -13,10 +16,10 @@ use crate::adam::{Moments, Rates, Step, Tolls};
 use crate::dataset::{Dataset, Photo};
 use crate::gaussians::Gaussians;
 use crate::loss::{Exposure, Loss, Parts, Weights};
+use crate::passes::Passes;
 use crate::project::{RowGradient, Style};
 use crate::random::Random;
 use crate::relocate::{relocate, wander};
-use crate::render::Renderer;
 
 /// How to train.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -66,7 +69,7 @@ pub struct Trainer<'a> {
     gaussians: Gaussians,
     moments: Moments,
     exposures: Vec<ExposureState>,
-    renderer: Renderer,
+    passes: Passes,
     loss: Loss,
     gradients: Vec<RowGradient>,
     seen: Vec<u32>,
@@ -79,7 +82,7 @@ pub struct Trainer<'a> {
 }
 
 /// A photo's exposure and its moments, gain then offset.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct ExposureState {
     exposure: Exposure,
     first: [f32; 6],
@@ -110,11 +113,19 @@ pub struct Comparison {
 }
 
 impl<'a> Trainer<'a> {
-    /// Begins a training.
+    /// Begins a training on the processor.
     ///
     /// # Panics
     /// If the dataset has no photo, or all are held out.
     pub fn new(dataset: &'a Dataset, options: Options) -> Self {
+        Self::with(dataset, options, Passes::cpu())
+    }
+
+    /// Begins a training on what renders and takes derivatives back.
+    ///
+    /// # Panics
+    /// If the dataset has no photo, or all are held out.
+    pub fn with(dataset: &'a Dataset, options: Options, passes: Passes) -> Self {
         let extent = dataset.extent();
         let gaussians = start::gaussians(dataset, &options, extent);
         let trainer = Self {
@@ -125,7 +136,7 @@ impl<'a> Trainer<'a> {
             errors: vec![0.0; gaussians.len()],
             gaussians,
             exposures: vec![ExposureState::default(); dataset.photos.len()],
-            renderer: Renderer::default(),
+            passes,
             loss: Loss::default(),
             gradients: Vec::new(),
             seen: Vec::new(),
@@ -140,6 +151,11 @@ impl<'a> Trainer<'a> {
     /// Returns the steps done.
     pub fn steps(&self) -> u32 {
         self.step
+    }
+
+    /// Returns what renders and takes derivatives back.
+    pub fn passes(&mut self) -> &mut Passes {
+        &mut self.passes
     }
 
     /// Returns what is trained.
@@ -169,11 +185,10 @@ impl<'a> Trainer<'a> {
         let background = std::array::from_fn(|_| self.random.unit());
         let exposure = self.exposures[photo].exposure;
         let weights = self.options.weights;
-        let image = self.renderer.forward(&self.gaussians, view, style);
+        let image = self.passes.forward(&self.gaussians, view, style);
         let (parts, by_exposure, by) = self.loss.of(image, target, &exposure, background, &weights);
-        self.seen.clear();
-        self.seen.extend(self.renderer.seen().map(|row| row as u32));
-        self.renderer.backward(&self.gaussians, view, style, by, &mut self.gradients);
+        let (seen, gradients) = (&mut self.seen, &mut self.gradients);
+        self.passes.backward(&self.gaussians, view, style, by, seen, gradients);
         for (&row, by) in self.seen.iter().zip(&self.gradients) {
             self.errors[row as usize] += by.error;
         }
@@ -232,7 +247,7 @@ impl<'a> Trainer<'a> {
     pub fn compare(&mut self, photo: usize) -> Comparison {
         let Photo { view, target, .. } = &self.dataset.photos[photo];
         let style = Style { degree: self.options.degree, ..self.style() };
-        let image = self.renderer.forward(&self.gaussians, view, style);
+        let image = self.passes.forward(&self.gaussians, view, style);
         let exposure = if self.options.exposure {
             Exposure::fitting(image, target)
         } else {

@@ -6,9 +6,11 @@ use std::path::Path;
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+use vizflyt_splat::gpu::{Adapter, Budget};
 use vizflyt_splat::{Camera, Splats, render_reference};
 use vizflyt_twin::random::Random;
-use vizflyt_twin::{Dataset, Options, Trainer};
+use vizflyt_twin::train::{Checkpoint, CheckpointError};
+use vizflyt_twin::{Dataset, Options, Passes, Trainer};
 
 const PHOTOS: usize = 6;
 
@@ -161,6 +163,73 @@ fn the_same_seed_gives_the_same_twin_on_any_number_of_threads() {
     };
     let one = on(1);
     assert!(one == on(4), "four threads train another twin");
+}
+
+/// Trains; loses the device after so many steps. Returns the loss of each step, and PSNR of held-out photos.
+fn train_on(dataset: &Dataset, passes: Passes, lost_after: u32) -> (Vec<f64>, f64) {
+    let mut trainer = Trainer::with(dataset, options(), passes);
+    let mut losses = Vec::new();
+    while trainer.steps() < options().steps {
+        losses.push(trainer.step().total(&options().weights));
+        if trainer.steps() == lost_after {
+            trainer.passes().lose_device();
+        }
+    }
+    (losses, trainer.judge().unwrap().psnr_db)
+}
+
+#[test]
+fn a_graphics_card_trains_as_the_processor_does() {
+    let Some(adapter) = Adapter::all().into_iter().next() else {
+        println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path());
+    let dataset = Dataset::read(folder.path(), None).unwrap();
+    let passes = || Passes::gpu(&adapter, Budget::default()).expect("a device");
+    let (expected, expected_db) = train_on(&dataset, Passes::cpu(), u32::MAX);
+    let first = train_on(&dataset, passes(), u32::MAX);
+    assert!(first == train_on(&dataset, passes(), u32::MAX), "the same device trains another twin");
+    let lost = train_on(&dataset, passes(), 70);
+    // Rounding grows with the steps; where training goes it does not.
+    for (what, (losses, db)) in [("gpu", first), ("gpu, lost after 70 steps", lost)] {
+        println!("{what}: {db:.2} dB for {expected_db:.2}");
+        assert!((db - expected_db).abs() < 0.5, "{what}: {db} dB for {expected_db}");
+        for (i, (a, b)) in losses.chunks(30).zip(expected.chunks(30)).enumerate() {
+            let ratio = a.iter().sum::<f64>() / b.iter().sum::<f64>();
+            assert!((ratio - 1.0).abs() < 0.03, "{what}, steps from {}: {ratio}", 30 * i);
+        }
+    }
+}
+
+#[test]
+fn a_training_that_was_interrupted_ends_as_one_that_was_not() {
+    let folder = tempfile::tempdir().unwrap();
+    colmap(folder.path());
+    let dataset = Dataset::read(folder.path(), None).unwrap();
+    let whole = train(&dataset);
+    let mut trainer = Trainer::new(&dataset, options());
+    // In the middle of the photos, of a move, and before either; each time by way of bytes.
+    for stop in [7, 50, 51, 99, 150] {
+        while trainer.steps() < stop {
+            trainer.step();
+        }
+        let bytes = trainer.checkpoint().to_bytes();
+        let checkpoint = Checkpoint::from_bytes(&bytes).unwrap();
+        assert_eq!(checkpoint.steps(), stop);
+        trainer = Trainer::resume(&dataset, options(), Passes::cpu(), checkpoint).unwrap();
+        assert!(trainer.checkpoint().to_bytes() == bytes);
+    }
+    assert!((trainer.judge().unwrap().psnr_db, trainer.splats()) == whole);
+
+    let checkpoint = trainer.checkpoint();
+    let other = Options { seed: 2, ..options() };
+    let refused = Trainer::resume(&dataset, other, Passes::cpu(), checkpoint.clone());
+    assert_eq!(refused.err(), Some(CheckpointError::Training));
+    let small = Dataset::read(folder.path(), Some(24)).unwrap();
+    let refused = Trainer::resume(&small, options(), Passes::cpu(), checkpoint);
+    assert_eq!(refused.err(), Some(CheckpointError::Training));
 }
 
 #[test]

@@ -1,19 +1,23 @@
 //! `vizflyt scene train`: a scene from photos with known poses.
 
+mod kept;
+
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde::Serialize;
+use vizflyt_server::render::RendererKind;
 use vizflyt_splat::format::{self, Format};
 use vizflyt_twin::train::Quality;
-use vizflyt_twin::{Dataset, Options, Trainer};
+use vizflyt_twin::{Dataset, Options, Passes, Trainer};
 
+use self::kept::Kept;
 use super::progress::Progress;
 use crate::terminal::print_fmt;
 
-/// Trains a scene from photos with known poses, on the processor.
+/// Trains a scene from photos with known poses, on a graphics card or the processor.
 #[derive(Args, Debug)]
 #[command(after_help = "DATASET is a folder of one of these kinds:
   COLMAP      sparse/0 with cameras, images, points3D (.bin or .txt), and images/; masks/NAME.png may
@@ -22,8 +26,12 @@ use crate::terminal::print_fmt;
   nerfstudio  transforms.json, with masks, depth images and a PLY of points where it names them
 Images are PNG or JPEG. The scene keeps the dataset's frame and unit of length.
 
+A graphics card of any vendor (Vulkan) renders and takes derivatives, once its own of a test scene are the
+processor's; loss and optimiser stay with the processor. If it is lost on the way, the processor goes on.
+
 Examples:
   vizflyt scene train my-hall -o my-hall.ply
+  vizflyt scene train my-hall -o my-hall.ply --resume      (after an interruption)
   vizflyt scene train my-hall -o my-hall.ply --width 640 --steps 7000 --splats 200000 --report my-hall.json
   vizflyt scene view my-hall.ply")]
 pub(crate) struct TrainArgs {
@@ -47,7 +55,10 @@ pub(crate) struct TrainArgs {
     /// Degree of the harmonics: how colours may change with the direction of view
     #[arg(long, default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: u8,
-    /// Same dataset, same options, same seed: the same scene on the same kind of processor
+    /// What renders photos and takes derivatives
+    #[arg(long, value_enum, default_value_t, value_name = "KIND")]
+    renderer: RendererKind,
+    /// Same dataset, same options, same seed: the same scene on the same kind of processor or card
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Holds every N-th photo out of training, to judge by; 0 holds none out
@@ -59,6 +70,9 @@ pub(crate) struct TrainArgs {
     /// Trains for a renderer that dims splats smaller than a pixel (mip-splatting)
     #[arg(long)]
     antialiased: bool,
+    /// Goes on with a training of the same photos and options that was interrupted; it is kept every minute
+    #[arg(long)]
+    resume: bool,
     /// Writes what was done and how good it is as JSON
     #[arg(long, value_name = "FILE.json")]
     report: Option<PathBuf>,
@@ -76,6 +90,8 @@ struct Report {
     splats: usize,
     seed: u64,
     antialiased: bool,
+    /// What rendered at the end: `cpu avx2`, or `gpu` and the adapter's name.
+    renderer: String,
     seconds: f64,
     /// Of photos that training did not see; absent if none was held out.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -96,6 +112,8 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     if args.hold_out == 1 {
         bail!("--hold-out 1 leaves no photo to train with; give 0 to hold out none");
     }
+    let mut kept = Kept::beside(&args.output);
+    let checkpoint = kept.find(args.resume, args.force)?;
     let start = Instant::now();
     let dataset = Dataset::read(&args.dataset, Some(args.width))?;
     let view = &dataset.photos[0].view;
@@ -127,20 +145,35 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         exposure: !args.no_exposure,
         ..Options::default()
     };
-    let mut trainer = Trainer::new(&dataset, options);
+    let (passes, reason) = Passes::choose(args.renderer.into())?;
+    print_fmt!("renderer     {} ({reason})", passes.name());
+    let mut trainer = match checkpoint {
+        Some(checkpoint) => {
+            print_fmt!("resumed      after {} of {} steps", checkpoint.steps(), args.steps);
+            Trainer::resume(&dataset, options, passes, checkpoint)
+                .context("cannot go on with what was kept")?
+        }
+        None => Trainer::with(&dataset, options, passes),
+    };
     let mut progress = Progress::new("");
     while trainer.steps() < args.steps {
         let parts = trainer.step();
         let (step, splats) = (trainer.steps(), trainer.gaussians().len());
+        if let Some(lost) = trainer.passes().take_lost() {
+            let now = trainer.passes().name();
+            tracing::warn!("step {step}: {lost}; {now} goes on from here, at its own pace");
+        }
         progress.show(f64::from(step) / f64::from(args.steps), || {
             format!("step {step} of {}, {splats} splats, error {:.4}", args.steps, parts.l1)
         });
+        kept.keep(&trainer);
     }
     drop(progress);
     let held_out = trainer.judge();
     let mut splats = trainer.splats();
     splats.antialiased = args.antialiased;
     format::write(&args.output, &splats)?;
+    kept.remove();
     let report = Report {
         dataset: args.dataset.display().to_string(),
         photos: dataset.photos.len(),
@@ -151,6 +184,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         splats: splats.len(),
         seed: args.seed,
         antialiased: args.antialiased,
+        renderer: trainer.passes().name().to_owned(),
         seconds: start.elapsed().as_secs_f64(),
         held_out,
     };

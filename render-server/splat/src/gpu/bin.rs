@@ -16,8 +16,8 @@ const SOURCE: &str = concat!(
 );
 
 /// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
-const PAIRS: Count = Count { size: 4, groups: 12 };
-const BIN: u32 = 8;
+pub(super) const PAIRS: Count = Count { size: 4, groups: 12 };
+pub(super) const BIN: u32 = 8;
 
 /// The pass.
 #[derive(Debug)]
@@ -52,22 +52,25 @@ impl Bin {
         }
     }
 
-    /// Binds; `order` is what the sort by depth leaves.
+    /// Binds; `order` is what the sort by depth leaves. With a `permutation` the sort by tile moves the
+    /// numbers of pairs there, and leaves their slots as they were emitted, in `slots[0]`.
     pub(super) fn bind(
         &self,
         device: &Device,
         sort: &Sort,
         buffers: &Buffers,
         order: &wgpu::Buffer,
+        permutation: Option<[&wgpu::Buffer; 2]>,
     ) -> BinBindings {
         let b = buffers;
         let pairs = Pairs {
             keys: [&b.tiles[0], &b.tiles[1]],
-            values: [&b.slots[0], &b.slots[1]],
+            values: permutation.unwrap_or([&b.slots[0], &b.slots[1]]),
             counts: &b.digits,
             sizes: &b.sizes,
         };
         let sorted = b.capacity.tile_digits as usize % 2;
+        let tile_bits = b.capacity.tile_digits * 8;
         let (tick, views, sizes) = ((0, &b.tick), (1, &b.views), (2, &b.sizes));
         let (dispatches, order, counts) = ((3, &b.dispatches), (4, order), (7, &b.counts));
         let (shapes, extents) = ((5, &b.shapes), (6, &b.extents));
@@ -90,7 +93,7 @@ impl Bin {
                     (9, &b.slots[0]),
                 ],
             ),
-            digits: sort.bind(device, pairs, b.capacity.tile_digits * 8, [PAIRS; 2], false),
+            digits: sort.bind(device, pairs, tile_bits, [PAIRS; 2], permutation.is_some()),
             bound: device.bind(&self.bound, &[tick, sizes, (11, &b.tiles[sorted]), (12, &b.lists)]),
         }
     }

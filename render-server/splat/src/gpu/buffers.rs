@@ -120,7 +120,7 @@ impl Buffers {
             let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
             device.buffer(label, words * 4, usage)
         };
-        let indirect = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::INDIRECT;
+        let counted = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let slots = capacity.regions * BLOCK as u64;
         Self {
             capacity,
@@ -130,8 +130,8 @@ impl Buffers {
                 "regions",
                 capacity.camera_blocks + capacity.camera_blocks.div_ceil(256),
             ),
-            sizes: source("sizes", SIZES_BYTES / 4),
-            dispatches: device.buffer("dispatches", 64, indirect),
+            sizes: device.buffer("sizes", SIZES_BYTES, counted | wgpu::BufferUsages::COPY_SRC),
+            dispatches: device.buffer("dispatches", 64, counted | wgpu::BufferUsages::INDIRECT),
             shapes: storage("shapes", slots * 4),
             extents: storage("extents", slots * 4),
             colours: storage("colours", slots * 4),

@@ -28,6 +28,7 @@ mod project;
 mod read;
 mod scene;
 mod sort;
+pub mod training;
 mod view;
 
 use std::borrow::Cow;
@@ -299,7 +300,7 @@ impl GpuRenderer {
             cull: passes.cull.bind(device, &self.scene, &buffers),
             project: passes.project.bind(device, &self.scene, &buffers),
             sort: passes.sort.bind(device, pairs, DEPTH_BITS, [SLOTS, VISIBLE], true),
-            bin: passes.bin.bind(device, &passes.sort, &buffers, order),
+            bin: passes.bin.bind(device, &passes.sort, &buffers, order, None),
             blend: passes.blend.bind(device, &buffers),
             buffers,
         });

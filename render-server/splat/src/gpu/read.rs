@@ -100,11 +100,26 @@ impl Staging {
         pixels: u64,
         has_ids: bool,
     ) -> Self {
-        let bytes = PIXELS_AT + pixels * if has_ids { 20 } else { 16 };
+        Self::of(old, device, PIXELS_AT + pixels * if has_ids { 20 } else { 16 })
+    }
+
+    /// Returns one of so many bytes; a given one if it is large enough.
+    pub(super) fn of(old: Option<Self>, device: &Device, bytes: u64) -> Self {
         old.filter(|old| old.buffer.size() >= bytes).unwrap_or_else(|| {
             let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
             Self { buffer: device.buffer("staging", bytes, usage) }
         })
+    }
+
+    /// Adds the copy of the first bytes of a buffer.
+    pub(super) fn copy_from(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        from: &wgpu::Buffer,
+        at: u64,
+        bytes: u64,
+    ) {
+        encoder.copy_buffer_to_buffer(from, 0, &self.buffer, at, bytes);
     }
 
     /// Adds the copies of a tick of so many pixels.

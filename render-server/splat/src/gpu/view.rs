@@ -121,6 +121,11 @@ impl GpuView {
         }
     }
 
+    /// Returns a view of which only the size is known: width, height [px], tiles across, tiles.
+    pub(super) fn of_size([width, height, across, _]: [u32; 4]) -> Self {
+        Self { size: [width, height, across, 0], ..Self::default() }
+    }
+
     /// Is the view of a part that is not there.
     pub(super) fn absent() -> Self {
         Self::default()

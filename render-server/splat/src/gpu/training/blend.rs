@@ -1,0 +1,78 @@
+//! Passes 3 and 4 of training: each tile's pixels from its list, and what a loss feels at them back to it.
+//!
+//! Back, a splat's sums over the 256 pixels of a tile are added up in workgroup memory, in one order, and
+//! written to the pair's own place: no atomics, and the same bits in every run.
+//!
+//! Budget: 48 bytes read per pair that is not behind opaque ones, 24 written per pixel; back 52 read per pixel
+//! and 48 written per pair. Bound by arithmetic: some 25 operations per pair and pixel forward, 70 back, and 64
+//! additions by each of 44 threads for four pairs.
+
+use super::super::device::{Device, Groups, Kernel};
+use super::buffers::TrainingBuffers;
+
+const SOURCE: &str =
+    concat!(include_str!("../common.wgsl"), include_str!("photo.wgsl"), include_str!("blend.wgsl"));
+
+/// Workgroups along x; `GRID` in `blend.wgsl`.
+const GRID: u32 = 32_768;
+
+/// The passes.
+#[derive(Debug)]
+pub(super) struct Blend {
+    forward: Kernel,
+    back: Kernel,
+}
+
+/// Their buffers, bound.
+#[derive(Debug)]
+pub(super) struct BlendBindings {
+    forward: wgpu::BindGroup,
+    back: wgpu::BindGroup,
+}
+
+impl Blend {
+    pub(super) fn new(device: &Device) -> Self {
+        let kernel = |entry: &str| device.kernel(SOURCE, entry, &[]);
+        Self { forward: kernel("blend"), back: kernel("blend_back") }
+    }
+
+    pub(super) fn bind(&self, device: &Device, training: &TrainingBuffers) -> BlendBindings {
+        let b = &training.shared;
+        let both = [
+            (0, &training.photo),
+            (1, &b.shapes),
+            (2, &b.extents),
+            (3, &b.colours),
+            (4, &b.slots[1]),
+            (5, &b.lists),
+            (6, &training.image),
+        ];
+        let back = [&both[..], &[(7, &training.by), (8, &training.pair_sums)]].concat();
+        BlendBindings {
+            forward: device.bind(&self.forward, &both),
+            back: device.bind(&self.back, &back),
+        }
+    }
+
+    pub(super) fn run(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &BlendBindings,
+        tiles: u32,
+    ) {
+        self.forward.run(pass, &bindings.forward, groups(tiles));
+    }
+
+    pub(super) fn run_back(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &BlendBindings,
+        tiles: u32,
+    ) {
+        self.back.run(pass, &bindings.back, groups(tiles));
+    }
+}
+
+fn groups(tiles: u32) -> Groups<'static> {
+    Groups::Known(tiles.min(GRID), tiles.div_ceil(GRID))
+}

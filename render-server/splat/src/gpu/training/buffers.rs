@@ -1,0 +1,100 @@
+//! What the passes of training leave for each other, beside the renderer's own buffers.
+//!
+//! Memory: 132 bytes per row besides its numbers, 76 per pair, 52 per pixel.
+
+use super::super::buffers::{Buffers, Capacity};
+use super::super::device::Device;
+use super::photo::PHOTO_BYTES;
+use super::{BY_CHANNELS, CHANNELS, RowGradient};
+use crate::blocks::BLOCK;
+
+/// Numbers that a pair's sums take.
+const PAIR_WORDS: u64 = 12;
+
+/// How much there must be room for, beside the shared [`Capacity`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct TrainingCapacity {
+    /// `camera_blocks` and `pixels` are none.
+    pub(super) shared: Capacity,
+    /// Numbers of all rows.
+    pub(super) row_words: u64,
+    /// Numbers of a channel.
+    pub(super) plane: u64,
+}
+
+impl TrainingCapacity {
+    /// Returns the greatest that a device can give.
+    pub(super) fn limit(binding_bytes: u64) -> Self {
+        // So that a pair's sums, the largest there is per pair, fit too.
+        let shared = Capacity::limit(binding_bytes / PAIR_WORDS);
+        let channels = BY_CHANNELS as u64;
+        Self { shared, row_words: binding_bytes / 4, plane: binding_bytes / (4 * channels) }
+    }
+
+    /// Whether it holds another.
+    pub(super) fn holds(&self, other: &Self) -> bool {
+        self.shared.holds(&other.shared)
+            && self.row_words >= other.row_words
+            && self.plane >= other.plane
+    }
+
+    /// Whether a device can give it.
+    pub(super) fn is_within(&self, limit: &Self) -> bool {
+        self.shared.is_within(&limit.shared)
+            && self.shared.tile_digits <= limit.shared.tile_digits
+            && self.row_words <= limit.row_words
+            && self.plane <= limit.plane
+    }
+
+    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
+        let grow = |has: u64, wants: u64, limit: u64| {
+            if has >= wants { has } else { (wants + wants / 4).min(limit) }
+        };
+        Self {
+            shared: self.shared.grown_to(&other.shared, &limit.shared),
+            row_words: grow(self.row_words, other.row_words, limit.row_words),
+            plane: grow(self.plane, other.plane, limit.plane),
+        }
+    }
+}
+
+/// The buffers; named as in the shaders.
+#[derive(Debug)]
+pub(super) struct TrainingBuffers {
+    pub(super) capacity: TrainingCapacity,
+    pub(super) shared: Buffers,
+    pub(super) photo: wgpu::Buffer,
+    pub(super) rows: wgpu::Buffer,
+    pub(super) image: wgpu::Buffer,
+    pub(super) by: wgpu::Buffer,
+    /// Numbers of pairs, before and after each digit of the sort by tile.
+    pub(super) permutation: [wgpu::Buffer; 2],
+    pub(super) places: wgpu::Buffer,
+    pub(super) pair_sums: wgpu::Buffer,
+    pub(super) gradients: wgpu::Buffer,
+}
+
+impl TrainingBuffers {
+    pub(super) fn new(device: &Device, capacity: TrainingCapacity) -> Self {
+        let storage = |label: &str, words: u64| device.storage(label, words * 4);
+        let source = |label: &str, bytes: u64| {
+            let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
+            device.buffer(label, bytes, usage)
+        };
+        let Capacity { pairs, regions, .. } = capacity.shared;
+        let slots = regions * BLOCK as u64;
+        Self {
+            shared: Buffers::new(device, capacity.shared, false),
+            photo: device.uniform("photo", &[0; PHOTO_BYTES]),
+            rows: storage("rows", capacity.row_words),
+            image: source("image", capacity.plane * CHANNELS as u64 * 4),
+            by: storage("by", capacity.plane * BY_CHANNELS as u64),
+            permutation: [storage("permutation", pairs), storage("permutation", pairs)],
+            places: storage("places", pairs),
+            pair_sums: storage("pair sums", pairs * PAIR_WORDS),
+            gradients: source("gradients", slots * size_of::<RowGradient>() as u64),
+            capacity,
+        }
+    }
+}

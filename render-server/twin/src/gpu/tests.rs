@@ -1,0 +1,249 @@
+//! The passes of a graphics card against finite differences of the f64 reference and against the processor's,
+//! on whatever adapter there is: software Vulkan (`mesa-vulkan-drivers`) will do. Without any, each test prints
+//! what it skips.
+
+use std::sync::OnceLock;
+
+use super::*;
+use crate::passes::Passes;
+use crate::render::Renderer;
+use crate::render::tests::{assert_differences, dense, rows, scene, view, weights};
+use crate::{loss, reference};
+
+/// Returns the adapter to test on.
+fn adapter() -> Option<&'static Adapter> {
+    static ADAPTERS: OnceLock<Vec<Adapter>> = OnceLock::new();
+    let adapter = ADAPTERS.get_or_init(Adapter::all).first();
+    if adapter.is_none() {
+        println!("skipped: no graphics adapter; install mesa-vulkan-drivers and libvulkan1");
+    }
+    adapter
+}
+
+/// Returns passes that start with room for so many pairs.
+fn passes(pairs: u32) -> Option<GpuPasses> {
+    let budget = Budget { pairs, ..Budget::default() };
+    Some(GpuPasses::new(adapter()?, budget).expect("a device"))
+}
+
+/// Renders a view and takes a derivative back to it.
+fn run(
+    gpu: &mut GpuPasses,
+    gaussians: &Gaussians,
+    view: &View,
+    style: Style,
+    by: &Planes,
+) -> (Planes, Vec<u32>, Gaussians) {
+    let (mut seen, mut found) = (Vec::new(), Vec::new());
+    gpu.forward(gaussians, view, style).expect("an image");
+    gpu.backward(gaussians, view, style, by, &mut seen, &mut found).expect("gradients");
+    assert!(seen.is_sorted() && seen.len() == found.len());
+    let gradient = dense(gaussians, seen.iter().map(|&row| row as usize), &found);
+    (gpu.image().clone(), seen, gradient)
+}
+
+#[test]
+fn derivatives_are_those_of_finite_differences() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    for (degree, antialiased) in [(0, false), (1, false), (3, false), (2, true)] {
+        let view = view(35, 21);
+        let style = Style { degree, antialiased };
+        let gaussians = scene(25, degree, &view, 11 + u64::from(degree));
+        let (weights, by) = weights(&view, 5);
+        let (_, _, gradient) = run(&mut gpu, &gaussians, &view, style, &by);
+        // Exponentials of drivers are off by 1e-5, and steep Gaussians multiply that.
+        assert_differences(&gaussians, &view, style, &weights, &gradient, 4e-3);
+    }
+}
+
+#[test]
+fn the_image_is_the_references() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    for (degree, antialiased) in [(0, false), (3, false), (2, true)] {
+        let view = view(70, 50);
+        let style = Style { degree, antialiased };
+        let gaussians = scene(500, degree, &view, 7);
+        let expected = reference::render(&rows(&gaussians), gaussians.stride(), &view, style);
+        gpu.forward(&gaussians, &view, style).expect("an image");
+        let mut off = 0;
+        for (i, expected) in expected.iter().enumerate() {
+            let (x, y) = (i % view.width, i / view.width);
+            let error = (0..channel::COUNT)
+                .map(|c| {
+                    let z = if c == channel::SECOND { 10.0 } else { 1.0 };
+                    (f64::from(gpu.image().at(c, x, y)) - expected[c]).abs() / z
+                })
+                .fold(0.0, f64::max);
+            // A Gaussian on the threshold of 1/255 is in one image and not in the other.
+            off += usize::from(error > 5e-4);
+            assert!(error < 0.03, "{error} at {x}, {y}");
+        }
+        assert!(off <= 4, "{off} pixels are off");
+    }
+}
+
+#[test]
+fn gradients_are_the_processors() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    for (degree, antialiased) in [(0, false), (2, false), (3, true)] {
+        let view = view(150, 130);
+        let style = Style { degree, antialiased };
+        let gaussians = scene(5000, degree, &view, 3);
+        let (_, mut by) = weights(&view, 8);
+        for y in 0..view.height {
+            by.row_mut(channel::ERROR, y).fill(1.0);
+        }
+        let mut cpu = Renderer::default();
+        cpu.forward(&gaussians, &view, style);
+        let mut expected = Vec::new();
+        cpu.backward(&gaussians, &view, style, &by, &mut expected);
+        let errors: f32 = expected.iter().map(|by| by.error).sum();
+        let seen_by_cpu: Vec<u32> = cpu.seen().map(|row| row as u32).collect();
+        let expected = dense(&gaussians, cpu.seen(), &expected);
+        let (_, seen, found) = run(&mut gpu, &gaussians, &view, style, &by);
+
+        // One whose level is that of 1/255 may be seen by either.
+        let apart = seen.len().abs_diff(seen_by_cpu.len());
+        assert!(apart <= 3, "{} rows seen for {}", seen.len(), seen_by_cpu.len());
+        let (mut seen, mut gradients) = (Vec::new(), Vec::new());
+        gpu.backward(&gaussians, &view, style, &by, &mut seen, &mut gradients).expect("gradients");
+        let found_errors: f32 = gradients.iter().map(|by| by.error).sum();
+        assert!((found_errors / errors - 1.0).abs() < 1e-3, "{found_errors} for {errors}");
+        for column in 0..gaussians.stride() {
+            let values = || (column..found.values.len()).step_by(gaussians.stride());
+            let square = |of: &dyn Fn(usize) -> f32| {
+                values().map(|i| f64::from(of(i)).powi(2)).sum::<f64>().sqrt()
+            };
+            let off = square(&|i| found.values[i] - expected.values[i])
+                / square(&|i| expected.values[i]).max(1e-9);
+            assert!(off < 5e-3, "degree {degree}, column {column}: off by {off}");
+        }
+    }
+}
+
+#[test]
+fn every_run_and_every_room_gives_the_same_bits() {
+    let Some(mut gpu) = passes(1 << 20) else { return };
+    let (wide, view) = (view(300, 200), view(150, 130));
+    let style = Style { degree: 2, antialiased: false };
+    let gaussians = scene(5000, 2, &view, 3);
+    let (_, by) = weights(&view, 8);
+    let bits = |(image, seen, gradient): (Planes, Vec<u32>, Gaussians)| {
+        let bits = |values: &[f32]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        (bits(&image.values), seen, bits(&gradient.values))
+    };
+    let expected = bits(run(&mut gpu, &gaussians, &view, style, &by));
+    // A larger photo in between leaves its numbers in all buffers.
+    let other = scene(9000, 2, &view, 5);
+    run(&mut gpu, &other, &wide, style, &weights(&wide, 2).1);
+    assert!(bits(run(&mut gpu, &gaussians, &view, style, &by)) == expected, "the second time");
+    for pairs in [1, 1000] {
+        let mut gpu = passes(pairs).expect("an adapter was there");
+        assert!(bits(run(&mut gpu, &gaussians, &view, style, &by)) == expected, "{pairs} pairs");
+    }
+}
+
+#[test]
+fn photos_of_all_sizes_and_no_gaussians_at_all() {
+    let Some(mut gpu) = passes(1 << 10) else { return };
+    let style = Style { degree: 0, antialiased: false };
+    for (width, height) in [(1, 1), (16, 16), (15, 33), (97, 3)] {
+        let view = view(width, height);
+        let (_, by) = weights(&view, 2);
+        for count in [0, 1, 300] {
+            let gaussians = scene(count, 0, &view, 5);
+            let (image, _, gradient) = run(&mut gpu, &gaussians, &view, style, &by);
+            let mut cpu = Renderer::default();
+            let expected = cpu.forward(&gaussians, &view, style);
+            for y in 0..view.height {
+                let rows = image.row(5, y).iter().zip(expected.row(5, y));
+                assert!(rows.into_iter().all(|(a, b)| (a - b).abs() < 0.03), "{width} {count}");
+            }
+            assert!(gradient.values.iter().all(|v| v.is_finite()));
+        }
+    }
+}
+
+#[test]
+fn poison_leaves_no_trace() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    let view = view(32, 32);
+    let style = Style { degree: 0, antialiased: false };
+    let mut gaussians = scene(40, 0, &view, 3);
+    let (_, by) = weights(&view, 8);
+    let (clean, _, _) = run(&mut gpu, &gaussians, &view, style, &by);
+    for poison in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        for column in [column::MEAN, column::LOG_SCALE, column::ROTATION] {
+            let at = view.unproject([16.0, 16.0], 1.0);
+            gaussians.push(at, Vec3::splat(0.1), glam::Quat::IDENTITY, 0.9, [0.5; 3]);
+            let last = gaussians.len() - 1;
+            gaussians.row_mut(last)[column] = poison;
+            let (image, _, _) = run(&mut gpu, &gaussians, &view, style, &by);
+            assert!(image.values.iter().all(|v| v.is_finite()), "{poison} in column {column}");
+            gaussians.values.truncate(last * gaussians.stride());
+        }
+    }
+    assert!(clean == run(&mut gpu, &gaussians, &view, style, &by).0);
+}
+
+#[test]
+fn a_lost_device_is_named_and_the_processor_goes_on() {
+    let Some(adapter) = adapter() else { return };
+    let view = view(40, 30);
+    let style = Style { degree: 1, antialiased: false };
+    let gaussians = scene(200, 1, &view, 3);
+    let (_, by) = weights(&view, 8);
+    let mut cpu = Passes::cpu();
+    let (mut seen, mut expected) = (Vec::new(), Vec::new());
+    cpu.forward(&gaussians, &view, style);
+    cpu.backward(&gaussians, &view, style, &by, &mut seen, &mut expected);
+    let numbers = |of: &[RowGradient]| of.iter().map(|by| by.geometry).collect::<Vec<_>>();
+    // Before the image, or between it and its derivative.
+    for early in [true, false] {
+        let mut passes = Passes::gpu(adapter, Budget::default()).expect("a device");
+        assert!(passes.name().starts_with("gpu "));
+        let (mut again, mut found) = (Vec::new(), Vec::new());
+        if early {
+            passes.lose_device();
+        }
+        passes.forward(&gaussians, &view, style);
+        passes.lose_device();
+        passes.backward(&gaussians, &view, style, &by, &mut again, &mut found);
+        assert!(passes.name().starts_with("cpu "));
+        let lost = passes.take_lost().expect("it says so");
+        assert!(lost.starts_with("gpu ") && passes.take_lost().is_none(), "{lost}");
+        assert!(again == seen && numbers(&found) == numbers(&expected));
+    }
+}
+
+#[test]
+fn the_trial_passes_a_right_adapter() {
+    if adapter().is_none() {
+        return;
+    }
+    let (passes, reason) = Passes::choose(vizflyt_splat::Backend::Gpu).expect("an adapter");
+    assert!(passes.name().starts_with("gpu ") && reason.contains("trains as"), "{reason}");
+}
+
+#[test]
+fn the_loss_reads_what_a_device_renders() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    let view = view(64, 48);
+    let style = Style { degree: 0, antialiased: false };
+    let gaussians = scene(400, 0, &view, 3);
+    let target = loss::Target {
+        width: 64,
+        height: 48,
+        rgb: (0..64 * 48 * 3).map(|i| (i * 7 % 251) as u8).collect(),
+        ..loss::Target::default()
+    };
+    let weights = loss::Weights { dssim: 0.2, depth: 0.5, spread: 0.02, bend: 0.1 };
+    let mut cpu = Renderer::default();
+    gpu.forward(&gaussians, &view, style).expect("an image");
+    let [a, b] = [gpu.image(), cpu.forward(&gaussians, &view, style)].map(|image| {
+        let exposure = loss::Exposure::default();
+        let mut loss = loss::Loss::default();
+        loss.of(image, &target, &exposure, [0.3; 3], &weights).0.total(&weights)
+    });
+    assert!((a / b - 1.0).abs() < 1e-3, "{a} for {b}");
+}

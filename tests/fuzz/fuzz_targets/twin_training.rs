@@ -1,0 +1,11 @@
+//! A training under way from a file that somebody wrote to: an error or sound, and the same bytes again.
+#![no_main]
+use libfuzzer_sys::fuzz_target;
+use vizflyt_twin::train::Checkpoint;
+
+fuzz_target!(|bytes: &[u8]| {
+    match Checkpoint::from_bytes(bytes) {
+        Ok(checkpoint) => assert_eq!(checkpoint.to_bytes(), bytes),
+        Err(error) => assert!(!error.to_string().is_empty()),
+    }
+});
