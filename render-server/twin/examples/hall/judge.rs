@@ -8,6 +8,7 @@ use vizflyt_twin::align::Similarity;
 use vizflyt_twin::carve::{CarveOptions, Carved, Seen, Voxels};
 
 use crate::capture::{Capture, depth_m, render};
+use crate::profile::Profile;
 
 /// What is off.
 #[derive(Debug)]
@@ -27,6 +28,8 @@ pub(crate) struct Verdict {
     pub(crate) on_way: usize,
     /// Of the photos' truth, without exposure.
     pub(crate) psnr_db: f64,
+    /// Where the occupied voxels are.
+    pub(crate) profile: Profile,
 }
 
 /// Carves a rebuilt room by its capture, within the arena's own voxels.
@@ -108,6 +111,7 @@ pub(crate) fn judge(
         })
         .count();
     Verdict {
+        profile: Profile::of(&rebuilt, &right, &spec.grid, capture, fence.max_m.z),
         on_way,
         beside_seen: beside_seen(&rebuilt) / beside_seen(&right),
         psnr_db: -10.0 * (squares.0 / squares.1.max(1) as f64).log10(),

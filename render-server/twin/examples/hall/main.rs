@@ -4,12 +4,14 @@
 //! cargo run --release -p vizflyt-twin --example hall
 //! cargo run --release -p vizflyt-twin --example hall -- steps=1000 splats=40000 folder=hall sheet=hall.png
 //! ```
-//! `race=SEED` takes a race hall on a usual walk of `seconds` instead of the room. `scene` judges and carves what was trained before, instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth, twin, and
-//! the depths of both. Other keys are those of [`Options`].
+//! `race=SEED` takes a race hall on a usual walk of `seconds` instead of the room. `save` writes what was trained, `scene` judges
+//! and carves that instead of training. `folder` keeps the capture as COLMAP would leave it; `sheet` shows held-out photos: truth,
+//! twin, and the depths of both. Other keys are those of [`Options`].
 
 mod capture;
 mod folder;
 mod judge;
+mod profile;
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -21,7 +23,7 @@ use vizflyt_twin::{Dataset, Options, Trainer};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut options = Options::default();
-    let (mut kept, mut sheet, mut trained, mut race) = (None, None, None, None);
+    let (mut kept, mut sheet, mut trained, mut race, mut save) = (None, None, None, None, None);
     let (mut photos, mut seconds) = (80, 50.0);
     for arg in std::env::args().skip(1) {
         let (key, value) = arg.split_once('=').ok_or("options are KEY=VALUE")?;
@@ -41,6 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             "needle" => options.tolls.needle = number()?,
             "antialiased" => options.antialiased = number()? > 0.0,
             "scene" => trained = Some(PathBuf::from(value)),
+            "save" => save = Some(PathBuf::from(value)),
             "race" => race = Some(value.parse()?),
             "photos" => photos = value.parse()?,
             "seconds" => seconds = value.parse()?,
@@ -72,6 +75,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         Some(path) => vizflyt_splat::format::read(&path)?.splats,
         None => train(&dataset, options)?,
     };
+    if let Some(path) = save {
+        vizflyt_splat::format::write(path, &splats)?;
+    }
     let only = |i: usize| i.is_multiple_of(options.hold_out);
     let judge = |splats: &Splats, seen: Option<&Seen>| {
         judge::judge(splats, &scene.splats, &scene.arena, &capture, seen, only)
@@ -135,6 +141,7 @@ fn print(verdict: &judge::Verdict) {
         verdict.truly_within_fence,
         verdict.on_way
     );
+    println!("voxels       {}", verdict.profile);
 }
 
 /// Writes truth and twin next to each other, colour and depth, of some held-out photos.
