@@ -10,7 +10,6 @@ use sha2::{Digest, Sha256};
 use vizflyt_arena::verdict::StageVerdict;
 use vizflyt_protocol::messages::OutcomeKind;
 
-use super::odometry::OdometryScore;
 use super::statistics::{Interval, mean_interval, share_interval};
 
 /// What the first field holds; another layout is another number.
@@ -94,6 +93,22 @@ pub(crate) struct Shard {
     pub index: u64,
     /// How many there are.
     pub count: u64,
+}
+
+/// How far off a flight's published estimate was; origin and heading are the plugin's choice, and found by least squares.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct OdometryScore {
+    /// Estimates that were compared.
+    pub poses: usize,
+    /// Distance from the truth, root of the mean square. [m]
+    pub ate_rmse_m: f64,
+    /// The greatest. [m]
+    pub ate_max_m: f64,
+    /// How the way of each second differs, root of the mean square; absent if the estimates are of less. [m]
+    pub rpe_trans_rmse_m: Option<f64>,
+    /// And the turn. [deg]
+    pub rpe_rot_rmse_deg: Option<f64>,
 }
 
 /// One flight.
@@ -348,6 +363,28 @@ pub(crate) fn check_files(files: &[SignedFile]) -> Result<()> {
     let is_sorted = files.windows(2).all(|pair| pair[0].path < pair[1].path);
     ensure!(is_sorted, "its files are not in the order of their paths, each once");
     Ok(())
+}
+
+impl OdometryScore {
+    /// Rounds figures to what a text of them holds.
+    pub(crate) fn round(&mut self) {
+        let optional = self.rpe_trans_rmse_m.iter_mut().chain(&mut self.rpe_rot_rmse_deg);
+        for number in [&mut self.ate_rmse_m, &mut self.ate_max_m].into_iter().chain(optional) {
+            *number = millionth(*number);
+        }
+    }
+
+    /// Returns it in a sentence.
+    pub(crate) fn text(&self) -> String {
+        let relative = match (self.rpe_trans_rmse_m, self.rpe_rot_rmse_deg) {
+            (Some(m), Some(deg)) => format!("; a second's motion is off by {m:.3} m, {deg:.2} deg"),
+            _ => String::new(),
+        };
+        format!(
+            "its odometry was off by {:.3} m (rmse of {} poses, {:.3} at most){relative}",
+            self.ate_rmse_m, self.poses, self.ate_max_m
+        )
+    }
 }
 
 impl Run {

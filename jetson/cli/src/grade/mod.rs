@@ -51,7 +51,7 @@ use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
 use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, hex};
 use self::folder::{FLIGHTS, ReportFolder};
-use self::odometry::OdometryScore;
+use self::odometry::odometry_score;
 use self::progress::Progress;
 use self::record::{FlightRecord, FlownWith, SealingKey};
 use self::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
@@ -675,7 +675,7 @@ fn run_of(
         max_speed_mps: verdict.max_speed_mps,
         path_m: verdict.path_m,
         images: flown.images,
-        odometry: OdometryScore::of(&flown.truth, &flown.odometry),
+        odometry: odometry_score(&flown.truth, &flown.odometry),
         scene_sha256: course.scene_sha256.clone(),
         rules_sha256: course.rules_sha256.clone(),
         hash: hex(&flown.hash),
