@@ -136,44 +136,31 @@ fn modified(path: &Path) -> SystemTime {
     fs::metadata(path).unwrap().modified().unwrap()
 }
 
+/// Runs the program with the words of two texts; returns whether it succeeded, and what it printed.
+fn run_words(home: &Path, words: &str, more: &str) -> (bool, String) {
+    run_in(home, &words.split_whitespace().chain(more.split_whitespace()).collect::<Vec<_>>())
+}
+
+/// Films the generated hall into `walk`.
+fn film(home: &Path, more: &str) {
+    let (ok, said) = run_words(home, "scene generate room --seed 3 --capture walk", more);
+    assert!(ok, "{said}");
+}
+
 #[test]
 fn photos_with_poses_become_a_twin_in_metres() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
-    let film = [
-        "scene",
-        "generate",
-        "room",
-        "--seed",
-        "3",
-        "--tags",
-        "--capture",
-        "walk",
-        "--frames",
-        "60",
-    ];
-    let (ok, said) = run_in(home, &film);
-    assert!(ok, "{said}");
+    film(home, "--tags --frames 60");
     let truth = truth(&home.join("walk"));
     write_model(&home.join("model"), &truth, |_| DVec3::ZERO, |_| true);
-    let capture = |more: &[&str]| {
-        let start = [
-            "scene",
-            "capture",
-            "walk",
-            "-o",
-            "hall",
-            "--poses",
-            "model",
-            "--tags",
-            "walk/tags.toml",
-        ];
-        let small =
-            ["--camera", "walk/camera.toml", "--steps", "40", "--splats", "4000", "--width", "80"];
-        run_in(home, &[&start[..], &small, more].concat())
+    let capture = |more: &str| {
+        let words = "scene capture walk -o hall --poses model --tags walk/tags.toml --camera walk/camera.toml --steps 40 \
+                     --splats 4000 --width 80";
+        run_words(home, words, more)
     };
     // So little training leaves floaters where the start should be: whether it can be flown is not asked here.
-    let (_, said) = capture(&[]);
+    let (_, said) = capture("");
     println!("{said}");
     let record: Value =
         serde_json::from_slice(&fs::read(home.join("hall/capture.json")).unwrap()).unwrap();
@@ -209,10 +196,10 @@ fn photos_with_poses_become_a_twin_in_metres() {
     let metric = home.join("hall/stages/metric.json");
     let trained = home.join("hall/stages/train.json");
     let before = (modified(&metric), modified(&trained));
-    let (_, said) = capture(&[]);
+    let (_, said) = capture("");
     assert_eq!(said.matches("(kept)").count(), 6, "{said}");
     assert_eq!((modified(&metric), modified(&trained)), before);
-    let (_, said) = capture(&["--from", "train"]);
+    let (_, said) = capture("--from train");
     assert_eq!(said.matches("(kept)").count(), 4, "{said}");
     assert_eq!(modified(&metric), before.0);
     assert_ne!(modified(&trained), before.1);
@@ -220,7 +207,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
     // A model whose second half stands 3 m beside the first, and some images nowhere: refused, and nothing to fly by is left.
     let half = |n: usize| if n >= 30 { DVec3::new(3.0, 1.0, 0.0) } else { DVec3::ZERO };
     write_model(&home.join("model"), &truth, half, |n| !(10..20).contains(&n));
-    let (ok, said) = capture(&[]);
+    let (ok, said) = capture("");
     println!("{said}");
     assert!(!ok && said.contains("REFUSED"), "{said}");
     assert!(!home.join("hall/arena.toml").exists());
@@ -233,9 +220,7 @@ fn photos_with_poses_become_a_twin_in_metres() {
 fn a_motion_capture_gives_photos_metres_and_their_place() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
-    let film = "scene generate room --seed 3 --capture walk --frames 120 --seconds 8 --size 80x64";
-    let (ok, said) = run_in(home, &film.split(' ').collect::<Vec<_>>());
-    assert!(ok, "{said}");
+    film(home, "--frames 120 --seconds 8 --size 80x64");
     let truth = truth(&home.join("walk"));
     write_model(&home.join("model"), &truth, |_| DVec3::ZERO, |_| true);
     let beside_m = DVec3::new(0.03, -0.09, -0.02);
@@ -250,7 +235,7 @@ fn a_motion_capture_gives_photos_metres_and_their_place() {
     fs::write(home.join("times.csv"), times).unwrap();
     let capture = |more: &str| {
         let words = "scene capture walk -o hall --poses model --track track.txt --steps 1 --splats 1000 --width 40";
-        run_in(home, &words.split(' ').chain(more.split_whitespace()).collect::<Vec<_>>())
+        run_words(home, words, more)
     };
     let (ok, said) = capture("--tracked-at 0.03,-0.09,-0.02");
     assert!(!ok && said.contains("--times"), "{said}");
@@ -276,21 +261,7 @@ fn what_cannot_be_captured_is_explained() {
     fs::write(home.join("hall.mp4"), "no video").unwrap();
     fs::create_dir(home.join("thesis")).unwrap();
     fs::write(home.join("thesis/thesis.tex"), "x").unwrap();
-    let film = [
-        "scene",
-        "generate",
-        "room",
-        "--seed",
-        "3",
-        "--capture",
-        "walk",
-        "--frames",
-        "3",
-        "--size",
-        "64x64",
-    ];
-    let (ok, said) = run_in(home, &film);
-    assert!(ok, "{said}");
+    film(home, "--frames 3 --size 64x64");
     for (args, says) in [
         (&["nothing.mp4", "-o", "out"][..], "neither a video nor a folder"),
         (&["empty", "-o", "out"], "no photos"),
@@ -328,21 +299,7 @@ const STOPS: [&str; 3] = ["no video", "holds no poses", "pip install"];
 fn a_stage_that_fails_leaves_a_report() {
     let folder = tempfile::tempdir().unwrap();
     let home = folder.path();
-    let film = [
-        "scene",
-        "generate",
-        "room",
-        "--seed",
-        "3",
-        "--capture",
-        "walk",
-        "--frames",
-        "8",
-        "--size",
-        "64x64",
-    ];
-    let (ok, said) = run_in(home, &film);
-    assert!(ok, "{said}");
+    film(home, "--frames 8 --size 64x64");
     // A Python whose pycolmap places nothing.
     let python = home.join("python");
     fs::write(&python, "#!/bin/sh\ncase \"$*\" in *version*) echo 4.2.1;; esac\n").unwrap();
