@@ -13,6 +13,7 @@ mod crazyflie;
 #[cfg(all(test, not(feature = "crazyflie")))]
 #[path = "crazyflie/estimate.rs"]
 mod crazyflie_estimate;
+mod dataset;
 mod demo;
 mod doctor;
 #[cfg(test)]
@@ -98,6 +99,7 @@ enum Command {
     Stats(stats::StatsArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
+    Dataset(Box<dataset::DatasetArgs>),
     /// Feeds a flight's recorded images to a plugin and reports where its answers differ.
     Replay(replay::ReplayArgs),
     /// Runs a built-in example plugin; started by `vizflyt fly`.
@@ -128,7 +130,7 @@ pub fn main() -> ExitCode {
             "warn".to_owned()
         }
         // What they print is the result; a load of seconds still shows its progress.
-        Command::Bench(_) => "warn,vizflyt_server::scene=info".to_owned(),
+        Command::Bench(_) | Command::Dataset(_) => "warn,vizflyt_server::scene=info".to_owned(),
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
@@ -184,6 +186,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Stats(args) => stats::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Export(args) => export::run(&args),
+        Command::Dataset(args) => dataset::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Plugin(args) => Ok(plugins::run(&args)),
         Command::Guardian { mavlink } => Ok(vizflyt_guardian::run(&mavlink)),

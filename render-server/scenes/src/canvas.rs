@@ -45,6 +45,11 @@ impl Canvas {
         self.splats.sh.extend(((display - 0.5) / SH_CONSTANT).as_vec3().to_array());
     }
 
+    /// Returns how many patches there are.
+    pub(crate) fn len(&self) -> usize {
+        self.splats.len()
+    }
+
     /// Returns the splats.
     pub(crate) fn finish(self) -> Splats {
         self.splats

@@ -15,6 +15,7 @@ mod canvas;
 pub mod film;
 mod forest;
 mod hall;
+pub mod parts;
 mod prints;
 pub mod projects;
 mod random;
@@ -31,6 +32,7 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_splat::{RigidObject, Splats};
 
+use parts::ScenePart;
 use staging::Staging;
 
 pub use prints::Print;
@@ -98,6 +100,8 @@ pub struct UnknownScene(pub String);
 pub struct Generated {
     /// What cameras see, SH degree 0. [m, world]
     pub splats: Splats,
+    /// Which of the splats are of which thing; in the order of their splats, which no two share.
+    pub parts: Vec<ScenePart>,
     /// The room and its rules; names the scene file that [`Self::write`] makes.
     pub arena: ArenaConfig,
     /// The true obstacles, and the floor as a half space; not the fence. [m, world]

@@ -3,7 +3,7 @@
 mod errors;
 mod page;
 mod pairs;
-mod trajectory;
+pub(crate) mod trajectory;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -8,7 +8,7 @@ use std::fmt::Write;
 
 use anyhow::Result;
 use glam::DVec3;
-use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, Pose};
+use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
 
 use super::files::{Folder, write_depth, write_rgb};
 use super::motion::Motion;
@@ -68,12 +68,28 @@ pub(super) fn write(folder: &Folder, motion: &Motion, mut pictures: Pictures) ->
 }
 
 fn camera(folder: &Folder, path: &str, sensor: &Sensor, stamps: &[u64]) -> Result<()> {
+    write_text(&folder.at(&format!("{path}/data.csv"))?, &images_csv(stamps, "png"))?;
+    let Sensor { camera, intrinsics, body_from_cam, .. } = sensor;
+    let text = camera_yaml(camera, intrinsics, body_from_cam, stamps);
+    write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
+}
+
+/// Returns a camera's list of images, named by their instants.
+pub(crate) fn images_csv(stamps: &[u64], ending: &str) -> String {
     let mut text = "#timestamp [ns],filename\n".to_owned();
     for at_ns in stamps {
-        let _ = writeln!(text, "{at_ns},{at_ns}.png");
+        let _ = writeln!(text, "{at_ns},{at_ns}.{ending}");
     }
-    write_text(&folder.at(&format!("{path}/data.csv"))?, &text)?;
-    let k = &sensor.intrinsics;
+    text
+}
+
+/// Returns a camera's `sensor.yaml`.
+pub(crate) fn camera_yaml(
+    comment: &str,
+    k: &Intrinsics,
+    body_from_cam: &Pose<Body, Cam>,
+    stamps: &[u64],
+) -> String {
     let (model, coefficients) = match k.distortion {
         Distortion::None => ("radial-tangential", vec![0.0; 4]),
         Distortion::BrownConrady { k1, k2, p1, p2, k3 } => {
@@ -84,17 +100,15 @@ fn camera(folder: &Folder, path: &str, sensor: &Sensor, stamps: &[u64]) -> Resul
     };
     // OpenCV's: the centre of the first pixel is 0.
     let intrinsics = [k.fx_px, k.fy_px, k.cx_px - 0.5, k.cy_px - 0.5];
-    let text = format!(
-        "sensor_type: camera\ncomment: {}\n{}rate_hz: {:.3}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
+    format!(
+        "sensor_type: camera\ncomment: {comment}\n{}rate_hz: {:.3}\nresolution: [{}, {}]\ncamera_model: pinhole\n\
          intrinsics: {intrinsics:?} # fu, fv, cu, cv\ndistortion_model: {model}\n\
          distortion_coefficients: {coefficients:?}\n",
-        sensor.camera,
-        transform(&sensor.body_from_cam),
+        transform(body_from_cam),
         rate_hz(stamps),
         k.width_px,
         k.height_px,
-    );
-    write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
+    )
 }
 
 /// Returns a sensor's place in the body as its file has it.
@@ -138,26 +152,44 @@ fn imu(folder: &Folder, motion: &Motion) -> Result<()> {
 }
 
 fn truth(folder: &Folder, motion: &Motion) -> Result<()> {
+    let rows = motion.poses.iter().map(|pose| TruthRow {
+        at_ns: pose.at_ns,
+        world_from_body: pose.from_body,
+        v_world_mps: motion.motion_at(pose.at_ns).v_world_mps,
+    });
+    let path = "mav0/state_groundtruth_estimate0";
+    write_text(&folder.at(&format!("{path}/data.csv"))?, &truth_csv(rows))?;
+    let text = truth_yaml("the localized pose of the body in the world");
+    write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
+}
+
+/// The true motion of the body at an instant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct TruthRow {
+    pub(crate) at_ns: u64,
+    pub(crate) world_from_body: Pose<World, Body>,
+    pub(crate) v_world_mps: DVec3,
+}
+
+/// Returns the list of true motions. Biases are not known, and written as 0.
+pub(crate) fn truth_csv(rows: impl Iterator<Item = TruthRow>) -> String {
     let mut text = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
                     v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], \
                     b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], \
                     b_a_RS_S_z [m s^-2]\n"
         .to_owned();
-    for pose in &motion.poses {
-        let (p, q) = (pose.from_body.translation_m, pose.from_body.rotation);
-        let v = motion.motion_at(pose.at_ns).v_world_mps;
-        // Biases are not known, and written as 0.
+    for TruthRow { at_ns, world_from_body, v_world_mps: v } in rows {
+        let (p, q) = (world_from_body.translation_m, world_from_body.rotation);
         let _ = writeln!(
             text,
-            "{},{},{},{},{},{},{},{},{},{},{},0,0,0,0,0,0",
-            pose.at_ns, p.x, p.y, p.z, q.w, q.x, q.y, q.z, v.x, v.y, v.z
+            "{at_ns},{},{},{},{},{},{},{},{},{},{},0,0,0,0,0,0",
+            p.x, p.y, p.z, q.w, q.x, q.y, q.z, v.x, v.y, v.z
         );
     }
-    let path = "mav0/state_groundtruth_estimate0";
-    write_text(&folder.at(&format!("{path}/data.csv"))?, &text)?;
-    let text = format!(
-        "sensor_type: visual-inertial\ncomment: the localized pose of the body in the world\n{}",
-        transform(&Pose::IDENTITY)
-    );
-    write_text(&folder.at(&format!("{path}/sensor.yaml"))?, &text)
+    text
+}
+
+/// Returns the `sensor.yaml` of the list of true motions.
+pub(crate) fn truth_yaml(comment: &str) -> String {
+    format!("sensor_type: visual-inertial\ncomment: {comment}\n{}", transform(&Pose::IDENTITY))
 }

@@ -7,7 +7,7 @@
 //! Every image is named by the instant that it shows. The folder appears under its name when it is whole.
 
 mod columns;
-mod euroc;
+pub(crate) mod euroc;
 mod files;
 mod motion;
 mod parquet;

@@ -12,7 +12,7 @@
 //! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
 
 mod course;
-mod document;
+pub(crate) mod document;
 mod folder;
 mod judge;
 mod junit;

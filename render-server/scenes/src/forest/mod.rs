@@ -21,6 +21,7 @@ use vizflyt_protocol::messages::Limits;
 
 use crate::Generated;
 use crate::canvas::Canvas;
+use crate::parts::{PartClass, Parts};
 use crate::solids::Solids;
 use crate::staging::{Stage, Staging};
 use light::Light;
@@ -33,21 +34,26 @@ pub(crate) fn build(seed: u64) -> Generated {
 
 /// Returns the forest of a seed, made to be filmed.
 pub(crate) fn build_staged(seed: u64, staging: &mut Staging) -> Generated {
-    let layers = [ground::paint_ground, bark::paint_wood, plants::paint_plants];
+    let layers: [Layer; 3] = [
+        (PartClass::Ground, ground::paint_ground),
+        (PartClass::Tree, bark::paint_wood),
+        (PartClass::Plant, plants::paint_plants),
+    ];
     build_layers(seed, &layers, staging)
 }
 
 /// Returns the forest without leaves, ferns and grass: what is solid only.
 #[cfg(test)]
 pub(crate) fn build_bare(seed: u64) -> Generated {
-    build_layers(seed, &[ground::paint_ground, bark::paint_wood], &mut Staging::none())
+    let layers: [Layer; 2] =
+        [(PartClass::Ground, ground::paint_ground), (PartClass::Tree, bark::paint_wood)];
+    build_layers(seed, &layers, &mut Staging::none())
 }
 
-fn build_layers(
-    seed: u64,
-    layers: &[fn(&mut Canvas, &Site, &Light)],
-    staging: &mut Staging,
-) -> Generated {
+/// What a painter paints, and the painter.
+type Layer = (PartClass, fn(&mut Canvas, &Site, &Light));
+
+fn build_layers(seed: u64, layers: &[Layer], staging: &mut Staging) -> Generated {
     let site = Site::plan(seed);
     let arena = arena(&site);
     let mut truth = site.truth();
@@ -63,13 +69,17 @@ fn build_layers(
     let solids = Solids::new(truth);
     let mut canvas = Canvas::default();
     let light = Light::new(&site, &solids);
-    for layer in layers {
-        layer(&mut canvas, &site, &light);
+    let mut parts = Parts::default();
+    for (class, paint) in layers {
+        paint(&mut canvas, &site, &light);
+        parts.add(&canvas, *class, class.name());
     }
     backdrop::paint_backdrop(&mut canvas, &site);
+    parts.add(&canvas, PartClass::Backdrop, PartClass::Backdrop.name());
     staging.paint(&mut canvas, &mut |p_m, normal, albedo| light.matt(p_m, normal, albedo));
     Generated {
         splats: canvas.finish(),
+        parts: parts.finish(),
         arena,
         truth: solids.into_volumes(),
         objects: Vec::new(),

@@ -39,8 +39,8 @@ impl Gate {
         self.bars().into_iter().chain(self.stand()).collect()
     }
 
-    /// Paints it.
-    pub(crate) fn paint(&self, painter: &mut Painter) {
+    /// Paints its bars.
+    pub(crate) fn paint_frame(&self, painter: &mut Painter) {
         let middle_m = self.center_m;
         let back = self.rotation().conjugate();
         let outer_m = self.opening_m / 2.0 + BAR_M;
@@ -69,6 +69,10 @@ impl Gate {
                 }))
             });
         }
+    }
+
+    /// Paints legs and feet, and the hub if it has one.
+    pub(crate) fn paint_stand(&self, painter: &mut Painter) {
         for (n, block) in self.stand().into_iter().enumerate() {
             let hub = n == 4;
             let colour = if hub { paint(0x1d1e21) } else { paint(0x8b8e93) };

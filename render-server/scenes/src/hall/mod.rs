@@ -27,6 +27,7 @@ use vizflyt_protocol::messages::Limits;
 use crate::Generated;
 use crate::canvas::{Canvas, paint};
 use crate::forest::front_camera;
+use crate::parts::{PartClass, Parts};
 use crate::random::{Rng, fractal2, noise2};
 use crate::solids::Solids;
 use crate::staging::{Stage, Staging};
@@ -154,8 +155,11 @@ impl Course {
         Self { windows, gap, hand, pillars, doorway, movers }
     }
 
-    fn gates(&self) -> impl Iterator<Item = &Gate> {
-        self.windows.iter().chain(&self.hand)
+    /// Returns each gate with the name of its stage.
+    fn gates(&self) -> impl Iterator<Item = (&Gate, String)> {
+        let window = |(n, gate)| (gate, format!("window {}", n + 1));
+        let hand = self.hand.iter().map(|gate| (gate, HAND.to_owned()));
+        self.windows.iter().enumerate().map(window).chain(hand)
     }
 
     fn stages(&self) -> Vec<StageConfig> {
@@ -163,21 +167,21 @@ impl Course {
         for (n, window) in self.windows.iter().enumerate() {
             stages.push(window.stage(&format!("window {}", n + 1)));
         }
-        stages.extend(self.gap.iter().map(|gap| gap.stage("gap")));
-        stages.extend(self.hand.iter().map(|hand| hand.stage("clock hand")));
+        stages.extend(self.gap.iter().map(|gap| gap.stage(GAP)));
+        stages.extend(self.hand.iter().map(|hand| hand.stage(HAND)));
         stages
     }
 
     fn blocks(&self) -> Vec<Block> {
         let gap = self.gap.iter().flat_map(GapWall::blocks);
         let others = self.pillars.blocks().chain(self.doorway.iter().copied());
-        self.gates().flat_map(Gate::blocks).chain(gap).chain(others).collect()
+        self.gates().flat_map(|(gate, _)| gate.blocks()).chain(gap).chain(others).collect()
     }
 
     fn casters(&self) -> Vec<Block> {
         let gap = self.gap.iter().flat_map(GapWall::casters);
         let others = self.pillars.blocks().chain(self.doorway.iter().copied());
-        self.gates().flat_map(Gate::blocks).chain(gap).chain(others).collect()
+        self.gates().flat_map(|(gate, _)| gate.blocks()).chain(gap).chain(others).collect()
     }
 }
 
@@ -194,6 +198,9 @@ impl Layout {
     }
 }
 
+/// What the stages are called.
+const GAP: &str = "gap";
+const HAND: &str = "clock hand";
 /// Where the first thing to fly through stands along x. [m, world]
 const FIRST_M: f64 = 2.3;
 /// And the last: enough room behind it to stop before the net. [m, world]
@@ -234,20 +241,27 @@ fn build(
     let mut painter = Painter { canvas: Canvas::default(), rng, light };
 
     let spawn_m = DVec3::new(0.9, 0.0, 0.0);
+    let mut parts = Parts::default();
     shell.paint(&mut painter, &|at| mats(seed, at, &[spawn_m, goal.position_m]));
-    for gate in course.gates() {
-        gate.paint(&mut painter);
+    parts.add(&painter.canvas, PartClass::Room, "room");
+    for (gate, name) in course.gates() {
+        gate.paint_frame(&mut painter);
+        parts.add(&painter.canvas, PartClass::Gate, &name);
+        gate.paint_stand(&mut painter);
+        parts.add(&painter.canvas, PartClass::Stand, &format!("stand of {name}"));
     }
     if let Some(gap) = &course.gap {
         gap.paint(&mut painter);
+        parts.add(&painter.canvas, PartClass::Wall, GAP);
     }
-    course.pillars.paint(&mut painter);
-    for block in &course.doorway {
+    course.pillars.paint(&mut painter, &mut parts);
+    for (n, block) in course.doorway.iter().enumerate() {
         let grain = Grain { coarse_m: 0.12, fine_m: 0.05 };
         painter.cuboid(block, grain, &[4], &|_, p| {
             let tone = 0.85 + 0.3 * noise2(seed ^ 0x84, p / 0.09);
             Some(Look::matt(paint(0x9a8f80) * tone))
         });
+        parts.add(&painter.canvas, PartClass::Wall, &format!("doorway {}", n + 1));
     }
     let made = course.movers.make(&mut painter);
     let Painter { canvas, rng, light } = &mut painter;
@@ -285,6 +299,7 @@ fn build(
         made.into_iter().map(|GeneratedMover { object, truth, .. }| (object, truth)).unzip();
     Generated {
         splats,
+        parts: parts.finish(),
         arena,
         truth: solids.into_volumes(),
         objects,
@@ -354,11 +369,36 @@ mod tests {
                 }
             }
             // Nothing reaches through the net or into another piece.
-            for gate in course.gates() {
+            for (gate, _) in course.gates() {
                 for block in gate.blocks() {
                     let (low, high) = crate::solids::bounds(&block.volume()).unwrap();
                     assert!(low.y > NET_MIN_M.y && high.y < NET_MAX_M.y, "seed {seed}");
                     assert!(low.z > -1e-9 && high.z < NET_MAX_M.z, "seed {seed}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_gates_part_is_its_bars_and_all_of_them() {
+        for seed in 0..3 {
+            let scene = build_race(seed, &mut Staging::none());
+            let course = Course::draw(seed, RACE);
+            assert!(scene.parts.windows(2).all(|pair| pair[0].splats.end == pair[1].splats.start));
+            for (gate, name) in course.gates() {
+                let part = scene.parts.iter().find(|part| part.name == name).unwrap();
+                assert_eq!(part.class, PartClass::Gate);
+                let bars: Vec<Volume> = gate.blocks()[..4].iter().map(Block::volume).collect();
+                for (i, mean_m) in scene.splats.means_m.iter().enumerate() {
+                    let of = |bar: &Volume| bar.signed_distance_m(mean_m.as_dvec3());
+                    let off_m = bars.iter().map(of).fold(f64::MAX, f64::min);
+                    let on_surface = (-0.005..1e-5).contains(&off_m);
+                    if part.splats.contains(&i) {
+                        assert!(on_surface, "seed {seed}, {name}: {off_m} m");
+                    } else {
+                        // The motor stands in the lower bar.
+                        assert!(off_m > -0.002 || gate.with_hub, "seed {seed}, {name}: {off_m} m");
+                    }
                 }
             }
         }

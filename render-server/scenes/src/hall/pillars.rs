@@ -5,6 +5,7 @@ use glam::{DQuat, DVec2, DVec3};
 use super::panel::{Block, Grain, Look, Painter};
 use super::shell::{NET_MAX_M, NET_MIN_M};
 use crate::canvas::paint;
+use crate::parts::{PartClass, Parts};
 use crate::random::{Rng, noise2};
 
 /// Upright boxes on the floor.
@@ -51,7 +52,7 @@ impl Pillars {
     }
 
     /// Paints them: blocks of foam, stacked.
-    pub(crate) fn paint(&self, painter: &mut Painter) {
+    pub(crate) fn paint(&self, painter: &mut Painter, parts: &mut Parts) {
         for (n, (block, colour)) in self.pillars.iter().enumerate() {
             let seed = self.seed ^ (n as u64 * 131);
             let grain = Grain { coarse_m: 0.11, fine_m: 0.04 };
@@ -62,6 +63,7 @@ impl Pillars {
                 let tone = 0.8 + 0.3 * noise2(seed, DVec2::new(p.x, p.y) / 0.07);
                 Some(Look::matt(*colour * if seam { 0.35 } else { tone }))
             });
+            parts.add(&painter.canvas, PartClass::Pillar, &format!("pillar {}", n + 1));
         }
     }
 }
