@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Pose, Sensor, World};
 
-use super::cast::{Beam, Echo, echoes, spread_of};
+use super::cast::{Beam, Echo, Hits, echoes, spread_of};
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
 
@@ -245,6 +245,7 @@ impl Lidar {
         out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, points)| {
             // Beams of a stack leave from one pose: a slerp is a fifth of what a beam may cost.
             let mut latest = (0.0, motion.sensor_at(0.0));
+            let mut hits = Hits::new();
             for (i, point) in points.iter_mut().enumerate() {
                 let number = chunk * CHUNK + i;
                 let leaving = self.leaving(number, seq);
@@ -252,7 +253,7 @@ impl Lidar {
                     latest = (leaving.share, motion.sensor_at(leaving.share));
                 }
                 let draws = Draws::new(seed, seq, number as u64);
-                *point = self.measure(scene, motion, &latest.1, &leaving, draws);
+                *point = self.measure(scene, motion, &latest.1, &leaving, draws, &mut hits);
             }
         });
         Ok(())
@@ -265,6 +266,7 @@ impl Lidar {
         world_from_sensor: &Pose<World, Sensor>,
         leaving: &Leaving,
         mut draws: Draws,
+        hits: &mut Hits,
     ) -> LidarPoint {
         let model = &self.model;
         let &Leaving { direction, share, ring } = leaving;
@@ -279,7 +281,7 @@ impl Lidar {
             ring,
             ..LidarPoint::default()
         };
-        let mut hits = scene.cast(motion, share, &beam);
+        scene.cast(motion, share, &beam, hits);
         let [threshold, error] = draws.gaussians();
         let threshold = 1.0 + THRESHOLD_NOISE * (threshold - NINE_IN_TEN);
         let mut reported: Option<Echo> = None;

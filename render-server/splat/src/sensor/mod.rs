@@ -5,13 +5,14 @@
 //! keeps, without allocation after the first call. What it is told is a [`Motion`]: where sensor and objects are from the
 //! first instant of a measurement to its last.
 //!
-//! Data flow, the files in run order: `tree` packs splats for rays, `cast` follows one beam through them and returns its
+//! Data flow, the files in run order: `tree` packs splats for rays, `follow` takes a ray through them, `cast` makes of what it meets a beam's
 //! echoes, `lidar`, `range` (one beam, and sonar) and `radar` make of echoes what the sensor reports, with the numbers of
 //! `noise`. All randomness follows from (seed, sequence number, beam): the same for any number of threads.
 //!
 //! Axes of a sensor: x forward, y left, z up. `docs/guides/sensor-models.md` states every formula and its source.
 
 mod cast;
+mod follow;
 mod lidar;
 mod noise;
 pub mod presets;
@@ -140,3 +141,6 @@ impl Checked {
         self.within("reference_range_m", reference_range_m, [1e-2, 1e4], "0.01 to 10000")
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -12,7 +12,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::cast::{Beam, echoes};
+use super::cast::{Beam, Hits, echoes};
 use super::lidar::pointing;
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
@@ -200,7 +200,8 @@ impl RadarModel {
         let direction = world_from_sensor.rotate(ray.direction.as_dvec3()).normalize();
         let origin_m = world_from_sensor.translation_m;
         let beam = Beam { origin_m, direction, spread, max_m: self.max_range_m };
-        let mut hits = scene.cast(motion, 0.5, &beam);
+        let mut hits = Hits::new();
+        scene.cast(motion, 0.5, &beam, &mut hits);
         let mut patch = Patch { cell: NOWHERE, ..Patch::default() };
         echoes(hits.weigh(), self.range_resolution_m, |echo| {
             let cosine = echo.cosine.clamp(1e-3, 1.0);

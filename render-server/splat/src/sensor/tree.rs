@@ -4,8 +4,8 @@
 //! construction of SAH-based bounding volume hierarchies") until the node has eight.
 
 use glam::{Mat3, Quat, Vec3};
+use half::f16;
 
-use crate::limits::{ALPHA_MIN, MAX_SCALE_M};
 use crate::{Splats, harmonics};
 
 /// Boxes of a node, splats of a leaf: the lanes of a vector.
@@ -16,6 +16,8 @@ pub(super) const LEAF: u32 = 1 << 31;
 pub(super) const NONE: u32 = u32::MAX;
 /// Thinner splats count as this thin: f32 cannot follow a ray of 100 m more exactly. [m]
 const MIN_SCALE_M: f32 = 1e-4;
+/// Larger ones count as this large: half precision ends there. [m]
+const MAX_SCALE_M: f32 = 6e4;
 
 /// A node: the boxes of its children, as middles and half sides.
 #[derive(Clone, Debug)]
@@ -26,20 +28,21 @@ pub(super) struct Node {
     pub(super) children: [u32; WIDTH],
 }
 
-/// Eight Gaussians, number by number; places that are not filled have the level minus infinity.
+/// Eight Gaussians, number by number, half of them in half precision: 240 bytes, for what a ray waits for is memory. Places that are
+/// not filled have the level minus infinity.
 #[derive(Clone, Debug)]
 pub(super) struct Leaf {
     pub(super) mean_m: [[f32; WIDTH]; 3],
-    /// Columns of the rotation from the Gaussian's axes: the thinnest last.
-    pub(super) axes: [[[f32; WIDTH]; 3]; 3],
-    /// Variances along those axes. [m^2]
-    pub(super) variance_m2: [[f32; WIDTH]; 3],
-    /// log2 of the opacity.
-    pub(super) level: [f32; WIDTH],
-    /// Share of light that comes back, 0 to 1.
-    pub(super) reflectivity: [f32; WIDTH],
-    /// How much of a disc it is: 1 where it has a normal, 0 where its two thinnest axes are alike.
-    pub(super) flatness: [f32; WIDTH],
+    /// Unit quaternion from the Gaussian's axes, of which the thinnest is the last; xyzw. [f16]
+    pub(super) rotation: [[u16; WIDTH]; 4],
+    /// Standard deviations along those axes. [m, f16]
+    pub(super) scale_m: [[u16; WIDTH]; 3],
+    /// log2 of the opacity. [f16]
+    pub(super) level: [u16; WIDTH],
+    /// Share of light that comes back, 0 to 255.
+    pub(super) reflectivity: [u8; WIDTH],
+    /// How much of a disc it is: 255 where it has a normal, 0 where its two thinnest axes are alike.
+    pub(super) flatness: [u8; WIDTH],
 }
 
 /// The splats of one part of a scene.
@@ -127,43 +130,51 @@ impl Tree {
 
 impl Leaf {
     fn new(splats: &Splats, items: &[Item]) -> Self {
+        let half = |v: f32| f16::from_f32(v).to_bits();
+        let byte = |share: f32| (share * 255.0).round() as u8;
         let mut leaf = Self {
             mean_m: [[0.0; WIDTH]; 3],
-            axes: [[[0.0; WIDTH]; 3]; 3],
-            variance_m2: [[1.0; WIDTH]; 3],
-            level: [f32::NEG_INFINITY; WIDTH],
-            reflectivity: [0.0; WIDTH],
-            flatness: [0.0; WIDTH],
+            rotation: [[half(0.5); WIDTH]; 4],
+            scale_m: [[half(1.0); WIDTH]; 3],
+            level: [half(f32::NEG_INFINITY); WIDTH],
+            reflectivity: [0; WIDTH],
+            flatness: [0; WIDTH],
         };
         let numbers = splats.sh_coefficients() * 3;
         for (lane, item) in items.iter().enumerate() {
             let i = item.index as usize;
-            let rotation = Mat3::from_quat(splats.rotations[i].normalize());
+            let axes = Mat3::from_quat(splats.rotations[i].normalize());
             let scales = clamped(splats.scales_m[i]).to_array();
-            // The thinnest axis last.
+            // The thinnest axis last; the first by the others, so that it stays a rotation.
             let mut order = [0, 1, 2];
             order.sort_by(|&a, &b| scales[b].total_cmp(&scales[a]));
-            for (to, &from) in order.iter().enumerate() {
-                for row in 0..3 {
-                    leaf.axes[to][row][lane] = rotation.col(from)[row];
-                }
-                leaf.variance_m2[to][lane] = scales[from] * scales[from];
+            let [_, middle, thinnest] = order;
+            let [across, normal] = [axes.col(middle), axes.col(thinnest)];
+            let turned = Quat::from_mat3(&Mat3::from_cols(across.cross(normal), across, normal));
+            for (numbers, v) in leaf.rotation.iter_mut().zip(turned.normalize().to_array()) {
+                numbers[lane] = half(v);
             }
             for axis in 0..3 {
+                leaf.scale_m[axis][lane] = half(scales[order[axis]]);
                 leaf.mean_m[axis][lane] = splats.means_m[i][axis];
             }
-            leaf.level[lane] = splats.opacities[i].log2();
+            leaf.level[lane] = half(splats.opacities[i].log2());
             let constant = &splats.sh[i * numbers..i * numbers + 3];
-            leaf.reflectivity[lane] = reflectivity([constant[0], constant[1], constant[2]]);
-            leaf.flatness[lane] = 1.0 - scales[order[2]] / scales[order[1]];
+            leaf.reflectivity[lane] = byte(reflectivity([constant[0], constant[1], constant[2]]));
+            // A third as thick as wide is a disc.
+            leaf.flatness[lane] = byte((1.5 * (1.0 - scales[thinnest] / scales[middle])).min(1.0));
         }
         leaf
     }
 }
 
-/// Returns the standard deviations at which an opacity falls below 1/255.
-pub(super) fn reach(opacity: f32) -> f32 {
-    (2.0 * (opacity / ALPHA_MIN as f32).ln().max(0.0)).sqrt()
+/// Where a splat hides less, a beam takes no notice of it. Images go down to 1/255, for what 8 bits show; a range does not change by
+/// it, a surface of splats loses a twentieth of its opacity, and boxes have half the area.
+pub(super) const LEAST_ALPHA: f32 = 0.05;
+
+/// Returns the standard deviations at which an opacity falls below [`LEAST_ALPHA`].
+fn reach(opacity: f32) -> f32 {
+    (2.0 * (opacity / LEAST_ALPHA).ln().max(0.0)).sqrt()
 }
 
 pub(super) fn clamped(scales_m: Vec3) -> Vec3 {
