@@ -11,7 +11,7 @@ use super::Motion;
 use super::follow::{Follow, Ray};
 use super::tree::{NONE, Tree, WIDTH};
 use crate::cpu::simd::InstructionSet;
-use crate::{Scene, Splats};
+use crate::{Placement, Scene, Splats};
 
 /// A scene packed for beams; made once, then any sensor measures in it.
 #[derive(Debug)]
@@ -48,36 +48,59 @@ impl SensorScene {
         self.parts.len() - 1
     }
 
-    /// Finds what a beam meets at a share of `motion`, 0 to 1.
-    pub(super) fn cast(&self, motion: &Motion<'_>, share: f64, beam: &Beam, hits: &mut Hits) {
-        hits.begin(beam.max_m);
-        let mut within = |part: &Part, number: usize, origin: DVec3, direction: DVec3| {
-            let ray = Ray {
-                origin_m: origin.as_vec3(),
-                direction: direction.as_vec3(),
-                spread: beam.spread,
-            };
-            let tag = Tag { id: part.id, part: number as u16 };
-            self.instructions.run(Follow { tree: &part.tree, ray, tag, hits });
-        };
-        within(&self.parts[0], 0, beam.origin_m, beam.direction);
-        for (i, (part, placements)) in self.parts[1..].iter().zip(motion.objects).enumerate() {
-            let [Some(begin), Some(end)] = placements else { continue };
-            // A sphere about its origin first, for most beams miss an object: a line costs less than a slerp.
-            let middle_m = begin.translation_m.lerp(end.translation_m, share) - beam.origin_m;
-            let along_m = middle_m.dot(beam.direction);
-            let across_m2 = middle_m.length_squared() - along_m * along_m;
-            let radius_m = part.radius_m + 4.0 * f64::from(beam.spread) * middle_m.length();
-            if !(along_m > -radius_m && across_m2 < radius_m * radius_m) {
-                continue;
+    /// Finds what each of some beams meets, at its share of `motion`, 0 to 1. Beams close to one another, as neighbours of a ring are,
+    /// take less time together; any others get the same.
+    pub(super) fn cast(&self, motion: &Motion<'_>, beams: &[(f64, Beam)], hits: &mut [Hits]) {
+        let mut rays = [Ray::default(); TOGETHER];
+        for (beams, hits) in beams.chunks(TOGETHER).zip(hits.chunks_mut(TOGETHER)) {
+            for (((_, beam), ray), hits) in beams.iter().zip(&mut rays).zip(hits.iter_mut()) {
+                hits.begin(beam.max_m);
+                *ray = beam.ray(beam.origin_m, beam.direction);
             }
-            let between = if begin == end { *begin } else { begin.interpolate(end, share) };
-            let object_from_world = between.inverse();
-            let origin = object_from_world.transform_point(beam.origin_m);
-            within(part, i + 1, origin, object_from_world.rotate(beam.direction));
+            self.follow(0, &rays[..beams.len()], hits);
+            for (i, placements) in motion.objects.iter().enumerate() {
+                for ((share, beam), hits) in beams.iter().zip(hits.iter_mut()) {
+                    if let Some(ray) = self.in_object(i + 1, placements, *share, beam) {
+                        self.follow(i + 1, &[ray], std::slice::from_mut(hits));
+                    }
+                }
+            }
         }
     }
+
+    fn follow(&self, number: usize, rays: &[Ray], hits: &mut [Hits]) {
+        let part = &self.parts[number];
+        let tag = Tag { id: part.id, part: number as u16 };
+        self.instructions.run(Follow { tree: &part.tree, rays, tag, hits });
+    }
+
+    /// Returns a beam as an object sees it that is placed at both ends of the motion; `None` if it passes by.
+    fn in_object(
+        &self,
+        number: usize,
+        placements: &[Placement; 2],
+        share: f64,
+        beam: &Beam,
+    ) -> Option<Ray> {
+        let [Some(begin), Some(end)] = placements else { return None };
+        // A sphere about its origin first, for most beams miss an object: a line costs less than a slerp.
+        let middle_m = begin.translation_m.lerp(end.translation_m, share) - beam.origin_m;
+        let along_m = middle_m.dot(beam.direction);
+        let across_m2 = middle_m.length_squared() - along_m * along_m;
+        let around_m = self.parts[number].radius_m;
+        let radius_m = around_m + 4.0 * f64::from(beam.spread) * (middle_m.length() + around_m);
+        if !(along_m > -radius_m && across_m2 < radius_m * radius_m) {
+            return None;
+        }
+        let between = if begin == end { *begin } else { begin.interpolate(end, share) };
+        let object_from_world = between.inverse();
+        let origin = object_from_world.transform_point(beam.origin_m);
+        Some(beam.ray(origin, object_from_world.rotate(beam.direction)))
+    }
 }
+
+/// Beams that go through the tree together.
+pub(super) const TOGETHER: usize = 8;
 
 impl Part {
     fn new(id: u16, splats: &Splats) -> Self {
@@ -95,7 +118,7 @@ impl Part {
 }
 
 /// One beam in the world.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Beam {
     /// Where it begins. [m, world]
     pub(super) origin_m: DVec3,
@@ -105,6 +128,12 @@ pub(super) struct Beam {
     pub(super) spread: f32,
     /// Nothing is looked for beyond. [m]
     pub(super) max_m: f32,
+}
+
+impl Beam {
+    fn ray(&self, origin_m: DVec3, direction: DVec3) -> Ray {
+        Ray { origin_m: origin_m.as_vec3(), direction: direction.as_vec3(), spread: self.spread }
+    }
 }
 
 /// Returns the standard deviation per metre of a beam whose full angle is stated where its intensity is 1/e^2 of its
@@ -136,7 +165,7 @@ pub(super) struct Tag {
 }
 
 /// What a beam meets, nearest first.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Hits {
     hits: [Hit; MAX_HITS],
     len: usize,

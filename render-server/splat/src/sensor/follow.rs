@@ -1,4 +1,4 @@
-//! A ray through a tree of splats: boxes eight at a time, then splats eight at a time, nearest first.
+//! Rays through a tree of splats: boxes eight at a time for a bundle of rays, then splats eight at a time for each, nearest first.
 //!
 //! Budget: some 0.5 us a ray, bound by the boxes and splats that it touches.
 //!
@@ -18,7 +18,7 @@ use crate::cpu::simd::{Kernel, Simd};
 use crate::limits::ALPHA_MAX;
 
 /// A beam in the axes of a part.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Ray {
     pub(super) origin_m: Vec3,
     /// Unit.
@@ -27,12 +27,13 @@ pub(super) struct Ray {
     pub(super) spread: f32,
 }
 
-/// Follows a ray through a tree.
+/// Follows rays that are close to one another through a tree: boxes once for all of them, splats for each.
 pub(super) struct Follow<'a> {
     pub(super) tree: &'a Tree,
-    pub(super) ray: Ray,
+    pub(super) rays: &'a [Ray],
     pub(super) tag: Tag,
-    pub(super) hits: &'a mut Hits,
+    /// What each meets, as many as there are rays.
+    pub(super) hits: &'a mut [Hits],
 }
 
 const _: () = assert!(LEAST_ALPHA == 0.05, "LEAST_LEVEL and REACH follow from it");
@@ -47,28 +48,79 @@ const REACH: f32 = 2.45;
 // Closures are no substitute for the functions below, nor are maps of arrays: they are not always inlined, and then run without the
 // kernel's instructions.
 
-/// A ray, in every lane.
+/// A cone around some rays, in every lane.
 #[derive(Clone, Copy)]
-struct Lanes<S: Simd> {
+struct Bundle<S: Simd> {
     origin: [S::F; 3],
     direction: [S::F; 3],
     inverse: [S::F; 3],
     steep: [S::F; 3],
-    spread: S::F,
+    /// How far from its axis its rays and their footprints are, per metre. [m/m]
+    slope: S::F,
+    /// How far from its origin theirs are. [m]
+    apart: S::F,
+}
+
+impl<S: Simd> Bundle<S> {
+    #[inline(always)]
+    fn around(s: S, rays: &[Ray]) -> Self {
+        let (mut origin, mut direction) = (Vec3::ZERO, Vec3::ZERO);
+        for ray in rays {
+            origin += ray.origin_m;
+            direction += ray.direction;
+        }
+        origin /= rays.len() as f32;
+        // Rays that cancel are no bundle, and their slopes below say so.
+        direction = direction.normalize_or(Vec3::X);
+        let (mut slope, mut apart) = (0.0_f32, 0.0_f32);
+        for ray in rays {
+            let turned = (ray.direction - direction).length();
+            slope = slope.max(1.1 * turned + REACH * ray.spread);
+            apart = apart.max((ray.origin_m - origin).length());
+        }
+        let inverse = [inverse(direction.x), inverse(direction.y), inverse(direction.z)];
+        let steep = [inverse[0].abs(), inverse[1].abs(), inverse[2].abs()];
+        Self {
+            origin: broadcast(s, origin.to_array()),
+            direction: broadcast(s, direction.to_array()),
+            inverse: broadcast(s, inverse),
+            steep: broadcast(s, steep),
+            slope: s.splat(slope),
+            apart: s.splat(apart),
+        }
+    }
+}
+
+/// Rays, one a lane.
+#[derive(Clone, Copy)]
+struct Lanes<S: Simd> {
+    origin: [S::F; 3],
+    inverse: [S::F; 3],
+    steep: [S::F; 3],
+    /// Radius of the widest footprint that counts, per metre. [m/m]
+    footprint: f32,
 }
 
 impl<S: Simd> Lanes<S> {
     #[inline(always)]
-    fn new(s: S, ray: &Ray) -> Self {
-        let inverse =
-            [inverse(ray.direction.x), inverse(ray.direction.y), inverse(ray.direction.z)];
-        let steep = [inverse[0].abs(), inverse[1].abs(), inverse[2].abs()];
+    fn new(s: S, rays: &[Ray]) -> Self {
+        let mut origin = [[0.0; WIDTH]; 3];
+        let mut inverses = [[1.0; WIDTH]; 3];
+        let mut steeps = [[1.0; WIDTH]; 3];
+        let mut footprint = 0.0_f32;
+        for (lane, ray) in rays.iter().enumerate() {
+            for axis in 0..3 {
+                origin[axis][lane] = ray.origin_m[axis];
+                inverses[axis][lane] = inverse(ray.direction[axis]);
+                steeps[axis][lane] = inverses[axis][lane].abs();
+            }
+            footprint = footprint.max(REACH * ray.spread);
+        }
         Self {
-            origin: broadcast(s, ray.origin_m.to_array()),
-            direction: broadcast(s, ray.direction.to_array()),
-            inverse: broadcast(s, inverse),
-            steep: broadcast(s, steep),
-            spread: s.splat(ray.spread),
+            origin: load(s, &origin),
+            inverse: load(s, &inverses),
+            steep: load(s, &steeps),
+            footprint,
         }
     }
 }
@@ -122,28 +174,44 @@ impl Kernel for Follow<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { tree, ray, tag, hits } = self;
+        let Self { tree, rays, tag, hits } = self;
         assert_eq!(S::LANES, WIDTH, "leaves hold the lanes of a vector");
-        if tree.nodes.is_empty() {
+        assert!(
+            rays.len() == hits.len() && rays.len() <= WIDTH,
+            "hits for each of a vector's rays"
+        );
+        if tree.nodes.is_empty() || rays.is_empty() {
             return;
         }
-        let lanes = Lanes::new(s, &ray);
+        let (bundle, lanes) = (Bundle::around(s, rays), Lanes::new(s, rays));
+        let mut reach_m = farthest(hits);
         let mut stack = [(0.0_f32, 0_u32); MAX_STACK];
         let mut waiting = 1;
         while waiting > 0 {
             waiting -= 1;
             let (near_m, child) = stack[waiting];
-            if near_m > hits.reach_m {
+            if near_m > reach_m {
                 continue;
             }
             if child & LEAF != 0 {
-                if meet(s, &tree.leaves[(child & !LEAF) as usize], &lanes, tag, hits) {
-                    hits.shorten();
+                let leaf = &tree.leaves[(child & !LEAF) as usize];
+                let mut any = false;
+                let mut through = touched(s, leaf, &lanes, near_m, hits);
+                while through != 0 {
+                    let i = through.trailing_zeros() as usize % WIDTH;
+                    through &= through - 1;
+                    if meet(s, leaf, &rays[i], tag, &mut hits[i]) {
+                        hits[i].shorten();
+                        any = true;
+                    }
+                }
+                if any {
+                    reach_m = farthest(hits);
                 }
                 continue;
             }
             let node = &tree.nodes[child as usize];
-            let (mut met, nears) = touch(s, node, &lanes, hits.reach_m);
+            let (mut met, nears) = touch(s, node, &bundle, reach_m);
             // The nearest on top: by insertion, of mostly two or three.
             let first = waiting;
             while met != 0 {
@@ -165,16 +233,26 @@ impl Kernel for Follow<'_> {
     }
 }
 
-/// Returns which boxes of a node a ray meets within `reach_m`, as bits, and where.
+/// Returns how far the farthest of some rays still looks. [m]
 #[inline(always)]
-fn touch<S: Simd>(s: S, node: &Node, ray: &Lanes<S>, reach_m: f32) -> (u32, [f32; WIDTH]) {
+fn farthest(hits: &[Hits]) -> f32 {
+    let mut reach_m = 0.0_f32;
+    for hits in hits {
+        reach_m = reach_m.max(hits.reach_m);
+    }
+    reach_m
+}
+
+/// Returns which boxes of a node a bundle meets within `reach_m`, as bits, and where.
+#[inline(always)]
+fn touch<S: Simd>(s: S, node: &Node, ray: &Bundle<S>, reach_m: f32) -> (u32, [f32; WIDTH]) {
     let zero = s.splat(0.0);
     let (center, half) = (load(s, &node.center_m), load(s, &node.half_m));
     let rel = [center[0] - ray.origin[0], center[1] - ray.origin[1], center[2] - ray.origin[2]];
     let along = dot(s, rel, ray.direction);
-    // The footprint at the box's far side at most.
+    // The cone's radius at the box's far side at most.
     let far_side = s.max(along, zero) + half[0] + half[1] + half[2];
-    let margin = far_side * ray.spread * s.splat(REACH);
+    let margin = s.mul_add(far_side, ray.slope, ray.apart);
     let (mut near, mut far) = (zero, s.splat(reach_m));
     for axis in 0..3 {
         let middle = rel[axis] * ray.inverse[axis];
@@ -187,15 +265,36 @@ fn touch<S: Simd>(s: S, node: &Node, ray: &Lanes<S>, reach_m: f32) -> (u32, [f32
     (!s.bits(s.lt(far, near)) & 0xff, nears)
 }
 
+/// Returns which rays meet a leaf's box, which begins at `near_m`, before they end.
+#[inline(always)]
+fn touched<S: Simd>(s: S, leaf: &Leaf, rays: &Lanes<S>, near_m: f32, hits: &[Hits]) -> u32 {
+    let half = leaf.half_m;
+    let margin = rays.footprint * (near_m + 4.0 * (half[0] + half[1] + half[2]));
+    let mut reach = [-1.0; WIDTH];
+    for (reach, hits) in reach.iter_mut().zip(hits) {
+        *reach = hits.reach_m;
+    }
+    let (mut near, mut far) = (s.splat(0.0), s.load(&reach));
+    for axis in 0..3 {
+        let middle = (s.splat(leaf.center_m[axis]) - rays.origin[axis]) * rays.inverse[axis];
+        let side = s.splat(half[axis] + margin) * rays.steep[axis];
+        near = s.max(middle - side, near);
+        far = s.min(middle + side, far);
+    }
+    !s.bits(s.lt(far, near)) & ((1 << hits.len()) - 1)
+}
+
 /// Adds the splats of a leaf that a ray meets; returns whether there are any.
 #[inline(always)]
-fn meet<S: Simd>(s: S, leaf: &Leaf, ray: &Lanes<S>, tag: Tag, hits: &mut Hits) -> bool {
+fn meet<S: Simd>(s: S, leaf: &Leaf, ray: &Ray, tag: Tag, hits: &mut Hits) -> bool {
     let (zero, one) = (s.splat(0.0), s.splat(1.0));
     let mean = load(s, &leaf.mean_m);
+    let origin = broadcast(s, ray.origin_m.to_array());
+    let direction = broadcast(s, ray.direction.to_array());
     // From the mean to the ray's origin.
-    let from = [ray.origin[0] - mean[0], ray.origin[1] - mean[1], ray.origin[2] - mean[2]];
-    let along = dot(s, from, ray.direction);
-    let width = along * ray.spread;
+    let from = [origin[0] - mean[0], origin[1] - mean[1], origin[2] - mean[2]];
+    let along = dot(s, from, direction);
+    let width = along * s.splat(ray.spread);
     let blur = width * width;
     let scale =
         [s.load_f16(&leaf.scale_m[0]), s.load_f16(&leaf.scale_m[1]), s.load_f16(&leaf.scale_m[2])];
@@ -208,11 +307,7 @@ fn meet<S: Simd>(s: S, leaf: &Leaf, ray: &Lanes<S>, tag: Tag, hits: &mut Hits) -
         return false;
     }
     let axes = axes(s, &leaf.rotation);
-    let d = [
-        dot(s, axes[0], ray.direction),
-        dot(s, axes[1], ray.direction),
-        dot(s, axes[2], ray.direction),
-    ];
+    let d = [dot(s, axes[0], direction), dot(s, axes[1], direction), dot(s, axes[2], direction)];
     let o = [dot(s, axes[0], from), dot(s, axes[1], from), dot(s, axes[2], from)];
     let wide = [thin[0] + blur, thin[1] + blur, thin[2] + blur];
     let weight = [one / wide[0], one / wide[1], one / wide[2]];

@@ -12,9 +12,8 @@ use std::f64::consts::TAU;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use vizflyt_protocol::geometry::{Pose, Sensor, World};
 
-use super::cast::{Beam, Echo, Hits, echoes, spread_of};
+use super::cast::{Beam, Echo, Hits, TOGETHER, echoes, spread_of};
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
 
@@ -135,8 +134,8 @@ pub struct Lidar {
 
 /// Beams a sweep at most: 4 million bytes of records times 28.
 const MAX_BEAMS: u64 = 1 << 22;
-/// Beams that one task follows: some 30 us.
-const CHUNK: usize = 64;
+/// Beams that one task follows, or some more: some 80 us.
+const CHUNK: usize = 128;
 /// A threshold's noise as a share of it: from a tenth of detections to nine tenths, returns double about.
 const THRESHOLD_NOISE: f32 = 0.25;
 /// The Gaussian is below this nine times in ten.
@@ -242,46 +241,62 @@ impl Lidar {
         out.clear();
         motion.validate(scene)?;
         out.resize(self.beams(), LidarPoint::default());
-        out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, points)| {
-            // Beams of a stack leave from one pose: a slerp is a fifth of what a beam may cost.
-            let mut latest = (0.0, motion.sensor_at(0.0));
-            let mut hits = Hits::new();
-            for (i, point) in points.iter_mut().enumerate() {
-                let number = chunk * CHUNK + i;
-                let leaving = self.leaving(number, seq);
-                if latest.0 != leaving.share {
-                    latest = (leaving.share, motion.sensor_at(leaving.share));
+        let rings = self.rings();
+        out.par_chunks_mut(rings * CHUNK.div_ceil(rings)).enumerate().for_each(
+            |(chunk, points)| {
+                let first = chunk * rings * CHUNK.div_ceil(rings);
+                let mut hits = [Hits::new(); TOGETHER];
+                // Beams of a stack leave from one pose, and come after one another.
+                for ring in 0..rings.min(points.len()) {
+                    let mut numbers = (ring..points.len()).step_by(rings).peekable();
+                    while numbers.peek().is_some() {
+                        let mut group = [(0, Leaving::default()); TOGETHER];
+                        let mut beams = [(0.0, Beam::default()); TOGETHER];
+                        let mut count = 0;
+                        for number in numbers.by_ref().take(TOGETHER) {
+                            let leaving = self.leaving(first + number, seq);
+                            beams[count] = (leaving.share, self.beam(motion, &leaving));
+                            group[count] = (number, leaving);
+                            count += 1;
+                        }
+                        scene.cast(motion, &beams[..count], &mut hits[..count]);
+                        for ((number, leaving), hits) in group[..count].iter().zip(&mut hits) {
+                            let draws = Draws::new(seed, seq, (first + number) as u64);
+                            points[*number] = self.measure(leaving, draws, hits);
+                        }
+                    }
                 }
-                let draws = Draws::new(seed, seq, number as u64);
-                *point = self.measure(scene, motion, &latest.1, &leaving, draws, &mut hits);
-            }
-        });
+            },
+        );
         Ok(())
     }
 
-    fn measure(
-        &self,
-        scene: &SensorScene,
-        motion: &Motion<'_>,
-        world_from_sensor: &Pose<World, Sensor>,
-        leaving: &Leaving,
-        mut draws: Draws,
-        hits: &mut Hits,
-    ) -> LidarPoint {
+    /// Returns how many beams leave between neighbours.
+    fn rings(&self) -> usize {
+        match &self.model.beams {
+            Beams::Spinning { elevations_rad, .. } => elevations_rad.len().max(1),
+            Beams::Raster { .. } | Beams::Flash { .. } | Beams::Rosette { .. } => 1,
+        }
+    }
+
+    fn beam(&self, motion: &Motion<'_>, leaving: &Leaving) -> Beam {
+        let world_from_sensor = motion.sensor_at(leaving.share);
+        Beam {
+            origin_m: world_from_sensor.translation_m,
+            direction: world_from_sensor.rotate(leaving.direction.as_dvec3()).normalize(),
+            spread: spread_of(self.model.divergence_rad),
+            max_m: self.model.max_range_m,
+        }
+    }
+
+    fn measure(&self, leaving: &Leaving, mut draws: Draws, hits: &mut Hits) -> LidarPoint {
         let model = &self.model;
         let &Leaving { direction, share, ring } = leaving;
-        let beam = Beam {
-            origin_m: world_from_sensor.translation_m,
-            direction: world_from_sensor.rotate(direction.as_dvec3()).normalize(),
-            spread: spread_of(model.divergence_rad),
-            max_m: model.max_range_m,
-        };
         let mut point = LidarPoint {
             offset_ns: (share / model.rate_hz * 1e9) as u32,
             ring,
             ..LidarPoint::default()
         };
-        scene.cast(motion, share, &beam, hits);
         let [threshold, error] = draws.gaussians();
         let threshold = 1.0 + THRESHOLD_NOISE * (threshold - NINE_IN_TEN);
         let mut reported: Option<Echo> = None;
@@ -359,6 +374,7 @@ impl Lidar {
 }
 
 /// When and where a beam leaves.
+#[derive(Clone, Copy, Default)]
 struct Leaving {
     /// Unit. [sensor]
     direction: Vec3,

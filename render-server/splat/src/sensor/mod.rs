@@ -48,7 +48,8 @@ impl<'a> Motion<'a> {
 
     /// Returns the sensor's pose at a share of the duration, 0 to 1. [m, world]
     fn sensor_at(&self, share: f64) -> Pose<World, Sensor> {
-        self.world_from_sensor[0].interpolate(&self.world_from_sensor[1], share)
+        let [begin, end] = &self.world_from_sensor;
+        if begin == end { *begin } else { begin.interpolate(end, share) }
     }
 
     fn validate(&self, scene: &SensorScene) -> Result<(), SensorError> {

@@ -201,7 +201,7 @@ impl RadarModel {
         let origin_m = world_from_sensor.translation_m;
         let beam = Beam { origin_m, direction, spread, max_m: self.max_range_m };
         let mut hits = Hits::new();
-        scene.cast(motion, 0.5, &beam, &mut hits);
+        scene.cast(motion, &[(0.5, beam)], std::slice::from_mut(&mut hits));
         let mut patch = Patch { cell: NOWHERE, ..Patch::default() };
         echoes(hits.weigh(), self.range_resolution_m, |echo| {
             let cosine = echo.cosine.clamp(1e-3, 1.0);

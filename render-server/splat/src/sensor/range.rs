@@ -169,7 +169,7 @@ impl Cone {
                 spread: self.spread,
                 max_m,
             };
-            scene.cast(motion, 0.5, &beam, &mut hits);
+            scene.cast(motion, &[(0.5, beam)], std::slice::from_mut(&mut hits));
             echoes(hits.weigh(), resolution_m, |echo| {
                 let power = power(share, &echo);
                 if count < MAX_RECEIVED && power > 0.0 {

@@ -28,10 +28,13 @@ pub(super) struct Node {
     pub(super) children: [u32; WIDTH],
 }
 
-/// Eight Gaussians, number by number, half of them in half precision: 240 bytes, for what a ray waits for is memory. Places that are
+/// Eight Gaussians, number by number, half of them in half precision: 264 bytes, for what a ray waits for is memory. Places that are
 /// not filled have the level minus infinity.
 #[derive(Clone, Debug)]
 pub(super) struct Leaf {
+    /// The box around all of it: its middle, and half its sides. [m]
+    pub(super) center_m: [f32; 3],
+    pub(super) half_m: [f32; 3],
     pub(super) mean_m: [[f32; WIDTH]; 3],
     /// Unit quaternion from the Gaussian's axes, of which the thinnest is the last; xyzw. [f16]
     pub(super) rotation: [[u16; WIDTH]; 4],
@@ -118,7 +121,11 @@ impl Tree {
             }
             let within = &mut items[start..end];
             self.nodes[index].children[place] = if within.len() <= WIDTH {
-                self.leaves.push(Leaf::new(splats, within));
+                self.leaves.push(Leaf {
+                    center_m: center.to_array(),
+                    half_m: half.to_array(),
+                    ..Leaf::new(splats, within)
+                });
                 (self.leaves.len() - 1) as u32 | LEAF
             } else {
                 self.add_node(splats, within)
@@ -133,6 +140,8 @@ impl Leaf {
         let half = |v: f32| f16::from_f32(v).to_bits();
         let byte = |share: f32| (share * 255.0).round() as u8;
         let mut leaf = Self {
+            center_m: [0.0; 3],
+            half_m: [0.0; 3],
             mean_m: [[0.0; WIDTH]; 3],
             rotation: [[half(0.5); WIDTH]; 4],
             scale_m: [[half(1.0); WIDTH]; 3],

@@ -75,7 +75,7 @@ fn beams_meet_what_the_plain_reference_meets() {
             };
             let truth = hits(&splats, &beam);
             let mut met = Hits::new();
-            scene.cast(&motion, 0.0, &beam, &mut met);
+            scene.cast(&motion, &[(0.0, beam)], std::slice::from_mut(&mut met));
             let met = met.weigh();
             // What f32 and a box around four deviations leave out is some thousandth of the beam.
             let (mut left, mut expected_m, mut sum) = (1.0, 0.0, 0.0);
