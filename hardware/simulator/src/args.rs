@@ -12,6 +12,7 @@ use vizflyt_protocol::geometry::Volume;
 
 use crate::autopilot::airframe;
 use crate::driver::Driver;
+use crate::imu::ImuModel;
 use crate::link::serial::{DEFAULT_BAUD, baud_rate};
 use crate::link::{Endpoint, resolve};
 use crate::mocap::feed::{FeedTarget, Format};
@@ -85,6 +86,11 @@ pub struct SimArgs {
     /// Standard deviation of gusts along each horizontal axis, in metres per second.
     #[arg(long, value_name = "M/S", default_value_t = 0.0)]
     pub gusts: f64,
+    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+        "The autopilot's inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
+        ImuModel::names()
+    ))]
+    pub imu: ImuModel,
     /// How much each unbalanced rotor shakes the sensors at full throttle, in m/s^2; with 200 a hovering
     /// vehicle reports about the 30 that ArduPilot warns of.
     #[arg(long, value_name = "M/S^2", default_value_t = 0.0)]
@@ -251,6 +257,7 @@ impl SimArgs {
                 .collect(),
             wind_world_mps: DVec3::from(self.wind),
             gust_mps: self.gusts,
+            imu: self.imu,
             vibration_mps2: self.vibration,
             battery_share: self.battery / 100.0,
             radio: self.radio,
@@ -440,6 +447,10 @@ mod tests {
         check(&["--serial", "/a", "--pty", "/b"], "cannot be used with");
         check(&["--object", "a name of more than twenty-four"], "1 to 24");
         check(&["--realtime-factor", "0"], "outside 0.01 to 20");
+        check(
+            &["--imu", "mpu"],
+            "no inertial sensor is called 'mpu'; there are frame, icm-42688-p",
+        );
         check(&["--param", "NO_SUCH=1"], "no parameter NO_SUCH");
         check(&["--truth", "/does/not/exist.json"], "cannot read the true geometry");
     }

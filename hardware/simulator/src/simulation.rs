@@ -17,7 +17,7 @@ use crate::airframe::{Airframe, AirframeState};
 pub use crate::autopilot::MAX_LINKS;
 use crate::autopilot::{Autopilot, Radio, UnknownParam, airframe};
 use crate::battery::Battery;
-use crate::imu::Imu;
+use crate::imu::{Imu, ImuModel};
 use crate::mocap::{Mocap, MocapConfig, Sight};
 use crate::truth::{Truth, TruthReport};
 use crate::wifi::{Wifi, WifiConfig};
@@ -57,6 +57,8 @@ pub struct SimulationConfig {
     pub wind_world_mps: DVec3,
     /// Standard deviation of gusts along each horizontal axis. [m/s]
     pub gust_mps: f64,
+    /// The errors of the autopilot's inertial sensor.
+    pub imu: ImuModel,
     /// Amplitude with which the rotors shake the sensors at full throttle. [m/s^2]
     pub vibration_mps2: f64,
     /// Charge of the battery at the start, 0 to 1.
@@ -89,6 +91,7 @@ impl Default for SimulationConfig {
             params: Vec::new(),
             wind_world_mps: DVec3::ZERO,
             gust_mps: 0.0,
+            imu: ImuModel::default(),
             vibration_mps2: 0.0,
             battery_share: 1.0,
             radio: false,
@@ -159,7 +162,7 @@ impl Simulation {
     /// # Errors
     /// Returns the first parameter name that the autopilot does not have.
     pub fn new(config: SimulationConfig) -> Result<Self, UnknownParam> {
-        let mut imu = Imu::new(config.seed);
+        let mut imu = Imu::new(config.imu, config.seed);
         imu.set_vibration(config.vibration_mps2);
         let mut autopilot = Autopilot::with_params(&config.params)?;
         autopilot.set_radio(if config.radio { Radio::Receiving } else { Radio::Absent });

@@ -194,12 +194,13 @@ fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
         project: subject.project.clone(),
         level: subject.level.clone(),
         conditions: format!(
-            "{}, seeds {} to {last_seed}, {:.1}+{:.1} ms late, every {:.1} ms",
+            "{}, seeds {} to {last_seed}, {:.1}+{:.1} ms late, every {:.1} ms{}",
             subject.variants.join(" "),
             subject.first_seed,
             delays.image,
             delays.answer,
-            delays.image_period
+            delays.image_period,
+            subject.imu.as_ref().map_or(String::new(), |imu| format!(", {imu}"))
         ),
         flights: summary.runs as u32,
         finished: summary.finished as u32,

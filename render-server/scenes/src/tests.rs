@@ -9,6 +9,8 @@ use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats, ply};
 use super::*;
 use crate::solids::{REACH_M, Solids};
 
+mod ranges;
+
 /// FNV-1a over every number of the splats and the truth.
 fn fingerprint(scene: &Generated) -> u64 {
     let Splats { means_m, scales_m, rotations, opacities, sh_degree: _, sh, antialiased: _ } =

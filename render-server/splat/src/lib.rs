@@ -49,6 +49,7 @@ pub mod limits;
 mod rasterizer;
 mod reference;
 mod scene;
+pub mod sensor;
 mod splats;
 
 pub use atmosphere::Atmosphere;

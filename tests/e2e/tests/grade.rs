@@ -121,6 +121,21 @@ fn two_runs_give_the_same_grade_under_load_and_parts_make_the_whole() {
     assert!(error.contains("was changed after it was signed"), "{error}");
 }
 
+#[test]
+fn another_inertial_sensor_is_another_flight_and_is_named() {
+    let rig = Rig::new();
+    let flown = |more: &[&str]| {
+        let one = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
+        rig.grade(&[&one[..], more].concat())
+    };
+    let (usual, named, chip) = (flown(&[]), flown(&["--imu=frame"]), flown(&["--imu=icm-42688-p"]));
+    assert_eq!(usual["hash"], named["hash"]);
+    assert_eq!(usual["subject"].get("imu"), None);
+    assert_eq!(chip["subject"]["imu"], "icm-42688-p");
+    assert_eq!(chip["runs"][0]["outcome"], "finished", "{}", chip["runs"][0]);
+    assert_ne!(chip["runs"][0]["hash"], usual["runs"][0]["hash"]);
+}
+
 /// A machine that is suspended, swapped out or starved must not cost points: in lock-step a plugin knows its runtime by
 /// its socket, not by a clock.
 #[test]
@@ -341,6 +356,7 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     };
     other(&["--answer-delay=11"], "time model");
     other(&["--log=full"], "--log");
+    other(&["--imu=bmi088"], "--imu");
     rig.refused(&[&["race"], &resumed[1..]].concat(), "with another plugin");
     let p4: Vec<&str> = resumed
         .iter()

@@ -65,6 +65,9 @@ pub(crate) struct Subject {
     pub seeds: u64,
     /// How long things took.
     pub delays: DelaysMs,
+    /// The simulated inertial sensor; absent where it is the usual one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imu: Option<String>,
     /// Version of this program.
     pub program: String,
     /// SHA-256 of this program's file.

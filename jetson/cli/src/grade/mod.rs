@@ -45,6 +45,7 @@ use vizflyt_runtime::log::LoggedImages;
 use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
+use vizflyt_simulator::imu::ImuModel;
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::CourseInstance;
@@ -117,6 +118,11 @@ struct FlyArgs {
     /// From then until the answer takes effect
     #[arg(long, value_name = "MS", default_value_t = 10.0)]
     answer_delay: f64,
+    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+        "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
+        ImuModel::names()
+    ))]
+    imu: ImuModel,
     /// A plugin that takes more of its own time for an answer has failed
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     answer_within: f64,
@@ -333,7 +339,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let typed = args.plugin.as_ref().context("no plugin is named")?;
     let plugin = Plugin::find(typed)?;
     let project = CourseProject::named(&args.project)?;
-    let delays = delays(args)?;
+    let (delays, imu) = (delays(args)?, args.imu);
     let subject = subject(args, &plugin, &project)?;
     let flights: Vec<(Variant, u64)> = subject
         .flights()
@@ -375,8 +381,18 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
                 plugin: typed,
             });
             let reached = &reached;
-            let trial =
-                Trial { course, seed, command, limits, answer_within, delays, stop, log, reached };
+            let trial = Trial {
+                course,
+                seed,
+                command,
+                limits,
+                answer_within,
+                delays,
+                imu,
+                stop,
+                log,
+                reached,
+            };
             let Some(flown) = trial.fly()? else { return Ok(None) };
             let run = run_of(course, &delays, seed, variant, &flown);
             let mut done = FlightDone { virtual_s: flown.virtual_s, ..FlightDone::of(run) };
@@ -646,6 +662,7 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<S
             image: tenth(args.image_delay),
             answer: tenth(args.answer_delay),
         },
+        imu: (args.imu != ImuModel::default()).then(|| args.imu.to_string()),
         program: env!("CARGO_PKG_VERSION").to_owned(),
         program_sha256: keys::program_sha256()?,
         renderer: CpuRenderer::new(&Splats::default()).name().into_owned(),

@@ -28,6 +28,9 @@ pub(crate) struct FlownWith {
     pub level: String,
     /// How long things took.
     pub delays: DelaysMs,
+    /// The simulated inertial sensor; absent where it is the usual one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imu: Option<String>,
     /// SHA-256 of this program's file.
     pub program_sha256: String,
     /// What rendered.
@@ -48,6 +51,7 @@ impl FlownWith {
             project: subject.project,
             level: subject.level,
             delays: subject.delays,
+            imu: subject.imu,
             program_sha256: subject.program_sha256,
             renderer: subject.renderer,
             answer_within_s,
@@ -65,6 +69,7 @@ impl FlownWith {
             ("project", self.project != there.project),
             ("level", self.level != there.level),
             ("time model", self.delays != there.delays),
+            ("--imu", self.imu != there.imu),
             ("program", self.program_sha256 != there.program_sha256),
             ("instruction set", self.renderer != there.renderer),
             ("--answer-within", self.answer_within_s.to_bits() != there.answer_within_s.to_bits()),

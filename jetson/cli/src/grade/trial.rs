@@ -40,6 +40,7 @@ use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
+use vizflyt_simulator::imu::ImuModel;
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
 
@@ -72,6 +73,8 @@ pub(crate) struct Trial<'a> {
     pub answer_within: Duration,
     /// The time model.
     pub delays: Delays,
+    /// The simulated inertial sensor.
+    pub imu: ImuModel,
     /// Ends it.
     pub stop: &'a AtomicBool,
     /// Where it is logged, if it is.
@@ -321,6 +324,7 @@ impl<'a> Flight<'a> {
             spawn_yaw_rad: arena.spawn.yaw_deg.to_radians(),
             seed: trial.seed,
             body_radius_m: arena.body_radius_m,
+            imu: trial.imu,
             ..SimulationConfig::airframe()
         };
         let simulation = Simulation::new(config).context("the simulated autopilot")?;

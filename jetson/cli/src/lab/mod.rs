@@ -37,6 +37,7 @@ use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
 use vizflyt_server::render::{DetailKind, RendererKind};
 use vizflyt_server::scene::{Antialiased, BareArgs};
+use vizflyt_simulator::imu::ImuModel;
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
@@ -99,6 +100,11 @@ pub(crate) struct LabArgs {
     /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
     #[arg(long)]
     pub through_bridge: bool,
+    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+        "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}.",
+        ImuModel::names()
+    ))]
+    pub imu: ImuModel,
     /// Also sends the vehicle's true pose here, as `vizflyt sim --truth-to` does: to measure localization by.
     #[arg(long, value_name = "ADDR:PORT")]
     pub truth_to: Option<SocketAddr>,
@@ -340,6 +346,7 @@ impl Show {
             seen.into(),
             format!("--spawn={}", stage.spawn).into(),
             format!("--seed={}", lab.seed()).into(),
+            format!("--imu={}", lab.imu).into(),
             self.log_level.clone(),
         ];
         sim.extend(lab.truth_to.map(|to| OsString::from(format!("--truth-to={to}"))));

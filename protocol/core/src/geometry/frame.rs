@@ -28,6 +28,8 @@ frames! {
     Scene = "scene";
     /// Where a plugin's own estimate begins: z up, origin and heading as it likes.
     Odom = "odom";
+    /// A sensor that is no camera: x forward, y left, z up.
+    Sensor = "sensor";
     /// A rigid part of a scene that moves: a door, a clock's hand, another vehicle.
     Object = "object";
 }

@@ -13,7 +13,7 @@ mod pose;
 mod volume;
 
 pub use distortion::Distortion;
-pub use frame::{Body, Cam, Frame, Object, Odom, Scene, World};
+pub use frame::{Body, Cam, Frame, Object, Odom, Scene, Sensor, World};
 pub use intrinsics::{Intrinsics, InvalidIntrinsics};
 #[cfg(feature = "std")]
 pub use lens_config::LensConfig;

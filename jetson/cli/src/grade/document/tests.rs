@@ -12,6 +12,7 @@ pub(crate) fn subject() -> Subject {
         first_seed: 1,
         seeds: 4,
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
+        imu: None,
         program: "0.1.0".into(),
         program_sha256: "22".repeat(32),
         renderer: "cpu avx2".into(),

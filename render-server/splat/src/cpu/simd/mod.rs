@@ -147,6 +147,19 @@ impl InstructionSet {
         wide.into_iter().flatten().chain([Self::Portable(Portable)]).collect()
     }
 
+    /// Returns the lanes of its vectors: 8 or 16.
+    pub fn lanes(self) -> usize {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => Avx512::LANES,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => Avx2::LANES,
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(_) => Neon::LANES,
+            Self::Portable(_) => Portable::LANES,
+        }
+    }
+
     /// Runs a kernel, compiled for this set.
     pub fn run<K: Kernel>(self, kernel: K) -> K::Output {
         match self {

@@ -1,0 +1,410 @@
+//! Range finders of one beam: light within a narrow cone, and sound in a wide one. Some dozens of rays a reading.
+//!
+//! Both look along x and report one range. Rays fill the cone evenly; each one's echo (`cast`) counts by what of the cone it stands
+//! for. Light comes back from a Lambertian surface, as in `lidar`, and the strongest group of echoes within the receiver's
+//! resolution is reported. Sound is mirrored by what is smooth for its wavelength: a facet of the surface sends it back if it
+//! faces the sensor, and facets' slopes are Gaussian (Beckmann and Spizzichino 1963, "The scattering of electromagnetic waves
+//! from rough surfaces", chapter 5: `exp(-tan^2(incidence) / (2 slope^2)) / cos^4(incidence)`); a share is scattered evenly, by
+//! Lambert's rule. It spreads both ways and is absorbed by air (ISO 9613-1), and the first group above the threshold is reported.
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use super::cast::{Beam, Echo, Hits, echoes};
+use super::lidar::rounded;
+use super::noise::Draws;
+use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
+
+/// A range finder that measures by light, in the words of its data sheet.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RangeModel {
+    /// Readings a second. [Hz]
+    pub rate_hz: f64,
+    /// Full angle of the cone that it sees. [rad]
+    pub fov_rad: f32,
+    /// Nothing nearer is reported. [m]
+    pub min_range_m: f32,
+    /// Nothing farther is reported. [m]
+    pub max_range_m: f32,
+    /// Standard deviation of a range. [m]
+    pub sigma_m: f32,
+    /// What it grows by per metre of range, as a share. [m/m]
+    pub sigma_per_m: f32,
+    /// Ranges are multiples of this; 0 for no rounding. [m]
+    pub range_step_m: f32,
+    /// Echoes within this range of one another are one. [m]
+    pub resolution_m: f32,
+    /// At this range a target across the whole cone, of `reference_reflectivity`, is detected nine times in ten. [m]
+    pub reference_range_m: f32,
+    /// Share of light that target sends back, 0 to 1.
+    pub reference_reflectivity: f32,
+}
+
+/// A range finder that measures by sound, in the words of its data sheet.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SonarModel {
+    /// Readings a second. [Hz]
+    pub rate_hz: f64,
+    /// Full angle of the cone at whose edge an echo, both ways, has a quarter of the power on axis (-6 dB). [rad]
+    pub beam_rad: f32,
+    /// Nothing nearer is reported. [m]
+    pub min_range_m: f32,
+    /// Nothing farther is reported. [m]
+    pub max_range_m: f32,
+    /// Standard deviation of a range. [m]
+    pub sigma_m: f32,
+    /// What it grows by per metre of range (temperature of the air), as a share. [m/m]
+    pub sigma_per_m: f32,
+    /// Ranges are multiples of this; 0 for no rounding. [m]
+    pub range_step_m: f32,
+    /// Half the pulse's length in air: echoes within it add up. [m]
+    pub resolution_m: f32,
+    /// What air absorbs, one way. [dB/m]
+    pub absorption_db_per_m: f32,
+    /// Standard deviation of a surface's slopes: how far from square it may stand to mirror the pulse back. [rad]
+    pub slope_rad: f32,
+    /// Share of the power that a surface scatters evenly instead.
+    pub diffuse: f32,
+    /// At this range a wall across the cone is detected nine times in ten. [m]
+    pub reference_range_m: f32,
+}
+
+/// What a range finder reports.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RangeReading {
+    /// 0 where nothing came back. [m]
+    pub range_m: f32,
+    /// Power of the echo over the detection threshold: 1 where nine in ten such echoes are detected; 0 without.
+    pub strength: f32,
+    /// Object of most of the echo; 0 is what stands still.
+    pub object: u16,
+}
+
+/// A [`RangeModel`] that is ready to measure.
+#[derive(Clone, Debug)]
+pub struct RangeFinder {
+    model: RangeModel,
+    cone: Cone,
+}
+
+/// A [`SonarModel`] that is ready to measure.
+#[derive(Clone, Debug)]
+pub struct Sonar {
+    model: SonarModel,
+    cone: Cone,
+    /// What echoes are divided by to be 1 at the threshold.
+    threshold: f32,
+}
+
+/// Rays that fill a cone about x, and the share of the cone that each stands for.
+#[derive(Clone, Debug)]
+struct Cone {
+    rays: Vec<(Vec3, f32)>,
+    /// Standard deviation of each ray's footprint per metre: half the distance to its neighbours. [rad]
+    spread: f32,
+}
+
+/// An echo of one ray, as the receiver takes it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Received {
+    range_m: f32,
+    power: f32,
+    object: u16,
+}
+
+/// Echoes that one reading can hold: three for each of the rays; more are not listened to.
+const MAX_RECEIVED: usize = 3 * MAX_RAYS;
+/// 1 + 3 n (n + 1) rays of n = 8 rings.
+const MAX_RAYS: usize = 217;
+/// Rings are at most this far apart. [rad]
+const RING_RAD: f32 = 0.03;
+/// A threshold's noise as a share of it, and where nine in ten are below: as in `lidar`.
+const THRESHOLD_NOISE: f32 = 0.25;
+const NINE_IN_TEN: f32 = 1.281_551_6;
+
+impl Cone {
+    /// Makes rays within `half_rad` of x, each weighed by `gain` of its angle from x.
+    fn new(half_rad: f32, gain: impl Fn(f32) -> f32) -> Self {
+        let rings = ((half_rad / RING_RAD).ceil() as usize).clamp(1, 8);
+        let mut rays = vec![(Vec3::X, gain(0.0))];
+        let apart = half_rad / (rings as f32 + 0.5);
+        for ring in 1..=rings {
+            // Rings of equal width, six rays more in each: all stand for the same solid angle.
+            let angle = apart * ring as f32;
+            let count = 6 * ring;
+            for n in 0..count {
+                let turn =
+                    std::f64::consts::TAU * (n as f64 + 0.5 * (ring % 2) as f64) / count as f64;
+                let (y, z) = turn.sin_cos();
+                let (sin, cos) = f64::from(angle).sin_cos();
+                rays.push((Vec3::new(cos as f32, (sin * y) as f32, (sin * z) as f32), gain(angle)));
+            }
+        }
+        let sum: f32 = rays.iter().map(|(_, weight)| weight).sum();
+        for (_, weight) in &mut rays {
+            *weight /= sum;
+        }
+        Self { rays, spread: apart / 2.0 }
+    }
+
+    /// Collects the echoes of all rays, nearest first; `power` says what comes back of (share of the cone, power of a Lambertian
+    /// surface, cosine of incidence, range). Returns how many there are.
+    fn receive(
+        &self,
+        scene: &SensorScene,
+        motion: &Motion<'_>,
+        max_m: f32,
+        resolution_m: f32,
+        received: &mut [Received; MAX_RECEIVED],
+        power: impl Fn(f32, &Echo) -> f32,
+    ) -> usize {
+        let (mut count, mut hits) = (0, Hits::new());
+        let world_from_sensor = motion.sensor_at(0.5);
+        for &(direction, share) in &self.rays {
+            let beam = Beam {
+                origin_m: world_from_sensor.translation_m,
+                direction: world_from_sensor.rotate(direction.as_dvec3()).normalize(),
+                spread: self.spread,
+                max_m,
+            };
+            scene.cast(motion, &[(0.5, beam)], std::slice::from_mut(&mut hits));
+            echoes(hits.weigh(), resolution_m, |echo| {
+                let power = power(share, &echo);
+                if count < MAX_RECEIVED && power > 0.0 {
+                    received[count] =
+                        Received { range_m: echo.range_m, power, object: echo.tag.id };
+                    count += 1;
+                }
+            });
+        }
+        received[..count].sort_unstable_by(|a, b| {
+            a.range_m.total_cmp(&b.range_m).then(a.power.total_cmp(&b.power))
+        });
+        count
+    }
+}
+
+/// Returns the threshold of one reading, and its standard normal error.
+fn threshold(seed: u64, seq: u64) -> (f32, f32) {
+    let [threshold, error] = Draws::new(seed, seq, 0).gaussians();
+    (1.0 + THRESHOLD_NOISE * (threshold - NINE_IN_TEN), error)
+}
+
+/// Returns the object of most power.
+fn object_of(group: &[Received]) -> u16 {
+    let strongest = group.iter().max_by(|a, b| a.power.total_cmp(&b.power));
+    strongest.map_or(0, |echo| echo.object)
+}
+
+impl RangeFinder {
+    /// Prepares a model.
+    ///
+    /// # Errors
+    /// [`InvalidModel`] names the first field that cannot be.
+    pub fn new(model: RangeModel) -> Result<Self, InvalidModel> {
+        let check = Checked("range finder");
+        check.common(
+            model.rate_hz,
+            [model.min_range_m, model.max_range_m],
+            [model.sigma_m, model.sigma_per_m, model.range_step_m, model.resolution_m],
+            model.reference_range_m,
+        )?;
+        check.within("fov_rad", model.fov_rad, [0.0, 1.6], "0 to 1.6")?;
+        check.within(
+            "reference_reflectivity",
+            model.reference_reflectivity,
+            [1e-3, 1.0],
+            "0.001 to 1",
+        )?;
+        let cone = Cone::new(model.fov_rad / 2.0, |_| 1.0);
+        Ok(Self { model, cone })
+    }
+
+    /// Returns its model.
+    pub fn model(&self) -> &RangeModel {
+        &self.model
+    }
+
+    /// Measures reading `seq` in the middle of `motion`. All noise follows from `seed` and `seq`.
+    ///
+    /// # Errors
+    /// [`SensorError`].
+    ///
+    /// # Panics
+    /// If `motion` has not as many objects as the scene.
+    pub fn measure(
+        &self,
+        scene: &SensorScene,
+        motion: &Motion<'_>,
+        seed: u64,
+        seq: u64,
+    ) -> Result<RangeReading, SensorError> {
+        motion.validate(scene)?;
+        let model = &self.model;
+        let mut received = [Received::default(); MAX_RECEIVED];
+        let scale = model.reference_range_m.powi(2) / model.reference_reflectivity;
+        let count = self.cone.receive(
+            scene,
+            motion,
+            model.max_range_m,
+            model.resolution_m,
+            &mut received,
+            |share, echo| share * echo.power * scale / echo.range_m.max(1e-3).powi(2),
+        );
+        let received = &received[..count];
+        let mut best: (f32, &[Received]) = (0.0, &[]);
+        for (i, first) in received.iter().enumerate() {
+            let group = &received[i..];
+            let within =
+                group.iter().take_while(|r| r.range_m - first.range_m <= model.resolution_m);
+            let group = &group[..within.count()];
+            let power: f32 = group.iter().map(|r| r.power).sum();
+            if power > best.0 {
+                best = (power, group);
+            }
+        }
+        let (power, group) = best;
+        let (threshold, error) = threshold(seed, seq);
+        if !(power >= threshold && power > 0.0) {
+            return Ok(RangeReading::default());
+        }
+        let mean_m = group.iter().map(|r| r.range_m * r.power).sum::<f32>() / power;
+        let sigma_m = model.sigma_m + model.sigma_per_m * mean_m;
+        let range_m = rounded(mean_m + sigma_m * error, model.range_step_m);
+        if !(range_m >= model.min_range_m && range_m <= model.max_range_m) {
+            return Ok(RangeReading::default());
+        }
+        Ok(RangeReading { range_m, strength: power, object: object_of(group) })
+    }
+}
+
+impl Sonar {
+    /// Prepares a model.
+    ///
+    /// # Errors
+    /// [`InvalidModel`] names the first field that cannot be.
+    pub fn new(model: SonarModel) -> Result<Self, InvalidModel> {
+        let check = Checked("sonar");
+        check.common(
+            model.rate_hz,
+            [model.min_range_m, model.max_range_m],
+            [model.sigma_m, model.sigma_per_m, model.range_step_m, model.resolution_m],
+            model.reference_range_m,
+        )?;
+        check.within("beam_rad", model.beam_rad, [0.01, 2.5], "0.01 to 2.5")?;
+        check.within("absorption_db_per_m", model.absorption_db_per_m, [0.0, 20.0], "0 to 20")?;
+        check.within("slope_rad", model.slope_rad, [0.01, 1.0], "0.01 to 1")?;
+        check.within("diffuse", model.diffuse, [0.0, 1.0], "0 to 1")?;
+        // A quarter of the power at half the beam: to where a hundredth is left.
+        let half = model.beam_rad / 2.0;
+        let gain = move |angle: f32| 0.25_f32.powf((angle / half).powi(2));
+        let cone = Cone::new((half * 1.82).min(1.3), gain);
+        let mut sonar = Self { model, cone, threshold: 1.0 };
+        sonar.threshold = sonar.of_wall(sonar.model.reference_range_m);
+        Ok(sonar)
+    }
+
+    /// Returns its model.
+    pub fn model(&self) -> &SonarModel {
+        &self.model
+    }
+
+    /// Returns the power that comes back from a wall across the axis within a pulse of its nearest point.
+    fn of_wall(&self, range_m: f32) -> f32 {
+        let rays = self.cone.rays.iter();
+        let powers = rays.map(|&(direction, share)| {
+            let cosine = direction.x;
+            let slant_m = range_m / cosine;
+            let heard = slant_m - range_m <= self.model.resolution_m;
+            if heard { share * self.returned(cosine, slant_m) } else { 0.0 }
+        });
+        powers.sum()
+    }
+
+    /// Returns the power that comes back per power sent into a ray, over that of 1 m without air.
+    fn returned(&self, cosine: f32, range_m: f32) -> f32 {
+        let model = &self.model;
+        let cosine = cosine.clamp(1e-3, 1.0);
+        let tan2 = (1.0 - cosine * cosine) / (cosine * cosine);
+        // Facets: 1 / (2 slope^2) of those of a Gaussian face the sensor, against 4 pi of an even scatterer's directions.
+        let facets = (-tan2 / (2.0 * model.slope_rad.powi(2))).exp()
+            / (8.0 * model.slope_rad.powi(2) * cosine.powi(4));
+        let scattered = (1.0 - model.diffuse) * facets + model.diffuse * cosine;
+        let absorbed = 10_f32.powf(-2.0 * model.absorption_db_per_m * range_m / 10.0);
+        scattered * absorbed / range_m.max(1e-2).powi(2)
+    }
+
+    /// Measures reading `seq` in the middle of `motion`. All noise follows from `seed` and `seq`.
+    ///
+    /// # Errors
+    /// [`SensorError`].
+    ///
+    /// # Panics
+    /// If `motion` has not as many objects as the scene.
+    pub fn measure(
+        &self,
+        scene: &SensorScene,
+        motion: &Motion<'_>,
+        seed: u64,
+        seq: u64,
+    ) -> Result<RangeReading, SensorError> {
+        motion.validate(scene)?;
+        let model = &self.model;
+        let mut received = [Received::default(); MAX_RECEIVED];
+        let count = self.cone.receive(
+            scene,
+            motion,
+            model.max_range_m,
+            model.resolution_m,
+            &mut received,
+            // Sound does not care for colour.
+            |share, echo| {
+                share * echo.weight * self.returned(echo.cosine, echo.range_m) / self.threshold
+            },
+        );
+        let received = &received[..count];
+        let (threshold, error) = threshold(seed, seq);
+        for (i, first) in received.iter().enumerate() {
+            let group = &received[i..];
+            let within =
+                group.iter().take_while(|r| r.range_m - first.range_m <= model.resolution_m);
+            let group = &group[..within.count()];
+            let power: f32 = group.iter().map(|r| r.power).sum();
+            // The first echo itself must be of some weight: its edge is what is timed.
+            if !(power >= threshold && first.power >= 0.002 * power) {
+                continue;
+            }
+            let sigma_m = model.sigma_m + model.sigma_per_m * first.range_m;
+            let measured_m = rounded(first.range_m + sigma_m * error, model.range_step_m);
+            // What is nearer than it can tell reads as the nearest that it can.
+            let range_m = measured_m.max(model.min_range_m);
+            if range_m > model.max_range_m {
+                return Ok(RangeReading::default());
+            }
+            return Ok(RangeReading { range_m, strength: power, object: object_of(group) });
+        }
+        Ok(RangeReading::default())
+    }
+}
+
+#[cfg(test)]
+mod shape {
+    use super::*;
+
+    #[test]
+    fn rays_fill_their_cone_evenly() {
+        let cone = Cone::new(0.3, |_| 1.0);
+        assert_eq!(cone.rays.len(), 217);
+        assert!(cone.rays.iter().all(|(ray, _)| (ray.length() - 1.0).abs() < 1e-6));
+        // Of 8.5 widths of a ring the inner 5.5 hold their share of the solid angle.
+        let inner: f32 = cone
+            .rays
+            .iter()
+            .filter(|(ray, _)| ray.x.acos() < 0.3 * 5.5 / 8.5)
+            .map(|(_, share)| share)
+            .sum();
+        assert!((inner - (5.5_f32 / 8.5).powi(2)).abs() < 0.01, "{inner}");
+    }
+}

@@ -1,0 +1,106 @@
+//! One ray, plainly: every splat in f64, sorted, blended. What the tree and its kernels are held against.
+
+use glam::{DMat3, DVec3};
+
+use super::*;
+use crate::limits::ALPHA_MAX;
+use crate::sensor::cast::{Beam, Hits, echoes};
+use crate::sensor::tree;
+
+/// Returns (range, alpha) of every splat that a beam meets before it ends, nearest first.
+fn hits(splats: &Splats, beam: &Beam) -> Vec<(f64, f64)> {
+    let d = beam.direction;
+    let mut hits = Vec::new();
+    for i in crate::blocks::order(splats) {
+        let i = i as usize;
+        let rotation = DMat3::from_quat(splats.rotations[i].as_dquat().normalize());
+        let from = beam.origin_m - splats.means_m[i].as_dvec3();
+        let blur = (from.dot(d) * f64::from(beam.spread)).powi(2);
+        let of = |add: f64| {
+            let variance =
+                tree::clamped(splats.scales_m[i]).as_dvec3().powf(2.0) + DVec3::splat(add);
+            rotation * DMat3::from_diagonal(variance) * rotation.transpose()
+        };
+        let (thin, wide) = (of(0.0), of(blur));
+        let weight = wide.inverse();
+        let range = -from.dot(weight * d) / d.dot(weight * d);
+        let p = from + d * range;
+        // The projection across the ray: a 2x2 determinant in any two directions across it.
+        let (u, v) = d.any_orthonormal_pair();
+        let area = |m: DMat3| u.dot(m * u) * v.dot(m * v) - u.dot(m * v).powi(2);
+        let dimmed = (area(thin) / area(wide)).sqrt();
+        let seen = f64::from(splats.opacities[i]) * (-0.5 * p.dot(weight * p)).exp();
+        if range > 0.0 && range < f64::from(beam.max_m) && seen > f64::from(tree::LEAST_ALPHA) {
+            hits.push((range, (seen * dimmed).min(ALPHA_MAX)));
+        }
+    }
+    hits.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut left = 1.0;
+    let end = hits.iter().position(|(_, alpha)| {
+        left *= 1.0 - alpha;
+        left < 0.25
+    });
+    hits.truncate(end.map_or(hits.len(), |end| end + 1));
+    hits
+}
+
+#[test]
+fn beams_meet_what_the_plain_reference_meets() {
+    let mut splats = Splats::default();
+    let mut draws = Draws::new(11, 0, 0);
+    for _ in 0..3000 {
+        let mut uniform = |from: f32, to: f32| from + (to - from) * draws.uniform();
+        splats.means_m.push(Vec3::new(uniform(-6.0, 6.0), uniform(-6.0, 6.0), uniform(-2.0, 2.0)));
+        splats.scales_m.push(Vec3::new(
+            uniform(0.01, 0.3),
+            uniform(0.01, 0.3),
+            uniform(0.002, 0.05),
+        ));
+        let turn = [uniform(-1.0, 1.0), uniform(-1.0, 1.0), uniform(-1.0, 1.0), uniform(0.1, 1.0)];
+        splats.rotations.push(Quat::from_array(turn).normalize());
+        splats.opacities.push(uniform(0.05, 0.99));
+        splats.sh.extend([0.5; 3]);
+    }
+    for set in InstructionSet::available().into_iter().filter(|set| set.lanes() == tree::WIDTH) {
+        let scene = SensorScene::with_instructions(Scene::from(&splats), set);
+        let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+        for n in 0..400 {
+            let turn = DQuat::from_rotation_z(0.05 * f64::from(n))
+                * DQuat::from_rotation_y(0.3 * f64::from(n % 5) - 0.6);
+            let beam = Beam {
+                origin_m: DVec3::new(0.1, -0.2, 0.05),
+                direction: turn * DVec3::X,
+                spread: [0.0, 0.001, 0.01][n as usize % 3],
+                max_m: 20.0,
+            };
+            let truth = hits(&splats, &beam);
+            let mut met = Hits::new();
+            scene.cast(&motion, &[(0.0, beam)], std::slice::from_mut(&mut met));
+            let met = met.weigh();
+            // What f32 and a box around four deviations leave out is some thousandth of the beam.
+            let (mut left, mut expected_m, mut sum) = (1.0, 0.0, 0.0);
+            for (range, alpha) in &truth {
+                expected_m += range * alpha * left;
+                sum += alpha * left;
+                left *= 1.0 - alpha;
+            }
+            if left < 0.25 {
+                // What is left ends with the last.
+                expected_m += truth.last().unwrap().0 * left;
+                sum += left;
+            }
+            let weight: f64 = met.iter().map(|h| f64::from(h.weight)).sum();
+            let mean_m: f64 = met.iter().map(|h| f64::from(h.weight * h.range_m)).sum();
+            assert!((weight - sum).abs() < 0.01, "{} {n}: {weight} of {sum}", set.name());
+            assert!(
+                (mean_m - expected_m).abs() < 0.1,
+                "{} {n}: {mean_m} of {expected_m}",
+                set.name()
+            );
+            assert!(met.windows(2).all(|w| w[0].range_m <= w[1].range_m));
+            let mut total = 0.0;
+            echoes(met, 0.3, |echo| total += echo.weight);
+            assert!((f64::from(total) - weight).abs() < 1e-4);
+        }
+    }
+}
