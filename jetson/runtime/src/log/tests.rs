@@ -120,7 +120,7 @@ fn images_are_logged_as_they_came_and_their_memory_goes_back() {
     let modes = [ColorMode::Jpeg444, ColorMode::Lossless, ColorMode::Jpeg420, ColorMode::Jpeg444];
     for (seq, mode) in (1..).zip(modes) {
         let head = vec![seq as u8; 2000];
-        images.observation(host_now(), seq, head, vec![image(seq, mode)]);
+        images.observation(host_now(), seq, head, vec![image(seq, mode)], LoggedSensors::default());
     }
     drop((log, images));
     let recorded = recorded(&path);
@@ -222,7 +222,13 @@ fn an_image_is_stamped_with_the_instant_that_it_shows() {
         log.pose(HostTime::from_ns(at_ns), HostTime::from_ns(at_ns), &sample);
         if n % 4 == 1 && n < 50 {
             let image = image_on_the_curve(n, at_ns);
-            images.observation(image.received, n, vec![0; 8], vec![image]);
+            images.observation(
+                image.received,
+                n,
+                vec![0; 8],
+                vec![image],
+                LoggedSensors::default(),
+            );
         }
     }
     drop((log, images));
@@ -249,7 +255,7 @@ fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
             let rgb = vec![n as u8; 64 * 96 * 3];
             let (header, name) = (&header, "front");
             let image = GivenImage { header, name, pose, rgb: &rgb, depth_mm: &depth_mm };
-            log.observation(received, n, &[0; 8], &[image]);
+            log.observation(received, n, &[0; 8], &[image], &LoggedSensors::default());
         }
     }
     log.finish().unwrap();
@@ -398,7 +404,13 @@ fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() 
     large.push(vec![7; 2 << 20]);
     for seq in 0..10 {
         let image = LoggedImage { pieces: large.clone(), ..image(1, ColorMode::Lossless) };
-        images.observation(HostTime::from_ns(seq), seq, vec![seq as u8; 2000], vec![image]);
+        images.observation(
+            HostTime::from_ns(seq),
+            seq,
+            vec![seq as u8; 2000],
+            vec![image],
+            LoggedSensors::default(),
+        );
     }
     drop((log, images));
     let found = recorded(&path);
@@ -538,7 +550,7 @@ proptest! {
             let log = FlightLog::open(&LogSettings::full(folder.path()), None);
             let path = log.path().unwrap().to_owned();
             let images = log.images(&Arc::default()).unwrap();
-            images.observation(host_now(), 1, vec![0; 99], vec![image(1, ColorMode::Jpeg444)]);
+            images.observation(host_now(), 1, vec![0; 99], vec![image(1, ColorMode::Jpeg444)], LoggedSensors::default());
             let note = Event { stamp: ServerTime::ZERO, kind: EventKind::Note, text: bounded("x") };
             log.to_plugin(host_now(), &ToPlugin::Event(note));
             drop((log, images));
