@@ -50,6 +50,7 @@ mod rasterizer;
 mod reference;
 mod scene;
 mod splats;
+pub mod weather;
 
 pub use atmosphere::Atmosphere;
 pub use backend::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
