@@ -9,6 +9,7 @@
 pub mod cameras;
 pub mod demand;
 pub mod dynamic_objects;
+pub mod effects;
 pub mod environment;
 pub mod rendered;
 mod renderer;
@@ -31,8 +32,10 @@ use crate::timing::StageDurations;
 pub struct Rendering {
     /// The cameras of each vehicle, at its index.
     pub cameras: Vec<Cameras>,
-    /// Light and fog.
+    /// Light and weather.
     pub environment: Environment,
+    /// What is where by chance in the weather: the same for all images.
+    pub seed: u64,
     /// Moving objects, and the vehicles as the others see them.
     pub dynamic_objects: DynamicObjects,
     /// The instant that images show.

@@ -240,6 +240,7 @@ async fn make_rooms(
             .map(|(_, arena)| Cameras::new(arena.cameras.clone()))
             .collect(),
         environment: Environment::new(scene.arena.environment),
+        seed: args.seed,
         dynamic_objects: std::mem::take(&mut scene.dynamic_objects),
         predict: scene.arena.pose.predict,
         renderer: Mutex::new(RendererInfo {
