@@ -9,6 +9,7 @@ pub(crate) fn subject() -> Subject {
         project: "forest".into(),
         level: "ug".into(),
         variants: vec!["day".into()],
+        environments: BTreeMap::new(),
         first_seed: 1,
         seeds: 4,
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
