@@ -30,7 +30,10 @@ mod vehicle;
 
 pub use body::BodyPart;
 pub use camera::CameraConfig;
-pub use environment::EnvironmentConfig;
+pub use environment::{
+    CloudConfig, EnvironmentConfig, FlickerConfig, LampPositions, LampsConfig, MAX_LAMPS,
+    OwnLightConfig, RainConfig, SnowConfig, SunConfig,
+};
 pub use line::line_of;
 pub use no_fly::NoFly;
 pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};
@@ -79,7 +82,7 @@ pub struct ArenaConfig {
     /// How obstacles are baked from the scene.
     #[serde(default)]
     pub occupancy: Occupancy,
-    /// Light and fog.
+    /// Light and weather.
     #[serde(default, skip_serializing_if = "EnvironmentConfig::is_default")]
     pub environment: EnvironmentConfig,
     /// How poses are fused, when they count as lost, and for which moment images are rendered.

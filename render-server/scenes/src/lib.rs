@@ -12,6 +12,7 @@
 //! Called once per scene by the command line; takes well under two seconds.
 
 mod canvas;
+mod draw;
 pub mod film;
 mod forest;
 mod hall;
@@ -35,9 +36,10 @@ use vizflyt_splat::{RigidObject, Splats};
 use parts::ScenePart;
 use staging::Staging;
 
+pub use draw::{DrawBounds, Weather};
 pub use prints::Print;
 pub use staging::{FilmSet, film_set};
-pub use variant::{UnknownVariant, Variant};
+pub use variant::{MAX_DRAWN, UnknownVariant, Variant, VariantChoice};
 pub use write::{WriteError, Written};
 
 /// What can be generated.

@@ -18,6 +18,7 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{CameraConfig, RulesConfig, SensorConfig};
 use vizflyt_protocol::messages::{Limits, SetpointKinds};
 
+use crate::draw::DrawBounds;
 use crate::hall::{self, Layout};
 use crate::variant::Variant;
 use crate::{Generated, forest};
@@ -104,6 +105,8 @@ struct ProjectFile {
     limits: Limits,
     #[serde(default)]
     rules: RulesConfig,
+    #[serde(default)]
+    environments: DrawBounds,
     levels: Levels,
 }
 
@@ -196,6 +199,11 @@ impl CourseProject {
         self.plan.finish == Finish::LastStage
     }
 
+    /// Returns within what environments are drawn for it.
+    pub fn environments(&self) -> &DrawBounds {
+        &self.plan.environments
+    }
+
     /// Returns the text of its file, all of its rules: what a grade vouches for.
     pub fn text(&self) -> &'static str {
         self.text
@@ -240,6 +248,16 @@ mod tests {
     use vizflyt_protocol::messages::SetpointKind;
 
     use super::*;
+
+    #[test]
+    fn environments_are_drawn_within_bounds_that_can_be_flown() {
+        for project in CourseProject::all() {
+            project
+                .environments()
+                .check()
+                .unwrap_or_else(|error| panic!("{}: {error}", project.name()));
+        }
+    }
 
     #[test]
     fn the_known_map_is_flown_by_points_and_by_graduates_by_velocities() {

@@ -143,7 +143,7 @@ fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
             events["events"].as_array()?.iter().filter_map(|event| event["text"].as_str());
         texts.next_back().map(str::to_owned)
     });
-    assert_eq!(told.as_deref(), Some("light and fog are changed to: fog"));
+    assert_eq!(told.as_deref(), Some("light and weather are changed to: fog"));
     assert_eq!(environment()["fog_visibility_m"], 12.0);
     assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
     for (body, expected) in [

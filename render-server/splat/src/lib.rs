@@ -51,6 +51,7 @@ mod reference;
 mod scene;
 pub mod sensor;
 mod splats;
+pub mod weather;
 
 pub use atmosphere::Atmosphere;
 pub use backend::{Backend, Chosen, NoRenderer, UnknownBackend, choose};

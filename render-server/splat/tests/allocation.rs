@@ -1,9 +1,12 @@
 //! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
 //! cameras, their lenses, and the objects that come and go.
 
-use glam::{DQuat, DVec3, Quat, Vec3};
+use glam::{DQuat, DVec3, Quat, Vec2, Vec3};
 use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
+use vizflyt_splat::weather::{
+    Cloud, Flicker, LampPlaces, Lamps, OwnLight, Rain, Shot, Snow, Sun, Weather, WeatherPass,
+};
 use vizflyt_splat::{
     Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
@@ -88,4 +91,57 @@ fn nothing_is_allocated_once_every_view_was_seen() {
         assert!(counts[0] > 0, "the counter counts");
         assert_eq!(counts[1..], [0, 0, 0], "{}", renderer.name());
     }
+}
+
+#[test]
+fn weather_allocates_nothing_once_every_view_was_seen() {
+    const TURNS: u32 = 13;
+    let weather = Weather {
+        cloud: Some(Cloud {
+            per_m: 0.3,
+            color: [0.6; 3],
+            patchiness: 1.0,
+            patch_m: 1.0,
+            drift_mps: Vec3::X,
+            layer_m: None,
+            ball: None,
+        }),
+        rain: Some(Rain { rate_mmph: 40.0, wind_mps: Vec2::ONE, lens_drops: 10 }),
+        snow: Some(Snow { rate_mmph: 3.0, wind_mps: Vec2::ONE }),
+        sun: Some(Sun { direction: DVec3::X, glare: 1.0, color: [1.0; 3], behind_m: 9.0 }),
+        lamps: Some(Lamps {
+            reach_m: 1.0,
+            color: [1.0; 3],
+            places: LampPlaces::Grid { height_m: 3.0, spacing_m: 4.0 },
+        }),
+        own_light: Some(OwnLight { reach_m: 2.0, color: [1.0; 3], cos_cone: 0.8 }),
+        flicker: Some(Flicker { mains_hz: 50.0, depth: 0.3, readout_s: 0.01 }),
+        depth_loss: true,
+        ..Weather::CLEAR
+    };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    let mut pass = WeatherPass::default();
+    let mut images = [(); 4].map(|()| RgbdImage::default());
+    let counts = pool.install(|| {
+        [(); 4].map(|()| {
+            let mut allocations = 0;
+            for turn in 0..TURNS {
+                let cameras = cameras(turn);
+                let at_ns = i64::from(turn) * 33_000_000;
+                let shot = Shot { at_ns, v_world_mps: DVec3::X, seed: 7 };
+                let before = CountingAllocator::allocations();
+                for (camera, image) in cameras.iter().zip(&mut images) {
+                    image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
+                    image.alpha.fill(1.0);
+                    image.depth_expected_m.fill(5.0);
+                    image.depth_median_m.fill(5.0);
+                    pass.apply(&weather, camera, &shot, image);
+                }
+                allocations += CountingAllocator::allocations() - before;
+            }
+            allocations
+        })
+    });
+    assert!(counts[0] > 0, "the counter counts");
+    assert_eq!(counts[1..], [0, 0, 0]);
 }

@@ -30,7 +30,7 @@ pub(super) struct NewArgs {
     #[command(flatten)]
     bare: BareArgs,
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The light and the fog it is flown in: {}", Variant::names()
+        "The light and the weather it is flown in: {}", Variant::names()
     ))]
     environment: Variant,
     /// Replaces an arena.toml that is already there

@@ -1,12 +1,18 @@
 //! `vizflyt bench render`: how fast this machine renders.
 
 use std::path::PathBuf;
+use std::time::Instant;
 
 use anyhow::Result;
 use clap::Args;
+use glam::DVec3;
 use serde::Serialize;
+use vizflyt_scenes::Variant;
+use vizflyt_server::render::effects::Effects;
+use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
+use vizflyt_splat::weather::Shot;
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
@@ -20,7 +26,8 @@ cameras, each is rendered in turn, --images times; the figures are over all of t
 Examples:
   vizflyt bench render room.ply --camera cam.json
   vizflyt bench render room.ply --camera a.json --camera b.json --size 640x480 --json
-  vizflyt bench render forest/arena.toml --camera cam.json --renderer cpu --images 200")]
+  vizflyt bench render forest/arena.toml --camera cam.json --renderer cpu --images 200
+  vizflyt bench render forest/arena.toml --camera cam.json --environment rain")]
 pub(super) struct RenderArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
@@ -36,6 +43,11 @@ pub(super) struct RenderArgs {
     /// How much of a large scene the processor renders; a graphics card renders all of it
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     detail: DetailKind,
+    #[arg(long, value_name = "NAME", help = format!(
+        "Also draws each image in this light and weather, in turn with a clear one, and prints their ratio: {}",
+        Variant::names()
+    ))]
+    environment: Option<Variant>,
     /// Images per camera that count; a few before them do not
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
@@ -59,8 +71,23 @@ struct Figures {
     median_ms: f32,
     p99_ms: f32,
     passes: Passes,
+    /// With the light and the weather that were asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    environment: Option<EnvironmentFigures>,
     /// Of the last image of each camera, the mean.
     workload: Work,
+}
+
+/// The same images in an environment: what weather costs besides the renderer, and both in relation to clear images.
+#[derive(Debug, Serialize)]
+struct EnvironmentFigures {
+    name: String,
+    /// Of a whole image.
+    median_ms: f32,
+    /// Of what is done to the finished image.
+    effects_median_ms: f32,
+    /// Of the whole image's time to that of the clear one before it, the median.
+    ratio: f32,
 }
 
 #[derive(Debug, Serialize)]
@@ -101,7 +128,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         })
         .collect::<Result<_>>()?;
     let (path, loaded) = load_as_it_is(&args.scene)?;
-    let start = std::time::Instant::now();
+    let start = Instant::now();
     let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
     let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
     let splats = loaded.splats.len();
@@ -110,11 +137,23 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
     let mut images = [RgbdImage::default()];
     let mut times: Vec<PassTimes> = Vec::new();
     let mut work = Work::default();
+    let (mut weather, mut effects) = (Vec::new(), Effects::default());
     for camera in &cameras {
         for image in 0..WARM_UP + args.images {
             let taken = rasterizer.render(&[], std::slice::from_ref(camera), &mut images)?;
             if image >= WARM_UP {
                 times.push(taken);
+            }
+            let Some(variant) = args.environment else { continue };
+            let environment = variant.environment();
+            let camera = Camera { atmosphere: atmosphere(&environment), ..*camera };
+            let start = Instant::now();
+            rasterizer.render(&[], &[camera], &mut images)?;
+            let rendered_ms = start.elapsed().as_secs_f32() * 1e3;
+            effects.apply(&environment, &camera, &shot(image), &mut images[0]);
+            let all_ms = start.elapsed().as_secs_f32() * 1e3;
+            if image >= WARM_UP {
+                weather.push([all_ms, all_ms - rendered_ms, all_ms / taken.total_ms]);
             }
         }
         let seen = rasterizer.workload();
@@ -127,6 +166,17 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         values.sort_unstable_by(f32::total_cmp);
         values[(share * (values.len() - 1) as f64).round() as usize]
     };
+    let of_weather = |figure: usize| {
+        let mut values: Vec<f32> = weather.iter().map(|figures| figures[figure]).collect();
+        values.sort_unstable_by(f32::total_cmp);
+        values[values.len() / 2]
+    };
+    let environment = args.environment.map(|variant| EnvironmentFigures {
+        name: variant.to_string(),
+        median_ms: of_weather(0),
+        effects_median_ms: of_weather(1),
+        ratio: of_weather(2),
+    });
     let k = cameras[0].intrinsics;
     Ok(Figures {
         scene: path.display().to_string(),
@@ -148,8 +198,14 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
             blend_ms: at(0.5, |t| t.blend_ms),
             read_ms: at(0.5, |t| t.read_ms),
         },
+        environment,
         workload: work,
     })
+}
+
+/// Returns the moment of an image: 30 a second.
+fn shot(image: u32) -> Shot {
+    Shot { at_ns: i64::from(image) * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 }
 }
 
 fn print(f: &Figures) {
@@ -180,6 +236,12 @@ fn print(f: &Figures) {
         ("read", passes.read_ms),
     ] {
         print_fmt!("  {name:<9} {ms:.2} ms");
+    }
+    if let Some(EnvironmentFigures { name, median_ms, effects_median_ms, ratio }) = &f.environment {
+        print_fmt!(
+            "{name:<11} {median_ms:.2} ms, of which {effects_median_ms:.2} are weather and lamps"
+        );
+        print_fmt!("            {ratio:.2} of a clear image, median of pairs");
     }
 }
 

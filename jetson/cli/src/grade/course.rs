@@ -63,7 +63,7 @@ impl CourseInstance {
         let map = truth.map(serde_json::to_string).transpose().context("the map has no text")?;
         let obstacles = obstacles(&generated.arena, &generated.objects, field.clone(), seed);
         Ok(Self {
-            scene_sha256: hash_of(&generated.splats, &generated.objects, &environment),
+            scene_sha256: hash_of(&generated.splats, &generated.objects, &environment)?,
             rules_sha256: hex(&hash.finalize()),
             arena: generated.arena,
             splats: generated.splats,
@@ -75,17 +75,32 @@ impl CourseInstance {
     }
 }
 
-fn hash_of(splats: &Splats, objects: &[RigidObject], environment: &EnvironmentConfig) -> String {
+fn hash_of(
+    splats: &Splats,
+    objects: &[RigidObject],
+    environment: &EnvironmentConfig,
+) -> Result<String> {
     let mut hash = Sha256::new();
     take_all(&mut hash, splats);
     for object in objects {
         take_all(&mut hash, &object.splats);
     }
-    let EnvironmentConfig { light, fog_visibility_m, fog } = environment;
+    let EnvironmentConfig { light, fog_visibility_m, fog, .. } = environment;
     for number in light.iter().chain(fog).chain([fog_visibility_m]) {
         hash.update(number.to_le_bytes());
     }
-    hex(&hash.finalize())
+    if *environment
+        != (EnvironmentConfig {
+            light: *light,
+            fog: *fog,
+            fog_visibility_m: *fog_visibility_m,
+            ..EnvironmentConfig::CLEAR
+        })
+    {
+        // Numbers as people read them: the same text is the same weather.
+        hash.update(serde_json::to_string(environment).context("weather has no text")?);
+    }
+    Ok(hex(&hash.finalize()))
 }
 
 fn take_all(hash: &mut Sha256, splats: &Splats) {
@@ -125,6 +140,9 @@ mod tests {
         let night = course("night".parse().unwrap(), 1);
         assert_eq!(night.rules_sha256, one.rules_sha256, "the rules are those of the day");
         assert_ne!(night.scene_sha256, one.scene_sha256);
+        let rain = course("rain".parse().unwrap(), 1);
+        assert_ne!(rain.scene_sha256, one.scene_sha256, "weather is part of what cameras see");
+        assert_eq!(rain.rules_sha256, one.rules_sha256);
         let other = CourseInstance::make(&project, Level::G, Variant::DAY, 1).unwrap();
         assert_ne!(other.rules_sha256, one.rules_sha256);
     }

@@ -1,12 +1,15 @@
 //! The grade as a document: what was graded, by what, how each flight went, and a signature over all
 //! of it. The same plugin, program, project and seeds give the same text, signature included.
 
+use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_arena::verdict::StageVerdict;
 use vizflyt_protocol::messages::OutcomeKind;
 
@@ -35,6 +38,9 @@ pub(crate) struct Grade {
     pub shard: Option<Shard>,
     /// The figures over all flights.
     pub summary: Summary,
+    /// And over those of each variant, in their order; absent if there is one.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub by_variant: Vec<VariantSummary>,
     /// The flights, by variant and seed.
     pub runs: Vec<Run>,
     /// All other files of the report's folder, by path; none without a report.
@@ -59,6 +65,9 @@ pub(crate) struct Subject {
     pub level: String,
     /// Variants of the surroundings that were flown, in order.
     pub variants: Vec<String>,
+    /// What those of them were that were drawn, as `[environment]` of an arena has it.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub environments: BTreeMap<String, EnvironmentConfig>,
     /// The first seed.
     pub first_seed: u64,
     /// How many seeds each variant was flown with.
@@ -190,6 +199,16 @@ pub(crate) struct Summary {
     pub min_clearance_m: Option<f64>,
 }
 
+/// The figures over the flights of one variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct VariantSummary {
+    /// The surroundings.
+    pub variant: String,
+    /// The figures.
+    pub summary: Summary,
+}
+
 /// A signature (Ed25519, RFC 8032).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -203,10 +222,15 @@ pub(crate) struct Signed {
 impl Subject {
     /// Returns variant and seed of every flight, in their order.
     pub(crate) fn flights(&self) -> impl Iterator<Item = (&str, u64)> {
-        let seeds = self.first_seed..self.first_seed.saturating_add(self.seeds);
+        let seeds = self.seeds();
         self.variants
             .iter()
             .flat_map(move |variant| seeds.clone().map(move |seed| (variant.as_str(), seed)))
+    }
+
+    /// Returns the seeds that each variant is flown with.
+    pub(crate) fn seeds(&self) -> Range<u64> {
+        self.first_seed..self.first_seed.saturating_add(self.seeds)
     }
 }
 
@@ -255,6 +279,7 @@ impl Grade {
             format: FORMAT.to_owned(),
             hash: hash_of(&runs),
             summary: Summary::of(&runs),
+            by_variant: by_variant(&subject, &runs),
             subject,
             shard,
             runs,
@@ -299,6 +324,11 @@ impl Grade {
         ensure!(
             self.summary == Summary::of(&self.runs),
             "the summary does not follow from the flights"
+        );
+        // An earlier version wrote none.
+        ensure!(
+            self.by_variant.is_empty() || self.by_variant == by_variant(&self.subject, &self.runs),
+            "the figures of the variants do not follow from the flights"
         );
         Ok(())
     }
@@ -430,6 +460,19 @@ impl Summary {
             min_clearance_m: runs.iter().filter_map(|run| run.min_clearance_m).reduce(f64::min),
         }
     }
+}
+
+/// Returns the figures of each variant that was flown, where there are several.
+fn by_variant(subject: &Subject, runs: &[Run]) -> Vec<VariantSummary> {
+    if subject.variants.len() < 2 {
+        return Vec::new();
+    }
+    let of = |variant: &String| {
+        let runs: Vec<Run> = runs.iter().filter(|run| run.variant == *variant).cloned().collect();
+        let summary = Summary::of(&runs);
+        (!runs.is_empty()).then(|| VariantSummary { variant: variant.clone(), summary })
+    };
+    subject.variants.iter().filter_map(of).collect()
 }
 
 /// Returns the hash over the flights.

@@ -39,7 +39,7 @@ pub(super) struct JudgeArgs {
     /// Level of the project
     #[arg(long, value_name = "ug|g", requires = "project")]
     level: Option<Level>,
-    /// Its light and fog
+    /// Its light and weather
     #[arg(long, value_name = "NAME", requires = "project")]
     variant: Option<Variant>,
     /// Its seed, of what is generated

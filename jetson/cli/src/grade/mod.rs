@@ -43,14 +43,14 @@ use clap::{Args, Subcommand, ValueEnum};
 use vizflyt_arena::crash::probable_cause;
 use vizflyt_runtime::log::LoggedImages;
 use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
-use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
+use vizflyt_scenes::{Variant, VariantChoice};
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
 use self::course::CourseInstance;
 pub(crate) use self::document::Grade;
-use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, hex};
+use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, VariantSummary, hex};
 use self::folder::{FLIGHTS, ReportFolder};
 use self::odometry::odometry_score;
 use self::progress::Progress;
@@ -65,6 +65,7 @@ use crate::terminal::{print_error, print_line, stop_flag};
 #[command(after_help = "Examples:
   vizflyt grade ./first --project p4 --seeds 20 --report out      flies 20 courses; open out/index.html
   vizflyt grade avoid --project forest --variants day,night       in other light, too
+  vizflyt grade ./first --project p5 --variants random:20         in twenty lights and weathers that are drawn
   vizflyt grade ./first --project p5 --level g --json > me.json   the signed grade, for programs
   vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        an eighth of the flights, on a cluster
   vizflyt grade merge *.json -o whole.json --report out           all eighths make the whole
@@ -94,9 +95,10 @@ struct FlyArgs {
     #[arg(long, value_name = "ug|g", default_value_t)]
     level: Level,
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day", help = format!(
-        "Light and fog that each seed is flown in: {}", Variant::names()
+        "Light and weather that each seed is flown in: {}; or random:20, so many that are drawn from the first \
+         seed within the project's bounds", Variant::names()
     ))]
-    variants: Vec<Variant>,
+    variants: Vec<VariantChoice>,
     /// Number of seeds: each is another course
     #[arg(long, value_name = "N", default_value_t = 10)]
     seeds: u64,
@@ -340,13 +342,17 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let plugin = Plugin::find(typed)?;
     let project = CourseProject::named(&args.project)?;
     let (delays, imu) = (delays(args)?, args.imu);
-    let subject = subject(args, &plugin, &project)?;
-    let flights: Vec<(Variant, u64)> = subject
-        .flights()
+    let variants = variants(args, &project)?;
+    let subject = subject(args, &plugin, &project, &variants)?;
+    // In the order of `Subject::flights`.
+    let seeds = |variant| subject.seeds().map(move |seed| (variant, seed));
+    let flights: Vec<(Variant, u64)> = variants
+        .iter()
+        .flat_map(|&variant| seeds(variant))
         .enumerate()
         .filter(|(index, _)| args.shard.is_none_or(|shard| shard.holds(*index)))
-        .map(|(_, (variant, seed))| Ok((variant.parse()?, seed)))
-        .collect::<Result<_>>()?;
+        .map(|(_, flight)| flight)
+        .collect();
     let answer_within = Duration::try_from_secs_f64(args.answer_within)
         .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
     let stop: &AtomicBool = &*stop_flag(false)?;
@@ -640,12 +646,34 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     })
 }
 
-fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<Subject> {
-    let mut variants: Vec<String> = Vec::new();
-    for variant in args.variants.iter().map(Variant::to_string) {
-        ensure!(!variants.contains(&variant), "--variants: {variant} is there twice");
-        variants.push(variant);
+/// Returns the variants that are flown, those that are drawn among them.
+fn variants(args: &FlyArgs, project: &CourseProject) -> Result<Vec<Variant>> {
+    let mut variants: Vec<Variant> = Vec::new();
+    for choice in &args.variants {
+        let chosen: Vec<Variant> = match *choice {
+            VariantChoice::Named(variant) => vec![variant],
+            VariantChoice::Random(count) => {
+                let draw =
+                    |number| Variant::drawn(args.first_seed.value, number, project.environments());
+                (1..=count).map(draw).collect()
+            }
+        };
+        for variant in chosen {
+            let is_new = variants.iter().all(|other| other.to_string() != variant.to_string());
+            ensure!(is_new, "--variants: {variant} is there twice");
+            variants.push(variant);
+        }
     }
+    Ok(variants)
+}
+
+fn subject(
+    args: &FlyArgs,
+    plugin: &Plugin,
+    project: &CourseProject,
+    variants: &[Variant],
+) -> Result<Subject> {
+    let drawn = variants.iter().filter(|variant| variant.is_drawn());
     let tenth = |ms: f64| (ms * 10.0).round() / 10.0;
     let outputs = [&args.report, &args.junit, &args.result.output];
     let outputs: Vec<&Path> = outputs.into_iter().flatten().map(PathBuf::as_path).collect();
@@ -654,7 +682,8 @@ fn subject(args: &FlyArgs, plugin: &Plugin, project: &CourseProject) -> Result<S
         plugin_sha256: keys::plugin_sha256(&plugin.watched(), &outputs)?,
         project: project.name().to_owned(),
         level: args.level.to_string(),
-        variants,
+        variants: variants.iter().map(Variant::to_string).collect(),
+        environments: drawn.map(|drawn| (drawn.to_string(), drawn.environment())).collect(),
         first_seed: args.first_seed.value,
         seeds: args.seeds,
         delays: DelaysMs {
@@ -720,6 +749,16 @@ fn hand_over(grade: &Grade, args: &ResultArgs) -> Result<()> {
         summary.finish_share.low * 100.0,
         summary.finish_share.high * 100.0
     ));
+    for VariantSummary { variant, summary } in &grade.by_variant {
+        print_line(format!(
+            "  {variant:<12}{:.1} (95 %: {:.1} to {:.1}), finished {} of {}",
+            summary.score.value,
+            summary.score.low,
+            summary.score.high,
+            summary.finished,
+            summary.runs
+        ));
+    }
     if let Some(mean_s) = summary.mean_finish_s {
         print_line(format!("time        {mean_s:.1} s to the finish, on average"));
     }

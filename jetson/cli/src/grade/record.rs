@@ -4,10 +4,13 @@
 //! It is sealed with a key that follows from the grading key and is nowhere on disk: a plugin that can write into the
 //! report's folder makes no flight.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Context, Result, ensure};
 use ed25519_dalek::{Signature, Signer, SigningKey};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use vizflyt_arena::config::EnvironmentConfig;
 
 use super::document::{DelaysMs, Run, SignedFile, Subject, check_files, from_hex, hex};
 
@@ -26,6 +29,9 @@ pub(crate) struct FlownWith {
     pub project: String,
     /// `ug` or `g`.
     pub level: String,
+    /// What drawn variants are.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub environments: BTreeMap<String, EnvironmentConfig>,
     /// How long things took.
     pub delays: DelaysMs,
     /// The simulated inertial sensor; absent where it is the usual one.
@@ -50,6 +56,7 @@ impl FlownWith {
             plugin_sha256: subject.plugin_sha256,
             project: subject.project,
             level: subject.level,
+            environments: subject.environments,
             delays: subject.delays,
             imu: subject.imu,
             program_sha256: subject.program_sha256,
@@ -68,6 +75,7 @@ impl FlownWith {
             ),
             ("project", self.project != there.project),
             ("level", self.level != there.level),
+            ("drawn environments", self.environments != there.environments),
             ("time model", self.delays != there.delays),
             ("--imu", self.imu != there.imu),
             ("program", self.program_sha256 != there.program_sha256),

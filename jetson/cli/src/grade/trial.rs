@@ -41,10 +41,11 @@ use vizflyt_runtime::stream::Reading;
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
+use vizflyt_server::render::effects::Effects;
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
-use vizflyt_simulator::imu::ImuModel;
 use vizflyt_server::render::sensors::{Around, MadeReading, SensorSet, VehicleSensors};
+use vizflyt_simulator::imu::ImuModel;
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::sensor::SensorScene;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
@@ -318,6 +319,7 @@ struct Flight<'a> {
     lockstep: Lockstep,
     referee: Referee,
     renderer: CpuRenderer,
+    effects: Effects,
     images: Vec<RgbdImage>,
     now: HostTime,
     schedule: CameraSchedule,
@@ -388,6 +390,7 @@ impl<'a> Flight<'a> {
             referee: Referee::new(arena, trial.course.obstacles.clone())
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
+            effects: Effects::default(),
             images: Vec::new(),
             now,
             schedule: CameraSchedule::new(ServerTime::from_ns(START_NS)),
@@ -551,6 +554,10 @@ impl<'a> Flight<'a> {
         self.renderer
             .render(&placements, &cameras, images)
             .context("an image cannot be rendered")?;
+        let shot = exposure.shot(self.trial.seed);
+        for (image, camera) in images.iter_mut().zip(&cameras) {
+            self.effects.apply(&self.arena.environment, camera, &shot, image);
+        }
         let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for (&index, image) in due.iter().zip(images) {
             let mut picture = Picture::default();

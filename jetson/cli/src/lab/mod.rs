@@ -69,11 +69,11 @@ pub(crate) struct LabArgs {
     #[arg(long, value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
     #[arg(long, value_name = "NAME", requires = "project", help = format!(
-        "The project's light and fog: {} [default: day]", Variant::names()
+        "The project's light and weather: {} [default: day]", Variant::names()
     ))]
     pub variant: Option<Variant>,
     #[arg(long, value_name = "NAME", conflicts_with = "project", help = format!(
-        "Light and fog of a generated scene or a scene file: {} [default: day]", Variant::names()
+        "Light and weather of a generated scene or a scene file: {} [default: day]", Variant::names()
     ))]
     pub environment: Option<Variant>,
     #[command(flatten)]

@@ -5,11 +5,15 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use glam::DVec3;
 use image::{ImageBuffer, Luma, Rgb};
+use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_scenes::Variant;
+use vizflyt_server::render::effects::Effects;
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::{Antialiased, is_in_an_arena, load_as_it_is, load_objects};
+use vizflyt_splat::weather::Shot;
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
@@ -48,13 +52,13 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_enum, default_value_t)]
     format: FileFormat,
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The light and the fog it is seen in: {}", Variant::names()
+        "The light and the weather it is seen in: {}", Variant::names()
     ))]
     environment: Variant,
-    /// Instant at which moving objects are rendered, since the arena's clock began
+    /// Instant at which moving objects and weather are rendered, since the arena's clock began
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0, value_parser = seconds)]
     at: f64,
-    /// Seed for the initial phase of objects that set none
+    /// Seed for the initial phase of objects that set none, and for weather
     #[arg(long, default_value_t = 7)]
     seed: u64,
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
@@ -84,10 +88,12 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let (scene, mut loaded) = load_as_it_is(&args.scene)?;
     args.antialiased.apply(&mut loaded.splats);
     let environment = args.environment.environment();
-    if environment.fog_visibility_m > 0.0 && !is_in_an_arena(&args.scene) {
+    let is_metric =
+        EnvironmentConfig { light: environment.light, ..EnvironmentConfig::CLEAR } != environment;
+    if is_metric && !is_in_an_arena(&args.scene) {
         bail!(
-            "--environment {}: fog is in metres, and the length of {}'s unit is unknown; name the \
-             arena.toml that it belongs to",
+            "--environment {}: weather is in metres and comes from above, and {} says neither its unit nor \
+             its up; name the arena.toml that it belongs to (`vizflyt arena new` makes one)",
             args.environment,
             scene.display()
         );
@@ -110,9 +116,13 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     print_fmt!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
     let atmosphere = atmosphere(&environment);
+    let at_ns = (args.at * 1e9).round() as i64;
+    let shot = Shot { at_ns, v_world_mps: DVec3::ZERO, seed: args.seed };
+    let mut effects = Effects::default();
     for RenderJob { camera, folder } in jobs {
         let camera = Camera { atmosphere, ..camera };
         let times = rasterizer.render(&placements, &[camera], &mut images)?;
+        effects.apply(&environment, &camera, &shot, &mut images[0]);
         let [image] = &images;
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;

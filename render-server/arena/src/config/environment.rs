@@ -1,9 +1,17 @@
-//! `[environment]`: the light on the scene and the air in it, for the cameras alone.
+//! `[environment]`: the light on the scene, the air in it and the weather, for the cameras alone.
 
 use serde::{Deserialize, Serialize};
 
 use super::ArenaConfig;
 use super::validate::{ConfigError, check_number};
+
+mod named;
+mod weather;
+
+pub use weather::{
+    CloudConfig, FlickerConfig, LampPositions, LampsConfig, MAX_LAMPS, OwnLightConfig, RainConfig,
+    SnowConfig, SunConfig,
+};
 
 /// `[environment]`: what lies between the scene, as it was captured, and the images of it. All of it
 /// may be left out: then nothing does. Obstacles, course, depth and ids do not depend on it.
@@ -27,37 +35,67 @@ pub struct EnvironmentConfig {
     pub fog_visibility_m: f64,
     /// What fog looks like where it hides everything: red, green, blue; 0 to 1.
     pub fog: [f64; 3],
+    /// How long a camera's shutter is open, 0.05 to 100: streaks and flicker. [ms]
+    #[serde(skip_serializing_if = "is_usual_exposure")]
+    pub exposure_ms: f64,
+    /// Whether depth cameras lose returns in what takes light, there and back; else depth is perfect.
+    #[serde(skip_serializing_if = "core::ops::Not::not")]
+    pub depth_loss: bool,
+    /// Smoke, dust or patchy fog.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cloud: Option<CloudConfig>,
+    /// Rain.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rain: Option<RainConfig>,
+    /// Snow.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub snow: Option<SnowConfig>,
+    /// A low sun.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sun: Option<SunConfig>,
+    /// Lamps in the scene.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lamps: Option<LampsConfig>,
+    /// A lamp on the vehicle, beside each camera.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub own_light: Option<OwnLightConfig>,
+    /// Flicker of the scene's light and its lamps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flicker: Option<FlickerConfig>,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes a reference")]
+fn is_usual_exposure(exposure_ms: &f64) -> bool {
+    *exposure_ms == EXPOSURE_MS
 }
 
 impl Default for EnvironmentConfig {
     fn default() -> Self {
-        Self { light: [1.0; 3], fog_visibility_m: 0.0, fog: FOG }
+        Self::CLEAR
     }
 }
 
 /// Grey, a little blue.
 const FOG: [f64; 3] = [0.70, 0.73, 0.76];
+/// Of a camera by day. [ms]
+const EXPOSURE_MS: f64 = 5.0;
 
 impl EnvironmentConfig {
-    /// The environments that have a name: the one table that the page, the command line and their
-    /// messages list. A new one is a row here, valid by the test below.
-    ///
-    /// Light is a factor of display values: a value of 0.5 stands for a fifth of the light, 0.22 for a
-    /// thirtieth. One sees 12 m in the fog, in rooms of 11 m: the far wall is a shadow.
-    pub const NAMED: &'static [(&'static str, Self)] = &[
-        ("day", Self { light: [1.0; 3], fog_visibility_m: 0.0, fog: FOG }),
-        ("dusk", Self { light: [0.62, 0.48, 0.42], fog_visibility_m: 0.0, fog: FOG }),
-        ("night", Self { light: [0.20, 0.23, 0.34], fog_visibility_m: 0.0, fog: FOG }),
-        ("fog", Self { light: [1.0; 3], fog_visibility_m: 12.0, fog: FOG }),
-        (
-            "night-fog",
-            Self {
-                light: [0.20, 0.23, 0.34],
-                fog_visibility_m: 12.0,
-                fog: [FOG[0] * 0.20, FOG[1] * 0.23, FOG[2] * 0.34],
-            },
-        ),
-    ];
+    /// The light of the capture and clear air.
+    pub const CLEAR: Self = Self {
+        light: [1.0; 3],
+        fog_visibility_m: 0.0,
+        fog: FOG,
+        exposure_ms: EXPOSURE_MS,
+        depth_loss: false,
+        cloud: None,
+        rain: None,
+        snow: None,
+        sun: None,
+        lamps: None,
+        own_light: None,
+        flicker: None,
+    };
 
     /// Returns the environment of a name.
     pub fn named(name: &str) -> Option<Self> {
@@ -71,8 +109,7 @@ impl EnvironmentConfig {
 
     /// Returns the extinction of the air: `exp(-it * d)` of the light is left at distance `d`. [1/m]
     pub fn fog_per_m(&self) -> f64 {
-        let contrast = 0.02_f64;
-        if self.fog_visibility_m > 0.0 { -contrast.ln() / self.fog_visibility_m } else { 0.0 }
+        if self.fog_visibility_m > 0.0 { extinction_per_m(self.fog_visibility_m) } else { 0.0 }
     }
 
     /// Checks every number.
@@ -86,16 +123,22 @@ impl EnvironmentConfig {
         for fog in self.fog {
             check_number("environment.fog", fog, "", 0.0..=1.0)?;
         }
-        if self.fog_visibility_m == 0.0 {
-            return Ok(());
+        if self.fog_visibility_m != 0.0 {
+            let key = "environment.fog_visibility_m";
+            check_number(key, self.fog_visibility_m, "m, or 0 for clear air", 0.5..=1000.0)?;
         }
-        let key = "environment.fog_visibility_m";
-        check_number(key, self.fog_visibility_m, "m, or 0 for clear air", 0.5..=1000.0)
+        self.check_weather()
     }
 
     pub(super) fn is_default(&self) -> bool {
         *self == Self::default()
     }
+}
+
+/// Returns the extinction of air in which 2 % of the contrast are left at a distance [m]: Koschmieder's law. [1/m]
+fn extinction_per_m(visibility_m: f64) -> f64 {
+    let contrast = 0.02_f64;
+    -contrast.ln() / visibility_m
 }
 
 impl ArenaConfig {

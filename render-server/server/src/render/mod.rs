@@ -10,6 +10,7 @@
 pub mod cameras;
 pub mod demand;
 pub mod dynamic_objects;
+pub mod effects;
 pub mod environment;
 pub mod rendered;
 mod renderer;
@@ -36,8 +37,10 @@ pub struct Rendering {
     pub cameras: Vec<Cameras>,
     /// The sensors beside the cameras of each vehicle, at its index.
     pub sensors: Vec<Sensors>,
-    /// Light and fog.
+    /// Light and weather.
     pub environment: Environment,
+    /// What is where by chance in the weather: the same for all images.
+    pub seed: u64,
     /// Moving objects, and the vehicles as the others see them.
     pub dynamic_objects: DynamicObjects,
     /// The instant that images show.

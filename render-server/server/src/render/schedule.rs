@@ -6,11 +6,13 @@
 //! newest motion, now ──▶ Exposure ──▶ the instant that images show, the pose by then, render cameras
 //! ```
 
+use glam::DVec3;
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_arena::pose::Predict;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
+use vizflyt_splat::weather::Shot;
 use vizflyt_splat::{Atmosphere, Camera};
 
 use crate::poses::newest::Localized;
@@ -88,6 +90,8 @@ pub struct Exposure {
     pub at: ServerTime,
     /// Where the vehicle is by then.
     pub world_from_body: Pose<World, Body>,
+    /// How it moves. [m/s, world]
+    pub v_world_mps: DVec3,
 }
 
 impl Exposure {
@@ -100,15 +104,22 @@ impl Exposure {
         now: ServerTime,
     ) -> Self {
         let Localized { sample, motion } = newest;
+        let v_world_mps = motion.v_world_mps;
         let after_ns = match predict {
             Predict::Measured => {
-                return Self { at: sample.stamp, world_from_body: sample.world_from_body };
+                let world_from_body = sample.world_from_body;
+                return Self { at: sample.stamp, world_from_body, v_world_mps };
             }
             Predict::Drawn => 0,
             Predict::Seen => seen_after_ns.unwrap_or(SEEN_AFTER_NS),
         };
         let at = motion.reach(now.plus_ns(after_ns));
-        Self { at, world_from_body: motion.at(at) }
+        Self { at, world_from_body: motion.at(at), v_world_mps }
+    }
+
+    /// Returns the moment of the images, in a flight of a seed.
+    pub fn shot(&self, seed: u64) -> Shot {
+        Shot { at_ns: self.at.as_ns().cast_signed(), v_world_mps: self.v_world_mps, seed }
     }
 
     /// Returns the camera to render, where it is at that instant.
@@ -136,7 +147,6 @@ pub fn withholds_depth(config: &CameraConfig) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
     use vizflyt_protocol::messages::PoseSample;
 
     const START: ServerTime = ServerTime::from_ns(10_000_000_000);

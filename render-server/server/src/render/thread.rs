@@ -13,9 +13,10 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use tracing::{trace_span, warn};
-use vizflyt_arena::config::{MAX_OBJECTS, MAX_VEHICLES};
+use vizflyt_arena::config::{EnvironmentConfig, MAX_OBJECTS, MAX_VEHICLES};
 use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
+use vizflyt_splat::weather::Shot;
 use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
@@ -25,6 +26,7 @@ use crate::mailbox::Mailbox;
 use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
+use crate::render::effects::Effects;
 use crate::render::environment::atmosphere;
 use crate::render::rendered::{RenderQueue, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
@@ -89,6 +91,10 @@ struct RenderLoop<'a, D> {
     /// The cameras of one tick, all vehicles'; which of them are whose.
     cameras: Vec<Camera>,
     ranges: [CameraRange; MAX_VEHICLES],
+    /// The moment of each camera's image, and what they are all seen in.
+    shots: Vec<Shot>,
+    environment: EnvironmentConfig,
+    effects: Effects,
     /// Their images side by side, as the renderer wants them.
     images: Vec<RgbdImage>,
     placements: Vec<Placement>,
@@ -116,6 +122,9 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             known: NewestPoses::default(),
             cameras: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
             ranges: Default::default(),
+            shots: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
+            environment: EnvironmentConfig::default(),
+            effects: Effects::default(),
             images: Vec::new(),
             placements: Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES),
             seq: 0,
@@ -159,7 +168,9 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
         self.cameras.clear();
-        let atmosphere = atmosphere(&self.rendering.environment.now());
+        self.shots.clear();
+        self.environment = self.rendering.environment.now();
+        let atmosphere = atmosphere(&self.environment);
         self.ranges = Default::default();
         for (vehicle, set) in self.sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
@@ -185,6 +196,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 };
                 let (config, info) = (&set.configs[camera], &set.infos[camera]);
                 self.cameras.push(exposure.camera(config, info, atmosphere));
+                self.shots.push(exposure.shot(self.rendering.seed));
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);
                 slot.counted = flies;
@@ -210,22 +222,27 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         tick: &mut RenderedTick,
     ) -> Result<(), RenderError> {
         let span = trace_span!("tick", seq = self.seq, stamp_ns = stamp.as_ns()).entered();
-        let Self { rendering, cameras, placements, known, .. } = self;
+        let Self { rendering, cameras, shots, environment, placements, known, .. } = self;
         let images = &mut self.images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| {
             if rendering.dynamic_objects.is_empty() {
-                return renderer.render(&[], cameras, images).map(|_| ());
+                renderer.render(&[], cameras, images)?;
+            } else {
+                // Each vehicle sees the moment that its images show, and not itself.
+                let mut ranges =
+                    self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
+                ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
+                    placements.clear();
+                    rendering.dynamic_objects.place(at, vehicle, known, placements);
+                    let images = &mut images[first..end];
+                    renderer.render(placements, &cameras[first..end], images).map(|_| ())
+                })?;
             }
-            // Each vehicle sees the moment that its images show, and not itself.
-            let mut ranges =
-                self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
-            ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
-                placements.clear();
-                rendering.dynamic_objects.place(at, vehicle, known, placements);
-                let images = &mut images[first..end];
-                renderer.render(placements, &cameras[first..end], images).map(|_| ())
-            })
+            for ((image, camera), shot) in images.iter_mut().zip(cameras).zip(shots) {
+                self.effects.apply(environment, camera, shot, image);
+            }
+            Ok(())
         });
         let end = clock::now();
         drop(span);

@@ -248,6 +248,7 @@ async fn make_rooms(
             .collect(),
         sensors: std::mem::take(&mut scene.sensors).into_iter().map(Sensors::new).collect(),
         environment: Environment::new(scene.arena.environment),
+        seed: args.seed,
         dynamic_objects: std::mem::take(&mut scene.dynamic_objects),
         predict: scene.arena.pose.predict,
         renderer: Mutex::new(RendererInfo {

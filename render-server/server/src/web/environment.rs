@@ -1,4 +1,4 @@
-//! Light and fog from the page: `GET /api/environment` returns those of this moment and those that have
+//! Light and weather from the page: `GET /api/environment` returns those of this moment and those that have
 //! a name, `PUT /api/environment` changes them, also in flight. For the instructor alone
 //! ([`super::routes`]).
 
@@ -28,7 +28,7 @@ struct EnvironmentStatus {
 
 /// Returns the environment.
 pub(super) async fn get(State(page): State<Arc<Page>>) -> Response {
-    Json(status(page.rooms.rendering.environment.now())).into_response()
+    Json(status(&page.rooms.rendering.environment.now())).into_response()
 }
 
 /// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
@@ -48,13 +48,13 @@ pub(super) async fn change(
     match page.rooms.rendering.environment.change(environment) {
         Ok(true) => {
             let name = environment.name().unwrap_or("the page's own");
-            page.rooms.flights.note(&format!("light and fog are changed to: {name}"));
+            page.rooms.flights.note(&format!("light and weather are changed to: {name}"));
         }
         // The same again is no news.
         Ok(false) => {}
         Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
     }
-    Json(status(environment)).into_response()
+    Json(status(&environment)).into_response()
 }
 
 fn parse(request: Map<String, Value>) -> Result<EnvironmentConfig, String> {
@@ -69,13 +69,35 @@ fn parse(request: Map<String, Value>) -> Result<EnvironmentConfig, String> {
     })
 }
 
-fn status(now: EnvironmentConfig) -> EnvironmentStatus {
+fn status(now: &EnvironmentConfig) -> EnvironmentStatus {
     let names = EnvironmentConfig::NAMED.iter().map(|(name, _)| *name).collect();
-    EnvironmentStatus { name: now.name(), now, names }
+    EnvironmentStatus { name: now.name(), now: *now, names }
 }
 
 #[cfg(test)]
 pub(super) fn examples() -> Vec<serde_json::Value> {
-    let own = EnvironmentConfig { fog_visibility_m: 7.5, ..EnvironmentConfig::default() };
-    [EnvironmentConfig::default(), own].map(|now| serde_json::json!(status(now))).into()
+    use glam::DVec3;
+    use vizflyt_arena::config::{
+        CloudConfig, FlickerConfig, LampsConfig, OwnLightConfig, RainConfig, SnowConfig, SunConfig,
+    };
+    let positions_m = Some(vec![DVec3::ONE].try_into().expect("one lamp"));
+    let own = EnvironmentConfig {
+        fog_visibility_m: 7.5,
+        exposure_ms: 2.5,
+        depth_loss: true,
+        cloud: Some(CloudConfig {
+            layer_m: Some([0.0, 1.5]),
+            center_m: Some(DVec3::ONE),
+            radius_m: Some(2.5),
+            ..CloudConfig::USUAL
+        }),
+        rain: Some(RainConfig::USUAL),
+        snow: Some(SnowConfig::USUAL),
+        sun: Some(SunConfig::USUAL),
+        lamps: Some(LampsConfig { positions_m, ..LampsConfig::USUAL }),
+        own_light: Some(OwnLightConfig::USUAL),
+        flicker: Some(FlickerConfig::USUAL),
+        ..EnvironmentConfig::default()
+    };
+    [EnvironmentConfig::default(), own].map(|now| serde_json::json!(status(&now))).into()
 }

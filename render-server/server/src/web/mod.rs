@@ -27,7 +27,7 @@
 //! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
 //! ```
 //! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]);
-//! `GET` and `PUT /api/environment` are its light and fog ([`environment`]).
+//! `GET` and `PUT /api/environment` are its light and weather ([`environment`]).
 //! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
 //! ([`access`]); all routes are in one table ([`routes`]):
 //! ```text

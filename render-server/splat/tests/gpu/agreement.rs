@@ -2,8 +2,11 @@
 
 use std::path::Path;
 
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec3, Vec2, Vec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
+use vizflyt_splat::weather::{
+    Cloud, LampPlaces, Lamps, OwnLight, Rain, Shot, Snow, Weather, WeatherPass,
+};
 use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, Splats, ply};
 
 use crate::{both, compare, twins};
@@ -54,6 +57,42 @@ fn generated_twins_of_every_degree_agree() {
         let cameras = [twins::camera(97, 61, 70.0), twins::camera(160, 120, 110.0)];
         check(&format!("degree {degree}"), &splats, &[], &cameras);
     }
+}
+
+/// Weather is one pass over finished images: what two renderers agree on, they agree on in any weather.
+#[test]
+fn both_are_seen_in_the_same_weather() {
+    let splats = twins::cloud(4000, 0, 7);
+    let dim = Atmosphere { light: [0.3; 3], ..Atmosphere::CLEAR };
+    let camera = Camera { atmosphere: dim, ..twins::camera(160, 120, 80.0) };
+    let Some((mut expected, mut actual)) = both(&splats, &[], &[camera]) else { return };
+    let clear = expected[0].rgb.clone();
+    let weather = Weather {
+        cloud: Some(Cloud {
+            per_m: 0.3,
+            color: [0.6, 0.6, 0.7],
+            patchiness: 1.0,
+            patch_m: 0.8,
+            drift_mps: Vec3::X,
+            layer_m: None,
+            ball: None,
+        }),
+        rain: Some(Rain { rate_mmph: 30.0, wind_mps: Vec2::X, lens_drops: 6 }),
+        snow: Some(Snow { rate_mmph: 2.0, wind_mps: Vec2::Y }),
+        lamps: Some(Lamps {
+            reach_m: 1.0,
+            color: [1.0, 0.8, 0.6],
+            places: LampPlaces::Grid { height_m: 2.0, spacing_m: 3.0 },
+        }),
+        own_light: Some(OwnLight { reach_m: 0.8, color: [1.0; 3], cos_cone: 0.85 }),
+        ..Weather::CLEAR
+    };
+    let shot = Shot { at_ns: 1_234_567_890, v_world_mps: DVec3::ZERO, seed: 7 };
+    for image in expected.iter_mut().chain(&mut actual) {
+        WeatherPass::default().apply(&weather, &camera, &shot, image);
+    }
+    assert_ne!(expected[0].rgb, clear, "there is weather");
+    assert_alike("weather", &actual[0], &expected[0]);
 }
 
 #[test]

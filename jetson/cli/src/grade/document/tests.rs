@@ -9,6 +9,7 @@ pub(crate) fn subject() -> Subject {
         project: "forest".into(),
         level: "ug".into(),
         variants: vec!["day".into()],
+        environments: BTreeMap::new(),
         first_seed: 1,
         seeds: 4,
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
@@ -172,6 +173,49 @@ fn shards_hold_every_flight_once() {
     for wrong in ["1/100001", "0/3", "4/3", "1/0", "1", "a/b", "-1/2"] {
         assert!(wrong.parse::<Shard>().is_err(), "{wrong}");
     }
+}
+
+/// A grade of two variants, one of which was drawn.
+fn of_two_variants() -> Grade {
+    let drawn = vizflyt_scenes::Variant::drawn(1, 1, &vizflyt_scenes::DrawBounds::default());
+    let subject = Subject {
+        variants: vec!["day".into(), drawn.to_string()],
+        environments: BTreeMap::from([(drawn.to_string(), drawn.environment())]),
+        ..subject()
+    };
+    let by_day = (1..=4).map(|seed| run(seed, OutcomeKind::Finished));
+    let drawn = (1..=4).map(|seed| {
+        let outcome = if seed == 1 { OutcomeKind::Finished } else { OutcomeKind::Collided };
+        Run { variant: drawn.to_string(), ..run(seed, outcome) }
+    });
+    let mut grade = Grade::new(subject, None, by_day.chain(drawn).collect());
+    grade.sign(&key()).unwrap();
+    grade
+}
+
+#[test]
+fn each_variant_has_its_mean_and_interval_and_drawn_ones_their_numbers() {
+    let grade = of_two_variants();
+    let [day, drawn] = &grade.by_variant[..] else { panic!("two variants") };
+    assert_eq!((day.variant.as_str(), day.summary.finished), ("day", 4));
+    assert_eq!(
+        (drawn.variant.as_str(), drawn.summary.runs, drawn.summary.finished),
+        ("random-01", 4, 1)
+    );
+    assert_eq!((day.summary.score.value, drawn.summary.score.value), (100.0, 62.5));
+    let Interval { low, high, .. } = drawn.summary.score;
+    assert!(50.0 <= low && low < 62.5 && 62.5 < high && high <= 100.0, "{low} {high}");
+    // One variant has the figures of the whole.
+    assert!(Grade::new(subject(), None, vec![run(1, OutcomeKind::Finished)]).by_variant.is_empty());
+    // As text and back, to the last bit: the signature is over the text.
+    let read = Grade::parse(&grade.to_text().unwrap()).unwrap();
+    assert_eq!(read, grade);
+    read.verify(&key().verifying_key()).unwrap();
+    let mut forged = grade;
+    forged.by_variant[1].summary.finished = 4;
+    forged.sign(&key()).unwrap();
+    let error = forged.verify(&key().verifying_key()).unwrap_err().to_string();
+    assert!(error.contains("figures of the variants"), "{error}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use anyhow::Result;
 use ed25519_dalek::SigningKey;
 use vizflyt_protocol::messages::OutcomeKind;
 
-use super::document::{Grade, Run, SignedFile};
+use super::document::{Grade, Run, SignedFile, VariantSummary};
 use super::folder::{GRADE, JUNIT, PAGE, ReportFolder, sorted};
 use super::junit;
 use super::statistics::Interval;
@@ -59,6 +59,7 @@ fn page(grade: &Grade, cards: &[String]) -> String {
         escape(&subject.variants.join(", "))
     );
     text += &figures(grade);
+    text += &variants(grade);
     text += &table(&grade.runs, !cards.is_empty());
     let with_cards = || grade.runs.iter().zip(cards);
     for (finished, title) in
@@ -105,6 +106,34 @@ fn figures(grade: &Grade) -> String {
         let _ = write!(text, "<div><dt>{name}</dt><dd>{value}<small>{note}</small></dd></div>");
     }
     text + "</dl>\n"
+}
+
+/// The variants, where there are several, and what those were that were drawn.
+fn variants(grade: &Grade) -> String {
+    if grade.by_variant.is_empty() {
+        return String::new();
+    }
+    let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Variant</th>\
+                    <th>Finished</th><th>Score</th><th>95 %</th><th class=\"text\">What it is</th>\
+                    </tr></thead><tbody>\n"
+        .to_owned();
+    for VariantSummary { variant, summary } in &grade.by_variant {
+        let drawn = grade.subject.environments.get(variant);
+        let what = drawn.and_then(|drawn| serde_json::to_string(drawn).ok()).unwrap_or_default();
+        let _ = writeln!(
+            text,
+            "<tr><td class=\"text\">{}</td><td>{} of {}</td><td>{:.1}</td><td>{:.1} to {:.1}</td>\
+             <td class=\"text why\">{}</td></tr>",
+            escape(variant),
+            summary.finished,
+            summary.runs,
+            summary.score.value,
+            summary.score.low,
+            summary.score.high,
+            escape(&what)
+        );
+    }
+    text + "</tbody></table></div>\n"
 }
 
 fn table(runs: &[Run], with_cards: bool) -> String {

@@ -268,11 +268,41 @@ export type SceneChoice = {
 };
 
 export type Environment = {
+  cloud?: {
+    center_m: [number, number, number];
+    color: [number, number, number];
+    drift_mps: [number, number, number];
+    layer_m: [number, number];
+    patch_m: number;
+    patchiness: number;
+    radius_m: number;
+    visibility_m: number;
+  };
+  depth_loss?: boolean;
+  exposure_ms?: number;
+  flicker?: { depth: number; mains_hz: number; readout_ms: number };
   fog: [number, number, number];
   fog_visibility_m: number;
+  lamps?: {
+    color: [number, number, number];
+    height_m: number;
+    positions_m: [number, number, number][];
+    reach_m: number;
+    spacing_m: number;
+  };
   light: [number, number, number];
   name: string | null;
   names: string[];
+  own_light?: { color: [number, number, number]; cone_deg: number; reach_m: number };
+  rain?: { lens_drops: number; rate_mmph: number; wind_mps: [number, number] };
+  snow?: { rate_mmph: number; wind_mps: [number, number] };
+  sun?: {
+    azimuth_deg: number;
+    behind_m: number;
+    color: [number, number, number];
+    elevation_deg: number;
+    glare: number;
+  };
 };
 
 export type Pairing = {

@@ -1,4 +1,4 @@
-// Light and fog of the scene: an environment by its name takes effect at once, a visibility with the button.
+// Light and weather of the scene: an environment by its name takes effect at once, a visibility with the button.
 
 import { fillChoices, makeFormDialog, makeLabel } from "../dialog.js";
 import { $, make } from "../dom.js";
@@ -12,9 +12,9 @@ const OWN = "own";
 const choice = make("select", { id: "environment-choice" });
 const visibility = make("input", { id: "environment-sight", type: "number", min: "0", max: "1000", step: "0.5" });
 const { dialog, form, status } = makeFormDialog(
-  "light and fog", "change", "status",
+  "light and weather", "change", "status",
   makeLabel(choice, "what the cameras see the scene in, from the next image on"), choice,
-  makeLabel(visibility, "visibility [m]; 0 is clear air"), visibility,
+  makeLabel(visibility, "visibility of fog [m]; 0 is clear air"), visibility,
 );
 /** @type {Environment | null} */
 let environment = null;
@@ -37,7 +37,10 @@ choice.addEventListener("change", () => {
   if (choice.value !== OWN) change({ name: choice.value });
 });
 form.addEventListener("submit", () => {
-  if (environment) change({ light: environment.light, fog: environment.fog, fog_visibility_m: Number(visibility.value) });
+  if (!environment) return;
+  // All that it has but its name, with another visibility.
+  const wanted = Object.entries(environment).filter(([key]) => key !== "name" && key !== "names");
+  change({ ...Object.fromEntries(wanted), fog_visibility_m: Number(visibility.value) });
 });
 $("environment").addEventListener("click", async () => {
   const answer = await fetch("/api/environment");

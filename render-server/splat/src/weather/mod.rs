@@ -1,0 +1,248 @@
+//! Weather and light: what lies and shines between a scene and a camera, over any renderer's image.
+//!
+//! ```text
+//! image (RGB, alpha, depth), camera, instant, seed, weather -> the image in that weather
+//!   rays      slopes of a coarse grid of pixels        cloud     integrals of density along them
+//!   light     lamps, own light, flicker, on surfaces   rain snow particles   streaks of those near enough
+//!   per row:  light -> cloud and veil by depth -> streaks before what is behind them -> glare
+//!   lens      drops on the lens, over all of it
+//! ```
+//! A function of its arguments: the same bits for any number of threads and, as no library's exponential is asked
+//! per pixel, for any kind of processor. Both renderers make the image, so neither knows of it. It knows depths, not
+//! splats: of what is half transparent it takes the mean depth.
+//!
+//! Perfect depth, alpha and ids stay as they are; with [`Weather::depth_loss`] a depth camera's returns are lost in what
+//! takes light, there and back: with probability `1 - exp(-2 k d)`.
+//!
+//! Budget on two cores, 320x240: 1 ms for a cloud, 1 ms for rain or snow, 0.3 ms for light. It is bounded by pixels, the
+//! cloud's 30 k places of noise, and 8 k particles in view at most. Nothing is allocated once every buffer was used.
+
+mod cloud;
+mod exp;
+mod flicker;
+mod glare;
+mod lens;
+mod light;
+mod particles;
+mod rain;
+mod random;
+mod rays;
+mod rows;
+mod snow;
+
+use glam::{DVec3, Vec3};
+
+pub use cloud::{Ball, Cloud};
+pub use flicker::Flicker;
+pub use glare::Sun;
+pub use light::{LEAST_LIGHT, LampPlaces, Lamps, MAX_LAMPS, OwnLight};
+pub use rain::Rain;
+pub use snow::Snow;
+
+use crate::{Camera, RgbdImage};
+use cloud::CloudPass;
+use glare::Glare;
+use lens::LensPass;
+use light::{Illumination, RowLight};
+use particles::{ParticlePass, Scene};
+use rays::Rays;
+use rows::{RowPass, Rows};
+
+/// What lies and shines between a scene and its cameras, besides [`crate::Atmosphere`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weather {
+    /// How long a shutter is open: streaks and flicker. [s]
+    pub exposure_s: f32,
+    /// Whether depth cameras lose returns in what takes light.
+    pub depth_loss: bool,
+    /// Smoke, dust, patchy fog.
+    pub cloud: Option<Cloud>,
+    /// Rain.
+    pub rain: Option<Rain>,
+    /// Snow.
+    pub snow: Option<Snow>,
+    /// A low sun.
+    pub sun: Option<Sun>,
+    /// Lamps in the scene.
+    pub lamps: Option<Lamps>,
+    /// A lamp on the vehicle.
+    pub own_light: Option<OwnLight>,
+    /// Flicker of the scene's light and its lamps.
+    pub flicker: Option<Flicker>,
+}
+
+impl Weather {
+    /// Nothing.
+    pub const CLEAR: Self = Self {
+        exposure_s: 0.005,
+        depth_loss: false,
+        cloud: None,
+        rain: None,
+        snow: None,
+        sun: None,
+        lamps: None,
+        own_light: None,
+        flicker: None,
+    };
+
+    /// Whether images stay as they are.
+    pub fn is_clear(&self) -> bool {
+        let Self { depth_loss, exposure_s, .. } = *self;
+        *self == Self { exposure_s, ..Self::CLEAR } && !depth_loss
+    }
+
+    /// Returns how much light rain and snow take together. [1/m]
+    fn veil_per_m(&self) -> f32 {
+        let rain = self.rain.map_or(0.0, |rain| rain.extinction_per_m());
+        let snow = self.snow.map_or(0.0, |snow| snow.extinction_per_m());
+        (rain + snow) as f32
+    }
+}
+
+impl Default for Weather {
+    fn default() -> Self {
+        Self::CLEAR
+    }
+}
+
+/// The moment of an image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shot {
+    /// The instant that it shows, of any clock. [ns]
+    pub at_ns: i64,
+    /// How the camera moves. [m/s, world]
+    pub v_world_mps: DVec3,
+    /// What is where by chance: the same for all images of a flight.
+    pub seed: u64,
+}
+
+/// Puts weather into images; keeps buffers between them.
+#[derive(Debug, Default)]
+pub struct WeatherPass {
+    rays: Rays,
+    cloud: CloudPass,
+    particles: ParticlePass,
+    rows: RowPass,
+    lens: LensPass,
+}
+
+impl WeatherPass {
+    /// Puts `weather` into the image that `camera` has of a scene.
+    ///
+    /// # Panics
+    /// If the image is not of the camera's size.
+    pub fn apply(
+        &mut self,
+        weather: &Weather,
+        camera: &Camera,
+        shot: &Shot,
+        image: &mut RgbdImage,
+    ) {
+        if weather.is_clear() {
+            return;
+        }
+        let size = [image.width_px as usize, image.height_px as usize];
+        let k = &camera.intrinsics;
+        assert_eq!(
+            [k.width_px, k.height_px],
+            [image.width_px, image.height_px],
+            "the camera's image"
+        );
+        let at_s = shot.at_ns as f64 * 1e-9;
+        self.rays.follow(k);
+        if let Some(cloud) = &weather.cloud {
+            self.cloud.follow(cloud, shot.seed, at_s, camera, &self.rays);
+        }
+        let illumination = Illumination::new(weather.lamps, weather.own_light, camera);
+        let light = RowLight {
+            flicker: weather.flicker,
+            at_ns: shot.at_ns,
+            exposure_s: weather.exposure_s,
+            height: size[1],
+        };
+        self.fall(weather, camera, shot, (&illumination, light.of(size[1] / 2)), image);
+        let is_lit =
+            weather.lamps.is_some() || weather.own_light.is_some() || weather.flicker.is_some();
+        let rows = Rows {
+            width: size[0],
+            seed: shot.seed ^ shot.at_ns as u64,
+            atmosphere: camera.atmosphere,
+            rays: &self.rays,
+            cloud: weather.cloud.as_ref().map(|cloud| (&self.cloud, *cloud)),
+            veil_per_m: weather.veil_per_m(),
+            illumination: is_lit.then_some((illumination, light)),
+            particles: &self.particles,
+            glare: weather.sun.and_then(|sun| Glare::of(&sun, camera, image)),
+            depth_loss: weather.depth_loss,
+        };
+        self.rows.run(&rows, image);
+        if let Some(Rain { lens_drops, .. }) = weather.rain
+            && lens_drops > 0
+        {
+            self.lens.draw(lens_drops, shot.seed, at_s, size, &mut image.rgb);
+        }
+    }
+
+    /// Lets drops and flakes fall, in the light there is.
+    fn fall(
+        &mut self,
+        weather: &Weather,
+        camera: &Camera,
+        shot: &Shot,
+        (illumination, flicker): (&Illumination, f32),
+        image: &RgbdImage,
+    ) {
+        self.particles.clear();
+        if let Some(rain) = &weather.rain {
+            self.particles.add(RAIN, rain.kinds());
+        }
+        if let Some(snow) = &weather.snow {
+            self.particles.add(SNOW, snow.kinds());
+        }
+        if weather.rain.is_none() && weather.snow.is_none() {
+            return;
+        }
+        let scene = Scene {
+            camera,
+            rays: &self.rays,
+            v_world_mps: shot.v_world_mps,
+            exposure_s: f64::from(weather.exposure_s),
+            at_s: shot.at_ns as f64 * 1e-9,
+            seed: shot.seed,
+        };
+        let around = mean_of(image).map(|value| value * DROP_BRIGHTNESS);
+        let white = camera.atmosphere.light.map(|light| light * FLAKE_WHITE);
+        self.particles.fall(&scene, |group, p_cam_m| {
+            let gain = illumination.gain(p_cam_m, flicker);
+            let color = if group == RAIN { around } else { white };
+            [0, 1, 2].map(|c| (color[c] * gain[c]).min(BRIGHTEST))
+        });
+    }
+}
+
+/// Groups of particles.
+const RAIN: u32 = 0;
+const SNOW: u32 = 1;
+/// A drop shows all that is around it, of which the brightest part, a sky or lamps, is above the camera's view: five
+/// times the light of the image's mean, as a display value.
+const DROP_BRIGHTNESS: f32 = 2.24;
+/// Fresh snow, as a display value in the capture's light.
+const FLAKE_WHITE: f32 = 0.92;
+/// A sensor is saturated at 1; a streak that is brighter shows before a dark wall.
+const BRIGHTEST: f32 = 1.5;
+
+/// Returns the mean colour of some pixels of an image; what is no number does not count.
+fn mean_of(image: &RgbdImage) -> [f32; 3] {
+    let (mut sum, mut count) = (Vec3::ZERO, 0.0);
+    for pixel in image.rgb.chunks_exact(3).step_by(97) {
+        let pixel = Vec3::from_slice(pixel);
+        if pixel.is_finite() {
+            sum += pixel.clamp(Vec3::ZERO, Vec3::ONE);
+            count += 1.0;
+        }
+    }
+    (sum / f32::max(count, 1.0)).to_array()
+}
+
+#[cfg(test)]
+mod tests;
