@@ -19,6 +19,7 @@ use crate::pose::PoseConfig;
 mod body;
 mod camera;
 mod environment;
+pub mod imaging;
 mod line;
 mod no_fly;
 mod object;
@@ -34,6 +35,7 @@ pub use environment::{
     CloudConfig, EnvironmentConfig, FlickerConfig, LampPositions, LampsConfig, MAX_LAMPS,
     OwnLightConfig, RainConfig, SnowConfig, SunConfig,
 };
+pub use imaging::ImagingConfig;
 pub use line::line_of;
 pub use no_fly::NoFly;
 pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};

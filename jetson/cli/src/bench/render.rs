@@ -8,11 +8,10 @@ use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
 use vizflyt_scenes::Variant;
-use vizflyt_server::render::effects::Effects;
-use vizflyt_server::render::environment::atmosphere;
+use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
-use vizflyt_splat::weather::Shot;
+use vizflyt_splat::weather::{Shot, WeatherPass};
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
@@ -137,7 +136,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
     let mut images = [RgbdImage::default()];
     let mut times: Vec<PassTimes> = Vec::new();
     let mut work = Work::default();
-    let (mut weather, mut effects) = (Vec::new(), Effects::default());
+    let (mut figures, mut pass) = (Vec::new(), WeatherPass::default());
     for camera in &cameras {
         for image in 0..WARM_UP + args.images {
             let taken = rasterizer.render(&[], std::slice::from_ref(camera), &mut images)?;
@@ -150,10 +149,10 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
             let start = Instant::now();
             rasterizer.render(&[], &[camera], &mut images)?;
             let rendered_ms = start.elapsed().as_secs_f32() * 1e3;
-            effects.apply(&environment, &camera, &shot(image), &mut images[0]);
+            pass.apply(&weather(&environment), &camera, &shot(image), &mut images[0]);
             let all_ms = start.elapsed().as_secs_f32() * 1e3;
             if image >= WARM_UP {
-                weather.push([all_ms, all_ms - rendered_ms, all_ms / taken.total_ms]);
+                figures.push([all_ms, all_ms - rendered_ms, all_ms / taken.total_ms]);
             }
         }
         let seen = rasterizer.workload();
@@ -167,7 +166,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         values[(share * (values.len() - 1) as f64).round() as usize]
     };
     let of_weather = |figure: usize| {
-        let mut values: Vec<f32> = weather.iter().map(|figures| figures[figure]).collect();
+        let mut values: Vec<f32> = figures.iter().map(|each: &[f32; 3]| each[figure]).collect();
         values.sort_unstable_by(f32::total_cmp);
         values[values.len() / 2]
     };

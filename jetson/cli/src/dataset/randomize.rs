@@ -156,7 +156,8 @@ impl Randomize {
         }
         // Fog is lit as the scene is.
         let lit = |k: usize| (EnvironmentConfig::default().fog[k] * light[k]).clamp(0.0, 1.0);
-        EnvironmentConfig { light, fog_visibility_m: visibility_m, fog: [lit(0), lit(1), lit(2)] }
+        let fog = [lit(0), lit(1), lit(2)];
+        EnvironmentConfig { light, fog_visibility_m: visibility_m, fog, ..*arena }
     }
 
     /// Draws the intrinsics of a camera that has these without it.

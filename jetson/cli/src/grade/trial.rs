@@ -41,13 +41,14 @@ use vizflyt_runtime::stream::Reading;
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
-use vizflyt_server::render::effects::Effects;
-use vizflyt_server::render::environment::atmosphere;
+use vizflyt_server::render::environment::{atmosphere, weather};
+use vizflyt_server::render::imaging::{CameraEffects, EffectInput};
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
 use vizflyt_server::render::sensors::{Around, MadeReading, SensorSet, VehicleSensors};
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::sensor::SensorScene;
+use vizflyt_splat::weather::WeatherPass;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
 
 use super::course::CourseInstance;
@@ -319,8 +320,10 @@ struct Flight<'a> {
     lockstep: Lockstep,
     referee: Referee,
     renderer: CpuRenderer,
-    effects: Effects,
+    weather: WeatherPass,
     images: Vec<RgbdImage>,
+    /// Of each camera.
+    imaging: Vec<CameraEffects>,
     now: HostTime,
     schedule: CameraSchedule,
     sensing: Option<Sensing>,
@@ -390,8 +393,9 @@ impl<'a> Flight<'a> {
             referee: Referee::new(arena, trial.course.obstacles.clone())
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
-            effects: Effects::default(),
+            weather: WeatherPass::default(),
             images: Vec::new(),
+            imaging: info.cameras.iter().map(|_| CameraEffects::default()).collect(),
             now,
             schedule: CameraSchedule::new(ServerTime::from_ns(START_NS)),
             sensing,
@@ -554,17 +558,22 @@ impl<'a> Flight<'a> {
         self.renderer
             .render(&placements, &cameras, images)
             .context("an image cannot be rendered")?;
+        let weather = weather(&self.arena.environment);
         let shot = exposure.shot(self.trial.seed);
-        for (image, camera) in images.iter_mut().zip(&cameras) {
-            self.effects.apply(&self.arena.environment, camera, &shot, image);
-        }
         let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
-        for (&index, image) in due.iter().zip(images) {
+        for ((&index, camera), image) in due.iter().zip(&cameras).zip(images) {
             let mut picture = Picture::default();
+            let (config, info) = (&self.arena.cameras[index], &self.cameras[index]);
+            image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
+            // What truly is ahead, whatever weather and camera make of it.
+            let width = info.intrinsics.width_px as usize;
+            picture.ahead_m = ahead_m(&picture.depth_mm, width, &mut self.scratch);
+            self.weather.apply(&weather, camera, &shot, image);
+            let seeds = [self.trial.seed, index as u64, self.seq + 1];
+            let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
+            self.imaging[index].apply(&input, image);
             image.write_rgb8(&mut picture.rgb);
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
-            let k = &self.cameras[index].intrinsics;
-            picture.ahead_m = ahead_m(&picture.depth_mm, k.width_px as usize, &mut self.scratch);
             if withholds_depth(&self.arena.cameras[index]) {
                 // As in flight: what the course withholds is "no return" everywhere.
                 picture.depth_mm.fill(0);

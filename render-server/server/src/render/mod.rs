@@ -10,8 +10,8 @@
 pub mod cameras;
 pub mod demand;
 pub mod dynamic_objects;
-pub mod effects;
 pub mod environment;
+pub mod imaging;
 pub mod rendered;
 mod renderer;
 pub mod schedule;

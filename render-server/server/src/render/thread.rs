@@ -16,7 +16,7 @@ use tracing::{trace_span, warn};
 use vizflyt_arena::config::{EnvironmentConfig, MAX_OBJECTS, MAX_VEHICLES};
 use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_splat::weather::Shot;
+use vizflyt_splat::weather::{Shot, WeatherPass};
 use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
@@ -26,9 +26,9 @@ use crate::mailbox::Mailbox;
 use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
-use crate::render::effects::Effects;
-use crate::render::environment::atmosphere;
-use crate::render::rendered::{RenderQueue, RenderedTick};
+use crate::render::environment::{atmosphere, weather};
+use crate::render::imaging::{CameraEffects, EffectInput};
+use crate::render::rendered::{RenderQueue, RenderedImage, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
 use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
@@ -94,10 +94,12 @@ struct RenderLoop<'a, D> {
     /// The moment of each camera's image, and what they are all seen in.
     shots: Vec<Shot>,
     environment: EnvironmentConfig,
-    effects: Effects,
+    weather: WeatherPass,
     /// Their images side by side, as the renderer wants them.
     images: Vec<RgbdImage>,
     placements: Vec<Placement>,
+    /// Of each camera of each vehicle, with [`MAX_CAMERAS`] places a vehicle.
+    imaging: Vec<CameraEffects>,
     seq: u64,
     refused: bool,
 }
@@ -124,9 +126,12 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             ranges: Default::default(),
             shots: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
             environment: EnvironmentConfig::default(),
-            effects: Effects::default(),
+            weather: WeatherPass::default(),
             images: Vec::new(),
             placements: Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES),
+            imaging: (0..rendering.cameras.len() * MAX_CAMERAS)
+                .map(|_| CameraEffects::default())
+                .collect(),
             seq: 0,
             refused: false,
         }
@@ -239,17 +244,22 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                     renderer.render(placements, &cameras[first..end], images).map(|_| ())
                 })?;
             }
+            let weather = weather(environment);
             for ((image, camera), shot) in images.iter_mut().zip(cameras).zip(shots) {
-                self.effects.apply(environment, camera, shot, image);
+                self.weather.apply(&weather, camera, shot, image);
             }
             Ok(())
         });
-        let end = clock::now();
-        drop(span);
         for (slot, image) in tick.slots.iter_mut().filter(|slot| slot.fresh).zip(images) {
             std::mem::swap(image, &mut slot.image);
-            (slot.render_start, slot.render_end) = (start, end);
+            slot.render_start = start;
+            if result.is_ok() {
+                take_image(&mut self.imaging, known, slot);
+            }
         }
+        let end = clock::now();
+        drop(span);
+        tick.slots.iter_mut().filter(|slot| slot.fresh).for_each(|slot| slot.render_end = end);
         result.inspect(|()| rendering.durations.add(start, end))
     }
 
@@ -273,6 +283,23 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             warn!("tick {} is not rendered: {error}; further errors are not logged", self.seq);
         }
     }
+}
+
+/// Turns a rendered image into the one that its camera takes.
+fn take_image(effects: &mut [CameraEffects], known: &NewestPoses, slot: &mut RenderedImage) {
+    let RenderedImage { vehicle, camera, seq, .. } = *slot;
+    let (Some(set), Some(newest), Some(world_from_body)) =
+        (&slot.set, &known[vehicle], slot.world_from_body)
+    else {
+        return;
+    };
+    let (config, info) = (&set.configs[camera], &set.infos[camera]);
+    let v_world_mps = newest.motion.v_world_mps;
+    let exposure = Exposure { at: slot.shown, world_from_body, v_world_mps };
+    let camera = vehicle * MAX_CAMERAS + camera;
+    let seeds = [0, camera as u64, seq];
+    let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
+    effects[camera].apply(&input, &mut slot.image);
 }
 
 /// Which of a tick's cameras are a vehicle's, and the instant that they show.
