@@ -278,7 +278,7 @@ async function lab(browser) {
   await page.keyboard.press("Escape");
   await until(page, "announcement", /no runtime is connected/);
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
-  // Light and fog: a name at once, a sight with the button, and an invalid value is reported.
+  // Light and weather: a name at once, a sight with the button, and what has no field here is kept.
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night-fog");
   await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).name === "night-fog");
@@ -286,6 +286,14 @@ async function lab(browser) {
   await page.locator("#environment-sight").fill("30");
   await page.locator("dialog[open] button[type=submit]").click();
   await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).fog_visibility_m === 30);
+  await page.locator("#environment-choice").selectOption("smoke");
+  await page.waitForFunction(async () => (await (await fetch("/api/environment")).json()).name === "smoke");
+  await page.locator("#environment-sight").fill("25");
+  await page.locator("dialog[open] button[type=submit]").click();
+  await page.waitForFunction(async () => {
+    const { cloud, fog_visibility_m } = await (await fetch("/api/environment")).json();
+    return fog_visibility_m === 25 && cloud.visibility_m === 12;
+  });
   await shot(page, "environment");
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
   // Another scene: the page comes back by itself, still logged in.

@@ -146,10 +146,14 @@ fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
     assert_eq!(told.as_deref(), Some("light and weather are changed to: fog"));
     assert_eq!(environment()["fog_visibility_m"], 12.0);
     assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
+    assert_eq!(put(r#"{"rain": {"rate_mmph": 5}, "depth_loss": true}"#, None).0, 200);
+    assert_eq!(environment()["rain"]["rate_mmph"], 5.0);
     for (body, expected) in [
         (r#"{"name": "hail"}"#, "there are day, "),
         (r#"{"fog": 1}"#, "invalid type"),
         (r#"{"wind": 1}"#, "unknown field `wind`"),
+        (r#"{"rain": {"rate": 1}}"#, "unknown field `rate`"),
+        (r#"{"snow": {"rate_mmph": -1}}"#, "environment.snow.rate_mmph = -1"),
         (r#"{"light": [9, 1, 1]}"#, "environment.light = 9"),
         ("{", "EOF"),
     ] {

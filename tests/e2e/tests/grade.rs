@@ -574,11 +574,37 @@ fn a_plugin_that_fails_is_graded_and_explained() {
 }
 
 #[test]
+fn weather_is_flown_the_same_again_and_what_is_drawn_is_written_down() {
+    let rig = Rig::new();
+    let flown = |jobs| {
+        let variants = "--variants=night-rain,random:1";
+        let forest = ["avoid", "--project=forest", "--seeds=1", "--image-rate=15", "--json"];
+        rig.grade(&[&forest[..], &[variants, jobs]].concat())
+    };
+    let one = flown("--jobs=1");
+    assert_eq!(one, flown("--jobs=2"), "bits do not depend on what flies beside it");
+    let variants = one["by_variant"].as_array().unwrap();
+    let names: Vec<_> = variants.iter().map(|variant| &variant["variant"]).collect();
+    assert_eq!(names, ["night-rain", "random-01"]);
+    for variant in variants {
+        let Value::Object(score) = &variant["summary"]["score"] else { panic!("{variant}") };
+        assert!(score["low"].as_f64() <= score["value"].as_f64(), "{variant}");
+    }
+    let drawn = one["subject"]["environments"].as_object().unwrap();
+    assert_eq!(drawn.keys().collect::<Vec<_>>(), ["random-01"]);
+    assert_eq!(drawn["random-01"]["light"].as_array().unwrap().len(), 3);
+    let runs = one["runs"].as_array().unwrap();
+    assert_ne!(runs[0]["scene_sha256"], runs[1]["scene_sha256"]);
+    assert_eq!(runs[0]["rules_sha256"], runs[1]["rules_sha256"]);
+}
+
+#[test]
 fn invalid_arguments_are_refused_before_any_flight() {
     let rig = Rig::new();
     rig.refused(&["avoid", "--project=p9"], "p2, p3");
     rig.refused(&["avoid", "--variants=noon"], "noon");
     rig.refused(&["avoid", "--variants=day,day"], "twice");
+    rig.refused(&["avoid", "--variants=random:0"], "give random:1 to random:40");
     rig.refused(&["avoid", "--shard=3/2"], "is no part");
     rig.refused(&["avoid", "--image-rate=0"], "1 to 200 Hz");
     rig.refused(&["./gone.py"], "there is no plugin");
