@@ -15,7 +15,7 @@ use core::str::FromStr;
 
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, RulesConfig, SensorConfig};
+use vizflyt_arena::config::{CameraConfig, RulesConfig, SensorConfig, StageConfig};
 use vizflyt_protocol::messages::{Limits, SetpointKinds};
 
 use crate::draw::DrawBounds;
@@ -32,7 +32,7 @@ macro_rules! projects {
         const FILES: &[&str] = &[$(include_str!(concat!("../projects/", $name, ".toml"))),*];
     };
 }
-projects!("p2" "p3" "p4" "p5" "forest");
+projects!("p2" "p3" "p4" "p5" "forest" "square" "spiral" "lemniscate");
 
 /// One project of the course.
 #[derive(Clone, Debug, PartialEq)]
@@ -103,6 +103,9 @@ struct ProjectFile {
     ground_truth: bool,
     time_limit_s: f64,
     limits: Limits,
+    /// Gates where nothing stands, after those of what does.
+    #[serde(default)]
+    stages: Vec<StageConfig>,
     #[serde(default)]
     rules: RulesConfig,
     #[serde(default)]
@@ -236,6 +239,7 @@ impl CourseProject {
             sensors: suite.sensors.clone(),
             environment: variant.environment(),
             goal: arena.goal.filter(|_| plan.finish == Finish::Goal),
+            stages: arena.stages.iter().chain(&plan.stages).cloned().collect(),
             ..arena.clone()
         };
         generated.map_is_known = plan.known_map;
@@ -245,6 +249,9 @@ impl CourseProject {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
+
+    use glam::DVec3;
     use vizflyt_protocol::messages::SetpointKind;
 
     use super::*;
@@ -330,7 +337,66 @@ mod tests {
         ];
         let windows = (windows > 0).then(|| format!("{windows} windows"));
         let named = named.into_iter().filter(|(there, _)| *there);
-        windows.into_iter().chain(named.map(|(_, name)| name.to_owned())).collect()
+        let mut parts: Vec<_> =
+            windows.into_iter().chain(named.map(|(_, name)| name.to_owned())).collect();
+        if parts.is_empty() {
+            parts.push("the empty net".to_owned());
+        }
+        parts
+    }
+
+    /// The paths of the odometry's projects from take-off, each over 0 to 1: what their tasks say. [m]
+    fn path_m(name: &str, s: f64) -> DVec3 {
+        match name {
+            "square" => {
+                let corners =
+                    [(0.0, 0.0), (0.0, -1.4), (2.8, -1.4), (2.8, 1.4), (0.0, 1.4), (0.0, 0.0)];
+                let corners = corners.map(|(x, y)| DVec3::new(x, y, 0.0));
+                let mut left_m = s * 11.2;
+                for side in corners.windows(2) {
+                    let length_m = side[0].distance(side[1]);
+                    if left_m <= length_m {
+                        return side[0].lerp(side[1], left_m / length_m);
+                    }
+                    left_m -= length_m;
+                }
+                corners[5]
+            }
+            "spiral" => {
+                let (sin, cos) = (4.0 * PI * s).sin_cos();
+                let r_m = 1.5 - 0.9 * s;
+                DVec3::new(1.5 - r_m * cos, -r_m * sin, 0.8 * s)
+            }
+            "lemniscate" => {
+                let (sin, cos) = (2.0 * PI * s).sin_cos();
+                let size_m = 2.5 / (1.0 + sin * sin);
+                DVec3::new(2.5 - size_m * cos, size_m * sin * cos, 0.0)
+            }
+            _ => panic!("no path of {name}"),
+        }
+    }
+
+    #[test]
+    fn the_gates_of_the_odometry_lie_on_its_paths_in_order() {
+        for name in ["square", "spiral", "lemniscate"] {
+            let arena =
+                CourseProject::named(name).unwrap().generate(3, Level::G, Variant::DAY).arena;
+            assert!(arena.stages.len() >= 8 && !arena.ground_truth, "{name}");
+            let from_m = arena.spawn.position_m + DVec3::Z * arena.takeoff_height_m;
+            let mut passed = 0;
+            for n in 0..100_000_u32 {
+                let (before_m, after_m) =
+                    (path_m(name, f64::from(n) * 1e-5), path_m(name, f64::from(n + 1) * 1e-5));
+                let Some(stage) = arena.stages.get(passed) else { break };
+                let to_m = stage.center_m - from_m;
+                if before_m.distance(to_m) < 2e-3 {
+                    let ahead = (after_m - before_m).with_z(0.0).normalize();
+                    assert!(ahead.dot(stage.normal.normalize()) > 0.999, "{name} {}", stage.name);
+                    passed += 1;
+                }
+            }
+            assert_eq!(passed, arena.stages.len(), "{name}: a gate is beside the path");
+        }
     }
 
     #[test]

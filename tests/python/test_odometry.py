@@ -1,0 +1,239 @@
+"""The visual odometries: their mathematics against closed forms, and flights by them."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vizflyt
+
+PLUGINS = Path(__file__).parents[2] / "jetson/plugins/python"
+sys.path.insert(0, str(PLUGINS))
+
+import inertial_odometry as inertial  # noqa: E402
+import odometry_flight as flight  # noqa: E402
+import rgbd_odometry as rgbd  # noqa: E402
+
+# The paper's bound on all trajectories. [m]
+BOUND_M = 0.12
+
+
+def rotations(count):
+    random = np.random.default_rng(3)
+    return [flight.exp_so3(random.uniform(-3.0, 3.0, 3)) for _ in range(count)]
+
+
+def test_rotations_are_those_of_the_package():
+    for rotation in [*rotations(50), np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0])]:
+        pose = vizflyt.Pose("odom", "body", [0, 0, 0], flight.quaternion_xyzw(rotation))
+        np.testing.assert_allclose(pose.rotation_matrix, rotation, atol=1e-12)
+    quarter = flight.exp_so3(np.array([0, 0, math.pi / 2]))
+    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(flight.exp_so3(np.full(3, 1e-12)), np.eye(3), atol=1e-11)
+
+
+def test_a_body_at_rest_is_levelled():
+    for rotation in rotations(20):
+        felt = rotation.T @ [0, 0, 9.8]
+        level = flight.level_from_body(felt)
+        np.testing.assert_allclose(level @ felt, [0, 0, 9.8], atol=1e-9)
+        np.testing.assert_allclose(level @ level.T, np.eye(3), atol=1e-12)
+        assert abs(level[1, 0]) < 1e-12 and np.linalg.det(level) > 0
+
+
+def test_the_imu_carries_a_circle_on():
+    # 1.5 m/s on a circle of 2 m, nose along the way: a turn of 0.75 rad/s, and v omega towards the middle.
+    v_mps, omega_radps, dt_s = 1.5, 0.75, 0.01
+    zero = np.zeros(3)
+    bias_g, bias_a = np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.2, -0.1])
+    motion = inertial.Motion(0.0, np.eye(3), np.array([v_mps, 0, 0]), zero, bias_g, bias_a)
+    accel = np.array([0, v_mps * omega_radps, 9.80665]) + bias_a
+    for _ in range(400):
+        motion = inertial.moved(motion, accel, np.array([0, 0, omega_radps]) + bias_g, dt_s)
+    angle = omega_radps * 4.0
+    radius_m = v_mps / omega_radps
+    np.testing.assert_allclose(motion.p_m, [radius_m * math.sin(angle), radius_m * (1 - math.cos(angle)), 0], atol=1e-4)
+    np.testing.assert_allclose(motion.v_mps, [v_mps * math.cos(angle), v_mps * math.sin(angle), 0], atol=1e-4)
+    np.testing.assert_allclose(motion.rotation, flight.exp_so3(np.array([0, 0, angle])), atol=1e-12)
+
+
+def test_errors_of_the_imu_go_on_as_motions_that_differ_do():
+    rotation = rotations(1)[0]
+    state = inertial.Motion(
+        0.0, rotation, np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), np.array([0.1, 0, 0.2]), np.array([0.3, 0.1, 0])
+    )
+    accel, gyro, dt_s = np.array([1.0, -2, 9]), np.array([0.5, -0.3, 0.8]), 0.01
+
+    def off_by(change):
+        return inertial.Motion(
+            0.0,
+            state.rotation @ flight.exp_so3(change[inertial.TURN]),
+            state.v_mps + change[inertial.V],
+            state.p_m + change[inertial.P],
+            state.gyro_bias + change[inertial.GYRO],
+            state.accel_bias + change[inertial.ACCEL],
+        )
+
+    after = inertial.moved(state, accel, gyro, dt_s)
+    by_error = inertial.transition(state, accel, gyro, dt_s)
+    for index in range(inertial.IMU_SIZE):
+        change = np.zeros(inertial.IMU_SIZE)
+        change[index] = 1e-6
+        other = inertial.moved(off_by(change), accel, gyro, dt_s)
+        turn = after.rotation.T @ other.rotation
+        turn = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
+        found = np.concatenate(
+            [turn, other.v_mps - after.v_mps, other.p_m - after.p_m, other.gyro_bias - after.gyro_bias,
+             other.accel_bias - after.accel_bias]
+        ) / 1e-6
+        np.testing.assert_allclose(by_error[:, index], found, atol=1e-4)
+
+
+def rays(count, views):
+    """Returns cameras that look along x from places along y, and true points before them."""
+    random = np.random.default_rng(5)
+    axes = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    axes = np.broadcast_to(axes, (count, views, 3, 3)).copy()
+    from_m = np.zeros((count, views, 3))
+    from_m[..., 1] = np.linspace(-0.5, 0.5, views)
+    places_m = np.column_stack([random.uniform(1, 6, count), random.uniform(-1, 1, (count, 2))])
+    in_cam_m = np.einsum("mnji,mnj->mni", axes, places_m[:, None] - from_m)
+    return axes, from_m, in_cam_m[..., :2] / in_cam_m[..., 2:], places_m
+
+
+def test_rays_meet_where_the_point_is():
+    axes, from_m, slopes, places_m = rays(40, 6)
+    seen = np.ones((40, 6), bool)
+    seen[:20, 3:] = False
+    slopes[:20, 3:] = np.nan_to_num(np.inf, posinf=7.0)
+    found_m, residual = inertial.triangulate(axes, from_m, slopes, seen)
+    np.testing.assert_allclose(found_m, places_m, atol=1e-7)
+    np.testing.assert_allclose(residual, 0, atol=1e-8)
+
+
+def test_parallel_rays_and_points_behind_have_no_place():
+    axes, from_m, slopes, _ = rays(2, 5)
+    slopes[0] = 0.1
+    slopes[1] *= -1
+    found_m, _ = inertial.triangulate(axes, from_m, slopes, np.ones((2, 5), bool))
+    assert np.isnan(found_m).all()
+
+
+def test_chi_square_is_that_of_tables():
+    for freedom, value in ((1, 3.841), (5, 11.070), (20, 31.410), (37, 52.192)):
+        assert inertial.chi_square(freedom) == pytest.approx(value, rel=0.03)
+
+
+def view(camera, body_from_cam, camera_m):
+    focal_px, center_px = np.array([160.0, 160.0]), np.array([159.5, 119.5])
+    return flight.View(camera, 0, np.zeros((240, 320), np.uint8), None, focal_px, center_px, body_from_cam, camera_m)
+
+
+AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+DOWN = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+
+
+@pytest.mark.parametrize("outliers", [0, 25])
+def test_the_pose_is_found_from_places(outliers):
+    random = np.random.default_rng(7)
+    rotation, p_m = flight.exp_so3(np.array([0.05, -0.1, 0.4])), np.array([1.0, -0.5, 1.2])
+    seen = []
+    for one in (view("front", AHEAD, np.array([0.06, 0, 0.02])), view("down", DOWN, np.array([0, 0, -0.03]))):
+        in_cam_m = np.column_stack([random.uniform(-1, 1, (60, 2)), np.ones(60)]) * random.uniform(1, 8, (60, 1))
+        places_m = (in_cam_m @ one.body_from_cam.T + one.camera_m) @ rotation.T + p_m
+        px = one.project(in_cam_m)
+        px[:outliers] += random.uniform(-20, 20, (outliers, 2))
+        depth_m = in_cam_m[:, 2].copy()
+        depth_m[::3] = 0
+        seen.append((one, px, places_m, depth_m))
+    guess, guess_m = rotation @ flight.exp_so3(np.array([0.02, -0.02, 0.03])), p_m + np.array([0.04, -0.05, 0.03])
+    found, found_m, offs = rgbd.solve_pose(guess, guess_m, seen)
+    # Gauss-Newton's prior of 5 cm pulls a little towards the guess.
+    np.testing.assert_allclose(found_m, p_m, atol=1e-3 if outliers == 0 else 1e-2)
+    np.testing.assert_allclose(found, rotation, atol=1e-3 if outliers == 0 else 1e-2)
+    if outliers:
+        assert (offs[0][:outliers] > rgbd.DROPPED).mean() > 0.8 and (offs[0][outliers:] < rgbd.DROPPED).all()
+
+
+def test_corners_are_followed_where_the_image_moves():
+    random = np.random.default_rng(1)
+    noise = random.integers(0, 255, (70, 90), dtype=np.uint8)
+    picture = flight.cv2.resize(noise, (360, 280), interpolation=flight.cv2.INTER_CUBIC)
+    tracks = flight.Tracks()
+    tracks.follow(picture[20:260, 20:340])
+    assert tracks.add() > 60
+    before = tracks.px.copy()
+    for shift in range(1, 7):
+        tracks.follow(picture[20:260, 20 + shift : 340 + shift])
+    moved = before[np.isin(np.arange(len(before)), tracks.ids)] - tracks.px
+    assert len(moved) > 50
+    np.testing.assert_allclose(moved, np.broadcast_to([6.0, 0.0], moved.shape), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "length_m"),
+    # A lemniscate's length is a Gamma(1/4)^2 / sqrt(2 pi).
+    [("square", 11.2), ("lemniscate", 2.5 * math.gamma(0.25) ** 2 / math.sqrt(2 * math.pi))],
+)
+def test_paths_are_as_long_as_their_formulas_say(name, length_m):
+    sides = np.linalg.norm(np.diff(flight.path_m(name), axis=0), axis=1)
+    assert sides.sum() == pytest.approx(length_m + flight.BEYOND_M, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["square", "spiral", "lemniscate"])
+def test_a_vehicle_that_lags_stays_near_the_path(name):
+    points_m = flight.path_m(name)
+    follower = flight.Follower(points_m)
+    p_m, v_mps, seconds = np.array([0.1, -0.1, 0.1]), np.zeros(3), 0.0
+    while not follower.is_over:
+        # A first-order lag of 0.25 s, as the autopilot's velocity loop has.
+        v_mps = v_mps + (follower.velocity(p_m, 1 / 30) - v_mps) / 30 / 0.25
+        p_m, seconds = p_m + v_mps / 30, seconds + 1 / 30
+        assert seconds < 40
+        if seconds > 3:
+            assert np.linalg.norm(points_m - p_m, axis=1).min() < 0.2
+    assert np.linalg.norm(p_m - points_m[-1]) < 0.15
+
+
+def test_a_project_without_a_path_is_named():
+    with pytest.raises(ValueError, match="the project 'p4' has no path"):
+        flight.path_m("p4")
+
+
+def test_a_folder_that_is_no_data_set_is_named(tmp_path):
+    with pytest.raises(ValueError, match="vizflyt export"):
+        list(flight.data_set(tmp_path, False))
+
+
+def run(*command):
+    done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("plugin", "project", "level"),
+    [("rgbd_odometry.py", "square", "ug"), ("inertial_odometry.py", "lemniscate", "g")],
+)
+def test_flies_by_its_own_odometry_within_the_bound(program, tmp_path, plugin, project, level):
+    """In lock-step, and again over the images that the flight's log was exported to."""
+    grade, data = tmp_path / "grade.json", tmp_path / "data"
+    report = tmp_path / "report"
+    run(
+        program, "grade", PLUGINS / plugin, f"--project={project}", f"--level={level}", "--seeds=1", "--first-seed=3",
+        f"--report={report}", "--log=full", f"--keys={tmp_path}", "-o", grade,
+    )
+    (flown,) = json.loads(grade.read_text())["document"]["runs"]
+    assert flown["outcome"] == "finished", flown
+    assert flown["odometry"]["poses"] > 300 and flown["odometry"]["ate_rmse_m"] < BOUND_M, flown
+    log = report / "logs/day-3.mcap"
+    run(program, "export", log, "--format=euroc", "-o", data)
+    estimate = tmp_path / "estimate.tum"
+    run(sys.executable, PLUGINS / plugin, "--dataset", data, "-o", estimate)
+    again = json.loads(run(program, "evaluate", log, estimate, "--align=yaw", "--json"))
+    # The same images and readings; only that they come one by one.
+    assert again["ate_rmse_m"] < BOUND_M, again
