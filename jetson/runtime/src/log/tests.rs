@@ -289,7 +289,14 @@ fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
         image.pieces = vec![vec![0; len]];
         let (at, head, images) = (HostTime::ZERO, vec![], vec![image]);
         let home = Arc::clone(&home);
-        Record::Observation(Box::new(ObservationRecord { at, seq: 1, head, images, home }))
+        Record::Observation(Box::new(ObservationRecord {
+            at,
+            seq: 1,
+            head,
+            images,
+            sensors: LoggedSensors::default(),
+            home,
+        }))
     };
     queue.push(observation(queue::MAX_IMAGE_BYTES - 10));
     queue.push(observation(11));
@@ -373,7 +380,14 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
         image.pieces = vec![vec![0; 79_000]];
         let head = vec![0; size_of::<ObservationHeader>()];
         let home = Arc::default();
-        let record = ObservationRecord { at, seq: tick, head, images: vec![image], home };
+        let record = ObservationRecord {
+            at,
+            seq: tick,
+            head,
+            images: vec![image],
+            sensors: LoggedSensors::default(),
+            home,
+        };
         writer.take(Record::Observation(Box::new(record))).unwrap();
         if tick % 60 == 59 {
             writer.check_health().unwrap();
@@ -477,7 +491,14 @@ fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     queue.push(Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: big });
     let images = vec![image(1, ColorMode::Jpeg444)];
     let (at, head) = (HostTime::ZERO, vec![]);
-    let record = ObservationRecord { at, seq: 1, head, images, home: Arc::clone(&home) };
+    let record = ObservationRecord {
+        at,
+        seq: 1,
+        head,
+        images,
+        sensors: LoggedSensors::default(),
+        home: Arc::clone(&home),
+    };
     queue.push(Record::Observation(Box::new(record)));
     queue.end();
     LogWriter::new(sinks, Arc::clone(&queue), Box::new(|| None)).run(&records);
@@ -500,7 +521,14 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     assert!(trouble.contains("no longer logged: only 1 MB"), "{trouble}");
     let home = Arc::default();
     let images = vec![image(1, ColorMode::Jpeg444)];
-    let record = ObservationRecord { at: HostTime::ZERO, seq: 1, head: vec![], images, home };
+    let record = ObservationRecord {
+        at: HostTime::ZERO,
+        seq: 1,
+        head: vec![],
+        images,
+        sensors: LoggedSensors::default(),
+        home,
+    };
     queue.push(Record::Observation(Box::new(record)));
     queue.push(Record::Json {
         channel: Channel::Requested,
