@@ -1,6 +1,6 @@
 //! Rays through a tree of splats: boxes eight at a time for a bundle of rays, then splats eight at a time for each, nearest first.
 //!
-//! Budget: some 0.5 us a ray, bound by the boxes and splats that it touches.
+//! Budget: some 1.2 us a ray and thread in a forest of 125 k splats, for the boxes and splats that it touches: some 30 and 17 leaves.
 //!
 //! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection of the Gaussian onto the plane
 //! across the ray, which is its greatest value along the ray. A beam is no line: its footprint, a Gaussian that grows with
