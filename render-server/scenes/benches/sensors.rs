@@ -62,12 +62,12 @@ fn main() {
                 }
                 Preset::Range(model) => {
                     let finder = RangeFinder::new(model).unwrap();
-                    let mut measure = |seq| finder.measure(&packed, &motion, 1, seq).unwrap();
+                    let measure = |seq| finder.measure(&packed, &motion, 1, seq).unwrap();
                     report(name, &mut |seq| usize::from(measure(seq).range_m > 0.0));
                 }
                 Preset::Sonar(model) => {
                     let sonar = Sonar::new(model).unwrap();
-                    let mut measure = |seq| sonar.measure(&packed, &motion, 1, seq).unwrap();
+                    let measure = |seq| sonar.measure(&packed, &motion, 1, seq).unwrap();
                     report(name, &mut |seq| usize::from(measure(seq).range_m > 0.0));
                 }
                 Preset::Radar(model) => {

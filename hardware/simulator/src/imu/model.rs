@@ -34,7 +34,7 @@ pub struct ImuModel {
     /// Range of the gyro. [rad/s]
     pub gyro_range_radps: f64,
     /// White noise per sample at 400 Hz where it is stated so, of gyro [rad/s] and accelerometer [m/s^2].
-    pub(super) stated_sigma: Option<[f64; 2]>,
+    pub(crate) stated_sigma: Option<[f64; 2]>,
 }
 
 /// Every model that has a name; the first flies where none is asked for.

@@ -247,7 +247,7 @@ mod tests {
     ) -> MadeReading {
         let world_from_body = Pose::new(DVec3::new(x_m, 0.0, 1.0), DQuat::IDENTITY);
         let motion = VehicleMotion::at_rest(START, world_from_body);
-        let exposure = Exposure { at: START, world_from_body };
+        let exposure = Exposure { v_world_mps: DVec3::ZERO, at: START, world_from_body };
         let mut place = |_: ServerTime, placements: &mut Vec<Placement>| {
             placements.push(wall_x_m.map(|x_m| Pose::new(DVec3::X * x_m, DQuat::IDENTITY)));
         };
