@@ -40,8 +40,8 @@ GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])
 # White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame, read 100 times a second.
 # [m/s^2/sqrt(Hz)], [rad/s/sqrt(Hz)], [m/s^3/sqrt(Hz)], [rad/s^2/sqrt(Hz)]
 ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.03, 0.0015, 1e-3, 1e-4
-# What is known where it stands: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2], that of the accelerometer upwards.
-TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, UP_SIGMA = 0.005, 0.02, 0.001, 0.05, 0.02
+# What is known where it stands: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2]; and the mean force felt. [m/s^2]
+TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.02, 0.001, 0.05, 0.01
 # Heading and place are the frame's own, by definition.
 OWN_SIGMA = 1e-4
 # It has left the ground when a tenth of a second's mean force or turn differs by so much. [m/s^2], [rad/s]
@@ -84,6 +84,11 @@ class Clone(NamedTuple):
     key: int
     rotation: F64
     p_m: F64
+    first_rotation: F64
+    """As it was first estimated: there all measurements are linearised, or the filter believes to know its heading (G.
+    Huang, A. Mourikis and S. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators",
+    IJRR 2010)."""
+    first_m: F64
 
 
 class Sight(NamedTuple):
@@ -231,16 +236,19 @@ class InertialOdometry:
         before = [one for one in readings if one.at_s < readings[-1].at_s - BEFORE_LIFT_S]
         accel_mps2 = np.mean([one.accel_mps2 for one in before], axis=0)
         gyro_bias = np.mean([one.gyro_radps for one in before], axis=0)
-        felt_mps2 = float(np.linalg.norm(accel_mps2))
-        # Up the bias is known, as gravity is; to the sides it cannot be told from tilt.
-        accel_bias = accel_mps2 * (1 + GRAVITY_MPS2[2] / felt_mps2)
-        zero = np.zeros(3)
-        self._motion = Motion(before[-1].at_s, level_from_body(accel_mps2), zero, zero, gyro_bias, accel_bias)
+        # Along the force felt the bias is known, as gravity is; across it, it cannot be told from tilt.
+        accel_bias = accel_mps2 * (1 + GRAVITY_MPS2[2] / float(np.linalg.norm(accel_mps2)))
+        level, zero = level_from_body(accel_mps2), np.zeros(3)
+        self._motion = Motion(before[-1].at_s, level, zero, zero, gyro_bias, accel_bias)
         sigmas = [TILT_SIGMA, TILT_SIGMA, OWN_SIGMA]
-        for sigma in (V_SIGMA, OWN_SIGMA, GYRO_SIGMA):
+        for sigma in (V_SIGMA, OWN_SIGMA, GYRO_SIGMA, ACCEL_SIGMA):
             sigmas += [sigma] * 3
-        sigmas += [ACCEL_SIGMA, ACCEL_SIGMA, UP_SIGMA]
-        self._covariance = np.diag(np.square(sigmas))
+        covariance = np.diag(np.square(sigmas))
+        # What the standing accelerometer felt binds the two together.
+        by_error = np.zeros((3, IMU_SIZE))
+        by_error[:, TURN], by_error[:, ACCEL] = skew(level.T @ -GRAVITY_MPS2), np.eye(3)
+        expected = by_error @ covariance @ by_error.T + np.eye(3) * STANDING_SIGMA**2
+        self._covariance = covariance - covariance @ by_error.T @ np.linalg.solve(expected, by_error @ covariance)
         self._readings = readings[len(before) - 1 :]
         return True
 
@@ -305,7 +313,8 @@ class InertialOdometry:
     def _clone(self) -> None:
         """Remembers the present pose, and that the image shows it as it was predicted."""
         self._keys += 1
-        self._clones.append(Clone(self._keys, self._motion.rotation, self._motion.p_m))
+        rotation, p_m = self._motion.rotation, self._motion.p_m
+        self._clones.append(Clone(self._keys, rotation, p_m, rotation, p_m))
         rows = np.concatenate([self._covariance[TURN], self._covariance[P]])
         corner = np.concatenate([rows[:, TURN], rows[:, P]], axis=1)
         corner = corner + np.diag([PREDICTED_RAD**2] * 3 + [PREDICTED_M**2] * 3)
@@ -333,41 +342,30 @@ class InertialOdometry:
             slopes[row, : len(sights)] = [sight.slope for sight in sights]
         views = [self._views[camera] for camera, _ in names]
         body_from_cam = np.array([view.body_from_cam for view in views])[:, None]
-        camera_m = np.array([view.camera_m for view in views])[:, None]
+        camera_m = np.array([view.camera_m for view in views])[:, None, :, None]
         sigma = SIGMA_PX / np.array([view.focal_px.mean() for view in views])
-        rotations = np.array([one.rotation for one in self._clones])[clone]
-        bodies_m = np.array([one.p_m for one in self._clones])[clone]
-        axes = rotations @ body_from_cam
-        from_m = bodies_m + np.einsum("mnij,mnj->mni", rotations, np.broadcast_to(camera_m, bodies_m.shape))
+
+        def cameras(rotations: F64, bodies_m: F64) -> tuple[F64, F64]:
+            return rotations[clone] @ body_from_cam, bodies_m[clone] + (rotations[clone] @ camera_m)[..., 0]
+
+        axes, from_m = cameras(
+            np.array([one.rotation for one in self._clones]), np.array([one.p_m for one in self._clones])
+        )
         places_m, residual = triangulate(axes, from_m, slopes, seen)
         off = np.sqrt((residual**2).sum(axis=(1, 2)) / (2 * seen.sum(axis=1) - 3)) / sigma
         far = np.linalg.norm(places_m - from_m[:, 0], axis=1) > FARTHEST_M
-        good = np.isfinite(places_m).all(axis=1) & (off < DROPPED) & ~far
-        if not good.any():
-            return
+        good = np.flatnonzero(np.isfinite(places_m).all(axis=1) & (off < DROPPED) & ~far)
         weight = np.minimum(1.0, HUBER / np.maximum(off, 1e-9)) / sigma**2
-        arrays = (places_m, axes, from_m, rotations, bodies_m, slopes, seen, clone, weight)
-        self._correct(*(array[good] for array in arrays))
-
-    def _correct(
-        self,
-        places_m: F64,
-        axes: F64,
-        from_m: F64,
-        rotations: F64,
-        bodies_m: F64,
-        slopes: F64,
-        seen: npt.NDArray[np.bool_],
-        clone: npt.NDArray[np.int_],
-        weight: F64,
-    ) -> None:
-        """Sums up what the corners say of the clones, each without its own place, and corrects the state by it."""
-        residual, by_place = _look(axes, from_m, slopes, seen, places_m)
-        in_body_m = np.einsum("mnji,mnj->mni", rotations, places_m[:, None] - bodies_m)
-        by_turn = by_place @ rotations @ skew(in_body_m)
+        # How residuals change with turn and place of the body, and with the corner's place.
+        rotations = np.array([one.first_rotation for one in self._clones])
+        bodies_m = np.array([one.first_m for one in self._clones])
+        axes, from_m = cameras(rotations, bodies_m)
+        _, by_place = _look(axes, from_m, slopes, seen, places_m)
+        in_body_m = np.einsum("mnji,mnj->mni", rotations[clone], places_m[:, None] - bodies_m[clone])
+        by_turn = by_place @ rotations[clone] @ skew(in_body_m)
         size = len(self._covariance)
         information, vector = np.zeros((size, size)), np.zeros(size)
-        for n in range(len(places_m)):
+        for n in good:
             count = int(seen[n].sum())
             slope = np.zeros((2 * count, size))
             for k in range(count):
@@ -377,19 +375,17 @@ class InertialOdometry:
             own = by_place[n, :count].reshape(-1, 3)
             # What is left of the rows when the corner's own place is free.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
-            rows, off = left @ slope, left @ -residual[n, :count].reshape(-1)
+            rows, lack = left @ slope, left @ -residual[n, :count].reshape(-1)
             # What the state makes most unlikely is not of a place that stands still (Mahalanobis' distance).
             expected = rows @ self._covariance @ rows.T + np.eye(len(rows)) / weight[n]
-            if off @ np.linalg.solve(expected, off) > chi_square(len(rows)):
+            if lack @ np.linalg.solve(expected, lack) > chi_square(len(rows)):
                 continue
             information += weight[n] * rows.T @ rows
-            vector += weight[n] * rows.T @ off
+            vector += weight[n] * rows.T @ lack
         # The Kalman filter's update in its information form: the measurements are many, the state is small.
         covariance = self._covariance @ np.linalg.inv(np.eye(size) + information @ self._covariance)
         self._covariance = (covariance + covariance.T) / 2
-        self._add(self._covariance @ vector)
-
-    def _add(self, change: F64) -> None:
+        change = self._covariance @ vector
         motion = self._motion
         self._motion = motion._replace(
             rotation=motion.rotation @ exp_so3(change[TURN]),
@@ -398,11 +394,10 @@ class InertialOdometry:
             gyro_bias=motion.gyro_bias + change[GYRO],
             accel_bias=motion.accel_bias + change[ACCEL],
         )
-        clones = []
-        for n, clone in enumerate(self._clones):
-            part = change[IMU_SIZE + CLONE_SIZE * n :][:CLONE_SIZE]
-            clones.append(Clone(clone.key, clone.rotation @ exp_so3(part[:3]), clone.p_m + part[3:]))
-        self._clones = clones
+        for index, old in enumerate(self._clones):
+            part = change[IMU_SIZE + CLONE_SIZE * index :][:CLONE_SIZE]
+            rotation, p_m = old.rotation @ exp_so3(part[:3]), old.p_m + part[3:]
+            self._clones[index] = old._replace(rotation=rotation, p_m=p_m)
 
 
 class Inertial(OdometryPlugin):

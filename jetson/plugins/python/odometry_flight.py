@@ -35,6 +35,8 @@ SPEED_MPS = 0.8
 RAMP_MPS2 = 0.8
 # Velocity towards the path per distance from it. [1/s]
 TOWARDS_PER_S = 1.2
+# What is asked for is flown so much later. [s]
+LAG_S = 0.3
 # The path's reference waits for a vehicle that is farther from it. [m]
 WAIT_M = 0.4
 # Beyond its end the path goes straight on, so that the last gate is passed. [m]
@@ -285,7 +287,9 @@ class Follower:
         else:
             self._speed_mps = max(self._speed_mps - RAMP_MPS2 * dt_s, 0.0)
         next_m = self._reference(self._at_m)
-        before_m, after_m = self._reference(self._at_m - 0.02), self._reference(self._at_m + 0.02)
+        # The velocity that is asked for now is flown a little later: farther along the path.
+        later_m = self._at_m + self._speed_mps * LAG_S
+        before_m, after_m = self._reference(later_m - 0.02), self._reference(later_m + 0.02)
         ahead = (after_m - before_m) / max(float(np.linalg.norm(after_m - before_m)), 1e-9)
         return ahead * (0.0 if self.is_over else self._speed_mps) + TOWARDS_PER_S * (next_m - p_m)
 
