@@ -58,25 +58,25 @@ pub(super) struct ImagingArgs {
 const KINDS: &[(&str, &str, Shown)] = &[
     ("perfect", "{}", Shown::Color),
     (
-        "noise: ov5647 bayer, 1 ms in 30 lx",
-        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 30, "exposure_ms": 1, "gain": 15, "filter": "bayer",
+        "noise: ov5647 bayer, 5 ms in 200 lx",
+        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 200, "exposure_ms": 5, "gain": 40, "filter": "bayer",
             "readout_ms": 0}"#,
         Shown::Color,
     ),
     (
         "the same, denoised",
-        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 30, "exposure_ms": 1, "gain": 15, "filter": "bayer",
+        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 200, "exposure_ms": 5, "gain": 40, "filter": "bayer",
             "readout_ms": 0, "denoise": true}"#,
         Shown::Color,
     ),
     (
         "blur: imx296, 60 ms",
-        r#"{"sensor": "imx296", "exposure_ms": 60, "illuminance_lx": 30}"#,
+        r#"{"sensor": "imx296", "exposure_ms": 60, "illuminance_lx": 400}"#,
         Shown::Color,
     ),
     (
         "rolling shutter: imx477, 90 ms",
-        r#"{"sensor": "imx477", "readout_ms": 90, "max_exposure_ms": 1}"#,
+        r#"{"sensor": "imx477", "readout_ms": 90, "max_exposure_ms": 1, "illuminance_lx": 5000}"#,
         Shown::Color,
     ),
     ("grey: ov9281", r#"{"sensor": "ov9281"}"#, Shown::Color),

@@ -80,7 +80,7 @@ fn exposure_gain_and_vignette_multiply() {
     let middle = 24 * 64 + 32;
     let at = |shutter_s: f64, gain: f64, vignette: f64| {
         let exposure = ExposureControl::Fixed(Exposure { shutter_s, gain });
-        let sensor = Sensor { exposure, vignette, ..IDEAL };
+        let sensor = Sensor { vignette, exposure, ..IDEAL };
         take(&model(sensor), &camera, &still(&camera), image.clone())
     };
     for (shutter_s, gain) in [(0.01, 1.0), (0.005, 1.0), (0.005, 3.0), (0.02, 2.0)] {
@@ -124,7 +124,7 @@ fn blur_is_as_long_as_the_turn_during_the_exposure() {
         let exposure = ExposureControl::Fixed(Exposure { shutter_s, gain: 1.0 });
         let electrons_per_s = IDEAL.full_well_e / shutter_s;
         let taken = take(
-            &model(Sensor { exposure, electrons_per_s, ..IDEAL }),
+            &model(Sensor { electrons_per_s, exposure, ..IDEAL }),
             &camera,
             &path,
             stripe_edge(&k, &camera.world_from_cam),

