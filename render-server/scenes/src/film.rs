@@ -14,7 +14,6 @@
 //! edges in that time is filled from beside it. `film/tests.rs` holds this against every row rendered at each of its instants.
 
 mod develop;
-mod light;
 mod meter;
 pub mod phone;
 
@@ -22,6 +21,8 @@ use core::ops::Range;
 
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+use vizflyt_splat::imaging::shutter::{Pixel, pixels};
+use vizflyt_splat::imaging::tone::Tone;
 use vizflyt_splat::{Camera, RgbdImage};
 
 pub use meter::{Exposure, Meter};
@@ -35,8 +36,8 @@ pub type Track<'a> = dyn Fn(f64) -> Pose<World, Cam> + Sync + 'a;
 pub struct Film {
     phone: Phone,
     bands: Vec<Band>,
-    pixels: Vec<develop::Pixel>,
-    tone: light::Tone,
+    pixels: Vec<Pixel>,
+    tone: Tone,
     noise: develop::Noise,
 }
 
@@ -72,8 +73,8 @@ impl Film {
     /// Prepares for a phone.
     pub fn new(phone: Phone) -> Self {
         let bands = bands(&phone);
-        let pixels = develop::pixels(&phone.intrinsics);
-        Self { phone, bands, pixels, tone: light::Tone::new(), noise: develop::Noise::new() }
+        let pixels = pixels(&phone.intrinsics);
+        Self { phone, bands, pixels, tone: Tone::default(), noise: develop::Noise::new() }
     }
 
     /// Returns the phone.

@@ -45,6 +45,7 @@ pub mod format;
 pub mod gpu;
 pub mod harmonics;
 mod image;
+pub mod imaging;
 pub mod limits;
 mod rasterizer;
 mod reference;

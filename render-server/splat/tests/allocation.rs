@@ -1,9 +1,15 @@
 //! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
-//! cameras, their lenses, and the objects that come and go.
+//! cameras, their lenses, and the objects that come and go. Nor do the sensors behind its images.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
+use vizflyt_splat::imaging::exposure::ExposureControl;
+use vizflyt_splat::imaging::mosaic::ColorFilter;
+use vizflyt_splat::imaging::noise::NoiseKey;
+use vizflyt_splat::imaging::stereo::Stereo;
+use vizflyt_splat::imaging::tof::Tof;
+use vizflyt_splat::imaging::{CameraModel, DepthModel, Imager, Sensor, Shot};
 use vizflyt_splat::{
     Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,
 };
@@ -88,4 +94,77 @@ fn nothing_is_allocated_once_every_view_was_seen() {
         assert!(counts[0] > 0, "the counter counts");
         assert_eq!(counts[1..], [0, 0, 0], "{}", renderer.name());
     }
+    // And what cameras make of the images: in this test, as the counter is of the whole process.
+    let mut renderer = CpuRenderer::new(&splats);
+    let camera = calls[1].1[0];
+    let mut clean = [RgbdImage::default()];
+    renderer.render(&[], &[camera], &mut clean).expect("a valid call");
+    for model in models() {
+        let (mut imager, mut image) = (Imager::default(), clean[0].clone());
+        let counts = pool.install(|| {
+            [(); 3].map(|()| {
+                let before = CountingAllocator::allocations();
+                for seq in 0..TURNS {
+                    image.rgb.copy_from_slice(&clean[0].rgb);
+                    image.alpha.copy_from_slice(&clean[0].alpha);
+                    image.depth_median_m.copy_from_slice(&clean[0].depth_median_m);
+                    let path = |at_s: f64| {
+                        let moved = Pose::new(DVec3::X * at_s, DQuat::from_rotation_y(at_s));
+                        camera.world_from_cam * moved
+                    };
+                    let key = NoiseKey::new(1, 2, u64::from(seq));
+                    let shot =
+                        Shot { camera: &camera, path: &path, at_s: f64::from(seq) / 30.0, key };
+                    imager.apply(&model, &shot, &mut image);
+                }
+                CountingAllocator::allocations() - before
+            })
+        });
+        assert_eq!(counts[1..], [0, 0], "{model:?}");
+    }
+}
+
+fn models() -> [CameraModel; 2] {
+    let sensor = |filter| Sensor {
+        full_well_e: 4000.0,
+        read_noise_e: 3.0,
+        electrons_per_s: 40_000.0,
+        bits: 10,
+        filter,
+        denoise: true,
+        noise: true,
+        vignette: 0.3,
+        readout_s: 0.02,
+        exposure: ExposureControl::Auto {
+            aim: 0.18,
+            lag_s: 0.3,
+            least_shutter_s: 1e-5,
+            most_shutter_s: 0.03,
+            most_gain: 10.0,
+        },
+    };
+    let stereo = Stereo {
+        baseline_m: 0.05,
+        focal_px: 446.8,
+        subpixel_px: 0.08,
+        most_disparity_px: 126.0,
+        most_m: 10.0,
+        fattening_px: 3.0,
+        least_texture: 0.02,
+    };
+    let tof = Tof {
+        modulation_hz: 20e6,
+        unambiguous_m: 7.5,
+        least_m: 0.1,
+        most_m: 7.5,
+        signal_e_1m: 40_000.0,
+        background_e: 0.0,
+        contrast: 0.8,
+        least_signal_e: 100.0,
+        multipath: true,
+    };
+    [
+        CameraModel { sensor: Some(sensor(ColorFilter::Bayer)), depth: DepthModel::Stereo(stereo) },
+        CameraModel { sensor: Some(sensor(ColorFilter::Rgb)), depth: DepthModel::Tof(tof) },
+    ]
 }

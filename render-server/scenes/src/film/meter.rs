@@ -1,5 +1,7 @@
 //! The automatic exposure: how bright the image is to be, by which shutter and ISO, and with which lag.
 
+use vizflyt_splat::imaging::exposure::Follow;
+
 use super::phone::LEAST_ISO;
 use super::{Band, BandImage, Phone};
 
@@ -17,8 +19,7 @@ pub struct Exposure {
 /// Follows the light.
 #[derive(Clone, Debug, Default)]
 pub struct Meter {
-    /// Natural logarithm of the gain; absent before the first image.
-    log_gain: Option<f64>,
+    gain: Follow,
 }
 
 impl Meter {
@@ -30,13 +31,8 @@ impl Meter {
         images: &[BandImage],
         dt_s: f64,
     ) -> Exposure {
-        let wanted = libm::log((AIM / mean_light(bands, images).max(1e-6)).clamp(LEAST, MOST));
-        let log_gain = match self.log_gain {
-            None => wanted,
-            Some(last) => last + (wanted - last) * (1.0 - libm::exp(-dt_s.max(0.0) / LAG_S)),
-        };
-        self.log_gain = Some(log_gain);
-        Exposure::of(phone, libm::exp(log_gain))
+        let wanted = AIM / mean_light(bands, images).max(1e-6);
+        Exposure::of(phone, self.gain.next(wanted, [LEAST, MOST], LAG_S, dt_s))
     }
 }
 

@@ -2,15 +2,15 @@
 
 /// Both directions.
 #[derive(Debug)]
-pub(super) struct Tone {
+pub struct Tone {
     /// Linear light of `n / LINEAR` of a display colour.
     linear: Vec<f32>,
     /// Display colour of `n / SHOWN` of linear light.
     shown: Vec<u8>,
 }
 
-impl Tone {
-    pub(super) fn new() -> Self {
+impl Default for Tone {
+    fn default() -> Self {
         let linear = (0..=LINEAR + 1).map(|n| linear_from_display(n as f64 / LINEAR as f64) as f32);
         let shown = (0..=SHOWN).map(|n| {
             let shown = display_from_linear(n as f64 / SHOWN as f64);
@@ -18,10 +18,13 @@ impl Tone {
         });
         Self { linear: linear.collect(), shown: shown.collect() }
     }
+}
 
+impl Tone {
     /// Returns the linear light of a display colour; what is outside 0 to 1 is cut.
     #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
-    pub(super) fn linear(&self, shown: f32) -> f32 {
+    #[inline]
+    pub fn linear(&self, shown: f32) -> f32 {
         let at = shown.max(0.0).min(1.0) * LINEAR as f32;
         let n = at as usize;
         let (low, high) = (self.linear[n], self.linear[n + 1]);
@@ -30,9 +33,16 @@ impl Tone {
 
     /// Returns the display colour of linear light; what is outside 0 to 1 is cut, as a full sensor does.
     #[expect(clippy::manual_clamp, reason = "NaN becomes 0")]
-    pub(super) fn shown(&self, linear: f32) -> u8 {
+    #[inline]
+    pub fn shown(&self, linear: f32) -> u8 {
         self.shown[(linear.max(0.0).min(1.0) * SHOWN as f32 + 0.5) as usize]
     }
+}
+
+/// Returns the luminance of linear red, green, blue (ITU-R BT.709).
+#[inline]
+pub fn luminance(red: f32, green: f32, blue: f32) -> f32 {
+    0.2126 * red + 0.7152 * green + 0.0722 * blue
 }
 
 fn linear_from_display(v: f64) -> f64 {
@@ -53,7 +63,7 @@ mod tests {
 
     #[test]
     fn display_colours_come_back() {
-        let tone = Tone::new();
+        let tone = Tone::default();
         for byte in 0..=255u8 {
             assert_eq!(tone.shown(tone.linear(f32::from(byte) / 255.0)), byte);
         }

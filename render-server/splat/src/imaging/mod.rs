@@ -1,0 +1,320 @@
+//! Cameras as they are: what a sensor makes of a perfect rendered image, in place.
+//!
+//! ```text
+//! RgbdImage, perfect --> Imager::apply --> the same image as the camera gives it
+//!   colour  display colours -> linear light [`tone`] -> exposure, automatic with its lag [`exposure`] -> each row's path while
+//!           it is exposed [`shutter`] -> electrons, noise, numbers [`noise`] -> mosaic, denoising [`mosaic`] -> display colours
+//!   depth   as a stereo pair [`stereo`] or a time-of-flight camera [`tof`] measures it
+//! ```
+//! Pure: a function of (image, model, path, key, time since the last image) and of the exposure's own state. The same bits for
+//! any number of threads. Callers are the server's render thread and graded flights, once an image; buffers are kept, and nothing
+//! is allocated once they have grown. Bounded by arithmetic: some 30 ns a pixel and core with everything on.
+//!
+//! An event camera ([`events`]) is another sensor: it takes a sequence of images.
+
+pub mod events;
+pub mod exposure;
+pub mod mosaic;
+pub mod noise;
+pub mod shutter;
+pub mod stereo;
+pub mod tof;
+pub mod tone;
+
+use std::sync::LazyLock;
+
+use glam::Vec2;
+use rayon::prelude::*;
+use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
+
+use self::exposure::{Exposure, ExposureControl, Follow, vignetting};
+use self::mosaic::{ColorFilter, bayer_color, demosaic_row, denoise_row};
+use self::noise::{NoiseKey, Normals, Readout};
+use self::shutter::{Moved, Pixel, Seen};
+use self::stereo::Stereo;
+use self::tof::Tof;
+use self::tone::{Tone, luminance};
+use crate::{Camera, RgbdImage};
+
+/// How a camera differs from a perfect one.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct CameraModel {
+    /// Its colour images; `None` is a perfect one.
+    pub sensor: Option<Sensor>,
+    /// Its depth.
+    pub depth: DepthModel,
+}
+
+/// How depth is measured.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum DepthModel {
+    /// As it is.
+    #[default]
+    Perfect,
+    /// By a stereo pair.
+    Stereo(Stereo),
+    /// By the time that light takes.
+    Tof(Tof),
+}
+
+/// An image sensor behind its lens. All figures are of a pixel of the image: where one joins `n` of the sensor, electrons and
+/// full well are theirs together, and read noise `sqrt(n)` times theirs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sensor {
+    /// Most electrons that a pixel holds. [e]
+    pub full_well_e: f64,
+    /// Of reading a pixel, standard deviation. [e]
+    pub read_noise_e: f64,
+    /// Electrons that linear light of 1, the brightest that the scene's file shows, makes in a second. [e/s]
+    pub electrons_per_s: f64,
+    /// Bits of the converter, 8 to 16.
+    pub bits: u32,
+    /// What lies before the pixels.
+    pub filter: ColorFilter,
+    /// Whether what is read is denoised.
+    pub denoise: bool,
+    /// Whether there is photon and read noise.
+    pub noise: bool,
+    /// Share of the light that the corners lack, 0 to 1.
+    pub vignette: f64,
+    /// From the first row's exposure to the last one's; 0 is a global shutter. [s]
+    pub readout_s: f64,
+    /// What decides shutter and gain.
+    pub exposure: ExposureControl,
+}
+
+/// Where a camera is, seconds from the instant that its image shows. [s]
+pub type Path<'a> = dyn Fn(f64) -> Pose<World, Cam> + Sync + 'a;
+
+/// One image that is taken.
+#[derive(Clone, Copy)]
+pub struct Shot<'a> {
+    /// What was rendered: at the middle of the middle row's exposure.
+    pub camera: &'a Camera,
+    /// How it moves about then.
+    pub path: &'a Path<'a>,
+    /// The instant, on a clock that goes on from image to image. [s]
+    pub at_s: f64,
+    /// What its noise is made from.
+    pub key: NoiseKey,
+}
+
+/// The state of one camera: its exposure, and buffers.
+#[derive(Debug, Default)]
+pub struct Imager {
+    follow: Follow,
+    last_s: Option<f64>,
+    lens: Option<Intrinsics>,
+    pixels: Vec<Pixel>,
+    /// Linear light as it was rendered, H x W x 3.
+    light: Vec<f32>,
+    /// Linear light that each row collects, H x W x 3; then what is read of it.
+    exposed: Vec<f32>,
+    /// What is read of a mosaic, H x W.
+    mosaic: Vec<f32>,
+    denoised: Vec<f32>,
+    depth: Vec<f32>,
+    stereo: stereo::Scratch,
+    tof: tof::Scratch,
+}
+
+impl Imager {
+    /// Turns a perfect image into the one that the camera gives; returns how it was exposed. Depth that is measured is in both
+    /// of the image's depths, in whole millimetres, with alpha 1 where there is a return; ids stay those of the perfect image.
+    ///
+    /// # Panics
+    /// If the image is not of the camera's size.
+    pub fn apply(
+        &mut self,
+        model: &CameraModel,
+        shot: &Shot<'_>,
+        image: &mut RgbdImage,
+    ) -> Option<Exposure> {
+        if *model == CameraModel::default() {
+            return None;
+        }
+        self.prepare(shot.camera, image);
+        let is_measured = self.measure_depth(&model.depth, shot, image);
+        let exposure = model.sensor.map(|sensor| self.take(&sensor, shot, image));
+        if is_measured {
+            for (alpha, &depth_m) in image.alpha.iter_mut().zip(&self.depth) {
+                // What is fattened over nothing is a return, too.
+                *alpha = if depth_m > 0.0 { 1.0 } else { *alpha };
+            }
+            image.depth_expected_m.copy_from_slice(&self.depth);
+            image.depth_median_m.copy_from_slice(&self.depth);
+        }
+        exposure
+    }
+
+    /// Gives buffers their sizes; what depends on the lens alone is made once.
+    fn prepare(&mut self, camera: &Camera, image: &RgbdImage) {
+        let k = &camera.intrinsics;
+        assert_eq!((image.width_px, image.height_px), (k.width_px, k.height_px));
+        if self.lens != Some(*k) {
+            self.pixels = shutter::pixels(k);
+            self.lens = Some(*k);
+        }
+        let count = k.pixels();
+        self.light.resize(3 * count, 0.0);
+        self.exposed.resize(3 * count, 0.0);
+        self.mosaic.resize(count, 0.0);
+        self.denoised.resize(3 * count, 0.0);
+        self.depth.resize(count, 0.0);
+        let tone = tone();
+        let wide = 3 * k.width_px as usize;
+        self.light.par_chunks_mut(wide).zip(image.rgb.par_chunks(wide)).for_each(|(light, rgb)| {
+            for (light, &shown) in light.iter_mut().zip(rgb) {
+                *light = tone.linear(shown);
+            }
+        });
+    }
+
+    /// Measures depth into `self.depth`; returns whether it is not perfect.
+    fn measure_depth(&mut self, model: &DepthModel, shot: &Shot<'_>, image: &RgbdImage) -> bool {
+        let k = &shot.camera.intrinsics;
+        match model {
+            DepthModel::Perfect => return false,
+            DepthModel::Stereo(stereo) => {
+                let key = shot.key.stream(1);
+                stereo.measure(k, image, &self.light, key, &mut self.stereo, &mut self.depth);
+            }
+            DepthModel::Tof(tof) => {
+                let (key, light) = (shot.key.stream(2), &self.light);
+                let (pixels, scratch) = (&self.pixels, &mut self.tof);
+                tof.measure(k, image, (pixels, light), key, scratch, &mut self.depth);
+            }
+        }
+        true
+    }
+
+    /// Takes the colour image.
+    fn take(&mut self, sensor: &Sensor, shot: &Shot<'_>, image: &mut RgbdImage) -> Exposure {
+        let k = &shot.camera.intrinsics;
+        let (width, height) = (k.width_px as usize, k.height_px as usize);
+        let full_s = sensor.full_well_e / sensor.electrons_per_s;
+        let dt_s = self.last_s.map_or(0.0, |last_s| shot.at_s - last_s);
+        self.last_s = Some(shot.at_s);
+        let mean = mean_light(&self.light);
+        let exposure = sensor.exposure.next(&mut self.follow, mean, full_s, dt_s);
+        let readout = sensor.readout(&exposure);
+        // Of a single row or column there is nothing to interpolate.
+        let is_line = width < 2 || height < 2;
+        let filter = if is_line { ColorFilter::Rgb } else { sensor.filter };
+
+        let seen =
+            Seen::new((k.width_px, k.height_px), &self.light, &image.depth_median_m, Vec2::ZERO);
+        let rendered_from_world = shot.camera.world_from_cam.inverse();
+        let moved = |at_s| Moved::new(rendered_from_world * (shot.path)(at_s));
+        let (pixels, light) = (&self.pixels, &self.light);
+        let lines = self.exposed.par_chunks_mut(3 * width);
+        lines.zip(self.mosaic.par_chunks_mut(width)).enumerate().for_each(|(y, (line, mosaic))| {
+            let middle_s = ((y as f64 + 0.5) / height as f64 - 0.5) * sensor.readout_s;
+            let half_s = exposure.shutter_s / 2.0;
+            let ends = [middle_s - half_s, middle_s + half_s].map(moved);
+            if is_line {
+                line.copy_from_slice(&light[3 * y * width..][..3 * width]);
+            } else {
+                line.fill(0.0);
+                seen.expose_row(&pixels[y * width..][..width], y, ends, line);
+            }
+            let key = shot.key;
+            read_row(&readout, sensor, filter, key, (width, height), y, line, mosaic);
+        });
+        let mut raw = if filter == ColorFilter::Rgb { &self.exposed } else { &self.mosaic };
+        if sensor.denoise {
+            let wide = filter.channels() * width;
+            let rows = self.denoised[..wide * height].par_chunks_mut(wide).enumerate();
+            rows.for_each(|(y, out)| denoise_row(raw, (width, height), filter, &readout, y, out));
+            raw = &self.denoised;
+        }
+        let tone = tone();
+        let show = |value: f32| f32::from(tone.shown(value)) / 255.0;
+        image.rgb.par_chunks_mut(3 * width).enumerate().for_each(|(y, out)| {
+            match filter {
+                ColorFilter::Rgb => out.copy_from_slice(&raw[3 * y * width..][..3 * width]),
+                ColorFilter::Bayer => demosaic_row(&raw[..width * height], width, y, out),
+                ColorFilter::Mono => {
+                    for (out, &value) in out.chunks_exact_mut(3).zip(&raw[y * width..][..width]) {
+                        out.fill(value);
+                    }
+                }
+            }
+            for value in out {
+                *value = show(*value);
+            }
+        });
+        exposure
+    }
+}
+
+impl Sensor {
+    fn readout(&self, exposure: &Exposure) -> Readout {
+        let full_scale = ((1u64 << self.bits.clamp(1, 24)) - 1) as f64;
+        Readout {
+            electrons: (self.electrons_per_s * exposure.shutter_s) as f32,
+            full_well_e: self.full_well_e as f32,
+            read_noise_e: self.read_noise_e as f32,
+            numbers_per_e: (exposure.gain * full_scale / self.full_well_e) as f32,
+            full_scale: full_scale as f32,
+            amount: f32::from(u8::from(self.noise)),
+        }
+    }
+}
+
+/// Reads a row of light out: in place, or into its row of the mosaic.
+#[expect(clippy::too_many_arguments, reason = "a row of all that an image is made of")]
+fn read_row(
+    readout: &Readout,
+    sensor: &Sensor,
+    filter: ColorFilter,
+    key: NoiseKey,
+    (width, height): (usize, usize),
+    y: usize,
+    line: &mut [f32],
+    mosaic: &mut [f32],
+) {
+    let table = Normals::table();
+    let vignette = sensor.vignette as f32;
+    let v = (y as f32 + 0.5) / height as f32 - 0.5;
+    for (x, (light, mosaic)) in line.chunks_exact_mut(3).zip(mosaic).enumerate() {
+        let bright = vignetting(vignette, (x as f32 + 0.5) / width as f32 - 0.5, v);
+        let bits = key.bits(y * width + x);
+        match filter {
+            ColorFilter::Rgb => {
+                for (c, light) in (0u32..).zip(light) {
+                    *light = readout.read(bright * *light, table.of(bits, c));
+                }
+            }
+            ColorFilter::Bayer => {
+                *mosaic = readout.read(bright * light[bayer_color(x, y)], table.of(bits, 0));
+            }
+            ColorFilter::Mono => {
+                let light = luminance(light[0], light[1], light[2]);
+                *mosaic = readout.read(bright * light, table.of(bits, 0));
+            }
+        }
+    }
+}
+
+/// Returns the mean luminance, of every so many pixels.
+fn mean_light(light: &[f32]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0u32);
+    for rgb in light.chunks_exact(3).step_by(METERED) {
+        sum += f64::from(luminance(rgb[0], rgb[1], rgb[2]));
+        count += 1;
+    }
+    sum / f64::from(count.max(1))
+}
+
+/// Returns the tables of tones: 80 kB, made once.
+fn tone() -> &'static Tone {
+    static TONE: LazyLock<Tone> = LazyLock::new(Tone::default);
+    &TONE
+}
+
+/// Prime, so that no column of an image is looked at more than others.
+const METERED: usize = 31;
+
+#[cfg(test)]
+mod tests;
