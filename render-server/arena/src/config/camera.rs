@@ -7,6 +7,7 @@ use vizflyt_protocol::geometry::{
 };
 use vizflyt_protocol::messages::{CameraInfo, bounded};
 
+use super::imaging::ImagingConfig;
 use super::validate::{ConfigError, check_number, check_position, invalid};
 
 /// One of `[[cameras]]`.
@@ -89,6 +90,9 @@ pub struct CameraConfig {
     /// not leave the server: plugins get "no return" in every pixel.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub depth: bool,
+    /// How it differs from a perfect camera; absent is not at all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imaging: Option<ImagingConfig>,
 }
 
 impl CameraConfig {
@@ -121,6 +125,7 @@ impl CameraConfig {
             rate_hz: None,
             priority: 0,
             depth: true,
+            imaging: None,
         }
     }
 
@@ -181,7 +186,9 @@ impl CameraConfig {
         check_number(&key("yaw_deg"), self.yaw_deg, "degrees", -360.0..=360.0)?;
         check_number(&key("roll_deg"), self.roll_deg, "degrees", -360.0..=360.0)?;
         check_number(&key("near_m"), self.near_m, "m", 0.001..=100.0)?;
-        self.rate_hz.map_or(Ok(()), |hz| check_number(&key("rate_hz"), hz, "Hz", 0.1..=1000.0))
+        self.rate_hz.map_or(Ok(()), |hz| check_number(&key("rate_hz"), hz, "Hz", 0.1..=1000.0))?;
+        let key = |field: &str| key(&format!("imaging.{field}"));
+        self.imaging.as_ref().map_or(Ok(()), |imaging| imaging.check(key))
     }
 
     fn check_intrinsics(&self, key: impl Fn(&str) -> String) -> Result<(), ConfigError> {

@@ -3,7 +3,8 @@
 use glam::{DQuat, DVec2, DVec3};
 use serde::Serialize;
 use serde_json::Value;
-use vizflyt_arena::config::CameraConfig;
+use vizflyt_arena::config::imaging::DepthConfig;
+use vizflyt_arena::config::{CameraConfig, ImagingConfig};
 use vizflyt_arena::pose::SourceQuality;
 use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
 use vizflyt_protocol::geometry::LensConfig;
@@ -100,6 +101,7 @@ fn camera_examples() -> Vec<CameraLine> {
         rate_hz: None,
         priority: 0,
         depth: true,
+        imaging: None,
     };
     let calibrated = |lens| CameraConfig {
         horizontal_fov_deg: None,
@@ -114,8 +116,21 @@ fn camera_examples() -> Vec<CameraLine> {
     };
     let brown = LensConfig::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 };
     let kannala = LensConfig::KannalaBrandt { k1: 0.0, k2: 0.0, k3: 0.0, k4: 0.0 };
+    let named = |imaging| CameraConfig { imaging: Some(imaging), ..fov.clone() };
+    let depth = Some(DepthConfig { model: "d435".to_owned(), ..DepthConfig::default() });
+    let sensor = Some("imx219".to_owned());
+    let sensors = [
+        named(ImagingConfig {
+            sensor: sensor.clone(),
+            depth: depth.clone(),
+            ..ImagingConfig::default()
+        }),
+        named(ImagingConfig { sensor, ..ImagingConfig::default() }),
+        named(ImagingConfig { depth, ..ImagingConfig::default() }),
+    ];
     [fov.clone(), calibrated(None), calibrated(Some(brown)), calibrated(Some(kannala))]
         .iter()
+        .chain(&sensors)
         .map(|config| CameraLine { keys: camera_keys(config), intrinsics: config.intrinsics() })
         .collect()
 }

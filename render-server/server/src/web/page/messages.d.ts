@@ -13,6 +13,7 @@ export type Arena = {
     fy_px?: number;
     height_px: number;
     horizontal_fov_deg?: number;
+    imaging?: { depth?: { model: string }; sensor?: string };
     intrinsics: {
       cx_px: number;
       cy_px: number;
@@ -72,6 +73,7 @@ export type Cameras = {
     fy_px?: number;
     height_px: number;
     horizontal_fov_deg?: number;
+    imaging?: { depth?: { model: string }; sensor?: string };
     intrinsics: {
       cx_px: number;
       cy_px: number;
