@@ -249,6 +249,8 @@ async function lab(browser) {
   // A camera.
   await page.locator("#setup summary").click();
   await page.locator("#camera-form [name=width_px]").fill("200");
+  await page.locator("#camera-form [name=sensor]").selectOption("imx219");
+  await page.locator("#camera-form [name=depth_model]").selectOption("d435");
   await page.locator("#camera-form button[type=submit]").click();
   await until(page, "camera-status", /applied/);
   await until(page, "camera-name", /200 ×/);

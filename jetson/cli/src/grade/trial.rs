@@ -38,6 +38,7 @@ use vizflyt_runtime::log::{GivenImage, LoggedImages, VirtualLog};
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
+use vizflyt_server::render::effects::{CameraEffects, EffectInput};
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
@@ -291,6 +292,8 @@ struct Flight<'a> {
     referee: Referee,
     renderer: CpuRenderer,
     images: Vec<RgbdImage>,
+    /// Of each camera.
+    effects: Vec<CameraEffects>,
     now: HostTime,
     schedule: CameraSchedule,
     poses: u64,
@@ -355,6 +358,7 @@ impl<'a> Flight<'a> {
                 .counting_from(ServerTime::from_ns(START_NS)),
             renderer,
             images: Vec::new(),
+            effects: info.cameras.iter().map(|_| CameraEffects::default()).collect(),
             now,
             schedule: CameraSchedule::new(ServerTime::from_ns(START_NS)),
             poses: 0,
@@ -518,10 +522,16 @@ impl<'a> Flight<'a> {
         let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for (&index, image) in due.iter().zip(images) {
             let mut picture = Picture::default();
+            let (config, info) = (&self.arena.cameras[index], &self.cameras[index]);
+            image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
+            // What truly is ahead, whatever the camera makes of it.
+            let width = info.intrinsics.width_px as usize;
+            picture.ahead_m = ahead_m(&picture.depth_mm, width, &mut self.scratch);
+            let seeds = [self.trial.seed, index as u64, self.seq + 1];
+            let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
+            self.effects[index].apply(&input, image);
             image.write_rgb8(&mut picture.rgb);
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
-            let k = &self.cameras[index].intrinsics;
-            picture.ahead_m = ahead_m(&picture.depth_mm, k.width_px as usize, &mut self.scratch);
             if withholds_depth(&self.arena.cameras[index]) {
                 // As in flight: what the course withholds is "no return" everywhere.
                 picture.depth_mm.fill(0);

@@ -253,6 +253,21 @@ mod tests {
     }
 
     #[test]
+    fn a_sensor_is_taken_and_given_back() {
+        let cameras = cameras();
+        let json = br#"{"imaging": {"sensor": "imx219", "depth": {"model": "d435"}}}"#;
+        let new = cameras.patch("front", json).unwrap();
+        assert_eq!(new.imaging.unwrap().describe(), "imx219, depth d435");
+        let json = br#"{"imaging": {"sensor": "ov9281"}}"#;
+        assert_eq!(cameras.patch("front", json).unwrap().imaging.unwrap().describe(), "ov9281");
+        assert_eq!(cameras.patch("front", br#"{"imaging": null}"#).unwrap().imaging, None);
+        refused(
+            cameras.patch("front", br#"{"imaging": {"sensor": "eye"}}"#),
+            "imaging.sensor = \"eye\": unknown; give one of imx219",
+        );
+    }
+
+    #[test]
     fn a_put_is_the_whole_camera() {
         let cameras = cameras();
         let json = br#"{"width_px": 64, "height_px": 48, "horizontal_fov_deg": 70,

@@ -9,6 +9,7 @@
 pub mod cameras;
 pub mod demand;
 pub mod dynamic_objects;
+pub mod effects;
 pub mod environment;
 pub mod rendered;
 mod renderer;

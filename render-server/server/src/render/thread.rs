@@ -25,8 +25,9 @@ use crate::mailbox::Mailbox;
 use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
+use crate::render::effects::{CameraEffects, EffectInput};
 use crate::render::environment::atmosphere;
-use crate::render::rendered::{RenderQueue, RenderedTick};
+use crate::render::rendered::{RenderQueue, RenderedImage, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
 use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
@@ -92,6 +93,8 @@ struct RenderLoop<'a, D> {
     /// Their images side by side, as the renderer wants them.
     images: Vec<RgbdImage>,
     placements: Vec<Placement>,
+    /// Of each camera of each vehicle, with [`MAX_CAMERAS`] places a vehicle.
+    effects: Vec<CameraEffects>,
     seq: u64,
     refused: bool,
 }
@@ -118,6 +121,9 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             ranges: Default::default(),
             images: Vec::new(),
             placements: Vec::with_capacity(MAX_OBJECTS + MAX_VEHICLES),
+            effects: (0..rendering.cameras.len() * MAX_CAMERAS)
+                .map(|_| CameraEffects::default())
+                .collect(),
             seq: 0,
             refused: false,
         }
@@ -227,12 +233,16 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 renderer.render(placements, &cameras[first..end], images).map(|_| ())
             })
         });
-        let end = clock::now();
-        drop(span);
         for (slot, image) in tick.slots.iter_mut().filter(|slot| slot.fresh).zip(images) {
             std::mem::swap(image, &mut slot.image);
-            (slot.render_start, slot.render_end) = (start, end);
+            slot.render_start = start;
+            if result.is_ok() {
+                take_image(&mut self.effects, known, slot);
+            }
         }
+        let end = clock::now();
+        drop(span);
+        tick.slots.iter_mut().filter(|slot| slot.fresh).for_each(|slot| slot.render_end = end);
         result.inspect(|()| rendering.durations.add(start, end))
     }
 
@@ -256,6 +266,22 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             warn!("tick {} is not rendered: {error}; further errors are not logged", self.seq);
         }
     }
+}
+
+/// Turns a rendered image into the one that its camera takes.
+fn take_image(effects: &mut [CameraEffects], known: &NewestPoses, slot: &mut RenderedImage) {
+    let RenderedImage { vehicle, camera, seq, .. } = *slot;
+    let (Some(set), Some(newest), Some(world_from_body)) =
+        (&slot.set, &known[vehicle], slot.world_from_body)
+    else {
+        return;
+    };
+    let (config, info) = (&set.configs[camera], &set.infos[camera]);
+    let exposure = Exposure { at: slot.shown, world_from_body };
+    let camera = vehicle * MAX_CAMERAS + camera;
+    let seeds = [0, camera as u64, seq];
+    let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
+    effects[camera].apply(&input, &mut slot.image);
 }
 
 /// Which of a tick's cameras are a vehicle's, and the instant that they show.

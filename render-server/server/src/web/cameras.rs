@@ -88,8 +88,10 @@ fn describe(camera: &CameraConfig) -> String {
         _ => ", Kannala-Brandt",
     };
     let rate = camera.rate_hz.map_or_else(String::new, |hz| format!(", {hz} Hz at most"));
+    let imaging = camera.imaging.as_ref();
+    let imaging = imaging.map_or_else(String::new, |imaging| format!(", {}", imaging.describe()));
     format!(
-        "camera {} is now {}x{} px, fx {:.1}, fy {:.1}{lens}, near {} m, at {} tilted {} deg{rate}",
+        "camera {} is now {}x{} px, fx {:.1}, fy {:.1}{lens}, near {} m, at {} tilted {} deg{rate}{imaging}",
         camera.name,
         k.width_px,
         k.height_px,

@@ -17,6 +17,10 @@ const MODELS = [
   ["brown-conrady", "Brown-Conrady, calibrated"], ["kannala-brandt", "Kannala-Brandt fisheye, calibrated"],
 ];
 
+/** Image sensors and depth cameras that have a name; a test holds them against the server's. */
+const SENSORS = ["imx219", "imx477", "ov5647", "ov9281", "imx296"];
+const DEPTHS = ["d435", "azure-kinect", "tofcam-635"];
+
 // ---- the form ----------------------------------------------------------------------------
 /** The number fields by name. @type {Map<string, HTMLInputElement>} */
 const fields = new Map();
@@ -57,6 +61,11 @@ function number(name) {
 const required = { required: true };
 const pixels = { min: "1", max: "8192", step: "1", ...required };
 const model = make("select", { name: "model" }, ...MODELS.map(([value, text]) => new Option(text, value)));
+/** @param {string} name @param {string[]} names */
+const sensorSelect = (name, names) =>
+  make("select", { name }, new Option("perfect", ""), ...names.map((value) => new Option(value, value)));
+const sensor = sensorSelect("sensor", SENSORS);
+const depthModel = sensorSelect("depth_model", DEPTHS);
 const status = make("span", { id: "camera-status", role: "status" });
 const submit = make("p", {}, make("button", { type: "submit", textContent: "apply from the next image on" }), status);
 submit.dataset.for = "instructor";
@@ -72,6 +81,8 @@ const form = make("form", { id: "camera-form", autocomplete: "off" },
     lensField("view", "horizontal_fov_deg", "°", ["fov"], { min: "1", max: "170" }),
     ...CALIBRATED.map((name) => lensField(name.slice(0, 2), name, "px", calibrated)),
     ...COEFFICIENTS.map((name) => lensField(name, name, "", Object.keys(LENSES).filter((lens) => LENSES[lens].includes(name))))),
+  make("fieldset", {}, make("legend", { textContent: "sensor" }),
+    make("label", {}, "image ", sensor), make("label", {}, "depth ", depthModel)),
   make("fieldset", {}, make("legend", { textContent: "mounting on the body" }),
     numberField("ahead", "x_m", "m", required), numberField("left", "y_m", "m", required), numberField("up", "z_m", "m", required),
     numberField("tilt up", "tilt_deg", "°", required), numberField("turn left", "yaw_deg", "°", required),
@@ -101,6 +112,8 @@ export function showSettings(camera, again) {
   for (const name of CALIBRATED) set(name, camera.intrinsics[name]);
   for (const name of COEFFICIENTS) set(name, camera.distortion?.[name] ?? 0);
   for (const [axis, name] of POSITION.entries()) set(name, camera.position_m[axis]);
+  sensor.value = camera.imaging?.sensor ?? "";
+  depthModel.value = camera.imaging?.depth?.model ?? "";
   model.value = camera.distortion?.model ?? (camera.fx_px == null ? "fov" : "pinhole");
   showModel();
   if (!same) status.textContent = "";
@@ -116,10 +129,22 @@ function showModel() {
 model.addEventListener("change", showModel);
 
 /**
+ * Returns how the camera differs from a perfect one; what else is set of a sensor stays with it.
+ * @param {Camera["imaging"]} shown
+ */
+function readImaging(shown) {
+  const { depth, ...light } = shown ?? {};
+  return {
+    ...((light.sensor ?? "") === sensor.value ? light : sensor.value !== "" && { sensor: sensor.value }),
+    ...(depthModel.value !== "" && { depth: depth?.model === depthModel.value ? depth : { model: depthModel.value } }),
+  };
+}
+
+/**
  * Returns the camera that the form describes; what the form does not show stays as it is.
  * @param {Camera} shown
  */
-function read({ priority, depth }) {
+function read({ priority, depth, imaging }) {
   const value = (/** @type {string} */ name) => +number(name).value;
   const pick = (/** @type {readonly string[]} */ names) => Object.fromEntries(names.map((name) => [name, value(name)]));
   return {
@@ -129,6 +154,7 @@ function read({ priority, depth }) {
     ...pick(model.value === "fov" ? ["horizontal_fov_deg"] : CALIBRATED),
     ...(priority != null && { priority }),
     ...(depth != null && { depth }),
+    ...((imaging != null || sensor.value !== "" || depthModel.value !== "") && { imaging: readImaging(imaging) }),
     ...(model.value in LENSES && { distortion: { model: model.value, ...pick(LENSES[model.value]) } }),
   };
 }
@@ -143,7 +169,7 @@ form.addEventListener("submit", async (event) => {
 
 /** @type {import("../panels.js").Panel} */
 export const cameraSettings = {
-  element: makeFoldingPanel("setup", "cameras: size, lens, mounting", form),
+  element: makeFoldingPanel("setup", "cameras: size, lens, sensor, mounting", form),
   onArena(arena) {
     ({ vehicle } = arena);
   },
