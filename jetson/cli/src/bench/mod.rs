@@ -3,6 +3,7 @@
 
 mod bandwidth;
 mod bridge;
+mod imaging;
 mod render;
 mod stream;
 
@@ -22,6 +23,7 @@ pub(crate) struct BenchArgs {
 enum BenchCommand {
     Bandwidth(bandwidth::BandwidthArgs),
     Bridge(bridge::BridgeBenchArgs),
+    Imaging(imaging::ImagingArgs),
     Render(render::RenderArgs),
     Stream(stream::StreamArgs),
 }
@@ -31,6 +33,7 @@ pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
     match args.command {
         BenchCommand::Bandwidth(args) => bandwidth::run(&args)?,
         BenchCommand::Bridge(args) => bridge::run(&args)?,
+        BenchCommand::Imaging(args) => imaging::run(&args)?,
         BenchCommand::Render(args) => render::run(&args)?,
         BenchCommand::Stream(args) => stream::run(&args)?,
     }

@@ -15,8 +15,8 @@ use serde::Serialize;
 pub(crate) use self::errors::{Alignment, Delta};
 use self::errors::{Error, Statistics};
 use self::pairs::Pair;
-pub(crate) use self::pairs::{Association, associate};
-pub(crate) use self::trajectory::Stamped;
+pub(crate) use self::pairs::{Association, associate, interpolated};
+pub(crate) use self::trajectory::{Stamped, read};
 use crate::terminal::print_line;
 
 /// Measures how far an estimated trajectory is from the true one: absolute and relative errors.

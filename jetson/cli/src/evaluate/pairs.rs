@@ -62,8 +62,8 @@ fn nearest(poses: &[Stamped], at_s: f64) -> Option<Stamped> {
     Some(*only)
 }
 
-/// Beyond the ends the first or last pose stays.
-fn interpolated(poses: &[Stamped], at_s: f64) -> Stamped {
+/// Returns the pose of an instant; beyond the ends the first or last one stays.
+pub(crate) fn interpolated(poses: &[Stamped], at_s: f64) -> Stamped {
     let [only] = poses else {
         let next = after(poses, at_s);
         let (a, b) = (poses[next - 1], poses[next]);

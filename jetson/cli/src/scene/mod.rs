@@ -7,6 +7,7 @@ mod capture;
 mod carve;
 mod convert;
 mod edit;
+mod events;
 mod generate;
 mod inspect;
 mod npy;
@@ -38,6 +39,7 @@ enum SceneCommand {
     Convert(convert::ConvertArgs),
     // Boxed: it has a flag for every kind of step.
     Edit(Box<edit::EditArgs>),
+    Events(events::EventsArgs),
     Inspect(inspect::InspectArgs),
     Render(render::RenderArgs),
     Train(train::TrainArgs),
@@ -54,6 +56,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Carve(args) => carve::run(&args)?,
         SceneCommand::Convert(args) => convert::run(&args)?,
         SceneCommand::Edit(args) => edit::run(&args)?,
+        SceneCommand::Events(args) => events::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::Train(args) => train::run(&args)?,

@@ -1,0 +1,291 @@
+//! `vizflyt bench imaging`: what cameras with faults cost next to rendering, and a sheet of what they see.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use glam::{DQuat, DVec3};
+use image::{Rgb, RgbImage};
+use serde::Serialize;
+use vizflyt_arena::config::ImagingConfig;
+use vizflyt_protocol::geometry::{Cam, Pose, World};
+use vizflyt_server::render::effects::camera_model;
+use vizflyt_server::render::{DetailKind, RendererKind, choose};
+use vizflyt_server::scene::load_as_it_is;
+use vizflyt_splat::imaging::events::{Event, EventCamera, EventSensor};
+use vizflyt_splat::imaging::noise::NoiseKey;
+use vizflyt_splat::imaging::{Imager, Shot};
+use vizflyt_splat::{Camera, Chosen, Rasterizer, RgbdImage};
+
+use crate::scene::camera::{self, ImageSize};
+use crate::terminal::print_fmt;
+
+/// Renders one camera many times over, as sensors take it; prints milliseconds of each, and of rendering.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "The camera turns to the left by 60 degrees a second and flies 1 m/s to its right.
+Ratios to rendering are of the same run.
+
+Examples:
+  vizflyt bench imaging forest/arena.toml --camera cam.json
+  vizflyt bench imaging forest/arena.toml --camera cam.json --size 176x132 --sheet imaging.png"
+)]
+pub(super) struct ImagingArgs {
+    /// Scene file of any format, or an arena.toml (then its scene)
+    scene: PathBuf,
+    /// The camera, as for `vizflyt scene render`
+    #[arg(long, value_name = "CAM.json")]
+    camera: PathBuf,
+    /// Draws images of this size instead of the camera's; they show the same
+    #[arg(long, value_name = "WxH")]
+    size: Option<ImageSize>,
+    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
+    /// Images of each kind that count
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    images: u32,
+    /// Writes what each sees side by side, as one PNG
+    #[arg(long, value_name = "FILE.png")]
+    sheet: Option<PathBuf>,
+    /// Prints one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+/// What is measured: a name, the camera as `[cameras.imaging]` has it, and whether its depth is what it shows.
+const KINDS: &[(&str, &str, Shown)] = &[
+    ("perfect", "{}", Shown::Color),
+    (
+        "noise: ov5647 bayer, 5 ms in 200 lx",
+        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 200, "exposure_ms": 5, "gain": 40, "filter": "bayer",
+            "readout_ms": 0}"#,
+        Shown::Color,
+    ),
+    (
+        "the same, denoised",
+        r#"{"sensor": "ov5647", "binning": 1, "illuminance_lx": 200, "exposure_ms": 5, "gain": 40, "filter": "bayer",
+            "readout_ms": 0, "denoise": true}"#,
+        Shown::Color,
+    ),
+    (
+        "blur: imx296, 60 ms",
+        r#"{"sensor": "imx296", "exposure_ms": 60, "illuminance_lx": 400}"#,
+        Shown::Color,
+    ),
+    (
+        "rolling shutter: imx477, 90 ms",
+        r#"{"sensor": "imx477", "readout_ms": 90, "max_exposure_ms": 1, "illuminance_lx": 5000}"#,
+        Shown::Color,
+    ),
+    ("grey: ov9281", r#"{"sensor": "ov9281"}"#, Shown::Color),
+    ("perfect depth", "{}", Shown::Depth),
+    ("d435", r#"{"depth": {"model": "d435"}}"#, Shown::Depth),
+    ("d435 without projector", r#"{"depth": {"model": "d435", "projector": false}}"#, Shown::Depth),
+    ("azure-kinect", r#"{"depth": {"model": "azure-kinect"}}"#, Shown::Depth),
+    ("tofcam-635", r#"{"depth": {"model": "tofcam-635"}}"#, Shown::Depth),
+];
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Shown {
+    Color,
+    Depth,
+}
+
+/// What `--json` prints.
+#[derive(Debug, Serialize)]
+struct Figures {
+    scene: String,
+    width_px: u32,
+    height_px: u32,
+    renderer: String,
+    images: u32,
+    render_ms: f64,
+    kinds: Vec<Kind>,
+}
+
+#[derive(Debug, Serialize)]
+struct Kind {
+    name: String,
+    median_ms: f64,
+    of_render: f64,
+}
+
+/// Runs `vizflyt bench imaging`.
+pub(super) fn run(args: &ImagingArgs) -> Result<()> {
+    let camera = camera::read(&args.camera)?;
+    let camera = args.size.map_or(Ok(camera), |size| camera::resized(&camera, size))?;
+    let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let Chosen { mut rasterizer, .. } =
+        choose(&loaded.splats, args.renderer, DetailKind::Adaptive)?;
+    drop(loaded);
+    let path = |at_s: f64| path(&camera, at_s);
+    let mut sheet = Sheet::new(&camera);
+    let mut measure = Measure { camera: &camera, path: &path, rasterizer: &mut *rasterizer };
+    let (clean, render_ms) = measure.render(args.images)?;
+    let mut kinds = Vec::new();
+    for &(name, text, shown) in KINDS {
+        let config: ImagingConfig = serde_json::from_str(text)?;
+        let (image, median_ms) = measure.take(&config, &clean, args.images);
+        sheet.add(&image, shown);
+        kinds.push(Kind { name: name.to_owned(), median_ms, of_render: median_ms / render_ms });
+    }
+    let (events, median_ms) = measure.events(&mut sheet)?;
+    let name = format!("event camera ({events} events in 20 ms)");
+    kinds.push(Kind { name, median_ms, of_render: median_ms / render_ms });
+    let renderer = rasterizer.name().into_owned();
+    if let Some(file) = &args.sheet {
+        sheet.save(file)?;
+    }
+    let k = &camera.intrinsics;
+    let (width_px, height_px) = (k.width_px, k.height_px);
+    let scene = scene.display().to_string();
+    let images = args.images;
+    let figures = Figures { scene, width_px, height_px, renderer, images, render_ms, kinds };
+    if args.json {
+        print_fmt!("{}", serde_json::to_string_pretty(&figures)?);
+    } else {
+        print(&figures);
+    }
+    Ok(())
+}
+
+fn print(figures: &Figures) {
+    let Figures { scene, width_px, height_px, renderer, images, render_ms, kinds } = figures;
+    print_fmt!("scene       {scene}, {width_px}x{height_px}, {renderer}, {images} images each");
+    print_fmt!("{:<34} {:>8} {:>10}", "median", "ms", "of render");
+    print_fmt!("{:<34} {render_ms:>8.2} {:>10.2}", "rendering", 1.0);
+    for Kind { name, median_ms, of_render } in kinds {
+        print_fmt!("{name:<34} {median_ms:>8.2} {of_render:>10.2}");
+    }
+}
+
+/// Where the camera is, from where it is now.
+fn path(camera: &Camera, at_s: f64) -> Pose<World, Cam> {
+    let moved: Pose<Cam, Cam> =
+        Pose::new(DVec3::X * at_s, DQuat::from_rotation_y(-60f64.to_radians() * at_s));
+    camera.world_from_cam * moved
+}
+
+struct Measure<'a> {
+    camera: &'a Camera,
+    path: &'a vizflyt_splat::imaging::Path<'a>,
+    rasterizer: &'a mut dyn Rasterizer,
+}
+
+impl Measure<'_> {
+    fn render(&mut self, count: u32) -> Result<(RgbdImage, f64)> {
+        let mut images = [RgbdImage::default()];
+        let mut times = Vec::new();
+        for n in 0..WARM_UP + count {
+            let start = Instant::now();
+            self.rasterizer.render(&[], std::slice::from_ref(self.camera), &mut images)?;
+            if n >= WARM_UP {
+                times.push(start.elapsed().as_secs_f64() * 1e3);
+            }
+        }
+        let [image] = images;
+        Ok((image, median(&mut times)))
+    }
+
+    fn take(&self, config: &ImagingConfig, clean: &RgbdImage, count: u32) -> (RgbdImage, f64) {
+        let model = camera_model(config, clean.width_px);
+        let mut imager = Imager::default();
+        let (mut image, mut times) = (clean.clone(), Vec::new());
+        for n in 0..WARM_UP + count {
+            image.clone_from(clean);
+            let key = NoiseKey::new(7, 0, n.into());
+            let at_s = f64::from(n) / 30.0;
+            let start = Instant::now();
+            let shot = Shot { camera: self.camera, path: self.path, at_s, key };
+            imager.apply(&model, &shot, &mut image);
+            if n >= WARM_UP {
+                times.push(start.elapsed().as_secs_f64() * 1e3);
+            }
+        }
+        (image, median(&mut times))
+    }
+
+    /// Events of 20 ms, of an image every 0.5 ms.
+    fn events(&mut self, sheet: &mut Sheet) -> Result<(usize, f64)> {
+        let (mut camera, mut events, mut times) = (EventCamera::default(), Vec::new(), Vec::new());
+        let mut images = [RgbdImage::default()];
+        for n in 0..=40u32 {
+            let at_s = f64::from(n) * 5e-4;
+            let moved = Camera { world_from_cam: (self.path)(at_s), ..*self.camera };
+            self.rasterizer.render(&[], &[moved], &mut images)?;
+            let start = Instant::now();
+            let at_ns = 1 + u64::from(n) * 500_000;
+            camera.push(&EventSensor::default(), &images[0], at_ns, &mut events);
+            times.push(start.elapsed().as_secs_f64() * 1e3);
+        }
+        sheet.add_events(&events);
+        Ok((events.len(), median(&mut times)))
+    }
+}
+
+fn median(times: &mut [f64]) -> f64 {
+    times.sort_unstable_by(f64::total_cmp);
+    times[times.len() / 2]
+}
+
+/// Pictures side by side, in the order of the kinds.
+struct Sheet {
+    width: u32,
+    height: u32,
+    tiles: Vec<RgbImage>,
+}
+
+impl Sheet {
+    fn new(camera: &Camera) -> Self {
+        let k = &camera.intrinsics;
+        Self { width: k.width_px, height: k.height_px, tiles: Vec::new() }
+    }
+
+    fn add(&mut self, image: &RgbdImage, shown: Shown) {
+        let tile = RgbImage::from_fn(self.width, self.height, |x, y| {
+            let n = (y * self.width + x) as usize;
+            let rgb = match shown {
+                Shown::Color => [0, 1, 2].map(|c| image.rgb[3 * n + c]),
+                Shown::Depth => depth_color(image.depth_median_m[n], image.alpha[n]),
+            };
+            // Coarser steps than eight bits keep the file small.
+            Rgb(rgb.map(|value| (value.clamp(0.0, 1.0) * 63.0 + 0.5) as u8 * 4))
+        });
+        self.tiles.push(tile);
+    }
+
+    fn add_events(&mut self, events: &[Event]) {
+        let mut tile = RgbImage::from_pixel(self.width, self.height, Rgb([240; 3]));
+        for event in events {
+            let color = if event.on { [200, 40, 40] } else { [40, 80, 200] };
+            tile.put_pixel(event.x.into(), event.y.into(), Rgb(color));
+        }
+        self.tiles.push(tile);
+    }
+
+    fn save(&self, file: &Path) -> Result<()> {
+        let rows = (self.tiles.len() as u32).div_ceil(COLUMNS);
+        let (width, height) = (self.width + GAP_PX, self.height + GAP_PX);
+        let mut all = RgbImage::from_pixel(COLUMNS * width, rows * height, Rgb([255; 3]));
+        for (n, tile) in (0..).zip(&self.tiles) {
+            let at = (i64::from(n % COLUMNS * width), i64::from(n / COLUMNS * height));
+            image::imageops::replace(&mut all, tile, at.0, at.1);
+        }
+        all.save(file).with_context(|| format!("cannot write {}", file.display()))
+    }
+}
+
+/// Near is bright and red, far is dark and blue; nothing is black.
+fn depth_color(depth_m: f32, alpha: f32) -> [f32; 3] {
+    if !(depth_m > 0.0 && alpha >= RgbdImage::MIN_DEPTH_ALPHA) {
+        return [0.0; 3];
+    }
+    let near = 1.0 / (1.0 + 0.25 * depth_m);
+    [near * near * 1.3, near * 0.9, 1.0 - 0.8 * near]
+}
+
+const COLUMNS: u32 = 4;
+const GAP_PX: u32 = 4;
+const WARM_UP: u32 = 3;
