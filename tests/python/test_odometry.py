@@ -209,6 +209,19 @@ def test_a_folder_that_is_no_data_set_is_named(tmp_path):
         list(flight.data_set(tmp_path, False))
 
 
+@pytest.mark.parametrize("kind", [rgbd.Rgbd, inertial.Inertial])
+def test_the_plugins_take_observations_and_wait_on_the_ground(kind):
+    front = vizflyt.CameraInfo("front", vizflyt.Intrinsics.from_horizontal_fov(64, 48, 1.5))
+    buffer = vizflyt.ObservationBuffer([front])
+    random = np.random.default_rng(2)
+    rgb, depth_mm = random.integers(0, 255, (48, 64, 3), dtype=np.uint8), np.full((48, 64), 2500, np.uint16)
+    buffer.set_image("front", rgb, depth_mm, stamp_ns=10**9)
+    plugin = kind()
+    plugin.on_start(vizflyt.ArenaInfo(name="spiral", cameras=[front]))
+    assert plugin.on_image(buffer.observation()).kind == "hold"
+    assert plugin.shown_ns == {"front": 10**9}
+
+
 def run(*command):
     done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, text=True, timeout=600)
     assert done.returncode == 0, done.stdout
