@@ -1,7 +1,7 @@
-"""Trains a small network that segments gates, on images of `vizflyt dataset` alone, and says how well it does on others.
+"""Trains a small network that segments gates, on images of `vizflyt dataset` alone; says how well it does on others.
 
-    vizflyt dataset --project p3 --seeds 20 --images 2000 --size 160x120 --layers rgb,classes --randomize randomize.toml \
-        -o train
+    vizflyt dataset --project p3 --seeds 20 --images 2000 --size 160x120 --layers rgb,classes \
+        --randomize randomize.toml -o train
     vizflyt dataset --project p5 --seed 900 --seeds 4 --images 200 --size 160x120 --layers rgb,classes --val 0 -o race
     pip install torch numpy pillow
     python segment_gates.py train race
@@ -10,6 +10,7 @@ Both folders have `images` and `classes`; a pixel of class 2 is of a gate. Minut
 """
 
 import argparse
+import itertools
 import pathlib
 import time
 
@@ -49,7 +50,7 @@ class SmallUNet(nn.Module):
         super().__init__()
         sizes = [width, 2 * width, 4 * width, 8 * width]
         self.down = nn.ModuleList(block(a, b) for a, b in zip([3, *sizes], sizes))
-        self.up = nn.ModuleList(block(a + b, a) for a, b in zip(sizes[:-1], sizes[1:]))
+        self.up = nn.ModuleList(block(a + b, a) for a, b in itertools.pairwise(sizes))
         self.last = nn.Conv2d(width, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
@@ -104,8 +105,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("train", type=pathlib.Path)
     parser.add_argument("test", type=pathlib.Path)
-    parser.add_argument("--epochs", type=int, default=12)
-    parser.add_argument("--width", type=int, default=12, help="channels of the first stage")
+    parser.add_argument("--epochs", type=int, default=4)
+    parser.add_argument("--width", type=int, default=8, help="channels of the first stage")
     parser.add_argument("--batch", type=int, default=16)
     args = parser.parse_args()
     torch.manual_seed(1)
@@ -115,7 +116,8 @@ def main() -> None:
     optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=1e-4)
     batches = -(-len(images) // args.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=6e-3, total_steps=args.epochs * batches)
-    print(f"{len(images)} images to train with, {len(others)} others, {sum(p.numel() for p in network.parameters())} weights")
+    weights = sum(weight.numel() for weight in network.parameters())
+    print(f"{len(images)} images to train with, {len(others)} others, {weights} weights")
     start = time.monotonic()
     for epoch in range(args.epochs):
         network.train()
@@ -130,7 +132,8 @@ def main() -> None:
             total += float(loss.detach())
         overall, mean = score(network, others, true)
         spent = time.monotonic() - start
-        print(f"epoch {epoch + 1:2}  loss {total / batches:.3f}  IoU {overall:.4f}, mean of images {mean:.4f}  {spent:.0f} s", flush=True)
+        figures = f"loss {total / batches:.3f}  IoU {overall:.4f}, mean of images {mean:.4f}"
+        print(f"epoch {epoch + 1:2}  {figures}  {spent:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ pub(super) struct ImageRecord {
     pub(super) environment: EnvironmentConfig,
     /// Things that are seen, by their ids.
     pub(super) things: Vec<ThingRecord>,
-    /// Gates a corner of which is in the image, hidden ones too, in the order of the course.
+    /// Gates that are seen, and those a corner of which is in the image though hidden, in the order of the course.
     pub(super) gates: Vec<GateRecord>,
 }
 

@@ -146,8 +146,15 @@ impl<'a> LabelRenderer<'a> {
                 rle: rle::to_text(&mask.counts),
             }
         };
-        let things = rle::masks(&layers.instances, size).into_iter().map(thing).collect();
-        let gates = world.gates.iter().filter_map(|gate| seen_gate(gate, shot, &layers.depth_m));
+        let things: Vec<ThingRecord> =
+            rle::masks(&layers.instances, size).into_iter().map(thing).collect();
+        let is_seen = |gate: &Gate| gate.id != 0 && things.iter().any(|thing| thing.id == gate.id);
+        let gates = world.gates.iter().filter_map(|gate| {
+            let record = gate_record(gate, shot, &layers.depth_m);
+            let has_corner = record.corners.iter().any(|corner| corner.visibility > 0);
+            (has_corner || is_seen(gate)).then_some(record)
+        });
+        let gates = gates.collect();
         let next = shot
             .next
             .map(|(at_ns, pose)| NextRecord { at_ns, world_from_cam: PoseRecord::of(&pose) });
@@ -162,26 +169,26 @@ impl<'a> LabelRenderer<'a> {
             next,
             environment: shot.environment,
             things,
-            gates: gates.collect(),
+            gates,
         }
     }
 }
 
-/// Returns a gate's pose and corners; `None` where no corner is in the image.
-fn seen_gate(gate: &Gate, shot: &Shot, depth_m: &[f32]) -> Option<GateRecord> {
+/// Returns a gate's pose and corners.
+fn gate_record(gate: &Gate, shot: &Shot, depth_m: &[f32]) -> GateRecord {
     let cam_from_world = shot.world_from_cam.inverse();
     let corners = gate.corners_m().map(|corner_m| {
         let p_cam = cam_from_world.transform_point(corner_m);
         corner(&shot.intrinsics, p_cam, depth_m)
     });
     let cam_from_gate = cam_from_world * gate.world_from_gate;
-    corners.iter().any(|corner| corner.visibility > 0).then(|| GateRecord {
+    GateRecord {
         name: gate.name.clone(),
         id: gate.id,
         cam_from_gate: PoseRecord::of(&cam_from_gate),
         size_m: gate.size_m,
         corners,
-    })
+    }
 }
 
 /// Whether a point is seen: no surface of its pixel is well before it.
