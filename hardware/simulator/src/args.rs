@@ -86,6 +86,7 @@ pub struct SimArgs {
     /// Standard deviation of gusts along each horizontal axis, in metres per second.
     #[arg(long, value_name = "M/S", default_value_t = 0.0)]
     pub gusts: f64,
+    /// The autopilot's inertial sensor.
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
         "The autopilot's inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
         ImuModel::names()
