@@ -120,6 +120,7 @@ struct FlyArgs {
     /// From then until the answer takes effect
     #[arg(long, value_name = "MS", default_value_t = 10.0)]
     answer_delay: f64,
+    /// The simulated inertial sensor
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
         "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
         ImuModel::names()

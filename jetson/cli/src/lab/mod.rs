@@ -100,6 +100,7 @@ pub(crate) struct LabArgs {
     /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
     #[arg(long)]
     pub through_bridge: bool,
+    /// The simulated inertial sensor.
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
         "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}.",
         ImuModel::names()

@@ -40,7 +40,7 @@ pub struct Motion<'a> {
     pub duration_s: f64,
 }
 
-impl<'a> Motion<'a> {
+impl Motion<'_> {
     /// Returns the motion of a sensor that stands, in a scene without objects.
     pub fn standing(world_from_sensor: Pose<World, Sensor>) -> Motion<'static> {
         Motion { world_from_sensor: [world_from_sensor; 2], objects: &[], duration_s: 0.0 }

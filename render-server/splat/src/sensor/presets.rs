@@ -17,8 +17,11 @@ pub enum Preset {
     Radar(RadarModel),
 }
 
-/// Every named sensor: the name that files and command lines use, what it is, and its model.
-pub const PRESETS: [(&str, &str, fn() -> Preset); 12] = [
+/// The name that files and command lines use, what it is, and its model.
+pub type Named = (&'static str, &'static str, fn() -> Preset);
+
+/// Every named sensor.
+pub const PRESETS: [Named; 12] = [
     ("vlp-16", "Velodyne VLP-16: 16 rings, 30 degrees, 100 m", || Preset::Lidar(vlp_16())),
     ("os1-16", "Ouster OS1-16: 16 x 1024, 33.2 degrees, 120 m", || Preset::Lidar(os1(16))),
     ("os1-64", "Ouster OS1-64: 64 x 1024, 33.2 degrees, 120 m", || Preset::Lidar(os1(64))),

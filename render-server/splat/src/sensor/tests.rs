@@ -179,7 +179,7 @@ fn a_beam_over_an_edge_has_an_echo_of_each_side() {
     splats.sh.extend(near.sh);
     let scene = SensorScene::new(&splats);
     let ahead = |returns, divergence_rad, y_m| {
-        let model = LidarModel { returns, divergence_rad, ..exact(8) };
+        let model = LidarModel { divergence_rad, returns, ..exact(8) };
         scan(model, &scene, &Motion::standing(at(DVec3::Y * y_m, 0.0)))[4].range_m
     };
     // A footprint of 0.1 rad is 0.4 m wide there.
@@ -203,6 +203,8 @@ fn with_object() -> ([RigidObject; 1], Splats) {
     ([RigidObject { id: 9, splats }], Splats::default())
 }
 
+// Why: as placements are written.
+#[allow(clippy::unnecessary_wraps)]
 fn object_at(x_m: f64) -> Option<Pose<World, Object>> {
     Some(Pose::new(DVec3::X * x_m, DQuat::IDENTITY))
 }
