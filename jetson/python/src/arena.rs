@@ -6,6 +6,7 @@ use pyo3::prelude::*;
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
 use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_NO_FLY, PoseAges, bounded};
+use vizflyt_sdk::protocol::sensor::MAX_SENSORS;
 use vizflyt_sdk::{
     ArenaInfo as SdkArenaInfo, CameraInfo as SdkCameraInfo, Limits as SdkLimits, SetpointKind,
     SetpointKinds,
@@ -14,6 +15,7 @@ use vizflyt_sdk::{Body, Cam};
 
 use crate::arguments::{array3, vector};
 use crate::geometry::{Intrinsics, Pose, Volume};
+use crate::sensor::SensorInfo;
 
 /// One camera of the vehicle.
 ///
@@ -121,7 +123,7 @@ impl ArenaInfo {
     #[pyo3(signature = (
         *, name = "test", geofence = None, no_fly = Vec::new(), floor_z_m = 0.0, limits = None, body_radius_m = 0.12, takeoff_height_m = 1.0,
         goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, start_box = None, ground_truth = true,
-        attitude_rate = false, setpoints = None, cameras = Vec::new()
+        attitude_rate = false, setpoints = None, cameras = Vec::new(), sensors = Vec::new()
     ))]
     #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
     fn make(
@@ -140,6 +142,7 @@ impl ArenaInfo {
         attitude_rate: bool,
         setpoints: Option<Vec<String>>,
         cameras: Vec<CameraInfo>,
+        sensors: Vec<SensorInfo>,
     ) -> PyResult<Self> {
         if no_fly.len() > MAX_NO_FLY {
             return Err(PyValueError::new_err(format!(
@@ -160,6 +163,12 @@ impl ArenaInfo {
                 cameras.len()
             )));
         }
+        if sensors.len() > MAX_SENSORS {
+            return Err(PyValueError::new_err(format!(
+                "a vehicle has at most {MAX_SENSORS} sensors beside its cameras, not {}",
+                sensors.len()
+            )));
+        }
         let everywhere = vizflyt_sdk::Volume::Sphere { center_m: DVec3::ZERO, radius_m: 1000.0 };
         let usual = SdkLimits::new(5.0, 5.0);
         Ok(Self(SdkArenaInfo {
@@ -178,6 +187,7 @@ impl ArenaInfo {
             pose_ages: PoseAges::default(),
             setpoints: kinds,
             cameras: cameras.into_iter().map(|camera| camera.0).collect(),
+            sensors: sensors.into_iter().map(|sensor| sensor.0).collect(),
         }))
     }
 
@@ -270,6 +280,12 @@ impl ArenaInfo {
     #[getter]
     fn cameras(&self) -> Vec<CameraInfo> {
         self.0.cameras.iter().cloned().map(CameraInfo).collect()
+    }
+
+    /// The vehicle's sensors beside the cameras.
+    #[getter]
+    fn sensors(&self) -> Vec<SensorInfo> {
+        self.0.sensors.iter().cloned().map(SensorInfo).collect()
     }
 
     fn __repr__(&self) -> String {

@@ -7,22 +7,26 @@ use pyo3::exceptions::PyLookupError;
 use pyo3::prelude::*;
 use vizflyt_sdk::protocol::messages::Name;
 use vizflyt_sdk::{
-    CameraInfo as SdkCameraInfo, HostTime, ImageStamps, ObservationBuffer as SdkBuffer,
+    Body, CameraInfo as SdkCameraInfo, GivenReading, HostTime, ImageStamps,
+    ObservationBuffer as SdkBuffer, Pose as SdkPose, SensorInfo as SdkSensorInfo, World,
 };
 
 use crate::arena::CameraInfo;
 use crate::arguments::wrong_type;
 use crate::geometry::Pose;
 use crate::observation::{Battery, ImuSample, Observation, Vehicle};
+use crate::sensor::SensorInfo;
 use crate::shared_memory::Memory;
 
 /// Observations made by hand: for a plugin's own tests and for notebooks.
 ///
-/// `ObservationBuffer([CameraInfo(...)])` has planes for these cameras.
+/// `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras, and room for these sensors.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct ObservationBuffer {
     cameras: Vec<SdkCameraInfo>,
+    sensors: Vec<SdkSensorInfo>,
     names: Arc<[Name]>,
+    readings: Mutex<Vec<Option<OwnReading>>>,
     buffer: Mutex<SdkBuffer>,
 }
 
@@ -30,6 +34,11 @@ impl ObservationBuffer {
     /// Returns the cameras it has planes for.
     pub(crate) fn cameras(&self) -> &[SdkCameraInfo] {
         &self.cameras
+    }
+
+    /// Returns the sensors it has room for.
+    pub(crate) fn sensors(&self) -> &[SdkSensorInfo] {
+        &self.sensors
     }
 
     /// Lets `f` read the bytes.
@@ -41,11 +50,14 @@ impl ObservationBuffer {
 #[pymethods]
 impl ObservationBuffer {
     #[new]
-    fn make(cameras: Vec<CameraInfo>) -> Self {
+    #[pyo3(signature = (cameras, sensors = Vec::new()))]
+    fn make(cameras: Vec<CameraInfo>, sensors: Vec<SensorInfo>) -> Self {
         let cameras: Vec<_> = cameras.into_iter().map(|camera| camera.0).collect();
+        let sensors: Vec<_> = sensors.into_iter().map(|sensor| sensor.0).collect();
         let names = cameras.iter().map(|camera| camera.name.clone()).collect();
-        let buffer = Mutex::new(SdkBuffer::new(&cameras));
-        Self { cameras, names, buffer }
+        let buffer = Mutex::new(SdkBuffer::with_sensors(&cameras, &sensors));
+        let readings = Mutex::new(sensors.iter().map(|_| None).collect());
+        Self { cameras, sensors, names, readings, buffer }
     }
 
     /// Empties it and numbers it.
@@ -123,10 +135,65 @@ impl ObservationBuffer {
         Ok(())
     }
 
+    /// Fills in a sensor's reading: `records` as bytes or as an array of the layout that `SensorReading.records`
+    /// documents. `pose_at_reading` is where the body was. Stamps are of `time.monotonic_ns()`. [ns]
+    #[pyo3(signature = (name, records, *, seq = 1, stamp_ns = 0, pose_at_reading = None))]
+    fn set_reading(
+        &self,
+        name: &str,
+        records: &Bound<'_, PyAny>,
+        seq: u64,
+        stamp_ns: u64,
+        pose_at_reading: Option<Pose>,
+    ) -> PyResult<()> {
+        let index = self.sensors.iter().position(|sensor| sensor.name == name);
+        let index = index.ok_or_else(|| {
+            PyLookupError::new_err(format!("this buffer was made without a sensor '{name}'"))
+        })?;
+        let bytes: Vec<u8> = match records.extract::<Vec<u8>>() {
+            Ok(bytes) => bytes,
+            Err(_) => records.call_method0("tobytes")?.extract()?,
+        };
+        let world_from_body =
+            pose_at_reading.map(|pose| pose.typed("world", "body")).transpose()?;
+        let mut readings = self.readings.lock().unwrap_or_else(PoisonError::into_inner);
+        readings[index] = Some(OwnReading { seq, stamp_ns, world_from_body, bytes });
+        let given: Vec<_> = readings
+            .iter()
+            .zip(&self.sensors)
+            .map(|(reading, sensor)| reading.as_ref().map(|own| own.given(sensor)))
+            .collect();
+        self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_readings(&given);
+        Ok(())
+    }
+
     /// Returns what a plugin would see.
     fn observation(&self, py: Python<'_>) -> PyResult<Observation> {
         let memory = self.with_bytes(|bytes| Memory::copied(bytes, Arc::clone(&self.names)));
         Observation::new(py, memory, HostTime::ZERO)
+    }
+}
+
+/// A reading that was filled in.
+struct OwnReading {
+    seq: u64,
+    stamp_ns: u64,
+    world_from_body: Option<SdkPose<World, Body>>,
+    bytes: Vec<u8>,
+}
+
+impl OwnReading {
+    fn given(&self, sensor: &SdkSensorInfo) -> GivenReading<'_> {
+        let stamp = HostTime::from_ns(self.stamp_ns);
+        GivenReading {
+            seq: self.seq,
+            pose: stamp,
+            shown: stamp,
+            ready: stamp,
+            body_from_sensor: sensor.body_from_sensor,
+            world_from_body: self.world_from_body,
+            records: &self.bytes,
+        }
     }
 }
 

@@ -15,6 +15,7 @@ mod observation;
 mod odometry;
 mod plugin_end;
 mod rehearsal;
+mod sensor;
 mod setpoint;
 mod shared_memory;
 
@@ -41,6 +42,8 @@ mod _vizflyt {
     use crate::plugin_end::{PluginEnd, waiting_services};
     #[pymodule_export]
     use crate::rehearsal::Rehearsal;
+    #[pymodule_export]
+    use crate::sensor::{SensorInfo, SensorReading};
     #[pymodule_export]
     use crate::setpoint::Setpoint;
 

@@ -9,6 +9,7 @@ use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::yaw_of;
+use vizflyt_sdk::protocol::packet::ObservationHeader;
 use vizflyt_sdk::{
     Battery as SdkBattery, CameraImage as SdkCameraImage, HostTime, ImuSample as SdkImuSample,
     Intrinsics as SdkIntrinsics, Observation as SdkObservation, Pose as SdkPose,
@@ -18,6 +19,7 @@ use vizflyt_sdk::{Body, Cam, World};
 
 use crate::arguments::{array3, quaternion, vector};
 use crate::geometry::{Intrinsics, Pose};
+use crate::sensor::SensorReading;
 use crate::shared_memory::{Memory, depth_array, rgb_array};
 
 /// The vehicle and its cameras' images at one moment.
@@ -37,6 +39,9 @@ pub(crate) struct Observation {
     imu: Vec<SdkImuSample>,
     battery: SdkBattery,
     images: Vec<Py<CameraImage>>,
+    readings: Vec<Py<SensorReading>>,
+    /// The sensors' names, with a reading or without.
+    sensor_names: Vec<String>,
 }
 
 /// One camera's RGB-D image. Row 0 is the top; index arrays as [y, x].
@@ -89,10 +94,19 @@ impl Observation {
             .cameras()
             .map(|image| Py::new(py, CameraImage::new(&memory, &image)))
             .collect::<PyResult<_>>()?;
+        let header = ObservationHeader::parse(memory.bytes())
+            .map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let table = header.sensors(memory.bytes());
+        let sensor_names = table.iter().map(|sensor| sensor.name().to_owned()).collect();
+        let mut readings = Vec::new();
+        for (sensor, reading) in table.iter().filter(|sensor| sensor.seq > 0).zip(seen.sensors()) {
+            let place = (sensor.records_offset as usize, sensor.record_count as usize);
+            readings.push(Py::new(py, SensorReading::new(&memory, &reading, place))?);
+        }
         let vehicle = seen.vehicle().map(|vehicle| Py::new(py, Vehicle(vehicle))).transpose()?;
         let (imu, battery) = (seen.imu().collect(), seen.battery());
         let (seq, stamp_ns) = (seen.seq(), seen.stamp().as_ns());
-        Ok(Self { memory, seq, stamp_ns, vehicle, imu, battery, images })
+        Ok(Self { memory, seq, stamp_ns, vehicle, imu, battery, images, readings, sensor_names })
     }
 
     /// Returns when its newest IMU sample was measured.
@@ -119,6 +133,30 @@ impl Observation {
             "there is no camera '{name}'; this vehicle has {}",
             if known.is_empty() { "none".to_owned() } else { known.join(", ") }
         )))
+    }
+
+    /// Returns the newest reading of the sensor of this name; None if it has none yet.
+    ///
+    /// Raises LookupError if the vehicle has no such sensor.
+    fn sensor(&self, py: Python<'_>, name: &str) -> PyResult<Option<Py<SensorReading>>> {
+        if let Some(reading) = self.readings.iter().find(|reading| reading.get().is(name)) {
+            return Ok(Some(reading.clone_ref(py)));
+        }
+        if self.sensor_names.iter().any(|known| known == name) {
+            return Ok(None);
+        }
+        let known: Vec<String> =
+            self.sensor_names.iter().map(|known| format!("'{known}'")).collect();
+        Err(PyLookupError::new_err(format!(
+            "there is no sensor '{name}'; this vehicle has {}",
+            if known.is_empty() { "none".to_owned() } else { known.join(", ") }
+        )))
+    }
+
+    /// The newest readings there are, in the order of the arena's sensors.
+    #[getter]
+    fn sensors(&self, py: Python<'_>) -> Vec<Py<SensorReading>> {
+        self.readings.iter().map(|reading| reading.clone_ref(py)).collect()
     }
 
     /// The images there are, in the order of the arena's cameras.

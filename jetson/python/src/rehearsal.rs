@@ -78,7 +78,10 @@ impl Rehearsal {
     fn publish(&self, buffer: &ObservationBuffer) -> PyResult<()> {
         let mut loan = self
             .end
-            .loan(ObservationWriter::len_for(buffer.cameras()))
+            .loan(
+                ObservationWriter::len_for(buffer.cameras())
+                    + ObservationWriter::sensors_len(buffer.sensors()),
+            )
             .map_err(|error| failed(&error))?;
         buffer.with_bytes(|bytes| {
             let memory = loan.memory();

@@ -29,7 +29,7 @@ use crate::descriptors;
 use crate::flight::FlightSettings;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::Report;
-use crate::stream::{self, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
+use crate::stream::{self, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
 
 /// How long the last events may take to reach the server.
 const GOODBYE: Duration = Duration::from_millis(500);
@@ -88,7 +88,8 @@ pub fn fly_command(
         forward_reloads(reloads, sender.clone())?;
     }
 
-    let shared = Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
+    let shared =
+        Shared { clock: ServerClock::default(), mailbox: Arc::default(), readings: Arc::default() };
     let to_server = Arc::new(Outbox::default());
     watch_signals(&tokio, sender.clone())?;
     let settings = StreamSettings {

@@ -15,20 +15,24 @@
 //!
 //! Cameras may change while flying: each image carries the camera it was rendered with, and so does the
 //! observation that holds it. The plugin never sees an image with another one's intrinsics.
+//!
+//! The newest readings of the other sensors are copied behind the images as the observation is published; a vehicle
+//! without such sensors pays nothing.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use vizflyt_protocol::messages::{Arrivals, CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_rgbd::{DecodeError, Decoder, ImageMut, Info};
 use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 use vizflyt_sdk::{ImageStamps, ObservationTooLarge, ObservationWriter, PlanesMut, host_now};
 
 use crate::companion::Senses;
-use crate::log::{ImageLog, LoggedImage, observation_head};
-use crate::stream::{Arrival, Mailbox, Step, Whole};
+use crate::log::{ImageLog, LoggedImage, LoggedSensors, observation_head};
+use crate::stream::{Arrival, Mailbox, NewestReadings, Readings, Step, Whole};
 use crate::waterfall::Stamps;
 
 /// The control loop writes them, the image publisher reads them.
@@ -63,6 +67,8 @@ pub struct ImagePublisher {
     under_way: Option<UnderWay>,
     rejected: u64,
     log: Option<ImageLog>,
+    sensors: Vec<SensorInfo>,
+    readings: Arc<Readings>,
 }
 
 /// One camera's decoder and the image it is at.
@@ -118,7 +124,14 @@ impl ImagePublisher {
             under_way: None,
             rejected: 0,
             log: None,
+            sensors: Vec::new(),
+            readings: Arc::default(),
         }
+    }
+
+    /// Puts the newest of `readings` of these sensors (at most 8) into what it publishes.
+    pub fn with_sensors(self, sensors: Vec<SensorInfo>, readings: Arc<Readings>) -> Self {
+        Self { sensors, readings, ..self }
     }
 
     /// Logs what it publishes.
@@ -272,7 +285,8 @@ impl ImagePublisher {
         }
         self.follow(camera, &arrival)?;
         if self.under_way.is_none() {
-            let memory = self.ipc.loan(ObservationWriter::len_for(&self.cameras))?;
+            let len = self.observation_len();
+            let memory = self.ipc.loan(len)?;
             (self.seq, self.homes) = (self.seq + 1, self.homes + 1);
             let (seq, home, cameras) = (self.seq, self.homes, &self.cameras);
             self.under_way = Some(UnderWay::new(memory, seq, home, cameras, tick, together)?);
@@ -304,7 +318,8 @@ impl ImagePublisher {
         else {
             return Ok(());
         };
-        let mut memory = self.ipc.loan(ObservationWriter::len_for(&self.cameras))?;
+        let len = self.observation_len();
+        let mut memory = self.ipc.loan(len)?;
         let old = under_way.memory.bytes();
         ObservationWriter::adopt(memory.memory(), &self.cameras, old, &before)?;
         self.homes += 1;
@@ -318,23 +333,46 @@ impl ImagePublisher {
         if done.there == 0 {
             return Ok(());
         }
+        let mut readings = NewestReadings::default();
         if let Ok(mut writer) = ObservationWriter::resume(done.memory.memory(), &self.cameras) {
             let senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
             senses.write(&mut writer);
             for header in &done.headers {
                 senses.write_pose_at_image(&mut writer, header);
             }
+            if !self.sensors.is_empty() {
+                readings = self.readings.newest();
+                senses.write_readings(&mut writer, &self.sensors, &readings);
+            }
         }
-        let logged =
-            self.log.as_ref().map(|log| (log, observation_head(done.memory.bytes()).to_vec()));
+        let logged = self.log.as_ref().map(|log| {
+            let bytes = done.memory.bytes();
+            let sensors = LoggedSensors::of(bytes, &self.sensors, &readings);
+            (log, observation_head(bytes).to_vec(), sensors)
+        });
         // Told first: the answer must not overtake it.
         notify(done.published.clone());
         let published_at = host_now();
         self.ipc.publish(done.memory)?;
-        if let Some((log, head)) = logged {
-            log.observation(published_at, done.published.seq, head, done.logged);
+        if let Some((log, head, sensors)) = logged {
+            log.observation(published_at, done.published.seq, head, done.logged, sensors);
         }
         Ok(())
+    }
+
+    /// Returns how many bytes an observation takes now. [bytes]
+    fn observation_len(&mut self) -> usize {
+        let len = ObservationWriter::len_for(&self.cameras);
+        if self.sensors.is_empty() {
+            return len;
+        }
+        // A sensor that was changed in flight may see more than it was announced to.
+        let newest = self.readings.newest();
+        for (sensor, reading) in self.sensors.iter_mut().zip(newest.iter()) {
+            let Some(reading) = reading else { continue };
+            sensor.most_records = sensor.most_records.max(reading.header.record_count.get());
+        }
+        len + ObservationWriter::sensors_len(&self.sensors)
     }
 
     /// Gives up a camera's image, and the observation if nothing else is or will be in it.

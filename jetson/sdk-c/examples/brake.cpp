@@ -1,5 +1,6 @@
 // Flies ahead as fast as the way is free, and turns where it is not: a C++ plugin on vizflyt.h.
 #include <algorithm>
+#include <cmath>
 #include <cstdio>
 #include <cstring>
 
@@ -36,11 +37,25 @@ double nearest_m(const VizflytObservation *obs, unsigned camera) {
     return nearest;
 }
 
+// Returns what a range finder "ahead" and a LiDAR "top" have ahead, in metres; 20 where there are none.
+double sensed_m(const VizflytObservation *obs) {
+    double nearest = 20.0;
+    const VizflytSensor *ahead = vizflyt_sensor(obs, "ahead");
+    if (const void *records = vizflyt_records(obs, ahead))
+        if (const auto *range = static_cast<const VizflytRange *>(records); range->range_m > 0)
+            nearest = range->range_m;
+    const VizflytSensor *top = vizflyt_sensor(obs, "top");
+    if (const auto *points = static_cast<const VizflytLidarPoint *>(vizflyt_records(obs, top)))
+        for (uint32_t i = 0; i < top->record_count; ++i)
+            if (points[i].p_m[0] > std::abs(points[i].p_m[1])) nearest = std::min<double>(nearest, points[i].p_m[0]);
+    return nearest;
+}
+
 int on_image(void *user, const VizflytObservation *obs, VizflytSetpoint *answer) {
     auto *self = static_cast<Brake *>(user);
     if (!vizflyt_depth_mm(obs, self->camera)) return 0;
     ++self->images;
-    const double free_m = nearest_m(obs, self->camera) - 1.0;
+    const double free_m = std::min(nearest_m(obs, self->camera), sensed_m(obs)) - 1.0;
     answer->kind = VIZFLYT_VELOCITY;
     answer->axes = VIZFLYT_HEADING;
     answer->v[0] = std::clamp(0.5 * free_m, 0.0, self->max_speed_mps);

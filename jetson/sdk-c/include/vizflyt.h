@@ -23,13 +23,15 @@
 
 #include <stddef.h>
 #include <stdint.h>
+#include <string.h>
 
 #ifdef __cplusplus
 extern "C" {
 #endif
 
-#define VIZFLYT_PROTOCOL_VERSION 12
+#define VIZFLYT_PROTOCOL_VERSION 13
 #define VIZFLYT_MAX_CAMERAS 8
+#define VIZFLYT_MAX_SENSORS 8
 #define VIZFLYT_MAX_IMU 64
 #define VIZFLYT_MAX_WAYPOINTS 32
 #define VIZFLYT_MAX_PIECES 8
@@ -84,7 +86,67 @@ typedef struct VizflytObservation {
     double battery_v;        /* 0 if unknown */
     VizflytImu imu[VIZFLYT_MAX_IMU]; /* the newest, oldest first; those had before come again */
     VizflytCamera cameras[VIZFLYT_MAX_CAMERAS];
+    uint32_t sensors_offset; /* of the table of sensors beside the cameras, if there are any */
+    uint32_t sensor_count;
 } VizflytObservation;
+
+/* Kinds of sensors beside the cameras. */
+enum { VIZFLYT_LIDAR = 1, VIZFLYT_RANGE_FINDER = 2, VIZFLYT_SONAR = 3, VIZFLYT_RADAR = 4 };
+
+/* One sensor and its newest reading: record_count records at records_offset from the start of the observation. A reading
+ * stays until the next one comes: seq tells whether it is new. Sensor axes: x forward, y left, z up. */
+typedef struct VizflytSensor {
+    uint64_t seq;              /* counts readings from 1; 0: none yet */
+    uint64_t pose_ns;          /* when the newest pose behind the reading was measured */
+    uint64_t stamp_ns;         /* the instant that the reading is of; a sweep's last */
+    uint64_t ready_ns;         /* when the runtime had it */
+    double translation_m[3];   /* of the sensor in the body */
+    double rotation_xyzw[4];   /* sensor to body */
+    double body_position_m[3];    /* of the body at that instant, world; zero where the course withholds it */
+    double body_rotation_xyzw[4]; /* body to world at that instant; likewise: no rotation is all zero */
+    uint32_t kind;
+    uint32_t record_count;
+    uint32_t records_offset;
+    uint32_t reserved;
+    char name[32]; /* zeros behind it; of 32 bytes none */
+} VizflytSensor;
+
+/* One return of a LiDAR; beams without a return have none. */
+typedef struct VizflytLidarPoint {
+    float p_m[3];       /* in the sensor's axes when this beam was fired: not corrected for motion during the sweep */
+    uint32_t before_ns; /* how long before stamp_ns the beam was fired */
+    uint16_t intensity; /* freed of range: 255 of a white surface across the whole beam */
+    uint16_t ring;
+} VizflytLidarPoint;
+
+/* Of a range finder and a sonar: one per reading. */
+typedef struct VizflytRange {
+    float range_m; /* along x; 0: nothing came back */
+    float signal;  /* power of the echo over the detection threshold */
+} VizflytRange;
+
+typedef struct VizflytRadarDetection {
+    float range_m;
+    float azimuth_rad; /* to the left of x */
+    float radial_mps;  /* positive: it goes away */
+    float snr_db;
+    float cross_section_m2;
+} VizflytRadarDetection;
+
+/* Returns the sensor of this name; NULL if there is none. */
+static inline const VizflytSensor *vizflyt_sensor(const VizflytObservation *obs, const char *name) {
+    const VizflytSensor *sensors = (const VizflytSensor *)(const void *)((const uint8_t *)obs + obs->sensors_offset);
+    for (uint32_t i = 0; i < obs->sensor_count; i++)
+        if (strncmp(sensors[i].name, name, sizeof sensors[i].name) == 0) return &sensors[i];
+    return NULL;
+}
+
+/* Returns the records of a sensor's newest reading: VizflytLidarPoint, VizflytRange or VizflytRadarDetection, by its kind;
+ * NULL if it has none yet. */
+static inline const void *vizflyt_records(const VizflytObservation *obs, const VizflytSensor *sensor) {
+    if (sensor == NULL || sensor->seq == 0) return NULL;
+    return (const uint8_t *)obs + sensor->records_offset;
+}
 
 /* Returns the colour image, H x W x 3 bytes, sRGB; NULL if the camera has none yet. */
 static inline const uint8_t *vizflyt_rgb(const VizflytObservation *obs, unsigned camera) {
@@ -212,7 +274,13 @@ int vizflyt_run(const VizflytPlugin *plugin);
 }
 static_assert(sizeof(VizflytCamera) == 232, "layout of the shared memory");
 static_assert(sizeof(VizflytImu) == 32, "layout of the shared memory");
-static_assert(sizeof(VizflytObservation) == 4056, "layout of the shared memory");
+static_assert(sizeof(VizflytSensor) == 192, "layout of the shared memory");
+static_assert(offsetof(VizflytSensor, kind) == 144, "layout of the shared memory");
+static_assert(sizeof(VizflytLidarPoint) == 20, "layout of the shared memory");
+static_assert(sizeof(VizflytRange) == 8, "layout of the shared memory");
+static_assert(sizeof(VizflytRadarDetection) == 20, "layout of the shared memory");
+static_assert(offsetof(VizflytObservation, sensors_offset) == 4056, "layout of the shared memory");
+static_assert(sizeof(VizflytObservation) == 4064, "layout of the shared memory");
 static_assert(offsetof(VizflytObservation, cameras) == 2200, "layout of the shared memory");
 #endif
 

@@ -8,6 +8,7 @@ use std::process::ExitCode;
 use vizflyt_sdk::glam::{DQuat, DVec3};
 use vizflyt_sdk::protocol::messages::{MAX_CAMERAS, MAX_NO_FLY, MAX_PIECES, MAX_WAYPOINTS};
 use vizflyt_sdk::protocol::packet::ObservationHeader;
+use vizflyt_sdk::protocol::sensor::{LidarPoint, RadarDetection, RangeReading, SensorHeader};
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, Axes, Event, HostTime, Observation, Path, PathYaw, Piece, Pose, Setpoint,
     SetpointKind, Trajectory, Volume, Waypoint, YawTarget,
@@ -365,5 +366,10 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
 }
 
 // What `vizflyt.h` asserts on its side.
-const _: () = assert!(size_of::<ObservationHeader>() == 4056);
+const _: () = assert!(size_of::<ObservationHeader>() == 4064);
+const _: () = assert!(std::mem::offset_of!(ObservationHeader, sensors_offset) == 4056);
+const _: () = assert!(size_of::<SensorHeader>() == 192);
+const _: () = assert!(std::mem::offset_of!(SensorHeader, kind) == 144);
+const _: () = assert!(size_of::<LidarPoint>() == 20 && size_of::<RangeReading>() == 8);
+const _: () = assert!(size_of::<RadarDetection>() == 20);
 const _: () = assert!(std::mem::offset_of!(ObservationHeader, cameras) == 2200);

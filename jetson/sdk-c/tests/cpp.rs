@@ -6,11 +6,13 @@ use std::time::{Duration, Instant};
 
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{RuntimeEnd, SERVICE_OPTION};
-use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin};
+use vizflyt_sdk::protocol::messages::{FromPlugin, ToPlugin, bounded};
 use vizflyt_sdk::{
-    ArenaInfo, Axes, CameraInfo, ImageStamps, Intrinsics, Limits, ObservationWriter, Setpoint,
-    Volume, YawTarget,
+    ArenaInfo, Axes, CameraInfo, GivenReading, HostTime, ImageStamps, Intrinsics, LidarPoint,
+    Limits, ObservationWriter, Pose, RangeReading, SensorInfo, SensorKind, Setpoint, Volume,
+    YawTarget,
 };
+use zerocopy::IntoBytes;
 
 const WAIT: Duration = Duration::from_secs(20);
 
@@ -62,10 +64,31 @@ fn arena() -> ArenaInfo {
     }
 }
 
+fn sensors() -> [SensorInfo; 2] {
+    [("top", SensorKind::Lidar, 4), ("ahead", SensorKind::RangeFinder, 1)].map(
+        |(name, kind, most_records)| SensorInfo {
+            name: bounded(name),
+            kind,
+            enabled: true,
+            to_autopilot: false,
+            rate_hz: 10.0,
+            min_range_m: 0.1,
+            max_range_m: 10.0,
+            horizontal_fov_rad: 0.1,
+            vertical_fov_rad: 0.1,
+            most_records,
+            body_from_sensor: Pose::IDENTITY,
+        },
+    )
+}
+
 struct Rig {
     ipc: RuntimeEnd,
     child: Child,
     seq: u64,
+    /// What the range finder measures; 0 is nothing. [m]
+    range_m: f32,
+    points: Vec<LidarPoint>,
 }
 
 impl Drop for Rig {
@@ -88,7 +111,7 @@ impl Rig {
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
-        let mut rig = Self { ipc, child, seq: 0 };
+        let mut rig = Self { ipc, child, seq: 0, range_m: 0.0, points: Vec::new() };
         let until = Instant::now() + WAIT;
         while !rig.ipc.plugin_attached() {
             assert!(Instant::now() < until && rig.child.try_wait().unwrap().is_none());
@@ -114,12 +137,28 @@ impl Rig {
     fn see(&mut self, depth_mm: u16) -> Option<Setpoint> {
         self.seq += 1;
         let cameras = &arena().cameras;
-        let mut loan = self.ipc.loan(ObservationWriter::len_for(cameras)).unwrap();
+        let len = ObservationWriter::len_for(cameras) + ObservationWriter::sensors_len(&sensors());
+        let mut loan = self.ipc.loan(len).unwrap();
         let mut writer = ObservationWriter::new(loan.memory(), self.seq, cameras).unwrap();
         if depth_mm > 0 {
             writer.planes(1, &cameras[1]).unwrap().depth_mm.fill(depth_mm);
             writer.image_ready(1, &cameras[1], ImageStamps::default());
         }
+        let given = |records| GivenReading {
+            seq: 1,
+            pose: HostTime::ZERO,
+            shown: HostTime::ZERO,
+            ready: HostTime::ZERO,
+            body_from_sensor: Pose::IDENTITY,
+            world_from_body: None,
+            records,
+        };
+        let range = RangeReading { range_m: self.range_m, signal: 1.0 };
+        let readings = [
+            (!self.points.is_empty()).then(|| given(self.points.as_bytes())),
+            Some(given(range.as_bytes())),
+        ];
+        writer.sensors(&sensors(), &readings);
         self.ipc.publish(loan).unwrap();
         let FromPlugin::Reply { seq, setpoint, .. } = self.next() else { panic!("no answer") };
         assert_eq!(seq, self.seq);
@@ -139,12 +178,18 @@ fn a_cpp_plugin_attaches_sees_and_answers() {
     assert_eq!(rig.see(9000), ahead(1.0, YawTarget::Keep));
     assert_eq!(rig.see(2000), ahead(0.5, YawTarget::Keep));
     assert_eq!(rig.see(900), ahead(0.0, YawTarget::Rate(0.5)));
+    // The other sensors: the nearest of all counts.
+    rig.range_m = 2.0;
+    assert_eq!(rig.see(9000), ahead(0.5, YawTarget::Keep));
+    let at = |x: f32, y: f32| LidarPoint { p_m: [x, y, 0.1], ..LidarPoint::default() };
+    rig.points = vec![at(5.0, 0.0), at(1.5, -0.2), at(0.5, 3.0)];
+    assert_eq!(rig.see(9000), ahead(0.25, YawTarget::Keep));
     rig.ipc.send(&ToPlugin::Stop).unwrap();
     let mut output = String::new();
     std::io::Read::read_to_string(rig.child.stdout.as_mut().unwrap(), &mut output).unwrap();
     assert!(rig.child.wait().unwrap().success());
     assert_eq!(
         output,
-        "flying in hall: floor at 0.25 m, 1 no-fly boxes, a map of 1, velocities allowed\nstopped after 3 images\n"
+        "flying in hall: floor at 0.25 m, 1 no-fly boxes, a map of 1, velocities allowed\nstopped after 5 images\n"
     );
 }

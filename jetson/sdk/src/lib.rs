@@ -37,16 +37,23 @@ mod memory;
 mod observation;
 mod odometry;
 mod run;
+mod sensor;
 
 pub use glam;
 #[cfg(feature = "opencv")]
 pub use opencv;
 pub use vizflyt_protocol as protocol;
 
-pub use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Odom, Pose, Twist, Volume, World};
+pub use vizflyt_protocol::geometry::{
+    Body, Cam, Intrinsics, Odom, Pose, Sensor, Twist, Volume, World,
+};
 pub use vizflyt_protocol::messages::{
     ArenaInfo, Axes, CameraInfo, Event, EventKind, FlightPhase, Limits, Odometry, Path, PathYaw,
     Piece, Setpoint, SetpointKind, SetpointKinds, Trajectory, Waypoint, YawTarget,
+};
+pub use vizflyt_protocol::sensor::memory::Records;
+pub use vizflyt_protocol::sensor::{
+    LidarPoint, RadarDetection, RangeReading, SensorInfo, SensorKind,
 };
 pub use vizflyt_protocol::time::HostTime;
 
@@ -59,6 +66,7 @@ pub use memory::{
 pub use observation::{Battery, CameraImage, ImuSample, Observation, Vehicle};
 pub use odometry::{OdometryError, publish_odometry, take_odometry};
 pub use run::{attach, run};
+pub use sensor::{GivenReading, SensorReading};
 
 /// The plugin in the project's README compiles.
 #[cfg(doctest)]

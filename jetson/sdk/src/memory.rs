@@ -4,10 +4,12 @@
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Name};
 use vizflyt_protocol::packet::{ImuRecord, MAX_IMU, ObservationHeader, ObservationLayout};
+use vizflyt_protocol::sensor::{MAX_SENSORS, SensorInfo};
 use vizflyt_protocol::time::HostTime;
 use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 
 use crate::observation::{Battery, ImuSample, Observation, Vehicle};
+use crate::sensor::GivenReading;
 
 /// When an image's pose was measured, when it was ready, and which tick made it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -134,6 +136,15 @@ impl<'m> ObservationWriter<'m> {
         Ok(Self { memory, layout })
     }
 
+    /// Returns where the last image ends. [bytes]
+    pub(crate) fn images_end(&self) -> usize {
+        self.layout.total_len
+    }
+
+    pub(crate) fn memory(&mut self) -> &mut [u8] {
+        self.memory
+    }
+
     fn header(&mut self) -> &mut ObservationHeader {
         ObservationHeader::mut_from_prefix(self.memory).expect("checked in `new`").0
     }
@@ -235,6 +246,7 @@ fn layout_of(cameras: &[CameraInfo]) -> ObservationLayout {
 pub struct ObservationBuffer {
     blocks: Vec<Block>,
     cameras: Vec<CameraInfo>,
+    sensors: Vec<SensorInfo>,
     names: Vec<Name>,
 }
 
@@ -249,10 +261,20 @@ impl ObservationBuffer {
     /// # Panics
     /// If the cameras together need 4 GiB or more.
     pub fn new(cameras: &[CameraInfo]) -> Self {
+        Self::with_sensors(cameras, &[])
+    }
+
+    /// As [`Self::new`], with room for the readings of these sensors (at most 8).
+    ///
+    /// # Panics
+    /// As [`Self::new`].
+    pub fn with_sensors(cameras: &[CameraInfo], sensors: &[SensorInfo]) -> Self {
         let cameras = cameras[..cameras.len().min(MAX_CAMERAS)].to_vec();
+        let sensors = sensors[..sensors.len().min(MAX_SENSORS)].to_vec();
         let names = cameras.iter().map(|camera| camera.name.clone()).collect();
-        let len = ObservationWriter::len_for(&cameras).div_ceil(size_of::<Block>());
-        let mut buffer = Self { blocks: vec![Block::new_zeroed(); len], cameras, names };
+        let len = ObservationWriter::len_for(&cameras) + ObservationWriter::sensors_len(&sensors);
+        let blocks = vec![Block::new_zeroed(); len.div_ceil(size_of::<Block>())];
+        let mut buffer = Self { blocks, cameras, sensors, names };
         buffer.clear(0);
         buffer
     }
@@ -304,6 +326,13 @@ impl ObservationBuffer {
     /// Fills in where the body was at the instant that camera `index`'s image shows.
     pub fn set_pose_at_image(&mut self, index: usize, world_from_body: &Pose<World, Body>) {
         self.writer().pose_at_image(index, world_from_body);
+    }
+
+    /// Fills in the newest readings, in the order of the sensors; `None` of one that has none yet.
+    pub fn set_readings(&mut self, readings: &[Option<GivenReading<'_>>]) {
+        let sensors = std::mem::take(&mut self.sensors);
+        self.writer().sensors(&sensors, readings);
+        self.sensors = sensors;
     }
 
     /// Returns the bytes in the layout of [`ObservationHeader`], aligned to 64.

@@ -106,6 +106,10 @@ impl<'a> Observation<'a> {
         Self { imu_after: stamp, ..self }
     }
 
+    pub(crate) fn header(&self) -> &'a ObservationHeader {
+        self.header
+    }
+
     /// Returns the memory it lies in, in the layout of [`ObservationHeader`].
     pub fn as_bytes(&self) -> &'a [u8] {
         self.bytes

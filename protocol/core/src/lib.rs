@@ -11,6 +11,7 @@
 //! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
+//! - [`sensor`]: sensors beside the cameras, by kind; their readings on the wire and in shared memory;
 //! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is.
 //!
 //! Absent on purpose: sockets, clocks, threads, files.
@@ -24,10 +25,11 @@ pub mod histogram;
 pub mod mavlink;
 pub mod messages;
 pub mod packet;
+pub mod sensor;
 pub mod time;
 
 /// Version of everything in this crate that crosses a wire or shared memory.
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first
 /// ([`packet::Preamble`]) and refuse a mismatch by name.
-pub const PROTOCOL_VERSION: u16 = 12;
+pub const PROTOCOL_VERSION: u16 = 13;

@@ -24,6 +24,7 @@ mod no_fly;
 mod object;
 mod rules;
 mod scene;
+mod sensor;
 pub(crate) mod validate;
 mod vehicle;
 
@@ -35,6 +36,7 @@ pub use no_fly::NoFly;
 pub use object::{MAX_OBJECTS, MotionConfig, ObjectConfig};
 pub use rules::RulesConfig;
 pub use scene::{METRES_PER_UNIT, SceneConfig, UnknownAxis, Up};
+pub use sensor::SensorConfig;
 pub use validate::{ConfigError, check_number, check_position, invalid};
 pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
@@ -85,6 +87,9 @@ pub struct ArenaConfig {
     pub pose: PoseConfig,
     /// The cameras, in the order of their index on the wire; 1 to 8.
     pub cameras: Vec<CameraConfig>,
+    /// The sensors beside the cameras, in the order of their index on the wire; up to 8.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub sensors: Vec<SensorConfig>,
     /// The vehicles, up to 8; without any, the server's command line names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<VehicleConfig>,
@@ -280,7 +285,8 @@ impl ArenaConfig {
         if self.attitude_rate { allowed.with(SetpointKind::AttitudeRate) } else { allowed }
     }
 
-    /// Returns what the runtime must know. Of a validated config nothing is cut.
+    /// Returns what the runtime must know, but for the sensors, whose models the server knows. Of a validated config
+    /// nothing is cut.
     pub fn info(&self) -> ArenaInfo {
         ArenaInfo {
             name: bounded(&self.name),
@@ -301,6 +307,7 @@ impl ArenaConfig {
             },
             setpoints: self.setpoints(),
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
+            sensors: Default::default(),
         }
     }
 }

@@ -15,7 +15,7 @@ use core::str::FromStr;
 
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_arena::config::{CameraConfig, RulesConfig};
+use vizflyt_arena::config::{CameraConfig, RulesConfig, SensorConfig};
 use vizflyt_protocol::messages::{Limits, SetpointKinds};
 
 use crate::hall::{self, Layout};
@@ -139,6 +139,8 @@ struct SensorSuite {
     #[serde(default)]
     setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
+    #[serde(default)]
+    sensors: Vec<SensorConfig>,
 }
 
 impl CourseProject {
@@ -223,6 +225,7 @@ impl CourseProject {
                 ..plan.rules
             },
             cameras: suite.cameras.clone(),
+            sensors: suite.sensors.clone(),
             environment: variant.environment(),
             goal: arena.goal.filter(|_| plan.finish == Finish::Goal),
             ..arena.clone()

@@ -1,13 +1,18 @@
-//! Image and observation headers from a network and from shared memory.
+//! Headers of images, observations and sensors' readings from a network and from shared memory.
 #![no_main]
 use libfuzzer_sys::fuzz_target;
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer, ObservationHeader};
+use vizflyt_protocol::sensor::ReadingHeader;
 
 fuzz_target!(|bytes: &[u8]| {
     if let Ok((header, _)) = ImageHeader::parse(bytes) {
         assert!(header.intrinsics().validate().is_ok());
         assert!(header.world_from_cam().is_valid());
         assert!(header.most_payload() >= 8 * header.intrinsics().pixels() as u64);
+    }
+    if let Ok((header, _)) = ReadingHeader::parse(bytes) {
+        assert!(header.world_from_body().is_valid() && header.body_from_sensor().is_valid());
+        assert!(header.payload_len() <= header.kind().max_records() * header.kind().record_len());
     }
     if let Some(trailer) = bytes.first_chunk::<{ ImageTrailer::SIZE }>()
         && let Ok(found) = ImageTrailer::parse(trailer, bytes.len() as u64)
@@ -23,6 +28,9 @@ fuzz_target!(|bytes: &[u8]| {
             let pixels = camera.width_px as usize * camera.height_px as usize;
             assert!(camera.rgb_offset as usize + 3 * pixels <= memory.len());
             assert!(camera.depth_offset as usize + 2 * pixels <= memory.len());
+        }
+        for sensor in header.sensors(memory) {
+            assert!(sensor.seq == 0 || sensor.records(memory).is_some());
         }
     }
 });

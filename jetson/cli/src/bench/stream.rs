@@ -365,7 +365,11 @@ impl Link {
         let rooms = Rooms::bare(vehicles, Adaptation::default(), Stop::default());
         let tokio =
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-        let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
+        let shared = Shared {
+            clock: ServerClock::default(),
+            mailbox: Arc::default(),
+            readings: Arc::default(),
+        };
         {
             let _inside = tokio.enter();
             let congestion = Congestion::Auto;

@@ -5,6 +5,7 @@
 //! tick of 2.5 ms:  Simulation ──MAVLink──▶ Lockstep ──MAVLink──▶ Simulation
 //!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Lockstep
 //! image is due:    Referee's motion ─▶ where the vehicle will be when it is seen ─▶ CpuRenderer
+//! sensor is due:   likewise ─▶ reading, on its way as long as an image
 //! image is seen:   observation ─▶ plugin ─▶ answer; it counts `answer` later
 //! ```
 //! No wall clock decides anything but that a plugin is hung, and no order of threads anything at
@@ -15,6 +16,7 @@ use std::cell::Cell;
 use std::collections::VecDeque;
 use std::ffi::OsString;
 use std::fs::File;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
@@ -35,13 +37,16 @@ use vizflyt_runtime::flight::FlightSettings;
 use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
 use vizflyt_runtime::log::{GivenImage, LoggedImages, VirtualLog};
+use vizflyt_runtime::stream::Reading;
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
+use vizflyt_server::render::sensors::{Around, MadeReading, SensorSet, VehicleSensors};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
-use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene};
+use vizflyt_splat::sensor::SensorScene;
+use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
 
 use super::course::CourseInstance;
 use crate::evaluate::Stamped;
@@ -282,6 +287,26 @@ impl Pending {
     }
 }
 
+/// The sensors beside the cameras, in a course that has some.
+struct Sensing {
+    scene: SensorScene,
+    sensors: VehicleSensors,
+    /// Readings on their way to the plugin, and when they are there.
+    pending: VecDeque<(HostTime, MadeReading)>,
+}
+
+impl Sensing {
+    /// Returns `None` of a course without sensors.
+    fn of(set: SensorSet, scene: Scene<'_>, seed: u64) -> Option<Self> {
+        if set.configs.is_empty() {
+            return None;
+        }
+        let start = ServerTime::from_ns(START_NS);
+        let sensors = VehicleSensors::new(Arc::new(set), start, seed);
+        Some(Self { scene: SensorScene::new(scene), sensors, pending: VecDeque::new() })
+    }
+}
+
 struct Flight<'a> {
     trial: &'a Trial<'a>,
     arena: &'a ArenaConfig,
@@ -293,6 +318,7 @@ struct Flight<'a> {
     images: Vec<RgbdImage>,
     now: HostTime,
     schedule: CameraSchedule,
+    sensing: Option<Sensing>,
     poses: u64,
     seq: u64,
     pending: VecDeque<Pending>,
@@ -331,9 +357,13 @@ impl<'a> Flight<'a> {
             slip_seed: trial.seed,
             cameras: Vec::new(),
         };
-        let info = arena.info();
+        let sensors = SensorSet::new(&arena.sensors).context("the course's sensors")?;
+        let mut info = arena.info();
+        info.sensors = sensors.infos.iter().cloned().collect();
         let (splats, objects) = (&trial.course.splats, &trial.course.objects[..]);
-        let renderer = CpuRenderer::new(Scene { splats, objects });
+        let scene = Scene { splats, objects };
+        let sensing = Sensing::of(sensors, scene, trial.seed);
+        let renderer = CpuRenderer::new(scene);
         let mut hash = Sha256::new();
         hash.update(renderer.name().as_bytes());
         let mut lockstep =
@@ -357,6 +387,7 @@ impl<'a> Flight<'a> {
             images: Vec::new(),
             now,
             schedule: CameraSchedule::new(ServerTime::from_ns(START_NS)),
+            sensing,
             poses: 0,
             seq: 0,
             pending: VecDeque::new(),
@@ -417,6 +448,7 @@ impl<'a> Flight<'a> {
         }
         self.localize();
         self.draw()?;
+        self.sense();
         while self.pending.front().is_some_and(|pending| pending.due <= self.now) {
             if let Some(pending) = self.pending.pop_front() {
                 self.show(&pending)?;
@@ -533,6 +565,44 @@ impl<'a> Flight<'a> {
         let (seq, world_from_body) = (self.seq, exposure.world_from_body);
         self.pending.push_back(Pending { due, seq, pose, shown, world_from_body, rendered });
         Ok(())
+    }
+
+    /// Measures with the sensors that are due, and hands over what has come as far as the plugin.
+    fn sense(&mut self) {
+        if self.sensing.is_none() {
+            return;
+        }
+        let phase = self.lockstep.companion.flight().phase();
+        let is_over = matches!(phase, FlightPhase::Landing | FlightPhase::Landed);
+        let now = self.server_now();
+        let (motion, sample) = (self.referee.motion(), self.referee.newest().copied());
+        let Some(sensing) = &mut self.sensing else { return };
+        if let (Some(motion), Some(sample), false) = (motion, sample, is_over) {
+            let image_ns = self.trial.delays.image_ns;
+            let pose = sample.stamp;
+            let exposure =
+                Exposure::new(Predict::Seen, Some(image_ns), &Localized { sample, motion }, now);
+            let objects = &self.trial.course.obstacles.objects;
+            let mut place = |at: ServerTime, placements: &mut Vec<Placement>| {
+                objects.place(at.as_ns().wrapping_sub(START_NS).cast_signed(), placements);
+            };
+            let taken = sensing.sensors.take(now);
+            for (index, _) in taken.iter().enumerate().filter(|(_, taken)| **taken) {
+                let scene = &sensing.scene;
+                let mut around = Around { scene, motion: &motion, pose, place: &mut place };
+                if let Some(made) = sensing.sensors.measure(index, &exposure, &mut around) {
+                    sensing.pending.push_back((self.now.plus_ns(image_ns), made));
+                }
+            }
+        }
+        while let Some((due, made)) = sensing.pending.pop_front_if(|(due, _)| *due <= self.now) {
+            let records = made.records().to_vec();
+            self.hash.update(&records);
+            let at = |ns: u64| HostTime::from_ns(ns);
+            let (pose, shown) = (at(made.header.pose_ns.get()), at(made.header.stamp_ns.get()));
+            let reading = Reading { header: made.header, pose, shown, received: due, records };
+            self.lockstep.take_reading(self.now, reading);
+        }
     }
 
     /// Shows the plugin an image and takes its reply.

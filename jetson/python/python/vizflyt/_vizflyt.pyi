@@ -40,6 +40,7 @@ class ArenaInfo:
         attitude_rate: bool = False,
         setpoints: Sequence[str] | None = None,
         cameras: Sequence[CameraInfo] = ...,
+        sensors: Sequence[SensorInfo] = ...,
     ) -> ArenaInfo: ...
     @property
     def name(self) -> str:
@@ -100,6 +101,10 @@ class ArenaInfo:
     @property
     def cameras(self) -> list[CameraInfo]:
         """The vehicle's cameras."""
+
+    @property
+    def sensors(self) -> list[SensorInfo]:
+        """The vehicle's sensors beside the cameras."""
 
 @final
 class CameraInfo:
@@ -176,6 +181,16 @@ class Observation:
     def cameras(self) -> list[CameraImage]:
         """The images there are, in the order of the arena's cameras."""
 
+    def sensor(self, name: str) -> SensorReading | None:
+        """Returns the newest reading of the sensor of this name; None if it has none yet.
+
+        Raises LookupError if the vehicle has no such sensor.
+        """
+
+    @property
+    def sensors(self) -> list[SensorReading]:
+        """The newest readings there are, in the order of the arena's sensors."""
+
     @property
     def pose_at_image(self) -> Pose | None:
         """Where the body was at the instant that the newest image shows: the pose that belongs to its pixels. None
@@ -197,6 +212,115 @@ class Observation:
     @property
     def is_copy(self) -> bool:
         """Whether the images are copies, because the plugin keeps too many earlier ones."""
+
+@final
+class SensorInfo:
+    """One sensor of the vehicle that is no camera.
+
+    `SensorInfo(name, kind, most_records=1, ...)` makes one, for tests; without a mounting it looks along the nose.
+    """
+
+    def __new__(
+        cls,
+        name: str,
+        kind: str,
+        *,
+        most_records: int = 1,
+        rate_hz: float = 10.0,
+        min_range_m: float = 0.0,
+        max_range_m: float = 100.0,
+        horizontal_fov_rad: float = 0.0,
+        vertical_fov_rad: float = 0.0,
+        body_from_sensor: Pose | None = None,
+    ) -> SensorInfo: ...
+    @property
+    def name(self) -> str:
+        """What `obs.sensor(name)` calls it."""
+
+    @property
+    def kind(self) -> str:
+        """'lidar', 'range_finder', 'sonar' or 'radar'."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Readings a second. [Hz]"""
+
+    @property
+    def min_range_m(self) -> float:
+        """Nearest that it measures. [m]"""
+
+    @property
+    def max_range_m(self) -> float:
+        """Furthest that it measures. [m]"""
+
+    @property
+    def horizontal_fov_rad(self) -> float:
+        """Width of what it sees. [rad]"""
+
+    @property
+    def vertical_fov_rad(self) -> float:
+        """Height of what it sees. [rad]"""
+
+    @property
+    def body_from_sensor(self) -> Pose:
+        """How it is mounted: sensor axes are x forward, y left, z up."""
+
+@final
+class SensorReading:
+    """The newest reading of one sensor. It stays in later observations until the next one comes: `seq` tells whether
+    it is new.
+    """
+
+    @property
+    def name(self) -> str:
+        """The sensor's name in `arena.toml`."""
+
+    @property
+    def kind(self) -> str:
+        """'lidar', 'range_finder', 'sonar' or 'radar'."""
+
+    @property
+    def seq(self) -> int:
+        """Counts this sensor's readings, from 1."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """When the newest pose behind it was measured. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def shown_ns(self) -> int:
+        """The instant that it is of; of a sweep that of its last beam. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def ready_ns(self) -> int:
+        """When the runtime had it. [ns, `time.monotonic_ns()`]"""
+
+    @property
+    def records(self) -> npt.NDArray[np.void]:
+        """What was measured: a read-only structured view of shape (N,). [sensor: x forward, y left, z up]
+
+        lidar: `p_m` (3 x float32, [m]), `before_ns` (uint32), `intensity` (uint16), `ring` (uint16);
+        range_finder, sonar (N is 1): `range_m` (0 is no echo), `signal` (float32);
+        radar: `range_m`, `azimuth_rad`, `radial_mps`, `snr_db`, `cross_section_m2` (float32).
+        """
+
+    @property
+    def points_m(self) -> npt.NDArray[np.float32] | None:
+        """The points of a LiDAR: a read-only view of shape (N, 3), float32; None of another sensor. [m, sensor]"""
+
+    @property
+    def range_m(self) -> float | None:
+        """The distance that a range finder or a sonar has measured; None where nothing came back, and of other
+        sensors. [m]
+        """
+
+    @property
+    def body_from_sensor(self) -> Pose:
+        """Where the sensor sits."""
+
+    @property
+    def pose_at_reading(self) -> Pose | None:
+        """Where the body was at the instant that it is of; None where the course withholds the pose. [m, world]"""
 
 @final
 class CameraImage:
@@ -618,10 +742,12 @@ class Volume:
 class ObservationBuffer:
     """Observations made by hand: for a plugin's own tests and for notebooks.
 
-    `ObservationBuffer([CameraInfo(...)])` has planes for these cameras.
+    `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras, and room for these sensors.
     """
 
-    def __new__(cls, cameras: Sequence[CameraInfo]) -> ObservationBuffer: ...
+    def __new__(
+        cls, cameras: Sequence[CameraInfo], sensors: Sequence[SensorInfo] = ...
+    ) -> ObservationBuffer: ...
     def clear(self, seq: int = 0) -> None:
         """Empties it and numbers it."""
 
@@ -650,6 +776,19 @@ class ObservationBuffer:
 
     def set_pose_at_image(self, name: str, world_from_body: Pose) -> None:
         """Fills in where the body was at the instant that a camera's image shows."""
+
+    def set_reading(
+        self,
+        name: str,
+        records: bytes | npt.NDArray[np.void],
+        *,
+        seq: int = 1,
+        stamp_ns: int = 0,
+        pose_at_reading: Pose | None = None,
+    ) -> None:
+        """Fills in a sensor's reading: `records` as bytes or as an array of the layout that `SensorReading.records`
+        documents. `pose_at_reading` is where the body was. Stamps are of `time.monotonic_ns()`. [ns]
+        """
 
     def observation(self) -> Observation:
         """Returns what a plugin would see."""

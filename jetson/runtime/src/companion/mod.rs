@@ -24,6 +24,7 @@ use vizflyt_protocol::mavlink::{GuidedMotion, GuidedSetpoint};
 use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, Event, EventKind, ImuReading, PoseSample, Setpoint, ToPlugin, bounded,
 };
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle};
 
@@ -32,7 +33,7 @@ use crate::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
 use crate::guard::VehicleMotion;
 use crate::link::{Datagram, Link, LinkEvent, LinkSettings};
 use crate::steering::Steering;
-use crate::stream::ServerClock;
+use crate::stream::{Reading, ServerClock};
 
 pub use senses::Senses;
 
@@ -153,6 +154,23 @@ impl Companion {
         let arena = self.arena.as_mut().filter(|_| !self.is_greeted);
         if let Some(known) = arena.and_then(|arena| arena.cameras.get_mut(usize::from(index))) {
             *known = camera.clone();
+        }
+    }
+
+    /// Handles a change of sensor `index`.
+    pub fn handle_sensor(&mut self, index: u8, sensor: &SensorInfo) {
+        let arena = self.arena.as_mut();
+        if let Some(known) = arena.and_then(|arena| arena.sensors.get_mut(usize::from(index))) {
+            *known = sensor.clone();
+        }
+    }
+
+    /// Handles a sensor's reading: passes it on to the autopilot where the sensor says so.
+    pub fn handle_reading(&mut self, now: HostTime, reading: &Reading) {
+        let index = reading.header.sensor;
+        let sensor = self.arena.as_ref().and_then(|arena| arena.sensors.get(usize::from(index)));
+        if let Some(sensor) = sensor.filter(|sensor| sensor.to_autopilot) {
+            self.link.reading(now, index, sensor, &reading.records);
         }
     }
 

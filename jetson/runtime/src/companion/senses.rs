@@ -1,7 +1,10 @@
 //! What a plugin may know beside images.
 
 use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle};
+
+use crate::stream::NewestReadings;
 
 /// The vehicle's state as the plugin may know it. What the course withholds is never in it.
 #[derive(Clone, Debug, Default)]
@@ -31,5 +34,18 @@ impl Senses {
         if self.gives_pose {
             writer.pose_at_image(header.camera.into(), &header.world_from_body());
         }
+    }
+
+    /// Writes the sensors' newest readings into an observation.
+    pub fn write_readings(
+        &self,
+        writer: &mut ObservationWriter<'_>,
+        sensors: &[SensorInfo],
+        readings: &NewestReadings,
+    ) {
+        let given = readings
+            .each_ref()
+            .map(|reading| reading.as_ref().map(|one| one.given(self.gives_pose)));
+        writer.sensors(sensors, &given);
     }
 }

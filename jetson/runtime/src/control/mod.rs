@@ -30,6 +30,7 @@ use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{
     CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ToPlugin, bounded,
 };
+use vizflyt_protocol::sensor::MAX_SENSORS;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::host_now;
 
@@ -145,6 +146,8 @@ struct ControlLoop {
     odometry_gate: OdometryGate,
     /// The companion's ticks so far.
     ticks: u64,
+    /// The newest reading of each sensor that the companion had, by its instant.
+    readings_taken: [HostTime; MAX_SENSORS],
 }
 
 impl Control {
@@ -194,6 +197,7 @@ impl ControlLoop {
             page_lines: 0,
             odometry_gate: OdometryGate::default(),
             ticks: 0,
+            readings_taken: [HostTime::ZERO; MAX_SENSORS],
         }
     }
 
@@ -249,12 +253,27 @@ impl ControlLoop {
     fn tick(&mut self, now: HostTime) {
         self.tend_plugin(now);
         self.tend_by_hand(now);
+        self.take_readings(now);
         if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
             self.report(now);
         }
         if self.ticks.is_multiple_of(TIMING_TICKS) {
             self.page_lines = 0;
             self.report_timing(now);
+        }
+    }
+
+    /// Takes the sensors' readings that have come since the last tick.
+    fn take_readings(&mut self, now: HostTime) {
+        if self.companion.arena().is_none_or(|arena| arena.sensors.is_empty()) {
+            return;
+        }
+        let newest = self.control.shared.readings.newest();
+        for (reading, taken) in newest.iter().zip(&mut self.readings_taken) {
+            if let Some(reading) = reading.as_ref().filter(|one| one.shown > *taken) {
+                *taken = reading.shown;
+                self.companion.handle_reading(now, reading);
+            }
         }
     }
 
@@ -306,6 +325,10 @@ impl ControlLoop {
                 self.companion.handle_event(now, event);
             }
             StreamEvent::Camera(index, camera) => self.handle_camera(index, &camera),
+            StreamEvent::Sensor(index, sensor) => {
+                tracing::info!("sensor {} was changed", sensor.name);
+                self.companion.handle_sensor(index, &sensor);
+            }
             // The guardian's alone.
             StreamEvent::Feed(..) => {}
         }

@@ -9,6 +9,7 @@ use std::thread::{self, JoinHandle};
 
 use vizflyt_protocol::flight_end::PluginFault;
 use vizflyt_protocol::messages::{CameraInfo, Setpoint, ToPlugin};
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
 use vizflyt_sdk::ipc::{Offer, RuntimeEnd};
@@ -50,18 +51,18 @@ impl ControlLoop {
     /// is known.
     pub(super) fn start_plugin(&mut self, now: HostTime) {
         let Some(arena) = self.companion.arena() else { return };
-        let cameras = arena.cameras.to_vec();
+        let (cameras, sensors) = (arena.cameras.to_vec(), arena.sensors.to_vec());
         if let Some(camera) = cameras.first() {
             self.image_size_px = (camera.intrinsics.width_px, camera.intrinsics.height_px);
         }
-        let len = ObservationWriter::len_for(&cameras);
+        let len = ObservationWriter::len_for(&cameras) + ObservationWriter::sensors_len(&sensors);
         let command = self.control.plugin_command.clone();
         let confinement = Confinement::prepare(&self.control.plugin_limits, &command);
         let by_hand = command.is_empty();
         let ipc = Arc::new(RuntimeEnd::new(len));
         let stop = Arc::default();
         let replies = Arc::new(PluginReplies::new(Arc::clone(&ipc)));
-        let threads = self.start_threads(&ipc, cameras, &stop, &replies);
+        let threads = self.start_threads(&ipc, cameras, sensors, &stop, &replies);
         let mut offer = None;
         if by_hand {
             match ipc.offer() {
@@ -198,12 +199,14 @@ impl ControlLoop {
         &self,
         ipc: &Arc<RuntimeEnd>,
         cameras: Vec<CameraInfo>,
+        sensors: Vec<SensorInfo>,
         stop: &Arc<AtomicBool>,
         replies: &Arc<PluginReplies>,
     ) -> Vec<JoinHandle<()>> {
         let mailbox = Arc::clone(&self.control.shared.mailbox);
         let publisher = ImagePublisher::new(Arc::clone(ipc), cameras, Arc::clone(&self.senses))
-            .with_log(self.control.log.images(&mailbox));
+            .with_log(self.control.log.images(&mailbox))
+            .with_sensors(sensors, Arc::clone(&self.control.shared.readings));
         let (sender, stopped) = (self.sender.clone(), Arc::clone(stop));
         let images = spawn("images", move || {
             publisher.run(

@@ -73,7 +73,11 @@ impl Drivers {
             waits_for_start: false,
             to_autopilot: Box::new(move |bytes| into.borrow_mut().push(bytes.to_vec())),
             link: LinkSettings::default(),
-            shared: Shared { clock: ServerClock::same(), mailbox: Arc::default() },
+            shared: Shared {
+                clock: ServerClock::same(),
+                mailbox: Arc::default(),
+                readings: Arc::default(),
+            },
             to_server: Arc::default(),
             log: FlightLog::open(&LogSettings::full(folder.path()), None),
             json: false,

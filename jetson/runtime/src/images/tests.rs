@@ -314,3 +314,73 @@ fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
         }
     }
 }
+
+#[test]
+fn the_newest_readings_come_along_with_images() {
+    use vizflyt_protocol::sensor::{
+        LidarPoint, RangeReading, ReadingHeader, SensorInfo, SensorKind,
+    };
+    use zerocopy::IntoBytes;
+
+    let sensor = |name: &str, kind| SensorInfo {
+        name: vizflyt_protocol::messages::bounded(name),
+        kind,
+        enabled: true,
+        to_autopilot: false,
+        rate_hz: 10.0,
+        min_range_m: 0.1,
+        max_range_m: 10.0,
+        horizontal_fov_rad: 0.1,
+        vertical_fov_rad: 0.1,
+        most_records: 1,
+        body_from_sensor: Pose::IDENTITY,
+    };
+    let body = Pose::new(DVec3::new(12.345_678, -3.456_789, 2.345_678), DQuat::IDENTITY);
+    let reading = |sensor: u8, kind: SensorKind, seq: u64, records: &[u8]| {
+        let count = (records.len() / kind.record_len()) as u32;
+        let stamp = ServerTime::from_ns(seq);
+        let header = ReadingHeader::new(seq, (sensor, kind), stamp, &Pose::IDENTITY, &body, count);
+        let at = HostTime::from_ns(seq);
+        let records = records.to_vec();
+        crate::stream::Reading { header, pose: at, shown: at, received: at, records }
+    };
+    let mut rig = Rig::new(&["front"]);
+    let plain_len = rig.take(&image(0, 1, 900)).map(|_| rig.publisher.observation_len()).unwrap();
+    assert_eq!(plain_len, ObservationWriter::len_for(&[camera("front")]), "none, and no byte more");
+    let readings: Arc<Readings> = Arc::default();
+    let sensors = vec![sensor("top", SensorKind::Lidar), sensor("down", SensorKind::RangeFinder)];
+    rig.publisher = rig.publisher.with_sensors(sensors, Arc::clone(&readings));
+    let mut see = |tick: u64, gives_pose: bool| {
+        rig.publisher.senses.lock().unwrap().gives_pose = gives_pose;
+        let arriving = image(0, tick, 900);
+        let ticket = rig.open(&arriving).unwrap();
+        rig.push(ticket, &arriving, 0..99);
+        rig.end(ticket, &arriving);
+        while rig.publisher.step(&rig.mailbox, Duration::ZERO, &mut |_| ()).unwrap() {}
+        let sample = rig.plugin.observation().unwrap().unwrap();
+        let observation = Observation::from_bytes(sample.bytes(), &rig.names).unwrap();
+        assert_eq!(observation.camera("front").unwrap().seq, tick);
+        let top = observation.sensor("top").map(|top| (top.seq, top.points().len()));
+        let down = observation.sensor("down").map(|down| {
+            (down.seq, down.range_m(), down.pose_at_reading.map(|pose| pose.translation_m))
+        });
+        (top, down)
+    };
+    assert_eq!(see(2, true), (None, None), "none has come");
+    let range = RangeReading { range_m: 1.5, signal: 1.0 };
+    readings.put(reading(1, SensorKind::RangeFinder, 5, range.as_bytes()));
+    assert_eq!(see(3, true), (None, Some((5, Some(1.5), Some(body.translation_m)))));
+    assert_eq!(
+        see(4, false),
+        (None, Some((5, Some(1.5), None))),
+        "the same again; the pose withheld"
+    );
+    // A scan of more points than the sensor was announced with.
+    let points = [LidarPoint::default(); 500];
+    readings.put(reading(0, SensorKind::Lidar, 6, points.as_bytes()));
+    readings.put(reading(1, SensorKind::RangeFinder, 7, RangeReading::default().as_bytes()));
+    assert_eq!(see(5, true), (Some((6, 500)), Some((7, None, Some(body.translation_m)))));
+    // One of the other kind than the sensor's: only it is missing.
+    readings.put(reading(1, SensorKind::Lidar, 8, points.as_bytes()));
+    assert_eq!(see(6, true), (Some((6, 500)), None));
+}

@@ -3,6 +3,7 @@
 //!
 //! ```text
 //! poses 100 Hz ── vision() ──▶ VISION_POSITION_ESTIMATE 30-50 Hz   what the autopilot flies by
+//! readings ── reading() ─────▶ DISTANCE_SENSOR, OBSTACLE_DISTANCE  of sensors that say so
 //! guard 50 Hz ── setpoint() ─▶ SET_POSITION_TARGET_LOCAL_NED       yaw always sent
 //! flight ── set_goal() ──────▶ mode, arming, take-off, landing     acknowledged, repeated
 //! autopilot ── handle_input() ▶ VehicleState, clock offset, parameters, LinkEvents
@@ -17,6 +18,7 @@ mod advance;
 mod commands;
 mod companions;
 mod dialect;
+mod distances;
 mod events;
 mod fence;
 mod messages;
@@ -40,6 +42,7 @@ use vizflyt_protocol::mavlink::{
     guided_to_mavlink, is_signed, vision_of_sample,
 };
 use vizflyt_protocol::messages::{PoseSample, VehicleState};
+use vizflyt_protocol::sensor::MAX_SENSORS;
 use vizflyt_protocol::time::{Autopilot, Host, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
@@ -248,6 +251,7 @@ pub struct Link {
     rising: Option<Rising>,
     feed: Feed,
     delay_reported: bool,
+    distances_due: distances::Due,
     params: Params,
     rates: Rates,
     beat_at: HostTime,
@@ -305,6 +309,7 @@ impl Link {
             rising: None,
             feed: Feed::new(settings.vision_hz),
             delay_reported: false,
+            distances_due: [now; MAX_SENSORS],
             params: Params::default(),
             rates: Rates::default(),
             beat_at: now,

@@ -3,6 +3,7 @@
 // Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
 #![allow(deprecated)]
 
+mod distances;
 mod fence;
 mod imu;
 mod px4;

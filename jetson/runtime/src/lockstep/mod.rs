@@ -17,18 +17,20 @@ mod process;
 mod tests;
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use serde_json::json;
 use vizflyt_protocol::messages::{ArenaInfo, CameraInfo, FromPlugin, Odometry, Setpoint};
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::ObservationWriter;
 
 use crate::companion::{Companion, Senses};
 use crate::flight::{FlightSettings, Views};
 use crate::link::LinkSettings;
-use crate::log::{Channel, GivenImage, VirtualLog, observation_head, sent_message};
+use crate::log::{Channel, GivenImage, LoggedSensors, VirtualLog, observation_head, sent_message};
 use crate::odometry::OdometryGate;
-use crate::stream::ServerClock;
+use crate::stream::{NewestReadings, Reading, ServerClock};
 
 pub use process::{LineSink, PluginProcess, ProcessError};
 
@@ -53,6 +55,9 @@ pub struct Lockstep {
     /// Replies on their way to the companion, and when they count.
     replies: VecDeque<(HostTime, Reply)>,
     log: Option<VirtualLog>,
+    sensors: Vec<SensorInfo>,
+    /// The newest of each sensor, for the next observation.
+    readings: NewestReadings,
     odometry_gate: OdometryGate,
     /// Estimates of the plugin that nobody has taken yet.
     odometry: Vec<Odometry>,
@@ -81,6 +86,8 @@ impl Lockstep {
             reply_after_ns,
             replies,
             log: None,
+            sensors: arena.sensors.to_vec(),
+            readings: NewestReadings::default(),
             odometry_gate,
             odometry,
         }
@@ -124,6 +131,14 @@ impl Lockstep {
         Ok(())
     }
 
+    /// Takes a sensor's reading, which the plugin gets with its next images.
+    pub fn take_reading(&mut self, now: HostTime, reading: Reading) {
+        self.companion.handle_reading(now, &reading);
+        if let Some(newest) = self.readings.get_mut(usize::from(reading.header.sensor)) {
+            *newest = Some(Arc::new(reading));
+        }
+    }
+
     /// Shows the plugin observation `seq` and waits for its reply: `write` puts in the images, and the
     /// senses are there already; `images` are the same, for the log. Returns `None` if there is no plugin any
     /// more.
@@ -149,7 +164,9 @@ impl Lockstep {
             self.unless_failed(now, result, line)?;
         }
         let Some(process) = &mut self.process else { return Ok(None) };
-        let mut memory = process.loan(ObservationWriter::len_for(cameras))?;
+        let len =
+            ObservationWriter::len_for(cameras) + ObservationWriter::sensors_len(&self.sensors);
+        let mut memory = process.loan(len)?;
         let mut writer = ObservationWriter::new(memory.memory(), seq, cameras)?;
         self.companion.update_senses(&mut self.senses);
         self.senses.write(&mut writer);
@@ -157,8 +174,11 @@ impl Lockstep {
         for image in images {
             self.senses.write_pose_at_image(&mut writer, image.header);
         }
+        self.senses.write_readings(&mut writer, &self.sensors, &self.readings);
         if let Some(log) = &mut self.log {
-            log.observation(now, seq, observation_head(memory.memory()), images);
+            let bytes = memory.memory();
+            let sensors = LoggedSensors::of(bytes, &self.sensors, &self.readings);
+            log.observation(now, seq, observation_head(bytes), images, &sensors);
         }
         let mut views = Views::default();
         for image in images {

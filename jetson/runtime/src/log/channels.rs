@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::messages;
 
-/// What is logged; each has its topic, the cameras' have one for each camera.
+/// What is logged; each has its topic, the cameras' and sensors' have one for each of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Channel {
     /// Localized pose: foxglove.PoseInFrame.
@@ -52,6 +52,10 @@ pub enum Channel {
     Stamps(u8),
     /// A camera's depth for viewers, if it is wanted: foxglove.RawImage.
     Depth(u8),
+    /// What a LiDAR or a radar sees: foxglove.PointCloud.
+    Points(u8),
+    /// What a range finder or a sonar measures: foxglove.LaserScan.
+    Range(u8),
 }
 
 /// How a channel presents itself in a file or to a viewer.
@@ -84,7 +88,7 @@ impl Channel {
         Self::Plugin,
     ];
 
-    /// Returns the topic; `camera` is the name of the camera whose channel it is.
+    /// Returns the topic; `camera` is the name of the camera or sensor whose channel it is.
     pub(super) fn topic(self, camera: &str) -> String {
         match self {
             Self::Pose => "/pose".into(),
@@ -107,6 +111,7 @@ impl Channel {
             Self::Calibration(_) => format!("/camera/{camera}/calibration"),
             Self::Stamps(_) => format!("/camera/{camera}/stamps"),
             Self::Depth(_) => format!("/camera/{camera}/depth"),
+            Self::Points(_) | Self::Range(_) => format!("/sensor/{camera}"),
         }
     }
 
@@ -120,6 +125,8 @@ impl Channel {
             Self::Color(_) => fox::CompressedImage::get_schema(),
             Self::Calibration(_) => fox::CameraCalibration::get_schema(),
             Self::Depth(_) => fox::RawImage::get_schema(),
+            Self::Points(_) => fox::PointCloud::get_schema(),
+            Self::Range(_) => fox::LaserScan::get_schema(),
             Self::Observation => Some(messages::schema("Observation")),
             Self::Plugin => Some(messages::schema("PluginMessage")),
             _ => None,

@@ -296,7 +296,8 @@ mod tests {
             ..ObservedImage::default()
         };
         let published_ns = pose_ns + 20_000_000;
-        Observation { seq: n, protocol: 11, published_ns, head, images: vec![image] }
+        let images = vec![image];
+        Observation { seq: n, protocol: 11, published_ns, head, images, ..Observation::default() }
     }
 
     fn log(observations: &[Observation]) -> Vec<u8> {

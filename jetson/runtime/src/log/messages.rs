@@ -25,6 +25,29 @@ pub struct Observation {
     /// Its images; none where a reduced log left them out.
     #[prost(message, repeated, tag = "5")]
     pub images: Vec<ObservedImage>,
+    /// The table of its sensors: one `SensorHeader` after the other.
+    #[prost(bytes = "vec", tag = "6")]
+    pub sensors: Vec<u8>,
+    /// Their records, of those that have a reading.
+    #[prost(message, repeated, tag = "7")]
+    pub records: Vec<ObservedRecords>,
+}
+
+/// The records of one sensor's newest reading.
+#[derive(Clone, PartialEq, Message)]
+pub struct ObservedRecords {
+    /// Index of the sensor.
+    #[prost(uint32, tag = "1")]
+    pub sensor: u32,
+    /// Its name.
+    #[prost(string, tag = "2")]
+    pub name: String,
+    /// They are those of the newest message on `/sensor/NAME`.
+    #[prost(bool, tag = "3")]
+    pub is_apart: bool,
+    /// As in shared memory; none if they are apart.
+    #[prost(bytes = "vec", tag = "4")]
+    pub bytes: Vec<u8>,
 }
 
 /// One camera's image of an observation.
@@ -87,6 +110,11 @@ pub(super) fn schema(name: &str) -> Schema {
         type_name: Some(".vizflyt.ObservedImage".into()),
         ..field("images", 5, Type::Message)
     };
+    let records = FieldDescriptorProto {
+        label: Some(Label::Repeated.into()),
+        type_name: Some(".vizflyt.ObservedRecords".into()),
+        ..field("records", 7, Type::Message)
+    };
     let message = |name: &str, field: Vec<FieldDescriptorProto>| DescriptorProto {
         name: Some(name.into()),
         field,
@@ -105,6 +133,17 @@ pub(super) fn schema(name: &str) -> Schema {
                     field("published_ns", 3, Type::Uint64),
                     field("head", 4, Type::Bytes),
                     images,
+                    field("sensors", 6, Type::Bytes),
+                    records,
+                ],
+            ),
+            message(
+                "ObservedRecords",
+                vec![
+                    field("sensor", 1, Type::Uint32),
+                    field("name", 2, Type::String),
+                    field("is_apart", 3, Type::Bool),
+                    field("bytes", 4, Type::Bytes),
                 ],
             ),
             message(

@@ -27,6 +27,7 @@ mod messages;
 mod queue;
 pub mod read;
 mod retention;
+mod sensors;
 #[cfg(test)]
 mod tests;
 mod virtual_log;
@@ -57,11 +58,12 @@ pub use self::channels::Channel;
 use self::file::RealFile;
 pub use self::file::keep_going_when_files_are_full;
 pub use self::live::Live;
-pub use self::messages::{Observation, ObservedImage, PluginMessage};
+pub use self::messages::{Observation, ObservedImage, ObservedRecords, PluginMessage};
 pub use self::queue::{Dropped, LoggedImage};
 use self::queue::{ObservationRecord, Queue, Record};
 pub use self::read::read_timing;
 pub use self::retention::Retention;
+pub use self::sensors::{LoggedReading, LoggedSensors};
 pub use self::virtual_log::{GivenImage, VirtualLog};
 use self::writer::{LogSinks, LogWriter};
 use crate::stream::Mailbox;
@@ -278,10 +280,17 @@ pub struct ImageLog {
 }
 
 impl ImageLog {
-    /// Logs an observation: shared memory up to its first plane, and its images as received.
-    pub fn observation(&self, at: HostTime, seq: u64, head: Vec<u8>, images: Vec<LoggedImage>) {
+    /// Logs an observation: shared memory up to its first plane, its images as received, and its sensors' readings.
+    pub fn observation(
+        &self,
+        at: HostTime,
+        seq: u64,
+        head: Vec<u8>,
+        images: Vec<LoggedImage>,
+        sensors: LoggedSensors,
+    ) {
         let home = Arc::clone(&self.home);
-        let record = ObservationRecord { at, seq, head, images, home };
+        let record = ObservationRecord { at, seq, head, images, sensors, home };
         self.queue.push(Record::Observation(Box::new(record)));
     }
 }
@@ -362,11 +371,12 @@ pub(crate) fn sent_message(setpoint: &GuidedSetpoint) -> Option<serde_json::Valu
     }))
 }
 
-/// Returns the bytes of an observation before its first plane: header and what belongs to it.
+/// Returns the bytes of an observation before its first plane or sensor: header and what belongs to it.
 pub fn observation_head(bytes: &[u8]) -> &[u8] {
     let Ok(header) = ObservationHeader::parse(bytes) else { return &[] };
     let cameras = &header.cameras[..header.camera_count.into()];
-    let first = cameras.iter().map(|camera| camera.rgb_offset as usize).min();
+    let sensors = (header.sensor_count > 0).then_some(header.sensors_offset as usize);
+    let first = cameras.iter().map(|camera| camera.rgb_offset as usize).chain(sensors).min();
     let len = first.unwrap_or(bytes.len()).max(size_of::<ObservationHeader>());
     &bytes[..len.min(bytes.len())]
 }

@@ -8,7 +8,7 @@ use vizflyt_protocol::messages::{Odometry, PoseSample};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::HostTime;
 
-use super::{Channel, Level};
+use super::{Channel, Level, LoggedSensors};
 use crate::stream::Mailbox;
 
 /// Records waiting for the disk at most: some 10 s of flight. Beyond, they are dropped, counted.
@@ -45,6 +45,7 @@ pub(super) struct ObservationRecord {
     pub(super) seq: u64,
     pub(super) head: Vec<u8>,
     pub(super) images: Vec<LoggedImage>,
+    pub(super) sensors: LoggedSensors,
     /// Where the memory of the images goes when they are written.
     pub(super) home: Arc<Mailbox>,
 }

@@ -23,6 +23,7 @@ use vizflyt_rgbd::{DecodeError, join_jpeg};
 
 use super::channels::Channel;
 use super::messages::{Observation, ObservedImage, PluginMessage};
+use super::sensors::points_of;
 use super::writer::FLIGHT;
 
 /// Longest record that is read: more than an image of the largest size needs. [bytes]
@@ -409,6 +410,8 @@ pub struct RecordedFlight<R> {
     topics: [String; 2],
     /// The newest colour of each camera, by topic.
     colors: HashMap<Arc<str>, (u64, Vec<u8>)>,
+    /// The newest points of each LiDAR, by topic, as they stand there.
+    points: HashMap<Arc<str>, Vec<u8>>,
     /// Whether images are wanted.
     with_images: bool,
 }
@@ -417,7 +420,8 @@ impl<R: Read> RecordedFlight<R> {
     /// Reads from `reader`; without images, observations come with empty bitstreams.
     pub fn new(reader: LogReader<R>, with_images: bool) -> Self {
         let topics = [Channel::Observation, Channel::Plugin].map(|channel| channel.topic(""));
-        Self { reader, topics, colors: HashMap::new(), with_images }
+        let (colors, points) = (HashMap::new(), HashMap::new());
+        Self { reader, topics, colors, points, with_images }
     }
 
     /// Whether the log ended before its end.
@@ -461,6 +465,9 @@ impl<R: Read> RecordedFlight<R> {
                     self.colors.insert(message.topic, (at_ns, message.data));
                 }
             } else {
+                if self.with_images && message.topic.starts_with("/sensor/") {
+                    self.points.insert(Arc::clone(&message.topic), message.data.clone());
+                }
                 return Ok(Some((at_ns, Next::Other(message))));
             }
         }
@@ -478,6 +485,20 @@ impl<R: Read> RecordedFlight<R> {
                 && self.join(message.log_time_ns, image).is_none_or(|joined| joined.is_err())
             {
                 return Recorded::Broken(observation.seq);
+            }
+        }
+        for records in observation.records.iter_mut().filter(|one| one.is_apart) {
+            if !self.with_images {
+                continue;
+            }
+            let topic = Channel::Points(0).topic(&records.name);
+            let points = self.points.get(&*topic).and_then(|message| points_of(message));
+            // A reduced log that leaves the images out leaves out points, too.
+            let is_left_out = observation.images.is_empty();
+            match points {
+                Some(points) => (records.bytes, records.is_apart) = (points, false),
+                None if is_left_out => {}
+                None => return Recorded::Broken(observation.seq),
             }
         }
         Recorded::Observation(observation)

@@ -120,7 +120,7 @@ fn images_are_logged_as_they_came_and_their_memory_goes_back() {
     let modes = [ColorMode::Jpeg444, ColorMode::Lossless, ColorMode::Jpeg420, ColorMode::Jpeg444];
     for (seq, mode) in (1..).zip(modes) {
         let head = vec![seq as u8; 2000];
-        images.observation(host_now(), seq, head, vec![image(seq, mode)]);
+        images.observation(host_now(), seq, head, vec![image(seq, mode)], LoggedSensors::default());
     }
     drop((log, images));
     let recorded = recorded(&path);
@@ -222,7 +222,13 @@ fn an_image_is_stamped_with_the_instant_that_it_shows() {
         log.pose(HostTime::from_ns(at_ns), HostTime::from_ns(at_ns), &sample);
         if n % 4 == 1 && n < 50 {
             let image = image_on_the_curve(n, at_ns);
-            images.observation(image.received, n, vec![0; 8], vec![image]);
+            images.observation(
+                image.received,
+                n,
+                vec![0; 8],
+                vec![image],
+                LoggedSensors::default(),
+            );
         }
     }
     drop((log, images));
@@ -249,7 +255,7 @@ fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
             let rgb = vec![n as u8; 64 * 96 * 3];
             let (header, name) = (&header, "front");
             let image = GivenImage { header, name, pose, rgb: &rgb, depth_mm: &depth_mm };
-            log.observation(received, n, &[0; 8], &[image]);
+            log.observation(received, n, &[0; 8], &[image], &LoggedSensors::default());
         }
     }
     log.finish().unwrap();
@@ -283,7 +289,14 @@ fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
         image.pieces = vec![vec![0; len]];
         let (at, head, images) = (HostTime::ZERO, vec![], vec![image]);
         let home = Arc::clone(&home);
-        Record::Observation(Box::new(ObservationRecord { at, seq: 1, head, images, home }))
+        Record::Observation(Box::new(ObservationRecord {
+            at,
+            seq: 1,
+            head,
+            images,
+            sensors: LoggedSensors::default(),
+            home,
+        }))
     };
     queue.push(observation(queue::MAX_IMAGE_BYTES - 10));
     queue.push(observation(11));
@@ -367,7 +380,14 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
         image.pieces = vec![vec![0; 79_000]];
         let head = vec![0; size_of::<ObservationHeader>()];
         let home = Arc::default();
-        let record = ObservationRecord { at, seq: tick, head, images: vec![image], home };
+        let record = ObservationRecord {
+            at,
+            seq: tick,
+            head,
+            images: vec![image],
+            sensors: LoggedSensors::default(),
+            home,
+        };
         writer.take(Record::Observation(Box::new(record))).unwrap();
         if tick % 60 == 59 {
             writer.check_health().unwrap();
@@ -398,7 +418,13 @@ fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() 
     large.push(vec![7; 2 << 20]);
     for seq in 0..10 {
         let image = LoggedImage { pieces: large.clone(), ..image(1, ColorMode::Lossless) };
-        images.observation(HostTime::from_ns(seq), seq, vec![seq as u8; 2000], vec![image]);
+        images.observation(
+            HostTime::from_ns(seq),
+            seq,
+            vec![seq as u8; 2000],
+            vec![image],
+            LoggedSensors::default(),
+        );
     }
     drop((log, images));
     let found = recorded(&path);
@@ -465,7 +491,14 @@ fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     queue.push(Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: big });
     let images = vec![image(1, ColorMode::Jpeg444)];
     let (at, head) = (HostTime::ZERO, vec![]);
-    let record = ObservationRecord { at, seq: 1, head, images, home: Arc::clone(&home) };
+    let record = ObservationRecord {
+        at,
+        seq: 1,
+        head,
+        images,
+        sensors: LoggedSensors::default(),
+        home: Arc::clone(&home),
+    };
     queue.push(Record::Observation(Box::new(record)));
     queue.end();
     LogWriter::new(sinks, Arc::clone(&queue), Box::new(|| None)).run(&records);
@@ -488,7 +521,14 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
     assert!(trouble.contains("no longer logged: only 1 MB"), "{trouble}");
     let home = Arc::default();
     let images = vec![image(1, ColorMode::Jpeg444)];
-    let record = ObservationRecord { at: HostTime::ZERO, seq: 1, head: vec![], images, home };
+    let record = ObservationRecord {
+        at: HostTime::ZERO,
+        seq: 1,
+        head: vec![],
+        images,
+        sensors: LoggedSensors::default(),
+        home,
+    };
     queue.push(Record::Observation(Box::new(record)));
     queue.push(Record::Json {
         channel: Channel::Requested,
@@ -538,7 +578,7 @@ proptest! {
             let log = FlightLog::open(&LogSettings::full(folder.path()), None);
             let path = log.path().unwrap().to_owned();
             let images = log.images(&Arc::default()).unwrap();
-            images.observation(host_now(), 1, vec![0; 99], vec![image(1, ColorMode::Jpeg444)]);
+            images.observation(host_now(), 1, vec![0; 99], vec![image(1, ColorMode::Jpeg444)], LoggedSensors::default());
             let note = Event { stamp: ServerTime::ZERO, kind: EventKind::Note, text: bounded("x") };
             log.to_plugin(host_now(), &ToPlugin::Event(note));
             drop((log, images));

@@ -25,7 +25,8 @@ use super::file::{self, Disk};
 use super::queue::{LoggedImage, Queue, Record, shown};
 use super::writer::{LogSinks, LogWriter, timestamp};
 use super::{
-    Channel, LoggedImages, event_record, flight_record, imu_message, line_record, plugin_record,
+    Channel, LoggedImages, LoggedSensors, event_record, flight_record, imu_message, line_record,
+    plugin_record,
 };
 
 /// A chunk is closed this often. [s]
@@ -128,11 +129,18 @@ impl VirtualLog {
     }
 
     /// Logs an observation: shared memory up to its first plane, and its images, if the log keeps them.
-    pub fn observation(&mut self, at: HostTime, seq: u64, head: &[u8], images: &[GivenImage<'_>]) {
+    pub fn observation(
+        &mut self,
+        at: HostTime,
+        seq: u64,
+        head: &[u8],
+        images: &[GivenImage<'_>],
+        sensors: &LoggedSensors,
+    ) {
         if self.failed.is_some() {
             return;
         }
-        let result = self.write_observation(at, seq, head, images);
+        let result = self.write_observation(at, seq, head, images, sensors);
         self.keep(at, result);
     }
 
@@ -142,6 +150,7 @@ impl VirtualLog {
         seq: u64,
         head: &[u8],
         images: &[GivenImage<'_>],
+        sensors: &LoggedSensors,
     ) -> McapResult<()> {
         let is_kept = self.writer.keeps_image(at);
         let mut logged = Vec::new();
@@ -162,7 +171,7 @@ impl VirtualLog {
                 pieces: vec![bitstream],
             });
         }
-        self.writer.observation(at, seq, head.to_vec(), &logged, is_kept)
+        self.writer.observation(at, seq, head.to_vec(), &logged, sensors, is_kept)
     }
 
     /// Writes an image's colour so that viewers open it.

@@ -27,8 +27,9 @@ use super::channels::Channel;
 use super::depth::DepthReader;
 use super::file::{Disk, SafeFile};
 use super::live::Live;
-use super::messages::{Observation, ObservedImage, PluginMessage};
+use super::messages::{Observation, ObservedImage, ObservedRecords, PluginMessage};
 use super::queue::{Dropped, LoggedImage, ObservationRecord, Queue, Record};
+use super::sensors::LoggedSensors;
 
 /// A chunk is closed this often: what a killed process loses.
 const CHUNK_PERIOD: Duration = Duration::from_secs(1);
@@ -191,6 +192,8 @@ pub(super) struct LogWriter<D: Disk> {
     /// Drops that have been reported.
     reported: Dropped,
     calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
+    /// The newest reading of each sensor that was written, by its instant. [host]
+    readings: BTreeMap<u8, HostTime>,
     rest: Vec<u8>,
     /// Decodes depth for viewers, if that is wanted.
     depth: Option<DepthReader>,
@@ -225,6 +228,7 @@ impl<D: Disk> LogWriter<D> {
             left_out: 0,
             reported: Dropped::default(),
             calibrations: BTreeMap::new(),
+            readings: BTreeMap::new(),
             rest: Vec::new(),
             depth: None,
         }
@@ -395,7 +399,8 @@ impl<D: Disk> LogWriter<D> {
             return Ok(());
         }
         let is_kept = self.keeps_image(record.at);
-        self.observation(record.at, record.seq, record.head.clone(), &record.images, is_kept)
+        let ObservationRecord { at, seq, head, images, sensors, .. } = record;
+        self.observation(*at, *seq, head.clone(), images, sensors, is_kept)
     }
 
     /// Whether the images that came `at` are to be written.
@@ -410,10 +415,12 @@ impl<D: Disk> LogWriter<D> {
         seq: u64,
         head: Vec<u8>,
         logged: &[LoggedImage],
+        sensors: &LoggedSensors,
         is_kept: bool,
     ) -> McapResult<()> {
         let at_ns = self.wall_ns(at);
         let mut images = Vec::new();
+        let records = self.readings(at_ns, sensors, is_kept)?;
         if is_kept {
             self.poses_at_images(at_ns, logged)?;
             for image in logged {
@@ -424,8 +431,34 @@ impl<D: Disk> LogWriter<D> {
             self.show_images(at_ns, logged)?;
         }
         let protocol = PROTOCOL_VERSION.into();
-        let observation = Observation { seq, protocol, published_ns: at.as_ns(), head, images };
+        let (published_ns, table) = (at.as_ns(), sensors.table.clone());
+        let observation =
+            Observation { seq, protocol, published_ns, head, images, sensors: table, records };
         self.sinks.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
+    }
+
+    /// Writes the readings that are new on the sensors' topics: large ones only with images that are kept. Returns what
+    /// the observation holds of all.
+    fn readings(
+        &mut self,
+        at_ns: u64,
+        sensors: &LoggedSensors,
+        is_kept: bool,
+    ) -> McapResult<Vec<ObservedRecords>> {
+        let mut records = Vec::new();
+        for logged in &sensors.readings {
+            let (shown, is_apart) = (logged.reading.shown, logged.is_apart());
+            let is_new = self.readings.get(&logged.sensor) != Some(&shown);
+            if is_new && (is_kept || !is_apart) {
+                let message = logged.message(self.wall_ns(shown));
+                self.sinks.put(logged.channel(), &logged.name, at_ns, &message)?;
+                self.readings.insert(logged.sensor, shown);
+            }
+            let bytes = if is_apart { Vec::new() } else { logged.reading.records.clone() };
+            let (sensor, name) = (logged.sensor.into(), logged.name.clone());
+            records.push(ObservedRecords { sensor, name, is_apart, bytes });
+        }
+        Ok(records)
     }
 
     /// Writes where images were rendered from, once for all of the same instant.
@@ -557,7 +590,7 @@ impl<D: Disk> LogWriter<D> {
 }
 
 const WORLD: &str = "world";
-const BODY: &str = "body";
+pub(super) const BODY: &str = "body";
 const ODOM: &str = "odom";
 
 /// Whether images are to be logged with so much room on the disk.
@@ -571,7 +604,7 @@ pub(super) fn timestamp(at_ns: u64) -> fox::Timestamp {
     fox::Timestamp::new(u32::try_from(seconds).unwrap_or(u32::MAX), nanoseconds as u32)
 }
 
-fn parts<A, B>(pose: &Pose<A, B>) -> (fox::Vector3, fox::Quaternion) {
+pub(super) fn parts<A, B>(pose: &Pose<A, B>) -> (fox::Vector3, fox::Quaternion) {
     let (p, q) = (pose.translation_m, pose.rotation);
     (fox::Vector3 { x: p.x, y: p.y, z: p.z }, fox::Quaternion { x: q.x, y: q.y, z: q.z, w: q.w })
 }

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use vizflyt_protocol::messages::{Setpoint, ToPlugin};
 use vizflyt_protocol::packet::ObservationHeader;
+use vizflyt_protocol::sensor::SensorHeader;
 use vizflyt_rgbd::{Decoder, peek};
 use zerocopy::FromBytes;
 
@@ -124,7 +125,7 @@ pub fn observation_len(head: &[u8]) -> Option<usize> {
     (head.len() <= len && len <= LARGEST).then_some(len)
 }
 
-/// Writes an observation as it was: the recorded head, the images decoded again. `None` if the log
+/// Writes an observation as it was: the recorded head, the sensors' readings, the images decoded again. `None` if the log
 /// does not hold it whole, or it makes no sense.
 #[allow(clippy::implicit_hasher)] // Why: nobody brings another one.
 pub fn decode(
@@ -133,6 +134,7 @@ pub fn decode(
     decoders: &mut HashMap<u32, Decoder>,
 ) -> Option<()> {
     memory.get_mut(..observation.head.len())?.copy_from_slice(&observation.head);
+    write_sensors(observation, memory)?;
     // A copy: the planes are in the same memory. It is small, and checked to be in there.
     let header = *ObservationHeader::parse(memory).ok()?;
     let planes_begin = size_of::<ObservationHeader>();
@@ -155,6 +157,33 @@ pub fn decode(
         let depth_mm = <[u16]>::mut_from_bytes(back.get_mut(..2 * pixels)?).ok()?;
         let decoder = decoders.entry(index).or_default();
         decoder.decode(&image.bitstream, rgb, depth_mm).ok()?;
+    }
+    Some(())
+}
+
+/// Writes the table of sensors and their records to where the head and the table say.
+fn write_sensors(observation: &Observation, memory: &mut [u8]) -> Option<()> {
+    let (header, _) = ObservationHeader::ref_from_prefix(memory).ok()?;
+    let (at, count) = (header.sensors_offset as usize, header.sensor_count as usize);
+    if count == 0 {
+        return Some(());
+    }
+    let behind_the_head = at >= size_of::<ObservationHeader>();
+    let table = observation.sensors.as_slice();
+    memory.get_mut(at..)?.get_mut(..table.len())?.copy_from_slice(table);
+    for records in &observation.records {
+        let (stride, index) = (size_of::<SensorHeader>(), records.sensor as usize);
+        let head = table.get(index.checked_mul(stride)?..)?.get(..stride)?;
+        let sensor = SensorHeader::read_from_bytes(head).ok()?;
+        let (from, len) = (sensor.records_offset as usize, records.bytes.len());
+        let kind = sensor.kind()?;
+        let is_whole = len == (sensor.record_count as usize).checked_mul(kind.record_len())?;
+        let is_behind = from >= at.checked_add(table.len())?;
+        let room = memory.get_mut(from..from.checked_add(len)?)?;
+        if !(is_whole && is_behind && behind_the_head) {
+            return None;
+        }
+        room.copy_from_slice(&records.bytes);
     }
     Some(())
 }

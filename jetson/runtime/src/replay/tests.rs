@@ -17,7 +17,9 @@ use vizflyt_sdk::{CameraInfo, ImageStamps, ObservationBuffer};
 use prost::Message as _;
 
 use super::*;
-use crate::log::{FlightLog, LogSettings, LoggedImage, PluginMessage, observation_head};
+use crate::log::{
+    FlightLog, LogSettings, LoggedImage, LoggedSensors, PluginMessage, observation_head,
+};
 
 fn camera() -> CameraInfo {
     CameraInfo::forward("front", Intrinsics::from_horizontal_fov(32, 24, 1.5))
@@ -81,7 +83,13 @@ impl Flight {
             pieces,
         };
         let images = self.log.images(&Arc::default()).unwrap();
-        images.observation(at(ms), seq, observation_head(buffer.as_bytes()).to_vec(), vec![image]);
+        images.observation(
+            at(ms),
+            seq,
+            observation_head(buffer.as_bytes()).to_vec(),
+            vec![image],
+            LoggedSensors::default(),
+        );
     }
 
     /// An image as a reduced log has it that left it out.
@@ -89,7 +97,13 @@ impl Flight {
         let mut buffer = ObservationBuffer::new(&[camera()]);
         buffer.clear(seq);
         let images = self.log.images(&Arc::default()).unwrap();
-        images.observation(at(ms), seq, observation_head(buffer.as_bytes()).to_vec(), vec![]);
+        images.observation(
+            at(ms),
+            seq,
+            observation_head(buffer.as_bytes()).to_vec(),
+            vec![],
+            LoggedSensors::default(),
+        );
     }
 
     fn answer(&self, seq: u64, ms: u64, setpoint: Option<Setpoint>) {
@@ -363,4 +377,94 @@ fn a_head_that_makes_no_sense_is_not_fed() {
         })
         .unwrap();
     feeder::tests::check(&observation);
+}
+
+#[test]
+fn readings_are_fed_as_they_were() {
+    use vizflyt_protocol::packet::ObservationHeader;
+    use vizflyt_protocol::sensor::{
+        LidarPoint, RangeReading, ReadingHeader, SensorInfo, SensorKind,
+    };
+    use zerocopy::IntoBytes;
+
+    let sensors =
+        [("top", SensorKind::Lidar), ("down", SensorKind::Sonar)].map(|(name, kind)| SensorInfo {
+            name: bounded(name),
+            kind,
+            enabled: true,
+            to_autopilot: false,
+            rate_hz: 10.0,
+            min_range_m: 0.1,
+            max_range_m: 10.0,
+            horizontal_fov_rad: 0.1,
+            vertical_fov_rad: 0.1,
+            most_records: 40,
+            body_from_sensor: Pose::IDENTITY,
+        });
+    let reading = |sensor: usize, ms: u64, records: &[u8]| {
+        let kind = sensors[sensor].kind;
+        let count = (records.len() / kind.record_len()) as u32;
+        let (of, stamp) = ((sensor as u8, kind), ServerTime::from_ns(ms));
+        let header = ReadingHeader::new(ms, of, stamp, &Pose::IDENTITY, &Pose::IDENTITY, count);
+        let records = records.to_vec();
+        Some(Arc::new(crate::stream::Reading {
+            header,
+            pose: at(ms),
+            shown: at(ms),
+            received: at(ms),
+            records,
+        }))
+    };
+    let flight = Flight::new();
+    let mut shown = Vec::new();
+    for seq in 1..=4_u64 {
+        let mut buffer = ObservationBuffer::with_sensors(&[], &sensors);
+        buffer.clear(seq);
+        // A scan every other time.
+        let scan = seq.div_ceil(2);
+        let points = [LidarPoint { p_m: [scan as f32; 3], ring: 3, ..LidarPoint::default() }; 33];
+        let range = RangeReading { range_m: seq as f32, signal: 0.5 };
+        let mut readings = crate::stream::NewestReadings::default();
+        readings[0] = reading(0, scan, &points[..10 + scan as usize].as_bytes()[..]);
+        readings[1] = reading(1, 100 + seq, range.as_bytes());
+        let given: Vec<_> =
+            readings.iter().map(|one| one.as_ref().map(|one| one.given(true))).collect();
+        buffer.set_readings(&given);
+        let bytes = buffer.as_bytes();
+        let logged = LoggedSensors::of(bytes, &sensors, &readings);
+        let images = flight.log.images(&Arc::default()).unwrap();
+        images.observation(at(seq), seq, observation_head(bytes).to_vec(), vec![], logged);
+        shown.push(bytes.to_vec());
+    }
+    let (path, _folder) = flight.close();
+    let mut recorded = RecordedFlight::new(LogReader::open(&path).unwrap(), true);
+    let mut seen = 0;
+    while let Some(next) = recorded.next().unwrap() {
+        let crate::log::read::Recorded::Observation(observation) = next else { continue };
+        let len = feeder::observation_len(&observation.head).unwrap();
+        let mut blocks = vec![0_u64; len.div_ceil(8)];
+        let memory = &mut blocks.as_mut_bytes()[..len];
+        feeder::decode(&observation, memory, &mut std::collections::HashMap::new()).unwrap();
+        let was = &shown[seen];
+        let (found, expected) = (&*memory, &was[..len]);
+        let header = ObservationHeader::parse(found).unwrap();
+        assert_eq!(header.sensors(found), ObservationHeader::parse(was).unwrap().sensors(was));
+        for sensor in header.sensors(found) {
+            assert_eq!(sensor.records(found), sensor.records(expected));
+            assert!(sensor.records(found).is_some());
+        }
+        seen += 1;
+        // Wherever a byte of the table is another, nothing panics, and nothing is written outside.
+        for place in 0..observation.sensors.len() {
+            let mut other = observation.clone();
+            other.sensors[place] ^= 0x55;
+            let _ = feeder::decode(&other, memory, &mut std::collections::HashMap::new());
+        }
+    }
+    assert_eq!(seen, 4);
+    let (found, _) = (std::fs::read(&path).unwrap(), ());
+    let scans = mcap::MessageStream::new(&found)
+        .unwrap()
+        .filter(|message| message.as_ref().is_ok_and(|one| one.channel.topic == "/sensor/top"));
+    assert_eq!(scans.count(), 2, "each once");
 }

@@ -5,6 +5,7 @@
 //! control stream (bi, ordered)  ── Event, Camera, Clock ──▶ control loop
 //!                               ◀─ Hello, Clock, Telemetry 10 Hz, Event ── Outbox
 //! one uni stream per image      ── header, slices, trailer ──▶ Mailbox, newest wins ──▶ images
+//! one uni stream per reading    ── header, records ──▶ Readings, newest wins ──▶ images, control loop
 //! ```
 //! Runs on tokio. Any outage (3 s of silence, a server that restarts) ends in a new connection,
 //! tried for as long as the flight lasts. Events are numbered and acknowledged both ways: after an
@@ -14,6 +15,7 @@
 mod mailbox;
 mod outbox;
 mod pair;
+mod readings;
 mod receive;
 mod session;
 #[cfg(test)]
@@ -29,6 +31,7 @@ use vizflyt_protocol::messages::{
     ArenaInfo, CameraInfo, ClockState, Event, Name, PoseSample, Purpose, ReceivedEvents, Text,
 };
 use vizflyt_protocol::packet::feed::FeedKey;
+use vizflyt_protocol::sensor::SensorInfo;
 use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, random_instance_id};
@@ -36,6 +39,7 @@ use vizflyt_trust::{ALPN, Fingerprint, Identity, random_instance_id};
 pub use mailbox::{Arrival, Fates, Mailbox, Step, Ticket, Whole};
 pub use outbox::Outbox;
 pub use pair::{NowPaired, pair};
+pub use readings::{NewestReadings, Reading, Readings};
 
 /// Where the server is, and who we are.
 #[derive(Clone, Debug)]
@@ -72,6 +76,8 @@ pub enum StreamEvent {
     Event(Event),
     /// A camera, by its index, was changed.
     Camera(u8, Box<CameraInfo>),
+    /// A sensor, by its index, was changed.
+    Sensor(u8, Box<SensorInfo>),
 }
 
 /// The relation of the server's clock to ours, shared by all who stamp.
@@ -143,6 +149,8 @@ pub struct Shared {
     pub clock: ServerClock,
     /// Where images go.
     pub mailbox: Arc<Mailbox>,
+    /// Where readings of the other sensors go.
+    pub readings: Arc<Readings>,
 }
 
 /// Socket buffers: with the kernel's own 200 KB, large images lose packets (measured: 4000 lost

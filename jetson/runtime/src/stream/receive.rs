@@ -1,4 +1,4 @@
-//! Image streams into the mailbox, piece by piece as they arrive.
+//! Image streams into the mailbox, piece by piece as they arrive; readings of other sensors whole.
 //!
 //! A few tasks live as long as the connection and wait for the next stream; there is always one
 //! that waits, so no image waits for another. Bytes are copied once, from the transport's packets
@@ -11,9 +11,11 @@ use std::time::Duration;
 use quinn::{Connection, ReadExactError, RecvStream, VarInt};
 use tokio::time::timeout;
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
+use vizflyt_protocol::sensor::ReadingHeader;
 use vizflyt_rgbd::{HEADER_BYTES, Info, SLICE_HEADER_BYTES, peek, slice_len};
 
 use super::mailbox::{Arrival, Ticket, Whole};
+use super::readings::{self, Reading};
 use super::{IMAGES_AT_ONCE, Shared};
 use crate::clock;
 
@@ -35,6 +37,8 @@ enum Lost {
     Bitstream(#[from] vizflyt_rgbd::DecodeError),
     #[error(transparent)]
     Trailer(#[from] vizflyt_protocol::packet::InvalidImageTrailer),
+    #[error(transparent)]
+    Reading(#[from] vizflyt_protocol::sensor::InvalidReading),
     #[error("more bytes than an image of its size can need")]
     Long,
     #[error("its bitstream is of another size than its header")]
@@ -86,15 +90,15 @@ impl Receivers {
         }
     }
 
-    /// Receives one image. One that is cut off, late or nonsense is dropped: the next one comes in
+    /// Receives one image or reading. One that is cut off, late or nonsense is dropped: the next one comes in
     /// a moment.
     async fn receive(&self, stream: &mut RecvStream, piece: &mut Vec<u8>) {
         let mut ticket = None;
-        let result = timeout(IMAGE_WITHIN, self.pieces(stream, piece, &mut ticket)).await;
+        let result = timeout(IMAGE_WITHIN, self.whole(stream, piece, &mut ticket)).await;
         let why = match result {
             Ok(Ok(whole)) => {
                 if let Some(ticket) = ticket {
-                    self.shared.mailbox.end(ticket, Some(whole));
+                    self.shared.mailbox.end(ticket, whole);
                 }
                 return;
             }
@@ -109,14 +113,50 @@ impl Receivers {
         tracing::debug!("image dropped: {why}");
     }
 
-    async fn pieces(
+    /// Receives what a stream carries by its first bytes; returns the end of an image.
+    async fn whole(
         &self,
         stream: &mut RecvStream,
         piece: &mut Vec<u8>,
         ticket: &mut Option<Ticket>,
+    ) -> Result<Option<Whole>, Lost> {
+        let mut magic = [0; ReadingHeader::MAGIC.len()];
+        stream.read_exact(&mut magic).await?;
+        if magic == ReadingHeader::MAGIC {
+            self.reading(stream, magic).await?;
+            return Ok(None);
+        }
+        self.pieces(stream, magic, piece, ticket).await.map(Some)
+    }
+
+    /// Receives a reading of a sensor that is no camera.
+    async fn reading(&self, stream: &mut RecvStream, magic: [u8; 4]) -> Result<(), Lost> {
+        let mut bytes = [0; ReadingHeader::SIZE];
+        let (first, rest) = bytes.split_at_mut(magic.len());
+        first.copy_from_slice(&magic);
+        stream.read_exact(rest).await?;
+        let (header, len) = readings::head(&bytes)?;
+        let clock = &self.shared.clock;
+        let pose = clock.to_host(header.pose_stamp()).ok_or(Lost::Clock)?;
+        let shown = clock.to_host(header.stamp()).ok_or(Lost::Clock)?;
+        let mut records = Vec::new();
+        read(stream, &mut records, len).await?;
+        let received = clock::now();
+        self.shared.readings.put(Reading { header, pose, shown, received, records });
+        Ok(())
+    }
+
+    async fn pieces(
+        &self,
+        stream: &mut RecvStream,
+        magic: [u8; 4],
+        piece: &mut Vec<u8>,
+        ticket: &mut Option<Ticket>,
     ) -> Result<Whole, Lost> {
         let mut head = [0; ImageHeader::SIZE];
-        stream.read_exact(&mut head).await?;
+        let (front, rest) = head.split_at_mut(magic.len());
+        front.copy_from_slice(&magic);
+        stream.read_exact(rest).await?;
         let first = clock::now();
         let (header, _) = ImageHeader::parse(&head)?;
         let pose = self.shared.clock.to_host(header.pose_stamp()).ok_or(Lost::Clock)?;

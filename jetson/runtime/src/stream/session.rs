@@ -181,6 +181,9 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
             Ok(ToRuntime::Camera { index, camera }) => {
                 self.hand(StreamEvent::Camera(index, Box::new(camera)))?;
             }
+            Ok(ToRuntime::Sensor { index, sensor }) => {
+                self.hand(StreamEvent::Sensor(index, Box::new(sensor)))?;
+            }
             Err(error @ FramingError::Body(_)) => tracing::warn!("server: {error}"),
             Err(error @ FramingError::TooLong(_)) => return Err(lost(error)),
         }

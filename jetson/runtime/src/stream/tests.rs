@@ -151,7 +151,11 @@ impl Client {
     fn start(server: &Server, fingerprint: Fingerprint) -> Self {
         let (sender, events) = channel();
         let outbox = Arc::new(Outbox::default());
-        let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
+        let shared = Shared {
+            clock: ServerClock::default(),
+            mailbox: Arc::default(),
+            readings: Arc::default(),
+        };
         let settings = StreamSettings {
             server: server.endpoint.local_addr().unwrap(),
             fingerprint,
@@ -325,7 +329,8 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
 async fn event_that_was_not_taken_is_sent_again() {
     let server = Server::start();
     let (sender, events) = channel();
-    let shared = Shared { clock: ServerClock::default(), mailbox: Arc::default() };
+    let shared =
+        Shared { clock: ServerClock::default(), mailbox: Arc::default(), readings: Arc::default() };
     let settings = StreamSettings {
         server: server.endpoint.local_addr().unwrap(),
         fingerprint: server.fingerprint,

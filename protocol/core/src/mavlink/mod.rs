@@ -5,6 +5,7 @@
 //! simulator and the bridge agree on one version of it.
 
 mod command;
+mod distance;
 mod fence;
 mod frames;
 mod setpoint;
@@ -16,6 +17,7 @@ pub use ::mavlink::dialects::ardupilotmega as dialect;
 pub use ::mavlink::{MavHeader, MavlinkVersion, Message, MessageData};
 
 pub use command::{CopterMode, command_name, result_name};
+pub use distance::{distance_to_mavlink, obstacles_to_mavlink};
 pub use fence::{
     FenceCorner, FenceSide, GlobalPoint, fence_corner_from_mavlink, fence_corner_to_mavlink,
     fence_request_from_mavlink, mission_result_name,

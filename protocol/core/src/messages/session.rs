@@ -7,6 +7,7 @@ use super::{
     Event, MAX_CAMERAS, MAX_NO_FLY, Name, SetpointKinds, Telemetry, Text, Timing, bounded,
 };
 use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World, body_from_forward_cam};
+use crate::sensor::{MAX_SENSORS, SensorInfo};
 use crate::time::{HostTime, ServerTime};
 
 /// What a client is there for.
@@ -139,6 +140,13 @@ pub enum ToRuntime {
         index: u8,
         /// The camera as it is from now on; its name stays.
         camera: CameraInfo,
+    },
+    /// A sensor was changed while flying.
+    Sensor {
+        /// Index into [`ArenaInfo::sensors`].
+        index: u8,
+        /// The sensor as it is from now on; its name and its kind stay.
+        sensor: SensorInfo,
     },
 }
 
@@ -349,6 +357,8 @@ pub struct ArenaInfo {
     pub setpoints: SetpointKinds,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
+    /// The sensors beside the cameras, in the order of their index on the wire.
+    pub sensors: heapless::Vec<SensorInfo, MAX_SENSORS>,
 }
 
 impl ArenaInfo {
@@ -371,6 +381,7 @@ impl ArenaInfo {
             pose_ages: PoseAges::default(),
             setpoints: SetpointKinds::USUAL,
             cameras: heapless::Vec::new(),
+            sensors: heapless::Vec::new(),
         }
     }
 }

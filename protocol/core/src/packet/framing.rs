@@ -93,6 +93,7 @@ mod tests {
     use super::*;
     use crate::geometry::{Intrinsics, Pose, Twist, Volume, body_from_forward_cam};
     use crate::messages::*;
+    use crate::sensor::{MAX_SENSORS, SensorInfo, SensorKind};
     use crate::time::{HostTime, ServerTime};
     use glam::{DQuat, DVec3, Vec3};
     use std::vec::Vec;
@@ -128,6 +129,23 @@ mod tests {
             pose_ages: PoseAges::default(),
             setpoints: crate::messages::SetpointKinds::ALL,
             cameras: core::iter::repeat_n(camera, MAX_CAMERAS).collect(),
+            sensors: core::iter::repeat_n(widest_sensor(), MAX_SENSORS).collect(),
+        }
+    }
+
+    fn widest_sensor() -> SensorInfo {
+        SensorInfo {
+            name: bounded("this sensor's name is far too long to fit"),
+            kind: SensorKind::Lidar,
+            enabled: true,
+            to_autopilot: true,
+            rate_hz: 9.9,
+            min_range_m: 0.1,
+            max_range_m: 99.9,
+            horizontal_fov_rad: 6.28,
+            vertical_fov_rad: 0.7,
+            most_records: u32::MAX,
+            body_from_sensor: Pose::new(DVec3::splat(0.1), DQuat::from_rotation_x(0.4)),
         }
     }
 
@@ -196,8 +214,10 @@ mod tests {
     #[test]
     fn the_widest_messages_fit() {
         let mut buffer = [0; MAX_FRAMED];
-        assert!(encode(&ToRuntime::Welcome(welcome()), &mut buffer).len() < MAX_FRAMED / 2);
-        assert!(encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED / 2);
+        assert!(encode(&ToRuntime::Welcome(welcome()), &mut buffer).len() < MAX_FRAMED * 3 / 4);
+        assert!(
+            encode_body(&ToPlugin::Start(widest_arena()), &mut buffer).len() < MAX_FRAMED * 3 / 4
+        );
         let piece = Piece { seconds: 1.1, coefficients: [DVec3::splat(1.1); COEFFICIENTS] };
         let way = Waypoint { p_m: DVec3::splat(1.1), speed_mps: 1.1 };
         let paths = [

@@ -1,8 +1,9 @@
 //! The layout of one observation in shared memory, from the runtime to the plugin.
 //!
 //! `ObservationHeader`, then for each camera its RGB plane (H x W x 3 bytes) and its depth plane
-//! (H x W u16 of millimetres), each at a 64-byte boundary. Little-endian, fixed offsets: the C
-//! header for other languages mirrors this file.
+//! (H x W u16 of millimetres), each at a 64-byte boundary; behind them the sensors' part, if there are
+//! sensors ([`crate::sensor::memory`]). Little-endian, fixed offsets: the C header for other languages
+//! mirrors this file.
 //!
 //! What the course withholds (pose, velocity) is not written: those bytes are zero.
 
@@ -12,6 +13,7 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 use crate::PROTOCOL_VERSION;
 use crate::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
 use crate::messages::MAX_CAMERAS;
+use crate::sensor::{SensorHeader, memory};
 
 /// Alignment of the payload and of each plane in it. [bytes]
 pub const PLANE_ALIGN: usize = 64;
@@ -103,12 +105,16 @@ pub struct ObservationHeader {
     pub imu: [ImuRecord; MAX_IMU],
     /// The cameras.
     pub cameras: [CameraHeader; MAX_CAMERAS],
+    /// Start of the table of sensors from the start of the header, if there are any. [bytes]
+    pub sensors_offset: u32,
+    /// Sensors in the table.
+    pub sensor_count: u32,
 }
 
 // The layout is a contract with other languages and processes.
 const _: () = assert!(size_of::<CameraHeader>() == 232);
 const _: () = assert!(size_of::<ImuRecord>() == 32);
-const _: () = assert!(size_of::<ObservationHeader>() == 152 + 32 * MAX_IMU + 232 * MAX_CAMERAS);
+const _: () = assert!(size_of::<ObservationHeader>() == 160 + 32 * MAX_IMU + 232 * MAX_CAMERAS);
 
 /// Where the planes of a set of images lie.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -155,6 +161,9 @@ pub enum InvalidObservation {
     /// A plane lies outside the memory.
     #[error("camera {0} of the observation lies outside its memory")]
     Plane(usize),
+    /// A sensor of no kind, or a reading that lies outside the memory.
+    #[error("sensor {0} of the observation lies outside its memory, or is of an unknown kind")]
+    Sensor(usize),
 }
 
 impl ObservationHeader {
@@ -183,10 +192,12 @@ impl ObservationHeader {
             battery_v: 0.0,
             imu: [ImuRecord::default(); MAX_IMU],
             cameras: [CameraHeader::default(); MAX_CAMERAS],
+            sensors_offset: 0,
+            sensor_count: 0,
         }
     }
 
-    /// Reads and validates the header in place; every plane named in it then lies in `bytes`.
+    /// Reads and validates the header in place; every plane and reading named in it then lies in `bytes`.
     pub fn parse(bytes: &[u8]) -> Result<&Self, InvalidObservation> {
         let (header, _) =
             Self::ref_from_prefix(bytes).map_err(|_| InvalidObservation::Short(bytes.len()))?;
@@ -211,7 +222,14 @@ impl ObservationHeader {
                 return Err(InvalidObservation::Plane(index));
             }
         }
+        memory::parse(bytes, header.sensors_offset, header.sensor_count)
+            .map_err(InvalidObservation::Sensor)?;
         Ok(header)
+    }
+
+    /// Returns the sensors of the observation in `bytes`, of which this is the header.
+    pub fn sensors<'a>(&self, bytes: &'a [u8]) -> &'a [SensorHeader] {
+        memory::parse(bytes, self.sensors_offset, self.sensor_count).unwrap_or_default()
     }
 
     /// Returns the vehicle's attitude, body to world, if it is known.

@@ -176,6 +176,7 @@ impl ArenaConfig {
             self.check_body(),
             self.check_occupancy(),
             self.check_cameras(),
+            self.check_sensors(),
             self.check_vehicles(),
             self.check_stages(),
             self.check_no_fly(),

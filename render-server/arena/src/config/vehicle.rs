@@ -20,12 +20,15 @@ pub struct VehicleConfig {
     /// Names of its cameras, in the order of their index on the wire; all if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<String>>,
+    /// Names of its sensors beside the cameras; all if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<Vec<String>>,
 }
 
 impl VehicleConfig {
     /// Returns a vehicle with all cameras at the arena's spawn.
     pub fn named(name: &str) -> Self {
-        Self { name: name.to_owned(), spawn: None, cameras: None }
+        Self { name: name.to_owned(), spawn: None, cameras: None, sensors: None }
     }
 }
 
@@ -66,6 +69,10 @@ impl ArenaConfig {
             let named = |name: &String| self.cameras.iter().find(|camera| camera.name == *name);
             arena.cameras = names.iter().filter_map(named).cloned().collect();
         }
+        if let Some(names) = &vehicle.sensors {
+            let named = |name: &String| self.sensors.iter().find(|sensor| sensor.name == *name);
+            arena.sensors = names.iter().filter_map(named).cloned().collect();
+        }
         arena
     }
 
@@ -89,6 +96,15 @@ impl ArenaConfig {
                     );
                     return Err(invalid(key, "[]", advice));
                 }
+            }
+            let mut taken = HashSet::new();
+            for name in vehicle.sensors.iter().flatten() {
+                let key = format!("vehicles[{index}].sensors");
+                if !self.sensors.iter().any(|sensor| sensor.name == *name) {
+                    let advice = "is not among the [[sensors]]; name one that is, or add it there";
+                    return Err(invalid(key, format!("{name:?}"), advice));
+                }
+                check_name(&key, name, &mut taken)?;
             }
             if let Some(spawn) = vehicle.spawn {
                 self.check_spawn(&format!("vehicles[{index}].spawn"), spawn)?;

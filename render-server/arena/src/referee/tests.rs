@@ -32,6 +32,7 @@ pub(crate) fn arena() -> ArenaConfig {
         occupancy: Occupancy { voxel_m: 0.1, ..Occupancy::default() },
         environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
+        sensors: Vec::new(),
         vehicles: Vec::new(),
         localization: Vec::new(),
         cameras: Vec::new(),

@@ -101,6 +101,7 @@ fn arena(site: &Site) -> ArenaConfig {
         cameras: vec![front_camera()],
         environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
+        sensors: Vec::new(),
         vehicles: Vec::new(),
         localization: Vec::new(),
         stages: Vec::new(),

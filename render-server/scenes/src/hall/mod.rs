@@ -272,6 +272,7 @@ fn build(
         cameras: vec![front_camera()],
         environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
+        sensors: Vec::new(),
         vehicles: Vec::new(),
         localization: Vec::new(),
         stages: course.stages(),

@@ -10,6 +10,7 @@ use serde_json::{Map, Value};
 use tokio::sync::watch;
 use vizflyt_arena::config::{CameraConfig, ConfigError};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
+use vizflyt_protocol::sensor::SensorKind;
 
 /// All cameras at one moment, in the order of their index on the wire.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -75,14 +76,32 @@ pub enum ChangeError {
         /// What there is.
         known: Vec<String>,
     },
+    /// No sensor has this name.
+    #[error("there is no sensor '{name}'; there are {}", known.join(", "))]
+    UnknownSensor {
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: Vec<String>,
+    },
+    /// Plugins expect records of the kind that they were told of.
+    #[error("model = {model:?} is a {is}, and the sensor a {was}; it stays one while flying")]
+    Kind {
+        /// What was asked for.
+        model: String,
+        /// Its kind.
+        is: SensorKind,
+        /// The sensor's.
+        was: SensorKind,
+    },
     /// The text is no camera.
-    #[error("no camera: {0}")]
+    #[error("no settings of it: {0}")]
     Json(serde_json::Error),
     /// A value that cannot work.
     #[error(transparent)]
     Value(#[from] ConfigError),
     /// Plugins call cameras by name.
-    #[error("name = {0:?}: a camera keeps its name while flying; leave `name` out")]
+    #[error("name = {0:?}: a camera or sensor keeps its name while flying; leave `name` out")]
     Renamed(String),
     /// It would take so long to draw that the vehicle flies blind.
     #[error(
@@ -268,8 +287,8 @@ mod tests {
         let before = cameras.newest();
         let patch = |json: &str| cameras.patch("front", json.as_bytes());
         refused(cameras.patch("left", b"{}"), "there is no camera 'left'; there are front, rear");
-        refused(patch("{"), "no camera: EOF");
-        refused(patch("[1]"), "no camera: invalid type: sequence");
+        refused(patch("{"), "no settings of it: EOF");
+        refused(patch("[1]"), "no settings of it: invalid type: sequence");
         refused(patch(r#"{"fov": 60}"#), "unknown field `fov`, expected one of");
         refused(patch(r#"{"width_px": "wide"}"#), "invalid type: string");
         refused(patch(r#"{"width_px": 0}"#), "width_px");

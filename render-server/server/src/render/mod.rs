@@ -1,8 +1,9 @@
-//! What the cameras see: newest motions in, rendered ticks out.
+//! What cameras and other sensors see: newest motions in, rendered ticks and readings out.
 //!
 //! ```text
 //! in   the newest motions of all vehicles, from `poses`; the demand for images, from `stream`
-//! out  rendered ticks (RGB, depth, object ids), to the encode thread and then to the previews
+//! out  rendered ticks (RGB, depth, object ids), to the encode thread and then to the previews;
+//!      readings of other sensors, to sessions and the page
 //! ```
 //! Imports `scene`, `poses` and `flights`; `stream` states its demand through [`demand::Demand`].
 
@@ -13,6 +14,7 @@ pub mod environment;
 pub mod rendered;
 mod renderer;
 pub mod schedule;
+pub mod sensors;
 pub mod thread;
 
 use std::sync::Mutex;
@@ -24,6 +26,7 @@ use self::cameras::Cameras;
 use self::dynamic_objects::DynamicObjects;
 use self::environment::Environment;
 pub use self::renderer::{DetailKind, RendererInfo, RendererKind, choose};
+use self::sensors::Sensors;
 use crate::timing::StageDurations;
 
 /// What is rendered, and how.
@@ -31,6 +34,8 @@ use crate::timing::StageDurations;
 pub struct Rendering {
     /// The cameras of each vehicle, at its index.
     pub cameras: Vec<Cameras>,
+    /// The sensors beside the cameras of each vehicle, at its index.
+    pub sensors: Vec<Sensors>,
     /// Light and fog.
     pub environment: Environment,
     /// Moving objects, and the vehicles as the others see them.

@@ -152,6 +152,7 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
         occupancy: Occupancy { voxel_m, ..Occupancy::default() },
         environment: EnvironmentConfig::default(),
         pose: PoseConfig::default(),
+        sensors: Vec::new(),
         vehicles: Vec::new(),
         localization: Vec::new(),
         cameras: vec![CameraConfig::ahead(

@@ -5,12 +5,14 @@ use std::sync::Arc;
 use anyhow::Result;
 use tracing::warn;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
+use vizflyt_splat::sensor::SensorScene;
 use vizflyt_splat::{Chosen, Scene as RenderedScene};
 
 use crate::args::ServeArgs;
 use crate::clock;
 use crate::render::choose;
 use crate::render::dynamic_objects::{DynamicObjects, vehicle_models};
+use crate::render::sensors::SensorSet;
 use crate::scene::{self, Scene};
 use crate::web::top_view::TopView;
 
@@ -22,6 +24,10 @@ pub(super) struct LoadedScene {
     pub(super) flying: Vec<(String, ArenaConfig)>,
     pub(super) referees: Vec<Referee>,
     pub(super) dynamic_objects: DynamicObjects,
+    /// Each vehicle's sensors beside the cameras.
+    pub(super) sensors: Vec<SensorSet>,
+    /// What they measure in; `None` if there are none.
+    pub(super) sensor_scene: Option<SensorScene>,
     /// Whether the vehicles see and touch each other.
     pub(super) neighbours: bool,
     pub(super) top_view: TopView,
@@ -41,6 +47,8 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
         .iter()
         .map(|vehicle| (vehicle.name.clone(), arena.of_vehicle(vehicle)))
         .collect();
+    let sensors = flying.iter().map(|(_, arena)| SensorSet::new(&arena.sensors));
+    let sensors = sensors.collect::<Result<Vec<_>, _>>()?;
     let field = Arc::new(scene::bake(&splats, &arena, seen.as_ref()));
     for finding in scene::check_fit(&splats, &arena, &field) {
         warn!("{finding}");
@@ -51,6 +59,8 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     objects.extend(vehicle_models(together));
     let rendered = RenderedScene { splats: &splats, objects: &objects };
     let renderer = choose(rendered, args.renderer, args.detail)?;
+    let has_sensors = sensors.iter().any(|set| !set.configs.is_empty());
+    let sensor_scene = has_sensors.then(|| SensorScene::new(rendered));
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
     // Pictures and referees count what moves from the same instant.
@@ -65,6 +75,8 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
         flying,
         referees,
         dynamic_objects,
+        sensors,
+        sensor_scene,
         neighbours,
         top_view,
         field,

@@ -34,6 +34,7 @@ use crate::poses::drivers::{self, Opened};
 use crate::poses::settings::{self, Driver};
 use crate::render::cameras::Cameras;
 use crate::render::environment::Environment;
+use crate::render::sensors::Sensors;
 use crate::render::{RendererInfo, Rendering};
 use crate::scene::Scenes;
 use crate::stop::Stop;
@@ -125,7 +126,13 @@ async fn run(
     let source = drivers::track(sources, &names)?;
     let threads =
         threads::Threads { rooms: &rooms, previews: &previews, neighbours: scene.neighbours };
-    let threads = threads.start(args, scene.renderer.rasterizer, scene.referees, source)?;
+    let threads = threads.start(
+        args,
+        scene.renderer.rasterizer,
+        scene.referees,
+        source,
+        scene.sensor_scene.take(),
+    )?;
 
     let renderer = lock(&rooms.rendering.renderer).clone();
     let url = format!("{}://{http}", if tls.is_some() { "https" } else { "http" });
@@ -239,6 +246,7 @@ async fn make_rooms(
             .iter()
             .map(|(_, arena)| Cameras::new(arena.cameras.clone()))
             .collect(),
+        sensors: std::mem::take(&mut scene.sensors).into_iter().map(Sensors::new).collect(),
         environment: Environment::new(scene.arena.environment),
         dynamic_objects: std::mem::take(&mut scene.dynamic_objects),
         predict: scene.arena.pose.predict,

@@ -1,4 +1,4 @@
-//! Starts the four threads: pose, render, encode, previews.
+//! Starts the threads: pose, render, encode, previews, and sensors where there are any.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -6,6 +6,7 @@ use std::thread::JoinHandle;
 use anyhow::{Context, Result};
 use vizflyt_arena::Referee;
 use vizflyt_splat::Rasterizer;
+use vizflyt_splat::sensor::SensorScene;
 
 use crate::args::ServeArgs;
 use crate::mailbox::Mailbox;
@@ -32,6 +33,7 @@ impl Threads<'_> {
         mut renderer: Box<dyn Rasterizer>,
         referees: Vec<Referee>,
         mut source: Box<dyn PoseSource>,
+        sensor_scene: Option<SensorScene>,
     ) -> Result<Vec<JoinHandle<()>>> {
         let newest = Arc::new(Mailbox::default());
         let ticks = Arc::new(RenderQueue::default());
@@ -59,12 +61,22 @@ impl Threads<'_> {
             let Rooms { streaming, flights, stop, .. } = &rooms;
             previews::run(&made, flights, &streaming.subscriptions, &ticks, stop);
         };
-        Ok(vec![
+        let mut threads = vec![
             start("pose", pose)?,
             start("render", render)?,
             start("encode", encode)?,
             start("previews", previews)?,
-        ])
+        ];
+        if let Some(scene) = sensor_scene {
+            let rooms = self.rooms.clone();
+            let sensors = move || {
+                let Rooms { rendering, localization, streaming, stop, .. } = &rooms;
+                let shared = (&**rendering, &**localization, &**streaming);
+                render::sensors::thread::run(shared, &scene, stop);
+            };
+            threads.push(start("sensors", sensors)?);
+        }
+        Ok(threads)
     }
 }
 

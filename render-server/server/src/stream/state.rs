@@ -16,6 +16,7 @@ use crate::poses::Localization;
 use crate::render::Rendering;
 use crate::render::cameras::Cameras;
 use crate::render::demand::Demand;
+use crate::render::sensors::Sensors;
 use crate::stop::Stop;
 use crate::timing::StageDurations;
 
@@ -96,6 +97,7 @@ impl Rooms {
         stop: Stop,
     ) -> Self {
         let counts: Vec<_> = vehicles.iter().map(|(.., cameras)| cameras.len()).collect();
+        let sensors = counts.iter().map(|_| Sensors::default()).collect();
         let (mut flights, mut cameras) = (Vec::new(), Vec::new());
         for (index, (name, arena, configs)) in vehicles.into_iter().enumerate() {
             flights.push(VehicleFlight::new(index, name, arena));
@@ -104,7 +106,7 @@ impl Rooms {
         Self {
             flights: Arc::new(Flights::new(flights, None)),
             localization: Arc::new(Localization::new(counts.len(), Vec::new())),
-            rendering: Arc::new(Rendering { cameras, ..Rendering::default() }),
+            rendering: Arc::new(Rendering { cameras, sensors, ..Rendering::default() }),
             streaming: Arc::new(Streaming::new(&counts, adapt)),
             stop,
         }

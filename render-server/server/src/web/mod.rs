@@ -53,6 +53,7 @@ mod pairing;
 pub mod previews;
 mod routes;
 mod scenes;
+mod sensors;
 mod sessions;
 mod stats;
 pub mod top_view;

@@ -14,8 +14,8 @@ use axum::routing::{MethodRouter, delete, get, patch, post, put};
 use super::Page;
 use super::access::{self, Takes};
 use super::{
-    cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, shell, stats,
-    vehicles, watch,
+    cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, sensors, shell,
+    stats, vehicles, watch,
 };
 
 /// One route.
@@ -95,6 +95,9 @@ fn table() -> Vec<Route> {
         act(Method::POST, "/api/vehicles/{vehicle}/land", Vehicle, vehicles::land),
         act(Method::POST, "/api/vehicles/{vehicle}/reset", Everything, vehicles::reset),
         read("/api/vehicles/{vehicle}/cameras", Vehicle, cameras::list),
+        read("/api/vehicles/{vehicle}/sensors", Vehicle, sensors::list),
+        read("/api/vehicles/{vehicle}/sensors/{name}/reading", Vehicle, sensors::reading),
+        act(Method::PATCH, "/api/vehicles/{vehicle}/sensors/{name}", Everything, sensors::patch),
         read("/api/vehicles/{vehicle}/crash", Vehicle, crash::show),
         read("/api/vehicles/{vehicle}/crash/{id}/{camera}/{kind}/{number}", Vehicle, crash::image),
         act(Method::PUT, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::put),

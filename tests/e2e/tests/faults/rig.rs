@@ -324,8 +324,11 @@ impl Runtime {
         address: SocketAddr,
         notes: &Arc<Mutex<Notes>>,
     ) -> Self {
-        let shared =
-            Shared { clock: ServerClock::default(), mailbox: Arc::new(Mailbox::default()) };
+        let shared = Shared {
+            clock: ServerClock::default(),
+            mailbox: Arc::new(Mailbox::default()),
+            readings: Arc::default(),
+        };
         lock(notes).events_down.push(BTreeMap::new());
         let outbox = Arc::new(Outbox::default());
         let settings = StreamSettings {
@@ -361,7 +364,10 @@ impl Runtime {
                 }
                 StreamEvent::Down(why) => notes.downs.push(why),
                 StreamEvent::Refused(why) => panic!("refused: {why}"),
-                StreamEvent::Welcome(_) | StreamEvent::Camera(..) | StreamEvent::Feed(..) => {}
+                StreamEvent::Welcome(_)
+                | StreamEvent::Camera(..)
+                | StreamEvent::Sensor(..)
+                | StreamEvent::Feed(..) => {}
             }
             true
         };

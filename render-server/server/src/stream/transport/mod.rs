@@ -5,6 +5,7 @@
 //!        -> pairing, if that is what it asks for; else
 //!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
+//!        -> readings of other sensors: one uni stream each, the newest, behind images
 //!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
 //!        -> feed: sealed poses to the flight's guardian, over UDP, also when the connection has ended
 //! ```
@@ -16,6 +17,7 @@ mod greeting;
 mod images;
 mod lan;
 mod pairing;
+mod readings;
 mod session;
 
 pub use lan::{Lan, LanConfig};

@@ -15,12 +15,13 @@ use vizflyt_protocol::time::ServerTime;
 use super::control::{Ending, Incoming, Outbound, gone};
 use super::greeting::why;
 use super::images::ImageSenders;
-use super::{REPLACED, SLOW, feed};
+use super::{REPLACED, SLOW, feed, readings};
 use crate::clock;
 use crate::flights::control_lease::{ControlLease, WatchLease};
 use crate::flights::events::Origin;
 use crate::flights::vehicle::VehicleFlight;
 use crate::render::cameras::CameraSet;
+use crate::render::sensors::SensorSet;
 use crate::stream::Rooms;
 
 /// A granted conversation with one client.
@@ -90,6 +91,7 @@ impl Session<'_> {
         let (received_sender, received) = cell::channel(0);
         let purpose = if lease.is_some() { Purpose::Fly } else { Purpose::Watch };
         let (rooms, vehicle) = (self.rooms.clone(), self.vehicle.index);
+        let readings = readings::send(rooms.clone(), vehicle, self.connection.clone(), purpose);
         let senders = ImageSenders::open(rooms, vehicle, self.connection.clone(), id, purpose);
         let received_events =
             lease.map_or_else(ReceivedEvents::default, |lease| lease.received_events);
@@ -99,6 +101,7 @@ impl Session<'_> {
             ending = self.send(send, received_events, cursor, clock_requests, received) => ending,
             ending = self.receive(lease, incoming, &clock_sender, &received_sender) => ending,
             ending = senders.run() => ending,
+            never = readings => match never {},
             error = self.connection.closed() => gone(&error),
         }
     }
@@ -120,8 +123,13 @@ impl Session<'_> {
         log.mark_changed();
         let mut cameras = self.rooms.rendering.cameras[index].subscribe();
         let mut sent = cameras.borrow_and_update().clone();
-        let arena =
-            ArenaInfo { cameras: sent.infos.iter().cloned().collect(), ..vehicle.arena.clone() };
+        let mut sensors = self.rooms.rendering.sensors[index].subscribe();
+        let mut sent_sensors = sensors.borrow_and_update().clone();
+        let arena = ArenaInfo {
+            cameras: sent.infos.iter().cloned().collect(),
+            sensors: sent_sensors.infos.iter().cloned().collect(),
+            ..vehicle.arena.clone()
+        };
         let boot = self.rooms.flights.instance_id;
         let feed_port = self.rooms.streaming.feed_port.load(Ordering::Relaxed);
         let welcome = Welcome { boot, received_events, arena, feed_port };
@@ -144,6 +152,11 @@ impl Session<'_> {
                     let newest = cameras.borrow_and_update().clone();
                     let before = std::mem::replace(&mut sent, newest);
                     send_cameras(&mut out, &before, &sent).await
+                }
+                _ = sensors.changed() => {
+                    let newest = sensors.borrow_and_update().clone();
+                    let before = std::mem::replace(&mut sent_sensors, newest);
+                    send_sensors(&mut out, &before, &sent_sensors).await
                 }
                 Some(request) = clock_requests.recv() => {
                     let reply = ClockReply { sent: request.sent, answered: clock::now() };
@@ -240,6 +253,20 @@ async fn send_cameras(
         if before.infos.get(index) != Some(camera) {
             let camera = camera.clone();
             out.write(&ToRuntime::Camera { index: index as u8, camera }).await?;
+        }
+    }
+    Ok(())
+}
+
+async fn send_sensors(
+    out: &mut Outbound,
+    before: &SensorSet,
+    now: &SensorSet,
+) -> Result<(), Ending> {
+    for (index, sensor) in now.infos.iter().enumerate() {
+        if before.infos.get(index) != Some(sensor) {
+            let sensor = sensor.clone();
+            out.write(&ToRuntime::Sensor { index: index as u8, sensor }).await?;
         }
     }
     Ok(())

@@ -26,6 +26,8 @@ pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
         ("State", vec![json(&full_state()), json(&sparse_state())]),
         ("Session", web::login::examples()),
         ("VehicleLine", web::vehicles::examples()),
+        ("SensorLine", web::sensors::examples().0),
+        ("ReadingLine", web::sensors::examples().1),
         ("SceneChoice", web::scenes::examples()),
         ("Environment", web::environment::examples()),
         ("Pairing", web::pairing::examples()),

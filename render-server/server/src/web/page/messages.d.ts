@@ -235,6 +235,33 @@ export type VehicleLine = {
   runtime: string | null;
 };
 
+export type SensorLine = {
+  enabled: boolean;
+  kind: string;
+  late: number;
+  made: number;
+  measures: {
+    horizontal_fov_rad: number;
+    max_range_m: number;
+    min_range_m: number;
+    rate_hz: number;
+    vertical_fov_rad: number;
+  };
+  model: string;
+  name: string;
+  position_m: [number, number, number];
+  sent: number;
+  to_autopilot: boolean;
+};
+
+export type ReadingLine = {
+  age_s: number;
+  points_m: [number, number, number][];
+  range_m: number | null;
+  records: number;
+  seq: number;
+};
+
 export type SceneChoice = {
   now: string | null;
   scenes: string[];

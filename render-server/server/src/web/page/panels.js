@@ -8,6 +8,7 @@ import { crashCard } from "./panels/crash_card.js";
 import { events } from "./panels/events.js";
 import { figures } from "./panels/figures.js";
 import { leaderboard } from "./panels/leaderboard.js";
+import { sensors } from "./panels/sensors.js";
 import { timing } from "./panels/timing.js";
 
 /**
@@ -28,5 +29,5 @@ import { timing } from "./panels/timing.js";
 /** By column, from top to bottom. @type {{ left: Panel[], right: Panel[] }} */
 export const PANELS = {
   left: [arenaView, crashCard, timing, figures],
-  right: [cameraImages, cameraSettings, leaderboard, events],
+  right: [cameraImages, cameraSettings, sensors, leaderboard, events],
 };

@@ -33,7 +33,7 @@ export const known = fetchSession();
 
 /**
  * Sends a request that changes something; an outdated token is renewed once. Never throws.
- * @param {"POST" | "PUT" | "DELETE"} method
+ * @param {"POST" | "PUT" | "PATCH" | "DELETE"} method
  * @param {string} url
  * @param {object} [body] sent as JSON
  * @returns {Promise<Reply>}

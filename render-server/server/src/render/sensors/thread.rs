@@ -1,0 +1,116 @@
+//! The sensors' thread: newest motions in, newest readings out, by each sensor's rate.
+//!
+//! A plain thread of its own with one core at most: images come first. What it does not get done in time is left out.
+
+use std::thread::sleep;
+use std::time::Duration;
+
+use tracing::{trace_span, warn};
+use vizflyt_arena::pose::Motion;
+use vizflyt_protocol::messages::PoseSample;
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_splat::sensor::SensorScene;
+
+use super::measure::{Around, VehicleSensors};
+use crate::clock;
+use crate::poses::Localization;
+use crate::poses::newest::{Localized, NewestPoses};
+use crate::render::Rendering;
+use crate::render::demand::Demand;
+use crate::render::schedule::Exposure;
+use crate::stop::Stop;
+
+/// How long a stop, or somebody who wants readings, may go unnoticed.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// Measures until the server stops: what is due of the vehicles that someone wants images of.
+pub fn run<D: Demand + Sync>(
+    (rendering, localization, demand): (&Rendering, &Localization, &D),
+    scene: &SensorScene,
+    stop: &Stop,
+) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
+    let pool = match pool {
+        Ok(pool) => pool,
+        Err(error) => return warn!("no sensor measures: {error}"),
+    };
+    let now = clock::now();
+    let sensors = rendering.sensors.iter().enumerate();
+    let seed = |vehicle: usize| (vehicle as u64) << 32;
+    let mut vehicles: Vec<_> = sensors
+        .map(|(vehicle, sensors)| VehicleSensors::new(sensors.newest(), now, seed(vehicle)))
+        .collect();
+    while !stop.is_set() {
+        let wanted = demand.wait_for_interest(PATIENCE);
+        let mut next: Option<ServerTime> = None;
+        for (vehicle, sensors) in vehicles.iter_mut().enumerate() {
+            if !wanted[vehicle] {
+                continue;
+            }
+            sensors.follow(rendering.sensors[vehicle].newest(), clock::now());
+            let known = known(localization);
+            if let Some(newest) = &known[vehicle] {
+                pool.install(|| {
+                    measure(rendering, demand, scene, vehicle, sensors, newest, &known)
+                });
+            }
+            next = next.into_iter().chain(sensors.next()).min();
+        }
+        if wanted.contains(&true) {
+            let wait_ns = next.map_or(u64::MAX, |next| {
+                next.as_ns().saturating_sub(clock::now().as_ns()).max(SHORTEST_NS)
+            });
+            sleep(Duration::from_nanos(wait_ns).min(PATIENCE));
+        }
+    }
+}
+
+/// Measures what is due of one vehicle.
+fn measure<D: Demand + Sync>(
+    rendering: &Rendering,
+    demand: &D,
+    scene: &SensorScene,
+    vehicle: usize,
+    sensors: &mut VehicleSensors,
+    newest: &Localized,
+    known: &NewestPoses,
+) {
+    let now = clock::now();
+    let taken = sensors.take(now);
+    let after_ns = demand.seen_after_s(vehicle).map(|s| (s * 1e9) as i64);
+    for (index, _) in taken.iter().enumerate().filter(|(_, taken)| **taken) {
+        let span = trace_span!("measure", vehicle, sensor = index).entered();
+        let exposure = Exposure::new(rendering.predict, after_ns, newest, clock::now());
+        let objects = &rendering.dynamic_objects;
+        let mut place = |at, placements: &mut Vec<_>| objects.place(at, vehicle, known, placements);
+        let pose = newest.sample.stamp;
+        let mut around = Around { scene, motion: &newest.motion, pose, place: &mut place };
+        let reading = sensors.measure(index, &exposure, &mut around);
+        drop(span);
+        if let Some(reading) = reading {
+            rendering.sensors[vehicle].publish(reading);
+        }
+    }
+}
+
+/// Returns the newest pose of each vehicle, and how it moves by its twist.
+fn known(localization: &Localization) -> NewestPoses {
+    let mut known = NewestPoses::default();
+    for (known, vehicle) in known.iter_mut().zip(&localization.vehicles) {
+        *known = (*vehicle.newest.borrow()).map(localized);
+    }
+    known
+}
+
+fn localized(sample: PoseSample) -> Localized {
+    let still = Motion::at_rest(sample.stamp, sample.world_from_body);
+    let motion = Motion {
+        v_world_mps: sample.twist.linear_mps,
+        omega_body_radps: sample.twist.angular_radps,
+        ..still
+    };
+    Localized { sample, motion }
+}
+
+/// Between two looks at what is due: while no pose has come, a sensor stays due. [ns]
+const SHORTEST_NS: u64 = 1_000_000;
