@@ -9,7 +9,7 @@
 use glam::{DMat3, DQuat, DVec3, Vec2, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::weather::{
-    Cloud, Flicker, LampPlaces, Lamps, OwnLight, Rain, Shot, Snow, Sun, Weather, WeatherPass,
+    Cloud, Flicker, LampPlaces, Lamps, Moment, OwnLight, Rain, Snow, Sun, Weather, WeatherPass,
 };
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, ply};
 
@@ -40,11 +40,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let mut pass = WeatherPass::default();
         let (mut clear_ms, mut weather_ms) = (Vec::new(), Vec::new());
         for image in 0..IMAGES {
-            let shot = Shot { at_ns: image * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 };
+            let moment = Moment { at_ns: image * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 };
             let start_ms = processor_ms()?;
             renderer.render(&[], &[camera], &mut images)?;
             let rendered_ms = processor_ms()?;
-            pass.apply(&weather, &camera, &shot, &mut images[0]);
+            pass.apply(&weather, &camera, &moment, &mut images[0]);
             clear_ms.push(rendered_ms - start_ms);
             weather_ms.push(processor_ms()? - rendered_ms);
         }

@@ -11,8 +11,7 @@ use vizflyt_splat::imaging::stereo::Stereo;
 use vizflyt_splat::imaging::tof::Tof;
 use vizflyt_splat::imaging::{CameraModel, DepthModel, Imager, Sensor, Shot};
 use vizflyt_splat::weather::{
-    Cloud, Flicker, LampPlaces, Lamps, OwnLight, Rain, Shot as Moment, Snow, Sun, Weather,
-    WeatherPass,
+    Cloud, Flicker, LampPlaces, Lamps, Moment, OwnLight, Rain, Snow, Sun, Weather, WeatherPass,
 };
 use vizflyt_splat::{
     Camera, CpuRenderer, Placement, Rasterizer, RgbdImage, RigidObject, Scene, Splats,

@@ -11,7 +11,7 @@ use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
-use vizflyt_splat::weather::{Shot, WeatherPass};
+use vizflyt_splat::weather::{Moment, WeatherPass};
 use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
 
 use crate::scene::camera::{self, ImageSize};
@@ -149,7 +149,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
             let start = Instant::now();
             rasterizer.render(&[], &[camera], &mut images)?;
             let rendered_ms = start.elapsed().as_secs_f32() * 1e3;
-            pass.apply(&weather(&environment), &camera, &shot(image), &mut images[0]);
+            pass.apply(&weather(&environment), &camera, &moment(image), &mut images[0]);
             let all_ms = start.elapsed().as_secs_f32() * 1e3;
             if image >= WARM_UP {
                 figures.push([all_ms, all_ms - rendered_ms, all_ms / taken.total_ms]);
@@ -203,8 +203,8 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
 }
 
 /// Returns the moment of an image: 30 a second.
-fn shot(image: u32) -> Shot {
-    Shot { at_ns: i64::from(image) * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 }
+fn moment(image: u32) -> Moment {
+    Moment { at_ns: i64::from(image) * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 }
 }
 
 fn print(f: &Figures) {

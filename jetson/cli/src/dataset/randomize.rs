@@ -9,6 +9,7 @@ use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_protocol::geometry::Intrinsics;
+use vizflyt_scenes::DrawBounds;
 use vizflyt_twin::random::Random;
 
 /// The whole file.
@@ -17,6 +18,7 @@ use vizflyt_twin::random::Random;
 pub(super) struct Randomize {
     pub(super) light: Light,
     pub(super) fog: Fog,
+    pub(super) weather: WeatherBounds,
     pub(super) gates: Gates,
     pub(super) distractors: Distractors,
     pub(super) vehicles: Vehicles,
@@ -60,6 +62,16 @@ pub(super) struct Distractors {
     pub(super) count: [usize; 2],
     /// Their greatest side. [m]
     pub(super) size_m: [f64; 2],
+}
+
+/// Weather and its light, in the place of `light` and `fog`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct WeatherBounds {
+    /// Of an image; 0 to 1.
+    pub(super) probability: f64,
+    /// What it is drawn from, as `[environments]` of a project has it.
+    pub(super) within: DrawBounds,
 }
 
 /// Other vehicles that hover in the free space.
@@ -118,11 +130,13 @@ impl Randomize {
 
     fn parse(text: &str) -> Result<Self> {
         let file: Self = vizflyt_toml::parse(text)?;
-        let Self { light, fog, gates, distractors, vehicles, camera } = &file;
+        let Self { light, fog, weather, gates, distractors, vehicles, camera } = &file;
         within("light.brightness", light.brightness, [0.05, 4.0])?;
         within("light.tint", [light.tint; 2], [0.0, 0.9])?;
         within("fog.probability", [fog.probability; 2], [0.0, 1.0])?;
         within("fog.visibility_m", fog.visibility_m, [0.5, 1000.0])?;
+        within("weather.probability", [weather.probability; 2], [0.0, 1.0])?;
+        weather.within.check().context("of [weather.within]")?;
         within("gates.probability", [gates.probability; 2], [0.0, 1.0])?;
         within("gates.textures", [gates.textures as f64; 2], [1.0, 32.0])?;
         within("distractors.count", distractors.count.map(|n| n as f64), [0.0, 64.0])?;
@@ -144,6 +158,11 @@ impl Randomize {
         arena: &EnvironmentConfig,
         random: &mut Random,
     ) -> EnvironmentConfig {
+        let weather = &self.weather;
+        // Nothing is drawn for what is left out: the rest of the image stays what it was without it.
+        if weather.probability > 0.0 && f64::from(random.unit()) < weather.probability {
+            return weather.within.draw(random.bits(), 0);
+        }
         let brightness = log_range(random, self.light.brightness);
         let tint = self.light.tint;
         let light = arena.light.map(|light| {
@@ -211,6 +230,7 @@ mod tests {
         assert!(file.light != still.light && file.fog != still.fog && file.gates != still.gates);
         assert!(file.distractors != still.distractors && file.vehicles != still.vehicles);
         assert!(file.camera != still.camera && file.textures() > 0);
+        assert!(file.weather != still.weather);
     }
 
     #[test]
@@ -228,12 +248,13 @@ mod tests {
     fn draws_are_valid_and_within_their_bounds() {
         let file = Randomize::parse(EXAMPLE).unwrap();
         let plain = Intrinsics::from_horizontal_fov(320, 240, 1.2);
-        let mut foggy = 0;
+        let (mut foggy, mut wet) = (0, 0);
         for n in 0..2000 {
             let mut random = Random::stream(1, n);
             let drawn = file.environment(&EnvironmentConfig::default(), &mut random);
             drawn.check().unwrap();
             foggy += u32::from(drawn.fog_visibility_m > 0.0);
+            wet += u32::from(drawn.rain.is_some() || drawn.snow.is_some());
             let k = file.intrinsics(plain, &mut random);
             k.validate().unwrap();
             assert!((k.cx_px - 160.0).abs() <= 320.0 * file.camera.center);
@@ -242,8 +263,12 @@ mod tests {
                     .contains(&count(&mut random, file.distractors.count))
             );
         }
-        let share = f64::from(foggy) / 2000.0;
-        assert!((share - file.fog.probability).abs() < 0.04, "{share}");
+        // One kind of weather of seven is fog, two are wet.
+        let [foggy, wet] = [foggy, wet].map(|count| f64::from(count) / 2000.0);
+        let weather = file.weather.probability;
+        let expected = file.fog.probability * (1.0 - weather) + weather / 7.0;
+        assert!((foggy - expected).abs() < 0.04, "{foggy}");
+        assert!((wet - weather * 2.0 / 7.0).abs() < 0.04, "{wet}");
     }
 
     #[test]
@@ -252,6 +277,8 @@ mod tests {
             ("[light]\nbrightness = [2, 1]", "light.brightness = [2, 1]"),
             ("[fog]\nprobability = 1.5", "fog.probability = 1.5"),
             ("[fog]\nvisibility_m = [nan, 3]", "fog.visibility_m"),
+            ("[weather]\nprobability = 2", "weather.probability = 2"),
+            ("[weather.within]\nrain_mmph = [9, 1]", "environments.rain_mmph"),
             ("[gates]\ntextures = 0", "gates.textures = 0"),
             ("[camera]\nfov_deg = [5, 90]", "camera.fov_deg"),
             ("[cam]\nfov_deg = [5, 90]", "cam"),

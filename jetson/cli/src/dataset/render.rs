@@ -1,8 +1,10 @@
 //! One image with all of its layers: a function of the scene and the shot, on one thread.
 
 use anyhow::Result;
+use glam::DVec3;
 use vizflyt_protocol::geometry::{Cam, Pose};
-use vizflyt_server::render::environment::atmosphere;
+use vizflyt_server::render::environment::{atmosphere, weather};
+use vizflyt_splat::weather::{Moment, WeatherPass};
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Scene};
 
 use super::classes::Classes;
@@ -19,6 +21,7 @@ pub(super) struct LabelRenderer<'a> {
     world: &'a World,
     renderer: CpuRenderer,
     images: [RgbdImage; 1],
+    weather: WeatherPass,
     class_of_id: Vec<u8>,
     /// Whether an id is one of a thing.
     is_thing: Vec<bool>,
@@ -58,7 +61,8 @@ impl<'a> LabelRenderer<'a> {
         let class_of_id = world.class_of_id();
         let is_thing = class_of_id.iter().map(|&class| classes.is_thing(class)).collect();
         let renderer = CpuRenderer::new(scene);
-        Self { world, renderer, images: [RgbdImage::default()], class_of_id, is_thing }
+        let (images, weather) = ([RgbdImage::default()], WeatherPass::default());
+        Self { world, renderer, images, weather, class_of_id, is_thing }
     }
 
     /// Renders a shot.
@@ -120,6 +124,8 @@ impl<'a> LabelRenderer<'a> {
         let camera = Camera { atmosphere, ..Camera::new(shot.intrinsics, world_from_cam, NEAR_M) };
         let placements = shot.placements(self.world, at_ns);
         self.renderer.render(&placements, &[camera], &mut self.images)?;
+        let moment = Moment { at_ns, v_world_mps: DVec3::ZERO, seed: shot.seed };
+        self.weather.apply(&weather(&shot.environment), &camera, &moment, &mut self.images[0]);
         Ok(())
     }
 

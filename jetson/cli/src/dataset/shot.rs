@@ -65,6 +65,8 @@ pub(super) struct Shot {
     pub(super) next: Option<TimedCamera>,
     pub(super) intrinsics: Intrinsics,
     pub(super) environment: EnvironmentConfig,
+    /// Of what is where by chance in the weather.
+    pub(super) seed: u64,
     /// The texture of each gate that has several.
     textures: Vec<usize>,
     /// Of each loose object.
@@ -103,7 +105,8 @@ impl Shooting {
             })
             .collect();
         let loose = self.scatter(world, at_ns, &world_from_cam, &intrinsics, &mut random);
-        Ok(Shot { at_ns, world_from_cam, next, intrinsics, environment, textures, loose })
+        let seed = self.seed ^ within as u64;
+        Ok(Shot { at_ns, world_from_cam, next, intrinsics, environment, seed, textures, loose })
     }
 
     /// Returns the instant of image `within` of the `count` of a scene, on the scene's clock. [ns]

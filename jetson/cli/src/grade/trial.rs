@@ -559,7 +559,7 @@ impl<'a> Flight<'a> {
             .render(&placements, &cameras, images)
             .context("an image cannot be rendered")?;
         let weather = weather(&self.arena.environment);
-        let shot = exposure.shot(self.trial.seed);
+        let moment = exposure.moment(self.trial.seed);
         let mut rendered: Vec<Option<Picture>> = self.cameras.iter().map(|_| None).collect();
         for ((&index, camera), image) in due.iter().zip(&cameras).zip(images) {
             let mut picture = Picture::default();
@@ -568,7 +568,7 @@ impl<'a> Flight<'a> {
             // What truly is ahead, whatever weather and camera make of it.
             let width = info.intrinsics.width_px as usize;
             picture.ahead_m = ahead_m(&picture.depth_mm, width, &mut self.scratch);
-            self.weather.apply(&weather, camera, &shot, image);
+            self.weather.apply(&weather, camera, &moment, image);
             let seeds = [self.trial.seed, index as u64, self.seq + 1];
             let input = EffectInput { config, info, motion: &newest.motion, exposure, seeds };
             self.imaging[index].apply(&input, image);

@@ -12,7 +12,7 @@ use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::{Antialiased, is_in_an_arena, load_as_it_is, load_objects};
-use vizflyt_splat::weather::{Shot, WeatherPass};
+use vizflyt_splat::weather::{Moment, WeatherPass};
 use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
 
 use super::camera;
@@ -116,12 +116,12 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
     let mut images = [RgbdImage::default()];
     let atmosphere = atmosphere(&environment);
     let at_ns = (args.at * 1e9).round() as i64;
-    let shot = Shot { at_ns, v_world_mps: DVec3::ZERO, seed: args.seed };
+    let moment = Moment { at_ns, v_world_mps: DVec3::ZERO, seed: args.seed };
     let mut pass = WeatherPass::default();
     for RenderJob { camera, folder } in jobs {
         let camera = Camera { atmosphere, ..camera };
         let times = rasterizer.render(&placements, &[camera], &mut images)?;
-        pass.apply(&weather(&environment), &camera, &shot, &mut images[0]);
+        pass.apply(&weather(&environment), &camera, &moment, &mut images[0]);
         let [image] = &images;
         std::fs::create_dir_all(&folder)
             .with_context(|| format!("cannot make the folder {}", folder.display()))?;

@@ -12,7 +12,7 @@ use vizflyt_arena::pose::Predict;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_splat::weather::Shot;
+use vizflyt_splat::weather::Moment;
 use vizflyt_splat::{Atmosphere, Camera};
 
 use crate::poses::newest::Localized;
@@ -118,8 +118,8 @@ impl Exposure {
     }
 
     /// Returns the moment of the images, in a flight of a seed.
-    pub fn shot(&self, seed: u64) -> Shot {
-        Shot { at_ns: self.at.as_ns().cast_signed(), v_world_mps: self.v_world_mps, seed }
+    pub fn moment(&self, seed: u64) -> Moment {
+        Moment { at_ns: self.at.as_ns().cast_signed(), v_world_mps: self.v_world_mps, seed }
     }
 
     /// Returns the camera to render, where it is at that instant.

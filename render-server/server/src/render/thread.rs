@@ -16,7 +16,7 @@ use tracing::{trace_span, warn};
 use vizflyt_arena::config::{EnvironmentConfig, MAX_OBJECTS, MAX_VEHICLES};
 use vizflyt_protocol::messages::{EventKind, MAX_CAMERAS};
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_splat::weather::{Shot, WeatherPass};
+use vizflyt_splat::weather::{Moment, WeatherPass};
 use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
@@ -92,7 +92,7 @@ struct RenderLoop<'a, D> {
     cameras: Vec<Camera>,
     ranges: [CameraRange; MAX_VEHICLES],
     /// The moment of each camera's image, and what they are all seen in.
-    shots: Vec<Shot>,
+    moments: Vec<Moment>,
     environment: EnvironmentConfig,
     weather: WeatherPass,
     /// Their images side by side, as the renderer wants them.
@@ -124,7 +124,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             known: NewestPoses::default(),
             cameras: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
             ranges: Default::default(),
-            shots: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
+            moments: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
             environment: EnvironmentConfig::default(),
             weather: WeatherPass::default(),
             images: Vec::new(),
@@ -173,7 +173,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         let mut slots = tick.slots.iter_mut();
         let mut stamp = ServerTime::ZERO;
         self.cameras.clear();
-        self.shots.clear();
+        self.moments.clear();
         self.environment = self.rendering.environment.now();
         let atmosphere = atmosphere(&self.environment);
         self.ranges = Default::default();
@@ -201,7 +201,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 };
                 let (config, info) = (&set.configs[camera], &set.infos[camera]);
                 self.cameras.push(exposure.camera(config, info, atmosphere));
-                self.shots.push(exposure.shot(self.rendering.seed));
+                self.moments.push(exposure.moment(self.rendering.seed));
                 stamp = stamp.max(sample.stamp);
                 (slot.vehicle, slot.camera) = (vehicle, camera);
                 slot.counted = flies;
@@ -227,7 +227,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         tick: &mut RenderedTick,
     ) -> Result<(), RenderError> {
         let span = trace_span!("tick", seq = self.seq, stamp_ns = stamp.as_ns()).entered();
-        let Self { rendering, cameras, shots, environment, placements, known, .. } = self;
+        let Self { rendering, cameras, moments, environment, placements, known, .. } = self;
         let images = &mut self.images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| {
@@ -245,8 +245,8 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                 })?;
             }
             let weather = weather(environment);
-            for ((image, camera), shot) in images.iter_mut().zip(cameras).zip(shots) {
-                self.weather.apply(&weather, camera, shot, image);
+            for ((image, camera), moment) in images.iter_mut().zip(cameras).zip(moments) {
+                self.weather.apply(&weather, camera, moment, image);
             }
             Ok(())
         });

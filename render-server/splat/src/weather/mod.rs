@@ -107,7 +107,7 @@ impl Default for Weather {
 
 /// The moment of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shot {
+pub struct Moment {
     /// The instant that it shows, of any clock. [ns]
     pub at_ns: i64,
     /// How the camera moves. [m/s, world]
@@ -135,7 +135,7 @@ impl WeatherPass {
         &mut self,
         weather: &Weather,
         camera: &Camera,
-        shot: &Shot,
+        moment: &Moment,
         image: &mut RgbdImage,
     ) {
         if weather.is_clear() {
@@ -148,24 +148,24 @@ impl WeatherPass {
             [image.width_px, image.height_px],
             "the camera's image"
         );
-        let at_s = shot.at_ns as f64 * 1e-9;
+        let at_s = moment.at_ns as f64 * 1e-9;
         self.rays.follow(k);
         if let Some(cloud) = &weather.cloud {
-            self.cloud.follow(cloud, shot.seed, at_s, camera, &self.rays);
+            self.cloud.follow(cloud, moment.seed, at_s, camera, &self.rays);
         }
         let illumination = Illumination::new(weather.lamps, weather.own_light, camera);
         let light = RowLight {
             flicker: weather.flicker,
-            at_ns: shot.at_ns,
+            at_ns: moment.at_ns,
             exposure_s: weather.exposure_s,
             height: size[1],
         };
-        self.fall(weather, camera, shot, (&illumination, light.of(size[1] / 2)), image);
+        self.fall(weather, camera, moment, (&illumination, light.of(size[1] / 2)), image);
         let is_lit =
             weather.lamps.is_some() || weather.own_light.is_some() || weather.flicker.is_some();
         let rows = Rows {
             width: size[0],
-            seed: shot.seed ^ shot.at_ns as u64,
+            seed: moment.seed ^ moment.at_ns as u64,
             atmosphere: camera.atmosphere,
             rays: &self.rays,
             cloud: weather.cloud.as_ref().map(|cloud| (&self.cloud, *cloud)),
@@ -179,7 +179,7 @@ impl WeatherPass {
         if let Some(Rain { lens_drops, .. }) = weather.rain
             && lens_drops > 0
         {
-            self.lens.draw(lens_drops, shot.seed, at_s, size, &mut image.rgb);
+            self.lens.draw(lens_drops, moment.seed, at_s, size, &mut image.rgb);
         }
     }
 
@@ -188,7 +188,7 @@ impl WeatherPass {
         &mut self,
         weather: &Weather,
         camera: &Camera,
-        shot: &Shot,
+        moment: &Moment,
         (illumination, flicker): (&Illumination, f32),
         image: &RgbdImage,
     ) {
@@ -205,10 +205,10 @@ impl WeatherPass {
         let scene = Scene {
             camera,
             rays: &self.rays,
-            v_world_mps: shot.v_world_mps,
+            v_world_mps: moment.v_world_mps,
             exposure_s: f64::from(weather.exposure_s),
-            at_s: shot.at_ns as f64 * 1e-9,
-            seed: shot.seed,
+            at_s: moment.at_ns as f64 * 1e-9,
+            seed: moment.seed,
         };
         let around = mean_of(image).map(|value| value * DROP_BRIGHTNESS);
         let white = camera.atmosphere.light.map(|light| light * FLAKE_WHITE);

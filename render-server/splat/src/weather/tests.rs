@@ -7,7 +7,7 @@ use super::*;
 
 const WIDTH: u32 = 96;
 const HEIGHT: u32 = 64;
-const SHOT: Shot = Shot { at_ns: 12_345_678_901, v_world_mps: DVec3::ZERO, seed: 7 };
+const MOMENT: Moment = Moment { at_ns: 12_345_678_901, v_world_mps: DVec3::ZERO, seed: 7 };
 const MIST: Cloud = Cloud {
     per_m: 0.3,
     color: [0.6, 0.7, 0.8],
@@ -42,9 +42,9 @@ fn wall(rgb: f32, depth_m: f32) -> RgbdImage {
     image
 }
 
-fn seen(weather: &Weather, shot: &Shot, image: &RgbdImage) -> RgbdImage {
+fn seen(weather: &Weather, moment: &Moment, image: &RgbdImage) -> RgbdImage {
     let mut image = image.clone();
-    WeatherPass::default().apply(weather, &camera(), shot, &mut image);
+    WeatherPass::default().apply(weather, &camera(), moment, &mut image);
     image
 }
 
@@ -94,14 +94,14 @@ fn room() -> RgbdImage {
 fn clear_weather_changes_nothing() {
     assert!(Weather::CLEAR.is_clear() && !everything().is_clear());
     assert!(Weather { exposure_s: 0.02, ..Weather::CLEAR }.is_clear());
-    assert_eq!(seen(&Weather::CLEAR, &SHOT, &room()), room());
+    assert_eq!(seen(&Weather::CLEAR, &MOMENT, &room()), room());
 }
 
 #[test]
 fn air_of_one_density_takes_light_as_beer_and_lambert_have_it() {
     for depth_m in [0.1, 1.0, 3.7, 12.0, 29.0] {
         let image =
-            seen(&Weather { cloud: Some(MIST), ..Weather::CLEAR }, &SHOT, &wall(0.5, depth_m));
+            seen(&Weather { cloud: Some(MIST), ..Weather::CLEAR }, &MOMENT, &wall(0.5, depth_m));
         for (pixel, rgb) in image.rgb.chunks_exact(3).enumerate() {
             let left = (-0.3 * f64::from(depth_m) * norm_at(pixel)).exp();
             for (value, color) in rgb.iter().zip(MIST.color) {
@@ -117,7 +117,7 @@ fn rain_and_snow_veil_what_is_far() {
     let weather = Weather { rain: Some(Rain { lens_drops: 0, ..SHOWER }), ..Weather::CLEAR };
     let per_m = SHOWER.extinction_per_m();
     // No drop is before a wall that is nearer than any.
-    let image = seen(&weather, &SHOT, &wall(0.5, 0.1));
+    let image = seen(&weather, &MOMENT, &wall(0.5, 0.1));
     let left = (-per_m * 0.1 * norm_at(0)).exp();
     assert!((f64::from(image.rgb[0]) - 0.5 * left).abs() < 1e-5, "black is the fog of no fog");
 }
@@ -128,8 +128,8 @@ fn patches_have_the_mean_density_and_move_with_the_wind() {
     let weather = Weather { cloud: Some(mist), ..Weather::CLEAR };
     let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
     for k in 0..40 {
-        let shot = Shot { at_ns: k * 31_000_000_000, seed: k as u64, ..SHOT };
-        let image = seen(&weather, &shot, &wall(0.0, 4.0));
+        let moment = Moment { at_ns: k * 31_000_000_000, seed: k as u64, ..MOMENT };
+        let image = seen(&weather, &moment, &wall(0.0, 4.0));
         for (pixel, rgb) in image.rgb.chunks_exact(3).enumerate().step_by(61) {
             let taken = -(1.0 - f64::from(rgb[0] / mist.color[0])).ln();
             let density = taken / (0.3 * 4.0 * norm_at(pixel));
@@ -148,7 +148,7 @@ fn patches_have_the_mean_density_and_move_with_the_wind() {
         let mut camera = camera();
         camera.world_from_cam.translation_m.y = y_m;
         let weather = Weather { cloud: Some(drifting), ..Weather::CLEAR };
-        WeatherPass::default().apply(&weather, &camera, &Shot { at_ns, ..SHOT }, &mut image);
+        WeatherPass::default().apply(&weather, &camera, &Moment { at_ns, ..MOMENT }, &mut image);
         image.rgb
     };
     let off = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>();
@@ -160,31 +160,31 @@ fn patches_have_the_mean_density_and_move_with_the_wind() {
 fn a_layer_and_a_ball_leave_the_rest_clear() {
     let ball = Ball { center_m: DVec3::new(3.0, 0.0, 1.5), radius_m: 0.8 };
     let cloud = Cloud { per_m: 4.0, ball: Some(ball), ..MIST };
-    let image = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &SHOT, &wall(0.5, 6.0));
+    let image = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &MOMENT, &wall(0.5, 6.0));
     let at = |x: u32, y: u32| image.rgb[3 * (y * WIDTH + x) as usize];
     assert!(at(WIDTH / 2, HEIGHT / 2) > 0.59, "the ball hides what is behind it");
     assert!((at(2, 2) - 0.5).abs() < 1e-4, "and nothing beside it");
     // Nothing of it lies between the camera and what is nearer.
-    let near = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &SHOT, &wall(0.5, 2.0));
+    let near = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &MOMENT, &wall(0.5, 2.0));
     assert!((near.rgb[3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize] - 0.5).abs() < 1e-3);
     let layer = Cloud { per_m: 4.0, layer_m: Some([0.0, 0.5]), ..MIST };
-    let image = seen(&Weather { cloud: Some(layer), ..Weather::CLEAR }, &SHOT, &wall(0.5, 6.0));
+    let image = seen(&Weather { cloud: Some(layer), ..Weather::CLEAR }, &MOMENT, &wall(0.5, 6.0));
     let at = |y: u32| image.rgb[3 * (y * WIDTH + WIDTH / 2) as usize];
     assert!((at(4) - 0.5).abs() < 1e-4 && at(HEIGHT - 1) > 0.55, "{} {}", at(4), at(HEIGHT - 1));
 }
 
-fn streaks(rain: Option<Rain>, snow: Option<Snow>, shot: &Shot, k: &Intrinsics) -> Vec<Streak> {
+fn streaks(rain: Option<Rain>, snow: Option<Snow>, moment: &Moment, k: &Intrinsics) -> Vec<Streak> {
     let (mut rays, mut pass) = (Rays::default(), ParticlePass::default());
     rays.follow(k);
     let camera = Camera { intrinsics: *k, ..camera() };
-    let (v_world_mps, at_s) = (shot.v_world_mps, shot.at_ns as f64 * 1e-9);
+    let (v_world_mps, at_s) = (moment.v_world_mps, moment.at_ns as f64 * 1e-9);
     let scene = Scene {
         camera: &camera,
         rays: &rays,
         v_world_mps,
         exposure_s: 0.005,
         at_s,
-        seed: shot.seed,
+        seed: moment.seed,
     };
     pass.add(RAIN, rain.iter().flat_map(Rain::kinds));
     pass.add(SNOW, snow.iter().flat_map(Snow::kinds));
@@ -201,8 +201,8 @@ fn drops_are_as_many_as_marshall_and_palmer_counted_and_as_long_as_they_fall() {
     let mut found = vec![0.0; rain.kinds().count()];
     let images = 150;
     for image in 0..images {
-        let shot = Shot { seed: image, at_ns: image as i64 * 997_000_000, ..SHOT };
-        for streak in streaks(Some(rain), None, &shot, &k) {
+        let moment = Moment { seed: image, at_ns: image as i64 * 997_000_000, ..MOMENT };
+        for streak in streaks(Some(rain), None, &moment, &k) {
             let diameter_m = f64::from(streak.width_px * streak.z_m) / k.fx_px;
             let same = |kind: &Kind| (kind.diameter_m - diameter_m).abs() < 1e-5;
             let index = rain.kinds().position(|kind| same(&kind)).expect("a kind of this size");
@@ -240,13 +240,13 @@ fn streaks_are_as_long_as_the_way_relative_to_the_camera() {
     let rain = Rain { wind_mps: Vec2::ZERO, ..SHOWER };
     // Whoever falls with a drop sees it stand still; who flies ahead sees it come.
     let mut kinds = rain.kinds();
-    let falling = Shot { v_world_mps: kinds.nth(3).unwrap().v_world_mps, ..SHOT };
+    let falling = Moment { v_world_mps: kinds.nth(3).unwrap().v_world_mps, ..MOMENT };
     let shortest = streaks(Some(rain), None, &falling, &k)
         .iter()
         .map(|streak| (streak.to_px - streak.from_px).length())
         .fold(f32::INFINITY, f32::min);
     assert!(shortest < 1e-2, "{shortest}");
-    let ahead = Shot { v_world_mps: DVec3::X * 20.0, ..SHOT };
+    let ahead = Moment { v_world_mps: DVec3::X * 20.0, ..MOMENT };
     let outward = streaks(Some(rain), None, &ahead, &k);
     // Away from the point that it flies to, which is above the middle as drops fall.
     let away = outward.iter().filter(|streak| {
@@ -260,13 +260,13 @@ fn streaks_are_as_long_as_the_way_relative_to_the_camera() {
 fn a_flake_moves_on_by_its_speed_times_the_time() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.57);
     let dt_s = 0.04;
-    let later = Shot { at_ns: SHOT.at_ns + 40_000_000, ..SHOT };
+    let later = Moment { at_ns: MOMENT.at_ns + 40_000_000, ..MOMENT };
     let place = |streak: &Streak| {
         let middle = ((streak.from_px + streak.to_px) * 0.5).as_dvec2();
         camera().world_from_cam.transform_point(k.unproject(middle, f64::from(streak.z_m)).unwrap())
     };
     let (before, after) =
-        (streaks(None, Some(FLURRY), &SHOT, &k), streaks(None, Some(FLURRY), &later, &k));
+        (streaks(None, Some(FLURRY), &MOMENT, &k), streaks(None, Some(FLURRY), &later, &k));
     let after: Vec<DVec3> = after.iter().map(place).collect();
     let mut followed = 0;
     for streak in &before {
@@ -320,7 +320,7 @@ fn a_streak_takes_as_much_light_as_its_drop_however_long_it_is() {
 fn nothing_falls_behind_a_wall() {
     let weather = Weather { snow: Some(FLURRY), ..Weather::CLEAR };
     let changed = |depth_m: f32| {
-        let image = seen(&weather, &SHOT, &wall(0.0, depth_m));
+        let image = seen(&weather, &MOMENT, &wall(0.0, depth_m));
         image.rgb.iter().filter(|value| **value > 0.02).count()
     };
     assert_eq!(changed(0.1), 0);
@@ -331,10 +331,10 @@ fn nothing_falls_behind_a_wall() {
 fn the_sun_shines_where_nothing_hides_it() {
     let weather = Weather { sun: Some(EVENING), ..Weather::CLEAR };
     let center = 3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize;
-    assert_eq!(seen(&weather, &SHOT, &wall(0.2, 5.0)).rgb, wall(0.2, 5.0).rgb, "a wall hides it");
-    let sky = seen(&weather, &SHOT, &wall(0.2, 60.0));
+    assert_eq!(seen(&weather, &MOMENT, &wall(0.2, 5.0)).rgb, wall(0.2, 5.0).rgb, "a wall hides it");
+    let sky = seen(&weather, &MOMENT, &wall(0.2, 60.0));
     assert!(sky.rgb[center] > 3.0 && sky.rgb[0] > 0.2, "a picture of a sky does not");
-    let through = seen(&weather, &SHOT, &room());
+    let through = seen(&weather, &MOMENT, &room());
     assert!(through.rgb[center] > 3.0, "nor does a gap");
     // CIE 146 at 20 degrees: 10 / 8000 + 5 / 400.
     let k = camera().intrinsics;
@@ -349,12 +349,12 @@ fn the_sun_shines_where_nothing_hides_it() {
             (half.alpha[pixel], half.depth_median_m[pixel]) = (0.0, 0.0);
         }
     }
-    let ratio = seen(&weather, &SHOT, &half).rgb[0].powi(2)
-        / seen(&weather, &SHOT, &wall(0.0, 60.0)).rgb[0].powi(2);
+    let ratio = seen(&weather, &MOMENT, &half).rgb[0].powi(2)
+        / seen(&weather, &MOMENT, &wall(0.0, 60.0)).rgb[0].powi(2);
     assert!((0.3..0.7).contains(&ratio), "{ratio}");
     let behind = Sun { direction: -DVec3::X, ..EVENING };
     assert_eq!(
-        seen(&Weather { sun: Some(behind), ..Weather::CLEAR }, &SHOT, &room()).rgb,
+        seen(&Weather { sun: Some(behind), ..Weather::CLEAR }, &MOMENT, &room()).rgb,
         room().rgb
     );
 }
@@ -364,7 +364,7 @@ fn own_light_falls_with_the_square_of_the_distance() {
     let weather = Weather { own_light: Some(TORCH), ..Weather::CLEAR };
     let center = 3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize;
     for depth_m in [0.5, 1.0, 2.0, 8.0] {
-        let value = seen(&weather, &SHOT, &wall(0.1, depth_m)).rgb[center];
+        let value = seen(&weather, &MOMENT, &wall(0.1, depth_m)).rgb[center];
         // Besides the scene's own light, which is 1.
         let added = (value / 0.1).powi(2) - 1.0;
         assert!((added / (2.0 / depth_m).powi(2) - 1.0).abs() < 2e-3, "{depth_m} m: {added}");
@@ -372,7 +372,7 @@ fn own_light_falls_with_the_square_of_the_distance() {
     // A wide image's corners are beyond its cone of 60 degrees to either side.
     let narrow = OwnLight { cos_cone: 0.95, ..TORCH };
     let image =
-        seen(&Weather { own_light: Some(narrow), ..Weather::CLEAR }, &SHOT, &wall(0.1, 1.0));
+        seen(&Weather { own_light: Some(narrow), ..Weather::CLEAR }, &MOMENT, &wall(0.1, 1.0));
     assert_eq!(image.rgb[0], 0.1);
 }
 
@@ -385,7 +385,7 @@ fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
     dark.atmosphere.light = [0.2; 3];
     let mut image = wall(0.1, 4.0);
     let weather = Weather { lamps: Some(lamps), ..Weather::CLEAR };
-    WeatherPass::default().apply(&weather, &dark, &SHOT, &mut image);
+    WeatherPass::default().apply(&weather, &dark, &MOMENT, &mut image);
     let pixel = (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize;
     let at = camera().intrinsics.unproject(DVec2::new(48.5, 32.5), 4.0).unwrap();
     let distance_m = (camera().world_from_cam.transform_point(at) - places[2]).length();
@@ -400,7 +400,7 @@ fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
     let grid = LampPlaces::Grid { height_m: 3.0, spacing_m: 4.0 };
     let mut image = wall(0.1, 4.0);
     let weather = Weather { lamps: Some(Lamps { places: grid, ..lamps }), ..Weather::CLEAR };
-    WeatherPass::default().apply(&weather, &dark, &SHOT, &mut image);
+    WeatherPass::default().apply(&weather, &dark, &MOMENT, &mut image);
     let value = f64::from(image.rgb[3 * pixel]);
     let truth = 0.5 * (0.04 + added + 3.0 * 2.25 / 18.0_f64).sqrt();
     assert!((value - truth).abs() < 0.1 && value > 0.5 * (0.04 + added).sqrt(), "{value} {truth}");
@@ -408,7 +408,7 @@ fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
 
 #[test]
 fn depth_is_perfect_unless_its_loss_is_asked_for() {
-    let perfect = seen(&Weather { depth_loss: false, ..everything() }, &SHOT, &room());
+    let perfect = seen(&Weather { depth_loss: false, ..everything() }, &MOMENT, &room());
     assert_eq!(perfect.depth_median_m, room().depth_median_m);
     assert_eq!(perfect.depth_expected_m, room().depth_expected_m);
     assert_eq!((perfect.ids, perfect.alpha), (room().ids, room().alpha));
@@ -417,7 +417,7 @@ fn depth_is_perfect_unless_its_loss_is_asked_for() {
     let weather = Weather { depth_loss: true, cloud, ..Weather::CLEAR };
     let (mut lost, mut expected) = (0.0, 0.0);
     for k in 0..20 {
-        let image = seen(&weather, &Shot { at_ns: k * 1_000_000, ..SHOT }, &wall(0.5, 4.0));
+        let image = seen(&weather, &Moment { at_ns: k * 1_000_000, ..MOMENT }, &wall(0.5, 4.0));
         for (pixel, &depth_m) in image.depth_median_m.iter().enumerate() {
             lost += f64::from(u8::from(depth_m == 0.0));
             expected += 1.0 - (-2.0 * 0.1 * 4.0 * norm_at(pixel)).exp();
@@ -445,8 +445,8 @@ fn drops_on_the_lens_show_what_is_on_the_other_side_of_them() {
         (0..image.alpha.len()).filter(|&p| image.rgb[3 * p] != before[3 * p]).collect();
     assert!(changed.len() < image.alpha.len() / 50, "one drop is small");
     let rain = Rain { lens_drops: 60, ..SHOWER };
-    let now = seen(&Weather { rain: Some(rain), ..Weather::CLEAR }, &SHOT, &wall(0.3, 0.1));
-    let later = Shot { at_ns: SHOT.at_ns + 10_000_000, ..SHOT };
+    let now = seen(&Weather { rain: Some(rain), ..Weather::CLEAR }, &MOMENT, &wall(0.3, 0.1));
+    let later = Moment { at_ns: MOMENT.at_ns + 10_000_000, ..MOMENT };
     let soon = seen(&Weather { rain: Some(rain), ..Weather::CLEAR }, &later, &wall(0.3, 0.1));
     let moved = now.rgb.iter().zip(&soon.rgb).filter(|(a, b)| (**a - **b).abs() > 0.05).count();
     assert!(moved * 50 < now.rgb.len(), "drops stay from image to image: {moved}");
@@ -473,7 +473,7 @@ fn drops_on_the_lens_show_what_is_on_the_other_side_of_them() {
 fn bits_do_not_depend_on_threads() {
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| seen(&everything(), &SHOT, &room()))
+        pool.install(|| seen(&everything(), &MOMENT, &room()))
     };
     let one = with(1);
     assert_eq!(one, with(2));
@@ -481,9 +481,9 @@ fn bits_do_not_depend_on_threads() {
     // Nor on what the pass did before.
     let mut pass = WeatherPass::default();
     let mut other = room();
-    pass.apply(&everything(), &camera(), &Shot { seed: 8, at_ns: 5, ..SHOT }, &mut other);
+    pass.apply(&everything(), &camera(), &Moment { seed: 8, at_ns: 5, ..MOMENT }, &mut other);
     let mut again = room();
-    pass.apply(&everything(), &camera(), &SHOT, &mut again);
+    pass.apply(&everything(), &camera(), &MOMENT, &mut again);
     assert_eq!(one, again);
     assert_ne!(one.rgb, other.rgb);
 }
@@ -499,11 +499,11 @@ fn what_is_no_number_stays_where_it_is() {
         image.rgb[3 * (pixel + WIDTH as usize)] = value;
     }
     let rain = everything().rain.map(|rain| Rain { lens_drops: 0, ..rain });
-    let found = seen(&Weather { rain, ..everything() }, &SHOT, &image);
+    let found = seen(&Weather { rain, ..everything() }, &MOMENT, &image);
     let is_poison = |value: &f32| !value.is_finite();
     assert!(found.rgb.iter().filter(|value| is_poison(value)).count() <= 3 * poison.len());
     // With drops on the lens, which average, too.
-    let found = seen(&everything(), &SHOT, &image);
+    let found = seen(&everything(), &MOMENT, &image);
     assert!(found.rgb.iter().filter(|value| is_poison(value)).count() <= 3 * poison.len());
     assert_eq!(found.alpha, image.alpha);
 }
@@ -536,8 +536,8 @@ proptest! {
         image.alpha.fill(0.7);
         image.depth_expected_m.fill(3.0);
         image.depth_median_m.fill(3.0);
-        let shot = Shot { at_ns, v_world_mps: DVec3::from(speed), seed: 1 };
-        WeatherPass::default().apply(&everything(), &camera, &shot, &mut image);
+        let moment = Moment { at_ns, v_world_mps: DVec3::from(speed), seed: 1 };
+        WeatherPass::default().apply(&everything(), &camera, &moment, &mut image);
         prop_assert!(image.rgb.iter().all(|value| value.is_finite() && *value >= 0.0));
     }
 }

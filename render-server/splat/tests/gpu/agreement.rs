@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::{DQuat, DVec3, Vec2, Vec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_splat::weather::{
-    Cloud, LampPlaces, Lamps, OwnLight, Rain, Shot, Snow, Weather, WeatherPass,
+    Cloud, LampPlaces, Lamps, Moment, OwnLight, Rain, Snow, Weather, WeatherPass,
 };
 use vizflyt_splat::{Atmosphere, Camera, RgbdImage, RigidObject, Scene, Splats, ply};
 
@@ -87,9 +87,9 @@ fn both_are_seen_in_the_same_weather() {
         own_light: Some(OwnLight { reach_m: 0.8, color: [1.0; 3], cos_cone: 0.85 }),
         ..Weather::CLEAR
     };
-    let shot = Shot { at_ns: 1_234_567_890, v_world_mps: DVec3::ZERO, seed: 7 };
+    let moment = Moment { at_ns: 1_234_567_890, v_world_mps: DVec3::ZERO, seed: 7 };
     for image in expected.iter_mut().chain(&mut actual) {
-        WeatherPass::default().apply(&weather, &camera, &shot, image);
+        WeatherPass::default().apply(&weather, &camera, &moment, image);
     }
     assert_ne!(expected[0].rgb, clear, "there is weather");
     assert_alike("weather", &actual[0], &expected[0]);
