@@ -174,7 +174,7 @@ impl Pose {
     }
 }
 
-const FRAMES: [&str; 4] = ["world", "body", "cam", "odom"];
+const FRAMES: [&str; 5] = ["world", "body", "cam", "odom", "sensor"];
 
 /// Size, focal lengths, principal point and lens of a camera.
 ///

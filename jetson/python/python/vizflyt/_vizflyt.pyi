@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 __version__: Final[str]
 PROTOCOL_VERSION: Final[int]
-_Frame = Literal["world", "body", "cam", "odom"]
+_Frame = Literal["world", "body", "cam", "odom", "sensor"]
 _Axes = Literal["world", "heading", "body"]
 _Vector = npt.ArrayLike
 _F64 = npt.NDArray[np.float64]
