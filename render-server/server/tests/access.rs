@@ -177,6 +177,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /panels/camera_settings.js", Takes::Nothing),
     ("GET /panels/crash_card.js", Takes::Nothing),
     ("GET /panels/events.js", Takes::Nothing),
+    ("GET /panels/sensors.js", Takes::Nothing),
     ("GET /panels/figures.js", Takes::Nothing),
     ("GET /panels/leaderboard.js", Takes::Nothing),
     ("GET /panels/timing.js", Takes::Nothing),

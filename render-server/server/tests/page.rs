@@ -99,7 +99,7 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
 
     for (name, body, status, expected) in [
         ("left", good, 404, "there is no camera 'left'; there are front"),
-        ("front", "{", 400, "no camera: EOF"),
+        ("front", "{", 400, "settings cannot be read: EOF"),
         ("front", r#"{"fov": 3}"#, 400, "unknown field `fov`"),
         ("front", &good.replace("70", "700"), 400, "horizontal_fov_deg = 700"),
         ("front", &" ".repeat(1 << 20), 413, "length limit"),
@@ -146,6 +146,7 @@ fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
     assert_eq!(told.as_deref(), Some("light and weather are changed to: fog"));
     assert_eq!(environment()["fog_visibility_m"], 12.0);
     assert_eq!(put(r#"{"fog_visibility_m": 20}"#, None).0, 200);
+    assert_eq!(environment()["fog_visibility_m"], 20.0);
     assert_eq!(put(r#"{"rain": {"rate_mmph": 5}, "depth_loss": true}"#, None).0, 200);
     assert_eq!(environment()["rain"]["rate_mmph"], 5.0);
     for (body, expected) in [
@@ -161,7 +162,7 @@ fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
         assert!(status == 400 && answer.contains(expected), "{body}: {status} {answer}");
     }
     // What was refused has changed nothing.
-    assert_eq!(environment()["fog_visibility_m"], 20.0);
+    assert_eq!(environment()["rain"]["rate_mmph"], 5.0);
     assert_eq!(put(r#"{"name": "day"}"#, Some("http://evil.example")).0, 403);
 }
 

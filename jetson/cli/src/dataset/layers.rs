@@ -186,7 +186,13 @@ mod tests {
         for normal in [DVec3::NEG_Z, DVec3::new(0.3, -0.5, -1.0), DVec3::new(-0.6, 0.1, -0.7)] {
             let normal = normal.normalize();
             normals(&k, &plane(&k, normal, -3.0), &mut bytes);
-            for (n, bytes) in bytes.chunks_exact(3).enumerate() {
+            for (n, bytes) in (0u32..).zip(bytes.chunks_exact(3)) {
+                let at = DVec2::new(f64::from(n % 64) + 0.5, f64::from(n / 64) + 0.5);
+                let ray = k.unproject(at, 1.0).unwrap().normalize();
+                // Beside the plane's vanishing line 1 / z changes by too much from pixel to pixel to be one surface.
+                if bytes == [0; 3] && normal.dot(ray).abs() < 0.1 {
+                    continue;
+                }
                 let decoded =
                     DVec3::new(bytes[0].into(), bytes[1].into(), bytes[2].into()) / 127.5 - 1.0;
                 assert!(

@@ -95,7 +95,7 @@ impl Shooting {
             Poses::Path { poses, of: kind } => on_path(poses, *kind, within, of),
             Poses::Random(bounds) => bounds
                 .draw(world, self.at_ns(within, of), &intrinsics, &mut random)
-                .with_context(|| format!("image {within} of {}", world.name))?,
+                .with_context(|| format!("number {within} of {}", world.name))?,
         };
         let textures = (0..world.textured_gates())
             .map(|_| {

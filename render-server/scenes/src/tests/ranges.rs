@@ -106,7 +106,11 @@ fn check(name: &str, mut strayed: Strayed) {
     assert!(median <= 0.01 && most <= 0.03, "{name}: {median} {most}");
     // The floor is painted some centimetres below where it is, for images, which take a splat's depth at its centre.
     assert!(floor <= 0.03 && most_floor <= 0.06, "{name}: {floor} {most_floor}");
-    assert!(strayed.lost * 100 <= obstacles, "{name}: {} lost", strayed.lost);
+    assert!(
+        strayed.lost * 100 <= obstacles + strayed.floor_m.len(),
+        "{name}: {} lost",
+        strayed.lost
+    );
 }
 
 #[test]

@@ -95,7 +95,7 @@ pub enum ChangeError {
         was: SensorKind,
     },
     /// The text is no camera.
-    #[error("no settings of it: {0}")]
+    #[error("settings cannot be read: {0}")]
     Json(serde_json::Error),
     /// A value that cannot work.
     #[error(transparent)]
@@ -302,8 +302,8 @@ mod tests {
         let before = cameras.newest();
         let patch = |json: &str| cameras.patch("front", json.as_bytes());
         refused(cameras.patch("left", b"{}"), "there is no camera 'left'; there are front, rear");
-        refused(patch("{"), "no settings of it: EOF");
-        refused(patch("[1]"), "no settings of it: invalid type: sequence");
+        refused(patch("{"), "settings cannot be read: EOF");
+        refused(patch("[1]"), "settings cannot be read: invalid type: sequence");
         refused(patch(r#"{"fov": 60}"#), "unknown field `fov`, expected one of");
         refused(patch(r#"{"width_px": "wide"}"#), "invalid type: string");
         refused(patch(r#"{"width_px": 0}"#), "width_px");
