@@ -7,7 +7,7 @@ use numpy::{PyArray1, PyArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
-use pyo3::types::{PyDict, PyList};
+use pyo3::types::PyDict;
 use vizflyt_sdk::protocol::messages::bounded;
 use vizflyt_sdk::{
     Body, Pose as SdkPose, Sensor, SensorInfo as SdkSensorInfo, SensorKind,
@@ -258,18 +258,13 @@ fn record_type(py: Python<'_>, kind: SensorKind) -> PyResult<Bound<'_, PyAny>> {
         ],
     };
     let make = || -> PyResult<Py<PyAny>> {
-        let list = |values: Vec<Bound<'_, PyAny>>| PyList::new(py, values).map(Bound::into_any);
-        let text = |text: &str| text.into_pyobject(py).map(Bound::into_any);
         let description = PyDict::new(py);
-        let (mut names, mut formats, mut offsets) = (Vec::new(), Vec::new(), Vec::new());
-        for (name, format, offset) in fields {
-            names.push(text(name)?);
-            formats.push(text(format)?);
-            offsets.push(offset.into_pyobject(py)?.into_any());
-        }
-        description.set_item("names", list(names)?)?;
-        description.set_item("formats", list(formats)?)?;
-        description.set_item("offsets", list(offsets)?)?;
+        let names: Vec<&str> = fields.iter().map(|field| field.0).collect();
+        let formats: Vec<&str> = fields.iter().map(|field| field.1).collect();
+        let offsets: Vec<usize> = fields.iter().map(|field| field.2).collect();
+        description.set_item("names", names)?;
+        description.set_item("formats", formats)?;
+        description.set_item("offsets", offsets)?;
         description.set_item("itemsize", kind.record_len())?;
         Ok(py.import("numpy")?.call_method1("dtype", (description,))?.unbind())
     };
