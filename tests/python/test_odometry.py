@@ -238,7 +238,7 @@ def test_flies_by_its_own_odometry_within_the_bound(program, tmp_path, plugin, p
     report = tmp_path / "report"
     run(
         program, "grade", PLUGINS / plugin, f"--project={project}", f"--level={level}", "--seeds=1", "--first-seed=3",
-        f"--report={report}", "--log=full", f"--keys={tmp_path}", "-o", grade,
+        f"--report={report}", "--log=full", f"--keys={tmp_path / 'keys'}", "-o", grade,
     )
     (flown,) = json.loads(grade.read_text())["document"]["runs"]
     assert flown["outcome"] == "finished", flown

@@ -55,9 +55,11 @@ impl ObservationBuffer {
         let cameras: Vec<_> = cameras.into_iter().map(|camera| camera.0).collect();
         let sensors: Vec<_> = sensors.into_iter().map(|sensor| sensor.0).collect();
         let names = cameras.iter().map(|camera| camera.name.clone()).collect();
-        let buffer = Mutex::new(SdkBuffer::with_sensors(&cameras, &sensors));
+        let mut buffer = SdkBuffer::with_sensors(&cameras, &sensors);
+        // Which there are is known before the first reading.
+        buffer.set_readings(&sensors.iter().map(|_| None).collect::<Vec<_>>());
         let readings = Mutex::new(sensors.iter().map(|_| None).collect());
-        Self { cameras, sensors, names, readings, buffer }
+        Self { cameras, sensors, names, readings, buffer: Mutex::new(buffer) }
     }
 
     /// Empties it and numbers it.

@@ -312,7 +312,8 @@ impl ArenaConfig {
             },
             setpoints: self.setpoints(),
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
-            sensors: Default::default(),
+            // Which they are is resolved as the scene loads: names of models are the server's.
+            sensors: [].into_iter().collect(),
         }
     }
 }
