@@ -13,7 +13,7 @@ use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::sensor::records::{LidarPoint, RangeReading};
 use vizflyt_protocol::sensor::{SensorHeader, SensorKind};
 use vizflyt_runtime::log::read::{LogReader, Recorded, RecordedFlight};
-use vizflyt_scenes::{SceneKind, generate};
+use vizflyt_scenes::{Generated, SceneKind, generate};
 use zerocopy::FromBytes;
 
 const AIRBORNE: Duration = Duration::from_secs(90);
@@ -101,7 +101,8 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
     demo.wait(FLIGHT);
 
     let log = std::fs::read_dir(&flights).unwrap().next().unwrap().unwrap().path();
-    let truth = generate(SceneKind::Forest, SEED).truth;
+    let Generated { truth, arena, .. } = generate(SceneKind::Forest, SEED);
+    let fence = &arena.geofence;
     let reader = LogReader::new(File::open(&log).unwrap()).unwrap();
     let mut flight = RecordedFlight::new(reader, true);
     let (mut ranges_m, mut points_m, mut radar) = (Vec::new(), Vec::new(), 0);
@@ -141,7 +142,16 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
                     let points = bytes.map(|bytes| LidarPoint::read_from_bytes(bytes).unwrap());
                     // The sweep's last milliseconds: the pose is that of its end.
                     let last = points.filter(|point| point.before_ns < 8_000_000).step_by(7);
-                    points_m.extend(last.map(|p| is_ahead_m(p.p_m.map(f64::from).into())));
+                    // Of trunks within the fence: the truth has neither plants nor what stands beyond.
+                    let on_trunks =
+                        last.map(|p| DVec3::from(p.p_m.map(f64::from))).filter(|&p_m| {
+                            let along = world_from_sensor.rotate(p_m).normalize();
+                            let hit_m = from_m + along * true_range_m(&truth, from_m, along);
+                            hit_m.z > 0.2
+                                && hit_m.cmpgt(fence.min_m).all()
+                                && hit_m.cmplt(fence.max_m).all()
+                        });
+                    points_m.extend(on_trunks.map(is_ahead_m));
                 }
                 SensorKind::Radar => radar += 1,
                 SensorKind::Sonar => panic!("there is none"),

@@ -51,7 +51,7 @@ pub fn run<D: Demand + Sync>(
             let known = known(localization);
             if let Some(newest) = &known[vehicle] {
                 pool.install(|| {
-                    measure(rendering, demand, scene, vehicle, sensors, newest, &known)
+                    measure(rendering, demand, scene, vehicle, sensors, newest, &known);
                 });
             }
             next = next.into_iter().chain(sensors.next()).min();
