@@ -232,7 +232,7 @@ mod tests {
     fn an_observation_without_sensors_is_as_long_as_ever() {
         let camera = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(5, 3, 1.5));
         assert_eq!(ObservationWriter::sensors_len(&[]), 0);
-        let mut buffer = ObservationBuffer::new(&[camera.clone()]);
+        let mut buffer = ObservationBuffer::new(std::slice::from_ref(&camera));
         buffer.set_readings(&[]);
         assert_eq!(buffer.observation().sensors().count(), 0);
         let len = buffer.as_bytes().len();

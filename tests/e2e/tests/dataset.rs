@@ -108,8 +108,8 @@ fn other_layouts_and_a_path_of_a_scene_file() {
     let rig = Rig::new();
     good(&["scene", "generate", "race", "--seed", "4", "-o", &rig.at("race")]);
     let path = rig.at("path.tum");
-    let rows: String =
-        (0..5).map(|n| format!("{n}.5 {} 0 1.2 0 0 0 1\n", 0.5 + 0.1 * f64::from(n))).collect();
+    let row = |n: u8| format!("{n}.5 {} 0 1.2 0 0 0 1\n", 0.5 + 0.1 * f64::from(n));
+    let rows = (0..5).map(row).collect::<Vec<_>>().concat();
     fs::write(&path, rows).unwrap();
     let parts = rig.at("parts.toml");
     fs::write(&parts, "[[parts]]\nname = \"floor\"\nclass = \"mat\"\ncenter_m = [5, 0, 0]\nsize_m = [30, 30, 0.1]\n").unwrap();

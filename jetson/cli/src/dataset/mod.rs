@@ -296,7 +296,7 @@ fn plan(args: &DatasetArgs) -> Result<Plan> {
 
 fn source(args: &DatasetArgs) -> Result<SceneSource> {
     if let Some(name) = &args.project {
-        return Ok(SceneSource::Project(CourseProject::named(name)?));
+        return Ok(SceneSource::Project(Box::new(CourseProject::named(name)?)));
     }
     let path = args.scene.clone().context("give --project or --scene")?;
     ensure!(args.seeds == 1, "--seeds is of --project; a scene is one");

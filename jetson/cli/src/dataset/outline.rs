@@ -83,7 +83,8 @@ fn join(polygon: &mut Vec<[u32; 2]>, hole: &[[u32; 2]]) {
     let Some((a, b)) = pairs.min_by_key(|&(a, b)| distance2(polygon[a], hole[b])) else { return };
     let around = hole[b..].iter().chain(&hole[..=b]).copied();
     let seam: Vec<[u32; 2]> = around.chain([polygon[a]]).collect();
-    polygon.splice(a + 1..a + 1, seam);
+    let after = polygon.split_off(a + 1);
+    polygon.extend(seam.into_iter().chain(after));
 }
 
 #[cfg(test)]

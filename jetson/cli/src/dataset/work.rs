@@ -45,7 +45,7 @@ pub(super) struct Plan {
 
 /// Where scenes are from.
 pub(super) enum SceneSource {
-    Project(CourseProject),
+    Project(Box<CourseProject>),
     Scene(PathBuf, BareArgs),
 }
 

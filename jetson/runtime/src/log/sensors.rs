@@ -97,7 +97,7 @@ impl LoggedReading {
             }
             SensorKind::Radar => {
                 let detections = <[RadarDetection]>::ref_from_bytes(records).unwrap_or_default();
-                let data: Vec<u8> = detections.iter().flat_map(|one| bytes_of(one)).collect();
+                let data: Vec<u8> = detections.iter().flat_map(bytes_of).collect();
                 cloud(at_ns, &body_from_sensor, RADAR, 20, data)
             }
         }

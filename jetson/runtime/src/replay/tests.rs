@@ -425,7 +425,7 @@ fn readings_are_fed_as_they_were() {
         let points = [LidarPoint { p_m: [scan as f32; 3], ring: 3, ..LidarPoint::default() }; 33];
         let range = RangeReading { range_m: seq as f32, signal: 0.5 };
         let mut readings = crate::stream::NewestReadings::default();
-        readings[0] = reading(0, scan, &points[..10 + scan as usize].as_bytes()[..]);
+        readings[0] = reading(0, scan, points[..10 + scan as usize].as_bytes());
         readings[1] = reading(1, 100 + seq, range.as_bytes());
         let given: Vec<_> =
             readings.iter().map(|one| one.as_ref().map(|one| one.given(true))).collect();
@@ -462,7 +462,7 @@ fn readings_are_fed_as_they_were() {
         }
     }
     assert_eq!(seen, 4);
-    let (found, _) = (std::fs::read(&path).unwrap(), ());
+    let found = std::fs::read(&path).unwrap();
     let scans = mcap::MessageStream::new(&found)
         .unwrap()
         .filter(|message| message.as_ref().is_ok_and(|one| one.channel.topic == "/sensor/top"));

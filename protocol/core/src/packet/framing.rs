@@ -142,7 +142,7 @@ mod tests {
             rate_hz: 9.9,
             min_range_m: 0.1,
             max_range_m: 99.9,
-            horizontal_fov_rad: 6.28,
+            horizontal_fov_rad: 6.0,
             vertical_fov_rad: 0.7,
             most_records: u32::MAX,
             body_from_sensor: Pose::new(DVec3::splat(0.1), DQuat::from_rotation_x(0.4)),

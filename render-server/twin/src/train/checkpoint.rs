@@ -185,7 +185,7 @@ impl<'a> Trainer<'a> {
         }
         let queue = queue.into_iter().map(|photo| photo as usize).collect();
         let begun = Self::with(dataset, options, passes);
-        Ok(Self { step, gaussians, moments, errors, exposures, queue, random, ..begun })
+        Ok(Self { gaussians, moments, exposures, errors, queue, random, step, ..begun })
     }
 }
 

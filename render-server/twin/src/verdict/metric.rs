@@ -35,9 +35,10 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     verdict.checked.push(format!("metric: scale known to {:.2} % (three sigmas)", 100.0 * scale));
     if scale > MOST_SCALE {
         let what = format!("its scale is known to no better than {:.1} %", 100.0 * scale);
-        let remedy = match has_tags {
-            true => "put up more tags, far apart from each other, and film each from several sides",
-            false => PUT_UP_TAGS,
+        let remedy = if has_tags {
+            "put up more tags, far apart from each other, and film each from several sides"
+        } else {
+            PUT_UP_TAGS
         };
         refuse(verdict, Severity::Refused, what, remedy);
     }
@@ -50,11 +51,10 @@ pub(super) fn check(evidence: &Evidence<'_>, verdict: &mut Verdict) {
     verdict.checked.push(format!("metric: up known to {tilt:.2} degrees (three sigmas)"));
     if tilt > MOST_TILT_DEG {
         let what = format!("which way is up is known to no better than {tilt:.1} degrees");
-        let remedy = match has_tags {
-            true => "put tags farther apart, or measure their places again",
-            false => {
-                "measure where tags stand, or pick three points of the floor (`vizflyt scene align`)"
-            }
+        let remedy = if has_tags {
+            "put tags farther apart, or measure their places again"
+        } else {
+            "measure where tags stand, or pick three points of the floor (`vizflyt scene align`)"
         };
         refuse(verdict, Severity::Refused, what, remedy);
     }

@@ -204,7 +204,7 @@ fn each_variant_has_its_mean_and_interval_and_drawn_ones_their_numbers() {
     );
     assert_eq!((day.summary.score.value, drawn.summary.score.value), (100.0, 62.5));
     let Interval { low, high, .. } = drawn.summary.score;
-    assert!(50.0 <= low && low < 62.5 && 62.5 < high && high <= 100.0, "{low} {high}");
+    assert!((50.0..62.5).contains(&low) && 62.5 < high && high <= 100.0, "{low} {high}");
     // One variant has the figures of the whole.
     assert!(Grade::new(subject(), None, vec![run(1, OutcomeKind::Finished)]).by_variant.is_empty());
     // As text and back, to the last bit: the signature is over the text.

@@ -8,7 +8,7 @@ use vizflyt_twin::Trainer;
 use vizflyt_twin::train::Checkpoint;
 
 /// What is lost of an interrupted training at most.
-const EVERY: Duration = Duration::from_secs(60);
+const EVERY: Duration = Duration::from_mins(1);
 
 /// Writes a training from time to time.
 #[derive(Debug)]

@@ -212,6 +212,7 @@ mod tests {
     use vizflyt_splat::{RigidObject, Scene, Splats};
 
     use super::*;
+    use zerocopy::FromBytes;
 
     const START: ServerTime = ServerTime::from_ns(10_000_000_000);
 
@@ -257,7 +258,6 @@ mod tests {
     }
 
     fn range_m(reading: &MadeReading) -> Option<f32> {
-        use zerocopy::FromBytes;
         RangeReading::read_from_bytes(reading.records()).unwrap().measured_m()
     }
 
@@ -275,7 +275,6 @@ mod tests {
         assert_eq!(range_m(&measure(&mut sensors, 0, 0.0, None)), None, "the wall is gone");
         let zones = measure(&mut sensors, 1, 1.0, Some(0.0));
         assert!(zones.header.record_count.get() > 32, "{:?}", zones.header);
-        use zerocopy::FromBytes;
         for bytes in zones.records().chunks_exact(size_of::<LidarPoint>()) {
             let point = LidarPoint::read_from_bytes(bytes).unwrap();
             assert!((point.p_m[0] - 2.8).abs() < 0.03 && point.before_ns > 0, "{point:?}");
