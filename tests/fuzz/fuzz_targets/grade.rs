@@ -1,6 +1,8 @@
 //! Grades, as `vizflyt grade verify` and `merge` read them, and records of flights, as `--resume` does: nothing counts
 //! that was not signed as it is.
 #![no_main]
+use std::collections::BTreeMap;
+
 use ed25519_dalek::SigningKey;
 use libfuzzer_sys::fuzz_target;
 
@@ -41,7 +43,9 @@ fuzz_target!(|text: &str| {
         plugin_sha256: String::new(),
         project: String::new(),
         level: String::new(),
+        environments: BTreeMap::new(),
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
+        imu: None,
         program_sha256: String::new(),
         renderer: String::new(),
         answer_within_s: 10.0,
