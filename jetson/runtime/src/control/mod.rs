@@ -305,6 +305,8 @@ impl ControlLoop {
             StreamEvent::Welcome(arena) => {
                 tracing::info!("server: arena {}", arena.name);
                 self.companion.handle_arena(now, arena);
+                // The first image may come before the first pose.
+                self.share_senses();
                 self.companion.upload_fence(now);
                 if self.plugin.is_none() && self.companion.flight().outcome().is_none() {
                     self.start_plugin(now);

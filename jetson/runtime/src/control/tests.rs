@@ -111,6 +111,8 @@ impl Drivers {
             _folder: folder,
             _inputs: inputs,
         };
+        // Before the first pose, too: an image may come before it.
+        drivers.check_senses();
         // The first turn greets the control loop's plugin.
         drivers.turn(now);
         drivers.lockstep.companion.plugin_ready(now);
