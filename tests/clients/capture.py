@@ -1,17 +1,20 @@
 """Writes the packets that the bridge is tested with, as pymavlink makes them:
-firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt.
+firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt; and those of distances to obstacles, which
+ours are held against: protocol/core/src/mavlink/distances.txt.
 
     target/clients/bin/python tests/clients/capture.py
 
 Every message of the dialect once, small fields set and floats not, some as MAVLink 1, some signed.
 """
 
+import math
 from pathlib import Path
 
 from pymavlink.dialects.v10 import ardupilotmega as v1
 from pymavlink.dialects.v20 import ardupilotmega as v2
 
-FOLDER = Path(__file__).parents[2] / "firmware-esp/bridge/tests/data"
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "firmware-esp/bridge/tests/data"
 # MANUAL_CONTROL calls its target system otherwise.
 SYSTEM = {69: "target"}
 
@@ -35,6 +38,32 @@ def message(dialect, cls, index):
         else:
             fields.append(value(index + place, kind, length))
     return cls(*fields)
+
+
+def distances():
+    """Returns, as hexadecimal, what a range finder that looks down, a sonar that looks 20 degrees below the nose and a
+    LiDAR with walls ahead and to the right are to send."""
+    link = v2.MAVLink(None, srcSystem=1, srcComponent=191)
+    half = math.radians(-20) / 2
+    nowhere = [1201] * 72
+    nowhere[0], nowhere[18] = 200, 300
+    messages = [
+        v2.MAVLink_distance_sensor_message(
+            time_boot_ms=55, min_distance=20, max_distance=1200, current_distance=123, type=v2.MAV_DISTANCE_SENSOR_LASER,
+            id=3, orientation=v2.MAV_SENSOR_ROTATION_PITCH_270, covariance=255, horizontal_fov=0.25, vertical_fov=0.5,
+            quaternion=[0, 0, 0, 0], signal_quality=50,
+        ),  # fmt: skip
+        v2.MAVLink_distance_sensor_message(
+            time_boot_ms=56, min_distance=20, max_distance=1200, current_distance=1201,
+            type=v2.MAV_DISTANCE_SENSOR_ULTRASOUND, id=4, orientation=v2.MAV_SENSOR_ROTATION_CUSTOM, covariance=255,
+            horizontal_fov=0.25, vertical_fov=0.5, quaternion=[math.cos(half), 0, math.sin(half), 0], signal_quality=0,
+        ),  # fmt: skip
+        v2.MAVLink_obstacle_distance_message(
+            time_usec=9, sensor_type=v2.MAV_DISTANCE_SENSOR_LASER, distances=nowhere, increment=5, min_distance=20,
+            max_distance=1200, increment_f=5, angle_offset=0, frame=v2.MAV_FRAME_BODY_FRD,
+        ),  # fmt: skip
+    ]
+    return [message.pack(link).hex() for message in messages]
 
 
 def main():
@@ -61,6 +90,7 @@ def main():
     (FOLDER / "pymavlink.bin").write_bytes(b"".join(packets))
     head = "# length message system component sequence signed target_system target_component\n"
     (FOLDER / "pymavlink.txt").write_text(head + "\n".join(lines) + "\n")
+    (ROOT / "protocol/core/src/mavlink/distances.txt").write_text("\n".join(distances()) + "\n")
     print(len(packets), "packets,", sum(map(len, packets)), "bytes")
 
 

@@ -1,8 +1,9 @@
-"""Reads what `vizflyt export` writes by programs that nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow.
+"""Reads what `vizflyt export` writes by programs that nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow, pypcd4.
 
     export.py VIZFLYT
 
-A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly.
+A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly. Its project is p2
+with a LiDAR and a range finder, and a camera that sees as a Raspberry Pi's does.
 """
 
 import json
@@ -17,6 +18,25 @@ import yaml
 from evo.core import sync
 from evo.tools import file_interface
 from PIL import Image
+from pypcd4 import PointCloud
+
+PROJECTS = pathlib.Path(__file__).parents[2] / "render-server/scenes/projects"
+SENSED = """
+[levels.ug.cameras.imaging]
+sensor = "imx219"
+illuminance_lx = 100.0
+
+[[levels.ug.sensors]]
+name = "top"
+model = "os1-16"
+position_m = [0.0, 0.0, 0.1]
+
+[[levels.ug.sensors]]
+name = "below"
+model = "tfmini"
+position_m = [0.0, 0.0, -0.05]
+tilt_deg = -90.0
+"""
 
 
 def run(*command):
@@ -77,6 +97,71 @@ def check_euroc(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> None:
     assert abs(turned - (yaw[-1] - yaw[0])) < 0.1, (turned, yaw[-1] - yaw[0])
 
 
+def matrices(table, name):
+    """Returns the poses NAME_* of a table as 4 x 4 matrices."""
+    x, y, z, w = (table[f"{name}_{axis}"].to_numpy() for axis in ("qx", "qy", "qz", "qw"))
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1)
+    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1)
+    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1)
+    poses[:, :3, 3] = table[[f"{name}_{axis}" for axis in "xyz"]]
+    return poses
+
+
+def check_sensors(folder: pathlib.Path) -> None:
+    """Holds an exported LiDAR against the depth of a camera, and a range finder against the height that was flown."""
+    mav = folder / "mav0"
+    lidar = yaml.safe_load((mav / "top/sensor.yaml").read_text())
+    assert lidar["sensor_type"] == "lidar" and 5 < lidar["rate_hz"] < 25, lidar
+    body_from_lidar = np.array(lidar["T_BS"]["data"]).reshape(4, 4)
+    truth = pd.read_csv(mav / "state_groundtruth_estimate0/data.csv")
+    named = dict(zip(("p_qw", "p_qx", "p_qy", "p_qz"), truth.columns[4:8]))
+    truth = truth.rename(columns={old: new for new, old in named.items()} | dict(zip(truth.columns[1:4], ("p_x", "p_y", "p_z"))))
+    stamps, poses = truth.iloc[:, 0].to_numpy(), matrices(truth, "p")
+    images = pd.read_csv(folder / "images.csv")
+    front = images[images.camera == "front"].reset_index(drop=True)
+    world_from_cam = matrices(front, "pose_at_image") @ matrices(front, "body_from_cam")
+    sweeps = sorted((mav / "top/data").iterdir())
+    assert len(sweeps) > 50 and [path.name for path in sweeps] == list(pd.read_csv(mav / "top/data.csv").iloc[:, 1])
+    off = []
+    for path in sweeps[20::3]:
+        cloud = PointCloud.from_path(path)
+        assert cloud.fields == ("x", "y", "z", "before_ns", "intensity", "ring") and cloud.points > 1000
+        p_lidar, before = cloud.numpy(("x", "y", "z")).astype(float), cloud.numpy(("before_ns",))[:, 0].astype(np.int64)
+        # Each beam from where the vehicle was when it was fired, by the nearest pose.
+        fired = np.clip(np.searchsorted(stamps, int(path.stem) - before), 0, len(stamps) - 1)
+        from_lidar = poses[fired] @ body_from_lidar
+        p_world = np.einsum("nij,nj->ni", from_lidar[:, :3, :3], p_lidar) + from_lidar[:, :3, 3]
+        index = (front.timestamp_ns - int(path.stem)).abs().argmin()
+        cam = np.linalg.inv(world_from_cam[index])
+        p_cam = p_world @ cam[:3, :3].T + cam[:3, 3]
+        p_cam = p_cam[p_cam[:, 2] > 0.3]
+        row = front.loc[index]
+        u = np.rint(row.fx_px * p_cam[:, 0] / p_cam[:, 2] + row.cx_px).astype(int)
+        v = np.rint(row.fy_px * p_cam[:, 1] / p_cam[:, 2] + row.cy_px).astype(int)
+        inside = (u >= 0) & (u < row.width_px) & (v >= 0) & (v < row.height_px)
+        depth = np.asarray(Image.open(folder / row.depth_file)) / 1000
+        seen = depth[v[inside], u[inside]]
+        off.append(np.abs(seen - p_cam[inside, 2])[seen > 0])
+    off = np.concatenate(off)
+    print(f"LiDAR beside a camera's depth: {len(off)} points, median {np.median(off):.3f} m, 80 % {np.quantile(off, 0.8):.3f} m")
+    assert len(off) > 5000 and np.median(off) < 0.04, np.median(off)
+    below = pd.read_csv(mav / "below/data.csv")
+    height = np.interp(below.iloc[:, 0], stamps, truth.p_z)
+    level = (height > 0.8) & (height < 2.5)
+    assert np.nanmedian(np.abs(below.iloc[:, 1] - height + 0.05)[level]) < 0.06
+
+
+def check_noise(folder: pathlib.Path) -> None:
+    """A camera with a sensor's noise sees what stands still differently each time; a perfect one does not."""
+    images = pd.read_csv(folder / "images.csv")
+    flicker = {}
+    for camera, rows in images.groupby("camera"):
+        first, second = (np.asarray(Image.open(folder / file), float) for file in rows.file[:2])
+        flicker[camera] = np.std(first - second)
+    assert flicker["down"] > 1.0 and flicker["front"] < 0.5, flicker
+
+
 def truth_yaw(truth):
     w, x, y, z = truth.orientations_quat_wxyz.T
     return 2 * (w * z + x * y), 1 - 2 * (y * y + z * z)
@@ -128,14 +213,18 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         report = folder / "report"
-        run(vizflyt, "grade", "avoid", "--project", "p2", "--seeds", "1", "--log", "full", "--report", report,
+        project = folder / "p2-sensed.toml"
+        project.write_text((PROJECTS / "p2.toml").read_text().replace("\n# Graduate:", SENSED + "\n# Graduate:"))
+        run(vizflyt, "grade", "avoid", "--project", project, "--seeds", "1", "--log", "full", "--report", report,
             "--keys", folder / "keys")  # fmt: skip
         log = report / "logs/day-1.mcap"
         check_tum(vizflyt, log, folder / "tum")
         check_euroc(vizflyt, log, folder / "euroc")
+        check_sensors(folder / "euroc")
+        check_noise(folder / "euroc")
         check_parquet(vizflyt, log, folder / "parquet")
         check_refusals(vizflyt, log, folder)
-    print("vizflyt export: evo, Pillow, PyYAML and pandas read what it writes")
+    print("vizflyt export: evo, Pillow, PyYAML, pandas and pypcd4 read what it writes")
 
 
 main()

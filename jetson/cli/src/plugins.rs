@@ -29,7 +29,7 @@ pub(crate) fn is_built_in(name: &str) -> bool {
 
 /// Returns the built-in that flies a scene or a project of the course.
 pub(crate) fn default_for(scene: &str) -> &'static str {
-    let is_race = CourseProject::named(scene).map_or(scene == "race", |project| project.is_race());
+    let is_race = CourseProject::find(scene).map_or(scene == "race", |project| project.is_race());
     if is_race { "race" } else { "avoid" }
 }
 

@@ -8,10 +8,13 @@
 //! level, light from the variant. Called once per flight.
 //!
 //! A new project is its file, its name in [`NAMES`], and its row in `docs/guides/course.md`, which a test
-//! here prints; help, messages and defaults of the command line follow from the file.
+//! here prints; help, messages and defaults of the command line follow from the file. An instructor's own is a file
+//! beside the program, of the same form ([`CourseProject::find`]).
 
 use core::fmt;
 use core::str::FromStr;
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
@@ -37,8 +40,8 @@ projects!("p2" "p3" "p4" "p5" "forest" "square" "spiral" "lemniscate");
 /// One project of the course.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CourseProject {
-    name: &'static str,
-    text: &'static str,
+    name: Cow<'static, str>,
+    text: Cow<'static, str>,
     plan: ProjectFile,
 }
 
@@ -89,6 +92,20 @@ pub struct UnknownLevel(pub String);
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no project '{0}'; there are: {all}", all = NAMES.join(", "))]
 pub struct UnknownProject(pub String);
+
+/// Why a course is that of no project.
+#[derive(Debug, thiserror::Error)]
+pub enum NoProject {
+    /// No project has this name.
+    #[error("{0}; or give the path of a file of your own that ends in .toml")]
+    Unknown(#[from] UnknownProject),
+    /// Its file cannot be read.
+    #[error("cannot read the project {path}: {1}", path = .0.display())]
+    Unreadable(PathBuf, std::io::Error),
+    /// Its file describes no course that can be flown.
+    #[error("{path} is no project: {1}", path = .0.display())]
+    Wrong(PathBuf, String),
+}
 
 /// The whole of a project's file.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -173,8 +190,32 @@ impl CourseProject {
         let (name, text) = files
             .find(|(known, _)| **known == name)
             .ok_or_else(|| UnknownProject(name.to_owned()))?;
-        let plan = toml::from_str(text).unwrap_or_else(|error| panic!("{name}.toml: {error}"));
-        Ok(Self { name, text, plan })
+        let plan = vizflyt_toml::parse(text).unwrap_or_else(|error| panic!("{name}.toml: {error}"));
+        Ok(Self { name: Cow::Borrowed(name), text: Cow::Borrowed(text), plan })
+    }
+
+    /// Returns the project of a name, or that of a file, whose path ends in `.toml`; it is called as the file.
+    ///
+    /// # Errors
+    /// [`NoProject`]: no such name, or a file that cannot be read, or that describes no course that can be flown.
+    pub fn find(name_or_path: &str) -> Result<Self, NoProject> {
+        let path = Path::new(name_or_path);
+        if path.extension().is_none_or(|ending| ending != "toml") {
+            return Ok(Self::named(name_or_path)?);
+        }
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| NoProject::Unreadable(path.to_owned(), error))?;
+        let wrong = |why: String| NoProject::Wrong(path.to_owned(), why);
+        let plan: ProjectFile =
+            vizflyt_toml::parse(&text).map_err(|errors| wrong(errors.to_string()))?;
+        plan.environments.check().map_err(|error| wrong(error.to_string()))?;
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let project = Self { name: Cow::Owned(name), text: Cow::Owned(text), plan };
+        for level in Level::ALL {
+            let arena = project.generate(1, level, Variant::DAY).arena;
+            arena.validate().map_err(|error| wrong(format!("level {level}: {error}")))?;
+        }
+        Ok(project)
     }
 
     /// Returns every project.
@@ -183,8 +224,8 @@ impl CourseProject {
     }
 
     /// Returns its name: `p5`.
-    pub fn name(&self) -> &'static str {
-        self.name
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// Returns what it is about, in a few words.
@@ -208,8 +249,8 @@ impl CourseProject {
     }
 
     /// Returns the text of its file, all of its rules: what a grade vouches for.
-    pub fn text(&self) -> &'static str {
-        self.text
+    pub fn text(&self) -> &str {
+        &self.text
     }
 
     /// Generates the project's place of a seed, with the sensors of a level, in the environment of a variant.
@@ -218,7 +259,7 @@ impl CourseProject {
         let plan = &self.plan;
         let mut generated = match plan.place {
             CoursePlace::Forest => forest::build(seed),
-            CoursePlace::Net(layout) => hall::build_course(seed, self.name, layout),
+            CoursePlace::Net(layout) => hall::build_course(seed, &self.name, layout),
         };
         let suite = match level {
             Level::Ug => &plan.levels.ug,
@@ -226,7 +267,7 @@ impl CourseProject {
         };
         let arena = &mut generated.arena;
         *arena = ArenaConfig {
-            name: self.name.to_owned(),
+            name: self.name.clone().into_owned(),
             time_limit_s: plan.time_limit_s,
             ground_truth: plan.ground_truth,
             limits: plan.limits,
@@ -255,6 +296,33 @@ mod tests {
     use vizflyt_protocol::messages::SetpointKind;
 
     use super::*;
+
+    #[test]
+    fn a_project_of_ones_own_is_a_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("scanned.toml");
+        let found = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            CourseProject::find(path.to_str().unwrap())
+        };
+        let (p4, p5) = (CourseProject::named("p4").unwrap(), CourseProject::named("p5").unwrap());
+        let own = found(p4.text()).unwrap();
+        assert_eq!((own.name(), own.text()), ("scanned", p4.text()));
+        assert_eq!(CourseProject::find("p4").unwrap(), p4);
+        let text =
+            format!("{}\n[[levels.ug.sensors]]\nname = \"top\"\nmodel = \"vlp-16\"\n", p5.text());
+        let own = found(&text).unwrap();
+        let of = |level| own.generate(2, level, Variant::DAY).arena;
+        assert_eq!((of(Level::Ug).sensors.len(), of(Level::G).sensors.len()), (1, 0));
+        let error = found(&text.replace("vlp-16", "vlp-17")).unwrap_err().to_string();
+        assert!(error.contains("level ug") && error.contains("vlp-17"), "{error}");
+        let error = found(&text.replace("finish", "fnish")).unwrap_err().to_string();
+        assert!(error.contains("scanned.toml") && error.contains("line "), "{error}");
+        let error = CourseProject::find("nowhere.toml").unwrap_err().to_string();
+        assert!(error.contains("cannot read the project nowhere.toml"), "{error}");
+        let error = CourseProject::find("p9").unwrap_err().to_string();
+        assert!(error.contains("p2, p3") && error.contains(".toml"), "{error}");
+    }
 
     #[test]
     fn environments_are_drawn_within_bounds_that_can_be_flown() {

@@ -244,7 +244,11 @@ fn depth_bound(text: &str) -> Result<DepthBound, String> {
     DepthBound::new(k_per_m).ok_or_else(|| format!("{k_per_m} is outside 0.000001 to 0.1"))
 }
 
-fn rate(text: &str) -> Result<f64, String> {
+/// Reads `--max-rate`. [Hz]
+///
+/// # Errors
+/// In words, of what is no rate from 1 to 1000.
+pub fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
 }
 

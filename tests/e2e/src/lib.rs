@@ -71,6 +71,9 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
 }
 
+/// How often a flight's images are drawn: flights are as they are at 120 Hz, and what runs aside gets its time. [Hz]
+const MAX_RATE_HZ: f64 = 40.0;
+
 /// A running `vizflyt` whose output can be waited for. Killed when dropped.
 pub struct Demo {
     child: Child,
@@ -80,12 +83,16 @@ pub struct Demo {
 }
 
 impl Demo {
-    /// Starts `vizflyt demo --headless ARGS`.
+    /// Starts `vizflyt demo --headless ARGS`, which draws [`MAX_RATE_HZ`] at most unless they say otherwise.
     ///
     /// # Panics
     /// If the program cannot be started.
     pub fn start(args: &[&str]) -> Self {
-        Self::spawn(Command::new(vizflyt()).args(["demo", "--headless"]).args(args))
+        let rate = "--max-rate";
+        let is_given = args.iter().any(|argument| argument.starts_with(rate));
+        let rate = (!is_given).then(|| format!("{rate}={MAX_RATE_HZ}"));
+        let mut command = Command::new(vizflyt());
+        Self::spawn(command.args(["demo", "--headless"]).args(rate).args(args))
     }
 
     /// Starts `command` in the root of the repository.

@@ -72,7 +72,7 @@ fn page_url(demo: &mut Demo) -> String {
 #[test]
 fn the_forest_is_flown_and_reported() {
     let file = ReportFile::new();
-    let mut demo = file.demo(&["--seed", "7", "--seconds", "90"]);
+    let mut demo = file.demo(&["--seed", "7", "--seconds", "90", "--max-rate", "120"]);
     let url = page_url(&mut demo);
     assert!(http(&url, "GET /").contains("<title>"), "the page is served");
     let code = demo.wait(FLIGHT);
@@ -121,7 +121,7 @@ fn the_forest_is_flown_and_reported() {
 #[test]
 fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
     let file = ReportFile::new();
-    let mut demo = file.demo(&["--seconds", "60"]);
+    let mut demo = file.demo(&["--seconds", "60", "--max-rate", "120"]);
     demo.wait_for(FLYING, AIRBORNE);
     let server = demo.descendants("vizflyt serve")[0];
     let over = AtomicBool::new(false);
@@ -171,7 +171,7 @@ fn over_many_seeds() {
     let mut failed = Vec::new();
     for seed in 1..=seeds {
         let file = ReportFile::new();
-        let mut demo = file.demo(&["--seed", &seed.to_string()]);
+        let mut demo = file.demo(&["--seed", &seed.to_string(), "--max-rate", "120"]);
         demo.wait(FLIGHT);
         let report = file.read();
         println!(

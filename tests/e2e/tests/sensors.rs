@@ -173,6 +173,16 @@ fn readings_agree_with_the_true_geometry_and_change_in_flight() {
     assert!(figures[0] < 0.03 && figures[1] < 0.10, "down: {figures:?}");
     assert!(figures[2] < 0.03 && figures[3] < 0.30, "top: {figures:?}");
 
+    // As a data set: every reading once.
+    let set = folder.path().join("set");
+    let set_name = set.to_str().unwrap();
+    good(&["export", log.to_str().unwrap(), "--format", "euroc", "-o", set_name]);
+    let sweeps = std::fs::read_dir(set.join("mav0/top/data")).unwrap().count();
+    let ranges = std::fs::read_to_string(set.join("mav0/down/data.csv")).unwrap().lines().count();
+    assert!(sweeps > 50 && ranges > ranges_m.len(), "{sweeps} sweeps, {ranges} distances");
+    let place = std::fs::read_to_string(set.join("mav0/nose/sensor.yaml")).unwrap();
+    assert!(place.contains("sensor_type: radar") && place.contains("T_BS"), "{place}");
+
     // The plugin is replayed with the very readings that it had.
     let report = folder.path().join("report.json");
     let arguments = ["replay", log.to_str().unwrap(), "--report", report.to_str().unwrap()];

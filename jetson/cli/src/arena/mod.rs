@@ -41,7 +41,7 @@ struct CheckArgs {
     #[arg(required_unless_present = "project", conflicts_with = "project")]
     arena: Option<PathBuf>,
     #[arg(long, value_name = "NAME", help = format!(
-        "A project of the course: {}", projects::NAMES.join(", ")
+        "A project of the course: {}; or a file of your own, FILE.toml", projects::NAMES.join(", ")
     ))]
     project: Option<String>,
     /// This seed of the project alone
@@ -63,7 +63,7 @@ pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
 fn check_all(args: &CheckArgs) -> Result<ExitCode> {
     let good = match (&args.project, &args.arena) {
         (Some(project), _) => {
-            let project = CourseProject::named(project)?;
+            let project = CourseProject::find(project)?;
             let seeds = args.seed.map_or(0..args.seeds, |seed| seed..seed + 1);
             if seeds.is_empty() {
                 bail!("--seeds 0 checks nothing; give at least 1");

@@ -8,7 +8,7 @@ use std::fmt::Write;
 
 use anyhow::Result;
 use glam::DVec3;
-use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
+use vizflyt_protocol::geometry::{Body, Cam, Distortion, Frame, Intrinsics, Pose, World};
 
 use super::files::{Folder, write_depth, write_rgb};
 use super::motion::Motion;
@@ -112,9 +112,9 @@ pub(crate) fn camera_yaml(
 }
 
 /// Returns a sensor's place in the body as its file has it.
-fn transform(body_from_cam: &Pose<Body, Cam>) -> String {
-    let p = body_from_cam.translation_m;
-    let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| body_from_cam.rotate(axis));
+pub(super) fn transform<A: Frame>(body_from_sensor: &Pose<Body, A>) -> String {
+    let p = body_from_sensor.translation_m;
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| body_from_sensor.rotate(axis));
     let row = |k: usize| format!("{}, {}, {}, {}", axes[0][k], axes[1][k], axes[2][k], p[k]);
     format!(
         "T_BS: # from the sensor to the body\n  cols: 4\n  rows: 4\n  data: [{},\n         {},\n         {},\n         \
@@ -125,7 +125,8 @@ fn transform(body_from_cam: &Pose<Body, Cam>) -> String {
     )
 }
 
-fn rate_hz(stamps: &[u64]) -> f64 {
+/// Returns how many readings there are a second, from the first to the last.
+pub(super) fn rate_hz(stamps: &[u64]) -> f64 {
     let seconds = stamps
         .last()
         .zip(stamps.first())
@@ -145,7 +146,7 @@ fn imu(folder: &Folder, motion: &Motion) -> Result<()> {
     let stamps: Vec<u64> = motion.imu.iter().map(|reading| reading.at_ns).collect();
     let text = format!(
         "sensor_type: imu\ncomment: the autopilot's\n{}rate_hz: {:.3}\n",
-        transform(&Pose::IDENTITY),
+        transform::<Body>(&Pose::IDENTITY),
         rate_hz(&stamps)
     );
     write_text(&folder.at("mav0/imu0/sensor.yaml")?, &text)
@@ -191,5 +192,8 @@ pub(crate) fn truth_csv(rows: impl Iterator<Item = TruthRow>) -> String {
 
 /// Returns the `sensor.yaml` of the list of true motions.
 pub(crate) fn truth_yaml(comment: &str) -> String {
-    format!("sensor_type: visual-inertial\ncomment: {comment}\n{}", transform(&Pose::IDENTITY))
+    format!(
+        "sensor_type: visual-inertial\ncomment: {comment}\n{}",
+        transform::<Body>(&Pose::IDENTITY)
+    )
 }

@@ -3,6 +3,7 @@
 //! ```text
 //! log, without images -> Motion    poses, sigmas, IMU, setpoints, odometry: all in memory
 //! log, with images    -> Pictures  one after the other, decoded -> euroc | tum -> folder
+//! log, with images    -> sensors   readings of what is no camera
 //! ```
 //! Every image is named by the instant that it shows. The folder appears under its name when it is whole.
 
@@ -12,6 +13,7 @@ mod files;
 mod motion;
 mod parquet;
 mod pictures;
+mod sensors;
 mod table;
 mod tum;
 
@@ -79,6 +81,8 @@ pub(crate) fn run(args: &ExportArgs) -> Result<ExitCode> {
         Format::Tum => tum::write(&folder, &motion, pictures, args.camera.as_deref())?,
         Format::Parquet => table::write(&folder, &motion, pictures)?,
     };
+    let above = if args.format == Format::Euroc { "mav0/" } else { "sensors/" };
+    let readings = sensors::write(&folder, &args.log, above)?;
     folder.finish()?;
     let left_out = motion.observations - motion.with_images;
     let reduced = match left_out {
@@ -100,6 +104,9 @@ pub(crate) fn run(args: &ExportArgs) -> Result<ExitCode> {
         motion.sent.len(),
         motion.odometry.len()
     ));
+    if readings > 0 {
+        print_line(format!("sensors     {readings} readings, in {above}NAME"));
+    }
     if motion.is_cut {
         print_line("note        the log ends early: its flight was killed, or the file is damaged");
     }

@@ -59,6 +59,8 @@ impl Motion {
                 }
                 FlightDatum::LeftOut => motion.observations += 1,
                 FlightDatum::Foreign { protocol } => motion.foreign_protocol = Some(protocol),
+                // In a pass of their own: a LiDAR's are larger than images.
+                FlightDatum::Reading(_) => {}
                 FlightDatum::Pose(pose) => motion.poses.push(pose),
                 FlightDatum::Motion(one) => motion.motions.push(one),
                 FlightDatum::Imu(reading) => motion.imu.push(reading),

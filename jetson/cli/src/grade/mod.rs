@@ -87,8 +87,8 @@ struct FlyArgs {
     /// The plugin, as for `vizflyt fly`
     #[arg(value_name = "PLUGIN", required = true)]
     plugin: Option<OsString>,
-    #[arg(long, value_name = "NAME", default_value = "p4", help = format!(
-        "The project whose course is flown: {}", projects::NAMES.join(", ")
+    #[arg(long, value_name = "NAME|FILE", default_value = "p4", help = format!(
+        "The project whose course is flown: {}; or a file of your own, FILE.toml", projects::NAMES.join(", ")
     ))]
     project: String,
     /// Sensors: ug has depth, g has not
@@ -341,7 +341,7 @@ pub(crate) fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> R
 fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let typed = args.plugin.as_ref().context("no plugin is named")?;
     let plugin = Plugin::find(typed)?;
-    let project = CourseProject::named(&args.project)?;
+    let project = CourseProject::find(&args.project)?;
     let (delays, imu) = (delays(args)?, args.imu);
     let variants = variants(args, &project)?;
     let subject = subject(args, &plugin, &project, &variants)?;

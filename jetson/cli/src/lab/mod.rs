@@ -41,7 +41,7 @@ use vizflyt_simulator::imu::ImuModel;
 
 use self::child::{Child, Notice, Role};
 use self::keys::Keys;
-use vizflyt_scenes::projects::{self, CourseProject, Level, UnknownProject};
+use vizflyt_scenes::projects::{self, CourseProject, Level, NoProject};
 use vizflyt_scenes::{SceneKind, Variant};
 
 use self::localization::Localization;
@@ -60,8 +60,8 @@ pub(crate) struct LabArgs {
          --localization tags or mat]", SceneKind::names()
     ))]
     pub scene: Option<String>,
-    #[arg(long, value_name = "NAME", value_parser = project_name, help = format!(
-        "A project of the course, with its place, sensors and rules: {}; takes the place of --scene",
+    #[arg(long, value_name = "NAME|FILE", value_parser = project_name, help = format!(
+        "A project of the course, with its place, sensors and rules: {}; or a file of your own, FILE.toml; takes the place of --scene",
         projects::NAMES.join(", ")
     ))]
     pub project: Option<String>,
@@ -90,6 +90,9 @@ pub(crate) struct LabArgs {
     /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
+    /// Draws at most this often, as `vizflyt-server` does [Hz] [default: 120].
+    #[arg(long, value_name = "HZ", value_parser = vizflyt_server::args::rate)]
+    pub max_rate: Option<f64>,
     /// Opens no browser.
     #[arg(long)]
     pub headless: bool,
@@ -127,7 +130,7 @@ impl LabArgs {
 
     /// Returns the project of the course that is flown, if one is.
     pub(crate) fn project(&self) -> Option<CourseProject> {
-        self.project.as_deref().and_then(|name| CourseProject::named(name).ok())
+        self.project.as_deref().and_then(|name| CourseProject::find(name).ok())
     }
 
     /// Returns the project's level.
@@ -146,8 +149,8 @@ impl LabArgs {
     }
 }
 
-fn project_name(name: &str) -> Result<String, UnknownProject> {
-    CourseProject::named(name).map(|project| project.name().to_owned())
+fn project_name(name: &str) -> Result<String, NoProject> {
+    CourseProject::find(name).map(|_| name.to_owned())
 }
 
 /// One flight in the simulated lab.
@@ -245,7 +248,7 @@ impl Show {
                 lab.port
             );
         }
-        let serve: Vec<OsString> = vec![
+        let mut serve: Vec<OsString> = vec![
             "serve".into(),
             stage.arena.clone().into(),
             keys.option(),
@@ -263,6 +266,7 @@ impl Show {
             format!("--antialiased={}", lab.antialiased).into(),
             self.log_level.clone(),
         ];
+        serve.extend(lab.max_rate.map(|rate| format!("--max-rate={rate}").into()));
         let Some(server) = self.start(Role::Server, &serve)? else {
             return Ok(LabEnd::Interrupted);
         };

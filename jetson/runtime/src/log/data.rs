@@ -9,6 +9,8 @@ use std::io::Read;
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Frame, Odom, Pose, World};
 use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::sensor::{MAX_SENSORS, SensorHeader};
+use zerocopy::FromBytes;
 
 use super::channels::Channel;
 use super::messages::{Observation, ObservedImage};
@@ -67,6 +69,17 @@ pub struct FlightImu {
     pub gyro_radps: DVec3,
 }
 
+/// A new reading of a sensor beside the cameras.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FlightReading {
+    /// The instant that it is of, since 1970; a sweep's last. [ns]
+    pub at_ns: u64,
+    /// The sensor, and what else the plugin knew of the reading; its times are of the computer that flew. [ns, host]
+    pub sensor: SensorHeader,
+    /// As in shared memory, by the sensor's kind.
+    pub records: Vec<u8>,
+}
+
 /// Something that a flight's log holds.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
@@ -75,6 +88,8 @@ pub enum FlightDatum {
     Image(FlightImage),
     /// Images that a reduced log left out.
     LeftOut,
+    /// A sensor's reading; only with images, which a large one lies beside.
+    Reading(FlightReading),
     /// A localized pose.
     Pose(StampedPose<World>),
     /// What belongs to the pose of the same instant.
@@ -103,6 +118,8 @@ pub struct FlightData<R> {
     has_imu: bool,
     /// Newest IMU sample that was found in a head. [ns, host]
     imu_had_ns: u64,
+    /// Number of each sensor's newest reading.
+    readings_had: [u64; MAX_SENSORS],
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -132,6 +149,7 @@ impl<R: Read> FlightData<R> {
             ready: std::collections::VecDeque::new(),
             has_imu: false,
             imu_had_ns: 0,
+            readings_had: [0; MAX_SENSORS],
         }
     }
 
@@ -196,9 +214,31 @@ impl<R: Read> FlightData<R> {
         })
     }
 
+    /// Takes the readings that are new in an observation.
+    fn readings(&mut self, offset_ns: u64, observation: &Observation) {
+        let table = observation.sensors.chunks_exact(size_of::<SensorHeader>());
+        let table = table.filter_map(|bytes| SensorHeader::read_from_bytes(bytes).ok());
+        for (index, (sensor, had)) in table.zip(&mut self.readings_had).enumerate() {
+            // Points that are apart were not asked for, or are not in a reduced log.
+            let records = observation
+                .records
+                .iter()
+                .find(|records| records.sensor as usize == index && !records.is_apart);
+            let Some(records) = records else { continue };
+            if std::mem::replace(had, sensor.seq) != sensor.seq {
+                self.ready.push_back(FlightDatum::Reading(FlightReading {
+                    at_ns: sensor.stamp_ns.wrapping_add(offset_ns),
+                    sensor,
+                    records: records.bytes.clone(),
+                }));
+            }
+        }
+    }
+
     fn observation(&mut self, at_ns: u64, observation: Observation) {
         // From this computer's clock to time since 1970.
         let offset_ns = at_ns.wrapping_sub(observation.published_ns);
+        self.readings(offset_ns, &observation);
         let Observation { seq, protocol, head, images, .. } = observation;
         if images.is_empty() {
             self.ready.push_back(FlightDatum::LeftOut);
@@ -266,6 +306,7 @@ mod tests {
     use vizflyt_protocol::time::ServerTime;
     use zerocopy::IntoBytes;
 
+    use super::super::messages::ObservedRecords;
     use super::*;
 
     /// From the clock of the computer that flew to 1970. [ns]
@@ -344,6 +385,29 @@ mod tests {
         let imu: Vec<u64> = imu.collect();
         assert_eq!(imu.len(), 38);
         assert!(imu.is_sorted_by(|a, b| a < b), "each once, though heads repeat them");
+    }
+
+    #[test]
+    fn a_reading_comes_once_by_the_instant_that_it_is_of() {
+        let observed = |n: u64, seq: u64, is_apart: bool| {
+            let header = SensorHeader { seq, stamp_ns: 1_000 * seq, ..SensorHeader::default() };
+            let bytes = if is_apart { Vec::new() } else { vec![seq as u8] };
+            let records = ObservedRecords { sensor: 1, name: "top".into(), is_apart, bytes };
+            Observation {
+                sensors: [SensorHeader::default(), header].as_bytes().to_vec(),
+                records: vec![records],
+                images: Vec::new(),
+                ..old_observation(n)
+            }
+        };
+        let all = [observed(1, 4, false), observed(2, 4, false), observed(3, 5, true)];
+        let found = read(log(&[&all[..], &[observed(4, 6, false)]].concat()));
+        let readings = found.iter().filter_map(|datum| match datum {
+            FlightDatum::Reading(reading) => Some((reading.at_ns - OFFSET_NS, &*reading.records)),
+            _ => None,
+        });
+        let found: Vec<_> = readings.collect();
+        assert_eq!(found, [(4_000, &[4][..]), (6_000, &[6])], "a reduced log lacks the fifth");
     }
 
     #[test]

@@ -171,6 +171,12 @@ fn wxyz_frd(rotation: DQuat) -> [f32; 4] {
 
 #[cfg(test)]
 mod tests {
+    extern crate std;
+    use std::format;
+    use std::string::String;
+
+    use super::super::dialect::MavMessage;
+    use super::super::{MAX_PACKET, MavHeader, encode};
     use super::*;
     use crate::geometry::Pose;
     use crate::messages::bounded;
@@ -263,5 +269,36 @@ mod tests {
         let message = obstacles_to_mavlink(&lidar, &[], DQuat::IDENTITY, 9);
         let known = message.distances.iter().filter(|&&cm| cm == 1201).count();
         assert_eq!((known, message.distances[36]), (11, u16::MAX));
+    }
+    /// What pymavlink makes of the same sensors' readings, bit by bit: `tests/clients/capture.py`.
+    #[test]
+    fn packets_are_pymavlinks() {
+        let level = DQuat::IDENTITY;
+        let narrow =
+            |kind, tilt_deg| SensorInfo { horizontal_fov_rad: 0.25, ..sensor(kind, 0.0, tilt_deg) };
+        let down = narrow(SensorKind::RangeFinder, -90.0);
+        let below = narrow(SensorKind::Sonar, -20.0);
+        let reading = RangeReading { range_m: 1.23, signal: 1.0 };
+        let walls = [at([2.0, 0.0, 0.0]), at([0.0, -3.0, 0.0])];
+        let lidar = sensor(SensorKind::Lidar, 0.0, 0.0);
+        let messages = [
+            MavMessage::DISTANCE_SENSOR(distance_to_mavlink(&down, 3, reading, 55)),
+            MavMessage::DISTANCE_SENSOR(distance_to_mavlink(
+                &below,
+                4,
+                RangeReading::default(),
+                56,
+            )),
+            MavMessage::OBSTACLE_DISTANCE(obstacles_to_mavlink(&lidar, &walls, level, 9)),
+        ];
+        let header = MavHeader { system_id: 1, component_id: 191, sequence: 0 };
+        let mut expected = include_str!("distances.txt").lines();
+        for message in messages {
+            let mut buffer = [0; MAX_PACKET];
+            let packet = encode(header, &message, &mut buffer);
+            let hex: String = packet.iter().map(|byte| format!("{byte:02x}")).collect();
+            assert_eq!(Some(&*hex), expected.next());
+        }
+        assert_eq!(expected.next(), None);
     }
 }
