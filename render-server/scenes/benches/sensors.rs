@@ -1,11 +1,11 @@
 //! Milliseconds per measurement of each named sensor in the forest and the race, beside an image of the same place.
 //!
 //! ```text
-//! cargo bench -p vizflyt-scenes --bench sensors
+//! cargo bench -p vizflyt-scenes --bench sensors [-- NAME ...]
 //! ```
 //!
 //! Times are of the whole machine's cores: compare figures of one run with each other. Where others use the machine, the least
-//! of the repetitions is the most meaningful.
+//! of the repetitions is the most meaningful; with `RAYON_NUM_THREADS=1` it is close to the processor's time.
 
 use std::time::Instant;
 
@@ -23,6 +23,8 @@ fn main() {
     if !std::env::args().any(|argument| argument == "--bench") {
         return;
     }
+    let asked: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let is_asked = |name: &str| asked.is_empty() || asked.iter().any(|asked| asked == name);
     for (kind, p_m) in [
         (SceneKind::Forest, DVec3::new(7.5, 0.8, 1.3)),
         (SceneKind::Race, DVec3::new(3.2, 0.9, 1.6)),
@@ -51,7 +53,7 @@ fn main() {
         let begin: Pose<World, Sensor> = Pose::new(p_m, DQuat::IDENTITY);
         let end = Pose::new(p_m + DVec3::X * 0.2, DQuat::from_rotation_z(0.157));
         let motion = Motion { world_from_sensor: [begin, end], objects: &[], duration_s: 0.1 };
-        for (name, _, preset) in PRESETS {
+        for (name, _, preset) in PRESETS.into_iter().filter(|(name, ..)| is_asked(name)) {
             match preset() {
                 Preset::Lidar(model) => {
                     let (lidar, mut points) = (Lidar::new(model).unwrap(), Vec::new());

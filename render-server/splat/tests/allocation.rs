@@ -1,5 +1,5 @@
 //! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
-//! cameras, their lenses, and the objects that come and go. Nor do the sensors behind its images.
+//! cameras, their lenses, and the objects that come and go. Nor do the sensors behind its images, and those beside its cameras.
 
 use glam::{DQuat, DVec3, Quat, Vec2, Vec3};
 use vizflyt_fixtures::CountingAllocator;
@@ -10,6 +10,10 @@ use vizflyt_splat::imaging::noise::NoiseKey;
 use vizflyt_splat::imaging::stereo::Stereo;
 use vizflyt_splat::imaging::tof::Tof;
 use vizflyt_splat::imaging::{CameraModel, DepthModel, Imager, Sensor, Shot};
+use vizflyt_splat::sensor::presets::{PRESETS, Preset};
+use vizflyt_splat::sensor::{
+    Lidar, LidarPoint, Motion, Radar, RadarDetection, RangeFinder, SensorScene, Sonar,
+};
 use vizflyt_splat::weather::{
     Cloud, Flicker, LampPlaces, Lamps, Moment, OwnLight, Rain, Snow, Sun, Weather, WeatherPass,
 };
@@ -170,6 +174,72 @@ fn models() -> [CameraModel; 2] {
         CameraModel { sensor: Some(sensor(ColorFilter::Bayer)), depth: DepthModel::Stereo(stereo) },
         CameraModel { sensor: Some(sensor(ColorFilter::Rgb)), depth: DepthModel::Tof(tof) },
     ]
+}
+
+#[test]
+fn sensors_allocate_nothing_after_their_first_measurement() {
+    let splats = cloud(20_000, 4.0);
+    let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(500, 0.5) });
+    let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    // Motions of the sensor and the objects, of which one comes and goes.
+    let turns: Vec<_> = (0..7).map(|turn| (placements(turn), placements(turn + 1))).collect();
+    for (name, _, preset) in PRESETS {
+        let mut sensor = Prepared::new(preset());
+        let counts = pool.install(|| {
+            [(); 3].map(|()| {
+                let before = CountingAllocator::allocations();
+                for (seq, (begin, end)) in turns.iter().enumerate() {
+                    let moved_m = DVec3::X * (0.1 * seq as f64);
+                    let begins = Pose::new(moved_m, DQuat::from_rotation_z(0.3 * seq as f64));
+                    let ends = Pose::new(moved_m + DVec3::Y * 0.2, begins.rotation);
+                    let motion = Motion {
+                        world_from_sensor: [begins, ends],
+                        objects: &[[begin[0], end[0]], [begin[1], end[1]]],
+                        duration_s: 0.1,
+                    };
+                    sensor.measure(&scene, &motion, seq as u64);
+                }
+                CountingAllocator::allocations() - before
+            })
+        });
+        // Beams look into a cloud all around: whoever keeps records has grown them in the first pass.
+        assert_eq!(counts[1..], [0, 0], "{name}");
+    }
+}
+
+/// A sensor, and the records that it fills.
+enum Prepared {
+    Lidar(Lidar, Vec<LidarPoint>),
+    Range(RangeFinder),
+    Sonar(Sonar),
+    Radar(Radar, Vec<RadarDetection>),
+}
+
+impl Prepared {
+    fn new(preset: Preset) -> Self {
+        match preset {
+            Preset::Lidar(model) => Self::Lidar(Lidar::new(model).expect("a model"), Vec::new()),
+            Preset::Range(model) => Self::Range(RangeFinder::new(model).expect("a model")),
+            Preset::Sonar(model) => Self::Sonar(Sonar::new(model).expect("a model")),
+            Preset::Radar(model) => Self::Radar(Radar::new(model).expect("a model"), Vec::new()),
+        }
+    }
+
+    fn measure(&mut self, scene: &SensorScene, motion: &Motion<'_>, seq: u64) {
+        let valid = "a valid motion";
+        match self {
+            Self::Lidar(lidar, points) => {
+                lidar.scan(scene, motion, 1, seq, points).expect(valid);
+                assert!(points.iter().any(|point| point.range_m > 0.0), "it sees the cloud");
+            }
+            Self::Range(finder) => drop(finder.measure(scene, motion, 1, seq).expect(valid)),
+            Self::Sonar(sonar) => drop(sonar.measure(scene, motion, 1, seq).expect(valid)),
+            Self::Radar(radar, found) => {
+                radar.measure(scene, motion, 1, seq, found).expect(valid);
+            }
+        }
+    }
 }
 
 #[test]

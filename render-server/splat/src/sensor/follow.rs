@@ -1,6 +1,8 @@
-//! Rays through a tree of splats: boxes eight at a time for a bundle of rays, then splats eight at a time for each, nearest first.
+//! Rays through a tree of splats, nearest first: eight boxes or splats at a time for a fan of rays, then splats that are left for eight
+//! rays at a time.
 //!
-//! Budget: some 1.2 us a ray and thread in a forest of 125 k splats, for the boxes and splats that it touches: some 30 and 17 leaves.
+//! Budget: some 0.7 us a ray and thread in a forest of 125 k splats. A fan of eight rays touches some 30 nodes and 20 leaves there,
+//! and works out some 40 splats, each of which ends at one or two of its rays.
 //!
 //! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection of the Gaussian onto the plane
 //! across the ray, which is its greatest value along the ray. A beam is no line: its footprint, a Gaussian that grows with
@@ -9,6 +11,8 @@
 //!
 //! Its depth is where that greatest value lies (for a disc: where the ray meets its plane), not its centre's as in images: a range
 //! must not depend on how large the splats of a surface are.
+
+use std::ops::Sub;
 
 use glam::Vec3;
 
@@ -40,6 +44,8 @@ const _: () = assert!(LEAST_ALPHA == 0.05, "LEAST_LEVEL and REACH follow from it
 
 /// Nodes that wait: at most seven of each level. Deeper trees, of splats that halve in size again and again, lose some.
 const MAX_STACK: usize = 128;
+/// What f32 may round off a slope. [m/m]
+const ROUNDING: f32 = 2e-6;
 /// log2 of [`LEAST_ALPHA`].
 const LEAST_LEVEL: f32 = -4.321_928;
 /// Standard deviations at which the most opaque splat falls below it: sqrt(2 ln 20).
@@ -48,20 +54,34 @@ const REACH: f32 = 2.45;
 // Closures are no substitute for the functions below, nor are maps of arrays: they are not always inlined, and then run without the
 // kernel's instructions.
 
-/// A cone around some rays, in every lane.
+/// Some rays as a fan, in every lane: how far they stray from its axis, along each axis of the part and of the fan itself.
 #[derive(Clone, Copy)]
-struct Bundle<S: Simd> {
+struct Fan<S: Simd> {
     origin: [S::F; 3],
-    direction: [S::F; 3],
+    /// Its axis, the side along which its rays are apart, and the side across. Unit, orthogonal.
+    frame: [[S::F; 3]; 3],
     inverse: [S::F; 3],
     steep: [S::F; 3],
-    /// How far from its axis its rays and their footprints are, per metre. [m/m]
-    slope: S::F,
+    /// How far from the axis its rays and their footprints are along x, y and z of the part, per metre. [m/m]
+    slope: [S::F; 3],
+    /// The sizes of the axis' and the side's parts along x, y and z.
+    lean: [[S::F; 3]; 2],
+    /// How far from the axis its rays are across, per metre. [m/m]
+    across: S::F,
+    /// How far along its side are its rays from this lane on at least, and up to this lane at most, per metre. [m/m]
+    side_low: [f32; WIDTH],
+    side_high: [f32; WIDTH],
+    /// The greatest size of those. [m/m]
+    side: S::F,
+    /// Radius of the widest footprint that counts, per metre. [m/m]
+    footprint: S::F,
     /// How far from its origin theirs are. [m]
     apart: S::F,
+    /// The widest of its footprints. [rad]
+    spread: S::F,
 }
 
-impl<S: Simd> Bundle<S> {
+impl<S: Simd> Fan<S> {
     #[inline(always)]
     fn around(s: S, rays: &[Ray]) -> Self {
         let (mut origin, mut direction) = (Vec3::ZERO, Vec3::ZERO);
@@ -70,23 +90,53 @@ impl<S: Simd> Bundle<S> {
             direction += ray.direction;
         }
         origin /= rays.len() as f32;
-        // Rays that cancel are no bundle, and their slopes below say so.
+        // Rays that cancel are no fan, and `cast` makes none of them.
         direction = direction.normalize_or(Vec3::X);
-        let (mut slope, mut apart) = (0.0_f32, 0.0_f32);
-        for ray in rays {
-            let turned = (ray.direction - direction).length();
-            slope = slope.max(1.1 * turned + REACH * ray.spread);
+        let between = rays[rays.len() - 1].direction - rays[0].direction;
+        let wide = between - direction * between.dot(direction);
+        let side = wide.try_normalize().unwrap_or_else(|| direction.any_orthonormal_vector());
+        let across = direction.cross(side);
+        let (mut slope, mut widest, mut off) = (Vec3::ZERO, 0.0_f32, 0.0_f32);
+        let (mut apart, mut spread) = (0.0_f32, 0.0_f32);
+        let (mut side_low, mut side_high) = ([f32::MAX; WIDTH], [f32::MIN; WIDTH]);
+        for (lane, ray) in rays.iter().enumerate() {
+            // Where it is a metre ahead.
+            let ahead = ray.direction / ray.direction.dot(direction).max(1e-3) - direction;
+            slope = slope.max(ahead.abs());
+            let along_side = ahead.dot(side);
+            side_low[lane] = along_side - ROUNDING;
+            side_high[lane] = along_side + ROUNDING;
+            widest = widest.max(along_side.abs());
+            off = off.max(ahead.dot(across).abs());
             apart = apart.max((ray.origin_m - origin).length());
+            spread = spread.max(ray.spread);
         }
+        for lane in 1..WIDTH {
+            side_high[lane] = side_high[lane].max(side_high[lane - 1]);
+            side_low[WIDTH - 1 - lane] = side_low[WIDTH - 1 - lane].min(side_low[WIDTH - lane]);
+        }
+        let slope = (slope + REACH * spread).to_array();
         let inverse = [inverse(direction.x), inverse(direction.y), inverse(direction.z)];
         let steep = [inverse[0].abs(), inverse[1].abs(), inverse[2].abs()];
         Self {
             origin: broadcast(s, origin.to_array()),
-            direction: broadcast(s, direction.to_array()),
+            frame: [
+                broadcast(s, direction.to_array()),
+                broadcast(s, side.to_array()),
+                broadcast(s, across.to_array()),
+            ],
             inverse: broadcast(s, inverse),
             steep: broadcast(s, steep),
-            slope: s.splat(slope),
-            apart: s.splat(apart),
+            slope: broadcast(s, slope),
+            lean: [broadcast(s, direction.abs().to_array()), broadcast(s, side.abs().to_array())],
+            across: s.splat(off + ROUNDING),
+            side_low,
+            side_high,
+            side: s.splat(widest + ROUNDING),
+            footprint: s.splat(REACH * spread),
+            // Where they begin along the axis moves them to the side, too.
+            apart: s.splat(1.3 * apart + 1e-5),
+            spread: s.splat(spread),
         }
     }
 }
@@ -95,34 +145,46 @@ impl<S: Simd> Bundle<S> {
 #[derive(Clone, Copy)]
 struct Lanes<S: Simd> {
     origin: [S::F; 3],
-    inverse: [S::F; 3],
-    steep: [S::F; 3],
-    /// Radius of the widest footprint that counts, per metre. [m/m]
-    footprint: f32,
+    direction: [S::F; 3],
+    spread: S::F,
 }
 
 impl<S: Simd> Lanes<S> {
     #[inline(always)]
     fn new(s: S, rays: &[Ray]) -> Self {
         let mut origin = [[0.0; WIDTH]; 3];
-        let mut inverses = [[1.0; WIDTH]; 3];
-        let mut steeps = [[1.0; WIDTH]; 3];
-        let mut footprint = 0.0_f32;
+        let mut direction = [[1.0; WIDTH]; 3];
+        let mut spread = [0.0; WIDTH];
         for (lane, ray) in rays.iter().enumerate() {
             for axis in 0..3 {
                 origin[axis][lane] = ray.origin_m[axis];
-                inverses[axis][lane] = inverse(ray.direction[axis]);
-                steeps[axis][lane] = inverses[axis][lane].abs();
+                direction[axis][lane] = ray.direction[axis];
             }
-            footprint = footprint.max(REACH * ray.spread);
+            spread[lane] = ray.spread;
         }
-        Self {
-            origin: load(s, &origin),
-            inverse: load(s, &inverses),
-            steep: load(s, &steeps),
-            footprint,
-        }
+        Self { origin: load(s, &origin), direction: load(s, &direction), spread: s.load(&spread) }
     }
+}
+
+/// What of a leaf's splats every ray asks for, splat by splat.
+struct Unpacked {
+    mean_m: [[f32; WIDTH]; 3],
+    axes: [[[f32; WIDTH]; 3]; 3],
+    /// Variances along the axes. [m^2]
+    thin: [[f32; WIDTH]; 3],
+    /// log2 of the opacity.
+    level: [f32; WIDTH],
+}
+
+/// Where the rays meet a splat.
+#[derive(Clone, Copy, Default)]
+struct Met {
+    /// Which do, as bits.
+    rays: u32,
+    range_m: [f32; WIDTH],
+    alpha: [f32; WIDTH],
+    /// Cosine between ray and the splat's thinnest axis, of either sign.
+    normal: [f32; WIDTH],
 }
 
 /// Returns 1 over `v`; no infinity, so that no product is NaN.
@@ -139,6 +201,22 @@ fn broadcast<S: Simd>(s: S, v: [f32; 3]) -> [S::F; 3] {
 #[inline(always)]
 fn load<S: Simd>(s: S, v: &[[f32; WIDTH]; 3]) -> [S::F; 3] {
     [s.load(&v[0]), s.load(&v[1]), s.load(&v[2])]
+}
+
+/// Returns one splat's numbers, for every ray.
+#[inline(always)]
+fn one_of<S: Simd>(s: S, v: &[[f32; WIDTH]; 3], splat: usize) -> [S::F; 3] {
+    [s.splat(v[0][splat]), s.splat(v[1][splat]), s.splat(v[2][splat])]
+}
+
+#[inline(always)]
+fn abs<S: Simd>(s: S, v: S::F) -> S::F {
+    s.max(v, s.splat(0.0) - v)
+}
+
+#[inline(always)]
+fn from<F: Copy + Sub<Output = F>>(a: [F; 3], b: [F; 3]) -> [F; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
 #[inline(always)]
@@ -183,40 +261,68 @@ impl Kernel for Follow<'_> {
         if tree.nodes.is_empty() || rays.is_empty() {
             return;
         }
-        let (bundle, lanes) = (Bundle::around(s, rays), Lanes::new(s, rays));
-        let mut reach_m = farthest(hits);
+        let (fan, lanes) = (Fan::around(s, rays), Lanes::new(s, rays));
+        // How far each ray still looks; lanes without one see nothing.
+        let mut reach = [-1.0; WIDTH];
+        for (reach, hits) in reach.iter_mut().zip(&*hits) {
+            *reach = hits.reach_m;
+        }
+        let mut reach_m = farthest(&reach);
+        let mut unpacked = Unpacked {
+            mean_m: [[0.0; WIDTH]; 3],
+            axes: [[[0.0; WIDTH]; 3]; 3],
+            thin: [[0.0; WIDTH]; 3],
+            level: [0.0; WIDTH],
+        };
+        let mut met = [Met::default(); WIDTH];
         let mut stack = [(0.0_f32, 0_u32); MAX_STACK];
         let mut waiting = 1;
         while waiting > 0 {
             waiting -= 1;
             let (near_m, child) = stack[waiting];
-            if near_m > reach_m {
+            // Of the fan only what lies between the first and the last ray that still look as far.
+            let looking = !s.bits(s.lt(s.load(&reach), s.splat(near_m))) & 0xff;
+            if looking == 0 {
                 continue;
             }
+            let first = looking.trailing_zeros() as usize % WIDTH;
+            let last = looking.ilog2() as usize % WIDTH;
+            let window = [s.splat(fan.side_low[first]), s.splat(fan.side_high[last])];
             if child & LEAF != 0 {
                 let leaf = &tree.leaves[(child & !LEAF) as usize];
-                let mut any = false;
-                let mut through = touched(s, leaf, &lanes, near_m, hits);
-                while through != 0 {
-                    let i = through.trailing_zeros() as usize % WIDTH;
-                    through &= through - 1;
-                    if meet(s, leaf, &rays[i], tag, &mut hits[i]) {
-                        hits[i].shorten();
-                        any = true;
-                    }
+                let close = unpack(s, leaf, &fan, window, reach_m, &mut unpacked);
+                // First all of them, without a branch between; then what came of it.
+                let mut left = close;
+                while left != 0 {
+                    let splat = left.trailing_zeros() as usize % WIDTH;
+                    left &= left - 1;
+                    meet(s, &unpacked, splat, &lanes, &reach, &mut met[splat]);
                 }
-                if any {
-                    reach_m = farthest(hits);
+                let (mut left, mut longer) = (close, 0);
+                while left != 0 {
+                    let splat = left.trailing_zeros() as usize % WIDTH;
+                    left &= left - 1;
+                    longer |= met[splat].rays;
+                    insert(leaf, splat, &met[splat], tag, hits);
+                }
+                if longer != 0 {
+                    while longer != 0 {
+                        let i = longer.trailing_zeros() as usize % WIDTH;
+                        longer &= longer - 1;
+                        hits[i].shorten();
+                        reach[i] = hits[i].reach_m;
+                    }
+                    reach_m = farthest(&reach);
                 }
                 continue;
             }
             let node = &tree.nodes[child as usize];
-            let (mut met, nears) = touch(s, node, &bundle, reach_m);
+            let (mut touched, nears) = touch(s, node, &fan, window, reach_m);
             // The nearest on top: by insertion, of mostly two or three.
             let first = waiting;
-            while met != 0 {
-                let lane = met.trailing_zeros() as usize % WIDTH;
-                met &= met - 1;
+            while touched != 0 {
+                let lane = touched.trailing_zeros() as usize % WIDTH;
+                touched &= touched - 1;
                 let child = node.children[lane];
                 if child == NONE || waiting == MAX_STACK {
                     continue;
@@ -228,127 +334,230 @@ impl Kernel for Follow<'_> {
                 }
                 stack[place] = (nears[lane], child);
                 waiting += 1;
+                prefetch(s, tree, child);
             }
         }
     }
 }
 
-/// Returns how far the farthest of some rays still looks. [m]
+/// Asks for a child's memory, which is more than one level of caches holds.
 #[inline(always)]
-fn farthest(hits: &[Hits]) -> f32 {
+fn prefetch<S: Simd>(s: S, tree: &Tree, child: u32) {
+    if child & LEAF == 0 {
+        let node = &tree.nodes[child as usize];
+        s.prefetch(&node.center_m[0]);
+        s.prefetch(&node.center_m[2]);
+        s.prefetch(&node.half_m[1]);
+        s.prefetch(&node.children);
+    } else {
+        let leaf = &tree.leaves[(child & !LEAF) as usize];
+        s.prefetch(&leaf.mean_m[0]);
+        s.prefetch(&leaf.mean_m[2]);
+        s.prefetch(&leaf.rotation[2]);
+        s.prefetch(&leaf.level);
+    }
+}
+
+/// Returns the greatest of some numbers, or 0. [m]
+#[inline(always)]
+fn farthest(reach: &[f32; WIDTH]) -> f32 {
     let mut reach_m = 0.0_f32;
-    for hits in hits {
-        reach_m = reach_m.max(hits.reach_m);
+    for &reach in reach {
+        reach_m = reach_m.max(reach);
     }
     reach_m
 }
 
-/// Returns which boxes of a node a bundle meets within `reach_m`, as bits, and where.
+/// Returns which boxes of a node the rays of a fan within a window meet within `reach_m`, as bits, and where.
 #[inline(always)]
-fn touch<S: Simd>(s: S, node: &Node, ray: &Bundle<S>, reach_m: f32) -> (u32, [f32; WIDTH]) {
+fn touch<S: Simd>(
+    s: S,
+    node: &Node,
+    fan: &Fan<S>,
+    window: [S::F; 2],
+    reach_m: f32,
+) -> (u32, [f32; WIDTH]) {
     let zero = s.splat(0.0);
     let (center, half) = (load(s, &node.center_m), load(s, &node.half_m));
-    let rel = [center[0] - ray.origin[0], center[1] - ray.origin[1], center[2] - ray.origin[2]];
-    let along = dot(s, rel, ray.direction);
-    // The cone's radius at the box's far side at most.
-    let far_side = s.max(along, zero) + half[0] + half[1] + half[2];
-    let margin = s.mul_add(far_side, ray.slope, ray.apart);
+    let rel = from(center, fan.origin);
+    let (ahead, sideways) = (dot(s, rel, fan.frame[0]), dot(s, rel, fan.frame[1]));
+    let [deep, wide] = [dot(s, half, fan.lean[0]), dot(s, half, fan.lean[1])];
+    let far_side = s.max(ahead + deep, zero) + fan.apart;
     let (mut near, mut far) = (zero, s.splat(reach_m));
     for axis in 0..3 {
-        let middle = rel[axis] * ray.inverse[axis];
-        let side = (half[axis] + margin) * ray.steep[axis];
+        let middle = rel[axis] * fan.inverse[axis];
+        let margin = s.mul_add(far_side, fan.slope[axis], fan.apart);
+        let side = (half[axis] + margin) * fan.steep[axis];
         near = s.max(middle - side, near);
         far = s.min(middle + side, far);
     }
+    let reach = s.mul_add(far_side, fan.footprint, wide) + fan.apart;
+    let beside = beside(s, fan, window, ahead - deep, far_side, sideways, reach);
     let mut nears = [0.0; WIDTH];
     s.store(near, &mut nears);
-    (!s.bits(s.lt(far, near)) & 0xff, nears)
+    (!s.bits(s.lt(far, near)) & s.bits(beside) & 0xff, nears)
 }
 
-/// Returns which rays meet a leaf's box, which begins at `near_m`, before they end.
+/// Returns where what is between two distances ahead, and at a place along the fan's side, from where it reaches as far as
+/// `reach`, overlaps the window.
 #[inline(always)]
-fn touched<S: Simd>(s: S, leaf: &Leaf, rays: &Lanes<S>, near_m: f32, hits: &[Hits]) -> u32 {
-    let half = leaf.half_m;
-    let margin = rays.footprint * (near_m + 4.0 * (half[0] + half[1] + half[2]));
-    let mut reach = [-1.0; WIDTH];
-    for (reach, hits) in reach.iter_mut().zip(hits) {
-        *reach = hits.reach_m;
-    }
-    let (mut near, mut far) = (s.splat(0.0), s.load(&reach));
-    for axis in 0..3 {
-        let middle = (s.splat(leaf.center_m[axis]) - rays.origin[axis]) * rays.inverse[axis];
-        let side = s.splat(half[axis] + margin) * rays.steep[axis];
-        near = s.max(middle - side, near);
-        far = s.min(middle + side, far);
-    }
-    !s.bits(s.lt(far, near)) & ((1 << hits.len()) - 1)
+fn beside<S: Simd>(
+    s: S,
+    fan: &Fan<S>,
+    [low, high]: [S::F; 2],
+    near_side: S::F,
+    far_side: S::F,
+    at: S::F,
+    reach: S::F,
+) -> S::M {
+    let near_side = s.max(near_side - fan.apart, s.splat(0.0));
+    let low = s.min(low * near_side, low * far_side);
+    let high = s.max(high * near_side, high * far_side);
+    s.lt(low, at + reach) & s.lt(at - reach, high)
 }
 
-/// Adds the splats of a leaf that a ray meets; returns whether there are any.
+/// Returns which splats of a leaf the rays of a fan within a window may meet within `reach_m`, as bits; where there are any, all are unpacked.
+///
+/// A splat counts within an ellipsoid. Along a direction it reaches as far as the root of its variance there, and the fan
+/// as far as its outermost ray where the splat ends: if these do not overlap, no ray meets it.
 #[inline(always)]
-fn meet<S: Simd>(s: S, leaf: &Leaf, ray: &Ray, tag: Tag, hits: &mut Hits) -> bool {
-    let (zero, one) = (s.splat(0.0), s.splat(1.0));
+fn unpack<S: Simd>(
+    s: S,
+    leaf: &Leaf,
+    fan: &Fan<S>,
+    window: [S::F; 2],
+    reach_m: f32,
+    out: &mut Unpacked,
+) -> u32 {
+    let zero = s.splat(0.0);
     let mean = load(s, &leaf.mean_m);
-    let origin = broadcast(s, ray.origin_m.to_array());
-    let direction = broadcast(s, ray.direction.to_array());
-    // From the mean to the ray's origin.
-    let from = [origin[0] - mean[0], origin[1] - mean[1], origin[2] - mean[2]];
-    let along = dot(s, from, direction);
-    let width = along * s.splat(ray.spread);
+    let rel = from(mean, fan.origin);
+    let at = [dot(s, rel, fan.frame[0]), dot(s, rel, fan.frame[1]), dot(s, rel, fan.frame[2])];
+    // The footprint where it is widest.
+    let sideways = s.mul_add(abs(s, at[1]), fan.side, abs(s, at[2]) * fan.across);
+    let width = (abs(s, at[0]) + sideways + fan.apart) * fan.spread;
     let blur = width * width;
+    let level = s.load_f16(&leaf.level);
+    // Squared deviations within which it hides more than the least, and a little more.
+    let deviations = (level - s.splat(LEAST_LEVEL)) * s.splat(2.004 * std::f32::consts::LN_2);
     let scale =
         [s.load_f16(&leaf.scale_m[0]), s.load_f16(&leaf.scale_m[1]), s.load_f16(&leaf.scale_m[2])];
     let thin = [scale[0] * scale[0], scale[1] * scale[1], scale[2] * scale[2]];
-    // Balls around them first: half of the leaves are missed by all. The squares' rounding is allowed for.
-    let away = dot(s, from, from);
-    let across = s.neg_mul_add(along, along, away);
-    let ball = s.mul_add(thin[0] + blur, s.splat(REACH * REACH), away * s.splat(1e-6));
-    if !s.any(s.lt(across, ball)) {
-        return false;
+    // Balls around them first, for they are cheap, and miss most.
+    let ball = s.sqrt(s.max(deviations * (thin[0] + blur), zero));
+    let counts = s.lt(zero, deviations);
+    let balls = overlap(s, fan, window, at, [ball; 3], reach_m);
+    if !s.any(counts & balls) {
+        return 0;
     }
     let axes = axes(s, &leaf.rotation);
-    let d = [dot(s, axes[0], direction), dot(s, axes[1], direction), dot(s, axes[2], direction)];
-    let o = [dot(s, axes[0], from), dot(s, axes[1], from), dot(s, axes[2], from)];
+    let mut extent = [ball; 3];
+    for (extent, side) in extent.iter_mut().zip(&fan.frame) {
+        let v = [dot(s, axes[0], *side), dot(s, axes[1], *side), dot(s, axes[2], *side)];
+        let variance = dot(s, thin, [v[0] * v[0], v[1] * v[1], v[2] * v[2]]) + blur;
+        *extent = s.sqrt(s.max(deviations * variance, zero));
+    }
+    let close = s.bits(counts & overlap(s, fan, window, at, extent, reach_m)) & 0xff;
+    if close != 0 {
+        for axis in 0..3 {
+            s.store(mean[axis], &mut out.mean_m[axis]);
+            s.store(thin[axis], &mut out.thin[axis]);
+            for row in 0..3 {
+                s.store(axes[axis][row], &mut out.axes[axis][row]);
+            }
+        }
+        s.store(level, &mut out.level);
+    }
+    close
+}
+
+/// Returns where what lies at `at` in a fan's frame overlaps its window if it reaches as far as `extent`.
+#[inline(always)]
+fn overlap<S: Simd>(
+    s: S,
+    fan: &Fan<S>,
+    window: [S::F; 2],
+    at: [S::F; 3],
+    extent: [S::F; 3],
+    reach_m: f32,
+) -> S::M {
+    let near_side = at[0] - extent[0];
+    let end = at[0] + extent[0] + fan.apart;
+    let far_side = s.max(end, s.splat(0.0));
+    let ahead = s.lt(s.splat(0.0), end);
+    let before = s.lt(near_side, s.splat(reach_m) + fan.apart);
+    let across = s.lt(abs(s, at[2]), s.mul_add(far_side, fan.across, extent[2] + fan.apart));
+    let beside = beside(s, fan, window, near_side, far_side, at[1], extent[1] + fan.apart);
+    ahead & before & across & beside
+}
+
+/// Works out where each ray meets a splat of a leaf, how much of it ends there, and which rays meet it at all.
+#[inline(always)]
+fn meet<S: Simd>(
+    s: S,
+    unpacked: &Unpacked,
+    splat: usize,
+    rays: &Lanes<S>,
+    reach: &[f32; WIDTH],
+    out: &mut Met,
+) {
+    let (zero, one) = (s.splat(0.0), s.splat(1.0));
+    let Unpacked { mean_m, axes, thin, level } = unpacked;
+    // From the mean to each ray's origin.
+    let from = from(rays.origin, one_of(s, mean_m, splat));
+    let along = dot(s, from, rays.direction);
+    let width = along * rays.spread;
+    let blur = width * width;
+    let (mut d, mut o) = ([zero; 3], [zero; 3]);
+    for (axis, of) in axes.iter().enumerate() {
+        let of = one_of(s, of, splat);
+        d[axis] = dot(s, of, rays.direction);
+        o[axis] = dot(s, of, from);
+    }
+    let thin = one_of(s, thin, splat);
     let wide = [thin[0] + blur, thin[1] + blur, thin[2] + blur];
-    let weight = [one / wide[0], one / wide[1], one / wide[2]];
+    // The inverse of the covariance times its determinant: one division for all three.
+    let weight = [wide[1] * wide[2], wide[0] * wide[2], wide[0] * wide[1]];
     let wd = [weight[0] * d[0], weight[1] * d[1], weight[2] * d[2]];
+    let wide_area = one / dot(s, wd, d);
     // Where the Gaussian is greatest along the ray.
-    let range = (zero - dot(s, wd, o)) / dot(s, wd, d);
+    let range = (zero - dot(s, wd, o)) * wide_area;
     let p =
         [s.mul_add(range, d[0], o[0]), s.mul_add(range, d[1], o[1]), s.mul_add(range, d[2], o[2])];
-    let squares = dot(s, [weight[0] * p[0], weight[1] * p[1], weight[2] * p[2]], p);
+    let squares =
+        dot(s, [weight[0] * p[0], weight[1] * p[1], weight[2] * p[2]], p) / (wide[0] * weight[0]);
     let half_log2_e = s.splat(std::f32::consts::LOG2_E / 2.0);
-    let level = s.neg_mul_add(squares, half_log2_e, s.load_f16(&leaf.level));
+    let level = s.neg_mul_add(squares, half_log2_e, s.splat(level[splat]));
     // Before it is dimmed: many small splats under a wide footprint are a wall, too.
-    let near =
-        s.lt(s.splat(LEAST_LEVEL), level) & s.lt(zero, range) & s.lt(range, s.splat(hits.reach_m));
-    if !s.any(near) {
-        return false;
-    }
+    let near = s.lt(s.splat(LEAST_LEVEL), level) & s.lt(zero, range) & s.lt(range, s.load(reach));
     // By what the footprint adds to the area of the projection.
     let square = [d[0] * d[0], d[1] * d[1], d[2] * d[2]];
-    let dimmed = s.sqrt(area(s, square, thin) / area(s, square, wide));
+    let dimmed = s.sqrt(area(s, square, thin) * wide_area);
     // exp2 promises nothing below -126.
     let alpha = s.exp2(s.max(level, s.splat(-100.0))) * dimmed;
     let alpha = s.min(alpha, s.splat(ALPHA_MAX as f32));
-    let mut met = s.bits(near & s.lt(zero, alpha));
-    let any = met != 0;
-    let (mut ranges, mut alphas, mut normals) = ([0.0; WIDTH], [0.0; WIDTH], [0.0; WIDTH]);
-    s.store(range, &mut ranges);
-    s.store(alpha, &mut alphas);
-    s.store(d[2], &mut normals);
-    while met != 0 {
-        let lane = met.trailing_zeros() as usize % WIDTH;
-        met &= met - 1;
-        let flat = f32::from(leaf.flatness[lane]) / 255.0;
-        hits.insert(Hit {
-            range_m: ranges[lane],
-            weight: alphas[lane],
+    out.rays = s.bits(near & s.lt(zero, alpha)) & 0xff;
+    s.store(range, &mut out.range_m);
+    s.store(alpha, &mut out.alpha);
+    s.store(d[2], &mut out.normal);
+}
+
+/// Adds a splat to what rays meet.
+#[inline(always)]
+fn insert(leaf: &Leaf, splat: usize, met: &Met, tag: Tag, hits: &mut [Hits]) {
+    let flat = f32::from(leaf.flatness[splat]) / 255.0;
+    let reflectivity = f32::from(leaf.reflectivity[splat]) / 255.0;
+    let mut left = met.rays;
+    while left != 0 {
+        let i = left.trailing_zeros() as usize % WIDTH;
+        left &= left - 1;
+        hits[i].insert(Hit {
+            range_m: met.range_m[i],
+            weight: met.alpha[i],
             // A ball's mean over the directions that it faces.
-            cosine: (flat * normals[lane].abs() + (1.0 - flat) * (2.0 / 3.0)).min(1.0),
-            reflectivity: f32::from(leaf.reflectivity[lane]) / 255.0,
+            cosine: (flat * met.normal[i].abs() + (1.0 - flat) * (2.0 / 3.0)).min(1.0),
+            reflectivity,
             tag,
         });
     }
-    any
 }

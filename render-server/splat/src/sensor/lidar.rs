@@ -1,6 +1,6 @@
 //! LiDAR: many beams in a sweep, each from where the sensor is at its own instant.
 //!
-//! Budget: 5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; `cast` is nearly all of it.
+//! Budget: 6.5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; `cast` is nearly all of it.
 //!
 //! A beam's echoes (`cast`) come back with the power of a Lambertian surface that is larger than the beam, `reflectivity cos(incidence) /
 //! range^2` (Wagner 2010, "Radiometric calibration of small-footprint full-waveform airborne laser scanner measurements", ISPRS
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Pose, Sensor, World};
 
-use super::cast::{Beam, Echo, Hits, TOGETHER, echoes, spread_of};
+use super::cast::{Beam, Echo, Hit, Hits, TOGETHER, echoes, spread_of};
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
 
@@ -131,6 +131,9 @@ pub struct LidarPoint {
 #[derive(Clone, Debug)]
 pub struct Lidar {
     model: LidarModel,
+    /// Sine and cosine of each column's azimuth and each row's elevation, where they stay the same from sweep to sweep.
+    columns: Vec<[f64; 2]>,
+    rows: Vec<[f64; 2]>,
 }
 
 /// Beams a sweep at most: 4 million bytes of records times 28.
@@ -191,13 +194,16 @@ impl Lidar {
                 check.within("nods_hz", *nods_hz as f32, [0.0, 1e5], "0 to 100000")?;
             }
         }
-        let lidar = Self { model };
+        let mut lidar = Self { model, columns: Vec::new(), rows: Vec::new() };
         check.within(
             "beams",
             lidar.count() as f32,
             [0.0, MAX_BEAMS as f32],
             "at most 4194304 beams a sweep",
         )?;
+        if lidar.count() > 0 {
+            (lidar.columns, lidar.rows) = lidar.model.beams.angles();
+        }
         Ok(lidar)
     }
 
@@ -273,18 +279,17 @@ impl Lidar {
         }
         for ring in 0..rings {
             let mut leaving = [Leaving::default(); TOGETHER];
-            let mut beams = [(0.0, Beam::default()); TOGETHER];
-            for column in 0..columns {
-                leaving[column] = self.leaving(first + column * rings + ring, seq);
-                beams[column] =
-                    (leaving[column].share, self.beam(&poses[column], &leaving[column]));
+            for (column, leaving) in leaving[..columns].iter_mut().enumerate() {
+                *leaving = self.leaving(first + column * rings + ring, seq);
             }
-            scene.cast(motion, &beams[..columns], &mut hits[..columns]);
-            for (column, hits) in hits[..columns].iter_mut().enumerate() {
+            let beam = |column: usize| {
+                (leaving[column].share, self.beam(&poses[column], &leaving[column]))
+            };
+            scene.cast_each(motion, columns, hits, beam, |column, hits| {
                 let number = column * rings + ring;
                 let draws = Draws::new(seed, seq, (first + number) as u64);
                 points[number] = self.measure(&leaving[column], draws, hits);
-            }
+            });
         }
     }
 
@@ -305,7 +310,7 @@ impl Lidar {
         }
     }
 
-    fn measure(&self, leaving: &Leaving, mut draws: Draws, hits: &mut Hits) -> LidarPoint {
+    fn measure(&self, leaving: &Leaving, mut draws: Draws, hits: &[Hit]) -> LidarPoint {
         let model = &self.model;
         let &Leaving { direction, share, ring } = leaving;
         let mut point = LidarPoint {
@@ -316,7 +321,7 @@ impl Lidar {
         let [threshold, error] = draws.gaussians();
         let threshold = 1.0 + THRESHOLD_NOISE * (threshold - NINE_IN_TEN);
         let mut reported: Option<Echo> = None;
-        echoes(hits.weigh(), model.resolution_m, |echo| {
+        echoes(hits, model.resolution_m, |echo| {
             let strength = echo.power / echo.range_m.max(1e-3).powi(2);
             if !(echo.range_m >= model.min_range_m && strength * self.per_threshold() >= threshold)
             {
@@ -354,28 +359,20 @@ impl Lidar {
     /// Returns when and where a beam leaves.
     fn leaving(&self, number: usize, seq: u64) -> Leaving {
         let of = |number: usize, all: usize| number as f64 / all as f64;
+        let ahead = |column: usize, row: usize, share: f64| {
+            let direction = pointing_at(self.columns[column], self.rows[row]);
+            Leaving { direction, share, ring: row as u16 }
+        };
+        let (rows, columns) = (self.rows.len(), self.columns.len());
         match &self.model.beams {
-            Beams::Spinning { elevations_rad, columns } => {
-                let (column, ring) = (number / elevations_rad.len(), number % elevations_rad.len());
-                let share = of(column, *columns as usize);
-                // The middle column of a turn looks ahead.
-                let azimuth = TAU * (0.5 - share);
-                let elevation = f64::from(elevations_rad[ring]);
-                Leaving { direction: pointing(azimuth, elevation), share, ring: ring as u16 }
+            Beams::Spinning { .. } => {
+                let column = number / rows;
+                ahead(column, number % rows, of(column, columns))
             }
-            Beams::Raster { rows, columns, horizontal_rad, vertical_rad } => {
-                let share = of(number, *rows as usize * *columns as usize);
-                let (row, column) = (number / *columns as usize, number % *columns as usize);
-                let direction =
-                    grid([row, column], [*rows, *columns], [*vertical_rad, *horizontal_rad]);
-                Leaving { direction, share, ring: row as u16 }
+            Beams::Raster { .. } => {
+                ahead(number % columns, number / columns, of(number, rows * columns))
             }
-            Beams::Flash { rows, columns, horizontal_rad, vertical_rad } => {
-                let (row, column) = (number / *columns as usize, number % *columns as usize);
-                let direction =
-                    grid([row, column], [*rows, *columns], [*vertical_rad, *horizontal_rad]);
-                Leaving { direction, share: 0.5, ring: row as u16 }
-            }
+            Beams::Flash { .. } => ahead(number % columns, number / columns, 0.5),
             Beams::Rosette { points, lowest_rad, highest_rad, turns_hz, nods_hz } => {
                 let share = of(number, *points as usize);
                 let time_s = (seq as f64 + share) / self.model.rate_hz;
@@ -399,19 +396,40 @@ struct Leaving {
     ring: u16,
 }
 
-/// Returns the unit vector at an azimuth and an elevation. [rad, sensor]
-pub(super) fn pointing(azimuth: f64, elevation: f64) -> Vec3 {
-    let ((sin, cos), (up, level)) = (azimuth.sin_cos(), elevation.sin_cos());
-    DVec3::new(level * cos, level * sin, up).as_vec3()
+impl Beams {
+    /// Returns sine and cosine of each column's azimuth and of each row's elevation; none of a rosette.
+    fn angles(&self) -> (Vec<[f64; 2]>, Vec<[f64; 2]>) {
+        let sin_cos = |angle: f64| <[f64; 2]>::from(angle.sin_cos());
+        match self {
+            Beams::Spinning { elevations_rad, columns } => {
+                // The middle column of a turn looks ahead.
+                let azimuth = |n: u32| TAU * (0.5 - f64::from(n) / f64::from(*columns));
+                let rows = elevations_rad.iter().map(|&angle| sin_cos(f64::from(angle)));
+                ((0..*columns).map(|n| sin_cos(azimuth(n))).collect(), rows.collect())
+            }
+            Beams::Raster { rows, columns, horizontal_rad, vertical_rad }
+            | Beams::Flash { rows, columns, horizontal_rad, vertical_rad } => {
+                // From the left, and from the top.
+                let angles = |count: u32, angle_rad: f32| {
+                    let share =
+                        |n: u32| if count > 1 { f64::from(n) / f64::from(count - 1) } else { 0.5 };
+                    (0..count).map(|n| sin_cos(f64::from(angle_rad) * (0.5 - share(n)))).collect()
+                };
+                (angles(*columns, *horizontal_rad), angles(*rows, *vertical_rad))
+            }
+            Beams::Rosette { .. } => (Vec::new(), Vec::new()),
+        }
+    }
 }
 
-/// Returns where a cell of a raster looks: rows from the top, columns from the left.
-fn grid(cell: [usize; 2], cells: [u32; 2], angles_rad: [f32; 2]) -> Vec3 {
-    let [elevation, azimuth] = [0, 1].map(|a| {
-        let share = if cells[a] > 1 { cell[a] as f64 / f64::from(cells[a] - 1) } else { 0.5 };
-        f64::from(angles_rad[a]) * (0.5 - share)
-    });
-    pointing(azimuth, elevation)
+/// Returns the unit vector at an azimuth and an elevation. [rad, sensor]
+pub(super) fn pointing(azimuth: f64, elevation: f64) -> Vec3 {
+    pointing_at(azimuth.sin_cos().into(), elevation.sin_cos().into())
+}
+
+/// Returns the unit vector at an azimuth and an elevation, of which sine and cosine are given. [sensor]
+fn pointing_at([sin, cos]: [f64; 2], [up, level]: [f64; 2]) -> Vec3 {
+    DVec3::new(level * cos, level * sin, up).as_vec3()
 }
 
 /// Returns the nearest multiple of `step`, or `value` where there is none.

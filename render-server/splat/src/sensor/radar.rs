@@ -12,7 +12,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::cast::{Beam, Hits, echoes};
+use super::cast::{Beam, Hit, Hits, TOGETHER, echoes};
 use super::lidar::pointing;
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
@@ -104,6 +104,8 @@ const NOWHERE: [i32; 3] = [i32::MAX; 3];
 /// Rays are at most this far apart, and at most `MAX_RAYS` both ways. [rad]
 const RAY_RAD: f32 = 0.03;
 const MAX_RAYS: usize = 96;
+/// Rays that one task follows.
+const CHUNK: usize = 32;
 
 impl Radar {
     /// Prepares a model.
@@ -176,10 +178,12 @@ impl Radar {
         out.clear();
         motion.validate(scene)?;
         let (model, rays, spread) = (&self.model, &self.rays, self.spread);
-        self.patches.par_iter_mut().zip(rays).enumerate().with_min_len(32).for_each(
-            |(number, (patch, ray))| {
-                *patch = model.patch(scene, motion, ray, spread);
-                patch.ray = number as u32;
+        self.patches.par_chunks_mut(CHUNK).zip(rays.par_chunks(CHUNK)).enumerate().for_each(
+            |(chunk, (patches, rays))| {
+                model.patches(scene, motion, rays, spread, patches);
+                for (i, patch) in patches.iter_mut().enumerate() {
+                    patch.ray = (chunk * CHUNK + i) as u32;
+                }
             },
         );
         self.patches.sort_unstable_by_key(|patch| (patch.cell, patch.ray));
@@ -195,15 +199,31 @@ impl Radar {
 }
 
 impl RadarModel {
-    fn patch(&self, scene: &SensorScene, motion: &Motion<'_>, ray: &Ray, spread: f32) -> Patch {
+    /// Casts neighbouring rays: the strongest echo of each makes its patch.
+    fn patches(
+        &self,
+        scene: &SensorScene,
+        motion: &Motion<'_>,
+        rays: &[Ray],
+        spread: f32,
+        patches: &mut [Patch],
+    ) {
         let world_from_sensor = motion.sensor_at(0.5);
-        let direction = world_from_sensor.rotate(ray.direction.as_dvec3()).normalize();
-        let origin_m = world_from_sensor.translation_m;
-        let beam = Beam { origin_m, direction, spread, max_m: self.max_range_m };
-        let mut hits = Hits::new();
-        scene.cast(motion, &[(0.5, beam)], std::slice::from_mut(&mut hits));
+        let beam = |n: usize| {
+            let direction = world_from_sensor.rotate(rays[n].direction.as_dvec3()).normalize();
+            let origin_m = world_from_sensor.translation_m;
+            (0.5, Beam { origin_m, direction, spread, max_m: self.max_range_m })
+        };
+        let mut hits = [Hits::new(); TOGETHER];
+        scene.cast_each(motion, rays.len(), &mut hits, beam, |n, hits| {
+            patches[n] = self.patch(motion, &rays[n], &beam(n).1, hits);
+        });
+    }
+
+    fn patch(&self, motion: &Motion<'_>, ray: &Ray, beam: &Beam, hits: &[Hit]) -> Patch {
+        let &Beam { origin_m, direction, .. } = beam;
         let mut patch = Patch { cell: NOWHERE, ..Patch::default() };
-        echoes(hits.weigh(), self.range_resolution_m, |echo| {
+        echoes(hits, self.range_resolution_m, |echo| {
             let cosine = echo.cosine.clamp(1e-3, 1.0);
             let tan2 = (1.0 - cosine * cosine) / (cosine * cosine);
             let slope2 = self.slope_rad.powi(2);

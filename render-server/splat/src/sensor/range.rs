@@ -10,7 +10,7 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::cast::{Beam, Echo, Hits, echoes};
+use super::cast::{Beam, Echo, Hits, TOGETHER, echoes};
 use super::lidar::rounded;
 use super::noise::Draws;
 use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
@@ -160,25 +160,23 @@ impl Cone {
         received: &mut [Received; MAX_RECEIVED],
         power: impl Fn(f32, &Echo) -> f32,
     ) -> usize {
-        let (mut count, mut hits) = (0, Hits::new());
+        let (mut count, mut hits) = (0, [Hits::new(); TOGETHER]);
         let world_from_sensor = motion.sensor_at(0.5);
-        for &(direction, share) in &self.rays {
-            let beam = Beam {
-                origin_m: world_from_sensor.translation_m,
-                direction: world_from_sensor.rotate(direction.as_dvec3()).normalize(),
-                spread: self.spread,
-                max_m,
-            };
-            scene.cast(motion, &[(0.5, beam)], std::slice::from_mut(&mut hits));
-            echoes(hits.weigh(), resolution_m, |echo| {
-                let power = power(share, &echo);
+        let beam = |n: usize| {
+            let direction = world_from_sensor.rotate(self.rays[n].0.as_dvec3()).normalize();
+            let origin_m = world_from_sensor.translation_m;
+            (0.5, Beam { origin_m, direction, spread: self.spread, max_m })
+        };
+        scene.cast_each(motion, self.rays.len(), &mut hits, beam, |n, hits| {
+            echoes(hits, resolution_m, |echo| {
+                let power = power(self.rays[n].1, &echo);
                 if count < MAX_RECEIVED && power > 0.0 {
                     received[count] =
                         Received { range_m: echo.range_m, power, object: echo.tag.id };
                     count += 1;
                 }
             });
-        }
+        });
         received[..count].sort_unstable_by(|a, b| {
             a.range_m.total_cmp(&b.range_m).then(a.power.total_cmp(&b.power))
         });

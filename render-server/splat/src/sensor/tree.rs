@@ -28,13 +28,10 @@ pub(super) struct Node {
     pub(super) children: [u32; WIDTH],
 }
 
-/// Eight Gaussians, number by number, half of them in half precision: 264 bytes, for what a ray waits for is memory. Places that are
+/// Eight Gaussians, number by number, half of them in half precision: 240 bytes, for what a ray waits for is memory. Places that are
 /// not filled have the level minus infinity.
 #[derive(Clone, Debug)]
 pub(super) struct Leaf {
-    /// The box around all of it: its middle, and half its sides. [m]
-    pub(super) center_m: [f32; 3],
-    pub(super) half_m: [f32; 3],
     pub(super) mean_m: [[f32; WIDTH]; 3],
     /// Unit quaternion from the Gaussian's axes, of which the thinnest is the last; xyzw. [f16]
     pub(super) rotation: [[u16; WIDTH]; 4],
@@ -97,20 +94,8 @@ impl Tree {
             half_m: [[0.0; WIDTH]; 3],
             children: [NONE; WIDTH],
         });
-        // (start, end, area): the ranges that become children.
-        let mut ranges = vec![(0, items.len(), area(items))];
-        while ranges.len() < WIDTH {
-            let widest = ranges
-                .iter()
-                .enumerate()
-                .filter(|(_, (start, end, _))| end - start > WIDTH)
-                .max_by(|(_, a), (_, b)| a.2.total_cmp(&b.2));
-            let Some((place, &(start, end, _))) = widest else { break };
-            let middle = start + split(&mut items[start..end]);
-            ranges[place] = (start, middle, area(&items[start..middle]));
-            ranges.push((middle, end, area(&items[middle..end])));
-        }
-        for (place, &(start, end, _)) in ranges.iter().enumerate() {
+        let ranges = ranges(items);
+        for (place, &Range { start, end, .. }) in ranges.iter().enumerate() {
             let (low, high) = bounds(&items[start..end]);
             // Halved before they are added: no sum overflows. Widened by their own rounding.
             let center = low * 0.5 + high * 0.5;
@@ -121,11 +106,7 @@ impl Tree {
             }
             let within = &mut items[start..end];
             self.nodes[index].children[place] = if within.len() <= WIDTH {
-                self.leaves.push(Leaf {
-                    center_m: center.to_array(),
-                    half_m: half.to_array(),
-                    ..Leaf::new(splats, within)
-                });
+                self.leaves.push(Leaf::new(splats, within));
                 (self.leaves.len() - 1) as u32 | LEAF
             } else {
                 self.add_node(splats, within)
@@ -140,8 +121,6 @@ impl Leaf {
         let half = |v: f32| f16::from_f32(v).to_bits();
         let byte = |share: f32| (share * 255.0).round() as u8;
         let mut leaf = Self {
-            center_m: [0.0; 3],
-            half_m: [0.0; 3],
             mean_m: [[0.0; WIDTH]; 3],
             rotation: [[half(0.5); WIDTH]; 4],
             scale_m: [[half(1.0); WIDTH]; 3],
@@ -212,6 +191,49 @@ fn bounds(items: &[Item]) -> (Vec3, Vec3) {
     })
 }
 
+/// A range of a node's items that becomes a child, and half the surface of the box around it.
+#[derive(Clone, Copy)]
+struct Range {
+    start: usize,
+    end: usize,
+    area: f32,
+}
+
+impl Range {
+    /// Returns how many leaves it fills.
+    fn leaves(&self) -> usize {
+        (self.end - self.start).div_ceil(WIDTH)
+    }
+}
+
+/// Sorts a node's items into at most eight ranges, one a child.
+///
+/// What a ray pays for is nodes and leaves, however empty. So ranges of more than a node of leaves are split first, the widest
+/// before others; one that is less than that is split into its leaves if all of them find a place, else left whole.
+fn ranges(items: &mut [Item]) -> Vec<Range> {
+    let mut ranges = vec![Range { start: 0, end: items.len(), area: area(items) }];
+    loop {
+        let spare = WIDTH - ranges.len();
+        let splits = |range: &Range| match range.leaves() {
+            0 | 1 => false,
+            leaves if leaves <= WIDTH => leaves - 1 <= spare,
+            _ => spare > 0,
+        };
+        let widest = (0..ranges.len()).filter(|&i| splits(&ranges[i])).max_by(|&a, &b| {
+            let (a, b) = (&ranges[a], &ranges[b]);
+            let large = |range: &Range| range.leaves() > WIDTH;
+            large(a).cmp(&large(b)).then(a.area.total_cmp(&b.area))
+        });
+        let Some(place) = widest else { return ranges };
+        let Range { start, end, .. } = ranges[place];
+        let middle = start + split(&mut items[start..end]);
+        let range =
+            |start, end, items: &[Item]| Range { start, end, area: area(&items[start..end]) };
+        ranges[place] = range(start, middle, items);
+        ranges.push(range(middle, end, items));
+    }
+}
+
 /// Returns half the surface of the box around all; large scenes overflow to infinity, which compares.
 fn area(items: &[Item]) -> f32 {
     let (low, high) = bounds(items);
@@ -222,7 +244,8 @@ fn half_surface(side: Vec3) -> f32 {
     side.x * side.y + side.y * side.z + side.z * side.x
 }
 
-/// Sorts items to both sides of the plane that costs least, and returns how many are before it; never none nor all.
+/// Sorts more items than a leaf's to both sides of the plane that costs least, and returns how many are before it; never none
+/// nor all.
 fn split(items: &mut [Item]) -> usize {
     const BINS: usize = 16;
     let middle = |item: &Item| item.low_m * 0.5 + item.high_m * 0.5;
@@ -274,6 +297,13 @@ fn split(items: &mut [Item]) -> usize {
             }
         }
     }
-    // All in one place, or beyond f32: halves do.
-    if count == 0 || count == items.len() { items.len() / 2 } else { count }
+    let leaves = items.len().div_ceil(WIDTH);
+    if leaves > WIDTH {
+        // All in one place, or beyond f32: halves do.
+        return if count == 0 || count == items.len() { items.len() / 2 } else { count };
+    }
+    // Leaves are full but for the last: the plane moves to the nearest place that keeps them so.
+    let full = ((count + WIDTH / 2) / WIDTH).clamp(1, leaves - 1) * WIDTH;
+    items.select_nth_unstable_by(full, |a, b| middle(a)[axis].total_cmp(&middle(b)[axis]));
+    full
 }
