@@ -112,7 +112,14 @@ fn beams_meet_what_the_plain_reference_meets() {
 
 #[test]
 fn beams_that_go_together_meet_what_each_meets_alone() {
-    let splats = wall(Vec3::new(4.0, 0.3, 0.0), Vec3::new(-1.0, 0.2, 0.1), 2.0, 0.07);
+    let mut splats = wall(Vec3::new(4.0, 0.3, 0.0), Vec3::new(-1.0, 0.2, 0.1), 2.0, 0.07);
+    // Before it a board that ends some of the close ones, so that the rest go on alone.
+    let board = wall(Vec3::new(2.0, -0.25, 0.0), -Vec3::X, 0.09, 0.02);
+    splats.means_m.extend(board.means_m);
+    splats.scales_m.extend(board.scales_m);
+    splats.rotations.extend(board.rotations);
+    splats.opacities.extend(board.opacities);
+    splats.sh.extend(board.sh);
     let scene = SensorScene::new(&splats);
     let motion = Motion::standing(at(DVec3::ZERO, 0.0));
     // Close ones, and eight that look all around.
@@ -127,7 +134,7 @@ fn beams_that_go_together_meet_what_each_meets_alone() {
             .collect();
         let mut together = [Hits::new(); 8];
         scene.cast(&motion, &beams, &mut together);
-        let mut met = 0;
+        let (mut met, mut near, mut far) = (0, 0, 0);
         for (beam, together) in beams.iter().zip(&mut together) {
             let mut alone = Hits::new();
             scene.cast(&motion, std::slice::from_ref(beam), std::slice::from_mut(&mut alone));
@@ -137,7 +144,10 @@ fn beams_that_go_together_meet_what_each_meets_alone() {
             let (together, alone) = (ranges(together), ranges(&mut alone));
             assert_eq!(together, alone);
             met += usize::from(!alone.is_empty());
+            near += usize::from(alone.last().is_some_and(|&last_m| last_m < 3.0));
+            far += usize::from(alone.last().is_some_and(|&last_m| last_m > 3.0));
         }
         assert!(met >= 1);
+        assert!(step_rad > 0.1 || (near >= 2 && far >= 2), "{near} {far}");
     }
 }
