@@ -1,8 +1,8 @@
 //! Rays through a tree of splats, nearest first: eight boxes or splats at a time for a fan of rays, then splats that are left for eight
 //! rays at a time.
 //!
-//! Budget: some 0.7 us a ray and thread in a forest of 125 k splats. A fan of eight rays touches some 30 nodes and 20 leaves there,
-//! and works out some 40 splats, each of which ends at one or two of its rays.
+//! Budget: 0.8 us a ray and thread in a forest of 128 k splats (docs/BENCHMARKS.md, "LiDAR"). A fan of eight rays touches tens of
+//! nodes and leaves there, and works out tens of splats.
 //!
 //! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection of the Gaussian onto the plane
 //! across the ray, which is its greatest value along the ray. A beam is no line: its footprint, a Gaussian that grows with

@@ -125,7 +125,7 @@ pub fn mid_360() -> LidarModel {
     }
 }
 
-/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 across the corners; 15 Hz with all zones, 4 m). A zone's cone is
+/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 across the corners; 15 Hz with all zones and 4 m by vendors' texts). A zone's cone is
 /// one wide beam. Its errors (5 % beyond 20 cm), nearest range (2 cm) and the 88 % of the white target are estimates: the sheet's
 /// tables of them could not be read.
 pub fn vl53l5cx() -> LidarModel {
