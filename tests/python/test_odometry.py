@@ -161,18 +161,20 @@ def test_the_pose_is_found_from_places(outliers, monkeypatch):
         assert (offs[0][:outliers] > rgbd.DROPPED).mean() > 0.8 and (offs[0][outliers:] < rgbd.DROPPED).all()
 
 
-def test_a_net_before_a_wall_does_not_turn_the_pose():
-    """Corners of the net have the wall's depth: as the vehicle moves sideways, they all err to the same side."""
+@pytest.mark.parametrize(("sigma_rad", "least_rad", "most_rad"), [(0.05, 1e-3, 1e-2), (None, 0.0, 5e-4)])
+def test_what_corners_have_in_common_turns_the_pose_less_than_the_gyroscope_says(
+    sigma_rad, least_rad, most_rad, monkeypatch
+):
+    if sigma_rad is not None:
+        monkeypatch.setattr(rgbd, "SIGMA_TURN_RAD", sigma_rad)
     random = np.random.default_rng(8)
-    one = view("front", AHEAD, np.zeros(3))
-    wall_m = np.column_stack([random.uniform(-4, 4, (90, 2)), np.full(90, 8.0)])
-    moved_m = np.array([0.0, 0.03, 0.0])
-    px = one.project(wall_m - one.body_from_cam.T @ moved_m)
-    # Two thirds are on the net, at 2 m.
-    px[:60] = one.project(wall_m[:60] / 4 - one.body_from_cam.T @ moved_m)
-    seen = [(one, px, wall_m @ one.body_from_cam.T, np.full(90, 8.0))]
-    found, _, _ = rgbd.solve_pose(np.eye(3), moved_m, seen)
-    assert abs(found[1, 0]) < math.radians(0.02)
+    seen = []
+    for one, off_px in ((view("front", AHEAD, np.zeros(3)), 1.0), (view("down", DOWN, np.zeros(3)), 0.0)):
+        in_cam_m = np.column_stack([random.uniform(-1, 1, (90, 2)), np.ones(90)]) * random.uniform(1, 3, (90, 1))
+        px = one.project(in_cam_m) + np.array([off_px, 0.0])
+        seen.append((one, px, in_cam_m @ one.body_from_cam.T, in_cam_m[:, 2]))
+    found, _, _ = rgbd.solve_pose(np.eye(3), np.zeros(3), seen)
+    assert least_rad <= abs(found[1, 0]) <= most_rad
 
 
 def test_contrast_is_spread_alike_everywhere():

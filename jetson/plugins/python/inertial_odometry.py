@@ -58,6 +58,9 @@ HUBER, DROPPED = 1.5, 6.0
 # Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
+# The floor is even: a corner that a camera looking down sees, from this height on, is as high as where the vehicle stood,
+# unless it is farther from there; and how far it is off. [m, odom]
+FLOOR_M, ABOVE_M, NEAR_FLOOR_M, FLOOR_SIGMA_M = -0.02, 0.5, 0.3, 0.15
 
 # Places in the error state: turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer.
 TURN, V, P, GYRO, ACCEL = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
@@ -303,6 +306,7 @@ class InertialOdometry(Odometry):
         body_from_cam = np.array([view.body_from_cam for view in views])[:, None]
         camera_m = np.array([view.camera_m for view in views])[:, None, :, None]
         sigma = SIGMA_PX / np.array([view.focal_px.mean() for view in views])
+        looks_down = np.array([view.body_from_cam[2, 2] < -0.7 for view in views])
 
         def cameras(rotations: F64, bodies_m: F64) -> tuple[F64, F64]:
             return rotations[clone] @ body_from_cam, bodies_m[clone] + (rotations[clone] @ camera_m)[..., 0]
@@ -332,6 +336,11 @@ class InertialOdometry(Odometry):
                 slope[2 * k : 2 * k + 2, column : column + 3] = by_turn[n, k]
                 slope[2 * k : 2 * k + 2, column + 3 : column + 6] = -by_place[n, k]
             own, lack = by_place[n, :count].reshape(-1, 3), -residual[n, :count].reshape(-1)
+            if looks_down[n] and self._motion.p_m[2] > ABOVE_M and abs(places_m[n, 2] - FLOOR_M) < NEAR_FLOOR_M:
+                # It is on the floor: one more measurement, of the corner's place alone. It keeps the scale.
+                own = np.vstack([own, [0.0, 0.0, sigma[n] / FLOOR_SIGMA_M]])
+                lack = np.append(lack, (FLOOR_M - places_m[n, 2]) * sigma[n] / FLOOR_SIGMA_M)
+                slope = np.vstack([slope, np.zeros(size)])
             # What is left of the rows when the corner's own place is free.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
             rows, lack = left @ slope, left @ lack
