@@ -58,7 +58,7 @@ HUBER, DROPPED = 1.5, 6.0
 # Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
-# The floor is even: a corner that a camera looking down sees, from this height on, is as high as where the vehicle stood,
+# The floor is even: a corner that a camera looking down sees, from this height on, is as high as where it stood,
 # unless it is farther from there; and how far it is off. [m, odom]
 FLOOR_M, ABOVE_M, NEAR_FLOOR_M, FLOOR_SIGMA_M = -0.02, 0.5, 0.3, 0.15
 
