@@ -138,7 +138,9 @@ DOWN = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 
 
 @pytest.mark.parametrize("outliers", [0, 25])
-def test_the_pose_is_found_from_places(outliers):
+def test_the_pose_is_found_from_places(outliers, monkeypatch):
+    # Without a gyroscope, the guess is a wide one.
+    monkeypatch.setattr(rgbd, "SIGMA_TURN_RAD", 0.05)
     random = np.random.default_rng(7)
     rotation, p_m = flight.exp_so3(np.array([0.05, -0.1, 0.4])), np.array([1.0, -0.5, 1.2])
     seen = []
@@ -157,6 +159,42 @@ def test_the_pose_is_found_from_places(outliers):
     np.testing.assert_allclose(found, rotation, atol=1e-3 if outliers == 0 else 1e-2)
     if outliers:
         assert (offs[0][:outliers] > rgbd.DROPPED).mean() > 0.8 and (offs[0][outliers:] < rgbd.DROPPED).all()
+
+
+@pytest.mark.parametrize(("sigma_rad", "least_rad", "most_rad"), [(0.05, 1e-3, 1e-2), (None, 0.0, 5e-4)])
+def test_what_corners_have_in_common_turns_the_pose_less_than_the_gyroscope_says(
+    sigma_rad, least_rad, most_rad, monkeypatch
+):
+    if sigma_rad is not None:
+        monkeypatch.setattr(rgbd, "SIGMA_TURN_RAD", sigma_rad)
+    random = np.random.default_rng(8)
+    seen = []
+    for one, off_px in ((view("front", AHEAD, np.zeros(3)), 1.0), (view("down", DOWN, np.zeros(3)), 0.0)):
+        in_cam_m = np.column_stack([random.uniform(-1, 1, (90, 2)), np.ones(90)]) * random.uniform(1, 3, (90, 1))
+        px = one.project(in_cam_m) + np.array([off_px, 0.0])
+        seen.append((one, px, in_cam_m @ one.body_from_cam.T, in_cam_m[:, 2]))
+    found, _, _ = rgbd.solve_pose(np.eye(3), np.zeros(3), seen)
+    assert least_rad <= abs(found[1, 0]) <= most_rad
+
+
+def test_contrast_is_spread_alike_everywhere():
+    random = np.random.default_rng(4)
+    rgb = np.repeat(random.integers(40, 200, (60, 320, 1), dtype=np.uint8), 3, axis=2)
+    rgb = np.concatenate([rgb, rgb // 2 + 60, rgb, rgb])
+    grey = flight.even_grey(rgb)
+    assert grey.std() == pytest.approx(flight.SPREAD, abs=3)
+    # The same rows are as bright wherever they stand in the image.
+    np.testing.assert_array_equal(grey[130:170], grey[190:230])
+
+
+def test_it_stands_until_it_lifts():
+    readings = [flight.Imu(n * 0.01, np.array([0.1, 0, 9.8]), np.array([0.01, 0, -0.02])) for n in range(200)]
+    assert flight.stood(readings) is None
+    readings += [flight.Imu(2 + n * 0.01, np.array([0.1, 0, 11.0]), np.zeros(3)) for n in range(10)]
+    standing = flight.stood(readings)
+    assert standing is not None and 1.7 < standing.until_s < 1.8
+    np.testing.assert_allclose(standing.gyro_bias, [0.01, 0, -0.02], atol=1e-12)
+    np.testing.assert_allclose(standing.accel_mps2, [0.1, 0, 9.8], atol=1e-12)
 
 
 def test_corners_are_followed_where_the_image_moves():

@@ -18,7 +18,6 @@ Data set:  inertial_odometry.py --dataset DIR -o estimate.tum
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +25,9 @@ import numpy.typing as npt
 from odometry_flight import (
     F64,
     Estimate,
-    Imu,
+    Odometry,
     OdometryPlugin,
+    Standing,
     Tracks,
     View,
     exp_so3,
@@ -39,21 +39,18 @@ from odometry_flight import (
 GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])
 # White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame, read 100 times a second.
 # [m/s^2/sqrt(Hz)], [rad/s/sqrt(Hz)], [m/s^3/sqrt(Hz)], [rad/s^2/sqrt(Hz)]
-ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.03, 0.0015, 1e-3, 1e-4
+ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.03, 0.001, 1e-3, 1e-4
 # What is known where it stands: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2]; and the mean force felt. [m/s^2]
 TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.02, 0.001, 0.05, 0.01
 # Heading and place are the frame's own, by definition.
 OWN_SIGMA = 1e-4
-# It has left the ground when a tenth of a second's mean force or turn differs by so much. [m/s^2], [rad/s]
-LIFT_MPS2, LIFT_RADPS = 0.4, 0.15
-LIFT_READINGS, FEWEST_STANDING = 10, 30
-# The filter begins so long before that was noticed. [s]
-BEFORE_LIFT_S = 0.3
 # Key images are so far apart, and so many are remembered. [s]
-KEY_S, KEYS = 0.09, 20
+KEY_S, KEYS = 0.15, 25
 # An image shows where the vehicle was predicted to be at its instant, not where it then was: how far the two are apart.
 # [rad], [m]
-PREDICTED_RAD, PREDICTED_M = 0.0015, 0.001
+PREDICTED_RAD, PREDICTED_M = 0.0008, 0.0005
+# Corners of each camera, and how far they are apart at least. [px]
+CORNERS, APART_PX = 220, 10
 # How far a followed corner is off. [px]
 SIGMA_PX = 0.5
 # Corners whose residuals are beyond so many sigmas count less, or not at all.
@@ -61,6 +58,9 @@ HUBER, DROPPED = 1.5, 6.0
 # Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
+# The floor is even: a corner that a camera looking down sees, from this height on, is as high as where it stood,
+# unless it is farther from there; and how far it is off. [m, odom]
+FLOOR_M, ABOVE_M, NEAR_FLOOR_M, FLOOR_SIGMA_M = -0.02, 0.5, 0.3, 0.15
 
 # Places in the error state: turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer.
 TURN, V, P, GYRO, ACCEL = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
@@ -172,74 +172,27 @@ def chi_square(freedom: int) -> float:
     return freedom * (1 - spread + 1.645 * spread**0.5) ** 3
 
 
-class InertialOdometry:
-    """Where the body is, from images and IMU; it must stand when it begins."""
+class InertialOdometry(Odometry):
+    """Where the body is, from images and IMU."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._motion: Motion | None = None
         self._covariance = np.zeros((IMU_SIZE, IMU_SIZE))
         self._clones: list[Clone] = []
         self._keys = 0
-        self._readings: list[Imu] = []
-        self._pending: list[View] = []
         self._tracks: dict[str, Tracks] = {}
         self._sights: dict[tuple[str, int], list[Sight]] = {}
         self._views: dict[str, View] = {}
         self._key_s: dict[str, float] = {}
 
-    def update(self, imu: Sequence[Imu], views: Sequence[View]) -> list[Estimate]:
-        """Takes new readings and images; returns the estimates of the images up to which there are readings."""
-        self._readings += imu
-        if self._motion is None and not self._lift_off():
-            return []
-        self._pending += views
-        estimates = []
-        while self._pending and self._readings[-1].at_s >= self._pending[0].at_ns * 1e-9:
-            at_ns = self._pending[0].at_ns
-            together = [view for view in self._pending if view.at_ns == at_ns]
-            self._pending = self._pending[len(together) :]
-            if at_ns * 1e-9 <= self._motion.at_s:
-                continue
-            self._propagate(at_ns * 1e-9)
-            self._see(at_ns * 1e-9, together)
-            estimates.append(self._estimate(at_ns, self._motion))
-        return estimates
-
-    def now(self) -> Estimate | None:
-        """Returns the motion at the newest reading, for steering; None while it stands."""
-        if self._motion is None:
-            return None
-        motion = self._motion
-        for one in self._readings:
-            if one.at_s > motion.at_s:
-                motion = moved(motion, one.accel_mps2, one.gyro_radps, one.at_s - motion.at_s)
-        return self._estimate(round(motion.at_s * 1e9), motion)
-
-    @staticmethod
-    def _estimate(at_ns: int, motion: Motion) -> Estimate:
-        return Estimate(at_ns, motion.p_m, motion.rotation, motion.v_mps)
-
-    # --- the start
-
-    def _lift_off(self) -> bool:
-        """Begins when the vehicle leaves the ground; until then it learns what standing feels like."""
-        readings = self._readings
-        standing = len(readings) - LIFT_READINGS
-        if standing < FEWEST_STANDING:
-            return False
-        accel = np.array([one.accel_mps2 for one in readings])
-        gyro = np.array([one.gyro_radps for one in readings])
-        force = np.abs(accel[standing:].mean(axis=0) - accel[:standing].mean(axis=0)).max()
-        turn = np.abs(gyro[standing:].mean(axis=0) - gyro[:standing].mean(axis=0)).max()
-        if force < LIFT_MPS2 and turn < LIFT_RADPS:
-            return False
-        before = [one for one in readings if one.at_s < readings[-1].at_s - BEFORE_LIFT_S]
-        accel_mps2 = np.mean([one.accel_mps2 for one in before], axis=0)
-        gyro_bias = np.mean([one.gyro_radps for one in before], axis=0)
+    def begin(self, standing: Standing) -> None:
+        """Begins at rest."""
         # Along the force felt the bias is known, as gravity is; across it, it cannot be told from tilt.
+        accel_mps2 = standing.accel_mps2
         accel_bias = accel_mps2 * (1 + GRAVITY_MPS2[2] / float(np.linalg.norm(accel_mps2)))
         level, zero = level_from_body(accel_mps2), np.zeros(3)
-        self._motion = Motion(before[-1].at_s, level, zero, zero, gyro_bias, accel_bias)
+        self._motion = Motion(standing.until_s, level, zero, zero, standing.gyro_bias, accel_bias)
         sigmas = [TILT_SIGMA, TILT_SIGMA, OWN_SIGMA]
         for sigma in (V_SIGMA, OWN_SIGMA, GYRO_SIGMA, ACCEL_SIGMA):
             sigmas += [sigma] * 3
@@ -249,23 +202,32 @@ class InertialOdometry:
         by_error[:, TURN], by_error[:, ACCEL] = skew(level.T @ -GRAVITY_MPS2), np.eye(3)
         expected = by_error @ covariance @ by_error.T + np.eye(3) * STANDING_SIGMA**2
         self._covariance = covariance - covariance @ by_error.T @ np.linalg.solve(expected, by_error @ covariance)
-        self._readings = readings[len(before) - 1 :]
-        return True
+
+    def see(self, at_ns: int, views: list[View]) -> Estimate:
+        """Returns the estimate of an instant, from its images and the readings until then."""
+        self._propagate(at_ns * 1e-9)
+        self._follow(at_ns * 1e-9, views)
+        return self._estimate(at_ns, self._motion)
+
+    def now(self) -> Estimate | None:
+        """Returns the motion at the newest reading, for steering; None while it stands."""
+        if self._motion is None:
+            return None
+        motion = self._motion
+        for one in self.readings:
+            if one.at_s > motion.at_s:
+                motion = moved(motion, one.accel_mps2, one.gyro_radps, one.at_s - motion.at_s)
+        return self._estimate(round(motion.at_s * 1e9), motion)
+
+    @staticmethod
+    def _estimate(at_ns: int, motion: Motion) -> Estimate:
+        return Estimate(at_ns, motion.p_m, motion.rotation, motion.v_mps)
 
     # --- the IMU
 
     def _propagate(self, to_s: float) -> None:
-        """Carries the state on to an instant up to which there are readings; between two they are interpolated."""
-        while self._motion.at_s < to_s - 1e-9:
-            # The readings before and after where it is.
-            while len(self._readings) > 2 and self._readings[1].at_s <= self._motion.at_s + 1e-9:
-                self._readings.pop(0)
-            before, after = self._readings[:2]
-            until_s = min(after.at_s, to_s)
-            share = ((self._motion.at_s + until_s) / 2 - before.at_s) / (after.at_s - before.at_s)
-            accel = before.accel_mps2 + share * (after.accel_mps2 - before.accel_mps2)
-            gyro = before.gyro_radps + share * (after.gyro_radps - before.gyro_radps)
-            dt_s = until_s - self._motion.at_s
+        """Carries the state on to an instant up to which there are readings."""
+        for dt_s, accel, gyro in self.between(self._motion.at_s, to_s):
             by_error = transition(self._motion, accel, gyro, dt_s)
             noise = np.repeat([GYRO_NOISE, ACCEL_NOISE, 0.0, GYRO_WALK, ACCEL_WALK], 3) ** 2 * dt_s
             covariance = self._covariance
@@ -276,11 +238,11 @@ class InertialOdometry:
 
     # --- images
 
-    def _see(self, at_s: float, views: list[View]) -> None:
+    def _follow(self, at_s: float, views: list[View]) -> None:
         """Follows corners into new images; at key images the filter takes what they say."""
         key_views = []
         for view in views:
-            tracks = self._tracks.setdefault(view.camera, Tracks())
+            tracks = self._tracks.setdefault(view.camera, Tracks(CORNERS, APART_PX))
             tracks.follow(view.grey)
             self._views[view.camera] = view
             if at_s - self._key_s.get(view.camera, -1e9) >= KEY_S:
@@ -344,6 +306,7 @@ class InertialOdometry:
         body_from_cam = np.array([view.body_from_cam for view in views])[:, None]
         camera_m = np.array([view.camera_m for view in views])[:, None, :, None]
         sigma = SIGMA_PX / np.array([view.focal_px.mean() for view in views])
+        looks_down = np.array([view.body_from_cam[2, 2] < -0.7 for view in views])
 
         def cameras(rotations: F64, bodies_m: F64) -> tuple[F64, F64]:
             return rotations[clone] @ body_from_cam, bodies_m[clone] + (rotations[clone] @ camera_m)[..., 0]
@@ -372,10 +335,15 @@ class InertialOdometry:
                 column = IMU_SIZE + CLONE_SIZE * int(clone[n, k])
                 slope[2 * k : 2 * k + 2, column : column + 3] = by_turn[n, k]
                 slope[2 * k : 2 * k + 2, column + 3 : column + 6] = -by_place[n, k]
-            own = by_place[n, :count].reshape(-1, 3)
+            own, lack = by_place[n, :count].reshape(-1, 3), -residual[n, :count].reshape(-1)
+            if looks_down[n] and self._motion.p_m[2] > ABOVE_M and abs(places_m[n, 2] - FLOOR_M) < NEAR_FLOOR_M:
+                # It is on the floor: one more measurement, of the corner's place alone. It keeps the scale.
+                own = np.vstack([own, [0.0, 0.0, sigma[n] / FLOOR_SIGMA_M]])
+                lack = np.append(lack, (FLOOR_M - places_m[n, 2]) * sigma[n] / FLOOR_SIGMA_M)
+                slope = np.vstack([slope, np.zeros(size)])
             # What is left of the rows when the corner's own place is free.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
-            rows, lack = left @ slope, left @ -residual[n, :count].reshape(-1)
+            rows, lack = left @ slope, left @ lack
             # What the state makes most unlikely is not of a place that stands still (Mahalanobis' distance).
             expected = rows @ self._covariance @ rows.T + np.eye(len(rows)) / weight[n]
             if lack @ np.linalg.solve(expected, lack) > chi_square(len(rows)):

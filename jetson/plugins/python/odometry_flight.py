@@ -1,9 +1,10 @@
-"""What both visual odometries share: the paths of their projects, flight along them, a data set in a flight's place.
+"""What both visual odometries share: their start, the paths of their projects, flight along them, a data set in a
+flight's place.
 
 ::
 
-    flight:   vizflyt.Observation -> View, Imu -> estimator.update -> publish_odometry
-                                                  estimator.now    -> Follower -> Setpoint.velocity
+    flight:   vizflyt.Observation -> View, Imu -> Odometry.update -> publish_odometry
+                                                  Odometry.now    -> Follower -> Setpoint.velocity
     data set: vizflyt export FLIGHT.mcap --format euroc -o DIR;  rgbd_odometry.py --dataset DIR -o estimate.tum
 
 The frame `odom` begins where the vehicle stands before take-off, with its nose along x and z up. What steers the
@@ -18,7 +19,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -96,16 +97,6 @@ class Estimate(NamedTuple):
     v_mps: F64
 
 
-class Estimator(Protocol):
-    """An odometry: readings and images in, estimates out."""
-
-    def update(self, imu: Sequence[Imu], views: Sequence[View]) -> list[Estimate]:
-        """Takes what is new, each sorted by time; returns the estimates of images that are complete by now."""
-
-    def now(self) -> Estimate | None:
-        """Returns the newest estimate, for steering; None before there is one."""
-
-
 # --- small rotations
 
 
@@ -149,6 +140,105 @@ def level_from_body(accel_mps2: F64) -> F64:
     left = np.cross(up, [1.0, 0.0, 0.0])
     left /= np.linalg.norm(left)
     return np.stack([np.cross(left, up), left, up])
+
+
+# --- from images and readings to estimates
+
+# It has left the ground when a tenth of a second's mean force or turn differs by so much. [m/s^2], [rad/s]
+LIFT_MPS2, LIFT_RADPS = 0.4, 0.15
+LIFT_READINGS, FEWEST_STANDING, MOST_STANDING = 10, 30, 1000
+# An odometry begins so long before that was noticed. [s]
+BEFORE_LIFT_S = 0.3
+
+
+class Standing(NamedTuple):
+    """What the IMU's readings are on the ground."""
+
+    until_s: float
+    accel_mps2: F64
+    """Mean specific force, shape (3,). [m/s^2, body]"""
+    gyro_bias: F64
+    """Mean of the gyroscope, which is what it is off by, shape (3,). [rad/s, body]"""
+
+
+def stood(readings: Sequence[Imu]) -> Standing | None:
+    """Returns how it stood before it left the ground; None while it stands."""
+    standing = len(readings) - LIFT_READINGS
+    if standing < FEWEST_STANDING:
+        return None
+    accel = np.array([one.accel_mps2 for one in readings])
+    gyro = np.array([one.gyro_radps for one in readings])
+    force = np.abs(accel[standing:].mean(axis=0) - accel[:standing].mean(axis=0)).max()
+    turn = np.abs(gyro[standing:].mean(axis=0) - gyro[:standing].mean(axis=0)).max()
+    if force < LIFT_MPS2 and turn < LIFT_RADPS:
+        return None
+    count = sum(one.at_s < readings[-1].at_s - BEFORE_LIFT_S for one in readings)
+    return Standing(readings[count - 1].at_s, accel[:count].mean(axis=0), gyro[:count].mean(axis=0))
+
+
+class Odometry:
+    """What odometries have in common: readings and images in, estimates out, from when the vehicle leaves the ground.
+
+    It must stand when it begins: there gravity is what the accelerometer feels, and the gyroscope's mean is its bias.
+    Each odometry has `begin`, `see` and `now`.
+    """
+
+    def __init__(self) -> None:
+        self.readings: list[Imu] = []
+        """From the last one before the newest estimate on."""
+        self._pending: list[View] = []
+        self._began = False
+
+    def update(self, imu: Sequence[Imu], views: Sequence[View]) -> list[Estimate]:
+        """Takes what is new, each sorted by time; returns those of images up to which there are readings."""
+        self.readings += imu
+        self._pending += views
+        if not self._began:
+            standing = stood(self.readings)
+            if standing is None:
+                self.readings = self.readings[-MOST_STANDING:]
+                self._pending = [view for view in self._pending if view.at_ns > views[-1].at_ns - 1e9] if views else []
+                return []
+            self.begin(standing)
+            self._began = True
+            self.readings = [one for one in self.readings if one.at_s >= standing.until_s]
+            self._pending = [view for view in self._pending if view.at_ns * 1e-9 > standing.until_s]
+        estimates = []
+        while self._pending and self.readings[-1].at_s >= self._pending[0].at_ns * 1e-9:
+            at_ns = self._pending[0].at_ns
+            together = [view for view in self._pending if view.at_ns == at_ns]
+            self._pending = self._pending[len(together) :]
+            estimates.append(self.see(at_ns, together))
+        return estimates
+
+    def begin(self, standing: Standing) -> None:
+        """Takes how it stood on the ground."""
+        raise NotImplementedError
+
+    def see(self, at_ns: int, views: list[View]) -> Estimate:
+        """Returns the estimate of an instant, from its images and the readings until then."""
+        raise NotImplementedError
+
+    def now(self) -> Estimate | None:
+        """Returns the estimate at the newest reading, for steering; None while it stands."""
+        raise NotImplementedError
+
+    def between(self, from_s: float, to_s: float) -> Iterator[tuple[float, F64, F64]]:
+        """Yields in steps from an instant to one up to which there are readings: how long the step is [s], and
+        accelerometer and gyroscope in its middle, between two readings. Forgets the readings before."""
+        while from_s < to_s - 1e-9:
+            # The readings before and after where it is.
+            while len(self.readings) > 2 and self.readings[1].at_s <= from_s + 1e-9:
+                self.readings.pop(0)
+            before, after = self.readings[:2]
+            until_s = min(after.at_s, to_s)
+            share = ((from_s + until_s) / 2 - before.at_s) / (after.at_s - before.at_s)
+            yield (
+                until_s - from_s,
+                before.accel_mps2 + share * (after.accel_mps2 - before.accel_mps2),
+                before.gyro_radps + share * (after.gyro_radps - before.gyro_radps),
+            )
+            from_s = until_s
 
 
 # --- features
@@ -218,16 +308,25 @@ class Tracks:
         return len(fresh)
 
 
-CONTRAST = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(4, 4))
 # What is finer than two pixels is not where it seems to be: rendered images alias, as those of sensors without an
 # optical low-pass do. Without the blur a flight of 10 m ahead was 1 to 4 % too long. [px]
 BLUR_PX = 1.5
 
 
+# Brightness is spread so that its standard deviation is this; one that is less than so many levels is spread less.
+SPREAD, LEAST_SPREAD = 50.0, 4.0
+
+
 def even_grey(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Returns brightness without its finest details, and with its contrast evened out: fog and dusk leave little of it
-    (K. Zuiderveld, "Contrast limited adaptive histogram equalization", Graphics Gems IV, 1994)."""
-    return CONTRAST.apply(cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX))
+    """Returns brightness without its finest details, and with its contrast spread: fog and dusk leave little of it.
+
+    By one gain for the whole image. One that differs from place to place, as that of an adaptive equalization (CLAHE)
+    does, is a pattern that stays in the image while the world moves: corners were followed twice as badly by it.
+    """
+    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
+    mean, spread = cv2.meanStdDev(grey)
+    gain = SPREAD / max(float(spread[0, 0]), LEAST_SPREAD)
+    return cv2.addWeighted(grey, gain, grey, 0.0, 128 - gain * float(mean[0, 0]))
 
 
 # --- paths
@@ -303,7 +402,7 @@ class Follower:
 class OdometryPlugin(vizflyt.Plugin):
     """Flies the project's path by an estimator of its own, and publishes what that says of each image."""
 
-    make_estimator: Callable[[], Estimator]
+    make_estimator: Callable[[], Odometry]
     needs_depth = False
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:

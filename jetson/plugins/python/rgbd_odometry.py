@@ -5,7 +5,8 @@ Corners are followed from image to image; each got its place in the frame `odom`
 The body's pose is the one from which all of them, of all cameras together, are seen where they are: perspective-n-point
 with depth, by Gauss-Newton and Huber's weights (compare D. Nister, O. Naroditsky and J. Bergen, "Visual odometry", CVPR
 2004; R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed., section 7; P. Huber, Ann. Math. Statist. 35(1),
-1964). The accelerometer says before take-off where up is; else no IMU is used.
+1964). The accelerometer says before take-off where up is, and the gyroscope how the vehicle turns: what all corners
+of a net or a pole before a wall have in common would else turn the pose, in fog by a degree in each second.
 
 Fly:       vizflyt demo --project square --plugin jetson/plugins/python/rgbd_odometry.py
 Data set:  rgbd_odometry.py --dataset DIR -o estimate.tum
@@ -20,8 +21,9 @@ import numpy.typing as npt
 from odometry_flight import (
     F64,
     Estimate,
-    Imu,
+    Odometry,
     OdometryPlugin,
+    Standing,
     Tracks,
     View,
     exp_so3,
@@ -43,48 +45,46 @@ NEAREST_M, FARTHEST_M = 0.15, 15.0
 EDGE = 0.04
 # A pose stands on at least so many corners.
 FEWEST = 8
-# How much the pose may change unseen from what the motion so far predicts: keeps it where images say nothing.
+# From one image to the next: how far the gyroscope's turn is off, and the place that the motion so far predicts.
+# Corners' errors go together, so what a hundred of them say of a turn is worth less than if they erred by chance.
 # [rad], [m]
-SIGMA_TURN_RAD, SIGMA_MOVE_M = 0.05, 0.05
+SIGMA_TURN_RAD, SIGMA_MOVE_M = 0.0001, 0.05
 
 
-class RgbdOdometry:
-    """Where the body is, from images with depth."""
+class RgbdOdometry(Odometry):
+    """Where the body is, from images with depth and the gyroscope."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._cameras: dict[str, tuple[Tracks, F64]] = {}
         self._rotation: F64 | None = None
-        self._p_m, self._v_mps, self._omega_radps = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._at_ns = 0
-        self._accel_mps2: list[F64] = []
+        self._p_m, self._v_mps = np.zeros(3), np.zeros(3)
+        self._gyro_bias = np.zeros(3)
+        self._at_s = 0.0
 
-    def update(self, imu: Sequence[Imu], views: Sequence[View]) -> list[Estimate]:
-        """Takes new images; returns the estimates of their instants."""
-        if self._rotation is None:
-            self._accel_mps2 += [one.accel_mps2 for one in imu]
-            if not self._accel_mps2 or not views:
-                return []
-            self._rotation = level_from_body(np.mean(self._accel_mps2, axis=0))
-            self._at_ns = views[0].at_ns
-        estimates = []
-        for at_ns in sorted({view.at_ns for view in views}):
-            self._locate(at_ns, [view for view in views if view.at_ns == at_ns])
-            estimates.append(self._estimate())
-        return estimates
+    def begin(self, standing: Standing) -> None:
+        """Begins at rest."""
+        self._rotation, self._gyro_bias = level_from_body(standing.accel_mps2), standing.gyro_bias
+        self._at_s = standing.until_s
 
     def now(self) -> Estimate | None:
-        """Returns the newest image's estimate."""
-        return None if self._rotation is None else self._estimate()
+        """Returns the newest image's estimate as it goes on, for steering; None while it stands."""
+        if self._rotation is None:
+            return None
+        rotation, at_s = self._rotation, self._at_s
+        for one in self.readings:
+            if one.at_s > at_s:
+                rotation = rotation @ exp_so3((one.gyro_radps - self._gyro_bias) * (one.at_s - at_s))
+                at_s = one.at_s
+        return Estimate(round(at_s * 1e9), self._p_m + self._v_mps * (at_s - self._at_s), rotation, self._v_mps)
 
-    def _estimate(self) -> Estimate:
-        return Estimate(self._at_ns, self._p_m, self._rotation, self._v_mps)
-
-    def _locate(self, at_ns: int, views: list[View]) -> None:
-        dt_s = max(at_ns - self._at_ns, 0) * 1e-9
-        # As fast as until now; images before take-off come seldom, and then it stands.
-        ahead_s = dt_s if dt_s < 0.15 else 0.0
-        rotation = self._rotation @ exp_so3(self._omega_radps * ahead_s)
-        p_m = self._p_m + self._v_mps * ahead_s
+    def see(self, at_ns: int, views: list[View]) -> Estimate:
+        """Returns the estimate of an instant, from its images and the readings until then."""
+        dt_s = at_ns * 1e-9 - self._at_s
+        # It turns as the gyroscope says, and is as fast as until now.
+        rotation, p_m = self._rotation, self._p_m + self._v_mps * dt_s
+        for step_s, _, gyro_radps in self.between(self._at_s, at_ns * 1e-9):
+            rotation = rotation @ exp_so3((gyro_radps - self._gyro_bias) * step_s)
         seen = []
         for view in views:
             tracks, places_m = self._cameras.setdefault(view.camera, (Tracks(), np.empty((0, 3))))
@@ -98,13 +98,12 @@ class RgbdOdometry:
             self._cameras[view.camera] = (tracks, places_m)
             seen.append((view, tracks.px, places_m, depth_at(view.depth_m, tracks.px)[0]))
         rotation, p_m, offs = solve_pose(rotation, p_m, seen)
-        # Velocities are a little smoothed, as they only predict.
-        if ahead_s > 0:
-            self._omega_radps = 0.5 * self._omega_radps + 0.5 * small_turn(self._rotation.T @ rotation) / dt_s
-            self._v_mps = 0.5 * self._v_mps + 0.5 * (p_m - self._p_m) / dt_s
-        self._rotation, self._p_m, self._at_ns = rotation, p_m, at_ns
+        # The velocity is a little smoothed, as it only predicts.
+        self._v_mps = 0.5 * self._v_mps + 0.5 * (p_m - self._p_m) / dt_s
+        self._rotation, self._p_m, self._at_s = rotation, p_m, at_ns * 1e-9
         for (view, *_), off in zip(seen, offs):
             self._renew(view, off)
+        return Estimate(at_ns, p_m, rotation, self._v_mps)
 
     def _renew(self, view: View, off: F64) -> None:
         """Drops corners that do not fit, and places new ones."""
