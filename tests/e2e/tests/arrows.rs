@@ -20,7 +20,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-race", &["vizflyt-sdk"]),
     ("vizflyt-c", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
-    ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena"]),
+    ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena", "vizflyt-toml"]),
     ("vizflyt-twin", &["vizflyt-protocol", "vizflyt-splat"]),
     (
         "vizflyt-server",
