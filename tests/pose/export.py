@@ -2,8 +2,8 @@
 
     export.py VIZFLYT
 
-A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly. Its project is
-p2 with a LiDAR and a range finder, and a camera that sees as a Raspberry Pi's does.
+A graded flight, in lock-step, is logged with all images: where each image was rendered from is known exactly. Its
+project is p2 with a LiDAR and a range finder, and a camera that sees as a Raspberry Pi's does.
 """
 
 import json
