@@ -123,6 +123,15 @@ def test_parallel_rays_and_points_behind_have_no_place():
     assert np.isnan(found_m).all()
 
 
+def test_a_camera_that_stands_places_nothing():
+    axes, from_m, slopes, _ = rays(3, 5)
+    from_m[...] = 0
+    slopes[1:] += np.random.default_rng(6).normal(0, 1e-2, slopes[1:].shape)
+    slopes[2] *= 50
+    found_m, residual = inertial.triangulate(axes, from_m, slopes, np.ones((3, 5), bool))
+    assert np.isnan(found_m[0]).all() and np.isfinite(residual).all()
+
+
 def test_chi_square_is_that_of_tables():
     for freedom, value in ((1, 3.841), (5, 11.070), (20, 31.410), (37, 52.192)):
         assert inertial.chi_square(freedom) == pytest.approx(value, rel=0.03)

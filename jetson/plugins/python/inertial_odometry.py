@@ -45,10 +45,10 @@ TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.02, 0.001
 # Heading and place are the frame's own, by definition.
 OWN_SIGMA = 1e-4
 # Key images are so far apart, and so many are remembered. [s]
-KEY_S, KEYS = 0.15, 25
+KEY_S, KEYS = 0.09, 20
 # An image shows where the vehicle was predicted to be at its instant, not where it then was: how far the two are apart.
 # [rad], [m]
-PREDICTED_RAD, PREDICTED_M = 0.0008, 0.0005
+PREDICTED_RAD, PREDICTED_M = 0.0015, 0.001
 # Corners of each camera, and how far they are apart at least. [px]
 CORNERS, APART_PX = 220, 10
 # How far a followed corner is off. [px]
@@ -58,9 +58,6 @@ HUBER, DROPPED = 1.5, 6.0
 # Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
-# The floor is even: a corner that a camera looking down sees, from this height on, is as high as where it stood,
-# unless it is farther from there; and how far it is off. [m, odom]
-FLOOR_M, ABOVE_M, NEAR_FLOOR_M, FLOOR_SIGMA_M = -0.02, 0.5, 0.3, 0.15
 
 # Places in the error state: turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer.
 TURN, V, P, GYRO, ACCEL = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
@@ -143,7 +140,9 @@ def triangulate(axes: F64, from_m: F64, slopes: F64, seen: npt.NDArray[np.bool_]
     places_m = np.linalg.solve(matrix, right[..., None])[..., 0]
     for _ in range(TRIANGULATIONS):
         residual, slope = _look(axes, from_m, slopes, seen, places_m)
-        matrix = np.einsum("mnij,mnik->mjk", slope, slope) + 1e-9 * np.eye(3)
+        matrix = np.einsum("mnij,mnik->mjk", slope, slope)
+        # A little of its own size on the diagonal, or rays of one camera that stands leave it singular.
+        matrix += (1e-9 + 1e-12 * np.trace(matrix, axis1=1, axis2=2))[:, None, None] * np.eye(3)
         places_m = places_m - np.linalg.solve(matrix, np.einsum("mnij,mni->mj", slope, residual)[..., None])[..., 0]
     residual, _ = _look(axes, from_m, slopes, seen, places_m)
     in_cam_m = np.einsum("mnji,mnj->mni", axes, places_m[:, None] - from_m)
@@ -306,7 +305,6 @@ class InertialOdometry(Odometry):
         body_from_cam = np.array([view.body_from_cam for view in views])[:, None]
         camera_m = np.array([view.camera_m for view in views])[:, None, :, None]
         sigma = SIGMA_PX / np.array([view.focal_px.mean() for view in views])
-        looks_down = np.array([view.body_from_cam[2, 2] < -0.7 for view in views])
 
         def cameras(rotations: F64, bodies_m: F64) -> tuple[F64, F64]:
             return rotations[clone] @ body_from_cam, bodies_m[clone] + (rotations[clone] @ camera_m)[..., 0]
@@ -336,11 +334,6 @@ class InertialOdometry(Odometry):
                 slope[2 * k : 2 * k + 2, column : column + 3] = by_turn[n, k]
                 slope[2 * k : 2 * k + 2, column + 3 : column + 6] = -by_place[n, k]
             own, lack = by_place[n, :count].reshape(-1, 3), -residual[n, :count].reshape(-1)
-            if looks_down[n] and self._motion.p_m[2] > ABOVE_M and abs(places_m[n, 2] - FLOOR_M) < NEAR_FLOOR_M:
-                # It is on the floor: one more measurement, of the corner's place alone. It keeps the scale.
-                own = np.vstack([own, [0.0, 0.0, sigma[n] / FLOOR_SIGMA_M]])
-                lack = np.append(lack, (FLOOR_M - places_m[n, 2]) * sigma[n] / FLOOR_SIGMA_M)
-                slope = np.vstack([slope, np.zeros(size)])
             # What is left of the rows when the corner's own place is free.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
             rows, lack = left @ slope, left @ lack
