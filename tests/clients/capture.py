@@ -1,6 +1,6 @@
 """Writes the packets that the bridge is tested with, as pymavlink makes them:
-firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt; and those of distances to obstacles, which
-ours are held against: protocol/core/src/mavlink/distances.txt.
+firmware-esp/bridge/tests/data/pymavlink.bin, and what each is in pymavlink.txt; and those of distances to obstacles,
+which ours are held against: protocol/core/src/mavlink/distances.txt.
 
     target/clients/bin/python tests/clients/capture.py
 
@@ -47,22 +47,41 @@ def distances():
     half = math.radians(-20) / 2
     nowhere = [1201] * 72
     nowhere[0], nowhere[18] = 200, 300
-    messages = [
-        v2.MAVLink_distance_sensor_message(
-            time_boot_ms=55, min_distance=20, max_distance=1200, current_distance=123, type=v2.MAV_DISTANCE_SENSOR_LASER,
-            id=3, orientation=v2.MAV_SENSOR_ROTATION_PITCH_270, covariance=255, horizontal_fov=0.25, vertical_fov=0.5,
-            quaternion=[0, 0, 0, 0], signal_quality=50,
-        ),  # fmt: skip
-        v2.MAVLink_distance_sensor_message(
-            time_boot_ms=56, min_distance=20, max_distance=1200, current_distance=1201,
-            type=v2.MAV_DISTANCE_SENSOR_ULTRASOUND, id=4, orientation=v2.MAV_SENSOR_ROTATION_CUSTOM, covariance=255,
-            horizontal_fov=0.25, vertical_fov=0.5, quaternion=[math.cos(half), 0, math.sin(half), 0], signal_quality=0,
-        ),  # fmt: skip
-        v2.MAVLink_obstacle_distance_message(
-            time_usec=9, sensor_type=v2.MAV_DISTANCE_SENSOR_LASER, distances=nowhere, increment=5, min_distance=20,
-            max_distance=1200, increment_f=5, angle_offset=0, frame=v2.MAV_FRAME_BODY_FRD,
-        ),  # fmt: skip
-    ]
+    range_m = {"min_distance": 20, "max_distance": 1200}
+    cone = {"covariance": 255, "horizontal_fov": 0.25, "vertical_fov": 0.5}
+    down = v2.MAVLink_distance_sensor_message(
+        time_boot_ms=55,
+        current_distance=123,
+        type=v2.MAV_DISTANCE_SENSOR_LASER,
+        id=3,
+        orientation=v2.MAV_SENSOR_ROTATION_PITCH_270,
+        quaternion=[0, 0, 0, 0],
+        signal_quality=50,
+        **range_m,
+        **cone,
+    )
+    below = v2.MAVLink_distance_sensor_message(
+        time_boot_ms=56,
+        current_distance=1201,
+        type=v2.MAV_DISTANCE_SENSOR_ULTRASOUND,
+        id=4,
+        orientation=v2.MAV_SENSOR_ROTATION_CUSTOM,
+        quaternion=[math.cos(half), 0, math.sin(half), 0],
+        signal_quality=0,
+        **range_m,
+        **cone,
+    )
+    around = v2.MAVLink_obstacle_distance_message(
+        time_usec=9,
+        sensor_type=v2.MAV_DISTANCE_SENSOR_LASER,
+        distances=nowhere,
+        increment=5,
+        increment_f=5,
+        angle_offset=0,
+        frame=v2.MAV_FRAME_BODY_FRD,
+        **range_m,
+    )
+    messages = [down, below, around]
     return [message.pack(link).hex() for message in messages]
 
 

@@ -1,4 +1,4 @@
-"""Reads what `vizflyt export` writes by programs that nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow, pypcd4.
+"""Reads what `vizflyt export` writes by what nobody here wrote: evo, Pillow, PyYAML, pandas with pyarrow, pypcd4.
 
     export.py VIZFLYT
 
@@ -123,7 +123,7 @@ def check_sensors(folder: pathlib.Path) -> None:
     world_from_cam = matrices(front, "pose_at_image") @ matrices(front, "body_from_cam")
     sweeps = sorted((mav / "top/data").iterdir())
     assert len(sweeps) > 50 and [path.name for path in sweeps] == list(pd.read_csv(mav / "top/data.csv").iloc[:, 1])
-    off = []
+    each = []
     for path in sweeps[20::3]:
         cloud = PointCloud.from_path(path)
         assert cloud.fields == ("x", "y", "z", "before_ns", "intensity", "ring") and cloud.points > 1000
@@ -142,8 +142,8 @@ def check_sensors(folder: pathlib.Path) -> None:
         inside = (u >= 0) & (u < row.width_px) & (v >= 0) & (v < row.height_px)
         depth = np.asarray(Image.open(folder / row.depth_file)) / 1000
         seen = depth[v[inside], u[inside]]
-        off.append(np.abs(seen - p_cam[inside, 2])[seen > 0])
-    off = np.concatenate(off)
+        each.append(np.abs(seen - p_cam[inside, 2])[seen > 0])
+    off = np.concatenate(each)
     median, most = np.quantile(off, [0.5, 0.8])
     print(f"LiDAR beside a camera's depth: {len(off)} points, median {median:.3f} m, 80 % {most:.3f} m")
     assert len(off) > 5000 and median < 0.04, median
