@@ -166,7 +166,8 @@ fn orientation(body_from_sensor: DQuat) -> MavSensorOrientation {
 /// Returns a rotation between forward-left-up frames as one between forward-right-down frames, w first.
 fn wxyz_frd(rotation: DQuat) -> [f32; 4] {
     let [x, y, z, w] = rotation.to_array().map(|part| part as f32);
-    [w, x, -y, -z]
+    // Never -0: a packet ends with its last byte that is not zero.
+    [w, x, 0.0 - y, 0.0 - z]
 }
 
 #[cfg(test)]
