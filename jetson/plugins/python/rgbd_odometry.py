@@ -5,8 +5,8 @@ Corners are followed from image to image; each got its place in the frame `odom`
 The body's pose is the one from which all of them, of all cameras together, are seen where they are: perspective-n-point
 with depth, by Gauss-Newton and Huber's weights (compare D. Nister, O. Naroditsky and J. Bergen, "Visual odometry", CVPR
 2004; R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed., section 7; P. Huber, Ann. Math. Statist. 35(1),
-1964). The accelerometer says before take-off where up is, and the gyroscope how the vehicle turns: what all corners
-of a net or a pole before a wall have in common would else turn the pose, in fog by a degree in each second.
+1964). The accelerometer says before take-off where up is, and the gyroscope how the vehicle turns: the errors that
+corners have in common would else turn the pose, in fog by degrees.
 
 Fly:       vizflyt demo --project square --plugin jetson/plugins/python/rgbd_odometry.py
 Data set:  rgbd_odometry.py --dataset DIR -o estimate.tum
