@@ -277,7 +277,7 @@ def run(*command):
 
 @pytest.mark.parametrize(
     ("plugin", "project", "level"),
-    [("rgbd_odometry.py", "square", "ug"), ("inertial_odometry.py", "lemniscate", "g")],
+    [("rgbd_odometry.py", "square", "ug"), ("inertial_odometry.py", "spiral", "g")],
 )
 def test_flies_by_its_own_odometry_within_the_bound(program, tmp_path, plugin, project, level):
     """In lock-step, and again over the images that the flight's log was exported to."""
