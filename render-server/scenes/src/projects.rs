@@ -98,7 +98,7 @@ pub struct UnknownProject(pub String);
 pub enum NoProject {
     /// No project has this name.
     #[error("{0}; or give the path of a file of your own that ends in .toml")]
-    Unknown(#[from] UnknownProject),
+    Unknown(UnknownProject),
     /// Its file cannot be read.
     #[error("cannot read the project {path}: {1}", path = .0.display())]
     Unreadable(PathBuf, std::io::Error),
@@ -201,7 +201,7 @@ impl CourseProject {
     pub fn find(name_or_path: &str) -> Result<Self, NoProject> {
         let path = Path::new(name_or_path);
         if path.extension().is_none_or(|ending| ending != "toml") {
-            return Ok(Self::named(name_or_path)?);
+            return Self::named(name_or_path).map_err(NoProject::Unknown);
         }
         let text = std::fs::read_to_string(path)
             .map_err(|error| NoProject::Unreadable(path.to_owned(), error))?;
@@ -309,8 +309,10 @@ mod tests {
         let own = found(p4.text()).unwrap();
         assert_eq!((own.name(), own.text()), ("scanned", p4.text()));
         assert_eq!(CourseProject::find("p4").unwrap(), p4);
-        let text =
-            format!("{}\n[[levels.ug.sensors]]\nname = \"top\"\nmodel = \"vlp-16\"\n", p5.text());
+        let text = format!(
+            "{}\n[[levels.ug.sensors]]\nname = \"top\"\nmodel = \"vlp-16\"\nposition_m = [0.0, 0.0, 0.1]\n",
+            p5.text()
+        );
         let own = found(&text).unwrap();
         let of = |level| own.generate(2, level, Variant::DAY).arena;
         assert_eq!((of(Level::Ug).sensors.len(), of(Level::G).sensors.len()), (1, 0));
