@@ -316,8 +316,9 @@ mod tests {
         let own = found(&text).unwrap();
         let of = |level| own.generate(2, level, Variant::DAY).arena;
         assert_eq!((of(Level::Ug).sensors.len(), of(Level::G).sensors.len()), (1, 0));
-        let error = found(&text.replace("vlp-16", "vlp-17")).unwrap_err().to_string();
-        assert!(error.contains("level ug") && error.contains("vlp-17"), "{error}");
+        let fast = text.replace("max_speed_mps = 4.0", "max_speed_mps = 99.0");
+        let error = found(&fast).unwrap_err().to_string();
+        assert!(error.contains("level ug") && error.contains("limits.max_speed_mps"), "{error}");
         let error = found(&text.replace("finish", "fnish")).unwrap_err().to_string();
         assert!(error.contains("scanned.toml") && error.contains("line "), "{error}");
         let error = CourseProject::find("nowhere.toml").unwrap_err().to_string();
