@@ -228,6 +228,11 @@ impl CourseProject {
         &self.name
     }
 
+    /// Whether it was read from a file, whatever that is called, and is not one of the program.
+    pub fn is_from_file(&self) -> bool {
+        matches!(self.text, Cow::Owned(_))
+    }
+
     /// Returns what it is about, in a few words.
     pub fn title(&self) -> &str {
         &self.plan.title

@@ -71,7 +71,7 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
 }
 
-/// How often a flight's images are drawn: flights are as they are at 120 Hz, and what runs aside gets its time. [Hz]
+/// How often a flight's images are drawn, unless a test is about rates: what runs aside gets its time. [Hz]
 const MAX_RATE_HZ: f64 = 40.0;
 
 /// A running `vizflyt` whose output can be waited for. Killed when dropped.

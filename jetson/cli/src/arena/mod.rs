@@ -13,6 +13,7 @@ use vizflyt_arena::config::line_of;
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{self, CourseProject, Level};
 use vizflyt_server::poses::settings;
+use vizflyt_server::render::sensors::SensorSet;
 use vizflyt_server::scene::{self, BareArgs};
 
 use crate::terminal::print_fmt;
@@ -64,6 +65,10 @@ fn check_all(args: &CheckArgs) -> Result<ExitCode> {
     let good = match (&args.project, &args.arena) {
         (Some(project), _) => {
             let project = CourseProject::find(project)?;
+            for level in Level::ALL {
+                let arena = project.generate(0, level, Variant::default()).arena;
+                SensorSet::new(&arena.sensors).with_context(|| format!("level {level}"))?;
+            }
             let seeds = args.seed.map_or(0..args.seeds, |seed| seed..seed + 1);
             if seeds.is_empty() {
                 bail!("--seeds 0 checks nothing; give at least 1");
@@ -104,6 +109,7 @@ fn check_file(path: &Path) -> Result<bool> {
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
     let scene = scene::load(&file, &BareArgs::default())?;
+    SensorSet::new(&scene.arena.sensors).with_context(|| file.display().to_string())?;
     let still = Arc::new(scene::bake(&scene.splats, &scene.arena, scene.seen.as_ref()));
     let mut findings = scene::check_fit(&scene.splats, &scene.arena, &still);
     let obstacles = scene::obstacles(&scene.arena, &scene.objects, still, 0);

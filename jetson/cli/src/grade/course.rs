@@ -9,6 +9,7 @@ use vizflyt_arena::config::EnvironmentConfig;
 use vizflyt_arena::{ArenaConfig, BakeSpec, DistanceField, Obstacles};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{CourseProject, Level};
+use vizflyt_server::render::sensors::SensorSet;
 use vizflyt_server::scene::{bake_with, obstacles};
 use vizflyt_splat::{RigidObject, Splats};
 
@@ -34,11 +35,22 @@ pub(crate) struct CourseInstance {
     pub rules_sha256: String,
 }
 
+/// Returns a project's name as grades have it. One from a file bears what it says, too: it is another project when it was
+/// changed, and never one of the program's that its file is called after.
+pub(crate) fn graded_name(project: &CourseProject) -> String {
+    let name = project.name();
+    if !project.is_from_file() {
+        return name.to_owned();
+    }
+    let hash = hex(&Sha256::digest(project.text()));
+    format!("{name}-{}", &hash[..16])
+}
+
 impl CourseInstance {
     /// Generates the course of a seed.
     ///
     /// # Errors
-    /// If its arena cannot be written down, which a test of the projects excludes.
+    /// If a sensor's model is none, or its arena cannot be written down: a test of the program's own projects excludes both.
     pub(crate) fn make(
         project: &CourseProject,
         level: Level,
@@ -46,6 +58,7 @@ impl CourseInstance {
         seed: u64,
     ) -> Result<Self> {
         let generated = project.generate(seed, level, variant);
+        SensorSet::new(&generated.arena.sensors).context("the course's sensors")?;
         // Not kept for later: on disk it would be a map for the next plugin.
         let baked =
             bake_with(&generated.splats, &BakeSpec::of(&generated.arena), None, None, &|_| ());
@@ -126,6 +139,29 @@ fn take_all(hash: &mut Sha256, splats: &Splats) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_is_never_one_of_the_programs_projects() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("p4.toml");
+        let found = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            CourseProject::find(path.to_str().unwrap()).unwrap()
+        };
+        let p4 = CourseProject::named("p4").unwrap();
+        assert_eq!(graded_name(&p4), "p4");
+        let copied = graded_name(&found(p4.text()));
+        assert!(copied.starts_with("p4-") && copied.len() == 19, "{copied}");
+        assert_eq!(copied, graded_name(&found(p4.text())));
+        let changed = found(&p4.text().replace("finish = ", "finish  = "));
+        assert_ne!(copied, graded_name(&changed));
+        let model =
+            "[[levels.ug.sensors]]\nname = \"x\"\nmodel = \"vlp-17\"\nposition_m = [0, 0, 0.1]\n";
+        let wrong = found(&format!("{}\n{model}", p4.text()));
+        let made = CourseInstance::make(&wrong, Level::Ug, Variant::DAY, 1);
+        let why = format!("{:#}", made.err().unwrap());
+        assert!(why.contains("vlp-17") && why.contains("vlp-16"), "{why}");
+    }
 
     #[test]
     fn a_place_is_known_by_its_hashes() {

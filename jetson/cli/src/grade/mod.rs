@@ -48,7 +48,7 @@ use vizflyt_scenes::{Variant, VariantChoice};
 use vizflyt_simulator::imu::ImuModel;
 use vizflyt_splat::{CpuRenderer, Rasterizer, Splats};
 
-use self::course::CourseInstance;
+use self::course::{CourseInstance, graded_name};
 pub(crate) use self::document::Grade;
 use self::document::{DelaysMs, MAX_SEEDS, Run, Shard, SignedFile, Subject, VariantSummary, hex};
 use self::folder::{FLIGHTS, ReportFolder};
@@ -681,7 +681,7 @@ fn subject(
     Ok(Subject {
         plugin: plugin.name().to_string_lossy().into_owned(),
         plugin_sha256: keys::plugin_sha256(&plugin.watched(), &outputs)?,
-        project: project.name().to_owned(),
+        project: graded_name(project),
         level: args.level.to_string(),
         variants: variants.iter().map(Variant::to_string).collect(),
         environments: drawn.map(|drawn| (drawn.to_string(), drawn.environment())).collect(),
