@@ -1,9 +1,9 @@
 //! `vizflyt bench imaging`: what cameras with faults cost next to rendering, and a sheet of what they see.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clap::Args;
 use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
@@ -18,6 +18,7 @@ use vizflyt_splat::imaging::noise::NoiseKey;
 use vizflyt_splat::imaging::{Imager, Shot};
 use vizflyt_splat::{Camera, Chosen, Rasterizer, RgbdImage};
 
+use super::sheet::{Sheet, coarse, depth_color};
 use crate::scene::camera::{self, ImageSize};
 use crate::terminal::print_fmt;
 
@@ -121,14 +122,14 @@ pub(super) fn run(args: &ImagingArgs) -> Result<()> {
         choose(&loaded.splats, args.renderer, DetailKind::Adaptive)?;
     drop(loaded);
     let path = |at_s: f64| path(&camera, at_s);
-    let mut sheet = Sheet::new(&camera);
+    let mut sheet = Sheet::new(camera.intrinsics.width_px, camera.intrinsics.height_px);
     let mut measure = Measure { camera: &camera, path: &path, rasterizer: &mut *rasterizer };
     let (clean, render_ms) = measure.render(args.images)?;
     let mut kinds = Vec::new();
     for &(name, text, shown) in KINDS {
         let config: ImagingConfig = serde_json::from_str(text)?;
         let (image, median_ms) = measure.take(&config, &clean, args.images);
-        sheet.add(&image, shown);
+        sheet.add(picture(&image, shown));
         kinds.push(Kind { name: name.to_owned(), median_ms, of_render: median_ms / render_ms });
     }
     let (events, median_ms) = measure.events(&mut sheet)?;
@@ -220,7 +221,7 @@ impl Measure<'_> {
             camera.push(&EventSensor::default(), &images[0], at_ns, &mut events);
             times.push(start.elapsed().as_secs_f64() * 1e3);
         }
-        sheet.add_events(&events);
+        sheet.add(picture_of_events(&events, sheet));
         Ok((events.len(), median(&mut times)))
     }
 }
@@ -230,62 +231,23 @@ fn median(times: &mut [f64]) -> f64 {
     times[times.len() / 2]
 }
 
-/// Pictures side by side, in the order of the kinds.
-struct Sheet {
-    width: u32,
-    height: u32,
-    tiles: Vec<RgbImage>,
-}
-
-impl Sheet {
-    fn new(camera: &Camera) -> Self {
-        let k = &camera.intrinsics;
-        Self { width: k.width_px, height: k.height_px, tiles: Vec::new() }
-    }
-
-    fn add(&mut self, image: &RgbdImage, shown: Shown) {
-        let tile = RgbImage::from_fn(self.width, self.height, |x, y| {
-            let n = (y * self.width + x) as usize;
-            let rgb = match shown {
-                Shown::Color => [0, 1, 2].map(|c| image.rgb[3 * n + c]),
-                Shown::Depth => depth_color(image.depth_median_m[n], image.alpha[n]),
-            };
-            // Coarser steps than eight bits keep the file small.
-            Rgb(rgb.map(|value| (value.clamp(0.0, 1.0) * 63.0 + 0.5) as u8 * 4))
-        });
-        self.tiles.push(tile);
-    }
-
-    fn add_events(&mut self, events: &[Event]) {
-        let mut tile = RgbImage::from_pixel(self.width, self.height, Rgb([240; 3]));
-        for event in events {
-            let color = if event.on { [200, 40, 40] } else { [40, 80, 200] };
-            tile.put_pixel(event.x.into(), event.y.into(), Rgb(color));
+fn picture(image: &RgbdImage, shown: Shown) -> RgbImage {
+    RgbImage::from_fn(image.width_px, image.height_px, |x, y| {
+        let n = (y * image.width_px + x) as usize;
+        match shown {
+            Shown::Color => coarse([0, 1, 2].map(|c| image.rgb[3 * n + c])),
+            Shown::Depth => depth_color(image.depth_median_m[n], image.alpha[n]),
         }
-        self.tiles.push(tile);
-    }
-
-    fn save(&self, file: &Path) -> Result<()> {
-        let rows = (self.tiles.len() as u32).div_ceil(COLUMNS);
-        let (width, height) = (self.width + GAP_PX, self.height + GAP_PX);
-        let mut all = RgbImage::from_pixel(COLUMNS * width, rows * height, Rgb([255; 3]));
-        for (n, tile) in (0..).zip(&self.tiles) {
-            let at = (i64::from(n % COLUMNS * width), i64::from(n / COLUMNS * height));
-            image::imageops::replace(&mut all, tile, at.0, at.1);
-        }
-        all.save(file).with_context(|| format!("cannot write {}", file.display()))
-    }
+    })
 }
 
-/// Near is bright and red, far is dark and blue; nothing is black.
-fn depth_color(depth_m: f32, alpha: f32) -> [f32; 3] {
-    if !(depth_m > 0.0 && alpha >= RgbdImage::MIN_DEPTH_ALPHA) {
-        return [0.0; 3];
+fn picture_of_events(events: &[Event], sheet: &Sheet) -> RgbImage {
+    let mut tile = RgbImage::from_pixel(sheet.width_px, sheet.height_px, Rgb([240; 3]));
+    for event in events {
+        let color = if event.on { [200, 40, 40] } else { [40, 80, 200] };
+        tile.put_pixel(event.x.into(), event.y.into(), Rgb(color));
     }
-    let near = 1.0 / (1.0 + 0.25 * depth_m);
-    [near * near * 1.3, near * 0.9, 1.0 - 0.8 * near]
+    tile
 }
 
-const COLUMNS: u32 = 4;
-const GAP_PX: u32 = 4;
 const WARM_UP: u32 = 3;

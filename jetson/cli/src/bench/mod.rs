@@ -5,6 +5,8 @@ mod bandwidth;
 mod bridge;
 mod imaging;
 mod render;
+mod sensors;
+mod sheet;
 mod stream;
 
 use std::process::ExitCode;
@@ -25,6 +27,7 @@ enum BenchCommand {
     Bridge(bridge::BridgeBenchArgs),
     Imaging(imaging::ImagingArgs),
     Render(render::RenderArgs),
+    Sensors(sensors::SensorsArgs),
     Stream(stream::StreamArgs),
 }
 
@@ -35,6 +38,7 @@ pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
         BenchCommand::Bridge(args) => bridge::run(&args)?,
         BenchCommand::Imaging(args) => imaging::run(&args)?,
         BenchCommand::Render(args) => render::run(&args)?,
+        BenchCommand::Sensors(args) => sensors::run(&args)?,
         BenchCommand::Stream(args) => stream::run(&args)?,
     }
     Ok(ExitCode::SUCCESS)

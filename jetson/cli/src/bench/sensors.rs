@@ -1,0 +1,312 @@
+//! `vizflyt bench sensors`: what LiDARs, range finders, sonars and radars cost in a scene, and a sheet of what they see.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Result;
+use clap::Args;
+use glam::{DQuat, DVec3};
+use image::{Rgb, RgbImage};
+use serde::Serialize;
+use vizflyt_protocol::geometry::{Pose, Sensor, World, body_from_forward_cam};
+use vizflyt_server::scene::load_as_it_is;
+use vizflyt_splat::sensor::presets::{self, PRESETS, Preset};
+use vizflyt_splat::sensor::{
+    Beams, Lidar, LidarPoint, Motion, Radar, RangeFinder, SensorScene, Sonar,
+};
+use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Scene};
+
+use super::sheet::{Sheet, coarse, depth_color};
+use crate::scene::camera;
+use crate::terminal::print_fmt;
+
+/// Measures each named sensor many times over; prints milliseconds of each, beside an image of the same place.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "The sensor is where the camera is and looks along its axis; it flies 2 m/s forward and turns to the left by
+90 degrees a second. Times are of all cores; where others use them, the least is the most meaningful, and
+with RAYON_NUM_THREADS=1 it is close to the processor's time.
+
+The sheet's pictures, in the order of the list: LiDARs that look all around, range finders, sonars and radars from
+above, the sensor in the middle looking up, with rings of 2, 4, 6 and 8 m; other LiDARs as the image that their beams
+are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a cone ends
+at its reading; a radar's detections are red where they come closer, blue where they go away.
+
+Examples:
+  vizflyt bench sensors forest/arena.toml --camera cam.json
+  vizflyt bench sensors forest/arena.toml --camera cam.json --sensor vlp-16 --sheet sensors.png"
+)]
+pub(super) struct SensorsArgs {
+    /// Scene file of any format, or an arena.toml (then its scene)
+    scene: PathBuf,
+    /// Where the sensors are, as for `vizflyt scene render`
+    #[arg(long, value_name = "CAM.json")]
+    camera: PathBuf,
+    /// Only this sensor; may be given more than once
+    #[arg(long, value_name = "NAME", value_parser = known)]
+    sensor: Vec<String>,
+    /// Measurements of each that count
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    count: u32,
+    /// Writes what each sees side by side, as one PNG
+    #[arg(long, value_name = "FILE.png")]
+    sheet: Option<PathBuf>,
+    /// Prints one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+fn known(name: &str) -> Result<String, String> {
+    match presets::preset(name) {
+        Some(_) => Ok(name.to_owned()),
+        None => Err(format!("the named sensors are {}", presets::names())),
+    }
+}
+
+/// What `--json` prints.
+#[derive(Debug, Serialize)]
+struct Figures {
+    scene: String,
+    splats: usize,
+    packed_ms: f64,
+    kinds: Vec<Kind>,
+}
+
+#[derive(Debug, Serialize)]
+struct Kind {
+    name: String,
+    least_ms: f64,
+    median_ms: f64,
+    /// Records of the last measurement that are no gap.
+    records: usize,
+}
+
+/// Runs `vizflyt bench sensors`.
+pub(super) fn run(args: &SensorsArgs) -> Result<()> {
+    let camera = camera::read(&args.camera)?;
+    let (scene, loaded) = load_as_it_is(&args.scene)?;
+    let start = Instant::now();
+    let packed = SensorScene::new(&loaded.splats);
+    let packed_ms = start.elapsed().as_secs_f64() * 1e3;
+    let motion = motion_from(&camera);
+    let seen = surroundings(&packed, &motion)?;
+    let mut kinds = vec![image(Scene::from(&loaded.splats), &camera, args.count)?];
+    let mut sheet = Sheet::new(TILE_PX, TILE_PX);
+    for (name, _, preset) in PRESETS {
+        if args.sensor.is_empty() || args.sensor.iter().any(|asked| asked == name) {
+            let mut top = TopView::new(&seen);
+            let (kind, tile) = measure(name, preset(), &packed, &motion, (args.count, &mut top))?;
+            kinds.push(kind);
+            sheet.add(tile.unwrap_or(top.picture));
+        }
+    }
+    if let Some(file) = &args.sheet {
+        sheet.save(file)?;
+    }
+    let scene = scene.display().to_string();
+    let figures = Figures { scene, splats: loaded.splats.len(), packed_ms, kinds };
+    if args.json {
+        print_fmt!("{}", serde_json::to_string_pretty(&figures)?);
+        return Ok(());
+    }
+    let Figures { scene, splats, packed_ms, kinds } = &figures;
+    print_fmt!("scene       {scene}, {splats} splats, packed in {packed_ms:.1} ms");
+    print_fmt!("{:<14} {:>9} {:>9} {:>8}", "ms", "least", "median", "records");
+    for Kind { name, least_ms, median_ms, records } in kinds {
+        print_fmt!("{name:<14} {least_ms:>9.3} {median_ms:>9.3} {records:>8}");
+    }
+    Ok(())
+}
+
+/// How the sensor flies from where the camera is, within a tenth of a second.
+fn motion_from(camera: &Camera) -> Motion<'static> {
+    let body = camera.world_from_cam * body_from_forward_cam(DVec3::ZERO, 0.0).inverse();
+    let begin: Pose<World, Sensor> = Pose::new(body.translation_m, body.rotation);
+    let flown: Pose<Sensor, Sensor> =
+        Pose::new(DVec3::X * 0.2, DQuat::from_rotation_z(9f64.to_radians()));
+    Motion { world_from_sensor: [begin, begin * flown], objects: &[], duration_s: 0.1 }
+}
+
+/// What a LiDAR without error sees all around, from where the sensor is at first.
+fn surroundings(scene: &SensorScene, motion: &Motion<'_>) -> Result<Vec<LidarPoint>> {
+    let mut model = presets::os1(64);
+    let elevations_rad = (0..64).map(|n| (60.0 - 1.9 * n as f32).to_radians()).collect();
+    model.beams = Beams::Spinning { elevations_rad, columns: 2048 };
+    (model.sigma_m, model.sigma_per_m, model.min_range_m) = (0.0, 0.0, 0.05);
+    let mut points = Vec::new();
+    let standing = Motion::standing(motion.world_from_sensor[0]);
+    Lidar::new(model)?.scan(scene, &standing, 1, 0, &mut points)?;
+    Ok(points)
+}
+
+fn image(scene: Scene<'_>, camera: &Camera, count: u32) -> Result<Kind> {
+    let mut renderer = CpuRenderer::new(scene);
+    let mut images = [RgbdImage::default()];
+    let (width, height) = (camera.intrinsics.width_px, camera.intrinsics.height_px);
+    timed(&format!("{width}x{height}"), count, |_| {
+        renderer.render(&[], std::slice::from_ref(camera), &mut images)?;
+        Ok(images[0].alpha.len())
+    })
+}
+
+/// Measures a sensor, and draws its last measurement into the view from above, unless it is an image: that is returned.
+fn measure(
+    name: &str,
+    preset: Preset,
+    scene: &SensorScene,
+    motion: &Motion<'_>,
+    (count, top): (u32, &mut TopView),
+) -> Result<(Kind, Option<RgbImage>)> {
+    let (mut tile, has_range) = (None, |range_m: f32| usize::from(range_m > 0.0));
+    let kind = match preset {
+        Preset::Lidar(model) => {
+            let (lidar, mut points) = (Lidar::new(model)?, Vec::new());
+            let kind = timed(name, count, |seq| {
+                lidar.scan(scene, motion, 1, seq, &mut points)?;
+                Ok(points.iter().filter(|point| point.range_m > 0.0).count())
+            })?;
+            match &lidar.model().beams {
+                Beams::Raster { rows, columns, .. } | Beams::Flash { rows, columns, .. } => {
+                    tile = Some(raster(&points, *rows, *columns));
+                }
+                Beams::Spinning { .. } | Beams::Rosette { .. } => top.add_points(&points),
+            }
+            kind
+        }
+        Preset::Range(model) => {
+            let (finder, mut range_m) = (RangeFinder::new(model)?, 0.0);
+            let kind = timed(name, count, |seq| {
+                range_m = finder.measure(scene, motion, 1, seq)?.range_m;
+                Ok(has_range(range_m))
+            })?;
+            top.add_cone(finder.model().fov_rad / 2.0, range_m);
+            kind
+        }
+        Preset::Sonar(model) => {
+            let (sonar, mut range_m) = (Sonar::new(model)?, 0.0);
+            let kind = timed(name, count, |seq| {
+                range_m = sonar.measure(scene, motion, 1, seq)?.range_m;
+                Ok(has_range(range_m))
+            })?;
+            top.add_cone(sonar.model().beam_rad / 2.0, range_m);
+            kind
+        }
+        Preset::Radar(model) => {
+            let (mut radar, mut found) = (Radar::new(model)?, Vec::new());
+            let kind = timed(name, count, |seq| {
+                radar.measure(scene, motion, 1, seq, &mut found)?;
+                Ok(found.len())
+            })?;
+            for it in &found {
+                let (sin, cos) = it.azimuth_rad.sin_cos();
+                let away = (it.speed_mps / 2.0).clamp(-1.0, 1.0);
+                let color = coarse([0.5 - 0.5 * away, 0.1, 0.5 + 0.5 * away]);
+                top.dot([it.range_m * cos, it.range_m * sin], 2, color);
+            }
+            kind
+        }
+    };
+    Ok((kind, tile))
+}
+
+fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) -> Result<Kind> {
+    let (mut times, mut records) = (Vec::new(), 0);
+    for seq in 0..count.into() {
+        let start = Instant::now();
+        records = measure(seq)?;
+        times.push(start.elapsed().as_secs_f64() * 1e3);
+    }
+    times.sort_unstable_by(f64::total_cmp);
+    let (least_ms, median_ms) = (times[0], times[times.len() / 2]);
+    Ok(Kind { name: name.to_owned(), least_ms, median_ms, records })
+}
+
+/// Beams in their places, coloured by range.
+fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
+    // Whole pixels for each beam, as many as fit.
+    let scale = TILE_PX as f32 / rows.max(columns) as f32;
+    let (width, height) = (columns as f32 * scale, rows as f32 * scale);
+    let (left, above) = ((TILE_PX as f32 - width) / 2.0, (TILE_PX as f32 - height) / 2.0);
+    RgbImage::from_fn(TILE_PX, TILE_PX, |x, y| {
+        let (column, row) = ((x as f32 - left) / scale, (y as f32 - above) / scale);
+        if column < 0.0 || row < 0.0 || column >= columns as f32 || row >= rows as f32 {
+            return BACKGROUND;
+        }
+        let beam = row as usize * columns as usize + column as usize;
+        depth_color(points[beam].range_m, 1.0)
+    })
+}
+
+/// The sensor's surroundings from above, x up and y to the left.
+struct TopView {
+    picture: RgbImage,
+}
+
+impl TopView {
+    fn new(seen: &[LidarPoint]) -> Self {
+        let mut view = Self { picture: RgbImage::from_pixel(TILE_PX, TILE_PX, BACKGROUND) };
+        for point in seen.iter().filter(|point| point.range_m > 0.0 && point.p_sensor_m[2] < 1.0) {
+            view.dot([point.p_sensor_m[0], point.p_sensor_m[1]], 0, Rgb([208; 3]));
+        }
+        for ring_m in [2.0f32, 4.0, 6.0, 8.0] {
+            view.arc(ring_m, std::f32::consts::PI, Rgb([232, 220, 200]));
+        }
+        view.dot([0.0; 2], 2, Rgb([0; 3]));
+        view
+    }
+
+    fn add_points(&mut self, points: &[LidarPoint]) {
+        for point in points.iter().filter(|point| point.range_m > 0.0) {
+            let [x, y, z] = point.p_sensor_m;
+            let above = (z / 3.0).clamp(-0.5, 0.5);
+            self.dot([x, y], 0, coarse([0.5 + above, 0.15, 0.5 - above]));
+        }
+    }
+
+    fn add_cone(&mut self, half_rad: f32, range_m: f32) {
+        let ends = if range_m > 0.0 { range_m } else { SHOWN_M };
+        let color = Rgb([40, 80, 200]);
+        let steps = (ends * PX_PER_M) as u32;
+        for n in 0..steps {
+            let at_m = n as f32 / PX_PER_M;
+            for side in [-half_rad, half_rad] {
+                self.dot([at_m * side.cos(), at_m * side.sin()], 0, color);
+            }
+        }
+        if range_m > 0.0 {
+            for wider_px in 0..3u8 {
+                self.arc(range_m + f32::from(wider_px) / PX_PER_M, half_rad, Rgb([200, 40, 40]));
+            }
+        }
+    }
+
+    /// From one side of the sensor's axis to the other.
+    fn arc(&mut self, range_m: f32, half_rad: f32, color: Rgb<u8>) {
+        let steps = (2.0 * half_rad * range_m * PX_PER_M).ceil().max(1.0);
+        for n in 0..=steps as u32 {
+            let angle = half_rad * (2.0 * n as f32 / steps - 1.0);
+            self.dot([range_m * angle.cos(), range_m * angle.sin()], 0, color);
+        }
+    }
+
+    /// A square at a place; `wider_px` to each side of its pixel. [m, sensor]
+    fn dot(&mut self, [x_m, y_m]: [f32; 2], wider_px: i32, color: Rgb<u8>) {
+        let middle = TILE_PX as f32 / 2.0;
+        let (column, row) = (middle - y_m * PX_PER_M, middle - x_m * PX_PER_M);
+        for x in column as i32 - wider_px..=column as i32 + wider_px {
+            for y in row as i32 - wider_px..=row as i32 + wider_px {
+                if let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y))
+                    && let Some(pixel) = self.picture.get_pixel_mut_checked(x, y)
+                {
+                    *pixel = color;
+                }
+            }
+        }
+    }
+}
+
+const TILE_PX: u32 = 240;
+/// From the middle of a view to its side. [m]
+const SHOWN_M: f32 = 8.5;
+const PX_PER_M: f32 = TILE_PX as f32 / (2.0 * SHOWN_M);
+const BACKGROUND: Rgb<u8> = Rgb([248; 3]);
