@@ -55,12 +55,13 @@ pub const MODELS: [ImuModel; 4] = [
         gyro_range_radps: 34.9,
         stated_sigma: Some([0.01, 0.2]),
     },
-    // TDK InvenSense ICM-42688-P (DS-000347, tables 1 and 2): 2.8 mdps/sqrt(Hz), 70 ug/sqrt(Hz); 2000 dps, 16 g.
+    // TDK InvenSense ICM-42688-P (DS-000347 rev 1.7, first page): 2.8 mdps/sqrt(Hz), 70 ug/sqrt(Hz); 2000 dps, 16 g.
     ImuModel::chip("icm-42688-p", 2.8e-3, 70e-6, 16.0),
-    // Bosch BMI088 (BST-BMI088-DS001 rev 1.3: 2000 dps, 24 g): 0.014 dps/sqrt(Hz), as drivers of it quote. 175 ug/sqrt(Hz) is an
-    // estimate: the sheet's table of the accelerometer could not be read.
+    // Bosch BMI088 (BST-BMI088-DS001 rev 1.3: 2000 dps, 24 g): 0.014 dps/sqrt(Hz) and 175 ug/sqrt(Hz), as public code
+    // that uses one quotes its maker: the sheet's tables of noise could not be read.
     ImuModel::chip("bmi088", 0.014, 175e-6, 24.0),
-    // InvenSense MPU-6000 (PS-MPU-6000A-00 rev 3.4, sections 6.1 and 6.2): 0.005 dps/sqrt(Hz), 400 ug/sqrt(Hz); 2000 dps, 16 g.
+    // InvenSense MPU-6000 (PS-MPU-6000A-00 rev 3.4, sections 6.1 and 6.2): 0.005 dps/sqrt(Hz), 400 ug/sqrt(Hz), both at
+    // 10 Hz and in the narrowest range; that they hold in the widest, 2000 dps and 16 g, is an estimate.
     ImuModel::chip("mpu-6000", 0.005, 400e-6, 16.0),
 ];
 

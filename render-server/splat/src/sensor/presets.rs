@@ -1,5 +1,5 @@
-//! Named sensors, by the figures that their makers publish, with where each was read. What a data sheet leaves open, or could not
-//! be read, is called an estimate where it is filled in.
+//! Named sensors, by the figures that their makers publish, with where each was read. What a data sheet leaves open, or
+//! could not be read, is called an estimate where it is filled in.
 //!
 //! Accuracies that a data sheet states as bounds are taken for two standard deviations.
 
@@ -56,10 +56,11 @@ fn even(count: u32, lowest_deg: f32, highest_deg: f32) -> Vec<f32> {
     (0..count).map(|n| (highest_deg - step * n as f32).to_radians()).collect()
 }
 
-/// Velodyne VLP-16 at 10 Hz (user manual 63-9243 rev D): 16 beams from -15 to 15 degrees, 100 m, accuracy 3 cm typical, ranges in 2 mm,
-/// single return. Divergence: that of the same maker's VLS-128 (its manual, table F-1, page 115: 3.0 mrad along the scan, 1.5 mrad
-/// across it), the wider of both, for beams here are round. 1024 columns of its 1800, for a cloud of 16 x 1024. The manual names
-/// no reflectivity for its range: 100 m at 80 % is an estimate, and so is the resolution of two echoes.
+/// Velodyne VLP-16 at 10 Hz (user manual 63-9243 rev D): 16 beams from -15 to 15 degrees, 100 m, accuracy 3 cm typical,
+/// ranges in 2 mm, single return. Divergence: that of the same maker's VLS-128 (its manual, table F-1, page 115: 3.0
+/// mrad along the scan, 1.5 mrad across it), the wider of both, for beams here are round. 1024 columns of its 1800, for
+/// a cloud of 16 x 1024. The manual names no reflectivity for its range: 100 m at 80 % is an estimate, and so is the
+/// resolution of two echoes.
 pub fn vlp_16() -> LidarModel {
     LidarModel {
         beams: Beams::Spinning { elevations_rad: even(16, -15.0, 15.0), columns: 1024 },
@@ -77,8 +78,10 @@ pub fn vlp_16() -> LidarModel {
     }
 }
 
-/// Ouster OS1 of 16 or 64 rings at 1024 x 10 Hz (data sheet of the first OS1): 33.2 degrees, 0.8 to 120 m, 40 m at 10 %, steps of 12 mm,
-/// 1.5 cm repeatability at a good signal, divergence 0.13 degrees at half maximum (1/e^2 at 1.699 times that), strongest return.
+/// Ouster OS1 of 16 or 64 rings at 1024 x 10 Hz (data sheet of the first OS1, of 850 nm): 33.2 degrees, 0.8 to 120 m,
+/// 40 m at 10 %, steps of 12 mm, divergence 0.13 degrees at half maximum (1/e^2 at 1.699 times that), strongest return.
+/// One standard deviation is 1.5 cm at a good signal, 3 and 10 cm at weaker ones: that it grows by 0.4 mm a metre is an
+/// estimate, and so are rings that are evenly spaced and the resolution of two echoes.
 pub fn os1(rings: u32) -> LidarModel {
     LidarModel {
         beams: Beams::Spinning { elevations_rad: even(rings, -16.6, 16.6), columns: 1024 },
@@ -96,11 +99,12 @@ pub fn os1(rings: u32) -> LidarModel {
     }
 }
 
-/// Livox Mid-360 (the maker's specification, livoxtech.com/mid-360/specs, as public simulators of it quote): 360 by -7 to 52 degrees,
-/// 200 000 points a second in frames of 10 Hz, from 0.1 m, 40 m at 10 % and 70 m at 80 %, one standard deviation of at most 2 cm at
-/// 10 m, first return. Its directions are within 0.15 degrees, which is not modelled. Its pattern is not published as a formula: here one beam turns and nods
-/// at rates whose quotient is irrational, which covers the field ever more densely as the original does, in other curves. Divergence
-/// (3 mrad), step and the resolution of two echoes were found nowhere: estimates.
+/// Livox Mid-360 (the maker's specification, livoxtech.com/mid-360/specs, as public simulators of it quote): 360 by -7
+/// to 52 degrees, 200 000 points a second in frames of 10 Hz, from 0.1 m, 40 m at 10 % and 70 m at 80 %, one standard
+/// deviation of at most 2 cm at 10 m, first return. Its directions are within 0.15 degrees, which is not modelled. Its
+/// pattern is not published as a formula: here one beam turns and nods at rates whose quotient is irrational, which
+/// covers the field ever more densely as the original does, in other curves. Divergence (3 mrad), step and the
+/// resolution of two echoes were found nowhere: estimates.
 pub fn mid_360() -> LidarModel {
     LidarModel {
         beams: Beams::Rosette {
@@ -125,9 +129,9 @@ pub fn mid_360() -> LidarModel {
     }
 }
 
-/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 across the corners; 15 Hz with all zones and 4 m by vendors' texts). A zone's cone is
-/// one wide beam. Its errors (5 % beyond 20 cm), nearest range (2 cm) and the 88 % of the white target are estimates: the sheet's
-/// tables of them could not be read.
+/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 across the corners; 15 Hz with all zones and 4 m
+/// by vendors' texts). A zone's cone is one wide beam. Its errors (5 % beyond 20 cm), nearest range (2 cm) and the 88 %
+/// of the white target are estimates: the sheet's tables of them could not be read.
 pub fn vl53l5cx() -> LidarModel {
     let zone_rad = 45_f32.to_radians() / 8.0;
     LidarModel {
@@ -151,8 +155,11 @@ pub fn vl53l5cx() -> LidarModel {
     }
 }
 
-/// Zvision ML-30s, as its maker describes it for a simulator (`Example_Solid_State_ML30S.json`): 160 lines of 320 points over 140 x 70
-/// degrees at 10 Hz, 0.2 to 45 m, 3 cm. Divergence and the range at 10 % (20 m) are not given there.
+/// Zvision ML-30s (the maker's table for hardware B, as a public guide to fitting it on cranes prints it, and the
+/// maker's file for a simulator, `Example_Solid_State_ML30S.json`): 160 lines of 320 points over 140 x 70 degrees at
+/// 10 Hz, 0.2 to 45 m, 20 m at 10 % (14 m in the lower 40 degrees, which is not modelled), 3 cm repeated at one
+/// standard deviation, steps of 3 cm, pulses of 6 ns, which are 0.9 m of echo. Its field reaches from 50 degrees below
+/// to 20 above; here it is level, to be mounted 15 degrees down. Divergence was found nowhere: 5 mrad are an estimate.
 pub fn ml_30s() -> LidarModel {
     LidarModel {
         beams: Beams::Raster {
@@ -165,7 +172,7 @@ pub fn ml_30s() -> LidarModel {
         min_range_m: 0.2,
         max_range_m: 45.0,
         divergence_rad: 5.0e-3,
-        sigma_m: 0.015,
+        sigma_m: 0.03,
         sigma_per_m: 0.0,
         range_step_m: 0.03,
         resolution_m: 0.9,
@@ -175,7 +182,9 @@ pub fn ml_30s() -> LidarModel {
     }
 }
 
-/// Benewake TFmini (SJ-GU-TFmini-01): 2.3 degrees, 100 Hz, 0.3 to 12 m on 90 %, steps of 5 mm, within 1 % below 6 m.
+/// Benewake TFmini (SJ-GU-TFmini-01 A00, and the same sheet as Seeed prints it): 2.3 degrees, 100 Hz, 0.3 to 12 m,
+/// 12 m indoors on 90 %, steps of 5 mm, within 1 % below 6 m. From there on the sheet allows 2 %, which is not
+/// modelled; its 5 m on 10 % are 4 m here. The 2 mm close by and the resolution of two echoes are estimates.
 pub fn tfmini() -> RangeModel {
     RangeModel {
         rate_hz: 100.0,
@@ -191,10 +200,10 @@ pub fn tfmini() -> RangeModel {
     }
 }
 
-/// Garmin LIDAR-Lite v3 (operation manual and technical specifications, as a public survey of range finders quotes its table, and
-/// Garmin's product page): 8 mrad, 40 m on 70 %, 2.5 cm typical below 5 m and 10 cm from there on, steps of 1 cm, 270 readings a
-/// second typical; 5 cm at least. A deviation that grows by 1 mm a metre is half of both. Here it is asked 100 times a second.
-/// The resolution of two echoes is an estimate.
+/// Garmin LIDAR-Lite v3 (operation manual and technical specifications, as a public survey of range finders quotes its
+/// table, and Garmin's product page): 8 mrad, 40 m on 70 %, 2.5 cm typical below 5 m and 10 cm from there on, steps of
+/// 1 cm, 270 readings a second typical; 5 cm at least. A deviation that grows by 1 mm a metre is half of both. Here it
+/// is asked 100 times a second. The resolution of two echoes is an estimate.
 pub fn lidar_lite_v3() -> RangeModel {
     RangeModel {
         rate_hz: 100.0,
@@ -210,10 +219,13 @@ pub fn lidar_lite_v3() -> RangeModel {
     }
 }
 
-/// ST VL53L1X (DocID031281 rev 2): 27 degrees, up to 50 Hz, 4 cm to 4 m in the dark on white (88 %), within 20 mm.
+/// ST VL53L1X (DocID031281 rev 2: 27 degrees, up to 4 m and up to 50 Hz). Not both at once: the 4 m, in the dark on
+/// white, take 140 ms a reading, and 20 ms reach 1.3 m (UM2356, as drivers quote it). The manual of ST's BlueTile
+/// board, which carries one: 4 cm at least, 20 mm typical in the dark, white is 88 %. Readings are whole millimetres.
+/// The resolution of two echoes is an estimate.
 pub fn vl53l1x() -> RangeModel {
     RangeModel {
-        rate_hz: 50.0,
+        rate_hz: 7.0,
         fov_rad: 27_f32.to_radians(),
         min_range_m: 0.04,
         max_range_m: 4.0,
@@ -226,10 +238,12 @@ pub fn vl53l1x() -> RangeModel {
     }
 }
 
-/// MaxBotix MB1242 (I2CXL-MaxSonar-EZ4, PD11848): 42 kHz, 15 Hz over the whole range, 20 cm (nearer reads as 20 cm) to 765 cm, steps of
-/// 1 cm. The beam of this narrowest of the series is drawn, not stated: some 30 degrees for a wide target. Absorption at 42 kHz by ISO
-/// 9613-1 at 20 degrees and half humidity. Sound's speed changes by 0.17 % a kelvin: 1 %. Surfaces: slopes of 12 degrees,
-/// a twentieth scattered.
+/// MaxBotix MB1242 (I2CXL-MaxSonar-EZ4, PD11848): 42 kHz, 15 Hz over the whole range, 20 cm (nearer reads as 20 cm) to
+/// 765 cm, steps of 1 cm. The beam of this narrowest of the series is drawn for rods, not stated: some 30 degrees for a
+/// wide target are an estimate. Absorption at 42 kHz by ISO 9613-1 at 20 degrees and half humidity. Sound's speed
+/// changes by 0.17 % a kelvin (0.6 m/s, the maker's PD11500) and nothing corrects it: 0.3 %, by 2 kelvin, are an
+/// estimate. So are half a step of other error, the resolution of two echoes, that a wall is just heard at 765 cm, and
+/// surfaces: slopes of 12 degrees, a twentieth scattered.
 pub fn mb1242() -> SonarModel {
     SonarModel {
         rate_hz: 15.0,
@@ -240,16 +254,17 @@ pub fn mb1242() -> SonarModel {
         sigma_per_m: 0.003,
         range_step_m: 0.01,
         resolution_m: 0.1,
-        absorption_db_per_m: 1.3,
+        absorption_db_per_m: 1.4,
         slope_rad: 12_f32.to_radians(),
         diffuse: 0.05,
         reference_range_m: 7.65,
     }
 }
 
-/// HC-SR04 (the sheet that sellers of the module print, "Ultrasonic Ranging Module HC-SR04"): bursts of eight cycles at 40 kHz, which
-/// are 3.4 cm of echo, 2 cm to 4 m, 15 degrees, 3 mm, a reading every 60 ms. What it says of 15 degrees is taken for the full
-/// angle at -6 dB. That a wall is just heard at 4 m, how rough surfaces are, and the error by the air's temperature are estimates.
+/// HC-SR04 (the sheet that sellers of the module print, "Ultrasonic Ranging Module HC-SR04"): bursts of eight cycles at
+/// 40 kHz, which are 3.4 cm of echo, 2 cm to 4 m, 15 degrees, 3 mm, a reading every 60 ms. What it says of 15 degrees
+/// is taken for the full angle at -6 dB. That a wall is just heard at 4 m, how rough surfaces are, and the error by the
+/// air's temperature are estimates.
 pub fn hc_sr04() -> SonarModel {
     SonarModel {
         rate_hz: 16.0,
@@ -267,14 +282,16 @@ pub fn hc_sr04() -> SonarModel {
     }
 }
 
-/// TI IWR6843 on an evaluation module (SWRU585: 15 degrees of azimuth from 12 virtual antennas; TIDUE71D, the 8 m indoor chirp of people
-/// counting: 60.75 GHz, 8.4 cm of range, 16.2 km/h at most, 0.324 km/h of speed, 8.1 m). Field of view 120 x 30 degrees; a person (1 m^2)
-/// stands out at twice that range by 12 dB. Surfaces: gamma -10 dB, slopes of 15 degrees, a tenth reflected.
+/// TI IWR6843 on an evaluation module. SWRU585 (IWR6843L EVM): 15 degrees of azimuth from 12 virtual antennas.
+/// TIDUE71D, the 8 m indoor chirp of people counting: 60.75 GHz, a frame every 55 ms, 8.4 cm of range, 16.2 km/h at
+/// most, 0.324 km/h of speed, 8.1 m. Its field of view of some 120 x 40 degrees is taken for the angles at -6 dB. It
+/// follows people to 15 m with another chirp; that a person (1 m^2) stands out by 12 dB at twice the range of this one
+/// is an estimate, and so are the nearest range and surfaces: gamma -10 dB, slopes of 15 degrees, a tenth reflected.
 pub fn iwr6843() -> RadarModel {
     RadarModel {
         rate_hz: 18.0,
         azimuth_fov_rad: 120_f32.to_radians(),
-        elevation_fov_rad: 30_f32.to_radians(),
+        elevation_fov_rad: 40_f32.to_radians(),
         min_range_m: 0.1,
         max_range_m: 8.1,
         range_resolution_m: 0.084,

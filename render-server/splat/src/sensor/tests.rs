@@ -325,12 +325,12 @@ fn a_sonar_hears_the_nearest_that_faces_it() {
     // Nearer than it can tell reads as the nearest that it can.
     let near = heard(&wall(Vec3::X * 0.1, -Vec3::X, 0.5, 0.02), 1);
     assert!((near.range_m - 0.2).abs() < 1e-6, "{near:?}");
-    // A quarter of the power per half of the range, and two ways of air: 2 * 1.3 dB/m.
+    // A quarter of the power per half of the range, and two ways of air: 2 * 1.4 dB/m.
     let (two, four) = (
         heard(&wall(Vec3::X * 2.0, -Vec3::X, 3.0, 0.1), 1).strength,
         heard(&wall(Vec3::X * 4.0, -Vec3::X, 3.0, 0.1), 1).strength,
     );
-    let expected_db = 20.0 * 2f32.log10() + 2.0 * 1.3 * 2.0;
+    let expected_db = 20.0 * 2f32.log10() + 2.0 * 1.4 * 2.0;
     assert!((10.0 * (two / four).log10() - expected_db).abs() < 1.5, "{two} {four}");
 }
 
