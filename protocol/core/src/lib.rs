@@ -12,16 +12,20 @@
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
 //! - [`sensor`]: sensors beside the cameras, by kind; their readings on the wire and in shared memory;
-//! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is.
+//! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is. It and [`failsafe`] are the
+//!   feature `mavlink`: a plugin needs neither, and its dialect takes as long to compile as all the rest.
 //!
 //! Absent on purpose: sockets, clocks, threads, files.
 
 #![no_std]
 
+mod copter_mode;
+#[cfg(feature = "mavlink")]
 pub mod failsafe;
 pub mod flight_end;
 pub mod geometry;
 pub mod histogram;
+#[cfg(feature = "mavlink")]
 pub mod mavlink;
 pub mod messages;
 pub mod packet;

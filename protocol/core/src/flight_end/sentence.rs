@@ -3,7 +3,7 @@
 use core::fmt;
 
 use super::{Boundary, Collision, EndReason, FenceBreach, Missing, Obstacle, PluginFault};
-use crate::mavlink::CopterMode;
+use crate::copter_mode::CopterMode;
 
 impl EndReason {
     /// Returns a few words, as a headline.

@@ -16,7 +16,8 @@ mod stream;
 pub use ::mavlink::dialects::ardupilotmega as dialect;
 pub use ::mavlink::{MavHeader, MavlinkVersion, Message, MessageData};
 
-pub use command::{CopterMode, command_name, result_name};
+pub use crate::copter_mode::CopterMode;
+pub use command::{command_name, result_name};
 pub use distance::{distance_to_mavlink, obstacles_to_mavlink};
 pub use fence::{
     FenceCorner, FenceSide, GlobalPoint, fence_corner_from_mavlink, fence_corner_to_mavlink,
