@@ -42,8 +42,6 @@ mod tests {
 
     use crate::{CameraInfo, ImageStamps, ObservationBuffer};
 
-    use super::*;
-
     #[test]
     fn matrices_lie_over_the_image_itself() {
         let front = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(7, 5, 1.5));

@@ -32,6 +32,8 @@ pub mod packet;
 pub mod sensor;
 pub mod time;
 
+pub use copter_mode::CopterMode;
+
 /// Version of everything in this crate that crosses a wire or shared memory.
 ///
 /// Raise it with any change that an older peer would misread. Peers compare it first
