@@ -28,8 +28,7 @@ use crate::terminal::print_fmt;
 with RAYON_NUM_THREADS=1 it is close to the processor's time.
 
 The sheet's pictures, in the order of the list: LiDARs that look all around, range finders, sonars and radars from
-above, the sensor in the middle looking up, with rings of 2, 4, 6 and 8 m; other LiDARs as the image that their beams
-are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a cone ends
+above, the sensor in the middle looking up, with a ring each metre; other LiDARs as the image that their beams are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a cone ends
 at its reading; a radar's detections are red where they come closer, blue where they go away.
 
 Examples:
@@ -240,16 +239,27 @@ fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
 /// The sensor's surroundings from above, x up and y to the left.
 struct TopView {
     picture: RgbImage,
+    px_per_m: f32,
 }
 
 impl TopView {
+    /// Shows what most of the surroundings are within, 2 to 8 m.
     fn new(seen: &[LidarPoint]) -> Self {
-        let mut view = Self { picture: RgbImage::from_pixel(TILE_PX, TILE_PX, BACKGROUND) };
+        let mut aside_m: Vec<f32> = seen
+            .iter()
+            .filter(|point| point.range_m > 0.0)
+            .map(|point| point.p_sensor_m[0].hypot(point.p_sensor_m[1]))
+            .collect();
+        aside_m.sort_unstable_by(f32::total_cmp);
+        let most_m = aside_m.get(aside_m.len() * 9 / 10).map_or(8.0, |most_m| most_m * 1.2);
+        let picture = RgbImage::from_pixel(TILE_PX, TILE_PX, BACKGROUND);
+        let px_per_m = TILE_PX as f32 / 2.0 / most_m.clamp(2.0, 8.0);
+        let mut view = Self { picture, px_per_m };
         for point in seen.iter().filter(|point| point.range_m > 0.0 && point.p_sensor_m[2] < 1.0) {
             view.dot([point.p_sensor_m[0], point.p_sensor_m[1]], 0, Rgb([208; 3]));
         }
-        for ring_m in [2.0f32, 4.0, 6.0, 8.0] {
-            view.arc(ring_m, std::f32::consts::PI, Rgb([232, 220, 200]));
+        for ring_m in 1..12u8 {
+            view.arc(f32::from(ring_m), std::f32::consts::PI, Rgb([232, 220, 200]));
         }
         view.dot([0.0; 2], 2, Rgb([0; 3]));
         view
@@ -264,25 +274,28 @@ impl TopView {
     }
 
     fn add_cone(&mut self, half_rad: f32, range_m: f32) {
-        let ends = if range_m > 0.0 { range_m } else { SHOWN_M };
+        let ends_m = if range_m > 0.0 { range_m } else { 12.0 };
         let color = Rgb([40, 80, 200]);
-        let steps = (ends * PX_PER_M) as u32;
-        for n in 0..steps {
-            let at_m = n as f32 / PX_PER_M;
+        for n in 0..(ends_m * self.px_per_m) as u32 {
+            let at_m = n as f32 / self.px_per_m;
             for side in [-half_rad, half_rad] {
                 self.dot([at_m * side.cos(), at_m * side.sin()], 0, color);
             }
         }
         if range_m > 0.0 {
             for wider_px in 0..3u8 {
-                self.arc(range_m + f32::from(wider_px) / PX_PER_M, half_rad, Rgb([200, 40, 40]));
+                self.arc(
+                    range_m + f32::from(wider_px) / self.px_per_m,
+                    half_rad,
+                    Rgb([200, 40, 40]),
+                );
             }
         }
     }
 
     /// From one side of the sensor's axis to the other.
     fn arc(&mut self, range_m: f32, half_rad: f32, color: Rgb<u8>) {
-        let steps = (2.0 * half_rad * range_m * PX_PER_M).ceil().max(1.0);
+        let steps = (2.0 * half_rad * range_m * self.px_per_m).ceil().max(1.0);
         for n in 0..=steps as u32 {
             let angle = half_rad * (2.0 * n as f32 / steps - 1.0);
             self.dot([range_m * angle.cos(), range_m * angle.sin()], 0, color);
@@ -292,7 +305,7 @@ impl TopView {
     /// A square at a place; `wider_px` to each side of its pixel. [m, sensor]
     fn dot(&mut self, [x_m, y_m]: [f32; 2], wider_px: i32, color: Rgb<u8>) {
         let middle = TILE_PX as f32 / 2.0;
-        let (column, row) = (middle - y_m * PX_PER_M, middle - x_m * PX_PER_M);
+        let (column, row) = (middle - y_m * self.px_per_m, middle - x_m * self.px_per_m);
         for x in column as i32 - wider_px..=column as i32 + wider_px {
             for y in row as i32 - wider_px..=row as i32 + wider_px {
                 if let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y))
@@ -306,7 +319,4 @@ impl TopView {
 }
 
 const TILE_PX: u32 = 240;
-/// From the middle of a view to its side. [m]
-const SHOWN_M: f32 = 8.5;
-const PX_PER_M: f32 = TILE_PX as f32 / (2.0 * SHOWN_M);
 const BACKGROUND: Rgb<u8> = Rgb([248; 3]);

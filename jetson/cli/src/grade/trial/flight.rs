@@ -1,180 +1,41 @@
-//! One graded flight on a virtual clock: simulated vehicle, runtime, referee, renderer in one thread,
-//! and the plugin in a process of its own that is waited for.
-//!
-//! ```text
-//! tick of 2.5 ms:  Simulation ──MAVLink──▶ Lockstep ──MAVLink──▶ Simulation
-//!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Lockstep
-//! image is due:    Referee's motion ─▶ where the vehicle will be when it is seen ─▶ CpuRenderer
-//! sensor is due:   likewise ─▶ reading, on its way as long as an image
-//! image is seen:   observation ─▶ plugin ─▶ answer; it counts `answer` later
-//! ```
-//! No wall clock decides anything but that a plugin is hung, and no order of threads anything at
-//! all: the same program, plugin, course and seed give the same bits on the same kind of processor.
-//! [`Flown::hash`] is over all of them.
+//! A graded flight as it happens, tick by tick: the loop of `trial`.
 
-use std::cell::Cell;
 use std::collections::VecDeque;
-use std::ffi::OsString;
-use std::fs::File;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::atomic::Ordering;
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::{DQuat, DVec3};
 use sha2::{Digest, Sha256};
-use vizflyt_arena::crash::{ClearanceAhead, Flight as Record, TimedSetpoint, ahead_m};
+use vizflyt_arena::crash::{ClearanceAhead, TimedSetpoint, ahead_m};
 use vizflyt_arena::pose::{Measured, Predict};
-use vizflyt_arena::verdict::{Sample, Verdict, judge_ended};
+use vizflyt_arena::verdict::{Sample, judge_ended};
 use vizflyt_arena::{ArenaConfig, Referee};
 use vizflyt_protocol::flight_end::FlightEnd;
-use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::messages::{CameraInfo, Event, FlightPhase, Limits, Odometry, Setpoint};
-use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::flight::FlightSettings;
 use vizflyt_runtime::guard::VehicleMotion;
 use vizflyt_runtime::lockstep::{Lockstep, PluginProcess};
-use vizflyt_runtime::log::{GivenImage, LoggedImages, VirtualLog};
+use vizflyt_runtime::log::VirtualLog;
 use vizflyt_runtime::stream::Reading;
-use vizflyt_runtime::supervisor::{PluginLimits, Stream};
+use vizflyt_runtime::supervisor::Stream;
 use vizflyt_sdk::{ImageStamps, ObservationWriter};
 use vizflyt_server::poses::newest::Localized;
 use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::imaging::{CameraEffects, EffectInput};
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
 use vizflyt_server::render::sensors::{Around, MadeReading, SensorSet, VehicleSensors};
-use vizflyt_simulator::imu::ImuModel;
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
 use vizflyt_splat::sensor::SensorScene;
 use vizflyt_splat::weather::WeatherPass;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
 
-use super::course::CourseInstance;
+use super::kept::{Keyframes, Lines};
+use super::pending::{Pending, Picture};
+use super::{AnotherWay, Delays, Reached, Trial, TrialImage, TrialLog, TrialResult};
 use crate::evaluate::Stamped;
-
-/// How long things take in a graded flight, always the same.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Delays {
-    /// From one image to the next, of cameras that have no rate of their own. [ns]
-    pub image_period_ns: i64,
-    /// From the start of rendering until the plugin is given the image, which shows the vehicle where
-    /// it is by then, as far as can be foretold. [ns]
-    pub image_ns: i64,
-    /// From when the plugin is given an image until its answer counts. [ns]
-    pub answer_ns: i64,
-}
-
-/// What is flown, and how.
-pub(crate) struct Trial<'a> {
-    /// Where.
-    pub course: &'a CourseInstance,
-    /// Seed of the course and of the simulator's noise.
-    pub seed: u64,
-    /// The command that starts the plugin.
-    pub command: &'a [OsString],
-    /// What it may use.
-    pub limits: &'a PluginLimits,
-    /// A plugin that takes more of its own time for an answer has failed.
-    pub answer_within: Duration,
-    /// The time model.
-    pub delays: Delays,
-    /// The simulated inertial sensor.
-    pub imu: ImuModel,
-    /// Ends it.
-    pub stop: &'a AtomicBool,
-    /// Where it is logged, if it is.
-    pub log: Option<TrialLog<'a>>,
-    /// How far it came, until it is over: the next attempt has to come by there.
-    pub reached: &'a Cell<Option<Reached>>,
-}
-
-/// How far a flight came.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Reached {
-    /// Images that the plugin has answered.
-    images: u64,
-    /// Over all until then.
-    hash: [u8; 32],
-}
-
-/// A flight that was lost and flown again went another way: a plugin that draws lots could have ended itself to draw
-/// again.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "flown again, it went another way before it came to where it was lost; a plugin that is not the same every time \
-     and is killed gets no grade"
-)]
-pub(crate) struct AnotherWay;
-
-/// Where a flight is logged.
-pub(crate) struct TrialLog<'a> {
-    /// An empty file.
-    pub file: &'a File,
-    /// Which images it keeps.
-    pub images: LoggedImages,
-    /// Whether depth is written for viewers, too.
-    pub depth: bool,
-    /// The plugin as the command line names it.
-    pub plugin: &'a OsString,
-}
-
-/// One image that the plugin was given, for the report.
-#[derive(Clone, Debug)]
-pub(crate) struct TrialImage {
-    /// The instant that it shows.
-    pub stamp: ServerTime,
-    /// H x W x 3.
-    pub rgb: Vec<u8>,
-    /// Its size. [px]
-    pub size_px: (u32, u32),
-}
-
-/// The result of a trial.
-#[derive(Clone, Debug)]
-pub(crate) struct TrialResult {
-    /// The score.
-    pub verdict: Verdict,
-    /// Over all samples, setpoints, events and images.
-    pub hash: [u8; 32],
-    /// All that happened, in order.
-    pub events: Vec<Event>,
-    /// Where it was, 200 a second.
-    pub samples: Vec<Sample>,
-    /// The plugin's setpoints.
-    pub asked: Vec<TimedSetpoint>,
-    /// What was ahead in the images that it answered.
-    pub seen: Vec<ClearanceAhead>,
-    /// The newest images until the flight was decided.
-    pub shots: VecDeque<TrialImage>,
-    /// Images from take-off until then, evenly spread.
-    pub keyframes: Vec<TrialImage>,
-    /// The last lines that the plugin printed.
-    pub lines: VecDeque<String>,
-    /// Images that the plugin answered.
-    pub images: u64,
-    /// Where the plugin thought it was.
-    pub odometry: Vec<Odometry>,
-    /// Where the simulated vehicle truly was, 200 a second, while a plugin publishes.
-    pub truth: Vec<Stamped>,
-    /// Virtual time. [s]
-    pub virtual_s: f64,
-}
-
-impl TrialResult {
-    /// Returns the record from which its probable cause is found.
-    pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
-        Record {
-            verdict: &self.verdict,
-            samples: &self.samples,
-            asked: Some(&self.asked),
-            seen: &self.seen,
-            last_line: self.lines.back().map(String::as_str),
-            delay_s: (delays.image_ns + delays.answer_ns) as f64 * 1e-9,
-        }
-    }
-}
 
 /// Where the clocks start: far enough from zero that nothing is before it. [ns]
 const START_NS: u64 = 10_000_000_000;
@@ -190,107 +51,10 @@ const POSES_PER_SENT: u64 = 2;
 const SHOWN_S: f64 = 2.0;
 /// The time between two of them. [s]
 const SHOT_PERIOD_S: f64 = 0.1;
-/// Images of a whole flight that the report shows, at most; at least half as many of any that takes a few seconds.
-const KEYFRAMES: usize = 16;
-/// Two of them are at least so far apart. [s]
-const KEYFRAME_PERIOD_S: f64 = 0.25;
 /// Between two poses of the truth. [s]
 const TRUTH_PERIOD_S: f64 = 4e-3;
 /// So many are kept before the first estimate: more than 10 s, the age that one may have.
 const TRUTH_BEFORE_FIRST: usize = 2500;
-/// Lines of the plugin that are kept.
-const LINES: usize = 200;
-
-impl Trial<'_> {
-    /// Flies; `None` if it is ended by [`Self::stop`]. Call it on a thread that lives as long: the
-    /// plugin dies with it.
-    ///
-    /// # Errors
-    /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
-    /// verdict.
-    pub(crate) fn fly(&self) -> Result<Option<TrialResult>> {
-        let expected = self.reached.get();
-        let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
-        let mut flight = Flight::new(self, process)?;
-        let result = flight.run();
-        flight.lockstep.stop(&mut flight.lines.sink());
-        flight.log_lines();
-        if !result? {
-            return Ok(None);
-        }
-        ensure!(expected.is_none_or(|expected| expected.images <= flight.answered), AnotherWay);
-        if let Some(log) = flight.lockstep.take_log() {
-            log.finish().context("the flight's log cannot be written")?;
-        }
-        Ok(Some(flight.end()))
-    }
-}
-
-/// An image on its way to the plugin.
-struct Pending {
-    /// When the plugin is given it.
-    due: HostTime,
-    seq: u64,
-    /// Of the newest pose behind it.
-    pose: ServerTime,
-    /// What it shows.
-    shown: ServerTime,
-    /// Where the vehicle is by then.
-    world_from_body: Pose<World, Body>,
-    /// By camera; those not rendered this time are `None`.
-    rendered: Vec<Option<Picture>>,
-}
-
-/// What a plugin gets of a camera.
-#[derive(Debug, Default)]
-struct Picture {
-    rgb: Vec<u8>,
-    depth_mm: Vec<u16>,
-    /// What is ahead, for the report; also where the plugin gets no depth. [m, cam]
-    ahead_m: Option<f64>,
-}
-
-impl Picture {
-    fn add_to(&self, hash: &mut Sha256) {
-        hash.update(&self.rgb);
-        for depth_mm in self.depth_mm.chunks(4096) {
-            let mut bytes = [0; 2 * 4096];
-            for (pair, mm) in bytes.chunks_exact_mut(2).zip(depth_mm) {
-                pair.copy_from_slice(&mm.to_le_bytes());
-            }
-            hash.update(&bytes[..2 * depth_mm.len()]);
-        }
-    }
-}
-
-impl Pending {
-    /// Returns what the log says of each camera's image.
-    fn headers(&self, cameras: &[CameraInfo]) -> Vec<ImageHeader> {
-        let header = |(index, camera): (usize, &CameraInfo)| {
-            let CameraInfo { intrinsics, body_from_cam, .. } = camera;
-            let camera = index as u8;
-            let of = (intrinsics, body_from_cam, &self.world_from_body);
-            let mut header = ImageHeader::new(self.seq, camera, self.pose, of.0, of.1, of.2);
-            header.exposure_ns = self.shown.as_ns().into();
-            header
-        };
-        cameras.iter().enumerate().map(header).collect()
-    }
-
-    /// Returns the images that were rendered, for the log.
-    fn given<'a>(
-        &'a self,
-        cameras: &'a [CameraInfo],
-        headers: &'a [ImageHeader],
-    ) -> Vec<GivenImage<'a>> {
-        let pose = HostTime::from_ns(self.pose.as_ns());
-        let given = |((camera, header), picture): ((&'a CameraInfo, _), &'a Option<Picture>)| {
-            let Picture { rgb, depth_mm, .. } = picture.as_ref()?;
-            Some(GivenImage { header, name: camera.name.as_str(), pose, rgb, depth_mm })
-        };
-        cameras.iter().zip(headers).zip(&self.rendered).filter_map(given).collect()
-    }
-}
 
 /// The sensors beside the cameras, in a course that has some.
 struct Sensing {
@@ -312,12 +76,12 @@ impl Sensing {
     }
 }
 
-struct Flight<'a> {
+pub(super) struct Flight<'a> {
     trial: &'a Trial<'a>,
     arena: &'a ArenaConfig,
     cameras: Vec<CameraInfo>,
     simulation: Simulation,
-    lockstep: Lockstep,
+    pub(super) lockstep: Lockstep,
     referee: Referee,
     renderer: CpuRenderer,
     weather: WeatherPass,
@@ -338,8 +102,8 @@ struct Flight<'a> {
     scratch: Vec<u16>,
     shots: VecDeque<TrialImage>,
     keyframes: Keyframes,
-    lines: Lines,
-    answered: u64,
+    pub(super) lines: Lines,
+    pub(super) answered: u64,
     odometry: Vec<Odometry>,
     truth: VecDeque<Stamped>,
     /// How it ends, by all that happened so far.
@@ -347,7 +111,7 @@ struct Flight<'a> {
 }
 
 impl<'a> Flight<'a> {
-    fn new(trial: &'a Trial<'a>, process: PluginProcess) -> Result<Self> {
+    pub(super) fn new(trial: &'a Trial<'a>, process: PluginProcess) -> Result<Self> {
         let arena = &trial.course.arena;
         let now = HostTime::from_ns(START_NS);
         let config = SimulationConfig {
@@ -419,7 +183,7 @@ impl<'a> Flight<'a> {
     }
 
     /// Logs what the plugin has printed since the last call.
-    fn log_lines(&mut self) {
+    pub(super) fn log_lines(&mut self) {
         let Some(log) = self.lockstep.log() else { return self.lines.fresh.clear() };
         for (stream, text) in self.lines.fresh.drain(..) {
             let stream = match stream {
@@ -431,7 +195,7 @@ impl<'a> Flight<'a> {
     }
 
     /// Flies to the end; false if it is stopped.
-    fn run(&mut self) -> Result<bool> {
+    pub(super) fn run(&mut self) -> Result<bool> {
         self.lockstep.begin(self.now, &mut self.lines.sink())?;
         self.log_lines();
         loop {
@@ -754,7 +518,7 @@ impl<'a> Flight<'a> {
         self.now.seconds_since(HostTime::from_ns(START_NS))
     }
 
-    fn end(mut self) -> TrialResult {
+    pub(super) fn end(mut self) -> TrialResult {
         let virtual_s = self.virtual_s();
         // Server's and runtime's, each in order, become one story.
         self.events.sort_by_key(|event| event.stamp);
@@ -772,85 +536,6 @@ impl<'a> Flight<'a> {
             odometry: self.odometry,
             truth: self.truth.into(),
             virtual_s,
-        }
-    }
-}
-
-/// What the plugin prints.
-#[derive(Debug, Default)]
-struct Lines {
-    /// The last lines.
-    kept: VecDeque<String>,
-    /// Those that are not logged yet.
-    fresh: Vec<(Stream, String)>,
-}
-
-impl Lines {
-    /// Returns who hears them.
-    fn sink(&mut self) -> impl FnMut(Stream, &str) {
-        |stream, text| {
-            if self.kept.len() == LINES {
-                self.kept.pop_front();
-            }
-            self.kept.push_back(text.to_owned());
-            self.fresh.push((stream, text.to_owned()));
-        }
-    }
-}
-
-/// Images spread evenly over a flight, however long it takes.
-#[derive(Debug)]
-struct Keyframes {
-    images: Vec<TrialImage>,
-    period_s: f64,
-}
-
-impl Default for Keyframes {
-    fn default() -> Self {
-        Self { images: Vec::new(), period_s: KEYFRAME_PERIOD_S }
-    }
-}
-
-impl Keyframes {
-    /// Takes the image of this instant if one is due.
-    fn take(&mut self, stamp: ServerTime, image: impl FnOnce() -> TrialImage) {
-        let is_due = self
-            .images
-            .last()
-            .is_none_or(|last| stamp.seconds_since(last.stamp) >= self.period_s - 0.5 * 2.5e-3);
-        if !is_due {
-            return;
-        }
-        self.images.push(image());
-        if self.images.len() > KEYFRAMES {
-            let mut index = 0;
-            self.images.retain(|_| {
-                index += 1;
-                index % 2 == 1
-            });
-            self.period_s *= 2.0;
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn keyframes_are_spread_over_any_flight() {
-        for seconds in [3, 10, 60, 600] {
-            let mut keyframes = Keyframes::default();
-            for image in 0..seconds * 30 {
-                let stamp = ServerTime::from_ns(image * 33_333_333);
-                let image = || TrialImage { stamp, rgb: Vec::new(), size_px: (0, 0) };
-                keyframes.take(stamp, image);
-            }
-            let stamps: Vec<_> = keyframes.images.iter().map(|image| image.stamp).collect();
-            let gaps = || stamps.windows(2).map(|pair| pair[1].seconds_since(pair[0]));
-            let (least, most) = (gaps().reduce(f64::min), gaps().reduce(f64::max));
-            assert!((KEYFRAMES / 2..=KEYFRAMES).contains(&stamps.len()), "{seconds} s: {stamps:?}");
-            assert!(most.unwrap() < 1.4 * least.unwrap(), "{seconds} s: {least:?} {most:?}");
         }
     }
 }

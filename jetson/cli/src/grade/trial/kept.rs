@@ -1,0 +1,94 @@
+//! What of a flight is kept for its report: the plugin's last lines, and images of the whole way.
+
+use std::collections::VecDeque;
+
+use vizflyt_protocol::time::ServerTime;
+use vizflyt_runtime::supervisor::Stream;
+
+use super::TrialImage;
+
+/// Images of a whole flight that the report shows, at most; at least half as many of any that takes a few seconds.
+const KEYFRAMES: usize = 16;
+/// Two of them are at least so far apart. [s]
+const KEYFRAME_PERIOD_S: f64 = 0.25;
+/// Lines of the plugin that are kept.
+const LINES: usize = 200;
+
+/// What the plugin prints.
+#[derive(Debug, Default)]
+pub(super) struct Lines {
+    /// The last lines.
+    pub(super) kept: VecDeque<String>,
+    /// Those that are not logged yet.
+    pub(super) fresh: Vec<(Stream, String)>,
+}
+
+impl Lines {
+    /// Returns who hears them.
+    pub(super) fn sink(&mut self) -> impl FnMut(Stream, &str) {
+        |stream, text| {
+            if self.kept.len() == LINES {
+                self.kept.pop_front();
+            }
+            self.kept.push_back(text.to_owned());
+            self.fresh.push((stream, text.to_owned()));
+        }
+    }
+}
+
+/// Images spread evenly over a flight, however long it takes.
+#[derive(Debug)]
+pub(super) struct Keyframes {
+    pub(super) images: Vec<TrialImage>,
+    period_s: f64,
+}
+
+impl Default for Keyframes {
+    fn default() -> Self {
+        Self { images: Vec::new(), period_s: KEYFRAME_PERIOD_S }
+    }
+}
+
+impl Keyframes {
+    /// Takes the image of this instant if one is due.
+    pub(super) fn take(&mut self, stamp: ServerTime, image: impl FnOnce() -> TrialImage) {
+        let is_due = self
+            .images
+            .last()
+            .is_none_or(|last| stamp.seconds_since(last.stamp) >= self.period_s - 0.5 * 2.5e-3);
+        if !is_due {
+            return;
+        }
+        self.images.push(image());
+        if self.images.len() > KEYFRAMES {
+            let mut index = 0;
+            self.images.retain(|_| {
+                index += 1;
+                index % 2 == 1
+            });
+            self.period_s *= 2.0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keyframes_are_spread_over_any_flight() {
+        for seconds in [3, 10, 60, 600] {
+            let mut keyframes = Keyframes::default();
+            for image in 0..seconds * 30 {
+                let stamp = ServerTime::from_ns(image * 33_333_333);
+                let image = || TrialImage { stamp, rgb: Vec::new(), size_px: (0, 0) };
+                keyframes.take(stamp, image);
+            }
+            let stamps: Vec<_> = keyframes.images.iter().map(|image| image.stamp).collect();
+            let gaps = || stamps.windows(2).map(|pair| pair[1].seconds_since(pair[0]));
+            let (least, most) = (gaps().reduce(f64::min), gaps().reduce(f64::max));
+            assert!((KEYFRAMES / 2..=KEYFRAMES).contains(&stamps.len()), "{seconds} s: {stamps:?}");
+            assert!(most.unwrap() < 1.4 * least.unwrap(), "{seconds} s: {least:?} {most:?}");
+        }
+    }
+}

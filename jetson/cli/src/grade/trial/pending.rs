@@ -1,0 +1,74 @@
+//! Images on their way to the plugin.
+
+use sha2::{Digest, Sha256};
+use vizflyt_protocol::geometry::{Body, Pose, World};
+use vizflyt_protocol::messages::CameraInfo;
+use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::time::{HostTime, ServerTime};
+use vizflyt_runtime::log::GivenImage;
+
+/// An image on its way to the plugin.
+pub(super) struct Pending {
+    /// When the plugin is given it.
+    pub(super) due: HostTime,
+    pub(super) seq: u64,
+    /// Of the newest pose behind it.
+    pub(super) pose: ServerTime,
+    /// What it shows.
+    pub(super) shown: ServerTime,
+    /// Where the vehicle is by then.
+    pub(super) world_from_body: Pose<World, Body>,
+    /// By camera; those not rendered this time are `None`.
+    pub(super) rendered: Vec<Option<Picture>>,
+}
+
+/// What a plugin gets of a camera.
+#[derive(Debug, Default)]
+pub(super) struct Picture {
+    pub(super) rgb: Vec<u8>,
+    pub(super) depth_mm: Vec<u16>,
+    /// What is ahead, for the report; also where the plugin gets no depth. [m, cam]
+    pub(super) ahead_m: Option<f64>,
+}
+
+impl Picture {
+    pub(super) fn add_to(&self, hash: &mut Sha256) {
+        hash.update(&self.rgb);
+        for depth_mm in self.depth_mm.chunks(4096) {
+            let mut bytes = [0; 2 * 4096];
+            for (pair, mm) in bytes.chunks_exact_mut(2).zip(depth_mm) {
+                pair.copy_from_slice(&mm.to_le_bytes());
+            }
+            hash.update(&bytes[..2 * depth_mm.len()]);
+        }
+    }
+}
+
+impl Pending {
+    /// Returns what the log says of each camera's image.
+    pub(super) fn headers(&self, cameras: &[CameraInfo]) -> Vec<ImageHeader> {
+        let header = |(index, camera): (usize, &CameraInfo)| {
+            let CameraInfo { intrinsics, body_from_cam, .. } = camera;
+            let camera = index as u8;
+            let of = (intrinsics, body_from_cam, &self.world_from_body);
+            let mut header = ImageHeader::new(self.seq, camera, self.pose, of.0, of.1, of.2);
+            header.exposure_ns = self.shown.as_ns().into();
+            header
+        };
+        cameras.iter().enumerate().map(header).collect()
+    }
+
+    /// Returns the images that were rendered, for the log.
+    pub(super) fn given<'a>(
+        &'a self,
+        cameras: &'a [CameraInfo],
+        headers: &'a [ImageHeader],
+    ) -> Vec<GivenImage<'a>> {
+        let pose = HostTime::from_ns(self.pose.as_ns());
+        let given = |((camera, header), picture): ((&'a CameraInfo, _), &'a Option<Picture>)| {
+            let Picture { rgb, depth_mm, .. } = picture.as_ref()?;
+            Some(GivenImage { header, name: camera.name.as_str(), pose, rgb, depth_mm })
+        };
+        cameras.iter().zip(headers).zip(&self.rendered).filter_map(given).collect()
+    }
+}
