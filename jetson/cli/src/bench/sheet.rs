@@ -1,9 +1,12 @@
 //! Pictures side by side, in rows of four.
 
+use std::fs::File;
+use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use image::{Rgb, RgbImage};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ImageError, Rgb, RgbImage};
 use vizflyt_splat::RgbdImage;
 
 const COLUMNS: u32 = 4;
@@ -35,7 +38,15 @@ impl Sheet {
             let at = (i64::from(n % COLUMNS * width), i64::from(n / COLUMNS * height));
             image::imageops::replace(&mut all, tile, at.0, at.1);
         }
-        all.save(file).with_context(|| format!("cannot write {}", file.display()))
+        // A picture for a document: small rather than quickly written.
+        File::create(file)
+            .map_err(ImageError::from)
+            .and_then(|out| {
+                let (best, adaptive) = (CompressionType::Best, FilterType::Adaptive);
+                let encoder = PngEncoder::new_with_quality(BufWriter::new(out), best, adaptive);
+                all.write_with_encoder(encoder)
+            })
+            .with_context(|| format!("cannot write {}", file.display()))
     }
 }
 
