@@ -44,7 +44,7 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class SmallUNet(nn.Module):
-    """Ronneberger et al. 2015, with few channels, three halvings; first and last stage look at squares of 2 x 2 pixels."""
+    """Ronneberger et al. 2015, with few channels and three halvings; it sees and answers squares of 2 x 2 pixels."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
