@@ -400,6 +400,9 @@ async function align(browser) {
   const server = start("scene", "align", at("room"), "--no-browser", "--renderer", "cpu");
   const [, url] = await server.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
+  // The panel comes later than the first picture, as on a busy computer: what it asks for, it takes.
+  await page.route("**/align.js", (route) => setTimeout(() => route.continue(), 1000));
+  await page.reload();
   const press = (name) => page.getByRole("button", { name, exact: true }).click();
   /** Clicks into a picture that shows where the camera is now; returns the server's answer. */
   const pick = async (x, y) => {

@@ -265,7 +265,7 @@ panel.setAttribute("aria-label", "align the scene with the room");
 function draw() {
   const focus = document.activeElement?.getAttribute("aria-label");
   const scrolled = panel.scrollTop;
-  const hint = busy ? "looking …" : wanted ? HINTS[wanted.kind](wanted.index) : "fly and look: is the floor level, do the walls stand where they should?";
+  const hint = !shown ? "the scene is being drawn …" : busy ? "looking …" : wanted ? HINTS[wanted.kind](wanted.index) : "fly and look: is the floor level, do the walls stand where they should?";
   panel.replaceChildren(
     make("p", { className: "hint", id: "hint", textContent: hint }),
     ...(problem ? [make("p", { className: "wrong", id: "problem", textContent: problem })] : []),
@@ -315,7 +315,9 @@ function drawOverlay() {
 }
 
 view.listeners.push((request, info) => {
+  const isFirst = !shown;
   shown = { request, info };
+  if (isFirst && setup) draw(); // From now on clicks are taken.
   drawOverlay();
 });
 
