@@ -228,6 +228,41 @@ fn a_benchmark_prints_what_scripts_read() {
     assert!(table.contains("median") && table.contains("images/s"), "{table}");
 }
 
+#[test]
+fn named_sensors_are_measured_and_drawn() {
+    let rig = Rig::new();
+    let (scene, camera, sheet) = (rig.at("race"), rig.at("cam.json"), rig.at("sensors.png"));
+    let args = ["bench", "sensors", &scene, "--camera", &camera, "--count", "2"];
+    let figures: Value =
+        serde_json::from_str(&good(&[&args[..], &["--json", "--sheet", &sheet]].concat())).unwrap();
+    let kinds = figures["kinds"].as_array().unwrap();
+    assert_eq!(kinds.len(), 13, "an image, and twelve sensors: {figures:#}");
+    assert!(kinds.iter().all(|kind| kind["least_ms"].as_f64().is_some_and(|ms| ms > 0.0)));
+    let records = |name: &str| {
+        let kind = kinds.iter().find(|kind| kind["name"] == name);
+        kind.and_then(|kind| kind["records"].as_u64()).unwrap()
+    };
+    // A hall has walls and a floor, wherever a beam looks.
+    assert!(records("vlp-16") > 12_000 && records("os1-64") > 48_000, "{figures:#}");
+    assert!(records("iwr6843") > 0, "{figures:#}");
+    let picture = image::open(&sheet).unwrap().to_rgb8();
+    assert_eq!(picture.dimensions(), (4 * 244, 3 * 244));
+    // The first looks all around: points below it are blue, points above it red.
+    let reddest = |sign: i32| {
+        let pixels = (0..240).flat_map(|y| (0..240).map(move |x| (x, y)));
+        let of = |(x, y)| {
+            let [r, _, b] = picture.get_pixel(x, y).0.map(i32::from);
+            sign * (r - b) > 60
+        };
+        pixels.filter(|&at| of(at)).count()
+    };
+    assert!(reddest(1) > 50 && reddest(-1) > 50, "{} {}", reddest(1), reddest(-1));
+
+    let one = good(&[&args[..], &["--sensor", "tfmini"]].concat());
+    assert!(one.contains("tfmini") && !one.contains("vlp-16"), "{one}");
+    check_refused(&[&args[..], &["--sensor", "vlp"]].concat(), &["vlp-16", "tfmini"]);
+}
+
 /// The renderer against an independent one in float64; see `../shared/tools/splat_oracle.py`.
 #[test]
 fn pictures_are_those_of_the_oracle() {

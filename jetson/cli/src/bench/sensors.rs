@@ -27,9 +27,10 @@ use crate::terminal::print_fmt;
 90 degrees a second. Times are of all cores; where others use them, the least is the most meaningful, and
 with RAYON_NUM_THREADS=1 it is close to the processor's time.
 
-The sheet's pictures, in the order of the list: LiDARs that look all around, range finders, sonars and radars from
-above, the sensor in the middle looking up, with a ring each metre; other LiDARs as the image that their beams are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a cone ends
-at its reading; a radar's detections are red where they come closer, blue where they go away.
+The sheet's pictures, in the order of the list: LiDARs that look all around, range finders, sonars and radars
+from above, the sensor in the middle looking up, with a ring each metre; other LiDARs as the image that their
+beams are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a
+cone ends at its reading; a radar's detections are red where they come closer, blue where they go away.
 
 Examples:
   vizflyt bench sensors forest/arena.toml --camera cam.json
@@ -88,12 +89,14 @@ pub(super) fn run(args: &SensorsArgs) -> Result<()> {
     let packed = SensorScene::new(&loaded.splats);
     let packed_ms = start.elapsed().as_secs_f64() * 1e3;
     let motion = motion_from(&camera);
-    let seen = surroundings(&packed, &motion)?;
+    // Of many more beams than any sensor has: for pictures alone.
+    let seen = if args.sheet.is_some() { surroundings(&packed, &motion)? } else { Vec::new() };
+    let around = TopView::new(&seen);
     let mut kinds = vec![image(Scene::from(&loaded.splats), &camera, args.count)?];
     let mut sheet = Sheet::new(TILE_PX, TILE_PX);
     for (name, _, preset) in PRESETS {
         if args.sensor.is_empty() || args.sensor.iter().any(|asked| asked == name) {
-            let mut top = TopView::new(&seen);
+            let mut top = around.clone();
             let (kind, tile) = measure(name, preset(), &packed, &motion, (args.count, &mut top))?;
             kinds.push(kind);
             sheet.add(tile.unwrap_or(top.picture));
@@ -110,9 +113,9 @@ pub(super) fn run(args: &SensorsArgs) -> Result<()> {
     }
     let Figures { scene, splats, packed_ms, kinds } = &figures;
     print_fmt!("scene       {scene}, {splats} splats, packed in {packed_ms:.1} ms");
-    print_fmt!("{:<14} {:>9} {:>9} {:>8}", "ms", "least", "median", "records");
+    print_fmt!("{:<16} {:>9} {:>9} {:>8}", "ms", "least", "median", "records");
     for Kind { name, least_ms, median_ms, records } in kinds {
-        print_fmt!("{name:<14} {least_ms:>9.3} {median_ms:>9.3} {records:>8}");
+        print_fmt!("{name:<16} {least_ms:>9.3} {median_ms:>9.3} {records:>8}");
     }
     Ok(())
 }
@@ -142,7 +145,7 @@ fn image(scene: Scene<'_>, camera: &Camera, count: u32) -> Result<Kind> {
     let mut renderer = CpuRenderer::new(scene);
     let mut images = [RgbdImage::default()];
     let (width, height) = (camera.intrinsics.width_px, camera.intrinsics.height_px);
-    timed(&format!("{width}x{height}"), count, |_| {
+    timed(&format!("image {width}x{height}"), count, |_| {
         renderer.render(&[], std::slice::from_ref(camera), &mut images)?;
         Ok(images[0].alpha.len())
     })
@@ -222,7 +225,7 @@ fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) 
 
 /// Beams in their places, coloured by range.
 fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
-    // Whole pixels for each beam, as many as fit.
+    // Beams are square, and the longer side fills the picture.
     let scale = TILE_PX as f32 / rows.max(columns) as f32;
     let (width, height) = (columns as f32 * scale, rows as f32 * scale);
     let (left, above) = ((TILE_PX as f32 - width) / 2.0, (TILE_PX as f32 - height) / 2.0);
@@ -237,6 +240,7 @@ fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
 }
 
 /// The sensor's surroundings from above, x up and y to the left.
+#[derive(Clone)]
 struct TopView {
     picture: RgbImage,
     px_per_m: f32,
