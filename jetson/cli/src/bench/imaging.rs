@@ -136,9 +136,6 @@ pub(super) fn run(args: &ImagingArgs) -> Result<()> {
     let name = format!("event camera ({events} events in 20 ms)");
     kinds.push(Kind { name, median_ms, of_render: median_ms / render_ms });
     let renderer = rasterizer.name().into_owned();
-    if let Some(file) = &args.sheet {
-        sheet.save(file)?;
-    }
     let k = &camera.intrinsics;
     let (width_px, height_px) = (k.width_px, k.height_px);
     let scene = scene.display().to_string();
@@ -149,7 +146,8 @@ pub(super) fn run(args: &ImagingArgs) -> Result<()> {
     } else {
         print(&figures);
     }
-    Ok(())
+    // Last: a file that cannot be written costs no figure.
+    args.sheet.as_ref().map_or(Ok(()), |file| sheet.save(file))
 }
 
 fn print(figures: &Figures) {

@@ -23,14 +23,15 @@ use crate::terminal::print_fmt;
 /// Measures each named sensor many times over; prints milliseconds of each, beside an image of the same place.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The sensor is where the camera is and looks along its axis; it flies 2 m/s forward and turns to the left by
-90 degrees a second. Times are of all cores; where others use them, the least is the most meaningful, and
-with RAYON_NUM_THREADS=1 it is close to the processor's time.
+    after_help = "The sensor is where the camera is and looks along its axis; it flies 2 m/s forward and turns
+to the left by 90 degrees a second. Times are of all cores; where others use them, the least
+is the most meaningful, and with RAYON_NUM_THREADS=1 it is close to the processor's time.
 
-The sheet's pictures, in the order of the list: LiDARs that look all around, range finders, sonars and radars
-from above, the sensor in the middle looking up, with a ring each metre; other LiDARs as the image that their
-beams are. Grey is what a LiDAR without error sees. LiDAR points are blue below the sensor and red above it; a
-cone ends at its reading; a radar's detections are red where they come closer, blue where they go away.
+The sheet's pictures, in the order of the list: LiDARs that look all around, range finders,
+sonars and radars from above, the sensor in the middle looking up, with a ring each metre;
+other LiDARs as the image that their beams are. Grey is what a LiDAR without error sees. LiDAR
+points are blue below the sensor and red above it; a cone ends at its reading; a radar's
+detections are red where they come closer, blue where they go away.
 
 Examples:
   vizflyt bench sensors forest/arena.toml --camera cam.json
@@ -102,22 +103,24 @@ pub(super) fn run(args: &SensorsArgs) -> Result<()> {
             sheet.add(tile.unwrap_or(top.picture));
         }
     }
-    if let Some(file) = &args.sheet {
-        sheet.save(file)?;
-    }
     let scene = scene.display().to_string();
     let figures = Figures { scene, splats: loaded.splats.len(), packed_ms, kinds };
     if args.json {
         print_fmt!("{}", serde_json::to_string_pretty(&figures)?);
-        return Ok(());
+    } else {
+        print(&figures);
     }
-    let Figures { scene, splats, packed_ms, kinds } = &figures;
+    // Last: a file that cannot be written costs no figure.
+    args.sheet.as_ref().map_or(Ok(()), |file| sheet.save(file))
+}
+
+fn print(figures: &Figures) {
+    let Figures { scene, splats, packed_ms, kinds } = figures;
     print_fmt!("scene       {scene}, {splats} splats, packed in {packed_ms:.1} ms");
     print_fmt!("{:<16} {:>9} {:>9} {:>8}", "ms", "least", "median", "records");
     for Kind { name, least_ms, median_ms, records } in kinds {
         print_fmt!("{name:<16} {least_ms:>9.3} {median_ms:>9.3} {records:>8}");
     }
-    Ok(())
 }
 
 /// How the sensor flies from where the camera is, within a tenth of a second.

@@ -1,4 +1,4 @@
-//! Pictures side by side, in rows of four.
+//! Pictures side by side, in rows of four at most.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -31,9 +31,10 @@ impl Sheet {
 
     /// Writes all as one picture.
     pub(super) fn save(&self, file: &Path) -> Result<()> {
-        let rows = (self.tiles.len() as u32).div_ceil(COLUMNS);
+        let count = self.tiles.len() as u32;
+        let (columns, rows) = (count.min(COLUMNS), count.div_ceil(COLUMNS));
         let (width, height) = (self.width_px + GAP_PX, self.height_px + GAP_PX);
-        let mut all = RgbImage::from_pixel(COLUMNS * width, rows * height, Rgb([255; 3]));
+        let mut all = RgbImage::from_pixel(columns * width, rows * height, Rgb([255; 3]));
         for (n, tile) in (0..).zip(&self.tiles) {
             let at = (i64::from(n % COLUMNS * width), i64::from(n / COLUMNS * height));
             image::imageops::replace(&mut all, tile, at.0, at.1);
