@@ -5,8 +5,7 @@
     pip install torch numpy pillow
     python segment_gates.py train race
 
-Both folders have `images` and `classes`; a pixel of class 2 is of a gate. A minute or two an epoch on two cores, no
-graphics card.
+Both folders have `images` and `classes`; a pixel of class 2 is of a gate. Minutes on two cores, no graphics card.
 """
 
 import argparse
