@@ -500,6 +500,15 @@ async function edit(browser) {
   // The box is 0.15 of the picture; the floor and the walls in it are seen as selected, and nothing else is.
   await orange(before + 0.08, before + 0.16);
   await shot(page, "edit-box");
+  // Named as a part, it is found by a data set.
+  await page.locator("#edit-naming summary").click();
+  await page.locator("#edit-name").fill("corner");
+  await after(() => page.locator("#edit-call").click(), /^0 of/);
+  assert.match(await text(page, "edit-parts"), /^corner \(part\): [\d.]+ x [\d.]+ x [\d.]+ m$/);
+  await shot(page, "edit-named");
+  const parts = fs.readFileSync(`${scene}.parts.toml`, "utf8");
+  assert.match(parts, /name = "corner"\nclass = "part"\ncenter_m = \[/);
+  await after(() => drag([420, 250], [900, 650]), new RegExp(`^${boxed.toLocaleString("en")} of`));
   await after(() => page.locator("#edit-invert").click(), new RegExp(`^${(all - boxed).toLocaleString("en")} of`));
   await after(() => page.locator("#edit-invert").click(), new RegExp(`^${boxed.toLocaleString("en")} of`));
   await after(() => page.locator("#edit-delete").click(), /^0 of/);

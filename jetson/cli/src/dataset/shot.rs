@@ -328,8 +328,8 @@ pub(super) fn motion(
 mod tests {
     use super::*;
     use crate::dataset::classes::Classes;
-    use crate::dataset::parts::PartsFile;
     use vizflyt_scenes::projects::CourseProject;
+    use vizflyt_server::scene::PartsFile;
 
     pub(super) const BOUNDS: RandomPoses = RandomPoses {
         clearance_m: 0.25,

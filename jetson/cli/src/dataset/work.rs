@@ -10,10 +10,9 @@ use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 use serde_json::Value;
 use vizflyt_scenes::projects::CourseProject;
-use vizflyt_server::scene::BareArgs;
+use vizflyt_server::scene::{BareArgs, PartsFile};
 
 use super::classes::Classes;
-use super::parts::PartsFile;
 use super::render::{LabelRenderer, Layers, Wanted};
 use super::sheet::Sheet;
 use super::shot::Shooting;

@@ -18,14 +18,13 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::{Object, Pose, World as WorldFrame};
 use vizflyt_scenes::projects::{CourseProject, Level};
 use vizflyt_scenes::{Generated, Variant};
-use vizflyt_server::scene::{self, BareArgs};
+use vizflyt_server::scene::{self, BareArgs, PartsFile};
 use vizflyt_splat::builtin_models::{QUADROTOR, boxes};
 use vizflyt_splat::{RigidObject, Splats};
 use vizflyt_twin::random::Random;
 
 use super::classes::{self, Classes, GATE};
 use super::free_space::{FreeSpace, Solid};
-use super::parts::PartsFile;
 use super::randomize::{Randomize, range};
 use super::{distractor, texture};
 

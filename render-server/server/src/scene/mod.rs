@@ -18,6 +18,7 @@ mod edit;
 mod fit;
 mod floor;
 mod objects;
+mod parts;
 mod placement;
 mod seen;
 
@@ -29,6 +30,7 @@ pub use core::{bounds, core};
 pub use edit::{DoneStep, EditList, EditListError, Editor, list_path, read_list, result_path};
 pub use fit::check_fit;
 pub use objects::{bounds_m, obstacles};
+pub use parts::{BoxedPart, PartsFile, parts_path};
 pub use placement::{Placement, WorldFromScene};
 pub use seen::{Seen, scene_hash, seen_path, write_seen};
 pub use vizflyt_arena::config::Up;

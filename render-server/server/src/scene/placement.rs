@@ -68,6 +68,11 @@ impl WorldFromScene {
     pub const IDENTITY: Self =
         Self { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
 
+    /// Returns where a point of the scene comes to lie. [m, world]
+    pub fn point_m(&self, p_scene: DVec3) -> DVec3 {
+        self.scale * (self.rotation * p_scene) + self.translation_m
+    }
+
     /// Moves every splat into the world; where nothing is to be moved, every bit stays.
     pub fn apply(&self, splats: &mut Splats) {
         if *self == Self::IDENTITY {

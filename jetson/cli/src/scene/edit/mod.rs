@@ -24,7 +24,8 @@ use crate::terminal::{open_browser, print_fmt, print_line};
 #[command(
     after_help = "The scene's file stays as it is. The steps go into a list beside it (room.ply.edits.toml), which names the
 original by its hash, and the result into a file of its own (room.edited.ply, or -o). Lengths and coordinates are in
-the file's own axes and units, as the steps before leave them.
+the file's own axes and units, as the steps before leave them. On the page a selection can also be named, as a part
+of the scene for `vizflyt dataset --parts` (room.ply.parts.toml).
 
 Examples:
   vizflyt scene edit room.ply --min-opacity 0.02 --drop-floaters --keep-parts
@@ -50,7 +51,7 @@ pub(crate) struct EditArgs {
     /// Writes the edited scene again, from the original and the list
     #[arg(long)]
     apply: bool,
-    /// Opens a page on which a lasso and a box select what goes
+    /// Opens a page on which a lasso and a box select what goes, or what gets a name
     #[arg(long)]
     page: bool,
     /// Where the page is served; port 0 takes a free one

@@ -185,7 +185,7 @@ pub fn read_list(original: &Path) -> Result<Option<EditList>> {
     Ok(Some(list))
 }
 
-fn file_name(path: &Path) -> String {
+pub(super) fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
@@ -231,7 +231,7 @@ fn hash(path: &Path) -> std::io::Result<String> {
 }
 
 /// Writes beside its place and then renames, so that a list is whole or the one before.
-fn replace(path: &Path, text: &str) -> std::io::Result<()> {
+pub(super) fn replace(path: &Path, text: &str) -> std::io::Result<()> {
     let partial = path.with_extension("toml.part");
     let mut file = File::create(&partial)?;
     file.write_all(text.as_bytes())?;

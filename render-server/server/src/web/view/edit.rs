@@ -5,8 +5,9 @@
 //! POST /api/edit              Order -> Report: what is selected, what was done, in words
 //! ```
 //! A selection is an outline in a picture with the camera that showed it; which splats lie in it is found here. It is shown
-//! by their colour. Deleting makes a step of it, as the command line makes them; saving writes the list and the result. Only
-//! a browser on this computer, on a page of ours, may edit.
+//! by their colour. Deleting makes a step of it, as the command line makes them; saving writes the list and the result. Naming
+//! puts the box about it into the scene's file of parts, at once. Only a browser on this computer, on a page of ours, may
+//! edit.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -30,7 +31,7 @@ use super::engine::Request;
 use super::{ViewArgs, ViewState};
 use crate::lock::lock;
 use crate::render::choose;
-use crate::scene::{Editor, Placement};
+use crate::scene::{BoxedPart, Editor, PartsFile, Placement, parts_path};
 use crate::web::{self, ordered};
 
 /// The panel's part of the view's state.
@@ -45,6 +46,7 @@ pub(super) struct Session {
     args: ViewArgs,
     placement: Placement,
     objects: Vec<RigidObject>,
+    parts: PartsFile,
     regions: Vec<Region>,
     is_inverted: bool,
     is_saved: bool,
@@ -68,6 +70,13 @@ pub(super) enum Order {
     Undo,
     /// Writes result and list.
     Save,
+    /// Calls what is selected a part of the scene.
+    Name {
+        /// What it is called.
+        name: String,
+        /// Its class.
+        class: String,
+    },
 }
 
 /// An outline in a picture.
@@ -91,6 +100,8 @@ struct Report {
     selected: usize,
     /// In words, in order.
     steps: Vec<String>,
+    /// Named parts, in words.
+    parts: Vec<String>,
     saved: bool,
     /// Where the result goes.
     output: String,
@@ -105,9 +116,11 @@ impl Session {
         args: ViewArgs,
         placement: Placement,
         objects: Vec<RigidObject>,
-    ) -> Self {
+    ) -> Result<Self> {
         let (regions, is_inverted, is_saved) = (Vec::new(), false, true);
-        Self { editor, output, args, placement, objects, regions, is_inverted, is_saved }
+        let path = parts_path(editor.original());
+        let parts = if path.exists() { PartsFile::read(&path)? } else { PartsFile::default() };
+        Ok(Self { editor, output, args, placement, objects, parts, regions, is_inverted, is_saved })
     }
 
     /// Does what the page asks for; returns what was done, and whether the picture changes.
@@ -155,6 +168,20 @@ impl Session {
                 self.editor.save(&self.output)?;
                 self.is_saved = true;
                 Ok((format!("written: {}", self.output.display()), false))
+            }
+            Order::Name { name, class } => {
+                ensure!(!self.regions.is_empty(), "nothing is selected");
+                let marks = self.selected();
+                let means =
+                    self.editor.splats().means_m.iter().zip(marks).filter(|(_, mark)| *mark);
+                let place = &self.placement.world_from_scene;
+                let points_m: Vec<_> =
+                    means.map(|(mean, _)| place.point_m(mean.as_dvec3())).collect();
+                let part = BoxedPart::about(name.trim(), class.trim(), &points_m)?;
+                let (said, path) = (part.to_string(), parts_path(self.editor.original()));
+                self.parts.put(part, &path)?;
+                self.clear();
+                Ok((format!("{said}, in {}", path.display()), true))
             }
         }
     }
@@ -212,6 +239,7 @@ impl Session {
             splats: self.editor.splats().len(),
             selected: selected.iter().filter(|mark| **mark).count(),
             steps: self.editor.steps().iter().map(|done| done.edit.to_string()).collect(),
+            parts: self.parts.parts.iter().map(BoxedPart::to_string).collect(),
             saved: self.is_saved,
             output: self.output.display().to_string(),
             said,
@@ -331,7 +359,7 @@ mod tests {
         let placement = Placement { world_from_scene: place, crop: None };
         let editor = Editor::open(&scene).unwrap();
         let output = folder.join("out.ply");
-        (Session::new(editor, output, args, placement, Vec::new()), place)
+        (Session::new(editor, output, args, placement, Vec::new()).unwrap(), place)
     }
 
     /// An order as the page writes it: what the left half of the picture shows, and a little more.
@@ -379,6 +407,26 @@ mod tests {
         let saved = vizflyt_splat::format::read(folder.path().join("out.ply")).unwrap();
         assert_eq!(saved.splats.len(), 11);
         assert_eq!(Editor::open(&folder.path().join("row.ply")).unwrap().steps().len(), 1);
+    }
+
+    #[test]
+    fn what_is_selected_gets_a_name_and_is_found_by_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut session, _) = session(folder.path());
+        let name = |name: &str| Order::Name { name: name.to_owned(), class: "gate".to_owned() };
+        assert!(session.obey(name("row")).unwrap_err().to_string().contains("nothing is selected"));
+        session.obey(left_half(false, false)).unwrap();
+        assert!(session.obey(name(" ")).unwrap_err().to_string().contains("give a name"));
+        let (said, _) = session.obey(name(" row ")).unwrap();
+        assert!(said.starts_with("row (gate): 0.02 x 2.02 x 0.02 m, in "), "{said}");
+        assert_eq!(session.report(&[], said).parts, ["row (gate): 0.02 x 2.02 x 0.02 m"]);
+        // As a data set reads it, of the scene in the world.
+        let parts = PartsFile::read(&parts_path(&folder.path().join("row.ply"))).unwrap();
+        let mut splats = session.editor.splats().clone();
+        session.placement.apply(&mut splats);
+        let found = parts.label(&splats).iter().filter(|part| **part == Some(0)).count();
+        assert_eq!(found, 11);
+        assert_eq!(session.parts, parts);
     }
 
     #[test]

@@ -245,7 +245,7 @@ fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<Prepared> {
         None => (None, None),
         Some(Work::Align(aligner)) => (Some(align::Panel { aligner, setup }), None),
         Some(Work::Edit(editor, output)) => {
-            let session = Session::new(editor, output, args.clone(), placement, objects);
+            let session = Session::new(editor, output, args.clone(), placement, objects)?;
             (None, Some(edit::Panel { session: Mutex::new(session) }))
         }
     };

@@ -1,5 +1,5 @@
 // The panel of `vizflyt scene edit --page`: a lasso or a box over the picture selects splats; the server finds them and shows
-// them in a colour of their own. They are deleted as a step, which can be taken back.
+// them in a colour of their own. They are deleted as a step, which can be taken back, or named as a part of the scene.
 
 import { view } from "/view.js";
 
@@ -31,6 +31,10 @@ const orders = {
 };
 const steps = make("ol", { id: "edit-steps" });
 const output = make("p", { id: "edit-output" });
+const name = make("input", { id: "edit-name", placeholder: "window 1", maxLength: 60 });
+const kind = make("input", { id: "edit-class", placeholder: "part", maxLength: 60 });
+const call = button("edit-call", "name it", () => order({ name: { name: name.value, class: kind.value || "part" } }));
+const parts = make("ul", { id: "edit-parts" });
 const overlay = make("canvas", { id: "lasso" });
 overlay.ariaHidden = "true";
 document.head.append(make("link", { rel: "stylesheet", href: "/edit.css" }));
@@ -43,7 +47,15 @@ document.body.append(overlay, make("section", { id: "edit", ariaLabel: "edit" },
   row(orders.undo, orders.save),
   steps,
   output,
+  make("details", { id: "edit-naming" },
+    make("summary", { textContent: "parts, for data sets" }),
+    make("label", {}, "name", name),
+    make("label", {}, "class", kind),
+    row(call),
+    parts,
+  ),
 ));
+for (const input of [name, kind]) input.addEventListener("keydown", (event) => event.code === "Enter" && !call.disabled && call.click());
 
 function choose(next) {
   tool = tool === next ? null : next;
@@ -56,9 +68,11 @@ function show() {
   counts.textContent = report ? `${count(report.selected)} of ${count(report.splats)} splats selected` : "";
   const nothing = !report?.selected;
   orders.invert.disabled = orders.clear.disabled = orders.delete.disabled = busy || nothing;
+  call.disabled = busy || nothing;
   orders.undo.disabled = busy || !report?.steps.length;
   orders.save.disabled = busy || !report || report.saved;
   steps.replaceChildren(...(report?.steps ?? []).map((text) => make("li", { textContent: text })));
+  parts.replaceChildren(...(report?.parts ?? []).map((text) => make("li", { textContent: text })));
   output.textContent = report ? `${!report.saved ? "not saved yet:" : report.steps.length ? "saved as" : "saves to"} ${report.output}` : "";
 }
 
@@ -71,6 +85,7 @@ async function order(what) {
     const answer = await fetch("/api/edit", { method: "POST", body: JSON.stringify(what) });
     if (answer.ok) {
       report = await answer.json();
+      if (what.name) name.value = "";
       if (report.said) view.announce(report.said);
     } else {
       view.announce(await answer.text());
