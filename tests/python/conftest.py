@@ -10,6 +10,7 @@ import vizflyt
 
 def pytest_addoption(parser):
     parser.addoption("--vizflyt", help="the built program; without it nothing flies")
+    parser.addoption("--wheel", help="the built wheel; without it nothing is installed")
 
 
 @pytest.fixture

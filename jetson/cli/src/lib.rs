@@ -50,7 +50,7 @@ use vizflyt_server::settings;
 #[command(version, propagate_version = true)]
 #[command(after_help = "Start here:
   vizflyt demo                       fly a simulated drone through a forest and watch it in the browser
-  vizflyt new first --lang python    a plugin of your own that flies
+  vizflyt new first                  a plugin of your own that flies
   vizflyt fly first                  fly it in the simulated lab")]
 struct Cli {
     #[command(subcommand)]

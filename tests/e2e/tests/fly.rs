@@ -171,13 +171,17 @@ fn a_saved_plugin_takes_over_while_the_vehicle_holds() {
 #[test]
 fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
     let student = StudentFolder::new();
-    assert!(student.run(&["new", "first", "--lang", "python"]).status.success());
+    let made = student.run(&["new", "first"]);
+    assert!(made.status.success());
+    let package = root().join("jetson/python").canonicalize().unwrap();
+    let said = String::from_utf8_lossy(&made.stdout).into_owned();
+    assert!(said.contains(&format!("pip install {} -r first/requirements.txt", text(&package))));
     for file in ["plugin.py", "test_plugin.py", "README.md", "vizflyt.toml", "requirements.txt"] {
         let text = std::fs::read_to_string(student.path("first").join(file)).unwrap();
         assert!(!text.contains("{{"), "{file}: {text}");
     }
     let required = std::fs::read_to_string(student.path("first/requirements.txt")).unwrap();
-    assert!(required.contains(text(&root().join("jetson/python").canonicalize().unwrap())));
+    assert!(required.starts_with(&format!("vizflyt=={}\n", env!("CARGO_PKG_VERSION"))), "{required}");
     // A Python without the package: what is missing, and the command that brings it.
     let python = student.write(
         "first/.venv/bin/python3",

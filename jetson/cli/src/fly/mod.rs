@@ -24,7 +24,7 @@ use plugin::Plugin;
 /// of a built-in (avoid, race).
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
-  vizflyt new first --lang python && vizflyt fly first     your own plugin in the simulated lab
+  vizflyt new first && vizflyt fly first                   your own plugin in the simulated lab
   vizflyt fly first --watch                                a saved file takes over in flight
   vizflyt fly race --scene race --seed 3                   a built-in example, another scene
   vizflyt fly first --headless --seconds 20 --report r.json
@@ -180,7 +180,11 @@ fn print_lab(json: bool, which: &str, what: &str) {
 pub(crate) fn sources() -> Result<std::path::PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("/"));
     if !root.join("jetson/sdk/Cargo.toml").is_file() {
-        bail!("the sources that this program was built from are no longer at {}", root.display());
+        bail!(
+            "the sources that this program was built from are not at {}; clone {} and build the program there",
+            root.display(),
+            env!("CARGO_PKG_REPOSITORY")
+        );
     }
     root.canonicalize().with_context(|| format!("cannot resolve {}", root.display()))
 }

@@ -3,7 +3,7 @@
 //! ```text
 //! avoid                 a built-in: this program again, as `vizflyt plugin avoid`
 //! first/                by first/vizflyt.toml (made by `vizflyt new`); or a Cargo project; or plugin.py
-//! first/plugin.py       the python3 of its own .venv, else the one on PATH
+//! first/plugin.py       the python3 of its own .venv, else that which this program was installed into, else the one on PATH
 //! target/release/first  a program; a bare name is looked up on PATH
 //! ```
 
@@ -159,10 +159,21 @@ fn on_path(name: &OsStr) -> bool {
     std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
 }
 
-/// Returns the interpreter of the script's own virtual environment, else the one on PATH.
+/// Returns the interpreter of the script's own virtual environment, else that which this program was installed into,
+/// else the one on PATH.
 fn python_of(script: &Path) -> PathBuf {
     let own = script.parent().unwrap_or(Path::new("")).join(".venv/bin/python3");
-    if own.exists() { own } else { "python3".into() }
+    if own.exists() { own } else { own_python().unwrap_or_else(|| "python3".into()) }
+}
+
+/// Returns the interpreter beside this program, if `pip install` has put the program there.
+pub(crate) fn own_python() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok()?;
+    let python = program.with_file_name("python3");
+    let libraries = program.parent()?.parent()?.join("lib").read_dir().ok()?;
+    let has_package = |library: PathBuf| library.join("site-packages/vizflyt").is_dir();
+    let is_there = libraries.flatten().any(|library| has_package(library.path()));
+    (is_there && python.exists()).then_some(python)
 }
 
 /// Compiles the script, then finds the package as the script will: its own folder is the first that

@@ -13,6 +13,7 @@ use clap::{Args, ValueEnum};
 use vizflyt_scenes::SceneKind;
 use vizflyt_scenes::projects::{self, CourseProject};
 
+use crate::fly::plugin::own_python;
 use crate::fly::sources;
 use crate::manifest;
 use crate::plugins::BuiltIn;
@@ -21,14 +22,15 @@ use crate::terminal::print_line;
 /// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt new first --lang python      then: vizflyt fly first
+  vizflyt new first                    in Python; then: vizflyt fly first
+  vizflyt new p4 --project p4          for the course
   vizflyt new ../second --lang rust")]
 pub(crate) struct NewArgs {
     /// The folder to make; its last part names the plugin
     #[arg(value_name = "NAME")]
     path: PathBuf,
     /// What it is written in
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, default_value_t)]
     lang: Language,
     #[arg(long, value_name = "NAME", help = format!(
         "The course's project that it is for: {}; or a folder projects/NAME", projects::NAMES.join(", ")
@@ -37,9 +39,10 @@ pub(crate) struct NewArgs {
 }
 
 /// A language of plugins.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 enum Language {
     /// plugin.py
+    #[default]
     Python,
     /// src/main.rs
     Rust,
@@ -65,7 +68,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     }
     let folder = args.path.display().to_string();
     let files = match args.lang {
-        Language::Python => python(&name, &folder, &place)?,
+        Language::Python => python(&name, &folder, &place),
         Language::Rust => rust(&name, &folder, &place)?,
     };
     for (file, text) in files {
@@ -77,10 +80,12 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
         write().with_context(|| format!("cannot write {}", path.display()))?;
     }
     print_line(format!("{folder} is made; now"));
-    if args.lang == Language::Python {
+    // Installed by pip, it has brought the package; where it was built, the package is built too.
+    if args.lang == Language::Python && own_python().is_none() {
+        let package = sources().map(|root| format!("{} ", root.join("jetson/python").display()));
+        let package = package.unwrap_or_default();
         print_line(format!(
-            "  python3 -m venv {folder}/.venv && {folder}/.venv/bin/pip install -r \
-             {folder}/requirements.txt"
+            "  python3 -m venv {folder}/.venv && {folder}/.venv/bin/pip install {package}-r {folder}/requirements.txt"
         ));
     }
     print_line(format!("  vizflyt fly {folder}"));
@@ -90,13 +95,12 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
 /// A file of the folder, and its text.
 type File = (&'static str, String);
 
-fn python(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
-    let package = sources()?.join("jetson/python").display().to_string();
+fn python(name: &str, folder: &str, place: &str) -> Vec<File> {
     let fill = |text: &str| {
         let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
-        text.replace("{{class}}", &class(name)).replace("{{package}}", &package)
+        text.replace("{{class}}", &class(name)).replace("{{version}}", env!("CARGO_PKG_VERSION"))
     };
-    Ok(vec![
+    vec![
         ("plugin.py", fill(include_str!("../../templates/python/plugin.py"))),
         ("test_plugin.py", fill(include_str!("../../templates/python/test_plugin.py"))),
         ("README.md", fill(include_str!("../../templates/python/README.md"))),
@@ -105,12 +109,13 @@ fn python(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
         (".vscode/settings.json", fill(include_str!("../../templates/python/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/python/gitignore"))),
         (manifest::FILE, lab("plugin.py", place)),
-    ])
+    ]
 }
 
 fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
     // As JSON: a path in TOML is quoted alike.
-    let sdk = format!("path = {:?}", sources()?.join("jetson/sdk").display().to_string());
+    let sources = sources().context("a plugin in Rust is built with VizFlyt's own crates")?;
+    let sdk = format!("path = {:?}", sources.join("jetson/sdk").display().to_string());
     let fill = |text: &str| {
         let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
         text.replace("{{class}}", &class(name)).replace("{{sdk}}", &sdk)
@@ -220,7 +225,7 @@ mod tests {
     #[test]
     fn every_blank_is_filled_and_the_readme_has_ten_lines() {
         let both = [
-            python("a-b", "x/a-b", "scene = \"room\"").unwrap(),
+            python("a-b", "x/a-b", "scene = \"room\""),
             rust("a-b", "x/a-b", "project = \"p5\"").unwrap(),
         ];
         for (file, text) in both.iter().flatten() {
