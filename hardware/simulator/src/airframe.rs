@@ -116,6 +116,13 @@ impl Airframe {
         }
     }
 
+    /// Puts the vehicle into the air, at rest and level, rotors carrying its weight. [m, world]
+    pub fn hovering(p_world_m: DVec3, yaw_rad: f64, floor_z_m: f64) -> Self {
+        let standing = Self::standing(p_world_m, yaw_rad);
+        let rotor_speed = [(MASS_KG * GRAVITY_MPS2 / 4.0 / thrust_n(1.0)).sqrt(); 4];
+        Self { state: AirframeState { rotor_speed, ..standing.state }, floor_z_m, ..standing }
+    }
+
     /// Returns the state.
     pub fn state(&self) -> &AirframeState {
         &self.state

@@ -22,6 +22,7 @@ mod evaluate;
 mod export;
 mod fly;
 mod grade;
+mod gym;
 mod lab;
 mod leaderboard;
 mod manifest;
@@ -72,6 +73,8 @@ enum Command {
     Fly(fly::FlyArgs),
     /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
     Grade(grade::GradeArgs),
+    /// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
+    Gym(gym::GymArgs),
     /// The render server: pose in, RGB-D out, page and events.
     Serve(vizflyt_server::ServeArgs),
     /// Pairs this computer with a render server, once, by a short code.
@@ -130,7 +133,9 @@ pub fn main() -> ExitCode {
             "warn".to_owned()
         }
         // What they print is the result; a load of seconds still shows its progress.
-        Command::Bench(_) | Command::Dataset(_) => "warn,vizflyt_server::scene=info".to_owned(),
+        Command::Bench(_) | Command::Dataset(_) | Command::Gym(_) => {
+            "warn,vizflyt_server::scene=info".to_owned()
+        }
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
@@ -169,6 +174,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => fly::run(args, log_level),
         Command::Grade(args) => grade::run(&args),
+        Command::Gym(args) => gym::run(&args),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
         #[cfg(feature = "crazyflie")]

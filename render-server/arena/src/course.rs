@@ -40,6 +40,11 @@ impl Course {
         }
     }
 
+    /// Returns the index of the stage to pass next; the number of stages where only the goal is left.
+    pub fn next(&self) -> usize {
+        self.next
+    }
+
     /// Takes the way of the body's centre between two poses; returns what it achieved. Call it with
     /// the same way until it returns nothing: the last stage may be the end. [m, world]
     pub fn advance(&mut self, from_m: DVec3, to_m: DVec3) -> Option<Progress> {

@@ -181,7 +181,10 @@ fn a_new_python_plugin_has_all_that_it_needs_but_the_package() {
         assert!(!text.contains("{{"), "{file}: {text}");
     }
     let required = std::fs::read_to_string(student.path("first/requirements.txt")).unwrap();
-    assert!(required.starts_with(&format!("vizflyt=={}\n", env!("CARGO_PKG_VERSION"))), "{required}");
+    assert!(
+        required.starts_with(&format!("vizflyt=={}\n", env!("CARGO_PKG_VERSION"))),
+        "{required}"
+    );
     // A Python without the package: what is missing, and the command that brings it.
     let python = student.write(
         "first/.venv/bin/python3",

@@ -6,7 +6,7 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion};
 use vizflyt_protocol::messages::YawTarget;
 use vizflyt_protocol::time::AutopilotTime;
 
-use super::{Autopilot, Guided, Param, Return};
+use super::{Autopilot, Guided, Param, Return, airframe};
 use crate::airframe::{GRAVITY_MPS2, MASS_KG};
 use crate::control::Limits;
 use crate::control::attitude::Heading;
@@ -63,6 +63,14 @@ impl Default for FlightState {
             armed_s: 0.0,
         }
     }
+}
+
+/// Returns the limits of a vehicle set up by `hardware/airframe`.
+///
+/// # Panics
+/// If the autopilot lacks one of its parameters: a test sets them all.
+pub fn airframe_limits() -> Limits {
+    Autopilot::with_params(&airframe()).expect("the airframe's parameters are known").limits()
 }
 
 /// What a mode asks for.

@@ -44,6 +44,7 @@ use crate::control::position::PositionController;
 use crate::estimator::Estimator;
 use crate::imu::SensorSample;
 use dialect::{MavMessage, MavSeverity};
+pub use flight::airframe_limits;
 pub use params::{Param, ParamSpec, Params, TABLE, airframe};
 use streams::Streams;
 

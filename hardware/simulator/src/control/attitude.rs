@@ -102,6 +102,21 @@ impl AttitudeController {
         }
     }
 
+    /// Returns thrust and torque for a turn. [rad/s, body; N]
+    pub fn follow_rates(
+        &mut self,
+        omega_body_radps: DVec3,
+        target_radps: DVec3,
+        thrust_n: f64,
+        dt_s: f64,
+    ) -> Wrench {
+        Wrench {
+            thrust_n: thrust_n.clamp(0.0, 4.0 * MAX_THRUST_N * THRUST_SHARE),
+            torque_nm: self.torque(omega_body_radps, target_radps, dt_s),
+            saturated: false,
+        }
+    }
+
     fn torque(&mut self, omega: DVec3, target: DVec3, dt_s: f64) -> DVec3 {
         let difference = self.last_omega.map_or(DVec3::ZERO, |last| (omega - last) / dt_s);
         self.last_omega = Some(omega);

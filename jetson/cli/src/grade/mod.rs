@@ -11,7 +11,7 @@
 //! ```
 //! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
 
-mod course;
+pub(crate) mod course;
 pub(crate) mod document;
 mod folder;
 mod judge;

@@ -23,6 +23,8 @@ Images are read-only numpy arrays that lie in shared memory: nothing is copied. 
 to keep it for long, take a ``.copy()``.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from ._log import Images, Imu, Log, LogImage, Motion, Poses, Sent
 from ._plugin import Plugin
 from ._run import HeldImagesWarning, run
@@ -50,11 +52,15 @@ from ._vizflyt import (
     publish_odometry,
 )
 
+if TYPE_CHECKING:
+    from .gym import Env, VectorEnv
+
 __all__ = [
     "ArenaInfo",
     "Battery",
     "CameraImage",
     "CameraInfo",
+    "Env",
     "Event",
     "HeldImagesWarning",
     "Images",
@@ -76,6 +82,7 @@ __all__ = [
     "SensorReading",
     "Sent",
     "Setpoint",
+    "VectorEnv",
     "Vehicle",
     "Volume",
     "__version__",
@@ -83,3 +90,12 @@ __all__ = [
     "publish_odometry",
     "run",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # A plugin pays nothing for what needs Gymnasium.
+    if name in ("Env", "VectorEnv"):
+        from . import gym
+
+        return getattr(gym, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,268 @@
+//! `vizflyt gym`: courses as environments that a policy learns in, many at once, for `vizflyt.Env` of the Python package.
+//!
+//! ```text
+//! Python ─ stdin ──▶ reset or not, seeds, actions ─▶ Episodes, each flown on (all cores)
+//!        ◀ stdout ── states, figures, ends, images ◀─ one batch of cameras, one renderer a course
+//! ```
+//! A process of its own: Python's interpreter lock holds nothing up, what breaks here breaks no notebook, and the wheel
+//! holds simulator and renderer once. First comes a line of JSON that says how long each part is; then, for each step, as
+//! many bytes as that, little-endian, both ways. It ends with its input. The same seeds and actions give the same bytes.
+
+mod draw;
+mod episode;
+
+use std::io::{self, BufWriter, Read, Write};
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, ensure};
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+use serde_json::json;
+use vizflyt_scenes::Variant;
+use vizflyt_scenes::projects::{CourseProject, Level, NAMES};
+use vizflyt_simulator::autopilot::airframe_limits;
+
+use self::draw::{Drawn, View};
+use self::episode::{ACTION, Episode, FIGURES, Manner, Rules, STATE};
+use crate::grade::course::CourseInstance;
+use crate::scene::camera::ImageSize;
+
+/// Ticks of the controllers in a second.
+const TICKS_HZ: u32 = 400;
+
+/// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
+#[derive(Args, Debug)]
+pub(crate) struct GymArgs {
+    /// The course: a project's name or file
+    #[arg(long, value_name = "NAME", help = format!("The course's project: {}, or FILE.toml", NAMES.join(", ")))]
+    project: String,
+    /// Courses to fly, by their seeds
+    #[arg(long, value_delimiter = ',', value_name = "SEED,...", default_value = "1")]
+    courses: Vec<u64>,
+    /// How many vehicles fly at once, each in an episode of its own
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    envs: u32,
+    /// What an action asks for
+    #[arg(long, value_enum, default_value_t)]
+    action: ActionKind,
+    /// Steps a second
+    #[arg(long, value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(10..=400))]
+    rate: u32,
+    /// Steps from an action until it counts
+    #[arg(long, value_name = "STEPS", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=40))]
+    delay: u32,
+    /// An episode's longest time
+    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
+    seconds: f64,
+    /// Images by the first camera of the course, of this size
+    #[arg(long, value_name = "WxH")]
+    camera: Option<ImageSize>,
+    /// Their width of view, if not the camera's own
+    #[arg(long, value_name = "DEGREES", requires = "camera")]
+    fov: Option<f64>,
+    /// How far splats may be drawn from where they are; 0 draws every one as it is
+    #[arg(long, value_name = "PX", default_value_t = 0.7, value_parser = error_px)]
+    error_px: f32,
+    /// What images show
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "depth", requires = "camera")]
+    layers: Vec<Layer>,
+    /// Light and weather
+    #[arg(long, value_name = "NAME", default_value = "day")]
+    variant: Variant,
+}
+
+fn error_px(text: &str) -> Result<f32, String> {
+    let px: f32 = text.parse().map_err(|_| format!("'{text}' is no number of pixels"))?;
+    (0.0..=10.0).contains(&px).then_some(px).ok_or_else(|| "give 0 to 10 px".to_owned())
+}
+
+/// What an action asks for; its numbers are within -1 and 1.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ActionKind {
+    /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn
+    #[default]
+    Velocity,
+    /// Acceleration ahead, to the left, up, in shares of the course's limit, and a turn
+    Acceleration,
+    /// Body rates and thrust
+    BodyRates,
+}
+
+impl ActionKind {
+    /// The action that asks for nothing.
+    fn rest(self) -> [f64; ACTION] {
+        [0.0; ACTION]
+    }
+}
+
+/// What an image shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Layer {
+    /// Depth, 16 bits, millimetres; 0 is nothing seen
+    Depth,
+    /// Colour, 8 bits a channel
+    Rgb,
+}
+
+/// A course, and who draws it.
+struct Place {
+    rules: Rules,
+    view: Option<View>,
+}
+
+/// An episode, and in which course it is.
+struct Env {
+    place: usize,
+    episode: Episode,
+}
+
+/// Runs `vizflyt gym`.
+pub(crate) fn run(args: &GymArgs) -> Result<ExitCode> {
+    ensure!(
+        TICKS_HZ.is_multiple_of(args.rate),
+        "--rate {}: give a rate that 400 Hz is a multiple of: 10, 20, 25, 40, 50, 80, 100, 200 or 400",
+        args.rate
+    );
+    ensure!((0.1..=3600.0).contains(&args.seconds), "--seconds {}: give 0.1 to 3600", args.seconds);
+    let manner = Manner {
+        action: args.action,
+        ticks: TICKS_HZ / args.rate,
+        delay: args.delay as usize,
+        seconds: args.seconds,
+    };
+    let project = CourseProject::find(&args.project)?;
+    let mut places = places(args, &project)?;
+    let mut envs: Vec<Env> = (0..args.envs as usize)
+        .map(|index| {
+            let place = index % places.len();
+            Env { place, episode: Episode::start(&places[place].rules, &manner, 0) }
+        })
+        .collect();
+    let image = places[0].view.as_ref().map(|view| view.size());
+    let [depth, rgb] =
+        [Layer::Depth, Layer::Rgb].map(|layer| image.is_some() && args.layers.contains(&layer));
+    let mut out = BufWriter::new(io::stdout().lock());
+    let arena = &places[0].rules.arena;
+    let head = json!({
+        "version": 1, "envs": envs.len(), "action": ACTION, "state": STATE, "figures": FIGURES,
+        "image": image, "depth": depth, "rgb": rgb, "courses": places.len(), "project": project.name(),
+        "max_speed_mps": arena.limits.max_speed_mps, "max_acceleration_mps2": arena.limits.max_acceleration_mps2,
+        "rate_hz": args.rate, "stages": arena.stages.len(),
+    });
+    writeln!(out, "{head}")?;
+    out.flush()?;
+    let mut input = io::stdin().lock();
+    let mut order = Order::for_envs(envs.len());
+    while order.read(&mut input)? {
+        envs.par_iter_mut().zip(&order.resets).zip(&order.seeds).zip(&order.actions).for_each(
+            |(((env, reset), seed), action)| {
+                if *reset {
+                    env.place = (*seed % places.len() as u64) as usize;
+                    env.episode = Episode::start(&places[env.place].rules, &manner, *seed);
+                } else {
+                    env.episode.step(&places[env.place].rules, &manner, *action);
+                }
+            },
+        );
+        answer(&mut out, &envs, &mut places, &manner, Drawn { depth, rgb })?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Makes the courses, on all cores.
+fn places(args: &GymArgs, project: &CourseProject) -> Result<Vec<Place>> {
+    let limits = airframe_limits();
+    let made: Result<Vec<_>> = args
+        .courses
+        .par_iter()
+        .map(|&seed| {
+            let course = CourseInstance::make(project, Level::Ug, args.variant, seed)?;
+            let view = args
+                .camera
+                .map(|size| View::new(&course, size, args.fov, args.error_px))
+                .transpose()?;
+            Ok(Place { rules: Rules::new(course.arena, course.obstacles, limits), view })
+        })
+        .collect();
+    let made = made?;
+    ensure!(!made.is_empty(), "--courses: give at least one seed");
+    Ok(made)
+}
+
+/// Writes all that Python is told after a step.
+fn answer(
+    out: &mut impl Write,
+    envs: &[Env],
+    places: &mut [Place],
+    manner: &Manner,
+    drawn: Drawn,
+) -> Result<()> {
+    let bytes =
+        |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    let mut state = [0.0; STATE];
+    for env in envs {
+        env.episode.write_state(&places[env.place].rules, manner, &mut state);
+        out.write_all(&bytes(&state))?;
+    }
+    for env in envs {
+        out.write_all(&bytes(&env.episode.figures()))?;
+    }
+    for env in envs {
+        out.write_all(&[env.episode.end() as u8])?;
+    }
+    if drawn.depth || drawn.rgb {
+        draw::images(out, envs, places, drawn)?;
+    }
+    out.flush().context("Python is gone")
+}
+
+/// What Python asks for.
+struct Order {
+    resets: Vec<bool>,
+    seeds: Vec<u64>,
+    actions: Vec<[f32; ACTION]>,
+    bytes: Vec<u8>,
+}
+
+impl Order {
+    /// Bytes of each environment: begins it anew or not, with which seed, its action.
+    const BYTES: usize = 1 + 8 + 4 * ACTION;
+
+    fn for_envs(count: usize) -> Self {
+        Self {
+            resets: vec![false; count],
+            seeds: vec![0; count],
+            actions: vec![[0.0; ACTION]; count],
+            bytes: vec![0; count * Self::BYTES],
+        }
+    }
+
+    /// Reads the next one; false at the end.
+    fn read(&mut self, input: &mut impl Read) -> Result<bool> {
+        let mut read = 0;
+        while read < self.bytes.len() {
+            match input.read(&mut self.bytes[read..]) {
+                Ok(0) if read == 0 => return Ok(false),
+                Ok(0) => return Err(io::Error::from(io::ErrorKind::UnexpectedEof).into()),
+                Ok(more) => read += more,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        let count = self.resets.len();
+        let (resets, rest) = self.bytes.split_at(count);
+        let (seeds, actions) = rest.split_at(8 * count);
+        for (to, from) in self.resets.iter_mut().zip(resets) {
+            *to = *from != 0;
+        }
+        let (seeds, _) = seeds.as_chunks();
+        for (to, from) in self.seeds.iter_mut().zip(seeds) {
+            *to = u64::from_le_bytes(*from);
+        }
+        let (actions, _) = actions.as_chunks();
+        for (to, from) in self.actions.as_flattened_mut().iter_mut().zip(actions) {
+            *to = f32::from_le_bytes(*from);
+        }
+        Ok(true)
+    }
+}
