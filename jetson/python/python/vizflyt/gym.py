@@ -22,10 +22,11 @@ none, 0 the weight, 1 twice that.
 
 An episode ends with a contact, outside the fence or at the finish (terminated), or after ``seconds`` (truncated).
 
-Keywords of both classes: ``project`` (a name or a FILE.toml), ``courses`` (seeds; an episode's seed chooses among them),
-``action``, ``observation`` (one of state, depth, rgb, or several: then a ``Dict``), ``camera`` (width, height), ``fov_deg``,
-``far_m``, ``error_px`` (how far splats may be drawn from where they are: 0 is exact, and slower), ``rate_hz``, ``delay``
-(steps until an action counts), ``seconds``, ``variant`` (light and weather), ``reward`` (of a `Step`), ``program``.
+Keywords of both classes: ``project`` (a name or a FILE.toml), ``courses`` (seeds; an episode's seed chooses among
+them), ``action``, ``observation`` (one of state, depth, rgb, or several: then a ``Dict``), ``camera`` (width, height),
+``fov_deg``, ``far_m``, ``error_px`` (how far splats may be drawn from where they are: 0 is exact, and slower),
+``rate_hz``, ``delay`` (steps until an action counts), ``seconds``, ``variant`` (light and weather), ``reward`` (of a
+`Step`), ``program``.
 """
 
 from __future__ import annotations
