@@ -13,8 +13,8 @@ obstacles and fence are judged as in a graded flight. What is not there: the est
 ``state`` has 22 numbers: velocity (3, [m/s, heading]), up as the body sees it (3), turn (3, [rad/s, body]), the way to
 the next stage or the goal (3, [m, heading]), the direction in which it is passed (3, 0 of a goal), position (3, [m,
 world]), sine and cosine of the heading, stages and goal left, share of the time left. Heading axes: x along the nose, y
-left, z up. ``depth`` is height x width, float32: 0 at the camera, 1 at ``far_m`` and where nothing is. ``rgb`` is height
-x width x 3, uint8.
+left, z up. ``depth`` is height x width, float32: 0 at the camera, 1 at ``far_m`` and where nothing is. ``rgb`` is
+height x width x 3, uint8.
 
 An action has four numbers from -1 to 1. ``velocity``, ``acceleration``: ahead, left and up in shares of the course's
 limit, and a turn to the left, 1 is 2 rad/s. ``body-rates``: roll, pitch and yaw, 1 is 6, 6 and 3 rad/s, and thrust: -1
