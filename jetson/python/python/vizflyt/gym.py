@@ -38,7 +38,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -156,13 +156,15 @@ class _Flights:
         self._answer = bytearray(end)
         self._shape = (count, height, width)
         self._passed = np.zeros(count)
-        spaces_of = {
+        spaces_of: dict[str, spaces.Space[Any]] = {
             "state": spaces.Box(-np.inf, np.inf, (_STATE,), np.float32),
             "depth": spaces.Box(0.0, 1.0, (height, width), np.float32),
             "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
         }
         chosen = {part: spaces_of[part] for part in self.parts}
-        self.observation_space: spaces.Space = chosen[self.parts[0]] if len(chosen) == 1 else spaces.Dict(chosen)
+        self.observation_space: spaces.Space[Any] = spaces.Dict(chosen)
+        if len(chosen) == 1:
+            self.observation_space = chosen[self.parts[0]]
         self.action_space = spaces.Box(-1.0, 1.0, (_ACTION,), np.float32)
 
     @property
@@ -223,7 +225,7 @@ class _Flights:
 class Env(gymnasium.Env):
     """One vehicle in a course; the module explains its keywords."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata = {"render_modes": []}  # noqa: RUF012, as Gymnasium declares it
 
     def __init__(self, project: str = "forest", render_mode: str | None = None, **how: Any) -> None:
         self.render_mode = render_mode
@@ -231,14 +233,14 @@ class Env(gymnasium.Env):
         self.observation_space = self._flights.observation_space
         self.action_space = self._flights.action_space
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode; course and start follow from the seed."""
         super().reset(seed=seed)
         drawn = self.np_random.integers(0, 2**63, 1) if seed is None else np.array([seed])
         seen, step = self._flights.fly(np.ones(1, bool), drawn, np.zeros((1, _ACTION)))
         return _first(seen), _info(step)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one step."""
         seen, step = self._flights.fly(np.zeros(1, bool), np.zeros(1), np.asarray(action)[None])
         end = step.end[0]
@@ -254,7 +256,7 @@ def _first(seen: Any) -> Any:
     return {part: values[0] for part, values in seen.items()} if isinstance(seen, dict) else seen[0]
 
 
-def _info(step: Step) -> dict:
+def _info(step: Step) -> dict[str, Any]:
     return {
         "end": _ENDS[step.end[0]],
         "clearance_m": float(step.clearance_m[0]),
@@ -266,7 +268,7 @@ def _info(step: Step) -> dict:
 class VectorEnv(gymnasium.vector.VectorEnv):
     """Many vehicles, each in an episode of its own, flown and drawn together."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(self, num_envs: int = 1, project: str = "forest", render_mode: str | None = None, **how: Any) -> None:
         self.render_mode = render_mode
@@ -278,7 +280,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._is_over = np.zeros(num_envs, bool)
 
-    def reset(self, *, seed: int | Sequence[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begins all episodes; of one seed they are seed, seed + 1, and so on."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is None:
@@ -289,7 +293,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         seen, step = self._flights.fly(np.ones(self.num_envs, bool), seeds, np.zeros((self.num_envs, _ACTION)))
         return seen, self._infos(step)
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Flies one step; where an episode was over, the next one begins instead."""
         began = self._is_over.copy()
         seen, step = self._flights.fly(began, self._draw(), np.asarray(actions))
@@ -307,7 +311,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return self.np_random.integers(0, 2**63, self.num_envs)
 
     @staticmethod
-    def _infos(step: Step) -> dict:
+    def _infos(step: Step) -> dict[str, Any]:
         return {"end": step.end, "clearance_m": step.clearance_m, "passed": step.passed, "time_s": step.time_s}
 
 
