@@ -7,13 +7,15 @@
 import time
 from pathlib import Path
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 
 import vizflyt.gym
 
-DEPTH = dict(observation=("state", "depth"), camera=(64, 48))
-ROWS = [
+DEPTH: dict[str, Any] = dict(observation=("state", "depth"), camera=(64, 48))
+ROWS: list[tuple[str, int, dict[str, Any]]] = [
     ("state", 1, {}),
     ("state", 16, {}),
     ("state, depth 64x48", 16, DEPTH),
@@ -22,7 +24,7 @@ ROWS = [
 ]
 
 
-def processor_s(envs: gymnasium.vector.VectorEnv) -> float:
+def processor_s(envs: Any) -> float:
     """Seconds of processor that the process which flies has taken."""
     words = Path(f"/proc/{envs.unwrapped._flights._process.pid}/stat").read_text().rsplit(")")[-1].split()
     return (int(words[11]) + int(words[12])) / 100

@@ -18,12 +18,10 @@ def make(program):
     made = []
 
     def make(name="Windows", number=None, **how):
-        if number is None:
-            env = gymnasium.make(f"vizflyt/{name}-v0", program=program, **how)
-        else:
-            env = gymnasium.make_vec(f"vizflyt/{name}-v0", num_envs=number, program=program, **how)
-        made.append(env)
-        return env
+        one, name = number is None, f"vizflyt/{name}-v0"
+        how = {**how, "program": program}
+        made.append(gymnasium.make(name, **how) if one else gymnasium.make_vec(name, num_envs=number, **how))
+        return made[-1]
 
     yield make
     for env in made:
