@@ -7,6 +7,7 @@
 mod arena;
 mod bench;
 mod bridge;
+mod class;
 #[cfg(feature = "crazyflie")]
 mod crazyflie;
 // What of it needs no radio is tested in every build.
@@ -73,6 +74,10 @@ enum Command {
     Fly(fly::FlyArgs),
     /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
     Grade(grade::GradeArgs),
+    /// Packs a plugin's folder as a team hands it in.
+    Submit(class::SubmitArgs),
+    /// Grades every team of a class, and makes one table of all.
+    GradeClass(class::ClassArgs),
     /// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
     Gym(gym::GymArgs),
     /// The render server: pose in, RGB-D out, page and events.
@@ -174,6 +179,8 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => fly::run(args, log_level),
         Command::Grade(args) => grade::run(&args),
+        Command::Submit(args) => class::submit(&args),
+        Command::GradeClass(args) => class::grade_class(&args),
         Command::Gym(args) => gym::run(&args),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),

@@ -22,7 +22,7 @@ mod odometry;
 mod pool;
 mod progress;
 mod record;
-mod report;
+pub(crate) mod report;
 mod statistics;
 mod trial;
 
@@ -148,6 +148,9 @@ struct FlyArgs {
     /// Writes depth into them a second time so that any viewer shows it (16UC1)
     #[arg(long, requires = "report")]
     log_depth: bool,
+    /// What the plugin shall not read, beside keys, seed and report; may be given more than once
+    #[arg(long, value_name = "PATH")]
+    hide: Vec<PathBuf>,
     /// Writes JUnit XML there
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -364,6 +367,7 @@ fn grade(args: &FlyArgs) -> Result<ExitCode> {
     hide.extend(args.first_seed.file.clone());
     // It may lie in the plugin's own folder, and holds the logs of flights that are over.
     hide.extend(args.report.clone());
+    hide.extend(args.hide.clone());
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
     let command = plugin.command(&limits)?;
     let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
