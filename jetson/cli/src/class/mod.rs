@@ -193,7 +193,7 @@ fn own_seed(options: &mut Vec<OsString>, team: &str) -> Result<()> {
     while index < options.len() {
         let text = options[index].to_string_lossy().into_owned();
         if let Some(value) = text.strip_prefix("--first-seed=") {
-            given = value.to_owned();
+            value.clone_into(&mut given);
             options.remove(index);
         } else if text == "--first-seed" && index + 1 < options.len() {
             given = options.remove(index + 1).to_string_lossy().into_owned();

@@ -101,7 +101,7 @@ impl Roster {
                 }
                 Err(why) => {
                     let mut added: [String; 10] = Default::default();
-                    added[0] = "0".to_owned();
+                    "0".clone_into(&mut added[0]);
                     added[8].clone_from(&one.submission);
                     // What a cell begins with is taken for a formula.
                     added[9] = format!("no grade: {why}");

@@ -171,7 +171,9 @@ fn read_folder(root: &Path) -> Result<Files> {
                 .to_str()
                 .with_context(|| format!("{}: a name that is no text", entry.path().display()))?;
             let (kind, path) = (entry.file_type().with_context(cannot)?, format!("{prefix}{name}"));
-            if name.starts_with('.') || name.ends_with(".pyc") || name.ends_with(".mcap") {
+            let is_made =
+                Path::new(name).extension().is_some_and(|end| end == "pyc" || end == "mcap");
+            if name.starts_with('.') || is_made {
                 continue;
             }
             if kind.is_dir() {

@@ -139,7 +139,7 @@ impl Episode {
             course: Course::new(&rules.arena),
             ticks: 0,
             checked: TimedPose { since_epoch_ns: 0, world_from_body: airframe.state().pose() },
-            waiting: vec![manner.action.rest(); manner.delay],
+            waiting: vec![[0.0; ACTION]; manner.delay],
             progress_m: 0.0,
             clearance_m: CLEARANCE_TOLD_M,
             end: End::Flying,

@@ -88,13 +88,6 @@ pub(crate) enum ActionKind {
     BodyRates,
 }
 
-impl ActionKind {
-    /// The action that asks for nothing.
-    fn rest(self) -> [f64; ACTION] {
-        [0.0; ACTION]
-    }
-}
-
 /// What an image shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Layer {
@@ -138,7 +131,7 @@ pub(crate) fn run(args: &GymArgs) -> Result<ExitCode> {
             Env { place, episode: Episode::start(&places[place].rules, &manner, 0) }
         })
         .collect();
-    let image = places[0].view.as_ref().map(|view| view.size());
+    let image = places[0].view.as_ref().map(View::size);
     let [depth, rgb] =
         [Layer::Depth, Layer::Rgb].map(|layer| image.is_some() && args.layers.contains(&layer));
     let mut out = BufWriter::new(io::stdout().lock());

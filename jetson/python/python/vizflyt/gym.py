@@ -76,9 +76,9 @@ class Step:
 
 
 def default_reward(step: Step) -> np.ndarray:
-    """A metre nearer is worth 1, a stage 5, the finish 10, a crash or the fence -10."""
+    """A metre nearer is worth 2, a stage 5, the finish 10, a crash or the fence -4, a step -0.02."""
     lost = (step.end == CRASHED) | (step.end == LEFT_FENCE)
-    return step.progress_m + 5.0 * step.passed + 10.0 * (step.end == FINISHED) - 10.0 * lost
+    return 2.0 * step.progress_m + 5.0 * step.passed + 10.0 * (step.end == FINISHED) - 4.0 * lost - 0.02
 
 
 def _program() -> str:
