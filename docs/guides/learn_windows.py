@@ -1,0 +1,89 @@
+"""Learns to fly through the three windows of project p3, from the state; says how the last hundred episodes ended.
+
+pip install 'vizflyt[gym]' stable-baselines3
+python learn_windows.py --steps 300000
+python learn_windows.py --fly windows.zip          flies courses that it has not seen
+"""
+
+import argparse
+import time
+from collections import Counter
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+import vizflyt.gym
+
+# Twenty steps a second: each has an effect that a policy can see.
+HOW = dict(rate_hz=20, seconds=12.0)
+# What the numbers of a state are about: a network learns from numbers about 1.
+SCALE = np.array([2] * 3 + [1] * 3 + [3] * 3 + [3] * 3 + [1] * 3 + [5] * 3 + [1, 1, 3, 1], np.float32)
+
+
+class Scaled(vizflyt.gym.Env):
+    """An environment whose state is about 1."""
+
+    def reset(self, **how):
+        state, info = super().reset(**how)
+        return state / SCALE, info
+
+    def step(self, action):
+        state, *rest = super().step(action)
+        return (state / SCALE, *rest)
+
+
+class Ends(BaseCallback):
+    """Prints now and then how episodes end."""
+
+    def __init__(self):
+        super().__init__()
+        self.ends, self.start, self.told = [], time.monotonic(), 0
+
+    def _on_step(self):
+        self.ends += [info["end"] for done, info in zip(self.locals["dones"], self.locals["infos"]) if done]
+        if self.num_timesteps - self.told >= 20_000:
+            self.told = self.num_timesteps
+            ends = dict(Counter(self.ends[-100:]).most_common())
+            print(f"{self.num_timesteps:7} steps, {time.monotonic() - self.start:4.0f} s: {ends}", flush=True)
+        return True
+
+
+def learn(steps, output):
+    envs = make_vec_env(Scaled, n_envs=8, seed=1, env_kwargs=dict(project="p3", courses=range(1, 9), **HOW))
+    policy = dict(log_std_init=-0.7)
+    model = PPO("MlpPolicy", envs, n_steps=512, batch_size=512, n_epochs=8, learning_rate=5e-4, ent_coef=0.001,
+                policy_kwargs=policy, seed=1, device="cpu")  # fmt: skip
+    model.learn(steps, callback=Ends())
+    model.save(output)
+    envs.close()
+
+
+def fly(policy, episodes):
+    model, env = PPO.load(policy, device="cpu"), Scaled("p3", courses=range(1001, 1011), **HOW)
+    ends, seconds = Counter(), []
+    for seed in range(episodes):
+        state, _ = env.reset(seed=seed)
+        over = late = False
+        while not (over or late):
+            state, _, over, late, info = env.step(model.predict(state, deterministic=True)[0])
+        ends[info["end"]] += 1
+        seconds += [info["time_s"]] if info["end"] == "finished" else []
+    env.close()
+    print(f"{dict(ends.most_common())}; {np.mean(seconds or [np.nan]):.1f} s to the finish, on average")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=300_000)
+    parser.add_argument("--output", default="windows.zip")
+    parser.add_argument("--fly", metavar="POLICY", help="flies courses that are new to it")
+    parser.add_argument("--episodes", type=int, default=100)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    if args.fly:
+        fly(args.fly, args.episodes)
+    else:
+        learn(args.steps, args.output)
