@@ -5,8 +5,8 @@
     python score_attitude.py live/FLIGHT.mcap --case p0/live
 
 Tilt is the angle between where the estimate and the truth have up; it has roll and pitch in it, and no heading. Heading
-is what remains; an IMU cannot know where it is counted from, so its drift is what is scored: the slope of a line through
-its error. Only what was in the air counts, and nothing before the filter had its time to settle.
+is what remains; an IMU cannot know where it is counted from, so its drift is what is scored: the slope of a line
+through its error. Only what was in the air counts, and nothing before the filter had its time to settle.
 """
 
 import argparse
@@ -200,8 +200,8 @@ def main():
         return 0
     print(f"tilt       rms {figures.tilt_rms_deg:.2f} deg, max {figures.tilt_max_deg:.2f}")
     print(
-        f"heading    drift {figures.heading_drift_deg_per_min:+.2f} deg/min, rms {figures.heading_rms_deg:.2f} deg about "
-        "its mean"
+        f"heading    drift {figures.heading_drift_deg_per_min:+.2f} deg/min, "
+        f"rms {figures.heading_rms_deg:.2f} deg about its mean"
     )
     print(f"over       {figures.seconds:.1f} s in the air, {figures.poses} attitudes")
     if bounds and got:

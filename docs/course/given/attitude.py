@@ -20,18 +20,17 @@ IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def multiply(a: F64, b: F64) -> F64:
-    """Returns the product a b: first b turns, then a. Shapes (..., 4)."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    (ax, ay, az, aw), (bx, by, bz, bw) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack(
+    """Returns the product a b: first b turns, then a. Shapes (4,) or (N, 4)."""
+    # Transposed, the parts come first: shapes (4,) and (N, 4) alike.
+    (ax, ay, az, aw), (bx, by, bz, bw) = np.asarray(a, float).T, np.asarray(b, float).T
+    return np.array(
         [
             aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
             aw * bw - ax * bx - ay * by - az * bz,
-        ],
-        axis=-1,
-    )
+        ]
+    ).T
 
 
 def conjugate(q: F64) -> F64:
@@ -64,8 +63,9 @@ def rotate(q: F64, vector: F64) -> F64:
 
 
 def up_in_body(q: F64) -> F64:
-    """Returns the world's up in body axes: what an accelerometer at rest points along. Shape (..., 4) gives (..., 3)."""
-    return rotate(conjugate(q), np.array([0.0, 0.0, 1.0]))
+    """Returns the world's up in body axes, where an accelerometer at rest points; shape (N, 4) gives (N, 3)."""
+    x, y, z, w = np.asarray(q, float).T
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]).T
 
 
 def level(accel_mps2: F64) -> F64:

@@ -1,7 +1,7 @@
 """Project 0, the reference: an explicit complementary filter on the unit quaternions, with the gyroscope's bias.
 
 R. Mahony, T. Hamel and J.-M. Pflimlin, "Nonlinear complementary filters on the special orthogonal group", IEEE
-Transactions on Automatic Control 53(5), 2008, section V.
+Transactions on Automatic Control 53(5), 2008, the explicit filter: equations 32 and 48.
 """
 
 from __future__ import annotations
