@@ -46,8 +46,11 @@ CASES = {
 }
 # Nearer than this to where it stood, the vehicle is not in the air. [m]
 AIR_M = 0.3
-# How far in time two true poses may be, so that there is truth between them. [s]
+# How far in time two true poses may be, so that there is truth between them; and an attitude from an instant, so that
+# it says something of it. [s]
 GAP_S = 0.2
+# An estimate tells this share of the flight at least: leaving out what is bad gains nothing.
+LEAST_TOLD = 0.95
 
 
 class Trajectory(NamedTuple):
@@ -79,10 +82,11 @@ def read(path, from_ns=0):
                 x, y, z, qw, qx, qy, qz = (float(one) for one in row[1:8])
                 rows.append((int(row[0]), x, y, z, qx, qy, qz, qw))
             else:
-                stamp, *numbers = line.split()
+                stamp, *words = line.split()
                 # By hand: a float does not hold nanoseconds since 1970.
                 seconds, _, part = stamp.partition(".")
-                rows.append((int(seconds) * 10**9 + int(part[:9].ljust(9, "0")), *map(float, numbers[:7])))
+                x, y, z, qx, qy, qz, qw = (float(one) for one in words[:7])
+                rows.append((int(seconds) * 10**9 + int(part[:9].ljust(9, "0")), x, y, z, qx, qy, qz, qw))
     return trajectory([row[0] for row in rows], np.array([row[1:] for row in rows]).reshape(-1, 7), from_ns)
 
 
@@ -140,10 +144,18 @@ def errors(q_xyzw, true_xyzw):
 def score(truth, estimate, settle_s=0.0):
     """Returns the figures of an estimate."""
     true_xyzw, height_m, known = truth_at(truth, estimate.at_s)
-    counted = known & (height_m > truth.p_m[0, 2] + AIR_M) & (estimate.at_s >= estimate.at_s[0] + settle_s)
-    if counted.sum() < 100:
-        raise ValueError(f"only {counted.sum()} attitudes are of a time in the air whose truth is known")
+    # What begins in the air counts from when it has settled; what does not, all the way.
+    from_s = estimate.at_s[0] + settle_s if settle_s and len(estimate.at_s) else -np.inf
+    counted = known & (height_m > truth.p_m[0, 2] + AIR_M) & (estimate.at_s >= from_s)
     at_s = estimate.at_s[counted]
+    flown_s = truth.at_s[(truth.p_m[:, 2] > truth.p_m[0, 2] + AIR_M) & (truth.at_s >= from_s)]
+    if len(flown_s) < 2 or len(at_s) < 2:
+        raise ValueError("there is no attitude of a time in the air whose truth is known")
+    after = np.searchsorted(at_s, flown_s).clip(1, len(at_s) - 1)
+    away_s = np.minimum(abs(at_s[after] - flown_s), abs(at_s[after - 1] - flown_s))
+    told = (away_s <= GAP_S).mean()
+    if told < LEAST_TOLD:
+        raise ValueError(f"only {told:.0%} of the time in the air has an attitude; {LEAST_TOLD:.0%} are asked for")
     tilt, heading, _ = errors(estimate.q_xyzw[counted], true_xyzw[counted])
     slope, _ = np.polyfit(at_s, heading, 1)
     degrees = np.degrees
@@ -171,7 +183,9 @@ def points(bounds, figures):
 
 def first_ns(path):
     with open(path) as file:
-        line = next(line for line in file if line.strip() and not line.startswith("#"))
+        line = next((line for line in file if line.strip() and not line.startswith("#")), None)
+    if line is None:
+        raise ValueError(f"{path} holds no pose")
     stamp = line.split("," if "," in line else None)[0]
     return int(stamp) if "," in line else int(stamp.partition(".")[0]) * 10**9
 
@@ -191,7 +205,7 @@ def main():
             from_ns = first_ns(arguments.truth)
             truth, estimate = (read(path, from_ns) for path in (arguments.truth, arguments.estimate))
         figures = score(truth, estimate, bounds.settle_s if bounds else 0.0)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, IndexError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 1
     got = points(bounds, figures) if bounds else None

@@ -106,8 +106,31 @@ def test_the_reference_flies_within_its_bound(finished):
     )
     live = finished.scores(["python score_attitude.py live/logs/day-5.mcap --case p0/live"])
     assert live == {"p0/live": (10.0, 10.0)}
-    said = finished.run("python score_attitude.py data/mav0/imu0/none.csv my-p0/calibrated.tum", status=1)
-    assert "none.csv" in said
+
+
+@pytest.mark.parametrize(
+    ("estimate", "said"),
+    [
+        ("", "is no MCAP file; give a flight's log"),
+        ("none.tum", "No such file"),
+        ("empty.tum", "no attitude of a time in the air"),
+        ("words.tum", "could not convert"),
+        ("half.tum", "only 5\\d% of the time in the air has an attitude"),
+        ("long.tum", "no unit quaternion"),
+    ],
+)
+def test_what_cannot_be_scored_is_said(finished, estimate, said):
+    whole = (finished.course / "my-p0/calibrated.tum").read_text().splitlines()
+    for name, lines in (
+        ("empty", ["# nothing"]),
+        ("words", ["1.0 0 0 0 zero 0 0 1"]),
+        ("half", whole[: len(whole) * 11 // 20]),
+        ("long", [line.rsplit(" ", 1)[0] + " 1.5" for line in whole]),
+    ):
+        (finished.course / f"{name}.tum").write_text("\n".join(lines))
+    truth = "data/mav0/state_groundtruth_estimate0/data.csv"
+    found = finished.run(f"python score_attitude.py {truth} {estimate}", status=1)
+    assert re.search(said, found) and "Traceback" not in found, found
 
 
 def test_the_whole_error_is_that_of_evaluate(finished):
