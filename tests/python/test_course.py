@@ -40,7 +40,8 @@ class Student:
     def __init__(self, folder, program):
         self.course = folder / "course"
         self.starters, self.solutions = {}, {}
-        shutil.copytree(COURSE, self.course, ignore=shutil.ignore_patterns("my-*", "__pycache__"))
+        made = shutil.ignore_patterns("my-*", ".venv", "flown", "data", "sets", "graded", "__pycache__")
+        shutil.copytree(COURSE, self.course, ignore=made)
         path = os.pathsep.join([str(Path(program).parent), str(Path(sys.executable).parent), os.environ["PATH"]])
         keys = str(folder / "config")
         self.environment = os.environ | {"PATH": path, "XDG_CONFIG_HOME": keys, "PYTHONDONTWRITEBYTECODE": "1"}

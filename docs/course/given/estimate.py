@@ -6,7 +6,7 @@
 Cases: what of the data set the filter gets to see.
 
     calibrated     all readings, as they were measured
-    uncalibrated   all readings; 1 deg/s is added to each axis of the gyroscope
+    uncalibrated   all readings; each axis of the gyroscope is off by another 1 deg/s, up or down
     restart        as uncalibrated, but the readings begin in the air, 12 s after the data set does
 """
 
