@@ -93,10 +93,7 @@ mod tests {
             assert_eq!((classes.number(name), classes.name(number)), (Some(number), name));
         }
         assert_eq!(classes.number("distractor"), Some(DISTRACTOR));
-        assert_eq!(
-            (classes.number("scene"), classes.number("nothing")),
-            (Some(SCENE), Some(0))
-        );
+        assert_eq!((classes.number("scene"), classes.number("nothing")), (Some(SCENE), Some(0)));
         assert_eq!(classes.names().len(), FIXED.len() + 1);
         assert!(classes.is_thing(classes.number("table").unwrap()) && !classes.is_thing(SCENE));
         let all = [
