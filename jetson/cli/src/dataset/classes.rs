@@ -3,14 +3,12 @@
 use anyhow::{Result, ensure};
 use vizflyt_scenes::parts::PartClass;
 
-/// All classes of a data set; a class's number is its place, 0 where nothing is seen.
+/// All classes of a data set; a class's number is its place, 0 where nothing was hit, or too little.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Classes {
     names: Vec<String>,
 }
 
-/// Nothing was hit, or too little.
-pub(super) const NOTHING: u8 = 0;
 /// What nobody has named.
 pub(super) const SCENE: u8 = 1;
 pub(super) const GATE: u8 = 2;
@@ -95,10 +93,7 @@ mod tests {
             assert_eq!((classes.number(name), classes.name(number)), (Some(number), name));
         }
         assert_eq!(classes.number("distractor"), Some(DISTRACTOR));
-        assert_eq!(
-            (classes.number("scene"), classes.number("nothing")),
-            (Some(SCENE), Some(NOTHING))
-        );
+        assert_eq!((classes.number("scene"), classes.number("nothing")), (Some(SCENE), Some(0)));
         assert_eq!(classes.names().len(), FIXED.len() + 1);
         assert!(classes.is_thing(classes.number("table").unwrap()) && !classes.is_thing(SCENE));
         let all = [

@@ -5,7 +5,7 @@
 //! scene, one after the other:
 //!   world     splats cut into things, gates, free space
 //!   shot      pose, light, textures of image N, by the seeds and N alone
-//!   render    colour, depth, ids -> layers; a thread each, one image at a time
+//!   render    colour, depth, ids -> layers (vizflyt-labels); a thread each, one image at a time
 //!   store     files of the layers, then the image's record: it is whole
 //! all images there: coco | yolo | euroc, of the records
 //! ```
@@ -16,13 +16,10 @@ mod coco;
 mod distractor;
 mod euroc;
 mod free_space;
-mod layers;
 mod outline;
-mod picture;
 mod randomize;
 mod record;
 mod render;
-mod rle;
 mod sheet;
 mod shot;
 mod store;

@@ -2,17 +2,18 @@
 
 use anyhow::Result;
 use glam::DVec3;
+use vizflyt_labels::flow::Flow;
+use vizflyt_labels::normals::Normals;
+use vizflyt_labels::{layers, rle};
 use vizflyt_protocol::geometry::{Cam, Pose};
 use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_splat::weather::{Moment, WeatherPass};
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Scene};
 
 use super::classes::Classes;
-use super::layers;
 use super::record::{
     CameraRecord, CornerRecord, GateRecord, ImageRecord, NextRecord, PoseRecord, ThingRecord,
 };
-use super::rle;
 use super::shot::{Shot, motion};
 use super::world::{Gate, Slot, World};
 
@@ -22,6 +23,8 @@ pub(super) struct LabelRenderer<'a> {
     renderer: CpuRenderer,
     images: [RgbdImage; 1],
     weather: WeatherPass,
+    normals: Normals,
+    flow: Flow,
     class_of_id: Vec<u8>,
     /// Whether an id is one of a thing.
     is_thing: Vec<bool>,
@@ -36,12 +39,12 @@ pub(super) struct Layers {
     pub(super) next: Vec<u8>,
     /// Of surfaces; 0 is none. [m, cam]
     pub(super) depth_m: Vec<f32>,
-    /// H x W x 3; see [`layers::normals`].
+    /// H x W x 3; see [`Normals::write`].
     pub(super) normals: Vec<u8>,
     /// Ids of things; 0 of surroundings.
     pub(super) instances: Vec<u16>,
     pub(super) classes: Vec<u8>,
-    /// H x W x 3; see [`layers::flow`].
+    /// H x W x 3; see [`Flow::write`].
     pub(super) flow: Vec<u16>,
 }
 
@@ -61,8 +64,16 @@ impl<'a> LabelRenderer<'a> {
         let class_of_id = world.class_of_id();
         let is_thing = class_of_id.iter().map(|&class| classes.is_thing(class)).collect();
         let renderer = CpuRenderer::new(scene);
-        let (images, weather) = ([RgbdImage::default()], WeatherPass::default());
-        Self { world, renderer, images, weather, class_of_id, is_thing }
+        Self {
+            world,
+            renderer,
+            images: [RgbdImage::default()],
+            weather: WeatherPass::default(),
+            normals: Normals::default(),
+            flow: Flow::default(),
+            class_of_id,
+            is_thing,
+        }
     }
 
     /// Renders a shot.
@@ -82,7 +93,7 @@ impl<'a> LabelRenderer<'a> {
         image.write_rgb8(&mut out.rgb);
         layers::surface_depth(image, &mut out.depth_m);
         if wanted.normals {
-            layers::normals(k, &out.depth_m, &mut out.normals);
+            self.normals.write(k, &out.depth_m, &mut out.normals);
         }
         if wanted.classes {
             layers::classes(&out.depth_m, &image.ids, &self.class_of_id, &mut out.classes);
@@ -99,18 +110,13 @@ impl<'a> LabelRenderer<'a> {
                 });
                 let moved: Vec<(u16, Pose<Cam, Cam>)> = moved.collect();
                 let (depth_m, ids) = (&out.depth_m, &image.ids);
-                layers::flow(k, depth_m, ids, &next_from_cam, &moved, &mut out.flow);
+                self.flow.write(k, depth_m, ids, &next_from_cam, &moved, &mut out.flow);
             } else {
                 out.flow.clear();
                 out.flow.resize(3 * k.pixels(), 0);
             }
         }
-        out.instances.clear();
-        let ids = image.ids.iter().zip(&out.depth_m);
-        let of_thing = |(&id, &z_m): (&u16, &f32)| {
-            if z_m > 0.0 && self.is_thing[usize::from(id)] { id } else { 0 }
-        };
-        out.instances.extend(ids.map(of_thing));
+        layers::instances(&out.depth_m, &image.ids, &self.is_thing, &mut out.instances);
         Ok(())
     }
 

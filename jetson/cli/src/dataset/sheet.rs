@@ -6,9 +6,9 @@
 use std::path::Path;
 
 use anyhow::{Context, Result};
+use vizflyt_labels::picture;
 use vizflyt_protocol::geometry::Intrinsics;
 
-use super::picture;
 use super::record::ImageRecord;
 use super::render::Layers;
 use super::store::write_whole;

@@ -9,6 +9,7 @@ use anyhow::{Context, Result};
 use nix::sys::resource::{UsageWho, getrusage};
 use nix::sys::time::TimeValLike;
 use serde_json::Value;
+use vizflyt_labels::{layers, picture};
 use vizflyt_scenes::projects::CourseProject;
 use vizflyt_server::scene::{BareArgs, PartsFile};
 
@@ -18,7 +19,6 @@ use super::sheet::Sheet;
 use super::shot::Shooting;
 use super::store::{ImageName, Layer, Store};
 use super::world::World;
-use super::{layers, picture};
 use crate::grade::document::Shard;
 use crate::terminal::print_fmt;
 
@@ -232,7 +232,7 @@ fn encoded(plan: &Plan, layer: Layer, layers: &Layers, size: [u32; 2]) -> Result
         Some(quality) => picture::jpeg(rgb, size, quality),
         None => picture::rgb8(rgb, size),
     };
-    match layer {
+    let file = match layer {
         Layer::Rgb => colour(&layers.rgb),
         Layer::Next => colour(&layers.next),
         Layer::Depth => {
@@ -244,7 +244,8 @@ fn encoded(plan: &Plan, layer: Layer, layers: &Layers, size: [u32; 2]) -> Result
         Layer::Instances => picture::grey16(&layers.instances, size),
         Layer::Classes => picture::grey8(&layers.classes, size),
         Layer::Flow => picture::rgb16(&layers.flow, size),
-    }
+    };
+    Ok(file?)
 }
 
 /// Renders some images again, with all of their layers, and writes the sheet.

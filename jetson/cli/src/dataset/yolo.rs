@@ -6,11 +6,11 @@
 use std::fmt::Write;
 
 use anyhow::{Context, Result};
+use vizflyt_labels::rle;
 
 use super::Labelled;
 use super::outline::outline;
 use super::record::{GateRecord, ImageRecord, ThingRecord};
-use super::rle;
 use super::store::{Format, Store, write_whole};
 
 /// Writes all labels of these splits, and the file that names them.

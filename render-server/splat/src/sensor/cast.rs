@@ -1,6 +1,6 @@
 //! One beam through the splats: what it meets, and the echoes that makes.
 //!
-//! Budget: some 0.8 us a beam and thread in a forest of 125 k splats, bound by the boxes and splats that it touches.
+//! Budget: some 0.7 us a beam and thread in a forest of 125 k splats, bound by the boxes and splats that it touches.
 //!
 //! `follow` finds the splats; here they become echoes. Splats are taken in the order of their depths, and what one lets pass
 //! meets the next, as in an image.

@@ -1,7 +1,7 @@
 //! Rays through a tree of splats, nearest first: eight boxes or splats at a time for a fan of rays, then splats that are left for eight
 //! rays at a time.
 //!
-//! Budget: 0.8 us a ray and thread in a forest of 128 k splats (docs/BENCHMARKS.md, "LiDAR"). A fan of eight rays touches tens of
+//! Budget: 0.7 us a ray and thread in a forest of 128 k splats (docs/BENCHMARKS.md, "LiDAR"). A fan of eight rays touches tens of
 //! nodes and leaves there, and works out tens of splats.
 //!
 //! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection of the Gaussian onto the plane
@@ -83,7 +83,7 @@ struct Fan<S: Simd> {
 
 impl<S: Simd> Fan<S> {
     #[inline(always)]
-    fn around(s: S, rays: &[Ray]) -> Self {
+    fn around(s: S, rays: &[Ray], lanes: &Lanes<S>) -> Self {
         let (mut origin, mut direction) = (Vec3::ZERO, Vec3::ZERO);
         for ray in rays {
             origin += ray.origin_m;
@@ -91,26 +91,33 @@ impl<S: Simd> Fan<S> {
         }
         origin /= rays.len() as f32;
         // Rays that cancel are no fan, and `cast` makes none of them.
-        direction = direction.normalize_or(Vec3::X);
+        direction = unit(s, direction).unwrap_or(Vec3::X);
         let between = rays[rays.len() - 1].direction - rays[0].direction;
         let wide = between - direction * between.dot(direction);
-        let side = wide.try_normalize().unwrap_or_else(|| direction.any_orthonormal_vector());
+        let side = unit(s, wide).unwrap_or_else(|| direction.any_orthonormal_vector());
         let across = direction.cross(side);
-        let (mut slope, mut widest, mut off) = (Vec3::ZERO, 0.0_f32, 0.0_f32);
-        let (mut apart, mut spread) = (0.0_f32, 0.0_f32);
-        let (mut side_low, mut side_high) = ([f32::MAX; WIDTH], [f32::MIN; WIDTH]);
-        for (lane, ray) in rays.iter().enumerate() {
-            // Where it is a metre ahead.
-            let ahead = ray.direction / ray.direction.dot(direction).max(1e-3) - direction;
-            slope = slope.max(ahead.abs());
-            let along_side = ahead.dot(side);
-            side_low[lane] = along_side - ROUNDING;
-            side_high[lane] = along_side + ROUNDING;
-            widest = widest.max(along_side.abs());
-            off = off.max(ahead.dot(across).abs());
-            apart = apart.max((ray.origin_m - origin).length());
-            spread = spread.max(ray.spread);
+        // Where each ray is a metre ahead, from the axis.
+        let axis = broadcast(s, direction.to_array());
+        let per = s.splat(1.0) / s.max(dot(s, lanes.direction, axis), s.splat(1e-3));
+        let mut ahead = lanes.direction;
+        for (ahead, axis) in ahead.iter_mut().zip(axis) {
+            *ahead = *ahead * per - axis;
         }
+        let along_side = dot(s, ahead, broadcast(s, side.to_array()));
+        let along_across = dot(s, ahead, broadcast(s, across.to_array()));
+        let from_origin = from(lanes.origin, broadcast(s, origin.to_array()));
+        let slope = Vec3::new(
+            greatest(s, abs(s, ahead[0])),
+            greatest(s, abs(s, ahead[1])),
+            greatest(s, abs(s, ahead[2])),
+        );
+        let widest = greatest(s, abs(s, along_side));
+        let off = greatest(s, abs(s, along_across));
+        let apart = greatest(s, s.sqrt(dot(s, from_origin, from_origin)));
+        let spread = greatest(s, lanes.spread);
+        let (mut side_low, mut side_high) = ([0.0; WIDTH], [0.0; WIDTH]);
+        s.store(along_side - s.splat(ROUNDING), &mut side_low);
+        s.store(along_side + s.splat(ROUNDING), &mut side_high);
         for lane in 1..WIDTH {
             side_high[lane] = side_high[lane].max(side_high[lane - 1]);
             side_low[WIDTH - 1 - lane] = side_low[WIDTH - 1 - lane].min(side_low[WIDTH - lane]);
@@ -141,7 +148,7 @@ impl<S: Simd> Fan<S> {
     }
 }
 
-/// Rays, one a lane.
+/// Rays, one a lane; the last again in lanes that are left.
 #[derive(Clone, Copy)]
 struct Lanes<S: Simd> {
     origin: [S::F; 3],
@@ -153,9 +160,10 @@ impl<S: Simd> Lanes<S> {
     #[inline(always)]
     fn new(s: S, rays: &[Ray]) -> Self {
         let mut origin = [[0.0; WIDTH]; 3];
-        let mut direction = [[1.0; WIDTH]; 3];
+        let mut direction = [[0.0; WIDTH]; 3];
         let mut spread = [0.0; WIDTH];
-        for (lane, ray) in rays.iter().enumerate() {
+        for lane in 0..WIDTH {
+            let ray = &rays[lane.min(rays.len() - 1)];
             for axis in 0..3 {
                 origin[axis][lane] = ray.origin_m[axis];
                 direction[axis][lane] = ray.direction[axis];
@@ -191,6 +199,23 @@ struct Met {
 #[inline(always)]
 fn inverse(v: f32) -> f32 {
     if v.abs() < 1e-12 { 1e12_f32.copysign(v) } else { 1.0 / v }
+}
+
+/// Returns the direction of a vector that has one. By the kernel's own square root: glam's is an instruction from before AVX (of
+/// `libm`), and one of those among AVX's takes some hundred cycles.
+#[inline(always)]
+fn unit<S: Simd>(s: S, v: Vec3) -> Option<Vec3> {
+    let mut length = [0.0; WIDTH];
+    s.store(s.sqrt(s.splat(v.length_squared())), &mut length);
+    (length[0] > 1e-9).then(|| v / length[0])
+}
+
+/// Returns the greatest lane of what is not negative.
+#[inline(always)]
+fn greatest<S: Simd>(s: S, v: S::F) -> f32 {
+    let mut lanes = [0.0; WIDTH];
+    s.store(v, &mut lanes);
+    farthest(&lanes)
 }
 
 #[inline(always)]
@@ -261,7 +286,8 @@ impl Kernel for Follow<'_> {
         if tree.nodes.is_empty() || rays.is_empty() {
             return;
         }
-        let (fan, lanes) = (Fan::around(s, rays), Lanes::new(s, rays));
+        let lanes = Lanes::new(s, rays);
+        let fan = Fan::around(s, rays, &lanes);
         // How far each ray still looks; lanes without one see nothing.
         let mut reach = [-1.0; WIDTH];
         for (reach, hits) in reach.iter_mut().zip(&*hits) {

@@ -1,6 +1,6 @@
 //! LiDAR: many beams in a sweep, each from where the sensor is at its own instant.
 //!
-//! Budget: 6.5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; `cast` is nearly all of it.
+//! Budget: 5.5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; `cast` is nearly all of it.
 //!
 //! A beam's echoes (`cast`) come back with the power of a Lambertian surface that is larger than the beam, `reflectivity cos(incidence) /
 //! range^2` (Wagner 2010, "Radiometric calibration of small-footprint full-waveform airborne laser scanner measurements", ISPRS

@@ -7,17 +7,17 @@ use std::collections::BTreeMap;
 
 /// One id's pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Mask {
+pub struct Mask {
     /// Lengths of runs down the columns, from the left; the first is of pixels outside, and may be 0.
-    pub(super) counts: Vec<u32>,
+    pub counts: Vec<u32>,
     /// Number of pixels inside.
-    pub(super) area_px: u32,
+    pub area_px: u32,
     /// The tight box: left, top, width, height. [px]
-    pub(super) box_px: [u32; 4],
+    pub box_px: [u32; 4],
 }
 
 /// Returns the mask of each id that is not 0. Row-major ids in.
-pub(super) fn masks(ids: &[u16], [width, height]: [usize; 2]) -> BTreeMap<u16, Mask> {
+pub fn masks(ids: &[u16], [width, height]: [usize; 2]) -> BTreeMap<u16, Mask> {
     debug_assert_eq!(ids.len(), width * height);
     let mut runs: BTreeMap<u16, Runs> = BTreeMap::new();
     for x in 0..width {
@@ -78,7 +78,7 @@ impl Runs {
 }
 
 /// Returns counts as COCO's text: differences to the count before last, five bits a character.
-pub(super) fn to_text(counts: &[u32]) -> String {
+pub fn to_text(counts: &[u32]) -> String {
     let mut text = String::new();
     for (n, &count) in counts.iter().enumerate() {
         let before = if n > 2 { counts[n - 2] } else { 0 };
@@ -97,7 +97,7 @@ pub(super) fn to_text(counts: &[u32]) -> String {
 }
 
 /// Returns the counts of COCO's text; `None` where it is none.
-pub(super) fn from_text(text: &str) -> Option<Vec<u32>> {
+pub fn from_text(text: &str) -> Option<Vec<u32>> {
     let mut counts: Vec<u32> = Vec::new();
     let mut bytes = text.bytes();
     while bytes.len() > 0 {
@@ -124,7 +124,7 @@ pub(super) fn from_text(text: &str) -> Option<Vec<u32>> {
 }
 
 /// Returns which pixels counts are of, row-major; `None` if they do not fill the image.
-pub(super) fn to_pixels(counts: &[u32], [width, height]: [usize; 2]) -> Option<Vec<bool>> {
+pub fn to_pixels(counts: &[u32], [width, height]: [usize; 2]) -> Option<Vec<bool>> {
     let mut pixels = vec![false; width * height];
     let mut at = 0usize;
     for (n, &count) in counts.iter().enumerate() {

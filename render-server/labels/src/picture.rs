@@ -3,32 +3,60 @@
 //! Budget on one core, 320x240: most of an image's time beside its rendering; fast deflate and one filter for all rows, by
 //! layer.
 
-use anyhow::{Context, Result};
 use png::{BitDepth, ColorType, DeflateCompression, Encoder, Filter};
 
+/// Why there is no file.
+#[derive(Debug, thiserror::Error)]
+pub enum EncodeError {
+    /// Of a PNG.
+    #[error("cannot encode a PNG")]
+    Png(#[from] png::EncodingError),
+    /// Of a JPEG.
+    #[error("cannot encode a JPEG")]
+    Jpeg(#[from] jpeg_encoder::EncodingError),
+    /// Of a JPEG, whose sides are 16 bits.
+    #[error("an image of {0} x {1} pixels is too large for a JPEG")]
+    Size(u32, u32),
+}
+
 /// Encodes RGB, 8 bits each.
-pub(super) fn rgb8(rgb: &[u8], size: [u32; 2]) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn rgb8(rgb: &[u8], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
     png(rgb, size, (ColorType::Rgb, BitDepth::Eight), Filter::Paeth)
 }
 
 /// Encodes one channel of 8 bits: long runs.
-pub(super) fn grey8(grey: &[u8], size: [u32; 2]) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn grey8(grey: &[u8], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
     png(grey, size, (ColorType::Grayscale, BitDepth::Eight), Filter::Up)
 }
 
 /// Encodes one channel of 16 bits.
-pub(super) fn grey16(grey: &[u16], size: [u32; 2]) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn grey16(grey: &[u16], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
     png(&bytes(grey), size, (ColorType::Grayscale, BitDepth::Sixteen), Filter::Up)
 }
 
 /// Encodes three channels of 16 bits.
-pub(super) fn rgb16(rgb: &[u16], size: [u32; 2]) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn rgb16(rgb: &[u16], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
     png(&bytes(rgb), size, (ColorType::Rgb, BitDepth::Sixteen), Filter::Up)
 }
 
 /// Encodes RGB as JPEG of a quality from 1 to 100, colour at full resolution.
-pub(super) fn jpeg(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> Result<Vec<u8>> {
-    let side = |side: u32| u16::try_from(side).context("a JPEG's sides are below 65536");
+///
+/// # Errors
+/// [`EncodeError`].
+pub fn jpeg(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> Result<Vec<u8>, EncodeError> {
+    let side = |side: u32| u16::try_from(side).map_err(|_| EncodeError::Size(width, height));
     let mut out = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut out, quality);
     encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_1_1);
@@ -41,17 +69,16 @@ fn png(
     [width, height]: [u32; 2],
     (color, depth): (ColorType, BitDepth),
     filter: Filter,
-) -> Result<Vec<u8>> {
-    let context = "cannot encode a PNG";
+) -> Result<Vec<u8>, EncodeError> {
     let mut out = Vec::with_capacity(bytes.len() / 4);
     let mut encoder = Encoder::new(&mut out, width, height);
     encoder.set_color(color);
     encoder.set_depth(depth);
     encoder.set_deflate_compression(DeflateCompression::FdeflateUltraFast);
     encoder.set_filter(filter);
-    let mut writer = encoder.write_header().context(context)?;
-    writer.write_image_data(bytes).context(context)?;
-    writer.finish().context(context)?;
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(bytes)?;
+    writer.finish()?;
     Ok(out)
 }
 
