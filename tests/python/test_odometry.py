@@ -146,6 +146,89 @@ AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 DOWN = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
 
 
+def after_key_images(count):
+    """Returns an inertial odometry that moves ahead and to the left, with a camera that looks ahead."""
+    estimator = inertial.InertialOdometry()
+    estimator.begin(flight.Standing(0.0, np.array([0.0, 0.0, 9.80665]), np.zeros(3)))
+    for k in range(count):
+        at_m = np.array([0.1, 0.2, 0.05]) * k
+        estimator._motion = estimator._motion._replace(p_m=at_m)
+        estimator._covariance += np.diag(np.repeat([1e-7, 0.0, 1e-6, 0.0, 0.0, *[0.0] * (2 * k)], 3))
+        estimator._clone()
+    estimator._views["front"] = view("front", AHEAD, np.array([0.06, 0.0, 0.02]))
+    return estimator
+
+
+def slopes_of(estimator, rotation, body_m, place_m):
+    front = estimator._views["front"]
+    in_cam_m = front.body_from_cam.T @ (rotation.T @ (place_m - body_m) - front.camera_m)
+    return in_cam_m[:2] / in_cam_m[2]
+
+
+def test_a_place_in_the_state_is_as_uncertain_as_it_is_off():
+    estimator, place_m, name = after_key_images(8), np.array([4.0, 1.0, 0.5]), ("front", 7)
+    clones, size = list(estimator._clones), len(estimator._covariance)
+    slopes = np.array([slopes_of(estimator, one.rotation, one.p_m, place_m) for one in clones])
+    estimator._sights[name] = [inertial.Sight(one.key, slope) for one, slope in zip(clones, slopes)]
+    before = estimator._covariance.copy()
+    estimator._place([name])
+    (placed,) = estimator._places
+    np.testing.assert_allclose(placed.p_m, place_m, atol=1e-6)
+    at = slice(inertial.IMU_SIZE, inertial.IMU_SIZE + inertial.PLACE_SIZE)
+    rest = np.r_[0 : at.start, at.stop : size + inertial.PLACE_SIZE]
+    np.testing.assert_array_equal(estimator._covariance[np.ix_(rest, rest)], before)
+    # Drawn: the images were taken from elsewhere than where the state has them, and corners are off as well.
+    random = np.random.default_rng(11)
+    drawn = random.multivariate_normal(np.zeros(size), before, 3000)
+    seen = np.empty((len(drawn), len(clones), 2))
+    for n, error in enumerate(drawn):
+        for k, one in enumerate(clones):
+            part = error[inertial.IMU_SIZE + inertial.CLONE_SIZE * k :][: inertial.CLONE_SIZE]
+            seen[n, k] = slopes_of(estimator, one.rotation @ flight.exp_so3(part[:3]), one.p_m + part[3:], place_m)
+    seen += random.normal(0, inertial.SIGMA_PX / 160, seen.shape)
+    camera_m = np.array([0.06, 0.0, 0.02])
+    axes = np.broadcast_to([one.rotation @ AHEAD for one in clones], (*seen.shape[:2], 3, 3))
+    from_m = np.broadcast_to([one.p_m + one.rotation @ camera_m for one in clones], (*seen.shape[:2], 3))
+    found_m, _ = inertial.triangulate(axes, from_m, seen, np.ones(seen.shape[:2], bool))
+    off_m = place_m - found_m
+    sigma_m = np.sqrt(np.diag(estimator._covariance)[at])
+    np.testing.assert_allclose(off_m.std(axis=0), sigma_m, rtol=0.08)
+    # It goes with where the body is, too: correlations.
+    sigmas_m = sigma_m[:, None] * np.sqrt(np.diag(before)[inertial.P])
+    together = (off_m[:, :, None] * drawn[:, None, inertial.P]).mean(axis=0)
+    np.testing.assert_allclose(together / sigmas_m, estimator._covariance[at, inertial.P] / sigmas_m, atol=0.06)
+
+
+def test_places_in_the_state_tell_where_the_body_is():
+    estimator = after_key_images(8)
+    random = np.random.default_rng(12)
+    clones = estimator._clones
+    for number in range(20):
+        place_m = np.array([random.uniform(3, 6), random.uniform(-2, 3), random.uniform(-2, 2)])
+        slopes = [slopes_of(estimator, one.rotation, one.p_m, place_m) for one in clones]
+        estimator._sights["front", number] = [inertial.Sight(one.key, slope) for one, slope in zip(clones, slopes)]
+    estimator._place(sorted(estimator._sights))
+    places_m = {place.name: place.p_m for place in estimator._places}
+    assert len(places_m) == 20
+    # It drifts: farther than it believes to be.
+    truth, truth_m = estimator._motion.rotation, estimator._motion.p_m
+    estimator._covariance[: inertial.IMU_SIZE, : inertial.IMU_SIZE] += np.diag(np.repeat([1e-4, 0, 4e-2, 0, 0], 3))
+    turn = flight.exp_so3(np.array([0.01, -0.005, 0.008]))
+    estimator._motion = estimator._motion._replace(rotation=truth @ turn, p_m=truth_m + np.array([0.05, -0.08, 0.04]))
+    estimator._clone()
+    looks = {name: slopes_of(estimator, truth, truth_m, place_m) for name, place_m in places_m.items()}
+    looks["front", 3] = looks["front", 3] + 0.3
+    estimator._use([], looks)
+    assert {place.name for place in estimator._places} == set(places_m) - {("front", 3)}
+    # Turn and side-step look alike: a sigma of 1 to 3 cm is left.
+    np.testing.assert_allclose(estimator._motion.p_m, truth_m, atol=0.02)
+    np.testing.assert_allclose(estimator._motion.rotation, truth, atol=0.004)
+    # What is no longer followed leaves the state.
+    estimator._forget_places({("front", 0), ("front", 5)})
+    assert len(estimator._places) == 17
+    assert len(estimator._covariance) == inertial.IMU_SIZE + 17 * inertial.PLACE_SIZE + 9 * inertial.CLONE_SIZE
+
+
 @pytest.mark.parametrize("outliers", [0, 25])
 def test_the_pose_is_found_from_places(outliers, monkeypatch):
     # Without a gyroscope, the guess is a wide one.

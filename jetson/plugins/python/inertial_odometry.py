@@ -5,12 +5,15 @@ A multi-state constraint Kalman filter (A. Mourikis and S. Roumeliotis, "A multi
 vision-aided inertial navigation", ICRA 2007). Its state is the body's motion and the IMU's biases, and the body's poses
 at the last key images. Between images the IMU carries it on; scale and up come from there. A corner that was seen in
 several of those images says how they lie to each other: its own place is eliminated (Schur complement), so it needs no
-room in the state. Scale is known at once, as the vehicle stands before it takes off: velocity is 0 there, gravity is
-what the accelerometer feels, and the gyroscope's mean is its bias.
+room in the state. Corners that are followed for longer get a place in the state all the same (M. Li and A. Mourikis,
+"Optimization-based estimator design for vision-aided inertial navigation", RSS 2012): they remember how large the world
+is, when the images in which that was measured are long forgotten. Scale is known at once, as the vehicle stands before
+it takes off: velocity is 0 there, gravity is what the accelerometer feels, and the gyroscope's mean is its bias.
 
 ::
 
     IMU -> propagate -> clone at key images -> corners that end or grow old -> triangulate -> update
+                                            -> corners with a place ------------------------> update
 
 Fly:       vizflyt demo --project spiral --level g --plugin jetson/plugins/python/inertial_odometry.py
 Data set:  inertial_odometry.py --dataset DIR -o estimate.tum
@@ -37,11 +40,12 @@ from odometry_flight import (
 )
 
 GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])
-# White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame, read 100 times a second.
+# White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame. A reading is off by 0.2 m/s^2 and
+# 0.01 rad/s, and 100 come in a second: divided by the root of 100 Hz.
 # [m/s^2/sqrt(Hz)], [rad/s/sqrt(Hz)], [m/s^3/sqrt(Hz)], [rad/s^2/sqrt(Hz)]
-ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.03, 0.001, 1e-3, 1e-4
+ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.02, 0.001, 1e-3, 1e-4
 # What is known where it stands: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2]; and the mean force felt. [m/s^2]
-TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.02, 0.001, 0.05, 0.01
+TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.003, 0.001, 0.05, 0.01
 # Heading and place are the frame's own, by definition.
 OWN_SIGMA = 1e-4
 # Key images are so far apart, and so many are remembered. [s]
@@ -53,15 +57,18 @@ PREDICTED_RAD, PREDICTED_M = 0.0015, 0.001
 CORNERS, APART_PX = 220, 10
 # How far a followed corner is off. [px]
 SIGMA_PX = 0.5
-# Corners whose residuals are beyond so many sigmas count less, or not at all.
-HUBER, DROPPED = 1.5, 6.0
+# So many corners have their places in the state; and how far such a corner is off, which drifts as it is followed. [px]
+PLACES, PLACE_SIGMA_PX = 50, 1.5
+# Corners whose residuals are beyond so many sigmas count less, or not at all; beyond the last, a place is forgotten.
+HUBER, DROPPED, LOST = 1.5, 6.0, 4.0
 # Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
 
-# Places in the error state: turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer.
+# The error state begins with turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer. Then
+# come the places of corners, and turn and place of each clone.
 TURN, V, P, GYRO, ACCEL = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
-IMU_SIZE, CLONE_SIZE = 15, 6
+IMU_SIZE, PLACE_SIZE, CLONE_SIZE = 15, 3, 6
 
 
 class Motion(NamedTuple):
@@ -93,6 +100,36 @@ class Sight(NamedTuple):
 
     key: int
     slope: F64
+
+
+# A corner's name: its camera, and its number there.
+Name = tuple[str, int]
+
+
+class Place(NamedTuple):
+    """A corner whose place is in the state."""
+
+    name: Name
+    p_m: F64
+    first_m: F64
+    """As it was first estimated; see `Clone`."""
+
+
+class Rays(NamedTuple):
+    """The sights of M corners, of each in up to N key images."""
+
+    seen: npt.NDArray[np.bool_]
+    """Which of them there are, shape (M, N): in each row the first ones."""
+    clone: npt.NDArray[np.int64]
+    """Which clone saw it, shape (M, N)."""
+    slopes: F64
+    """Shape (M, N, 2)."""
+    body_from_cam: F64
+    """Rotation, shape (M, 1, 3, 3)."""
+    camera_m: F64
+    """Where the camera sits, shape (M, 1, 3, 1). [m, body]"""
+    sigma: F64
+    """How far slopes are off, shape (M,)."""
 
 
 def moved(motion: Motion, accel_mps2: F64, gyro_radps: F64, dt_s: float) -> Motion:
@@ -179,9 +216,10 @@ class InertialOdometry(Odometry):
         self._motion: Motion | None = None
         self._covariance = np.zeros((IMU_SIZE, IMU_SIZE))
         self._clones: list[Clone] = []
+        self._places: list[Place] = []
         self._keys = 0
         self._tracks: dict[str, Tracks] = {}
-        self._sights: dict[tuple[str, int], list[Sight]] = {}
+        self._sights: dict[Name, list[Sight]] = {}
         self._views: dict[str, View] = {}
         self._key_s: dict[str, float] = {}
 
@@ -249,18 +287,27 @@ class InertialOdometry(Odometry):
         if not key_views:
             return
         self._clone()
+        going_on = {(camera, int(number)) for camera, tracks in self._tracks.items() for number in tracks.ids}
+        self._forget_places({place.name for place in self._places} - going_on)
+        placed = {place.name for place in self._places}
+        looks: dict[Name, F64] = {}
         for view in key_views:
             tracks = self._tracks[view.camera]
             self._key_s[view.camera] = at_s
             for number, slope in zip(tracks.ids, view.slopes(tracks.px)):
-                self._sights.setdefault((view.camera, int(number)), []).append(Sight(self._keys, slope))
-        going_on = {(camera, int(number)) for camera, tracks in self._tracks.items() for number in tracks.ids}
+                name = view.camera, int(number)
+                if name in placed:
+                    looks[name] = slope
+                else:
+                    self._sights.setdefault(name, []).append(Sight(self._keys, slope))
         ended = [name for name in self._sights if name not in going_on]
+        old = []
         if len(self._clones) > KEYS:
             oldest = self._clones[0].key
-            ended += [name for name in going_on if name in self._sights and self._sights[name][0].key == oldest]
-        self._use(sorted(ended))
-        for name in ended:
+            old = sorted(name for name in going_on if name in self._sights and self._sights[name][0].key == oldest)
+        self._use(sorted(ended + old), looks)
+        self._place(old[: PLACES - len(self._places)])
+        for name in ended + old:
             del self._sights[name]
         if len(self._clones) > KEYS:
             self._forget_oldest()
@@ -270,6 +317,12 @@ class InertialOdometry(Odometry):
             first = len(tracks.ids) - added
             for number, slope in zip(tracks.ids[first:], view.slopes(tracks.px[first:])):
                 self._sights[view.camera, int(number)] = [Sight(self._keys, slope)]
+
+    # --- what is in the state
+
+    def _clone_at(self, index: int) -> int:
+        """Returns where a clone begins in the error state."""
+        return IMU_SIZE + PLACE_SIZE * len(self._places) + CLONE_SIZE * index
 
     def _clone(self) -> None:
         """Remembers the present pose, and that the image shows it as it was predicted."""
@@ -282,15 +335,50 @@ class InertialOdometry(Odometry):
         self._covariance = np.block([[self._covariance, rows.T], [rows, corner]])
 
     def _forget_oldest(self) -> None:
+        at = self._clone_at(0)
         del self._clones[0]
-        keep = np.r_[0:IMU_SIZE, IMU_SIZE + CLONE_SIZE : len(self._covariance)]
-        self._covariance = self._covariance[np.ix_(keep, keep)]
+        self._keep(np.r_[0:at, at + CLONE_SIZE : len(self._covariance)])
 
-    def _use(self, names: list[tuple[str, int]]) -> None:
-        """Corrects the state by corners that are complete."""
-        names = [name for name in names if len(self._sights[name]) >= FEWEST_SEEN]
+    def _forget_places(self, names: set[Name]) -> None:
+        stay = np.repeat([place.name not in names for place in self._places], PLACE_SIZE)
+        places = IMU_SIZE + np.flatnonzero(stay)
+        self._keep(np.r_[0:IMU_SIZE, places, self._clone_at(0) : len(self._covariance)])
+        self._places = [place for place in self._places if place.name not in names]
+
+    def _keep(self, which: npt.NDArray[np.int64]) -> None:
+        self._covariance = self._covariance[np.ix_(which, which)]
+
+    def _place(self, names: list[Name]) -> None:
+        """Takes the places of corners into the state."""
         if not names:
             return
+        rays = self._rays(names)
+        places_m, _, off = self._meet(rays)
+        by_state, by_place = self._slopes_by(rays, places_m)
+        size = len(self._covariance)
+        added, by_error, own = [], [np.eye(size)], []
+        for n in np.flatnonzero(np.isfinite(places_m).all(axis=1) & (off < HUBER)):
+            count = int(rays.seen[n].sum())
+            # Least squares: how the place follows from what the rays are off by, and from what the clones are off by.
+            by_slopes = np.linalg.pinv(by_place[n, :count].reshape(-1, 3))
+            by_error.append(-by_slopes @ by_state[n, :count].reshape(-1, size))
+            own.append(rays.sigma[n] ** 2 * by_slopes @ by_slopes.T)
+            added.append(Place(names[n], places_m[n], places_m[n]))
+        grow = np.concatenate(by_error)
+        covariance = grow @ self._covariance @ grow.T
+        for k, square in enumerate(own):
+            at = slice(size + PLACE_SIZE * k, size + PLACE_SIZE * (k + 1))
+            covariance[at, at] += square
+        # Places come before clones.
+        at_clones = self._clone_at(0)
+        order = np.r_[0:at_clones, size : len(covariance), at_clones:size]
+        self._covariance = covariance[np.ix_(order, order)]
+        self._places += added
+
+    # --- what corners say
+
+    def _rays(self, names: list[Name]) -> Rays:
+        """Returns the sights of corners."""
         at = {clone.key: index for index, clone in enumerate(self._clones)}
         most = max(len(self._sights[name]) for name in names)
         seen = np.zeros((len(names), most), bool)
@@ -305,34 +393,56 @@ class InertialOdometry(Odometry):
         body_from_cam = np.array([view.body_from_cam for view in views])[:, None]
         camera_m = np.array([view.camera_m for view in views])[:, None, :, None]
         sigma = SIGMA_PX / np.array([view.focal_px.mean() for view in views])
+        return Rays(seen, clone, slopes, body_from_cam, camera_m, sigma)
 
-        def cameras(rotations: F64, bodies_m: F64) -> tuple[F64, F64]:
-            return rotations[clone] @ body_from_cam, bodies_m[clone] + (rotations[clone] @ camera_m)[..., 0]
-
-        axes, from_m = cameras(
-            np.array([one.rotation for one in self._clones]), np.array([one.p_m for one in self._clones])
-        )
-        places_m, residual = triangulate(axes, from_m, slopes, seen)
-        off = np.sqrt((residual**2).sum(axis=(1, 2)) / (2 * seen.sum(axis=1) - 3)) / sigma
+    def _meet(self, rays: Rays) -> tuple[F64, F64, F64]:
+        """Returns where rays meet (M, 3), NaN if nowhere [m, odom]; their residuals (M, N, 2); how many sigmas those
+        are (M,)."""
+        rotations = np.array([one.rotation for one in self._clones])[rays.clone]
+        bodies_m = np.array([one.p_m for one in self._clones])[rays.clone]
+        from_m = bodies_m + (rotations @ rays.camera_m)[..., 0]
+        places_m, residual = triangulate(rotations @ rays.body_from_cam, from_m, rays.slopes, rays.seen)
+        off = np.sqrt((residual**2).sum(axis=(1, 2)) / (2 * rays.seen.sum(axis=1) - 3)) / rays.sigma
         far = np.linalg.norm(places_m - from_m[:, 0], axis=1) > FARTHEST_M
-        good = np.flatnonzero(np.isfinite(places_m).all(axis=1) & (off < DROPPED) & ~far)
-        weight = np.minimum(1.0, HUBER / np.maximum(off, 1e-9)) / sigma**2
-        # How residuals change with turn and place of the body, and with the corner's place.
-        rotations = np.array([one.first_rotation for one in self._clones])
-        bodies_m = np.array([one.first_m for one in self._clones])
-        axes, from_m = cameras(rotations, bodies_m)
-        _, by_place = _look(axes, from_m, slopes, seen, places_m)
-        in_body_m = np.einsum("mnji,mnj->mni", rotations[clone], places_m[:, None] - bodies_m[clone])
-        by_turn = by_place @ rotations[clone] @ skew(in_body_m)
+        places_m[far | (off > DROPPED)] = np.nan
+        return places_m, residual, off
+
+    def _slopes_by(self, rays: Rays, places_m: F64) -> tuple[F64, F64]:
+        """Returns how residuals change with the error state (M, N, 2, S), and with the corner's place (M, N, 2, 3)."""
+        rotations = np.array([one.first_rotation for one in self._clones])[rays.clone]
+        bodies_m = np.array([one.first_m for one in self._clones])[rays.clone]
+        from_m = bodies_m + (rotations @ rays.camera_m)[..., 0]
+        _, by_place = _look(rotations @ rays.body_from_cam, from_m, rays.slopes, rays.seen, places_m)
+        in_body_m = np.einsum("mnji,mnj->mni", rotations, places_m[:, None] - bodies_m)
+        by_clone = np.concatenate([by_place @ rotations @ skew(in_body_m), -by_place], axis=3)
+        by_state = np.zeros((*rays.seen.shape, 2, len(self._covariance)))
+        row, column = np.indices(rays.seen.shape)
+        for k in range(CLONE_SIZE):
+            by_state[row, column, :, self._clone_at(0) + CLONE_SIZE * rays.clone + k] = by_clone[..., k]
+        return by_state, by_place
+
+    def _use(self, names: list[Name], looks: dict[Name, F64]) -> None:
+        """Corrects the state by corners that are complete, and by where those are seen now whose places it has."""
         size = len(self._covariance)
         information, vector = np.zeros((size, size)), np.zeros(size)
-        for n in good:
-            count = int(seen[n].sum())
-            slope = np.zeros((2 * count, size))
-            for k in range(count):
-                column = IMU_SIZE + CLONE_SIZE * int(clone[n, k])
-                slope[2 * k : 2 * k + 2, column : column + 3] = by_turn[n, k]
-                slope[2 * k : 2 * k + 2, column + 3 : column + 6] = -by_place[n, k]
+        names = [name for name in names if len(self._sights[name]) >= FEWEST_SEEN]
+        if names:
+            self._take_rays(self._rays(names), information, vector)
+        lost = self._take_looks(looks, information, vector)
+        # The Kalman filter's update in its information form: the measurements are many, the state is small.
+        covariance = self._covariance @ np.linalg.inv(np.eye(size) + information @ self._covariance)
+        self._covariance = (covariance + covariance.T) / 2
+        self._change(self._covariance @ vector)
+        self._forget_places(lost)
+
+    def _take_rays(self, rays: Rays, information: F64, vector: F64) -> None:
+        """Adds what rays say that meet somewhere, wherever that is."""
+        places_m, residual, off = self._meet(rays)
+        weight = np.minimum(1.0, HUBER / np.maximum(off, 1e-9)) / rays.sigma**2
+        by_state, by_place = self._slopes_by(rays, places_m)
+        for n in np.flatnonzero(np.isfinite(places_m).all(axis=1)):
+            count = int(rays.seen[n].sum())
+            slope = by_state[n, :count].reshape(-1, len(vector))
             own, lack = by_place[n, :count].reshape(-1, 3), -residual[n, :count].reshape(-1)
             # What is left of the rows when the corner's own place is free.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
@@ -343,10 +453,38 @@ class InertialOdometry(Odometry):
                 continue
             information += weight[n] * rows.T @ rows
             vector += weight[n] * rows.T @ lack
-        # The Kalman filter's update in its information form: the measurements are many, the state is small.
-        covariance = self._covariance @ np.linalg.inv(np.eye(size) + information @ self._covariance)
-        self._covariance = (covariance + covariance.T) / 2
-        change = self._covariance @ vector
+
+    def _take_looks(self, looks: dict[Name, F64], information: F64, vector: F64) -> set[Name]:
+        """Adds where corners with a place are seen now; returns those that are too far from there."""
+        clone, at_clone = self._clones[-1], self._clone_at(len(self._clones) - 1)
+        there = np.ones((1, 1), bool)
+        lost = set()
+        for n, place in enumerate(self._places):
+            if place.name not in looks:
+                continue
+            view = self._views[place.name[0]]
+            camera = (clone.rotation @ view.body_from_cam)[None, None], clone.p_m + clone.rotation @ view.camera_m
+            residual, _ = _look(*camera, looks[place.name], there, place.p_m[None])
+            _, by_place = _look(*camera, looks[place.name], there, place.first_m[None])
+            lack, by_place = -residual[0, 0], by_place[0, 0]
+            by_turn = by_place @ clone.rotation @ skew(clone.rotation.T @ (place.first_m - clone.p_m))
+            rows = np.concatenate([by_place, by_turn, -by_place], axis=1)
+            at = IMU_SIZE + PLACE_SIZE * n
+            columns = np.r_[at : at + PLACE_SIZE, at_clone : at_clone + CLONE_SIZE]
+            block = np.ix_(columns, columns)
+            sigma = PLACE_SIGMA_PX / view.focal_px.mean()
+            expected = rows @ self._covariance[block] @ rows.T + np.eye(2) * sigma**2
+            off = np.sqrt(lack @ np.linalg.solve(expected, lack) / 2)
+            if off > LOST:
+                lost.add(place.name)
+                continue
+            weight = min(1.0, HUBER / max(off, 1e-9)) / sigma**2
+            information[block] += weight * rows.T @ rows
+            vector[columns] += weight * rows.T @ lack
+        return lost
+
+    def _change(self, change: F64) -> None:
+        """Corrects all that is in the state."""
         motion = self._motion
         self._motion = motion._replace(
             rotation=motion.rotation @ exp_so3(change[TURN]),
@@ -355,8 +493,11 @@ class InertialOdometry(Odometry):
             gyro_bias=motion.gyro_bias + change[GYRO],
             accel_bias=motion.accel_bias + change[ACCEL],
         )
+        for index, place in enumerate(self._places):
+            part = change[IMU_SIZE + PLACE_SIZE * index :][:PLACE_SIZE]
+            self._places[index] = place._replace(p_m=place.p_m + part)
         for index, old in enumerate(self._clones):
-            part = change[IMU_SIZE + CLONE_SIZE * index :][:CLONE_SIZE]
+            part = change[self._clone_at(index) :][:CLONE_SIZE]
             rotation, p_m = old.rotation @ exp_so3(part[:3]), old.p_m + part[3:]
             self._clones[index] = old._replace(rotation=rotation, p_m=p_m)
 
