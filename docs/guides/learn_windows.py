@@ -14,25 +14,12 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import vizflyt.gym
 
 # Twenty steps a second: each has an effect that a policy can see.
 HOW = dict(rate_hz=20, seconds=12.0)
-# What the numbers of a state are about: a network learns from numbers about 1.
-SCALE = np.array([2] * 3 + [1] * 3 + [3] * 3 + [3] * 3 + [1] * 3 + [5] * 3 + [1, 1, 3, 1], np.float32)
-
-
-class Scaled(vizflyt.gym.Env):
-    """An environment whose state is about 1."""
-
-    def reset(self, **how):
-        state, info = super().reset(**how)
-        return state / SCALE, info
-
-    def step(self, action):
-        state, *rest = super().step(action)
-        return (state / SCALE, *rest)
 
 
 class Ends(BaseCallback):
@@ -52,23 +39,29 @@ class Ends(BaseCallback):
 
 
 def learn(steps, output):
-    envs = make_vec_env(Scaled, n_envs=8, seed=1, env_kwargs=dict(project="p3", courses=range(1, 9), **HOW))
+    courses = dict(courses=range(1, 9), **HOW)
+    envs = make_vec_env("vizflyt/Windows-v0", n_envs=8, seed=1, env_kwargs=courses, vec_env_cls=DummyVecEnv)
+    # A network learns from numbers about 1.
+    envs = VecNormalize(envs, norm_reward=False)
     policy = dict(log_std_init=-0.7)
     model = PPO("MlpPolicy", envs, n_steps=512, batch_size=512, n_epochs=8, learning_rate=5e-4, ent_coef=0.001,
                 policy_kwargs=policy, seed=1, device="cpu")  # fmt: skip
     model.learn(steps, callback=Ends())
     model.save(output)
+    envs.save(f"{output}.scale")
     envs.close()
 
 
 def fly(policy, episodes):
-    model, env = PPO.load(policy, device="cpu"), Scaled("p3", courses=range(1001, 1011), **HOW)
+    model, env = PPO.load(policy, device="cpu"), vizflyt.gym.Env("p3", courses=range(1001, 1011), **HOW)
+    scale = VecNormalize.load(f"{policy}.scale", DummyVecEnv([lambda: env]))
     ends, seconds = Counter(), []
     for seed in range(episodes):
         state, _ = env.reset(seed=seed)
         over = late = False
         while not (over or late):
-            state, _, over, late, info = env.step(model.predict(state, deterministic=True)[0])
+            action, _ = model.predict(scale.normalize_obs(state), deterministic=True)
+            state, _, over, late, info = env.step(action)
         ends[info["end"]] += 1
         seconds += [info["time_s"]] if info["end"] == "finished" else []
     env.close()
