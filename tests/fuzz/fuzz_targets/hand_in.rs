@@ -1,0 +1,29 @@
+//! Archives that teams hand in, as `vizflyt grade-class` unpacks them: no path leads out of a folder, and what is read is
+//! packed and read again.
+#![no_main]
+use std::path::{Component, Path};
+
+use libfuzzer_sys::fuzz_target;
+
+// The command line is a program, no library: its parser is compiled in here.
+#[path = "../../../jetson/cli/src/class/archive.rs"]
+#[allow(dead_code)]
+mod archive;
+use archive::{MOST_BYTES, MOST_FILES, open, pack, without_outer_folder};
+
+fuzz_target!(|bytes: &[u8]| {
+    let Ok(files) = open(bytes) else { return };
+    let total: u64 = files.values().map(|content| content.len() as u64).sum();
+    assert!(files.len() <= MOST_FILES && total <= MOST_BYTES);
+    for path in files.keys() {
+        assert!(
+            Path::new(path).components().all(|part| matches!(part, Component::Normal(_))),
+            "{path}"
+        );
+    }
+    if total < 1 << 20 {
+        assert_eq!(open(&pack(&files).unwrap()).unwrap(), files);
+    }
+    let inner = without_outer_folder(files);
+    assert!(inner.keys().all(|path| !path.is_empty() && !path.starts_with('/')));
+});
