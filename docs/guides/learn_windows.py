@@ -1,7 +1,7 @@
 """Learns to fly through the three windows of project p3, from the state; says how the last hundred episodes ended.
 
 pip install 'vizflyt[gym]' stable-baselines3
-python learn_windows.py --steps 300000
+python learn_windows.py
 python learn_windows.py --fly windows.zip          flies courses that it has not seen
 """
 
@@ -70,7 +70,7 @@ def fly(policy, episodes):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=300_000)
+    parser.add_argument("--steps", type=int, default=170_000)
     parser.add_argument("--output", default="windows.zip")
     parser.add_argument("--fly", metavar="POLICY", help="flies courses that are new to it")
     parser.add_argument("--episodes", type=int, default=100)
