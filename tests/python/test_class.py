@@ -82,7 +82,12 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     assert len(seeds) == 2, "each team has courses of its own"
     assert (tmp_path / "grades/index.html").read_text().count("<tr>") == 5
 
-    # Again: what has a grade keeps it; who hands in anew is graded anew.
+    # Again: what has a grade keeps it, and one that was changed is flown again; who hands in anew is graded anew.
+    changed = tmp_path / "grades/reports/blue/grade.json"
+    if '"signature"' in (was := changed.read_text()):
+        changed.write_text(was.replace('"score": 0.0', '"score": 99.0'))
+        status, said = desk(*grade)
+        assert status == 0 and "graded again" in said and changed.read_text() == was, said
     before = (tmp_path / "grades/reports/red/grade.json").stat().st_mtime_ns
     (tmp_path / "blue/plugin.py").write_text("raise SystemExit('anew')\n")
     desk("submit", "blue", "-o", "submissions/blue.zip")

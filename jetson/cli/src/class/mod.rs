@@ -24,7 +24,7 @@ use sha2::{Digest, Sha256};
 use self::roster::{Roster, Team};
 pub(crate) use self::submission::{SubmitArgs, submit};
 use crate::Cli;
-use crate::grade::Grade;
+use crate::grade::{Grade, verified};
 use crate::terminal::{print_fmt, print_line};
 
 /// Grades every team of a class, one after the other, and makes one table of all.
@@ -147,7 +147,13 @@ fn grade_team(
     let is_same = fs::read(&kept).is_ok_and(|bytes| {
         serde_json::from_slice(&bytes).ok().is_some_and(|old: Flown| old == flown)
     });
-    if !is_same {
+    if is_same && grade_file.is_file() {
+        match kept_grade(&grade_file, &options) {
+            Ok(grade) => return Ok(grade),
+            Err(why) => print_fmt!("    graded again: {why:#}"),
+        }
+    }
+    if !is_same || grade_file.is_file() {
         for folder in [&plugin, &report] {
             if folder.exists() {
                 fs::remove_dir_all(folder)
@@ -156,8 +162,6 @@ fn grade_team(
         }
         found.unpack(&plugin)?;
         write(&kept, &serde_json::to_vec(&flown)?)?;
-    } else if grade_file.is_file() {
-        return Grade::read(&grade_file);
     }
     let hidden = hidden(args, &plugin)?;
     let status = Command::new(program)
@@ -170,6 +174,22 @@ fn grade_team(
         .context("cannot start vizflyt grade")?;
     ensure!(status.success(), "vizflyt grade ended with {status}; it says why above");
     Grade::read(&grade_file)
+}
+
+/// Returns the grade of an earlier run, if it is as it was signed; one without a signature says so in the table.
+fn kept_grade(file: &Path, options: &[OsString]) -> Result<Grade> {
+    let grade = Grade::read(file)?;
+    if grade.signature.is_none() {
+        return Ok(grade);
+    }
+    let value = |(option, next): (&OsString, Option<&OsString>)| {
+        let text = option.to_str()?;
+        let inline = text.strip_prefix("--keys=").map(PathBuf::from);
+        inline.or_else(|| next.filter(|_| text == "--keys").map(PathBuf::from))
+    };
+    let nexts = options.iter().skip(1).map(Some).chain([None]);
+    let keys = options.iter().zip(nexts).find_map(value);
+    verified(file, None, keys.as_deref())
 }
 
 /// Returns what a team's plugin must not read: what others have handed in, and how they fared.
