@@ -81,9 +81,14 @@ impl Fence {
         self.keep_out.iter().map(depth_m).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling,
-    /// the floor, or into a box. Motion along a face is left as it is. [m/s, world]
+    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling, the floor, or into a
+    /// box. Motion along a face is left as it is, unless it takes what stopping before the face needs. [m/s, world]
     pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
+        self.leave_for_stopping(p_m, self.towards_faces(p_m, v_mps, vehicle), vehicle)
+    }
+
+    /// [`Self::limit`], face by face: how fast towards each.
+    fn towards_faces(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let mut v = self.within(p_m, v_mps, vehicle);
         if self.keep_out.is_empty() {
             return v;
@@ -185,6 +190,54 @@ impl Fence {
         let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
         let stopping = Stopping::new(vehicle.response, self.max_mps2, share);
         stopping.most_mps(wanted_mps, free_m, flown_mps, a_mps2)
+    }
+
+    /// Returns `v_mps` with less along each face that the vehicle still flies towards: what it has to change along a face
+    /// is missing for stopping before it, and a plugin may ask for more of it after the vehicle was told to stop.
+    /// Half of the face's margin is left for that. Curved faces are [`Self::shorten`]'s. [m/s, world]
+    fn leave_for_stopping(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
+        let mut v = v_mps;
+        self.each_flat_face(p_m, |free_m, margin_m, out| {
+            let (flown_mps, a_mps2) = (vehicle.v_mps.dot(out), vehicle.a_mps2.dot(out));
+            if flown_mps <= 0.0 {
+                return;
+            }
+            let towards = out * v.dot(out);
+            let along = v - towards;
+            let stops = |scale: f64| {
+                let change = towards + along * scale - vehicle.v_mps;
+                let share =
+                    flown_mps / flown_mps.hypot(change.reject_from_normalized(out).length());
+                let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
+                let stopping = Stopping::new(vehicle.response, self.max_mps2, share);
+                let (command_mps, within_m) = (v.dot(out).max(0.0), free_m + 0.5 * margin_m);
+                stopping.bound_m(command_mps, flown_mps, a_mps2) <= within_m
+                    || stopping.reach_m(command_mps, flown_mps, a_mps2) <= within_m
+            };
+            v = towards + along * largest(1.0, stops);
+        });
+        v
+    }
+
+    /// Calls `each` with the distance to the margin [m], the margin [m] and the direction of every face that is flat, and
+    /// of every box.
+    fn each_flat_face(&self, p_m: DVec3, mut each: impl FnMut(f64, f64, DVec3)) {
+        if let Volume::Cuboid { center_m, half_m, rotation } = self.volume {
+            let q = rotation.conjugate() * (p_m - center_m);
+            let free_m = half_m - DVec3::splat(self.body_radius_m + MARGIN_M);
+            for (axis, face) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
+                each(free_m[axis] - q[axis], MARGIN_M, rotation * face);
+                each(free_m[axis] + q[axis], MARGIN_M, rotation * -face);
+            }
+        }
+        each(p_m.z - self.floor_m, FLOOR_MARGIN_M, DVec3::NEG_Z);
+        if let Some(ceiling_m) = self.ceiling_m {
+            each(ceiling_m - MARGIN_M - p_m.z, MARGIN_M, DVec3::Z);
+        }
+        for volume in &self.keep_out {
+            let free_m = volume.signed_distance_m(p_m) - self.body_radius_m - MARGIN_M;
+            each(free_m, MARGIN_M, -volume.outward_normal(p_m));
+        }
     }
 
     /// Scales `v_mps` down until its stopping path is inside. Nearer than the margin, the path must not come nearer still.
