@@ -24,7 +24,7 @@ pub(crate) struct LabConfig {
     /// A generated scene; or the path of a scene folder, an arena.toml or a scene file, relative to the
     /// folder.
     pub scene: Option<String>,
-    /// Instead of a scene, a project of the course.
+    /// Instead of a scene, a project of the course, or the path of one's file, relative to the folder.
     project: Option<String>,
     /// Level of the project: ug or g.
     level: Option<String>,
@@ -42,8 +42,8 @@ impl LabConfig {
         if self.scene.is_some() {
             bail!("{FILE} gives both a scene and the project '{name}'; remove one of them");
         }
-        let project = CourseProject::named(name).with_context(|| FILE.to_owned())?;
-        Ok(Some(project.name().to_owned()))
+        CourseProject::find(name).with_context(|| FILE.to_owned())?;
+        Ok(Some(name.clone()))
     }
 
     /// Returns the level, if one is given.
@@ -75,10 +75,13 @@ impl PluginManifest {
             .with_context(|| format!("cannot read {}", file.display()))?;
         let mut manifest = Self::parse(&text).with_context(|| format!("{}", file.display()))?;
         manifest.plugin = folder.join(&manifest.plugin);
-        if let Some(scene) = &mut manifest.lab.scene
-            && folder.join(&*scene).exists()
-        {
-            *scene = folder.join(&*scene).display().to_string();
+        let LabConfig { scene, project, .. } = &mut manifest.lab;
+        // A project's file; its name is no place.
+        let project = project.iter_mut().filter(|name| name.ends_with(".toml"));
+        for place in scene.iter_mut().chain(project) {
+            if folder.join(&*place).exists() {
+                *place = folder.join(&*place).display().to_string();
+            }
         }
         Ok(Some(manifest))
     }
@@ -105,6 +108,12 @@ mod tests {
         std::fs::create_dir(root.path().join("forest")).unwrap();
         let manifest = PluginManifest::read(root.path()).unwrap().unwrap();
         assert_eq!(manifest.lab.scene, Some(root.path().join("forest").display().to_string()));
+        let own = "plugin = \"plugin.py\"\n[lab]\nproject = \"own.toml\"\n";
+        std::fs::write(root.path().join(FILE), own).unwrap();
+        std::fs::write(root.path().join("own.toml"), "title = 1").unwrap();
+        let manifest = PluginManifest::read(root.path()).unwrap().unwrap();
+        let error = format!("{:#}", manifest.lab.project().unwrap_err());
+        assert!(error.contains(&root.path().join("own.toml").display().to_string()), "{error}");
         for (text, part) in [
             ("", "plugin"),
             ("plugin = \"a\"\n[lab]\nscen = \"x\"\n", "did you mean 'scene'"),

@@ -12,6 +12,7 @@
 //! - [`check`]: whether a course can be flown at all;
 //! - [`referee`]: all of it for one vehicle, as one state machine;
 //! - [`verdict`]: what a flight was worth, by all that happened in it;
+//! - [`points`]: what the figures over all flights are worth;
 //! - [`crash`]: why one failed, in words and drawings.
 
 pub mod body;
@@ -27,6 +28,7 @@ pub mod neighbours;
 pub mod objects;
 pub mod obstacles;
 pub mod occupancy;
+pub mod points;
 pub mod pose;
 pub mod referee;
 pub mod seen;

@@ -19,6 +19,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{CameraConfig, RulesConfig, SensorConfig, StageConfig};
+use vizflyt_arena::points::PointsTable;
 use vizflyt_protocol::messages::{Limits, SetpointKinds};
 
 use crate::draw::DrawBounds;
@@ -151,19 +152,22 @@ enum Finish {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Levels {
-    ug: SensorSuite,
-    g: SensorSuite,
+    ug: LevelPlan,
+    g: LevelPlan,
 }
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct SensorSuite {
+struct LevelPlan {
     /// The allowed setpoints, if not those of `[rules]`.
     #[serde(default)]
     setpoints: Option<SetpointKinds>,
     cameras: Vec<CameraConfig>,
     #[serde(default)]
     sensors: Vec<SensorConfig>,
+    /// What a grade's figures are worth.
+    #[serde(default)]
+    points: Option<PointsTable>,
 }
 
 impl CourseProject {
@@ -214,6 +218,8 @@ impl CourseProject {
         for level in Level::ALL {
             let arena = project.generate(1, level, Variant::DAY).arena;
             arena.validate().map_err(|error| wrong(format!("level {level}: {error}")))?;
+            let points = project.points(level).map_or(Ok(()), PointsTable::check);
+            points.map_err(|error| wrong(format!("level {level}: {error}")))?;
         }
         Ok(project)
     }
@@ -258,6 +264,18 @@ impl CourseProject {
         &self.text
     }
 
+    /// Returns what a grade's figures are worth at a level, if the project says it.
+    pub fn points(&self, level: Level) -> Option<&PointsTable> {
+        self.level(level).points.as_ref()
+    }
+
+    fn level(&self, level: Level) -> &LevelPlan {
+        match level {
+            Level::Ug => &self.plan.levels.ug,
+            Level::G => &self.plan.levels.g,
+        }
+    }
+
     /// Generates the project's place of a seed, with the sensors of a level, in the environment of a variant.
     /// The same arguments give the same result on every machine.
     pub fn generate(&self, seed: u64, level: Level, variant: Variant) -> Generated {
@@ -266,10 +284,7 @@ impl CourseProject {
             CoursePlace::Forest => forest::build(seed),
             CoursePlace::Net(layout) => hall::build_course(seed, &self.name, layout),
         };
-        let suite = match level {
-            Level::Ug => &plan.levels.ug,
-            Level::G => &plan.levels.g,
-        };
+        let suite = self.level(level);
         let arena = &mut generated.arena;
         *arena = ArenaConfig {
             name: self.name.clone().into_owned(),
@@ -324,6 +339,10 @@ mod tests {
         let fast = text.replace("max_speed_mps = 4.0", "max_speed_mps = 99.0");
         let error = found(&fast).unwrap_err().to_string();
         assert!(error.contains("level ug") && error.contains("limits.max_speed_mps"), "{error}");
+        let turned = p4.text().replace("all = 15.0, half = 25.0", "all = 25.0, half = 15.0");
+        let error = found(&turned);
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("level ug: points.time_s"), "{error}");
         let error = found(&text.replace("finish", "fnish")).unwrap_err().to_string();
         assert!(error.contains("scanned.toml") && error.contains("line "), "{error}");
         let error = CourseProject::find("nowhere.toml").unwrap_err().to_string();

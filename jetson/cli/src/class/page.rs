@@ -26,7 +26,7 @@ pub(super) fn page(all: &[Graded<'_>]) -> String {
          content=\"width=device-width, initial-scale=1\"><meta http-equiv=\"Content-Security-Policy\" \
          content=\"default-src 'none'; style-src 'unsafe-inline'\"><title>Grades of a class</title>\
          <style>{STYLE}</style></head><body>\n<h1>Grades of a class</h1><p>{about}</p>\n<table><thead><tr><th>team</th>\
-         <th>score</th><th></th><th>finished</th><th>time to the finish</th><th></th></tr></thead><tbody>\n"
+         <th>score</th><th></th><th>finished</th><th>time to the finish</th><th>points</th><th></th></tr></thead><tbody>\n"
     );
     for one in rows {
         let name = escape(&one.team.name);
@@ -36,6 +36,9 @@ pub(super) fn page(all: &[Graded<'_>]) -> String {
                 let (value, low, high) =
                     (summary.score.value, summary.score.low, summary.score.high);
                 let time = summary.mean_finish_s.map_or("-".to_owned(), |s| format!("{s:.1} s"));
+                let points = grade.all_points();
+                let points = points
+                    .map_or("-".to_owned(), |(points, most)| format!("{points:.1} of {most:.0}"));
                 let unsigned = if grade.signature.is_some() { "" } else { "not signed" };
                 writeln!(
                     text,
@@ -43,7 +46,7 @@ pub(super) fn page(all: &[Graded<'_>]) -> String {
                      <td><svg viewBox=\"0 0 100 10\" preserveAspectRatio=\"none\" aria-label=\"95 %: {low:.0} to {high:.0}\">\
                      <rect class=\"bar\" width=\"{value:.1}\" height=\"10\"/><rect class=\"range\" x=\"{low:.1}\" y=\"4\" \
                      width=\"{:.1}\" height=\"2\"/></svg></td><td class=\"number\">{} of {}</td><td class=\"number\">{time}</td>\
-                     <td>{unsigned}</td></tr>",
+                     <td class=\"number\">{points}</td><td>{unsigned}</td></tr>",
                     high - low,
                     summary.finished,
                     summary.runs,
@@ -51,7 +54,7 @@ pub(super) fn page(all: &[Graded<'_>]) -> String {
             }
             Err(why) => writeln!(
                 text,
-                "<tr><td>{name}</td><td class=\"number\">0</td><td></td><td></td><td></td><td class=\"why\">{}</td></tr>",
+                "<tr><td>{name}</td><td class=\"number\">0</td><td></td><td></td><td></td><td></td><td class=\"why\">{}</td></tr>",
                 escape(why)
             ),
         };

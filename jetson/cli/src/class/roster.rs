@@ -23,13 +23,15 @@ pub(super) struct Roster {
 }
 
 /// Headings of what is added.
-const ADDED: [&str; 10] = [
+const ADDED: [&str; 12] = [
     "score",
     "score_low",
     "score_high",
     "finished",
     "flights",
     "mean_finish_s",
+    "points",
+    "points_of",
     "signed",
     "grade_hash",
     "submission_sha256",
@@ -83,16 +85,22 @@ impl Roster {
         let mut table = csv::Writer::from_writer(Vec::new());
         table.write_record(self.headings.iter().map(String::as_str).chain(ADDED))?;
         for one in graded {
-            let added: [String; 10] = match &one.result {
+            let added: [String; 12] = match &one.result {
                 Ok(grade) => {
                     let summary = &grade.summary;
+                    let (points, most) = grade.all_points().unzip();
+                    let optional = |value: Option<f64>| {
+                        value.map_or(String::new(), |value| format!("{value:.1}"))
+                    };
                     [
                         format!("{:.1}", summary.score.value),
                         format!("{:.1}", summary.score.low),
                         format!("{:.1}", summary.score.high),
                         summary.finished.to_string(),
                         summary.runs.to_string(),
-                        summary.mean_finish_s.map_or(String::new(), |s| format!("{s:.1}")),
+                        optional(summary.mean_finish_s),
+                        optional(points),
+                        optional(most),
                         if grade.signature.is_some() { "yes" } else { "no" }.to_owned(),
                         grade.hash.clone(),
                         one.submission.clone(),
@@ -100,11 +108,11 @@ impl Roster {
                     ]
                 }
                 Err(why) => {
-                    let mut added: [String; 10] = Default::default();
+                    let mut added: [String; 12] = Default::default();
                     "0".clone_into(&mut added[0]);
-                    added[8].clone_from(&one.submission);
+                    added[10].clone_from(&one.submission);
                     // What a cell begins with is taken for a formula.
-                    added[9] = format!("no grade: {why}");
+                    added[11] = format!("no grade: {why}");
                     added
                 }
             };
@@ -134,7 +142,7 @@ mod tests {
             lines.next().unwrap().starts_with("Section,Team,members,score,score_low,"),
             "{table}"
         );
-        assert_eq!(lines.next().unwrap(), "1,red,\"A, B\",0,,,,,,,,ab,no grade: =1+1");
+        assert_eq!(lines.next().unwrap(), "1,red,\"A, B\",0,,,,,,,,,,ab,no grade: =1+1");
         for (text, told) in [
             ("name\nred\n", "headed 'team'"),
             ("team\n", "no team"),

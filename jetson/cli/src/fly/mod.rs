@@ -3,7 +3,7 @@
 
 mod cargo;
 pub(crate) mod plugin;
-mod watch;
+pub(crate) mod watch;
 
 use std::path::Path;
 use std::process::ExitCode;

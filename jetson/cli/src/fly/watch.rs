@@ -16,7 +16,7 @@ use crate::terminal::print_error;
 
 /// Files are looked at this often: the hand is barely off the key, and a folder of sources costs
 /// nothing to list.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+pub(crate) const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// Folders deeper than this are not a student's sources.
 const DEEPEST: usize = 8;
 
@@ -54,11 +54,11 @@ pub(crate) fn watch(plugin: Plugin, limits: PluginLimits) -> Result<Receiver<()>
 
 /// Files with the time and size of their last change.
 #[derive(Debug, PartialEq, Eq)]
-struct Sources(BTreeMap<PathBuf, (SystemTime, u64)>);
+pub(crate) struct Sources(BTreeMap<PathBuf, (SystemTime, u64)>);
 
 impl Sources {
     /// Looks at a file, or at the sources under a folder.
-    fn of(path: &Path) -> Self {
+    pub(crate) fn of(path: &Path) -> Self {
         let mut sources = Self(BTreeMap::new());
         if path.is_dir() {
             sources.add_folder(path, 0);

@@ -16,7 +16,11 @@ use super::judge;
 
 /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
 #[derive(Args, Clone, Debug)]
-#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(
+    args_conflicts_with_subcommands = true,
+    subcommand_negates_reqs = true,
+    args_override_self = true
+)]
 #[command(after_help = "Examples:
   vizflyt grade ./first --project p4 --seeds 20 --report out      flies 20 courses; open out/index.html
   vizflyt grade avoid --project forest --variants day,night       in other light, too
@@ -27,6 +31,7 @@ use super::judge;
   vizflyt grade verify whole.json                                 checks its signature
   vizflyt grade verify out                                        and every file of a report
   vizflyt grade ./first --project p4 --report out --resume        goes on where it was interrupted
+  vizflyt grade ./first --project p4 --seeds 3 --watch            again whenever the plugin is saved
 
 The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
 1 if --least was not reached.")]
@@ -91,6 +96,12 @@ pub(super) struct FlyArgs {
     /// Keeps the finished flights of a grade that was interrupted, and flies the others
     #[arg(long, requires = "report")]
     pub(super) resume: bool,
+    /// Grades again whenever the plugin is saved, and says what changed
+    #[arg(long, conflicts_with_all = ["resume", "shard", "json", "junit", "least"])]
+    pub(super) watch: bool,
+    /// Says what changed since this grade, or that of a report's folder [default: what the report replaces]
+    #[arg(long, value_name = "FILE|DIR")]
+    pub(super) since: Option<PathBuf>,
     /// Images in the report's flight logs: as many as fit into 60 MB a minute, all, or no log
     #[arg(
         long,

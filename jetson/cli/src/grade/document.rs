@@ -10,6 +10,8 @@ use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use vizflyt_arena::config::EnvironmentConfig;
+pub(crate) use vizflyt_arena::points::PartPoints;
+use vizflyt_arena::points::{Figures, PointsTable};
 use vizflyt_arena::verdict::StageVerdict;
 use vizflyt_protocol::messages::OutcomeKind;
 
@@ -38,6 +40,9 @@ pub(crate) struct Grade {
     pub shard: Option<Shard>,
     /// The figures over all flights.
     pub summary: Summary,
+    /// What they are worth, by the project's table; absent if it has none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub points: Vec<PartPoints>,
     /// And over those of each variant, in their order; absent if there is one.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub by_variant: Vec<VariantSummary>,
@@ -72,6 +77,9 @@ pub(crate) struct Subject {
     pub first_seed: u64,
     /// How many seeds each variant was flown with.
     pub seeds: u64,
+    /// What figures are worth; absent if the project says nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub points: Option<PointsTable>,
     /// How long things took.
     pub delays: DelaysMs,
     /// The simulated inertial sensor; absent where it is the usual one.
@@ -279,6 +287,7 @@ impl Grade {
             format: FORMAT.to_owned(),
             hash: hash_of(&runs),
             summary: Summary::of(&runs),
+            points: points_of(&subject, &runs),
             by_variant: by_variant(&subject, &runs),
             subject,
             shard,
@@ -325,6 +334,10 @@ impl Grade {
             self.summary == Summary::of(&self.runs),
             "the summary does not follow from the flights"
         );
+        ensure!(
+            self.points == points_of(&self.subject, &self.runs),
+            "the points do not follow from the flights"
+        );
         // An earlier version wrote none.
         ensure!(
             self.by_variant.is_empty() || self.by_variant == by_variant(&self.subject, &self.runs),
@@ -335,12 +348,13 @@ impl Grade {
 
     /// Returns the median time of the flights that finished, penalties included. [s]
     pub(crate) fn median_finish_s(&self) -> Option<f64> {
-        let finished = self.runs.iter().filter(|run| run.outcome == OutcomeKind::Finished);
-        let mut times: Vec<f64> = finished.map(|run| run.seconds + run.penalty_s).collect();
-        times.sort_by(f64::total_cmp);
-        let upper = *times.get(times.len() / 2)?;
-        let lower = times[(times.len() - 1) / 2];
-        Some(millionth(f64::midpoint(lower, upper)))
+        median_of_finished(&self.runs, |run| run.seconds + run.penalty_s)
+    }
+
+    /// Returns the points, and how many there could be; none where the project says nothing.
+    pub(crate) fn all_points(&self) -> Option<(f64, f64)> {
+        let most = self.subject.points?.most();
+        Some((millionth(self.points.iter().map(|part| part.points).sum()), millionth(most)))
     }
 
     /// Reads a grade from a file.
@@ -366,6 +380,8 @@ impl Grade {
             "{seeds} seeds in {} variants: at most {MAX_SEEDS} and {MAX_VARIANTS}",
             variants.len()
         );
+        let points = grade.subject.points.as_ref();
+        points.map_or(Ok(()), PointsTable::check).map_err(anyhow::Error::msg)?;
         if let Some(Shard { index, count }) = grade.shard {
             ensure!(Shard::is_one(index, count), "{index}/{count} is no part");
         }
@@ -438,7 +454,7 @@ impl Run {
 }
 
 impl Summary {
-    fn of(runs: &[Run]) -> Self {
+    pub(super) fn of(runs: &[Run]) -> Self {
         let finished: Vec<&Run> =
             runs.iter().filter(|run| run.outcome == OutcomeKind::Finished).collect();
         let scores: Vec<f64> = runs.iter().map(|run| run.score).collect();
@@ -460,6 +476,28 @@ impl Summary {
             min_clearance_m: runs.iter().filter_map(|run| run.min_clearance_m).reduce(f64::min),
         }
     }
+}
+
+/// Returns the median of a figure of the flights that finished.
+fn median_of_finished(runs: &[Run], figure: impl Fn(&Run) -> f64) -> Option<f64> {
+    let finished = runs.iter().filter(|run| run.outcome == OutcomeKind::Finished);
+    let mut values: Vec<f64> = finished.map(figure).collect();
+    values.sort_by(f64::total_cmp);
+    let upper = *values.get(values.len() / 2)?;
+    let lower = values[(values.len() - 1) / 2];
+    Some(millionth(f64::midpoint(lower, upper)))
+}
+
+/// Returns what the figures over these flights are worth, by the project's table.
+fn points_of(subject: &Subject, runs: &[Run]) -> Vec<PartPoints> {
+    let Some(table) = &subject.points else { return Vec::new() };
+    let summary = Summary::of(runs);
+    table.parts(&Figures {
+        score: summary.score.value,
+        time_s: summary.mean_finish_s,
+        clearance_m: summary.min_clearance_m,
+        speed_mps: median_of_finished(runs, |run| run.max_speed_mps),
+    })
 }
 
 /// Returns the figures of each variant that was flown, where there are several.

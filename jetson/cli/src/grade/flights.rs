@@ -26,7 +26,7 @@ use super::odometry::odometry_score;
 use super::progress::Progress;
 use super::record::FlownWith;
 use super::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
-use super::{figures, folder, junit, keys, pool, report};
+use super::{changes, figures, folder, junit, keys, pool, report};
 use crate::fly::plugin::Plugin;
 use crate::terminal::{print_error, print_line, stop_flag};
 
@@ -38,6 +38,10 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let (delays, imu) = (delays(args)?, args.imu);
     let variants = variants(args, &project)?;
     let subject = subject(args, &plugin, &project, &variants)?;
+    let earlier = changes::earlier(args)?;
+    if let Some(earlier) = earlier.as_ref().filter(|_| args.since.is_some()) {
+        changes::check(&earlier.subject, &subject)?;
+    }
     // In the order of `Subject::flights`.
     let seeds = |variant| subject.seeds().map(move |seed| (variant, seed));
     let flights: Vec<(Variant, u64)> = variants
@@ -152,6 +156,15 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         junit::write(path, &grade)?;
     }
     figures::hand_over(&grade, &args.result)?;
+    let earlier = earlier.filter(|earlier| {
+        !args.result.json && changes::check(&earlier.subject, &grade.subject).is_ok()
+    });
+    if let Some(lines) = earlier.map(|earlier| changes::lines(&earlier, &grade)) {
+        if !lines.is_empty() {
+            print_line("since the last attempt");
+        }
+        lines.iter().for_each(|line| print_line(format!("  {line}")));
+    }
     if let (Some(folder), false) = (&args.report, args.result.json) {
         print_line(format!("report      {}", folder.join(folder::PAGE).display()));
     }
@@ -243,6 +256,7 @@ fn subject(
         environments: drawn.map(|drawn| (drawn.to_string(), drawn.environment())).collect(),
         first_seed: args.first_seed.value,
         seeds: args.seeds,
+        points: project.points(args.level).copied(),
         delays: DelaysMs {
             image_period: tenth(1e3 / args.image_rate),
             image: tenth(args.image_delay),

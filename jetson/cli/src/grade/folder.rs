@@ -74,6 +74,18 @@ impl ReportFolder {
         Ok(folder)
     }
 
+    /// Puts a whole report, which lies on the same disk, in the place of an earlier one.
+    ///
+    /// # Errors
+    /// As [`Self::begin`], or if it cannot be moved.
+    pub(crate) fn replace(root: &Path, with: &Path) -> Result<()> {
+        Self::begin(root)?;
+        // Folders alone are left of the earlier one.
+        fs::remove_dir_all(root)
+            .and_then(|()| fs::rename(with, root))
+            .with_context(|| format!("cannot put the report into {}", root.display()))
+    }
+
     /// Opens the folder of a grade that was interrupted, or makes it.
     ///
     /// # Errors

@@ -6,12 +6,14 @@
 //!                               -> trial   one flight in lock-step, a plugin process of its own
 //!                               -> vizflyt_arena::crash  what a failure probably was
 //! each flight                   -> folder    its card's images, its log, its record (record)
-//! flights                       -> document  figures, hash, signature -> report/, junit, JSON
+//! flights                       -> document  figures, points, hash, signature -> report/, junit, JSON
+//! an earlier grade              -> changes   what is better and worse; `--watch` (watch) flies again and again
 //! parts of a grade              -> merge     the whole
 //! ```
 //! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
 
 mod args;
+mod changes;
 pub(crate) mod course;
 pub(crate) mod document;
 mod figures;
@@ -29,6 +31,7 @@ mod record;
 pub(crate) mod report;
 mod statistics;
 mod trial;
+mod watch;
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -45,6 +48,7 @@ use crate::terminal::print_line;
 /// Does what was asked for.
 pub(crate) fn run(args: &GradeArgs) -> Result<ExitCode> {
     match &args.command {
+        None if args.fly.watch => watch::watch(&args.fly),
         None => flights::grade(&args.fly),
         Some(GradeCommand::Verify { file, junit, key, keys }) => {
             let is_folder = file.is_dir();

@@ -1,8 +1,10 @@
 //! `vizflyt new NAME`: a folder with a plugin that flies, its test, and what an editor needs.
 //!
-//! The files are the ones under `jetson/cli/templates`, with the names filled in.
+//! The files are the ones under `jetson/cli/templates`, with the names filled in; for a project of the course that has a
+//! starter, its plugin, modules and tests instead of the template's.
 
 mod course_folder;
+mod starter;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -23,7 +25,7 @@ use crate::terminal::print_line;
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt new first                    in Python; then: vizflyt fly first
-  vizflyt new p4 --project p4          for the course
+  vizflyt new my-p4 --project p4       for the course: its starter, with tests
   vizflyt new ../second --lang rust")]
 pub(crate) struct NewArgs {
     /// The folder to make; its last part names the plugin
@@ -33,7 +35,9 @@ pub(crate) struct NewArgs {
     #[arg(long, value_enum, default_value_t)]
     lang: Language,
     #[arg(long, value_name = "NAME", help = format!(
-        "The course's project that it is for: {}; or a folder projects/NAME", projects::NAMES.join(", ")
+        "The course's project that it is for: {}, {}; or a folder projects/NAME",
+        starter::IN_THE_NET.join(", "),
+        projects::NAMES.join(", ")
     ))]
     project: Option<String>,
 }
@@ -51,14 +55,24 @@ enum Language {
 /// Makes the folder.
 pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     let name = name_of(&args.path)?;
+    let starter = args.project.as_deref().and_then(starter::of);
+    if let (Some(project), Some(_), Language::Rust) = (&args.project, &starter, args.lang)
+        && starter::IN_THE_NET.contains(&&**project)
+    {
+        bail!("{project} is done in Python: leave --lang out");
+    }
     let place = match &args.project {
+        Some(name) if starter::IN_THE_NET.contains(&&**name) => {
+            format!("project = {:?}", starter::NET)
+        }
         Some(name) if CourseProject::named(name).is_ok() => format!("project = {name:?}"),
         Some(name) => {
             let roots: Vec<PathBuf> = sources().into_iter().collect();
-            let known =
-                CourseProject::named(name).map(|_| ()).map_err(|unknown| unknown.to_string());
-            let folder = course_folder::find(name, &roots);
-            let folder = folder.with_context(|| known.err().unwrap_or_default())?;
+            let known = starter::IN_THE_NET.iter().chain(projects::NAMES).copied();
+            let known: Vec<&str> = known.collect();
+            let folder = course_folder::find(name, &roots).with_context(|| {
+                format!("there is no project '{name}'; there are: {}", known.join(", "))
+            })?;
             format!("scene = {:?}", folder.display().to_string())
         }
         None => "scene = \"forest\"".to_owned(),
@@ -68,7 +82,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     }
     let folder = args.path.display().to_string();
     let files = match args.lang {
-        Language::Python => python(&name, &folder, &place),
+        Language::Python => python(&name, &folder, &place, starter),
         Language::Rust => rust(&name, &folder, &place)?,
     };
     for (file, text) in files {
@@ -95,21 +109,32 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
 /// A file of the folder, and its text.
 type File = (&'static str, String);
 
-fn python(name: &str, folder: &str, place: &str) -> Vec<File> {
+fn python(
+    name: &str,
+    folder: &str,
+    place: &str,
+    starter: Option<(&'static str, Vec<File>)>,
+) -> Vec<File> {
     let fill = |text: &str| {
         let text = text.replace("{{name}}", name).replace("{{folder}}", folder);
         text.replace("{{class}}", &class(name)).replace("{{version}}", env!("CARGO_PKG_VERSION"))
     };
-    vec![
-        ("plugin.py", fill(include_str!("../../templates/python/plugin.py"))),
-        ("test_plugin.py", fill(include_str!("../../templates/python/test_plugin.py"))),
-        ("README.md", fill(include_str!("../../templates/python/README.md"))),
+    let (plugin, own) = starter.unwrap_or_else(|| {
+        let files = vec![
+            ("plugin.py", fill(include_str!("../../templates/python/plugin.py"))),
+            ("test_plugin.py", fill(include_str!("../../templates/python/test_plugin.py"))),
+            ("README.md", fill(include_str!("../../templates/python/README.md"))),
+        ];
+        ("plugin.py", files)
+    });
+    let common = [
         ("requirements.txt", fill(include_str!("../../templates/python/requirements.txt"))),
         ("pyrightconfig.json", fill(include_str!("../../templates/python/pyrightconfig.json"))),
         (".vscode/settings.json", fill(include_str!("../../templates/python/settings.json"))),
         (".gitignore", fill(include_str!("../../templates/python/gitignore"))),
-        (manifest::FILE, lab("plugin.py", place)),
-    ]
+        (manifest::FILE, lab(plugin, place)),
+    ];
+    own.into_iter().chain(common).collect()
 }
 
 fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
@@ -225,7 +250,7 @@ mod tests {
     #[test]
     fn every_blank_is_filled_and_the_readme_has_ten_lines() {
         let both = [
-            python("a-b", "x/a-b", "scene = \"room\""),
+            python("a-b", "x/a-b", "scene = \"room\"", None),
             rust("a-b", "x/a-b", "project = \"p5\"").unwrap(),
         ];
         for (file, text) in both.iter().flatten() {

@@ -11,6 +11,7 @@ pub(crate) fn subject() -> Subject {
         variants: vec!["day".into()],
         environments: BTreeMap::new(),
         first_seed: 1,
+        points: None,
         seeds: 4,
         delays: DelaysMs { image_period: 33.3, image: 30.0, answer: 10.0 },
         imu: None,

@@ -10,6 +10,7 @@ use ed25519_dalek::SigningKey;
 use vizflyt_protocol::messages::OutcomeKind;
 
 use super::document::{Grade, Run, SignedFile, VariantSummary};
+use super::figures::{figure, name_of};
 use super::folder::{GRADE, JUNIT, PAGE, ReportFolder, sorted};
 use super::junit;
 use super::statistics::Interval;
@@ -59,6 +60,7 @@ fn page(grade: &Grade, cards: &[String]) -> String {
         escape(&subject.variants.join(", "))
     );
     text += &figures(grade);
+    text += &points(grade);
     text += &variants(grade);
     text += &table(&grade.runs, !cards.is_empty());
     let with_cards = || grade.runs.iter().zip(cards);
@@ -106,6 +108,28 @@ fn figures(grade: &Grade) -> String {
         let _ = write!(text, "<div><dt>{name}</dt><dd>{value}<small>{note}</small></dd></div>");
     }
     text + "</dl>\n"
+}
+
+/// What the figures are worth, where the project says it, and what stands in the way of more.
+fn points(grade: &Grade) -> String {
+    let Some((points, most)) = grade.all_points() else { return String::new() };
+    let mut text = format!(
+        "<div class=\"wide\"><table><thead><tr><th class=\"text\">Part</th><th>Points</th><th>Figure</th>\
+         <th class=\"text\">What is missing</th></tr></thead><tbody>\n<tr><td class=\"text\">all</td>\
+         <td>{points:.1} of {most:.0}</td><td></td><td></td></tr>\n"
+    );
+    for part in &grade.points {
+        let value = part.value.map_or("-".to_owned(), |value| figure(&part.part, value));
+        let _ = writeln!(
+            text,
+            "<tr><td class=\"text\">{}</td><td>{:.1} of {:.0}</td><td>{value}</td><td class=\"text why\">{}</td></tr>",
+            escape(name_of(&part.part)),
+            part.points,
+            part.of,
+            escape(part.missing.as_deref().unwrap_or_default())
+        );
+    }
+    text + "</tbody></table></div>\n"
 }
 
 /// The variants, where there are several, and what those were that were drawn.

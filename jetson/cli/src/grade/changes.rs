@@ -1,0 +1,198 @@
+//! What changed since an earlier attempt: flights of the same places, compared one by one.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use anyhow::{Context, Result, ensure};
+use vizflyt_protocol::messages::OutcomeKind;
+
+use super::args::FlyArgs;
+use super::document::{Grade, Run, Subject, Summary};
+use super::figures::{NAMED, flight, outcome};
+use super::folder::GRADE;
+
+/// A score that differs by less is the same.
+const SAME_SCORE: f64 = 0.5;
+/// So does a time. [s]
+const SAME_S: f64 = 0.5;
+
+/// Returns the attempt that this one is compared with: what `--since` names, or what lies where the report is about to be
+/// written; nothing where there is none.
+///
+/// # Errors
+/// If `--since` names no grade.
+pub(super) fn earlier(args: &FlyArgs) -> Result<Option<Grade>> {
+    if let Some(path) = &args.since {
+        return read(path).map(Some).context("--since");
+    }
+    let report = args.report.as_deref().filter(|_| !args.resume);
+    // Whatever else lies there, the report says what it thinks of it.
+    Ok(report.and_then(|folder| Grade::read(&folder.join(GRADE)).ok()))
+}
+
+fn read(path: &Path) -> Result<Grade> {
+    let file = if path.is_dir() { path.join(GRADE) } else { path.to_owned() };
+    Grade::read(&file)
+}
+
+/// Checks that two grades can be compared.
+///
+/// # Errors
+/// What differs.
+pub(super) fn check(earlier: &Subject, now: &Subject) -> Result<()> {
+    let differs = |what: &str, earlier: &str, now: &str| {
+        ensure!(earlier == now, "the earlier attempt is of {what} {earlier}, this one of {now}");
+        Ok(())
+    };
+    differs("project", &earlier.project, &now.project)?;
+    differs("level", &earlier.level, &now.level)
+}
+
+/// Returns what changed, a line for each thing; nothing where no place was flown both times.
+pub(super) fn lines(earlier: &Grade, now: &Grade) -> Vec<String> {
+    let key = |run: &Run| (run.variant.clone(), run.seed);
+    let before: HashMap<(String, u64), &Run> =
+        earlier.runs.iter().map(|run| (key(run), run)).collect();
+    let both: Vec<(&Run, &Run)> =
+        now.runs.iter().filter_map(|run| Some((*before.get(&key(run))?, run))).collect();
+    if both.is_empty() {
+        return Vec::new();
+    }
+    if both.iter().all(|(before, after)| before.hash == after.hash) {
+        return vec![format!("nothing changed: {} flights went as before", both.len())];
+    }
+    let of =
+        |pick: fn(&(&Run, &Run)) -> Run| Summary::of(&both.iter().map(pick).collect::<Vec<_>>());
+    let (old, new) = (of(|both| both.0.clone()), of(|both| both.1.clone()));
+    let optional = |value: Option<f64>, unit: &str, digits: usize| {
+        value.map_or("-".to_owned(), |value| format!("{value:.digits$} {unit}"))
+    };
+    let mut lines = vec![format!(
+        "score {:.1} -> {:.1}, finished {} -> {} of {}, time {} -> {}, clearance {} -> {}",
+        old.score.value,
+        new.score.value,
+        old.finished,
+        new.finished,
+        both.len(),
+        optional(old.mean_finish_s, "s", 1),
+        optional(new.mean_finish_s, "s", 1),
+        optional(old.min_clearance_m, "m", 2),
+        optional(new.min_clearance_m, "m", 2),
+    )];
+    let is = |better: bool| {
+        both.iter().filter(move |(before, after)| {
+            step(before, after) == if better { Step::Better } else { Step::Worse }
+        })
+    };
+    for (word, better) in [("better", true), ("worse", false)] {
+        let all = is(better).count();
+        for (before, after) in is(better).take(NAMED) {
+            lines.push(format!("{word}: {}", told(now, before, after)));
+        }
+        if all > NAMED {
+            lines.push(format!("{word}: {} more", all - NAMED));
+        }
+    }
+    lines
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    Better,
+    Worse,
+    Alike,
+}
+
+/// By the score, then by the time of two flights that finished.
+fn step(before: &Run, after: &Run) -> Step {
+    let finished = [before, after].iter().all(|run| run.outcome == OutcomeKind::Finished);
+    let seconds = |run: &Run| run.seconds + run.penalty_s;
+    match (after.score - before.score, seconds(after) - seconds(before)) {
+        (more, _) if more > SAME_SCORE => Step::Better,
+        (more, _) if more < -SAME_SCORE => Step::Worse,
+        (_, longer) if finished && longer < -SAME_S => Step::Better,
+        (_, longer) if finished && longer > SAME_S => Step::Worse,
+        _ => Step::Alike,
+    }
+}
+
+fn told(grade: &Grade, before: &Run, after: &Run) -> String {
+    let ended = |run: &Run| match run.outcome {
+        OutcomeKind::Finished => format!("finished in {:.1} s", run.seconds + run.penalty_s),
+        _ => outcome(run),
+    };
+    let why = match &after.cause {
+        Some(cause) => format!("; {cause}"),
+        None => String::new(),
+    };
+    format!("{}: {} -> {}{why}", flight(grade, after), ended(before), ended(after))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::document::tests::{run, subject};
+    use super::*;
+
+    fn grade(runs: Vec<Run>) -> Grade {
+        Grade::new(subject(), None, runs)
+    }
+
+    fn flown(seed: u64, outcome: OutcomeKind, score: f64, seconds: f64) -> Run {
+        let hash = format!("{seed}-{outcome}-{score}-{seconds}");
+        Run { score, seconds, penalty_s: 0.0, hash, ..run(seed, outcome) }
+    }
+
+    #[test]
+    fn flights_are_compared_place_by_place() {
+        use OutcomeKind::{Collided, Finished};
+        let earlier = grade(vec![
+            flown(1, Collided, 50.0, 8.0),
+            flown(2, Finished, 100.0, 20.0),
+            flown(3, Finished, 100.0, 20.0),
+            flown(9, Collided, 0.0, 1.0),
+        ]);
+        let now = grade(vec![
+            flown(1, Finished, 100.0, 21.0),
+            flown(2, Collided, 25.0, 5.0),
+            flown(3, Finished, 100.0, 18.0),
+            flown(4, Finished, 100.0, 18.0),
+        ]);
+        let lines = lines(&earlier, &now);
+        assert!(
+            lines[0].contains("finished 2 -> 2 of 3"),
+            "seeds 4 and 9 were flown once: {lines:?}"
+        );
+        assert!(lines[0].contains("score 83.3 -> 75.0"), "{lines:?}");
+        assert!(lines[1].starts_with("better: seed 1: collided"), "{lines:?}");
+        assert!(lines[1].contains("-> finished in 21.0 s"), "{lines:?}");
+        assert!(lines[2].starts_with("better: seed 3: finished in 20.0 s -> "), "{lines:?}");
+        assert!(lines[3].starts_with("worse: seed 2: finished in 20.0 s -> collided"), "{lines:?}");
+        assert_eq!(lines.len(), 4);
+    }
+
+    #[test]
+    fn the_same_flights_and_other_places_say_so() {
+        let one = grade(vec![flown(1, OutcomeKind::Finished, 100.0, 9.0)]);
+        assert_eq!(lines(&one, &one), ["nothing changed: 1 flights went as before"]);
+        let other = grade(vec![flown(2, OutcomeKind::Finished, 100.0, 9.0)]);
+        assert_eq!(lines(&one, &other), Vec::<String>::new());
+    }
+
+    #[test]
+    fn many_are_counted() {
+        let all =
+            |score| (1..=9).map(|seed| flown(seed, OutcomeKind::Collided, score, 9.0)).collect();
+        let lines = lines(&grade(all(10.0)), &grade(all(20.0)));
+        assert_eq!(lines.len(), 1 + NAMED + 1, "{lines:?}");
+        assert_eq!(lines[NAMED + 1], "better: 4 more");
+    }
+
+    #[test]
+    fn another_course_is_not_compared() {
+        let p4 = subject();
+        let p5 = Subject { project: "p5-other".into(), ..subject() };
+        let error = check(&p4, &p5).unwrap_err().to_string();
+        assert!(error.contains("of project") && error.contains("p5-other"), "{error}");
+        assert!(check(&p4, &Subject { plugin_sha256: "00".into(), ..subject() }).is_ok());
+    }
+}

@@ -1,0 +1,95 @@
+//! What `vizflyt new --project pN` puts into a folder: the course's starters, as `docs/course` has them.
+
+use super::File;
+
+/// Lists files of a folder of `docs/course`.
+macro_rules! files {
+    ($folder:literal $($file:literal)*) => {
+        &[$(($file, include_str!(concat!("../../../../docs/course/", $folder, "/", $file)))),*]
+    };
+}
+
+/// One project's starter: the folders of `docs/course` that it is made of.
+struct Starter {
+    project: &'static str,
+    /// What is flown.
+    plugin: &'static str,
+    parts: &'static [&'static [(&'static str, &'static str)]],
+}
+
+/// Quaternions, files, the flight: what needs no filling in.
+const GIVEN: &[(&str, &str)] = files!("given" "attitude.py" "estimate.py" "flight.py");
+/// The flight's rules and the scores of an attitude.
+const ATTITUDE: &[(&str, &str)] = files!("." "attitude.toml" "score_attitude.py");
+
+const STARTERS: &[Starter] = &[
+    Starter {
+        project: "p0",
+        plugin: "live_complementary.py",
+        parts: &[
+            GIVEN,
+            ATTITUDE,
+            files!("p0/starter" "README.md" "complementary.py" "live_complementary.py" "test_complementary.py"),
+        ],
+    },
+    Starter {
+        project: "p1",
+        plugin: "live_madgwick.py",
+        parts: &[
+            GIVEN,
+            ATTITUDE,
+            files!("p1/starter" "README.md" "live_madgwick.py" "live_ukf.py" "madgwick.py" "test_madgwick.py" "test_ukf.py" "ukf.py"),
+        ],
+    },
+];
+
+/// The projects that are not flown through a course of their own, but through the empty net.
+pub(super) const IN_THE_NET: [&str; 2] = ["p0", "p1"];
+/// Their rules, in the folder.
+pub(super) const NET: &str = "attitude.toml";
+
+/// Returns the plugin and the files of a project's starter, if it has one.
+pub(super) fn of(project: &str) -> Option<(&'static str, Vec<File>)> {
+    let starter = STARTERS.iter().find(|starter| starter.project == project)?;
+    let files = starter.parts.iter().copied().flatten();
+    Some((starter.plugin, files.map(|&(file, text)| (file, text.to_owned())).collect()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+    use std::path::Path;
+
+    /// A file that is added to a starter is handed out.
+    #[test]
+    fn every_file_of_a_starter_is_in_the_program() {
+        let course = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/course");
+        let names = |folder: &Path| -> BTreeSet<String> {
+            let entries = std::fs::read_dir(folder).unwrap().map(Result::unwrap);
+            let files = entries.filter(|entry| entry.file_type().unwrap().is_file());
+            files.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect()
+        };
+        let mut with_starter = 0;
+        for entry in std::fs::read_dir(&course).unwrap() {
+            let project = entry.unwrap();
+            let folder = project.path().join("starter");
+            if !folder.is_dir() {
+                continue;
+            }
+            with_starter += 1;
+            let project = project.file_name().to_string_lossy().into_owned();
+            let (plugin, files) = of(&project).expect("it has a starter");
+            let files: BTreeSet<String> =
+                files.iter().map(|(file, _)| (*file).to_owned()).collect();
+            assert!(files.contains(plugin), "{project}");
+            let mut there = names(&folder);
+            if IN_THE_NET.contains(&&*project) {
+                there.extend(names(&course.join("given")));
+                there.extend(["score_attitude.py".to_owned(), NET.to_owned()]);
+            }
+            assert_eq!(files, there, "{project}");
+        }
+        assert_eq!(with_starter, STARTERS.len());
+    }
+}
