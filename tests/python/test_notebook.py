@@ -35,11 +35,12 @@ AHEAD = Setpoint.velocity([1, 0, 0])
 class End:
     """The runtime of a flight, as a plugin's end of it: a hundred images a second."""
 
-    def __init__(self):
-        self.info = vizflyt.ArenaInfo(name="stage", cameras=[camera()])
+    def __init__(self, cameras=("front",)):
+        self.info = vizflyt.ArenaInfo(name="stage", cameras=[camera(name) for name in cameras])
         self.messages: deque[tuple[str, Any]] = deque([("start", self.info)])
         self.answers, self.named, self.failed_with = [], [], []
         self.sees = True
+        self.refuses, self.has_refused = [], False
         self.seq = 0
 
     def tell(self, kind, text="", **details):
@@ -56,7 +57,8 @@ class End:
         buffer = vizflyt.ObservationBuffer(self.info.cameras)
         buffer.clear(self.seq)
         if self.sees:
-            buffer.set_image("front", *pattern(48, 64, self.seq), seq=self.seq)
+            name = self.info.cameras[self.seq % len(self.info.cameras)].name
+            buffer.set_image(name, *pattern(48, 64, self.seq), seq=self.seq)
         return buffer.observation()
 
     def ready(self, name):
@@ -65,6 +67,9 @@ class End:
 
     def answer(self, seq, entered_ns, setpoint):
         self.answers.append((seq, setpoint))
+        if setpoint in self.refuses and not self.has_refused:
+            self.tell("note", f"setpoint refused: no {setpoint.kind}")
+        self.has_refused = setpoint in self.refuses
         if setpoint == Setpoint.land():
             self.tell("ended", "the plugin asked to land", ended="plugin_landed")
             self.tell("phase", "landing", phase="landing")
@@ -103,6 +108,19 @@ def air(ground):
     lab, _ = ground
     lab.take_off()
     return ground
+
+
+def test_one_waits_for_the_camera_that_is_asked_for():
+    end = End(["front", "down"])
+    lab = Lab(cast(Any, end))
+    until(lambda: lab._info is not None)
+    # As of cameras of different rates: an observation has what was drawn at its instant.
+    for _ in range(3):
+        assert lab.look().camera("front") is not None
+        assert [image.name for image in lab.look("down").cameras] == ["down"]
+    with pytest.raises(LookupError, match="there is no camera 'dwon'; this vehicle has 'front', 'down'"):
+        lab.look("dwon")
+    lab.close()
 
 
 def test_on_the_ground_one_looks_and_nothing_is_answered(ground):
@@ -190,18 +208,20 @@ def test_what_is_no_setpoint_to_fly_by_is_a_sentence(air):
 
 def test_a_setpoint_that_the_course_refuses_is_an_error_and_it_holds(air):
     lab, end = air
-    refusal = "setpoint refused: this course does not allow velocity"
-    threading.Timer(0.1, end.tell, ("note", refusal)).start()
-    with pytest.raises(ValueError, match=refusal):
-        lab.fly(AHEAD, 30)
+    end.refuses = [AHEAD, Setpoint.position([1, 0, 1])]
+    # One right after the other: the runtime speaks of the second only if a good one came between.
+    for setpoint in end.refuses * 3:
+        with pytest.raises(ValueError, match=f"setpoint refused: no {setpoint.kind}"):
+            lab.fly(setpoint, 5)
     assert end.newest() == Setpoint.hold()
-    # Between two steps: the second one says it.
+    # A step has its image by then: the next one says it.
     lab.step(AHEAD)
-    end.tell("note", refusal)
-    until(lambda: not end.messages)
-    assert end.newest() == Setpoint.hold()
-    with pytest.raises(ValueError, match=refusal):
-        lab.step(AHEAD)
+    until(lambda: end.newest() == Setpoint.hold())
+    with pytest.raises(ValueError, match="setpoint refused: no velocity"):
+        lab.step(Setpoint.velocity([2, 0, 0]))
+    began = len(end.answers)
+    lab.step(Setpoint.velocity([2, 0, 0]))
+    assert AHEAD not in [setpoint for _, setpoint in end.answers[began:]]
 
 
 def test_landing_ends_the_flight_in_a_sentence(air):

@@ -82,10 +82,14 @@ class Lab:
         """What has happened in this flight, the newest last."""
         self._info: ArenaInfo | None = None
         self._phase = "connecting"
+        # The camera that is looked through, and the newest with an image of it.
+        self._camera: str | None = None
         self._newest: Observation | None = None
-        # What is asked for, until when, and why the runtime refused the last.
+        # What is asked for, and until when.
         self._asked: Setpoint | None = None
         self._asked_until_s = 0.0
+        # Why the runtime refused it: before the vehicle is told to hold, and after.
+        self._refusal: str | None = None
         self._refused: str | None = None
         self._takes_off = self._lands = self._leaves = False
         # Why nobody is attached any more, and whether the flight came to its end before.
@@ -118,13 +122,20 @@ class Lab:
         """Whether the vehicle is in the air and takes setpoints."""
         return self.is_attached and self._phase in ("flying", "holding")
 
-    def look(self) -> Observation:
-        """Waits for the next image and returns it: what the vehicle sees now, on the ground too.
+    def look(self, camera: str | None = None) -> Observation:
+        """Waits for the next image of a camera, the course's first if it is not named, and returns the observation
+        that holds it: what the vehicle sees now, on the ground too.
 
-        Its `imu` are the samples since the image before it, not since your last look.
+        Other cameras are in it as far as they were drawn at the same instant. Its `imu` are the samples since the
+        observation before it, not since your last look.
+
+        Raises LookupError if the vehicle has no such camera.
         """
+        cameras = [known.name for known in self.info.cameras]
+        if camera is not None and camera not in cameras:
+            raise LookupError(f"there is no camera {camera!r}; this vehicle has {', '.join(map(repr, cameras))}")
         with self._news:
-            self._newest = None
+            self._camera, self._newest = camera or next(iter(cameras), None), None
         self._wait(lambda lab: lab._newest is not None, IMAGE_WITHIN_S, "no image has come")
         newest = self._newest
         assert newest is not None
@@ -288,16 +299,19 @@ class Lab:
             else:
                 self.events.append(content)
                 self._phase = content.details.get("phase", self._phase)
-                if content.text.startswith(REFUSED) and self._asked is not None:
-                    # Asked for on, it would hold and then land.
-                    self._asked, self._refused = None, content.text
+                if content.text.startswith(REFUSED):
+                    self._refusal = content.text
             self._news.notify_all()
 
     def _answer(self, obs: Observation) -> Setpoint:
         with self._news:
-            if obs.cameras:
+            if self._camera is None or any(image.name == self._camera for image in obs.cameras):
                 self._newest = obs
-                self._news.notify_all()
+            if self._refusal is not None:
+                # Asked for on, it would end in a landing. And a hold comes first, whatever is asked next: only after
+                # a good setpoint the runtime says that it refuses another.
+                self._asked, self._refused, self._refusal = None, self._refusal, None
+            self._news.notify_all()
             if self._lands:
                 return Setpoint.land()
             if self._asked is not None and time.monotonic() < self._asked_until_s:
