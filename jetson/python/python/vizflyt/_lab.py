@@ -68,10 +68,10 @@ def attach(*, service: str | None = None, wait_s: float = 30.0) -> Lab:
 class Lab:
     """A lab that is flown by hand: what :func:`attach` returns.
 
-    Time does not stand still between two calls, as it does not in the real lab, where this works as well. A thread
-    answers every image. Whenever nobody asks for anything it answers **hold**: after :meth:`fly`, 0.5 s after
-    :meth:`step`, while you read and think. So the deadlines of plugins never land the vehicle; the course's time
-    limit and an empty battery do. The guard has the last word, as over any plugin.
+    Time does not stand still between two calls, as it does not in the real lab. A thread answers every image. Whenever
+    nobody asks for anything it answers **hold**: after :meth:`fly`, 0.5 s after :meth:`step`, while you read and think.
+    So the deadlines of plugins never land the vehicle; the course's time limit and an empty battery do. The guard has
+    the last word, as over any plugin.
 
     Ctrl-C ("interrupt the kernel") ends a call, and the vehicle holds. When the kernel ends, the vehicle lands. As a
     context manager it lands at the end of the block.
