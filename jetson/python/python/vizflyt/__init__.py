@@ -25,7 +25,9 @@ to keep it for long, take a ``.copy()``.
 
 from typing import TYPE_CHECKING, Any
 
+from ._lab import Lab, attach
 from ._log import Images, Imu, Log, LogImage, Motion, Poses, Sent
+from ._picture import Picture, show
 from ._plugin import Plugin
 from ._run import HeldImagesWarning, run
 from ._vizflyt import (
@@ -67,6 +69,7 @@ __all__ = [
     "Imu",
     "ImuSample",
     "Intrinsics",
+    "Lab",
     "Limits",
     "Log",
     "LogImage",
@@ -74,6 +77,7 @@ __all__ = [
     "NotFiniteError",
     "Observation",
     "ObservationBuffer",
+    "Picture",
     "Plugin",
     "Pose",
     "Poses",
@@ -86,9 +90,11 @@ __all__ = [
     "Vehicle",
     "Volume",
     "__version__",
+    "attach",
     "course_map",
     "publish_odometry",
     "run",
+    "show",
 ]
 
 
