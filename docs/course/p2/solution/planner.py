@@ -59,8 +59,8 @@ def astar(
 ) -> F64 | None:
     """Finds a path on a grid within the box from `low_m` to `high_m`, with more than `margin_m` of room all along.
 
-    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not so
-    much room. [m, world]
+    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not
+    so much room. [m, world]
     """
     start_m, goal_m = np.asarray(start_m, float), np.asarray(goal_m, float)
     # The start is a node. A rim of nodes that are not free spares the search to look where the grid ends.

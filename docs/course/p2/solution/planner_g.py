@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from planner import F64, Room, are_free
 
 DEGREE = 7

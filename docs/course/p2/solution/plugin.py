@@ -4,10 +4,10 @@ Which of the two follows from what the level allows to ask for.
 """
 
 import numpy as np
-
-import vizflyt
 from planner import F64, astar, shorten
 from planner_g import curve, rrt_star, smooth
+
+import vizflyt
 from vizflyt import Setpoint
 
 # Room to plan with: the first that leaves a way (ug); the one whose curve is flown in the least time (g). [m]
@@ -42,7 +42,7 @@ def box_of(volume: vizflyt.Volume, inside_m: F64) -> tuple[F64, F64]:
 
 
 def slow_corners(path_m: F64) -> tuple[F64, F64]:
-    """Returns waypoints (N, 3) along a path [m, world], and the speeds (N,) on the way to them: slow behind corners. [m/s]
+    """Returns waypoints (N, 3) along a path [m, world], and the speeds (N,) on the way to each: slow at corners. [m/s]
 
     The runtime comes to a corner no faster than the way behind it is flown.
     """

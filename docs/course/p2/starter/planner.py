@@ -1,7 +1,7 @@
 """Project 2: a path through a known map. This is the file to work in; it does not know the vehicle, nor `vizflyt`.
 
-A room is a function: it takes points (N, 3) [m, world] and returns the room about the body's centre there, (N,) [m]: (1)
-of the assignment. All points are float64, in the world frame.
+A room is a function: it takes points (N, 3) [m, world] and returns the room about the body's centre there, (N,) [m]:
+(1) of the assignment. All points are float64, in the world frame.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def astar(
 ) -> F64 | None:
     """Finds a path on a grid within the box from `low_m` to `high_m`, with more than `margin_m` of room all along.
 
-    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not so
-    much room.
+    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not
+    so much room.
     """
     # So far it is the straight line, whatever stands there.
     return np.array([start_m, goal_m], float)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from planner import F64, Room
 
 DEGREE = 7
@@ -25,9 +24,9 @@ def rrt_star(
 ) -> F64 | None:
     """Grows a tree of `nodes` nodes within the box from `low_m` to `high_m`, with more than `margin_m` of room.
 
-    Every number is drawn from `np.random.default_rng(seed)`, so that more nodes from the same seed are the same tree, grown
-    further. Returns the best path (N, 3), `start_m` first and `goal_m` last; None if none was found, or if start or goal
-    have not so much room.
+    Every number is drawn from `np.random.default_rng(seed)`, so that more nodes from the same seed are the same tree,
+    grown further. Returns the best path (N, 3), `start_m` first and `goal_m` last; None if none was found, or if start
+    or goal have not so much room.
     """
     # So far it is the straight line, whatever stands there.
     return np.array([start_m, goal_m], float)

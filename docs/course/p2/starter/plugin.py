@@ -1,8 +1,8 @@
 """Project 2: plans on the ground, and flies its points once it is in the air. Runs at both levels as it is."""
 
 import numpy as np
-
 import planner
+
 import vizflyt
 from vizflyt import Setpoint
 

@@ -3,9 +3,10 @@
 Those marked "so far fails" are yours to mend.
 """
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
-
 from planner import astar, is_free, length_m, shorten
 
 BODY_M, MARGIN_M = 0.12, 0.1
@@ -38,7 +39,10 @@ def room_with(boxes):
 
 def least_room_m(room, path_m):
     """Room at every millimetre of a path."""
-    return min(room(np.linspace(a, b, 2 + int(1000 * np.linalg.norm(b - a)))).min() for a, b in zip(path_m, path_m[1:]))
+    found_m = []
+    for from_m, to_m in pairwise(path_m):
+        found_m.append(room(np.linspace(from_m, to_m, 2 + int(1000 * np.linalg.norm(to_m - from_m)))).min())
+    return min(found_m)
 
 
 def shortest_m():
@@ -64,13 +68,13 @@ def test_a_segment_that_ends_in_something_is_not_free():
 
 def test_no_segment_through_something_is_free():
     """So far fails: what stands between the ends is not seen. Neither a thin post is missed, nor room denied."""
-    random = np.random.default_rng(1)
+    random, half_m = np.random.default_rng(1), np.array([0.01, 0.01, 1.0])
     missed, denied = [], []
     for _ in range(300):
         post_m = random.uniform(LOW_M + 0.5, HIGH_M - 0.5)
-        room = room_with([(post_m - [0.01, 0.01, 1.0], post_m + [0.01, 0.01, 1.0])])
+        room = room_with([(post_m - half_m, post_m + half_m)])
         ends_m = random.uniform(LOW_M + 0.3, HIGH_M - 0.3, (2, 3))
-        least_m, said = least_room_m(room, ends_m), is_free(room, *ends_m, MARGIN_M)
+        least_m, said = least_room_m(room, ends_m), is_free(room, ends_m[0], ends_m[1], MARGIN_M)
         missed += [least_m] if said and least_m <= MARGIN_M - 1e-4 else []
         denied += [least_m] if not said and least_m > MARGIN_M + 0.02 else []
     assert (missed, denied) == ([], [])
@@ -92,7 +96,7 @@ def test_a_wall_is_passed_by_its_door():
 
 def test_a_goal_beside_the_grid_is_reached():
     """So far fails. Start and goal lie where they lie."""
-    start_m, goal_m = START_M + [0.03, -0.07, 0.01], GOAL_M + [0.11, 0.05, 0.13]
+    start_m, goal_m = START_M + np.array([0.03, -0.07, 0.01]), GOAL_M + np.array([0.11, 0.05, 0.13])
     path_m = plan(DOOR, start_m, goal_m)
     np.testing.assert_allclose(path_m[[0, -1]], [start_m, goal_m])
     assert least_room_m(room_with(DOOR), path_m) > MARGIN_M - 1e-4

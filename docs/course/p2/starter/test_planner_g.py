@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from test_planner import DOOR, GOAL_M, HIGH_M, LOW_M, MARGIN_M, START_M, WALL, least_room_m, room_with, shortest_m
-
 from planner import length_m
 from planner_g import curve, minimum_snap, rrt_star, smooth, timed
+from test_planner import DOOR, GOAL_M, HIGH_M, LOW_M, MARGIN_M, START_M, WALL, least_room_m, room_with, shortest_m
 
 POINTS_M = np.array([[0, 0, 1], [1, 0.5, 1], [2, -0.5, 1.5], [3.5, 0, 1]], float)
 SECONDS = np.array([1.5, 1.0, 2.0])
@@ -66,7 +65,7 @@ def test_they_begin_and_end_at_rest():
 
 @pytest.mark.parametrize("derivative", [1, 2, 3, 4, 5, 6])
 def test_pieces_meet_in_every_derivative(derivative):
-    """So far fails. Up to the fourth it was asked for; the fifth and sixth follow where the snap is least."""
+    """So far fails in the first. Up to the fourth it is asked for; the fifth and sixth follow where snap is least."""
     coefficients = minimum_snap(POINTS_M, SECONDS)
     for piece, joint_s in enumerate(np.cumsum(SECONDS)[:-1]):
         before = curve(SECONDS[piece:], coefficients[piece:], np.array([SECONDS[piece] - 1e-9]), derivative)
