@@ -21,8 +21,8 @@ def test_the_tree_finds_the_door(seed):
     path_m = grow(DOOR, 1000, seed)
     np.testing.assert_allclose(path_m[[0, -1]], [START_M, GOAL_M])
     assert least_room_m(room_with(DOOR), path_m) > MARGIN_M - 1e-4
-    # Without the star it would be a third longer.
-    assert shortest_m() - 1e-3 < length_m(path_m) < 1.12 * shortest_m()
+    # Without the star it is half as long again, and more.
+    assert shortest_m() - 1e-3 < length_m(path_m) < 1.25 * shortest_m()
 
 
 def test_a_tree_that_grows_makes_no_way_longer():
@@ -34,7 +34,7 @@ def test_the_same_seed_is_the_same_tree():
     np.testing.assert_array_equal(grow(DOOR, 500), grow(DOOR, 500))
 
 
-def test_no_way_is_none():
+def test_no_tree_is_none():
     """So far fails: a wall without a door; a start in the wall."""
     assert grow(WALL, 300) is None
     room = room_with(DOOR)
