@@ -3,6 +3,8 @@
 Which of the two follows from what the level allows to ask for.
 """
 
+from itertools import product
+
 import numpy as np
 from planner import F64, astar, shorten
 from planner_g import curve, rrt_star, smooth
@@ -21,13 +23,15 @@ CORNER_M = 0.3
 
 # What a curve leaves at least. [m]
 LEAST_M = 0.22
+# Trees for each margin, and their nodes: one alone may lead by a long way round.
+TREES, NODES = 2, 600
 
 # By velocities. What is left to the limits of 3 m/s and 6 m/s^2 is for corrections. [m/s], [m/s^2]
-CURVE_MPS, CURVE_MPS2 = 2.5, 2.5
-# From a velocity that is asked for to the velocity; measured on a flight's log (`sent` and `motion`). [s]
-LAG_S = 0.45
+CURVE_MPS, CURVE_MPS2 = 2.6, 3.0
+# From a velocity that is asked for to the velocity, along x, y, z; measured on flights' logs (`sent` and `motion`). [s]
+LAG_S = np.array([0.40, 0.40, 0.20])
 # From where the vehicle was seen to when the answer counts. [s]
-AHEAD_S = 0.05
+AHEAD_S = 0.07
 # k of (7). [1/s]
 GAIN_PER_S = 1.0
 # The reference gets slower from this far before the vehicle on, and stands so far before it. [m]
@@ -91,11 +95,10 @@ class Planned(vizflyt.Plugin):
 
     def plan_curve(self):
         """Returns the points (N, 3) of the curve that is flown in the least time; that curve is `seconds, pieces`."""
+        ends_m = self.start_m, self.info.goal_m, self.low_m, self.high_m
         fastest_s, best_m = np.inf, None
-        for margin_m in MARGINS_M:
-            path_m = rrt_star(
-                self.room, self.start_m, self.info.goal_m, self.low_m, self.high_m, nodes=800, margin_m=margin_m
-            )
+        for margin_m, seed in product(MARGINS_M, range(TREES)):
+            path_m = rrt_star(self.room, *ends_m, nodes=NODES, seed=seed, margin_m=margin_m)
             if path_m is None:
                 continue
             path_m = shorten(self.room, path_m, margin_m)
