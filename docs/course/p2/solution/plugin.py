@@ -38,11 +38,12 @@ GAIN_PER_S = 1.0
 WAITS_M, STANDS_M = 0.10, 0.40
 
 
-def box_of(volume: vizflyt.Volume, inside_m: F64) -> tuple[F64, F64]:
-    """Returns the low and the high corner of a box with sides along the axes, from a point (3,) in it. [m, world]"""
-    far_m = 100.0 * np.eye(3)
-    low_m = inside_m - 100.0 + volume.signed_distance_m(inside_m - far_m)
-    return low_m, inside_m + 100.0 - volume.signed_distance_m(inside_m + far_m)
+def box_of(volume: vizflyt.Volume, near_m: F64) -> tuple[F64, F64]:
+    """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
+    away_m = 10_000.0
+    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
+    return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
 
 def slow_corners(path_m: F64) -> tuple[F64, F64]:
@@ -70,7 +71,7 @@ class Planned(vizflyt.Plugin):
         places_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self.solids = [solid for solid in vizflyt.course_map() if solid.signed_distance_m(places_m).min() < 0.2]
 
-        low_m, high_m = box_of(info.start_box, self.low_m + 1.0)
+        low_m, high_m = box_of(info.start_box, self.low_m)
         self.start_m = np.array([*(0.5 * (low_m + high_m))[:2], info.takeoff_height_m])
         self.by_velocity = "velocity" in info.setpoints
         self.path_m = self.plan_curve() if self.by_velocity else self.plan_lines()

@@ -10,11 +10,12 @@ MARGIN_M = 0.3  # room to plan with
 SPEED_MPS = 1.0  # on the way to each point
 
 
-def box_of(volume, inside_m):
-    """Returns the low and the high corner of a box with sides along the axes, from a point (3,) in it. [m, world]"""
-    far_m = 100.0 * np.eye(3)
-    low_m = inside_m - 100.0 + volume.signed_distance_m(inside_m - far_m)
-    return low_m, inside_m + 100.0 - volume.signed_distance_m(inside_m + far_m)
+def box_of(volume, near_m):
+    """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
+    away_m = 10_000.0
+    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
+    return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
 
 class PathPlanner(vizflyt.Plugin):
@@ -22,7 +23,7 @@ class PathPlanner(vizflyt.Plugin):
         self.info, self.map = info, vizflyt.course_map()
         self.low_m, self.high_m = box_of(info.geofence, info.goal_m)
         # No pose yet: over the middle of the start box, where the take-off ends.
-        low_m, high_m = box_of(info.start_box, self.low_m + 1.0)
+        low_m, high_m = box_of(info.start_box, self.low_m)
         start_m = np.array([*(low_m + high_m)[:2] / 2, info.takeoff_height_m])
         self.flying = self.asked = False
 
