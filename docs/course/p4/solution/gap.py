@@ -1,7 +1,7 @@
 """Project 4: the gap, from one image with depth or from colour images that a sideways flight has taken.
 
-Images are (H, W) or (H, W, 3); a camera looks along +z, x to the right, y down; its axis goes through the image's middle.
-Pixels are continuous: (0, 0) is the outer corner of the top-left one.
+Images are (H, W) or (H, W, 3). A camera looks along +z, x to the right, y down; its axis goes through the image's
+middle. Pixels are continuous: (0, 0) is the outer corner of the top-left one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BEHIND = 0.8
 # Halves of the windows in which images are compared, and in which the comparison is averaged. [px]
 FINE_PX, WIDE_PX = 2, 6
 # By so much attitude and place may shift an image. [px]
-SLACK_PX = np.arange(-3.0, 3.1, 0.5)
+SLACK_PX = 3
 # More than this no two pixels differ. [grey levels of 255]
 UNLIKE = 40.0
 
@@ -215,11 +215,11 @@ def difference(one: F64, other: F64) -> F64:
 class Views:
     """Grey images (H, W) of level cameras beside each other; distances are tried on the first one.
 
-    A place at the distance Z is f X / Z further left in an image that was taken X further to the right: (2), with V dt =
-    X. Images from the left and from the right are taken apart, and those count that explain more: what the gap's edge
-    hides from one side is seen from the other (S. B. Kang, R. Szeliski and J. Chai, "Handling occlusions in dense
-    multi-view stereo", CVPR 2001). That several images decide together, and by 1 / Z, is M. Okutomi's and T. Kanade's
-    "multiple-baseline stereo", IEEE Transactions on Pattern Analysis and Machine Intelligence 15(4), 1993.
+    A place at the distance Z is f X / Z further left in an image that was taken X further to the right: (2), with
+    V dt = X. Images from the left and from the right are taken apart, and those count that explain more: what the gap's
+    edge hides from one side is seen from the other (S. B. Kang, R. Szeliski and J. Chai, "Handling occlusions in dense
+    multi-view stereo", CVPR 2001). That several images decide together, by 1 / Z: M. Okutomi and T. Kanade, "A
+    multiple-baseline stereo", IEEE Transactions on Pattern Analysis and Machine Intelligence 15(4), 1993.
     """
 
     def __init__(self, images: Sequence[F64], right_m: Sequence[float], focal_px: float) -> None:
@@ -237,18 +237,23 @@ class Views:
 
     def left_over(self, per_m: float, among: Mask) -> float:
         """Returns what the distance 1 / `per_m` [1/m] leaves unexplained in all images, `among` some pixels (H, W)."""
-        return float(sum(difference(shifted(image, -step * per_m), self.first)[among].sum() for image, step in self.others))
+        moved = [shifted(image, -step * per_m) for image, step in self.others]
+        return float(sum(difference(image, self.first)[among].sum() for image in moved))
 
     def align(self, per_m: float, of_wall: Mask) -> None:
         """Shifts each image so that the wall fits best: by what attitude and place are off, some pixels."""
         for index, (image, step) in enumerate(self.others):
             moved = shifted(image, -step * per_m)
-            right = down = 0.0
+
+            def off(right_px: float, down_px: int, moved: F64 = moved) -> float:
+                return float(difference(shifted(moved, right_px, down_px), self.first)[of_wall].sum())
+
             # Across and down in turn: the wall has edges in both directions.
+            right_px, down_px = 0.0, 0
             for _ in range(2):
-                right = min(SLACK_PX, key=lambda x: difference(shifted(moved, x, int(down)), self.first)[of_wall].sum())
-                down = min(SLACK_PX[::2], key=lambda y: difference(shifted(moved, right, int(y)), self.first)[of_wall].sum())
-            self.others[index] = (shifted(image, right, int(down)), step)
+                right_px = min(np.arange(-SLACK_PX, SLACK_PX + 0.1, 0.5), key=lambda x: off(x, down_px))
+                down_px = min(range(-SLACK_PX, SLACK_PX + 1), key=lambda y: off(right_px, y))
+            self.others[index] = (shifted(image, right_px, down_px), step)
 
 
 def by_motion(images: Sequence[F64], right_m: Sequence[float], focal_px: float) -> Gap | None:
@@ -262,7 +267,7 @@ def by_motion(images: Sequence[F64], right_m: Sequence[float], focal_px: float) 
     middle = np.zeros((rows, columns), bool)
     middle[rows // 5 : rows - rows // 5, columns // 5 : columns - columns // 5] = True
 
-    # The wall: the distance at which most of the middle is, first roughly, in every third row, then between those tried.
+    # The wall: the distance at which most of the middle is, first roughly, in every third row, then finely.
     tried = np.linspace(1 / FARTHEST_M, 1 / NEAREST_M, DEPTHS)
     roughly = Views([image[::3] for image in images], right_m, focal_px)
     best = np.argmin([roughly.cost(per_m, FINE_PX) for per_m in tried], axis=0)
