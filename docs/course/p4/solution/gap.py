@@ -76,8 +76,9 @@ def surrounded(free: Mask, solid: Mask) -> Mask:
     outside = np.zeros_like(free)
     outside[[0, -1], :] = ~solid[[0, -1], :]
     outside[:, [0, -1]] |= ~solid[:, [0, -1]]
-    count = 0
-    while count < (count := np.count_nonzero(outside)):
+    before = None
+    while before is None or (before != outside).any():
+        before = outside.copy()
         outside[1:] |= outside[:-1]
         outside[:-1] |= outside[1:]
         outside[:, 1:] |= outside[:, :-1]

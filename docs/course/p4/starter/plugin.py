@@ -96,7 +96,7 @@ class Mine(vizflyt.Plugin):
         yield from self._go(np.array([0, -ASIDE_M, 0]), SPEED_MPS)
         images.append(self._level_image())
         found = by_motion(images, [0.0, ASIDE_M], focal_px)
-        return None if found is None else self._way(found, HEADING_FROM_LEVEL) + [0, ASIDE_M, 0]
+        return None if found is None else self._way(found, HEADING_FROM_LEVEL) + np.array([0, ASIDE_M, 0])
 
     def _heading_from_cam(self) -> F64:
         """Turns directions from the front camera's axes into axes `heading` of the flight's begin, (3, 3)."""
