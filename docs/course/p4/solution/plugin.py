@@ -7,6 +7,7 @@ moves less in the image than the wall does. All that is known of the own place a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Generator
 
 import numpy as np
@@ -29,8 +30,8 @@ VIEWS_M = (0.35, -0.35)
 ENOUGH_M = 0.22
 # So many images with depth are tried at one place.
 PATIENCE = 15
-# Where it looks from if it has seen nothing, one step after the other. [m, heading]
-ABOUT_M = ((0.0, 0.0, 0.3), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -1.0, 0.0), (0.0, 0.5, 0.0))
+# Where it looks from if it has seen nothing: steps that lead back to where it began. [m, heading]
+ABOUT_M = ((-0.4, 0.0, 0.3), (0.0, 0.5, 0.0), (0.0, -1.0, 0.0), (0.4, 0.5, -0.3))
 
 Steps = Generator[Setpoint | None, None, None]
 Look = Generator[Setpoint | None, None, F64 | None]
@@ -80,12 +81,12 @@ class Through(vizflyt.Plugin):
 
     def _fly(self) -> Steps:
         yield from self._rest(SETTLE_S)
-        about = 0
+        about_m = itertools.cycle(ABOUT_M)
         while True:
             to_m = yield from self._look()
             if to_m is None:
-                yield from self._go(np.array(ABOUT_M[about % len(ABOUT_M)]), ASIDE_MPS)
-                about += 1
+                print("no gap seen, looking about", flush=True)
+                yield from self._go(np.array(next(about_m)), ASIDE_MPS)
                 continue
             print(f"gap {to_m[0]:.2f} m ahead, {to_m[1]:+.2f} m left, {to_m[2]:+.2f} m up", flush=True)
             if to_m[0] < STAND_M + 0.3:
