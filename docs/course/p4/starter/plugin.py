@@ -81,9 +81,10 @@ class Mine(vizflyt.Plugin):
         """Flies a straight way [m, heading], and waits until it is over and the vehicle stands."""
         self.path += 1
         until_s = self.now_s + float(np.linalg.norm(by_m)) / speed_mps + SETTLE_S
-        yield Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
+        path = Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
+        # The same path again goes on, and holds its end; None would stop the vehicle wherever it is half a second later.
         while self.now_s < until_s:
-            yield None
+            yield path
 
     def _look(self) -> Look:
         """Returns the way from here to the gap's middle, (3,) [m, heading]; None if none is seen. Without depth it
