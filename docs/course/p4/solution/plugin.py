@@ -108,7 +108,7 @@ class Through(vizflyt.Plugin):
         self.path += 1
         until_s = self.now_s + float(np.linalg.norm(by_m)) / speed_mps + SETTLE_S
         path = Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
-        # The same path again goes on, and holds its end; None would stop the vehicle wherever it is half a second later.
+        # The same path again goes on, and holds its end; after None the vehicle stops half a second later, where it is.
         while self.now_s < until_s:
             yield path
 
