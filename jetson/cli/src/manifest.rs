@@ -77,7 +77,9 @@ impl PluginManifest {
         manifest.plugin = folder.join(&manifest.plugin);
         let LabConfig { scene, project, .. } = &mut manifest.lab;
         // A project's file; its name is no place.
-        let project = project.iter_mut().filter(|name| name.ends_with(".toml"));
+        let is_file =
+            |name: &&mut String| Path::new(&**name).extension().is_some_and(|end| end == "toml");
+        let project = project.iter_mut().filter(is_file);
         for place in scene.iter_mut().chain(project) {
             if folder.join(&*place).exists() {
                 *place = folder.join(&*place).display().to_string();

@@ -18,7 +18,7 @@ pub struct PointsTable {
     /// For the mean time to the finish, penalties included. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub time_s: Option<Bounds>,
-    /// For the least clearance of all flights. [m]
+    /// For the least clearance of the flights that finish: one that touches has lost its score already. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clearance_m: Option<Bounds>,
     /// For the greatest speed of a flight, the median of those that finish. [m/s]
@@ -45,7 +45,7 @@ pub struct Figures {
     pub score: f64,
     /// Mean time to the finish; none finished. [s]
     pub time_s: Option<f64>,
-    /// Least clearance; nothing stands there. [m]
+    /// Least clearance of those that finished; none did, or nothing stands there. [m]
     pub clearance_m: Option<f64>,
     /// Median of the greatest speeds of the flights that finished. [m/s]
     pub speed_mps: Option<f64>,

@@ -339,7 +339,7 @@ mod tests {
         let fast = text.replace("max_speed_mps = 4.0", "max_speed_mps = 99.0");
         let error = found(&fast).unwrap_err().to_string();
         assert!(error.contains("level ug") && error.contains("limits.max_speed_mps"), "{error}");
-        let turned = p4.text().replace("all = 15.0, half = 25.0", "all = 25.0, half = 15.0");
+        let turned = p4.text().replace("all = 14.0, half = 23.0", "all = 23.0, half = 14.0");
         let error = found(&turned);
         let error = error.unwrap_err().to_string();
         assert!(error.contains("level ug: points.time_s"), "{error}");

@@ -455,8 +455,7 @@ impl Run {
 
 impl Summary {
     pub(super) fn of(runs: &[Run]) -> Self {
-        let finished: Vec<&Run> =
-            runs.iter().filter(|run| run.outcome == OutcomeKind::Finished).collect();
+        let finished: Vec<&Run> = runs.iter().filter(|run| is_finished(run)).collect();
         let scores: Vec<f64> = runs.iter().map(|run| run.score).collect();
         let stages: usize = runs.iter().map(|run| run.stages_passed).sum();
         let times = finished.iter().map(|run| run.seconds + run.penalty_s);
@@ -473,14 +472,22 @@ impl Summary {
             mean_finish_s: (!finished.is_empty())
                 .then(|| millionth(times.sum::<f64>() / finished.len() as f64)),
             mean_stages_passed: millionth(stages as f64 / runs.len().max(1) as f64),
-            min_clearance_m: runs.iter().filter_map(|run| run.min_clearance_m).reduce(f64::min),
+            min_clearance_m: least_clearance_m(runs.iter()),
         }
     }
 }
 
+fn is_finished(run: &Run) -> bool {
+    run.outcome == OutcomeKind::Finished
+}
+
+fn least_clearance_m<'a>(runs: impl Iterator<Item = &'a Run>) -> Option<f64> {
+    runs.filter_map(|run| run.min_clearance_m).reduce(f64::min)
+}
+
 /// Returns the median of a figure of the flights that finished.
 fn median_of_finished(runs: &[Run], figure: impl Fn(&Run) -> f64) -> Option<f64> {
-    let finished = runs.iter().filter(|run| run.outcome == OutcomeKind::Finished);
+    let finished = runs.iter().filter(|run| is_finished(run));
     let mut values: Vec<f64> = finished.map(figure).collect();
     values.sort_by(f64::total_cmp);
     let upper = *values.get(values.len() / 2)?;
@@ -495,7 +502,7 @@ fn points_of(subject: &Subject, runs: &[Run]) -> Vec<PartPoints> {
     table.parts(&Figures {
         score: summary.score.value,
         time_s: summary.mean_finish_s,
-        clearance_m: summary.min_clearance_m,
+        clearance_m: least_clearance_m(runs.iter().filter(|run| is_finished(run))),
         speed_mps: median_of_finished(runs, |run| run.max_speed_mps),
     })
 }

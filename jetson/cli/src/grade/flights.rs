@@ -163,7 +163,9 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         if !lines.is_empty() {
             print_line("since the last attempt");
         }
-        lines.iter().for_each(|line| print_line(format!("  {line}")));
+        for line in lines {
+            print_line(format!("  {line}"));
+        }
     }
     if let (Some(folder), false) = (&args.report, args.result.json) {
         print_line(format!("report      {}", folder.join(folder::PAGE).display()));

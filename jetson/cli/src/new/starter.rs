@@ -41,6 +41,18 @@ const STARTERS: &[Starter] = &[
             files!("p1/starter" "README.md" "live_madgwick.py" "live_ukf.py" "madgwick.py" "test_madgwick.py" "test_ukf.py" "ukf.py"),
         ],
     },
+    Starter {
+        project: "p2",
+        plugin: "plugin.py",
+        parts: &[files!(
+            "p2/starter" "README.md" "planner.py" "planner_g.py" "plugin.py" "test_planner.py" "test_planner_g.py"
+        )],
+    },
+    Starter {
+        project: "p4",
+        plugin: "plugin.py",
+        parts: &[files!("p4/starter" "README.md" "gap.py" "plugin.py" "test_gap.py")],
+    },
 ];
 
 /// The projects that are not flown through a course of their own, but through the empty net.

@@ -32,11 +32,32 @@ pub(super) struct Momentum {
     pub response: Response,
 }
 
+/// What the body's centre must not pass.
+#[derive(Clone, Copy, Debug)]
+enum Limit {
+    Fence,
+    Floor,
+    Ceiling,
+    /// Of [`Fence::keep_out`].
+    Box(usize),
+}
+
+impl Limit {
+    /// Returns what a stop shall leave of the room to it: half of the margin. [m]
+    fn kept_m(self) -> f64 {
+        0.5 * if matches!(self, Self::Floor) { FLOOR_MARGIN_M } else { MARGIN_M }
+    }
+}
+
 /// Part of acceleration and jerk counted on for stopping before one face. Three faces at once
 /// (a corner) then need sqrt(3)/2 = 0.87 of the limit.
 const STOPPING_SHARE: f64 = 0.5;
 /// And where it has to change more along the face than towards it, so much at least.
 const LEAST_SHARE: f64 = 0.1;
+/// Part of it counted on where the whole stop is flown ahead, in all directions at once.
+const WHOLE_SHARE: f64 = 0.8;
+/// A vehicle that stands still is not moved by what numbers lose. [m]
+const ROUNDING_M: f64 = 1e-3;
 /// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
 /// an autopilot's integrators carry the vehicle a decimetre too far. [m]
 pub(super) const MARGIN_M: f64 = 0.2;
@@ -192,51 +213,66 @@ impl Fence {
         stopping.most_mps(wanted_mps, free_m, flown_mps, a_mps2)
     }
 
-    /// Returns `v_mps` with less along each face that the vehicle still flies towards: what it has to change along a face
-    /// is missing for stopping before it, and a plugin may ask for more of it after the vehicle was told to stop.
-    /// Half of the face's margin is left for that. Curved faces are [`Self::shorten`]'s. [m/s, world]
+    /// Returns `v_mps` with less of all that does not lead back from the nearest limit, until the vehicle stops in time.
+    ///
+    /// Each face is reckoned with by itself: what the vehicle has to change along it, and how it accelerates there already,
+    /// is missing for stopping before it, and a plugin may ask for more of it after the vehicle was told to stop. So the
+    /// whole stop is flown ahead, with all that the vehicle can; half of the margin is left for what is only reckoned.
+    /// [m/s, world]
     fn leave_for_stopping(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
-        let mut v = v_mps;
-        self.each_flat_face(p_m, |free_m, margin_m, out| {
-            let (flown_mps, a_mps2) = (vehicle.v_mps.dot(out), vehicle.a_mps2.dot(out));
-            if flown_mps <= 0.0 {
-                return;
+        let stopping = Stopping::new(vehicle.response, self.max_mps2, WHOLE_SHARE);
+        let (flown_mps, a_mps2) = (vehicle.v_mps.length(), vehicle.a_mps2.length());
+        let reach_m = stopping.bound_m(v_mps.length(), flown_mps, a_mps2);
+        // What is out of reach is not looked at again.
+        let mut near: heapless::Vec<(Limit, f64), { MAX_NO_FLY + 3 }> = heapless::Vec::new();
+        let mut nearest = (f64::INFINITY, DVec3::ZERO);
+        for limit in self.limits() {
+            let (room_m, kept_m) = (self.room_m(limit, p_m), limit.kept_m());
+            if room_m < kept_m + reach_m {
+                // Nearer than what is kept, or beyond, a stop must not lead still farther.
+                let near_m = if room_m > 0.0 { KEPT_SHARE * room_m } else { room_m };
+                let _ = near.push((limit, kept_m.min(near_m) - ROUNDING_M));
             }
-            let towards = out * v.dot(out);
-            let along = v - towards;
-            let stops = |scale: f64| {
-                let change = towards + along * scale - vehicle.v_mps;
-                let share =
-                    flown_mps / flown_mps.hypot(change.reject_from_normalized(out).length());
-                let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
-                let stopping = Stopping::new(vehicle.response, self.max_mps2, share);
-                let (command_mps, within_m) = (v.dot(out).max(0.0), free_m + 0.5 * margin_m);
-                stopping.bound_m(command_mps, flown_mps, a_mps2) <= within_m
-                    || stopping.reach_m(command_mps, flown_mps, a_mps2) <= within_m
-            };
-            v = towards + along * largest(1.0, stops);
+            if room_m < nearest.0 {
+                nearest = (room_m, self.direction_to(limit, p_m));
+            }
+        }
+        if near.is_empty() {
+            return v_mps;
+        }
+        let stays = |way_m: DVec3| {
+            near.iter().all(|&(limit, least_m)| self.room_m(limit, p_m + way_m) >= least_m)
+        };
+        let back = nearest.1 * v_mps.dot(nearest.1).min(0.0);
+        let rest = v_mps - back;
+        let share = largest(1.0, |share| {
+            stopping.stays(back + rest * share, vehicle.v_mps, vehicle.a_mps2, stays)
         });
-        v
+        back + rest * share
     }
 
-    /// Calls `each` with the distance to the margin [m], the margin [m] and the direction of every face that is flat, and
-    /// of every box.
-    fn each_flat_face(&self, p_m: DVec3, mut each: impl FnMut(f64, f64, DVec3)) {
-        if let Volume::Cuboid { center_m, half_m, rotation } = self.volume {
-            let q = rotation.conjugate() * (p_m - center_m);
-            let free_m = half_m - DVec3::splat(self.body_radius_m + MARGIN_M);
-            for (axis, face) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
-                each(free_m[axis] - q[axis], MARGIN_M, rotation * face);
-                each(free_m[axis] + q[axis], MARGIN_M, rotation * -face);
-            }
+    fn limits(&self) -> impl Iterator<Item = Limit> {
+        let ceiling = self.ceiling_m.map(|_| Limit::Ceiling);
+        let boxes = (0..self.keep_out.len()).map(Limit::Box);
+        [Limit::Fence, Limit::Floor].into_iter().chain(ceiling).chain(boxes)
+    }
+
+    /// Returns how far a limit is away from the body's centre at `p_m`; negative beyond. [m]
+    fn room_m(&self, limit: Limit, p_m: DVec3) -> f64 {
+        match limit {
+            Limit::Fence => -self.outside_m(p_m),
+            Limit::Floor => p_m.z - self.floor_m + FLOOR_MARGIN_M,
+            Limit::Ceiling => self.ceiling_m.map_or(f64::INFINITY, |ceiling_m| ceiling_m - p_m.z),
+            Limit::Box(index) => self.keep_out[index].signed_distance_m(p_m) - self.body_radius_m,
         }
-        each(p_m.z - self.floor_m, FLOOR_MARGIN_M, DVec3::NEG_Z);
-        if let Some(ceiling_m) = self.ceiling_m {
-            each(ceiling_m - MARGIN_M - p_m.z, MARGIN_M, DVec3::Z);
-        }
-        for volume in &self.keep_out {
-            let free_m = volume.signed_distance_m(p_m) - self.body_radius_m - MARGIN_M;
-            each(free_m, MARGIN_M, -volume.outward_normal(p_m));
+    }
+
+    fn direction_to(&self, limit: Limit, p_m: DVec3) -> DVec3 {
+        match limit {
+            Limit::Fence => self.volume.outward_normal(p_m),
+            Limit::Floor => DVec3::NEG_Z,
+            Limit::Ceiling => DVec3::Z,
+            Limit::Box(index) => -self.keep_out[index].outward_normal(p_m),
         }
     }
 
