@@ -251,6 +251,7 @@ impl Fence {
         back + rest * share
     }
 
+    /// Returns what there is here that the body's centre must not pass.
     fn limits(&self) -> impl Iterator<Item = Limit> {
         let ceiling = self.ceiling_m.map(|_| Limit::Ceiling);
         let boxes = (0..self.keep_out.len()).map(Limit::Box);
@@ -267,6 +268,7 @@ impl Fence {
         }
     }
 
+    /// Returns the direction from `p_m` to a limit.
     fn direction_to(&self, limit: Limit, p_m: DVec3) -> DVec3 {
         match limit {
             Limit::Fence => self.volume.outward_normal(p_m),
