@@ -57,10 +57,8 @@ def student(request, tmp_path):
     made = Student(tmp_path, Path(program).absolute())
     for line in printed("vizflyt new", "vizflyt arena check"):
         made.run(line)
-    # Whatever tests a template has, the folder's are the starter's.
-    (made.course / "my-p2/test_plugin.py").unlink(missing_ok=True)
-    for source in ("starter", *(["solution"] if request.param == "solution" else [])):
-        made.run(f"cp p2/{source}/*.py my-p2/")
+    if request.param == "solution":
+        made.run(f"cp {P2}/solution/*.py my-p2/")
     return made
 
 
