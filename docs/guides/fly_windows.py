@@ -19,13 +19,13 @@ YAW_RATE_RADPS = 2.0
 
 
 class Policy:
-    """A network of tanh layers, its input scaled; `policy.npz` holds w0, b0, w1, ..., mean, deviation, seconds."""
+    """A network of tanh layers, its input scaled; `policy.npz` holds w0, b0, w1, ..., and what is read here."""
 
     def __init__(self, values):
         count = sum(name.startswith("w") for name in values)
         self.layers = [(values[f"w{n}"], values[f"b{n}"]) for n in range(count)]
         self.mean, self.deviation = values["mean"], values["deviation"]
-        self.seconds = float(values["seconds"])
+        self.seconds, self.most_change = float(values["seconds"]), float(values["most_change"])
 
     def act(self, state):
         """Returns the action, shape (4,), from -1 to 1, for a state, shape (22,)."""
@@ -34,6 +34,13 @@ class Policy:
             x = np.tanh(weights @ x + bias)
         weights, bias = self.layers[-1]
         return np.clip(weights @ x + bias, -1.0, 1.0)
+
+
+def towards(asked, wish, most):
+    """Returns a velocity asked for, shape (3,), moved by at most `most` to the one wished for, within length 1."""
+    wish = np.asarray(wish) / max(np.linalg.norm(wish), 1.0)
+    change = wish - asked
+    return asked + change * min(most / max(np.linalg.norm(change), 1e-9), 1.0)
 
 
 def rotation(quaternion):
@@ -99,6 +106,7 @@ class Windows(vizflyt.Plugin):
         self.windows = windows_of(json.loads(os.environ["VIZFLYT_MAP"]))
         self.speed_mps = info.limits.max_speed_mps
         self.passed, self.is_flying, self.began_ns = 0, False, None
+        self.asked = np.zeros(3)
 
     def on_event(self, event):
         if event.kind == "stage":
@@ -114,10 +122,10 @@ class Windows(vizflyt.Plugin):
         self.began_ns = self.began_ns or vehicle.stamp_ns
         time_left = max(1.0 - (vehicle.stamp_ns - self.began_ns) * 1e-9 / self.policy.seconds, 0.0)
         state = state_of(vehicle, self.windows, self.passed, time_left)
-        *wish, turn = self.policy.act(state)
-        # What the gym asks of the controllers: shares of the course's speed, which no sum of them exceeds.
-        v_mps = np.array(wish) * self.speed_mps / max(np.linalg.norm(wish), 1.0)
-        return Setpoint.velocity(v_mps, axes="heading", yaw_rate=turn * YAW_RATE_RADPS)
+        action = self.policy.act(state)
+        # Shares of the course's speed, changed as slowly as the policy has learnt with.
+        self.asked = towards(self.asked, action[:3], self.policy.most_change)
+        return Setpoint.velocity(self.asked * self.speed_mps, axes="heading", yaw_rate=action[3] * YAW_RATE_RADPS)
 
 
 if __name__ == "__main__":

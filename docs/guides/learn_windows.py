@@ -13,8 +13,10 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import torch
+from fly_windows import towards
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
@@ -26,6 +28,9 @@ import vizflyt.gym
 HOW = dict(rate_hz=20, seconds=12.0)
 # Steps of 50 ms until an action counts: what is flown live is between these.
 DELAYS = (1, 2)
+# Most by which the velocity asked for changes in a step, in shares of the course's speed: 4 m/s and 6 m/s^2 make 0.075.
+# The guard lets no more through, and a policy shall not learn to count on it.
+MOST_CHANGE = 0.07
 # Nearer to a window's edge than this costs. [m]
 COMFORT_M = 0.15
 # What a plugin of a policy consists of, beside its network.
@@ -35,6 +40,18 @@ PLUGIN = ("fly_windows.py", "windows.toml")
 def careful(step):
     """The usual reward, and up to 0.3 less for a step near an edge."""
     return vizflyt.gym.default_reward(step) - 0.3 * np.clip(1.0 - step.clearance_m / COMFORT_M, 0.0, 1.0)
+
+
+class Steady(gymnasium.Wrapper):
+    """Lets a velocity change no faster than a plugin's will."""
+
+    def reset(self, **how):
+        self.asked = np.zeros(3)
+        return self.env.reset(**how)
+
+    def step(self, action):
+        self.asked = towards(self.asked, action[:3], MOST_CHANGE)
+        return self.env.step(np.append(self.asked, action[3]))
 
 
 class Ends(BaseCallback):
@@ -55,7 +72,8 @@ class Ends(BaseCallback):
 
 def learn(steps, output):
     def make(delay):
-        return lambda: Monitor(vizflyt.gym.Env("p3", courses=range(1, 9), delay=delay, reward=careful, **HOW))
+        how = dict(courses=range(1, 9), delay=delay, reward=careful, **HOW)
+        return lambda: Monitor(Steady(vizflyt.gym.Env("p3", **how)))
 
     envs = DummyVecEnv([make(delay) for delay in DELAYS * 4])
     envs.seed(1)
@@ -72,7 +90,7 @@ def learn(steps, output):
 
 def fly(policy, episodes):
     model = PPO.load(policy, device="cpu")
-    env = vizflyt.gym.Env("p3", courses=range(1001, 1011), delay=DELAYS[0], **HOW)
+    env = Steady(vizflyt.gym.Env("p3", courses=range(1001, 1011), delay=DELAYS[0], **HOW))
     scale = VecNormalize.load(f"{policy}.scale", DummyVecEnv([lambda: env]))
     ends, seconds = Counter(), []
     for seed in range(episodes):
@@ -98,7 +116,8 @@ def export(policy, folder):
         values |= {f"w{n}": layer.weight.detach().numpy(), f"b{n}": layer.bias.detach().numpy()}
     deviation = np.sqrt(scale.obs_rms.var + scale.epsilon)
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(folder / "policy.npz", mean=scale.obs_rms.mean, deviation=deviation, seconds=HOW["seconds"], **values)
+    values |= dict(mean=scale.obs_rms.mean, deviation=deviation, seconds=HOW["seconds"], most_change=MOST_CHANGE)
+    np.savez(folder / "policy.npz", **values)
     for name in PLUGIN:
         shutil.copy(Path(__file__).with_name(name), folder)
     print(f"vizflyt grade {folder / PLUGIN[0]} --project {folder / PLUGIN[1]} --first-seed 1001")
