@@ -1,6 +1,6 @@
-"""A camera that fails: plays a flight's images as YUV4MPEG2, each when it was exposed, and does what drivers do.
+"""A camera that fails: plays a flight's images as YUV4MPEG2, slower than they were exposed, and does what drivers do.
 
-Usage: feed.py FOLDER BEGIN_NS [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end
+Usage: feed.py FOLDER BEGIN_NS [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end; times of the recording
 """
 
 import pathlib
@@ -10,6 +10,10 @@ import time
 import cv2
 import numpy as np
 
+# A camera that is plugged in again starts this program: on a loaded machine that takes seconds, which the other camera
+# must still be there for.
+SLOWER = 3
+
 
 def main() -> None:
     folder, begin_ns = pathlib.Path(sys.argv[1]), int(sys.argv[2])
@@ -17,11 +21,12 @@ def main() -> None:
     lines = (folder / "stamps.csv").read_text().splitlines()[1:]
     stamps = [(name, int(stamp)) for name, stamp in (line.split(",") for line in lines)]
     first_ns = stamps[0][1] // 10**9 * 10**9
-    opened_s = (time.monotonic_ns() - begin_ns) / 1e9
+    opened_s = (time.monotonic_ns() - begin_ns) / 1e9 / SLOWER
     image, headed = None, False
     for name, stamp_ns in stamps:
         now_s = (stamp_ns - first_ns) / 1e9
-        wait_s = (begin_ns + stamp_ns - first_ns - time.monotonic_ns()) / 1e9
+        shown_ns = begin_ns + SLOWER * (stamp_ns - first_ns)
+        wait_s = (shown_ns - time.monotonic_ns()) / 1e9
         if wait_s < 0:
             continue
         time.sleep(wait_s)
@@ -37,7 +42,7 @@ def main() -> None:
             headed = True
             height, width = image.shape
             sys.stdout.buffer.write(b"YUV4MPEG2 W%d H%d F30:1 Cmono\n" % (width, height))
-        sys.stdout.buffer.write(b"FRAME XSTAMP_NS=%d\n" % (begin_ns + stamp_ns - first_ns))
+        sys.stdout.buffer.write(b"FRAME XSTAMP_NS=%d\n" % shown_ns)
         sys.stdout.buffer.write(shown.tobytes())
         sys.stdout.buffer.flush()
 
