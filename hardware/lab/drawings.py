@@ -3,19 +3,22 @@
     python3 hardware/lab/drawings.py OUT          # writes all parts into the folder OUT
     python3 hardware/lab/drawings.py OUT guard    # those whose name begins so
 
-Millimetres throughout; z is up, a part lies on z = 0 as it is printed. Nothing here was cut, printed or flown by us: what
-each number comes from stands beside it, and `drawings.md` says what to measure first. `tests/python/test_lab_book.py`
-reads the files back.
+Millimetres throughout; z is up, a part lies on z = 0. Nothing here was cut, printed or flown by us: what each number
+comes from stands beside it, and `drawings.md` says what to measure first. `tests/python/test_lab_book.py` reads the
+files back.
 
-A part is a list of pieces. A piece is a polygon of the plan (corners counter-clockwise, shape (n, 2)) with holes, and the
-heights between which it is filled. Pieces that touch share the corners on their common edge, so that every edge of the
-surface belongs to two triangles.
+A part is a list of pieces. A piece is a polygon of the plan (corners counter-clockwise, shape (n, 2)) with holes, and
+the heights between which it is filled. Pieces that touch share the corners on their common edge, so that every edge
+of the surface belongs to two triangles.
 """
 
 import math
 import struct
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +32,7 @@ STACK, MINI = 30.5, 20.0    # edge of the square of holes of autopilots and spee
 class Size:
     """One size of vehicle."""
 
-    diagonal: float       # between the shafts of opposite motors; 160: the paper's. 220: usual for propellers of 5 inches
+    diagonal: float       # between the shafts of opposite motors; 160: the paper's. 220: usual for 5 inches
     propeller: float      # diameter: 3 inches, 5 inches
     motor_circle: float   # circle on which the motor's four screws stand: usual for 15xx and 22xx motors; measure yours
     motor_screw: float
@@ -158,7 +161,7 @@ def bridge_tray() -> list:
 
 
 def cube_carrier(face: float) -> list:
-    """A cross between two opposite faces of the cube that `vizflyt tags print cube --face-mm` prints, on foam core of 5 mm."""
+    """A cross inside the cube of `vizflyt tags print cube --face-mm`, whose faces are on foam core of 5 mm."""
     reach, width, tab, deep = face / 2 - 5, 5.0, 20.0, 8.0
     side = np.array([[22, -width], [reach - deep, -width], [reach - deep, -tab], [reach, -tab],
                      [reach, tab], [reach - deep, tab], [reach - deep, width], [22, width], [22, 22]])
@@ -173,19 +176,18 @@ def leg() -> list:
     return [Piece(outline, 0, 8, [box(x - 1.5, 86.5, x + 1.5, 88.5) for x in (-6.0, 6.0)])]
 
 
-PARTS = {
-    **{f"frame-{name}": (frame, size) for name, size in SIZES.items()},
-    **{f"guard-{name}": (guard, size) for name, size in SIZES.items()},
-    "bridge-tray": (bridge_tray,),
-    "cube-carrier-170": (cube_carrier, 170.0),
-    "cube-carrier-250": (cube_carrier, 250.0),
-    "leg-90": (leg,),
+PARTS: dict[str, Callable[[], list]] = {
+    **{f"frame-{name}": partial(frame, size) for name, size in SIZES.items()},
+    **{f"guard-{name}": partial(guard, size) for name, size in SIZES.items()},
+    "bridge-tray": bridge_tray,
+    "cube-carrier-170": partial(cube_carrier, 170.0),
+    "cube-carrier-250": partial(cube_carrier, 250.0),
+    "leg-90": leg,
 }
 
 
 def part(name: str) -> list:
-    make, *args = PARTS[name]
-    return make(*args)
+    return PARTS[name]()
 
 
 # --- triangles of a polygon with holes ---
@@ -260,7 +262,8 @@ def surface(pieces) -> np.ndarray:
     sides = {}
     for t, tri in enumerate(corners):
         for k in range(3):
-            sides[(*tri[k], *tri[(k + 1) % 3])] = t
+            side = (*tri[k], *tri[(k + 1) % 3])
+            sides[side] = t
     out = []
 
     def at(p, z):
@@ -268,7 +271,7 @@ def surface(pieces) -> np.ndarray:
 
     for (x0, y0, x1, y1), t in sides.items():
         neighbour = sides.get((x1, y1, x0, y0))
-        for i, (low, high) in enumerate(zip(levels, levels[1:])):
+        for i, (low, high) in enumerate(pairwise(levels)):
             if filled[t, i] and (neighbour is None or not filled[neighbour, i]):
                 a, b = (x0, y0), (x1, y1)
                 out += [(at(a, low), at(b, low), at(b, high)), (at(a, low), at(b, high), at(a, high))]

@@ -1,9 +1,10 @@
-"""The lab book, hardware/lab: its totals are the bill's sums, its drawings have the sizes they say, its links lead somewhere."""
+"""The lab book, hardware/lab: totals are the bill's sums, drawings have the sizes they say, links lead somewhere."""
 
 import importlib.util
 import math
 import re
 import struct
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -17,9 +18,7 @@ LAB = ROOT / "hardware" / "lab"
 def load(name):
     spec = importlib.util.spec_from_file_location(name, LAB / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    # Data classes look their module up by its name.
-    import sys
-    sys.modules[name] = module
+    sys.modules[name] = module      # data classes look their module up by its name
     spec.loader.exec_module(module)
     return module
 
@@ -57,9 +56,9 @@ def volume(faces):
 
 
 def holes(faces, z):
-    """Holes that go down from the flat surface at height z: middle and least distance of its edge from there, by the edge's loops.
+    """Holes that go down from the flat surface at height z: (middle, distance of the nearest edge from there) of each.
 
-    The loop around the outside encloses all others and is left out."""
+    They are loops of edges that one triangle of the surface has; the loop around the outside is left out."""
     flat = np.abs(faces[:, :, 2] - z).max(1) < 1e-4
     up = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])[:, 2] > 0
     once = edges(faces[flat & up])
@@ -135,7 +134,9 @@ def distances(points):
     return {round(float(np.linalg.norm(a - b)), 2) for i, a in enumerate(points) for b in points[:i]}
 
 
-@pytest.mark.parametrize("name, diagonal, circle, screw, bore, plate", [("160", 160, 12, 2.2, 6, 2), ("220", 220, 16, 3.2, 8, 4)])
+@pytest.mark.parametrize("name, diagonal, circle, screw, bore, plate", [
+    ("160", 160, 12, 2.2, 6, 2), ("220", 220, 16, 3.2, 8, 4),
+])
 def test_a_frame_takes_both_stacks_and_the_motors(parts, name, diagonal, circle, screw, bore, plate):
     found = holes(read_stl(parts / f"frame-{name}.stl")[0], plate)
     bores = of_diameter(found, bore)
@@ -249,13 +250,62 @@ def test_the_papers_figures_come_out_of_its_own_numbers():
     assert round(costs.paper(mocap=5_000)) != 110
 
 
+# --- what is reckoned in the pages ---
+
+def rows(page, start):
+    """Cells of the rows of the table of a page whose head begins so."""
+    lines = (LAB / page).read_text().split("\n")
+    at = next(i for i, line in enumerate(lines) if line.startswith(start)) + 2
+    found = []
+    while lines[at].startswith("|"):
+        found.append([c.strip() for c in lines[at].strip("|").split("|")])
+        at += 1
+    return found
+
+
+def test_areas_are_those_of_the_halls():
+    for hall, net, more, floor, *_ in rows("net-and-frame.md", "| hall, m"):
+        long, wide, high = (float(v) for v in hall.split(" x "))
+        area = 2 * high * (long + wide) + long * wide
+        assert (float(net), float(more), float(floor)) == pytest.approx((area, 1.1 * area, long * wide), abs=0.06)
+
+
+def test_loads_are_those_of_the_vehicle():
+    for vehicle, case, speed, energy, force in rows("net-and-frame.md", "| vehicle | case"):
+        mass = float(vehicle.split(", ")[1].removesuffix(" kg"))
+        v = math.sqrt(2 * (6.26 - 1) * 9.81 * 3.65) if "full throttle" in case else 3.0
+        e = mass * v ** 2 / 2
+        assert (float(speed), float(energy), float(force)) == pytest.approx((v, e, 2 * e / 0.4), rel=0.01)
+
+
+def test_tuning_follows_its_rules_and_the_vehicles_table():
+    table = (ROOT / "hardware" / "vehicle.toml").read_text()
+    ours = {n: float(v) for n, v in re.findall(r'name = "(\w+)"\nvalue = ([\d.]+)', table)}
+    said = {r[0]: r for r in rows("tuning.md", "| what | rule")}
+
+    def row(start):
+        return next(r for name, r in said.items() if name.startswith(start))[2:4]
+
+    assert [float(v) for v in row("`INS_GYRO_FILTER`")] == [round(289.22 * d ** -0.838) for d in (3, 5)]
+    assert [float(v) for v in row("`ATC_RAT_RLL_FLTD`")] == [115 / 2, 75 / 2]
+    assert [float(v) for v in row("`ATC_ACC_Y_MAX`")] == [360 - 9 * d for d in (3, 5)]
+    assert [float(v) for v in row("`MOT_THST_EXPO`")] == [round(0.15686 * math.log(d) + 0.23693, 2) for d in (3, 5)]
+    roll = [(-2.613267 * d ** 3 + 343.39216 * d ** 2 - 15083.7121 * d + 235771) / 100 for d in (3, 5)]
+    assert [float(v) for v in row("`ATC_ACC_R_MAX`")] == [min(v, 1620) for v in roll]
+    for name in ("INS_GYRO_FILTER", "ATC_RAT_RLL_FLTD", "INS_ACCEL_FILTER", "ATC_ACC_R_MAX", "ATC_ACC_Y_MAX",
+                 "MOT_THST_EXPO", "ATC_RAT_RLL_P", "ATC_RAT_RLL_D"):
+        assert float(row(f"`{name}`")[0]) == ours[name], name
+    assert row("`PSC_D_ACC_P")[0] == f"{ours['PSC_D_ACC_P']}, {ours['PSC_D_ACC_I']}"
+
+
 # --- pages ---
 
 PAGES = sorted(LAB.glob("*.md"))
 
 
 def anchors(path):
-    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.+)$", path.read_text(), re.M)}
+    heads = re.findall(r"^#+ (.+)$", path.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
 @pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "hardware" / "airframe").glob("*.md"))], ids=lambda p: p.name)
@@ -278,7 +328,7 @@ def test_the_index_names_every_page_and_script():
 
 
 def test_ports_and_flow_control_are_named_alike():
-    """What `vehicle.toml` says of the two ports, the lab's pages and the guides say too; its own pages are checked in Rust."""
+    """What `vehicle.toml` says of the two ports, the lab's pages and the guides say too; others are checked in Rust."""
     table = (ROOT / "hardware" / "vehicle.toml").read_text()
     ports = dict(re.findall(r'name = "(TELEM\d)"\ndevice = "(\w+)"', table))
     rtscts = dict(re.findall(r'name = "TELEM(\d)".*?rtscts = (\d)', table, re.S))
@@ -289,13 +339,13 @@ def test_ports_and_flow_control_are_named_alike():
         for number, value in re.findall(r"BRD_SER(\d)_RTSCTS`?\s*(?:=\s*)?(\d)", page.read_text()):
             assert value == rtscts[number], page.name
             said += 1
-    assert said >= 3
+    assert said >= 2
     wires = re.findall(r"bridge'?s? [^.|\n]*TELEM(\d)", " ".join(p.read_text() for p in PAGES))
     assert set(wires) <= {"1"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_a_page_can_be_read(page):
-    lines = page.read_text().split("\n")
+    lines = re.sub(r"\]\([^)]*\)", "]", page.read_text()).split("\n")
     assert max(len(line) for line in lines if not line.startswith("|")) <= 132
-    assert len(lines) <= 130
+    assert len(lines) <= 90
