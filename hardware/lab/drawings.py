@@ -148,7 +148,7 @@ def guard(size: Size) -> list:
 
 
 def bridge_tray() -> list:
-    """Holds the XIAO between two holes of the large stack; its USB plug and antenna plug look out at the open side."""
+    """Holds the XIAO between two holes of the large stack; its USB plug looks out at the open side."""
     wide, long, wall, gap = XIAO[0] / 2 + 0.3, XIAO[1] / 2 + 0.3, 1.6, 5.5
     x, y, ear, hole = wide + wall, long + wall, STACK / 2 + 4, STACK / 2
     floor = np.array([[-wide, -long], [-gap, -long], [gap, -long], [wide, -long], [wide, long], [-wide, long]])
