@@ -182,6 +182,26 @@ def test_assignments_say_the_bounds():
             assert sum(int(row) for row in re.findall(r"^\|[^|]+\| (\d+) \|", table, re.M)) == 100, table
 
 
+@pytest.mark.parametrize("project", ["p2", "p3", "p4", "p5"])
+def test_assignments_say_the_points_that_the_program_gives(project):
+    text = (COURSE / project / "README.md").read_text()
+    file = (COURSE.parents[1] / f"render-server/scenes/projects/{project}.toml").read_text()
+    rows = {"time_s": "mean time", "clearance_m": "least clearance", "speed_mps": "greatest speed"}
+    for level in ("ug", "g"):
+        section = re.search(rf"^\[levels\.{level}\.points\]\n((?:[^\n\[]+\n)+)", file, re.M)[1]
+        table = dict(line.split(" = ", 1) for line in section.splitlines())
+        (score,) = re.findall(r"^\| `score`(?: by day)? \| (\d+) \|", text, re.M)
+        assert float(score) == float(table.pop("score")) and float(table.pop("least_score")) == 50
+        assert "from a `score` of 50 on" in " ".join(text.split())
+        assert table.keys() <= rows.keys() and table
+        for key, bounds in table.items():
+            points, *cells = re.search(rf"^\| {rows[key]}[^|]* \| (\d+) \| ([^|]+) \| ([^|]+) \|", text, re.M).groups()
+            # A bound for each level, or one for both.
+            said = [re.search(rf"(?:`{level}` )?[<>]= ([\d.]+)(?!.*`{level}`)", cell)[1] for cell in cells]
+            given = [re.search(rf"{name} = ([\d.]+)", bounds)[1] for name in ("points", "all", "half")]
+            assert [*map(float, (points, *said))] == [*map(float, given)], (level, key)
+
+
 def test_errors_are_split_into_tilt_and_heading():
     sys.path.insert(0, str(COURSE / "given"))
     sys.path.insert(0, str(COURSE))
