@@ -72,7 +72,7 @@ class Watcher:
 
 
 class Stalled:
-    """A TCP client that says hello and never reads."""
+    """A TCP client that says hello every second, as every station does, and never reads."""
 
     def __init__(self, address):
         host, port = address.split(":")
@@ -80,12 +80,21 @@ class Stalled:
         # What the kernel would read for it is kept small.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         self.socket.connect((host, int(port)))
-        mav = mavlink.MAVLink(None, srcSystem=249, srcComponent=190)
-        hello = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
-        self.socket.sendall(hello.pack(mav))
+        self.mav = mavlink.MAVLink(None, srcSystem=249, srcComponent=190)
+        self.beat = 0.0
+        self.is_dropped()
 
     def is_dropped(self):
-        """Whether the bridge has ended the connection; nothing is read."""
+        """Whether the bridge has ended the connection; nothing is read. The reset that ends it may lie
+        behind what this side's full window has refused, and the kernel passes over such a one
+        (RFC 5961): a client learns of it when it next speaks."""
+        if time.monotonic() - self.beat > 1:
+            self.beat = time.monotonic()
+            hello = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+            try:
+                self.socket.sendall(hello.pack(self.mav))
+            except ConnectionError:
+                return True
         poll = select.poll()
         poll.register(self.socket, 0)
         return bool(poll.poll(0))
