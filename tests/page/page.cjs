@@ -255,6 +255,7 @@ async function lab(browser) {
   await until(page, "camera-status", /applied/);
   await until(page, "camera-name", /200 ×/);
   // The view in space: drawn, and turned by keys. Not in flight: without a card it takes the processor.
+  const twin = page.waitForResponse((answer) => answer.url().includes("/api/splats/0"));
   await page.locator("#view-space").click();
   const canvas = page.locator("#space");
   await canvas.waitFor({ state: "visible" });
@@ -264,8 +265,15 @@ async function lab(browser) {
     assert.ok(blank < 50, "the view in space stays blank");
     await page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
   } while ((await canvas.screenshot()).length < 20_000);
+  // The twin takes the place of the boxes; without a card its first part alone.
+  assert.equal((await twin).status(), 200);
   await canvas.press("ArrowLeft");
   await shot(page, "laptop-space");
+  for (const view of ["chase", "onboard"]) {
+    await page.locator(`#view-${view}`).click();
+    assert.equal(await page.locator(`#view-${view}`).getAttribute("aria-pressed"), "true");
+    await shot(page, `laptop-${view}`);
+  }
   await page.locator("#view-top").click();
   // Pairing; and the stop button works beside the panel, by mouse and by key.
   await page.getByRole("button", { name: "pair a computer" }).click();

@@ -15,6 +15,7 @@ use crate::render::dynamic_objects::{DynamicObjects, vehicle_models};
 use crate::render::sensors::SensorSet;
 use crate::scene::{self, Scene};
 use crate::web::top_view::TopView;
+use crate::web::twin::TwinParts;
 
 /// Everything made from the scene.
 pub(super) struct LoadedScene {
@@ -31,6 +32,7 @@ pub(super) struct LoadedScene {
     /// Whether the vehicles see and touch each other.
     pub(super) neighbours: bool,
     pub(super) top_view: TopView,
+    pub(super) twin: TwinParts,
     /// What stands still.
     pub(super) field: Arc<DistanceField>,
 }
@@ -54,6 +56,7 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
         warn!("{finding}");
     }
     let top_view = TopView::render(&splats, &arena, &field);
+    let twin = TwinParts::choose(&splats, arena.geofence.min_m, arena.geofence.max_m);
     let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };
     objects.extend(vehicle_models(together));
@@ -79,6 +82,7 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
         sensor_scene,
         neighbours,
         top_view,
+        twin,
         field,
     })
 }

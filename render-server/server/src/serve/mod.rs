@@ -162,6 +162,7 @@ async fn run(
         rooms: rooms.clone(),
         previews,
         top_view: scene.top_view,
+        twin: scene.twin,
         stages: scene.arena.stages,
         boot: clock::now(),
         rates: Rates::of(rooms.flights.vehicles.len()),

@@ -63,6 +63,8 @@ pub(super) struct Arena<'a> {
     map_max_m: [f64; 2],
     obstacles: &'a Obstacles,
     stages: &'a [StageConfig],
+    /// Parts of the twin for the view in space ([`super::twin`]).
+    twin_parts: usize,
 }
 
 /// A camera: the keys of `[[cameras]]`, and what follows from them.
@@ -196,6 +198,7 @@ pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a VehicleFlight) -> Message<'
         map_max_m: page.top_view.max_m,
         obstacles: &page.top_view.obstacles,
         stages: &page.stages,
+        twin_parts: page.twin.len(),
     }))
 }
 

@@ -8,6 +8,7 @@
 //! GET /api/map     the top view: a JPEG rendered at the start
 //! GET /api/shell   what is solid, as cells, for the instructor's view in space
 //!                  ([`crate::web::top_view::shell`])
+//! GET /api/splats/N   part N of the twin itself, for the same view, SPZ ([`twin`])
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
 //! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
@@ -57,6 +58,7 @@ mod sensors;
 mod sessions;
 mod stats;
 pub mod top_view;
+pub mod twin;
 mod vehicles;
 mod view;
 mod viewer;
@@ -95,6 +97,7 @@ use crate::rate_limit::RateLimiter;
 use crate::scene::Scenes;
 use crate::stream::Rooms;
 use crate::web::top_view::TopView;
+use crate::web::twin::TwinParts;
 
 /// What the page's handlers share.
 #[derive(Debug)]
@@ -102,6 +105,7 @@ pub(crate) struct Page {
     pub(crate) rooms: Rooms,
     pub(crate) previews: Arc<Previews>,
     pub(crate) top_view: TopView,
+    pub(crate) twin: TwinParts,
     /// The course's gates, for the top view.
     pub(crate) stages: Vec<StageConfig>,
     /// When the server started; differs from start to start, so that a page notices a new server.

@@ -15,7 +15,7 @@ use super::Page;
 use super::access::{self, Takes};
 use super::{
     cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, sensors, shell,
-    stats, vehicles, watch,
+    stats, twin, vehicles, watch,
 };
 
 /// One route.
@@ -85,6 +85,7 @@ fn table() -> Vec<Route> {
         read("/api/map", Key, map),
         // Where everything stands, to the centimetre: what a course may keep from plugins.
         read("/api/shell", Everything, shell),
+        read("/api/splats/{part}", Everything, twin::splats),
         read("/ws", Vehicle, watch),
         read("/api/stats", Vehicle, stats::get),
         read("/api/vehicles", Key, vehicles::list),

@@ -13,6 +13,8 @@ use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
+use super::twin::select;
+
 /// The map's picture and obstacles.
 #[derive(Clone, Debug, Default)]
 pub struct TopView {
@@ -192,23 +194,13 @@ pub fn picture(splats: &Splats, min_m: DVec2, max_m: DVec2, ceiling_m: f64) -> O
     Some(jpeg.into())
 }
 
-/// Returns the splats whose centre is below a height.
+/// Returns the splats whose centre is below a height; seen straight down from afar the constant term is the
+/// colour.
 fn below(splats: &Splats, ceiling_m: f32) -> Splats {
-    let kept: Vec<usize> = (0..splats.len()).filter(|&k| splats.means_m[k].z < ceiling_m).collect();
-    let per_splat = splats.sh_coefficients() * 3;
-    Splats {
-        means_m: kept.iter().map(|&k| splats.means_m[k]).collect(),
-        scales_m: kept.iter().map(|&k| splats.scales_m[k]).collect(),
-        rotations: kept.iter().map(|&k| splats.rotations[k]).collect(),
-        opacities: kept.iter().map(|&k| splats.opacities[k]).collect(),
-        // Seen straight down from afar the constant term is the colour.
-        sh_degree: 0,
-        sh: kept.iter().flat_map(|&k| &splats.sh[k * per_splat..][..3]).copied().collect(),
-        antialiased: splats.antialiased,
-    }
+    let kept = (0..splats.len()).filter(|&k| splats.means_m[k].z < ceiling_m);
+    select(splats, kept)
 }
 
-/// Returns RFC 4648 base64 with padding.
 /// Returns bytes in base64 (RFC 4648), for data within a page.
 pub fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";

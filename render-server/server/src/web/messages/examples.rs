@@ -78,6 +78,7 @@ fn arenas() -> Vec<Value> {
             map_max_m: [1.0; 2],
             obstacles: &obstacles,
             stages: &stages,
+            twin_parts: 3,
         }))
     };
     let goals = [Some([0.0; 3]), None, None, None];

@@ -58,6 +58,7 @@ export type Arena = {
     width_m: number;
   }[];
   time_limit_s: number;
+  twin_parts: number;
   type: "arena";
   vehicle: string;
   vehicles: string[];

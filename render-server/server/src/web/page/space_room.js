@@ -1,8 +1,7 @@
-// What the view in space shows of one arena: floor, what is solid, fence, gates, goal, and the vehicle. World x east,
-// y north, z up; [m, world] throughout.
+// What the view in space shows of one arena: fence, gates, goal, and the vehicle; floor and what is solid, until the twin
+// is there. World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
-import { known } from "./session.js";
 import { cssColours } from "./theme.js";
 
 /** @typedef {import("./messages").Arena} Arena */
@@ -52,15 +51,18 @@ export class Room {
     this.lo = lo;
     this.size = joined(hi, lo, (h, l) => h - l);
     this.middle = vec(joined(lo, hi, (l, h) => (l + h) / 2));
+    this.fenceTurn = turn;
     this.disposed = false;
+    /** What the twin takes the place of. */
+    this.stand = new THREE.Group();
+    this.group.add(this.stand);
     this.addFloor(theme);
-    this.fenceColour = this.addFence(turn);
+    this.fenceColour = this.addFence();
     /** Each colours one stage. */
     this.stages = arena.stages.map((stage) => this.addStage(stage));
     if (arena.goal_m) this.addGoal(arena.goal_m);
     this.vehicle = this.addVehicle();
     this.shadow = this.addShadow();
-    this.addSolid();
   }
 
   /** @param {string | undefined} theme */
@@ -70,7 +72,7 @@ export class Room {
     const material = new THREE.MeshBasicMaterial({ color: this.colour("--floor"), side: THREE.DoubleSide });
     const floor = new THREE.Mesh(geometry, material);
     floor.position.set((min[0] + max[0]) / 2, (min[1] + max[1]) / 2, this.floorHeight() - 0.01);
-    this.group.add(floor);
+    this.stand.add(floor);
     new THREE.TextureLoader().load(`/api/map?${boot}`, (texture) => {
       texture.colorSpace = THREE.SRGBColorSpace;
       material.map = texture;
@@ -83,13 +85,13 @@ export class Room {
     return Math.max(0, this.lo[2]);
   }
 
-  /** Adds the fence; returns its colour. @param {THREE.Quaternion} turn */
-  addFence(turn) {
+  /** Adds the fence; returns its colour. */
+  addFence() {
     const edges = new THREE.EdgesGeometry(new THREE.BoxGeometry(...this.size));
     const material = new THREE.LineBasicMaterial({ color: this.colour("--warn") });
     const fence = new THREE.LineSegments(edges, material);
     fence.position.copy(this.middle);
-    fence.quaternion.copy(turn);
+    fence.quaternion.copy(this.fenceTurn);
     this.group.add(fence);
     return material.color;
   }
@@ -166,10 +168,8 @@ export class Room {
     return shadow;
   }
 
-  /** Fetches what is solid, and adds it as boxes coloured by height. The server gives it to the instructor alone. */
+  /** Fetches what is solid, and adds it as boxes coloured by height. */
   async addSolid() {
-    await known;
-    if (document.body.dataset.role !== "instructor") return;
     try {
       const answer = await fetch(`/api/shell?${this.arena.boot}`);
       if (!answer.ok) return;
@@ -188,7 +188,7 @@ export class Room {
         mesh.setMatrixAt(k, at);
         mesh.setColorAt(k, colour.lerpColors(low, high, Math.min(1, Math.max(0, (z - this.lo[2]) / height))));
       }
-      this.group.add(mesh);
+      this.stand.add(mesh);
     } catch {
       // Without it the rest is drawn all the same.
     }

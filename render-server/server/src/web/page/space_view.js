@@ -1,9 +1,11 @@
-// The view in space: a room, and in it what moves: objects, the track, the vehicle. Drag turns, right drag or two fingers
-// shift, the wheel zooms; with the keyboard: arrows turn, + and - zoom, 0 goes back, F follows the vehicle. World x east,
-// y north, z up; [m, world] throughout.
+// The view in space: a room, its twin, and in it what moves: objects, the track, the vehicle. Drag turns, right drag or two
+// fingers shift, the wheel zooms; with the keyboard: arrows turn, + and - zoom, 0 goes back, F follows the vehicle. Or the
+// camera goes behind the vehicle ("chase"), or flies in it ("onboard"). World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
+import { known } from "./session.js";
 import { joined, Room, vec } from "./space_room.js";
+import { Twin } from "./space_twin.js";
 import { speedColour } from "./top_view.js";
 
 /** @typedef {import("./messages").Arena} Arena */
@@ -12,8 +14,16 @@ import { speedColour } from "./top_view.js";
 
 /** The most points of the track; as many as the top view keeps. */
 const MAX_POINTS = 3000;
-/** Thirty images a second are smooth, and leave a machine without a card to the flight. [ms] */
+/** Without a card thirty images a second at most, and less where one takes long: the processor is the flight's. [ms] */
 const EVERY_MS = 1000 / 31;
+/** Without a card the page rests so much longer than it draws. */
+const REST = 3;
+/** Behind the vehicle, and above it. [m] */
+const CHASE_BACK_M = 1.8, CHASE_UP_M = 0.7;
+/** Height of the picture: from afar, and as wide as cameras of vehicles see. [deg] */
+const FREE_FOV_DEG = 50, ONBOARD_FOV_DEG = 74;
+
+/** @typedef {"free" | "chase" | "onboard"} Mode */
 
 /** Returns whether a graphics card draws; in software it would take the processor from the flight. */
 export function hasCard() {
@@ -31,13 +41,15 @@ export class SpaceView {
    * @param {HTMLCanvasElement} canvas in the element whose size it takes
    * @param {Arena} arena
    * @param {string | undefined} theme
+   * @param {boolean} card whether a graphics card draws
    */
-  constructor(canvas, arena, theme) {
+  constructor(canvas, arena, theme, card) {
     this.canvas = canvas;
+    this.card = card;
     this.parent = /** @type {HTMLElement} */ (canvas.parentElement);
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(50, 1, 0.02, 500);
+    this.camera = new THREE.PerspectiveCamera(FREE_FOV_DEG, 1, 0.02, 500);
     this.camera.up.set(0, 0, 1);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0x445566, 2.2));
     const sun = new THREE.DirectionalLight(0xffffff, 1.6);
@@ -51,6 +63,11 @@ export class SpaceView {
     /** The part of the track that is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
     this.drawnTrack = { length: -1, end: undefined };
     this.drawn_ms = -Infinity;
+    this.rest_ms = card ? 0 : EVERY_MS;
+    /** @type {Mode} */
+    this.mode = "free";
+    /** @type {Twin | null} */
+    this.twin = null;
     /** Where the camera looks. */
     this.target = new THREE.Vector3();
     /** From where: angles about z and above the floor [rad], share of the distance at which the room fits. */
@@ -59,6 +76,7 @@ export class SpaceView {
     this.follows = false;
     this.home();
     this.listen();
+    this.addTwin();
     new ResizeObserver(() => this.resize()).observe(this.parent);
   }
 
@@ -67,13 +85,33 @@ export class SpaceView {
    * @param {string | undefined} theme
    */
   setArena(arena, theme) {
+    const isOther = arena.boot !== this.room.arena.boot;
     this.room.dispose();
     this.room = new Room(arena, theme);
     this.scene.add(this.room.group);
+    if (isOther) this.addTwin();
+    else this.room.stand.visible = !this.twin?.isShown;
     this.moving.clear();
     this.drawnTrack.length = -1;
     this.home();
     this.resize();
+  }
+
+  /** Fetches the twin, and until it is there what is solid, as boxes; the server gives both to the instructor alone. */
+  async addTwin() {
+    this.twin?.mesh.removeFromParent();
+    this.twin?.dispose();
+    this.twin = null;
+    await known;
+    if (document.body.dataset.role !== "instructor") return;
+    const { room } = this;
+    room.addSolid();
+    const parts = this.card ? room.arena.twin_parts : Math.min(1, room.arena.twin_parts);
+    if (!parts) return;
+    this.twin = new Twin(room.arena, parts, () => {
+      this.room.stand.visible = false;
+    });
+    this.scene.add(this.twin.mesh);
   }
 
   // ---- what moves ------------------------------------------------------------------------
@@ -132,7 +170,7 @@ export class SpaceView {
 
   /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0] & { track: TrackPoint[] }} shown */
   draw({ pose, now_ms, crashed, track, objects, passed }) {
-    if (!this.canvas.clientWidth || now_ms - this.drawn_ms < EVERY_MS) return;
+    if (!this.canvas.clientWidth || now_ms - this.drawn_ms < this.rest_ms) return;
     this.drawn_ms = now_ms;
     const { room } = this;
     room.fenceColour.copy(room.colour(crashed ? "--bad" : "--warn"));
@@ -143,8 +181,21 @@ export class SpaceView {
       paint(room.colour(passed.has(k) ? "--good" : k === next ? "--accent" : "--muted"));
     room.vehicle.visible = room.shadow.visible = pose != null;
     if (pose) this.showVehicle(pose, now_ms);
-    this.placeCamera();
+    room.vehicle.visible &&= this.mode !== "onboard";
+    if (this.mode === "free" || !pose) this.placeCamera();
+    else this.placeWithVehicle();
+    this.twin?.place(this.camera, this.renderer.getDrawingBufferSize(new THREE.Vector2()), room, this.mode === "free");
     this.renderer.render(this.scene, this.camera);
+    if (!this.card) this.rest(now_ms);
+  }
+
+  /** Lets the processor rest, in proportion to what the picture took. @param {number} began_ms */
+  rest(began_ms) {
+    const gl = this.renderer.getContext();
+    // Reading waits until it is drawn.
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    const took_ms = performance.now() - began_ms;
+    this.rest_ms = Math.max(EVERY_MS, (1 + REST) * took_ms);
   }
 
   // ---- the camera ------------------------------------------------------------------------
@@ -157,7 +208,37 @@ export class SpaceView {
     this.follows = false;
   }
 
+  /** Where the camera is: free, behind the vehicle, in it. @param {Mode} mode */
+  setMode(mode) {
+    this.mode = mode;
+    this.drawn_ms = -Infinity;
+  }
+
+  /** Places the camera behind the vehicle, or in it. */
+  placeWithVehicle() {
+    const { camera, room: { vehicle } } = this;
+    const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(vehicle.quaternion);
+    const isIn = this.mode === "onboard";
+    camera.up.set(0, 0, 1);
+    if (isIn) {
+      camera.up.applyQuaternion(vehicle.quaternion);
+      camera.position.copy(vehicle.position);
+    } else {
+      ahead.setZ(0).normalize();
+      const behind = vehicle.position.clone().addScaledVector(ahead, -CHASE_BACK_M);
+      behind.z += CHASE_UP_M;
+      // The first picture is there at once; then it follows as if on a spring.
+      camera.position.lerp(behind, camera.position.distanceTo(behind) > 3 * CHASE_BACK_M ? 1 : 0.12);
+    }
+    camera.lookAt(isIn ? camera.position.clone().add(ahead) : vehicle.position.clone().addScaledVector(ahead, 0.8));
+    camera.fov = isIn ? ONBOARD_FOV_DEG : FREE_FOV_DEG;
+    camera.far = Math.hypot(...this.room.size) * 4 + 50;
+    camera.updateProjectionMatrix();
+  }
+
   placeCamera() {
+    this.camera.up.set(0, 0, 1);
+    this.camera.fov = FREE_FOV_DEG;
     const [x, y, z] = this.room.size, half = Math.tan((this.camera.fov * Math.PI) / 360);
     // So far that the room fits, in width or in height.
     const fit = Math.max(Math.hypot(x, y) / 2 / half / this.camera.aspect, (y + z) / 2 / half) * 0.95;

@@ -17,13 +17,15 @@ const spaceCanvas = make("canvas", {
   ariaLabel: "view in space; arrows turn, plus and minus zoom, 0 goes back, F follows",
 });
 const stages = make("ol", { id: "stages", ariaLabel: "stages of the course", hidden: true });
-const topButton = make("button", { id: "view-top", type: "button", textContent: "top" });
-const spaceButton = make("button", { id: "view-space", type: "button", textContent: "space" });
+/** What there is to choose from: the map, and the view in space from somewhere. @typedef {"top" | "space" | "chase" | "onboard"} View */
+/** @type {View[]} */
+const VIEWS = ["top", "space", "chase", "onboard"];
+const buttons = VIEWS.map((view) => make("button", { id: `view-${view}`, type: "button", textContent: view }));
 const fastest = make("span", { id: "speed-top", textContent: "m/s" });
 const hint = make("p", { id: "hint", className: "hint", hidden: true });
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
   top, spaceCanvas, stages,
-  make("div", { className: "views", role: "group", ariaLabel: "view" }, topButton, spaceButton),
+  make("div", { className: "views", role: "group", ariaLabel: "view" }, ...buttons),
   make("div", { className: "legend" },
     make("span", { className: "speed" }, make("span", { textContent: "0" }), make("i"), fastest)),
   hint,
@@ -40,41 +42,42 @@ let pose = null;
 let state = null;
 /** Indices of the stages passed in this flight. @type {Set<number>} */
 const passed = new Set();
-let boot = "", flown = false, inSpace = false;
+let boot = "", flown = false;
+/** @type {View} */
+let view = "top";
 
-/** Shows the view in space, or the top view. @param {boolean} wanted */
+/** Shows a view. @param {View} wanted */
 async function pickView(wanted) {
-  inSpace = wanted;
-  if (inSpace && arena && !spaceView) {
+  view = wanted;
+  if (view !== "top" && arena && !spaceView) {
     try {
-      const { SpaceView } = await import("../space_view.js");
-      spaceView ??= new SpaceView(spaceCanvas, arena, theme());
+      const { SpaceView, hasCard } = await import("../space_view.js");
+      spaceView ??= new SpaceView(spaceCanvas, arena, theme(), hasCard());
     } catch {
-      inSpace = false;
-      spaceButton.disabled = true;
-      spaceButton.title = "this browser has no WebGL 2";
+      view = "top";
+      for (const button of buttons.slice(1)) {
+        button.disabled = true;
+        button.title = "this browser has no WebGL 2";
+      }
     }
   }
-  top.hidden = inSpace;
-  spaceCanvas.hidden = !inSpace;
-  topButton.ariaPressed = String(!inSpace);
-  spaceButton.ariaPressed = String(inSpace);
-  (inSpace ? spaceView : topView)?.resize();
+  spaceView?.setMode(view === "chase" || view === "onboard" ? view : "free");
+  top.hidden = view !== "top";
+  spaceCanvas.hidden = view === "top";
+  for (const [k, button] of buttons.entries()) button.ariaPressed = String(VIEWS[k] === view);
+  (view === "top" ? topView : spaceView)?.resize();
 }
 
 /** What was chosen last; else space, where a graphics card draws it. */
 async function firstView() {
-  const chosen = localStorage.getItem("view");
-  pickView(chosen ? chosen === "space" : (await import("../space_view.js")).hasCard());
+  const chosen = VIEWS.find((name) => name === localStorage.getItem("view"));
+  pickView(chosen ?? ((await import("../space_view.js")).hasCard() ? "space" : "top"));
 }
-topButton.addEventListener("click", () => {
-  localStorage.setItem("view", "top");
-  pickView(false);
-});
-spaceButton.addEventListener("click", () => {
-  localStorage.setItem("view", "space");
-  pickView(true);
-});
+for (const [k, button] of buttons.entries())
+  button.addEventListener("click", () => {
+    localStorage.setItem("view", VIEWS[k]);
+    pickView(VIEWS[k]);
+  });
 firstView();
 
 /** Shows a light for each stage of the course: passed, the next one, those after it. */
@@ -114,7 +117,7 @@ export const arenaView = {
     if (arena.boot !== boot) [boot, flown] = [arena.boot, false];
     topView.setArena(arena);
     spaceView?.setArena(arena, theme());
-    pickView(inSpace);
+    pickView(view);
     showStages();
     setText(fastest, `${Math.max(1, arena.max_speed_mps)} m/s`);
   },
