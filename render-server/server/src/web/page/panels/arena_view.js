@@ -1,6 +1,8 @@
 // Where the vehicle flies: the arena from above or in space, the stages of its course, and what the page waits for.
 
 import { make, setText } from "../dom.js";
+import { FlightRecording } from "../flight_recording.js";
+import { ReplayBar } from "../replay_bar.js";
 import { theme } from "../theme.js";
 import { TopView } from "../top_view.js";
 
@@ -22,13 +24,15 @@ const stages = make("ol", { id: "stages", ariaLabel: "stages of the course", hid
 const VIEWS = ["top", "space", "chase", "onboard"];
 const buttons = VIEWS.map((view) => make("button", { id: `view-${view}`, type: "button", textContent: view }));
 const fastest = make("span", { id: "speed-top", textContent: "m/s" });
+const recording = new FlightRecording();
+const replay = new ReplayBar(recording);
 const hint = make("p", { id: "hint", className: "hint", hidden: true });
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
   top, spaceCanvas, stages,
   make("div", { className: "views", role: "group", ariaLabel: "view" }, ...buttons),
   make("div", { className: "legend" },
     make("span", { className: "speed" }, make("span", { textContent: "0" }), make("i"), fastest)),
-  hint,
+  replay.element, hint,
 );
 
 const topView = new TopView(top);
@@ -80,14 +84,17 @@ for (const [k, button] of buttons.entries())
   });
 firstView();
 
+/** Those whose lights are shown: of now, or of a moment that is looked at again. */
+let lit = passed;
+
 /** Shows a light for each stage of the course: passed, the next one, those after it. */
 function showStages() {
   const course = arena?.stages ?? [];
-  const next = course.findIndex((_, k) => !passed.has(k));
+  const next = course.findIndex((_, k) => !lit.has(k));
   stages.hidden = !course.length;
   stages.replaceChildren(
     ...course.map(({ name }, k) => {
-      const status = passed.has(k) ? "passed" : k === next ? "next" : "to come";
+      const status = lit.has(k) ? "passed" : k === next ? "next" : "to come";
       const light = make("li", { textContent: name, ariaLabel: `${name}: ${status}` });
       light.dataset.light = status;
       if (k === next) light.ariaCurrent = "step";
@@ -114,7 +121,10 @@ export const arenaView = {
   onArena(newest) {
     arena = newest;
     passed.clear();
-    if (arena.boot !== boot) [boot, flown] = [arena.boot, false];
+    if (arena.boot !== boot) {
+      [boot, flown] = [arena.boot, false];
+      recording.clear();
+    }
     topView.setArena(arena);
     spaceView?.setArena(arena, theme());
     pickView(view);
@@ -136,8 +146,11 @@ export const arenaView = {
       // A new flight on the same server.
       topView.track = [];
       passed.clear();
+      recording.clear();
       showStages();
     }
+    recording.add(state, passed);
+    replay.offer(flown && (state.landed || state.outcome != null));
     flown = state.flight_s != null;
     if (state.pose) {
       const fresh = state.pose.age_s < FRESH_S;
@@ -147,10 +160,21 @@ export const arenaView = {
     showHint(hintOf(state));
   },
   onFrame(now_ms) {
-    const crashed = ["collided", "geofence"].includes(state?.outcome?.outcome ?? "");
-    const objects = state?.objects ?? [];
-    if (spaceCanvas.hidden) topView.draw({ pose, now_ms, crashed, objects, passed });
-    else spaceView?.draw({ pose, now_ms, crashed, objects, passed, track: topView.track });
+    const moment = replay.moment(now_ms);
+    const isOver = !moment || moment.flight_s >= recording.end_s;
+    const shown = {
+      now_ms,
+      crashed: isOver && ["collided", "geofence"].includes(state?.outcome?.outcome ?? ""),
+      pose: moment ? { ...moment.pose, age_s: 0, received_ms: now_ms } : pose,
+      objects: (moment ?? state)?.objects ?? [],
+      passed: moment?.passed ?? passed,
+    };
+    if (shown.passed !== lit) {
+      lit = shown.passed;
+      showStages();
+    }
+    if (spaceCanvas.hidden) topView.draw(shown);
+    else spaceView?.draw({ ...shown, track: topView.track });
   },
   onTheme() {
     topView.restyle();
