@@ -153,9 +153,22 @@ async function flight(browser) {
   await until(page, "announcement", /lands/);
   await until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/);
   await shot(page, "laptop-stopped");
+  // It is looked at again, also when the program has ended.
+  assert.equal(await demo.ended, 1, "a stopped flight is no success");
+  await page.locator("#replay-at").fill("1");
+  assert.match(await text(page, "replay-time"), /^0:01\.0 of \d:\d\d\.\d$/);
+  await page.locator("#replay-play").click();
+  assert.equal(await text(page, "replay-play"), "pause");
+  await page.waitForFunction(() => Number(document.getElementById("replay-at").value) > 1.2);
+  for (const [size, [width, height]] of Object.entries(SIZES)) {
+    await page.setViewportSize({ width, height });
+    await checkAccess(page, size);
+    await shot(page, `${size}-replay`);
+  }
+  await page.locator("#replay-now").click();
+  assert.ok(await page.locator("#replay-now").isHidden());
   assert.deepEqual(page.faults, []);
   await page.context().close();
-  assert.equal(await demo.ended, 1, "a stopped flight is no success");
   assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
 }
 
