@@ -62,6 +62,9 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     assert status == 0 and "2 of 4 teams have a grade" in said, said
     rows = {row["Team"]: row for row in csv.DictReader((tmp_path / "grades/grades.csv").read_text().splitlines())}
     assert rows["red"]["members"] == "Ann, Bo" and rows["red"]["score"] == "0.0" and rows["red"]["flights"] == "1", rows
+    # Points by the project's own table; nobody who has no grade has any.
+    assert float(rows["red"]["points"]) == 0 and float(rows["red"]["points_of"]) > 0, rows
+    assert rows["up"]["points"] == "", rows
     assert "leads out" in rows["up"]["note"] and "nothing handed in" in rows["gone"]["note"], rows
     assert not (tmp_path / "up.py").exists() and not (tmp_path / "grades/up.py").exists()
     seeds = set()

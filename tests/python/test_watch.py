@@ -105,6 +105,32 @@ def test_a_round_that_is_overtaken_leaves_nothing(tmp_path, program):
     assert not list(tmp_path.glob(".attempt-*"))
 
 
+def test_an_attempt_is_compared_with_the_one_that_is_named(tmp_path, program):
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+
+    def grade(seeds, *options):
+        done = subprocess.run(
+            [program, "grade", "plugin.py", "--project", "p3", "--seeds", str(seeds), "--log", "none", *options],
+            cwd=tmp_path, env=os.environ | {"PATH": path, "XDG_CONFIG_HOME": str(tmp_path / "config")},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
+        )
+        return done.returncode, done.stdout
+
+    tmp_path.chmod(0o755)
+    (tmp_path / "plugin.py").write_text(PLUGIN.format(images=5))
+    status, said = grade(1, "--report", "first")
+    assert status == 0 and "since the last attempt" not in said, said
+    (tmp_path / "plugin.py").write_text(PLUGIN.format(images=40))
+    status, said = grade(1, "--since", "first")
+    assert status == 0 and "since the last attempt" in said and "finished 0 -> 0 of 1" in said, said
+    # Another project's flights are no earlier attempt, and neither is a folder without a grade.
+    status, said = grade(1, "--since", "first", "--project", "p4")
+    assert status == 1 and "the earlier attempt is of project p3" in said, said
+    (tmp_path / "empty").mkdir()
+    status, said = grade(1, "--since", "empty")
+    assert status == 1 and "--since" in said, said
+
+
 def test_what_it_does_not_go_with_is_refused(tmp_path, program):
     done = subprocess.run(
         [program, "grade", "plugin.py", "--watch", "--json"], cwd=tmp_path, stdout=subprocess.PIPE,
