@@ -21,6 +21,7 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
         ("/top_view.js", "text/javascript"),
         ("/icon.svg", "image/svg+xml"),
         ("/api/map", "image/jpeg"),
+        ("/api/splats/0", "application/octet-stream"),
     ] {
         let (status, answer) = http(server.http, &format!("GET {path} HTTP/1.1"));
         assert_eq!(status, 200, "{path}");
@@ -33,6 +34,8 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
         assert!(!links.contains("http://") && !links.contains("https://"), "{path}");
     }
     assert_eq!(http(server.http, "GET /nothing HTTP/1.1").0, 404);
+    let (status, none) = http(server.http, "GET /api/splats/9 HTTP/1.1");
+    assert!(status == 404 && none.contains("the twin has 1 parts"), "{status} {none}");
     assert_eq!(http(server.http, "GET /../Cargo.toml HTTP/1.1").0, 404);
 }
 
