@@ -89,8 +89,9 @@ def test_the_starter_finds_by_the_same_network(tmp_path):
     """The network that a student trains has the form that the starter's plugin reads: the reference's is one."""
     folder = handed_in(tmp_path / "my-p3", "starter")
     shutil.copy(PROJECT / "solution/windows.onnx", folder)
+    ask = "import numpy as np, plugin; print(plugin.Network()(np.zeros((240, 320, 3), np.uint8)).shape)"
     said = subprocess.run(
-        [sys.executable, "-c", "import numpy as np, plugin; print(plugin.Network()(np.zeros((240, 320, 3), np.uint8)).shape)"],
+        [sys.executable, "-c", ask],
         capture_output=True, text=True, timeout=100, cwd=folder,
     )
     assert said.stdout == "(120, 160)\n", said

@@ -19,7 +19,7 @@ import vizflyt
 from vizflyt import Setpoint
 
 # Image the network takes, and how far its masks reach beyond a frame's edges, in its pixels.
-COLUMNS, ROWS, EXCESS_PX = 160, 120, 1.2
+COLUMNS, ROWS, EXCESS_PX = 160, 120, 1.3
 # Of a mask with fewer pixels, at twice that size, nothing is taken.
 LEAST_PX = 150
 # Corners that are further off those of any window are of something else. [px]

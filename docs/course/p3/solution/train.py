@@ -144,7 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("train", type=pathlib.Path)
     parser.add_argument("others", type=pathlib.Path, nargs="*", help="other sets, to measure with")
-    parser.add_argument("--epochs", type=int, default=30)
+    parser.add_argument("--epochs", type=int, default=16)
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("-o", "--output", type=pathlib.Path, default=pathlib.Path("windows.onnx"))
     args = parser.parse_args()
@@ -172,7 +172,7 @@ def main() -> None:
             f"  {name} IoU " + " ".join(f"{share:.3f}" for share in score(network, *others[name])) for name in others
         )
         print(f"epoch {epoch + 1:2}  loss {total / batches:.3f}{figures}  {time.monotonic() - start:.0f} s", flush=True)
-        if (epoch + 1) % 5 == 0 or epoch + 1 == args.epochs:
+        if (epoch + 1) % 4 == 0 or epoch + 1 == args.epochs:
             write(network, args.output, *images.shape[1:3])
 
 

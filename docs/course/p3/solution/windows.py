@@ -273,6 +273,7 @@ def _solve(
 
 
 def _wrapped(angle_rad: float) -> float:
+    """Returns an angle within half a turn of 0. [rad]"""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
