@@ -49,6 +49,11 @@ const STARTERS: &[Starter] = &[
         )],
     },
     Starter {
+        project: "p3",
+        plugin: "plugin.py",
+        parts: &[files!("p3/starter" "README.md" "plugin.py" "test_windows.py" "windows.py")],
+    },
+    Starter {
         project: "p4",
         plugin: "plugin.py",
         parts: &[files!("p4/starter" "README.md" "gap.py" "plugin.py" "test_gap.py")],
