@@ -87,20 +87,24 @@ CORNERS, OUTWARDS, KINDS = frame_samples()
 UPRIGHT = abs(CORNERS[:, 0]) == 1.0
 
 
-def weights(size_m: F64, striped: bool) -> F64:
-    """Returns what colour at each place counts for, (K, N), of frames with these openings, (K, 2) [m].
+def weights(coloured: Mask) -> F64:
+    """Returns what colour at each place counts for, (..., N): what has to be `coloured` sums up to one, what has not to
+    minus one."""
+    positive = coloured / coloured.sum(axis=-1, keepdims=True)
+    return positive - ~coloured / (~coloured).sum(axis=-1, keepdims=True)
 
-    What has to be coloured sums up to one, what has not to minus one. `striped` counts arrowheads as not coloured.
-    """
-    coloured = np.broadcast_to(KINDS == 1.0, (len(size_m), len(KINDS)))
-    if striped:
-        # Arrowheads point to the middle of each bar.
-        at_m = abs(CORNERS * size_m[:, None] / 2 + OUTWARDS)
-        along = np.where(UPRIGHT, at_m[..., 1], at_m[..., 0])
-        out = np.where(UPRIGHT, abs(OUTWARDS[:, 0]), abs(OUTWARDS[:, 1]))
-        coloured = coloured & (np.floor((along + abs(out - BAR_M / 2)) / STRIPE_M) % 3 != 0)
-    positive = coloured / coloured.sum(axis=1, keepdims=True)
-    return positive - ~coloured / (~coloured).sum(axis=1, keepdims=True)
+
+ON_BARS = weights(KINDS == 1.0)
+
+
+def striped_weights(size_m: F64) -> F64:
+    """Returns the same for frames with these openings, (K, 2) [m], whose arrowheads count as not coloured, (K, N)."""
+    # Arrowheads point to the middle of each bar.
+    at_m = abs(CORNERS * size_m[:, None] / 2 + OUTWARDS)
+    along = np.where(UPRIGHT, at_m[..., 1], at_m[..., 0])
+    out = np.where(UPRIGHT, abs(OUTWARDS[:, 0]), abs(OUTWARDS[:, 1]))
+    in_stripe = np.floor((along + abs(out - BAR_M / 2)) / STRIPE_M) % 3 != 0
+    return weights((KINDS == 1.0) & in_stripe)
 
 
 def scores(mask: Mask, cam_from_level: F64, focal_px: float, candidates: F64, striped: bool) -> F64:
@@ -122,7 +126,7 @@ def scores(mask: Mask, cam_from_level: F64, focal_px: float, candidates: F64, st
     v = (focal_px * seen[..., 1] / ahead + rows / 2).astype(int)
     inside = (seen[..., 2] > 0.05) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     coloured = mask[v.clip(0, rows - 1), u.clip(0, columns - 1)] & inside
-    return (coloured * weights(candidates[:, 4:6], striped)).sum(axis=1)
+    return (coloured * striped_weights(candidates[:, 4:6])).sum(axis=1) if striped else coloured @ ON_BARS
 
 
 def groups(mask: Mask) -> list[Mask]:
