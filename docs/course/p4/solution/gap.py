@@ -257,11 +257,14 @@ class Views:
             self.others[index] = (shifted(image, right_px, down_px), step)
 
 
-def by_motion(images: Sequence[F64], right_m: Sequence[float], focal_px: float) -> Gap | None:
+def by_motion(
+    images: Sequence[F64], right_m: Sequence[float], focal_px: float, margin: float = 0.0
+) -> Gap | None:
     """Finds the gap in grey images (H, W) that level cameras of one heading have taken beside each other.
 
     `right_m` says how far to the right each was taken [m]. The gap's place is that in the first image. None if there is
-    none.
+    none. A place counts as behind if that explains the images better by `margin` [grey levels]: of one colour alone,
+    the many distances behind fit a little better by chance.
     """
     views = Views(images, right_m, focal_px)
     rows, columns = images[0].shape
@@ -284,7 +287,7 @@ def by_motion(images: Sequence[F64], right_m: Sequence[float], focal_px: float) 
     behind = np.min([views.cost(per_m, FINE_PX) for per_m in np.linspace(0.0, BEHIND * wall_per_m, count)], axis=0)
     on_it = np.min([views.cost(wall_per_m * share, FINE_PX) for share in (0.98, 1.0, 1.02)], axis=0)
     # One colour alone fits everywhere: there the neighbourhood decides.
-    free = without_specks(box_mean(behind - on_it, WIDE_PX) < 0)
+    free = without_specks(box_mean(behind - on_it, WIDE_PX) < -margin)
     found = greatest_circle(surrounded(free, ~free))
     if found is None:
         return None

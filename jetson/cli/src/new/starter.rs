@@ -58,6 +58,13 @@ const STARTERS: &[Starter] = &[
         plugin: "plugin.py",
         parts: &[files!("p4/starter" "README.md" "gap.py" "plugin.py" "test_gap.py")],
     },
+    Starter {
+        project: "p5",
+        plugin: "plugin.py",
+        parts: &[files!(
+            "p5/starter" "README.md" "hand.py" "plugin.py" "score.py" "states.py" "test_hand.py" "test_score.py" "test_states.py"
+        )],
+    },
 ];
 
 /// The projects that are not flown through a course of their own, but through the empty net.
