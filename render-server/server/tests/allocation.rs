@@ -133,8 +133,10 @@ impl Rasterizer for Everyone {
 
 /// Of every pixel, display colours.
 const RENDERED: f32 = 0.3;
-const WARM_UP: u64 = 60;
-const TICKS: u64 = 360;
+/// Which image's buffers a camera is given follows from when it is due, so from the machine's clock: in so many ticks
+/// each has been with each camera.
+const WARM_UP: u64 = 600;
+const TICKS: u64 = 900;
 
 #[test]
 fn drawing_allocates_nothing_once_it_is_warm() {
