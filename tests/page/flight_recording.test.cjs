@@ -25,6 +25,7 @@ test("what is no state of a flight is left out", async () => {
   recording.add(state(1, 5), new Set());
   recording.add(state(0.9, 5), new Set());
   assert.equal(recording.moments.length, 1);
+  assert.deepEqual([recording.start_s, recording.end_s], [1, 1]);
   recording.clear();
   assert.equal(recording.at(1), null);
 });

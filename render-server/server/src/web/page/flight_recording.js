@@ -42,6 +42,11 @@ export class FlightRecording {
     this.moments = [];
   }
 
+  /** When it begins: later than take-off, if the page was opened in flight. [s since take-off] */
+  get start_s() {
+    return this.moments[0]?.flight_s ?? 0;
+  }
+
   /** When it ends. [s since take-off] */
   get end_s() {
     return this.moments.at(-1)?.flight_s ?? 0;

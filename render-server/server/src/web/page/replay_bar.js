@@ -2,7 +2,7 @@
 
 import { clockText, make, makeButton, setText } from "./dom.js";
 
-/** A flight that is shorter is not looked at again. [s] */
+/** What was watched for less is not looked at again. [s] */
 const SHORTEST_S = 1;
 /** What an arrow key moves by, and how finely the bar is dragged. [s] */
 const STEP_S = 0.02;
@@ -16,7 +16,7 @@ export class ReplayBar {
     this.plays = false;
     this.painted_ms = 0;
     this.play = makeButton("replay", { id: "replay-play" });
-    this.range = make("input", { id: "replay-at", type: "range", min: "0", step: String(STEP_S), ariaLabel: "moment of the flight" });
+    this.range = make("input", { id: "replay-at", type: "range", step: String(STEP_S), ariaLabel: "moment of the flight" });
     this.time = make("output", { id: "replay-time" });
     this.now = makeButton("now", { id: "replay-now", hidden: true, title: "back to what is now" });
     this.element = make("div", { className: "replay", role: "group", ariaLabel: "replay of the flight", hidden: true },
@@ -31,7 +31,8 @@ export class ReplayBar {
 
   /** Offers the replay, or takes it away; that ends one that runs. @param {boolean} offered */
   offer(offered) {
-    const hidden = !offered || this.recording.end_s < SHORTEST_S;
+    const { start_s, end_s } = this.recording;
+    const hidden = !offered || end_s - start_s < SHORTEST_S;
     if (hidden === this.element.hidden) return;
     this.element.hidden = hidden;
     this.close();
@@ -44,14 +45,15 @@ export class ReplayBar {
 
   toggle() {
     this.plays = !this.plays;
-    const { end_s } = this.recording;
-    this.show(this.plays && (this.at_s ?? end_s) >= end_s ? 0 : this.at_s ?? 0);
+    const { start_s, end_s } = this.recording;
+    this.show(this.at_s == null || (this.plays && this.at_s >= end_s) ? start_s : this.at_s);
   }
 
   /** @param {number | null} at_s */
   show(at_s) {
-    const { end_s } = this.recording;
+    const { start_s, end_s } = this.recording;
     this.at_s = at_s;
+    this.range.min = String(start_s);
     this.range.max = String(end_s);
     this.range.value = String(at_s ?? end_s);
     setText(this.time, `${clockText(at_s ?? end_s)} of ${clockText(end_s)}`);

@@ -99,10 +99,10 @@ export class SpaceView {
 
   /** Fetches the twin, and until it is there what is solid, as boxes; the server gives both to the instructor alone. */
   async addTwin() {
+    await known;
     this.twin?.mesh.removeFromParent();
     this.twin?.dispose();
     this.twin = null;
-    await known;
     if (document.body.dataset.role !== "instructor") return;
     const { room } = this;
     room.addSolid();
