@@ -1,16 +1,12 @@
 """The course's project 5: what a starter's tests find, and what starter and solution get for a flight."""
 
-import json
-import os
 import re
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 
-COURSE = Path(__file__).parents[2] / "docs/course"
 PROJECT = COURSE / "p5"
 # What the starter fails in, and nothing else.
 UNFINISHED = {
@@ -35,50 +31,27 @@ UNFINISHED = {
 }
 
 
-def handed_in(folder, who):
-    """Makes a student's folder: the starter, and for `solution` the references of p4 and p5 over it."""
-    shutil.copytree(PROJECT / "starter", folder, ignore=shutil.ignore_patterns("__pycache__"))
+def folder_of(folder, who):
+    """Makes a student's folder; the reference takes the gap's part from project 4."""
+    handed_in(folder, "p5", who)
     if who == "solution":
-        for file in (COURSE / "p4/solution/gap.py", *(PROJECT / "solution").glob("*.py")):
-            shutil.copy(file, folder)
+        shutil.copy(COURSE / "p4/solution/gap.py", folder)
     return folder
 
 
 @pytest.mark.parametrize("who", ["starter", "solution"])
 def test_tests_of_the_starter_pass_where_the_work_is_done(tmp_path, who):
-    folder = handed_in(tmp_path / "my-p5", who)
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-rf", "--tb=no", "-W", "error", "-p", "no:cacheprovider", str(folder)],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, cwd=tmp_path,
-    )
-    failed = set(re.findall(r"^FAILED \S+::(\w+)", done.stdout, re.M))
-    assert " passed" in done.stdout, done.stdout
-    assert failed == (UNFINISHED if who == "starter" else set()), done.stdout
+    failed, said = failing(folder_of(tmp_path / "my-p5", who))
+    assert failed == (UNFINISHED if who == "starter" else set()), said
 
 
 def test_a_starter_says_which_of_its_tests_fail():
-    text = "\n".join(file.read_text() for file in sorted((PROJECT / "starter").glob("test_*.py")))
-    said = re.findall(r'^def (test_\w+)\([^\n]*\n    """([^"]+)', text, re.M)
-    assert {name for name, words in said if words.startswith("So far fails")} == UNFINISHED
-
-
-def grade(program, folder, level, first):
-    """Grades a plugin on one seed of the project; returns its flight."""
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    done = subprocess.run(
-        [program, "grade", folder.name, "--project=p5", f"--level={level}", "--seeds=1", f"--first-seed={first}",
-         "--log=none", "--json"],
-        env=os.environ | {"PATH": path, "XDG_CONFIG_HOME": str(folder.parent / "config"), "OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=300, cwd=folder.parent,
-    )
-    assert done.returncode == 0, done.stderr
-    (run,) = json.loads(done.stdout)["runs"]
-    return run
+    assert said_to_fail("p5") == UNFINISHED
 
 
 @pytest.mark.parametrize("level", ["ug", "g"])
 def test_a_starter_flies_and_gets_nothing(program, tmp_path, level):
-    run = grade(program, handed_in(tmp_path / "my-p5", "starter"), level, 1)
+    (run,) = grade(program, folder_of(tmp_path / "my-p5", "starter"), "p5", level)
     assert (run["outcome"], run["score"]) == ("landed", 0.0), run
 
 
@@ -87,7 +60,7 @@ def test_a_solution_finishes_in_the_time_for_half_of_the_points(program, tmp_pat
     text = (PROJECT / "README.md").read_text()
     half = re.search(r"^\| mean time to the finish[^|]*\| \d+ \|[^|]*\| ([^|]*) \|", text, re.M)[1]
     most_s = float(re.search(rf"`{level}` <= (\d+) s", half)[1])
-    run = grade(program, handed_in(tmp_path / "my-p5", "solution"), level, first)
+    (run,) = grade(program, folder_of(tmp_path / "my-p5", "solution"), "p5", level, first=first)
     assert (run["outcome"], run["score"], run["stages_passed"]) == ("finished", 100.0, 4), run
     assert run["seconds"] + run["penalty_s"] <= most_s, run
 
@@ -106,5 +79,4 @@ def test_a_solutions_scores_are_those_of_the_answers():
 
 
 def test_the_points_add_up():
-    points = re.findall(r"^\|[^|]+\| (\d+) \|", (PROJECT / "README.md").read_text(), re.M)
-    assert sum(map(int, points)) == 100
+    assert points_of("p5") == 100
