@@ -8,8 +8,8 @@ use anyhow::{Context, Result, bail};
 /// folder people work in or in one of `roots`.
 ///
 /// # Errors
-/// If there is none of that name; the sentence lists those that exist.
-pub(super) fn find(name: &str, roots: &[PathBuf]) -> Result<PathBuf> {
+/// If there is none of that name; the sentence lists `ours` and those that exist.
+pub(super) fn find(name: &str, ours: &[&str], roots: &[PathBuf]) -> Result<PathBuf> {
     let roots: Vec<PathBuf> =
         std::iter::once(PathBuf::new()).chain(roots.iter().cloned()).collect();
     let mut known = Vec::new();
@@ -29,13 +29,11 @@ pub(super) fn find(name: &str, roots: &[PathBuf]) -> Result<PathBuf> {
     }
     known.sort();
     known.dedup();
-    if known.is_empty() {
-        bail!(
-            "there is no project '{name}': no folder projects/{name} with an arena.toml, and no \
-             other project either; leave --project out to start with the forest"
-        );
-    }
-    bail!("there is no project '{name}'; there are: {}", known.join(", "))
+    let all = ours.iter().copied().chain(known.iter().map(String::as_str)).collect::<Vec<_>>();
+    bail!(
+        "there is no project '{name}'; there are: {}; one of your own is a folder projects/{name} with an arena.toml",
+        all.join(", ")
+    )
 }
 
 #[cfg(test)]
@@ -46,17 +44,18 @@ mod tests {
     fn projects_of_the_course_are_found_by_name() {
         let root = tempfile::tempdir().unwrap();
         let roots = [root.path().to_owned()];
-        let error = |name: &str| find(name, &roots).unwrap_err().to_string();
-        assert!(error("p2").contains("no project 'p2'") && error("p2").contains("no other"));
+        let error = |name: &str| find(name, &["p1"], &roots).unwrap_err().to_string();
+        let none = "there is no project 'p2'; there are: p1; ";
+        assert!(error("p2").starts_with(none), "{}", error("p2"));
         for name in ["p3", "p2"] {
             std::fs::create_dir_all(root.path().join("projects").join(name)).unwrap();
         }
-        assert!(error("p2").contains("no other"), "a folder without an arena.toml is no project");
+        assert!(error("p2").starts_with(none), "a folder without an arena.toml is no project");
         for name in ["p3", "p2"] {
             std::fs::write(root.path().join("projects").join(name).join("arena.toml"), "").unwrap();
         }
-        assert!(find("p2", &roots).unwrap().ends_with("projects/p2"));
-        assert!(error("p9").ends_with("there are: p2, p3"), "{}", error("p9"));
+        assert!(find("p2", &["p1"], &roots).unwrap().ends_with("projects/p2"));
+        assert!(error("p9").contains("there are: p1, p2, p3; "), "{}", error("p9"));
         assert!(error("../p2").contains("no project"), "no path");
     }
 }

@@ -70,9 +70,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
             let roots: Vec<PathBuf> = sources().into_iter().collect();
             let known = starter::IN_THE_NET.iter().chain(projects::NAMES).copied();
             let known: Vec<&str> = known.collect();
-            let folder = course_folder::find(name, &roots).with_context(|| {
-                format!("there is no project '{name}'; there are: {}", known.join(", "))
-            })?;
+            let folder = course_folder::find(name, &known, &roots)?;
             format!("scene = {:?}", folder.display().to_string())
         }
         None => "scene = \"forest\"".to_owned(),
