@@ -53,7 +53,7 @@ fn clock_hand() -> (DistanceField, MovingObjects) {
         position_m: DVec3::new(0.0, 0.0, 1.2),
         yaw_deg: 0.0,
         phase_s: Some(0.0),
-        motion: MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 },
+        motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 }),
     };
     let field = DistanceField::of(OccupancyGrid::bake_object(bar, grid, 0.3));
     (field, MovingObjects::of(&[hand], 7))

@@ -9,14 +9,14 @@
 use std::collections::VecDeque;
 use std::fmt;
 
-use glam::{DVec3, IVec3};
+use glam::{DQuat, DVec3, IVec3};
 
 use crate::body::BodyShape;
-use crate::collision::sweep;
+use crate::collision::Sweep;
 use crate::config::{ArenaConfig, StageConfig};
 use crate::grid::Grid;
-use crate::obstacles::Obstacles;
-use vizflyt_protocol::geometry::{Body, Pose, World};
+use crate::obstacles::{Obstacles, TimedPose, Touched};
+use vizflyt_protocol::geometry::Pose;
 
 /// Something that a course cannot be flown with.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -47,12 +47,8 @@ pub struct Checked {
 
 /// Checks a course against its obstacles.
 pub fn check(config: &ArenaConfig, obstacles: &Obstacles) -> Checked {
-    let mut checker = Checker {
-        config,
-        obstacles,
-        body: BodyShape::of(config),
-        checked: Checked { least_room_m: f64::INFINITY, ..Checked::default() },
-    };
+    let mut checker = Checker::new(config, obstacles);
+    checker.checked.least_room_m = f64::INFINITY;
     checker.check_start();
     for (index, stage) in config.stages.iter().enumerate() {
         checker.check_stage(index, stage);
@@ -66,8 +62,7 @@ pub fn check(config: &ArenaConfig, obstacles: &Obstacles) -> Checked {
 
 /// Checks where the vehicle starts, and its climb, alone: for places without a course.
 pub fn check_start(config: &ArenaConfig, obstacles: &Obstacles) -> Vec<Finding> {
-    let checked = Checked::default();
-    let mut checker = Checker { config, obstacles, body: BodyShape::of(config), checked };
+    let mut checker = Checker::new(config, obstacles);
     checker.check_start();
     checker.checked.findings
 }
@@ -75,17 +70,37 @@ pub fn check_start(config: &ArenaConfig, obstacles: &Obstacles) -> Vec<Finding> 
 struct Checker<'a> {
     config: &'a ArenaConfig,
     obstacles: &'a Obstacles,
+    /// Of the obstacles, what never moves.
+    still: Obstacles,
+    /// The objects that move.
+    moving: Vec<usize>,
     body: BodyShape,
     checked: Checked,
 }
 
-impl Checker<'_> {
+impl<'a> Checker<'a> {
+    fn new(config: &'a ArenaConfig, obstacles: &'a Obstacles) -> Self {
+        let objects = &obstacles.objects;
+        let (moving, resting): (Vec<_>, Vec<_>) =
+            (0..objects.len()).partition(|&index| objects.moves(index));
+        let still = obstacles.select(&resting);
+        let (body, checked) = (BodyShape::of(config), Checked::default());
+        Self { config, obstacles, still, moving, body, checked }
+    }
+
+    /// Sweeps the body, level, along a straight way past what never moves.
+    fn sweep(&self, from_m: DVec3, to_m: DVec3) -> (Sweep, Touched) {
+        let at = |p_m| Pose::new(p_m, DQuat::IDENTITY);
+        let timed = |p_m| TimedPose { since_epoch_ns: 0, world_from_body: at(p_m) };
+        self.still.sweep(&self.body, &timed(from_m), &timed(to_m))
+    }
+
     fn found(&mut self, key: impl Into<String>, text: impl Into<String>) {
         self.checked.findings.push(Finding { key: key.into(), text: text.into() });
     }
 
     fn room_m(&self, p_m: DVec3) -> f64 {
-        self.obstacles.still.obstacle_distance_m(p_m) - self.body.radius_m()
+        self.still.distance_m(0, p_m) - self.body.radius_m()
     }
 
     fn above_start_m(&self) -> DVec3 {
@@ -95,9 +110,10 @@ impl Checker<'_> {
     fn check_start(&mut self) {
         let (start_m, top_m) = (self.config.spawn.position_m, self.above_start_m());
         let from_m = start_m + DVec3::Z * self.body.radius_m();
-        let straight = sweep(&self.obstacles.still, &self.body, &at(from_m), &at(top_m));
+        let (straight, touched) = self.sweep(from_m, top_m);
         if let Some(contact) = straight.contact {
-            let (what, advice) = self.touched(contact.p_world_m, "move the start or the obstacle");
+            let otherwise = "move the start or the obstacle";
+            let (what, advice) = self.touched(touched, contact.p_world_m, otherwise);
             let text = format!(
                 "the climb to {} m touches {what} at {:.2} m; {advice}",
                 self.config.takeoff_height_m, contact.p_world_m
@@ -105,8 +121,9 @@ impl Checker<'_> {
             self.found("spawn.position_m", text);
         }
         self.check_seen();
-        for (index, name) in self.obstacles.objects.names().enumerate() {
+        for &index in &self.moving {
             if self.longest_free_s(from_m, top_m, index) < WINDOW_S {
+                let name = self.obstacles.objects.names().nth(index).unwrap_or_default();
                 let text = format!("'{name}' leaves no {WINDOW_S} s to climb; move one of the two");
                 self.checked.findings.push(Finding { key: "spawn.position_m".into(), text });
                 return;
@@ -115,13 +132,22 @@ impl Checker<'_> {
     }
 
     /// Returns what a body touches at a place, and what to do: `otherwise`, if it is a known obstacle.
-    fn touched(&self, p_m: DVec3, otherwise: &'static str) -> (&'static str, &'static str) {
+    fn touched(
+        &self,
+        touched: Touched,
+        p_m: DVec3,
+        otherwise: &'static str,
+    ) -> (String, &'static str) {
+        if let Touched::Object(index) = touched {
+            let name = self.still.objects.names().nth(index).unwrap_or_default();
+            return (format!("'{name}'"), otherwise);
+        }
         let still = &self.obstacles.still;
         let reach_m = self.body.radius_m() + 2.0 * still.grid().voxel_m;
         if still.is_unseen_nearest(p_m, reach_m) {
-            ("unseen space", FILM)
+            ("unseen space".to_owned(), FILM)
         } else {
-            ("an obstacle", otherwise)
+            ("an obstacle".to_owned(), otherwise)
         }
     }
 
@@ -178,18 +204,18 @@ impl Checker<'_> {
                 return;
             }
         }
-        let through = sweep(&self.obstacles.still, &self.body, &at(before_m), &at(after_m));
+        let (through, touched) = self.sweep(before_m, after_m);
         self.checked.least_room_m = self.checked.least_room_m.min(through.clearance_m);
         if let Some(contact) = through.contact {
             let otherwise = "move the gate, or correct center_m and normal";
-            let (what, advice) = self.touched(contact.p_world_m, otherwise);
+            let (what, advice) = self.touched(touched, contact.p_world_m, otherwise);
             let text = format!(
                 "straight through '{}' the vehicle touches {what} at {:.2} m; {advice}",
                 stage.name, contact.p_world_m
             );
             self.found(key("center_m"), text);
         }
-        for number in 0..self.obstacles.objects.len() {
+        for &number in &self.moving.clone() {
             let free_s = self.longest_free_s(before_m, after_m, number);
             if free_s < WINDOW_S {
                 let name = self.obstacles.objects.names().nth(number).unwrap_or_default();
@@ -205,11 +231,7 @@ impl Checker<'_> {
 
     /// Returns the longest time that an object leaves a straight way free, within a minute. [s]
     fn longest_free_s(&self, from_m: DVec3, to_m: DVec3, object: usize) -> f64 {
-        let alone = Obstacles::new(
-            self.obstacles.still.clone(),
-            vec![self.obstacles.moving[object].clone()],
-            self.obstacles.objects.only(object),
-        );
+        let alone = self.obstacles.select(&[object]);
         let (mut longest, mut free) = (0_u32, 0_u32);
         for tick in 0..LOOKS {
             let ns = i64::from(tick) * LOOK_NS;
@@ -304,12 +326,9 @@ impl Cells {
             away(a).total_cmp(&away(b))
         });
         cells.into_iter().find(|&cell| {
-            let between = |cell| {
-                sweep(&checker.obstacles.still, &checker.body, &at(p_m), &at(self.center_m(cell)))
-            };
             self.index(cell).is_some()
                 && self.is_free(checker, cell)
-                && between(cell).contact.is_none()
+                && checker.sweep(p_m, self.center_m(cell)).0.contact.is_none()
         })
     }
 
@@ -344,10 +363,6 @@ impl Cells {
     }
 }
 
-fn at(p_m: DVec3) -> Pose<World, Body> {
-    Pose::new(p_m, glam::DQuat::IDENTITY)
-}
-
 /// Returns the places straight before and behind a gate. [m, world]
 fn ends_m(stage: &StageConfig) -> (DVec3, DVec3) {
     let ahead_m = stage.normal.normalize_or(DVec3::X) * AHEAD_M;
@@ -376,8 +391,12 @@ const BLOCKED: u32 = u32::MAX - 1;
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
+    use crate::config::ObjectConfig;
     use crate::distance::DistanceField;
+    use crate::objects::MovingObjects;
     use crate::occupancy::occupancy_of;
     use crate::referee::tests::arena;
     use vizflyt_protocol::geometry::Volume;
@@ -401,6 +420,36 @@ mod tests {
             wall.signed_distance_m(p) < 0.0 && !in_hole
         }));
         (config, field.into())
+    }
+
+    /// The room with a board of its own frame, half a metre square, that stands still at a place.
+    fn with_board(at_m: DVec3) -> (ArenaConfig, Obstacles) {
+        let (mut config, walled) = walled(1.0);
+        config.objects.push(ObjectConfig {
+            name: "board".into(),
+            scene: "board.ply".into(),
+            position_m: at_m,
+            yaw_deg: 0.0,
+            phase_s: None,
+            motion: None,
+        });
+        let board = Volume::aabb(DVec3::new(-0.05, -0.6, -0.6), DVec3::new(0.05, 0.6, 0.6));
+        let grid = Grid::covering(DVec3::splat(-1.0), DVec3::splat(1.0), 0.025);
+        let field =
+            DistanceField::of(occupancy_of(grid, -1e4, |p| board.signed_distance_m(p) < 0.0));
+        let objects = MovingObjects::new(&config, 0);
+        (config, Obstacles::new(walled.still, vec![Arc::new(field)], objects))
+    }
+
+    #[test]
+    fn what_stands_still_in_a_frame_of_its_own_is_an_obstacle() {
+        let free = with_board(DVec3::new(2.0, -2.0, 1.0));
+        assert_eq!(check(&free.0, &free.1).findings, []);
+        // Right before the hole.
+        let (config, obstacles) = with_board(DVec3::new(2.8, 0.0, 1.0));
+        let checked = check(&config, &obstacles);
+        assert_eq!(keys(&checked), ["stages[0].center_m"]);
+        assert!(checked.findings[0].text.contains("touches 'board'"), "{checked:?}");
     }
 
     fn keys(checked: &Checked) -> Vec<&str> {

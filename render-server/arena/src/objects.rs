@@ -44,6 +44,7 @@ struct MovingObject {
 /// As [`MotionConfig`], ready to be asked.
 #[derive(Clone, Debug, PartialEq)]
 enum Motion {
+    None,
     Rotation {
         /// Unit. [object]
         axis: DVec3,
@@ -55,7 +56,11 @@ enum Motion {
         swing_rad: f64,
     },
     /// The corners of one round, the first of them again at the end, and how far along each is.
-    Path { corners_m: Vec<DVec3>, along_m: Vec<f64>, speed_mps: f64 },
+    Path {
+        corners_m: Vec<DVec3>,
+        along_m: Vec<f64>,
+        speed_mps: f64,
+    },
 }
 
 impl MovingObjects {
@@ -71,7 +76,7 @@ impl MovingObjects {
     ///     position_m: DVec3::new(5.0, 0.0, 1.0),
     ///     yaw_deg: 0.0,
     ///     phase_s: Some(0.0),
-    ///     motion: MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 },
+    ///     motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 }),
     /// };
     /// let objects = MovingObjects::of(&[hand], 7);
     /// // A quarter of the turn later what pointed up points to -y.
@@ -98,10 +103,15 @@ impl MovingObjects {
         self.objects.is_empty()
     }
 
-    /// Returns one of them alone, on the same clock.
+    /// Returns some of them alone, on the same clock.
     #[must_use]
-    pub fn only(&self, index: usize) -> Self {
-        Self { objects: vec![self.objects[index].clone()] }
+    pub fn select(&self, indices: &[usize]) -> Self {
+        Self { objects: indices.iter().map(|&index| self.objects[index].clone()).collect() }
+    }
+
+    /// Whether an object moves at all.
+    pub fn moves(&self, index: usize) -> bool {
+        self.objects[index].motion != Motion::None
     }
 
     /// Returns their names, in order.
@@ -135,15 +145,16 @@ impl MovingObjects {
 impl MovingObject {
     fn new(config: &ObjectConfig, index: usize, seed: u64) -> Self {
         let (motion, period_s) = match &config.motion {
-            MotionConfig::Rotation { axis, period_s } => {
+            None => (Motion::None, 1.0),
+            Some(MotionConfig::Rotation { axis, period_s }) => {
                 (Motion::Rotation { axis: axis.normalize_or(DVec3::Z) }, *period_s)
             }
-            MotionConfig::Oscillation { slide_m, axis, swing_deg, period_s } => {
+            Some(MotionConfig::Oscillation { slide_m, axis, swing_deg, period_s }) => {
                 let axis = axis.normalize_or_zero();
                 let swing_rad = if axis == DVec3::ZERO { 0.0 } else { swing_deg.to_radians() };
                 (Motion::Oscillation { slide_m: *slide_m, axis, swing_rad }, *period_s)
             }
-            MotionConfig::Path { points_m, speed_mps, closed } => {
+            Some(MotionConfig::Path { points_m, speed_mps, closed }) => {
                 let mut corners_m = points_m.clone();
                 if *closed {
                     corners_m.extend(points_m.first());
@@ -175,6 +186,7 @@ impl MovingObject {
         let into_ns = ns.rem_euclid(i128::from(self.period_ns)) as u64;
         let share = into_ns as f64 / self.period_ns as f64;
         let (offset_m, rotation) = match &self.motion {
+            Motion::None => (DVec3::ZERO, DQuat::IDENTITY),
             Motion::Rotation { axis } => (DVec3::ZERO, turn(*axis, TAU * share)),
             Motion::Oscillation { slide_m, axis, swing_rad } => {
                 let side = libm::sin(TAU * share);
@@ -196,6 +208,7 @@ impl MovingObject {
     fn top_speed(&self) -> TopSpeed {
         let turns_radps = TAU / (self.period_ns as f64 * 1e-9);
         match &self.motion {
+            Motion::None => TopSpeed::default(),
             Motion::Rotation { .. } => TopSpeed { linear_mps: 0.0, angular_radps: turns_radps },
             Motion::Oscillation { slide_m, swing_rad, .. } => TopSpeed {
                 linear_mps: slide_m.length() * turns_radps,
@@ -227,14 +240,14 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn object(motion: MotionConfig, phase_s: Option<f64>) -> ObjectConfig {
+    fn object(motion: impl Into<Option<MotionConfig>>, phase_s: Option<f64>) -> ObjectConfig {
         ObjectConfig {
             name: "thing".into(),
             scene: "thing.ply".into(),
             position_m: DVec3::new(1.0, 2.0, 3.0),
             yaw_deg: 90.0,
             phase_s,
-            motion,
+            motion: motion.into(),
         }
     }
 
@@ -309,6 +322,19 @@ mod tests {
         let fixed = |seed| MovingObjects::of(&[object(motion.clone(), Some(7.5))], seed);
         assert_eq!(fixed(3), fixed(4));
         assert_eq!(fixed(3).placements(0), one(motion.clone()).placements(S * 3 / 2));
+    }
+
+    #[test]
+    fn what_has_no_motion_stands_still() {
+        let frame = MovingObjects::of(&[object(None, None)], 3);
+        let rest = frame.placement(0, 0);
+        assert_eq!(rest.translation_m, DVec3::new(1.0, 2.0, 3.0));
+        assert!((rest.rotate(DVec3::X) - DVec3::Y).length() < 1e-12);
+        assert_eq!((frame.placement(0, 5 * S), frame.top_speed(0)), (rest, TopSpeed::default()));
+        assert!(
+            !frame.moves(0)
+                && one(MotionConfig::Rotation { axis: DVec3::X, period_s: 6.0 }).moves(0)
+        );
     }
 
     fn motions() -> impl Strategy<Value = MotionConfig> {

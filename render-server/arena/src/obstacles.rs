@@ -20,7 +20,7 @@ use crate::objects::{MovingObjects, TopSpeed};
 pub struct Obstacles {
     /// What stands still.
     pub still: Arc<DistanceField>,
-    /// The field of each of `objects`, in its own frame. [m, object]
+    /// The field of each of `objects`, of those too that do not move, in its own frame. [m, object]
     pub moving: Vec<Arc<DistanceField>>,
     /// Where they are when.
     pub objects: MovingObjects,
@@ -68,6 +68,13 @@ impl Obstacles {
     ) -> Self {
         assert_eq!(moving.len(), objects.len(), "one field for each object");
         Self { still, moving, objects }
+    }
+
+    /// Returns some of the objects alone, with what stands still.
+    #[must_use]
+    pub fn select(&self, indices: &[usize]) -> Self {
+        let fields = indices.iter().map(|&index| self.moving[index].clone()).collect();
+        Self::new(self.still.clone(), fields, self.objects.select(indices))
     }
 
     /// Returns the distance from a point to the nearest obstacle at an instant, the floor not
@@ -187,7 +194,7 @@ mod tests {
             position_m: DVec3::ZERO,
             yaw_deg: 0.0,
             phase_s: Some(phase_s),
-            motion: MotionConfig::Rotation { axis: DVec3::X, period_s },
+            motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s }),
         };
         Obstacles::new(nothing(), vec![hand_field()], MovingObjects::of(&[hand], 0))
     }

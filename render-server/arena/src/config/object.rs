@@ -1,4 +1,5 @@
-//! `[[objects]]`: rigid parts of the twin that move by themselves: a clock's hand, a door, a pendulum.
+//! `[[objects]]`: rigid parts of the twin beside its scene: a gate's frame that stands still; a clock's hand, a door, a
+//! pendulum that move by themselves.
 
 use std::collections::HashSet;
 
@@ -36,8 +37,9 @@ pub struct ObjectConfig {
     /// Where in its motion it is when the arena starts; random by the seed if absent. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase_s: Option<f64>,
-    /// How it moves about its rest.
-    pub motion: MotionConfig,
+    /// How it moves about its rest; without it, it stands still, as a part of the scene.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub motion: Option<MotionConfig>,
 }
 
 /// `motion`: how an object moves about its rest, over and over.
@@ -106,7 +108,9 @@ impl ArenaConfig {
             if let Some(phase_s) = object.phase_s {
                 check_number(&key("phase_s"), phase_s, "s", 0.0..=MAX_PERIOD_S)?;
             }
-            check_motion(&object.motion, |field| format!("objects[{index}].motion.{field}"))?;
+            if let Some(motion) = &object.motion {
+                check_motion(motion, |field| format!("objects[{index}].motion.{field}"))?;
+            }
         }
         Ok(())
     }

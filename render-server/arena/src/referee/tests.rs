@@ -286,12 +286,12 @@ fn with_door(config: &mut ArenaConfig) -> Referee {
         position_m: DVec3::new(4.0, 0.0, 0.0),
         yaw_deg: 0.0,
         phase_s: Some(1.0),
-        motion: MotionConfig::Oscillation {
+        motion: Some(MotionConfig::Oscillation {
             slide_m: DVec3::Y,
             axis: DVec3::ZERO,
             swing_deg: 0.0,
             period_s: 4.0,
-        },
+        }),
     });
     let leaf = Volume::aabb(DVec3::new(-0.05, -0.4, 0.0), DVec3::new(0.05, 0.4, 2.0));
     let grid = Grid::covering(DVec3::new(-0.5, -0.9, -0.5), DVec3::new(0.5, 0.9, 2.5), 0.025);

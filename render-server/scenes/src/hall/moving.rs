@@ -178,7 +178,7 @@ impl Mover {
             position_m: self.position_m,
             yaw_deg: self.yaw_rad.to_degrees(),
             phase_s: Some(self.phase_s),
-            motion: self.motion.clone(),
+            motion: Some(self.motion.clone()),
         };
         GeneratedMover { config, object: RigidObject { id, splats }, truth }
     }

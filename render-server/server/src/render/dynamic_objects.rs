@@ -116,7 +116,7 @@ mod tests {
             position_m: DVec3::ZERO,
             yaw_deg: 0.0,
             phase_s: Some(0.25),
-            motion: MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 },
+            motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 }),
         };
         let objects = MovingObjects::of(&[hand], 0);
         let epoch = ServerTime::from_ns(5_000_000_000);

@@ -304,11 +304,11 @@ mod tests {
             position_m: DVec3::new(0.0, 0.5, 0.0),
             yaw_deg: 0.0,
             phase_s: Some(0.0),
-            motion: MotionConfig::Path {
+            motion: Some(MotionConfig::Path {
                 points_m: vec![DVec3::ZERO, DVec3::Y * 5.0],
                 speed_mps: 1.0,
                 closed: false,
-            },
+            }),
         };
         // The ball is the object; the room is empty.
         let objects = [RigidObject { id: 1, splats: ball() }];
