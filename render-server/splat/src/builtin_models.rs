@@ -42,25 +42,30 @@ const fn part(center_m: [f32; 3], half_m: [f32; 3], colour: [f32; 3]) -> Part {
 /// Returns the splats of boxes, in their own frame: flat ones on every face, brighter above than
 /// below, so that edges are seen without any light. [m, object]
 pub fn boxes(parts: &[Part]) -> Splats {
+    boxes_in_patches(parts, PATCH_M)
+}
+
+/// As [`boxes`], in patches of this side at most: what is plain and large needs few. [m]
+pub fn boxes_in_patches(parts: &[Part], patch_m: f32) -> Splats {
     let mut splats = Splats::default();
     for part in parts {
         for axis in 0..3 {
             for side in [-1.0, 1.0] {
-                face(&mut splats, part, axis, side);
+                face(&mut splats, part, patch_m, axis, side);
             }
         }
     }
     splats
 }
 
-fn face(splats: &mut Splats, part: &Part, axis: usize, side: f32) {
+fn face(splats: &mut Splats, part: &Part, patch_m: f32, axis: usize, side: f32) {
     let out = Vec3::AXES[axis] * side;
     let right = Vec3::AXES[(axis + 1) % 3];
     let up = out.cross(right);
     let half = |direction: Vec3| direction.abs().dot(part.half_m);
     let (wide_m, high_m) = (2.0 * half(right), 2.0 * half(up));
-    let columns = (wide_m / PATCH_M).ceil().max(1.0);
-    let rows = (high_m / PATCH_M).ceil().max(1.0);
+    let columns = (wide_m / patch_m).ceil().max(1.0);
+    let rows = (high_m / patch_m).ceil().max(1.0);
     let shade = 0.82 + 0.18 * out.z;
     let rotation = Quat::from_mat3(&Mat3::from_cols(right, up, out)).normalize();
     for row in 0..rows as u16 {

@@ -1,5 +1,7 @@
-//! `vizflyt arena`: makes rooms for captured scenes, looks at rooms and courses before anyone flies in them.
+//! `vizflyt arena`: makes rooms for captured scenes, sets up courses in them, and looks at both before anyone flies.
 
+mod edit;
+pub(crate) mod file;
 mod new;
 
 use std::path::{Path, PathBuf};
@@ -18,7 +20,7 @@ use vizflyt_server::scene::{self, BareArgs};
 
 use crate::terminal::print_fmt;
 
-/// Makes rooms for captured scenes; looks at rooms and courses before anyone flies in them.
+/// Makes rooms for captured scenes, sets up courses in them, and looks at both before anyone flies.
 #[derive(Args, Debug)]
 pub(crate) struct ArenaArgs {
     #[command(subcommand)]
@@ -28,7 +30,9 @@ pub(crate) struct ArenaArgs {
 #[derive(Subcommand, Debug)]
 enum ArenaCommand {
     Check(CheckArgs),
+    #[command(visible_alias = "init")]
     New(new::NewArgs),
+    Edit(edit::EditArgs),
 }
 
 /// Reports whether a course can be flown: the scene lies in it as it is meant, the start is free, gates fit the vehicle and the room, a way leads
@@ -58,6 +62,7 @@ pub(crate) fn run(args: &ArenaArgs) -> Result<ExitCode> {
     match &args.command {
         ArenaCommand::Check(args) => check_all(args),
         ArenaCommand::New(args) => new::run(args).map(|()| ExitCode::SUCCESS),
+        ArenaCommand::Edit(args) => edit::run(args).map(|()| ExitCode::SUCCESS),
     }
 }
 

@@ -77,13 +77,13 @@ pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
     let stage = Stage::prepare(&lab)?;
     let scene = load(&stage.arena, &BareArgs::default())?;
     ensure!(
-        scene.objects.is_empty(),
+        scene.arena.objects.iter().all(|object| object.motion.is_none()),
         "something moves in {}, and a log does not tell where it was: such a flight is judged by its server alone",
         scene.arena.name
     );
     let baked =
         bake_with(&scene.splats, &BakeSpec::of(&scene.arena), scene.seen.as_ref(), None, &|_| ());
-    let still = obstacles(&scene.arena, &[], Arc::new(baked.field), lab.seed());
+    let still = obstacles(&scene.arena, &scene.objects, Arc::new(baked.field), lab.seed());
     let verdict = judge_track(&scene.arena, still, track);
     if args.json {
         print_line(serde_json::to_string_pretty(&verdict)?);

@@ -17,6 +17,7 @@ mod core;
 mod edit;
 mod fit;
 mod floor;
+mod models;
 mod objects;
 mod parts;
 mod placement;
@@ -29,6 +30,8 @@ pub use choose::Scenes;
 pub use core::{bounds, core};
 pub use edit::{DoneStep, EditList, EditListError, Editor, list_path, read_list, result_path};
 pub use fit::check_fit;
+pub use models::model;
+pub(crate) use objects::bake_object;
 pub use objects::{bounds_m, obstacles};
 pub use parts::{BoxedPart, PartsFile, parts_path};
 pub use placement::{Placement, WorldFromScene};
@@ -261,6 +264,11 @@ fn in_the_open(path: &Path, bare: &BareArgs, mut splats: Splats) -> Result<Scene
         warn!("{} has no arena, so this is guessed: {guessed}", path.display());
     }
     Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene, seen: None })
+}
+
+/// Reads the splats of a file of any format.
+pub(crate) fn read_splats(path: &Path) -> Result<Splats> {
+    Ok(read(path)?.splats)
 }
 
 /// Reads a scene file of any format; how far it has come goes to the log, if it takes long.

@@ -64,7 +64,8 @@ pub fn bounds_m(splats: &Splats) -> (Vec3, Vec3) {
     if low.cmple(high).all() { (low, high) } else { (Vec3::ZERO, Vec3::ZERO) }
 }
 
-fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
+/// Bakes an object's splats in its own frame, as an arena bakes.
+pub(crate) fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     let (low_m, high_m) = bounds_m(splats);
     let (low_m, high_m) = (low_m.as_dvec3() - MARGIN_M, high_m.as_dvec3() + MARGIN_M);
     let of_size = |voxel_m: f64| ((high_m - low_m) / voxel_m).element_product();

@@ -68,7 +68,8 @@ pub use login::set_password;
 pub use routes::list as routes;
 pub use stats::{ServerStages, VehicleStats};
 pub use view::align::{Aligner, Length, Line, Picks, Solved, Wish};
-pub use view::{Place, ViewArgs, align, edit, view};
+pub use view::course::{Course, CourseFile};
+pub use view::{Place, ViewArgs, align, edit, set_up, view};
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};

@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use toml_edit::{Array, DocumentMut, InlineTable, Item, TableLike, Value, value};
-use vizflyt_arena::ArenaConfig;
+use toml_edit::{DocumentMut, InlineTable, value};
 use vizflyt_arena::config::{Geofence, Spawn};
 use vizflyt_twin::align::Similarity;
+
+use crate::arena::file::{self, numbers, set, table};
 
 /// What is written.
 pub(super) struct Changes {
@@ -22,30 +23,18 @@ pub(super) struct Changes {
 /// # Errors
 /// A file that cannot be read or written, or an arena that would be none.
 pub(super) fn write(path: &Path, changes: &Changes) -> Result<()> {
-    let text =
-        std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let changed = changed(&text, changes)?;
-    ArenaConfig::parse(&changed).with_context(|| {
-        format!("nothing is written, for {} would not be read again", path.display())
-    })?;
-    std::fs::write(path, changed).with_context(|| format!("cannot write {}", path.display()))
+    file::change(path, |document| put(document, changes))
 }
 
-/// Returns the text of an arena.toml with the changes.
-fn changed(text: &str, changes: &Changes) -> Result<String> {
-    let mut document: DocumentMut = text.parse()?;
-    put_place(&mut document, &changes.place)?;
+fn put(document: &mut DocumentMut, changes: &Changes) -> Result<()> {
+    put_place(document, &changes.place)?;
     if let Some(fence) = changes.fence {
-        let table = table(&mut document, "geofence")?;
-        set(table, "min_m", numbers(&fence.min_m.to_array()));
-        set(table, "max_m", numbers(&fence.max_m.to_array()));
+        file::put(document, "geofence", &fence)?;
     }
     if let Some(spawn) = changes.spawn {
-        let table = table(&mut document, "spawn")?;
-        set(table, "position_m", numbers(&spawn.position_m.to_array()));
-        set(table, "yaw_deg", spawn.yaw_deg.into());
+        file::put(document, "spawn", &spawn)?;
     }
-    Ok(document.to_string())
+    Ok(())
 }
 
 fn put_place(document: &mut DocumentMut, place: &Similarity) -> Result<()> {
@@ -66,28 +55,17 @@ fn put_place(document: &mut DocumentMut, place: &Similarity) -> Result<()> {
     Ok(())
 }
 
-fn table<'a>(document: &'a mut DocumentMut, key: &str) -> Result<&'a mut dyn TableLike> {
-    let item = document.get_mut(key).and_then(Item::as_table_like_mut);
-    item.with_context(|| format!("{key} is no table"))
-}
-
-/// Sets a key; what stands about an old value stays.
-fn set(table: &mut dyn TableLike, key: &str, mut new: Value) {
-    if let Some(old) = table.get(key).and_then(Item::as_value) {
-        *new.decor_mut() = old.decor().clone();
-    }
-    table.insert(key, Item::Value(new));
-}
-
-fn numbers(of: &[f64]) -> Value {
-    Value::Array(of.iter().copied().collect::<Array>())
-}
-
 #[cfg(test)]
 mod tests {
     use glam::{DQuat, DVec3};
 
     use super::*;
+
+    fn changed(text: &str, changes: &Changes) -> Result<String> {
+        let mut document: DocumentMut = text.parse()?;
+        put(&mut document, changes)?;
+        Ok(document.to_string())
+    }
 
     const PLACE: Similarity = Similarity {
         scale: 0.25,

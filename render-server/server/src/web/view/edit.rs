@@ -281,7 +281,7 @@ async fn edit(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if view.edit.is_none() {
+    if view.panels.edit.is_none() {
         return StatusCode::NOT_FOUND.into_response();
     }
     if !from.ip().to_canonical().is_loopback() {
@@ -300,7 +300,7 @@ async fn edit(
 }
 
 fn obey(view: &ViewState, order: Order) -> Result<Report> {
-    let panel = view.edit.as_ref().context("this page does not edit")?;
+    let panel = view.panels.edit.as_ref().context("this page does not edit")?;
     let mut session = lock(&panel.session);
     let (said, is_changed) = session.obey(order)?;
     let selected = session.selected();

@@ -153,6 +153,18 @@ impl Engine {
         self.rasterizer = rasterizer;
     }
 
+    /// Shows other objects from now on, with the renderer that draws them if it is another.
+    pub(super) fn set_objects(
+        &mut self,
+        rasterizer: Option<Box<dyn Rasterizer>>,
+        moving: MovingObjects,
+    ) {
+        self.moving = moving;
+        if let Some(rasterizer) = rasterizer {
+            self.rasterizer = rasterizer;
+        }
+    }
+
     pub(super) fn render(&mut self, request: &Request) -> Result<Picture> {
         let (camera, unit) = self.loaded_camera(request)?;
         // A time beyond the clock's range shows the start.

@@ -9,6 +9,7 @@
 //! viewers in turn.
 
 pub(crate) mod align;
+pub(crate) mod course;
 mod edit;
 mod engine;
 mod pick;
@@ -35,6 +36,7 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
 use self::align::{Aligner, Setup};
+use self::course::CourseFile;
 use self::edit::Session;
 use self::engine::{Engine, Picture, Request};
 pub use self::place::Place;
@@ -102,6 +104,7 @@ pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()
 #[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
 enum Work {
     Align(Arc<dyn Aligner>),
+    Course(Arc<dyn CourseFile>),
     /// What is saved goes to the path.
     Edit(Editor, PathBuf),
 }
@@ -117,6 +120,19 @@ pub fn align(
     open: impl FnOnce(&str, &RendererInfo),
 ) -> Result<()> {
     serve_view(&args, Some(Work::Align(aligner)), open)
+}
+
+/// As [`view`], with the panel that sets up the arena's course.
+///
+/// # Errors
+/// As [`view`].
+#[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
+pub fn set_up(
+    args: ViewArgs,
+    file: Arc<dyn CourseFile>,
+    open: impl FnOnce(&str, &RendererInfo),
+) -> Result<()> {
+    serve_view(&args, Some(Work::Course(file)), open)
 }
 
 /// As [`view`], with the panel that edits the scene; it is saved to `output`.
@@ -154,9 +170,16 @@ fn serve_view(
 struct ViewState {
     engine: Mutex<Engine>,
     welcome: Welcome,
-    align: Option<align::Panel>,
-    edit: Option<edit::Panel>,
+    panels: Panels,
     stop: Stop,
+}
+
+/// What is done with the scene on the page; one of them, or none.
+#[derive(Default)]
+struct Panels {
+    align: Option<align::Panel>,
+    course: Option<course::Panel>,
+    edit: Option<edit::Panel>,
 }
 
 /// The first message to each page.
@@ -189,13 +212,13 @@ async fn run(
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading, work));
-    let (engine, welcome, align, edit) = tokio::select! {
+    let (engine, welcome, panels) = tokio::select! {
         prepared = load => prepared.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
     let (engine, stopping) = (Mutex::new(engine), stop.clone());
-    let view = Arc::new(ViewState { engine, welcome, align, edit, stop: stopping });
+    let view = Arc::new(ViewState { engine, welcome, panels, stop: stopping });
     let router = router(view).into_make_service_with_connect_info::<SocketAddr>();
     tokio::select! {
         served = axum::serve(listener, router) => served.context("the page's server failed"),
@@ -203,32 +226,31 @@ async fn run(
     }
 }
 
-type Prepared = (Engine, Welcome, Option<align::Panel>, Option<edit::Panel>);
-
-fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<Prepared> {
+fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Engine, Welcome, Panels)> {
     let scene = match &work {
         Some(Work::Edit(editor, _)) => {
             scene::load_with(&args.scene, &args.bare, editor.splats().clone())
         }
         _ => scene::load(&args.scene, &args.bare),
     };
-    let Scene { mut arena, mut splats, mut objects, world_from_scene, .. } = scene?;
+    let mut scene = scene?;
     if let Some(Work::Align(_)) = work {
         // What moves stands in the room: it is no part of the scene, and does not move along with it.
-        arena.objects.clear();
-        objects.clear();
+        scene.arena.objects.clear();
+        scene.objects.clear();
     }
-    args.antialiased.apply(&mut splats);
-    let twin = vizflyt_splat::Scene { splats: &splats, objects: &objects };
+    args.antialiased.apply(&mut scene.splats);
+    let Scene { arena, splats, objects, world_from_scene, .. } = &scene;
+    let twin = vizflyt_splat::Scene { splats, objects };
     let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
-    let moving = MovingObjects::new(&arena, args.seed);
+    let moving = MovingObjects::new(arena, args.seed);
     let placement = Placement::of(&arena.scene);
     let world_from_file = placement.world_from_scene;
-    let setup = Setup::new(&arena, Place::new(&world_from_file));
+    let setup = Setup::new(arena, Place::new(&world_from_file));
     let mut start_m = arena.spawn.position_m;
     start_m.z += arena.takeoff_height_m;
     let welcome = Welcome {
-        name: arena.name,
+        name: arena.name.clone(),
         renderer: RendererInfo { name: rasterizer.name().into_owned(), reason },
         splats: splats.len(),
         start_m: start_m.to_array(),
@@ -237,19 +259,24 @@ fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<Prepared> {
         objects: moving.len(),
         tool: work.as_ref().map(|work| match work {
             Work::Align(_) => "/align.js",
+            Work::Course(_) => "/course.js",
             Work::Edit(..) => "/edit.js",
         }),
     };
-    let engine = Engine::new(rasterizer, moving, world_from_scene, world_from_file);
-    let (align, edit) = match work {
-        None => (None, None),
-        Some(Work::Align(aligner)) => (Some(align::Panel { aligner, setup }), None),
-        Some(Work::Edit(editor, output)) => {
-            let session = Session::new(editor, output, args.clone(), placement, objects)?;
-            (None, Some(edit::Panel { session: Mutex::new(session) }))
+    let engine = Engine::new(rasterizer, moving, *world_from_scene, world_from_file);
+    let mut panels = Panels::default();
+    match work {
+        None => {}
+        Some(Work::Align(aligner)) => panels.align = Some(align::Panel { aligner, setup }),
+        Some(Work::Course(file)) => {
+            panels.course = Some(course::Panel::new(scene, file, args.clone()));
         }
-    };
-    Ok((engine, welcome, align, edit))
+        Some(Work::Edit(editor, output)) => {
+            let session = Session::new(editor, output, args.clone(), placement, scene.objects)?;
+            panels.edit = Some(edit::Panel { session: Mutex::new(session) });
+        }
+    }
+    Ok((engine, welcome, panels))
 }
 
 fn router(view: Arc<ViewState>) -> Router {
@@ -260,7 +287,10 @@ fn router(view: Arc<ViewState>) -> Router {
         .route("/view.js", get(async || file("text/javascript; charset=utf-8", SCRIPT)))
         .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
         .route("/ws", get(watch))
+        .route("/panel.css", get(async || file("text/css; charset=utf-8", PANEL_STYLE)))
+        .route("/overlay.js", get(async || file("text/javascript; charset=utf-8", OVERLAY)))
         .merge(align::routes())
+        .merge(course::routes())
         .merge(edit::routes())
         .with_state(view)
 }
@@ -330,6 +360,8 @@ async fn send(socket: &mut WebSocket, message: Message) -> Option<()> {
 const INDEX: &str = include_str!("page/view.html");
 const STYLE: &str = include_str!("page/view.css");
 const SCRIPT: &str = include_str!("page/view.js");
+const PANEL_STYLE: &str = include_str!("page/panel.css");
+const OVERLAY: &str = include_str!("page/overlay.js");
 /// A page that takes nothing for this long is gone.
 const PATIENCE: Duration = Duration::from_secs(10);
 

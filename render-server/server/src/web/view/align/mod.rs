@@ -1,7 +1,7 @@
 //! `vizflyt scene align`'s page: the view, with a panel that takes clicks for points of the room.
 //!
 //! ```text
-//! GET  /align.js, /align_overlay.js, /align.css    the panel, and what is drawn over the picture
+//! GET  /align.js          the panel
 //! GET  /api/align         Setup: the arena as its file has it
 //! POST /api/align/pick    a pixel -> the point of the scene there, or why there is none
 //! POST /api/align/solve   Picks -> Solved: the place, in words how well it is known, go or no-go
@@ -157,14 +157,6 @@ pub(super) fn routes() -> Router<Arc<ViewState>> {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
         .route("/align.js", get(async || file(SCRIPT, include_str!("../page/align.js"))))
-        .route(
-            "/align_overlay.js",
-            get(async || file(SCRIPT, include_str!("../page/align_overlay.js"))),
-        )
-        .route(
-            "/align.css",
-            get(async || file("text/css; charset=utf-8", include_str!("../page/align.css"))),
-        )
         .route("/api/align", get(setup))
         .route("/api/align/pick", post(pick))
         .route("/api/align/solve", post(solve))
@@ -173,7 +165,7 @@ pub(super) fn routes() -> Router<Arc<ViewState>> {
 }
 
 async fn setup(State(view): State<Arc<ViewState>>) -> Response {
-    match &view.align {
+    match &view.panels.align {
         Some(panel) => Json(&panel.setup).into_response(),
         None => none(),
     }
@@ -202,7 +194,7 @@ async fn solve(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let Some(panel) = &view.align else { return none() };
+    let Some(panel) = &view.panels.align else { return none() };
     let picks: Picks = match ordered(&headers, body) {
         Ok(picks) => picks,
         Err(refusal) => return *refusal,
@@ -219,7 +211,7 @@ async fn save(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let Some(panel) = &view.align else { return none() };
+    let Some(panel) = &view.panels.align else { return none() };
     if !from.ip().to_canonical().is_loopback() {
         let text = "only a browser on this computer may write its files; open the page here, or through ssh -L";
         return (StatusCode::FORBIDDEN, text).into_response();

@@ -6,7 +6,7 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::{CpuRenderer, Splats};
 
 use super::super::engine::Engine;
-use super::super::{RendererInfo, Welcome};
+use super::super::{Panels, RendererInfo, Welcome};
 use super::*;
 use crate::scene::{WorldFromScene, default_arena};
 use crate::stop::Stop;
@@ -56,8 +56,10 @@ fn view(panel: bool) -> State<Arc<ViewState>> {
     State(Arc::new(ViewState {
         engine: Mutex::new(Engine::new(renderer, MovingObjects::default(), one, one)),
         welcome,
-        align: panel.then(|| Panel { aligner: Arc::new(Yes), setup }),
-        edit: None,
+        panels: Panels {
+            align: panel.then(|| Panel { aligner: Arc::new(Yes), setup }),
+            ..Panels::default()
+        },
         stop: Stop::default(),
     }))
 }

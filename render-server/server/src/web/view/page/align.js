@@ -1,7 +1,7 @@
 // The panel of `vizflyt scene align`: clicks become points of the scene, points a place in the room, and the place is saved.
 // The server finds points and solves; what was clicked is kept here alone.
 
-import { Drawing, drawRoom } from "/align_overlay.js";
+import { Drawing, drawRoom } from "/overlay.js";
 import { view } from "/view.js";
 
 const FLOOR = "#7df09a", LENGTH = "#ffd166", ABOVE = "#b9c7ff";
@@ -259,7 +259,7 @@ function resultRows() {
   return [...rows, end];
 }
 
-const panel = make("aside", { id: "align" });
+const panel = make("aside", { id: "align", className: "panel" });
 panel.setAttribute("aria-label", "align the scene with the room");
 
 function draw() {
@@ -336,7 +336,7 @@ addEventListener("keydown", (event) => {
   draw();
 });
 
-document.head.append(make("link", { rel: "stylesheet", href: "/align.css" }));
+document.head.append(make("link", { rel: "stylesheet", href: "/panel.css" }));
 view.canvas.after(overlay);
 document.body.append(panel);
 setup = await (await fetch("/api/align")).json();

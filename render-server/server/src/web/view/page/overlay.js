@@ -107,6 +107,24 @@ export class Drawing {
     context.globalAlpha = 1;
   }
 
+  /** Draws the edges of a box along the world's axes. */
+  box(min, max, style, name) {
+    for (const edge of edges(min, max)) this.line(edge, style);
+    this.label([min[0], min[1], max[2]], name, style.color);
+  }
+
+  /** Draws a ball as three rings. */
+  ball(centre, radius, color, name) {
+    for (const flat of [0, 1, 2]) {
+      const ring = Array.from({ length: 33 }, (_, k) => {
+        const around = [Math.cos((k * Math.PI) / 16), Math.sin((k * Math.PI) / 16)].map((share) => share * radius);
+        return centre.map((value, axis) => (axis === flat ? value : value + around[(axis - flat + 3) % 3 === 1 ? 0 : 1]));
+      });
+      this.line(ring, { color, width: 1.5 });
+    }
+    this.label(centre, name, color, [8, 14]);
+  }
+
   /** Draws a clicked point with its name. */
   marker(point, text, color) {
     const place = this.place(point);
@@ -134,8 +152,7 @@ export function drawRoom(drawing, room) {
   const { min_m: min, max_m: max } = room.geofence;
   if (min.every((value, k) => value < max[k])) drawFence(drawing, min, max);
   if (room.crop) {
-    for (const edge of edges(room.crop.min_m, room.crop.max_m)) drawing.line(edge, { color: "#9aa4b2", alpha: 0.6 });
-    drawing.label(room.crop.max_m, "crop", "#9aa4b2");
+    drawing.box(room.crop.min_m, room.crop.max_m, { color: "#9aa4b2", alpha: 0.6 }, "crop");
   }
   for (const stage of room.stages) drawGate(drawing, stage);
   drawVehicle(drawing, room);
