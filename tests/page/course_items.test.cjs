@@ -82,13 +82,16 @@ test("the pointer's ray meets what the picture shows there", async () => {
   const items = await module_;
   const request = { p_m: [1, 2, 1.5], yaw_rad: 0.3, pitch_rad: -0.4, fov_deg: 75, width_px: 1440, height_px: 900 };
   const middle = items.ray(request, [0, 0]);
-  const floor = items.onLevel(middle, 0);
+  const floor = items.onLevel(middle, [4, 2, 0]);
   const ahead = 1.5 / Math.tan(0.4);
   assert.ok(Math.hypot(floor[0] - 1 - ahead * Math.cos(0.3), floor[1] - 2 - ahead * Math.sin(0.3)) < 1e-9);
-  assert.equal(items.onLevel(items.ray({ ...request, pitch_rad: 0.4 }, [0, 0]), 0), null, "above the horizon is no floor");
+  assert.equal(items.onLevel(items.ray({ ...request, pitch_rad: 0.4 }, [0, 0]), [4, 2, 0]), null, "above the horizon is no floor");
   // At the right edge of the picture the ray is half the view to the right.
   const { way } = items.ray({ ...request, pitch_rad: 0 }, [0.5, 0]);
   assert.ok(Math.abs(Math.atan2(way[1], way[0]) - (0.3 - (37.5 * Math.PI) / 180)) < 1e-9);
+  // A gate at the height of the eye is moved across the view.
+  const level = items.onLevel(items.ray({ ...request, yaw_rad: 0, pitch_rad: 0 }, [0.25, 0.1]), [5, 2, 1.5]);
+  assert.ok(Math.abs(level[0] - 5) < 1e-9 && level[1] < 1 && level[2] === 1.5, String(level));
   const post = items.onLine(middle, [floor[0], floor[1], 3], [0, 0, 1]);
   assert.ok(Math.abs(post[2]) < 1e-9, "up the post from its foot");
   assert.equal(items.onLine({ from: [0, 0, 0], way: [0, 0, 1] }, [1, 0, 0], [0, 0, 1]), null);

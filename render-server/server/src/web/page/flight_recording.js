@@ -12,6 +12,8 @@
 
 /** Half an hour of states, 20 a second: what is longer is kept from its start on. */
 const MAX_MOMENTS = 36_000;
+/** As many points of a track as the views draw. */
+const MAX_TRACK = 3000;
 
 /**
  * Returns what lies between two numbers of each place.
@@ -66,6 +68,13 @@ export class FlightRecording {
     if (flight_s == null || !pose || (last && flight_s <= last.flight_s) || this.moments.length >= MAX_MOMENTS) return;
     const same = last?.passed.size === passed.size;
     this.moments.push({ flight_s, pose, objects, passed: same ? last.passed : new Set(passed) });
+  }
+
+  /** Returns the track that was flown, with its speeds; of a long flight every second point, or third. @returns {import("./messages").Track["points"]} */
+  track() {
+    const every = Math.ceil(this.moments.length / MAX_TRACK);
+    const kept = this.moments.filter((_, k) => k % every === 0);
+    return kept.map(({ pose: { p_world_m: [x, y, z], v_world_mps } }) => [x, y, z, Math.hypot(...v_world_mps)]);
   }
 
   /**

@@ -1,6 +1,13 @@
-// The bar that a flight is looked at again with: play, the moment, back to what is now.
+// The bar that flights are looked at again with: which, beside which other as a ghost, the moment, back to what is now; and
+// flights as files.
 
 import { clockText, make, makeButton, setText } from "./dom.js";
+import { readFlight, writeFlight } from "./flight_file.js";
+import { flightText, keepFlight, keptFlights } from "./flight_store.js";
+
+/** @typedef {import("./flight_recording.js").FlightRecording} FlightRecording */
+/** @typedef {import("./flight_file.js").About} About */
+/** A flight that can be chosen. @typedef {{ name: string, about: About, load: () => Promise<FlightRecording> }} Choice */
 
 /** What was watched for less is not looked at again. [s] */
 const SHORTEST_S = 1;
@@ -8,9 +15,23 @@ const SHORTEST_S = 1;
 const STEP_S = 0.02;
 
 export class ReplayBar {
-  /** @param {import("./flight_recording.js").FlightRecording} recording */
-  constructor(recording) {
-    this.recording = recording;
+  /**
+   * @param {FlightRecording} live the flight that is watched now
+   * @param {(text: string) => void} tell says what went wrong
+   */
+  constructor(live, tell) {
+    this.live = live;
+    this.tell = tell;
+    /** What is looked at. */
+    this.recording = live;
+    /** What flies beside it, and its track. @type {{ recording: FlightRecording, track: ReturnType<FlightRecording["track"]> } | null} */
+    this.ghost = null;
+    /** What is said of the flight that was watched last. @type {About | null} */
+    this.about = null;
+    /** Those that were kept, and those from files. @type {Choice[]} */
+    this.choices = [];
+    /** Those from files. @type {Choice[]} */
+    this.files = [];
     /** The moment that is shown; none while what is now is. [s since take-off] @type {number | null} */
     this.at_s = null;
     this.plays = false;
@@ -19,28 +40,136 @@ export class ReplayBar {
     this.range = make("input", { id: "replay-at", type: "range", step: String(STEP_S), ariaLabel: "moment of the flight" });
     this.time = make("output", { id: "replay-time" });
     this.now = makeButton("now", { id: "replay-now", hidden: true, title: "back to what is now" });
+    this.flight = make("select", { id: "replay-flight", ariaLabel: "flight", title: "which flight is shown" });
+    this.beside = make("select", { id: "replay-ghost", ariaLabel: "ghost", title: "another flight beside it" });
+    this.save = makeButton("save", { id: "replay-save", title: "this flight as a file" });
+    this.open = makeButton("open", { id: "replay-open", title: "a flight from a file" });
+    this.file = make("input", { id: "replay-file", type: "file", accept: ".json", hidden: true });
     this.element = make("div", { className: "replay", role: "group", ariaLabel: "replay of the flight", hidden: true },
-      this.play, this.range, this.time, this.now);
+      this.play, this.range, this.time, this.now, this.flight, this.beside, this.save, this.open, this.file);
     this.play.addEventListener("click", () => this.toggle());
     this.range.addEventListener("input", () => {
       this.plays = false;
       this.show(Number(this.range.value));
     });
     this.now.addEventListener("click", () => this.close());
+    this.flight.addEventListener("change", () => this.choose());
+    this.beside.addEventListener("change", () => this.chooseGhost());
+    this.save.addEventListener("click", () => this.download());
+    this.open.addEventListener("click", () => this.file.click());
+    this.file.addEventListener("change", () => this.upload());
   }
 
-  /** Offers the replay, or takes it away; that ends one that runs. @param {boolean} offered */
-  offer(offered) {
-    const { start_s, end_s } = this.recording;
-    const hidden = !offered || end_s - start_s < SHORTEST_S;
+  /** Whether the flight that is watched can be looked at again. */
+  get hasLive() {
+    return this.about != null && this.live.end_s - this.live.start_s >= SHORTEST_S;
+  }
+
+  /**
+   * Offers replays between flights; takes them away, and ends one that runs, in flight.
+   * @param {boolean} offered
+   * @param {About | null} about the flight that has just ended, if one has
+   */
+  offer(offered, about) {
+    if (!offered) this.about = null;
+    else if (about && !this.about && this.live.end_s - this.live.start_s >= SHORTEST_S) {
+      this.about = about;
+      keepFlight(about, writeFlight(this.live, about)).then(() => this.list(about.arena));
+      this.close();
+    }
+    const hidden = !offered || !(this.hasLive || this.choices.length);
     if (hidden === this.element.hidden) return;
     this.element.hidden = hidden;
     this.close();
   }
 
+  /** Lists what there is of an arena. @param {string} arena */
+  async list(arena) {
+    const kept = await keptFlights(arena);
+    // The newest is the one that is watched.
+    const older = kept.filter(({ at }) => at !== this.about?.at);
+    this.choices = [...this.files, ...older.map((about) => ({
+      name: named(about), about,
+      load: async () => readFlight(await flightText(about.key)).recording,
+    }))];
+    this.fill();
+  }
+
+  fill() {
+    const options = this.choices.map(({ name }, k) => [String(k), name]);
+    const put = (/** @type {HTMLSelectElement} */ select, /** @type {string} */ first) => {
+      const { value } = select;
+      select.replaceChildren(...[["", first], ...options].map(([value, textContent]) => make("option", { value, textContent })));
+      select.value = options.some(([of]) => of === value) ? value : "";
+    };
+    put(this.flight, this.hasLive ? "this flight" : "choose a flight");
+    put(this.beside, "no ghost");
+    this.flight.hidden = this.beside.hidden = !options.length;
+    this.play.disabled = this.range.disabled = this.save.disabled = this.recording === this.live && !this.hasLive;
+  }
+
+  async choose() {
+    await this.load(this.flight, (recording) => {
+      this.recording = recording ?? this.live;
+      this.plays = false;
+      this.show(recording ? recording.start_s : null);
+    });
+    this.fill();
+  }
+
+  async chooseGhost() {
+    await this.load(this.beside, (recording) => {
+      this.ghost = recording && { recording, track: recording.track() };
+      if (recording && this.at_s == null && this.hasLive) this.show(this.recording.start_s);
+    });
+  }
+
+  /**
+   * @param {HTMLSelectElement} select
+   * @param {(recording: FlightRecording | null) => void} take
+   */
+  async load(select, take) {
+    try {
+      take(select.value === "" ? null : await this.choices[Number(select.value)].load());
+    } catch (error) {
+      select.value = "";
+      take(null);
+      this.tell(`this flight cannot be shown: ${error instanceof Error ? error.message : error}`);
+    }
+  }
+
+  download() {
+    const about = this.choices[Number(this.flight.value || -1)]?.about ?? this.about;
+    if (!about) return;
+    const url = URL.createObjectURL(new Blob([writeFlight(this.recording, about)], { type: "application/json" }));
+    make("a", { href: url, download: `${about.arena}-${about.at.replaceAll(/[:.]/g, "-")}.flight.json` }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 1000);
+  }
+
+  async upload() {
+    const [file] = this.file.files ?? [];
+    this.file.value = "";
+    if (!file) return;
+    try {
+      const { recording, about } = readFlight(await file.text());
+      const choice = { name: `${file.name}: ${named(about)}`, about, load: async () => recording };
+      this.files.unshift(choice);
+      this.choices.unshift(choice);
+      this.fill();
+      this.flight.value = "0";
+      await this.choose();
+    } catch (error) {
+      this.tell(`${file.name}: ${error instanceof Error ? error.message : error}`);
+    }
+  }
+
   close() {
     this.plays = false;
+    this.recording = this.live;
+    this.ghost = null;
+    this.flight.value = this.beside.value = "";
     this.show(null);
+    this.fill();
   }
 
   toggle() {
@@ -73,4 +202,13 @@ export class ReplayBar {
     }
     return this.recording.at(this.at_s);
   }
+
+  /** Returns the ghost at the moment that is shown, with its track. */
+  ghostNow() {
+    const moment = this.at_s == null ? null : this.ghost?.recording.at(this.at_s);
+    return this.ghost && moment ? { pose: moment.pose, track: this.ghost.track } : null;
+  }
 }
+
+/** @param {About} about */
+const named = ({ at, outcome }) => `${at.slice(5, 16).replace("T", " ")} ${outcome}`.trim();

@@ -62,6 +62,8 @@ export class Room {
     this.stages = arena.stages.map((stage) => this.addStage(stage));
     if (arena.goal_m) this.addGoal(arena.goal_m);
     this.vehicle = this.addVehicle();
+    /** Another flight's, seen through. */
+    this.ghost = this.addVehicle(0.4);
     this.shadow = this.addShadow();
   }
 
@@ -137,12 +139,12 @@ export class Room {
     return Math.max(0.08, this.arena.body_radius_m);
   }
 
-  /** Adds four rotors, a body and a nose, as large as the sphere that encloses the vehicle. */
-  addVehicle() {
+  /** Adds four rotors, a body and a nose, as large as the sphere that encloses the vehicle. @param {number} [opacity] */
+  addVehicle(opacity = 1) {
     const r = this.bodyRadius();
     const vehicle = new THREE.Group();
-    const accent = new THREE.MeshLambertMaterial({ color: this.colour("--accent") });
-    const dark = new THREE.MeshLambertMaterial({ color: this.colour("--text") });
+    const accent = new THREE.MeshLambertMaterial({ color: this.colour("--accent"), transparent: opacity < 1, opacity });
+    const dark = new THREE.MeshLambertMaterial({ color: this.colour("--text"), transparent: opacity < 1, opacity });
     const body = new THREE.Mesh(new THREE.BoxGeometry(0.9 * r, 0.5 * r, 0.3 * r), accent);
     const nose = new THREE.Mesh(new THREE.ConeGeometry(0.24 * r, 0.6 * r, 12), accent);
     nose.rotation.z = -Math.PI / 2;

@@ -59,7 +59,8 @@ export class SpaceView {
     this.moving = new THREE.Group();
     this.scene.add(this.room.group, this.moving);
     this.track = makeTrack();
-    this.scene.add(this.track);
+    this.ghostTrack = makeTrack();
+    this.scene.add(this.track, this.ghostTrack);
     /** The part of the track that is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
     this.drawnTrack = { length: -1, end: undefined };
     this.drawn_ms = -Infinity;
@@ -168,14 +169,32 @@ export class SpaceView {
     if (this.follows) this.target.lerp(vehicle.position, 0.15);
   }
 
-  /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0] & { track: TrackPoint[] }} shown */
-  draw({ pose, now_ms, crashed, track, objects, passed }) {
+  /** Shows another flight beside this one. @param {import("./top_view.js").Ghost | null} ghost */
+  showGhost(ghost) {
+    this.room.ghost.visible = this.ghostTrack.visible = ghost != null;
+    if (!ghost) return;
+    this.room.ghost.position.set(...ghost.pose.p_world_m);
+    this.room.ghost.quaternion.set(...ghost.pose.rotation);
+    const { position, color } = this.ghostTrack.geometry.attributes;
+    const count = Math.min(ghost.track.length, MAX_POINTS), grey = this.room.colour("--muted");
+    for (let k = 0; k < count; k++) {
+      const [x, y, z] = ghost.track[k];
+      position.setXYZ(k, x, y, z);
+      color.setXYZ(k, grey.r, grey.g, grey.b);
+    }
+    position.needsUpdate = color.needsUpdate = true;
+    this.ghostTrack.geometry.setDrawRange(0, count);
+  }
+
+  /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0]} shown */
+  draw({ pose, now_ms, crashed, track, objects, passed, ghost }) {
     if (!this.canvas.clientWidth || now_ms - this.drawn_ms < this.rest_ms) return;
     this.drawn_ms = now_ms;
     const { room } = this;
     room.fenceColour.copy(room.colour(crashed ? "--bad" : "--warn"));
     this.showTrack(track);
     this.showObjects(objects);
+    this.showGhost(ghost);
     const next = room.stages.findIndex((_, k) => !passed.has(k));
     for (const [k, paint] of room.stages.entries())
       paint(room.colour(passed.has(k) ? "--good" : k === next ? "--accent" : "--muted"));

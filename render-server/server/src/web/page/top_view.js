@@ -7,6 +7,7 @@ import { cssColours } from "./theme.js";
 /** @typedef {import("./messages").Arena} Arena */
 /** @typedef {import("./messages").State["objects"][number]} MovingObject */
 /** A point of the track: where, and how fast. [m, world; m/s] @typedef {import("./messages").Track["points"][number]} TrackPoint */
+/** Another flight beside the one that is shown. @typedef {{ pose: import("./flight_recording.js").FlownPose, track: TrackPoint[] }} Ghost */
 /** @typedef {[x: number, y: number]} Point2 */
 /** At least x and y. @typedef {readonly [number, number, ...number[]]} Point */
 
@@ -156,8 +157,8 @@ export class TopView {
     if (this.track.length > 3000) this.track = this.track.filter((_, k) => k % 2 === 0);
   }
 
-  /** @param {{ pose: import("./panels/arena_view.js").ShownPose | null, now_ms: number, crashed: boolean, objects: MovingObject[], passed: Set<number> }} shown */
-  draw({ pose, now_ms, crashed, objects, passed }) {
+  /** @param {{ pose: import("./panels/arena_view.js").ShownPose | null, now_ms: number, crashed: boolean, objects: MovingObject[], passed: Set<number>, track: TrackPoint[], ghost: Ghost | null }} shown */
+  draw({ pose, now_ms, crashed, objects, passed, track, ghost }) {
     const { g, arena, ratio } = this;
     if (!arena || !this.scale) return;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -167,7 +168,8 @@ export class TopView {
     for (const [k, stage] of arena.stages.entries()) this.drawStage(stage, passed.has(k));
     if (arena.goal_m) this.drawGoal(arena.goal_m, arena.goal_radius_m, now_ms);
     for (const object of objects) this.drawObject(object);
-    this.drawTrack(arena);
+    if (ghost) this.drawGhost(arena, ghost);
+    this.drawTrack(arena, track);
     if (pose) this.drawVehicle(arena, pose, now_ms);
     this.drawScaleBar();
   }
@@ -275,9 +277,26 @@ export class TopView {
     g.fill();
   }
 
-  /** @param {Arena} arena */
-  drawTrack(arena) {
-    const { g, track } = this;
+  /** Another flight: its way and its outline. @param {Arena} arena @param {Ghost} ghost */
+  drawGhost(arena, { pose, track }) {
+    const { g, style } = this;
+    g.strokeStyle = style.muted;
+    g.lineWidth = 1.5;
+    g.beginPath();
+    for (const point of track) g.lineTo(...this.at(point));
+    g.stroke();
+    const r = Math.max(9, arena.body_radius_m * this.scale);
+    g.lineWidth = 2;
+    g.setLineDash([4, 3]);
+    g.beginPath();
+    g.arc(...this.at(pose.p_world_m), r, 0, 7);
+    g.stroke();
+    g.setLineDash([]);
+  }
+
+  /** @param {Arena} arena @param {TrackPoint[]} track */
+  drawTrack(arena, track) {
+    const { g } = this;
     const fastest_mps = Math.max(1, arena.max_speed_mps);
     g.lineWidth = 3;
     g.lineJoin = g.lineCap = "round";

@@ -25,7 +25,7 @@ const VIEWS = ["top", "space", "chase", "onboard"];
 const buttons = VIEWS.map((view) => make("button", { id: `view-${view}`, type: "button", textContent: view }));
 const fastest = make("span", { id: "speed-top", textContent: "m/s" });
 const recording = new FlightRecording();
-const replay = new ReplayBar(recording);
+const replay = new ReplayBar(recording, showHint);
 const hint = make("p", { id: "hint", className: "hint", hidden: true });
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
   top, spaceCanvas, stages,
@@ -47,6 +47,8 @@ let state = null;
 /** Indices of the stages passed in this flight. @type {Set<number>} */
 const passed = new Set();
 let boot = "", flown = false;
+/** The track of the flight that is looked at again. @type {{ of: FlightRecording, track: import("../messages").Track["points"] } | null} */
+let former = null;
 /** @type {View} */
 let view = "top";
 
@@ -115,6 +117,18 @@ function hintOf({ pose, runtime, landed }) {
   return runtime || landed ? "" : `waiting for a runtime: vizflyt fly PLUGIN --vehicle ${arena?.vehicle} --server …`;
 }
 
+/** What is said of the flight that has just ended. @param {State} state */
+function ended({ outcome }) {
+  return { arena: arena?.name ?? "", vehicle: arena?.vehicle ?? "", outcome: outcome?.title ?? "landed", at: new Date().toISOString() };
+}
+
+/** The track of what is shown: of now, or of a flight of another time. */
+function shownTrack() {
+  if (replay.recording === recording) return topView.track;
+  if (former?.of !== replay.recording) former = { of: replay.recording, track: replay.recording.track() };
+  return former.track;
+}
+
 /** @type {import("../panels.js").Panel} */
 export const arenaView = {
   element,
@@ -124,6 +138,8 @@ export const arenaView = {
     if (arena.boot !== boot) {
       [boot, flown] = [arena.boot, false];
       recording.clear();
+      replay.offer(false, null);
+      replay.list(arena.name);
     }
     topView.setArena(arena);
     spaceView?.setArena(arena, theme());
@@ -150,7 +166,8 @@ export const arenaView = {
       showStages();
     }
     recording.add(state, passed);
-    replay.offer(flown && (state.landed || state.outcome != null));
+    const hasEnded = flown && (state.landed || state.outcome != null);
+    replay.offer(hasEnded || state.flight_s == null, hasEnded ? ended(state) : null);
     flown = state.flight_s != null;
     if (state.pose) {
       const fresh = state.pose.age_s < FRESH_S;
@@ -161,20 +178,22 @@ export const arenaView = {
   },
   onFrame(now_ms) {
     const moment = replay.moment(now_ms);
-    const isOver = !moment || moment.flight_s >= recording.end_s;
+    const isOver = !moment || (replay.recording === recording && moment.flight_s >= recording.end_s);
     const shown = {
       now_ms,
       crashed: isOver && ["collided", "geofence"].includes(state?.outcome?.outcome ?? ""),
       pose: moment ? { ...moment.pose, age_s: 0, received_ms: now_ms } : pose,
       objects: (moment ?? state)?.objects ?? [],
       passed: moment?.passed ?? passed,
+      track: shownTrack(),
+      ghost: replay.ghostNow(),
     };
     if (shown.passed !== lit) {
       lit = shown.passed;
       showStages();
     }
     if (spaceCanvas.hidden) topView.draw(shown);
-    else spaceView?.draw({ ...shown, track: topView.track });
+    else spaceView?.draw(shown);
   },
   onTheme() {
     topView.restyle();

@@ -96,7 +96,9 @@ pub(super) struct Panel {
 
 /// An arena whose course is set up.
 struct Session {
+    /// With the course as it is shown.
     arena: ArenaConfig,
+    on_file: Course,
     folder: PathBuf,
     splats: Splats,
     seen: Option<Seen>,
@@ -172,8 +174,9 @@ impl Panel {
             models.insert(config.scene.clone(), Model { splats, field, is_written: true });
         }
         let drawn = arena.objects.iter().map(|object| object.scene.clone()).collect();
-        let still = None;
-        let session = Session { arena, folder, splats, seen, file, args, still, models, drawn };
+        let (on_file, still) = (Course::of(&arena), None);
+        let session =
+            Session { arena, on_file, folder, splats, seen, file, args, still, models, drawn };
         Self { session: Mutex::new(session) }
     }
 }
@@ -261,7 +264,9 @@ impl Session {
         new.dedup();
         let with_path = |file: &String| (self.folder.join(file), self.models[file].splats.clone());
         let models: Vec<_> = new.iter().map(with_path).collect();
-        let said = self.file.save(&Course::of(&self.arena), &models)?;
+        let course = Course::of(&self.arena);
+        let said = self.file.save(&course, &models)?;
+        self.on_file = course;
         for file in new {
             if let Some(model) = self.models.get_mut(&file) {
                 model.is_written = true;
@@ -341,13 +346,12 @@ async fn obey(
 fn carry_out(view: &ViewState, order: Order) -> Result<Report> {
     let panel = view.panels.course.as_ref().context("this page sets up no course")?;
     let mut session = lock(&panel.session);
-    let (course, saves) = match order {
-        Order::Open => (None, false),
-        Order::Look(course) => (Some(*course), false),
-        Order::Save(course) => (Some(*course), true),
+    let (course, opens, saves) = match order {
+        Order::Open => (session.on_file.clone(), true, false),
+        Order::Look(course) => (*course, false, false),
+        Order::Save(course) => (*course, false, true),
     };
-    let opens = course.is_none();
-    if let Some(Err(findings)) = course.map(|course| session.take(course)) {
+    if let Err(findings) = session.take(course) {
         return Ok(session.report(findings));
     }
     let renderer = session.renderer()?;
@@ -356,7 +360,7 @@ fn carry_out(view: &ViewState, order: Order) -> Result<Report> {
     let Checked { findings, way_m, least_room_m } = session.look();
     let said = if saves { session.save()? } else { Vec::new() };
     let report = session.report(findings.into_iter().map(Found::from).collect());
-    let course = opens.then(|| Course::of(&session.arena));
+    let course = opens.then(|| session.on_file.clone());
     let least_room_m = least_room_m.is_finite().then_some(least_room_m);
     Ok(Report { course, way_m, least_room_m, said, ..report })
 }

@@ -70,6 +70,19 @@ function select(key) {
   draw();
 }
 
+/** Selects from the list; looks at what is not in the picture. */
+function selectAndFace(key) {
+  select(key);
+  const item = chosen();
+  const at = item && items.centre(course, item);
+  const place = at && shown && drawing().place(at);
+  if (!at || (place && place.at[0] > 40 && place.at[0] < innerWidth - 400 && place.at[1] > 40 && place.at[1] < innerHeight - 40)) return;
+  const way = at.map((value, k) => value - view.eye.p[k]);
+  view.eye.yaw = Math.atan2(way[1], way[0]);
+  view.eye.pitch = Math.max(-1.2, Math.min(1.2, Math.atan2(way[2], Math.hypot(way[0], way[1]))));
+  view.changed(false);
+}
+
 function add(kind) {
   const { eye } = view;
   const ahead = Math.min(shown?.info.middle_m ?? 3, 3);
@@ -185,7 +198,7 @@ function verdict() {
 function findings() {
   const line = ({ key, text }) => {
     const item = items.items(course).find((item) => key.startsWith(item.key));
-    return make("li", {}, button(item?.name ?? key, () => item && select(item.key), { disabled: !item }), make("span", { textContent: text }));
+    return make("li", {}, button(item?.name ?? key, () => item && selectAndFace(item.key), { disabled: !item }), make("span", { textContent: text }));
   };
   return make("ul", { id: "course-findings" }, ...(report.findings ?? []).map(line));
 }
@@ -197,7 +210,7 @@ function draw() {
   const focus = document.activeElement?.ariaLabel, scrolled = panel.scrollTop, item = chosen();
   const isSaved = saved === JSON.stringify(course);
   const list = items.items(course).map((one) => {
-    const element = button(one.name, () => select(one.key === selected ? null : one.key), { className: one.kind });
+    const element = button(one.name, () => (one.key === selected ? select(null) : selectAndFace(one.key)), { className: one.kind });
     element.setAttribute("aria-pressed", String(one.key === selected));
     return make("li", {}, element);
   });
@@ -315,7 +328,7 @@ take("pointermove", (event) => {
   }
   const { item, handle: { id, at, axis } } = held;
   const along = axis ?? (event.shiftKey ? [0, 0, 1] : null);
-  const to = along ? items.onLine(pointed(event), at, along) : items.onLevel(pointed(event), at[2]);
+  const to = along ? items.onLine(pointed(event), at, along) : items.onLevel(pointed(event), at);
   if (to) {
     items.drag(course, item, id, to, { free: event.ctrlKey, surface: surface(event), floor_z_m: report.floor_z_m });
     drawOverlay();

@@ -204,6 +204,8 @@ export function add(course, kind, [x, y], yaw, floor_z_m) {
 }
 
 // ---- from the pointer to the world -------------------------------------------------------------
+const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
+
 /** The ray through a place on the page (as shares of it, from its middle, -0.5 to 0.5) of the picture that a request shows. */
 export function ray(request, [u, v]) {
   const [cy, sy] = [Math.cos(request.yaw_rad), Math.sin(request.yaw_rad)];
@@ -214,13 +216,17 @@ export function ray(request, [u, v]) {
   return { from: request.p_m, way: ahead.map((value, k) => value + right[k] * x + down[k] * y) };
 }
 
-const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
-
-/** Where a ray meets the level plane of a height, no farther than some metres; null if it does not. */
-export function onLevel({ from, way }, z, farthest_m = 200) {
-  const t = (z - from[2]) / way[2];
-  const at = from.map((value, k) => value + way[k] * t);
-  return t > 0 && Math.hypot(...at.map((value, k) => value - from[k])) < farthest_m ? [at[0], at[1], z] : null;
+/**
+ * Where a ray meets the level plane of a place, no farther than some metres; null if it does not. Seen from its own height a
+ * plane is a line: then the place moves across the view alone.
+ */
+export function onLevel({ from, way }, at, farthest_m = 200) {
+  const flat = [way[0], way[1], 0];
+  const isEdgeOn = Math.abs(at[2] - from[2]) < 0.12 * Math.hypot(at[0] - from[0], at[1] - from[1]);
+  const gap = at.map((value, k) => value - from[k]);
+  const t = isEdgeOn ? dot([gap[0], gap[1], 0], gap) / dot([gap[0], gap[1], 0], flat) : gap[2] / way[2];
+  const reached = from.map((value, k) => value + way[k] * t);
+  return t > 0 && Math.hypot(...reached.map((value, k) => value - from[k])) < farthest_m ? [reached[0], reached[1], at[2]] : null;
 }
 
 /** The point of a line, through a place along an axis, that is nearest to a ray; null if they run alike. */
