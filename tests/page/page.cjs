@@ -167,9 +167,37 @@ async function flight(browser) {
   }
   await page.locator("#replay-now").click();
   assert.ok(await page.locator("#replay-now").isHidden());
+  await keptFlight(page, url);
   assert.deepEqual(page.faults, []);
   await page.context().close();
   assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
+}
+
+/** The flight that a page has watched: a program started anew has it still; it is saved, read again, and flies beside itself. */
+async function keptFlight(page, url) {
+  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--port", new URL(url).port);
+  await demo.line(/page\s+http:\S+/);
+  await page.reload();
+  await until(page, "phase-text", /ready to start/);
+  await until(page, "replay-flight", /choose a flight.*(Stopped by hand|Collision|Left the geofence)/);
+  assert.ok(await page.locator("#replay-play").isDisabled(), "nothing has been watched yet");
+  await page.locator("#replay-flight").selectOption({ index: 1 });
+  await page.locator("#replay-at").fill("1");
+  assert.match(await text(page, "replay-time"), /^0:01\.0 of \d:\d\d\.\d$/);
+  const [saved] = await Promise.all([page.waitForEvent("download"), page.locator("#replay-save").click()]);
+  assert.match(saved.suggestedFilename(), /^race-.*\.flight\.json$/);
+  const file = path.join(scratch, "again.json");
+  await saved.saveAs(file);
+  await page.locator("#replay-file").setInputFiles(file);
+  await until(page, "replay-flight", /again\.json/);
+  await page.locator("#replay-ghost").selectOption({ index: 2 });
+  await page.locator("#replay-at").fill("1");
+  await shot(page, "laptop-ghost");
+  fs.writeFileSync(file, "{}");
+  await page.locator("#replay-file").setInputFiles(file);
+  await until(page, "outcome-text", /again\.json: the file is no flight of VizFlyt/);
+  demo.child.kill("SIGINT");
+  await demo.ended;
 }
 
 /** A flight that flies straight into a wall: its crash card comes by itself, and is looked at by keyboard alone. */

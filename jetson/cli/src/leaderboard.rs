@@ -1,16 +1,17 @@
 //! `vizflyt leaderboard`: teams, runs and standings of the lab's flights, from the database that `vizflyt serve`
 //! writes; and signed grades, which are added here.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
 use vizflyt_server::flights::leaderboard::{
-    Attempt, Database, GradeBoard, GradeEntry, Leaderboard, Run, Standing, grade_boards, standings,
-    write_csv,
+    Attempt, Database, Erased, GradeBoard, GradeEntry, Leaderboard, Run, Standing, grade_boards,
+    standings, write_csv,
 };
 
+use crate::class::archive::{Files, pack};
 use crate::grade::{self, Grade};
 use crate::terminal::print_line;
 
@@ -20,6 +21,8 @@ use crate::terminal::print_line;
   vizflyt leaderboard                                who leads on each course
   vizflyt leaderboard team add wasps                 prints the token by which the team checks in
   vizflyt leaderboard export --course race runs.csv
+  vizflyt leaderboard team export wasps wasps.json   all that is kept of a team; `team erase wasps` erases it
+  vizflyt leaderboard archive autumn.zip             a term in one file
   vizflyt leaderboard add grade.json --team wasps    a grade of `vizflyt grade`, if it is as it was signed
   vizflyt leaderboard --database postgres://user:password@db.example.edu/vizflyt")]
 pub(crate) struct LeaderboardArgs {
@@ -42,6 +45,12 @@ enum LeaderboardCommand {
     },
     /// Writes the runs as CSV.
     Export(ExportArgs),
+    /// Writes a term into one file: every team's records, all runs.
+    Archive {
+        /// A ZIP
+        #[arg(value_name = "FILE.zip")]
+        out: PathBuf,
+    },
     /// Adds a signed grade of `vizflyt grade`; once, and only as it was signed.
     Add(AddArgs),
 }
@@ -86,6 +95,22 @@ enum TeamCommand {
         /// Its name
         name: String,
     },
+    /// Writes all that is kept of a team: runs with their verdicts, signed grades.
+    Export {
+        /// Its name
+        name: String,
+        /// Where to write; standard output without it
+        #[arg(value_name = "FILE.json")]
+        out: Option<PathBuf>,
+    },
+    /// Erases a team with its runs and grades, for good.
+    Erase {
+        /// Its name
+        name: String,
+        /// Erases; without it, only says what there is
+        #[arg(long)]
+        yes: bool,
+    },
 }
 
 #[derive(Args, Debug)]
@@ -127,6 +152,7 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
     match args.command.as_ref().unwrap_or(&LeaderboardCommand::Show(shown)) {
         LeaderboardCommand::Show(show) => self::show(&board, show).await,
         LeaderboardCommand::Team { command } => team(&board, command).await,
+        LeaderboardCommand::Archive { out } => archive(&board, out).await,
         // Dealt with above.
         LeaderboardCommand::Add(_) => Ok(()),
         LeaderboardCommand::Export(export) => {
@@ -171,7 +197,57 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
             board.retire_team(name).await?;
             print_line(format!("the token of team '{name}' opens nothing any more; its runs stay"));
         }
+        TeamCommand::Export { name, out } => {
+            let text = records_text(board, name).await?;
+            let Some(path) = out else {
+                print_line(text);
+                return Ok(());
+            };
+            std::fs::write(path, text)
+                .with_context(|| format!("cannot write {}", path.display()))?;
+            print_line(format!("all that is kept of '{name}' is in {}", path.display()));
+        }
+        TeamCommand::Erase { name, yes: false } => {
+            let records = board.records_of(name).await?;
+            print_line(format!(
+                "'{name}' has {} runs and {} grades here; `--yes` erases them for good. Logs, reports and hand-ins are files \
+                 of their own: docs/guides/records.md",
+                records.runs.len(),
+                records.grades.len()
+            ));
+        }
+        TeamCommand::Erase { name, yes: true } => {
+            let Erased { runs, grades } = board.erase_team(name).await?;
+            print_line(format!("team '{name}', {runs} runs and {grades} grades are erased"));
+        }
     }
+    Ok(())
+}
+
+async fn records_text(board: &Leaderboard, team: &str) -> Result<String> {
+    Ok(serde_json::to_string_pretty(&board.records_of(team).await?)?)
+}
+
+/// Writes a term: `runs.csv`, and a file for each team, numbered, as a name need not be one of a file.
+async fn archive(board: &Leaderboard, out: &Path) -> Result<()> {
+    let mut files = Files::new();
+    let runs = board.runs(None).await?;
+    let mut csv = Vec::new();
+    write_csv(&runs, &mut csv)?;
+    files.insert("runs.csv".to_owned(), csv);
+    let teams = board.teams().await?;
+    for (number, team) in (1..).zip(&teams) {
+        let text = records_text(board, &team.name).await?;
+        files.insert(format!("teams/{number:03}.json"), text.into_bytes());
+    }
+    std::fs::write(out, pack(&files)?)
+        .with_context(|| format!("cannot write {}", out.display()))?;
+    print_line(format!(
+        "{} teams and {} runs written to {}",
+        teams.len(),
+        runs.len(),
+        out.display()
+    ));
     Ok(())
 }
 

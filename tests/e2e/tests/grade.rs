@@ -508,6 +508,20 @@ fn on_the_leaderboard(rig: &Rig, whole: &str, part: &str) {
         (&1.into(), &"wasps".into(), &2.into())
     );
     assert!(place["median_s"].as_f64().unwrap() > 5.0, "{place}");
+    // All that is kept of a team is its own to have, the signed grade among it, and to have erased.
+    let kept: Value =
+        serde_json::from_str(&leaderboard(rig, &["team", "export", "wasps"]).unwrap()).unwrap();
+    let exported = rig.at("exported.json");
+    fs::write(&exported, kept["grades"][0]["document"].as_str().unwrap()).unwrap();
+    let verified = Command::new(vizflyt()).args(["grade", "verify", &exported, &keys]).status();
+    assert!(verified.unwrap().success(), "{kept}");
+    let asked = leaderboard(rig, &["team", "erase", "wasps"]).unwrap();
+    assert!(asked.contains("0 runs and 1 grades") && asked.contains("--yes"), "{asked}");
+    let term = rig.at("term.zip");
+    assert!(leaderboard(rig, &["archive", &term]).unwrap().starts_with("2 teams and 0 runs"));
+    leaderboard(rig, &["team", "erase", "wasps", "--yes"]).unwrap();
+    let teams = leaderboard(rig, &["team", "list"]).unwrap();
+    assert_eq!(teams.trim(), "bees");
 }
 
 #[test]

@@ -6,7 +6,7 @@
 //! ```
 //! It can be ended at any time and begun again: what is graded, of the same hand-in and with the same options, is kept.
 
-mod archive;
+pub(crate) mod archive;
 mod page;
 mod roster;
 mod submission;

@@ -112,12 +112,20 @@ pub(crate) struct LabArgs {
     /// Also sends the vehicle's true pose here, as `vizflyt sim --truth-to` does: to measure localization by.
     #[arg(long, value_name = "ADDR:PORT")]
     pub truth_to: Option<SocketAddr>,
-    /// Port of the page; a free one without it.
+    /// Port of the page; without it 8377, where a browser finds the flights that it has kept, or a free one.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
 }
 
 impl LabArgs {
+    /// Returns where the page is served: where it was the last time, if a person looks and nobody else has the place.
+    fn page_address(&self) -> String {
+        let is_usual = self.port == 0
+            && !self.headless
+            && TcpListener::bind(("127.0.0.1", USUAL_PORT)).is_ok();
+        format!("127.0.0.1:{}", if is_usual { USUAL_PORT } else { self.port })
+    }
+
     /// Returns the project's name, else the scene's name or path.
     pub(crate) fn scene(&self) -> &str {
         if let Some(project) = &self.project {
@@ -226,6 +234,9 @@ enum LabEnd {
 }
 
 /// The running children and what they have reported.
+/// A browser keeps what it keeps by address.
+const USUAL_PORT: u16 = 8377;
+
 struct Show {
     /// The option that gives the children our log level.
     log_level: OsString,
@@ -240,7 +251,7 @@ struct Show {
 impl Show {
     fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<LabEnd> {
         let lab = flight.lab;
-        let page = format!("127.0.0.1:{}", lab.port);
+        let page = lab.page_address();
         // The server would name an option of its own.
         if let Err(error) = TcpListener::bind(&page) {
             bail!(

@@ -14,6 +14,7 @@
 mod database_url;
 mod export;
 pub(crate) mod grades;
+mod records;
 mod standings;
 mod store;
 #[cfg(test)]
@@ -22,6 +23,7 @@ pub(crate) mod tests;
 pub use database_url::{Database, UnknownDatabase};
 pub use export::write_csv;
 pub use grades::{GradeBoard, GradeEntry, GradePlace, grade_boards};
+pub use records::{Erased, GradeRecord, RunRecord, TeamRecords};
 pub use standings::{Standing, standings};
 pub use store::{Leaderboard, LeaderboardError, MAX_RUNS};
 

@@ -14,7 +14,7 @@ use super::{Attempt, Database, NewRun, Run, RunEnd, RunState, Team};
 #[derive(Clone, Debug)]
 pub struct Leaderboard {
     pub(super) pool: AnyPool,
-    database: Database,
+    pub(super) database: Database,
 }
 
 /// Why the leaderboard did not do as asked.
@@ -49,6 +49,11 @@ pub enum LeaderboardError {
     /// No team has that name.
     #[error("there is no team '{0}'; the teams are: {1}")]
     NoTeam(String, String),
+    /// A team whose flight is not over.
+    #[error(
+        "team '{0}' is flying; wait until its run has ended, or a minute where its server has gone"
+    )]
+    Flying(String),
     /// No more official attempts.
     #[error("team '{team}' has flown its {most} official attempts on '{course}'; practice is free")]
     Spent {
@@ -102,6 +107,8 @@ impl Leaderboard {
                         connection.execute("PRAGMA journal_mode = WAL").await?;
                         connection.execute("PRAGMA synchronous = FULL").await?;
                         connection.execute("PRAGMA foreign_keys = ON").await?;
+                        // What is erased is overwritten.
+                        connection.execute("PRAGMA secure_delete = ON").await?;
                     }
                     Ok(())
                 })

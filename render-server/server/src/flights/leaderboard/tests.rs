@@ -101,6 +101,28 @@ async fn behaves(board: &Leaderboard) {
     assert!(board.retire_team("bees").await.is_err());
 }
 
+/// All that is kept of a team is read, then erased: others keep theirs.
+async fn erases(board: &Leaderboard) {
+    let records = board.records_of("wasps").await.unwrap();
+    assert_eq!((records.runs.len(), records.grades.len()), (2, 1));
+    assert!(records.runs.iter().any(|run| run.verdict == Some(serde_json::json!({"score": 1}))));
+    assert_eq!(records.grades[0].document, "{}");
+    let flying = board.begin(&new(Some("wasps"), Attempt::Practice), None).await.unwrap();
+    let refused = board.erase_team("wasps").await.unwrap_err().to_string();
+    assert!(refused.contains("is flying"), "{refused}");
+    assert_eq!(board.records_of("wasps").await.unwrap().grades.len(), 1, "all or nothing");
+    board.end(&flying, &end(0)).await.unwrap();
+    assert_eq!(board.erase_team("wasps").await.unwrap(), Erased { runs: 3, grades: 1 });
+    assert!(board.teams().await.unwrap().iter().all(|team| team.name != "wasps"));
+    assert!(board.runs(None).await.unwrap().iter().all(|run| run.team.is_none()));
+    assert_eq!(board.grades().await.unwrap().len(), 1);
+    for gone in
+        [board.erase_team("wasps").await.map(|_| ()), board.records_of("wasps").await.map(|_| ())]
+    {
+        assert!(gone.unwrap_err().to_string().starts_with("there is no team 'wasps'"));
+    }
+}
+
 /// The same for grades, with the team 'wasps' there.
 async fn grades_behave(board: &Leaderboard) {
     let own = grade("wasps", 4.25, 7, 31.5);
@@ -147,6 +169,12 @@ async fn a_file_keeps_teams_and_runs() {
     drop(board);
     let again = Leaderboard::open(&database).await.unwrap();
     assert_eq!(again.runs(None).await.unwrap().len(), 3);
+    erases(&again).await;
+    let Database::File(path) = &database else { panic!("a file") };
+    for file in std::fs::read_dir(path.parent().unwrap()).unwrap() {
+        let bytes = std::fs::read(file.unwrap().path()).unwrap();
+        assert!(!bytes.windows(5).any(|word| word == b"wasps"), "a name is left");
+    }
     drop(folder);
 }
 
@@ -160,6 +188,7 @@ async fn a_postgres_server_keeps_them_alike() {
     };
     let board = Leaderboard::open(&url.parse().unwrap()).await.unwrap();
     behaves(&board).await;
+    erases(&board).await;
 }
 
 #[cfg(not(feature = "postgres"))]

@@ -211,4 +211,8 @@ export class ReplayBar {
 }
 
 /** @param {About} about */
-const named = ({ at, outcome }) => `${at.slice(5, 16).replace("T", " ")} ${outcome}`.trim();
+function named({ at, outcome }) {
+  const when = new Date(at);
+  const time = Number.isNaN(when.getTime()) ? "" : when.toLocaleString([], { day: "numeric", month: "short", hour: "2-digit", minute: "2-digit", second: "2-digit" });
+  return `${time} ${outcome}`.trim();
+}

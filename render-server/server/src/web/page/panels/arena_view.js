@@ -2,6 +2,7 @@
 
 import { make, setText } from "../dom.js";
 import { FlightRecording } from "../flight_recording.js";
+import { showOutcome } from "../outcome.js";
 import { ReplayBar } from "../replay_bar.js";
 import { theme } from "../theme.js";
 import { TopView } from "../top_view.js";
@@ -25,7 +26,7 @@ const VIEWS = ["top", "space", "chase", "onboard"];
 const buttons = VIEWS.map((view) => make("button", { id: `view-${view}`, type: "button", textContent: view }));
 const fastest = make("span", { id: "speed-top", textContent: "m/s" });
 const recording = new FlightRecording();
-const replay = new ReplayBar(recording, showHint);
+const replay = new ReplayBar(recording, (text) => showOutcome("warn", "No flight", text));
 const hint = make("p", { id: "hint", className: "hint", hidden: true });
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
   top, spaceCanvas, stages,
