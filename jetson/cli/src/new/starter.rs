@@ -65,6 +65,13 @@ const STARTERS: &[Starter] = &[
             "p5/starter" "README.md" "hand.py" "plugin.py" "score.py" "states.py" "test_hand.py" "test_score.py" "test_states.py"
         )],
     },
+    Starter {
+        project: "forest",
+        plugin: "plugin.py",
+        parts: &[files!(
+            "forest/starter" "README.md" "plugin.py" "primitives.py" "sight.py" "test_primitives.py" "test_sight.py"
+        )],
+    },
 ];
 
 /// The projects that are not flown through a course of their own, but through the empty net.

@@ -1,0 +1,44 @@
+"""The course's elective "forest": what a starter's tests find, and how fast the reference flies."""
+
+import re
+
+import pytest
+from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
+
+# What the starter fails in, and nothing else.
+UNFINISHED = {
+    "test_nothing_in_the_way_is_straight_on_and_fast",
+    "test_a_trunk_in_the_way_is_passed_without_a_touch",
+    "test_a_gap_between_trunks_is_taken_in_its_middle",
+    "test_an_obstacle_is_where_it_stands",
+    "test_two_pixels_are_no_obstacle",
+}
+
+
+@pytest.mark.parametrize("who", ["starter", "solution"])
+def test_tests_of_the_starter_pass_where_the_work_is_done(tmp_path, who):
+    failed, said = failing(handed_in(tmp_path / "my-forest", "forest", who))
+    assert failed == (UNFINISHED if who == "starter" else set()), said
+
+
+def test_a_starter_says_which_of_its_tests_fail():
+    assert said_to_fail("forest") == UNFINISHED
+
+
+def test_a_starter_flies_into_a_trunk(program, tmp_path):
+    (run,) = grade(program, handed_in(tmp_path / "my-forest", "forest", "starter"), "forest", "ug")
+    assert (run["outcome"], run["score"]) == ("collided", 0.0), run
+
+
+def test_a_solution_is_fast_and_touches_nothing(program, tmp_path):
+    """By the project's file as it is here, whatever limits the program has been built with."""
+    project = COURSE.parents[1] / "render-server/scenes/projects/forest.toml"
+    text = (COURSE / "forest/README.md").read_text()
+    all_mps = float(re.search(r"^\| greatest speed [^|]*\| \d+ \| >= (\S+) m/s \|", text, re.M)[1])
+    (run,) = grade(program, handed_in(tmp_path / "my-forest", "forest", "solution"), project, "ug", first=301)
+    assert (run["outcome"], run["score"]) == ("finished", 100.0), run
+    assert run["max_speed_mps"] >= all_mps and run["seconds"] < 10.5, run
+
+
+def test_the_points_add_up():
+    assert points_of("forest") == 100
