@@ -51,13 +51,13 @@ pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 pub struct ArenaConfig {
     /// The arena's name; at most 32 bytes.
     pub name: String,
-    /// The splats that it is seen as, and their place in it.
+    /// The splats that the room is seen as, and how they lie in the world.
     pub scene: SceneConfig,
     /// Radius of the sphere that encloses the vehicle. [m]
     pub body_radius_m: f64,
-    /// Height above the spawn to which the runtime climbs before the plugin flies. [m]
+    /// Height above the spawn to which the vehicle climbs before the plugin flies it. [m]
     pub takeoff_height_m: f64,
-    /// From take-off; 0 is none. [s]
+    /// So long after take-off the flight is over; 0 is never. [s]
     #[serde(default)]
     pub time_limit_s: f64,
     /// Whether plugins get the vehicle's pose and velocity; by default they do.
@@ -71,43 +71,44 @@ pub struct ArenaConfig {
     /// Where the flight shall end; without one it ends with the last stage.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub goal: Option<Goal>,
-    /// Keep-in box for the body's surface.
+    /// The box that the body's surface must not leave, along the world's axes.
     pub geofence: Geofence,
-    /// What the guard enforces.
+    /// What the guard enforces, whatever a plugin asks.
     pub limits: Limits,
-    /// Parts of the vehicle within its sphere; without any, the sphere is the vehicle.
+    /// Parts of the vehicle, up to 16; without any, it is the sphere of `body_radius_m`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub body: Vec<BodyPart>,
     /// Boxes that the body's surface must stay out of, up to 8.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub no_fly: Vec<NoFly>,
-    /// How obstacles are baked from the scene.
+    /// How obstacles are made of the scene: in a grid of cubes (voxels), each solid or free.
     #[serde(default)]
     pub occupancy: Occupancy,
-    /// Light and weather.
+    /// Light, air and weather, for the cameras alone; without it, the scene is as it was captured.
     #[serde(default, skip_serializing_if = "EnvironmentConfig::is_default")]
     pub environment: EnvironmentConfig,
     /// How poses are fused, when they count as lost, and for which moment images are rendered.
     #[serde(default, skip_serializing_if = "PoseConfig::is_default")]
     pub pose: PoseConfig,
-    /// The cameras, in the order of their index on the wire; 1 to 8.
+    /// The cameras, 1 to 8, in the order of their index in messages.
     pub cameras: Vec<CameraConfig>,
-    /// The sensors beside the cameras, in the order of their index on the wire; up to 8.
+    /// The sensors beside the cameras, up to 8, in the order of their index in messages.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sensors: Vec<SensorConfig>,
     /// The vehicles, up to 8; without any, the server's command line names them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<VehicleConfig>,
-    /// Where poses come from, as the file has it: the settings are the server's, which reads them.
+    /// Where poses come from, up to 8 sources; without any, Vicon at port 51001.
+    // As the file has it: the settings are the server's, which reads them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub localization: Vec<toml::Table>,
     /// The course's gates in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<StageConfig>,
-    /// What is fined.
+    /// What a flight is fined for, in seconds that are added to its time, and what plugins may ask for.
     #[serde(default, skip_serializing_if = "RulesConfig::is_default")]
     pub rules: RulesConfig,
-    /// What moves by itself, up to 32.
+    /// What stands or moves in the room and is no part of its scene, up to 32.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub objects: Vec<ObjectConfig>,
 }
@@ -116,9 +117,9 @@ pub struct ArenaConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Spawn {
-    /// On the floor. [m, world]
+    /// Where it stands on the floor. [m, world]
     pub position_m: DVec3,
-    /// Heading: from x, counter-clockwise. [deg, world]
+    /// Where its nose points: from x, counter-clockwise. [deg, world]
     #[serde(default)]
     pub yaw_deg: f64,
 }
@@ -127,9 +128,9 @@ pub struct Spawn {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Goal {
-    /// Centre. [m, world]
+    /// The point that shall be reached. [m, world]
     pub position_m: DVec3,
-    /// How near counts as reached. [m]
+    /// How near the body's centre must come. [m]
     pub radius_m: f64,
 }
 
@@ -137,9 +138,9 @@ pub struct Goal {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Geofence {
-    /// Least corner. [m, world]
+    /// The corner with the least x, y and z. [m, world]
     pub min_m: DVec3,
-    /// Greatest corner. [m, world]
+    /// The corner opposite. [m, world]
     pub max_m: DVec3,
 }
 
@@ -149,14 +150,14 @@ pub struct Geofence {
 pub struct Occupancy {
     /// Side of a voxel. [m]
     pub voxel_m: f64,
-    /// Splats fainter than this are no obstacle, 0 to 1.
+    /// Splats fainter than this are no obstacle.
     pub min_opacity: f64,
     /// Height of the floor; below is solid. [m, world]
     pub floor_z_m: f64,
-    /// What hangs in the air with fewer splats in its volume is a floater of training; 0 keeps
-    /// all. [1/m^3]
+    /// What hangs in the air with fewer splats than this in its volume is taken for a fault of the scene, and is no
+    /// obstacle; 0 keeps all. [1/m^3]
     pub min_splats_per_m3: f64,
-    /// What space is that no ray of the capture has passed, as the file beside the scene says.
+    /// What space counts as that no photo of the capture has looked into, as the file beside the scene says.
     #[serde(skip_serializing_if = "Unseen::is_free")]
     pub unseen: Unseen,
 }
@@ -165,7 +166,7 @@ pub struct Occupancy {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Unseen {
-    /// Free, where no splat stands: nothing is known of what the capture has seen, or it is not asked.
+    /// Free where no splat stands, whether anybody has looked there or not.
     #[default]
     Free,
     /// Solid: who flies where nobody has looked has collided.
@@ -202,21 +203,21 @@ pub struct StageConfig {
     pub name: String,
     /// Centre of the opening. [m, world]
     pub center_m: DVec3,
-    /// Direction of passage; any length but 0. [world]
+    /// Direction in which it is flown through; any length but 0. [world]
     pub normal: DVec3,
-    /// Width of the opening, level. [m]
+    /// Width of the opening, level; not less than the body's. [m]
     pub width_m: f64,
-    /// Height of the opening, across width and normal. [m]
+    /// Its height, across width and normal; not less than the body's. [m]
     pub height_m: f64,
-    /// Corners of the opening, to the left and up from its centre as one flies through; within width
-    /// and height. Without any it is the rectangle. [m]
+    /// Corners of the opening, 3 to 128: to the left and up from its centre as one flies through; within
+    /// width and height. Without any it is the rectangle. [m]
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub polygon_m: Vec<DVec2>,
     /// Depth of the opening along the passage, its centre in the middle: it counts when both its faces
     /// were passed. [m]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub thickness_m: f64,
-    /// What the body's centre must keep from the opening's edge for the passage to count. [m]
+    /// What the body's centre must keep from the opening's edge for the passage to count; at most half of the lesser side. [m]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub clearance_m: f64,
 }

@@ -8,12 +8,13 @@ use super::Distortion;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum LensConfig {
-    /// [`Distortion::BrownConrady`].
+    /// Radial and tangential, as most lenses up to some 110 degrees are calibrated (OpenCV
+    /// `calibrateCamera`).
     BrownConrady {
-        /// Radial, r^2.
+        /// Radial, of r^2.
         #[serde(default)]
         k1: f64,
-        /// Radial, r^4.
+        /// Radial, of r^4.
         #[serde(default)]
         k2: f64,
         /// Tangential, along y.
@@ -22,22 +23,22 @@ pub enum LensConfig {
         /// Tangential, along x.
         #[serde(default)]
         p2: f64,
-        /// Radial, r^6.
+        /// Radial, of r^6.
         #[serde(default)]
         k3: f64,
     },
-    /// [`Distortion::KannalaBrandt`], a fisheye.
+    /// A fisheye (OpenCV `fisheye::calibrate`); of an angle t off the axis.
     KannalaBrandt {
-        /// t^3.
+        /// Of t^3.
         #[serde(default)]
         k1: f64,
-        /// t^5.
+        /// Of t^5.
         #[serde(default)]
         k2: f64,
-        /// t^7.
+        /// Of t^7.
         #[serde(default)]
         k3: f64,
-        /// t^9.
+        /// Of t^9.
         #[serde(default)]
         k4: f64,
     },

@@ -12,10 +12,10 @@ use super::{ArenaConfig, ConfigError};
 pub struct BodyPart {
     /// Centre of a sphere, one end of a capsule's axis. [m, body]
     pub from_m: DVec3,
-    /// The other end; none is a sphere. [m, body]
+    /// The axis's other end; without it the part is a sphere. [m, body]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub to_m: Option<DVec3>,
-    /// Of the sphere, or around the axis. [m]
+    /// Radius of the sphere, or around the axis. [m]
     pub radius_m: f64,
 }
 

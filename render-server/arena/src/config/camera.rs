@@ -47,7 +47,7 @@ pub struct CameraConfig {
     pub width_px: u32,
     /// Image height. [px]
     pub height_px: u32,
-    /// From the left edge to the right edge of a pinhole; instead of the four below. [deg]
+    /// From the left edge to the right edge, of a camera without distortion; or give the four below. [deg]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub horizontal_fov_deg: Option<f64>,
     /// Focal length along x. [px]
@@ -63,10 +63,10 @@ pub struct CameraConfig {
     /// Principal point from the image's upper edge: OpenCV's plus 0.5. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cy_px: Option<f64>,
-    /// What the lens does; of the same calibration as the focal lengths.
+    /// How the lens distorts; of the same calibration as the focal lengths. Without it, not at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub distortion: Option<LensConfig>,
-    /// Where it sits. [m, body]
+    /// Where it sits on the vehicle. [m, body]
     pub position_m: DVec3,
     /// Nose-up tilt of the optical axis, after the yaw. [deg]
     #[serde(default)]
@@ -77,20 +77,20 @@ pub struct CameraConfig {
     /// Turn about the optical axis, its right side down, after yaw and tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub roll_deg: f64,
-    /// Nearest distance along the optical axis that is rendered. [m]
+    /// Nearest distance along the optical axis that is drawn. [m]
     #[serde(default = "default_near_m", skip_serializing_if = "is_default_near")]
     pub near_m: f64,
-    /// The maximum rate; absent is as fast as the server renders. [Hz]
+    /// Images a second at most; without it as many as the server can render. [Hz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
-    /// When the network is short, the images of cameras with a higher number go first.
+    /// When the network is short, images of cameras with a higher number are sent first.
     #[serde(default, skip_serializing_if = "is_normal")]
     pub priority: i32,
     /// Whether its images come with depth; by default they do. Depth that a course withholds does
     /// not leave the server: plugins get "no return" in every pixel.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub depth: bool,
-    /// How it differs from a perfect camera; absent is not at all.
+    /// How it differs from a perfect camera; without it, not at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imaging: Option<ImagingConfig>,
 }

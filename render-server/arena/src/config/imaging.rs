@@ -24,13 +24,13 @@ pub use presets::{DEPTHS, DepthSensor, LightSensor, SENSORS, StereoPair, TimeOfF
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImagingConfig {
-    /// The image sensor, one of [`SENSORS`]; absent is a perfect one.
+    /// The image sensor, one of [`SENSORS`]; without it, a perfect one. What else is absent is as this sensor has it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensor: Option<String>,
     /// A fixed exposure of each row; without it the exposure is automatic. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_ms: Option<f64>,
-    /// Analogue gain of a fixed exposure; 1 without it.
+    /// Analogue gain of a fixed exposure; without it 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain: Option<f64>,
     /// Time constant of the automatic exposure. [s]
@@ -45,7 +45,7 @@ pub struct ImagingConfig {
     /// Light that falls onto the scene: what is white in its file is as bright as white paper in it. [lx]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub illuminance_lx: Option<f64>,
-    /// The lens's.
+    /// Of the lens: focal length over aperture.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub f_number: Option<f64>,
     /// Pixels of the sensor that one of the image joins, along each side; without it as many as it has for the image's width.
@@ -54,10 +54,10 @@ pub struct ImagingConfig {
     /// Most electrons that a pixel of the sensor holds. [e]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub full_well_e: Option<f64>,
-    /// Of reading a pixel of the sensor, standard deviation. [e]
+    /// Noise of reading a pixel of the sensor, standard deviation. [e]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub read_noise_e: Option<f64>,
-    /// From the first row's exposure to the last one's; 0 is a global shutter. [ms]
+    /// Rolling shutter: from the first row's exposure to the last one's; 0 is a global shutter. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub readout_ms: Option<f64>,
     /// Share of the light that the corners lack.
@@ -72,7 +72,7 @@ pub struct ImagingConfig {
     /// Whether there is photon and read noise; by default there is.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise: Option<bool>,
-    /// How depth is measured; absent is perfect.
+    /// How depth is measured; without it, perfectly.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthConfig>,
 }
@@ -85,7 +85,7 @@ pub enum FilterKind {
     Rgb,
     /// One colour a pixel, interpolated.
     Bayer,
-    /// None: grey images.
+    /// Nothing: images are grey.
     Mono,
 }
 
@@ -93,7 +93,7 @@ pub enum FilterKind {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
-    /// One of [`DEPTHS`].
+    /// The depth camera, one of [`DEPTHS`]. What else is absent is as this one has it.
     pub model: String,
     /// Nothing nearer is reported; of a time-of-flight camera. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -101,7 +101,7 @@ pub struct DepthConfig {
     /// Nothing further is reported. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_m: Option<f64>,
-    /// Between the cameras of a stereo pair. [mm]
+    /// Distance between the cameras of a stereo pair. [mm]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baseline_mm: Option<f64>,
     /// Focal length of the images that a stereo pair matches. [px]
@@ -116,10 +116,10 @@ pub struct DepthConfig {
     /// Whether a projector gives blank walls a texture; without one they are holes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projector: Option<bool>,
-    /// Modulation of a time-of-flight camera; where only this is given distances repeat by it. [MHz]
+    /// Modulation of a time-of-flight camera's light; where only this is given, `unambiguous_m` follows from it. [MHz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub modulation_mhz: Option<f64>,
-    /// Distance from which on distances repeat. [m]
+    /// Distance from which on a time-of-flight camera's distances begin at 0 again. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unambiguous_m: Option<f64>,
     /// Electrons of its own light that white makes 1 m ahead. [e]

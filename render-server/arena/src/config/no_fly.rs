@@ -10,15 +10,15 @@ use vizflyt_protocol::messages::MAX_NO_FLY;
 use super::validate::{check_name, check_position, invalid};
 use super::{ArenaConfig, ConfigError};
 
-/// `[[no_fly]]`: an axis-aligned box, as the real table that the twin does not show.
+/// `[[no_fly]]`: along the world's axes, as around a real table that the twin does not show.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NoFly {
     /// Its name; at most 32 bytes.
     pub name: String,
-    /// Least corner. [m, world]
+    /// The corner with the least x, y and z. [m, world]
     pub min_m: DVec3,
-    /// Greatest corner. [m, world]
+    /// The corner opposite. [m, world]
     pub max_m: DVec3,
 }
 

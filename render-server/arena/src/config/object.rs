@@ -27,14 +27,14 @@ use super::validate::{ConfigError, check_name, check_number, check_position, inv
 pub struct ObjectConfig {
     /// Its name; unique, at most 32 bytes.
     pub name: String,
-    /// Its splats in its own frame, relative to the folder of `arena.toml`. [m, object]
+    /// The file of its splats, in metres of its own frame, relative to the folder of `arena.toml`.
     pub scene: String,
     /// Where the origin of its frame rests. [m, world]
     pub position_m: DVec3,
-    /// How its frame rests: turned from the world's by this about z, counter-clockwise. [deg]
+    /// How far its frame is turned about the world's z, counter-clockwise. [deg]
     #[serde(default)]
     pub yaw_deg: f64,
-    /// Where in its motion it is when the arena starts; random by the seed if absent. [s]
+    /// Where in its motion it is when the arena starts; without it, random by the seed. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase_s: Option<f64>,
     /// How it moves about its rest; without it, it stands still, as a part of the scene.
@@ -48,9 +48,9 @@ pub struct ObjectConfig {
 pub enum MotionConfig {
     /// Turns evenly about an axis through its origin.
     Rotation {
-        /// Counter-clockwise about this; any length but 0. [object]
+        /// It turns counter-clockwise about this; any length but 0. [object]
         axis: DVec3,
-        /// One turn. [s]
+        /// Time of one turn. [s]
         period_s: f64,
     },
     /// Slides or swings to and fro, as a sine; at rest in the middle, where it is fastest.
@@ -64,14 +64,14 @@ pub enum MotionConfig {
         /// How far it swings to each side. [deg]
         #[serde(default, skip_serializing_if = "is_zero")]
         swing_deg: f64,
-        /// To and fro. [s]
+        /// Time of once to and fro. [s]
         period_s: f64,
     },
     /// Runs along points at an even speed without turning.
     Path {
-        /// Where its origin comes by, from its rest; 2 to 64. [m, object at rest]
+        /// The points, 2 to 64, from where it rests. [m, object at rest]
         points_m: Vec<DVec3>,
-        /// [m/s]
+        /// How fast it runs, 0.01 to 30. [m/s]
         speed_mps: f64,
         /// Whether it runs on from the last point to the first; else it turns there and runs back.
         #[serde(default)]

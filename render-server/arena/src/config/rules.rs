@@ -12,15 +12,15 @@ use super::{ArenaConfig, Geofence};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RulesConfig {
-    /// The body's centre must be in this box at take-off: the runtime waits for it. A flight that begins elsewhere
-    /// all the same is no official one. Of a vehicle with a spawn of its own the box lies about that. [m, world]
+    /// The body's centre must be in this box at take-off, which is waited for. A flight that begins elsewhere all the
+    /// same is no official one. Of a vehicle with a spawn of its own the box lies about that. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start_box: Option<Geofence>,
-    /// For a take-off outside of the start box. [s]
+    /// Fine for a take-off outside of the start box. [s]
     pub false_start_s: f64,
     /// Nearer to an obstacle than this is a near miss; 0 is none. [m]
     pub near_miss_m: f64,
-    /// For each near miss: of one, until it is over. [s]
+    /// Fine for each near miss, however long it lasts. [s]
     pub near_miss_s: f64,
     /// Kinds of setpoint that plugins may ask for; without it all but attitude rates.
     #[serde(skip_serializing_if = "Option::is_none")]

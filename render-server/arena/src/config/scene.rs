@@ -127,18 +127,18 @@ pub const METRES_PER_UNIT: std::ops::RangeInclusive<f64> = 1e-4..=1e4;
 /// Which axis of a scene's file points up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Up {
-    /// +x.
+    /// `x`: its x axis.
     X,
-    /// -x.
+    /// `-x`: against its x axis.
     NegX,
-    /// +y: exports of game engines.
+    /// `y`: its y axis, as in exports of game engines.
     Y,
-    /// -y: what COLMAP's first upright camera gives (y down, z forward).
+    /// `-y`: against its y axis, as COLMAP's first upright camera gives it (y down, z forward).
     #[default]
     NegY,
-    /// +z: the world's own; exports of nerfstudio.
+    /// `z`: its z axis, as in the world and in exports of nerfstudio.
     Z,
-    /// -z.
+    /// `-z`: against its z axis.
     NegZ,
 }
 
@@ -227,6 +227,7 @@ struct Table {
     rotation: Option<[f64; 4]>,
     #[serde(default = "one")]
     metres_per_unit: f64,
+    /// Where the file's own origin comes to lie. [m, world]
     #[serde(default)]
     origin: DVec3,
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -37,7 +37,7 @@ pub struct SensorConfig {
     pub name: String,
     /// The name of its model, which says of what kind it is: `os1-16`, `tfmini`.
     pub model: String,
-    /// Where it sits. [m, body]
+    /// Where it sits on the vehicle. [m, body]
     pub position_m: DVec3,
     /// Nose-up tilt of its x axis, after the yaw. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
@@ -63,7 +63,7 @@ pub struct SensorConfig {
     /// Whether the runtime passes its readings on to the autopilot; by default it does not.
     #[serde(default, skip_serializing_if = "is_no")]
     pub to_autopilot: bool,
-    /// What else is other than its model has it, by the model's own keys.
+    /// What else is other than its model has it, by the model's own keys (sensor-models.md).
     #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
     pub settings: toml::Table,
 }

@@ -17,7 +17,7 @@ pub struct VehicleConfig {
     /// Where it stands at the start; the arena's `spawn` if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub spawn: Option<Spawn>,
-    /// Names of its cameras, in the order of their index on the wire; all if absent.
+    /// Names of its cameras, in the order of their index in messages; all if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<String>>,
     /// Names of its sensors beside the cameras; all if absent.

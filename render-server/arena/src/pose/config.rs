@@ -8,7 +8,7 @@ use super::PoseSigma;
 use crate::config::ConfigError;
 use crate::config::validate::{check_number, invalid};
 
-/// The whole of `[pose]`; what is not given is as in [`PoseConfig::default`].
+/// `[pose]`: what is believed of poses, and for which moment images are rendered.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PoseConfig {

@@ -26,7 +26,7 @@ pub struct CloudConfig {
     /// Centre of the ball it fills, with `radius_m`. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub center_m: Option<DVec3>,
-    /// Radius of that ball. [m]
+    /// Radius of that ball, 0.1 to 1000. [m]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub radius_m: Option<f64>,
 }
@@ -208,7 +208,7 @@ pub struct LampsConfig {
     pub color: [f64; 3],
     /// How high they hang, on a square grid through the origin. [m, world]
     pub height_m: f64,
-    /// From one to the next, 0.5 to 1000. [m]
+    /// Distance from one to the next, 0.5 to 1000. [m]
     pub spacing_m: f64,
     /// Where they are instead: up to 8. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -314,11 +314,11 @@ impl Default for OwnLightConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FlickerConfig {
-    /// Of the mains, half of the light's: 16 to 400. [Hz]
+    /// Frequency of the mains, half of the light's: 16 to 400. [Hz]
     pub mains_hz: f64,
     /// How far light falls and rises, as a share of its mean: 0 to 1.
     pub depth: f64,
-    /// From the first row's exposure to the last one's, up to 100; 0 of a global shutter. [ms]
+    /// Rolling shutter: from the first row's exposure to the last one's, up to 100; 0 of a global shutter. [ms]
     pub readout_ms: f64,
 }
 

@@ -10,7 +10,7 @@ use super::conventions::{Axes, BodyAxes, Nose, Quaternion};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Offset {
-    /// Where it is. [m, world]
+    /// Where the stream's origin is. [m, world]
     pub position_m: DVec3,
     /// How far its x axis is turned from the world's, counter-clockwise. [deg]
     pub yaw_deg: f64,

@@ -338,7 +338,7 @@ impl fmt::Display for BodyAxes {
 }
 
 /// Where the vehicle's nose points in the object's level axes: counter-clockwise from their x, seen from above.
-/// `x`, `y`, `-x` and `-y` are 0, 90, 180 and -90 degrees.
+/// `x`, `y`, `-x` and `-y` are 0, 90, 180 and -90 degrees; any other angle is written as a number of degrees.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Nose {
     deg: f64,

@@ -31,9 +31,9 @@ use crate::scene;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocalizationConfig {
-    /// What sends them.
+    /// What sends poses.
     pub driver: Driver,
-    /// Where they come from or arrive, as the driver reads it; its usual address by default.
+    /// Address and port where they arrive, or are asked for; the driver's usual one by default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
     /// Length unit of the stream; the driver's own by default.
@@ -42,7 +42,7 @@ pub struct LocalizationConfig {
     /// The stream's axis that points up; a short form of `axes`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<UpAxis>,
-    /// Which of the stream's axes the world's x, y and z are: `xyz` by default, `x-zy` for y up.
+    /// How the stream's axes lie in the world; `xyz` by default, `x-zy` for y up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
     /// Vicon: the order in which its three angles turn about the fixed axes.
@@ -54,7 +54,7 @@ pub struct LocalizationConfig {
     /// How the object's own axes are laid; as the stream's by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub body: BodyAxes,
-    /// Where the vehicle's nose points in the object's level axes; along x by default.
+    /// How the object's axes lie to the vehicle's nose; it points along x by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub nose: Nose,
     /// Where the stream's origin is in the world, and how it is turned there.
@@ -63,8 +63,8 @@ pub struct LocalizationConfig {
     /// Where the tracked point is on the vehicle. [m, body]
     #[serde(default, skip_serializing_if = "is_default")]
     pub pivot_m: DVec3,
-    /// How much earlier than stamped, or than its arrival where it has no stamp, a pose was true: the source's own
-    /// constant delay, 0 to 500. [ms]
+    /// The source's own constant delay, 0 to 500: so much earlier than stamped, or than it arrived where it has no
+    /// stamp, a pose was true. [ms]
     #[serde(default, skip_serializing_if = "is_default")]
     pub latency_ms: f64,
     /// Names of the vehicles' objects in the stream, where they differ from the vehicles' names.
