@@ -12,7 +12,6 @@ import argparse
 import json
 import re
 import subprocess
-import tomllib
 import uuid
 from pathlib import Path
 
@@ -166,8 +165,10 @@ def main():
                      if dep["pkg"] in by_id and any(kind["kind"] is None for kind in dep["dep_kinds"])]
         for node in metadata["resolve"]["nodes"] if node["id"] in by_id
     }
-    lock = tomllib.loads((ROOT / "Cargo.lock").read_text())
-    checksums = {(entry["name"], entry["version"]): entry.get("checksum") for entry in lock["package"]}
+    # Cargo writes one key a line; a reader of TOML comes with Python from 3.11 on.
+    entries = (ROOT / "Cargo.lock").read_text().split("[[package]]")[1:]
+    locked = (dict(re.findall(r'^(\w+) = "(.*)"$', entry, re.MULTILINE)) for entry in entries)
+    checksums = {(entry["name"], entry["version"]): entry.get("checksum") for entry in locked}
 
     document = bill(arguments.package, crates, edges, checksums, arguments)
     file = arguments.folder / f"{arguments.package}.cdx.json"
