@@ -56,7 +56,7 @@ class Worker:
     def answer(self):
         line = self.process.stdout.readline()
         if not line:
-            sys.exit(f"{self.maker} has ended; VERBOSE=1 shows what it says")
+            sys.exit(f"{self.maker} has ended with status {self.process.wait()}; VERBOSE=1 shows what it says")
         return json.loads(line)
 
     def turn(self, seconds):
