@@ -32,11 +32,12 @@ TABLES = {
     ]),
     "images of 64x48, one vehicle, one core": (1, 1, [
         "vizflyt race depth", "vizflyt forest depth", "vizflyt race rgb", "vizflyt forest rgb",
-        "gym-pybullet-drones image", "pyflyt image",
+        "gym-pybullet-drones image", "pyflyt image", "crazyflow depth",
     ]),
     "images of 64x48, 8 vehicles, two cores": (8, 2, [
         "vizflyt race depth", "vizflyt forest depth", "vizflyt race rgb", "vizflyt forest rgb",
         "gym-pybullet-drones image", "gym-pybullet-drones image async", "pyflyt image", "pyflyt image async",
+        "crazyflow depth",
     ]),
 }  # fmt: skip
 

@@ -77,9 +77,15 @@ def pybullet_drones(act="vel", obs="kin", hz=40, async_envs=False):
     from gym_pybullet_drones.envs.HoverAviary import HoverAviary
     from gym_pybullet_drones.utils.enums import ActionType, ObservationType
 
+    class Hover(HoverAviary):
+        """Its hovering, with images of the kind that its observation space promises: vectors insist on that."""
+
+        def _computeObs(self):
+            return super()._computeObs().astype(self.observation_space.dtype)
+
     # In the air, and not at the place 1 m up where an episode is over.
     how = dict(initial_xyzs=np.array([[0.0, 0.0, 0.7]]), ctrl_freq=hz, pyb_freq=240)
-    make = lambda: HoverAviary(act=ActionType(act), obs=ObservationType(obs), **how)
+    make = lambda: Hover(act=ActionType(act), obs=ObservationType(obs), **how)
     return alone_or_many(make, lambda: small((1, 4)), async_envs)
 
 
@@ -112,7 +118,7 @@ def pyflyt(with_camera=False, async_envs=False):
     return alone_or_many(make, lambda: np.append(small(3), 0.0), async_envs)
 
 
-def crazyflow(dynamics):
+def crazyflow(dynamics, with_camera=False):
     import jax
     from crazyflow.dynamics import Dynamics
     from crazyflow.envs import ReachVelEnv
@@ -123,7 +129,15 @@ def crazyflow(dynamics):
     hover = np.zeros_like(low)
     # Thrust is last in its attitude actions.
     hover[..., -1] = (low + high)[..., -1] / 2
-    return lambda: jax.block_until_ready(envs.step(hover + small(hover.shape) * (high - hover) * 0.1)[:4])
+    fly = lambda: envs.step(hover + small(hover.shape) * (high - hover) * 0.1)[:4]
+    if not with_camera:
+        return lambda: jax.block_until_ready(fly())
+    import mujoco
+    from crazyflow.sim.sensors.depth import build_render_depth_fn
+
+    camera = mujoco.mj_name2id(envs.sim.mj_model, mujoco.mjtObj.mjOBJ_CAMERA, "fpv_cam:0")
+    depth = build_render_depth_fn(envs.sim.mjx_model, camera, SIZE_PX)
+    return lambda: jax.block_until_ready((fly(), depth(envs.sim)))
 
 
 MAKERS = {
@@ -146,6 +160,7 @@ MAKERS = {
     "pyflyt image async": lambda: pyflyt(with_camera=True, async_envs=True),
     "crazyflow first_principles": lambda: crazyflow("first_principles"),
     "crazyflow so_rpy": lambda: crazyflow("so_rpy"),
+    "crazyflow depth": lambda: crazyflow("first_principles", with_camera=True),
 }
 
 
