@@ -1,5 +1,6 @@
 """Environments to learn in: Gymnasium's own check, the same flights again, one and many alike, rules, mistakes."""
 
+import gc
 import warnings
 
 import gymnasium
@@ -111,6 +112,18 @@ def test_an_episode_that_is_over_begins_anew_and_rewards_are_ones_own(make):
     assert (seen[:, 21] == 1.0).all(), "all of the time is left"
 
 
+def test_what_follows_comes_from_one_seed_or_from_many(make):
+    for seed in (5, [5, 11, 17]):
+        starts = []
+        for _ in range(2):
+            envs = make(number=3, seconds=0.1)
+            envs.reset(seed=seed)
+            steps = [envs.step(np.zeros((3, 4))) for _ in range(30)]
+            starts.append(np.array([seen for seen, *_, infos in steps if not any(infos["time_s"])]))
+        assert starts[0].shape == (6, 3, 22) and (starts[0] == starts[1]).all(), seed
+        assert len(np.unique(starts[0][:, :, 15])) == 18, "each episode has a start of its own"
+
+
 def test_hovering_stays_and_numbers_that_are_none_ask_for_nothing(make):
     for action in ("velocity", "acceleration", "body-rates"):
         env = make(action=action)
@@ -124,6 +137,11 @@ def test_mistakes_are_explained(program, capfd):
     with pytest.raises(RuntimeError, match="ended with status 1"):
         vizflyt.gym.Env("p99", program=program)
     assert "no project 'p99'; there are" in capfd.readouterr().err
+    # Whose end would be told of by gymnasium, were it not marked as closed.
+    with pytest.raises(RuntimeError, match="ended with status 1"):
+        vizflyt.gym.VectorEnv(2, "p99", program=program)
+    gc.collect()
+    capfd.readouterr()
     with pytest.raises(RuntimeError):
         vizflyt.Env("p3", rate_hz=33, program=program)
     assert "a multiple of" in capfd.readouterr().err

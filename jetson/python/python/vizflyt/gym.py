@@ -273,7 +273,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def __init__(self, num_envs: int = 1, project: str = "forest", render_mode: str | None = None, **how: Any) -> None:
         self.render_mode = render_mode
         self.num_envs = num_envs
+        # What has not begun to fly needs no closing.
+        self.closed = True
         self._flights = _Flights(count=num_envs, project=project, **how)
+        self.closed = False
         self.single_observation_space = self._flights.observation_space
         self.single_action_space = self._flights.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -283,12 +286,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins all episodes; of one seed they are seed, seed + 1, and so on."""
+        """Begins all episodes; of one seed they are seed, seed + 1, and so on. Later ones follow from these."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is None:
             seeds = self._draw()
+        elif isinstance(seed, int):
+            seeds = np.arange(self.num_envs) + seed
         else:
-            seeds = np.arange(self.num_envs) + seed if isinstance(seed, int) else np.asarray(seed)
+            seeds = np.asarray(seed)
+            self.np_random = np.random.default_rng(seeds)
         self._is_over[:] = False
         seen, step = self._flights.fly(np.ones(self.num_envs, bool), seeds, np.zeros((self.num_envs, _ACTION)))
         return seen, self._infos(step)
