@@ -10,9 +10,8 @@ import argparse
 import os
 import time
 
-# What Ray's processes start with: one thread each, and no token for nodes that no other machine can reach.
+# What Ray's processes start with: one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 
 import ray
 from ray.cluster_utils import Cluster
