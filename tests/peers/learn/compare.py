@@ -13,9 +13,10 @@ import signal
 import statistics
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
-WORKER = Path(__file__).with_name("worker.py")
+WORKER = Path(__file__).absolute().with_name("worker.py")
 # What is compared with what: name, vehicles, cores, who flies. The first is ours.
 TABLES = {
     "state, one vehicle, one core": (1, 1, [
@@ -43,13 +44,13 @@ TABLES = {
 
 
 class Worker:
-    def __init__(self, folder, maker, vehicles, cores):
-        python = folder / maker.split()[0] / "bin" / "python"
+    def __init__(self, folder, maker, vehicles, cores, scratch):
+        python = folder.absolute() / maker.split()[0] / "bin" / "python"
         command = [python, WORKER, maker, str(vehicles), str(cores)]
         self.maker = maker
         # A group of its own: it ends with all that it has started.
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+            command, cwd=scratch, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
             stderr=None if os.environ.get("VERBOSE") else subprocess.DEVNULL,
         )  # fmt: skip
         self.turns = []
@@ -79,12 +80,12 @@ class Worker:
         self.process.wait()
 
 
-def compare(folder, title, rounds, seconds):
+def compare(folder, title, rounds, seconds, scratch):
     vehicles, cores, makers = TABLES[title]
     workers = []
     try:
         for maker in makers:
-            workers.append(Worker(folder, maker, vehicles, cores))
+            workers.append(Worker(folder, maker, vehicles, cores, scratch))
             workers[-1].answer()
         for worker in workers:
             # A first turn that does not count: caches, compilers.
@@ -117,5 +118,7 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--only", choices=TABLES, help="one table of these")
     args = parser.parse_args()
-    for title in [args.only] if args.only else TABLES:
-        compare(args.folder, title, args.rounds, args.seconds)
+    # Some simulators leave files where they run.
+    with tempfile.TemporaryDirectory() as scratch:
+        for title in [args.only] if args.only else TABLES:
+            compare(args.folder, title, args.rounds, args.seconds, scratch)

@@ -6,6 +6,8 @@
     env = gymnasium.make("vizflyt/Forest-v0")                              # the state
     envs = gymnasium.make_vec("vizflyt/Race-v0", num_envs=16, camera=(64, 48), observation=("state", "depth"))
 
+``"vizflyt.gym:vizflyt/Forest-v0"`` imports this module where it is not yet: in the processes of Ray's RLlib.
+
 What flies is the simulated airframe under the simulated autopilot's own controllers, on the true state; openings,
 obstacles and fence are judged as in a graded flight. What is not there: the estimator, the guard, and delays other than
 ``delay``. The same seeds and actions give the same observations, bit for bit, on the same kind of processor.
