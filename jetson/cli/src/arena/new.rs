@@ -97,7 +97,7 @@ fn way(folder: &Path, file: &Path) -> PathBuf {
 
 const HEAD: &str = "\
 # Made by `vizflyt arena new`. [scene] says how the file lies in the world; the fence goes around its core.
-# Correct what was guessed (a door is 2 m high), then add [goal] and [[stages]]: docs/guides/scenes.md, course.md.
+# Correct what was guessed (a door is 2 m high), then set up a course: `vizflyt arena edit`, or by hand: docs/guides/arena-reference.md.
 ";
 
 #[cfg(test)]
