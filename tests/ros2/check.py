@@ -421,6 +421,21 @@ def check_commands(stage, sent, node):
     answer_of(stage, Setpoint.land())
 
 
+def check_restart(seq, inboxes):
+    """The runtime is started anew: the same node goes on, and the landing was the former flight's."""
+    stage = Stage()
+    stage.seq = seq
+    stage.start()
+    images = inboxes[FRONT + "image_raw"]
+    known = len(images.found)
+    deadline = time.monotonic() + 20
+    while len(images.found) == known:
+        check(time.monotonic() < deadline, "no images after a restart")
+        check(stage.publish() == Setpoint.hold(), "a landing outlives its flight")
+        poll(inboxes, 0.05)
+    stage.rehearsal.stop()
+
+
 def fly(vizflyt_program, command, domain_id, domain):
     """The simulated lab: takes off, is flown by velocities, lands."""
     inboxes = {name: inbox for name, inbox in subscribe(domain).items() if name in
@@ -523,16 +538,10 @@ def main():
         sent = writers(domain)
         check_commands(stage, sent, node)
 
-        # The runtime is started anew: the same node goes on, and the landing was the former flight's.
         stage.rehearsal.stop()
-        again = Stage()
+        # Withdraws its offer.
         del stage.rehearsal
-        again.seq = stage.seq
-        again.start()
-        known = len(inboxes[FRONT + "image_raw"].found)
-        wait_for(lambda: [again.publish(), poll(inboxes, 0.05), len(inboxes[FRONT + "image_raw"].found) > known][2],
-                 "no images after a restart")
-        check(again.publish() == Setpoint.hold(), "a landing outlives its flight")
+        check_restart(stage.seq, inboxes)
         check(node.end() == 0, "the node did not end cleanly")
         gone = [lambda inbox=inbox: not inbox.is_matched() for inbox in inboxes.values()]
         wait_for(lambda: all(is_gone() for is_gone in gone), "the node left without a goodbye", 5)

@@ -31,8 +31,9 @@ use self::convert::DepthEncoding;
 use self::dds::Dds;
 use self::node::{Node, Participants, Ros2};
 
-/// What the node logs unless told otherwise: the library's own steps are nobody's concern.
-pub const LOG_LEVEL: &str = "info,rustdds=error";
+/// What the node logs unless told otherwise: the library's own steps are nobody's concern, nor that its end overtakes the
+/// removal of a writer.
+pub const LOG_LEVEL: &str = "info,rustdds=error,rustdds::dds::pubsub=off";
 /// Between two looks for a runtime that waits.
 const LOOK: Duration = Duration::from_millis(200);
 
@@ -128,7 +129,7 @@ pub fn run(args: &Ros2Args) -> Result<ExitCode> {
         };
         said.clear();
         let code = vizflyt_sdk::attach(Ros2(&mut node), service);
-        if args.once {
+        if args.once && node.has_flown() {
             drop(node);
             dds.leave();
             return Ok(code);

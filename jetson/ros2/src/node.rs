@@ -81,6 +81,7 @@ pub(crate) struct Node {
     sensors: Vec<Source<Sensor>>,
     /// Stamp of the newest state of the vehicle that was sent.
     sent_vehicle: HostTime,
+    has_flown: bool,
 }
 
 /// A camera or a sensor of this flight.
@@ -133,11 +134,18 @@ impl Node {
             cameras: Vec::new(),
             sensors: Vec::new(),
             sent_vehicle: HostTime::ZERO,
+            has_flown: false,
             dds: Arc::clone(dds),
         })
     }
 
+    /// Whether a runtime has begun a flight with it.
+    pub(crate) fn has_flown(&self) -> bool {
+        self.has_flown
+    }
+
     fn begin(&mut self, info: &ArenaInfo) -> Result<()> {
+        self.has_flown = true;
         self.commands.clear();
         self.relate_clocks();
         self.sent_vehicle = HostTime::ZERO;
