@@ -73,7 +73,9 @@ impl Writer {
 
     /// Writes an array of doubles, whose length both ends know.
     pub fn f64s(&mut self, values: &[f64]) {
-        values.iter().for_each(|&value| self.f64(value));
+        for &value in values {
+            self.f64(value);
+        }
     }
 
     /// Writes a string.
