@@ -13,6 +13,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from typing import Literal
@@ -446,9 +447,10 @@ def fly(vizflyt_program, command, domain_id, domain):
         Inbox(domain, "vizflyt/imu", ros.Imu, DEFAULT),
     )}
     node = Node(command, domain_id, "--once", "--reliable", "--depth", "16uc1")
+    logs = tempfile.TemporaryDirectory()
     flight = subprocess.Popen(
         [vizflyt_program, "fly", "--attach", "--sim", "--no-config", "--headless", "--json", "--scene", "room",
-         "--max-rate", "20", "--log-dir", "/tmp" if not os.environ.get("TMPDIR") else os.environ["TMPDIR"]],
+         "--max-rate", "20", "--log-dir", logs.name],
         stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     phases = []
 
@@ -483,6 +485,7 @@ def fly(vizflyt_program, command, domain_id, domain):
             flight.wait(20)
         if node.process.poll() is None:
             node.end()
+        logs.cleanup()
     check(flight.returncode == 0, f"the flight ended with status {flight.returncode}")
     check((depth.encoding, depth.step) == ("16UC1", 2 * depth.width), f"depth is {depth.encoding}")
     millimetres = np.frombuffer(bytes(depth.data), "<u2")
