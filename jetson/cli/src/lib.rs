@@ -89,6 +89,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     #[cfg(feature = "crazyflie")]
     Crazyflie(crazyflie::CrazyflieArgs),
+    #[cfg(feature = "ros2")]
+    Ros2(vizflyt_ros2::Ros2Args),
     /// Sets up the vehicle: the key for MAVLink signing.
     Vehicle(vehicle::VehicleArgs),
     /// Teams, runs and standings of the lab's flights.
@@ -141,6 +143,8 @@ pub fn main() -> ExitCode {
         Command::Bench(_) | Command::Dataset(_) | Command::Gym(_) => {
             "warn,vizflyt_server::scene=info".to_owned()
         }
+        #[cfg(feature = "ros2")]
+        Command::Ros2(_) => vizflyt_ros2::LOG_LEVEL.to_owned(),
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
@@ -186,6 +190,8 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Pair(args) => pair::run(&args),
         #[cfg(feature = "crazyflie")]
         Command::Crazyflie(args) => crazyflie::run(&args),
+        #[cfg(feature = "ros2")]
+        Command::Ros2(args) => vizflyt_ros2::run(&args),
         Command::Password(args) => password::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Vehicle(args) => vehicle::run(&args),

@@ -19,6 +19,8 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-tags", &["vizflyt-protocol", "vizflyt-toml"]),
     ("vizflyt-avoid", &["vizflyt-sdk"]),
     ("vizflyt-race", &["vizflyt-sdk"]),
+    // It links its own DDS, which nothing else shall.
+    ("vizflyt-ros2", &["vizflyt-sdk"]),
     ("vizflyt-c", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena", "vizflyt-toml"]),
@@ -67,6 +69,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-tags",
             "vizflyt-avoid",
             "vizflyt-race",
+            "vizflyt-ros2",
         ],
     ),
     ("vizflyt-e2e", &[]),
@@ -83,6 +86,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-twin",
             "vizflyt-server",
             "vizflyt-runtime",
+            "vizflyt-ros2",
             "vizflyt-guardian",
             "vizflyt-simulator",
             "vizflyt-bridge",
