@@ -40,12 +40,14 @@ struct Lane {
 }
 
 impl View {
-    /// Makes one of the course's first camera, with another size and width of view. [px, deg]
+    /// Makes one of the course's first camera, with another size and width of view; where nobody asks for colour, of depth
+    /// alone. [px, deg]
     pub(super) fn new(
         course: &CourseInstance,
         size: ImageSize,
         fov_deg: Option<f64>,
         max_error_px: f32,
+        depth_alone: bool,
     ) -> Result<Self> {
         let config = course.arena.cameras.first().context("the course has no camera")?;
         let ImageSize { width_px, height_px } = size;
@@ -57,10 +59,9 @@ impl View {
         let scene = Scene { splats: &course.splats, objects: &course.objects };
         let lane = |_| {
             let pool = ThreadPoolBuilder::new().num_threads(1).build()?;
-            Ok::<_, ThreadPoolBuildError>(Lane {
-                pool,
-                renderer: CpuRenderer::with_detail(scene, Detail::Adaptive { max_error_px }),
-            })
+            let mut renderer = CpuRenderer::with_detail(scene, Detail::Adaptive { max_error_px });
+            renderer.set_depth_alone(depth_alone);
+            Ok::<_, ThreadPoolBuildError>(Lane { pool, renderer })
         };
         let lanes: Result<Vec<_>, _> = (0..rayon::current_num_threads()).map(lane).collect();
         Ok(Self {

@@ -165,6 +165,7 @@ pub(crate) fn run(args: &GymArgs) -> Result<ExitCode> {
 /// Makes the courses, on all cores.
 fn places(args: &GymArgs, project: &CourseProject) -> Result<Vec<Place>> {
     let limits = airframe_limits();
+    let depth_alone = !args.layers.contains(&Layer::Rgb);
     let made: Result<Vec<_>> = args
         .courses
         .par_iter()
@@ -172,7 +173,7 @@ fn places(args: &GymArgs, project: &CourseProject) -> Result<Vec<Place>> {
             let course = CourseInstance::make(project, Level::Ug, args.variant, seed)?;
             let view = args
                 .camera
-                .map(|size| View::new(&course, size, args.fov, args.error_px))
+                .map(|size| View::new(&course, size, args.fov, args.error_px, depth_alone))
                 .transpose()?;
             Ok(Place { rules: Rules::new(course.arena, course.obstacles, limits), view })
         })

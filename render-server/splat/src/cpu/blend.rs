@@ -7,7 +7,8 @@
 //! depths and transmittance in registers, and stops when all its pixels are opaque.
 //!
 //! Transmittance carries the pixel's end in its sign: the splat that would bring a pixel to 1e-4 is
-//! not rendered, and makes it negative.
+//! not rendered, and makes it negative. Where depth alone is asked for, a pixel ends once half of its light is gone: neither
+//! median depth nor id changes behind that.
 //!
 //! Budget: some 30 vector instructions per block and splat; 12 kB of tables, all in the L1 cache.
 
@@ -60,6 +61,7 @@ pub(super) fn blend<S: Simd>(
     splats: &[Splat2d],
     bins: &Bins,
     tagged: &Tagged<'_>,
+    depth_alone: bool,
     tiles: &mut Vec<f32>,
     image: &mut RgbdImage,
 ) {
@@ -71,6 +73,7 @@ pub(super) fn blend<S: Simd>(
             splats,
             list: bins.list(index),
             tagged,
+            depth_alone,
             origin: [index % bins.tiles_x * TILE, index / bins.tiles_x * TILE],
             scratch,
             pixels,
@@ -135,6 +138,8 @@ struct BlendTile<'a> {
     splats: &'a [Splat2d],
     list: &'a [AtomicU32],
     tagged: &'a Tagged<'a>,
+    /// Median depth and id are all that counts.
+    depth_alone: bool,
     /// The tile's first pixel, x and y.
     origin: [usize; 2],
     scratch: &'a mut Scratch,
@@ -146,7 +151,7 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { view, splats, list, tagged, origin, scratch, pixels } = self;
+        let Self { view, splats, list, tagged, depth_alone, origin, scratch, pixels } = self;
         // Ids cost a twentieth of the pass: only where something moves.
         let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];
@@ -196,10 +201,12 @@ impl Kernel for BlendTile<'_> {
                 let (x, y) = (lane_x + s.splat(x), lane_y + s.splat(y));
                 let list = &scratch.lists[block][..lengths[block]];
                 let state = &mut pixels[block * CHANNELS * S::LANES..][..CHANNELS * S::LANES];
-                let goes_on = if has_ids {
-                    blend_block::<S, true>(s, &scratch.batch, list, x, y, state)
-                } else {
-                    blend_block::<S, false>(s, &scratch.batch, list, x, y, state)
+                let batch = &scratch.batch;
+                let goes_on = match (has_ids, depth_alone) {
+                    (true, false) => blend_block::<S, true, false>(s, batch, list, x, y, state),
+                    (false, false) => blend_block::<S, false, false>(s, batch, list, x, y, state),
+                    (true, true) => blend_block::<S, true, true>(s, batch, list, x, y, state),
+                    (false, true) => blend_block::<S, false, true>(s, batch, list, x, y, state),
                 };
                 if !goes_on {
                     live &= !(1 << block);
@@ -344,7 +351,7 @@ static POSITIONS: [u64; 256] = {
 
 /// Blends a list onto one block; returns whether any of its pixels goes on.
 #[inline(always)]
-fn blend_block<S: Simd, const IDS: bool>(
+fn blend_block<S: Simd, const IDS: bool, const DEPTH_ALONE: bool>(
     s: S,
     batch: &Batch,
     list: &[u8],
@@ -368,15 +375,17 @@ fn blend_block<S: Simd, const IDS: bool>(
         let level = s.neg_mul_add(dx * s.splat(batch.falloff_x[i]), dx, level);
         let hit = s.lt(s.splat(MIN_LEVEL), level);
         let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
-        let weight = alpha * transmittance;
         // Not `transmittance - weight`: one latency less from splat to splat.
         let after = s.neg_mul_add(alpha, transmittance, transmittance);
-        let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
-        let weight = s.keep(live, weight);
-        red = s.mul_add(weight, s.splat(batch.red[i]), red);
-        green = s.mul_add(weight, s.splat(batch.green[i]), green);
-        blue = s.mul_add(weight, s.splat(batch.blue[i]), blue);
-        depth = s.mul_add(weight, s.splat(batch.z_m[i]), depth);
+        let end = if DEPTH_ALONE { 0.5 } else { TRANSMITTANCE_MIN as f32 };
+        let live = s.lt(s.splat(end), after);
+        if !DEPTH_ALONE {
+            let weight = s.keep(live, alpha * transmittance);
+            red = s.mul_add(weight, s.splat(batch.red[i]), red);
+            green = s.mul_add(weight, s.splat(batch.green[i]), green);
+            blue = s.mul_add(weight, s.splat(batch.blue[i]), blue);
+            depth = s.mul_add(weight, s.splat(batch.z_m[i]), depth);
+        }
         // The last splat rendered while more than half of the light passed; `finish` checks that it
         // brought the pixel to half.
         let before_half = hit & s.lt(s.splat(0.5), transmittance);
@@ -384,7 +393,8 @@ fn blend_block<S: Simd, const IDS: bool>(
         if IDS {
             id = s.select(before_half, s.splat(batch.id[i]), id);
         }
-        transmittance = s.select(live, after, s.negative(transmittance));
+        transmittance =
+            if DEPTH_ALONE { after } else { s.select(live, after, s.negative(transmittance)) };
         if !s.any(live) {
             goes_on = false;
             break;

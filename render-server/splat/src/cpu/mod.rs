@@ -33,6 +33,7 @@ use crate::{Camera, Placement, RgbdImage, Scene};
 pub struct CpuRenderer {
     instructions: InstructionSet,
     detail: Detail,
+    depth_alone: bool,
     /// What stands still, then the objects.
     parts: Vec<scene::Part>,
     buffers: Buffers,
@@ -71,11 +72,17 @@ impl CpuRenderer {
         sets.map(|set| Self::with_instructions(scene, Detail::Full, set)).collect()
     }
 
+    /// From now on images have their median depths and ids, bit by bit as ever; colour, alpha and expected depth are
+    /// unspecified. Faster: a pixel ends where half of its light does.
+    pub fn set_depth_alone(&mut self, is_alone: bool) {
+        self.depth_alone = is_alone;
+    }
+
     fn with_instructions(scene: Scene<'_>, detail: Detail, instructions: InstructionSet) -> Self {
         let mut parts = vec![scene::Part::new(0, scene.splats, detail)];
         let moving = scene.objects.iter();
         parts.extend(moving.map(|object| scene::Part::new(object.id, &object.splats, detail)));
-        Self { instructions, detail, parts, buffers: Buffers::default() }
+        Self { instructions, detail, depth_alone: false, parts, buffers: Buffers::default() }
     }
 
     fn render_one<S: Simd>(
@@ -120,7 +127,8 @@ impl CpuRenderer {
         times.bin_ms += milliseconds(start);
         let start = Instant::now();
         let tagged = blend::Tagged { parts, visible };
-        blend::blend(simd, &still, &projected.splats, bins, &tagged, tiles, image);
+        let depth_alone = self.depth_alone;
+        blend::blend(simd, &still, &projected.splats, bins, &tagged, depth_alone, tiles, image);
         times.blend_ms += milliseconds(start);
     }
 }

@@ -52,6 +52,39 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(cases(32))]
+
+    /// Depth alone: median depths and ids to the bit, from image to image, on every instruction set.
+    #[test]
+    fn depth_alone_is_the_same_depth(
+        still in splats(0..300),
+        objects in objects(),
+        cameras in prop::collection::vec(camera(), 1..3),
+    ) {
+        let (objects, placements): (Vec<_>, Vec<_>) = objects.into_iter().unzip();
+        for objects in [&objects[..], &[]] {
+            let scene = Scene { splats: &still, objects };
+            let placements = &placements[..objects.len()];
+            let alone = CpuRenderer::every(scene);
+            for (mut whole, mut alone) in CpuRenderer::every(scene).into_iter().zip(alone) {
+                alone.set_depth_alone(true);
+                let mut images = vec![[RgbdImage::default(), RgbdImage::default()]; cameras.len()];
+                for (camera, [expected, found]) in cameras.iter().zip(&mut images) {
+                    let camera = std::slice::from_ref(camera);
+                    whole.render(placements, camera, std::slice::from_mut(expected)).unwrap();
+                    alone.render(placements, camera, std::slice::from_mut(found)).unwrap();
+                    let bits = |image: &RgbdImage| -> Vec<u32> {
+                        image.depth_median_m.iter().map(|m| m.to_bits()).collect()
+                    };
+                    prop_assert!(bits(expected) == bits(found), "{}", whole.name());
+                    prop_assert_eq!(&expected.ids, &found.ids);
+                }
+            }
+        }
+    }
+}
+
 /// A square wall of opaque splats across the z axis of its own frame.
 fn wall(z_m: f32, half_m: f32, colour: f32) -> Splats {
     let mut splats = Splats::default();
