@@ -35,7 +35,7 @@ def test_a_solution_is_fast_and_touches_nothing(program, tmp_path):
     project = COURSE.parents[1] / "render-server/scenes/projects/forest.toml"
     text = (COURSE / "forest/README.md").read_text()
     all_mps = float(re.search(r"^\| greatest speed [^|]*\| \d+ \| >= (\S+) m/s \|", text, re.M)[1])
-    (run,) = grade(program, handed_in(tmp_path / "my-forest", "forest", "solution"), project, "ug", first=301)
+    (run,) = grade(program, handed_in(tmp_path / "my-forest", "forest", "solution"), project, "ug", first=305)
     assert (run["outcome"], run["score"]) == ("finished", 100.0), run
     assert run["max_speed_mps"] >= all_mps and run["seconds"] < 10.5, run
 

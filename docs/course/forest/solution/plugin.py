@@ -10,11 +10,11 @@ import vizflyt
 from vizflyt import Setpoint
 
 MOST_MPS = 8.5
-BRAKE_MPS2, BRAKE_LATE_S = 1.7, 0.55  # with which the guard stops before the fence: asking for more is no use
+BRAKE_MPS2, BRAKE_LATE_S = 1.6, 0.55  # with which the guard stops before the fence: asking for more is no use
 GUARD_M = 0.2  # the guard's own distance from the fence
 FENCE_M = 0.9  # kept from the fence beside, where the guard would turn the vehicle
 # A short brake at the start shows the guard how soon this vehicle answers; else it counts on less all the flight.
-SHOW_S = (0.8, 0.92)
+SHOW_S = (0.8, 1.0)
 LEAD_MPS = 1.2  # asked for beyond what is flown: enough for the guard, and the direction stays the one that is meant
 BAND_M = 0.5  # obstacles are what stands so far above and below the height of flight
 LATENCY_S = 0.06  # until an answer acts
