@@ -193,6 +193,9 @@ impl Session {
                 return Err(vec![Found { key, text }]);
             }
         }
+        // Of those that were dragged through, none is kept.
+        let is_used = |file: &str| arena.objects.iter().any(|object| object.scene == file);
+        self.models.retain(|file, model| model.is_written || is_used(file));
         self.arena = arena;
         Ok(())
     }
