@@ -39,13 +39,15 @@ const TILE_NUMBERS: usize = CHANNELS * TILE_PIXELS;
 /// How far ahead records of the list are asked for.
 const PREFETCH: usize = 12;
 
-/// Which part of the scene a slot is of.
+/// Which part of the scene a slot is of, and what of it is wanted.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tagged<'a> {
     /// What stands still, then the objects.
     pub(super) parts: &'a [Part],
     /// Per region of slots.
     pub(super) visible: &'a [Visible],
+    /// Median depth and id are all that counts.
+    pub(super) depth_alone: bool,
 }
 
 impl Tagged<'_> {
@@ -61,7 +63,6 @@ pub(super) fn blend<S: Simd>(
     splats: &[Splat2d],
     bins: &Bins,
     tagged: &Tagged<'_>,
-    depth_alone: bool,
     tiles: &mut Vec<f32>,
     image: &mut RgbdImage,
 ) {
@@ -73,7 +74,6 @@ pub(super) fn blend<S: Simd>(
             splats,
             list: bins.list(index),
             tagged,
-            depth_alone,
             origin: [index % bins.tiles_x * TILE, index / bins.tiles_x * TILE],
             scratch,
             pixels,
@@ -138,8 +138,6 @@ struct BlendTile<'a> {
     splats: &'a [Splat2d],
     list: &'a [AtomicU32],
     tagged: &'a Tagged<'a>,
-    /// Median depth and id are all that counts.
-    depth_alone: bool,
     /// The tile's first pixel, x and y.
     origin: [usize; 2],
     scratch: &'a mut Scratch,
@@ -151,7 +149,7 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { view, splats, list, tagged, depth_alone, origin, scratch, pixels } = self;
+        let Self { view, splats, list, tagged, origin, scratch, pixels } = self;
         // Ids cost a twentieth of the pass: only where something moves.
         let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];
@@ -202,7 +200,7 @@ impl Kernel for BlendTile<'_> {
                 let list = &scratch.lists[block][..lengths[block]];
                 let state = &mut pixels[block * CHANNELS * S::LANES..][..CHANNELS * S::LANES];
                 let batch = &scratch.batch;
-                let goes_on = match (has_ids, depth_alone) {
+                let goes_on = match (has_ids, tagged.depth_alone) {
                     (true, false) => blend_block::<S, true, false>(s, batch, list, x, y, state),
                     (false, false) => blend_block::<S, false, false>(s, batch, list, x, y, state),
                     (true, true) => blend_block::<S, true, true>(s, batch, list, x, y, state),
