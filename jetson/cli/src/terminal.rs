@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 pub(crate) use vizflyt_runtime::control::print_line;
+use vizflyt_server::render::RendererInfo;
 
 /// Prints a line on standard error; unlike `eprintln!` it does not panic when nobody reads any more.
 pub(crate) fn print_error(line: impl std::fmt::Display) {
@@ -67,6 +68,17 @@ pub(crate) fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
         });
     }
     Ok(flag)
+}
+
+/// Returns what tells of a page that answers: what draws it and its address; and opens it, if that is not to be `quiet`.
+pub(crate) fn show_page(quiet: bool) -> impl FnOnce(&str, &RendererInfo) {
+    move |url, renderer| {
+        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
+        print_line(format!("page        {url}"));
+        if !quiet {
+            open_browser(url);
+        }
+    }
 }
 
 /// Opens the page where there is a desktop; the address is printed in any case.

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result};
 use clap::Args;
 use vizflyt_server::ViewArgs;
 use vizflyt_server::render::{DetailKind, RendererKind};
@@ -13,7 +13,7 @@ use vizflyt_server::web::{self, Course, CourseFile, Line};
 use vizflyt_splat::{Splats, ply};
 
 use super::file;
-use crate::terminal::{open_browser, print_line};
+use crate::terminal::{print_line, show_page};
 
 /// Opens a page on which a course is set up in the twin: start, goal, fence, boxes to stay out of, gates, what moves.
 #[derive(Args, Debug)]
@@ -43,12 +43,7 @@ pub(super) struct EditArgs {
 
 /// Runs `vizflyt arena edit` until it is interrupted.
 pub(super) fn run(args: &EditArgs) -> Result<()> {
-    let path = if args.arena.is_dir() { args.arena.join("arena.toml") } else { args.arena.clone() };
-    ensure!(
-        path.extension().is_some_and(|extension| extension == "toml") && path.is_file(),
-        "{0} is no arena; make one around a scene: vizflyt arena new FOLDER --scene {0}",
-        args.arena.display()
-    );
+    let path = file::find(&args.arena)?;
     let view = ViewArgs {
         scene: path.clone(),
         http: args.http,
@@ -59,13 +54,7 @@ pub(super) fn run(args: &EditArgs) -> Result<()> {
         seed: 0,
         no_browser: args.no_browser,
     };
-    web::set_up(view, Arc::new(ArenaFile { path }), |url, renderer| {
-        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
-        print_line(format!("page        {url}"));
-        if !args.no_browser {
-            open_browser(url);
-        }
-    })
+    web::set_up(view, Arc::new(ArenaFile { path }), show_page(args.no_browser))
 }
 
 struct ArenaFile {

@@ -1,14 +1,29 @@
-//! Writes into an arena.toml that people have written: what is not changed stays, comments too.
+//! An arena.toml that people have written, found and changed: what is not changed stays, comments too.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml_edit::{
     Array, ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value,
 };
 use vizflyt_arena::ArenaConfig;
+
+/// Returns the file of an arena, given it or its folder.
+///
+/// # Errors
+/// There is none.
+pub(crate) fn find(arena: &Path) -> Result<PathBuf> {
+    let path = if arena.is_dir() { arena.join("arena.toml") } else { arena.to_owned() };
+    ensure!(
+        path.extension().is_some_and(|extension| extension == "toml") && path.is_file(),
+        "{} is no arena; make one around the scene: vizflyt arena new FOLDER --scene {}",
+        arena.display(),
+        arena.display()
+    );
+    Ok(path)
+}
 
 /// Changes an arena's file.
 ///

@@ -20,7 +20,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-use crate::terminal::{open_browser, print_line};
+use crate::terminal::show_page;
 
 /// Makes, trains, edits, bakes, inspects and renders scenes.
 #[derive(Args, Debug)]
@@ -67,11 +67,5 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
 
 fn view(args: vizflyt_server::ViewArgs) -> Result<()> {
     let quiet = args.no_browser;
-    vizflyt_server::web::view(args, |url, renderer| {
-        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
-        print_line(format!("page        {url}"));
-        if !quiet {
-            open_browser(url);
-        }
-    })
+    vizflyt_server::web::view(args, show_page(quiet))
 }

@@ -8,10 +8,10 @@ pub(super) mod track;
 mod write;
 
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, bail};
 use clap::{ArgGroup, Args};
 use glam::DVec3;
 use vizflyt_arena::ArenaConfig;
@@ -21,6 +21,7 @@ use vizflyt_twin::align::floor::{self, Floor};
 use self::report::Report;
 pub(super) use self::track::ClockArgs;
 use self::write::Changes;
+use crate::arena::file;
 use crate::terminal::print_fmt;
 
 /// Finds how a captured scene lies in the room, and writes it into `[scene]` of its arena.toml.
@@ -91,7 +92,7 @@ pub(crate) struct AlignArgs {
 
 /// Runs `vizflyt scene align`.
 pub(crate) fn run(args: &AlignArgs) -> Result<ExitCode> {
-    let path = arena_file(&args.arena)?;
+    let path = file::find(&args.arena)?;
     let text = std::fs::read_to_string(&path)
         .with_context(|| format!("cannot read {}", path.display()))?;
     let arena = ArenaConfig::parse(&text).with_context(|| path.display().to_string())?;
@@ -132,17 +133,6 @@ pub(crate) fn run(args: &AlignArgs) -> Result<ExitCode> {
     }
     print_fmt!("next        vizflyt arena check {}", args.arena.display());
     Ok(ExitCode::SUCCESS)
-}
-
-fn arena_file(arena: &Path) -> Result<PathBuf> {
-    let path = if arena.is_dir() { arena.join("arena.toml") } else { arena.to_owned() };
-    ensure!(
-        path.extension().is_some_and(|extension| extension == "toml") && path.is_file(),
-        "{} is no arena; make one around the scene: vizflyt arena new FOLDER --scene {}",
-        arena.display(),
-        arena.display()
-    );
-    Ok(path)
 }
 
 fn point(text: &str) -> Result<DVec3, String> {

@@ -16,7 +16,7 @@ use vizflyt_twin::align::{Fit, Similarity};
 use super::report::{Report, report};
 use super::write::{self, Changes};
 use super::{AlignArgs, CROP, LENGTH_SHARE};
-use crate::terminal::{open_browser, print_line};
+use crate::terminal::{print_line, show_page};
 
 /// Serves the page until it is interrupted.
 pub(super) fn run(args: &AlignArgs, path: &Path) -> Result<()> {
@@ -35,13 +35,7 @@ pub(super) fn run(args: &AlignArgs, path: &Path) -> Result<()> {
         click_sigma_m: args.sigma_mm * 1e-3,
         allow_m: args.allow_m,
     };
-    web::align(view, Arc::new(clicked), |url, renderer| {
-        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
-        print_line(format!("page        {url}"));
-        if !args.no_browser {
-            open_browser(url);
-        }
-    })
+    web::align(view, Arc::new(clicked), show_page(args.no_browser))
 }
 
 /// Places by what was clicked, for one arena.

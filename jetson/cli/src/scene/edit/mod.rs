@@ -17,7 +17,7 @@ use vizflyt_server::{ViewArgs, web};
 use vizflyt_splat::edit::Step;
 
 use self::request::{CarveSettings, Requests};
-use crate::terminal::{open_browser, print_fmt, print_line};
+use crate::terminal::{print_fmt, show_page};
 
 /// Crops, cleans, carves, thins out, turns and converts a scene; every step can be taken back.
 #[derive(Args, Debug)]
@@ -176,11 +176,5 @@ fn page(args: &EditArgs, editor: Editor, output: PathBuf) -> Result<()> {
         seed: 7,
         no_browser: args.no_browser,
     };
-    web::edit(view, editor, output, |url, renderer| {
-        print_line(format!("renderer    {} ({})", renderer.name, renderer.reason));
-        print_line(format!("page        {url}"));
-        if !args.no_browser {
-            open_browser(url);
-        }
-    })
+    web::edit(view, editor, output, show_page(args.no_browser))
 }
