@@ -1,19 +1,19 @@
-//! Pass 4: which splats touch which tile, each list nearest first.
+//! Pass 4: which splats touch which tile, and which of its blocks, each list nearest first.
 //!
 //! The depth order is cut into slices. Each slice walks its splats from near to far and notes a
-//! (tile, slot) pair for every tile that the ellipse alpha >= 1/255 really touches; the counts give
+//! pair for every tile of which the ellipse alpha >= 1/255 touches a block; the counts give
 //! each slice its places in every tile's list; then all slices scatter. Lists come out ordered
 //! because slices are, so nothing is sorted per tile.
 //!
-//! Budget: 48 bytes read per splat in random order (hence the prefetch), 12 written per pair.
+//! Budget: 8 bytes read per splat in random order, 64 of a large one (hence the prefetch); 20 written per pair.
 
-use std::ops::Range;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
+use super::cover::{self, Bands, COLUMNS};
 use super::cull::ObjectView;
-use super::project::{MIN_LEVEL, Projected, Splat2d};
+use super::project::{Projected, Splat2d, TileBox};
 use super::simd::{Kernel, Simd};
 
 /// Side of a tile. [px]
@@ -33,20 +33,44 @@ pub(super) struct Bins {
     slices: Vec<Slice>,
     /// Where each tile's list starts; one more than there are tiles.
     starts: Vec<u32>,
-    entries: Vec<AtomicU32>,
+    entries: Vec<AtomicU64>,
+}
+
+/// A splat of a tile's list.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Entry {
+    pub(super) slot: usize,
+    /// The blocks it touches, by column, then band, the first lowest.
+    pub(super) blocks: u32,
+}
+
+impl Entry {
+    /// Takes an entry of [`Bins::list`] apart.
+    #[inline(always)]
+    pub(super) fn of(entry: &AtomicU64) -> Self {
+        let entry = entry.load(Relaxed);
+        Self { slot: entry as u32 as usize, blocks: (entry >> 32) as u32 }
+    }
 }
 
 #[derive(Debug, Default)]
 struct Slice {
-    /// Tile in the upper half, slot in the lower.
-    pairs: Vec<u64>,
+    pairs: Vec<Pair>,
     /// Per tile: how many pairs; later, the place of the next.
     places: Vec<u32>,
 }
 
+#[derive(Clone, Copy, Debug, Default)]
+struct Pair {
+    tile: u32,
+    slot: u32,
+    /// [`Entry::blocks`].
+    blocks: u32,
+}
+
 impl Bins {
-    /// Returns the slots of the splats that touch a tile, nearest first.
-    pub(super) fn list(&self, tile: usize) -> &[AtomicU32] {
+    /// Returns the splats that touch a tile, nearest first, each to be read by [`Entry::of`].
+    pub(super) fn list(&self, tile: usize) -> &[AtomicU64] {
         &self.entries[self.starts[tile] as usize..self.starts[tile + 1] as usize]
     }
 
@@ -76,9 +100,10 @@ impl Bins {
         let tiles_x = self.tiles_x;
         slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
             slice.places.clear();
-            slice.places.resize(tiles, 0);
+            // Where a window that lies within the last tiles would go on: never more than 0.
+            slice.places.resize(tiles + tiles_x + 2, 0);
             let order = &order[order.len() * i / count..order.len() * (i + 1) / count];
-            simd.run(BinSlice { view, tiles_x, projected, order, slice });
+            simd.run(BinSlice { tiles_x, projected, order, slice });
         });
 
         self.starts.clear();
@@ -93,14 +118,15 @@ impl Bins {
         }
         self.starts.push(place);
         if self.entries.len() < place as usize {
-            self.entries.resize_with(place as usize, AtomicU32::default);
+            self.entries.resize_with(place as usize, AtomicU64::default);
         }
         let entries = &self.entries;
         slices.par_iter_mut().with_max_len(1).for_each(|slice| {
-            for &pair in &slice.pairs {
-                let place = &mut slice.places[(pair >> 32) as usize];
+            for &Pair { tile, slot, blocks } in &slice.pairs {
+                let place = &mut slice.places[tile as usize];
                 // Disjoint from all other places; atomic because no borrow can say so.
-                entries[*place as usize].store(pair as u32, Relaxed);
+                let entry = u64::from(blocks) << 32 | u64::from(slot);
+                entries[*place as usize].store(entry, Relaxed);
                 *place += 1;
             }
         });
@@ -109,7 +135,6 @@ impl Bins {
 
 /// Notes the pairs of one slice.
 struct BinSlice<'a> {
-    view: &'a ObjectView,
     tiles_x: usize,
     projected: &'a Projected,
     order: &'a [AtomicU32],
@@ -121,83 +146,82 @@ impl Kernel for BinSlice<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { view, tiles_x, projected, order, slice } = self;
-        let width = view.width_px as f32;
+        let Self { tiles_x, projected, order, slice } = self;
         let mut len = 0;
         for (i, slot) in order.iter().enumerate() {
+            if let Some(ahead) = order.get(i + 2 * PREFETCH) {
+                s.prefetch(&projected.covers[ahead.load(Relaxed) as usize]);
+            }
             if let Some(ahead) = order.get(i + PREFETCH) {
-                s.prefetch(&projected.boxes[ahead.load(Relaxed) as usize]);
+                let ahead = ahead.load(Relaxed) as usize;
+                if projected.covers[ahead].blocks == 0 {
+                    s.prefetch(&projected.splats[ahead]);
+                }
             }
             let slot = slot.load(Relaxed);
-            let tiles = projected.boxes[slot as usize];
-            let (left, right) = (usize::from(tiles.left), usize::from(tiles.right));
-            let (top, bottom) = (usize::from(tiles.top), usize::from(tiles.bottom));
-            if top == bottom || left == right {
-                // In one row or column of tiles an ellipse touches all that its box does.
-                for tile_y in top..=bottom {
-                    note(slice, &mut len, tile_y * tiles_x, left, right, slot);
-                }
+            let cover = projected.covers[slot as usize];
+            if cover.blocks == 0 {
+                note_large(s, tiles_x, &projected.splats[slot as usize], slot, slice, &mut len);
                 continue;
             }
-            let splat = &projected.splats[slot as usize];
-            for tile_y in top..=bottom {
-                let first = (tile_y * TILE) as f32 + 0.5;
-                let last = first + (TILE - 1) as f32;
-                let (low, high) = splat.span(first, last);
-                let columns = centres(low, high, width);
-                if !columns.is_empty() {
-                    let (left, right) = (columns.start / TILE, (columns.end - 1) / TILE);
-                    note(slice, &mut len, tile_y * tiles_x, left, right, slot);
-                }
+            let column = usize::from(cover.left) / COLUMNS;
+            let row = usize::from(cover.top) / cover::bands(S::LANES);
+            let tile = row * tiles_x + column;
+            let [first, right, below, last] = cover.split(S::LANES);
+            make_room(slice, len, 4);
+            for (tile, blocks) in [
+                (tile, first),
+                (tile + 1, right),
+                (tile + tiles_x, below),
+                (tile + tiles_x + 1, last),
+            ] {
+                note(slice, &mut len, tile, slot, blocks);
             }
         }
         slice.pairs.truncate(len);
     }
 }
 
-/// Notes a pair for each tile from `left` to `right` of a row of tiles.
+/// Notes the pairs of a splat that may touch any number of tiles.
 #[inline(always)]
-fn note(slice: &mut Slice, len: &mut usize, row: usize, left: usize, right: usize, slot: u32) {
-    // At least one: where rounding leaves none, the pair is of a tile next to the splat.
-    let count = right.saturating_sub(left) + 1;
-    if slice.pairs.len() < *len + count {
-        slice.pairs.resize((*len + count) * 2, 0);
+fn note_large<S: Simd>(
+    s: S,
+    tiles_x: usize,
+    splat: &Splat2d,
+    slot: u32,
+    slice: &mut Slice,
+    len: &mut usize,
+) {
+    let TileBox { left, right, top, bottom } = splat.tiles;
+    let columns = usize::from(left)..usize::from(right) + 1;
+    let last_row = usize::from(bottom);
+    // A vector of bands is some rows of tiles.
+    let step = S::LANES / cover::bands(S::LANES);
+    for row in (usize::from(top)..=last_row).step_by(step) {
+        let bands = Bands::new(s, splat, (row * TILE) as f32);
+        make_room(slice, *len, columns.len() * step);
+        for column in columns.clone() {
+            let bits = bands.of_column(s, (column * TILE) as f32);
+            for (i, row) in (row..=last_row).take(step).enumerate() {
+                note(slice, len, row * tiles_x + column, slot, Bands::<S>::of_row(bits, i));
+            }
+        }
     }
-    let tiles = row + left..row + left + count;
-    for (pair, tile) in slice.pairs[*len..*len + count].iter_mut().zip(tiles) {
-        *pair = (tile as u64) << 32 | u64::from(slot);
-        slice.places[tile] += 1;
-    }
-    *len += count;
 }
 
-/// Returns the pixels of a row (or column) of `size` whose centres lie from `low` to `high`.
+/// Makes room for more pairs.
 #[inline(always)]
-fn centres(low: f32, high: f32, size: f32) -> Range<usize> {
-    // Clamped below at 0, where truncation is rounding down; `as` saturates above.
-    let low = (low - 0.5).max(0.0).min(size);
-    let high = (high + 0.5).max(0.0).min(size);
-    let start = low as usize;
-    start + usize::from((start as f32) < low)..high as usize
+fn make_room(slice: &mut Slice, len: usize, count: usize) {
+    if slice.pairs.len() < len + count {
+        slice.pairs.resize((len + count) * 2, Pair::default());
+    }
 }
 
-impl Splat2d {
-    /// Returns the leftmost and rightmost x of the ellipse alpha >= 1/255 between two ys that it
-    /// reaches. [px]
-    #[inline(always)]
-    fn span(&self, top: f32, bottom: f32) -> (f32, f32) {
-        let (top, bottom) = (top - self.mean_y, bottom - self.mean_y);
-        // The outermost points are the ellipse's tips, or where it leaves the band next to them.
-        (
-            self.edge((-self.tip_y).max(top).min(bottom), -1.0),
-            self.edge(self.tip_y.max(top).min(bottom), 1.0),
-        )
-    }
-
-    /// Returns the x of the ellipse's left (-1) or right (1) edge at a height. [px]
-    #[inline(always)]
-    fn edge(&self, dy: f32, side: f32) -> f32 {
-        let left = (self.level - MIN_LEVEL - self.falloff_y * dy * dy).max(0.0);
-        self.mean_x + self.shear * dy + side * (left / self.falloff_x).sqrt()
-    }
+/// Notes a pair if it has blocks, without a branch; there must be room.
+#[inline(always)]
+fn note(slice: &mut Slice, len: &mut usize, tile: usize, slot: u32, blocks: u32) {
+    let counts = blocks != 0;
+    slice.pairs[*len] = Pair { tile: tile as u32, slot, blocks };
+    slice.places[tile] += u32::from(counts);
+    *len += usize::from(counts);
 }

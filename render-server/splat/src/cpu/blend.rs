@@ -1,22 +1,21 @@
 //! Pass 5: the pixels of each tile, from near to far.
 //!
-//! A tile is cut into blocks of one vector: 4 pixels wide, 2 or 4 high (squarer than a row, so
-//! fewer lanes are spent outside the ellipse). Its list is taken in batches of [`BATCH`]: copied
-//! next to each other, then tested, a vector of splats at a time, against every block's rows and
-//! columns, which leaves an exact list per block; then each block runs down its list with colour,
-//! depths and transmittance in registers, and stops when all its pixels are opaque.
+//! A tile is cut into blocks of one vector (`cover`). Its list is taken in batches of [`BATCH`]: copied
+//! next to each other, and turned into a row of bits per block, of the splats that touch it; then each block runs along
+//! its bits with colour, depths and transmittance in registers, and stops when all its pixels are opaque.
 //!
 //! Transmittance carries the pixel's end in its sign: the splat that would bring a pixel to 1e-4 is
-//! not rendered, and makes it negative. Where depth alone is asked for, a pixel ends once half of its light is gone: neither
+//! not rendered, and makes it negative from the next batch on. Where depth alone is asked for, a pixel ends once half of its light is gone: neither
 //! median depth nor id changes behind that.
 //!
-//! Budget: some 30 vector instructions per block and splat; 12 kB of tables, all in the L1 cache.
+//! Budget: some 26 vector instructions per block and splat; 10 kB of tables, all in the L1 cache.
 
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::AtomicU64;
 
 use rayon::prelude::*;
 
-use super::bin::{Bins, TILE};
+use super::bin::{Bins, Entry, TILE};
+use super::cover::{BLOCK_WIDTH, bands, block_height};
 use super::cull::{ObjectView, Visible};
 use super::project::{MIN_LEVEL, Splat2d};
 use super::scene::{BLOCK, Part};
@@ -24,10 +23,10 @@ use super::simd::{Kernel, Simd};
 use crate::RgbdImage;
 use crate::limits::{ALPHA_MAX, TRANSMITTANCE_MIN};
 
-/// Splats tested and blended at once; indices into a batch are bytes.
-const BATCH: usize = 128;
-/// Width of a block. [px]
-const BLOCK_WIDTH: usize = 4;
+/// Splats blended at once.
+const BATCH: usize = 64 * WORDS;
+/// Words of a row of bits.
+const WORDS: usize = 2;
 /// Blocks of a tile at most: 8 lanes, 4x2 pixels.
 const MAX_BLOCKS: usize = TILE * TILE / 8;
 /// Pixels of a tile.
@@ -86,48 +85,35 @@ pub(super) fn blend<S: Simd>(
 
 /// Tables of a batch.
 struct Scratch {
-    batch: Batch,
-    lists: [[u8; BATCH + 8]; MAX_BLOCKS],
+    splats: [Record; BATCH],
+    /// [`Entry::blocks`], byte by byte.
+    touched: [[[u8; 64]; WORDS]; 4],
+    /// Per block, which of the splats touch it.
+    hits: [[u64; WORDS]; MAX_BLOCKS],
 }
 
-/// A batch of splats, column by column; means relative to the tile. Columns are 256 long so that a
-/// byte can index them without a check.
-struct Batch {
-    mean_x: [f32; 256],
-    mean_y: [f32; 256],
-    shear: [f32; 256],
-    falloff_x: [f32; 256],
-    falloff_y: [f32; 256],
-    level: [f32; 256],
-    tip_y: [f32; 256],
-    extent_y: [f32; 256],
-    z_m: [f32; 256],
-    red: [f32; 256],
-    green: [f32; 256],
-    blue: [f32; 256],
-    id: [f32; 256],
+/// A splat, relative to the tile: at pixel (x, y) its level is `level - u^2 - v^2`,
+/// with `u = u_x x + u_y y + u_0` and `v = v_y y + v_0`.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
+struct Record {
+    u_x: f32,
+    u_y: f32,
+    u_0: f32,
+    v_y: f32,
+    v_0: f32,
+    level: f32,
+    z_m: f32,
+    rgb: [f32; 3],
+    id: f32,
 }
 
 impl Scratch {
     fn new() -> Self {
-        const ZEROS: [f32; 256] = [0.0; 256];
         Self {
-            batch: Batch {
-                mean_x: ZEROS,
-                mean_y: ZEROS,
-                shear: ZEROS,
-                falloff_x: ZEROS,
-                falloff_y: ZEROS,
-                level: ZEROS,
-                tip_y: ZEROS,
-                extent_y: ZEROS,
-                z_m: ZEROS,
-                red: ZEROS,
-                green: ZEROS,
-                blue: ZEROS,
-                id: ZEROS,
-            },
-            lists: [[0; BATCH + 8]; MAX_BLOCKS],
+            splats: [Record::default(); BATCH],
+            touched: [[[0; 64]; WORDS]; 4],
+            hits: [[0; WORDS]; MAX_BLOCKS],
         }
     }
 }
@@ -136,7 +122,7 @@ impl Scratch {
 struct BlendTile<'a> {
     view: &'a ObjectView,
     splats: &'a [Splat2d],
-    list: &'a [AtomicU32],
+    list: &'a [AtomicU64],
     tagged: &'a Tagged<'a>,
     /// The tile's first pixel, x and y.
     origin: [usize; 2],
@@ -153,7 +139,7 @@ impl Kernel for BlendTile<'_> {
         // Ids cost a twentieth of the pass: only where something moves.
         let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];
-        let block_height = S::LANES / BLOCK_WIDTH;
+        let block_height = block_height(S::LANES);
         let blocks = TILE_PIXELS / S::LANES;
         // Lane's centre within its block.
         let mut lane_x = [0.0; 16];
@@ -178,33 +164,35 @@ impl Kernel for BlendTile<'_> {
             s.store(transmittance, &mut pixels[(block * CHANNELS + 5) * S::LANES..]);
         }
 
-        for (first, slots) in list.chunks(BATCH).enumerate() {
+        for (first, entries) in list.chunks(BATCH).enumerate() {
             if live == 0 {
                 break;
             }
-            let ahead = &list[first * BATCH..];
-            load_batch(s, splats, slots, ahead, origin, &mut scratch.batch);
+            load_batch(s, splats, entries, origin, scratch);
             if has_ids {
-                for (id, slot) in scratch.batch.id.iter_mut().zip(slots) {
-                    *id = f32::from(tagged.id(slot.load(Relaxed) as usize));
+                for (splat, entry) in scratch.splats.iter_mut().zip(entries) {
+                    splat.id = f32::from(tagged.id(Entry::of(entry).slot));
                 }
             }
-            let mut lengths = [0usize; MAX_BLOCKS];
-            list_blocks(s, &scratch.batch, slots.len(), live, &mut scratch.lists, &mut lengths);
+            find_hits(s, entries.len(), blocks, scratch);
+            let mut next = list[((first + 1) * BATCH).min(list.len())..].iter();
             for block in 0..blocks {
-                if lengths[block] == 0 {
+                for later in next.by_ref().take(BATCH / blocks) {
+                    s.prefetch(&splats[Entry::of(later).slot]);
+                }
+                let hits = scratch.hits[block];
+                if live >> block & 1 == 0 || hits == [0; WORDS] {
                     continue;
                 }
                 let (x, y) = block_origin(block, block_height);
                 let (x, y) = (lane_x + s.splat(x), lane_y + s.splat(y));
-                let list = &scratch.lists[block][..lengths[block]];
                 let state = &mut pixels[block * CHANNELS * S::LANES..][..CHANNELS * S::LANES];
-                let batch = &scratch.batch;
-                let goes_on = match (has_ids, tagged.depth_alone) {
-                    (true, false) => blend_block::<S, true, false>(s, batch, list, x, y, state),
-                    (false, false) => blend_block::<S, false, false>(s, batch, list, x, y, state),
-                    (true, true) => blend_block::<S, true, true>(s, batch, list, x, y, state),
-                    (false, true) => blend_block::<S, false, true>(s, batch, list, x, y, state),
+                let batch = &scratch.splats;
+                let goes_on = match (tagged.depth_alone, has_ids) {
+                    (false, false) => blend_block::<S, false, false>(s, batch, hits, x, y, state),
+                    (false, true) => blend_block::<S, false, true>(s, batch, hits, x, y, state),
+                    (true, false) => blend_block::<S, true, false>(s, batch, hits, x, y, state),
+                    (true, true) => blend_block::<S, true, true>(s, batch, hits, x, y, state),
                 };
                 if !goes_on {
                     live &= !(1 << block);
@@ -221,138 +209,84 @@ impl Kernel for BlendTile<'_> {
 /// Returns the first pixel of a block within its tile.
 #[inline(always)]
 fn block_origin(block: usize, block_height: usize) -> (f32, f32) {
-    let across = TILE / BLOCK_WIDTH;
-    ((block % across * BLOCK_WIDTH) as f32, (block / across * block_height) as f32)
+    let bands = TILE / block_height;
+    ((block / bands * BLOCK_WIDTH) as f32, (block % bands * block_height) as f32)
 }
 
-/// Copies the records of a batch next to each other, column by column.
+/// Copies the splats of a batch next to each other.
 #[inline(always)]
 fn load_batch<S: Simd>(
     s: S,
     splats: &[Splat2d],
-    slots: &[AtomicU32],
-    ahead: &[AtomicU32],
+    batch: &[AtomicU64],
     origin: [usize; 2],
-    batch: &mut Batch,
+    scratch: &mut Scratch,
 ) {
     let (x, y) = (origin[0] as f32, origin[1] as f32);
-    for (i, slot) in slots.iter().enumerate().take(BATCH) {
-        if let Some(later) = ahead.get(i + PREFETCH) {
-            s.prefetch(&splats[later.load(Relaxed) as usize]);
+    for (i, entry) in batch.iter().enumerate().take(BATCH) {
+        if let Some(later) = batch.get(i + PREFETCH) {
+            s.prefetch(&splats[Entry::of(later).slot]);
         }
-        let splat = &splats[slot.load(Relaxed) as usize];
-        batch.mean_x[i] = splat.mean_x - x;
-        batch.mean_y[i] = splat.mean_y - y;
-        batch.shear[i] = splat.shear;
-        batch.falloff_x[i] = splat.falloff_x;
-        batch.falloff_y[i] = splat.falloff_y;
-        batch.level[i] = splat.level;
-        batch.tip_y[i] = splat.tip_y;
-        batch.extent_y[i] = splat.extent_y;
-        batch.z_m[i] = splat.z_m;
-        batch.red[i] = splat.rgb[0];
-        batch.green[i] = splat.rgb[1];
-        batch.blue[i] = splat.rgb[2];
-    }
-    // What pads the last vector reaches no row.
-    for i in slots.len()..slots.len().next_multiple_of(S::LANES) {
-        batch.extent_y[i] = f32::NEG_INFINITY;
+        let Entry { slot, blocks } = Entry::of(entry);
+        let splat = &splats[slot];
+        let (mean_x, mean_y) = (splat.mean_x - x, splat.mean_y - y);
+        scratch.splats[i] = Record {
+            u_x: splat.scale_x,
+            u_y: -splat.shear * splat.scale_x,
+            u_0: (splat.shear * mean_y - mean_x) * splat.scale_x,
+            v_y: splat.scale_y,
+            v_0: -mean_y * splat.scale_y,
+            level: splat.level,
+            z_m: splat.z_m,
+            rgb: splat.rgb,
+            id: 0.0,
+        };
+        for (bytes, byte) in scratch.touched.iter_mut().zip(blocks.to_le_bytes()) {
+            bytes[i / 64][i % 64] = byte;
+        }
     }
 }
 
-/// Lists for every live block the splats of the batch whose ellipse alpha >= 1/255 reaches it.
+/// Turns the blocks of each of `len` splats into the splats of each block.
 #[inline(always)]
-fn list_blocks<S: Simd>(
-    s: S,
-    batch: &Batch,
-    len: usize,
-    live: u32,
-    lists: &mut [[u8; BATCH + 8]; MAX_BLOCKS],
-    lengths: &mut [usize; MAX_BLOCKS],
-) {
-    let across = TILE / BLOCK_WIDTH;
-    let block_height = S::LANES / BLOCK_WIDTH;
-    for first in (0..len).step_by(S::LANES) {
-        let (mean_x, mean_y) = (s.load(&batch.mean_x[first..]), s.load(&batch.mean_y[first..]));
-        let (shear, tip_y) = (s.load(&batch.shear[first..]), s.load(&batch.tip_y[first..]));
-        let falloff_x = s.load(&batch.falloff_x[first..]);
-        let falloff_y = s.load(&batch.falloff_y[first..]);
-        let extent_y = s.load(&batch.extent_y[first..]);
-        let reach = s.load(&batch.level[first..]) - s.splat(MIN_LEVEL);
-        // Infinite where a splat covers everything evenly: bounded, so that 0 times it is 0.
-        let width2 = s.min(s.splat(1.0) / falloff_x, s.splat(1e30));
-        let zero = s.splat(0.0);
-        for band in 0..TILE / block_height {
-            let in_band = (1 << across) - 1;
-            if live >> (band * across) & in_band == 0 {
-                continue;
-            }
-            // From the first row's centres to the last's, relative to the means.
-            let top = s.splat((band * block_height) as f32 + 0.5) - mean_y;
-            let bottom = top + s.splat(block_height as f32 - 1.0);
-            let reaches = s.lt(top, extent_y) & s.lt(zero - extent_y, bottom);
-            if !s.any(reaches) {
-                continue;
-            }
-            // As `Splat2d::span`.
-            let dy = s.min(s.max(zero - tip_y, top), bottom);
-            let rest = s.max(s.neg_mul_add(falloff_y * dy, dy, reach), zero);
-            let left = s.mul_add(shear, dy, mean_x) - s.sqrt(rest * width2);
-            let dy = s.min(s.max(tip_y, top), bottom);
-            let rest = s.max(s.neg_mul_add(falloff_y * dy, dy, reach), zero);
-            let right = s.mul_add(shear, dy, mean_x) + s.sqrt(rest * width2);
-            for column in 0..across {
-                let block = band * across + column;
-                let x = (column * BLOCK_WIDTH) as f32;
-                let hit = reaches
-                    & s.lt(left, s.splat(x + BLOCK_WIDTH as f32 - 0.5))
-                    & s.lt(s.splat(x + 0.5), right);
-                let mut bits = s.bits(hit);
-                if live >> block & 1 == 0 {
-                    bits = 0;
-                }
-                let list = &mut lists[block];
-                let length = &mut lengths[block];
-                for half in 0..S::LANES / 8 {
-                    let bits = (bits >> (half * 8)) as usize & 0xff;
-                    // Eight positions at once, of which the first so many count.
-                    let base = (first + half * 8) as u64 * 0x0101_0101_0101_0101;
-                    let positions = POSITIONS[bits].wrapping_add(base).to_le_bytes();
-                    // Never more than `first + half * 8`; the bound spares the check.
-                    let at = (*length).min(BATCH);
-                    list[at..at + 8].copy_from_slice(&positions);
-                    *length = at + bits.count_ones() as usize;
-                }
+fn find_hits<S: Simd>(s: S, len: usize, blocks: usize, scratch: &mut Scratch) {
+    for byte in 0..blocks / 8 {
+        for word in 0..WORDS {
+            let planes = s.bit_planes(&scratch.touched[byte][word]);
+            // What lies behind the batch's end is of an earlier one.
+            let count = len.saturating_sub(64 * word).min(64);
+            let there = if count == 64 { u64::MAX } else { (1 << count) - 1 };
+            for (hits, plane) in scratch.hits[byte * 8..].iter_mut().zip(planes) {
+                hits[word] = plane & there;
             }
         }
     }
 }
 
-/// Positions of the set bits of every byte, packed as bytes, lowest first.
-static POSITIONS: [u64; 256] = {
-    let mut table = [0; 256];
-    let mut bits = 0;
-    while bits < 256 {
-        let mut at = 0;
-        let mut bit = 0;
-        while bit < 8 {
-            if bits >> bit & 1 == 1 {
-                table[bits] |= bit << (8 * at);
-                at += 1;
-            }
-            bit += 1;
-        }
-        bits += 1;
-    }
-    table
-};
-
-/// Blends a list onto one block; returns whether any of its pixels goes on.
+/// Blends the splats of the bits that are set onto one block; returns whether any of its pixels goes on.
 #[inline(always)]
-fn blend_block<S: Simd, const IDS: bool, const DEPTH_ALONE: bool>(
+fn blend_block<S: Simd, const DEPTH_ALONE: bool, const IDS: bool>(
     s: S,
-    batch: &Batch,
-    list: &[u8],
+    batch: &[Record; BATCH],
+    hits: [u64; WORDS],
+    x: S::F,
+    y: S::F,
+    state: &mut [f32],
+) -> bool {
+    // Behind half of the light neither median depth nor id changes any more.
+    let transmittance = s.load(&state[5 * S::LANES..]);
+    if s.any(s.lt(s.splat(0.5), transmittance)) {
+        blend_hits::<S, DEPTH_ALONE, true, IDS>(s, batch, hits, x, y, state)
+    } else {
+        blend_hits::<S, DEPTH_ALONE, false, false>(s, batch, hits, x, y, state)
+    }
+}
+
+#[inline(always)]
+fn blend_hits<S: Simd, const DEPTH_ALONE: bool, const MEDIAN: bool, const IDS: bool>(
+    s: S,
+    batch: &[Record; BATCH],
+    hits: [u64; WORDS],
     x: S::F,
     y: S::F,
     state: &mut [f32],
@@ -364,45 +298,55 @@ fn blend_block<S: Simd, const IDS: bool, const DEPTH_ALONE: bool>(
     let mut median = s.load(&state[4 * S::LANES..]);
     let mut transmittance = s.load(&state[5 * S::LANES..]);
     let mut id = s.load(&state[6 * S::LANES..]);
-    let mut goes_on = true;
-    for &i in list {
-        let i = usize::from(i);
-        let dy = y - s.splat(batch.mean_y[i]);
-        let dx = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
-        let level = s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
-        let level = s.neg_mul_add(dx * s.splat(batch.falloff_x[i]), dx, level);
-        let hit = s.lt(s.splat(MIN_LEVEL), level);
-        let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
-        // Not `transmittance - weight`: one latency less from splat to splat.
-        let after = s.neg_mul_add(alpha, transmittance, transmittance);
-        let end = if DEPTH_ALONE { 0.5 } else { TRANSMITTANCE_MIN as f32 };
-        let live = s.lt(s.splat(end), after);
-        if !DEPTH_ALONE {
-            let weight = s.keep(live, alpha * transmittance);
-            red = s.mul_add(weight, s.splat(batch.red[i]), red);
-            green = s.mul_add(weight, s.splat(batch.green[i]), green);
-            blue = s.mul_add(weight, s.splat(batch.blue[i]), blue);
-            depth = s.mul_add(weight, s.splat(batch.z_m[i]), depth);
-        }
-        // The last splat rendered while more than half of the light passed; `finish` checks that it
-        // brought the pixel to half.
-        let before_half = hit & s.lt(s.splat(0.5), transmittance);
-        median = s.select(before_half, s.splat(batch.z_m[i]), median);
-        if IDS {
-            id = s.select(before_half, s.splat(batch.id[i]), id);
-        }
-        transmittance =
-            if DEPTH_ALONE { after } else { s.select(live, after, s.negative(transmittance)) };
-        if !s.any(live) {
-            goes_on = false;
-            break;
+    let end = s.splat(if DEPTH_ALONE { 0.5 } else { TRANSMITTANCE_MIN as f32 });
+    // Goes on falling behind the pixel's end, so that from splat to splat there is but one operation's latency; `shown`
+    // is what it was before the end.
+    let mut shown = transmittance;
+    'batch: for (word, mut bits) in hits.into_iter().enumerate() {
+        while bits != 0 {
+            let splat = &batch[(word * 64 + bits.trailing_zeros() as usize) % BATCH];
+            bits &= bits - 1;
+            let u = s.mul_add(y, s.splat(splat.u_y), s.splat(splat.u_0));
+            let u = s.mul_add(x, s.splat(splat.u_x), u);
+            let v = s.mul_add(y, s.splat(splat.v_y), s.splat(splat.v_0));
+            let level = s.neg_mul_add(u, u, s.neg_mul_add(v, v, s.splat(splat.level)));
+            let hit = s.lt(s.splat(MIN_LEVEL), level);
+            let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
+            // Not `transmittance - weight`: a latency less.
+            let after = s.neg_mul_add(alpha, transmittance, transmittance);
+            // Far behind the end, but no subnormal number, which takes a hundred times as long.
+            let after = s.max(after, s.splat(1e-30));
+            let live = s.lt(end, after);
+            if !DEPTH_ALONE {
+                let weight = s.keep(live, alpha * transmittance);
+                red = s.mul_add(weight, s.splat(splat.rgb[0]), red);
+                green = s.mul_add(weight, s.splat(splat.rgb[1]), green);
+                blue = s.mul_add(weight, s.splat(splat.rgb[2]), blue);
+                depth = s.mul_add(weight, s.splat(splat.z_m), depth);
+            }
+            // The last splat rendered while more than half of the light passed; `finish` checks that it
+            // brought the pixel to half.
+            if MEDIAN {
+                let before_half = hit & s.lt(s.splat(0.5), transmittance);
+                median = s.select(before_half, s.splat(splat.z_m), median);
+                if IDS {
+                    id = s.select(before_half, s.splat(splat.id), id);
+                }
+            }
+            shown = if DEPTH_ALONE { after } else { s.select(live, after, shown) };
+            transmittance = after;
+            if !s.any(live) {
+                break 'batch;
+            }
         }
     }
-    let channels = [red, green, blue, depth, median, transmittance, id];
+    let live = s.lt(end, transmittance);
+    let shown = s.select(live, shown, s.negative(shown));
+    let channels = [red, green, blue, depth, median, shown, id];
     for channel in 0..CHANNELS {
         s.store(channels[channel], &mut state[channel * S::LANES..]);
     }
-    goes_on
+    s.any(live)
 }
 
 /// Turns a block's sums into what an image holds: RGB on the background, expected depth, median
@@ -416,7 +360,8 @@ fn finish<S: Simd>(s: S, view: &ObjectView, state: &mut [f32]) {
         let rgb = s.mul_add(transmittance, s.splat(view.background[channel]), sum);
         s.store(rgb, &mut state[channel * S::LANES..]);
     }
-    let depth = s.load(&state[3 * S::LANES..]) / alpha;
+    // What rounding brings beyond the greatest number comes back.
+    let depth = s.min(s.load(&state[3 * S::LANES..]) / alpha, s.splat(f32::MAX));
     let covered = s.lt(s.splat(0.0), alpha);
     s.store(s.keep(covered, depth), &mut state[3 * S::LANES..]);
     // Half itself counts as reached.
@@ -431,7 +376,7 @@ fn finish<S: Simd>(s: S, view: &ObjectView, state: &mut [f32]) {
 /// Copies tiles of blocks to rows of pixels.
 fn untile(lanes: usize, tiles_x: usize, tiles: &[f32], image: &mut RgbdImage) {
     let width = image.width_px as usize;
-    let block_height = lanes / BLOCK_WIDTH;
+    let block_height = block_height(lanes);
     let band = TILE * width;
     image
         .rgb
@@ -445,8 +390,7 @@ fn untile(lanes: usize, tiles_x: usize, tiles: &[f32], image: &mut RgbdImage) {
             for row in 0..alpha.len() / width {
                 for x in (0..width).step_by(BLOCK_WIDTH) {
                     let tile = &tiles[x / TILE * TILE_NUMBERS..][..TILE_NUMBERS];
-                    let across = TILE / BLOCK_WIDTH;
-                    let block = row / block_height * across + x % TILE / BLOCK_WIDTH;
+                    let block = x % TILE / BLOCK_WIDTH * bands(lanes) + row / block_height;
                     let lane = row % block_height * BLOCK_WIDTH;
                     let state = &tile[block * CHANNELS * lanes..][..CHANNELS * lanes];
                     let channel = |k: usize| &state[k * lanes + lane..][..BLOCK_WIDTH];

@@ -12,7 +12,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::bin::TILE;
+use super::cover::{self, BLOCK_WIDTH, COLUMNS, Cover, Ellipse};
 use super::cull::{ObjectView, Visible};
 use super::lens::{self, Model};
 use super::scene::{BLOCK, GROUP, GROUP_NUMBERS, Part, column};
@@ -31,24 +31,28 @@ const EXTENT2: f32 = 2.0 * std::f32::consts::LN_2;
 const MAX_EXTENT_PX: f32 = 1e18;
 
 /// A Gaussian on the image plane: alpha at (x, y) is
-/// `2^(level - falloff_x (dx - shear dy)^2 - falloff_y dy^2)`, dx and dy from the mean. [px]
+/// `2^(level - (scale_x (dx - shear dy))^2 - (scale_y dy)^2)`, dx and dy from the mean. [px] A cache line, so that reading
+/// one is one access to memory.
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(C)]
+#[repr(C, align(64))]
 pub(super) struct Splat2d {
     pub(super) mean_x: f32,
     pub(super) mean_y: f32,
     pub(super) shear: f32,
-    pub(super) falloff_x: f32,
-    pub(super) falloff_y: f32,
+    pub(super) scale_x: f32,
+    pub(super) scale_y: f32,
     /// log2 of the opacity.
     pub(super) level: f32,
     /// dy of the rightmost point of the ellipse alpha = 1/255.
     pub(super) tip_y: f32,
     /// Half the height of that ellipse.
     pub(super) extent_y: f32,
+    /// `1 / scale_x`, or 1e15 if that is less: 0 times it is 0.
+    pub(super) width: f32,
     /// Camera z. [m]
     pub(super) z_m: f32,
     pub(super) rgb: [f32; 3],
+    pub(super) tiles: TileBox,
 }
 
 /// The tiles that the box around the ellipse alpha = 1/255 touches, both ends included.
@@ -68,7 +72,7 @@ pub(super) struct Projected {
     /// Indexed by slot.
     pub(super) splats: Vec<Splat2d>,
     /// Apart from the splats, because binning most of them needs no more. Indexed by slot.
-    pub(super) boxes: Vec<TileBox>,
+    pub(super) covers: Vec<Cover>,
     /// Camera z as bits, which order as the positive numbers do. Indexed by slot.
     pub(super) keys: Vec<u32>,
     /// Filled slots of each region.
@@ -86,7 +90,7 @@ pub(super) fn project<S: Simd>(
     let slots = visible.len() * BLOCK;
     if out.splats.len() < slots {
         out.splats.resize(slots, Splat2d::default());
-        out.boxes.resize(slots, TileBox::default());
+        out.covers.resize(slots, Cover::default());
         out.keys.resize(slots, 0);
     }
     out.counts.resize(visible.len(), 0);
@@ -94,14 +98,14 @@ pub(super) fn project<S: Simd>(
     let distorted = views.first().is_some_and(|view| view.model != Model::Pinhole);
     out.splats
         .par_chunks_mut(BLOCK)
-        .zip(out.boxes.par_chunks_mut(BLOCK))
+        .zip(out.covers.par_chunks_mut(BLOCK))
         .zip(out.keys.par_chunks_mut(BLOCK))
         .zip(&mut out.counts)
         .zip(visible)
         // Four blocks are some 5 us of work.
         .with_min_len(4)
-        .for_each(|((((splats, boxes), keys), count), &Visible { part, block })| {
-            let out = Region { splats, boxes, keys };
+        .for_each(|((((splats, covers), keys), count), &Visible { part, block })| {
+            let out = Region { splats, covers, keys };
             let (part, view) = (&parts[part as usize], &views[part as usize]);
             let block = block as usize;
             *count = match (distorted, part.antialiased) {
@@ -124,7 +128,7 @@ struct ProjectBlock<'a, const LENS: bool, const ANTIALIASED: bool> {
 /// Slots of one block.
 struct Region<'a> {
     splats: &'a mut [Splat2d],
-    boxes: &'a mut [TileBox],
+    covers: &'a mut [Cover],
     keys: &'a mut [u32],
 }
 
@@ -244,6 +248,39 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
     }
 
     let inverse_c = s.splat(1.0) / c;
+    let scale_x = s.sqrt(s.splat(HALF_LOG2_E) * c / determinant);
+    let ellipse = Ellipse {
+        mean_x,
+        mean_y,
+        shear: b * inverse_c,
+        width: s.min(s.splat(1.0) / scale_x, s.splat(1e15)),
+        scale_y: s.sqrt(s.splat(HALF_LOG2_E) * inverse_c),
+        level,
+        tip_y: b * extent_x / a,
+        extent_y,
+    };
+    // The blocks of the first and the last pixel centre in the box around the ellipse.
+    let height = cover::block_height(S::LANES) as f32;
+    let left = first_block(s, mean_x - extent_x, BLOCK_WIDTH as f32, view.width_px);
+    let right = last_block(s, mean_x + extent_x, BLOCK_WIDTH as f32, view.width_px);
+    let top = first_block(s, mean_y - extent_y, height, view.height_px);
+    let bottom = last_block(s, mean_y + extent_y, height, view.height_px);
+    let bands = cover::bands(S::LANES);
+    let fits = s.lt(right - left, s.splat(COLUMNS as f32 - 0.5))
+        & s.lt(bottom - top, s.splat(bands as f32 - 0.5));
+    let mut blocks = [s.splat(0.0); 2];
+    if s.any(seen & fits) {
+        let corner = [left * s.splat(BLOCK_WIDTH as f32), top * s.splat(height)];
+        let size = [view.width_px, view.height_px];
+        let [low, high] = cover::window(s, &ellipse, corner, size);
+        blocks = [s.keep(fits, low), s.keep(fits, high)];
+        // Between the centres of pixels.
+        bits &= !s.bits(fits) | s.bits(s.lt(s.splat(0.5), low + high));
+        if bits == 0 {
+            return count;
+        }
+    }
+
     let distance = s.sqrt(dot(s, d, d));
     let inverse_length = s.splat(1.0) / distance;
     let direction = [d[0] * inverse_length, d[1] * inverse_length, d[2] * inverse_length];
@@ -254,49 +291,54 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
     let fields = [
         mean_x,
         mean_y,
-        b * inverse_c,
-        s.splat(HALF_LOG2_E) * c / determinant,
-        s.splat(HALF_LOG2_E) * inverse_c,
+        ellipse.shear,
+        scale_x,
+        ellipse.scale_y,
         level,
-        b * extent_x / a,
+        ellipse.tip_y,
         extent_y,
+        ellipse.width,
         z,
         rgb[0],
         rgb[1],
         rgb[2],
-        // The tiles of the first and last pixel centres in the box: `ceil` is written as adding a
-        // little less than 1, because the conversion to whole numbers rounds down.
-        first_tile(s, mean_x - extent_x, view.width_px),
-        last_tile(s, mean_x + extent_x, view.width_px),
-        first_tile(s, mean_y - extent_y, view.height_px),
-        last_tile(s, mean_y + extent_y, view.height_px),
+        left,
+        right,
+        top,
+        bottom,
+        blocks[0],
+        blocks[1],
     ];
-    let mut lanes = [[0f32; GROUP]; 16];
+    let mut lanes = [[0f32; GROUP]; 19];
     for (lanes, field) in lanes.iter_mut().zip(fields) {
         s.store(field, lanes);
     }
     while bits != 0 {
         let lane = bits.trailing_zeros() as usize % GROUP;
         bits &= bits - 1;
+        let (left, top) = (lanes[13][lane] as u16, lanes[15][lane] as u16);
         out.splats[count] = Splat2d {
             mean_x: lanes[0][lane],
             mean_y: lanes[1][lane],
             shear: lanes[2][lane],
-            falloff_x: lanes[3][lane],
-            falloff_y: lanes[4][lane],
+            scale_x: lanes[3][lane],
+            scale_y: lanes[4][lane],
             level: lanes[5][lane],
             tip_y: lanes[6][lane],
             extent_y: lanes[7][lane],
-            z_m: lanes[8][lane],
-            rgb: [lanes[9][lane], lanes[10][lane], lanes[11][lane]],
+            width: lanes[8][lane],
+            z_m: lanes[9][lane],
+            rgb: [lanes[10][lane], lanes[11][lane], lanes[12][lane]],
+            tiles: TileBox {
+                left: left / COLUMNS as u16,
+                right: lanes[14][lane] as u16 / COLUMNS as u16,
+                top: top / bands as u16,
+                bottom: lanes[16][lane] as u16 / bands as u16,
+            },
         };
-        out.boxes[count] = TileBox {
-            left: lanes[12][lane] as u16,
-            right: lanes[13][lane] as u16,
-            top: lanes[14][lane] as u16,
-            bottom: lanes[15][lane] as u16,
-        };
-        out.keys[count] = lanes[8][lane].to_bits();
+        out.covers[count] =
+            Cover { left, top, blocks: lanes[17][lane] as u32 | (lanes[18][lane] as u32) << 16 };
+        out.keys[count] = lanes[9][lane].to_bits();
         count += 1;
     }
     count
@@ -371,19 +413,20 @@ fn inside<S: Simd>(s: S, mean: S::F, extent: S::F, size: u32) -> S::M {
         & s.lt(extent, s.splat(MAX_EXTENT_PX))
 }
 
-/// Returns the tile of the first pixel centre at or after `low`; rounded down, a whole number.
+/// Returns the row or column of blocks of the first pixel centre at or after `low`. `ceil` is written as adding a little
+/// less than 1.
 #[inline(always)]
-fn first_tile<S: Simd>(s: S, low: S::F, size: u32) -> S::F {
+fn first_block<S: Simd>(s: S, low: S::F, block: f32, size: u32) -> S::F {
     let pixel = s.max(low + s.splat(0.999_99 - 0.5), s.splat(0.0));
     let pixel = s.min(pixel, s.splat(size as f32 - 1.0));
-    pixel * s.splat(1.0 / TILE as f32)
+    s.floor(pixel * s.splat(1.0 / block))
 }
 
-/// Returns the tile of the last pixel centre at or before `high`; rounded down, a whole number.
+/// Returns the row or column of blocks of the last pixel centre at or before `high`.
 #[inline(always)]
-fn last_tile<S: Simd>(s: S, high: S::F, size: u32) -> S::F {
+fn last_block<S: Simd>(s: S, high: S::F, block: f32, size: u32) -> S::F {
     let pixel = s.min(high - s.splat(0.5), s.splat(size as f32 - 1.0));
-    pixel * s.splat(1.0 / TILE as f32)
+    s.floor(pixel * s.splat(1.0 / block))
 }
 
 /// Returns the colour of a vector of splats seen along unit directions; the vector form of

@@ -141,6 +141,11 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
+    fn floor(self, a: F32x8) -> F32x8 {
+        F32x8(proven!(_mm256_floor_ps(a.0)))
+    }
+
+    #[inline(always)]
     fn exp2(self, a: F32x8) -> F32x8 {
         /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.
         const ROUND: f32 = 12_582_912.0;
@@ -192,6 +197,22 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn any(self, m: Mask8) -> bool {
         self.bits(m) != 0
+    }
+
+    #[inline(always)]
+    fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
+        let at = bytes.as_ptr();
+        // SAFETY: 64 bytes are there; the loads need no alignment. AVX is proven by `self`.
+        let mut halves =
+            unsafe { [_mm256_loadu_si256(at.cast()), _mm256_loadu_si256(at.add(32).cast())] };
+        let mut planes = [0; 8];
+        // From the uppermost bit, which is what is gathered, down; adding a byte to itself brings up the next.
+        for plane in planes.iter_mut().rev() {
+            let [low, high] = halves.map(|half| proven!(_mm256_movemask_epi8(half)) as u32);
+            *plane = u64::from(high) << 32 | u64::from(low);
+            halves = halves.map(|half| proven!(_mm256_add_epi8(half, half)));
+        }
+        planes
     }
 
     #[inline(always)]

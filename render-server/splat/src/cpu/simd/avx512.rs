@@ -6,7 +6,7 @@
 use std::arch::x86_64::*;
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
-use super::{EXP2, Kernel, Simd};
+use super::{Kernel, Simd};
 
 /// Proof that the processor has AVX-512 F, VL, BW and DQ, and all that [`super::Avx2`] proves.
 #[derive(Clone, Copy, Debug)]
@@ -24,6 +24,9 @@ impl Avx512 {
 }
 
 const LANES: usize = 16;
+
+/// As [`super::EXP2`], on [0, 1], since here rounding down is free: 2.7e-6.
+const EXP2: [f32; 5] = [1.000_002_6, 0.693_003_83, 0.241_442_74, 0.052_011_49, 0.013_534_154];
 
 /// Made only by methods of [`Avx512`], so it too is proof.
 #[derive(Clone, Copy)]
@@ -140,14 +143,21 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
+    fn floor(self, a: F32x16) -> F32x16 {
+        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+        F32x16(proven!(_mm512_roundscale_ps::<DOWN>(a.0)))
+    }
+
+    #[inline(always)]
     fn exp2(self, a: F32x16) -> F32x16 {
-        let whole = F32x16(proven!(_mm512_roundscale_ps::<_MM_FROUND_NO_EXC>(a.0)));
-        let f = a - whole;
+        // What is above the whole number below, which is what the scaling rounds to.
+        const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+        let f = F32x16(proven!(_mm512_reduce_ps::<DOWN>(a.0)));
         let p = self.mul_add(self.splat(EXP2[4]), f, self.splat(EXP2[3]));
         let p = self.mul_add(p, f, self.splat(EXP2[2]));
         let p = self.mul_add(p, f, self.splat(EXP2[1]));
         let p = self.mul_add(p, f, self.splat(EXP2[0]));
-        F32x16(proven!(_mm512_scalef_ps(p.0, whole.0)))
+        F32x16(proven!(_mm512_scalef_ps(p.0, a.0)))
     }
 
     #[inline(always)]
@@ -183,6 +193,15 @@ impl Simd for Avx512 {
     #[inline(always)]
     fn any(self, m: Mask16) -> bool {
         m.0 != 0
+    }
+
+    #[inline(always)]
+    fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
+        // SAFETY: 64 bytes are there; the load needs no alignment. `self` proves AVX-512.
+        let bytes = unsafe { _mm512_loadu_si512(bytes.as_ptr().cast()) };
+        std::array::from_fn(|bit| {
+            proven!(_mm512_test_epi8_mask(bytes, _mm512_set1_epi8((1u8 << bit) as i8)))
+        })
     }
 
     #[inline(always)]

@@ -61,6 +61,8 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
     /// Returns the square root.
     fn sqrt(self, a: Self::F) -> Self::F;
+    /// Returns the greatest whole number that is not greater.
+    fn floor(self, a: Self::F) -> Self::F;
     /// Returns `2^a` within 3e-6 relative for `a` in -126 to 127; anything, but no trap, beyond.
     fn exp2(self, a: Self::F) -> Self::F;
     /// Returns the binary logarithm within 1e-6 for positive `a`; -127 of 0. Plain code, which compiles to the set's
@@ -87,6 +89,20 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn bits(self, m: Self::M) -> u32;
     /// Whether any flag is set.
     fn any(self, m: Self::M) -> bool;
+
+    /// Returns, for each bit of a byte, lowest first, which of the bytes have it: the first byte lowest. Plain code, as
+    /// [`Self::log2`].
+    #[inline(always)]
+    fn bit_planes(self, bytes: &[u8; 64]) -> [u64; 8] {
+        let mut planes = [0; 8];
+        for (i, eight) in bytes.as_chunks().0.iter().enumerate() {
+            let bits = transpose(u64::from_le_bytes(*eight)).to_le_bytes();
+            for (plane, bits) in planes.iter_mut().zip(bits) {
+                *plane |= u64::from(bits) << (8 * i);
+            }
+        }
+        planes
+    }
 
     /// Asks for the cache line at `value`, to be read soon.
     fn prefetch<T>(self, value: &T);
@@ -117,6 +133,19 @@ fn log2(a: f32) -> f32 {
     let ss = s * s;
     let series = ((ss * (1.0 / 7.0) + 1.0 / 5.0) * ss + 1.0 / 3.0) * ss + 1.0;
     exponent as f32 + 2.0 * std::f32::consts::LOG2_E * s * series
+}
+
+/// Transposes 8x8 bits, a byte a row: by halves, quarters and eighths (Warren 2012, "Hacker's Delight", 7-3).
+#[inline(always)]
+fn transpose(rows: u64) -> u64 {
+    let mut bits = rows;
+    for (shift, upper_right) in
+        [(7, 0x00aa_00aa_00aa_00aa), (14, 0x0000_cccc_0000_cccc), (28, 0x0000_0000_f0f0_f0f0)]
+    {
+        let swapped = (bits ^ (bits >> shift)) & upper_right;
+        bits ^= swapped ^ (swapped << shift);
+    }
+    bits
 }
 
 /// The instruction sets this build can dispatch to.

@@ -6,8 +6,8 @@ use std::arch::aarch64::{
     float32x4_t, uint32x4_t, vaddq_f32, vaddq_u32, vaddvq_f32, vaddvq_u32, vandq_u32, vbslq_f32,
     vcltq_f32, vdivq_f32, vdupq_n_f32, vdupq_n_u32, vfmaq_f32, vfmsq_f32, vget_high_u16,
     vget_low_u16, vld1q_f32, vld1q_u16, vld1q_u32, vmaxnmq_f32, vmaxvq_u32, vminnmq_f32, vmovl_u16,
-    vmulq_f32, vorrq_u32, vreinterpretq_f32_u32, vreinterpretq_u32_f32, vshlq_n_u32, vsqrtq_f32,
-    vst1q_f32, vsubq_f32,
+    vmulq_f32, vorrq_u32, vreinterpretq_f32_u32, vreinterpretq_u32_f32, vrndmq_f32, vshlq_n_u32,
+    vsqrtq_f32, vst1q_f32, vsubq_f32,
 };
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
@@ -160,6 +160,11 @@ impl Simd for Neon {
     #[inline(always)]
     fn sqrt(self, a: F32x8) -> F32x8 {
         F32x8(neon!([vsqrtq_f32(a.0[0]), vsqrtq_f32(a.0[1])]))
+    }
+
+    #[inline(always)]
+    fn floor(self, a: F32x8) -> F32x8 {
+        F32x8(neon!([vrndmq_f32(a.0[0]), vrndmq_f32(a.0[1])]))
     }
 
     #[inline(always)]

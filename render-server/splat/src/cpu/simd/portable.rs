@@ -122,6 +122,11 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    fn floor(self, a: F32x8) -> F32x8 {
+        F32x8(a.0.map(f32::floor))
+    }
+
+    #[inline(always)]
     fn exp2(self, a: F32x8) -> F32x8 {
         /// 1.5 * 2^23: adding it rounds to a whole number, held in the low bits.
         const ROUND: f32 = 12_582_912.0;

@@ -32,6 +32,7 @@ impl Kernel for Check {
         check("min", s.min(va, vb), &|i| a[i].min(b[i]), 0.0);
         check("max", s.max(va, vb), &|i| a[i].max(b[i]), 0.0);
         check("sqrt", s.sqrt(va * va), &|i| (a[i] * a[i]).sqrt(), 1e-7);
+        check("floor", s.floor(va), &|i| a[i].floor(), 0.0);
         check("exp2", s.exp2(va), &|i| a[i].exp2(), 4e-6);
         let above_2 = va * va + s.splat(2.0);
         check("log2", s.log2(above_2), &|i| (a[i] * a[i] + 2.0).log2(), 1e-6);
@@ -59,6 +60,14 @@ impl Kernel for Check {
         assert_eq!(s.bits(s.lt(va, zero)), expected);
         let both = s.lt(va, zero) & s.lt(vb, zero);
         assert_eq!(s.any(both), (0..S::LANES).any(|i| a[i] < 0.0 && b[i] < 0.0));
+
+        let bytes: [u8; 64] = std::array::from_fn(|i| (i * i * 37 + i) as u8);
+        let planes = s.bit_planes(&bytes);
+        for (i, byte) in bytes.iter().enumerate() {
+            for (bit, plane) in planes.iter().enumerate() {
+                assert_eq!(plane >> i & 1, u64::from(byte >> bit & 1), "byte {i}, bit {bit}");
+            }
+        }
 
         // All finite halves, subnormal ones too.
         for chunk in (0..=u16::MAX).collect::<Vec<_>>().chunks(16) {
