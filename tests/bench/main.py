@@ -66,6 +66,8 @@ def tell(name: str, before: figures.Taken | None, after: figures.Taken) -> None:
         return
     if before.processor != after.processor:
         print(f"   another processor than the committed figures' ({before.processor}): ratios say little")
+    if after.load > (os.cpu_count() or 1):
+        print(f"   load {after.load}: others use the processors; times that are not the processor's say little")
     kernel = tables.MEASURED[name].kernel
     found = figures.moved(before, after, kernel)
     for one in found:
@@ -76,7 +78,8 @@ def tell(name: str, before: figures.Taken | None, after: figures.Taken) -> None:
         if names:
             print(f"   {what}: {', '.join(sorted(names))}")
     print(f"   {len(found)} of {len(after.figures)} moved by more than 10 %; "
-          f"{kernel}: {before.reference.of(kernel):.2f} -> {after.reference.of(kernel):.2f} ms")
+          f"{kernel}: {before.reference.of(kernel):.2f} -> {after.reference.of(kernel):.2f} ms; "
+          f"load: {before.load} -> {after.load}")
 
 
 def list_tables() -> None:
