@@ -36,6 +36,7 @@ mod scene;
 mod stats;
 mod tags;
 mod terminal;
+mod usage;
 mod vehicle;
 
 use std::io::IsTerminal;

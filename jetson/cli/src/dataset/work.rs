@@ -6,8 +6,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use nix::sys::resource::{UsageWho, getrusage};
-use nix::sys::time::TimeValLike;
 use serde_json::Value;
 use vizflyt_labels::{layers, picture};
 use vizflyt_scenes::projects::CourseProject;
@@ -21,6 +19,7 @@ use super::store::{ImageName, Layer, Store};
 use super::world::World;
 use crate::grade::document::Shard;
 use crate::terminal::print_fmt;
+use crate::usage::processor_seconds;
 
 /// What is to be rendered, checked.
 pub(super) struct Plan {
@@ -270,13 +269,6 @@ pub(super) fn write_sheet(plan: &Plan, path: &Path) -> Result<()> {
         sheet.add(&shot.intrinsics, &layers, &record);
     }
     sheet.write(path)
-}
-
-/// Returns what this process has had of the processors. [s]
-fn processor_seconds() -> Result<f64> {
-    let usage = getrusage(UsageWho::RUSAGE_SELF).context("cannot read the processor's time")?;
-    let microseconds = (usage.user_time() + usage.system_time()).num_microseconds();
-    Ok(microseconds as f64 * 1e-6)
 }
 
 const SHEET_ROWS: u64 = 6;

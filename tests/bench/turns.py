@@ -1,0 +1,81 @@
+"""The command line of tests/bench/turns: the loop flown by two builds in turns.
+
+A computer that is shared is faster at one time than at another; of two builds that fly one after the other, again and
+again, each pair is of about the same time, and the median of the pairs' ratios is the builds' own.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+from pathlib import Path
+
+import machine
+
+# What is compared: names, and where a report of the demo has them.
+COMPARED = {"age p50 [ms]": "age_ms_p50", "age p99 [ms]": "age_ms_p99", "images a second": "image_hz",
+            "drawing p50 [ms]": "render_ms_p50", "processor [s]": "processor_s"}
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="tests/bench/turns",
+        description="Flies `vizflyt demo --headless --seed 7` with two programs in turns, and prints what of the loop "
+                    "differs: medians, and the ratios after / before of each turn: their median, least and greatest. A "
+                    "difference is one if all ratios are on the same side of 1. One program given twice tells what the "
+                    "computer does by itself.")
+    parser.add_argument("before", type=Path, help="a built program, as target/release/vizflyt")
+    parser.add_argument("after", type=Path, help="another one")
+    parser.add_argument("--turns", type=int, default=5, help="flights of each, some 30 s long [5]")
+    parser.add_argument("demo", nargs="*", help="after --: further arguments of both demos, as --through-bridge")
+    args = parser.parse_args()
+    for program in (args.before, args.after):
+        if not program.is_file():
+            parser.error(f"no program {program}; build it (cargo build --release)")
+    if args.turns < 1:
+        parser.error("--turns: 1 or more")
+    return args
+
+
+def fly(program: Path, folder: Path, more: list[str]) -> dict[str, float]:
+    """Flies once; returns what is compared."""
+    report = folder / "report.json"
+    used = machine.run([str(program.resolve()), "demo", "--headless", "--seed", "7", "--seconds", "90", "--report",
+                        str(report), *more], folder, most=1)
+    found = {**json.loads(report.read_text()), "processor_s": used.processor_s}
+    return {name: found[key] for name, key in COMPARED.items()}
+
+
+def ratios(pairs: dict[str, list[tuple[float, float]]]) -> list[str]:
+    """Returns a line for each name: medians before and after, and of the pairs' ratios median, least and greatest."""
+    lines = []
+    for name, values in pairs.items():
+        before, after = (statistics.median(pair[i] for pair in values) for i in (0, 1))
+        each = [b / a for a, b in values]
+        lines.append(f"{name:<24}{before:>12.1f}{after:>11.1f}{statistics.median(each):>10.2f}"
+                     f"{min(each):>7.2f} to {max(each):.2f}")
+    return lines
+
+
+def main() -> None:
+    args = arguments()
+    pairs: dict[str, list[tuple[float, float]]] = {name: [] for name in COMPARED}
+    with tempfile.TemporaryDirectory() as folder:
+        for turn in range(args.turns):
+            # Whoever flies first finds the computer as it was left: each is first in every second turn.
+            order = [0, 1] if turn % 2 == 0 else [1, 0]
+            flown = {which: fly((args.before, args.after)[which], Path(folder), args.demo) for which in order}
+            for name in COMPARED:
+                pairs[name].append((flown[0][name], flown[1][name]))
+            both = (f"{name} {flown[0][name]:.1f}, {flown[1][name]:.1f}" for name in COMPARED)
+            print(f"turn {turn + 1}: " + "; ".join(both), flush=True)
+    print(f"\n{'median of turns':<24}{'before':>12}{'after':>11}{'ratio':>10}   least to greatest")
+    print("\n".join(ratios(pairs)))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except machine.CommandFailed as error:
+        sys.exit(f"tests/bench/turns: {error}")
