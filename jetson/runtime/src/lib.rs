@@ -14,10 +14,11 @@
 //! [`flight`] (phases and outcome), [`trajectory`] (follows paths), [`guard`] (the last word),
 //! [`link`] (MAVLink) and [`steering`] (when setpoints leave), all sans-IO. Then [`stats`] and
 //! [`waterfall`] (ages by stage), [`log`], `odometry` (the plugin's own estimate), [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it
-//! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight.
+//! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight; and [`bench`].
 
 pub mod airframe;
 pub mod args;
+pub mod bench;
 pub mod clock;
 pub mod companion;
 pub mod config;

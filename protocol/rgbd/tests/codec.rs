@@ -206,6 +206,69 @@ fn wrong_arguments_are_refused_precisely() {
     assert!(matches!(error, DecodeError::Room { part: "colour", found: 5, expected: 192, .. }));
 }
 
+/// FNV-1a.
+fn hash(bytes: &[u8]) -> u64 {
+    let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, step)
+}
+
+/// Returns hashes of colour and depth.
+fn pixels(bytes: &[u8]) -> [u64; 2] {
+    let back = Picture::decode(&mut Decoder::new(), bytes).unwrap();
+    let depth: Vec<_> = back.depth_mm.iter().flat_map(|mm| mm.to_le_bytes()).collect();
+    [hash(&back.rgb), hash(&depth)]
+}
+
+/// Servers and runtimes are of different processors, each with instructions of its own.
+#[test]
+fn what_is_exact_is_the_same_on_every_processor() {
+    let mut picture = Picture::blank(160, 120);
+    // Integers alone: no machine's own sine.
+    for at in 0..160 * 120 {
+        let (x, y) = (at % 160, at / 160);
+        let wave = |n: usize| ((n * n / 64 + n) % 256) as u8;
+        let rgb = [wave(x + y), wave(2 * x), wave(3 * y + x / 2)];
+        picture.rgb[3 * at..][..3].copy_from_slice(&rgb);
+        let near = (x / 40 + y / 30) % 2 == 0;
+        picture.depth_mm[at] = if near { 1500 + 3 * x + y } else { 6000 + 20 * y } as u16;
+        picture.ids[at] = if near { 7 } else { 0 };
+        picture.alpha[at] = 255 - (x / 2) as u8;
+    }
+    let mut noise = Picture::blank(160, 120);
+    noise.fill_at_random(7, 11);
+    let mut found = Vec::new();
+    for picture in [&picture, &noise] {
+        for depth_mode in [DepthMode::Fast, DepthMode::Small] {
+            let depth_bound = DepthBound::new(0.002);
+            let bytes = picture.encode(EncodeOptions { depth_mode, depth_bound, ..SMALLEST });
+            let [colour, depth] = pixels(&bytes);
+            found.push([hash(&bytes), colour, depth]);
+        }
+    }
+    // Of bitstream, colour and depth.
+    let expected = [
+        [0x9c5a_d2af_faf3_0414, 0xc555_48f0_95d4_af01, 0x8112_1e6e_8dc8_5ad9],
+        [0x4d29_fc70_4bd8_2428, 0xc555_48f0_95d4_af01, 0x8112_1e6e_8dc8_5ad9],
+        [0xfff9_a86b_d42d_a4b1, 0x5399_3a0a_1624_a80c, 0x8a2e_070a_b772_6551],
+        [0x549d_cf74_e32c_d46c, 0x5399_3a0a_1624_a80c, 0x8a2e_070a_b772_6551],
+    ];
+    assert_eq!(found, expected, "{found:#x?}");
+}
+
+/// What one computer records another one replays. JPEG encoders round as their processor does; the bytes here are one's.
+/// (The other JPEG library decodes otherwise.)
+#[cfg(not(feature = "turbo"))]
+#[test]
+fn a_recorded_image_has_the_same_pixels_on_every_processor() {
+    let found =
+        [include_bytes!("data/444.rgbd").as_slice(), include_bytes!("data/420.rgbd")].map(pixels);
+    let expected = [
+        [0xb041_3c74_741d_49c5, 0x9a46_d6c0_94b8_4596],
+        [0x00d2_b4dd_9f4a_a11c, 0x9a46_d6c0_94b8_4596],
+    ];
+    assert_eq!(found, expected, "{found:#x?}");
+}
+
 #[test]
 fn large_images_come_back() {
     for (width, height) in [(4096, 3000), (4095, 17), (19, 3000)] {

@@ -1,8 +1,9 @@
-//! `vizflyt bench`: how fast this machine renders and streams, and what its images need; what the
+//! `vizflyt bench`: how fast this machine renders, streams and decodes, and what its images need; what the
 //! bridge adds to a packet's way.
 
 mod bandwidth;
 mod bridge;
+mod decode;
 mod imaging;
 mod render;
 mod sensors;
@@ -25,6 +26,7 @@ pub(crate) struct BenchArgs {
 enum BenchCommand {
     Bandwidth(bandwidth::BandwidthArgs),
     Bridge(bridge::BridgeBenchArgs),
+    Decode(decode::DecodeArgs),
     Imaging(imaging::ImagingArgs),
     Render(render::RenderArgs),
     Sensors(sensors::SensorsArgs),
@@ -36,6 +38,7 @@ pub(crate) fn run(args: BenchArgs) -> Result<ExitCode> {
     match args.command {
         BenchCommand::Bandwidth(args) => bandwidth::run(&args)?,
         BenchCommand::Bridge(args) => bridge::run(&args)?,
+        BenchCommand::Decode(args) => decode::run(&args)?,
         BenchCommand::Imaging(args) => imaging::run(&args)?,
         BenchCommand::Render(args) => render::run(&args)?,
         BenchCommand::Sensors(args) => sensors::run(&args)?,

@@ -16,6 +16,7 @@
 //! them, listens, and ends them.
 
 mod child;
+mod kept;
 mod keys;
 mod localization;
 mod memory;

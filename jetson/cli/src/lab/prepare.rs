@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use glam::DVec3;
 use tempfile::TempDir;
+use tracing::warn;
 use vizflyt_arena::ArenaConfig;
-use vizflyt_scenes::SceneKind;
+use vizflyt_scenes::{Generated, SceneKind};
 use vizflyt_server::scene::BareArgs;
 use vizflyt_tags::print::Pad;
 
 use super::LabArgs;
+use super::kept::{KeptScenes, SceneKey};
 
 /// A scene on disk, ready to be served.
 pub(crate) struct Stage {
@@ -30,7 +32,7 @@ pub(crate) struct Stage {
     pub pads: Vec<Pad>,
     /// Whether it depends on the seed.
     is_generated: bool,
-    /// Holds files that were made for this flight until it ends.
+    /// Holds files that were made for this flight alone until it ends.
     #[expect(dead_code, reason = "dropped with the stage, which removes them")]
     folder: Option<TempDir>,
 }
@@ -38,23 +40,15 @@ pub(crate) struct Stage {
 impl Stage {
     /// Generates the project's place or the named scene, or takes the one at a path.
     pub(crate) fn prepare(lab: &LabArgs) -> Result<Self> {
-        let (scene, seed) = (lab.scene(), lab.seed());
-        let generated = match (lab.project(), scene.parse::<SceneKind>()) {
-            (Some(project), _) => Some(project.generate(seed, lab.level(), lab.variant())),
-            (None, Ok(kind)) => Some(vizflyt_scenes::generate(kind, seed)),
-            (None, Err(_)) => None,
-        };
-        if let Some(mut generated) = generated {
+        let scene = lab.scene();
+        if let Some(generate) = generator(lab) {
             ensure!(
                 lab.bare == BareArgs::default(),
                 "--up and --scale are for a scene file: '{scene}' is generated upright and in metres"
             );
-            if let Some(variant) = lab.environment {
-                generated.arena.environment = variant.environment();
-            }
-            let folder = folder()?;
-            let written = generated.write(folder.path())?;
-            return Ok(Self { is_generated: true, ..Self::at(written.arena, Some(folder))? });
+            let (generated, made_for_this) = generated_folder(lab, generate)?;
+            let stage = Self::at(generated.join("arena.toml"), made_for_this)?;
+            return Ok(Self { is_generated: true, ..stage });
         }
         let path = Path::new(scene);
         if !path.exists() {
@@ -111,6 +105,45 @@ impl Stage {
         let (spawn, fence_m, pads) = (spawn(&config), fence_m(&config), pads(&config));
         Ok(Self { arena, truth, map, spawn, fence_m, pads, is_generated: false, folder })
     }
+}
+
+/// Returns what makes the lab's place, if it is a generated one.
+fn generator(lab: &LabArgs) -> Option<Box<dyn Fn() -> Generated + '_>> {
+    if let Some(project) = lab.project() {
+        return Some(Box::new(move || project.generate(lab.seed(), lab.level(), lab.variant())));
+    }
+    let kind: SceneKind = lab.scene().parse().ok()?;
+    Some(Box::new(move || {
+        let mut generated = vizflyt_scenes::generate(kind, lab.seed());
+        if let Some(variant) = lab.environment {
+            generated.arena.environment = variant.environment();
+        }
+        generated
+    }))
+}
+
+/// Returns the folder of a generated place, kept from an earlier start or generated now; and what removes it, if it is
+/// for this flight alone.
+fn generated_folder(
+    lab: &LabArgs,
+    generate: impl Fn() -> Generated,
+) -> Result<(PathBuf, Option<TempDir>)> {
+    let make = |folder: &Path| -> Result<()> {
+        generate().write(folder)?;
+        Ok(())
+    };
+    let place = (lab.scene(), lab.seed(), lab.level(), lab.variant(), lab.environment);
+    let rules = lab.project().map(|project| project.text().to_owned());
+    let key = SceneKey::of(&[&format!("{place:?}"), &rules.unwrap_or_default()]);
+    if let Some((scenes, key)) = KeptScenes::of_user().zip(key) {
+        match scenes.get(&key, make) {
+            Ok(kept) => return Ok((kept, None)),
+            Err(error) => warn!("the generated scene is not kept: {error:#}"),
+        }
+    }
+    let folder = folder()?;
+    make(folder.path())?;
+    Ok((folder.path().to_owned(), Some(folder)))
 }
 
 fn folder() -> Result<TempDir> {

@@ -51,17 +51,25 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
         .collect();
     let sensors = flying.iter().map(|(_, arena)| SensorSet::new(&arena.sensors));
     let sensors = sensors.collect::<Result<Vec<_>, _>>()?;
-    let field = Arc::new(scene::bake(&splats, &arena, seen.as_ref()));
-    for finding in scene::check_fit(&splats, &arena, &field) {
-        warn!("{finding}");
-    }
-    let top_view = TopView::render(&splats, &arena, &field);
-    let twin = TwinParts::choose(&splats, arena.geofence.min_m, arena.geofence.max_m);
-    let obstacles = scene::obstacles(&arena, &objects, field.clone(), args.seed);
     let together = if args.apart { 0 } else { flying.len() };
+    let still = objects.len();
     objects.extend(vehicle_models(together));
     let rendered = RenderedScene { splats: &splats, objects: &objects };
-    let renderer = choose(rendered, args.renderer, args.detail)?;
+    let (renderer, (field, obstacles, top_view)) = rayon::join(
+        // Mostly waits for graphics drivers.
+        || choose(rendered, args.renderer, args.detail),
+        || {
+            let field = Arc::new(scene::bake(&splats, &arena, seen.as_ref()));
+            for finding in scene::check_fit(&splats, &arena, &field) {
+                warn!("{finding}");
+            }
+            let obstacles = scene::obstacles(&arena, &objects[..still], field.clone(), args.seed);
+            let top_view = TopView::render(&splats, &arena, &field);
+            (field, obstacles, top_view)
+        },
+    );
+    let renderer = renderer?;
+    let twin = TwinParts::choose(&splats, arena.geofence.min_m, arena.geofence.max_m);
     let has_sensors = sensors.iter().any(|set| !set.configs.is_empty());
     let sensor_scene = has_sensors.then(|| SensorScene::new(rendered));
     // The renderer holds its own form of the scene; the file's form is no longer needed.

@@ -40,9 +40,7 @@ impl TopView {
         });
         let jpeg = picture(splats, min, max, flight_m + MAP_HEADROOM_M);
         let (low, high) = (arena.geofence.min_m, arena.geofence.max_m);
-        let shell = shell(low, high, arena.occupancy.voxel_m, |p, within_m| {
-            field.obstacle_distance_m(p) < within_m
-        });
+        let shell = shell(low, high, arena.occupancy.voxel_m, |p| field.obstacle_distance_m(p));
         Self {
             shell,
             jpeg: jpeg.unwrap_or_default(),
@@ -95,12 +93,12 @@ impl Obstacles {
     }
 }
 
-/// Returns the surface of what is `solid` in a box, as cells for the page: little-endian, the box's
+/// Returns the surface of what is solid in a box, as cells for the page: little-endian, the box's
 /// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
 /// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MAX_SHELL`].
 ///
-/// `solid` returns whether anything solid is within a distance [m] of a point [m, world].
-pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64) -> bool) -> Bytes {
+/// `distance_m` returns the distance of a point to what is solid, right within half of `cell_m`. [m, world]
+pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, distance_m: impl Fn(DVec3) -> f64) -> Bytes {
     let span = (max_m - min_m).max(DVec3::splat(1e-3));
     let mut cell_m = cell_m.max((span.element_product() / MAX_SAMPLES).cbrt());
     cell_m = cell_m.max(span.max_element() / f64::from(u16::MAX));
@@ -110,9 +108,13 @@ pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, solid: impl Fn(DVec3, f64)
         let mut is_solid = vec![false; nx * ny * nz];
         for z in 0..nz {
             for y in 0..ny {
-                for x in 0..nx {
+                let mut x = 0;
+                while x < nx {
                     let p = min_m + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell_m;
-                    is_solid[at(x, y, z)] = solid(p, cell_m / 2.0);
+                    let cells = distance_m(p) / cell_m;
+                    is_solid[at(x, y, z)] = cells < 0.5;
+                    // What is so far from anything solid has neighbours that are free too.
+                    x += (cells - 1.5) as usize + 1;
                 }
             }
         }
@@ -261,16 +263,42 @@ mod tests {
     #[test]
     fn a_shell_is_the_surface_of_what_is_solid() {
         // A cube of 5 x 5 x 5 cells in the middle of 9 x 9 x 9: 125 less the 27 inside.
-        let cube = |p: DVec3, _| (p - 0.45).abs().max_element() < 0.25;
+        let cube = |p: DVec3| (p - 0.45).abs().max_element() - 0.2;
         let bytes = shell(DVec3::ZERO, DVec3::splat(0.9), 0.1, cube);
         let f32_at = |k: usize| f32::from_le_bytes(bytes[4 * k..4 * k + 4].try_into().unwrap());
         assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
         assert_eq!((bytes.len() - 16) / 6, 125 - 27);
         assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
         // A hall of walls is rendered in cells as coarse as needed; nothing at all is an empty list.
-        let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_, _| true);
+        let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_| -1.0);
         assert!(all.len() <= 16 + 6 * MAX_SHELL && all.len() > 1000);
-        assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_, _| false).len(), 16);
+        assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_| 1.0).len(), 16);
+        assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_| f64::NAN).len(), 16);
+    }
+
+    #[test]
+    fn a_shell_passes_over_free_space_and_misses_nothing() {
+        // Balls in a box of 8 x 5 x 3 m, one cell across and more; distances are off by up to half a cell either way.
+        let balls: Vec<_> = (0..60)
+            .map(|k| {
+                let r = |share: f64| (0.5 + share * f64::from(k)).fract();
+                (DVec3::new(8.0 * r(0.819), 5.0 * r(0.671), 3.0 * r(0.549)), 0.05 + 0.3 * r(0.137))
+            })
+            .collect();
+        let asked = std::cell::Cell::new(0);
+        let noisy_m = |p: DVec3| {
+            asked.set(asked.get() + 1);
+            let off_m = 0.1 * ((p.x * 91.7 + p.y * 53.3 + p.z * 17.9).sin() / 2.0);
+            off_m + balls.iter().map(|(c, r)| p.distance(*c) - r).fold(f64::MAX, f64::min)
+        };
+        let size_m = DVec3::new(8.0, 5.0, 3.0);
+        let quick = shell(DVec3::ZERO, size_m, 0.1, noisy_m);
+        let asked_quickly = asked.take();
+        // Capped below what is passed over, so that every cell is asked for.
+        let every = shell(DVec3::ZERO, size_m, 0.1, |p| noisy_m(p).min(0.2));
+        assert_eq!(quick, every);
+        assert_eq!(asked.get(), 80 * 50 * 30);
+        assert!(asked_quickly < asked.get() / 2 && quick.len() > 1000, "{asked_quickly}");
     }
 
     #[test]

@@ -10,3 +10,4 @@ mod objects;
 mod oracle;
 mod poison;
 mod renderers;
+mod simd;
