@@ -25,7 +25,7 @@ function receive(message) {
   for (const part of parts) {
     if (message.type === "arena") part.onArena?.(message);
     else if (message.type === "cameras") part.onCameras?.(message.cameras);
-    else if (message.type === "track") part.onTrack?.(message.points);
+    else if (message.type === "track") part.onTrack?.(message.points, message.vehicle);
     else if (message.type === "events") part.onEvents?.(message.events);
     else if (message.type === "state") part.onState?.(message);
   }

@@ -16,7 +16,7 @@ import { timing } from "./panels/timing.js";
  * @typedef {object} Part
  * @property {(arena: import("./messages").Arena) => void} [onArena] the vehicle, its room and course; first on each connection
  * @property {(cameras: import("./messages").Camera[]) => void} [onCameras] after one was changed
- * @property {(points: import("./messages").Track["points"]) => void} [onTrack] the track flown before the page came
+ * @property {(points: import("./messages").Track["points"], vehicle: string) => void} [onTrack] the track flown before the page came, of each vehicle
  * @property {(events: import("./messages").EventLine[]) => void} [onEvents] new ones, or again those before
  * @property {(state: import("./messages").State) => void} [onState] 20 times a second
  * @property {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} [onImage] kind: 0 colour, 1 depth, 2 objects
