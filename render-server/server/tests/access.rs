@@ -166,6 +166,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /dialogs/pairing.js", Takes::Nothing),
     ("GET /dialogs/scene.js", Takes::Nothing),
     ("GET /dom.js", Takes::Nothing),
+    ("GET /event_groups.js", Takes::Nothing),
     ("GET /event_kinds.js", Takes::Nothing),
     ("GET /fleet.js", Takes::Nothing),
     ("GET /flight_file.js", Takes::Nothing),
