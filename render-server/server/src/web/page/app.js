@@ -12,13 +12,11 @@ import { followTheme, switchTheme } from "./theme.js";
 import "./dialogs/environment.js";
 import "./dialogs/login.js";
 import "./dialogs/pairing.js";
+import "./dialogs/panels.js";
 import "./dialogs/scene.js";
 
-$("left").append(...PANELS.left.map(({ element }) => element));
-$("right").append(...PANELS.right.map(({ element }) => element));
-
 /** @type {import("./panels.js").Part[]} */
-const parts = [stopButton, header, orders, outcome, ...PANELS.left, ...PANELS.right];
+const parts = [stopButton, header, orders, outcome, ...Object.values(PANELS.left), ...Object.values(PANELS.right)];
 
 /** @param {import("./messages").Message} message */
 function receive(message) {
