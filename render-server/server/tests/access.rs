@@ -159,6 +159,7 @@ enum Takes {
 const ROUTES: &[(&str, Takes)] = &[
     ("GET /", Takes::Nothing),
     ("GET /app.js", Takes::Nothing),
+    ("GET /best_run.js", Takes::Nothing),
     ("GET /closing.js", Takes::Nothing),
     ("GET /connection.js", Takes::Nothing),
     ("GET /dialog.js", Takes::Nothing),
@@ -211,6 +212,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /wall", Takes::Nothing),
     ("GET /wall.css", Takes::Nothing),
     ("GET /wall.js", Takes::Nothing),
+    ("GET /wall_flight.js", Takes::Nothing),
     ("GET /api/leaderboard", Takes::AnyKey),
     // By the team's token, whoever brings it.
     ("PUT /api/vehicles/ant/team", Takes::Nothing),
