@@ -12,6 +12,8 @@ const { chromium } = require("playwright-core");
 const [vizflyt, shots, only] = process.argv.slice(2);
 /** Bounds a test that fails; a passing one waits for what it waits for. [ms] */
 const PATIENCE = 120_000;
+/** Finds barriers; run in the page. */
+const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
 const scratch = fs.mkdtempSync(path.join(os.tmpdir(), "vizflyt-page-"));
 const children = [];
@@ -87,10 +89,48 @@ async function checkAccess(page, size) {
   assert.ok(over <= 0, `${size}: ${over} px too wide`);
 }
 
+/** Nothing that axe knows bars anybody from what is open, in the dark or in the light. */
+async function checkBarriers(page, what) {
+  await page.evaluate(axe);
+  const found = await page.evaluate(async () => {
+    const root = document.documentElement, former = root.dataset.theme, found = [];
+    for (const theme of ["dark", "light"]) {
+      root.dataset.theme = theme;
+      const { violations } = await globalThis.axe.run(document, { resultTypes: ["violations"] });
+      for (const { id, nodes } of violations)
+        found.push(`${theme}: ${id}: ${nodes.map(({ html, any }) => `${html.slice(0, 80)} ${any[0]?.message ?? ""}`).join("; ")}`);
+    }
+    root.dataset.theme = former;
+    return found;
+  });
+  assert.deepEqual(found, [], what);
+}
+
+/** What opening the page costs: bytes over the wire, and time until the camera's first picture; the former has a bound. */
+async function checkLoad(browser, url) {
+  const context = await browser.newContext();
+  const page = await context.newPage();
+  const wire = await context.newCDPSession(page);
+  await wire.send("Network.enable");
+  let bytes = 0;
+  wire.on("Network.loadingFinished", ({ encodedDataLength }) => (bytes += encodedDataLength));
+  const began = Date.now();
+  // The largest file, which comes last.
+  const last = page.waitForResponse((answer) => answer.url().endsWith("/three.core.min.js"), { timeout: PATIENCE });
+  await page.goto(url);
+  await isPainted(page, "colour");
+  const first_s = (Date.now() - began) / 1000;
+  await (await last).finished();
+  console.log(`      first picture after ${first_s.toFixed(2)} s; ${(bytes / 1e6).toFixed(2)} MB over the wire`);
+  assert.ok(bytes > 1e5 && bytes <= 3e6, `${bytes} bytes`);
+  await context.close();
+}
+
 /** Whether a canvas shows a picture rather than one colour. */
 const isPainted = (page, id) =>
   page.waitForFunction((id) => {
-    const canvas = document.getElementById(id);
+    const canvas = document.querySelector(`#${id}`);
+    if (!canvas?.width) return false;
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
     const seen = new Set();
     for (let k = 0; k < data.length; k += 404) seen.add((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
@@ -122,6 +162,9 @@ async function flight(browser) {
   await page.locator("#theme").click();
   await shot(page, "laptop-other-theme");
   await page.locator("#theme").click();
+  await checkBarriers(page, "the page before a flight");
+  await checkLoad(browser, url);
+  await panels(page);
   // Another light is seen with the next images.
   await isPainted(page, "colour");
   const day = await brightness(page);
@@ -153,6 +196,7 @@ async function flight(browser) {
   await until(page, "announcement", /lands/);
   await until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/);
   await shot(page, "laptop-stopped");
+  await checkBarriers(page, "the page after a stop");
   // It is looked at again, also when the program has ended.
   assert.equal(await demo.ended, 1, "a stopped flight is no success");
   await page.locator("#replay-at").fill("1");
@@ -171,6 +215,45 @@ async function flight(browser) {
   assert.deepEqual(page.faults, []);
   await page.context().close();
   assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
+}
+
+/** Panels are closed, moved and kept, by keyboard, and put back; the cameras take the page, and escape gives it back. */
+async function panels(page) {
+  await page.getByRole("button", { name: "panels" }).press("Enter");
+  const dialog = page.getByRole("dialog", { name: "panels" });
+  await checkBarriers(page, "the panels' dialog");
+  const inColumn = (side) =>
+    page.evaluate((side) => [...document.getElementById(side).children].map(({ id, className }) => id || className.split(" ").at(-1)), side);
+  const [left, right] = [await inColumn("left"), await inColumn("right")];
+  await dialog.getByRole("checkbox", { name: "timing" }).press("Space");
+  await dialog.getByRole("button", { name: "figures to the other column" }).press("Enter");
+  await dialog.getByRole("button", { name: "events up" }).press("Enter");
+  await shot(page, "laptop-panels");
+  // Escape closes the dialog; it stops nothing.
+  await page.keyboard.press("Escape");
+  await dialog.waitFor({ state: "hidden" });
+  assert.equal(await text(page, "announcement"), "");
+  const arranged = [await inColumn("left"), await inColumn("right")];
+  assert.ok(!arranged[0].includes("timing") && !arranged[0].includes("figures") && arranged[1].includes("figures"), `${arranged}`);
+  await page.reload();
+  await until(page, "phase-text", /ready to start/);
+  assert.deepEqual([await inColumn("left"), await inColumn("right")], arranged);
+  await page.getByRole("button", { name: "panels" }).click();
+  await dialog.getByRole("button", { name: "reset" }).click();
+  assert.deepEqual([await inColumn("left"), await inColumn("right")], [left, right]);
+  await dialog.getByRole("button", { name: "close" }).click();
+  await page.getByRole("button", { name: "large" }).click();
+  await page.locator("#map").waitFor({ state: "hidden" });
+  await isPainted(page, "depth");
+  for (const size of ["phone", "projector", "laptop"]) {
+    const [width, height] = SIZES[size];
+    await page.setViewportSize({ width, height });
+    await checkAccess(page, size);
+    await shot(page, `${size}-cameras`);
+  }
+  await page.keyboard.press("Escape");
+  await page.locator("#map").waitFor({ state: "visible" });
+  assert.equal(await text(page, "announcement"), "");
 }
 
 /** The flight that a page has watched: a program started anew has it still; it is saved, read again, and flies beside itself. */
@@ -244,6 +327,7 @@ async function crash(browser) {
   await page.waitForFunction(() => document.querySelector("#crash img").naturalWidth > 100);
   assert.ok((await seen()) > 100);
   await region.getByRole("button", { name: "show colour" }).press("Enter");
+  await checkBarriers(page, "the crash card");
   for (const size of ["laptop", "phone", "projector"]) {
     const [width, height] = SIZES[size];
     await page.setViewportSize({ width, height });
@@ -276,6 +360,7 @@ async function lab(browser) {
   assert.ok(await page.locator("#reset").isHidden());
   await page.locator("#login").click();
   await shot(page, "login");
+  await checkBarriers(page, "the login");
   await page.keyboard.type("not the password");
   await page.keyboard.press("Enter");
   await page.getByRole("alert").filter({ hasText: "this is not the password" }).waitFor();
@@ -295,6 +380,7 @@ async function lab(browser) {
   await page.locator("#camera-form button[type=submit]").click();
   await until(page, "camera-status", /applied/);
   await until(page, "camera-name", /200 ×/);
+  await checkBarriers(page, "a camera's settings");
   // The view in space: drawn, and turned by keys. Not in flight: without a card it takes the processor.
   const twin = page.waitForResponse((answer) => answer.url().includes("/api/splats/0"));
   await page.locator("#view-space").click();
@@ -321,12 +407,16 @@ async function lab(browser) {
   await page.getByRole("button", { name: "show a code" }).click();
   await page.waitForFunction(() => /^\d{3}.?\d{3}$/.test(document.querySelector(".pair-code").textContent));
   await shot(page, "pairing");
+  await checkBarriers(page, "the pairing");
   await page.locator("#estop").click();
   await until(page, "announcement", /no runtime is connected/);
+  // Escape closes the dialog first, and stops only then.
   await page.evaluate(() => (document.getElementById("announcement").textContent = ""));
   await page.keyboard.press("Escape");
+  await page.locator("dialog[open]").waitFor({ state: "hidden" });
+  assert.equal(await text(page, "announcement"), "");
+  await page.keyboard.press("Escape");
   await until(page, "announcement", /no runtime is connected/);
-  await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
   // Light and weather: a name at once, a sight with the button, and what has no field here is kept.
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night-fog");
@@ -344,6 +434,7 @@ async function lab(browser) {
     return fog_visibility_m === 25 && cloud.visibility_m === 12;
   });
   await shot(page, "environment");
+  await checkBarriers(page, "light and weather");
   await page.locator("dialog[open]").getByRole("button", { name: "close" }).click();
   // Another scene: the page comes back by itself, still logged in.
   const before = await page.evaluate(async () => (await (await fetch("/api/scenes")).json()).now);
@@ -351,6 +442,7 @@ async function lab(browser) {
   await page.locator("#scenes").click();
   await page.locator("#scene-choice").selectOption("second");
   await shot(page, "scenes");
+  await checkBarriers(page, "the scenes");
   await page.locator("dialog[open] button[type=submit]").click();
   await page.waitForFunction(async () => {
     try {
@@ -413,8 +505,21 @@ async function leaderboard(browser) {
   const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
   const fly = start("fly", "race", "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
     "--seconds", "3", "--log-dir", at("flights"), "--json");
-  await until(wall, "flying", /wasps, official: \d/);
+  const picture = wall.getByRole("region", { name: "who flies now" }).getByRole("figure");
+  await picture.filter({ hasText: /wasps\s*official\s*\d\/\d\s*0:0\d\.\d/ }).waitFor();
+  for (const canvas of ["map", "pictures canvas"]) await isPainted(wall, canvas);
+  for (const size of ["phone", "projector", "laptop"]) {
+    const [width, height] = SIZES[size];
+    await wall.setViewportSize({ width, height });
+    const over = await wall.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+    assert.ok(over <= 0, `wall on ${size}: ${over} px too wide`);
+    await shot(wall, `${size}-wall-flying`);
+  }
+  await checkBarriers(wall, "the wall while somebody flies");
   assert.equal(await fly.ended, 0);
+  await picture.waitFor({ state: "detached" });
+  // It has watched the run that leads: the next ones have it for a ghost.
+  await until(wall, "ghost", /ghost: the best official run, wasps/);
   // Neither page is loaded again.
   for (const screen of [wall, page]) await shows(screen, "official", /^1\s+wasps\s+0\/\d\s/);
   assert.match(await firstRow(wall, "practice"), /nobody yet/);
@@ -426,6 +531,8 @@ async function leaderboard(browser) {
   assert.match(await text(wall, "graded"), /graded: p4 ug, day[\s\S]*wasps/);
   const over = await wall.evaluate(() => document.documentElement.scrollWidth - innerWidth);
   assert.ok(over <= 0, `wall: ${over} px too wide`);
+  await checkBarriers(page, "the leaderboard");
+  await checkBarriers(wall, "the wall");
   await shot(page, "laptop-leaderboard");
   await shot(wall, "wall");
   for (const screen of [page, wall]) {
@@ -484,6 +591,7 @@ async function align(browser) {
   await until(page, "verdict", /GO/);
   assert.match(await text(page, "result"), /residual[\s\S]*cm rms[\s\S]*bound[\s\S]*within the fence/);
   await shot(page, "align");
+  await checkBarriers(page, "the alignment");
   await page.getByLabel("fence to z in metres").fill("3.1");
   await page.getByLabel("fence to z in metres").press("Tab");
   await press("↶ 90°");
@@ -555,6 +663,7 @@ async function edit(browser) {
   await after(() => page.locator("#edit-call").click(), /^0 of/);
   assert.match(await text(page, "edit-parts"), /^corner \(part\): [\d.]+ x [\d.]+ x [\d.]+ m$/);
   await shot(page, "edit-named");
+  await checkBarriers(page, "the editor of scenes");
   const parts = fs.readFileSync(`${scene}.parts.toml`, "utf8");
   assert.match(parts, /name = "corner"\nclass = "part"\ncenter_m = \[/);
   await after(() => drag([420, 250], [900, 650]), new RegExp(`^${boxed.toLocaleString("en")} of`));
@@ -614,6 +723,7 @@ async function course(browser) {
     return (count * 4) / data.length > 0.002;
   }, null, { polling: 200 });
   await shot(page, "course-gate");
+  await checkBarriers(page, "the editor of courses");
   const [x, width] = [await value("middle x"), await value("width")];
   // From the eye's height the handle of the width is to the right of the middle; the picture is 75 degrees wide.
   const px = (metres) => (metres / (x - 0.9)) * (720 / Math.tan((37.5 * Math.PI) / 180));
@@ -643,6 +753,116 @@ async function course(browser) {
   assert.equal(await server.ended, 0);
 }
 
+/** A stranger's tasks on a page: only by what is visible, named as it is shown; each task's seconds and clicks are printed. */
+class Stranger {
+  constructor() {
+    this.tasks = [];
+    this.clicks = 0;
+  }
+
+  async task(name, act) {
+    const [began, clicks] = [Date.now(), this.clicks];
+    await act();
+    this.tasks.push(`${name} ${((Date.now() - began) / 1000).toFixed(1)} s, ${this.clicks - clicks} clicks`);
+  }
+
+  async press(page, name) {
+    await page.getByRole("button", { name }).click();
+    this.clicks += 1;
+  }
+}
+
+/**
+ * Somebody who has never seen the page watches two vehicles: understands it, chooses the other one, learns why that has
+ * crashed, starts the first and stops it; and puts up a gate. Both are on the map and in space, at once.
+ */
+async function stranger(browser) {
+  const at = (name) => path.join(scratch, `two-${name}`);
+  const free = "127.0.0.1:0", plugin = path.join(path.dirname(vizflyt), "examples", "misbehave");
+  command("scene", "generate", "race", "-o", at("race"));
+  const file = at("race/arena.toml");
+  const vehicle = (name, y_m) => `\n[[vehicles]]\nname = "${name}"\nspawn = { position_m = [0.9, ${y_m}, 0], yaw_deg = 0 }\n`;
+  fs.appendFileSync(file, vehicle("wasp", 1.2) + vehicle("bee", 0));
+  const server = start("serve", file, "--leaderboard", "none", "--keys", at("server"), "--pair", "instructor",
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+  const [ready] = await server.line(/^.*"ready":"server".*$/);
+  const { http, quic, vicon } = JSON.parse(ready);
+  const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
+  command("pair", quic, "--code", code, "--keys", at("jetson"));
+  const flown = [];
+  for (const [name, y_m, options, how] of [["wasp", 1.2, ["--wait"], ["hover"]], ["bee", 0, [], []]]) {
+    const sim = start("sim", "--object", name, "--vicon", vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", `0.9,${y_m},0,0`, "--json");
+    const [, mavlink] = await sim.line(/"mavlink":"([^"]+)"/);
+    const fly = start("fly", plugin, "--vehicle", name, "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
+      "--log-dir", at("flights"), "--json", ...options, "--", ...how);
+    flown.push([sim, fly]);
+  }
+  const somebody = new Stranger();
+  let page;
+  await somebody.task("understands what is shown:", async () => {
+    page = await open(browser, http);
+    const banner = page.getByRole("banner");
+    await banner.getByText("race", { exact: true }).waitFor();
+    await banner.getByText(/ready to start|preparing|no runtime/).waitFor();
+    await page.getByRole("button", { name: /^STOP wasp/ }).waitFor();
+  });
+  const other = page.getByRole("button", { name: /^2 bee/ });
+  await other.waitFor();
+  for (const view of ["space", "top"]) {
+    await page.getByRole("button", { name: view, exact: true }).click();
+    await other.waitFor();
+    await page.getByText(/^1 wasp/).waitFor();
+    await shot(page, `laptop-two-${view}`);
+  }
+  await checkBarriers(page, "two vehicles");
+  await page.getByRole("button", { name: /bee · landed/ }).waitFor();
+  const way = page.waitForURL(/vehicle=bee/);
+  await somebody.task("chooses the other vehicle:", async () => {
+    await somebody.press(page, /^2 bee/);
+    await way;
+    await page.getByRole("button", { name: /^STOP bee/ }).waitFor();
+  });
+  await somebody.task("finds the cause of its crash:", async () => {
+    const card = page.getByRole("region", { name: "Collision" });
+    assert.match(await card.getByRole("paragraph").first().innerText(), /.{20}/);
+  });
+  // Back, by the number that stands there.
+  await page.keyboard.press("1");
+  await page.waitForURL(/vehicle=wasp/);
+  await somebody.task("starts a vehicle:", async () => {
+    await somebody.press(page, "start");
+    await page.getByRole("banner").getByText(/taking off|holding|flying/).waitFor();
+  });
+  await page.getByRole("banner").getByText(/holding|flying/).waitFor();
+  await somebody.task("stops it:", async () => {
+    await somebody.press(page, /^STOP wasp/);
+    await page.getByRole("alert").getByText("Stopped by hand").waitFor();
+  });
+  assert.deepEqual(page.faults, []);
+  await page.context().close();
+  for (const [sim, fly] of flown) {
+    await fly.ended;
+    sim.child.kill();
+  }
+  server.child.stdin.end();
+  assert.equal(await server.ended, 0);
+
+  command("scene", "generate", "room", "--seed", "3", "-o", at("room"));
+  const editor = start("arena", "edit", at("room"), "--no-browser", "--renderer", "cpu");
+  const [, url] = await editor.line(/^page\s+(http\S+)/);
+  const drawing = await open(browser, url);
+  await drawing.getByText(/can be flown: 0 gates/).waitFor();
+  await somebody.task("places a gate:", async () => {
+    await drawing.getByRole("button", { name: "gate", exact: true }).click();
+    somebody.clicks += 1;
+    await drawing.getByText(/can be flown: 1 gate/).waitFor();
+  });
+  await drawing.context().close();
+  editor.child.kill("SIGTERM");
+  await editor.ended;
+  for (const task of somebody.tasks) console.log(`      ${task}`);
+}
+
 async function main() {
   if (shots) fs.mkdirSync(shots, { recursive: true });
   const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
@@ -650,7 +870,7 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  const wanted = [edit, course, lab, flight, crash, leaderboard, align].filter(({ name }) => !only || name === only);
+  const wanted = [edit, course, lab, flight, crash, leaderboard, align, stranger].filter(({ name }) => !only || name === only);
   for (const test of wanted) {
     const began = Date.now();
     try {

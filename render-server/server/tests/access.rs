@@ -7,7 +7,7 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 
 use serde_json::Value;
-use support::{PATIENCE, Server, write_arena};
+use support::{Emitter, PATIENCE, Server, Socket, write_arena};
 use vizflyt_server::web::Takes as DeclaredTakes;
 
 /// The server, and the cookies of those who were given a key.
@@ -159,18 +159,24 @@ enum Takes {
 const ROUTES: &[(&str, Takes)] = &[
     ("GET /", Takes::Nothing),
     ("GET /app.js", Takes::Nothing),
+    ("GET /best_run.js", Takes::Nothing),
+    ("GET /closing.js", Takes::Nothing),
     ("GET /connection.js", Takes::Nothing),
     ("GET /dialog.js", Takes::Nothing),
     ("GET /dialogs/environment.js", Takes::Nothing),
     ("GET /dialogs/login.js", Takes::Nothing),
     ("GET /dialogs/pairing.js", Takes::Nothing),
+    ("GET /dialogs/panels.js", Takes::Nothing),
     ("GET /dialogs/scene.js", Takes::Nothing),
     ("GET /dom.js", Takes::Nothing),
+    ("GET /event_groups.js", Takes::Nothing),
     ("GET /event_kinds.js", Takes::Nothing),
+    ("GET /fleet.js", Takes::Nothing),
     ("GET /flight_file.js", Takes::Nothing),
     ("GET /flight_recording.js", Takes::Nothing),
     ("GET /flight_store.js", Takes::Nothing),
     ("GET /header.js", Takes::Nothing),
+    ("GET /layout.js", Takes::Nothing),
     ("GET /icon.svg", Takes::Nothing),
     ("GET /orders.js", Takes::Nothing),
     ("GET /outcome.js", Takes::Nothing),
@@ -184,9 +190,13 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /panels/figures.js", Takes::Nothing),
     ("GET /panels/leaderboard.js", Takes::Nothing),
     ("GET /panels/timing.js", Takes::Nothing),
+    ("GET /phases.js", Takes::Nothing),
     ("GET /replay_bar.js", Takes::Nothing),
     ("GET /session.js", Takes::Nothing),
+    ("GET /socket.js", Takes::Nothing),
+    ("GET /space_others.js", Takes::Nothing),
     ("GET /space_room.js", Takes::Nothing),
+    ("GET /space_track.js", Takes::Nothing),
     ("GET /space_twin.js", Takes::Nothing),
     ("GET /space_view.js", Takes::Nothing),
     ("GET /splat_worker.js", Takes::Nothing),
@@ -198,9 +208,11 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /three/three.core.min.js", Takes::Nothing),
     ("GET /three/three.module.min.js", Takes::Nothing),
     ("GET /top_view.js", Takes::Nothing),
+    ("GET /vehicle_tags.js", Takes::Nothing),
     ("GET /wall", Takes::Nothing),
     ("GET /wall.css", Takes::Nothing),
     ("GET /wall.js", Takes::Nothing),
+    ("GET /wall_flight.js", Takes::Nothing),
     ("GET /api/leaderboard", Takes::AnyKey),
     // By the team's token, whoever brings it.
     ("PUT /api/vehicles/ant/team", Takes::Nothing),
@@ -472,6 +484,40 @@ fn a_team_stops_its_own_vehicle_and_no_other() {
 }
 
 /// A page elsewhere cannot use the cookie or the computer of someone who may.
+#[test]
+fn a_team_sees_its_own_vehicle_alone_and_the_instructor_all() {
+    let lab = Lab::start();
+    let _emitters = ["ant", "bee"].map(|name| Emitter::start(lab.server.vicon, name));
+    let watch = |cookie: &str| {
+        // The header lines of a page that has the cookie.
+        let origin = format!("http://{}\r\nCookie: {cookie}", lab.server.http);
+        let mut socket = Socket::open_at(lab.server.http, &origin, "/ws?vehicle=ant").unwrap();
+        let mut tracks = vec![socket.message("track")["vehicle"].clone()];
+        let state = loop {
+            let (opcode, payload) = socket.next();
+            if opcode != 1 {
+                continue;
+            }
+            let message: Value = serde_json::from_slice(&payload).unwrap();
+            match message["type"].as_str().unwrap() {
+                "track" => tracks.push(message["vehicle"].clone()),
+                "state" if !message["pose"].is_null() => break message,
+                _ => {}
+            }
+        };
+        (tracks, state, socket)
+    };
+    let (tracks, state, _) = watch(&lab.ants);
+    assert_eq!((tracks, &state["others"]), (vec!["ant".into()], &serde_json::json!([])));
+    let (tracks, mut state, mut socket) = watch(&lab.instructor);
+    assert_eq!(tracks, ["ant", "bee"]);
+    while state["others"][0]["pose"].is_null() {
+        state = socket.message("state");
+    }
+    let others = state["others"].as_array().unwrap();
+    assert_eq!((others.len(), &others[0]["name"]), (1, &"bee".into()));
+}
+
 #[test]
 fn another_page_acts_for_nobody() {
     let lab = Lab::start();

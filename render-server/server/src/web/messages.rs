@@ -8,13 +8,14 @@ use vizflyt_arena::config::{CameraConfig, StageConfig};
 use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
-use vizflyt_protocol::messages::{Event, OutcomeKind, StageTimes, Telemetry};
+use vizflyt_protocol::messages::{Event, FlightPhase, OutcomeKind, StageTimes, Telemetry};
 use vizflyt_protocol::time::ServerTime;
 
 use super::Page;
+use super::access::Viewer;
 use crate::clock;
 use crate::flights::events::{Entry, Origin};
-use crate::flights::vehicle::VehicleFlight;
+use crate::flights::vehicle::{Flight, VehicleFlight};
 use crate::lock::lock;
 use crate::poses::drivers::SourceCounters;
 use crate::render::RendererInfo;
@@ -33,8 +34,9 @@ pub(super) enum Message<'a> {
     Cameras {
         cameras: Vec<CameraLine>,
     },
-    /// (x, y, z [m, world], speed [m/s]), oldest first.
+    /// Where a vehicle was in this flight: (x, y, z [m, world], speed [m/s]), oldest first.
     Track {
+        vehicle: &'a str,
         points: &'a [[f32; 4]],
     },
     Events {
@@ -112,6 +114,18 @@ pub(super) struct State {
     crash: Option<u64>,
     /// What moves, where it is now.
     objects: Vec<ObjectLine>,
+    /// The other vehicles that the viewer may see.
+    others: Vec<OtherLine>,
+}
+
+/// A vehicle beside the one that is shown.
+#[derive(Debug, Serialize)]
+struct OtherLine {
+    name: String,
+    phase: FlightPhase,
+    pose: Option<PoseLine>,
+    /// Since take-off. [s]
+    flight_s: Option<f64>,
 }
 
 /// An object of the arena: a box in its own frame, and where that is.
@@ -242,7 +256,7 @@ pub(super) fn events(page: &Page, entries: Vec<Entry>) -> Message<'static> {
     Message::Events { events: entries.into_iter().map(line).collect() }
 }
 
-pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
+pub(super) fn state(page: &Page, vehicle: &VehicleFlight, viewer: &Viewer) -> Message<'static> {
     let Rooms { localization, rendering, streaming, .. } = &page.rooms;
     let (localized, stream) =
         (&localization.vehicles[vehicle.index], &streaming.vehicles[vehicle.index]);
@@ -252,13 +266,7 @@ pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
     let source = *lock(&localized.counters);
     let total = |counter: &std::sync::atomic::AtomicU64| counter.load(Ordering::Relaxed);
     Message::State(Box::new(State {
-        pose: (*localized.newest.borrow()).map(|sample| PoseLine {
-            p_world_m: sample.world_from_body.translation_m.to_array(),
-            yaw_rad: yaw_of(sample.world_from_body.rotation),
-            rotation: sample.world_from_body.rotation.to_array(),
-            v_world_mps: sample.twist.linear_mps.to_array(),
-            age_s: now.seconds_since(sample.stamp),
-        }),
+        pose: pose(page, vehicle, now),
         runtime: vehicle.runtime().map(|runtime| RuntimeLine {
             address: runtime.address.to_string(),
             program: runtime.program.as_str().to_owned(),
@@ -275,7 +283,7 @@ pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
         source,
         quality: lock(&localized.quality).clone(),
         source_hz: rates.poses.of(source.poses, now),
-        flight_s: flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start)),
+        flight_s: flight_s(&flight, now),
         landed: flight.landed.is_some(),
         outcome: flight.end.decided().map(|(at, reason)| OutcomeLine {
             outcome: reason.outcome(),
@@ -286,7 +294,36 @@ pub(super) fn state(page: &Page, vehicle: &VehicleFlight) -> Message<'static> {
         }),
         crash: vehicle.crash.borrow().as_ref().map(|card| card.id),
         objects: objects(&rendering.dynamic_objects, now),
+        others: others(page, vehicle, viewer, now),
     }))
+}
+
+fn pose(page: &Page, vehicle: &VehicleFlight, now: ServerTime) -> Option<PoseLine> {
+    let newest = *page.rooms.localization.vehicles[vehicle.index].newest.borrow();
+    newest.map(|sample| PoseLine {
+        p_world_m: sample.world_from_body.translation_m.to_array(),
+        yaw_rad: yaw_of(sample.world_from_body.rotation),
+        rotation: sample.world_from_body.rotation.to_array(),
+        v_world_mps: sample.twist.linear_mps.to_array(),
+        age_s: now.seconds_since(sample.stamp),
+    })
+}
+
+fn flight_s(flight: &Flight, now: ServerTime) -> Option<f64> {
+    flight.took_off.map(|start| flight.landed.unwrap_or(now).seconds_since(start))
+}
+
+fn others(page: &Page, shown: &VehicleFlight, viewer: &Viewer, now: ServerTime) -> Vec<OtherLine> {
+    let line = |vehicle: &std::sync::Arc<VehicleFlight>| OtherLine {
+        name: vehicle.name.to_string(),
+        phase: vehicle.phase(),
+        pose: pose(page, vehicle, now),
+        flight_s: flight_s(&vehicle.flight(), now),
+    };
+    let vehicles = page.rooms.flights.vehicles.iter();
+    let seen =
+        vehicles.filter(|vehicle| vehicle.index != shown.index && viewer.may_see(&vehicle.name));
+    seen.map(line).collect()
 }
 
 /// Returns the colour that the page shows an end in, by the name that its style sheet has for it.

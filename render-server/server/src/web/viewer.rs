@@ -101,7 +101,7 @@ pub(super) async fn run(
     } else {
         let presence = Presence::new(&page, &vehicle, &shown.viewer);
         let ending = tokio::select! {
-            _ = send_all(&page, &vehicle, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
+            _ = send_all(&page, &vehicle, &shown.viewer, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
             () = right_ends(&page, &shown) => (close_code::POLICY, "logged out"),
             () = page.rooms.stop.wait() => (close_code::RESTART, "the server ends or changes its scene"),
         };
@@ -122,13 +122,24 @@ async fn right_ends(page: &Page, shown: &Shown) {
 }
 
 /// Returns `None` when the viewer is gone.
-async fn send_all(page: &Page, vehicle: &VehicleFlight, socket: &mut WebSocket) -> Option<()> {
+async fn send_all(
+    page: &Page,
+    vehicle: &VehicleFlight,
+    viewer: &Viewer,
+    socket: &mut WebSocket,
+) -> Option<()> {
     let mut log = vehicle.events.subscribe();
     let mut cameras = page.rooms.rendering.cameras[vehicle.index].subscribe();
     let (entries, mut cursor) = vehicle.events.newest(HISTORY);
     send_json(socket, &messages::arena(page, vehicle)).await?;
-    let points = lock(&vehicle.track).points.clone();
-    send_json(socket, &messages::Message::Track { points: &points }).await?;
+    let vehicles = page.rooms.flights.vehicles.iter().map(|vehicle| &**vehicle);
+    let others =
+        vehicles.filter(|other| other.index != vehicle.index && viewer.may_see(&other.name));
+    for flown in std::iter::once(vehicle).chain(others) {
+        let points = lock(&flown.track).points.clone();
+        let track = messages::Message::Track { vehicle: &flown.name, points: &points };
+        send_json(socket, &track).await?;
+    }
     send_json(socket, &messages::events(page, entries)).await?;
     let mut previews = page.previews.subscribe(vehicle.index);
     for preview in &mut previews {
@@ -161,7 +172,7 @@ async fn send_all(page: &Page, vehicle: &VehicleFlight, socket: &mut WebSocket) 
                 send_json(socket, &messages::cameras(&newest)).await?;
             }
             _ = tick.tick() => {
-                send_json(socket, &messages::state(page, vehicle)).await?;
+                send_json(socket, &messages::state(page, vehicle, viewer)).await?;
                 // Polled with the state rather than awaited: one picture per turn at most, and
                 // whatever was drawn meanwhile is skipped.
                 for (index, preview) in previews.iter_mut().enumerate() {

@@ -8,7 +8,7 @@ use vizflyt_arena::config::{CameraConfig, ImagingConfig};
 use vizflyt_arena::pose::SourceQuality;
 use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
 use vizflyt_protocol::geometry::LensConfig;
-use vizflyt_protocol::messages::{Arrivals, ClockState, EventKind, FlightPhase, Timing, bounded};
+use vizflyt_protocol::messages::{Arrivals, ClockState, EventKind, Timing, bounded};
 
 use super::*;
 use crate::flights::crash_card;
@@ -22,7 +22,7 @@ pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
     vec![
         ("Arena", arenas()),
         ("Cameras", vec![json(&Message::Cameras { cameras: camera_examples() })]),
-        ("Track", vec![json(&Message::Track { points: &[[0.0; 4]] })]),
+        ("Track", vec![json(&Message::Track { vehicle: "vizflyt", points: &[[0.0; 4]] })]),
         ("Events", vec![json(&Message::Events { events: event_examples() })]),
         ("State", vec![json(&full_state()), json(&sparse_state())]),
         ("Session", web::login::examples()),
@@ -190,14 +190,21 @@ fn full_state() -> Message<'static> {
         view_port: None,
         view: Some(([127, 0, 0, 1], 8090).into()),
     };
+    let pose = || PoseLine {
+        p_world_m: [0.0; 3],
+        yaw_rad: 0.0,
+        rotation: [0.0, 0.0, 0.0, 1.0],
+        v_world_mps: [0.0; 3],
+        age_s: 0.0,
+    };
+    let other = |pose, flight_s| OtherLine {
+        name: "bee".to_owned(),
+        phase: FlightPhase::Flying,
+        pose,
+        flight_s,
+    };
     Message::State(Box::new(State {
-        pose: Some(PoseLine {
-            p_world_m: [0.0; 3],
-            yaw_rad: 0.0,
-            rotation: [0.0, 0.0, 0.0, 1.0],
-            v_world_mps: [0.0; 3],
-            age_s: 0.0,
-        }),
+        pose: Some(pose()),
         runtime: Some(RuntimeLine {
             address: "127.0.0.1:1".to_owned(),
             program: "vizflyt".to_owned(),
@@ -222,6 +229,7 @@ fn full_state() -> Message<'static> {
             min_m: [0.0; 3],
             max_m: [0.0; 3],
         }],
+        others: vec![other(Some(pose()), Some(1.0)), other(None, None)],
         ..*sparse
     }))
 }
@@ -247,6 +255,7 @@ fn sparse_state() -> Message<'static> {
         outcome: None,
         crash: None,
         objects: Vec::new(),
+        others: Vec::new(),
     }))
 }
 

@@ -12,20 +12,18 @@ import { followTheme, switchTheme } from "./theme.js";
 import "./dialogs/environment.js";
 import "./dialogs/login.js";
 import "./dialogs/pairing.js";
+import "./dialogs/panels.js";
 import "./dialogs/scene.js";
 
-$("left").append(...PANELS.left.map(({ element }) => element));
-$("right").append(...PANELS.right.map(({ element }) => element));
-
 /** @type {import("./panels.js").Part[]} */
-const parts = [stopButton, header, orders, outcome, ...PANELS.left, ...PANELS.right];
+const parts = [stopButton, header, orders, outcome, ...Object.values(PANELS.left), ...Object.values(PANELS.right)];
 
 /** @param {import("./messages").Message} message */
 function receive(message) {
   for (const part of parts) {
     if (message.type === "arena") part.onArena?.(message);
     else if (message.type === "cameras") part.onCameras?.(message.cameras);
-    else if (message.type === "track") part.onTrack?.(message.points);
+    else if (message.type === "track") part.onTrack?.(message.points, message.vehicle);
     else if (message.type === "events") part.onEvents?.(message.events);
     else if (message.type === "state") part.onState?.(message);
   }

@@ -1,9 +1,10 @@
-// The WebSocket: messages and images of one vehicle. A lost connection comes back by itself.
+// The connection to the vehicle that is shown. A lost one comes back by itself.
 
 import { $, setText } from "./dom.js";
 import { showVehicles } from "./header.js";
 import { showOutcome } from "./outcome.js";
 import { fetchSession } from "./session.js";
+import { openSocket } from "./socket.js";
 
 /** The vehicle asked for; the first one, if none is. */
 const wanted = new URLSearchParams(location.search).get("vehicle");
@@ -14,20 +15,13 @@ const wanted = new URLSearchParams(location.search).get("vehicle");
  * @param {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} onImage kind: 0 colour, 1 depth, 2 objects
  */
 export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
-  const query = wanted == null ? "" : `?vehicle=${encodeURIComponent(wanted)}`;
-  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws${query}`);
+  const socket = openSocket(wanted, onMessage, onImage);
   let opened = false;
-  socket.binaryType = "arraybuffer";
   socket.onopen = () => {
     opened = true;
     wait_ms = FIRST_WAIT_MS;
     showLink("good", "live");
     delete document.body.dataset.stale;
-  };
-  socket.onmessage = ({ data }) => {
-    if (typeof data === "string") return onMessage(JSON.parse(data));
-    const [kind, camera] = new Uint8Array(data, 0, 2);
-    onImage(kind, camera, new Uint8Array(data, 2));
   };
   socket.onclose = ({ code, reason }) => {
     // The server says why it closes; of one that is gone nobody knows.

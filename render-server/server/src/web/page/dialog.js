@@ -1,5 +1,6 @@
-// Dialogs over the page. They leave the stop button, and its keys, where they are.
+// Dialogs over the page. They leave the stop button where it is; escape closes them, and only then stops.
 
+import { closed, opened } from "./closing.js";
 import { make, makeButton } from "./dom.js";
 
 /**
@@ -14,12 +15,17 @@ export function makeDialog(title, ...content) {
   document.body.append(dialog);
   /** @type {HTMLElement | null} */
   let opener = null;
-  dialog.addEventListener("close", () => opener?.focus());
+  const close = () => dialog.close();
+  dialog.addEventListener("close", () => {
+    closed(close);
+    opener?.focus();
+  });
   return Object.assign(dialog, {
     /** @param {HTMLElement} button */
     openFrom(button) {
       opener = button;
       if (!dialog.open) dialog.show();
+      opened(close);
     },
   });
 }

@@ -1,13 +1,8 @@
 // The line at the top and the one at the bottom: which vehicle, its phase and clock; who renders, who flies.
 
 import { $, clockText, setText } from "./dom.js";
+import { PHASES } from "./phases.js";
 
-/** @type {Record<string, [tone: string, text: string]>} */
-const PHASES = {
-  connecting: ["idle", "connecting"], preparing: ["warn", "preparing"], taking_off: ["go", "taking off"],
-  flying: ["good", "flying"], holding: ["warn", "holding"], landing: ["warn", "landing"], landed: ["idle", "landed"],
-  waiting: ["go", "ready to start"],
-};
 const list = $("vehicles", HTMLSelectElement);
 
 /**
@@ -25,8 +20,13 @@ export function showVehicles(names, current) {
   setText($("estop-what"), names.length < 2 || current == null ? "" : current);
 }
 list.addEventListener("change", () => {
-  if (list.value) location.search = `?vehicle=${encodeURIComponent(list.value)}`;
+  if (list.value) chooseVehicle(list.value);
 });
+
+/** Shows another vehicle. @param {string} name */
+export function chooseVehicle(name) {
+  location.search = `?vehicle=${encodeURIComponent(name)}`;
+}
 
 let time_limit_s = 0;
 

@@ -100,6 +100,7 @@ export type Cameras = {
 export type Track = {
   points: [number, number, number, number][];
   type: "track";
+  vehicle: string;
 };
 
 export type Events = {
@@ -143,6 +144,18 @@ export type State = {
     name: string;
     p_world_m: [number, number, number];
     q_xyzw: [number, number, number, number];
+  }[];
+  others: {
+    flight_s: number | null;
+    name: string;
+    phase: string;
+    pose: {
+      age_s: number;
+      p_world_m: [number, number, number];
+      rotation: [number, number, number, number];
+      v_world_mps: [number, number, number];
+      yaw_rad: number;
+    } | null;
   }[];
   outcome: { at_s: number; outcome: string; text: string; title: string; tone: string } | null;
   pose: {

@@ -1,5 +1,5 @@
 // The panels of the page: every one is in this table, and nowhere else. A panel makes its own element; the page puts it
-// in its column, and calls those of the functions below that it has.
+// in a column, and calls those of the functions below that it has.
 
 import { arenaView } from "./panels/arena_view.js";
 import { cameraImages } from "./panels/camera_images.js";
@@ -16,7 +16,7 @@ import { timing } from "./panels/timing.js";
  * @typedef {object} Part
  * @property {(arena: import("./messages").Arena) => void} [onArena] the vehicle, its room and course; first on each connection
  * @property {(cameras: import("./messages").Camera[]) => void} [onCameras] after one was changed
- * @property {(points: import("./messages").Track["points"]) => void} [onTrack] the track flown before the page came
+ * @property {(points: import("./messages").Track["points"], vehicle: string) => void} [onTrack] the track flown before the page came, of each vehicle
  * @property {(events: import("./messages").EventLine[]) => void} [onEvents] new ones, or again those before
  * @property {(state: import("./messages").State) => void} [onState] 20 times a second
  * @property {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} [onImage] kind: 0 colour, 1 depth, 2 objects
@@ -26,8 +26,8 @@ import { timing } from "./panels/timing.js";
  * @typedef {Part & { element: HTMLElement }} Panel
  */
 
-/** By column, from top to bottom. @type {{ left: Panel[], right: Panel[] }} */
+/** By column, from top to bottom, each with its name; `dialogs/panels.js` puts them where this browser wants them. */
 export const PANELS = {
-  left: [arenaView, crashCard, timing, figures],
-  right: [cameraImages, cameraSettings, sensors, leaderboard, events],
+  left: { map: arenaView, crash: crashCard, timing, figures },
+  right: { cameras: cameraImages, "camera settings": cameraSettings, sensors, leaderboard, events },
 };

@@ -139,11 +139,11 @@ export class Room {
     return Math.max(0.08, this.arena.body_radius_m);
   }
 
-  /** Adds four rotors, a body and a nose, as large as the sphere that encloses the vehicle. @param {number} [opacity] */
-  addVehicle(opacity = 1) {
+  /** Adds four rotors, a body and a nose, as large as the sphere that encloses the vehicle. @param {number} [opacity] @param {string} [colour] */
+  addVehicle(opacity = 1, colour = "--accent") {
     const r = this.bodyRadius();
     const vehicle = new THREE.Group();
-    const accent = new THREE.MeshLambertMaterial({ color: this.colour("--accent"), transparent: opacity < 1, opacity });
+    const accent = new THREE.MeshLambertMaterial({ color: this.colour(colour), transparent: opacity < 1, opacity });
     const dark = new THREE.MeshLambertMaterial({ color: this.colour("--text"), transparent: opacity < 1, opacity });
     const body = new THREE.Mesh(new THREE.BoxGeometry(0.9 * r, 0.5 * r, 0.3 * r), accent);
     const nose = new THREE.Mesh(new THREE.ConeGeometry(0.24 * r, 0.6 * r, 12), accent);

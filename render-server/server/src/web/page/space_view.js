@@ -3,17 +3,16 @@
 // camera goes behind the vehicle ("chase"), or flies in it ("onboard"). World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
+import { movedOn } from "./fleet.js";
 import { known } from "./session.js";
+import { Others } from "./space_others.js";
 import { joined, Room, vec } from "./space_room.js";
+import { speedColours, TrackLine } from "./space_track.js";
 import { Twin } from "./space_twin.js";
-import { speedColour } from "./top_view.js";
 
 /** @typedef {import("./messages").Arena} Arena */
 /** @typedef {import("./messages").State["objects"]} MovingObjects */
-/** @typedef {import("./top_view.js").TrackPoint} TrackPoint */
 
-/** The most points of the track; as many as the top view keeps. */
-const MAX_POINTS = 3000;
 /** Without a card thirty images a second at most, and less where one takes long: the processor is the flight's. [ms] */
 const EVERY_MS = 1000 / 31;
 /** Without a card the page rests so much longer than it draws. */
@@ -58,11 +57,10 @@ export class SpaceView {
     this.room = new Room(arena, theme);
     this.moving = new THREE.Group();
     this.scene.add(this.room.group, this.moving);
-    this.track = makeTrack();
-    this.ghostTrack = makeTrack();
-    this.scene.add(this.track, this.ghostTrack);
-    /** The part of the track that is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
-    this.drawnTrack = { length: -1, end: undefined };
+    this.track = new TrackLine();
+    this.ghostTrack = new TrackLine();
+    this.others = new Others();
+    this.scene.add(this.track.line, this.ghostTrack.line, this.others.group);
     this.drawn_ms = -Infinity;
     this.rest_ms = card ? 0 : EVERY_MS;
     /** @type {Mode} */
@@ -87,13 +85,14 @@ export class SpaceView {
    */
   setArena(arena, theme) {
     const isOther = arena.boot !== this.room.arena.boot;
+    this.others.clear();
     this.room.dispose();
     this.room = new Room(arena, theme);
     this.scene.add(this.room.group);
     if (isOther) this.addTwin();
     else this.room.stand.visible = !this.twin?.isShown;
     this.moving.clear();
-    this.drawnTrack.length = -1;
+    for (const track of [this.track, this.ghostTrack]) track.forget();
     this.home();
     this.resize();
   }
@@ -116,24 +115,6 @@ export class SpaceView {
   }
 
   // ---- what moves ------------------------------------------------------------------------
-  /** @param {TrackPoint[]} track */
-  showTrack(track) {
-    const { length } = track, end = track.at(-1);
-    if (length === this.drawnTrack.length && end === this.drawnTrack.end) return;
-    this.drawnTrack = { length, end };
-    const { position, color } = this.track.geometry.attributes;
-    const fastest_mps = Math.max(1, this.room.arena.max_speed_mps), colour = new THREE.Color();
-    const count = Math.min(length, MAX_POINTS);
-    for (let k = 0; k < count; k++) {
-      const [x, y, z, speed] = track[k];
-      position.setXYZ(k, x, y, z);
-      colour.setStyle(speedColour(speed / fastest_mps).replaceAll(/(\d) (?=\d)/g, "$1,"));
-      color.setXYZ(k, colour.r, colour.g, colour.b);
-    }
-    position.needsUpdate = color.needsUpdate = true;
-    this.track.geometry.setDrawRange(0, count);
-  }
-
   /** Shows moving objects: each as the box about it in its own frame, where it is and how it is turned. @param {MovingObjects} objects */
   showObjects(objects) {
     for (const surplus of this.moving.children.slice(objects.length)) this.moving.remove(surplus);
@@ -156,45 +137,38 @@ export class SpaceView {
   }
 
   /**
-   * @param {import("./panels/arena_view.js").ShownPose} pose
+   * @param {import("./fleet.js").ShownPose} pose
    * @param {number} now_ms
    */
   showVehicle(pose, now_ms) {
     const { vehicle, shadow } = this.room;
-    const dt_s = Math.min(0.1, Math.max(0, (now_ms - pose.received_ms) / 1000));
-    const p = joined(pose.p_world_m, pose.v_world_mps, (x, v) => x + v * dt_s);
+    const p = movedOn(pose, now_ms);
     vehicle.position.set(...p);
     vehicle.quaternion.set(...pose.rotation);
     shadow.position.set(p[0], p[1], this.room.floorHeight() + 0.005);
     if (this.follows) this.target.lerp(vehicle.position, 0.15);
   }
 
-  /** Shows another flight beside this one. @param {import("./top_view.js").Ghost | null} ghost */
+  /** Shows another flight beside this one. @param {ReturnType<import("./replay_bar.js").ReplayBar["ghostNow"]>} ghost */
   showGhost(ghost) {
-    this.room.ghost.visible = this.ghostTrack.visible = ghost != null;
+    this.room.ghost.visible = this.ghostTrack.line.visible = ghost != null;
     if (!ghost) return;
     this.room.ghost.position.set(...ghost.pose.p_world_m);
     this.room.ghost.quaternion.set(...ghost.pose.rotation);
-    const { position, color } = this.ghostTrack.geometry.attributes;
-    const count = Math.min(ghost.track.length, MAX_POINTS), grey = this.room.colour("--muted");
-    for (let k = 0; k < count; k++) {
-      const [x, y, z] = ghost.track[k];
-      position.setXYZ(k, x, y, z);
-      color.setXYZ(k, grey.r, grey.g, grey.b);
-    }
-    position.needsUpdate = color.needsUpdate = true;
-    this.ghostTrack.geometry.setDrawRange(0, count);
+    const grey = this.room.colour("--muted");
+    this.ghostTrack.show(ghost.track, () => grey);
   }
 
-  /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0]} shown */
-  draw({ pose, now_ms, crashed, track, objects, passed, ghost }) {
+  /** @param {Parameters<import("./top_view.js").TopView["draw"]>[0] & { ghost: Parameters<SpaceView["showGhost"]>[0] }} shown */
+  draw({ pose, now_ms, crashed, track, objects, passed, ghost, others }) {
     if (!this.canvas.clientWidth || now_ms - this.drawn_ms < this.rest_ms) return;
     this.drawn_ms = now_ms;
     const { room } = this;
     room.fenceColour.copy(room.colour(crashed ? "--bad" : "--warn"));
-    this.showTrack(track);
+    this.track.show(track, speedColours(room.arena.max_speed_mps));
     this.showObjects(objects);
     this.showGhost(ghost);
+    this.others.show(room, others, now_ms);
     const next = room.stages.findIndex((_, k) => !passed.has(k));
     for (const [k, paint] of room.stages.entries())
       paint(room.colour(passed.has(k) ? "--good" : k === next ? "--accent" : "--muted"));
@@ -215,6 +189,13 @@ export class SpaceView {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     const took_ms = performance.now() - began_ms;
     this.rest_ms = Math.max(EVERY_MS, (1 + REST) * took_ms);
+  }
+
+  /** Returns where a point of the world is on the canvas; null of one that is not in sight. @param {import("./space_room.js").Point} p @returns {[number, number] | null} [CSS px] */
+  at(p) {
+    const { x, y, z } = vec(p).project(this.camera);
+    if (z > 1 || Math.abs(x) > 1 || Math.abs(y) > 1) return null;
+    return [((1 + x) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
 
   // ---- the camera ------------------------------------------------------------------------
@@ -357,15 +338,4 @@ export class SpaceView {
     this.camera.aspect = w / h;
     this.drawn_ms = -Infinity;
   }
-}
-
-/** Returns the track: a line with a colour for each point, none drawn yet. */
-function makeTrack() {
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * MAX_POINTS), 3));
-  geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * MAX_POINTS), 3));
-  geometry.setDrawRange(0, 0);
-  const track = new THREE.Line(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
-  track.frustumCulled = false;
-  return track;
 }

@@ -51,13 +51,3 @@ export function fillGrades(node, boards) {
   });
   node.replaceChildren(...parts);
 }
-
-/**
- * Returns who flies now, in a sentence; empty if nobody.
- * @param {Leaderboard["vehicles"]} vehicles
- */
-export function flyingText(vehicles) {
-  return vehicles
-    .flatMap(({ team, vehicle, attempt, flight_s }) => (flight_s == null ? [] : [`${team ?? vehicle}, ${attempt}: ${flight_s.toFixed(1)} s`]))
-    .join(" · ");
-}

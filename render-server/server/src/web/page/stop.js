@@ -1,5 +1,6 @@
-// The stop buttons, and their keys: space and escape.
+// The stop buttons, and their keys: space and escape, which closes first what lies over the page.
 
+import { closeNewest } from "./closing.js";
 import { $ } from "./dom.js";
 import { showOutcome } from "./outcome.js";
 import { vehicleUrl } from "./session.js";
@@ -44,12 +45,12 @@ addEventListener("keydown", (event) => {
   const elsewhere = control && control !== $("estop");
   if (event.code === "Escape" || (event.code === "Space" && !elsewhere)) {
     event.preventDefault();
-    stop(false);
+    if (event.code !== "Escape" || !closeNewest()) stop(false);
   }
 });
 
 /**
-* Announces a text to screen readers.
+ * Announces a text to screen readers.
  * @param {string} text
  */
 export function announce(text) {

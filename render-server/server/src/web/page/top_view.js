@@ -2,12 +2,13 @@
 // throughout.
 
 import { context2d, make } from "./dom.js";
+import { movedOn } from "./fleet.js";
 import { cssColours } from "./theme.js";
 
 /** @typedef {import("./messages").Arena} Arena */
 /** @typedef {import("./messages").State["objects"][number]} MovingObject */
 /** A point of the track: where, and how fast. [m, world; m/s] @typedef {import("./messages").Track["points"][number]} TrackPoint */
-/** Another flight beside the one that is shown. @typedef {{ pose: import("./flight_recording.js").FlownPose, track: TrackPoint[] }} Ghost */
+/** Another flight beside the one that is shown. @typedef {{ pose: Pick<import("./flight_recording.js").FlownPose, "p_world_m">, track: TrackPoint[] }} Ghost */
 /** @typedef {[x: number, y: number]} Point2 */
 /** At least x and y. @typedef {readonly [number, number, ...number[]]} Point */
 
@@ -144,21 +145,8 @@ export class TopView {
     return [this.origin[0] + p[0] * this.scale, this.origin[1] - p[1] * this.scale];
   }
 
-  /**
-   * Adds a point to the track.
-   * @param {[number, number, number]} p [m, world]
-   * @param {number} speed [m/s]
-   */
-  addPoint(p, speed) {
-    const last = this.track.at(-1);
-    if (last && Math.hypot(p[0] - last[0], p[1] - last[1]) < 0.04) return;
-    this.track.push([p[0], p[1], p[2], speed]);
-    // Thinned as on the server, so that an hour's flight draws as fast as a minute's.
-    if (this.track.length > 3000) this.track = this.track.filter((_, k) => k % 2 === 0);
-  }
-
-  /** @param {{ pose: import("./panels/arena_view.js").ShownPose | null, now_ms: number, crashed: boolean, objects: MovingObject[], passed: Set<number>, track: TrackPoint[], ghost: Ghost | null }} shown */
-  draw({ pose, now_ms, crashed, objects, passed, track, ghost }) {
+  /** @param {{ pose: import("./fleet.js").ShownPose | null, now_ms: number, crashed: boolean, objects: MovingObject[], passed: Set<number>, track: TrackPoint[], ghost: Ghost | null, others: import("./fleet.js").Other[] }} shown */
+  draw({ pose, now_ms, crashed, objects, passed, track, ghost, others }) {
     const { g, arena, ratio } = this;
     if (!arena || !this.scale) return;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
@@ -169,8 +157,10 @@ export class TopView {
     if (arena.goal_m) this.drawGoal(arena.goal_m, arena.goal_radius_m, now_ms);
     for (const object of objects) this.drawObject(object);
     if (ghost) this.drawGhost(arena, ghost);
+    for (const other of others) this.drawTrack(arena, other.track, this.style.muted);
     this.drawTrack(arena, track);
-    if (pose) this.drawVehicle(arena, pose, now_ms);
+    for (const other of others) this.drawVehicle(arena, other.pose, now_ms, this.style.muted);
+    if (pose) this.drawVehicle(arena, pose, now_ms, this.style.accent);
     this.drawScaleBar();
   }
 
@@ -294,14 +284,14 @@ export class TopView {
     g.setLineDash([]);
   }
 
-  /** @param {Arena} arena @param {TrackPoint[]} track */
-  drawTrack(arena, track) {
+  /** Draws a track, in the colours of its speeds unless one is given. @param {Arena} arena @param {TrackPoint[]} track @param {string} [colour] */
+  drawTrack(arena, track, colour) {
     const { g } = this;
     const fastest_mps = Math.max(1, arena.max_speed_mps);
-    g.lineWidth = 3;
+    g.lineWidth = colour ? 1.5 : 3;
     g.lineJoin = g.lineCap = "round";
     for (let k = 1; k < track.length; k++) {
-      g.strokeStyle = speedColour(track[k][3] / fastest_mps);
+      g.strokeStyle = colour ?? speedColour(track[k][3] / fastest_mps);
       g.beginPath();
       g.moveTo(...this.at(track[k - 1]));
       g.lineTo(...this.at(track[k]));
@@ -310,13 +300,10 @@ export class TopView {
     g.lineCap = "butt";
   }
 
-  /** @param {Arena} arena @param {import("./panels/arena_view.js").ShownPose} pose @param {number} now_ms */
-  drawVehicle(arena, pose, now_ms) {
+  /** @param {Arena} arena @param {import("./fleet.js").ShownPose} pose @param {number} now_ms @param {string} colour */
+  drawVehicle(arena, pose, now_ms, colour) {
     const { g, style } = this;
-    // Between two messages the vehicle goes on at its speed: smooth at any screen rate.
-    const dt = Math.min(0.1, Math.max(0, (now_ms - pose.received_ms) / 1000));
-    /** @type {Point2} */
-    const p = [pose.p_world_m[0] + pose.v_world_mps[0] * dt, pose.p_world_m[1] + pose.v_world_mps[1] * dt];
+    const p = movedOn(pose, now_ms);
     const [x, y] = this.at(p);
     const v = this.at([p[0] + pose.v_world_mps[0] * 0.5, p[1] + pose.v_world_mps[1] * 0.5]);
     g.strokeStyle = style.text;
@@ -331,7 +318,7 @@ export class TopView {
     g.save();
     g.translate(x, y);
     g.rotate(-pose.yaw_rad);
-    g.fillStyle = style.accent;
+    g.fillStyle = colour;
     g.strokeStyle = style.background;
     g.lineWidth = 2;
     g.beginPath();

@@ -1,18 +1,18 @@
 // Where the vehicle flies: the arena from above or in space, the stages of its course, and what the page waits for.
 
 import { make, setText } from "../dom.js";
+import { notePassed } from "../event_kinds.js";
+import { extended, Fleet, movedOn, received } from "../fleet.js";
 import { FlightRecording } from "../flight_recording.js";
+import { chooseVehicle } from "../header.js";
 import { showOutcome } from "../outcome.js";
 import { ReplayBar } from "../replay_bar.js";
 import { theme } from "../theme.js";
 import { TopView } from "../top_view.js";
+import { VehicleTags } from "../vehicle_tags.js";
 
 /** @typedef {import("../messages").Arena} Arena */
 /** @typedef {import("../messages").State} State */
-/** The newest pose, and when it came; long ago where it is too old to go on from. @typedef {NonNullable<State["pose"]> & { received_ms: number }} ShownPose */
-
-/** A pose older than this is shown, but not moved on. [s] */
-const FRESH_S = 0.5;
 
 const top = make("canvas", { id: "map", role: "img", ariaLabel: "top view of the arena" });
 const spaceCanvas = make("canvas", {
@@ -28,8 +28,10 @@ const fastest = make("span", { id: "speed-top", textContent: "m/s" });
 const recording = new FlightRecording();
 const replay = new ReplayBar(recording, (text) => showOutcome("warn", "No flight", text));
 const hint = make("p", { id: "hint", className: "hint", hidden: true });
+const fleet = new Fleet();
+const tags = new VehicleTags(chooseVehicle);
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
-  top, spaceCanvas, stages,
+  top, spaceCanvas, tags.element, stages,
   make("div", { className: "views", role: "group", ariaLabel: "view" }, ...buttons),
   make("div", { className: "legend" },
     make("span", { className: "speed" }, make("span", { textContent: "0" }), make("i"), fastest)),
@@ -41,7 +43,7 @@ const topView = new TopView(top);
 let spaceView = null;
 /** @type {Arena | null} */
 let arena = null;
-/** @type {ShownPose | null} */
+/** @type {import("../fleet.js").ShownPose | null} */
 let pose = null;
 /** @type {State | null} */
 let state = null;
@@ -123,6 +125,14 @@ function ended({ outcome }) {
   return { arena: arena?.name ?? "", vehicle: arena?.vehicle ?? "", outcome: outcome?.title ?? "landed", at: new Date().toISOString() };
 }
 
+/** Shows the vehicles' names where they are drawn. @param {Parameters<TopView["draw"]>[0]} shown */
+function showTags({ pose, others, now_ms }) {
+  const drawn = spaceCanvas.hidden ? topView : spaceView;
+  const place = (/** @type {import("../fleet.js").ShownPose} */ pose) => drawn?.at(movedOn(pose, now_ms)) ?? null;
+  const own = pose && view !== "onboard" ? [{ name: arena?.vehicle ?? "", phase: null, at: place(pose) }] : [];
+  tags.show([...own, ...others.map(({ name, phase, pose }) => ({ name, phase, at: place(pose) }))]);
+}
+
 /** The track of what is shown: of now, or of a flight of another time. */
 function shownTrack() {
   if (replay.recording === recording) return topView.track;
@@ -142,19 +152,20 @@ export const arenaView = {
       replay.offer(false, null);
       replay.list(arena.name);
     }
+    fleet.clear();
+    tags.setVehicles(arena.vehicles, arena.vehicle);
     topView.setArena(arena);
     spaceView?.setArena(arena, theme());
     pickView(view);
     showStages();
     setText(fastest, `${Math.max(1, arena.max_speed_mps)} m/s`);
   },
-  onTrack(points) {
-    topView.track = points;
+  onTrack(points, vehicle) {
+    if (vehicle === arena?.vehicle) topView.track = points;
+    else fleet.setTrack(vehicle, points);
   },
   onEvents(entries) {
-    for (const { kind } of entries) {
-      if (typeof kind === "object" && "stage" in kind) passed.add(kind.stage.index);
-    }
+    notePassed(passed, entries);
     showStages();
   },
   onState(newest) {
@@ -171,10 +182,10 @@ export const arenaView = {
     replay.offer(hasEnded || state.flight_s == null, hasEnded ? ended(state) : null);
     flown = state.flight_s != null;
     if (state.pose) {
-      const fresh = state.pose.age_s < FRESH_S;
-      pose = { ...state.pose, received_ms: fresh ? performance.now() : -Infinity };
-      if (fresh) topView.addPoint(pose.p_world_m, Math.hypot(...pose.v_world_mps));
+      pose = received(state.pose, performance.now());
+      topView.track = extended(topView.track, state.pose);
     }
+    fleet.update(state.others, performance.now());
     showHint(hintOf(state));
   },
   onFrame(now_ms) {
@@ -188,6 +199,8 @@ export const arenaView = {
       passed: moment?.passed ?? passed,
       track: shownTrack(),
       ghost: replay.ghostNow(),
+      // Of a moment that is looked at again, the page knows the one vehicle.
+      others: moment ? [] : fleet.others,
     };
     if (shown.passed !== lit) {
       lit = shown.passed;
@@ -195,6 +208,7 @@ export const arenaView = {
     }
     if (spaceCanvas.hidden) topView.draw(shown);
     else spaceView?.draw(shown);
+    showTags(shown);
   },
   onTheme() {
     topView.restyle();

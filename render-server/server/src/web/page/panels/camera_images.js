@@ -1,5 +1,6 @@
 // What the vehicle sees: colour and depth of one camera, or the objects in it.
 
+import { closed, opened } from "../closing.js";
 import { context2d, make, setText } from "../dom.js";
 import { showSettings } from "./camera_settings.js";
 
@@ -13,9 +14,13 @@ const kindButton = make("button", { id: "depth-kind", type: "button", className:
 const word = make("span", { id: "depth-word", textContent: "depth" });
 const scale = make("span", { className: "depth-scale", ariaLabel: "depth scale from 0.3 to 20 metres" },
   make("span", { textContent: "0.3" }), make("i"), make("span", { textContent: "20 m" }));
+/** How large the pictures can be but in their column: side by side in place of all panels, on the page or on the whole screen. */
+const SIZES = ["large", "full screen"];
+const sizeButtons = SIZES.map((textContent) => make("button", { type: "button", textContent, ariaPressed: "false" }));
 const element = make("section", { className: "cameras", ariaLabel: "what the vehicle sees" },
   tabs,
-  make("figure", { className: "panel" }, colour, make("figcaption", {}, "colour ", name)),
+  make("figure", { className: "panel" }, colour,
+    make("div", { className: "views", role: "group", ariaLabel: "size of the pictures" }, ...sizeButtons), make("figcaption", {}, "colour ", name)),
   make("figure", { className: "panel" }, depth, make("figcaption", {}, kindButton, word, " ", scale)),
 );
 
@@ -50,6 +55,24 @@ function showSecond(kind) {
 }
 kindButton.addEventListener("click", () => showSecond(second === DEPTH ? OBJECTS : DEPTH));
 showSecond(DEPTH);
+
+const shrink = () => showSize("");
+
+/** @param {string} size one of `SIZES`; in the column, if it is empty */
+async function showSize(size) {
+  document.body.dataset.cameras = size ? "large" : "";
+  for (const button of sizeButtons) button.ariaPressed = String(button.textContent === size);
+  size ? opened(shrink) : closed(shrink);
+  const isFull = document.fullscreenElement != null;
+  if (size === "full screen" && !isFull) await document.documentElement.requestFullscreen().catch(() => {});
+  else if (size !== "full screen" && isFull) await document.exitFullscreen();
+}
+for (const button of sizeButtons)
+  button.addEventListener("click", () => showSize(button.ariaPressed === "true" ? "" : (button.textContent ?? "")));
+// The browser itself takes escape for leaving the whole screen.
+document.addEventListener("fullscreenchange", () => {
+  if (!document.fullscreenElement) shrink();
+});
 
 /** @type {import("../panels.js").Panel} */
 export const cameraImages = {

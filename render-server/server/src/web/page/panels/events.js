@@ -1,6 +1,7 @@
-// The events: what the server, the runtime and the plugin report, newest last.
+// The events: what the server, the runtime and the plugin report, newest last; what comes again and again is one line.
 
-import { clockText, make } from "../dom.js";
+import { clockText, make, setText } from "../dom.js";
+import { EventGroups } from "../event_groups.js";
 import { kindName, toneOf } from "../event_kinds.js";
 
 /** Lines kept on the page. */
@@ -8,30 +9,49 @@ const MAX_LINES = 400;
 /** What the buttons leave in the list: all, those of the flight, those of the plugin. */
 const FEEDS = [["all", "all"], ["flight", "flight"], ["code", "plugin"]];
 
-const list = make("ol", { id: "events", role: "log", ariaLive: "polite", tabIndex: 0 });
+const list = make("ol");
+const log = make("div", { id: "events", role: "log", ariaLive: "polite", ariaLabel: "events", tabIndex: 0 }, list);
 const choices = make("div", { className: "views", role: "group", ariaLabel: "which events" });
 const title = make("h2", { id: "events-title", textContent: "events" });
-const element = make("section", { className: "panel events" }, title, choices, list);
+const element = make("section", { className: "panel events" }, title, choices, log);
 element.setAttribute("aria-labelledby", title.id);
 
 let boot = "";
 /** Indices of the events in the list. @type {Set<number>} */
 const shown = new Set();
+let groups = new EventGroups();
+/** The line of each group. @type {WeakMap<import("../event_groups.js").Group, HTMLElement>} */
+const lines = new WeakMap();
+
+/** Shows an event in its group's line, which is the last one from now on. @param {import("../messages").EventLine} entry */
+function showEvent(entry) {
+  const tone = toneOf(entry);
+  const sentence = entry.text || kindName(entry.kind).replaceAll("_", " ");
+  const group = groups.add(tone, sentence, entry.at_s);
+  const line = lines.get(group) ?? make("li", {}, make("time"), make("span"));
+  lines.set(group, line);
+  const [time, words] = line.children;
+  setText(time, clockText(group.at_s));
+  words.replaceChildren(sentence, ...(group.count > 1 ? [" ", make("b", { className: "count", textContent: `×${group.count}` })] : []));
+  if (group.count > 1) line.title = `${group.count} times since ${clockText(group.first_s)}`;
+  line.dataset.tone = tone;
+  list.append(line);
+}
 
 // The newest event stays in sight until someone scrolls up to read.
 let following = true;
 function follow() {
-  if (following) list.scrollTop = list.scrollHeight;
+  if (following) log.scrollTop = log.scrollHeight;
 }
-list.addEventListener("scroll", () => {
-  following = list.scrollTop + list.clientHeight >= list.scrollHeight - 40;
+log.addEventListener("scroll", () => {
+  following = log.scrollTop + log.clientHeight >= log.scrollHeight - 40;
 });
-new ResizeObserver(follow).observe(list);
+new ResizeObserver(follow).observe(log);
 
 for (const [feed, textContent] of FEEDS) {
   const button = make("button", { type: "button", textContent, ariaPressed: String(feed === "all") });
   button.addEventListener("click", () => {
-    list.dataset.feed = feed;
+    log.dataset.feed = feed;
     for (const other of choices.children) other.ariaPressed = String(other === button);
     follow();
   });
@@ -45,17 +65,14 @@ export const events = {
     if (arena.boot === boot) return;
     ({ boot } = arena);
     shown.clear();
+    groups = new EventGroups();
     list.replaceChildren();
   },
   onEvents(entries) {
     for (const entry of entries) {
-      const { index, kind, text, at_s } = entry;
-      if (shown.has(index)) continue;
-      shown.add(index);
-      const sentence = text || kindName(kind).replaceAll("_", " ");
-      const line = make("li", {}, make("time", { textContent: clockText(at_s) }), make("span", { textContent: sentence }));
-      line.dataset.tone = toneOf(entry);
-      list.append(line);
+      if (shown.has(entry.index)) continue;
+      shown.add(entry.index);
+      showEvent(entry);
     }
     while (list.childElementCount > MAX_LINES) list.firstChild?.remove();
     follow();

@@ -16,8 +16,8 @@ const official = make("tbody", { id: "official" }), practice = make("tbody", { i
 const element = makeFoldingPanel("leaderboard", "leaderboard: who leads, who flies",
   make("div", { className: "board" },
     make("p", {}, checkedIn, " ", checkOut), form,
-    make("h3", { textContent: "official" }), make("table", {}, official),
-    make("h3", { textContent: "practice" }), make("table", {}, practice),
+    make("h2", { textContent: "official" }), make("table", {}, official),
+    make("h2", { textContent: "practice" }), make("table", {}, practice),
     graded,
     make("p", {}, make("a", { href: "/wall", target: "_blank", rel: "noopener", textContent: "wall view" }))));
 element.hidden = true;

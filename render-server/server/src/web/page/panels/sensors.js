@@ -72,7 +72,7 @@ function makeRow({ name, kind }) {
   let reach_m = 1;
   return {
     url,
-    element: make("section", { className: "sensor" }, make("h3", {}, `${name} `, model, " ", value), canvas, form),
+    element: make("section", { className: "sensor" }, make("h2", {}, `${name} `, model, " ", value), canvas, form),
     fill(line) {
       setText(model, `${line.kind.replace("_", " ")}, ${line.model}`);
       if (form.contains(document.activeElement)) return;

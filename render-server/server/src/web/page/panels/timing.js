@@ -92,7 +92,7 @@ function show({ runtime, timing, images, connection }) {
 function waterfall({ stages, age, total, images }) {
   const sum_ms = Object.values(stages).reduce((sum, { p50 }) => sum + p50, 0);
   const width_ms = Math.max(sum_ms, total.p99, age.p99, 0.1);
-  const heads = ["stage", "", "p50", "p90", "p99", "max ms"].map((textContent) => make("th", { textContent }));
+  const heads = ["stage", "", "p50", "p90", "p99", "max ms"].map((textContent) => make(textContent ? "th" : "td", { textContent }));
   const rows = [];
   let start_ms = 0;
   for (const [name, what] of entries(STAGES)) {

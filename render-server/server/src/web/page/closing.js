@@ -1,0 +1,24 @@
+// What lies over the page and is closed by escape, the newest first. While anything is open, escape stops no vehicle.
+
+/** How each is closed, the newest last. @type {(() => void)[]} */
+const open = [];
+
+/** Notes what has opened. @param {() => void} close */
+export function opened(close) {
+  closed(close);
+  open.push(close);
+}
+
+/** Notes what has closed. @param {() => void} close */
+export function closed(close) {
+  const at = open.indexOf(close);
+  if (at >= 0) open.splice(at, 1);
+}
+
+/** Closes the newest; returns whether there was one. A list of choices that hangs open is the browser's to close. */
+export function closeNewest() {
+  if (CSS.supports("selector(select:open)") && document.querySelector("select:open")) return true;
+  const close = open.at(-1);
+  close?.();
+  return close != null;
+}

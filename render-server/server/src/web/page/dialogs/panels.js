@@ -1,0 +1,52 @@
+// Arranging the panels: which are shown, in which column and in which order. This browser keeps it.
+
+import { makeDialog } from "../dialog.js";
+import { $, make, makeButton } from "../dom.js";
+import { moved, readLayout, toggled } from "../layout.js";
+import { PANELS } from "../panels.js";
+
+const KEPT = "panels";
+const SIDES = /** @type {const} */ (["left", "right"]);
+/** @type {Record<string, import("../panels.js").Panel>} */
+const panels = { ...PANELS.left, ...PANELS.right };
+const usual = { left: Object.keys(PANELS.left), right: Object.keys(PANELS.right), closed: [] };
+let layout = readLayout(usual, localStorage.getItem(KEPT));
+
+const lists = { left: make("ol"), right: make("ol") };
+const reset = makeButton("reset", { onclick: () => change({ ...usual }) });
+const close = makeButton("close", { onclick: () => dialog.close() });
+const dialog = makeDialog("panels",
+  make("h3", { textContent: "left column" }), lists.left, make("h3", { textContent: "right column" }), lists.right,
+  make("p", { className: "choices" }, reset, close));
+dialog.classList.add("arrange");
+
+/** Puts the panels where the layout has them. */
+function apply() {
+  for (const side of SIDES) {
+    const open = layout[side].filter((name) => !layout.closed.includes(name));
+    $(side).replaceChildren(...open.map((name) => panels[name].element));
+    lists[side].replaceChildren(...layout[side].map(makeRow));
+  }
+}
+
+/** @param {import("../layout.js").Layout} next */
+function change(next) {
+  const focused = document.activeElement?.ariaLabel;
+  layout = next;
+  localStorage.setItem(KEPT, JSON.stringify(layout));
+  apply();
+  // What was pressed is there again, and is pressed again.
+  if (focused) /** @type {HTMLElement | null} */ (dialog.querySelector(`[aria-label="${CSS.escape(focused)}"]`))?.focus();
+}
+
+/** @param {string} name */
+function makeRow(name) {
+  const shown = make("input", { type: "checkbox", checked: !layout.closed.includes(name), ariaLabel: name, onchange: () => change(toggled(layout, name)) });
+  const way = (/** @type {"up" | "down" | "over"} */ to, /** @type {string} */ sign, /** @type {string} */ words) =>
+    makeButton(sign, { ariaLabel: `${name} ${words}`, title: words, onclick: () => change(moved(layout, name, to)) });
+  return make("li", {}, make("label", {}, shown, ` ${name}`),
+    way("up", "↑", "up"), way("down", "↓", "down"), way("over", "⇄", "to the other column"));
+}
+
+apply();
+$("arrange").addEventListener("click", () => dialog.openFrom($("arrange")));
