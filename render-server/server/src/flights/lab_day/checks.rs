@@ -368,7 +368,7 @@ pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParam
         }
         Some(parameters) => {
             for FenceParameter { name, has, right } in parameters {
-                let value = has.map_or("absent".to_owned(), |has| format!("{:.2}", has));
+                let value = has.map_or("absent".to_owned(), |has| format!("{has:.2}"));
                 autopilot += &format!(", {name} {value}");
                 if !has.is_some_and(|has| (has - right).abs() <= 1e-3 * right.abs().max(1.0)) {
                     todo.push(format!("{name} must be {right:.2}: vizflyt doctor vehicle --arena arena.toml --apply"));

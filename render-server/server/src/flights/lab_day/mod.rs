@@ -201,10 +201,12 @@ impl LabDay {
     pub fn state(&self, vehicle: &str, check: CheckId, now_unix_ms: u64) -> State {
         let Some(record) = self.evidence(vehicle, check) else { return State::NotDone };
         let age_s = now_unix_ms.saturating_sub(record.at_unix_ms) as f64 * 1e-3;
-        match record.finding.ok {
-            _ if age_s > check.valid_s() => State::Outdated,
-            true => State::Ok,
-            false => State::Failed,
+        if age_s > check.valid_s() {
+            State::Outdated
+        } else if record.finding.ok {
+            State::Ok
+        } else {
+            State::Failed
         }
     }
 

@@ -53,8 +53,9 @@ fn finding(diagnosis: Diagnosis) -> Finding {
     let todo = if change.is_empty() {
         "no setting explains all of it: do it again, one motion at a time; then vizflyt doctor localization".to_owned()
     } else {
-        let others: String = others.iter().map(|other| format!(", or {}", set(other))).collect();
-        format!("set {}{others} in [[localization]], then start the server again", set(&change))
+        let all: Vec<_> =
+            std::iter::once(&change).chain(&others).map(|change| set(change)).collect();
+        format!("set {} in [[localization]], then start the server again", all.join(", or "))
     };
     Finding { ok: false, evidence: faults.join("; "), todo }
 }

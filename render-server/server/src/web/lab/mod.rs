@@ -29,6 +29,7 @@ use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::FlightPhase;
 
@@ -38,7 +39,7 @@ use super::access::Viewer;
 use super::{Page, ordered, origin, refuse};
 use crate::flights::lab_day::formation::apart_m;
 use crate::flights::lab_day::{
-    BookingState, CHECKS, CheckId, CheckInfo, FenceParameter, Finding, How, LabDay,
+    Booking, BookingState, CHECKS, CheckId, CheckInfo, FenceParameter, Finding, How, LabDay, Stand,
     State as CheckState, TakeOffOrder, Told,
 };
 use crate::flights::vehicle::VehicleFlight;
@@ -163,12 +164,8 @@ impl VehicleView {
             let of = if info.of_room { "" } else { name };
             day.state(of, info.id, now_unix_ms) == CheckState::Ok
         };
-        let stand = |name: &str| {
-            page.rooms
-                .flights
-                .vehicle(name)
-                .map_or(crate::flights::lab_day::Stand::Below, |v| keep::stand(v))
-        };
+        let stand =
+            |name: &str| page.rooms.flights.vehicle(name).map_or(Stand::Below, |v| keep::stand(v));
         let checked_in = lock(&vehicle.checked_in).as_ref().map(|by| by.team.clone());
         Self {
             name: name.to_owned(),
@@ -215,7 +212,7 @@ impl CheckView {
 }
 
 fn bookings(day: &LabDay, viewer: &Viewer) -> Vec<BookingView> {
-    let view = |booking: &crate::flights::lab_day::Booking| BookingView {
+    let view = |booking: &Booking| BookingView {
         id: booking.id,
         team: booking.team.clone(),
         vehicle: booking.vehicle.clone(),
@@ -538,14 +535,14 @@ pub(super) async fn begin(State(page): State<Arc<Page>>, headers: HeaderMap) -> 
 }
 
 /// Does what a page of ours orders in JSON, and writes it down before it answers.
-async fn change<T: serde::de::DeserializeOwned>(
+async fn change<T>(
     page: &Arc<Page>,
     headers: &HeaderMap,
     body: Result<Bytes, BytesRejection>,
     order: impl FnOnce(&Page, T) -> Result<String, String> + Send + 'static,
 ) -> Response
 where
-    T: Send + 'static,
+    T: DeserializeOwned + Send + 'static,
 {
     match ordered::<T>(headers, body) {
         Ok(asked) => apply(page, headers, move |page| order(page, asked)).await,

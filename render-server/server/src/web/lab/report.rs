@@ -82,12 +82,15 @@ fn lay_out(
     small(&mut lines, 0.0, &format!("Order of take-off: {order}. Least separation: {separation}."));
     lines.push(line(Kind::Heading, "Queue"));
     for booking in day.queue.bookings() {
-        lines.push(booked(booking));
+        booked(&mut lines, booking);
     }
     if day.queue.bookings().is_empty() {
         small(&mut lines, 0.0, "Nobody has booked.");
     }
     lines.push(line(Kind::Heading, "What happened"));
+    if day.story().next().is_none() {
+        small(&mut lines, 0.0, "Nothing yet.");
+    }
     for told in day.story() {
         let wrapped = wrap(&told.text, Kind::Small.size().0, WIDTH - STORY_AT);
         for (at, text) in wrapped.into_iter().enumerate() {
@@ -119,7 +122,7 @@ fn check(lines: &mut Vec<Line>, day: &LabDay, vehicle: &str, info: &CheckInfo, n
     }
 }
 
-fn booked(booking: &Booking) -> Line {
+fn booked(lines: &mut Vec<Line>, booking: &Booking) {
     let state = match booking.state {
         BookingState::Waiting => "waits",
         BookingState::Called => "its turn",
@@ -133,19 +136,21 @@ fn booked(booking: &Booking) -> Line {
         0 => String::new(),
         times => format!(", passed over {times} times"),
     };
+    let name = format!("{} on {}", booking.team, booking.vehicle);
+    for (at, text) in wrap(&name, Kind::Row.size().0, WIDTH - NAME_AT).into_iter().enumerate() {
+        let mut cells = vec![(NAME_AT, text)];
+        if at == 0 {
+            cells.insert(0, (0.0, state.to_owned()));
+        }
+        lines.push(Line { kind: Kind::Row, cells, state: None });
+    }
     let times = format!(
         "booked {}, called {}, ended {}{passed}",
         hour(Some(booking.booked_unix_ms)),
         hour(booking.called_unix_ms),
         hour(booking.ended_unix_ms)
     );
-    let cells = vec![
-        (0.0, state.to_owned()),
-        (NAME_AT, format!("{} on {}", booking.team, booking.vehicle)),
-    ];
-    let mut line = Line { kind: Kind::Row, cells, state: None };
-    line.cells.push((QUEUE_TIMES_AT, times));
-    line
+    small(lines, NAME_AT, &times);
 }
 
 /// Adds small text, wrapped.
@@ -323,7 +328,6 @@ const HEIGHT: f32 = PAPER.1 - 2.0 * MARGIN;
 /// Columns. [points from the left margin]
 const NAME_AT: f32 = 60.0;
 const TIME_AT: f32 = 370.0;
-const QUEUE_TIMES_AT: f32 = 220.0;
 const STORY_AT: f32 = 120.0;
 /// Lines that are kept together at most.
 const BLOCK: usize = 20;

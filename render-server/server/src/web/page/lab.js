@@ -175,7 +175,7 @@ function makeTurn({ name, called }) {
 function showQueue(day) {
   const { queue, vehicles } = day;
   fill($("lab-turns"), vehicles.map(({ name, called }) => [name, called]), () => vehicles.map(makeTurn));
-  const isOpen = ({ state }) => state === "waiting" || state === "called";
+  const isOpen = (/** @type {Booking} */ { state }) => state === "waiting" || state === "called";
   const over = queue.filter((booking) => !isOpen(booking)).slice(-5);
   const called = queue.filter(({ state }) => state === "called"), waiting = queue.filter(({ state }) => state === "waiting");
   const shown = [...called, ...waiting, ...over];
