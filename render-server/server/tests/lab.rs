@@ -113,8 +113,13 @@ async fn checks_go_green_and_red_by_what_is_measured() {
     );
 
     emitter.pause(true);
-    let found = until_state(at, "vizflyt", "localization", "failed").await;
-    assert!(found["evidence"].as_str().unwrap().starts_with("no pose for"), "{found}");
+    // First the gap is too long, then it is silence.
+    let mut found = until_state(at, "vizflyt", "localization", "failed").await;
+    while !found["evidence"].as_str().unwrap().starts_with("no pose for") {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        found = until_state(at, "vizflyt", "localization", "failed").await;
+    }
+    assert!(found["todo"].as_str().unwrap().contains("is the localization on"), "{found}");
     emitter.pause(false);
     until_state(at, "vizflyt", "localization", "ok").await;
 }

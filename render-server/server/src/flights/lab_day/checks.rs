@@ -367,12 +367,17 @@ pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParam
             todo.push("FENCE_* of the autopilot are not known: vizflyt doctor vehicle --arena arena.toml --report PAGE".to_owned());
         }
         Some(parameters) => {
+            let mut wrong = Vec::new();
             for FenceParameter { name, has, right } in parameters {
                 let value = has.map_or("absent".to_owned(), |has| format!("{has:.2}"));
-                autopilot += &format!(", {name} {value}");
+                autopilot = format!("{autopilot}, {name} {value}");
                 if !has.is_some_and(|has| (has - right).abs() <= 1e-3 * right.abs().max(1.0)) {
-                    todo.push(format!("{name} must be {right:.2}: vizflyt doctor vehicle --arena arena.toml --apply"));
+                    wrong.push(format!("{name} must be {right:.2}"));
                 }
+            }
+            if !wrong.is_empty() {
+                let wrong = wrong.join(", ");
+                todo.push(format!("{wrong}: vizflyt doctor vehicle --arena arena.toml --apply"));
             }
         }
     }

@@ -57,7 +57,7 @@ fn lay_out(
     vehicles: &[&str],
     now_unix_ms: u64,
 ) -> Vec<Line> {
-    let mut lines = vec![line(Kind::Title, title), line(Kind::Small, foot)];
+    let mut lines = vec![line(Kind::Title, title), line(Kind::Row, foot)];
     let group = |lines: &mut Vec<Line>, name: &str, of_room: bool| {
         lines.push(line(
             Kind::Heading,
@@ -108,8 +108,13 @@ fn check(lines: &mut Vec<Line>, day: &LabDay, vehicle: &str, info: &CheckInfo, n
     let state = day.state(vehicle, info.id, now_unix_ms);
     let record = day.evidence(vehicle, info.id);
     let when = record.map_or_else(String::new, |record| time(record.at_unix_ms));
-    let cells =
-        vec![(0.0, state.words().to_owned()), (NAME_AT, info.title.to_owned()), (TIME_AT, when)];
+    // On paper it is always too late to look again: what was found then counts.
+    let words = match record.filter(|_| state == State::Outdated) {
+        Some(record) if record.finding.ok => "was ok",
+        Some(_) => "had failed",
+        None => state.words(),
+    };
+    let cells = vec![(0.0, words.to_owned()), (NAME_AT, info.title.to_owned()), (TIME_AT, when)];
     lines.push(Line { kind: Kind::Row, cells, state: Some(state) });
     match record {
         Some(record) => {
@@ -369,7 +374,7 @@ mod tests {
     }
 
     fn pages(stories: usize) -> Vec<Vec<Line>> {
-        paginate(lay_out(&day(stories), "title", "foot", &["wasp", "bee"], 1_795_703_500_000))
+        paginate(lay_out(&day(stories), "title", "foot", &["wasp", "bee"], 1_795_703_600_000))
     }
 
     #[test]
@@ -386,6 +391,7 @@ mod tests {
             .join("\n");
         for expected in [
             "net closed",
+            "had failed",
             "2026-11-26 14:31:00 UTC",
             "looked at by Ada Lovelace (Ada Lovelace)",
             "To do: look at the network",
