@@ -449,7 +449,7 @@ async function labDay(browser) {
   const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
   const [, teams] = await server.line(/"team of 'wasp'","link":"([^"]+)"/);
   command("pair", quic, "--code", code, "--keys", at("jetson"));
-  const vehicle = start("sim", "--vicon", vicon, "--object", "wasp", "--airframe", "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
+  const vehicle = start("sim", "--vicon", vicon, "--object", "wasp", "--airframe", "--radio", "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
   const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
   // What the autopilot has, before its runtime takes the link.
   const doctor = (...more) => spawnSync(vizflyt, ["doctor", "vehicle", "--mavlink", `udpout:${mavlink}`, "--arena", at("room/arena.toml"),
