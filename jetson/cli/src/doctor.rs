@@ -38,7 +38,7 @@ enum CheckCommand {
   vizflyt doctor vehicle --mavlink serial:/dev/ttyACM0
   vizflyt doctor vehicle --arena arena.toml --apply   with the fence that the arena's room asks for
   vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply
-  vizflyt doctor vehicle --arena arena.toml --report http://192.168.10.2:8080 --vehicle wasp --key KEY   for `vizflyt lab`")]
+  vizflyt doctor vehicle --arena arena.toml --report http://192.168.10.2:8080 --key KEY   for `vizflyt lab`")]
     Vehicle(VehicleArgs),
     /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
     /// turns it left; then which setting is wrong.

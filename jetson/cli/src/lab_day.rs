@@ -13,10 +13,10 @@ use crate::terminal::print_line;
 
 /// A lab day: the checklist before flights, and the queue of teams.
 ///
-/// The checklist is a page of the server, /lab: localization live and its axes, network, clocks, camera latency, battery,
-/// the autopilot's parameters, the fence in three places, STOP tried, each with its evidence and time; a queue in which
-/// teams book; the order of take-off and the separation of several vehicles, and one STOP for all. This prints where it
-/// is, and how it stands. Ends with status 1 if a check is not done, failed or outdated.
+/// The checklist is a page of the server, /lab: localization live and its axes, network, clocks, camera latency,
+/// battery, the autopilot's parameters, the fence in three places, STOP tried, each with its evidence and time; a
+/// queue in which teams book; the order of take-off and the separation of several vehicles, and one STOP for all.
+/// This prints where it is, and how it stands. Ends with status 1 if a check is not done, failed or outdated.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt lab                                       where the page is, what is still to do, and who waits
@@ -137,9 +137,12 @@ mod tests {
     fn a_day_in_words() {
         let day: Day = serde_json::from_str(
             r#"{"arena": "hall", "more": 1, "checks": [
-                {"title": "net closed", "vehicle": "", "state": "ok", "evidence": "looked at by Ada", "todo": "", "ask": "sign"},
-                {"title": "battery", "vehicle": "wasp", "state": "failed", "evidence": "14.2 V", "todo": "charge", "ask": "power"},
-                {"title": "clocks", "vehicle": "wasp", "state": "not_done", "evidence": "", "todo": "", "ask": "fly --wait"}],
+                {"title": "net closed", "vehicle": "", "state": "ok",
+                 "evidence": "looked at by Ada", "todo": "", "ask": "sign"},
+                {"title": "battery", "vehicle": "wasp", "state": "failed",
+                 "evidence": "14.2 V", "todo": "charge", "ask": "power"},
+                {"title": "clocks", "vehicle": "wasp", "state": "not_done",
+                 "evidence": "", "todo": "", "ask": "fly --wait"}],
               "queue": [{"team": "ants", "vehicle": "wasp", "state": "called", "place": null},
                         {"team": "bees", "vehicle": "wasp", "state": "waiting", "place": 1},
                         {"team": "cats", "vehicle": "wasp", "state": "done", "place": null}]}"#,

@@ -1,5 +1,5 @@
-//! A lab day through a running server: checks that go green and red by what runtimes and poses do, the queue, the order of
-//! take-off, the separation, and a restart.
+//! A lab day through a running server: checks that go green and red by what runtimes and poses do, the queue, the order
+//! of take-off, the separation, and a restart.
 
 mod support;
 

@@ -212,12 +212,14 @@ pub fn localization(
         ));
     }
     if 3.0 * sigma_mm > KEPT_FREE_MM {
-        todo.push(format!("three sigmas do not fit into the {KEPT_FREE_MM:.0} mm that the guard keeps free: calibrate the localization"));
+        todo.push(format!("three sigmas do not fit into the {KEPT_FREE_MM:.0} mm that the guard keeps free: calibrate \
+             the localization"));
     }
     let jitter = match seen.jitter_mm {
         Some(jitter_mm) => {
             if jitter_mm > MAX_JITTER_MM {
-                todo.push(format!("at rest it trembles by more than {MAX_JITTER_MM:.0} mm: look for reflections and loose markers"));
+                todo.push(format!("at rest it trembles by more than {MAX_JITTER_MM:.0} mm: look for reflections and \
+                     loose markers"));
             }
             format!("{jitter_mm:.1} mm rms at rest")
         }
@@ -258,10 +260,14 @@ pub fn network(before: &Traffic, now: &Traffic) -> Option<Finding> {
     let mbit_s = now.bytes.saturating_sub(before.bytes) as f64 * 8e-6 / seconds;
     let mut todo = Vec::new();
     if now.rtt_ms > MAX_RTT_MS {
-        todo.push(format!("a round trip takes more than {MAX_RTT_MS:.0} ms: by cable, or 5 GHz with nobody else on the channel (docs/guides/network.md)"));
+        todo.push(format!("a round trip takes more than {MAX_RTT_MS:.0} ms: by cable, or 5 GHz with nobody else on \
+             the channel (docs/guides/network.md)"));
     }
     if lost_percent > MAX_LOST_PERCENT {
-        todo.push(format!("more than {MAX_LOST_PERCENT:.0} % of the packets are lost: look at cable, switch and channel (docs/guides/network.md)"));
+        todo.push(format!(
+            "more than {MAX_LOST_PERCENT:.0} % of the packets are lost: look at cable, switch and \
+             channel (docs/guides/network.md)"
+        ));
     }
     let evidence = format!(
         "round trip {:.1} ms, {lost_percent:.2} % of {sent} packets lost, {mbit_s:.1} Mbit/s in {seconds:.0} s",
@@ -274,7 +280,10 @@ pub fn network(before: &Traffic, now: &Traffic) -> Option<Finding> {
 pub fn clocks(clock: &ClockState) -> Finding {
     let mut todo = Vec::new();
     if !(clock.error_bound_ms <= MAX_CLOCK_MS) {
-        todo.push(format!("ages of images may be off by more than {MAX_CLOCK_MS:.0} ms: a slow or uneven network (docs/guides/network.md)"));
+        todo.push(format!(
+            "ages of images may be off by more than {MAX_CLOCK_MS:.0} ms: a slow or uneven network \
+             (docs/guides/network.md)"
+        ));
     }
     let evidence = format!(
         "offset {:.3} s, uncertain by {:.2} ms, drift {:.1} ppm, set {} times",
@@ -286,14 +295,18 @@ pub fn clocks(clock: &ClockState) -> Finding {
     Finding::of(evidence, &todo)
 }
 
-/// Returns what the ages of images are worth: from the pose to the plugin, of `images` in `seconds`; `None` without any.
+/// Returns what the ages of images are worth: from the pose to the plugin, of `images` in `seconds`; `None` without
+/// any.
 pub fn latency(p50_ms: f32, p99_ms: f32, images: u64, seconds: f32) -> Option<Finding> {
     if images == 0 {
         return None;
     }
     let mut todo = Vec::new();
     if !(f64::from(p99_ms) <= MAX_AGE_MS) {
-        todo.push(format!("images older than {MAX_AGE_MS:.0} ms slow the vehicle down: vizflyt stats says which stage takes the time (docs/guides/timing.md)"));
+        todo.push(format!(
+            "images older than {MAX_AGE_MS:.0} ms slow the vehicle down: vizflyt stats says which \
+             stage takes the time (docs/guides/timing.md)"
+        ));
     }
     let evidence = format!(
         "images are {p50_ms:.0} ms old (median), {p99_ms:.0} ms (99 %), {images} in {seconds:.0} s"
@@ -333,8 +346,8 @@ pub struct FenceParameter {
     pub right: f64,
 }
 
-/// Returns whether arena, guard and autopilot keep the same fence. `parameters` are the autopilot's, `None` if nobody has
-/// brought them.
+/// Returns whether arena, guard and autopilot keep the same fence. `parameters` are the autopilot's, `None` if nobody
+/// has brought them.
 pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParameter]>) -> Finding {
     let mut todo = Vec::new();
     let no_fly = arena.no_fly.len();
@@ -364,7 +377,9 @@ pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParam
     };
     match parameters {
         None => {
-            todo.push("FENCE_* of the autopilot are not known: vizflyt doctor vehicle --arena arena.toml --report PAGE".to_owned());
+            todo.push("FENCE_* of the autopilot are not known: vizflyt doctor vehicle --arena arena.toml --report PAGE"
+                    .to_owned(),
+            );
         }
         Some(parameters) => {
             let mut wrong = Vec::new();

@@ -81,7 +81,8 @@ impl TakeOffOrder {
             return Ok(());
         }
         Err(format!(
-            "'{before}' goes before '{vehicle}' ({order}) and {what}; start it first, or change the order on the page /lab"
+            "'{before}' goes before '{vehicle}' ({order}) and {what}; start it first, or change the order on the \
+             page /lab"
         ))
     }
 }
@@ -191,8 +192,8 @@ mod tests {
             "bee",
             Stand::Below,
             Some(
-                "'wasp' goes before 'bee' (wasp, bee, ant) and is not up yet; start it first, or change the order on the \
-                 page /lab",
+                "'wasp' goes before 'bee' (wasp, bee, ant) and is not up yet; start it first, or change the order on \
+                 the page /lab",
             ),
         );
         check(Until::Up, "bee", Stand::Up, None);

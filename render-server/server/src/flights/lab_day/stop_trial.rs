@@ -69,8 +69,8 @@ impl StopTrial {
         let is_late = |ms: Option<f64>| ms.is_none_or(|ms| ms > MAX_MS);
         if is_late(self.received_ms) || is_late(self.obeyed_ms) {
             todo.push(format!(
-                "STOP must be received and obeyed within {MAX_MS:.0} ms: do not fly; look at the network, then try again \
-                 (docs/guides/failsafe.md)"
+                "STOP must be received and obeyed within {MAX_MS:.0} ms: do not fly; look at the network, then try \
+                 again (docs/guides/failsafe.md)"
             ));
         } else if self.stands_ms.is_none() {
             todo.push(

@@ -1,5 +1,5 @@
-//! What the server sees of a lab day by itself: it measures the live checks, watches what comes of the stop button and of
-//! the vehicle in somebody's hands, and keeps vehicles in the air apart. 50 times a second, 20 us a vehicle.
+//! What the server sees of a lab day by itself: it measures the live checks, watches what comes of the stop button and
+//! of the vehicle in somebody's hands, and keeps vehicles in the air apart. 50 times a second.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -73,7 +73,8 @@ fn keep_apart(rooms: &Rooms, lab: &Lab, watch: &mut SeparationWatch) {
         for vehicle in land.iter().filter_map(|&index| vehicles.get(index)) {
             let landed = if land.len() > 1 { String::new() } else { format!("{} ", vehicle.name) };
             let text = format!(
-                "{first} and {later}, which took off later, are {apart_m:.2} m apart, less than {least_m} m: {landed}{who}"
+                "{first} and {later}, which took off later, are {apart_m:.2} m apart, less than {least_m} m: \
+                 {landed}{who}"
             );
             vehicle.publish(EventKind::EmergencyStop, &text);
             lab.change(|day, now_unix_ms| day.tell(text, now_unix_ms));

@@ -1,7 +1,7 @@
 //! The lab day on paper: every check with evidence and time, the queue, and what happened; A4, as PDF (ISO 32000-1).
 //!
-//! Lines are laid out first ([`lay_out`]), then cut into pages ([`paginate`]) and drawn. Text is Helvetica, which every reader
-//! has, in its Latin letters; what it has not is a question mark.
+//! Lines are laid out first ([`lay_out`]), then cut into pages ([`paginate`]) and drawn. Text is Helvetica, which every
+//! reader has, in its Latin letters; what it has not is a question mark.
 
 use pdf_writer::{Content, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
 use vizflyt_protocol::time::Civil;

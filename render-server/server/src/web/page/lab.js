@@ -1,5 +1,5 @@
-// The lab day: the checklist, the queue of teams, several vehicles, and one STOP for all. Asks every second; rows stay where
-// they are, so that a finger or the keyboard does not lose them.
+// The lab day: the checklist, the queue of teams, several vehicles, and one STOP for all. Asks every second; rows stay
+// where they are, so that a finger or the keyboard does not lose them.
 
 import "./dialogs/login.js";
 import { $, make, makeButton, setText } from "./dom.js";
@@ -14,6 +14,8 @@ import { followTheme } from "./theme.js";
 const EVERY_MS = 1000;
 /** @type {Record<string, string>} */
 const TONES = { ok: "good", failed: "bad", outdated: "warn", not_done: "idle" };
+/** What a check's button says: to begin, and to end. @type {Record<string, [string, string]>} */
+const WORDS = { signed: ["sign", "take back"], guided: ["begin", "cancel"], pressed: ["STOP it", "STOP it"] };
 /** @type {Record<string, string>} */
 const STATES = { ok: "ok", failed: "failed", outdated: "outdated", not_done: "not done" };
 const signer = $("signer", HTMLInputElement);
@@ -21,7 +23,10 @@ signer.value = localStorage.getItem("signer") ?? "";
 signer.addEventListener("change", () => localStorage.setItem("signer", signer.value.trim()));
 
 /** @param {number | null} unix_ms */
-const clock = (unix_ms) => (unix_ms == null ? "–" : new Date(unix_ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" }));
+const clock = (unix_ms) => {
+  if (unix_ms == null) return "–";
+  return new Date(unix_ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+};
 
 /**
  * Gives an order, and shows what comes of it.
@@ -57,11 +62,14 @@ function makeRow({ check, title, how, vehicle }) {
   act.dataset.for = "instructor";
   let isActive = false;
   act.addEventListener("click", () => {
-    if (how === "signed") return order("POST", "/api/lab/sign", { vehicle, check, name: signer.value, take_back: isActive });
+    if (how === "signed") {
+      return order("POST", "/api/lab/sign", { vehicle, check, name: signer.value, take_back: isActive });
+    }
     if (how === "guided") return order("POST", "/api/lab/axes", { vehicle, begin: !isActive });
     return order("POST", `${vehicleUrl(vehicle)}/estop`);
   });
-  const row = make("li", { className: "check" }, state, make("div", {}, make("h3", { textContent: title }), evidence, todo), make("div", { className: "act" }, act, when));
+  const told = make("div", {}, make("h3", { textContent: title }), evidence, todo);
+  const row = make("li", { className: "check" }, state, told, make("div", { className: "act" }, act, when));
   row.dataset.check = check;
   return [row, (now, day) => {
     row.dataset.state = now.state;
@@ -69,7 +77,8 @@ function makeRow({ check, title, how, vehicle }) {
     setText(state, STATES[now.state]);
     const guide = how === "guided" && day.axes?.vehicle === vehicle ? day.axes : null;
     isActive = how === "signed" ? now.state === "ok" : guide != null;
-    setText(act, how === "signed" ? (isActive ? "take back" : "sign") : how === "guided" ? (isActive ? "cancel" : "begin") : "STOP it");
+    const [begin, end] = WORDS[how] ?? WORDS.pressed;
+    setText(act, isActive ? end : begin);
     // Who reads a screen aloud hears which.
     act.ariaLabel = `${act.textContent}: ${title}${vehicle && ` of ${vehicle}`}`;
     setText(evidence, guide ? guide.seen : now.evidence);
@@ -84,7 +93,8 @@ function makeRow({ check, title, how, vehicle }) {
  * @returns {[HTMLElement, (vehicle: Vehicle) => void]}
  */
 function makeHeading(name) {
-  const phase = make("span", { className: "muted" }), badge = make("span", { className: "badge" }), hint = make("p", { className: "hint-line" });
+  const phase = make("span", { className: "muted" }), badge = make("span", { className: "badge" });
+  const hint = make("p", { className: "hint-line" });
   const start = makeButton("start", { hidden: true }), land = makeButton("land", { hidden: true });
   start.ariaLabel = `start ${name}`;
   land.ariaLabel = `land ${name}`;
@@ -99,7 +109,8 @@ function makeHeading(name) {
     start.hidden = vehicle.phase !== "waiting" || !vehicle.runtime;
     land.hidden = !["taking_off", "flying", "holding"].includes(vehicle.phase);
     const { called, checked_in, must_wait } = vehicle;
-    const stranger = called && checked_in && called !== checked_in ? `${called} is called, but ${checked_in} is checked in here. ` : "";
+    const isOther = called && checked_in && called !== checked_in;
+    const stranger = isOther ? `${called} is called, but ${checked_in} is checked in here. ` : "";
     setText(hint, stranger + (start.hidden ? "" : must_wait ?? ""));
   }];
 }
@@ -149,7 +160,8 @@ function fill(list, shown, children) {
 /** @param {Booking} booking */
 function makeBooking({ id, team, vehicle, state, place, booked_unix_ms, called_unix_ms, ended_unix_ms, passed_over, is_own }) {
   const where = state === "called" ? "now" : state === "waiting" ? String(place) : state === "done" ? "flown" : "left";
-  const times = state === "waiting" ? `booked ${clock(booked_unix_ms)}` : state === "called" ? `called ${clock(called_unix_ms)}` : clock(ended_unix_ms);
+  const open = state === "called" ? `called ${clock(called_unix_ms)}` : `booked ${clock(booked_unix_ms)}`;
+  const times = state === "waiting" || state === "called" ? open : clock(ended_unix_ms);
   const note = passed_over ? `, passed over ${passed_over}×` : "";
   const leave = makeButton("withdraw", { hidden: state !== "waiting" || !is_own, ariaLabel: `take ${team} out of the queue` });
   leave.addEventListener("click", () => order("DELETE", `/api/lab/queue/${id}`));
@@ -177,9 +189,11 @@ function showQueue(day) {
   fill($("lab-turns"), vehicles.map(({ name, called }) => [name, called]), () => vehicles.map(makeTurn));
   const isOpen = (/** @type {Booking} */ { state }) => state === "waiting" || state === "called";
   const over = queue.filter((booking) => !isOpen(booking)).slice(-5);
-  const called = queue.filter(({ state }) => state === "called"), waiting = queue.filter(({ state }) => state === "waiting");
+  const called = queue.filter(({ state }) => state === "called");
+  const waiting = queue.filter(({ state }) => state === "waiting");
   const shown = [...called, ...waiting, ...over];
-  fill($("lab-queue"), shown, () => shown.length ? shown.map(makeBooking) : [make("tr", {}, make("td", { colSpan: 5, className: "muted", textContent: "nobody has booked" }))]);
+  const none = () => make("tr", {}, make("td", { colSpan: 5, className: "muted", textContent: "nobody has booked" }));
+  fill($("lab-queue"), shown, () => (shown.length ? shown.map(makeBooking) : [none()]));
   const list = book.elements.namedItem("vehicle");
   if (list instanceof HTMLSelectElement) {
     fill(list, vehicles.map(({ name }) => name), () => vehicles.map(({ name }) => new Option(name, name)));
@@ -234,14 +248,18 @@ function show(day) {
   showChecks(day);
   showQueue(day);
   showFormation(day);
-  fill($("lab-story"), day.story, () => day.story.map(({ at_unix_ms, text }) => make("li", {}, make("small", { className: "muted", textContent: clock(at_unix_ms) }), ` ${text}`)));
+  fill($("lab-story"), day.story, () => day.story.map(({ at_unix_ms, text }) => {
+    const at = make("small", { className: "muted", textContent: clock(at_unix_ms) });
+    return make("li", {}, at, ` ${text}`);
+  }));
 }
 
 async function refresh() {
   try {
     const answer = await fetch("/api/lab");
     if (answer.ok) show(await answer.json());
-    else setText($("lab-link"), answer.status === 401 ? "log in, or open the address that you were given" : await answer.text());
+    else if (answer.status === 401) setText($("lab-link"), "log in, or open the address that you were given");
+    else setText($("lab-link"), await answer.text());
     document.body.toggleAttribute("data-stale", !answer.ok);
   } catch {
     setText($("lab-link"), UNREACHABLE);
