@@ -44,7 +44,7 @@ impl<'a> ServerPage<'a> {
             let (_, session) = self.get("/api/session")?;
             let session: serde_json::Value = serde_json::from_slice(&session).unwrap_or_default();
             if let Some(token) = session["token"].as_str() {
-                heads += &format!("X-VizFlyt-Token: {token}\r\n");
+                heads = format!("{heads}X-VizFlyt-Token: {token}\r\n");
             }
         }
         self.ask(&format!("POST {path}"), &heads, json)
