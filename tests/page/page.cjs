@@ -544,6 +544,114 @@ async function leaderboard(browser) {
   assert.equal(await server.ended, 0);
 }
 
+/** A lab day: checks go green by what is measured, red where the motion capture pauses; a queue, several vehicles, a report. */
+async function labDay(browser) {
+  const at = (name) => path.join(scratch, `day-${name}`), free = "127.0.0.1:0";
+  command("scene", "generate", "room", "-o", at("room"));
+  fs.appendFileSync(at("room/arena.toml"), '\n[[vehicles]]\nname = "wasp"\n[[vehicles]]\nname = "bee"\n');
+  const server = start("serve", at("room"), "--leaderboard", "none", "--lab-day", at("kept.json"), "--keys", at("server"), "--print-page-keys",
+    "--pair", "instructor", "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+  const [ready] = await server.line(/^.*"ready":"server".*$/);
+  const { http, quic, vicon, spawn: stand } = JSON.parse(ready);
+  const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
+  const [, teams] = await server.line(/"team of 'wasp'","link":"([^"]+)"/);
+  command("pair", quic, "--code", code, "--keys", at("jetson"));
+  const vehicle = start("sim", "--vicon", vicon, "--object", "wasp", "--airframe", "--radio", "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
+  const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
+  // What the autopilot has, before its runtime takes the link.
+  const doctor = (...more) => spawnSync(vizflyt, ["doctor", "vehicle", "--mavlink", `udpout:${mavlink}`, "--arena", at("room/arena.toml"),
+    ...more], { encoding: "utf8" });
+  doctor("--apply");
+  const { stdout, stderr } = doctor("--report", http, "--vehicle", "wasp");
+  assert.match(stdout, /reported http\S+: noted for wasp/, stderr);
+
+  const page = await open(browser, `${http}/lab`, { viewport: { width: 1280, height: 720 } });
+  const check = (name, of = "wasp") => page.getByRole("region", { name: of ? `checks of ${of}` : "checks of the room" }).locator(`[data-check=${name}]`);
+  const stands = (name, state, of) => check(name, of).and(page.locator(`[data-state=${state}]`)).waitFor();
+  await stands("localization", "ok");
+  await stands("network", "not_done");
+  const fly = start("fly", "avoid", "--server", quic, "--vehicle", "wasp", "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`, "--wait", "--json");
+  await page.getByRole("button", { name: "start wasp" }).waitFor();
+  for (const name of ["network", "clocks", "battery"]) await stands(name, "ok");
+  for (const name of ["parameters", "fence"]) await stands(name, "ok");
+  // Whatever this computer's pace, it is measured.
+  await page.waitForFunction(() => /images are \d+ ms old/.test(document.querySelector("[data-check=latency]").textContent));
+  await page.waitForFunction(() => /polygons accepted/.test(document.querySelector("[data-check=fence]").textContent));
+  await page.locator("#signer").fill("Ada Lovelace");
+  await page.getByRole("button", { name: "sign: net closed" }).click();
+  await stands("net", "ok", "");
+  assert.match(await check("net", "").innerText(), /looked at by Ada Lovelace/);
+  await page.getByRole("button", { name: "begin: axes of localization of wasp" }).click();
+  await page.waitForFunction(() => /do: (put it on the floor|lift it)/.test(document.querySelector("[data-check=axes]").textContent));
+  await page.getByRole("button", { name: "cancel: axes of localization of wasp" }).click();
+  // The motion capture pauses: red, with what to do; and green when it is back.
+  vehicle.child.kill("SIGSTOP");
+  await page.waitForFunction(() => /no pose for[\s\S]*is the localization on/.test(document.querySelector("[data-check=localization]").textContent));
+  await stands("localization", "failed");
+  await shot(page, "lab-day-red");
+  vehicle.child.kill("SIGCONT");
+  await stands("localization", "ok");
+
+  // A team books from its own address, and sees its place; the instructor calls.
+  await page.locator("#book-form [name=team]").fill("cats");
+  await page.locator("#book-form [name=vehicle]").selectOption("wasp");
+  await page.locator("#book-form button").click();
+  const team = await open(browser, teams, { viewport: { width: 390, height: 844 } });
+  await team.goto(`${http}/lab`);
+  await team.locator("#book-form [name=team]").fill("ants");
+  await team.locator("#book-form button").click();
+  await until(team, "lab-status", /place 2 for wasp/);
+  assert.match(await text(team, "lab-queue"), /1\s+cats[\s\S]*2\s+ants/);
+  assert.ok(await team.locator("#formation").isHidden() && await team.getByRole("button", { name: "sign: LiPo" }).isHidden());
+  assert.equal(await team.getByRole("region", { name: "checks of bee" }).count(), 0);
+  const call = (words) => page.getByRole("button", { name: `${words}, wasp` }).click();
+  await call("call next");
+  await until(team, "lab-queue", /nowcats/);
+  await call("pass over");
+  await call("call next");
+  await until(team, "lab-queue", /nowants[\s\S]*1cats/);
+
+  // The bee goes first: the wasp's start is refused with the reason.
+  await page.locator("#formation-form [name=order]").fill("bee, wasp");
+  await page.locator("#formation-form [name=separation]").fill("1.5");
+  await page.locator("#formation-form button").click();
+  await until(page, "lab-status", /order of take-off: bee, wasp; 1.5 m apart/);
+  await page.getByRole("button", { name: "start wasp" }).click();
+  await until(page, "lab-status", /'bee' goes before 'wasp' \(bee, wasp\) and is not up yet/);
+  for (const [screen, size] of [[page, [1280, 720]], [page, [390, 844]], [team, [390, 844]]]) {
+    await screen.setViewportSize({ width: size[0], height: size[1] });
+    const over = await screen.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+    assert.ok(over <= 0, `lab day: ${over} px too wide at ${size}`);
+    const stop = await screen.locator("#estop").boundingBox();
+    assert.ok(stop.x >= 0 && stop.x + stop.width <= size[0] && stop.y >= 0 && stop.y + stop.height <= size[1] && stop.height >= 44, JSON.stringify(stop));
+    await shot(screen, `lab-day-${screen === team ? "team-" : ""}${size.join("x")}`);
+  }
+  // One STOP for all, by the keyboard: on the ground it is the trial of STOP.
+  await page.keyboard.press("Escape");
+  await stands("stop", "ok");
+  assert.match(await check("stop").innerText(), /received by the runtime after \d+ ms, landing reported after \d+ ms, disarmed after \d+ ms/);
+  await fly.ended;
+
+  const paper = at("day.pdf");
+  command("lab", "report", "--page", http, "--out", paper);
+  const words = spawnSync("pdftotext", ["-layout", paper, "-"], { encoding: "utf8" });
+  if (!words.error) {
+    for (const expected of [/net closed\s+20\d\d-\d\d-\d\d \d\d:\d\d:\d\d UTC/, /looked at by Ada Lovelace/, /ants on wasp\s+booked/,
+      /passed over 1 times/, /STOP tried/, /localization live failed/, /page 1 of \d/]) assert.match(words.stdout, expected);
+    if (shots) spawnSync("pdftoppm", ["-r", "70", "-png", paper, path.join(shots, "lab-day-report")]);
+  }
+  const told = spawnSync(vizflyt, ["lab", "--page", http], { encoding: "utf8" });
+  assert.equal(told.status, 1, "not all is done");
+  assert.match(told.stdout, /page {5}http\S+\/lab\n[\s\S]*ok {7}the room: net closed[\s\S]*called {3}ants on wasp/);
+  for (const screen of [page, team]) {
+    assert.deepEqual(screen.faults, []);
+    await screen.context().close();
+  }
+  vehicle.child.kill();
+  server.child.stdin.end();
+  assert.equal(await server.ended, 0);
+}
+
 /** A captured scene, tilted by 5 degrees and a tenth too small, is put into its room by clicks, and its place is written. */
 async function align(browser) {
   const at = (name) => path.join(scratch, `align-${name}`);
@@ -870,7 +978,8 @@ async function main() {
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
   const browser = await chromium.launch({ executablePath, args });
   let code = 0;
-  const wanted = [edit, course, lab, flight, crash, leaderboard, align, stranger].filter(({ name }) => !only || name === only);
+  const tests = [edit, course, lab, labDay, flight, crash, leaderboard, align, stranger];
+  const wanted = tests.filter(({ name }) => !only || name === only);
   for (const test of wanted) {
     const began = Date.now();
     try {

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_runtime::airframe::{
@@ -14,7 +14,10 @@ use vizflyt_runtime::airframe::{
     shipped,
 };
 use vizflyt_runtime::link::same;
+use vizflyt_server::flights::lab_day::{FenceParameter, Finding};
+use vizflyt_server::web::Evidence;
 
+use crate::server_page::ServerPage;
 use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;
 
@@ -34,7 +37,8 @@ enum CheckCommand {
   vizflyt doctor vehicle                              the autopilot of jetson.toml, or udpin:0.0.0.0:14550
   vizflyt doctor vehicle --mavlink serial:/dev/ttyACM0
   vizflyt doctor vehicle --arena arena.toml --apply   with the fence that the arena's room asks for
-  vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply")]
+  vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply
+  vizflyt doctor vehicle --arena arena.toml --report http://192.168.10.2:8080 --key KEY   for `vizflyt lab`")]
     Vehicle(VehicleArgs),
     /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
     /// turns it left; then which setting is wrong.
@@ -68,6 +72,15 @@ struct VehicleArgs {
     /// Writes the right values, after showing them
     #[arg(long)]
     apply: bool,
+    /// The page of a server whose lab day gets what was found, as evidence: http://HOST:PORT
+    #[arg(long, value_name = "URL", conflicts_with = "apply")]
+    report: Option<String>,
+    /// The vehicle's name on that server
+    #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "report")]
+    vehicle: String,
+    /// The instructor's key of that page, as in its address /enter?key=KEY; not needed on the server's own computer
+    #[arg(long, value_name = "KEY", requires = "report")]
+    key: Option<String>,
 }
 
 fn metres(text: &str) -> Result<f64, String> {
@@ -102,6 +115,10 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         "{dangers} dangerous, {} other differences, {absent} parameters that it does not have, {tuned} tuned",
         wrong.len() - dangers,
     ));
+    if let Some(page) = &args.report {
+        let fence = fence_parameters(&wanted, &found, &has);
+        args.bring(page, finding(&firmware, has.len(), &found), fence)?;
+    }
     if !args.apply {
         if !wrong.is_empty() || arena.is_some() {
             let also = if arena.is_some() { ", and the arena's polygons" } else { "" };
@@ -134,6 +151,25 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
 }
 
 impl VehicleArgs {
+    /// Brings what was found to a server's lab day.
+    fn bring(&self, page: &str, finding: Finding, fence: Vec<FenceParameter>) -> Result<()> {
+        let vehicle = self.vehicle.clone();
+        let by = format!("vizflyt doctor vehicle {}", env!("CARGO_PKG_VERSION"));
+        // Without an arena nobody knows what its fence asks for.
+        let fence = if self.arena.is_some() { fence } else { Vec::new() };
+        let json = serde_json::to_string(&Evidence { vehicle, finding, fence, by })?;
+        let server = ServerPage::at(page).with_key(self.key.as_deref());
+        let (status, body) = server.post("/api/lab/evidence", &json)?;
+        let said = String::from_utf8_lossy(&body);
+        if status != 200 {
+            bail!(
+                "{page} does not take the evidence: {said} (HTTP status {status}); --vehicle and --key say whose it is"
+            );
+        }
+        print_line(format!("reported {page}: {said}"));
+        Ok(())
+    }
+
     fn arena(&self) -> Result<Option<ArenaConfig>> {
         let Some(path) = &self.arena else { return Ok(None) };
         let text = std::fs::read_to_string(path)
@@ -170,6 +206,54 @@ impl VehicleArgs {
     }
 }
 
+/// Returns what was found in a few words, as evidence: dangers with their reason.
+fn finding(firmware: &str, count: usize, found: &[Difference]) -> Finding {
+    let dangers: Vec<_> = found.iter().filter(|f| f.danger.is_some()).collect();
+    let others =
+        found.iter().filter(|f| f.danger.is_none() && f.has.is_some() && !f.is_tuned).count();
+    let name = |f: &&Difference| match f.has.map(|has| has as f32) {
+        Some(has) => format!("{} is {has}", f.name),
+        None => f.name.clone(),
+    };
+    let names: Vec<_> = dangers.iter().take(NAMED).map(name).collect();
+    let named = if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) };
+    let evidence = format!(
+        "{firmware}, {count} parameters: {} dangerous{named}, {others} other differences",
+        dangers.len()
+    );
+    let todo = (!dangers.is_empty())
+        .then(|| "vizflyt doctor vehicle --arena arena.toml --apply".to_owned());
+    Finding::of(evidence, todo.as_slice())
+}
+
+/// Returns the autopilot's FENCE_*, and what is right for the arena.
+fn fence_parameters(
+    wanted: &BTreeMap<String, f64>,
+    found: &[Difference],
+    has: &BTreeMap<String, f64>,
+) -> Vec<FenceParameter> {
+    let parameter = |name: &&str| {
+        let (&file, has) = (wanted.get(*name)?, has.get(*name).copied());
+        let differs = found.iter().find(|difference| difference.name == **name);
+        // What does not differ is right.
+        let right = differs.map_or_else(|| has.unwrap_or(file), |difference| difference.right);
+        Some(FenceParameter { name: (*name).to_owned(), has, right })
+    };
+    FENCE.iter().filter_map(parameter).collect()
+}
+
+/// What makes the autopilot's fence.
+const FENCE: [&str; 6] = [
+    "FENCE_ENABLE",
+    "FENCE_ACTION",
+    "FENCE_TYPE",
+    "FENCE_ALT_MAX",
+    "FENCE_ALT_MIN",
+    "FENCE_RADIUS",
+];
+/// Dangers that evidence names.
+const NAMED: usize = 8;
+
 /// Uploads the arena's polygons; returns whether the autopilot accepts them.
 fn upload_fence(session: &mut ParamSession, arena: &ArenaConfig) -> Result<bool> {
     let info = arena.info();
@@ -201,5 +285,46 @@ fn line(difference: &Difference) -> String {
         }
         (Some(has), None) => format!("differs  {name} is {has}, right is {right}"),
         (None, _) => format!("absent   {name}, right is {right}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn evidence_names_dangers_and_the_fence() {
+        let difference = |name: &str, has, right, danger: Option<&str>| Difference {
+            name: name.to_owned(),
+            has,
+            right,
+            danger: danger.map(str::to_owned),
+            is_tuned: false,
+        };
+        let found = [
+            difference("FENCE_ALT_MAX", Some(100.0), 3.5, Some("far above")),
+            difference("LOG_BITMASK", Some(1.0), 2.0, None),
+            difference("NEW_ONE", None, 2.0, None),
+        ];
+        let told = finding("ArduCopter 4.6", 900, &found);
+        assert_eq!(
+            told.evidence,
+            "ArduCopter 4.6, 900 parameters: 1 dangerous (FENCE_ALT_MAX is 100), 1 other differences"
+        );
+        assert!(!told.ok && told.todo.contains("--apply"));
+        assert!(finding("ArduCopter 4.6", 900, &found[1..]).ok);
+        let map = |pairs: &[(&str, f64)]| {
+            pairs.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect()
+        };
+        let wanted = map(&[("FENCE_ALT_MAX", 3.0), ("FENCE_ENABLE", 1.0), ("FENCE_RADIUS", 4.0)]);
+        let has = map(&[("FENCE_ALT_MAX", 100.0), ("FENCE_ENABLE", 1.0)]);
+        let fence = fence_parameters(&wanted, &found, &has);
+        let fence: Vec<_> = fence.iter().map(|p| (p.name.as_str(), p.has, p.right)).collect();
+        let expected = [
+            ("FENCE_ENABLE", Some(1.0), 1.0),
+            ("FENCE_ALT_MAX", Some(100.0), 3.5),
+            ("FENCE_RADIUS", None, 4.0),
+        ];
+        assert_eq!(fence, expected);
     }
 }

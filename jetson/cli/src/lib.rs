@@ -25,6 +25,7 @@ mod fly;
 mod grade;
 mod gym;
 mod lab;
+mod lab_day;
 mod leaderboard;
 mod manifest;
 mod new;
@@ -33,6 +34,7 @@ mod password;
 mod plugins;
 mod replay;
 mod scene;
+mod server_page;
 mod stats;
 mod tags;
 mod terminal;
@@ -94,6 +96,7 @@ enum Command {
     Ros2(vizflyt_ros2::Ros2Args),
     /// Sets up the vehicle: the key for MAVLink signing.
     Vehicle(vehicle::VehicleArgs),
+    Lab(lab_day::LabDayArgs),
     /// Teams, runs and standings of the lab's flights.
     Leaderboard(leaderboard::LeaderboardArgs),
     /// The simulated lab: vehicle, autopilot, motion capture.
@@ -196,6 +199,7 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Password(args) => password::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Vehicle(args) => vehicle::run(&args),
+        Command::Lab(args) => lab_day::run(&args),
         Command::Leaderboard(args) => leaderboard::run(&args),
         Command::Sim(args) => vizflyt_simulator::run(args).map(|()| ExitCode::SUCCESS),
         Command::Bridge(args) => bridge::run(args).map(|()| ExitCode::SUCCESS),

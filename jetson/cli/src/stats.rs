@@ -2,8 +2,7 @@
 //! of a running server, or from a flight's log.
 
 use std::fmt::Write as _;
-use std::io::{IsTerminal, Read, Write};
-use std::net::{TcpStream, ToSocketAddrs};
+use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -17,6 +16,8 @@ use vizflyt_protocol::messages::{
 use vizflyt_server::stream::connection::Connection;
 use vizflyt_server::stream::delivery::Delivery;
 use vizflyt_server::web::VehicleStats;
+
+use crate::server_page::ServerPage;
 
 /// Where images get their age, stage by stage, and why images were skipped.
 #[derive(Args, Clone, Debug)]
@@ -89,7 +90,8 @@ fn ask(args: &StatsArgs) -> Result<String> {
             query
         })
     });
-    let (status, body) = get(&args.page, &format!("/api/stats{query}"))?;
+    let (status, body) = ServerPage::at(&args.page).get(&format!("/api/stats{query}"))?;
+    let body = String::from_utf8_lossy(&body).into_owned();
     match status {
         200 => Ok(body + "\n"),
         404 if body.is_empty() => {
@@ -101,38 +103,6 @@ fn ask(args: &StatsArgs) -> Result<String> {
 
 fn parse(json: &str) -> Result<VehicleStats> {
     serde_json::from_str(json).context("the server's answer is not understood: another version?")
-}
-
-/// Gets `path` from the page at `url`; returns status and body.
-fn get(url: &str, path: &str) -> Result<(u16, String)> {
-    let host = url.strip_prefix("http://").unwrap_or(url).trim_end_matches('/');
-    if host.contains('/') {
-        bail!("'{url}' is not the address of a page; write http://HOST:PORT");
-    }
-    let with_port = if host.rsplit(']').next().is_some_and(|tail| tail.contains(':')) {
-        host.to_owned()
-    } else {
-        format!("{host}:80")
-    };
-    let no_server = || {
-        format!(
-            "no server answers at {url}; start `vizflyt serve` or `vizflyt demo`, and give the page \
-             it prints with --page"
-        )
-    };
-    let mut addresses = with_port.to_socket_addrs().with_context(no_server)?;
-    let address = addresses.next().with_context(no_server)?;
-    let mut stream = TcpStream::connect_timeout(&address, PATIENCE).with_context(no_server)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.set_write_timeout(Some(PATIENCE))?;
-    // HTTP/1.0: the answer ends with the connection.
-    write!(stream, "GET {path} HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n")
-        .with_context(no_server)?;
-    let mut answer = String::new();
-    stream.take(MAX_BYTES).read_to_string(&mut answer).with_context(no_server)?;
-    let (head, body) = answer.split_once("\r\n\r\n").with_context(no_server)?;
-    let status = head.split(' ').nth(1).and_then(|status| status.parse().ok());
-    Ok((status.with_context(no_server)?, body.to_owned()))
 }
 
 /// Returns the figures of a running vehicle for a person.
@@ -358,10 +328,6 @@ const REASONS: [(&str, &str); 8] = [
 ];
 /// Columns of the longest bar.
 const BAR: f32 = 40.0;
-/// A server on the other side of the lab answers within this.
-const PATIENCE: Duration = Duration::from_secs(3);
-/// An answer has some 10 KB. [bytes]
-const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {
@@ -431,10 +397,6 @@ mod tests {
 
     #[test]
     fn missing_parts_are_reported() {
-        let error = get("http://127.0.0.1:1", "/").unwrap_err();
-        assert!(error.to_string().contains("no server answers at http://127.0.0.1:1"), "{error}");
-        let error = get("http://127.0.0.1:1/page", "/").unwrap_err();
-        assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
                        "images": [], "connection": null, "pose": POSE}"#;
         let server = serde_json::to_string(&vizflyt_server::web::ServerStages::default());

@@ -1,6 +1,7 @@
 //! Stamps: when a measurement was valid, in a clock that its type names. Only this module
 //! converts between clocks.
 
+mod civil;
 mod offset;
 
 use core::cmp::Ordering;
@@ -9,6 +10,7 @@ use core::marker::PhantomData;
 
 use serde::{Deserialize, Serialize};
 
+pub use civil::Civil;
 pub use offset::OffsetFilter;
 
 /// A clock domain; implemented by empty marker types only.

@@ -153,6 +153,11 @@ pub struct ServeArgs {
     #[arg(long, value_name = "N")]
     pub official_attempts: Option<u32>,
 
+    /// Where the lab day is kept, its checks and the queue: a file, or none
+    /// [default: lab-day.json beside the leaderboard's file; none without a leaderboard]
+    #[arg(long, value_name = "FILE|none", value_parser = lab_storage, value_hint = ValueHint::FilePath)]
+    pub lab_day: Option<LabStorage>,
+
     /// Print JSON lines on standard output: ready, events, report
     #[arg(long)]
     pub json: bool,
@@ -173,6 +178,20 @@ pub enum RunStorage {
 
 fn run_storage(text: &str) -> Result<RunStorage, UnknownDatabase> {
     if text == "none" { Ok(RunStorage::Nowhere) } else { text.parse().map(RunStorage::In) }
+}
+
+/// Where the lab day is stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum LabStorage {
+    /// In this file.
+    In(PathBuf),
+    /// Nowhere.
+    Nowhere,
+}
+
+#[allow(clippy::unnecessary_wraps)] // Why: what clap parses by may fail.
+fn lab_storage(text: &str) -> Result<LabStorage, String> {
+    Ok(if text == "none" { LabStorage::Nowhere } else { LabStorage::In(text.into()) })
 }
 
 /// How colour is stored.
@@ -209,6 +228,17 @@ impl ServeArgs {
         let given: Vec<_> = vicon.into_iter().chain(self.pose.clone()).collect();
         let vicon = || vec![LocalizationConfig::new(Driver::Vicon)];
         [given, arena].into_iter().find(|sources| !sources.is_empty()).unwrap_or_else(vicon)
+    }
+
+    /// Returns the file that keeps the lab day; `None` if none does.
+    pub fn lab_day_file(&self) -> Option<PathBuf> {
+        let runs = match (&self.lab_day, &self.leaderboard) {
+            (Some(LabStorage::In(file)), _) => return Some(file.clone()),
+            (Some(LabStorage::Nowhere), _) | (None, Some(RunStorage::Nowhere)) => return None,
+            (None, Some(RunStorage::In(Database::File(file)))) => file.clone(),
+            (None, _) => Database::default_file()?,
+        };
+        Some(runs.with_file_name("lab-day.json"))
     }
 
     /// Returns how images are encoded.

@@ -20,6 +20,7 @@ fn every_command_has_help() {
         "tags",
         "bench",
         "grade",
+        "lab",
         "leaderboard",
         "arena",
         "evaluate",

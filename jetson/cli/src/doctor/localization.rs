@@ -1,8 +1,6 @@
 //! `vizflyt doctor localization`: the pose in plain words, and the check by hand.
 
-mod check;
 mod delay;
-mod description;
 mod gyro;
 
 use std::path::PathBuf;
@@ -13,12 +11,12 @@ use anyhow::{Result, bail};
 use clap::Args;
 use vizflyt_guardian::port::MavlinkAddress;
 use vizflyt_server::poses::drivers::{Measurement, PoseSource};
+use vizflyt_server::poses::hand_check::description::describe_pose;
+use vizflyt_server::poses::hand_check::{Change, Check, Diagnosis, Step};
 use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 use vizflyt_server::poses::{drivers, settings};
 
-use self::check::{Change, Check, Diagnosis, Step};
 use self::delay::{Delay, DelayMeter, NoDelay};
-use self::description::describe_pose;
 use self::gyro::Gyro;
 use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;

@@ -38,7 +38,7 @@ use crate::companion::Companion;
 use crate::console::Screen;
 use crate::flight::{FlightSettings, Views};
 use crate::images::{Published, SharedSenses};
-use crate::link::{LinkEvent, LinkSettings};
+use crate::link::{FenceEvent, LinkEvent, LinkSettings};
 use crate::log::{Channel, FlightLog};
 use crate::odometry::OdometryGate;
 use crate::report::Counters;
@@ -148,6 +148,8 @@ struct ControlLoop {
     ticks: u64,
     /// The newest reading of each sensor that the companion had, by its instant.
     readings_taken: [HostTime; MAX_SENSORS],
+    /// Polygons that the autopilot has accepted for its own fence.
+    polygons: Option<u8>,
 }
 
 impl Control {
@@ -198,6 +200,7 @@ impl ControlLoop {
             odometry_gate: OdometryGate::default(),
             ticks: 0,
             readings_taken: [HostTime::ZERO; MAX_SENSORS],
+            polygons: None,
         }
     }
 
@@ -283,6 +286,10 @@ impl ControlLoop {
             (self.control.to_autopilot)(&datagram);
         }
         while let Some(event) = self.companion.poll_link_event() {
+            if let LinkEvent::Fence(FenceEvent::Accepted(polygons)) = event {
+                self.polygons = u8::try_from(polygons).ok();
+                self.report_guarded();
+            }
             match &event {
                 LinkEvent::Text { text, .. } => tracing::info!("autopilot: {text}"),
                 event => tracing::info!("link: {event:?}"),
@@ -308,6 +315,7 @@ impl ControlLoop {
                 // The first image may come before the first pose.
                 self.share_senses();
                 self.companion.upload_fence(now);
+                self.report_guarded();
                 if self.plugin.is_none() && self.companion.flight().outcome().is_none() {
                     self.start_plugin(now);
                 }

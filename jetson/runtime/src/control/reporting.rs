@@ -4,7 +4,7 @@ use std::io::Write;
 
 use serde_json::json;
 use vizflyt_protocol::mavlink::GuidedSetpoint;
-use vizflyt_protocol::messages::{Arrivals, Event, MAX_CAMERAS, Telemetry};
+use vizflyt_protocol::messages::{Arrivals, Event, Guarded, MAX_CAMERAS, Telemetry};
 use vizflyt_protocol::time::HostTime;
 
 use super::ControlLoop;
@@ -55,6 +55,13 @@ impl ControlLoop {
         let timing = self.times.timing(now, clock, &self.arrived());
         self.control.log.write(Channel::Timing, now, &timing);
         self.control.to_server.report_timing(timing);
+    }
+
+    /// Reports what the guard keeps the vehicle within, and what the autopilot does.
+    pub(super) fn report_guarded(&self) {
+        if let Some(arena) = self.companion.arena() {
+            self.control.to_server.report_guarded(Guarded::of(arena, self.polygons));
+        }
     }
 
     /// Returns what became of images before they reached shared memory, by camera.

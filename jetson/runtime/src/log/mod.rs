@@ -50,7 +50,7 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::packet::ObservationHeader;
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
-use vizflyt_protocol::time::HostTime;
+use vizflyt_protocol::time::{Civil, HostTime};
 use vizflyt_sdk::ImuSample;
 
 use self::budget::Budget;
@@ -384,19 +384,7 @@ pub fn observation_head(bytes: &[u8]) -> &[u8] {
 /// Returns `2026-11-21T04-09-21.123Z`: sorts by time, and is a file name everywhere.
 fn utc_name(time: SystemTime) -> String {
     let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
-    let (days, second) = (since.as_secs() / 86_400, since.as_secs() % 86_400);
-    // Civil date from days since 1970, after H. Hinnant, "chrono-compatible low-level date
-    // algorithms", civil_from_days, for dates after 1970.
-    let z = days + 719_468;
-    let (era, day_of_era) = (z / 146_097, z % 146_097);
-    let year_of_era =
-        (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let shifted = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * shifted + 2) / 5 + 1;
-    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
-    let year = year_of_era + era * 400 + u64::from(month <= 2);
-    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    let Civil { year, month, day, hour, minute, second } = Civil::of_unix(since.as_secs());
     let ms = since.subsec_millis();
     format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}.{ms:03}Z")
 }

@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::Notify;
 use vizflyt_protocol::messages::{
-    Event, EventKind, ImuReading, MAX_IMU_BATCH, Telemetry, Timing, ToServer,
+    Event, EventKind, Guarded, ImuReading, MAX_IMU_BATCH, Telemetry, Timing, ToServer,
 };
 
 /// Reports and events on their way to the server.
@@ -20,6 +20,10 @@ pub struct Outbox {
 struct Inner {
     report: Option<Telemetry>,
     timing: Option<Timing>,
+    /// What the guard keeps the vehicle within; kept for the next connection.
+    guarded: Option<Guarded>,
+    /// It is to be sent on the present connection.
+    guarded_due: bool,
     /// Readings of the IMU that are not sent yet, oldest first.
     imu: heapless::Vec<ImuReading, MAX_IMU_BATCH>,
     /// Not yet acknowledged, oldest first.
@@ -56,6 +60,15 @@ impl Outbox {
     /// Puts a report of where images get their age in place of an older one.
     pub fn report_timing(&self, timing: Timing) {
         self.lock().timing = Some(timing);
+        self.changed.notify_one();
+    }
+
+    /// Reports what the guard keeps the vehicle within, on this connection and on each later one.
+    pub fn report_guarded(&self, guarded: Guarded) {
+        let mut inner = self.lock();
+        inner.guarded_due |= inner.guarded != Some(guarded);
+        inner.guarded = Some(guarded);
+        drop(inner);
         self.changed.notify_one();
     }
 
@@ -107,6 +120,7 @@ impl Outbox {
         inner.forget(received);
         inner.written = received;
         (inner.report, inner.timing) = (None, None);
+        inner.guarded_due = inner.guarded.is_some();
         inner.imu.clear();
     }
 
@@ -155,6 +169,9 @@ impl Inner {
         }
         if let Some(timing) = self.timing.take() {
             return Next::Send(ToServer::Timing(timing));
+        }
+        if let Some(guarded) = self.guarded.filter(|_| std::mem::take(&mut self.guarded_due)) {
+            return Next::Send(ToServer::Guarded(guarded));
         }
         if self.closed && self.events.is_empty() { Next::End } else { Next::Wait }
     }
@@ -210,6 +227,25 @@ mod tests {
         assert_eq!(written(&outbox), "", "4 is not acknowledged");
         outbox.acknowledged(4);
         assert_eq!(written(&outbox), "-");
+    }
+
+    #[test]
+    fn what_the_guard_keeps_is_sent_once_a_connection_and_when_it_changes() {
+        let outbox = Outbox::default();
+        let arena = crate::flight::tests::arena();
+        let guarded = |polygons| Guarded::of(&arena, polygons);
+        let sent = || match outbox.lock().take() {
+            Next::Send(ToServer::Guarded(guarded)) => Some(guarded.polygons),
+            _ => None,
+        };
+        outbox.report_guarded(guarded(None));
+        outbox.report_guarded(guarded(None));
+        assert_eq!((sent(), sent()), (Some(None), None));
+        outbox.report_guarded(guarded(Some(1)));
+        outbox.report_guarded(guarded(Some(2)));
+        assert_eq!((sent(), sent()), (Some(Some(2)), None));
+        outbox.resume(0);
+        assert_eq!((sent(), sent()), (Some(Some(2)), None));
     }
 
     #[test]

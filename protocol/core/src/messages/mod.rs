@@ -34,7 +34,7 @@ pub use kinds::{SetpointKind, SetpointKinds};
 pub use pairing::{Grant, MAX_GRANTED, PairingProof, PairingReply, PairingRequest, PairingShare};
 pub use plugin::{FromPlugin, MAX_ODOMETRY_PER_REPLY, Odometry, ToPlugin};
 pub use session::{
-    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, Hello, ImuReading, Limits,
+    ArenaInfo, CameraInfo, ClockReply, ClockRequest, Datagram, Guarded, Hello, ImuReading, Limits,
     MAX_ALLOWANCE_S, MAX_IMU_BATCH, PoseAges, PoseSample, Purpose, ReceivedEvents, ToRuntime,
     ToServer, Welcome,
 };

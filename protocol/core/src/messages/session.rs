@@ -112,6 +112,37 @@ pub enum ToServer {
     Timing(Timing),
     /// Readings of the autopilot's IMU, oldest first; each once. 25 to 50 Hz.
     Imu(heapless::Vec<ImuReading, MAX_IMU_BATCH>),
+    /// Reports what the guard keeps the vehicle within; once a connection, and when it changes. A server that does
+    /// not know it drops it.
+    Guarded(Guarded),
+}
+
+/// What the runtime keeps its vehicle within.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Guarded {
+    /// Keep-in volume of the guard, for the body's surface. [world]
+    pub geofence: Volume,
+    /// Keep-out volumes of the guard.
+    pub no_fly: u8,
+    /// Height of the floor. [m, world]
+    pub floor_z_m: f64,
+    /// Limits of motion: the stricter ones of arena and vehicle.
+    pub limits: Limits,
+    /// Polygons that the autopilot has accepted for its own fence in this flight; `None` if it accepted none.
+    pub polygons: Option<u8>,
+}
+
+impl Guarded {
+    /// Returns what a guard holds that flies by `arena`, with an autopilot that has accepted so many polygons.
+    pub fn of(arena: &ArenaInfo, polygons: Option<u8>) -> Self {
+        Self {
+            geofence: arena.geofence,
+            no_fly: arena.no_fly.len() as u8,
+            floor_z_m: arena.floor_z_m,
+            limits: arena.limits,
+            polygons,
+        }
+    }
 }
 
 /// Server to client.

@@ -1,4 +1,4 @@
-//! Who flies, and how it goes: control leases, events, tracks, crash cards, the leaderboard.
+//! Who flies, and how it goes: control leases, events, tracks, crash cards, the leaderboard, the lab day.
 //!
 //! ```text
 //! in   poses and the referee's events, from the pose thread; reports of the runtimes; orders of
@@ -12,6 +12,7 @@ pub mod control_lease;
 pub mod crash;
 pub mod crash_card;
 pub mod events;
+pub mod lab_day;
 pub mod leaderboard;
 pub mod recent_previews;
 mod recorder;

@@ -16,7 +16,7 @@ use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::verdict::{Verdict, judge_ended};
 use vizflyt_protocol::flight_end::FlightEnd;
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, Hello, Name, Telemetry, bounded,
+    ArenaInfo, Event, EventKind, FlightPhase, Guarded, Hello, Name, Telemetry, bounded,
 };
 use vizflyt_protocol::time::ServerTime;
 
@@ -43,6 +43,10 @@ pub struct VehicleFlight {
     pub events: EventLog,
     /// The runtime's newest report.
     pub telemetry: watch::Sender<Option<Telemetry>>,
+    /// What the runtime's guard keeps it within, as reported.
+    pub guarded: watch::Sender<Option<Guarded>>,
+    /// The server's events up to this number have reached the runtime; of the newest runtime.
+    pub received: watch::Sender<u64>,
     /// The previews of the last seconds.
     pub previews: Mutex<RecentPreviews>,
     /// The crash card of its last failed flight.
@@ -78,6 +82,8 @@ impl VehicleFlight {
             arena,
             events: EventLog::default(),
             telemetry: watch::Sender::new(None),
+            guarded: watch::Sender::new(None),
+            received: watch::Sender::new(0),
             previews: Mutex::new(RecentPreviews::of(cameras)),
             crash: watch::Sender::new(None),
             track: Mutex::default(),
@@ -240,6 +246,7 @@ impl VehicleFlight {
     /// Forgets the former flight; returns the index of the first event of the new one.
     fn begin(&self) -> u64 {
         self.telemetry.send_replace(None);
+        self.guarded.send_replace(None);
         lock(&self.track).clear();
         *lock(&self.samples) = Samples::default();
         *lock(&self.flight) = Flight::default();

@@ -9,6 +9,7 @@
 //! Imports `flights`, and `scene` for the file that names the sources.
 
 pub mod drivers;
+pub mod hand_check;
 mod margin;
 pub mod newest;
 pub mod settings;

@@ -41,7 +41,7 @@ use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
 use crate::web::messages::Rates;
 use crate::web::previews::Previews;
-use crate::web::{self, Access, Logins, Page, PageTls};
+use crate::web::{self, Access, Lab, Logins, Page, PageTls};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -158,8 +158,11 @@ async fn run(
     if args.print_page_keys || !args.http.ip().is_loopback() {
         print::page_keys(access.keys(), &url, &names, args.json);
     }
+    let localization = args.localization(settings::of_arena(&args.arena)?);
+    let lab = Arc::new(Lab::open(args.lab_day_file(), localization.into_iter().next()));
     let page = Page {
         rooms: rooms.clone(),
+        lab: lab.clone(),
         previews,
         top_view: scene.top_view,
         twin: scene.twin,
@@ -175,6 +178,7 @@ async fn run(
     };
     let mut tasks = JoinSet::new();
     tasks.spawn(web::serve(page, listener, tls));
+    tasks.spawn(web::follow_lab(rooms.clone(), lab.clone()));
     if let Some(grant) = args.pair.take() {
         open_pairing(&authorizer, &grant, quic.port(), args.json)?;
     }
@@ -192,6 +196,7 @@ async fn run(
     transport::serve(rooms.clone(), endpoint, authorizer, args.congestion).await;
     rooms.streaming.subscriptions.shut();
     tasks.shutdown().await;
+    lab.close();
     for thread in threads {
         // A thread that panicked has reported it on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;

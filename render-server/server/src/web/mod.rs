@@ -27,6 +27,7 @@
 //! GET /api/leaderboard        the standings of the course, JSON; GET /wall shows them large ([`leaderboard`])
 //! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
 //! ```
+//! `/lab` is the checklist and the queue of a lab day ([`lab`]).
 //! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`scenes`]);
 //! `GET` and `PUT /api/environment` are its light and weather ([`environment`]).
 //! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
@@ -45,6 +46,7 @@ mod cameras;
 mod crash;
 mod environment;
 mod https;
+mod lab;
 mod leaderboard;
 mod listener;
 mod login;
@@ -64,6 +66,8 @@ mod view;
 mod viewer;
 
 pub use access::{Access, Login, Logins, PageKeys, Takes};
+pub use lab::Evidence;
+pub(crate) use lab::{Lab, follow as follow_lab};
 pub use login::set_password;
 pub use routes::list as routes;
 pub use stats::{ServerStages, VehicleStats};
@@ -112,6 +116,8 @@ pub(crate) struct Page {
     /// When the server started; differs from start to start, so that a page notices a new server.
     pub(crate) boot: ServerTime,
     pub(crate) rates: messages::Rates,
+    /// The lab day.
+    pub(crate) lab: Arc<Lab>,
     /// Who may see and do what.
     pub(crate) access: Arc<Access>,
     /// Who may connect, and pairing.

@@ -14,8 +14,8 @@ use axum::routing::{MethodRouter, delete, get, patch, post, put};
 use super::Page;
 use super::access::{self, Takes};
 use super::{
-    cameras, crash, environment, file, leaderboard, login, map, pairing, scenes, sensors, shell,
-    stats, twin, vehicles, watch,
+    cameras, crash, environment, file, lab, leaderboard, login, map, pairing, scenes, sensors,
+    shell, stats, twin, vehicles, watch,
 };
 
 /// One route.
@@ -62,6 +62,7 @@ fn served(file: &'static str) -> (&'static str, &'static str) {
     let path = match file {
         "/index.html" => "/",
         "/wall.html" => "/wall",
+        "/lab.html" => "/lab",
         other => other,
     };
     (path, kind)
@@ -108,6 +109,17 @@ fn table() -> Vec<Route> {
         at_once(Method::PUT, "/api/vehicles/{vehicle}/team", Nothing, leaderboard::put),
         act(Method::POST, "/api/vehicles/{vehicle}/team", Everything, leaderboard::assign),
         act(Method::DELETE, "/api/vehicles/{vehicle}/team", Vehicle, leaderboard::check_out),
+        read("/api/lab", Key, lab::show),
+        read("/api/lab/report.pdf", Everything, lab::report),
+        act(Method::POST, "/api/lab/sign", Everything, lab::sign),
+        act(Method::POST, "/api/lab/axes", Everything, lab::axes),
+        act(Method::POST, "/api/lab/evidence", Everything, lab::evidence),
+        // A team books on its own vehicle, which is judged there.
+        act(Method::POST, "/api/lab/queue", Key, lab::book),
+        act(Method::DELETE, "/api/lab/queue/{id}", Key, lab::withdraw),
+        act(Method::POST, "/api/lab/turn", Everything, lab::turn),
+        act(Method::PUT, "/api/lab/formation", Everything, lab::formation),
+        act(Method::POST, "/api/lab/begin", Everything, lab::begin),
         read("/api/scenes", Everything, scenes::list),
         act(Method::PUT, "/api/scene", Everything, scenes::change),
         read("/api/environment", Everything, environment::get),

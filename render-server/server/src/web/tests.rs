@@ -18,7 +18,7 @@ fn the_timing_panel_counts_by_the_edges_of_the_reports() {
 #[test]
 fn every_id_of_the_scripts_is_on_the_page() {
     let mut found = 0;
-    let pages = [text("/index.html"), text("/wall.html")];
+    let pages = [text("/index.html"), text("/wall.html"), text("/lab.html")];
     let is_ours = |file: &str| {
         !file.starts_with("/three/") && Path::new(file).extension().is_some_and(|kind| kind == "js")
     };

@@ -73,7 +73,11 @@ pub(super) async fn start(
     name: Path<String>,
     headers: HeaderMap,
 ) -> Response {
-    order(&page, &name, &headers, |_, vehicle| vehicle.start(BY), "it takes off")
+    let start = |page: &Page, vehicle: &VehicleFlight| {
+        page.lab.may_start(&page.rooms.flights, &vehicle.name)?;
+        vehicle.start(BY)
+    };
+    order(&page, &name, &headers, start, "it takes off")
 }
 
 /// Lands a vehicle in order.

@@ -212,7 +212,15 @@ impl Session<'_> {
                     }
                     received.send_modify(|newest| *newest = seq.max(*newest));
                 }
-                (ToServer::EventsReceived(seq), _) => debug!("events up to {seq} were received"),
+                (ToServer::EventsReceived(seq), lease) => {
+                    debug!("events up to {seq} were received");
+                    if lease.is_some() {
+                        vehicle.received.send_replace(seq);
+                    }
+                }
+                (ToServer::Guarded(guarded), Some(_)) => {
+                    vehicle.guarded.send_replace(Some(guarded));
+                }
                 (ToServer::Hello(_), _) => debug!("a second Hello is ignored"),
                 (_, None) => debug!("a report of a watcher is ignored"),
             }

@@ -32,6 +32,7 @@ pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
         ("SceneChoice", web::scenes::examples()),
         ("Environment", web::environment::examples()),
         ("Pairing", web::pairing::examples()),
+        ("LabDay", web::lab::examples()),
         ("Leaderboard", web::leaderboard::examples()),
         ("CrashCard", crash_card::examples()),
         ("Stats", stats_examples()),

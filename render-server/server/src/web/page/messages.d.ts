@@ -327,6 +327,51 @@ export type Pairing = {
   port: number;
 };
 
+export type LabDay = {
+  arena: string;
+  axes: { ask: string; seen: string; vehicle: string } | null;
+  began_unix_ms: number;
+  checks: {
+    ask: string;
+    at_unix_ms: number | null;
+    by: string;
+    check: string;
+    evidence: string;
+    how: string;
+    state: string;
+    title: string;
+    todo: string;
+    vehicle: string;
+  }[];
+  distances: { apart_m: number; first: string; second: string }[];
+  is_instructor: boolean;
+  now_unix_ms: number;
+  order: { until: string; vehicles: string[] };
+  queue: {
+    booked_unix_ms: number;
+    called_unix_ms: number | null;
+    ended_unix_ms: number | null;
+    id: number;
+    is_own: boolean;
+    passed_over: number;
+    place: number | null;
+    state: string;
+    team: string;
+    vehicle: string;
+  }[];
+  separation_m: number | null;
+  story: { at_unix_ms: number; text: string }[];
+  vehicles: {
+    called: string | null;
+    checked_in: string | null;
+    is_ready: boolean;
+    must_wait: string | null;
+    name: string;
+    phase: string;
+    runtime: string | null;
+  }[];
+};
+
 export type Leaderboard = {
   course: string;
   graded: {

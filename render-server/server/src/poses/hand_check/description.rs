@@ -4,7 +4,7 @@ use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
 /// Returns where a vehicle is and which way it points.
-pub(super) fn describe_pose(pose: &Pose<World, Body>) -> String {
+pub fn describe_pose(pose: &Pose<World, Body>) -> String {
     let p = pose.translation_m;
     format!(
         "nose points {}, up is {}, drone is {:.2} m above the floor, at x {:.2}, y {:.2}",
@@ -17,7 +17,7 @@ pub(super) fn describe_pose(pose: &Pose<World, Body>) -> String {
 }
 
 /// Returns the axis nearest to a direction, and how far it is off.
-pub(super) fn direction(v: DVec3) -> String {
+pub fn direction(v: DVec3) -> String {
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let names = ["x", "y", "z"];
     let (mut best, mut name) = (f64::NEG_INFINITY, String::new());

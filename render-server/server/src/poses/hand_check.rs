@@ -9,20 +9,22 @@
 //! the object follows from the push. The smallest change under which all motions look as they were done
 //! is the answer. The last motion is asked for only where several changes of the same size would do.
 
+pub mod description;
+
 use std::collections::VecDeque;
 use std::f64::consts::FRAC_PI_2;
 
-use glam::{DQuat, DVec3};
-use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
-use vizflyt_server::poses::settings::{
+use crate::poses::settings::{
     Axes, BodyAxes, Driver, Euler, LocalizationConfig, Nose, Offset, Quaternion, Units, UpAxis,
 };
+use glam::{DQuat, DVec3};
+use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
 
-use super::description::direction;
+use self::description::direction;
 
 /// What is to be done next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Step {
+pub enum Step {
     /// It stands on the floor.
     Stand,
     /// Somebody lifts it,
@@ -41,7 +43,7 @@ pub(super) enum Step {
 
 impl Step {
     /// Returns what a person is asked to do.
-    pub(super) fn ask(self) -> &'static str {
+    pub fn ask(self) -> &'static str {
         match self {
             Self::Stand => "put it on the floor and let go",
             Self::Lift => "lift it straight up, by half a metre or so, and hold it still",
@@ -61,21 +63,21 @@ impl Step {
 
 /// The result of the check.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Diagnosis {
+pub struct Diagnosis {
     /// The faults, in sentences; empty if there are none.
-    pub(super) faults: Vec<String>,
+    pub faults: Vec<String>,
     /// Settings to change. Empty, too, if none would help.
-    pub(super) change: Change,
+    pub change: Change,
     /// Other changes of the same size that would explain all that was seen as well.
-    pub(super) others: Vec<Change>,
+    pub others: Vec<Change>,
 }
 
 /// Settings to change: key and value.
-pub(super) type Change = Vec<(&'static str, String)>;
+pub type Change = Vec<(&'static str, String)>;
 
 /// Follows the motions.
 #[derive(Debug)]
-pub(super) struct Check {
+pub struct Check {
     config: LocalizationConfig,
     step: Step,
     /// The last moments. [s]
@@ -86,17 +88,17 @@ pub(super) struct Check {
 
 impl Check {
     /// Begins; poses will come as these settings make them.
-    pub(super) fn new(config: LocalizationConfig) -> Self {
+    pub fn new(config: LocalizationConfig) -> Self {
         Self { config, step: Step::Stand, window: VecDeque::new(), rests: Vec::new() }
     }
 
     /// Returns what is to be done.
-    pub(super) fn step(&self) -> Step {
+    pub fn step(&self) -> Step {
         self.step
     }
 
     /// Takes a pose; returns whether a step was seen to its end. [s]
-    pub(super) fn handle_pose(&mut self, at_s: f64, pose: &Pose<World, Body>) -> bool {
+    pub fn handle_pose(&mut self, at_s: f64, pose: &Pose<World, Body>) -> bool {
         if self.step == Step::Done || !pose.is_valid() {
             return false;
         }
@@ -178,7 +180,7 @@ impl Check {
     }
 
     /// Returns what the last step looked like.
-    pub(super) fn seen(&self) -> String {
+    pub fn seen(&self) -> String {
         let moved = |a: &Pose<World, Body>, b: &Pose<World, Body>| {
             let v = b.translation_m - a.translation_m;
             format!("it went {} along {}", length(v.length()), direction(v))
@@ -199,7 +201,7 @@ impl Check {
     }
 
     /// Returns what is wrong, when all was seen.
-    pub(super) fn diagnosis(&self) -> Diagnosis {
+    pub fn diagnosis(&self) -> Diagnosis {
         let faults = faults(&self.rests);
         if faults.is_empty() {
             return Diagnosis::default();

@@ -3,9 +3,9 @@
 
 use std::fmt::Write;
 
+use crate::poses::drivers::json::JsonStream;
+use crate::poses::drivers::udp::PoseStream;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::poses::drivers::json::JsonStream;
-use vizflyt_server::poses::drivers::udp::PoseStream;
 
 use super::super::*;
 

@@ -1,0 +1,163 @@
+//! `vizflyt lab`: a lab day of a running server, its checklist in words and its report as a PDF.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, Subcommand};
+use serde::Deserialize;
+
+use crate::server_page::ServerPage;
+use crate::terminal::print_line;
+
+/// A lab day: the checklist before flights, and the queue of teams.
+///
+/// The checklist is a page of the server, /lab: localization live and its axes, network, clocks, camera latency,
+/// battery, the autopilot's parameters, the fence in three places, STOP tried, each with its evidence and time; a
+/// queue in which teams book; the order of take-off and the separation of several vehicles, and one STOP for all.
+/// This prints where it is, and how it stands. Ends with status 1 if a check is not done, failed or outdated.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt lab                                       where the page is, what is still to do, and who waits
+  vizflyt lab report --out monday.pdf               every check with evidence and time, and the queue
+  vizflyt lab --page http://192.168.10.2:8080 --key KEY   from another computer
+  vizflyt doctor vehicle --arena arena.toml --report http://127.0.0.1:8080   brings the autopilot's parameters")]
+pub(crate) struct LabDayArgs {
+    #[command(subcommand)]
+    command: Option<LabDayCommand>,
+    /// The server's page
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080", global = true)]
+    page: String,
+    /// The instructor's key, as in the address /enter?key=KEY; not needed on the server's own computer
+    #[arg(long, value_name = "KEY", global = true)]
+    key: Option<String>,
+}
+
+#[derive(Subcommand, Debug)]
+enum LabDayCommand {
+    /// Writes the day as a PDF: every check with evidence and time, the queue, what happened.
+    Report {
+        /// The PDF
+        #[arg(short, long, value_name = "FILE.pdf", default_value = "lab-day.pdf")]
+        out: PathBuf,
+    },
+}
+
+/// What `GET /api/lab` says, as far as it is printed.
+#[derive(Debug, Deserialize)]
+struct Day {
+    arena: String,
+    checks: Vec<Check>,
+    queue: Vec<Booking>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Check {
+    title: String,
+    vehicle: String,
+    state: String,
+    evidence: String,
+    todo: String,
+    ask: String,
+}
+
+#[derive(Debug, Deserialize)]
+struct Booking {
+    team: String,
+    vehicle: String,
+    state: String,
+    place: Option<usize>,
+}
+
+/// Prints how the day stands, or writes its report.
+pub(crate) fn run(args: &LabDayArgs) -> Result<ExitCode> {
+    let page = ServerPage::at(&args.page).with_key(args.key.as_deref());
+    if let Some(LabDayCommand::Report { out }) = &args.command {
+        let pdf = ask(&page, args, "/api/lab/report.pdf")?;
+        std::fs::write(out, &pdf).with_context(|| format!("cannot write {}", out.display()))?;
+        print_line(format!("{}: {} bytes", out.display(), pdf.len()));
+        return Ok(ExitCode::SUCCESS);
+    }
+    let day: Day = serde_json::from_slice(&ask(&page, args, "/api/lab")?)
+        .context("the server's answer is not understood: another version?")?;
+    print_line(format!("page     {}/lab", args.page.trim_end_matches('/')));
+    print_line(words(&day).trim_end());
+    Ok(if day.checks.iter().all(|check| check.state == "ok") {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
+}
+
+fn ask(page: &ServerPage<'_>, args: &LabDayArgs, path: &str) -> Result<Vec<u8>> {
+    let (status, body) = page.get(path)?;
+    match status {
+        200 => Ok(body),
+        401 | 403 => bail!("{} opens this for its instructor alone: give --key", args.page),
+        404 => {
+            bail!("{} has no lab day: it is no VizFlyt server, or one from before it", args.page)
+        }
+        status => bail!("{}: {} (HTTP status {status})", args.page, String::from_utf8_lossy(&body)),
+    }
+}
+
+/// Returns the day in words: each check, then who waits.
+fn words(day: &Day) -> String {
+    let mut text = format!("arena    {}\n", day.arena);
+    for check in &day.checks {
+        let of = if check.vehicle.is_empty() { "the room" } else { &check.vehicle };
+        let state = check.state.replace('_', " ");
+        // Why: writing to a String cannot fail.
+        let _ = write!(text, "{state:<9}{of}: {}", check.title);
+        if !check.evidence.is_empty() {
+            let _ = write!(text, ": {}", check.evidence);
+        }
+        if check.state != "ok" {
+            let todo = if check.todo.is_empty() { &check.ask } else { &check.todo };
+            let _ = write!(text, "\n         to do: {todo}");
+        }
+        text.push('\n');
+    }
+    for Booking { team, vehicle, state, place } in &day.queue {
+        match (state.as_str(), place) {
+            ("called", _) => _ = writeln!(text, "called   {team} on {vehicle}"),
+            (_, Some(place)) => _ = writeln!(text, "waits    {team} on {vehicle}, place {place}"),
+            _ => {}
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_day_in_words() {
+        let day: Day = serde_json::from_str(
+            r#"{"arena": "hall", "more": 1, "checks": [
+                {"title": "net closed", "vehicle": "", "state": "ok",
+                 "evidence": "looked at by Ada", "todo": "", "ask": "sign"},
+                {"title": "battery", "vehicle": "wasp", "state": "failed",
+                 "evidence": "14.2 V", "todo": "charge", "ask": "power"},
+                {"title": "clocks", "vehicle": "wasp", "state": "not_done",
+                 "evidence": "", "todo": "", "ask": "fly --wait"}],
+              "queue": [{"team": "ants", "vehicle": "wasp", "state": "called", "place": null},
+                        {"team": "bees", "vehicle": "wasp", "state": "waiting", "place": 1},
+                        {"team": "cats", "vehicle": "wasp", "state": "done", "place": null}]}"#,
+        )
+        .unwrap();
+        let expected = "\
+arena    hall
+ok       the room: net closed: looked at by Ada
+failed   wasp: battery: 14.2 V
+         to do: charge
+not done wasp: clocks
+         to do: fly --wait
+called   ants on wasp
+waits    bees on wasp, place 1
+";
+        assert_eq!(words(&day), expected);
+    }
+}

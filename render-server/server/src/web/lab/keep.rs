@@ -1,0 +1,218 @@
+//! The lab day and its file: read at the start, written whole at each order, so that a restart loses nothing.
+
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use tracing::warn;
+use vizflyt_protocol::time::Civil;
+
+use super::guided::Guided;
+use crate::flights::Flights;
+use crate::flights::lab_day::{CheckId, Finding, LabDay, Stand};
+use crate::flights::vehicle::VehicleFlight;
+use crate::lock::lock;
+use crate::poses::settings::LocalizationConfig;
+
+/// The lab day of a server.
+#[derive(Debug)]
+pub(crate) struct Lab {
+    day: Mutex<LabDay>,
+    /// Where it is kept; nowhere without one.
+    file: Option<PathBuf>,
+    /// One writer at a time, with the newest state.
+    writing: Mutex<()>,
+    is_changed: AtomicBool,
+    /// The check of axes under way.
+    pub(super) guided: Mutex<Option<Guided>>,
+    /// The first source of poses, whose settings that check is about.
+    pub(super) source: Option<LocalizationConfig>,
+}
+
+impl Lab {
+    /// Opens the day that `file` keeps, or begins one. A file that cannot be used is set aside.
+    pub(crate) fn open(file: Option<PathBuf>, source: Option<LocalizationConfig>) -> Self {
+        let day = file.as_deref().and_then(read);
+        Self {
+            day: Mutex::new(day.unwrap_or_else(|| LabDay::new(unix_ms()))),
+            file,
+            writing: Mutex::default(),
+            is_changed: AtomicBool::new(false),
+            guided: Mutex::default(),
+            source,
+        }
+    }
+
+    /// Looks at the day.
+    pub(super) fn look<T>(&self, look: impl FnOnce(&LabDay) -> T) -> T {
+        look(&lock(&self.day))
+    }
+
+    /// Changes the day; `change` gets the time, ms since 1970. It is written with the next [`Self::keep`].
+    pub(super) fn change<T>(&self, change: impl FnOnce(&mut LabDay, u64) -> T) -> T {
+        self.is_changed.store(true, Ordering::Relaxed);
+        change(&mut lock(&self.day), unix_ms())
+    }
+
+    /// Takes what the server measures again and again; only what is news is written before the end.
+    pub(super) fn measured(&self, vehicle: &str, check: CheckId, finding: Finding) {
+        let is_news = lock(&self.day).record(vehicle, check, finding, "the server", unix_ms());
+        self.is_changed.fetch_or(is_news, Ordering::Relaxed);
+    }
+
+    /// Writes all, at the end.
+    pub(crate) fn close(&self) {
+        self.is_changed.store(true, Ordering::Relaxed);
+        self.keep();
+    }
+
+    /// Says whether a vehicle may take off now, by the order of take-off.
+    ///
+    /// # Errors
+    /// Why not, and what to do.
+    pub(crate) fn may_start(&self, flights: &Flights, vehicle: &str) -> Result<(), String> {
+        let stand =
+            |name: &str| flights.vehicle(name).map_or(Stand::Below, |vehicle| stand(vehicle));
+        self.look(|day| day.order.may_start(vehicle, stand))
+    }
+
+    /// Writes what has changed; returns once it is on the disk. What cannot be written is told, and tried again.
+    pub(crate) fn keep(&self) {
+        let Some(file) = &self.file else { return };
+        let _one = lock(&self.writing);
+        if !self.is_changed.swap(false, Ordering::Relaxed) {
+            return;
+        }
+        let bytes = self.look(LabDay::to_bytes);
+        if let Err(error) = write(file, &bytes) {
+            self.is_changed.store(true, Ordering::Relaxed);
+            warn!("the lab day is not kept: {}: {error}", file.display());
+        }
+    }
+
+    /// Begins another day; the old one's file stays beside it, by its date.
+    pub(super) fn begin_anew(&self, by: &str) {
+        self.keep();
+        let began_unix_ms = self.look(|day| day.began_unix_ms);
+        if let Some(file) = &self.file {
+            let Civil { year, month, day, hour, minute, second } =
+                Civil::of_unix(began_unix_ms / 1000);
+            let name =
+                format!("lab-day-{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}.json");
+            if let Err(error) = fs::rename(file, file.with_file_name(name)) {
+                warn!("the former lab day is not set aside: {}: {error}", file.display());
+            }
+        }
+        self.change(|day, now_unix_ms| {
+            // What is set stays: it is the room's, not the day's.
+            let (order, separation_m) = (std::mem::take(&mut day.order), day.separation_m);
+            *day = LabDay::new(now_unix_ms);
+            (day.order, day.separation_m) = (order, separation_m);
+            day.tell(format!("the day begins, by {by}"), now_unix_ms);
+        });
+    }
+}
+
+/// Returns where a vehicle's flight stands.
+pub(super) fn stand(vehicle: &VehicleFlight) -> Stand {
+    use vizflyt_protocol::messages::FlightPhase::TakingOff;
+    let flight = vehicle.flight();
+    match flight.took_off {
+        Some(_) if flight.landed.is_some() => Stand::Landed,
+        Some(_) if vehicle.phase() != TakingOff => Stand::Up,
+        _ => Stand::Below,
+    }
+}
+
+/// Returns the wall clock. [ms since 1970]
+pub(super) fn unix_ms() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
+}
+
+fn read(file: &Path) -> Option<LabDay> {
+    let bytes = match fs::metadata(file).and_then(|known| {
+        if known.len() > MAX_BYTES {
+            Err(io::ErrorKind::FileTooLarge.into())
+        } else {
+            fs::read(file)
+        }
+    }) {
+        Ok(bytes) => bytes,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
+        Err(error) => {
+            set_aside(file, &error.to_string());
+            return None;
+        }
+    };
+    LabDay::parse(&bytes).map_err(|error| set_aside(file, &error.to_string())).ok()
+}
+
+fn set_aside(file: &Path, why: &str) {
+    let aside = file.with_extension("damaged");
+    let moved = fs::rename(file, &aside);
+    let aside =
+        moved.map_or_else(|error| error.to_string(), |()| format!("it is {} now", aside.display()));
+    warn!("{}: {why}; a new lab day begins, {aside}", file.display());
+}
+
+fn write(file: &Path, bytes: &[u8]) -> io::Result<()> {
+    if let Some(folder) = file.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    let beside = file.with_extension("new");
+    let mut new = File::create(&beside)?;
+    new.write_all(bytes)?;
+    new.sync_all()?;
+    fs::rename(&beside, file)
+}
+
+/// A full day has a tenth of it.
+const MAX_BYTES: u64 = 4 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::flights::lab_day::State;
+
+    #[test]
+    fn what_was_changed_is_there_after_a_restart() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("deeper/lab-day.json");
+        let lab = Lab::open(Some(file.clone()), None);
+        lab.change(|day, now| {
+            day.record("", CheckId::Net, Finding::of("signed".to_owned(), &[]), "Ada", now)
+        });
+        lab.change(|day, now| day.queue.book("ants", "wasp", now)).unwrap();
+        lab.keep();
+        let again = Lab::open(Some(file.clone()), None);
+        assert_eq!(again.look(Clone::clone), lab.look(Clone::clone));
+        assert_eq!(again.look(|day| day.state("", CheckId::Net, unix_ms())), State::Ok);
+        // Another day: the former one's file stays.
+        again.change(|day, _| day.set_separation(Some(1.5))).unwrap();
+        again.begin_anew("Ada");
+        again.keep();
+        let third = Lab::open(Some(file.clone()), None);
+        assert_eq!(
+            third.look(|day| (day.queue.bookings().len(), day.separation_m)),
+            (0, Some(1.5))
+        );
+        let kept = fs::read_dir(file.parent().unwrap()).unwrap().count();
+        assert_eq!(kept, 2, "the new day and the former");
+    }
+
+    #[test]
+    fn a_damaged_file_is_set_aside() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("lab-day.json");
+        fs::write(&file, b"{\"version\": 1").unwrap();
+        let lab = Lab::open(Some(file.clone()), None);
+        assert_eq!(lab.look(|day| day.queue.bookings().len()), 0);
+        assert!(!file.exists() && file.with_extension("damaged").exists());
+        lab.change(|day, now| day.tell("go on".to_owned(), now));
+        lab.keep();
+        assert!(file.exists());
+    }
+}
