@@ -23,7 +23,7 @@ const SLICES_PER_THREAD: usize = 4;
 const MAX_SLICES: usize = 32;
 const MIN_SLICE: usize = 1024;
 /// How far ahead a splat's record is asked for: some 100 ns of work.
-const PREFETCH: usize = 8;
+const PREFETCH: usize = 16;
 
 /// Lists of slots per tile.
 #[derive(Debug, Default)]
@@ -153,10 +153,10 @@ impl Kernel for BinSlice<'_> {
                 s.prefetch(&projected.covers[ahead.load(Relaxed) as usize]);
             }
             if let Some(ahead) = order.get(i + PREFETCH) {
+                // Of a small splat, what is there already: no branch to foretell.
                 let ahead = ahead.load(Relaxed) as usize;
-                if projected.covers[ahead].blocks == 0 {
-                    s.prefetch(&projected.splats[ahead]);
-                }
+                let is_large = projected.covers[ahead].blocks == 0;
+                s.prefetch(&projected.splats[if is_large { ahead } else { 0 }]);
             }
             let slot = slot.load(Relaxed);
             let cover = projected.covers[slot as usize];
