@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Instant;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
@@ -12,7 +12,7 @@ use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::weather::{Moment, WeatherPass};
-use vizflyt_splat::{Camera, Chosen, PassTimes, RgbdImage};
+use vizflyt_splat::{Camera, Chosen, CpuRenderer, Need, PassTimes, Rasterizer, RgbdImage, Scene};
 
 use crate::scene::camera::{self, ImageSize};
 use crate::terminal::print_fmt;
@@ -27,6 +27,7 @@ Examples:
   vizflyt bench render room.ply --camera cam.json
   vizflyt bench render room.ply --camera a.json --camera b.json --size 640x480 --json
   vizflyt bench render forest/arena.toml --camera cam.json --renderer cpu --images 200
+  vizflyt bench render room.ply --camera cam.json --limits
   vizflyt bench render forest/arena.toml --camera cam.json --environment rain")]
 pub(super) struct RenderArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
@@ -48,6 +49,10 @@ pub(super) struct RenderArgs {
         Variant::names()
     ))]
     environment: Option<Variant>,
+    /// Also counts what the images need, measures what the processor does at most, and prints beside each pass how long
+    /// it takes at least: its splats' pixels with no lane of a vector idle, or its bytes
+    #[arg(long, conflicts_with = "environment")]
+    limits: bool,
     /// Images per camera that count; a few before them do not
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
@@ -74,6 +79,8 @@ struct Figures {
     /// Of all threads together, user and system, of one image: what it costs where others use the processors, too.
     processor_ms: f64,
     passes: Passes,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    limits: Option<Limits>,
     /// With the light and the weather that were asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     environment: Option<EnvironmentFigures>,
@@ -93,6 +100,19 @@ struct EnvironmentFigures {
     ratio: f32,
 }
 
+/// How long each pass takes at least on this machine, and from what that follows.
+#[derive(Debug, Serialize)]
+struct Limits {
+    bound_ms: f32,
+    bound_passes: Passes,
+    /// Of all threads together, billions a second.
+    vector_operations_g: f64,
+    lanes: usize,
+    bytes_g: f64,
+    /// (Pixel, splat) pairs of an image, the mean over the cameras.
+    evaluations: u64,
+}
+
 #[derive(Debug, Serialize)]
 struct Passes {
     cull_ms: f32,
@@ -101,6 +121,20 @@ struct Passes {
     bin_ms: f32,
     blend_ms: f32,
     read_ms: f32,
+}
+
+impl Passes {
+    /// In run order.
+    fn named(&self) -> [(&'static str, f32); 6] {
+        [
+            ("cull", self.cull_ms),
+            ("project", self.project_ms),
+            ("sort", self.sort_ms),
+            ("bin", self.bin_ms),
+            ("blend", self.blend_ms),
+            ("read", self.read_ms),
+        ]
+    }
 }
 
 #[derive(Debug, Default, Serialize)]
@@ -122,6 +156,9 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
 }
 
 fn measure(args: &RenderArgs) -> Result<Figures> {
+    if args.limits && args.renderer == RendererKind::Gpu {
+        bail!("--limits are the processor's: leave --renderer out");
+    }
     let cameras: Vec<Camera> = args
         .cameras
         .iter()
@@ -132,7 +169,14 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         .collect::<Result<_>>()?;
     let (path, loaded) = load_as_it_is(&args.scene)?;
     let start = Instant::now();
-    let Chosen { mut rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
+    let (mut renderer, reason) = if args.limits {
+        let scene = Scene::from(&loaded.splats);
+        let renderer = CpuRenderer::with_detail(scene, args.detail.of(&scene));
+        (Renderer::Processor(renderer), "whose limits were asked for".to_owned())
+    } else {
+        let Chosen { rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
+        (Renderer::Chosen(rasterizer), reason)
+    };
     let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
     let splats = loaded.splats.len();
     drop(loaded);
@@ -142,9 +186,11 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
     let mut processor_ms: Vec<f64> = Vec::new();
     let mut work = Work::default();
     let (mut figures, mut pass) = (Vec::new(), WeatherPass::default());
+    let mut needs = Vec::new();
     for camera in &cameras {
         for image in 0..WARM_UP + args.images {
             let before_s = processor_seconds()?;
+            let rasterizer = renderer.rasterizer();
             let taken = rasterizer.render(&[], std::slice::from_ref(camera), &mut images)?;
             if image >= WARM_UP {
                 times.push(taken);
@@ -162,7 +208,11 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
                 figures.push([all_ms, all_ms - rendered_ms, all_ms / taken.total_ms]);
             }
         }
-        let seen = rasterizer.workload();
+        if let Renderer::Processor(renderer) = &renderer {
+            let k = camera.intrinsics;
+            needs.push(renderer.need([k.width_px as usize, k.height_px as usize]));
+        }
+        let seen = renderer.rasterizer().workload();
         work.splats = seen.splats;
         work.visible += seen.visible / cameras.len();
         work.pairs += seen.pairs / cameras.len();
@@ -192,7 +242,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         height_px: k.height_px,
         cameras: cameras.len(),
         images: times.len(),
-        renderer: rasterizer.name().into_owned(),
+        renderer: renderer.rasterizer().name().into_owned(),
         renderer_reason: reason,
         prepare_ms,
         least_ms: at(0.0, |t| t.total_ms),
@@ -207,9 +257,53 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
             blend_ms: at(0.5, |t| t.blend_ms),
             read_ms: at(0.5, |t| t.read_ms),
         },
+        limits: match &renderer {
+            Renderer::Processor(renderer) => Some(limits(renderer, &needs)),
+            Renderer::Chosen(_) => None,
+        },
         environment,
         workload: work,
     })
+}
+
+/// A renderer whose limits can be told, or any.
+enum Renderer {
+    Processor(CpuRenderer),
+    Chosen(Box<dyn Rasterizer>),
+}
+
+impl Renderer {
+    fn rasterizer(&mut self) -> &mut dyn Rasterizer {
+        match self {
+            Self::Processor(renderer) => renderer,
+            Self::Chosen(rasterizer) => rasterizer.as_mut(),
+        }
+    }
+}
+
+/// Returns the mean of what images need at least.
+fn limits(renderer: &CpuRenderer, needs: &[Need]) -> Limits {
+    let count = needs.len().max(1) as u64;
+    // As much memory as an image takes.
+    let bytes = needs.iter().map(Need::bytes).sum::<u64>() / count;
+    let machine = renderer.machine(bytes as usize);
+    let bounds: Vec<PassTimes> = needs.iter().map(|need| need.bound(&machine)).collect();
+    let mean = |of: fn(&PassTimes) -> f32| bounds.iter().map(of).sum::<f32>() / count as f32;
+    Limits {
+        bound_ms: mean(|t| t.total_ms),
+        bound_passes: Passes {
+            cull_ms: mean(|t| t.cull_ms),
+            project_ms: mean(|t| t.project_ms),
+            sort_ms: mean(|t| t.sort_ms),
+            bin_ms: mean(|t| t.bin_ms),
+            blend_ms: mean(|t| t.blend_ms),
+            read_ms: mean(|t| t.read_ms),
+        },
+        vector_operations_g: machine.operations_per_s / 1e9,
+        lanes: machine.lanes,
+        bytes_g: machine.bytes_per_s / 1e9,
+        evaluations: needs.iter().map(|need| need.evaluations).sum::<u64>() / count,
+    }
 }
 
 /// Returns the moment of an image: 30 a second.
@@ -241,16 +335,31 @@ fn print(f: &Figures) {
     );
     print_fmt!("p99         {:.2} ms", f.p99_ms);
     print_fmt!("processor   {:.2} ms an image, all threads together", f.processor_ms);
-    let passes = &f.passes;
-    for (name, ms) in [
-        ("cull", passes.cull_ms),
-        ("project", passes.project_ms),
-        ("sort", passes.sort_ms),
-        ("bin", passes.bin_ms),
-        ("blend", passes.blend_ms),
-        ("read", passes.read_ms),
-    ] {
-        print_fmt!("  {name:<9} {ms:.2} ms");
+    let passes = f.passes.named();
+    let bounds = f.limits.as_ref().map(|limits| limits.bound_passes.named());
+    for (i, (name, ms)) in passes.into_iter().enumerate() {
+        match &bounds {
+            Some(bounds) if bounds[i].1 > 0.0 => {
+                let bound = bounds[i].1;
+                print_fmt!("  {name:<9} {ms:.2} ms, at least {bound:.2}: {:.1} times", ms / bound);
+            }
+            _ => print_fmt!("  {name:<9} {ms:.2} ms"),
+        }
+    }
+    if let Some(limits) = &f.limits {
+        print_fmt!(
+            "at least    {:.2} ms: the images take {:.1} times as long",
+            limits.bound_ms,
+            f.median_ms / limits.bound_ms
+        );
+        print_fmt!(
+            "            {:.1} million pixels of splats; the machine does {:.1} billion operations on {} numbers a \
+             second, and moves {:.1} GB",
+            limits.evaluations as f64 / 1e6,
+            limits.vector_operations_g,
+            limits.lanes,
+            limits.bytes_g
+        );
     }
     if let Some(EnvironmentFigures { name, median_ms, effects_median_ms, ratio }) = &f.environment {
         print_fmt!(

@@ -62,7 +62,8 @@ pub enum DetailKind {
 }
 
 impl DetailKind {
-    fn of(self, scene: &Scene<'_>) -> Detail {
+    /// Returns what the renderer of a scene is told.
+    pub fn of(self, scene: &Scene<'_>) -> Detail {
         match self {
             Self::Full => Detail::Full,
             Self::Adaptive => Detail::suited_to(scene),

@@ -16,6 +16,7 @@ mod cull;
 mod detail;
 mod lens;
 mod merge;
+mod need;
 mod project;
 mod scene;
 pub mod simd;
@@ -25,6 +26,7 @@ use std::borrow::Cow;
 use std::time::Instant;
 
 pub use detail::Detail;
+pub use need::{Machine, Need};
 use simd::{InstructionSet, Simd};
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
@@ -78,6 +80,22 @@ impl CpuRenderer {
     /// unspecified. Faster: a pixel ends where half of its light does.
     pub fn set_depth_alone(&mut self, is_alone: bool) {
         self.depth_alone = is_alone;
+    }
+
+    /// Counts what the last image of [`Rasterizer::render`], of a size [px], needed; takes many times as long as it.
+    pub fn need(&self, size_px: [usize; 2]) -> Need {
+        let Buffers { visible, projected, sorter, bins, .. } = &self.buffers;
+        Need {
+            projected: (visible.len() * scene::BLOCK) as u64,
+            visible: sorter.order().len() as u64,
+            harmonics_bytes: (self.parts[0].coefficients * 3 * 2) as u64,
+            ..need::count(&projected.splats, bins, size_px)
+        }
+    }
+
+    /// Measures what this machine does at most: with this renderer's instruction set, and memory of some bytes.
+    pub fn machine(&self, bytes: usize) -> Machine {
+        Machine::measure(self.instructions, bytes)
     }
 
     fn with_instructions(scene: Scene<'_>, detail: Detail, instructions: InstructionSet) -> Self {
