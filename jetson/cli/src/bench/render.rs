@@ -172,7 +172,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
     let (mut renderer, reason) = if args.limits {
         let scene = Scene::from(&loaded.splats);
         let renderer = CpuRenderer::with_detail(scene, args.detail.of(&scene));
-        (Renderer::Processor(renderer), "whose limits were asked for".to_owned())
+        (Renderer::Processor(Box::new(renderer)), "whose limits were asked for".to_owned())
     } else {
         let Chosen { rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
         (Renderer::Chosen(rasterizer), reason)
@@ -268,14 +268,14 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
 
 /// A renderer whose limits can be told, or any.
 enum Renderer {
-    Processor(CpuRenderer),
+    Processor(Box<CpuRenderer>),
     Chosen(Box<dyn Rasterizer>),
 }
 
 impl Renderer {
     fn rasterizer(&mut self) -> &mut dyn Rasterizer {
         match self {
-            Self::Processor(renderer) => renderer,
+            Self::Processor(renderer) => renderer.as_mut(),
             Self::Chosen(rasterizer) => rasterizer.as_mut(),
         }
     }
