@@ -91,8 +91,11 @@ export class WallFlight {
     const { state, arena } = this;
     if (!state) return;
     const phase = state.report?.phase ?? "connecting";
-    const count = arena?.stages.length ?? 0;
-    setText(this.stages, count ? `${this.passed.size}/${count}` : "");
+    // The goal is the last stage, as in the standings.
+    const goal = arena?.goal_m ? 1 : 0;
+    const reached = state.outcome?.outcome === "finished" ? goal : 0;
+    const count = (arena?.stages.length ?? 0) + goal;
+    setText(this.stages, count ? `${this.passed.size + reached}/${count}` : "");
     setText(this.clock, state.outcome?.title ?? (state.flight_s == null ? (PHASES[phase] ?? PHASES.connecting)[1] : clockText(state.flight_s)));
     this.element.dataset.tone = state.outcome?.tone ?? "";
   }
