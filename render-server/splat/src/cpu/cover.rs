@@ -68,6 +68,21 @@ pub(super) struct Ellipse<S: Simd> {
 }
 
 impl<S: Simd> Ellipse<S> {
+    /// The same ellipse in every lane.
+    #[inline(always)]
+    fn of(s: S, splat: &Splat2d) -> Self {
+        Self {
+            mean_x: s.splat(splat.mean_x),
+            mean_y: s.splat(splat.mean_y),
+            shear: s.splat(splat.shear),
+            width: s.splat(splat.width),
+            scale_y: s.splat(splat.scale_y),
+            level: s.splat(splat.level),
+            tip_y: s.splat(splat.tip_y),
+            extent_y: s.splat(splat.extent_y),
+        }
+    }
+
     /// Returns what the ellipse covers of a band of blocks whose first row of pixels is `top`.
     #[inline(always)]
     fn span(&self, s: S, top: S::F) -> Span<S> {
@@ -156,18 +171,8 @@ impl<S: Simd> Bands<S> {
     pub(super) fn new(s: S, splat: &Splat2d, top: f32) -> Self {
         const LANE: [f32; 16] =
             [0., 1., 2., 3., 4., 5., 6., 7., 8., 9., 10., 11., 12., 13., 14., 15.];
-        let ellipse = Ellipse {
-            mean_x: s.splat(splat.mean_x),
-            mean_y: s.splat(splat.mean_y),
-            shear: s.splat(splat.shear),
-            width: s.splat(splat.width),
-            scale_y: s.splat(splat.scale_y),
-            level: s.splat(splat.level),
-            tip_y: s.splat(splat.tip_y),
-            extent_y: s.splat(splat.extent_y),
-        };
         let height = s.splat(block_height(S::LANES) as f32);
-        Self(ellipse.span(s, s.mul_add(s.load(&LANE), height, s.splat(top))))
+        Self(Ellipse::of(s, splat).span(s, s.mul_add(s.load(&LANE), height, s.splat(top))))
     }
 
     /// Returns the bits of the bands' blocks of a column of tiles, for [`Self::of_row`]. `left` is its first pixel.

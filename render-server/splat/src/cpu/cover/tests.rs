@@ -63,19 +63,9 @@ impl Kernel for Small<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> [[u32; 4]; 4] {
         let Self(splat, [left, top]) = self;
-        let ellipse = Ellipse {
-            mean_x: s.splat(splat.mean_x),
-            mean_y: s.splat(splat.mean_y),
-            shear: s.splat(splat.shear),
-            width: s.splat(splat.width),
-            scale_y: s.splat(splat.scale_y),
-            level: s.splat(splat.level),
-            tip_y: s.splat(splat.tip_y),
-            extent_y: s.splat(splat.extent_y),
-        };
         let height = block_height(S::LANES);
         let corner = [s.splat((left * BLOCK_WIDTH) as f32), s.splat((top * height) as f32)];
-        let halves = window(s, &ellipse, corner, [64, 64]).map(|half| {
+        let halves = window(s, &Ellipse::of(s, splat), corner, [64, 64]).map(|half| {
             let mut lanes = [0.0; 16];
             s.store(half, &mut lanes);
             lanes[0] as u32
