@@ -94,7 +94,13 @@ fn ask(page: &ServerPage<'_>, args: &LabDayArgs, path: &str) -> Result<Vec<u8>> 
     let (status, body) = page.get(path)?;
     match status {
         200 => Ok(body),
-        401 | 403 => bail!("{} opens this for its instructor alone: give --key", args.page),
+        401 | 403 => {
+            let todo = match args.key {
+                Some(_) => "the --key that was given is another: page-keys.toml has it",
+                None => "give --key",
+            };
+            bail!("{} opens this for its instructor alone: {todo}", args.page)
+        }
         404 => {
             bail!("{} has no lab day: it is no VizFlyt server, or one from before it", args.page)
         }
