@@ -111,6 +111,10 @@ struct Limits {
     bytes_g: f64,
     /// (Pixel, splat) pairs of an image, the mean over the cameras.
     evaluations: u64,
+    /// Of the lanes that blending must take along, those that do such a pair.
+    lanes_used: f64,
+    /// Of the (tile, splat) pairs, those before their tile's last pixel ends.
+    pairs_used: f64,
 }
 
 #[derive(Debug, Serialize)]
@@ -285,8 +289,10 @@ impl Renderer {
 fn limits(renderer: &CpuRenderer, needs: &[Need]) -> Limits {
     let count = needs.len().max(1) as u64;
     // As much memory as an image takes.
-    let bytes = needs.iter().map(Need::bytes).sum::<u64>() / count;
-    let machine = renderer.machine(bytes as usize);
+    let sum = |of: fn(&Need) -> u64| needs.iter().map(of).sum::<u64>();
+    let share = |part: u64, whole: u64| part as f64 / whole.max(1) as f64;
+    let machine = renderer.machine((sum(Need::bytes) / count) as usize);
+    let lanes = machine.lanes as u64;
     let bounds: Vec<PassTimes> = needs.iter().map(|need| need.bound(&machine)).collect();
     let mean = |of: fn(&PassTimes) -> f32| bounds.iter().map(of).sum::<f32>() / count as f32;
     Limits {
@@ -302,7 +308,9 @@ fn limits(renderer: &CpuRenderer, needs: &[Need]) -> Limits {
         vector_operations_g: machine.operations_per_s / 1e9,
         lanes: machine.lanes,
         bytes_g: machine.bytes_per_s / 1e9,
-        evaluations: needs.iter().map(|need| need.evaluations).sum::<u64>() / count,
+        evaluations: sum(|need| need.evaluations) / count,
+        lanes_used: share(sum(|need| need.evaluations), sum(|need| need.vectors) * lanes),
+        pairs_used: share(sum(|need| need.pairs_used), sum(|need| need.pairs)),
     }
 }
 
@@ -359,6 +367,11 @@ fn print(f: &Figures) {
             limits.vector_operations_g,
             limits.lanes,
             limits.bytes_g
+        );
+        print_fmt!(
+            "            of the lanes {:.0} % are such a pixel; of the tile pairs {:.0} % come before their tile's end",
+            limits.lanes_used * 1e2,
+            limits.pairs_used * 1e2
         );
     }
     if let Some(EnvironmentFigures { name, median_ms, effects_median_ms, ratio }) = &f.environment {

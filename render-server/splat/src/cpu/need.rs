@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 
 use super::bin::{Bins, Entry, TILE};
+use super::cover::{BLOCK_WIDTH, bands, block_height};
 use super::project::{MIN_LEVEL, Splat2d};
 use super::simd::{InstructionSet, Kernel, Simd};
 use crate::PassTimes;
@@ -27,6 +28,9 @@ pub struct Need {
     pub pairs_used: u64,
     /// (Pixel, splat) pairs that change a pixel before it ends.
     pub evaluations: u64,
+    /// Vectors of pixels, one a block, of which the renderer does at least one pixel's evaluation: those of its lanes that
+    /// are no evaluations are idle.
+    pub vectors: u64,
     /// Pixels.
     pub pixels: u64,
 }
@@ -159,8 +163,13 @@ impl Kernel for Multiply {
     }
 }
 
-/// Counts what blending needs of lists of `splats`, on an image of a size [px].
-pub(super) fn count(splats: &[Splat2d], bins: &Bins, [width_px, height_px]: [usize; 2]) -> Need {
+/// Counts what blending needs of lists of `splats`, on an image of a size [px], with vectors of so many lanes.
+pub(super) fn count(
+    splats: &[Splat2d],
+    bins: &Bins,
+    [width_px, height_px]: [usize; 2],
+    lanes: usize,
+) -> Need {
     let tiles = bins.tiles_x * bins.tiles_y;
     let count = |tile: usize| {
         let origin = [tile % bins.tiles_x * TILE, tile / bins.tiles_x * TILE];
@@ -176,15 +185,19 @@ pub(super) fn count(splats: &[Splat2d], bins: &Bins, [width_px, height_px]: [usi
             }
             need.pairs_used += 1;
             let splat = &splats[Entry::of(entry).slot];
+            let mut blocks = 0u32;
             live.retain(|&pixel| {
                 let level = level(splat, [origin[0] + pixel % TILE, origin[1] + pixel / TILE]);
                 if level <= MIN_LEVEL {
                     return true;
                 }
                 need.evaluations += 1;
+                let band = pixel / TILE / block_height(lanes);
+                blocks |= 1 << (pixel % TILE / BLOCK_WIDTH * bands(lanes) + band);
                 transmittance[pixel] *= 1.0 - level.exp2().min(ALPHA_MAX as f32);
                 transmittance[pixel] > TRANSMITTANCE_MIN as f32
             });
+            need.vectors += u64::from(blocks.count_ones());
         }
         need
     };
@@ -193,6 +206,7 @@ pub(super) fn count(splats: &[Splat2d], bins: &Bins, [width_px, height_px]: [usi
         pairs: a.pairs + b.pairs,
         pairs_used: a.pairs_used + b.pairs_used,
         evaluations: a.evaluations + b.evaluations,
+        vectors: a.vectors + b.vectors,
         pixels: a.pixels.max(b.pixels),
         ..a
     })
@@ -236,6 +250,9 @@ mod tests {
         let (need, image) = need_of(&[(2.0, 0.8)]);
         let shown = image.alpha.iter().filter(|&&alpha| alpha > 0.0).count() as u64;
         assert!(shown > 500 && need.evaluations == shown, "{need:?}, shown {shown}");
+        // The vectors of a round splat are mostly its own.
+        let lanes = CpuRenderer::new(&Splats::default()).machine(1 << 16).lanes as u64;
+        assert!(need.vectors * lanes >= shown && need.vectors * lanes < 2 * shown, "{need:?}");
         assert_eq!((need.visible, need.pixels, need.pairs), (1, 80 * 60, need.pairs_used));
     }
 
