@@ -1,7 +1,7 @@
 //! Pass 2: the splats of visible blocks onto the image plane.
 //!
 //! Budget: 52 bytes read per splat of a visible block, its harmonics where a lane of its vector
-//! survives; 48 bytes written per survivor. Some 4 ns per splat and thread without harmonics.
+//! survives; 76 bytes written per survivor. Some 4 ns per splat and thread without harmonics.
 //!
 //! A projected Gaussian is kept in the form that is cheap and stable to evaluate. With covariance
 //! `[a b; b c]` and `det = a c - b^2`,
