@@ -53,8 +53,10 @@ impl Lab {
 
     /// Changes the day; `change` gets the time, ms since 1970. It is written with the next [`Self::keep`].
     pub(super) fn change<T>(&self, change: impl FnOnce(&mut LabDay, u64) -> T) -> T {
+        let mut day = lock(&self.day);
+        // While the day is held: whoever takes this back and then looks sees the change.
         self.is_changed.store(true, Ordering::Relaxed);
-        change(&mut lock(&self.day), unix_ms())
+        change(&mut day, unix_ms())
     }
 
     /// Takes what the server measures again and again; only what is news is written before the end.
@@ -66,7 +68,8 @@ impl Lab {
     /// Writes all, at the end.
     pub(crate) fn close(&self) {
         self.is_changed.store(true, Ordering::Relaxed);
-        self.keep();
+        // It has been told.
+        let _ = self.keep();
     }
 
     /// Says whether a vehicle may take off now, by the order of take-off.
@@ -79,23 +82,27 @@ impl Lab {
         self.look(|day| day.order.may_start(vehicle, stand))
     }
 
-    /// Writes what has changed; returns once it is on the disk. What cannot be written is told, and tried again.
-    pub(crate) fn keep(&self) {
-        let Some(file) = &self.file else { return };
+    /// Writes what has changed; returns once it is on the disk.
+    ///
+    /// # Errors
+    /// Why it is not; it is tried again with the next call.
+    pub(crate) fn keep(&self) -> io::Result<()> {
+        let Some(file) = &self.file else { return Ok(()) };
         let _one = lock(&self.writing);
         if !self.is_changed.swap(false, Ordering::Relaxed) {
-            return;
+            return Ok(());
         }
         let bytes = self.look(LabDay::to_bytes);
-        if let Err(error) = write(file, &bytes) {
+        write(file, &bytes).inspect_err(|error| {
             self.is_changed.store(true, Ordering::Relaxed);
             warn!("the lab day is not kept: {}: {error}", file.display());
-        }
+        })
     }
 
     /// Begins another day; the old one's file stays beside it, by its date.
     pub(super) fn begin_anew(&self, by: &str) {
-        self.keep();
+        // What it could not write has been told, and the new day takes its place.
+        let _ = self.keep();
         let began_unix_ms = self.look(|day| day.began_unix_ms);
         if let Some(file) = &self.file {
             let Civil { year, month, day, hour, minute, second } =
@@ -166,7 +173,12 @@ fn write(file: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut new = File::create(&beside)?;
     new.write_all(bytes)?;
     new.sync_all()?;
-    fs::rename(&beside, file)
+    fs::rename(&beside, file)?;
+    // The new name, too, outlasts a power cut.
+    File::open(
+        file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new(".")),
+    )?
+    .sync_all()
 }
 
 /// A full day has a tenth of it.
@@ -186,14 +198,14 @@ mod tests {
             day.record("", CheckId::Net, Finding::of("signed".to_owned(), &[]), "Ada", now)
         });
         lab.change(|day, now| day.queue.book("ants", "wasp", now)).unwrap();
-        lab.keep();
+        lab.keep().unwrap();
         let again = Lab::open(Some(file.clone()), None);
         assert_eq!(again.look(Clone::clone), lab.look(Clone::clone));
         assert_eq!(again.look(|day| day.state("", CheckId::Net, unix_ms())), State::Ok);
         // Another day: the former one's file stays.
         again.change(|day, _| day.set_separation(Some(1.5))).unwrap();
         again.begin_anew("Ada");
-        again.keep();
+        again.keep().unwrap();
         let third = Lab::open(Some(file.clone()), None);
         assert_eq!(
             third.look(|day| (day.queue.bookings().len(), day.separation_m)),
@@ -212,7 +224,41 @@ mod tests {
         assert_eq!(lab.look(|day| day.queue.bookings().len()), 0);
         assert!(!file.exists() && file.with_extension("damaged").exists());
         lab.change(|day, now| day.tell("go on".to_owned(), now));
-        lab.keep();
+        lab.keep().unwrap();
         assert!(file.exists());
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_told_and_tried_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let blocked = folder.path().join("full");
+        fs::write(&blocked, b"").unwrap();
+        let lab = Lab::open(Some(blocked.join("lab-day.json")), None);
+        lab.change(|day, now| day.tell("a day".to_owned(), now));
+        assert!(lab.keep().is_err() && lab.keep().is_err());
+        fs::remove_file(&blocked).unwrap();
+        lab.keep().unwrap();
+        assert!(blocked.join("lab-day.json").exists());
+    }
+
+    #[test]
+    fn what_is_changed_while_another_writes_is_on_the_disk_when_it_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("lab-day.json");
+        let lab = Lab::open(Some(file.clone()), None);
+        std::thread::scope(|scope| {
+            for who in ["ants", "bees", "cats"] {
+                let (lab, file) = (&lab, &file);
+                scope.spawn(move || {
+                    for n in 0..60 {
+                        let text = format!("{who} {n}.");
+                        lab.change(|day, now| day.tell(text.clone(), now));
+                        lab.keep().unwrap();
+                        let kept = fs::read_to_string(file).unwrap();
+                        assert!(kept.contains(&text), "{text} is lost");
+                    }
+                });
+            }
+        });
     }
 }

@@ -355,12 +355,15 @@ async fn apply(
     let page = page.clone();
     let done = tokio::task::spawn_blocking(move || {
         let done = order(&page);
-        page.lab.keep();
-        done
+        (done, page.lab.keep())
     });
     match done.await {
-        Ok(Ok(said)) => (StatusCode::OK, said).into_response(),
-        Ok(Err(why)) => (StatusCode::CONFLICT, why).into_response(),
+        Ok((Ok(said), Ok(()))) => (StatusCode::OK, said).into_response(),
+        Ok((Ok(said), Err(error))) => {
+            let text = format!("{said}, but it is not on the disk: {error}; it is tried again");
+            (StatusCode::INSUFFICIENT_STORAGE, text).into_response()
+        }
+        Ok((Err(why), _)) => (StatusCode::CONFLICT, why).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
