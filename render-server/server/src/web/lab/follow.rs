@@ -9,7 +9,7 @@ use tokio::time::{MissedTickBehavior, interval};
 use vizflyt_protocol::messages::{EventKind, FlightPhase};
 use vizflyt_protocol::time::ServerTime;
 
-use super::keep::Lab;
+use super::keep::{Keeper, Lab};
 use crate::clock;
 use crate::flights::events::Origin;
 use crate::flights::lab_day::checks::{self, Traffic};
@@ -26,6 +26,7 @@ pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {
     let vehicles = &rooms.flights.vehicles;
     let mut watches: Vec<_> = vehicles.iter().map(|vehicle| VehicleWatch::of(vehicle)).collect();
     let mut separation = SeparationWatch::default();
+    let mut keeper = Keeper::default();
     let mut looks = interval(Duration::from_millis(20));
     looks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     for n in 1_u64.. {
@@ -40,9 +41,7 @@ pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {
             }
         }
         if n.is_multiple_of(MEASURE_LOOKS) {
-            let lab = lab.clone();
-            // Waits for the disk.
-            let _ = tokio::task::spawn_blocking(move || lab.keep()).await;
+            keeper.begin(&lab);
         }
     }
 }

@@ -3,10 +3,11 @@
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use tokio::task::JoinHandle;
 use tracing::warn;
 use vizflyt_protocol::time::Civil;
 
@@ -181,6 +182,21 @@ fn write(file: &Path, bytes: &[u8]) -> io::Result<()> {
     .sync_all()
 }
 
+/// Writes beside what must not wait for a disk.
+#[derive(Debug, Default)]
+pub(super) struct Keeper(Option<JoinHandle<()>>);
+
+impl Keeper {
+    /// Begins to write what has changed, unless the last time is not over yet.
+    pub(super) fn begin(&mut self, lab: &Arc<Lab>) {
+        if self.0.as_ref().is_none_or(JoinHandle::is_finished) {
+            let lab = lab.clone();
+            // It tells by itself what it cannot write.
+            self.0 = Some(tokio::task::spawn_blocking(move || drop(lab.keep())));
+        }
+    }
+}
+
 /// A full day has a tenth of it.
 const MAX_BYTES: u64 = 4 << 20;
 
@@ -260,5 +276,22 @@ mod tests {
                 });
             }
         });
+    }
+
+    #[tokio::test]
+    async fn a_disk_that_stands_still_keeps_nobody() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("lab-day.json");
+        let lab = Arc::new(Lab::open(Some(file.clone()), None));
+        lab.change(|day, now| day.tell("a day".to_owned(), now));
+        let mut keeper = Keeper::default();
+        let stalled = lock(&lab.writing);
+        for _ in 0..3 {
+            keeper.begin(&lab);
+        }
+        assert!(!file.exists());
+        drop(stalled);
+        keeper.0.take().unwrap().await.unwrap();
+        assert!(file.exists());
     }
 }
