@@ -1,15 +1,18 @@
 //! Pass 5: the pixels of each tile, from near to far.
 //!
 //! Budget: 48 bytes read per pair that is not behind opaque ones, 16 written per pixel (20 with
-//! ids). Bound by arithmetic: some 20 operations per pair and pixel of the tile; a thread has four pixels, for whom it fetches each splat once.
+//! ids). Bound by arithmetic: some 10 operations per splat and pixel of a patch that it reaches, 25 where
+//! it is seen.
 
 use super::buffers::Buffers;
-use super::device::{Device, Groups, Kernel};
+use super::device::{Device, Groups, Kernel, Slice};
 
-const SOURCE: &str = concat!(include_str!("common.wgsl"), include_str!("blend.wgsl"));
+const SOURCE: &str =
+    concat!(include_str!("common.wgsl"), include_str!("ellipse.wgsl"), include_str!("blend.wgsl"));
 
-/// Workgroups along x; `GRID` in `blend.wgsl`.
-const GRID: u32 = 32_768;
+/// What pixels and ids are written to.
+#[derive(Debug)]
+pub(super) struct Output(wgpu::BindGroup);
 
 /// The pass.
 #[derive(Debug)]
@@ -29,24 +32,27 @@ impl Blend {
             &[
                 (0, &b.tick),
                 (1, &b.views),
-                (2, &b.shapes),
-                (3, &b.extents),
-                (4, &b.colours),
-                (5, &b.slots[b.capacity.tile_digits as usize % 2]),
-                (6, &b.lists),
-                (7, &b.pixels),
-                (8, &b.ids),
+                (2, &b.projected),
+                (3, &b.pairs[0]),
+                (4, &b.firsts),
+                (5, &b.ends),
             ],
         )
+    }
+
+    /// Binds what pixels and ids are written to.
+    pub(super) fn bind_output(&self, device: &Device, pixels: Slice<'_>, ids: Slice<'_>) -> Output {
+        Output(device.bind_group(&self.kernel, 1, &[(0, pixels), (1, ids)]))
     }
 
     pub(super) fn run(
         &self,
         pass: &mut wgpu::ComputePass<'_>,
         bindings: &wgpu::BindGroup,
+        output: &Output,
         tiles: u32,
     ) {
-        let groups = Groups::Known(tiles.min(GRID), tiles.div_ceil(GRID));
-        self.kernel.run(pass, bindings, groups);
+        pass.set_bind_group(1, &output.0, &[]);
+        self.kernel.run(pass, bindings, Groups::of_tiles(tiles));
     }
 }

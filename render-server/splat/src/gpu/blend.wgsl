@@ -1,17 +1,18 @@
-// Pass 5: the pixels of each tile, from near to far. One workgroup per tile; each thread has four
-// pixels of a row, so that what it fetches of a splat serves four times. Lists are taken in batches
-// through workgroup memory, until every pixel of the tile has ended.
+// Pass 5: the pixels of each tile, from near to far. One workgroup per tile, a thread per pixel. Lists are
+// taken in batches through workgroup memory, until every pixel of the tile has ended. The thread that
+// fetches a splat also finds which of the tile's eight patches of 8x4 pixels it reaches: threads of a patch,
+// which are neighbours, walk the splats of their patch alone.
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
-@group(0) @binding(2) var<storage, read> shapes: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> extents: array<vec4<f32>>;
-@group(0) @binding(4) var<storage, read> colours: array<vec4<f32>>;
-@group(0) @binding(5) var<storage, read> slots: array<u32>;
-@group(0) @binding(6) var<storage, read> lists: array<vec2<u32>>;
+@group(0) @binding(2) var<storage, read> projected: array<Projected>;
+// Depth as bits, slot.
+@group(0) @binding(3) var<storage, read> pairs: array<vec2<u32>>;
+@group(0) @binding(4) var<storage, read> firsts: array<u32>;
+@group(0) @binding(5) var<storage, read> ends: array<u32>;
 // Red and green as halves; blue as half, alpha in 65535ths; expected depth; median depth.
-@group(0) @binding(7) var<storage, read_write> pixels: array<vec4<u32>>;
-@group(0) @binding(8) var<storage, read_write> ids: array<u32>;
+@group(1) @binding(0) var<storage, read_write> pixels: array<vec4<u32>>;
+@group(1) @binding(1) var<storage, read_write> ids: array<u32>;
 
 const ALPHA_MAX = 0.99;
 const TRANSMITTANCE_MIN = 1e-4;
@@ -21,17 +22,49 @@ const COLOUR_MAX = 65000.0;
 const GRID = 32768u;
 
 const NO_PAIR = 0xffffffffu;
-const THREADS = 64u;
-const BATCH = 128u;
+const THREADS = 256u;
+const BATCH = 256u;
+/// Threads of a patch, columns and rows of it, patches across a tile, and in a tile.
+const PATCH = 32u;
+const PATCH_SIZE = vec2(8u, 4u);
+const ACROSS = 2u;
+const PATCHES = 8u;
+/// What rounding may move an ellipse's edge by. [px]
+const SLACK = 0.01;
 
-var<workgroup> batch_shapes: array<vec4<f32>, BATCH>;
-var<workgroup> batch_extents: array<vec4<f32>, BATCH>;
-var<workgroup> batch_colours: array<vec4<f32>, BATCH>;
-/// Threads all of whose pixels have ended.
+var<workgroup> batch: array<Projected, BATCH>;
+/// Bit b of word w, patch p: splat 32 w + b of the batch reaches it. Patch by patch.
+var<workgroup> reached: array<atomic<u32>, 64>;
+/// Threads whose pixel has ended.
 var<workgroup> ended: atomic<u32>;
 var<workgroup> ended_before: u32;
+var<workgroup> own_list: vec2<u32>;
 
-@compute @workgroup_size(64)
+/// Notes which patches of a tile a splat of the batch reaches.
+fn note_patches(i: u32, splat: Projected, origin: vec2<f32>) {
+    let extent = splat.extent;
+    let reach = extent.y - MIN_LEVEL;
+    let e = Ellipse(splat.shape.xy, splat.shape.z, vec2(splat.shape.w, extent.x), reach, extent.w);
+    let extent_y = sqrt(reach / e.falloff.y) + SLACK;
+    for (var row = 0u; row < PATCHES / ACROSS; row++) {
+        let top = origin.y + f32(row * PATCH_SIZE.y) + 0.5;
+        let bottom = top + f32(PATCH_SIZE.y - 1u);
+        if e.mean.y + extent_y < top || e.mean.y - extent_y > bottom {
+            continue;
+        }
+        let edges = band(e, top, bottom) + vec2(-SLACK, SLACK);
+        for (var column = 0u; column < ACROSS; column++) {
+            let left = origin.x + f32(column * PATCH_SIZE.x) + 0.5;
+            let right = left + f32(PATCH_SIZE.x - 1u);
+            if edges.x <= right && edges.y >= left {
+                let patch_of = row * ACROSS + column;
+                atomicOr(&reached[patch_of * (BATCH / 32u) + i / 32u], 1u << (i % 32u));
+            }
+        }
+    }
+}
+
+@compute @workgroup_size(256)
 fn blend(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
@@ -46,103 +79,96 @@ fn blend(
     }
     let size = views[camera * tick.parts].size;
     let origin = vec2((tile - size.w) % size.z, (tile - size.w) / size.z) * TILE;
-    // The first of four.
-    let pixel = origin + vec2(thread % 4u * 4u, thread / 4u);
-    let at_x = vec4<f32>(vec4(pixel.x) + vec4(0u, 1u, 2u, 3u)) + 0.5;
-    let at_y = f32(pixel.y) + 0.5;
+    let own_patch = thread / PATCH;
+    let pixel = origin + vec2(own_patch % ACROSS, own_patch / ACROSS) * PATCH_SIZE
+        + vec2(thread % PATCH_SIZE.x, thread % PATCH / PATCH_SIZE.x);
+    let at = vec2<f32>(pixel) + 0.5;
     // Pixels beyond the image's edge have ended before they start.
-    let exists = vec4(pixel.x) + vec4(0u, 1u, 2u, 3u) < vec4(select(0u, size.x, pixel.y < size.y));
+    let exists = all(pixel < size.xy);
     var goes_on = exists;
     if thread == 0u {
         atomicStore(&ended, 0u);
+        own_list = vec2(firsts[tile], ends[tile]);
     }
-    workgroupBarrier();
-    if !any(exists) {
+    let list = workgroupUniformLoad(&own_list);
+    if !exists {
         atomicAdd(&ended, 1u);
     }
 
-    var red = vec4(0.0);
-    var green = vec4(0.0);
-    var blue = vec4(0.0);
-    var weighted_z = vec4(0.0);
+    var seen = vec4(0.0);
     // The pair at which transmittance fell to one half; NO_PAIR where it did not.
-    var median = vec4(NO_PAIR);
-    var transmittance = vec4(1.0);
-    let list = lists[tile];
+    var median = NO_PAIR;
+    var transmittance = 1.0;
     for (var first = list.x; first < list.y; first += BATCH) {
+        // Nobody reads the last batch any more.
         workgroupBarrier();
         if thread == 0u {
             ended_before = atomicLoad(&ended);
         }
+        if thread < 64u {
+            atomicStore(&reached[thread], 0u);
+        }
         if workgroupUniformLoad(&ended_before) == THREADS {
             break;
         }
-        for (var i = thread; i < min(BATCH, list.y - first); i += THREADS) {
-            let slot = slots[first + i];
-            batch_shapes[i] = shapes[slot];
-            batch_extents[i] = extents[slot];
-            batch_colours[i] = colours[slot];
+        if first + thread < list.y {
+            let splat = projected[pairs[first + thread].y];
+            batch[thread] = splat;
+            note_patches(thread, splat, vec2<f32>(origin));
         }
         workgroupBarrier();
-        if any(goes_on) {
-            let count = min(BATCH, list.y - first);
-            for (var i = 0u; i < count; i++) {
-                let shape = batch_shapes[i];
-                let extent = batch_extents[i];
-                let dy = at_y - shape.y;
-                let dx = at_x - (shape.x + shape.z * dy);
+        for (var word = 0u; word < BATCH / 32u && goes_on; word++) {
+            var left = atomicLoad(&reached[own_patch * (BATCH / 32u) + word]);
+            while left != 0u {
+                let i = word * 32u + firstTrailingBit(left);
+                left &= left - 1u;
+                let shape = batch[i].shape;
+                let extent = batch[i].extent;
+                let dy = at.y - shape.y;
+                let dx = at.x - (shape.x + shape.z * dy);
                 let level = (extent.y - extent.x * dy * dy) - shape.w * dx * dx;
-                let hit = goes_on & (level > vec4(MIN_LEVEL));
-                if !any(hit) {
-                    continue;
-                }
-                let colour = batch_colours[i];
-                let alpha = select(vec4(0.0), min(exp2(level), vec4(ALPHA_MAX)), hit);
-                let after = transmittance - alpha * transmittance;
-                // A pixel ends before the splat that would bring it here.
-                goes_on = goes_on & (after > vec4(TRANSMITTANCE_MIN));
-                let weight = select(vec4(0.0), alpha * transmittance, goes_on);
-                red += weight * colour.x;
-                green += weight * colour.y;
-                blue += weight * colour.z;
-                weighted_z += weight * colour.w;
-                let halves = goes_on & (transmittance > vec4(0.5)) & (after <= vec4(0.5));
-                median = select(median, vec4(first + i), halves);
-                transmittance = select(transmittance, after, goes_on);
-                if !any(goes_on) {
-                    atomicAdd(&ended, 1u);
-                    break;
+                if level > MIN_LEVEL {
+                    let alpha = min(exp2(level), ALPHA_MAX);
+                    let after = transmittance - alpha * transmittance;
+                    // A pixel ends before the splat that would bring it here.
+                    if after <= TRANSMITTANCE_MIN {
+                        goes_on = false;
+                        atomicAdd(&ended, 1u);
+                        break;
+                    }
+                    seen += alpha * transmittance * batch[i].colour;
+                    if transmittance > 0.5 && after <= 0.5 {
+                        median = first + i;
+                    }
+                    transmittance = after;
                 }
             }
         }
     }
 
-    let background = views[camera * tick.parts].background;
-    let place = views[camera * tick.parts].flags.z + pixel.y * size.x + pixel.x;
-    for (var i = 0u; i < 4u; i++) {
-        if exists[i] {
-            let alpha = 1.0 - transmittance[i];
-            let rgb = vec3(red[i], green[i], blue[i]) + transmittance[i] * background.xyz;
-            let shown = clamp(rgb, vec3(-COLOUR_MAX), vec3(COLOUR_MAX));
-            var expected = 0.0;
-            if alpha > 0.0 {
-                expected = weighted_z[i] / alpha;
-            }
-            var median_z = 0.0;
-            var id = 0u;
-            if median[i] != NO_PAIR {
-                let slot = slots[median[i]];
-                median_z = colours[slot].w;
-                id = bitcast<u32>(extents[slot].z) & 0xffffu;
-            }
-            let red_green = pack2x16float(shown.xy);
-            let blue_half = pack2x16float(vec2(shown.z, 0.0)) & 0xffffu;
-            let opacity = u32(alpha * 65535.0 + 0.5) << 16u;
-            let depths = vec2(bitcast<u32>(expected), bitcast<u32>(median_z));
-            pixels[place + i] = vec4(red_green, blue_half | opacity, depths);
-            if tick.has_ids != 0u {
-                ids[place + i] = id;
-            }
+    if exists {
+        let alpha = 1.0 - transmittance;
+        let rgb = seen.xyz + transmittance * views[camera * tick.parts].background.xyz;
+        let shown = clamp(rgb, vec3(-COLOUR_MAX), vec3(COLOUR_MAX));
+        var expected = 0.0;
+        if alpha > 0.0 {
+            expected = seen.w / alpha;
+        }
+        var median_z = 0.0;
+        var id = 0u;
+        if median != NO_PAIR {
+            let slot = pairs[median].y;
+            median_z = projected[slot].colour.w;
+            id = bitcast<u32>(projected[slot].extent.z);
+        }
+        let red_green = pack2x16float(shown.xy);
+        let blue_half = pack2x16float(vec2(shown.z, 0.0)) & 0xffffu;
+        let opacity = u32(alpha * 65535.0 + 0.5) << 16u;
+        let place = views[camera * tick.parts].flags.z + pixel.y * size.x + pixel.x;
+        let depths = vec2(bitcast<u32>(expected), bitcast<u32>(median_z));
+        pixels[place] = vec4(red_green, blue_half | opacity, depths);
+        if tick.has_ids != 0u {
+            ids[place] = id;
         }
     }
 }

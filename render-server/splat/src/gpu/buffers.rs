@@ -5,11 +5,10 @@
 //! what there is; the counts come back with the images, and where there was too little the buffers
 //! are grown and the tick is rendered again (`read.rs`).
 //!
-//! Memory: 68 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile, 16 (20 with objects)
-//! per pixel, and as much per pixel again for each of two staging buffers.
+//! Memory: 64 bytes per slot, 16 per pair, 4 per camera and block, 8 per tile; 16 (20 with objects)
+//! per pixel for each of two staging buffers, and once more where shaders cannot write these.
 
 use super::device::Device;
-use super::sort;
 use super::view::GpuView;
 use crate::blocks::BLOCK;
 
@@ -24,32 +23,27 @@ pub(super) struct Capacity {
     pub(super) pairs: u64,
     pub(super) tiles: u64,
     pub(super) pixels: u64,
-    /// Digits of a tile's number; not grown but equalled.
-    pub(super) tile_digits: u32,
 }
 
 impl Capacity {
     /// Returns the greatest that a device can give.
     pub(super) fn limit(binding_bytes: u64) -> Self {
-        // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
-        let slots = (binding_bytes / 16).min(65_535 * 256);
+        // One workgroup writes a region's pairs; there are 65535 of them at most.
+        let regions = (binding_bytes / PROJECTED_BYTES / BLOCK as u64).min(65_535);
         Self {
             views: binding_bytes / size_of::<GpuView>() as u64,
             // Ranks, and a number per workgroup.
             camera_blocks: (binding_bytes / 4 * 255 / 256).min(65_535 * 256),
-            regions: slots / BLOCK as u64,
-            // The counts of the sort take half a byte each; fewer than 65535 groups sort them.
-            pairs: (binding_bytes / 4).min(65_535 * sort::SORT_GROUP),
-            tiles: binding_bytes / 8,
+            regions,
+            pairs: binding_bytes / 8,
+            tiles: binding_bytes / 4 - 1,
             pixels: binding_bytes / 16,
-            tile_digits: 4,
         }
     }
 
     /// Whether it holds another.
     pub(super) fn holds(&self, other: &Self) -> bool {
         self.pairwise(other).iter().all(|(has, wants)| has >= wants)
-            && self.tile_digits == other.tile_digits
     }
 
     /// Whether a device can give it.
@@ -69,7 +63,6 @@ impl Capacity {
             pairs: grow(self.pairs, other.pairs, limit.pairs),
             tiles: grow(self.tiles, other.tiles, limit.tiles),
             pixels: grow(self.pixels, other.pixels, limit.pixels),
-            tile_digits: other.tile_digits,
         }
     }
 
@@ -94,22 +87,19 @@ pub(super) struct Buffers {
     pub(super) regions: wgpu::Buffer,
     pub(super) sizes: wgpu::Buffer,
     pub(super) dispatches: wgpu::Buffer,
-    pub(super) shapes: wgpu::Buffer,
-    pub(super) extents: wgpu::Buffer,
-    pub(super) colours: wgpu::Buffer,
-    pub(super) keys: [wgpu::Buffer; 2],
-    pub(super) order: [wgpu::Buffer; 2],
-    /// Of sorts.
-    pub(super) digits: wgpu::Buffer,
-    /// Tiles per splat.
-    pub(super) counts: wgpu::Buffer,
-    pub(super) tiles: [wgpu::Buffer; 2],
-    pub(super) slots: [wgpu::Buffer; 2],
-    pub(super) lists: wgpu::Buffer,
+    pub(super) projected: wgpu::Buffer,
+    pub(super) covers: wgpu::Buffer,
+    /// Splats per tile, and of all images; then each tile's first pair.
+    pub(super) firsts: wgpu::Buffer,
+    /// One past each tile's last pair.
+    pub(super) ends: wgpu::Buffer,
+    pub(super) pairs: [wgpu::Buffer; 2],
     pub(super) pixels: wgpu::Buffer,
     pub(super) ids: wgpu::Buffer,
 }
 
+/// Bytes of `Projected` of `common.wgsl`.
+const PROJECTED_BYTES: u64 = 48;
 /// Bytes of `sizes`.
 pub(super) const SIZES_BYTES: u64 = 32;
 
@@ -132,18 +122,13 @@ impl Buffers {
             ),
             sizes: device.buffer("sizes", SIZES_BYTES, counted | wgpu::BufferUsages::COPY_SRC),
             dispatches: device.buffer("dispatches", 64, counted | wgpu::BufferUsages::INDIRECT),
-            shapes: storage("shapes", slots * 4),
-            extents: storage("extents", slots * 4),
-            colours: storage("colours", slots * 4),
-            keys: [storage("keys", slots), storage("keys", slots)],
-            order: [storage("order", slots), storage("order", slots)],
-            digits: device.storage("digits", sort::count_bytes(slots.max(capacity.pairs))),
-            counts: storage("counts", slots + slots.div_ceil(256)),
-            tiles: [storage("tiles", capacity.pairs), storage("tiles", capacity.pairs)],
-            slots: [storage("slots", capacity.pairs), storage("slots", capacity.pairs)],
-            lists: storage("lists", capacity.tiles * 2),
-            pixels: source("pixels", capacity.pixels * 4),
-            ids: source("ids", if has_ids { capacity.pixels } else { 0 }),
+            projected: device.storage("projected", slots * PROJECTED_BYTES),
+            covers: storage("covers", slots * 4),
+            firsts: storage("firsts", capacity.tiles + 1),
+            ends: storage("ends", capacity.tiles),
+            pairs: [storage("pairs", capacity.pairs * 2), storage("pairs", capacity.pairs * 2)],
+            pixels: source("pixels", if device.maps_storage { 0 } else { capacity.pixels * 4 }),
+            ids: source("ids", if has_ids && !device.maps_storage { capacity.pixels } else { 0 }),
         }
     }
 }

@@ -55,3 +55,13 @@ const TILE = 16u;
 const MIN_LEVEL = -7.9943535;
 /// The key of a slot without a splat.
 const EMPTY = 0xffffffffu;
+
+/// A splat on the image plane. Training keeps the three in buffers of their own.
+struct Projected {
+    /// Mean x, y [px], shear, falloff along x [1/px^2].
+    shape: vec4<f32>,
+    /// Falloff along y, level, id, dy of the ellipse's rightmost point.
+    extent: vec4<f32>,
+    /// Red, green, blue, camera z [m].
+    colour: vec4<f32>,
+}

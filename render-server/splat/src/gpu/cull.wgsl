@@ -17,6 +17,7 @@ struct Block {
 // workgroup's number of regions, later its first.
 @group(0) @binding(3) var<storage, read_write> regions: array<u32>;
 @group(0) @binding(4) var<storage, read_write> sizes: array<u32>;
+// Workgroups of `emit`.
 @group(0) @binding(5) var<storage, read_write> dispatches: array<u32>;
 
 // Views by index, not by value: a copy indexed in a loop would go to memory.
@@ -82,8 +83,8 @@ fn place(@builtin(local_invocation_index) thread: u32) {
         sizes[REGIONS_WANTED] = carry;
         let slots = min(carry, tick.regions) * BLOCK;
         sizes[SLOTS] = slots;
-        dispatches[SORT_SLOTS] = (slots + SORT_GROUP - 1u) / SORT_GROUP;
-        dispatches[SORT_SLOTS + 1u] = 1u;
-        dispatches[SORT_SLOTS + 2u] = 1u;
+        dispatches[0] = slots / BLOCK;
+        dispatches[1] = 1u;
+        dispatches[2] = 1u;
     }
 }

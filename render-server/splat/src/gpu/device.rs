@@ -4,6 +4,7 @@
 //! place ([`Device::fault`]), asked after each tick; nothing panics.
 
 use std::future::Future;
+use std::num::NonZero;
 use std::pin::pin;
 use std::sync::{Arc, OnceLock};
 use std::task::{Context, Poll, Waker};
@@ -74,10 +75,11 @@ impl Adapter {
             max_storage_buffer_binding_size: best.max_storage_buffer_binding_size,
             ..wgpu::Limits::default()
         };
-        let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let wanted = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::MAPPABLE_PRIMARY_BUFFERS;
+        let features = adapter.features() & wanted;
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("vizflyt"),
-            required_features: timestamps,
+            required_features: features,
             required_limits: limits,
             ..wgpu::DeviceDescriptor::default()
         }))
@@ -98,7 +100,14 @@ impl Adapter {
             .min(budget.binding_bytes)
             // Indices into words are 32 bits wide; a limit of 4 GiB less a page keeps them so.
             .min(MAX_BINDING_BYTES);
-        Ok(Device { device, queue, fault, binding_bytes, has_timestamps: !timestamps.is_empty() })
+        Ok(Device {
+            device,
+            queue,
+            fault,
+            binding_bytes,
+            has_timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
+            maps_storage: features.contains(wgpu::Features::MAPPABLE_PRIMARY_BUFFERS),
+        })
     }
 }
 
@@ -111,6 +120,8 @@ pub(super) struct Device {
     /// Greatest size of a buffer that a shader sees.
     pub(super) binding_bytes: u64,
     pub(super) has_timestamps: bool,
+    /// Whether shaders can write what the host reads.
+    pub(super) maps_storage: bool,
 }
 
 impl Device {
@@ -174,20 +185,35 @@ impl Device {
         kernel: &Kernel,
         buffers: &[(u32, &wgpu::Buffer)],
     ) -> wgpu::BindGroup {
-        let entries: Vec<_> = buffers
+        let slices: Vec<_> = buffers.iter().map(|&(binding, b)| (binding, b.slice(..))).collect();
+        self.bind_group(kernel, 0, &slices)
+    }
+
+    /// Binds parts of buffers for a kernel's group.
+    pub(super) fn bind_group(
+        &self,
+        kernel: &Kernel,
+        group: u32,
+        slices: &[(u32, Slice<'_>)],
+    ) -> wgpu::BindGroup {
+        let entries: Vec<_> = slices
             .iter()
-            .map(|&(binding, buffer)| wgpu::BindGroupEntry {
-                binding,
-                resource: buffer.as_entire_binding(),
+            .map(|&(binding, slice)| {
+                let (buffer, offset) = (slice.buffer(), slice.offset());
+                let part = wgpu::BufferBinding { buffer, offset, size: NonZero::new(slice.size()) };
+                wgpu::BindGroupEntry { binding, resource: wgpu::BindingResource::Buffer(part) }
             })
             .collect();
         self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: None,
-            layout: &kernel.pipeline.get_bind_group_layout(0),
+            layout: &kernel.pipeline.get_bind_group_layout(group),
             entries: &entries,
         })
     }
 }
+
+/// Part of a buffer.
+pub(super) type Slice<'a> = wgpu::BufferSlice<'a>;
 
 /// A compiled entry point.
 #[derive(Debug)]
@@ -202,6 +228,14 @@ pub(super) enum Groups<'a> {
     Known(u32, u32),
     /// Counted by the device: three words of a buffer, from this word on.
     Counted(&'a wgpu::Buffer, u32),
+}
+
+impl Groups<'_> {
+    /// Returns one workgroup per tile; `GRID` of the shaders is how many lie along x at most.
+    pub(super) fn of_tiles(tiles: u32) -> Self {
+        const GRID: u32 = 32_768;
+        Self::Known(tiles.min(GRID), tiles.div_ceil(GRID))
+    }
 }
 
 impl Kernel {

@@ -3,21 +3,19 @@
 //! Data flow, the files in run order: `scene` packs and uploads once; `view` turns cameras and
 //! placements into numbers. Then, for all cameras of a tick in one submission: `cull` finds the
 //! blocks in view and gives each a region of slots, `project` brings their splats onto the image
-//! planes, `sort` orders them by depth, `bin` gives each 16x16-pixel tile its list, `blend` renders the
-//! tiles, `read` brings pixels home. `device` chooses the adapter; `buffers` is what passes share.
+//! planes and counts those of each 16x16-pixel tile (`cover.wgsl`), `bin` gives each tile its list, `sort` puts
+//! that in order of depth, `blend` renders the tiles, `read` brings pixels home. `device` chooses the
+//! adapter; `buffers` is what passes share.
 //!
 //! Nothing is read back in mid-frame: the device counts and dispatches on its own. What it counted
 //! comes back with the images; had it too little room, buffers grow and the tick is rendered again, so
 //! that no image ever lacks a splat. No kernel uses subgroup operations or waits for another
-//! workgroup, and the slots of regions are in order of the scene: the same tick gives the same
-//! images, bit for bit, on any adapter that rounds alike.
+//! workgroup. Slots of regions are in order of the scene, and lists are sorted by depth and slot: the same
+//! tick gives the same images, bit for bit, on any adapter that rounds alike.
 //!
-//! Memory: the formulas of `scene` and `buffers`. 5 M splats of degree 3, all in view of one camera
-//! at 640x480 with 20 M pairs: 0.74 + 0.35 + 0.33 + 0.02 GB.
+//! Memory: the formulas of `scene` and `buffers`.
 //!
-//! Budget per camera at 640x480, 1 M splats, some 300 k visible, 1 TB/s: cull and project 0.15 ms,
-//! sort 0.05, bin 0.1, blend 0.2, read 0.2: from bytes and operations, not measured on a card yet;
-//! `tests/gpu/table` measures.
+//! A dispatch costs a card some 6 us beside its work: seven of them render a tick.
 
 mod bin;
 mod blend;
@@ -41,7 +39,6 @@ use buffers::{Buffers, Capacity};
 use device::Device;
 use read::{Staging, Stamps};
 use scene::GpuScene;
-use sort::{Count, Pairs, Sort};
 use view::{GpuView, ImageOffset, Tick};
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
@@ -51,11 +48,9 @@ use crate::{Camera, Placement, RgbdImage, Scene};
 const TILE_PX: u32 = 16;
 /// Ticks that may be under way at once.
 const MAX_IN_FLIGHT: usize = 2;
-/// Digits of a depth: 32 bits.
-const DEPTH_BITS: u32 = 32;
-/// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
-const SLOTS: Count = Count { size: 1, groups: 0 };
-const VISIBLE: Count = Count { size: 2, groups: 4 };
+/// Cameras of a tick, and tiles along an image's side: what `Cover` of `cover.wgsl` has bits for.
+const MAX_CAMERAS: usize = 1 << 12;
+const MAX_SIDE_TILES: u32 = (1 << 10) - 1;
 
 /// What a renderer may use and starts with; the defaults suit every scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -100,8 +95,8 @@ pub struct GpuRenderer {
 struct Passes {
     cull: cull::Cull,
     project: project::Project,
-    sort: Sort,
     bin: bin::Bin,
+    sort: sort::Sort,
     blend: blend::Blend,
 }
 
@@ -111,9 +106,11 @@ struct Bound {
     buffers: Buffers,
     cull: cull::CullBindings,
     project: Vec<wgpu::BindGroup>,
-    sort: Vec<sort::Digit>,
     bin: bin::BinBindings,
+    sort: wgpu::BindGroup,
     blend: wgpu::BindGroup,
+    /// What it writes to where shaders cannot write what the host reads.
+    output: Option<blend::Output>,
 }
 
 /// A tick to be rendered.
@@ -151,8 +148,8 @@ impl GpuRenderer {
         let passes = Passes {
             cull: cull::Cull::new(&device),
             project: project::Project::new(&device),
-            sort: Sort::new(&device),
             bin: bin::Bin::new(&device),
+            sort: sort::Sort::new(&device),
             blend: blend::Blend::new(&device),
         };
         let stamps = Stamps::new(&device);
@@ -234,10 +231,19 @@ impl GpuRenderer {
     ) -> Result<(), SubmitError> {
         assert!(self.in_flight.len() < MAX_IN_FLIGHT, "two ticks are under way already");
         let began = Instant::now();
+        if cameras.len() > MAX_CAMERAS {
+            return Err(SubmitError::TooLarge(format!("{} cameras at once", cameras.len())));
+        }
         let mut places = Vec::with_capacity(cameras.len());
         let (mut tiles, mut pixels) = (0u64, 0u64);
         for camera in cameras {
             let k = &camera.intrinsics;
+            if k.width_px.max(k.height_px).div_ceil(TILE_PX) > MAX_SIDE_TILES {
+                return Err(SubmitError::TooLarge(format!(
+                    "an image of {}x{} has more than {MAX_SIDE_TILES} tiles along a side",
+                    k.width_px, k.height_px
+                )));
+            }
             places.push(ImageOffset { first_tile: tiles as u32, first_pixel: pixels as u32 });
             let across = k.width_px.div_ceil(TILE_PX);
             tiles += u64::from(across) * u64::from(k.height_px.div_ceil(TILE_PX));
@@ -250,11 +256,10 @@ impl GpuRenderer {
             pairs: u64::from(self.budget.pairs).min(self.limit.pairs),
             tiles,
             pixels,
-            // One number more than there are tiles: that of none.
-            tile_digits: sort::digits(u64::BITS - tiles.leading_zeros()),
         };
         self.reserve(&wanted)?;
-        let staging = Staging::for_pixels(self.spare.pop(), &self.device, pixels, self.has_ids());
+        let (old, blend) = (self.spare.pop(), &self.passes.blend);
+        let staging = Staging::for_pixels(old, &self.device, blend, pixels, self.has_ids());
         let tick = PendingTick {
             placements: placements.to_vec(),
             cameras: cameras.to_vec(),
@@ -274,7 +279,7 @@ impl GpuRenderer {
 
     /// Makes sure of buffers for what is wanted.
     fn reserve(&mut self, wanted: &Capacity) -> Result<(), SubmitError> {
-        if !wanted.is_within(&self.limit) || wanted.tile_digits > self.limit.tile_digits {
+        if !wanted.is_within(&self.limit) {
             return Err(SubmitError::TooLarge(format!(
                 "a tick needs {wanted:?}, and the graphics device has {:?}",
                 self.limit
@@ -289,19 +294,16 @@ impl GpuRenderer {
         let capacity = has.grown_to(wanted, &self.limit);
         let buffers = Buffers::new(&self.device, capacity, self.has_ids());
         let (device, passes) = (&self.device, &self.passes);
-        let pairs = Pairs {
-            keys: [&buffers.keys[0], &buffers.keys[1]],
-            values: [&buffers.order[0], &buffers.order[1]],
-            counts: &buffers.digits,
-            sizes: &buffers.sizes,
-        };
-        let order = &buffers.order[sort::digits(DEPTH_BITS) as usize % 2];
         self.bound = Some(Bound {
             cull: passes.cull.bind(device, &self.scene, &buffers),
             project: passes.project.bind(device, &self.scene, &buffers),
-            sort: passes.sort.bind(device, pairs, DEPTH_BITS, [SLOTS, VISIBLE], true),
-            bin: passes.bin.bind(device, &passes.sort, &buffers, order, None),
+            bin: passes.bin.bind(device, &buffers),
+            sort: passes.sort.bind(device, &buffers),
             blend: passes.blend.bind(device, &buffers),
+            output: (!device.maps_storage).then(|| {
+                let (pixels, ids) = (buffers.pixels.slice(..), buffers.ids.slice(..));
+                passes.blend.bind_output(device, pixels, ids)
+            }),
             buffers,
         });
         self.check_device()
@@ -339,7 +341,7 @@ impl GpuRenderer {
             .create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("tick") });
         let mut stage = 0;
         let mut begin = |encoder: &mut wgpu::CommandEncoder| {
-            let label = ["cull", "project", "sort", "bin", "blend"][stage];
+            let label = ["cull", "project", "bin", "sort", "blend"][stage];
             let pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
                 label: Some(label),
                 timestamp_writes: self.stamps.as_ref().map(|stamps| stamps.of_pass(stage)),
@@ -347,7 +349,7 @@ impl GpuRenderer {
             stage += 1;
             pass.forget_lifetime()
         };
-        encoder.clear_buffer(&buffers.lists, 0, Some(u64::from(tiles.max(1)) * 8));
+        encoder.clear_buffer(&buffers.firsts, 0, Some((u64::from(tiles) + 1) * 4));
         let mut pass = begin(&mut encoder);
         passes.cull.run(&mut pass, &bound.cull, cameras * self.scene.block_count);
         drop(pass);
@@ -355,18 +357,14 @@ impl GpuRenderer {
         passes.project.run(&mut pass, &bound.project, &self.scene, cameras);
         drop(pass);
         let mut pass = begin(&mut encoder);
-        for (i, digit) in bound.sort.iter().enumerate() {
-            passes.sort.run(&mut pass, digit, &buffers.dispatches);
-            if i == 0 {
-                passes.bin.count_visible(&mut pass, &bound.bin);
-            }
-        }
+        passes.bin.run(&mut pass, &bound.bin, buffers);
         drop(pass);
         let mut pass = begin(&mut encoder);
-        passes.bin.run(&mut pass, &bound.bin, &passes.sort, buffers);
+        passes.sort.run(&mut pass, &bound.sort, tiles);
         drop(pass);
         let mut pass = begin(&mut encoder);
-        passes.blend.run(&mut pass, &bound.blend, tiles);
+        let output = pending.staging.output().or(bound.output.as_ref()).expect("one of both is");
+        passes.blend.run(&mut pass, &bound.blend, output, tiles);
         drop(pass);
         let has_ids = self.has_ids();
         let pixels = pending.wanted.pixels;
@@ -422,7 +420,7 @@ impl GpuRenderer {
                 read_ms = milliseconds(start);
                 (sizes, passes_ms)
             });
-            let (sizes, [cull_ms, project_ms, sort_ms, bin_ms, blend_ms]) =
+            let (sizes, [cull_ms, project_ms, bin_ms, sort_ms, blend_ms]) =
                 read.map_err(|fault| SubmitError::Render(RenderError::Device(fault)))?;
             if sizes.is_complete() {
                 let cameras = pending.cameras.len().max(1);

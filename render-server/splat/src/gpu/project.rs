@@ -1,14 +1,22 @@
 //! Pass 2: the splats of visible blocks onto the image plane.
 //!
+//! Also which tiles each touches, and how many each tile has.
+//!
 //! Budget: 52 bytes read per splat of a visible block, 2 per number of its harmonics where it is
-//! seen; 4 bytes written per slot and 48 per survivor. At 1 TB/s: 0.1 ms per million visible splats
+//! seen; 16 bytes written per slot and 48 per survivor, an atomic per pair. At 1 TB/s: 0.1 ms per million visible splats
 //! without harmonics, 0.2 ms with those of degree 3.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};
 use super::scene::GpuScene;
 
-const SOURCE: &str = concat!(include_str!("common.wgsl"), include_str!("project.wgsl"));
+const SOURCE: &str = concat!(
+    include_str!("common.wgsl"),
+    include_str!("scan.wgsl"),
+    include_str!("ellipse.wgsl"),
+    include_str!("cover.wgsl"),
+    include_str!("project.wgsl")
+);
 
 /// The pass.
 #[derive(Debug)]
@@ -38,10 +46,9 @@ impl Project {
                     (3, &chunk.place),
                     (4, &chunk.geometry),
                     (5, &chunk.harmonics),
-                    (6, &buffers.shapes),
-                    (7, &buffers.extents),
-                    (8, &buffers.colours),
-                    (9, &buffers.keys[0]),
+                    (6, &buffers.projected),
+                    (7, &buffers.covers),
+                    (8, &buffers.firsts),
                 ],
             )
         };

@@ -18,14 +18,10 @@ struct Chunk {
 @group(0) @binding(4) var<storage, read> geometry: array<u32>;
 // Halves, two to a word: per block, coefficient by coefficient, RGB within, BLOCK of each.
 @group(0) @binding(5) var<storage, read> harmonics: array<u32>;
-// Mean x, y [px], shear, falloff along x [1/px^2].
-@group(0) @binding(6) var<storage, read_write> shapes: array<vec4<f32>>;
-// Falloff along y, level, camera << 16 | id, dy of the ellipse's rightmost point.
-@group(0) @binding(7) var<storage, read_write> extents: array<vec4<f32>>;
-// Red, green, blue, camera z [m].
-@group(0) @binding(8) var<storage, read_write> colours: array<vec4<f32>>;
-// Camera z as bits, which order as the positive numbers do; EMPTY where there is no splat.
-@group(0) @binding(9) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(6) var<storage, read_write> projected: array<Projected>;
+@group(0) @binding(7) var<storage, read_write> covers: array<Cover>;
+// Splats per tile; then those of all images.
+@group(0) @binding(8) var<storage, read_write> counts: array<atomic<u32>>;
 
 const HEADER = 4u;
 const BLUR = 0.3;
@@ -172,23 +168,58 @@ fn colour(first: u32, coefficients: u32, lane: u32, direction: vec3<f32>) -> vec
     return max(rgb, vec3(0.0));
 }
 
-/// Projects one splat into a slot; returns its key.
-fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u32 {
+/// Returns which tiles of an image an ellipse touches.
+fn cover_of(e: Ellipse, view: u32, key: u32, camera: u32) -> Cover {
+    let size = views[view].size;
+    let extent_y = sqrt(e.reach / e.falloff.y);
+    let height = centres(e.mean.y - extent_y, e.mean.y + extent_y, f32(size.y));
+    let edges = band(e, e.mean.y - extent_y, e.mean.y + extent_y);
+    let width = centres(edges.x, edges.y, f32(size.x));
+    if width.x >= width.y || height.x >= height.y {
+        return nothing();
+    }
+    let first = vec2(width.x, height.x) / TILE;
+    let tiles = (vec2(width.y, height.y) - 1u) / TILE + 1u - first;
+    var cover = Cover(
+        size.w + first.y * size.z + first.x,
+        tiles.x | tiles.y << 10u | camera << 20u,
+        0u,
+        key,
+    );
+    let cell = cell_size(cover);
+    for (var row = 0u; row * cell.y < tiles.y; row++) {
+        let top = (first.y + row * cell.y) * TILE;
+        let bottom = min((first.y + min((row + 1u) * cell.y, tiles.y)) * TILE, size.y);
+        let reached = band(e, f32(top) + 0.5, f32(bottom) - 0.5);
+        let pixels = centres(reached.x, reached.y, f32(size.x));
+        if pixels.x < pixels.y {
+            // Rounding may find a row wider than the whole.
+            let from_column = (max(pixels.x / TILE, first.x) - first.x) / cell.x;
+            let to_column = (min((pixels.y - 1u) / TILE, first.x + tiles.x - 1u) - first.x) / cell.x;
+            let bits = (2u << to_column) - (1u << from_column);
+            cover.cells |= bits << (row * CELL_COLUMNS);
+        }
+    }
+    return cover;
+}
+
+/// Projects one splat into a slot; returns what it touches.
+fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> Cover {
     if lane >= geometry[first + 3u] {
-        return EMPTY;
+        return nothing();
     }
     // Relative to the camera before anything else: large coordinates cancel while still exact.
     let d = vector(first, 0u, lane) - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
     let z = dot(views[view].row_z.xyz, d);
     let farthest = max(max(abs(d.x), abs(d.y)), abs(d.z));
     if !(z > views[view].more.z && farthest < MAX_DISTANCE) {
-        return EMPTY;
+        return nothing();
     }
     let inverse_z = 1.0 / z;
     let slope = vec2(dot(views[view].row_x.xyz, d), dot(views[view].row_y.xyz, d)) * inverse_z;
     let has_lens = views[view].flags.x != NO_LENS;
     if has_lens && !(length(slope) <= views[view].more.y) {
-        return EMPTY;
+        return nothing();
     }
     let mean = views[view].focal.xy * distort(view, slope).slope + views[view].focal.zw;
 
@@ -231,7 +262,7 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
         && all(mean - extent < size - 0.5)
         && all(extent < vec2(MAX_EXTENT));
     if !is_seen {
-        return EMPTY;
+        return nothing();
     }
     // Above 0, so that dividing by it is no trap where a splat covers everything evenly.
     let falloff = max(HALF_LOG2_E * vec2(c / determinant, 1.0 / c), vec2(1e-36));
@@ -241,12 +272,21 @@ fn project_splat(view: u32, camera: u32, first: u32, lane: u32, slot: u32) -> u3
     let light = views[view].light;
     let fog = views[view].fog.xyz;
     let seen = mix(fog, rgb * light.xyz, exp2(-light.w * distance));
-    let tag = camera << 16u | views[view].flags.w;
-    shapes[slot] = vec4(mean, b / c, falloff.x);
-    extents[slot] = vec4(falloff.y, level, bitcast<f32>(tag), b * extent.x / a);
-    colours[slot] = vec4(seen, z);
-    return bitcast<u32>(z);
+    let tag = views[view].flags.w;
+    let tip_y = b * extent.x / a;
+    projected[slot] = Projected(
+        vec4(mean, b / c, falloff.x),
+        vec4(falloff.y, level, bitcast<f32>(tag), tip_y),
+        vec4(seen, z),
+    );
+    let ellipse = Ellipse(mean, b / c, falloff, level - MIN_LEVEL, tip_y);
+    return cover_of(ellipse, view, bitcast<u32>(z), camera);
 }
+
+/// The region of a block that its camera sees; NO_REGION for another.
+var<workgroup> own_region: u32;
+
+const NO_REGION = 0xffffffffu;
 
 @compute @workgroup_size(256)
 fn project(
@@ -254,17 +294,39 @@ fn project(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let camera = group.y;
-    let index = camera * tick.blocks + chunk.first_block + group.x;
-    let rank = regions[index];
-    if rank == 0u {
-        return;
+    if lane == 0u {
+        let index = camera * tick.blocks + chunk.first_block + group.x;
+        let rank = regions[index];
+        let region = regions[tick.cameras * tick.blocks + index / 256u] + rank - 1u;
+        own_region = select(NO_REGION, region, rank != 0u && region < tick.regions);
     }
-    let region = regions[tick.cameras * tick.blocks + index / 256u] + rank - 1u;
-    if region >= tick.regions {
+    let region = workgroupUniformLoad(&own_region);
+    if region == NO_REGION {
         return;
     }
     let first = group.x * chunk.stride;
     let slot = region * BLOCK + lane;
     let view = camera * tick.parts + geometry[first];
-    keys[slot] = project_splat(view, camera, first, lane, slot);
+    let cover = project_splat(view, camera, first, lane, slot);
+    covers[slot] = cover;
+
+    let tiles_x = views[camera * tick.parts].size.z;
+    for (var i = 0u; i < tiles_alone(cover); i++) {
+        let tile = tile_of(cover, i, tiles_x);
+        if tile != NO_TILE {
+            atomicAdd(&counts[tile], 1u);
+        }
+    }
+    let large_tiles = share(lane, cover);
+    for (var i = lane; i < large_tiles; i += 256u) {
+        let whose = owner(i);
+        let tile = tile_of(large[whose], i - starts[whose], tiles_x);
+        if tile != NO_TILE {
+            atomicAdd(&counts[tile], 1u);
+        }
+    }
+    let visible = scan(lane, select(0u, 1u, cover.size != 0u));
+    if lane == 255u {
+        atomicAdd(&counts[tick.tiles], visible + select(0u, 1u, cover.size != 0u));
+    }
 }

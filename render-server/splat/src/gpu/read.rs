@@ -1,17 +1,16 @@
 //! From the device's memory to the images.
 //!
-//! Each tick copies its pixels, and what the device counted, to one of two staging buffers: while
-//! one tick is read here, the next is rendered there.
+//! Each tick has one of two staging buffers: while one tick is read here, the next is rendered there. Where
+//! the adapter lets shaders write what the host reads, `blend` writes the pixels there itself, across the bus
+//! while it still computes; elsewhere they are copied.
 //!
 //! Budget: 16 bytes per pixel over the bus (20 with ids): 4.9 MB at 640x480, 0.2 ms at 25 GB/s; then
 //! 28 bytes written per pixel, by all cores.
 
-use half::f16;
-use half::slice::HalfBitsSliceExt as _;
-use half::slice::HalfFloatSliceExt as _;
 use rayon::prelude::*;
 use zerocopy::{FromBytes, Immutable, KnownLayout};
 
+use super::blend::{Blend, Output};
 use super::buffers::{Buffers, SIZES_BYTES};
 use super::device::Device;
 use super::view::ImageOffset;
@@ -22,10 +21,16 @@ use crate::{Camera, RgbdImage};
 pub(super) const PASSES: usize = 5;
 /// Where the timestamps lie in a staging buffer.
 const STAMPS_AT: u64 = SIZES_BYTES;
-/// Where the pixels do.
-const PIXELS_AT: u64 = 128;
-/// Words per pixel.
-const PIXEL_WORDS: usize = 4;
+/// Where the pixels do; a multiple of every adapter's alignment of bindings.
+const PIXELS_AT: u64 = 256;
+/// `pixels` of `blend.wgsl`.
+type Pixel = [u32; 4];
+const PIXEL_BYTES: u64 = size_of::<Pixel>() as u64;
+
+/// Returns where the ids of so many pixels lie in a staging buffer.
+fn ids_at(pixels: u64) -> u64 {
+    (PIXELS_AT + pixels * PIXEL_BYTES).next_multiple_of(PIXELS_AT)
+}
 
 /// `sizes` of `sizes.wgsl`.
 #[derive(Clone, Copy, Debug, Default, FromBytes, Immutable, KnownLayout)]
@@ -90,6 +95,8 @@ impl Stamps {
 #[derive(Debug)]
 pub(super) struct Staging {
     buffer: wgpu::Buffer,
+    /// It as the output of `blend`, where shaders can write it, and of how many pixels.
+    output: Option<(Output, u64)>,
 }
 
 impl Staging {
@@ -97,17 +104,36 @@ impl Staging {
     pub(super) fn for_pixels(
         old: Option<Self>,
         device: &Device,
+        blend: &Blend,
         pixels: u64,
         has_ids: bool,
     ) -> Self {
-        Self::of(old, device, PIXELS_AT + pixels * if has_ids { 20 } else { 16 })
+        // A binding is never empty.
+        let ids = if has_ids { pixels * 4 } else { PIXELS_AT };
+        let mut staging = Self::of(old, device, ids_at(pixels) + ids);
+        let is_bound = staging.output.as_ref().is_some_and(|&(_, bound)| bound == pixels);
+        if device.maps_storage && !is_bound {
+            let (buffer, ids_at) = (&staging.buffer, ids_at(pixels));
+            let (pixels_slice, ids_slice) =
+                (buffer.slice(PIXELS_AT..ids_at), buffer.slice(ids_at..));
+            staging.output = Some((blend.bind_output(device, pixels_slice, ids_slice), pixels));
+        }
+        staging
+    }
+
+    /// Returns what `blend` writes to, if it is this.
+    pub(super) fn output(&self) -> Option<&Output> {
+        self.output.as_ref().map(|(output, _)| output)
     }
 
     /// Returns one of so many bytes; a given one if it is large enough.
     pub(super) fn of(old: Option<Self>, device: &Device, bytes: u64) -> Self {
         old.filter(|old| old.buffer.size() >= bytes).unwrap_or_else(|| {
-            let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
-            Self { buffer: device.buffer("staging", bytes, usage) }
+            let mut usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
+            if device.maps_storage {
+                usage |= wgpu::BufferUsages::STORAGE;
+            }
+            Self { buffer: device.buffer("staging", bytes, usage), output: None }
         })
     }
 
@@ -137,9 +163,13 @@ impl Staging {
             let bytes = 16 * PASSES as u64;
             encoder.copy_buffer_to_buffer(&stamps.resolved, 0, &self.buffer, STAMPS_AT, bytes);
         }
-        encoder.copy_buffer_to_buffer(&buffers.pixels, 0, &self.buffer, PIXELS_AT, pixels * 16);
+        if self.output.is_some() {
+            return;
+        }
+        let bytes = pixels * PIXEL_BYTES;
+        encoder.copy_buffer_to_buffer(&buffers.pixels, 0, &self.buffer, PIXELS_AT, bytes);
         if has_ids {
-            let at = PIXELS_AT + pixels * 16;
+            let at = ids_at(pixels);
             encoder.copy_buffer_to_buffer(&buffers.ids, 0, &self.buffer, at, pixels * 4);
         }
     }
@@ -204,17 +234,18 @@ pub(super) fn images(
     has_ids: bool,
     images: &mut [RgbdImage],
 ) {
-    let words = |at: usize, count: usize| {
-        let bytes = &bytes[PIXELS_AT as usize + at * 4..][..count * 4];
-        <[u32]>::ref_from_bytes(bytes).expect("staging is aligned")
-    };
+    let all =
+        <[Pixel]>::ref_from_bytes(&bytes[PIXELS_AT as usize..][..pixels * size_of::<Pixel>()])
+            .expect("staging is aligned");
     for ((camera, place), image) in cameras.iter().zip(places).zip(images) {
         let k = &camera.intrinsics;
         let (first, count) = (place.first_pixel as usize, k.pixels());
         image.resize(k.width_px, k.height_px);
-        unpack(words(first * PIXEL_WORDS, count * PIXEL_WORDS), image);
+        unpack(&all[first..first + count], image);
         if has_ids {
-            let ids = words(pixels * PIXEL_WORDS + first, count);
+            let at = ids_at(pixels as u64) as usize + 4 * first;
+            let ids =
+                <[u32]>::ref_from_bytes(&bytes[at..at + 4 * count]).expect("staging is aligned");
             image.ids.par_chunks_mut(BAND).zip(ids.par_chunks(BAND)).for_each(|(out, ids)| {
                 for (out, &id) in out.iter_mut().zip(ids) {
                     *out = id as u16;
@@ -226,35 +257,49 @@ pub(super) fn images(
     }
 }
 
-/// Pixels that one task unpacks: some 20 us of work.
-const BAND: usize = 16 * 1024;
-/// Pixels whose halves are converted at once; on the stack.
-const RUN: usize = 128;
+/// Pixels that one task unpacks: some 10 us of work.
+const BAND: usize = 4 * 1024;
 
-fn unpack(words: &[u32], image: &mut RgbdImage) {
+fn unpack(pixels: &[Pixel], image: &mut RgbdImage) {
     image
         .rgb
         .par_chunks_mut(3 * BAND)
         .zip(image.alpha.par_chunks_mut(BAND))
         .zip(image.depth_expected_m.par_chunks_mut(BAND))
         .zip(image.depth_median_m.par_chunks_mut(BAND))
-        .zip(words.par_chunks(PIXEL_WORDS * BAND))
-        .for_each(|((((rgb, alpha), expected), median), words)| {
-            let mut halves = [0u16; 3 * RUN];
-            for (run, words) in words.chunks(PIXEL_WORDS * RUN).enumerate() {
-                let first = run * RUN;
-                let count = words.len() / PIXEL_WORDS;
-                for (i, pixel) in words.chunks_exact(PIXEL_WORDS).enumerate() {
-                    halves[3 * i] = pixel[0] as u16;
-                    halves[3 * i + 1] = (pixel[0] >> 16) as u16;
-                    halves[3 * i + 2] = pixel[1] as u16;
-                    alpha[first + i] = (pixel[1] >> 16) as f32 / 65535.0;
-                    expected[first + i] = f32::from_bits(pixel[2]);
-                    median[first + i] = f32::from_bits(pixel[3]);
-                }
-                halves[..3 * count]
-                    .reinterpret_cast::<f16>()
-                    .convert_to_f32_slice(&mut rgb[3 * first..3 * (first + count)]);
+        .zip(pixels.par_chunks(BAND))
+        .for_each(|((((rgb, alpha), expected), median), pixels)| {
+            let (rgb, _) = rgb.as_chunks_mut::<3>();
+            let out = rgb.iter_mut().zip(alpha).zip(expected.iter_mut().zip(median));
+            for (&[red_green, blue_alpha, first, second], ((rgb, alpha), (expected, median))) in
+                pixels.iter().zip(out)
+            {
+                *rgb = [red_green, red_green >> 16, blue_alpha].map(half_to_f32);
+                *alpha = (blue_alpha >> 16) as f32 / 65535.0;
+                *expected = f32::from_bits(first);
+                *median = f32::from_bits(second);
             }
         });
+}
+
+/// Returns the number that the lower 16 bits hold as a half; it is finite. In a line of code that compilers make
+/// vectors of, where a conversion of the processor's would have to be asked for.
+fn half_to_f32(bits: u32) -> f32 {
+    // Exponents of halves are 112 less: a product puts them right, subnormal ones too.
+    let magnitude = f32::from_bits((bits & 0x7fff) << 13) * f32::from_bits(0x7780_0000);
+    f32::from_bits(magnitude.to_bits() | (bits & 0x8000) << 16)
+}
+
+#[cfg(test)]
+mod tests {
+    use half::f16;
+
+    #[test]
+    fn every_finite_half_is_read() {
+        let finite = (0..=u16::MAX).filter(|&bits| f16::from_bits(bits).is_finite());
+        for bits in finite {
+            let expected = f16::from_bits(bits).to_f32().to_bits();
+            assert_eq!(super::half_to_f32(0xabcd_0000 | u32::from(bits)).to_bits(), expected);
+        }
+    }
 }

@@ -1,142 +1,143 @@
-// Pass 3, and again in pass 4: one digit of a stable radix sort of (key, value) pairs.
+// Pass 4: each tile's list, nearest first. One workgroup per tile.
 //
-// `count` counts the digits of each group of keys, `rows` turns the counts of each digit into
-// places, `scatter` moves. A group's own ranks come from bit masks in workgroup memory: a thread
-// sets its bit in its digit's mask, and its rank is the number of bits below its own. No subgroup
-// operation, no waiting for another workgroup: right for subgroups of any size.
+// Runs of CHUNK pairs are sorted in workgroup memory by a bitonic network; longer lists merge their runs in
+// the device's memory, each time into the other buffer, and end in the first.
 
-struct Digit {
-    shift: u32,
-    /// Index into `sizes` of the number of keys.
-    size: u32,
-    padding: vec2<u32>,
+@group(0) @binding(0) var<uniform> tick: Tick;
+@group(0) @binding(1) var<storage, read> firsts: array<u32>;
+@group(0) @binding(2) var<storage, read> ends: array<u32>;
+// Depth as bits, slot.
+@group(0) @binding(3) var<storage, read_write> pairs: array<vec2<u32>>;
+@group(0) @binding(4) var<storage, read_write> other: array<vec2<u32>>;
+
+const CHUNK = 1024u;
+const THREADS = 256u;
+/// Workgroups along x at most.
+const GRID = 32768u;
+/// Pairs that a thread merges one after the other.
+const STRIP = 16u;
+
+var<workgroup> run: array<vec2<u32>, CHUNK>;
+var<workgroup> own_list: vec2<u32>;
+
+/// Whether a pair is nearer; those at one depth stay in order of the scene.
+fn is_before(a: vec2<u32>, b: vec2<u32>) -> bool {
+    return a.x < b.x || (a.x == b.x && a.y < b.y);
 }
 
-@group(0) @binding(0) var<uniform> digit_of: Digit;
-@group(0) @binding(1) var<storage, read> sizes: array<u32>;
-@group(0) @binding(2) var<storage, read> keys_in: array<u32>;
-@group(0) @binding(3) var<storage, read> values_in: array<u32>;
-@group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
-@group(0) @binding(5) var<storage, read_write> values_out: array<u32>;
-// Per digit and group; then per digit.
-@group(0) @binding(6) var<storage, read_write> counts: array<u32>;
-
-/// In the first pass values are the keys' indices, and EMPTY keys are left out.
-override FIRST: bool = false;
-
-const ROUNDS = SORT_GROUP / 256u;
-
-var<workgroup> tally: array<atomic<u32>, 256>;
-/// Bit t of word w, digit d: thread 32 w + t holds digit d. Word by word.
-var<workgroup> masks: array<atomic<u32>, 2048>;
-/// Where the group's next key of each digit goes.
-var<workgroup> places: array<u32, 256>;
-
-fn is_in(key: u32) -> bool {
-    return !FIRST || key != EMPTY;
-}
-
-fn digit(key: u32) -> u32 {
-    return (key >> digit_of.shift) & 255u;
-}
-
-@compute @workgroup_size(256)
-fn count(
-    @builtin(workgroup_id) group: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
-) {
-    let size = sizes[digit_of.size];
-    let groups = (size + SORT_GROUP - 1u) / SORT_GROUP;
-    atomicStore(&tally[thread], 0u);
-    workgroupBarrier();
-    for (var round = 0u; round < ROUNDS; round++) {
-        let i = group.x * SORT_GROUP + round * 256u + thread;
-        if i < size {
-            let key = keys_in[i];
-            if is_in(key) {
-                atomicAdd(&tally[digit(key)], 1u);
-            }
+/// Sorts a run of `pairs`; leaves it there, or in `other`.
+fn sort_run(thread: u32, first: u32, count: u32, stays: bool) {
+    var size = 2u;
+    while size < count {
+        size *= 2u;
+    }
+    for (var i = thread; i < size; i += THREADS) {
+        run[i] = vec2(0xffffffffu);
+        if i < count {
+            run[i] = pairs[first + i];
         }
     }
     workgroupBarrier();
-    counts[thread * groups + group.x] = atomicLoad(&tally[thread]);
+    for (var block = 2u; block <= size; block *= 2u) {
+        for (var step = block / 2u; step > 0u; step /= 2u) {
+            for (var i = thread; i < size / 2u; i += THREADS) {
+                let low = 2u * i - (i & (step - 1u));
+                let a = run[low];
+                let b = run[low + step];
+                if is_before(b, a) == ((low & block) == 0u) {
+                    run[low] = b;
+                    run[low + step] = a;
+                }
+            }
+            workgroupBarrier();
+        }
+    }
+    for (var i = thread; i < count; i += THREADS) {
+        if stays {
+            pairs[first + i] = run[i];
+        } else {
+            other[first + i] = run[i];
+        }
+    }
+    workgroupBarrier();
 }
 
-// One workgroup per digit.
+fn at(i: u32, in_other: bool) -> vec2<u32> {
+    if in_other {
+        return other[i];
+    }
+    return pairs[i];
+}
+
+/// Merges neighbouring runs of so many pairs, from one buffer into the other.
+fn merge(thread: u32, first: u32, count: u32, length: u32, from_other: bool) {
+    for (var start = thread * STRIP; start < count; start += THREADS * STRIP) {
+        // Its two runs: a, b, of the list's pairs from these on.
+        let a = start / (2u * length) * 2u * length;
+        let b = min(a + length, count);
+        let end = min(b + length, count);
+        // How many of the first `start - a` pairs are of run a.
+        let before = start - a;
+        var low = before - min(before, end - b);
+        var high = min(before, b - a);
+        while low < high {
+            let middle = (low + high) / 2u;
+            let left = at(first + a + middle, from_other);
+            let right = at(first + b + before - middle - 1u, from_other);
+            if is_before(right, left) {
+                high = middle;
+            } else {
+                low = middle + 1u;
+            }
+        }
+        var i = a + low;
+        var j = b + before - low;
+        for (var k = start; k < min(start + STRIP, end); k++) {
+            var is_left = j >= end;
+            if i < b && j < end {
+                is_left = is_before(at(first + i, from_other), at(first + j, from_other));
+            }
+            let next = at(first + select(j, i, is_left), from_other);
+            i += select(0u, 1u, is_left);
+            j += select(1u, 0u, is_left);
+            if from_other {
+                pairs[first + k] = next;
+            } else {
+                other[first + k] = next;
+            }
+        }
+    }
+    storageBarrier();
+    workgroupBarrier();
+}
+
 @compute @workgroup_size(256)
-fn rows(
+fn sort(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let groups = (sizes[digit_of.size] + SORT_GROUP - 1u) / SORT_GROUP;
-    let row = group.x * groups;
-    var carry = 0u;
-    for (var first = 0u; first < groups; first += 256u) {
-        let i = first + thread;
-        var count = 0u;
-        if i < groups {
-            count = counts[row + i];
-        }
-        let before = scan(thread, count);
-        if i < groups {
-            counts[row + i] = carry + before;
-        }
-        carry += scan_total;
-        workgroupBarrier();
+    let tile = group.y * GRID + group.x;
+    if tile >= tick.tiles {
+        return;
     }
     if thread == 0u {
-        counts[256u * groups + group.x] = carry;
+        own_list = vec2(firsts[tile], ends[tile] - firsts[tile]);
     }
-}
-
-@compute @workgroup_size(256)
-fn scatter(
-    @builtin(workgroup_id) group: vec3<u32>,
-    @builtin(local_invocation_index) thread: u32,
-) {
-    let size = sizes[digit_of.size];
-    let groups = (size + SORT_GROUP - 1u) / SORT_GROUP;
-    let smaller = scan(thread, counts[256u * groups + thread]);
-    places[thread] = smaller + counts[thread * groups + group.x];
-    for (var word = 0u; word < 8u; word++) {
-        atomicStore(&masks[word * 256u + thread], 0u);
+    let list = workgroupUniformLoad(&own_list);
+    let first = list.x;
+    let count = list.y;
+    var merges = 0u;
+    for (var length = CHUNK; length < count; length *= 2u) {
+        merges++;
     }
+    var from_other = merges % 2u == 1u;
+    for (var start = 0u; start < count; start += CHUNK) {
+        sort_run(thread, first + start, min(CHUNK, count - start), !from_other);
+    }
+    storageBarrier();
     workgroupBarrier();
-    let own_word = thread / 32u;
-    let own_bit = 1u << (thread % 32u);
-    for (var round = 0u; round < ROUNDS; round++) {
-        let i = group.x * SORT_GROUP + round * 256u + thread;
-        var key = EMPTY;
-        var takes_part = false;
-        if i < size {
-            key = keys_in[i];
-            takes_part = is_in(key);
-        }
-        let own_digit = digit(key);
-        if takes_part {
-            atomicOr(&masks[own_word * 256u + own_digit], own_bit);
-        }
-        workgroupBarrier();
-        if takes_part {
-            var place = places[own_digit];
-            for (var word = 0u; word < own_word; word++) {
-                place += countOneBits(atomicLoad(&masks[word * 256u + own_digit]));
-            }
-            place += countOneBits(atomicLoad(&masks[own_word * 256u + own_digit]) & (own_bit - 1u));
-            keys_out[place] = key;
-            if FIRST {
-                values_out[place] = i;
-            } else {
-                values_out[place] = values_in[i];
-            }
-        }
-        workgroupBarrier();
-        // Now each thread looks after the digit of its own number.
-        var taken = 0u;
-        for (var word = 0u; word < 8u; word++) {
-            taken += countOneBits(atomicExchange(&masks[word * 256u + thread], 0u));
-        }
-        places[thread] += taken;
-        workgroupBarrier();
+    for (var length = CHUNK; length < count; length *= 2u) {
+        merge(thread, first, count, length, from_other);
+        from_other = !from_other;
     }
 }

@@ -46,8 +46,8 @@ fn too_little_room_is_noticed_and_made() {
 #[test]
 fn scenes_are_split_into_what_a_binding_holds() {
     let splats = twins::cloud(1500, 3, 2);
-    // 12 frame-filling blocks: harmonics of one, geometry of two, regions for seven.
-    let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
+    // 6 frame-filling blocks: harmonics of three, geometry of five, regions for six.
+    let tiny = Budget { binding_bytes: 79_000, ..Budget::default() };
     let cameras: Vec<Camera> = (0..6u32).map(|i| twins::camera(20 + i, 30 - i, 80.0)).collect();
     let Some(mut ample) = renderer(&splats) else { return };
     let expected = render_all(&mut ample, &cameras);
@@ -77,7 +77,7 @@ fn scenes_are_split_into_what_a_binding_holds() {
 #[test]
 fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
     let splats = twins::cloud(1500, 0, 2);
-    let tiny = Budget { binding_bytes: 30_000, ..Budget::default() };
+    let tiny = Budget { binding_bytes: 79_000, ..Budget::default() };
     let Some(mut gpu) = with_budget(&splats, tiny) else { return };
     let large = [twins::camera(200, 100, 80.0)];
     let refused = gpu.render(&[], &large, &mut [RgbdImage::default()]);

@@ -13,9 +13,6 @@ use super::buffers::TrainingBuffers;
 const SOURCE: &str =
     concat!(include_str!("../common.wgsl"), include_str!("photo.wgsl"), include_str!("blend.wgsl"));
 
-/// Workgroups along x; `GRID` in `blend.wgsl`.
-const GRID: u32 = 32_768;
-
 /// The passes.
 #[derive(Debug)]
 pub(super) struct Blend {
@@ -60,7 +57,7 @@ impl Blend {
         bindings: &BlendBindings,
         tiles: u32,
     ) {
-        self.forward.run(pass, &bindings.forward, groups(tiles));
+        self.forward.run(pass, &bindings.forward, Groups::of_tiles(tiles));
     }
 
     pub(super) fn run_back(
@@ -69,10 +66,6 @@ impl Blend {
         bindings: &BlendBindings,
         tiles: u32,
     ) {
-        self.back.run(pass, &bindings.back, groups(tiles));
+        self.back.run(pass, &bindings.back, Groups::of_tiles(tiles));
     }
-}
-
-fn groups(tiles: u32) -> Groups<'static> {
-    Groups::Known(tiles.min(GRID), tiles.div_ceil(GRID))
 }

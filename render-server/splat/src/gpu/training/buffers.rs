@@ -2,9 +2,9 @@
 //!
 //! Memory: 132 bytes per row besides its numbers, 76 per pair, 52 per pixel.
 
-use super::super::buffers::{Buffers, Capacity};
 use super::super::device::Device;
 use super::photo::PHOTO_BYTES;
+use super::tiling::{Buffers, Capacity};
 use super::{BY_CHANNELS, CHANNELS, RowGradient};
 use crate::blocks::BLOCK;
 
@@ -14,7 +14,6 @@ const PAIR_WORDS: u64 = 12;
 /// How much there must be room for, beside the shared [`Capacity`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct TrainingCapacity {
-    /// `camera_blocks` and `pixels` are none.
     pub(super) shared: Capacity,
     /// Numbers of all rows.
     pub(super) row_words: u64,
@@ -85,7 +84,7 @@ impl TrainingBuffers {
         let Capacity { pairs, regions, .. } = capacity.shared;
         let slots = regions * BLOCK as u64;
         Self {
-            shared: Buffers::new(device, capacity.shared, false),
+            shared: Buffers::new(device, capacity.shared),
             photo: device.uniform("photo", &[0; PHOTO_BYTES]),
             rows: storage("rows", capacity.row_words),
             image: source("image", capacity.plane * CHANNELS as u64 * 4),

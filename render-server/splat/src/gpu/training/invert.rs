@@ -2,13 +2,13 @@
 //!
 //! Budget: 20 bytes moved per pair, half of them in random order.
 
-use super::super::bin::PAIRS;
 use super::super::device::{Device, Groups, Kernel};
+use super::bin::PAIRS;
 use super::buffers::TrainingBuffers;
 
 const SOURCE: &str = concat!(
     include_str!("../common.wgsl"),
-    include_str!("../sizes.wgsl"),
+    include_str!("sizes.wgsl"),
     include_str!("invert.wgsl")
 );
 

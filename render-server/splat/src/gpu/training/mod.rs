@@ -13,27 +13,30 @@
 //! Budget: `project`, `blend` and `unproject` say theirs. The bus carries the rows up, the image down, its
 //! derivative up and 64 bytes per visible row down: 60 k rows of degree 2 at 320x240, 9.1 + 1.8 + 2.2 + 3.8 MB.
 
+mod bin;
 mod blend;
 mod buffers;
 mod invert;
 mod photo;
 mod project;
+mod sort;
+mod tiling;
 mod unproject;
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 pub use photo::Photo;
 
-use super::bin::{Bin, BinBindings};
+use super::Budget;
 use super::device::{Adapter, Device};
 use super::read::{self, Staging};
-use super::sort::{self, Pairs, Sort};
 use super::view::{GpuView, Tick};
-use super::{Budget, DEPTH_BITS, SLOTS, VISIBLE};
 use crate::blocks::BLOCK;
 use crate::rasterizer::RenderError;
 
+use bin::{Bin, BinBindings};
 use buffers::{TrainingBuffers, TrainingCapacity};
+use sort::{Count, Pairs, Sort};
 
 /// Channels of an image: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Numbers lie band of tiles by
 /// band, channel by channel, row by row, padded to whole tiles of 16 pixels.
@@ -63,6 +66,12 @@ impl RowGradient {
         self.row as usize
     }
 }
+
+/// Digits of a depth: 32 bits.
+const DEPTH_BITS: u32 = 32;
+/// Words of `sizes` and `dispatches`, as in `sizes.wgsl`.
+const SLOTS: Count = Count { size: 1, groups: 0 };
+const VISIBLE: Count = Count { size: 2, groups: 4 };
 
 /// Where the image lies in a staging buffer, behind what the device counted.
 const IMAGE_AT: usize = super::buffers::SIZES_BYTES as usize;
@@ -181,7 +190,6 @@ impl TrainingRenderer {
             ..TrainingCapacity::default()
         };
         let shared = &mut wanted.shared;
-        shared.views = 1;
         shared.regions = (count as u64).div_ceil(BLOCK as u64);
         shared.pairs = u64::from(self.budget.pairs).min(self.limit.shared.pairs);
         shared.tiles = u64::from(self.tiles);

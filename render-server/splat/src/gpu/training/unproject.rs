@@ -3,15 +3,15 @@
 //! Budget: 52 bytes read per pair in random order, a row and 64 bytes written per visible splat. One thread
 //! walks a splat's pairs: one as large as the image takes longest.
 
-use super::super::bin::BIN;
 use super::super::device::{Device, Groups, Kernel};
-use super::super::{DEPTH_BITS, sort};
+use super::bin::BIN;
 use super::buffers::TrainingBuffers;
+use super::{DEPTH_BITS, sort};
 
 const SOURCE: &str = concat!(
     include_str!("../common.wgsl"),
     include_str!("../scan.wgsl"),
-    include_str!("../sizes.wgsl"),
+    include_str!("sizes.wgsl"),
     include_str!("photo.wgsl"),
     include_str!("rows.wgsl"),
     include_str!("unproject.wgsl")

@@ -2,8 +2,9 @@
 
 use zerocopy::{FromBytes, IntoBytes};
 
-use super::super::device::Adapter;
-use super::super::{Budget, SLOTS, VISIBLE};
+use super::super::super::Budget;
+use super::super::super::device::Adapter;
+use super::super::{SLOTS, VISIBLE};
 use super::*;
 
 /// What a sort of up to `room` pairs takes.

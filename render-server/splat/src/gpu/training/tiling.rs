@@ -1,0 +1,113 @@
+//! What `project`, `sort`, `bin` and `blend` leave for each other; kept from photo to photo, and only ever grown.
+//!
+//! How many pairs (of tile and row) a photo needs is known to the device alone: it counts what it wants and uses
+//! what there is; where there was too little the buffers are grown and the photo is rendered again.
+//!
+//! Memory: 68 bytes per row, 16 per pair, 8 per tile.
+
+use super::super::buffers::SIZES_BYTES;
+use super::super::device::Device;
+use super::super::view::GpuView;
+use super::sort;
+use crate::blocks::BLOCK;
+
+/// How much there must be room for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Capacity {
+    /// Rows, in blocks.
+    pub(super) regions: u64,
+    pub(super) pairs: u64,
+    pub(super) tiles: u64,
+    /// Digits of a tile's number; not grown but equalled.
+    pub(super) tile_digits: u32,
+}
+
+impl Capacity {
+    /// Returns the greatest that a device can give.
+    pub(super) fn limit(binding_bytes: u64) -> Self {
+        // Binning runs one workgroup of 256 per 256 visible splats, 65535 at most.
+        let slots = (binding_bytes / 16).min(65_535 * 256);
+        Self {
+            regions: slots / BLOCK as u64,
+            // The counts of the sort take half a byte each; fewer than 65535 groups sort them.
+            pairs: (binding_bytes / 4).min(65_535 * sort::SORT_GROUP),
+            tiles: binding_bytes / 8,
+            tile_digits: 4,
+        }
+    }
+
+    /// Whether it holds another.
+    pub(super) fn holds(&self, other: &Self) -> bool {
+        self.pairwise(other).iter().all(|(has, wants)| has >= wants)
+            && self.tile_digits == other.tile_digits
+    }
+
+    /// Whether a device can give it.
+    pub(super) fn is_within(&self, limit: &Self) -> bool {
+        self.pairwise(limit).iter().all(|(wants, limit)| wants <= limit)
+    }
+
+    /// Returns room for another too, a quarter more than what has to grow, within a limit.
+    pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
+        let grow = |has: u64, wants: u64, limit: u64| {
+            if has >= wants { has } else { (wants + wants / 4).min(limit) }
+        };
+        Self {
+            regions: grow(self.regions, other.regions, limit.regions),
+            pairs: grow(self.pairs, other.pairs, limit.pairs),
+            tiles: grow(self.tiles, other.tiles, limit.tiles),
+            tile_digits: other.tile_digits,
+        }
+    }
+
+    fn pairwise(&self, other: &Self) -> [(u64, u64); 3] {
+        [(self.regions, other.regions), (self.pairs, other.pairs), (self.tiles, other.tiles)]
+    }
+}
+
+/// The buffers; named as in the shaders.
+#[derive(Debug)]
+pub(super) struct Buffers {
+    pub(super) capacity: Capacity,
+    pub(super) tick: wgpu::Buffer,
+    pub(super) views: wgpu::Buffer,
+    pub(super) sizes: wgpu::Buffer,
+    pub(super) dispatches: wgpu::Buffer,
+    pub(super) shapes: wgpu::Buffer,
+    pub(super) extents: wgpu::Buffer,
+    pub(super) colours: wgpu::Buffer,
+    pub(super) keys: [wgpu::Buffer; 2],
+    pub(super) order: [wgpu::Buffer; 2],
+    /// Of sorts.
+    pub(super) digits: wgpu::Buffer,
+    /// Tiles per splat.
+    pub(super) counts: wgpu::Buffer,
+    pub(super) tiles: [wgpu::Buffer; 2],
+    pub(super) slots: [wgpu::Buffer; 2],
+    pub(super) lists: wgpu::Buffer,
+}
+
+impl Buffers {
+    pub(super) fn new(device: &Device, capacity: Capacity) -> Self {
+        let storage = |label: &str, words: u64| device.storage(label, words * 4);
+        let counted = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let slots = capacity.regions * BLOCK as u64;
+        Self {
+            capacity,
+            tick: device.uniform("tick", &[0; 32]),
+            views: device.storage("views", size_of::<GpuView>() as u64),
+            sizes: device.buffer("sizes", SIZES_BYTES, counted | wgpu::BufferUsages::COPY_SRC),
+            dispatches: device.buffer("dispatches", 64, counted | wgpu::BufferUsages::INDIRECT),
+            shapes: storage("shapes", slots * 4),
+            extents: storage("extents", slots * 4),
+            colours: storage("colours", slots * 4),
+            keys: [storage("keys", slots), storage("keys", slots)],
+            order: [storage("order", slots), storage("order", slots)],
+            digits: device.storage("digits", sort::count_bytes(slots.max(capacity.pairs))),
+            counts: storage("counts", slots + slots.div_ceil(256)),
+            tiles: [storage("tiles", capacity.pairs), storage("tiles", capacity.pairs)],
+            slots: [storage("slots", capacity.pairs), storage("slots", capacity.pairs)],
+            lists: storage("lists", capacity.tiles * 2),
+        }
+    }
+}
