@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use vizflyt_splat::RenderError;
-use vizflyt_splat::gpu::training::{self, Photo, TrainingRenderer};
+use vizflyt_splat::gpu::training::{self, Changed, Photo, TrainingRenderer, TrainingTimes};
 use vizflyt_splat::gpu::{Adapter, Budget};
 
 use crate::gaussians::{Gaussians, column};
@@ -23,8 +23,7 @@ pub(crate) struct GpuPasses {
     renderer: TrainingRenderer,
     /// Of the view rendered last.
     image: Planes,
-    found: Vec<training::RowGradient>,
-    /// Where each row's gradient is in `found`; [`UNSEEN`] where there is none.
+    /// Where each row's gradient is in what the device found; [`UNSEEN`] where there is none.
     places: Vec<u32>,
 }
 
@@ -36,7 +35,6 @@ impl GpuPasses {
         Ok(Self {
             renderer: TrainingRenderer::new(adapter, budget)?,
             image: Planes::default(),
-            found: Vec::new(),
             places: Vec::new(),
         })
     }
@@ -51,15 +49,21 @@ impl GpuPasses {
         &self.image
     }
 
+    /// Returns where the time of all photos so far went.
+    pub(crate) fn times(&self) -> TrainingTimes {
+        self.renderer.times()
+    }
+
     /// Destroys the device, as a driver's reset does.
     pub(crate) fn lose_device(&self) {
         self.renderer.lose_device();
     }
 
-    /// Renders the image of a view.
+    /// Renders the image of a view; `changed` is what may differ from the Gaussians of the last one.
     pub(crate) fn forward(
         &mut self,
         gaussians: &Gaussians,
+        changed: Changed<'_>,
         view: &View,
         style: Style,
     ) -> Result<(), RenderError> {
@@ -77,7 +81,7 @@ impl GpuPasses {
             antialiased: style.antialiased,
         };
         let image = &mut self.image.values;
-        self.renderer.forward(&gaussians.values, gaussians.stride(), &photo, image)
+        self.renderer.forward(&gaussians.values, gaussians.stride(), changed, &photo, image)
     }
 
     /// Takes the derivative of a loss by the last image's channels back: fills `seen` with the rows that it
@@ -91,30 +95,31 @@ impl GpuPasses {
         seen: &mut Vec<u32>,
         out: &mut Vec<RowGradient>,
     ) -> Result<(), RenderError> {
-        self.renderer.backward(&by.values, &mut self.found)?;
-        self.places.clear();
-        self.places.resize(gaussians.len(), UNSEEN);
-        for (place, found) in self.found.iter().enumerate() {
-            self.places[found.row()] = place as u32;
-        }
-        seen.clear();
-        seen.extend((0..).zip(&self.places).filter(|(_, p)| **p != UNSEEN).map(|(row, _)| row));
-        let (places, found) = (&self.places, &self.found);
-        seen.par_iter()
-            .with_min_len(1024)
-            .map(|&row| {
-                let by = &found[places[row as usize] as usize];
-                let mean = Vec3::from_slice(&gaussians.row(row as usize)[column::MEAN..]);
-                let d = mean - view.position;
-                RowGradient {
-                    geometry: by.geometry,
-                    basis: basis(d / d.length(), style.degree),
-                    rgb: by.rgb,
-                    error: by.error,
-                }
-            })
-            .collect_into_vec(out);
-        Ok(())
+        let places = &mut self.places;
+        self.renderer.backward(&by.values, |found| {
+            places.clear();
+            places.resize(gaussians.len(), UNSEEN);
+            for (place, found) in found.iter().enumerate() {
+                places[found.row()] = place as u32;
+            }
+            seen.clear();
+            seen.extend((0..).zip(&*places).filter(|(_, p)| **p != UNSEEN).map(|(row, _)| row));
+            let places = &*places;
+            seen.par_iter()
+                .with_min_len(1024)
+                .map(|&row| {
+                    let by = &found[places[row as usize] as usize];
+                    let mean = Vec3::from_slice(&gaussians.row(row as usize)[column::MEAN..]);
+                    let d = mean - view.position;
+                    RowGradient {
+                        geometry: by.geometry,
+                        basis: basis(d / d.length(), style.degree),
+                        rgb: by.rgb,
+                        error: by.error,
+                    }
+                })
+                .collect_into_vec(out);
+        })
     }
 }
 
