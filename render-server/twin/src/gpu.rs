@@ -1,5 +1,7 @@
 //! The passes on a graphics card: `vizflyt_splat::gpu::training` in the trainer's words.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use glam::Vec3;
 use rayon::prelude::*;
 use vizflyt_splat::RenderError;
@@ -24,7 +26,7 @@ pub(crate) struct GpuPasses {
     /// Of the view rendered last.
     image: Planes,
     /// Where each row's gradient is in what the device found; [`UNSEEN`] where there is none.
-    places: Vec<u32>,
+    places: Vec<AtomicU32>,
 }
 
 const UNSEEN: u32 = u32::MAX;
@@ -97,18 +99,20 @@ impl GpuPasses {
     ) -> Result<(), RenderError> {
         let places = &mut self.places;
         self.renderer.backward(&by.values, |found| {
-            places.clear();
-            places.resize(gaussians.len(), UNSEEN);
-            for (place, found) in found.iter().enumerate() {
-                places[found.row()] = place as u32;
-            }
+            places.resize_with(gaussians.len(), AtomicU32::default);
+            places.par_iter_mut().with_min_len(1 << 14).for_each(|p| *p.get_mut() = UNSEEN);
+            // A row is found once: which thread notes it makes no difference.
+            found.par_iter().enumerate().with_min_len(4096).for_each(|(place, found)| {
+                places[found.row()].store(place as u32, Ordering::Relaxed);
+            });
+            let place = |row: u32| places[row as usize].load(Ordering::Relaxed);
+            let rows = (0..gaussians.len() as u32).into_par_iter().with_min_len(4096);
             seen.clear();
-            seen.extend((0..).zip(&*places).filter(|(_, p)| **p != UNSEEN).map(|(row, _)| row));
-            let places = &*places;
+            seen.par_extend(rows.filter(|&row| place(row) != UNSEEN));
             seen.par_iter()
                 .with_min_len(1024)
                 .map(|&row| {
-                    let by = &found[places[row as usize] as usize];
+                    let by = &found[place(row) as usize];
                     let mean = Vec3::from_slice(&gaussians.row(row as usize)[column::MEAN..]);
                     let d = mean - view.position;
                     RowGradient {

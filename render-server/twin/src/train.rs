@@ -11,13 +11,14 @@ pub use checkpoint::{Checkpoint, CheckpointError};
 
 use std::time::Instant;
 
+use rayon::prelude::*;
 use vizflyt_splat::Splats;
 use vizflyt_splat::gpu::training::Changed;
 use vizflyt_splat::simd::InstructionSet;
 
 use crate::adam::{Moments, Rates, Step, Tolls};
 use crate::dataset::{Dataset, Photo};
-use crate::gaussians::{Gaussians, coefficients, column};
+use crate::gaussians::{CHUNK, Gaussians, coefficients, column, within};
 use crate::loss::{Exposure, Loss, Parts, Weights};
 use crate::passes::Passes;
 use crate::project::{RowGradient, Style};
@@ -212,9 +213,7 @@ impl<'a> Trainer<'a> {
         let (seen, gradients) = (&mut self.seen, &mut self.gradients);
         self.passes.backward(&self.gaussians, view, style, by, seen, gradients);
         lap(&mut self.times.backward, &mut start);
-        for (&row, by) in self.seen.iter().zip(&self.gradients) {
-            self.errors[row as usize] += by.error;
-        }
+        note(&mut self.errors, &self.seen, &self.gradients);
         self.step += 1;
         let rates = self.rates();
         let step = Step {
@@ -358,6 +357,17 @@ impl<'a> Trainer<'a> {
 /// Returns what of the Gaussians a device does not have as it is; see [`Trainer::stale`].
 fn changed(stale: Option<usize>, seen: &[u32]) -> Changed<'_> {
     stale.map_or(Changed::All, |columns| Changed::Rows { rows: seen, columns })
+}
+
+/// Adds the errors seen through some rows, which ascend, to theirs.
+fn note(errors: &mut [f32], seen: &[u32], gradients: &[RowGradient]) {
+    errors.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, errors)| {
+        let first = chunk * CHUNK;
+        let part = within(seen, first);
+        for (&row, by) in seen[part.clone()].iter().zip(&gradients[part]) {
+            errors[row as usize - first] += by.error;
+        }
+    });
 }
 
 /// Keeps the items, `width` numbers each, that `keep` says.

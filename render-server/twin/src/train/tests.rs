@@ -49,7 +49,7 @@ fn rows_that_changed_train_the_same_twin_as_all_rows() {
             }
             trainer.step();
             // Images in between, of other photos; after a move, too.
-            if trainer.steps() % 25 == 0 {
+            if trainer.steps().is_multiple_of(25) {
                 judged.push(trainer.judge().map(|quality| quality.psnr_db.to_bits()));
             }
         }

@@ -1,7 +1,7 @@
 //! How long the parts of training take: on the device by its own clock, where the adapter has one.
 
 use std::fmt;
-use std::ops::{AddAssign, Range};
+use std::ops::Range;
 use std::time::Instant;
 
 use serde::Serialize;
@@ -144,5 +144,5 @@ impl Clock {
 
 /// Adds what has passed since an instant. [ms]
 pub(super) fn add(to: &mut f64, since: Instant) {
-    to.add_assign(since.elapsed().as_secs_f64() * 1e3);
+    *to += since.elapsed().as_secs_f64() * 1e3;
 }

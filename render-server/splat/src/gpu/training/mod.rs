@@ -29,6 +29,7 @@ mod upload;
 
 use std::time::Instant;
 
+use rayon::prelude::*;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 pub use clock::TrainingTimes;
@@ -47,7 +48,7 @@ use crate::rasterizer::RenderError;
 use buffers::{TrainingBuffers, TrainingCapacity};
 use clock::{BACKWARD, Clock, FORWARD};
 use scatter::Scatter;
-use upload::Upload;
+use upload::{PART, Upload};
 
 /// Channels of an image: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Numbers lie band of tiles by
 /// band, channel by channel, row by row, padded to whole tiles of 16 pixels.
@@ -244,7 +245,10 @@ impl TrainingRenderer {
                 let (sizes, _) = read::sizes(bytes, None);
                 if sizes.pairs == sizes.pairs_wanted {
                     let numbers = &bytes[IMAGE_AT..][..image.len() * 4];
-                    image.as_mut_bytes().copy_from_slice(numbers);
+                    let parts = image.as_mut_bytes().par_chunks_mut(PART);
+                    parts
+                        .zip(numbers.par_chunks(PART))
+                        .for_each(|(to, from)| to.copy_from_slice(from));
                 }
                 clock::add(&mut times.image, start);
                 if let Some(clock) = clock {

@@ -11,8 +11,8 @@ pub(super) struct Upload {
     buffer: wgpu::Buffer,
 }
 
-/// Bytes that one task writes at a time; views of the memory begin at multiples of 8.
-const PART: usize = 1 << 16;
+/// Bytes that one task copies at a time; views of the memory begin at multiples of 8.
+pub(super) const PART: usize = 1 << 16;
 
 impl Upload {
     /// Returns one of so many bytes; a given one if it is large enough.
