@@ -6,14 +6,12 @@
 use rayon::prelude::*;
 use vizflyt_splat::simd::{InstructionSet, Kernel, Simd};
 
-use crate::gaussians::{Gaussians, coefficients, column, sigmoid};
+use crate::gaussians::{CHUNK, Gaussians, coefficients, column, sigmoid, within};
 use crate::project::RowGradient;
 
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
-/// Rows that one thread takes at a time.
-const CHUNK: usize = 1024;
 
 /// Steps of each group of columns.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -97,14 +95,13 @@ impl Step<'_> {
             .enumerate()
             .for_each(|(chunk, ((values, first), second))| {
                 let first_row = chunk * CHUNK;
-                let start = self.seen.partition_point(|&row| (row as usize) < first_row);
-                let end = self.seen.partition_point(|&row| (row as usize) < first_row + CHUNK);
+                let part = within(self.seen, first_row);
                 instructions.run(Rows {
                     step: self,
                     stride,
                     rows,
-                    seen: &self.seen[start..end],
-                    gradients: &self.gradients[start..end],
+                    seen: &self.seen[part.clone()],
+                    gradients: &self.gradients[part],
                     first_row,
                     values,
                     first,
@@ -177,18 +174,31 @@ impl Kernel for Rows<'_> {
             let values = &mut self.values[at..at + counted];
             let gradient = self.step.gradient(values, by, self.rows);
             // A row that came out wrong somewhere stays where it is.
-            if !gradient.iter().sum::<f32>().is_finite() {
+            if !is_finite(&gradient) {
                 continue;
             }
-            let (first, second) =
-                (&mut self.first[at..at + counted], &mut self.second[at..at + counted]);
-            for i in 0..counted {
-                first[i] = BETA1 * first[i] + (1.0 - BETA1) * gradient[i];
-                second[i] = BETA2 * second[i] + (1.0 - BETA2) * gradient[i] * gradient[i];
-                values[i] -= rates[i] * first[i] * bias1 / ((second[i] * bias2).sqrt() + EPSILON);
+            let first = &mut self.first[at..at + counted];
+            let second = &mut self.second[at..at + counted];
+            let steps = values.iter_mut().zip(first).zip(second).zip(&gradient).zip(&rates);
+            for ((((value, first), second), gradient), rate) in steps {
+                *first = BETA1 * *first + (1.0 - BETA1) * gradient;
+                *second = BETA2 * *second + (1.0 - BETA2) * gradient * gradient;
+                *value -= rate * *first * bias1 / ((*second * bias2).sqrt() + EPSILON);
             }
         }
     }
+}
+
+/// Whether the sum of some numbers is finite; in eight parts, which the processor adds at once.
+#[inline(always)]
+fn is_finite(numbers: &[f32]) -> bool {
+    let mut sums = [0.0f32; 8];
+    for numbers in numbers.chunks(8) {
+        for (sum, number) in sums.iter_mut().zip(numbers) {
+            *sum += number;
+        }
+    }
+    sums.iter().sum::<f32>().is_finite()
 }
 
 #[cfg(test)]

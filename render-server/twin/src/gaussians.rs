@@ -6,7 +6,10 @@
 //! RGB within), as Kerbl et al. 2023 parametrise them. Rows make moments of the optimiser, copies and
 //! checkpoints the same three lines.
 
+use std::ops::Range;
+
 use glam::{Quat, Vec3};
+use rayon::prelude::*;
 use vizflyt_splat::Splats;
 
 /// Where a row's numbers are.
@@ -66,6 +69,18 @@ impl Gaussians {
         &mut self.values[i * stride..(i + 1) * stride]
     }
 
+    /// Calls `change` with each of some rows, which ascend, on all cores.
+    pub(crate) fn change(&mut self, rows: &[u32], change: impl Fn(u32, &mut [f32]) + Sync) {
+        let stride = self.stride();
+        self.values.par_chunks_mut(CHUNK * stride).enumerate().for_each(|(chunk, values)| {
+            let first = chunk * CHUNK;
+            for &row in &rows[within(rows, first)] {
+                let at = (row as usize - first) * stride;
+                change(row, &mut values[at..at + stride]);
+            }
+        });
+    }
+
     /// Returns as many rows of zeros.
     pub fn zeros(&self) -> Self {
         Self { degree: self.degree, values: vec![0.0; self.values.len()] }
@@ -114,6 +129,15 @@ impl Gaussians {
         }
         splats
     }
+}
+
+/// Rows that one thread takes at a time.
+pub(crate) const CHUNK: usize = 1024;
+
+/// Returns which of some ascending rows are in the chunk that begins with a row.
+pub(crate) fn within(rows: &[u32], first: usize) -> Range<usize> {
+    let place = |row: usize| rows.partition_point(|&r| (r as usize) < row);
+    place(first)..place(first + CHUNK)
 }
 
 /// Returns the coefficients of a degree: 1, 4, 9 or 16.

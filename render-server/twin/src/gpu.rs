@@ -1,9 +1,11 @@
 //! The passes on a graphics card: `vizflyt_splat::gpu::training` in the trainer's words.
 
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use glam::Vec3;
 use rayon::prelude::*;
 use vizflyt_splat::RenderError;
-use vizflyt_splat::gpu::training::{self, Photo, TrainingRenderer};
+use vizflyt_splat::gpu::training::{self, Changed, Photo, TrainingRenderer, TrainingTimes};
 use vizflyt_splat::gpu::{Adapter, Budget};
 
 use crate::gaussians::{Gaussians, column};
@@ -23,9 +25,8 @@ pub(crate) struct GpuPasses {
     renderer: TrainingRenderer,
     /// Of the view rendered last.
     image: Planes,
-    found: Vec<training::RowGradient>,
-    /// Where each row's gradient is in `found`; [`UNSEEN`] where there is none.
-    places: Vec<u32>,
+    /// Where each row's gradient is in what the device found; [`UNSEEN`] where there is none.
+    places: Vec<AtomicU32>,
 }
 
 const UNSEEN: u32 = u32::MAX;
@@ -36,7 +37,6 @@ impl GpuPasses {
         Ok(Self {
             renderer: TrainingRenderer::new(adapter, budget)?,
             image: Planes::default(),
-            found: Vec::new(),
             places: Vec::new(),
         })
     }
@@ -51,15 +51,21 @@ impl GpuPasses {
         &self.image
     }
 
+    /// Returns where the time of all photos so far went.
+    pub(crate) fn times(&self) -> TrainingTimes {
+        self.renderer.times()
+    }
+
     /// Destroys the device, as a driver's reset does.
     pub(crate) fn lose_device(&self) {
         self.renderer.lose_device();
     }
 
-    /// Renders the image of a view.
+    /// Renders the image of a view; `changed` is what may differ from the Gaussians of the last one.
     pub(crate) fn forward(
         &mut self,
         gaussians: &Gaussians,
+        changed: Changed<'_>,
         view: &View,
         style: Style,
     ) -> Result<(), RenderError> {
@@ -77,7 +83,7 @@ impl GpuPasses {
             antialiased: style.antialiased,
         };
         let image = &mut self.image.values;
-        self.renderer.forward(&gaussians.values, gaussians.stride(), &photo, image)
+        self.renderer.forward(&gaussians.values, gaussians.stride(), changed, &photo, image)
     }
 
     /// Takes the derivative of a loss by the last image's channels back: fills `seen` with the rows that it
@@ -91,30 +97,33 @@ impl GpuPasses {
         seen: &mut Vec<u32>,
         out: &mut Vec<RowGradient>,
     ) -> Result<(), RenderError> {
-        self.renderer.backward(&by.values, &mut self.found)?;
-        self.places.clear();
-        self.places.resize(gaussians.len(), UNSEEN);
-        for (place, found) in self.found.iter().enumerate() {
-            self.places[found.row()] = place as u32;
-        }
-        seen.clear();
-        seen.extend((0..).zip(&self.places).filter(|(_, p)| **p != UNSEEN).map(|(row, _)| row));
-        let (places, found) = (&self.places, &self.found);
-        seen.par_iter()
-            .with_min_len(1024)
-            .map(|&row| {
-                let by = &found[places[row as usize] as usize];
-                let mean = Vec3::from_slice(&gaussians.row(row as usize)[column::MEAN..]);
-                let d = mean - view.position;
-                RowGradient {
-                    geometry: by.geometry,
-                    basis: basis(d / d.length(), style.degree),
-                    rgb: by.rgb,
-                    error: by.error,
-                }
-            })
-            .collect_into_vec(out);
-        Ok(())
+        let places = &mut self.places;
+        self.renderer.backward(&by.values, |found| {
+            places.resize_with(gaussians.len(), AtomicU32::default);
+            places.par_iter_mut().with_min_len(1 << 14).for_each(|p| *p.get_mut() = UNSEEN);
+            // A row is found once: which thread notes it makes no difference.
+            found.par_iter().enumerate().with_min_len(4096).for_each(|(place, found)| {
+                places[found.row()].store(place as u32, Ordering::Relaxed);
+            });
+            let place = |row: u32| places[row as usize].load(Ordering::Relaxed);
+            let rows = (0..gaussians.len() as u32).into_par_iter().with_min_len(4096);
+            seen.clear();
+            seen.par_extend(rows.filter(|&row| place(row) != UNSEEN));
+            seen.par_iter()
+                .with_min_len(1024)
+                .map(|&row| {
+                    let by = &found[place(row) as usize];
+                    let mean = Vec3::from_slice(&gaussians.row(row as usize)[column::MEAN..]);
+                    let d = mean - view.position;
+                    RowGradient {
+                        geometry: by.geometry,
+                        basis: basis(d / d.length(), style.degree),
+                        rgb: by.rgb,
+                        error: by.error,
+                    }
+                })
+                .collect_into_vec(out);
+        })
     }
 }
 

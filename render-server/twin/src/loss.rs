@@ -131,7 +131,7 @@ pub struct Loss {
     truth: Planes,
     maps: Planes,
     by_shown: Planes,
-    inverse: Planes,
+    smooth: smooth::Scratch,
     /// The derivative by the image's channels.
     by: Planes,
 }
@@ -144,7 +144,7 @@ impl Default for Loss {
             truth: Planes::default(),
             maps: Planes::default(),
             by_shown: Planes::default(),
-            inverse: Planes::default(),
+            smooth: smooth::Scratch::default(),
             by: Planes::default(),
         }
     }
@@ -168,7 +168,7 @@ impl Loss {
         self.expose(image, target, exposure, background);
         let numbers = (3 * width * height) as f64;
         let sum = ssim::similarity(self.instructions, &self.shown, &self.truth, &mut self.maps);
-        let Self { shown, truth, maps, by_shown, inverse, by, .. } = self;
+        let Self { shown, truth, maps, by_shown, smooth, by, .. } = self;
         ssim::derivative(self.instructions, shown, truth, maps, by_shown);
 
         by.resize(channel::BY_COUNT, width, height);
@@ -177,8 +177,8 @@ impl Loss {
         let l1_step = ((1.0 - f64::from(weights.dssim)) / numbers) as f32;
         let ssim_step = (-f64::from(weights.dssim) / numbers) as f32;
         let rows = |band: usize| TILE.min(height - band * TILE);
-        // Of a band: absolute error, spread, derivatives by gain and offset.
-        let sums: Vec<[f64; 8]> = by
+        // Of a band: absolute error, spread, derivatives by gain and offset; error of depth.
+        let sums: Vec<[f64; 9]> = by
             .values
             .par_chunks_mut(len)
             .zip(shown.values.par_chunks(shown_len))
@@ -190,7 +190,7 @@ impl Loss {
             .map(|(band, ((((by, shown), truth), by_ssim), image))| {
                 let plane = TILE * stride;
                 by.fill(0.0);
-                let mut sums = [0.0; 8];
+                let mut sums = [0.0; 9];
                 for at in (0..rows(band)).flat_map(|row| row * stride..row * stride + width) {
                     let i = band * TILE * width + at / stride * width + at % stride;
                     if target.mask.get(i) == Some(&0) {
@@ -225,43 +225,28 @@ impl Loss {
                     if let Some(&z) = target.depth.get(i)
                         && z > 0.0
                     {
+                        sums[8] += f64::from((ray.mean / z - 1.0).abs());
                         add(ray.by_depth(z).map(|v| v * weights.depth / pixels));
                     }
                 }
                 sums
             })
             .collect();
-        let mut total = [0.0; 8];
+        let mut total = [0.0; 9];
         for band in &sums {
-            for k in 0..8 {
+            for k in 0..9 {
                 total[k] += band[k];
             }
         }
         let mut parts = Parts {
             l1: total[0] / numbers,
             ssim: sum / numbers,
-            depth: 0.0,
+            depth: total[8] / (width * height) as f64,
             spread: total[1] / (width * height) as f64,
             bend: 0.0,
         };
         if weights.bend > 0.0 {
-            parts.bend = smooth::add(image, truth, weights.bend, inverse, by);
-        }
-        let counts = |i: usize, z: f32| z > 0.0 && target.mask.get(i) != Some(&0);
-        if !target.depth.is_empty() {
-            let pixels = (width * height) as f64;
-            let error = |(i, z): (usize, &f32)| {
-                let ray = Ray::of(|c| image.at(c, i % width, i / width));
-                if ray.alpha < MIN_ALPHA { 0.0 } else { f64::from((ray.mean / z - 1.0).abs()) }
-            };
-            parts.depth += target
-                .depth
-                .iter()
-                .enumerate()
-                .filter(|&(i, &z)| counts(i, z))
-                .map(error)
-                .sum::<f64>()
-                / pixels;
+            parts.bend = smooth::add(image, truth, weights.bend, smooth, by);
         }
         let share = 1.0 / target.points.len().max(1) as f32;
         for point in &target.points {

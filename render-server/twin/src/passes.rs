@@ -4,6 +4,7 @@
 
 mod trial;
 
+use vizflyt_splat::gpu::training::{Changed, TrainingTimes};
 use vizflyt_splat::gpu::{Adapter, AdapterName, Budget};
 use vizflyt_splat::{Backend, NoRenderer, RenderError};
 
@@ -98,9 +99,20 @@ impl Passes {
         }
     }
 
-    /// Renders the image of a view.
-    pub(crate) fn forward(&mut self, gaussians: &Gaussians, view: &View, style: Style) -> &Planes {
-        let rendered = self.gpu.as_mut().map(|gpu| gpu.forward(gaussians, view, style));
+    /// Returns where a device's time went in all images so far; `None` where none renders.
+    pub fn device_times(&self) -> Option<TrainingTimes> {
+        self.gpu.as_ref().map(GpuPasses::times)
+    }
+
+    /// Renders the image of a view; `changed` is what may differ from the Gaussians of the last one.
+    pub(crate) fn forward(
+        &mut self,
+        gaussians: &Gaussians,
+        changed: Changed<'_>,
+        view: &View,
+        style: Style,
+    ) -> &Planes {
+        let rendered = self.gpu.as_mut().map(|gpu| gpu.forward(gaussians, changed, view, style));
         if let Some(Err(why)) = rendered {
             self.lose(&why);
         }

@@ -89,15 +89,14 @@ const LENGTH: f32 = 0.6;
 const WIDTH: f32 = 0.95;
 const OPACITY: f32 = 0.95;
 
-/// Moves faint rows of `seen` by noise of their own shape, `strength` times their covariance.
+/// Moves faint rows of `seen`, which ascend, by noise of their own shape, `strength` times their covariance.
 pub(crate) fn wander(gaussians: &mut Gaussians, seen: &[u32], strength: f32, seed: u64) {
-    for &row in seen {
-        let values = gaussians.row_mut(row as usize);
+    gaussians.change(seen, |row, values| {
         let opacity = sigmoid(values[column::LOGIT]);
         // A step at 0.005; what is well visible stays.
         let faint = sigmoid(-100.0 * (opacity - DEAD_OPACITY));
         if faint < 1e-4 {
-            continue;
+            return;
         }
         let mut random = Random::stream(seed, u64::from(row));
         let noise = Vec3::new(random.normal(), random.normal(), random.normal());
@@ -108,7 +107,7 @@ pub(crate) fn wander(gaussians: &mut Gaussians, seen: &[u32], strength: f32, see
         for (value, step) in values.iter_mut().zip((moved * (strength * faint)).to_array()) {
             *value += step;
         }
-    }
+    });
 }
 
 #[cfg(test)]

@@ -9,17 +9,22 @@ mod start;
 
 pub use checkpoint::{Checkpoint, CheckpointError};
 
+use std::time::Instant;
+
+use rayon::prelude::*;
 use vizflyt_splat::Splats;
+use vizflyt_splat::gpu::training::Changed;
 use vizflyt_splat::simd::InstructionSet;
 
 use crate::adam::{Moments, Rates, Step, Tolls};
 use crate::dataset::{Dataset, Photo};
-use crate::gaussians::Gaussians;
+use crate::gaussians::{CHUNK, Gaussians, coefficients, column, within};
 use crate::loss::{Exposure, Loss, Parts, Weights};
 use crate::passes::Passes;
 use crate::project::{RowGradient, Style};
 use crate::random::Random;
 use crate::relocate::{relocate, wander};
+use crate::times::{Times, lap};
 
 /// How to train.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -73,12 +78,17 @@ pub struct Trainer<'a> {
     loss: Loss,
     gradients: Vec<RowGradient>,
     seen: Vec<u32>,
+    /// How many numbers of each row in `seen` are others than at the last rendering; `None`: any of any row.
+    stale: Option<usize>,
     /// Error seen through each Gaussian since they last moved house.
     errors: Vec<f32>,
     /// Photos still to come before all are shuffled again.
     queue: Vec<usize>,
     random: Random,
     step: u32,
+    /// Of the steps after this one, all together.
+    timed_from: u32,
+    times: Times,
 }
 
 /// A photo's exposure and its moments, gain then offset.
@@ -140,9 +150,12 @@ impl<'a> Trainer<'a> {
             loss: Loss::default(),
             gradients: Vec::new(),
             seen: Vec::new(),
+            stale: None,
             queue: Vec::new(),
             random: Random::stream(options.seed, 1),
             step: 0,
+            timed_from: 0,
+            times: Times::default(),
         };
         assert!(trainer.trained().next().is_some(), "no photo to train with");
         trainer
@@ -156,6 +169,12 @@ impl<'a> Trainer<'a> {
     /// Returns what renders and takes derivatives back.
     pub fn passes(&mut self) -> &mut Passes {
         &mut self.passes
+    }
+
+    /// Returns how long the parts of a step took, on average of those taken here.
+    pub fn times(&self) -> Times {
+        let device = self.passes.device_times();
+        Times { device, ..self.times }.mean(self.step - self.timed_from)
     }
 
     /// Returns what is trained.
@@ -179,19 +198,22 @@ impl<'a> Trainer<'a> {
 
     /// Takes one step; returns the parts of the loss before it.
     pub fn step(&mut self) -> Parts {
+        let mut start = Instant::now();
         let photo = self.draw();
         let Photo { view, target, .. } = &self.dataset.photos[photo];
         let style = self.style();
         let background = std::array::from_fn(|_| self.random.unit());
         let exposure = self.exposures[photo].exposure;
         let weights = self.options.weights;
-        let image = self.passes.forward(&self.gaussians, view, style);
+        let changed = changed(self.stale, &self.seen);
+        let image = self.passes.forward(&self.gaussians, changed, view, style);
+        lap(&mut self.times.forward, &mut start);
         let (parts, by_exposure, by) = self.loss.of(image, target, &exposure, background, &weights);
+        lap(&mut self.times.loss, &mut start);
         let (seen, gradients) = (&mut self.seen, &mut self.gradients);
         self.passes.backward(&self.gaussians, view, style, by, seen, gradients);
-        for (&row, by) in self.seen.iter().zip(&self.gradients) {
-            self.errors[row as usize] += by.error;
-        }
+        lap(&mut self.times.backward, &mut start);
+        note(&mut self.errors, &self.seen, &self.gradients);
         self.step += 1;
         let rates = self.rates();
         let step = Step {
@@ -204,17 +226,22 @@ impl<'a> Trainer<'a> {
             degree: style.degree,
         };
         step.apply(InstructionSet::available()[0], &mut self.gaussians, &mut self.moments);
+        self.stale = Some(column::SH + 3 * coefficients(style.degree));
         if self.options.exposure {
             let rate = EXPOSURE_RATE * self.decay(0.1);
             self.exposures[photo].apply(&by_exposure, rate);
         }
+        lap(&mut self.times.adam, &mut start);
         if self.is_moving() {
             let seed = self.options.seed ^ (u64::from(self.step) << 32);
             wander(&mut self.gaussians, &self.seen, NOISE * rates.mean, seed);
+            lap(&mut self.times.wander, &mut start);
             if self.step.is_multiple_of(RELOCATE_EVERY) {
                 let grow = self.growth();
                 let (gaussians, moments) = (&mut self.gaussians, &mut self.moments);
                 relocate(gaussians, moments, &mut self.errors, grow, &mut self.random);
+                self.stale = None;
+                lap(&mut self.times.relocate, &mut start);
             }
         }
         parts
@@ -247,7 +274,8 @@ impl<'a> Trainer<'a> {
     pub fn compare(&mut self, photo: usize) -> Comparison {
         let Photo { view, target, .. } = &self.dataset.photos[photo];
         let style = Style { degree: self.options.degree, ..self.style() };
-        let image = self.passes.forward(&self.gaussians, view, style);
+        let changed = changed(self.stale.replace(0), &self.seen);
+        let image = self.passes.forward(&self.gaussians, changed, view, style);
         let exposure = if self.options.exposure {
             Exposure::fitting(image, target)
         } else {
@@ -326,6 +354,22 @@ impl<'a> Trainer<'a> {
     }
 }
 
+/// Returns what of the Gaussians a device does not have as it is; see [`Trainer::stale`].
+fn changed(stale: Option<usize>, seen: &[u32]) -> Changed<'_> {
+    stale.map_or(Changed::All, |columns| Changed::Rows { rows: seen, columns })
+}
+
+/// Adds the errors seen through some rows, which ascend, to theirs.
+fn note(errors: &mut [f32], seen: &[u32], gradients: &[RowGradient]) {
+    errors.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, errors)| {
+        let first = chunk * CHUNK;
+        let part = within(seen, first);
+        for (&row, by) in seen[part.clone()].iter().zip(&gradients[part]) {
+            errors[row as usize - first] += by.error;
+        }
+    });
+}
+
 /// Keeps the items, `width` numbers each, that `keep` says.
 pub(crate) fn retain<T: Copy>(list: &mut Vec<T>, width: usize, keep: impl Fn(usize) -> bool) {
     let kept = list.chunks_exact(width).enumerate().filter(|(i, _)| keep(*i));
@@ -365,3 +409,6 @@ const DEGREES_PER_TRAINING: f32 = 5.0;
 const EXPOSURE_RATE: f32 = 3e-3;
 /// How strongly exposures are held to no change.
 const EXPOSURE_PULL: f32 = 0.02;
+
+#[cfg(test)]
+mod tests;

@@ -11,7 +11,7 @@ use serde::Serialize;
 use vizflyt_server::render::RendererKind;
 use vizflyt_splat::format::{self, Format};
 use vizflyt_twin::train::Quality;
-use vizflyt_twin::{Dataset, Options, Passes, Trainer};
+use vizflyt_twin::{Dataset, Options, Passes, Times, Trainer};
 
 use self::kept::Kept;
 use super::progress::Progress;
@@ -73,7 +73,7 @@ pub(crate) struct TrainArgs {
     /// Goes on with a training of the same photos and options that was interrupted; it is kept every minute
     #[arg(long)]
     resume: bool,
-    /// Writes what was done and how good it is as JSON
+    /// Writes what was done, how good it is and where the time of a step went as JSON
     #[arg(long, value_name = "FILE.json")]
     report: Option<PathBuf>,
 }
@@ -93,6 +93,8 @@ struct Report {
     /// What rendered at the end: `cpu avx2`, or `gpu` and the adapter's name.
     renderer: String,
     seconds: f64,
+    /// The parts of a step, on average of those taken here.
+    ms_a_step: Times,
     /// Of photos that training did not see; absent if none was held out.
     #[serde(skip_serializing_if = "Option::is_none")]
     held_out: Option<Quality>,
@@ -169,6 +171,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         kept.keep(&trainer);
     }
     drop(progress);
+    let ms_a_step = trainer.times();
     let held_out = trainer.judge();
     let mut splats = trainer.splats();
     splats.antialiased = args.antialiased;
@@ -186,9 +189,11 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
         antialiased: args.antialiased,
         renderer: trainer.passes().name().to_owned(),
         seconds: start.elapsed().as_secs_f64(),
+        ms_a_step,
         held_out,
     };
     print_fmt!("trained      {} steps in {:.0} s", report.steps, report.seconds);
+    print_fmt!("ms a step    {ms_a_step}");
     if let Some(quality) = &report.held_out {
         print_fmt!(
             "held out     {} photos: PSNR {:.2} dB, SSIM {:.3}",

@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 
 use super::*;
 use crate::passes::Passes;
+use crate::random::Random;
 use crate::render::Renderer;
 use crate::render::tests::{assert_differences, dense, rows, scene, view, weights};
 use crate::{loss, reference};
@@ -35,7 +36,7 @@ fn run(
     by: &Planes,
 ) -> (Planes, Vec<u32>, Gaussians) {
     let (mut seen, mut found) = (Vec::new(), Vec::new());
-    gpu.forward(gaussians, view, style).expect("an image");
+    gpu.forward(gaussians, Changed::All, view, style).expect("an image");
     gpu.backward(gaussians, view, style, by, &mut seen, &mut found).expect("gradients");
     assert!(seen.is_sorted() && seen.len() == found.len());
     let gradient = dense(gaussians, seen.iter().map(|&row| row as usize), &found);
@@ -64,7 +65,7 @@ fn the_image_is_the_references() {
         let style = Style { degree, antialiased };
         let gaussians = scene(500, degree, &view, 7);
         let expected = reference::render(&rows(&gaussians), gaussians.stride(), &view, style);
-        gpu.forward(&gaussians, &view, style).expect("an image");
+        gpu.forward(&gaussians, Changed::All, &view, style).expect("an image");
         let mut off = 0;
         for (i, expected) in expected.iter().enumerate() {
             let (x, y) = (i % view.width, i / view.width);
@@ -144,6 +145,52 @@ fn every_run_and_every_room_gives_the_same_bits() {
 }
 
 #[test]
+fn a_device_that_is_told_what_changed_renders_what_the_host_has() {
+    let Some(mut gpu) = passes(1 << 16) else { return };
+    let (wide, narrow) = (view(300, 200), view(150, 130));
+    let style = Style { degree: 2, antialiased: false };
+    let mut gaussians = scene(3000, 2, &narrow, 3);
+    let mut random = Random::new(7);
+    let mut whole = passes(1 << 16).expect("an adapter was there");
+    let mut check = |gaussians: &Gaussians, changed: Changed<'_>, view: &View| {
+        gpu.forward(gaussians, changed, view, style).expect("an image");
+        whole.forward(gaussians, Changed::All, view, style).expect("an image");
+        let bits =
+            |gpu: &GpuPasses| gpu.image().values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert!(bits(&gpu) == bits(&whole), "{} rows, {changed:?}", gaussians.len());
+    };
+    // It has none yet, whatever it is told.
+    check(&gaussians, Changed::Rows { rows: &[], columns: 0 }, &narrow);
+    // Few and many, odd and even numbers; then a larger photo, for which all buffers are new.
+    for (count, columns, view) in [
+        (1, 3, &narrow),
+        (2, 14, &narrow),
+        (777, 23, &narrow),
+        (1500, 38, &narrow),
+        (2999, 38, &narrow),
+        (3000, 38, &narrow),
+        (500, 38, &wide),
+        (40, 38, &narrow),
+        (900, 0, &narrow),
+    ] {
+        let mut rows: Vec<u32> = (0..gaussians.len() as u32).collect();
+        random.shuffle(&mut rows);
+        rows.truncate(count);
+        for &row in &rows {
+            for value in &mut gaussians.row_mut(row as usize)[..columns] {
+                *value += 0.02 * random.normal();
+            }
+        }
+        check(&gaussians, Changed::Rows { rows: &rows, columns }, view);
+    }
+    // More of them, and fewer: these it cannot have.
+    let more = scene(3001, 2, &narrow, 4);
+    check(&more, Changed::Rows { rows: &[3000], columns: 38 }, &narrow);
+    let fewer = scene(2000, 2, &narrow, 5);
+    check(&fewer, Changed::Rows { rows: &[], columns: 0 }, &narrow);
+}
+
+#[test]
 fn photos_of_all_sizes_and_no_gaussians_at_all() {
     let Some(mut gpu) = passes(1 << 10) else { return };
     let style = Style { degree: 0, antialiased: false };
@@ -195,7 +242,7 @@ fn a_lost_device_is_named_and_the_processor_goes_on() {
     let (_, by) = weights(&view, 8);
     let mut cpu = Passes::cpu();
     let (mut seen, mut expected) = (Vec::new(), Vec::new());
-    cpu.forward(&gaussians, &view, style);
+    cpu.forward(&gaussians, Changed::All, &view, style);
     cpu.backward(&gaussians, &view, style, &by, &mut seen, &mut expected);
     let numbers = |of: &[RowGradient]| of.iter().map(|by| by.geometry).collect::<Vec<_>>();
     // Before the image, or between it and its derivative.
@@ -206,7 +253,7 @@ fn a_lost_device_is_named_and_the_processor_goes_on() {
         if early {
             passes.lose_device();
         }
-        passes.forward(&gaussians, &view, style);
+        passes.forward(&gaussians, Changed::All, &view, style);
         passes.lose_device();
         passes.backward(&gaussians, &view, style, &by, &mut again, &mut found);
         assert!(passes.name().starts_with("cpu "));
@@ -239,7 +286,7 @@ fn the_loss_reads_what_a_device_renders() {
     };
     let weights = loss::Weights { dssim: 0.2, depth: 0.5, spread: 0.02, bend: 0.1 };
     let mut cpu = Renderer::default();
-    gpu.forward(&gaussians, &view, style).expect("an image");
+    gpu.forward(&gaussians, Changed::All, &view, style).expect("an image");
     let [a, b] = [gpu.image(), cpu.forward(&gaussians, &view, style)].map(|image| {
         let exposure = loss::Exposure::default();
         let mut loss = loss::Loss::default();

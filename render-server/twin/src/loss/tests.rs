@@ -140,9 +140,9 @@ fn bends_have_the_derivative_of_finite_differences_and_planes_have_none() {
         truth
     });
     let of = |image: &Planes| {
-        let (mut inverse, mut by) = (Planes::default(), Planes::default());
+        let (mut scratch, mut by) = (smooth::Scratch::default(), Planes::default());
         by.resize(channel::BY_COUNT, WIDTH, HEIGHT);
-        let bend = crate::smooth::add(image, &truth, 1.0, &mut inverse, &mut by);
+        let bend = smooth::add(image, &truth, 1.0, &mut scratch, &mut by);
         (bend, by)
     };
     let (_, by) = of(&image);

@@ -2,6 +2,7 @@
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_splat::gpu::training::Changed;
 
 use crate::gaussians::Gaussians;
 use crate::gpu::GpuPasses;
@@ -29,7 +30,7 @@ pub(super) fn check(gpu: &mut GpuPasses) -> Result<f64, String> {
     let mut runs = Vec::new();
     for _ in 0..2 {
         let (mut seen, mut found) = (Vec::new(), Vec::new());
-        gpu.forward(&gaussians, &view, style).map_err(|error| error.to_string())?;
+        gpu.forward(&gaussians, Changed::All, &view, style).map_err(|error| error.to_string())?;
         gpu.backward(&gaussians, &view, style, &by, &mut seen, &mut found)
             .map_err(|error| error.to_string())?;
         runs.push(dense(&gaussians, seen.iter().map(|&row| row as usize), &found));

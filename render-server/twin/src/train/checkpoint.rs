@@ -185,7 +185,8 @@ impl<'a> Trainer<'a> {
         }
         let queue = queue.into_iter().map(|photo| photo as usize).collect();
         let begun = Self::with(dataset, options, passes);
-        Ok(Self { gaussians, moments, exposures, errors, queue, random, step, ..begun })
+        let timed_from = step;
+        Ok(Self { gaussians, moments, exposures, errors, queue, random, step, timed_from, ..begun })
     }
 }
 

@@ -1,6 +1,6 @@
 //! What the passes of training leave for each other, beside the renderer's own buffers.
 //!
-//! Memory: 132 bytes per row besides its numbers, 76 per pair, 52 per pixel.
+//! Memory: 132 bytes per row besides its numbers, which are there twice, 76 per pair, 52 per pixel.
 
 use super::super::device::Device;
 use super::photo::PHOTO_BYTES;
@@ -65,6 +65,8 @@ pub(super) struct TrainingBuffers {
     pub(super) shared: Buffers,
     pub(super) photo: wgpu::Buffer,
     pub(super) rows: wgpu::Buffer,
+    /// Rows that changed.
+    pub(super) changes: wgpu::Buffer,
     pub(super) image: wgpu::Buffer,
     pub(super) by: wgpu::Buffer,
     /// Numbers of pairs, before and after each digit of the sort by tile.
@@ -87,6 +89,7 @@ impl TrainingBuffers {
             shared: Buffers::new(device, capacity.shared),
             photo: device.uniform("photo", &[0; PHOTO_BYTES]),
             rows: storage("rows", capacity.row_words),
+            changes: storage("changes", capacity.row_words),
             image: source("image", capacity.plane * CHANNELS as u64 * 4),
             by: storage("by", capacity.plane * BY_CHANNELS as u64),
             permutation: [storage("permutation", pairs), storage("permutation", pairs)],

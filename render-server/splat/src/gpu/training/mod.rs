@@ -1,8 +1,8 @@
 //! Training on a graphics card: rows of parameters -> the channels of a photo, and the derivative of a loss by
 //! them back to the rows.
 //!
-//! Data flow, the files in run order: `photo` turns a camera into numbers; `project` brings rows onto its image
-//! plane; the renderer's own `sort` and `bin` give each tile its list; `invert` notes where each pair stands in
+//! Data flow, the files in run order: `scatter` brings rows up to date; `photo` turns a camera into numbers;
+//! `project` brings rows onto its image plane; the renderer's own `sort` and `bin` give each tile its list; `invert` notes where each pair stands in
 //! the lists; `blend` renders the tiles. The caller compares image and photo. Then `blend` takes what the loss
 //! feels at the pixels to the pairs, and `unproject` adds each row's pairs up and takes them to its
 //! parameters. `vizflyt-twin` has the same passes for the processor, and what they are held against.
@@ -10,22 +10,34 @@
 //! Every sum has one order and a place of its own (`blend.rs`): the same rows, photo and derivative give the
 //! same gradients, bit for bit, in every run on one device.
 //!
-//! Budget: `project`, `blend` and `unproject` say theirs. The bus carries the rows up, the image down, its
-//! derivative up and 64 bytes per visible row down: 60 k rows of degree 2 at 320x240, 9.1 + 1.8 + 2.2 + 3.8 MB.
+//! The rows stay on the device: what changed since the last photo goes up alone (`scatter.rs`), and the host's are
+//! the truth. A device that has others, or new buffers, takes them all.
+//!
+//! Budget: `scatter`, `project`, `blend` and `unproject` say theirs, and [`TrainingTimes`] what it came to. The bus
+//! carries changed rows up, the image down, its derivative up and 64 bytes per visible row down: where 60 k rows of
+//! degree 2 are seen at 320x240, 9.4 + 1.8 + 2.2 + 3.8 MB.
 
 mod bin;
 mod blend;
 mod buffers;
+mod clock;
 mod invert;
 mod photo;
 mod project;
+mod scatter;
 mod sort;
 mod tiling;
 mod unproject;
+mod upload;
 
+use std::time::Instant;
+
+use rayon::prelude::*;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
+pub use clock::TrainingTimes;
 pub use photo::Photo;
+pub use scatter::Changed;
 
 use super::Budget;
 use super::device::{Adapter, Device};
@@ -36,7 +48,10 @@ use crate::rasterizer::RenderError;
 
 use bin::{Bin, BinBindings};
 use buffers::{TrainingBuffers, TrainingCapacity};
+use clock::{BACKWARD, Clock, FORWARD};
+use scatter::Scatter;
 use sort::{Count, Pairs, Sort};
+use upload::{PART, Upload};
 
 /// Channels of an image: red, green, blue, `sum w z`, `sum w z^2`, transmittance. Numbers lie band of tiles by
 /// band, channel by channel, row by row, padded to whole tiles of 16 pixels.
@@ -73,8 +88,10 @@ const DEPTH_BITS: u32 = 32;
 const SLOTS: Count = Count { size: 1, groups: 0 };
 const VISIBLE: Count = Count { size: 2, groups: 4 };
 
-/// Where the image lies in a staging buffer, behind what the device counted.
-const IMAGE_AT: usize = super::buffers::SIZES_BYTES as usize;
+/// Where the stamps lie in a staging buffer, behind what the device counted; and the image behind them.
+const STAMPS_AT: usize = super::buffers::SIZES_BYTES as usize;
+const IMAGE_AT: usize = 128;
+const _: () = assert!(STAMPS_AT + 16 * FORWARD.end <= IMAGE_AT);
 
 /// Renders rows, and takes derivatives back to them, with a graphics card.
 #[derive(Debug)]
@@ -86,6 +103,9 @@ pub struct TrainingRenderer {
     limit: TrainingCapacity,
     bound: Option<Bound>,
     staging: Option<Staging>,
+    upload: Option<Upload>,
+    clock: Option<Clock>,
+    times: TrainingTimes,
     /// Of the photo rendered last: tiles, rows that it shows, pairs.
     tiles: u32,
     visible: u32,
@@ -95,6 +115,7 @@ pub struct TrainingRenderer {
 /// The kernels.
 #[derive(Debug)]
 struct Passes {
+    scatter: Scatter,
     project: project::Project,
     sort: Sort,
     bin: Bin,
@@ -107,6 +128,9 @@ struct Passes {
 #[derive(Debug)]
 struct Bound {
     buffers: TrainingBuffers,
+    /// How many numbers of rows it has, and of each row: as they were for the last photo.
+    rows: Option<(usize, usize)>,
+    scatter: wgpu::BindGroup,
     project: wgpu::BindGroup,
     sort: Vec<sort::Digit>,
     bin: BinBindings,
@@ -123,6 +147,7 @@ impl TrainingRenderer {
     pub fn new(adapter: &Adapter, budget: Budget) -> Result<Self, RenderError> {
         let device = adapter.open(&budget).map_err(RenderError::Device)?;
         let passes = Passes {
+            scatter: Scatter::new(&device),
             project: project::Project::new(&device),
             sort: Sort::new(&device),
             bin: Bin::new(&device),
@@ -133,11 +158,14 @@ impl TrainingRenderer {
         let renderer = Self {
             name: format!("gpu {}", adapter.name().name),
             limit: TrainingCapacity::limit(device.binding_bytes),
+            clock: Clock::new(&device),
+            times: TrainingTimes::default(),
             device,
             passes,
             budget,
             bound: None,
             staging: None,
+            upload: None,
             tiles: 0,
             visible: 0,
             pairs: 0,
@@ -156,12 +184,18 @@ impl TrainingRenderer {
         self.pairs as usize
     }
 
+    /// Returns where the time of all photos so far went.
+    pub fn times(&self) -> TrainingTimes {
+        self.times
+    }
+
     /// Destroys the device, as a driver's reset does: to test what takes over.
     pub fn lose_device(&self) {
         self.device.device.destroy();
     }
 
     /// Renders rows of `stride` numbers as a photo shows them into `image`, [`CHANNELS`] padded to whole tiles.
+    /// `changed` is what of them may differ from the last photo's.
     ///
     /// # Errors
     /// [`RenderError::Device`] if the device is lost, or has no room for so much.
@@ -172,6 +206,7 @@ impl TrainingRenderer {
         &mut self,
         rows: &[f32],
         stride: usize,
+        changed: Changed<'_>,
         photo: &Photo,
         image: &mut [f32],
     ) -> Result<(), RenderError> {
@@ -195,16 +230,42 @@ impl TrainingRenderer {
         shared.tiles = u64::from(self.tiles);
         // One number more than there are tiles: that of none.
         shared.tile_digits = sort::digits(u32::BITS - self.tiles.leading_zeros());
+        let mut changed = changed;
         loop {
             self.reserve(&wanted)?;
+            let start = Instant::now();
+            let moved = self.write_rows(rows, stride, changed).map_err(RenderError::Device)?;
+            clock::add(&mut self.times.rows, start);
+            changed = Changed::Rows { rows: &[], columns: 0 };
             let bytes = IMAGE_AT + image.len() * 4;
             let staging = Staging::of(self.staging.take(), &self.device, bytes as u64);
-            let submission = self.submit_forward(rows, stride, photo, &staging, image.len() as u64);
+            let count = count as u32;
+            let submission = self.submit_forward(
+                [count, stride as u32],
+                moved,
+                photo,
+                &staging,
+                image.len() as u64,
+            );
+            let (clock, times) = (self.clock.as_ref(), &mut self.times);
             let sizes = staging.read(&self.device, submission, |bytes| {
+                let start = Instant::now();
                 let (sizes, _) = read::sizes(bytes, None);
                 if sizes.pairs == sizes.pairs_wanted {
                     let numbers = &bytes[IMAGE_AT..][..image.len() * 4];
-                    image.as_mut_bytes().copy_from_slice(numbers);
+                    let parts = image.as_mut_bytes().par_chunks_mut(PART);
+                    parts
+                        .zip(numbers.par_chunks(PART))
+                        .for_each(|(to, from)| to.copy_from_slice(from));
+                }
+                clock::add(&mut times.image, start);
+                if let Some(clock) = clock {
+                    let [scatter, project, sort, bin, blend] = clock.times(&bytes[STAMPS_AT..]);
+                    times.scatter += scatter;
+                    times.project += project;
+                    times.sort += sort;
+                    times.bin += bin;
+                    times.blend += blend;
                 }
                 sizes
             });
@@ -219,41 +280,63 @@ impl TrainingRenderer {
     }
 
     /// Takes the derivative of a loss by the last image, [`BY_CHANNELS`] padded to whole tiles, back to the
-    /// rows that it shows; fills `out` with them, nearest first.
+    /// rows that it shows; gives these to `take`, nearest first.
     ///
     /// # Errors
     /// [`RenderError::Device`] if the device is lost.
     ///
     /// # Panics
     /// If no image was rendered, or `by` has another size.
-    pub fn backward(&mut self, by: &[f32], out: &mut Vec<RowGradient>) -> Result<(), RenderError> {
+    pub fn backward<R>(
+        &mut self,
+        by: &[f32],
+        take: impl FnOnce(&[RowGradient]) -> R,
+    ) -> Result<R, RenderError> {
         let bound = self.bound.as_ref().expect("an image was rendered before");
         let (device, passes, buffers) = (&self.device, &self.passes, &bound.buffers);
         let pixels = u64::from(self.tiles) * 256;
         assert_eq!(by.len() as u64, pixels * BY_CHANNELS as u64);
-        device.queue.write_buffer(&buffers.by, 0, by.as_bytes());
+        let start = Instant::now();
+        let upload = Upload::of(self.upload.take(), device, by.len() as u64 * 4);
+        upload.write(0, by.as_bytes()).map_err(RenderError::Device)?;
+        clock::add(&mut self.times.derivative, start);
         let bytes = u64::from(self.visible) * size_of::<RowGradient>() as u64;
-        let staging = Staging::of(self.staging.take(), device, bytes);
+        let staging = bytes + clock::stamp_bytes(&BACKWARD);
+        let staging = Staging::of(self.staging.take(), device, staging);
         let mut encoder = device
             .device
             .create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("backward") });
-        {
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
-                label: Some("backward"),
-                timestamp_writes: None,
-            });
-            passes.blend.run_back(&mut pass, &bound.blend, self.tiles);
-            passes.unproject.run(&mut pass, &bound.unproject, &buffers.shared.dispatches);
-        }
+        upload.hand_over(&mut encoder, &buffers.by, by.len() as u64 * 4);
+        let clock = self.clock.as_ref();
+        let [blend_back, unproject] = ["blend back", "unproject"];
+        let mut pass = begin(&mut encoder, blend_back, clock, BACKWARD.start);
+        passes.blend.run_back(&mut pass, &bound.blend, self.tiles);
+        drop(pass);
+        let mut pass = begin(&mut encoder, unproject, clock, BACKWARD.start + 1);
+        passes.unproject.run(&mut pass, &bound.unproject, &buffers.shared.dispatches);
+        drop(pass);
         staging.copy_from(&mut encoder, &buffers.gradients, 0, bytes);
+        if let Some(clock) = clock {
+            clock.copy(&mut encoder, &BACKWARD, &staging, bytes);
+        }
         let submission = device.queue.submit([encoder.finish()]);
         staging.map();
-        out.clear();
+        upload.map();
+        let times = &mut self.times;
         let taken = staging.read(device, submission, |view| {
-            let gradients = <[RowGradient]>::ref_from_bytes(&view[..bytes as usize]);
-            out.extend_from_slice(gradients.expect("staging is aligned"));
+            let (gradients, stamps) = view.split_at(bytes as usize);
+            if let Some(clock) = clock {
+                let [blend_back, unproject] = clock.times(stamps);
+                times.blend_back += blend_back;
+                times.unproject += unproject;
+            }
+            let start = Instant::now();
+            let taken =
+                take(<[RowGradient]>::ref_from_bytes(gradients).expect("staging is aligned"));
+            clock::add(&mut times.gradients, start);
+            taken
         });
-        self.staging = Some(staging);
+        (self.staging, self.upload) = (Some(staging), Some(upload));
         taken.map_err(RenderError::Device)
     }
 
@@ -282,6 +365,8 @@ impl TrainingRenderer {
         let order = &shared.order[sort::digits(DEPTH_BITS) as usize % 2];
         let permutation = Some([&buffers.permutation[0], &buffers.permutation[1]]);
         self.bound = Some(Bound {
+            rows: None,
+            scatter: passes.scatter.bind(device, &buffers),
             project: passes.project.bind(device, &buffers),
             sort: passes.sort.bind(device, by_depth, DEPTH_BITS, [SLOTS, VISIBLE], true),
             bin: passes.bin.bind(device, &passes.sort, shared, order, permutation),
@@ -297,11 +382,44 @@ impl TrainingRenderer {
         self.device.fault().map_or(Ok(()), |fault| Err(RenderError::Device(fault)))
     }
 
-    /// Writes rows and photo, and submits the passes to the image and its copy.
-    fn submit_forward(
-        &self,
+    /// Brings the device's rows up to date: all of them by the queue, changed ones by [`Upload`]. Returns how many
+    /// `scatter` shall move, and how many numbers of each.
+    fn write_rows(
+        &mut self,
         rows: &[f32],
         stride: usize,
+        changed: Changed<'_>,
+    ) -> Result<Option<[usize; 2]>, String> {
+        let bound = self.bound.as_mut().expect("buffers were made before");
+        let has = bound.rows.replace((rows.len(), stride));
+        let words = changed.words(rows.len()).filter(|_| has == Some((rows.len(), stride)));
+        match (changed, words) {
+            (Changed::Rows { rows: [], .. } | Changed::Rows { columns: 0, .. }, Some(_)) => {
+                Ok(None)
+            }
+            (Changed::Rows { rows: which, columns }, Some(words)) => {
+                assert!(
+                    columns <= stride
+                        && which.iter().all(|&row| (row as usize) < rows.len() / stride)
+                );
+                let upload = Upload::of(self.upload.take(), &self.device, words * 4);
+                Scatter::write(&upload, rows, stride, which, columns)?;
+                self.upload = Some(upload);
+                Ok(Some([which.len(), columns]))
+            }
+            _ => {
+                self.device.queue.write_buffer(&bound.buffers.rows, 0, rows.as_bytes());
+                Ok(None)
+            }
+        }
+    }
+
+    /// Writes the photo of so many rows of so many numbers, and submits the passes to the image and its copy;
+    /// before them that of the rows which `scatter` shall move.
+    fn submit_forward(
+        &self,
+        [count, stride]: [u32; 2],
+        moved: Option<[usize; 2]>,
         photo: &Photo,
         staging: &Staging,
         numbers: u64,
@@ -309,8 +427,7 @@ impl TrainingRenderer {
         let bound = self.bound.as_ref().expect("buffers were made before");
         let (device, passes, buffers) = (&self.device, &self.passes, &bound.buffers);
         let shared = &buffers.shared;
-        let count = (rows.len() / stride) as u32;
-        let photo = photo.packed(count, stride as u32);
+        let photo = photo.packed(count, stride);
         let tick = Tick {
             cameras: 1,
             parts: 1,
@@ -328,7 +445,6 @@ impl TrainingRenderer {
         dispatches[SLOTS.groups as usize..][..3].copy_from_slice(&[groups, 1, 1]);
         let write =
             |buffer: &wgpu::Buffer, bytes: &[u8]| device.queue.write_buffer(buffer, 0, bytes);
-        write(&buffers.rows, rows.as_bytes());
         write(&buffers.photo, photo.as_bytes());
         write(&shared.tick, tick.as_bytes());
         write(&shared.views, view.as_bytes());
@@ -339,26 +455,58 @@ impl TrainingRenderer {
             .device
             .create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("forward") });
         encoder.clear_buffer(&shared.lists, 0, Some(u64::from(self.tiles) * 8));
-        {
-            let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
-                label: Some("forward"),
-                timestamp_writes: None,
-            });
-            passes.project.run(&mut pass, &bound.project, count);
-            for (i, digit) in bound.sort.iter().enumerate() {
-                passes.sort.run(&mut pass, digit, &shared.dispatches);
-                if i == 0 {
-                    passes.bin.count_visible(&mut pass, &bound.bin);
-                }
-            }
-            passes.bin.run(&mut pass, &bound.bin, &passes.sort, shared);
-            passes.invert.run(&mut pass, &bound.invert, &shared.dispatches);
-            passes.blend.run(&mut pass, &bound.blend, self.tiles);
+        let (upload, clock) =
+            (self.upload.as_ref().filter(|_| moved.is_some()), self.clock.as_ref());
+        if let (Some(upload), Some([rows, columns])) = (upload, moved) {
+            upload.hand_over(&mut encoder, &buffers.changes, Scatter::bytes(rows, columns));
         }
+        let mut pass = begin(&mut encoder, "scatter", clock, 0);
+        if let Some([rows, columns]) = moved {
+            passes.scatter.run(&mut pass, &bound.scatter, rows, columns);
+        }
+        drop(pass);
+        let mut pass = begin(&mut encoder, "project", clock, 1);
+        passes.project.run(&mut pass, &bound.project, count);
+        drop(pass);
+        let mut pass = begin(&mut encoder, "sort", clock, 2);
+        for (i, digit) in bound.sort.iter().enumerate() {
+            passes.sort.run(&mut pass, digit, &shared.dispatches);
+            if i == 0 {
+                passes.bin.count_visible(&mut pass, &bound.bin);
+            }
+        }
+        drop(pass);
+        let mut pass = begin(&mut encoder, "bin", clock, 3);
+        passes.bin.run(&mut pass, &bound.bin, &passes.sort, shared);
+        passes.invert.run(&mut pass, &bound.invert, &shared.dispatches);
+        drop(pass);
+        let mut pass = begin(&mut encoder, "blend", clock, 4);
+        passes.blend.run(&mut pass, &bound.blend, self.tiles);
+        drop(pass);
         staging.copy_from(&mut encoder, &shared.sizes, 0, super::buffers::SIZES_BYTES);
+        if let Some(clock) = clock {
+            clock.copy(&mut encoder, &FORWARD, staging, STAMPS_AT as u64);
+        }
         staging.copy_from(&mut encoder, &buffers.image, IMAGE_AT as u64, numbers * 4);
         let submission = device.queue.submit([encoder.finish()]);
         staging.map();
+        if let Some(upload) = upload {
+            upload.map();
+        }
         submission
     }
+}
+
+/// Begins a pass with its two stamps.
+fn begin(
+    encoder: &mut wgpu::CommandEncoder,
+    label: &str,
+    clock: Option<&Clock>,
+    pass: usize,
+) -> wgpu::ComputePass<'static> {
+    let pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+        label: Some(label),
+        timestamp_writes: clock.map(|clock| clock.of_pass(pass)),
+    });
+    pass.forget_lifetime()
 }
