@@ -38,7 +38,7 @@ fn rows_that_changed_train_the_same_twin_as_all_rows() {
         return;
     };
     let dataset = dataset();
-    let options = Options { steps: 120, splats: 900, hold_out: 3, ..Options::default() };
+    let options = Options { steps: 60, splats: 900, hold_out: 3, ..Options::default() };
     let train = |all: bool| {
         let passes = Passes::gpu(&adapter, Budget::default()).expect("a device");
         let mut trainer = Trainer::with(&dataset, options, passes);
