@@ -48,12 +48,8 @@ fn place(@builtin(local_invocation_index) thread: u32) {
     }
 }
 
-fn emit_pair(cover: Cover, index: u32, slot: u32, tiles_x: u32) {
-    let tile = tile_of(cover, index, tiles_x);
-    if tile != NO_TILE {
-        pairs[atomicAdd(&ends[tile], 1u)] = vec2(cover.key, slot);
-    }
-}
+/// Splats of tiles that a thread has on their way at once: an atomic's answer takes long.
+const AT_ONCE = 4u;
 
 // One workgroup per region.
 @compute @workgroup_size(256)
@@ -63,19 +59,53 @@ fn emit(
 ) {
     let slot = group.x * BLOCK + thread;
     // With no room for all pairs there will be another try.
-    var cover = nothing();
+    var own = nothing();
     if sizes[PAIRS_WANTED] <= tick.pairs {
-        cover = covers[slot];
+        own = covers[slot];
     }
-    let tiles_x = views[(cover.size >> 20u) * tick.parts].size.z;
-    for (var i = 0u; i < tiles_alone(cover); i++) {
-        emit_pair(cover, i, slot, tiles_x);
+    let large_tiles = share(thread, own);
+    let tiles_x = views[(own.size >> 20u) * tick.parts].size.z;
+    for (var first = 0u; first < tiles_alone(own); first += AT_ONCE) {
+        var places: array<u32, AT_ONCE>;
+        for (var i = 0u; i < AT_ONCE; i++) {
+            places[i] = place_in(own, first + i, tiles_x);
+        }
+        for (var i = 0u; i < AT_ONCE; i++) {
+            write(places[i], own.key, slot);
+        }
     }
-    let large_tiles = share(thread, cover);
-    for (var i = thread; i < large_tiles; i += 256u) {
-        let whose = owner(i);
-        let whole = large[whose];
-        let across = views[(whole.size >> 20u) * tick.parts].size.z;
-        emit_pair(whole, i - starts[whose], group.x * BLOCK + whose, across);
+    for (var first = thread; first < large_tiles; first += 256u * AT_ONCE) {
+        var places: array<u32, AT_ONCE>;
+        var whose: array<u32, AT_ONCE>;
+        for (var i = 0u; i < AT_ONCE; i++) {
+            let tile = first + 256u * i;
+            whose[i] = owner(min(tile, large_tiles - 1u));
+            let cover = large[whose[i]];
+            let across = views[(cover.size >> 20u) * tick.parts].size.z;
+            // Beyond the last there is none: a tile beyond its rectangle.
+            places[i] = place_in(cover, select(NO_TILE, tile - starts[whose[i]], tile < large_tiles), across);
+        }
+        for (var i = 0u; i < AT_ONCE; i++) {
+            write(places[i], large[whose[i]].key, group.x * BLOCK + whose[i]);
+        }
+    }
+}
+
+/// Returns a place in the list of a tile of a rectangle; NO_PLACE if the ellipse does not reach that.
+fn place_in(cover: Cover, index: u32, tiles_x: u32) -> u32 {
+    if index < columns(cover) * rows(cover) {
+        let tile = tile_of(cover, index, tiles_x);
+        if tile != NO_TILE {
+            return atomicAdd(&ends[tile], 1u);
+        }
+    }
+    return NO_PLACE;
+}
+
+const NO_PLACE = 0xffffffffu;
+
+fn write(place: u32, key: u32, slot: u32) {
+    if place != NO_PLACE {
+        pairs[place] = vec2(key, slot);
     }
 }

@@ -99,6 +99,11 @@ fn blend(
     // The pair at which transmittance fell to one half; NO_PAIR where it did not.
     var median = NO_PAIR;
     var transmittance = 1.0;
+    // What a thread fetches is on its way while the batch before is walked.
+    var fetched: Projected;
+    if list.x + thread < list.y {
+        fetched = projected[pairs[list.x + thread].y];
+    }
     for (var first = list.x; first < list.y; first += BATCH) {
         // Nobody reads the last batch any more.
         workgroupBarrier();
@@ -112,18 +117,27 @@ fn blend(
             break;
         }
         if first + thread < list.y {
-            let splat = projected[pairs[first + thread].y];
-            batch[thread] = splat;
-            note_patches(thread, splat, vec2<f32>(origin));
+            batch[thread] = fetched;
+            note_patches(thread, fetched, vec2<f32>(origin));
+        }
+        if first + BATCH + thread < list.y {
+            fetched = projected[pairs[first + BATCH + thread].y];
         }
         workgroupBarrier();
         for (var word = 0u; word < BATCH / 32u && goes_on; word++) {
             var left = atomicLoad(&reached[own_patch * (BATCH / 32u) + word]);
-            while left != 0u {
-                let i = word * 32u + firstTrailingBit(left);
+            if left == 0u {
+                continue;
+            }
+            var i = word * 32u + firstTrailingBit(left);
+            var shape = batch[i].shape;
+            var extent = batch[i].extent;
+            loop {
+                // The next one's numbers are on their way while this one is blended.
                 left &= left - 1u;
-                let shape = batch[i].shape;
-                let extent = batch[i].extent;
+                let next = select(i, word * 32u + firstTrailingBit(left), left != 0u);
+                let next_shape = batch[next].shape;
+                let next_extent = batch[next].extent;
                 let dy = at.y - shape.y;
                 let dx = at.x - (shape.x + shape.z * dy);
                 let level = (extent.y - extent.x * dy * dy) - shape.w * dx * dx;
@@ -142,6 +156,12 @@ fn blend(
                     }
                     transmittance = after;
                 }
+                if left == 0u {
+                    break;
+                }
+                i = next;
+                shape = next_shape;
+                extent = next_extent;
             }
         }
     }

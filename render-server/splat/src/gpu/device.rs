@@ -105,6 +105,7 @@ impl Adapter {
             queue,
             fault,
             binding_bytes,
+            is_card: !self.name.is_software,
             has_timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
             maps_storage: features.contains(wgpu::Features::MAPPABLE_PRIMARY_BUFFERS),
         })
@@ -120,6 +121,8 @@ pub(super) struct Device {
     /// Greatest size of a buffer that a shader sees.
     pub(super) binding_bytes: u64,
     pub(super) has_timestamps: bool,
+    /// Whether it is no processor in disguise.
+    pub(super) is_card: bool,
     /// Whether shaders can write what the host reads.
     pub(super) maps_storage: bool,
 }

@@ -25,6 +25,11 @@ fn is_before(a: vec2<u32>, b: vec2<u32>) -> bool {
     return a.x < b.x || (a.x == b.x && a.y < b.y);
 }
 
+/// Returns two pairs, the nearer one first; last, if not `is_up`.
+fn ordered(a: vec2<u32>, b: vec2<u32>, is_up: bool) -> vec4<u32> {
+    return select(vec4(a, b), vec4(b, a), is_before(b, a) == is_up);
+}
+
 /// Sorts a run of `pairs`; leaves it there, or in `other`.
 fn sort_run(thread: u32, first: u32, count: u32, stays: bool) {
     var size = 2u;
@@ -39,15 +44,31 @@ fn sort_run(thread: u32, first: u32, count: u32, stays: bool) {
     }
     workgroupBarrier();
     for (var block = 2u; block <= size; block *= 2u) {
-        for (var step = block / 2u; step > 0u; step /= 2u) {
+        var step = block / 2u;
+        // Steps go two at a time, a quarter of the run's pairs to the left: an odd one goes first.
+        if countTrailingZeros(block) % 2u == 1u {
             for (var i = thread; i < size / 2u; i += THREADS) {
                 let low = 2u * i - (i & (step - 1u));
-                let a = run[low];
-                let b = run[low + step];
-                if is_before(b, a) == ((low & block) == 0u) {
-                    run[low] = b;
-                    run[low + step] = a;
-                }
+                let pair = ordered(run[low], run[low + step], (low & block) == 0u);
+                run[low] = pair.xy;
+                run[low + step] = pair.zw;
+            }
+            workgroupBarrier();
+            step /= 2u;
+        }
+        for (; step > 0u; step /= 4u) {
+            let half = step / 2u;
+            for (var i = thread; i < size / 4u; i += THREADS) {
+                let low = 4u * i - 3u * (i & (half - 1u));
+                let is_up = (low & block) == 0u;
+                let even = ordered(run[low], run[low + step], is_up);
+                let odd = ordered(run[low + half], run[low + step + half], is_up);
+                let left = ordered(even.xy, odd.xy, is_up);
+                let right = ordered(even.zw, odd.zw, is_up);
+                run[low] = left.xy;
+                run[low + half] = left.zw;
+                run[low + step] = right.xy;
+                run[low + step + half] = right.zw;
             }
             workgroupBarrier();
         }
