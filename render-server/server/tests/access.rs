@@ -238,6 +238,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /api/map", Takes::AnyKey),
     ("GET /api/shell", Takes::All),
     ("GET /api/splats/0", Takes::All),
+    ("GET /api/twin", Takes::All),
     ("GET /api/vehicles", Takes::AnyKey),
     ("GET /ws?vehicle=ant", Takes::Ants),
     ("GET /ws?vehicle=bee", Takes::Bees),
