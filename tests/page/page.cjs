@@ -260,6 +260,12 @@ async function weak(browser, url) {
   await without.close();
   const slow = await open(browser, url);
   await slow.locator("#view-space").click();
+  // Whoever asks first decides what a canvas is drawn with: it has to be the page.
+  await slow.waitForFunction(() => !document.getElementById("space").hidden);
+  await slow.evaluate(() => document.getElementById("space").getContext("webgl2").getExtension("WEBGL_lose_context").loseContext());
+  await slow.getByText("drawn by the server: this browser's graphics have failed").waitFor();
+  await served(slow);
+  await slow.getByRole("button", { name: "draw here" }).click();
   await slow.getByRole("button", { name: "let the server draw" }).click();
   await slow.getByText("drawn by the server, twice a second at most").waitFor();
   await served(slow);
