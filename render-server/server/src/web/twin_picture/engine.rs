@@ -39,7 +39,7 @@ impl Engine {
             splats.sh.extend(part.sh);
             splats.antialiased = part.antialiased;
         }
-        let fence_m = fence_m.map(|corner_m| corner_m.as_vec3());
+        let fence_m = fence_m.map(DVec3::as_vec3);
         let image = [RgbdImage::default()];
         Ok(Self { splats, fence_m, renderer: None, image, rgb: Vec::new() })
     }
