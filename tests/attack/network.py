@@ -199,9 +199,10 @@ def the_page(folder):
     lab = Lab(folder)
     try:
         told = []
-        for request in ("GET /api/vehicles", "GET /api/map", "GET /api/shell", "GET /api/splats/0", "GET /api/stats",
-                        "GET /api/session", "GET /api/leaderboard", "GET /api/pairing", "GET /ws?vehicle=heron",
-                        "GET /nothing", "GET /", "POST /api/estop", "PUT /api/scene", "GET /api/vehicles/heron/crash"):
+        for request in ("GET /api/vehicles", "GET /api/map", "GET /api/shell", "GET /api/splats/0", "GET /api/twin",
+                        "GET /api/stats", "GET /api/session", "GET /api/leaderboard", "GET /api/pairing",
+                        "GET /ws?vehicle=heron", "GET /nothing", "GET /", "POST /api/estop", "PUT /api/scene",
+                        "GET /api/vehicles/heron/crash"):
             status, _, text, _ = lab.ask(request, "X-Forwarded-For: 127.0.0.1", source=ELSEWHERE)
             allowed = request in ("GET /api/session", "GET /")
             if (status != 200) if allowed else (status not in (401, 404, 405)):
@@ -231,8 +232,8 @@ def the_page(folder):
         status, _, text, _ = lab.ask("POST /api/estop", "Origin: http://evil.example", cookie=lab.instructor)
         check("a page elsewhere presses no button", status == 403, text)
 
-        for request in ("GET /api/shell", "GET /api/splats/0", "GET /api/vehicles/wasp/cameras", "GET /ws?vehicle=wasp",
-                        "POST /api/estop", "POST /api/vehicles/wasp/estop"):
+        for request in ("GET /api/shell", "GET /api/splats/0", "GET /api/twin", "GET /api/vehicles/wasp/cameras",
+                        "GET /ws?vehicle=wasp", "POST /api/estop", "POST /api/vehicles/wasp/estop"):
             status, _, text, _ = lab.ask(request, f"Origin: http://{lab.host}", cookie=lab.team)
             check(f"a team gets no {request}", status == 403, f"{status} {text}")
         guesses = [lab.put("POST /api/login", {"password": f"guess {n}"}, source=ELSEWHERE)[0] for n in range(14)]

@@ -14,6 +14,7 @@ const [vizflyt, shots, only] = process.argv.slice(2);
 const PATIENCE = 120_000;
 /** Finds barriers; run in the page. */
 const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
+const chromiumPath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
 const scratch = fs.mkdtempSync(path.join(os.tmpdir(), "vizflyt-page-"));
 const children = [];
@@ -165,6 +166,7 @@ async function flight(browser) {
   await checkBarriers(page, "the page before a flight");
   await checkLoad(browser, url);
   await panels(page);
+  await weak(browser, url);
   // Another light is seen with the next images.
   await isPainted(page, "colour");
   const day = await brightness(page);
@@ -215,6 +217,63 @@ async function flight(browser) {
   assert.deepEqual(page.faults, []);
   await page.context().close();
   assert.equal(JSON.parse(fs.readFileSync(`${scratch}/report.json`)).outcome === "finished", false);
+}
+
+/** Waits until the view in space shows a picture of the scene, other than the one before; returns colours of its points. */
+const served = (page, before = "") =>
+  page.waitForFunction((before) => {
+    const canvas = document.getElementById("space");
+    const g = canvas?.getContext("2d");
+    if (!canvas?.width || !g) return false;
+    const { data } = g.getImageData(0, 0, canvas.width, canvas.height);
+    const seen = [], step = 4 * Math.ceil(data.length / 4 / 2000);
+    for (let k = 0; k < data.length; k += step) seen.push((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
+    // Lines, faces and one colour behind them are some tens.
+    return new Set(seen).size > 200 && seen.join() !== before && seen.join();
+  }, before).then((handle) => handle.jsonValue());
+
+/** A browser without WebGL 2, and one that draws slowly: the server's pictures of the twin, turned by keys, stand in. */
+async function weak(browser, url) {
+  const without = await chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", "--disable-3d-apis"] });
+  const page = await open(without, url);
+  assert.equal(await page.locator("#view-top").getAttribute("aria-pressed"), "true");
+  await page.locator("#view-space").click();
+  await page.getByText("drawn by the server: this browser has no WebGL 2").waitFor();
+  let before = await served(page);
+  await page.locator("#space").focus();
+  for (let k = 0; k < 8; k++) await page.keyboard.press("ArrowRight");
+  const answer = await page.waitForResponse((answer) => answer.url().includes("/api/twin?"));
+  assert.equal(answer.headers()["content-type"], "image/jpeg");
+  before = await served(page, before);
+  await page.locator("#view-onboard").click();
+  await served(page, before);
+  await page.locator("#view-space").click();
+  await checkBarriers(page, "the server's picture");
+  for (const size of ["phone", "laptop"]) {
+    const [width, height] = SIZES[size];
+    await page.setViewportSize({ width, height });
+    await served(page);
+    await checkAccess(page, size);
+    await shot(page, `${size}-served`);
+  }
+  assert.deepEqual(page.faults, []);
+  await without.close();
+  const slow = await open(browser, url);
+  await slow.locator("#view-space").click();
+  // Whoever asks first decides what a canvas is drawn with: it has to be the page.
+  await slow.waitForFunction(() => !document.getElementById("space").hidden);
+  await slow.evaluate(() => document.getElementById("space").getContext("webgl2").getExtension("WEBGL_lose_context").loseContext());
+  await slow.getByText("drawn by the server: this browser's graphics have failed").waitFor();
+  await served(slow);
+  await slow.getByRole("button", { name: "draw here" }).click();
+  await slow.getByRole("button", { name: "let the server draw" }).click();
+  await slow.getByText("drawn by the server, twice a second at most").waitFor();
+  await served(slow);
+  await slow.getByRole("button", { name: "draw here" }).click();
+  await slow.getByText("drawn by the server").waitFor({ state: "hidden" });
+  await slow.waitForFunction(() => document.getElementById("space").getContext("webgl2"));
+  assert.deepEqual(slow.faults, []);
+  await slow.context().close();
 }
 
 /** Panels are closed, moved and kept, by keyboard, and put back; the cameras take the page, and escape gives it back. */
@@ -973,10 +1032,9 @@ async function stranger(browser) {
 
 async function main() {
   if (shots) fs.mkdirSync(shots, { recursive: true });
-  const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
   // Its sandbox wants rights that a container lacks; WebGL without a card is drawn in software.
   const args = ["--no-sandbox", "--enable-unsafe-swiftshader"];
-  const browser = await chromium.launch({ executablePath, args });
+  const browser = await chromium.launch({ executablePath: chromiumPath, args });
   let code = 0;
   const tests = [edit, course, lab, labDay, flight, crash, leaderboard, align, stranger];
   const wanted = tests.filter(({ name }) => !only || name === only);

@@ -6,6 +6,9 @@ use quinn::TransportConfig;
 use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{EventKind, FlightPhase, Telemetry, ToRuntime, ToServer};
 
+/// A picture of the twin: from 1 m above the start, along x.
+const TWIN: &str = "/api/twin?x_m=0&y_m=0&z_m=1&qx=-0.5&qy=0.5&qz=-0.5&qw=0.5&fov_deg=50&width_px=160&height_px=90\
+     &cut=false&background=0d1217";
 /// Messages within which what is waited for must come: a minute's worth.
 const MANY: usize = 2000;
 
@@ -22,6 +25,7 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
         ("/icon.svg", "image/svg+xml"),
         ("/api/map", "image/jpeg"),
         ("/api/splats/0", "application/octet-stream"),
+        (TWIN, "image/jpeg"),
     ] {
         let (status, answer) = http(server.http, &format!("GET {path} HTTP/1.1"));
         assert_eq!(status, 200, "{path}");
@@ -37,6 +41,11 @@ fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
     let (status, none) = http(server.http, "GET /api/splats/9 HTTP/1.1");
     assert!(status == 404 && none.contains("the twin has 1 parts"), "{status} {none}");
     assert_eq!(http(server.http, "GET /../Cargo.toml HTTP/1.1").0, 404);
+    let (status, refused) = http(server.http, &format!("GET {TWIN}&more=1 HTTP/1.1"));
+    assert!(status == 400 && refused.contains("more"), "{status} {refused}");
+    let wide = TWIN.replace("width_px=160", "width_px=1000");
+    let (status, refused) = http(server.http, &format!("GET {wide} HTTP/1.1"));
+    assert!(status == 400 && refused.contains("give 16 to 960 a side"), "{status} {refused}");
 }
 
 #[test]

@@ -41,7 +41,7 @@ use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
 use crate::web::messages::Rates;
 use crate::web::previews::Previews;
-use crate::web::{self, Access, Lab, Logins, Page, PageTls};
+use crate::web::{self, Access, Lab, Logins, Page, PageTls, TwinPictures};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
@@ -160,11 +160,13 @@ async fn run(
     }
     let localization = args.localization(settings::of_arena(&args.arena)?);
     let lab = Arc::new(Lab::open(args.lab_day_file(), localization.into_iter().next()));
+    let fence = &scene.arena.geofence;
     let page = Page {
         rooms: rooms.clone(),
         lab: lab.clone(),
         previews,
         top_view: scene.top_view,
+        twin_pictures: TwinPictures::new(scene.twin.clone(), fence.min_m, fence.max_m),
         twin: scene.twin,
         stages: scene.arena.stages,
         boot: clock::now(),

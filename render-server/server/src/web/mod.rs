@@ -9,6 +9,8 @@
 //! GET /api/shell   what is solid, as cells, for the instructor's view in space
 //!                  ([`crate::web::top_view::shell`])
 //! GET /api/splats/N   part N of the twin itself, for the same view, SPZ ([`twin`])
+//! GET /api/twin    a picture of the twin from anywhere, for browsers that cannot draw it, JPEG
+//!                  ([`twin_picture`])
 //! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
 //! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
@@ -61,6 +63,7 @@ mod sessions;
 mod stats;
 pub mod top_view;
 pub mod twin;
+mod twin_picture;
 mod vehicles;
 mod view;
 mod viewer;
@@ -103,6 +106,7 @@ use crate::scene::Scenes;
 use crate::stream::Rooms;
 use crate::web::top_view::TopView;
 use crate::web::twin::TwinParts;
+pub(crate) use crate::web::twin_picture::TwinPictures;
 
 /// What the page's handlers share.
 #[derive(Debug)]
@@ -111,6 +115,7 @@ pub(crate) struct Page {
     pub(crate) previews: Arc<Previews>,
     pub(crate) top_view: TopView,
     pub(crate) twin: TwinParts,
+    pub(crate) twin_pictures: TwinPictures,
     /// The course's gates, for the top view.
     pub(crate) stages: Vec<StageConfig>,
     /// When the server started; differs from start to start, so that a page notices a new server.

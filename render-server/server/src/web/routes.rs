@@ -15,7 +15,7 @@ use super::Page;
 use super::access::{self, Takes};
 use super::{
     cameras, crash, environment, file, lab, leaderboard, login, map, pairing, scenes, sensors,
-    shell, stats, twin, vehicles, watch,
+    shell, stats, twin, twin_picture, vehicles, watch,
 };
 
 /// One route.
@@ -87,6 +87,7 @@ fn table() -> Vec<Route> {
         // Where everything stands, to the centimetre: what a course may keep from plugins.
         read("/api/shell", Everything, shell),
         read("/api/splats/{part}", Everything, twin::splats),
+        read("/api/twin", Everything, twin_picture::draw),
         read("/ws", Vehicle, watch),
         read("/api/stats", Vehicle, stats::get),
         read("/api/vehicles", Key, vehicles::list),

@@ -3,10 +3,13 @@
 // camera goes behind the vehicle ("chase"), or flies in it ("onboard"). World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
+import { DrawRate } from "./draw_rate.js";
 import { movedOn } from "./fleet.js";
 import { known } from "./session.js";
+import { FlatRenderer } from "./space_flat.js";
 import { Others } from "./space_others.js";
 import { joined, Room, vec } from "./space_room.js";
+import { ServedTwin } from "./space_served.js";
 import { speedColours, TrackLine } from "./space_track.js";
 import { Twin } from "./space_twin.js";
 
@@ -23,16 +26,17 @@ const CHASE_BACK_M = 1.8, CHASE_UP_M = 0.7;
 const FREE_FOV_DEG = 50, ONBOARD_FOV_DEG = 74;
 
 /** @typedef {"free" | "chase" | "onboard"} Mode */
+/** Who draws the twin: the browser on a graphics card or in software, or the server. @typedef {"card" | "software" | "server"} Drawer */
 
-/** Returns whether a graphics card draws; in software it would take the processor from the flight. */
-export function hasCard() {
-  const canvas = document.createElement("canvas");
-  const gl = canvas.getContext("webgl2", { failIfMajorPerformanceCaveat: true });
-  if (!gl) return false;
+/** Returns who can draw here; a browser without WebGL 2 leaves it to the server. @returns {Drawer} */
+export function ableDrawer() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return "server";
   const renderer = gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER;
   const name = String(gl.getParameter(renderer));
   gl.getExtension("WEBGL_lose_context")?.loseContext();
-  return !/swiftshader|llvmpipe|software/i.test(name);
+  // In software it takes the processor from the flight.
+  return /swiftshader|llvmpipe|software/i.test(name) ? "software" : "card";
 }
 
 export class SpaceView {
@@ -40,13 +44,15 @@ export class SpaceView {
    * @param {HTMLCanvasElement} canvas in the element whose size it takes
    * @param {Arena} arena
    * @param {string | undefined} theme
-   * @param {boolean} card whether a graphics card draws
+   * @param {Drawer} drawer
+   * @param {(text: string) => void} report told why the server gives no picture; nothing, if it does
    */
-  constructor(canvas, arena, theme, card) {
+  constructor(canvas, arena, theme, drawer, report) {
     this.canvas = canvas;
-    this.card = card;
+    this.drawer = drawer;
+    this.report = report;
     this.parent = /** @type {HTMLElement} */ (canvas.parentElement);
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.renderer = drawer === "server" ? new FlatRenderer(canvas) : new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(FREE_FOV_DEG, 1, 0.02, 500);
     this.camera.up.set(0, 0, 1);
@@ -61,12 +67,18 @@ export class SpaceView {
     this.ghostTrack = new TrackLine();
     this.others = new Others();
     this.scene.add(this.track.line, this.ghostTrack.line, this.others.group);
+    this.disposed = false;
     this.drawn_ms = -Infinity;
-    this.rest_ms = card ? 0 : EVERY_MS;
+    this.rest_ms = drawer === "card" ? 0 : EVERY_MS;
+    this.rate = new DrawRate();
+    /** Whether the browser draws too seldom. */
+    this.isSlow = false;
     /** @type {Mode} */
     this.mode = "free";
-    /** @type {Twin | null} */
+    /** @type {Twin | ServedTwin | null} */
     this.twin = null;
+    /** The camera of what is shown. */
+    this.eye = this.camera;
     /** Where the camera looks. */
     this.target = new THREE.Vector3();
     /** From where: angles about z and above the floor [rad], share of the distance at which the room fits. */
@@ -76,7 +88,8 @@ export class SpaceView {
     this.home();
     this.listen();
     this.addTwin();
-    new ResizeObserver(() => this.resize()).observe(this.parent);
+    this.resized = new ResizeObserver(() => this.resize());
+    this.resized.observe(this.parent);
   }
 
   /**
@@ -90,7 +103,7 @@ export class SpaceView {
     this.room = new Room(arena, theme);
     this.scene.add(this.room.group);
     if (isOther) this.addTwin();
-    else this.room.stand.visible = !this.twin?.isShown;
+    else this.showStand();
     this.moving.clear();
     for (const track of [this.track, this.ghostTrack]) track.forget();
     this.home();
@@ -100,18 +113,30 @@ export class SpaceView {
   /** Fetches the twin, and until it is there what is solid, as boxes; the server gives both to the instructor alone. */
   async addTwin() {
     await known;
-    this.twin?.mesh.removeFromParent();
+    this.removeTwin();
+    this.showStand();
+    const { room } = this;
+    if (this.disposed || document.body.dataset.role !== "instructor" || !room.arena.twin_parts) return;
+    if (this.drawer === "server") {
+      this.twin = new ServedTwin(this.report);
+      return;
+    }
+    room.addSolid();
+    const parts = this.drawer === "card" ? room.arena.twin_parts : 1;
+    const twin = new Twin(room.arena, parts, () => this.showStand());
+    this.scene.add(twin.mesh);
+    this.twin = twin;
+  }
+
+  removeTwin() {
+    if (this.twin instanceof Twin) this.twin.mesh.removeFromParent();
     this.twin?.dispose();
     this.twin = null;
-    if (document.body.dataset.role !== "instructor") return;
-    const { room } = this;
-    room.addSolid();
-    const parts = this.card ? room.arena.twin_parts : Math.min(1, room.arena.twin_parts);
-    if (!parts) return;
-    this.twin = new Twin(room.arena, parts, () => {
-      this.room.stand.visible = false;
-    });
-    this.scene.add(this.twin.mesh);
+  }
+
+  /** Shows floor and boxes until the twin is there; without a card they are not drawn. */
+  showStand() {
+    this.room.stand.visible = this.drawer !== "server" && !(this.twin instanceof Twin && this.twin.isShown);
   }
 
   // ---- what moves ------------------------------------------------------------------------
@@ -178,22 +203,38 @@ export class SpaceView {
     if (this.mode === "free" || !pose) this.placeCamera();
     else this.placeWithVehicle();
     this.twin?.place(this.camera, this.renderer.getDrawingBufferSize(new THREE.Vector2()), room, this.mode === "free");
-    this.renderer.render(this.scene, this.camera);
-    if (!this.card) this.rest(now_ms);
+    this.render();
+    this.isSlow = this.rate.note(now_ms) ?? this.isSlow;
+    if (this.drawer !== "card") this.rest(now_ms);
+  }
+
+  /** Draws; over the server's picture from where that was taken, unless a hand turns the view: that is to be seen at once. */
+  render() {
+    this.eye = this.camera;
+    if (!(this.renderer instanceof FlatRenderer)) {
+      this.renderer.render(this.scene, this.camera);
+      return;
+    }
+    const served = this.twin instanceof ServedTwin ? this.twin : null;
+    const follows = this.mode !== "free" || this.follows;
+    if (served?.picture && follows) this.eye = served.picture.camera;
+    this.renderer.render(this.scene, this.eye, served?.picture?.bitmap, follows || served?.isCurrent() === true);
   }
 
   /** Lets the processor rest, in proportion to what the picture took. @param {number} began_ms */
   rest(began_ms) {
-    const gl = this.renderer.getContext();
-    // Reading waits until it is drawn.
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    if (this.renderer instanceof THREE.WebGLRenderer) {
+      const gl = this.renderer.getContext();
+      // Reading waits until it is drawn.
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    }
     const took_ms = performance.now() - began_ms;
     this.rest_ms = Math.max(EVERY_MS, (1 + REST) * took_ms);
   }
 
   /** Returns where a point of the world is on the canvas; null of one that is not in sight. @param {import("./space_room.js").Point} p @returns {[number, number] | null} [CSS px] */
   at(p) {
-    const { x, y, z } = vec(p).project(this.camera);
+    const { x, y, z } = vec(p).project(this.eye);
     if (z > 1 || Math.abs(x) > 1 || Math.abs(y) > 1) return null;
     return [((1 + x) / 2) * this.canvas.clientWidth, ((1 - y) / 2) * this.canvas.clientHeight];
   }
@@ -212,6 +253,8 @@ export class SpaceView {
   setMode(mode) {
     this.mode = mode;
     this.drawn_ms = -Infinity;
+    // None were drawn while another view was shown.
+    this.rate.restart();
   }
 
   /** Places the camera behind the vehicle, or in it. */
@@ -337,5 +380,15 @@ export class SpaceView {
     this.renderer.setSize(w, h, false);
     this.camera.aspect = w / h;
     this.drawn_ms = -Infinity;
+  }
+
+  dispose() {
+    this.disposed = true;
+    this.resized.disconnect();
+    this.removeTwin();
+    this.others.clear();
+    for (const track of [this.track, this.ghostTrack]) track.dispose();
+    this.room.dispose();
+    this.renderer.dispose();
   }
 }

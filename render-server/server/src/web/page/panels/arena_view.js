@@ -7,6 +7,7 @@ import { FlightRecording } from "../flight_recording.js";
 import { chooseVehicle } from "../header.js";
 import { showOutcome } from "../outcome.js";
 import { ReplayBar } from "../replay_bar.js";
+import { SpaceDrawing } from "../space_drawing.js";
 import { theme } from "../theme.js";
 import { TopView } from "../top_view.js";
 import { VehicleTags } from "../vehicle_tags.js";
@@ -15,10 +16,7 @@ import { VehicleTags } from "../vehicle_tags.js";
 /** @typedef {import("../messages").State} State */
 
 const top = make("canvas", { id: "map", role: "img", ariaLabel: "top view of the arena" });
-const spaceCanvas = make("canvas", {
-  id: "space", role: "img", tabIndex: 0, hidden: true,
-  ariaLabel: "view in space; arrows turn, plus and minus zoom, 0 goes back, F follows",
-});
+const space = new SpaceDrawing();
 const stages = make("ol", { id: "stages", ariaLabel: "stages of the course", hidden: true });
 /** What there is to choose from: the map, and the view in space from somewhere. @typedef {"top" | "space" | "chase" | "onboard"} View */
 /** @type {View[]} */
@@ -31,16 +29,14 @@ const hint = make("p", { id: "hint", className: "hint", hidden: true });
 const fleet = new Fleet();
 const tags = new VehicleTags(chooseVehicle);
 const element = make("section", { className: "panel map", ariaLabel: "where it flies" },
-  top, spaceCanvas, tags.element, stages,
+  top, space.canvas, tags.element, stages,
   make("div", { className: "views", role: "group", ariaLabel: "view" }, ...buttons),
   make("div", { className: "legend" },
     make("span", { className: "speed" }, make("span", { textContent: "0" }), make("i"), fastest)),
-  replay.element, hint,
+  replay.element, space.note, hint,
 );
 
 const topView = new TopView(top);
-/** Made when it is first asked for. @type {import("../space_view.js").SpaceView | null} */
-let spaceView = null;
 /** @type {Arena | null} */
 let arena = null;
 /** @type {import("../fleet.js").ShownPose | null} */
@@ -58,29 +54,17 @@ let view = "top";
 /** Shows a view. @param {View} wanted */
 async function pickView(wanted) {
   view = wanted;
-  if (view !== "top" && arena && !spaceView) {
-    try {
-      const { SpaceView, hasCard } = await import("../space_view.js");
-      spaceView ??= new SpaceView(spaceCanvas, arena, theme(), hasCard());
-    } catch {
-      view = "top";
-      for (const button of buttons.slice(1)) {
-        button.disabled = true;
-        button.title = "this browser has no WebGL 2";
-      }
-    }
-  }
-  spaceView?.setMode(view === "chase" || view === "onboard" ? view : "free");
+  if (view !== "top" && arena) await space.open(arena, theme(), view === "space" ? "free" : view);
   top.hidden = view !== "top";
-  spaceCanvas.hidden = view === "top";
+  space.isHidden = view === "top";
   for (const [k, button] of buttons.entries()) button.ariaPressed = String(VIEWS[k] === view);
-  (view === "top" ? topView : spaceView)?.resize();
+  (view === "top" ? topView : space.view)?.resize();
 }
 
 /** What was chosen last; else space, where a graphics card draws it. */
 async function firstView() {
   const chosen = VIEWS.find((name) => name === localStorage.getItem("view"));
-  pickView(chosen ?? ((await import("../space_view.js")).hasCard() ? "space" : "top"));
+  pickView(chosen ?? ((await space.hasCard()) ? "space" : "top"));
 }
 for (const [k, button] of buttons.entries())
   button.addEventListener("click", () => {
@@ -127,7 +111,7 @@ function ended({ outcome }) {
 
 /** Shows the vehicles' names where they are drawn. @param {Parameters<TopView["draw"]>[0]} shown */
 function showTags({ pose, others, now_ms }) {
-  const drawn = spaceCanvas.hidden ? topView : spaceView;
+  const drawn = space.isHidden ? topView : space.view;
   const place = (/** @type {import("../fleet.js").ShownPose} */ pose) => drawn?.at(movedOn(pose, now_ms)) ?? null;
   const own = pose && view !== "onboard" ? [{ name: arena?.vehicle ?? "", phase: null, at: place(pose) }] : [];
   tags.show([...own, ...others.map(({ name, phase, pose }) => ({ name, phase, at: place(pose) }))]);
@@ -155,7 +139,7 @@ export const arenaView = {
     fleet.clear();
     tags.setVehicles(arena.vehicles, arena.vehicle);
     topView.setArena(arena);
-    spaceView?.setArena(arena, theme());
+    space.setArena(arena, theme());
     pickView(view);
     showStages();
     setText(fastest, `${Math.max(1, arena.max_speed_mps)} m/s`);
@@ -206,12 +190,12 @@ export const arenaView = {
       lit = shown.passed;
       showStages();
     }
-    if (spaceCanvas.hidden) topView.draw(shown);
-    else spaceView?.draw(shown);
+    if (space.isHidden) topView.draw(shown);
+    else space.draw(shown);
     showTags(shown);
   },
   onTheme() {
     topView.restyle();
-    if (arena) spaceView?.setArena(arena, theme());
+    if (arena) space.setArena(arena, theme());
   },
 };
