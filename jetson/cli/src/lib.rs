@@ -235,6 +235,8 @@ fn start_log(filter: &str) -> Result<()> {
         .with_ansi(std::io::stderr().is_terminal())
         // Told on standard error itself, which may be what is gone.
         .log_internal_errors(false);
-    tracing_subscriber::registry().with(printed).with(filter.parse::<Targets>()?).init();
+    // What wgpu says of a card that works; errors reach the user as the renderer's.
+    let filter = format!("wgpu_core::instance=error,wgpu_hal=error,{filter}").parse::<Targets>()?;
+    tracing_subscriber::registry().with(printed).with(filter).init();
     Ok(())
 }
