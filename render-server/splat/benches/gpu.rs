@@ -193,7 +193,9 @@ fn hall(count: usize, options: &Options) -> Case {
             0 => Vec3::new(random(-12.0, 12.0), random(-12.0, 12.0), random(-0.02, 0.02)),
             1 => Vec3::new(random(-12.0, 12.0), random(-12.0, 12.0), 4.0 + random(-0.02, 0.02)),
             2 => {
-                let (along, side) = (random(-12.0, 12.0), 12.0 * (i % 2 * 2) as f32 - 12.0);
+                // Rough as all else: on a wall that is flat to the bit, no two renderers have one order.
+                let rough = random(-0.02, 0.02);
+                let (along, side) = (random(-12.0, 12.0), 12.0 * (i % 2 * 2) as f32 - 12.0 + rough);
                 let z = random(0.0, 4.0);
                 if i % 4 < 2 { Vec3::new(along, side, z) } else { Vec3::new(side, along, z) }
             }
