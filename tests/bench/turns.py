@@ -28,8 +28,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("before", type=Path, help="a built program, as target/release/vizflyt")
     parser.add_argument("after", type=Path, help="another one")
     parser.add_argument("--turns", type=int, default=5, help="flights of each, some 30 s long [5]")
-    parser.add_argument("demo", nargs="*", help="after --: further arguments of both demos, as --through-bridge")
-    args = parser.parse_args()
+    parser.epilog = "After --: further arguments of both demos, as --through-bridge."
+    given = sys.argv[1:]
+    end = given.index("--") if "--" in given else len(given)
+    args = parser.parse_args(given[:end])
+    args.demo = given[end + 1:]
     for program in (args.before, args.after):
         if not program.is_file():
             parser.error(f"no program {program}; build it (cargo build --release)")
