@@ -77,7 +77,8 @@ impl Adapter {
             max_storage_buffer_binding_size: best.max_storage_buffer_binding_size,
             ..wgpu::Limits::default()
         };
-        let wanted = wgpu::Features::TIMESTAMP_QUERY | wgpu::Features::MAPPABLE_PRIMARY_BUFFERS;
+        let mut wanted = wgpu::Features::TIMESTAMP_QUERY;
+        wanted.set(wgpu::Features::MAPPABLE_PRIMARY_BUFFERS, budget.writes_to_host);
         let features = adapter.features() & wanted;
         let (device, queue) = ready(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("vizflyt"),

@@ -61,12 +61,14 @@ pub struct Budget {
     pub regions: u32,
     /// (Tile, splat) pairs to begin with; grown where an image needs more.
     pub pairs: u32,
+    /// Whether pixels are written to the host's memory, if the adapter can; else they are copied there.
+    pub writes_to_host: bool,
 }
 
 impl Default for Budget {
     /// 70 MB of slots, 32 MB of pairs.
     fn default() -> Self {
-        Self { binding_bytes: u64::MAX, regions: 4096, pairs: 1 << 21 }
+        Self { binding_bytes: u64::MAX, regions: 4096, pairs: 1 << 21, writes_to_host: true }
     }
 }
 

@@ -44,6 +44,32 @@ fn too_little_room_is_noticed_and_made() {
 }
 
 #[test]
+fn pixels_are_the_same_written_to_the_host_or_copied() {
+    let objects = [RigidObject { id: 9, splats: twins::ball(400, 0.4, 3) }];
+    let splats = twins::cloud(2000, 1, 5);
+    let at = [Some(vizflyt_protocol::geometry::Pose::new(
+        glam::DVec3::new(0.1, 0.0, 1.5),
+        glam::DQuat::IDENTITY,
+    ))];
+    // A small image after a large one has the large one's memory.
+    for objects in [&objects[..], &[]] {
+        let scene = Scene { splats: &splats, objects };
+        let Some(mut written) = with_budget(scene, Budget::default()) else { return };
+        let copies = Budget { writes_to_host: false, ..Budget::default() };
+        let mut copied = with_budget(scene, copies).expect("an adapter was there");
+        for (width, height) in [(97, 61), (33, 20), (97, 60), (128, 70)] {
+            let camera = [twins::camera(width, height, 80.0)];
+            let mut images = [RgbdImage::default(), RgbdImage::default()];
+            let at = &at[..objects.len()];
+            written.render(at, &camera, &mut images[..1]).expect("an image");
+            copied.render(at, &camera, &mut images[1..]).expect("an image");
+            assert!(images[0] == images[1], "{width}x{height}, {} objects", objects.len());
+            assert_eq!(images[0].ids.contains(&9), !objects.is_empty());
+        }
+    }
+}
+
+#[test]
 fn scenes_are_split_into_what_a_binding_holds() {
     let splats = twins::cloud(1500, 3, 2);
     // 6 frame-filling blocks: harmonics of three, geometry of five, regions for six.
