@@ -23,6 +23,16 @@ test("panels move up, down and over, and are kept so", async () => {
   assert.deepEqual(moved(moved(usual, "map", "down"), "map", "up"), usual);
 });
 
+test("panels are put before another, in either column", async () => {
+  const { put } = await layout;
+  assert.deepEqual(put(usual, "map", "right", "events"), { left: ["figures"], right: ["cameras", "map", "events"], closed: [] });
+  assert.deepEqual(put(usual, "map", "left").left, ["figures", "map"]);
+  assert.deepEqual(put(usual, "figures", "left", "map").left, ["figures", "map"]);
+  assert.equal(put(usual, "map", "left", "map"), usual, "where it is");
+  assert.equal(put(usual, "no panel", "left"), usual, "a text from another page was dropped");
+  assert.deepEqual(put({ ...usual, closed: ["map"] }, "map", "right").closed, ["map"]);
+});
+
 test("whatever was kept, every panel is there once and no other", async () => {
   const { readLayout } = await layout;
   let seed = 1;

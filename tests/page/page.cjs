@@ -287,6 +287,9 @@ async function panels(page) {
   await dialog.getByRole("checkbox", { name: "timing" }).press("Space");
   await dialog.getByRole("button", { name: "figures to the other column" }).press("Enter");
   await dialog.getByRole("button", { name: "events up" }).press("Enter");
+  // By mouse: before the first of the other column.
+  const row = (name) => dialog.getByRole("listitem").filter({ has: page.getByRole("checkbox", { name, exact: true }) });
+  await row("leaderboard").dragTo(row("map"), { targetPosition: { x: 40, y: 3 } });
   await shot(page, "laptop-panels");
   // Escape closes the dialog; it stops nothing.
   await page.keyboard.press("Escape");
@@ -294,6 +297,7 @@ async function panels(page) {
   assert.equal(await text(page, "announcement"), "");
   const arranged = [await inColumn("left"), await inColumn("right")];
   assert.ok(!arranged[0].includes("timing") && !arranged[0].includes("figures") && arranged[1].includes("figures"), `${arranged}`);
+  assert.ok(arranged[0].length === left.length - 1 && arranged[0][1] === left[0] && !arranged[1].includes(arranged[0][0]), `${arranged}`);
   await page.reload();
   await until(page, "phase-text", /ready to start/);
   assert.deepEqual([await inColumn("left"), await inColumn("right")], arranged);

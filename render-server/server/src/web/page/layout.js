@@ -56,6 +56,22 @@ export function moved(layout, name, way) {
   return { ...layout, [side]: [...rest.slice(0, at), name, ...rest.slice(at)] };
 }
 
+/**
+ * Returns the layout with a panel put in a column before another of it; at its end without one.
+ * @param {Layout} layout
+ * @param {string} name
+ * @param {"left" | "right"} side
+ * @param {string} [before]
+ * @returns {Layout}
+ */
+export function put(layout, name, side, before) {
+  if (name === before || ![...layout.left, ...layout.right].includes(name)) return layout;
+  const without = { ...layout, left: layout.left.filter((one) => one !== name), right: layout.right.filter((one) => one !== name) };
+  const at = before === undefined ? -1 : without[side].indexOf(before);
+  const place = at < 0 ? without[side].length : at;
+  return { ...without, [side]: without[side].toSpliced(place, 0, name) };
+}
+
 /** Returns the layout with a panel closed, or open again. @param {Layout} layout @param {string} name @returns {Layout} */
 export function toggled(layout, name) {
   const closed = layout.closed.includes(name) ? layout.closed.filter((one) => one !== name) : [...layout.closed, name];

@@ -2,7 +2,7 @@
 
 import { makeDialog } from "../dialog.js";
 import { $, make, makeButton } from "../dom.js";
-import { moved, readLayout, toggled } from "../layout.js";
+import { moved, put, readLayout, toggled } from "../layout.js";
 import { PANELS } from "../panels.js";
 
 const KEPT = "panels";
@@ -11,6 +11,8 @@ const SIDES = /** @type {const} */ (["left", "right"]);
 const panels = { ...PANELS.left, ...PANELS.right };
 const usual = { left: Object.keys(PANELS.left), right: Object.keys(PANELS.right), closed: [] };
 let layout = readLayout(usual, localStorage.getItem(KEPT));
+/** The panel whose row is dragged; empty if none is. */
+let dragged = "";
 
 const lists = { left: make("ol"), right: make("ol") };
 const reset = makeButton("reset", { onclick: () => change({ ...usual }) });
@@ -44,9 +46,33 @@ function makeRow(name) {
   const shown = make("input", { type: "checkbox", checked: !layout.closed.includes(name), ariaLabel: name, onchange: () => change(toggled(layout, name)) });
   const way = (/** @type {"up" | "down" | "over"} */ to, /** @type {string} */ sign, /** @type {string} */ words) =>
     makeButton(sign, { ariaLabel: `${name} ${words}`, title: words, onclick: () => change(moved(layout, name, to)) });
-  return make("li", {}, make("label", {}, shown, ` ${name}`),
+  const row = make("li", { draggable: true }, make("label", {}, shown, ` ${name}`),
     way("up", "↑", "up"), way("down", "↓", "down"), way("over", "⇄", "to the other column"));
+  row.dataset.panel = name;
+  row.addEventListener("dragstart", () => (dragged = name));
+  row.addEventListener("dragend", () => (dragged = ""));
+  return row;
 }
+
+/** Lets rows of either column be dropped on this one. @param {"left" | "right"} side */
+function takeDrops(side) {
+  const list = lists[side];
+  /** The row above which a pointer is. @param {DragEvent} event @returns {HTMLElement | undefined} */
+  const below = ({ clientY }) =>
+    /** @type {HTMLElement[]} */ ([...list.children]).find((row) => {
+      const { top, height } = row.getBoundingClientRect();
+      return clientY < top + height / 2;
+    });
+  list.addEventListener("dragover", (event) => {
+    if (dragged) event.preventDefault();
+  });
+  list.addEventListener("drop", (event) => {
+    event.preventDefault();
+    if (dragged) change(put(layout, dragged, side, below(event)?.dataset.panel));
+  });
+}
+
+SIDES.forEach(takeDrops);
 
 apply();
 $("arrange").addEventListener("click", () => dialog.openFrom($("arrange")));
