@@ -36,3 +36,6 @@ impl Sort {
         self.kernel.run(pass, bindings, Groups::of_tiles(tiles));
     }
 }
+
+#[cfg(test)]
+mod tests;
