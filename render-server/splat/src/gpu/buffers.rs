@@ -53,16 +53,13 @@ impl Capacity {
 
     /// Returns room for another too, a quarter more than what has to grow, within a limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
-        let grow = |has: u64, wants: u64, limit: u64| {
-            if has >= wants { has } else { (wants + wants / 4).min(limit) }
-        };
         Self {
-            views: grow(self.views, other.views, limit.views),
-            camera_blocks: grow(self.camera_blocks, other.camera_blocks, limit.camera_blocks),
-            regions: grow(self.regions, other.regions, limit.regions),
-            pairs: grow(self.pairs, other.pairs, limit.pairs),
-            tiles: grow(self.tiles, other.tiles, limit.tiles),
-            pixels: grow(self.pixels, other.pixels, limit.pixels),
+            views: grown(self.views, other.views, limit.views),
+            camera_blocks: grown(self.camera_blocks, other.camera_blocks, limit.camera_blocks),
+            regions: grown(self.regions, other.regions, limit.regions),
+            pairs: grown(self.pairs, other.pairs, limit.pairs),
+            tiles: grown(self.tiles, other.tiles, limit.tiles),
+            pixels: grown(self.pixels, other.pixels, limit.pixels),
         }
     }
 
@@ -76,6 +73,11 @@ impl Capacity {
             (self.pixels, other.pixels),
         ]
     }
+}
+
+/// Returns room for what is wanted, within a limit: a quarter more where there is less.
+pub(super) fn grown(has: u64, wants: u64, limit: u64) -> u64 {
+    if has >= wants { has } else { (wants + wants / 4).min(limit) }
 }
 
 /// The buffers; named as in the shaders.

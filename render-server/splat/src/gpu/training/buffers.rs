@@ -2,6 +2,7 @@
 //!
 //! Memory: 132 bytes per row besides its numbers, which are there twice, 76 per pair, 52 per pixel.
 
+use super::super::buffers::grown;
 use super::super::device::Device;
 use super::photo::PHOTO_BYTES;
 use super::tiling::{Buffers, Capacity};
@@ -47,13 +48,10 @@ impl TrainingCapacity {
 
     /// Returns room for another too, a quarter more than what has to grow, within a limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
-        let grow = |has: u64, wants: u64, limit: u64| {
-            if has >= wants { has } else { (wants + wants / 4).min(limit) }
-        };
         Self {
             shared: self.shared.grown_to(&other.shared, &limit.shared),
-            row_words: grow(self.row_words, other.row_words, limit.row_words),
-            plane: grow(self.plane, other.plane, limit.plane),
+            row_words: grown(self.row_words, other.row_words, limit.row_words),
+            plane: grown(self.plane, other.plane, limit.plane),
         }
     }
 }

@@ -5,7 +5,7 @@
 //!
 //! Memory: 68 bytes per row, 16 per pair, 8 per tile.
 
-use super::super::buffers::SIZES_BYTES;
+use super::super::buffers::{SIZES_BYTES, grown};
 use super::super::device::Device;
 use super::super::view::GpuView;
 use super::sort;
@@ -49,13 +49,10 @@ impl Capacity {
 
     /// Returns room for another too, a quarter more than what has to grow, within a limit.
     pub(super) fn grown_to(&self, other: &Self, limit: &Self) -> Self {
-        let grow = |has: u64, wants: u64, limit: u64| {
-            if has >= wants { has } else { (wants + wants / 4).min(limit) }
-        };
         Self {
-            regions: grow(self.regions, other.regions, limit.regions),
-            pairs: grow(self.pairs, other.pairs, limit.pairs),
-            tiles: grow(self.tiles, other.tiles, limit.tiles),
+            regions: grown(self.regions, other.regions, limit.regions),
+            pairs: grown(self.pairs, other.pairs, limit.pairs),
+            tiles: grown(self.tiles, other.tiles, limit.tiles),
             tile_digits: other.tile_digits,
         }
     }
