@@ -41,6 +41,8 @@ use read::{Staging, Stamps};
 use scene::GpuScene;
 use view::{GpuView, ImageOffset, Tick};
 
+use vizflyt_protocol::geometry::Intrinsics;
+
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, Placement, RgbdImage, Scene};
 
@@ -48,9 +50,9 @@ use crate::{Camera, Placement, RgbdImage, Scene};
 const TILE_PX: u32 = 16;
 /// Ticks that may be under way at once.
 const MAX_IN_FLIGHT: usize = 2;
-/// Cameras of a tick, and tiles along an image's side: what `Cover` of `cover.wgsl` has bits for.
+/// Cameras of a tick: what `Cover` of `cover.wgsl` has bits for; as for tiles along an image's side.
 const MAX_CAMERAS: usize = 1 << 12;
-const MAX_SIDE_TILES: u32 = (1 << 10) - 1;
+const _: () = assert!(Intrinsics::MAX_SIDE_PX.div_ceil(TILE_PX) < 1 << 10);
 
 /// What a renderer may use and starts with; the defaults suit every scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -240,12 +242,6 @@ impl GpuRenderer {
         let (mut tiles, mut pixels) = (0u64, 0u64);
         for camera in cameras {
             let k = &camera.intrinsics;
-            if k.width_px.max(k.height_px).div_ceil(TILE_PX) > MAX_SIDE_TILES {
-                return Err(SubmitError::TooLarge(format!(
-                    "an image of {}x{} has more than {MAX_SIDE_TILES} tiles along a side",
-                    k.width_px, k.height_px
-                )));
-            }
             places.push(ImageOffset { first_tile: tiles as u32, first_pixel: pixels as u32 });
             let across = k.width_px.div_ceil(TILE_PX);
             tiles += u64::from(across) * u64::from(k.height_px.div_ceil(TILE_PX));

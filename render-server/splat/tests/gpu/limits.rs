@@ -1,5 +1,6 @@
 //! Too little room, small bindings, devices that go.
 
+use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_splat::gpu::{Budget, GpuRenderer};
 use vizflyt_splat::{
     Backend, Camera, CpuRenderer, Detail, FallbackRenderer, NoRenderer, Rasterizer, RenderError,
@@ -120,6 +121,21 @@ fn images_too_large_for_the_device_are_rendered_by_the_cpu() {
     let none = Budget { binding_bytes: 5000, ..Budget::default() };
     let refused = adapter().map(|adapter| GpuRenderer::new(&splats, adapter, none).map(|_| ()));
     assert!(matches!(refused, Some(Err(RenderError::Device(_)))), "{refused:?}");
+}
+
+#[test]
+fn the_widest_image_and_more_cameras_than_a_tick_has_are_rendered() {
+    let splats = twins::cloud(300, 0, 2);
+    let Some(mut gpu) = renderer(&splats) else { return };
+    let mut cpu = CpuRenderer::new(&splats);
+    let widest = [twins::camera(Intrinsics::MAX_SIDE_PX, 2, 80.0)];
+    let expected = render_all(&mut cpu, &widest);
+    assert_alike("the widest", &render_all(&mut gpu, &widest)[0], &expected[0]);
+    // A tick has 4096.
+    let mut many = vec![twins::camera(1, 1, 80.0); 4097];
+    many[4096] = twins::camera(20, 10, 80.0);
+    let expected = render_all(&mut cpu, &many[4096..]);
+    assert_alike("the last", &render_all(&mut gpu, &many)[4096], &expected[0]);
 }
 
 #[test]
