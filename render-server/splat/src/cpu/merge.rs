@@ -79,8 +79,11 @@ impl Blob {
             return (self.covariance_m2, opacity);
         }
         let growth = (GROWTH_SHARE * (opacity - 1.0)).min(MAX_GROWTH);
-        let pixel = DMat3::from_diagonal(DVec3::splat(growth * blur_m2));
-        (self.covariance_m2 * (1.0 + growth) + pixel, 1.0)
+        let grown_m2 = self.covariance_m2 * (1.0 + growth);
+        // As thick as its growth of the pixel, but where a needle would cover more than its splats.
+        let most_m2 = thickness(&grown_m2, self.mass(blur_m2) - blur_m2);
+        let pixel = DMat3::from_diagonal(DVec3::splat((growth * blur_m2).min(most_m2)));
+        (grown_m2 + pixel, 1.0)
     }
 }
 
@@ -113,10 +116,23 @@ pub(super) fn merge(blobs: impl Iterator<Item = Blob> + Clone, blur_m2: f64) -> 
 /// Returns the area of a Gaussian's image seen from a random side (root mean square), over 2 pi:
 /// the variance itself for a ball, none for a needle. [m^2]
 pub(super) fn area(covariance_m2: &DMat3) -> f64 {
+    (minors(covariance_m2) / 3.0).sqrt()
+}
+
+/// Returns the variance that added on every side gives the area `area_m2`; 0 where it is larger
+/// already. [m^2]
+///
+/// The minors of `C + v I` sum to `minors(C) + 2 trace(C) v + 3 v^2`.
+fn thickness(covariance_m2: &DMat3, area_m2: f64) -> f64 {
+    let (side, lacking) = (trace(covariance_m2), 3.0 * area_m2 * area_m2 - minors(covariance_m2));
+    if lacking > 0.0 { lacking / (side + (side * side + 3.0 * lacking).sqrt()) } else { 0.0 }
+}
+
+/// Returns the sum of the principal minors, which is that of the products of two eigenvalues. [m^4]
+fn minors(covariance_m2: &DMat3) -> f64 {
     let [a, b, c] = [covariance_m2.x_axis, covariance_m2.y_axis, covariance_m2.z_axis];
-    // The sum of the principal minors, which is that of the products of two eigenvalues.
-    let minors = (a.x * b.y - a.y * b.x) + (a.x * c.z - a.z * c.x) + (b.y * c.z - b.z * c.y);
-    (minors.max(0.0) / 3.0).sqrt()
+    let sum = (a.x * b.y - a.y * b.x) + (a.x * c.z - a.z * c.x) + (b.y * c.z - b.z * c.y);
+    sum.max(0.0)
 }
 
 /// Returns the opacity that a Gaussian needs to cover what `count` equal ones at random places
@@ -128,10 +144,10 @@ pub(super) fn area(covariance_m2: &DMat3) -> f64 {
 pub(super) fn covered(depth: f64, count: f64) -> f64 {
     let terms = count.clamp(1.0, MAX_TERMS);
     let u = (depth / terms).min(1.0);
-    let (mut clear, mut sum) = (1.0, 0.0);
+    let (mut hidden, mut sum) = (0.0, 0.0);
     for j in 1..=terms as u32 {
-        clear *= 1.0 - u;
-        sum += (1.0 - clear) / f64::from(j);
+        hidden += u * (1.0 - hidden);
+        sum += hidden / f64::from(j);
     }
     sum
 }

@@ -110,6 +110,29 @@ fn area_is_that_of_the_shadow() {
 }
 
 #[test]
+fn two_far_apart_cover_no_more_than_two() {
+    // 22 m apart, each some tenths of a millimetre, seen from where a pixel is 30 cm.
+    let points =
+        [0.0, 22.0].map(|z| Blob::new(DVec3::new(0.0, 0.0, z), DMat3::IDENTITY * 3e-4, 0.7));
+    let merged = merge(points.into_iter(), 0.09);
+    let (covariance, opacity) = merged.rendered(0.09);
+    assert_eq!(opacity, 1.0);
+    assert!(area(&covariance) + 0.09 <= merged.mass(0.09) * (1.0 + 1e-9));
+}
+
+#[test]
+fn a_thickness_gives_the_area_asked_for() {
+    for diagonal in [[1.0, 1.0, 1.0], [100.0, 1e-9, 1e-9], [4.0, 9.0, 0.0]] {
+        let covariance = DMat3::from_diagonal(diagonal.into());
+        for wanted in [5.0, 70.0] {
+            let side = DMat3::from_diagonal(DVec3::splat(thickness(&covariance, wanted)));
+            let got = area(&(covariance + side));
+            assert!((got / wanted.max(area(&covariance)) - 1.0).abs() < 1e-12, "{got} {wanted}");
+        }
+    }
+}
+
+#[test]
 fn splats_on_each_other_cover_less_than_their_sum() {
     assert!((covered(0.7, 1.0) - 0.7).abs() < 1e-12);
     // Two of opacity 1/2 on each other: 1/2 + (1 - 1/4) / 2 of a Gaussian.
