@@ -54,10 +54,11 @@ let view = "top";
 /** Shows a view. @param {View} wanted */
 async function pickView(wanted) {
   view = wanted;
+  // At once: opening the view in space takes as long as a busy computer lets it.
+  for (const [k, button] of buttons.entries()) button.ariaPressed = String(VIEWS[k] === view);
   if (view !== "top" && arena) await space.open(arena, theme(), view === "space" ? "free" : view);
   top.hidden = view !== "top";
   space.isHidden = view === "top";
-  for (const [k, button] of buttons.entries()) button.ariaPressed = String(VIEWS[k] === view);
   (view === "top" ? topView : space.view)?.resize();
 }
 
