@@ -12,6 +12,7 @@ use crate::args::ServeArgs;
 use crate::mailbox::Mailbox;
 use crate::poses::drivers::PoseSource;
 use crate::poses::thread::PoseThread;
+use crate::priority::give_way;
 use crate::render::rendered::RenderQueue;
 use crate::stream::Rooms;
 use crate::web::previews::{self, Previews};
@@ -58,6 +59,7 @@ impl Threads<'_> {
         };
         let (rooms, made) = (self.rooms.clone(), self.previews.clone());
         let previews = move || {
+            give_way(PREVIEWS_NICE);
             let Rooms { streaming, flights, stop, .. } = &rooms;
             previews::run(&made, flights, &streaming.subscriptions, &ticks, stop);
         };
@@ -84,3 +86,6 @@ fn start(name: &str, run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<(
     let thread = std::thread::Builder::new().name(name.to_owned());
     thread.spawn(run).with_context(|| format!("cannot start the {name} thread"))
 }
+
+/// A tenth of a core that a flight's threads want, too; the rest of one that they leave.
+const PREVIEWS_NICE: i32 = 10;

@@ -3,7 +3,8 @@
 //! Takes the ticks that the encode thread is done with ([`crate::render::rendered`]), each newest-wins, of
 //! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera; of those that fly
 //! and nobody watches, [`UNWATCHED_HZ`], for the card of a crash ([`crate::flights::crash`]). Per image of
-//! 640x480, on this thread of its own: 3 ms, most of it the two JPEGs of at most [`MAX_WIDTH_PX`].
+//! 640x480, on this thread of its own, which gives way to the flight's: 3 ms, most of it the two
+//! JPEGs of at most [`MAX_WIDTH_PX`].
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -32,6 +32,7 @@ use self::request::PictureRequest;
 use super::twin::TwinParts;
 use super::{Page, picture};
 use crate::lock::lock;
+use crate::priority::give_way;
 
 /// A JPEG, or why there is none.
 type Drawn = Result<Vec<u8>, String>;
@@ -86,7 +87,8 @@ impl TwinPictures {
 /// Draws what is asked for, until nobody has asked for [`KEPT`] or the server ends.
 fn run(twin: &TwinParts, fence_m: [DVec3; 2], asked: &Receiver<Asked>) {
     // The renderer's passes run where it is called from: on this pool's one thread.
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).start_handler(|_| give_way()).build();
+    let pool =
+        rayon::ThreadPoolBuilder::new().num_threads(1).start_handler(|_| give_way(NICE)).build();
     let pool = match pool {
         Ok(pool) => pool,
         Err(error) => return warn!("page: the twin cannot be drawn: {error}"),
@@ -110,13 +112,6 @@ fn run(twin: &TwinParts, fence_m: [DVec3; 2], asked: &Receiver<Asked>) {
         });
         due = next_due(began, Instant::now(), busy);
         let _ = next.answer.send(drawn);
-    }
-}
-
-/// Lets every thread of usual priority go first; on Linux a priority is the thread's own (setpriority(2)).
-fn give_way() {
-    if let Err(error) = rustix::process::setpriority_process(None, NICE) {
-        warn!("page: pictures of the twin do not give way to flights: {error}");
     }
 }
 
@@ -232,21 +227,5 @@ mod tests {
         stuck.join().unwrap();
         let jpeg = pictures.ask(camera(), false).unwrap().blocking_recv().unwrap().unwrap();
         assert_eq!(jpeg[..2], [0xff, 0xd8]);
-    }
-
-    #[test]
-    fn the_thread_that_draws_gives_way_and_no_other_does() {
-        let nice = || {
-            let stat = std::fs::read_to_string("/proc/thread-self/stat").unwrap();
-            // Behind the name, which may hold spaces: field 3; the priority is field 19 (proc_pid_stat(5)).
-            let (_, fields) = stat.rsplit_once(')').unwrap();
-            fields.split_whitespace().nth(16).unwrap().parse::<i32>().unwrap()
-        };
-        let before = nice();
-        let own = std::thread::spawn(move || {
-            give_way();
-            nice()
-        });
-        assert_eq!((own.join().unwrap(), nice()), (NICE, before));
     }
 }
