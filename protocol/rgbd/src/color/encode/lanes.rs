@@ -24,6 +24,7 @@ pub(super) trait Lanes: Copy {
     fn and(self, other: Self) -> Self;
     /// Magnitudes, unsigned.
     fn abs(self) -> Self;
+    fn up<const BITS: i32>(self) -> Self;
     /// Shifts zeros in.
     fn down<const BITS: i32>(self) -> Self;
     /// Shifts signs in.
@@ -95,6 +96,10 @@ impl Lanes for Plain {
         Self(self.0.map(i16::wrapping_abs))
     }
     #[inline(always)]
+    fn up<const BITS: i32>(self) -> Self {
+        Self(self.0.map(|lane| lane << BITS))
+    }
+    #[inline(always)]
     fn down<const BITS: i32>(self) -> Self {
         Self(self.0.map(|lane| (lane.cast_unsigned() >> BITS).cast_signed()))
     }
@@ -142,13 +147,14 @@ mod x86 {
         __m256i, __m512i, _mm_cvtsi32_si128, _mm_loadu_si128, _mm256_abs_epi16, _mm256_add_epi16,
         _mm256_and_si256, _mm256_broadcastsi128_si256, _mm256_cmpgt_epi16, _mm256_loadu_si256,
         _mm256_movemask_epi8, _mm256_mulhi_epu16, _mm256_mulhrs_epi16, _mm256_or_si256,
-        _mm256_packs_epi16, _mm256_set1_epi16, _mm256_setzero_si256, _mm256_sra_epi16,
-        _mm256_srl_epi16, _mm256_storeu_si256, _mm256_sub_epi16, _mm256_unpackhi_epi16,
-        _mm256_unpacklo_epi16, _mm256_xor_si256, _mm512_abs_epi16, _mm512_add_epi16,
-        _mm512_and_si512, _mm512_broadcast_i32x4, _mm512_cmpgt_epi16_mask, _mm512_loadu_si512,
-        _mm512_mulhi_epu16, _mm512_mulhrs_epi16, _mm512_or_si512, _mm512_set1_epi16,
-        _mm512_setzero_si512, _mm512_sra_epi16, _mm512_srl_epi16, _mm512_storeu_si512,
-        _mm512_sub_epi16, _mm512_unpackhi_epi16, _mm512_unpacklo_epi16, _mm512_xor_si512,
+        _mm256_packs_epi16, _mm256_set1_epi16, _mm256_setzero_si256, _mm256_sll_epi16,
+        _mm256_sra_epi16, _mm256_srl_epi16, _mm256_storeu_si256, _mm256_sub_epi16,
+        _mm256_unpackhi_epi16, _mm256_unpacklo_epi16, _mm256_xor_si256, _mm512_abs_epi16,
+        _mm512_add_epi16, _mm512_and_si512, _mm512_broadcast_i32x4, _mm512_cmpgt_epi16_mask,
+        _mm512_loadu_si512, _mm512_mulhi_epu16, _mm512_mulhrs_epi16, _mm512_or_si512,
+        _mm512_set1_epi16, _mm512_setzero_si512, _mm512_sll_epi16, _mm512_sra_epi16,
+        _mm512_srl_epi16, _mm512_storeu_si512, _mm512_sub_epi16, _mm512_unpackhi_epi16,
+        _mm512_unpacklo_epi16, _mm512_xor_si512,
     };
 
     use super::Lanes;
@@ -158,7 +164,7 @@ mod x86 {
     macro_rules! vectors {
         (
             $(#[$docs:meta])* $name:ident($vector:ty), $blocks:literal, $load:ident, $store:ident,
-            $all:ident, $every_block:ident, $abs:ident, $down:ident, $down_signed:ident,
+            $all:ident, $every_block:ident, $abs:ident, $up:ident, $down:ident, $down_signed:ident,
             zip: $low:ident $high:ident, positive: $positive:expr,
             $($pair:ident: $intrinsic:ident),*
         ) => {
@@ -198,6 +204,11 @@ mod x86 {
                     Self(unsafe { $abs(self.0) })
                 }
                 #[inline(always)]
+                fn up<const BITS: i32>(self) -> Self {
+                    // SAFETY: works on values only.
+                    Self(unsafe { $up(self.0, _mm_cvtsi32_si128(BITS)) })
+                }
+                #[inline(always)]
                 fn down<const BITS: i32>(self) -> Self {
                     // SAFETY: works on values only.
                     Self(unsafe { $down(self.0, _mm_cvtsi32_si128(BITS)) })
@@ -232,7 +243,7 @@ mod x86 {
     vectors!(
         /// With AVX2.
         Avx2(__m256i), 2, _mm256_loadu_si256, _mm256_storeu_si256, _mm256_set1_epi16,
-        _mm256_broadcastsi128_si256, _mm256_abs_epi16, _mm256_srl_epi16, _mm256_sra_epi16,
+        _mm256_broadcastsi128_si256, _mm256_abs_epi16, _mm256_sll_epi16, _mm256_srl_epi16, _mm256_sra_epi16,
         zip: _mm256_unpacklo_epi16 _mm256_unpackhi_epi16,
         // The pack leaves each half's 8 lanes in that half, twice.
         positive: |vector| {
@@ -247,7 +258,7 @@ mod x86 {
     vectors!(
         /// With AVX-512BW.
         Avx512(__m512i), 4, _mm512_loadu_si512, _mm512_storeu_si512, _mm512_set1_epi16,
-        _mm512_broadcast_i32x4, _mm512_abs_epi16, _mm512_srl_epi16, _mm512_sra_epi16,
+        _mm512_broadcast_i32x4, _mm512_abs_epi16, _mm512_sll_epi16, _mm512_srl_epi16, _mm512_sra_epi16,
         zip: _mm512_unpacklo_epi16 _mm512_unpackhi_epi16,
         positive: |vector| _mm512_cmpgt_epi16_mask(vector, _mm512_setzero_si512()),
         add: _mm512_add_epi16, sub: _mm512_sub_epi16, or: _mm512_or_si512, xor: _mm512_xor_si512,

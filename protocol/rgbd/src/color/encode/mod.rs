@@ -16,9 +16,11 @@
 mod entropy;
 mod lanes;
 mod tables;
+#[cfg(test)]
+mod tests;
 mod transform;
 
-use entropy::Bits;
+use entropy::{Bits, Coded};
 use lanes::{Lanes, Plain};
 use tables::WORDS;
 use transform::{ACROSS, BLOCKS, Coefficients, Quantiser, Samples, convert, transform};
@@ -103,33 +105,8 @@ impl Scan {
 
     /// Appends the scan of these rows and its end, by the machine's widest vectors.
     fn write(&self, rgb: &[u8], out: &mut Vec<u8>) {
-        #[cfg(target_arch = "x86_64")]
-        {
-            use lanes::{Avx2, Avx512};
-
-            #[target_feature(enable = "avx512bw,avx512vl,avx2,bmi1,bmi2,lzcnt,popcnt")]
-            fn avx512(scan: &Scan, rgb: &[u8], out: &mut Vec<u8>) {
-                scan.write_by::<Avx512>(rgb, out);
-            }
-            #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
-            fn avx2(scan: &Scan, rgb: &[u8], out: &mut Vec<u8>) {
-                scan.write_by::<Avx2>(rgb, out);
-            }
-            if is_x86_feature_detected!("avx2")
-                && is_x86_feature_detected!("bmi1")
-                && is_x86_feature_detected!("bmi2")
-                && is_x86_feature_detected!("lzcnt")
-                && is_x86_feature_detected!("popcnt")
-            {
-                if is_x86_feature_detected!("avx512bw") && is_x86_feature_detected!("avx512vl") {
-                    // SAFETY: the machine has what the function is compiled for.
-                    return unsafe { avx512(self, rgb, out) };
-                }
-                // SAFETY: the machine has what the function is compiled for.
-                return unsafe { avx2(self, rgb, out) };
-            }
-        }
-        self.write_by::<Plain>(rgb, out);
+        let way = by_avx512().or_else(by_avx2).unwrap_or(Self::write_by::<Plain>);
+        way(self, rgb, out);
     }
 
     #[inline(always)]
@@ -139,6 +116,7 @@ impl Scan {
         let view = View { rgb, width: self.width, height: rgb.len() / (3 * self.width) };
         let mut samples: [Samples; 3] = [[[0; ACROSS]; 8]; 3];
         let mut coefficients = [const { Coefficients::new() }; 3];
+        let mut coded = Coded::new();
         let mut last_dc = [0; 3];
         let mut bits = Bits::new(out);
         for top in (0..view.height).step_by(side) {
@@ -152,10 +130,9 @@ impl Scan {
                     let is_luma = strip == 0 || strip == 1 && is_halved;
                     transform::<V>(samples, &self.quantisers[usize::from(!is_luma)], out);
                 }
-                bits.make_room();
                 for unit in 0..ACROSS.min(view.width - left).div_ceil(side) {
                     for part in parts {
-                        bits.block(
+                        coded.block(
                             &coefficients[part.strip],
                             part.first + part.step * unit,
                             &WORDS[part.component.min(1)],
@@ -163,12 +140,44 @@ impl Scan {
                         );
                     }
                 }
+                bits.extend(coded.take());
             }
         }
         bits.finish();
         out.extend_from_slice(&END_OF_IMAGE);
     }
 }
+
+/// A way to write a scan.
+type Way = fn(&Scan, &[u8], &mut Vec<u8>);
+
+/// Makes a function that gives a way compiled for these instructions, where the machine has them.
+macro_rules! way {
+    ($name:ident, $lanes:ident, $features:literal, [$($feature:tt),*]) => {
+        fn $name() -> Option<Way> {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = $features)]
+                fn compiled(scan: &Scan, rgb: &[u8], out: &mut Vec<u8>) {
+                    scan.write_by::<lanes::$lanes>(rgb, out);
+                }
+                if $(is_x86_feature_detected!($feature))&&* {
+                    // SAFETY: the machine has what the function is compiled for.
+                    return Some(|scan, rgb, out| unsafe { compiled(scan, rgb, out) });
+                }
+            }
+            None
+        }
+    };
+}
+
+way!(by_avx2, Avx2, "avx2,bmi1,bmi2,lzcnt,popcnt", ["avx2", "bmi1", "bmi2", "lzcnt", "popcnt"]);
+way!(
+    by_avx512,
+    Avx512,
+    "avx512bw,avx512vl,bmi1,bmi2,lzcnt,popcnt",
+    ["avx512bw", "avx512vl", "bmi1", "bmi2", "lzcnt", "popcnt"]
+);
 
 /// One block of those that are coded together: in its strip of blocks side by side, which one is
 /// the first unit's, and how many further the next unit's is.

@@ -150,9 +150,9 @@ pub(super) struct Words {
     /// The same by 16 times the zeros before, and the leading zeros of the coefficient's magnitude
     /// in 32 bits, less 256 where it is more.
     pub(super) ac: [u32; 256],
-    /// Sixteen zeros, and nothing but zeros to the end: words and their lengths. [bits]
-    pub(super) zeros: (u64, u32),
-    pub(super) end: (u64, u32),
+    pub(super) sixteen_zeros: u32,
+    /// Nothing but zeros to the end.
+    pub(super) end: u32,
 }
 
 impl Words {
@@ -160,12 +160,13 @@ impl Words {
         const fn joined((word, bits): (u16, u8), category: u32) -> u32 {
             (word as u32) << (category + 5) | (bits as u32 + category)
         }
-        const fn alone((word, bits): (u16, u8)) -> (u64, u32) {
-            (word as u64, bits as u32)
-        }
         let (dc, ac) = (dc.words(), ac.words());
-        let mut words =
-            Self { dc: [0; 12], ac: [0; 256], zeros: alone(ac[0xf0]), end: alone(ac[0]) };
+        let mut words = Self {
+            dc: [0; 12],
+            ac: [0; 256],
+            sixteen_zeros: joined(ac[0xf0], 0),
+            end: joined(ac[0], 0),
+        };
         let mut category = 0;
         while category < 12 {
             words.dc[category] = joined(dc[category], category as u32);

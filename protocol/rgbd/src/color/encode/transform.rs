@@ -47,41 +47,35 @@ pub(super) fn convert<V: Lanes>(
     }
 }
 
-/// What coefficients of a component are divided by, and how; row by row of their horizontal
+/// What magnitudes of coefficients are multiplied by, twice; row by row of their horizontal
 /// frequency, as the transform leaves them.
 #[derive(Clone, Debug)]
-pub(super) struct Quantiser {
-    /// Half a divisor. [1/32]
-    half: [[i16; 8]; 8],
-    /// See [`factors`].
-    factors: [[[i16; 8]; 8]; 2],
-}
+pub(super) struct Quantiser([[[i16; 8]; 8]; 2]);
 
 impl Quantiser {
     /// Of divisors row by row of their vertical frequency.
     pub(super) fn new(divisors: &[u8; 64]) -> Self {
-        let mut quantiser = Self { half: [[0; 8]; 8], factors: [[[0; 8]; 8]; 2] };
+        let mut tables = [[[0; 8]; 8]; 2];
         for (at, &divisor) in divisors.iter().enumerate() {
-            let (u, v) = (at % 8, at / 8);
-            quantiser.half[u][v] = 16 * i16::from(divisor);
-            let factors = factors(divisor);
-            quantiser.factors[0][u][v] = factors[0].cast_signed();
-            quantiser.factors[1][u][v] = factors[1].cast_signed();
+            let (first, second) = factors(divisor);
+            tables[0][at % 8][at / 8] = first.cast_signed();
+            tables[1][at % 8][at / 8] = second;
         }
-        quantiser
+        Self(tables)
     }
 }
 
-/// Returns x and y such that floor(floor(n x / 2^16) y / 2^16) = floor(n / 4d) for n below 2^15.
+/// Returns x and y such that floor(n x / 2^16) y / 2^15 is n / 32 d, both rounded to the nearest,
+/// halves up, for n up to 2^15.
 ///
-/// With 2^s the greatest power of two that is at most 4d, x is 2^(16 + s) / 4d, rounded up, so too
-/// large by less than 1: the quotient is too large by less than n / 2^(16 + s), which is less than
-/// 1 / 4d, so the floor is the same.
-fn factors(divisor: u8) -> [u16; 2] {
-    let divisor = 4 * u32::from(divisor);
-    // 2^16 does not fit: for powers of two, s is one less and x still exact.
+/// With 2^s the greatest power of two below 32 d, y is 2^(15 - s), so the second product is a
+/// rounding shift by s; x is 2^(16 + s) / 32 d, rounded up, so too large by less than 1. That adds
+/// less than n / 2^(16 + s) to the quotient, which is at most 1 / 32 d: to a multiple of 1 / 32 d
+/// it makes no difference.
+pub(super) fn factors(divisor: u8) -> (u16, i16) {
+    let divisor = 32 * u32::from(divisor);
     let s = (divisor - 1).ilog2();
-    [(1u32 << (16 + s)).div_ceil(divisor) as u16, 1 << (16 - s)]
+    ((1u32 << (16 + s)).div_ceil(divisor) as u16, 1 << (15 - s))
 }
 
 /// Quantised coefficients of blocks side by side. Rows are horizontal frequencies, a block's 8
@@ -89,7 +83,7 @@ fn factors(divisor: u8) -> [u16; 2] {
 pub(super) struct Coefficients {
     /// Magnitudes; 24 lanes more, so that a block's window of all is whole.
     pub(super) magnitudes: [i16; 8 * ACROSS + 24],
-    /// The bits that tell a number from others of its category (T.81, F.1.2.1.1).
+    /// The bits that tell a number from others of its category (T.81, F.1.2.1.1), times 32.
     pub(super) bits: [i16; 8 * ACROSS + 24],
     /// Which are not zero: by horizontal frequency, of each block a byte.
     pub(super) nonzero: [[u8; BLOCKS]; 8],
@@ -119,15 +113,10 @@ pub(super) fn transform<V: Lanes>(
 ) {
     for block in (0..BLOCKS).step_by(V::BLOCKS) {
         let at = 8 * block;
-        let mut rows: [V; 8] = samples.each_ref().map(|row| V::load(&row[at..]));
-        rows = columns::<V, false>(rows);
-        rows = transpose(rows);
-        rows = columns::<V, true>(rows);
-        for (u, row) in rows.into_iter().enumerate() {
-            let every = |rows: &[[i16; 8]; 8]| V::every_block(&rows[u]);
-            let quotient = row.abs().add(every(&quantiser.half)).down::<3>();
-            let quotient = quotient.times_unsigned(every(&quantiser.factors[0]));
-            let magnitude = quotient.times_unsigned(every(&quantiser.factors[1]));
+        let rows = samples.each_ref().map(|row| V::load(&row[at..]));
+        for (u, row) in frequencies(rows).into_iter().enumerate() {
+            let [x, y] = quantiser.0.each_ref().map(|rows| V::every_block(&rows[u]));
+            let magnitude = row.abs().times_unsigned(x).times(y);
             // All bits below the highest one too, for numbers of up to 11 bits.
             let ones = magnitude.or(magnitude.down::<1>());
             let ones = ones.or(ones.down::<2>());
@@ -135,11 +124,18 @@ pub(super) fn transform<V: Lanes>(
             let ones = ones.or(ones.down::<8>());
             let bits = magnitude.xor(ones.and(row.down_signed::<15>()));
             magnitude.store(&mut out.magnitudes[ACROSS * u + at..]);
-            bits.store(&mut out.bits[ACROSS * u + at..]);
+            bits.up::<5>().store(&mut out.bits[ACROSS * u + at..]);
             let nonzero = magnitude.positive();
             out.nonzero[u][block..block + V::BLOCKS].copy_from_slice(&nonzero[..V::BLOCKS]);
         }
     }
+}
+
+/// Returns the coefficients of blocks: rows of samples in, rows of horizontal frequencies out.
+/// [1/32]
+#[inline(always)]
+pub(super) fn frequencies<V: Lanes>(rows: [V; 8]) -> [V; 8] {
+    columns::<V, true>(transpose(columns::<V, false>(rows)))
 }
 
 /// Discrete cosine transform of all columns, times the square root of 8, or half of that.
