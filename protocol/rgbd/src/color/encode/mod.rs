@@ -21,7 +21,7 @@ mod tests;
 mod transform;
 
 use entropy::{Bits, Coded};
-use lanes::{Lanes, Plain};
+use lanes::Lanes;
 use tables::WORDS;
 use transform::{ACROSS, BLOCKS, Coefficients, Quantiser, Samples, convert, transform};
 
@@ -103,12 +103,12 @@ impl Scan {
         Self { width: usize::from(width), mode, quantisers }
     }
 
-    /// Appends the scan of these rows and its end, by the machine's widest vectors.
+    /// Appends the scan of these rows and its end.
     fn write(&self, rgb: &[u8], out: &mut Vec<u8>) {
-        let way = by_avx512().or_else(by_avx2).unwrap_or(Self::write_by::<Plain>);
-        way(self, rgb, out);
+        widest()(self, rgb, out);
     }
 
+    /// The same by vectors of a kind.
     #[inline(always)]
     fn write_by<V: Lanes>(&self, rgb: &[u8], out: &mut Vec<u8>) {
         let is_halved = self.mode == ColorMode::Jpeg420;
@@ -151,27 +151,42 @@ impl Scan {
 /// A way to write a scan.
 type Way = fn(&Scan, &[u8], &mut Vec<u8>);
 
+/// Returns the way by the machine's widest vectors.
+#[cfg(target_arch = "x86_64")]
+fn widest() -> Way {
+    by_avx512().or_else(by_avx2).unwrap_or(Scan::write_by::<lanes::Plain>)
+}
+
+/// Returns the way by the machine's vectors.
+#[cfg(target_arch = "aarch64")]
+fn widest() -> Way {
+    Scan::write_by::<lanes::Neon>
+}
+
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+fn widest() -> Way {
+    Scan::write_by::<lanes::Plain>
+}
+
 /// Makes a function that gives a way compiled for these instructions, where the machine has them.
+#[cfg(target_arch = "x86_64")]
 macro_rules! way {
     ($name:ident, $lanes:ident, $features:literal, [$($feature:tt),*]) => {
         fn $name() -> Option<Way> {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = $features)]
-                fn compiled(scan: &Scan, rgb: &[u8], out: &mut Vec<u8>) {
-                    scan.write_by::<lanes::$lanes>(rgb, out);
-                }
-                if $(is_x86_feature_detected!($feature))&&* {
-                    // SAFETY: the machine has what the function is compiled for.
-                    return Some(|scan, rgb, out| unsafe { compiled(scan, rgb, out) });
-                }
+            #[target_feature(enable = $features)]
+            fn compiled(scan: &Scan, rgb: &[u8], out: &mut Vec<u8>) {
+                scan.write_by::<lanes::$lanes>(rgb, out);
             }
-            None
+            let is_there = $(is_x86_feature_detected!($feature))&&*;
+            // SAFETY: the machine has what the function is compiled for.
+            is_there.then_some(|scan, rgb, out| unsafe { compiled(scan, rgb, out) })
         }
     };
 }
 
+#[cfg(target_arch = "x86_64")]
 way!(by_avx2, Avx2, "avx2,bmi1,bmi2,lzcnt,popcnt", ["avx2", "bmi1", "bmi2", "lzcnt", "popcnt"]);
+#[cfg(target_arch = "x86_64")]
 way!(
     by_avx512,
     Avx512,
