@@ -94,8 +94,7 @@ impl Encoder {
     /// next is encoded, or drawn.
     ///
     /// # Errors
-    /// [`EncodeError::Size`], [`EncodeError::Quality`], [`EncodeError::Slices`],
-    /// [`EncodeError::Jpeg`].
+    /// [`EncodeError::Size`], [`EncodeError::Quality`], [`EncodeError::Slices`].
     pub fn start(
         &mut self,
         width: u32,
@@ -118,7 +117,7 @@ impl Encoder {
         }
         let tables = match color_mode {
             ColorMode::Jpeg444 | ColorMode::Jpeg420 if parts.color => {
-                self.jpeg.tables(width as u16, jpeg_quality, color_mode)?
+                self.jpeg.tables(width as u16, jpeg_quality, color_mode)
             }
             _ => &[],
         };
@@ -144,7 +143,7 @@ impl Encoder {
     ///
     /// # Errors
     /// [`EncodeError::Rows`] if these are not the rows or parts due, or an error about lengths;
-    /// the image can go on with the right ones. [`EncodeError::Jpeg`].
+    /// the image can go on with the right ones.
     pub fn push_slice(
         &mut self,
         rows: &ImageView<'_>,
@@ -172,7 +171,7 @@ impl Encoder {
         };
         match info.color {
             Some(ColorMode::Lossless) => self.lossless.encode(rgb, width, out),
-            Some(_) => self.jpeg.scan(rgb, height as u16, out)?,
+            Some(_) => self.jpeg.scan(rgb, out),
             None => {}
         }
         header.color_len = grown(out);

@@ -65,9 +65,6 @@ pub enum EncodeError {
         /// Rows due; 0 if none is.
         expected: u32,
     },
-    /// The JPEG library declined.
-    #[error("JPEG: {0}")]
-    Jpeg(String),
 }
 
 /// Why bytes are no image, or not the one the caller has room for.

@@ -1,8 +1,9 @@
-//! Depth allocates nothing once the scratch memory has grown to the image's size. (Colour
-//! allocates inside the JPEG libraries, a handful of small buffers an image.)
+//! Depth, and encoding of colour, allocate nothing once the scratch memory has grown to the image's
+//! size. (Decoding of colour allocates inside the JPEG library, a handful of small buffers an
+//! image.)
 
 use vizflyt_fixtures::CountingAllocator;
-use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
+use vizflyt_rgbd::{ColorMode, Decoder, EncodeOptions, Encoder, RgbdView};
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
@@ -24,4 +25,24 @@ fn depth_allocates_for_the_first_image_only() {
         assert_eq!(turn(), 0);
     }
     assert_eq!(depth_out, depth_mm);
+}
+
+#[test]
+fn encoding_allocates_for_the_first_image_only() {
+    let rgb: Vec<u8> = (0..3 * 330 * 240).map(|n| (n * 7919 % 251) as u8).collect();
+    let depth_mm: Vec<u16> = (0..330 * 240).map(|n| (n * 7919 % 9000) as u16).collect();
+    let view = RgbdView { width: 330, height: 240, rgb: &rgb, depth_mm: &depth_mm };
+    for color_mode in [ColorMode::Jpeg444, ColorMode::Jpeg420] {
+        let mut encoder = Encoder::new(EncodeOptions { color_mode, ..EncodeOptions::default() });
+        let mut bytes = Vec::new();
+        let mut turn = || {
+            let before = CountingAllocator::thread_allocations();
+            encoder.encode(&view, &mut bytes).unwrap();
+            CountingAllocator::thread_allocations() - before
+        };
+        assert!(turn() > 0, "the counter counts");
+        for _ in 0..3 {
+            assert_eq!(turn(), 0, "{color_mode:?}");
+        }
+    }
 }

@@ -16,7 +16,8 @@ mod rvl;
 use std::time::Instant;
 
 use images::Image;
-use peers::{Codec, Given, Lz4, Ours, Png16, Qoi, Rvl, Zstd};
+use jpeg_encoder::SamplingFactor;
+use peers::{Codec, Given, Lz4, Ours, Png16, PureJpeg, Qoi, Rvl, Zstd};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
 /// Turns of every codec.
@@ -153,6 +154,10 @@ fn entries() -> Vec<Entry> {
     add("colour: zstd 1", Given::Color, true, Box::new(Zstd::new(Given::Color)));
     add("colour: lz4", Given::Color, true, Box::new(Lz4::new(Given::Color)));
     add("colour: QOI", Given::Color, true, Box::<Qoi>::default());
+    let pure = |sampling| Box::new(PureJpeg::new(sampling));
+    let (full, half) = (SamplingFactor::R_4_4_4, SamplingFactor::R_4_2_0);
+    add("colour: jpeg-encoder 4:4:4 q93", Given::Color, false, pure(full));
+    add("colour: jpeg-encoder 4:2:0 q93", Given::Color, false, pure(half));
     #[cfg(feature = "turbo")]
     {
         use peers::TurboJpeg;

@@ -198,6 +198,36 @@ impl Codec for Qoi {
     }
 }
 
+/// `jpeg-encoder` and `zune-jpeg`, quality 93.
+pub(crate) struct PureJpeg {
+    sampling: jpeg_encoder::SamplingFactor,
+    bytes: Vec<u8>,
+}
+
+impl PureJpeg {
+    pub(crate) fn new(sampling: jpeg_encoder::SamplingFactor) -> Self {
+        Self { sampling, bytes: Vec::new() }
+    }
+}
+
+impl Codec for PureJpeg {
+    fn encode(&mut self, image: &Image) -> usize {
+        self.bytes.clear();
+        let mut encoder = jpeg_encoder::Encoder::new(&mut self.bytes, 93);
+        encoder.set_sampling_factor(self.sampling);
+        let (width, height) = (image.width as u16, image.height as u16);
+        encoder
+            .encode(&image.rgb, width, height, jpeg_encoder::ColorType::Rgb)
+            .expect("a good image");
+        self.bytes.len()
+    }
+
+    fn decode(&mut self, back: &mut Image) {
+        let mut decoder = zune_jpeg::JpegDecoder::new(Cursor::new(&self.bytes));
+        decoder.decode_into(&mut back.rgb).expect("our own bytes");
+    }
+}
+
 /// libjpeg-turbo alone, quality 93.
 #[cfg(feature = "turbo")]
 pub(crate) struct TurboJpeg {

@@ -1,114 +1,7 @@
-//! JPEGs whole, and JPEGs cut into tables and scans.
+//! JPEGs put together of tables and scans, and decoded.
 
 use super::library;
-use crate::error::{DecodeError, EncodeError};
-use crate::header::{ColorMode, MAX_SIDE};
-
-/// Appends a baseline JPEG, 4:4:4, to `out`. `rgb` is row-major, three bytes a pixel; quality is
-/// 1 to 100.
-///
-/// # Errors
-/// [`EncodeError::Size`], [`EncodeError::Rgb`] or [`EncodeError::Quality`] for arguments out of
-/// range; [`EncodeError::Jpeg`] if the JPEG library declines.
-pub fn encode_jpeg(
-    rgb: &[u8],
-    width: u32,
-    height: u32,
-    quality: u8,
-    out: &mut Vec<u8>,
-) -> Result<(), EncodeError> {
-    let side = 1..=MAX_SIDE;
-    if !side.contains(&width) || !side.contains(&height) {
-        return Err(EncodeError::Size(width, height));
-    }
-    let expected = width as usize * height as usize * 3;
-    if rgb.len() != expected {
-        return Err(EncodeError::Rgb { found: rgb.len(), expected, width, height });
-    }
-    if !(1..=100).contains(&quality) {
-        return Err(EncodeError::Quality(quality));
-    }
-    // Sides are at most 8192, so they fit.
-    let size = (width as u16, height as u16);
-    library::Encoder::default().encode(rgb, size, quality, ColorMode::Jpeg444, out)
-}
-
-/// Encodes slices; owns the scratch memory.
-#[derive(Debug, Default)]
-pub(crate) struct JpegSliceEncoder {
-    library: library::Encoder,
-    /// What `tables` are of.
-    made_for: Option<(u16, u8, ColorMode)>,
-    /// All up to the scan, for 0 rows.
-    tables: Vec<u8>,
-    jpeg: Vec<u8>,
-}
-
-impl JpegSliceEncoder {
-    /// Returns the tables of images so wide, of this quality and mode, to be stored once.
-    pub(crate) fn tables(
-        &mut self,
-        width: u16,
-        quality: u8,
-        mode: ColorMode,
-    ) -> Result<&[u8], EncodeError> {
-        if self.made_for != Some((width, quality, mode)) {
-            self.made_for = None;
-            // They do not depend on the pixels, so the least image serves.
-            let row = vec![0; 3 * usize::from(width)];
-            self.compress(&row, (width, 1), quality, mode)?;
-            self.made_for = Some((width, quality, mode));
-        }
-        Ok(&self.tables)
-    }
-
-    /// Appends the scan of some rows to `out`, to be decoded with [`Self::tables`].
-    pub(crate) fn scan(
-        &mut self,
-        rgb: &[u8],
-        rows: u16,
-        out: &mut Vec<u8>,
-    ) -> Result<(), EncodeError> {
-        let Some((width, quality, mode)) = self.made_for else {
-            return Err(EncodeError::Jpeg("no tables were made".into()));
-        };
-        let before = self.tables.len();
-        let scan = self.compress(rgb, (width, rows), quality, mode)?;
-        debug_assert_eq!(self.tables.len(), before, "tables depend on pixels");
-        out.extend_from_slice(&self.jpeg[scan..]);
-        Ok(())
-    }
-
-    /// Leaves a JPEG, returns where its scan begins, and leaves its tables apart.
-    fn compress(
-        &mut self,
-        rgb: &[u8],
-        size: (u16, u16),
-        quality: u8,
-        mode: ColorMode,
-    ) -> Result<usize, EncodeError> {
-        self.jpeg.clear();
-        self.library.encode(rgb, size, quality, mode, &mut self.jpeg)?;
-        let layout = Layout::of(&self.jpeg)
-            .ok_or_else(|| EncodeError::Jpeg("the library writes no baseline JPEG".into()))?;
-        let tables = &self.jpeg[..layout.scan];
-        let (rows, after) = (layout.rows..layout.rows + 2, layout.rows + 2);
-        let same = self.made_for.is_none_or(|_| {
-            self.tables.len() == tables.len()
-                && self.tables[..rows.start] == tables[..rows.start]
-                && self.tables[after..] == tables[after..]
-        });
-        if !same {
-            return Err(EncodeError::Jpeg("the library's tables depend on the pixels".into()));
-        }
-        if self.made_for.is_none() {
-            self.tables.clear();
-            self.tables.extend_from_slice(tables);
-            self.tables[rows].fill(0);
-        }
-        Ok(layout.scan)
-    }
-}
+use crate::error::DecodeError;
 
 /// Decodes slices; owns the scratch memory.
 #[derive(Debug, Default)]
@@ -222,6 +115,6 @@ pub(super) fn damaged(why: &str) -> DecodeError {
 }
 
 /// ITU-T T.81, table B.1: SOI.
-const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
+pub(super) const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
 /// ITU-T T.81, table B.1: EOI.
 pub(super) const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];

@@ -5,6 +5,7 @@
 //! slices but for the number of rows, and goes into the image's header once; the scan goes into
 //! the slice. A decoder puts them together again, so any JPEG library serves at either end.
 
+mod encode;
 mod file;
 mod jpeg;
 mod lossless;
@@ -13,9 +14,10 @@ mod pure;
 #[cfg(feature = "turbo")]
 mod turbo;
 
+pub(crate) use encode::JpegSliceEncoder;
+pub use encode::encode_jpeg;
 pub use file::{join_jpeg, split_jpeg};
-pub use jpeg::encode_jpeg;
-pub(crate) use jpeg::{JpegSliceDecoder, JpegSliceEncoder};
+pub(crate) use jpeg::JpegSliceDecoder;
 pub(crate) use lossless::{LosslessDecoder, LosslessEncoder};
 #[cfg(not(feature = "turbo"))]
 use pure as library;

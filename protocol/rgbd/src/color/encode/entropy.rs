@@ -1,0 +1,183 @@
+//! Huffman coding of blocks (ITU-T T.81, F.1.2).
+
+use super::tables::{Words, ZIGZAG};
+use super::transform::{ACROSS, Coefficients};
+
+/// Blocks that are coded before their bits are joined, at most.
+pub(super) const GROUP_BLOCKS: usize = 12;
+/// More than their words: of each coefficient one, and the end.
+const GROUP_WORDS: usize = 1024;
+/// More than their bytes, at 26 bits a word.
+const GROUP_BYTES: usize = GROUP_WORDS * 26 / 8 + 16;
+const _: () = assert!(GROUP_WORDS > GROUP_BLOCKS * 65);
+
+/// Where the zigzag's n-th coefficient of the first block is in [`Coefficients`].
+const PLACES: [u8; 64] = {
+    let mut places = [0; 64];
+    let mut n = 0;
+    while n < 64 {
+        let (v, u) = (ZIGZAG[n] / 8, ZIGZAG[n] % 8);
+        places[n] = ACROSS as u8 * u + v;
+        n += 1;
+    }
+    places
+};
+
+/// By horizontal frequency u and a set of vertical ones: the set of zigzag numbers.
+static ZIGZAG_SETS: [[u64; 256]; 8] = {
+    let mut sets = [[0; 256]; 8];
+    let mut n = 0;
+    while n < 64 {
+        let (v, u) = (ZIGZAG[n] / 8, ZIGZAG[n] % 8);
+        let mut set = 0;
+        while set < 256 {
+            sets[u as usize][set] |= (set as u64 >> v & 1) << n;
+            set += 1;
+        }
+        n += 1;
+    }
+    sets
+};
+
+/// The words of a group of blocks: their bits times 32, and how many these are.
+pub(super) struct Coded {
+    words: [u32; GROUP_WORDS],
+    len: usize,
+}
+
+impl Coded {
+    pub(super) const fn new() -> Self {
+        Self { words: [0; GROUP_WORDS], len: 0 }
+    }
+
+    /// Takes the words away, with one of no bits where they are odd in number.
+    pub(super) fn take(&mut self) -> &[[u32; 2]] {
+        self.words[self.len] = 0;
+        let len = std::mem::take(&mut self.len).next_multiple_of(2);
+        self.words[..len].as_chunks().0
+    }
+
+    /// Adds a block, of those side by side; `last_dc` is the DC coefficient of the block before, of
+    /// the same component.
+    #[inline(always)]
+    pub(super) fn block(
+        &mut self,
+        coefficients: &Coefficients,
+        block: usize,
+        words: &Words,
+        last_dc: &mut i32,
+    ) {
+        let (magnitudes, bits) = coefficients.of_block(block);
+        let mut room = self.words[self.len..].iter_mut();
+        let mut push = |word| *room.next().expect("a group has not so many") = word;
+
+        // Where its bits are the magnitude, a number is not negative.
+        let dc = i32::from(magnitudes[0]);
+        let dc =
+            if bits[0].cast_unsigned() >> 5 == magnitudes[0].cast_unsigned() { dc } else { -dc };
+        let difference = dc - *last_dc;
+        *last_dc = dc;
+        let category = 32 - difference.unsigned_abs().leading_zeros();
+        let low = (difference + (difference >> 31)) & ((1 << category) - 1);
+        push(words.dc[category as usize] | low.cast_unsigned() << 5);
+
+        let mut left = 0;
+        for (sets, set) in ZIGZAG_SETS.iter().zip(&coefficients.nonzero) {
+            left |= sets[usize::from(set[block])];
+        }
+        left &= !1;
+        let mut next = 1;
+        while left != 0 {
+            let at = left.trailing_zeros();
+            left &= left - 1;
+            let mut zeros = at - next;
+            next = at + 1;
+            while zeros >= 16 {
+                push(words.sixteen_zeros);
+                zeros -= 16;
+            }
+            let place = usize::from(PLACES[at as usize]);
+            let leading = u32::from(magnitudes[place].cast_unsigned()).leading_zeros();
+            let word = words.ac[usize::from((16 * zeros + leading) as u8)];
+            push(word | u32::from(bits[place].cast_unsigned()));
+        }
+        if next < 64 {
+            push(words.end);
+        }
+        self.len = GROUP_WORDS - room.len();
+    }
+}
+
+/// Joins words, high bits first, and writes a zero byte after every 0xff.
+pub(super) struct Bits<'a> {
+    /// What is written, then room.
+    out: &'a mut Vec<u8>,
+    len: usize,
+    /// The last bits, high; below them are zeros.
+    open: u64,
+    /// How many they are, less than 8 between calls.
+    used: u32,
+    /// The bytes of a group, before zeros are put between.
+    bytes: [u8; GROUP_BYTES],
+}
+
+impl<'a> Bits<'a> {
+    pub(super) fn new(out: &'a mut Vec<u8>) -> Self {
+        Self { len: out.len(), out, open: 0, used: 0, bytes: [0; GROUP_BYTES] }
+    }
+
+    /// Adds the words of a group, in pairs: both have 52 bits at most.
+    #[inline(always)]
+    pub(super) fn extend(&mut self, words: &[[u32; 2]]) {
+        let (mut open, mut used, mut len) = (self.open, self.used, 0);
+        for &[first, second] in words {
+            let count = second & 31;
+            let bits = u64::from(first >> 5) << count | u64::from(second >> 5);
+            used += (first & 31) + count;
+            open |= bits << (64 - used);
+            self.bytes[len..len + 8].copy_from_slice(&open.to_be_bytes());
+            len += used as usize / 8;
+            open <<= used & !7;
+            used &= 7;
+        }
+        (self.open, self.used) = (open, used);
+        self.write(len);
+    }
+
+    /// Writes the first bytes of the group.
+    #[inline(always)]
+    fn write(&mut self, len: usize) {
+        if self.out.len() < self.len + 2 * GROUP_BYTES {
+            self.out.resize(self.len + 8 * GROUP_BYTES, 0);
+        }
+        let (eights, rest) = self.bytes[..len].as_chunks::<8>();
+        for eight in eights {
+            const EVERY: u64 = 0x0101_0101_0101_0101;
+            let word = u64::from_ne_bytes(*eight);
+            // A byte of 0xff loses its high bit when one is added, whatever is carried in.
+            if word & !word.wrapping_add(EVERY) & (EVERY << 7) == 0 {
+                self.out[self.len..self.len + 8].copy_from_slice(eight);
+                self.len += 8;
+            } else {
+                self.len = stuffed(self.out, self.len, eight);
+            }
+        }
+        self.len = stuffed(self.out, self.len, rest);
+    }
+
+    /// Fills the last byte with ones, and takes the room that is left away.
+    pub(super) fn finish(mut self) {
+        self.extend(&[[0x7f << 5 | 7, 0]]);
+        self.out.truncate(self.len);
+    }
+}
+
+/// Writes bytes, and a zero after every 0xff; returns the new length.
+fn stuffed(room: &mut [u8], mut len: usize, bytes: &[u8]) -> usize {
+    for &byte in bytes {
+        // The zero is overwritten where it is not needed.
+        room[len..len + 2].copy_from_slice(&[byte, 0]);
+        len += 1 + usize::from(byte == 0xff);
+    }
+    len
+}
