@@ -16,7 +16,7 @@ mod rvl;
 use std::time::Instant;
 
 use images::Image;
-use peers::{Codec, Given, Lz4, Ours, Png16, Qoi, Rvl, Zstd};
+use peers::{Codec, Given, Lz4, Ours, Png16, Qoi, Rvl, Zstd, ZuneJpeg};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
 /// Turns of every codec.
@@ -161,6 +161,7 @@ fn entries() -> Vec<Entry> {
         add("colour: libjpeg-turbo 4:4:4 q93", Given::Color, false, turbo(None));
         add("colour: libjpeg-turbo 4:2:0 q93", Given::Color, false, turbo(Sub2x2));
     }
+    add("colour: zune-jpeg decodes 4:4:4 q93", Given::Color, false, Box::<ZuneJpeg>::default());
     let (full, half) = (colour(ColorMode::Jpeg444), colour(ColorMode::Jpeg420));
     let exact = colour(ColorMode::Lossless);
     add("colour: ours 4:4:4 q93", Given::Color, false, ours(Given::Color, full));

@@ -2,8 +2,11 @@
 
 use std::io::Cursor;
 
-use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, ImageMut, ImageView};
+use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, ImageMut, ImageView, encode_jpeg};
 use zerocopy::IntoBytes;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::images::Image;
 use crate::rvl;
@@ -195,6 +198,24 @@ impl Codec for Qoi {
 
     fn decode(&mut self, back: &mut Image) {
         qoi::decode_to_buf(&mut back.rgb, &self.0).expect("our own bytes");
+    }
+}
+
+/// Our whole JPEGs, quality 93, decoded by zune-jpeg.
+#[derive(Default)]
+pub(crate) struct ZuneJpeg(Vec<u8>);
+
+impl Codec for ZuneJpeg {
+    fn encode(&mut self, image: &Image) -> usize {
+        self.0.clear();
+        encode_jpeg(&image.rgb, image.width, image.height, 93, &mut self.0).expect("a good image");
+        self.0.len()
+    }
+
+    fn decode(&mut self, back: &mut Image) {
+        let options = DecoderOptions::new_fast();
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.0), options);
+        decoder.decode_into(&mut back.rgb).expect("our own bytes");
     }
 }
 
