@@ -120,9 +120,9 @@ fn decode_scan_here(
     // Of samples coded together (A.2.3): luma in both directions.
     let side = 8 * halving;
     let groups = width.div_ceil(side);
-    let strides = [groups * side, groups * 8, groups * 8];
-    for (plane, rows, stride) in [(0, side, strides[0]), (1, 8, strides[1]), (2, 8, strides[2])] {
-        scratch.planes[plane].resize(2 * rows * stride, 0);
+    let stride = (groups * side).next_multiple_of(transform::GROUP);
+    for (plane, rows) in scratch.planes.iter_mut().zip([side, 8, 8]) {
+        plane.resize(2 * rows * stride, 0);
     }
     // Component, and its block in the group: column and row.
     let blocks = [(0, 0, 0), (0, 1, 0), (0, 0, 1), (0, 1, 1), (1, 0, 0), (2, 0, 0)];
@@ -138,13 +138,13 @@ fn decode_scan_here(
                 let of = &tables.components[component];
                 let coded = bits.block(tables.prefixes(of), &of.basis, &mut dc[component])?;
                 let samples = transform::samples(&coded);
-                let (stride, luma) = (strides[component], component == 0);
-                let across = if luma { halving } else { 1 };
+                let across = if component == 0 { halving } else { 1 };
                 let top = 8 * (row % 2 * across + down);
-                let start = top * stride + 8 * (group * across + column);
-                let plane = &mut scratch.planes[component][start..];
-                for (out, samples) in plane.chunks_mut(stride).zip(&samples) {
-                    out[..8].copy_from_slice(samples);
+                let mut start = top * stride + 8 * (group * across + column);
+                let plane = &mut scratch.planes[component];
+                for samples in &samples {
+                    plane[start..start + 8].copy_from_slice(samples);
+                    start += stride;
                 }
             }
         }
@@ -153,7 +153,7 @@ fn decode_scan_here(
         let ready = if decoded >= height { height } else { decoded + 1 - halving };
         for y in done..ready {
             let out = &mut rgb_out[3 * width * y..3 * width * (y + 1)];
-            write_row(tables, scratch, strides, (y, height), out);
+            write_row(tables, scratch, stride, (y, height), out);
         }
         done = ready;
     }
@@ -165,14 +165,14 @@ fn decode_scan_here(
 fn write_row(
     tables: &Tables,
     scratch: &mut Scratch,
-    strides: [usize; 3],
+    stride: usize,
     (y, height): (usize, usize),
     rgb_out: &mut [u8],
 ) {
     let Scratch { planes, doubled, sums } = scratch;
     let plane_row = |plane: usize, y: usize| {
-        let rows = planes[plane].len() / strides[plane];
-        &planes[plane][y % rows * strides[plane]..][..strides[plane]]
+        let rows = if plane == 0 { 16 * tables.halving } else { 16 };
+        &planes[plane][y % rows * stride..][..stride]
     };
     let luma = plane_row(0, y);
     if tables.halving == 1 {
@@ -183,7 +183,7 @@ fn write_row(
     let len = usize::from(tables.width).div_ceil(2);
     sums.resize(len + 2, 0);
     for (plane, out) in [1, 2].into_iter().zip(&mut *doubled) {
-        out.resize(2 * len, 0);
+        out.resize(stride, 0);
         let (near, far) = (&plane_row(plane, near)[..len], &plane_row(plane, far)[..len]);
         transform::double_row(near, far, sums, out);
     }

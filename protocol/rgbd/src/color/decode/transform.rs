@@ -140,19 +140,40 @@ pub(super) fn double_row(near: &[Sample], far: &[Sample], sums: &mut [u16], out:
     }
 }
 
-/// Turns a row into RGB (ITU-T T.871, 7).
+/// Pixels whose colours are computed at once, and then interleaved.
+pub(super) const GROUP: usize = 32;
+
+/// Turns a row into RGB (ITU-T T.871, 7). Rows of samples end with a whole group.
 #[inline(always)]
 pub(super) fn color_row(luma: &[Sample], cb: &[Sample], cr: &[Sample], rgb_out: &mut [u8]) {
-    let pixels = rgb_out.as_chunks_mut::<3>().0;
-    for (((pixel, &y), &cb), &cr) in pixels.iter_mut().zip(luma).zip(cb).zip(cr) {
-        let (y, cb, cr) = (y as i16 + 8, cb as i16 - 16 * 128, cr as i16 - 16 * 128);
+    let samples = [luma, cb, cr].map(|row| row.as_chunks::<GROUP>().0);
+    let (groups, rest) = rgb_out.as_chunks_mut::<{ 3 * GROUP }>();
+    let (last, rest) = (groups.len(), rest);
+    for (at, out) in groups.iter_mut().enumerate() {
+        color_group(samples.map(|row| &row[at]), out);
+    }
+    if !rest.is_empty() {
+        let mut out = [0; 3 * GROUP];
+        color_group(samples.map(|row| &row[last]), &mut out);
+        rest.copy_from_slice(&out[..rest.len()]);
+    }
+}
+
+#[inline(always)]
+fn color_group([luma, cb, cr]: [&[Sample; GROUP]; 3], out: &mut [u8; 3 * GROUP]) {
+    let (mut red, mut green, mut blue) = ([0; GROUP], [0; GROUP], [0; GROUP]);
+    for x in 0..GROUP {
+        let (y, cb, cr) = (luma[x] as i16 + 8, cb[x] as i16 - 16 * 128, cr[x] as i16 - 16 * 128);
         // 1.402, 1.772, -0.344136 and -0.714136, less what whole numbers make of them: so factors
         // have 16 bits.
         let part = |c: i16, factor: i32| ((i32::from(c) * factor) >> 16) as i16;
-        let red = y + cr + part(cr, 26_345);
-        let green = y - cr + part(cr, 18_734) - part(cb, 22_554);
-        let blue = y + 2 * cb - part(cb, 14_942);
-        *pixel = [red, green, blue].map(|value| (value >> 4).clamp(0, 255) as u8);
+        let byte = |value: i16| (value >> 4).clamp(0, 255) as u8;
+        red[x] = byte(y + cr + part(cr, 26_345));
+        green[x] = byte(y - cr + part(cr, 18_734) - part(cb, 22_554));
+        blue[x] = byte(y + 2 * cb - part(cb, 14_942));
+    }
+    for (x, pixel) in out.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+        *pixel = [red[x], green[x], blue[x]];
     }
 }
 
