@@ -1,4 +1,4 @@
-//! JPEG in pure Rust: nothing but Rust and a C compiler to build.
+//! JPEG encoded in pure Rust: nothing but Rust and a C compiler to build.
 
 use jpeg_encoder::{ColorType, SamplingFactor};
 

@@ -1,4 +1,4 @@
-//! JPEG by libjpeg-turbo: a third of the time.
+//! JPEG encoded by libjpeg-turbo: a third of the time.
 
 use core::fmt;
 

@@ -272,6 +272,25 @@ fn a_scan_cut_anywhere_or_longer_is_an_error() {
     }
 }
 
+#[test]
+fn tables_are_those_of_the_latest_start() {
+    let mut decoder = JpegSliceDecoder::default();
+    let refused = decoder.decode(&END_OF_IMAGE, (21, 18), &mut [0; 3 * 21 * 18]);
+    assert_eq!(refused, Err(damaged("it has no tables")));
+    for (quality, halved) in [(90, false), (90, false), (20, false), (20, true), (90, false)] {
+        let made = Made { width: 21, height: 18, quality, halved };
+        let jpeg = jpeg(&pixels(21, 18, 3, 30), made);
+        let (tables, scan) = split(&jpeg);
+        decoder.start(tables, 21).unwrap();
+        let mut out = vec![0; 3 * 21 * 18];
+        decoder.decode(scan, (21, 18), &mut out).unwrap();
+        assert_eq!(out, decode(&jpeg, 21, 18).unwrap());
+        assert!(decoder.start(tables, 22).is_err(), "of another width");
+        assert!(decoder.start(&tables[1..], 21).is_err(), "damaged");
+        assert!(decoder.decode(scan, (21, 18), &mut out).is_err(), "none are left");
+    }
+}
+
 /// A JPEG's tables for one block: codes by their lengths, for DC and AC.
 fn tables(dc: (&[u8], &[u8]), ac: (&[u8], &[u8])) -> Vec<u8> {
     let mut all = vec![0xff, 0xd8];
