@@ -1,6 +1,5 @@
-//! Depth, and encoding of colour, allocate nothing once the scratch memory has grown to the image's
-//! size. (Decoding of colour allocates inside the JPEG library, a handful of small buffers an
-//! image.)
+//! Encoder and decoder, of depth and of colour, allocate nothing once the scratch memory has grown to the
+//! image's size.
 
 use vizflyt_fixtures::CountingAllocator;
 use vizflyt_rgbd::{ColorMode, Decoder, EncodeOptions, Encoder, RgbdView};
@@ -28,16 +27,18 @@ fn depth_allocates_for_the_first_image_only() {
 }
 
 #[test]
-fn encoding_allocates_for_the_first_image_only() {
+fn all_of_an_image_allocates_for_the_first_only() {
     let rgb: Vec<u8> = (0..3 * 330 * 240).map(|n| (n * 7919 % 251) as u8).collect();
     let depth_mm: Vec<u16> = (0..330 * 240).map(|n| (n * 7919 % 9000) as u16).collect();
     let view = RgbdView { width: 330, height: 240, rgb: &rgb, depth_mm: &depth_mm };
+    let (mut rgb_out, mut depth_out) = (vec![0; rgb.len()], vec![0; depth_mm.len()]);
     for color_mode in [ColorMode::Jpeg444, ColorMode::Jpeg420] {
         let mut encoder = Encoder::new(EncodeOptions { color_mode, ..EncodeOptions::default() });
-        let mut bytes = Vec::new();
+        let (mut decoder, mut bytes) = (Decoder::new(), Vec::new());
         let mut turn = || {
             let before = CountingAllocator::thread_allocations();
             encoder.encode(&view, &mut bytes).unwrap();
+            decoder.decode(&bytes, &mut rgb_out, &mut depth_out).unwrap();
             CountingAllocator::thread_allocations() - before
         };
         assert!(turn() > 0, "the counter counts");

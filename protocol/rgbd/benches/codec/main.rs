@@ -156,8 +156,8 @@ fn entries() -> Vec<Entry> {
     add("colour: QOI", Given::Color, true, Box::<Qoi>::default());
     let pure = |sampling| Box::new(PureJpeg::new(sampling));
     let (full, half) = (SamplingFactor::R_4_4_4, SamplingFactor::R_4_2_0);
-    add("colour: jpeg-encoder 4:4:4 q93", Given::Color, false, pure(full));
-    add("colour: jpeg-encoder 4:2:0 q93", Given::Color, false, pure(half));
+    add("colour: jpeg-encoder, zune-jpeg 4:4:4 q93", Given::Color, false, pure(full));
+    add("colour: jpeg-encoder, zune-jpeg 4:2:0 q93", Given::Color, false, pure(half));
     #[cfg(feature = "turbo")]
     {
         use peers::TurboJpeg;

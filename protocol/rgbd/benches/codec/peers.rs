@@ -4,6 +4,9 @@ use std::io::Cursor;
 
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, ImageMut, ImageView};
 use zerocopy::IntoBytes;
+use zune_jpeg::JpegDecoder;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::images::Image;
 use crate::rvl;
@@ -223,7 +226,8 @@ impl Codec for PureJpeg {
     }
 
     fn decode(&mut self, back: &mut Image) {
-        let mut decoder = zune_jpeg::JpegDecoder::new(Cursor::new(&self.bytes));
+        let options = DecoderOptions::new_fast();
+        let mut decoder = JpegDecoder::new_with_options(ZCursor::new(&self.bytes), options);
         decoder.decode_into(&mut back.rgb).expect("our own bytes");
     }
 }
