@@ -1,7 +1,7 @@
 //! One rendered image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
 //! before is on its way already.
 //!
-//! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms (feature `turbo`) a slice, so
+//! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms a slice, so
 //! the first bytes leave after a quarter of the image's time. Each slice is quantised just before it
 //! is encoded: it is still in the cache. Its bytes (25 KB) are copied once, from the encoder's
 //! scratch memory into a buffer of the pool; all subscribers share that. In the steady state nothing
