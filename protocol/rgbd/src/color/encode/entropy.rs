@@ -5,7 +5,7 @@ use super::transform::{ACROSS, Coefficients};
 
 /// Blocks that are coded before their bits are joined, at most.
 pub(super) const GROUP_BLOCKS: usize = 12;
-/// More than their words: of each coefficient one, and the end.
+/// More than their words: of each coefficient one, and the end's.
 const GROUP_WORDS: usize = 1024;
 /// More than their bytes, at 26 bits a word.
 const GROUP_BYTES: usize = GROUP_WORDS * 26 / 8 + 16;
@@ -133,6 +133,7 @@ impl<'a> Bits<'a> {
         for &[first, second] in words {
             let count = second & 31;
             let bits = u64::from(first >> 5) << count | u64::from(second >> 5);
+            // At least 2, at most 7 + 52.
             used += (first & 31) + count;
             open |= bits << (64 - used);
             self.bytes[len..len + 8].copy_from_slice(&open.to_be_bytes());

@@ -1,7 +1,8 @@
-//! Baseline JPEG (ITU-T T.81) out of our own hands.
+//! An encoder of baseline JPEG (ITU-T T.81), 32 pixels of 8 or 16 rows at a time.
 //!
 //! ```text
-//! 32 x 8 pixels -> YCbCr -> cosine transform -> quotients, which are not 0 -> Huffman words
+//! pixels -> YCbCr -> cosine transform -> quotients, and which are not 0 -> words -> bytes
+//! |----------------- transform.rs, by lanes.rs ----------------|  |--- entropy.rs ---|
 //! ```
 //!
 //! Tables are annex K's, so they depend on width, quality and mode alone, and a scan is written
@@ -60,7 +61,7 @@ pub fn encode_jpeg(
     Ok(())
 }
 
-/// Encodes slices; owns the scratch memory.
+/// Encodes slices.
 #[derive(Debug, Default)]
 pub(crate) struct JpegSliceEncoder {
     /// What `tables` and `scan` are of.
