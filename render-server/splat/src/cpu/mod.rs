@@ -161,11 +161,11 @@ impl CpuRenderer {
         let lens = lenses.of(camera);
         let still = cull::ObjectView::new(camera, &lens, &camera.world_from_cam);
         views.push(still);
-        match &mut self.streamed {
-            Some(streamed) => {
-                streamed.cull(&mut self.parts[0], &still, visible).map_err(RenderError::Scene)?
-            }
-            None => cull::cull(0, &self.parts[0], &still, max_error_px, visible),
+        if let Some(streamed) = &mut self.streamed {
+            let drawn = streamed.cull(&mut self.parts[0], &still, visible);
+            drawn.map_err(RenderError::Scene)?;
+        } else {
+            cull::cull(0, &self.parts[0], &still, max_error_px, visible);
         }
         let parts = &self.parts[..];
         for (i, (part, placement)) in parts[1..].iter().zip(placements).enumerate() {

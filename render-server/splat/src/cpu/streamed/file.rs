@@ -377,7 +377,9 @@ impl Fields<'_> {
 
 fn checksum(pieces: &[&[u8]]) -> u32 {
     let mut crc = Crc::new();
-    pieces.iter().for_each(|piece| crc.update(piece));
+    for piece in pieces {
+        crc.update(piece);
+    }
     crc.sum()
 }
 

@@ -183,6 +183,9 @@ impl Streamed {
         let waits = self.loading == Loading::Whole;
         self.reader.take(&mut self.arrived, false)?;
         self.install(pool);
+        if !waits {
+            self.fit();
+        }
         self.image += 1;
         let first = visible.len();
         loop {
@@ -204,13 +207,10 @@ impl Streamed {
             self.reader.take(&mut self.arrived, true)?;
             self.install(pool);
         }
-        if !waits {
-            self.fit();
-        }
         Ok(())
     }
 
-    /// Allows more error where what the image needs does not fit, and less again where it does by far.
+    /// Allows more error where what the last image needed does not fit, and less again where it does by far.
     fn fit(&mut self) {
         if self.needed > self.most_slots {
             self.relief *= 1.1;
