@@ -162,7 +162,10 @@ impl CpuRenderer {
         let still = cull::ObjectView::new(camera, &lens, &camera.world_from_cam);
         views.push(still);
         if let Some(streamed) = &mut self.streamed {
-            let drawn = streamed.cull(&mut self.parts[0], &still, visible);
+            let wide = streamed::looking_beyond(camera);
+            let soon = cull::ObjectView::new(&wide, &lenses.of(&wide), &camera.world_from_cam);
+            let views = streamed::Views { image: &still, soon: &soon };
+            let drawn = streamed.cull(&mut self.parts[0], views, visible);
             drawn.map_err(RenderError::Scene)?;
         } else {
             cull::cull(0, &self.parts[0], &still, max_error_px, visible);

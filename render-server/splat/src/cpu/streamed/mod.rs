@@ -6,7 +6,8 @@
 //! The bounds of all blocks stay in memory, so that the walk is that of `cull`: where a block is off by too many pixels,
 //! those that it stands for are drawn in its place. Those of them in view must all be there; as long as one is not, the coarser
 //! block stands in, so that nothing is drawn twice or left out. What is missing on the way down is asked for at once, level
-//! below level, what is off by most pixels first. The coarsest block of each part is always there. When all that an image
+//! below level, what is off by most pixels first; then what comes into view or is to be finer soon, where there is room for
+//! it. The coarsest block of each part is always there. When all that an image
 //! needs is in the pool, it is bit by bit the image of the same parts in memory.
 //!
 //! The pool gives the slot to a new block that was needed longest ago, never one that this image needs: what does not fit
@@ -18,11 +19,15 @@ mod reader;
 pub(crate) use file::MAGIC;
 pub use file::{PackSummary, PackedError, PackedScene, Source, pack};
 
+use vizflyt_protocol::geometry::Intrinsics;
+
 use super::cull::{ObjectView, Visible};
 use super::detail::BRANCH;
 use super::scene::{BLOCK, Block, Part};
 use file::{GEOMETRY, Tree, block_bytes};
 use reader::{Arrived, Reader};
+
+use crate::Camera;
 
 /// What an image does about blocks that are not in memory.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -36,6 +41,12 @@ pub enum Loading {
 
 /// The pool among the parts that are rendered: what stands still.
 const POOL: u32 = 0;
+/// What is drawn by a block that is off by more than this share of what is allowed is asked for already: at 10 m/s and 50 m
+/// half a second before.
+const SOON_SHARE: f32 = 0.9;
+/// Of the image's sides, what is looked at beyond each for what comes into view: a quarter of it, half a second of a slow
+/// turn.
+const BEYOND: f64 = 0.25;
 /// Asked for at most, at once: more than arrives until the next image.
 const MAX_WANTED: usize = 4096;
 /// Of a block that is not in the pool.
@@ -77,11 +88,38 @@ pub(super) struct Streamed {
     wanted: Vec<u32>,
 }
 
-/// A block that is needed and not there, and how far off is what it is needed for. [px]
+/// A block that is needed and not there.
 #[derive(Clone, Copy, Debug)]
 struct Missing {
     block: u32,
+    /// How far off is what it is needed for. [px]
     error_px: f32,
+    /// Not by this image, but soon.
+    soon: bool,
+}
+
+/// What a walk is for.
+#[derive(Clone, Copy)]
+pub(super) struct Views<'a> {
+    /// The image.
+    pub(super) image: &'a ObjectView,
+    /// A wider one, of what comes into view soon.
+    pub(super) soon: &'a ObjectView,
+}
+
+/// Returns a camera that looks at what the next images of another may show.
+pub(super) fn looking_beyond(camera: &Camera) -> Camera {
+    let k = camera.intrinsics;
+    let [beyond_x, beyond_y] =
+        [k.width_px, k.height_px].map(|side| (f64::from(side) * BEYOND) as u32);
+    let intrinsics = Intrinsics {
+        width_px: k.width_px + 2 * beyond_x,
+        height_px: k.height_px + 2 * beyond_y,
+        cx_px: k.cx_px + f64::from(beyond_x),
+        cy_px: k.cy_px + f64::from(beyond_y),
+        ..k
+    };
+    Camera { intrinsics, ..*camera }
 }
 
 /// What the last image of a packed scene was made of.
@@ -177,7 +215,7 @@ impl Streamed {
     pub(super) fn cull(
         &mut self,
         pool: &mut Part,
-        view: &ObjectView,
+        views: Views<'_>,
         visible: &mut Vec<Visible>,
     ) -> Result<(), String> {
         let waits = self.loading == Loading::Whole;
@@ -190,7 +228,7 @@ impl Streamed {
         let first = visible.len();
         loop {
             visible.truncate(first);
-            self.walk(view, visible);
+            self.walk(views, visible);
             if waits && self.needed > self.most_slots {
                 let bytes =
                     |blocks: usize| (blocks * block_bytes(pool.coefficients)).div_ceil(1 << 20);
@@ -257,14 +295,20 @@ impl Streamed {
         }
     }
 
-    /// Asks for what is missing, as much of it as there is room for.
+    /// Asks for what is missing, as much of it as there is room for: what the image needs in place of all that it does not,
+    /// what is needed soon in place of what neither this nor the last image looked at.
     fn ask(&mut self) {
         let urgency = |a: &Missing, b: &Missing| {
             // Of a tree's blocks the coarser one, which comes later, leads to the finer one.
-            b.error_px.total_cmp(&a.error_px).then(b.block.cmp(&a.block))
+            let error = b.error_px.total_cmp(&a.error_px);
+            a.soon.cmp(&b.soon).then(error).then(b.block.cmp(&a.block))
         };
-        let kept = self.slots.iter().filter(|slot| slot.needed >= self.image).count();
-        let most = (self.most_slots - kept).min(MAX_WANTED);
+        let room = |image: u64| {
+            let kept = self.slots.iter().filter(|slot| slot.needed >= image).count();
+            self.most_slots - kept
+        };
+        let now = self.missing.iter().filter(|missing| !missing.soon).count();
+        let most = now.min(room(self.image)).max(room(self.image - 1)).min(MAX_WANTED);
         if most < self.missing.len() {
             if most > 0 {
                 self.missing.select_nth_unstable_by(most - 1, urgency);
@@ -278,60 +322,79 @@ impl Streamed {
     }
 
     /// Appends the blocks to draw and notes those that are missing.
-    fn walk(&mut self, view: &ObjectView, visible: &mut Vec<Visible>) {
+    fn walk(&mut self, views: Views<'_>, visible: &mut Vec<Visible>) {
         self.missing.clear();
         self.stand_ins = 0;
         // All the tops are there.
         self.needed = self.trees.len();
         for tree in 0..self.trees.len() {
-            if view.sees(&self.blocks[self.trees[tree].top()]) {
+            let top = &self.blocks[self.trees[tree].top()];
+            let is_seen = views.image.sees(top);
+            if is_seen || self.loading == Loading::Live && views.soon.sees(top) {
                 let at = At { tree, level: self.trees[tree].levels.len() - 2, place: 0 };
-                self.descend(at, true, view, visible);
+                self.descend(at, is_seen, !is_seen, views, visible);
             }
         }
     }
 
-    /// Visits a block that is in view, and what it stands for; draws where all on the way is there.
-    fn descend(&mut self, at: At, draws: bool, view: &ObjectView, visible: &mut Vec<Visible>) {
+    /// Visits a block that is needed, now or `soon`, and what it stands for; draws where all on the way is there.
+    fn descend(
+        &mut self,
+        at: At,
+        draws: bool,
+        soon: bool,
+        views: Views<'_>,
+        visible: &mut Vec<Visible>,
+    ) {
         let At { tree, level, place } = at;
         let Tree { first, levels, .. } = &self.trees[tree];
         let block = first + levels[level] + place;
         let slot = self.slot_of[block];
         if slot != ABSENT {
             let needed = &mut self.slots[slot as usize].needed;
-            *needed = self.image.max(*needed);
+            *needed = (*needed).max(self.image - u64::from(soon));
         }
-        let error_px = self.blocks[block].error_m * view.px_per_m(&self.blocks[block]);
-        if level == 0 || error_px <= self.max_error_px * self.relief {
-            if draws {
-                visible.push(Visible { part: POOL, block: slot });
-            }
+        let error_px = self.blocks[block].error_m * views.image.px_per_m(&self.blocks[block]);
+        let most_px = self.max_error_px * self.relief;
+        let is_fine = level == 0 || error_px <= most_px;
+        if is_fine && draws {
+            visible.push(Visible { part: POOL, block: slot });
+        }
+        let looks_ahead = self.loading == Loading::Live && error_px > most_px * SOON_SHARE;
+        if level == 0 || is_fine && !looks_ahead {
             return;
         }
         let finer = levels[level] - levels[level - 1];
         let children = place * BRANCH..((place + 1) * BRANCH).min(finer);
         let first_child = first + levels[level - 1];
-        let mut are_seen = [false; BRANCH];
+        let soon = soon || is_fine;
+        let (mut now, mut later) = ([false; BRANCH], [false; BRANCH]);
         let mut all_there = true;
-        for (is_seen, child) in are_seen.iter_mut().zip(children.clone()) {
+        for (i, child) in children.clone().enumerate() {
             let child = first_child + child;
-            *is_seen = view.sees(&self.blocks[child]);
-            if *is_seen {
+            let bounds = &self.blocks[child];
+            let is_seen = views.image.sees(bounds);
+            now[i] = is_seen && !soon;
+            later[i] =
+                !now[i] && self.loading == Loading::Live && (is_seen || views.soon.sees(bounds));
+            let is_absent = self.slot_of[child] == ABSENT;
+            if is_absent && (now[i] || later[i]) {
+                self.missing.push(Missing { block: child as u32, error_px, soon: later[i] });
+            }
+            if now[i] {
                 self.needed += 1;
-                if self.slot_of[child] == ABSENT {
-                    all_there = false;
-                    self.missing.push(Missing { block: child as u32, error_px });
-                }
+                all_there &= !is_absent;
             }
         }
-        if draws && !all_there {
+        let refines = draws && !is_fine && all_there;
+        if draws && !is_fine && !all_there {
             self.stand_ins += 1;
             visible.push(Visible { part: POOL, block: slot });
         }
-        for (is_seen, place) in are_seen.into_iter().zip(children) {
-            if is_seen {
+        for (i, place) in children.enumerate() {
+            if now[i] || later[i] {
                 let child = At { tree, level: level - 1, place };
-                self.descend(child, draws && all_there, view, visible);
+                self.descend(child, refines && now[i], later[i], views, visible);
             }
         }
     }
