@@ -13,7 +13,7 @@ use crate::terminal::print_fmt;
 #[derive(Args, Debug)]
 #[command(
     after_help = "A streamed scene (lod-meta.json) is read chunk by chunk, so that packing takes the memory of the \
-largest; any other is read whole. The file takes some 70 bytes a splat without harmonics, 200 with all of them. `scene \
+largest; any other is read whole. The file takes some 80 bytes a splat without harmonics, 200 with all of them. `scene \
 render` and `bench render` draw it within --memory; cameras are in the frame of the scene's file. What needs the splats \
 themselves (arenas, `serve`, collisions, the other scene commands) takes the scene that it was packed of, not this.
 
