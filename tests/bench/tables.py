@@ -247,6 +247,7 @@ BY_HAND = [
            "captured scenes, which are not part of the project"),
     ByHand("Renderer: peers", "", "brush, web-splat"),
     ByHand("Large scenes", "cargo bench -p vizflyt-splat --bench detail", "a long run"),
+    ByHand("A city larger than memory", "tests/bench/city", "6 GB of disk, a long run"),
     ByHand("Weather: effects one by one", "cargo run --release -p vizflyt-splat --example weather", "a long run"),
     ByHand("On a graphics card", "tests/gpu/table; tests/gpu/train", "a graphics card"),
     ByHand("Training a twin", "cargo run --release -p vizflyt-twin --example hall", "a long run"),

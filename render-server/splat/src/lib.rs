@@ -57,7 +57,10 @@ pub mod weather;
 pub use atmosphere::Atmosphere;
 pub use backend::{Backend, Chosen, NoRenderer, UnknownBackend, choose};
 pub use camera::{Camera, InvalidCamera};
-pub use cpu::{CpuRenderer, Detail, Machine, Need, simd};
+pub use cpu::{
+    CpuRenderer, Detail, Loading, Machine, Need, PackSummary, PackedError, PackedScene, Source,
+    Streaming, pack, simd,
+};
 pub use fallback::FallbackRenderer;
 pub use format::ply;
 pub use image::{DepthKind, RgbdImage};

@@ -71,6 +71,9 @@ pub enum RenderError {
     /// The graphics device is gone, or cannot hold what was asked of it, and why.
     #[error("the graphics device cannot render this: {0}; use the processor")]
     Device(String),
+    /// A packed scene cannot be read, or an image that is to be whole needs more memory than it has; and why.
+    #[error("packed scene: {0}")]
+    Scene(String),
 }
 
 /// Checks what every renderer asks of a call.

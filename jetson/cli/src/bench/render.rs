@@ -9,11 +9,15 @@ use glam::DVec3;
 use serde::Serialize;
 use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::{atmosphere, weather};
-use vizflyt_server::render::{DetailKind, RendererKind, choose};
+use vizflyt_server::render::{DetailKind, RendererKind, choose, open_packed};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::weather::{Moment, WeatherPass};
-use vizflyt_splat::{Camera, Chosen, CpuRenderer, Need, PassTimes, Rasterizer, RgbdImage, Scene};
+use vizflyt_splat::{
+    Camera, Chosen, CpuRenderer, Loading, Need, PackedScene, PassTimes, Rasterizer, RgbdImage,
+    Scene,
+};
 
+use crate::scene::MEMORY_MIB;
 use crate::scene::camera::{self, ImageSize};
 use crate::terminal::print_fmt;
 use crate::usage::processor_seconds;
@@ -30,7 +34,7 @@ Examples:
   vizflyt bench render room.ply --camera cam.json --limits
   vizflyt bench render forest/arena.toml --camera cam.json --environment rain")]
 pub(super) struct RenderArgs {
-    /// Scene file of any format, or an arena.toml (then its scene)
+    /// Scene file of any format, a packed one (`scene pack`), or an arena.toml (then its scene)
     scene: PathBuf,
     /// The camera, as for `vizflyt scene render`; may be given several times
     #[arg(long = "camera", value_name = "CAM.json", required = true)]
@@ -56,6 +60,9 @@ pub(super) struct RenderArgs {
     /// Images per camera that count; a few before them do not
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
+    /// Memory for the blocks of a packed scene; images that count wait for none [MiB]
+    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
+    memory: u32,
     /// Prints one JSON object
     #[arg(long)]
     json: bool,
@@ -171,19 +178,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
             args.size.map_or(Ok(camera), |size| camera::resized(&camera, size))
         })
         .collect::<Result<_>>()?;
-    let (path, loaded) = load_as_it_is(&args.scene)?;
-    let start = Instant::now();
-    let (mut renderer, reason) = if args.limits {
-        let scene = Scene::from(&loaded.splats);
-        let renderer = CpuRenderer::with_detail(scene, args.detail.of(&scene));
-        (Renderer::Processor(Box::new(renderer)), "whose limits were asked for".to_owned())
-    } else {
-        let Chosen { rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
-        (Renderer::Chosen(rasterizer), reason)
-    };
-    let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
-    let splats = loaded.splats.len();
-    drop(loaded);
+    let Opened { path, splats, mut renderer, reason, prepare_ms } = opened(args)?;
 
     let mut images = [RgbdImage::default()];
     let mut times: Vec<PassTimes> = Vec::new();
@@ -268,6 +263,47 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
         environment,
         workload: work,
     })
+}
+
+/// A scene, ready to be rendered.
+struct Opened {
+    path: PathBuf,
+    splats: usize,
+    renderer: Renderer,
+    reason: String,
+    prepare_ms: f64,
+}
+
+fn opened(args: &RenderArgs) -> Result<Opened> {
+    if PackedScene::is_packed(&args.scene) {
+        let start = Instant::now();
+        let memory_bytes = args.memory as usize * (1 << 20);
+        // What images need is read by those that do not count.
+        let renderer = open_packed(&args.scene, args.renderer, memory_bytes, Loading::Whole)?;
+        return Ok(Opened {
+            path: args.scene.clone(),
+            splats: renderer.workload().splats,
+            renderer: if args.limits {
+                Renderer::Processor(Box::new(renderer))
+            } else {
+                Renderer::Chosen(Box::new(renderer))
+            },
+            reason: "a packed scene".to_owned(),
+            prepare_ms: start.elapsed().as_secs_f64() * 1e3,
+        });
+    }
+    let (path, loaded) = load_as_it_is(&args.scene)?;
+    let start = Instant::now();
+    let (renderer, reason) = if args.limits {
+        let scene = Scene::from(&loaded.splats);
+        let renderer = CpuRenderer::with_detail(scene, args.detail.of(&scene));
+        (Renderer::Processor(Box::new(renderer)), "whose limits were asked for".to_owned())
+    } else {
+        let Chosen { rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
+        (Renderer::Chosen(rasterizer), reason)
+    };
+    let prepare_ms = start.elapsed().as_secs_f64() * 1e3;
+    Ok(Opened { path, splats: loaded.splats.len(), renderer, reason, prepare_ms })
 }
 
 /// A renderer whose limits can be told, or any.

@@ -1,4 +1,4 @@
-//! `vizflyt scene`: makes, captures, trains, edits, bakes, inspects and renders scenes.
+//! `vizflyt scene`: makes, captures, trains, edits, bakes, inspects, packs and renders scenes.
 
 mod align;
 mod bake;
@@ -11,6 +11,7 @@ mod events;
 mod generate;
 mod inspect;
 mod npy;
+mod pack;
 mod progress;
 mod render;
 mod train;
@@ -21,8 +22,9 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 
 use crate::terminal::show_page;
+pub(crate) use render::MEMORY_MIB;
 
-/// Makes, trains, edits, bakes, inspects and renders scenes.
+/// Makes, trains, edits, bakes, inspects, packs and renders scenes.
 #[derive(Args, Debug)]
 pub(crate) struct SceneArgs {
     #[command(subcommand)]
@@ -41,6 +43,7 @@ enum SceneCommand {
     Edit(Box<edit::EditArgs>),
     Events(events::EventsArgs),
     Inspect(inspect::InspectArgs),
+    Pack(pack::PackArgs),
     Render(render::RenderArgs),
     Train(train::TrainArgs),
     View(vizflyt_server::ViewArgs),
@@ -58,6 +61,7 @@ pub(crate) fn run(args: SceneArgs) -> Result<ExitCode> {
         SceneCommand::Edit(args) => edit::run(&args)?,
         SceneCommand::Events(args) => events::run(&args)?,
         SceneCommand::Inspect(args) => inspect::run(&args)?,
+        SceneCommand::Pack(args) => pack::run(&args)?,
         SceneCommand::Render(args) => render::run(&args)?,
         SceneCommand::Train(args) => train::run(&args)?,
         SceneCommand::View(args) => view(args)?,

@@ -8,12 +8,15 @@ use clap::{Args, ValueEnum};
 use glam::DVec3;
 use image::{ImageBuffer, Luma, Rgb};
 use vizflyt_arena::config::EnvironmentConfig;
+use vizflyt_arena::objects::MovingObjects;
 use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::{atmosphere, weather};
-use vizflyt_server::render::{DetailKind, RendererKind, choose};
+use vizflyt_server::render::{DetailKind, RendererKind, choose, open_packed};
 use vizflyt_server::scene::{Antialiased, is_in_an_arena, load_as_it_is, load_objects};
 use vizflyt_splat::weather::{Moment, WeatherPass};
-use vizflyt_splat::{Camera, Chosen, DepthKind, RgbdImage, Scene};
+use vizflyt_splat::{
+    Camera, Chosen, DepthKind, Loading, PackedScene, Rasterizer, RgbdImage, Scene,
+};
 
 use super::camera;
 use super::npy;
@@ -39,7 +42,7 @@ Examples:
   vizflyt scene render forest/arena.toml --camera a.json --camera b.json --format npy --out poses
   vizflyt scene render race/arena.toml --camera cam.json --at 2.5")]
 pub(crate) struct RenderArgs {
-    /// Scene file of any format, or an arena.toml (then its scene)
+    /// Scene file of any format, a packed one (`scene pack`), or an arena.toml (then its scene)
     scene: PathBuf,
     /// The camera; given several times, each has a folder of its name in --out
     #[arg(long = "camera", value_name = "CAM.json", required = true)]
@@ -69,7 +72,13 @@ pub(crate) struct RenderArgs {
     /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     antialiased: Antialiased,
+    /// Memory for the blocks of a packed scene, which is always rendered in adaptive detail [MiB]
+    #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
+    memory: u32,
 }
+
+/// Of a packed scene's blocks in memory. [MiB]
+pub(crate) const MEMORY_MIB: u32 = 1024;
 
 #[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum FileFormat {
@@ -84,8 +93,6 @@ enum FileFormat {
 pub(super) fn run(args: &RenderArgs) -> Result<()> {
     // Cameras first: a mistake in one is reported before the scene is loaded.
     let jobs = jobs(args)?;
-    let (scene, mut loaded) = load_as_it_is(&args.scene)?;
-    args.antialiased.apply(&mut loaded.splats);
     let environment = args.environment.environment();
     let is_metric =
         EnvironmentConfig { light: environment.light, ..EnvironmentConfig::CLEAR } != environment;
@@ -94,23 +101,10 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
             "--environment {}: weather is in metres and comes from above, and {} says neither its unit nor \
              its up; name the arena.toml that it belongs to (`vizflyt arena new` makes one)",
             args.environment,
-            scene.display()
+            args.scene.display()
         );
     }
-    let (objects, moving) = load_objects(&args.scene, args.seed)?;
-    let start = Instant::now();
-    let twin = Scene { splats: &loaded.splats, objects: &objects };
-    let Chosen { mut rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
-    print_fmt!("scene       {}: {} splats", scene.display(), loaded.splats.len());
-    if !moving.is_empty() {
-        let names: Vec<_> = moving.names().collect();
-        print_fmt!("objects     {} at {} s", names.join(", "), args.at);
-    }
-    if loaded.splats.antialiased {
-        print_fmt!("            trained with anti-aliasing, rendered so");
-    }
-    print_fmt!("renderer    {} ({reason})", rasterizer.name());
-    drop((loaded, objects));
+    let (mut rasterizer, moving, start) = opened(args)?;
     let placements = moving.placements((args.at * 1e9).round() as i64);
     print_fmt!("prepared    in {:.0} ms", start.elapsed().as_secs_f64() * 1e3);
     let mut images = [RgbdImage::default()];
@@ -140,6 +134,37 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
         );
     }
     Ok(())
+}
+
+/// Returns what renders the scene, what moves in it, and when its preparation began.
+fn opened(args: &RenderArgs) -> Result<(Box<dyn Rasterizer>, MovingObjects, Instant)> {
+    if PackedScene::is_packed(&args.scene) {
+        if args.antialiased != Antialiased::default() {
+            bail!("--antialiased: a packed scene is rendered as the one that it was packed of");
+        }
+        let start = Instant::now();
+        let memory_bytes = args.memory as usize * (1 << 20);
+        let renderer = open_packed(&args.scene, args.renderer, memory_bytes, Loading::Whole)?;
+        print_fmt!("scene       {}: {} splats", args.scene.display(), renderer.workload().splats);
+        print_fmt!("renderer    {}", renderer.name());
+        return Ok((Box::new(renderer), MovingObjects::default(), start));
+    }
+    let (scene, mut loaded) = load_as_it_is(&args.scene)?;
+    args.antialiased.apply(&mut loaded.splats);
+    let (objects, moving) = load_objects(&args.scene, args.seed)?;
+    let start = Instant::now();
+    let twin = Scene { splats: &loaded.splats, objects: &objects };
+    let Chosen { rasterizer, reason } = choose(twin, args.renderer, args.detail)?;
+    print_fmt!("scene       {}: {} splats", scene.display(), loaded.splats.len());
+    if !moving.is_empty() {
+        let names: Vec<_> = moving.names().collect();
+        print_fmt!("objects     {} at {} s", names.join(", "), args.at);
+    }
+    if loaded.splats.antialiased {
+        print_fmt!("            trained with anti-aliasing, rendered so");
+    }
+    print_fmt!("renderer    {} ({reason})", rasterizer.name());
+    Ok((rasterizer, moving, start))
 }
 
 /// Within the range of a clock of nanoseconds.

@@ -26,7 +26,7 @@ use vizflyt_arena::pose::Predict;
 use self::cameras::Cameras;
 use self::dynamic_objects::DynamicObjects;
 use self::environment::Environment;
-pub use self::renderer::{DetailKind, RendererInfo, RendererKind, choose};
+pub use self::renderer::{DetailKind, RendererInfo, RendererKind, choose, open_packed};
 use self::sensors::Sensors;
 use crate::timing::StageDurations;
 

@@ -2,11 +2,12 @@
 //! it and as the page shows it.
 
 use std::fmt;
+use std::path::Path;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use serde::Serialize;
-use vizflyt_splat::{Backend, Chosen, Detail, Scene};
+use vizflyt_splat::{Backend, Chosen, CpuRenderer, Detail, Loading, PackedScene, Scene};
 
 /// Which renderer renders, for reports and the page.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
@@ -79,6 +80,24 @@ impl fmt::Display for DetailKind {
             Self::Adaptive => "adaptive",
         })
     }
+}
+
+/// Returns the renderer of a packed scene ([`vizflyt_splat::pack`]), which has at most so many bytes of it in memory.
+///
+/// # Errors
+/// If the file cannot be used, or a graphics adapter was asked for: they render what is in memory.
+pub fn open_packed(
+    path: &Path,
+    kind: RendererKind,
+    memory_bytes: usize,
+    loading: Loading,
+) -> Result<CpuRenderer> {
+    if kind == RendererKind::Gpu {
+        bail!("--renderer gpu: packed scenes are rendered by the processor");
+    }
+    let cannot = || format!("cannot use scene {}", path.display());
+    let scene = PackedScene::open(path).with_context(cannot)?;
+    CpuRenderer::streamed(scene, memory_bytes, loading).with_context(cannot)
 }
 
 /// Returns the renderer of a scene, which it packs a copy of.

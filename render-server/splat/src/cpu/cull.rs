@@ -122,7 +122,7 @@ impl ObjectView {
     }
 
     /// Whether a splat of the block may touch the image.
-    fn sees(&self, block: &Block) -> bool {
+    pub(super) fn sees(&self, block: &Block) -> bool {
         let center = block.center_m - self.center_m;
         let beyond = |plane: &Plane| {
             let slack = plane.normal.abs().dot(block.half_m) + block.reach_m * plane.weight;
@@ -195,7 +195,7 @@ impl Walk<'_> {
 
 impl ObjectView {
     /// Returns how many pixels a metre is at most where the block is nearest to the camera.
-    fn px_per_m(&self, block: &Block) -> f32 {
+    pub(super) fn px_per_m(&self, block: &Block) -> f32 {
         let forward = self.rows[2];
         let center = block.center_m - self.center_m;
         let nearest_m = forward.dot(center) - forward.abs().dot(block.half_m);

@@ -43,7 +43,9 @@ impl Detail {
     /// most, the median depth by more than 1 % in 6 % of those that show something. Up to 100 splats a pixel, RGB to
     /// 30 dB: so many are in sight from far away alone, and which of them hides which is chance in full detail too.
     /// Single pixels at edges may be off by any amount. `tests/lod` holds it; 0.5 px does not.
-    pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: 0.35 };
+    pub const ADAPTIVE: Self = Self::Adaptive { max_error_px: Self::ADAPTIVE_PX };
+    /// The error that it allows. [px]
+    pub const ADAPTIVE_PX: f32 = 0.35;
     /// Scenes of fewer splats are rendered fast enough in full. [splats]
     pub const WORTHWHILE_FROM: usize = 1_000_000;
 

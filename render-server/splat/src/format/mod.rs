@@ -249,6 +249,25 @@ pub fn read_with_progress(path: impl AsRef<Path>, report: Report) -> Result<Load
     Ok(loaded)
 }
 
+/// Reads a scene of any format piece by piece: the finest level of a streamed one chunk by chunk, so that no more than one
+/// is in memory, any other in one piece. What surrounds a streamed scene is its last.
+///
+/// # Errors
+/// As [`read()`], and whatever `visit` returns.
+pub fn read_in_chunks<E: From<FormatError>>(
+    path: impl AsRef<Path>,
+    mut visit: impl FnMut(Splats) -> Result<(), E>,
+) -> Result<(), E> {
+    let path = path.as_ref();
+    match streamed_folder(path) {
+        Some(folder) => {
+            let open = |name: &str| open_chunk(folder, name);
+            sog::each_chunk(&read_tree(folder)?, 0, open, |chunk, _| visit(chunk.splats))
+        }
+        None => visit(read(path)?.splats),
+    }
+}
+
 /// Reads the bytes of a scene file. Content decides where it has a mark, otherwise `named`.
 ///
 /// # Errors
@@ -332,9 +351,7 @@ pub fn encode_variant(
 
 fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, FormatError> {
     let named = Format::of_name(path);
-    let is_tree = path.file_name().is_some_and(|name| name == sog::LOD_META);
-    if is_tree || path.join(sog::LOD_META).is_file() {
-        let folder = if is_tree { path.parent().unwrap_or(Path::new("")) } else { path };
+    if let Some(folder) = streamed_folder(path) {
         return read_streamed(folder, level);
     }
     if level > 0 {
@@ -350,7 +367,7 @@ fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, Format
     }
     let io = |cause| FormatError::Io { path: path.to_owned(), verb: "read", cause };
     let bytes = file::map(path).map_err(io)?;
-    if let Some(what) = not_downloaded(&bytes) {
+    if let Some(what) = no_scene(&bytes) {
         return Err(FormatError::Unknown { what: format!("{} is {what}", path.display()) });
     }
     let format = Format::of_content(&bytes).or(named).ok_or_else(|| {
@@ -364,36 +381,55 @@ fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, Format
 
 /// Reads a level of the streamed scene in a folder.
 fn read_streamed(folder: &Path, level: u32) -> Result<Loaded, FormatError> {
-    let path = folder.join(sog::LOD_META);
-    let io = |cause| FormatError::Io { path: path.clone(), verb: "read", cause };
-    let index = file::map(&path).map_err(io)?;
-    sog::assemble_streamed(&index, level, |name| {
-        // A scene names files in its own folder, not anywhere on this machine.
-        let inside = name.split('/').all(|part| !matches!(part, "" | "." | ".."));
-        if !inside || name.contains(['\\', ':', '\0']) {
-            return Err(FormatError::Invalid {
-                format: Format::Sog,
-                place: sog::LOD_META.into(),
-                reason: format!("{name:?} is no file in its folder"),
-            });
-        }
-        let chunk = folder.join(name);
-        if chunk.file_name().is_some_and(|name| name == sog::META) {
-            return sog::decode(sog::Files::from(chunk.as_path()), &Meter::SILENT);
-        }
-        let io = |cause| FormatError::Io { path: chunk.clone(), verb: "read", cause };
-        sog::decode(sog::Files::zip(&file::map(&chunk).map_err(io)?)?, &Meter::SILENT)
-    })
+    sog::assemble_streamed(&read_tree(folder)?, level, |name| open_chunk(folder, name))
 }
 
-/// Returns what a file is that a download left in the scene's place.
-fn not_downloaded(bytes: &[u8]) -> Option<&'static str> {
+/// Maps the tree of the streamed scene in a folder.
+fn read_tree(folder: &Path) -> Result<memmap2::Mmap, FormatError> {
+    let path = folder.join(sog::LOD_META);
+    file::map(&path).map_err(|cause| FormatError::Io { path, verb: "read", cause })
+}
+
+/// Reads a chunk of the streamed scene in a folder.
+fn open_chunk(folder: &Path, name: &str) -> Result<Loaded, FormatError> {
+    // A scene names files in its own folder, not anywhere on this machine.
+    let inside = name.split('/').all(|part| !matches!(part, "" | "." | ".."));
+    if !inside || name.contains(['\\', ':', '\0']) {
+        return Err(FormatError::Invalid {
+            format: Format::Sog,
+            place: sog::LOD_META.into(),
+            reason: format!("{name:?} is no file in its folder"),
+        });
+    }
+    let chunk = folder.join(name);
+    if chunk.file_name().is_some_and(|name| name == sog::META) {
+        return sog::decode(sog::Files::from(chunk.as_path()), &Meter::SILENT);
+    }
+    let io = |cause| FormatError::Io { path: chunk.clone(), verb: "read", cause };
+    sog::decode(sog::Files::zip(&file::map(&chunk).map_err(io)?)?, &Meter::SILENT)
+}
+
+/// Returns the folder of a streamed scene, if a path names one.
+fn streamed_folder(path: &Path) -> Option<&Path> {
+    if path.file_name().is_some_and(|name| name == sog::LOD_META) {
+        return Some(path.parent().unwrap_or(Path::new("")));
+    }
+    path.join(sog::LOD_META).is_file().then_some(path)
+}
+
+/// Returns what a file is that stands in a scene's place: what a download left there, or what is only drawn.
+fn no_scene(bytes: &[u8]) -> Option<&'static str> {
     let start = bytes.trim_ascii_start();
     let is_html = |tag: &[u8]| start.get(..tag.len()).is_some_and(|s| s.eq_ignore_ascii_case(tag));
     if bytes.starts_with(b"version https://git-lfs.github.com/spec/") {
         Some("a pointer of Git LFS, not the file itself; run `git lfs pull`")
     } else if is_html(b"<!doctype html") || is_html(b"<html") {
         Some("a web page, not the file itself; download it by its direct address")
+    } else if bytes.starts_with(crate::cpu::PACKED_MAGIC) {
+        Some(
+            "a packed scene, which `scene render` and `bench render` draw, and nothing takes whole into memory; give the \
+             scene that it was packed of",
+        )
     } else {
         None
     }

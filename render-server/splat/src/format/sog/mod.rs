@@ -27,8 +27,8 @@ mod write;
 
 pub(super) use files::{Files, META};
 pub(super) use read::decode;
-pub(super) use streamed::LOD_META;
 pub use streamed::assemble_streamed;
+pub(super) use streamed::{LOD_META, each_chunk};
 pub(super) use write::{encode, parts};
 
 use super::{Format, FormatError};

@@ -54,35 +54,50 @@ fn invalid(reason: impl Into<String>) -> FormatError {
 pub fn assemble_streamed(
     index: &[u8],
     level: u32,
-    mut open: impl FnMut(&str) -> Result<Loaded, FormatError>,
+    open: impl FnMut(&str) -> Result<Loaded, FormatError>,
 ) -> Result<Loaded, FormatError> {
+    let mut whole = Whole::default();
+    each_chunk(index, level, open, |chunk, wanted| whole.add(chunk, wanted))?;
+    whole.finish()
+}
+
+/// Visits what one level has of each chunk, and how many splats that was before faulty ones were left out; then what
+/// surrounds the scene.
+pub(in crate::format) fn each_chunk<E: From<FormatError>>(
+    index: &[u8],
+    level: u32,
+    mut open: impl FnMut(&str) -> Result<Loaded, FormatError>,
+    mut visit: impl FnMut(Loaded, usize) -> Result<(), E>,
+) -> Result<(), E> {
     let index: Index = serde_json::from_slice(index).map_err(|error| invalid(error.to_string()))?;
     if let Some(version) = index.version.filter(|&version| version != 1) {
-        return Err(FormatError::Unsupported {
+        return Err(E::from(FormatError::Unsupported {
             format: Format::Sog,
             what: format!("version {version} of {LOD_META}"),
             advice: "save it as version 1, or as one .sog",
-        });
+        }));
     }
     if level >= index.lod_levels {
         let most = index.lod_levels.saturating_sub(1);
-        return Err(invalid(format!("no level {level}; there are 0 to {most}")));
+        return Err(E::from(invalid(format!("no level {level}; there are 0 to {most}"))));
     }
     let mut runs: BTreeMap<usize, Vec<Run>> = BTreeMap::new();
     collect(&index.tree, level, &mut runs);
-    let mut whole = Whole::default();
     for (file, runs) in runs {
         let name = index.filenames.get(file);
         let name = name.ok_or_else(|| invalid(format!("no file {file} among its filenames")))?;
-        let declared: u64 = runs.iter().map(|run| run.count as u64).fold(0, u64::saturating_add);
-        limit::count(Format::Sog, declared)?;
-        let chunk = open(name)?;
-        whole.add(chunk, Some((&runs, name)))?;
+        let wanted = runs.iter().fold(0usize, |sum, run| sum.saturating_add(run.count));
+        limit::count(Format::Sog, wanted as u64)?;
+        let mut chunk = open(name)?;
+        keep(&mut chunk, &runs, wanted, name)?;
+        visit(chunk, wanted)?;
     }
     if let Some(name) = &index.environment {
-        whole.add(open(name)?, None)?;
+        let chunk = open(name)?;
+        let held = chunk.splats.len() + chunk.dropped.total();
+        visit(chunk, held)?;
     }
-    whole.finish()
+    Ok(())
 }
 
 /// Lists the runs of a level, by file. As deep as JSON may be.
@@ -105,33 +120,13 @@ struct Whole {
 }
 
 impl Whole {
-    /// Adds the runs of a chunk, or all of it.
-    fn add(&mut self, chunk: Loaded, runs: Option<(&[Run], &str)>) -> Result<(), FormatError> {
-        let Loaded { mut splats, dropped, .. } = chunk;
-        let held = splats.len() + dropped.total();
-        let wanted = runs.map_or(held, |(runs, _)| runs.iter().map(|run| run.count).sum());
+    /// Adds a chunk that has been `wanted` splats.
+    fn add(&mut self, chunk: Loaded, wanted: usize) -> Result<(), FormatError> {
         self.declared = self.declared.saturating_add(wanted);
         limit::count(Format::Sog, self.declared as u64)?;
-        if let Some((runs, name)) = runs {
-            let beyond = |run: &&Run| run.offset.saturating_add(run.count) > held;
-            if let Some(run) = runs.iter().find(beyond) {
-                let Run { offset, count, .. } = run;
-                return Err(invalid(format!(
-                    "{count} splats from {offset} on of {name}, which has {held}"
-                )));
-            }
-            if wanted < held {
-                if dropped.total() > 0 {
-                    return Err(invalid(format!(
-                        "{name} has faulty splats, so that those of a part are unknown"
-                    )));
-                }
-                splats = taken(&splats, runs);
-            }
-        }
-        self.antialiased |= splats.antialiased;
-        self.dropped = self.dropped.plus(dropped);
-        self.chunks.push(splats);
+        self.antialiased |= chunk.splats.antialiased;
+        self.dropped = self.dropped.plus(chunk.dropped);
+        self.chunks.push(chunk.splats);
         Ok(())
     }
 
@@ -155,6 +150,26 @@ impl Whole {
         }
         Loaded::whole(Format::Sog, self.declared, whole, self.dropped)
     }
+}
+
+/// Leaves of a chunk the splats of runs, `wanted` in all.
+fn keep(chunk: &mut Loaded, runs: &[Run], wanted: usize, name: &str) -> Result<(), FormatError> {
+    let held = chunk.splats.len() + chunk.dropped.total();
+    let beyond = |run: &&Run| run.offset.saturating_add(run.count) > held;
+    if let Some(Run { offset, count, .. }) = runs.iter().find(beyond) {
+        return Err(invalid(format!(
+            "{count} splats from {offset} on of {name}, which has {held}"
+        )));
+    }
+    if wanted < held {
+        if chunk.dropped.total() > 0 {
+            return Err(invalid(format!(
+                "{name} has faulty splats, so that those of a part are unknown"
+            )));
+        }
+        chunk.splats = taken(&chunk.splats, runs);
+    }
+    Ok(())
 }
 
 /// Returns the splats of runs that lie within them.

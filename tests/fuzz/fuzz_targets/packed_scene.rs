@@ -1,0 +1,32 @@
+//! A packed scene from a stranger: an error, or an image. The checksum of its tables is put right, so that what they say is
+//! read; those of blocks are the stranger's.
+#![no_main]
+use std::io::Cursor;
+
+use libfuzzer_sys::fuzz_target;
+use vizflyt_protocol::geometry::{Intrinsics, Pose};
+use vizflyt_splat::{Camera, CpuRenderer, Loading, PackedScene, Rasterizer, RgbdImage};
+
+/// Bytes of the header, and those that its checksum covers.
+const HEADER: usize = 48;
+const CHECKED: usize = 40;
+
+fuzz_target!(|bytes: &[u8]| {
+    let mut bytes = bytes.to_vec();
+    if bytes.len() >= HEADER {
+        bytes[..8].copy_from_slice(b"VFPACKED");
+        let number = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")) as usize;
+        let tables = (number(12) * 8).saturating_add(number(16) * 36).min(bytes.len() - HEADER);
+        let mut crc = flate2::Crc::new();
+        crc.update(&bytes[..CHECKED]);
+        crc.update(&bytes[bytes.len() - tables..]);
+        bytes[CHECKED..CHECKED + 4].copy_from_slice(&crc.sum().to_le_bytes());
+    }
+    let len = bytes.len();
+    let Ok(scene) = PackedScene::from_source(Box::new(Cursor::new(bytes))) else { return };
+    assert!(scene.len() <= len, "{} splats in {len} bytes", scene.len());
+    let Ok(mut renderer) = CpuRenderer::streamed(scene, 1 << 24, Loading::Whole) else { return };
+    let camera = Camera::new(Intrinsics::from_horizontal_fov(48, 32, 1.2), Pose::IDENTITY, 0.05);
+    // Damage is told; nothing else is wrong with the camera.
+    let _ = renderer.render(&[], &[camera], &mut [RgbdImage::default()]);
+});
