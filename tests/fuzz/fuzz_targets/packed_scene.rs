@@ -15,7 +15,8 @@ fuzz_target!(|bytes: &[u8]| {
     let mut bytes = bytes.to_vec();
     if bytes.len() >= HEADER {
         bytes[..8].copy_from_slice(b"VFPACKED");
-        let number = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")) as usize;
+        let number =
+            |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")) as usize;
         let tables = (number(12) * 8).saturating_add(number(16) * 36).min(bytes.len() - HEADER);
         let mut crc = flate2::Crc::new();
         crc.update(&bytes[..CHECKED]);
