@@ -1,4 +1,4 @@
-//! Where things are in a baseline JPEG.
+//! Where things are in a baseline JPEG: its segments, and a block's coefficients.
 
 use crate::error::DecodeError;
 
@@ -64,3 +64,25 @@ pub(super) fn damaged(why: &str) -> DecodeError {
 pub(super) const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
 /// ITU-T T.81, table B.1: EOI.
 pub(super) const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
+
+/// Where the zigzag's n-th coefficient is: 8 times its vertical frequency, and its horizontal one
+/// (figure A.6).
+pub(super) const ZIGZAG: [u8; 64] = {
+    let mut order = [0; 64];
+    let (mut at, mut diagonal) = (0, 0);
+    while diagonal < 15 {
+        // Odd diagonals go down, even ones up.
+        let mut step = 0;
+        while step <= diagonal {
+            let (v, u) =
+                if diagonal % 2 == 1 { (step, diagonal - step) } else { (diagonal - step, step) };
+            if v < 8 && u < 8 {
+                order[at] = 8 * v + u;
+                at += 1;
+            }
+            step += 1;
+        }
+        diagonal += 1;
+    }
+    order
+};

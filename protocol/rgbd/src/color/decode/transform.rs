@@ -6,6 +6,8 @@
 //!
 //! Products and sums are rounded one by one, as everywhere, so pixels are the same everywhere.
 
+use super::super::jpeg::ZIGZAG;
+
 /// A row of eight.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(32))]
@@ -176,10 +178,3 @@ fn color_group([luma, cb, cr]: [&[Sample; GROUP]; 3], out: &mut [u8; 3 * GROUP])
         *pixel = [red[x], green[x], blue[x]];
     }
 }
-
-/// Where coefficients lie in their block, in the order of a scan (T.81, figure A.6).
-const ZIGZAG: [u8; 64] = [
-    0, 1, 8, 16, 9, 2, 3, 10, 17, 24, 32, 25, 18, 11, 4, 5, 12, 19, 26, 33, 40, 48, 41, 34, 27, 20,
-    13, 6, 7, 14, 21, 28, 35, 42, 49, 56, 57, 50, 43, 36, 29, 22, 15, 23, 30, 37, 44, 51, 58, 59,
-    52, 45, 38, 31, 39, 46, 53, 60, 61, 54, 47, 55, 62, 63,
-];

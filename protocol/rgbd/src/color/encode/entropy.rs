@@ -1,6 +1,7 @@
 //! Huffman coding of blocks (ITU-T T.81, F.1.2).
 
-use super::tables::{Words, ZIGZAG};
+use super::super::jpeg::ZIGZAG;
+use super::tables::Words;
 use super::transform::{ACROSS, Coefficients};
 
 /// Blocks that are coded before their bits are joined, at most.

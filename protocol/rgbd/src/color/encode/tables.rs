@@ -1,30 +1,8 @@
 //! Annex K of ITU-T T.81: what coefficients are divided by and the codes of what remains; and the
 //! segments before a scan (annex B), which say both.
 
-use super::super::jpeg::START_OF_IMAGE;
+use super::super::jpeg::{START_OF_IMAGE, ZIGZAG};
 use crate::header::ColorMode;
-
-/// Where the zigzag's n-th coefficient is: 8 times its vertical frequency, and its horizontal one
-/// (figure A.6).
-pub(super) const ZIGZAG: [u8; 64] = {
-    let mut order = [0; 64];
-    let (mut at, mut diagonal) = (0, 0);
-    while diagonal < 15 {
-        // Odd diagonals go down, even ones up.
-        let mut step = 0;
-        while step <= diagonal {
-            let (v, u) =
-                if diagonal % 2 == 1 { (step, diagonal - step) } else { (diagonal - step, step) };
-            if v < 8 && u < 8 {
-                order[at] = 8 * v + u;
-                at += 1;
-            }
-            step += 1;
-        }
-        diagonal += 1;
-    }
-    order
-};
 
 /// Tables K.1 and K.2, row by row: luma and chroma.
 const DIVISORS: [[u8; 64]; 2] = [
