@@ -200,6 +200,20 @@ def pose(_: Lab) -> Figures:
     return printed(cargo(["-p", "vizflyt-arena", "--bench", "pose", "--", "the table alone"]), columns=columns, head=6)
 
 
+def codec(_: Lab) -> Figures:
+    text = cargo(["-p", "vizflyt-rgbd", "--features", "turbo", "--bench", "codec"])
+    (forest,) = re.findall(r"^demo forest.*\n.*\n((?:.+\n)+)", text, re.MULTILINE)
+    out: Figures = {}
+    for name, encode, decode, bits, error in re.findall(
+            r"^(.+?) +(\d+\.\d\d) +(\d+\.\d\d) +(\d+\.\d\d) +(\d+\.\d )?", forest, re.MULTILINE):
+        out[f"{name} | encode [ms]"] = time(float(encode))
+        out[f"{name} | decode [ms]"] = time(float(decode))
+        out[f"{name} | bits a pixel"] = count(float(bits), 2)
+        if error:
+            out[f"{name} | colour [dB]"] = count(float(error), 1)
+    return out
+
+
 def simulator(_: Lab) -> Figures:
     (second_ns,) = criterion_ns("second", "vizflyt-simulator").values()
     return {"a simulated second: 800 Hz physics, 400 Hz autopilot [ms] | ": time(second_ns / 1e6)}
@@ -217,6 +231,7 @@ MEASURED: dict[str, Table] = {
         imaging, layout=shares("forest 7, 176x132, one thread")),
     "sensors": Table(["RAYON_NUM_THREADS=1 vizflyt bench sensors forest/arena.toml --camera cam.json"], sensors,
                      "sensor, one thread"),
+    "codec": Table(["cargo bench -p vizflyt-rgbd --features turbo"], codec, "the demo's forest, 640x480, one core", turns=1),
     "stream": Table(["vizflyt bench stream --seconds 5"], stream, "way", kernel="memory"),
     "dataset": Table(["vizflyt dataset --project forest --seed 7 --images 60 --threads 1 --layers LAYERS -o DIR"],
                      dataset, "layers"),
@@ -254,7 +269,8 @@ BY_HAND = [
     ByHand("Captures", "cargo run --release -p vizflyt-twin --example verdict -- IMAGES MODEL", "pycolmap, a long run"),
     ByHand("Collision rules against the truth", "cargo bench -p vizflyt-scenes --bench collision", "a long run"),
     ByHand("Pose filter: outliers", "tests/pose/run target/release/examples/trajectories", "evo"),
-    ByHand("RGB-D codec", "cargo bench -p vizflyt-rgbd --features turbo", "libjpeg-turbo, a long run"),
+    ByHand("RGB-D codec: captured scenes", "cargo bench -p vizflyt-rgbd --features turbo",
+           "captured scenes, which are not part of the project"),
     ByHand("Faults of the network", "VIZFLYT_FAULTS=write cargo test --release -p vizflyt-e2e --test faults",
            "nothing: a test holds the file that is shown"),
     ByHand("Many watchers", "VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test viewers", "a long run"),

@@ -5,10 +5,14 @@ again, each pair is of about the same time, and the median of the pairs' ratios 
 """
 
 import argparse
+import contextlib
 import json
+import socket
 import statistics
+import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import machine
@@ -28,6 +32,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("before", type=Path, help="a built program, as target/release/vizflyt")
     parser.add_argument("after", type=Path, help="another one")
     parser.add_argument("--turns", type=int, default=5, help="flights of each, some 30 s long [5]")
+    parser.add_argument("--pages", type=int, default=0,
+                        help="so many open pages watch the second one's flights, of the lowest priority here [0]")
     parser.epilog = "After --: further arguments of both demos, as --through-bridge."
     given = sys.argv[1:]
     end = given.index("--") if "--" in given else len(given)
@@ -41,13 +47,32 @@ def arguments() -> argparse.Namespace:
     return args
 
 
-def fly(program: Path, folder: Path, more: list[str]) -> dict[str, float]:
+def fly(program: Path, folder: Path, more: list[str], pages: int) -> dict[str, float]:
     """Flies once; returns what is compared."""
     report = folder / "report.json"
-    used = machine.run([str(program.resolve()), "demo", "--headless", "--seed", "7", "--seconds", "90", "--report",
-                        str(report), *more], folder, most=1)
+    with watched(pages) as address:
+        used = machine.run([str(program.resolve()), "demo", "--headless", "--seed", "7", "--seconds", "90", "--report",
+                            str(report), *address, *more], folder, most=1)
     found = {**json.loads(report.read_text()), "processor_s": used.processor_s}
     return {name: found[key] for name, key in COMPARED.items()}
+
+
+@contextlib.contextmanager
+def watched(pages: int) -> Iterator[list[str]]:
+    """Opens so many pages; gives what the demo is to be told for it."""
+    if pages == 0:
+        yield []
+        return
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    command = ["nice", "-n", "19", sys.executable, str(Path(__file__).with_name("viewers.py")), address, "vizflyt", str(pages)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as viewers:
+        try:
+            yield ["--port", address.rpartition(":")[2]]
+            pictures, _ = viewers.communicate(timeout=10)
+            print(f"{pages} pages got {int(pictures)} pictures", flush=True)
+        finally:
+            viewers.kill()
 
 
 def ratios(pairs: dict[str, list[tuple[float, float]]]) -> list[str]:
@@ -68,7 +93,8 @@ def main() -> None:
         for turn in range(args.turns):
             # Whoever flies first finds the computer as it was left: each is first in every second turn.
             order = [0, 1] if turn % 2 == 0 else [1, 0]
-            flown = {which: fly((args.before, args.after)[which], Path(folder), args.demo) for which in order}
+            flown = {which: fly((args.before, args.after)[which], Path(folder), args.demo, args.pages * which)
+                     for which in order}
             for name in COMPARED:
                 pairs[name].append((flown[0][name], flown[1][name]))
             both = (f"{name} {flown[0][name]:.1f}, {flown[1][name]:.1f}" for name in COMPARED)

@@ -10,6 +10,7 @@ import os
 import selectors
 import socket
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -143,3 +144,29 @@ def read(selector: selectors.BaseSelector, seconds: float) -> None:
             continue
         for key, _ in selector.select(left):
             key.data.read()
+
+
+def open_pages(address: str, vehicle: str, pages: int) -> None:
+    """Watches a server that may be yet to start, until it ends."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            opened = [Page(address, vehicle)]
+            break
+        except OSError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+    opened += [Page(address, vehicle) for _ in range(pages - 1)]
+    with selectors.DefaultSelector() as selector:
+        for page in opened:
+            selector.register(page.socket, selectors.EVENT_READ, page)
+        try:
+            while True:
+                read(selector, 1.0)
+        except ConnectionError:
+            print(sum(page.pictures for page in opened))
+
+
+if __name__ == "__main__":
+    open_pages(sys.argv[1], sys.argv[2], int(sys.argv[3]))
