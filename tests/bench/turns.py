@@ -65,7 +65,8 @@ def watched(pages: int) -> Iterator[list[str]]:
         return
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    command = ["nice", "-n", "19", sys.executable, str(Path(__file__).with_name("viewers.py")), address, "vizflyt", str(pages)]
+    viewers_py = str(Path(__file__).with_name("viewers.py"))
+    command = ["nice", "-n", "19", sys.executable, viewers_py, address, "vizflyt", str(pages)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as viewers:
         try:
             yield ["--port", address.rpartition(":")[2]]
