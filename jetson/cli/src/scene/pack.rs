@@ -36,11 +36,11 @@ pub(super) fn run(args: &PackArgs) -> Result<()> {
         // Progress once a second.
         if start.elapsed().as_secs() > shown_s {
             shown_s = start.elapsed().as_secs();
-            print_fmt!("{} splats in {} parts", so_far.splats, so_far.parts);
+            print_fmt!("{} splats, parts: {}", so_far.splats, so_far.parts);
         }
     })?;
     print_fmt!(
-        "{}: {} splats in {} parts, {:.0} MB, {:.1} s",
+        "{}: {} splats, parts: {}, {:.0} MB, {:.1} s",
         args.to.display(),
         summary.splats,
         summary.parts,
