@@ -26,7 +26,7 @@ use crate::topics::{Qos, Topic};
 
 /// A participant in a domain.
 pub(crate) struct Dds {
-    /// By name in ROS. Dropped before what they belong to, which then says goodbye for them.
+    /// By name in ROS.
     writers: HashMap<String, Writer>,
     publisher: Publisher,
     subscriber: Subscriber,
@@ -98,6 +98,11 @@ impl Dds {
             .map_err(|error| anyhow!("{name}: {error:?}"))?;
         self.writers.insert(name, Writer { writer, matched: 0 });
         Ok(())
+    }
+
+    /// Withdraws all topics that it sends.
+    pub(crate) fn withdraw(&mut self) {
+        self.writers.clear();
     }
 
     /// Counts who has come and gone; called between images.

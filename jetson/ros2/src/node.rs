@@ -38,10 +38,14 @@ impl Participants {
         Ok(())
     }
 
-    /// Says goodbye, behind what was sent last.
+    /// Says goodbye, behind what was sent last: of each topic first, which is repeated until it arrives. That of a
+    /// participant is one packet that may be lost, or never sent by a processor that is busy; it is then missed after a
+    /// minute.
     pub(crate) fn leave(&self) {
-        let left = [lock(&self.state).take(), lock(&self.images).take()];
+        let mut left = [lock(&self.state).take(), lock(&self.images).take()];
         thread::sleep(LAST_IMAGE);
+        left.iter_mut().flatten().for_each(Dds::withdraw);
+        thread::sleep(GOODBYE);
         drop(left);
     }
 }
@@ -54,6 +58,8 @@ fn lock(dds: &Mutex<Option<Dds>>) -> MutexGuard<'_, Option<Dds>> {
 const JPEG_QUALITY: u8 = 95;
 /// The last image is under way for less.
 const LAST_IMAGE: Duration = Duration::from_millis(100);
+/// Topics are withdrawn in less, on a busy computer too.
+const GOODBYE: Duration = Duration::from_millis(300);
 /// Images that wait to be sent; a further one takes nobody's place and is left out.
 const WAITING_IMAGES: usize = 4;
 const CAMERA_TOPICS: [Topic; 6] = [
