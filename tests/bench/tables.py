@@ -277,7 +277,7 @@ BY_HAND = [
     ByHand("Many watchers", "VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test viewers", "a long run"),
     ByHand("Stream: zenoh", "cargo run --release --manifest-path tests/peers/stream/Cargo.toml", "zenoh"),
     ByHand("Bridge", "vizflyt bench bridge", "a computer on which nothing else runs"),
-    ByHand("AprilTags", "cargo bench -p vizflyt-tags --bench locate -- 3", "a long run"),
+    ByHand("AprilTags", "cargo bench -p vizflyt-e2e --bench locate -- 3", "a long run"),
     ByHand("Visual odometry; attitude filters", "python3 tests/python/odometry.py *.json",
            "the Python package, long flights"),
     ByHand("Learning; other simulators", "tests/peers/learn/run WHEEL", "the Python package, those simulators"),

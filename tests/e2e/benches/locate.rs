@@ -1,8 +1,8 @@
 //! How well and how fast the vehicle is located: the tables of docs/BENCHMARKS.md.
 //!
-//! `cargo bench -p vizflyt-tags --bench locate`; a number after `--` is the seconds of each flight, 0 leaves them out.
+//! `cargo bench -p vizflyt-e2e --bench locate`; a number after `--` is the seconds of each flight, 0 leaves them out.
 
-#[path = "../tests/flights/mod.rs"]
+#[path = "../tests/accuracy/flights.rs"]
 mod flights;
 
 use flights::{Figures, Path, fly, fly_over_mat, lemniscate, pads, pose_on, spiral, square};
