@@ -38,9 +38,9 @@ impl Participants {
         Ok(())
     }
 
-    /// Says goodbye, behind what was sent last: of each topic first, which is repeated until it arrives. That of a
-    /// participant is one packet that may be lost, or never sent by a processor that is busy; it is then missed after a
-    /// minute.
+    /// Says goodbye, behind what was sent last. A participant's is one packet, which may be lost, and which RustDDS may
+    /// not send where the processor is busy; subscribers then keep the node for 50 s. So topics are withdrawn first, by
+    /// writers that repeat what is not acknowledged, for a while.
     pub(crate) fn leave(&self) {
         let mut left = [lock(&self.state).take(), lock(&self.images).take()];
         thread::sleep(LAST_IMAGE);
@@ -58,7 +58,7 @@ fn lock(dds: &Mutex<Option<Dds>>) -> MutexGuard<'_, Option<Dds>> {
 const JPEG_QUALITY: u8 = 95;
 /// The last image is under way for less.
 const LAST_IMAGE: Duration = Duration::from_millis(100);
-/// Topics are withdrawn in less, on a busy computer too.
+/// How long the withdrawal of topics may be repeated; the vehicle still flies as it was told last.
 const GOODBYE: Duration = Duration::from_millis(300);
 /// Images that wait to be sent; a further one takes nobody's place and is left out.
 const WAITING_IMAGES: usize = 4;
