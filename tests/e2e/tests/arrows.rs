@@ -37,6 +37,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         ],
     ),
     ("vizflyt-guardian", &["vizflyt-protocol"]),
+    ("vizflyt-gym", &["vizflyt-protocol", "vizflyt-arena", "vizflyt-simulator"]),
     (
         "vizflyt-runtime",
         &[
@@ -63,6 +64,7 @@ const ARROWS: &[(&str, &[&str])] = &[
             "vizflyt-server",
             "vizflyt-runtime",
             "vizflyt-guardian",
+            "vizflyt-gym",
             "vizflyt-simulator",
             "vizflyt-bridge",
             "vizflyt-sdk",

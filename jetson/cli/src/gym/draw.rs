@@ -5,6 +5,7 @@ use std::io::Write;
 use anyhow::{Context, Result};
 use rayon::prelude::*;
 use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
+use vizflyt_gym::append_depth_mm;
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose};
 use vizflyt_server::render::environment::atmosphere;
 use vizflyt_splat::{
@@ -123,17 +124,13 @@ pub(super) fn images(
     if drawn.depth {
         each(envs, places, |image| {
             bytes.clear();
-            let depth = image.depth_median_m.iter();
-            bytes.extend(
-                depth.flat_map(|m| ((m * 1000.0).round().clamp(0.0, 65535.0) as u16).to_le_bytes()),
-            );
+            append_depth_mm(&image.depth_median_m, &mut bytes);
             out.write_all(&bytes)
         })?;
     }
     if drawn.rgb {
         each(envs, places, |image| {
-            bytes.clear();
-            bytes.extend(image.rgb.iter().map(|v| (v * 255.0).round().clamp(0.0, 255.0) as u8));
+            image.write_rgb8(&mut bytes);
             out.write_all(&bytes)
         })?;
     }

@@ -9,7 +9,8 @@
 //! many bytes as that, little-endian, both ways. It ends with its input. The same seeds and actions give the same bytes.
 
 mod draw;
-mod episode;
+#[cfg(test)]
+mod tests;
 
 use std::io::{self, BufWriter, Read, Write};
 use std::process::ExitCode;
@@ -18,12 +19,12 @@ use anyhow::{Context, Result, ensure};
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
 use serde_json::json;
+use vizflyt_gym::{ACTION, ActionKind, Episode, FIGURES, Manner, Rules, STATE, append};
 use vizflyt_scenes::Variant;
 use vizflyt_scenes::projects::{CourseProject, Level, NAMES};
 use vizflyt_simulator::autopilot::airframe_limits;
 
 use self::draw::{Drawn, View};
-use self::episode::{ACTION, Episode, FIGURES, Manner, Rules, STATE};
 use crate::grade::course::CourseInstance;
 use crate::scene::camera::ImageSize;
 
@@ -44,7 +45,7 @@ pub(crate) struct GymArgs {
     envs: u32,
     /// What an action asks for
     #[arg(long, value_enum, default_value_t)]
-    action: ActionKind,
+    action: Action,
     /// Steps a second
     #[arg(long, value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(10..=400))]
     rate: u32,
@@ -78,7 +79,7 @@ fn error_px(text: &str) -> Result<f32, String> {
 
 /// What an action asks for; its numbers are within -1 and 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(crate) enum ActionKind {
+pub(crate) enum Action {
     /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn
     #[default]
     Velocity,
@@ -118,7 +119,11 @@ pub(crate) fn run(args: &GymArgs) -> Result<ExitCode> {
     );
     ensure!((0.1..=3600.0).contains(&args.seconds), "--seconds {}: give 0.1 to 3600", args.seconds);
     let manner = Manner {
-        action: args.action,
+        action: match args.action {
+            Action::Velocity => ActionKind::Velocity,
+            Action::Acceleration => ActionKind::Acceleration,
+            Action::BodyRates => ActionKind::BodyRates,
+        },
         ticks: TICKS_HZ / args.rate,
         delay: args.delay as usize,
         seconds: args.seconds,
@@ -191,19 +196,17 @@ fn answer(
     manner: &Manner,
     drawn: Drawn,
 ) -> Result<()> {
-    let bytes =
-        |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+    let mut bytes = Vec::new();
     let mut state = [0.0; STATE];
     for env in envs {
         env.episode.write_state(&places[env.place].rules, manner, &mut state);
-        out.write_all(&bytes(&state))?;
+        append(&state, &mut bytes);
     }
     for env in envs {
-        out.write_all(&bytes(&env.episode.figures()))?;
+        append(&env.episode.figures(), &mut bytes);
     }
-    for env in envs {
-        out.write_all(&[env.episode.end() as u8])?;
-    }
+    bytes.extend(envs.iter().map(|env| env.episode.end() as u8));
+    out.write_all(&bytes)?;
     if drawn.depth || drawn.rgb {
         draw::images(out, envs, places, drawn)?;
     }

@@ -1,4 +1,6 @@
 //! One vehicle that a policy flies through a course: setpoints in, true state and rules out. Pure, on a clock of its own.
+//! `vizflyt gym` flies many at once; a crate by itself, because what learns waits for it a million times: it is optimised as
+//! the renderer is, and the command around it is not.
 //!
 //! What flies is the simulator's airframe under the simulator's own controllers, which are given the truth: no
 //! estimator, no MAVLink, no motion capture. Rules are the referee's: the same openings, obstacles, fence.
@@ -16,8 +18,6 @@ use vizflyt_simulator::control::mixer::mix;
 use vizflyt_simulator::control::position::{Horizontal, PositionController, Vertical};
 use vizflyt_simulator::estimator::Estimate;
 
-use super::ActionKind;
-
 /// Physics at twice the rate of the controllers, as in the simulated lab. [s]
 const TICK_S: f64 = 1.0 / 400.0;
 const TICK_NS: i64 = 2_500_000;
@@ -27,8 +27,9 @@ const TICKS_PER_CHECK: u32 = 4;
 /// Fastest turns that an action of 1 asks for. [rad/s]
 const YAW_RATE_RADPS: f64 = 2.0;
 const BODY_RATES_RADPS: DVec3 = DVec3::new(6.0, 6.0, 3.0);
-/// How far an episode's start is off the spawn, at most: sideways and in height; and its heading.
-const START_M: f64 = 0.3;
+/// How far an episode's start is off the spawn, at most: sideways and in height. [m]
+pub const START_M: f64 = 0.3;
+/// How far its heading is.
 const START_YAW_RAD: f64 = 0.3;
 /// So much room must be about a start. [m]
 const START_CLEARANCE_M: f64 = 0.15;
@@ -36,27 +37,46 @@ const START_CLEARANCE_M: f64 = 0.15;
 const CLEARANCE_TOLD_M: f64 = 10.0;
 
 /// Numbers of an action.
-pub(super) const ACTION: usize = 4;
-/// Numbers of a state, as `vizflyt.gym` explains them.
-pub(super) const STATE: usize = 22;
+pub const ACTION: usize = 4;
+/// Numbers of a state, as [`Episode::write_state`] has them and `vizflyt.gym` explains them.
+pub const STATE: usize = 22;
 /// Numbers that rewards are made of.
-pub(super) const FIGURES: usize = 4;
+pub const FIGURES: usize = 4;
+
+/// What an action asks for; its numbers are within -1 and 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ActionKind {
+    /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn.
+    Velocity,
+    /// Acceleration ahead, to the left, up, in shares of the course's limit, and a turn.
+    Acceleration,
+    /// Body rates and thrust.
+    BodyRates,
+}
 
 /// How an episode stands; its number goes to Python.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-pub(super) enum End {
+pub enum End {
+    /// In the air.
     Flying = 0,
+    /// It touched something.
     Crashed = 1,
+    /// It left the fence.
     LeftFence = 2,
+    /// All stages are passed.
     Finished = 3,
+    /// Its time is over.
     TimeUp = 4,
 }
 
 /// What episodes of one course have in common.
-pub(super) struct Rules {
-    pub(super) arena: ArenaConfig,
-    pub(super) obstacles: Obstacles,
+#[derive(Debug)]
+pub struct Rules {
+    /// The room.
+    pub arena: ArenaConfig,
+    /// What may be touched.
+    pub obstacles: Obstacles,
     boundaries: Boundaries,
     body: BodyShape,
     limits: Limits,
@@ -65,7 +85,8 @@ pub(super) struct Rules {
 }
 
 impl Rules {
-    pub(super) fn new(arena: ArenaConfig, obstacles: Obstacles, limits: Limits) -> Self {
+    /// Returns the rules of a course, for a vehicle with these limits.
+    pub fn new(arena: ArenaConfig, obstacles: Obstacles, limits: Limits) -> Self {
         let stages =
             arena.stages.iter().map(|stage| (stage.center_m, stage.normal.normalize_or(DVec3::X)));
         let goal = arena.goal.map(|goal| (goal.position_m, DVec3::ZERO));
@@ -82,18 +103,20 @@ impl Rules {
 
 /// How an episode is flown.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Manner {
-    pub(super) action: ActionKind,
+pub struct Manner {
+    /// What actions ask for.
+    pub action: ActionKind,
     /// Controller's ticks a step.
-    pub(super) ticks: u32,
+    pub ticks: u32,
     /// Steps until an action counts.
-    pub(super) delay: usize,
+    pub delay: usize,
     /// After so much an episode is over. [s]
-    pub(super) seconds: f64,
+    pub seconds: f64,
 }
 
 /// A vehicle in the air.
-pub(super) struct Episode {
+#[derive(Debug)]
+pub struct Episode {
     airframe: Airframe,
     position: PositionController,
     attitude: AttitudeController,
@@ -113,7 +136,7 @@ pub(super) struct Episode {
 
 impl Episode {
     /// Starts near the spawn: where, follows from the seed.
-    pub(super) fn start(rules: &Rules, manner: &Manner, seed: u64) -> Self {
+    pub fn start(rules: &Rules, manner: &Manner, seed: u64) -> Self {
         let spawn = &rules.arena.spawn;
         let mut noise = Noise(seed);
         let floor_z_m = spawn.position_m.z;
@@ -150,7 +173,7 @@ impl Episode {
     }
 
     /// Since its start. [ns]
-    pub(super) fn elapsed_ns(&self) -> i64 {
+    pub fn elapsed_ns(&self) -> i64 {
         self.ticks as i64 * TICK_NS
     }
 
@@ -159,16 +182,18 @@ impl Episode {
         self.ticks as f64 * TICK_S
     }
 
-    pub(super) fn airframe(&self) -> &Airframe {
+    /// Returns the vehicle.
+    pub fn airframe(&self) -> &Airframe {
         &self.airframe
     }
 
-    pub(super) fn end(&self) -> End {
+    /// Returns how it stands.
+    pub fn end(&self) -> End {
         self.end
     }
 
     /// Flies one step; an action's numbers are within -1 and 1, others are cut.
-    pub(super) fn step(&mut self, rules: &Rules, manner: &Manner, action: [f32; ACTION]) {
+    pub fn step(&mut self, rules: &Rules, manner: &Manner, action: [f32; ACTION]) {
         if self.end != End::Flying {
             return;
         }
@@ -287,7 +312,7 @@ impl Episode {
 
     /// Writes the state, in the order that `vizflyt.gym` gives: velocity, up, turn, the way to the target and its
     /// direction, position, sine and cosine of the heading, targets left, share of the time left.
-    pub(super) fn write_state(&self, rules: &Rules, manner: &Manner, out: &mut [f32; STATE]) {
+    pub fn write_state(&self, rules: &Rules, manner: &Manner, out: &mut [f32; STATE]) {
         let state = self.airframe.state();
         let yaw_rad = yaw_of(state.world_from_body);
         let heading_from_world = glam::DQuat::from_rotation_z(-yaw_rad);
@@ -316,7 +341,7 @@ impl Episode {
     }
 
     /// Returns what rewards are made of: progress [m], clearance [m], stages passed, time [s].
-    pub(super) fn figures(&self) -> [f32; FIGURES] {
+    pub fn figures(&self) -> [f32; FIGURES] {
         [
             self.progress_m as f32,
             self.clearance_m as f32,
@@ -324,6 +349,18 @@ impl Episode {
             self.elapsed_s() as f32,
         ]
     }
+}
+
+/// Appends numbers, little-endian.
+pub fn append(numbers: &[f32], out: &mut Vec<u8>) {
+    out.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
+}
+
+/// Appends depths as `vizflyt gym` sends them: whole millimetres, little-endian, 65535 at most; 0 where nothing is seen. [m]
+pub fn append_depth_mm(depth_m: &[f32], out: &mut Vec<u8>) {
+    // Clamped before the cast, in an order that vectorises.
+    let mm = depth_m.iter().map(|m| (m * 1000.0 + 0.5).clamp(0.0, 65535.0) as u16);
+    out.extend(mm.flat_map(u16::to_le_bytes));
 }
 
 /// SplitMix64 (Steele, Lea, Flood 2014): numbers that follow from a seed.
@@ -337,90 +374,5 @@ impl Noise {
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use vizflyt_scenes::Variant;
-    use vizflyt_scenes::projects::{CourseProject, Level};
-    use vizflyt_simulator::autopilot::airframe_limits;
-
-    use super::*;
-    use crate::grade::course::CourseInstance;
-
-    const MANNER: Manner =
-        Manner { action: ActionKind::Velocity, ticks: 10, delay: 0, seconds: 20.0 };
-
-    fn rules() -> Rules {
-        let project = CourseProject::named("square").unwrap();
-        let course = CourseInstance::make(&project, Level::Ug, Variant::DAY, 1).unwrap();
-        Rules::new(course.arena, course.obstacles, airframe_limits())
-    }
-
-    fn state(episode: &Episode, rules: &Rules) -> [f32; STATE] {
-        let mut state = [0.0; STATE];
-        episode.write_state(rules, &MANNER, &mut state);
-        state
-    }
-
-    #[test]
-    fn a_velocity_is_flown_and_the_fence_ends_it() {
-        let rules = rules();
-        let mut episode = Episode::start(&rules, &MANNER, 3);
-        let most_mps = rules.arena.limits.max_speed_mps as f32;
-        for _ in 0..60 {
-            episode.step(&rules, &MANNER, [0.4, 0.0, 0.0, 0.0]);
-        }
-        let flown = state(&episode, &rules);
-        // Ahead in its own axes, whichever way it looks.
-        assert!((flown[0] - 0.4 * most_mps).abs() < 0.1, "{flown:?}");
-        assert!(flown[1].abs() < 0.1 && flown[2].abs() < 0.1, "{flown:?}");
-        assert_eq!(episode.end(), End::Flying);
-        for _ in 0..400 {
-            episode.step(&rules, &MANNER, [1.0, 0.0, 0.0, 0.0]);
-        }
-        assert!(matches!(episode.end(), End::LeftFence | End::Crashed), "{:?}", episode.end());
-        let ended = state(&episode, &rules);
-        episode.step(&rules, &MANNER, [-1.0; 4]);
-        assert_eq!(state(&episode, &rules), ended, "what is over stays as it is");
-    }
-
-    #[test]
-    fn the_seed_says_where_it_starts_and_time_ends_it() {
-        let rules = rules();
-        let begin = |seed| state(&Episode::start(&rules, &MANNER, seed), &rules);
-        assert_eq!(begin(1), begin(1));
-        assert_ne!(begin(1), begin(2));
-        let spawn_m = rules.arena.spawn.position_m + DVec3::Z * rules.arena.takeoff_height_m;
-        for seed in 0..50 {
-            let start = begin(seed);
-            let p_m = DVec3::new(start[15].into(), start[16].into(), start[17].into());
-            assert!((p_m - spawn_m).abs().max_element() <= START_M + 1e-6, "seed {seed}: {p_m}");
-        }
-        let short = Manner { seconds: 1.0, ..MANNER };
-        let mut episode = Episode::start(&rules, &short, 1);
-        for _ in 0..39 {
-            episode.step(&rules, &short, [0.0; ACTION]);
-            assert_eq!(episode.end(), End::Flying);
-        }
-        episode.step(&rules, &short, [0.0; ACTION]);
-        assert_eq!(episode.end(), End::TimeUp);
-    }
-
-    #[test]
-    fn an_action_counts_after_its_delay() {
-        let rules = rules();
-        let late = Manner { delay: 3, ..MANNER };
-        let turned = |manner: &Manner, steps| {
-            let mut episode = Episode::start(&rules, manner, 1);
-            let before = state(&episode, &rules);
-            for _ in 0..steps {
-                episode.step(&rules, manner, [0.0, 0.0, 0.0, 1.0]);
-            }
-            (state(&episode, &rules)[8] - before[8]).abs()
-        };
-        assert!(turned(&MANNER, 3) > 0.1, "{}", turned(&MANNER, 3));
-        assert!(turned(&late, 3) < 1e-3 && turned(&late, 6) > 0.1, "{}", turned(&late, 3));
     }
 }
