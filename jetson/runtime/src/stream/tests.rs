@@ -120,7 +120,9 @@ impl Peer {
                     // This server's clock is 100 s ahead.
                     let answered = ServerTime::from_ns(host_now().as_ns() + AHEAD_NS);
                     let reply = ClockReply { sent: request.sent, answered };
-                    self.send(&ToRuntime::Clock(reply)).await;
+                    let reply = ToRuntime::Clock(reply);
+                    // It may have closed behind its request: that is the end, as for whoever reads.
+                    self.send.write_all(encode(&reply, &mut [0; MAX_FRAMED])).await.ok()?;
                 }
                 other => return Some(other),
             }
