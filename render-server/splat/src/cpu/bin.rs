@@ -1,11 +1,11 @@
 //! Pass 4: which splats touch which tile, and which of its blocks, each list nearest first.
 //!
-//! The depth order is cut into slices. Each slice walks its splats from near to far and notes a
-//! pair for every tile of which the ellipse alpha >= 1/255 touches a block; the counts give
-//! each slice its places in every tile's list; then all slices scatter. Lists come out ordered
-//! because slices are, so nothing is sorted per tile.
+//! The depth order is cut into slices. Each slice walks its splats from near to far, and appends an entry to the list of
+//! every tile of which the ellipse alpha >= 1/255 touches a block. A slice's list of a tile is made of pieces of two cache
+//! lines, so that it is written once, wherever it ends; then the pieces of a tile are copied next to each other, slice by
+//! slice. Lists come out ordered because slices are, so nothing is sorted per tile.
 //!
-//! Budget: 8 bytes read per splat in random order, 64 of a large one (hence the prefetch); 20 written per pair.
+//! Budget: 8 bytes read per splat in random order, 64 of a large one (hence the prefetch); 16 written per pair.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
@@ -22,6 +22,10 @@ pub(super) const TILE: usize = 16;
 const SLICES_PER_THREAD: usize = 4;
 const MAX_SLICES: usize = 32;
 const MIN_SLICE: usize = 1024;
+/// Entries of a piece: two cache lines.
+const PIECE: usize = 16;
+/// No piece.
+const NONE: u32 = u32::MAX;
 /// How far ahead a splat's record is asked for, and twice as far its cover: some 300 ns of work.
 const PREFETCH: usize = 16;
 
@@ -53,19 +57,19 @@ impl Entry {
     }
 }
 
+/// The lists of one slice.
 #[derive(Debug, Default)]
 struct Slice {
-    pairs: Vec<Pair>,
-    /// Per tile: how many pairs; later, the place of the next.
-    places: Vec<u32>,
-}
-
-#[derive(Clone, Copy, Debug, Default)]
-struct Pair {
-    tile: u32,
-    slot: u32,
-    /// [`Entry::blocks`].
-    blocks: u32,
+    /// Piece by piece.
+    entries: Vec<u64>,
+    /// Of each piece, which one comes before it in its tile's list.
+    before: Vec<u32>,
+    /// How many pieces there are.
+    pieces: usize,
+    /// Per tile: where its next entry goes. That piece is never full.
+    next: Vec<u32>,
+    /// Per tile: how many entries its full pieces have.
+    full: Vec<u32>,
 }
 
 impl Bins {
@@ -99,9 +103,8 @@ impl Bins {
         let slices = &mut self.slices[..count];
         let tiles_x = self.tiles_x;
         slices.par_iter_mut().enumerate().with_max_len(1).for_each(|(i, slice)| {
-            slice.places.clear();
-            // Where a window that lies within the last tiles would go on: never more than 0.
-            slice.places.resize(tiles + tiles_x + 2, 0);
+            // Where a window that lies within the last tiles would go on: nothing is ever there.
+            slice.start(tiles + tiles_x + 2);
             let order = &order[order.len() * i / count..order.len() * (i + 1) / count];
             simd.run(BinSlice { tiles_x, projected, order, slice });
         });
@@ -110,26 +113,85 @@ impl Bins {
         let mut place = 0;
         for tile in 0..tiles {
             self.starts.push(place);
-            for slice in &mut *slices {
-                let pairs = slice.places[tile];
-                slice.places[tile] = place;
-                place += pairs;
-            }
+            place += slices.iter().map(|slice| slice.len(tile)).sum::<u32>();
         }
         self.starts.push(place);
         if self.entries.len() < place as usize {
             self.entries.resize_with(place as usize, AtomicU64::default);
         }
-        let entries = &self.entries;
-        slices.par_iter_mut().with_max_len(1).for_each(|slice| {
-            for &Pair { tile, slot, blocks } in &slice.pairs {
-                let place = &mut slice.places[tile as usize];
+        let (starts, entries, slices) = (&self.starts, &self.entries, &*slices);
+        (0..tiles).into_par_iter().with_min_len(8).for_each(|tile| {
+            let mut start = starts[tile] as usize;
+            for slice in slices {
+                let end = start + slice.len(tile) as usize;
                 // Disjoint from all other places; atomic because no borrow can say so.
-                let entry = u64::from(blocks) << 32 | u64::from(slot);
-                entries[*place as usize].store(entry, Relaxed);
-                *place += 1;
+                slice.copy(tile, &entries[start..end]);
+                start = end;
             }
         });
+    }
+}
+
+impl Slice {
+    /// Begins anew, with an empty piece for each tile.
+    fn start(&mut self, tiles: usize) {
+        self.pieces = tiles;
+        self.next.clear();
+        self.next.extend((0..tiles).map(|tile| (tile * PIECE) as u32));
+        self.full.clear();
+        self.full.resize(tiles, 0);
+        self.before.clear();
+        self.before.resize(tiles, NONE);
+        self.make_room(0);
+    }
+
+    /// Returns the number of a tile's entries.
+    fn len(&self, tile: usize) -> u32 {
+        self.full[tile] + self.next[tile] % PIECE as u32
+    }
+
+    /// Copies a tile's entries, which are as many.
+    fn copy(&self, tile: usize, mut to: &[AtomicU64]) {
+        let next = self.next[tile] as usize;
+        let (mut piece, mut count) = (next / PIECE, next % PIECE);
+        // The last piece is the first that is found.
+        loop {
+            let (earlier, later) = to.split_at(to.len() - count);
+            for (to, &entry) in later.iter().zip(&self.entries[piece * PIECE..]) {
+                to.store(entry, Relaxed);
+            }
+            if self.before[piece] == NONE {
+                return;
+            }
+            (to, piece, count) = (earlier, self.before[piece] as usize, PIECE);
+        }
+    }
+
+    /// Makes room for more entries, each of which may begin a piece.
+    #[inline(always)]
+    fn make_room(&mut self, count: usize) {
+        let pieces = self.pieces + count;
+        if self.entries.len() < pieces * PIECE {
+            self.entries.resize(2 * pieces * PIECE, 0);
+        }
+        if self.before.len() < pieces {
+            self.before.resize(2 * pieces, NONE);
+        }
+    }
+
+    /// Notes an entry if it has blocks, without a branch that is hard to foretell; there must be room.
+    #[inline(always)]
+    fn note(&mut self, tile: usize, slot: u32, blocks: u32) {
+        let place = self.next[tile];
+        self.entries[place as usize] = u64::from(blocks) << 32 | u64::from(slot);
+        let next = place + u32::from(blocks != 0);
+        self.next[tile] = next;
+        if next / PIECE as u32 != place / PIECE as u32 {
+            self.before[self.pieces] = place / PIECE as u32;
+            self.next[tile] = (self.pieces * PIECE) as u32;
+            self.full[tile] += PIECE as u32;
+            self.pieces += 1;
+        }
     }
 }
 
@@ -147,7 +209,6 @@ impl Kernel for BinSlice<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let Self { tiles_x, projected, order, slice } = self;
-        let mut len = 0;
         for (i, slot) in order.iter().enumerate() {
             if let Some(ahead) = order.get(i + 2 * PREFETCH) {
                 s.prefetch(&projected.covers[ahead.load(Relaxed) as usize]);
@@ -161,37 +222,29 @@ impl Kernel for BinSlice<'_> {
             let slot = slot.load(Relaxed);
             let cover = projected.covers[slot as usize];
             if cover.blocks == 0 {
-                note_large(s, tiles_x, &projected.splats[slot as usize], slot, slice, &mut len);
+                note_large(s, tiles_x, &projected.splats[slot as usize], slot, slice);
                 continue;
             }
             let column = usize::from(cover.left) / COLUMNS;
             let row = usize::from(cover.top) / cover::bands(S::LANES);
             let tile = row * tiles_x + column;
             let [first, right, below, last] = cover.split(S::LANES);
-            make_room(slice, len, 4);
+            slice.make_room(4);
             for (tile, blocks) in [
                 (tile, first),
                 (tile + 1, right),
                 (tile + tiles_x, below),
                 (tile + tiles_x + 1, last),
             ] {
-                note(slice, &mut len, tile, slot, blocks);
+                slice.note(tile, slot, blocks);
             }
         }
-        slice.pairs.truncate(len);
     }
 }
 
 /// Notes the pairs of a splat that may touch any number of tiles.
 #[inline(always)]
-fn note_large<S: Simd>(
-    s: S,
-    tiles_x: usize,
-    splat: &Splat2d,
-    slot: u32,
-    slice: &mut Slice,
-    len: &mut usize,
-) {
+fn note_large<S: Simd>(s: S, tiles_x: usize, splat: &Splat2d, slot: u32, slice: &mut Slice) {
     let TileBox { left, right, top, bottom } = splat.tiles;
     let columns = usize::from(left)..usize::from(right) + 1;
     let last_row = usize::from(bottom);
@@ -199,29 +252,12 @@ fn note_large<S: Simd>(
     let step = S::LANES / cover::bands(S::LANES);
     for row in (usize::from(top)..=last_row).step_by(step) {
         let bands = Bands::new(s, splat, (row * TILE) as f32);
-        make_room(slice, *len, columns.len() * step);
+        slice.make_room(columns.len() * step);
         for column in columns.clone() {
             let bits = bands.of_column(s, (column * TILE) as f32);
             for (i, row) in (row..=last_row).take(step).enumerate() {
-                note(slice, len, row * tiles_x + column, slot, Bands::<S>::of_row(bits, i));
+                slice.note(row * tiles_x + column, slot, Bands::<S>::of_row(bits, i));
             }
         }
     }
-}
-
-/// Makes room for more pairs.
-#[inline(always)]
-fn make_room(slice: &mut Slice, len: usize, count: usize) {
-    if slice.pairs.len() < len + count {
-        slice.pairs.resize((len + count) * 2, Pair::default());
-    }
-}
-
-/// Notes a pair if it has blocks, without a branch; there must be room.
-#[inline(always)]
-fn note(slice: &mut Slice, len: &mut usize, tile: usize, slot: u32, blocks: u32) {
-    let counts = blocks != 0;
-    slice.pairs[*len] = Pair { tile: tile as u32, slot, blocks };
-    slice.places[tile] += u32::from(counts);
-    *len += usize::from(counts);
 }

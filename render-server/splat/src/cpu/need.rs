@@ -56,8 +56,8 @@ const PROJECTED: u64 = 64 + 8 + 4;
 const SORTED: u64 = 2 * 4 + 8 + 2 * 8 + 4;
 /// Bytes that binning reads of a splat: its slot and its cover.
 const BINNED: u64 = 4 + 8;
-/// Bytes of a pair: written, read, and written to its list.
-const PAIR: u64 = 12 + 12 + 8;
+/// Bytes of a pair: written to a piece, read, and written to its tile's list.
+const PAIR: u64 = 8 + 8 + 8;
 /// Bytes that blending reads of a pair.
 const BLENDED: u64 = 8 + 64;
 /// Bytes of a pixel: in a tile, written and read, and in the image.
