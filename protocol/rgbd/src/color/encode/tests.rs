@@ -116,17 +116,26 @@ fn tables_are_those_of_another_encoder() {
 #[test]
 fn pictures_lose_no_more_than_by_another_encoder() {
     for mode in [ColorMode::Jpeg444, ColorMode::Jpeg420] {
-        for quality in [30, 75, 93, 100] {
+        for quality in [5, 12, 30, 75, 93, 100] {
+            let (mut all_ours, mut all_theirs) = (0.0, 0.0);
             for kind in 0..5 {
                 let rgb = picture(203, 149, kind, 3);
-                let ours = jpeg(&rgb, 203, quality, mode, Scan::write);
-                let theirs = reference(&rgb, 203, quality, mode);
-                let loss = decibels((squares(&rgb, &ours) + 1.0) / (squares(&rgb, &theirs) + 1.0));
+                let (ours, theirs) = (
+                    jpeg(&rgb, 203, quality, mode, Scan::write),
+                    reference(&rgb, 203, quality, mode),
+                );
                 let larger = ours.len() as f64 / theirs.len() as f64;
                 let of = format!("{mode:?} at {quality}, kind {kind}");
-                assert!(loss < 0.05, "{loss:.3} dB worse: {of}");
                 assert!(larger < 1.03, "{larger:.4} times the bytes: {of}");
+                let (ours, theirs) = (squares(&rgb, &ours) + 1.0, squares(&rgb, &theirs) + 1.0);
+                all_ours += ours;
+                all_theirs += theirs;
+                let loss = decibels(ours / theirs);
+                // Below, a step is so large that the other way to round a value may show it better by luck: black for one.
+                assert!(quality < 30 || loss < 0.05, "{loss:.3} dB worse: {of}");
             }
+            let loss = decibels(all_ours / all_theirs);
+            assert!(loss < 0.05, "{loss:.3} dB worse in all: {mode:?} at {quality}");
         }
     }
 }
