@@ -82,8 +82,8 @@ const PEERS: &str = "peers, room p0 / p1, RGB only, median ms: 320x240: brush 66
     262 / 205 (a wrong picture), wgpu-3dgs-viewer 547 / 480 (a wrong picture); 640x480: brush 1344 / \
     1021, web-splat 402 / 315, wgpu-3dgs-viewer 830 / 764";
 
-/// Prints the median and least ms of every pass, and how many times faster the whole is than the
-/// reference.
+/// Prints the median and least ms of every pass, how long each takes at least on this machine, and how many times faster the
+/// whole is than the reference.
 fn passes(case: &Case) {
     println!("\n{} ({} splats): median (least) ms of 60 images", case.name, case.splats.len());
     println!(
@@ -120,6 +120,21 @@ fn passes(case: &Case) {
                 cell(row(|t| t.blend_ms)),
                 cell(total),
                 reference_ms / total.0,
+            );
+            let Intrinsics { width_px, height_px, .. } = camera.intrinsics;
+            let need = renderer.need([width_px as usize, height_px as usize]);
+            let bound = need.bound(&renderer.machine(need.bytes() as usize));
+            println!(
+                "{:32} {:15} | {:13} {:13.2} {:13.2} {:13.2} {:13.2} {:13.2} | {:.1} times",
+                "",
+                "at least",
+                "",
+                bound.project_ms,
+                bound.sort_ms,
+                bound.bin_ms,
+                bound.blend_ms,
+                bound.total_ms,
+                total.0 / bound.total_ms,
             );
         }
     }

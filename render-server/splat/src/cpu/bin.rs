@@ -261,3 +261,37 @@ fn note_large<S: Simd>(s: S, tiles_x: usize, splat: &Splat2d, slot: u32, slice: 
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn pieces_keep_every_entry_that_has_blocks_in_order(
+            noted in prop::collection::vec((0usize..5, 0u32..3), 0..400),
+        ) {
+            let mut slice = Slice::default();
+            // What an earlier image left behind must not matter.
+            for _ in 0..2 {
+                slice.start(5);
+                for (slot, &(tile, blocks)) in noted.iter().enumerate() {
+                    slice.make_room(1);
+                    slice.note(tile, slot as u32, blocks);
+                }
+            }
+            for tile in 0..5 {
+                let entries: Vec<AtomicU64> =
+                    (0..slice.len(tile)).map(|_| AtomicU64::default()).collect();
+                slice.copy(tile, &entries);
+                let kept = entries.iter().map(Entry::of).map(|e| (e.slot, e.blocks));
+                let of_tile = noted.iter().enumerate().filter(|(_, of)| of.0 == tile);
+                let expected =
+                    of_tile.map(|(slot, of)| (slot, of.1)).filter(|&(_, blocks)| blocks != 0);
+                prop_assert!(kept.eq(expected), "tile {}", tile);
+            }
+        }
+    }
+}
