@@ -376,3 +376,17 @@ impl Noise {
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::append_depth_mm;
+
+    #[test]
+    fn depths_are_whole_millimetres() {
+        let mut bytes = vec![7];
+        append_depth_mm(&[0.0, 1.2344, 2.0006, 65.534, 65.6, f32::MAX, f32::NAN], &mut bytes);
+        let (pairs, rest) = bytes[1..].as_chunks();
+        let mm: Vec<u16> = pairs.iter().map(|pair| u16::from_le_bytes(*pair)).collect();
+        assert_eq!((mm, rest.len()), (vec![0, 1234, 2001, 65534, 65535, 65535, 0], 0));
+    }
+}
