@@ -1,8 +1,13 @@
 """A camera that fails: plays a flight's images as YUV4MPEG2, slower than they were exposed, and does what drivers do.
 
-Usage: feed.py FOLDER BEGIN_NS [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end; times of the recording
+The flight is flown there and back until the file END is there: a camera that is plugged in again starts this program,
+which on a loaded machine takes longer than any recording, and the other camera must still be there for it.
+
+Usage: feed.py FOLDER BEGIN_NS END [FAULT:FROM_S:TO_S ...]      faults: hang, repeat, dark, end; times of the first way
 """
 
+import itertools
+import math
 import pathlib
 import sys
 import time
@@ -10,26 +15,33 @@ import time
 import cv2
 import numpy as np
 
-# A camera that is plugged in again starts this program: on a loaded machine that takes seconds, which the other camera
-# must still be there for.
 SLOWER = 3
+# Ways, after which nobody waits any more.
+WAYS = 20
 
 
 def main() -> None:
-    folder, begin_ns = pathlib.Path(sys.argv[1]), int(sys.argv[2])
-    faults = [(word, float(start), float(end)) for word, start, end in (x.split(":") for x in sys.argv[3:])]
+    folder, begin_ns, ending = pathlib.Path(sys.argv[1]), int(sys.argv[2]), pathlib.Path(sys.argv[3])
+    faults = [(word, float(start), float(end)) for word, start, end in (x.split(":") for x in sys.argv[4:])]
     lines = (folder / "stamps.csv").read_text().splitlines()[1:]
-    stamps = [(name, int(stamp)) for name, stamp in (line.split(",") for line in lines)]
-    first_ns = stamps[0][1] // 10**9 * 10**9
+    stamps = [(name, int(stamp) / 1e9) for name, stamp in (line.split(",") for line in lines)]
+    first_s = math.floor(stamps[0][1])
+    # The same for all cameras.
+    way_s = math.ceil(stamps[-1][1]) - first_s
+    there = [(name, stamp_s - first_s) for name, stamp_s in stamps]
+    # Without the images at both ends, which would be shown twice.
+    back = [(name, way_s - time_s) for name, time_s in there[-2:0:-1]]
+    ways = itertools.islice(itertools.cycle((there, back)), WAYS)
     opened_s = (time.monotonic_ns() - begin_ns) / 1e9 / SLOWER
     image, headed = None, False
-    for name, stamp_ns in stamps:
-        now_s = (stamp_ns - first_ns) / 1e9
-        shown_ns = begin_ns + SLOWER * (stamp_ns - first_ns)
+    for name, now_s in ((name, way * way_s + time_s) for way, images in enumerate(ways) for name, time_s in images):
+        shown_ns = begin_ns + round(SLOWER * now_s * 1e9)
         wait_s = (shown_ns - time.monotonic_ns()) / 1e9
         if wait_s < 0:
             continue
         time.sleep(wait_s)
+        if ending.exists():
+            return
         fault = next((word for word, start, end in faults if start <= now_s < end), "")
         if fault == "end" and opened_s < now_s - 0.2:
             raise SystemExit("the camera was unplugged")

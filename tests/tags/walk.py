@@ -460,23 +460,27 @@ def cameras_come_and_go(lab: Lab) -> None:
     faults = ["hang:1:1.7", "repeat:2.2:2.7", "dark:3.2:3.7", "end:4.2:4.3"]
     feed = f"{sys.executable} {pathlib.Path(__file__).with_name('feed.py')}"
     sources = [
-        f"--source={name}=| exec {feed} slow/{name} {begin_ns} {' '.join(faults if name == 'right' else [])}"
+        f"--source={name}=| exec {feed} slow/{name} {begin_ns} slow/end {' '.join(faults if name == 'right' else [])}"
         for name in EYES
     ]
     lab.write_config("cube")
     command = [lab.vizflyt, "tags", "locate", "lab.toml", "--poses", "--json", "--to", server.poses, *sources]
     with subprocess.Popen(command, cwd=lab.home, stdout=subprocess.PIPE, text=True) as located:
         events, alone, both, after = [], 0, 0, 0
+        unplugged, again = False, False
         for line in located.stdout:
             said = json.loads(line)
             if "fault" in said:
                 events.append((said["camera"], said["fault"]))
                 print("  ", said, flush=True)
+                unplugged = unplugged or "ended with" in str(said["fault"])
+                again = again or (unplugged and events[-1] == ("right", None))
             if "vizflyt_pose" in said:
                 alone += said["quality"]["cameras"] == 1
                 both += said["quality"]["cameras"] == 2
-                after += "ended with" in str(events) and events[-1] == ("right", None)
-            # The left one ends with its recording.
+                after += again
+            if after == 10:
+                (lab.home / "slow/end").touch()
             if events and events[-1] == ("left", "its images ended"):
                 located.send_signal(signal.SIGINT)
                 break
