@@ -141,7 +141,7 @@ fn path() -> impl Strategy<Value = Path> {
     ]
 }
 
-/// Random flights: as many as `VIZFLYT_GUARD_CASES` says, 30,000 in `tests/run`.
+/// Random flights: as many as `VIZFLYT_GUARD_CASES` says, 10,000 in `tests/run`.
 fn cases() -> u32 {
     std::env::var("VIZFLYT_GUARD_CASES").ok().and_then(|n| n.parse().ok()).unwrap_or(5_000)
 }
