@@ -71,7 +71,7 @@ def main(vizflyt: str, home: Path) -> None:
     encode = ["ffmpeg", "-nostdin", "-v", "error", "-y", "-framerate", str(RATE_HZ), "-i", "film/%05d.jpg"]
     subprocess.run([*encode, "-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "hall.mp4"], cwd=home, check=True)
     truth = json.loads((home / "film/truth.json").read_text())
-    small = ["--python", sys.executable, "--steps", "300", "--splats", "15000", "--width", "160"]
+    small = ["--python", sys.executable, "--steps", "60", "--splats", "5000", "--width", "160"]
     capture = ["scene", "capture", "hall.mp4", "-o", "hall", "--camera", "film/camera.toml", *small]
 
     # Pictures at a fixed pace are more blurred than the sharpest of each time, and may be refused: what is asked is
