@@ -7,7 +7,7 @@
 //! ```
 //!
 //! Takes the first adapter, software ones last. Scenes are generated halls with harmonics of degree
-//! 3, and the captured ones of a neighbouring `../shared` where present. `--out` leaves the scenes as
+//! 3, those of a million splats and more in adaptive detail too, and the captured ones of a neighbouring `../shared` where present. `--out` leaves the scenes as
 //! PLY, the cameras, the first image of each scene and all figures there: `tests/gpu/table` gives
 //! them to gsplat.
 //!
@@ -22,7 +22,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use vizflyt_protocol::geometry::{Cam, Distortion, Intrinsics, Pose, World};
 use vizflyt_splat::gpu::{Adapter, Budget, GpuRenderer};
-use vizflyt_splat::{Camera, CpuRenderer, PassTimes, Rasterizer, RgbdImage, Splats, ply};
+use vizflyt_splat::{Camera, CpuRenderer, Detail, PassTimes, Rasterizer, RgbdImage, Splats, ply};
 
 /// What the command line asks for.
 struct Options {
@@ -62,8 +62,15 @@ fn main() {
     );
     println!("|{}", "---|".repeat(15));
     let mut rows = Vec::new();
+    let mut measure_all = |case: &Case| {
+        measure(case, Detail::Full, adapter, &options, &mut rows);
+        let suited = Detail::suited_to(&(&case.splats).into());
+        if suited != Detail::Full {
+            measure(case, suited, adapter, &options, &mut rows);
+        }
+    };
     for case in captured().iter().filter(|case| case.name.contains(&options.only)) {
-        measure(case, adapter, &options, &mut rows);
+        measure_all(case);
     }
     for &count in &options.counts {
         let case = hall(count, &options);
@@ -73,7 +80,7 @@ fn main() {
         if let Some(out) = &options.out {
             leave(&case, adapter, out);
         }
-        measure(&case, adapter, &options, &mut rows);
+        measure_all(&case);
     }
     if let Some(out) = &options.out {
         let figures = json!({ "adapter": adapter.name().name, "rows": rows });
@@ -102,12 +109,22 @@ fn options(arguments: &[String]) -> Options {
 }
 
 /// Prints a row per number of cameras.
-fn measure(case: &Case, adapter: &Adapter, options: &Options, rows: &mut Vec<Value>) {
-    let mut gpu = match GpuRenderer::new(&case.splats, adapter, Budget::default()) {
-        Ok(gpu) => gpu,
-        Err(error) => return println!("| {} | {error} |", case.name),
+fn measure(
+    case: &Case,
+    detail: Detail,
+    adapter: &Adapter,
+    options: &Options,
+    rows: &mut Vec<Value>,
+) {
+    let name = match detail {
+        Detail::Full => case.name.clone(),
+        Detail::Adaptive { .. } => format!("{}, adaptive", case.name),
     };
-    let mut cpu = CpuRenderer::new(&case.splats);
+    let mut cpu = CpuRenderer::with_detail(&case.splats, detail);
+    let mut gpu = match GpuRenderer::like(&cpu, adapter, Budget::default()) {
+        Ok(gpu) => gpu,
+        Err(error) => return println!("| {name} | {error} |"),
+    };
     let most = Duration::from_secs_f32(options.seconds);
     for &count in options.cameras.iter().filter(|&&count| count <= case.cameras.len()) {
         let cameras = &case.cameras[..count];
@@ -161,17 +178,19 @@ fn measure(case: &Case, adapter: &Adapter, options: &Options, rows: &mut Vec<Val
         let work = gpu.workload();
         let cells: Vec<String> = passes.iter().map(|ms| format!("{ms:.3}")).collect();
         println!(
-            "| {} | {count} | {} | {} | {} | {p50:.3} | {p99:.3} | {per_second:.0} | \
+            "| {name} | {count} | {} | {} | {} | {p50:.3} | {p99:.3} | {per_second:.0} | \
              {pipelined:.0} | {cpu_ms:.2} |",
-            case.name,
             work.visible,
             work.pairs,
             cells.join(" | ")
         );
-        rows.push(json!({
-            "scene": case.name, "splats": case.splats.len(), "cameras": count,
-            "call_ms": p50, "cpu_ms": cpu_ms, "images_per_s": per_second, "pipelined_images_per_s": pipelined,
-        }));
+        // Who is compared with us renders every splat.
+        if detail == Detail::Full {
+            rows.push(json!({
+                "scene": case.name, "splats": case.splats.len(), "cameras": count,
+                "call_ms": p50, "cpu_ms": cpu_ms, "images_per_s": per_second, "pipelined_images_per_s": pipelined,
+            }));
+        }
     }
 }
 

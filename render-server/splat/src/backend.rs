@@ -60,8 +60,7 @@ pub enum NoRenderer {
 }
 
 /// Returns the renderer for a scene on this machine. One on a graphics card has the processor
-/// behind it ([`crate::FallbackRenderer`]): no image is missing when its device is lost. `detail` is what the processor
-/// renders; a graphics card renders every splat.
+/// behind it ([`crate::FallbackRenderer`]), in the same detail: no image is missing when its device is lost.
 ///
 /// # Errors
 /// [`NoRenderer::Gpu`] if [`Backend::Gpu`] was asked for and there is none; the others always
@@ -71,12 +70,11 @@ pub fn choose<'a>(
     backend: Backend,
     detail: Detail,
 ) -> Result<Chosen, NoRenderer> {
-    let scene = scene.into();
     let cpu = CpuRenderer::with_detail(scene, detail);
     if backend == Backend::Cpu {
         return Ok(Chosen { rasterizer: Box::new(cpu), reason: "asked for".to_owned() });
     }
-    match (graphics(scene, backend == Backend::Gpu), backend) {
+    match (graphics(&cpu, backend == Backend::Gpu), backend) {
         (Ok((rasterizer, reason)), _) => {
             Ok(Chosen { rasterizer: Box::new(FallbackRenderer::new(rasterizer, cpu)), reason })
         }
@@ -89,7 +87,7 @@ pub fn choose<'a>(
 /// there is none.
 #[cfg(feature = "gpu")]
 fn graphics(
-    scene: Scene<'_>,
+    packed: &CpuRenderer,
     takes_software: bool,
 ) -> Result<(Box<dyn Rasterizer>, String), String> {
     let mut found = Vec::new();
@@ -105,7 +103,7 @@ fn graphics(
             .map_err(|error| error.to_string())
             .and_then(|mut renderer| {
                 let found_db = trial::check(&mut renderer, &opened.0, &opened.1)?;
-                renderer.load(scene).map_err(|error| error.to_string())?;
+                renderer.load(packed).map_err(|error| error.to_string())?;
                 Ok((renderer, found_db))
             });
         match rendered {
@@ -121,7 +119,7 @@ fn graphics(
 }
 
 #[cfg(not(feature = "gpu"))]
-fn graphics(_: Scene<'_>, _: bool) -> Result<(Box<dyn Rasterizer>, String), String> {
+fn graphics(_: &CpuRenderer, _: bool) -> Result<(Box<dyn Rasterizer>, String), String> {
     Err("built without the feature `gpu`".to_owned())
 }
 

@@ -57,7 +57,7 @@ impl fmt::Display for RendererKind {
 pub enum DetailKind {
     /// Every splat.
     Full,
-    /// The processor renders merged splats for what is small in the image, where the scene has a million and more.
+    /// Merged splats for what is small in the image, where the scene has a million and more.
     #[default]
     Adaptive,
 }

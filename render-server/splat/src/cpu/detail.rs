@@ -58,7 +58,7 @@ impl Detail {
 }
 
 /// Blocks of one level that a block of the next stands for.
-pub(super) const BRANCH: usize = 4;
+pub(crate) const BRANCH: usize = 4;
 
 /// Adds the coarser levels to a part that has only the finest.
 pub(super) fn add_levels(part: &mut Part, max_error_px: f32) {

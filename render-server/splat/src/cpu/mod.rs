@@ -14,12 +14,12 @@ mod bin;
 mod blend;
 mod cover;
 mod cull;
-mod detail;
+pub(crate) mod detail;
 mod lens;
 mod merge;
 mod need;
 mod project;
-mod scene;
+pub(crate) mod scene;
 pub mod simd;
 mod sort;
 mod streamed;
@@ -134,6 +134,19 @@ impl CpuRenderer {
         Machine::measure(self.instructions, bytes)
     }
 
+    /// Returns the parts as they are packed, and how far splats may be off [px]; `None` of a scene larger than memory.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn packed(&self) -> Option<(&[scene::Part], f32)> {
+        self.streamed.is_none().then_some((&self.parts, self.max_error_px()))
+    }
+
+    fn max_error_px(&self) -> f32 {
+        match self.detail {
+            Detail::Full => 0.0,
+            Detail::Adaptive { max_error_px } => max_error_px,
+        }
+    }
+
     fn with_instructions(scene: Scene<'_>, detail: Detail, instructions: InstructionSet) -> Self {
         let mut parts = vec![scene::Part::new(0, scene.splats, detail)];
         let moving = scene.objects.iter();
@@ -150,10 +163,7 @@ impl CpuRenderer {
         image: &mut RgbdImage,
         times: &mut PassTimes,
     ) -> Result<(), RenderError> {
-        let max_error_px = match self.detail {
-            Detail::Full => 0.0,
-            Detail::Adaptive { max_error_px } => max_error_px,
-        };
+        let max_error_px = self.max_error_px();
         let Buffers { lenses, views, visible, projected, sorter, bins, tiles } = &mut self.buffers;
         let start = Instant::now();
         views.clear();

@@ -1,4 +1,4 @@
-//! The renderer's own copy of a scene: reordered, precomputed, packed for vectors. What stands
+//! The renderers' own copy of a scene, of which the one for graphics cards is made too: reordered, precomputed, packed for vectors. What stands
 //! still is one part, every rigid object another: a part that moves is rendered as one that stands
 //! still before a camera that moves.
 //!
@@ -20,57 +20,57 @@ use crate::blocks::{self, Bounds};
 
 pub(super) use crate::blocks::BLOCK;
 /// Splats per group: the widest vector.
-pub(super) const GROUP: usize = 16;
+pub(crate) const GROUP: usize = 16;
 
 /// Columns of a group.
-pub(super) mod column {
+pub(crate) mod column {
     /// Centre, x y z. [m, world]
-    pub(in crate::cpu) const MEAN: usize = 0;
+    pub(crate) const MEAN: usize = 0;
     /// The square root of the covariance: axes times scales, column by column. [m, world]
-    pub(in crate::cpu) const AXES: usize = 3;
+    pub(crate) const AXES: usize = 3;
     /// log2 of the opacity.
-    pub(in crate::cpu) const LEVEL: usize = 12;
+    pub(crate) const LEVEL: usize = 12;
     /// How many.
-    pub(in crate::cpu) const COUNT: usize = 13;
+    pub(crate) const COUNT: usize = 13;
 }
 
 /// Numbers of one group's geometry.
-pub(super) const GROUP_NUMBERS: usize = column::COUNT * GROUP;
+pub(crate) const GROUP_NUMBERS: usize = column::COUNT * GROUP;
 
 /// Bounds of [`BLOCK`] consecutive splats.
 #[allow(clippy::struct_field_names, reason = "metres, all of them")]
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Block {
+pub(crate) struct Block {
     /// Middle of the box around the centres. [m, world]
-    pub(super) center_m: Vec3,
+    pub(crate) center_m: Vec3,
     /// Half the sides of that box. [m]
-    pub(super) half_m: Vec3,
+    pub(crate) half_m: Vec3,
     /// The greatest distance from its centre at which a splat of the block still counts. [m]
-    pub(super) reach_m: f32,
+    pub(crate) reach_m: f32,
     /// How far its splats are from what they stand for, as root mean square; 0 for the scene's own
     /// splats. [m]
-    pub(super) error_m: f32,
+    pub(crate) error_m: f32,
 }
 
 /// What stands still, or one rigid object; packed in its own frame.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Part {
+pub(crate) struct Part {
     /// What the image of ids shows.
-    pub(super) id: u16,
+    pub(crate) id: u16,
     /// Level by level, the finest first.
-    pub(super) blocks: Vec<Block>,
+    pub(crate) blocks: Vec<Block>,
     /// The first block of each level; at least one.
-    pub(super) levels: Vec<usize>,
+    pub(crate) levels: Vec<usize>,
     /// [`GROUP_NUMBERS`] per group, whole blocks; the last is padded with centres that are NaN.
-    pub(super) geometry: Vec<f32>,
+    pub(crate) geometry: Vec<f32>,
     /// Halves: per group, coefficient by coefficient, RGB within, 16 splats each.
-    pub(super) sh: Vec<u16>,
+    pub(crate) sh: Vec<u16>,
     /// Coefficients per colour channel.
-    pub(super) coefficients: usize,
+    pub(crate) coefficients: usize,
     /// Splats kept.
-    pub(super) len: usize,
+    pub(crate) len: usize,
     /// [`Splats::antialiased`].
-    pub(super) antialiased: bool,
+    pub(crate) antialiased: bool,
 }
 
 impl Part {
@@ -84,7 +84,7 @@ impl Part {
     }
 
     /// Returns how many numbers the harmonics of a splat are.
-    pub(super) fn sh_numbers(&self) -> usize {
+    pub(crate) fn sh_numbers(&self) -> usize {
         self.coefficients * 3
     }
 

@@ -13,7 +13,8 @@ struct Tick {
     /// (Tile, slot) pairs there is room for.
     pairs: u32,
     has_ids: u32,
-    padding: u32,
+    /// How far splats may be rendered from where they are. [px]
+    max_error: f32,
 }
 
 /// A camera as one part of the scene sees it. `view.rs` holds the same in Rust.

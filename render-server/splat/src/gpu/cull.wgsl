@@ -1,4 +1,5 @@
-// Pass 1: which blocks of splats each camera may see, and the region of slots of each.
+// Pass 1: which blocks of splats each camera may see, and the region of slots of each. Of a tree of blocks, everywhere the
+// coarsest that is off by little enough, as `cpu/cull.rs`.
 
 struct Block {
     /// Middle of the box around the centres. [m, part]
@@ -8,7 +9,14 @@ struct Block {
     /// Half the sides of that box. [m]
     half_size: vec3<f32>,
     part: u32,
+    /// How far its splats are from what they stand for; 0 of the scene's own. [m]
+    error: f32,
+    /// The block that stands for this one, or NONE.
+    parent: u32,
+    padding: vec2<u32>,
 }
+
+const NONE = 0xffffffffu;
 
 @group(0) @binding(0) var<uniform> tick: Tick;
 @group(0) @binding(1) var<storage, read> views: array<View>;
@@ -36,6 +44,31 @@ fn is_seen(block: Block, view: u32) -> bool {
     return true;
 }
 
+/// Whether a block's splats are off by little enough.
+fn is_fine(index: u32, view: u32) -> bool {
+    let center = blocks[index].center - vec3(views[view].row_x.w, views[view].row_y.w, views[view].row_z.w);
+    let ahead = views[view].row_z.xyz;
+    // Of its point that is nearest to the camera.
+    let nearest = dot(ahead, center) - dot(abs(ahead), blocks[index].half_size);
+    let focal = max(abs(views[view].focal.x), abs(views[view].focal.y));
+    return blocks[index].error * focal / max(nearest, views[view].more.z) <= tick.max_error;
+}
+
+/// Whether a block is the coarsest one that is fine: all above it are asked, so that rounding draws nothing twice.
+fn is_drawn(index: u32, view: u32) -> bool {
+    if !is_fine(index, view) {
+        return false;
+    }
+    var above = blocks[index].parent;
+    while above != NONE {
+        if is_fine(above, view) {
+            return false;
+        }
+        above = blocks[above].parent;
+    }
+    return true;
+}
+
 @compute @workgroup_size(256)
 fn cull(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -45,9 +78,9 @@ fn cull(
     let index = group.x * 256u + thread;
     var seen = 0u;
     if index < total {
-        let block = blocks[index % tick.blocks];
-        let view = index / tick.blocks * tick.parts + block.part;
-        if views[view].flags.y != 0u && is_seen(block, view) {
+        let place = index % tick.blocks;
+        let view = index / tick.blocks * tick.parts + blocks[place].part;
+        if views[view].flags.y != 0u && is_drawn(place, view) && is_seen(blocks[place], view) {
             seen = 1u;
         }
     }

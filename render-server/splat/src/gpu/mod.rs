@@ -44,7 +44,7 @@ use view::{GpuView, ImageOffset, Tick};
 use vizflyt_protocol::geometry::Intrinsics;
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
-use crate::{Camera, Placement, RgbdImage, Scene};
+use crate::{Camera, CpuRenderer, Placement, RgbdImage, Scene};
 
 /// Side of a tile; `TILE` in `common.wgsl`. [px]
 const TILE_PX: u32 = 16;
@@ -77,6 +77,7 @@ impl Default for Budget {
 /// Renders a scene with a graphics card.
 #[derive(Debug)]
 pub struct GpuRenderer {
+    /// The adapter's.
     name: String,
     device: Device,
     passes: Passes,
@@ -147,8 +148,20 @@ impl GpuRenderer {
         adapter: &Adapter,
         budget: Budget,
     ) -> Result<Self, RenderError> {
+        Self::like(&CpuRenderer::new(scene), adapter, budget)
+    }
+
+    /// Uploads what a processor's renderer has packed, to render it in the same detail.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; and of a scene larger than memory.
+    pub fn like(
+        packed: &CpuRenderer,
+        adapter: &Adapter,
+        budget: Budget,
+    ) -> Result<Self, RenderError> {
         let device = adapter.open(&budget).map_err(RenderError::Device)?;
-        let scene = GpuScene::new(&device, scene.into())?;
+        let scene = upload(&device, packed)?;
         let passes = Passes {
             cull: cull::Cull::new(&device),
             project: project::Project::new(&device),
@@ -161,7 +174,7 @@ impl GpuRenderer {
             return Err(RenderError::Device(fault));
         }
         Ok(Self {
-            name: format!("gpu {}", adapter.name().name),
+            name: adapter.name().name.clone(),
             limit: Capacity::limit(device.binding_bytes),
             workload: Workload { splats: scene.len, ..Workload::default() },
             device,
@@ -177,17 +190,17 @@ impl GpuRenderer {
         })
     }
 
-    /// Renders another scene from now on.
+    /// Renders another scene from now on, in the detail in which it is packed.
     ///
     /// # Errors
-    /// As [`Self::new`]; this renderer is of no more use then.
+    /// As [`Self::like`]; this renderer is of no more use then.
     ///
     /// # Panics
     /// If a tick is under way.
-    pub fn load<'a>(&mut self, scene: impl Into<Scene<'a>>) -> Result<(), RenderError> {
+    pub fn load(&mut self, packed: &CpuRenderer) -> Result<(), RenderError> {
         assert!(self.in_flight.is_empty(), "finish what was begun first");
         self.bound = None;
-        self.scene = GpuScene::new(&self.device, scene.into())?;
+        self.scene = upload(&self.device, packed)?;
         self.workload = Workload { splats: self.scene.len, ..Workload::default() };
         self.check_device().map_err(SubmitError::into_error)
     }
@@ -329,7 +342,7 @@ impl GpuRenderer {
             regions: buffers.capacity.regions as u32,
             pairs: buffers.capacity.pairs as u32,
             has_ids: u32::from(self.has_ids()),
-            padding: 0,
+            max_error_px: self.scene.max_error_px,
         };
         device.queue.write_buffer(&buffers.tick, 0, zerocopy::IntoBytes::as_bytes(&tick));
         device.queue.write_buffer(&buffers.views, 0, zerocopy::IntoBytes::as_bytes(&views[..]));
@@ -445,6 +458,13 @@ impl GpuRenderer {
     }
 }
 
+fn upload(device: &Device, packed: &CpuRenderer) -> Result<GpuScene, RenderError> {
+    let (parts, max_error_px) = packed.packed().ok_or_else(|| {
+        RenderError::Device("a scene larger than memory is the processor's".to_owned())
+    })?;
+    GpuScene::new(device, parts, max_error_px)
+}
+
 impl SubmitError {
     fn into_error(self) -> RenderError {
         match self {
@@ -456,9 +476,10 @@ impl SubmitError {
 }
 
 impl Rasterizer for GpuRenderer {
-    /// Returns `gpu`, the adapter's name and the interface: `gpu llvmpipe (Vulkan)`.
+    /// Returns `gpu`, the adapter's name and the interface, and whether it is in adaptive detail: `gpu llvmpipe (Vulkan)`.
     fn name(&self) -> Cow<'_, str> {
-        self.name.as_str().into()
+        let detail = if self.scene.max_error_px > 0.0 { ", adaptive detail" } else { "" };
+        format!("gpu {}{detail}", self.name).into()
     }
 
     fn render(

@@ -1,26 +1,25 @@
-//! Packs a scene for the device, once; then it is only read.
+//! Uploads what the processor's renderer has packed ([`crate::cpu`]'s `scene`), once; then it is only read.
 //!
-//! As for the processor, splats stand in blocks ([`crate::blocks`]), here column after column: the threads of a workgroup read neighbouring
-//! words. Blocks of all parts (what stands still, then the objects) lie one after the other in
-//! chunks, each of which a binding can hold.
+//! The same blocks, and the coarser ones that stand for them where those are asked for; here column after column: the
+//! threads of a workgroup read neighbouring words. Blocks of all parts (what stands still, then the objects) lie one after
+//! the other in chunks, each of which a binding can hold.
 //!
-//! Memory on the device: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16: 740 MB for
-//! 5 M splats of degree 3. On the host it is packed chunk by chunk and not kept.
+//! Memory on the device: 52 bytes per splat and 6, 24, 54 or 96 for its harmonics as f16, a third more with coarser blocks:
+//! 740 MB for 5 M splats of degree 3, in full detail.
 
-use half::f16;
 use rayon::prelude::*;
 use zerocopy::{Immutable, IntoBytes};
 
 use super::device::Device;
-use crate::blocks::{self, BLOCK};
-use crate::{RenderError, Scene, Splats};
+use crate::RenderError;
+use crate::blocks::BLOCK;
+use crate::cpu::detail::BRANCH;
+use crate::cpu::scene::{Block, GROUP, GROUP_NUMBERS, Part, column};
 
 /// Words before a block's columns; `HEADER` in `project.wgsl`.
 const HEADER: usize = 4;
-/// Centre, axes times scales, log2 of the opacity.
-const COLUMNS: usize = 13;
 /// Words from block to block.
-const STRIDE: usize = HEADER + COLUMNS * BLOCK;
+const STRIDE: usize = HEADER + column::COUNT * BLOCK;
 /// Blocks that one dispatch can cover.
 const MAX_BLOCKS: usize = 65_535;
 
@@ -33,10 +32,12 @@ pub(super) struct GpuScene {
     pub(super) block_count: u32,
     /// Ids of the parts: what stands still, then the objects.
     pub(super) ids: Vec<u16>,
-    /// [`Splats::antialiased`] of the parts.
+    /// [`crate::Splats::antialiased`] of the parts.
     pub(super) antialiased: Vec<bool>,
     /// Splats kept.
     pub(super) len: usize,
+    /// How far splats may be rendered from where they are. [px]
+    pub(super) max_error_px: f32,
 }
 
 /// Some consecutive blocks.
@@ -57,42 +58,49 @@ struct Bounds {
     reach_m: f32,
     half_m: [f32; 3],
     part: u32,
+    error_m: f32,
+    /// The block that stands for this one, or [`NONE`].
+    parent: u32,
+    padding: [u32; 2],
 }
 
-const _: () = assert!(size_of::<Bounds>() == 32);
+const _: () = assert!(size_of::<Bounds>() == 48);
 
-/// A block before it is packed.
+/// `NONE` of `cull.wgsl`.
+const NONE: u32 = u32::MAX;
+
+/// A block before it is uploaded.
 #[derive(Clone, Copy)]
 struct Pending<'a> {
     part: u32,
-    splats: &'a Splats,
-    /// Which of its splats.
-    order: &'a [u32],
+    packed: &'a Part,
+    /// Which of its blocks.
+    block: usize,
 }
 
 impl Pending<'_> {
     /// Words of its harmonics.
     fn harmonics_words(&self) -> usize {
-        self.splats.sh_coefficients() * 3 * BLOCK / 2
+        self.packed.sh_numbers() * BLOCK / 2
     }
 }
 
 impl GpuScene {
-    /// Packs and uploads a scene.
-    pub(super) fn new(device: &Device, scene: Scene<'_>) -> Result<Self, RenderError> {
-        let objects = scene.objects.iter().map(|object| &object.splats);
-        let parts: Vec<&Splats> = std::iter::once(scene.splats).chain(objects).collect();
-        let orders: Vec<Vec<u32>> = parts.iter().map(|splats| blocks::order(splats)).collect();
-        let pending: Vec<Pending<'_>> = parts
-            .iter()
-            .zip(&orders)
-            .zip(0..)
-            .flat_map(|((splats, order), part)| {
-                order.chunks(BLOCK).map(move |order| Pending { part, splats, order })
-            })
-            .collect();
-        let bounds: Vec<Bounds> = pending.par_iter().map(bounds).collect();
-        let blocks = device.storage("blocks", bounds.len() as u64 * 32);
+    /// Uploads packed parts.
+    pub(super) fn new(
+        device: &Device,
+        parts: &[Part],
+        max_error_px: f32,
+    ) -> Result<Self, RenderError> {
+        let mut pending = Vec::new();
+        let mut bounds = Vec::new();
+        for (part, packed) in (0..).zip(parts) {
+            let first = pending.len();
+            let blocks = 0..packed.blocks.len();
+            pending.extend(blocks.map(|block| Pending { part, packed, block }));
+            bounds.extend(all_bounds(part, packed, first));
+        }
+        let blocks = device.storage("blocks", size_of_val(&bounds[..]) as u64);
         device.queue.write_buffer(&blocks, 0, bounds.as_bytes());
 
         let mut chunks = Vec::new();
@@ -114,11 +122,28 @@ impl GpuScene {
             blocks,
             chunks,
             block_count: pending.len() as u32,
-            ids: std::iter::once(0).chain(scene.objects.iter().map(|object| object.id)).collect(),
-            antialiased: parts.iter().map(|splats| splats.antialiased).collect(),
-            len: orders.iter().map(Vec::len).sum(),
+            ids: parts.iter().map(|part| part.id).collect(),
+            antialiased: parts.iter().map(|part| part.antialiased).collect(),
+            len: parts.iter().map(|part| part.len).sum(),
+            max_error_px,
         })
     }
+}
+
+/// Returns the bounds of a part's blocks, the first of which is the scene's `first`.
+fn all_bounds(part: u32, packed: &Part, first: usize) -> impl Iterator<Item = Bounds> {
+    let begins = packed.levels.iter().copied();
+    let ends = begins.clone().skip(1).chain([packed.blocks.len()]);
+    begins.zip(ends).flat_map(move |(begin, end)| {
+        packed.blocks[begin..end].iter().enumerate().map(move |(i, block)| {
+            let Block { center_m, half_m, reach_m, error_m } = *block;
+            // The coarsest level stands for itself.
+            let is_last = end == packed.blocks.len();
+            let parent = if is_last { NONE } else { (first + end + i / BRANCH) as u32 };
+            let (center_m, half_m) = (center_m.to_array(), half_m.to_array());
+            Bounds { center_m, reach_m, half_m, part, error_m, parent, padding: [0; 2] }
+        })
+    })
 }
 
 /// Returns how many of the next blocks one chunk can hold.
@@ -166,29 +191,66 @@ const BLOCKS_PER_UPLOAD: usize = 2048;
 
 /// Returns a block's header and columns, and its harmonics.
 fn pack(block: &Pending<'_>) -> (Vec<u32>, Vec<u32>) {
-    let Pending { part, splats, order } = *block;
-    let coefficients = splats.sh_coefficients();
-    let numbers = coefficients * 3;
+    let Pending { part, packed, block } = *block;
+    let numbers = packed.sh_numbers();
+    let groups = BLOCK / GROUP;
+    let geometry = &packed.geometry[block * groups * GROUP_NUMBERS..][..groups * GROUP_NUMBERS];
+    let sh = &packed.sh[block * BLOCK * numbers..][..BLOCK * numbers];
     let mut columns = vec![0; STRIDE];
-    columns[..HEADER].copy_from_slice(&[part, 0, coefficients as u32, order.len() as u32]);
-    let mut halves = vec![0u32; block.harmonics_words()];
-    for (lane, &i) in order.iter().enumerate() {
-        let i = i as usize;
-        let axes = blocks::axes(splats, i);
-        let values = splats.means_m[i].to_array().into_iter().chain(axes.to_cols_array());
-        for (column, value) in values.chain([splats.opacities[i].log2()]).enumerate() {
-            columns[HEADER + column * BLOCK + lane] = value.to_bits();
+    let mut halves = vec![0u32; numbers * BLOCK / 2];
+    let mut splats = 0;
+    for (group, geometry) in geometry.chunks_exact(GROUP_NUMBERS).enumerate() {
+        splats += geometry[column::MEAN..][..GROUP].iter().filter(|x| !x.is_nan()).count();
+        for (column, values) in geometry.chunks_exact(GROUP).enumerate() {
+            let to = &mut columns[HEADER + column * BLOCK + group * GROUP..][..GROUP];
+            to.iter_mut().zip(values).for_each(|(to, value)| *to = value.to_bits());
         }
-        for (k, &value) in splats.sh[i * numbers..(i + 1) * numbers].iter().enumerate() {
-            // Clamped: f16 ends at 65504, and an infinity would become NaN.
-            let bits = f16::from_f32(value.clamp(-6e4, 6e4)).to_bits();
-            halves[k * BLOCK / 2 + lane / 2] |= u32::from(bits) << (lane % 2 * 16);
+        for k in 0..numbers {
+            let from = &sh[(group * numbers + k) * GROUP..][..GROUP];
+            let to = &mut halves[k * (BLOCK / 2) + group * (GROUP / 2)..][..GROUP / 2];
+            for (to, pair) in to.iter_mut().zip(from.chunks_exact(2)) {
+                *to = u32::from(pair[0]) | u32::from(pair[1]) << 16;
+            }
         }
     }
+    columns[..HEADER].copy_from_slice(&[part, 0, packed.coefficients as u32, splats as u32]);
     (columns, halves)
 }
 
-fn bounds(block: &Pending<'_>) -> Bounds {
-    let blocks::Bounds { center_m, half_m, reach_m } = blocks::bounds(block.splats, block.order);
-    Bounds { center_m: center_m.to_array(), reach_m, half_m: half_m.to_array(), part: block.part }
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CpuRenderer, Detail, Splats};
+
+    #[test]
+    fn a_block_lies_within_the_one_that_stands_for_it() {
+        for count in [0usize, 100, 256, 1024, 5000, 20_000] {
+            let mut splats = Splats::default();
+            for i in 0..count {
+                let at = |share: f64| (share * i as f64).fract() as f32 * 10.0;
+                splats.means_m.push(glam::Vec3::new(at(0.819_172), at(0.671_043), at(0.549_7)));
+                splats.scales_m.push(glam::Vec3::splat(0.02));
+                splats.rotations.push(glam::Quat::IDENTITY);
+                splats.opacities.push(0.8);
+                splats.sh.extend([0.1; 3]);
+            }
+            let packed = CpuRenderer::with_detail(&splats, Detail::ADAPTIVE);
+            let part = &packed.packed().expect("it is in memory").0[0];
+            let bounds: Vec<Bounds> = all_bounds(3, part, 7).collect();
+            assert_eq!(bounds.len(), part.blocks.len());
+            for (i, block) in bounds.iter().enumerate() {
+                assert_eq!(block.part, 3);
+                if block.parent == NONE {
+                    assert_eq!(i + 1, bounds.len(), "one stands for all");
+                    continue;
+                }
+                let above = &bounds[block.parent as usize - 7];
+                assert!(above.error_m >= block.error_m);
+                for k in 0..3 {
+                    let off_m = (block.center_m[k] - above.center_m[k]).abs();
+                    assert!(off_m + block.half_m[k] <= above.half_m[k] + 1e-5);
+                }
+            }
+        }
+    }
 }

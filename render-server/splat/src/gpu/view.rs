@@ -19,7 +19,7 @@ pub(super) struct Tick {
     pub(super) regions: u32,
     pub(super) pairs: u32,
     pub(super) has_ids: u32,
-    pub(super) padding: u32,
+    pub(super) max_error_px: f32,
 }
 
 /// `View` of `common.wgsl`, field by field.

@@ -3,9 +3,12 @@
 #![cfg(feature = "gpu")]
 
 mod agreement;
+#[path = "../../benches/detail/city.rs"]
+mod city;
 #[allow(dead_code, reason = "the oracle's tests use more of it")]
 #[path = "../images/compare.rs"]
 mod compare;
+mod detail;
 mod limits;
 mod poison;
 mod twins;

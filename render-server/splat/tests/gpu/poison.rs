@@ -4,8 +4,8 @@ use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::gpu::GpuRenderer;
 use vizflyt_splat::{
-    Camera, InvalidCamera, Rasterizer, RenderError, RgbdImage, RigidObject, Scene, Splats,
-    render_reference,
+    Camera, CpuRenderer, InvalidCamera, Rasterizer, RenderError, RgbdImage, RigidObject, Scene,
+    Splats, render_reference,
 };
 
 use crate::{compare, renderer, twins};
@@ -42,7 +42,7 @@ impl GpuTest {
     }
 
     fn render_one(&mut self, splats: &Splats, camera: &Camera) -> RgbdImage {
-        self.0.load(splats).expect("room");
+        self.0.load(&CpuRenderer::new(splats)).expect("room");
         let mut image = [RgbdImage::default()];
         self.0.render(&[], &[*camera], &mut image).expect("a valid camera");
         let [image] = image;
