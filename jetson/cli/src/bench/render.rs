@@ -45,7 +45,7 @@ pub(super) struct RenderArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// How much of a large scene the processor renders; a graphics card renders all of it
+    /// How much of a large scene is rendered
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     detail: DetailKind,
     #[arg(long, value_name = "NAME", help = format!(

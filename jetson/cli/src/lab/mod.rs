@@ -85,7 +85,7 @@ pub(crate) struct LabArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter.
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
-    /// How much of a large scene the processor renders; a graphics card renders all of it.
+    /// How much of a large scene is rendered.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
     /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file.

@@ -70,7 +70,7 @@ pub struct ViewArgs {
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
 
-    /// How much of a large scene the processor draws; a graphics card draws all of it
+    /// How much of a large scene is drawn
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
