@@ -55,6 +55,8 @@ pub fn serve(args: ServeArgs) -> Result<()> {
     descriptors::raise_limit();
     let stop = Stop::default();
     let mut args = args;
+    // Unnamed, they would be called as the thread that needs them first; an error says that they are there already.
+    let _ = rayon::ThreadPoolBuilder::new().thread_name(|i| format!("render-{i}")).build_global();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .thread_name("net")
