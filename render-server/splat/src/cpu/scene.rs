@@ -1,5 +1,5 @@
-//! The renderers' own copy of a scene, of which the one for graphics cards is made too: reordered, precomputed, packed for vectors. What stands
-//! still is one part, every rigid object another: a part that moves is rendered as one that stands
+//! The renderers' own copy of a scene, of which the one for graphics cards is made too: reordered, precomputed, packed for
+//! vectors. What stands still is one part, every rigid object another: a part that moves is rendered as one that stands
 //! still before a camera that moves.
 //!
 //! Splats stand in blocks ([`crate::blocks`]). Within a block, groups of 16 splats hold column after column

@@ -1,7 +1,7 @@
 //! Pass 1: which blocks each camera may see, of coarser ones those that do.
 //!
-//! Budget: 48 bytes read per block of 256 splats and camera, and as many of those above it in adaptive detail; 4 written; two dispatches, some 5 us
-//! per million splats.
+//! Budget: 48 bytes read per block of 256 splats and camera, and of those above it in adaptive detail; 4 written; two
+//! dispatches, some 5 us per million splats.
 
 use super::buffers::Buffers;
 use super::device::{Device, Groups, Kernel};

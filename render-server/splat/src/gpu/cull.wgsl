@@ -51,7 +51,9 @@ fn is_fine(index: u32, view: u32) -> bool {
     // Of its point that is nearest to the camera.
     let nearest = dot(ahead, center) - dot(abs(ahead), blocks[index].half_size);
     let focal = max(abs(views[view].focal.x), abs(views[view].focal.y));
-    return blocks[index].error * focal / max(nearest, views[view].more.z) <= tick.max_error;
+    let px_per_m = focal / max(nearest, views[view].more.z);
+    // The scene's own splats always are: also where a number overflows.
+    return blocks[index].error == 0.0 || blocks[index].error * px_per_m <= tick.max_error;
 }
 
 /// Whether a block is the coarsest one that is fine: all above it are asked, so that rounding draws nothing twice.

@@ -137,7 +137,7 @@ fn all_bounds(part: u32, packed: &Part, first: usize) -> impl Iterator<Item = Bo
     begins.zip(ends).flat_map(move |(begin, end)| {
         packed.blocks[begin..end].iter().enumerate().map(move |(i, block)| {
             let Block { center_m, half_m, reach_m, error_m } = *block;
-            // The coarsest level stands for itself.
+            // Nothing stands for the coarsest level.
             let is_last = end == packed.blocks.len();
             let parent = if is_last { NONE } else { (first + end + i / BRANCH) as u32 };
             let (center_m, half_m) = (center_m.to_array(), half_m.to_array());
