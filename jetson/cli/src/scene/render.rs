@@ -66,7 +66,7 @@ pub(crate) struct RenderArgs {
     /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// How much of a large scene is rendered; adaptive is what it does in flight
+    /// How much of a large scene is rendered; adaptive is as in flight
     #[arg(long, value_enum, value_name = "HOW", default_value_t = DetailKind::Full)]
     detail: DetailKind,
     /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
