@@ -14,7 +14,7 @@ use anyhow::{Result, anyhow};
 use bytes::Bytes;
 use rustdds::dds::adapters::no_key as adapters;
 use rustdds::no_key::{DataWriter, SimpleDataReader};
-use rustdds::policy::{Durability, History, Reliability};
+use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
 use rustdds::{
     DataWriterStatus, DomainParticipant, DomainParticipantBuilder, Publisher, QosPolicies,
     QosPolicyBuilder, RepresentationIdentifier, StatusEvented, Subscriber, Timestamp, TopicKind,
@@ -177,30 +177,38 @@ impl Inbox {
 
 fn policies(qos: Qos, reliable: bool) -> QosPolicies {
     let is_reliable = match qos {
-        Qos::SensorData => reliable,
+        Qos::SensorData | Qos::Bulk => reliable,
         Qos::Command => false,
         Qos::Default | Qos::Tf | Qos::TfStatic => true,
     };
     let depth = match qos {
         Qos::SensorData => 5,
+        Qos::Bulk => 2,
         Qos::Default => 10,
         Qos::Tf => 100,
         Qos::TfStatic | Qos::Command => 1,
     };
     let durability =
         if qos == Qos::TfStatic { Durability::TransientLocal } else { Durability::Volatile };
-    let max_blocking_time = rustdds::Duration::from_millis(100);
-    let reliability = if is_reliable {
-        Reliability::Reliable { max_blocking_time }
+    let builder =
+        QosPolicyBuilder::new().durability(durability).history(History::KeepLast { depth });
+    if !is_reliable {
+        return builder.reliability(Reliability::BestEffort).build();
+    }
+    let wait = if qos == Qos::Bulk { 0 } else { 100 };
+    let max_blocking_time = rustdds::Duration::from_millis(wait);
+    let builder = builder.reliability(Reliability::Reliable { max_blocking_time });
+    if qos == Qos::Bulk {
+        builder.resource_limits(MOST_UNACKNOWLEDGED).build()
     } else {
-        Reliability::BestEffort
-    };
-    QosPolicyBuilder::new()
-        .reliability(reliability)
-        .durability(durability)
-        .history(History::KeepLast { depth })
-        .build()
+        builder.build()
+    }
 }
+
+/// RustDDS keeps all that a reliable subscriber has not acknowledged, whatever the depth: of one that has stopped, 8,192
+/// images. Of images it keeps these, and then leaves out what comes, without waiting, until that subscriber counts as gone.
+const MOST_UNACKNOWLEDGED: ResourceLimits =
+    ResourceLimits { max_samples: 64, max_instances: 1, max_samples_per_instance: 64 };
 
 /// Hands bytes over as they are: encoding is `cdr`'s.
 struct Raw;
@@ -248,5 +256,20 @@ impl<'de> adapters::Decode<'de, Payload> for RawDecoder {
     ) -> Result<Payload, Infallible> {
         let little = encoding == RepresentationIdentifier::CDR_LE;
         Ok(Payload { bytes: input_bytes.to_vec(), little })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn images_that_wait_are_few_and_make_nobody_wait() {
+        let best_effort = policies(Qos::Bulk, false);
+        assert_eq!(best_effort.history(), Some(History::KeepLast { depth: 2 }));
+        let reliable = policies(Qos::Bulk, true);
+        assert_eq!(reliable.resource_limits(), Some(MOST_UNACKNOWLEDGED));
+        let at_once = rustdds::Duration::from_millis(0);
+        assert_eq!(reliable.reliable_max_blocking_time(), Some(at_once));
     }
 }

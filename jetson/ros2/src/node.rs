@@ -38,9 +38,9 @@ impl Participants {
         Ok(())
     }
 
-    /// Says goodbye, behind what was sent last. A participant's is one packet, which may be lost, and which RustDDS may
-    /// not send where the processor is busy; subscribers then keep the node for 50 s. So topics are withdrawn first, by
-    /// writers that repeat what is not acknowledged, for a while.
+    /// Says goodbye, behind what was sent last. A participant's is one packet, which may be lost, and which RustDDS does
+    /// not send if images still wait when it ends; subscribers then keep the node for 50 s. So topics are withdrawn first,
+    /// by writers that repeat what is not acknowledged, for a while.
     pub(crate) fn leave(&self) {
         let mut left = [lock(&self.state).take(), lock(&self.images).take()];
         thread::sleep(LAST_IMAGE);
@@ -58,8 +58,9 @@ fn lock(dds: &Mutex<Option<Dds>>) -> MutexGuard<'_, Option<Dds>> {
 const JPEG_QUALITY: u8 = 95;
 /// The last image is under way for less.
 const LAST_IMAGE: Duration = Duration::from_millis(100);
-/// How long the withdrawal of topics may be repeated; the vehicle still flies as it was told last.
-const GOODBYE: Duration = Duration::from_millis(300);
+/// How long the withdrawal of topics may take and be repeated. RustDDS sends it behind the images that wait, two of each
+/// topic: clouds of 5 MB take a tenth of a second each where the processor is free.
+const GOODBYE: Duration = Duration::from_millis(900);
 /// Images that wait to be sent; a further one takes nobody's place and is left out.
 const WAITING_IMAGES: usize = 4;
 const CAMERA_TOPICS: [Topic; 6] = [

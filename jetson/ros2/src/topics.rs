@@ -11,6 +11,9 @@ pub enum Qos {
     /// `SensorDataQoS`: best effort, volatile, keep last 5; with `--reliable` reliable instead, as REP 2003 has drivers
     /// send, so that subscribers of both kinds get it.
     SensorData,
+    /// The same of what fills a network, keep last 2: messages that wait to be sent are soon old, and what is said behind
+    /// them waits for them.
+    Bulk,
     /// The default of ROS 2: reliable, volatile, keep last 10.
     Default,
     /// `DynamicBroadcasterQoS` of tf2: reliable, volatile, keep last 100.
@@ -26,6 +29,7 @@ impl Qos {
     pub fn words(self) -> &'static str {
         match self {
             Self::SensorData => "best effort, volatile, 5",
+            Self::Bulk => "best effort, volatile, 2",
             Self::Default => "reliable, volatile, 10",
             Self::Tf => "reliable, volatile, 100",
             Self::TfStatic => "reliable, transient local, 1",
@@ -75,11 +79,11 @@ impl Topic {
 
 /// Colour.
 pub const IMAGE: Topic =
-    Topic::new::<Image>("CAMERA/image_raw", Qos::SensorData, OPTICAL, "colour, `rgb8`");
+    Topic::new::<Image>("CAMERA/image_raw", Qos::Bulk, OPTICAL, "colour, `rgb8`");
 /// Colour as JPEG.
 pub const COMPRESSED: Topic = Topic::new::<CompressedImage>(
     "CAMERA/image_raw/compressed",
-    Qos::SensorData,
+    Qos::Bulk,
     OPTICAL,
     "colour, `jpeg`, of the decoded image",
 );
@@ -93,7 +97,7 @@ pub const CAMERA_INFO: Topic = Topic::new::<CameraInfo>(
 /// Depth.
 pub const DEPTH: Topic = Topic::new::<Image>(
     "CAMERA/depth/image_raw",
-    Qos::SensorData,
+    Qos::Bulk,
     OPTICAL,
     "depth along the optical axis: `32FC1` [m], no return is NaN; or `16UC1` [mm], no return is 0",
 );
@@ -107,14 +111,14 @@ pub const DEPTH_INFO: Topic = Topic::new::<CameraInfo>(
 /// Depth as points.
 pub const DEPTH_POINTS: Topic = Topic::new::<PointCloud2>(
     "CAMERA/depth/points",
-    Qos::SensorData,
+    Qos::Bulk,
     OPTICAL,
     "a point a pixel: x, y, z [m], rgb",
 );
 /// A LiDAR's sweep.
 pub const LIDAR: Topic = Topic::new::<PointCloud2>(
     "SENSOR/points",
-    Qos::SensorData,
+    Qos::Bulk,
     "`SENSOR`",
     "a LiDAR's sweep: x, y, z [m], before_ns, intensity, ring",
 );
