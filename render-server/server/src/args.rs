@@ -80,6 +80,10 @@ pub struct ServeArgs {
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
+    /// Memory for the blocks of a packed scene, which is drawn from the disk [MiB]
+    #[arg(long, value_name = "MIB", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..))]
+    pub scene_memory: u32,
+
     /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,

@@ -95,7 +95,7 @@ struct Flown {
 
 fn fly(packed: &Path, memory_mib: usize, seconds: f64) -> Result<(), Box<dyn Error>> {
     let opened = |loading| -> Result<CpuRenderer, Box<dyn Error>> {
-        Ok(CpuRenderer::streamed(PackedScene::open(packed)?, memory_mib << 20, loading)?)
+        Ok(CpuRenderer::streamed(PackedScene::open(packed)?, &[], memory_mib << 20, loading)?)
     };
     let start = Instant::now();
     let mut renderer = opened(Loading::Live)?;

@@ -352,3 +352,40 @@ fn a_captured_scene_is_rendered() {
     assert!(report["images_delivered"].as_u64().unwrap() > 10, "{report:#}");
     assert_ne!(report["outcome"], "error", "{report:#}");
 }
+
+/// A scene larger than memory, in small: drawn from the disk, with the trees where they are.
+#[test]
+fn a_packed_scene_is_flown_in() {
+    let file = ReportFile::new();
+    let at = |name: &str| file.0.path().join(name).to_str().unwrap().to_owned();
+    let (forest, packed) = (at("forest"), at("forest/forest.packed"));
+    good(&["scene", "generate", "forest", "--seed", "7", "-o", &forest]);
+    let arena = at("forest/arena.toml");
+    let in_memory = good(&["arena", "check", &arena]);
+    good(&["scene", "pack", &arena, &packed]);
+    std::fs::remove_file(at("forest/scene.ply")).unwrap();
+    let text = std::fs::read_to_string(&arena).unwrap();
+    let name = |scene: &str| {
+        let named = text.replacen(r#"scene = "scene.ply""#, scene, 1);
+        std::fs::write(&arena, named).unwrap();
+    };
+    name(r#"scene = { file = "forest.packed", up = "-y" }"#);
+    check_refused(&["arena", "check", &arena], &["a packed scene lies where it was packed"]);
+    name(r#"scene = "forest.packed""#);
+    // The shortest way round the obstacles is as long.
+    assert_eq!(good(&["arena", "check", &arena]), in_memory);
+    check_refused(&["scene", "inspect", &packed], &["a packed scene", "that it was packed of"]);
+
+    let mut demo = file.demo(&["--scene", &forest, "--seconds", "12"]);
+    demo.wait(FLIGHT);
+    let report = file.read();
+    assert!(report["renderer"].as_str().unwrap().ends_with("streamed"), "{report:#}");
+    assert!(report["images_delivered"].as_u64().unwrap() > 100, "{report:#}");
+    assert_ne!(report["outcome"], "error", "{report:#}");
+    // Judged from the log by the forest as it was made.
+    let log = report["log"].as_str().unwrap();
+    let verdict: Value =
+        serde_json::from_str(&good(&["grade", "judge", log, "--seed=7", "--json"])).unwrap();
+    assert!(verdict["min_clearance_m"].as_f64().unwrap() > 0.0, "{verdict:#}");
+    assert_eq!(verdict["outcome"], report["outcome"], "{report:#} {verdict:#}");
+}

@@ -24,9 +24,15 @@ fuzz_target!(|bytes: &[u8]| {
         bytes[CHECKED..CHECKED + 4].copy_from_slice(&crc.sum().to_le_bytes());
     }
     let len = bytes.len();
-    let Ok(scene) = PackedScene::from_source(Box::new(Cursor::new(bytes))) else { return };
+    let Ok(mut scene) = PackedScene::from_source(Box::new(Cursor::new(bytes))) else { return };
     assert!(scene.len() <= len, "{} splats in {len} bytes", scene.len());
-    let Ok(mut renderer) = CpuRenderer::streamed(scene, 1 << 24, Loading::Whole) else { return };
+    let all = glam::Vec3::INFINITY;
+    if let Ok(near) = scene.splats_within(-all, all, len) {
+        assert!(near.len() <= len, "{} splats in {len} bytes", near.len());
+    }
+    let Ok(mut renderer) = CpuRenderer::streamed(scene, &[], 1 << 24, Loading::Whole) else {
+        return;
+    };
     let camera = Camera::new(Intrinsics::from_horizontal_fov(48, 32, 1.2), Pose::IDENTITY, 0.05);
     // Damage is told; nothing else is wrong with the camera.
     let _ = renderer.render(&[], &[camera], &mut [RgbdImage::default()]);

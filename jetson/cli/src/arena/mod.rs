@@ -113,7 +113,7 @@ fn check_file(path: &Path) -> Result<bool> {
     let text = std::fs::read_to_string(&file)
         .with_context(|| format!("cannot read {}", file.display()))?;
     settings::of_arena(&file)?;
-    let scene = scene::load(&file, &BareArgs::default())?;
+    let scene = scene::load_to_fly(&file, &BareArgs::default())?;
     SensorSet::new(&scene.arena.sensors).with_context(|| file.display().to_string())?;
     let still = Arc::new(scene::bake(&scene.splats, &scene.arena, scene.seen.as_ref()));
     let mut findings = scene::check_fit(&scene.splats, &scene.arena, &still);

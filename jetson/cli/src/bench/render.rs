@@ -279,7 +279,7 @@ fn opened(args: &RenderArgs) -> Result<Opened> {
         let start = Instant::now();
         let memory_bytes = args.memory as usize * (1 << 20);
         // What images need is read by those that do not count.
-        let renderer = open_packed(&args.scene, args.renderer, memory_bytes, Loading::Whole)?;
+        let renderer = open_packed(&args.scene, &[], args.renderer, memory_bytes, Loading::Whole)?;
         return Ok(Opened {
             path: args.scene.clone(),
             splats: renderer.workload().splats,

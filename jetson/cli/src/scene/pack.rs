@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 use clap::Args;
+use vizflyt_server::scene::placed;
 use vizflyt_splat::{Detail, pack};
 
 use crate::terminal::print_fmt;
@@ -14,15 +15,18 @@ use crate::terminal::print_fmt;
 #[command(
     after_help = "A streamed scene (lod-meta.json) is read chunk by chunk, so that packing takes the memory of the \
 largest; any other is read whole. The file takes some 80 bytes a splat without harmonics, 200 with all of them. `scene \
-render` and `bench render` draw it within --memory; cameras are in the frame of the scene's file. What needs the splats \
-themselves (arenas, `serve`, collisions, the other scene commands) takes the scene that it was packed of, not this.
+render` and `bench render` draw it within --memory. An arena.toml that names it (scene = \"city.packed\") is flown in; it lies \
+where it was packed, in metres of the world: give the arena.toml of the scene itself where [scene] places it. The other \
+scene commands, and graded flights, take the scene that it was packed of, not this.
 
 Examples:
   vizflyt scene pack city/lod-meta.json city.packed
+  vizflyt scene pack lab/arena.toml lab.packed
   vizflyt scene render city.packed --camera cam.json --memory 1024"
 )]
 pub(crate) struct PackArgs {
-    /// The scene: of any format, or a streamed SOG (lod-meta.json, or its folder), of which the finest level is taken
+    /// The scene: of any format, or a streamed SOG (lod-meta.json, or its folder), of which the finest level is taken; or an
+    /// arena.toml, which places its scene
     from: PathBuf,
     /// The file to write
     to: PathBuf,
@@ -32,7 +36,8 @@ pub(crate) struct PackArgs {
 pub(super) fn run(args: &PackArgs) -> Result<()> {
     let start = Instant::now();
     let mut shown_s = 0;
-    let summary = pack(&args.from, &args.to, Detail::ADAPTIVE_PX, |so_far| {
+    let (scene, place) = placed(&args.from)?;
+    let summary = pack(&scene, &args.to, Detail::ADAPTIVE_PX, place, |so_far| {
         // Progress once a second.
         if start.elapsed().as_secs() > shown_s {
             shown_s = start.elapsed().as_secs();

@@ -144,7 +144,7 @@ fn opened(args: &RenderArgs) -> Result<(Box<dyn Rasterizer>, MovingObjects, Inst
         }
         let start = Instant::now();
         let memory_bytes = args.memory as usize * (1 << 20);
-        let renderer = open_packed(&args.scene, args.renderer, memory_bytes, Loading::Whole)?;
+        let renderer = open_packed(&args.scene, &[], args.renderer, memory_bytes, Loading::Whole)?;
         print_fmt!("scene       {}: {} splats", args.scene.display(), renderer.workload().splats);
         print_fmt!("renderer    {}", renderer.name());
         return Ok((Box::new(renderer), MovingObjects::default(), start));

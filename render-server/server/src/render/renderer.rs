@@ -7,7 +7,9 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use serde::Serialize;
-use vizflyt_splat::{Backend, Chosen, CpuRenderer, Detail, Loading, PackedScene, Scene};
+use vizflyt_splat::{
+    Backend, Chosen, CpuRenderer, Detail, Loading, PackedScene, RigidObject, Scene,
+};
 
 /// Which renderer renders, for reports and the page.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
@@ -82,12 +84,14 @@ impl fmt::Display for DetailKind {
     }
 }
 
-/// Returns the renderer of a packed scene ([`vizflyt_splat::pack`]), which has at most so many bytes of it in memory.
+/// Returns the renderer of a packed scene ([`vizflyt_splat::pack`]), which has at most so many bytes of it in memory, and of
+/// what moves in it.
 ///
 /// # Errors
 /// If the file cannot be used, or a graphics adapter was asked for: they render what is in memory.
 pub fn open_packed(
     path: &Path,
+    objects: &[RigidObject],
     kind: RendererKind,
     memory_bytes: usize,
     loading: Loading,
@@ -97,7 +101,7 @@ pub fn open_packed(
     }
     let cannot = || format!("cannot use scene {}", path.display());
     let scene = PackedScene::open(path).with_context(cannot)?;
-    CpuRenderer::streamed(scene, memory_bytes, loading).with_context(cannot)
+    CpuRenderer::streamed(scene, objects, memory_bytes, loading).with_context(cannot)
 }
 
 /// Returns the renderer of a scene, which it packs a copy of.

@@ -19,6 +19,7 @@ mod fit;
 mod floor;
 mod models;
 mod objects;
+mod packed;
 mod parts;
 mod placement;
 mod seen;
@@ -33,6 +34,7 @@ pub use fit::check_fit;
 pub use models::model;
 pub(crate) use objects::bake_object;
 pub use objects::{bounds_m, obstacles};
+pub use packed::placed;
 pub use parts::{BoxedPart, PartsFile, parts_path};
 pub use placement::{Placement, WorldFromScene};
 pub use seen::{Seen, scene_hash, seen_path, write_seen};
@@ -46,7 +48,7 @@ use tracing::{info, warn};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::format::{self, Loaded, Progress};
-use vizflyt_splat::{RigidObject, Splats};
+use vizflyt_splat::{PackedScene, RigidObject, Splats};
 
 /// A loaded twin.
 #[derive(Debug)]
@@ -62,6 +64,8 @@ pub struct Scene {
     pub world_from_scene: WorldFromScene,
     /// What the capture has seen, where the arena takes all else for solid.
     pub seen: Option<Seen>,
+    /// The whole twin as a packed file, where `splats` are those near the fence alone.
+    pub packed: Option<PathBuf>,
 }
 
 /// What a path on the command line names.
@@ -82,6 +86,21 @@ pub fn load(path: &Path, bare: &BareArgs) -> Result<Scene> {
         }
         Named::Scene(path) => without_arena(&path, bare),
     }
+}
+
+/// As [`load`], of an arena with a packed scene too: that is drawn from the disk.
+///
+/// # Errors
+/// As [`load`]; more splats near the fence than fit into memory.
+pub fn load_to_fly(path: &Path, bare: &BareArgs) -> Result<Scene> {
+    if let Named::Arena(path) = named(path)? {
+        let (arena, scene) = parse_arena(&path)?;
+        if PackedScene::is_packed(&scene) {
+            bare.check_unused(&path)?;
+            return packed::near(arena, &path, scene);
+        }
+    }
+    load(path, bare)
 }
 
 /// As [`load`], with splats in the place of those in the scene's file.
@@ -219,7 +238,8 @@ fn in_arena(
 ) -> Result<Scene> {
     let objects = read_objects(&arena, path)?;
     put(&arena, &mut splats)?;
-    Ok(Scene { splats, arena, objects, world_from_scene: WorldFromScene::IDENTITY, seen })
+    let world_from_scene = WorldFromScene::IDENTITY;
+    Ok(Scene { splats, arena, objects, world_from_scene, seen, packed: None })
 }
 
 /// Puts splats, as their file has them, where an arena wants them, to be rendered as it says.
@@ -263,7 +283,7 @@ fn in_the_open(path: &Path, bare: &BareArgs, mut splats: Splats) -> Result<Scene
     if let Some(guessed) = bare.guessed(&arena.scene) {
         warn!("{} has no arena, so this is guessed: {guessed}", path.display());
     }
-    Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene, seen: None })
+    Ok(Scene { arena, splats, objects: Vec::new(), world_from_scene, seen: None, packed: None })
 }
 
 /// Reads the splats of a file of any format.

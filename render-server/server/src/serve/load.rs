@@ -2,18 +2,18 @@
 
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use tracing::warn;
 use vizflyt_arena::{ArenaConfig, DistanceField, Referee};
 use vizflyt_splat::sensor::SensorScene;
-use vizflyt_splat::{Chosen, Scene as RenderedScene};
+use vizflyt_splat::{Chosen, Loading, Scene as RenderedScene};
 
 use crate::args::ServeArgs;
 use crate::clock;
-use crate::render::choose;
 use crate::render::dynamic_objects::{DynamicObjects, vehicle_models};
 use crate::render::sensors::SensorSet;
-use crate::scene::{self, Scene};
+use crate::render::{choose, open_packed};
+use crate::scene::{self, Antialiased, Scene};
 use crate::web::top_view::TopView;
 use crate::web::twin::TwinParts;
 
@@ -42,7 +42,11 @@ pub(super) struct LoadedScene {
 /// # Errors
 /// A scene or an arena that cannot be used, no such renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
-    let Scene { arena, mut splats, mut objects, seen, .. } = scene::load(&args.arena, &args.bare)?;
+    let scene = scene::load_to_fly(&args.arena, &args.bare)?;
+    let Scene { arena, mut splats, mut objects, seen, packed, .. } = scene;
+    if packed.is_some() && args.antialiased != Antialiased::default() {
+        bail!("--antialiased: a packed scene is drawn as the one that it was packed of");
+    }
     args.antialiased.apply(&mut splats);
     let flying: Vec<_> = arena
         .flying(&args.vehicles)?
@@ -57,7 +61,18 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     let rendered = RenderedScene { splats: &splats, objects: &objects };
     let (renderer, (field, obstacles, top_view)) = rayon::join(
         // Mostly waits for graphics drivers.
-        || choose(rendered, args.renderer, args.detail),
+        || match &packed {
+            None => choose(rendered, args.renderer, args.detail),
+            Some(path) => {
+                let memory_bytes = args.scene_memory as usize * (1 << 20);
+                open_packed(path, &objects, args.renderer, memory_bytes, Loading::Live).map(
+                    |renderer| Chosen {
+                        rasterizer: Box::new(renderer),
+                        reason: "the scene is packed".to_owned(),
+                    },
+                )
+            }
+        },
         || {
             let field = Arc::new(scene::bake(&splats, &arena, seen.as_ref()));
             for finding in scene::check_fit(&splats, &arena, &field) {

@@ -35,7 +35,7 @@ pub use streamed::{Loading, PackSummary, PackedError, PackedScene, Source, Strea
 pub(crate) use streamed::MAGIC as PACKED_MAGIC;
 
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
-use crate::{Camera, Placement, RgbdImage, Scene};
+use crate::{Camera, Placement, RgbdImage, RigidObject, Scene};
 
 /// Renders a scene with all cores of the processor.
 #[derive(Debug)]
@@ -76,25 +76,27 @@ impl CpuRenderer {
     }
 
     /// Renders a packed scene, in the adaptive detail that it was packed for, of which at most so many bytes are in memory
-    /// at once, besides what an image takes.
+    /// at once, besides what an image takes and the objects, which are in memory whole.
     ///
     /// # Errors
     /// It cannot be read, or needs more memory.
     pub fn streamed(
         scene: PackedScene,
+        objects: &[RigidObject],
         memory_bytes: usize,
         loading: Loading,
     ) -> Result<Self, PackedError> {
         let instructions = InstructionSet::available()[0];
         let detail = Detail::Adaptive { max_error_px: scene.max_error_px() };
         let (streamed, pool) = streamed::Streamed::new(scene, memory_bytes, loading)?;
-        let (parts, streamed) = (vec![pool], Some(streamed));
+        let mut parts = vec![pool];
+        parts.extend(moving(objects, detail));
         Ok(Self {
             instructions,
             detail,
             depth_alone: false,
             parts,
-            streamed,
+            streamed: Some(streamed),
             buffers: Buffers::default(),
         })
     }
@@ -149,8 +151,7 @@ impl CpuRenderer {
 
     fn with_instructions(scene: Scene<'_>, detail: Detail, instructions: InstructionSet) -> Self {
         let mut parts = vec![scene::Part::new(0, scene.splats, detail)];
-        let moving = scene.objects.iter();
-        parts.extend(moving.map(|object| scene::Part::new(object.id, &object.splats, detail)));
+        parts.extend(moving(scene.objects, detail));
         let buffers = Buffers::default();
         Self { instructions, detail, depth_alone: false, parts, streamed: None, buffers }
     }
@@ -260,6 +261,11 @@ impl Rasterizer for CpuRenderer {
             pairs: self.buffers.bins.pairs(),
         }
     }
+}
+
+/// Packs what moves.
+fn moving(objects: &[RigidObject], detail: Detail) -> impl Iterator<Item = scene::Part> {
+    objects.iter().map(move |object| scene::Part::new(object.id, &object.splats, detail))
 }
 
 fn milliseconds(since: Instant) -> f32 {

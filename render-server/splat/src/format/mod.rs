@@ -427,8 +427,8 @@ fn no_scene(bytes: &[u8]) -> Option<&'static str> {
         Some("a web page, not the file itself; download it by its direct address")
     } else if bytes.starts_with(crate::cpu::PACKED_MAGIC) {
         Some(
-            "a packed scene, which `scene render` and `bench render` draw, and nothing takes whole into memory; give the \
-             scene that it was packed of",
+            "a packed scene, which `scene render` and `bench render` draw, and which is flown in by an arena.toml that names \
+             it; nothing takes it whole into memory: give the scene that it was packed of",
         )
     } else {
         None

@@ -72,6 +72,16 @@ pub enum PackedError {
     /// The thread that reads does not start.
     #[error("no thread to read the scene with: {0}")]
     Thread(io::Error),
+    /// More splats where they are to be in memory one by one than were allowed.
+    #[error("more than {most} splats lie between {min_m} and {max_m} m")]
+    Crowded {
+        /// As many were allowed.
+        most: usize,
+        /// A corner of the box. [m]
+        min_m: Vec3,
+        /// The corner opposite. [m]
+        max_m: Vec3,
+    },
     /// Less memory than the coarsest blocks of all parts take.
     #[error("{given} bytes of memory are too few for this scene; it needs {least} at least")]
     Memory {
@@ -399,7 +409,8 @@ pub struct PackSummary {
 }
 
 /// Packs a scene file of any format, a streamed scene chunk by chunk: memory is that of the largest. Coarser levels are
-/// made for errors of so many pixels ([`Detail::Adaptive`]). `report` hears of every chunk.
+/// made for errors of so many pixels ([`Detail::Adaptive`]). `place` may move the splats of a chunk, or leave some out; `report`
+/// hears of every chunk.
 ///
 /// # Errors
 /// The scene cannot be read or the file not be written; chunks that are not all trained with anti-aliasing, or none.
@@ -407,6 +418,7 @@ pub fn pack(
     from: &Path,
     to: &Path,
     max_error_px: f32,
+    place: impl Fn(&mut Splats),
     mut report: impl FnMut(&PackSummary),
 ) -> Result<PackSummary, PackedError> {
     let io = |cause| PackedError::Io { path: to.to_owned(), verb: "write", cause };
@@ -414,7 +426,8 @@ pub fn pack(
     partial.push(".part");
     let file = File::create(&partial).map_err(io)?;
     let mut packer = Packer::new(BufWriter::new(file), max_error_px).map_err(io)?;
-    let packed = format::read_in_chunks(from, |splats| {
+    let packed = format::read_in_chunks(from, |mut splats| {
+        place(&mut splats);
         packer.add(&splats).map_err(|error| match error {
             AddError::Io(cause) => io(cause),
             AddError::Mixed => invalid(

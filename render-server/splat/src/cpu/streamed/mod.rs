@@ -14,6 +14,7 @@
 //! stays coarse, and nothing is read only to be thrown away.
 
 mod file;
+mod near;
 mod reader;
 
 pub(crate) use file::MAGIC;

@@ -62,7 +62,7 @@ fn open(bytes: impl Into<Vec<u8>>) -> Result<PackedScene, PackedError> {
 fn streamed(blocks: usize, loading: Loading) -> CpuRenderer {
     let scene = open(file()).unwrap();
     let bytes = blocks * block_bytes(scene.coefficients);
-    CpuRenderer::streamed(scene, bytes, loading).unwrap()
+    CpuRenderer::streamed(scene, &[], bytes, loading).unwrap()
 }
 
 /// 1.5 m above the lawns at `x_m`, looking along them, and down by some degrees.
@@ -171,7 +171,7 @@ fn what_does_not_fit_is_coarser_or_refused() {
     assert!(stand_ins == 0 && max_error_px > ERROR_PX, "{stand_ins}, {max_error_px} px");
 
     let scene = open(file()).unwrap();
-    let refused = CpuRenderer::streamed(scene, 40_000, Loading::Live).unwrap_err().to_string();
+    let refused = CpuRenderer::streamed(scene, &[], 40_000, Loading::Live).unwrap_err().to_string();
     assert!(refused.contains("too few for this scene"), "{refused}");
 }
 
@@ -195,7 +195,7 @@ fn a_damaged_block_is_told_when_it_is_needed() {
     // Far from the tops, which are read first.
     bytes[48 + 5 * block_bytes(4) + 77] ^= 1;
     let mut renderer =
-        CpuRenderer::streamed(open(bytes).unwrap(), 1 << 30, Loading::Whole).unwrap();
+        CpuRenderer::streamed(open(bytes).unwrap(), &[], 1 << 30, Loading::Whole).unwrap();
     let camera = camera(4.0, std::f64::consts::PI);
     let told = (0..2).map(|_| render(&mut renderer, 0, camera).unwrap_err().to_string());
     for told in told {
@@ -220,6 +220,82 @@ fn seal(bytes: &mut [u8], block: usize) {
     bytes[tables + 24 + 36 * block + 32..][..4].copy_from_slice(&check);
     let check = sum(&[&bytes[..40], &bytes[tables..]]);
     bytes[40..44].copy_from_slice(&check);
+}
+
+#[test]
+fn what_is_near_is_read_splat_by_splat() {
+    let (min_m, max_m) = (Vec3::new(6.0, 2.0, -1.0), Vec3::new(9.0, 5.0, 1.0));
+    let mut scene = open(file()).unwrap();
+    let near = scene.splats_within(min_m, max_m, 40_000).unwrap();
+    let mut found = 0;
+    for splats in lawns() {
+        for i in 0..splats.len() {
+            let at_m = splats.means_m[i];
+            if (at_m.cmplt(min_m) | at_m.cmpgt(max_m)).any() {
+                continue;
+            }
+            found += 1;
+            // Two may stand at one place.
+            let same = near.means_m.iter().enumerate().filter(|(_, mean_m)| **mean_m == at_m);
+            let is_same = |k: usize| {
+                let wide = |rotation: Quat, scale_m: Vec3| {
+                    let axes = glam::Mat3::from_quat(rotation) * glam::Mat3::from_diagonal(scale_m);
+                    axes * axes.transpose()
+                };
+                let expected = wide(splats.rotations[i], splats.scales_m[i]);
+                let covariance = wide(near.rotations[k], near.scales_m[k]);
+                let constant = i * splats.sh_coefficients() * 3;
+                covariance.abs_diff_eq(expected, 1e-6)
+                    && (near.opacities[k] - splats.opacities[i]).abs() < 1e-5
+                    && (0..3).all(|c| (near.sh[k * 3 + c] - splats.sh[constant + c]).abs() < 1e-3)
+            };
+            assert!(same.map(|(k, _)| k).any(is_same), "splat {i} at {at_m}");
+        }
+    }
+    assert_eq!((near.len(), near.sh_degree), (found, 0));
+    assert!(found > 1000, "{found}");
+    let crowded = scene.splats_within(min_m, max_m, found - 1).unwrap_err().to_string();
+    assert!(
+        crowded.starts_with(&format!("more than {} splats lie between", found - 1)),
+        "{crowded}"
+    );
+}
+
+#[test]
+fn a_splat_without_extent_keeps_a_turn() {
+    let splats = Splats {
+        means_m: vec![Vec3::ZERO; 3],
+        scales_m: vec![Vec3::ZERO, Vec3::new(0.0, 0.1, 0.0), Vec3::new(0.1, 0.0, 0.2)],
+        rotations: vec![Quat::from_rotation_y(0.3); 3],
+        opacities: vec![0.5; 3],
+        sh: vec![0.1; 9],
+        ..Splats::default()
+    };
+    let mut scene = open(packed(&[splats])).unwrap();
+    let near = scene.splats_within(Vec3::NEG_ONE, Vec3::ONE, 3).unwrap();
+    assert_eq!(near.len(), 3);
+    for (rotation, scale_m) in near.rotations.iter().zip(&near.scales_m) {
+        assert!(rotation.is_normalized());
+        let longest = scale_m.max_position();
+        if scale_m.max_element() > 0.0 {
+            let was = Quat::from_rotation_y(0.3) * Vec3::AXES[longest];
+            assert!((*rotation * Vec3::AXES[longest]).dot(was).abs() > 0.9999);
+        }
+    }
+}
+
+#[test]
+fn objects_move_in_a_streamed_scene_as_in_memory() {
+    let [still, ball, _] = lawns();
+    let moving = [RigidObject { id: 7, splats: ball }];
+    let scene = open(packed(std::slice::from_ref(&still))).unwrap();
+    let mut streamed = CpuRenderer::streamed(scene, &moving, 1 << 26, Loading::Whole).unwrap();
+    let whole = Scene { splats: &still, objects: &moving };
+    let detail = Detail::Adaptive { max_error_px: ERROR_PX };
+    let mut in_memory = CpuRenderer::with_detail(whole, detail);
+    let image = render(&mut streamed, 1, camera(-2.0, 0.0)).unwrap();
+    assert_eq!(image, render(&mut in_memory, 1, camera(-2.0, 0.0)).unwrap());
+    assert!(image.ids.contains(&7));
 }
 
 proptest! {
@@ -264,8 +340,13 @@ proptest! {
             bytes[table + block * 36 + at * 4..][..4].copy_from_slice(&number.to_le_bytes());
         }
         seal(&mut bytes, block);
-        let Ok(scene) = open(bytes) else { return Ok(()) };
-        let Ok(mut renderer) = CpuRenderer::streamed(scene, 1 << 26, Loading::Whole) else { return Ok(()) };
+        let Ok(mut scene) = open(bytes) else { return Ok(()) };
+        if let Ok(near) = scene.splats_within(Vec3::ZERO, Vec3::splat(8.0), 1 << 20) {
+            let are_splats = near.rotations.iter().all(|turn| turn.is_normalized())
+                && near.scales_m.iter().all(|scale| scale.is_finite());
+            prop_assert!(are_splats);
+        }
+        let Ok(mut renderer) = CpuRenderer::streamed(scene, &[], 1 << 26, Loading::Whole) else { return Ok(()) };
         for yaw_rad in [0.0, 3.0] {
             match render(&mut renderer, 0, camera(4.0, yaw_rad)) {
                 Ok(image) => prop_assert_eq!(image.alpha.len(), 160 * 120),

@@ -63,8 +63,14 @@ fn view(file: Arc<Kept>) -> Arc<ViewState> {
         seed: 0,
         no_browser: true,
     };
-    let scene =
-        Scene { arena, splats: floor, objects: Vec::new(), world_from_scene: one, seen: None };
+    let scene = Scene {
+        arena,
+        splats: floor,
+        objects: Vec::new(),
+        world_from_scene: one,
+        seen: None,
+        packed: None,
+    };
     let panels = Panels { course: Some(Panel::new(scene, file, args)), ..Panels::default() };
     Arc::new(ViewState { engine: Mutex::new(engine), welcome, panels, stop: Stop::default() })
 }
