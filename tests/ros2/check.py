@@ -341,11 +341,14 @@ def check_on_demand(stage, domain):
     clouds = Inbox(domain, FRONT + "depth/points", ros.PointCloud2, SENSOR)
     both = {inbox.name: inbox for inbox in (jpegs, clouds)}
     wait_for(lambda: jpegs.is_matched() and clouds.is_matched(), "nobody sends JPEG and points")
-    for _ in range(8):
+    # Best effort: a computer that does something else loses some.
+    for image in range(40):
         stage.publish()
         poll(both, 0.2)
-    counts = len(jpegs.found), len(clouds.found)
-    check(min(counts) >= 2, f"JPEGs and clouds of 8 images: {counts}")
+        counts = len(jpegs.found), len(clouds.found)
+        if image >= 7 and min(counts) >= 2:
+            break
+    check(min(counts) >= 2, f"JPEGs and clouds of 40 images: {counts}")
     jpeg = jpegs.messages()[-1]
     pixels = np.asarray(Image.open(io.BytesIO(bytes(jpeg.data)))).astype(int)
     check(jpeg.format == "jpeg" and pixels.shape == (HEIGHT, WIDTH, 3), f"a JPEG of {pixels.shape}")

@@ -208,7 +208,7 @@ fn policies(qos: Qos, reliable: bool) -> QosPolicies {
 /// RustDDS keeps all that a reliable subscriber has not acknowledged, whatever the depth: of one that has stopped, 8,192
 /// images. Of images it keeps these, and then leaves out what comes, without waiting, until that subscriber counts as gone.
 const MOST_UNACKNOWLEDGED: ResourceLimits =
-    ResourceLimits { max_samples: 64, max_instances: 1, max_samples_per_instance: 64 };
+    ResourceLimits { max_samples: 32, max_instances: 1, max_samples_per_instance: 32 };
 
 /// Hands bytes over as they are: encoding is `cdr`'s.
 struct Raw;

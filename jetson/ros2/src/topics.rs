@@ -83,7 +83,7 @@ pub const IMAGE: Topic =
 /// Colour as JPEG.
 pub const COMPRESSED: Topic = Topic::new::<CompressedImage>(
     "CAMERA/image_raw/compressed",
-    Qos::Bulk,
+    Qos::SensorData,
     OPTICAL,
     "colour, `jpeg`, of the decoded image",
 );
