@@ -72,7 +72,7 @@ pub enum RenderError {
     #[error("the graphics device cannot render this: {0}; use the processor")]
     Device(String),
     /// A packed scene cannot be read, or an image that is to be whole needs more memory than it has; and why.
-    #[error("packed scene: {0}")]
+    #[error("{0}")]
     Scene(String),
 }
 

@@ -234,7 +234,7 @@ impl Streamed {
                 let bytes =
                     |blocks: usize| (blocks * block_bytes(pool.coefficients)).div_ceil(1 << 20);
                 return Err(format!(
-                    "this image needs {} MiB of the scene, more than the {} MiB of memory that it was given",
+                    "packed scene: this image needs {} MiB of it, more than the {} MiB of memory that it was given",
                     bytes(self.needed),
                     bytes(self.most_slots)
                 ));

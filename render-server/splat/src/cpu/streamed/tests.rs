@@ -199,10 +199,7 @@ fn a_damaged_block_is_told_when_it_is_needed() {
     let camera = camera(4.0, std::f64::consts::PI);
     let told = (0..2).map(|_| render(&mut renderer, 0, camera).unwrap_err().to_string());
     for told in told {
-        assert_eq!(
-            told,
-            "packed scene: packed scene, block 5: the checksum differs; the file is damaged"
-        );
+        assert_eq!(told, "packed scene, block 5: the checksum differs; the file is damaged");
     }
 }
 
