@@ -1,6 +1,6 @@
-//! Symmetric positive definite systems, dense, and small inverses.
+//! Symmetric positive definite systems, dense, and small orthonormal bases.
 
-use glam::DMat3;
+use glam::{DMat3, DVec2};
 
 /// A symmetric matrix; its lower triangle, row by row.
 #[derive(Clone, Debug)]
@@ -111,11 +111,31 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     sums.iter().sum::<f64>() + rest
 }
 
-/// Returns the inverse of a symmetric matrix; `None` if it is not positive definite beyond rounding.
-pub(super) fn inverse(m: &DMat3) -> Option<DMat3> {
-    let determinant = m.determinant();
-    let product = m.x_axis.x * m.y_axis.y * m.z_axis.z;
-    (determinant > 1e-9 * product && product > 0.0).then(|| m.inverse())
+/// Makes three columns orthonormal, each less what those before it are (Gram and Schmidt, twice); returns the upper
+/// triangle that makes the former columns of the new ones. `None` if they depend on each other, but for rounding.
+pub(super) fn orthonormal(columns: &mut [Vec<DVec2>; 3]) -> Option<DMat3> {
+    let product = |a: &[DVec2], b: &[DVec2]| a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum::<f64>();
+    let mut upper = DMat3::ZERO;
+    let mut left = 1.0;
+    for k in 0..3 {
+        let (before, column) = columns.split_at_mut(k);
+        let column = &mut column[0];
+        let length2 = product(column, column);
+        // What rounding left of the others after the first time is taken away the second time.
+        for _ in 0..2 {
+            for (j, other) in before.iter().enumerate() {
+                let along = product(other, column);
+                column.iter_mut().zip(other).for_each(|(x, y)| *x -= *y * along);
+                upper.col_mut(k)[j] += along;
+            }
+        }
+        let left2 = product(column, column);
+        left *= left2 / length2;
+        let length = left2.sqrt();
+        column.iter_mut().for_each(|x| *x /= length);
+        upper.col_mut(k)[k] = length;
+    }
+    (left > 1e-9).then_some(upper)
 }
 
 #[cfg(test)]
@@ -154,6 +174,30 @@ mod tests {
         matrix.add_block(0, 0, &[[2.0]]);
         assert_eq!(matrix.lower, [2.0, 0.0, 1.0, 0.0, 1.0, 1.0]);
         assert!(matrix.factor().is_none());
-        assert!(inverse(&DMat3::from_diagonal(glam::DVec3::new(1.0, 0.0, 1.0))).is_none());
+    }
+
+    #[test]
+    fn columns_become_orthonormal_unless_they_depend_on_each_other() {
+        // Nearly one, as those of a point just before a camera.
+        let columns =
+            [1e-4, 2e-4, 3e-4].map(|off| vec![DVec2::new(1.0, off), DVec2::new(off * off, 1.0)]);
+        let mut basis = columns.clone();
+        let upper = orthonormal(&mut basis);
+        assert!(upper.is_none(), "{upper:?}");
+        let columns = [0.0, 0.3, 0.7].map(|off| {
+            vec![DVec2::new(1.0, off), DVec2::new(off * off, 1.0), DVec2::new(0.0, off.sin())]
+        });
+        let mut basis = columns.clone();
+        let upper = orthonormal(&mut basis).unwrap();
+        for i in 0..3 {
+            for j in 0..3 {
+                let product: f64 = basis[i].iter().zip(&basis[j]).map(|(a, b)| a.dot(*b)).sum();
+                assert!((product - f64::from(u8::from(i == j))).abs() < 1e-14, "{i} {j} {product}");
+            }
+            for row in 0..3 {
+                let back: DVec2 = (0..3).map(|k| basis[k][row] * upper.col(i)[k]).sum();
+                assert!((back - columns[i][row]).length() < 1e-14);
+            }
+        }
     }
 }

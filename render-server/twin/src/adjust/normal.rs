@@ -1,11 +1,13 @@
 //! The normal equations of everything but the points, which are eliminated as they come (Triggs et al. 2000, "Bundle
-//! adjustment: a modern synthesis", section 6.1).
+//! adjustment: a modern synthesis", section 6.1): by orthonormal bases of what their moves change in images, as a point
+//! just before a camera, or far from all, would drown the others in rounding if its own equations were inverted (Demmel
+//! et al. 2021, "Square root bundle adjustment").
 
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::capture::Capture;
-use super::matrix::{Symmetric, inverse};
+use super::matrix::{Symmetric, orthonormal};
 use super::project::{LENS, Projected};
 use super::rolling::{READOUT_S, Slopes};
 use super::solve::{INSET_PX, Problem, weight};
@@ -123,14 +125,17 @@ struct Seen<const N: usize> {
     camera: usize,
     by_camera: [DVec2; N],
     by_shared: [DVec2; SHARED],
-    by_point: [DVec2; 3],
+    /// Its rows of the basis of what the point's moves change.
+    basis: [DVec2; 3],
     residual: DVec2,
 }
 
 /// A point's own part of the equations.
 struct PointPart<const N: usize> {
-    inverse: DMat3,
-    gradient: DVec3,
+    /// Takes moves of the point to the basis.
+    basis_from_move: DMat3,
+    /// Of all residuals, along the basis.
+    residual: DVec3,
     seen: Vec<Seen<N>>,
 }
 
@@ -143,7 +148,7 @@ fn part<const N: usize>(
 ) -> Option<PointPart<N>> {
     let sightings = problem.sightings(point);
     let mut seen = Vec::with_capacity(sightings.len());
-    let (mut matrix, mut gradient) = (DMat3::ZERO, DVec3::ZERO);
+    let mut columns = [const { Vec::new() }; 3];
     for &(camera, pixel) in sightings {
         let Some((projected, in_row)) = state.see(camera, state.points[point], pixel) else {
             continue;
@@ -154,32 +159,39 @@ fn part<const N: usize>(
         let Slopes { by_camera, by_point, by_readout } =
             in_row.slopes(&state.cameras[camera], &by_point);
         let by_shared = problem.layout.by_shared(by_lens, by_readout);
-        let one = Seen {
+        columns.iter_mut().zip(by_point).for_each(|(column, d)| column.push(d * root));
+        seen.push(Seen {
             camera,
             by_camera: std::array::from_fn(|i| by_camera[i] * root),
             by_shared: by_shared.map(|d| d * root),
-            by_point: by_point.map(|d| d * root),
+            basis: [DVec2::ZERO; 3],
             residual: residual * root,
-        };
-        let [x, y, z] = one.by_point;
-        let row = |a: DVec2| DVec3::new(a.dot(x), a.dot(y), a.dot(z));
-        matrix += DMat3::from_cols(row(x), row(y), row(z));
-        gradient += row(one.residual);
-        seen.push(one);
+        });
     }
     if seen.len() < 2 {
         return None;
     }
-    for k in 0..3 {
-        matrix.col_mut(k)[k] *= 1.0 + damping;
+    // Damping is as if each number of the point had been measured to be what it is.
+    let by_itself = columns.each_ref().map(|column| {
+        let length2: f64 = column.iter().map(|d| d.length_squared()).sum();
+        (damping * length2).sqrt()
+    });
+    for (k, (column, by)) in columns.iter_mut().zip(by_itself).enumerate() {
+        let row = DVec3::AXES[k] * by;
+        column.extend([row.truncate(), DVec2::new(row.z, 0.0)]);
     }
-    Some(PointPart { inverse: inverse(&matrix)?, gradient, seen })
+    let basis_from_move = orthonormal(&mut columns)?;
+    let mut residual = DVec3::ZERO;
+    for (row, one) in seen.iter_mut().enumerate() {
+        one.basis = columns.each_ref().map(|column| column[row]);
+        residual += along(one.residual, &one.basis);
+    }
+    Some(PointPart { basis_from_move, residual, seen })
 }
 
-/// Returns how each of the numbers changes with the point.
-fn across<const N: usize>(by: &[DVec2; N], by_point: &[DVec2; 3]) -> [DVec3; N] {
-    let [x, y, z] = *by_point;
-    by.map(|d| DVec3::new(d.dot(x), d.dot(y), d.dot(z)))
+/// Returns how much of a change in an image a move of the point makes too.
+fn along(change: DVec2, basis: &[DVec2; 3]) -> DVec3 {
+    DVec3::from_array(basis.map(|row| change.dot(row)))
 }
 
 fn products<const R: usize, const C: usize>(a: &[DVec3; R], b: &[DVec3; C]) -> [[f64; C]; R] {
@@ -227,26 +239,20 @@ fn add_point<const N: usize>(
 ) {
     let Some(part) = part::<N>(problem, state, point, damping) else { return };
     let shared = problem.layout.shared;
-    let mut shared_across = [DVec3::ZERO; SHARED];
-    let crossed: Vec<([DVec3; N], [DVec3; N])> = part
-        .seen
-        .iter()
-        .map(|seen| {
-            let across = across(&seen.by_camera, &seen.by_point);
-            (across, across.map(|row| part.inverse * row))
-        })
-        .collect();
-    for (one, (_, solved)) in part.seen.iter().zip(&crossed) {
+    let mut shared_along = [DVec3::ZERO; SHARED];
+    let all_along: Vec<[DVec3; N]> =
+        part.seen.iter().map(|seen| seen.by_camera.map(|by| along(by, &seen.basis))).collect();
+    for (one, one_along) in part.seen.iter().zip(&all_along) {
         let row = N * one.camera;
         for i in 0..N {
             sum.gradient[row + i] +=
-                one.by_camera[i].dot(one.residual) - solved[i].dot(part.gradient);
+                one.by_camera[i].dot(one.residual) - one_along[i].dot(part.residual);
         }
         sum.matrix.add_block(row, row, &outer(&one.by_camera, &one.by_camera));
-        for (other, (across_b, _)) in part.seen.iter().zip(&crossed) {
+        for (other, other_along) in part.seen.iter().zip(&all_along) {
             // The lower triangle of the matrix.
             if other.camera <= one.camera {
-                sum.matrix.add_block(row, N * other.camera, &products(solved, across_b));
+                sum.matrix.add_block(row, N * other.camera, &products(one_along, other_along));
             }
         }
         if let Some(shared) = shared {
@@ -254,19 +260,17 @@ fn add_point<const N: usize>(
             sum.matrix.add_block(shared, shared, &outer(&one.by_shared, &one.by_shared));
             for i in 0..SHARED {
                 sum.gradient[shared + i] += one.by_shared[i].dot(one.residual);
+                shared_along[i] += along(one.by_shared[i], &one.basis);
             }
-            let across = across(&one.by_shared, &one.by_point);
-            shared_across.iter_mut().zip(across).for_each(|(sum, row)| *sum += row);
         }
     }
     if let Some(shared) = shared {
-        let solved = shared_across.map(|row| part.inverse * row);
         for i in 0..SHARED {
-            sum.gradient[shared + i] -= solved[i].dot(part.gradient);
+            sum.gradient[shared + i] -= shared_along[i].dot(part.residual);
         }
-        sum.matrix.add_block(shared, shared, &products(&solved, &shared_across));
-        for (one, (across, _)) in part.seen.iter().zip(&crossed) {
-            sum.matrix.add_block(shared, N * one.camera, &products(&solved, across));
+        sum.matrix.add_block(shared, shared, &products(&shared_along, &shared_along));
+        for (one, one_along) in part.seen.iter().zip(&all_along) {
+            sum.matrix.add_block(shared, N * one.camera, &products(&shared_along, one_along));
         }
     }
 }
@@ -389,7 +393,7 @@ fn point_step<const N: usize>(
     damping: f64,
 ) -> DVec3 {
     let Some(part) = part::<N>(problem, state, point, damping) else { return DVec3::ZERO };
-    let mut right = part.gradient;
+    let mut right = part.residual;
     for seen in &part.seen {
         let mut off = DVec2::ZERO;
         for (d, by) in seen.by_camera.iter().zip(&change[N * seen.camera..]) {
@@ -400,10 +404,9 @@ fn point_step<const N: usize>(
                 off += *d * *by;
             }
         }
-        let [x, y, z] = seen.by_point;
-        right += DVec3::new(x.dot(off), y.dot(off), z.dot(off));
+        right += along(off, &seen.basis);
     }
-    -(part.inverse * right)
+    -(part.basis_from_move.inverse() * right)
 }
 
 /// Place and turn.

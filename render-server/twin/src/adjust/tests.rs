@@ -136,6 +136,40 @@ fn without_anything_it_has_no_metres() {
     assert!(adjusted.points_rms_px < 0.4, "{}", adjusted.points_rms_px);
 }
 
+/// A mismatch may put a point a millimetre before a camera: that it pulls hard on this one tells nothing of the others,
+/// and takes nothing from what is known.
+#[test]
+fn a_point_before_the_nose_of_a_camera_leaves_all_determined() {
+    for before_m in [1e-2, 1e-3, 1e-4, 1e-6] {
+        let mut hall = hall(5, 24, 2500, 0.2);
+        hall.capture.tags.clear();
+        hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
+        // One camera stands where another looks.
+        let far = hall.poses[3];
+        let ahead = far.rotation * DVec3::Z;
+        let near = Pose::new(far.translation_m + ahead, far.rotation);
+        let nose = near.translation_m + ahead * before_m;
+        let mut image = hall.capture.images[3].clone();
+        image.scene_from_cam = near;
+        image.seen.retain_mut(|seen| {
+            let p_cam = near.inverse().transform_point(hall.capture.points[seen.point]);
+            let pixel = hall.lens.project(p_cam).filter(|_| p_cam.z > 0.3);
+            seen.pixel = pixel.unwrap_or_default();
+            pixel.is_some()
+        });
+        hall.capture.images.push(image);
+        hall.capture.points.push(nose);
+        let point = hall.capture.points.len() - 1;
+        for at in [3, 24] {
+            let pixel = hall.lens.project(DVec3::Z).unwrap();
+            hall.capture.images[at].seen.push(Sighting { point, pixel });
+        }
+        let adjusted = adjust(&hall.capture, Options::default());
+        let adjusted = adjusted.unwrap_or_else(|error| panic!("{before_m} m: {error}"));
+        assert!(adjusted.points_rms_px < 0.4, "{before_m} m: {}", adjusted.points_rms_px);
+    }
+}
+
 /// Rows that follow each other over a fiftieth of a second, held by a hand that nods: what no shutter that opens at once
 /// explains.
 #[test]
