@@ -348,8 +348,14 @@ async function keptFlight(page, url) {
 
 /** A flight that flies straight into a wall: its crash card comes by itself, and is looked at by keyboard alone. */
 async function crash(browser) {
-  const plugin = path.join(path.dirname(vizflyt), "examples", "misbehave");
-  assert.ok(fs.existsSync(plugin), `no ${plugin}: cargo build --release --examples`);
+  const misbehave = path.join(path.dirname(vizflyt), "examples", "misbehave");
+  assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --release --examples`);
+  // Past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post.
+  // A plugin sees its own folder alone, as nobody.
+  fs.chmodSync(scratch, 0o755);
+  const plugin = path.join(scratch, "into-the-wall");
+  fs.copyFileSync(misbehave, path.join(scratch, "misbehave"));
+  fs.writeFileSync(plugin, '#!/bin/sh\nexec "$(dirname "$0")/misbehave" world:1:-0.16 "$@"\n', { mode: 0o755 });
   const demo = start("demo", "--headless", "--wait", "--scene", "race", "--plugin", plugin, "--log-dir", scratch);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
@@ -1052,7 +1058,8 @@ async function main() {
       console.log(`FAIL  ${test.name}: ${error.stack}`);
       const page = browser.contexts().at(-1)?.pages()[0];
       if (page) {
-        console.log(`      the page reports: ${page.faults}`);
+        const shown = await page.evaluate(() => document.body.innerText);
+        console.log(`      the page reports: ${page.faults}\n      it shows: ${shown.replaceAll(/\n+/g, " | ").slice(0, 1000)}`);
         await shot(page, `failed-${test.name}`);
       }
     }

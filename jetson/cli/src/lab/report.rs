@@ -179,6 +179,7 @@ impl Report {
     pub(crate) fn summary(&self) -> String {
         let clearance = match self.min_clearance_m {
             Some(clearance_m) => format!("{clearance_m:.2} m"),
+            None if self.seconds == 0.0 => "not known (it did not fly)".to_owned(),
             None => "not known (this scene has no true geometry)".to_owned(),
         };
         let tags = &self.localization;
