@@ -156,7 +156,7 @@ async function flight(browser) {
   // Every screen before the start: nothing flies meanwhile, and the order of what follows is short.
   await isPainted(page, "map");
   // Nothing here has a graphics card: the top view comes first by itself.
-  assert.equal(await page.locator("#view-top").getAttribute("aria-pressed"), "true");
+  await page.locator("#view-top[aria-pressed=true]").waitFor();
   assert.ok((await page.locator("#stages li").count()) > 0, "stage lights");
   assert.equal(await page.locator("#stages [aria-current]").count(), 1);
   await checkAccess(page, "laptop");
@@ -236,7 +236,7 @@ const served = (page, before = "") =>
 async function weak(browser, url) {
   const without = await chromium.launch({ executablePath: chromiumPath, args: ["--no-sandbox", "--disable-3d-apis"] });
   const page = await open(without, url);
-  assert.equal(await page.locator("#view-top").getAttribute("aria-pressed"), "true");
+  await page.locator("#view-top[aria-pressed=true]").waitFor();
   await page.locator("#view-space").click();
   await page.getByText("drawn by the server: this browser has no WebGL 2").waitFor();
   let before = await served(page);
@@ -401,6 +401,8 @@ async function crash(browser) {
     const [width, height] = SIZES[size];
     await page.setViewportSize({ width, height });
     await checkAccess(page, size);
+    const map = await page.locator(".map").boundingBox();
+    assert.ok(map.height >= 240, `${size}: the map beside the crash card is ${map.height} px high`);
     if (size === "phone") await region.scrollIntoViewIfNeeded();
     await shot(page, `${size}-crash`);
   }
@@ -1062,6 +1064,8 @@ async function main() {
         console.log(`      the page reports: ${page.faults}\n      it shows: ${shown.replaceAll(/\n+/g, " | ").slice(0, 1000)}`);
         await shot(page, `failed-${test.name}`);
       }
+      // The next one has the machine for itself.
+      for (const child of children.splice(0)) child.kill("SIGKILL");
     }
   }
   await browser.close();

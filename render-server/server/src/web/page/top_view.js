@@ -101,7 +101,10 @@ export class TopView {
     this.scale = 0;
     /** Where the world's origin is. [CSS px] @type {Point2} */
     this.origin = [0, 0];
-    new ResizeObserver(() => this.resize()).observe(this.room);
+    /** Over the bottom of the drawing, once there is a flight to look at again. */
+    this.replay = /** @type {HTMLElement | null} */ (this.room.querySelector(".replay"));
+    const resized = new ResizeObserver(() => this.resize());
+    for (const one of [this.room, this.replay]) if (one) resized.observe(one);
   }
 
   /** @param {Arena} arena */
@@ -134,7 +137,8 @@ export class TopView {
     // Below the stage lights and above what is written at the bottom, where there is room for that.
     const lights = /** @type {HTMLElement | null} */ (this.room.querySelector("#stages"));
     const top = Math.min(lights && !lights.hidden ? lights.offsetTop + lights.offsetHeight + 8 : pad, h * 0.35);
-    const bottom = Math.min(pad + 14, h * 0.25);
+    const bar = this.replay && !this.replay.hidden ? h - this.replay.offsetTop + 8 : 0;
+    const bottom = Math.max(Math.min(pad + 14, h * 0.25), Math.min(bar, h * 0.45));
     this.scale = Math.min((w - 2 * pad) / dx, (h - top - bottom) / dy);
     const middle = (top + h - bottom) / 2;
     this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, middle + ((lo[1] + hi[1]) / 2) * this.scale];

@@ -5,6 +5,7 @@ import { make, makeButton } from "../dom.js";
 import { vehicleUrl } from "../session.js";
 
 /** @typedef {import("../messages").CrashCard} CrashCard */
+/** @typedef {"colour" | "depth"} Kind */
 
 /** How long the last image stays before it plays again. [ms] */
 const REST_MS = 1200;
@@ -21,14 +22,19 @@ class Replay {
    * @param {number} camera the one shown first, by index
    */
   constructor(url, card, camera) {
-    this.url = url;
     this.card = card;
     this.timer = 0;
-    /** @type {"colour" | "depth"} */
+    /** @type {Kind} */
     this.kind = "colour";
-    /** @type {HTMLImageElement[]} */
-    this.images = [];
-    this.picture = make("img", { width: 480, height: 360 });
+    // All of them now: a replay does not wait for each, and a demo's server ends soon after its flight.
+    /** Of each camera. @type {Record<Kind, HTMLImageElement[]>[]} */
+    this.images = card.images.map(({ before_s }, camera) => {
+      /** @param {Kind} kind */
+      const all = (kind) => before_s.map((_, k) => make("img", { src: `${url}/crash/${card.id}/${camera}/${kind}/${k}`, width: 480, height: 360 }));
+      return { colour: all("colour"), depth: all("depth") };
+    });
+    /** The image that is shown. */
+    this.picture = this.images[camera].colour[0];
     this.when = make("span");
     this.slider = make("input", { type: "range", min: "0", step: "1", ariaLabel: "time of the image" });
     this.slider.addEventListener("input", () => this.pause());
@@ -54,19 +60,19 @@ class Replay {
     this.showKind(this.kind);
   }
 
-  /** @param {"colour" | "depth"} kind */
+  /** @param {Kind} kind */
   showKind(kind) {
     this.kind = kind;
     this.kindButton.textContent = kind === "colour" ? "show depth" : "show colour";
-    // All of them now: a replay does not wait for each.
-    this.images = this.before_s.map((_, k) => make("img", { src: `${this.url}/crash/${this.card.id}/${this.camera}/${kind}/${k}` }));
     this.show();
   }
 
   show() {
     const k = Number(this.slider.value), when = ago(this.before_s[k]);
-    this.picture.src = this.images[k].src;
-    this.picture.alt = `${this.kind} image of ${this.card.images[this.camera].camera}, ${when}`;
+    const picture = this.images[this.camera][this.kind][k];
+    this.picture.replaceWith(picture);
+    this.picture = picture;
+    picture.alt = `${this.kind} image of ${this.card.images[this.camera].camera}, ${when}`;
     this.slider.setAttribute("aria-valuetext", when);
     this.when.textContent = when;
     this.playButton.textContent = this.timer ? "pause" : "play";
