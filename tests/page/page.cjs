@@ -173,7 +173,7 @@ async function flight(browser) {
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night");
   for (let k = 0; (await brightness(page)) > 0.6 * day; k += 1) {
-    assert.ok(k < 100, "no night on the picture");
+    assert.ok(k < PATIENCE / 100, "no night on the picture");
     await page.waitForTimeout(100);
   }
   await page.locator("#environment-choice").selectOption("day");
@@ -189,9 +189,9 @@ async function flight(browser) {
   await page.keyboard.press("Enter");
   await until(page, "phase-text", /flying|holding/);
   for (const id of ["colour", "depth"]) await isPainted(page, id);
-  assert.notEqual(await text(page, "clock"), "0:00.0");
-  assert.match(await text(page, "poses"), /^\d+$/);
-  assert.match(await text(page, "battery"), /^\d/);
+  await until(page, "clock", /^(?!0:00\.0$)\d/);
+  await until(page, "poses", /^\d+$/);
+  await until(page, "battery", /^\d/);
   await shot(page, "laptop-flying");
   // Someone who types has the space bar; escape stops from anywhere.
   await page.keyboard.press("Escape");
@@ -202,9 +202,9 @@ async function flight(browser) {
   // It is looked at again, also when the program has ended.
   assert.equal(await demo.ended, 1, "a stopped flight is no success");
   await page.locator("#replay-at").fill("1");
-  assert.match(await text(page, "replay-time"), /^0:01\.0 of \d:\d\d\.\d$/);
+  await until(page, "replay-time", /^0:01\.0 of \d:\d\d\.\d$/);
   await page.locator("#replay-play").click();
-  assert.equal(await text(page, "replay-play"), "pause");
+  await until(page, "replay-play", /^pause$/);
   await page.waitForFunction(() => Number(document.getElementById("replay-at").value) > 1.2);
   for (const [size, [width, height]] of Object.entries(SIZES)) {
     await page.setViewportSize({ width, height });
@@ -212,7 +212,7 @@ async function flight(browser) {
     await shot(page, `${size}-replay`);
   }
   await page.locator("#replay-now").click();
-  assert.ok(await page.locator("#replay-now").isHidden());
+  await page.locator("#replay-now").waitFor({ state: "hidden" });
   await keptFlight(page, url);
   assert.deepEqual(page.faults, []);
   await page.context().close();
@@ -329,7 +329,7 @@ async function keptFlight(page, url) {
   assert.ok(await page.locator("#replay-play").isDisabled(), "nothing has been watched yet");
   await page.locator("#replay-flight").selectOption({ index: 1 });
   await page.locator("#replay-at").fill("1");
-  assert.match(await text(page, "replay-time"), /^0:01\.0 of \d:\d\d\.\d$/);
+  await until(page, "replay-time", /^0:01\.0 of \d:\d\d\.\d$/);
   const [saved] = await Promise.all([page.waitForEvent("download"), page.locator("#replay-save").click()]);
   assert.match(saved.suggestedFilename(), /^race-.*\.flight\.json$/);
   const file = path.join(scratch, "again.json");
@@ -469,7 +469,7 @@ async function lab(browser) {
   await shot(page, "laptop-space");
   for (const view of ["chase", "onboard"]) {
     await page.locator(`#view-${view}`).click();
-    assert.equal(await page.locator(`#view-${view}`).getAttribute("aria-pressed"), "true");
+    await page.locator(`#view-${view}[aria-pressed=true]`).waitFor();
     await shot(page, `laptop-${view}`);
   }
   await page.locator("#view-top").click();
@@ -672,7 +672,7 @@ async function labDay(browser) {
   await team.locator("#book-form [name=team]").fill("ants");
   await team.locator("#book-form button").click();
   await until(team, "lab-status", /place 2 for wasp/);
-  assert.match(await text(team, "lab-queue"), /1\s+cats[\s\S]*2\s+ants/);
+  await until(team, "lab-queue", /1cats[\s\S]*2ants/);
   assert.ok(await team.locator("#formation").isHidden() && await team.getByRole("button", { name: "sign: LiPo" }).isHidden());
   assert.equal(await team.getByRole("region", { name: "checks of bee" }).count(), 0);
   const call = (words) => page.getByRole("button", { name: `${words}, wasp` }).click();
