@@ -148,44 +148,56 @@ impl Distortion {
     /// assert!((lens.reach() - (1.0 / 0.9f64).sqrt()).abs() < 1e-9);
     /// ```
     pub fn reach(&self) -> f64 {
-        // The derivative along the radius, a polynomial in u: r^2, or t^2.
-        let (factors, tilt, is_angle) = match *self {
-            Self::None => return f64::INFINITY,
-            Self::BrownConrady { k1, k2, p1, p2, k3 } => {
-                // The tangential part adds 3 r^2 |p| along the radius, or takes it away opposite.
-                let tilt = 6.0 * libm::hypot(p1, p2);
-                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0], tilt, false)
-            }
-            Self::KannalaBrandt { k1, k2, k3, k4 } => {
-                ([3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4], 0.0, true)
-            }
-        };
-        let grows = |u: f64| {
-            let radial = factors.iter().rev().fold(0.0, |sum, k| (sum + k) * u);
-            1.0 + radial - tilt * libm::sqrt(u) > 0.0
-        };
-        let farthest = libm::tan(MAX_ANGLE_RAD);
-        let end = if is_angle { MAX_ANGLE_RAD } else { farthest };
+        let Some(growth) = self.growth() else { return f64::INFINITY };
         // Its first root: by steps that are fine near the axis, where lenses have theirs, then by
         // halving.
-        let place = |i: u32| {
-            let share = f64::from(i) / f64::from(REACH_STEPS);
-            end * end * share * share * share
+        let Some(past) = (1..=REACH_STEPS).find(|&i| !growth.is_positive(growth.place(i))) else {
+            return libm::tan(MAX_ANGLE_RAD);
         };
-        let Some(past) = (1..=REACH_STEPS).find(|&i| !grows(place(i))) else {
-            return farthest;
-        };
-        let (mut low, mut high) = (place(past - 1), place(past));
+        let (mut low, mut high) = (growth.place(past - 1), growth.place(past));
         for _ in 0..50 {
             let middle = 0.5 * (low + high);
-            if grows(middle) {
+            if growth.is_positive(middle) {
                 low = middle;
             } else {
                 high = middle;
             }
         }
         let root = libm::sqrt(low);
-        if is_angle { libm::tan(root) } else { root }
+        if growth.is_angle { libm::tan(root) } else { root }
+    }
+
+    /// Returns whether the lens images a slope of this length: whether that is at most its
+    /// [`Self::reach`], in less time.
+    pub fn reaches(&self, length: f64) -> bool {
+        let Some(growth) = self.growth() else { return !length.is_nan() };
+        let r = if growth.is_angle { libm::atan(length) } else { length };
+        (1..=REACH_STEPS)
+            .map(|i| growth.place(i))
+            .take_while(|&u| growth.is_positive(u))
+            .any(|u| u > r * r)
+            || length <= self.reach()
+    }
+
+    /// `None` for a pinhole.
+    fn growth(&self) -> Option<Growth> {
+        let farthest = libm::tan(MAX_ANGLE_RAD);
+        Some(match *self {
+            Self::None => return None,
+            Self::BrownConrady { k1, k2, p1, p2, k3 } => Growth {
+                factors: [3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0],
+                // The tangential part adds 3 r^2 |p| along the radius, or takes it away opposite.
+                tilt: 6.0 * libm::hypot(p1, p2),
+                is_angle: false,
+                end: farthest,
+            },
+            Self::KannalaBrandt { k1, k2, k3, k4 } => Growth {
+                factors: [3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4],
+                tilt: 0.0,
+                is_angle: true,
+                end: MAX_ANGLE_RAD,
+            },
+        })
     }
 
     /// Returns the coefficients in the order of OpenCV (`k1 k2 p1 p2 k3` or `k1 k2 k3 k4`), the
@@ -225,6 +237,29 @@ impl Distortion {
             }
             other => other,
         }
+    }
+}
+
+/// The derivative of a lens's map along the radius, a polynomial in u: r^2, or t^2.
+struct Growth {
+    factors: [f64; 4],
+    tilt: f64,
+    /// Whether u is of the angle t.
+    is_angle: bool,
+    /// The greatest r, or t, that is looked at.
+    end: f64,
+}
+
+impl Growth {
+    fn is_positive(&self, u: f64) -> bool {
+        let radial = self.factors.iter().rev().fold(0.0, |sum, k| (sum + k) * u);
+        1.0 + radial - self.tilt * libm::sqrt(u) > 0.0
+    }
+
+    /// Returns the u of a step.
+    fn place(&self, step: u32) -> f64 {
+        let share = f64::from(step) / f64::from(REACH_STEPS);
+        self.end * self.end * share * share * share
     }
 }
 
@@ -287,6 +322,14 @@ mod tests {
                 let measured = (ahead - behind) / (2.0 * h);
                 prop_assert!((measured - column).length() < 1e-6, "{} for {}", column, measured);
             }
+        }
+
+        #[test]
+        fn what_it_reaches_is_within_its_reach(lens in lenses(), share in 0.0..2.0f64, r in 0.0..70.0f64) {
+            for length in [share * lens.reach().min(100.0), r] {
+                prop_assert_eq!(lens.reaches(length), length <= lens.reach(), "{}", length);
+            }
+            prop_assert!(!lens.reaches(f64::NAN) && !Distortion::None.reaches(f64::NAN));
         }
 
         #[test]

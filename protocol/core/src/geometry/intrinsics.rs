@@ -94,7 +94,7 @@ impl Intrinsics {
         }
         let mut slope = p_cam.truncate() / p_cam.z;
         if self.distortion != Distortion::None {
-            if !(slope.length() <= self.distortion.reach()) {
+            if !self.distortion.reaches(slope.length()) {
                 return None;
             }
             slope = self.distortion.distort(slope).0;
