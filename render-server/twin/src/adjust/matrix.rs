@@ -1,6 +1,7 @@
 //! Symmetric positive definite systems, dense, and small orthonormal bases.
 
 use glam::{DMat3, DVec2};
+use rayon::prelude::*;
 
 /// A symmetric matrix; its lower triangle, row by row.
 #[derive(Clone, Debug)]
@@ -45,9 +46,15 @@ impl Symmetric {
         }
     }
 
-    /// Adds another one.
-    pub(super) fn add_all(&mut self, other: &Self) {
-        self.lower.iter_mut().zip(&other.lower).for_each(|(x, y)| *x += y);
+    /// Returns the sum of matrices of one size, each element's in their order; zero of none.
+    pub(super) fn sum(size: usize, all: &[&Self]) -> Self {
+        let mut sum = Self::zero(size);
+        sum.lower.par_chunks_mut(PIECE).enumerate().for_each(|(piece, sum)| {
+            for one in all {
+                sum.iter_mut().zip(&one.lower[piece * PIECE..]).for_each(|(x, y)| *x += y);
+            }
+        });
+        sum
     }
 
     /// Makes the diagonal larger by this share (Marquardt 1963).
@@ -57,24 +64,42 @@ impl Symmetric {
         }
     }
 
-    /// Returns its factor; `None` if it is not positive definite.
+    /// Returns its factor; `None` if it is not positive definite. The same to the last bit on any number of threads.
     pub(super) fn factor(mut self) -> Option<Factor> {
-        for i in 0..self.size {
-            let start = i * (i + 1) / 2;
-            let (before, row) = self.lower.split_at_mut(start);
-            let greatest = row[i];
-            for j in 0..i {
-                let other = &before[j * (j + 1) / 2..][..=j];
-                row[j] = (row[j] - dot(&row[..j], &other[..j])) / other[j];
+        for begin in (0..self.size).step_by(PANEL) {
+            let end = (begin + PANEL).min(self.size);
+            let (before, after) = self.lower.split_at_mut(end * (end + 1) / 2);
+            for i in begin..end {
+                let (above, row) = before.split_at_mut(i * (i + 1) / 2);
+                let greatest = row[i];
+                factor_row(&mut row[..i], begin, above);
+                let value = row[i] - dot(&row[..i], &row[..i]);
+                // What is left of the diagonal after subtraction must be more than rounding.
+                if !(value > 1e-13 * greatest && value > 0.0) {
+                    return None;
+                }
+                row[i] = value.sqrt();
             }
-            let value = row[i] - dot(&row[..i], &row[..i]);
-            // What is left of the diagonal after subtraction must be more than rounding.
-            if !(value > 1e-13 * greatest && value > 0.0) {
-                return None;
+            // These columns of the rows below, each for itself.
+            let mut rows = Vec::with_capacity(self.size - end);
+            let mut rest = after;
+            for i in end..self.size {
+                let (row, next) = rest.split_at_mut(i + 1);
+                rows.push(&mut row[..end]);
+                rest = next;
             }
-            row[i] = value.sqrt();
+            let before = &*before;
+            rows.into_par_iter().with_min_len(16).for_each(|row| factor_row(row, begin, before));
         }
         Some(Factor(self))
+    }
+}
+
+/// Finds a row of the factor from a column on, given the rows above, which reach as far, and its elements before.
+fn factor_row(row: &mut [f64], from: usize, above: &[f64]) {
+    for j in from..row.len() {
+        let other = &above[j * (j + 1) / 2..][..=j];
+        row[j] = (row[j] - dot(&row[..j], &other[..j])) / other[j];
     }
 }
 
@@ -97,7 +122,12 @@ impl Factor {
     }
 }
 
-/// Four sums at once: one waits for itself.
+/// Columns that are found together: with as many rows they stay in a core's cache.
+const PANEL: usize = 32;
+/// Elements that are added by one thread.
+const PIECE: usize = 1 << 15;
+
+/// Eight sums at once: one waits for itself.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a_eights, a_rest) = a.as_chunks::<8>();
@@ -146,22 +176,22 @@ mod tests {
     proptest! {
         #[test]
         fn solutions_solve(
-            rows in prop::collection::vec(prop::collection::vec(-1.0..1.0f64, 19), 22),
-            right in prop::collection::vec(-1.0..1.0f64, 19),
+            rows in prop::collection::vec(prop::collection::vec(-1.0..1.0f64, 70), 73),
+            right in prop::collection::vec(-1.0..1.0f64, 70),
         ) {
             let full = |i: usize, j: usize| {
                 let product: f64 = rows.iter().map(|row| row[i] * row[j]).sum();
                 product + if i == j { 0.1 } else { 0.0 }
             };
-            let mut matrix = Symmetric::zero(19);
-            for i in 0..19 {
+            let mut matrix = Symmetric::zero(70);
+            for i in 0..70 {
                 for j in 0..=i {
                     matrix.add(i, j, full(i, j));
                 }
             }
             let x = matrix.factor().unwrap().solve(right.clone());
-            for i in 0..19 {
-                let back: f64 = (0..19).map(|j| full(i, j) * x[j]).sum();
+            for i in 0..70 {
+                let back: f64 = (0..70).map(|j| full(i, j) * x[j]).sum();
                 prop_assert!((back - right[i]).abs() < 1e-9);
             }
         }

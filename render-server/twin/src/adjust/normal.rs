@@ -220,9 +220,10 @@ pub(super) fn normal(problem: &Problem, state: &State, damping: f64) -> Normal {
             sum
         })
         .collect();
-    let mut sum = Normal::zero(layout.size);
+    let matrices: Vec<&Symmetric> = parts.iter().map(|part| &part.matrix).collect();
+    let mut sum =
+        Normal { matrix: Symmetric::sum(layout.size, &matrices), gradient: vec![0.0; layout.size] };
     for part in &parts {
-        sum.matrix.add_all(&part.matrix);
         sum.gradient.iter_mut().zip(&part.gradient).for_each(|(sum, g)| *sum += g);
     }
     add_tags(&mut sum, problem, state);
