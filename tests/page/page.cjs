@@ -575,7 +575,7 @@ async function leaderboard(browser) {
   const vehicle = start("sim", "--vicon", vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", stand.join(), "--json");
   const [, mavlink] = await vehicle.line(/"mavlink":"([^"]+)"/);
   const fly = start("fly", "race", "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
-    "--seconds", "3", "--log-dir", at("flights"), "--json");
+    "--seconds", "6", "--log-dir", at("flights"), "--json");
   const picture = wall.getByRole("region", { name: "who flies now" }).getByRole("figure");
   await picture.filter({ hasText: /wasps\s*official\s*\d\/\d\s*0:0\d\.\d/ }).waitFor();
   for (const canvas of ["map", "pictures canvas"]) await isPainted(wall, canvas);
