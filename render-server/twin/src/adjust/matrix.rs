@@ -162,7 +162,9 @@ pub(super) fn orthonormal(columns: &mut [Vec<DVec2>; 3]) -> Option<DMat3> {
         let left2 = product(column, column);
         left *= left2 / length2;
         let length = left2.sqrt();
-        column.iter_mut().for_each(|x| *x /= length);
+        for x in column.iter_mut() {
+            *x /= length;
+        }
         upper.col_mut(k)[k] = length;
     }
     (left > 1e-9).then_some(upper)
