@@ -48,6 +48,9 @@ function start(...args) {
   return { child, line, ended };
 }
 
+/** Starts a demo that waits for its start. It draws no more than the page shows: what draws for nobody takes Chromium's time. */
+const startDemo = (...args) => start("demo", "--headless", "--wait", "--scene", "race", "--max-rate", "30", ...args);
+
 /** Opens a page of its own that notes what it should not do. */
 async function open(browser, url, options = {}) {
   const context = await browser.newContext({ viewport: { width: 1440, height: 900 }, ...options });
@@ -148,7 +151,7 @@ const brightness = (page) =>
 
 /** A flight: it waits for its start, is watched on three screens, and is stopped by the keyboard. */
 async function flight(browser) {
-  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--log-dir", scratch, "--report", `${scratch}/report.json`);
+  const demo = startDemo("--log-dir", scratch, "--report", `${scratch}/report.json`);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
   await until(page, "phase-text", /ready to start/);
@@ -321,7 +324,7 @@ async function panels(page) {
 
 /** The flight that a page has watched: a program started anew has it still; it is saved, read again, and flies beside itself. */
 async function keptFlight(page, url) {
-  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--port", new URL(url).port);
+  const demo = startDemo("--port", new URL(url).port);
   await demo.line(/page\s+http:\S+/);
   await page.reload();
   await until(page, "phase-text", /ready to start/);
@@ -356,7 +359,7 @@ async function crash(browser) {
   const plugin = path.join(scratch, "into-the-wall");
   fs.copyFileSync(misbehave, path.join(scratch, "misbehave"));
   fs.writeFileSync(plugin, '#!/bin/sh\nexec "$(dirname "$0")/misbehave" world:1:-0.16 "$@"\n', { mode: 0o755 });
-  const demo = start("demo", "--headless", "--wait", "--scene", "race", "--plugin", plugin, "--log-dir", scratch);
+  const demo = startDemo("--plugin", plugin, "--log-dir", scratch);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
   await until(page, "phase-text", /ready to start/);
@@ -424,7 +427,7 @@ async function lab(browser) {
   assert.equal(set.status, 0, `${set.stderr}`);
   const free = "127.0.0.1:0";
   const server = start("serve", path.join(scenes, "first"), "--scenes", scenes, "--login", "always", "--keys", keys,
-    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--max-rate", "30", "--json", "--lifeline");
   const [, url] = await server.line(/"http":"([^"]+)"/);
   const page = await open(browser, url);
   await until(page, "link-text", /not logged in/);
@@ -552,7 +555,7 @@ async function leaderboard(browser) {
   command("scene", "generate", "race", "-o", at("race"));
   const [token] = command("leaderboard", "--database", database, "team", "add", "wasps").match(/^[0-9a-f]{32}$/m);
   const server = start("serve", at("race"), "--leaderboard", database, "--keys", at("server"), "--pair", "team:vizflyt",
-    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--max-rate", "30", "--json", "--lifeline");
   const [ready] = await server.line(/^.*"ready":"server".*$/);
   const { http, quic, vicon, spawn: stand } = JSON.parse(ready);
   const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
@@ -621,7 +624,7 @@ async function labDay(browser) {
   command("scene", "generate", "room", "-o", at("room"));
   fs.appendFileSync(at("room/arena.toml"), '\n[[vehicles]]\nname = "wasp"\n[[vehicles]]\nname = "bee"\n');
   const server = start("serve", at("room"), "--leaderboard", "none", "--lab-day", at("kept.json"), "--keys", at("server"), "--print-page-keys",
-    "--pair", "instructor", "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+    "--pair", "instructor", "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--max-rate", "30", "--json", "--lifeline");
   const [ready] = await server.line(/^.*"ready":"server".*$/);
   const { http, quic, vicon, spawn: stand } = JSON.parse(ready);
   const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
@@ -963,7 +966,7 @@ async function stranger(browser) {
   const vehicle = (name, y_m) => `\n[[vehicles]]\nname = "${name}"\nspawn = { position_m = [0.9, ${y_m}, 0], yaw_deg = 0 }\n`;
   fs.appendFileSync(file, vehicle("wasp", 1.2) + vehicle("bee", 0));
   const server = start("serve", file, "--leaderboard", "none", "--keys", at("server"), "--pair", "instructor",
-    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--json", "--lifeline");
+    "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu", "--max-rate", "30", "--json", "--lifeline");
   const [ready] = await server.line(/^.*"ready":"server".*$/);
   const { http, quic, vicon } = JSON.parse(ready);
   const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
