@@ -139,7 +139,7 @@ struct PointPart<const N: usize> {
     seen: Vec<Seen<N>>,
 }
 
-/// Returns it; `None` where its sightings do not place it, or it is seen by fewer than two.
+/// Returns it; `None` where its sightings do not place it, it is seen by fewer than two, or is at a camera.
 fn part<const N: usize>(
     problem: &Problem,
     state: &State,
@@ -149,6 +149,8 @@ fn part<const N: usize>(
     let sightings = problem.sightings(point);
     let mut seen = Vec::with_capacity(sightings.len());
     let mut columns = [const { Vec::new() }; 3];
+    // By how much images change with the point. [px^2/m^2]
+    let (mut least, mut greatest) = (f64::MAX, 0.0f64);
     for &(camera, pixel) in sightings {
         let Some((projected, in_row)) = state.see(camera, state.points[point], pixel) else {
             continue;
@@ -158,6 +160,8 @@ fn part<const N: usize>(
         let Projected { by_point, by_lens, .. } = projected;
         let Slopes { by_camera, by_point, by_readout } =
             in_row.slopes(&state.cameras[camera], &by_point);
+        let slope2 = by_point.iter().map(|d| d.length_squared()).sum();
+        (least, greatest) = (least.min(slope2), greatest.max(slope2));
         let by_shared = problem.layout.by_shared(by_lens, by_readout);
         columns.iter_mut().zip(by_point).for_each(|(column, d)| column.push(d * root));
         seen.push(Seen {
@@ -168,7 +172,7 @@ fn part<const N: usize>(
             residual: residual * root,
         });
     }
-    if seen.len() < 2 {
+    if seen.len() < 2 || greatest > BEFORE_THE_NOSE.powi(2) * least {
         return None;
     }
     // Damping is as if each number of the point had been measured to be what it is.
@@ -415,6 +419,8 @@ const STILL: usize = 6;
 /// And a bend.
 const ROLLING: usize = 9;
 
+/// So many times nearer to one camera than to another a point is a mismatch, and rounding all that it tells.
+const BEFORE_THE_NOSE: f64 = 1e4;
 /// More threads than most machines of a lab have: each has a matrix of half of size^2 numbers.
 const PARTS: usize = 16;
 /// Of all matrices: 300 images take 30 MB each.

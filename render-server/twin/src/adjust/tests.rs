@@ -140,8 +140,8 @@ fn without_anything_it_has_no_metres() {
 /// and takes nothing from what is known.
 #[test]
 fn a_point_before_the_nose_of_a_camera_leaves_all_determined() {
-    for before_m in [1e-2, 1e-3, 1e-4, 1e-6] {
-        let mut hall = hall(5, 24, 2500, 0.2);
+    for before_m in [1e-2, 1e-4, 1e-6, 1e-9] {
+        let mut hall = hall(5, 24, 1000, 0.2);
         hall.capture.tags.clear();
         hall.capture.images.iter_mut().for_each(|image| image.tags.clear());
         // One camera stands where another looks.
