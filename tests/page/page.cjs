@@ -412,8 +412,19 @@ async function crash(browser) {
   await page.locator("#theme").click();
   await shot(page, "projector-crash-other-theme");
   assert.deepEqual(page.faults, []);
-  await page.context().close();
   assert.equal(await demo.ended, 1, "a collision is no success");
+  // The server is gone, and the card has its images: every one that is looked at.
+  await region.getByRole("button", { name: "show depth" }).press("Enter");
+  await slider.focus();
+  await page.keyboard.press("Home");
+  for (let before = ""; ; await page.keyboard.press("ArrowRight")) {
+    const image = region.locator("img").first(), address = await image.getAttribute("src");
+    if (address === before) break;
+    assert.match(address, /depth/);
+    await page.waitForFunction(() => document.querySelector("#crash img").naturalWidth > 100);
+    before = address;
+  }
+  await page.context().close();
 }
 
 /** A lab whose page takes a login: wrong, right, cameras, scene, pairing, out again. */
