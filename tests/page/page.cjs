@@ -16,6 +16,8 @@ const PATIENCE = 120_000;
 const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
 const chromiumPath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
+/** How `misbehave` flies the race past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post. */
+const INTO_THE_WALL = "world:1:-0.16";
 const scratch = fs.mkdtempSync(path.join(os.tmpdir(), "vizflyt-page-"));
 const children = [];
 
@@ -353,12 +355,11 @@ async function keptFlight(page, url) {
 async function crash(browser) {
   const misbehave = path.join(path.dirname(vizflyt), "examples", "misbehave");
   assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --release --examples`);
-  // Past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post.
   // A plugin sees its own folder alone, as nobody.
   fs.chmodSync(scratch, 0o755);
   const plugin = path.join(scratch, "into-the-wall");
   fs.copyFileSync(misbehave, path.join(scratch, "misbehave"));
-  fs.writeFileSync(plugin, '#!/bin/sh\nexec "$(dirname "$0")/misbehave" world:1:-0.16 "$@"\n', { mode: 0o755 });
+  fs.writeFileSync(plugin, `#!/bin/sh\nexec "$(dirname "$0")/misbehave" ${INTO_THE_WALL} "$@"\n`, { mode: 0o755 });
   const demo = startDemo("--plugin", plugin, "--log-dir", scratch);
   const [, url] = await demo.line(/page\s+(http:\S+)/);
   const page = await open(browser, url);
@@ -983,7 +984,7 @@ async function stranger(browser) {
   const [, code] = await server.line(/"pairing":{"code":"([0-9 ]+)"/);
   command("pair", quic, "--code", code, "--keys", at("jetson"));
   const flown = [];
-  for (const [name, y_m, options, how] of [["wasp", 1.2, ["--wait"], ["hover"]], ["bee", 0, [], []]]) {
+  for (const [name, y_m, options, how] of [["wasp", 1.2, ["--wait"], ["hover"]], ["bee", 0, [], [INTO_THE_WALL]]]) {
     const sim = start("sim", "--object", name, "--vicon", vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", `0.9,${y_m},0,0`, "--json");
     const [, mavlink] = await sim.line(/"mavlink":"([^"]+)"/);
     const fly = start("fly", plugin, "--vehicle", name, "--server", quic, "--keys", at("jetson"), "--mavlink", `udpout:${mavlink}`,
