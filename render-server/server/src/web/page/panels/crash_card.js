@@ -40,7 +40,9 @@ class Replay {
     this.slider.addEventListener("input", () => this.pause());
     this.playButton = makeButton("", { onclick: () => (this.timer ? this.pause() : this.play()) });
     this.kindButton = makeButton("", { onclick: () => this.showKind(this.kind === "colour" ? "depth" : "colour") });
-    this.cameras = make("select", { ariaLabel: "camera" }, ...card.images.map(({ camera }, k) => new Option(camera, String(k))));
+    // One that rendered nothing meanwhile has nothing to be chosen for.
+    const options = card.images.map(({ camera, before_s }, k) => make("option", { value: String(k), textContent: camera, disabled: !before_s.length }));
+    this.cameras = make("select", { ariaLabel: "camera" }, ...options);
     this.cameras.addEventListener("change", () => this.showCamera(Number(this.cameras.value)));
     this.cameras.hidden = card.images.length < 2;
     this.cameras.value = String(camera);
