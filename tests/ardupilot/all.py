@@ -28,7 +28,7 @@ def arguments():
     parser = argparse.ArgumentParser(prog="tests/ardupilot/run", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a few flights of each check, in about a minute")
     parser.add_argument("--only", default=",".join(CHECKS), metavar="CHECKS", help="some of %(default)s")
-    parser.add_argument("--vizflyt", default=ROOT / "target/release/vizflyt", type=pathlib.Path, metavar="PROGRAM")
+    parser.add_argument("--vizflyt", default=ROOT / "target/debug/vizflyt", type=pathlib.Path, metavar="PROGRAM")
     parser.add_argument("--plugin", type=pathlib.Path, help="the example `misbehave`, if not beside PROGRAM")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="another parameter")
     parser.add_argument("--keep", type=pathlib.Path, metavar="FOLDER", help="keeps logs and parameters there")
@@ -41,7 +41,7 @@ def arguments():
     # Of a PX4 nothing is flown, so that nothing of ours is needed.
     for file in (given.binary, *([] if "px4" in given.binary.name else [given.vizflyt, given.plugin])):
         if not file.is_file():
-            parser.error(f"there is no {file}; `cargo build --release --workspace --bins --examples` builds ours")
+            parser.error(f"there is no {file}; `cargo build --workspace --bins --examples` builds ours")
     return given
 
 

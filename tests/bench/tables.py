@@ -274,7 +274,7 @@ BY_HAND = [
            "captured scenes, which are not part of the project"),
     ByHand("Faults of the network", "VIZFLYT_FAULTS=write cargo test --release -p vizflyt-e2e --test faults",
            "nothing: a test holds the file that is shown"),
-    ByHand("Many watchers", "VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test viewers", "a long run"),
+    ByHand("Many watchers", "VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test server viewers", "a long run"),
     ByHand("Stream: zenoh", "cargo run --release --manifest-path tests/peers/stream/Cargo.toml", "zenoh"),
     ByHand("Bridge", "vizflyt bench bridge", "a computer on which nothing else runs"),
     ByHand("AprilTags", "cargo bench -p vizflyt-e2e --bench locate -- 3", "a long run"),

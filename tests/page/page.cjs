@@ -354,7 +354,7 @@ async function keptFlight(page, url) {
 /** A flight that flies straight into a wall: its crash card comes by itself, and is looked at by keyboard alone. */
 async function crash(browser) {
   const misbehave = path.join(path.dirname(vizflyt), "examples", "misbehave");
-  assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --release --examples`);
+  assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --examples`);
   // A plugin sees its own folder alone, as nobody.
   fs.chmodSync(scratch, 0o755);
   const plugin = path.join(scratch, "into-the-wall");

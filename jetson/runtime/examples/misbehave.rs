@@ -1,7 +1,7 @@
 //! A plugin that does what its first argument says, well or badly: for tests, and to see what the
 //! vehicle does.
 //!
-//! `vizflyt fly target/release/examples/misbehave --server ... -- late-panic`
+//! `vizflyt fly target/debug/examples/misbehave --server ... -- late-panic`
 //!
 //! With `late-` it flies well for a moment before. Several, separated by commas, are done one after
 //! the other; what is left to do is kept in the file named by the second argument, so that a plugin

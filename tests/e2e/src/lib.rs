@@ -16,7 +16,7 @@ pub fn vizflyt() -> PathBuf {
     let program = test.ancestors().nth(2).expect("target/PROFILE").join("vizflyt");
     assert!(
         program.exists(),
-        "{} is not built; run `cargo build --release` first (tests/run does)",
+        "{} is not built; run `cargo build` first (tests/run does)",
         program.display()
     );
     program

@@ -11,7 +11,7 @@
 //! 0.7 ms per image.
 //!
 //! To try an idea, change one of the constants at the foot of a file, or one step, and fly:
-//! `cargo run --release -- demo --plugin PATH`. Each constant states where it comes from.
+//! `cargo run -- demo --plugin PATH`. Each constant states where it comes from.
 
 pub mod field;
 pub mod memory;

@@ -1,5 +1,5 @@
 //! Flies generated courses in lock-step, without autopilot and server, with images and attitude alone:
-//! `cargo run --release -p vizflyt-race --example rehearse -- p5 0 1 2`. One seed alone is reported
+//! `cargo run -p vizflyt-race --example rehearse -- p5 0 1 2`. One seed alone is reported
 //! every half second.
 //!
 //! `-- race 1 twin=FOLDER` flies the race hall of a seed as it was rebuilt from a capture: images are the twin's

@@ -25,7 +25,7 @@ const NO_LINES: fn(Stream, &str) = |_, _| {};
 fn misbehave(how: &str) -> Vec<OsString> {
     let test = std::env::current_exe().unwrap();
     let program = test.ancestors().nth(2).unwrap().join("examples/misbehave");
-    assert!(program.exists(), "run `cargo build --release --examples` first (tests/run does)");
+    assert!(program.exists(), "run `cargo build --examples` first (tests/run does)");
     vec![program.into(), how.into()]
 }
 

@@ -238,7 +238,7 @@ fn log_of_another_version_is_refused_with_its_version() {
 fn misbehave(how: &str) -> Vec<OsString> {
     let test = std::env::current_exe().unwrap();
     let program = test.ancestors().nth(2).unwrap().join("examples/misbehave");
-    assert!(program.exists(), "run `cargo build --release --examples` first (tests/run does)");
+    assert!(program.exists(), "run `cargo build --examples` first (tests/run does)");
     vec![program.into(), how.into()]
 }
 

@@ -1,6 +1,6 @@
 //! docs/guides/arena-reference.md is written from the types that read `arena.toml`; these tests hold it to them.
 //!
-//! `UPDATE=1 cargo test --release -p vizflyt-arena --test reference` writes the page anew.
+//! `UPDATE=1 cargo test -p vizflyt-arena --test reference` writes the page anew.
 
 mod page;
 mod probe;
@@ -37,7 +37,7 @@ fn the_page_is_what_the_types_say() {
     assert!(
         written == committed,
         "docs/guides/arena-reference.md is not what the types say, first in {differs:?}; run \
-         UPDATE=1 cargo test --release -p vizflyt-arena --test reference to write it"
+         UPDATE=1 cargo test -p vizflyt-arena --test reference to write it"
     );
 }
 

@@ -12,7 +12,7 @@ use super::{BY_SERVER, EXAMPLE};
 const HEAD: &str = "\
 # arena.toml, key by key
 
-<!-- Written by `UPDATE=1 cargo test --release -p vizflyt-arena --test reference` from the types that read the file. -->
+<!-- Written by `UPDATE=1 cargo test -p vizflyt-arena --test reference` from the types that read the file. -->
 
 What stands in the room, what is flown through, and by which rules: how to use it is in [scenes.md](scenes.md) and
 [course.md](course.md), here is every key. `vizflyt arena new` writes a first file, `vizflyt arena check` finds mistakes.

@@ -2,7 +2,7 @@
 //! kept by whatever is left when the server, the runtime, or the guard is not there.
 //!
 //! The vehicle is watched from outside, by the motion capture's packets and its own heartbeats. Prints
-//! what it measures: `cargo test --release -p vizflyt-e2e --test chain -- --nocapture`. Times are not
+//! what it measures: `cargo test -p vizflyt-e2e --test chain -- --nocapture`. Times are not
 //! judged tighter than a loaded machine allows; `docs/BENCHMARKS.md` has those of a quiet one.
 
 #[path = "../lab/mod.rs"]

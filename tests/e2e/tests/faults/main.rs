@@ -2,7 +2,7 @@
 //!
 //! The real transport of server and runtime, between a source of images without a renderer and a
 //! sink without a decoder, over a network in memory with seeded impairment. What each fault does is
-//! a table, `table.txt` beside this file; `VIZFLYT_FAULTS=write cargo test --release -p vizflyt-e2e
+//! a table, `table.txt` beside this file; `VIZFLYT_FAULTS=write cargo test -p vizflyt-e2e
 //! --test faults` writes it anew.
 
 mod memory;

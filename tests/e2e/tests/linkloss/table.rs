@@ -69,5 +69,4 @@ pub(crate) fn compare(rows: &[Row]) {
     }
 }
 
-const WRITE: &str =
-    "run VIZFLYT_LINKLOSS=write cargo test --release -p vizflyt-e2e --test linkloss";
+const WRITE: &str = "run VIZFLYT_LINKLOSS=write cargo test -p vizflyt-e2e --test linkloss";

@@ -1,16 +1,14 @@
 //! The page over HTTPS, with a certificate that the server makes.
 
-mod support;
-
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::{Arc, Mutex};
 
+use crate::support::{PATIENCE, Server, write_arena};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::{CryptoProvider, ring, verify_tls13_signature};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, ClientConnection, DigitallySignedStruct, Error, SignatureScheme};
-use support::{PATIENCE, Server, write_arena};
 use vizflyt_trust::Fingerprint;
 
 /// Takes any certificate, as a person does who clicks on, and remembers it.
@@ -98,6 +96,6 @@ fn the_page_is_served_over_https_with_a_certificate_of_its_own() {
     let cookie = answer.lines().find(|line| line.starts_with("set-cookie: ")).unwrap();
     assert!(answer.starts_with("HTTP/1.1 303") && cookie.ends_with("; Secure"), "{answer}");
     // Who types http:// is told so.
-    let (status, answer) = support::http(server.http, "GET / HTTP/1.1");
+    let (status, answer) = crate::support::http(server.http, "GET / HTTP/1.1");
     assert!(status == 400 && answer.contains("this page is HTTPS"), "{answer}");
 }

@@ -1,12 +1,10 @@
 //! MultiSource vehicles on one server, each with its own client over real QUIC.
 
-mod support;
-
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use crate::support::{Client, Emitter, STEP_M, Server, Socket, http, send_json, write_arena};
 use quinn::{TransportConfig, VarInt};
-use support::{Client, Emitter, STEP_M, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{Event, EventKind, ToRuntime};
 use vizflyt_protocol::packet::ImageHeader;
 

@@ -2,7 +2,6 @@
 //!
 //! Everything waits on conditions; [`PATIENCE`] only bounds a test that fails.
 
-#![allow(dead_code, unreachable_pub)] // Why: every test file uses another part, as its own module.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
@@ -31,11 +30,11 @@ use vizflyt_trust::{ALPN, Fingerprint, Identity, KeysFolder, Owner, Paired, Role
 use zerocopy::IntoBytes;
 
 /// Bounds a test that fails; never part of a passing one's outcome.
-pub const PATIENCE: Duration = Duration::from_mins(1);
+pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
 
 /// Writes an arena whose scene is a wall of splats at x = 5 m, and returns the path of its
 /// arena.toml.
-pub fn write_arena(folder: &Path, more: &str) -> std::path::PathBuf {
+pub(crate) fn write_arena(folder: &Path, more: &str) -> std::path::PathBuf {
     let mut means = Vec::new();
     for y in -30..=30 {
         for z in 0..=30 {
@@ -77,28 +76,28 @@ position_m = [0.06, 0, 0.02]
 }
 
 /// The server's binary, running.
-pub struct Server {
+pub(crate) struct Server {
     child: Child,
     stdin: Option<ChildStdin>,
     lines: mpsc::Receiver<Value>,
-    pub quic: SocketAddr,
-    pub http: SocketAddr,
-    pub vicon: SocketAddr,
+    pub(crate) quic: SocketAddr,
+    pub(crate) http: SocketAddr,
+    pub(crate) vicon: SocketAddr,
     /// Its `ready` line.
-    pub ready: Value,
+    pub(crate) ready: Value,
     /// An instructor's, paired before the start.
-    pub instructor: Identity,
+    pub(crate) instructor: Identity,
     keys: TempDir,
 }
 
 impl Server {
     /// Starts it on free ports and waits until it is ready.
-    pub fn start(arena: &Path, more: &[&str]) -> Self {
+    pub(crate) fn start(arena: &Path, more: &[&str]) -> Self {
         Self::start_paired(arena, more, &[])
     }
 
     /// As [`Self::start`], with others paired than the instructor.
-    pub fn start_paired(arena: &Path, more: &[&str], others: &[vizflyt_trust::Client]) -> Self {
+    pub(crate) fn start_paired(arena: &Path, more: &[&str], others: &[vizflyt_trust::Client]) -> Self {
         let keys = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&keys.path().join("keys"))).unwrap();
         let instructor = Identity::ephemeral().unwrap();
@@ -149,22 +148,22 @@ impl Server {
     }
 
     /// Returns its process.
-    pub fn id(&self) -> u32 {
+    pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
 
     /// Returns the server's keys folder.
-    pub fn keys(&self) -> KeysFolder {
+    pub(crate) fn keys(&self) -> KeysFolder {
         KeysFolder::open(Some(&self.keys.path().join("keys"))).unwrap()
     }
 
     /// Returns who the server is.
-    pub fn fingerprint(&self) -> Fingerprint {
+    pub(crate) fn fingerprint(&self) -> Fingerprint {
         Identity::load_or_create(&self.keys(), Owner::Server).unwrap().fingerprint()
     }
 
     /// Returns the next line of standard output for which `wanted` yields something.
-    pub fn line<T>(&self, mut wanted: impl FnMut(&Value) -> Option<T>) -> T {
+    pub(crate) fn line<T>(&self, mut wanted: impl FnMut(&Value) -> Option<T>) -> T {
         loop {
             let line = self.lines.recv_timeout(PATIENCE).expect("a line of standard output");
             if let Some(found) = wanted(&line) {
@@ -174,7 +173,7 @@ impl Server {
     }
 
     /// Closes standard input (the lifeline) and returns the report; the server must then end.
-    pub fn finish(mut self) -> Value {
+    pub(crate) fn finish(mut self) -> Value {
         drop(self.stdin.take());
         let report = self.line(|line| line.get("report").cloned());
         assert!(self.child.wait().unwrap().success());
@@ -182,19 +181,19 @@ impl Server {
     }
 
     /// Sends SIGTERM.
-    pub fn terminate(&self) {
+    pub(crate) fn terminate(&self) {
         let done = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
         assert!(done.success());
     }
 
     /// Kills it, as a power cut would.
-    pub fn kill(mut self) {
+    pub(crate) fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
 
     /// Waits for the end and returns the exit status.
-    pub fn wait(mut self) -> std::process::ExitStatus {
+    pub(crate) fn wait(mut self) -> std::process::ExitStatus {
         self.child.wait().unwrap()
     }
 }
@@ -207,26 +206,26 @@ impl Drop for Server {
 }
 
 /// Sends poses at about 200 Hz: level, nose along x.
-pub struct Emitter {
+pub(crate) struct Emitter {
     stop: Arc<AtomicBool>,
     paused: Arc<AtomicBool>,
-    pub sent: Arc<AtomicU32>,
+    pub(crate) sent: Arc<AtomicU32>,
     thread: Option<JoinHandle<()>>,
 }
 
 /// How far the emitter's vehicle backs off per frame. [m]
-pub const STEP_M: f64 = 0.001;
+pub(crate) const STEP_M: f64 = 0.001;
 /// Height of the emitter's vehicle. [m]
-pub const HEIGHT_M: f64 = 1.5;
+pub(crate) const HEIGHT_M: f64 = 1.5;
 
 impl Emitter {
     /// Frame n is at x = -n * `STEP_M`.
-    pub fn start(to: SocketAddr, object: &'static str) -> Self {
+    pub(crate) fn start(to: SocketAddr, object: &'static str) -> Self {
         Self::along(to, object, |frame| -f64::from(frame) * STEP_M)
     }
 
     /// Frame n is at x = `x_m(n)`.
-    pub fn along(to: SocketAddr, object: &'static str, x_m: fn(u32) -> f64) -> Self {
+    pub(crate) fn along(to: SocketAddr, object: &'static str, x_m: fn(u32) -> f64) -> Self {
         let (stop, paused) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
         let sent = Arc::new(AtomicU32::new(0));
         let (stop2, paused2, sent2) = (stop.clone(), paused.clone(), sent.clone());
@@ -246,7 +245,7 @@ impl Emitter {
         Self { stop, paused, sent, thread: Some(thread) }
     }
 
-    pub fn pause(&self, paused: bool) {
+    pub(crate) fn pause(&self, paused: bool) {
         self.paused.store(paused, Ordering::Relaxed);
     }
 }
@@ -261,7 +260,7 @@ impl Drop for Emitter {
 }
 
 /// Returns a packet of Vicon Tracker's UDP object stream with one object. [mm, rad]
-pub fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
+pub(crate) fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
     let mut bytes = frame.to_le_bytes().to_vec();
     bytes.extend_from_slice(&[1, 0, 72, 0]);
     let mut name = [0u8; 24];
@@ -272,16 +271,16 @@ pub fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8> {
 }
 
 /// A runtime's connection.
-pub struct Client {
-    pub connection: Connection,
-    pub send: SendStream,
-    pub recv: RecvStream,
+pub(crate) struct Client {
+    pub(crate) connection: Connection,
+    pub(crate) send: SendStream,
+    pub(crate) recv: RecvStream,
     deframer: Deframer,
     endpoint: Endpoint,
 }
 
 /// Returns an entry of `paired.toml`.
-pub fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizflyt_trust::Client {
+pub(crate) fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizflyt_trust::Client {
     vizflyt_trust::Client {
         name: format!("{role:?}").to_lowercase(),
         fingerprint: identity.fingerprint(),
@@ -291,7 +290,7 @@ pub fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizflyt_tru
 }
 
 /// Returns what a client that has just been started says first.
-pub fn hello(vehicle: &str, purpose: Purpose) -> Hello {
+pub(crate) fn hello(vehicle: &str, purpose: Purpose) -> Hello {
     static BOOTS: AtomicU64 = AtomicU64::new(1);
     Hello {
         vehicle: bounded(vehicle),
@@ -303,12 +302,12 @@ pub fn hello(vehicle: &str, purpose: Purpose) -> Hello {
 }
 
 /// Connects, without any message yet.
-pub async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
+pub(crate) async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
     connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
 }
 
 /// As [`connect`], as somebody else.
-pub async fn connect_as(
+pub(crate) async fn connect_as(
     server: &Server,
     identity: &Identity,
     transport: TransportConfig,
@@ -326,12 +325,12 @@ pub async fn connect_as(
 impl Client {
     /// Connects, exchanges preambles and says hello for `vehicle`, as a runtime that has just been
     /// started.
-    pub async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
+    pub(crate) async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
         Self::hello_as(server, &server.instructor, vehicle, transport).await
     }
 
     /// As [`Self::hello`], as somebody else who is paired.
-    pub async fn hello_as(
+    pub(crate) async fn hello_as(
         server: &Server,
         identity: &Identity,
         vehicle: &str,
@@ -341,7 +340,7 @@ impl Client {
     }
 
     /// Connects, exchanges preambles and says `hello`.
-    pub async fn greet(server: &Server, hello: Hello, transport: TransportConfig) -> Self {
+    pub(crate) async fn greet(server: &Server, hello: Hello, transport: TransportConfig) -> Self {
         Self::greet_as(server, &server.instructor, hello, transport).await
     }
 
@@ -363,12 +362,12 @@ impl Client {
     }
 
     /// Connects and is welcomed.
-    pub async fn welcomed(server: &Server, transport: TransportConfig) -> (Self, ArenaInfo) {
+    pub(crate) async fn welcomed(server: &Server, transport: TransportConfig) -> (Self, ArenaInfo) {
         Self::welcomed_to(server, "vizflyt", transport).await
     }
 
     /// As [`Self::welcomed`], to another vehicle.
-    pub async fn welcomed_to(
+    pub(crate) async fn welcomed_to(
         server: &Server,
         vehicle: &str,
         transport: TransportConfig,
@@ -379,14 +378,14 @@ impl Client {
     }
 
     /// Connects as a watcher and is welcomed.
-    pub async fn watching(server: &Server, transport: TransportConfig) -> Self {
+    pub(crate) async fn watching(server: &Server, transport: TransportConfig) -> Self {
         let hello = hello("vizflyt", Purpose::Watch);
         let mut client = Self::greet(server, hello, transport).await;
         client.welcome().await;
         client
     }
 
-    pub async fn welcome(&mut self) -> Welcome {
+    pub(crate) async fn welcome(&mut self) -> Welcome {
         match self.next().await {
             ToRuntime::Welcome(welcome) => welcome,
             other => panic!("not welcomed: {other:?}"),
@@ -394,24 +393,24 @@ impl Client {
     }
 
     /// Returns the next pose.
-    pub async fn pose(&self) -> PoseSample {
+    pub(crate) async fn pose(&self) -> PoseSample {
         let datagram = tokio::time::timeout(PATIENCE, self.connection.read_datagram());
         let bytes = datagram.await.expect("a pose").expect("the connection lives");
         let Datagram::Pose(pose) = decode_body(&bytes).unwrap();
         pose
     }
 
-    pub async fn send(&mut self, message: &ToServer) {
+    pub(crate) async fn send(&mut self, message: &ToServer) {
         self.send.write_all(encode(message, &mut [0; MAX_FRAMED])).await.unwrap();
     }
 
     /// Returns the next message of the control stream.
-    pub async fn next(&mut self) -> ToRuntime {
+    pub(crate) async fn next(&mut self) -> ToRuntime {
         tokio::time::timeout(PATIENCE, self.next_ever()).await.expect("a message")
     }
 
     /// As [`Self::next`], however long it takes.
-    pub async fn next_ever(&mut self) -> ToRuntime {
+    pub(crate) async fn next_ever(&mut self) -> ToRuntime {
         loop {
             if let Some(message) = self.deframer.next::<ToRuntime>() {
                 return message.unwrap();
@@ -424,7 +423,7 @@ impl Client {
     }
 
     /// Returns the first message for which `wanted` yields something.
-    pub async fn until<T>(&mut self, mut wanted: impl FnMut(ToRuntime) -> Option<T>) -> T {
+    pub(crate) async fn until<T>(&mut self, mut wanted: impl FnMut(ToRuntime) -> Option<T>) -> T {
         tokio::time::timeout(PATIENCE, async {
             loop {
                 if let Some(found) = wanted(self.next().await) {
@@ -437,13 +436,13 @@ impl Client {
     }
 
     /// Returns the next image stream that was not reset, whole.
-    pub async fn image(&self) -> (ImageHeader, Vec<u8>) {
+    pub(crate) async fn image(&self) -> (ImageHeader, Vec<u8>) {
         let (header, payload, _) = self.whole_image().await;
         (header, payload)
     }
 
     /// As [`Self::image`], with its trailer.
-    pub async fn whole_image(&self) -> (ImageHeader, Vec<u8>, ImageTrailer) {
+    pub(crate) async fn whole_image(&self) -> (ImageHeader, Vec<u8>, ImageTrailer) {
         tokio::time::timeout(PATIENCE, async {
             loop {
                 let mut stream = self.connection.accept_uni().await.expect("an image stream");
@@ -459,14 +458,14 @@ impl Client {
     }
 
     /// Ends the conversation and waits until the server knows.
-    pub async fn close(self) {
+    pub(crate) async fn close(self) {
         self.connection.close(VarInt::from_u32(0), b"bye");
         self.endpoint.wait_idle().await;
     }
 }
 
 /// Sends one HTTP request and returns the status and the rest of the answer.
-pub fn http(address: SocketAddr, head: &str) -> (u16, String) {
+pub(crate) fn http(address: SocketAddr, head: &str) -> (u16, String) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     write!(stream, "{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
@@ -477,7 +476,7 @@ pub fn http(address: SocketAddr, head: &str) -> (u16, String) {
 }
 
 /// Sends JSON as our own page would, or a page of `origin`, and returns the status and the body.
-pub fn send_json(
+pub(crate) fn send_json(
     address: SocketAddr,
     request: &str,
     origin: Option<&str>,
@@ -509,26 +508,26 @@ fn status(answer: &str) -> u16 {
 }
 
 /// The page's WebSocket.
-pub struct Socket(WebSocket);
+pub(crate) struct Socket(WebSocket);
 
 impl Socket {
     /// Opens it as a page of `origin` would; the status if the server declines.
-    pub fn open(address: SocketAddr, origin: &str) -> Result<Self, u16> {
+    pub(crate) fn open(address: SocketAddr, origin: &str) -> Result<Self, u16> {
         Self::open_at(address, origin, "/ws")
     }
 
     /// As [`Self::open`], with another path and query.
-    pub fn open_at(address: SocketAddr, origin: &str, path: &str) -> Result<Self, u16> {
+    pub(crate) fn open_at(address: SocketAddr, origin: &str, path: &str) -> Result<Self, u16> {
         WebSocket::open(address, path, &format!("Origin: {origin}\r\n")).map(Self)
     }
 
     /// Returns the next message: opcode (1 text, 2 binary) and payload.
-    pub fn next(&mut self) -> (u8, Vec<u8>) {
+    pub(crate) fn next(&mut self) -> (u8, Vec<u8>) {
         self.0.receive()
     }
 
     /// Returns the next JSON message of a type.
-    pub fn message(&mut self, kind: &str) -> Value {
+    pub(crate) fn message(&mut self, kind: &str) -> Value {
         loop {
             let (opcode, payload) = self.next();
             if opcode == TEXT {

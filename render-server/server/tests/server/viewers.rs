@@ -2,20 +2,18 @@
 //! the runtimes keep their images.
 //!
 //! ```text
-//! VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test viewers -- --nocapture
+//! VIZFLYT_STRESS_S=600 cargo test -p vizflyt-server --test server viewers -- --nocapture
 //! ```
 //! runs it for ten minutes and prints rates and memory; without it, for a few seconds. Rates are
 //! compared in one run, without pages, with them, and without again; no test hangs on them.
-
-mod support;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use crate::support::{Client, Emitter, Server, Socket, send_json, write_arena};
 use quinn::TransportConfig;
-use support::{Client, Emitter, Server, Socket, send_json, write_arena};
 use vizflyt_protocol::messages::ToRuntime;
 
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];

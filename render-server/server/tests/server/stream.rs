@@ -1,13 +1,11 @@
 //! The real binary, a Vicon emitter and a runtime's client over loopback.
 
-mod support;
-
 use std::sync::atomic::Ordering;
 
-use quinn::{TransportConfig, VarInt};
-use support::{
+use crate::support::{
     Client, Emitter, HEIGHT_M, PATIENCE, STEP_M, Server, connect, hello, send_json, write_arena,
 };
+use quinn::{TransportConfig, VarInt};
 use vizflyt_protocol::PROTOCOL_VERSION;
 use vizflyt_protocol::messages::{
     ClockRequest, Event, EventKind, FlightPhase, Hello, Purpose, ReceivedEvents, Telemetry,
@@ -311,7 +309,7 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     client.until(|message| (message == ToRuntime::EventsReceived(3)).then_some(())).await;
     let page = server.http;
     let log = tokio::task::spawn_blocking(move || {
-        let mut socket = support::Socket::open(page, &format!("http://{page}")).unwrap();
+        let mut socket = crate::support::Socket::open(page, &format!("http://{page}")).unwrap();
         let mut texts = Vec::new();
         while !texts.iter().any(|text| text == "three") {
             let events = socket.message("events");

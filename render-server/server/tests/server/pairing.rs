@@ -1,11 +1,9 @@
 //! Pairing over real QUIC with the real binary: the right code, wrong ones, and a man in the middle.
 
-mod support;
-
 use std::sync::Arc;
 
+use crate::support::{Client, PATIENCE, Server, connect_as, write_arena};
 use quinn::{ClientConfig, Connection, Endpoint, ServerConfig, TransportConfig};
-use support::{Client, PATIENCE, Server, connect_as, write_arena};
 use vizflyt_protocol::messages::{Grant, PairingReply, PairingRequest, ToRuntime};
 use vizflyt_protocol::packet::framing::{Deframer, MAX_FRAMED, encode};
 use vizflyt_protocol::packet::{PeerRole, Preamble};

@@ -1,12 +1,10 @@
 //! Flights through a running server onto the leaderboard: check-in, verdict, standings, and a server that is killed.
 
-mod support;
-
 use std::io::{Read, Write};
 
+use crate::support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use quinn::TransportConfig;
 use serde_json::Value;
-use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{FlightPhase, Telemetry, ToServer};
 use vizflyt_server::flights::leaderboard::{Attempt, Database, Leaderboard, Run, RunState};
 

@@ -1,10 +1,8 @@
 //! A flight into a wall through a running server, which nobody watches: its crash card.
 
-mod support;
-
+use crate::support::{Client, Emitter, Server, Socket, http, write_arena};
 use quinn::TransportConfig;
 use serde_json::Value;
-use support::{Client, Emitter, Server, Socket, http, write_arena};
 use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, Telemetry, ToServer, bounded};
 use vizflyt_protocol::time::ServerTime;
 

@@ -1,14 +1,12 @@
 //! Handshakes that nobody finishes: a paired runtime comes in beside them, from the same address even.
 
-mod support;
-
 use std::net::UdpSocket;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use crate::support::{Client, Server, write_arena};
 use quinn::{ClientConfig, Endpoint, TransportConfig};
-use support::{Client, Server, write_arena};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Identity};
 

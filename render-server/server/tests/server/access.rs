@@ -1,13 +1,11 @@
 //! Who may see and do what on the page, over real HTTP to the real binary: every route as a
 //! stranger, as a team, as the instructor, and from the server's own computer without a key.
 
-mod support;
-
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
 
+use crate::support::{Emitter, PATIENCE, Server, Socket, write_arena};
 use serde_json::Value;
-use support::{Emitter, PATIENCE, Server, Socket, write_arena};
 use vizflyt_server::web::Takes as DeclaredTakes;
 
 /// The server, and the cookies of those who were given a key.
@@ -440,8 +438,12 @@ fn refuses_large_requests_and_paths_out_of_the_folder() {
         "PUT /api/vehicles/ant/cameras/front",
         "PATCH /api/vehicles/ant/cameras/front",
     ] {
-        let (status, answer) =
-            support::send_json(address, request, None, &format!("\"{}\"", "x".repeat(1 << 20)));
+        let (status, answer) = crate::support::send_json(
+            address,
+            request,
+            None,
+            &format!("\"{}\"", "x".repeat(1 << 20)),
+        );
         assert_eq!(status, 413, "{request}: {answer}");
     }
 }
@@ -565,7 +567,7 @@ fn another_page_acts_for_nobody() {
 fn the_page_opens_a_pairing_and_closes_it() {
     let lab = Lab::start();
     let standing = |request: &str, body: &str| {
-        let (status, answer) = support::send_json(lab.server.http, request, None, body);
+        let (status, answer) = crate::support::send_json(lab.server.http, request, None, body);
         (status, serde_json::from_str::<Value>(&answer).unwrap_or(Value::Null))
     };
     assert_eq!(standing("GET /api/pairing", "").1["open"], Value::Null);

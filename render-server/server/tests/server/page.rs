@@ -1,9 +1,7 @@
 //! The page over a real socket: files, WebSocket, stop button, and who may use them.
 
-mod support;
-
+use crate::support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use quinn::TransportConfig;
-use support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use vizflyt_protocol::messages::{EventKind, FlightPhase, Telemetry, ToRuntime, ToServer};
 
 /// A picture of the twin: from 1 m above the start, along x.

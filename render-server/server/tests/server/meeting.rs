@@ -1,12 +1,10 @@
 //! Two vehicles in one arena: each sees the other, neither itself, and they collide. And what a camera
 //! withholds.
 
-mod support;
-
 use std::fmt::Write;
 
+use crate::support::{Client, Emitter, PATIENCE, Server, write_arena};
 use quinn::TransportConfig;
-use support::{Client, Emitter, PATIENCE, Server, write_arena};
 use vizflyt_protocol::messages::{EventKind, ToRuntime};
 use vizflyt_rgbd::Decoder;
 
@@ -71,7 +69,8 @@ async fn depth_that_is_withheld_does_not_leave_the_server() {
     assert_eq!(middle_mm(&client, 1).await, 0);
     // Nor can it be had by asking for it.
     let request = "PATCH /api/vehicles/vizflyt/cameras/colour";
-    let (status, text) = support::send_json(server.http, request, None, r#"{"depth": true}"#);
+    let (status, text) =
+        crate::support::send_json(server.http, request, None, r#"{"depth": true}"#);
     assert_eq!(status, 200, "{text}");
     assert!(text.contains("\"depth\":false"), "{text}");
     assert_eq!(middle_mm(&client, 1).await, 0);

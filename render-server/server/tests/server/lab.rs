@@ -1,15 +1,13 @@
 //! A lab day through a running server: checks that go green and red by what runtimes and poses do, the queue, the order
 //! of take-off, the separation, and a restart.
 
-mod support;
-
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use crate::support::{Client, Emitter, Server, http, send_json, write_arena};
 use proptest::prelude::*;
 use quinn::TransportConfig;
 use serde_json::{Value, json};
-use support::{Client, Emitter, Server, http, send_json, write_arena};
 use vizflyt_protocol::messages::{
     ClockState, Event, EventKind, FlightPhase, Guarded, Telemetry, Timing, ToRuntime, ToServer,
     VehicleState,

@@ -1,11 +1,9 @@
 //! Who may connect, over real QUIC to the real binary: a stranger, a team, an instructor.
 
-mod support;
-
 use std::os::unix::fs::PermissionsExt;
 
+use crate::support::{Client, Emitter, PATIENCE, Server, client, connect_as, write_arena};
 use quinn::{ConnectionError, TransportConfig};
-use support::{Client, Emitter, PATIENCE, Server, client, connect_as, write_arena};
 use vizflyt_protocol::messages::{Telemetry, ToRuntime, ToServer};
 use vizflyt_trust::{Identity, Paired, Role};
 

@@ -1,0 +1,167 @@
+"""The stages of `tests/run`: what each runs, which tier it belongs to, what it needs, and which files it depends on.
+
+Tiers: `quick` runs with `--quick` too; `everyday` runs always; `heavy` runs with `--all`, and otherwise only if one of its
+`inputs` has changed since it last passed (`tests/all-passed.toml`).
+Lanes: `clock` stages wait for real time (flights, servers) and run one at a time; `compute` stages use the time that those
+leave, at the lowest priority.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+PROGRAM = "target/debug/vizflyt"
+EXAMPLES = "target/debug/examples"
+# The workspace without the crates that only heavy stages compile.
+WORKSPACE = "--locked --workspace --exclude vizflyt-ros2 --exclude vizflyt-fuzz"
+# Features that no ordinary build has.
+FEATURES = "vizflyt/postgres,vizflyt/foxglove,vizflyt/ros2,vizflyt/crazyflie,vizflyt-bridge/net"
+
+
+@dataclasses.dataclass(frozen=True)
+class Need:
+    """A program, library or Python module that a stage uses, and the Debian package that has it."""
+
+    test: str
+    """Shell command that succeeds if it is installed."""
+    package: str
+
+
+def program(name: str, package: str = "") -> Need:
+    return Need(f"command -v {name}", package or name)
+
+
+def file(pattern: str, package: str) -> Need:
+    return Need(f"compgen -G '{pattern}'", package)
+
+
+CC = program("cc", "gcc libc6-dev")
+CXX = program("c++", "g++")
+VENV = Need("python3 -c 'import venv, ensurepip'", "python3-venv")
+FFMPEG = program("ffmpeg")
+POPPLER = program("pdftoppm", "poppler-utils")
+NODE = program("node", "nodejs")
+NPM = program("npm")
+CHROMIUM = program("chromium")
+VULKAN = file("/usr/share/vulkan/icd.d/*.json", "mesa-vulkan-drivers libvulkan1")
+POSTGRES = Need("compgen -G '/usr/lib/postgresql/*/bin/initdb' || command -v initdb", "postgresql")
+YAML = Need("python3 -c 'import yaml'", "python3-yaml")
+ARM = [
+    program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu libc6-dev-arm64-cross"),
+    program("qemu-aarch64", "qemu-user"),
+]
+OPENCV = [
+    file("/usr/include/opencv4/opencv2/imgproc.hpp", "libopencv-imgproc-dev"),
+    file("/usr/include/opencv4/opencv2/calib3d.hpp", "libopencv-calib3d-dev"),
+    Need("ldconfig -p | grep 'libclang[-.0-9]*so'", "libclang-dev"),
+    program("clang"),
+]
+
+QUICK, EVERYDAY, HEAVY = "quick", "everyday", "heavy"
+FIRST, CLOCK, COMPUTE = "first", "clock", "compute"
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """One row of the table."""
+
+    name: str
+    title: str
+    tier: str
+    lane: str
+    """`first` stages run before all others, one after another; if one fails, nothing else runs."""
+    command: str
+    """Bash, run in the root of the repository."""
+    expected_s: int
+    """Usual duration on two cores, shown next to the elapsed time [s]."""
+    needs: Sequence[Need] = ()
+    inputs: Sequence[str] = ()
+    """Heavy stages: folders and files of ours that it depends on; toolchain and other people's crates are added to them."""
+    when_quick: str = ""
+    """Command in place of `command` with `--quick`; {crates} are the changed ones."""
+
+
+# Tests that fly, serve or wait: they measure rates and latencies. The others compute, or have a virtual clock.
+CLOCKED = (
+    "not (package(/^vizflyt-(arena|avoid|race|rgbd|scenes|splat|tags|twin)$/)"
+    " | binary(/^(accuracy|grade)$/) | package(vizflyt-runtime) & test(/^guard::tests::/))"
+)
+
+STAGES = [
+    # --- first: without these, nothing else can run
+    Stage("format", "format of Rust", QUICK, FIRST, "cargo fmt --all -- --check", 2),
+    Stage(
+        "build", "build", QUICK, FIRST,
+        f"cargo build {WORKSPACE} --bins --example detections --example misbehave --example trajectories",
+        280, [CC, CXX],
+    ),
+    Stage("compile", "compile the tests", EVERYDAY, FIRST, "tests/rust/compile", 270, [CC, CXX]),
+    # --- everyday: compute
+    Stage("lint-rust", "lints of Rust", QUICK, COMPUTE, f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings", 150,
+          when_quick="cargo clippy --locked {crates} --all-targets --quiet -- -D warnings"),
+    Stage("tests", "tests that compute", QUICK, COMPUTE, f"tests/rust/test '{CLOCKED}' --not", 240, [VULKAN, FFMPEG, POPPLER],
+          when_quick="cargo nextest run --locked {crates}"),
+    Stage("doc", "examples in the documentation", EVERYDAY, COMPUTE, f"cargo test {WORKSPACE} --doc", 60),
+    Stage("lint-page", "the page's scripts: lints, types, unit tests", QUICK, COMPUTE, "tests/page/lint", 15, [NODE, NPM]),
+    Stage("lint-python", "Python: lints and types", QUICK, COMPUTE, "tests/python/lint", 40, [VENV]),
+    # --- everyday: clock
+    Stage("flights", "flights and servers in real time", EVERYDAY, CLOCK, f"tests/rust/test '{CLOCKED}'", 500,
+          [VULKAN, FFMPEG]),
+    Stage("attack", "attacks on the real program", EVERYDAY, CLOCK, f"tests/attack/run {PROGRAM}", 120, [VENV]),
+    Stage("page", "the page in Chromium", EVERYDAY, CLOCK, f"tests/page/run {PROGRAM}", 200, [NODE, NPM, CHROMIUM]),
+    Stage("python", "Python package and plugins", EVERYDAY, CLOCK, f"tests/python/run {PROGRAM}", 200, [VENV, YAML]),
+    # --- heavy: compute
+    Stage("targets", "lints for ARM64, and what chips build", HEAVY, COMPUTE, "tests/rust/targets", 60, [ARM[0]],
+          ["protocol/core", "protocol/rgbd", "render-server/splat", "firmware-esp/bridge", "tests/rust/targets"]),
+    Stage("features", "optional features: lints and tests", HEAVY, COMPUTE, f"tests/rust/features {FEATURES}", 300, [VULKAN],
+          ["jetson/ros2", "jetson/runtime/src/log", "jetson/runtime/Cargo.toml", "jetson/cli/Cargo.toml",
+           "jetson/cli/src/crazyflie", "render-server/server/src/flights/leaderboard", "render-server/server/Cargo.toml",
+           "firmware-esp/bridge", "tests/fuzz/tests", "tests/fuzz/Cargo.toml", "tests/rust/features"]),
+    Stage("firmware", "firmware of the bridge: both chips, the ESP8266's in QEMU", HEAVY, COMPUTE, "tests/firmware/run", 150,
+          [VENV], ["firmware-esp", "protocol/core", "tests/firmware"]),
+    Stage("opencv", "OpenCV's bindings", HEAVY, COMPUTE, "tests/opencv/run", 300, OPENCV,
+          ["jetson/sdk", "jetson/tags", "protocol/core", "tests/opencv"]),
+    Stage("sanitize", "unsafe code under AddressSanitizer", HEAVY, COMPUTE, "tests/sanitize/run", 200, [],
+          ["render-server/splat", "protocol/rgbd", "jetson/tags", "jetson/sdk", "jetson/sdk-c", "tests/sanitize",
+           "tests/fuzz/instrument"]),
+    Stage("fuzz", "fuzz targets, four seconds each", HEAVY, COMPUTE, "tests/fuzz/run 4", 300, [CXX],
+          ["tests/fuzz", "protocol", "render-server/splat/src/format", "render-server/arena/src/config",
+           "render-server/server/src/poses/drivers", "render-server/server/src/stream", "render-server/twin/src/dataset",
+           "jetson/runtime/src/link", "jetson/runtime/src/stream", "jetson/runtime/src/log", "jetson/guardian",
+           "jetson/ros2", "jetson/cli/src/class", "jetson/cli/src/grade", "firmware-esp/bridge", "hardware/simulator/src",
+           "jetson/tags/src"]),
+    Stage("arm", "ARM64: codec, renderer, tags in QEMU", HEAVY, COMPUTE, "tests/arm/run", 300, ARM,
+          ["protocol/core", "protocol/rgbd", "render-server/splat", "jetson/tags", "tests/arm"]),
+    Stage("formats", "scene formats against other people's tools", HEAVY, COMPUTE, f"tests/formats/run {PROGRAM}", 120,
+          [VENV, NODE, NPM],
+          ["render-server/splat/src/format", "render-server/splat/src/edit", "jetson/cli/src/scene", "tests/formats"]),
+    Stage("capture", "from a video to a twin, with pycolmap", HEAVY, COMPUTE, f"tests/capture/run {PROGRAM}", 210,
+          [VENV, FFMPEG], ["render-server/twin", "jetson/cli/src/scene", "jetson/tags", "tests/capture"]),
+    Stage("tags", "tags against pupil-apriltags, in images and as printed", HEAVY, COMPUTE,
+          f"tests/tags/run {EXAMPLES}/detections {PROGRAM}", 60, [VENV, POPPLER],
+          ["jetson/tags", "jetson/cli/src/tags", "tests/tags"]),
+    Stage("dataset", "data sets against pycocotools", HEAVY, COMPUTE, f"tests/dataset/run {PROGRAM}", 60, [VENV],
+          ["render-server/labels", "jetson/cli/src/dataset", "tests/dataset"]),
+    # --- heavy: clock
+    Stage("clients", "independent MAVLink clients", HEAVY, CLOCK, "tests/clients/run target/debug/vizflyt-simulator", 200,
+          [VENV], ["hardware/simulator", "firmware-esp/bridge", "protocol/core/src/mavlink", "tests/clients"]),
+    Stage("ardupilot", "the vehicle's promises, as they are held against ArduCopter", HEAVY, CLOCK,
+          "tests/ardupilot/run --quick target/debug/vizflyt-simulator", 150, [VENV],
+          ["hardware/simulator", "hardware/airframe", "jetson/runtime/src", "jetson/guardian", "protocol/core/src/mavlink",
+           "protocol/core/src/failsafe.rs", "tests/ardupilot"]),
+    Stage("ros2", "ROS 2 against Cyclone DDS", HEAVY, CLOCK,
+          f"cargo build --locked --workspace --features {FEATURES} --bins && jetson/python/build-wheel -o target/ros2/wheels"
+          f" --program {PROGRAM} && tests/ros2/run {PROGRAM} target/ros2/wheels/*.whl", 200, [VENV],
+          ["jetson/ros2", "tests/ros2"]),
+    Stage("leaderboard", "leaderboard on a PostgreSQL server", HEAVY, CLOCK, f"tests/leaderboard/run {FEATURES}", 60, [POSTGRES],
+          ["render-server/server/src/flights/leaderboard", "tests/leaderboard"]),
+    Stage("mcap", "flight logs against an independent reader", HEAVY, CLOCK, f"tests/mcap/run {PROGRAM}", 60, [VENV],
+          ["jetson/runtime/src/log", "jetson/cli/src/export", "tests/mcap"]),
+    Stage("pose", "fused poses against evo", HEAVY, CLOCK, f"tests/pose/run {EXAMPLES}/trajectories {PROGRAM}", 60, [VENV],
+          ["render-server/arena/src/pose", "jetson/cli/src/evaluate", "jetson/cli/src/export", "tests/pose"]),
+    Stage("packages", "packages: built twice, installed in a clean Debian, flown, upgraded, purged; the image", HEAVY, CLOCK,
+          "cargo build --release --locked --bin vizflyt"
+          " && $([ $(id -u) = 0 ] || echo sudo) tests/packages/run target/release/vizflyt", 700, [],
+          ["hardware/packages", "render-server/systemd", "jetson/python/build-wheel", "tests/packages"]),
+]
