@@ -255,7 +255,7 @@ class ByHand(NamedTuple):
 
 
 BY_HAND = [
-    ByHand("The whole loop: seeds 1 to 20", "cargo test --release -p vizflyt-e2e --test demo -- over_many_seeds",
+    ByHand("The whole loop: seeds 1 to 20", "cargo test --release -p vizflyt-e2e --test flights -- over_many_seeds",
            "long flights"),
     ByHand("The forest, fast; projects 2 to 5", "vizflyt grade my-p2 --project p2 --seeds 20 --first-seed 100",
            "the Python package, long flights"),

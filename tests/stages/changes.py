@@ -16,7 +16,8 @@ from table import Stage
 class Record:
     """`tests/all-passed.toml`: when each heavy stage last passed, and the hash of its inputs then.
 
-    The hash, not the commit, decides whether a stage has changed: a commit may be squashed or missing in a shallow clone.
+    The hash, not the commit, decides whether a stage has changed: a commit may be squashed, or missing in a shallow
+    clone.
     """
 
     def __init__(self, root: pathlib.Path) -> None:
@@ -48,8 +49,8 @@ class Record:
         self.path.write_text(head + "".join(f"{line}\n" for _, line in sorted(self.lines.items())))
 
     def hash_of(self, stage: Stage) -> str:
-        """Returns a hash of the command, of the toolchain, of the versions of other people's crates, and of names, modes and
-        contents of all input files that git would commit."""
+        """Returns a hash of command, toolchain, versions of crates from elsewhere, and names, modes and contents of all
+        input files that git would commit."""
         digest = hashlib.sha256(stage.command.encode())
         digest.update((self.root / "rust-toolchain.toml").read_bytes())
         for package in (self.root / "Cargo.lock").read_text().split("[[package]]"):
@@ -73,7 +74,10 @@ def crates(root: pathlib.Path, base: str) -> list[str]:
     metadata = json.loads(
         subprocess.run(
             ["cargo", "metadata", "--no-deps", "--format-version=1", "--locked"],
-            cwd=root, check=True, capture_output=True, text=True,
+            cwd=root,
+            check=True,
+            capture_output=True,
+            text=True,
         ).stdout
     )
     folders = {

@@ -48,8 +48,8 @@ def of_line(line: str) -> Counts:
     # 3 failed, 12 passed, 1 skipped in 12.3s
     if re.match(r"(=+ )?\d+ (passed|failed|skipped|error).* in [\d.]+s", line):
         return Counts(number(line, "passed"), number(line, "failed") + number(line, "errors?"), number(line, "skipped"))
-    # ℹ pass 12
-    if match := re.match(r"(?:#|ℹ) (pass|fail|skipped) (\d+)$", line):
+    # node: "# pass 12", or an information sign in place of the hash
+    if match := re.match(r"(?:#|\u2139) (pass|fail|skipped) (\d+)$", line):
         kind = {"pass": "passed", "fail": "failed", "skipped": "skipped"}[match[1]]
         return Counts(**{kind: int(match[2])})
     # 12 passed, 0 failed, 1 skipped

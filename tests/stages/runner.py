@@ -1,7 +1,7 @@
 """Runs the stages of `table.py`; `tests/run` calls it.
 
-Two lanes share the machine: stages that wait for real time run one at a time, and stages that compute fill the time that
-those leave (`tests/idle`). Output goes to `target/tests/NAME.log`, and to the terminal where a stage fails.
+Two lanes share the machine: stages that wait for real time run one at a time, and stages that compute fill the time
+that those leave (`tests/idle`). Output goes to `target/tests/NAME.log`, and to the terminal where a stage fails.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import changes
 import counts
 import table
-from table import CLOCK, COMPUTE, EVERYDAY, FIRST, HEAVY, QUICK, Need, Stage
+from table import CLOCK, COMPUTE, FIRST, HEAVY, QUICK, Need, Stage
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 LOGS = ROOT / "target/tests"
@@ -76,7 +76,11 @@ class Run:
         with log.open("wb") as output:
             child = subprocess.Popen(
                 [*idle, "bash", "-c", f"set -euo pipefail\n{command}"],
-                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
+                cwd=ROOT,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
             )
             self.groups.add(child.pid)
             # Not `wait`, which would not return the processor time of this child only.
@@ -88,8 +92,12 @@ class Run:
         text = log.read_text(errors="replace")
         passed = child.returncode == 0
         result = Result(
-            stage, "passed" if passed else "failed", "" if passed else f"exit status {child.returncode}",
-            time.monotonic() - begin, usage.ru_utime + usage.ru_stime, counts.of(text, passed),
+            stage,
+            "passed" if passed else "failed",
+            "" if passed else f"exit status {child.returncode}",
+            time.monotonic() - begin,
+            usage.ru_utime + usage.ru_stime,
+            counts.of(text, passed),
         )
         self.results.append(result)
         done = sum(r.outcome != "skipped" for r in self.results)
@@ -182,12 +190,20 @@ def arguments() -> argparse.Namespace:
         "stage whose inputs have changed since it last passed. The stages are in tests/stages/table.py.",
     )
     tier = parser.add_mutually_exclusive_group()
-    tier.add_argument("--quick", action="store_true",
-                      help="only the crates changed since --base: lints and unit tests; installs nothing")
-    tier.add_argument("--all", action="store_true",
-                      help="every stage; those that pass are recorded in tests/all-passed.toml")
-    parser.add_argument("--base", default="origin/main", metavar="REV",
-                        help="with --quick: what the changes are relative to [origin/main, or else HEAD]")
+    tier.add_argument(
+        "--quick",
+        action="store_true",
+        help="only the crates changed since --base: lints and unit tests; installs nothing",
+    )
+    tier.add_argument(
+        "--all", action="store_true", help="every stage; those that pass are recorded in tests/all-passed.toml"
+    )
+    parser.add_argument(
+        "--base",
+        default="origin/main",
+        metavar="REV",
+        help="with --quick: what the changes are relative to [origin/main, or else HEAD]",
+    )
     parser.add_argument("--list", action="store_true", help="print the stages and exit")
     parser.add_argument("-v", "--verbose", action="store_true", help="print the output of stages that pass, too")
     parser.add_argument("stages", nargs="*", metavar="STAGE", help="only these stages, after the build")
@@ -204,9 +220,15 @@ def arguments() -> argparse.Namespace:
 def choose(args: argparse.Namespace, record: changes.Record, crates: list[str] | None, run: Run) -> list[Stage]:
     """Returns the stages of this run, in the order of the table."""
     if args.stages:
-        return [stage for stage in table.STAGES if stage.name in args.stages or stage.lane == FIRST and stage.name != "format"]
+        return [
+            stage
+            for stage in table.STAGES
+            if stage.name in args.stages or (stage.lane == FIRST and stage.name != "format")
+        ]
     if args.quick:
-        return [stage for stage in table.STAGES if stage.tier == QUICK and (crates or "{crates}" not in stage.when_quick)]
+        return [
+            stage for stage in table.STAGES if stage.tier == QUICK and (crates or "{crates}" not in stage.when_quick)
+        ]
     chosen = []
     for stage in table.STAGES:
         if stage.tier == HEAVY and not args.all and (passed := record.passed(stage)):
@@ -226,11 +248,13 @@ def missing_needs(stages: Sequence[Stage]) -> dict[str, list[Need]]:
 
 
 def install_or_skip(missing: dict[str, list[Need]], chosen: list[Stage], run: Run, may_install: bool) -> list[Stage]:
-    """Installs what is missing with apt, after asking where somebody can answer; otherwise leaves out the stages that need it."""
+    """Installs what is missing with apt, after asking if there is a terminal; or leaves out the stages that need it."""
     packages = sorted({word for needs in missing.values() for need in needs for word in need.package.split()})
     root = [] if os.geteuid() == 0 else ["sudo", "-n"]
-    can_install = may_install and shutil.which("apt-get") and (
-        not root or subprocess.run([*root, "true"], capture_output=True).returncode == 0
+    can_install = (
+        may_install
+        and shutil.which("apt-get")
+        and (not root or subprocess.run([*root, "true"], capture_output=True).returncode == 0)
     )
     print(f"Debian packages that tests use and this machine lacks: {' '.join(packages)}", flush=True)
     if can_install and sys.stdin.isatty():
@@ -271,7 +295,8 @@ def print_table() -> None:
         print(f"{stage.name:16} {stage.tier:9} {stage.lane:8} {stage.expected_s:4d} s  {stage.title}")
         if stage.tier == HEAVY:
             passed = record.passed(stage)
-            print(f"{'':16} {f'unchanged since {passed}' if passed else 'changed, or never passed'}: {' '.join(stage.inputs)}")
+            state = f"unchanged since {passed}" if passed else "changed, or never passed"
+            print(f"{'':16} {state}: {' '.join(stage.inputs)}")
 
 
 def kill_group(group: int) -> None:

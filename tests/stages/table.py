@@ -1,9 +1,9 @@
 """The stages of `tests/run`: what each runs, which tier it belongs to, what it needs, and which files it depends on.
 
-Tiers: `quick` runs with `--quick` too; `everyday` runs always; `heavy` runs with `--all`, and otherwise only if one of its
-`inputs` has changed since it last passed (`tests/all-passed.toml`).
-Lanes: `clock` stages wait for real time (flights, servers) and run one at a time; `compute` stages use the time that those
-leave, at the lowest priority.
+Tiers: `quick` runs with `--quick` too; `everyday` runs always; `heavy` runs with `--all`, and otherwise only if one of
+its `inputs` has changed since it last passed (`tests/all-passed.toml`).
+Lanes: `clock` stages wait for real time (flights, servers) and run one at a time; `compute` stages use the time that
+those leave, at the lowest priority.
 """
 
 from __future__ import annotations
@@ -77,15 +77,16 @@ class Stage:
     """Usual duration on two cores, shown next to the elapsed time [s]."""
     needs: Sequence[Need] = ()
     inputs: Sequence[str] = ()
-    """Heavy stages: folders and files of ours that it depends on; toolchain and other people's crates are added to them."""
+    """Heavy stages: our folders and files that it depends on; toolchain and crates from elsewhere are added to them."""
     when_quick: str = ""
     """Command in place of `command` with `--quick`; {crates} are the changed ones."""
 
 
 # Tests that fly, serve or wait: they measure rates and latencies. The others compute, or have a virtual clock.
+LONG = "test(over_many_seeds)"
 CLOCKED = (
-    "not (package(/^vizflyt-(arena|avoid|race|rgbd|scenes|splat|tags|twin)$/)"
-    " | binary(/^(accuracy|grade)$/) | package(vizflyt-runtime) & test(/^guard::tests::/))"
+    "(package(/^vizflyt-(guardian|runtime|sdk|c|server|simulator|bridge)$/) - test(/^guard::tests::/)"
+    f" + binary(/^(flights|linkloss|misbehave)$/)) - {LONG}"
 )
 
 STAGES = [
@@ -98,13 +99,17 @@ STAGES = [
     ),
     Stage("compile", "compile the tests", EVERYDAY, FIRST, "tests/rust/compile", 270, [CC, CXX]),
     # --- everyday: compute
-    Stage("lint-rust", "lints of Rust", QUICK, COMPUTE, f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings", 150,
+    Stage("lint-rust", "lints of Rust", QUICK, COMPUTE,
+          f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings", 150,
           when_quick="cargo clippy --locked {crates} --all-targets --quiet -- -D warnings"),
-    Stage("tests", "tests that compute", QUICK, COMPUTE, f"tests/rust/test '{CLOCKED}' --not", 240, [VULKAN, FFMPEG, POPPLER],
+    Stage("tests", "tests that compute", QUICK, COMPUTE, f"tests/rust/test 'not ({CLOCKED} + {LONG})'", 240,
+          [VULKAN, FFMPEG, POPPLER],
           when_quick="cargo nextest run --locked {crates}"),
     Stage("doc", "examples in the documentation", EVERYDAY, COMPUTE, f"cargo test {WORKSPACE} --doc", 60),
-    Stage("lint-page", "the page's scripts: lints, types, unit tests", QUICK, COMPUTE, "tests/page/lint", 15, [NODE, NPM]),
-    Stage("lint-python", "Python: lints and types", QUICK, COMPUTE, "tests/python/lint", 40, [VENV]),
+    Stage("lint-page", "the page's scripts: lints, types, unit tests", QUICK, COMPUTE, "tests/page/lint", 15,
+          [NODE, NPM]),
+    Stage("lint-python", "Python: lints and types", QUICK, COMPUTE,
+          "tests/python/lint && python3 -m unittest discover -q -s tests/stages", 40, [VENV]),
     # --- everyday: clock
     Stage("flights", "flights and servers in real time", EVERYDAY, CLOCK, f"tests/rust/test '{CLOCKED}'", 500,
           [VULKAN, FFMPEG]),
@@ -114,12 +119,14 @@ STAGES = [
     # --- heavy: compute
     Stage("targets", "lints for ARM64, and what chips build", HEAVY, COMPUTE, "tests/rust/targets", 60, [ARM[0]],
           ["protocol/core", "protocol/rgbd", "render-server/splat", "firmware-esp/bridge", "tests/rust/targets"]),
-    Stage("features", "optional features: lints and tests", HEAVY, COMPUTE, f"tests/rust/features {FEATURES}", 300, [VULKAN],
+    Stage("features", "optional features: lints and tests", HEAVY, COMPUTE, f"tests/rust/features {FEATURES}", 300,
+          [VULKAN],
           ["jetson/ros2", "jetson/runtime/src/log", "jetson/runtime/Cargo.toml", "jetson/cli/Cargo.toml",
-           "jetson/cli/src/crazyflie", "render-server/server/src/flights/leaderboard", "render-server/server/Cargo.toml",
-           "firmware-esp/bridge", "tests/fuzz/tests", "tests/fuzz/Cargo.toml", "tests/rust/features"]),
-    Stage("firmware", "firmware of the bridge: both chips, the ESP8266's in QEMU", HEAVY, COMPUTE, "tests/firmware/run", 150,
-          [VENV], ["firmware-esp", "protocol/core", "tests/firmware"]),
+           "jetson/cli/src/crazyflie", "render-server/server/src/flights/leaderboard",
+           "render-server/server/Cargo.toml", "firmware-esp/bridge", "tests/fuzz/tests", "tests/fuzz/Cargo.toml",
+           "tests/rust/features"]),
+    Stage("firmware", "firmware of the bridge: both chips, the ESP8266's in QEMU", HEAVY, COMPUTE,
+          "tests/firmware/run", 150, [VENV], ["firmware-esp", "protocol/core", "tests/firmware"]),
     Stage("opencv", "OpenCV's bindings", HEAVY, COMPUTE, "tests/opencv/run", 300, OPENCV,
           ["jetson/sdk", "jetson/tags", "protocol/core", "tests/opencv"]),
     Stage("sanitize", "unsafe code under AddressSanitizer", HEAVY, COMPUTE, "tests/sanitize/run", 200, [],
@@ -127,10 +134,10 @@ STAGES = [
            "tests/fuzz/instrument"]),
     Stage("fuzz", "fuzz targets, four seconds each", HEAVY, COMPUTE, "tests/fuzz/run 4", 300, [CXX],
           ["tests/fuzz", "protocol", "render-server/splat/src/format", "render-server/arena/src/config",
-           "render-server/server/src/poses/drivers", "render-server/server/src/stream", "render-server/twin/src/dataset",
-           "jetson/runtime/src/link", "jetson/runtime/src/stream", "jetson/runtime/src/log", "jetson/guardian",
-           "jetson/ros2", "jetson/cli/src/class", "jetson/cli/src/grade", "firmware-esp/bridge", "hardware/simulator/src",
-           "jetson/tags/src"]),
+           "render-server/server/src/poses/drivers", "render-server/server/src/stream",
+           "render-server/twin/src/dataset", "jetson/runtime/src/link", "jetson/runtime/src/stream",
+           "jetson/runtime/src/log", "jetson/guardian", "jetson/ros2", "jetson/cli/src/class", "jetson/cli/src/grade",
+           "firmware-esp/bridge", "hardware/simulator/src", "jetson/tags/src"]),
     Stage("arm", "ARM64: codec, renderer, tags in QEMU", HEAVY, COMPUTE, "tests/arm/run", 300, ARM,
           ["protocol/core", "protocol/rgbd", "render-server/splat", "jetson/tags", "tests/arm"]),
     Stage("formats", "scene formats against other people's tools", HEAVY, COMPUTE, f"tests/formats/run {PROGRAM}", 120,
@@ -144,23 +151,32 @@ STAGES = [
     Stage("dataset", "data sets against pycocotools", HEAVY, COMPUTE, f"tests/dataset/run {PROGRAM}", 60, [VENV],
           ["render-server/labels", "jetson/cli/src/dataset", "tests/dataset"]),
     # --- heavy: clock
-    Stage("clients", "independent MAVLink clients", HEAVY, CLOCK, "tests/clients/run target/debug/vizflyt-simulator", 200,
-          [VENV], ["hardware/simulator", "firmware-esp/bridge", "protocol/core/src/mavlink", "tests/clients"]),
+    Stage("seeds", "the forest, flown live over twenty seeds", HEAVY, CLOCK, f"tests/rust/test '{LONG}'", 300, [],
+          ["jetson/plugins/avoid", "jetson/runtime/src/control", "jetson/runtime/src/companion",
+           "jetson/runtime/src/guard", "hardware/simulator/src", "tests/e2e/tests/flights/demo.rs"]),
+    Stage("clients", "independent MAVLink clients", HEAVY, CLOCK,
+          "tests/clients/run target/debug/vizflyt-simulator", 200, [VENV],
+          ["hardware/simulator", "firmware-esp/bridge", "protocol/core/src/mavlink", "tests/clients"]),
     Stage("ardupilot", "the vehicle's promises, as they are held against ArduCopter", HEAVY, CLOCK,
           "tests/ardupilot/run --quick target/debug/vizflyt-simulator", 150, [VENV],
-          ["hardware/simulator", "hardware/airframe", "jetson/runtime/src", "jetson/guardian", "protocol/core/src/mavlink",
-           "protocol/core/src/failsafe.rs", "tests/ardupilot"]),
+          ["hardware/simulator", "hardware/airframe", "jetson/runtime/src", "jetson/guardian",
+           "protocol/core/src/mavlink", "protocol/core/src/failsafe.rs", "tests/ardupilot"]),
     Stage("ros2", "ROS 2 against Cyclone DDS", HEAVY, CLOCK,
-          f"cargo build --locked --workspace --features {FEATURES} --bins && jetson/python/build-wheel -o target/ros2/wheels"
-          f" --program {PROGRAM} && tests/ros2/run {PROGRAM} target/ros2/wheels/*.whl", 200, [VENV],
+          f"cargo build --locked --workspace --features {FEATURES} --bins"
+          f" && jetson/python/build-wheel -o target/ros2/wheels --program {PROGRAM}"
+          f" && tests/ros2/run {PROGRAM} target/ros2/wheels/*.whl", 200, [VENV],
           ["jetson/ros2", "tests/ros2"]),
-    Stage("leaderboard", "leaderboard on a PostgreSQL server", HEAVY, CLOCK, f"tests/leaderboard/run {FEATURES}", 60, [POSTGRES],
+    Stage("leaderboard", "leaderboard on a PostgreSQL server", HEAVY, CLOCK,
+          f"tests/leaderboard/run {FEATURES}", 60, [POSTGRES],
           ["render-server/server/src/flights/leaderboard", "tests/leaderboard"]),
-    Stage("mcap", "flight logs against an independent reader", HEAVY, CLOCK, f"tests/mcap/run {PROGRAM}", 60, [VENV],
+    Stage("mcap", "flight logs against an independent reader", HEAVY, CLOCK,
+          f"tests/mcap/run {PROGRAM}", 60, [VENV],
           ["jetson/runtime/src/log", "jetson/cli/src/export", "tests/mcap"]),
-    Stage("pose", "fused poses against evo", HEAVY, CLOCK, f"tests/pose/run {EXAMPLES}/trajectories {PROGRAM}", 60, [VENV],
+    Stage("pose", "fused poses against evo", HEAVY, CLOCK,
+          f"tests/pose/run {EXAMPLES}/trajectories {PROGRAM}", 60, [VENV],
           ["render-server/arena/src/pose", "jetson/cli/src/evaluate", "jetson/cli/src/export", "tests/pose"]),
-    Stage("packages", "packages: built twice, installed in a clean Debian, flown, upgraded, purged; the image", HEAVY, CLOCK,
+    Stage("packages", "packages: built twice, installed in a clean Debian, flown, upgraded, purged; the image",
+          HEAVY, CLOCK,
           "cargo build --release --locked --bin vizflyt"
           " && $([ $(id -u) = 0 ] || echo sudo) tests/packages/run target/release/vizflyt", 700, [],
           ["hardware/packages", "render-server/systemd", "jetson/python/build-wheel", "tests/packages"]),

@@ -97,7 +97,7 @@ fn a_webcam_under_the_vehicle_locates_it_over_a_mat() {
         assert!(figures.availability_percent() >= 99.0, "seed {seed}: {:?}", figures.unlocated);
         let honest = figures.position_consistency();
         println!("squared errors of the position {honest:.2} of the predicted");
-        // Cautious by itself: what is off all along does not average out in the filter behind (tests/e2e/tests/mat.rs).
+        // Cautious by itself: what is off all along does not average out in the filter behind (tests/e2e/tests/flights/mat.rs).
         assert!((0.3..2.0).contains(&honest), "seed {seed}: {honest}");
     }
 }

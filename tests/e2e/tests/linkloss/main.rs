@@ -7,7 +7,7 @@
 //! Prints the table of `docs/guides/failsafe.md`; with `VIZFLYT_LINKLOSS=write` writes it there.
 //! Durations are the simulator's, so that a busy machine does not make the vehicle look slow.
 
-#[path = "../lab/mod.rs"]
+#[path = "../flights/lab.rs"]
 mod lab;
 mod table;
 

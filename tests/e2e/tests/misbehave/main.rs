@@ -5,7 +5,7 @@
 //! The plugin is `jetson/runtime/examples/misbehave.rs`; Python's own misdeeds are in `tests/python`.
 //! Flights are flown several at a time, as short as they can be.
 
-#[path = "../lab/mod.rs"]
+#[path = "../flights/lab.rs"]
 mod lab;
 
 use std::time::Instant;

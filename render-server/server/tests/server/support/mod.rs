@@ -2,7 +2,6 @@
 //!
 //! Everything waits on conditions; [`PATIENCE`] only bounds a test that fails.
 
-
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::path::Path;
@@ -97,7 +96,11 @@ impl Server {
     }
 
     /// As [`Self::start`], with others paired than the instructor.
-    pub(crate) fn start_paired(arena: &Path, more: &[&str], others: &[vizflyt_trust::Client]) -> Self {
+    pub(crate) fn start_paired(
+        arena: &Path,
+        more: &[&str],
+        others: &[vizflyt_trust::Client],
+    ) -> Self {
         let keys = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&keys.path().join("keys"))).unwrap();
         let instructor = Identity::ephemeral().unwrap();
@@ -302,7 +305,10 @@ pub(crate) fn hello(vehicle: &str, purpose: Purpose) -> Hello {
 }
 
 /// Connects, without any message yet.
-pub(crate) async fn connect(server: &Server, transport: TransportConfig) -> Result<Connection, String> {
+pub(crate) async fn connect(
+    server: &Server,
+    transport: TransportConfig,
+) -> Result<Connection, String> {
     connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
 }
 

@@ -2,17 +2,14 @@
 //! kept by whatever is left when the server, the runtime, or the guard is not there.
 //!
 //! The vehicle is watched from outside, by the motion capture's packets and its own heartbeats. Prints
-//! what it measures: `cargo test -p vizflyt-e2e --test chain -- --nocapture`. Times are not
+//! what it measures: `cargo test -p vizflyt-e2e --test flights chain -- --nocapture`. Times are not
 //! judged tighter than a loaded machine allows; `docs/BENCHMARKS.md` has those of a quiet one.
-
-#[path = "../lab/mod.rs"]
-mod lab;
 
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use crate::lab::{Flight, LOCALIZATION, Lab, Plan};
 use glam::{DVec3, Quat, Vec3};
-use lab::{Flight, LOCALIZATION, Lab, Plan};
 use serde_json::Value;
 use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavMessage};
 use vizflyt_protocol::mavlink::{

@@ -1,12 +1,9 @@
 //! A flight whose every MAVLink packet is signed: the key is given over the wire, as a person would give
 //! it; from then on the vehicle obeys its runtime and nobody else.
 
-#[path = "lab/mod.rs"]
-mod lab;
-
 use std::process::Command;
 
-use lab::{Lab, Plan};
+use crate::lab::{Lab, Plan};
 use vizflyt_e2e::vizflyt;
 use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, encode};

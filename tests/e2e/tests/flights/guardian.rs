@@ -1,6 +1,6 @@
 //! The guardian as a process, between a runtime and an autopilot that are played by the test: what ends a runtime
 //! does not end it, it lands what is in the air, and it leaves when nothing is left to do. What it adds to the way
-//! of a packet is printed: `cargo test -p vizflyt-e2e --test guardian -- --nocapture`.
+//! of a packet is printed: `cargo test -p vizflyt-e2e --test flights guardian -- --nocapture`.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};

@@ -1,0 +1,10 @@
+//! Black-box tests of commands that need no clock, and of the imports between crates.
+
+mod align;
+mod arrows;
+mod capture;
+mod command_line;
+mod dataset;
+mod locate;
+mod obstacles;
+mod scene;

@@ -1,0 +1,17 @@
+//! Black-box flights: the real programs, in real time. One program, because each one links both halves of the system.
+
+mod bridge;
+mod chain;
+mod demo;
+mod doctor;
+mod fly;
+mod guardian;
+mod lab;
+mod localization;
+mod logs;
+mod mat;
+mod pairing;
+mod sensors;
+mod signing;
+mod stop_button;
+mod tags;
