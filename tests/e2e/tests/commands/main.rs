@@ -5,6 +5,7 @@ mod arrows;
 mod capture;
 mod command_line;
 mod dataset;
+mod features;
 mod locate;
 mod obstacles;
 mod scene;

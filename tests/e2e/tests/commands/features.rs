@@ -1,0 +1,71 @@
+//! A crate that is built or tested alone uses the dependencies that `cargo build` has compiled: every dependency has the same
+//! features whatever is selected.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+use cargo_metadata::MetadataCommand;
+
+/// Crates that an everyday build leaves out.
+const LEFT_OUT: [&str; 2] = ["vizflyt-ros2", "vizflyt-fuzz"];
+/// Crates that plugins and chips link, with fewer of our own features.
+const SLIM: [&str; 4] = ["vizflyt-rgbd", "vizflyt-sdk", "vizflyt-c", "vizflyt-bridge"];
+
+/// By package and version, the sets of features with which it is compiled: for the target, and for build scripts.
+type Features = BTreeMap<String, BTreeSet<String>>;
+
+#[test]
+fn dependencies_have_the_same_features_whatever_is_selected() {
+    let whole = features(
+        &["--workspace", "--exclude=vizflyt-ros2", "--exclude=vizflyt-fuzz"],
+        "normal,dev,build",
+    );
+    let mut different = different("cargo build", &features(&[], "normal,build"), &whole);
+    for package in &MetadataCommand::new().no_deps().exec().expect("cargo metadata").packages {
+        let name = package.name.as_str();
+        if LEFT_OUT.contains(&name) {
+            continue;
+        }
+        let mut alone = features(&["--package", name], "normal,dev,build");
+        alone.retain(|package, _| !(SLIM.contains(&name) && package.starts_with("vizflyt-")));
+        different.extend(self::different(name, &alone, &whole));
+    }
+    assert!(
+        different.is_empty(),
+        "these would be compiled again; add what is missing to tests/fixtures/Cargo.toml: {different:#?}"
+    );
+}
+
+/// Returns the packages that a selection compiles with features which the whole workspace does not give them.
+fn different(name: &str, selected: &Features, whole: &Features) -> Vec<String> {
+    let differs = |(package, sets): (&String, &BTreeSet<String>)| {
+        let other = sets.difference(whole.get(package)?).next()?;
+        Some(format!("{name}: {package} with [{other}], elsewhere with {:?}", whole[package]))
+    };
+    selected.iter().filter_map(differs).collect()
+}
+
+fn features(selection: &[&str], edges: &str) -> Features {
+    let mut command = Command::new(env!("CARGO"));
+    command.args([
+        "tree",
+        "--locked",
+        "--offline",
+        "--prefix=none",
+        "--no-dedupe",
+        "--format={p}|{f}",
+        "--edges",
+        edges,
+    ]);
+    let output =
+        command.args(selection).current_dir(vizflyt_e2e::root()).output().expect("cargo tree");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let mut features = Features::new();
+    for line in String::from_utf8(output.stdout).expect("cargo prints text").lines() {
+        let (package, set) = line.split_once('|').expect("package|features");
+        // Without the folder of a crate of ours, or "(proc-macro)".
+        let package = package.split(" (").next().unwrap_or(package);
+        features.entry(package.to_owned()).or_default().insert(set.to_owned());
+    }
+    features
+}
