@@ -104,7 +104,7 @@ STAGES = [
           when_quick="cargo clippy --locked {crates} --all-targets --quiet -- -D warnings"),
     Stage("tests", "tests that compute", QUICK, COMPUTE, f"tests/rust/test 'not ({CLOCKED} + {LONG})'", 240,
           [VULKAN, FFMPEG, POPPLER],
-          when_quick="cargo nextest run --locked {crates}"),
+          when_quick="tests/rust/test --crates {crates}"),
     Stage("doc", "examples in the documentation", EVERYDAY, COMPUTE, f"cargo test {WORKSPACE} --doc", 60),
     Stage("lint-page", "the page's scripts: lints, types, unit tests", QUICK, COMPUTE, "tests/page/lint", 15,
           [NODE, NPM]),
