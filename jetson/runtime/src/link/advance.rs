@@ -161,7 +161,7 @@ impl Link {
             return;
         }
         // Parameters first: a serial link carries one conversation at a time.
-        if self.state.armed || self.params.is_busy() {
+        if self.state.armed || self.params.is_talking() {
             return;
         }
         match self.fence.poll(now) {

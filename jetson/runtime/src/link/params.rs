@@ -76,6 +76,8 @@ struct PendingRead {
     key: ParamKey,
     tries: u8,
     due_at: HostTime,
+    /// A later request was answered: the autopilot may not have this one.
+    is_overtaken: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -142,6 +144,16 @@ impl Params {
         self.open || !self.writes.is_empty() || self.writing.is_some()
     }
 
+    /// Whether the link is busy with parameters. Repeated requests for names that the autopilot may not have, two a
+    /// second, leave it free.
+    pub(super) fn is_talking(&self) -> bool {
+        self.list.is_some()
+            || !self.queue.is_empty()
+            || self.asked.iter().any(|asked| !asked.is_overtaken)
+            || !self.writes.is_empty()
+            || self.writing.is_some()
+    }
+
     /// Takes a value; returns what it completes.
     pub(super) fn handle(
         &mut self,
@@ -158,10 +170,15 @@ impl Params {
         let param = Param { value, kind: message.param_type };
         self.known.insert(name.clone(), param);
         self.note(now, message.param_index, message.param_count);
-        self.asked.retain(|asked| match &asked.key {
-            ParamKey::Name(key) => *key != name,
-            ParamKey::Index(index) => *index != message.param_index,
-        });
+        let is_answered = |asked: &PendingRead| match &asked.key {
+            ParamKey::Name(key) => *key == name,
+            ParamKey::Index(index) => *index == message.param_index,
+        };
+        let answered = self.asked.iter().rposition(is_answered).unwrap_or(0);
+        for earlier in &mut self.asked[..answered] {
+            earlier.is_overtaken = true;
+        }
+        self.asked.retain(|asked| !is_answered(asked));
         let writing = self.writing.as_mut().filter(|writing| writing.name == name)?;
         if same(value, writing.value) {
             self.writing = None;
@@ -260,7 +277,8 @@ impl Params {
             && let Some(key) = self.queue.pop_front()
         {
             send(request(&key));
-            self.asked.push(PendingRead { key, tries: 1, due_at: now.plus_seconds(REPEAT_S) });
+            let due_at = now.plus_seconds(REPEAT_S);
+            self.asked.push(PendingRead { key, tries: 1, due_at, is_overtaken: false });
         }
     }
 

@@ -127,6 +127,8 @@ impl Link {
                 self.forget();
                 self.params.read(dialect.watched());
                 self.announced_at = None;
+                // The origin and the clocks' relation need not wait for the next beat.
+                self.beat_at = self.beat_at.min(now);
                 self.events.push_back(LinkEvent::Connected { system: from.system });
             }
             Some(known) if known == from => {}

@@ -357,6 +357,16 @@ fn the_origin_is_sent_every_second_until_confirmed() {
 }
 
 #[test]
+fn an_autopilot_that_comes_later_gets_the_origin_at_once() {
+    let mut script = Script::new();
+    script.run_silently(0.5);
+    script.heartbeat();
+    script.run_silently(0.02);
+    let origin = |message: &MavMessage| matches!(message, MavMessage::SET_GPS_GLOBAL_ORIGIN(_));
+    assert_eq!(script.count(origin), 1);
+}
+
+#[test]
 fn an_unanswered_command_is_repeated_with_a_count_and_given_up() {
     let mut script = Script::ready();
     script.answer = |_| None;

@@ -7,6 +7,7 @@ use vizflyt_protocol::mavlink::dialect::{
 };
 use vizflyt_protocol::mavlink::{FenceSide, GlobalPoint};
 
+use super::refusals::param;
 use super::*;
 
 const ACCEPTED: MavMissionResult = MavMissionResult::MAV_MISSION_ACCEPTED;
@@ -147,6 +148,33 @@ fn arming_waits_for_the_upload_and_an_armed_vehicle_gets_none() {
     script.armed = false;
     script.run(3.0);
     assert!(script.count(|m| matches!(m, MavMessage::MISSION_COUNT(m) if m.count == 4)) > 0);
+}
+
+/// PSC_JERK_XY and WPNAV_ACCEL are ArduCopter's names before 4.7: later versions do not answer them.
+#[test]
+fn upload_does_not_wait_for_names_that_the_autopilot_lacks() {
+    let mut script = Script::new();
+    script.link.set_fence(script.now, fence());
+    script.heartbeat();
+    script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
+    let asked = |script: &Script| {
+        let name = |message: &MavMessage| match message {
+            MavMessage::PARAM_REQUEST_READ(m) => m.param_id.to_str().ok().map(str::to_owned),
+            _ => None,
+        };
+        script.sent.iter().filter_map(name).collect::<Vec<_>>()
+    };
+    // Each answer makes room for another request.
+    let mut seen = 0;
+    while let Some(name) = asked(&script).get(seen) {
+        assert_eq!(script.offers(), 0, "parameters first: {name}");
+        if !["PSC_JERK_XY", "WPNAV_ACCEL"].contains(&name.as_str()) {
+            param(&mut script, name, 1.0);
+        }
+        seen += 1;
+    }
+    assert!(script.link.is_busy_with_params(), "two names are not given up yet");
+    assert_eq!((script.link.params().len(), script.offers()), (seen - 2, 1));
 }
 
 #[test]

@@ -13,7 +13,7 @@ fn companion(own: u32) -> MavMessage {
     })
 }
 
-fn param(script: &mut Script, name: &str, value: f32) {
+pub(super) fn param(script: &mut Script, name: &str, value: f32) {
     script.inject(&MavMessage::PARAM_VALUE(PARAM_VALUE_DATA {
         param_value: value,
         param_count: 900,
