@@ -16,6 +16,7 @@
 //! them, listens, and ends them.
 
 mod child;
+mod inbox;
 mod kept;
 mod keys;
 mod localization;
@@ -26,7 +27,7 @@ mod report;
 use std::ffi::OsString;
 use std::net::{SocketAddr, TcpListener};
 use std::os::unix::process::ExitStatusExt;
-use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
@@ -41,6 +42,7 @@ use vizflyt_server::scene::{Antialiased, BareArgs};
 use vizflyt_simulator::imu::ImuModel;
 
 use self::child::{Child, Notice, Role};
+use self::inbox::Inbox;
 use self::keys::Keys;
 use vizflyt_scenes::projects::{self, CourseProject, Level, NoProject};
 use vizflyt_scenes::{SceneKind, Variant};
@@ -202,7 +204,7 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let mut show = Show {
         log_level: format!("--log-level={}", flight.log_level).into(),
         notices,
-        inbox,
+        inbox: Inbox::new(inbox),
         children: Vec::new(),
         parts: Parts::default(),
         json: flight.json,
@@ -242,7 +244,7 @@ struct Show {
     /// The option that gives the children our log level.
     log_level: OsString,
     notices: Sender<Notice>,
-    inbox: Receiver<Notice>,
+    inbox: Inbox,
     children: Vec<(Role, Child)>,
     parts: Parts,
     json: bool,
@@ -385,6 +387,7 @@ impl Show {
     fn start(&mut self, role: Role, args: &[OsString]) -> Result<Option<Value>> {
         let child = Child::start(role, args, &self.notices)?;
         self.children.push((role, child));
+        self.inbox.child_started();
         let deadline = Instant::now() + READY_LIMIT;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -467,12 +470,10 @@ impl Show {
             }
         }
         // Each child's reader closes behind its last line, so this ends.
-        let mut open = self.children.len();
-        while open > 0 {
+        while self.inbox.open() > 0 {
             match self.inbox.recv_timeout(END_LIMIT) {
                 Ok(Notice::Line(from, line)) => self.note(from, &line),
-                Ok(Notice::Closed(_)) => open -= 1,
-                Ok(Notice::Interrupted) => {}
+                Ok(Notice::Closed(_) | Notice::Interrupted) => {}
                 Err(_) => break,
             }
         }
