@@ -40,7 +40,7 @@ class RunningSimulator:
     def __init__(self, simulator, arguments):
         with open(simulator.folder / "simulator.log", "w") as log:
             self.process = subprocess.Popen(
-                [simulator.binary, "--json", "--lifeline", *arguments], stdin=subprocess.PIPE,
+                [simulator.binary, "--json", "--lifeline", "--realistic-startup", *arguments], stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE, stderr=log, text=True)
         self.ready = json.loads(self.process.stdout.readline())
 

@@ -49,7 +49,7 @@ def square(command, script, address, seed, results):
     vicon = feed.stdout.readline().strip()
     endpoints = ["--mavlink", "udpin:127.0.0.1:0", "--mavlink", "tcpin:127.0.0.1:0"]
     simulator = subprocess.Popen(
-        [*command, "--json", "--lifeline", *endpoints, "--vicon", vicon, "--seed", str(seed)],
+        [*command, "--json", "--lifeline", "--realistic-startup", *endpoints, "--vicon", vicon, "--seed", str(seed)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

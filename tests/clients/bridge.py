@@ -120,7 +120,7 @@ class Rig:
         self.processes.append(feed)
         vicon = feed.stdout.readline().strip()
         self.simulator, _ = self.start(
-            [*command, "--json", "--lifeline", "--serial", uart, "--baud", str(baud),
+            [*command, "--json", "--lifeline", "--realistic-startup", "--serial", uart, "--baud", str(baud),
              "--vicon", vicon, "--seed", str(seed)]
         )
         self.watcher = Watcher(self.udp)

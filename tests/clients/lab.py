@@ -89,7 +89,8 @@ class Lab:
         else:
             address = endpoint + ":127.0.0.1:0"
         self.process = subprocess.Popen(
-            [*command, "--json", "--lifeline", "--mavlink", address, "--vicon", self.vicon.address, *options],
+            [*command, "--json", "--lifeline", "--realistic-startup", "--mavlink", address,
+             "--vicon", self.vicon.address, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -19,6 +19,7 @@ use crate::mocap::feed::{FeedTarget, Format};
 use crate::mocap::{MAX_NAME, MocapConfig};
 use crate::simulation::faults::{Faults, MotorFault};
 use crate::simulation::{Simulation, SimulationConfig};
+use crate::startup::Startup;
 use crate::stop::stop_flag;
 use crate::truth_feed::TruthFeed;
 use crate::wifi::WifiConfig;
@@ -77,6 +78,10 @@ pub struct SimArgs {
     /// answer velocities late.
     #[arg(long)]
     pub airframe: bool,
+    /// Start-up times of a real autopilot: 2 s of alignment, 1 s of external navigation; without this the vehicle has
+    /// stood powered before the start, and its position counts after 0.2 s.
+    #[arg(long)]
+    pub realistic_startup: bool,
     /// Changes a parameter of the autopilot at boot; may be given several times.
     #[arg(long = "param", value_name = "NAME=VALUE", value_parser = parse_param)]
     pub params: Vec<(String, f32)>,
@@ -252,6 +257,7 @@ impl SimArgs {
                 loss: self.mocap_drop_percent / 100.0,
             },
             hand: self.hand,
+            startup: if self.realistic_startup { Startup::Realistic } else { Startup::Quick },
             params: if self.airframe { airframe() } else { Vec::new() }
                 .into_iter()
                 .chain(self.params.iter().cloned())

@@ -25,6 +25,7 @@ pub mod estimator;
 
 pub mod mocap;
 pub mod simulation;
+pub mod startup;
 pub mod truth;
 pub mod wifi;
 

@@ -17,8 +17,10 @@ use crate::airframe::{Airframe, AirframeState};
 pub use crate::autopilot::MAX_LINKS;
 use crate::autopilot::{Autopilot, Radio, UnknownParam, airframe};
 use crate::battery::Battery;
+use crate::estimator::ALIGN_S;
 use crate::imu::{Imu, ImuModel};
 use crate::mocap::{Mocap, MocapConfig, Sight};
+use crate::startup::Startup;
 use crate::truth::{Truth, TruthReport};
 use crate::wifi::{Wifi, WifiConfig};
 use crate::wind::Wind;
@@ -33,6 +35,9 @@ const STEPS: u32 = 2;
 
 /// An autopilot that reboots is silent for this long. [s]
 const BOOT_S: f64 = 1.5;
+/// With [`Startup::Quick`] the vehicle has stood powered for this long before the start: its estimator is aligned,
+/// and remembers the half second that late measurements are compared with. [s]
+const POWERED_S: f64 = ALIGN_S + 0.6;
 
 /// The lab as it stands at the start.
 #[derive(Clone, Debug)]
@@ -51,6 +56,8 @@ pub struct SimulationConfig {
     pub mocap: MocapConfig,
     /// The motion capture sees somebody carry the vehicle about instead.
     pub hand: bool,
+    /// How long the autopilot takes to be ready.
+    pub startup: Startup,
     /// Autopilot parameters that differ from the defaults.
     pub params: Vec<(String, f32)>,
     /// Steady wind. [m/s, world]
@@ -88,6 +95,7 @@ impl Default for SimulationConfig {
             body_radius_m: 0.12,
             mocap: MocapConfig::default(),
             hand: false,
+            startup: Startup::default(),
             params: Vec::new(),
             wind_world_mps: DVec3::ZERO,
             gust_mps: 0.0,
@@ -136,6 +144,8 @@ pub struct Simulation {
     now: AutopilotTime,
     /// When the autopilot began to run; its clock counts from here.
     booted_at: AutopilotTime,
+    /// Time for which the autopilot ran before the start. [ns]
+    powered_ns: u64,
     reboots: u32,
     /// To the autopilot, and from it.
     wifi: Option<[Wifi; 2]>,
@@ -166,9 +176,11 @@ impl Simulation {
         imu.set_vibration(config.vibration_mps2);
         let mut autopilot = Autopilot::with_params(&config.params)?;
         autopilot.set_radio(if config.radio { Radio::Receiving } else { Radio::Absent });
-        Ok(Self {
+        autopilot.set_startup(config.startup);
+        let mut simulation = Self {
             now: AutopilotTime::ZERO,
             booted_at: AutopilotTime::ZERO,
+            powered_ns: 0,
             reboots: 0,
             airframe: Airframe::standing(config.spawn_m, config.spawn_yaw_rad),
             wind: Wind::new(config.seed, config.wind_world_mps, config.gust_mps),
@@ -187,7 +199,29 @@ impl Simulation {
             mocap_poses: 0,
             error_square_sum: 0.0,
             error_samples: 0,
-        })
+        };
+        if config.startup == Startup::Quick {
+            simulation.stand_powered();
+        }
+        Ok(simulation)
+    }
+
+    /// Runs the autopilot of the standing vehicle before the start. It sends nothing yet.
+    fn stand_powered(&mut self) {
+        let state = *self.airframe.state();
+        let felt_body = self.airframe.specific_force_body_mps2();
+        for _ in 0..(POWERED_S * TICK_HZ as f64) as u64 {
+            self.powered_ns += TICK_NS.unsigned_abs();
+            let mut sample = self.imu.sample(
+                felt_body,
+                state.omega_body_radps,
+                state.p_world_m.z,
+                state.rotor_speed,
+                TICK_S,
+            );
+            sample.battery_v = self.battery.voltage_v();
+            self.motors = self.autopilot.handle_sensors(self.autopilot_now(), &sample, TICK_S);
+        }
     }
 
     /// Returns the time since the start.
@@ -207,7 +241,8 @@ impl Simulation {
 
     /// Returns the time on the autopilot's own clock, which restarts at 0 when it reboots.
     pub fn autopilot_now(&self) -> AutopilotTime {
-        AutopilotTime::from_ns(self.now.as_ns().saturating_sub(self.booted_at.as_ns()))
+        let since_ns = self.now.as_ns().saturating_sub(self.booted_at.as_ns());
+        AutopilotTime::from_ns(since_ns + self.powered_ns)
     }
 
     fn since_start_s(&self) -> f64 {
@@ -236,6 +271,7 @@ impl Simulation {
         self.autopilot = self.autopilot.rebooted();
         self.motors = [0.0; 4];
         self.booted_at = self.now.plus_seconds(BOOT_S);
+        self.powered_ns = 0;
         self.reboots += 1;
     }
 

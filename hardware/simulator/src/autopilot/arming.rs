@@ -7,6 +7,7 @@ use super::dialect::{MavResult, MavSeverity};
 use super::failsafe::needs_position;
 use super::flight::FlightState;
 use super::{Autopilot, Guided, Param, Radio, name_of};
+use crate::startup::Startup;
 
 impl Autopilot {
     /// Why the vehicle may not be armed; `None` if it may.
@@ -86,6 +87,9 @@ impl Autopilot {
             self.guided = Guided::Hold;
             self.flight = FlightState::default();
             self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "Disarming motors");
+            if self.startup == Startup::Quick {
+                self.streams.heartbeat_now();
+            }
         }
     }
 

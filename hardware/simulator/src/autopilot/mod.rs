@@ -43,6 +43,7 @@ use crate::control::attitude::{AttitudeController, Heading};
 use crate::control::position::PositionController;
 use crate::estimator::Estimator;
 use crate::imu::SensorSample;
+use crate::startup::Startup;
 use dialect::{MavMessage, MavSeverity};
 pub use flight::airframe_limits;
 pub use params::{Param, ParamSpec, Params, TABLE, airframe};
@@ -95,6 +96,7 @@ pub enum Radio {
 /// The autopilot.
 pub struct Autopilot {
     params: Params,
+    startup: Startup,
     estimator: Estimator,
     position: PositionController,
     attitude: AttitudeController,
@@ -136,6 +138,7 @@ impl Default for Autopilot {
     fn default() -> Self {
         Self {
             params: Params::default(),
+            startup: Startup::default(),
             estimator: Estimator::default(),
             position: PositionController::default(),
             attitude: AttitudeController::default(),
@@ -184,11 +187,18 @@ impl Autopilot {
         Ok(autopilot)
     }
 
+    /// Makes it start as `startup` has it. Call it before it runs.
+    pub fn set_startup(&mut self, startup: Startup) {
+        self.startup = startup;
+        self.estimator = Estimator::new(startup);
+    }
+
     /// Makes an autopilot that boots with the parameters, the fence and the key this one has stored.
     pub fn rebooted(&self) -> Self {
         let signing = self.signing.as_ref().map(|signing| signing.rebooted(self.now));
         let (params, polygons) = (self.params.clone(), self.polygons.stored());
-        Self { params, polygons, radio: self.radio, signing, ..Self::default() }
+        let (startup, estimator) = (self.startup, Estimator::new(self.startup));
+        Self { params, polygons, radio: self.radio, signing, startup, estimator, ..Self::default() }
     }
 
     /// Whether somebody has asked for a reboot.

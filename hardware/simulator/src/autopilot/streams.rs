@@ -4,6 +4,7 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use super::Autopilot;
 use super::dialect::MavDataStream;
+use crate::startup::Startup;
 
 pub(super) const HEARTBEAT: u32 = 0;
 pub(super) const SYS_STATUS: u32 = 1;
@@ -52,6 +53,14 @@ const MIN_INTERVAL_US: i32 = 2_500;
 #[derive(Clone, Debug)]
 pub(super) struct Streams {
     rows: [Stream; DEFAULTS.len()],
+    readiness: Readiness,
+}
+
+/// What a companion waits for before it arms.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Readiness {
+    checks_pass: bool,
+    position: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -66,7 +75,7 @@ impl Default for Streams {
     fn default() -> Self {
         let rows =
             DEFAULTS.map(|(id, interval_us)| Stream { id, interval_us, due: AutopilotTime::ZERO });
-        Self { rows }
+        Self { rows, readiness: Readiness::default() }
     }
 }
 
@@ -133,11 +142,28 @@ impl Streams {
     pub(super) fn heartbeat_now(&mut self) {
         self.rows[0].due = AutopilotTime::ZERO;
     }
+
+    /// Makes the messages due at once whose flags say that the vehicle may be armed, if `readiness` has changed.
+    fn note_readiness(&mut self, readiness: Readiness) {
+        if self.readiness != readiness {
+            self.readiness = readiness;
+            for row in &mut self.rows {
+                if matches!(row.id, SYS_STATUS | EKF_STATUS_REPORT) {
+                    row.due = AutopilotTime::ZERO;
+                }
+            }
+        }
+    }
 }
 
 impl Autopilot {
     /// Sends what is due.
     pub(super) fn stream(&mut self, now: AutopilotTime) {
+        if self.startup == Startup::Quick {
+            let position = self.estimator.health(now).position;
+            let checks_pass = self.arming_refusal(now).is_none();
+            self.streams.note_readiness(Readiness { checks_pass, position });
+        }
         for index in 0..self.streams.rows.len() {
             let row = self.streams.rows[index];
             if row.interval_us == 0 || now < row.due {

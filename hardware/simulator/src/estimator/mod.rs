@@ -2,7 +2,7 @@
 //! navigation (vision poses from the companion) as ArduCopter's EKF3 with EK3_SRC1_* = 6.
 //!
 //! - Boot: the vehicle stands still for two seconds; tilt and gyro bias are read off the sensors.
-//! - Vision and no origin: heading only. With vision and an origin: position, after a second.
+//! - Vision and no origin: heading only. With vision and an origin: position, after a settling time ([`Startup`]).
 //! - A late measurement is compared with the state remembered for its time, and the correction is
 //!   applied to now and to what is remembered.
 //! - Vision gone: the IMU carries on; height soon leans on the barometer; after 7.1 s the
@@ -21,14 +21,13 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use crate::airframe::GRAVITY_MPS2;
 use crate::imu::{ACCEL_RANGE_MPS2, SensorSample};
+use crate::startup::Startup;
 use covariance::{ATTITUDE, Covariance, POSITION, VELOCITY};
 use stamp::StampCorrector;
 
 /// Standing time before the filter starts. A real ArduCopter takes about 4 s; a laboratory
 /// waits for nothing here. [s]
-const ALIGN_S: f64 = 2.0;
-/// Vision must have been fused this long before the position counts. [s]
-const SETTLE_S: f64 = 1.0;
+pub const ALIGN_S: f64 = 2.0;
 /// Without vision for this long the position is lost. [s]
 pub const POSITION_LOST_S: f64 = 7.1;
 /// Without vision for this long the height leans on the barometer. [s]
@@ -123,6 +122,8 @@ pub struct Estimator {
     prediction: Prediction,
     baro: Baro,
     last_still: Option<AutopilotTime>,
+    /// Vision must have been fused this long before the position counts. [s]
+    settle_s: f64,
 }
 
 /// Gathers the standing vehicle's sensors at boot.
@@ -190,11 +191,17 @@ impl Default for Estimator {
             prediction: Prediction::default(),
             baro: Baro::default(),
             last_still: None,
+            settle_s: Startup::default().settle_s(),
         }
     }
 }
 
 impl Estimator {
+    /// Makes an estimator that starts as `startup` has it.
+    pub fn new(startup: Startup) -> Self {
+        Self { settle_s: startup.settle_s(), ..Self::default() }
+    }
+
     /// Returns the estimate.
     pub fn estimate(&self) -> &Estimate {
         &self.estimate
@@ -207,7 +214,7 @@ impl Estimator {
             vision: self.last_vision.is_some_and(|t| now.seconds_since(t) < 0.5),
             origin: self.origin,
             position: matches!(self.position, Position::Fused { since, last }
-                if last.seconds_since(since) >= SETTLE_S),
+                if last.seconds_since(since) >= self.settle_s),
         }
     }
 

@@ -205,7 +205,7 @@ impl Companion {
         self.wait(2.5);
         self.set_origin();
         self.until(5.0, "a position", |c| {
-            c.lab.autopilot().estimator().health(c.lab.now()).position
+            c.lab.autopilot().estimator().health(c.lab.autopilot_now()).position
         });
         self.wait(1.5);
     }

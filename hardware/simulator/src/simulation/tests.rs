@@ -4,8 +4,8 @@ use crate::mocap::formats::encode_object;
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
 use vizflyt_protocol::mavlink::dialect::{
-    MavCmd, MavFrame, MavMessage, PARAM_REQUEST_LIST_DATA, PositionTargetTypemask,
-    SET_POSITION_TARGET_LOCAL_NED_DATA,
+    EkfStatusFlags, MavCmd, MavFrame, MavMessage, MavResult, PARAM_REQUEST_LIST_DATA,
+    PositionTargetTypemask, SET_POSITION_TARGET_LOCAL_NED_DATA,
 };
 use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, MavHeader, encode};
 use vizflyt_protocol::messages::YawTarget;
@@ -35,6 +35,92 @@ fn takes_off_hovers_and_lands_by_itself() {
     let report = c.lab.report();
     assert!(report.truth.landed && !report.truth.collided);
     assert!(c.p().z.abs() < 0.01 && c.v().length() < 0.01);
+}
+
+/// Returns when a companion that repeats what it wants ten times a second has it armed, and in the air. [s]
+fn started(startup: Startup) -> (f64, f64) {
+    let config = SimulationConfig { startup, ..SimulationConfig::airframe() };
+    let mut c = Companion::new(config);
+    let mut armed_s = None;
+    for _ in 0..200 {
+        c.wait(0.1);
+        let now_s = c.lab.since_start_s();
+        c.set_origin();
+        c.set_mode(CopterMode::Guided);
+        if c.lab.autopilot().estimator().health(c.lab.autopilot_now()).position {
+            c.arm();
+        }
+        if c.lab.autopilot().is_armed() {
+            armed_s.get_or_insert(now_s);
+            c.take_off(1.2);
+        }
+        if c.p().z > 0.9 * 1.2 {
+            return (armed_s.unwrap_or(f64::NAN), now_s);
+        }
+    }
+    panic!("it does not rise: {:?}", c.texts);
+}
+
+#[test]
+fn a_quick_start_is_in_the_air_seconds_before_a_realistic_one() {
+    let (quick_armed_s, quick_risen_s) = started(Startup::Quick);
+    let (armed_s, risen_s) = started(Startup::Realistic);
+    println!(
+        "quick {quick_armed_s:.2}, {quick_risen_s:.2} s; realistic {armed_s:.2}, {risen_s:.2} s"
+    );
+    assert!(quick_armed_s <= 0.5, "armed after {quick_armed_s} s");
+    assert!((3.0..3.5).contains(&armed_s), "a realistic start takes {armed_s} s");
+    // The climb is the same physics.
+    let climbs_s = (quick_risen_s - quick_armed_s, risen_s - armed_s);
+    assert!((climbs_s.0 - climbs_s.1).abs() < 0.15, "{climbs_s:?}");
+    assert!(quick_risen_s < 3.5, "in the air after {quick_risen_s} s");
+}
+
+#[test]
+fn a_quick_start_flies_as_well_as_a_realistic_one() {
+    for seed in 0..4 {
+        let startup = Startup::Quick;
+        let mut c = Companion::new(SimulationConfig { startup, seed, ..Default::default() });
+        let attitude =
+            |c: &Companion| c.lab.autopilot().estimator().health(c.lab.autopilot_now()).attitude;
+        assert!(attitude(&c), "aligned before the start");
+        c.prepare();
+        assert_eq!(c.set_mode(CopterMode::Guided), MavResult::MAV_RESULT_ACCEPTED);
+        assert_eq!(c.arm(), MavResult::MAV_RESULT_ACCEPTED);
+        assert_eq!(c.take_off(1.2), MavResult::MAV_RESULT_ACCEPTED);
+        let mut worst_m = 0f64;
+        for _ in 0..8 * TICK_HZ {
+            c.tick();
+            let p_world_m = c.lab.autopilot().estimator().estimate().p_world_m;
+            worst_m = worst_m.max((p_world_m - c.p()).truncate().length());
+        }
+        assert!(worst_m < 0.1, "seed {seed}: the estimate is {worst_m:.3} m off");
+        // A power failure takes the alignment away.
+        c.lab.reboot();
+        c.wait(BOOT_S + 0.1);
+        assert!(!attitude(&c), "it aligns again");
+    }
+}
+
+#[test]
+fn a_quick_start_reports_at_once_what_a_companion_waits_for() {
+    let position_reported_s = |startup| {
+        let mut c = Companion::new(SimulationConfig { startup, ..Default::default() });
+        c.wait(2.6);
+        c.set_origin();
+        let reported = |c: &Companion| match c.newest.get(&193) {
+            Some(MavMessage::EKF_STATUS_REPORT(m)) => {
+                m.flags.contains(EkfStatusFlags::EKF_POS_HORIZ_ABS)
+            }
+            _ => false,
+        };
+        let health =
+            |c: &Companion| c.lab.autopilot().estimator().health(c.lab.autopilot_now()).position;
+        c.until(5.0, "a position", health);
+        c.until(5.0, "its report", reported)
+    };
+    assert!(position_reported_s(Startup::Quick) <= TICK_S);
+    assert!(position_reported_s(Startup::Realistic) > TICK_S);
 }
 
 #[test]

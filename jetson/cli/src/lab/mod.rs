@@ -112,6 +112,9 @@ pub(crate) struct LabArgs {
         ImuModel::names()
     ))]
     pub imu: ImuModel,
+    /// Start-up times of a real autopilot, as of `vizflyt sim --realistic-startup`.
+    #[arg(long)]
+    pub realistic_startup: bool,
     /// Also sends the vehicle's true pose here, as `vizflyt sim --truth-to` does: to measure localization by.
     #[arg(long, value_name = "ADDR:PORT")]
     pub truth_to: Option<SocketAddr>,
@@ -368,6 +371,7 @@ impl Show {
             format!("--imu={}", lab.imu).into(),
             self.log_level.clone(),
         ];
+        sim.extend(lab.realistic_startup.then(|| "--realistic-startup".into()));
         sim.extend(lab.truth_to.map(|to| OsString::from(format!("--truth-to={to}"))));
         if let Some(truth) = &stage.truth {
             sim.push("--truth".into());

@@ -12,6 +12,7 @@ use vizflyt_protocol::time::ServerTime;
 use vizflyt_sdk::glam::DVec3;
 use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
+use vizflyt_simulator::startup::Startup;
 
 use super::*;
 use crate::companion::Senses;
@@ -222,24 +223,30 @@ fn setpoint(seq: u64, axes: Axes) -> Option<Setpoint> {
     }
 }
 
+/// Goes on by a tick of the simulation, whose packets and poses both drivers get; returns when.
+fn simulate(simulation: &mut Simulation, drivers: &mut Drivers) -> HostTime {
+    simulation.tick();
+    let now = at(simulation.now().as_ns());
+    let mut buffer = [0; MAX_PACKET];
+    while let Some(packet) = simulation.poll_mavlink(&mut buffer) {
+        drivers.mavlink(now, packet);
+    }
+    while let Some(sight) = simulation.poll_mocap() {
+        let stamp = ServerTime::from_ns(at(sight.at.as_ns()).as_ns());
+        let mut sample = PoseSample::still(stamp, sight.world_from_body);
+        sample.twist.linear_mps = simulation.state().v_world_mps;
+        drivers.pose(now, sample);
+    }
+    now
+}
+
 /// Flies both drivers through a simulated flight until the last one has landed; returns the events.
 fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
     let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
     let mut drivers = Drivers::new(at(0), &arena(ground_truth));
     let (mut events, mut seq) = (Vec::new(), 0);
     for tick in 1..=400 * 90 {
-        simulation.tick();
-        let now = at(simulation.now().as_ns());
-        let mut buffer = [0; MAX_PACKET];
-        while let Some(packet) = simulation.poll_mavlink(&mut buffer) {
-            drivers.mavlink(now, packet);
-        }
-        while let Some(sight) = simulation.poll_mocap() {
-            let stamp = ServerTime::from_ns(at(sight.at.as_ns()).as_ns());
-            let mut sample = PoseSample::still(stamp, sight.world_from_body);
-            sample.twist.linear_mps = simulation.state().v_world_mps;
-            drivers.pose(now, sample);
-        }
+        let now = simulate(&mut simulation, &mut drivers);
         if tick == 400 * seconds {
             drivers.event(now, ends_with.clone());
         }
@@ -263,6 +270,39 @@ fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
         }
     }
     panic!("the flight does not end: {events:?}");
+}
+
+/// Returns how long after its start a simulated vehicle takes off, and when the plugin flies it. [s]
+fn starts_after_s(startup: Startup) -> (f64, f64) {
+    let config = SimulationConfig { startup, ..SimulationConfig::airframe() };
+    let mut simulation = Simulation::new(config).unwrap();
+    let mut drivers = Drivers::new(at(0), &arena(true));
+    let mut takes_off_s = None;
+    for tick in 1..=400 * 20 {
+        let now = simulate(&mut simulation, &mut drivers);
+        if tick % IMAGE_TICKS == 0 {
+            drivers.image(now, tick / IMAGE_TICKS, None);
+        }
+        for datagram in drivers.turn(now) {
+            simulation.handle_mavlink(0, &datagram);
+        }
+        let seconds = now.seconds_since(at(0));
+        match drivers.lockstep.companion.flight().phase() {
+            FlightPhase::TakingOff => takes_off_s = takes_off_s.or(Some(seconds)),
+            FlightPhase::Flying => return (takes_off_s.unwrap(), seconds),
+            _ => {}
+        }
+    }
+    panic!("it does not fly: {:?}", drivers.take_messages());
+}
+
+/// The virtual clock's seconds: the same on every computer.
+#[test]
+fn a_simulated_vehicle_takes_off_half_a_second_after_a_quick_start() {
+    let (takes_off_s, flies_s) = starts_after_s(Startup::Quick);
+    assert!(takes_off_s < 0.5 && flies_s < 3.5, "{takes_off_s} s, {flies_s} s");
+    let (takes_off_s, flies_s) = starts_after_s(Startup::Realistic);
+    assert!(takes_off_s > 3.0 && flies_s > 5.5, "{takes_off_s} s, {flies_s} s");
 }
 
 #[test]

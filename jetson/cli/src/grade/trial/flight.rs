@@ -28,6 +28,7 @@ use vizflyt_server::render::imaging::{CameraEffects, EffectInput};
 use vizflyt_server::render::schedule::{CameraSchedule, Exposure, Periods, withholds_depth};
 use vizflyt_server::render::sensors::{Around, MadeReading, SensorSet, VehicleSensors};
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig};
+use vizflyt_simulator::startup::Startup;
 use vizflyt_splat::sensor::SensorScene;
 use vizflyt_splat::weather::WeatherPass;
 use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Placement, Rasterizer, RgbdImage, Scene};
@@ -120,6 +121,8 @@ impl<'a> Flight<'a> {
             seed: trial.seed,
             body_radius_m: arena.body_radius_m,
             imu: trial.imu,
+            // The hash of a flight holds every packet since the start.
+            startup: Startup::Realistic,
             ..SimulationConfig::airframe()
         };
         let simulation = Simulation::new(config).context("the simulated autopilot")?;
