@@ -80,7 +80,7 @@ fn a_quick_start_is_in_the_air_seconds_before_a_realistic_one() {
 fn a_quick_start_flies_as_well_as_a_realistic_one() {
     for seed in 0..4 {
         let startup = Startup::Quick;
-        let mut c = Companion::new(SimulationConfig { startup, seed, ..Default::default() });
+        let mut c = Companion::new(SimulationConfig { seed, startup, ..Default::default() });
         let attitude =
             |c: &Companion| c.lab.autopilot().estimator().health(c.lab.autopilot_now()).attitude;
         assert!(attitude(&c), "aligned before the start");
