@@ -83,6 +83,16 @@ impl Located {
             omega_body_radps: vehicle.omega_body_radps,
         })
     }
+
+    /// Returns the pose at another instant, within 0.3 s, if velocity and turn rate stay as they are.
+    fn at(&self, then: HostTime) -> Pose<World, Body> {
+        let ahead_s = then.seconds_since(self.stamp).clamp(-BLIND_S, BLIND_S);
+        Pose::new(
+            self.world_from_body.translation_m + self.v_world_mps * ahead_s,
+            self.world_from_body.rotation
+                * DQuat::from_scaled_axis(self.omega_body_radps * ahead_s),
+        )
+    }
 }
 
 impl Avoid {
@@ -159,19 +169,14 @@ impl Avoid {
     }
 }
 
-/// Returns the image with the pose its camera had: the vehicle's state is newer (or older) than
-/// the image by some milliseconds, over which it moved and turned at a steady rate.
+/// Returns the image with the pose that it was rendered from. The server predicts that pose; the vehicle's own state at the
+/// same instant may differ from it by decimetres at the obstacles if images are late.
 fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
-    let ahead_s = camera.shown.seconds_since(vehicle.stamp).clamp(-BLIND_S, BLIND_S);
-    let then: Pose<World, _> = Pose::new(
-        vehicle.world_from_body.translation_m + vehicle.v_world_mps * ahead_s,
-        vehicle.world_from_body.rotation
-            * DQuat::from_scaled_axis(vehicle.omega_body_radps * ahead_s),
-    );
+    let world_from_body = camera.pose_at_image.unwrap_or_else(|| vehicle.at(camera.shown));
     View {
         depth_mm: camera.depth_mm,
         intrinsics: camera.intrinsics,
-        world_from_cam: then * camera.body_from_cam,
+        world_from_cam: world_from_body * camera.body_from_cam,
     }
 }
 
