@@ -1,7 +1,10 @@
 //! The CPU renderer allocates while its buffers grow, and nothing after: whatever the poses, the
 //! cameras, their lenses, and the objects that come and go. Nor do the sensors behind its images, and those beside its cameras.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use glam::{DQuat, DVec3, Quat, Vec2, Vec3};
+use rayon::{ThreadPool, ThreadPoolBuilder};
 use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Object, Pose, World};
 use vizflyt_splat::imaging::exposure::ExposureControl;
@@ -23,6 +26,35 @@ use vizflyt_splat::{
 
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
+
+/// A pool whose threads' allocations are counted, and no others': tests run next to each other in one process.
+struct Pool {
+    threads: ThreadPool,
+    count: &'static AtomicUsize,
+}
+
+impl Pool {
+    fn new() -> Self {
+        let count: &'static AtomicUsize = Box::leak(Box::default());
+        let threads = ThreadPoolBuilder::new()
+            .num_threads(3)
+            .start_handler(move |_| CountingAllocator::count_in(count))
+            .build()
+            .expect("a pool");
+        // A thread allocates as it starts, which on a loaded machine may be late: here all have.
+        threads.broadcast(|_| ());
+        Self { threads, count }
+    }
+
+    /// Returns the result of `work` on the pool's own threads: rayon allocates a little to take in work from outside.
+    fn install<R: Send>(&self, work: impl FnOnce() -> R + Send) -> R {
+        self.threads.install(work)
+    }
+
+    fn allocations(&self) -> usize {
+        self.count.load(Ordering::Relaxed)
+    }
+}
 
 /// `count` splats all around, up to 4 m away.
 fn cloud(count: u32, half_m: f32) -> Splats {
@@ -84,24 +116,22 @@ fn nothing_is_allocated_once_every_view_was_seen() {
     let splats = cloud(60_000, 4.0);
     let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(2000, 0.5) });
     let calls: Vec<_> = (0..TURNS).map(|turn| (placements(turn), cameras(turn))).collect();
-    // On the pool's own thread, as rayon itself allocates a little, now and then, to take in work
-    // from outside.
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    let pool = Pool::new();
     for mut renderer in CpuRenderer::every(Scene { splats: &splats, objects: &objects }) {
         let mut images = vec![RgbdImage::default(); calls[0].1.len()];
         let counts = pool.install(|| {
             [(); 4].map(|()| {
-                let before = CountingAllocator::allocations();
+                let before = pool.allocations();
                 for (placements, cameras) in &calls {
                     renderer.render(placements, cameras, &mut images).expect("a valid call");
                 }
-                CountingAllocator::allocations() - before
+                pool.allocations() - before
             })
         });
         assert!(counts[0] > 0, "the counter counts");
         assert_eq!(counts[1..], [0, 0, 0], "{}", renderer.name());
     }
-    // And what cameras make of the images: in this test, as the counter is of the whole process.
+    // And what cameras make of the images.
     let mut renderer = CpuRenderer::new(&splats);
     let camera = calls[1].1[0];
     let mut clean = [RgbdImage::default()];
@@ -110,7 +140,7 @@ fn nothing_is_allocated_once_every_view_was_seen() {
         let (mut imager, mut image) = (Imager::default(), clean[0].clone());
         let counts = pool.install(|| {
             [(); 3].map(|()| {
-                let before = CountingAllocator::allocations();
+                let before = pool.allocations();
                 for seq in 0..TURNS {
                     image.rgb.copy_from_slice(&clean[0].rgb);
                     image.alpha.copy_from_slice(&clean[0].alpha);
@@ -124,7 +154,7 @@ fn nothing_is_allocated_once_every_view_was_seen() {
                         Shot { camera: &camera, path: &path, at_s: f64::from(seq) / 30.0, key };
                     imager.apply(&model, &shot, &mut image);
                 }
-                CountingAllocator::allocations() - before
+                pool.allocations() - before
             })
         });
         assert_eq!(counts[1..], [0, 0], "{model:?}");
@@ -181,14 +211,14 @@ fn sensors_allocate_nothing_after_their_first_measurement() {
     let splats = cloud(20_000, 4.0);
     let objects = [1, 2].map(|id| RigidObject { id, splats: cloud(500, 0.5) });
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    let pool = Pool::new();
     // Motions of the sensor and the objects, of which one comes and goes.
     let turns: Vec<_> = (0..7).map(|turn| (placements(turn), placements(turn + 1))).collect();
     for (name, _, preset) in PRESETS {
         let mut sensor = Prepared::new(preset());
         let counts = pool.install(|| {
             [(); 3].map(|()| {
-                let before = CountingAllocator::allocations();
+                let before = pool.allocations();
                 for (seq, (begin, end)) in turns.iter().enumerate() {
                     let moved_m = DVec3::X * (0.1 * seq as f64);
                     let begins = Pose::new(moved_m, DQuat::from_rotation_z(0.3 * seq as f64));
@@ -200,7 +230,7 @@ fn sensors_allocate_nothing_after_their_first_measurement() {
                     };
                     sensor.measure(&scene, &motion, seq as u64);
                 }
-                CountingAllocator::allocations() - before
+                pool.allocations() - before
             })
         });
         // Beams look into a cloud all around: whoever keeps records has grown them in the first pass.
@@ -268,7 +298,7 @@ fn weather_allocates_nothing_once_every_view_was_seen() {
         depth_loss: true,
         ..Weather::CLEAR
     };
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().expect("a pool");
+    let pool = Pool::new();
     let mut pass = WeatherPass::default();
     let mut images = [(); 4].map(|()| RgbdImage::default());
     let counts = pool.install(|| {
@@ -278,7 +308,7 @@ fn weather_allocates_nothing_once_every_view_was_seen() {
                 let cameras = cameras(turn);
                 let at_ns = i64::from(turn) * 33_000_000;
                 let shot = Moment { at_ns, v_world_mps: DVec3::X, seed: 7 };
-                let before = CountingAllocator::allocations();
+                let before = pool.allocations();
                 for (camera, image) in cameras.iter().zip(&mut images) {
                     image.resize(camera.intrinsics.width_px, camera.intrinsics.height_px);
                     image.alpha.fill(1.0);
@@ -286,7 +316,7 @@ fn weather_allocates_nothing_once_every_view_was_seen() {
                     image.depth_median_m.fill(5.0);
                     pass.apply(&weather, camera, &shot, image);
                 }
-                allocations += CountingAllocator::allocations() - before;
+                allocations += pool.allocations() - before;
             }
             allocations
         })
