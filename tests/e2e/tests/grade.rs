@@ -60,6 +60,19 @@ impl Rig {
 
 const FOREST: [&str; 5] = ["avoid", "--project=forest", "--seeds=2", "--image-rate=15", "--json"];
 
+/// A starved server, on the virtual clock: ten images a second, each 200 ms old on arrival, and 50 ms for the answer.
+#[test]
+fn late_and_rare_images_make_the_example_touch_nothing() {
+    let rig = Rig::new();
+    let starved = ["--image-rate=10", "--image-delay=200", "--answer-delay=50", "--seeds=4"];
+    let args = [&["avoid", "--project=forest", "--json"], &starved[..]].concat();
+    let grade = rig.grade(&args);
+    for run in grade["runs"].as_array().unwrap() {
+        assert_eq!(run["outcome"], "finished", "{run}");
+        assert!(run["min_clearance_m"].as_f64().unwrap() > 0.1, "{run}");
+    }
+}
+
 fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
     FOREST.iter().copied().chain(more.iter().copied()).collect()
 }
