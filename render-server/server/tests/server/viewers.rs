@@ -8,11 +8,11 @@
 //! compared in one run, without pages, with them, and without again; no test hangs on them.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::support::{Client, Emitter, Server, Socket, send_json, write_arena};
+use crate::support::{Client, Emitter, PATIENCE, Server, Socket, send_json, write_arena};
 use quinn::TransportConfig;
 use vizflyt_protocol::messages::ToRuntime;
 
@@ -61,20 +61,23 @@ fn twenty_pages_cost_four_runtimes_no_event() {
             std::thread::sleep(Duration::from_millis(500));
             during();
         }
+        // A loaded machine may need longer for the first image of each camera.
+        let got_one = || count().iter().zip(&before).all(|(now, then)| now > then);
+        wait_until(&format!("{phase}: an image of each camera"), got_one);
         let passed_s = start.elapsed().as_secs_f64();
         let hz: Vec<f64> =
-            count().iter().zip(before).map(|(now, then)| (now - then) as f64 / passed_s).collect();
+            count().iter().zip(&before).map(|(now, then)| (now - then) as f64 / passed_s).collect();
         let (sum, least) = (hz.iter().sum::<f64>(), hz.iter().copied().fold(f64::MAX, f64::min));
         println!("{phase:<16} {sum:6.1} images/s of 8 cameras, the slowest {least:.2} Hz");
-        assert!(least > 0.0, "{phase}: a camera stands still");
         sum
     };
     // The first seconds fill caches and open streams.
     rate("start", 2, &mut || {});
     let before = rate("no page", (seconds / 4).max(2), &mut || {});
 
-    let done = Arc::new(AtomicBool::new(false));
-    let pages: Vec<_> = (0..VIEWERS).map(|k| Page::open(&server, VEHICLES[k % 4], &done)).collect();
+    // How many changes there are in all, once that is known.
+    let all = Arc::new(AtomicU64::new(u64::MAX));
+    let pages: Vec<_> = (0..VIEWERS).map(|k| Page::open(&server, VEHICLES[k % 4], &all)).collect();
     let (mut memory_mb, mut changes) = (vec![rss_mb(&server)], 0);
     let watched = rate("20 pages", seconds, &mut || {
         memory_mb.push(rss_mb(&server));
@@ -87,16 +90,16 @@ fn twenty_pages_cost_four_runtimes_no_event() {
             assert_eq!(status, 200, "{answer}");
         }
     });
-    std::thread::sleep(Duration::from_secs(1));
-    done.store(true, Ordering::Relaxed);
+    all.store(changes, Ordering::Relaxed);
     let (mut pictures, mut states) = (0, 0);
     for page in pages {
         let seen = page.join().unwrap();
         assert_eq!(seen.changes, changes, "events of a page");
-        assert!(seen.pictures > 0 && seen.states > 0, "{seen:?}");
         (pictures, states) = (pictures + seen.pictures, states + seen.states);
     }
     for (name, got) in VEHICLES.iter().zip(&got) {
+        let is_told = || got.cameras_changed.load(Ordering::Relaxed) >= changes;
+        wait_until(&format!("events of {name}"), is_told);
         assert_eq!(got.cameras_changed.load(Ordering::Relaxed), changes, "events of {name}");
     }
     let after = rate("no page again", (seconds / 4).max(2), &mut || {});
@@ -112,6 +115,18 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         states as f64 / VIEWERS as f64 / seconds as f64,
     );
     assert!(tenths[10] - tenths[5] < MAX_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
+}
+
+/// Waits until `done`.
+///
+/// # Panics
+/// If that does not come.
+fn wait_until(what: &str, done: impl Fn() -> bool) {
+    let start = Instant::now();
+    while !done() {
+        assert!(start.elapsed() < PATIENCE, "waited for {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }
 
 /// Counts a runtime's images.
@@ -144,17 +159,21 @@ struct Seen {
 struct Page;
 
 impl Page {
-    fn open(server: &Server, vehicle: &str, done: &Arc<AtomicBool>) -> JoinHandle<Seen> {
+    /// Reads until the page has been told of `all` changes, and has had pictures and states.
+    fn open(server: &Server, vehicle: &str, all: &Arc<AtomicU64>) -> JoinHandle<Seen> {
         let origin = format!("http://{}", server.http);
         let path = format!("/ws?vehicle={vehicle}");
         let mut socket = Socket::open_at(server.http, &origin, &path).unwrap();
         // From here on no event may be missing.
         let history = socket.message("events");
         let mut next = 1 + history["events"].as_array().unwrap().iter().fold(0, index_of);
-        let done = done.clone();
+        let all = all.clone();
         std::thread::spawn(move || {
             let mut seen = Seen::default();
-            while !done.load(Ordering::Relaxed) {
+            while seen.changes < all.load(Ordering::Relaxed)
+                || seen.pictures == 0
+                || seen.states == 0
+            {
                 let (opcode, payload) = socket.next();
                 if opcode == 2 {
                     seen.pictures += 1;
