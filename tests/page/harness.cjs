@@ -1,0 +1,364 @@
+// What the tests of the page share: a browser, pages that note their faults, a program or a recorded server, and what is looked
+// at on every page.
+//
+//   node all.cjs [--shots DIR] [--real | --record] [--only NAME]... VIZFLYT
+//   node tests/NAME.cjs [...as above]
+
+const assert = require("node:assert/strict");
+const fs = require("node:fs");
+const os = require("node:os");
+const path = require("node:path");
+const { test, after } = require("node:test");
+const { parseArgs } = require("node:util");
+const { chromium } = require("playwright-core");
+const { PATIENCE_MS, Program } = require("./program.cjs");
+const { Recorder } = require("./record.cjs");
+const { Replay, VIEWER } = require("./replay.cjs");
+
+const { values: options, positionals: [vizflyt] } = parseArgs({
+  allowPositionals: true,
+  options: {
+    shots: { type: "string" }, only: { type: "string", multiple: true, default: [] },
+    real: { type: "boolean", default: false }, record: { type: "boolean", default: false },
+  },
+});
+/** Finds barriers; run in the page. */
+const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
+const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
+const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
+/** Its sandbox wants rights that a container lacks; WebGL without a card is drawn in software. */
+const CHROMIUM_ARGS = ["--no-sandbox", "--enable-unsafe-swiftshader"];
+/** Bounds a test against recorded messages that fails. [ms] */
+const RECORDED_PATIENCE_MS = 30_000;
+/** How `misbehave` flies the race past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post. */
+const INTO_THE_WALL = "world:1:-0.16";
+
+if (options.shots) fs.mkdirSync(options.shots, { recursive: true });
+
+/** The browser that all tests share. */
+let shared = null;
+const launch = (...args) => chromium.launch({ executablePath, args: args.length ? args : CHROMIUM_ARGS });
+after(async () => (await shared)?.close());
+
+/** One test: its folder, its processes, its pages. */
+class Fixture {
+  constructor(name) {
+    this.name = name;
+    this.scratch = fs.mkdtempSync(path.join(os.tmpdir(), `vizflyt-page-${name}-`));
+    // A plugin sees its own folder alone, as nobody.
+    fs.chmodSync(this.scratch, 0o755);
+    this.program = new Program(vizflyt);
+    this.pages = [];
+    this.browsers = [];
+    /** Requests of the pages that change something, in their order. */
+    this.orders = [];
+    this.waiting = new Set();
+    this.recorder = null;
+    /** Bounds a test that fails. [ms] */
+    this.patience_ms = PATIENCE_MS;
+  }
+
+  at(name) {
+    return path.join(this.scratch, name);
+  }
+
+  start(...args) {
+    return this.program.start(...args);
+  }
+
+  command(...args) {
+    return this.program.command(...args);
+  }
+
+  /** Starts a server with all that listens on free ports of this computer; `more` are its other options. */
+  async serve(place, ...more) {
+    const free = "127.0.0.1:0";
+    const server = this.start("serve", place, "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu",
+      "--max-rate", "30", "--json", "--lifeline", ...more);
+    const [ready] = await server.line(/^.*"ready":"server".*$/);
+    const end = async () => {
+      server.child.stdin.end();
+      assert.equal(await server.ended, 0);
+    };
+    return { ...server, ...JSON.parse(ready), end };
+  }
+
+  /** Starts a demo that waits for its start, without a page of its own; it draws no more than the page shows. */
+  async startDemo(...args) {
+    const rate = args.includes("--max-rate") ? [] : ["--max-rate", "30"];
+    const demo = this.start("demo", "--headless", "--wait", "--log-dir", this.scratch, ...rate, ...args);
+    const [, url] = await demo.line(/page\s+(http:\S+)/);
+    return { ...demo, url };
+  }
+
+  /** Makes the race, with cameras whose images are small enough for a recording; returns its arena's file. */
+  smallRace(name) {
+    this.command("scene", "generate", "race", "-o", this.at(name));
+    const file = path.join(this.at(name), "arena.toml");
+    const small = fs.readFileSync(file, "utf8").replace(/width_px = 320\nheight_px = 240/, "width_px = 120\nheight_px = 90");
+    fs.writeFileSync(file, small);
+    return file;
+  }
+
+  /** A demo in that race; returns its page's address. */
+  async raceDemo(...args) {
+    this.demo = await this.startDemo("--scene", this.smallRace("race"), ...args);
+    return this.demo.url;
+  }
+
+  /** Makes a plugin that is `misbehave` with these arguments; returns its path. */
+  plugin(name, ...args) {
+    const { misbehave } = this.program;
+    assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --examples`);
+    const folder = this.at("plugins");
+    fs.mkdirSync(folder, { recursive: true, mode: 0o755 });
+    fs.copyFileSync(misbehave, path.join(folder, "misbehave"));
+    const script = path.join(folder, name);
+    fs.writeFileSync(script, `#!/bin/sh\nexec "$(dirname "$0")/misbehave" ${args.join(" ")} "$@"\n`, { mode: 0o755 });
+    return script;
+  }
+
+  /** Opens a page in a context of its own, in the shared browser or in `browser`; it notes what it should not do. A `viewer`
+   * is one to whom the server shows less. */
+  async open(url, { browser, viewer, ...more } = {}) {
+    shared ??= launch();
+    const context = await (browser ?? (await shared)).newContext({ viewport: { width: 1440, height: 900 }, ...this.asViewer(viewer), ...more });
+    const page = await context.newPage();
+    this.watch(page, url, viewer);
+    await page.goto(url);
+    return page;
+  }
+
+  /** Another browser, with other arguments. */
+  async launch(...args) {
+    const browser = await launch(...args);
+    this.browsers.push(browser);
+    return browser;
+  }
+
+  asViewer() {
+    return {};
+  }
+
+  watch(page, url, viewer) {
+    page.setDefaultTimeout(this.patience_ms);
+    page.faults = [];
+    this.pages.push(page);
+    page.on("pageerror", (error) => page.faults.push(`error: ${error.message}`));
+    page.on("request", (request) => {
+      const to = new URL(request.url());
+      // With the Internet unplugged all is there: nothing is asked of anyone else.
+      if (!["blob:", "data:"].includes(to.protocol) && to.host !== new URL(url).host) page.faults.push(`asks ${to.host}`);
+      if (request.method() === "GET") return;
+      this.orders.push({ order: `${request.method()} ${to.pathname}`, body: request.postData() && request.postDataJSON() });
+      for (const look of this.waiting) look();
+    });
+    this.recorder?.watch(page, viewer);
+  }
+
+  /** Waits until a page has sent an order, once more than before; returns its body. */
+  ordered(order) {
+    return new Promise((done, fail) => {
+      const timer = setTimeout(() => fail(new Error(`no page has sent ${order}, but ${JSON.stringify(this.orders)}`)), this.patience_ms);
+      const look = () => {
+        const at = this.orders.findIndex((one) => one.order === order && !one.isSeen);
+        if (at < 0) return;
+        this.orders[at].isSeen = true;
+        clearTimeout(timer);
+        this.waiting.delete(look);
+        done(this.orders[at].body);
+      };
+      this.waiting.add(look);
+      look();
+    });
+  }
+
+  async shot(page, name) {
+    if (options.shots) await page.screenshot({ path: path.join(options.shots, `${name}.png`) });
+  }
+
+  /** Closes a page that has done nothing that it should not do. */
+  async finish(...pages) {
+    for (const page of pages) {
+      assert.deepEqual(page.faults, []);
+      await page.context().close();
+    }
+  }
+
+  /** Prints what the pages show, for people who look for the cause of a failure. */
+  async explain() {
+    for (const page of this.pages.filter((page) => !page.isClosed())) {
+      const shown = await page.evaluate(() => document.body.innerText).catch(String);
+      console.log(`${page.url()} reports: ${page.faults}\n  it shows: ${shown.replaceAll(/\n+/g, " | ").slice(0, 1000)}`);
+      await this.shot(page, `failed-${this.name}`);
+    }
+  }
+
+  async close() {
+    for (const page of this.pages) if (!page.isClosed()) await page.context().close();
+    for (const browser of this.browsers) await browser.close();
+    this.program.kill();
+    fs.rmSync(this.scratch, { recursive: true, force: true });
+  }
+}
+
+/**
+ * A test against a recorded server, or, with --real and --record, against the real one: `real` starts it. What happens on the
+ * way is the same: in the recording it is a mark.
+ */
+class RecordedFixture extends Fixture {
+  constructor(name, { of = name, what, without }) {
+    super(name);
+    this.recording = of;
+    this.isReal = options.real || options.record;
+    if (options.record) this.recorder = new Recorder(name, what, without);
+    this.replay = null;
+    if (!this.isReal) this.patience_ms = RECORDED_PATIENCE_MS;
+  }
+
+  async begin(real) {
+    if (this.isReal) this.url = await real(this);
+    else {
+      this.replay = await Replay.start(this.recording);
+      this.url = this.replay.url;
+    }
+  }
+
+  asViewer(viewer) {
+    return this.replay && viewer ? { extraHTTPHeaders: { [VIEWER]: viewer } } : {};
+  }
+
+  /** Goes on to the moment `name`: with the real server `really` brings it about. Then waits until it is `shown`. */
+  async event(name, { really = () => {}, shown = () => {} }) {
+    if (this.replay) await this.replay.to(name);
+    else await really();
+    await shown();
+    this.recorder?.mark(name);
+  }
+
+  /** Does something that only a real server needs; returns what comes of it, or nothing. */
+  async really(act) {
+    return this.isReal ? act() : undefined;
+  }
+
+  /** Waits for the end of the server. */
+  async serverEnds(really) {
+    this.recorder?.end();
+    await (this.replay ? this.replay.end() : really());
+  }
+
+  /** Starts the server anew at the same port: it stands at the moment `mark`. */
+  async serverReturns(mark, really) {
+    if (!this.replay) return really(new URL(this.url).port);
+    this.replay = await Replay.start(this.recording, { port: Number(new URL(this.url).port), mark });
+  }
+
+  async close() {
+    await super.close();
+    if (this.replay?.server.listening) await this.replay.end();
+  }
+}
+
+const isWanted = (name) => !options.only.length || options.only.includes(name);
+
+async function run(fixture, body) {
+  try {
+    await body(fixture);
+  } catch (error) {
+    await fixture.explain();
+    throw error;
+  } finally {
+    await fixture.close();
+  }
+}
+
+/** A test against the program itself. */
+function serverTest(name, body) {
+  if (!isWanted(name) || options.record) return;
+  test(name, () => {
+    assert.ok(vizflyt, "this test starts the program: give its path");
+    return run(new Fixture(name), body);
+  });
+}
+
+/**
+ * A test against recorded messages; `real` starts the program that they are recorded from, and returns the page's address.
+ * The recording `of` another test will do where that one comes to the same moments. Answers at addresses that match `without`
+ * are left out of a recording.
+ */
+function recordedTest(name, { real, body, ...about }) {
+  if (!isWanted(name) || (options.record && about.of)) return;
+  test(name, () =>
+    run(new RecordedFixture(name, about), async (fixture) => {
+      await fixture.begin(real);
+      await body(fixture);
+      assert.deepEqual(fixture.replay?.unknown ?? [], [], "questions that the recording has no answer to: record it anew");
+      await fixture.recorder?.write();
+    }));
+}
+
+// ---- what is looked at on every page ----
+
+const text = (page, id) => page.locator(`#${id}`).innerText();
+const until = (page, id, pattern) =>
+  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id)?.textContent ?? ""), [id, pattern.source]);
+
+/** Everything that can be pressed or filled has a label, and the stop button is in sight. */
+async function checkAccess(page, size) {
+  const nameless = await page.evaluate(() =>
+    [...document.querySelectorAll("button, input, select, a[href], canvas, summary")]
+      .filter((node) => node.checkVisibility() && node.getAttribute("aria-hidden") !== "true")
+      .filter((node) => !(node.ariaLabel || node.textContent.trim() || node.labels?.[0]?.textContent.trim()))
+      .map((node) => node.outerHTML),
+  );
+  assert.deepEqual(nameless, [], `${size}: without a name`);
+  const stop = await page.locator("#estop").boundingBox();
+  const [width, height] = SIZES[size];
+  assert.ok(stop.x >= 0 && stop.x + stop.width <= width + 1, `${size}: STOP at ${JSON.stringify(stop)}`);
+  assert.ok(stop.y >= 0 && stop.y + stop.height <= height + 1, `${size}: STOP at ${JSON.stringify(stop)}`);
+  assert.ok(stop.height >= 44, `${size}: STOP is ${stop.height} px high`);
+  await checkWidth(page, size);
+}
+
+/** Nothing has to be scrolled sideways. */
+async function checkWidth(page, what) {
+  const over = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
+  assert.ok(over <= 0, `${what}: ${over} px too wide`);
+}
+
+async function resize(page, size) {
+  const [width, height] = SIZES[size];
+  await page.setViewportSize({ width, height });
+}
+
+/** Nothing that axe knows bars anybody from what is open, in the dark or in the light. */
+async function checkBarriers(page, what) {
+  await page.evaluate(axe);
+  const found = await page.evaluate(async () => {
+    const root = document.documentElement, former = root.dataset.theme, found = [];
+    for (const theme of ["dark", "light"]) {
+      root.dataset.theme = theme;
+      const { violations } = await globalThis.axe.run(document, { resultTypes: ["violations"] });
+      for (const { id, nodes } of violations)
+        found.push(`${theme}: ${id}: ${nodes.map(({ html, any }) => `${html.slice(0, 80)} ${any[0]?.message ?? ""}`).join("; ")}`);
+    }
+    root.dataset.theme = former;
+    return found;
+  });
+  assert.deepEqual(found, [], what);
+}
+
+/** Waits until a canvas shows a picture rather than one colour. */
+const isPainted = (page, id) =>
+  page.waitForFunction((id) => {
+    const canvas = document.querySelector(`#${id}`);
+    if (!canvas?.width) return false;
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const seen = new Set();
+    for (let k = 0; k < data.length; k += 404) seen.add((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
+    return seen.size > 20;
+  }, id);
+
+module.exports = {
+  INTO_THE_WALL, PATIENCE_MS, SIZES, checkAccess, checkBarriers, checkWidth, isPainted, options, recordedTest, resize, serverTest, text, until,
+};

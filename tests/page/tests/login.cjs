@@ -1,0 +1,109 @@
+// A server whose page takes a login: wrong, right, and out again in every window.
+
+const assert = require("node:assert/strict");
+const { spawnSync } = require("node:child_process");
+const { checkBarriers, serverTest, text, until } = require("../harness.cjs");
+
+const PASSWORD = "four words for tests";
+
+/** Starts a server that always asks for the password, with two scenes to choose from. */
+async function guarded(it) {
+  for (const [name, seed] of [["first", "1"], ["second", "2"]]) it.command("scene", "generate", "room", "--seed", seed, "-o", it.at(`scenes/${name}`));
+  const set = spawnSync(it.program.vizflyt, ["password", "--keys", it.at("keys")], { input: `${PASSWORD}\n` });
+  assert.equal(set.status, 0, `${set.stderr}`);
+  return it.serve(it.at("scenes/first"), "--scenes", it.at("scenes"), "--login", "always", "--keys", it.at("keys"));
+}
+
+/** Opens the page, not logged in, with the dialog of the login. */
+async function openLogin(it, url) {
+  const page = await it.open(url);
+  await until(page, "link-text", /not logged in/);
+  assert.ok(await page.locator("#reset").isHidden());
+  await page.locator("#login").click();
+  return page;
+}
+
+async function logIn(page) {
+  await page.keyboard.type(PASSWORD);
+  await page.keyboard.press("Enter");
+  await until(page, "link-text", /live/);
+}
+
+const pairingStatus = (page) => page.evaluate(async () => (await fetch("/api/pairing")).status);
+
+serverTest("login", async (it) => {
+  const server = await guarded(it);
+  const page = await openLogin(it, server.http);
+  await it.shot(page, "login");
+  await checkBarriers(page, "the login");
+  await page.keyboard.type("not the password");
+  await page.keyboard.press("Enter");
+  await page.getByRole("alert").filter({ hasText: "this is not the password" }).waitFor();
+  assert.equal(await pairingStatus(page), 401);
+  await logIn(page);
+  // The cookie is out of reach of scripts, and without its token nothing changes.
+  assert.equal(await page.evaluate(() => document.cookie), "");
+  const bare = await page.evaluate(async () => (await fetch("/api/pairing", { method: "POST", body: '{"right":"instructor"}' })).status);
+  assert.equal(bare, 403);
+  // Another window of the same login sees no more either, once it is logged out.
+  const window = await page.context().newPage();
+  it.watch(window, server.http);
+  await window.goto(server.http);
+  await until(window, "link-text", /live/);
+  await page.locator("#logout").click();
+  await until(window, "link-text", /not logged in/);
+  await until(page, "link-text", /not logged in/);
+  assert.equal(await pairingStatus(page), 401);
+  assert.deepEqual(window.faults, []);
+  await it.finish(page);
+  await server.end();
+});
+
+serverTest("pairing", async (it) => {
+  const server = await guarded(it);
+  const page = await openLogin(it, server.http);
+  await logIn(page);
+  // The stop button works beside the panel, by mouse and by key.
+  await page.locator("#setup summary").click();
+  await page.getByRole("button", { name: "pair a computer" }).click();
+  await page.getByRole("button", { name: "show a code" }).click();
+  await page.waitForFunction(() => /^\d{3}.?\d{3}$/.test(document.querySelector(".pair-code").textContent));
+  await it.shot(page, "pairing");
+  await checkBarriers(page, "the pairing");
+  await page.locator("#estop").click();
+  await until(page, "announcement", /no runtime is connected/);
+  // Escape closes the dialog first, and stops only then.
+  await page.evaluate(() => (document.getElementById("announcement").textContent = ""));
+  await page.keyboard.press("Escape");
+  await page.locator("dialog[open]").waitFor({ state: "hidden" });
+  assert.equal(await text(page, "announcement"), "");
+  await page.keyboard.press("Escape");
+  await until(page, "announcement", /no runtime is connected/);
+  await it.finish(page);
+  await server.end();
+});
+
+serverTest("scenes", async (it) => {
+  const server = await guarded(it);
+  const page = await openLogin(it, server.http);
+  await logIn(page);
+  // Another scene: the page comes back by itself, still logged in.
+  const before = await page.evaluate(async () => (await (await fetch("/api/scenes")).json()).now);
+  assert.equal(before, "first");
+  await page.locator("#scenes").click();
+  await page.locator("#scene-choice").selectOption("second");
+  await it.shot(page, "scenes");
+  await checkBarriers(page, "the scenes");
+  await page.locator("dialog[open] button[type=submit]").click();
+  await page.waitForFunction(async () => {
+    try {
+      const answer = await fetch("/api/scenes");
+      return answer.ok && (await answer.json()).now === "second";
+    } catch {
+      return false;
+    }
+  }, null, { polling: 250 });
+  await until(page, "link-text", /live/);
+  await it.finish(page);
+  await server.end();
+});
