@@ -82,7 +82,7 @@ impl CrashCard {
 /// Returns what the page reads of cards, for the check of its scripts.
 #[cfg(test)]
 pub(crate) fn examples() -> Vec<serde_json::Value> {
-    use vizflyt_protocol::flight_end::EndReason;
+    use vizflyt_protocol::flight_end::{Collision, EndReason, Obstacle};
     let verdict = |end: EndReason, passed_s| Verdict {
         outcome: end.outcome(),
         reason: end.to_string(),
@@ -121,6 +121,14 @@ pub(crate) fn examples() -> Vec<serde_json::Value> {
         printed: vec!["a line".to_owned()],
         shots: Vec::new(),
     };
+    let touch = EndReason::Collision(Collision {
+        p_world_m: glam::DVec3::ZERO,
+        clearance_m: -0.1,
+        with: Obstacle::Scene,
+        speed_mps: 1.0,
+    });
     let (full, sparse) = (EndReason::TimeLimit { limit_s: 60.0 }, EndReason::StopButton);
-    vec![serde_json::json!(card(full, Some(1.0))), serde_json::json!(card(sparse, None))]
+    [(full, Some(1.0)), (touch, Some(1.0)), (sparse, None)]
+        .map(|(end, some)| serde_json::json!(card(end, some)))
+        .into()
 }

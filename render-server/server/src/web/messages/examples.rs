@@ -159,6 +159,7 @@ fn event_examples() -> Vec<Line> {
         EventKind::PoseLost { age_s: 0.6 },
         EventKind::Ended(EndReason::PluginLanded),
         EventKind::Ended(EndReason::PoseLost { age_s: 0.6 }),
+        EventKind::Ended(EndReason::TimeAsked { seconds: 6.0 }),
         EventKind::Phase(FlightPhase::Flying),
         EventKind::Note,
     ];

@@ -122,7 +122,7 @@ export type Events = {
         p_world_m: [number, number, number];
         speed_mps: number;
       };
-    } | { ended: string | { pose_lost: { age_s: number } } } | { finished: { seconds: number } } | { phase: string } | { pose_lost: { age_s: number } } | { stage: { index: number; name: string } } | { time_limit: { limit_s: number } };
+    } | { ended: string | { pose_lost: { age_s: number } } | { time_asked: { seconds: number } } } | { finished: { seconds: number } } | { phase: string } | { pose_lost: { age_s: number } } | { stage: { index: number; name: string } } | { time_limit: { limit_s: number } };
     origin: string;
     stamp: number;
     text: string;
@@ -453,7 +453,9 @@ export type CrashCard = {
   top_svg: string;
   vehicle: string;
   verdict: {
-    end: string | { time_limit: { limit_s: number } };
+    end: string | {
+      collision: { clearance_m: number; p_world_m: [number, number, number]; speed_mps: number; with: string };
+    } | { time_limit: { limit_s: number } };
     max_speed_mps: number;
     min_clearance_m: number | null;
     outcome: string;
