@@ -141,6 +141,10 @@ struct ControlLoop {
     /// Replies that took longer than the plugin's deadline.
     overruns: u64,
     restarts: u32,
+    /// The silence of the plugin that was explained last: its oldest image, and whether the vehicle lands for it.
+    explained: Option<(u64, bool)>,
+    /// Silences for which the vehicle has held.
+    silences: u64,
     /// Lines that went to the page in this second of ticks.
     page_lines: u64,
     odometry_gate: OdometryGate,
@@ -163,7 +167,7 @@ impl Control {
         let outcome = loop {
             let wait_s = state.companion.poll_timeout().seconds_since(host_now()).max(0.0);
             match inputs.recv_timeout(Duration::from_secs_f64(wait_s)) {
-                Ok(input) => state.handle(host_now(), input),
+                Ok(input) => state.handle_all(input, inputs, host_now),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => thread::sleep(IDLE),
             }
@@ -196,11 +200,26 @@ impl ControlLoop {
             image_size_px: (0, 0),
             overruns: 0,
             restarts: 0,
+            explained: None,
+            silences: 0,
             page_lines: 0,
             odometry_gate: OdometryGate::default(),
             ticks: 0,
             readings_taken: [HostTime::ZERO; MAX_SENSORS],
             polygons: None,
+        }
+    }
+
+    /// Takes an input, and those that have come by then: after a stall of this loop, an answer that waits in the queue
+    /// counts before the plugin is judged silent, and a pose before it is judged old.
+    fn handle_all(
+        &mut self,
+        first: ControlInput,
+        inputs: &Receiver<ControlInput>,
+        now: impl Fn() -> HostTime,
+    ) {
+        for input in std::iter::once(first).chain(inputs.try_iter().take(QUEUE)) {
+            self.handle(now(), input);
         }
     }
 
@@ -256,6 +275,7 @@ impl ControlLoop {
     fn tick(&mut self, now: HostTime) {
         self.tend_plugin(now);
         self.tend_by_hand(now);
+        self.explain_silence(now);
         self.take_readings(now);
         if self.ticks.is_multiple_of(TELEMETRY_TICKS) {
             self.report(now);

@@ -95,6 +95,23 @@ impl ControlLoop {
         }
     }
 
+    /// Notes what a silent plugin's process does: when the vehicle lands for its silence, and when it holds, the first
+    /// time and then ever fewer.
+    pub(super) fn explain_silence(&mut self, now: HostTime) {
+        let Some((image, since, lands)) = self.companion.flight().silence() else { return };
+        if self.explained.replace((image, lands)) == Some((image, lands)) {
+            return;
+        }
+        self.silences += u64::from(!lands);
+        if !(lands || self.silences.is_power_of_two()) {
+            return;
+        }
+        let supervisor = self.plugin.as_ref().and_then(|side| side.supervisor.as_ref());
+        if let Some(spent) = supervisor.and_then(|supervisor| supervisor.time_spent(since)) {
+            self.companion.note(now, &format!("image {image}: {spent}"));
+        }
+    }
+
     /// Watches a plugin that a person started: its end is noticed, and while it stands at a
     /// breakpoint the vehicle holds instead of landing.
     pub(super) fn tend_by_hand(&mut self, now: HostTime) {

@@ -145,21 +145,7 @@ impl Drivers {
 
     /// The plugin is shown observation `seq`, and will ask for `setpoint`.
     fn image(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
-        let stamps = Stamps {
-            camera: 0,
-            pose: now,
-            render_start: now,
-            render_end: now,
-            encode_end: now,
-            send: now,
-            receive_first: now,
-            receive: now,
-            decode_end: now,
-            clock_error_ns: 0,
-        };
-        let images = [stamps].into_iter().collect();
-        let (pose, received, ready) = (now, now, now);
-        let published = Published { seq, tick: seq, pose, received, ready, images };
+        let published = published(now, seq);
         let reply = Reply { seq, setpoint };
         let mut views = Views::default();
         views[0] = Some(now);
@@ -206,6 +192,24 @@ impl Drivers {
         let control = self.control.senses.lock().unwrap();
         assert_eq!(format!("{control:?}"), format!("{senses:?}"));
     }
+}
+
+/// Observation `seq`, of one camera, taken and published at `now`.
+fn published(now: HostTime, seq: u64) -> Published {
+    let stamps = Stamps {
+        camera: 0,
+        pose: now,
+        render_start: now,
+        render_end: now,
+        encode_end: now,
+        send: now,
+        receive_first: now,
+        receive: now,
+        decode_end: now,
+        clock_error_ns: 0,
+    };
+    let images = [stamps].into_iter().collect();
+    Published { seq, tick: seq, pose: now, received: now, ready: now, images }
 }
 
 /// What the plugin asks for in reply to image `seq`: one of everything.
@@ -340,4 +344,57 @@ fn both_drivers_withhold_the_pose_alike() {
     });
     let events = fly(false, &outside, 25);
     assert!(!events.iter().any(|event| event.kind == outside), "the place is withheld");
+}
+
+/// What the simulated vehicle and its localization send up to now.
+fn sent_by(simulation: &mut Simulation) -> Vec<ControlInput> {
+    let (mut inputs, mut buffer) = (Vec::new(), [0; MAX_PACKET]);
+    while let Some(packet) = simulation.poll_mavlink(&mut buffer) {
+        inputs.push(ControlInput::Mavlink(packet.to_vec()));
+    }
+    while let Some(sight) = simulation.poll_mocap() {
+        let stamp = at(sight.at.as_ns());
+        let sample = PoseSample::still(ServerTime::from_ns(stamp.as_ns()), sight.world_from_body);
+        inputs.push(ControlInput::Stream(StreamEvent::Pose(sample, stamp)));
+    }
+    inputs
+}
+
+#[test]
+fn answers_that_wait_in_the_queue_count_after_a_stall_of_the_loop() {
+    let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
+    let mut drivers = Drivers::new(at(0), &arena(true));
+    let (queue, inputs) = sync_channel(4 * QUEUE);
+    // From one time that the loop runs to the next, in ticks of 2.5 ms: at last 2.5 s, longer than it waits for an answer.
+    let (mut seq, mut flown, stall) = (0, 0, 1000);
+    let mut wait = 1;
+    while wait < stall {
+        wait = if flown < 400 { 1 } else { stall };
+        for _ in 0..wait {
+            simulation.tick();
+            let now = at(simulation.now().as_ns());
+            for input in sent_by(&mut simulation) {
+                queue.send(input).unwrap();
+            }
+            if (simulation.now().as_ns() / 2_500_000).is_multiple_of(IMAGE_TICKS) {
+                seq += 1;
+                queue.send(ControlInput::Published(published(now, seq))).unwrap();
+                let setpoint = Some(Setpoint::velocity(DVec3::ZERO, YawTarget::Keep));
+                let reply = FromPlugin::Reply { seq, entered: now, returned: now, setpoint };
+                queue.send(ControlInput::FromPlugin(Box::new(reply))).unwrap();
+            }
+        }
+        let now = at(simulation.now().as_ns());
+        if let Ok(first) = inputs.try_recv() {
+            drivers.control.handle_all(first, &inputs, || now);
+        }
+        drivers.control.handle_timeout(now);
+        for datagram in drivers.sent.take() {
+            simulation.handle_mavlink(0, &datagram);
+        }
+        let flight = drivers.control.companion.flight();
+        assert!(flight.outcome().is_none() && seq < 2000, "{:?}", flight.outcome());
+        flown += u64::from(flight.phase() == FlightPhase::Flying);
+    }
+    assert_eq!(drivers.control.companion.flight().phase(), FlightPhase::Flying);
 }

@@ -34,7 +34,7 @@ use vizflyt_protocol::messages::{
 };
 use vizflyt_protocol::time::{Host, HostTime};
 
-use crate::guard::{Guard, GuardMode, Lagging, Response, VehicleMotion};
+use crate::guard::{Guard, GuardMode, HoldReason, Lagging, LandReason, Response, VehicleMotion};
 use crate::link::{Goal, Link, LinkEvent};
 
 use sight::Sight;
@@ -266,6 +266,17 @@ impl Flight {
     pub fn seconds(&self, now: HostTime) -> f64 {
         let end = self.landed_at.unwrap_or(now);
         self.took_off_at.map_or(0.0, |at| end.seconds_since(at))
+    }
+
+    /// Returns the oldest image that the plugin has not answered, and when it got it, where the guard holds or lands for
+    /// its silence; and whether it lands.
+    pub fn silence(&self) -> Option<(u64, HostTime, bool)> {
+        let (image, since) = self.unanswered?;
+        match self.guard_mode? {
+            GuardMode::Holding(HoldReason::NoSetpoint) => Some((image, since, false)),
+            GuardMode::Landing(LandReason::NoSetpoint(_)) => Some((image, since, true)),
+            _ => None,
+        }
     }
 
     /// Returns the next notice.

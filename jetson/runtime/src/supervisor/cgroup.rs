@@ -116,6 +116,11 @@ impl Cgroup {
         })
     }
 
+    /// Returns the members; none without a group.
+    pub(super) fn members(&self) -> Vec<Pid> {
+        self.parts.first().map_or_else(Vec::new, GroupFolder::members)
+    }
+
     /// Kills every member, and those they start meanwhile.
     pub(super) fn kill(&self) {
         for part in &self.parts {

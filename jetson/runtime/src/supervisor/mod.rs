@@ -10,6 +10,7 @@ mod cell;
 mod cgroup;
 mod confine;
 mod limits;
+mod occupation;
 mod output;
 #[cfg(test)]
 mod tests;
@@ -26,13 +27,17 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, killpg};
 use nix::unistd::Pid;
+use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::host_now;
 use vizflyt_sdk::ipc::PluginSocket;
 
 use confine::Bounds;
+use occupation::{Look, Occupation};
 use output::{Tracebacks, read_lines};
 
 pub use confine::Confinement;
 pub use limits::{MIN_MEMORY_MB, PluginLimits, Restart};
+pub use occupation::TimeSpent;
 pub use output::LINE_BYTES;
 
 /// Which of the two outputs a line came from.
@@ -72,11 +77,12 @@ struct SharedState {
     last_error: Mutex<String>,
     /// Why the supervisor itself ended it.
     kill_reason: Mutex<Option<String>>,
+    occupation: Mutex<Occupation>,
 }
 
 /// Time a plugin has to end when asked.
 const END_WITHIN: Duration = Duration::from_millis(300);
-/// Limits are looked at this often: at 2 GB/s, 200 MB of a leak.
+/// Limits, and what the process does, are looked at this often: at 2 GB/s, 200 MB of a leak.
 const WATCH_EVERY: Duration = Duration::from_millis(100);
 
 impl Supervisor {
@@ -119,6 +125,7 @@ impl Supervisor {
             changed: Condvar::new(),
             last_error: Mutex::new(String::new()),
             kill_reason: Mutex::new(None),
+            occupation: Mutex::default(),
         });
         if let Some(stdout) = child.stdout.take() {
             let handle = handle.clone();
@@ -155,6 +162,11 @@ impl Supervisor {
     /// Whether the process still runs.
     pub fn is_running(&self) -> bool {
         lock(&self.shared.ended).is_none()
+    }
+
+    /// Returns what the process, and all it started, has done since then; `None` if the time is too short to know.
+    pub fn time_spent(&self, since: HostTime) -> Option<TimeSpent> {
+        lock(&self.shared.occupation).since(since)
     }
 
     /// Ends the process and all it started: waits 0.3 s (it was asked to end by a message), then
@@ -209,12 +221,24 @@ impl SharedState {
     /// Looks at the limits until the process has ended; ends it if it is beyond them.
     fn watch(&self) {
         while !self.wait_ended(WATCH_EVERY) {
+            self.look();
             if let Some(sentence) = self.beyond_limits() {
                 *lock(&self.kill_reason) = Some(sentence);
                 self.kill();
                 return;
             }
         }
+    }
+
+    /// Looks at what the process, and all it started, does.
+    fn look(&self) {
+        let members = self.bounds.group().members();
+        let processes = if members.is_empty() {
+            watch::processes(self.group, self.bounds.in_cell())
+        } else {
+            members
+        };
+        lock(&self.occupation).add(Look::at(host_now(), &processes));
     }
 
     fn beyond_limits(&self) -> Option<String> {

@@ -472,3 +472,19 @@ fn a_hung_plugin_is_killed_and_blocks_nobody() {
     rig.ipc.clean_up();
     assert!(!rig.ipc.plugin_attached());
 }
+
+#[test]
+fn notes_what_a_process_does_with_its_time() {
+    let looks_until = |script: &str, is_so: fn(&TimeSpent) -> bool| {
+        let since = host_now();
+        let (supervisor, _events) = start(&["sh", "-c", script]);
+        // Beside the watch, which looks ten times a second.
+        while !supervisor.time_spent(since).is_some_and(|spent| is_so(&spent)) {
+            supervisor.shared.look();
+        }
+    };
+    looks_until("while :; do :; done", |spent| {
+        spent.computed_s > 0.0 && !spent.to_string().contains("slept")
+    });
+    looks_until("exec sleep 100", |spent| spent.to_string().contains("slept"));
+}

@@ -46,25 +46,7 @@ pub(super) fn count(group: Pid, in_cell: bool) -> Usage {
     let page = nix::unistd::sysconf(nix::unistd::SysconfVar::PAGE_SIZE).ok().flatten();
     let page = page.map_or(4096, i64::unsigned_abs);
     let mut usage = Usage::default();
-    let mut all = BTreeMap::new();
-    for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
-        let folder = entry.path();
-        let id = entry.file_name().to_str().and_then(|name| name.parse::<i32>().ok());
-        let stat = fs::read_to_string(folder.join("stat")).unwrap_or_default();
-        all.extend(id.and_then(|id| Some((id, parse_stat(&stat)?))));
-    }
-    let parent = |id: i32| all.get(&id).map(|stat: &Stat| stat.parent);
-    for (&id, stat) in &all {
-        // Keeper and init, which has the keeper's number as its parent's, hold copies of our own memory.
-        let counts = if in_cell {
-            let mut above = std::iter::successors(parent(id), |&id| parent(id)).skip(1);
-            above.any(|id| id == group.as_raw())
-        } else {
-            stat.group == group.as_raw()
-        };
-        if !counts {
-            continue;
-        }
+    for (id, stat) in found(group, in_cell) {
         let folder = format!("/proc/{id}");
         // Resident less shared (proc_pid_statm(5)): the images lie in the runtime's memory.
         let statm = fs::read_to_string(format!("{folder}/statm")).unwrap_or_default();
@@ -74,6 +56,32 @@ pub(super) fn count(group: Pid, in_cell: bool) -> Usage {
         usage.tasks += stat.threads;
     }
     usage
+}
+
+/// Returns the processes that [`count`] counts.
+pub(super) fn processes(group: Pid, in_cell: bool) -> Vec<Pid> {
+    found(group, in_cell).into_iter().map(|(id, _)| Pid::from_raw(id)).collect()
+}
+
+fn found(group: Pid, in_cell: bool) -> Vec<(i32, Stat)> {
+    let mut all = BTreeMap::new();
+    for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
+        let folder = entry.path();
+        let id = entry.file_name().to_str().and_then(|name| name.parse::<i32>().ok());
+        let stat = fs::read_to_string(folder.join("stat")).unwrap_or_default();
+        all.extend(id.and_then(|id| Some((id, parse_stat(&stat)?))));
+    }
+    let parent = |id: i32| all.get(&id).map(|stat: &Stat| stat.parent);
+    let counts = |id: i32, stat: &Stat| {
+        // Keeper and init, which has the keeper's number as its parent's, hold copies of our own memory.
+        if in_cell {
+            let mut above = std::iter::successors(parent(id), |&id| parent(id)).skip(1);
+            above.any(|id| id == group.as_raw())
+        } else {
+            stat.group == group.as_raw()
+        }
+    };
+    all.iter().filter(|(id, stat)| counts(**id, stat)).map(|(&id, &stat)| (id, stat)).collect()
 }
 
 /// A process (proc_pid_stat(5)).
