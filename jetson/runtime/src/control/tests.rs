@@ -385,10 +385,10 @@ fn answers_that_wait_in_the_queue_count_after_a_stall_of_the_loop() {
             }
         }
         let now = at(simulation.now().as_ns());
-        if let Ok(first) = inputs.try_recv() {
+        while let Ok(first) = inputs.try_recv() {
             drivers.control.handle_all(first, &inputs, || now);
+            drivers.control.handle_timeout(now);
         }
-        drivers.control.handle_timeout(now);
         for datagram in drivers.sent.take() {
             simulation.handle_mavlink(0, &datagram);
         }

@@ -11,6 +11,9 @@ use vizflyt_protocol::time::HostTime;
 /// Looks that are kept: more than the silence after which the vehicle lands.
 const LOOKS: usize = 40;
 
+/// Who computes for less, and wants more, is kept from it by others: twice the usual deadline of an answer. [s]
+const LITTLE_S: f64 = 0.2;
+
 /// The state of all threads at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Look {
@@ -83,25 +86,23 @@ impl Occupation {
 impl fmt::Display for TimeSpent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { total_s, computed_s, waited_s } = *self;
-        if waited_s >= 0.5 * total_s {
-            write!(
-                f,
-                "of {total_s:.1} s the plugin's process waited {waited_s:.1} s for a processor and computed for \
-                 {computed_s:.1} s: other programs keep this computer busy, or it needs more than `cpus` in [plugin]"
-            )
-        } else if computed_s >= 0.5 * total_s {
-            write!(
-                f,
-                "of {total_s:.1} s the plugin's process computed for {computed_s:.1} s: look for a loop or slow code in \
-                 `on_image`"
-            )
-        } else {
-            let slept_s = (total_s - waited_s - computed_s).max(0.0);
-            write!(
+        let wanted_s = computed_s + waited_s;
+        if wanted_s < 0.5 * total_s {
+            let slept_s = (total_s - wanted_s).max(0.0);
+            return write!(
                 f,
                 "of {total_s:.1} s the plugin's process slept for {slept_s:.1} s: look for what `on_image` waits for"
-            )
+            );
         }
+        write!(
+            f,
+            "of {total_s:.1} s the plugin's process computed for {computed_s:.1} s and waited {waited_s:.1} s for a processor: "
+        )?;
+        f.write_str(if computed_s < LITTLE_S {
+            "other programs keep this computer busy, or it needs more than `cpus` in [plugin]"
+        } else {
+            "look for a loop or slow code in `on_image`"
+        })
     }
 }
 
@@ -119,7 +120,8 @@ fn wants_processor(stat: &str) -> bool {
 mod tests {
     use super::*;
 
-    /// Returns the sentence of a silence of 2 s, of which each tenth computes so long, and wants a processor or not.
+    /// Returns the sentence about a silence of 2 s in which each tenth of a second has this much computing, and wants a
+    /// processor or not.
     fn sentence(computed_ms: u64, wants_processor: bool) -> String {
         let mut occupation = Occupation::default();
         let start = HostTime::from_ns(1_000_000_000);
@@ -138,15 +140,19 @@ mod tests {
 
     #[test]
     fn tells_starving_from_computing_and_sleeping() {
+        let expect = |sentence: String, times: &str, advice: &str| {
+            assert!(sentence.contains(times) && sentence.contains(advice), "{sentence}");
+        };
         let starved = sentence(1, true);
-        assert!(
-            starved.contains("of 2.0 s") && starved.contains("waited 2.0 s for a processor"),
-            "{starved}"
+        expect(
+            starved,
+            "of 2.0 s the plugin's process computed for 0.0 s and waited 2.0 s",
+            "busy",
         );
-        let looping = sentence(95, true);
-        assert!(looping.contains("computed for 1.9 s"), "{looping}");
-        let asleep = sentence(1, false);
-        assert!(asleep.contains("slept for 2.0 s"), "{asleep}");
+        expect(sentence(95, true), "computed for 1.9 s and waited 0.1 s", "a loop or slow code");
+        // On a busy computer, too.
+        expect(sentence(40, true), "computed for 0.8 s and waited 1.2 s", "a loop or slow code");
+        expect(sentence(1, false), "slept for 2.0 s", "waits for");
     }
 
     #[test]
