@@ -93,7 +93,7 @@ class Fixture {
 
   /** Makes the race, with cameras whose images are small enough for a recording; returns its arena's file. */
   smallRace(name) {
-    this.command("scene", "generate", "race", "-o", this.at(name));
+    this.command("scene", "generate", "race", "--force", "-o", this.at(name));
     const file = path.join(this.at(name), "arena.toml");
     const small = fs.readFileSync(file, "utf8").replace(/width_px = 320\nheight_px = 240/, "width_px = 120\nheight_px = 90");
     fs.writeFileSync(file, small);
