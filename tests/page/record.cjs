@@ -99,7 +99,8 @@ class Recorder {
     // The page has not read it either.
     if (!bytes) record.is_unread = true;
     else if (bytes.length > MAX_ANSWER || this.without?.test(url.pathname)) record.left_out = bytes.length;
-    else if (kind?.startsWith("application/json")) record.json = JSON.parse(text);
+    // What is recorded is no secret, though it opens nothing any more.
+    else if (kind?.startsWith("application/json")) record.json = JSON.parse(text, (key, value) => (key === "token" && value ? "recorded" : value));
     else if (!kind || kind.startsWith("text/")) record.text = text;
     else record.base64 = bytes.toString("base64");
   }
