@@ -28,8 +28,6 @@ const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/c
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
 /** Its sandbox wants rights that a container lacks; WebGL without a card is drawn in software. */
 const CHROMIUM_ARGS = ["--no-sandbox", "--enable-unsafe-swiftshader"];
-/** Bounds a test against recorded messages that fails. [ms] */
-const RECORDED_PATIENCE_MS = 30_000;
 /** How `misbehave` flies the race past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post. */
 const INTO_THE_WALL = "world:1:-0.16";
 
@@ -54,8 +52,6 @@ class Fixture {
     this.orders = [];
     this.waiting = new Set();
     this.recorder = null;
-    /** Bounds a test that fails. [ms] */
-    this.patience_ms = PATIENCE_MS;
   }
 
   at(name) {
@@ -123,6 +119,8 @@ class Fixture {
   async open(url, { browser, viewer, ...more } = {}) {
     shared ??= launch();
     const context = await (browser ?? (await shared)).newContext({ viewport: { width: 1440, height: 900 }, ...this.asViewer(viewer), ...more });
+    // A busy computer takes its time for a page, too.
+    context.setDefaultTimeout(PATIENCE_MS);
     const page = await context.newPage();
     this.watch(page, url, viewer);
     await page.goto(url);
@@ -141,7 +139,7 @@ class Fixture {
   }
 
   watch(page, url, viewer) {
-    page.setDefaultTimeout(this.patience_ms);
+    page.setDefaultTimeout(PATIENCE_MS);
     page.faults = [];
     this.pages.push(page);
     page.on("pageerror", (error) => page.faults.push(`error: ${error.message}`));
@@ -159,7 +157,7 @@ class Fixture {
   /** Waits until a page has sent an order, once more than before; returns its body. */
   ordered(order) {
     return new Promise((done, fail) => {
-      const timer = setTimeout(() => fail(new Error(`no page has sent ${order}, but ${JSON.stringify(this.orders)}`)), this.patience_ms);
+      const timer = setTimeout(() => fail(new Error(`no page has sent ${order}, but ${JSON.stringify(this.orders)}`)), PATIENCE_MS);
       const look = () => {
         const at = this.orders.findIndex((one) => one.order === order && !one.isSeen);
         if (at < 0) return;
@@ -213,7 +211,6 @@ class RecordedFixture extends Fixture {
     this.isReal = options.real || options.record;
     if (options.record) this.recorder = new Recorder(name, what, without);
     this.replay = null;
-    if (!this.isReal) this.patience_ms = RECORDED_PATIENCE_MS;
   }
 
   async begin(real) {
