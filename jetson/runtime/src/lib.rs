@@ -34,7 +34,7 @@ pub mod lockstep;
 pub mod log;
 mod odometry;
 pub mod replay;
-mod replies;
+pub mod replies;
 pub mod report;
 pub mod stats;
 pub mod steering;

@@ -4,21 +4,23 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use vizflyt_protocol::messages::{FromPlugin, bounded};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_sdk::host_now;
 use vizflyt_sdk::ipc::{IpcError, RuntimeEnd};
 
 /// Maximum messages per second: twice 200 images a second, more than any camera here gives, and a
 /// fifth of what would keep the control loop busy.
 const MAX_PER_SECOND: u32 = 400;
-/// The window in which they are counted.
-const WINDOW: Duration = Duration::from_millis(250);
+/// The window in which they are counted. [ms]
+const WINDOW_MS: u32 = 250;
 
 /// Limits the rate of messages; reports once when there are too many, or one cannot be decoded.
 #[derive(Debug)]
-struct RateLimiter {
-    window_start: Instant,
+pub struct RateLimiter {
+    window_start: HostTime,
     count: u32,
     /// Of estimates, which are dropped beyond the limit.
     odometry: u32,
@@ -27,19 +29,24 @@ struct RateLimiter {
 }
 
 impl RateLimiter {
-    fn new(now: Instant) -> Self {
+    /// Makes one for a process that starts at `now`.
+    pub fn new(now: HostTime) -> Self {
         Self { window_start: now, count: 0, odometry: 0, has_failed: false }
     }
 
     /// Returns the message to pass on for what was received.
-    fn take(&mut self, now: Instant, received: Result<FromPlugin, String>) -> Option<FromPlugin> {
+    pub fn take(
+        &mut self,
+        now: HostTime,
+        received: Result<FromPlugin, String>,
+    ) -> Option<FromPlugin> {
         if self.has_failed {
             return None;
         }
-        if now.saturating_duration_since(self.window_start) >= WINDOW {
+        if now.seconds_since(self.window_start) * 1e3 >= f64::from(WINDOW_MS) {
             (self.window_start, self.count, self.odometry) = (now, 0, 0);
         }
-        let max = MAX_PER_SECOND * WINDOW.as_millis() as u32 / 1000;
+        let max = MAX_PER_SECOND * WINDOW_MS / 1000;
         if let Ok(FromPlugin::Odometry(_)) = received {
             self.odometry += 1;
             return received.ok().filter(|_| self.odometry <= max);
@@ -75,7 +82,7 @@ impl PluginReplies {
         Self {
             ipc,
             restarted: AtomicBool::new(false),
-            limiter: Mutex::new(RateLimiter::new(Instant::now())),
+            limiter: Mutex::new(RateLimiter::new(host_now())),
         }
     }
 
@@ -107,9 +114,9 @@ impl PluginReplies {
                 Ok(None) | Err(_) => break,
             };
             if self.restarted.swap(false, Ordering::Relaxed) {
-                *limiter = RateLimiter::new(Instant::now());
+                *limiter = RateLimiter::new(host_now());
             }
-            if let Some(message) = limiter.take(Instant::now(), received) {
+            if let Some(message) = limiter.take(host_now(), received) {
                 handle(message);
             }
         }
@@ -121,7 +128,6 @@ mod tests {
     use super::*;
     use vizflyt_protocol::geometry::Pose;
     use vizflyt_protocol::messages::{Odometry, Setpoint};
-    use vizflyt_protocol::time::HostTime;
 
     fn reply(seq: u64) -> FromPlugin {
         let (entered, returned) = (HostTime::ZERO, HostTime::ZERO);
@@ -130,11 +136,11 @@ mod tests {
 
     /// Returns how many of a second's replies at `hz` pass, and the failure.
     fn second(hz: u32) -> (usize, Option<String>) {
-        let start = Instant::now();
+        let start = host_now();
         let mut limiter = RateLimiter::new(start);
         let (mut passed, mut failure) = (0, None);
         for n in 0..hz {
-            let now = start + Duration::from_secs(1) * n / hz;
+            let now = start.plus_seconds(f64::from(n) / f64::from(hz));
             match limiter.take(now, Ok(reply(n.into()))) {
                 Some(FromPlugin::Failed { reason }) => {
                     assert!(failure.replace(reason.as_str().to_owned()).is_none(), "reported once");
@@ -157,7 +163,7 @@ mod tests {
 
     #[test]
     fn estimates_beyond_the_limit_are_dropped_and_replies_go_on() {
-        let now = Instant::now();
+        let now = host_now();
         let mut limiter = RateLimiter::new(now);
         let estimate = Odometry { stamp: HostTime::ZERO, odom_from_body: Pose::IDENTITY };
         let taken = (0..5000)
@@ -169,7 +175,7 @@ mod tests {
 
     #[test]
     fn reports_an_undecodable_message_once() {
-        let now = Instant::now();
+        let now = host_now();
         let mut limiter = RateLimiter::new(now);
         let Some(FromPlugin::Failed { reason }) = limiter.take(now, Err("cut short".into())) else {
             panic!("nothing is reported")
