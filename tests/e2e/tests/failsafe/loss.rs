@@ -1,0 +1,492 @@
+//! Losses: each joint of the chain between a pose and a motor, broken in flight.
+
+use vizflyt_guardian::watch::COMPONENT_ID as GUARDIAN;
+use vizflyt_protocol::mavlink::CopterMode;
+use vizflyt_protocol::messages::FlightPhase;
+use vizflyt_runtime::link::COMPONENT_ID as RUNTIME;
+
+use glam::DVec3;
+use vizflyt_bridge::bridge::COMPONENT_ID as BRIDGE;
+
+use crate::plugin::Deed;
+use crate::rig::{Place, Plan, Rig, Sight};
+use crate::runtime::Settings;
+
+/// What is lost.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Loss {
+    /// The runtime is killed.
+    Runtime,
+    /// The runtime is stopped, as one that hangs.
+    Stopped,
+    /// The runtime and its guardian are killed.
+    Jetson,
+    /// MAVLink stops both ways: Wi-Fi. [s]
+    Mavlink(f64),
+    /// The bridge is stopped, as one that hangs.
+    BridgeHangs,
+    /// The bridge is without power. [s]
+    Bridge(f64),
+    /// The motion capture sees nothing. [s]
+    Poses(f64),
+    /// The server is killed.
+    Server,
+    /// The autopilot reboots.
+    Autopilot,
+    /// Runtime, guardian, poses and MAVLink.
+    All,
+}
+
+/// For ever, as far as a flight goes. [s]
+const FOR_EVER: f64 = 1e6;
+
+/// Who brings it down.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum By {
+    /// The first LAND that reaches the autopilot is this component's.
+    Order(u8),
+    /// The autopilot has to find out.
+    Autopilot,
+    /// Its own weight.
+    Gravity,
+    /// It flies on.
+    FliesOn,
+}
+
+/// A row of the table.
+#[derive(Debug)]
+pub(crate) struct Case {
+    loss: Loss,
+    /// How the row reads.
+    pub(crate) name: &'static str,
+    /// Who notices, and what it does.
+    pub(crate) does: &'static str,
+    /// Whether its MAVLink goes through a bridge.
+    bridge: bool,
+    by: By,
+    /// LAND begins this long after the loss at most. [s]
+    land_within_s: f64,
+}
+
+/// Flown at each of [`SPEEDS`].
+const AT_ALL_SPEEDS: [Case; 11] = [
+    Case {
+        loss: Loss::Runtime,
+        name: "the runtime is killed",
+        does: "guardian: LAND at once",
+        bridge: false,
+        by: By::Order(GUARDIAN),
+        land_within_s: 0.02,
+    },
+    Case {
+        loss: Loss::Stopped,
+        name: "the runtime is stopped",
+        does: "guardian: LAND after 0.5 s",
+        bridge: false,
+        by: By::Order(GUARDIAN),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Runtime,
+        name: "the runtime is killed, behind a bridge",
+        does: "guardian: LAND at once",
+        bridge: true,
+        by: By::Order(GUARDIAN),
+        land_within_s: 0.02,
+    },
+    Case {
+        loss: Loss::Server,
+        name: "the server is killed",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Poses(FOR_EVER),
+        name: "the pose is gone",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies, behind a bridge",
+        does: "bridge: LAND after 1 s",
+        bridge: true,
+        by: By::Order(BRIDGE),
+        land_within_s: 1.05,
+    },
+    Case {
+        loss: Loss::Jetson,
+        name: "the Jetson is off, behind a bridge",
+        does: "bridge: LAND after 1 s",
+        bridge: true,
+        by: By::Order(BRIDGE),
+        land_within_s: 1.05,
+    },
+    Case {
+        loss: Loss::Jetson,
+        name: "the Jetson is off",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        by: By::Autopilot,
+        land_within_s: 2.1,
+    },
+    Case {
+        loss: Loss::Mavlink(FOR_EVER),
+        name: "Wi-Fi dies",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        by: By::Autopilot,
+        land_within_s: 2.1,
+    },
+    Case {
+        loss: Loss::BridgeHangs,
+        name: "the bridge hangs",
+        does: BY_AUTOPILOT,
+        bridge: true,
+        by: By::Autopilot,
+        land_within_s: 2.1,
+    },
+    Case {
+        loss: Loss::All,
+        name: "all at once",
+        does: BY_AUTOPILOT,
+        bridge: false,
+        by: By::Autopilot,
+        land_within_s: 2.1,
+    },
+];
+
+const BY_AUTOPILOT: &str = "autopilot: stops by GUID_TIMEOUT, LAND by FS_GCS_TIMEOUT";
+
+/// Flown at the least of [`SPEEDS`].
+const AT_ONE_SPEED: [Case; 6] = [
+    Case {
+        loss: Loss::Autopilot,
+        name: "the autopilot reboots in flight",
+        does: "nobody can: motors stop, it falls",
+        bridge: false,
+        by: By::Gravity,
+        land_within_s: 0.0,
+    },
+    Case {
+        loss: Loss::Mavlink(1.0),
+        name: "Wi-Fi is away for 1 s",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: false,
+        by: By::FliesOn,
+        land_within_s: 0.0,
+    },
+    Case {
+        loss: Loss::Bridge(1.0),
+        name: "the bridge loses power for 1 s",
+        does: "autopilot: stops by GUID_TIMEOUT, flies on",
+        bridge: true,
+        by: By::FliesOn,
+        land_within_s: 0.0,
+    },
+    Case {
+        loss: Loss::Poses(0.2),
+        name: "the pose stalls for 200 ms",
+        does: "runtime: holds after 0.15 s, flies on",
+        bridge: false,
+        by: By::FliesOn,
+        land_within_s: 0.0,
+    },
+    Case {
+        loss: Loss::Poses(1.0),
+        name: "the pose stalls for 1 s",
+        does: "runtime: holds after 0.15 s, LAND after 0.5 s",
+        bridge: false,
+        by: By::Order(RUNTIME),
+        land_within_s: 0.55,
+    },
+    Case {
+        loss: Loss::Bridge(FOR_EVER),
+        name: "the bridge loses power",
+        does: BY_AUTOPILOT,
+        bridge: true,
+        by: By::Autopilot,
+        land_within_s: 2.1,
+    },
+];
+
+/// Speeds at which vehicles are struck. [m/s]
+const SPEEDS_MPS: [f64; 3] = [0.35, 1.0, 2.5];
+
+/// One flight: a row at a speed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Run {
+    pub(crate) case: &'static Case,
+    pub(crate) speed_mps: f64,
+    /// Of noise and delays.
+    seed: u64,
+}
+
+/// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
+/// for an autopilot that does not receive it.
+const PARAMETERS: [&str; 26] = [
+    "FS_GCS_ENABLE",
+    "FS_GCS_TIMEOUT",
+    "FS_THR_ENABLE",
+    "FS_EKF_ACTION",
+    "FS_CRASH_CHECK",
+    "FS_OPTIONS",
+    "GUID_TIMEOUT",
+    "FENCE_ENABLE",
+    "FENCE_TYPE",
+    "FENCE_ACTION",
+    "FENCE_ALT_MAX",
+    "FENCE_RADIUS",
+    "BATT_MONITOR",
+    "BATT_LOW_VOLT",
+    "BATT_FS_LOW_ACT",
+    "WP_SPD",
+    "WP_SPD_UP",
+    "WP_SPD_DN",
+    "WP_ACC",
+    "WP_ACC_Z",
+    "PSC_JERK_NE",
+    "PSC_JERK_D",
+    "WP_YAW_BEHAVIOR",
+    "LAND_SPD_MS",
+    "LAND_SPD_HIGH_MS",
+    "LAND_ALT_LOW_M",
+];
+/// Down means this near the floor. [m]
+const DOWN_M: f64 = 0.05;
+/// How long a vehicle that shall fly on is watched after the loss is over. [s]
+const WATCH_S: f64 = 3.0;
+/// One that is to land has had its time after this. [s]
+const LONGEST_S: f64 = 20.0;
+/// A vehicle is on its way after this. [s]
+const READY_S: f64 = 60.0;
+/// Poses by the guardian's own feed until a vehicle is down: 50 a second.
+const GUARDIAN_POSES: u32 = 80;
+
+/// A flight as measured.
+#[derive(Clone, Debug)]
+pub(crate) struct Row {
+    pub(crate) run: Run,
+    /// From the loss until it stood, or came straight down. [s]
+    pub(crate) stands_s: Option<f64>,
+    /// From the loss until LAND was entered. [s]
+    pub(crate) lands_s: Option<f64>,
+    /// From the last good pose until it was down. [s]
+    pub(crate) down_s: Option<f64>,
+    /// Greatest horizontal distance from where it was at the last good pose, until it was down or
+    /// the loss was over. [m]
+    pub(crate) drift_m: f64,
+    /// Component of the first order to LAND.
+    ordered_by: Option<u8>,
+    guardian_poses: u32,
+    /// Whether it stayed inside the room's fence all the way.
+    is_inside: bool,
+    pub(crate) hash: u64,
+}
+
+/// Returns all flights, in the order of the table.
+pub(crate) fn runs() -> Vec<Run> {
+    let at_all =
+        AT_ALL_SPEEDS.iter().flat_map(|case| SPEEDS_MPS.map(|speed_mps| (case, speed_mps)));
+    let at_one = AT_ONE_SPEED.iter().map(|case| (case, SPEEDS_MPS[0]));
+    let seeded = |(seed, (case, speed_mps))| Run { case, speed_mps, seed };
+    (1..).zip(at_all.chain(at_one)).map(seeded).collect()
+}
+
+/// Returns parameters of a vehicle that is set up by the files in `hardware/airframe`.
+pub(crate) fn parameters() -> Vec<(String, f32)> {
+    let path = vizflyt_e2e::root().join("hardware/airframe/whippet-copter-4.8.param");
+    let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
+    let values: Vec<_> = text
+        .lines()
+        .filter_map(|line| line.split_once(','))
+        .filter(|(name, _)| PARAMETERS.contains(name))
+        .map(|(name, value)| (name.to_owned(), value.trim().parse().expect("a number")))
+        .collect();
+    assert_eq!(values.len(), PARAMETERS.len(), "hardware/airframe lacks one of {PARAMETERS:?}");
+    values
+}
+
+/// Flies a run: strikes a vehicle that flies at its speed, and watches the rest of the flight.
+pub(crate) fn fly(place: &Place, params: &[(String, f32)], run: Run) -> Row {
+    let Run { case, speed_mps, seed } = run;
+    let deeds = [Deed::World(DVec3::X * speed_mps)];
+    let settings = Settings { deeds: &deeds, restarts: 0, time_limit_s: 0.0 };
+    let (params, bridge) = (params.to_vec(), case.bridge);
+    let mut rig = Rig::new(&Plan { place, params, radio: true, bridge, seed, settings });
+    rig.until(case.name, READY_S, |rig| rig.runtime().phase() == FlightPhase::Flying);
+    let start_m = rig.sight().p_m;
+    let way_m = speed_mps.mul_add(1.2, 0.2);
+    rig.until(case.name, READY_S, |rig| (rig.sight().p_m - start_m).truncate().length() > way_m);
+    let last_good = rig.sight();
+    let over_s = strike(&mut rig, case);
+    let since_s = |rig: &Rig| rig.now_s() - last_good.at_s;
+    let lands = case.by != By::FliesOn;
+    // One that lands is watched until it is down, or ought to be; one that flies on for a while.
+    rig.until(case.name, 2.0 * LONGEST_S, |rig| {
+        if lands {
+            rig.sight().p_m.z < DOWN_M || since_s(rig) > LONGEST_S
+        } else {
+            since_s(rig) > over_s + WATCH_S
+        }
+    });
+    measure(place, run, &rig, last_good, over_s)
+}
+
+/// Lets the loss happen, and end if it does; returns how long it lasts, 0 for ever. [s]
+fn strike(rig: &mut Rig, case: &Case) -> f64 {
+    let since_s = rig.now_s();
+    let lasts_s = match case.loss {
+        Loss::Mavlink(seconds) | Loss::Bridge(seconds) | Loss::Poses(seconds)
+            if seconds < FOR_EVER =>
+        {
+            seconds
+        }
+        _ => 0.0,
+    };
+    match case.loss {
+        Loss::Runtime => rig.kill_runtime(),
+        Loss::Stopped => rig.stop_runtime(),
+        Loss::Jetson => rig.switch_off(),
+        Loss::BridgeHangs => rig.hang_bridge(),
+        Loss::Server => rig.kill_server(),
+        Loss::Autopilot => rig.reboot_autopilot(),
+        Loss::Mavlink(_) => rig.wires.cut_mavlink(true),
+        Loss::Bridge(_) => rig.kill_bridge(),
+        Loss::Poses(_) => rig.wires.capture.is_cut = true,
+        Loss::All => {
+            rig.switch_off();
+            rig.wires.capture.is_cut = true;
+            rig.wires.cut_mavlink(true);
+        }
+    }
+    if lasts_s > 0.0 {
+        rig.until(case.name, 2.0 * lasts_s, |rig| rig.now_s() - since_s >= lasts_s);
+        match case.loss {
+            Loss::Bridge(_) => rig.restart_bridge(),
+            Loss::Poses(_) => rig.wires.capture.is_cut = false,
+            _ => rig.wires.cut_mavlink(false),
+        }
+    }
+    lasts_s
+}
+
+fn measure(place: &Place, run: Run, rig: &Rig, last_good: Sight, over_s: f64) -> Row {
+    let lands = run.case.by != By::FliesOn;
+    let since_s = |sight: &Sight| sight.at_s - last_good.at_s;
+    let track = &rig.seen.track;
+    let lost: Vec<_> = track.iter().filter(|sight| since_s(sight) >= 0.0).collect();
+    let down_s = lost.iter().find(|sight| sight.p_m.z < DOWN_M).map(|sight| since_s(sight));
+    let until_s = if lands { down_s.unwrap_or(f64::INFINITY) } else { over_s };
+    let drift_m = lost
+        .iter()
+        .filter(|sight| since_s(sight) <= until_s)
+        .map(|sight| (sight.p_m - last_good.p_m).truncate().length())
+        .fold(0.0, f64::max);
+    let after = |at_s: f64| (at_s >= last_good.at_s).then_some(at_s - last_good.at_s);
+    let is_land = |&&(_, mode): &&(f64, CopterMode)| mode == CopterMode::Land;
+    let fence = &place.arena.geofence;
+    Row {
+        run,
+        // One that flies on stands later too, at the end of its way.
+        stands_s: stands_s(&lost, &last_good).filter(|&s| lands || s <= over_s),
+        lands_s: rig.seen.modes.iter().filter(is_land).find_map(|&(at_s, _)| after(at_s)),
+        down_s,
+        drift_m,
+        ordered_by: rig.seen.orders.first().map(|&(_, component)| component),
+        guardian_poses: rig.seen.guardian_poses,
+        is_inside: track
+            .iter()
+            .all(|sight| (sight.p_m.cmpgt(fence.min_m) & sight.p_m.cmplt(fence.max_m)).all()),
+        hash: rig.hash(),
+    }
+}
+
+/// When the vehicle first moved along the ground by less than 3 cm in a fifth of a second.
+fn stands_s(lost: &[&Sight], last_good: &Sight) -> Option<f64> {
+    let mut later = 0;
+    lost.iter().find_map(|sight| {
+        while lost.get(later)?.at_s < sight.at_s + 0.2 {
+            later += 1;
+        }
+        let moved_m = (lost[later].p_m - sight.p_m).truncate().length();
+        (moved_m < 0.03).then_some(sight.at_s - last_good.at_s)
+    })
+}
+
+impl Run {
+    /// From 1.2 m. [s]
+    fn down_within_s(self) -> f64 {
+        if self.case.by == By::Autopilot { 9.0 } else { 5.0 }
+    }
+
+    /// From where it was at the last good pose. [m]
+    fn drift_within_m(self) -> f64 {
+        match (self.case.by, self.case.loss) {
+            // Blind for eight seconds.
+            (By::Autopilot, _) => 2.0 + 0.8 * self.speed_mps,
+            // The bridge waits for a second.
+            (_, Loss::Jetson | Loss::Mavlink(_)) => 0.5 + self.speed_mps,
+            _ => 0.5 + 0.8 * self.speed_mps,
+        }
+    }
+}
+
+impl Row {
+    /// Returns what breaks the promise.
+    pub(crate) fn complaint(&self) -> Option<String> {
+        let Run { case, speed_mps, .. } = self.run;
+        let complain = |what: String| Some(format!("{}, {speed_mps} m/s: {what}", case.name));
+        let within_m = self.run.drift_within_m();
+        if !(self.drift_m <= within_m) {
+            return complain(format!("drifted by {:.2} of {within_m:.2} m", self.drift_m));
+        }
+        if !self.is_inside {
+            return complain("it left the fence".to_owned());
+        }
+        if case.by == By::FliesOn {
+            let is_down = self.down_s.is_some() || self.lands_s.is_some();
+            return if is_down { complain(format!("it landed: {self:?}")) } else { None };
+        }
+        if !self.down_s.is_some_and(|down_s| down_s <= self.run.down_within_s()) {
+            return complain(format!("down after {:?} s", self.down_s));
+        }
+        if case.by != By::Gravity && !self.lands_s.is_some_and(|s| s <= case.land_within_s) {
+            return complain(format!("LAND after {:?} s", self.lands_s));
+        }
+        let orders = if let By::Order(component) = case.by { Some(component) } else { None };
+        if self.ordered_by != orders && case.by != By::Gravity {
+            return complain(format!("LAND was ordered by {:?}", self.ordered_by));
+        }
+        let is_fed = !matches!(case.loss, Loss::Runtime | Loss::Stopped)
+            || self.guardian_poses >= GUARDIAN_POSES;
+        if is_fed {
+            None
+        } else {
+            complain(format!("{} poses by the guardian", self.guardian_poses))
+        }
+    }
+}
+
+impl Row {
+    /// Returns the row as the guide's table has it.
+    pub(crate) fn line(&self) -> String {
+        let Run { case, speed_mps, .. } = self.run;
+        let seconds =
+            |value: Option<f64>| value.map_or("-".to_owned(), |seconds| format!("{seconds:.1} s"));
+        let lands =
+            if case.by == By::FliesOn { "flies on".to_owned() } else { seconds(self.lands_s) };
+        format!(
+            "| {} | {} | {speed_mps} m/s | {} | {lands} | {} | {:.2} m |",
+            case.name,
+            case.does,
+            seconds(self.stands_s),
+            seconds(self.down_s),
+            self.drift_m
+        )
+    }
+}

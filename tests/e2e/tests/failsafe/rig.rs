@@ -1,0 +1,452 @@
+//! The lab on one virtual clock: vehicle, bridge, guardian, runtime, server and motion capture, each the program's own
+//! sans-IO core, joined by links with seeded delays.
+//!
+//! ```text
+//! Simulation ── capture ─▶ Server ── poses, events, images ─▶ Runtime ◀──▶ Plugin (a model)
+//!     ▲ │                     └───── feed ──▶ Guardian ◀── packets ──▶ │
+//!     │ └── MAVLink (─ serial line ─ WifiBridge) ──▶ │
+//!     └──────────────────────────────────────────────┘
+//! ```
+//! [`Rig::step`] goes on to the next instant at which anything is due. A loss is what the operating system makes of it:
+//! a process that is killed is gone and its socket closes, one that is stopped does nothing and nothing closes.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use vizflyt_arena::{ArenaConfig, DistanceField};
+use vizflyt_protocol::mavlink::dialect::{COMMAND_LONG_DATA, MavCmd, MavMessage};
+use vizflyt_protocol::mavlink::{CopterMode, MAX_PACKET, MavHeader, encode};
+use vizflyt_protocol::messages::{Event, ImuReading, PoseSample};
+use vizflyt_protocol::time::{HostTime, ServerTime};
+use vizflyt_simulator::mocap::MocapConfig;
+use vizflyt_simulator::mocap::formats::encode_object;
+use vizflyt_simulator::simulation::{Simulation, SimulationConfig, TICK_HZ};
+
+use crate::bridge::WifiBridge;
+use crate::guardian::{Guardian, ToRuntime};
+use crate::runtime::{Runtime, Settings};
+use crate::server::Server;
+use crate::wire::Wire;
+
+/// The vehicle's name in the motion capture.
+pub(crate) const OBJECT: &str = "vehicle";
+/// Where the clocks start: far enough from zero that nothing is before it. [ns]
+const START_NS: u64 = 10_000_000_000;
+const TICK_NS: i64 = (1_000_000_000 / TICK_HZ).cast_signed();
+/// A connection whose other end has died ends after this silence. [s]
+const CONNECTION_LOST_S: f64 = 5.0;
+/// The socket of a killed process closes after this. [s]
+const SOCKET_CLOSES_S: f64 = 0.002;
+/// Least time from one step to the next. [ns]
+const LEAST_STEP_NS: i64 = 1000;
+/// Link of the autopilot that is not the companion's.
+const TELEMETRY_PORT: usize = 1;
+
+/// Returns a server's stamp on the computer's clock: they are one.
+pub(crate) fn host(stamp: ServerTime) -> HostTime {
+    HostTime::from_ns(stamp.as_ns())
+}
+
+/// Returns a stamp of the computer on the server's clock.
+pub(crate) fn server(now: HostTime) -> ServerTime {
+    ServerTime::from_ns(now.as_ns())
+}
+
+/// All links.
+pub(crate) struct Wires {
+    /// Motion capture to server.
+    pub(crate) capture: Wire<Vec<u8>>,
+    /// Server to runtime.
+    pub(crate) poses: Wire<PoseSample>,
+    /// Server to runtime.
+    pub(crate) events: Wire<Event>,
+    /// Server to runtime: stamps of the poses that images were rendered from.
+    pub(crate) images: Wire<HostTime>,
+    /// Server to guardian.
+    pub(crate) feed: Wire<PoseSample>,
+    /// Runtime to server.
+    pub(crate) imu: Wire<ImuReading>,
+    /// Runtime to server.
+    pub(crate) reports: Wire<Event>,
+    /// Runtime to guardian.
+    pub(crate) to_guardian: Wire<Vec<u8>>,
+    /// Guardian to runtime.
+    pub(crate) to_runtime: Wire<ToRuntime>,
+    /// Guardian to vehicle or bridge.
+    pub(crate) to_vehicle: Wire<Vec<u8>>,
+    /// Vehicle or bridge to guardian.
+    pub(crate) from_vehicle: Wire<Vec<u8>>,
+    /// Bridge to vehicle.
+    pub(crate) uart_to_vehicle: Wire<Vec<u8>>,
+    /// Vehicle to bridge.
+    pub(crate) uart_from_vehicle: Wire<Vec<u8>>,
+}
+
+impl Wires {
+    fn new(seed: u64) -> Self {
+        // Cables: within a millisecond; an image is rendered, encoded, sent and decoded; the radio.
+        let (local, image, socket, radio) = ((200, 1500), (20_000, 30_000), (10, 60), (300, 2500));
+        Self {
+            capture: Wire::new(seed, 1, local),
+            poses: Wire::new(seed, 2, local),
+            events: Wire::new(seed, 3, local),
+            images: Wire::new(seed, 4, image),
+            feed: Wire::new(seed, 5, local),
+            imu: Wire::new(seed, 6, local),
+            reports: Wire::new(seed, 7, local),
+            to_guardian: Wire::new(seed, 8, socket),
+            to_runtime: Wire::new(seed, 9, socket),
+            to_vehicle: Wire::new(seed, 10, radio),
+            from_vehicle: Wire::new(seed, 11, radio),
+            uart_to_vehicle: Wire::new(seed, 12, (0, 0)),
+            uart_from_vehicle: Wire::new(seed, 13, (0, 0)),
+        }
+    }
+
+    /// Cuts MAVLink both ways, or joins it again.
+    pub(crate) fn cut_mavlink(&mut self, is_cut: bool) {
+        (self.to_vehicle.is_cut, self.from_vehicle.is_cut) = (is_cut, is_cut);
+    }
+}
+
+/// One pose of the motion capture.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sight {
+    /// When it was true, since the start. [s]
+    pub(crate) at_s: f64,
+    /// Where the vehicle was. [m, world]
+    pub(crate) p_m: DVec3,
+}
+
+/// What is seen of a flight from outside.
+#[derive(Default)]
+pub(crate) struct Seen {
+    /// Poses of the motion capture, also while they are cut.
+    pub(crate) track: Vec<Sight>,
+    /// The autopilot's modes, and when each began. [s]
+    pub(crate) modes: Vec<(f64, CopterMode)>,
+    /// Orders to LAND that reached the autopilot: when, and of which component. [s]
+    pub(crate) orders: Vec<(f64, u8)>,
+    /// Poses of the guardian's that reached the autopilot.
+    pub(crate) guardian_poses: u32,
+    /// Hash of all motion, of everything that reached the autopilot, and of every event.
+    hash: u64,
+}
+
+impl Seen {
+    fn hash(&mut self, word: u64) {
+        self.hash = (self.hash ^ word).wrapping_mul(0x0000_0100_0000_01B3).rotate_left(29);
+    }
+
+    fn hash_bytes(&mut self, bytes: &[u8]) {
+        for chunk in bytes.chunks(8) {
+            let mut word = [0; 8];
+            word[..chunk.len()].copy_from_slice(chunk);
+            self.hash(u64::from_le_bytes(word));
+        }
+        self.hash(bytes.len() as u64);
+    }
+
+    /// Takes note of a packet that has reached the autopilot.
+    fn packet(&mut self, at_s: f64, packet: &[u8]) {
+        const COMMAND_LONG: [u8; 3] = [76, 0, 0];
+        const VISION_POSITION_ESTIMATE: [u8; 3] = [102, 0, 0];
+        self.hash_bytes(packet);
+        let [0xFD, _, _, _, _, _, component, a, b, c, payload @ ..] = packet else { return };
+        match [*a, *b, *c] {
+            COMMAND_LONG
+                if payload.get(28..30)
+                    == Some(&(MavCmd::MAV_CMD_NAV_LAND as u16).to_le_bytes()) =>
+            {
+                self.orders.push((at_s, *component));
+            }
+            VISION_POSITION_ESTIMATE if *component == vizflyt_guardian::watch::COMPONENT_ID => {
+                self.guardian_poses += 1;
+            }
+            _ => {}
+        }
+    }
+}
+
+/// A place to fly in, shared by its flights.
+#[derive(Clone)]
+pub(crate) struct Place {
+    pub(crate) arena: ArenaConfig,
+    pub(crate) obstacles: Arc<DistanceField>,
+}
+
+/// How a flight begins.
+pub(crate) struct Plan<'a> {
+    pub(crate) place: &'a Place,
+    /// Parameters of the autopilot that differ from its defaults.
+    pub(crate) params: Vec<(String, f32)>,
+    /// A pilot's transmitter is on.
+    pub(crate) radio: bool,
+    /// MAVLink goes through a bridge.
+    pub(crate) bridge: bool,
+    /// Of all noise and delays.
+    pub(crate) seed: u64,
+    pub(crate) settings: Settings<'a>,
+}
+
+/// A flight under way.
+pub(crate) struct Rig {
+    now: HostTime,
+    tick_at: HostTime,
+    simulation: Simulation,
+    pub(crate) wires: Wires,
+    server: Option<Server>,
+    has_bridge: bool,
+    bridge: Option<WifiBridge>,
+    guardian: Option<Guardian>,
+    runtime: Option<Runtime>,
+    pub(crate) seen: Seen,
+}
+
+impl Rig {
+    pub(crate) fn new(plan: &Plan<'_>) -> Self {
+        let now = HostTime::from_ns(START_NS);
+        let Plan { place, bridge, seed, settings, .. } = *plan;
+        let config = SimulationConfig {
+            spawn_m: place.arena.spawn.position_m,
+            seed,
+            mocap: MocapConfig { object: OBJECT.to_owned(), ..MocapConfig::default() },
+            params: plan.params.clone(),
+            radio: plan.radio,
+            ..SimulationConfig::default()
+        };
+        Self {
+            now,
+            tick_at: now.plus_ns(TICK_NS),
+            simulation: Simulation::new(config).expect("the autopilot has these parameters"),
+            wires: Wires::new(seed),
+            server: Some(Server::new(now, &place.arena, Arc::clone(&place.obstacles))),
+            has_bridge: bridge,
+            bridge: bridge.then(|| WifiBridge::new(now)),
+            guardian: Some(Guardian::new(now)),
+            runtime: Some(Runtime::new(now, &place.arena, settings)),
+            seen: Seen::default(),
+        }
+    }
+
+    /// Returns the time since the start. [s]
+    pub(crate) fn now_s(&self) -> f64 {
+        self.now.seconds_since(HostTime::from_ns(START_NS))
+    }
+
+    /// Returns an instant as seconds since the start.
+    pub(crate) fn at_s(&self, at: HostTime) -> f64 {
+        at.seconds_since(HostTime::from_ns(START_NS))
+    }
+
+    /// Returns the newest pose of the motion capture.
+    pub(crate) fn sight(&self) -> Sight {
+        *self.seen.track.last().expect("the motion capture runs")
+    }
+
+    /// Returns the runtime.
+    pub(crate) fn runtime(&self) -> &Runtime {
+        self.runtime.as_ref().expect("the runtime runs")
+    }
+
+    /// Whether the autopilot's motors may turn.
+    pub(crate) fn is_armed(&self) -> bool {
+        self.simulation.autopilot().is_armed()
+    }
+
+    /// Returns the hash of the whole flight so far.
+    pub(crate) fn hash(&self) -> u64 {
+        self.seen.hash
+    }
+
+    /// Flies on until `done`.
+    pub(crate) fn until(&mut self, what: &str, within_s: f64, mut done: impl FnMut(&Self) -> bool) {
+        let limit_s = self.now_s() + within_s;
+        while !done(self) {
+            assert!(self.now_s() < limit_s, "{what}: not within {within_s} s: {}", self.story());
+            self.step();
+        }
+    }
+
+    /// Returns the runtime's events, for messages.
+    pub(crate) fn story(&self) -> String {
+        let events = self.runtime.iter().flat_map(|runtime| &runtime.events);
+        events
+            .map(|(at, event)| {
+                let at_s = at.seconds_since(HostTime::from_ns(START_NS));
+                format!("\n{at_s:8.3} {}", event.text)
+            })
+            .collect()
+    }
+
+    // ---- losses ----
+
+    /// Kills the runtime: its plugin goes with it, its guardian does not.
+    pub(crate) fn kill_runtime(&mut self) {
+        self.runtime = None;
+        if let Some(guardian) = &mut self.guardian {
+            guardian.socket_closes_at = Some(self.now.plus_seconds(SOCKET_CLOSES_S));
+        }
+    }
+
+    /// Stops the runtime, as one that hangs.
+    pub(crate) fn stop_runtime(&mut self) {
+        self.runtime.as_mut().expect("it runs").is_stopped = true;
+    }
+
+    /// Switches the vehicle's computer off: runtime and guardian.
+    pub(crate) fn switch_off(&mut self) {
+        (self.runtime, self.guardian) = (None, None);
+    }
+
+    /// Kills the server.
+    pub(crate) fn kill_server(&mut self) {
+        self.server = None;
+        let lost_at = self.now.plus_seconds(CONNECTION_LOST_S);
+        self.runtime.as_mut().expect("it runs").server_lost_at = Some(lost_at);
+    }
+
+    /// Stops the bridge, as one that hangs.
+    pub(crate) fn hang_bridge(&mut self) {
+        self.bridge.as_mut().expect("it flies through a bridge").is_hung = true;
+    }
+
+    /// Takes the bridge's power away.
+    pub(crate) fn kill_bridge(&mut self) {
+        self.bridge = None;
+    }
+
+    /// Gives the bridge power again: it has forgotten everything.
+    pub(crate) fn restart_bridge(&mut self) {
+        self.bridge = Some(WifiBridge::new(self.now));
+    }
+
+    /// Reboots the autopilot, armed as it is.
+    pub(crate) fn reboot_autopilot(&mut self) {
+        let reboot = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
+            command: MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
+            param1: 1.0,
+            // While armed it must be forced, as a fault would.
+            param6: 20_190_226.0,
+            target_system: 1,
+            target_component: 1,
+            ..COMMAND_LONG_DATA::default()
+        });
+        let header = MavHeader { system_id: 254, component_id: 1, sequence: 0 };
+        self.simulation
+            .handle_mavlink(TELEMETRY_PORT, encode(header, &reboot, &mut [0; MAX_PACKET]));
+    }
+
+    // ---- time ----
+
+    /// Goes on to the next instant at which something is due, and does it.
+    pub(crate) fn step(&mut self) {
+        let Self { wires, now, .. } = self;
+        let into_vehicle =
+            if self.has_bridge { wires.uart_to_vehicle.due() } else { wires.to_vehicle.due() };
+        let dues = [
+            Some(self.tick_at),
+            into_vehicle,
+            self.server.as_ref().and_then(|server| server.due(wires)),
+            self.bridge.as_ref().and_then(|bridge| bridge.due(*now, wires)),
+            self.guardian.as_ref().and_then(|guardian| guardian.due(wires)),
+            self.runtime.as_ref().and_then(|runtime| runtime.due(wires)),
+        ];
+        let due = dues.into_iter().flatten().min().expect("the vehicle ticks");
+        self.now = due.max(now.plus_ns(LEAST_STEP_NS));
+        self.turn();
+    }
+
+    fn turn(&mut self) {
+        let now = self.now;
+        if now >= self.tick_at {
+            self.tick_vehicle();
+        }
+        let wires = &mut self.wires;
+        match &mut self.server {
+            Some(server) => server.turn(now, wires),
+            None => {
+                wires.capture.clear();
+                wires.imu.clear();
+                wires.reports.clear();
+            }
+        }
+        match &mut self.bridge {
+            Some(bridge) => bridge.turn(now, wires),
+            None if self.has_bridge => {
+                wires.uart_from_vehicle.clear();
+                wires.to_vehicle.clear();
+            }
+            None => {}
+        }
+        self.guardian = self.guardian.take().filter(|guardian| !guardian.is_over(now));
+        match &mut self.guardian {
+            Some(guardian) => guardian.turn(now, wires),
+            None => {
+                wires.from_vehicle.clear();
+                wires.to_guardian.clear();
+                wires.feed.clear();
+            }
+        }
+        match &mut self.runtime {
+            Some(runtime) => {
+                let known = runtime.events.len();
+                runtime.turn(now, wires);
+                for (_, event) in &runtime.events[known..] {
+                    self.seen.hash_bytes(event.text.as_bytes());
+                }
+            }
+            None => {
+                wires.to_runtime.clear();
+                wires.poses.clear();
+                wires.events.clear();
+                wires.images.clear();
+            }
+        }
+        self.reach_vehicle();
+    }
+
+    /// Hands the vehicle what has reached it.
+    fn reach_vehicle(&mut self) {
+        let (now, at_s) = (self.now, self.now_s());
+        let wire = if self.has_bridge {
+            &mut self.wires.uart_to_vehicle
+        } else {
+            &mut self.wires.to_vehicle
+        };
+        while let Some(packet) = wire.receive(now) {
+            self.seen.packet(at_s, &packet);
+            self.simulation.handle_mavlink(0, &packet);
+        }
+    }
+
+    /// Lets the vehicle fly on for a tick; sends what it and the motion capture send.
+    fn tick_vehicle(&mut self) {
+        self.tick_at = self.tick_at.plus_ns(TICK_NS);
+        self.simulation.tick();
+        let (now, at_s) = (self.now, self.now_s());
+        let mut buffer = [0; MAX_PACKET];
+        while let Some(packet) = self.simulation.poll_mavlink(&mut buffer) {
+            if self.has_bridge {
+                self.wires.uart_from_vehicle.send_serially(now, packet);
+            } else {
+                self.wires.from_vehicle.send(now, packet.to_vec());
+            }
+        }
+        while let Some(sight) = self.simulation.poll_mocap() {
+            let p_m = sight.world_from_body.translation_m;
+            self.seen.track.push(Sight { at_s, p_m });
+            let packet = encode_object(sight.frame, OBJECT, &sight.world_from_body);
+            self.wires.capture.send(now, packet.to_vec());
+        }
+        let mode = self.simulation.autopilot().mode();
+        if self.seen.modes.last().is_none_or(|&(_, last)| last != mode) {
+            self.seen.modes.push((at_s, mode));
+        }
+        let state = *self.simulation.state();
+        let (p, v, q) = (state.p_world_m, state.v_world_mps, state.world_from_body);
+        for value in p.to_array().into_iter().chain(v.to_array()).chain(q.to_array()) {
+            self.seen.hash(value.to_bits());
+        }
+    }
+}

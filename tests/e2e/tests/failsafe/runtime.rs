@@ -1,0 +1,189 @@
+//! The runtime's process: the companion, and what its driver on the wall clock does around it, `control`.
+
+use vizflyt_arena::ArenaConfig;
+use vizflyt_protocol::flight_end::PluginFault;
+use vizflyt_protocol::messages::{Event, FlightPhase, FromPlugin, Limits, OutcomeKind};
+use vizflyt_protocol::time::HostTime;
+use vizflyt_runtime::companion::Companion;
+use vizflyt_runtime::flight::{FlightSettings, Views};
+use vizflyt_runtime::link::LinkSettings;
+use vizflyt_runtime::replies::RateLimiter;
+use vizflyt_runtime::stream::ServerClock;
+
+use crate::guardian::ToRuntime;
+use crate::plugin::{Deed, Output, Plugin};
+use crate::rig::{Wires, host};
+
+/// What a flight is to be.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Settings<'a> {
+    /// What the plugin does.
+    pub(crate) deeds: &'a [Deed],
+    /// A plugin that fails in flight is started again, this often.
+    pub(crate) restarts: u32,
+    /// Time in the air; 0 leaves it to the arena. [s]
+    pub(crate) time_limit_s: f64,
+}
+
+/// A runtime that runs.
+pub(crate) struct Runtime {
+    pub(crate) companion: Companion,
+    pub(crate) plugin: Plugin,
+    limiter: RateLimiter,
+    seq: u64,
+    /// Events, its own and the server's, and when each was reported.
+    pub(crate) events: Vec<(HostTime, Event)>,
+    restarts_allowed: u32,
+    /// Times the plugin was started again.
+    pub(crate) restarts: u32,
+    /// The plugin's process is on its way out, and another one will be started.
+    is_leaving: bool,
+    /// It is stopped, as one that hangs: nothing closes.
+    pub(crate) is_stopped: bool,
+    /// Its connection to a server that has died times out.
+    pub(crate) server_lost_at: Option<HostTime>,
+}
+
+impl Runtime {
+    /// Starts one, which the server of `arena` has welcomed.
+    pub(crate) fn new(now: HostTime, arena: &ArenaConfig, settings: Settings<'_>) -> Self {
+        let Settings { deeds, restarts, time_limit_s } = settings;
+        let settings = FlightSettings {
+            ready_within_s: 100.0,
+            time_limit_s,
+            limits: Limits::NONE,
+            slip_seed: 1,
+            cameras: Vec::new(),
+        };
+        let mut companion =
+            Companion::new(now, settings, LinkSettings::default(), ServerClock::same());
+        companion.handle_arena(now, Box::new(arena.info()));
+        companion.upload_fence(now);
+        Self {
+            companion,
+            plugin: Plugin::start(now, deeds),
+            limiter: RateLimiter::new(now),
+            seq: 0,
+            events: Vec::new(),
+            restarts_allowed: restarts,
+            restarts: 0,
+            is_leaving: false,
+            is_stopped: false,
+            server_lost_at: None,
+        }
+    }
+
+    /// Returns the phase of flight.
+    pub(crate) fn phase(&self) -> FlightPhase {
+        self.companion.flight().phase()
+    }
+
+    /// Returns the flight's outcome, once it is over.
+    pub(crate) fn outcome(&self) -> Option<OutcomeKind> {
+        self.companion.flight().outcome().map(vizflyt_protocol::flight_end::EndReason::outcome)
+    }
+
+    /// Returns when it has something to do.
+    pub(crate) fn due(&self, wires: &Wires) -> Option<HostTime> {
+        if self.is_stopped {
+            return None;
+        }
+        let dues = [
+            wires.to_runtime.due(),
+            wires.poses.due(),
+            wires.events.due(),
+            wires.images.due(),
+            Some(self.companion.poll_timeout()),
+            self.plugin.due(),
+            self.server_lost_at,
+        ];
+        dues.into_iter().flatten().min()
+    }
+
+    /// Does what is due.
+    pub(crate) fn turn(&mut self, now: HostTime, wires: &mut Wires) {
+        if self.is_stopped {
+            return;
+        }
+        while let Some(message) = wires.to_runtime.receive(now) {
+            match message {
+                ToRuntime::Mavlink(bytes) => self.companion.handle_mavlink(now, &bytes),
+                ToRuntime::Note(text) => self.companion.note(now, text),
+            }
+        }
+        self.companion.drain_imu(|_, reading| wires.imu.send(now, reading));
+        while let Some(sample) = wires.poses.receive(now) {
+            self.companion.handle_pose(now, &sample, host(sample.stamp));
+        }
+        while let Some(event) = wires.events.receive(now) {
+            self.events.push((now, event.clone()));
+            self.companion.handle_event(now, event);
+        }
+        if self.server_lost_at.take_if(|at| *at <= now).is_some() {
+            self.companion.server_down(now, "server: timed out".to_owned());
+        }
+        while let Some(pose) = wires.images.receive(now) {
+            self.seq += 1;
+            let mut views = Views::default();
+            views[0] = Some(pose);
+            self.companion.published(now, self.seq, views);
+            self.plugin.handle_image(self.seq);
+        }
+        while let Some(output) = self.plugin.poll(now) {
+            self.handle_plugin(now, output);
+        }
+        if now >= self.companion.poll_timeout() {
+            self.companion.handle_timeout(now);
+        }
+        while let Some(datagram) = self.companion.poll_transmit() {
+            wires.to_guardian.send(now, datagram.to_vec());
+        }
+        while self.companion.poll_link_event().is_some() {}
+        while let Some(event) = self.companion.poll_event() {
+            wires.reports.send(now, event.clone());
+            self.events.push((now, event));
+        }
+        while let Some(message) = self.companion.poll_plugin() {
+            self.plugin.handle_message(now, &message);
+        }
+    }
+
+    fn handle_plugin(&mut self, now: HostTime, output: Output) {
+        match output {
+            Output::Attached => self.companion.greet_plugin(now),
+            Output::Message(received) => match self.limiter.take(now, received) {
+                _ if self.is_leaving => {}
+                Some(FromPlugin::Ready { .. }) => self.companion.plugin_ready(now),
+                Some(FromPlugin::Reply { seq, setpoint, .. }) => {
+                    self.companion.replied(now, seq, setpoint);
+                }
+                Some(FromPlugin::Failed { reason }) => {
+                    self.plugin_failed(now, &format!("the plugin failed: {reason}"));
+                }
+                Some(FromPlugin::Odometry(_)) | None => {}
+            },
+            Output::Exited(sentence) => {
+                self.plugin_failed(now, sentence);
+                if std::mem::take(&mut self.is_leaving) {
+                    self.companion.plugin_gone();
+                    self.limiter = RateLimiter::new(now);
+                    self.plugin.start_process(now);
+                }
+            }
+        }
+    }
+
+    /// Starts it again, or gives it up, by the policy of `control`.
+    fn plugin_failed(&mut self, now: HostTime, sentence: &str) {
+        if self.is_leaving {
+            return;
+        }
+        if self.restarts < self.restarts_allowed && self.companion.flight().can_wait_for_plugin() {
+            self.restarts += 1;
+            self.is_leaving = true;
+            self.companion.plugin_restarts(now, sentence.to_owned());
+        } else {
+            self.companion.plugin_failed(now, PluginFault::ended(sentence));
+        }
+    }
+}

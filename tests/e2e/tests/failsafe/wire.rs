@@ -1,0 +1,97 @@
+//! Links on the virtual clock: what is sent arrives later, in order, after a seeded delay.
+
+use std::collections::VecDeque;
+
+use vizflyt_protocol::time::HostTime;
+
+/// Pseudo-random numbers: SplitMix64.
+#[derive(Clone, Debug)]
+struct Chance(u64);
+
+impl Chance {
+    /// Returns a number from `least` to `most`.
+    fn between(&mut self, least: u64, most: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        least + (z ^ (z >> 31)) % (most - least + 1)
+    }
+}
+
+/// One direction of a link.
+#[derive(Clone, Debug)]
+pub(crate) struct Wire<T> {
+    chance: Chance,
+    /// Least and greatest delay. [us]
+    delay_us: (u64, u64),
+    on_their_way: VecDeque<(HostTime, T)>,
+    /// Arrival of the newest: nothing overtakes.
+    newest: HostTime,
+    /// Drops everything that is sent.
+    pub(crate) is_cut: bool,
+}
+
+impl<T> Wire<T> {
+    /// Makes link number `stream` of the links with this seed.
+    pub(crate) fn new(seed: u64, stream: u64, delay_us: (u64, u64)) -> Self {
+        Self {
+            chance: Chance(seed.wrapping_mul(0xD1B5_4A32_D192_ED03) ^ stream << 32),
+            delay_us,
+            on_their_way: VecDeque::new(),
+            newest: HostTime::ZERO,
+            is_cut: false,
+        }
+    }
+
+    /// Sends, to arrive after a delay.
+    pub(crate) fn send(&mut self, now: HostTime, item: T) {
+        let (least, most) = self.delay_us;
+        let delay_us = self.chance.between(least, most);
+        self.send_for(now.plus_ns(1000 * delay_us.cast_signed()), item);
+    }
+
+    /// Sends, to arrive at `at` or behind what was sent before.
+    pub(crate) fn send_for(&mut self, at: HostTime, item: T) {
+        if !self.is_cut {
+            self.newest = self.newest.max(at);
+            self.on_their_way.push_back((self.newest, item));
+        }
+    }
+
+    /// Returns the next item that has arrived.
+    pub(crate) fn receive(&mut self, now: HostTime) -> Option<T> {
+        self.on_their_way.pop_front_if(|(at, _)| *at <= now).map(|(_, item)| item)
+    }
+
+    /// Returns when the next item arrives.
+    pub(crate) fn due(&self) -> Option<HostTime> {
+        self.on_their_way.front().map(|(at, _)| *at)
+    }
+
+    /// Drops everything that is on its way: nobody receives it.
+    pub(crate) fn clear(&mut self) {
+        self.on_their_way.clear();
+    }
+}
+
+/// Time that one byte takes on a serial line of 921600 baud. [ns]
+const BYTE_NS: i64 = 10_000_000_000 / 921_600;
+/// Bytes that are dropped wait longer than this: the line's buffer is full. [s]
+const BACKLOG_S: f64 = 0.1;
+
+impl Wire<Vec<u8>> {
+    /// Sends over a serial line, which takes as long as its bytes.
+    pub(crate) fn send_serially(&mut self, now: HostTime, bytes: &[u8]) {
+        let free_at = self.free_at(now);
+        if free_at.seconds_since(now) < BACKLOG_S {
+            let took_ns = BYTE_NS * i64::try_from(bytes.len()).expect("a packet is short");
+            self.send_for(free_at.plus_ns(took_ns), bytes.to_vec());
+        }
+    }
+
+    /// Returns when a serial line has sent everything.
+    pub(crate) fn free_at(&self, now: HostTime) -> HostTime {
+        self.newest.max(now)
+    }
+}
