@@ -86,7 +86,7 @@ class Stage:
 LONG = "test(over_many_seeds)"
 CLOCKED = (
     "(package(/^vizflyt-(guardian|runtime|sdk|c|server|simulator|bridge)$/) - test(/^guard::tests::/)"
-    f" + binary(/^(flights|linkloss|misbehave)$/)) - {LONG}"
+    f" + binary(flights)) - {LONG}"
 )
 
 STAGES = [

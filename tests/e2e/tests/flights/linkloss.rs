@@ -2,14 +2,11 @@
 //! vehicle is watched from outside, by the motion capture's own packets. How soon it is down and how far it drifts is
 //! held by `failsafe`, which flies every loss on a virtual clock.
 
-#[path = "../flights/lab.rs"]
-mod lab;
-
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
+use crate::lab::{Flight, Lab, Plan, Sight};
 use glam::Vec3;
-use lab::{Flight, Lab, Plan, Sight};
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_splat::{format, ply};
 

@@ -5,12 +5,9 @@
 //!
 //! The plugin is `jetson/runtime/examples/misbehave.rs`; Python's own misdeeds are in `tests/python`.
 
-#[path = "../flights/lab.rs"]
-mod lab;
-
 use std::time::Instant;
 
-use lab::{Lab, Plan, Seen};
+use crate::lab::{Lab, Plan, Seen};
 
 /// A misdeed, and what is to come of it.
 struct Case {
