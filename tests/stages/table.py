@@ -15,7 +15,8 @@ PROGRAM = "target/debug/vizflyt"
 EXAMPLES = "target/debug/examples"
 # The workspace without the crates that only heavy stages compile.
 WORKSPACE = "--locked --workspace --exclude vizflyt-ros2 --exclude vizflyt-fuzz"
-# Features that no ordinary build has.
+# The crates with features that no ordinary build has: always selected together, so that stages share one build.
+FEATURED = "-p vizflyt -p vizflyt-ros2 -p vizflyt-bridge -p vizflyt-fuzz -p vizflyt-runtime -p vizflyt-server"
 FEATURES = "vizflyt/postgres,vizflyt/foxglove,vizflyt/ros2,vizflyt/crazyflie,vizflyt-bridge/net"
 
 
@@ -165,7 +166,7 @@ STAGES = [
           ["hardware/simulator", "hardware/airframe", "jetson/runtime/src", "jetson/guardian",
            "protocol/core/src/mavlink", "protocol/core/src/failsafe.rs", "tests/ardupilot"]),
     Stage("ros2", "ROS 2 against Cyclone DDS", HEAVY, CLOCK,
-          f"cargo build --locked --workspace --features {FEATURES} --bins"
+          f"cargo build --locked {FEATURED} --features {FEATURES} --bins"
           f" && jetson/python/build-wheel -o target/ros2/wheels --program {PROGRAM}"
           f" && tests/ros2/run {PROGRAM} target/ros2/wheels/*.whl", 200, [VENV],
           ["jetson/ros2", "tests/ros2"]),

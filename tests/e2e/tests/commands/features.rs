@@ -50,7 +50,6 @@ fn features(selection: &[&str], edges: &str) -> Features {
     command.args([
         "tree",
         "--locked",
-        "--offline",
         "--prefix=none",
         "--no-dedupe",
         "--format={p}|{f}",
@@ -62,7 +61,8 @@ fn features(selection: &[&str], edges: &str) -> Features {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let mut features = Features::new();
     for line in String::from_utf8(output.stdout).expect("cargo prints text").lines() {
-        let (package, set) = line.split_once('|').expect("package|features");
+        // Headings of kinds of dependencies have none.
+        let Some((package, set)) = line.split_once('|') else { continue };
         // Without the folder of a crate of ours, or "(proc-macro)".
         let package = package.split(" (").next().unwrap_or(package);
         features.entry(package.to_owned()).or_default().insert(set.to_owned());

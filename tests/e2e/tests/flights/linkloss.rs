@@ -209,11 +209,8 @@ fn fly_one(lab: &Mutex<Lab>, run: Run, mut flight: Flight) -> Row {
     let row = judge(run, &flight, last_good);
     // The runtime's own end is its own test's matter; a killed one has none.
     let poses = flight.guardian_poses();
-    match run.case.loss {
-        Loss::Runtime | Loss::Stopped => {
-            assert!(poses > 40, "{}: {poses} poses by the guardian's own feed", run.case.name);
-        }
-        _ => {}
+    if matches!(run.case.loss, Loss::Runtime | Loss::Stopped) {
+        assert!(poses > 40, "{}: {poses} poses by the guardian's own feed", run.case.name);
     }
     row
 }
