@@ -90,7 +90,7 @@ impl Case {
             return Some("it was not done".to_owned());
         };
         let track = &rig.seen.track;
-        let deed_s = rig.at_s(deed);
+        let deed_s = Rig::at_s(deed);
         let p_m = |at_s: f64| track.iter().find(|sight| sight.at_s >= at_s).map(|s| s.p_m);
         let moved_m = |at_s: f64| {
             let (Some(a), Some(b)) = (p_m(at_s), p_m(at_s + 0.2)) else { return 0.0 };

@@ -33,6 +33,7 @@ pub(crate) enum Deed {
 
 /// What comes of an image.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)] // Why: a handful a flight, in a test.
 enum Act {
     /// The reply, after so long. [s]
     Reply(f64, Setpoint),
@@ -50,6 +51,7 @@ enum Act {
 
 /// What the runtime gets.
 #[derive(Clone, Debug)]
+#[allow(clippy::large_enum_variant)] // Why: a handful a flight, in a test.
 pub(crate) enum Output {
     /// The process has opened its end of the shared memory.
     Attached,

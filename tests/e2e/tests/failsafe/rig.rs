@@ -235,7 +235,7 @@ impl Rig {
     }
 
     /// Returns an instant as seconds since the start.
-    pub(crate) fn at_s(&self, at: HostTime) -> f64 {
+    pub(crate) fn at_s(at: HostTime) -> f64 {
         at.seconds_since(HostTime::from_ns(START_NS))
     }
 
@@ -271,12 +271,9 @@ impl Rig {
     /// Returns the runtime's events, for messages.
     pub(crate) fn story(&self) -> String {
         let events = self.runtime.iter().flat_map(|runtime| &runtime.events);
-        events
-            .map(|(at, event)| {
-                let at_s = at.seconds_since(HostTime::from_ns(START_NS));
-                format!("\n{at_s:8.3} {}", event.text)
-            })
-            .collect()
+        let lines: Vec<_> =
+            events.map(|(at, event)| format!("{:8.3} {}", Self::at_s(*at), event.text)).collect();
+        lines.join("\n")
     }
 
     // ---- losses ----
@@ -363,13 +360,12 @@ impl Rig {
             self.tick_vehicle();
         }
         let wires = &mut self.wires;
-        match &mut self.server {
-            Some(server) => server.turn(now, wires),
-            None => {
-                wires.capture.clear();
-                wires.imu.clear();
-                wires.reports.clear();
-            }
+        if let Some(server) = &mut self.server {
+            server.turn(now, wires);
+        } else {
+            wires.capture.clear();
+            wires.imu.clear();
+            wires.reports.clear();
         }
         match &mut self.bridge {
             Some(bridge) => bridge.turn(now, wires),
@@ -380,28 +376,24 @@ impl Rig {
             None => {}
         }
         self.guardian = self.guardian.take().filter(|guardian| !guardian.is_over(now));
-        match &mut self.guardian {
-            Some(guardian) => guardian.turn(now, wires),
-            None => {
-                wires.from_vehicle.clear();
-                wires.to_guardian.clear();
-                wires.feed.clear();
-            }
+        if let Some(guardian) = &mut self.guardian {
+            guardian.turn(now, wires);
+        } else {
+            wires.from_vehicle.clear();
+            wires.to_guardian.clear();
+            wires.feed.clear();
         }
-        match &mut self.runtime {
-            Some(runtime) => {
-                let known = runtime.events.len();
-                runtime.turn(now, wires);
-                for (_, event) in &runtime.events[known..] {
-                    self.seen.hash_bytes(event.text.as_bytes());
-                }
+        if let Some(runtime) = &mut self.runtime {
+            let known = runtime.events.len();
+            runtime.turn(now, wires);
+            for (_, event) in &runtime.events[known..] {
+                self.seen.hash_bytes(event.text.as_bytes());
             }
-            None => {
-                wires.to_runtime.clear();
-                wires.poses.clear();
-                wires.events.clear();
-                wires.images.clear();
-            }
+        } else {
+            wires.to_runtime.clear();
+            wires.poses.clear();
+            wires.events.clear();
+            wires.images.clear();
         }
         self.reach_vehicle();
     }
