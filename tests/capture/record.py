@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pycolmap
 
-# At least so many points of each picture are kept if it has them: some 1.8 MB.
+# Minimum number of points kept for each picture, if it has them: about 1.8 MB.
 POINTS_OF_A_PICTURE = 260
 
 

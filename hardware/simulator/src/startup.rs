@@ -7,7 +7,7 @@ pub enum Startup {
     /// navigation, and a state is reported when its stream is due.
     #[default]
     Realistic,
-    /// For flights that nobody should wait for: the vehicle has stood powered before the start, the position counts
+    /// For flights that start at once: the vehicle has stood powered before the start, the position counts
     /// after a few poses, and a change that a companion waits for is reported at once.
     Quick,
 }

@@ -56,7 +56,7 @@ pub(super) struct Streams {
     readiness: Readiness,
 }
 
-/// What a companion waits for before it arms.
+/// Conditions that a companion waits for before it arms.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Readiness {
     checks_pass: bool,

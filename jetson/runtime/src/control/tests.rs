@@ -346,7 +346,7 @@ fn both_drivers_withhold_the_pose_alike() {
     assert!(!events.iter().any(|event| event.kind == outside), "the place is withheld");
 }
 
-/// What the simulated vehicle and its localization send up to now.
+/// Packets and poses that the simulated vehicle and its localization have sent.
 fn sent_by(simulation: &mut Simulation) -> Vec<ControlInput> {
     let (mut inputs, mut buffer) = (Vec::new(), [0; MAX_PACKET]);
     while let Some(packet) = simulation.poll_mavlink(&mut buffer) {

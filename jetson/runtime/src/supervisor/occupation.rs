@@ -69,7 +69,7 @@ impl Occupation {
             return None;
         }
         let computed_s = newest.computed_ns.saturating_sub(oldest.computed_ns) as f64 * 1e-9;
-        // What a look sees is taken to last since the look before.
+        // A state that is sampled counts for the time since the previous sample.
         let wanted_s: f64 = looks
             .windows(2)
             .filter(|pair| pair[0].wants_processor)

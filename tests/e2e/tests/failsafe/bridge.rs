@@ -14,7 +14,7 @@ const GUARDIAN: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(192, 168, 4, 2), 
 /// A bridge on a chip that has power.
 pub(crate) struct WifiBridge {
     bridge: Bridge,
-    /// It does nothing, and its network stack answers nothing.
+    /// Hung: neither the bridge nor its network stack answers.
     pub(crate) is_hung: bool,
 }
 

@@ -12,7 +12,7 @@ use crate::plugin::Deed;
 use crate::rig::{Place, Plan, Rig, Sight};
 use crate::runtime::Settings;
 
-/// What is lost.
+/// Lost program or link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Loss {
     /// The runtime is killed.
@@ -40,7 +40,7 @@ enum Loss {
 /// For ever, as far as a flight goes. [s]
 const FOR_EVER: f64 = 1e6;
 
-/// Who brings it down.
+/// Component that lands the vehicle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum By {
     /// The first LAND that reaches the autopilot is this component's.

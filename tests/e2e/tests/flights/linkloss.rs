@@ -10,7 +10,7 @@ use glam::Vec3;
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_splat::{format, ply};
 
-/// What is lost.
+/// Lost process.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Loss {
     /// The runtime is killed.
