@@ -13,6 +13,10 @@ def pytest_addoption(parser):
     parser.addoption("--wheel", help="the built wheel; without it nothing is installed")
 
 
+def pytest_configure(config):
+    config.addinivalue_line("markers", "long: whole flights that take many seconds; `tests/run` has a stage for them")
+
+
 @pytest.fixture
 def program(request):
     path = request.config.getoption("--vizflyt")

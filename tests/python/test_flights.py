@@ -37,6 +37,7 @@ def fly(program, tmp_path):
     return lambda plugin, *arguments: Flight(program, plugin, tmp_path, *arguments)
 
 
+@pytest.mark.long
 def test_avoid_crosses_the_forest(fly):
     flight = fly(PLUGINS / "avoid.py")
     assert (flight.status, flight.report["outcome"]) == (0, "finished"), flight.output
@@ -50,11 +51,13 @@ def test_hover_turns_and_lands(fly):
     assert 8 < flight.report["seconds"] < 40, flight.output
 
 
+@pytest.mark.long
 def test_waypoints_flies_its_square(fly):
     flight = fly(PLUGINS / "waypoints.py", "--scene=room")
     assert "the plugin asked to land" in flight.report["reason"], flight.output
 
 
+@pytest.mark.long
 def test_a_plugin_that_raises_ends_in_a_landing_with_its_own_line(fly, tmp_path):
     plugin = tmp_path / "raises.py"
     plugin.write_text(
@@ -77,6 +80,7 @@ def test_a_plugin_that_raises_ends_in_a_landing_with_its_own_line(fly, tmp_path)
     ), flight.output
 
 
+@pytest.mark.long
 def test_numbers_that_are_not_finite_end_in_a_landing_and_not_in_a_failure(fly, tmp_path):
     plugin = tmp_path / "nan.py"
     plugin.write_text(
@@ -99,6 +103,7 @@ def test_numbers_that_are_not_finite_end_in_a_landing_and_not_in_a_failure(fly, 
     assert "holding: " in flight.output, flight.output
 
 
+@pytest.mark.long
 def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
     others, report = set(waiting_services()), tmp_path / "report.json"
     lab = subprocess.Popen(

@@ -213,6 +213,7 @@ def test_the_lag_between_images_and_the_way_flown_is_none(graded):
     assert abs(best) <= 4, f"images are off by {best} ms"
 
 
+@pytest.mark.long
 def test_a_published_estimate_is_logged_and_graded(request, tmp_path):
     program = request.config.getoption("--vizflyt")
     if program is None:

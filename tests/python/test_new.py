@@ -61,6 +61,7 @@ def change(first, old, new):
     plugin.write_text(text.replace(old, new))
 
 
+@pytest.mark.long
 def test_a_new_plugin_is_tested_and_flies(program, first):
     subprocess.run([first / ".venv/bin/python3", "-m", "unittest"], cwd=first, check=True)
     with Flight(program, first, "--seconds=12") as flight:
@@ -69,6 +70,7 @@ def test_a_new_plugin_is_tested_and_flies(program, first):
     assert report["images_delivered"] > 10 and report["mean_speed_mps"] > 0.1, report
 
 
+@pytest.mark.long
 def test_a_file_saved_in_flight_flies_and_one_that_breaks_lands(program, first):
     with Flight(program, first, "--watch", "--seconds=60") as flight:
         flight.wait_for("plugin flies")

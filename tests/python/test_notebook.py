@@ -474,6 +474,7 @@ def run(request, tmp_path_factory):
     return Run(program, folder)
 
 
+@pytest.mark.long
 def test_the_first_hour_flies(run):
     z_m = run.number(r"at \[\S+ +\S+ +(\S+)\] m: x east")
     assert 0.9 < z_m < 1.5, run.text
@@ -482,6 +483,7 @@ def test_the_first_hour_flies(run):
     assert 4 < run.number(r"flown (\S+) m") < 15, run.text
 
 
+@pytest.mark.long
 def test_the_first_hour_shows_what_is_seen(run):
     found = [output["data"] for output in run.outputs("execute_result") if "image/png" in output["data"]]
     assert len(found) == 4
@@ -493,6 +495,7 @@ def test_the_first_hour_shows_what_is_seen(run):
     assert len(drawn) == 3
 
 
+@pytest.mark.long
 def test_the_first_hour_is_stopped_before_the_fence(run):
     y_m, inside_m = run.number(r"at y = (\S+) m"), run.number(r"(\S+) m inside of the fence")
     assert 1.5 < y_m < 2.25 - 0.12 and 0.12 < inside_m < 0.75, run.text
@@ -500,6 +503,7 @@ def test_the_first_hour_is_stopped_before_the_fence(run):
     assert "v_mps is [NaN, 0.0, 0.0]: every number must be finite" in run.text
 
 
+@pytest.mark.long
 def test_the_first_hour_ends_with_a_score(run):
     # One of two, where the renderer rounds as here; on another processor a flight may end otherwise.
     score = run.number(r"(?m)^score +(\S+) \(95 %")

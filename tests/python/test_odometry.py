@@ -358,6 +358,7 @@ def run(*command):
     return done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("plugin", "project", "level"),
     [("rgbd_odometry.py", "square", "ug"), ("inertial_odometry.py", "spiral", "g")],
