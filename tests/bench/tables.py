@@ -272,7 +272,7 @@ BY_HAND = [
     ByHand("Pose filter: outliers", "tests/pose/run target/release/examples/trajectories", "evo"),
     ByHand("RGB-D codec: captured scenes", "cargo bench -p vizflyt-rgbd --features turbo",
            "captured scenes, which are not part of the project"),
-    ByHand("Faults of the network", "VIZFLYT_FAULTS=write cargo test --release -p vizflyt-e2e --test faults",
+    ByHand("Faults of the network", "VIZFLYT_FAULTS=write cargo test --release -p vizflyt-e2e --test tables faults",
            "nothing: a test holds the file that is shown"),
     ByHand("Many watchers", "VIZFLYT_STRESS_S=600 cargo test --release -p vizflyt-server --test server viewers",
            "a long run"),

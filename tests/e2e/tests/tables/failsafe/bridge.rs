@@ -6,7 +6,7 @@ use vizflyt_bridge::{Bridge, Chip, Settings};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
-use crate::rig::Wires;
+use super::rig::Wires;
 
 /// Address of the guardian's port.
 const GUARDIAN: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(192, 168, 4, 2), 14550);

@@ -3,7 +3,7 @@
 //! The real transport of server and runtime, between a source of images without a renderer and a
 //! sink without a decoder, over a network in memory with seeded impairment. What each fault does is
 //! a table, `table.txt` beside this file; `VIZFLYT_FAULTS=write cargo test -p vizflyt-e2e
-//! --test faults` writes it anew.
+//! --test tables faults` writes it anew.
 
 mod memory;
 mod network;
@@ -60,7 +60,7 @@ fn the_table_of_faults() {
             assert!(row.newest_ms.is_some_and(|ms| ms <= 60.0), "{name}:\n{found}");
         }
     }
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/faults/table.txt");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/tables/faults/table.txt");
     if std::env::var("VIZFLYT_FAULTS").is_ok_and(|what| what == "write") {
         std::fs::write(path, &found).unwrap();
     }

@@ -11,10 +11,10 @@ use vizflyt_server::clock;
 use vizflyt_server::stream::rate_control::Adaptation;
 use vizflyt_server::stream::transport::Congestion;
 
-use crate::memory;
-use crate::network::{Impairment, Network};
-use crate::rig::{Keys, Notes, Runtime, SERVER, Server, Source};
-use crate::world::{World, lock};
+use super::memory;
+use super::network::{Impairment, Network};
+use super::rig::{Keys, Notes, Runtime, SERVER, Server, Source};
+use super::world::{World, lock};
 
 /// One case.
 #[derive(Clone)]

@@ -32,8 +32,8 @@ use vizflyt_server::stream::subscriptions::Broadcast;
 use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
-use crate::network::{Chance, Network, Socket};
-use crate::world::lock;
+use super::network::{Chance, Network, Socket};
+use super::world::lock;
 
 /// Makes a bitstream of 640x480 120 KB long. [mm]
 const DEPTH_NOISE_MM: f64 = 6.0;

@@ -22,11 +22,11 @@ use vizflyt_simulator::mocap::MocapConfig;
 use vizflyt_simulator::mocap::formats::encode_object;
 use vizflyt_simulator::simulation::{Simulation, SimulationConfig, TICK_HZ};
 
-use crate::bridge::WifiBridge;
-use crate::guardian::{Guardian, ToRuntime};
-use crate::runtime::{Runtime, Settings};
-use crate::server::Server;
-use crate::wire::Wire;
+use super::bridge::WifiBridge;
+use super::guardian::{Guardian, ToRuntime};
+use super::runtime::{Runtime, Settings};
+use super::server::Server;
+use super::wire::Wire;
 
 /// The vehicle's name in the motion capture.
 pub(crate) const OBJECT: &str = "vehicle";

@@ -8,9 +8,9 @@ use vizflyt_runtime::link::COMPONENT_ID as RUNTIME;
 use glam::DVec3;
 use vizflyt_bridge::bridge::COMPONENT_ID as BRIDGE;
 
-use crate::plugin::Deed;
-use crate::rig::{Place, Plan, Rig, Sight};
-use crate::runtime::Settings;
+use super::plugin::Deed;
+use super::rig::{Place, Plan, Rig, Sight};
+use super::runtime::Settings;
 
 /// Lost program or link.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -4,7 +4,7 @@ use vizflyt_guardian::port::Wanted;
 use vizflyt_guardian::watch::{Out, Watch};
 use vizflyt_protocol::time::HostTime;
 
-use crate::rig::{Wires, host};
+use super::rig::{Wires, host};
 
 /// Period of its clock, as in the guardian's main thread. [ns]
 const TICK_NS: i64 = 10_000_000;

@@ -10,9 +10,9 @@ use vizflyt_runtime::link::LinkSettings;
 use vizflyt_runtime::replies::RateLimiter;
 use vizflyt_runtime::stream::ServerClock;
 
-use crate::guardian::ToRuntime;
-use crate::plugin::{Deed, Output, Plugin};
-use crate::rig::{Wires, host};
+use super::guardian::ToRuntime;
+use super::plugin::{Deed, Output, Plugin};
+use super::rig::{Wires, host};
 
 /// What a flight is to be.
 #[derive(Clone, Copy, Debug)]

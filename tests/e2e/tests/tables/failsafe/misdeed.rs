@@ -3,9 +3,9 @@
 use vizflyt_protocol::messages::{EventKind, FlightPhase, OutcomeKind};
 use vizflyt_protocol::time::HostTime;
 
-use crate::plugin::Deed;
-use crate::rig::{Place, Plan, Rig};
-use crate::runtime::Settings;
+use super::plugin::Deed;
+use super::rig::{Place, Plan, Rig};
+use super::runtime::Settings;
 
 /// A misdeed, and what is to come of it.
 pub(crate) struct Case {

@@ -10,7 +10,7 @@ use vizflyt_server::poses::drivers::udp::PoseStream;
 use vizflyt_server::poses::drivers::vicon::ViconStream;
 use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 
-use crate::rig::{OBJECT, Wires, host, server};
+use super::rig::{OBJECT, Wires, host, server};
 
 /// Period of the images. [ns]
 const IMAGE_NS: i64 = 50_000_000;

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::fs;
 
-use crate::loss::Row;
+use super::loss::Row;
 
 const BEGIN: &str = "<!-- losses: begin -->\n";
 const END: &str = "<!-- losses: end -->";
@@ -27,7 +27,7 @@ pub(crate) fn check(rows: &[Row]) {
     } else {
         assert_eq!(
             found, table,
-            "the guide has other figures: VIZFLYT_FAILSAFE=write cargo test -p vizflyt-e2e --test failsafe"
+            "the guide has other figures: VIZFLYT_FAILSAFE=write cargo test -p vizflyt-e2e --test tables failsafe"
         );
     }
 }

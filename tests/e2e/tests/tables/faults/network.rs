@@ -14,7 +14,7 @@ use quinn::udp::{EcnCodepoint, RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
 use tokio::time::Instant;
 
-use crate::world::{World, lock};
+use super::world::{World, lock};
 
 /// What one direction does to packets.
 #[derive(Clone, Debug)]
