@@ -64,8 +64,10 @@ async function pickView(wanted) {
 
 /** What was chosen last; else space, where a graphics card draws it. */
 async function firstView() {
-  const chosen = VIEWS.find((name) => name === localStorage.getItem("view"));
-  pickView(chosen ?? ((await space.hasCard()) ? "space" : "top"));
+  const chosen = () => VIEWS.find((name) => name === localStorage.getItem("view"));
+  const usual = chosen() ?? ((await space.hasCard()) ? "space" : "top");
+  // A view that was picked meanwhile stays.
+  pickView(chosen() ?? usual);
 }
 for (const [k, button] of buttons.entries())
   button.addEventListener("click", () => {
