@@ -22,6 +22,8 @@ const { values: options, positionals: [vizflyt] } = parseArgs({
     real: { type: "boolean", default: false }, record: { type: "boolean", default: false },
   },
 });
+/** After a failure, a page that does not answer is given up after this. [ms] */
+const EXPLAIN_MS = 10_000;
 /** Finds barriers; run in the page. */
 const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
 const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
@@ -35,7 +37,7 @@ if (options.shots) fs.mkdirSync(options.shots, { recursive: true });
 
 /** The browser that all tests share. */
 let shared = null;
-const launch = (...args) => chromium.launch({ executablePath, args: args.length ? args : CHROMIUM_ARGS });
+const launch = (...args) => chromium.launch({ executablePath, args: args.length ? args : CHROMIUM_ARGS, timeout: PATIENCE_MS });
 after(async () => (await shared)?.close());
 
 /** One test: its folder, its processes, its pages. */
@@ -183,20 +185,25 @@ class Fixture {
     }
   }
 
-  /** Prints what the pages show, for people who look for the cause of a failure. */
+  /** Prints and returns the text and the faults of all pages: they show the cause of a failure. */
   async explain() {
+    const lines = [];
     for (const page of this.pages.filter((page) => !page.isClosed())) {
-      const shown = await page.evaluate(() => document.body.innerText).catch(String);
-      console.log(`${page.url()} reports: ${page.faults}\n  it shows: ${shown.replaceAll(/\n+/g, " | ").slice(0, 1000)}`);
-      await this.shot(page, `failed-${this.name}`);
+      const shown = await page.locator("body").innerText({ timeout: EXPLAIN_MS }).catch(String);
+      const explained = [`${page.url()} reports: ${page.faults}`, `  it shows: ${shown.replaceAll(/\n+/g, " | ").slice(0, 1000)}`];
+      console.log(explained.join("\n"));
+      lines.push(...explained);
+      await this.shot(page, `failed-${this.name}`).catch((error) => console.log(`no picture: ${error.message}`));
     }
+    return lines;
   }
 
   async close() {
     for (const page of this.pages) if (!page.isClosed()) await page.context().close();
     for (const browser of this.browsers) await browser.close();
-    this.program.kill();
-    fs.rmSync(this.scratch, { recursive: true, force: true });
+    await this.program.kill();
+    // Plugins outlive their killed program for a moment, and may still write here.
+    fs.rmSync(this.scratch, { recursive: true, force: true, maxRetries: 10, retryDelay: 100 });
   }
 }
 
@@ -259,14 +266,17 @@ class RecordedFixture extends Fixture {
 const isWanted = (name) => !options.only.length || options.only.includes(name);
 
 async function run(fixture, body) {
+  let failure = null;
   try {
     await body(fixture);
   } catch (error) {
-    await fixture.explain();
-    throw error;
-  } finally {
-    await fixture.close();
+    failure = error;
+    // The reporter lists it with the error.
+    failure.explanation = await fixture.explain();
   }
+  // An error on closing does not hide the one that came first.
+  await fixture.close().catch((error) => (failure ??= error));
+  if (failure) throw failure;
 }
 
 /** A test against the program itself. */
@@ -297,8 +307,12 @@ function recordedTest(name, { real, body, ...about }) {
 // ---- what is looked at on every page ----
 
 const text = (page, id) => page.locator(`#${id}`).innerText();
+/** Waits until an element's text matches; the error names both. */
 const until = (page, id, pattern) =>
-  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id)?.textContent ?? ""), [id, pattern.source]);
+  page.waitForFunction(([id, source]) => new RegExp(source).test(document.getElementById(id)?.textContent ?? ""), [id, pattern.source])
+    .catch((error) => {
+      throw new Error(`#${id} does not show ${pattern}: ${error.message}`, { cause: error });
+    });
 
 /** Everything that can be pressed or filled has a label, and the stop button is in sight. */
 async function checkAccess(page, size) {
@@ -345,7 +359,7 @@ async function checkBarriers(page, what) {
   assert.deepEqual(found, [], what);
 }
 
-/** Waits until a canvas shows a picture rather than one colour. */
+/** Waits until a canvas shows a picture rather than one colour; the error names the canvas. */
 const isPainted = (page, id) =>
   page.waitForFunction((id) => {
     const canvas = document.querySelector(`#${id}`);
@@ -354,7 +368,9 @@ const isPainted = (page, id) =>
     const seen = new Set();
     for (let k = 0; k < data.length; k += 404) seen.add((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
     return seen.size > 20;
-  }, id);
+  }, id).catch((error) => {
+    throw new Error(`#${id} shows no picture: ${error.message}`, { cause: error });
+  });
 
 module.exports = {
   INTO_THE_WALL, PATIENCE_MS, SIZES, checkAccess, checkBarriers, checkWidth, isPainted, options, recordedTest, resize, serverTest, text, until,

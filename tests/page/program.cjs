@@ -2,6 +2,7 @@
 
 const assert = require("node:assert/strict");
 const { spawn, spawnSync } = require("node:child_process");
+const { once } = require("node:events");
 const path = require("node:path");
 
 /** Bounds a test that fails; a passing one waits for an event. [ms] */
@@ -65,9 +66,15 @@ class Program {
     return spawnSync(this.vizflyt, args, { encoding: "utf8" });
   }
 
-  /** Kills all that still runs. */
-  kill() {
-    for (const child of this.children.splice(0)) child.kill("SIGKILL");
+  /** Kills all that still runs, and waits until it has ended. */
+  async kill() {
+    for (const child of this.children.splice(0)) {
+      // One that could not be started has no end either.
+      if (!child.pid || child.exitCode !== null || child.signalCode !== null) continue;
+      const ended = once(child, "exit");
+      child.kill("SIGKILL");
+      await ended;
+    }
   }
 }
 

@@ -96,7 +96,7 @@ class Replay {
   static async start(name, { port = 0, mark } = {}) {
     const replay = new Replay(name);
     if (mark) await replay.to(mark);
-    await new Promise((done) => replay.server.listen(port, "127.0.0.1", done));
+    await new Promise((done, fail) => replay.server.once("error", fail).listen(port, "127.0.0.1", done));
     replay.repeating = setInterval(() => replay.repeat(), STATE_EVERY_MS);
     return replay;
   }

@@ -19,14 +19,31 @@ serverTest("align", async (it) => {
     await page.waitForFunction(() => document.body.dataset.pictures > 0);
     await route.continue();
   });
+  // Counts the orders that have no answer yet: with each answer the panel is drawn anew, and a button that is down is lost.
+  await page.addInitScript(() => {
+    const { fetch } = globalThis;
+    globalThis.waiting = 0;
+    globalThis.fetch = async (...request) => {
+      if (request[1]?.method !== "POST") return fetch(...request);
+      globalThis.waiting += 1;
+      const answer = await fetch(...request), text = answer.text.bind(answer);
+      // A task of its own: what the page does with the text comes first.
+      answer.text = () => text().finally(() => setTimeout(() => (globalThis.waiting -= 1)));
+      return answer;
+    };
+  });
   await page.reload();
-  const press = (name) => page.getByRole("button", { name, exact: true }).click();
+  const settled = () => page.waitForFunction(() => globalThis.waiting === 0);
+  const press = async (name) => {
+    await settled();
+    await page.getByRole("button", { name, exact: true }).click();
+  };
   /** Clicks into a picture that shows where the camera is now; returns the server's answer. */
   const pick = async (x, y) => {
     const answer = page.waitForResponse((response) => response.url().endsWith("/pick"));
     await page.mouse.click(x, y);
     const { p_scene, ...rest } = await (await answer).json().catch(() => ({ refused: true }));
-    await page.waitForFunction(() => document.getElementById("hint").textContent !== "looking …");
+    await settled();
     return { p_scene, ...rest };
   };
   await page.waitForFunction(() => document.body.dataset.pictures > 0);
@@ -58,6 +75,7 @@ serverTest("align", async (it) => {
   await press("↶ 90°");
   await press("carry along");
   await until(page, "verdict", /GO/);
+  await settled();
   const forced = await page.locator("#force").count();
   await page.locator(forced ? "#force" : "#save").click();
   await until(page, "saved", /written .*arena.toml/);

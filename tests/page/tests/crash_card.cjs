@@ -10,6 +10,8 @@ recordedTest("crash_card", {
   real: (it) => it.raceDemo("--max-rate", "6", "--plugin", it.plugin("into-the-wall", INTO_THE_WALL)),
   async body(it) {
     const page = await it.open(it.url);
+    const loaded = new Set();
+    page.on("requestfinished", (request) => /\/crash\/.*\/(colour|depth)\/\d+$/.test(request.url()) && loaded.add(request.url()));
     await it.event("waiting", { shown: () => until(page, "phase-text", /ready to start/) });
     const region = page.locator("#crash");
     assert.ok(await region.isHidden(), "nothing has crashed yet");
@@ -62,6 +64,9 @@ recordedTest("crash_card", {
     await page.locator("#theme").click();
     await it.shot(page, "projector-crash-other-theme");
     assert.deepEqual(page.faults, []);
+    // It has fetched all of them.
+    const total = images.reduce((sum, { before_s }) => sum + 2 * before_s.length, 0);
+    while (loaded.size < total) await page.waitForEvent("requestfinished");
     await it.serverEnds(async () => assert.equal(await it.demo.ended, 1, "a collision is no success"));
     // The server is gone, and the card has its images: every one that is looked at.
     await region.getByRole("button", { name: "show depth" }).press("Enter");

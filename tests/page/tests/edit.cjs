@@ -38,6 +38,13 @@ serverTest("edit", async (it) => {
   };
   await until(page, "edit-counts", /^0 of/);
   await isPainted(page, "picture");
+  // The panel may come later than the first picture, and takes no outline before it has seen one itself.
+  await page.evaluate(async () => {
+    const { view } = await import("/view.js");
+    view.listeners.push(() => (globalThis.isSeen = true));
+    view.changed(false);
+  });
+  await page.waitForFunction(() => globalThis.isSeen);
   const [, all] = await counts();
   // Posters and boxes have it, too.
   const before = await orange(0, 0.1);

@@ -15,6 +15,17 @@ recordedTest("kept_flight", {
     await page.locator("#estop").click();
     await it.event("stopped", { shown: () => until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/) });
     await page.locator("#replay-save").waitFor();
+    // The browser keeps it a moment later: `flight_store.js`.
+    await page.waitForFunction(() => new Promise((done, fail) => {
+      const opening = indexedDB.open("vizflyt-flights");
+      opening.onerror = () => fail(opening.error);
+      opening.onsuccess = () => {
+        const counting = opening.result.transaction("flights").objectStore("flights").count();
+        counting.onsuccess = () => done(counting.result > 0);
+        counting.onerror = () => fail(counting.error);
+        opening.result.close();
+      };
+    }));
     await it.serverEnds(() => it.demo.ended);
     await it.serverReturns("waiting", (port) => it.raceDemo("--port", port));
     await page.reload();

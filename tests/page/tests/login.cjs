@@ -23,9 +23,14 @@ async function openLogin(it, url) {
   return page;
 }
 
+/** Does something after which a page loads itself again, and waits for that: until then its former self may connect, too. */
+const reloaded = (page, act) => Promise.all([page.waitForEvent("load"), act()]);
+
 async function logIn(page) {
-  await page.keyboard.type(PASSWORD);
-  await page.keyboard.press("Enter");
+  await reloaded(page, async () => {
+    await page.keyboard.type(PASSWORD);
+    await page.keyboard.press("Enter");
+  });
   await until(page, "link-text", /live/);
 }
 
@@ -50,7 +55,7 @@ serverTest("login", async (it) => {
   it.watch(window, server.http);
   await window.goto(server.http);
   await until(window, "link-text", /live/);
-  await page.locator("#logout").click();
+  await reloaded(page, () => page.locator("#logout").click());
   await until(window, "link-text", /not logged in/);
   await until(page, "link-text", /not logged in/);
   assert.equal(await pairingStatus(page), 401);

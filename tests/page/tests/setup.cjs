@@ -7,6 +7,8 @@ serverTest("camera", async (it) => {
   it.command("scene", "generate", "room", "--seed", "1", "-o", it.at("room"));
   const server = await it.serve(it.at("room"), "--leaderboard", "none", "--keys", it.at("keys"));
   const page = await it.open(server.http);
+  // The form is filled with the camera's settings first.
+  await until(page, "camera-name", /\d ×/);
   await until(page, "link-text", /live/);
   await page.locator("#setup summary").click();
   await page.locator("#camera-form [name=width_px]").fill("200");
@@ -43,10 +45,13 @@ serverTest("environment", async (it) => {
   await page.locator("#environment-choice").selectOption("night");
   await darkerThan(page, 0.6 * day);
   // A name at once, a sight with the button, and what has no field here is kept.
+  /** Waits until the server has what is expected, and the dialog shows that it has: until then it would overwrite what is typed. */
   const isNow = (...expected) =>
     page.waitForFunction(async (expected) => {
       const now = await (await fetch("/api/environment")).json();
-      return expected.every(([path, value]) => path.split(".").reduce((part, key) => part?.[key], now) === value);
+      const [choice, sight] = ["choice", "sight"].map((name) => document.getElementById(`environment-${name}`).value);
+      return choice === (now.name ?? "own") && Number(sight) === now.fog_visibility_m
+        && expected.every(([path, value]) => path.split(".").reduce((part, key) => part?.[key], now) === value);
     }, expected);
   await page.locator("#environment-choice").selectOption("night-fog");
   await isNow(["name", "night-fog"]);
