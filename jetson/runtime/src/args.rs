@@ -6,7 +6,6 @@ use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::builder::{OsStringValueParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 
 use vizflyt_protocol::messages::Limits;
@@ -161,10 +160,9 @@ impl FlyArgs {
 /// What is logged, and where.
 #[derive(Args, Clone, Debug, Default)]
 pub struct LogArgs {
-    /// Which images the flight log holds: `full` all, for a bit-exact replay; `reduced` as many as
-    /// fit into 60 MB a minute [default: `images` of [log] in jetson.toml, or else reduced]
-    #[arg(long = "log", value_name = "reduced|full",
-          value_parser = OsStringValueParser::new().map(LogOption::from))]
+    /// Images in the flight log: `reduced` as many as fit into 60 MB a minute, `full` all, for a bit-exact replay,
+    /// `none` writes no log [default: `images` of [log] in jetson.toml, or else reduced]
+    #[arg(long = "log", value_name = "reduced|full|none", hide_possible_values = true)]
     pub option: Option<LogOption>,
     /// Folder for flight logs (MCAP) [default: flights]
     #[arg(long, value_name = "DIR")]
@@ -175,28 +173,34 @@ pub struct LogArgs {
 }
 
 /// The value of `--log`.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum LogOption {
-    /// Which images.
-    Images(LoggedImages),
-    /// Any other text is a folder: so `--log DIR` was once meant.
-    Folder(PathBuf),
+    /// As many images as fit into 60 MB a minute.
+    #[default]
+    Reduced,
+    /// All images.
+    Full,
+    /// No log.
+    None,
 }
 
 impl LogOption {
-    fn text(&self) -> OsString {
+    /// Returns which images are logged; `None` without a log.
+    pub fn images(self) -> Option<LoggedImages> {
         match self {
-            Self::Images(LoggedImages::Reduced) => "reduced".into(),
-            Self::Images(LoggedImages::Full) => "full".into(),
-            Self::Folder(folder) => folder.into(),
+            Self::Reduced => Some(LoggedImages::Reduced),
+            Self::Full => Some(LoggedImages::Full),
+            Self::None => None,
         }
     }
-}
 
-impl From<OsString> for LogOption {
-    fn from(text: OsString) -> Self {
-        let images = text.to_str().and_then(|text| LoggedImages::from_str(text, false).ok());
-        images.map_or_else(|| Self::Folder(text.into()), Self::Images)
+    /// Returns the word that is typed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Reduced => "reduced",
+            Self::Full => "full",
+            Self::None => "none",
+        }
     }
 }
 
@@ -204,7 +208,7 @@ impl LogArgs {
     /// Returns the options for another `vizflyt fly` that is to log as this one does.
     pub fn to_command_line(&self) -> Vec<OsString> {
         let pairs = [
-            ("--log", self.option.as_ref().map(LogOption::text)),
+            ("--log", self.option.map(|option| option.name().into())),
             ("--log-dir", self.log_dir.clone().map(Into::into)),
         ];
         let given = pairs.into_iter().filter_map(|(name, value)| Some([name.into(), value?]));
@@ -213,29 +217,14 @@ impl LogArgs {
     }
 
     /// Returns where and how to log; options that the command line leaves out come from `config`.
-    ///
-    /// # Errors
-    /// If two folders are given.
-    pub fn settings(&self, config: &LogConfig) -> anyhow::Result<LogSettings> {
-        let (images, folder) = match &self.option {
-            None => (None, None),
-            Some(LogOption::Images(images)) => (Some(*images), None),
-            Some(LogOption::Folder(folder)) => (None, Some(folder)),
-        };
-        if let Some(folder) = folder {
-            let folder = folder.display();
-            if self.log_dir.is_some() {
-                anyhow::bail!("--log {folder}: give `reduced` or `full`; --log-dir is the folder");
-            }
-            tracing::warn!("--log {folder}: the folder's option is now --log-dir");
-        }
-        let folder = self.log_dir.as_ref().or(folder);
-        Ok(LogSettings {
-            folder: folder.cloned().unwrap_or_else(|| "flights".into()),
-            images: images.or(config.images).unwrap_or_default(),
+    pub fn settings(&self, config: &LogConfig) -> LogSettings {
+        let folder = self.log_dir.clone().unwrap_or_else(|| "flights".into());
+        LogSettings {
+            folder: (self.option != Some(LogOption::None)).then_some(folder),
+            images: self.option.and_then(LogOption::images).or(config.images).unwrap_or_default(),
             depth: self.log_depth,
             retention: config.retention(),
-        })
+        }
     }
 }
 
@@ -393,15 +382,20 @@ mod tests {
             log.settings(&JetsonConfig::parse(config).unwrap().log)
         };
         let check = |line: &[&str], config: &str, folder: &str, images| {
-            let found = settle(line, config).unwrap();
-            assert_eq!((found.folder, found.images), (folder.into(), images), "{line:?}");
+            let found = settle(line, config);
+            assert_eq!((found.folder, found.images), (Some(folder.into()), images), "{line:?}");
         };
         let full = "[log]\nimages = \"full\"\n";
         check(&[], "", "flights", LoggedImages::Reduced);
         check(&[], full, "flights", LoggedImages::Full);
         check(&["--log=full"], "", "flights", LoggedImages::Full);
         check(&["--log", "reduced", "--log-dir=d"], full, "d", LoggedImages::Reduced);
-        check(&["--log=some/folder"], full, "some/folder", LoggedImages::Full);
+        assert_eq!(settle(&["--log=none", "--log-dir=d"], full).folder, None);
+        // Neither a typing error nor a folder is taken for one of them.
+        for wrong in ["--log=nnoe", "--log=some/folder"] {
+            let error = Program::try_parse_from(["fly", "x", wrong]).err().unwrap().to_string();
+            assert!(error.contains("[possible values: reduced, full, none]"), "{error}");
+        }
         // A child with the same options does the same.
         let line = ["fly", "x", "--log=full", "--log-dir=d"];
         let args = Program::try_parse_from(line).unwrap().fly.log;
@@ -409,8 +403,6 @@ mod tests {
         let args = Program::try_parse_from(["fly", "x", "--log-depth"]).unwrap().fly.log;
         assert_eq!(args.to_command_line(), ["--log-depth"]);
         assert!(LogArgs::default().to_command_line().is_empty());
-        let error = settle(&["--log=a", "--log-dir=b"], "").unwrap_err().to_string();
-        assert!(error.contains("--log a: give `reduced` or `full`"), "{error}");
     }
 
     #[test]

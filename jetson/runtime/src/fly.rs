@@ -76,7 +76,7 @@ pub fn fly_command(
     let guardian = Arc::new(guardian);
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
-    let log = FlightLog::open(&args.log.settings(&args.jetson.log)?, live);
+    let log = FlightLog::open(&args.log.settings(&args.jetson.log), live);
     log.flight(&args.plugin.clone().unwrap_or_default(), &args.plugin_arguments);
     let (sender, inputs) = sync_channel(QUEUE);
     let stop = Arc::new(AtomicBool::new(false));

@@ -5,8 +5,8 @@ use std::num::NonZero;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::{Args, Subcommand, ValueEnum};
-use vizflyt_runtime::log::LoggedImages;
+use clap::{Args, Subcommand};
+use vizflyt_runtime::args::LogOption;
 use vizflyt_scenes::projects::{self, Level};
 use vizflyt_scenes::{Variant, VariantChoice};
 use vizflyt_simulator::imu::ImuModel;
@@ -110,7 +110,7 @@ pub(super) struct FlyArgs {
         default_value_t,
         hide_possible_values = true
     )]
-    pub(super) log: GradeLog,
+    pub(super) log: LogOption,
     /// Writes depth into them a second time so that any viewer shows it (16UC1)
     #[arg(long, requires = "report")]
     pub(super) log_depth: bool,
@@ -148,33 +148,6 @@ impl FromStr for FirstSeed {
         // What it holds is a secret, whatever it is.
         let value = number(&held).map_err(|_| format!("{path} holds no seed; {advice}"))?;
         Ok(Self { value, file: Some(path.into()) })
-    }
-}
-
-/// What a report holds of flight logs.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum GradeLog {
-    #[default]
-    Reduced,
-    Full,
-    None,
-}
-
-impl GradeLog {
-    pub(super) fn images(self) -> Option<LoggedImages> {
-        match self {
-            Self::Reduced => Some(LoggedImages::Reduced),
-            Self::Full => Some(LoggedImages::Full),
-            Self::None => None,
-        }
-    }
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Self::Reduced => "reduced",
-            Self::Full => "full",
-            Self::None => "none",
-        }
     }
 }
 

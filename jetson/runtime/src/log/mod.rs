@@ -35,6 +35,7 @@ mod writer;
 
 use std::ffi::OsString;
 use std::fs::{File, create_dir_all};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -93,8 +94,8 @@ pub enum LoggedImages {
 /// Where flights are logged, and how much of them.
 #[derive(Clone, Debug)]
 pub struct LogSettings {
-    /// The folder.
-    pub folder: PathBuf,
+    /// The folder; without one, only live viewers see the log.
+    pub folder: Option<PathBuf>,
     /// Which images are kept.
     pub images: LoggedImages,
     /// Whether depth is also written so that any viewer shows it.
@@ -107,8 +108,17 @@ impl LogSettings {
     /// Keeps every image and every log of `folder`.
     pub fn full(folder: impl Into<PathBuf>) -> Self {
         let (images, retention) = (LoggedImages::Full, Retention::FOREVER);
-        Self { folder: folder.into(), images, depth: false, retention }
+        Self { folder: Some(folder.into()), images, depth: false, retention }
     }
+}
+
+/// Makes the folder and the file of a log. Returns the file twice: to ask how much room is left, and to write to.
+fn open_file(folder: &Path, path: &Path) -> io::Result<(File, RealFile)> {
+    create_dir_all(folder)?;
+    let file = File::create(path)?;
+    // Where the file system knows no locks, being the newest protects it.
+    let _ = file.try_lock();
+    Ok((file.try_clone()?, RealFile::new(file)?))
 }
 
 /// The log of one flight. Cheap to call from the control loop; dropping it closes the file.
@@ -125,31 +135,33 @@ impl FlightLog {
     pub fn open(settings: &LogSettings, live: Option<Live>) -> Self {
         let LogSettings { folder, images, depth, retention } = settings;
         let now = SystemTime::now();
-        let path = folder.join(format!("{}.mcap", utc_name(now)));
-        let file = create_dir_all(folder).and_then(|()| File::create(&path));
-        let file = file.inspect(|file| {
-            // Where the file system knows no locks, being the newest protects it.
-            let _ = file.try_lock();
+        let file = folder.as_deref().and_then(|folder| {
+            let path = folder.join(format!("{}.mcap", utc_name(now)));
+            let warn =
+                |error: &io::Error| tracing::warn!("no flight log: {}: {error}", path.display());
+            let (probe, file) = open_file(folder, &path).inspect_err(warn).ok()?;
+            Some((path, probe, file))
         });
-        let file = file.and_then(|file| Ok((file.try_clone()?, RealFile::new(file)?)));
-        let disk = file.inspect_err(|error| {
-            tracing::warn!("no flight log: {}: {error}", path.display());
-        });
-        if disk.is_err() && live.is_none() {
-            return Self { queue: None, writer: None, path: None };
+        let none = Self { queue: None, writer: None, path: None };
+        if file.is_none() && live.is_none() {
+            return none;
         }
-        let path = disk.is_ok().then(|| path.clone());
-        let (probe, disk) = disk.ok().unzip();
+        let (path, probe, disk) = match file {
+            Some((path, probe, disk)) => (Some(path), Some(probe), Some(disk)),
+            None => (None, None, None),
+        };
         match Self::start(disk, probe, live, *images, *depth) {
             Ok((queue, writer)) => {
                 // Nothing to delete from a folder that cannot be listed.
-                let deleted = retention::delete_old(folder, *retention, now).unwrap_or_default();
+                let deleted =
+                    folder.as_deref().map(|folder| retention::delete_old(folder, *retention, now));
+                let deleted = deleted.and_then(Result::ok).unwrap_or_default();
                 deleted.sentence(*retention).into_iter().for_each(|text| queue.complain(text));
                 Self { queue: Some(queue), writer: Some(writer), path }
             }
             Err(error) => {
-                tracing::warn!("no flight log: {}: {error}", folder.display());
-                Self { queue: None, writer: None, path: None }
+                tracing::warn!("no flight log: {error}");
+                none
             }
         }
     }
