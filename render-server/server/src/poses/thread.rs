@@ -228,6 +228,7 @@ struct VehicleWatch {
     event: u64,
     rejected: u64,
     margins: MarginWatch,
+    outliers: OutlierCount,
     warned: Option<(Instant, std::mem::Discriminant<Rejected>)>,
 }
 
@@ -240,6 +241,9 @@ impl VehicleWatch {
     /// Counts a rejected measurement, and warns of it at a bounded rate.
     fn reject(&mut self, vehicle: &VehicleFlight, source: Option<&String>, reason: Rejected) {
         self.rejected += 1;
+        if matches!(reason, Rejected::Outlier(_)) && !self.outliers.add(Instant::now()) {
+            return;
+        }
         // Another kind of rejection than the last one is warned of sooner.
         let kind = std::mem::discriminant(&reason);
         let repeated =
@@ -255,6 +259,26 @@ impl VehicleWatch {
     }
 }
 
+/// Outliers within [`WARN_EVERY`] of the first of them.
+#[derive(Debug, Default)]
+struct OutlierCount {
+    since: Option<Instant>,
+    count: u32,
+}
+
+impl OutlierCount {
+    /// Counts an outlier at `now`; returns whether there are more than a touch-down or a bump makes.
+    fn add(&mut self, now: Instant) -> bool {
+        if self.since.is_none_or(|since| now.duration_since(since) > WARN_EVERY) {
+            (self.since, self.count) = (Some(now), 0);
+        }
+        self.count += 1;
+        self.count > USUAL_OUTLIERS
+    }
+}
+
+/// A hard motion begins with so many at most: the next measurement shows that it goes on.
+const USUAL_OUTLIERS: u32 = 2;
 /// How long a stop may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
 /// The period of a repeated warning: a bad source sends 200 packets a second.
@@ -263,3 +287,17 @@ const WARN_EVERY: Duration = Duration::from_secs(5);
 const WARN_APART: Duration = Duration::from_secs(1);
 /// The period at which the localization's quality is published.
 const QUALITY_EVERY: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_touch_down_is_no_reason_to_warn_and_a_bad_source_is() {
+        let (mut outliers, start) = (OutlierCount::default(), Instant::now());
+        let mut add = |after_s| outliers.add(start + Duration::from_secs_f64(after_s));
+        assert_eq!([0.0, 0.01].map(&mut add), [false; 2]);
+        // The next landing, and then one that lasts.
+        assert_eq!([9.0, 9.01, 9.02, 9.5].map(&mut add), [false, false, true, true]);
+    }
+}

@@ -237,6 +237,8 @@ fn the_stop_button_lands_the_vehicle() {
     let report = file.read();
     assert_eq!(report["outcome"], "landed", "{report:#}");
     assert!(report["reason"].as_str().unwrap().contains("stop"), "{report:#}");
+    // The touch-down is a motion, and no fault of the localization.
+    assert!(!demo.seen.iter().any(|line| line.contains("an outlier")), "{:#?}", demo.seen);
 }
 
 #[test]
