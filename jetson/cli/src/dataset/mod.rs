@@ -32,7 +32,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
-use clap::Args;
+use clap::{ArgGroup, Args};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use vizflyt_protocol::geometry::Intrinsics;
@@ -62,8 +62,9 @@ use crate::terminal::print_fmt;
   vizflyt dataset --project p3 --images 9000 --shard 1/3 -o part              a third; run again, it goes on
 
 What each layer and file holds is in docs/guides/datasets.md.")]
+#[command(group = ArgGroup::new("world").args(["project", "scene"]).required(true))]
 pub(crate) struct DatasetArgs {
-    #[arg(long, value_name = "NAME", conflicts_with = "scene", required_unless_present = "scene", help = format!(
+    #[arg(long, value_name = "NAME", help = format!(
         "Generated courses of this project: {}", projects::NAMES.join(", ")
     ))]
     project: Option<String>,

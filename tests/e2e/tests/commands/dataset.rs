@@ -164,7 +164,7 @@ fn what_is_wrong_is_told() {
     fs::write(&how, "[fog]\nprobability = 2\n").unwrap();
     refused(&["--randomize", &how], &["how.toml", "fog.probability = 2"]);
     check_refused(&["dataset", "--project", "p9", "-o", &out], &["no project 'p9'"]);
-    check_refused(&["dataset", "-o", &out], &["--project"]);
+    check_refused(&["dataset", "-o", &out], &["--project <NAME>|--scene <PATH>"]);
     good(&["dataset", "--project", "p3", "-o", &rig.at("set"), "--images", "2", "--size", "32x24"]);
     let again =
         ["dataset", "--project", "p3", "-o", &rig.at("set"), "--images", "3", "--size", "32x24"];
