@@ -1,4 +1,4 @@
-//! Who wants images at this moment, and the vehicle out to them.
+//! Who wants images at this moment, and the way out to them.
 //!
 //! A vehicle's images go to its runtime and to any number of watchers, at most [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS).
 //! For each camera at most K images may be in flight to each of them (handed to the transport, not
@@ -41,7 +41,7 @@ impl Wanted {
     }
 }
 
-/// Demand and vehicle out; shared by the render, encode and transport sides.
+/// Demand, and the way out; shared by the render, encode and transport sides.
 #[derive(Debug)]
 pub struct Subscriptions {
     state: Mutex<State>,
@@ -84,7 +84,7 @@ struct CameraSlots {
 /// The places of a subscriber's images, by camera, [`MAX_IN_FLIGHT`] of each.
 pub type Slots = Vec<Vec<Arc<InFlightImage>>>;
 
-/// An image on its vehicle to all who had room when it began. Reused from image to image.
+/// An image on its way to all who had room when it began. Reused from image to image.
 #[derive(Debug, Default)]
 pub struct Broadcast {
     vehicle: usize,
