@@ -71,6 +71,54 @@ pub fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).expect("tests/e2e").to_owned()
 }
 
+/// The parameters of `hardware/airframe` that say what the autopilot does by itself when something is lost, and how fast
+/// it flies: the runtime cannot act for an autopilot that does not receive it.
+const FAILSAFE_PARAMETERS: [&str; 26] = [
+    "FS_GCS_ENABLE",
+    "FS_GCS_TIMEOUT",
+    "FS_THR_ENABLE",
+    "FS_EKF_ACTION",
+    "FS_CRASH_CHECK",
+    "FS_OPTIONS",
+    "GUID_TIMEOUT",
+    "FENCE_ENABLE",
+    "FENCE_TYPE",
+    "FENCE_ACTION",
+    "FENCE_ALT_MAX",
+    "FENCE_RADIUS",
+    "BATT_MONITOR",
+    "BATT_LOW_VOLT",
+    "BATT_FS_LOW_ACT",
+    "WP_SPD",
+    "WP_SPD_UP",
+    "WP_SPD_DN",
+    "WP_ACC",
+    "WP_ACC_Z",
+    "PSC_JERK_NE",
+    "PSC_JERK_D",
+    "WP_YAW_BEHAVIOR",
+    "LAND_SPD_MS",
+    "LAND_SPD_HIGH_MS",
+    "LAND_ALT_LOW_M",
+];
+
+/// Returns the names and values of [`FAILSAFE_PARAMETERS`], as the files in `hardware/airframe` have them.
+///
+/// # Panics
+/// If a file lacks one of them.
+pub fn airframe_parameters() -> Vec<(String, f32)> {
+    let path = root().join("hardware/airframe/whippet-copter-4.8.param");
+    let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
+    let values: Vec<_> = text
+        .lines()
+        .filter_map(|line| line.split_once(','))
+        .filter(|(name, _)| FAILSAFE_PARAMETERS.contains(name))
+        .map(|(name, value)| (name.to_owned(), value.trim().parse().expect("a number")))
+        .collect();
+    assert_eq!(values.len(), FAILSAFE_PARAMETERS.len(), "hardware/airframe lacks one of them");
+    values
+}
+
 /// How often a flight's images are drawn, unless a test is about rates: what runs aside gets its time. [Hz]
 const MAX_RATE_HZ: f64 = 40.0;
 

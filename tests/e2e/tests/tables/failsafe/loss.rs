@@ -226,36 +226,6 @@ pub(crate) struct Run {
     seed: u64,
 }
 
-/// Parameters of the vehicle that are flown with as `hardware/airframe` has them: the runtime cannot act
-/// for an autopilot that does not receive it.
-const PARAMETERS: [&str; 26] = [
-    "FS_GCS_ENABLE",
-    "FS_GCS_TIMEOUT",
-    "FS_THR_ENABLE",
-    "FS_EKF_ACTION",
-    "FS_CRASH_CHECK",
-    "FS_OPTIONS",
-    "GUID_TIMEOUT",
-    "FENCE_ENABLE",
-    "FENCE_TYPE",
-    "FENCE_ACTION",
-    "FENCE_ALT_MAX",
-    "FENCE_RADIUS",
-    "BATT_MONITOR",
-    "BATT_LOW_VOLT",
-    "BATT_FS_LOW_ACT",
-    "WP_SPD",
-    "WP_SPD_UP",
-    "WP_SPD_DN",
-    "WP_ACC",
-    "WP_ACC_Z",
-    "PSC_JERK_NE",
-    "PSC_JERK_D",
-    "WP_YAW_BEHAVIOR",
-    "LAND_SPD_MS",
-    "LAND_SPD_HIGH_MS",
-    "LAND_ALT_LOW_M",
-];
 /// Down means this near the floor. [m]
 const DOWN_M: f64 = 0.05;
 /// How long a vehicle that shall fly on is watched after the loss is over. [s]
@@ -295,20 +265,6 @@ pub(crate) fn runs() -> Vec<Run> {
     let at_one = AT_ONE_SPEED.iter().map(|case| (case, SPEEDS_MPS[0]));
     let seeded = |(seed, (case, speed_mps))| Run { case, speed_mps, seed };
     (1..).zip(at_all.chain(at_one)).map(seeded).collect()
-}
-
-/// Returns parameters of a vehicle that is set up by the files in `hardware/airframe`.
-pub(crate) fn parameters() -> Vec<(String, f32)> {
-    let path = vizflyt_e2e::root().join("hardware/airframe/whippet-copter-4.8.param");
-    let text = std::fs::read_to_string(path).expect("the vehicle's parameters are there");
-    let values: Vec<_> = text
-        .lines()
-        .filter_map(|line| line.split_once(','))
-        .filter(|(name, _)| PARAMETERS.contains(name))
-        .map(|(name, value)| (name.to_owned(), value.trim().parse().expect("a number")))
-        .collect();
-    assert_eq!(values.len(), PARAMETERS.len(), "hardware/airframe lacks one of {PARAMETERS:?}");
-    values
 }
 
 /// Flies a run: strikes a vehicle that flies at its speed, and watches the rest of the flight.

@@ -28,7 +28,7 @@ fn vehicle_lands_in_time_or_flies_on_after_any_loss() {
         // No goal is reached.
         arena.goal.as_mut().expect("the room has a goal").radius_m = 0.01;
     });
-    let params = loss::parameters();
+    let params = vizflyt_e2e::airframe_parameters();
     let rows = twice(&loss::runs(), |run| {
         let row = loss::fly(&place, &params, *run);
         (row.hash, row)
