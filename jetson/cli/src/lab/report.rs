@@ -217,7 +217,7 @@ impl Report {
             setpoints = self.setpoints_sent,
             packets = self.mavlink_packets,
             memory = self.peak_rss_mb,
-            log = self.log,
+            log = if self.log.is_empty() { "none" } else { &self.log },
         )
     }
 }
