@@ -7,7 +7,7 @@ const fs = require("node:fs");
 const path = require("node:path");
 const test = require("node:test");
 
-const source = fs.readFileSync(path.join(__dirname, "../../render-server/server/src/web/view/page/course_items.js"));
+const source = fs.readFileSync(path.join(__dirname, "../../render-server/server/src/web/editors/page/course_items.js"));
 const module_ = import(`data:text/javascript;base64,${source.toString("base64")}`);
 
 function course() {

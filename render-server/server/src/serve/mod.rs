@@ -39,9 +39,9 @@ use crate::render::{RendererInfo, Rendering};
 use crate::scene::Scenes;
 use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
-use crate::web::messages::Rates;
+
 use crate::web::previews::Previews;
-use crate::web::{self, Access, Lab, Logins, Page, PageTls, TwinPictures};
+use crate::web::{self, Access, Lab, Logins, Page, PageTls, Rates, TwinPictures};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///

@@ -1,36 +1,27 @@
-//! Who may see and do what on the page. Every request passes here before its route.
+//! Who looks at the page: the instructor, or a team, by address, password or key.
 //!
 //! Loopback is the instructor's own computer and needs no login, unless `--login always` asks for
-//! one there too. Everyone else logs in with the password ([`super::login`]) and is the instructor,
+//! one there too. Everyone else logs in with the password ([`super::password`]) and is the instructor,
 //! or shows a key, once, by opening `/enter?key=...`, and has it in a cookie from then on. Who shows
 //! a session or a key is judged by it, wherever it comes from. The instructor's key opens
 //! everything, a vehicle's key that vehicle's page and stop button. What each route takes is stated
-//! where it is made ([`super::routes`]); one that nobody thought of is the instructor's.
+//! where it is made ([`super::routes`]), and checked by [`super::guard`].
 //!
 //! What changes something also takes the token that belongs to the cookie, which no other site's
 //! page can read; all but the stop button, which must work whatever state a page is in.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fmt::Write;
-use std::net::{IpAddr, SocketAddr};
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use axum::body::{HttpBody, to_bytes};
-use axum::extract::{ConnectInfo, MatchedPath, Query, Request, State};
-use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
-use axum::middleware::Next;
-use axum::response::{IntoResponse, Response};
+use axum::http::{HeaderMap, header};
 use serde::{Deserialize, Serialize};
 use tokio::sync::Semaphore;
-use tokio::time::timeout;
-use tracing::warn;
 use vizflyt_trust::{Fingerprint, KeyError, KeysFolder, secret};
 
-use super::listener::ConnectionPlace;
-use super::routes::{Rights, Rule};
+use super::password;
 use super::sessions::{Sessions, Tokens};
-use super::{Page, login, origin, refuse};
 use crate::lock::lock;
 use crate::rate_limit::RateLimiter;
 
@@ -212,10 +203,15 @@ impl Access {
         &self.keys
     }
 
+    /// Returns whom a key lets in; `None` if it is wrong.
+    pub(super) fn viewer_of(&self, key: &str) -> Option<&Viewer> {
+        self.keys.viewer(key)
+    }
+
     /// Returns who asks; `None` for a stranger.
     pub(super) fn judge(&self, from: IpAddr, headers: &HeaderMap) -> Option<Shown> {
         if let Some(session) = cookie(headers, SESSION) {
-            let password = self.folder.stamp(login::FILE);
+            let password = self.folder.stamp(password::FILE);
             if lock(&self.logins.sessions).is_live(Instant::now(), password, session) {
                 let session = Some(session.to_owned());
                 return Some(Shown { viewer: Viewer::Instructor, session, key: None });
@@ -245,7 +241,7 @@ impl Access {
     /// Whether what was shown still counts: a session may have ended meanwhile.
     pub(super) fn holds(&self, shown: &Shown) -> bool {
         shown.session.as_ref().is_none_or(|session| {
-            let password = self.folder.stamp(login::FILE);
+            let password = self.folder.stamp(password::FILE);
             lock(&self.logins.sessions).is_live(Instant::now(), password, session)
         })
     }
@@ -257,173 +253,11 @@ impl Access {
     }
 
     /// Whether the request bears the token that goes with what was shown.
-    fn has_token(&self, shown: &Shown, headers: &HeaderMap) -> bool {
+    pub(super) fn has_token(&self, shown: &Shown, headers: &HeaderMap) -> bool {
         let Some(cookie) = shown.session.as_ref().or(shown.key.as_ref()) else { return true };
         let token = headers.get(TOKEN).and_then(|token| token.to_str().ok());
         token.is_some_and(|token| self.logins.tokens.fits(cookie, token))
     }
-}
-
-/// What a route takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Takes {
-    /// Nothing: the page's own files, which hold no secret.
-    Nothing,
-    /// Any key or login.
-    Key,
-    /// The right to a vehicle: the one that the path names as `{vehicle}`, else the query.
-    Vehicle,
-    /// The right to all vehicles: the instructor's.
-    Everything,
-}
-
-/// What a request takes.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Need {
-    Nothing,
-    Key,
-    /// This vehicle.
-    Vehicle(String),
-    Everything,
-}
-
-impl Need {
-    /// Returns what a request takes whose route is `path`, with `{vehicle}` where a name stands.
-    fn of(takes: Takes, path: &str, uri: &Uri) -> Self {
-        match takes {
-            Takes::Nothing => Self::Nothing,
-            Takes::Key => Self::Key,
-            Takes::Everything => Self::Everything,
-            Takes::Vehicle => {
-                let name = match path.split('/').position(|part| part == "{vehicle}") {
-                    Some(at) => uri.path().split('/').nth(at).and_then(decoded),
-                    None => asked(uri),
-                };
-                name.map_or(Self::Everything, Self::Vehicle)
-            }
-        }
-    }
-
-    fn is_met_by(&self, viewer: &Viewer) -> bool {
-        match (self, viewer) {
-            (Self::Nothing | Self::Key, _) | (_, Viewer::Instructor) => true,
-            (Self::Vehicle(name), viewer) => viewer.may_see(name),
-            (Self::Everything, Viewer::Team(_)) => false,
-        }
-    }
-}
-
-/// Lets a request through to its route, or answers it.
-pub(super) async fn guard(
-    State((page, rights)): State<(Arc<Page>, Arc<Rights>)>,
-    ConnectInfo(from): ConnectInfo<SocketAddr>,
-    mut request: Request,
-    next: Next,
-) -> Response {
-    // This connection outlived its round: the next one of the same browser meets the new round.
-    if page.rooms.stop.is_set() {
-        let close = [(header::CONNECTION, "close")];
-        return (StatusCode::SERVICE_UNAVAILABLE, close, "the server ends or changes its scene")
-            .into_response();
-    }
-    let path = request.extensions().get::<MatchedPath>().map_or("", MatchedPath::as_str);
-    let method = if request.method() == Method::HEAD { &Method::GET } else { request.method() };
-    let rule = rights.of(method, path);
-    let need = Need::of(rule.takes, path, request.uri());
-    if need == Need::Nothing {
-        return run(request, None, next).await;
-    }
-    // Reading too: a stranger's name that resolves to us would read as loopback.
-    if let Err(refusal) = origin::check_host(request.headers()) {
-        return refuse(&refusal);
-    }
-    match page.access.judge(from.ip(), request.headers()) {
-        Some(shown) if !need.is_met_by(&shown.viewer) => {
-            (StatusCode::FORBIDDEN, "this key is for another vehicle").into_response()
-        }
-        Some(shown) if rule.token && !page.access.has_token(&shown, request.headers()) => {
-            (StatusCode::FORBIDDEN, NO_TOKEN).into_response()
-        }
-        Some(shown) => {
-            let viewer = shown.viewer.clone();
-            request.extensions_mut().insert(viewer.clone());
-            request.extensions_mut().insert(shown);
-            run(request, Some(&viewer), next).await
-        }
-        None => (StatusCode::UNAUTHORIZED, NO_KEY).into_response(),
-    }
-}
-
-/// Reads the rest of a request and hands it to its route. Until its body is here the connection keeps the
-/// place of whoever waits; a client that dawdles holds nobody up.
-async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response {
-    let place = request.extensions().get::<ConnectionPlace>().cloned();
-    let (parts, mut body) = request.into_parts();
-    if !body.is_end_stream() {
-        body = match timeout(BODY_WITHIN, to_bytes(body, MAX_BODY)).await {
-            Ok(Ok(bytes)) => bytes.into(),
-            // Too long, or the client has gone and hears nothing of it.
-            Ok(Err(_)) => return (StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE).into_response(),
-            Err(_) => {
-                let close = [(header::CONNECTION, "close")];
-                return (StatusCode::REQUEST_TIMEOUT, close, TOO_SLOW).into_response();
-            }
-        };
-    }
-    if let Some(place) = &place {
-        place.serve(viewer);
-    }
-    let response = next.run(Request::from_parts(parts, body)).await;
-    if let Some(place) = &place {
-        place.wait();
-    }
-    response
-}
-
-impl Rule {
-    /// What is not thought of is the instructor's.
-    pub(super) const STRICTEST: Self = Self { takes: Takes::Everything, token: true };
-}
-
-/// What `/enter` is asked with.
-#[derive(Debug, Deserialize)]
-pub(super) struct Entering {
-    #[serde(default)]
-    key: String,
-}
-
-/// Exchanges a key for a cookie. Any page can send a browser here, so nothing that the browser had is lost: a
-/// wrong key changes nothing, and a team's has a cookie of its own beside the instructor's.
-pub(super) async fn enter(
-    State(page): State<Arc<Page>>,
-    Query(entering): Query<Entering>,
-    headers: HeaderMap,
-) -> Response {
-    if let Err(refusal) = origin::check_navigation(&headers) {
-        return refuse(&refusal);
-    }
-    let (name, to) = match page.access.keys.viewer(&entering.key) {
-        Some(Viewer::Instructor) => (KEY, "/".to_owned()),
-        Some(Viewer::Team(name)) => (TEAM_KEY, format!("/?vehicle={}", encoded(name))),
-        None => {
-            warn!("page: somebody came with a wrong key");
-            let no_store = [(header::CACHE_CONTROL, "no-store")];
-            return (StatusCode::UNAUTHORIZED, no_store, NO_KEY).into_response();
-        }
-    };
-    let cookie = cookie_line(name, &entering.key, Some(COOKIE_S), &headers);
-    let mut response = StatusCode::SEE_OTHER.into_response();
-    let headers = response.headers_mut();
-    for (name, value) in [(header::SET_COOKIE, cookie), (header::LOCATION, to)] {
-        if let Ok(value) = HeaderValue::from_str(&value)
-            && !value.is_empty()
-        {
-            headers.insert(name, value);
-        }
-    }
-    headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
-    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    response
 }
 
 /// Returns the line that sets a cookie: out of reach of scripts, and never sent along by another
@@ -453,48 +287,8 @@ pub(super) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str
     pairs.next()
 }
 
-/// Returns the one vehicle that the query names; `None` without, or with several.
-fn asked(uri: &Uri) -> Option<String> {
-    let pairs = uri.query()?.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, "")));
-    // A key that needs decoding might be read as `vehicle` by the route: not taken for granted.
-    let mut names = None;
-    for (key, value) in pairs {
-        match key {
-            "vehicle" if names.is_none() => names = Some(value),
-            key if key == "vehicle" || key.contains('%') => return None,
-            _ => {}
-        }
-    }
-    decoded(&names?.replace('+', " "))
-}
-
-/// Undoes percent-encoding (RFC 3986, section 2.1); `None` if it is none.
-fn decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.bytes();
-    while let Some(byte) = rest.next() {
-        if byte != b'%' {
-            bytes.push(byte);
-            continue;
-        }
-        let digit = |byte: Option<u8>| char::from(byte?).to_digit(16);
-        bytes.push((digit(rest.next())? * 16 + digit(rest.next())?) as u8);
-    }
-    String::from_utf8(bytes).ok()
-}
-
-fn encoded(text: &str) -> String {
-    text.bytes().fold(String::new(), |mut out, byte| {
-        if byte.is_ascii_alphanumeric() || b"-._~".contains(&byte) {
-            out.push(char::from(byte));
-        } else {
-            // Why: writing to a String cannot fail.
-            let _ = write!(out, "%{byte:02X}");
-        }
-        out
-    })
-}
-
+pub(super) const NO_KEY: &str = "this page needs a key: open the address that the instructor gave you, which ends in \
+     /enter?key=..., or log in with the instructor's password";
 const FILE: &str = "page-keys.toml";
 const HEAD: &str = "\
 # Keys of the server's page: whoever has one opens it by http://SERVER/enter?key=KEY. Remove a line and start
@@ -510,17 +304,6 @@ pub(super) const SESSION: &str = "vizflyt_session";
 pub(super) const FORWARDED_PROTO: &str = "x-forwarded-proto";
 /// The header that bears the token.
 const TOKEN: &str = "x-vizflyt-token";
-/// A term. [s]
-const COOKIE_S: u32 = 180 * 24 * 3600;
-const NO_KEY: &str = "this page needs a key: open the address that the instructor gave you, which ends in \
-     /enter?key=..., or log in with the instructor's password";
-const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session has it, or reload the page";
-const TOO_LARGE: &str = "length limit: a request has 16 KB at most";
-const TOO_SLOW: &str = "the request's body did not come within 5 s";
-/// A camera takes some hundred bytes. [bytes]
-pub(super) const MAX_BODY: usize = 16 << 10;
-/// A body of a few packets, over a bad link.
-const BODY_WITHIN: Duration = Duration::from_secs(5);
 /// More logins at once are nobody's.
 const MAX_WAITING: usize = 8;
 /// 80 bits, should somebody write one by hand.

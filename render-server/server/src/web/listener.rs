@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! accept -> place of a stranger: the newest gets one, the longest waiting of its address gives way
-//!        -> TLS, if set -> a head within 15 s -> access::guard: a body within 5 s, and who it is
+//!        -> TLS, if set -> a head within 15 s -> guard: a body within 5 s, and who it is
 //!        -> place of a team or an instructor, which no stranger can take
 //! ```
 

@@ -11,8 +11,9 @@ use vizflyt_protocol::geometry::{Intrinsics, Volume, yaw_of};
 use vizflyt_protocol::messages::{Event, FlightPhase, OutcomeKind, StageTimes, Telemetry};
 use vizflyt_protocol::time::ServerTime;
 
-use super::Page;
 use super::access::Viewer;
+use super::state::Page;
+use super::top_view::Obstacles;
 use crate::clock;
 use crate::flights::events::{Entry, Origin};
 use crate::flights::vehicle::{Flight, VehicleFlight};
@@ -22,8 +23,6 @@ use crate::render::RendererInfo;
 use crate::render::cameras::CameraSet;
 use crate::render::dynamic_objects::{DynamicObjects, ObjectBounds};
 use crate::stream::Rooms;
-use crate::timing::RateMeter;
-use crate::web::top_view::Obstacles;
 
 /// Server to page.
 #[derive(Debug, Serialize)]
@@ -169,29 +168,6 @@ struct PoseLine {
 struct RuntimeLine {
     address: String,
     program: String,
-}
-
-/// Rates that all viewers share.
-#[derive(Debug, Default)]
-pub(crate) struct Rates {
-    ticks: RateMeter,
-    vehicles: Vec<VehicleRates>,
-}
-
-/// Rates of one vehicle.
-#[derive(Debug, Default)]
-struct VehicleRates {
-    images: RateMeter,
-    bytes: RateMeter,
-    poses: RateMeter,
-}
-
-impl Rates {
-    /// Returns those of this many vehicles.
-    pub(crate) fn of(vehicles: usize) -> Self {
-        let vehicles = std::iter::repeat_with(VehicleRates::default).take(vehicles).collect();
-        Self { ticks: RateMeter::default(), vehicles }
-    }
 }
 
 pub(super) fn arena<'a>(page: &'a Page, vehicle: &'a VehicleFlight) -> Message<'a> {

@@ -1,7 +1,6 @@
 //! Every route of the page in one table: it makes the router, and states what each request takes.
 //! What is not in it is the instructor's, and answered with 404 or 405.
 
-use std::collections::HashMap;
 use std::sync::Arc;
 
 use axum::Router;
@@ -11,12 +10,13 @@ use axum::http::Method;
 use axum::middleware;
 use axum::routing::{MethodRouter, delete, get, patch, post, put};
 
-use super::Page;
-use super::access::{self, Takes};
-use super::{
-    cameras, crash, environment, file, lab, leaderboard, login, map, pairing, scenes, sensors,
-    shell, stats, twin, twin_picture, vehicles, watch,
+use super::api::{
+    cameras, crash, environment, lab, leaderboard, login, pairing, pictures, scenes, sensors,
+    stats, vehicles, watch,
 };
+use super::guard::{MAX_BODY, Rights, Rule, Takes, guard};
+use super::http::file;
+use super::state::Page;
 
 /// One route.
 struct Route {
@@ -24,27 +24,6 @@ struct Route {
     path: &'static str,
     rule: Rule,
     handler: MethodRouter<Arc<Page>>,
-}
-
-/// What a route asks of whoever calls it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Rule {
-    /// The right.
-    pub(super) takes: Takes,
-    /// The token that shows that a page of ours sent it.
-    pub(super) token: bool,
-}
-
-/// What each route takes.
-#[derive(Debug, Default)]
-pub(super) struct Rights(HashMap<(Method, &'static str), Rule>);
-
-impl Rights {
-    /// Returns what the route `path` takes; of one that is not in the table, everything.
-    pub(super) fn of(&self, method: &Method, path: &str) -> Rule {
-        let known = self.0.iter().find(|((m, p), _)| m == method && *p == path);
-        known.map_or(Rule::STRICTEST, |(_, rule)| *rule)
-    }
 }
 
 /// The page's own files: path and text, as the build script finds them.
@@ -78,17 +57,17 @@ fn table() -> Vec<Route> {
         })
         .collect();
     routes.extend([
-        read("/enter", Nothing, access::enter),
+        read("/enter", Nothing, login::enter),
         read("/api/session", Nothing, login::standing),
         // Who logs in has no token yet.
         at_once(Method::POST, "/api/login", Nothing, login::login),
         act(Method::POST, "/api/logout", Key, login::logout),
-        read("/api/map", Key, map),
+        read("/api/map", Key, pictures::map),
         // Where everything stands, to the centimetre: what a course may keep from plugins.
-        read("/api/shell", Everything, shell),
-        read("/api/splats/{part}", Everything, twin::splats),
-        read("/api/twin", Everything, twin_picture::draw),
-        read("/ws", Vehicle, watch),
+        read("/api/shell", Everything, pictures::shell),
+        read("/api/splats/{part}", Everything, pictures::splats),
+        read("/api/twin", Everything, pictures::draw),
+        read("/ws", Vehicle, watch::watch),
         read("/api/stats", Vehicle, stats::get),
         read("/api/vehicles", Key, vehicles::list),
         // The stop button waits for no token.
@@ -168,15 +147,17 @@ where
 
 /// Makes the router.
 pub(super) fn router(page: Arc<Page>) -> Router {
-    let (mut router, mut rights) = (Router::new(), Rights::default());
-    for Route { method, path, rule, handler } in table() {
-        rights.0.insert((method, path), rule);
+    let table = table();
+    let rights =
+        Rights::of_routes(table.iter().map(|route| (route.method.clone(), route.path, route.rule)));
+    let mut router = Router::new();
+    for Route { path, handler, .. } in table {
         router = router.route(path, handler);
     }
     router
         // Also before routes that are not there: what exists is nobody's business.
-        .layer(middleware::from_fn_with_state((page.clone(), Arc::new(rights)), access::guard))
-        .layer(DefaultBodyLimit::max(access::MAX_BODY))
+        .layer(middleware::from_fn_with_state((page.clone(), Arc::new(rights)), guard))
+        .layer(DefaultBodyLimit::max(MAX_BODY))
         .with_state(page)
 }
 

@@ -1,18 +1,10 @@
 //! `GET /api/stats`: where the images of a vehicle get their age, what became of them, and how its
 //! connection fares. `vizflyt stats` and the page show it.
 
-use std::sync::Arc;
-
-use axum::Json;
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
-use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::messages::{StageTimes, Timing};
 
-use super::Page;
 use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
 use crate::stream::Rooms;
@@ -66,7 +58,7 @@ impl ServerStages {
 
 impl VehicleStats {
     /// Returns the figures of `vehicle` at this moment.
-    fn of(rooms: &Rooms, vehicle: &VehicleFlight) -> Self {
+    pub(super) fn of(rooms: &Rooms, vehicle: &VehicleFlight) -> Self {
         let stream = &rooms.streaming.vehicles[vehicle.index];
         let runtime = vehicle.runtime();
         Self {
@@ -77,32 +69,6 @@ impl VehicleStats {
             images: stream.deliveries(&vehicle.arena.cameras),
             connection: stream.connection(),
             pose: lock(&rooms.localization.vehicles[vehicle.index].quality).clone(),
-        }
-    }
-}
-
-#[derive(Debug, Deserialize)]
-pub(super) struct StatsQuery {
-    /// Name; the first one without.
-    vehicle: Option<String>,
-}
-
-/// Answers with the figures of a vehicle.
-pub(super) async fn get(
-    State(page): State<Arc<Page>>,
-    question: Result<Query<StatsQuery>, QueryRejection>,
-) -> Response {
-    let vehicle = match question {
-        Ok(Query(StatsQuery { vehicle: Some(name) })) => page.rooms.flights.vehicle(&name),
-        Ok(Query(StatsQuery { vehicle: None })) => Ok(&page.rooms.flights.vehicles[0]),
-        Err(rejection) => return rejection.into_response(),
-    };
-    match vehicle {
-        Ok(vehicle) => Json(VehicleStats::of(&page.rooms, vehicle)).into_response(),
-        // What follows the semicolon is for a runtime.
-        Err(why) => {
-            let why = why.split(';').next().unwrap_or_default().to_owned();
-            (StatusCode::NOT_FOUND, why).into_response()
         }
     }
 }

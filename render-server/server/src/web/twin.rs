@@ -9,16 +9,10 @@ use std::fmt;
 use std::sync::{Arc, LazyLock};
 
 use axum::body::Bytes;
-use axum::extract::{Path, State};
-use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
 use glam::{DVec3, Vec3};
-use tokio::task::spawn_blocking;
 use tracing::warn;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{Format, encode_variant};
-
-use super::{Page, picture};
 
 /// Splats of each part: what is drawn in software, what a phone takes, what a laptop's card draws.
 const PARTS: [usize; 3] = [40_000, 160_000, 300_000];
@@ -113,16 +107,6 @@ fn pack(splats: &Splats) -> Bytes {
             warn!("page: the twin cannot be shown in space: {error}");
             Bytes::new()
         }
-    }
-}
-
-/// `GET /api/splats/N`.
-pub(super) async fn splats(State(page): State<Arc<Page>>, Path(index): Path<usize>) -> Response {
-    let parts = page.twin.clone();
-    match spawn_blocking(move || parts.get(index)).await {
-        Ok(Some(bytes)) => picture("application/octet-stream", bytes),
-        _ => (StatusCode::NOT_FOUND, format!("the twin has {} parts", page.twin.len()))
-            .into_response(),
     }
 }
 

@@ -47,7 +47,7 @@ pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {
 }
 
 /// Returns the vehicles that are in the air and seen now.
-pub(super) fn airborne(rooms: &Rooms) -> Vec<Airborne> {
+pub(in crate::web) fn airborne(rooms: &Rooms) -> Vec<Airborne> {
     let now = clock::now();
     let seen = rooms.flights.vehicles.iter().filter_map(|vehicle| {
         let took_off = vehicle.flight().took_off.filter(|_| vehicle.under_way())?;

@@ -8,28 +8,28 @@ use crate::poses::settings::LocalizationConfig;
 
 /// A check under way.
 #[derive(Debug)]
-pub(super) struct Guided {
+pub(in crate::web) struct Guided {
     /// The vehicle, by its index.
-    pub(super) vehicle: usize,
+    pub(in crate::web) vehicle: usize,
     check: Check,
     newest_s: f64,
     /// Who began it.
-    pub(super) by: String,
+    pub(in crate::web) by: String,
 }
 
 impl Guided {
     /// Begins; poses will come as `source` makes them.
-    pub(super) fn new(vehicle: usize, source: LocalizationConfig, by: String) -> Self {
+    pub(in crate::web) fn new(vehicle: usize, source: LocalizationConfig, by: String) -> Self {
         Self { vehicle, check: Check::new(source), newest_s: f64::NEG_INFINITY, by }
     }
 
     /// Returns what is to be done, and what was seen last.
-    pub(super) fn ask(&self) -> (String, String) {
+    pub(in crate::web) fn ask(&self) -> (String, String) {
         (self.check.step().ask().to_owned(), self.check.seen())
     }
 
     /// Takes the vehicle's pose; returns the result once all was seen.
-    pub(super) fn handle_pose(&mut self, pose: &PoseSample) -> Option<Finding> {
+    pub(in crate::web) fn handle_pose(&mut self, pose: &PoseSample) -> Option<Finding> {
         let at_s = pose.stamp.as_ns() as f64 * 1e-9;
         if at_s <= self.newest_s {
             return None;

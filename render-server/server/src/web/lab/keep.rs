@@ -28,9 +28,9 @@ pub(crate) struct Lab {
     writing: Mutex<()>,
     is_changed: AtomicBool,
     /// The check of axes under way.
-    pub(super) guided: Mutex<Option<Guided>>,
+    pub(in crate::web) guided: Mutex<Option<Guided>>,
     /// The first source of poses, whose settings that check is about.
-    pub(super) source: Option<LocalizationConfig>,
+    pub(in crate::web) source: Option<LocalizationConfig>,
 }
 
 impl Lab {
@@ -48,12 +48,12 @@ impl Lab {
     }
 
     /// Looks at the day.
-    pub(super) fn look<T>(&self, look: impl FnOnce(&LabDay) -> T) -> T {
+    pub(in crate::web) fn look<T>(&self, look: impl FnOnce(&LabDay) -> T) -> T {
         look(&lock(&self.day))
     }
 
     /// Changes the day; `change` gets the time, ms since 1970. It is written with the next [`Self::keep`].
-    pub(super) fn change<T>(&self, change: impl FnOnce(&mut LabDay, u64) -> T) -> T {
+    pub(in crate::web) fn change<T>(&self, change: impl FnOnce(&mut LabDay, u64) -> T) -> T {
         let mut day = lock(&self.day);
         // While the day is held: whoever takes this back and then looks sees the change.
         self.is_changed.store(true, Ordering::Relaxed);
@@ -61,7 +61,7 @@ impl Lab {
     }
 
     /// Takes what the server measures again and again; only what is news is written before the end.
-    pub(super) fn measured(&self, vehicle: &str, check: CheckId, finding: Finding) {
+    pub(in crate::web) fn measured(&self, vehicle: &str, check: CheckId, finding: Finding) {
         let is_news = lock(&self.day).record(vehicle, check, finding, "the server", unix_ms());
         self.is_changed.fetch_or(is_news, Ordering::Relaxed);
     }
@@ -101,7 +101,7 @@ impl Lab {
     }
 
     /// Begins another day; the old one's file stays beside it, by its date.
-    pub(super) fn begin_anew(&self, by: &str) {
+    pub(in crate::web) fn begin_anew(&self, by: &str) {
         // What it could not write has been told, and the new day takes its place.
         let _ = self.keep();
         let began_unix_ms = self.look(|day| day.began_unix_ms);
@@ -125,7 +125,7 @@ impl Lab {
 }
 
 /// Returns where a vehicle's flight stands.
-pub(super) fn stand(vehicle: &VehicleFlight) -> Stand {
+pub(in crate::web) fn stand(vehicle: &VehicleFlight) -> Stand {
     use vizflyt_protocol::messages::FlightPhase::TakingOff;
     let flight = vehicle.flight();
     match flight.took_off {
@@ -136,7 +136,7 @@ pub(super) fn stand(vehicle: &VehicleFlight) -> Stand {
 }
 
 /// Returns the wall clock. [ms since 1970]
-pub(super) fn unix_ms() -> u64 {
+pub(in crate::web) fn unix_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
 
@@ -184,11 +184,11 @@ fn write(file: &Path, bytes: &[u8]) -> io::Result<()> {
 
 /// Writes beside what must not wait for a disk.
 #[derive(Debug, Default)]
-pub(super) struct Keeper(Option<JoinHandle<()>>);
+pub(in crate::web) struct Keeper(Option<JoinHandle<()>>);
 
 impl Keeper {
     /// Begins to write what has changed, unless the last time is not over yet.
-    pub(super) fn begin(&mut self, lab: &Arc<Lab>) {
+    pub(in crate::web) fn begin(&mut self, lab: &Arc<Lab>) {
         if self.0.as_ref().is_none_or(JoinHandle::is_finished) {
             let lab = lab.clone();
             // It tells by itself what it cannot write.

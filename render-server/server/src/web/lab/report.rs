@@ -9,7 +9,12 @@ use vizflyt_protocol::time::Civil;
 use crate::flights::lab_day::{Booking, BookingState, CHECKS, CheckInfo, LabDay, State};
 
 /// Returns the day as a PDF.
-pub(super) fn pdf(day: &LabDay, arena: &str, vehicles: &[&str], now_unix_ms: u64) -> Vec<u8> {
+pub(in crate::web) fn pdf(
+    day: &LabDay,
+    arena: &str,
+    vehicles: &[&str],
+    now_unix_ms: u64,
+) -> Vec<u8> {
     let title = format!("VizFlyt lab day, {}", date(day.began_unix_ms));
     let foot = format!("{arena}; printed {}", time(now_unix_ms));
     draw(&title, &foot, &paginate(lay_out(day, &title, &foot, vehicles, now_unix_ms)))

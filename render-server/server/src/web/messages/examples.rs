@@ -15,7 +15,7 @@ use crate::flights::crash_card;
 use crate::poses::drivers::TagsSeen;
 use crate::stream::connection::Connection;
 use crate::stream::delivery::{CameraDelivery, Delivery};
-use crate::web;
+use crate::web::{api, stats};
 
 /// Returns the examples of every message by the name that the page's scripts know it by.
 pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
@@ -25,15 +25,15 @@ pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
         ("Track", vec![json(&Message::Track { vehicle: "vizflyt", points: &[[0.0; 4]] })]),
         ("Events", vec![json(&Message::Events { events: event_examples() })]),
         ("State", vec![json(&full_state()), json(&sparse_state())]),
-        ("Session", web::login::examples()),
-        ("VehicleLine", web::vehicles::examples()),
-        ("SensorLine", web::sensors::examples().0),
-        ("ReadingLine", web::sensors::examples().1),
-        ("SceneChoice", web::scenes::examples()),
-        ("Environment", web::environment::examples()),
-        ("Pairing", web::pairing::examples()),
-        ("LabDay", web::lab::examples()),
-        ("Leaderboard", web::leaderboard::examples()),
+        ("Session", api::login::examples()),
+        ("VehicleLine", api::vehicles::examples()),
+        ("SensorLine", api::sensors::examples().0),
+        ("ReadingLine", api::sensors::examples().1),
+        ("SceneChoice", api::scenes::examples()),
+        ("Environment", api::environment::examples()),
+        ("Pairing", api::pairing::examples()),
+        ("LabDay", api::lab::examples()),
+        ("Leaderboard", api::leaderboard::examples()),
         ("CrashCard", crash_card::examples()),
         ("Stats", stats_examples()),
     ]
@@ -262,10 +262,10 @@ fn sparse_state() -> Message<'static> {
 }
 
 fn stats_examples() -> Vec<Value> {
-    let sparse = web::stats::VehicleStats {
+    let sparse = stats::VehicleStats {
         vehicle: "vizflyt".to_owned(),
         runtime: None,
-        server: web::stats::ServerStages::default(),
+        server: stats::ServerStages::default(),
         timing: None,
         images: Vec::new(),
         connection: None,
@@ -276,7 +276,7 @@ fn stats_examples() -> Vec<Value> {
         cameras: [Arrivals::default()].into_iter().collect(),
         ..Timing::default()
     };
-    let full = web::stats::VehicleStats {
+    let full = stats::VehicleStats {
         runtime: Some("vizflyt at 127.0.0.1:1".to_owned()),
         timing: Some(timing.clone()),
         images: vec![CameraDelivery { camera: "front".to_owned(), account: Delivery::default() }],
@@ -288,9 +288,7 @@ fn stats_examples() -> Vec<Value> {
         },
         ..sparse.clone()
     };
-    let unsynchronised = web::stats::VehicleStats {
-        timing: Some(Timing { clock: None, ..timing }),
-        ..sparse.clone()
-    };
+    let unsynchronised =
+        stats::VehicleStats { timing: Some(Timing { clock: None, ..timing }), ..sparse.clone() };
     vec![json(&full), json(&sparse), json(&unsynchronised)]
 }

@@ -12,15 +12,11 @@
 mod engine;
 mod request;
 
+use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex};
 use std::thread::{JoinHandle, sleep};
 use std::time::{Duration, Instant};
 
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
-use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
 use glam::DVec3;
 use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
@@ -28,14 +24,13 @@ use tracing::warn;
 use vizflyt_splat::Camera;
 
 use self::engine::Engine;
-use self::request::PictureRequest;
+pub(super) use self::request::PictureRequest;
 use super::twin::TwinParts;
-use super::{Page, picture};
 use crate::lock::lock;
 use crate::priority::give_way;
 
 /// A JPEG, or why there is none.
-type Drawn = Result<Vec<u8>, String>;
+pub(super) type Drawn = Result<Vec<u8>, String>;
 
 /// Draws pictures of a twin, when asked.
 #[derive(Debug)]
@@ -61,7 +56,11 @@ impl TwinPictures {
     }
 
     /// Asks for a picture: returns where it will come, or why it is refused.
-    fn ask(&self, camera: Camera, cut: bool) -> Result<oneshot::Receiver<Drawn>, &'static str> {
+    pub(super) fn ask(
+        &self,
+        camera: Camera,
+        cut: bool,
+    ) -> Result<oneshot::Receiver<Drawn>, &'static str> {
         let mut thread = lock(&self.thread);
         if thread.as_ref().is_none_or(|(_, handle)| handle.is_finished()) {
             *thread = Some(self.start().map_err(|error| {
@@ -125,31 +124,6 @@ fn next_due(began: Instant, ended: Instant, busy: Duration) -> Instant {
     (began + EVERY).max(ended + REST * busy)
 }
 
-/// `GET /api/twin`.
-pub(super) async fn draw(
-    State(page): State<Arc<Page>>,
-    request: Result<Query<PictureRequest>, QueryRejection>,
-) -> Response {
-    let camera = request.map_err(|rejection| rejection.body_text());
-    let camera = camera.and_then(|Query(request)| {
-        let camera = request.camera().map_err(|error| error.to_string());
-        Ok((camera?, request.cut))
-    });
-    let (camera, cut) = match camera {
-        Ok(camera) => camera,
-        Err(error) => return (StatusCode::BAD_REQUEST, error).into_response(),
-    };
-    let drawn = match page.twin_pictures.ask(camera, cut) {
-        Ok(drawn) => drawn.await,
-        Err(error) => return (StatusCode::SERVICE_UNAVAILABLE, error).into_response(),
-    };
-    match drawn {
-        Ok(Ok(jpeg)) => picture("image/jpeg", jpeg.into()),
-        Ok(Err(error)) => (StatusCode::INTERNAL_SERVER_ERROR, error).into_response(),
-        Err(_) => (StatusCode::SERVICE_UNAVAILABLE, NO_THREAD).into_response(),
-    }
-}
-
 /// The lowest priority there is: 1.5 % of a core that others want, too.
 const NICE: i32 = 19;
 /// Twice a second.
@@ -161,7 +135,7 @@ const KEPT: Duration = Duration::from_mins(1);
 /// Each waits for half a second at least.
 const MAX_WAITING: usize = 4;
 const BUSY: &str = "too many pages ask for pictures of the twin; ask again in a second";
-const NO_THREAD: &str = "the twin cannot be drawn; the server's log says why";
+pub(super) const NO_THREAD: &str = "the twin cannot be drawn; the server's log says why";
 
 #[cfg(test)]
 mod tests {

@@ -23,14 +23,14 @@ pub(in crate::web) struct PictureRequest {
     width_px: u32,
     height_px: u32,
     /// Leaves out what lies beyond a side of the fence that the camera is beyond, too.
-    pub(super) cut: bool,
+    pub(in crate::web) cut: bool,
     /// Shown where no splat is: RGB as six hexadecimal digits.
     background: String,
 }
 
 /// Why a request is refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub(super) enum Refused {
+pub(in crate::web) enum Refused {
     #[error("{0} x {1} px: give 16 to {MAX_SIDE_PX} a side, {MAX_PX} in all")]
     Size(u32, u32),
     #[error("fov_deg = {0}: give 5 to 150")]
@@ -48,7 +48,7 @@ impl PictureRequest {
     ///
     /// # Errors
     /// A number that is none, or beyond what a page needs.
-    pub(super) fn camera(&self) -> Result<Camera, Refused> {
+    pub(in crate::web) fn camera(&self) -> Result<Camera, Refused> {
         let Self { width_px, height_px, fov_deg, .. } = *self;
         let is_side = |side| (16..=MAX_SIDE_PX).contains(&side);
         if !is_side(width_px) || !is_side(height_px) || width_px * height_px > MAX_PX {

@@ -3,7 +3,6 @@
 use serde::Serialize;
 use vizflyt_protocol::messages::FlightPhase;
 
-use super::{follow, keep};
 use crate::flights::lab_day::formation::apart_m;
 use crate::flights::lab_day::{
     Booking, BookingState, CHECKS, CheckId, CheckInfo, How, LabDay, Stand, State, TakeOffOrder,
@@ -11,12 +10,13 @@ use crate::flights::lab_day::{
 };
 use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
-use crate::web::Page;
 use crate::web::access::Viewer;
+use crate::web::lab::{airborne, keep};
+use crate::web::state::Page;
 
 /// What the page shows.
 #[derive(Debug, Serialize)]
-pub(super) struct LabView {
+pub(in crate::web) struct LabView {
     arena: String,
     is_instructor: bool,
     now_unix_ms: u64,
@@ -96,7 +96,7 @@ struct AxesView {
 }
 
 impl LabView {
-    pub(super) fn of(page: &Page, viewer: &Viewer) -> Self {
+    pub(in crate::web) fn of(page: &Page, viewer: &Viewer) -> Self {
         let now_unix_ms = keep::unix_ms();
         let vehicles: Vec<_> =
             page.rooms.flights.vehicles.iter().filter(|v| viewer.may_see(&v.name)).collect();
@@ -198,7 +198,7 @@ fn bookings(day: &LabDay, viewer: &Viewer) -> Vec<BookingView> {
 
 /// Returns how far vehicles are apart: those in the air.
 fn distances(page: &Page) -> Vec<Distance> {
-    let airborne = follow::airborne(&page.rooms);
+    let airborne = airborne(&page.rooms);
     let name = |index: usize| page.rooms.flights.vehicles[index].name.as_str().to_owned();
     let mut found = Vec::new();
     for (at, a) in airborne.iter().enumerate() {

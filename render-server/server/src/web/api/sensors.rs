@@ -16,14 +16,16 @@ use vizflyt_protocol::messages::EventKind;
 use vizflyt_protocol::sensor::{LidarPoint, RadarDetection, RangeReading, SensorInfo, SensorKind};
 use zerocopy::FromBytes;
 
-use super::{Page, origin, refuse, vehicle};
 use crate::clock;
 use crate::render::cameras::ChangeError;
 use crate::render::sensors::{MadeReading, SensorCounters};
+use crate::web::http::refuse;
+use crate::web::origin;
+use crate::web::state::{Page, vehicle};
 
 /// A sensor: the keys of `[[sensors]]`, and what follows from its model.
 #[derive(Debug, Serialize)]
-pub(super) struct SensorLine {
+pub(in crate::web) struct SensorLine {
     #[serde(flatten)]
     keys: Map<String, Value>,
     kind: SensorKind,
@@ -47,7 +49,7 @@ struct Measures {
 
 /// A sensor's newest reading, thinned out for a drawing.
 #[derive(Debug, Serialize)]
-pub(super) struct ReadingLine {
+pub(in crate::web) struct ReadingLine {
     seq: u64,
     /// Since the instant that it is of. [s]
     age_s: f64,
@@ -127,7 +129,10 @@ impl ReadingLine {
 }
 
 /// Answers with all sensors.
-pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>) -> Response {
+pub(in crate::web) async fn list(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+) -> Response {
     let vehicle = match vehicle(&page, &name) {
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
@@ -140,7 +145,7 @@ pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>
 }
 
 /// Answers with a sensor's newest reading, `null` before there is one.
-pub(super) async fn reading(
+pub(in crate::web) async fn reading(
     State(page): State<Arc<Page>>,
     Path((name, sensor)): Path<(String, String)>,
 ) -> Response {
@@ -159,7 +164,7 @@ pub(super) async fn reading(
 }
 
 /// Changes a sensor.
-pub(super) async fn patch(
+pub(in crate::web) async fn patch(
     State(page): State<Arc<Page>>,
     Path((name, sensor)): Path<(String, String)>,
     headers: HeaderMap,
@@ -207,7 +212,7 @@ fn describe(info: &SensorInfo) -> String {
 const MAX_POINTS: usize = 2048;
 
 #[cfg(test)]
-pub(super) fn examples() -> (Vec<Value>, Vec<Value>) {
+pub(in crate::web) fn examples() -> (Vec<Value>, Vec<Value>) {
     let config = SensorConfig::ahead("top", "os1-16", glam::DVec3::ZERO);
     let set = crate::render::sensors::SensorSet::new(&[config]).expect("a named model");
     let line = SensorLine::of(&set.configs[0], &set.infos[0], &SensorCounters::default());

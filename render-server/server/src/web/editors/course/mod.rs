@@ -34,7 +34,7 @@ use super::{ViewArgs, ViewState};
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{self, Scene, Seen};
-use crate::web::{self, ordered};
+use crate::web::http::{file, ordered};
 
 /// The file that a course is written to.
 pub trait CourseFile: Send + Sync {
@@ -305,7 +305,6 @@ fn refusals(error: ConfigError) -> Vec<Found> {
 
 /// The panel's files and orders; nothing at all on a page without it.
 pub(super) fn routes() -> Router<Arc<ViewState>> {
-    use web::file;
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
         .route("/course.js", get(async || file(SCRIPT, include_str!("../page/course.js"))))

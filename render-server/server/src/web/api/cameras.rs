@@ -11,11 +11,16 @@ use axum::response::{IntoResponse, Response};
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_protocol::messages::EventKind;
 
-use super::{Page, messages, origin, refuse, vehicle};
 use crate::render::cameras::{Cameras, ChangeError};
+use crate::web::http::refuse;
+use crate::web::state::{Page, vehicle};
+use crate::web::{messages, origin};
 
 /// Answers with all cameras.
-pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>) -> Response {
+pub(in crate::web) async fn list(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+) -> Response {
     let vehicle = match vehicle(&page, &name) {
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
@@ -25,7 +30,7 @@ pub(super) async fn list(State(page): State<Arc<Page>>, Path(name): Path<String>
 }
 
 /// Replaces a camera.
-pub(super) async fn put(
+pub(in crate::web) async fn put(
     State(page): State<Arc<Page>>,
     Path((vehicle, name)): Path<(String, String)>,
     headers: HeaderMap,
@@ -35,7 +40,7 @@ pub(super) async fn put(
 }
 
 /// Changes a camera.
-pub(super) async fn patch(
+pub(in crate::web) async fn patch(
     State(page): State<Arc<Page>>,
     Path((vehicle, name)): Path<(String, String)>,
     headers: HeaderMap,

@@ -32,7 +32,7 @@ use super::{ViewArgs, ViewState};
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{BoxedPart, Editor, PartsFile, Placement, parts_path};
-use crate::web::{self, ordered};
+use crate::web::http::{file, ordered};
 
 /// The panel's part of the view's state.
 pub(super) struct Panel {
@@ -261,7 +261,6 @@ fn highlight(splats: &mut Splats, marks: &[bool]) {
 
 /// The panel's files and orders; nothing at all on a page without it.
 pub(super) fn routes() -> Router<Arc<ViewState>> {
-    use web::file;
     Router::new()
         .route(
             "/edit.js",

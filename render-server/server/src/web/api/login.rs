@@ -1,81 +1,67 @@
-//! The instructor's password: set by `vizflyt password`, asked for by `POST /api/login`.
-//!
-//! The file holds its Argon2id hash alone and is read at each login, so that a new password counts
-//! at once (and ends every session). A try takes some 20 ms and 19 MiB on purpose; one is checked
-//! at a time, few wait, and an address has ten tries, then one in three seconds.
+//! `/enter`, `/api/login`, `/api/logout`, `/api/session`: who the viewer is, and how that begins and ends.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use argon2::password_hash::phc::PasswordHash;
-use argon2::{Argon2, Params, PasswordHasher, PasswordVerifier};
+use argon2::{Argon2, PasswordVerifier};
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
-use axum::extract::{ConnectInfo, State};
+use axum::extract::{ConnectInfo, Query, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
 use tracing::warn;
-use vizflyt_trust::{KeyError, KeysFolder};
+use vizflyt_trust::KeyError;
 
-use super::access::{self, Shown, Viewer};
-use super::{Page, origin, refuse};
 use crate::lock::lock;
+use crate::web::access::{self, KEY, NO_KEY, Shown, TEAM_KEY, Viewer, cookie_line};
+use crate::web::http::refuse;
+use crate::web::origin;
+use crate::web::password::{FILE, MAX_BYTES, read};
+use crate::web::percent::encoded;
+use crate::web::state::Page;
 
-/// Name of the password's file in the keys folder.
-pub(super) const FILE: &str = "page-login.toml";
-
-/// `page-login.toml`.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct LoginFile {
-    /// In PHC's string format: `$argon2id$v=19$m=19456,t=2,p=1$...`.
-    password: String,
+/// What `/enter` is asked with.
+#[derive(Debug, Deserialize)]
+pub(in crate::web) struct Entering {
+    #[serde(default)]
+    key: String,
 }
 
-/// Sets the instructor's password of the server that uses `folder`; a running one takes it at once.
-///
-/// # Errors
-/// A password too short or too long; a folder that cannot be written.
-pub fn set_password(folder: &KeysFolder, password: &str) -> Result<(), KeyError> {
-    let damaged = |what: String| KeyError::Damaged { path: folder.file(FILE), what };
-    let length = password.chars().count();
-    if length < MIN_LETTERS || password.len() > MAX_BYTES {
-        return Err(damaged(format!(
-            "a password has {MIN_LETTERS} letters at least and {MAX_BYTES} bytes at most, not \
-             {length} letters; take four words that nobody else puts together"
-        )));
+/// Exchanges a key for a cookie. Any page can send a browser here, so nothing that the browser had is lost: a
+/// wrong key changes nothing, and a team's has a cookie of its own beside the instructor's.
+pub(in crate::web) async fn enter(
+    State(page): State<Arc<Page>>,
+    Query(entering): Query<Entering>,
+    headers: HeaderMap,
+) -> Response {
+    if let Err(refusal) = origin::check_navigation(&headers) {
+        return refuse(&refusal);
     }
-    let mut salt = [0; 16];
-    SystemRandom::new()
-        .fill(&mut salt)
-        .map_err(|_| damaged("the system gives no random numbers".to_owned()))?;
-    let hash = Argon2::default()
-        .hash_password_with_salt(password.as_bytes(), &salt)
-        .map_err(|error| damaged(error.to_string()))?;
-    let file = LoginFile { password: hash.to_string() };
-    let text = toml::to_string(&file).map_err(|error| damaged(error.to_string()))?;
-    folder.write(FILE, &(HEAD.to_owned() + &text))
-}
-
-/// Returns the hash of the password; `None` if none is set.
-fn read(folder: &KeysFolder) -> Result<Option<PasswordHash>, KeyError> {
-    let damaged = |what: String| KeyError::Damaged {
-        path: folder.file(FILE),
-        what: format!("{what}; set a new password: vizflyt password"),
+    let (name, to) = match page.access.viewer_of(&entering.key) {
+        Some(Viewer::Instructor) => (KEY, "/".to_owned()),
+        Some(Viewer::Team(name)) => (TEAM_KEY, format!("/?vehicle={}", encoded(name))),
+        None => {
+            warn!("page: somebody came with a wrong key");
+            let no_store = [(header::CACHE_CONTROL, "no-store")];
+            return (StatusCode::UNAUTHORIZED, no_store, NO_KEY).into_response();
+        }
     };
-    let Some(text) = folder.read_secret(FILE)? else { return Ok(None) };
-    let file: LoginFile = toml::from_str(&text).map_err(|error| damaged(error.to_string()))?;
-    let hash = PasswordHash::new(&file.password)
-        .map_err(|error| damaged(format!("password is no Argon2 hash: {error}")))?;
-    let params = Params::try_from(&hash).map_err(|error| damaged(error.to_string()))?;
-    if params.m_cost() > MAX_KIB || params.t_cost() > MAX_PASSES {
-        return Err(damaged(format!("a hash of {} KiB is refused", params.m_cost())));
+    let cookie = cookie_line(name, &entering.key, Some(COOKIE_S), &headers);
+    let mut response = StatusCode::SEE_OTHER.into_response();
+    let headers = response.headers_mut();
+    for (name, value) in [(header::SET_COOKIE, cookie), (header::LOCATION, to)] {
+        if let Ok(value) = HeaderValue::from_str(&value)
+            && !value.is_empty()
+        {
+            headers.insert(name, value);
+        }
     }
-    Ok(Some(hash))
+    headers.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    response
 }
 
 /// The session as the page receives it.
@@ -94,7 +80,7 @@ struct Standing<'a> {
 }
 
 /// `GET /api/session`: who the server takes the viewer for.
-pub(super) async fn standing(
+pub(in crate::web) async fn standing(
     State(page): State<Arc<Page>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
@@ -135,7 +121,7 @@ struct Attempt {
 }
 
 /// `POST /api/login`: exchanges the password for a session.
-pub(super) async fn login(
+pub(in crate::web) async fn login(
     State(page): State<Arc<Page>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
@@ -211,7 +197,7 @@ pub(super) async fn login(
 }
 
 /// `POST /api/logout`: ends the session, and takes the key out of the browser too.
-pub(super) async fn logout(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+pub(in crate::web) async fn logout(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
@@ -229,25 +215,15 @@ pub(super) async fn logout(State(page): State<Arc<Page>>, headers: HeaderMap) ->
     response
 }
 
-const HEAD: &str = "\
-# The instructor's password for the server's page, hashed. Set another with `vizflyt password`; remove this file
-# to let nobody log in by password.
-";
+/// A term. [s]
+const COOKIE_S: u32 = 180 * 24 * 3600;
 const WRONG: &str = "this is not the password";
 const NO_PASSWORD: &str =
     "no password is set; on the server's computer run `vizflyt password`, then log in";
 const TOO_MANY: &str = "too many tries; wait some seconds, then try again";
-/// NIST SP 800-63B-4, section 3.1.1.2: 15 where a password stands alone; a lab's lies behind its own
-/// network, and tries are limited.
-const MIN_LETTERS: usize = 10;
-/// More is no password. [bytes]
-const MAX_BYTES: usize = 256;
-/// A quarter of a GiB: more is a slip of the hand. [KiB]
-const MAX_KIB: u32 = 256 << 10;
-const MAX_PASSES: u32 = 32;
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     let full = Standing {
         role: Some("instructor"),
         vehicle: Some("vizflyt"),
@@ -257,49 +233,4 @@ pub(super) fn examples() -> Vec<serde_json::Value> {
     };
     let sparse = Standing { role: None, vehicle: None, by: None, token: None, password: false };
     vec![serde_json::json!(full), serde_json::json!(sparse)]
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_password_is_kept_as_its_hash_and_checked_by_it() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
-        assert!(read(&folder).unwrap().is_none());
-        for wrong in ["", "short", &"x".repeat(MAX_BYTES + 1)] {
-            let error = set_password(&folder, wrong).unwrap_err().to_string();
-            assert!(error.contains("10 letters at least"), "{error}");
-        }
-        set_password(&folder, "correct horse battery").unwrap();
-        let text = folder.read_secret(FILE).unwrap().unwrap();
-        assert!(text.contains("$argon2id$v=19$m=19456,t=2,p=1$") && !text.contains("horse"));
-        let hash = read(&folder).unwrap().unwrap();
-        let fits =
-            |password: &str| Argon2::default().verify_password(password.as_bytes(), &hash).is_ok();
-        assert!(fits("correct horse battery") && !fits("correct horse batterY") && !fits(""));
-        // Another time, another salt.
-        set_password(&folder, "correct horse battery").unwrap();
-        assert_ne!(folder.read_secret(FILE).unwrap().unwrap(), text);
-    }
-
-    #[test]
-    fn a_damaged_file_is_an_error_and_lets_nobody_in() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
-        for (text, expected) in [
-            ("", "missing field"),
-            ("password = \"open\"", "no Argon2 hash"),
-            ("password = \"x\"\nuser = 1", "unknown field"),
-            (
-                "password = \"$argon2id$v=19$m=4194304,t=2,p=1$c2FsdHNhbHRzYWx0$aGFzaGhhc2hoYXNoaGFzaA\"",
-                "4194304 KiB is refused",
-            ),
-        ] {
-            folder.write(FILE, text).unwrap();
-            let error = read(&folder).unwrap_err().to_string();
-            assert!(error.contains(expected), "{error}");
-        }
-    }
 }

@@ -9,10 +9,14 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use super::{Page, picture, vehicle};
+use crate::web::http::picture;
+use crate::web::state::{Page, vehicle};
 
 /// `GET /api/vehicles/V/crash`: the newest card.
-pub(super) async fn show(State(page): State<Arc<Page>>, Path(name): Path<String>) -> Response {
+pub(in crate::web) async fn show(
+    State(page): State<Arc<Page>>,
+    Path(name): Path<String>,
+) -> Response {
     let vehicle = match vehicle(&page, &name) {
         Ok(vehicle) => vehicle,
         Err(none) => return *none,
@@ -28,13 +32,13 @@ pub(super) async fn show(State(page): State<Arc<Page>>, Path(name): Path<String>
 /// Which picture of a moment.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Kind {
+pub(in crate::web) enum Kind {
     Colour,
     Depth,
 }
 
 /// `GET /api/vehicles/V/crash/ID/CAMERA/KIND/N`: an image of a card, as long as it is the newest.
-pub(super) async fn image(
+pub(in crate::web) async fn image(
     State(page): State<Arc<Page>>,
     Path((name, id, camera, kind, number)): Path<(String, u64, usize, Kind, usize)>,
 ) -> Response {

@@ -44,7 +44,8 @@ use crate::lock::lock;
 use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
 use crate::scene::{self, Antialiased, BareArgs, Editor, Placement, Scene};
 use crate::stop::Stop;
-use crate::web::{self, origin};
+use crate::web::http::{ICON, file, refuse};
+use crate::web::{listener, origin};
 
 /// Opens a page with a free-flying camera in a scene.
 #[derive(Args, Clone, Debug)]
@@ -208,7 +209,7 @@ async fn run(
     let stop = Stop::default();
     stop.on_signals(false)?;
     // First: a taken port is reported before the scene is loaded.
-    let listener = web::bind(args.http, None, true)?;
+    let listener = listener::bind(args.http)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading, work));
@@ -280,12 +281,11 @@ fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Engine, Welcome, Pane
 }
 
 fn router(view: Arc<ViewState>) -> Router {
-    use web::file;
     Router::new()
         .route("/", get(async || file("text/html; charset=utf-8", INDEX)))
         .route("/view.css", get(async || file("text/css; charset=utf-8", STYLE)))
         .route("/view.js", get(async || file("text/javascript; charset=utf-8", SCRIPT)))
-        .route("/icon.svg", get(async || file("image/svg+xml", web::ICON)))
+        .route("/icon.svg", get(async || file("image/svg+xml", ICON)))
         .route("/ws", get(watch))
         .route("/panel.css", get(async || file("text/css; charset=utf-8", PANEL_STYLE)))
         .route("/overlay.js", get(async || file("text/javascript; charset=utf-8", OVERLAY)))
@@ -301,7 +301,7 @@ async fn watch(
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Response {
     if let Err(refusal) = origin::check(&headers) {
-        return web::refuse(&refusal);
+        return refuse(&refusal);
     }
     match upgrade {
         Ok(upgrade) => upgrade

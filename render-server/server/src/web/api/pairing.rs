@@ -11,8 +11,10 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::Grant;
 
-use super::{Page, origin, refuse};
 use crate::authorization::parse_grant;
+use crate::web::http::refuse;
+use crate::web::origin;
+use crate::web::state::Page;
 
 /// How pairing stands.
 #[derive(Debug, Serialize)]
@@ -42,12 +44,12 @@ struct OpenRequest {
 }
 
 /// Returns the pairing's status.
-pub(super) async fn standing(State(page): State<Arc<Page>>) -> Response {
+pub(in crate::web) async fn standing(State(page): State<Arc<Page>>) -> Response {
     respond(&page)
 }
 
 /// Opens a pairing.
-pub(super) async fn open(
+pub(in crate::web) async fn open(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
     body: Bytes,
@@ -73,7 +75,7 @@ pub(super) async fn open(
 }
 
 /// Closes the pairing.
-pub(super) async fn shut(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+pub(in crate::web) async fn shut(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
@@ -106,7 +108,7 @@ fn respond(page: &Page) -> Response {
 }
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     let open = Open {
         code: "123 456".to_owned(),
         right: "instructor".to_owned(),

@@ -9,13 +9,15 @@ use axum::{Extension, Json};
 use serde::Serialize;
 use vizflyt_protocol::messages::FlightPhase;
 
-use super::access::Viewer;
-use super::{Page, origin, refuse, vehicle};
 use crate::flights::vehicle::VehicleFlight;
+use crate::web::access::Viewer;
+use crate::web::http::refuse;
+use crate::web::origin;
+use crate::web::state::{Page, vehicle};
 
 /// A vehicle in the list.
 #[derive(Debug, Serialize)]
-pub(super) struct VehicleLine {
+pub(in crate::web) struct VehicleLine {
     name: String,
     phase: FlightPhase,
     /// Which program flies it.
@@ -24,7 +26,7 @@ pub(super) struct VehicleLine {
 }
 
 impl VehicleLine {
-    pub(super) fn of(page: &Page, vehicle: &VehicleFlight) -> Self {
+    pub(in crate::web) fn of(page: &Page, vehicle: &VehicleFlight) -> Self {
         let cameras = page.rooms.rendering.cameras[vehicle.index].newest();
         Self {
             name: vehicle.name.to_string(),
@@ -36,7 +38,7 @@ impl VehicleLine {
 }
 
 /// Answers with all vehicles that the viewer may see.
-pub(super) async fn list(
+pub(in crate::web) async fn list(
     State(page): State<Arc<Page>>,
     Extension(viewer): Extension<Viewer>,
 ) -> Response {
@@ -45,7 +47,10 @@ pub(super) async fn list(
 }
 
 /// Stops every vehicle.
-pub(super) async fn stop_all(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
+pub(in crate::web) async fn stop_all(
+    State(page): State<Arc<Page>>,
+    headers: HeaderMap,
+) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
     }
@@ -53,7 +58,7 @@ pub(super) async fn stop_all(State(page): State<Arc<Page>>, headers: HeaderMap) 
 }
 
 /// Stops one vehicle.
-pub(super) async fn stop(
+pub(in crate::web) async fn stop(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
     headers: HeaderMap,
@@ -68,7 +73,7 @@ pub(super) async fn stop(
 }
 
 /// Lets a vehicle take off.
-pub(super) async fn start(
+pub(in crate::web) async fn start(
     page: State<Arc<Page>>,
     name: Path<String>,
     headers: HeaderMap,
@@ -81,7 +86,7 @@ pub(super) async fn start(
 }
 
 /// Lands a vehicle in order.
-pub(super) async fn land(
+pub(in crate::web) async fn land(
     page: State<Arc<Page>>,
     name: Path<String>,
     headers: HeaderMap,
@@ -90,7 +95,7 @@ pub(super) async fn land(
 }
 
 /// Begins a vehicle's run anew.
-pub(super) async fn reset(
+pub(in crate::web) async fn reset(
     page: State<Arc<Page>>,
     name: Path<String>,
     headers: HeaderMap,
@@ -146,7 +151,7 @@ fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
 const BY: &str = "the page";
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     let line = |runtime| VehicleLine {
         name: "vizflyt".to_owned(),
         phase: FlightPhase::Flying,

@@ -13,7 +13,8 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
-use super::{Page, ordered};
+use crate::web::http::ordered;
+use crate::web::state::Page;
 
 /// The scenes that can be selected.
 #[derive(Debug, Serialize)]
@@ -30,7 +31,7 @@ struct SceneRequest {
 }
 
 /// Returns the scenes.
-pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
+pub(in crate::web) async fn list(State(page): State<Arc<Page>>) -> Response {
     let scenes = page.scenes.clone();
     // Reads a folder.
     let found = tokio::task::spawn_blocking(move || SceneList {
@@ -44,7 +45,7 @@ pub(super) async fn list(State(page): State<Arc<Page>>) -> Response {
 }
 
 /// Changes to a scene.
-pub(super) async fn change(
+pub(in crate::web) async fn change(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
@@ -75,7 +76,7 @@ pub(super) async fn change(
 }
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     let scenes = vec!["room".to_owned()];
     [Some("room".to_owned()), None]
         .map(|now| serde_json::json!(SceneList { now, scenes: scenes.clone() }))

@@ -14,7 +14,8 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use vizflyt_arena::config::EnvironmentConfig;
 
-use super::{Page, ordered};
+use crate::web::http::ordered;
+use crate::web::state::Page;
 
 /// The present environment, and the named ones.
 #[derive(Debug, Serialize)]
@@ -27,12 +28,12 @@ struct EnvironmentStatus {
 }
 
 /// Returns the environment.
-pub(super) async fn get(State(page): State<Arc<Page>>) -> Response {
+pub(in crate::web) async fn get(State(page): State<Arc<Page>>) -> Response {
     Json(status(&page.rooms.rendering.environment.now())).into_response()
 }
 
 /// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
-pub(super) async fn change(
+pub(in crate::web) async fn change(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
@@ -75,7 +76,7 @@ fn status(now: &EnvironmentConfig) -> EnvironmentStatus {
 }
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     use glam::DVec3;
     use vizflyt_arena::config::{
         CloudConfig, FlickerConfig, LampsConfig, OwnLightConfig, RainConfig, SnowConfig, SunConfig,

@@ -12,14 +12,16 @@ use serde::{Deserialize, Serialize};
 use tracing::warn;
 use vizflyt_protocol::messages::FlightPhase;
 
-use super::access::{Shown, Viewer};
-use super::{Page, origin, refuse, vehicle};
 use crate::flights::check_in::{self, CheckIn, Claim};
 use crate::flights::leaderboard::{
     Attempt, GradeBoard, LeaderboardError, Run, Standing, grade_boards, standings,
 };
 use crate::flights::vehicle::VehicleFlight;
 use crate::lock::lock;
+use crate::web::access::{Shown, Viewer};
+use crate::web::http::refuse;
+use crate::web::origin;
+use crate::web::state::{Page, vehicle};
 
 /// What the page and the wall show.
 #[derive(Debug, Serialize)]
@@ -50,7 +52,7 @@ struct Flyer {
 }
 
 /// `GET /api/leaderboard`: the standings of the course that is flown here.
-pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
+pub(in crate::web) async fn show(State(page): State<Arc<Page>>) -> Response {
     let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
     let course = page.rooms.flights.vehicles[0].arena.name.as_str().to_owned();
     let runs = match board.runs(Some(&course)).await {
@@ -87,7 +89,7 @@ pub(super) async fn show(State(page): State<Arc<Page>>) -> Response {
 /// Who checks in: a team by its token, or as the instructor sets it.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct CheckingIn {
+pub(in crate::web) struct CheckingIn {
     token: Option<String>,
     team: Option<String>,
     #[serde(default)]
@@ -95,7 +97,7 @@ pub(super) struct CheckingIn {
 }
 
 /// `PUT /api/vehicles/V/team`: a team checks in by its token, at its vehicle ([`crate::flights::check_in`]).
-pub(super) async fn put(
+pub(in crate::web) async fn put(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
@@ -141,7 +143,7 @@ pub(super) async fn put(
 }
 
 /// `POST /api/vehicles/V/team`: the instructor checks a team in by its name.
-pub(super) async fn assign(
+pub(in crate::web) async fn assign(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
@@ -171,7 +173,7 @@ pub(super) async fn assign(
 }
 
 /// `DELETE /api/vehicles/V/team`: whoever has checked in leaves.
-pub(super) async fn check_out(
+pub(in crate::web) async fn check_out(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
@@ -232,7 +234,7 @@ fn failed(error: &LeaderboardError) -> Response {
 const NEWEST: usize = 20;
 
 #[cfg(test)]
-pub(super) fn examples() -> Vec<serde_json::Value> {
+pub(in crate::web) fn examples() -> Vec<serde_json::Value> {
     use crate::flights::leaderboard::{GradeEntry, GradePlace, RunState};
 
     let place = |seconds| Standing {

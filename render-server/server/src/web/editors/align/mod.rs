@@ -29,7 +29,7 @@ use super::ViewState;
 use super::engine::Request;
 use super::place::Place;
 use crate::lock::lock;
-use crate::web::{self, ordered};
+use crate::web::http::{file, ordered};
 
 /// Finds a place from what was clicked, and writes it down.
 pub trait Aligner: Send + Sync {
@@ -153,7 +153,6 @@ struct Click {
 
 /// The panel's files and orders; nothing at all on a page without it.
 pub(super) fn routes() -> Router<Arc<ViewState>> {
-    use web::file;
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
         .route("/align.js", get(async || file(SCRIPT, include_str!("../page/align.js"))))
