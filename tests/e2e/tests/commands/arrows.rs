@@ -1,4 +1,4 @@
-//! The import arrows of docs/ARCHITECTURE.md: who may depend on whom, read from cargo itself.
+//! The imports of crates in docs/ARCHITECTURE.md, compared with cargo's own metadata.
 
 use std::collections::BTreeSet;
 
@@ -115,7 +115,7 @@ fn every_import_is_an_arrow_of_the_architecture() {
             if !test_only && ours.contains(dependency.name.as_str()) {
                 assert!(
                     allowed.contains(&dependency.name.as_str()),
-                    "{} may not import {}; docs/ARCHITECTURE.md has the reason",
+                    "{} may not import {}; docs/ARCHITECTURE.md lists the imports",
                     package.name,
                     dependency.name
                 );
