@@ -341,11 +341,20 @@ fn the_viewer_serves_a_page_and_draws_what_it_asks_for() {
     let line = line.expect("the address is printed");
     let address = line.rsplit("http://").next().unwrap().to_owned();
 
-    let mut page = TcpStream::connect(&address).unwrap();
-    write!(page, "GET / HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
-    let mut text = String::new();
-    page.read_to_string(&mut text).unwrap();
+    let get = |path: &str| {
+        let mut page = TcpStream::connect(&address).unwrap();
+        write!(page, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n")
+            .unwrap();
+        let mut text = String::new();
+        page.read_to_string(&mut text).unwrap();
+        text
+    };
+    let text = get("/");
     assert!(text.starts_with("HTTP/1.1 200") && text.contains("<canvas"), "{text}");
+    // It shows the scene, and changes nothing.
+    for path in ["/api/align", "/api/course", "/api/edit"] {
+        assert!(get(path).starts_with("HTTP/1.1 404"), "{path}");
+    }
 
     let origin = format!("Origin: http://{address}\r\n");
     let mut socket = WebSocket::open(address.parse().unwrap(), "/ws", &origin).ok().unwrap();

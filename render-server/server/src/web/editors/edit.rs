@@ -13,7 +13,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::extract::{ConnectInfo, DefaultBodyLimit, State};
@@ -27,8 +27,8 @@ use vizflyt_splat::edit::{Region, Step, select};
 use vizflyt_splat::harmonics::C0;
 use vizflyt_splat::{Chosen, Rasterizer, RigidObject, Splats};
 
-use super::engine::Request;
-use super::{ViewArgs, ViewState};
+use super::args::ViewArgs;
+use super::engine::{Engine, Request};
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{BoxedPart, Editor, PartsFile, Placement, parts_path};
@@ -36,6 +36,7 @@ use crate::web::http::{file, ordered};
 
 /// The panel's part of the view's state.
 pub(super) struct Panel {
+    pub(super) engine: Arc<Mutex<Engine>>,
     pub(super) session: Mutex<Session>,
 }
 
@@ -259,8 +260,8 @@ fn highlight(splats: &mut Splats, marks: &[bool]) {
     }
 }
 
-/// The panel's files and orders; nothing at all on a page without it.
-pub(super) fn routes() -> Router<Arc<ViewState>> {
+/// The panel's files and orders.
+pub(super) fn routes(panel: Panel) -> Router {
     Router::new()
         .route(
             "/edit.js",
@@ -272,17 +273,15 @@ pub(super) fn routes() -> Router<Arc<ViewState>> {
         )
         .route("/api/edit", post(edit))
         .layer(DefaultBodyLimit::max(MAX_ORDER))
+        .with_state(Arc::new(panel))
 }
 
 async fn edit(
-    State(view): State<Arc<ViewState>>,
+    State(panel): State<Arc<Panel>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if view.panels.edit.is_none() {
-        return StatusCode::NOT_FOUND.into_response();
-    }
     if !from.ip().to_canonical().is_loopback() {
         let said = "only a browser on the computer that serves the page may edit";
         return (StatusCode::FORBIDDEN, said).into_response();
@@ -291,21 +290,20 @@ async fn edit(
         Ok(order) => order,
         Err(refusal) => return *refusal,
     };
-    match tokio::task::spawn_blocking(move || obey(&view, order)).await {
+    match tokio::task::spawn_blocking(move || obey(&panel, order)).await {
         Ok(Ok(report)) => Json(report).into_response(),
         Ok(Err(error)) => (StatusCode::CONFLICT, format!("{error:#}")).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 
-fn obey(view: &ViewState, order: Order) -> Result<Report> {
-    let panel = view.panels.edit.as_ref().context("this page does not edit")?;
+fn obey(panel: &Panel, order: Order) -> Result<Report> {
     let mut session = lock(&panel.session);
     let (said, is_changed) = session.obey(order)?;
     let selected = session.selected();
     if is_changed {
         let renderer = session.renderer(&selected)?;
-        lock(&view.engine).replace(renderer);
+        lock(&panel.engine).replace(renderer);
     }
     Ok(session.report(&selected, said))
 }

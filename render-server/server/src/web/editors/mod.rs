@@ -9,6 +9,7 @@
 //! viewers in turn.
 
 pub(crate) mod align;
+mod args;
 pub(crate) mod course;
 mod edit;
 mod engine;
@@ -28,7 +29,6 @@ use axum::extract::{State, WebSocketUpgrade};
 use axum::http::HeaderMap;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use clap::Args;
 use serde::Serialize;
 use tokio::time::timeout;
 use tracing::debug;
@@ -36,61 +36,17 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::Chosen;
 
 use self::align::{Aligner, Setup};
+pub use self::args::ViewArgs;
 use self::course::CourseFile;
 use self::edit::Session;
 use self::engine::{Engine, Picture, Request};
 pub use self::place::Place;
 use crate::lock::lock;
-use crate::render::{DetailKind, RendererInfo, RendererKind, choose};
-use crate::scene::{self, Antialiased, BareArgs, Editor, Placement, Scene};
+use crate::render::{RendererInfo, choose};
+use crate::scene::{self, Editor, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::http::{ICON, file, refuse};
 use crate::web::{listener, origin};
-
-/// Opens a page with a free-flying camera in a scene.
-#[derive(Args, Clone, Debug)]
-#[command(
-    after_help = "On the page: W A S D to fly, E and Q up and down, drag to look around, wheel \
-for the speed; on a touch screen one finger looks, two fly. `play` lets the clock of what moves \
-run, where something does. `copy camera` gives the camera as a CAM.json for `vizflyt scene render`.
-
-Examples:
-  vizflyt scene view room.ply
-  vizflyt scene view forest/arena.toml --renderer cpu
-  vizflyt scene view room.ply --up z --http 0.0.0.0:8090 --no-browser"
-)]
-pub struct ViewArgs {
-    /// Scene file of any format, or an arena.toml
-    pub scene: PathBuf,
-
-    /// Where the page is served; port 0 takes a free one
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
-    pub http: SocketAddr,
-
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
-    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
-    pub renderer: RendererKind,
-
-    /// How much of a large scene is drawn
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub detail: DetailKind,
-
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
-    #[arg(long, value_enum, value_name = "HOW", default_value_t)]
-    pub antialiased: Antialiased,
-
-    /// How a scene without an arena is put into the world
-    #[command(flatten)]
-    pub bare: BareArgs,
-
-    /// What the arena leaves to chance: where in their motion its objects begin
-    #[arg(long, default_value_t = 7)]
-    pub seed: u64,
-
-    /// Only prints the address
-    #[arg(long)]
-    pub no_browser: bool,
-}
 
 /// Serves the page until SIGINT or SIGTERM; `open` is called with its address once it answers.
 ///
@@ -169,18 +125,9 @@ fn serve_view(
 
 /// State that the handlers share.
 struct ViewState {
-    engine: Mutex<Engine>,
+    engine: Arc<Mutex<Engine>>,
     welcome: Welcome,
-    panels: Panels,
     stop: Stop,
-}
-
-/// What is done with the scene on the page; one of them, or none.
-#[derive(Default)]
-struct Panels {
-    align: Option<align::Panel>,
-    course: Option<course::Panel>,
-    edit: Option<edit::Panel>,
 }
 
 /// The first message to each page.
@@ -213,21 +160,21 @@ async fn run(
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
     let load = tokio::task::spawn_blocking(move || prepare(&loading, work));
-    let (engine, welcome, panels) = tokio::select! {
+    let (engine, welcome, panel) = tokio::select! {
         prepared = load => prepared.context("loading the scene failed")??,
         () = stop.wait() => return Ok(()),
     };
     open(&url, &welcome.renderer);
-    let (engine, stopping) = (Mutex::new(engine), stop.clone());
-    let view = Arc::new(ViewState { engine, welcome, panels, stop: stopping });
-    let router = router(view).into_make_service_with_connect_info::<SocketAddr>();
+    let view = Arc::new(ViewState { engine, welcome, stop: stop.clone() });
+    let router = router(view).merge(panel).into_make_service_with_connect_info::<SocketAddr>();
     tokio::select! {
         served = axum::serve(listener, router) => served.context("the page's server failed"),
         () = stop.wait() => Ok(()),
     }
 }
 
-fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Engine, Welcome, Panels)> {
+/// Returns the engine, the welcome, and the routes of the panel, if there is one.
+fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Arc<Mutex<Engine>>, Welcome, Router)> {
     let scene = match &work {
         Some(Work::Edit(editor, _)) => {
             scene::load_with(&args.scene, &args.bare, editor.splats().clone())
@@ -265,19 +212,21 @@ fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Engine, Welcome, Pane
         }),
     };
     let engine = Engine::new(rasterizer, moving, *world_from_scene, world_from_file);
-    let mut panels = Panels::default();
-    match work {
-        None => {}
-        Some(Work::Align(aligner)) => panels.align = Some(align::Panel { aligner, setup }),
+    let engine = Arc::new(Mutex::new(engine));
+    let routes = match work {
+        None => Router::new(),
+        Some(Work::Align(aligner)) => {
+            align::routes(align::Panel { engine: engine.clone(), aligner, setup })
+        }
         Some(Work::Course(file)) => {
-            panels.course = Some(course::Panel::new(scene, file, args.clone()));
+            course::routes(course::Panel::new(engine.clone(), scene, file, args.clone()))
         }
         Some(Work::Edit(editor, output)) => {
             let session = Session::new(editor, output, args.clone(), placement, scene.objects)?;
-            panels.edit = Some(edit::Panel { session: Mutex::new(session) });
+            edit::routes(edit::Panel { engine: engine.clone(), session: Mutex::new(session) })
         }
-    }
-    Ok((engine, welcome, panels))
+    };
+    Ok((engine, welcome, routes))
 }
 
 fn router(view: Arc<ViewState>) -> Router {
@@ -289,9 +238,6 @@ fn router(view: Arc<ViewState>) -> Router {
         .route("/ws", get(watch))
         .route("/panel.css", get(async || file("text/css; charset=utf-8", PANEL_STYLE)))
         .route("/overlay.js", get(async || file("text/javascript; charset=utf-8", OVERLAY)))
-        .merge(align::routes())
-        .merge(course::routes())
-        .merge(edit::routes())
         .with_state(view)
 }
 

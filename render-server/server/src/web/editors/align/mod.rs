@@ -11,7 +11,7 @@
 //! As all that acts, requests must come from a page of ours; and only a browser on this computer may write.
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
@@ -25,8 +25,7 @@ use serde::{Deserialize, Serialize};
 use vizflyt_arena::ArenaConfig;
 use vizflyt_arena::config::{Geofence, Spawn, StageConfig};
 
-use super::ViewState;
-use super::engine::Request;
+use super::engine::{Engine, Request};
 use super::place::Place;
 use crate::lock::lock;
 use crate::web::http::{file, ordered};
@@ -135,8 +134,9 @@ impl Setup {
     }
 }
 
-/// The panel's part of the view's state.
+/// What the panel's routes share.
 pub(super) struct Panel {
+    pub(super) engine: Arc<Mutex<Engine>>,
     pub(super) aligner: Arc<dyn Aligner>,
     pub(super) setup: Setup,
 }
@@ -151,8 +151,8 @@ struct Click {
     px: DVec2,
 }
 
-/// The panel's files and orders; nothing at all on a page without it.
-pub(super) fn routes() -> Router<Arc<ViewState>> {
+/// The panel's files and orders.
+pub(super) fn routes(panel: Panel) -> Router {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
         .route("/align.js", get(async || file(SCRIPT, include_str!("../page/align.js"))))
@@ -161,17 +161,15 @@ pub(super) fn routes() -> Router<Arc<ViewState>> {
         .route("/api/align/solve", post(solve))
         .route("/api/align/save", post(save))
         .layer(DefaultBodyLimit::max(MAX_ORDER))
+        .with_state(Arc::new(panel))
 }
 
-async fn setup(State(view): State<Arc<ViewState>>) -> Response {
-    match &view.panels.align {
-        Some(panel) => Json(&panel.setup).into_response(),
-        None => none(),
-    }
+async fn setup(State(panel): State<Arc<Panel>>) -> Response {
+    Json(&panel.setup).into_response()
 }
 
 async fn pick(
-    State(view): State<Arc<ViewState>>,
+    State(panel): State<Arc<Panel>>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
@@ -179,7 +177,7 @@ async fn pick(
         Ok(click) => click,
         Err(refusal) => return *refusal,
     };
-    let picked = tokio::task::spawn_blocking(move || lock(&view.engine).pick(&request, px)).await;
+    let picked = tokio::task::spawn_blocking(move || lock(&panel.engine).pick(&request, px)).await;
     match picked {
         Ok(Ok(Ok(picked))) => Json(picked).into_response(),
         Ok(Ok(Err(nothing))) => refused(nothing.to_string()),
@@ -189,11 +187,10 @@ async fn pick(
 }
 
 async fn solve(
-    State(view): State<Arc<ViewState>>,
+    State(panel): State<Arc<Panel>>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let Some(panel) = &view.panels.align else { return none() };
     let picks: Picks = match ordered(&headers, body) {
         Ok(picks) => picks,
         Err(refusal) => return *refusal,
@@ -205,12 +202,11 @@ async fn solve(
 }
 
 async fn save(
-    State(view): State<Arc<ViewState>>,
+    State(panel): State<Arc<Panel>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    let Some(panel) = &view.panels.align else { return none() };
     if !from.ip().to_canonical().is_loopback() {
         let text = "only a browser on this computer may write its files; open the page here, or through ssh -L";
         return (StatusCode::FORBIDDEN, text).into_response();
@@ -231,11 +227,6 @@ fn check(picks: &Picks) -> Result<(), String> {
         return Err(format!("{count} points of the floor; {MAX_POINTS} are plenty"));
     }
     Ok(())
-}
-
-fn none() -> Response {
-    (StatusCode::NOT_FOUND, "this page only shows; to align: vizflyt scene align ARENA")
-        .into_response()
 }
 
 fn refused(why: String) -> Response {

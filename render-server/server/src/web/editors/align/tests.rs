@@ -1,15 +1,11 @@
-use std::sync::Mutex;
-
 use axum::http::HeaderValue;
 use glam::{Quat, Vec3};
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::{CpuRenderer, Splats};
 
 use super::super::engine::Engine;
-use super::super::{Panels, RendererInfo, Welcome};
 use super::*;
 use crate::scene::{WorldFromScene, default_arena};
-use crate::stop::Stop;
 
 /// Says yes to three points, and remembers nothing.
 struct Yes;
@@ -28,8 +24,8 @@ impl Aligner for Yes {
     }
 }
 
-/// A wall 3 m ahead of the origin, and its page, with the panel or without.
-fn view(panel: bool) -> State<Arc<ViewState>> {
+/// A wall 3 m ahead of the origin, and the panel on its page.
+fn panel() -> State<Arc<Panel>> {
     let wall = Splats {
         means_m: vec![Vec3::new(3.0, 0.0, 1.0)],
         scales_m: vec![Vec3::new(0.001, 1.0, 1.0)],
@@ -43,25 +39,8 @@ fn view(panel: bool) -> State<Arc<ViewState>> {
     let one = WorldFromScene::IDENTITY;
     let renderer = Box::new(CpuRenderer::new(&wall));
     let setup = Setup::new(&arena, Place::new(&one));
-    let welcome = Welcome {
-        name: arena.name,
-        renderer: RendererInfo { name: "cpu".to_owned(), reason: "a test".to_owned() },
-        splats: 1,
-        start_m: [0.0; 3],
-        yaw_rad: 0.0,
-        fence_m: [[0.0; 3]; 2],
-        objects: 0,
-        tool: None,
-    };
-    State(Arc::new(ViewState {
-        engine: Mutex::new(Engine::new(renderer, MovingObjects::default(), one, one)),
-        welcome,
-        panels: Panels {
-            align: panel.then(|| Panel { aligner: Arc::new(Yes), setup }),
-            ..Panels::default()
-        },
-        stop: Stop::default(),
-    }))
+    let engine = Engine::new(renderer, MovingObjects::default(), one, one);
+    State(Arc::new(Panel { engine: Arc::new(Mutex::new(engine)), aligner: Arc::new(Yes), setup }))
 }
 
 fn headers(origin: &'static str) -> HeaderMap {
@@ -97,9 +76,8 @@ async fn words(response: Response) -> (u16, String) {
 
 #[tokio::test]
 async fn a_click_finds_the_wall_or_says_why_not() {
-    let pick = async |px, yaw| {
-        words(super::pick(view(true), headers(OURS), Ok(click(px, yaw))).await).await
-    };
+    let pick =
+        async |px, yaw| words(super::pick(panel(), headers(OURS), Ok(click(px, yaw))).await).await;
     let (status, text) = pick([80.0, 60.0], 0.0).await;
     assert_eq!(status, 200, "{text}");
     let found: serde_json::Value = serde_json::from_str(&text).unwrap();
@@ -112,7 +90,7 @@ async fn a_click_finds_the_wall_or_says_why_not() {
         let (status, text) = pick(px, yaw).await;
         assert!(status == 422 && text.contains(expected), "{status} {text}");
     }
-    let garbage = super::pick(view(true), headers(OURS), Ok("{".into())).await;
+    let garbage = super::pick(panel(), headers(OURS), Ok("{".into())).await;
     assert_eq!(words(garbage).await.0, 400);
 }
 
@@ -120,7 +98,7 @@ async fn a_click_finds_the_wall_or_says_why_not() {
 async fn only_our_page_on_this_computer_writes() {
     let save = async |from: &str, origin| {
         let from = ConnectInfo(from.parse::<SocketAddr>().unwrap());
-        words(super::save(view(true), from, headers(origin), Ok(wish().into())).await).await
+        words(super::save(panel(), from, headers(origin), Ok(wish().into())).await).await
     };
     assert_eq!(save("127.0.0.1:9", OURS).await.0, 200);
     assert_eq!(save("[::1]:9", OURS).await.0, 200);
@@ -132,14 +110,13 @@ async fn only_our_page_on_this_computer_writes() {
 
 #[tokio::test]
 async fn picks_are_solved_for_our_page_alone() {
-    let solve = async |panel, origin, picks: String| {
-        words(super::solve(view(panel), headers(origin), Ok(picks.into())).await).await
+    let solve = async |origin, picks: String| {
+        words(super::solve(panel(), headers(origin), Ok(picks.into())).await).await
     };
-    assert_eq!(solve(true, OURS, PICKS.to_owned()).await.0, 200);
-    assert_eq!(solve(true, "http://evil.example", PICKS.to_owned()).await.0, 403);
-    assert_eq!(solve(false, OURS, PICKS.to_owned()).await.0, 404);
+    assert_eq!(solve(OURS, PICKS.to_owned()).await.0, 200);
+    assert_eq!(solve("http://evil.example", PICKS.to_owned()).await.0, 403);
     let few = PICKS.replace(", [0,1,0]]", "]");
-    assert_eq!(solve(true, OURS, few).await, (422, "too few".to_owned()));
+    assert_eq!(solve(OURS, few).await, (422, "too few".to_owned()));
     let many = PICKS.replace("[[0,0,0]", &format!("[[0,0,0]{}", ", [0,0,0]".repeat(MAX_POINTS)));
-    assert!(solve(true, OURS, many).await.1.contains("plenty"));
+    assert!(solve(OURS, many).await.1.contains("plenty"));
 }

@@ -30,7 +30,8 @@ use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_splat::{Chosen, Rasterizer, RigidObject, Splats};
 
 use super::align::Line;
-use super::{ViewArgs, ViewState};
+use super::args::ViewArgs;
+use super::engine::Engine;
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{self, Scene, Seen};
@@ -91,6 +92,7 @@ impl Course {
 
 /// The panel's part of the view's state.
 pub(super) struct Panel {
+    engine: Arc<Mutex<Engine>>,
     session: Mutex<Session>,
 }
 
@@ -162,7 +164,12 @@ impl From<Finding> for Found {
 
 impl Panel {
     /// Takes a scene whose objects are drawn already.
-    pub(super) fn new(scene: Scene, file: Arc<dyn CourseFile>, args: ViewArgs) -> Self {
+    pub(super) fn new(
+        engine: Arc<Mutex<Engine>>,
+        scene: Scene,
+        file: Arc<dyn CourseFile>,
+        args: ViewArgs,
+    ) -> Self {
         let Scene { arena, splats, objects, seen, .. } = scene;
         let toml = &args.scene;
         let folder = if toml.is_dir() { Some(&**toml) } else { toml.parent() };
@@ -177,7 +184,7 @@ impl Panel {
         let (on_file, still) = (Course::of(&arena), None);
         let session =
             Session { arena, on_file, folder, splats, seen, file, args, still, models, drawn };
-        Self { session: Mutex::new(session) }
+        Self { engine, session: Mutex::new(session) }
     }
 }
 
@@ -303,8 +310,8 @@ fn refusals(error: ConfigError) -> Vec<Found> {
     }
 }
 
-/// The panel's files and orders; nothing at all on a page without it.
-pub(super) fn routes() -> Router<Arc<ViewState>> {
+/// The panel's files and orders.
+pub(super) fn routes(panel: Panel) -> Router {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
         .route("/course.js", get(async || file(SCRIPT, include_str!("../page/course.js"))))
@@ -318,18 +325,15 @@ pub(super) fn routes() -> Router<Arc<ViewState>> {
         )
         .route("/api/course", post(obey))
         .layer(DefaultBodyLimit::max(MAX_ORDER))
+        .with_state(Arc::new(panel))
 }
 
 async fn obey(
-    State(view): State<Arc<ViewState>>,
+    State(panel): State<Arc<Panel>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if view.panels.course.is_none() {
-        let text = "this page only shows; to set up a course: vizflyt arena edit ARENA";
-        return (StatusCode::NOT_FOUND, text).into_response();
-    }
     if !from.ip().to_canonical().is_loopback() {
         let text = "only a browser on this computer may set up a course; open the page here, or through ssh -L";
         return (StatusCode::FORBIDDEN, text).into_response();
@@ -338,15 +342,14 @@ async fn obey(
         Ok(order) => order,
         Err(refusal) => return *refusal,
     };
-    match tokio::task::spawn_blocking(move || carry_out(&view, order)).await {
+    match tokio::task::spawn_blocking(move || carry_out(&panel, order)).await {
         Ok(Ok(report)) => Json(report).into_response(),
         Ok(Err(error)) => (StatusCode::CONFLICT, format!("{error:#}")).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 
-fn carry_out(view: &ViewState, order: Order) -> Result<Report> {
-    let panel = view.panels.course.as_ref().context("this page sets up no course")?;
+fn carry_out(panel: &Panel, order: Order) -> Result<Report> {
     let mut session = lock(&panel.session);
     let (course, opens, saves) = match order {
         Order::Open => (session.on_file.clone(), true, false),
@@ -358,7 +361,7 @@ fn carry_out(view: &ViewState, order: Order) -> Result<Report> {
     }
     let renderer = session.renderer()?;
     let moving = MovingObjects::new(&session.arena, session.args.seed);
-    lock(&view.engine).set_objects(renderer, moving);
+    lock(&panel.engine).set_objects(renderer, moving);
     let Checked { findings, way_m, least_room_m } = session.look();
     let said = if saves { session.save()? } else { Vec::new() };
     let report = session.report(findings.into_iter().map(Found::from).collect());

@@ -4,10 +4,8 @@ use serde_json::{Value, json};
 use vizflyt_splat::CpuRenderer;
 
 use super::super::engine::Engine;
-use super::super::{Panels, RendererInfo, Welcome};
 use super::*;
 use crate::scene::{WorldFromScene, default_arena};
-use crate::stop::Stop;
 
 /// Remembers what it was given.
 #[derive(Default)]
@@ -22,8 +20,8 @@ impl CourseFile for Kept {
     }
 }
 
-/// A floor of 6 by 4 m, and its page.
-fn view(file: Arc<Kept>) -> Arc<ViewState> {
+/// A floor of 6 by 4 m, and the panel on its page.
+fn panel(file: Arc<Kept>) -> Arc<Panel> {
     let side = 0..24 * 16;
     let at = |k: usize| Vec3::new(0.25 * (k % 24) as f32, 0.25 * (k / 24) as f32, 0.0);
     let floor = Splats {
@@ -43,16 +41,6 @@ fn view(file: Arc<Kept>) -> Arc<ViewState> {
     let one = WorldFromScene::IDENTITY;
     let engine =
         Engine::new(Box::new(CpuRenderer::new(&floor)), MovingObjects::default(), one, one);
-    let welcome = Welcome {
-        name: arena.name.clone(),
-        renderer: RendererInfo { name: "cpu".to_owned(), reason: "a test".to_owned() },
-        splats: floor.len(),
-        start_m: [0.0; 3],
-        yaw_rad: 0.0,
-        fence_m: [[0.0; 3]; 2],
-        objects: 0,
-        tool: None,
-    };
     let args = ViewArgs {
         scene: PathBuf::from("/nowhere/arena.toml"),
         http: "127.0.0.1:0".parse().unwrap(),
@@ -71,21 +59,15 @@ fn view(file: Arc<Kept>) -> Arc<ViewState> {
         seen: None,
         packed: None,
     };
-    let panels = Panels { course: Some(Panel::new(scene, file, args)), ..Panels::default() };
-    Arc::new(ViewState { engine: Mutex::new(engine), welcome, panels, stop: Stop::default() })
+    Arc::new(Panel::new(Arc::new(Mutex::new(engine)), scene, file, args))
 }
 
-async fn ask(
-    view: &Arc<ViewState>,
-    from: &str,
-    origin: &'static str,
-    order: &Value,
-) -> (u16, Value) {
+async fn ask(panel: &Arc<Panel>, from: &str, origin: &'static str, order: &Value) -> (u16, Value) {
     let mut headers = HeaderMap::new();
     headers.insert("host", HeaderValue::from_static("127.0.0.1:80"));
     headers.insert("origin", HeaderValue::from_static(origin));
     let from = ConnectInfo(from.parse::<SocketAddr>().unwrap());
-    let response = obey(State(view.clone()), from, headers, Ok(order.to_string().into())).await;
+    let response = obey(State(panel.clone()), from, headers, Ok(order.to_string().into())).await;
     let status = response.status().as_u16();
     let body = axum::body::to_bytes(response.into_body(), 1 << 20).await.unwrap();
     let text = String::from_utf8(body.to_vec()).unwrap();
@@ -109,11 +91,11 @@ fn with_gate(course: &Value, x_m: f64, model: &str) -> Value {
 #[tokio::test]
 async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
     let kept = Arc::new(Kept::default());
-    let view = view(kept.clone());
-    let (status, opened) = ask(&view, HERE, OURS, &json!("open")).await;
+    let panel = panel(kept.clone());
+    let (status, opened) = ask(&panel, HERE, OURS, &json!("open")).await;
     assert_eq!((status, &opened["findings"]), (200, &json!([])), "{opened}");
     let gate = with_gate(&opened["course"], 3.0, "models/gate-120x100.ply");
-    let (_, looked) = ask(&view, HERE, OURS, &json!({"look": gate})).await;
+    let (_, looked) = ask(&panel, HERE, OURS, &json!({"look": gate})).await;
     assert_eq!(looked["findings"], json!([]), "{looked}");
     let room_m = looked["least_room_m"].as_f64().unwrap();
     // Half of the opening's height, less the body.
@@ -124,19 +106,19 @@ async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
         "p_m": [1.0, 1.8, 1.0], "yaw_rad": f64::atan2(0.63, 2.0), "pitch_rad": 0, "fov_deg": 15, "width_px": 320,
         "height_px": 320, "depth": false,
     }));
-    let picked = lock(&view.engine).pick(&request.unwrap(), glam::DVec2::splat(160.0)).unwrap();
+    let picked = lock(&panel.engine).pick(&request.unwrap(), glam::DVec2::splat(160.0)).unwrap();
     let depth_m = picked.unwrap().depth_m;
     assert!((depth_m - f64::hypot(1.97, 0.63)).abs() < 0.05, "{depth_m}");
     // Until it is saved, a page that is opened begins as the file does.
-    assert_eq!(ask(&view, HERE, OURS, &json!("open")).await.1["course"], opened["course"]);
+    assert_eq!(ask(&panel, HERE, OURS, &json!("open")).await.1["course"], opened["course"]);
     // Where its bar stands in the way, that is found.
     let mut low = gate.clone();
     low["stages"][0]["center_m"][2] = json!(1.5);
-    let (_, found) = ask(&view, HERE, OURS, &json!({"look": low})).await;
+    let (_, found) = ask(&panel, HERE, OURS, &json!({"look": low})).await;
     assert!(found["findings"][0]["text"].as_str().unwrap().contains("'gate 1 frame'"), "{found}");
-    let (_, saved) = ask(&view, HERE, OURS, &json!({"save": gate})).await;
+    let (_, saved) = ask(&panel, HERE, OURS, &json!({"save": gate})).await;
     assert_eq!(saved["said"][0]["key"], "written", "{saved}");
-    ask(&view, HERE, OURS, &json!({"save": gate})).await;
+    ask(&panel, HERE, OURS, &json!({"save": gate})).await;
     let kept = lock(&kept.0);
     assert_eq!(kept[0].0.stages[0].name, "gate 1");
     assert_eq!(kept[0].1, [PathBuf::from("/nowhere/models/gate-120x100.ply")]);
@@ -146,38 +128,38 @@ async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
 #[tokio::test]
 async fn what_is_no_course_is_told_by_key_and_changes_nothing() {
     let kept = Arc::new(Kept::default());
-    let view = view(kept.clone());
-    let (_, opened) = ask(&view, HERE, OURS, &json!("open")).await;
+    let panel = panel(kept.clone());
+    let (_, opened) = ask(&panel, HERE, OURS, &json!("open")).await;
     let course = &opened["course"];
     let mut wrong = course.clone();
     wrong["spawn"]["position_m"] = json!([90, 0, 0]);
-    let (status, report) = ask(&view, HERE, OURS, &json!({"save": wrong})).await;
+    let (status, report) = ask(&panel, HERE, OURS, &json!({"save": wrong})).await;
     assert_eq!(
         (status, &report["findings"][0]["key"]),
         (200, &json!("spawn.position_m")),
         "{report}"
     );
     let gone = with_gate(course, 3.0, "../frame.ply");
-    let (_, report) = ask(&view, HERE, OURS, &json!({"save": gone})).await;
+    let (_, report) = ask(&panel, HERE, OURS, &json!({"save": gone})).await;
     assert_eq!(report["findings"][0]["key"], "objects[0].scene", "{report}");
     let mut high = course.clone();
     high["takeoff_height_m"] = json!(5.5);
     high["geofence"]["max_m"][2] = json!(9.0);
-    let (status, text) = ask(&view, HERE, OURS, &json!({"save": high})).await;
+    let (status, text) = ask(&panel, HERE, OURS, &json!({"save": high})).await;
     assert_eq!((status, text), (409, json!("too high for this file")));
     assert!(lock(&kept.0).is_empty());
-    assert_eq!(ask(&view, HERE, OURS, &json!({"save": 3})).await.0, 400);
+    assert_eq!(ask(&panel, HERE, OURS, &json!({"save": 3})).await.0, 400);
 }
 
 #[tokio::test]
 async fn only_our_page_on_this_computer_orders() {
-    let view = view(Arc::default());
+    let panel = panel(Arc::default());
     for (from, origin, expected) in [
         (HERE, OURS, 200),
         ("[::1]:9", OURS, 200),
         ("192.168.1.4:9", OURS, 403),
         (HERE, "http://evil.example", 403),
     ] {
-        assert_eq!(ask(&view, from, origin, &json!("open")).await.0, expected, "{from} {origin}");
+        assert_eq!(ask(&panel, from, origin, &json!("open")).await.0, expected, "{from} {origin}");
     }
 }
