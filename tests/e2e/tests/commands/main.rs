@@ -3,6 +3,7 @@
 mod align;
 mod arrows;
 mod capture;
+mod circles;
 mod command_line;
 mod dataset;
 mod features;
