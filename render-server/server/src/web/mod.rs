@@ -38,7 +38,7 @@
 //! GET /enter?key=K     exchanges a key for a cookie
 //! GET /api/session     who the server takes the viewer for, and the token of whoever has a cookie
 //! POST /api/login, /api/logout     the instructor's password for a session ([`password`])
-//! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`pairing`])
+//! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`api::pairing`])
 //! ```
 //! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
 //! nobody. Only pages of the same origin may watch or stop ([`origin`]).
