@@ -46,7 +46,7 @@ use crate::render::{RendererInfo, choose};
 use crate::scene::{self, Editor, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::http::{ICON, file, refuse};
-use crate::web::{listener, origin};
+use crate::web::{https, listener, origin};
 
 /// Serves the page until SIGINT or SIGTERM; `open` is called with its address once it answers.
 ///
@@ -156,6 +156,7 @@ async fn run(
     let stop = Stop::default();
     stop.on_signals(false)?;
     // First: a taken port is reported before the scene is loaded.
+    https::check_plain(args.http, true)?;
     let listener = listener::bind(args.http)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
     let loading = args.clone();
