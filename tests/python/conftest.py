@@ -14,7 +14,9 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    config.addinivalue_line("markers", "long: whole flights that take many seconds; `tests/run` has a stage for them")
+    # `tests/run` has a stage for each.
+    config.addinivalue_line("markers", "long: whole flights that take many seconds")
+    config.addinivalue_line("markers", "course: starters and solutions of docs/course")
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.course
+
 COURSE = Path(__file__).parents[2] / "docs/course"
 PROJECTS = ("p0", "p1")
 # An environment is there, and flights in real time are the lab's.

@@ -5,6 +5,8 @@ import re
 import pytest
 from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 
+pytestmark = pytest.mark.course
+
 # What the starter fails in, and nothing else.
 UNFINISHED = {
     "test_nothing_in_the_way_is_straight_on_and_fast",

@@ -11,6 +11,8 @@ from zipfile import ZipFile
 import pytest
 from test_course import COURSE, Student
 
+pytestmark = pytest.mark.course
+
 P2 = COURSE / "p2"
 # What the starter fails in, and nothing else.
 UNFINISHED = {

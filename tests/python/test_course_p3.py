@@ -8,6 +8,8 @@ import sys
 import pytest
 from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 
+pytestmark = pytest.mark.course
+
 PROJECT = COURSE / "p3"
 # What the starter fails in, and nothing else.
 UNFINISHED = {

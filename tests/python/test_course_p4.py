@@ -5,6 +5,8 @@ import re
 import pytest
 from starters import COURSE, failing, grade, handed_in, points_of, said_to_fail
 
+pytestmark = pytest.mark.course
+
 PROJECT = COURSE / "p4"
 # What the starter fails in, and nothing else.
 UNFINISHED = {
