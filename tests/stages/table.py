@@ -13,6 +13,8 @@ from collections.abc import Sequence
 
 PROGRAM = "target/debug/vizflyt"
 EXAMPLES = "target/debug/examples"
+# The Python package's Rust.
+EXTENSION = "jetson/python/Cargo.toml"
 # The workspace without the crates that only heavy stages compile.
 WORKSPACE = "--locked --workspace --exclude vizflyt-ros2 --exclude vizflyt-fuzz"
 # The crates with features that no ordinary build has: always selected together, so that stages share one build.
@@ -94,7 +96,8 @@ CLOCKED = (
 
 STAGES = [
     # --- first: without these, nothing else can run
-    Stage("format", "format of Rust", QUICK, FIRST, "cargo fmt --all -- --check", 2),
+    Stage("format", "format of Rust", QUICK, FIRST,
+          f"cargo fmt --all -- --check && cargo fmt --manifest-path {EXTENSION} -- --check", 2),
     Stage(
         "build", "build", QUICK, FIRST,
         f"cargo build {WORKSPACE} --bins --example detections --example misbehave --example trajectories",
@@ -103,7 +106,12 @@ STAGES = [
     Stage("compile", "compile the tests", EVERYDAY, FIRST, "tests/rust/compile", 235, [CC, CXX]),
     # --- everyday: compute
     Stage("lint-rust", "lints of Rust", QUICK, COMPUTE,
-          f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings", 150,
+          f"cargo clippy {WORKSPACE} --all-targets --quiet -- -D warnings"
+          # A workspace of its own. Not in the stage `python`: cargo lets only one stage at a time use target/debug, and
+          # that stage must not wait for one that gives way.
+          " && PYO3_NO_PYTHON=1 cargo clippy --locked --quiet --target-dir target"
+          f" --manifest-path {EXTENSION} -- -D warnings",
+          150,
           when_quick="cargo clippy --locked {crates} --all-targets --quiet -- -D warnings"),
     Stage("tests", "tests that compute", QUICK, COMPUTE, f"tests/rust/test 'not ({CLOCKED} + {LONG} + {NEW})'", 450,
           [VULKAN, FFMPEG, POPPLER],
