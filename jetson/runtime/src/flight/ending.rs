@@ -139,19 +139,18 @@ impl Flight {
         })
     }
 
-    /// Returns why no setpoint comes: the plugin failed, or no image comes.
+    /// Returns why no setpoint comes: the plugin is silent, gets no image, or its answers cannot be flown.
     fn why_silent(&self, now: HostTime) -> EndReason {
+        let answered_s = self.replied_at.map(|at| now.seconds_since(at));
+        let is_answering = answered_s.is_some_and(|answered_s| answered_s < SETPOINT_HOLD_S);
         EndReason::Plugin(match self.unanswered {
-            Some((image, at)) => PluginFault::NoAnswer { image, silent_s: now.seconds_since(at) },
-            None if self.sees_nothing(now) => return EndReason::NoImage,
-            None if let Some(fault) = self.refused => PluginFault::Refused(fault),
-            None => PluginFault::NoSetpoint,
+            // While others are answered, an image that has just come is no silence.
+            Some((image, at)) if !is_answering => {
+                PluginFault::NoAnswer { image, silent_s: now.seconds_since(at) }
+            }
+            None if !is_answering => return EndReason::NoImage,
+            _ if let Some(fault) = self.refused => PluginFault::Refused(fault),
+            _ => PluginFault::NoSetpoint,
         })
-    }
-
-    /// Whether the plugin is idle because no image comes.
-    fn sees_nothing(&self, now: HostTime) -> bool {
-        self.unanswered.is_none()
-            && self.replied_at.is_none_or(|at| now.seconds_since(at) >= SETPOINT_HOLD_S)
     }
 }

@@ -34,6 +34,8 @@ struct Script {
     /// Images are published, and answered so.
     images: bool,
     replies: Replies,
+    /// The next image is published before the tick, and not yet answered.
+    next_is_shown: bool,
     /// Age of the images when they come. [s]
     image_age_s: f64,
     seq: u64,
@@ -78,6 +80,7 @@ impl Script {
             poses: true,
             images: true,
             replies: Replies::With(Setpoint::velocity(DVec3::X * 0.2, YawTarget::Keep)),
+            next_is_shown: false,
             image_age_s: 0.03,
             seq: 0,
             orders: Orders { goal: Goal::Prepare, setpoint: None, replies_to: None },
@@ -133,6 +136,10 @@ impl Script {
                 if let Some(setpoint) = setpoint {
                     let answer = FlightInput::Replied { seq: self.seq, setpoint };
                     self.flight.handle(self.now, answer);
+                }
+                if self.next_is_shown {
+                    let next = FlightInput::ImagePublished { seq: self.seq + 1, views };
+                    self.flight.handle(self.now, next);
                 }
             }
             self.orders = self.flight.tick(self.now, &self.link);
@@ -413,13 +420,17 @@ fn a_silent_plugin_holds_then_lands() {
 
 #[test]
 fn reports_why_no_setpoint_comes() {
-    let mut script = Script::flying();
-    script.replies = Replies::Without;
-    script.check_end(OutcomeKind::PluginFailed, "without a setpoint");
-
-    let mut script = Script::flying();
-    script.replies = Replies::With(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
-    script.check_end(OutcomeKind::PluginFailed, "not finite");
+    // Also while an image is on its way to it.
+    for next_is_shown in [false, true] {
+        let mut script = Script::flying();
+        script.next_is_shown = next_is_shown;
+        script.replies = Replies::With(Setpoint::velocity(DVec3::NAN, YawTarget::Keep));
+        script.check_end(OutcomeKind::PluginFailed, "not finite");
+        let mut script = Script::flying();
+        script.next_is_shown = next_is_shown;
+        script.replies = Replies::Without;
+        script.check_end(OutcomeKind::PluginFailed, "without a setpoint");
+    }
 
     let mut script = Script::flying();
     script.images = false;
