@@ -18,8 +18,11 @@ use vizflyt_protocol::messages::ToRuntime;
 
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
 const VIEWERS: usize = 20;
-/// In the second half of the watched time. [MB]
+/// In the second half of a watched time of minutes. [MB]
 const MAX_MEMORY_GROWTH_MB: f64 = 12.0;
+/// From the first page on: sockets, queues, threads and previews of 20 pages take half of it within seconds. Images that
+/// are never freed would take it in two seconds. [MB]
+const MAX_MEMORY_OF_PAGES_MB: f64 = 48.0;
 /// The server keeps so many previews of each camera (`flights/recent_previews.rs`).
 const KEPT_PREVIEWS: u64 = 36;
 
@@ -110,7 +113,7 @@ fn twenty_pages_cost_four_runtimes_no_event() {
     }
     let after = rate("no page again", (seconds / 4).max(2), &mut || {});
     let alone = f64::midpoint(before, after);
-    // The pages' queues fill in the first half; a leak shows in the second half, too.
+    // In a few seconds the pages' queues only just fill; in minutes a leak shows in the second half, too.
     let tenths: Vec<f64> = (0..=10).map(|n| memory_mb[n * (memory_mb.len() - 1) / 10]).collect();
     println!(
         "with 20 pages the runtimes get {:.3} of their images; a page {:.1} pictures and {:.1} states \
@@ -119,7 +122,8 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         pictures as f64 / VIEWERS as f64 / seconds as f64,
         states as f64 / VIEWERS as f64 / seconds as f64,
     );
-    assert!(tenths[10] - tenths[5] < MAX_MEMORY_GROWTH_MB, "{tenths:.1?} MB");
+    assert!(tenths[10] - tenths[0] < MAX_MEMORY_OF_PAGES_MB || seconds > 60, "{tenths:.1?} MB");
+    assert!(tenths[10] - tenths[5] < MAX_MEMORY_GROWTH_MB || seconds < 60, "{tenths:.1?} MB");
 }
 
 /// Waits until `done`.
