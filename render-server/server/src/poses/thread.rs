@@ -277,7 +277,7 @@ impl OutlierCount {
     }
 }
 
-/// A hard motion begins with so many at most: the next measurement shows that it goes on.
+/// Maximum number of poses that a hard motion makes look like outliers; the next pose confirms the motion.
 const USUAL_OUTLIERS: u32 = 2;
 /// How long a stop may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);

@@ -68,7 +68,7 @@ impl Need {
     }
 }
 
-/// What a route asks of whoever calls it.
+/// Requirements of a route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Rule {
     /// The right.
@@ -135,8 +135,8 @@ pub(super) async fn guard(
     }
 }
 
-/// Reads the rest of a request and hands it to its route. Until its body is here the connection keeps the
-/// place of whoever waits; a client that dawdles holds nobody up.
+/// Reads the rest of a request and calls its route. Until the body has arrived, the connection counts as waiting, so
+/// that a slow client does not block others.
 async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response {
     let place = request.extensions().get::<ConnectionPlace>().cloned();
     let (parts, mut body) = request.into_parts();

@@ -1,5 +1,7 @@
 //! Answers and orders in HTTP, as all handlers of the page need them.
 
+use std::net::SocketAddr;
+
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
@@ -37,6 +39,20 @@ pub(super) fn ordered<T: DeserializeOwned>(
     let body = body.map_err(|rejection| Box::new(rejection.into_response()))?;
     serde_json::from_slice(&body)
         .map_err(|error| Box::new((StatusCode::BAD_REQUEST, error.to_string()).into_response()))
+}
+
+/// As [`ordered`], for orders that write files or change what is served: only from a browser on this computer. `why`
+/// is the answer to others.
+pub(super) fn ordered_here<T: DeserializeOwned>(
+    from: SocketAddr,
+    why: &'static str,
+    headers: &HeaderMap,
+    body: Result<Bytes, BytesRejection>,
+) -> Result<T, Box<Response>> {
+    if !from.ip().to_canonical().is_loopback() {
+        return Err(Box::new((StatusCode::FORBIDDEN, why).into_response()));
+    }
+    ordered(headers, body)
 }
 
 /// Returns the answer to a request of another site.

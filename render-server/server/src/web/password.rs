@@ -65,7 +65,7 @@ pub(super) fn read(folder: &KeysFolder) -> Result<Option<PasswordHash>, KeyError
 
 const HEAD: &str = "\
 # The instructor's password for the server's page, hashed. Set another with `vizflyt password`; remove this file
-# to let nobody log in by password.
+# to disable login by password.
 ";
 /// NIST SP 800-63B-4, section 3.1.1.2: 15 where a password stands alone; a lab's lies behind its own
 /// network, and tries are limited.

@@ -53,7 +53,7 @@ pub(in crate::web) struct Signing {
     #[serde(default)]
     vehicle: String,
     check: CheckId,
-    /// Who signs.
+    /// Name of the person who signs.
     name: String,
     /// The signature is taken back.
     #[serde(default)]
@@ -130,17 +130,17 @@ pub(in crate::web) async fn axes(
     .await
 }
 
-/// What `vizflyt doctor vehicle --report` has found.
+/// Findings of `vizflyt doctor vehicle --report`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Evidence {
     /// The vehicle, by its name on this server.
     pub vehicle: String,
-    /// What was found of the autopilot's parameters.
+    /// Findings about the autopilot's parameters.
     pub finding: Finding,
     /// FENCE_* against what the arena asks for; empty if no arena was named.
     pub fence: Vec<FenceParameter>,
-    /// Where it was found.
+    /// Source of the findings.
     pub by: String,
 }
 
@@ -300,7 +300,7 @@ pub(in crate::web) async fn formation(
 pub(in crate::web) async fn begin(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     apply(&page, &headers, |page| {
         if page.rooms.flights.any_under_way() {
-            return Err("somebody flies; land first".to_owned());
+            return Err("a vehicle is flying; land it first".to_owned());
         }
         page.lab.begin_anew("the page");
         Ok("a new day".to_owned())

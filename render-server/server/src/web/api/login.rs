@@ -23,15 +23,15 @@ use crate::web::password::{FILE, MAX_BYTES, read};
 use crate::web::percent::encoded;
 use crate::web::state::Page;
 
-/// What `/enter` is asked with.
+/// Query of `/enter`.
 #[derive(Debug, Deserialize)]
 pub(in crate::web) struct Entering {
     #[serde(default)]
     key: String,
 }
 
-/// Exchanges a key for a cookie. Any page can send a browser here, so nothing that the browser had is lost: a
-/// wrong key changes nothing, and a team's has a cookie of its own beside the instructor's.
+/// Exchanges a key for a cookie. Any page can send a browser here, so the browser keeps the rights that it had: a
+/// wrong key changes nothing, and a team's key has another cookie than the instructor's.
 pub(in crate::web) async fn enter(
     State(page): State<Arc<Page>>,
     Query(entering): Query<Entering>,
@@ -44,7 +44,7 @@ pub(in crate::web) async fn enter(
         Some(Viewer::Instructor) => (KEY, "/".to_owned()),
         Some(Viewer::Team(name)) => (TEAM_KEY, format!("/?vehicle={}", encoded(name))),
         None => {
-            warn!("page: somebody came with a wrong key");
+            warn!("page: a request to /enter had a wrong key");
             let no_store = [(header::CACHE_CONTROL, "no-store")];
             return (StatusCode::UNAUTHORIZED, no_store, NO_KEY).into_response();
         }

@@ -30,7 +30,7 @@ pub(in crate::web) async fn get(
     };
     match vehicle {
         Ok(vehicle) => Json(VehicleStats::of(&page.rooms, vehicle)).into_response(),
-        // What follows the semicolon is for a runtime.
+        // The part after the semicolon is advice for a runtime.
         Err(why) => {
             let why = why.split(';').next().unwrap_or_default().to_owned();
             (StatusCode::NOT_FOUND, why).into_response()

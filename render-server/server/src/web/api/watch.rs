@@ -15,7 +15,7 @@ use crate::web::listener::ConnectionPlace;
 use crate::web::state::{Page, vehicle};
 use crate::web::{origin, viewer};
 
-/// What `/ws` is asked for.
+/// Query of `/ws`.
 #[derive(Debug, Deserialize)]
 pub(in crate::web) struct Watched {
     vehicle: Option<String>,

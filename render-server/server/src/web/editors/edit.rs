@@ -32,7 +32,7 @@ use super::engine::{Engine, Request};
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{BoxedPart, Editor, PartsFile, Placement, parts_path};
-use crate::web::http::{file, ordered};
+use crate::web::http::{file, ordered_here};
 
 /// The panel's part of the view's state.
 pub(super) struct Panel {
@@ -282,11 +282,8 @@ async fn edit(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if !from.ip().to_canonical().is_loopback() {
-        let said = "only a browser on the computer that serves the page may edit";
-        return (StatusCode::FORBIDDEN, said).into_response();
-    }
-    let order = match ordered(&headers, body) {
+    const WHY: &str = "only a browser on the computer that serves the page may edit";
+    let order = match ordered_here(from, WHY, &headers, body) {
         Ok(order) => order,
         Err(refusal) => return *refusal,
     };

@@ -28,7 +28,7 @@ use vizflyt_arena::config::{Geofence, Spawn, StageConfig};
 use super::engine::{Engine, Request};
 use super::place::Place;
 use crate::lock::lock;
-use crate::web::http::{file, ordered};
+use crate::web::http::{file, ordered, ordered_here};
 
 /// Finds a place from what was clicked, and writes it down.
 pub trait Aligner: Send + Sync {
@@ -207,11 +207,8 @@ async fn save(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if !from.ip().to_canonical().is_loopback() {
-        let text = "only a browser on this computer may write its files; open the page here, or through ssh -L";
-        return (StatusCode::FORBIDDEN, text).into_response();
-    }
-    let wish: Wish = match ordered(&headers, body) {
+    const WHY: &str = "only a browser on this computer may write its files; open the page here, or through ssh -L";
+    let wish: Wish = match ordered_here(from, WHY, &headers, body) {
         Ok(wish) => wish,
         Err(refusal) => return *refusal,
     };

@@ -35,7 +35,7 @@ use super::engine::Engine;
 use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{self, Scene, Seen};
-use crate::web::http::{file, ordered};
+use crate::web::http::{file, ordered_here};
 
 /// The file that a course is written to.
 pub trait CourseFile: Send + Sync {
@@ -334,11 +334,8 @@ async fn obey(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Response {
-    if !from.ip().to_canonical().is_loopback() {
-        let text = "only a browser on this computer may set up a course; open the page here, or through ssh -L";
-        return (StatusCode::FORBIDDEN, text).into_response();
-    }
-    let order = match ordered(&headers, body) {
+    const WHY: &str = "only a browser on this computer may set up a course; open the page here, or through ssh -L";
+    let order = match ordered_here(from, WHY, &headers, body) {
         Ok(order) => order,
         Err(refusal) => return *refusal,
     };
