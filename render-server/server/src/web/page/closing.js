@@ -15,10 +15,13 @@ export function closed(close) {
   if (at >= 0) open.splice(at, 1);
 }
 
-/** Closes the newest; returns whether there was one. A list of choices that hangs open is the browser's to close. */
+/**
+ * Closes the newest; returns whether there was one. A list of choices that hangs open is the browser's to close. What is closed
+ * here counts as closed at once: a dialog tells so only later, and the next escape must stop the vehicle.
+ */
 export function closeNewest() {
   if (CSS.supports("selector(select:open)") && document.querySelector("select:open")) return true;
-  const close = open.at(-1);
+  const close = open.pop();
   close?.();
   return close != null;
 }
