@@ -20,7 +20,6 @@ use crate::mocap::{MAX_NAME, MocapConfig};
 use crate::simulation::faults::{Faults, MotorFault};
 use crate::simulation::{Simulation, SimulationConfig};
 use crate::startup::Startup;
-use crate::stop::stop_flag;
 use crate::truth_feed::TruthFeed;
 use crate::wifi::WifiConfig;
 
@@ -309,7 +308,7 @@ impl SimArgs {
 // Why: by value, as every run function of the command line.
 #[allow(clippy::needless_pass_by_value)]
 pub fn run(args: SimArgs) -> anyhow::Result<()> {
-    let stop = stop_flag(args.lifeline)?;
+    let stop = vizflyt_process::stop_flag(args.lifeline)?;
     let simulation = Simulation::new(args.config()?)?;
     let endpoints = args.endpoints();
     let truth: std::io::Result<Vec<TruthFeed>> =
@@ -368,8 +367,9 @@ fn print(line: &impl Display) {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use clap::Parser;
+
+    use super::*;
 
     #[derive(Parser)]
     struct Command {

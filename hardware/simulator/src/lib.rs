@@ -32,7 +32,6 @@ pub mod wifi;
 mod args;
 pub mod driver;
 pub mod link;
-mod stop;
 pub mod truth_feed;
 
 pub use args::{SimArgs, run};

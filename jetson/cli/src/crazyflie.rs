@@ -18,9 +18,9 @@ use crazyflie_lib::crazyflie_link::LinkContext;
 use crazyflie_lib::subsystems::log::{LogData, LogPeriod};
 use crazyflie_lib::{Crazyflie, NoTocCache};
 use tokio::time::timeout;
+use vizflyt_process::print_line;
 
 use self::estimate::pose_packet;
-use crate::terminal::print_line;
 
 mod estimate;
 

@@ -5,12 +5,12 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
+use vizflyt_process::print_line;
 use vizflyt_protocol::messages::OutcomeKind;
 use vizflyt_runtime::args::LogArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::plugins;
-use crate::terminal::print_line;
 
 /// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
 #[derive(Args, Debug)]

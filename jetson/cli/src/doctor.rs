@@ -9,6 +9,7 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use vizflyt_arena::ArenaConfig;
+use vizflyt_process::print_line;
 use vizflyt_runtime::airframe::{
     AutopilotFence, Difference, FenceCylinder, ParamSession, Version, compare, parse_params,
     shipped,
@@ -18,7 +19,6 @@ use vizflyt_server::flights::lab_day::{FenceParameter, Finding};
 use vizflyt_server::web::Evidence;
 
 use crate::server_page::ServerPage;
-use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;
 
 /// Finds what is wrong before it flies.

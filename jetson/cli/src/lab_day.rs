@@ -7,9 +7,9 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use serde::Deserialize;
+use vizflyt_process::print_line;
 
 use crate::server_page::ServerPage;
-use crate::terminal::print_line;
 
 /// A lab day: the checklist before flights, and the queue of teams.
 ///

@@ -6,14 +6,13 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
 use clap::{Args, Subcommand};
+use vizflyt_grading::class::archive::{Files, pack};
+use vizflyt_grading::{Grade, verified};
+use vizflyt_process::print_line;
 use vizflyt_server::flights::leaderboard::{
     Attempt, Database, Erased, GradeBoard, GradeEntry, Leaderboard, Run, Standing, grade_boards,
     standings, write_csv,
 };
-
-use crate::class::archive::{Files, pack};
-use crate::grade::{self, Grade};
-use crate::terminal::print_line;
 
 /// Shows who flew what how well, keeps the teams, and exports the runs.
 #[derive(Args, Debug)]
@@ -142,7 +141,7 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
     };
     if let Some(LeaderboardCommand::Add(add)) = &args.command {
         // What does not count opens no database.
-        let grade = grade::verified(&add.file, add.key.as_deref(), add.keys.as_deref())?;
+        let grade = verified(&add.file, add.key.as_deref(), add.keys.as_deref())?;
         let entry = entry(&grade, &add.team)?;
         let board = Leaderboard::open(&database).await?;
         return self::add(&board, &entry, &grade.to_text()?).await;

@@ -4,41 +4,30 @@
 // `println!` panics where its reader has gone, as `head` does.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
-mod arena;
 mod bench;
 mod bridge;
-mod class;
 #[cfg(feature = "crazyflie")]
 mod crazyflie;
 // What of it needs no radio is tested in every build.
 #[cfg(all(test, not(feature = "crazyflie")))]
 #[path = "crazyflie/estimate.rs"]
 mod crazyflie_estimate;
-mod dataset;
 mod demo;
 mod doctor;
 #[cfg(test)]
 mod endings;
-mod evaluate;
-mod export;
 mod fly;
-mod grade;
-mod gym;
 mod lab;
 mod lab_day;
 mod leaderboard;
-mod manifest;
 mod new;
 mod pair;
 mod password;
 mod plugins;
 mod replay;
-mod scene;
 mod server_page;
 mod stats;
 mod tags;
-mod terminal;
-mod usage;
 mod vehicle;
 
 use std::io::IsTerminal;
@@ -48,7 +37,10 @@ use anyhow::Result;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::prelude::*;
+use vizflyt_grading::class;
+use vizflyt_process::{print_error, print_line};
 use vizflyt_server::settings;
+use vizflyt_studio::{arena, dataset, evaluate, export, scene};
 
 /// A drone flies in an empty net while its cameras see a photorealistic world.
 #[derive(Parser, Debug)]
@@ -76,13 +68,13 @@ enum Command {
     /// Flies a plugin: in the simulated lab, or in the real one if it is configured.
     Fly(fly::FlyArgs),
     /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
-    Grade(grade::GradeArgs),
+    Grade(vizflyt_grading::GradeArgs),
     /// Packs a plugin's folder as a team hands it in.
     Submit(class::SubmitArgs),
     /// Grades every team of a class, and makes one table of all.
     GradeClass(class::ClassArgs),
     /// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
-    Gym(gym::GymArgs),
+    Gym(vizflyt_gym::GymArgs),
     /// The render server: pose in, RGB-D out, page and events.
     Serve(vizflyt_server::ServeArgs),
     /// Pairs this computer with a render server, once, by a short code.
@@ -134,7 +126,7 @@ pub fn main() -> ExitCode {
         Ok(Some(cli)) => cli,
         Ok(None) => return ExitCode::SUCCESS,
         Err(error) => {
-            terminal::print_error(format_args!("error: {error:#}"));
+            print_error(format_args!("error: {error:#}"));
             return ExitCode::from(2);
         }
     };
@@ -152,13 +144,13 @@ pub fn main() -> ExitCode {
         _ => "info,quinn=warn".to_owned(),
     });
     if let Err(error) = start_log(&log_level) {
-        terminal::print_error(format_args!("error: --log-level '{log_level}': {error}"));
+        print_error(format_args!("error: --log-level '{log_level}': {error}"));
         return ExitCode::from(2);
     }
     match run(cli.command, &log_level) {
         Ok(code) => code,
         Err(error) => {
-            terminal::print_error(format_args!("error: {error:#}"));
+            print_error(format_args!("error: {error:#}"));
             ExitCode::FAILURE
         }
     }
@@ -175,7 +167,7 @@ fn command_line() -> Result<Option<Cli>> {
     if let Some(("serve", serve)) = matches.subcommand()
         && serve.get_flag("print_config")
     {
-        terminal::print_line(settings::to_toml(serve).trim_end());
+        print_line(settings::to_toml(serve).trim_end());
         return Ok(None);
     }
     Ok(Some(Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())))
@@ -186,10 +178,10 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Demo(args) => demo::run(&args, log_level),
         Command::Serve(args) => vizflyt_server::serve(args).map(|()| ExitCode::SUCCESS),
         Command::Fly(args) => fly::run(args, log_level),
-        Command::Grade(args) => grade::run(&args),
+        Command::Grade(args) => vizflyt_grading::run(&args),
         Command::Submit(args) => class::submit(&args),
         Command::GradeClass(args) => class::grade_class(&args),
-        Command::Gym(args) => gym::run(&args),
+        Command::Gym(args) => vizflyt_gym::run(&args),
         Command::New(args) => new::run(&args),
         Command::Pair(args) => pair::run(&args),
         #[cfg(feature = "crazyflie")]

@@ -6,12 +6,11 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use vizflyt_process::print_line;
 use vizflyt_protocol::messages::Grant;
 use vizflyt_runtime::args::ServerAddress;
 use vizflyt_trust::KeysFolder;
 use vizflyt_trust::pairing::Code;
-
-use crate::terminal::print_line;
 
 /// Pairs this computer with a render server, once.
 ///

@@ -7,9 +7,8 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
+use vizflyt_process::{print_error, print_line};
 use vizflyt_trust::KeysFolder;
-
-use crate::terminal::{print_error, print_line};
 
 /// Sets the password by which the instructor logs in on the server's page.
 ///

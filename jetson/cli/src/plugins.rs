@@ -2,30 +2,9 @@
 
 use std::process::ExitCode;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
+use vizflyt_grading::plugin::built_in::BuiltIn;
 use vizflyt_scenes::projects::CourseProject;
-
-/// A plugin that is linked into this program.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum BuiltIn {
-    /// Flies to the goal through obstacles, by a potential field on the depth image.
-    Avoid,
-    /// Flies windows, a gap and a rotating hand from images alone.
-    Race,
-}
-
-impl BuiltIn {
-    /// Returns the names of all, as the command line takes them.
-    pub(crate) fn names() -> String {
-        let values = Self::value_variants().iter().filter_map(ValueEnum::to_possible_value);
-        values.map(|value| value.get_name().to_owned()).collect::<Vec<_>>().join(", ")
-    }
-}
-
-/// Whether a plugin of this name is linked into this program.
-pub(crate) fn is_built_in(name: &str) -> bool {
-    !name.contains('/') && BuiltIn::from_str(name, true).is_ok()
-}
 
 /// Returns the built-in that flies a scene or a project of the course.
 pub(crate) fn default_for(scene: &str) -> &'static str {

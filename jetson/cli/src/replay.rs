@@ -11,15 +11,14 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::json;
+use vizflyt_grading::plugin::Plugin;
+use vizflyt_grading::plugin::built_in::BuiltIn;
+use vizflyt_process::{print_error, print_line};
 use vizflyt_runtime::log::read::{LogReader, RecordedFlight, RecordedPoses};
 use vizflyt_runtime::replay::{
     Differs, FlownPlugin, ReplayOptions, ReplayPlan, ReplayReport, replay,
 };
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
-
-use crate::fly::plugin::Plugin;
-use crate::plugins;
-use crate::terminal::{print_error, print_line};
 
 /// Feeds a flight's recorded images to the plugin again, or to another one, and reports where the
 /// answers differ.
@@ -133,7 +132,7 @@ fn flown(flown: Option<&FlownPlugin>) -> Result<(OsString, Vec<OsString>)> {
     let is_here = |path: &Path| {
         path.canonicalize().is_ok_and(|path| here.as_ref().is_ok_and(|here| path.starts_with(here)))
     };
-    if !plugins::is_built_in(plugin) && !is_here(Path::new(plugin)) {
+    if BuiltIn::find(plugin).is_none() && !is_here(Path::new(plugin)) {
         bail!(
             "{plugin} flew, which is not in this folder; name a plugin with --plugin, as a log does \
              not choose what runs here"

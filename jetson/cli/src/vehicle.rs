@@ -8,13 +8,12 @@ use std::process::ExitCode;
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand};
 use vizflyt_guardian::port::MavlinkAddress;
+use vizflyt_process::print_line;
 use vizflyt_protocol::mavlink::SigningKey;
 use vizflyt_runtime::airframe::ParamSession;
 use vizflyt_runtime::args::link_settings;
 use vizflyt_runtime::config::{self, JetsonConfig};
 use vizflyt_runtime::link::{LinkSettings, SigningFile};
-
-use crate::terminal::print_line;
 
 /// Which autopilot.
 #[derive(Args, Debug)]

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::hash::{BuildHasher, RandomState};
-use std::io::Read;
 use std::net::SocketAddr;
 use std::process;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,9 +13,9 @@ use std::time::Duration;
 use anyhow::Context;
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};
-use tokio::signal::unix::{SignalKind, signal};
 use vizflyt_guardian::client::BUFFER;
 use vizflyt_guardian::{Feed, Guardian, Message};
+use vizflyt_process::{on_interrupt, on_orphaned, print_line};
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{PoseSample, Purpose, bounded};
 use vizflyt_protocol::packet::feed::FeedKey;
@@ -24,7 +23,7 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
-use crate::control::{Control, ControlInput, QUEUE, print_line};
+use crate::control::{Control, ControlInput, QUEUE};
 use crate::descriptors;
 use crate::flight::FlightSettings;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
@@ -82,7 +81,8 @@ pub fn fly_command(
     let stop = Arc::new(AtomicBool::new(false));
     receive_mavlink(Arc::clone(&guardian), sender.clone(), Arc::clone(&stop))?;
     if args.lifeline {
-        watch_stdin(sender.clone())?;
+        let sender = sender.clone();
+        on_orphaned(move || _ = sender.send(ControlInput::Interrupt))?;
     }
     if let Some(reloads) = reloads {
         forward_reloads(reloads, sender.clone())?;
@@ -91,7 +91,7 @@ pub fn fly_command(
     let shared =
         Shared { clock: ServerClock::default(), mailbox: Arc::default(), readings: Arc::default() };
     let to_server = Arc::new(Outbox::default());
-    watch_signals(&tokio, sender.clone())?;
+    watch_signals(sender.clone())?;
     let settings = StreamSettings {
         server: server.address,
         fingerprint,
@@ -191,37 +191,17 @@ fn receive_mavlink(
 }
 
 /// The first signal lands and ends; the second ends at once.
-fn watch_signals(tokio: &Runtime, sender: SyncSender<ControlInput>) -> std::io::Result<()> {
-    let _context = tokio.enter();
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    let mut terminate = signal(SignalKind::terminate())?;
-    tokio.spawn(async move {
-        let mut count = 0;
-        loop {
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-            }
-            count += 1;
-            if count > 1 {
-                process::exit(CUT_SHORT);
-            }
-            tracing::info!("landing, then leaving; once more to leave at once");
-            let _ = sender.try_send(ControlInput::Interrupt);
+fn watch_signals(sender: SyncSender<ControlInput>) -> anyhow::Result<()> {
+    let mut count = 0;
+    on_interrupt(move || {
+        count += 1;
+        if count > 1 {
+            process::exit(CUT_SHORT);
         }
-    });
-    Ok(())
-}
-
-/// Ends the flight when the parent is gone.
-fn watch_stdin(sender: SyncSender<ControlInput>) -> std::io::Result<()> {
-    let watch = move || {
-        let mut buffer = [0; 256];
-        while matches!(std::io::stdin().read(&mut buffer), Ok(len) if len > 0) {}
-        let _ = sender.send(ControlInput::Interrupt);
-    };
-    thread::Builder::new().name("lifeline".into()).spawn(watch)?;
-    Ok(())
+        tracing::info!("landing, then leaving; once more to leave at once");
+        let _ = sender.try_send(ControlInput::Interrupt);
+        true
+    })
 }
 
 fn forward_reloads(reloads: Receiver<()>, sender: SyncSender<ControlInput>) -> std::io::Result<()> {

@@ -2,6 +2,7 @@
 //! by a short code; this is what the two must agree on, and neither may do in its own way.
 //!
 //! ```text
+//! hex          bytes as digits
 //! folder       the keys folder: 0700, its files 0600, written whole or not at all
 //! identity     an Ed25519 key and its self-signed certificate: server.key, runtime.key
 //! fingerprint  SHA-256 of a certificate: who somebody is
@@ -15,6 +16,7 @@
 
 pub mod fingerprint;
 pub mod folder;
+mod hex;
 pub mod identity;
 pub mod paired;
 pub mod pairing;
@@ -23,6 +25,7 @@ pub mod tls;
 
 pub use fingerprint::Fingerprint;
 pub use folder::{FileStamp, KeyError, KeysFolder};
+pub use hex::{from_hex, hex};
 pub use identity::{Identity, Owner, random_instance_id, secret};
 pub use paired::{Client, Paired, Role};
 pub use servers::{KnownServer, Servers};

@@ -1,11 +1,10 @@
 //! The end of the program: one flag that threads poll and tasks await.
 
-use std::io::Read;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
-use tokio::signal::unix::{SignalKind, signal};
+use anyhow::Result;
 use tokio::sync::watch;
+use vizflyt_process::{on_interrupt, on_orphaned};
 
 /// A request to end, shared by all threads and tasks; set once, for good.
 #[derive(Clone, Debug)]
@@ -49,31 +48,16 @@ impl Stop {
         let _ = receiver.wait_for(|set| *set).await;
     }
 
-    /// Sets the flag on SIGINT, SIGTERM, and with `lifeline` when stdin ends. Must run within
-    /// a tokio runtime.
+    /// Sets the flag on SIGINT, SIGTERM, and with `lifeline` when standard input ends.
     pub fn on_signals(&self, lifeline: bool) -> Result<()> {
-        let mut interrupt = signal(SignalKind::interrupt()).context("cannot handle SIGINT")?;
-        let mut terminate = signal(SignalKind::terminate()).context("cannot handle SIGTERM")?;
         let stop = self.clone();
-        tokio::spawn(async move {
-            tokio::select! {
-                _ = interrupt.recv() => {}
-                _ = terminate.recv() => {}
-            }
+        on_interrupt(move || {
             stop.set();
-        });
+            false
+        })?;
         if lifeline {
             let stop = self.clone();
-            // A thread of its own, never joined: a blocking read of stdin cannot be cancelled.
-            std::thread::Builder::new()
-                .name("lifeline".to_owned())
-                .spawn(move || {
-                    let mut buffer = [0; 64];
-                    let mut stdin = std::io::stdin().lock();
-                    while !matches!(stdin.read(&mut buffer), Ok(0) | Err(_)) {}
-                    stop.set();
-                })
-                .context("cannot start the thread that watches stdin")?;
+            on_orphaned(move || stop.set())?;
         }
         Ok(())
     }

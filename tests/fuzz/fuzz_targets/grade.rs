@@ -6,18 +6,9 @@ use std::collections::BTreeMap;
 use ed25519_dalek::SigningKey;
 use libfuzzer_sys::fuzz_target;
 
-// The command line is a program, no library: its parser is compiled in here.
-#[path = "../../../jetson/cli/src/grade"]
-#[allow(dead_code)]
-mod grade {
-    pub(crate) mod document;
-    pub(crate) mod merge;
-    pub(crate) mod record;
-    mod statistics;
-}
-use grade::document::{DelaysMs, Grade};
-use grade::merge::merge;
-use grade::record::{FlightRecord, FlownWith, SealingKey};
+use vizflyt_grading::document::{DelaysMs, Grade};
+use vizflyt_grading::merge::merge;
+use vizflyt_grading::record::{FlightRecord, FlownWith, SealingKey};
 
 /// A record of a flight: whatever it says, only our own counts, and only whole.
 fn record(text: &str, read: &Grade) {

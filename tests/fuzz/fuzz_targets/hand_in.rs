@@ -5,11 +5,7 @@ use std::path::{Component, Path};
 
 use libfuzzer_sys::fuzz_target;
 
-// The command line is a program, no library: its parser is compiled in here.
-#[path = "../../../jetson/cli/src/class/archive.rs"]
-#[allow(dead_code)]
-mod archive;
-use archive::{MOST_BYTES, MOST_FILES, open, pack, without_outer_folder};
+use vizflyt_grading::class::archive::{MOST_BYTES, MOST_FILES, open, pack, without_outer_folder};
 
 fuzz_target!(|bytes: &[u8]| {
     let Ok(files) = open(bytes) else { return };

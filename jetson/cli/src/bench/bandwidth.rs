@@ -6,15 +6,14 @@ use anyhow::{Result, ensure};
 use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
+use vizflyt_process::print_fmt;
 use vizflyt_protocol::geometry::{Intrinsics, Pose, body_from_forward_cam};
 use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView};
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
 use vizflyt_server::scene::{BareArgs, load, load_as_it_is};
 use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
-
-use crate::scene::camera::{self, ImageSize};
-use crate::terminal::print_fmt;
+use vizflyt_studio::scene::camera::{self, ImageSize};
 
 /// Draws views of a scene and encodes them at each level that a slow link may get; prints what they
 /// need.

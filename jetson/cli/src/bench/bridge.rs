@@ -19,6 +19,7 @@ use clap::Args;
 use nix::fcntl::OFlag;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use serde_json::{Value, json};
+use vizflyt_process::print_line;
 use vizflyt_protocol::mavlink::dialect::{
     ATTITUDE_DATA, HEARTBEAT_DATA, LOCAL_POSITION_NED_DATA, MavAutopilot, MavMessage, RAW_IMU_DATA,
     SET_POSITION_TARGET_LOCAL_NED_DATA, VISION_POSITION_ESTIMATE_DATA,
@@ -26,7 +27,6 @@ use vizflyt_protocol::mavlink::dialect::{
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
 use crate::bridge::{EmulateArgs, Emulation};
-use crate::terminal::print_line;
 
 /// Measures the latency that the emulated bridge adds, and counts what it loses.
 #[derive(Args, Clone, Debug)]

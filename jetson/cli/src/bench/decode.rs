@@ -2,10 +2,9 @@
 
 use anyhow::Result;
 use clap::Args;
+use vizflyt_process::print_fmt;
 use vizflyt_runtime::bench;
-
-use crate::scene::camera::ImageSize;
-use crate::terminal::print_fmt;
+use vizflyt_studio::scene::camera::ImageSize;
 
 /// Decodes images into the plugin's memory, on one processor; prints how long they take.
 #[derive(Args, Debug)]

@@ -9,6 +9,7 @@ use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use serde::Serialize;
 use vizflyt_arena::config::ImagingConfig;
+use vizflyt_process::print_fmt;
 use vizflyt_protocol::geometry::{Cam, Pose, World};
 use vizflyt_server::render::imaging::camera_model;
 use vizflyt_server::render::{DetailKind, RendererKind, choose};
@@ -17,10 +18,9 @@ use vizflyt_splat::imaging::events::{Event, EventCamera, EventSensor};
 use vizflyt_splat::imaging::noise::NoiseKey;
 use vizflyt_splat::imaging::{Imager, Shot};
 use vizflyt_splat::{Camera, Chosen, Rasterizer, RgbdImage};
+use vizflyt_studio::scene::camera::{self, ImageSize};
 
 use super::sheet::{Sheet, coarse, depth_color};
-use crate::scene::camera::{self, ImageSize};
-use crate::terminal::print_fmt;
 
 /// Renders one camera many times over, as sensors take it; prints milliseconds of each, and of rendering.
 #[derive(Args, Debug)]

@@ -7,6 +7,8 @@ use anyhow::{Result, bail};
 use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
+use vizflyt_process::print_fmt;
+use vizflyt_process::processor_seconds;
 use vizflyt_scenes::Variant;
 use vizflyt_server::render::environment::{atmosphere, weather};
 use vizflyt_server::render::{DetailKind, RendererKind, choose, open_packed};
@@ -16,11 +18,8 @@ use vizflyt_splat::{
     Camera, Chosen, CpuRenderer, Loading, Need, PackedScene, PassTimes, Rasterizer, RgbdImage,
     Scene,
 };
-
-use crate::scene::MEMORY_MIB;
-use crate::scene::camera::{self, ImageSize};
-use crate::terminal::print_fmt;
-use crate::usage::processor_seconds;
+use vizflyt_studio::scene::MEMORY_MIB;
+use vizflyt_studio::scene::camera::{self, ImageSize};
 
 /// Draws a scene many times over; prints milliseconds per image and pass.
 #[derive(Args, Debug)]

@@ -8,6 +8,7 @@ use clap::Args;
 use glam::{DQuat, DVec3};
 use image::{Rgb, RgbImage};
 use serde::Serialize;
+use vizflyt_process::print_fmt;
 use vizflyt_protocol::geometry::{Pose, Sensor, World, body_from_forward_cam};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::sensor::presets::{self, PRESETS, Preset};
@@ -15,10 +16,9 @@ use vizflyt_splat::sensor::{
     Beams, Lidar, LidarPoint, Motion, Radar, RangeFinder, SensorScene, Sonar,
 };
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Scene};
+use vizflyt_studio::scene::camera;
 
 use super::sheet::{Sheet, coarse, depth_color};
-use crate::scene::camera;
-use crate::terminal::print_fmt;
 
 /// Measures each named sensor many times over; prints milliseconds of each, beside an image of the same place.
 #[derive(Args, Debug)]

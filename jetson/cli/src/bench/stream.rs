@@ -21,6 +21,7 @@ use clap::Args;
 use glam::DVec3;
 use serde::Serialize;
 use vizflyt_arena::config::CameraConfig;
+use vizflyt_process::print_fmt;
 use vizflyt_protocol::geometry::{Pose, Volume};
 use vizflyt_protocol::messages::{ArenaInfo, Limits, Purpose, bounded};
 use vizflyt_protocol::packet::ImageHeader;
@@ -39,10 +40,8 @@ use vizflyt_server::stream::rate_control::Adaptation;
 use vizflyt_server::stream::subscriptions::Broadcast;
 use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_splat::RgbdImage;
+use vizflyt_studio::scene::camera::ImageSize;
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
-
-use crate::scene::camera::ImageSize;
-use crate::terminal::print_fmt;
 
 /// Streams images over loopback to a plugin; prints how long they take.
 #[derive(Args, Debug)]

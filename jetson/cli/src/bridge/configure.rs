@@ -10,10 +10,10 @@ use serde_json::{Map, Value};
 use vizflyt_bridge::access::{Op, Status};
 use vizflyt_bridge::settings::{Key, NUMBERS, TEXTS, key_from_hex, key_to_hex};
 use vizflyt_bridge::stats::REPORT;
+use vizflyt_process::print_line;
 use vizflyt_trust::KeysFolder;
 
 use super::ask::BridgeClient;
-use crate::terminal::print_line;
 
 /// Shows and changes a bridge's settings.
 #[derive(Args, Clone, Debug)]

@@ -21,13 +21,13 @@ use vizflyt_bridge::settings::{Key, key_from_hex};
 use vizflyt_bridge::stats::REPORT;
 use vizflyt_bridge::storage::Store;
 use vizflyt_bridge::{Bridge, Chip, Event, Settings};
+use vizflyt_process::{print_line, stop_flag};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 use super::flash::FileFlash;
 use super::page::Page;
 use super::port::{Port, Uart};
-use crate::terminal::{print_line, stop_flag};
 
 /// Runs the bridge's firmware on this computer.
 #[derive(Args, Clone, Debug)]

@@ -12,9 +12,8 @@ use ed25519_dalek::{Signer, SigningKey};
 use sha2::{Digest, Sha256};
 use vizflyt_bridge::settings::{Key, key_from_hex, key_to_hex};
 use vizflyt_bridge::update::{Header, MAGIC, Target};
+use vizflyt_process::print_line;
 use vizflyt_trust::KeysFolder;
-
-use crate::terminal::print_line;
 
 /// Signs a bridge's firmware, and brings it over the network.
 #[derive(Args, Clone, Debug)]
@@ -201,11 +200,12 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use std::net::TcpListener;
     use std::thread;
 
     use vizflyt_bridge::update::{Fault, HEADER};
+
+    use super::*;
 
     fn keys() -> (tempfile::TempDir, KeyArgs) {
         let folder = tempfile::tempdir().unwrap();

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use clap::Args;
 use vizflyt_guardian::port::MavlinkAddress;
+use vizflyt_process::print_line;
 use vizflyt_server::poses::drivers::{Measurement, PoseSource};
 use vizflyt_server::poses::hand_check::description::describe_pose;
 use vizflyt_server::poses::hand_check::{Change, Check, Diagnosis, Step};
@@ -18,7 +19,6 @@ use vizflyt_server::poses::{drivers, settings};
 
 use self::delay::{Delay, DelayMeter, NoDelay};
 use self::gyro::Gyro;
-use crate::terminal::print_line;
 use crate::vehicle::AutopilotArgs;
 
 /// What is looked at.

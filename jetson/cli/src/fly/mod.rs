@@ -1,21 +1,17 @@
 //! `vizflyt fly PLUGIN`: the same command in the simulated lab and in the real one. Which of the two
 //! it is, one line reports before anything is armed.
 
-mod cargo;
-pub(crate) mod plugin;
-pub(crate) mod watch;
-
 use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use clap::Args;
 use serde_json::json;
+use vizflyt_grading::plugin::{Plugin, watch};
+use vizflyt_process::print_line;
 use vizflyt_server::scene::BareArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
-use crate::terminal::print_line;
-use plugin::Plugin;
 
 /// Flies a plugin: in the simulated lab, or in the real one if `jetson.toml` or --server names a
 /// render server.
@@ -174,17 +170,4 @@ fn print_lab(json: bool, which: &str, what: &str) {
     } else {
         print_line(format!("lab         {which}: {what}"));
     }
-}
-
-/// Returns the folder of this program's sources, if it is still there: where a plugin gets the SDK.
-pub(crate) fn sources() -> Result<std::path::PathBuf> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("/"));
-    if !root.join("jetson/sdk/Cargo.toml").is_file() {
-        bail!(
-            "the sources that this program was built from are not at {}; clone {} and build the program there",
-            root.display(),
-            env!("CARGO_PKG_REPOSITORY")
-        );
-    }
-    root.canonicalize().with_context(|| format!("cannot resolve {}", root.display()))
 }

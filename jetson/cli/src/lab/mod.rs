@@ -17,11 +17,9 @@
 
 mod child;
 mod inbox;
-mod kept;
 mod keys;
 mod localization;
 mod memory;
-mod prepare;
 mod report;
 
 use std::ffi::OsString;
@@ -35,24 +33,22 @@ use clap::Args;
 use nix::sys::signal::Signal;
 use serde::Deserialize;
 use serde_json::{Value, json};
+use vizflyt_process::{on_interrupt, open_browser, print_line};
 use vizflyt_runtime::args::LogArgs;
 use vizflyt_runtime::console::{Screen, Status};
+use vizflyt_scenes::projects::{self, CourseProject, Level, NoProject};
+use vizflyt_scenes::{SceneKind, Variant};
 use vizflyt_server::render::{DetailKind, RendererKind};
 use vizflyt_server::scene::{Antialiased, BareArgs};
 use vizflyt_simulator::imu::ImuModel;
+use vizflyt_studio::stage::{Place, Stage};
 
 use self::child::{Child, Notice, Role};
 use self::inbox::Inbox;
 use self::keys::Keys;
-use vizflyt_scenes::projects::{self, CourseProject, Level, NoProject};
-use vizflyt_scenes::{SceneKind, Variant};
-
 use self::localization::Localization;
 use self::memory::MemoryWatch;
-pub(crate) use self::prepare::Stage;
 use self::report::Parts;
-use crate::terminal::{on_interrupt, open_browser, print_line};
-
 pub(crate) use self::report::Report;
 
 /// What the simulated lab looks like.
@@ -157,9 +153,22 @@ impl LabArgs {
         self.variant.unwrap_or_default()
     }
 
+    /// Returns what is flown in.
+    fn place(&self) -> Place<'_> {
+        Place {
+            scene: self.scene(),
+            project: self.project(),
+            level: self.level.unwrap_or_default(),
+            variant: self.variant.unwrap_or_default(),
+            environment: self.environment,
+            bare: self.bare,
+            seed: self.seed(),
+        }
+    }
+
     /// Returns the seed.
     pub(crate) fn seed(&self) -> u64 {
-        self.seed.unwrap_or(7)
+        self.seed.unwrap_or(Place::SEED)
     }
 }
 
@@ -194,7 +203,7 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
     let interrupted = notices.clone();
     on_interrupt(move || interrupted.send(Notice::Interrupted).is_ok())?;
     let (scene, seed) = (flight.lab.scene(), flight.lab.seed());
-    let stage = Stage::prepare(flight.lab)?;
+    let stage = Stage::prepare(&flight.lab.place())?;
     flight.lab.localization.check(stage.fence_m)?;
     if !flight.json {
         print_line(format!("scene       {scene}{}", stage.seeded(seed)));

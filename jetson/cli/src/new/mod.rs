@@ -12,14 +12,11 @@ use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use vizflyt_grading::plugin::built_in::BuiltIn;
+use vizflyt_grading::plugin::{manifest, own_python, sources};
+use vizflyt_process::print_line;
 use vizflyt_scenes::SceneKind;
 use vizflyt_scenes::projects::{self, CourseProject};
-
-use crate::fly::plugin::own_python;
-use crate::fly::sources;
-use crate::manifest;
-use crate::plugins::BuiltIn;
-use crate::terminal::print_line;
 
 /// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
 #[derive(Args, Debug)]

@@ -6,11 +6,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use vizflyt_process::{on_interrupt, print_line};
 use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, ViewOutcome};
 use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::capture;
-
-use crate::terminal::{on_interrupt, print_line};
 
 /// Finds a camera's focal lengths, principal point and distortion from images of the printed board, and
 /// writes the camera's file.

@@ -18,12 +18,12 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use serde_json::{Value, json};
+use vizflyt_process::{print_line, stop_flag};
 use vizflyt_tags::locate::{LocateOutcome, LocateSetup, Located, Locator, StampedImage, Unlocated};
 use vizflyt_tags::print::Pad;
 
 use self::sources::{CameraEvent, CameraImage, Sources};
 use self::view::LiveView;
-use crate::terminal::{print_line, stop_flag};
 
 /// Locates the vehicle by tags and sends its pose.
 #[derive(Args, Debug)]
@@ -448,11 +448,12 @@ const MAX_FIGURES: usize = 216_000;
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use glam::{DQuat, DVec3};
     use vizflyt_protocol::geometry::Pose;
     use vizflyt_protocol::time::HostTime;
     use vizflyt_tags::image::Gray;
+
+    use super::*;
 
     #[test]
     fn shots_are_cut_where_they_are_apart_and_where_a_camera_comes_again() {

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use clap::{Args, Subcommand, ValueEnum};
 use glam::{DVec2, DVec3};
+use vizflyt_process::print_line;
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::print::{
     BAR_MM, CUBE_FACES, Cube, Floor, Mat, Pad, Paper, Printed, checkerboard, pdf,
 };
 
 use super::family;
-use crate::terminal::print_line;
 
 /// Prints a cube for the vehicle, a mat for the floor, or a board or checkerboard to calibrate with: a
 /// PDF, and the layout file beside it.

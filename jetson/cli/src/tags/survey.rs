@@ -5,14 +5,13 @@ use std::path::PathBuf;
 
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand};
+use vizflyt_process::print_line;
 use vizflyt_tags::camera::{Mounting, Survey, TagCamera};
 use vizflyt_tags::capture::{self, ImageSource};
 use vizflyt_tags::detect::{Detector, DetectorSettings};
 use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{LayoutFrame, TagLayout};
 use vizflyt_tags::survey::{self, CameraImages, CubeScale, Picker};
-
-use crate::terminal::print_line;
 
 /// Measures where a mat's tags really are, and where fixed cameras are.
 #[derive(Args, Debug)]

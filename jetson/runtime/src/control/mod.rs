@@ -25,7 +25,9 @@ use std::sync::{Arc, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use plugin::PluginSide;
 use serde_json::json;
+use vizflyt_process::print_line;
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{
     CameraInfo, Event, EventKind, FlightPhase, FromPlugin, ToPlugin, bounded,
@@ -45,9 +47,6 @@ use crate::report::Counters;
 use crate::stats::ImageTimes;
 use crate::stream::{Outbox, Shared, StreamEvent};
 use crate::supervisor::{PluginEvent, PluginLimits, Stream};
-
-use plugin::PluginSide;
-pub use reporting::print_line;
 
 /// Something another thread sends to the control loop.
 #[derive(Debug)]

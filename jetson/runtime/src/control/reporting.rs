@@ -1,8 +1,7 @@
 //! What the control loop reports to server, plugin, log and console.
 
-use std::io::Write;
-
 use serde_json::json;
+use vizflyt_process::print_line;
 use vizflyt_protocol::mavlink::GuidedSetpoint;
 use vizflyt_protocol::messages::{Arrivals, Event, Guarded, MAX_CAMERAS, Telemetry};
 use vizflyt_protocol::time::HostTime;
@@ -75,10 +74,4 @@ impl ControlLoop {
             self.control.log.write(Channel::Sent, now, &message);
         }
     }
-}
-
-/// Prints a line on standard output; unlike `println!` it does not panic when nobody reads any more.
-pub fn print_line(line: impl std::fmt::Display) {
-    let mut out = std::io::stdout().lock();
-    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }

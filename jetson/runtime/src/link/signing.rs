@@ -162,7 +162,7 @@ impl SigningFile {
     /// # Errors
     /// If the file is there already, or cannot be written.
     pub fn create(&self, key: &SigningKey) -> Result<(), SigningFileError> {
-        let hex = key.bytes().iter().fold(String::new(), |hex, byte| hex + &format!("{byte:02x}"));
+        let hex = vizflyt_trust::hex(key.bytes());
         let written = OpenOptions::new()
             .write(true)
             .create_new(true)

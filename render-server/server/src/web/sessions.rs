@@ -87,13 +87,7 @@ impl Tokens {
 
     /// Returns the token of a cookie, 64 digits.
     pub(super) fn of(&self, cookie: &str) -> String {
-        use std::fmt::Write;
-        let tag = hmac::sign(&self.0, cookie.as_bytes());
-        tag.as_ref().iter().fold(String::with_capacity(64), |mut text, byte| {
-            // Why: writing to a String cannot fail.
-            let _ = write!(text, "{byte:02x}");
-            text
-        })
+        vizflyt_trust::hex(hmac::sign(&self.0, cookie.as_bytes()).as_ref())
     }
 
     /// Whether `token` is the cookie's; takes the same time whatever it is.

@@ -5,7 +5,6 @@
 //! not read, is baked anew and replaced. Files come whole (written aside, then renamed); the ones
 //! used longest ago go when the folder grows over [`MAX_BYTES`].
 
-use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -78,12 +77,7 @@ impl BakeKey {
     }
 
     fn name(&self) -> String {
-        let mut name = String::with_capacity(2 * self.0.len() + EXTENSION.len() + 1);
-        for byte in self.0 {
-            // Writing to a string does not fail.
-            let _ = write!(name, "{byte:02x}");
-        }
-        name + "." + EXTENSION
+        vizflyt_trust::hex(&self.0) + "." + EXTENSION
     }
 }
 

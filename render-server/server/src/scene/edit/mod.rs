@@ -13,13 +13,12 @@ use std::io::{ErrorKind, Read, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
+pub use list::{DoneStep, EditList, EditListError};
 use ring::digest::{Context as Hash, SHA256};
 use tracing::warn;
 use vizflyt_splat::Splats;
 use vizflyt_splat::edit::Step;
 use vizflyt_splat::format::{self, Format};
-
-pub use list::{DoneStep, EditList, EditListError};
 
 /// A scene with its steps applied.
 #[derive(Debug)]
@@ -220,11 +219,7 @@ fn hash(path: &Path) -> std::io::Result<String> {
     loop {
         let length = file.read(&mut block)?;
         if length == 0 {
-            let bytes = hash.finish();
-            return Ok(bytes
-                .as_ref()
-                .iter()
-                .fold(String::new(), |text, byte| text + &format!("{byte:02x}")));
+            return Ok(vizflyt_trust::hex(hash.finish().as_ref()));
         }
         hash.update(&block[..length]);
     }

@@ -1,0 +1,138 @@
+//! A hand-in as one ZIP. Whoever made it: it names no place outside and no link, and holds no more than [`MOST_BYTES`].
+
+use std::collections::BTreeMap;
+use std::io::{Cursor, Read, Write};
+use std::path::{Component, Path};
+
+use anyhow::{Context, Result, ensure};
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+/// All files together. [bytes]
+pub const MOST_BYTES: u64 = 200 << 20;
+/// How many they may be.
+pub const MOST_FILES: usize = 5000;
+
+/// A hand-in's files by their paths, with `/`.
+pub type Files = BTreeMap<String, Vec<u8>>;
+
+/// Makes an archive: the same files make the same bytes.
+pub fn pack(files: &Files) -> Result<Vec<u8>> {
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    let options = SimpleFileOptions::default()
+        .compression_method(CompressionMethod::Deflated)
+        .last_modified_time(zip::DateTime::default());
+    for (path, content) in files {
+        archive.start_file(path.as_str(), options)?;
+        archive.write_all(content)?;
+    }
+    Ok(archive.finish()?.into_inner())
+}
+
+/// Reads an archive that anybody may have made.
+pub fn open(bytes: &[u8]) -> Result<Files> {
+    let mut archive = ZipArchive::new(Cursor::new(bytes))?;
+    ensure!(archive.len() <= MOST_FILES, "{} files are more than {MOST_FILES}", archive.len());
+    let mut files = Files::new();
+    let mut left = MOST_BYTES;
+    for index in 0..archive.len() {
+        let part = archive.by_index(index)?;
+        let name = part.name()?.into_owned();
+        if part.is_dir() {
+            continue;
+        }
+        let is_within = !name.contains(['\\', '\0'])
+            && !name.is_empty()
+            && Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
+        ensure!(is_within, "'{}' leads out of it", name.escape_debug());
+        ensure!(part.is_file(), "'{}' is a link", name.escape_debug());
+        // What it says of its size is its own word.
+        let mut content = Vec::new();
+        part.take(left + 1).read_to_end(&mut content)?;
+        left = left
+            .checked_sub(content.len() as u64)
+            .with_context(|| format!("it holds more than {MOST_BYTES} bytes"))?;
+        let name = Path::new(&name)
+            .components()
+            .map(|part| part.as_os_str().to_string_lossy())
+            .collect::<Vec<_>>()
+            .join("/");
+        ensure!(
+            files.insert(name.clone(), content).is_none(),
+            "'{}' is there twice",
+            name.escape_debug()
+        );
+    }
+    for path in files.keys() {
+        let is_folder = path.match_indices('/').any(|(at, _)| files.contains_key(&path[..at]));
+        ensure!(!is_folder, "'{}' lies in a file", path.escape_debug());
+    }
+    Ok(files)
+}
+
+/// Takes off the folder that other programs put about all files.
+pub fn without_outer_folder(files: Files) -> Files {
+    let outer = files
+        .keys()
+        .next()
+        .and_then(|path| path.split_once('/'))
+        .map(|(outer, _)| format!("{outer}/"));
+    match outer {
+        Some(outer) if files.keys().all(|path| path.starts_with(&outer)) => files
+            .into_iter()
+            .map(|(path, content)| (path[outer.len()..].to_owned(), content))
+            .collect(),
+        _ => files,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn files(paths: &[&str]) -> Files {
+        paths.iter().map(|path| ((*path).to_owned(), path.as_bytes().to_vec())).collect()
+    }
+
+    #[test]
+    fn the_folder_about_all_files_is_taken_off() {
+        let inner = files(&["net/w.onnx", "plugin.py"]);
+        // As a file manager packs a folder.
+        let outer = inner.iter().map(|(path, content)| (format!("p4/{path}"), content.clone()));
+        assert_eq!(without_outer_folder(outer.collect()), inner);
+        assert_eq!(without_outer_folder(inner.clone()), inner);
+    }
+
+    #[test]
+    fn an_archive_leads_nowhere_else_and_grows_to_no_size() {
+        for path in ["../up", "/etc/x", "a/../../x", "a\\..\\x"] {
+            let error = open(&pack(&files(&[path])).unwrap()).unwrap_err().to_string();
+            assert!(error.contains("leads out"), "{path}: {error}");
+        }
+        let error = open(&pack(&files(&["a", "a/b"])).unwrap()).unwrap_err().to_string();
+        assert!(error.contains("lies in a file"), "{error}");
+        let bomb = BTreeMap::from([("zeros".to_owned(), vec![0; (MOST_BYTES + 1) as usize])]);
+        let bytes = pack(&bomb).unwrap();
+        assert!(bytes.len() < 1 << 20, "{}", bytes.len());
+        assert!(open(&bytes).unwrap_err().to_string().contains("holds more than"));
+        let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+        archive.add_symlink("x", "/etc/passwd", SimpleFileOptions::default()).unwrap();
+        let bytes = archive.finish().unwrap().into_inner();
+        assert!(open(&bytes).unwrap_err().to_string().contains("'x' is a link"));
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_read_or_refused(at in 0usize..300, value: u8, cut in 0usize..300) {
+            let mut bytes = pack(&files(&["plugin.py", "net/w.onnx"])).unwrap();
+            let at = at % bytes.len();
+            bytes[at] = value;
+            bytes.truncate(bytes.len() - cut % bytes.len());
+            for (path, _) in open(&bytes).into_iter().flatten() {
+                prop_assert!(Path::new(&path).components().all(|part| matches!(part, Component::Normal(_))));
+            }
+        }
+    }
+}

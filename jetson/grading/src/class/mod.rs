@@ -1,0 +1,280 @@
+//! A class's hand-ins: `vizflyt submit` makes a team's, `vizflyt grade-class` grades all of them.
+//!
+//! ```text
+//! roster.csv ── team ─▶ SUBMISSIONS/team.zip, or a folder ─▶ DIR/plugins/team ─▶ `vizflyt grade --resume`, a process of its own
+//! DIR/reports/team: each report, signed      DIR/grades.csv: the roster and what each has      DIR/index.html
+//! ```
+//! It can be ended at any time and begun again: what is graded, of the same hand-in and with the same options, is kept.
+
+pub mod archive;
+mod page;
+mod roster;
+mod submission;
+
+use std::ffi::{OsStr, OsString};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+use anyhow::{Context, Result, ensure};
+use clap::{Args, Parser};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use vizflyt_process::{print_fmt, print_line};
+use vizflyt_trust::hex;
+
+use self::roster::{Roster, Team};
+pub use self::submission::{SubmitArgs, submit};
+use crate::GradeArgs;
+use crate::{Grade, verified};
+
+/// Grades every team of a class, one after the other, and makes one table of all.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "ROSTER.csv has a line of headings, among them `team`; its other columns are kept. A team's hand-in is
+SUBMISSIONS/TEAM.zip, as `vizflyt submit` makes it, or a folder SUBMISSIONS/TEAM. Whoever has none gets 0.
+What follows DIR is for `vizflyt grade`. Begun again, it grades what is new or was changed.
+
+Examples:
+  vizflyt grade-class roster.csv submissions grades --project p4 --seeds 20 --first-seed @secret.txt
+  vizflyt grade-class --own-seeds roster.csv submissions grades --project p5 --level g"
+)]
+pub struct ClassArgs {
+    /// Each team flies courses of its own, that follow from the first seed and its name
+    #[arg(long)]
+    own_seeds: bool,
+    /// The class, a team a line
+    #[arg(value_name = "ROSTER.csv")]
+    roster: PathBuf,
+    /// Where the hand-ins are
+    #[arg(value_name = "SUBMISSIONS")]
+    submissions: PathBuf,
+    /// Where grades.csv, index.html and the teams' reports go
+    #[arg(value_name = "DIR")]
+    output: PathBuf,
+    /// Options of `vizflyt grade`, the same for all
+    #[arg(value_name = "OPTION OF GRADE", trailing_var_arg = true, allow_hyphen_values = true)]
+    options: Vec<OsString>,
+}
+
+/// What a team has.
+struct Graded<'a> {
+    team: &'a Team,
+    submission: String,
+    result: Result<Grade, String>,
+}
+
+/// Of which hand-in a report is, and how it was flown.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Flown {
+    submission_sha256: String,
+    options: Vec<String>,
+}
+
+/// Runs `vizflyt grade-class`.
+pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
+    let roster = Roster::read(&args.roster)?;
+    check_options(&args.options)?;
+    ensure!(args.submissions.is_dir(), "{} is no folder of hand-ins", args.submissions.display());
+    let program = std::env::current_exe().context("cannot find this program's path")?;
+    let mut all = Vec::with_capacity(roster.teams.len());
+    for (index, team) in roster.teams.iter().enumerate() {
+        print_fmt!("{}/{} {}", index + 1, roster.teams.len(), team.name);
+        let mut submission = String::new();
+        let result = grade_team(args, &program, team, &mut submission);
+        let result = result.map_err(|error| format!("{error:#}"));
+        if let Err(why) = &result {
+            print_fmt!("    no grade: {why}");
+        }
+        all.push(Graded { team, submission, result });
+        // After each, so that one who looks in the morning sees how far it is.
+        let table = roster.with_grades(&all)?;
+        write(&args.output.join("grades.csv"), table.as_bytes())?;
+        write(&args.output.join("index.html"), page::page(&all).as_bytes())?;
+    }
+    let graded = all.iter().filter(|one| one.result.is_ok()).count();
+    print_fmt!("{graded} of {} teams have a grade", all.len());
+    print_line(format!("table       {}", args.output.join("grades.csv").display()));
+    print_line(format!("page        {}", args.output.join("index.html").display()));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Refuses what `vizflyt grade` would refuse for every team, and what is given here.
+fn check_options(options: &[OsString]) -> Result<()> {
+    let ours = [
+        "--report", "--resume", "--output", "-o", "--json", "--least", "--junit", "--shard",
+        "--hide",
+    ];
+    for option in options {
+        let text = option.to_string_lossy();
+        let name = text.split('=').next().unwrap_or_default();
+        ensure!(
+            !ours.contains(&name),
+            "{name} is not for a class: each team has a report of its own in DIR"
+        );
+    }
+    let line =
+        ["vizflyt grade", "avoid"].map(OsString::from).into_iter().chain(options.iter().cloned());
+    if let Err(error) = GradeLine::try_parse_from(line) {
+        error.exit();
+    }
+    Ok(())
+}
+
+/// The command line of `vizflyt grade`, to check options by.
+#[derive(Parser)]
+struct GradeLine {
+    #[command(flatten)]
+    _args: GradeArgs,
+}
+
+/// Grades one team, or returns the grade that it has.
+fn grade_team(
+    args: &ClassArgs,
+    program: &Path,
+    team: &Team,
+    submission: &mut String,
+) -> Result<Grade> {
+    let found = submission::find(&args.submissions, &team.name)?;
+    *submission = found.sha256()?;
+    let mut options = args.options.clone();
+    if args.own_seeds {
+        own_seed(&mut options, &team.name)?;
+    }
+    let flown = Flown {
+        submission_sha256: submission.clone(),
+        // The secret seed stays out of it.
+        options: options.iter().map(|option| hash(option.as_encoded_bytes())).collect(),
+    };
+    let [plugin, report, kept] =
+        ["plugins", "reports", "state"].map(|folder| args.output.join(folder).join(&team.name));
+    let kept = kept.with_extension("json");
+    let grade_file = report.join("grade.json");
+    let is_same = fs::read(&kept).is_ok_and(|bytes| {
+        serde_json::from_slice(&bytes).ok().is_some_and(|old: Flown| old == flown)
+    });
+    if is_same && grade_file.is_file() {
+        match kept_grade(&grade_file, &options) {
+            Ok(grade) => return Ok(grade),
+            Err(why) => print_fmt!("    graded again: {why:#}"),
+        }
+    }
+    if !is_same || grade_file.is_file() {
+        for folder in [&plugin, &report] {
+            if folder.exists() {
+                fs::remove_dir_all(folder)
+                    .with_context(|| format!("cannot empty {}", folder.display()))?;
+            }
+        }
+        found.unpack(&plugin)?;
+        write(&kept, &serde_json::to_vec(&flown)?)?;
+    }
+    let hidden = hidden(args, &plugin)?;
+    let status = Command::new(program)
+        .arg("grade")
+        .arg(&plugin)
+        .args(&options)
+        .args([OsStr::new("--resume"), OsStr::new("--report"), report.as_os_str()])
+        .args(hidden.iter().flat_map(|path| [OsStr::new("--hide"), path.as_os_str()]))
+        .status()
+        .context("cannot start vizflyt grade")?;
+    ensure!(status.success(), "vizflyt grade ended with {status}; it says why above");
+    Grade::read(&grade_file)
+}
+
+/// Returns the grade of an earlier run, if it is as it was signed; one without a signature says so in the table.
+fn kept_grade(file: &Path, options: &[OsString]) -> Result<Grade> {
+    let grade = Grade::read(file)?;
+    if grade.signature.is_none() {
+        return Ok(grade);
+    }
+    let value = |(option, next): (&OsString, Option<&OsString>)| {
+        let text = option.to_str()?;
+        let inline = text.strip_prefix("--keys=").map(PathBuf::from);
+        inline.or_else(|| next.filter(|_| text == "--keys").map(PathBuf::from))
+    };
+    let nexts = options.iter().skip(1).map(Some).chain([None]);
+    let keys = options.iter().zip(nexts).find_map(value);
+    verified(file, None, keys.as_deref())
+}
+
+/// Returns what a team's plugin must not read: what others have handed in, and how they fared.
+fn hidden(args: &ClassArgs, plugin: &Path) -> Result<Vec<PathBuf>> {
+    let within = |folder: &Path| -> Result<Vec<PathBuf>> {
+        let read =
+            fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+        Ok(read.collect::<Result<Vec<_>, _>>()?.into_iter().map(|entry| entry.path()).collect())
+    };
+    let mut hidden = within(&args.output)?;
+    let plugins = plugin.parent().unwrap_or(plugin);
+    hidden.retain(|path| path != plugins);
+    hidden.extend(within(plugins)?.into_iter().filter(|path| path != plugin));
+    hidden.extend([args.submissions.clone(), args.roster.clone()]);
+    Ok(hidden)
+}
+
+/// Puts the team's own first seed in the place of the given one.
+fn own_seed(options: &mut Vec<OsString>, team: &str) -> Result<()> {
+    let mut given = String::from("1");
+    let mut index = 0;
+    while index < options.len() {
+        let text = options[index].to_string_lossy().into_owned();
+        if let Some(value) = text.strip_prefix("--first-seed=") {
+            value.clone_into(&mut given);
+            options.remove(index);
+        } else if text == "--first-seed" && index + 1 < options.len() {
+            given = options.remove(index + 1).to_string_lossy().into_owned();
+            options.remove(index);
+        } else {
+            index += 1;
+        }
+    }
+    if let Some(path) = given.strip_prefix('@') {
+        given = fs::read_to_string(path).with_context(|| format!("cannot read {path}"))?;
+    }
+    let digest = Sha256::digest(format!("{}\0{team}", given.trim()));
+    // 48 bits: the seeds that follow stay whole numbers everywhere.
+    let seed = digest[..6].iter().fold(0, |seed: u64, byte| seed << 8 | u64::from(*byte));
+    options.extend(["--first-seed".into(), seed.to_string().into()]);
+    Ok(())
+}
+
+fn hash(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// Writes a file whole, and its folder.
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let cannot = || format!("cannot write {}", path.display());
+    let folder = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).with_context(cannot)?;
+    let mut draft = tempfile::NamedTempFile::new_in(folder).with_context(cannot)?;
+    std::io::Write::write_all(&mut draft, bytes).with_context(cannot)?;
+    draft.persist(path).with_context(cannot)?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_teams_seeds_are_its_own_and_follow_from_the_secret() {
+        let seed = |options: &[&str], team: &str| {
+            let mut options: Vec<OsString> = options.iter().map(OsString::from).collect();
+            own_seed(&mut options, team).unwrap();
+            let text: Vec<String> =
+                options.iter().map(|o| o.to_string_lossy().into_owned()).collect();
+            assert_eq!(text.iter().filter(|o| *o == "--first-seed").count(), 1, "{text:?}");
+            text
+        };
+        let secret = ["--project", "p4", "--first-seed", "77", "--seeds", "3"];
+        let a = seed(&secret, "a");
+        assert_eq!(a[..4], ["--project", "p4", "--seeds", "3"]);
+        assert_eq!(a, seed(&secret, "a"));
+        assert_ne!(a, seed(&secret, "b"));
+        assert_ne!(seed(&["--first-seed=78"], "a").last(), a.last());
+        assert_eq!(seed(&["--first-seed=77"], "a").last(), a.last());
+        assert!(a.last().unwrap().parse::<u64>().unwrap() < 1 << 48);
+    }
+}

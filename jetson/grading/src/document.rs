@@ -1,0 +1,511 @@
+//! The grade as a document: what was graded, by what, how each flight went, and a signature over all
+//! of it. The same plugin, program, project and seeds give the same text, signature included.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::Path;
+
+use anyhow::{Context, Result, bail, ensure};
+use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use vizflyt_arena::config::EnvironmentConfig;
+pub(crate) use vizflyt_arena::points::PartPoints;
+use vizflyt_arena::points::{Figures, PointsTable};
+use vizflyt_arena::verdict::StageVerdict;
+use vizflyt_protocol::messages::OutcomeKind;
+use vizflyt_studio::shard::Shard;
+use vizflyt_trust::{from_hex, hex};
+
+use super::statistics::{Interval, mean_interval, share_interval};
+
+/// What the first field holds; another layout is another number.
+pub(crate) const FORMAT: &str = "vizflyt-grade-1";
+
+/// Seeds that are flown at most, and parts of a grade.
+pub(crate) const MAX_SEEDS: u64 = 100_000;
+/// Variants that there are at most, in this version and those to come.
+const MAX_VARIANTS: usize = 64;
+
+/// A grade.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Grade {
+    /// [`FORMAT`].
+    pub format: String,
+    /// Over the flights' hashes, in their order.
+    pub hash: String,
+    /// What was graded, and by what.
+    pub subject: Subject,
+    /// Which part of the flights this is; absent if all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shard: Option<Shard>,
+    /// The figures over all flights.
+    pub summary: Summary,
+    /// What they are worth, by the project's table; absent if it has none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub points: Vec<PartPoints>,
+    /// And over those of each variant, in their order; absent if there is one.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub by_variant: Vec<VariantSummary>,
+    /// The flights, by variant and seed.
+    pub runs: Vec<Run>,
+    /// All other files of the report's folder, by path; none without a report.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub files: Vec<SignedFile>,
+    /// Over all of the above; absent before it is signed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signature: Option<Signed>,
+}
+
+/// What was graded, and by what. Grades of the same subject can be compared and merged.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Subject {
+    /// What the command line called the plugin.
+    pub plugin: String,
+    /// SHA-256 over its files.
+    pub plugin_sha256: String,
+    /// The project's name.
+    pub project: String,
+    /// `ug` or `g`: which sensors it has.
+    pub level: String,
+    /// Variants of the surroundings that were flown, in order.
+    pub variants: Vec<String>,
+    /// What those of them were that were drawn, as `[environment]` of an arena has it.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub environments: BTreeMap<String, EnvironmentConfig>,
+    /// The first seed.
+    pub first_seed: u64,
+    /// How many seeds each variant was flown with.
+    pub seeds: u64,
+    /// What figures are worth; absent if the project says nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub points: Option<PointsTable>,
+    /// How long things took.
+    pub delays: DelaysMs,
+    /// The simulated inertial sensor; absent where it is the usual one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imu: Option<String>,
+    /// Version of this program.
+    pub program: String,
+    /// SHA-256 of this program's file.
+    pub program_sha256: String,
+    /// What drew, such as `cpu avx2`: another instruction set rounds differently.
+    pub renderer: String,
+}
+
+/// The time model. [ms]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DelaysMs {
+    /// From one image to the next.
+    pub image_period: f64,
+    /// Age of an image when the plugin gets it.
+    pub image: f64,
+    /// From then until its answer counts.
+    pub answer: f64,
+}
+
+/// How far off a flight's published estimate was; origin and heading are the plugin's choice, and found by least squares.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OdometryScore {
+    /// Estimates that were compared.
+    pub poses: usize,
+    /// Distance from the truth, root of the mean square. [m]
+    pub ate_rmse_m: f64,
+    /// The greatest. [m]
+    pub ate_max_m: f64,
+    /// How the way of each second differs, root of the mean square; absent if the estimates are of less. [m]
+    pub rpe_trans_rmse_m: Option<f64>,
+    /// And the turn. [deg]
+    pub rpe_rot_rmse_deg: Option<f64>,
+}
+
+/// One flight.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Run {
+    /// Seed of the course and of the simulator's noise.
+    pub seed: u64,
+    /// The surroundings.
+    pub variant: String,
+    /// How it ended.
+    pub outcome: OutcomeKind,
+    /// Why, in one sentence.
+    pub reason: String,
+    /// What it probably was, in words; absent if it finished.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cause: Option<String>,
+    /// How many stages were passed.
+    pub stages_passed: usize,
+    /// The stages in order.
+    pub stages: Vec<StageVerdict>,
+    /// From take-off to the end. [s]
+    pub seconds: f64,
+    /// Added for offences. [s]
+    pub penalty_s: f64,
+    /// 0 to 100.
+    pub score: f64,
+    /// Least distance of the body's surface to an obstacle. [m]
+    pub min_clearance_m: Option<f64>,
+    /// [m/s]
+    pub max_speed_mps: f64,
+    /// Way flown. [m]
+    pub path_m: f64,
+    /// Images that the plugin answered.
+    pub images: u64,
+    /// How far off the plugin's own estimate was; absent if it published none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub odometry: Option<OdometryScore>,
+    /// SHA-256 of the scene: its splats.
+    pub scene_sha256: String,
+    /// SHA-256 of its rules: `arena.toml`.
+    pub rules_sha256: String,
+    /// SHA-256 over all samples, setpoints, events and images of the flight.
+    pub hash: String,
+}
+
+/// A file of a report.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SignedFile {
+    /// Relative to the report's folder, with `/`.
+    pub path: String,
+    /// Its size. [bytes]
+    pub bytes: u64,
+    /// SHA-256 of what it holds.
+    pub sha256: String,
+}
+
+/// The figures over all flights.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Summary {
+    /// Flights.
+    pub runs: usize,
+    /// Those that finished.
+    pub finished: usize,
+    /// Share of flights that finish, 0 to 1, with its 95 % interval (Wilson).
+    pub finish_share: Interval,
+    /// Mean score, with its 95 % interval (bootstrap).
+    pub score: Interval,
+    /// Mean time of the flights that finished, penalties included. [s]
+    pub mean_finish_s: Option<f64>,
+    /// Mean of the stages passed.
+    pub mean_stages_passed: f64,
+    /// Least clearance of all flights. [m]
+    pub min_clearance_m: Option<f64>,
+}
+
+/// The figures over the flights of one variant.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VariantSummary {
+    /// The surroundings.
+    pub variant: String,
+    /// The figures.
+    pub summary: Summary,
+}
+
+/// A signature (Ed25519, RFC 8032).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Signed {
+    /// The public key, in hexadecimal.
+    pub key: String,
+    /// Over the grade's text without this field, in hexadecimal.
+    pub signature: String,
+}
+
+impl Subject {
+    /// Returns variant and seed of every flight, in their order.
+    pub fn flights(&self) -> impl Iterator<Item = (&str, u64)> {
+        let seeds = self.seeds();
+        self.variants
+            .iter()
+            .flat_map(move |variant| seeds.clone().map(move |seed| (variant.as_str(), seed)))
+    }
+
+    /// Returns the seeds that each variant is flown with.
+    pub fn seeds(&self) -> Range<u64> {
+        self.first_seed..self.first_seed.saturating_add(self.seeds)
+    }
+}
+
+impl SignedFile {
+    /// Returns what is signed of a file that holds these bytes.
+    pub fn of(path: &str, bytes: &[u8]) -> Self {
+        let sha256 = hex(&Sha256::digest(bytes));
+        Self { path: path.to_owned(), bytes: bytes.len() as u64, sha256 }
+    }
+}
+
+impl Grade {
+    /// Makes an unsigned grade of these flights.
+    pub fn new(subject: Subject, shard: Option<Shard>, mut runs: Vec<Run>) -> Self {
+        let order = |run: &Run| {
+            let variant = subject.variants.iter().position(|variant| *variant == run.variant);
+            (variant.unwrap_or(usize::MAX), run.seed)
+        };
+        runs.sort_by_key(order);
+        runs.iter_mut().for_each(Run::round);
+        Self {
+            format: FORMAT.to_owned(),
+            hash: hash_of(&runs),
+            summary: Summary::of(&runs),
+            points: points_of(&subject, &runs),
+            by_variant: by_variant(&subject, &runs),
+            subject,
+            shard,
+            runs,
+            files: Vec::new(),
+            signature: None,
+        }
+    }
+
+    /// Signs it.
+    pub fn sign(&mut self, key: &SigningKey) -> Result<()> {
+        self.signature = None;
+        let signature = key.sign(&self.bytes()?);
+        self.signature = Some(Signed {
+            key: hex(&key.verifying_key().to_bytes()),
+            signature: hex(&signature.to_bytes()),
+        });
+        Ok(())
+    }
+
+    /// Checks that the grade is as it was signed with `key`, and that its figures follow from its
+    /// flights.
+    ///
+    /// # Errors
+    /// What does not hold, in a sentence.
+    pub fn verify(&self, key: &VerifyingKey) -> Result<()> {
+        let Some(signed) = &self.signature else { bail!("the grade is not signed") };
+        let public = hex(&key.to_bytes());
+        ensure!(
+            signed.key == public,
+            "the grade is signed with the key {}, not with {public}",
+            signed.key
+        );
+        let Some(signature) = from_hex::<64>(&signed.signature) else {
+            bail!("the grade's signature is not 128 hexadecimal digits");
+        };
+        let bare = Self { signature: None, ..self.clone() };
+        key.verify_strict(&bare.bytes()?, &Signature::from_bytes(&signature))
+            .ok()
+            .context("the grade was changed after it was signed")?;
+        ensure!(self.format == FORMAT, "the grade is of the format {}", self.format);
+        ensure!(self.hash == hash_of(&self.runs), "the grade's hash is not that of its flights");
+        ensure!(
+            self.summary == Summary::of(&self.runs),
+            "the summary does not follow from the flights"
+        );
+        ensure!(
+            self.points == points_of(&self.subject, &self.runs),
+            "the points do not follow from the flights"
+        );
+        // An earlier version wrote none.
+        ensure!(
+            self.by_variant.is_empty() || self.by_variant == by_variant(&self.subject, &self.runs),
+            "the figures of the variants do not follow from the flights"
+        );
+        Ok(())
+    }
+
+    /// Returns the median time of the flights that finished, penalties included. [s]
+    pub fn median_finish_s(&self) -> Option<f64> {
+        median_of_finished(&self.runs, |run| run.seconds + run.penalty_s)
+    }
+
+    /// Returns the points, and how many there could be; none where the project says nothing.
+    pub fn all_points(&self) -> Option<(f64, f64)> {
+        let most = self.subject.points?.most();
+        Some((millionth(self.points.iter().map(|part| part.points).sum()), millionth(most)))
+    }
+
+    /// Reads a grade from a file.
+    ///
+    /// # Errors
+    /// If it cannot be read or is no grade of this format.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        Self::parse(&text).with_context(|| format!("{} is no grade", path.display()))
+    }
+
+    /// Reads a grade from its text.
+    ///
+    /// # Errors
+    /// Text that is no grade, or one of more flights or parts than are ever flown: what it says is
+    /// counted through, also before its signature holds.
+    pub fn parse(text: &str) -> Result<Self> {
+        let grade: Self = serde_json::from_str(text)?;
+        let Subject { seeds, variants, .. } = &grade.subject;
+        ensure!(
+            *seeds <= MAX_SEEDS && variants.len() <= MAX_VARIANTS,
+            "{seeds} seeds in {} variants: at most {MAX_SEEDS} and {MAX_VARIANTS}",
+            variants.len()
+        );
+        let points = grade.subject.points.as_ref();
+        points.map_or(Ok(()), PointsTable::check).map_err(anyhow::Error::msg)?;
+        if let Some(Shard { index, count }) = grade.shard {
+            ensure!(Shard::is_one(index, count), "{index}/{count} is no part");
+        }
+        check_files(&grade.files)?;
+        Ok(grade)
+    }
+
+    /// Returns the text for files and people.
+    pub fn to_text(&self) -> Result<String> {
+        Ok(serde_json::to_string_pretty(self)? + "\n")
+    }
+
+    /// Returns what is signed: the document without spaces, its fields in the order of the type.
+    fn bytes(&self) -> Result<Vec<u8>> {
+        Ok(serde_json::to_vec(self)?)
+    }
+}
+
+/// Checks that each path stays in the report's folder, and is there once, in order.
+///
+/// # Errors
+/// The first that does not.
+pub(crate) fn check_files(files: &[SignedFile]) -> Result<()> {
+    for SignedFile { path, .. } in files {
+        let is_inside = path.split('/').all(|part| !matches!(part, "" | "." | ".."));
+        ensure!(is_inside && !path.contains('\0'), "{path:?} is no file of a report");
+    }
+    let is_sorted = files.windows(2).all(|pair| pair[0].path < pair[1].path);
+    ensure!(is_sorted, "its files are not in the order of their paths, each once");
+    Ok(())
+}
+
+impl OdometryScore {
+    /// Rounds figures to what a text of them holds.
+    pub fn round(&mut self) {
+        let optional = self.rpe_trans_rmse_m.iter_mut().chain(&mut self.rpe_rot_rmse_deg);
+        for number in [&mut self.ate_rmse_m, &mut self.ate_max_m].into_iter().chain(optional) {
+            *number = millionth(*number);
+        }
+    }
+
+    /// Returns it in a sentence.
+    pub fn text(&self) -> String {
+        let relative = match (self.rpe_trans_rmse_m, self.rpe_rot_rmse_deg) {
+            (Some(m), Some(deg)) => format!("; a second's motion is off by {m:.3} m, {deg:.2} deg"),
+            _ => String::new(),
+        };
+        format!(
+            "its odometry was off by {:.3} m (rmse of {} poses, {:.3} at most){relative}",
+            self.ate_rmse_m, self.poses, self.ate_max_m
+        )
+    }
+}
+
+impl Run {
+    /// Rounds every number to a millionth: such numbers come back from any reader of JSON to the last
+    /// bit, and the signature is over the text.
+    pub fn round(&mut self) {
+        let numbers = [&mut self.seconds, &mut self.penalty_s, &mut self.score];
+        let others = [&mut self.max_speed_mps, &mut self.path_m].into_iter();
+        let optional = self.stages.iter_mut().filter_map(|stage| stage.passed_s.as_mut());
+        let optional = optional.chain(self.min_clearance_m.as_mut());
+        for number in numbers.into_iter().chain(others).chain(optional) {
+            *number = millionth(*number);
+        }
+        if let Some(odometry) = &mut self.odometry {
+            odometry.round();
+        }
+    }
+}
+
+impl Summary {
+    pub(super) fn of(runs: &[Run]) -> Self {
+        let finished: Vec<&Run> = runs.iter().filter(|run| is_finished(run)).collect();
+        let scores: Vec<f64> = runs.iter().map(|run| run.score).collect();
+        let stages: usize = runs.iter().map(|run| run.stages_passed).sum();
+        let times = finished.iter().map(|run| run.seconds + run.penalty_s);
+        let rounded = |found: Interval| Interval {
+            value: millionth(found.value),
+            low: millionth(found.low),
+            high: millionth(found.high),
+        };
+        Self {
+            runs: runs.len(),
+            finished: finished.len(),
+            finish_share: rounded(share_interval(finished.len(), runs.len())),
+            score: rounded(mean_interval(&scores)),
+            mean_finish_s: (!finished.is_empty())
+                .then(|| millionth(times.sum::<f64>() / finished.len() as f64)),
+            mean_stages_passed: millionth(stages as f64 / runs.len().max(1) as f64),
+            min_clearance_m: least_clearance_m(runs.iter()),
+        }
+    }
+}
+
+fn is_finished(run: &Run) -> bool {
+    run.outcome == OutcomeKind::Finished
+}
+
+fn least_clearance_m<'a>(runs: impl Iterator<Item = &'a Run>) -> Option<f64> {
+    runs.filter_map(|run| run.min_clearance_m).reduce(f64::min)
+}
+
+/// Returns the median of a figure of the flights that finished.
+fn median_of_finished(runs: &[Run], figure: impl Fn(&Run) -> f64) -> Option<f64> {
+    let finished = runs.iter().filter(|run| is_finished(run));
+    let mut values: Vec<f64> = finished.map(figure).collect();
+    values.sort_by(f64::total_cmp);
+    let upper = *values.get(values.len() / 2)?;
+    let lower = values[(values.len() - 1) / 2];
+    Some(millionth(f64::midpoint(lower, upper)))
+}
+
+/// Returns what the figures over these flights are worth, by the project's table.
+fn points_of(subject: &Subject, runs: &[Run]) -> Vec<PartPoints> {
+    let Some(table) = &subject.points else { return Vec::new() };
+    let summary = Summary::of(runs);
+    table.parts(&Figures {
+        score: summary.score.value,
+        time_s: summary.mean_finish_s,
+        clearance_m: least_clearance_m(runs.iter().filter(|run| is_finished(run))),
+        speed_mps: median_of_finished(runs, |run| run.max_speed_mps),
+    })
+}
+
+/// Returns the figures of each variant that was flown, where there are several.
+fn by_variant(subject: &Subject, runs: &[Run]) -> Vec<VariantSummary> {
+    if subject.variants.len() < 2 {
+        return Vec::new();
+    }
+    let of = |variant: &String| {
+        let runs: Vec<Run> = runs.iter().filter(|run| run.variant == *variant).cloned().collect();
+        let summary = Summary::of(&runs);
+        (!runs.is_empty()).then(|| VariantSummary { variant: variant.clone(), summary })
+    };
+    subject.variants.iter().filter_map(of).collect()
+}
+
+/// Returns the hash over the flights.
+fn hash_of(runs: &[Run]) -> String {
+    let mut hash = Sha256::new();
+    for run in runs {
+        // Lengths are fixed or written, so that no two lists give the same bytes.
+        hash.update(run.seed.to_le_bytes());
+        hash.update((run.variant.len() as u64).to_le_bytes());
+        hash.update(run.variant.as_bytes());
+        hash.update((run.hash.len() as u64).to_le_bytes());
+        hash.update(run.hash.as_bytes());
+    }
+    hex(&hash.finalize())
+}
+
+/// Rounds to a millionth.
+pub(super) fn millionth(number: f64) -> f64 {
+    (number * 1e6).round() / 1e6
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

@@ -1,0 +1,192 @@
+//! Whose word a grade is: the key that it is signed with, and what the plugin and this program are.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use ed25519_dalek::{SigningKey, VerifyingKey};
+use sha2::{Digest, Sha256};
+use vizflyt_trust::{KeysFolder, from_hex, hex};
+
+/// The file of the folder of keys that holds the secret, as 64 hexadecimal digits.
+const KEY_FILE: &str = "grading.key";
+/// What no plugin is made of: what builds and interpreters leave behind.
+const LEFT_ASIDE: [&str; 4] = ["target", "__pycache__", "node_modules", "venv"];
+/// A plugin of more files than this is some other folder.
+const MAX_FILES: usize = 20_000;
+
+/// Returns the key that grades are signed with; the first grade makes it.
+pub(crate) fn signing_key(keys: Option<&Path>) -> Result<SigningKey> {
+    let folder = KeysFolder::open(keys)?;
+    if let Some(key) = read_key(&folder)? {
+        return Ok(key);
+    }
+    let mut secret = [0; 32];
+    File::open("/dev/urandom")
+        .and_then(|mut file| file.read_exact(&mut secret))
+        .context("no random numbers from /dev/urandom")?;
+    folder.write(KEY_FILE, &format!("{}\n", hex(&secret)))?;
+    // Of two that made one at the same time, the later counts for both.
+    read_key(&folder)?.context("the key that was just written is not there")
+}
+
+fn read_key(folder: &KeysFolder) -> Result<Option<SigningKey>> {
+    let Some(text) = folder.read_secret(KEY_FILE)? else { return Ok(None) };
+    let Some(secret) = from_hex::<32>(text.trim()) else {
+        bail!("{}: not 64 hexadecimal digits", folder.file(KEY_FILE).display());
+    };
+    Ok(Some(SigningKey::from_bytes(&secret)))
+}
+
+/// Returns the key that grades are to be signed with: as given, in hexadecimal or in a file; else this
+/// computer's own.
+pub(crate) fn verifying_key(given: Option<&str>, keys: Option<&Path>) -> Result<VerifyingKey> {
+    let Some(given) = given else {
+        let own = read_key(&KeysFolder::open(keys)?)?;
+        let own = own.context(
+            "this computer has graded nothing yet; say with --key whose grades are to be trusted: the \
+             key that `vizflyt grade key` prints where they were made",
+        )?;
+        return Ok(own.verifying_key());
+    };
+    let text = if Path::new(given).is_file() {
+        fs::read_to_string(given).with_context(|| format!("cannot read {given}"))?
+    } else {
+        given.to_owned()
+    };
+    // As a person may have copied it.
+    let bytes = from_hex::<32>(&text.trim().to_ascii_lowercase());
+    let bytes = bytes.with_context(|| format!("--key {given}: not 64 hexadecimal digits"))?;
+    let key = VerifyingKey::from_bytes(&bytes).ok();
+    key.with_context(|| format!("--key {given}: that is no key"))
+}
+
+/// Returns the SHA-256 of this program's file.
+pub(crate) fn program_sha256() -> Result<String> {
+    let path = std::env::current_exe().context("cannot find this program's path")?;
+    let mut hash = Sha256::new();
+    update(&mut hash, &path)?;
+    Ok(hex(&hash.finalize()))
+}
+
+/// Returns the SHA-256 over a plugin's files: names and contents, in the order of their names. What a grade itself writes
+/// is none of them, wherever it lies: `outputs`.
+pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
+    let mut files = Vec::new();
+    if path.is_dir() {
+        let outputs: Vec<PathBuf> =
+            outputs.iter().filter_map(|output| output.canonicalize().ok()).collect();
+        gather(path, &outputs, &mut files)?;
+        files.sort();
+    } else {
+        files.push(found(path));
+    }
+    let mut hash = Sha256::new();
+    for file in &files {
+        let name = file.strip_prefix(path).ok().filter(|name| !name.as_os_str().is_empty());
+        let name = name.unwrap_or(file.file_name().map_or(path, Path::new)).to_string_lossy();
+        let len = fs::metadata(file).with_context(|| format!("{}", file.display()))?.len();
+        // Lengths first, so that no two folders give the same bytes.
+        hash.update((name.len() as u64).to_le_bytes());
+        hash.update(name.as_bytes());
+        hash.update(len.to_le_bytes());
+        update(&mut hash, file)?;
+    }
+    Ok(hex(&hash.finalize()))
+}
+
+/// Returns where a bare name is on the path.
+fn found(name: &Path) -> PathBuf {
+    if name.exists() {
+        return name.to_owned();
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let mut places = std::env::split_paths(&path).map(|folder| folder.join(name));
+    places.find(|place| place.is_file()).unwrap_or_else(|| name.to_owned())
+}
+
+fn gather(folder: &Path, outputs: &[PathBuf], files: &mut Vec<PathBuf>) -> Result<()> {
+    let entries = fs::read_dir(folder).with_context(|| format!("{}", folder.display()))?;
+    for entry in entries {
+        let entry = entry.with_context(|| format!("{}", folder.display()))?;
+        let (name, kind) = (entry.file_name(), entry.file_type()?);
+        let name = name.to_string_lossy();
+        if name.starts_with('.') || LEFT_ASIDE.contains(&name.as_ref()) {
+            continue;
+        }
+        if !outputs.is_empty()
+            && entry.path().canonicalize().is_ok_and(|path| outputs.contains(&path))
+        {
+            continue;
+        }
+        // A link is what it leads to, but not a way out or round: links to folders are left aside.
+        if kind.is_dir() {
+            gather(&entry.path(), outputs, files)?;
+        } else if entry.path().is_file() {
+            files.push(entry.path());
+        }
+        if files.len() > MAX_FILES {
+            bail!("{} holds more than {MAX_FILES} files; is it a plugin's?", folder.display());
+        }
+    }
+    Ok(())
+}
+
+fn update(hash: &mut Sha256, path: &Path) -> Result<()> {
+    let mut file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
+    std::io::copy(&mut file, hash).with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_key_is_made_once_and_is_secret() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o700)).unwrap();
+        let keys = Some(folder.path());
+        assert!(verifying_key(None, keys).unwrap_err().to_string().contains("--key"));
+        let key = signing_key(keys).unwrap();
+        assert_eq!(signing_key(keys).unwrap().to_bytes(), key.to_bytes());
+        let mode = folder.path().join(KEY_FILE).metadata().unwrap().permissions().mode();
+        assert_eq!(mode & 0o077, 0);
+        let public = key.verifying_key();
+        assert_eq!(verifying_key(None, keys).unwrap(), public);
+        assert_eq!(verifying_key(Some(&hex(&public.to_bytes())), None).unwrap(), public);
+        for wrong in ["", "12", &"zz".repeat(32)] {
+            assert!(verifying_key(Some(wrong), None).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_plugin_is_its_files_and_not_what_builds_leave_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| {
+            let path = folder.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        };
+        write("plugin.py", "import vizflyt");
+        write("lib/steer.py", "x = 1");
+        let out = folder.path().join("out");
+        let hash = || plugin_sha256(folder.path(), &[&out]).unwrap();
+        let first = hash();
+        write("__pycache__/plugin.pyc", "1");
+        write(".venv/lib/numpy.py", "2");
+        write("target/release/plugin", "3");
+        write("out/flights/day-1.json", "4");
+        assert_eq!(hash(), first);
+        write("lib/steer.py", "x = 2");
+        let second = hash();
+        assert_ne!(second, first);
+        // The same bytes under another name are another plugin.
+        fs::rename(folder.path().join("lib"), folder.path().join("lib2")).unwrap();
+        assert_ne!(hash(), second);
+        assert_ne!(plugin_sha256(&folder.path().join("plugin.py"), &[]).unwrap(), first);
+        assert!(plugin_sha256(&folder.path().join("gone.py"), &[]).is_err());
+    }
+}

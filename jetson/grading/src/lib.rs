@@ -1,0 +1,142 @@
+//! `vizflyt grade`: flies a plugin through a project's course, once for each seed, and scores
+//! it.
+//!
+//! ```text
+//! project, level, variant, seed -> course  in memory: splats, arena, distance field
+//!                               -> trial   one flight in lock-step, a plugin process of its own
+//!                               -> vizflyt_arena::crash  what a failure probably was
+//! each flight                   -> folder    its card's images, its log, its record (record)
+//! flights                       -> document  figures, points, hash, signature -> report/, junit, JSON
+//! an earlier grade              -> changes   what is better and worse; `--watch` (watch) flies again and again
+//! parts of a grade              -> merge     the whole
+//! ```
+//! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
+
+mod args;
+mod changes;
+pub mod class;
+pub mod document;
+mod figures;
+mod finished;
+mod flights;
+mod folder;
+mod judge;
+mod junit;
+mod keys;
+pub mod merge;
+mod odometry;
+pub mod plugin;
+mod pool;
+mod progress;
+pub mod record;
+mod report;
+mod statistics;
+mod trial;
+mod watch;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, ensure};
+use vizflyt_process::print_line;
+use vizflyt_trust::hex;
+
+pub use self::args::GradeArgs;
+use self::args::{GradeCommand, ResultArgs};
+pub use self::document::Grade;
+use self::folder::ReportFolder;
+
+/// Does what was asked for.
+pub fn run(args: &GradeArgs) -> Result<ExitCode> {
+    match &args.command {
+        None if args.fly.watch => watch::watch(&args.fly),
+        None => flights::grade(&args.fly),
+        Some(GradeCommand::Verify { file, junit, key, keys }) => {
+            let is_folder = file.is_dir();
+            let document = if is_folder { file.join(folder::GRADE) } else { file.clone() };
+            let grade = verified(&document, key.as_deref(), keys.as_deref())?;
+            if is_folder {
+                let cannot = || format!("{} does not count", file.display());
+                folder::verify(file, &grade).with_context(cannot)?;
+            }
+            if let Some(path) = junit {
+                junit::verify(path, &grade)?;
+            }
+            print_line(format!(
+                "{}: as signed with {}; score {:.1}, {} of {} finished",
+                file.display(),
+                grade.signature.as_ref().map_or("", |signed| &signed.key),
+                grade.summary.score.value,
+                grade.summary.finished,
+                grade.summary.runs
+            ));
+            match grade.files.len() {
+                0 => {}
+                count if is_folder => print_line(format!("all {count} files are as signed")),
+                count => print_line(format!(
+                    "the report's {count} files were not looked at: give its folder for that"
+                )),
+            }
+            Ok(ExitCode::SUCCESS)
+        }
+        Some(GradeCommand::Merge { files, key, report, result }) => {
+            let read = |path: &PathBuf| Ok((path.display().to_string(), Grade::read(path)?));
+            let parts = files.iter().map(read).collect::<Result<Vec<_>>>()?;
+            let key = keys::verifying_key(key.as_deref(), result.keys.as_deref())?;
+            let mut grade = merge::merge(&parts, &key)?;
+            check_outputs(report.as_deref(), result, None)?;
+            let folder = report.as_deref().map(ReportFolder::begin).transpose()?;
+            let key = keys::signing_key(result.keys.as_deref())?;
+            if let Some(folder) = &folder {
+                let cards: Vec<String> =
+                    grade.runs.iter().map(report::card::without_images).collect();
+                report::write(folder, &mut grade, Some(&key), &cards, Vec::new())?;
+            } else {
+                grade.sign(&key)?;
+            }
+            figures::hand_over(&grade, result)?;
+            if let (Some(folder), false) = (report, result.json) {
+                print_line(format!("report      {}", folder.join(folder::PAGE).display()));
+            }
+            Ok(ExitCode::SUCCESS)
+        }
+        Some(GradeCommand::Judge(args)) => judge::run(args),
+        Some(GradeCommand::Key { keys }) => {
+            print_line(hex(&keys::signing_key(keys.as_deref())?.verifying_key().to_bytes()));
+            Ok(ExitCode::SUCCESS)
+        }
+    }
+}
+
+/// Returns the grade of a file if it is as it was signed with a key: as given, in hexadecimal or in a
+/// file; else this computer's own.
+///
+/// # Errors
+/// What does not hold, in a sentence.
+pub fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> Result<Grade> {
+    let grade = Grade::read(file)?;
+    let key = keys::verifying_key(key, keys)?;
+    grade.verify(&key).with_context(|| format!("{} does not count", file.display()))?;
+    Ok(grade)
+}
+
+/// Checks that what else is written does not lie in the report's folder, where all is signed.
+fn check_outputs(report: Option<&Path>, result: &ResultArgs, junit: Option<&Path>) -> Result<()> {
+    let Some(root) = report else { return Ok(()) };
+    let made = std::fs::create_dir_all(root).and_then(|()| root.canonicalize());
+    let root = made.with_context(|| format!("cannot make {}", root.display()))?;
+    let outputs = [("--output", result.output.as_deref(), folder::GRADE)];
+    for (option, path, own) in outputs.into_iter().chain([("--junit", junit, folder::JUNIT)]) {
+        let Some(path) = path else { continue };
+        let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+        let parent = parent.unwrap_or(Path::new(".")).canonicalize();
+        let Ok(parent) = parent else { continue };
+        let is_own = parent == root && path.file_name() == Some(own.as_ref());
+        ensure!(
+            is_own || !parent.starts_with(&root),
+            "{option} {}: all that lies in a report is signed, and it holds {own} already; give another folder",
+            path.display()
+        );
+    }
+    Ok(())
+}

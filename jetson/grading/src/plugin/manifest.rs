@@ -1,0 +1,129 @@
+//! `vizflyt.toml`: what a student's folder flies, and where.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use serde::Deserialize;
+use vizflyt_scenes::projects::{CourseProject, Level};
+
+/// The whole of `vizflyt.toml`.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PluginManifest {
+    /// The plugin: `plugin.py`, `Cargo.toml`, or a program; relative to the folder.
+    pub plugin: PathBuf,
+    /// The simulated lab it flies in.
+    #[serde(default)]
+    pub lab: LabConfig,
+}
+
+/// `[lab]`: the simulated lab; the command line goes before it.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LabConfig {
+    /// A generated scene; or the path of a scene folder, an arena.toml or a scene file, relative to the
+    /// folder.
+    pub scene: Option<String>,
+    /// Instead of a scene, a project of the course, or the path of one's file, relative to the folder.
+    project: Option<String>,
+    /// Level of the project: ug or g.
+    level: Option<String>,
+    /// Seed of the generated scene and of the simulator's noise.
+    pub seed: Option<u64>,
+}
+
+impl LabConfig {
+    /// Returns the name of the course's project, if one is flown.
+    ///
+    /// # Errors
+    /// If no project has this name, or a scene is given too.
+    pub fn project(&self) -> Result<Option<String>> {
+        let Some(name) = &self.project else { return Ok(None) };
+        if self.scene.is_some() {
+            bail!("{FILE} gives both a scene and the project '{name}'; remove one of them");
+        }
+        CourseProject::find(name).with_context(|| FILE.to_owned())?;
+        Ok(Some(name.clone()))
+    }
+
+    /// Returns the level, if one is given.
+    ///
+    /// # Errors
+    /// If there is no such level.
+    pub fn level(&self) -> Result<Option<Level>> {
+        self.level
+            .as_deref()
+            .map(|level| level.parse().with_context(|| FILE.to_owned()))
+            .transpose()
+    }
+}
+
+/// Its file's name.
+pub const FILE: &str = "vizflyt.toml";
+
+impl PluginManifest {
+    /// Reads the file in `folder`; `None` if there is none. Paths are returned from here.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or has settings that it must not have.
+    pub fn read(folder: &Path) -> Result<Option<Self>> {
+        let file = folder.join(FILE);
+        if !file.is_file() {
+            return Ok(None);
+        }
+        let text = std::fs::read_to_string(&file)
+            .with_context(|| format!("cannot read {}", file.display()))?;
+        let mut manifest = Self::parse(&text).with_context(|| format!("{}", file.display()))?;
+        manifest.plugin = folder.join(&manifest.plugin);
+        let LabConfig { scene, project, .. } = &mut manifest.lab;
+        // A project's file; its name is no place.
+        let is_file =
+            |name: &&mut String| Path::new(&**name).extension().is_some_and(|end| end == "toml");
+        let project = project.iter_mut().filter(is_file);
+        for place in scene.iter_mut().chain(project) {
+            if folder.join(&*place).exists() {
+                *place = folder.join(&*place).display().to_string();
+            }
+        }
+        Ok(Some(manifest))
+    }
+
+    /// Parses the manifest in `text`.
+    fn parse(text: &str) -> Result<Self> {
+        Ok(vizflyt_toml::parse(text)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_are_relative_to_the_folder() {
+        let root = tempfile::tempdir().unwrap();
+        assert_eq!(PluginManifest::read(root.path()).unwrap(), None);
+        let text = "plugin = \"plugin.py\"\n[lab]\nscene = \"forest\"\nseed = 3\n";
+        std::fs::write(root.path().join(FILE), text).unwrap();
+        let manifest = PluginManifest::read(root.path()).unwrap().unwrap();
+        assert_eq!(manifest.plugin, root.path().join("plugin.py"));
+        assert_eq!((manifest.lab.scene.as_deref(), manifest.lab.seed), (Some("forest"), Some(3)));
+        std::fs::create_dir(root.path().join("forest")).unwrap();
+        let manifest = PluginManifest::read(root.path()).unwrap().unwrap();
+        assert_eq!(manifest.lab.scene, Some(root.path().join("forest").display().to_string()));
+        let own = "plugin = \"plugin.py\"\n[lab]\nproject = \"own.toml\"\n";
+        std::fs::write(root.path().join(FILE), own).unwrap();
+        std::fs::write(root.path().join("own.toml"), "title = 1").unwrap();
+        let manifest = PluginManifest::read(root.path()).unwrap().unwrap();
+        let error = format!("{:#}", manifest.lab.project().unwrap_err());
+        assert!(error.contains(&root.path().join("own.toml").display().to_string()), "{error}");
+        for (text, part) in [
+            ("", "plugin"),
+            ("plugin = \"a\"\n[lab]\nscen = \"x\"\n", "did you mean 'scene'"),
+            ("plugin = \"a\"\n[lap]\n", "did you mean 'lab'"),
+            ("plugin = \"a\"\n[lab]\nseed = -1\n", "line 3"),
+        ] {
+            let error = format!("{:#}", PluginManifest::parse(text).unwrap_err());
+            assert!(error.contains(part), "{text:?}: {error}");
+        }
+    }
+}

@@ -1,0 +1,346 @@
+//! What PLUGIN is, and the command that starts it.
+//!
+//! ```text
+//! avoid                 a built-in: this program again, as `vizflyt plugin avoid`
+//! first/                by first/vizflyt.toml (made by `vizflyt new`); or a Cargo project; or plugin.py
+//! first/plugin.py       the python3 of its own .venv, else that which this program was installed into, else the one on PATH
+//! target/release/first  a program; a bare name is looked up on PATH
+//! ```
+
+pub mod built_in;
+mod cargo;
+pub mod manifest;
+pub mod watch;
+
+use std::ffi::{OsStr, OsString};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
+
+use self::built_in::BuiltIn;
+use self::manifest::{LabConfig, PluginManifest};
+
+/// A plugin that was found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plugin {
+    name: OsString,
+    kind: Kind,
+    lab: Option<LabConfig>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Kind {
+    BuiltIn,
+    /// A file of Python.
+    Script(PathBuf),
+    /// The folder of a Cargo.toml.
+    Cargo(PathBuf),
+    Program,
+}
+
+impl Plugin {
+    /// Finds out what `name` is. Starts and builds nothing.
+    ///
+    /// # Errors
+    /// If it is nothing that can be flown.
+    pub fn find(name: &OsStr) -> Result<Self> {
+        let found = |kind, lab| Ok(Self { name: name.to_owned(), kind, lab });
+        let path = Path::new(name);
+        let is_bare = path.components().count() == 1 && !name.to_string_lossy().contains('/');
+        if is_bare && BuiltIn::find(&name.to_string_lossy()).is_some() {
+            return found(Kind::BuiltIn, None);
+        }
+        if path.is_dir() {
+            if let Some(manifest) = PluginManifest::read(path)? {
+                return found(kind_of(&manifest.plugin)?, Some(manifest.lab));
+            }
+            for file in ["Cargo.toml", "plugin.py"] {
+                if path.join(file).is_file() {
+                    return found(kind_of(&path.join(file))?, None);
+                }
+            }
+            bail!(
+                "{} is a folder without vizflyt.toml, Cargo.toml or plugin.py; `vizflyt new NAME` \
+                 makes one that flies",
+                path.display()
+            );
+        }
+        if path.is_file() {
+            return found(kind_of(path)?, None);
+        }
+        if is_bare && on_path(name) {
+            return found(Kind::Program, None);
+        }
+        bail!(
+            "there is no plugin at {}; give a folder made by `vizflyt new`, a .py file, a program, \
+             or a built-in: {}",
+            path.display(),
+            BuiltIn::names()
+        )
+    }
+
+    /// Returns what the command line called it.
+    pub fn name(&self) -> &OsStr {
+        &self.name
+    }
+
+    /// Returns the simulated lab that its manifest asks for.
+    pub fn lab(&self) -> Option<&LabConfig> {
+        self.lab.as_ref()
+    }
+
+    /// Returns the file or folder whose change means another plugin.
+    pub fn watched(&self) -> PathBuf {
+        match &self.kind {
+            Kind::BuiltIn => std::env::current_exe().unwrap_or_default(),
+            Kind::Program => PathBuf::from(&self.name),
+            Kind::Cargo(folder) => folder.clone(),
+            // What it imports lies beside it.
+            Kind::Script(script) => match script.parent() {
+                Some(folder) if folder != Path::new("") => folder.to_owned(),
+                _ => PathBuf::from("."),
+            },
+        }
+    }
+
+    /// Returns the command that starts it under `limits`. A script is checked and a Cargo project is built first, confined
+    /// as in flight: what runs then is student code too.
+    ///
+    /// # Errors
+    /// A build that fails, a Python without the package `vizflyt`.
+    pub fn command(&self, limits: &PluginLimits) -> Result<Vec<OsString>> {
+        match &self.kind {
+            Kind::BuiltIn => {
+                let program = std::env::current_exe().context("cannot find this program's path")?;
+                Ok(vec![program.into(), "plugin".into(), self.name.clone()])
+            }
+            Kind::Program => {
+                let path = Path::new(&self.name);
+                // A graded plugin starts in another folder; what is on PATH is looked up there.
+                Ok(vec![if path.is_file() { absolute(path)?.into() } else { self.name.clone() }])
+            }
+            Kind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
+            Kind::Script(script) => {
+                let path = absolute(script)?;
+                let python = python_of(&path);
+                check_python(&python, script, limits)?;
+                // Unbuffered: a print is seen when it is made, not when 8 kB are full.
+                Ok(vec![python.into(), "-u".into(), path.into()])
+            }
+        }
+    }
+}
+
+fn absolute(path: &Path) -> Result<PathBuf> {
+    std::path::absolute(path).context("cannot find the working folder")
+}
+
+/// Returns what an existing file is.
+fn kind_of(path: &Path) -> Result<Kind> {
+    use std::os::unix::fs::PermissionsExt;
+    if !path.is_file() {
+        bail!("there is no file {}", path.display());
+    }
+    if path.file_name() == Some(OsStr::new("Cargo.toml")) {
+        return Ok(Kind::Cargo(path.parent().unwrap_or(Path::new(".")).to_owned()));
+    }
+    if path.extension() == Some(OsStr::new("py")) {
+        return Ok(Kind::Script(path.to_owned()));
+    }
+    let mode = path.metadata().with_context(|| format!("{}", path.display()))?.permissions().mode();
+    if mode & 0o111 == 0 {
+        bail!("{0} is neither a .py file nor a program; try `chmod +x {0}`", path.display());
+    }
+    Ok(Kind::Program)
+}
+
+fn on_path(name: &OsStr) -> bool {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
+}
+
+/// Returns the interpreter of the script's own virtual environment, else that which this program was installed into,
+/// else the one on PATH.
+fn python_of(script: &Path) -> PathBuf {
+    let own = script.parent().unwrap_or(Path::new("")).join(".venv/bin/python3");
+    if own.exists() { own } else { own_python().unwrap_or_else(|| "python3".into()) }
+}
+
+/// Returns the interpreter beside this program, if `pip install` has put the program there.
+pub fn own_python() -> Option<PathBuf> {
+    let program = std::env::current_exe().ok()?;
+    let python = program.with_file_name("python3");
+    let libraries = program.parent()?.parent()?.join("lib").read_dir().ok()?;
+    let has_package = |library: PathBuf| library.join("site-packages/vizflyt").is_dir();
+    let is_there = libraries.flatten().any(|library| has_package(library.path()));
+    (is_there && python.exists()).then_some(python)
+}
+
+/// Compiles the script, then finds the package as the script will: its own folder is the first that
+/// Python looks in.
+const CHECK: &str = "
+import sys
+try:
+    compile(open(sys.argv[1], 'rb').read(), sys.argv[1], 'exec')
+except (SyntaxError, ValueError) as error:
+    import traceback
+    sys.exit('cannot be compiled\\n' + ''.join(traceback.format_exception_only(error)))
+sys.path.insert(0, sys.argv[2])
+import vizflyt
+vizflyt.run
+";
+
+/// A package with a large library beside it, from a slow disk.
+const CHECK_WITHIN: Duration = Duration::from_mins(2);
+
+/// Finds out whether the plugin is Python and will find the package, before anything is started for it.
+fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<()> {
+    let folder = script.parent().unwrap_or(Path::new(""));
+    if folder.join("vizflyt.py").exists() {
+        bail!(
+            "{} hides the package vizflyt from your plugin; give the file another name",
+            folder.join("vizflyt.py").display()
+        );
+    }
+    // As a person named it, it stands in messages.
+    let path = absolute(script)?;
+    let folder = path.parent().unwrap_or(Path::new("/"));
+    let confinement = Confinement::prepare(limits, &[python.into(), path.clone().into()]);
+    let mut check = confinement.command(python);
+    check.args(["-c", CHECK]).args([&path, folder]);
+    check.stdout(Stdio::null()).stderr(Stdio::piped());
+    let output = match confinement.run(check, CHECK_WITHIN) {
+        Ok(output) => output,
+        Err(error) if error.kind() == io::ErrorKind::TimedOut => {
+            bail!("{} cannot be checked: {error}", script.display())
+        }
+        Err(error) => bail!(
+            "{} is written in Python, and {} cannot be started: {error}; on Debian and Ubuntu: \
+             sudo apt install python3 python3-venv",
+            script.display(),
+            python.display()
+        ),
+    };
+    if output.status.success() {
+        return Ok(());
+    }
+    let words = String::from_utf8_lossy(&output.stderr);
+    if let Some(mistake) = words.strip_prefix("cannot be compiled\n") {
+        bail!("{} is not Python:\n{}", script.display(), mistake.trim_end());
+    }
+    let last = words.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
+    if let Some(user) = confinement.user_id().filter(|_| last.contains("PermissionError")) {
+        bail!(
+            "{last}: a plugin that root starts runs as another user (uid {user}), who must be able to read it; \
+             `chmod -R a+rX {}` lets everybody",
+            folder.display()
+        );
+    }
+    let venv = folder.join(".venv");
+    let package = match sources() {
+        Ok(root) => root.join("jetson/python").display().to_string(),
+        Err(_) => "vizflyt".to_owned(),
+    };
+    bail!(
+        "{} cannot import the package vizflyt ({last}); install it with `python3 -m venv {venv} && \
+         {venv}/bin/pip install {package}`",
+        python.display(),
+        venv = venv.display(),
+    )
+}
+
+/// Returns the folder of this program's sources, if it is still there: where a plugin gets the SDK.
+pub fn sources() -> Result<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("/"));
+    if !root.join("jetson/sdk/Cargo.toml").is_file() {
+        bail!(
+            "the sources that this program was built from are not at {}; clone {} and build the program there",
+            root.display(),
+            env!("CARGO_PKG_REPOSITORY")
+        );
+    }
+    root.canonicalize().with_context(|| format!("cannot resolve {}", root.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn refused(name: &Path, parts: &[&str]) {
+        let error = format!("{:#}", Plugin::find(name.as_os_str()).unwrap_err());
+        for part in parts {
+            assert!(error.contains(part), "{} does not contain {part:?}: {error}", name.display());
+        }
+    }
+
+    #[test]
+    fn plugins_are_distinguished() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;
+        assert_eq!(kind(Path::new("avoid")), Kind::BuiltIn);
+        assert_eq!(kind(Path::new("sh")), Kind::Program, "on PATH");
+        refused(&path("none"), &["there is no plugin at", "none", "avoid"]);
+        refused(Path::new("no-such-program"), &["there is no plugin at no-such-program"]);
+        refused(folder.path(), &["folder without", "vizflyt new"]);
+
+        fs::write(path("plugin.py"), "").unwrap();
+        assert_eq!(kind(folder.path()), Kind::Script(path("plugin.py")));
+        assert_eq!(kind(&path("plugin.py")), Kind::Script(path("plugin.py")));
+        fs::write(path("Cargo.toml"), "").unwrap();
+        assert_eq!(kind(folder.path()), Kind::Cargo(folder.path().to_owned()));
+        fs::write(path("vizflyt.toml"), "plugin = \"plugin.py\"\n[lab]\nscene = \"room\"\n")
+            .unwrap();
+        let plugin = Plugin::find(folder.path().as_os_str()).unwrap();
+        assert_eq!(plugin.kind, Kind::Script(path("plugin.py")));
+        assert_eq!(plugin.lab().unwrap().scene.as_deref(), Some("room"));
+
+        fs::write(path("notes.txt"), "").unwrap();
+        refused(&path("notes.txt"), &["neither", "chmod +x"]);
+        fs::write(path("vizflyt.toml"), "plugin = \"gone.py\"\n").unwrap();
+        refused(folder.path(), &["no file", "gone.py"]);
+        fs::write(path("vizflyt.toml"), "plugins = \"gone.py\"\n").unwrap();
+        refused(folder.path(), &["vizflyt.toml", "did you mean 'plugin'"]);
+    }
+
+    #[test]
+    fn a_folder_with_its_own_python_uses_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        assert_eq!(python_of(&script), Path::new("python3"));
+        fs::create_dir_all(folder.path().join(".venv/bin")).unwrap();
+        let own = folder.path().join(".venv/bin/python3");
+        fs::write(&own, "").unwrap();
+        assert_eq!(python_of(&script), own);
+    }
+
+    #[test]
+    fn a_file_called_like_the_package_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        fs::write(folder.path().join("vizflyt.py"), "").unwrap();
+        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("vizflyt.py hides the package"), "{error}");
+    }
+
+    #[test]
+    fn a_script_that_is_not_python_is_shown_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let script = folder.path().join("plugin.py");
+        fs::write(&script, "import vizflyt\nclass First(vizflyt.Plugin:\n").unwrap();
+        let error = check_python(Path::new("python3"), &script, &PluginLimits::default())
+            .unwrap_err()
+            .to_string();
+        for part in ["plugin.py is not Python", "line 2", "class First", "SyntaxError"] {
+            assert!(error.contains(part), "no {part:?} in {error}");
+        }
+    }
+}

@@ -1,0 +1,115 @@
+//! `--watch`: grades again whenever the plugin is saved, and says what changed.
+//!
+//! Each attempt is a process of its own, with what was asked for: it ends when the plugin is saved again, and leaves
+//! nothing. Its report is put in the place of the one before when it is whole.
+
+use std::path::Path;
+use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::sleep;
+
+use anyhow::{Context, Result};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use vizflyt_process::{print_error, print_line, stop_flag};
+
+use super::args::FlyArgs;
+use super::document::Grade;
+use super::folder::{self, ReportFolder};
+use super::{changes, figures};
+use crate::plugin::Plugin;
+use crate::plugin::watch::{LOOK_EVERY, Sources};
+
+/// Grades until it is interrupted.
+pub(super) fn watch(args: &FlyArgs) -> Result<ExitCode> {
+    let typed = args.plugin.as_ref().context("no plugin is named")?;
+    let plugin = Plugin::find(typed)?;
+    let stop: &AtomicBool = &*stop_flag(false)?;
+    let mut earlier = changes::earlier(args)?;
+    let mut attempt = 0;
+    while !stop.load(Ordering::Relaxed) {
+        let saved = Sources::of(&plugin.watched());
+        let is_saved = || Sources::of(&plugin.watched()) != saved;
+        match fly(args, stop, &is_saved)? {
+            None => {
+                if !stop.load(Ordering::Relaxed) {
+                    print_error("saved meanwhile: begun again");
+                }
+                continue;
+            }
+            Some(Attempt::Failed(status)) => print_error(format_args!("no grade: {status}")),
+            Some(Attempt::Flown(grade)) => {
+                attempt += 1;
+                print_line(format!("attempt {attempt}"));
+                figures::print(&grade);
+                for line in earlier.iter().flat_map(|earlier| changes::lines(earlier, &grade)) {
+                    print_line(format!("  {line}"));
+                }
+                if let Some(folder) = &args.report {
+                    print_line(format!("report      {}", folder.join(folder::PAGE).display()));
+                }
+                earlier = Some(*grade);
+            }
+        }
+        print_error(format_args!(
+            "waiting until {} is saved; Ctrl-C ends",
+            Path::new(typed).display()
+        ));
+        while !stop.load(Ordering::Relaxed) && !is_saved() {
+            sleep(LOOK_EVERY);
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+enum Attempt {
+    Flown(Box<Grade>),
+    Failed(ExitStatus),
+}
+
+/// Flies all flights once; nothing if it was interrupted, or the plugin saved.
+fn fly(args: &FlyArgs, stop: &AtomicBool, is_saved: &dyn Fn() -> bool) -> Result<Option<Attempt>> {
+    // On the report's disk, so that it is moved at once.
+    let beside = args.report.as_deref().map(Path::parent).unwrap_or_default();
+    let beside = beside.filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let scratch = match &args.report {
+        Some(_) => tempfile::Builder::new().prefix(".attempt-").tempdir_in(beside),
+        None => tempfile::tempdir(),
+    };
+    let scratch = scratch.context("no folder for an attempt")?;
+    let (document, report) = (scratch.path().join("grade.json"), scratch.path().join("report"));
+    let mut command = Command::new(std::env::current_exe()?);
+    command.args(std::env::args_os().skip(1).filter(|arg| arg != "--watch"));
+    // What is given once more takes the place of what was asked for.
+    command.arg("--output").arg(&document).stdout(Stdio::null()).stdin(Stdio::null());
+    if let Some(folder) = &args.report {
+        command.arg("--report").arg(&report).arg("--hide").arg(folder);
+    }
+    let mut child = command.spawn().context("cannot start an attempt")?;
+    let status = loop {
+        if let Some(status) = child.try_wait()? {
+            break status;
+        }
+        if stop.load(Ordering::Relaxed) || is_saved() {
+            end(&mut child)?;
+            return Ok(None);
+        }
+        sleep(LOOK_EVERY);
+    };
+    let Ok(grade) = Grade::read(&document) else { return Ok(Some(Attempt::Failed(status))) };
+    if let Some(path) = &args.result.output {
+        std::fs::copy(&document, path)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    if let Some(folder) = &args.report {
+        ReportFolder::replace(folder, &report)?;
+    }
+    Ok(Some(Attempt::Flown(Box::new(grade))))
+}
+
+/// Ends an attempt as Ctrl-C does, and waits for it: its plugins end with it.
+fn end(child: &mut Child) -> Result<()> {
+    let _ = kill(Pid::from_raw(child.id().cast_signed()), Signal::SIGTERM);
+    child.wait().context("cannot end an attempt")?;
+    Ok(())
+}

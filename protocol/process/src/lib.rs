@@ -1,0 +1,123 @@
+//! What each of our programs does as a process: prints lines, ends when it is asked to, opens a page in a browser.
+//!
+//! ```text
+//! print_line, print_fmt!, print_error   lines that survive a reader who has gone
+//! on_interrupt                          SIGINT and SIGTERM, each time
+//! stop_flag                             a flag that they set, or the end of standard input: then the parent has gone
+//! processor_seconds                     what this process has used
+//! ```
+
+mod usage;
+
+use std::fmt::Display;
+use std::io::{Read, Write};
+use std::process::Stdio;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result};
+use tokio::signal::unix::{SignalKind, signal};
+pub use usage::processor_seconds;
+
+/// Prints a line on standard output; unlike `println!` it does not panic when nobody reads any more.
+pub fn print_line(line: impl Display) {
+    let mut out = std::io::stdout().lock();
+    let _ = writeln!(out, "{line}").and_then(|()| out.flush());
+}
+
+/// Prints a line on standard error; unlike `eprintln!` it does not panic when nobody reads any more.
+pub fn print_error(line: impl Display) {
+    let _ = writeln!(std::io::stderr().lock(), "{line}");
+}
+
+/// Prints a line for people, formatted as by `println!`; see [`print_line`].
+#[macro_export]
+macro_rules! print_fmt {
+    ($($text:tt)*) => { $crate::print_line(format_args!($($text)*)) };
+}
+
+/// Calls `notice` on SIGINT and SIGTERM, on a thread of its own, until it returns false. The handlers are installed when this
+/// returns.
+///
+/// # Errors
+/// If they cannot be installed.
+pub fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot watch for signals")?;
+    let guard = runtime.enter();
+    let mut interrupt = signal(SignalKind::interrupt()).context("cannot watch for SIGINT")?;
+    let mut terminate = signal(SignalKind::terminate()).context("cannot watch for SIGTERM")?;
+    drop(guard);
+    let wait = move || {
+        runtime.block_on(async {
+            loop {
+                tokio::select! {
+                    _ = interrupt.recv() => {}
+                    _ = terminate.recv() => {}
+                }
+                if !notice() {
+                    return;
+                }
+            }
+        });
+    };
+    std::thread::Builder::new()
+        .name("signals".to_owned())
+        .spawn(wait)
+        .context("cannot start the thread that waits for signals")?;
+    Ok(())
+}
+
+/// Calls `notice` once, on a thread of its own, when standard input ends: the parent that held its other end has gone.
+///
+/// # Errors
+/// If there is no thread for it.
+pub fn on_orphaned(notice: impl FnOnce() + Send + 'static) -> Result<()> {
+    let wait = move || {
+        let mut buffer = [0; 256];
+        let mut input = std::io::stdin().lock();
+        // Bytes mean nothing; an error is an end, too.
+        while matches!(input.read(&mut buffer), Ok(length) if length > 0) {}
+        notice();
+    };
+    // Never joined: a blocking read cannot be cancelled.
+    std::thread::Builder::new()
+        .name("lifeline".to_owned())
+        .spawn(wait)
+        .context("cannot start the thread that watches standard input")?;
+    Ok(())
+}
+
+/// Returns a flag that is set on SIGINT and SIGTERM, and with `lifeline` by the end of standard input.
+///
+/// # Errors
+/// If the handlers cannot be installed.
+pub fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let set = Arc::clone(&flag);
+    on_interrupt(move || {
+        set.store(true, Ordering::Relaxed);
+        false
+    })?;
+    if lifeline {
+        let set = Arc::clone(&flag);
+        on_orphaned(move || set.store(true, Ordering::Relaxed))?;
+    }
+    Ok(flag)
+}
+
+/// Opens a page where there is a desktop; prints what to do where there is none.
+pub fn open_browser(url: &str) {
+    let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
+    let spawned = std::process::Command::new(opener)
+        .arg(url)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn();
+    if spawned.is_err() {
+        print_line("            open it in a browser");
+    }
+}

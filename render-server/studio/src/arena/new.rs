@@ -1,0 +1,116 @@
+//! `vizflyt arena new`: an `arena.toml` around a captured scene, to be edited: fence, start, gates.
+
+use std::path::{Component, Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::Args;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_process::print_fmt;
+use vizflyt_scenes::Variant;
+use vizflyt_server::scene::{self, BareArgs, is_in_an_arena};
+
+/// Writes an arena.toml around a scene file: how it lies, a fence around its core, a start with a view.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "The file stays where it is. Edit what was written, then look at it and check it:
+  vizflyt scene view my-arena
+  vizflyt arena check my-arena
+  vizflyt demo --scene my-arena
+
+Example:
+  vizflyt arena new my-arena --scene room.ply --up -y --scale 0.176"
+)]
+pub(super) struct NewArgs {
+    /// Folder to write arena.toml to; made if absent
+    folder: PathBuf,
+    /// The scene: .ply, .compressed.ply, .splat, .spz, .sog, .ksplat
+    #[arg(long, value_name = "FILE")]
+    scene: PathBuf,
+    #[command(flatten)]
+    bare: BareArgs,
+    #[arg(long, value_name = "NAME", default_value_t, help = format!(
+        "The light and the weather it is flown in: {}", Variant::names()
+    ))]
+    environment: Variant,
+    /// Replaces an arena.toml that is already there
+    #[arg(long)]
+    force: bool,
+}
+
+/// Runs `vizflyt arena new`.
+pub(super) fn run(args: &NewArgs) -> Result<()> {
+    let path = args.folder.join("arena.toml");
+    ensure!(
+        args.force || !path.exists(),
+        "{} already exists; give another folder, or --force to replace it",
+        path.display()
+    );
+    if is_in_an_arena(&args.scene) {
+        bail!("{} is an arena already; --scene takes a scene file", args.scene.display());
+    }
+    let loaded = scene::load(&args.scene, &args.bare)?;
+    let mut arena = loaded.arena;
+    arena.environment = args.environment.environment();
+    std::fs::create_dir_all(&args.folder)
+        .with_context(|| format!("cannot make the folder {}", args.folder.display()))?;
+    arena.scene.file = from_folder(&args.folder, &args.scene)?;
+    let text = format!("{HEAD}{}", arena.to_toml()?);
+    ArenaConfig::parse(&text).context("the arena would not be read again")?;
+    std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    let (scene, fence, p_m) = (&arena.scene, &arena.geofence, arena.spawn.position_m);
+    let size_m = fence.max_m - fence.min_m;
+    print_fmt!("arena       {}", path.display());
+    print_fmt!("scene       {}: {} splats", scene.file, loaded.splats.len());
+    let up = scene.up.map_or("z", |up| up.name());
+    print_fmt!("placed      {up} is up, {} m per unit", scene.metres_per_unit);
+    print_fmt!("fence       {:.2} x {:.2} x {:.2} m", size_m.x, size_m.y, size_m.z);
+    print_fmt!(
+        "start       {:.2}, {:.2}, {:.2}, {} degrees",
+        p_m.x,
+        p_m.y,
+        p_m.z,
+        arena.spawn.yaw_deg
+    );
+    print_fmt!("next        vizflyt arena check {}", args.folder.display());
+    Ok(())
+}
+
+/// Returns the way from a folder to a file, both of which exist.
+fn from_folder(folder: &Path, file: &Path) -> Result<String> {
+    let real = |path: &Path| {
+        path.canonicalize().with_context(|| format!("cannot resolve {}", path.display()))
+    };
+    let way = way(&real(folder)?, &real(file)?);
+    let text = way.to_str().with_context(|| {
+        format!("{} is no text, which arena.toml is; rename the file", way.display())
+    })?;
+    Ok(text.to_owned())
+}
+
+/// Returns the way from one absolute path to another.
+fn way(folder: &Path, file: &Path) -> PathBuf {
+    let shared = folder.components().zip(file.components()).take_while(|(a, b)| a == b).count();
+    let up = folder.components().skip(shared).map(|_| Component::ParentDir);
+    up.chain(file.components().skip(shared)).collect()
+}
+
+const HEAD: &str = "\
+# Made by `vizflyt arena new`. [scene] says how the file lies in the world; the fence goes around its core.
+# Correct what was guessed (a door is 2 m high), then set up a course: `vizflyt arena edit`, or by hand: docs/guides/arena-reference.md.
+";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_way_to_a_file_is_relative() {
+        let check = |folder: &str, file: &str, expected: &str| {
+            assert_eq!(way(Path::new(folder), Path::new(file)), Path::new(expected));
+        };
+        check("/a/b", "/a/b/room.ply", "room.ply");
+        check("/a/b", "/a/room.ply", "../room.ply");
+        check("/a/b/c", "/a/x/room.ply", "../../x/room.ply");
+        check("/a", "/b/room.ply", "../b/room.ply");
+    }
+}

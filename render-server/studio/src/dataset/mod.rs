@@ -1,0 +1,396 @@
+//! `vizflyt dataset`: labelled images of a scene, to train and to measure with.
+//!
+//! ```text
+//! options -> asked (dataset.json): what the bytes depend on, and nothing else
+//! scene, one after the other:
+//!   world     splats cut into things, gates, free space
+//!   shot      pose, light, textures of image N, by the seeds and N alone
+//!   render    colour, depth, ids -> layers (labels); a thread each, one image at a time
+//!   store     files of the layers, then the image's record: it is whole
+//! all images there: coco | yolo | euroc, of the records
+//! ```
+//! So an image is the same whoever renders it: in parts (`--shard`), again after an interruption, on any number of threads.
+
+mod classes;
+mod coco;
+mod distractor;
+mod euroc;
+mod free_space;
+mod outline;
+mod randomize;
+mod record;
+mod render;
+mod sheet;
+mod shot;
+mod store;
+mod texture;
+mod work;
+mod world;
+mod yolo;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, ensure};
+use clap::{ArgGroup, Args};
+use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+use vizflyt_process::print_fmt;
+use vizflyt_protocol::geometry::Intrinsics;
+use vizflyt_scenes::projects::{self, CourseProject};
+use vizflyt_server::scene::{BareArgs, PartsFile, scene_file, scene_hash};
+use vizflyt_trust::hex;
+
+use self::classes::Classes;
+use self::randomize::Randomize;
+use self::record::{ImageRecord, ThingRecord};
+use self::render::Wanted;
+use self::shot::{PathOf, Poses, RandomPoses, Shooting};
+use self::store::{Format, Layer, Store};
+use self::work::{Plan, SceneSource};
+use crate::evaluate::trajectory::{self, Stamped};
+use crate::scene::camera::ImageSize;
+use crate::shard::Shard;
+
+/// Renders labelled images of a scene: colour, depth, normals, masks, optical flow, boxes, corners of gates.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vizflyt dataset --project p3 --seeds 10 --images 2000 -o windows            COCO, a tenth held out by its scenes
+  vizflyt dataset --project p3 --images 500 --format yolo-seg -o windows --things gate
+  vizflyt dataset --project p5 --randomize randomize.toml --sheet sheet.jpg -o race
+  vizflyt dataset --scene my-room --parts parts.toml --images 300 -o room     parts of a captured scene, named by boxes
+  vizflyt dataset --project forest --path flight.tum --format euroc -o along  along a path
+  vizflyt dataset --project p3 --images 9000 --shard 1/3 -o part              a third; run again, it goes on
+
+What each layer and file holds is in docs/guides/datasets.md.")]
+#[command(group = ArgGroup::new("world").args(["project", "scene"]).required(true))]
+pub struct DatasetArgs {
+    #[arg(long, value_name = "NAME", help = format!(
+        "Generated courses of this project: {}", projects::NAMES.join(", ")
+    ))]
+    project: Option<String>,
+    /// arena.toml, its folder, or a scene file
+    #[arg(long, value_name = "PATH")]
+    scene: Option<PathBuf>,
+    #[command(flatten)]
+    bare: BareArgs,
+    /// Seed of the first course, and of everything that is drawn
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// How many courses of --project, one seed after the other
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    seeds: u32,
+    /// Folder to write to; what of the same data set is there already is kept
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// How many images, over all courses [default: 100, or all of --path]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    images: Option<u64>,
+    /// Size of the images
+    #[arg(long, value_name = "WxH", default_value = "320x240")]
+    size: ImageSize,
+    /// Horizontal field of view [deg]
+    #[arg(long, value_name = "DEG", default_value_t = 90.0)]
+    fov: f64,
+    /// What is written of each image
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        default_value = "rgb,depth,normals,instances,classes,flow"
+    )]
+    layers: Vec<Layer>,
+    /// Whose layout
+    #[arg(long, value_enum, default_value_t = Format::Coco)]
+    format: Format,
+    /// Colour as JPEG of this quality, not as PNG
+    #[arg(long, value_name = "QUALITY", value_parser = clap::value_parser!(u8).range(1..=100))]
+    jpeg: Option<u8>,
+    /// Classes that are annotated [default: all classes of things]
+    #[arg(long, value_name = "CLASS", value_delimiter = ',')]
+    things: Vec<String>,
+    /// Things of fewer pixels are not annotated
+    #[arg(long, value_name = "PX", default_value_t = 12)]
+    min_area: u32,
+    /// Share of the images that is held out, by whole courses where there are several
+    #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
+    val: f64,
+    /// Poses along a path: TUM's text, EuRoC's CSV or a flight's log; else they are drawn in the free space
+    #[arg(long, value_name = "FILE")]
+    path: Option<String>,
+    /// What the poses of --path are of
+    #[arg(long, value_enum, default_value_t, requires = "path")]
+    path_of: PathOf,
+    /// Drawn poses keep this from everything solid [m]
+    #[arg(long, value_name = "M", default_value_t = 0.25, conflicts_with = "path")]
+    clearance: f64,
+    /// Drawn poses pitch and roll up to this [deg]
+    #[arg(long, value_name = "DEG", default_value_t = 15.0, conflicts_with = "path")]
+    tilt: f64,
+    /// Probability that a drawn pose looks towards a gate
+    #[arg(long, value_name = "P", default_value_t = 0.7, conflicts_with = "path")]
+    look_at_gate: f64,
+    /// How far from that gate [m]
+    #[arg(long, value_name = "LEAST..MOST", default_value = "0.8..5", value_parser = bounds, conflicts_with = "path")]
+    gate_distance: [f64; 2],
+    /// Optical flow of drawn poses is to where the camera is this much later [s]
+    #[arg(long, value_name = "S", default_value_t = 0.04, conflicts_with = "path")]
+    flow_dt: f64,
+    /// What changes from image to image: light, fog, textures of gates, distractors, vehicles, the camera
+    #[arg(long, value_name = "FILE.toml")]
+    randomize: Option<PathBuf>,
+    /// Parts of the scene, named by boxes
+    #[arg(long, value_name = "FILE.toml")]
+    parts: Option<PathBuf>,
+    /// Renders only this part, as 2/4; whoever ends last, or a run without it, writes the annotations
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Threads [default: one a core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// Writes a few images with all of their layers to a PNG or JPEG, to look at
+    #[arg(long, value_name = "FILE")]
+    sheet: Option<PathBuf>,
+}
+
+/// Runs `vizflyt dataset`.
+pub fn run(args: &DatasetArgs) -> Result<ExitCode> {
+    let plan = plan(args)?;
+    let store = Store::open(&args.output, args.format, args.jpeg.is_some(), &plan.asked)?;
+    let rendered = work::render_all(&plan, &store)?;
+    if rendered.images > 0 {
+        print_fmt!(
+            "rendered    {} images in {:.1} s: {:.0} a second, {:.0} a second of processor",
+            rendered.images,
+            rendered.seconds,
+            rendered.images as f64 / rendered.seconds,
+            rendered.images as f64 / rendered.processor_seconds
+        );
+    }
+    let missing = (0..plan.images).filter(|&index| !plan.is_there(&store, index)).count();
+    if missing > 0 {
+        print_fmt!("missing     {missing} of {} images; run the other parts", plan.images);
+    } else {
+        write_annotations(&plan, &store, args.format)?;
+        print_fmt!("complete    {} images in {}", plan.images, args.output.display());
+    }
+    if let Some(path) = &args.sheet {
+        work::write_sheet(&plan, path)?;
+        print_fmt!("sheet       {}", path.display());
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn write_annotations(plan: &Plan, store: &Store, format: Format) -> Result<()> {
+    let labelled = Labelled { plan, things: plan.things.clone() };
+    match format {
+        Format::Coco => {
+            plan.splits().iter().try_for_each(|split| coco::write(store, &labelled, split))
+        }
+        Format::Euroc => euroc::write(store, &labelled, &plan.layers),
+        _ => yolo::write(store, &labelled, format, &plan.splits()),
+    }
+}
+
+/// What writers of annotations read.
+struct Labelled<'a> {
+    plan: &'a Plan,
+    /// The classes that are annotated, in the order of their numbers.
+    things: Vec<String>,
+}
+
+impl Labelled<'_> {
+    /// Reads the records of a split, in order.
+    fn records(&self, store: &Store, split: &str) -> impl Iterator<Item = Result<ImageRecord>> {
+        let of_split = (0..self.plan.images).filter(move |&index| self.plan.split(index) == split);
+        of_split.map(move |index| self.plan.with_name(index, |name| store.read(name)))
+    }
+
+    /// Returns what of an image is annotated, with the number of its class.
+    fn annotated<'r>(
+        &self,
+        record: &'r ImageRecord,
+    ) -> impl Iterator<Item = (usize, &'r ThingRecord)> {
+        let large = record.things.iter().filter(|thing| thing.area_px >= self.plan.min_area_px);
+        large.filter_map(|thing| {
+            let class = self.things.iter().position(|name| *name == thing.class)?;
+            Some((class, thing))
+        })
+    }
+}
+
+/// Checks the options, and says what the bytes depend on.
+fn plan(args: &DatasetArgs) -> Result<Plan> {
+    let randomize = args.randomize.as_deref().map(Randomize::read).transpose()?.unwrap_or_default();
+    let parts = args.parts.as_deref().map(PartsFile::read).transpose()?.unwrap_or_default();
+    let classes = Classes::with(parts.parts.iter().map(|part| &*part.class))?;
+    let source = source(args)?;
+    ensure!((10.0..=150.0).contains(&args.fov), "--fov {}: give 10 to 150 degrees", args.fov);
+    ensure!((0.0..=0.9).contains(&args.val), "--val {}: give a share from 0 to 0.9", args.val);
+    let ImageSize { width_px, height_px } = args.size;
+    let sides = 16..=4096;
+    ensure!(
+        sides.contains(&width_px) && sides.contains(&height_px),
+        "--size {width_px}x{height_px}: give sides of 16 to 4096 px"
+    );
+    ensure!(args.layers.contains(&Layer::Rgb), "--layers lacks rgb, which every layout has");
+    let poses = poses(args)?;
+    let images = match (&poses, args.images) {
+        (Poses::Random(_), images) => images.unwrap_or(100),
+        (Poses::Path { poses, .. }, images) => {
+            let most = poses.len() as u64 * u64::from(args.seeds);
+            let images = images.unwrap_or(most);
+            ensure!(
+                images <= most,
+                "--images {images}: the path has {most} poses over all courses"
+            );
+            images
+        }
+    };
+    ensure!(
+        images >= u64::from(args.seeds),
+        "--images {images}: {} courses need one each; give more, or fewer --seeds",
+        args.seeds
+    );
+    let things: Vec<String> = if args.things.is_empty() {
+        classes.things().map(str::to_owned).collect()
+    } else {
+        args.things.clone()
+    };
+    for name in &things {
+        ensure!(
+            classes.things().any(|known| known == name),
+            "--things {name}: there is no such class of things; there are {}",
+            classes.things().collect::<Vec<_>>().join(", ")
+        );
+    }
+    let asked = asked(args, &source, &poses, images, &randomize, &parts, &things)?;
+    let intrinsics = Intrinsics::from_horizontal_fov(width_px, height_px, args.fov.to_radians());
+    let has = |layer| args.layers.contains(&layer);
+    Ok(Plan {
+        asked,
+        source,
+        parts,
+        shooting: Shooting { seed: args.seed, intrinsics, poses, randomize },
+        classes,
+        things,
+        min_area_px: args.min_area,
+        seeds: args.seeds,
+        images,
+        val: if args.format == Format::Euroc { 0.0 } else { args.val },
+        layers: args.layers.clone(),
+        wanted: Wanted {
+            next: has(Layer::Next),
+            normals: has(Layer::Normals),
+            classes: has(Layer::Classes),
+            flow: has(Layer::Flow),
+        },
+        jpeg: args.jpeg,
+        shard: args.shard,
+        threads: args.threads.map(usize::from),
+    })
+}
+
+fn source(args: &DatasetArgs) -> Result<SceneSource> {
+    if let Some(name) = &args.project {
+        return Ok(SceneSource::Project(Box::new(CourseProject::named(name)?)));
+    }
+    let path = args.scene.clone().context("give --project or --scene")?;
+    ensure!(args.seeds == 1, "--seeds is of --project; a scene is one");
+    Ok(SceneSource::Scene(path, args.bare))
+}
+
+fn poses(args: &DatasetArgs) -> Result<Poses> {
+    if let Some(path) = &args.path {
+        return Ok(Poses::Path { poses: trajectory::read(path)?, of: args.path_of });
+    }
+    ensure!(
+        (0.05..=2.0).contains(&args.clearance),
+        "--clearance {}: give 0.05 to 2 m",
+        args.clearance
+    );
+    ensure!((0.0..=60.0).contains(&args.tilt), "--tilt {}: give 0 to 60 degrees", args.tilt);
+    ensure!(
+        (0.0..=1.0).contains(&args.look_at_gate),
+        "--look-at-gate {}: give a probability from 0 to 1",
+        args.look_at_gate
+    );
+    ensure!((1e-3..=1.0).contains(&args.flow_dt), "--flow-dt {}: give 0.001 to 1 s", args.flow_dt);
+    Ok(Poses::Random(RandomPoses {
+        clearance_m: args.clearance,
+        tilt_deg: args.tilt,
+        look_at_gate: args.look_at_gate,
+        gate_distance_m: args.gate_distance,
+        flow_dt_s: args.flow_dt,
+    }))
+}
+
+/// Returns what the bytes of the data set depend on.
+fn asked(
+    args: &DatasetArgs,
+    source: &SceneSource,
+    poses: &Poses,
+    images: u64,
+    randomize: &Randomize,
+    parts: &PartsFile,
+    things: &[String],
+) -> Result<Value> {
+    let scene = match source {
+        SceneSource::Project(project) => json!({"project": project.name()}),
+        SceneSource::Scene(path, bare) => {
+            let file = scene_file(path)?;
+            let hash =
+                scene_hash(&file).with_context(|| format!("cannot read {}", file.display()))?;
+            let arena = [path.clone(), path.join("arena.toml")]
+                .iter()
+                .find(|path| {
+                    path.extension().is_some_and(|ending| ending == "toml") && path.is_file()
+                })
+                .map(std::fs::read)
+                .transpose()
+                .with_context(|| format!("cannot read {}", path.display()))?;
+            let arena = arena.map(|text| hex(&Sha256::digest(text)));
+            json!({"sha256": hex(&hash), "arena_sha256": arena, "up": bare.up.map(|up| format!("{up:?}")), "scale": bare.scale})
+        }
+    };
+    let poses = match poses {
+        Poses::Random(bounds) => json!({"random": bounds}),
+        Poses::Path { poses, of } => {
+            let number = |pose: &Stamped| {
+                let Stamped { at_s, position_m, rotation } = pose;
+                [&[*at_s][..], &position_m.to_array(), &rotation.to_array()].concat()
+            };
+            let bytes: Vec<u8> = poses.iter().flat_map(number).flat_map(f64::to_le_bytes).collect();
+            json!({"path_sha256": hex(&Sha256::digest(bytes)), "of": of})
+        }
+    };
+    let ImageSize { width_px, height_px } = args.size;
+    Ok(json!({
+        "vizflyt": env!("CARGO_PKG_VERSION"),
+        "scene": scene,
+        "seed": args.seed,
+        "seeds": args.seeds,
+        "images": images,
+        "size_px": [width_px, height_px],
+        "fov_deg": args.fov,
+        "format": args.format,
+        "layers": args.layers,
+        "jpeg": args.jpeg,
+        "things": things,
+        "min_area_px": args.min_area,
+        "val": args.val,
+        "poses": poses,
+        "randomize": randomize,
+        "parts": parts.parts,
+        "classes": Classes::with(parts.parts.iter().map(|part| &*part.class))?.names(),
+    }))
+}
+
+/// `0.8..5`
+fn bounds(text: &str) -> Result<[f64; 2], String> {
+    let ends = text.split_once("..").and_then(|(a, b)| Some([a.parse().ok()?, b.parse().ok()?]));
+    match ends {
+        Some([least, most]) if 0.1 <= least && least <= most && most <= 100.0 => Ok([least, most]),
+        _ => Err(format!("'{text}' is no range of 0.1 to 100 m; write it as 0.8..5")),
+    }
+}

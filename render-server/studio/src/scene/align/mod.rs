@@ -1,0 +1,178 @@
+//! `vizflyt scene align`: where a captured scene lies in the room, written into its arena.toml, and whether that is known
+//! well enough to fly by.
+
+mod page;
+mod report;
+mod tags;
+pub(super) mod track;
+mod write;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result, bail};
+use clap::{ArgGroup, Args};
+use glam::DVec3;
+use vizflyt_arena::ArenaConfig;
+use vizflyt_process::print_fmt;
+use vizflyt_server::render::RendererKind;
+use vizflyt_twin::align::floor::{self, Floor};
+
+use self::report::Report;
+pub(super) use self::track::ClockArgs;
+use self::write::Changes;
+use crate::arena::file;
+
+/// Finds how a captured scene lies in the room, and writes it into `[scene]` of its arena.toml.
+#[derive(Args, Debug)]
+#[command(
+    group(ArgGroup::new("by").args(["tags", "floor", "track", "page"])),
+    after_help = "Without --tags, --floor or --track a page opens, on which floor and length are clicked.
+
+Examples:
+  vizflyt scene align my-hall
+  vizflyt scene align my-hall --tags mat.toml --capture my-capture
+  vizflyt scene align my-hall --floor 0.1,1.2,3.3 --floor 2.0,1.1,3.1 --floor 0.3,1.2,5.0 \\
+      --above 0,-1,3 --length 0.1,1.2,3.3:0.1,-0.4,3.3=2.0
+
+  vizflyt scene align my-hall --track hall.csv --capture my-capture --times times.csv
+
+--capture is what the scene was trained from: a folder of COLMAP, or of nerfstudio (transforms.json).
+Points are in the scene file's own axes and units.
+
+A track is a CSV of the poses of anything fixed to the camera, its header naming its columns: t or stamp [s] (or
+stamp_ns), x, y, z [m]; a TUM file (stamp tx ty tz qx qy qz qw); or Motive's or Vicon Tracker's export."
+)]
+pub(crate) struct AlignArgs {
+    /// An arena around a scene file, as `vizflyt arena new` makes one
+    arena: PathBuf,
+    /// Layout of printed tags that stand in the capture, surveyed in the room (`vizflyt tags print`)
+    #[arg(long, value_name = "LAYOUT", requires = "capture")]
+    tags: Option<PathBuf>,
+    /// A motion capture's track of something fixed to the camera while it filmed
+    #[arg(long, value_name = "TRACK", requires = "capture")]
+    track: Option<PathBuf>,
+    #[command(flatten)]
+    clocks: track::ClockArgs,
+    /// The photos and their poses that the scene was trained from
+    #[arg(long, value_name = "DATASET")]
+    capture: Option<PathBuf>,
+    /// A point of the floor; three or more. The first becomes the origin, the second lies on the x axis
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true, requires_all = ["above", "length"])]
+    floor: Vec<DVec3>,
+    /// A point above the floor
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, allow_hyphen_values = true)]
+    above: Option<DVec3>,
+    /// Two points, and how far apart they are in the room [m]
+    #[arg(long, value_name = "P:P=METRES", value_parser = length, allow_hyphen_values = true)]
+    length: Option<([DVec3; 2], f64)>,
+    /// How well points were picked, or tags surveyed, one sigma [mm]
+    #[arg(long, value_name = "MM", default_value_t = 5.0)]
+    sigma_mm: f64,
+    /// What the twin may be off within the fence, at most [m]
+    #[arg(long, value_name = "METRES", default_value_t = 0.1)]
+    allow_m: f64,
+    /// Writes the place even where it is not known well enough
+    #[arg(long)]
+    force: bool,
+    /// Opens the page, as without a method
+    #[arg(long)]
+    page: bool,
+    /// Where the page is served; port 0 takes a free one
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
+    http: SocketAddr,
+    /// What draws the page's pictures
+    #[arg(long, value_enum, value_name = "KIND", default_value_t)]
+    renderer: RendererKind,
+    /// Only prints the page's address
+    #[arg(long)]
+    no_browser: bool,
+}
+
+/// Runs `vizflyt scene align`.
+pub(crate) fn run(args: &AlignArgs) -> Result<ExitCode> {
+    let path = file::find(&args.arena)?;
+    let text = std::fs::read_to_string(&path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    let arena = ArenaConfig::parse(&text).with_context(|| path.display().to_string())?;
+    let sigma_m = args.sigma_mm * 1e-3;
+    let fit = match (&args.tags, &args.track, &args.capture, &args.above, &args.length) {
+        (Some(layout), _, Some(capture), ..) => tags::find(layout, capture, sigma_m)?,
+        (None, Some(track), Some(capture), ..) => {
+            track::find(&args.clocks, track, capture, sigma_m)?
+        }
+        (None, None, _, Some(above), Some((ends, length_m))) => floor::fit(&Floor {
+            points: args.floor.clone(),
+            above: *above,
+            length: *ends,
+            length_m: *length_m,
+            length_sigma_m: LENGTH_SHARE * length_m,
+            click_sigma_m: sigma_m,
+        })?,
+        (None, None, None, None, None) => {
+            page::run(args, &path)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+        _ => bail!(
+            "give --tags or --track with --capture, or --floor with --above and --length; the page needs none of them"
+        ),
+    };
+    let Report { lines, is_known } = report::report(&fit, &arena.geofence, args.allow_m);
+    for line in lines {
+        print_fmt!("{:<11} {}", line.key, line.text);
+    }
+    if !(is_known || args.force) {
+        print_fmt!("unchanged   {}", path.display());
+        return Ok(ExitCode::FAILURE);
+    }
+    write::write(&path, &Changes { place: fit.world_from_scene, fence: None, spawn: None })?;
+    print_fmt!("written     {}", path.display());
+    if arena.scene.crop.is_some() {
+        print_fmt!("note        {CROP}");
+    }
+    print_fmt!("next        vizflyt arena check {}", args.arena.display());
+    Ok(ExitCode::SUCCESS)
+}
+
+fn point(text: &str) -> Result<DVec3, String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|part| part.trim().parse()).collect();
+    match numbers.as_deref() {
+        Ok(&[x, y, z]) if DVec3::new(x, y, z).is_finite() => Ok(DVec3::new(x, y, z)),
+        _ => Err(format!("'{text}' is no point; write it as 0.1,-2,3.5")),
+    }
+}
+
+fn length(text: &str) -> Result<([DVec3; 2], f64), String> {
+    let wrong = || format!("'{text}' is no known length; write it as 0,1,2:0,1,4=2.0");
+    let (ends, metres) = text.split_once('=').ok_or_else(wrong)?;
+    let (from, to) = ends.split_once(':').ok_or_else(wrong)?;
+    let metres: f64 = metres.trim().parse().map_err(|_| wrong())?;
+    if !(metres > 0.0 && metres.is_finite()) {
+        return Err(wrong());
+    }
+    Ok(([point(from)?, point(to)?], metres))
+}
+
+/// What does not move along with a scene.
+const CROP: &str =
+    "scene.crop is in metres of the room and did not move along; correct or remove it";
+/// A tape measure, laid by hand.
+const LENGTH_SHARE: f64 = 0.001;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_and_lengths_are_read() {
+        assert_eq!(point("1, -2,3.5"), Ok(DVec3::new(1.0, -2.0, 3.5)));
+        assert_eq!(length("0,0,0:0,0,4=2.5"), Ok(([DVec3::ZERO, DVec3::Z * 4.0], 2.5)));
+        for wrong in ["1,2", "1,2,x", "1,2,inf", ""] {
+            assert!(point(wrong).is_err(), "{wrong}");
+        }
+        for wrong in ["0,0,0:0,0,4", "0,0,0=2", "0,0,0:0,0,4=-1", "0,0,0:0,0=1"] {
+            assert!(length(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,359 @@
+//! Steps as the command line asks for them: in its order, with what is left open found out of the scene.
+
+use std::str::FromStr;
+
+use clap::{ArgMatches, Command, FromArgMatches};
+use glam::{DQuat, DVec3, EulerRot};
+use vizflyt_arena::config::Up;
+use vizflyt_server::scene::{bounds, core};
+use vizflyt_splat::Splats;
+use vizflyt_splat::edit::{Axis, Carve, Region, Step};
+
+/// One step that is asked for.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Request {
+    /// With all its parameters.
+    Step(Step),
+    /// Cell, and the least number of splats.
+    Floaters(Option<f64>, u32),
+    /// Cell, and how many parts stay.
+    Parts(Option<f64>, u32),
+    /// A path; the rest is [`CarveSettings`].
+    Carve(Vec<[f64; 3]>),
+    /// A share of the splats, 0 to 1.
+    Share(f64),
+}
+
+/// What a carve leaves open. [scene]
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct CarveSettings {
+    pub(super) radius: Option<f64>,
+    pub(super) depth: Option<f64>,
+    pub(super) cell: Option<f64>,
+    pub(super) reach: Option<f64>,
+}
+
+impl Request {
+    /// Returns the step for a scene. What is not said comes from the size of its core.
+    pub(super) fn step(&self, splats: &Splats, carve: &CarveSettings) -> Step {
+        let size = || {
+            let [min, max] = bounds(core(splats, |p| p));
+            max - min
+        };
+        // A captured room is about 3 m high: cells of 5 cm.
+        let cell_of = |share: f64| rounded((size().min_element() / share).max(1e-6));
+        let usual_cell = || cell_of(60.0);
+        match self {
+            Self::Step(step) => step.clone(),
+            Self::Floaters(cell, least) => {
+                Step::Floaters { cell: cell.unwrap_or_else(usual_cell), least: *least }
+            }
+            Self::Parts(cell, keep) => {
+                Step::Parts { cell: cell.unwrap_or_else(usual_cell), keep: *keep }
+            }
+            Self::Carve(path) => {
+                // Coarser: a room takes two million.
+                let cell = carve.cell.unwrap_or_else(|| cell_of(30.0));
+                Step::Carve(Carve {
+                    path: path.clone(),
+                    radius: carve.radius.unwrap_or_else(|| rounded(2.0 * cell)),
+                    depth: carve.depth.unwrap_or_else(|| rounded(3.0 * cell)),
+                    cell,
+                    reach: carve.reach.unwrap_or_else(|| rounded(size().max_element())),
+                })
+            }
+            Self::Share(share) => {
+                Step::Decimate { count: ((share * splats.len() as f64).round() as u32).max(1) }
+            }
+        }
+    }
+}
+
+/// Returns a number to two digits: it is written down, and a guess is not better.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.1e}").parse().unwrap_or(value)
+}
+
+/// The steps of a command line, in its order.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Requests(pub(super) Vec<Request>);
+
+/// A flag: its name, how its value is written, its help, and what reads it.
+type Flag = (&'static str, &'static str, &'static str, fn(&str) -> Result<Request, String>);
+
+const FLAGS: [Flag; 17] = [
+    (
+        "crop-box",
+        "MIN:MAX",
+        "Keeps what lies in a box along the scene's axes: X,Y,Z:X,Y,Z",
+        |text| Ok(crop(boxed(text)?)),
+    ),
+    ("crop-sphere", "CENTER:RADIUS", "Keeps what lies in a ball: X,Y,Z:R", |text| {
+        Ok(crop(sphere(text)?))
+    }),
+    (
+        "crop-prism",
+        "AXIS:LOW,HIGH:P:P:P...",
+        "Keeps what lies within an outline, from LOW to HIGH along x, y or z; its points are the two other coordinates",
+        |text| Ok(crop(prism(text)?)),
+    ),
+    ("remove-box", "MIN:MAX", "Removes what lies in a box", |text| Ok(remove(boxed(text)?))),
+    ("remove-sphere", "CENTER:RADIUS", "Removes what lies in a ball", |text| {
+        Ok(remove(sphere(text)?))
+    }),
+    ("remove-prism", "AXIS:LOW,HIGH:P:P:P...", "Removes what lies within an outline", |text| {
+        Ok(remove(prism(text)?))
+    }),
+    ("min-opacity", "OPACITY", "Removes what is fainter, 0 to 1", |text| {
+        Ok(Request::Step(Step::Faint { below: number(text)? }))
+    }),
+    ("max-size", "SIZE", "Removes splats whose largest standard deviation is larger", |text| {
+        Ok(Request::Step(Step::Large { above: number(text)? }))
+    }),
+    ("min-size", "SIZE", "Removes splats whose largest standard deviation is smaller", |text| {
+        Ok(Request::Step(Step::Small { below: number(text)? }))
+    }),
+    (
+        "drop-floaters",
+        "CELL:LEAST",
+        "Removes connected parts of less than LEAST (50) splats, and haze in the open; CELL is about how near connects",
+        |text| cells(text, 50).map(|(cell, least)| Request::Floaters(cell, least)),
+    ),
+    ("keep-parts", "CELL:COUNT", "Keeps the largest COUNT (1) connected parts", |text| {
+        cells(text, 1).map(|(cell, keep)| Request::Parts(cell, keep))
+    }),
+    (
+        "carve",
+        "P:P...",
+        "Keeps what is seen from the free space around a point, or around a path through points: X,Y,Z:X,Y,Z",
+        |text| text.split(':').map(point).collect::<Result<_, _>>().map(Request::Carve),
+    ),
+    (
+        "decimate",
+        "COUNT",
+        "Keeps so many splats, or so many per cent: the most opaque and largest",
+        share,
+    ),
+    ("up", "AXIS", "Turns the scene so that this axis becomes +z: x, -x, y, -y, z or -z", |text| {
+        let up = Up::from_str(text).map_err(|error| error.to_string())?;
+        Ok(Request::Step(Step::Turn { rotation: up.world_from_scene().to_array() }))
+    }),
+    ("rotate", "X,Y,Z", "Turns it about x, then y, then z, counter-clockwise [deg]", |text| {
+        let rad = DVec3::from(point(text)?).map(f64::to_radians);
+        let rotation = DQuat::from_euler(EulerRot::ZYX, rad.z, rad.y, rad.x).to_array();
+        Ok(Request::Step(Step::Turn { rotation }))
+    }),
+    ("scale", "FACTOR", "Makes it larger by this factor", |text| {
+        Ok(Request::Step(Step::Scale { factor: number(text)? }))
+    }),
+    ("move", "X,Y,Z", "Moves it", |text| Ok(Request::Step(Step::Move { by: point(text)? }))),
+];
+
+impl clap::Args for Requests {
+    fn augment_args(mut command: Command) -> Command {
+        for (name, value, help, read) in FLAGS {
+            let may_be_bare = matches!(name, "drop-floaters" | "keep-parts");
+            let arg = clap::Arg::new(name)
+                .long(name)
+                .value_name(value)
+                .help(help)
+                .help_heading("Steps, in the order in which they are given")
+                .allow_hyphen_values(!may_be_bare)
+                .action(clap::ArgAction::Append)
+                .value_parser(move |text: &str| {
+                    let request = read(text)?;
+                    if let Request::Step(step) = &request {
+                        step.check().map_err(|error| error.to_string())?;
+                    }
+                    Ok::<_, String>(request)
+                });
+            command = command.arg(if may_be_bare {
+                arg.num_args(0..=1).require_equals(true).default_missing_value("")
+            } else {
+                arg
+            });
+        }
+        command
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for Requests {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let mut found = Vec::new();
+        for (name, ..) in FLAGS {
+            let values = matches.get_many::<Request>(name).into_iter().flatten();
+            let places = matches.indices_of(name).into_iter().flatten();
+            found.extend(places.zip(values.cloned()));
+        }
+        found.sort_by_key(|(place, _)| *place);
+        Ok(Self(found.into_iter().map(|(_, request)| request).collect()))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+fn crop(region: Region) -> Request {
+    Request::Step(Step::Crop { within: vec![region] })
+}
+
+fn remove(region: Region) -> Request {
+    Request::Step(Step::Remove { within: vec![region] })
+}
+
+fn number(text: &str) -> Result<f64, String> {
+    text.trim().parse().map_err(|_| format!("'{text}' is no number"))
+}
+
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let found: Vec<f64> = text.split(',').map(number).collect::<Result<_, _>>()?;
+    let example = &"1.5,-2,0.3"[..if N == 3 { 10 } else { 6 }];
+    found.try_into().map_err(|_| format!("'{text}' is not {N} numbers; write them as {example}"))
+}
+
+pub(super) fn point(text: &str) -> Result<[f64; 3], String> {
+    numbers(text)
+}
+
+fn boxed(text: &str) -> Result<Region, String> {
+    let (min, max) = text
+        .split_once(':')
+        .ok_or("write the least corner, a colon, and the greatest: 0,0,0:4,3,2.5")?;
+    Ok(Region::Box { min: point(min)?, max: point(max)? })
+}
+
+fn sphere(text: &str) -> Result<Region, String> {
+    let (center, radius) =
+        text.split_once(':').ok_or("write the centre, a colon, and the radius: 0,0,1:2.5")?;
+    Ok(Region::Sphere { center: point(center)?, radius: number(radius)? })
+}
+
+fn prism(text: &str) -> Result<Region, String> {
+    let wrong = "write axis, bounds and corners: z:0,2.5:0,0:4,0:4,3";
+    let mut parts = text.split(':');
+    let axis = match parts.next() {
+        Some("x") => Axis::X,
+        Some("y") => Axis::Y,
+        Some("z") => Axis::Z,
+        _ => return Err(wrong.into()),
+    };
+    let [low, high] = numbers(parts.next().ok_or(wrong)?)?;
+    let outline = parts.map(numbers).collect::<Result<_, _>>()?;
+    Ok(Region::Prism { axis, outline, low, high })
+}
+
+/// Parses a cell and a count, both of which may be left out.
+fn cells(text: &str, usual: u32) -> Result<(Option<f64>, u32), String> {
+    let (cell, count) = text.split_once(':').unwrap_or((text, ""));
+    let cell = if cell.is_empty() { None } else { Some(number(cell)?) };
+    let wrong =
+        || format!("'{count}' is no count; write the cell's side, a colon, and the count: 0.2:50");
+    let count = if count.is_empty() { usual } else { count.parse().map_err(|_| wrong())? };
+    // Checked here, not after the scene was loaded.
+    let step = Step::Floaters { cell: cell.unwrap_or(1.0), least: count };
+    step.check().map_err(|error| error.to_string())?;
+    Ok((cell, count))
+}
+
+fn share(text: &str) -> Result<Request, String> {
+    if let Some(percent) = text.strip_suffix('%') {
+        let percent = number(percent)?;
+        let is_meant = percent > 0.0 && percent <= 100.0;
+        let wrong = || format!("'{text}' is no share; give more than 0 % and up to 100 %");
+        return is_meant.then_some(Request::Share(percent / 100.0)).ok_or_else(wrong);
+    }
+    let count =
+        text.parse().map_err(|_| format!("'{text}' is no count; give splats, or per cent: 50%"))?;
+    Ok(Request::Step(Step::Decimate { count }))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Cli {
+        #[command(flatten)]
+        requests: Requests,
+    }
+
+    fn read(line: &str) -> Result<Vec<Request>, String> {
+        let words = std::iter::once("edit").chain(line.split_whitespace());
+        Cli::try_parse_from(words).map(|cli| cli.requests.0).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn steps_come_in_the_order_of_the_command_line() {
+        let step = Request::Step;
+        let line = "--scale 2 --drop-floaters --crop-box -1,0,0:1,2,3 --scale 0.5 --drop-floaters=0.2:9 --move -1,0,0";
+        let within = vec![Region::Box { min: [-1.0, 0.0, 0.0], max: [1.0, 2.0, 3.0] }];
+        let expected = [
+            step(Step::Scale { factor: 2.0 }),
+            Request::Floaters(None, 50),
+            step(Step::Crop { within }),
+            step(Step::Scale { factor: 0.5 }),
+            Request::Floaters(Some(0.2), 9),
+            step(Step::Move { by: [-1.0, 0.0, 0.0] }),
+        ];
+        assert_eq!(read(line).unwrap(), expected);
+        assert_eq!(read("").unwrap(), []);
+    }
+
+    #[test]
+    fn every_flag_reads_an_example() {
+        for (flag, example) in [
+            ("crop-sphere", "0,0,1:2.5"),
+            ("remove-sphere", "0,0,1:2.5"),
+            ("remove-box", "0,0,0:1,1,1"),
+            ("crop-prism", "z:0,2.5:0,0:4,0:4,3"),
+            ("remove-prism", "x:-1,2.5:0,0:4,0:4,3"),
+            ("min-opacity", "0.05"),
+            ("max-size", "2"),
+            ("min-size", "0.001"),
+            ("carve", "0,0,1:2,0,1"),
+            ("decimate", "1000"),
+            ("decimate", "50%"),
+            ("up", "-y"),
+            ("rotate", "0,0,90"),
+        ] {
+            assert_eq!(read(&format!("--{flag} {example}")).unwrap().len(), 1, "{flag}");
+        }
+        assert_eq!(read("--keep-parts=:2").unwrap(), [Request::Parts(None, 2)]);
+        // About x first: y becomes z, and stays there about z.
+        let [Request::Step(Step::Turn { rotation })] = read("--rotate 90,0,90").unwrap()[..] else {
+            panic!("a turn")
+        };
+        assert!((DQuat::from_array(rotation) * DVec3::Y).abs_diff_eq(DVec3::Z, 1e-12));
+    }
+
+    #[test]
+    fn what_cannot_be_meant_is_refused_with_advice() {
+        for (line, expected) in [
+            ("--crop-box 0,0,0", "the greatest"),
+            ("--crop-box 0,0,0:0,1,1", "must exceed"),
+            ("--crop-box 0,0:1,1,1", "not 3 numbers"),
+            ("--crop-sphere 0,0,0:-1", "length above 0"),
+            ("--crop-prism w:0,1:0,0:1,0:1,1", "axis, bounds and corners"),
+            ("--crop-prism z:0,1:0,0:1,0", "3 to 2000 corners"),
+            ("--min-opacity 5", "0 to 1"),
+            ("--drop-floaters=0", "length above 0"),
+            ("--drop-floaters=0.1:x", "no count"),
+            ("--decimate 0%", "more than 0 %"),
+            ("--decimate 0", "at least 1"),
+            ("--up w", "is no axis"),
+            ("--scale 0", "1e-6"),
+            ("--carve 1,2", "not 3 numbers"),
+        ] {
+            let error = read(line).unwrap_err();
+            assert!(error.contains(expected), "{line}: '{error}' lacks '{expected}'");
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! `vizflyt scene generate`: a scene with known geometry, and what a phone films on a walk through it.
+
+mod film;
+mod sink;
+mod truth;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+use clap::Args;
+use film::Shoot;
+use sink::Target;
+use vizflyt_process::print_fmt;
+use vizflyt_scenes::walk::Walk;
+use vizflyt_scenes::{FilmSet, Generated, SceneKind, film_set};
+
+use super::camera::ImageSize;
+
+/// Generates a scene with known geometry: scene.ply, arena.toml, truth.json.
+#[derive(Args, Debug)]
+#[command(
+    after_help = "A capture is a walk through the scene as a phone films it: a lens, rolling shutter, automatic exposure,
+motion blur, noise. Beside hall.mp4 come hall.truth.json (where the camera truly was), hall.camera.toml
+(its lens) and, with --tags, hall.tags.toml (where the tags stand); in a folder they have no 'hall.'.
+A video is encoded by the program ffmpeg; a folder of images needs none.
+
+Examples:
+  vizflyt scene generate forest --seed 7 -o my-forest
+  vizflyt demo --scene my-forest
+  vizflyt scene generate room --seed 3 --tags --capture hall.mp4
+  vizflyt scene generate room --seed 3 --tags --capture images/ --frames 80"
+)]
+pub(crate) struct GenerateArgs {
+    #[arg(help = format!("What to generate: {}", SceneKind::names()))]
+    kind: SceneKind,
+    /// Same seed, same scene, same walk, same phone
+    #[arg(long, default_value_t = 7)]
+    seed: u64,
+    /// Folder to write the scene to; made if absent
+    #[arg(short, long, value_name = "DIR", required_unless_present = "capture")]
+    output: Option<PathBuf>,
+    /// Films a walk through it: a video (.mp4, .mkv, .mov), or a folder of JPEG images
+    #[arg(long, value_name = "FILE|DIR")]
+    capture: Option<PathBuf>,
+    /// Puts up boards with printed AprilTags along the walk; they stand in the scene of --output, too
+    #[arg(long, requires = "capture")]
+    tags: bool,
+    /// How long the walk takes, which ends where it began
+    #[arg(long, value_name = "S", requires = "capture", default_value_t = 50.0)]
+    seconds: f64,
+    /// How many images: of a folder, evenly over the walk (80 unless given); of a video, its first ones
+    #[arg(long, value_name = "N", requires = "capture")]
+    frames: Option<u32>,
+    /// Size of the images
+    #[arg(long, value_name = "WxH", requires = "capture", default_value = "640x480")]
+    size: ImageSize,
+    /// What moves in the scene moves while it is filmed, by its clock; without, it stands still
+    #[arg(long, requires = "capture")]
+    moving: bool,
+    /// Replaces what is already there
+    #[arg(long)]
+    force: bool,
+}
+
+/// Runs `vizflyt scene generate`.
+pub(super) fn run(args: &GenerateArgs) -> Result<()> {
+    if let Some(output) = &args.output
+        && output.join("arena.toml").exists()
+        && !args.force
+    {
+        bail!(
+            "{} already holds an arena.toml; give another folder, or --force to replace it",
+            output.display()
+        );
+    }
+    let Some(capture) = &args.capture else {
+        return write_scene(
+            &vizflyt_scenes::generate(args.kind, args.seed),
+            args.output.as_deref(),
+        );
+    };
+    let target = Target::of(capture)?;
+    refuse_existing(&target.truth_file(), args.force)?;
+    if let Target::Video(file) = &target {
+        refuse_existing(file, args.force)?;
+    }
+    if !Walk::SECONDS.contains(&args.seconds) {
+        let (least, most) = (Walk::SECONDS.start(), Walk::SECONDS.end());
+        bail!("--seconds {}: a walk takes {least} to {most} s", args.seconds);
+    }
+    let shoot = Shoot::of(args, target)?;
+    let set = film_set(args.kind, args.seed, args.seconds, args.tags)?;
+    write_scene(&set.scene, args.output.as_deref())?;
+    let FilmSet { walk, prints, .. } = &set;
+    print_fmt!(
+        "walk        {:.0} m in {:.0} s, and back where it began",
+        walk.length_m(),
+        walk.seconds()
+    );
+    if args.tags {
+        print_fmt!("tags        {} boards along it", prints.len());
+    }
+    shoot.run(&set)
+}
+
+fn refuse_existing(path: &Path, force: bool) -> Result<()> {
+    if path.exists() && !force {
+        bail!("{} is there already; give another name, or --force to replace it", path.display());
+    }
+    Ok(())
+}
+
+fn write_scene(scene: &Generated, output: Option<&Path>) -> Result<()> {
+    let Some(output) = output else { return Ok(()) };
+    let written = scene.write(output)?;
+    print_fmt!("{} splats     {}", scene.splats.len(), written.scene.display());
+    print_fmt!("arena             {}", written.arena.display());
+    print_fmt!("{} true solids   {}", scene.truth.len(), written.truth.display());
+    Ok(())
+}

@@ -1,0 +1,227 @@
+//! `vizflyt scene train`: a scene from photos with known poses.
+
+mod kept;
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use serde::Serialize;
+use vizflyt_process::print_fmt;
+use vizflyt_server::render::RendererKind;
+use vizflyt_splat::format::{self, Format};
+use vizflyt_twin::train::Quality;
+use vizflyt_twin::{Dataset, Options, Passes, Times, Trainer};
+
+use self::kept::Kept;
+use super::progress::Progress;
+
+/// Trains a scene from photos with known poses, on a graphics card or the processor.
+#[derive(Args, Debug)]
+#[command(after_help = "DATASET is a folder of one of these kinds:
+  COLMAP      sparse/0 with cameras, images, points3D (.bin or .txt), and images/; masks/NAME.png may
+              black out what shall not count. Lenses: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL,
+              OPENCV, OPENCV_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE
+  nerfstudio  transforms.json, with masks, depth images and a PLY of points where it names them
+Images are PNG or JPEG. The scene keeps the dataset's frame and unit of length.
+
+A graphics card of any vendor (Vulkan) renders and takes derivatives, once its own of a test scene are the
+processor's; loss and optimiser stay with the processor. If it is lost on the way, the processor goes on.
+
+Examples:
+  vizflyt scene train my-hall -o my-hall.ply
+  vizflyt scene train my-hall -o my-hall.ply --resume      (after an interruption)
+  vizflyt scene train my-hall -o my-hall.ply --width 640 --steps 7000 --splats 200000 --report my-hall.json
+  vizflyt scene view my-hall.ply")]
+pub(crate) struct TrainArgs {
+    /// Folder with the photos and their poses
+    dataset: PathBuf,
+    /// Scene file to write; its name decides on the format: .ply, .spz, .sog, ...
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Replaces a file that is already there
+    #[arg(long)]
+    force: bool,
+    /// Steps, one photo each
+    #[arg(long, default_value_t = 3000, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    steps: u32,
+    /// The most splats
+    #[arg(long, default_value_t = 60_000, value_name = "N", value_parser = splats)]
+    splats: usize,
+    /// Width that wider photos are made smaller to [px]
+    #[arg(long, default_value_t = 320, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
+    width: u32,
+    /// Degree of the harmonics: how colours may change with the direction of view
+    #[arg(long, default_value_t = 2, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
+    sh_degree: u8,
+    /// What renders photos and takes derivatives
+    #[arg(long, value_enum, default_value_t, value_name = "KIND")]
+    renderer: RendererKind,
+    /// Same dataset, same options, same seed: the same scene on the same kind of processor or card
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Holds every N-th photo out of training, to judge by; 0 holds none out
+    #[arg(long, default_value_t = 8, value_name = "N")]
+    hold_out: usize,
+    /// Photos have one brightness and colour: do not solve for each one's
+    #[arg(long)]
+    no_exposure: bool,
+    /// Trains for a renderer that dims splats smaller than a pixel (mip-splatting)
+    #[arg(long)]
+    antialiased: bool,
+    /// Goes on with a training of the same photos and options that was interrupted; it is kept every minute
+    #[arg(long)]
+    resume: bool,
+    /// Writes what was done, how good it is and where the time of a step went as JSON
+    #[arg(long, value_name = "FILE.json")]
+    report: Option<PathBuf>,
+}
+
+/// What `--report` holds.
+#[derive(Debug, Serialize)]
+struct Report {
+    dataset: String,
+    photos: usize,
+    points: usize,
+    width_px: usize,
+    height_px: usize,
+    steps: u32,
+    splats: usize,
+    seed: u64,
+    antialiased: bool,
+    /// What rendered at the end: `cpu avx2`, or `gpu` and the adapter's name.
+    renderer: String,
+    seconds: f64,
+    /// The parts of a step, on average of those taken here.
+    ms_a_step: Times,
+    /// Of photos that training did not see; absent if none was held out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    held_out: Option<Quality>,
+}
+
+fn splats(text: &str) -> Result<usize, String> {
+    let count: usize = text.parse().map_err(|_| format!("'{text}' is no whole number"))?;
+    if (1000..=20_000_000).contains(&count) {
+        return Ok(count);
+    }
+    Err(format!("{count} is outside 1000 to 20000000"))
+}
+
+/// Runs `vizflyt scene train`.
+pub(crate) fn run(args: &TrainArgs) -> Result<()> {
+    check_output(&args.output, args.force)?;
+    if args.hold_out == 1 {
+        bail!("--hold-out 1 leaves no photo to train with; give 0 to hold out none");
+    }
+    let mut kept = Kept::beside(&args.output);
+    let checkpoint = kept.find(args.resume, args.force)?;
+    let start = Instant::now();
+    let dataset = Dataset::read(&args.dataset, Some(args.width))?;
+    let view = &dataset.photos[0].view;
+    print_fmt!(
+        "dataset      {} photos, the first {} x {}, {} points, read in {:.1} s",
+        dataset.photos.len(),
+        view.width,
+        view.height,
+        dataset.points.len(),
+        start.elapsed().as_secs_f64()
+    );
+    if let Some(first) = dataset.absent.first() {
+        let absent = dataset.absent.len();
+        print_fmt!("absent       {absent} photos that have a pose are not there, such as {first}");
+    }
+    let observed: usize = dataset.photos.iter().map(|photo| photo.target.points.len()).sum();
+    if observed == 0 && dataset.photos.iter().all(|photo| photo.target.depth.is_empty()) {
+        print_fmt!(
+            "no depth     neither points seen by three photos nor depth images: surfaces will be off"
+        );
+    }
+    let options = Options {
+        steps: args.steps,
+        splats: args.splats,
+        degree: args.sh_degree,
+        seed: args.seed,
+        hold_out: args.hold_out,
+        antialiased: args.antialiased,
+        exposure: !args.no_exposure,
+        ..Options::default()
+    };
+    let (passes, reason) = Passes::choose(args.renderer.into())?;
+    print_fmt!("renderer     {} ({reason})", passes.name());
+    let mut trainer = match checkpoint {
+        Some(checkpoint) => {
+            print_fmt!("resumed      after {} of {} steps", checkpoint.steps(), args.steps);
+            Trainer::resume(&dataset, options, passes, checkpoint)
+                .context("cannot go on with what was kept")?
+        }
+        None => Trainer::with(&dataset, options, passes),
+    };
+    let mut progress = Progress::new("");
+    while trainer.steps() < args.steps {
+        let parts = trainer.step();
+        let (step, splats) = (trainer.steps(), trainer.gaussians().len());
+        if let Some(lost) = trainer.passes().take_lost() {
+            let now = trainer.passes().name();
+            tracing::warn!("step {step}: {lost}; {now} goes on from here, at its own pace");
+        }
+        progress.show(f64::from(step) / f64::from(args.steps), || {
+            format!("step {step} of {}, {splats} splats, error {:.4}", args.steps, parts.l1)
+        });
+        kept.keep(&trainer);
+    }
+    drop(progress);
+    let ms_a_step = trainer.times();
+    let held_out = trainer.judge();
+    let mut splats = trainer.splats();
+    splats.antialiased = args.antialiased;
+    format::write(&args.output, &splats)?;
+    kept.remove();
+    let report = Report {
+        dataset: args.dataset.display().to_string(),
+        photos: dataset.photos.len(),
+        points: dataset.points.len(),
+        width_px: view.width,
+        height_px: view.height,
+        steps: args.steps,
+        splats: splats.len(),
+        seed: args.seed,
+        antialiased: args.antialiased,
+        renderer: trainer.passes().name().to_owned(),
+        seconds: start.elapsed().as_secs_f64(),
+        ms_a_step,
+        held_out,
+    };
+    print_fmt!("trained      {} steps in {:.0} s", report.steps, report.seconds);
+    print_fmt!("ms a step    {ms_a_step}");
+    if let Some(quality) = &report.held_out {
+        print_fmt!(
+            "held out     {} photos: PSNR {:.2} dB, SSIM {:.3}",
+            quality.photos,
+            quality.psnr_db,
+            quality.ssim
+        );
+    }
+    print_fmt!("scene        {} splats in {}", report.splats, args.output.display());
+    if let Some(path) = &args.report {
+        let text = serde_json::to_string_pretty(&report)?;
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Refuses what would only fail after the training.
+fn check_output(output: &Path, force: bool) -> Result<()> {
+    if Format::of_name(output).is_none() {
+        bail!("{}: no format has this ending; try .ply", output.display());
+    }
+    if output.exists() && !force {
+        bail!("{} is already there; give another name, or --force to replace it", output.display());
+    }
+    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty());
+    if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+        bail!("the folder {} is not there; make it first", folder.display());
+    }
+    Ok(())
+}
