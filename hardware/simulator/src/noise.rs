@@ -1,35 +1,26 @@
 //! Seeded random numbers: the same seed gives the same flight on every machine.
 
 use glam::DVec3;
+use vizflyt_protocol::random::{self, SplitMix64};
 
-/// A stream of pseudo-random numbers: SplitMix64 (Steele, Lea, Flood: "Fast splittable
-/// pseudorandom number generators", OOPSLA 2014), Gaussian by Box and Muller (1958).
+/// A stream of pseudo-random numbers; Gaussian by Box and Muller (1958).
 #[derive(Clone, Debug)]
 pub(crate) struct Noise {
-    state: u64,
+    random: SplitMix64,
     spare: Option<f64>,
 }
 
 impl Noise {
     /// Makes the stream `stream` of `seed`; streams of one seed are independent.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
-        let mut noise = Self { state: seed, spare: None };
         // One output as the start, so that near seeds and near streams do not overlap.
-        noise.state = noise.next_u64() ^ stream.wrapping_mul(0xD1B5_4A32_D192_ED03);
-        noise
-    }
-
-    fn next_u64(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+        let start = random::nth(seed, 0) ^ stream.wrapping_mul(0xD1B5_4A32_D192_ED03);
+        Self { random: SplitMix64::new(start), spare: None }
     }
 
     /// Returns a number in [0, 1), uniformly.
     pub(crate) fn uniform(&mut self) -> f64 {
-        (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
+        self.random.unit()
     }
 
     /// Returns a number of zero mean and unit variance.

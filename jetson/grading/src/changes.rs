@@ -81,7 +81,7 @@ pub(super) fn lines(earlier: &Grade, now: &Grade) -> Vec<String> {
     )];
     let is = |better: bool| {
         both.iter().filter(move |(before, after)| {
-            step(before, after) == if better { Step::Better } else { Step::Worse }
+            step(before, after) == if better { Trend::Better } else { Trend::Worse }
         })
     };
     for (word, better) in [("better", true), ("worse", false)] {
@@ -97,22 +97,22 @@ pub(super) fn lines(earlier: &Grade, now: &Grade) -> Vec<String> {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Step {
+enum Trend {
     Better,
     Worse,
     Alike,
 }
 
 /// By the score, then by the time of two flights that finished.
-fn step(before: &Run, after: &Run) -> Step {
+fn step(before: &Run, after: &Run) -> Trend {
     let finished = [before, after].iter().all(|run| run.outcome == OutcomeKind::Finished);
     let seconds = |run: &Run| run.seconds + run.penalty_s;
     match (after.score - before.score, seconds(after) - seconds(before)) {
-        (more, _) if more > SAME_SCORE => Step::Better,
-        (more, _) if more < -SAME_SCORE => Step::Worse,
-        (_, longer) if finished && longer < -SAME_S => Step::Better,
-        (_, longer) if finished && longer > SAME_S => Step::Worse,
-        _ => Step::Alike,
+        (more, _) if more > SAME_SCORE => Trend::Better,
+        (more, _) if more < -SAME_SCORE => Trend::Worse,
+        (_, longer) if finished && longer < -SAME_S => Trend::Better,
+        (_, longer) if finished && longer > SAME_S => Trend::Worse,
+        _ => Trend::Alike,
     }
 }
 

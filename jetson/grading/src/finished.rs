@@ -35,7 +35,7 @@ impl FlightDone {
 }
 
 /// The report while flights are flown.
-pub(super) struct Report {
+pub(super) struct LiveReport {
     pub(super) folder: ReportFolder,
     flown_with: FlownWith,
     key: SealingKey,
@@ -43,7 +43,7 @@ pub(super) struct Report {
     kept: HashMap<(String, u64), FlightDone>,
 }
 
-impl Report {
+impl LiveReport {
     /// Opens the report's folder, if there is to be one.
     pub(super) fn open(
         args: &FlyArgs,

@@ -23,7 +23,7 @@ use vizflyt_trust::hex;
 
 use super::args::FlyArgs;
 use super::document::{DelaysMs, Grade, MAX_SEEDS, Run, Subject};
-use super::finished::{FlightDone, Report};
+use super::finished::{FlightDone, LiveReport};
 use super::odometry::odometry_score;
 use super::progress::Progress;
 use super::record::FlownWith;
@@ -66,7 +66,7 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
     let command = plugin.command(&limits)?;
     let flown_with = FlownWith::new(&subject, args.answer_within, args.log.name());
-    let report = Report::open(args, flown_with, &flights)?;
+    let report = LiveReport::open(args, flown_with, &flights)?;
     let fly = |&(variant, seed): &(Variant, u64)| -> Result<Option<FlightDone>> {
         if let Some(done) = report.as_ref().and_then(|report| report.kept(variant, seed)) {
             return Ok(Some(done));

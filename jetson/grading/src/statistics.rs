@@ -1,6 +1,7 @@
 //! Figures over flights, with how far they can be trusted.
 
 use serde::{Deserialize, Serialize};
+use vizflyt_protocol::random::{GOLDEN, SplitMix64};
 
 /// A value and its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -38,18 +39,11 @@ pub(crate) fn mean_interval(values: &[f64]) -> Interval {
         return Interval { value: 0.0, low: 0.0, high: 0.0 };
     }
     let mean = |sum: f64| sum / values.len() as f64;
-    let mut random = 0x9e37_79b9_7f4a_7c15_u64;
-    let mut draw = || {
-        // SplitMix64 (Steele, Lea, Flood 2014).
-        random = random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = random;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ z >> 31
-    };
+    let mut random = SplitMix64::new(GOLDEN);
     let mut means: Vec<f64> = (0..RESAMPLES)
         .map(|_| {
-            let picks = (0..values.len()).map(|_| values[(draw() % values.len() as u64) as usize]);
+            let picks =
+                (0..values.len()).map(|_| values[(random.bits() % values.len() as u64) as usize]);
             mean(picks.sum())
         })
         .collect();

@@ -18,7 +18,7 @@ pub(crate) const MAX_MESSAGE: usize = 2049;
 /// First byte of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-pub(crate) enum Kind {
+pub(crate) enum MessageKind {
     /// Both ways: bytes to or from the autopilot.
     Mavlink = b'M',
     /// From the runtime, first: which autopilot, and the key; [`Setup`].
@@ -33,7 +33,7 @@ pub(crate) enum Kind {
     Note = b'N',
 }
 
-impl Kind {
+impl MessageKind {
     fn of(byte: u8) -> Option<Self> {
         [Self::Mavlink, Self::Setup, Self::Feed, Self::Ready, Self::Refused, Self::Note]
             .into_iter()
@@ -80,7 +80,7 @@ pub struct Feed {
 ///
 /// # Errors
 /// The system's: nobody reads, or there is no room.
-pub(crate) fn put(socket: BorrowedFd<'_>, kind: Kind, body: &[u8]) -> io::Result<()> {
+pub(crate) fn put(socket: BorrowedFd<'_>, kind: MessageKind, body: &[u8]) -> io::Result<()> {
     let mut message = [0; MAX_MESSAGE];
     let body = &body[..body.len().min(MAX_MESSAGE - 1)];
     message[0] = kind as u8;
@@ -96,7 +96,7 @@ pub(crate) fn put(socket: BorrowedFd<'_>, kind: Kind, body: &[u8]) -> io::Result
 /// As [`put`].
 pub(crate) fn put_body(
     socket: BorrowedFd<'_>,
-    kind: Kind,
+    kind: MessageKind,
     body: &impl Serialize,
 ) -> io::Result<()> {
     let mut bytes = [0; 256];
@@ -108,7 +108,7 @@ pub(crate) fn put_body(
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Received<'a> {
     /// A message.
-    Message(Kind, &'a [u8]),
+    Message(MessageKind, &'a [u8]),
     /// None within the socket's time-out, or one of no kind that we know.
     Nothing,
     /// The other side has ended.
@@ -119,7 +119,7 @@ pub(crate) enum Received<'a> {
 pub(crate) fn take<'a>(socket: BorrowedFd<'_>, buffer: &'a mut [u8; MAX_MESSAGE]) -> Received<'a> {
     match recv(socket.as_raw_fd(), &mut buffer[..], MsgFlags::empty()) {
         Ok(0) => Received::Ended,
-        Ok(len) => match Kind::of(buffer[0]) {
+        Ok(len) => match MessageKind::of(buffer[0]) {
             Some(kind) => Received::Message(kind, &buffer[1..len]),
             None => Received::Nothing,
         },

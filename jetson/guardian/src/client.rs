@@ -16,7 +16,7 @@ use nix::sys::socket::{
 };
 use nix::sys::time::{TimeVal, TimeValLike};
 
-use crate::channel::{Feed, Kind, MAX_MESSAGE, Received, Setup, put, put_body, take};
+use crate::channel::{Feed, MAX_MESSAGE, MessageKind, Received, Setup, put, put_body, take};
 use crate::port::{MavlinkAddress, Wanted};
 
 /// The subcommand that runs a guardian.
@@ -72,7 +72,7 @@ impl Guardian {
             // Keys that end the runtime must not end it.
             .process_group(0)
             .spawn()?;
-        put_body(ours.as_fd(), Kind::Setup, &Setup::of(wanted))?;
+        put_body(ours.as_fd(), MessageKind::Setup, &Setup::of(wanted))?;
         let local = wait_until_ready(&ours)?;
         let child = Mutex::new(child);
         Ok(Self { socket: ours, child, local, has_ended: AtomicBool::new(false) })
@@ -90,12 +90,12 @@ impl Guardian {
 
     /// Sends a packet to the autopilot; loss is the protocol's concern.
     pub fn send(&self, packet: &[u8]) {
-        let _ = put(self.socket.as_fd(), Kind::Mavlink, packet);
+        let _ = put(self.socket.as_fd(), MessageKind::Mavlink, packet);
     }
 
     /// Says where poses come from without the runtime; repeated, as the clocks drift apart.
     pub fn feed(&self, feed: &Feed) {
-        let _ = put_body(self.socket.as_fd(), Kind::Feed, feed);
+        let _ = put_body(self.socket.as_fd(), MessageKind::Feed, feed);
     }
 
     /// Tells it that the flight is over, and waits a second for it to leave: the next flight finds the port
@@ -125,8 +125,8 @@ impl Guardian {
             return Ok(None);
         }
         match take(self.socket.as_fd(), buffer) {
-            Received::Message(Kind::Mavlink, bytes) => Ok(Some(Message::Mavlink(bytes))),
-            Received::Message(Kind::Note, text) => {
+            Received::Message(MessageKind::Mavlink, bytes) => Ok(Some(Message::Mavlink(bytes))),
+            Received::Message(MessageKind::Note, text) => {
                 Ok(Some(Message::Note(String::from_utf8_lossy(text).into_owned())))
             }
             Received::Message(..) | Received::Nothing => Ok(None),
@@ -143,10 +143,10 @@ fn wait_until_ready(socket: &OwnedFd) -> io::Result<String> {
     let (deadline, mut buffer) = (Instant::now() + READY_WITHIN, [0; MAX_MESSAGE]);
     while Instant::now() < deadline {
         match take(socket.as_fd(), &mut buffer) {
-            Received::Message(Kind::Ready, local) => {
+            Received::Message(MessageKind::Ready, local) => {
                 return Ok(String::from_utf8_lossy(local).into_owned());
             }
-            Received::Message(Kind::Refused, why) => {
+            Received::Message(MessageKind::Refused, why) => {
                 return Err(io::Error::other(String::from_utf8_lossy(why).into_owned()));
             }
             Received::Message(..) | Received::Nothing => {}

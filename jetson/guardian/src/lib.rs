@@ -36,7 +36,7 @@ use vizflyt_protocol::time::HostTime;
 pub use channel::Feed;
 pub use client::{Guardian, Message, SUBCOMMAND};
 
-use channel::{Kind, MAX_MESSAGE, Received, Setup, put, take};
+use channel::{MAX_MESSAGE, MessageKind, Received, Setup, put, take};
 use feed::Subscription;
 use port::{MavlinkAddress, Port};
 use watch::{Out, Watch};
@@ -73,7 +73,7 @@ fn try_run(address: &str) -> io::Result<()> {
     SigSet::all().thread_block()?;
     let runtime = io::stdin().as_fd().try_clone_to_owned()?;
     let mut buffer = [0; MAX_MESSAGE];
-    let Received::Message(Kind::Setup, setup) = take(runtime.as_fd(), &mut buffer) else {
+    let Received::Message(MessageKind::Setup, setup) = take(runtime.as_fd(), &mut buffer) else {
         return Err(io::Error::other("the guardian is started by `vizflyt fly`, not by hand"));
     };
     let setup: Setup = postcard::from_bytes(setup).map_err(io::Error::other)?;
@@ -86,11 +86,11 @@ fn try_run(address: &str) -> io::Result<()> {
         Ok(port) => port,
         Err(error) => {
             let advice = if error.kind() == io::ErrorKind::AddrInUse { TAKEN } else { "" };
-            put(runtime.as_fd(), Kind::Refused, format!("{error}{advice}").as_bytes())?;
+            put(runtime.as_fd(), MessageKind::Refused, format!("{error}{advice}").as_bytes())?;
             return Ok(());
         }
     };
-    put(runtime.as_fd(), Kind::Ready, port.local()?.as_bytes())?;
+    put(runtime.as_fd(), MessageKind::Ready, port.local()?.as_bytes())?;
     setsockopt(&runtime, ReceiveTimeout, &TimeVal::milliseconds(TICK_MS))?;
     let shared = Arc::new(Shared {
         port,
@@ -121,10 +121,10 @@ fn hear_runtime(shared: &Shared) {
         let now = host_now();
         let mut watch = shared.watch();
         match received {
-            Received::Message(Kind::Mavlink, packet) => {
+            Received::Message(MessageKind::Mavlink, packet) => {
                 watch.handle_runtime(now, packet, &mut shared.out());
             }
-            Received::Message(Kind::Feed, body) => {
+            Received::Message(MessageKind::Feed, body) => {
                 if let Ok(feed) = postcard::from_bytes(body) {
                     *shared.feed.lock().unwrap_or_else(PoisonError::into_inner) = Some(feed);
                 }
@@ -148,12 +148,12 @@ fn hear_autopilot(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE - 1];
     while !shared.is_over.load(Ordering::Relaxed) {
         if let Some(intruder) = shared.port.poll_intruder() {
-            let _ = put(shared.runtime.as_fd(), Kind::Note, intruder.to_string().as_bytes());
+            let _ = put(shared.runtime.as_fd(), MessageKind::Note, intruder.to_string().as_bytes());
         }
         match shared.port.receive(&mut buffer) {
             Ok(Some(len)) => {
                 // No room drops telemetry, as the network might.
-                let _ = put(shared.runtime.as_fd(), Kind::Mavlink, &buffer[..len]);
+                let _ = put(shared.runtime.as_fd(), MessageKind::Mavlink, &buffer[..len]);
                 shared.watch().handle_autopilot(host_now(), &buffer[..len]);
             }
             Ok(None) => {}
@@ -203,7 +203,7 @@ impl Out for PortOut<'_> {
 
     fn say(&mut self, sentence: &'static str) {
         complain(sentence);
-        let _ = put(self.runtime, Kind::Note, sentence.as_bytes());
+        let _ = put(self.runtime, MessageKind::Note, sentence.as_bytes());
     }
 }
 

@@ -11,6 +11,7 @@ use vizflyt_arena::fence::{Boundaries, FenceVerdict};
 use vizflyt_arena::obstacles::TimedPose;
 use vizflyt_arena::{ArenaConfig, BodyShape, Obstacles};
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
+use vizflyt_protocol::random::SplitMix64;
 use vizflyt_simulator::airframe::{Airframe, GRAVITY_MPS2, MASS_KG};
 use vizflyt_simulator::control::Limits;
 use vizflyt_simulator::control::attitude::{AttitudeController, Heading};
@@ -138,15 +139,16 @@ impl Episode {
     /// Starts near the spawn: where, follows from the seed.
     pub fn start(rules: &Rules, manner: &Manner, seed: u64) -> Self {
         let spawn = &rules.arena.spawn;
-        let mut noise = Noise(seed);
+        let mut random = SplitMix64::new(seed);
+        let mut signed = || 2.0 * random.unit() - 1.0;
         let floor_z_m = spawn.position_m.z;
         let above_m = spawn.position_m + DVec3::Z * rules.arena.takeoff_height_m;
         let yaw_rad = spawn.yaw_deg.to_radians();
         let mut airframe = Airframe::hovering(above_m, yaw_rad, floor_z_m);
         // Where there is no room for a start of its own it starts above the spawn.
         for _ in 0..20 {
-            let offset_m = DVec3::new(noise.signed(), noise.signed(), noise.signed()) * START_M;
-            let turn_rad = noise.signed() * START_YAW_RAD;
+            let offset_m = DVec3::new(signed(), signed(), signed()) * START_M;
+            let turn_rad = signed() * START_YAW_RAD;
             if rules.obstacles.distance_m(0, above_m + offset_m)
                 > rules.body.radius_m() + START_CLEARANCE_M
             {
@@ -361,20 +363,6 @@ pub fn append_depth_mm(depth_m: &[f32], out: &mut Vec<u8>) {
     // Clamped before the cast, in an order that vectorises.
     let mm = depth_m.iter().map(|m| (m * 1000.0 + 0.5).clamp(0.0, 65535.0) as u16);
     out.extend(mm.flat_map(u16::to_le_bytes));
-}
-
-/// SplitMix64 (Steele, Lea, Flood 2014): numbers that follow from a seed.
-struct Noise(u64);
-
-impl Noise {
-    /// Returns the next one, from -1 to 1.
-    fn signed(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
-    }
 }
 
 #[cfg(test)]

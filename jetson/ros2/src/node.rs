@@ -6,6 +6,7 @@ use std::thread;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result};
+use vizflyt_rgbd::encode_jpeg;
 use vizflyt_sdk::{
     ArenaInfo, Autonomy, Body, Cam, Event, HostTime, Intrinsics, Observation, Pose, Sensor,
     SensorKind, Setpoint, host_now,
@@ -390,12 +391,8 @@ impl Sender {
 
 /// Returns an image as a JPEG file.
 fn jpeg(rgb: &[u8], intrinsics: &Intrinsics) -> Option<Vec<u8>> {
-    let (width, height) =
-        (intrinsics.width_px.try_into().ok()?, intrinsics.height_px.try_into().ok()?);
     let mut file = Vec::new();
-    jpeg_encoder::Encoder::new(&mut file, JPEG_QUALITY)
-        .encode(rgb, width, height, jpeg_encoder::ColorType::Rgb)
-        .ok()?;
+    encode_jpeg(rgb, intrinsics.width_px, intrinsics.height_px, JPEG_QUALITY, &mut file).ok()?;
     Some(file)
 }
 

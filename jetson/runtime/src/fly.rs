@@ -6,16 +6,17 @@ use std::net::SocketAddr;
 use std::process;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use anyhow::Context;
 use serde_json::json;
 use tokio::runtime::{Builder, Runtime};
 use vizflyt_guardian::client::BUFFER;
 use vizflyt_guardian::{Feed, Guardian, Message};
-use vizflyt_process::{on_interrupt, on_orphaned, print_line};
+use vizflyt_process::{descriptors, on_interrupt, on_orphaned, print_line};
 use vizflyt_protocol::flight_end::EndReason;
 use vizflyt_protocol::messages::{PoseSample, Purpose, bounded};
 use vizflyt_protocol::packet::feed::FeedKey;
@@ -24,10 +25,9 @@ use vizflyt_protocol::time::HostTime;
 use crate::args::{FlyArgs, ServerAddress};
 use crate::console::Screen;
 use crate::control::{Control, ControlInput, QUEUE};
-use crate::descriptors;
 use crate::flight::FlightSettings;
 use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
-use crate::report::Report;
+use crate::report::FlightReport;
 use crate::stream::{self, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
 
 /// How long the last events may take to reach the server.
@@ -136,7 +136,7 @@ pub fn fly_command(
     stop.store(true, Ordering::Relaxed);
     guardian.leave();
 
-    let mut report = Report::new(&flown.outcome, &flown.times, &flown.counters);
+    let mut report = FlightReport::new(&flown.outcome, &flown.times, &flown.counters);
     report.log = flown.log.path().map(|path| path.display().to_string());
     drop(flown.log);
     // The stream ends when the server has acknowledged every event, and closes the connection.
@@ -220,11 +220,11 @@ fn tell_stream(
     move |event| {
         let is_pose = match &event {
             StreamEvent::Feed(server, key) => {
-                feed.lock().unwrap_or_else(PoisonError::into_inner).source = Some((*server, *key));
+                lock(&feed).source = Some((*server, *key));
                 return true;
             }
             StreamEvent::Pose(sample, stamp) => {
-                let mut feed = feed.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut feed = lock(&feed);
                 if let Some(told) = feed.due(sample, *stamp) {
                     guardian.feed(&told);
                 }
@@ -269,7 +269,7 @@ fn print_ready(json: bool, server: &ServerAddress, mavlink: &str, log: &FlightLo
     }
 }
 
-fn print_outcome(args: &FlyArgs, report: &Report) {
+fn print_outcome(args: &FlyArgs, report: &FlightReport) {
     if args.json {
         print_line(json!({"report": report}));
         return;

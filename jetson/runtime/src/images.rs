@@ -19,8 +19,9 @@
 //! The newest readings of the other sensors are copied behind the images as the observation is published; a vehicle
 //! without such sensors pays nothing.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use vizflyt_protocol::messages::{Arrivals, CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::packet::ImageHeader;
@@ -32,7 +33,7 @@ use vizflyt_sdk::{ImageStamps, ObservationTooLarge, ObservationWriter, PlanesMut
 
 use crate::companion::Senses;
 use crate::log::{ImageLog, LoggedImage, LoggedSensors, observation_head};
-use crate::stream::{Arrival, Mailbox, NewestReadings, Readings, Step, Whole};
+use crate::stream::{Arrival, DecodeStep, Mailbox, NewestReadings, Readings, Whole};
 use crate::waterfall::Stamps;
 
 /// The control loop writes them, the image publisher reads them.
@@ -171,10 +172,10 @@ impl ImagePublisher {
         };
         let Some((camera, step)) = mailbox.next(timeout, may_begin) else { return Ok(false) };
         let result = match step {
-            Step::Begin(arrival) => self.begin(camera, &arrival),
-            Step::Piece(piece) => self.piece(camera, piece, notify),
-            Step::End(whole) => self.end(camera, &whole, notify),
-            Step::Drop => {
+            DecodeStep::Begin(arrival) => self.begin(camera, &arrival),
+            DecodeStep::Piece(piece) => self.piece(camera, piece, notify),
+            DecodeStep::End(whole) => self.end(camera, &whole, notify),
+            DecodeStep::Drop => {
                 self.forget(camera);
                 Ok(())
             }
@@ -335,7 +336,7 @@ impl ImagePublisher {
         }
         let mut readings = NewestReadings::default();
         if let Ok(mut writer) = ObservationWriter::resume(done.memory.memory(), &self.cameras) {
-            let senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
+            let senses = lock(&self.senses);
             senses.write(&mut writer);
             for header in &done.headers {
                 senses.write_pose_at_image(&mut writer, header);

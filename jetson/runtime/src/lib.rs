@@ -24,7 +24,6 @@ pub mod companion;
 pub mod config;
 pub mod console;
 pub mod control;
-mod descriptors;
 pub mod flight;
 pub mod fly;
 pub mod guard;

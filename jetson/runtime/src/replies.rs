@@ -2,9 +2,10 @@
 //! images has no more to send but, with each reply, its own estimate of where it is.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use vizflyt_protocol::messages::{FromPlugin, bounded};
 use vizflyt_protocol::time::HostTime;
@@ -105,7 +106,7 @@ impl PluginReplies {
     /// Passes on what has arrived. When it returns, `handle` has been given all that was sent before the
     /// call, by whichever thread: a plugin's last message is handled before its exit.
     pub(crate) fn drain(&self, handle: impl Fn(FromPlugin)) {
-        let mut limiter = self.limiter.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut limiter = lock(&self.limiter);
         // At most a queue full, so that `stop` is seen whatever the plugin does.
         for _ in 0..256 {
             let received = match self.ipc.receive() {

@@ -12,7 +12,7 @@ use crate::stats::ImageTimes;
 
 /// The report. Field names carry their units.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct FlightReport {
     /// How the flight ended.
     pub outcome: OutcomeKind,
     /// Why, in one sentence.
@@ -80,7 +80,7 @@ pub struct Counters {
     pub cameras: Vec<Arrivals>,
 }
 
-impl Report {
+impl FlightReport {
     /// Makes the report.
     pub fn new(end: &EndReason, times: &ImageTimes, counters: &Counters) -> Self {
         let (waterfall, intervals) = times.flight();
@@ -135,7 +135,7 @@ mod tests {
     #[test]
     fn names_are_those_agreed_on() {
         let end = EndReason::Plugin(PluginFault::NoSetpoint);
-        let report = Report::new(&end, &ImageTimes::default(), &Counters::default());
+        let report = FlightReport::new(&end, &ImageTimes::default(), &Counters::default());
         let json = serde_json::to_value(&report).unwrap();
         assert_eq!(json["outcome"], "plugin_failed");
         for key in ["age_ms_p99", "image_hz", "setpoints_sent", "mavlink_packets", "peak_rss_mb"] {

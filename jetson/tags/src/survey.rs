@@ -19,7 +19,7 @@ use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use crate::family::TagFamily;
 use crate::layout::Square;
-use crate::solve::{Geometry, Motion, Sighting, Solved, solve};
+use crate::solve::{Geometry, Sighting, Solved, VehicleTwist, solve};
 
 /// Why nothing was surveyed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -89,7 +89,7 @@ fn camera_pose(
             readout_s: 0.0,
         })
         .collect();
-    let solved = solve(&sightings, &Motion::default(), None)?;
+    let solved = solve(&sightings, &VehicleTwist::default(), None)?;
     let body = solved.best.world_from_body;
     Some((Pose::new(body.translation_m, body.rotation), solved))
 }
@@ -112,7 +112,7 @@ fn cube_pose(seen: &[OnCube<'_>]) -> Option<Solved> {
             readout_s: 0.0,
         })
         .collect();
-    solve(&sightings, &Motion::default(), None)
+    solve(&sightings, &VehicleTwist::default(), None)
 }
 
 /// Corners of a still camera are within a fraction of a pixel. [px]

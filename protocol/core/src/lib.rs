@@ -11,6 +11,7 @@
 //! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
 //! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
 //!   memory, framing of messages on a stream;
+//! - [`random`]: random numbers that follow from a seed;
 //! - [`sensor`]: sensors beside the cameras, by kind; their readings on the wire and in shared memory;
 //! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is. It and [`failsafe`] are the
 //!   feature `mavlink`: a plugin needs neither, and its dialect takes as long to compile as all the rest.
@@ -29,6 +30,7 @@ pub mod histogram;
 pub mod mavlink;
 pub mod messages;
 pub mod packet;
+pub mod random;
 pub mod sensor;
 pub mod time;
 

@@ -4,9 +4,15 @@
 //! print_line, print_fmt!, print_error   lines that survive a reader who has gone
 //! on_interrupt                          SIGINT and SIGTERM, each time
 //! stop_flag                             a flag that they set, or the end of standard input: then the parent has gone
+//! lock                                  a mutex, also where a thread has panicked
+//! descriptors                           how many there may be, and some kept back
+//! monotonic_ns                          the clock, as a test may hold it
 //! processor_seconds                     what this process has used
 //! ```
 
+mod clock;
+pub mod descriptors;
+mod lock;
 mod usage;
 
 use std::fmt::Display;
@@ -16,6 +22,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
+pub use clock::monotonic_ns;
+pub use lock::lock;
 use tokio::signal::unix::{SignalKind, signal};
 pub use usage::processor_seconds;
 

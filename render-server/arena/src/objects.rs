@@ -12,6 +12,7 @@ use std::f64::consts::TAU;
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Object, Pose, World};
+use vizflyt_protocol::random;
 
 use crate::config::{ArenaConfig, MotionConfig, ObjectConfig};
 
@@ -35,7 +36,7 @@ pub struct TopSpeed {
 struct MovingObject {
     name: String,
     rest: Pose<World, Object>,
-    motion: Motion,
+    motion: ObjectMotion,
     period_ns: u64,
     /// What of the period had passed at the epoch.
     phase_ns: u64,
@@ -43,7 +44,7 @@ struct MovingObject {
 
 /// As [`MotionConfig`], ready to be asked.
 #[derive(Clone, Debug, PartialEq)]
-enum Motion {
+enum ObjectMotion {
     None,
     Rotation {
         /// Unit. [object]
@@ -111,7 +112,7 @@ impl MovingObjects {
 
     /// Whether an object moves at all.
     pub fn moves(&self, index: usize) -> bool {
-        self.objects[index].motion != Motion::None
+        self.objects[index].motion != ObjectMotion::None
     }
 
     /// Returns their names, in order.
@@ -145,14 +146,14 @@ impl MovingObjects {
 impl MovingObject {
     fn new(config: &ObjectConfig, index: usize, seed: u64) -> Self {
         let (motion, period_s) = match &config.motion {
-            None => (Motion::None, 1.0),
+            None => (ObjectMotion::None, 1.0),
             Some(MotionConfig::Rotation { axis, period_s }) => {
-                (Motion::Rotation { axis: axis.normalize_or(DVec3::Z) }, *period_s)
+                (ObjectMotion::Rotation { axis: axis.normalize_or(DVec3::Z) }, *period_s)
             }
             Some(MotionConfig::Oscillation { slide_m, axis, swing_deg, period_s }) => {
                 let axis = axis.normalize_or_zero();
                 let swing_rad = if axis == DVec3::ZERO { 0.0 } else { swing_deg.to_radians() };
-                (Motion::Oscillation { slide_m: *slide_m, axis, swing_rad }, *period_s)
+                (ObjectMotion::Oscillation { slide_m: *slide_m, axis, swing_rad }, *period_s)
             }
             Some(MotionConfig::Path { points_m, speed_mps, closed }) => {
                 let mut corners_m = points_m.clone();
@@ -167,13 +168,16 @@ impl MovingObject {
                     length_m += (pair[1] - pair[0]).length();
                     along_m.push(length_m);
                 }
-                (Motion::Path { corners_m, along_m, speed_mps: *speed_mps }, length_m / speed_mps)
+                (
+                    ObjectMotion::Path { corners_m, along_m, speed_mps: *speed_mps },
+                    length_m / speed_mps,
+                )
             }
         };
         let period_ns = ((period_s * 1e9).round() as u64).max(1);
         let phase_ns = match config.phase_s {
             Some(phase_s) => (phase_s * 1e9).round() as u64 % period_ns,
-            None => random_u64(seed, index as u64) % period_ns,
+            None => random::nth(seed, index as u64) % period_ns,
         };
         let yaw_rad = config.yaw_deg.to_radians();
         let rest = Pose::new(config.position_m, turn(DVec3::Z, yaw_rad));
@@ -186,13 +190,13 @@ impl MovingObject {
         let into_ns = ns.rem_euclid(i128::from(self.period_ns)) as u64;
         let share = into_ns as f64 / self.period_ns as f64;
         let (offset_m, rotation) = match &self.motion {
-            Motion::None => (DVec3::ZERO, DQuat::IDENTITY),
-            Motion::Rotation { axis } => (DVec3::ZERO, turn(*axis, TAU * share)),
-            Motion::Oscillation { slide_m, axis, swing_rad } => {
+            ObjectMotion::None => (DVec3::ZERO, DQuat::IDENTITY),
+            ObjectMotion::Rotation { axis } => (DVec3::ZERO, turn(*axis, TAU * share)),
+            ObjectMotion::Oscillation { slide_m, axis, swing_rad } => {
                 let side = libm::sin(TAU * share);
                 (*slide_m * side, turn(*axis, *swing_rad * side))
             }
-            Motion::Path { corners_m, along_m, .. } => {
+            ObjectMotion::Path { corners_m, along_m, .. } => {
                 let way_m = share * along_m[along_m.len() - 1];
                 // The last corner that is behind; the first is, at 0.
                 let n = along_m.partition_point(|&at_m| at_m <= way_m).clamp(1, along_m.len() - 1);
@@ -208,13 +212,15 @@ impl MovingObject {
     fn top_speed(&self) -> TopSpeed {
         let turns_radps = TAU / (self.period_ns as f64 * 1e-9);
         match &self.motion {
-            Motion::None => TopSpeed::default(),
-            Motion::Rotation { .. } => TopSpeed { linear_mps: 0.0, angular_radps: turns_radps },
-            Motion::Oscillation { slide_m, swing_rad, .. } => TopSpeed {
+            ObjectMotion::None => TopSpeed::default(),
+            ObjectMotion::Rotation { .. } => {
+                TopSpeed { linear_mps: 0.0, angular_radps: turns_radps }
+            }
+            ObjectMotion::Oscillation { slide_m, swing_rad, .. } => TopSpeed {
                 linear_mps: slide_m.length() * turns_radps,
                 angular_radps: swing_rad.abs() * turns_radps,
             },
-            Motion::Path { speed_mps, .. } => {
+            ObjectMotion::Path { speed_mps, .. } => {
                 TopSpeed { linear_mps: *speed_mps, angular_radps: 0.0 }
             }
         }
@@ -225,14 +231,6 @@ impl MovingObject {
 fn turn(axis: DVec3, angle_rad: f64) -> DQuat {
     let (sin, cos) = libm::sincos(angle_rad / 2.0);
     DQuat::from_xyzw(axis.x * sin, axis.y * sin, axis.z * sin, cos)
-}
-
-/// Returns a random number for the `index`-th object of a seed (SplitMix64, Steele et al. 2014).
-fn random_u64(seed: u64, index: u64) -> u64 {
-    let mut z = seed.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15));
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
 }
 
 #[cfg(test)]

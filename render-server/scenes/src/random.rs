@@ -4,28 +4,21 @@
 use core::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
+use vizflyt_protocol::random::{GOLDEN, SplitMix64, mix, unit};
 
-/// A counter-based generator (SplitMix64, Steele et al. 2014): the n-th draw is a hash of
-/// `key + n`.
+/// The numbers of one stream of a seed.
 #[derive(Clone, Debug)]
-pub(crate) struct Rng {
-    state: u64,
-}
+pub(crate) struct Rng(SplitMix64);
 
 impl Rng {
     /// Makes the stream `stream` of a seed; streams are independent.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
-        Self { state: mix(seed ^ mix(stream.wrapping_mul(GOLDEN))) }
-    }
-
-    fn bits(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(GOLDEN);
-        mix(self.state)
+        Self(SplitMix64::new(mix(seed ^ mix(stream.wrapping_mul(GOLDEN)))))
     }
 
     /// Returns a number in [0, 1).
     pub(crate) fn unit(&mut self) -> f64 {
-        unit(self.bits())
+        self.0.unit()
     }
 
     /// Returns a number in [low, high).
@@ -129,30 +122,9 @@ fn lattice(seed: u64, x: i64, y: i64, z: i64) -> f64 {
     unit(mix(key ^ seed.wrapping_mul(GOLDEN)))
 }
 
-fn unit(bits: u64) -> f64 {
-    (bits >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
-}
-
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
-}
-
-/// 2^64 over the golden ratio, odd: SplitMix64's increment.
-const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn known_draws() {
-        // SplitMix64's published first outputs for the state 1234567.
-        let mut rng = Rng { state: 1234567 };
-        assert_eq!(rng.bits(), 6457827717110365317);
-        assert_eq!(rng.bits(), 3203168211198807973);
-    }
 
     #[test]
     fn draws_are_even_and_streams_differ() {
@@ -161,8 +133,8 @@ mod tests {
         assert!((mean - 0.5).abs() < 0.02);
         let variance = (0..10_000).map(|_| rng.normal().powi(2)).sum::<f64>() / 1e4;
         assert!((variance - 1.0).abs() < 0.05);
-        assert_ne!(Rng::new(1, 2).bits(), Rng::new(1, 3).bits());
-        assert_ne!(Rng::new(1, 2).bits(), Rng::new(2, 2).bits());
+        assert_ne!(Rng::new(1, 2).unit(), Rng::new(1, 3).unit());
+        assert_ne!(Rng::new(1, 2).unit(), Rng::new(2, 2).unit());
     }
 
     #[test]

@@ -24,13 +24,13 @@ pub struct Walk {
     seconds: f64,
     length_m: f64,
     /// At even distances along the way, closed; the gaze's direction without whole turns lost.
-    steps: Vec<Step>,
+    steps: Vec<Standpoint>,
     sway: Sway,
 }
 
 /// Where the walker is, and looks.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Step {
+struct Standpoint {
     at_m: DVec2,
     yaw_rad: f64,
 }
@@ -105,7 +105,8 @@ impl Walk {
         let step = |offset: isize| {
             let index = first as isize + offset;
             let lap = index.div_euclid(count as isize);
-            let Step { at_m, yaw_rad } = self.steps[index.rem_euclid(count as isize) as usize];
+            let Standpoint { at_m, yaw_rad } =
+                self.steps[index.rem_euclid(count as isize) as usize];
             DVec3::new(at_m.x, at_m.y, yaw_rad + whole * lap as f64)
         };
         let [a, b, c, d] = [step(-1), step(0), step(1), step(2)];
@@ -119,7 +120,7 @@ impl Walk {
 
 /// Turns the gaze along the way: to the left of it for one half of the time, to the right for the other, as who
 /// films a room does, so that each place is seen from two sides.
-fn look_about(way: &[DVec2]) -> Vec<Step> {
+fn look_about(way: &[DVec2]) -> Vec<Standpoint> {
     let count = way.len();
     let mut yaws = Vec::with_capacity(count);
     let mut last = None;
@@ -153,7 +154,7 @@ fn look_about(way: &[DVec2]) -> Vec<Step> {
         }
         sum / weights
     };
-    (0..count).map(|n| Step { at_m: way[n], yaw_rad: smooth(n) }).collect()
+    (0..count).map(|n| Standpoint { at_m: way[n], yaw_rad: smooth(n) }).collect()
 }
 
 /// Returns a turn about a unit axis, by the same mathematics on every machine.

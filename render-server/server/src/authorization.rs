@@ -17,7 +17,7 @@ use vizflyt_trust::pairing::{
 };
 use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, Paired};
 
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// What every way into the server asks.
 #[derive(Debug)]

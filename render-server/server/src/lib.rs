@@ -10,7 +10,7 @@
 //! scene     files -> splats, obstacles      imports none of these
 //! ```
 //! Beneath the rooms lie small files that import no room: clock, stop, lock, mailbox, timing,
-//! rate limits, admission, descriptors, priority, authorization. `tests/arrows.rs` fails on an import that runs upwards.
+//! rate limits, admission, priority, authorization. `tests/arrows.rs` fails on an import that runs upwards.
 //!
 //! Four threads (poses, render, encode, previews) and a tokio runtime for sockets share the rooms'
 //! states ([`stream::Rooms`]). Everything is latest-wins but events, which are a log. [`serve()`]
@@ -20,9 +20,7 @@ mod admission;
 pub mod args;
 pub mod authorization;
 pub mod clock;
-mod descriptors;
 pub mod flights;
-pub mod lock;
 pub mod mailbox;
 pub mod poses;
 mod priority;

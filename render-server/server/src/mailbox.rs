@@ -6,6 +6,7 @@
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use vizflyt_process::lock;
 
 /// A newest-wins slot for items of type `T`.
 #[derive(Debug, Default)]
@@ -84,7 +85,7 @@ impl<T: Default> Mailbox<T> {
 
     fn lock(&self) -> MutexGuard<'_, Inner<T>> {
         // Why: nothing panics while the lock is held; a poisoned mailbox is still a valid one.
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.inner)
     }
 }
 

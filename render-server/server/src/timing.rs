@@ -11,7 +11,7 @@ use vizflyt_protocol::histogram::Histogram;
 use vizflyt_protocol::messages::StageTimes;
 use vizflyt_protocol::time::ServerTime;
 
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// Durations of one stage.
 #[derive(Debug)]

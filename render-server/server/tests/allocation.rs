@@ -152,7 +152,7 @@ fn drawing_allocates_nothing_once_it_is_warm() {
     };
     rooms.streaming.subscriptions.viewer_came(0);
     rooms.streaming.subscriptions.viewer_came(1);
-    vizflyt_server::lock::lock(&rendering.renderer).name = "nothing".to_owned();
+    vizflyt_process::lock(&rendering.renderer).name = "nothing".to_owned();
     let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(RenderQueue::default()));
     newest.put(Everyone::poses(1));
     let mut everyone = Everyone {

@@ -7,7 +7,7 @@ use std::hint::black_box;
 use criterion::{BatchSize, Criterion, criterion_group, criterion_main};
 use glam::{DQuat, Quat, Vec3};
 use vizflyt_splat::Splats;
-use vizflyt_splat::edit::{Carve, Region, Step};
+use vizflyt_splat::edit::{Carve, EditStep, Region};
 use vizflyt_splat::format::{self, Format};
 
 /// Splats of the scene.
@@ -74,13 +74,13 @@ fn edits(criterion: &mut Criterion) {
     };
     let turn = DQuat::from_rotation_x(0.7).to_array();
     for (name, step) in [
-        ("crop to a box", Step::Crop { within }),
-        ("remove in a lasso, in front", Step::Remove { within: vec![lasso] }),
-        ("drop floaters", Step::Floaters { cell: 0.05, least: 50 }),
-        ("keep the largest part", Step::Parts { cell: 0.05, keep: 1 }),
-        ("carve", Step::Carve(carve)),
-        ("decimate to half", Step::Decimate { count: COUNT as u32 / 2 }),
-        ("turn", Step::Turn { rotation: turn }),
+        ("crop to a box", EditStep::Crop { within }),
+        ("remove in a lasso, in front", EditStep::Remove { within: vec![lasso] }),
+        ("drop floaters", EditStep::Floaters { cell: 0.05, least: 50 }),
+        ("keep the largest part", EditStep::Parts { cell: 0.05, keep: 1 }),
+        ("carve", EditStep::Carve(carve)),
+        ("decimate to half", EditStep::Decimate { count: COUNT as u32 / 2 }),
+        ("turn", EditStep::Turn { rotation: turn }),
     ] {
         let once = |mut splats: Splats| {
             step.apply(&mut splats).expect("a step");

@@ -15,7 +15,7 @@ use vizflyt_splat::imaging::tof::Tof;
 use vizflyt_splat::imaging::{CameraModel, DepthModel, Imager, Sensor, Shot};
 use vizflyt_splat::sensor::presets::{PRESETS, Preset};
 use vizflyt_splat::sensor::{
-    Lidar, LidarPoint, Motion, Radar, RadarDetection, RangeFinder, SensorScene, Sonar,
+    Lidar, LidarPoint, Radar, RadarDetection, RangeFinder, SensorMotion, SensorScene, Sonar,
 };
 use vizflyt_splat::weather::{
     Cloud, Flicker, LampPlaces, Lamps, Moment, OwnLight, Rain, Snow, Sun, Weather, WeatherPass,
@@ -223,7 +223,7 @@ fn sensors_allocate_nothing_after_their_first_measurement() {
                     let moved_m = DVec3::X * (0.1 * seq as f64);
                     let begins = Pose::new(moved_m, DQuat::from_rotation_z(0.3 * seq as f64));
                     let ends = Pose::new(moved_m + DVec3::Y * 0.2, begins.rotation);
-                    let motion = Motion {
+                    let motion = SensorMotion {
                         world_from_sensor: [begins, ends],
                         objects: &[[begin[0], end[0]], [begin[1], end[1]]],
                         duration_s: 0.1,
@@ -256,7 +256,7 @@ impl Prepared {
         }
     }
 
-    fn measure(&mut self, scene: &SensorScene, motion: &Motion<'_>, seq: u64) {
+    fn measure(&mut self, scene: &SensorScene, motion: &SensorMotion<'_>, seq: u64) {
         let valid = "a valid motion";
         match self {
             Self::Lidar(lidar, points) => {

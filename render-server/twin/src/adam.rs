@@ -63,7 +63,7 @@ impl Moments {
 }
 
 /// One step of all rows that were seen.
-pub(crate) struct Step<'a> {
+pub(crate) struct AdamStep<'a> {
     /// Ascending, as many as gradients.
     pub(crate) seen: &'a [u32],
     pub(crate) gradients: &'a [RowGradient],
@@ -77,7 +77,7 @@ pub(crate) struct Step<'a> {
     pub(crate) degree: u8,
 }
 
-impl Step<'_> {
+impl AdamStep<'_> {
     /// Moves the rows.
     pub(crate) fn apply(
         &self,
@@ -142,7 +142,7 @@ impl Step<'_> {
 
 /// A chunk of rows.
 struct Rows<'a> {
-    step: &'a Step<'a>,
+    step: &'a AdamStep<'a>,
     stride: usize,
     rows: usize,
     seen: &'a [u32],
@@ -220,8 +220,15 @@ mod tests {
         let rates =
             Rates { mean: 0.1, log_scale: 0.2, rotation: 0.3, logit: 0.4, sh: 0.5, sh_rest: 0.6 };
         let tolls = Tolls { opacity: 0.0, scale: 0.0, thickness: 0.0, needle: 0.0 };
-        let step =
-            Step { seen: &[1], gradients: &[by], number: 1, rates, tolls, extent: 1.0, degree: 0 };
+        let step = AdamStep {
+            seen: &[1],
+            gradients: &[by],
+            number: 1,
+            rates,
+            tolls,
+            extent: 1.0,
+            degree: 0,
+        };
         step.apply(InstructionSet::available()[0], &mut gaussians, &mut moments);
         assert_eq!(gaussians.row(0), before.row(0));
         assert_eq!(gaussians.row(2), before.row(2));

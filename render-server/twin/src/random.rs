@@ -1,39 +1,35 @@
 //! Random numbers that a seed and a counter determine, the same on every machine.
 
-/// A stream of numbers (Steele et al. 2014, "SplitMix").
+use vizflyt_protocol::random::{self, SplitMix64};
+
+/// A stream of numbers.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Random(u64);
+pub struct Random(SplitMix64);
 
 impl Random {
     /// Returns the stream of a seed.
     pub fn new(seed: u64) -> Self {
-        Self(seed)
+        Self(SplitMix64::new(seed))
     }
 
     /// Returns stream `i` of a seed: streams of neighbours are independent.
     pub fn stream(seed: u64, i: u64) -> Self {
-        let mut mixed = Self(seed ^ i.wrapping_mul(0xd1342543de82ef95));
-        mixed.0 = mixed.bits();
-        mixed
+        Self::new(random::nth(seed ^ i.wrapping_mul(0xd1342543de82ef95), 0))
     }
 
     /// Returns the seed of the numbers still to come.
     pub(crate) fn state(&self) -> u64 {
-        self.0
+        self.0.state()
     }
 
     /// Returns 64 random bits.
     pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e3779b97f4a7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58476d1ce4e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d049bb133111eb);
-        z ^ (z >> 31)
+        self.0.bits()
     }
 
     /// Returns a number from 0 to below 1.
     pub fn unit(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 / (1u32 << 24) as f32
+        self.0.unit_f32()
     }
 
     /// Returns a number from `low` to below `high`.

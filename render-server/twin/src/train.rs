@@ -16,7 +16,7 @@ use vizflyt_splat::Splats;
 use vizflyt_splat::gpu::training::Changed;
 use vizflyt_splat::simd::InstructionSet;
 
-use crate::adam::{Moments, Rates, Step, Tolls};
+use crate::adam::{AdamStep, Moments, Rates, Tolls};
 use crate::dataset::{Dataset, Photo};
 use crate::gaussians::{CHUNK, Gaussians, coefficients, column, within};
 use crate::loss::{Exposure, Loss, Parts, Weights};
@@ -216,7 +216,7 @@ impl<'a> Trainer<'a> {
         note(&mut self.errors, &self.seen, &self.gradients);
         self.step += 1;
         let rates = self.rates();
-        let step = Step {
+        let step = AdamStep {
             seen: &self.seen,
             gradients: &self.gradients,
             number: self.step,

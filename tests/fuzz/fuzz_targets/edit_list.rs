@@ -4,7 +4,7 @@ use glam::{Quat, Vec3};
 use libfuzzer_sys::fuzz_target;
 use vizflyt_server::scene::EditList;
 use vizflyt_splat::Splats;
-use vizflyt_splat::edit::{Carve, Step};
+use vizflyt_splat::edit::{Carve, EditStep};
 
 fuzz_target!(|text: &str| {
     let Ok(list) = EditList::parse(text) else { return };
@@ -16,7 +16,7 @@ fuzz_target!(|text: &str| {
             let all = carve.path.iter().flatten().chain([&carve.reach]);
             all.into_iter().all(|v| (v / carve.cell).abs() < 25.0)
         };
-        if matches!(&done.edit, Step::Carve(carve) if !is_coarse(carve)) {
+        if matches!(&done.edit, EditStep::Carve(carve) if !is_coarse(carve)) {
             continue;
         }
         let before = splats.clone();

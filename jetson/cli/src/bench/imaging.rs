@@ -103,11 +103,11 @@ struct Figures {
     renderer: String,
     images: u32,
     render_ms: f64,
-    kinds: Vec<Kind>,
+    kinds: Vec<Setting>,
 }
 
 #[derive(Debug, Serialize)]
-struct Kind {
+struct Setting {
     name: String,
     median_ms: f64,
     of_render: f64,
@@ -130,11 +130,11 @@ pub(super) fn run(args: &ImagingArgs) -> Result<()> {
         let config: ImagingConfig = serde_json::from_str(text)?;
         let (image, median_ms) = measure.take(&config, &clean, args.images);
         sheet.add(picture(&image, shown));
-        kinds.push(Kind { name: name.to_owned(), median_ms, of_render: median_ms / render_ms });
+        kinds.push(Setting { name: name.to_owned(), median_ms, of_render: median_ms / render_ms });
     }
     let (events, median_ms) = measure.events(&mut sheet)?;
     let name = format!("event camera ({events} events in 20 ms)");
-    kinds.push(Kind { name, median_ms, of_render: median_ms / render_ms });
+    kinds.push(Setting { name, median_ms, of_render: median_ms / render_ms });
     let renderer = rasterizer.name().into_owned();
     let k = &camera.intrinsics;
     let (width_px, height_px) = (k.width_px, k.height_px);
@@ -155,7 +155,7 @@ fn print(figures: &Figures) {
     print_fmt!("scene       {scene}, {width_px}x{height_px}, {renderer}, {images} images each");
     print_fmt!("{:<34} {:>8} {:>10}", "median", "ms", "of render");
     print_fmt!("{:<34} {render_ms:>8.2} {:>10.2}", "rendering", 1.0);
-    for Kind { name, median_ms, of_render } in kinds {
+    for Setting { name, median_ms, of_render } in kinds {
         print_fmt!("{name:<34} {median_ms:>8.2} {of_render:>10.2}");
     }
 }

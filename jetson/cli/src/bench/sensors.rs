@@ -13,7 +13,7 @@ use vizflyt_protocol::geometry::{Pose, Sensor, World, body_from_forward_cam};
 use vizflyt_server::scene::load_as_it_is;
 use vizflyt_splat::sensor::presets::{self, PRESETS, Preset};
 use vizflyt_splat::sensor::{
-    Beams, Lidar, LidarPoint, Motion, Radar, RangeFinder, SensorScene, Sonar,
+    Beams, Lidar, LidarPoint, Radar, RangeFinder, SensorMotion, SensorScene, Sonar,
 };
 use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Scene};
 use vizflyt_studio::scene::camera;
@@ -70,11 +70,11 @@ struct Figures {
     scene: String,
     splats: usize,
     packed_ms: f64,
-    kinds: Vec<Kind>,
+    kinds: Vec<Subject>,
 }
 
 #[derive(Debug, Serialize)]
-struct Kind {
+struct Subject {
     name: String,
     least_ms: f64,
     median_ms: f64,
@@ -118,33 +118,33 @@ fn print(figures: &Figures) {
     let Figures { scene, splats, packed_ms, kinds } = figures;
     print_fmt!("scene       {scene}, {splats} splats, packed in {packed_ms:.1} ms");
     print_fmt!("{:<16} {:>9} {:>9} {:>8}", "ms", "least", "median", "records");
-    for Kind { name, least_ms, median_ms, records } in kinds {
+    for Subject { name, least_ms, median_ms, records } in kinds {
         print_fmt!("{name:<16} {least_ms:>9.3} {median_ms:>9.3} {records:>8}");
     }
 }
 
 /// How the sensor flies from where the camera is, within a tenth of a second.
-fn motion_from(camera: &Camera) -> Motion<'static> {
+fn motion_from(camera: &Camera) -> SensorMotion<'static> {
     let body = camera.world_from_cam * body_from_forward_cam(DVec3::ZERO, 0.0).inverse();
     let begin: Pose<World, Sensor> = Pose::new(body.translation_m, body.rotation);
     let flown: Pose<Sensor, Sensor> =
         Pose::new(DVec3::X * 0.2, DQuat::from_rotation_z(9f64.to_radians()));
-    Motion { world_from_sensor: [begin, begin * flown], objects: &[], duration_s: 0.1 }
+    SensorMotion { world_from_sensor: [begin, begin * flown], objects: &[], duration_s: 0.1 }
 }
 
 /// What a LiDAR without error sees all around, from where the sensor is at first.
-fn surroundings(scene: &SensorScene, motion: &Motion<'_>) -> Result<Vec<LidarPoint>> {
+fn surroundings(scene: &SensorScene, motion: &SensorMotion<'_>) -> Result<Vec<LidarPoint>> {
     let mut model = presets::os1(64);
     let elevations_rad = (0..64).map(|n| (60.0 - 1.9 * n as f32).to_radians()).collect();
     model.beams = Beams::Spinning { elevations_rad, columns: 2048 };
     (model.sigma_m, model.sigma_per_m, model.min_range_m) = (0.0, 0.0, 0.05);
     let mut points = Vec::new();
-    let standing = Motion::standing(motion.world_from_sensor[0]);
+    let standing = SensorMotion::standing(motion.world_from_sensor[0]);
     Lidar::new(model)?.scan(scene, &standing, 1, 0, &mut points)?;
     Ok(points)
 }
 
-fn image(scene: Scene<'_>, camera: &Camera, count: u32) -> Result<Kind> {
+fn image(scene: Scene<'_>, camera: &Camera, count: u32) -> Result<Subject> {
     let mut renderer = CpuRenderer::new(scene);
     let mut images = [RgbdImage::default()];
     let (width, height) = (camera.intrinsics.width_px, camera.intrinsics.height_px);
@@ -159,9 +159,9 @@ fn measure(
     name: &str,
     preset: Preset,
     scene: &SensorScene,
-    motion: &Motion<'_>,
+    motion: &SensorMotion<'_>,
     (count, top): (u32, &mut TopView),
-) -> Result<(Kind, Option<RgbImage>)> {
+) -> Result<(Subject, Option<RgbImage>)> {
     let (mut tile, has_range) = (None, |range_m: f32| usize::from(range_m > 0.0));
     let kind = match preset {
         Preset::Lidar(model) => {
@@ -214,7 +214,7 @@ fn measure(
     Ok((kind, tile))
 }
 
-fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) -> Result<Kind> {
+fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) -> Result<Subject> {
     let (mut times, mut records) = (Vec::new(), 0);
     for seq in 0..count.into() {
         let start = Instant::now();
@@ -223,7 +223,7 @@ fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) 
     }
     times.sort_unstable_by(f64::total_cmp);
     let (least_ms, median_ms) = (times[0], times[times.len() / 2]);
-    Ok(Kind { name: name.to_owned(), least_ms, median_ms, records })
+    Ok(Subject { name: name.to_owned(), least_ms, median_ms, records })
 }
 
 /// Beams in their places, coloured by range.

@@ -27,7 +27,9 @@ use vizflyt_protocol::messages::{ArenaInfo, Limits, Purpose, bounded};
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::images::ImagePublisher;
-use vizflyt_runtime::stream::{self, Mailbox, Outbox, ServerClock, Shared, Step, StreamSettings};
+use vizflyt_runtime::stream::{
+    self, DecodeStep, Mailbox, Outbox, ServerClock, Shared, StreamSettings,
+};
 use vizflyt_sdk::ipc::{PluginEnd, RuntimeEnd};
 use vizflyt_sdk::{Observation, ObservationWriter};
 use vizflyt_server::authorization::Authorizer;
@@ -274,20 +276,20 @@ fn copy(ipc: &RuntimeEnd, mailbox: &Mailbox, stop: &AtomicBool) -> Result<()> {
     let mut bytes = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         match mailbox.next(PATIENCE, |_| true) {
-            Some((_, Step::Begin(arrival))) => {
+            Some((_, DecodeStep::Begin(arrival))) => {
                 bytes.clear();
                 bytes.extend_from_slice(&arrival.header.render_end_ns.get().to_le_bytes());
             }
-            Some((_, Step::Piece(piece))) => {
+            Some((_, DecodeStep::Piece(piece))) => {
                 bytes.extend_from_slice(&piece);
                 mailbox.recycle(piece);
             }
-            Some((_, Step::End(_))) => {
+            Some((_, DecodeStep::End(_))) => {
                 let mut memory = ipc.loan(bytes.len())?;
                 memory.memory().copy_from_slice(&bytes);
                 ipc.publish(memory)?;
             }
-            Some((_, Step::Drop)) | None => {}
+            Some((_, DecodeStep::Drop)) | None => {}
         }
     }
     Ok(())

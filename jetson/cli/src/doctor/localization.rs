@@ -13,7 +13,7 @@ use vizflyt_guardian::port::MavlinkAddress;
 use vizflyt_process::print_line;
 use vizflyt_server::poses::drivers::{Measurement, PoseSource};
 use vizflyt_server::poses::hand_check::description::describe_pose;
-use vizflyt_server::poses::hand_check::{Change, Check, Diagnosis, Step};
+use vizflyt_server::poses::hand_check::{Change, Check, Diagnosis, HandCheckStep};
 use vizflyt_server::poses::settings::{Driver, LocalizationConfig};
 use vizflyt_server::poses::{drivers, settings};
 
@@ -78,7 +78,7 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
             continue;
         }
         print_line(format!("seen     {}", check.seen()));
-        if check.step() == Step::Done {
+        if check.step() == HandCheckStep::Done {
             let diagnosis = check.diagnosis();
             let delay =
                 gyro.map(|mut gyro| measure_delay(&config, &diagnosis, &mut *source, &mut gyro));

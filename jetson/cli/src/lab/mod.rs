@@ -48,8 +48,8 @@ use self::inbox::Inbox;
 use self::keys::Keys;
 use self::localization::Localization;
 use self::memory::MemoryWatch;
+pub(crate) use self::report::LabReport;
 use self::report::Parts;
-pub(crate) use self::report::Report;
 
 /// What the simulated lab looks like.
 #[derive(Args, Clone, Debug, Default)]
@@ -197,7 +197,7 @@ pub(crate) struct LabFlight<'a> {
 ///
 /// # Errors
 /// If the lab cannot be started. What goes wrong in flight is an outcome of the report.
-pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<Report>> {
+pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<LabReport>> {
     let memory = MemoryWatch::start();
     let (notices, inbox) = mpsc::channel();
     let interrupted = notices.clone();

@@ -11,7 +11,7 @@ use super::child::Role;
 
 /// One flight. Written by `--report`.
 #[derive(Clone, Debug, Serialize, PartialEq)]
-pub(crate) struct Report {
+pub(crate) struct LabReport {
     /// How it ended.
     pub outcome: OutcomeKind,
     /// Why, in a sentence.
@@ -111,7 +111,7 @@ impl Parts {
 
     /// Joins the parts. A true collision outranks the referee's decision; a missing part is an
     /// error by name.
-    pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> Report {
+    pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> LabReport {
         let number = |part: &Value, key: &str| part[key].as_f64().unwrap_or(0.0);
         let count = |part: &Value, key: &str| part[key].as_u64().unwrap_or(0);
         let text = |part: &Value, key: &str| part[key].as_str().map(str::to_owned);
@@ -133,7 +133,7 @@ impl Parts {
                 text(&self.runtime, "reason").unwrap_or_default(),
             ),
         };
-        Report {
+        LabReport {
             outcome,
             reason,
             seed,
@@ -167,7 +167,7 @@ impl Parts {
     }
 }
 
-impl Report {
+impl LabReport {
     /// Writes the report as indented JSON.
     pub(crate) fn write(&self, path: &std::path::Path) -> Result<()> {
         let json = serde_json::to_string_pretty(self)? + "\n";

@@ -28,12 +28,12 @@ use self::manifest::{LabConfig, PluginManifest};
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plugin {
     name: OsString,
-    kind: Kind,
+    kind: PluginKind,
     lab: Option<LabConfig>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
-enum Kind {
+enum PluginKind {
     BuiltIn,
     /// A file of Python.
     Script(PathBuf),
@@ -52,7 +52,7 @@ impl Plugin {
         let path = Path::new(name);
         let is_bare = path.components().count() == 1 && !name.to_string_lossy().contains('/');
         if is_bare && BuiltIn::find(&name.to_string_lossy()).is_some() {
-            return found(Kind::BuiltIn, None);
+            return found(PluginKind::BuiltIn, None);
         }
         if path.is_dir() {
             if let Some(manifest) = PluginManifest::read(path)? {
@@ -73,7 +73,7 @@ impl Plugin {
             return found(kind_of(path)?, None);
         }
         if is_bare && on_path(name) {
-            return found(Kind::Program, None);
+            return found(PluginKind::Program, None);
         }
         bail!(
             "there is no plugin at {}; give a folder made by `vizflyt new`, a .py file, a program, \
@@ -96,11 +96,11 @@ impl Plugin {
     /// Returns the file or folder whose change means another plugin.
     pub fn watched(&self) -> PathBuf {
         match &self.kind {
-            Kind::BuiltIn => std::env::current_exe().unwrap_or_default(),
-            Kind::Program => PathBuf::from(&self.name),
-            Kind::Cargo(folder) => folder.clone(),
+            PluginKind::BuiltIn => std::env::current_exe().unwrap_or_default(),
+            PluginKind::Program => PathBuf::from(&self.name),
+            PluginKind::Cargo(folder) => folder.clone(),
             // What it imports lies beside it.
-            Kind::Script(script) => match script.parent() {
+            PluginKind::Script(script) => match script.parent() {
                 Some(folder) if folder != Path::new("") => folder.to_owned(),
                 _ => PathBuf::from("."),
             },
@@ -114,17 +114,17 @@ impl Plugin {
     /// A build that fails, a Python without the package `vizflyt`.
     pub fn command(&self, limits: &PluginLimits) -> Result<Vec<OsString>> {
         match &self.kind {
-            Kind::BuiltIn => {
+            PluginKind::BuiltIn => {
                 let program = std::env::current_exe().context("cannot find this program's path")?;
                 Ok(vec![program.into(), "plugin".into(), self.name.clone()])
             }
-            Kind::Program => {
+            PluginKind::Program => {
                 let path = Path::new(&self.name);
                 // A graded plugin starts in another folder; what is on PATH is looked up there.
                 Ok(vec![if path.is_file() { absolute(path)?.into() } else { self.name.clone() }])
             }
-            Kind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
-            Kind::Script(script) => {
+            PluginKind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
+            PluginKind::Script(script) => {
                 let path = absolute(script)?;
                 let python = python_of(&path);
                 check_python(&python, script, limits)?;
@@ -140,22 +140,22 @@ fn absolute(path: &Path) -> Result<PathBuf> {
 }
 
 /// Returns what an existing file is.
-fn kind_of(path: &Path) -> Result<Kind> {
+fn kind_of(path: &Path) -> Result<PluginKind> {
     use std::os::unix::fs::PermissionsExt;
     if !path.is_file() {
         bail!("there is no file {}", path.display());
     }
     if path.file_name() == Some(OsStr::new("Cargo.toml")) {
-        return Ok(Kind::Cargo(path.parent().unwrap_or(Path::new(".")).to_owned()));
+        return Ok(PluginKind::Cargo(path.parent().unwrap_or(Path::new(".")).to_owned()));
     }
     if path.extension() == Some(OsStr::new("py")) {
-        return Ok(Kind::Script(path.to_owned()));
+        return Ok(PluginKind::Script(path.to_owned()));
     }
     let mode = path.metadata().with_context(|| format!("{}", path.display()))?.permissions().mode();
     if mode & 0o111 == 0 {
         bail!("{0} is neither a .py file nor a program; try `chmod +x {0}`", path.display());
     }
-    Ok(Kind::Program)
+    Ok(PluginKind::Program)
 }
 
 fn on_path(name: &OsStr) -> bool {
@@ -284,21 +284,21 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;
-        assert_eq!(kind(Path::new("avoid")), Kind::BuiltIn);
-        assert_eq!(kind(Path::new("sh")), Kind::Program, "on PATH");
+        assert_eq!(kind(Path::new("avoid")), PluginKind::BuiltIn);
+        assert_eq!(kind(Path::new("sh")), PluginKind::Program, "on PATH");
         refused(&path("none"), &["there is no plugin at", "none", "avoid"]);
         refused(Path::new("no-such-program"), &["there is no plugin at no-such-program"]);
         refused(folder.path(), &["folder without", "vizflyt new"]);
 
         fs::write(path("plugin.py"), "").unwrap();
-        assert_eq!(kind(folder.path()), Kind::Script(path("plugin.py")));
-        assert_eq!(kind(&path("plugin.py")), Kind::Script(path("plugin.py")));
+        assert_eq!(kind(folder.path()), PluginKind::Script(path("plugin.py")));
+        assert_eq!(kind(&path("plugin.py")), PluginKind::Script(path("plugin.py")));
         fs::write(path("Cargo.toml"), "").unwrap();
-        assert_eq!(kind(folder.path()), Kind::Cargo(folder.path().to_owned()));
+        assert_eq!(kind(folder.path()), PluginKind::Cargo(folder.path().to_owned()));
         fs::write(path("vizflyt.toml"), "plugin = \"plugin.py\"\n[lab]\nscene = \"room\"\n")
             .unwrap();
         let plugin = Plugin::find(folder.path().as_os_str()).unwrap();
-        assert_eq!(plugin.kind, Kind::Script(path("plugin.py")));
+        assert_eq!(plugin.kind, PluginKind::Script(path("plugin.py")));
         assert_eq!(plugin.lab().unwrap().scene.as_deref(), Some("room"));
 
         fs::write(path("notes.txt"), "").unwrap();

@@ -3,12 +3,12 @@
 use std::fmt::Write;
 
 use anyhow::{Context, Result};
-use jpeg_encoder::{ColorType, Encoder};
 use vizflyt_arena::crash::{plot, since};
 use vizflyt_arena::verdict::Sample;
 use vizflyt_arena::{ArenaConfig, DistanceField};
 use vizflyt_protocol::messages::{EventKind, OutcomeKind};
 use vizflyt_protocol::time::ServerTime;
+use vizflyt_rgbd::encode_jpeg;
 
 use super::super::document::{Run, SignedFile};
 use super::super::folder::{IMAGES, LOGS, ReportFolder};
@@ -190,11 +190,8 @@ fn strip(
     for (index, shot) in shots.iter().enumerate() {
         let path = format!("{IMAGES}/{}-{index:02}.jpg", name(run));
         let (width, height) = shot.size_px;
-        let sizes = u16::try_from(width).ok().zip(u16::try_from(height).ok());
-        let (w, h) = sizes.context("an image of more than 65535 px")?;
         let mut bytes = Vec::new();
-        Encoder::new(&mut bytes, QUALITY)
-            .encode(&shot.rgb, w, h, ColorType::Rgb)
+        encode_jpeg(&shot.rgb, width, height, QUALITY, &mut bytes)
             .with_context(|| format!("cannot encode {path}"))?;
         files.push(folder.write(&path, &bytes)?);
         let caption = caption(shot.stamp);

@@ -29,7 +29,7 @@ use field::{Field, Surroundings};
 use memory::Memory;
 use pace::Pace;
 use scan::{Scan, View};
-use steer::Motion;
+use steer::PlanarState;
 
 /// The plugin.
 #[derive(Clone, Debug, Default)]
@@ -137,7 +137,7 @@ impl Avoid {
         }
         let nose = vehicle.world_from_body.rotate(DVec3::X).truncate();
         let v_mps = vehicle.v_world_mps.truncate();
-        let motion = Motion {
+        let motion = PlanarState {
             p_m: p_m.truncate(),
             v_mps,
             // Before take-off nobody follows the setpoint: it must not run away from the vehicle.

@@ -14,7 +14,7 @@ use crate::field::{Field, TOUCH_M};
 
 /// The vehicle as steering sees it: a point in the plane.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Motion {
+pub struct PlanarState {
     /// Position. [m, world]
     pub p_m: DVec2,
     /// Velocity. [m/s, world]
@@ -29,7 +29,7 @@ pub struct Motion {
 
 /// Returns the velocity to ask for, at most `max_speed_mps`, so that the vehicle gets on towards
 /// the goal and does not hit anything in `field`. [m/s, world]
-pub fn choose_velocity(field: &Field, motion: &Motion, max_speed_mps: f64) -> DVec2 {
+pub fn choose_velocity(field: &Field, motion: &PlanarState, max_speed_mps: f64) -> DVec2 {
     // The first candidate is to stop; the ring starts at the last choice, so that keeping it is
     // one of the candidates.
     let mut best = DVec2::ZERO;
@@ -57,7 +57,7 @@ fn sight_limit_mps(from_nose_rad: f64) -> f64 {
 }
 
 /// Returns how good it is to ask for a velocity, as a speed towards the goal. [m/s]
-fn score(field: &Field, motion: &Motion, candidate_mps: DVec2) -> f64 {
+fn score(field: &Field, motion: &PlanarState, candidate_mps: DVec2) -> f64 {
     // What is asked now acts a little later.
     let mut p_m = motion.p_m + motion.v_mps * (LATENCY_S + motion.late_s);
     let mut v_mps = motion.v_mps;

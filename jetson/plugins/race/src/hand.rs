@@ -15,7 +15,7 @@ pub struct Hand {
     sightings: VecDeque<Sighting>,
     first_s: Option<f64>,
     last_s: f64,
-    motion: Option<Motion>,
+    motion: Option<HandRotation>,
 }
 
 /// The hand in one image.
@@ -32,7 +32,7 @@ struct Sighting {
 
 /// How the hand turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Motion {
+pub struct HandRotation {
     /// What it turns about. [m, plane]
     pub pivot_m: DVec2,
     /// Angle at `at_s`, from the plane's left towards up. [rad]
@@ -45,7 +45,7 @@ pub struct Motion {
     pub length_m: f64,
 }
 
-impl Motion {
+impl HandRotation {
     /// Returns the hand's angle at a time. [rad]
     pub fn angle_at(&self, at_s: f64) -> f64 {
         wrap_pi(self.angle_rad + self.omega_radps * (at_s - self.at_s))
@@ -75,7 +75,7 @@ impl Hand {
     }
 
     /// Returns how it turns, once that is known.
-    pub fn motion(&self) -> Option<&Motion> {
+    pub fn motion(&self) -> Option<&HandRotation> {
         self.motion.as_ref()
     }
 
@@ -93,7 +93,7 @@ impl Hand {
         })
     }
 
-    fn fit(&self) -> Option<Motion> {
+    fn fit(&self) -> Option<HandRotation> {
         // Pieces cut off aslant, by the image's edge, have another direction than the hand.
         let longest_m = self.sightings.iter().map(|sighting| sighting.half_m).fold(0.0, f64::max);
         let whole = |sighting: &&Sighting| sighting.half_m > WHOLE * longest_m;
@@ -116,7 +116,7 @@ impl Hand {
         }))?;
         let tip_m = |sighting: &Sighting| (sighting.middle_m - pivot_m).length() + sighting.half_m;
         let length_m = self.sightings.iter().filter(whole).map(tip_m).fold(0.0, f64::max);
-        Some(Motion {
+        Some(HandRotation {
             pivot_m,
             angle_rad: wrap_pi(line.at_zero),
             at_s: newest_s,

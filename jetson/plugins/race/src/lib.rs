@@ -124,7 +124,7 @@ impl Race {
     }
 
     /// Returns how the hand turns, once that is known.
-    pub fn hand(&self) -> Option<&hand::Motion> {
+    pub fn hand(&self) -> Option<&hand::HandRotation> {
         self.hand.motion()
     }
 

@@ -19,11 +19,12 @@ mod reporting;
 mod tests;
 
 use std::ffi::OsString;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
-use std::sync::{Arc, PoisonError};
 use std::thread;
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use plugin::PluginSide;
 use serde_json::json;
@@ -373,7 +374,7 @@ impl ControlLoop {
     }
 
     fn share_senses(&self) {
-        let mut senses = self.senses.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut senses = lock(&self.senses);
         self.companion.update_senses(&mut senses);
     }
 

@@ -78,12 +78,12 @@ const STOPPED_MPS: f64 = 0.02;
 
 /// A velocity on its way to a command.
 #[derive(Clone, Copy, Debug, Default)]
-struct Motion<V> {
+struct CommandedVelocity<V> {
     v_mps: V,
     a_mps2: V,
 }
 
-impl Motion<DVec3> {
+impl CommandedVelocity<DVec3> {
     fn advance(&mut self, command_mps: DVec3, response: Response, max_mps2: f64, dt_s: f64) {
         let most_mps2 = max_mps2.min(response.acceleration_mps2);
         let wanted = ((command_mps - self.v_mps) / response.lag_s).clamp_length_max(most_mps2);
@@ -92,7 +92,7 @@ impl Motion<DVec3> {
     }
 }
 
-impl Motion<f64> {
+impl CommandedVelocity<f64> {
     fn advance(&mut self, command_mps: f64, response: Response, max_mps2: f64, dt_s: f64) {
         let most_mps2 = max_mps2.min(response.acceleration_mps2);
         let wanted = ((command_mps - self.v_mps) / response.lag_s).clamp(-most_mps2, most_mps2);
@@ -106,7 +106,7 @@ impl Motion<f64> {
 #[derive(Clone, Copy, Debug)]
 struct Candidate {
     response: Response,
-    motion: Motion<DVec3>,
+    motion: CommandedVelocity<DVec3>,
     /// How far it goes on from full speed. [m]
     stops_m: f64,
     /// Squared error over time, fading. [m^2/s]
@@ -137,7 +137,7 @@ impl Answers {
         let candidates = std::iter::once(parameters.unwrap_or(Response::UNKNOWN))
             .chain(others)
             .map(|response| {
-                let motion = Motion { v_mps, a_mps2: DVec3::ZERO };
+                let motion = CommandedVelocity { v_mps, a_mps2: DVec3::ZERO };
                 let stops_m =
                     Stopping::new(response, max_mps2, 1.0).reach_m(FAST_MPS, FAST_MPS, 0.0);
                 Candidate { response, motion, stops_m, error: 0.0 }
@@ -232,7 +232,7 @@ impl Stopping {
     /// and less from the next tick on. Along one axis. [m]
     pub(super) fn reach_m(&self, command_mps: f64, v_mps: f64, a_mps2: f64) -> f64 {
         // That it brakes already is not counted on: how hard is only reckoned.
-        let mut motion = Motion { v_mps, a_mps2: a_mps2.max(0.0) };
+        let mut motion = CommandedVelocity { v_mps, a_mps2: a_mps2.max(0.0) };
         let (mut way_m, mut most_m) = (0.0, 0.0_f64);
         let mut t_s = 0.0;
         while t_s < LONGEST_S {
@@ -298,7 +298,7 @@ impl Stopping {
         a_mps2: DVec3,
         is_inside: impl Fn(DVec3) -> bool,
     ) -> bool {
-        let mut motion = Motion { v_mps, a_mps2 };
+        let mut motion = CommandedVelocity { v_mps, a_mps2 };
         let (mut way_m, mut t_s) = (DVec3::ZERO, 0.0);
         let speed_mps = command_mps.length();
         while t_s < LONGEST_S {

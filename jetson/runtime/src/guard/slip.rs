@@ -6,6 +6,7 @@
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::wrap_pi;
+use vizflyt_protocol::random;
 
 /// Share of the way flown.
 const SHARE: f64 = 0.01;
@@ -55,13 +56,9 @@ impl Slip {
         DVec3::new(angle_rad.cos(), angle_rad.sin(), 0.0)
     }
 
-    /// Returns an angle that nobody guesses without the seed (splitmix64: G. Steele, D. Lea and C. Flood, "Fast
-    /// splittable pseudorandom number generators", OOPSLA 2014).
+    /// Returns the angle of this number, from 0 to a whole turn.
     fn angle_rad(&self, number: f64) -> f64 {
-        let mut x = self.seed.wrapping_add((number as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        x = (x ^ x >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        x = (x ^ x >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        (x ^ x >> 31) as f64 / u64::MAX as f64 * std::f64::consts::TAU
+        random::nth(self.seed, number as u64) as f64 / u64::MAX as f64 * std::f64::consts::TAU
     }
 }
 

@@ -2,7 +2,8 @@
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
+use vizflyt_process::lock;
 
 use vizflyt_protocol::messages::{Odometry, PoseSample};
 use vizflyt_protocol::packet::ImageHeader;
@@ -177,10 +178,10 @@ impl Queue {
     /// Tells people of trouble; the newest counts.
     pub(super) fn complain(&self, text: String) {
         tracing::warn!("flight log: {text}");
-        *self.trouble.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
+        *lock(&self.trouble) = Some(text);
     }
 
     pub(super) fn poll_trouble(&self) -> Option<String> {
-        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).take()
+        lock(&self.trouble).take()
     }
 }

@@ -20,6 +20,7 @@ use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use vizflyt_process::lock;
 
 use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
@@ -56,7 +57,7 @@ pub struct Whole {
 /// The decoder's next step for a camera.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)] // Why: boxing would allocate per image.
-pub enum Step {
+pub enum DecodeStep {
     /// An image begins.
     Begin(Arrival),
     /// Its next piece: the bitstream's header first, then slice by slice. Give it back with
@@ -190,7 +191,7 @@ impl Mailbox {
         &self,
         timeout: Duration,
         may_begin: impl Fn(&ImageHeader) -> bool,
-    ) -> Option<(usize, Step)> {
+    ) -> Option<(usize, DecodeStep)> {
         let deadline = Instant::now() + timeout;
         let mut inner = self.lock();
         loop {
@@ -257,17 +258,17 @@ impl Mailbox {
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
         // Why: nothing panics while the lock is held.
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.inner)
     }
 }
 
 impl Inner {
-    fn step(&mut self, may_begin: &impl Fn(&ImageHeader) -> bool) -> Option<(usize, Step)> {
+    fn step(&mut self, may_begin: &impl Fn(&ImageHeader) -> bool) -> Option<(usize, DecodeStep)> {
         let Self { lanes, spare_pieces, spare_queues, .. } = self;
         for (camera, lane) in lanes.iter_mut().enumerate() {
             let dropped = lane.supersede(|pieces| keep(spare_pieces, spare_queues, pieces));
             if dropped {
-                return Some((camera, Step::Drop));
+                return Some((camera, DecodeStep::Drop));
             }
         }
         let (_, camera, at) = lanes
@@ -282,17 +283,17 @@ impl Inner {
         let image = &mut lane.images[at];
         if lane.decoding.is_none() {
             lane.decoding = Some(image.id);
-            return Some((camera, Step::Begin(image.arrival)));
+            return Some((camera, DecodeStep::Begin(image.arrival)));
         }
         if let Some(piece) = image.pieces.pop_front() {
-            return Some((camera, Step::Piece(piece)));
+            return Some((camera, DecodeStep::Piece(piece)));
         }
         // `due` has seen to it that there is one or the other.
         let whole = image.end?;
         lane.decoding = None;
         let image = lane.images.swap_remove(at);
         keep(spare_pieces, spare_queues, image.pieces);
-        Some((camera, Step::End(whole)))
+        Some((camera, DecodeStep::End(whole)))
     }
 }
 
@@ -382,10 +383,10 @@ mod tests {
         let mut found = Vec::new();
         while let Some((camera, step)) = mailbox.next(Duration::ZERO, |_| true) {
             found.push(match step {
-                Step::Begin(arrival) => format!("{camera}B{}", arrival.header.seq),
-                Step::Piece(piece) => format!("{camera}{}", piece[0]),
-                Step::End(_) => format!("{camera}E"),
-                Step::Drop => format!("{camera}D"),
+                DecodeStep::Begin(arrival) => format!("{camera}B{}", arrival.header.seq),
+                DecodeStep::Piece(piece) => format!("{camera}{}", piece[0]),
+                DecodeStep::End(_) => format!("{camera}E"),
+                DecodeStep::Drop => format!("{camera}D"),
             });
         }
         found.join(" ")
@@ -432,7 +433,7 @@ mod tests {
         let old = mailbox.open(&arrival(0, 7)).unwrap();
         push(&mailbox, old, 1);
         mailbox.end(old, Some(whole()));
-        assert!(matches!(mailbox.next(Duration::ZERO, |_| true), Some((0, Step::Begin(_)))));
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| true), Some((0, DecodeStep::Begin(_)))));
         for seq in 8..11 {
             let new = mailbox.open(&arrival(0, seq)).unwrap();
             push(&mailbox, new, seq as u8);
@@ -471,10 +472,10 @@ mod tests {
         // One that must wait is begun once it is whole.
         mailbox.end(tickets[0], Some(whole()));
         let next = mailbox.open(&arrival(0, 4)).unwrap();
-        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, Step::End(_)))));
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, DecodeStep::End(_)))));
         assert_eq!(mailbox.next(Duration::ZERO, |_| false), None);
         mailbox.end(next, Some(whole()));
-        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, Step::Begin(_)))));
+        assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, DecodeStep::Begin(_)))));
     }
 
     #[test]

@@ -22,8 +22,9 @@ mod session;
 mod tests;
 
 use std::net::SocketAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use quinn::{AckFrequencyConfig, ClientConfig, Endpoint, EndpointConfig, TransportConfig, VarInt};
 use socket2::{Domain, Protocol, Socket, Type};
@@ -36,7 +37,7 @@ use vizflyt_protocol::time::{Host, HostTime, OffsetFilter, Server, ServerTime};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, random_instance_id};
 
-pub use mailbox::{Arrival, Fates, Mailbox, Step, Ticket, Whole};
+pub use mailbox::{Arrival, DecodeStep, Fates, Mailbox, Ticket, Whole};
 pub use outbox::Outbox;
 pub use pair::{NowPaired, pair};
 pub use readings::{NewestReadings, Reading, Readings};
@@ -94,7 +95,7 @@ impl ServerClock {
     }
 
     fn filter(&self) -> std::sync::MutexGuard<'_, OffsetFilter<Host, Server>> {
-        self.filter.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.filter)
     }
 
     /// Returns a server stamp on this computer's clock; `None` before the first exchange.

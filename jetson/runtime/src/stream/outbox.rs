@@ -2,7 +2,8 @@
 //! over any number of connections.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
+use vizflyt_process::lock;
 
 use tokio::sync::Notify;
 use vizflyt_protocol::messages::{
@@ -144,7 +145,7 @@ impl Outbox {
 
     fn lock(&self) -> MutexGuard<'_, Inner> {
         // Why: nothing panics while the lock is held.
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.inner)
     }
 }
 

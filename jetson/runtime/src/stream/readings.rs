@@ -7,7 +7,8 @@
 //! Newest wins, by the instant that a reading is of. A reading is shared, not copied; its memory goes when its last user
 //! has done with it.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
+use vizflyt_process::lock;
 
 use vizflyt_protocol::sensor::{InvalidReading, MAX_SENSORS, ReadingHeader};
 use vizflyt_protocol::time::HostTime;
@@ -54,7 +55,7 @@ impl Readings {
     /// Puts a reading in the place of an older one of the same sensor; drops one that was overtaken. Returns whether it
     /// was put.
     pub fn put(&self, reading: Reading) -> bool {
-        let mut newest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut newest = lock(&self.0);
         let Some(place) = newest.get_mut(usize::from(reading.header.sensor)) else { return false };
         let is_newer = place.as_ref().is_none_or(|old| old.shown < reading.shown);
         if is_newer {
@@ -65,7 +66,7 @@ impl Readings {
 
     /// Returns the newest readings.
     pub fn newest(&self) -> NewestReadings {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.0).clone()
     }
 }
 

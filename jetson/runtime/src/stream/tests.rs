@@ -236,14 +236,14 @@ async fn exchanges_messages_and_receives_an_image() {
     while whole.is_none() {
         let next = || client.shared.mailbox.next(WAIT, |_| true);
         match tokio::task::block_in_place(next).unwrap().1 {
-            Step::Begin(arrival) => {
+            DecodeStep::Begin(arrival) => {
                 assert_eq!(arrival.header, header);
                 assert!(arrival.first >= arrival.pose);
                 found.clear();
             }
-            Step::Piece(piece) => found.extend_from_slice(&piece),
-            Step::Drop => dropped += 1,
-            Step::End(end) => whole = Some(end),
+            DecodeStep::Piece(piece) => found.extend_from_slice(&piece),
+            DecodeStep::Drop => dropped += 1,
+            DecodeStep::End(end) => whole = Some(end),
         }
     }
     assert_eq!((found, whole.unwrap().trailer), (payload, trailer));

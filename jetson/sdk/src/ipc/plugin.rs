@@ -17,7 +17,7 @@ use vizflyt_protocol::packet::framing::{self, FramingError, MAX_FRAMED};
 use super::board::Board;
 use super::runtime::PluginSocket;
 use super::sealed::{map_read_only, take_inherited};
-use super::socket::{self, EMPTY, Kind, Received};
+use super::socket::{self, EMPTY, PacketKind, Received};
 use super::{BORROWED_OBSERVATIONS, IpcError, SLOTS, offer};
 
 /// The plugin's end.
@@ -87,7 +87,7 @@ impl PluginEnd {
         let mut buffer = EMPTY;
         let received = socket::receive_with_descriptors(socket.as_fd(), &mut buffer)
             .map_err(IpcError::system(attaching))?;
-        let Received::Packet(Kind::Hello, version, descriptors) = received else {
+        let Received::Packet(PacketKind::Hello, version, descriptors) = received else {
             return Ok(None);
         };
         check_version(version.try_into().map_or(0, u16::from_le_bytes))?;
@@ -99,7 +99,7 @@ impl PluginEnd {
             borrowed: Arc::new(Borrowed { board, count: AtomicUsize::default() }),
             inbox: Mutex::default(),
         };
-        end.send_packet(Kind::Hello, &[])?;
+        end.send_packet(PacketKind::Hello, &[])?;
         Ok(Some(end))
     }
 
@@ -167,10 +167,10 @@ impl PluginEnd {
     /// # Errors
     /// As [`Self::send`].
     pub fn send_bytes(&self, body: &[u8]) -> Result<(), IpcError> {
-        self.send_packet(Kind::Message, body)
+        self.send_packet(PacketKind::Message, body)
     }
 
-    fn send_packet(&self, kind: Kind, body: &[u8]) -> Result<(), IpcError> {
+    fn send_packet(&self, kind: PacketKind, body: &[u8]) -> Result<(), IpcError> {
         loop {
             match socket::send(self.socket.as_fd(), kind, body, &[]) {
                 Ok(()) => return Ok(()),
@@ -196,14 +196,14 @@ impl Inbox {
             let received = socket::receive_with_descriptors(socket.as_fd(), &mut buffer)
                 .map_err(IpcError::system("receiving from the runtime"))?;
             match received {
-                Received::Packet(Kind::Message, body, _) => {
+                Received::Packet(PacketKind::Message, body, _) => {
                     self.messages.push_back(framing::decode_body(body));
                 }
-                Received::Packet(Kind::Slot, index, descriptors) => {
+                Received::Packet(PacketKind::Slot, index, descriptors) => {
                     self.take_slot(index, descriptors)?;
                 }
                 // Of a newer runtime, perhaps; what counts comes as messages.
-                Received::Packet(Kind::Hello, ..) | Received::Garbage => {}
+                Received::Packet(PacketKind::Hello, ..) | Received::Garbage => {}
                 Received::Nothing => return Ok(()),
                 Received::Closed => {
                     self.is_closed = true;

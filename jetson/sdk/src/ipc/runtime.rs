@@ -16,7 +16,7 @@ use vizflyt_protocol::packet::framing::{self, FramingError, MAX_FRAMED};
 use super::board::{Board, Place};
 use super::offer::{Listener, Offer};
 use super::sealed::{WrittenMemory, let_inherit};
-use super::socket::{self, EMPTY, Kind, Received};
+use super::socket::{self, EMPTY, PacketKind, Received};
 use super::{IpcError, SERVICE_OPTION, SLOTS};
 
 /// The runtime's end. All calls return at once, but for [`Self::wait`]; a plugin that hangs never blocks them.
@@ -135,7 +135,7 @@ impl RuntimeEnd {
         let Some(connection) = self.connection() else { return false };
         if !connection.is_attached() {
             let _reading = lock(&connection.reading);
-            if let Ok(Received::Packet(Kind::Hello, ..)) =
+            if let Ok(Received::Packet(PacketKind::Hello, ..)) =
                 socket::peek(connection.socket.as_fd(), &mut [0])
             {
                 let _ = connection.next();
@@ -152,7 +152,7 @@ impl RuntimeEnd {
     pub fn send(&self, message: &ToPlugin) -> Result<(), IpcError> {
         let connection = self.connection().ok_or(IpcError::Gone("plugin"))?;
         let mut buffer = [0; MAX_FRAMED];
-        connection.send(Kind::Message, framing::encode_body(message, &mut buffer), &[])
+        connection.send(PacketKind::Message, framing::encode_body(message, &mut buffer), &[])
     }
 
     /// Lends memory for one observation of `len` bytes: zeros, aligned to 64. More than ever before takes longer
@@ -190,7 +190,9 @@ impl RuntimeEnd {
         let place = Place { slot: slot.index, len: observation.len };
         if slot.known_to != Some(connection.number) {
             let descriptor = slot.memory.as_fd().as_raw_fd();
-            if let Err(error) = connection.send(Kind::Slot, &[slot.index as u8], &[descriptor]) {
+            if let Err(error) =
+                connection.send(PacketKind::Slot, &[slot.index as u8], &[descriptor])
+            {
                 slots.free.extend(observation.slot.take());
                 return if matches!(error, IpcError::Gone(_)) { Ok(()) } else { Err(error) };
             }
@@ -272,7 +274,7 @@ impl RuntimeEnd {
         };
         let descriptors =
             [connection.board.as_fd().as_raw_fd(), connection.bell.as_fd().as_raw_fd()];
-        connection.send(Kind::Hello, &PROTOCOL_VERSION.to_le_bytes(), &descriptors)?;
+        connection.send(PacketKind::Hello, &PROTOCOL_VERSION.to_le_bytes(), &descriptors)?;
         let mut slots = lock(&self.slots);
         *lock(&self.connection) = Some(Arc::new(connection));
         slots.reclaim_all();
@@ -302,7 +304,7 @@ impl PluginSocket {
 impl Connection {
     fn send(
         &self,
-        kind: Kind,
+        kind: PacketKind,
         body: &[u8],
         descriptors: &[std::os::fd::RawFd],
     ) -> Result<(), IpcError> {
@@ -323,11 +325,13 @@ impl Connection {
             let received = socket::receive(self.socket.as_fd(), &mut buffer)
                 .map_err(IpcError::system("receiving from the plugin"))?;
             match received {
-                Received::Packet(Kind::Hello, ..) => self.attached.store(true, Ordering::Release),
-                Received::Packet(Kind::Message, body, _) => {
+                Received::Packet(PacketKind::Hello, ..) => {
+                    self.attached.store(true, Ordering::Release);
+                }
+                Received::Packet(PacketKind::Message, body, _) => {
                     return Ok(Some(framing::decode_body(body)?));
                 }
-                Received::Packet(Kind::Slot, ..) | Received::Garbage => {
+                Received::Packet(PacketKind::Slot, ..) | Received::Garbage => {
                     return Err(FramingError::Body(0).into());
                 }
                 Received::Nothing => return Ok(None),

@@ -14,7 +14,7 @@ use vizflyt_protocol::packet::framing::MAX_FRAMED;
 
 /// What a packet is; its first byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum PacketKind {
     /// The first packet each way. The runtime's: its protocol's version, with board and bell. The plugin's: it is
     /// complete.
     Hello,
@@ -24,7 +24,7 @@ pub(super) enum Kind {
     Slot,
 }
 
-impl Kind {
+impl PacketKind {
     fn of(byte: u8) -> Option<Self> {
         [Self::Hello, Self::Message, Self::Slot].get(usize::from(byte)).copied()
     }
@@ -39,7 +39,7 @@ pub(super) const EMPTY: Buffer = [0; 1 + MAX_FRAMED];
 #[derive(Debug)]
 pub(super) enum Received<'b> {
     /// A packet, with its descriptors.
-    Packet(Kind, &'b [u8], Vec<OwnedFd>),
+    Packet(PacketKind, &'b [u8], Vec<OwnedFd>),
     /// One of no kind.
     Garbage,
     /// There is none now.
@@ -51,7 +51,7 @@ pub(super) enum Received<'b> {
 /// Sends a packet, or fails at once; an [`Errno::EAGAIN`] says that the socket is full.
 pub(super) fn send(
     socket: BorrowedFd<'_>,
-    kind: Kind,
+    kind: PacketKind,
     body: &[u8],
     descriptors: &[RawFd],
 ) -> Result<(), Errno> {
@@ -151,7 +151,7 @@ fn wait_for(
 fn packet(bytes: &[u8], descriptors: Vec<OwnedFd>) -> Received<'_> {
     match bytes.split_first() {
         None => Received::Closed,
-        Some((&kind, body)) => match Kind::of(kind) {
+        Some((&kind, body)) => match PacketKind::of(kind) {
             Some(kind) => Received::Packet(kind, body, descriptors),
             None => Received::Garbage,
         },

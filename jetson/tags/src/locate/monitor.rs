@@ -24,7 +24,7 @@ use vizflyt_protocol::geometry::{Body, Frame, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
 use crate::bundle::matrix::Symmetric;
-use crate::solve::{CornerRow, Motion, Sighting, corner_rows};
+use crate::solve::{CornerRow, Sighting, VehicleTwist, corner_rows};
 use normal::{Normal, eliminate, times, unknowns};
 
 /// What is known to be wrong with a camera.
@@ -58,7 +58,7 @@ impl Linear {
     pub(super) fn at(
         sightings: &[Sighting],
         cameras: &[usize],
-        motion: &Motion,
+        motion: &VehicleTwist,
         pose: &Pose<World, Body>,
         middle_m: DVec3,
     ) -> Option<Self> {
@@ -142,7 +142,7 @@ impl Monitor {
     }
 
     /// Learns from a set at its pose.
-    pub(super) fn learn(&mut self, stamp: HostTime, set: &Linear, motion: &Motion) {
+    pub(super) fn learn(&mut self, stamp: HostTime, set: &Linear, motion: &VehicleTwist) {
         let dt_s = self.learnt.map_or(0.0, |learnt| stamp.seconds_since(learnt).clamp(0.0, 1.0));
         self.learnt = self.learnt.max(Some(stamp));
         // While it stands nothing is learnt of clocks and scale, and nothing forgotten.

@@ -7,7 +7,7 @@ use super::region::{self, Expected};
 use super::{Locator, StampedImage};
 use crate::camera::Mounting;
 use crate::layout::LayoutFrame;
-use crate::solve::{Geometry, Motion, Sighting};
+use crate::solve::{Geometry, Sighting, VehicleTwist};
 
 impl Locator {
     /// Looks now and then whether tags of the room are still where a camera in the room had them.
@@ -50,7 +50,7 @@ impl Locator {
             })
             .collect();
         let cameras = vec![view.camera; sightings.len()];
-        let motion = Motion::default();
+        let motion = VehicleTwist::default();
         let pose = Pose::IDENTITY;
         if let Some(set) = Linear::at(&sightings, &cameras, &motion, &pose, self.middle_m) {
             self.monitor.anchor(view.camera, &set);

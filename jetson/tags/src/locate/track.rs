@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::HostTime;
 
-use crate::solve::{Motion, PoseFit, Solved};
+use crate::solve::{PoseFit, Solved, VehicleTwist};
 
 /// What is known of the vehicle's way.
 #[derive(Debug, Default)]
@@ -55,7 +55,7 @@ impl Track {
     }
 
     /// Returns how it moves; `None` before there are enough poses, and some time after the last.
-    pub(super) fn motion(&self, stamp: HostTime) -> Option<Motion> {
+    pub(super) fn motion(&self, stamp: HostTime) -> Option<VehicleTwist> {
         let age_s = stamp.seconds_since(self.newest()?);
         (age_s <= MOTION_LASTS_S).then(|| self.hypotheses.first()?.motion())?
     }
@@ -132,13 +132,13 @@ impl Hypothesis {
 
     /// Returns parabolas through the latest poses, by least squares; straight lines through a few. At the newest
     /// pose: the velocity of a straight line is that of the middle of its span.
-    fn motion(&self) -> Option<Motion> {
+    fn motion(&self) -> Option<VehicleTwist> {
         let (_, pose) = self.newest()?;
         let (v_world_mps, a_world_mps2) =
             self.slope(MOTION_SPAN_S, |past| past.translation_m - pose.translation_m)?;
         let (omega_body_radps, _) =
             self.slope(TURN_SPAN_S, |past| turn(pose.rotation, past.rotation))?;
-        Some(Motion { v_world_mps, omega_body_radps, a_world_mps2 })
+        Some(VehicleTwist { v_world_mps, omega_body_radps, a_world_mps2 })
     }
 
     /// Returns first and second derivative by time of a quantity at the newest pose, by those of the last `span_s`.

@@ -7,7 +7,7 @@
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
 
-use super::{Geometry, Motion, Sighting};
+use super::{Geometry, Sighting, VehicleTwist};
 use crate::layout::CORNERS;
 
 /// A pose and how well it explains the corners.
@@ -32,7 +32,7 @@ impl PoseFit {
 }
 
 /// Returns the robust cost of a pose; infinite where a tag would lie behind its camera.
-pub(super) fn cost(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, Body>) -> f64 {
+pub(super) fn cost(sightings: &[Sighting], motion: &VehicleTwist, pose: &Pose<World, Body>) -> f64 {
     let mut total = 0.0;
     for sighting in sightings {
         for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
@@ -46,7 +46,11 @@ pub(super) fn cost(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, B
 }
 
 /// See [`super::residual_px`].
-pub(super) fn residual_px(sighting: &Sighting, motion: &Motion, pose: &Pose<World, Body>) -> f64 {
+pub(super) fn residual_px(
+    sighting: &Sighting,
+    motion: &VehicleTwist,
+    pose: &Pose<World, Body>,
+) -> f64 {
     let mut sum = 0.0;
     for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
         let at = motion.carry(pose, -sighting.lag_at_s(measured.y));
@@ -60,7 +64,7 @@ pub(super) fn residual_px(sighting: &Sighting, motion: &Motion, pose: &Pose<Worl
 /// Returns the nearest minimum; `None` where the corners do not determine one.
 pub(super) fn adjust(
     sightings: &[Sighting],
-    motion: &Motion,
+    motion: &VehicleTwist,
     start: Pose<World, Body>,
 ) -> Option<PoseFit> {
     let mut pose = start;
@@ -138,7 +142,7 @@ pub(crate) struct CornerRow {
 /// layout's frame.
 pub(crate) fn corner_rows(
     sighting: &Sighting,
-    motion: &Motion,
+    motion: &VehicleTwist,
     pose: &Pose<World, Body>,
     middle_m: DVec3,
 ) -> Option<[CornerRow; 4]> {
@@ -218,7 +222,7 @@ struct Normal {
 }
 
 impl Normal {
-    fn at(sightings: &[Sighting], motion: &Motion, pose: &Pose<World, Body>) -> Option<Self> {
+    fn at(sightings: &[Sighting], motion: &VehicleTwist, pose: &Pose<World, Body>) -> Option<Self> {
         let mut n = Self {
             matrix: [[0.0; 6]; 6],
             gradient: [0.0; 6],

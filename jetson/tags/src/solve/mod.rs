@@ -83,7 +83,7 @@ impl Sighting<'_> {
 
 /// How the vehicle moves, to relate images that were not exposed together.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Motion {
+pub struct VehicleTwist {
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
     /// Angular velocity. [rad/s, body]
@@ -92,7 +92,7 @@ pub struct Motion {
     pub a_world_mps2: DVec3,
 }
 
-impl Motion {
+impl VehicleTwist {
     /// Returns where a vehicle is `dt_s` later; earlier where that is negative.
     pub fn carry(&self, world_from_body: &Pose<World, Body>, dt_s: f64) -> Pose<World, Body> {
         Pose::new(
@@ -120,7 +120,7 @@ pub struct Solved {
 /// `expected` is where the vehicle should be by its last motion: one more start.
 pub fn solve(
     sightings: &[Sighting],
-    motion: &Motion,
+    motion: &VehicleTwist,
     expected: Option<&Pose<World, Body>>,
 ) -> Option<Solved> {
     let mut starts: Vec<(f64, Pose<World, Body>)> = Vec::with_capacity(3 * sightings.len() + 1);
@@ -176,7 +176,7 @@ pub fn solve(
 /// camera. [px]
 pub fn residual_px(
     sighting: &Sighting,
-    motion: &Motion,
+    motion: &VehicleTwist,
     world_from_body: &Pose<World, Body>,
 ) -> f64 {
     adjust::residual_px(sighting, motion, world_from_body)

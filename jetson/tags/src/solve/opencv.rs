@@ -138,7 +138,7 @@ fn pnp(
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::{Motion, adjust, plane, solve};
+    use super::super::{VehicleTwist, adjust, plane, solve};
     use super::*;
     use crate::synth::webcam;
 
@@ -216,7 +216,7 @@ mod tests {
                 pose.translation_m.distance(truth.translation_m) + pose.rotation.angle_between(truth.rotation)
             };
             prop_assert!(found.iter().any(|(pose, lag_s)| off(pose) < 1e-4 && *lag_s == 0.01), "{found:?}");
-            let still = Motion::default();
+            let still = VehicleTwist::default();
             let whole = solve(&sightings, &still, None).unwrap().best;
             let own = plane::poses(&camera, SIZE_M, &sightings[0].corners_px);
             let start = super::super::world_from_body(&sightings[0].sight, &own[0]);

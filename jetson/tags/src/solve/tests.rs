@@ -121,7 +121,7 @@ proptest! {
         ];
         let all = cube_seen(&camera, &cameras, &truth, &mut || DVec2::ZERO);
         prop_assume!(all.len() > 1);
-        let solved = solve(&all, &Motion::default(), None).unwrap();
+        let solved = solve(&all, &VehicleTwist::default(), None).unwrap();
         let (off_m, off_rad) = error(&solved.best.world_from_body, &truth);
         prop_assert!(off_m < 1e-6 && off_rad < 1e-6, "{} m, {} rad", off_m, off_rad);
     }
@@ -135,7 +135,7 @@ proptest! {
         let corners_px = [DVec2::new(a, b), DVec2::new(c, d), DVec2::new(e, f), DVec2::new(g, h)];
         let sight = Geometry::OutsideIn { world_from_cam: Pose::IDENTITY, body_from_tag: Pose::IDENTITY };
         let sighting = Sighting { camera: &camera, sight, size_m: SIZE_M, corners_px, sigma_px: 0.2, lag_s: 0.0, readout_s: 0.0 };
-        if let Some(solved) = solve(&[sighting], &Motion::default(), None) {
+        if let Some(solved) = solve(&[sighting], &VehicleTwist::default(), None) {
             prop_assert!(solved.best.world_from_body.is_valid());
             prop_assert!(solved.best.covariance.iter().flatten().all(|v| v.is_finite()));
         }
@@ -162,7 +162,7 @@ fn inside_out_and_outside_in_are_one_mathematics() {
         all.extend(seen(&camera, sight, &truth, &mut noise_px));
     }
     assert!(all.len() >= 3, "{} tags are in the picture", all.len());
-    let solved = solve(&all, &Motion::default(), None).unwrap();
+    let solved = solve(&all, &VehicleTwist::default(), None).unwrap();
     let (off_m, off_rad) = error(&solved.best.world_from_body, &truth);
     assert!(off_m < 0.004 && off_rad < 0.004, "{off_m} m, {off_rad} rad");
     assert!(solved.other.is_none());
@@ -183,7 +183,7 @@ fn errors_are_as_large_as_the_covariance_says() {
     let (mut sum, n) = (0.0, 300);
     for _ in 0..n {
         let all = cube_seen(&camera, &cameras, &truth, &mut noise_px);
-        let fit = solve(&all, &Motion::default(), None).unwrap().best;
+        let fit = solve(&all, &VehicleTwist::default(), None).unwrap().best;
         let p = fit.world_from_body.translation_m - truth.translation_m;
         let turn = truth.rotation.conjugate() * fit.world_from_body.rotation;
         let turn = (turn * turn.w.signum()).to_scaled_axis();
@@ -203,7 +203,7 @@ fn a_far_square_seen_from_the_front_keeps_both_answers() {
     let sight = Geometry::OutsideIn { world_from_cam, body_from_tag: face(DVec3::NEG_X) };
     let both = (0..50).filter(|&seed| {
         let one = seen(&camera, sight, &truth, noise(seed + 1, 0.1)).unwrap();
-        let solved = solve(&[one], &Motion::default(), None).unwrap();
+        let solved = solve(&[one], &VehicleTwist::default(), None).unwrap();
         let Some(other) = solved.other else { return false };
         let nearest = [solved.best, other]
             .map(|fit| error(&fit.world_from_body, &truth).1)
@@ -224,7 +224,7 @@ fn a_misread_tag_hardly_pulls() {
     assert!(all.len() >= 3);
     // One corner covered by a cable: 6 pixels off.
     all[0].corners_px[2] += DVec2::new(5.0, -3.0);
-    let solved = solve(&all, &Motion::default(), None).unwrap();
+    let solved = solve(&all, &VehicleTwist::default(), None).unwrap();
     let (off_m, off_rad) = error(&solved.best.world_from_body, &truth);
     assert!(off_m < 0.02 && off_rad < 0.03, "{off_m} m, {off_rad} rad");
 }
@@ -236,7 +236,7 @@ fn images_of_other_instants_are_carried_along() {
         looking(DVec3::new(-5.2, 2.0, 3.3), DVec3::new(0.0, 0.0, 1.2)),
         looking(DVec3::new(5.2, -2.0, 3.3), DVec3::new(0.0, 0.0, 1.2)),
     ];
-    let motion = Motion {
+    let motion = VehicleTwist {
         a_world_mps2: DVec3::ZERO,
         v_world_mps: DVec3::new(2.0, -1.0, 0.3),
         omega_body_radps: DVec3::new(0.1, 0.2, 1.0),
@@ -253,6 +253,6 @@ fn images_of_other_instants_are_carried_along() {
     let solved = solve(&all, &motion, None).unwrap();
     let (off_m, off_rad) = error(&solved.best.world_from_body, &truth);
     assert!(off_m < 1e-6 && off_rad < 1e-6, "{off_m} m, {off_rad} rad");
-    let still = solve(&all, &Motion::default(), None).unwrap();
+    let still = solve(&all, &VehicleTwist::default(), None).unwrap();
     assert!(error(&still.best.world_from_body, &truth).0 > 0.005);
 }

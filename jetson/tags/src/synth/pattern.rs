@@ -1,6 +1,7 @@
 //! Where in a pixel, and when in the exposure, it is sampled; random numbers.
 
 use glam::DVec2;
+use vizflyt_protocol::random::SplitMix64;
 
 /// Places of samples about a pixel's middle.
 pub(super) struct Pattern {
@@ -88,26 +89,22 @@ fn normal_below(z: f64) -> f64 {
     if z > 0.0 { 1.0 - tail } else { tail }
 }
 
-/// Repeatable random numbers: SplitMix64 (Steele, Lea, Flood 2014).
+/// Repeatable random numbers.
 #[derive(Clone, Debug)]
-pub(crate) struct Random(u64);
+pub(crate) struct Random(SplitMix64);
 
 impl Random {
     pub(crate) fn new(seed: u64) -> Self {
-        Self(seed)
+        Self(SplitMix64::new(seed))
     }
 
     pub(crate) fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        self.0.bits()
     }
 
     /// Returns a number from 0 to 1, without 1.
     pub(crate) fn unit(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1u64 << 53) as f64
+        self.0.unit()
     }
 
     /// Returns a standard normal number (Box and Muller 1958).

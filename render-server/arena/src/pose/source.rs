@@ -86,7 +86,7 @@ pub(super) struct Source {
 struct Noise {
     /// The last two measurements.
     last: Option<(ServerTime, Pose<World, Body>)>,
-    step: Option<Step>,
+    step: Option<Increment>,
     /// Squares of how far each measurement is beside the line through the two before it, 1 in the median where noise is
     /// as stated and nobody manoeuvres; of places and of attitudes.
     places: Window,
@@ -95,7 +95,7 @@ struct Noise {
 
 /// From one measurement to the next.
 #[derive(Clone, Copy, Debug)]
-struct Step {
+struct Increment {
     dt_s: f64,
     moved_m: DVec3,
     turned_rad: DVec3,
@@ -130,7 +130,7 @@ impl Window {
 impl Noise {
     fn add(&mut self, stamp: ServerTime, pose: &Pose<World, Body>, sigma: &PoseSigma) {
         let Some((at, from)) = self.last.replace((stamp, *pose)) else { return };
-        let step = Step {
+        let step = Increment {
             dt_s: stamp.seconds_since(at),
             moved_m: pose.translation_m - from.translation_m,
             turned_rad: shortest(from.rotation.conjugate() * pose.rotation).to_scaled_axis(),

@@ -34,11 +34,11 @@ pub(crate) fn with_pictures(seed: u64, side: u64, p: DVec2) -> Look {
         let key = seed ^ (side * 1000 + n as u64 * 13);
         let edge_m = ((q.min(DVec2::ONE - q)) * size).min_element();
         return match picture.kind {
-            Kind::Poster => Look::matt(poster(key, q, edge_m)),
-            Kind::Whiteboard => Look::matt(whiteboard(key, q, edge_m)),
-            Kind::Door => Look::matt(door(q, edge_m)),
-            Kind::Banner => Look::matt(banner(key, q)),
-            Kind::Screen => screen(key, q),
+            Hanging::Poster => Look::matt(poster(key, q, edge_m)),
+            Hanging::Whiteboard => Look::matt(whiteboard(key, q, edge_m)),
+            Hanging::Door => Look::matt(door(q, edge_m)),
+            Hanging::Banner => Look::matt(banner(key, q)),
+            Hanging::Screen => screen(key, q),
         };
     }
     Look::matt(wall(seed, p))
@@ -46,7 +46,7 @@ pub(crate) fn with_pictures(seed: u64, side: u64, p: DVec2) -> Look {
 
 /// What hangs on a wall.
 #[derive(Clone, Copy, Debug)]
-enum Kind {
+enum Hanging {
     Poster,
     Whiteboard,
     Door,
@@ -55,40 +55,40 @@ enum Kind {
 }
 
 struct Picture {
-    kind: Kind,
+    kind: Hanging,
     x_m: f64,
     y_m: f64,
     size_m: DVec2,
 }
 
-const fn picture(kind: Kind, x_m: f64, y_m: f64, width_m: f64, height_m: f64) -> Picture {
+const fn picture(kind: Hanging, x_m: f64, y_m: f64, width_m: f64, height_m: f64) -> Picture {
     Picture { kind, x_m, y_m, size_m: DVec2::new(width_m, height_m) }
 }
 
 fn pictures(side: u64) -> &'static [Picture] {
     const SOUTH: [Picture; 9] = [
-        picture(Kind::Poster, 1.0, 1.7, 0.9, 1.25),
-        picture(Kind::Poster, 2.2, 1.7, 0.9, 1.25),
-        picture(Kind::Whiteboard, 3.9, 1.4, 2.4, 1.3),
-        picture(Kind::Poster, 7.0, 2.3, 1.2, 0.85),
-        picture(Kind::Banner, 8.8, 3.3, 4.2, 0.9),
-        picture(Kind::Whiteboard, 9.2, 1.4, 2.0, 1.2),
-        picture(Kind::Poster, 12.0, 1.7, 0.9, 1.25),
-        picture(Kind::Poster, 13.2, 1.7, 0.9, 1.25),
-        picture(Kind::Door, 15.0, 0.0, 1.1, 2.15),
+        picture(Hanging::Poster, 1.0, 1.7, 0.9, 1.25),
+        picture(Hanging::Poster, 2.2, 1.7, 0.9, 1.25),
+        picture(Hanging::Whiteboard, 3.9, 1.4, 2.4, 1.3),
+        picture(Hanging::Poster, 7.0, 2.3, 1.2, 0.85),
+        picture(Hanging::Banner, 8.8, 3.3, 4.2, 0.9),
+        picture(Hanging::Whiteboard, 9.2, 1.4, 2.0, 1.2),
+        picture(Hanging::Poster, 12.0, 1.7, 0.9, 1.25),
+        picture(Hanging::Poster, 13.2, 1.7, 0.9, 1.25),
+        picture(Hanging::Door, 15.0, 0.0, 1.1, 2.15),
     ];
     const EAST: [Picture; 5] = [
-        picture(Kind::Banner, 2.6, 3.6, 4.8, 1.0),
-        picture(Kind::Screen, 3.9, 1.75, 2.2, 1.3),
-        picture(Kind::Poster, 1.0, 1.6, 1.1, 1.5),
-        picture(Kind::Poster, 7.1, 1.6, 1.1, 1.5),
-        picture(Kind::Door, 8.6, 0.0, 1.1, 2.15),
+        picture(Hanging::Banner, 2.6, 3.6, 4.8, 1.0),
+        picture(Hanging::Screen, 3.9, 1.75, 2.2, 1.3),
+        picture(Hanging::Poster, 1.0, 1.6, 1.1, 1.5),
+        picture(Hanging::Poster, 7.1, 1.6, 1.1, 1.5),
+        picture(Hanging::Door, 8.6, 0.0, 1.1, 2.15),
     ];
     const WEST: [Picture; 4] = [
-        picture(Kind::Whiteboard, 3.4, 1.4, 2.8, 1.3),
-        picture(Kind::Poster, 1.2, 1.6, 1.1, 1.5),
-        picture(Kind::Poster, 7.3, 1.6, 1.1, 1.5),
-        picture(Kind::Banner, 2.8, 3.5, 4.4, 0.9),
+        picture(Hanging::Whiteboard, 3.4, 1.4, 2.8, 1.3),
+        picture(Hanging::Poster, 1.2, 1.6, 1.1, 1.5),
+        picture(Hanging::Poster, 7.3, 1.6, 1.1, 1.5),
+        picture(Hanging::Banner, 2.8, 3.5, 4.4, 0.9),
     ];
     match side {
         1 => &SOUTH,

@@ -1,7 +1,9 @@
 //! What a LiDAR measures in the splats of generated scenes, against rays cast at their true geometry.
 
 use vizflyt_protocol::geometry::Sensor;
-use vizflyt_splat::sensor::{Beams, Lidar, LidarModel, LidarPoint, Motion, SensorScene, presets};
+use vizflyt_splat::sensor::{
+    Beams, Lidar, LidarModel, LidarPoint, SensorMotion, SensorScene, presets,
+};
 
 use super::*;
 
@@ -50,7 +52,7 @@ fn measure(scene: &Generated, within: &Volume, places: &[DVec3]) -> Strayed {
     let mut strayed = Strayed::default();
     for &p_m in places {
         let world_from_sensor: Pose<World, Sensor> = Pose::new(p_m, DQuat::IDENTITY);
-        lidar.scan(&packed, &Motion::standing(world_from_sensor), 1, 1, &mut points).unwrap();
+        lidar.scan(&packed, &SensorMotion::standing(world_from_sensor), 1, 1, &mut points).unwrap();
         for (i, point) in points.iter().enumerate().step_by(3) {
             let azimuth = core::f64::consts::TAU * (0.5 - (i / 16) as f64 / 1024.0);
             let elevation = f64::from(elevations_rad[i % 16]);

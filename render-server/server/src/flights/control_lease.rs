@@ -8,7 +8,7 @@ use tokio::sync::Notify;
 use vizflyt_protocol::messages::{Hello, ReceivedEvents, Text};
 use vizflyt_protocol::time::ServerTime;
 
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// The leases of one vehicle, and the count of its flights, which changes with them.
 #[derive(Debug, Default)]

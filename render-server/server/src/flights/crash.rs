@@ -20,7 +20,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::crash_card::{CardEvent, CardImages, CardSample, CrashCard};
 use super::vehicle::VehicleFlight;
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// Makes the cards of a vehicle's failed flights until the task is dropped.
 pub(crate) async fn follow(

@@ -5,7 +5,8 @@
 //! lost unnoticed: a runtime's session is then closed and opened anew.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
+use vizflyt_process::lock;
 
 use tokio::sync::watch;
 use vizflyt_protocol::messages::Event;
@@ -59,7 +60,7 @@ impl EventLog {
 
     /// Appends an event; returns its index.
     pub fn push(&self, origin: Origin, event: Event) -> u64 {
-        let mut entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut entries = lock(&self.entries);
         let index = *self.next.borrow();
         entries.push_back(Entry { index, origin, event });
         if entries.len() > Self::KEPT {
@@ -82,7 +83,7 @@ impl EventLog {
 
     /// Returns the events from `cursor` on, and moves it behind them.
     pub fn read(&self, cursor: &mut u64) -> Result<Vec<Entry>, Lagged> {
-        let entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+        let entries = lock(&self.entries);
         let oldest = entries.front().map_or(*cursor, |entry| entry.index);
         if *cursor < oldest {
             return Err(Lagged { cursor: *cursor, oldest });
@@ -95,7 +96,7 @@ impl EventLog {
 
     /// Returns the newest `most` events, and the cursor behind them.
     pub fn newest(&self, most: usize) -> (Vec<Entry>, u64) {
-        let entries = self.entries.lock().unwrap_or_else(PoisonError::into_inner);
+        let entries = lock(&self.entries);
         let skip = entries.len().saturating_sub(most);
         let cursor = entries.back().map_or(0, |entry| entry.index + 1);
         (entries.iter().skip(skip).cloned().collect(), cursor)

@@ -17,7 +17,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::leaderboard::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd};
 use super::vehicle::VehicleFlight;
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// Follows a vehicle's flights until the task is dropped.
 /// A team's official runs beyond `most_official` are practice.

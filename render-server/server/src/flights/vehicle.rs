@@ -28,7 +28,7 @@ use super::recent_previews::RecentPreviews;
 use super::samples::Samples;
 use super::track::Track;
 use crate::clock;
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// One vehicle in the arena.
 #[derive(Debug)]

@@ -24,7 +24,7 @@ use self::description::direction;
 
 /// What is to be done next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Step {
+pub enum HandCheckStep {
     /// It stands on the floor.
     Stand,
     /// Somebody lifts it,
@@ -41,7 +41,7 @@ pub enum Step {
     Done,
 }
 
-impl Step {
+impl HandCheckStep {
     /// Returns what a person is asked to do.
     pub fn ask(self) -> &'static str {
         match self {
@@ -79,7 +79,7 @@ pub type Change = Vec<(&'static str, String)>;
 #[derive(Debug)]
 pub struct Check {
     config: LocalizationConfig,
-    step: Step,
+    step: HandCheckStep,
     /// The last moments. [s]
     window: VecDeque<(f64, Pose<World, Body>)>,
     /// Where it rested after each step.
@@ -89,17 +89,17 @@ pub struct Check {
 impl Check {
     /// Begins; poses will come as these settings make them.
     pub fn new(config: LocalizationConfig) -> Self {
-        Self { config, step: Step::Stand, window: VecDeque::new(), rests: Vec::new() }
+        Self { config, step: HandCheckStep::Stand, window: VecDeque::new(), rests: Vec::new() }
     }
 
     /// Returns what is to be done.
-    pub fn step(&self) -> Step {
+    pub fn step(&self) -> HandCheckStep {
         self.step
     }
 
     /// Takes a pose; returns whether a step was seen to its end. [s]
     pub fn handle_pose(&mut self, at_s: f64, pose: &Pose<World, Body>) -> bool {
-        if self.step == Step::Done || !pose.is_valid() {
+        if self.step == HandCheckStep::Done || !pose.is_valid() {
             return false;
         }
         // Enough to judge by at any rate, and no more than fits.
@@ -116,12 +116,12 @@ impl Check {
         self.rests.push(rest);
         self.window.clear();
         self.step = match self.step {
-            Step::Stand => Step::Lift,
-            Step::Lift => Step::Push,
-            Step::Push => Step::Turn,
-            Step::Turn => Step::Nose,
-            Step::Nose if !self.diagnosis().others.is_empty() => Step::Roll,
-            Step::Nose | Step::Roll | Step::Done => Step::Done,
+            HandCheckStep::Stand => HandCheckStep::Lift,
+            HandCheckStep::Lift => HandCheckStep::Push,
+            HandCheckStep::Push => HandCheckStep::Turn,
+            HandCheckStep::Turn => HandCheckStep::Nose,
+            HandCheckStep::Nose if !self.diagnosis().others.is_empty() => HandCheckStep::Roll,
+            HandCheckStep::Nose | HandCheckStep::Roll | HandCheckStep::Done => HandCheckStep::Done,
         };
         true
     }
@@ -163,12 +163,12 @@ impl Check {
         let noise = self.window.iter().map(off).fold(0.0, f64::max);
         let turned_rad = rest.rotation.dot(last.rotation).abs().min(1.0).acos() * 2.0;
         match self.step {
-            Step::Stand | Step::Done => true,
-            Step::Lift => moved > 20.0 * noise + f64::MIN_POSITIVE,
+            HandCheckStep::Stand | HandCheckStep::Done => true,
+            HandCheckStep::Lift => moved > 20.0 * noise + f64::MIN_POSITIVE,
             // The lift has shown how much a motion is.
-            Step::Push => moved > 0.3 * self.lifted(),
-            Step::Turn => turned_rad > MIN_TURN_RAD,
-            Step::Nose | Step::Roll => turned_rad > MIN_NOSE_RAD,
+            HandCheckStep::Push => moved > 0.3 * self.lifted(),
+            HandCheckStep::Turn => turned_rad > MIN_TURN_RAD,
+            HandCheckStep::Nose | HandCheckStep::Roll => turned_rad > MIN_NOSE_RAD,
         }
     }
 

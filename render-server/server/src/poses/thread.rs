@@ -25,9 +25,9 @@ use crate::clock;
 use crate::flights::Flights;
 use crate::flights::events::Origin;
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::mailbox::Mailbox;
 use crate::stop::Stop;
+use vizflyt_process::lock;
 
 /// What the pose thread owns and whom it reports to.
 #[derive(Debug)]

@@ -7,8 +7,8 @@ use tokio::sync::watch;
 use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::messages::{ImuReading, PoseSample};
 
-use crate::lock::lock;
 use crate::poses::drivers::SourceCounters;
+use vizflyt_process::lock;
 
 /// The localization of one vehicle.
 #[derive(Debug)]

@@ -12,7 +12,7 @@ use vizflyt_splat::weather::{
     Ball, Cloud, Flicker, LampPlaces, Lamps, MAX_LAMPS, OwnLight, Rain, Snow, Sun, Weather,
 };
 
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// What cameras see the scene through; the render thread asks once a tick.
 #[derive(Debug, Default)]

@@ -21,7 +21,6 @@ use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
 use crate::flights::Flights;
-use crate::lock::lock;
 use crate::mailbox::Mailbox;
 use crate::poses::newest::{Localized, NewestPoses, merge};
 use crate::render::cameras::{CameraSet, RenderedCameras};
@@ -32,6 +31,7 @@ use crate::render::rendered::{RenderQueue, RenderedImage, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
 use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
+use vizflyt_process::lock;
 
 /// Renders the newest poses until the server stops: each tick the cameras that are due of the
 /// vehicles that someone wants images of.

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// The scenes to choose from, and the one chosen.
 #[derive(Debug)]

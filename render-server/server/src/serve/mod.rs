@@ -24,11 +24,9 @@ use self::print::{Ready, ReadySource, ReadyVehicle};
 use crate::args::{RunStorage, ServeArgs};
 use crate::authorization::Authorizer;
 use crate::clock;
-use crate::descriptors;
 use crate::flights::leaderboard::{Database, Leaderboard};
 use crate::flights::vehicle::VehicleFlight;
 use crate::flights::{self, Flights};
-use crate::lock::lock;
 use crate::poses::Localization;
 use crate::poses::drivers::{self, Opened};
 use crate::poses::settings::{self, Driver};
@@ -39,6 +37,8 @@ use crate::render::{RendererInfo, Rendering};
 use crate::scene::Scenes;
 use crate::stop::Stop;
 use crate::stream::{Rooms, Streaming, transport};
+use vizflyt_process::descriptors;
+use vizflyt_process::lock;
 
 use crate::web::previews::Previews;
 use crate::web::{self, Access, Lab, Logins, Page, PageTls, Rates, TwinPictures};
@@ -205,7 +205,7 @@ async fn run(
         // A thread that panicked has reported it on stderr; the report still comes.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
-    print::report(args.json, &print::Report::of(&rooms));
+    print::report(args.json, &print::ServerReport::of(&rooms));
     Ok(())
 }
 

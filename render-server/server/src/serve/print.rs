@@ -11,7 +11,6 @@ use vizflyt_arena::pose::PoseQuality;
 
 use crate::flights::events::Origin;
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::poses::drivers::{Opened, SourceCounters};
 use crate::poses::settings::Driver;
 use crate::stream::Rooms;
@@ -19,6 +18,7 @@ use crate::stream::delivery::CameraDelivery;
 use crate::stream::vehicle::ImageCounters;
 use crate::timing::StageDurations;
 use crate::web::{PageKeys, ServerStages};
+use vizflyt_process::lock;
 
 /// What is printed when the server is ready.
 #[derive(Debug, Serialize)]
@@ -151,7 +151,7 @@ pub(super) fn ready(json: bool, ready: &Ready<'_>) {
 }
 
 /// Prints the report at the end.
-pub(super) fn report(json: bool, report: &Report) {
+pub(super) fn report(json: bool, report: &ServerReport) {
     if json {
         return line(&serde_json::json!({ "report": report }));
     }
@@ -184,7 +184,7 @@ pub(super) fn plain(text: &str) {
 
 /// The report printed when the server ends.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(super) struct Report {
+pub(super) struct ServerReport {
     /// Drawing one tick, median. [ms]
     render_ms_p50: f32,
     /// 99th percentile. [ms]
@@ -223,7 +223,7 @@ pub(super) struct Report {
     renderer_reason: String,
 }
 
-impl Report {
+impl ServerReport {
     /// Returns the report over the whole run.
     pub(super) fn of(rooms: &Rooms) -> Self {
         let Rooms { flights, localization, rendering, streaming, .. } = rooms;

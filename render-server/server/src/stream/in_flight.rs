@@ -6,7 +6,8 @@
 //! buffer: however many subscribers an image has, its bytes are there once.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
+use vizflyt_process::lock;
 
 use bytes::Bytes;
 use tokio::sync::Notify;
@@ -110,6 +111,6 @@ impl InFlightImage {
 
     fn lock(&self) -> MutexGuard<'_, State> {
         // Why: nothing panics while the lock is held.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }

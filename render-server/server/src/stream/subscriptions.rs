@@ -13,6 +13,7 @@
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use vizflyt_process::lock;
 
 use bytes::Bytes;
 use vizflyt_arena::config::MAX_VEHICLES;
@@ -329,7 +330,7 @@ impl Subscriptions {
 
     fn lock(&self) -> MutexGuard<'_, State> {
         // Why: no code panics while it holds the lock.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

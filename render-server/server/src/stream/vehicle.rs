@@ -12,7 +12,7 @@ use super::connection::Connection;
 use super::delivery::{CameraCounters, CameraDelivery, DeliveryStats};
 use super::rate_control::{self, Level};
 use crate::clock;
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// The stream of one vehicle.
 #[derive(Debug, Default)]

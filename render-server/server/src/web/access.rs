@@ -22,8 +22,8 @@ use vizflyt_trust::{Fingerprint, KeyError, KeysFolder, secret};
 
 use super::password;
 use super::sessions::{Sessions, Tokens};
-use crate::lock::lock;
 use crate::rate_limit::RateLimiter;
+use vizflyt_process::lock;
 
 /// Who looks at the page.
 #[derive(Clone, Debug, PartialEq, Eq)]

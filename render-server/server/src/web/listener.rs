@@ -30,9 +30,9 @@ use tracing::{debug, warn};
 use super::access::{self, Viewer};
 use super::https::PageTls;
 use crate::admission::{Admission, Holder, Limits, PlaceId};
-use crate::descriptors::{self, Reserve};
-use crate::lock::lock;
 use crate::stop::Stop;
+use vizflyt_process::descriptors::{self, Reserve};
+use vizflyt_process::lock;
 
 /// Binds the page's address.
 ///

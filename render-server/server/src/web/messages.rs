@@ -17,12 +17,12 @@ use super::top_view::Obstacles;
 use crate::clock;
 use crate::flights::events::{Entry, Origin};
 use crate::flights::vehicle::{Flight, VehicleFlight};
-use crate::lock::lock;
 use crate::poses::drivers::SourceCounters;
 use crate::render::RendererInfo;
 use crate::render::cameras::CameraSet;
 use crate::render::dynamic_objects::{DynamicObjects, ObjectBounds};
 use crate::stream::Rooms;
+use vizflyt_process::lock;
 
 /// Server to page.
 #[derive(Debug, Serialize)]

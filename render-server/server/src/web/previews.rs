@@ -20,10 +20,10 @@ use vizflyt_splat::{DepthKind, RgbdImage};
 
 use crate::flights::Flights;
 use crate::flights::recent_previews::Preview;
-use crate::lock::lock;
 use crate::render::rendered::RenderQueue;
 use crate::stop::Stop;
 use crate::stream::subscriptions::Subscriptions;
+use vizflyt_process::lock;
 
 /// The newest previews, by vehicle and camera; latest-wins.
 #[derive(Debug)]

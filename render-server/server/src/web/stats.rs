@@ -6,11 +6,11 @@ use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::messages::{StageTimes, Timing};
 
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::stream::Rooms;
 use crate::stream::connection::Connection;
 use crate::stream::delivery::CameraDelivery;
 use crate::timing::StageDurations;
+use vizflyt_process::lock;
 
 /// The figures of one vehicle's images, as `GET /api/stats` returns them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -14,7 +14,7 @@ use super::messages;
 use super::state::Page;
 use crate::flights::recent_previews::Preview;
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// Counts a viewer for as long as it lives.
 struct Presence<'a> {

@@ -1,6 +1,6 @@
 //! Splats in, fewer or moved splats out: what a captured scene needs before it is flown.
 //!
-//! A [`Step`] is one edit with all that it depends on, in the axes and units that the scene has when its turn comes. Steps
+//! A [`EditStep`] is one edit with all that it depends on, in the axes and units that the scene has when its turn comes. Steps
 //! are data: whoever keeps them beside the original can repeat the edit, or leave the last one out.
 //!
 //! ```text
@@ -24,7 +24,7 @@ mod words;
 pub use carve::Carve;
 pub use region::{Axis, Region, select};
 pub use similarity::transform;
-pub use step::{EditError, InvalidStep, Step};
+pub use step::{EditError, EditStep, InvalidStep};
 
 use crate::Splats;
 

@@ -12,7 +12,7 @@ use crate::Splats;
 /// One edit of a scene. Lengths and axes are those the scene has when the step is applied.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum Step {
+pub enum EditStep {
     /// Keeps what lies in any of the regions.
     Crop {
         /// Where splats are kept, by their centres.
@@ -47,7 +47,7 @@ pub enum Step {
     },
     /// Keeps the largest connected parts.
     Parts {
-        /// As of [`Step::Floaters`]. [scene]
+        /// As of [`EditStep::Floaters`]. [scene]
         cell: f64,
         /// How many parts stay.
         keep: u32,
@@ -115,7 +115,7 @@ pub enum EditError {
     NoRoom([f64; 3]),
 }
 
-impl Step {
+impl EditStep {
     /// Checks that every number can be meant.
     ///
     /// # Errors

@@ -47,7 +47,7 @@ fn with(more: impl IntoIterator<Item = Vec3>) -> Splats {
 }
 
 /// Applies a step, and checks that the room's splats stay and the others go.
-fn check_room_stays(step: &Step, mut scene: Splats) {
+fn check_room_stays(step: &EditStep, mut scene: Splats) {
     let rest = scene.len() - room().len();
     assert_eq!(step.apply(&mut scene), Ok(rest), "{step:?}");
     assert!(scene.means_m == room());
@@ -58,12 +58,12 @@ fn check_room_stays(step: &Step, mut scene: Splats) {
 fn floaters_and_unconnected_parts_go() {
     let inside = Vec3::new(4.0, 3.0, 1.5);
     let floater = ball(20, inside, 0.1);
-    check_room_stays(&Step::Floaters { cell: 0.2, least: 50 }, with(floater));
+    check_room_stays(&EditStep::Floaters { cell: 0.2, least: 50 }, with(floater));
     let outside = Vec3::new(12.0, 3.0, 1.5);
     let mut houses = with(ball(4000, outside, 1.0));
-    assert_eq!(Step::Floaters { cell: 0.2, least: 50 }.apply(&mut houses), Ok(0));
-    check_room_stays(&Step::Parts { cell: 0.2, keep: 1 }, houses.clone());
-    assert_eq!(Step::Parts { cell: 0.2, keep: 2 }.apply(&mut houses), Ok(0));
+    assert_eq!(EditStep::Floaters { cell: 0.2, least: 50 }.apply(&mut houses), Ok(0));
+    check_room_stays(&EditStep::Parts { cell: 0.2, keep: 1 }, houses.clone());
+    assert_eq!(EditStep::Parts { cell: 0.2, keep: 2 }.apply(&mut houses), Ok(0));
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn haze_holds_nothing_together() {
     let wall_to_ball = (0..200).map(|k| Vec3::new(8.0 + k as f32 * 0.015, 3.0, 1.5));
     let far = Vec3::new(12.0, 3.0, 1.5);
     let mut scene = with(wall_to_ball.chain(ball(1000, far, 1.0)));
-    let step = Step::Parts { cell: 0.2, keep: 1 };
+    let step = EditStep::Parts { cell: 0.2, keep: 1 };
     assert_eq!(step.apply(&mut scene.clone()), Ok(0), "a solid bridge");
     scene.opacities[40_000..40_200].fill(0.05);
     let taken = step.apply(&mut scene).unwrap();
@@ -83,7 +83,7 @@ fn one_large_splat_connects_what_it_touches() {
     let (left, right) = (Vec3::new(-2.0, 0.0, 0.0), Vec3::new(2.0, 0.0, 0.0));
     let mut scene =
         splats(ball(100, left, 0.2).chain(ball(90, right, 0.2)).chain([Vec3::ZERO]).collect());
-    let step = Step::Parts { cell: 0.3, keep: 1 };
+    let step = EditStep::Parts { cell: 0.3, keep: 1 };
     assert_eq!(step.apply(&mut scene.clone()), Ok(91));
     // A plank along y, turned to lie along x.
     scene.scales_m[190] = Vec3::new(0.1, 2.0, 0.1);
@@ -99,7 +99,7 @@ fn carve(path: &[[f64; 3]]) -> Carve {
 
 #[test]
 fn a_room_is_carved_from_its_inside() {
-    let step = Step::Carve(carve(&[[1.0, 1.0, 1.0]]));
+    let step = EditStep::Carve(carve(&[[1.0, 1.0, 1.0]]));
     let behind_the_wall = ball(3000, Vec3::new(12.0, 3.0, 1.5), 1.0);
     check_room_stays(&step, with(behind_the_wall));
     // Haze in the middle goes, solid things stay; from beside a wall to the ceiling it is one room.
@@ -108,7 +108,7 @@ fn a_room_is_carved_from_its_inside() {
     check_room_stays(&step, hazy);
     assert_eq!(step.apply(&mut with(ball(500, Vec3::new(4.0, 3.0, 1.5), 0.2))), Ok(0));
     // What stands in the path's way is no obstacle: somebody walked there.
-    let walked = Step::Carve(carve(&[[1.0, 1.0, 1.5], [7.0, 5.0, 1.5]]));
+    let walked = EditStep::Carve(carve(&[[1.0, 1.0, 1.5], [7.0, 5.0, 1.5]]));
     check_room_stays(&walked, with(ball(100, Vec3::new(4.0, 3.0, 1.5), 0.1)));
 }
 
@@ -118,7 +118,7 @@ fn an_open_scene_keeps_what_lies_beyond_the_cells() {
     let without_ceiling = means.len();
     means.extend(ball(100, Vec3::new(0.0, 0.0, 500.0), 30.0));
     let mut scene = splats(means);
-    assert_eq!(Step::Carve(carve(&[[4.0, 3.0, 1.0]])).apply(&mut scene), Ok(0));
+    assert_eq!(EditStep::Carve(carve(&[[4.0, 3.0, 1.0]])).apply(&mut scene), Ok(0));
     assert_eq!(scene.len(), without_ceiling + 100);
 }
 
@@ -127,8 +127,9 @@ fn what_cannot_be_carved_is_said() {
     let mut scene = with(ball(2000, Vec3::new(4.0, 3.0, 1.5), 0.3));
     let whole = scene.clone();
     let within = Carve { radius: 0.1, ..carve(&[[4.0, 3.0, 1.5]]) };
-    let said =
-        |carve: Carve, scene: &mut Splats| Step::Carve(carve).apply(scene).unwrap_err().to_string();
+    let said = |carve: Carve, scene: &mut Splats| {
+        EditStep::Carve(carve).apply(scene).unwrap_err().to_string()
+    };
     assert!(said(within, &mut scene).contains("more room"));
     let elsewhere = carve(&[[100.0, 3.0, 1.5]]);
     assert!(said(elsewhere, &mut scene).contains("nothing solid is within 10"));
@@ -179,20 +180,22 @@ fn decimation_keeps_the_large_and_opaque_in_order() {
         scene.opacities[k] = if k < 50 { 0.9 } else { 0.1 };
     }
     let whole = scene.clone();
-    assert_eq!(Step::Decimate { count: 10 }.apply(&mut scene), Ok(90));
+    assert_eq!(EditStep::Decimate { count: 10 }.apply(&mut scene), Ok(90));
     // The largest are numbers 9, 19, ...; then 8, 18, ... of the opaque.
     let kept = [8, 9, 18, 19, 28, 29, 38, 39, 48, 49].map(|k: usize| whole.means_m[k]);
     assert_eq!(scene.means_m, kept);
-    assert_eq!(Step::Decimate { count: 1000 }.apply(&mut scene), Ok(0));
+    assert_eq!(EditStep::Decimate { count: 1000 }.apply(&mut scene), Ok(0));
 }
 
 #[test]
 fn what_takes_everything_is_refused() {
     let mut scene = with([]);
     let whole = scene.clone();
-    for step in
-        [Step::Faint { below: 1.0 }, Step::Large { above: 1e-3 }, Step::Small { below: 9.0 }]
-    {
+    for step in [
+        EditStep::Faint { below: 1.0 },
+        EditStep::Large { above: 1e-3 },
+        EditStep::Small { below: 9.0 },
+    ] {
         let error = step.apply(&mut scene).unwrap_err();
         assert_eq!(error, EditError::NothingLeft(whole.len()));
         assert!(scene == whole);
@@ -201,23 +204,29 @@ fn what_takes_everything_is_refused() {
 
 #[test]
 fn numbers_that_cannot_be_meant_are_refused() {
-    let check = |step: Step, key: &str| {
+    let check = |step: EditStep, key: &str| {
         let error = step.check().unwrap_err();
         assert_eq!(error.key, key, "{error}");
         assert!(step.apply(&mut with([])).is_err());
     };
-    let prism = |outline: Vec<[f64; 2]>, high| Step::Crop {
+    let prism = |outline: Vec<[f64; 2]>, high| EditStep::Crop {
         within: vec![Region::Prism { axis: Axis::Z, outline, low: 0.0, high }],
     };
-    check(Step::Faint { below: f64::NAN }, "below");
-    check(Step::Large { above: f64::INFINITY }, "above");
-    check(Step::Decimate { count: 0 }, "count");
-    check(Step::Turn { rotation: [0.0; 4] }, "rotation");
-    check(Step::Scale { factor: 0.0 }, "factor");
-    check(Step::Move { by: [1e9, 0.0, 0.0] }, "by");
-    check(Step::Crop { within: vec![] }, "within");
-    check(Step::Crop { within: vec![Region::Box { min: [0.0; 3], max: [1.0, 0.0, 1.0] }] }, "max");
-    check(Step::Crop { within: vec![Region::Sphere { center: [0.0; 3], radius: -1.0 }] }, "radius");
+    check(EditStep::Faint { below: f64::NAN }, "below");
+    check(EditStep::Large { above: f64::INFINITY }, "above");
+    check(EditStep::Decimate { count: 0 }, "count");
+    check(EditStep::Turn { rotation: [0.0; 4] }, "rotation");
+    check(EditStep::Scale { factor: 0.0 }, "factor");
+    check(EditStep::Move { by: [1e9, 0.0, 0.0] }, "by");
+    check(EditStep::Crop { within: vec![] }, "within");
+    check(
+        EditStep::Crop { within: vec![Region::Box { min: [0.0; 3], max: [1.0, 0.0, 1.0] }] },
+        "max",
+    );
+    check(
+        EditStep::Crop { within: vec![Region::Sphere { center: [0.0; 3], radius: -1.0 }] },
+        "radius",
+    );
     check(prism(vec![[0.0; 2]; 2], 1.0), "outline");
     check(prism(vec![[0.0; 2]; 3000], 1.0), "outline");
     check(prism(vec![[0.0; 2], [1.0, 0.0], [0.0, f64::NAN]], 1.0), "outline");
@@ -230,12 +239,12 @@ fn turns_scales_and_moves_can_be_taken_back() {
     let mut scene = whole.clone();
     let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.4, -1.2, 2.0);
     let steps = [
-        Step::Turn { rotation: turn.to_array() },
-        Step::Scale { factor: 2.5 },
-        Step::Move { by: [1.0, -2.0, 3.0] },
-        Step::Move { by: [-1.0, 2.0, -3.0] },
-        Step::Scale { factor: 0.4 },
-        Step::Turn { rotation: turn.inverse().to_array() },
+        EditStep::Turn { rotation: turn.to_array() },
+        EditStep::Scale { factor: 2.5 },
+        EditStep::Move { by: [1.0, -2.0, 3.0] },
+        EditStep::Move { by: [-1.0, 2.0, -3.0] },
+        EditStep::Scale { factor: 0.4 },
+        EditStep::Turn { rotation: turn.inverse().to_array() },
     ];
     for (done, step) in steps.iter().enumerate() {
         assert_eq!(step.apply(&mut scene), Ok(0));
@@ -306,19 +315,19 @@ fn region() -> impl Strategy<Value = Region> {
 }
 
 /// Steps that take splats away and leave the others as they are.
-fn removal() -> impl Strategy<Value = Step> {
+fn removal() -> impl Strategy<Value = EditStep> {
     let within = || prop::collection::vec(region(), 1..3);
     prop_oneof![
-        within().prop_map(|within| Step::Crop { within }),
-        within().prop_map(|within| Step::Remove { within }),
-        (0.0..1.0f64).prop_map(|below| Step::Faint { below }),
-        length().prop_map(|above| Step::Large { above }),
-        length().prop_map(|below| Step::Small { below }),
-        (length(), 1..9u32).prop_map(|(cell, least)| Step::Floaters { cell, least }),
-        (length(), 1..4u32).prop_map(|(cell, keep)| Step::Parts { cell, keep }),
-        (1..70u32).prop_map(|count| Step::Decimate { count }),
+        within().prop_map(|within| EditStep::Crop { within }),
+        within().prop_map(|within| EditStep::Remove { within }),
+        (0.0..1.0f64).prop_map(|below| EditStep::Faint { below }),
+        length().prop_map(|above| EditStep::Large { above }),
+        length().prop_map(|below| EditStep::Small { below }),
+        (length(), 1..9u32).prop_map(|(cell, least)| EditStep::Floaters { cell, least }),
+        (length(), 1..4u32).prop_map(|(cell, keep)| EditStep::Parts { cell, keep }),
+        (1..70u32).prop_map(|count| EditStep::Decimate { count }),
         (prop::collection::vec(point(), 1..4), length(), 0.3..2.0f64).prop_map(
-            |(path, depth, cell)| Step::Carve(Carve {
+            |(path, depth, cell)| EditStep::Carve(Carve {
                 path,
                 radius: 0.3,
                 depth,
@@ -330,11 +339,11 @@ fn removal() -> impl Strategy<Value = Step> {
 }
 
 /// Whether a region looks at what it takes from what there is: what hides then depends on what went.
-fn looks(step: &Step) -> bool {
+fn looks(step: &EditStep) -> bool {
     let sees = |region: &Region| matches!(region, Region::View { visible: true, .. });
     match step {
-        Step::Crop { within } | Step::Remove { within } => within.iter().any(sees),
-        Step::Carve(_) => true,
+        EditStep::Crop { within } | EditStep::Remove { within } => within.iter().any(sees),
+        EditStep::Carve(_) => true,
         _ => false,
     }
 }
@@ -381,8 +390,8 @@ proptest! {
     /// A crop and the removal of the same regions share the splats between them.
     #[test]
     fn what_is_not_kept_is_removed(whole in anything(), within in prop::collection::vec(region(), 1..3)) {
-        let left = |step: Step| step.apply(&mut whole.clone()).map_or(0, |taken| whole.len() - taken);
-        let [kept, rest] = [Step::Crop { within: within.clone() }, Step::Remove { within }].map(left);
+        let left = |step: EditStep| step.apply(&mut whole.clone()).map_or(0, |taken| whole.len() - taken);
+        let [kept, rest] = [EditStep::Crop { within: within.clone() }, EditStep::Remove { within }].map(left);
         prop_assert_eq!(kept + rest, whole.len());
     }
 

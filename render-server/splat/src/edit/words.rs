@@ -2,9 +2,9 @@
 
 use std::fmt;
 
-use super::{Axis, Region, Step};
+use super::{Axis, EditStep, Region};
 
-impl fmt::Display for Step {
+impl fmt::Display for EditStep {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Crop { within } => regions(f, "crop", within),

@@ -11,6 +11,8 @@
 
 use std::sync::LazyLock;
 
+use vizflyt_protocol::random::{GOLDEN, mix};
+
 /// What the random numbers of one image are made from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NoiseKey(u64);
@@ -102,18 +104,8 @@ fn quantile(p: f64) -> f64 {
     x
 }
 
-/// SplitMix64's finaliser (Steele et al. 2014).
-#[inline]
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
-}
-
 /// Numbers in the table: 16 kB, in the first cache; the last is 3.67 standard deviations out.
 const NORMALS: usize = 4096;
-/// 2^64 over the golden ratio, odd.
-const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
 
 #[cfg(test)]
 mod tests {

@@ -7,7 +7,7 @@
 
 use glam::DVec3;
 
-use super::Motion;
+use super::SensorMotion;
 use super::follow::{Follow, Ray};
 use super::tree::{NONE, Tree, WIDTH};
 use crate::cpu::simd::InstructionSet;
@@ -50,7 +50,7 @@ impl SensorScene {
 
     /// Finds what each of some beams meets, at its share of `motion`, 0 to 1. Beams close to one another, as neighbours of a ring are,
     /// take less time together; any others get the same.
-    pub(super) fn cast(&self, motion: &Motion<'_>, beams: &[(f64, Beam)], hits: &mut [Hits]) {
+    pub(super) fn cast(&self, motion: &SensorMotion<'_>, beams: &[(f64, Beam)], hits: &mut [Hits]) {
         let mut rays = [Ray::default(); TOGETHER];
         for (beams, hits) in beams.chunks(TOGETHER).zip(hits.chunks_mut(TOGETHER)) {
             for (((_, beam), ray), hits) in beams.iter().zip(&mut rays).zip(hits.iter_mut()) {
@@ -79,7 +79,7 @@ impl SensorScene {
     /// `met` is told what it meets, weighed and nearest first, one after the other.
     pub(super) fn cast_each(
         &self,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         count: usize,
         hits: &mut [Hits; TOGETHER],
         beam: impl Fn(usize) -> (f64, Beam),

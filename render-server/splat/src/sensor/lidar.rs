@@ -16,7 +16,7 @@ use vizflyt_protocol::geometry::{Pose, Sensor, World};
 
 use super::cast::{Beam, Echo, Hit, Hits, TOGETHER, echoes, spread_of};
 use super::noise::Draws;
-use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
+use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
 /// A LiDAR, in the words of its data sheet. [`super::presets`] has named ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -240,7 +240,7 @@ impl Lidar {
     pub fn scan(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         seed: u64,
         seq: u64,
         out: &mut Vec<LidarPoint>,
@@ -264,7 +264,7 @@ impl Lidar {
     fn measure_columns(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         (seed, seq): (u64, u64),
         first: usize,
         points: &mut [LidarPoint],

@@ -2,7 +2,7 @@
 //!
 //! A [`SensorScene`] packs a scene once. A sensor is a plain model ([`LidarModel`], [`RangeModel`], [`SonarModel`],
 //! [`RadarModel`], by name in [`presets`]); prepared once, it measures as often as asked, into records that the caller
-//! keeps, without allocation after the first call. What it is told is a [`Motion`]: where sensor and objects are from the
+//! keeps, without allocation after the first call. What it is told is a [`SensorMotion`]: where sensor and objects are from the
 //! first instant of a measurement to its last.
 //!
 //! Data flow, the files in run order: `tree` packs splats for rays, `follow` takes a ray through them, `cast` makes of what it meets a beam's
@@ -31,7 +31,7 @@ pub use range::{RangeFinder, RangeModel, RangeReading, Sonar, SonarModel};
 /// Where a sensor and the objects of its scene are while it measures: at the first instant, and at the last. Between them
 /// they move evenly: along a line, and by slerp.
 #[derive(Clone, Copy, Debug)]
-pub struct Motion<'a> {
+pub struct SensorMotion<'a> {
     /// The sensor at the first and at the last instant. [m, world]
     pub world_from_sensor: [Pose<World, Sensor>; 2],
     /// Each object of the scene, in its order, at both instants; one that is `None` at either is not there. [m, world]
@@ -40,10 +40,10 @@ pub struct Motion<'a> {
     pub duration_s: f64,
 }
 
-impl Motion<'_> {
+impl SensorMotion<'_> {
     /// Returns the motion of a sensor that stands, in a scene without objects.
-    pub fn standing(world_from_sensor: Pose<World, Sensor>) -> Motion<'static> {
-        Motion { world_from_sensor: [world_from_sensor; 2], objects: &[], duration_s: 0.0 }
+    pub fn standing(world_from_sensor: Pose<World, Sensor>) -> SensorMotion<'static> {
+        SensorMotion { world_from_sensor: [world_from_sensor; 2], objects: &[], duration_s: 0.0 }
     }
 
     /// Returns the sensor's pose at a share of the duration, 0 to 1. [m, world]

@@ -1,28 +1,22 @@
 //! Random numbers by counter: what a beam draws follows from where it stands in the scan, not from which thread cast it.
 
-/// The numbers that one beam draws, one after the other: SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom
-/// number generators", OOPSLA 2014) started at a hash of who draws; Gaussian by Box and Muller (1958).
+use vizflyt_protocol::random::{GOLDEN, SplitMix64, mix};
+
+/// The numbers that one beam draws, one after the other; Gaussian by Box and Muller (1958).
 #[derive(Clone, Debug)]
-pub(super) struct Draws {
-    state: u64,
-}
+pub(super) struct Draws(SplitMix64);
 
 impl Draws {
     /// Starts the numbers of beam `beam` in scan `seq` of a sensor with this seed.
     pub(super) fn new(seed: u64, seq: u64, beam: u64) -> Self {
         let seeded = mix(seed.wrapping_add(GOLDEN));
         let scanned = mix(seeded ^ seq.wrapping_mul(0xD1B5_4A32_D192_ED03));
-        Self { state: mix(scanned ^ beam.wrapping_mul(0x8CB9_2BA7_2F3D_8DD7)) }
-    }
-
-    fn next_u64(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(GOLDEN);
-        mix(self.state)
+        Self(SplitMix64::new(mix(scanned ^ beam.wrapping_mul(0x8CB9_2BA7_2F3D_8DD7))))
     }
 
     /// Returns a number in [0, 1), uniformly.
     pub(super) fn uniform(&mut self) -> f32 {
-        (self.next_u64() >> 40) as f32 * (1.0 / (1u64 << 24) as f32)
+        self.0.unit_f32()
     }
 
     /// Returns two independent numbers of zero mean and unit variance.
@@ -32,15 +26,6 @@ impl Draws {
         let (sin, cos) = (std::f32::consts::TAU * self.uniform()).sin_cos();
         [radius * cos, radius * sin]
     }
-}
-
-/// 2^64 over the golden ratio: SplitMix64's increment.
-const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;
-
-fn mix(mut z: u64) -> u64 {
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
 }
 
 #[cfg(test)]

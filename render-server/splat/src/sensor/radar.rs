@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::cast::{Beam, Hit, Hits, TOGETHER, echoes};
 use super::lidar::pointing;
 use super::noise::Draws;
-use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
+use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
 /// A radar, in the words of its data sheet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -170,7 +170,7 @@ impl Radar {
     pub fn measure(
         &mut self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         seed: u64,
         seq: u64,
         out: &mut Vec<RadarDetection>,
@@ -203,7 +203,7 @@ impl RadarModel {
     fn patches(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         rays: &[Ray],
         spread: f32,
         patches: &mut [Patch],
@@ -220,7 +220,7 @@ impl RadarModel {
         });
     }
 
-    fn patch(&self, motion: &Motion<'_>, ray: &Ray, beam: &Beam, hits: &[Hit]) -> Patch {
+    fn patch(&self, motion: &SensorMotion<'_>, ray: &Ray, beam: &Beam, hits: &[Hit]) -> Patch {
         let &Beam { origin_m, direction, .. } = beam;
         let mut patch = Patch { cell: NOWHERE, ..Patch::default() };
         echoes(hits, self.range_resolution_m, |echo| {
@@ -299,13 +299,13 @@ fn folded(speed_mps: f32, most_mps: f32) -> f32 {
 }
 
 /// Returns the velocity of the sensor. [m/s, world]
-fn own_velocity(motion: &Motion<'_>) -> DVec3 {
+fn own_velocity(motion: &SensorMotion<'_>) -> DVec3 {
     let [begin, end] = motion.world_from_sensor;
     per(motion.duration_s, end.translation_m - begin.translation_m)
 }
 
 /// Returns the velocity of the point of a part that is at `p_world_m` halfway. [m/s, world]
-fn velocity(motion: &Motion<'_>, part: u16, p_world_m: DVec3) -> DVec3 {
+fn velocity(motion: &SensorMotion<'_>, part: u16, p_world_m: DVec3) -> DVec3 {
     let object = usize::from(part).checked_sub(1).and_then(|i| motion.objects.get(i));
     let Some([Some(begin), Some(end)]) = object else { return DVec3::ZERO };
     let p_object_m = begin.interpolate(end, 0.5).inverse().transform_point(p_world_m);

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::cast::{Beam, Echo, Hits, TOGETHER, echoes};
 use super::lidar::rounded;
 use super::noise::Draws;
-use super::{Checked, InvalidModel, Motion, SensorError, SensorScene};
+use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
 /// A range finder that measures by light, in the words of its data sheet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -154,7 +154,7 @@ impl Cone {
     fn receive(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         max_m: f32,
         resolution_m: f32,
         received: &mut [Received; MAX_RECEIVED],
@@ -235,7 +235,7 @@ impl RangeFinder {
     pub fn measure(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         seed: u64,
         seq: u64,
     ) -> Result<RangeReading, SensorError> {
@@ -344,7 +344,7 @@ impl Sonar {
     pub fn measure(
         &self,
         scene: &SensorScene,
-        motion: &Motion<'_>,
+        motion: &SensorMotion<'_>,
         seed: u64,
         seq: u64,
     ) -> Result<RangeReading, SensorError> {

@@ -59,7 +59,7 @@ fn exact(columns: u32) -> LidarModel {
     }
 }
 
-fn scan(model: LidarModel, scene: &SensorScene, motion: &Motion<'_>) -> Vec<LidarPoint> {
+fn scan(model: LidarModel, scene: &SensorScene, motion: &SensorMotion<'_>) -> Vec<LidarPoint> {
     let mut points = Vec::new();
     Lidar::new(model).unwrap().scan(scene, motion, 1, 2, &mut points).unwrap();
     points
@@ -68,7 +68,7 @@ fn scan(model: LidarModel, scene: &SensorScene, motion: &Motion<'_>) -> Vec<Lida
 #[test]
 fn a_wall_is_seen_along_every_beam_at_its_distance() {
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 0.0, 0.0), -Vec3::X, 3.0, 0.05));
-    let points = scan(exact(360), &scene, &Motion::standing(at(DVec3::ZERO, 0.0)));
+    let points = scan(exact(360), &scene, &SensorMotion::standing(at(DVec3::ZERO, 0.0)));
     let mut seen = 0;
     for (column, point) in points.iter().enumerate() {
         let azimuth = std::f64::consts::PI * (1.0 - column as f64 / 180.0);
@@ -91,7 +91,7 @@ fn a_wall_is_seen_along_every_beam_at_its_distance() {
 #[test]
 fn points_of_a_moving_sensor_are_from_where_it_was_at_their_instants() {
     let scene = SensorScene::new(&wall(Vec3::new(4.0, 0.0, 0.0), -Vec3::X, 3.0, 0.05));
-    let moving = Motion {
+    let moving = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::X, 0.0)],
         objects: &[],
         duration_s: 0.1,
@@ -116,7 +116,7 @@ fn range_errors_are_of_the_stated_sigma_and_step() {
         ..exact(360)
     })
     .unwrap();
-    let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+    let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
     let mut points = Vec::new();
     let mut ranges = Vec::new();
     for seq in 0..4000 {
@@ -147,7 +147,7 @@ fn returns_drop_out_by_reflectivity_incidence_and_range() {
             ..exact(8)
         })
         .unwrap();
-        let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+        let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
         let mut points = Vec::new();
         let hits = (0..600).filter(|&seq| {
             lidar.scan(&scene, &motion, 1, seq, &mut points).unwrap();
@@ -180,7 +180,7 @@ fn a_beam_over_an_edge_has_an_echo_of_each_side() {
     let scene = SensorScene::new(&splats);
     let ahead = |returns, divergence_rad, y_m| {
         let model = LidarModel { divergence_rad, returns, ..exact(8) };
-        scan(model, &scene, &Motion::standing(at(DVec3::Y * y_m, 0.0)))[4].range_m
+        scan(model, &scene, &SensorMotion::standing(at(DVec3::Y * y_m, 0.0)))[4].range_m
     };
     // A footprint of 0.1 rad is 0.4 m wide there.
     assert!((ahead(Returns::First, 0.1, 0.0) - 4.0).abs() < 0.01);
@@ -213,21 +213,21 @@ fn object_at(x_m: f64) -> Option<Pose<World, Object>> {
 fn an_object_is_seen_where_it_is_at_the_beam_s_instant() {
     let (objects, splats) = with_object();
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
-    let motion = Motion {
+    let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0); 2],
         objects: &[[object_at(5.0), object_at(4.0)]],
         duration_s: 0.1,
     };
     let point = scan(exact(360), &scene, &motion)[180];
     assert!((point.range_m - 4.5).abs() < 2e-3 && point.object == 9, "{point:?}");
-    let gone = Motion { objects: &[[object_at(5.0), None]], ..motion };
+    let gone = SensorMotion { objects: &[[object_at(5.0), None]], ..motion };
     assert_eq!(scan(exact(360), &scene, &gone)[180].range_m, 0.0);
 }
 
 #[test]
 fn any_number_of_threads_gives_the_same_bits() {
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 0.0, 0.0), -Vec3::X, 2.0, 0.1));
-    let motion = Motion {
+    let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::new(0.2, 0.1, 0.0), 0.3)],
         objects: &[],
         duration_s: 0.1,
@@ -253,7 +253,7 @@ fn any_number_of_threads_gives_the_same_bits() {
 fn a_rosette_fills_its_field_and_never_repeats() {
     let lidar = Lidar::new(lidar_of("mid-360")).unwrap();
     let scene = SensorScene::new(&wall(Vec3::new(2.0, 0.0, 0.0), -Vec3::X, 4.0, 0.2));
-    let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+    let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
     let cells = |points: &[LidarPoint]| -> std::collections::HashSet<(i32, i32)> {
         let seen = points.iter().filter(|p| p.range_m > 0.0);
         seen.map(|p| {
@@ -293,14 +293,14 @@ fn a_range_finder_reports_the_mean_of_what_its_cone_sees() {
     for (name, distance_m) in [("tfmini", 5.0), ("lidar-lite-v3", 20.0), ("vl53l1x", 2.0)] {
         let finder = range_of(name);
         let scene = SensorScene::new(&wall(Vec3::X * distance_m, -Vec3::X, 2.0, 0.05));
-        let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+        let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
         let reading = finder.measure(&scene, &motion, 1, 1).unwrap();
         // Over a cone of half angle a the mean of 1 / cos is 1 + a^2 / 4 to second order.
         let half = finder.model().fov_rad / 2.0;
         let mean_m = distance_m * (1.0 + half * half / 4.0);
         let step_m = finder.model().range_step_m;
         assert!((reading.range_m - mean_m).abs() < 0.51 * step_m + 2e-3, "{name}: {reading:?}");
-        let far = Motion::standing(at(DVec3::NEG_X * 60.0, 0.0));
+        let far = SensorMotion::standing(at(DVec3::NEG_X * 60.0, 0.0));
         assert_eq!(finder.measure(&scene, &far, 1, 1).unwrap(), RangeReading::default());
     }
 }
@@ -310,7 +310,7 @@ fn a_sonar_hears_the_nearest_that_faces_it() {
     let sonar = sonar_of("mb1242");
     let heard = |splats: &Splats, seq| {
         let scene = SensorScene::new(splats);
-        let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+        let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
         sonar.measure(&scene, &motion, 1, seq).unwrap()
     };
     let square = heard(&wall(Vec3::X * 3.0, -Vec3::X, 2.5, 0.1), 1);
@@ -346,7 +346,7 @@ fn a_radar_tells_range_azimuth_and_speed_of_what_moves() {
     let mut radar = Radar::new(radar_of("iwr6843")).unwrap();
     let mut detections = Vec::new();
     // It comes at 2 m/s, the sensor goes at 0.5 m/s: 2.5 m/s less each second.
-    let motion = Motion {
+    let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::X * 0.025, 0.0)],
         objects: &[[object_at(5.0), object_at(4.9)]],
         duration_s: 0.05,
@@ -363,7 +363,7 @@ fn a_radar_tells_range_azimuth_and_speed_of_what_moves() {
         let along = detection.speed_mps / detection.azimuth_rad.cos();
         assert!((-2.7..-2.2).contains(&along), "{detection:?}");
     }
-    let fast = Motion { objects: &[[object_at(5.0), object_at(4.7)]], ..motion };
+    let fast = SensorMotion { objects: &[[object_at(5.0), object_at(4.7)]], ..motion };
     radar.measure(&scene, &fast, 1, 1, &mut detections).unwrap();
     let best = detections.iter().max_by(|a, b| a.snr_db.total_cmp(&b.snr_db)).unwrap();
     // 6.5 m/s towards it reads as 9 - 6.5 away from it.
@@ -376,7 +376,7 @@ fn what_stands_still_passes_at_the_cosine_of_its_bearing() {
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 2.0, 0.0), -Vec3::Y, 3.0, 0.1));
     let mut radar = Radar::new(RadarModel { threshold_db: 3.0, ..radar_of("iwr6843") }).unwrap();
     let mut detections = Vec::new();
-    let motion = Motion {
+    let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::X * 0.05, 0.0)],
         objects: &[],
         duration_s: 0.05,
@@ -400,7 +400,7 @@ fn a_target_fades_with_the_fourth_power_of_range() {
         let still = Splats::default();
         let scene = SensorScene::new(Scene { splats: &still, objects: &objects });
         let place = object_at(distance_m);
-        let motion = Motion {
+        let motion = SensorMotion {
             world_from_sensor: [at(DVec3::ZERO, 0.0); 2],
             objects: &[[place, place]],
             duration_s: 0.0,
@@ -442,7 +442,7 @@ fn presets_are_valid_and_named_once() {
 #[test]
 fn an_empty_scene_no_beams_and_bad_poses_are_answered() {
     let nothing = SensorScene::new(&Splats::default());
-    let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+    let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
     assert!(scan(exact(8), &nothing, &motion).iter().all(|p| p.range_m == 0.0));
     assert!(scan(exact(0), &nothing, &motion).is_empty());
     let no_rings = Beams::Spinning { elevations_rad: Vec::new(), columns: 8 };
@@ -456,17 +456,17 @@ fn an_empty_scene_no_beams_and_bad_poses_are_answered() {
 
     let lidar = Lidar::new(exact(8)).unwrap();
     let mut points = vec![LidarPoint::default()];
-    let bad = Motion::standing(at(DVec3::new(f64::NAN, 0.0, 0.0), 0.0));
+    let bad = SensorMotion::standing(at(DVec3::new(f64::NAN, 0.0, 0.0), 0.0));
     let error = lidar.scan(&nothing, &bad, 1, 1, &mut points).unwrap_err();
     assert!(error.to_string().contains("the sensor is at") && points.is_empty(), "{error}");
-    let long = Motion { duration_s: f64::NAN, ..motion };
+    let long = SensorMotion { duration_s: f64::NAN, ..motion };
     assert!(matches!(
         lidar.scan(&nothing, &long, 1, 1, &mut points),
         Err(SensorError::Duration(_))
     ));
     let (objects, splats) = with_object();
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
-    let bad = Motion { objects: &[[object_at(f64::INFINITY), None]], ..motion };
+    let bad = SensorMotion { objects: &[[object_at(f64::INFINITY), None]], ..motion };
     let error = lidar.scan(&scene, &bad, 1, 1, &mut points).unwrap_err().to_string();
     assert!(error.contains("object 0 is placed at"), "{error}");
 }
@@ -507,7 +507,7 @@ proptest! {
     #[test]
     fn poison_makes_no_poison(splats in poisoned_splats(), x in -2.0..2.0f64, yaw in -3.0..3.0f64, seq: u64) {
         let scene = SensorScene::new(&splats);
-        let motion = Motion {
+        let motion = SensorMotion {
             world_from_sensor: [at(DVec3::X * x, yaw), at(DVec3::Y * x, yaw)],
             objects: &[],
             duration_s: 0.1,

@@ -14,7 +14,7 @@ use crate::Camera;
 
 /// Particles of one size that go one way.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Kind {
+pub(super) struct ParticleKind {
     /// [m]
     pub(super) diameter_m: f64,
     /// How many there are.
@@ -54,7 +54,7 @@ const PARTS: usize = 4;
 /// The particles before one camera, at one instant.
 #[derive(Debug, Default)]
 pub(super) struct ParticlePass {
-    kinds: Vec<(u32, Kind)>,
+    kinds: Vec<(u32, ParticleKind)>,
     /// [`PARTS`] of each kind.
     parts: Vec<Vec<Streak>>,
 }
@@ -79,7 +79,7 @@ impl ParticlePass {
     }
 
     /// Adds kinds; `group` keeps the numbers of rain and snow apart.
-    pub(super) fn add(&mut self, group: u32, kinds: impl Iterator<Item = Kind>) {
+    pub(super) fn add(&mut self, group: u32, kinds: impl Iterator<Item = ParticleKind>) {
         self.kinds.extend(kinds.map(|kind| (group, kind)));
     }
 
@@ -88,7 +88,7 @@ impl ParticlePass {
         let parts = self.kinds.len() * PARTS;
         self.parts.resize_with(parts.max(self.parts.len()), Vec::new);
         let in_view = |shrunk: f64| -> f64 {
-            let volume = |kind: &Kind| view_m3(scene, shrunk * reach_m(kind, scene));
+            let volume = |kind: &ParticleKind| view_m3(scene, shrunk * reach_m(kind, scene));
             self.kinds.iter().map(|(_, kind)| kind.per_m3 * volume(kind)).sum()
         };
         let shrunk = (MOST / in_view(1.0).max(MOST)).cbrt();
@@ -113,7 +113,7 @@ impl ParticlePass {
 }
 
 /// Returns how opaque a particle is at a depth. [m, cam]
-fn opacity_at(kind: &Kind, scene: &Scene<'_>, z_m: f64) -> f32 {
+fn opacity_at(kind: &ParticleKind, scene: &Scene<'_>, z_m: f64) -> f32 {
     let px = scene.camera.intrinsics.fx_px / z_m;
     let way_m = (kind.v_world_mps - scene.v_world_mps).length() * scene.exposure_s;
     opacity((kind.diameter_m * px) as f32, (way_m * px) as f32)
@@ -129,7 +129,7 @@ fn opacity(width_px: f32, length_px: f32) -> f32 {
 }
 
 /// Returns how far away a kind is drawn. [m]
-fn reach_m(kind: &Kind, scene: &Scene<'_>) -> f64 {
+fn reach_m(kind: &ParticleKind, scene: &Scene<'_>) -> f64 {
     let mut reach_m = FARTHEST_M;
     while opacity_at(kind, scene, reach_m) < LEAST && reach_m > f64::from(NEAR_M) {
         reach_m *= 0.9;
@@ -145,7 +145,7 @@ fn view_m3(scene: &Scene<'_>, reach_m: f64) -> f64 {
 
 /// The cells of one kind before a camera.
 struct Cells<'a> {
-    kind: &'a Kind,
+    kind: &'a ParticleKind,
     scene: &'a Scene<'a>,
     reach_m: f32,
     side_m: f64,
@@ -159,7 +159,7 @@ struct Cells<'a> {
 }
 
 impl<'a> Cells<'a> {
-    fn of(kind: &'a Kind, scene: &'a Scene<'a>, reach_m: f64) -> Self {
+    fn of(kind: &'a ParticleKind, scene: &'a Scene<'a>, reach_m: f64) -> Self {
         let side_m = (PER_CELL / kind.per_m3).cbrt().clamp(0.08, 2.0);
         let moved_m = kind.v_world_mps * scene.at_s;
         let Camera { world_from_cam, .. } = scene.camera;

@@ -10,7 +10,7 @@
 
 use glam::Vec2;
 
-use super::particles::Kind;
+use super::particles::ParticleKind;
 
 /// Rain in the air, and what of it lies on the lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -46,7 +46,7 @@ impl Rain {
     }
 
     /// Returns the drops by size.
-    pub(super) fn kinds(&self) -> impl Iterator<Item = Kind> {
+    pub(super) fn kinds(&self) -> impl Iterator<Item = ParticleKind> {
         let slope = self.slope_per_mm();
         let wind_mps = self.wind_mps.as_dvec2();
         EDGES_MM.windows(2).map(move |edges| {
@@ -56,7 +56,7 @@ impl Rain {
             let first = |mm: f64, left: f64| (mm + 1.0 / slope) * left;
             let mean_mm = (first(edges[0], from) - first(edges[1], to)) / (from - to);
             let v_world_mps = wind_mps.extend(-Self::fall_mps(mean_mm));
-            Kind { diameter_m: mean_mm * 1e-3, per_m3, v_world_mps }
+            ParticleKind { diameter_m: mean_mm * 1e-3, per_m3, v_world_mps }
         })
     }
 }

@@ -10,7 +10,7 @@
 
 use glam::{DVec2, Vec2};
 
-use super::particles::Kind;
+use super::particles::ParticleKind;
 
 /// Snow in the air.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,7 +53,7 @@ impl Snow {
     }
 
     /// Returns the flakes by size and way.
-    pub(super) fn kinds(&self) -> impl Iterator<Item = Kind> {
+    pub(super) fn kinds(&self) -> impl Iterator<Item = ParticleKind> {
         let (n0, slope) = (self.n0(), self.slope_per_mm());
         let wind_mps = self.wind_mps.as_dvec2();
         EDGES_MM.windows(2).flat_map(move |edges| {
@@ -66,7 +66,7 @@ impl Snow {
                 let angle_rad = std::f64::consts::TAU * f64::from(way) / f64::from(WAYS) + mean_mm;
                 let sway_mps = DVec2::from_angle(angle_rad) * (0.2 * fall_mps);
                 let v_world_mps = (wind_mps + sway_mps).extend(-fall_mps);
-                Kind { diameter_m: Self::flake_mm(mean_mm) * 1e-3, per_m3, v_world_mps }
+                ParticleKind { diameter_m: Self::flake_mm(mean_mm) * 1e-3, per_m3, v_world_mps }
             })
         })
     }

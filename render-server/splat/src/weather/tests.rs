@@ -2,7 +2,7 @@ use glam::{DQuat, DVec2, DVec3, Vec2};
 use proptest::prelude::*;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
 
-use super::particles::{Kind, Streak};
+use super::particles::{ParticleKind, Streak};
 use super::*;
 
 const WIDTH: u32 = 96;
@@ -204,7 +204,7 @@ fn drops_are_as_many_as_marshall_and_palmer_counted_and_as_long_as_they_fall() {
         let moment = Moment { seed: image, at_ns: image as i64 * 997_000_000, ..MOMENT };
         for streak in streaks(Some(rain), None, &moment, &k) {
             let diameter_m = f64::from(streak.width_px * streak.z_m) / k.fx_px;
-            let same = |kind: &Kind| (kind.diameter_m - diameter_m).abs() < 1e-5;
+            let same = |kind: &ParticleKind| (kind.diameter_m - diameter_m).abs() < 1e-5;
             let index = rain.kinds().position(|kind| same(&kind)).expect("a kind of this size");
             let middle = (streak.from_px + streak.to_px) * 0.5;
             let inside =

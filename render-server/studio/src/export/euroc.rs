@@ -11,7 +11,7 @@ use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Cam, Distortion, Frame, Intrinsics, Pose, World};
 
 use super::files::{Folder, write_depth, write_rgb};
-use super::motion::Motion;
+use super::motion::FlightTracks;
 use super::pictures::Pictures;
 use super::table::{Row, write_beside};
 use super::{Written, write_text};
@@ -26,7 +26,11 @@ struct Sensor {
 }
 
 /// Writes it.
-pub(super) fn write(folder: &Folder, motion: &Motion, mut pictures: Pictures) -> Result<Written> {
+pub(super) fn write(
+    folder: &Folder,
+    motion: &FlightTracks,
+    mut pictures: Pictures,
+) -> Result<Written> {
     let mut sensors: Vec<Sensor> = Vec::new();
     let mut rows = Vec::new();
     while let Some(mut image) = pictures.next(|_| true)? {
@@ -134,7 +138,7 @@ pub(super) fn rate_hz(stamps: &[u64]) -> f64 {
     if seconds > 0.0 { (stamps.len() - 1) as f64 / seconds } else { 0.0 }
 }
 
-fn imu(folder: &Folder, motion: &Motion) -> Result<()> {
+fn imu(folder: &Folder, motion: &FlightTracks) -> Result<()> {
     let mut text = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],\
                     a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
         .to_owned();
@@ -152,7 +156,7 @@ fn imu(folder: &Folder, motion: &Motion) -> Result<()> {
     write_text(&folder.at("mav0/imu0/sensor.yaml")?, &text)
 }
 
-fn truth(folder: &Folder, motion: &Motion) -> Result<()> {
+fn truth(folder: &Folder, motion: &FlightTracks) -> Result<()> {
     let rows = motion.poses.iter().map(|pose| TruthRow {
         at_ns: pose.at_ns,
         world_from_body: pose.from_body,

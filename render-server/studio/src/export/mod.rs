@@ -25,7 +25,7 @@ use clap::{Args, ValueEnum};
 use vizflyt_process::print_line;
 
 use self::files::Folder;
-use self::motion::Motion;
+use self::motion::FlightTracks;
 use self::pictures::Pictures;
 
 /// Writes a flight's log as a data set: EuRoC, TUM RGB-D, or tables.
@@ -64,7 +64,7 @@ enum Format {
 
 /// Exports, and prints what was written.
 pub fn run(args: &ExportArgs) -> Result<ExitCode> {
-    let motion = Motion::read(&args.log)?;
+    let motion = FlightTracks::read(&args.log)?;
     let folder = Folder::begin(&args.output)?;
     ensure!(
         motion.images > 0,

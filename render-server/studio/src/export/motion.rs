@@ -13,7 +13,7 @@ const LONGEST_GAP_NS: u64 = 200_000_000;
 
 /// What a flight holds beside its pixels. All ascend in time.
 #[derive(Debug, Default)]
-pub(super) struct Motion {
+pub(super) struct FlightTracks {
     pub(super) poses: Vec<StampedPose<World>>,
     pub(super) motions: Vec<FlightMotion>,
     pub(super) imu: Vec<FlightImu>,
@@ -40,7 +40,7 @@ pub(super) struct Interpolated {
     pub(super) rotation_sigma_rad: DVec3,
 }
 
-impl Motion {
+impl FlightTracks {
     /// Reads a log.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let context = || format!("cannot read {}", path.display());
@@ -139,7 +139,7 @@ mod tests {
             ..FlightMotion::default()
         }];
         let poses = vec![pose(0), pose(10_000_000), pose(500_000_000)];
-        let motion = Motion { poses, motions, ..Motion::default() };
+        let motion = FlightTracks { poses, motions, ..FlightTracks::default() };
         let at = motion.at(7_500_000).unwrap();
         assert!((at.world_from_body.translation_m.x - 0.0075).abs() < 1e-12);
         assert!(at.world_from_body.rotation.angle_between(DQuat::from_rotation_z(0.0075)) < 1e-9);

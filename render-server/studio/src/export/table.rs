@@ -6,7 +6,7 @@ use vizflyt_runtime::log::data::FlightImage;
 
 use super::columns::Table;
 use super::files::{Folder, write_depth, write_rgb};
-use super::motion::{Interpolated, Motion};
+use super::motion::{FlightTracks, Interpolated};
 use super::pictures::Pictures;
 use super::{Written, parquet, seconds_text, write_text};
 
@@ -19,7 +19,11 @@ pub(super) struct Row {
 }
 
 /// Writes Parquet files and images.
-pub(super) fn write(folder: &Folder, motion: &Motion, mut pictures: Pictures) -> Result<Written> {
+pub(super) fn write(
+    folder: &Folder,
+    motion: &FlightTracks,
+    mut pictures: Pictures,
+) -> Result<Written> {
     let mut rows = Vec::new();
     while let Some(mut image) = pictures.next(|_| true)? {
         let size = (image.header.width_px.get(), image.header.height_px.get());
@@ -50,7 +54,7 @@ pub(super) fn write(folder: &Folder, motion: &Motion, mut pictures: Pictures) ->
 }
 
 /// Writes beside EuRoC's or TUM's files what these have no place for.
-pub(super) fn write_beside(folder: &Folder, motion: &Motion, rows: &[Row]) -> Result<()> {
+pub(super) fn write_beside(folder: &Folder, motion: &FlightTracks, rows: &[Row]) -> Result<()> {
     for (name, table) in [
         ("images.csv", images(motion, rows)),
         ("setpoints_asked.csv", asked(motion)),
@@ -78,7 +82,7 @@ pub(super) fn file_name(camera: &str) -> String {
     camera.chars().map(safe).collect()
 }
 
-fn images(motion: &Motion, rows: &[Row]) -> Table {
+fn images(motion: &FlightTracks, rows: &[Row]) -> Table {
     let mut table = Table::default();
     let all = || rows.iter().map(|row| &row.image);
     table.integers("timestamp_ns", all().map(|image| image.shown_ns));
@@ -112,7 +116,7 @@ fn images(motion: &Motion, rows: &[Row]) -> Table {
     table
 }
 
-fn poses(motion: &Motion) -> Table {
+fn poses(motion: &FlightTracks) -> Table {
     let mut table = Table::default();
     table.integers("timestamp_ns", motion.poses.iter().map(|pose| pose.at_ns));
     table.vectors("p", motion.poses.iter().map(|pose| Some(pose.from_body.translation_m)));
@@ -124,7 +128,7 @@ fn poses(motion: &Motion) -> Table {
     table
 }
 
-fn imu(motion: &Motion) -> Table {
+fn imu(motion: &FlightTracks) -> Table {
     let mut table = Table::default();
     table.integers("timestamp_ns", motion.imu.iter().map(|reading| reading.at_ns));
     table.vectors("gyro", motion.imu.iter().map(|reading| Some(reading.gyro_radps)));
@@ -132,7 +136,7 @@ fn imu(motion: &Motion) -> Table {
     table
 }
 
-fn odometry(motion: &Motion) -> Table {
+fn odometry(motion: &FlightTracks) -> Table {
     let mut table = Table::default();
     table.integers("timestamp_ns", motion.odometry.iter().map(|pose| pose.at_ns));
     table.vectors("p", motion.odometry.iter().map(|pose| Some(pose.from_body.translation_m)));
@@ -140,7 +144,7 @@ fn odometry(motion: &Motion) -> Table {
     table
 }
 
-fn asked(motion: &Motion) -> Table {
+fn asked(motion: &FlightTracks) -> Table {
     let mut table = Table::default();
     let all = || {
         motion.asked.iter().map(|(at_ns, json)| {
@@ -154,7 +158,7 @@ fn asked(motion: &Motion) -> Table {
     table
 }
 
-fn sent(motion: &Motion) -> Table {
+fn sent(motion: &FlightTracks) -> Table {
     let mut table = Table::default();
     let all: Vec<(u64, serde_json::Value)> = motion
         .sent

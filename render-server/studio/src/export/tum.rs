@@ -7,7 +7,7 @@ use anyhow::{Context, Result, ensure};
 use vizflyt_protocol::geometry::{Cam, Pose, World};
 
 use super::files::{Folder, write_depth, write_rgb};
-use super::motion::Motion;
+use super::motion::FlightTracks;
 use super::pictures::Pictures;
 use super::table::{Row, write_beside};
 use super::{Written, seconds_text, write_text};
@@ -18,7 +18,7 @@ const UNITS_PER_MM: u16 = 5;
 /// Writes it, of the camera of this name or the first one.
 pub(super) fn write(
     folder: &Folder,
-    motion: &Motion,
+    motion: &FlightTracks,
     mut pictures: Pictures,
     camera: Option<&str>,
 ) -> Result<Written> {

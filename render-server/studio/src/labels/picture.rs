@@ -13,10 +13,7 @@ pub enum EncodeError {
     Png(#[from] png::EncodingError),
     /// Of a JPEG.
     #[error("cannot encode a JPEG")]
-    Jpeg(#[from] jpeg_encoder::EncodingError),
-    /// Of a JPEG, whose sides are 16 bits.
-    #[error("an image of {0} x {1} pixels is too large for a JPEG")]
-    Size(u32, u32),
+    Jpeg(#[from] vizflyt_rgbd::EncodeError),
 }
 
 /// Encodes RGB, 8 bits each.
@@ -56,11 +53,8 @@ pub fn rgb16(rgb: &[u16], size: [u32; 2]) -> Result<Vec<u8>, EncodeError> {
 /// # Errors
 /// [`EncodeError`].
 pub fn jpeg(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> Result<Vec<u8>, EncodeError> {
-    let side = |side: u32| u16::try_from(side).map_err(|_| EncodeError::Size(width, height));
     let mut out = Vec::new();
-    let mut encoder = jpeg_encoder::Encoder::new(&mut out, quality);
-    encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_1_1);
-    encoder.encode(rgb, side(width)?, side(height)?, jpeg_encoder::ColorType::Rgb)?;
+    vizflyt_rgbd::encode_jpeg(rgb, width, height, quality, &mut out)?;
     Ok(out)
 }
 

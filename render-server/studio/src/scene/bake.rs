@@ -38,7 +38,7 @@ pub(crate) struct BakeArgs {
 
 /// What `--json` prints.
 #[derive(Debug, Serialize)]
-struct Report {
+struct BakeReport {
     splats: usize,
     voxel_m: f64,
     voxels: usize,
@@ -81,7 +81,7 @@ pub(crate) fn run(args: &BakeArgs) -> Result<()> {
     let seen = scene.seen.as_ref();
     let baked = bake_with(&scene.splats, &spec, seen, cache.as_ref(), &|share| bar.show(share));
     Bar::clear();
-    let report = Report::of(&baked, scene.splats.len(), &spec);
+    let report = BakeReport::of(&baked, scene.splats.len(), &spec);
     if args.json {
         print_line(serde_json::to_string(&report)?);
     } else {
@@ -111,7 +111,7 @@ fn refuse(findings: &[Finding], is_final: bool) -> Result<()> {
     bail!("this cannot be meant:\n  {}", lines.join("\n  "))
 }
 
-impl Report {
+impl BakeReport {
     fn of(baked: &Baked, splats: usize, spec: &BakeSpec) -> Self {
         Self {
             splats,

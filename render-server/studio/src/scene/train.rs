@@ -80,7 +80,7 @@ pub(crate) struct TrainArgs {
 
 /// What `--report` holds.
 #[derive(Debug, Serialize)]
-struct Report {
+struct TrainingReport {
     dataset: String,
     photos: usize,
     points: usize,
@@ -177,7 +177,7 @@ pub(crate) fn run(args: &TrainArgs) -> Result<()> {
     splats.antialiased = args.antialiased;
     format::write(&args.output, &splats)?;
     kept.remove();
-    let report = Report {
+    let report = TrainingReport {
         dataset: args.dataset.display().to_string(),
         photos: dataset.photos.len(),
         points: dataset.points.len(),

@@ -19,13 +19,13 @@ pub(super) struct Rolling {
     /// By how much each camera turns from the first row to the last beyond what its neighbours tell. [rad, cam]
     pub(super) bends_rad: Vec<DVec3>,
     /// Of each camera.
-    motions: Vec<Motion>,
+    motions: Vec<CameraVelocity>,
     height_px: f64,
 }
 
 /// How a camera moves.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Motion {
+struct CameraVelocity {
     /// [1/s of the state's lengths, world]
     v_world: DVec3,
     /// [rad/s, cam]
@@ -39,7 +39,7 @@ pub(super) struct Row {
     pub(super) share: f64,
     shift_world: DVec3,
     turn_rad: DVec3,
-    motion: Motion,
+    motion: CameraVelocity,
 }
 
 /// A point in the camera, as a row sees it.
@@ -56,7 +56,7 @@ impl Rolling {
         Self {
             readout_s: 0.0,
             bends_rad: vec![DVec3::ZERO; images],
-            motions: vec![Motion::default(); images],
+            motions: vec![CameraVelocity::default(); images],
             height_px: f64::from(lens.height_px),
         }
     }
@@ -138,8 +138,8 @@ impl InRow {
 
 /// Returns how cameras move: the mean of the speeds from the image before and to the image after, as far as these are
 /// near in time; nothing of what stands alone, or leaps.
-fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<Motion> {
-    let between = |a: usize| -> Option<Motion> {
+fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<CameraVelocity> {
+    let between = |a: usize| -> Option<CameraVelocity> {
         let (before, after) = (cameras[a], *cameras.get(a + 1)?);
         let took_s = capture.images[a + 1].at_s - capture.images[a].at_s;
         if !(took_s > 0.0 && took_s <= GAP_S) {
@@ -147,25 +147,25 @@ fn motions(capture: &Capture, cameras: &[Pose<World, Cam>]) -> Vec<Motion> {
         }
         let turn = before.rotation.conjugate() * after.rotation;
         let turn_rad = (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis();
-        Some(Motion {
+        Some(CameraVelocity {
             v_world: (after.translation_m - before.translation_m) / took_s,
             omega_cam: turn_rad / took_s,
         })
     };
-    let steps: Vec<Option<Motion>> = (0..cameras.len()).map(between).collect();
+    let steps: Vec<Option<CameraVelocity>> = (0..cameras.len()).map(between).collect();
     let usual = median(steps.iter().flatten().map(|motion| motion.v_world.length())).unwrap_or(0.0);
-    let is_walk = |motion: &Motion| {
+    let is_walk = |motion: &CameraVelocity| {
         motion.v_world.length() <= LEAP * usual && motion.omega_cam.length() <= MOST_RADPS
     };
     let walked = |step: usize| steps.get(step).copied().flatten().filter(is_walk);
     (0..cameras.len())
         .map(|camera| match (camera.checked_sub(1).and_then(walked), walked(camera)) {
-            (Some(a), Some(b)) => Motion {
+            (Some(a), Some(b)) => CameraVelocity {
                 v_world: 0.5 * (a.v_world + b.v_world),
                 omega_cam: 0.5 * (a.omega_cam + b.omega_cam),
             },
             (Some(one), None) | (None, Some(one)) => one,
-            (None, None) => Motion::default(),
+            (None, None) => CameraVelocity::default(),
         })
         .collect()
 }

@@ -7,12 +7,12 @@ pub type CloudPoint = (DVec3, [u8; 3]);
 
 /// How a property is stored.
 #[derive(Clone, Copy)]
-enum Kind {
+enum ScalarType {
     Integer { bytes: usize, signed: bool },
     Float { bytes: usize },
 }
 
-impl Kind {
+impl ScalarType {
     fn of(name: &str) -> Option<Self> {
         let integer = |bytes, signed| Some(Self::Integer { bytes, signed });
         match name {
@@ -63,7 +63,7 @@ pub fn parse(bytes: &[u8]) -> Result<Vec<CloudPoint>, String> {
         return Err("no PLY: it does not begin with 'ply'".to_owned());
     }
     let (mut is_text, mut count, mut elements) = (None, 0usize, 0);
-    let mut properties: Vec<(String, Kind)> = Vec::new();
+    let mut properties: Vec<(String, ScalarType)> = Vec::new();
     for line in lines {
         match line.as_slice() {
             ["format", "ascii", _] => is_text = Some(true),
@@ -80,7 +80,7 @@ pub fn parse(bytes: &[u8]) -> Result<Vec<CloudPoint>, String> {
             }
             ["property", kind, name] if elements == 1 => {
                 let kind =
-                    Kind::of(kind).ok_or_else(|| format!("property {name} is a '{kind}'"))?;
+                    ScalarType::of(kind).ok_or_else(|| format!("property {name} is a '{kind}'"))?;
                 properties.push(((*name).to_owned(), kind));
             }
             ["property", ..] if elements == 1 => return Err("a vertex has a list".to_owned()),

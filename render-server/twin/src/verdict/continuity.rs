@@ -7,7 +7,7 @@ use super::walk::Walk;
 use super::{Check, Finding, Severity, Verdict};
 
 /// A step of the walk.
-struct Step {
+struct WalkStep {
     /// The image it leads to; the one before comes from.
     to: usize,
     speed: f64,
@@ -59,7 +59,7 @@ fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
         usual_turn.to_degrees(),
         quickest.to_degrees()
     ));
-    let mut found: Vec<(f64, &Step, bool)> = steps
+    let mut found: Vec<(f64, &WalkStep, bool)> = steps
         .iter()
         .filter_map(|step| {
             let leap = step.speed / most_speed;
@@ -72,7 +72,7 @@ fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     let name = |image: usize| &walk.evidence.capture.images[image].name;
-    let tell = |&(_, step, is_leap): &(f64, &Step, bool)| {
+    let tell = |&(_, step, is_leap): &(f64, &WalkStep, bool)| {
         let (from, to) = (name(step.to - 1), name(step.to));
         if is_leap {
             let times = step.speed / usual_speed;
@@ -98,8 +98,8 @@ fn leaps(walk: &Walk<'_>, verdict: &mut Verdict) {
 }
 
 /// Adds steps that no step around them is like: a model that came apart and was put together again a little off.
-fn stands_out(walk: &Walk<'_>, steps: &[Step], usual_speed: f64, verdict: &mut Verdict) {
-    let alone: Vec<&Step> = steps
+fn stands_out(walk: &Walk<'_>, steps: &[WalkStep], usual_speed: f64, verdict: &mut Verdict) {
+    let alone: Vec<&WalkStep> = steps
         .windows(3)
         .filter(|three| {
             let around = three[0].speed.max(three[2].speed).max(usual_speed);
@@ -121,7 +121,7 @@ fn stands_out(walk: &Walk<'_>, steps: &[Step], usual_speed: f64, verdict: &mut V
     });
 }
 
-fn steps(walk: &Walk<'_>) -> Vec<Step> {
+fn steps(walk: &Walk<'_>) -> Vec<WalkStep> {
     let images = &walk.evidence.capture.images;
     (1..images.len())
         .filter_map(|to| {
@@ -129,7 +129,7 @@ fn steps(walk: &Walk<'_>) -> Vec<Step> {
             let (a, b) = (&walk.poses[to - 1], &walk.poses[to]);
             let length = a.translation_m.distance(b.translation_m);
             let turn_rad = 2.0 * a.rotation.dot(b.rotation).abs().min(1.0).acos();
-            (seconds > 0.0).then(|| Step {
+            (seconds > 0.0).then(|| WalkStep {
                 to,
                 speed: length / seconds,
                 turn_radps: turn_rad / seconds,

@@ -20,7 +20,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("vizflyt-avoid", &["vizflyt-sdk"]),
     ("vizflyt-race", &["vizflyt-sdk"]),
     // It links its own DDS, which nothing else shall.
-    ("vizflyt-ros2", &["vizflyt-sdk"]),
+    ("vizflyt-ros2", &["vizflyt-sdk", "vizflyt-rgbd"]),
     ("vizflyt-c", &["vizflyt-sdk"]),
     // The generator knows the truth; the server must never see it, so it does not import scenes.
     ("vizflyt-scenes", &["vizflyt-protocol", "vizflyt-splat", "vizflyt-arena", "vizflyt-toml"]),
@@ -72,6 +72,7 @@ const ARROWS: &[(&str, &[&str])] = &[
         &[
             "vizflyt-protocol",
             "vizflyt-toml",
+            "vizflyt-rgbd",
             "vizflyt-trust",
             "vizflyt-process",
             "vizflyt-splat",

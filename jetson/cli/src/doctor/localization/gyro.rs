@@ -4,8 +4,9 @@
 //! which the link relates to ours (TIMESYNC), else when it came.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
+use vizflyt_process::lock;
 
 use anyhow::{Context, Result};
 use glam::DVec3;
@@ -54,7 +55,7 @@ impl Gyro {
 
     /// Takes what has come since the last time.
     pub(super) fn take(&self) -> Heard {
-        let mut heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut heard = lock(&self.heard);
         let taken = heard.clone();
         heard.readings.clear();
         heard.began_anew = false;
@@ -88,7 +89,7 @@ fn listen(port: &Port, mut link: Link, heard: &Mutex<Heard>, stop: &AtomicBool) 
         // Nobody reads what happens on the link.
         while link.poll_event().is_some() {}
         let clock_off_ms = link.clock().error_bound_ns(host_now()).map(|ns| ns as f64 * 1e-6);
-        let mut heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut heard = lock(heard);
         heard.is_connected = link.is_connected();
         if clock_off_ms.is_some() && !is_timed {
             is_timed = true;

@@ -4,8 +4,9 @@
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
+use vizflyt_process::lock;
 
 use anyhow::{Context, Result, bail};
 use glam::{DQuat, DVec3};
@@ -375,11 +376,6 @@ fn draw(
             mailbox.put(CameraImage { camera: index, stamp, image });
         }
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // What a panicked thread left is whole: each change is a single step.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Recorded images closer than this were exposed together.

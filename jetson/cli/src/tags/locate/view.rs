@@ -2,8 +2,9 @@
 //! from where the pose puts them. It reads only; bind it to 127.0.0.1 unless the network is trusted.
 
 use std::net::SocketAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
+use vizflyt_process::lock;
 
 use anyhow::{Context, Result};
 use axum::Router;
@@ -12,8 +13,8 @@ use axum::http::{StatusCode, header};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use glam::DVec2;
-use jpeg_encoder::{ColorType, Encoder};
 use serde_json::{Value, json};
+use vizflyt_rgbd::encode_jpeg;
 use vizflyt_tags::camera::TagCamera;
 use vizflyt_tags::image::Gray;
 use vizflyt_tags::locate::{CameraResult, LocateOutcome};
@@ -80,7 +81,7 @@ impl LiveView {
 
     /// Shows a set of images and what came of it.
     pub(super) fn show(&self, shots: &[CameraImage], outcome: &LocateOutcome, image_ms: f64) {
-        let mut shown = self.shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut shown = lock(&self.shared);
         if shown.asked.is_none_or(|asked| asked.elapsed() > FORGET_AFTER) {
             return;
         }
@@ -131,7 +132,7 @@ fn look_json(look: &CameraResult) -> Value {
 type Shared = State<Arc<Mutex<Shown>>>;
 
 async fn state(State(shared): Shared) -> Response {
-    let mut shown = shared.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut shown = lock(&shared);
     shown.asked = Some(Instant::now());
     let cameras: Vec<Value> = shown
         .cameras
@@ -144,7 +145,7 @@ async fn state(State(shared): Shared) -> Response {
 
 async fn camera(State(shared): Shared, Path(index): Path<usize>) -> Response {
     let image = {
-        let mut shown = shared.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut shown = lock(&shared);
         shown.asked = Some(Instant::now());
         match shown.cameras.get(index) {
             None => return (StatusCode::NOT_FOUND, "no such camera").into_response(),
@@ -161,12 +162,9 @@ async fn camera(State(shared): Shared, Path(index): Path<usize>) -> Response {
 }
 
 fn jpeg(image: &Gray) -> Option<Vec<u8>> {
-    let (width, height) =
-        (u16::try_from(image.width_px()).ok()?, u16::try_from(image.height_px()).ok()?);
+    let rgb: Vec<u8> = image.pixels().iter().flat_map(|&grey| [grey; 3]).collect();
     let mut bytes = Vec::new();
-    Encoder::new(&mut bytes, QUALITY)
-        .encode(image.pixels(), width, height, ColorType::Luma)
-        .ok()?;
+    encode_jpeg(&rgb, image.width_px(), image.height_px(), QUALITY, &mut bytes).ok()?;
     Some(bytes)
 }
 

@@ -23,8 +23,8 @@ fn field(points_m: &[DVec2]) -> Field {
     field
 }
 
-fn moving(v_mps: DVec2) -> Motion {
-    Motion { p_m: DVec2::ZERO, v_mps, setpoint_mps: v_mps, heading_rad: 0.0, late_s: 0.0 }
+fn moving(v_mps: DVec2) -> PlanarState {
+    PlanarState { p_m: DVec2::ZERO, v_mps, setpoint_mps: v_mps, heading_rad: 0.0, late_s: 0.0 }
 }
 
 #[test]
@@ -64,7 +64,7 @@ fn stops_before_a_wall() {
 
 #[test]
 fn flies_slowly_into_unseen_space() {
-    let looking_back = Motion { heading_rad: PI, ..moving(DVec2::ZERO) };
+    let looking_back = PlanarState { heading_rad: PI, ..moving(DVec2::ZERO) };
     let v_mps = choose_velocity(&field(&[]), &looking_back, SPEED_MPS);
     assert!(v_mps.x > 0.5 && v_mps.length() <= UNSEEN_MPS + 1e-9, "{v_mps}");
 }

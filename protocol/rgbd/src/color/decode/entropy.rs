@@ -14,7 +14,7 @@ const END_OF_BLOCK: u32 = 64;
 
 /// What a code is of.
 #[derive(Clone, Copy)]
-pub(super) enum Kind {
+pub(super) enum CodeKind {
     Dc,
     Ac,
 }
@@ -73,7 +73,11 @@ impl Default for Prefixes {
 
 impl Prefixes {
     /// Makes the codes (C.2) of these symbols from how many have each length.
-    pub(super) fn new(kind: Kind, counts: &[u8; 16], symbols: &[u8]) -> Result<Self, &'static str> {
+    pub(super) fn new(
+        kind: CodeKind,
+        counts: &[u8; 16],
+        symbols: &[u8],
+    ) -> Result<Self, &'static str> {
         let mut prefixes = Self::default();
         let mut symbols = symbols.iter();
         let mut code = 0u32;
@@ -83,9 +87,9 @@ impl Prefixes {
             for &symbol in symbols.by_ref().take(usize::from(count)) {
                 let (run, size) = (u32::from(symbol >> 4), u32::from(symbol & 15));
                 let advance = match (kind, run, size) {
-                    (Kind::Ac, 0, 0) => END_OF_BLOCK,
-                    (Kind::Ac, 15, 0) | (Kind::Ac, _, 1..=10) => run + 1,
-                    (Kind::Dc, 0, 0..=11) => 0,
+                    (CodeKind::Ac, 0, 0) => END_OF_BLOCK,
+                    (CodeKind::Ac, 15, 0) | (CodeKind::Ac, _, 1..=10) => run + 1,
+                    (CodeKind::Dc, 0, 0..=11) => 0,
                     _ => return Err("a Huffman table has a symbol that baseline has not"),
                 };
                 let entry = Entry::new(len, size, advance);

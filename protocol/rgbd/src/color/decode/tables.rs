@@ -1,6 +1,6 @@
 //! The tables before a scan (ITU-T T.81, annex B), read once an image.
 
-use super::entropy::{Kind, Prefixes};
+use super::entropy::{CodeKind, Prefixes};
 use super::transform::Basis;
 
 /// What decoding a scan takes.
@@ -70,13 +70,14 @@ impl Tables {
                 0xda if rest.is_empty() => {
                     let (width, halving, parts) = frame.ok_or("a scan comes before its frame")?;
                     let scan = read_scan(body, parts.map(|part| part.id))?;
-                    let prefixes = |kind: Kind, number: usize| match codes[kind as usize][number] {
-                        Some((counts, symbols)) => Prefixes::new(kind, counts, symbols),
-                        None if scan.iter().any(|part| part[kind as usize] == number) => {
-                            Err("a Huffman table is missing")
-                        }
-                        None => Ok(Prefixes::default()),
-                    };
+                    let prefixes =
+                        |kind: CodeKind, number: usize| match codes[kind as usize][number] {
+                            Some((counts, symbols)) => Prefixes::new(kind, counts, symbols),
+                            None if scan.iter().any(|part| part[kind as usize] == number) => {
+                                Err("a Huffman table is missing")
+                            }
+                            None => Ok(Prefixes::default()),
+                        };
                     let mut bases = parts.map(|part| steps[part.steps].map(Basis::new)).into_iter();
                     let mut components = Vec::with_capacity(3);
                     for [dc, ac] in scan {
@@ -88,8 +89,8 @@ impl Tables {
                         width,
                         halving,
                         components: components.try_into().map_err(|_| CUT)?,
-                        dc: [prefixes(Kind::Dc, 0)?, prefixes(Kind::Dc, 1)?],
-                        ac: [prefixes(Kind::Ac, 0)?, prefixes(Kind::Ac, 1)?],
+                        dc: [prefixes(CodeKind::Dc, 0)?, prefixes(CodeKind::Dc, 1)?],
+                        ac: [prefixes(CodeKind::Ac, 0)?, prefixes(CodeKind::Ac, 1)?],
                     });
                 }
                 0xda => return Err("bytes follow its tables"),

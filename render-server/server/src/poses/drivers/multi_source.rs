@@ -10,7 +10,7 @@ use anyhow::{Context, Result};
 use vizflyt_arena::config::MAX_VEHICLES;
 
 use super::source::{Measurement, PoseSource, SourceCounters};
-use crate::lock::lock;
+use vizflyt_process::lock;
 
 /// What came together from one source.
 type Batch = heapless::Vec<Measurement, MAX_VEHICLES>;

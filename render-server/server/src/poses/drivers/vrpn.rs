@@ -45,7 +45,7 @@ pub struct Message<'a> {
 
 /// A report of a tracker.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Report {
+pub struct TrackerReport {
     /// Which of the tracker's sensors.
     pub sensor: i32,
     /// Where it is, in the stream's unit.
@@ -140,7 +140,7 @@ fn parse_name(body: &[u8]) -> Result<&[u8], VrpnError> {
 }
 
 /// Returns what the body of a tracker's report says.
-fn parse_report(body: &[u8]) -> Result<Report, VrpnError> {
+fn parse_report(body: &[u8]) -> Result<TrackerReport, VrpnError> {
     let Some((body, _)) = body.split_first_chunk::<REPORT>() else {
         return Err(VrpnError::Report(body.len()));
     };
@@ -156,13 +156,13 @@ fn parse_report(body: &[u8]) -> Result<Report, VrpnError> {
         return Err(VrpnError::NotAPose);
     }
     if rotation == DQuat::from_array([0.0; 4]) {
-        return Ok(Report { sensor, p_stream, rotation: None });
+        return Ok(TrackerReport { sensor, p_stream, rotation: None });
     }
     // Some trackers measure in single precision.
     if !((rotation.length() - 1.0).abs() <= 0.01) {
         return Err(VrpnError::NotAPose);
     }
-    Ok(Report { sensor, p_stream, rotation: Some(rotation.normalize()) })
+    Ok(TrackerReport { sensor, p_stream, rotation: Some(rotation.normalize()) })
 }
 
 /// Selects our vehicles from what a server sends, keeps the counters, and notices what is wrong.
@@ -317,7 +317,7 @@ impl VrpnStream {
         Ok(())
     }
 
-    fn handle_report(&mut self, message: &Message<'_>, report: &Report) {
+    fn handle_report(&mut self, message: &Message<'_>, report: &TrackerReport) {
         let now = self.came;
         let Some(sender) = self.session.senders.get_mut(&message.sender) else { return };
         sender.sensor = Some(report.sensor);

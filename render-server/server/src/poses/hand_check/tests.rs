@@ -59,7 +59,7 @@ fn diagnosis(stream: &LocalizationConfig, set: &LocalizationConfig, yaw_rad: f64
         };
         check.handle_pose(at_s, &set.alignment().world_from_body(p_stream, rotation));
     }
-    assert_eq!(check.step(), Step::Done, "{stream:?} as {set:?}: {:?}", check.rests);
+    assert_eq!(check.step(), HandCheckStep::Done, "{stream:?} as {set:?}: {:?}", check.rests);
     check.diagnosis()
 }
 
@@ -139,7 +139,7 @@ fn a_vehicle_that_moves_on_is_not_at_rest() {
         let shake = DVec3::splat(f64::from(tick * 7 % 11) * 1e-4);
         check.handle_pose(f64::from(tick) * 0.005, &Pose::new(shake, DQuat::IDENTITY));
     }
-    assert_eq!(check.step(), Step::Lift);
+    assert_eq!(check.step(), HandCheckStep::Lift);
 }
 
 proptest! {

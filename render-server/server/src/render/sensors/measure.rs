@@ -11,7 +11,7 @@ use vizflyt_protocol::sensor::{
 };
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::Placement;
-use vizflyt_splat::sensor::{self as models, Motion, SensorScene};
+use vizflyt_splat::sensor::{self as models, SensorMotion, SensorScene};
 use zerocopy::IntoBytes;
 
 use super::model::SensorModel;
@@ -121,7 +121,7 @@ impl VehicleSensors {
         let [before, after] = &self.placements;
         self.objects.clear();
         self.objects.extend(before.iter().zip(after).map(|(a, b)| [*a, *b]));
-        let motion = Motion { world_from_sensor, objects: &self.objects, duration_s };
+        let motion = SensorMotion { world_from_sensor, objects: &self.objects, duration_s };
         let (seq, seed) = (self.seq[index] + 1, self.seed.wrapping_add(index as u64));
         let head = (index as u8, kind, last, around.pose);
         let header = |count| {

@@ -16,7 +16,7 @@
 //! Lengths are in the unit that the scene has when it is the step's turn.
 
 use serde::{Deserialize, Serialize};
-use vizflyt_splat::edit::{InvalidStep, Step};
+use vizflyt_splat::edit::{EditStep, InvalidStep};
 use vizflyt_toml::TomlErrors;
 
 /// What is in the file.
@@ -49,7 +49,7 @@ pub struct DoneStep {
     /// How many splats it took away.
     pub taken: usize,
     /// The step.
-    pub edit: Step,
+    pub edit: EditStep,
 }
 
 /// Why a text is no list.

@@ -17,7 +17,7 @@ pub use list::{DoneStep, EditList, EditListError};
 use ring::digest::{Context as Hash, SHA256};
 use tracing::warn;
 use vizflyt_splat::Splats;
-use vizflyt_splat::edit::Step;
+use vizflyt_splat::edit::EditStep;
 use vizflyt_splat::format::{self, Format};
 
 /// A scene with its steps applied.
@@ -97,7 +97,7 @@ impl Editor {
     ///
     /// # Errors
     /// Why not; then nothing has changed.
-    pub fn apply(&mut self, step: Step) -> Result<usize> {
+    pub fn apply(&mut self, step: EditStep) -> Result<usize> {
         ensure!(
             self.list.steps.len() < EditList::MAX_STEPS,
             "{} steps are the most; save the scene under another name and go on with that",
@@ -112,7 +112,7 @@ impl Editor {
     ///
     /// # Errors
     /// There is none; the original cannot be read any more.
-    pub fn undo(&mut self) -> Result<Step> {
+    pub fn undo(&mut self) -> Result<EditStep> {
         let last = self.list.steps.len().checked_sub(1).context("there is nothing to undo")?;
         let (mut splats, sha256) = read_with_hash(&self.original)?;
         ensure!(

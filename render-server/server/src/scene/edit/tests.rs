@@ -33,9 +33,9 @@ fn edits_are_applied_listed_and_taken_back() {
     assert_eq!(result, folder.path().join("row.edited.ply"));
 
     let mut editor = Editor::open(&scene).unwrap();
-    assert_eq!(editor.apply(Step::Crop { within: box_to(49.5) }).unwrap(), 50);
-    assert!(editor.apply(Step::Crop { within: box_to(-0.5) }).is_err());
-    assert_eq!(editor.apply(Step::Remove { within: box_to(9.5) }).unwrap(), 10);
+    assert_eq!(editor.apply(EditStep::Crop { within: box_to(49.5) }).unwrap(), 50);
+    assert!(editor.apply(EditStep::Crop { within: box_to(-0.5) }).is_err());
+    assert_eq!(editor.apply(EditStep::Remove { within: box_to(9.5) }).unwrap(), 10);
     editor.save(&result).unwrap();
     let edited = std::fs::read(&result).unwrap();
     assert_eq!(format::read(&result).unwrap().splats.len(), 40);
@@ -50,7 +50,7 @@ fn edits_are_applied_listed_and_taken_back() {
 
     let mut back = Editor::open_without_last(&scene, 1).unwrap();
     assert_eq!((back.splats().len(), back.steps().len()), (50, 1));
-    assert_eq!(back.undo().unwrap(), Step::Crop { within: box_to(49.5) });
+    assert_eq!(back.undo().unwrap(), EditStep::Crop { within: box_to(49.5) });
     assert_eq!(back.splats().len(), 100);
     assert!(back.undo().unwrap_err().to_string().contains("nothing to undo"));
     back.save(&result).unwrap();
@@ -71,7 +71,7 @@ fn a_list_is_of_one_file() {
     };
     ply::write(at("row.ply"), &row(9)).unwrap();
     let mut editor = Editor::open(&at("row.ply")).unwrap();
-    editor.apply(Step::Decimate { count: 5 }).unwrap();
+    editor.apply(EditStep::Decimate { count: 5 }).unwrap();
     editor.save(&at("out.splat")).unwrap();
     ply::write(at("row.ply"), &row(10)).unwrap();
     check(&at("row.ply"), "put the original back");
@@ -115,7 +115,7 @@ fn what_is_wrong_in_a_list_is_said() {
     assert!(matches!(error, EditListError::Hash(_)), "{error}");
 }
 
-fn step() -> impl Strategy<Value = Step> {
+fn step() -> impl Strategy<Value = EditStep> {
     let length = || 1e-3..1e3f64;
     let point = || prop::array::uniform3(-1e3..1e3f64);
     let outline = || prop::collection::vec(prop::array::uniform2(-9.0..9.0f64), 3..9);
@@ -131,15 +131,15 @@ fn step() -> impl Strategy<Value = Step> {
         }),
     ];
     prop_oneof![
-        prop::collection::vec(region, 1..4).prop_map(|within| Step::Crop { within }),
-        (0.0..1.0f64).prop_map(|below| Step::Faint { below }),
-        (length(), 1..99u32).prop_map(|(cell, least)| Step::Floaters { cell, least }),
+        prop::collection::vec(region, 1..4).prop_map(|within| EditStep::Crop { within }),
+        (0.0..1.0f64).prop_map(|below| EditStep::Faint { below }),
+        (length(), 1..99u32).prop_map(|(cell, least)| EditStep::Floaters { cell, least }),
         (prop::collection::vec(point(), 1..4), length()).prop_map(|(path, radius)| {
-            Step::Carve(Carve { path, radius, depth: 0.1, cell: 0.1, reach: 9.0 })
+            EditStep::Carve(Carve { path, radius, depth: 0.1, cell: 0.1, reach: 9.0 })
         }),
-        (1..u32::MAX).prop_map(|count| Step::Decimate { count }),
-        point().prop_map(|by| Step::Move { by }),
-        Just(Step::Turn { rotation: [0.5; 4] }),
+        (1..u32::MAX).prop_map(|count| EditStep::Decimate { count }),
+        point().prop_map(|by| EditStep::Move { by }),
+        Just(EditStep::Turn { rotation: [0.5; 4] }),
     ]
 }
 

@@ -24,12 +24,12 @@ use zerocopy::IntoBytes;
 
 use super::{END, VarInt};
 use crate::clock;
-use crate::lock::lock;
 use crate::stream::Rooms;
 use crate::stream::rate_control::{DECIDE_EVERY, RateController, SentImage};
 use crate::stream::subscriptions::{InFlightImage, MAX_IN_FLIGHT, Part, Slots};
 use crate::stream::vehicle::VehicleStream;
 use crate::timing::RateMeter;
+use vizflyt_process::lock;
 
 /// The senders of images to one session; ends its subscription when dropped.
 pub(super) struct ImageSenders {

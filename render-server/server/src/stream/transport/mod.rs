@@ -44,10 +44,10 @@ use vizflyt_trust::{ALPN, ALPN_PAIR, Identity, tls};
 
 use crate::admission::{Admission, Limits, PlaceId};
 use crate::authorization::Authorizer;
-use crate::lock::lock;
 use crate::rate_limit::RateLimiter;
 use crate::stream::Rooms;
 use crate::stream::rate_control::is_near;
+use vizflyt_process::lock;
 
 /// Who decides how fast to send.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]

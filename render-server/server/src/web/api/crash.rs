@@ -32,7 +32,7 @@ pub(in crate::web) async fn show(
 /// Which picture of a moment.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(in crate::web) enum Kind {
+pub(in crate::web) enum CrashPicture {
     Colour,
     Depth,
 }
@@ -40,7 +40,7 @@ pub(in crate::web) enum Kind {
 /// `GET /api/vehicles/V/crash/ID/CAMERA/KIND/N`: an image of a card, as long as it is the newest.
 pub(in crate::web) async fn image(
     State(page): State<Arc<Page>>,
-    Path((name, id, camera, kind, number)): Path<(String, u64, usize, Kind, usize)>,
+    Path((name, id, camera, kind, number)): Path<(String, u64, usize, CrashPicture, usize)>,
 ) -> Response {
     let vehicle = match vehicle(&page, &name) {
         Ok(vehicle) => vehicle,
@@ -50,8 +50,8 @@ pub(in crate::web) async fn image(
     let card = card.filter(|card| card.id == id);
     let preview = card.as_ref().and_then(|card| card.image(camera, number));
     match preview.map(|preview| (preview, kind)) {
-        Some((preview, Kind::Colour)) => jpeg(&preview.colour),
-        Some((preview, Kind::Depth)) => jpeg(&preview.depth),
+        Some((preview, CrashPicture::Colour)) => jpeg(&preview.colour),
+        Some((preview, CrashPicture::Depth)) => jpeg(&preview.depth),
         None => {
             (StatusCode::NOT_FOUND, "there is no such image, or another flight has failed since")
                 .into_response()

@@ -16,7 +16,6 @@ use super::lab_view::LabView;
 pub(in crate::web) use super::lab_view::examples;
 use crate::flights::lab_day::{CheckId, FenceParameter, Finding, How, TakeOffOrder};
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::web::access::Viewer;
 use crate::web::http::{ordered, refuse};
 use crate::web::lab::guided::Guided;
@@ -24,6 +23,7 @@ use crate::web::lab::keep::unix_ms;
 use crate::web::lab::report;
 use crate::web::origin;
 use crate::web::state::Page;
+use vizflyt_process::lock;
 
 /// `GET /api/lab`: the day, as far as the viewer may see it.
 pub(in crate::web) async fn show(

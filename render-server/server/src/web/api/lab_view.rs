@@ -9,10 +9,10 @@ use crate::flights::lab_day::{
     Told,
 };
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::web::access::Viewer;
 use crate::web::lab::{airborne, keep};
 use crate::web::state::Page;
+use vizflyt_process::lock;
 
 /// What the page shows.
 #[derive(Debug, Serialize)]

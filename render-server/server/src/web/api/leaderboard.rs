@@ -17,11 +17,11 @@ use crate::flights::leaderboard::{
     Attempt, GradeBoard, LeaderboardError, Run, Standing, grade_boards, standings,
 };
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::web::access::{Shown, Viewer};
 use crate::web::http::refuse;
 use crate::web::origin;
 use crate::web::state::{Page, vehicle};
+use vizflyt_process::lock;
 
 /// What the page and the wall show.
 #[derive(Debug, Serialize)]

@@ -15,13 +15,13 @@ use serde::{Deserialize, Serialize};
 use tracing::warn;
 use vizflyt_trust::KeyError;
 
-use crate::lock::lock;
 use crate::web::access::{self, KEY, NO_KEY, Shown, TEAM_KEY, Viewer, cookie_line};
 use crate::web::http::refuse;
 use crate::web::origin;
 use crate::web::password::{FILE, MAX_BYTES, read};
 use crate::web::percent::encoded;
 use crate::web::state::Page;
+use vizflyt_process::lock;
 
 /// Query of `/enter`.
 #[derive(Debug, Deserialize)]

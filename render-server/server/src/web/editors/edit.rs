@@ -23,16 +23,16 @@ use axum::routing::{get, post};
 use axum::{Json, Router};
 use glam::DVec2;
 use serde::{Deserialize, Serialize};
-use vizflyt_splat::edit::{Region, Step, select};
+use vizflyt_splat::edit::{EditStep, Region, select};
 use vizflyt_splat::harmonics::C0;
 use vizflyt_splat::{Chosen, Rasterizer, RigidObject, Splats};
 
 use super::args::ViewArgs;
 use super::engine::{Engine, Request};
-use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{BoxedPart, Editor, PartsFile, Placement, parts_path};
 use crate::web::http::{file, ordered_here};
+use vizflyt_process::lock;
 
 /// The panel's part of the view's state.
 pub(super) struct Panel {
@@ -96,7 +96,7 @@ pub(super) struct Outline {
 
 /// What the page shows.
 #[derive(Debug, Serialize)]
-struct Report {
+struct EditState {
     splats: usize,
     selected: usize,
     /// In words, in order.
@@ -130,7 +130,7 @@ impl Session {
             Order::Report => Ok((String::new(), false)),
             Order::Select(outline) => {
                 let region = self.region(&outline);
-                let whole = Step::Remove { within: vec![region.clone()] };
+                let whole = EditStep::Remove { within: vec![region.clone()] };
                 whole.check()?;
                 if !outline.adds || self.is_inverted {
                     self.regions.clear();
@@ -152,8 +152,11 @@ impl Session {
             Order::Delete => {
                 ensure!(!self.regions.is_empty(), "nothing is selected");
                 let within = self.regions.clone();
-                let step =
-                    if self.is_inverted { Step::Crop { within } } else { Step::Remove { within } };
+                let step = if self.is_inverted {
+                    EditStep::Crop { within }
+                } else {
+                    EditStep::Remove { within }
+                };
                 let taken = self.editor.apply(step)?;
                 self.clear();
                 self.is_saved = false;
@@ -235,8 +238,8 @@ impl Session {
         Ok(rasterizer)
     }
 
-    fn report(&self, selected: &[bool], said: String) -> Report {
-        Report {
+    fn report(&self, selected: &[bool], said: String) -> EditState {
+        EditState {
             splats: self.editor.splats().len(),
             selected: selected.iter().filter(|mark| **mark).count(),
             steps: self.editor.steps().iter().map(|done| done.edit.to_string()).collect(),
@@ -294,7 +297,7 @@ async fn edit(
     }
 }
 
-fn obey(panel: &Panel, order: Order) -> Result<Report> {
+fn obey(panel: &Panel, order: Order) -> Result<EditState> {
     let mut session = lock(&panel.session);
     let (said, is_changed) = session.obey(order)?;
     let selected = session.selected();

@@ -41,12 +41,12 @@ use self::course::CourseFile;
 use self::edit::Session;
 use self::engine::{Engine, Picture, Request};
 pub use self::place::Place;
-use crate::lock::lock;
 use crate::render::{RendererInfo, choose};
 use crate::scene::{self, Editor, Placement, Scene};
 use crate::stop::Stop;
 use crate::web::http::{ICON, file, refuse};
 use crate::web::{https, listener, origin};
+use vizflyt_process::lock;
 
 /// Serves the page until SIGINT or SIGTERM; `open` is called with its address once it answers.
 ///

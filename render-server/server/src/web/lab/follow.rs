@@ -18,8 +18,8 @@ use crate::flights::lab_day::pose_window::PoseWindow;
 use crate::flights::lab_day::stop_trial::{Seen, StopTrial};
 use crate::flights::lab_day::{CheckId, Finding};
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::stream::Rooms;
+use vizflyt_process::lock;
 
 /// Follows all vehicles until the server ends.
 pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {

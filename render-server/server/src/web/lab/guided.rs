@@ -3,7 +3,7 @@
 use vizflyt_protocol::messages::PoseSample;
 
 use crate::flights::lab_day::Finding;
-use crate::poses::hand_check::{Check, Diagnosis, Step};
+use crate::poses::hand_check::{Check, Diagnosis, HandCheckStep};
 use crate::poses::settings::LocalizationConfig;
 
 /// A check under way.
@@ -36,7 +36,7 @@ impl Guided {
         }
         self.newest_s = at_s;
         self.check.handle_pose(at_s, &pose.world_from_body);
-        (self.check.step() == Step::Done).then(|| finding(self.check.diagnosis()))
+        (self.check.step() == HandCheckStep::Done).then(|| finding(self.check.diagnosis()))
     }
 }
 

@@ -15,8 +15,8 @@ use super::guided::Guided;
 use crate::flights::Flights;
 use crate::flights::lab_day::{CheckId, Finding, LabDay, Stand};
 use crate::flights::vehicle::VehicleFlight;
-use crate::lock::lock;
 use crate::poses::settings::LocalizationConfig;
+use vizflyt_process::lock;
 
 /// The lab day of a server.
 #[derive(Debug)]

@@ -23,14 +23,14 @@ pub(in crate::web) fn pdf(
 /// A line of the report.
 #[derive(Clone, Debug, PartialEq)]
 struct Line {
-    kind: Kind,
+    kind: LineKind,
     /// Texts, and where each begins. [points from the left margin]
     cells: Vec<(f32, String)>,
     state: Option<State>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum LineKind {
     Title,
     Heading,
     /// A check or a booking: what follows it in small belongs to it.
@@ -38,7 +38,7 @@ enum Kind {
     Small,
 }
 
-impl Kind {
+impl LineKind {
     /// Returns size and distance to the line above. [points]
     fn size(self) -> (f32, f32) {
         match self {
@@ -50,7 +50,7 @@ impl Kind {
     }
 }
 
-fn line(kind: Kind, text: impl Into<String>) -> Line {
+fn line(kind: LineKind, text: impl Into<String>) -> Line {
     Line { kind, cells: vec![(0.0, text.into())], state: None }
 }
 
@@ -62,10 +62,10 @@ fn lay_out(
     vehicles: &[&str],
     now_unix_ms: u64,
 ) -> Vec<Line> {
-    let mut lines = vec![line(Kind::Title, title), line(Kind::Row, foot)];
+    let mut lines = vec![line(LineKind::Title, title), line(LineKind::Row, foot)];
     let group = |lines: &mut Vec<Line>, name: &str, of_room: bool| {
         lines.push(line(
-            Kind::Heading,
+            LineKind::Heading,
             if of_room { "The room".to_owned() } else { format!("Vehicle {name}") },
         ));
         for info in CHECKS.iter().filter(|info| info.of_room == of_room) {
@@ -76,7 +76,7 @@ fn lay_out(
     for name in vehicles {
         group(&mut lines, name, false);
     }
-    lines.push(line(Kind::Heading, "Several vehicles"));
+    lines.push(line(LineKind::Heading, "Several vehicles"));
     let order = if day.order.vehicles.is_empty() {
         "none".to_owned()
     } else {
@@ -85,25 +85,25 @@ fn lay_out(
     let separation =
         day.separation_m.map_or("not watched".to_owned(), |m| format!("{m} m between centres"));
     small(&mut lines, 0.0, &format!("Order of take-off: {order}. Least separation: {separation}."));
-    lines.push(line(Kind::Heading, "Queue"));
+    lines.push(line(LineKind::Heading, "Queue"));
     for booking in day.queue.bookings() {
         booked(&mut lines, booking);
     }
     if day.queue.bookings().is_empty() {
         small(&mut lines, 0.0, "Nobody has booked.");
     }
-    lines.push(line(Kind::Heading, "What happened"));
+    lines.push(line(LineKind::Heading, "What happened"));
     if day.story().next().is_none() {
         small(&mut lines, 0.0, "Nothing yet.");
     }
     for told in day.story() {
-        let wrapped = wrap(&told.text, Kind::Small.size().0, WIDTH - STORY_AT);
+        let wrapped = wrap(&told.text, LineKind::Small.size().0, WIDTH - STORY_AT);
         for (at, text) in wrapped.into_iter().enumerate() {
             let mut cells = vec![(STORY_AT, text)];
             if at == 0 {
                 cells.insert(0, (0.0, time(told.at_unix_ms)));
             }
-            lines.push(Line { kind: Kind::Small, cells, state: None });
+            lines.push(Line { kind: LineKind::Small, cells, state: None });
         }
     }
     lines
@@ -120,7 +120,7 @@ fn check(lines: &mut Vec<Line>, day: &LabDay, vehicle: &str, info: &CheckInfo, n
         None => state.words(),
     };
     let cells = vec![(0.0, words.to_owned()), (NAME_AT, info.title.to_owned()), (TIME_AT, when)];
-    lines.push(Line { kind: Kind::Row, cells, state: Some(state) });
+    lines.push(Line { kind: LineKind::Row, cells, state: Some(state) });
     match record {
         Some(record) => {
             small(lines, NAME_AT, &format!("{} ({})", record.finding.evidence, record.by));
@@ -147,12 +147,12 @@ fn booked(lines: &mut Vec<Line>, booking: &Booking) {
         times => format!(", passed over {times} times"),
     };
     let name = format!("{} on {}", booking.team, booking.vehicle);
-    for (at, text) in wrap(&name, Kind::Row.size().0, WIDTH - NAME_AT).into_iter().enumerate() {
+    for (at, text) in wrap(&name, LineKind::Row.size().0, WIDTH - NAME_AT).into_iter().enumerate() {
         let mut cells = vec![(NAME_AT, text)];
         if at == 0 {
             cells.insert(0, (0.0, state.to_owned()));
         }
-        lines.push(Line { kind: Kind::Row, cells, state: None });
+        lines.push(Line { kind: LineKind::Row, cells, state: None });
     }
     let times = format!(
         "booked {}, called {}, ended {}{passed}",
@@ -165,9 +165,9 @@ fn booked(lines: &mut Vec<Line>, booking: &Booking) {
 
 /// Adds small text, wrapped.
 fn small(lines: &mut Vec<Line>, at: f32, text: &str) {
-    let wrapped = wrap(text, Kind::Small.size().0, WIDTH - at);
+    let wrapped = wrap(text, LineKind::Small.size().0, WIDTH - at);
     lines.extend(wrapped.into_iter().map(|text| Line {
-        kind: Kind::Small,
+        kind: LineKind::Small,
         cells: vec![(at, text)],
         state: None,
     }));
@@ -181,12 +181,12 @@ fn paginate(lines: Vec<Line>) -> Vec<Vec<Line>> {
     while let Some(first) = lines.next() {
         // What may not be torn apart.
         let mut block = vec![first];
-        let is_story = |line: &Line| line.kind == Kind::Small && line.cells.len() > 1;
+        let is_story = |line: &Line| line.kind == LineKind::Small && line.cells.len() > 1;
         while let Some(next) = lines.peek() {
             let last = block[block.len() - 1].kind;
             let follows = match (last, next.kind) {
-                (Kind::Heading, _) => true,
-                (Kind::Row | Kind::Small, Kind::Small) => !is_story(next),
+                (LineKind::Heading, _) => true,
+                (LineKind::Row | LineKind::Small, LineKind::Small) => !is_story(next),
                 _ => false,
             };
             if !follows || block.len() >= BLOCK {
@@ -248,7 +248,8 @@ fn draw_page(lines: &[Line], foot: &str) -> Vec<u8> {
     for line in lines {
         let (size, down) = line.kind.size();
         y -= down;
-        let font = if matches!(line.kind, Kind::Title | Kind::Heading) { BOLD } else { PLAIN };
+        let font =
+            if matches!(line.kind, LineKind::Title | LineKind::Heading) { BOLD } else { PLAIN };
         for (at, (x, text)) in line.cells.iter().enumerate() {
             match line.state.filter(|_| at == 0) {
                 Some(state) => show(BOLD, size, [MARGIN + x, y], colour(state), text),
@@ -415,7 +416,7 @@ mod tests {
             let high: f32 = page.iter().map(|line| line.kind.size().1).sum();
             assert!(high <= HEIGHT && !page.is_empty(), "{high}");
             // A heading is not the last line of its page.
-            assert_ne!(page.last().map(|line| line.kind), Some(Kind::Heading));
+            assert_ne!(page.last().map(|line| line.kind), Some(LineKind::Heading));
             for line in page {
                 for (at, text) in &line.cells {
                     let end = at + wide(text, line.kind.size().0);

@@ -26,8 +26,8 @@ use vizflyt_splat::Camera;
 use self::engine::Engine;
 pub(super) use self::request::PictureRequest;
 use super::twin::TwinParts;
-use crate::lock::lock;
 use crate::priority::give_way;
+use vizflyt_process::lock;
 
 /// A JPEG, or why there is none.
 pub(super) type Drawn = Result<Vec<u8>, String>;

@@ -11,7 +11,7 @@
 use glam::Vec3;
 
 use super::PlyError;
-use super::header::{Element, Format, Header, Kind, Scalar, VERTEX};
+use super::header::{Element, Format, Header, PropertyKind, Scalar, VERTEX};
 use super::rows::fixed_length;
 use crate::Splats;
 use crate::format::DropCounts;
@@ -188,7 +188,7 @@ impl Table<'_> {
     fn column(&self, name: &str, expected: Scalar) -> Result<usize, PlyError> {
         let mut at = 0;
         for property in &self.element.properties {
-            let Kind::Scalar(scalar) = property.kind else { continue };
+            let PropertyKind::Scalar(scalar) = property.kind else { continue };
             if property.name == name {
                 if scalar != expected {
                     return Err(fail(format!("`{name}` of a compressed PLY is {scalar:?}")));

@@ -81,7 +81,7 @@ impl Scalar {
 
 /// One number, or a counted list of them, per row.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum PropertyKind {
     Scalar(Scalar),
     List { count: Scalar, item: Scalar },
 }
@@ -90,7 +90,7 @@ pub(super) enum Kind {
 #[derive(Clone, Debug)]
 pub(super) struct Property {
     pub(super) name: String,
-    pub(super) kind: Kind,
+    pub(super) kind: PropertyKind,
 }
 
 /// A named table.
@@ -107,8 +107,8 @@ impl Element {
         self.properties
             .iter()
             .map(|property| match property.kind {
-                Kind::Scalar(scalar) => Some(scalar.bytes()),
-                Kind::List { .. } => None,
+                PropertyKind::Scalar(scalar) => Some(scalar.bytes()),
+                PropertyKind::List { .. } => None,
             })
             .sum()
     }
@@ -118,7 +118,9 @@ impl Element {
         self.properties
             .iter()
             .map(|property| match property.kind {
-                Kind::Scalar(scalar) | Kind::List { count: scalar, .. } => scalar.bytes(),
+                PropertyKind::Scalar(scalar) | PropertyKind::List { count: scalar, .. } => {
+                    scalar.bytes()
+                }
             })
             .sum()
     }
@@ -190,9 +192,9 @@ impl Header {
                             .ok_or_else(|| fail(format!("unknown property type `{name}`")))
                     };
                     let kind = match *kind {
-                        [single] => Kind::Scalar(scalar(single)?),
+                        [single] => PropertyKind::Scalar(scalar(single)?),
                         ["list", count, item] => {
-                            Kind::List { count: scalar(count)?, item: scalar(item)? }
+                            PropertyKind::List { count: scalar(count)?, item: scalar(item)? }
                         }
                         _ => return Err(fail(format!("cannot read `{line}`"))),
                     };

@@ -1,7 +1,7 @@
 //! Which properties of a vertex make a splat, and where they lie in its row.
 
 use super::PlyError;
-use super::header::{Element, Header, Kind, Scalar};
+use super::header::{Element, Header, PropertyKind, Scalar};
 
 /// Properties every splat has, in the order in which [`Layout::slots`] lists them.
 pub(super) const REQUIRED: [&str; 14] = [
@@ -81,8 +81,8 @@ impl Layout {
                     reason: format!("{rest} f_rest properties, but `{name}` is not among them"),
                 })?;
                 match vertex.properties[column].kind {
-                    Kind::Scalar(scalar) => Ok(Slot { column, scalar }),
-                    Kind::List { .. } => Err(PlyError::NotSplats {
+                    PropertyKind::Scalar(scalar) => Ok(Slot { column, scalar }),
+                    PropertyKind::List { .. } => Err(PlyError::NotSplats {
                         reason: format!("property `{name}` is a list, not one number"),
                     }),
                 }

@@ -4,7 +4,7 @@
 
 use glam::Vec3;
 
-use super::header::{Element, Header, Kind, Scalar, VERTEX};
+use super::header::{Element, Header, PropertyKind, Scalar, VERTEX};
 use super::layout::{Layout, slot};
 use super::{DropCounts, PlyError};
 use crate::Splats;
@@ -34,7 +34,7 @@ pub(super) fn read_binary(
         let mut start = 0;
         for property in &vertex.properties {
             starts.push(start);
-            if let Kind::Scalar(scalar) = property.kind {
+            if let PropertyKind::Scalar(scalar) = property.kind {
                 start += scalar.bytes();
             }
         }
@@ -109,7 +109,7 @@ pub(super) fn read_ascii(
             let row = first * SPLATS_PER_TASK + i;
             for (property, &slot) in vertex.properties.iter().zip(&slot_of_column) {
                 match property.kind {
-                    Kind::Scalar(_) if slot != usize::MAX => {
+                    PropertyKind::Scalar(_) if slot != usize::MAX => {
                         values[slot] = tokens.number(vertex, row, &property.name)? as f32;
                     }
                     kind => tokens.skip(vertex, row, kind)?,
@@ -175,8 +175,8 @@ fn variable_rows(
         for (column, property) in element.properties.iter().enumerate() {
             visit(column, offset);
             let (head, item) = match property.kind {
-                Kind::Scalar(scalar) => (scalar.bytes(), None),
-                Kind::List { count, item } => (count.bytes(), Some((count, item))),
+                PropertyKind::Scalar(scalar) => (scalar.bytes(), None),
+                PropertyKind::List { count, item } => (count.bytes(), Some((count, item))),
             };
             let available = bytes.len() - offset;
             if head > available {
@@ -251,10 +251,10 @@ impl Tokens<'_> {
     }
 
     /// Passes over one property.
-    fn skip(&mut self, element: &Element, row: usize, kind: Kind) -> Result<(), PlyError> {
+    fn skip(&mut self, element: &Element, row: usize, kind: PropertyKind) -> Result<(), PlyError> {
         let offset = self.offset;
         let first = self.number(element, row, "a skipped property")?;
-        if let Kind::List { .. } = kind {
+        if let PropertyKind::List { .. } = kind {
             if !(first >= 0.0 && first.fract() == 0.0) {
                 return Err(PlyError::Value {
                     offset,

@@ -63,7 +63,7 @@ fn beams_meet_what_the_plain_reference_meets() {
     }
     for set in InstructionSet::available().into_iter().filter(|set| set.lanes() == tree::WIDTH) {
         let scene = SensorScene::with_instructions(Scene::from(&splats), set);
-        let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+        let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
         let (mut compared, mut sum_off) = (0, 0.0);
         for n in 0..400 {
             let turn = DQuat::from_rotation_z(0.05 * f64::from(n))
@@ -121,7 +121,7 @@ fn beams_that_go_together_meet_what_each_meets_alone() {
     splats.opacities.extend(board.opacities);
     splats.sh.extend(board.sh);
     let scene = SensorScene::new(&splats);
-    let motion = Motion::standing(at(DVec3::ZERO, 0.0));
+    let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
     // Close ones, and eight that look all around.
     for step_rad in [0.006, std::f64::consts::FRAC_PI_4] {
         let beams: Vec<(f64, Beam)> = (0..8)

@@ -19,7 +19,7 @@ use vizflyt_process::print_fmt;
 use vizflyt_server::render::RendererKind;
 use vizflyt_twin::align::floor::{self, Floor};
 
-use self::report::Report;
+use self::report::PlacementReport;
 pub(super) use self::track::ClockArgs;
 use self::write::Changes;
 use crate::arena::file;
@@ -118,7 +118,7 @@ pub(crate) fn run(args: &AlignArgs) -> Result<ExitCode> {
             "give --tags or --track with --capture, or --floor with --above and --length; the page needs none of them"
         ),
     };
-    let Report { lines, is_known } = report::report(&fit, &arena.geofence, args.allow_m);
+    let PlacementReport { lines, is_known } = report::report(&fit, &arena.geofence, args.allow_m);
     for line in lines {
         print_fmt!("{:<11} {}", line.key, line.text);
     }

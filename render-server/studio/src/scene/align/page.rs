@@ -14,7 +14,7 @@ use vizflyt_server::web::{self, Aligner, Line, Picks, Place, Solved, Wish};
 use vizflyt_twin::align::floor::{self, Floor};
 use vizflyt_twin::align::{Fit, Similarity};
 
-use super::report::{Report, report};
+use super::report::{PlacementReport, report};
 use super::write::{self, Changes};
 use super::{AlignArgs, CROP, LENGTH_SHARE};
 use crate::page::show_page;
@@ -81,7 +81,7 @@ impl Aligner for Clicked {
     fn solve(&self, picks: &Picks) -> Result<Solved, String> {
         let (fit, has_scale) = self.fit(picks).map_err(in_words)?;
         let place = place(&fit.world_from_scene);
-        let Report { mut lines, is_known } = report(&fit, &picks.geofence, self.allow_m);
+        let PlacementReport { mut lines, is_known } = report(&fit, &picks.geofence, self.allow_m);
         if !has_scale {
             // Where the size is a guess, so is all that is said in metres.
             lines.clear();
@@ -97,7 +97,8 @@ impl Aligner for Clicked {
         if !has_scale {
             return Err("click both ends of a length that you have measured first".to_owned());
         }
-        let Report { mut lines, is_known } = report(&fit, &wish.picks.geofence, self.allow_m);
+        let PlacementReport { mut lines, is_known } =
+            report(&fit, &wish.picks.geofence, self.allow_m);
         if !(is_known || wish.force) {
             return Err(lines.pop().map_or_else(String::new, |last| last.text));
         }

@@ -5,13 +5,13 @@ use vizflyt_server::web::Line;
 use vizflyt_twin::align::{Fit, Similarity};
 
 /// What is said of a place, and whether it is known well enough.
-pub(super) struct Report {
+pub(super) struct PlacementReport {
     pub lines: Vec<Line>,
     pub is_known: bool,
 }
 
 /// Says how well a place is known, and whether that is enough for what lies within a fence.
-pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> Report {
+pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> PlacementReport {
     let bound_m = fit.bound_within_m(fence.min_m, fence.max_m);
     let is_known = bound_m <= allow_m;
     let Similarity { scale, rotation, translation_m: p_m } = fit.world_from_scene;
@@ -48,5 +48,5 @@ pub(super) fn report(fit: &Fit, fence: &Geofence, allow_m: f64) -> Report {
             ),
         )
     });
-    Report { lines, is_known }
+    PlacementReport { lines, is_known }
 }

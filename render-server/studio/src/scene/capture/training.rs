@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use jpeg_encoder::{ColorType, Encoder};
 use serde::{Deserialize, Serialize};
+use vizflyt_rgbd::encode_jpeg;
 use vizflyt_splat::format;
 use vizflyt_twin::dataset::colmap;
 use vizflyt_twin::train::Quality;
@@ -120,10 +120,9 @@ fn samples(dataset: &Dataset, trainer: &mut Trainer<'_>, folder: &Path) -> Resul
 }
 
 fn write(path: &Path, rgb: &[u8], size: [usize; 2]) -> Result<()> {
-    let [width, height] = size.map(|side| side as u16);
+    let [width, height] = size.map(|side| side as u32);
     let mut bytes = Vec::new();
-    Encoder::new(&mut bytes, JPEG_QUALITY)
-        .encode(rgb, width, height, ColorType::Rgb)
+    encode_jpeg(rgb, width, height, JPEG_QUALITY, &mut bytes)
         .with_context(|| format!("cannot encode {}", path.display()))?;
     std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }

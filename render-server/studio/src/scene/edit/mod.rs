@@ -15,7 +15,7 @@ use vizflyt_server::scene::{
     scene_file,
 };
 use vizflyt_server::{ViewArgs, web};
-use vizflyt_splat::edit::Step;
+use vizflyt_splat::edit::EditStep;
 
 use self::request::{CarveSettings, Requests};
 use crate::page::show_page;
@@ -162,10 +162,10 @@ fn print_list(original: &Path) -> Result<()> {
 
 fn page(args: &EditArgs, editor: Editor, output: PathBuf) -> Result<()> {
     // What has been turned here is upright now; what has been scaled is in metres.
-    let has = |kind: fn(&Step) -> bool| editor.steps().iter().any(|done| kind(&done.edit));
+    let has = |kind: fn(&EditStep) -> bool| editor.steps().iter().any(|done| kind(&done.edit));
     let bare = BareArgs {
-        up: has(|step| matches!(step, Step::Turn { .. })).then_some(Up::Z),
-        scale: has(|step| matches!(step, Step::Scale { .. })).then_some(1.0),
+        up: has(|step| matches!(step, EditStep::Turn { .. })).then_some(Up::Z),
+        scale: has(|step| matches!(step, EditStep::Scale { .. })).then_some(1.0),
     };
     let view = ViewArgs {
         scene: args.scene.clone(),

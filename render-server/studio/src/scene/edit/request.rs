@@ -7,13 +7,13 @@ use glam::{DQuat, DVec3, EulerRot};
 use vizflyt_arena::config::Up;
 use vizflyt_server::scene::{bounds, core};
 use vizflyt_splat::Splats;
-use vizflyt_splat::edit::{Axis, Carve, Region, Step};
+use vizflyt_splat::edit::{Axis, Carve, EditStep, Region};
 
 /// One step that is asked for.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Request {
     /// With all its parameters.
-    Step(Step),
+    Step(EditStep),
     /// Cell, and the least number of splats.
     Floaters(Option<f64>, u32),
     /// Cell, and how many parts stay.
@@ -35,7 +35,7 @@ pub(super) struct CarveSettings {
 
 impl Request {
     /// Returns the step for a scene. What is not said comes from the size of its core.
-    pub(super) fn step(&self, splats: &Splats, carve: &CarveSettings) -> Step {
+    pub(super) fn step(&self, splats: &Splats, carve: &CarveSettings) -> EditStep {
         let size = || {
             let [min, max] = bounds(core(splats, |p| p));
             max - min
@@ -46,15 +46,15 @@ impl Request {
         match self {
             Self::Step(step) => step.clone(),
             Self::Floaters(cell, least) => {
-                Step::Floaters { cell: cell.unwrap_or_else(usual_cell), least: *least }
+                EditStep::Floaters { cell: cell.unwrap_or_else(usual_cell), least: *least }
             }
             Self::Parts(cell, keep) => {
-                Step::Parts { cell: cell.unwrap_or_else(usual_cell), keep: *keep }
+                EditStep::Parts { cell: cell.unwrap_or_else(usual_cell), keep: *keep }
             }
             Self::Carve(path) => {
                 // Coarser: a room takes two million.
                 let cell = carve.cell.unwrap_or_else(|| cell_of(30.0));
-                Step::Carve(Carve {
+                EditStep::Carve(Carve {
                     path: path.clone(),
                     radius: carve.radius.unwrap_or_else(|| rounded(2.0 * cell)),
                     depth: carve.depth.unwrap_or_else(|| rounded(3.0 * cell)),
@@ -63,7 +63,7 @@ impl Request {
                 })
             }
             Self::Share(share) => {
-                Step::Decimate { count: ((share * splats.len() as f64).round() as u32).max(1) }
+                EditStep::Decimate { count: ((share * splats.len() as f64).round() as u32).max(1) }
             }
         }
     }
@@ -105,13 +105,13 @@ const FLAGS: [Flag; 17] = [
         Ok(remove(prism(text)?))
     }),
     ("min-opacity", "OPACITY", "Removes what is fainter, 0 to 1", |text| {
-        Ok(Request::Step(Step::Faint { below: number(text)? }))
+        Ok(Request::Step(EditStep::Faint { below: number(text)? }))
     }),
     ("max-size", "SIZE", "Removes splats whose largest standard deviation is larger", |text| {
-        Ok(Request::Step(Step::Large { above: number(text)? }))
+        Ok(Request::Step(EditStep::Large { above: number(text)? }))
     }),
     ("min-size", "SIZE", "Removes splats whose largest standard deviation is smaller", |text| {
-        Ok(Request::Step(Step::Small { below: number(text)? }))
+        Ok(Request::Step(EditStep::Small { below: number(text)? }))
     }),
     (
         "drop-floaters",
@@ -136,17 +136,17 @@ const FLAGS: [Flag; 17] = [
     ),
     ("up", "AXIS", "Turns the scene so that this axis becomes +z: x, -x, y, -y, z or -z", |text| {
         let up = Up::from_str(text).map_err(|error| error.to_string())?;
-        Ok(Request::Step(Step::Turn { rotation: up.world_from_scene().to_array() }))
+        Ok(Request::Step(EditStep::Turn { rotation: up.world_from_scene().to_array() }))
     }),
     ("rotate", "X,Y,Z", "Turns it about x, then y, then z, counter-clockwise [deg]", |text| {
         let rad = DVec3::from(point(text)?).map(f64::to_radians);
         let rotation = DQuat::from_euler(EulerRot::ZYX, rad.z, rad.y, rad.x).to_array();
-        Ok(Request::Step(Step::Turn { rotation }))
+        Ok(Request::Step(EditStep::Turn { rotation }))
     }),
     ("scale", "FACTOR", "Makes it larger by this factor", |text| {
-        Ok(Request::Step(Step::Scale { factor: number(text)? }))
+        Ok(Request::Step(EditStep::Scale { factor: number(text)? }))
     }),
-    ("move", "X,Y,Z", "Moves it", |text| Ok(Request::Step(Step::Move { by: point(text)? }))),
+    ("move", "X,Y,Z", "Moves it", |text| Ok(Request::Step(EditStep::Move { by: point(text)? }))),
 ];
 
 impl clap::Args for Requests {
@@ -200,11 +200,11 @@ impl FromArgMatches for Requests {
 }
 
 fn crop(region: Region) -> Request {
-    Request::Step(Step::Crop { within: vec![region] })
+    Request::Step(EditStep::Crop { within: vec![region] })
 }
 
 fn remove(region: Region) -> Request {
-    Request::Step(Step::Remove { within: vec![region] })
+    Request::Step(EditStep::Remove { within: vec![region] })
 }
 
 fn number(text: &str) -> Result<f64, String> {
@@ -256,7 +256,7 @@ fn cells(text: &str, usual: u32) -> Result<(Option<f64>, u32), String> {
         || format!("'{count}' is no count; write the cell's side, a colon, and the count: 0.2:50");
     let count = if count.is_empty() { usual } else { count.parse().map_err(|_| wrong())? };
     // Checked here, not after the scene was loaded.
-    let step = Step::Floaters { cell: cell.unwrap_or(1.0), least: count };
+    let step = EditStep::Floaters { cell: cell.unwrap_or(1.0), least: count };
     step.check().map_err(|error| error.to_string())?;
     Ok((cell, count))
 }
@@ -270,7 +270,7 @@ fn share(text: &str) -> Result<Request, String> {
     }
     let count =
         text.parse().map_err(|_| format!("'{text}' is no count; give splats, or per cent: 50%"))?;
-    Ok(Request::Step(Step::Decimate { count }))
+    Ok(Request::Step(EditStep::Decimate { count }))
 }
 
 #[cfg(test)]
@@ -296,12 +296,12 @@ mod tests {
         let line = "--scale 2 --drop-floaters --crop-box -1,0,0:1,2,3 --scale 0.5 --drop-floaters=0.2:9 --move -1,0,0";
         let within = vec![Region::Box { min: [-1.0, 0.0, 0.0], max: [1.0, 2.0, 3.0] }];
         let expected = [
-            step(Step::Scale { factor: 2.0 }),
+            step(EditStep::Scale { factor: 2.0 }),
             Request::Floaters(None, 50),
-            step(Step::Crop { within }),
-            step(Step::Scale { factor: 0.5 }),
+            step(EditStep::Crop { within }),
+            step(EditStep::Scale { factor: 0.5 }),
             Request::Floaters(Some(0.2), 9),
-            step(Step::Move { by: [-1.0, 0.0, 0.0] }),
+            step(EditStep::Move { by: [-1.0, 0.0, 0.0] }),
         ];
         assert_eq!(read(line).unwrap(), expected);
         assert_eq!(read("").unwrap(), []);
@@ -328,7 +328,8 @@ mod tests {
         }
         assert_eq!(read("--keep-parts=:2").unwrap(), [Request::Parts(None, 2)]);
         // About x first: y becomes z, and stays there about z.
-        let [Request::Step(Step::Turn { rotation })] = read("--rotate 90,0,90").unwrap()[..] else {
+        let [Request::Step(EditStep::Turn { rotation })] = read("--rotate 90,0,90").unwrap()[..]
+        else {
             panic!("a turn")
         };
         assert!((DQuat::from_array(rotation) * DVec3::Y).abs_diff_eq(DVec3::Z, 1e-12));

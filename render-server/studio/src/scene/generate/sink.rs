@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use anyhow::{Context, Result, anyhow, bail};
-use jpeg_encoder::{ColorType, Encoder};
+use vizflyt_rgbd::encode_jpeg;
 
 /// Where a capture is to go.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -122,10 +122,9 @@ impl Sink {
         let Some(name) = self.target.image_name(number) else { return Ok(()) };
         let Target::Folder(folder) = &self.target else { return Ok(()) };
         let path = folder.join(name);
-        let [width, height] = self.size_px.map(|side| side as u16);
+        let [width, height] = self.size_px;
         let mut bytes = Vec::new();
-        Encoder::new(&mut bytes, JPEG_QUALITY)
-            .encode(rgb, width, height, ColorType::Rgb)
+        encode_jpeg(rgb, width, height, JPEG_QUALITY, &mut bytes)
             .with_context(|| format!("cannot encode {}", path.display()))?;
         std::fs::write(&path, bytes).with_context(|| format!("cannot write {}", path.display()))
     }

@@ -2,27 +2,13 @@
 
 use std::collections::VecDeque;
 
+use vizflyt_protocol::random::SplitMix64;
 use vizflyt_protocol::time::HostTime;
-
-/// Pseudo-random numbers: SplitMix64.
-#[derive(Clone, Debug)]
-struct Chance(u64);
-
-impl Chance {
-    /// Returns a number from `least` to `most`.
-    fn between(&mut self, least: u64, most: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        least + (z ^ (z >> 31)) % (most - least + 1)
-    }
-}
 
 /// One direction of a link.
 #[derive(Clone, Debug)]
 pub(crate) struct Wire<T> {
-    chance: Chance,
+    random: SplitMix64,
     /// Least and greatest delay. [us]
     delay_us: (u64, u64),
     on_their_way: VecDeque<(HostTime, T)>,
@@ -36,7 +22,7 @@ impl<T> Wire<T> {
     /// Makes link number `stream` of the links with this seed.
     pub(crate) fn new(seed: u64, stream: u64, delay_us: (u64, u64)) -> Self {
         Self {
-            chance: Chance(seed.wrapping_mul(0xD1B5_4A32_D192_ED03) ^ stream << 32),
+            random: SplitMix64::new(seed.wrapping_mul(0xD1B5_4A32_D192_ED03) ^ stream << 32),
             delay_us,
             on_their_way: VecDeque::new(),
             newest: HostTime::ZERO,
@@ -47,7 +33,7 @@ impl<T> Wire<T> {
     /// Sends, to arrive after a delay.
     pub(crate) fn send(&mut self, now: HostTime, item: T) {
         let (least, most) = self.delay_us;
-        let delay_us = self.chance.between(least, most);
+        let delay_us = least + self.random.bits() % (most - least + 1);
         self.send_for(now.plus_ns(1000 * delay_us.cast_signed()), item);
     }
 

@@ -14,6 +14,8 @@ use quinn::udp::{EcnCodepoint, RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
 use tokio::time::Instant;
 
+use vizflyt_protocol::random::SplitMix64;
+
 use super::world::{World, lock};
 
 /// What one direction does to packets.
@@ -66,7 +68,7 @@ const HEADERS: usize = 28;
 /// One direction.
 struct Direction {
     does: Impairment,
-    chance: Chance,
+    random: SplitMix64,
     /// When the bottleneck has sent all it was given.
     busy: Instant,
     /// Arrival of the newest packet that kept its order.
@@ -76,9 +78,9 @@ struct Direction {
 impl Direction {
     /// Returns when a packet of `len` bytes arrives: never, once or twice.
     fn arrivals(&mut self, start: Instant, now: Instant, len: usize) -> [Option<Instant>; 2] {
-        let (does, chance) = (&self.does, &mut self.chance);
+        let (does, random) = (&self.does, &mut self.random);
         // Always as many draws, so that one setting does not change another's chances.
-        let [lost, twice, late, jitter] = [(); 4].map(|()| chance.next());
+        let [lost, twice, late, jitter] = [(); 4].map(|()| random.unit());
         let len = len + HEADERS;
         let dark = does.blackouts.iter().any(|range| range.contains(&(now - start)));
         let waiting = self.busy.saturating_duration_since(now);
@@ -123,7 +125,12 @@ impl Network {
     ) -> Arc<Self> {
         let start = Instant::now();
         let direction = |does, seed| {
-            Mutex::new(Direction { does, chance: Chance(seed), busy: start, newest: start })
+            Mutex::new(Direction {
+                does,
+                random: SplitMix64::new(seed),
+                busy: start,
+                newest: start,
+            })
         };
         let (down, up) = (direction(down, 2 * seed), direction(up, 2 * seed + 1));
         Arc::new(Self { world, start, server, inboxes: Mutex::default(), down, up })
@@ -269,19 +276,5 @@ struct Writable;
 impl UdpPoller for Writable {
     fn poll_writable(self: Pin<&mut Self>, _: &mut Context) -> Poll<io::Result<()>> {
         Poll::Ready(Ok(()))
-    }
-}
-
-/// Seeded chance (SplitMix64: Steele, Lea and Flood, OOPSLA 2014).
-pub(crate) struct Chance(pub(crate) u64);
-
-impl Chance {
-    /// Returns a number from 0 up to, not including, 1.
-    pub(crate) fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
     }
 }

@@ -17,10 +17,11 @@ use vizflyt_protocol::messages::{
     ArenaInfo, Event, EventKind, FlightPhase, Limits, PoseSample, Purpose, Telemetry, bounded,
 };
 use vizflyt_protocol::packet::ImageHeader;
+use vizflyt_protocol::random::SplitMix64;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{EncodeOptions, Encoder, RgbdView};
 use vizflyt_runtime::stream::{
-    Mailbox, Outbox, ServerClock, Shared, Step, StreamEvent, StreamSettings, run_over,
+    DecodeStep, Mailbox, Outbox, ServerClock, Shared, StreamEvent, StreamSettings, run_over,
 };
 use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
@@ -32,7 +33,7 @@ use vizflyt_server::stream::subscriptions::Broadcast;
 use vizflyt_server::stream::transport::{self, Congestion};
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
-use super::network::{Chance, Network, Socket};
+use super::network::{Network, Socket};
 use super::world::lock;
 
 /// Makes a bitstream of 640x480 120 KB long. [mm]
@@ -90,13 +91,13 @@ fn columns(width: u32, level: usize) -> u32 {
 }
 
 fn payloads([width, height]: [u32; 2]) -> Arc<Vec<Bytes>> {
-    let mut chance = Chance(1);
+    let mut random = SplitMix64::new(1);
     let payload = |level: usize| {
         let width = columns(width, level / IMAGES);
         // Flat colour and noisy depth: integer coding alone, so that every machine makes the same
         // number of bytes.
         let rgb = vec![128; (width * height * 3) as usize];
-        let noise = |_| 2000 + (chance.next() * DEPTH_NOISE_MM) as u16;
+        let noise = |_| 2000 + (random.unit() * DEPTH_NOISE_MM) as u16;
         let depth_mm: Vec<u16> = (0..width * height).map(noise).collect();
         let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
         let mut payload = Vec::new();
@@ -406,16 +407,16 @@ async fn take(shared: Shared, notes: Arc<Mutex<Notes>>) {
         while let Some((_, step)) = shared.mailbox.next(Duration::ZERO, |_| true) {
             match step {
                 // As the decoder does with what was overtaken on its way.
-                Step::Begin(arrival) if arrival.header.pose_stamp() <= rendered => {
+                DecodeStep::Begin(arrival) if arrival.header.pose_stamp() <= rendered => {
                     shared.mailbox.give_up(0);
                 }
-                Step::Begin(arrival) => rendered = arrival.header.pose_stamp(),
-                Step::Piece(piece) => shared.mailbox.recycle(piece),
-                Step::End(whole) => {
+                DecodeStep::Begin(arrival) => rendered = arrival.header.pose_stamp(),
+                DecodeStep::Piece(piece) => shared.mailbox.recycle(piece),
+                DecodeStep::End(whole) => {
                     let received = ServerTime::from_ns(whole.received.as_ns());
                     lock(&notes).images.push((rendered, received));
                 }
-                Step::Drop => {}
+                DecodeStep::Drop => {}
             }
         }
     }

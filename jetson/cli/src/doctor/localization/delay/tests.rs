@@ -1,5 +1,6 @@
 use super::*;
 use proptest::prelude::*;
+use vizflyt_protocol::random::SplitMix64;
 
 /// What happens in a hand, and how it is measured.
 #[derive(Clone, Copy, Debug)]
@@ -26,17 +27,14 @@ const LAB: Lab = Lab {
     seed: 1,
 };
 
-/// Noise of about one standard deviation, by splitmix64.
-struct Noise(u64);
+/// Noise of about one standard deviation.
+struct Noise(SplitMix64);
 
 impl Noise {
     fn next(&mut self) -> f64 {
         let mut sum = -6.0;
         for _ in 0..12 {
-            self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-            let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-            let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-            sum += ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64;
+            sum += self.0.unit();
         }
         sum
     }
@@ -58,7 +56,7 @@ fn attitude(at_s: f64, motion_s: f64) -> DQuat {
 }
 
 fn measure(lab: &Lab) -> Result<Delay, NoDelay> {
-    let mut noise = Noise(lab.seed);
+    let mut noise = Noise(SplitMix64::new(lab.seed));
     let mut meter = DelayMeter::default();
     let end_s = 9.5 + 2.0 * lab.motion_s;
     let bias = noise.vector() * 0.005;
@@ -101,7 +99,7 @@ fn what_was_too_gentle_is_not_said() {
 #[test]
 fn another_vehicles_gyroscope_is_noticed() {
     let mut meter = DelayMeter::default();
-    let mut noise = Noise(7);
+    let mut noise = Noise(SplitMix64::new(7));
     for step in 0..1200u32 {
         let at_s = f64::from(step) * 0.01;
         meter.add_gyro(at_s, noise.vector() * 0.01);

@@ -168,7 +168,7 @@ fn look(setup: &Setup, set: &str, yaw_rad: f64) -> (usize, Diagnosis) {
         let pose = read(&mut stream, tick, &setup.packet(p_m, &attitude));
         check.handle_pose(tick as f64 * 0.02, &pose);
     }
-    assert_eq!(check.step(), Step::Done, "{set}: {:?}", check.rests);
+    assert_eq!(check.step(), HandCheckStep::Done, "{set}: {:?}", check.rests);
     (check.rests.len(), check.diagnosis())
 }
 

@@ -27,8 +27,8 @@ use vizflyt_arena::config::{Geofence, Spawn, StageConfig};
 
 use super::engine::{Engine, Request};
 use super::place::Place;
-use crate::lock::lock;
 use crate::web::http::{file, ordered, ordered_here};
+use vizflyt_process::lock;
 
 /// Finds a place from what was clicked, and writes it down.
 pub trait Aligner: Send + Sync {

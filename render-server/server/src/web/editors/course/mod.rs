@@ -32,10 +32,10 @@ use vizflyt_splat::{Chosen, Rasterizer, RigidObject, Splats};
 use super::align::Line;
 use super::args::ViewArgs;
 use super::engine::Engine;
-use crate::lock::lock;
 use crate::render::choose;
 use crate::scene::{self, Scene, Seen};
 use crate::web::http::{file, ordered_here};
+use vizflyt_process::lock;
 
 /// The file that a course is written to.
 pub trait CourseFile: Send + Sync {
@@ -136,7 +136,7 @@ enum Order {
 
 /// What the page shows.
 #[derive(Debug, Serialize)]
-struct Report {
+struct CourseState {
     /// Answers [`Order::Open`].
     course: Option<Course>,
     name: String,
@@ -285,8 +285,8 @@ impl Session {
         Ok(said)
     }
 
-    fn report(&self, findings: Vec<Found>) -> Report {
-        Report {
+    fn report(&self, findings: Vec<Found>) -> CourseState {
+        CourseState {
             course: None,
             name: self.arena.name.clone(),
             body_radius_m: self.arena.body_radius_m,
@@ -346,7 +346,7 @@ async fn obey(
     }
 }
 
-fn carry_out(panel: &Panel, order: Order) -> Result<Report> {
+fn carry_out(panel: &Panel, order: Order) -> Result<CourseState> {
     let mut session = lock(&panel.session);
     let (course, opens, saves) = match order {
         Order::Open => (session.on_file.clone(), true, false),
@@ -364,7 +364,7 @@ fn carry_out(panel: &Panel, order: Order) -> Result<Report> {
     let report = session.report(findings.into_iter().map(Found::from).collect());
     let course = opens.then(|| session.on_file.clone());
     let least_room_m = least_room_m.is_finite().then_some(least_room_m);
-    Ok(Report { course, way_m, least_room_m, said, ..report })
+    Ok(CourseState { course, way_m, least_room_m, said, ..report })
 }
 
 /// An arena has at most 255 gates of 128 corners; a person's has a tenth of it.

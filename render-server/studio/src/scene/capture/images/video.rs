@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use vizflyt_rgbd::encode_jpeg;
 use vizflyt_tags::capture::{Colours, Y4m};
 
 use super::blur::blur;
@@ -66,7 +66,7 @@ pub(super) fn take(file: &Path, choice: Choice, folder: &Path) -> Result<Picture
     Ok(Pictures { folder: folder.to_owned(), size_px, of_video: true, pictures })
 }
 
-/// Writes a picture as JPEG, whose colours are the stream's: nothing is converted.
+/// Writes a picture as JPEG.
 fn write(best: &Best, number: usize, folder: &Path) -> Result<Picture> {
     let name = format!("{number:05}.jpg");
     let path = folder.join(&name);
@@ -74,18 +74,20 @@ fn write(best: &Best, number: usize, folder: &Path) -> Result<Picture> {
     let count = image.luma().len();
     let (luma, chroma) = image.planes.split_at(count);
     let (cb, cr) = chroma.split_at(count);
-    let pixels: Vec<u8> =
-        luma.iter().zip(cb).zip(cr).flat_map(|((&y, &cb), &cr)| [y, cb, cr]).collect();
-    let [width, height] = [image.width_px, image.height_px].map(|side| side as u16);
+    let rgb: Vec<u8> =
+        luma.iter().zip(cb).zip(cr).flat_map(|((&y, &cb), &cr)| rgb([y, cb, cr])).collect();
     let mut bytes = Vec::new();
-    let mut encoder = Encoder::new(&mut bytes, JPEG_QUALITY);
-    // Its colours were as coarse in the video.
-    encoder.set_sampling_factor(SamplingFactor::F_2_2);
-    encoder
-        .encode(&pixels, width, height, ColorType::Ycbcr)
+    encode_jpeg(&rgb, image.width_px, image.height_px, JPEG_QUALITY, &mut bytes)
         .with_context(|| format!("cannot encode {}", path.display()))?;
     std::fs::write(&path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(Picture { name, at_s: *at_s, blur: *blur, grey: mean(luma) })
+}
+
+/// Returns the colour of full-range YCbCr (ITU-T T.871, 7).
+fn rgb([y, cb, cr]: [u8; 3]) -> [u8; 3] {
+    let [y, cb, cr] = [f32::from(y), f32::from(cb) - 128.0, f32::from(cr) - 128.0];
+    [y + 1.402 * cr, y - 0.344136 * cb - 0.714136 * cr, y + 1.772 * cb]
+        .map(|value| (value + 0.5) as u8)
 }
 
 /// Returns how long a video is. [s]

@@ -6,7 +6,7 @@ use std::io;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 /// Raises the soft limit to the hard one, or as far as is of use, and returns what it is then.
-pub(crate) fn raise_limit() -> usize {
+pub fn raise_limit() -> usize {
     let Ok((soft, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else { return USUAL };
     let wanted = hard.min(ENOUGH).max(soft);
     let is_raised = setrlimit(Resource::RLIMIT_NOFILE, wanted, hard).is_ok();
@@ -15,7 +15,7 @@ pub(crate) fn raise_limit() -> usize {
 }
 
 /// Whether an error says that there are no more descriptors: of this process, or of the system.
-pub(crate) fn are_used_up(error: &io::Error) -> bool {
+pub fn are_used_up(error: &io::Error) -> bool {
     use nix::errno::Errno;
     let errors = [Errno::EMFILE, Errno::ENFILE, Errno::ENOBUFS, Errno::ENOMEM];
     error.raw_os_error().is_some_and(|code| errors.contains(&Errno::from_raw(code)))
@@ -23,11 +23,11 @@ pub(crate) fn are_used_up(error: &io::Error) -> bool {
 
 /// Descriptors of nothing, given up one by one when others are needed.
 #[derive(Debug, Default)]
-pub(crate) struct Reserve(Vec<File>);
+pub struct Reserve(Vec<File>);
 
 impl Reserve {
     /// Opens as many as there should be, if there are any left.
-    pub(crate) fn fill(&mut self) {
+    pub fn fill(&mut self) {
         while self.0.len() < RESERVED {
             let Ok(file) = File::open("/dev/null") else { break };
             self.0.push(file);
@@ -35,7 +35,7 @@ impl Reserve {
     }
 
     /// Gives one up; returns whether there was one.
-    pub(crate) fn release(&mut self) -> bool {
+    pub fn release(&mut self) -> bool {
         self.0.pop().is_some()
     }
 }
