@@ -18,10 +18,8 @@ from ._vizflyt import PROTOCOL_VERSION, Pose, decode_image
 _F64 = npt.NDArray[np.float64]
 _I64 = npt.NDArray[np.int64]
 
-# The first protocol whose images and heads of observations have this layout; both have only grown at their ends.
-FIRST_PROTOCOL, WITH_POSE = 6, 12
-CAMERAS_AT, OLD_CAMERA, CAMERA, AHEAD_AT = 2200, 176, 232, 172
-IMU_COUNT_AT, IMU_AT, IMU_RECORD, MAX_IMU = 12, 152, struct.Struct("<Q6f"), 64
+# The first protocol whose images have this layout.
+FIRST_PROTOCOL = 13
 # Of the header of an image: rotation and place of the camera in the world, of the camera on the body, intrinsics, lens.
 NUMBERS_AT, NUMBERS, SIZE_AT, HEADER = 48, struct.Struct("<23d"), 232, 252
 LENSES = {0: "none", 1: "brown_conrady", 2: "kannala_brandt"}
@@ -173,8 +171,7 @@ class Log:
         print(log.imu.accel_mps2.mean(axis=0), log.poses.p_m[-1], log.sent.v_world_mps.max())
 
     Times are nanoseconds since 1970, on the clock of the vehicle's computer; of graded flights, on their virtual
-    clock. Logs of earlier versions, in which an image is stamped with its pose's instant, are read as well, from
-    protocol 6 on.
+    clock.
 
     Raises OSError if it cannot be read, ValueError if it is no log, or of a version that is not known here.
     """
@@ -186,36 +183,26 @@ class Log:
         """Which flight it is: program, protocol, plugin, arguments, images."""
         self.is_cut = self._file.is_cut
         """Whether the log ends early: its flight was killed, or the file is damaged."""
-        form = self.flight.get("log_form", "1")
-        self._form = int(form) if form.isdecimal() else 1
         self._colors = {
             topic.removeprefix("/camera/").removesuffix("/image"): {one.log_time_ns: one for one in places}
             for topic, places in self._file.messages.items()
             if topic.startswith("/camera/") and topic.endswith("/image")
         }
         self._found: dict[str, list[_Found]] = {}
-        heads_imu: list[tuple[int, ...]] = []
-        newest_imu = 0
         for place in self._file.messages.get("/observation", []):
             try:
                 observation = fields(self._file.data(place))
-                protocol = _known(_first(observation, 2, 0), self.path)
-                head, published = _first(observation, 4, b""), _first(observation, 3, 0)
+                _check(_first(observation, 2, 0), self.path)
+                published = _first(observation, 3, 0)
                 for index, data in enumerate(observation.get(5, [])):
                     image = fields(data)
                     camera = _first(image, 2, b"").decode()
-                    _, shown_ns = _instants(image, head, protocol)
+                    shown_ns = _first(image, 8, 0)
                     found = _Found(place, index, camera, shown_ns + place.log_time_ns - published)
                     self._found.setdefault(camera, []).append(found)
             except (struct.error, IndexError, UnicodeDecodeError, DamagedMessageError):
                 # Damaged: the others are whole.
                 continue
-            if self._form < 2:
-                for sample in _imu_of_head(head):
-                    if sample[0] > newest_imu:
-                        newest_imu = sample[0]
-                        heads_imu.append((sample[0] + place.log_time_ns - published, *sample[1:]))
-        self._heads_imu = heads_imu
 
     @property
     def cameras(self) -> list[str]:
@@ -243,17 +230,7 @@ class Log:
     @property
     def pose_at_image(self) -> Poses:
         """What each instant's images were rendered from, in the frame `world`."""
-        if self._form >= 2:
-            return self._poses("/pose_at_image")
-        found = {}
-        for images in self._found.values():
-            for one in images:
-                numbers = self._header(one)[0]
-                found[one.shown_ns] = _body(numbers)
-        stamps = sorted(found)
-        p_m = np.array([found[stamp].translation_m for stamp in stamps]).reshape(-1, 3)
-        q_xyzw = np.array([found[stamp].rotation_xyzw for stamp in stamps]).reshape(-1, 4)
-        return Poses(np.array(stamps, np.int64), p_m, q_xyzw)
+        return self._poses("/pose_at_image")
 
     @property
     def odometry(self) -> Poses:
@@ -270,10 +247,6 @@ class Log:
     @property
     def imu(self) -> Imu:
         """The autopilot's accelerometer and gyroscope."""
-        if self._form < 2:
-            numbers = np.array([sample[1:] for sample in self._heads_imu], np.float64).reshape(-1, 6)
-            stamps = np.array([sample[0] for sample in self._heads_imu], np.int64)
-            return Imu(stamps, numbers[:, :3], numbers[:, 3:])
         stamps, rows = self._json("/imu")
         return Imu(stamps, _vectors(rows, "accel_mps2"), _vectors(rows, "gyro_radps"))
 
@@ -337,7 +310,7 @@ class Log:
         rgb, depth_mm = decode_image(_first(image, 5, b""), jpeg)
         if rgb.shape[:2] != struct.unpack_from("<II", header, SIZE_AT)[::-1]:
             raise ValueError(f"{self.path}: an image of {camera} is of another size than its header says")
-        pose_ns, shown_ns = _instants(image, _first(observation, 4, b""), _first(observation, 2, 0))
+        pose_ns, shown_ns = _first(image, 7, 0), _first(image, 8, 0)
         fx, fy, cx, cy = numbers[14:18]
         return LogImage(
             camera=camera,
@@ -361,29 +334,9 @@ def _first(message: dict[int, list[Any]], number: int, otherwise: Any) -> Any:
     return found if isinstance(found, type(otherwise)) else otherwise
 
 
-def _known(protocol: int, path: Path) -> int:
-    if FIRST_PROTOCOL <= protocol <= PROTOCOL_VERSION:
-        return protocol
-    raise ValueError(f"{path} is of protocol {protocol}; this version reads {FIRST_PROTOCOL} to {PROTOCOL_VERSION}")
-
-
-def _instants(image: dict[int, list[Any]], head: bytes, protocol: int) -> tuple[int, int]:
-    """Returns when the newest pose behind an image was measured, and the instant that it shows. [ns, host]"""
-    shown_ns = _first(image, 8, 0)
-    if shown_ns:
-        return _first(image, 7, 0), shown_ns
-    at = CAMERAS_AT + _first(image, 1, 0) * (CAMERA if protocol >= WITH_POSE else OLD_CAMERA)
-    (pose_ns,) = struct.unpack_from("<Q", head, at)
-    (ahead_ns,) = struct.unpack_from("<i", head, at + AHEAD_AT)
-    return pose_ns, pose_ns + ahead_ns
-
-
-def _imu_of_head(head: bytes) -> Iterator[tuple[int, ...]]:
-    if len(head) >= IMU_AT:
-        (count,) = struct.unpack_from("<I", head, IMU_COUNT_AT)
-        room = (len(head) - IMU_AT) // IMU_RECORD.size
-        for index in range(min(count, MAX_IMU, room)):
-            yield IMU_RECORD.unpack_from(head, IMU_AT + index * IMU_RECORD.size)
+def _check(protocol: int, path: Path) -> None:
+    if not FIRST_PROTOCOL <= protocol <= PROTOCOL_VERSION:
+        raise ValueError(f"{path} is of protocol {protocol}; this version reads {FIRST_PROTOCOL} to {PROTOCOL_VERSION}")
 
 
 def _pose_in_frame(message: bytes) -> tuple[float, ...]:

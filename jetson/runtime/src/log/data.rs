@@ -1,8 +1,5 @@
 //! A flight log as data: images by the instant that they show, poses, IMU, setpoints, in the order in which they
 //! were written. What `vizflyt export` writes for other people's programs.
-//!
-//! Logs of form 1 (see [`super::LOG_FORM`]) are read as well: what their `timestamp` lacks stands in the head of each
-//! observation, and so do IMU samples.
 
 use std::io::Read;
 
@@ -13,9 +10,8 @@ use vizflyt_protocol::sensor::{MAX_SENSORS, SensorHeader};
 use zerocopy::FromBytes;
 
 use super::channels::Channel;
-use super::messages::{Observation, ObservedImage};
+use super::messages::Observation;
 use super::read::{LogError, LogMessage, LogReader, Next, Recorded, RecordedFlight, pose_of};
-use super::{LOG_FORM, head};
 
 /// Where the body was at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -115,9 +111,6 @@ pub struct FlightData<R> {
     topics: [(String, Topic); 6],
     /// What came with the message before.
     ready: std::collections::VecDeque<FlightDatum>,
-    has_imu: bool,
-    /// Newest IMU sample that was found in a head. [ns, host]
-    imu_had_ns: u64,
     /// Number of each sensor's newest reading.
     readings_had: [u64; MAX_SENSORS],
 }
@@ -147,8 +140,6 @@ impl<R: Read> FlightData<R> {
             flight: RecordedFlight::new(reader, with_images),
             topics: topics.map(|(channel, topic)| (channel.topic(""), topic)),
             ready: std::collections::VecDeque::new(),
-            has_imu: false,
-            imu_had_ns: 0,
             readings_had: [0; MAX_SENSORS],
         }
     }
@@ -170,10 +161,6 @@ impl<R: Read> FlightData<R> {
             }
             match self.flight.next_of_all()? {
                 None => return Ok(None),
-                Some((_, Next::Recorded(Recorded::Flight(values)))) => {
-                    let form = values.get(LOG_FORM.0).and_then(|form| form.parse::<u32>().ok());
-                    self.has_imu = form.unwrap_or(1) >= 2;
-                }
                 Some((at_ns, Next::Recorded(Recorded::Observation(observation)))) => {
                     self.observation(at_ns, observation);
                 }
@@ -239,12 +226,11 @@ impl<R: Read> FlightData<R> {
         // From this computer's clock to time since 1970.
         let offset_ns = at_ns.wrapping_sub(observation.published_ns);
         self.readings(offset_ns, &observation);
-        let Observation { seq, protocol, head, images, .. } = observation;
+        let Observation { seq, protocol, images, .. } = observation;
         if images.is_empty() {
             self.ready.push_back(FlightDatum::LeftOut);
         }
         for image in images {
-            let Some((pose_ns, shown_ns)) = instants(&image, &head, protocol) else { continue };
             let Ok((header, _)) = ImageHeader::parse_logged(&image.header, protocol) else {
                 self.ready.push_back(FlightDatum::Foreign { protocol });
                 continue;
@@ -252,36 +238,14 @@ impl<R: Read> FlightData<R> {
             self.ready.push_back(FlightDatum::Image(FlightImage {
                 camera: image.name,
                 seq,
-                shown_ns: shown_ns.wrapping_add(offset_ns),
-                pose_ns: pose_ns.wrapping_add(offset_ns),
+                shown_ns: image.shown_ns.wrapping_add(offset_ns),
+                pose_ns: image.pose_ns.wrapping_add(offset_ns),
                 received_ns: image.received_ns.wrapping_add(offset_ns),
                 header,
                 bitstream: image.bitstream,
             }));
         }
-        if self.has_imu {
-            return;
-        }
-        for sample in head::imu(&head, protocol) {
-            if sample.stamp_ns > self.imu_had_ns {
-                self.imu_had_ns = sample.stamp_ns;
-                self.ready.push_back(FlightDatum::Imu(FlightImu {
-                    at_ns: sample.stamp_ns.wrapping_add(offset_ns),
-                    accel_mps2: DVec3::from(sample.accel_mps2.map(f64::from)),
-                    gyro_radps: DVec3::from(sample.gyro_radps.map(f64::from)),
-                }));
-            }
-        }
     }
-}
-
-/// Returns when the newest pose behind an image was measured, and the instant that it shows. [ns, host]
-fn instants(image: &ObservedImage, head: &[u8], protocol: u32) -> Option<(u64, u64)> {
-    if image.shown_ns != 0 {
-        return Some((image.pose_ns, image.shown_ns));
-    }
-    let (pose_ns, ahead_ns) = head::instants(head, protocol, image.camera as usize)?;
-    Some((pose_ns, pose_ns.wrapping_add_signed(ahead_ns.into())))
 }
 
 fn vector(value: &serde_json::Value) -> Option<DVec3> {
@@ -302,43 +266,40 @@ mod tests {
     use glam::DQuat;
     use mcap::records::MessageHeader;
     use prost::Message as _;
+    use vizflyt_protocol::PROTOCOL_VERSION;
     use vizflyt_protocol::geometry::Intrinsics;
     use vizflyt_protocol::time::ServerTime;
     use zerocopy::IntoBytes;
 
-    use super::super::messages::ObservedRecords;
+    use super::super::messages::{ObservedImage, ObservedRecords};
     use super::*;
 
     /// From the clock of the computer that flew to 1970. [ns]
     const OFFSET_NS: u64 = 1_700_000_000_000_000_000;
 
-    /// An observation as protocol 11 had it: its head names instants, its image none.
-    fn old_observation(n: u64) -> Observation {
+    fn observation(n: u64) -> Observation {
         let pose_ns = n * 33_000_000;
-        let mut head = vec![0; 152 + 32 * 64 + 176 * 8];
-        head[12..16].copy_from_slice(&2u32.to_le_bytes());
-        for (k, stamp_ns) in [pose_ns - 10_000_000, pose_ns].into_iter().enumerate() {
-            head[152 + 32 * k..][..8].copy_from_slice(&stamp_ns.to_le_bytes());
-        }
-        // The second camera.
-        head[2200 + 176..][..8].copy_from_slice(&pose_ns.to_le_bytes());
-        head[2200 + 176 + 172..][..4].copy_from_slice(&48_000_000i32.to_le_bytes());
         let k = Intrinsics::from_horizontal_fov(8, 6, 1.5);
         let body = Pose::new(DVec3::X * n as f64, DQuat::IDENTITY);
         let (stamp, mount) = (ServerTime::from_ns(1), Pose::IDENTITY);
-        let mut header = ImageHeader::new(n, 1, stamp, &k, &mount, &body).as_bytes().to_vec();
-        header[4..6].copy_from_slice(&11u16.to_le_bytes());
         let image = ObservedImage {
             camera: 1,
             name: "down".into(),
-            header,
+            header: ImageHeader::new(n, 1, stamp, &k, &mount, &body).as_bytes().to_vec(),
             received_ns: pose_ns + 1,
             bitstream: vec![7],
+            pose_ns,
+            shown_ns: pose_ns + 48_000_000,
             ..ObservedImage::default()
         };
-        let published_ns = pose_ns + 20_000_000;
-        let images = vec![image];
-        Observation { seq: n, protocol: 11, published_ns, head, images, ..Observation::default() }
+        let (protocol, published_ns) = (PROTOCOL_VERSION.into(), pose_ns + 20_000_000);
+        Observation {
+            seq: n,
+            protocol,
+            published_ns,
+            images: vec![image],
+            ..Observation::default()
+        }
     }
 
     fn log(observations: &[Observation]) -> Vec<u8> {
@@ -364,8 +325,8 @@ mod tests {
     }
 
     #[test]
-    fn a_log_of_form_1_has_the_instants_that_its_images_show() {
-        let observations: Vec<_> = (1..20).map(old_observation).collect();
+    fn images_have_the_instants_that_they_show() {
+        let observations: Vec<_> = (1..20).map(observation).collect();
         let found = read(log(&observations));
         let images = found.iter().filter_map(|datum| match datum {
             FlightDatum::Image(image) => Some(image),
@@ -378,13 +339,6 @@ mod tests {
             assert_eq!(image.header.world_from_body().translation_m, DVec3::X * n as f64);
         }
         assert_eq!(images.count(), 19);
-        let imu = found.iter().filter_map(|datum| match datum {
-            FlightDatum::Imu(reading) => Some(reading.at_ns),
-            _ => None,
-        });
-        let imu: Vec<u64> = imu.collect();
-        assert_eq!(imu.len(), 38);
-        assert!(imu.is_sorted_by(|a, b| a < b), "each once, though heads repeat them");
     }
 
     #[test]
@@ -397,7 +351,7 @@ mod tests {
                 sensors: [SensorHeader::default(), header].as_bytes().to_vec(),
                 records: vec![records],
                 images: Vec::new(),
-                ..old_observation(n)
+                ..observation(n)
             }
         };
         let all = [observed(1, 4, false), observed(2, 4, false), observed(3, 5, true)];
@@ -412,11 +366,9 @@ mod tests {
 
     #[test]
     fn images_of_a_protocol_that_is_not_known_are_said_to_be() {
-        let mut observation = old_observation(1);
-        observation.protocol = 99;
-        observation.images[0].shown_ns = 5;
-        assert_eq!(read(log(&[observation])), [FlightDatum::Foreign { protocol: 99 }]);
-        let left_out = Observation { images: Vec::new(), ..old_observation(1) };
+        let foreign = Observation { protocol: 99, ..observation(1) };
+        assert_eq!(read(log(&[foreign])), [FlightDatum::Foreign { protocol: 99 }]);
+        let left_out = Observation { images: Vec::new(), ..observation(1) };
         assert_eq!(read(log(&[left_out]))[0], FlightDatum::LeftOut);
     }
 }

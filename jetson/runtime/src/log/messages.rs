@@ -71,10 +71,10 @@ pub struct ObservedImage {
     /// The colour is the camera's `/camera/NAME/image` of the same log time.
     #[prost(bool, tag = "6")]
     pub is_color_apart: bool,
-    /// When the newest pose behind it was measured; 0 in logs of form 1. [ns, host]
+    /// When the newest pose behind it was measured. [ns, host]
     #[prost(uint64, tag = "7")]
     pub pose_ns: u64,
-    /// The instant that it shows; 0 in logs of form 1. [ns, host]
+    /// The instant that it shows. [ns, host]
     #[prost(uint64, tag = "8")]
     pub shown_ns: u64,
 }

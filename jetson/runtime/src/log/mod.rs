@@ -17,7 +17,6 @@ mod channels;
 pub mod data;
 mod depth;
 mod file;
-mod head;
 #[cfg(feature = "foxglove")]
 mod live;
 #[cfg(not(feature = "foxglove"))]
@@ -307,11 +306,6 @@ impl ImageLog {
     }
 }
 
-/// The key of a flight's metadata that says how its log is written, and what is written now. 1, or none: `timestamp` of
-/// an image is when the newest pose behind it was measured. 2: it is the instant that the image shows; `/imu`,
-/// `/pose_at_image` and `/camera/NAME/stamps` are there.
-pub const LOG_FORM: (&str, u32) = ("log_form", 2);
-
 /// Returns what the log says of a reading of the IMU.
 fn imu_message(sample: &ImuSample) -> serde_json::Value {
     json!({
@@ -327,7 +321,6 @@ fn flight_record(plugin: &OsString, arguments: &[OsString]) -> Record {
     Record::Flight(vec![
         ("program", concat!("vizflyt ", env!("CARGO_PKG_VERSION")).to_owned()),
         ("protocol", PROTOCOL_VERSION.to_string()),
-        (LOG_FORM.0, LOG_FORM.1.to_string()),
         ("plugin", plugin.to_string_lossy().into_owned()),
         ("arguments", json!(arguments).to_string()),
     ])

@@ -84,7 +84,7 @@ impl ImageHeader {
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZIM";
     /// The first protocol version whose images had this layout.
-    const SINCE: u16 = 6;
+    const SINCE: u16 = 13;
 
     /// Makes a header of an image that shows the instant of its pose, with all other stamps zero.
     pub fn new(
@@ -126,7 +126,7 @@ impl ImageHeader {
     }
 
     /// As [`Self::parse`], of a header that a log of another protocol version holds: the layout has been the same since
-    /// version 6.
+    /// version 13.
     pub fn parse_logged(bytes: &[u8], protocol: u32) -> Result<(Self, &[u8]), InvalidImageHeader> {
         let (header, rest) =
             Self::read_from_prefix(bytes).map_err(|_| InvalidImageHeader::Short(bytes.len()))?;

@@ -29,7 +29,6 @@ pub struct ArenaArgs {
 #[derive(Subcommand, Debug)]
 enum ArenaCommand {
     Check(CheckArgs),
-    #[command(visible_alias = "init")]
     New(new::NewArgs),
     Edit(edit::EditArgs),
 }

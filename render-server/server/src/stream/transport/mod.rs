@@ -59,9 +59,6 @@ pub enum Congestion {
     Lan,
     /// Fair to others, less bothered by loss (experimental in quinn).
     Bbr,
-    /// What `bbr` has replaced: it delivered less in every case that was measured.
-    #[value(hide = true)]
-    Cubic,
 }
 
 impl Congestion {
@@ -69,7 +66,7 @@ impl Congestion {
     fn toward(self, address: IpAddr) -> Self {
         match self {
             Self::Auto if is_near(address) => Self::Lan,
-            Self::Auto | Self::Cubic => Self::Bbr,
+            Self::Auto => Self::Bbr,
             chosen => chosen,
         }
     }
@@ -77,16 +74,13 @@ impl Congestion {
     fn factory(self) -> Arc<dyn ControllerFactory + Send + Sync> {
         match self {
             Self::Auto | Self::Lan => Arc::new(LanConfig::default()),
-            Self::Bbr | Self::Cubic => Arc::new(BbrConfig::default()),
+            Self::Bbr => Arc::new(BbrConfig::default()),
         }
     }
 }
 
 /// Opens the endpoint. Must run within a tokio runtime.
 pub fn bind(address: SocketAddr, identity: &Identity, congestion: Congestion) -> Result<Endpoint> {
-    if congestion == Congestion::Cubic {
-        warn!("--congestion cubic is no longer offered: bbr, which delivers more, takes its place");
-    }
     let open = || -> std::io::Result<std::net::UdpSocket> {
         let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
         // The kernel may grant less (net.core.wmem_max); more than 212 KB already helps.
@@ -375,6 +369,5 @@ mod tests {
         check("2001:db8::1", Congestion::Bbr);
         let lab = "127.0.0.1".parse().unwrap();
         assert_eq!(Congestion::Bbr.toward(lab), Congestion::Bbr);
-        assert_eq!(Congestion::Cubic.toward(lab), Congestion::Bbr);
     }
 }
