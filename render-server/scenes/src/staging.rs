@@ -6,10 +6,11 @@ use vizflyt_arena::config::Geofence;
 use vizflyt_protocol::geometry::Volume;
 
 use crate::canvas::Canvas;
+use crate::generated::{Generated, SceneKind};
 use crate::prints::{self, Board, Places, Print};
 use crate::solids::Solids;
 use crate::walk::{Ground, NoWalk, Walk};
-use crate::{Generated, SceneKind, forest, hall};
+use crate::{forest, hall};
 
 /// A generated scene, a walk through it, and the sheets that were put up for it.
 #[derive(Clone, Debug, PartialEq)]

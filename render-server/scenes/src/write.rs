@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use vizflyt_arena::ConfigError;
 use vizflyt_splat::ply;
 
-use crate::Generated;
+use crate::generated::Generated;
 
 /// Where a scene was stored.
 #[derive(Clone, Debug, PartialEq, Eq)]

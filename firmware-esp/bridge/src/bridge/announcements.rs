@@ -13,7 +13,7 @@ use vizflyt_protocol::time::HostTime;
 
 use super::clients::{Client, bit};
 use super::component::{COMPONENT_ID, HEARTBEAT};
-use super::router::{PacketRouter, kind, millis};
+use super::router::{PacketRouter, SECOND_S, kind, millis};
 use crate::access;
 use crate::mavlink_writer::{BridgeMessage, write_message, write_packet};
 use crate::ring::Tag;
@@ -21,8 +21,6 @@ use crate::settings::typed_key;
 
 /// After this silence of clients' TIMESYNC we ask ourselves. [s]
 const SYNC_S: f64 = 2.0;
-/// Heartbeats and reports. [s]
-pub(super) const SECOND_S: f64 = 1.0;
 /// Changes of parameters are kept together after this. [s]
 const SAVE_S: f64 = 1.0;
 /// The password that the bridge made is told this often. [s]

@@ -10,6 +10,7 @@
 //! Every packet that does not go on is counted with its reason ([`Stats`]).
 
 mod announcements;
+mod chip;
 mod clients;
 mod component;
 mod fields;
@@ -28,6 +29,7 @@ use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
 pub use crate::capacity::TCP_SLOTS;
+pub use chip::Chip;
 use clients::Client;
 pub use clients::{CLIENTS, Peer};
 pub use component::{COMPONENT_ID, Event};
@@ -39,15 +41,6 @@ use crate::packet::{CutStats, Cutter, each_in_datagram};
 use crate::page::form::Form;
 use crate::settings::Settings;
 use crate::stats::{RestartCause, Stats};
-
-/// What a bridge knows of the chip it runs on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Chip {
-    /// The radio's address.
-    pub address: [u8; 6],
-    /// Random bytes of this start: nobody guesses the next.
-    pub random: [u8; 16],
-}
 
 /// Silence on the autopilot's port after which a batch goes out. Autopilots write packets whole; a
 /// byte at 57600 baud takes 0.17 ms. [ns]

@@ -8,8 +8,7 @@ use vizflyt_protocol::failsafe::{Failsafe, Flight, is_stream};
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
 
-use super::Chip;
-use super::announcements::SECOND_S;
+use super::chip::Chip;
 use super::clients::{CLIENTS, Client, Peer, bit};
 use super::component::Event;
 use super::parameters::TypedTexts;
@@ -21,6 +20,8 @@ use crate::ring::{Ring, Tag};
 use crate::settings::Settings;
 use crate::stats::{Reason, Sequences, Stats};
 
+/// Between heartbeats, and between reports. [s]
+pub(super) const SECOND_S: f64 = 1.0;
 /// An autopilot silent for this long is gone: three heartbeats. [s]
 const LOST_AFTER_S: f64 = 3.5;
 /// A client silent for this long gives its place to a new one if there is no other. [s]

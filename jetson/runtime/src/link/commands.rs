@@ -5,7 +5,10 @@ use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
 use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
 use vizflyt_protocol::time::HostTime;
 
-use super::messages::is_final;
+/// Whether a retry cannot succeed.
+pub(super) fn is_final(result: MavResult) -> bool {
+    matches!(result, MavResult::MAV_RESULT_UNSUPPORTED)
+}
 
 /// A command to the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -10,7 +10,7 @@
 use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavType};
 use vizflyt_protocol::time::HostTime;
 
-use super::{COMPONENT_ID, SYSTEM_ID};
+use super::identity::{COMPONENT_ID, SYSTEM_ID};
 
 /// What a companion announces itself with, before its name.
 pub(super) const ANNOUNCES: &str = "companion ";

@@ -4,7 +4,11 @@ use std::borrow::Cow;
 
 use vizflyt_protocol::mavlink::SigningFault;
 
-use super::{Delay, FenceEvent, Firmware, ParamEvent, Rate};
+use super::fence::FenceEvent;
+use super::identity::Firmware;
+use super::navigation::Delay;
+use super::params::ParamEvent;
+use super::rates::Rate;
 
 /// Something that happened on the link.
 #[derive(Clone, Debug, PartialEq)]

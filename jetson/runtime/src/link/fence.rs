@@ -7,7 +7,7 @@ use vizflyt_protocol::mavlink::dialect::{MISSION_ACK_DATA, MavMissionResult, Mav
 use vizflyt_protocol::mavlink::{FenceCorner, FenceSide, GlobalPoint, mission_result_name};
 use vizflyt_protocol::time::HostTime;
 
-use super::{COMPONENT_ID, SYSTEM_ID};
+use super::identity::{COMPONENT_ID, SYSTEM_ID};
 
 /// A part of the floor plan that the vehicle must stay in, or out of.
 #[derive(Clone, Debug, PartialEq)]

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use vizflyt_protocol::mavlink::CopterMode;
-use vizflyt_protocol::mavlink::dialect::{EkfStatusFlags, MavResult, MavSysStatusSensor};
+use vizflyt_protocol::mavlink::dialect::{EkfStatusFlags, MavSysStatusSensor};
 use vizflyt_protocol::time::HostTime;
 
 use super::commands::Command;
@@ -14,11 +14,6 @@ use super::{LOST_AFTER_S, Link, events};
 const TEXT_WINDOW_S: f64 = 3.0;
 /// A pre-arm text this old has been taken back: ArduCopter repeats them every 30 s. [s]
 const PREARM_TEXT_S: f64 = 35.0;
-
-/// Whether a retry cannot succeed.
-pub(super) fn is_final(result: MavResult) -> bool {
-    matches!(result, MavResult::MAV_RESULT_UNSUPPORTED)
-}
 
 impl Link {
     /// Returns what arming waits for.

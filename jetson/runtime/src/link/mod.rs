@@ -21,6 +21,8 @@ mod dialect;
 mod distances;
 mod events;
 mod fence;
+mod goal;
+mod identity;
 mod messages;
 mod navigation;
 mod own_mode;
@@ -53,6 +55,8 @@ use companions::Companions;
 use dialect::Dialect;
 pub use events::{LinkEvent, advice};
 pub use fence::{FenceEvent, FencePolygon};
+pub use goal::Goal;
+pub use identity::{COMPONENT_ID, Firmware, SYSTEM_ID};
 use navigation::Feed;
 pub use navigation::{Delay, VISION_HZ};
 use own_mode::OwnMode;
@@ -65,20 +69,6 @@ use signing::Signatures;
 pub use signing::{SigningFile, SigningFileError};
 pub use vizflyt_guardian::port::LinkSigning;
 use vizflyt_guardian::port::Wanted;
-
-/// The state that the link is to reach.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum Goal {
-    /// Watch only: heartbeats, telemetry, origin and external navigation.
-    #[default]
-    Prepare,
-    /// GUIDED, armed, and risen by this much above the ground. [m]
-    TakeOff(f32),
-    /// Stay in GUIDED and follow setpoints.
-    Fly,
-    /// LAND mode, until disarmed. Never given up.
-    Land,
-}
 
 /// Settings of a person.
 #[derive(Clone, Debug)]
@@ -106,22 +96,6 @@ impl LinkSettings {
     }
 }
 
-/// An autopilot's firmware.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Firmware {
-    /// ArduCopter or PX4.
-    pub name: &'static str,
-    /// Major, minor, patch.
-    pub version: (u8, u8, u8),
-}
-
-impl std::fmt::Display for Firmware {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (major, minor, patch) = self.version;
-        write!(f, "{} {major}.{minor}.{patch}", self.name)
-    }
-}
-
 /// One UDP payload.
 #[derive(Clone, Copy, Debug)]
 pub struct Datagram {
@@ -136,12 +110,6 @@ impl std::ops::Deref for Datagram {
         &self.bytes[..self.len]
     }
 }
-
-/// Our system id: the one whose heartbeats ArduCopter's ground station failsafe counts
-/// (`MAV_GCS_SYSID`, default 255).
-pub const SYSTEM_ID: u8 = 255;
-/// Our component: MAV_COMP_ID_ONBOARD_COMPUTER.
-pub const COMPONENT_ID: u8 = 191;
 
 /// Heartbeats, origin and clock requests. [s]
 const SECOND_S: f64 = 1.0;

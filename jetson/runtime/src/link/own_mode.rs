@@ -4,7 +4,7 @@
 
 use vizflyt_protocol::mavlink::CopterMode;
 
-use super::Goal;
+use super::goal::Goal;
 
 /// What heartbeats tell of the mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -19,10 +19,10 @@ use vizflyt_protocol::packet::MAX_IMU;
 use vizflyt_protocol::time::{AutopilotTime, HostTime, OffsetFilter};
 use vizflyt_sdk::ImuSample;
 
-use super::commands::{Command, CommandOutcome};
+use super::commands::{Command, CommandOutcome, is_final};
 use super::params::ParamEvent;
 use super::{
-    COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect, messages,
+    COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect,
 };
 
 /// A boot clock that falls by more than this has restarted. [ms]
@@ -303,7 +303,7 @@ impl Link {
             return self.companions.answer(now, to);
         }
         if ack.command == MavCmd::MAV_CMD_RUN_PREARM_CHECKS {
-            self.prearm.is_unsupported = messages::is_final(ack.result);
+            self.prearm.is_unsupported = is_final(ack.result);
             return;
         }
         match self.commands.handle_ack(now, ack.command, ack.result) {

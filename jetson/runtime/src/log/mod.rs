@@ -14,6 +14,7 @@
 
 mod budget;
 mod channels;
+mod convert;
 pub mod data;
 mod depth;
 mod file;

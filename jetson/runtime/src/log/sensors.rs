@@ -13,7 +13,7 @@ use vizflyt_protocol::sensor::{LidarPoint, RadarDetection, SensorInfo, SensorKin
 use zerocopy::{FromBytes, IntoBytes};
 
 use super::channels::Channel;
-use super::writer::{BODY, parts, timestamp};
+use super::convert::{BODY, parts, timestamp};
 use crate::stream::{NewestReadings, Reading};
 
 /// The sensors of an observation, on their way to the log.

@@ -21,9 +21,10 @@ use vizflyt_rgbd::{ColorMode, EncodeOptions, Encoder, RgbdView, encode_jpeg};
 use vizflyt_sdk::ImuSample;
 
 use super::budget::Budget;
+use super::convert::timestamp;
 use super::file::{self, Disk};
 use super::queue::{LoggedImage, Queue, Record, shown};
-use super::writer::{LogSinks, LogWriter, timestamp};
+use super::writer::{LogSinks, LogWriter};
 use super::{
     Channel, LoggedImages, LoggedSensors, event_record, flight_record, imu_message, line_record,
     plugin_record,

@@ -24,6 +24,7 @@ use zerocopy::IntoBytes;
 
 use super::budget::Budget;
 use super::channels::Channel;
+use super::convert::{BODY, parts, timestamp};
 use super::depth::DepthReader;
 use super::file::{Disk, SafeFile};
 use super::live::Live;
@@ -590,23 +591,11 @@ impl<D: Disk> LogWriter<D> {
 }
 
 const WORLD: &str = "world";
-pub(super) const BODY: &str = "body";
 const ODOM: &str = "odom";
 
 /// Whether images are to be logged with so much room on the disk.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
     free.is_none_or(|free| free >= if they_did { MIN_FREE } else { ENOUGH_FREE })
-}
-
-/// Returns a time since 1970 as Foxglove has it. [ns]
-pub(super) fn timestamp(at_ns: u64) -> fox::Timestamp {
-    let (seconds, nanoseconds) = (at_ns / 1_000_000_000, at_ns % 1_000_000_000);
-    fox::Timestamp::new(u32::try_from(seconds).unwrap_or(u32::MAX), nanoseconds as u32)
-}
-
-pub(super) fn parts<A, B>(pose: &Pose<A, B>) -> (fox::Vector3, fox::Quaternion) {
-    let (p, q) = (pose.translation_m, pose.rotation);
-    (fox::Vector3 { x: p.x, y: p.y, z: p.z }, fox::Quaternion { x: q.x, y: q.y, z: q.z, w: q.w })
 }
 
 fn pose_in_frame<A, B>(at_ns: u64, frame: &str, pose: &Pose<A, B>) -> fox::PoseInFrame {

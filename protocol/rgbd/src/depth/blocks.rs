@@ -1,7 +1,7 @@
 //! Blocks of residuals to and from bits, 16 columns at a time.
 
+use super::layout::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS};
 use super::simd::Kernel;
-use super::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS};
 use crate::bits::{BitReader, BitWriter};
 
 /// One bit stream per column of a block: 16 lanes.

@@ -23,58 +23,18 @@
 
 mod blocks;
 pub mod bound;
+mod layout;
 pub(crate) mod predict;
 pub mod scalar;
 mod simd;
 
 use blocks::{Block, Packer, Shape, Unpacker};
+use layout::{BASES_BYTES, Bases, Layout};
+pub use layout::{BLOCK_COLUMNS, BLOCK_ROWS, STRIPES};
 use predict::{bases, residual_rows};
 use simd::Kernel;
 
 use crate::error::DecodeError;
-
-/// Stripes of an image.
-pub const STRIPES: usize = 8;
-/// Columns of a block.
-pub const BLOCK_COLUMNS: usize = 16;
-/// Rows of a block.
-pub const BLOCK_ROWS: usize = 4;
-const BLOCK_PIXELS: usize = BLOCK_COLUMNS * BLOCK_ROWS;
-
-/// What each stripe starts from.
-type Bases = [u16; STRIPES];
-const BASES_BYTES: usize = 2 * STRIPES;
-
-/// Sizes that follow from the image's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Layout {
-    width: usize,
-    height: usize,
-    /// Columns of a stripe, a multiple of [`BLOCK_COLUMNS`].
-    stripe_columns: usize,
-    /// Columns of all stripes.
-    stride: usize,
-    blocks_across: usize,
-    blocks_down: usize,
-}
-
-impl Layout {
-    fn new(width: usize, height: usize) -> Self {
-        let stripe_columns = width.div_ceil(STRIPES).next_multiple_of(BLOCK_COLUMNS);
-        Self {
-            width,
-            height,
-            stripe_columns,
-            stride: STRIPES * stripe_columns,
-            blocks_across: width.div_ceil(BLOCK_COLUMNS),
-            blocks_down: height.div_ceil(BLOCK_ROWS),
-        }
-    }
-
-    fn blocks(&self) -> usize {
-        self.blocks_across * self.blocks_down
-    }
-}
 
 /// Encodes depth; owns the scratch memory.
 #[derive(Clone, Debug, Default)]

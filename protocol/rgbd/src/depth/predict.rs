@@ -1,6 +1,6 @@
 //! Prediction while encoding: all neighbours are known, so each row is one vectorised loop.
 
-use super::{BLOCK_ROWS, Bases, Layout};
+use super::layout::{BLOCK_ROWS, Bases, Layout};
 
 /// Returns the median edge detector's prediction. With `c` the corner clamped between left and
 /// upper, `left + upper - c` is their lesser or greater one at an edge and the plane through the

@@ -1,8 +1,9 @@
 //! The reference: the format a pixel and a bit at a time.
 
+use super::Parts;
 use super::blocks::Shape;
+use super::layout::{BLOCK_COLUMNS, BLOCK_ROWS, Bases, Layout};
 use super::predict::{bases, med, unzigzag, zigzag};
-use super::{BLOCK_COLUMNS, BLOCK_ROWS, Bases, Layout, Parts};
 use crate::error::DecodeError;
 
 /// Appends the encoding of a row-major image to `out`. [mm]

@@ -13,7 +13,8 @@
 )]
 
 use super::blocks::{Block, Lanes, Shape};
-use super::{BLOCK_COLUMNS, DepthDecoder, DepthEncoder, Layout, Parts, STRIPES};
+use super::layout::{BLOCK_COLUMNS, Layout, STRIPES};
+use super::{DepthDecoder, DepthEncoder, Parts};
 
 /// What a machine's vectors do.
 pub(super) trait Kernel {
@@ -174,8 +175,8 @@ mod kernel {
         _mm_unpacklo_epi32, _mm_unpacklo_epi64, _mm_xor_si128,
     };
 
-    use super::super::BLOCK_ROWS;
     use super::super::blocks::{Block, Lanes, Shape};
+    use super::super::layout::BLOCK_ROWS;
     use super::{Kernel, STRIPES, Square, longest};
 
     #[inline(always)]

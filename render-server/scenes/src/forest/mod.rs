@@ -19,8 +19,8 @@ use vizflyt_arena::config::{
 use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::messages::Limits;
 
-use crate::Generated;
 use crate::canvas::Canvas;
+use crate::generated::Generated;
 use crate::parts::{PartClass, Parts};
 use crate::solids::Solids;
 use crate::staging::{Stage, Staging};

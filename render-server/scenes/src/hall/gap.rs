@@ -3,8 +3,8 @@
 use glam::{DVec2, DVec3};
 use vizflyt_arena::config::StageConfig;
 
+use super::dimensions::{NET_MAX_M, NET_MIN_M};
 use super::panel::{Block, Grain, INSET_M, Look, Painter, Panel};
-use super::shell::{NET_MAX_M, NET_MIN_M};
 use super::texture;
 use crate::canvas::{Patch, paint};
 use crate::random::Rng;

@@ -4,7 +4,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
 
-use super::shell::{HALL_MAX_M, HALL_MIN_M, WINDOWS};
+use super::dimensions::{HALL_MAX_M, HALL_MIN_M, LAMPS_M, TUBE_HALF_M, WINDOWS};
 use crate::random::Rng;
 use crate::solids::Solids;
 
@@ -112,19 +112,6 @@ impl Caster {
     }
 }
 
-/// Middles of the ceiling tubes. [m, world]
-pub(crate) const LAMPS_M: [DVec2; 8] = [
-    DVec2::new(-0.5, -1.6),
-    DVec2::new(3.5, -1.6),
-    DVec2::new(7.5, -1.6),
-    DVec2::new(11.5, -1.6),
-    DVec2::new(-0.5, 1.6),
-    DVec2::new(3.5, 1.6),
-    DVec2::new(7.5, 1.6),
-    DVec2::new(11.5, 1.6),
-];
-/// Half the length of a tube. [m]
-pub(crate) const TUBE_HALF_M: f64 = 0.75;
 const TUBE: DVec3 = DVec3::new(3.7, 3.55, 3.25);
 const SUN: DVec3 = DVec3::new(3.0, 2.5, 1.75);
 const BOUNCE: DVec3 = DVec3::new(0.36, 0.345, 0.315);

@@ -4,6 +4,7 @@
 //! boxes; [`light`] answers how much light arrives at a point; [`panel`] covers every face with
 //! Gaussians as fine as its [`texture`] needs.
 
+mod dimensions;
 mod furniture;
 mod gap;
 mod gate;
@@ -24,20 +25,21 @@ use vizflyt_arena::pose::PoseConfig;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::Limits;
 
-use crate::Generated;
 use crate::canvas::{Canvas, paint};
 use crate::forest::front_camera;
+use crate::generated::Generated;
 use crate::parts::{PartClass, Parts};
 use crate::random::{Rng, fractal2, noise2};
 use crate::solids::Solids;
 use crate::staging::{Stage, Staging};
+use dimensions::{NET_MAX_M, NET_MIN_M};
 use gap::GapWall;
 use gate::Gate;
 use light::HallLight;
 use moving::{GeneratedMover, HAND_M, Movers};
 use panel::{Block, Grain, Look, Painter};
 use pillars::Pillars;
-use shell::{NET_MAX_M, NET_MIN_M, Shell};
+use shell::Shell;
 
 /// What stands in the net, along the flight in this order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]

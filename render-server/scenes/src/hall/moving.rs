@@ -7,9 +7,9 @@ use vizflyt_protocol::geometry::{Object, Pose, Volume, World};
 use vizflyt_splat::builtin_models::{QUADROTOR, boxes};
 use vizflyt_splat::{RigidObject, Splats};
 
+use super::dimensions::{NET_MAX_M, NET_MIN_M};
 use super::gate::Gate;
 use super::panel::{Block, Grain, Look, Painter};
-use super::shell::{NET_MAX_M, NET_MIN_M};
 use crate::canvas::paint;
 use crate::random::Rng;
 

@@ -2,8 +2,8 @@
 
 use glam::{DQuat, DVec2, DVec3};
 
+use super::dimensions::{NET_MAX_M, NET_MIN_M};
 use super::panel::{Block, Grain, Look, Painter};
-use super::shell::{NET_MAX_M, NET_MIN_M};
 use crate::canvas::paint;
 use crate::parts::{PartClass, Parts};
 use crate::random::{Rng, noise2};

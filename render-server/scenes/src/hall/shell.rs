@@ -4,49 +4,14 @@
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
 
+use super::dimensions::{
+    HALL_MAX_M, HALL_MIN_M, LAMPS_M, NET_MAX_M, NET_MIN_M, TUBE_HALF_M, WINDOWS,
+};
 use super::furniture::Furniture;
-use super::light::{LAMPS_M, TUBE_HALF_M};
 use super::panel::{Block, Grain, INSET_M, Look, Painter, Panel};
 use super::texture;
 use crate::canvas::{Patch, paint};
 use crate::random::{fractal2, noise2, smoothstep};
-
-/// Inside of the hall's walls. [m, world]
-pub(crate) const HALL_MIN_M: DVec3 = DVec3::new(-3.0, -5.0, 0.0);
-/// Inside of the hall's walls and ceiling. [m, world]
-pub(crate) const HALL_MAX_M: DVec3 = DVec3::new(14.0, 5.0, 5.0);
-/// The netted flight space: 11 x 4.5 x 3.65 m. [m, world]
-pub(crate) const NET_MIN_M: DVec3 = DVec3::new(0.0, -2.25, 0.0);
-/// The netted flight space. [m, world]
-pub(crate) const NET_MAX_M: DVec3 = DVec3::new(11.0, 2.25, 3.65);
-
-/// A window of the north wall, in metres along the wall from its west end and up.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Window {
-    min_m: DVec2,
-    max_m: DVec2,
-}
-
-/// The windows.
-pub(crate) const WINDOWS: [Window; 4] =
-    [Window::at(1.2), Window::at(5.2), Window::at(9.2), Window::at(13.2)];
-
-impl Window {
-    const fn at(left_m: f64) -> Self {
-        Self { min_m: DVec2::new(left_m, 1.5), max_m: DVec2::new(left_m + 2.6, 4.1) }
-    }
-
-    fn contains(&self, p: DVec2, margin_m: f64) -> bool {
-        p.cmpge(self.min_m - margin_m).all() && p.cmple(self.max_m + margin_m).all()
-    }
-
-    /// Whether light passes at a point of the wall: within the window, beside its bars.
-    pub(crate) fn is_pane(&self, p: DVec2) -> bool {
-        let across = (p - self.min_m) / (self.max_m - self.min_m);
-        let bar = |t: f64| (t - t.round()).abs() < 0.055;
-        self.contains(p, 0.0) && !bar(across.x * 3.0) && !bar(across.y * 2.0)
-    }
-}
 
 /// The hall of a seed.
 pub(crate) struct Shell {

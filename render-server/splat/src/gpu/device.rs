@@ -11,7 +11,7 @@ use std::pin::pin;
 use std::sync::{Arc, OnceLock};
 use std::task::{Context, Poll, Waker};
 
-use super::Budget;
+use super::limits::Budget;
 
 /// What adapters are there, for reports.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -22,6 +22,7 @@ mod blend;
 mod buffers;
 mod cull;
 mod device;
+mod limits;
 mod project;
 mod read;
 mod scene;
@@ -37,6 +38,8 @@ pub use device::{Adapter, AdapterName};
 
 use buffers::{Buffers, Capacity};
 use device::Device;
+pub use limits::Budget;
+use limits::TILE_PX;
 use read::{Staging, Stamps};
 use scene::GpuScene;
 use view::{GpuView, ImageOffset, Tick};
@@ -46,33 +49,11 @@ use vizflyt_protocol::geometry::Intrinsics;
 use crate::rasterizer::{self, PassTimes, Rasterizer, RenderError, Workload};
 use crate::{Camera, CpuRenderer, Placement, RgbdImage, Scene};
 
-/// Side of a tile; `TILE` in `common.wgsl`. [px]
-const TILE_PX: u32 = 16;
 /// Ticks that may be under way at once.
 const MAX_IN_FLIGHT: usize = 2;
 /// Cameras of a tick: what `Cover` of `cover.wgsl` has bits for; as for tiles along an image's side.
 const MAX_CAMERAS: usize = 1 << 12;
 const _: () = assert!(Intrinsics::MAX_SIDE_PX.div_ceil(TILE_PX) < 1 << 10);
-
-/// What a renderer may use and starts with; the defaults suit every scene.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Budget {
-    /// Greatest size of a buffer that shaders see; the adapter's own limit holds too.
-    pub binding_bytes: u64,
-    /// Regions of 256 slots to begin with; grown where an image needs more.
-    pub regions: u32,
-    /// (Tile, splat) pairs to begin with; grown where an image needs more.
-    pub pairs: u32,
-    /// Whether pixels are written to the host's memory, if the adapter can; else they are copied there.
-    pub writes_to_host: bool,
-}
-
-impl Default for Budget {
-    /// 70 MB of slots, 32 MB of pairs.
-    fn default() -> Self {
-        Self { binding_bytes: u64::MAX, regions: 4096, pairs: 1 << 21, writes_to_host: true }
-    }
-}
 
 /// Renders a scene with a graphics card.
 #[derive(Debug)]

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Distortion, Frame, Intrinsics, Pose};
 use zerocopy::{Immutable, IntoBytes};
 
-use super::TILE_PX;
+use super::limits::TILE_PX;
 use crate::limits::BLUR_PX2;
 use crate::{Atmosphere, Camera};
 

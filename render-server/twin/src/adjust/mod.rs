@@ -13,6 +13,7 @@ mod known;
 mod matrix;
 mod normal;
 mod project;
+mod robust;
 mod rolling;
 mod solve;
 mod start;

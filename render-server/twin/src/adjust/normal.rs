@@ -9,8 +9,9 @@ use rayon::prelude::*;
 use super::capture::Capture;
 use super::matrix::{Symmetric, orthonormal};
 use super::project::{LENS, Projected};
+use super::robust::{INSET_PX, weight};
 use super::rolling::{READOUT_S, Slopes};
-use super::solve::{INSET_PX, Problem, weight};
+use super::solve::Problem;
 use super::state::{State, TagPlace, inwards};
 
 /// Matrix and gradient, and what it all costs.

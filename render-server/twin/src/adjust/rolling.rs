@@ -9,7 +9,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose, World};
 
 use super::capture::Capture;
-use super::solve::median;
+use super::robust::median;
 
 /// How rows follow each other, and how the camera moves meanwhile.
 #[derive(Clone, Debug)]

@@ -8,6 +8,7 @@ use super::capture::{Capture, TagSighting};
 use super::matrix::Factor;
 use super::normal::{Layout, Normal, normal, points_step};
 use super::project::{LENS, moved};
+use super::robust::{INSET_PX, loss, median, weight};
 use super::rolling::{MOST_READOUT_S, READOUT_S};
 use super::state::{State, TagPlace};
 use super::{AdjustError, Known, Options};
@@ -82,16 +83,6 @@ impl Noise {
     pub(super) fn place_weight(&self, off_m: f64, sigma_m: f64) -> f64 {
         weight(off_m, sigma_m * self.place_factor)
     }
-}
-
-pub(super) fn weight(off: f64, sigma: f64) -> f64 {
-    let share = (off / (LOSS_SIGMAS * sigma)).powi(2);
-    1.0 / (sigma * sigma * (1.0 + share))
-}
-
-fn loss(off: f64, sigma: f64) -> f64 {
-    let c2 = LOSS_SIGMAS * LOSS_SIGMAS;
-    c2 * ((off / sigma).powi(2) / c2).ln_1p()
 }
 
 impl<'a> Problem<'a> {
@@ -379,13 +370,6 @@ pub(super) fn stepped(state: &State, layout: &Layout, change: &[f64], points: &[
     }
 }
 
-/// Returns the median; `None` of nothing.
-pub(super) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut sorted: Vec<f64> = values.collect();
-    let middle = sorted.len() / 2;
-    (!sorted.is_empty()).then(|| *sorted.select_nth_unstable_by(middle, f64::total_cmp).1)
-}
-
 /// From a pixel to the least sigma, and some more.
 const MAX_NOISES: usize = 8;
 const SHARPER: f64 = 0.4;
@@ -397,9 +381,5 @@ const GIVE_UP: f64 = 1e8;
 const ALMOST_NONE: f64 = 1e-8;
 /// What is behind its camera counts as. [px]
 const BEHIND_PX: f64 = 1e4;
-/// Where Cauchy's loss bends: of sigmas.
-const LOSS_SIGMAS: f64 = 3.0;
-/// How far inside corners of tags are found, before they are looked at: one sigma, from images of our own detector. [px]
-pub(super) const INSET_PX: f64 = 0.15;
 /// Nothing is found in an image better than this. [px]
 const LEAST_PX: f64 = 0.02;
