@@ -167,6 +167,8 @@ STAGES = [
           ["jetson/tags", "jetson/cli/src/tags", "tests/tags"]),
     Stage("dataset", "data sets against pycocotools", HEAVY, COMPUTE, f"tests/dataset/run {PROGRAM}", 20, [VENV],
           ["render-server/studio/src/labels", "render-server/studio/src/dataset", "tests/dataset"]),
+    Stage("site", "documentation site", HEAVY, COMPUTE, f"docs/site/build {PROGRAM}", 40, [VENV],
+          ["docs", "jetson/python/python"]),
     # --- heavy: clock
     Stage("seeds", "the forest, flown live over twenty seeds", HEAVY, CLOCK, f"tests/rust/test '{LONG}'", 105, [],
           ["jetson/plugins/avoid", "jetson/runtime/src/control", "jetson/runtime/src/companion",

@@ -1,0 +1,92 @@
+#!/usr/bin/env python3
+"""Prepares the sources of the documentation site: the documents, with links to other files of the repository led there, and the
+pages that are generated: the help of every command, and the Python package's reference.
+
+docs/site/prepare.py VIZFLYT FOLDER
+"""
+
+import os
+import pathlib
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+
+SITE = pathlib.Path(__file__).resolve().parent
+ROOT = SITE.parents[1]
+REPOSITORY = "https://github.com/vizflyt/vizflyt"
+LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+CODE = re.compile(r"(^(?:```|~~~).*?^(?:```|~~~)[^\n]*$|`[^`\n]*`)", re.M | re.S)
+PYTHON = """# Python API
+
+The package `vizflyt`: `pip install` the wheel, or `pip install ./jetson/python` from the sources.
+
+::: vizflyt
+
+::: vizflyt.gym
+"""
+
+
+def led(name: str, text: str) -> str:
+    """Returns a document with its links to files outside `docs` led to the repository."""
+    folder = posixpath.dirname(name)
+
+    def lead(match: re.Match[str]) -> str:
+        begin, target, anchor, end = match.groups()
+        path = posixpath.normpath(posixpath.join(folder, target))
+        if re.match(r"[a-z]+:", target) or path.startswith("docs/") and (ROOT / path).is_file():
+            return match[0]
+        kind = "tree" if (ROOT / path).is_dir() else "blob"
+        return f"{begin}{REPOSITORY}/{kind}/main/{path}{anchor or ''}{end}"
+
+    # Odd parts are code.
+    parts = CODE.split(text)
+    return "".join(part if index % 2 else LINK.sub(lead, part) for index, part in enumerate(parts))
+
+
+def commands(program: str) -> str:
+    """Returns a page with the help of every command."""
+    parts = ["# Commands\n\nThe help of each command, as `vizflyt COMMAND --help` prints it.\n"]
+
+    def add(*names: str) -> None:
+        text = subprocess.run(
+            [program, *names, "--help"], check=True, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"}
+        ).stdout
+        level = "#" * min(max(len(names), 1) + 1, 4)
+        parts.append(f"{level} {' '.join(('vizflyt', *names))}\n\n```text\n{text.rstrip()}\n```\n")
+        section = re.search(r"^Commands:\n(.*?)(?:^\S|\Z)", text, re.M | re.S)
+        for name in re.findall(r"^  ([a-z][\w-]*)", section[1], re.M) if section else []:
+            if name != "help":
+                add(*names, name)
+
+    add()
+    return "\n".join(parts)
+
+
+def main() -> None:
+    program, folder = sys.argv[1], pathlib.Path(sys.argv[2])
+    shutil.rmtree(folder, ignore_errors=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "docs"],
+        cwd=ROOT, check=True, capture_output=True, text=True,
+    ).stdout.splitlines()
+    for name in listed:
+        source, target = ROOT / name, folder / name
+        if name.startswith("docs/site/") or not source.exists():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith(".md"):
+            target.write_text(led(name, source.read_text()))
+        else:
+            shutil.copy(source, target)
+    reference = folder / "docs/reference"
+    reference.mkdir(exist_ok=True)
+    (reference / "cli.md").write_text(commands(program))
+    (reference / "python.md").write_text(PYTHON)
+    config = (SITE / "mkdocs.yml").read_text()
+    (folder / "mkdocs.yml").write_text(config.replace("PYTHON_PACKAGE", str(ROOT / "jetson/python/python")))
+
+
+if __name__ == "__main__":
+    main()
