@@ -220,46 +220,78 @@ pub struct Lagging {
 /// The guard of one flight.
 #[derive(Clone, Debug)]
 pub struct Guard {
+    rules: Rules,
+    sight: Sight,
+    request: Request,
+    command: Command,
+    end: End,
+}
+
+/// What holds for the whole flight.
+#[derive(Clone, Debug)]
+struct Rules {
     fence: Fence,
     max_speed_mps: f64,
-    /// What is left of it by the age of what the plugin sees.
+    /// Bounds acceleration, and by it the tilt.
+    max_acceleration_mps2: f64,
+    /// Height of the vehicle when the plugin took over. [m, world]
+    take_off_z_m: f64,
+    /// Kinds of setpoint that the course permits.
+    allowed: SetpointKinds,
+    pose_ages: PoseAges,
+}
+
+/// How well the plugin sees, and how well the vehicle answers.
+#[derive(Clone, Debug)]
+struct Sight {
+    /// The speed limit that the age of the plugin's images leaves.
     speed_limit_mps: f64,
-    /// When the pose was measured behind what the plugin has answered last; none: not known.
+    /// When the pose behind the image that the plugin has answered last was measured; `None` if unknown.
     seen_at: Option<HostTime>,
-    /// Since when that has been too old.
+    /// Since when that image has been too old.
     blind_since: Option<HostTime>,
-    /// When the pose became too unsure.
+    /// Since when the pose has been too uncertain.
     unsure_since: Option<HostTime>,
     slowed: Option<Slowed>,
-    /// How the vehicle answers.
+    /// The vehicle's response to commands.
     answers: Answers,
-    /// What keeps the limits of acceleration and of tilt.
-    max_acceleration_mps2: f64,
-    /// The last command; the slew limit counts from it. [m/s, world]
-    v_command_mps: DVec3,
+}
+
+/// The plugin's newest setpoint.
+#[derive(Clone, Debug)]
+struct Request {
+    setpoint: Option<Setpoint>,
+    /// `setpoint` in the world, once the vehicle's position was known.
+    resolved: Resolved,
+    /// The drift added to positions where the course withholds the pose.
+    slip: Option<Slip>,
+    /// When the setpoint came, or the plugin took over.
+    at: HostTime,
+}
+
+/// The newest command to the autopilot.
+#[derive(Clone, Debug)]
+struct Command {
+    /// The slew limit counts from it. [m/s, world]
+    v_world_mps: DVec3,
     /// Heading to send: an angle or a rate.
     yaw: YawTarget,
     /// The heading that [`YawTarget::Keep`] keeps, from when it was first requested. [rad]
     kept_yaw_rad: Option<f64>,
     hold_point_m: Option<DVec3>,
-    setpoint: Option<Setpoint>,
-    /// `setpoint` in the world, once the vehicle's position was known.
-    resolved: Resolved,
-    /// How it slips, where the course withholds the pose.
-    slip: Option<Slip>,
-    /// Where the vehicle was when the plugin took over. [m, world]
-    take_off_z_m: f64,
-    allowed: SetpointKinds,
-    pose_ages: PoseAges,
-    /// When the newest setpoint came, or the plugin took over.
-    setpoint_at: HostTime,
-    ticked_at: HostTime,
+    /// When it was made.
+    at: HostTime,
+    /// Whether the fence limited it.
+    fence_stops: bool,
+}
+
+/// How the flight ends, once it does.
+#[derive(Clone, Debug, Default)]
+struct End {
     /// Set when the flight is to end in order: when braking ends.
     ending_until: Option<HostTime>,
     /// Set while the plugin is started again: when the wait ends.
     restarting_until: Option<HostTime>,
-    /// The fence limited the plugin's setpoint in the last tick.
-    fence_stops: bool,
     landing: Option<LandReason>,
 }
 
@@ -275,31 +307,37 @@ impl Guard {
     ) -> Self {
         let max_acceleration_mps2 = limits::acceleration_within_tilt_mps2(&arena.limits);
         Self {
-            fence: Fence::new(arena, max_acceleration_mps2),
-            max_speed_mps: arena.limits.max_speed_mps,
-            speed_limit_mps: arena.limits.max_speed_mps,
-            seen_at: None,
-            blind_since: None,
-            unsure_since: None,
-            slowed: None,
-            answers: Answers::new(response, vehicle.v_world_mps, max_acceleration_mps2),
-            max_acceleration_mps2,
-            v_command_mps: vehicle.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
-            yaw: YawTarget::Angle(vehicle.yaw_rad()),
-            kept_yaw_rad: Some(vehicle.yaw_rad()),
-            hold_point_m: None,
-            setpoint: None,
-            resolved: Resolved::Nothing,
-            slip: (!arena.ground_truth).then(|| Slip::new(slip_seed)),
-            take_off_z_m: vehicle.p_world_m.z,
-            allowed: arena.setpoints,
-            pose_ages: arena.pose_ages,
-            setpoint_at: now,
-            ticked_at: now,
-            ending_until: None,
-            restarting_until: None,
-            fence_stops: false,
-            landing: None,
+            rules: Rules {
+                fence: Fence::new(arena, max_acceleration_mps2),
+                max_speed_mps: arena.limits.max_speed_mps,
+                max_acceleration_mps2,
+                take_off_z_m: vehicle.p_world_m.z,
+                allowed: arena.setpoints,
+                pose_ages: arena.pose_ages,
+            },
+            sight: Sight {
+                speed_limit_mps: arena.limits.max_speed_mps,
+                seen_at: None,
+                blind_since: None,
+                unsure_since: None,
+                slowed: None,
+                answers: Answers::new(response, vehicle.v_world_mps, max_acceleration_mps2),
+            },
+            request: Request {
+                setpoint: None,
+                resolved: Resolved::Nothing,
+                slip: (!arena.ground_truth).then(|| Slip::new(slip_seed)),
+                at: now,
+            },
+            command: Command {
+                v_world_mps: vehicle.v_world_mps.clamp_length_max(arena.limits.max_speed_mps),
+                yaw: YawTarget::Angle(vehicle.yaw_rad()),
+                kept_yaw_rad: Some(vehicle.yaw_rad()),
+                hold_point_m: None,
+                at: now,
+                fence_stops: false,
+            },
+            end: End::default(),
         }
     }
 
@@ -315,14 +353,14 @@ impl Guard {
     ) -> Result<(), InvalidSetpoint> {
         setpoint.check()?;
         let setpoint = limits::bound_components(setpoint);
-        let allowed = self.allowed;
+        let allowed = self.rules.allowed;
         if let Some(asked) = SetpointKind::of(&setpoint).filter(|&kind| !allowed.contains(kind)) {
             return Err(InvalidSetpoint::NotAllowed { asked, allowed });
         }
-        if self.slip.is_some() && setpoint.is_in_world_axes() {
+        if self.request.slip.is_some() && setpoint.is_in_world_axes() {
             return Err(InvalidSetpoint::WorldAxes);
         }
-        let goes_on = match (&setpoint, &self.resolved, &self.setpoint) {
+        let goes_on = match (&setpoint, &self.request.resolved, &self.request.setpoint) {
             (Setpoint::Trajectory(new), Resolved::Path(follower), _) => {
                 *new == *follower.trajectory()
             }
@@ -331,126 +369,128 @@ impl Guard {
             _ => false,
         };
         if !goes_on {
-            self.resolved = Resolved::Nothing;
-            self.slip.iter_mut().for_each(Slip::restart);
+            self.request.resolved = Resolved::Nothing;
+            self.request.slip.iter_mut().for_each(Slip::restart);
         }
-        self.setpoint = Some(setpoint);
-        self.setpoint_at = now;
-        self.restarting_until = None;
+        self.request.setpoint = Some(setpoint);
+        self.request.at = now;
+        self.end.restarting_until = None;
         Ok(())
     }
 
     /// Takes note that the plugin replied to an image at `now` without a setpoint: a trajectory that
     /// is not over stays in force.
     pub fn handle_empty_reply(&mut self, now: HostTime) {
-        let is_under_way = match (&self.setpoint, &self.resolved) {
+        let is_under_way = match (&self.request.setpoint, &self.request.resolved) {
             (Some(Setpoint::Trajectory(_)), Resolved::Path(follower)) => !follower.is_over(),
             (Some(Setpoint::Trajectory(_)), _) => true,
             _ => false,
         };
         if is_under_way {
-            self.setpoint_at = now;
+            self.request.at = now;
         }
     }
 
     /// Lands now. Final.
     pub fn land(&mut self) {
-        self.landing.get_or_insert(LandReason::Ordered);
+        self.end.landing.get_or_insert(LandReason::Ordered);
     }
 
     /// Holds until the plugin, being started again, sends a setpoint; lands if it does not within
     /// [`RESTART_WITHIN_S`].
     pub fn wait_for_plugin(&mut self, now: HostTime) {
-        (self.setpoint, self.setpoint_at) = (None, now);
-        self.resolved = Resolved::Nothing;
-        self.restarting_until = Some(now.plus_seconds(RESTART_WITHIN_S));
+        (self.request.setpoint, self.request.at) = (None, now);
+        self.request.resolved = Resolved::Nothing;
+        self.end.restarting_until = Some(now.plus_seconds(RESTART_WITHIN_S));
     }
 
     /// Brakes, then lands. Final; [`Self::land`] still cuts the braking short.
     pub fn brake_and_land(&mut self, now: HostTime) {
-        self.ending_until.get_or_insert(now.plus_seconds(MAX_BRAKING_S));
+        self.end.ending_until.get_or_insert(now.plus_seconds(MAX_BRAKING_S));
     }
 
     /// Takes when the pose was measured behind what the plugin has answered last: speed falls with its age. `None`
     /// leaves it as it is.
     pub fn see(&mut self, seen_at: Option<HostTime>) {
-        self.seen_at = seen_at.or(self.seen_at);
+        self.sight.seen_at = seen_at.or(self.sight.seen_at);
     }
 
     /// Returns how old images slow down the plugin's setpoint, if much.
     pub fn slowed(&self) -> Option<Slowed> {
-        self.slowed
+        self.sight.slowed
     }
 
     /// Returns how the vehicle answers, if that lowers the speed limit.
     pub fn lagging(&self) -> Option<Lagging> {
-        let (response, measured) = (self.answers.response(), self.answers.is_measured());
+        let (response, measured) =
+            (self.sight.answers.response(), self.sight.answers.is_measured());
         let share = share_of_lag(response);
         (share < 1.0).then_some(Lagging { response, measured, share })
     }
 
     /// Whether the fence limits the plugin's setpoint.
     pub fn fence_stops(&self) -> bool {
-        self.fence_stops
+        self.command.fence_stops
     }
 
     /// Returns what to send at `now`, from the newest motion of the vehicle, and the mode.
     pub fn tick(&mut self, now: HostTime, vehicle: &VehicleMotion) -> (GuardOutput, GuardMode) {
-        let dt_s = now.seconds_since(self.ticked_at).clamp(0.0, MAX_TICK_S);
-        self.ticked_at = now;
-        self.slip.iter_mut().for_each(|slip| slip.advance(vehicle.p_world_m));
-        let sight_age_s = self.seen_at.map_or(0.0, |at| now.seconds_since(at));
+        let dt_s = now.seconds_since(self.command.at).clamp(0.0, MAX_TICK_S);
+        self.command.at = now;
+        self.request.slip.iter_mut().for_each(|slip| slip.advance(vehicle.p_world_m));
+        let sight_age_s = self.sight.seen_at.map_or(0.0, |at| now.seconds_since(at));
         let share = if sight_age_s > SIGHT_FRESH_S { SIGHT_FRESH_S / sight_age_s } else { 1.0 };
-        self.answers.watch(self.v_command_mps, vehicle.v_world_mps, dt_s);
-        let response = self.answers.response();
-        self.speed_limit_mps = self.max_speed_mps * share * share_of_lag(response);
+        self.sight.answers.watch(self.command.v_world_mps, vehicle.v_world_mps, dt_s);
+        let response = self.sight.answers.response();
+        self.sight.speed_limit_mps = self.rules.max_speed_mps * share * share_of_lag(response);
         let is_unsure = vehicle.off_m() > MARGIN_M;
-        self.unsure_since = is_unsure.then(|| self.unsure_since.unwrap_or(now));
-        self.blind_since = (sight_age_s > SIGHT_HOLD_S).then(|| self.blind_since.unwrap_or(now));
+        self.sight.unsure_since = is_unsure.then(|| self.sight.unsure_since.unwrap_or(now));
+        self.sight.blind_since =
+            (sight_age_s > SIGHT_HOLD_S).then(|| self.sight.blind_since.unwrap_or(now));
         let mode = self.mode(now, vehicle);
         let v_target = match mode {
             GuardMode::Landing(reason) => {
-                self.landing = Some(reason);
+                self.end.landing = Some(reason);
                 return (GuardOutput::Land, mode);
             }
             GuardMode::Holding(reason) => {
-                if let Resolved::Attitude(_) = self.resolved {
+                if let Resolved::Attitude(_) = self.request.resolved {
                     // The vehicle's attitude changes while it is held.
-                    self.resolved = Resolved::Nothing;
+                    self.request.resolved = Resolved::Nothing;
                 }
                 self.hold_velocity(vehicle, reason)
             }
             GuardMode::Following => {
-                self.hold_point_m = None;
+                self.command.hold_point_m = None;
                 self.setpoint_velocity(vehicle, dt_s)
             }
         };
-        let slew_mps = self.max_acceleration_mps2 * dt_s;
+        let slew_mps = self.rules.max_acceleration_mps2 * dt_s;
         let is_slowed = mode == GuardMode::Following
             && share < SLOWED_NOTICE
-            && v_target.length() > self.speed_limit_mps;
-        self.slowed = is_slowed.then_some(Slowed { age_s: sight_age_s, share });
-        let v_target = v_target.clamp_length_max(self.speed_limit_mps);
+            && v_target.length() > self.sight.speed_limit_mps;
+        self.sight.slowed = is_slowed.then_some(Slowed { age_s: sight_age_s, share });
+        let v_target = v_target.clamp_length_max(self.sight.speed_limit_mps);
         // A turn waits for a vehicle that cannot follow it: what it has to change along a face is missing for stopping
         // before it. To slow down, all that is allowed is asked for.
         let followed_mps2 = response.acceleration_mps2.max(LEAST_FOLLOWED_MPS2);
-        let slows = v_target.length() < self.v_command_mps.length();
+        let slows = v_target.length() < self.command.v_world_mps.length();
         let asked_mps = if slows { slew_mps } else { slew_mps.min(followed_mps2 * dt_s) };
-        let change = (v_target - self.v_command_mps).clamp_length_max(asked_mps);
-        let v_slewed = self.v_command_mps + change;
+        let change = (v_target - self.command.v_world_mps).clamp_length_max(asked_mps);
+        let v_slewed = self.command.v_world_mps + change;
         // Where the vehicle is now, not when the pose was measured.
         let age_s = vehicle.age_s(now).clamp(0.0, MAX_EXTRAPOLATION_S);
         let p_now = vehicle.p_world_m + vehicle.v_world_mps * age_s;
         // The fence comes last: where it and the slew limit disagree, it wins, at flat faces within bounds.
-        let (v_mps, a_mps2) = (vehicle.v_world_mps, self.answers.a_mps2());
+        let (v_mps, a_mps2) = (vehicle.v_world_mps, self.sight.answers.a_mps2());
         let momentum = Momentum { v_mps, a_mps2, response };
         let v_inside = self.within_bounds(p_now, v_slewed, &momentum, slew_mps);
-        self.fence_stops = mode == GuardMode::Following
+        self.command.fence_stops = mode == GuardMode::Following
             && v_inside != v_slewed
             && (v_target - v_inside).length() > FENCE_NOTICE_MPS;
-        self.v_command_mps = v_inside.clamp_length_max(self.max_speed_mps);
-        let motion = GuidedMotion::Velocity(self.v_command_mps);
-        (GuardOutput::Guided(GuidedSetpoint { motion, yaw: self.yaw }), mode)
+        self.command.v_world_mps = v_inside.clamp_length_max(self.rules.max_speed_mps);
+        let motion = GuidedMotion::Velocity(self.command.v_world_mps);
+        (GuardOutput::Guided(GuidedSetpoint { motion, yaw: self.command.yaw }), mode)
     }
 
     /// Returns what the fence leaves of `v_slewed` [m/s, world]. At flat faces it takes back speed by [`FENCE_EXCESS`] of
@@ -462,71 +502,71 @@ impl Guard {
         momentum: &Momentum,
         slew_mps: f64,
     ) -> DVec3 {
-        let v_inside = self.fence.limit(p_m, v_slewed, momentum);
-        let (change, most) = (v_inside - self.v_command_mps, FENCE_EXCESS * slew_mps);
-        if change.length() <= most || !self.fence.is_flat() {
+        let v_inside = self.rules.fence.limit(p_m, v_slewed, momentum);
+        let (change, most) = (v_inside - self.command.v_world_mps, FENCE_EXCESS * slew_mps);
+        if change.length() <= most || !self.rules.fence.is_flat() {
             return v_inside;
         }
-        let v_braked = self.fence.limit(p_m, self.v_command_mps, momentum);
-        let braking = (v_braked - self.v_command_mps).clamp_length_max(most);
+        let v_braked = self.rules.fence.limit(p_m, self.command.v_world_mps, momentum);
+        let braking = (v_braked - self.command.v_world_mps).clamp_length_max(most);
         let rest = (change - braking).clamp_length_max((most - braking.length()).max(0.0));
-        self.v_command_mps + braking + rest
+        self.command.v_world_mps + braking + rest
     }
 
     fn mode(&self, now: HostTime, vehicle: &VehicleMotion) -> GuardMode {
-        if let Some(reason) = self.landing {
+        if let Some(reason) = self.end.landing {
             return GuardMode::Landing(reason);
         }
         let overdue_s = vehicle.overdue_s(now);
-        if overdue_s > self.pose_ages.land_after_s {
+        if overdue_s > self.rules.pose_ages.land_after_s {
             return GuardMode::Landing(LandReason::PoseLost(vehicle.age_s(now)));
         }
-        if let Some(since) = self.unsure_since
-            && now.seconds_since(since) > self.pose_ages.land_after_s
+        if let Some(since) = self.sight.unsure_since
+            && now.seconds_since(since) > self.rules.pose_ages.land_after_s
         {
             return GuardMode::Landing(LandReason::PoseUnsure(vehicle.off_m()));
         }
-        let outside_m = self.fence.outside_m(vehicle.p_world_m);
+        let outside_m = self.rules.fence.outside_m(vehicle.p_world_m);
         if outside_m > 0.0 {
             return GuardMode::Landing(LandReason::OutsideFence(outside_m));
         }
-        let inside_m = self.fence.inside_no_fly_m(vehicle.p_world_m);
+        let inside_m = self.rules.fence.inside_no_fly_m(vehicle.p_world_m);
         if inside_m > 0.0 {
             return GuardMode::Landing(LandReason::InNoFly(inside_m));
         }
-        if let Some(until) = self.ending_until {
+        if let Some(until) = self.end.ending_until {
             if now >= until || vehicle.v_world_mps.length() < STOPPED_MPS {
                 return GuardMode::Landing(LandReason::Ordered);
             }
             return GuardMode::Holding(HoldReason::Ending);
         }
-        if let Some(until) = self.restarting_until {
-            return match overdue_s > self.pose_ages.hold_after_s {
+        if let Some(until) = self.end.restarting_until {
+            return match overdue_s > self.rules.pose_ages.hold_after_s {
                 _ if now >= until => GuardMode::Landing(LandReason::NoPlugin),
                 true => GuardMode::Holding(HoldReason::PoseStale),
                 false => GuardMode::Holding(HoldReason::Restarting),
             };
         }
-        let silent_s = now.seconds_since(self.setpoint_at);
+        let silent_s = now.seconds_since(self.request.at);
         if silent_s > SETPOINT_LAND_S {
             return GuardMode::Landing(LandReason::NoSetpoint(silent_s));
         }
-        if overdue_s > self.pose_ages.hold_after_s {
+        if overdue_s > self.rules.pose_ages.hold_after_s {
             return GuardMode::Holding(HoldReason::PoseStale);
         }
-        if self.unsure_since.is_some() {
+        if self.sight.unsure_since.is_some() {
             return GuardMode::Holding(HoldReason::PoseUnsure);
         }
         if silent_s > SETPOINT_HOLD_S {
             return GuardMode::Holding(HoldReason::NoSetpoint);
         }
-        if let (Some(since), Some(seen_at)) = (self.blind_since, self.seen_at) {
+        if let (Some(since), Some(seen_at)) = (self.sight.blind_since, self.sight.seen_at) {
             if now.seconds_since(since) > SIGHT_LAND_S {
                 return GuardMode::Landing(LandReason::ImagesOld(now.seconds_since(seen_at)));
             }
             return GuardMode::Holding(HoldReason::ImagesOld);
         }
-        match self.setpoint {
+        match self.request.setpoint {
             None | Some(Setpoint::Hold) => GuardMode::Holding(HoldReason::Requested),
             Some(Setpoint::Land) => GuardMode::Landing(LandReason::Requested),
             Some(_) => GuardMode::Following,

@@ -341,7 +341,7 @@ proptest! {
             fastest_mps = fastest_mps.max(vehicle.v_mps.length());
             let inside_m = -room.signed_distance_m(vehicle.p_m) - arena.body_radius_m;
             nearest_m = nearest_m.min(inside_m);
-            prop_assert!(inside_m >= 0.0, "{inside_m} m inside, {:?}", guard.answers.response());
+            prop_assert!(inside_m >= 0.0, "{inside_m} m inside, {:?}", guard.sight.answers.response());
         }
         // And it gets there.
         let near_m = if matches!(told, Told::Truth) { 0.5 } else { 1.0 };
@@ -408,14 +408,18 @@ fn a_lag_is_measured_and_lowers_the_speed_limit() {
     let late = Response::smooth(0.9, 5.0);
     // As the parameters say: nothing is lowered.
     let guard = fly(airframe, Some(airframe));
-    assert!(!guard.answers.is_measured() && guard.lagging().is_none());
+    assert!(!guard.sight.answers.is_measured() && guard.lagging().is_none());
     // They lie.
     let lagging = fly(late, Some(airframe)).lagging().expect("it answers late");
     assert!(lagging.measured && (0.8..1.6).contains(&lagging.response.lag_s), "{lagging:?}");
     assert!((0.3..0.65).contains(&lagging.share), "{lagging:?}");
     // Nothing is known, and it is quick: the limit is lifted.
     let guard = fly(airframe, None);
-    assert!(guard.answers.is_measured() && guard.lagging().is_none(), "{:?}", guard.lagging());
+    assert!(
+        guard.sight.answers.is_measured() && guard.lagging().is_none(),
+        "{:?}",
+        guard.lagging()
+    );
     let lagging = fly(late, None).lagging().expect("it answers late");
     assert!(lagging.response.lag_s >= 0.8, "{lagging:?}");
     // Somebody holds it: that says nothing of how it answers.
@@ -753,7 +757,7 @@ fn an_offset_counts_from_where_it_was_taken() {
     guard.handle_setpoint(time(0), offset(Axes::Heading)).unwrap();
     let from_m = vehicle.p_m;
     for tick in 1..400 {
-        guard.setpoint_at = time(tick);
+        guard.request.at = time(tick);
         vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
     }
     let ahead = DVec3::new(0.3_f64.cos(), 0.3_f64.sin(), 0.0);
@@ -860,7 +864,7 @@ fn without_the_pose_places_count_from_the_vehicle_and_slip() {
             if tick == 1 {
                 guard.handle_setpoint(time(tick), ahead.clone()).unwrap();
             }
-            guard.setpoint_at = time(tick);
+            guard.request.at = time(tick);
             vehicle.fly(output_velocity(guard.tick(time(tick), &vehicle.motion(time(tick))).0));
         }
         vehicle.p_m

@@ -47,15 +47,15 @@ impl Guard {
         self.set_heading(vehicle, YawTarget::Keep);
         if reason == HoldReason::PoseStale {
             // Blind: zero velocity is held by the autopilot's own estimate.
-            self.hold_point_m = None;
+            self.command.hold_point_m = None;
             return DVec3::ZERO;
         }
-        let stopped =
-            self.v_command_mps.length() < STOPPED_MPS && vehicle.v_world_mps.length() < STOPPED_MPS;
-        if self.hold_point_m.is_none() && stopped {
-            self.hold_point_m = Some(vehicle.p_world_m);
+        let stopped = self.command.v_world_mps.length() < STOPPED_MPS
+            && vehicle.v_world_mps.length() < STOPPED_MPS;
+        if self.command.hold_point_m.is_none() && stopped {
+            self.command.hold_point_m = Some(vehicle.p_world_m);
         }
-        match self.hold_point_m {
+        match self.command.hold_point_m {
             Some(p_m) => {
                 (POSITION_GAIN_PER_S * (p_m - vehicle.p_world_m)).clamp_length_max(RETURN_MPS)
             }
@@ -71,7 +71,7 @@ impl Guard {
             Axes::Heading => DQuat::from_rotation_z(vehicle.yaw_rad()) * v,
             Axes::Body => vehicle.rotation * v,
         };
-        let (v_target, yaw) = match self.setpoint.as_ref() {
+        let (v_target, yaw) = match self.request.setpoint.as_ref() {
             None | Some(Setpoint::Hold | Setpoint::Land) => (DVec3::ZERO, YawTarget::Keep),
             Some(&Setpoint::Velocity { v_mps, axes, yaw }) => (in_world(v_mps, axes), yaw),
             Some(&Setpoint::Position { p_world_m, yaw }) => {
@@ -85,17 +85,17 @@ impl Guard {
                 (self.velocity_towards(vehicle, p_m + self.slip_m()), yaw)
             }
             Some(&Setpoint::TakeOff) => {
-                let p_m = self.resolved_point(vehicle.p_world_m.with_z(self.take_off_z_m));
+                let p_m = self.resolved_point(vehicle.p_world_m.with_z(self.rules.take_off_z_m));
                 (self.velocity_towards(vehicle, p_m), YawTarget::Keep)
             }
             Some(&Setpoint::AttitudeRate { omega_body_radps, thrust }) => {
                 self.velocity_by_rates(vehicle, omega_body_radps, thrust, dt_s)
             }
             Some(Setpoint::Trajectory(trajectory)) => {
-                if !matches!(self.resolved, Resolved::Path(_)) {
+                if !matches!(self.request.resolved, Resolved::Path(_)) {
                     let start = Start { p_world_m: vehicle.p_world_m, rotation: vehicle.rotation };
                     let follower = Follower::new(trajectory.clone(), &start);
-                    self.resolved = Resolved::Path(Box::new(follower));
+                    self.request.resolved = Resolved::Path(Box::new(follower));
                 }
                 self.follow_path(vehicle, dt_s)
             }
@@ -107,21 +107,21 @@ impl Guard {
     /// Returns the point that the setpoint in force was resolved to; `p_m` if this is its first
     /// tick. [m, world]
     fn resolved_point(&mut self, p_m: DVec3) -> DVec3 {
-        if let Resolved::Point(resolved_m) = self.resolved {
+        if let Resolved::Point(resolved_m) = self.request.resolved {
             return resolved_m;
         }
-        self.resolved = Resolved::Point(p_m);
+        self.request.resolved = Resolved::Point(p_m);
         p_m
     }
 
     /// Returns by how much the place in force has slipped. [m, world]
     fn slip_m(&self) -> DVec3 {
-        self.slip.as_ref().map_or(DVec3::ZERO, Slip::slip_m)
+        self.request.slip.as_ref().map_or(DVec3::ZERO, Slip::slip_m)
     }
 
     /// Returns the velocity that an acceleration of `a_mps2` leads to. [m/s, world]
     fn velocity_by_acceleration(&self, a_mps2: DVec3, dt_s: f64) -> DVec3 {
-        self.v_command_mps + a_mps2.clamp_length_max(self.max_acceleration_mps2) * dt_s
+        self.command.v_world_mps + a_mps2.clamp_length_max(self.rules.max_acceleration_mps2) * dt_s
     }
 
     /// Rotates the resolved attitude by the rates, at most [`MAX_TILT_RAD`] from level; returns
@@ -133,7 +133,7 @@ impl Guard {
         thrust: f64,
         dt_s: f64,
     ) -> (DVec3, YawTarget) {
-        let attitude = match self.resolved {
+        let attitude = match self.request.resolved {
             Resolved::Attitude(attitude) => attitude,
             _ => vehicle.rotation,
         };
@@ -146,7 +146,7 @@ impl Guard {
             Some(axis) if excess_rad > 0.0 => DQuat::from_axis_angle(axis, excess_rad) * turned,
             _ => turned,
         };
-        self.resolved = Resolved::Attitude(attitude);
+        self.request.resolved = Resolved::Attitude(attitude);
         let lift_mps2 = thrust.clamp(0.0, MAX_THRUST) * GRAVITY_MPS2;
         let a_mps2 = attitude * DVec3::Z * lift_mps2 - DVec3::Z * GRAVITY_MPS2;
         (self.velocity_by_acceleration(a_mps2, dt_s), YawTarget::Angle(yaw_of(attitude)))
@@ -154,9 +154,9 @@ impl Guard {
 
     /// Returns the velocity that follows the path, and the heading on it. [m/s, world]
     fn follow_path(&mut self, vehicle: &VehicleMotion, dt_s: f64) -> (DVec3, YawTarget) {
-        let limits = (self.speed_limit_mps, self.max_acceleration_mps2);
+        let limits = (self.sight.speed_limit_mps, self.rules.max_acceleration_mps2);
         let slip_m = self.slip_m();
-        let (reference, is_over) = match &mut self.resolved {
+        let (reference, is_over) = match &mut self.request.resolved {
             Resolved::Path(follower) => {
                 (follower.advance(vehicle.p_world_m - slip_m, limits, dt_s), follower.is_over())
             }
@@ -170,15 +170,15 @@ impl Guard {
     /// Sets the heading to send; it is never left open, as ArduCopter would then turn the nose
     /// into the direction of travel.
     fn set_heading(&mut self, vehicle: &VehicleMotion, yaw: YawTarget) {
-        let kept_yaw_rad = self.kept_yaw_rad.take();
-        self.yaw = match yaw {
+        let kept_yaw_rad = self.command.kept_yaw_rad.take();
+        self.command.yaw = match yaw {
             YawTarget::Angle(yaw_rad) => YawTarget::Angle(wrap_pi(yaw_rad)),
             YawTarget::Rate(rate_radps) => {
                 YawTarget::Rate(rate_radps.clamp(-MAX_YAW_RATE_RADPS, MAX_YAW_RATE_RADPS))
             }
             YawTarget::Keep => {
                 let yaw_rad = kept_yaw_rad.unwrap_or(vehicle.yaw_rad());
-                self.kept_yaw_rad = Some(yaw_rad);
+                self.command.kept_yaw_rad = Some(yaw_rad);
                 YawTarget::Angle(yaw_rad)
             }
         };
@@ -192,7 +192,7 @@ impl Guard {
         if !(distance_m > 1e-6) {
             return DVec3::ZERO;
         }
-        let braking_mps = (self.max_acceleration_mps2 * distance_m).sqrt();
+        let braking_mps = (self.rules.max_acceleration_mps2 * distance_m).sqrt();
         way_m / distance_m * braking_mps.min(POSITION_GAIN_PER_S * distance_m)
     }
 }
