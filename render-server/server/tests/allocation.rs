@@ -11,11 +11,12 @@ use vizflyt_fixtures::CountingAllocator;
 use vizflyt_protocol::geometry::Pose;
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
-use vizflyt_server::mailbox::Mailbox;
-use vizflyt_server::poses::newest::{Localized, NewestPoses};
+use vizflyt_server::poses::Localization;
+use vizflyt_server::poses::newest::Localized;
 use vizflyt_server::render::Rendering;
 use vizflyt_server::render::cameras::Cameras;
 use vizflyt_server::render::dynamic_objects::DynamicObjects;
+use vizflyt_server::render::inputs::Inputs;
 use vizflyt_server::render::rendered::RenderQueue;
 use vizflyt_server::stop::Stop;
 use vizflyt_server::stream::Rooms;
@@ -58,7 +59,7 @@ imaging = { sensor = "imx219", denoise = true, depth = { model = "azure-kinect" 
 /// brings the next poses, encodes some ticks, and makes previews.
 struct Everyone {
     stop: Stop,
-    newest: Arc<Mailbox<NewestPoses>>,
+    localization: Arc<Localization>,
     ticks: Arc<RenderQueue>,
     calls: u64,
     images: usize,
@@ -67,15 +68,16 @@ struct Everyone {
 }
 
 impl Everyone {
-    fn poses(at: u64) -> NewestPoses {
+    /// Publishes the next poses; now and then one vehicle is not seen.
+    fn move_on(localization: &Localization, at: u64) {
         let stamp = ServerTime::from_ns(at);
         let still = Pose::new(DVec3::Z, DQuat::IDENTITY);
         let sample = Localized::still(PoseSample::still(stamp, still));
-        let mut poses = NewestPoses::default();
-        // Now and then one vehicle is not seen.
-        poses[0] = Some(sample);
-        poses[1] = (!at.is_multiple_of(7)).then_some(sample);
-        poses
+        localization.vehicles[0].newest.send_replace(Some(sample));
+        if !at.is_multiple_of(7) {
+            localization.vehicles[1].newest.send_replace(Some(sample));
+        }
+        localization.accepted.put(());
     }
 }
 
@@ -122,7 +124,7 @@ impl Rasterizer for Everyone {
         {
             self.ticks.recycle(tick);
         }
-        self.newest.put(Self::poses(self.calls));
+        Self::move_on(&self.localization, self.calls);
         Ok(PassTimes::default())
     }
 
@@ -153,23 +155,23 @@ fn drawing_allocates_nothing_once_it_is_warm() {
     rooms.streaming.subscriptions.viewer_came(0);
     rooms.streaming.subscriptions.viewer_came(1);
     vizflyt_process::lock(&rendering.renderer).name = "nothing".to_owned();
-    let (newest, ticks) = (Arc::new(Mailbox::default()), Arc::new(RenderQueue::default()));
-    newest.put(Everyone::poses(1));
+    let ticks = Arc::new(RenderQueue::default());
+    Everyone::move_on(&rooms.localization, 1);
     let mut everyone = Everyone {
         stop: rooms.stop.clone(),
-        newest: newest.clone(),
+        localization: rooms.localization.clone(),
         ticks: ticks.clone(),
         calls: 0,
         images: 0,
         warm: 0,
     };
-    let shared = (&rendering, &*rooms.flights, &*rooms.streaming);
+    let inputs = Inputs { rendering: &rendering, ..rooms.render_inputs() };
     // On a pool's own thread: rayon itself allocates a little, now and then, to take in work from outside.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool");
     let allocated = pool.install(|| {
         let (renderer, max_rate_hz) = (&mut everyone, 1000.0);
         let stop = &rooms.stop;
-        vizflyt_server::render::thread::run(shared, renderer, &newest, &ticks, max_rate_hz, stop);
+        vizflyt_server::render::thread::run(inputs, renderer, &ticks, max_rate_hz, stop);
         CountingAllocator::thread_allocations()
     }) - everyone.warm;
     assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);

@@ -4,7 +4,7 @@
 //! in   packets of Vicon, NatNet, JSON, MAVLink, VRPN; IMU readings of the autopilots
 //! out  each vehicle's newest pose, its quality, the drivers' counters;
 //!      to `flights`: the referee's events, track and samples
-//!      to `render`: the newest motions of all vehicles
+//!      to `render`: that there is a newer pose
 //! ```
 //! Imports `flights`, and `scene` for the file that names the sources.
 
@@ -19,7 +19,9 @@ mod vehicle;
 use std::sync::Mutex;
 
 pub use self::vehicle::VehiclePose;
+use crate::mailbox::Mailbox;
 use crate::poses::drivers::SourceCounters;
+use crate::poses::newest::NewestPoses;
 use crate::timing::StageDurations;
 
 /// The localization of all vehicles.
@@ -31,6 +33,8 @@ pub struct Localization {
     pub source_names: Vec<String>,
     /// What the sources delivered, of all vehicles.
     pub counters: Mutex<SourceCounters>,
+    /// Filled with each new pose: wakes the render thread.
+    pub accepted: Mailbox<()>,
     /// From the arrival of a pose to the end of filter and referee.
     pub durations: StageDurations,
 }
@@ -42,7 +46,17 @@ impl Localization {
             vehicles: (0..vehicles).map(|_| VehiclePose::default()).collect(),
             source_names,
             counters: Mutex::default(),
+            accepted: Mailbox::default(),
             durations: StageDurations::default(),
         }
+    }
+
+    /// Returns the newest pose of each vehicle.
+    pub fn newest(&self) -> NewestPoses {
+        let mut newest = NewestPoses::default();
+        for (newest, vehicle) in newest.iter_mut().zip(&self.vehicles) {
+            *newest = *vehicle.newest.borrow();
+        }
+        newest
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! source, IMUs -> a Referee for each vehicle (filter, rules) -> pose, track, events
-//!                                                           \-> newest motions (mailbox)
+//!                                                           \-> the newest pose and motion
 //! ```
 //! Budget: 20 us a pose, at 200 Hz for each vehicle, bounded by the referee's swept query. It is a
 //! plain thread: tokio's timers are a millisecond late.
@@ -20,12 +20,11 @@ use vizflyt_protocol::time::ServerTime;
 use super::Localization;
 use super::drivers::{Measurement, PoseSource, SourceCounters};
 use super::margin::MarginWatch;
-use super::newest::{Localized, NewestPoses, publish};
+use super::newest::Localized;
 use crate::clock;
 use crate::flights::Flights;
 use crate::flights::events::Origin;
 use crate::flights::vehicle::VehicleFlight;
-use crate::mailbox::Mailbox;
 use crate::stop::Stop;
 use vizflyt_process::lock;
 
@@ -44,7 +43,7 @@ pub struct PoseThread {
 
 impl PoseThread {
     /// Takes measurements from `source` until the server stops.
-    pub fn run(mut self, source: &mut dyn PoseSource, newest: &Mailbox<NewestPoses>, stop: &Stop) {
+    pub fn run(mut self, source: &mut dyn PoseSource, stop: &Stop) {
         let mut watches: Vec<_> =
             self.flights.vehicles.iter().map(|vehicle| VehicleWatch::of(vehicle)).collect();
         let mut quality_due = Instant::now() + QUALITY_EVERY;
@@ -59,14 +58,10 @@ impl PoseThread {
             // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
             // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
             let mut judged_at = None;
-            let mut accepted = NewestPoses::default();
             for measurement in measured {
-                let stamp = self.take(measurement, &mut accepted, &mut watches);
+                let stamp = self.take(measurement, &mut watches);
                 judged_at = judged_at.max(stamp);
                 self.localization.durations.add(measurement.arrival, clock::now());
-            }
-            if accepted.iter().any(Option::is_some) {
-                publish(newest, &accepted);
             }
             self.judge(judged_at.unwrap_or_else(clock::now));
             self.count(source, &watches);
@@ -114,7 +109,6 @@ impl PoseThread {
     fn take(
         &mut self,
         measurement: &Measurement,
-        accepted: &mut NewestPoses,
         watches: &mut [VehicleWatch],
     ) -> Option<ServerTime> {
         let index = measurement.vehicle;
@@ -123,9 +117,12 @@ impl PoseThread {
         let was_judging = referee.is_judging();
         match referee.handle_measurement(&measurement.with_covariance()) {
             Ok(sample) => {
-                accepted[index] = referee.motion().map(|motion| Localized { sample, motion });
+                let motion = referee.motion();
                 self.share_neighbours(index);
-                self.localization.vehicles[index].newest.send_replace(Some(sample));
+                let still = Localized::still(sample);
+                let newest = motion.map_or(still, |motion| Localized { sample, motion });
+                self.localization.vehicles[index].newest.send_replace(Some(newest));
+                self.localization.accepted.put(());
                 self.record(index, &sample, was_judging);
                 Some(sample.stamp)
             }

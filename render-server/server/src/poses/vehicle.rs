@@ -7,14 +7,15 @@ use tokio::sync::watch;
 use vizflyt_arena::pose::PoseQuality;
 use vizflyt_protocol::messages::{ImuReading, PoseSample};
 
+use super::newest::Localized;
 use crate::poses::drivers::SourceCounters;
 use vizflyt_process::lock;
 
 /// The localization of one vehicle.
 #[derive(Debug)]
 pub struct VehiclePose {
-    /// The newest pose; latest-wins.
-    pub newest: watch::Sender<Option<PoseSample>>,
+    /// The newest pose and motion; latest-wins. Kept here alone.
+    pub newest: watch::Sender<Option<Localized>>,
     /// What the sources delivered of it.
     pub counters: Mutex<SourceCounters>,
     /// How good it is, by the pose filter.
@@ -35,6 +36,11 @@ impl Default for VehiclePose {
 }
 
 impl VehiclePose {
+    /// Returns the newest pose.
+    pub fn sample(&self) -> Option<PoseSample> {
+        self.newest.borrow().map(|localized| localized.sample)
+    }
+
     /// Queues readings of the autopilot's IMU; when the queue is full, the oldest are dropped.
     pub fn push_imu(&self, readings: &[ImuReading]) {
         let mut queue = lock(&self.imu);

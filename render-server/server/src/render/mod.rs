@@ -12,6 +12,7 @@ pub mod demand;
 pub mod dynamic_objects;
 pub mod environment;
 pub mod imaging;
+pub mod inputs;
 pub mod rendered;
 mod renderer;
 pub mod schedule;

@@ -21,12 +21,12 @@ use vizflyt_splat::{Camera, Placement, Rasterizer, RenderError, RgbdImage};
 
 use crate::clock;
 use crate::flights::Flights;
-use crate::mailbox::Mailbox;
-use crate::poses::newest::{Localized, NewestPoses, merge};
+use crate::poses::newest::{Localized, NewestPoses};
 use crate::render::cameras::{CameraSet, RenderedCameras};
 use crate::render::demand::Demand;
 use crate::render::environment::{atmosphere, weather};
 use crate::render::imaging::{CameraEffects, EffectInput};
+use crate::render::inputs::Inputs;
 use crate::render::rendered::{RenderQueue, RenderedImage, RenderedTick};
 use crate::render::schedule::{CameraSchedule, Exposure, Periods};
 use crate::render::{RendererInfo, Rendering};
@@ -39,26 +39,25 @@ use vizflyt_process::lock;
 /// # Errors
 /// None; a camera that the renderer refuses is logged once and the tick left out.
 pub fn run<D: Demand>(
-    (rendering, flights, demand): (&Rendering, &Flights, &D),
+    inputs: Inputs<'_, D>,
     renderer: &mut dyn Rasterizer,
-    newest: &Mailbox<NewestPoses>,
     ticks: &RenderQueue,
     max_rate_hz: f64,
     stop: &Stop,
 ) {
-    let mut render = RenderLoop::new(rendering, flights, demand, max_rate_hz);
+    let Inputs { localization, demand, .. } = inputs;
+    let mut render = RenderLoop::new(inputs, max_rate_hz);
     while !stop.is_set() {
         let wanted = demand.wait_for_interest(PATIENCE);
         if !wanted.contains(&true) {
             continue;
         }
         render.follow_cameras();
+        render.newest = localization.newest();
         let wait = render.until_due(wanted);
-        if let Some(newer) = newest.take(wait) {
-            merge(&newer, &mut render.poses);
-            merge(&newer, &mut render.known);
-        }
         if !wait.is_zero() {
+            // A newer pose may be worth an image at once.
+            localization.accepted.take(wait);
             continue;
         }
         let mut tick = ticks.spare();
@@ -84,10 +83,10 @@ struct RenderLoop<'a, D> {
     /// Each vehicle's cameras, at the size that its link asks for.
     sets: Vec<Arc<CameraSet>>,
     rendered_cameras: [RenderedCameras; MAX_VEHICLES],
-    /// Poses that nothing was rendered from yet.
-    poses: NewestPoses,
-    /// The newest of each vehicle, for the others' images.
-    known: NewestPoses,
+    /// Poses of this tick.
+    newest: NewestPoses,
+    /// Stamp of the pose that each vehicle was last rendered from.
+    rendered: [Option<ServerTime>; MAX_VEHICLES],
     /// The cameras of one tick, all vehicles'; which of them are whose.
     cameras: Vec<Camera>,
     ranges: [CameraRange; MAX_VEHICLES],
@@ -105,12 +104,8 @@ struct RenderLoop<'a, D> {
 }
 
 impl<'a, D: Demand> RenderLoop<'a, D> {
-    fn new(
-        rendering: &'a Rendering,
-        flights: &'a Flights,
-        demand: &'a D,
-        max_rate_hz: f64,
-    ) -> Self {
+    fn new(inputs: Inputs<'a, D>, max_rate_hz: f64) -> Self {
+        let Inputs { rendering, flights, demand, .. } = inputs;
         let least_ns = (1e9 / max_rate_hz) as i64;
         Self {
             rendering,
@@ -120,8 +115,8 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             schedules: vec![CameraSchedule::new(clock::now()); rendering.cameras.len()],
             sets: Vec::with_capacity(MAX_VEHICLES),
             rendered_cameras: Default::default(),
-            poses: NewestPoses::default(),
-            known: NewestPoses::default(),
+            newest: NewestPoses::default(),
+            rendered: Default::default(),
             cameras: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
             ranges: Default::default(),
             moments: Vec::with_capacity(MAX_VEHICLES * MAX_CAMERAS),
@@ -146,13 +141,18 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         }));
     }
 
+    /// Returns the pose of a vehicle that nothing was rendered from yet.
+    fn unrendered(&self, vehicle: usize) -> Option<Localized> {
+        self.newest[vehicle].filter(|newest| Some(newest.sample.stamp) != self.rendered[vehicle])
+    }
+
     /// Returns how long no camera is due. Where nothing can be rendered, a newer pose is worth
     /// waking up for: it may be another vehicle's.
     fn until_due(&mut self, wanted: [bool; MAX_VEHICLES]) -> Duration {
         let now = clock::now();
         let mut next: Option<ServerTime> = None;
         for (vehicle, set) in self.sets.iter().enumerate() {
-            if !wanted[vehicle] || self.poses[vehicle].is_none() {
+            if !wanted[vehicle] || self.unrendered(vehicle).is_none() {
                 continue;
             }
             let schedule = &mut self.schedules[vehicle];
@@ -180,11 +180,11 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         for (vehicle, set) in self.sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
             // A vehicle's pose is kept until a camera of it is due.
-            let sample = self.poses[vehicle].filter(|_| wanted[vehicle]).inspect(|_| {
+            let sample = self.unrendered(vehicle).filter(|_| wanted[vehicle]).inspect(|_| {
                 due = self.schedules[vehicle].take(&set.configs, &self.periods, clock::now());
             });
-            if due.contains(&true) {
-                self.poses[vehicle] = None;
+            if let (true, Some(newest)) = (due.contains(&true), sample) {
+                self.rendered[vehicle] = Some(newest.sample.stamp);
             }
             let after_ns = self.demand.seen_after_s(vehicle).map(|s| (s * 1e9) as i64);
             let shown = sample.map(|newest| {
@@ -227,7 +227,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         tick: &mut RenderedTick,
     ) -> Result<(), RenderError> {
         let span = trace_span!("tick", seq = self.seq, stamp_ns = stamp.as_ns()).entered();
-        let Self { rendering, cameras, moments, environment, placements, known, .. } = self;
+        let Self { rendering, cameras, moments, environment, placements, newest, .. } = self;
         let images = &mut self.images[..cameras.len()];
         let start = clock::now();
         let result = trace_span!("render").in_scope(|| {
@@ -239,7 +239,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
                     self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
                 ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
                     placements.clear();
-                    rendering.dynamic_objects.place(at, vehicle, known, placements);
+                    rendering.dynamic_objects.place(at, vehicle, newest, placements);
                     let images = &mut images[first..end];
                     renderer.render(placements, &cameras[first..end], images).map(|_| ())
                 })?;
@@ -254,7 +254,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             std::mem::swap(image, &mut slot.image);
             slot.render_start = start;
             if result.is_ok() {
-                take_image(&mut self.imaging, known, slot);
+                take_image(&mut self.imaging, newest, slot);
             }
         }
         let end = clock::now();
@@ -286,10 +286,10 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
 }
 
 /// Turns a rendered image into the one that its camera takes.
-fn take_image(effects: &mut [CameraEffects], known: &NewestPoses, slot: &mut RenderedImage) {
+fn take_image(effects: &mut [CameraEffects], newest: &NewestPoses, slot: &mut RenderedImage) {
     let RenderedImage { vehicle, camera, seq, .. } = *slot;
     let (Some(set), Some(newest), Some(world_from_body)) =
-        (&slot.set, &known[vehicle], slot.world_from_body)
+        (&slot.set, &newest[vehicle], slot.world_from_body)
     else {
         return;
     };

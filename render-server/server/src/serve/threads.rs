@@ -9,7 +9,6 @@ use vizflyt_splat::Rasterizer;
 use vizflyt_splat::sensor::SensorScene;
 
 use crate::args::ServeArgs;
-use crate::mailbox::Mailbox;
 use crate::poses::drivers::PoseSource;
 use crate::poses::thread::PoseThread;
 use crate::priority::give_way;
@@ -36,7 +35,6 @@ impl Threads<'_> {
         mut source: Box<dyn PoseSource>,
         sensor_scene: Option<SensorScene>,
     ) -> Result<Vec<JoinHandle<()>>> {
-        let newest = Arc::new(Mailbox::default());
         let ticks = Arc::new(RenderQueue::default());
         let pose_thread = PoseThread {
             localization: self.rooms.localization.clone(),
@@ -44,13 +42,12 @@ impl Threads<'_> {
             referees,
             neighbours: self.neighbours,
         };
-        let (published, stop) = (newest.clone(), self.rooms.stop.clone());
-        let pose = move || pose_thread.run(&mut *source, &published, &stop);
+        let stop = self.rooms.stop.clone();
+        let pose = move || pose_thread.run(&mut *source, &stop);
         let (rooms, published, max_rate_hz) = (self.rooms.clone(), ticks.clone(), args.max_rate);
         let render = move || {
-            let shared = (&*rooms.rendering, &*rooms.flights, &*rooms.streaming);
-            let stop = &rooms.stop;
-            render::thread::run(shared, &mut *renderer, &newest, &published, max_rate_hz, stop);
+            let (inputs, stop) = (rooms.render_inputs(), &rooms.stop);
+            render::thread::run(inputs, &mut *renderer, &published, max_rate_hz, stop);
         };
         let (rooms, rendered, options) = (self.rooms.clone(), ticks.clone(), args.encode_options());
         let encode = move || {
@@ -72,9 +69,7 @@ impl Threads<'_> {
         if let Some(scene) = sensor_scene {
             let rooms = self.rooms.clone();
             let sensors = move || {
-                let Rooms { rendering, localization, streaming, stop, .. } = &rooms;
-                let shared = (&**rendering, &**localization, &**streaming);
-                render::sensors::thread::run(shared, &scene, stop);
+                render::sensors::thread::run(rooms.render_inputs(), &scene, &rooms.stop);
             };
             threads.push(start("sensors", sensors)?);
         }

@@ -16,6 +16,7 @@ use crate::poses::Localization;
 use crate::render::Rendering;
 use crate::render::cameras::Cameras;
 use crate::render::demand::Demand;
+use crate::render::inputs::Inputs;
 use crate::render::sensors::Sensors;
 use crate::stop::Stop;
 use crate::timing::StageDurations;
@@ -89,6 +90,16 @@ pub struct Rooms {
 }
 
 impl Rooms {
+    /// Returns what the threads that render and measure work with.
+    pub fn render_inputs(&self) -> Inputs<'_, Streaming> {
+        Inputs {
+            rendering: &self.rendering,
+            localization: &self.localization,
+            flights: &self.flights,
+            demand: &self.streaming,
+        }
+    }
+
     /// Returns the state of a server for vehicles, each with name, arena and cameras: without a
     /// leaderboard, pose sources and objects, as benchmarks and tests serve them.
     pub fn bare(

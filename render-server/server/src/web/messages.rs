@@ -275,7 +275,7 @@ pub(super) fn state(page: &Page, vehicle: &VehicleFlight, viewer: &Viewer) -> Me
 }
 
 fn pose(page: &Page, vehicle: &VehicleFlight, now: ServerTime) -> Option<PoseLine> {
-    let newest = *page.rooms.localization.vehicles[vehicle.index].newest.borrow();
+    let newest = page.rooms.localization.vehicles[vehicle.index].sample();
     newest.map(|sample| PoseLine {
         p_world_m: sample.world_from_body.translation_m.to_array(),
         yaw_rad: yaw_of(sample.world_from_body.rotation),

@@ -6,17 +6,13 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use tracing::{trace_span, warn};
-use vizflyt_arena::pose::Motion;
-use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::sensor::SensorScene;
 
 use super::measure::{Around, VehicleSensors};
 use crate::clock;
-use crate::poses::Localization;
-use crate::poses::newest::{Localized, NewestPoses};
-use crate::render::Rendering;
 use crate::render::demand::Demand;
+use crate::render::inputs::Inputs;
 use crate::render::schedule::Exposure;
 use crate::stop::Stop;
 
@@ -24,16 +20,13 @@ use crate::stop::Stop;
 const PATIENCE: Duration = Duration::from_millis(100);
 
 /// Measures until the server stops: what is due of the vehicles that someone wants images of.
-pub fn run<D: Demand + Sync>(
-    (rendering, localization, demand): (&Rendering, &Localization, &D),
-    scene: &SensorScene,
-    stop: &Stop,
-) {
+pub fn run<D: Demand + Sync>(inputs: Inputs<'_, D>, scene: &SensorScene, stop: &Stop) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let pool = match pool {
         Ok(pool) => pool,
         Err(error) => return warn!("no sensor measures: {error}"),
     };
+    let Inputs { rendering, demand, .. } = inputs;
     let now = clock::now();
     let sensors = rendering.sensors.iter().enumerate();
     let seed = |vehicle: usize| (vehicle as u64) << 32;
@@ -48,12 +41,7 @@ pub fn run<D: Demand + Sync>(
                 continue;
             }
             sensors.follow(rendering.sensors[vehicle].newest(), clock::now());
-            let known = known(localization);
-            if let Some(newest) = &known[vehicle] {
-                pool.install(|| {
-                    measure(rendering, demand, scene, vehicle, sensors, newest, &known);
-                });
-            }
+            pool.install(|| measure(inputs, scene, vehicle, sensors));
             next = next.into_iter().chain(sensors.next()).min();
         }
         if wanted.contains(&true) {
@@ -67,14 +55,13 @@ pub fn run<D: Demand + Sync>(
 
 /// Measures what is due of one vehicle.
 fn measure<D: Demand + Sync>(
-    rendering: &Rendering,
-    demand: &D,
+    Inputs { rendering, localization, demand, .. }: Inputs<'_, D>,
     scene: &SensorScene,
     vehicle: usize,
     sensors: &mut VehicleSensors,
-    newest: &Localized,
-    known: &NewestPoses,
 ) {
+    let poses = localization.newest();
+    let Some(newest) = &poses[vehicle] else { return };
     let now = clock::now();
     let taken = sensors.take(now);
     let after_ns = demand.seen_after_s(vehicle).map(|s| (s * 1e9) as i64);
@@ -82,7 +69,8 @@ fn measure<D: Demand + Sync>(
         let span = trace_span!("measure", vehicle, sensor = index).entered();
         let exposure = Exposure::new(rendering.predict, after_ns, newest, clock::now());
         let objects = &rendering.dynamic_objects;
-        let mut place = |at, placements: &mut Vec<_>| objects.place(at, vehicle, known, placements);
+        let mut place =
+            |at, placements: &mut Vec<_>| objects.place(at, vehicle, &poses, placements);
         let pose = newest.sample.stamp;
         let mut around = Around { scene, motion: &newest.motion, pose, place: &mut place };
         let reading = sensors.measure(index, &exposure, &mut around);
@@ -91,25 +79,6 @@ fn measure<D: Demand + Sync>(
             rendering.sensors[vehicle].publish(reading);
         }
     }
-}
-
-/// Returns the newest pose of each vehicle, and how it moves by its twist.
-fn known(localization: &Localization) -> NewestPoses {
-    let mut known = NewestPoses::default();
-    for (known, vehicle) in known.iter_mut().zip(&localization.vehicles) {
-        *known = (*vehicle.newest.borrow()).map(localized);
-    }
-    known
-}
-
-fn localized(sample: PoseSample) -> Localized {
-    let still = Motion::at_rest(sample.stamp, sample.world_from_body);
-    let motion = Motion {
-        v_world_mps: sample.twist.linear_mps,
-        omega_body_radps: sample.twist.angular_radps,
-        ..still
-    };
-    Localized { sample, motion }
 }
 
 /// Between two looks at what is due: while no pose has come, a sensor stays due. [ns]

@@ -75,7 +75,7 @@ pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
                 *subscriber = None;
                 continue;
             }
-            let newest = *rooms.localization.vehicles[index].newest.borrow();
+            let newest = rooms.localization.vehicles[index].sample();
             if let Some(pose) = newest
                 && pose.stamp.seconds_since(known.sent) >= POSE_EVERY_S
             {

@@ -163,7 +163,7 @@ impl Session<'_> {
                     out.write(&ToRuntime::Clock(reply)).await
                 }
                 _ = poses.changed() => {
-                    let newest = *poses.borrow_and_update();
+                    let newest = poses.borrow_and_update().map(|newest| newest.sample);
                     if let Some(pose) = newest
                         && pose.stamp.seconds_since(last_pose) >= POSE_EVERY_S
                     {

@@ -51,7 +51,7 @@ pub(in crate::web) fn airborne(rooms: &Rooms) -> Vec<Airborne> {
     let now = clock::now();
     let seen = rooms.flights.vehicles.iter().filter_map(|vehicle| {
         let took_off = vehicle.flight().took_off.filter(|_| vehicle.under_way())?;
-        let pose = (*rooms.localization.vehicles[vehicle.index].newest.borrow())?;
+        let pose = rooms.localization.vehicles[vehicle.index].sample()?;
         let is_fresh = now.seconds_since(pose.stamp) < FRESH_S;
         is_fresh.then(|| Airborne {
             vehicle: vehicle.index,
@@ -85,7 +85,7 @@ fn keep_apart(rooms: &Rooms, lab: &Lab, watch: &mut SeparationWatch) {
 fn watch_hands(rooms: &Rooms, lab: &Lab) {
     let mut guided = lock(&lab.guided);
     let Some(check) = guided.as_mut() else { return };
-    let Some(pose) = *rooms.localization.vehicles[check.vehicle].newest.borrow() else { return };
+    let Some(pose) = rooms.localization.vehicles[check.vehicle].sample() else { return };
     if let Some(finding) = check.handle_pose(&pose) {
         let (name, by) = (&rooms.flights.vehicles[check.vehicle].name, check.by.clone());
         lab.change(|day, now| day.record(name, CheckId::Axes, finding, &by, now));
@@ -114,7 +114,7 @@ impl VehicleWatch {
 
     /// Looks at pose, events and reports.
     fn look(&mut self, rooms: &Rooms, vehicle: &VehicleFlight, now: ServerTime, lab: &Lab) {
-        if let Some(pose) = *rooms.localization.vehicles[vehicle.index].newest.borrow() {
+        if let Some(pose) = rooms.localization.vehicles[vehicle.index].sample() {
             self.poses.push(&pose);
         }
         let events = vehicle.events.read(&mut self.event).unwrap_or_else(|lagged| {

@@ -26,6 +26,7 @@ use vizflyt_runtime::stream::{
 use vizflyt_server::authorization::Authorizer;
 use vizflyt_server::clock;
 use vizflyt_server::flights::events::Origin;
+use vizflyt_server::poses::newest::Localized;
 use vizflyt_server::stop::Stop;
 use vizflyt_server::stream::Rooms;
 use vizflyt_server::stream::rate_control::{self, Adaptation};
@@ -280,7 +281,7 @@ async fn localize(rooms: Rooms) {
     loop {
         tick.tick().await;
         let sample = PoseSample::still(clock::now(), Pose::IDENTITY);
-        rooms.localization.vehicles[0].newest.send_replace(Some(sample));
+        rooms.localization.vehicles[0].newest.send_replace(Some(Localized::still(sample)));
     }
 }
 

@@ -1,0 +1,26 @@
+//! What the threads of this room work with.
+
+use crate::flights::Flights;
+use crate::poses::Localization;
+use crate::render::Rendering;
+
+/// The states that rendering and measuring read and write; `demand` says what is wanted.
+#[derive(Debug)]
+pub struct Inputs<'a, D> {
+    /// Cameras, sensors, light and objects; what is rendered and measured is counted here.
+    pub rendering: &'a Rendering,
+    /// Poses of the vehicles.
+    pub localization: &'a Localization,
+    /// Flights under way.
+    pub flights: &'a Flights,
+    /// Demand for images.
+    pub demand: &'a D,
+}
+
+impl<D> Clone for Inputs<'_, D> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<D> Copy for Inputs<'_, D> {}
