@@ -131,6 +131,27 @@ pub struct Demo {
 }
 
 impl Demo {
+    /// Whether the flight of `report` has finished. If not, the machine has stood still until a safety rule landed the
+    /// vehicle in order, and there is nothing else to check.
+    ///
+    /// # Panics
+    /// If it ended in another way.
+    pub fn has_finished(&self, report: &serde_json::Value, code: Option<i32>) -> bool {
+        let explained = format!("{report:#} {:#?}", self.seen);
+        if report["outcome"] == "finished" {
+            assert_eq!(code, Some(0), "{explained}");
+            return true;
+        }
+        // What the simulator does not give up it catches up with.
+        assert!(report["seconds_given_up"].as_f64() > Some(0.1), "{explained}");
+        assert!(
+            self.seen.iter().any(|line| line.contains("on the ground, disarmed")),
+            "{explained}"
+        );
+        assert!(report["min_clearance_m"].as_f64().is_none_or(|m| m > 0.0), "{explained}");
+        false
+    }
+
     /// Starts `vizflyt demo --headless ARGS`, which draws [`MAX_RATE_HZ`] at most unless they say otherwise.
     ///
     /// # Panics

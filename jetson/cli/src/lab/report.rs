@@ -52,6 +52,8 @@ pub(crate) struct LabReport {
     pub max_speed_mps: f64,
     /// Least distance of the body's surface to the true geometry; absent where a scene has none. [m]
     pub min_clearance_m: Option<f64>,
+    /// Simulated time that was given up because this machine stood still or was too busy. [s]
+    pub seconds_given_up: f64,
     /// How good the localization was in the end, by vehicle: rate, age, sigma, what each source
     /// delivered and what of it was rejected.
     pub pose: Value,
@@ -154,6 +156,7 @@ impl Parts {
             mean_speed_mps: number(&self.simulator, "mean_speed_mps"),
             max_speed_mps: number(&self.simulator, "max_speed_mps"),
             min_clearance_m: self.simulator["min_clearance_m"].as_f64(),
+            seconds_given_up: number(&self.simulator, "seconds_given_up"),
             pose: self.server["pose"].clone(),
             setpoints_sent: count(&self.runtime, "setpoints_sent"),
             mavlink_packets: count(&self.runtime, "mavlink_packets"),
@@ -191,6 +194,14 @@ impl LabReport {
             ),
             _ => String::new(),
         };
+        let stalled = if self.seconds_given_up > NOTICEABLE_S {
+            format!(
+                "\x20 too busy    this machine stood still for {:.1} s; close other programs for figures that count\n",
+                self.seconds_given_up
+            )
+        } else {
+            String::new()
+        };
         let reason =
             if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
         format!(
@@ -198,7 +209,7 @@ impl LabReport {
              \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
              \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, rendered in {render:.1} ms ({renderer})\n\
              \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms; to the setpoint {setpoint:.1} ms\n\
-             \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n{tags}\
+             \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n{tags}{stalled}\
              \x20 memory      {memory:.0} MB at most, all processes together\n\
              \x20 log         {log}",
             outcome = self.outcome,
@@ -222,6 +233,9 @@ impl LabReport {
     }
 }
 
+/// Less is no reason to doubt a flight's figures. [s]
+const NOTICEABLE_S: f64 = 0.1;
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -244,6 +258,15 @@ mod tests {
         assert_eq!(parts.join(7, 1.0, "").outcome, OutcomeKind::Finished);
         parts.simulator["collided"] = json!(true);
         assert_eq!(parts.join(7, 1.0, "").outcome, OutcomeKind::Collided);
+    }
+
+    #[test]
+    fn a_machine_that_stood_still_is_named() {
+        let mut parts = parts();
+        assert!(!parts.join(7, 1.0, "").summary().contains("stood still"));
+        parts.simulator["seconds_given_up"] = json!(0.45);
+        let summary = parts.join(7, 1.0, "").summary();
+        assert!(summary.contains("this machine stood still for 0.5 s"), "{summary}");
     }
 
     #[test]
