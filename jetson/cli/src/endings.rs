@@ -11,7 +11,7 @@ use vizflyt_protocol::flight_end::{
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::messages::{Event, EventKind, Limits, OutcomeKind, Setpoint, bounded};
 use vizflyt_protocol::time::{HostTime, ServerTime};
-use vizflyt_runtime::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
+use vizflyt_runtime::flight::{Flight, FlightSettings, LinkView, Views};
 use vizflyt_runtime::guard::{Response, VehicleMotion};
 use vizflyt_runtime::link::{Goal, LinkEvent};
 use vizflyt_server::flights::events::Origin;
@@ -99,8 +99,8 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
         cameras: Vec::new(),
     };
     let mut flight = Flight::new(settings, at(0));
-    flight.handle(at(0), FlightInput::Arena(Box::new(info)));
-    flight.handle(at(0), FlightInput::PluginReady);
+    flight.handle_arena(at(0), Box::new(info));
+    flight.plugin_ready();
     let mut link = LinkView {
         connected: true,
         armed: false,
@@ -134,7 +134,7 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
                 }
                 Occurrence::PluginFails => {
                     let fault = PluginFault::ended("exit status 3");
-                    flight.handle(at(now), FlightInput::PluginFailed(fault));
+                    flight.plugin_failed(at(now), fault);
                 }
                 Occurrence::PluginLands => answer = Some(Setpoint::Land),
                 Occurrence::PluginHangs => answer = None,
@@ -144,19 +144,19 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
                 }
                 Occurrence::PilotTakesOver => {}
                 Occurrence::AutopilotRestarts => {
-                    flight.handle(at(now), FlightInput::Link(LinkEvent::Rebooted));
+                    flight.handle_link(at(now), LinkEvent::Rebooted);
                 }
                 Occurrence::AutopilotRefuses => {
-                    flight.handle(at(now), FlightInput::Link(LinkEvent::Refused("denied".into())));
+                    flight.handle_link(at(now), LinkEvent::Refused("denied".into()));
                 }
-                Occurrence::Interrupt => flight.handle(at(now), FlightInput::Interrupt),
+                Occurrence::Interrupt => flight.interrupt(at(now)),
                 Occurrence::PosesStop => poses = false,
             }
         }
         let due = |(ns, _): &mut (u64, Event)| *ns <= now;
         for (_, event) in to_runtime.extract_if(.., due) {
             let seen = at(event.stamp.as_ns() - AHEAD_NS);
-            flight.handle(at(now), FlightInput::Server(event, seen));
+            flight.handle_event(at(now), &event, seen);
         }
         if poses {
             let rotation = DQuat::IDENTITY;
@@ -169,13 +169,13 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
                 sigma_m: 0.0,
                 allowance_s: 0.0,
             };
-            flight.handle(at(now), FlightInput::Pose(motion));
+            flight.handle_pose(motion);
         }
         let mut views = Views::default();
         views[0] = Some(at(now));
-        flight.handle(at(now), FlightInput::ImagePublished { seq: tick, views });
+        flight.published(at(now), tick, views);
         if let Some(setpoint) = answer.clone() {
-            flight.handle(at(now), FlightInput::Replied { seq: tick, setpoint: Some(setpoint) });
+            flight.replied(at(now), tick, Some(setpoint));
         }
         let orders = flight.tick(at(now), &link);
         match orders.goal {

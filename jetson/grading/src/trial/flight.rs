@@ -284,7 +284,7 @@ impl<'a> Flight<'a> {
         self.referee.handle_timeout(now);
         while let Some(event) = self.referee.poll_event() {
             self.note(event.clone());
-            self.lockstep.companion.handle_event(self.now, event);
+            self.lockstep.companion.handle_event(self.now, &event);
         }
     }
 

@@ -29,7 +29,7 @@ use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_sdk::{Battery, ImuSample, Vehicle};
 
 use crate::airframe::AutopilotFence;
-use crate::flight::{Flight, FlightInput, FlightSettings, LinkView, Views};
+use crate::flight::{Flight, FlightSettings, LinkView, Views};
 use crate::guard::VehicleMotion;
 use crate::link::{Datagram, Link, LinkEvent, LinkSettings};
 use crate::steering::Steering;
@@ -144,7 +144,7 @@ impl Companion {
     pub fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
         // The plugin gets the limits that it is flown within.
         self.settings.tighten(&mut arena);
-        self.flight.handle(now, FlightInput::Arena(arena.clone()));
+        self.flight.handle_arena(now, arena.clone());
         self.arena.get_or_insert(arena);
     }
 
@@ -177,7 +177,7 @@ impl Companion {
     /// Handles a pose that the server has fused; `stamp` is its time on this computer's clock.
     pub fn handle_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         self.link.vision(now, sample, stamp);
-        self.flight.handle(now, FlightInput::Pose(VehicleMotion::of(sample, stamp)));
+        self.flight.handle_pose(VehicleMotion::of(sample, stamp));
         // Before the course is known, no pose is let out.
         if self.ground_truth() == Some(true) {
             self.vehicle = Some(Vehicle {
@@ -191,29 +191,29 @@ impl Companion {
     }
 
     /// Handles an event of the server's, such as one of the referee.
-    pub fn handle_event(&mut self, now: HostTime, event: Event) {
-        self.send_to_plugin(&event);
+    pub fn handle_event(&mut self, now: HostTime, event: &Event) {
+        self.send_to_plugin(event);
         let at = self.clock.to_host(event.stamp).unwrap_or(now);
-        self.flight.handle(now, FlightInput::Server(event, at));
+        self.flight.handle_event(now, event, at);
         // It may have ended the flight: LAND does not wait for the next setpoint's turn.
         self.steering.hurry();
     }
 
     /// Takes note that there is no connection to the server, or that it refuses us for now; `why` in a
     /// sentence, which stands in for the server's answer until it comes.
-    pub fn server_down(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, FlightInput::ServerDown(why));
+    pub fn server_down(&mut self, why: &str) {
+        self.flight.server_down(why);
     }
 
     /// Ends the flight because it cannot be flown: the server refused it, or the plugin's shared memory
     /// cannot be made; `why` in a sentence.
-    pub fn refuse(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, FlightInput::ServerRefused(why));
+    pub fn refuse(&mut self, now: HostTime, why: &str) {
+        self.flight.refuse(now, why);
     }
 
     /// Ends the flight because a person interrupts it.
     pub fn interrupt(&mut self, now: HostTime) {
-        self.flight.handle(now, FlightInput::Interrupt);
+        self.flight.interrupt(now);
     }
 
     // ---- inputs: the plugin ----
@@ -239,13 +239,13 @@ impl Companion {
     }
 
     /// The plugin waits for images.
-    pub fn plugin_ready(&mut self, now: HostTime) {
-        self.flight.handle(now, FlightInput::PluginReady);
+    pub fn plugin_ready(&mut self) {
+        self.flight.plugin_ready();
     }
 
     /// Observation `seq` went to the plugin; `views` tells how old its images are.
     pub fn published(&mut self, now: HostTime, seq: u64, views: Views) {
-        self.flight.handle(now, FlightInput::ImagePublished { seq, views });
+        self.flight.published(now, seq, views);
     }
 
     /// Handles the plugin's reply to observation `seq`.
@@ -253,17 +253,17 @@ impl Companion {
         if setpoint.is_some() {
             self.steering.replied();
         }
-        self.flight.handle(now, FlightInput::Replied { seq, setpoint });
+        self.flight.replied(now, seq, setpoint);
     }
 
     /// The plugin has failed for good.
     pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
-        self.flight.handle(now, FlightInput::PluginFailed(fault));
+        self.flight.plugin_failed(now, fault);
     }
 
     /// The plugin is being started again, and the vehicle holds until it replies; `why` in a sentence.
     pub fn plugin_restarts(&mut self, now: HostTime, why: String) {
-        self.flight.handle(now, FlightInput::PluginRestarts(why));
+        self.flight.plugin_restarts(now, why);
     }
 
     // ---- inputs: time, and notes of the driver's ----
@@ -405,7 +405,7 @@ impl Companion {
     fn handle_link_events(&mut self, now: HostTime) {
         while let Some(event) = self.link.poll_event() {
             self.link_events.push_back(event.clone());
-            self.flight.handle(now, FlightInput::Link(event));
+            self.flight.handle_link(now, event);
         }
     }
 

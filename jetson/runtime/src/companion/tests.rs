@@ -46,7 +46,7 @@ fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
     companion.handle_pose(at(5), &PoseSample::still(stamp, pose), at(5));
     let (clearance_m, with, speed_mps) = (-0.1, Obstacle::Scene, 1.0);
     let hit = Collision { p_world_m, clearance_m, with, speed_mps };
-    companion.handle_event(at(6), Event::ending(stamp, EventKind::Collision(hit)));
+    companion.handle_event(at(6), &Event::ending(stamp, EventKind::Collision(hit)));
     let messages = std::iter::from_fn(|| companion.poll_plugin()).collect();
     (companion, messages)
 }
@@ -127,7 +127,7 @@ fn takes_points_out_of_texts_and_nothing_else() {
 #[test]
 fn flight_without_an_autopilot_ends_at_its_time_limit() {
     let mut companion = companion(true);
-    companion.plugin_ready(at(0));
+    companion.plugin_ready();
     let mut beats = 0;
     let ended = (0..100_000).map(|tick| at(tick * 5)).find(|&now| {
         companion.handle_timeout(now);

@@ -340,10 +340,10 @@ impl ControlLoop {
                     self.start_plugin(now);
                 }
             }
-            StreamEvent::Refused(why) => self.companion.refuse(now, why),
+            StreamEvent::Refused(why) => self.companion.refuse(now, &why),
             StreamEvent::Down(why) => {
                 tracing::warn!("{why}; trying again");
-                self.companion.server_down(now, why);
+                self.companion.server_down(&why);
             }
             StreamEvent::Pose(sample, stamp) => {
                 self.companion.handle_pose(now, &sample, stamp);
@@ -352,7 +352,7 @@ impl ControlLoop {
             }
             StreamEvent::Event(event) => {
                 self.show_event(now, &event);
-                self.companion.handle_event(now, event);
+                self.companion.handle_event(now, &event);
             }
             StreamEvent::Camera(index, camera) => self.handle_camera(index, &camera),
             StreamEvent::Sensor(index, sensor) => {
@@ -414,7 +414,7 @@ impl ControlLoop {
             FromPlugin::Ready { .. } | FromPlugin::Reply { .. } if !counts => {}
             FromPlugin::Ready { name } => {
                 tracing::info!("plugin {name} is ready");
-                self.companion.plugin_ready(now);
+                self.companion.plugin_ready();
             }
             FromPlugin::Reply { seq, entered, returned, setpoint } => {
                 let age_ms = self.times.answered(seq, entered, returned);

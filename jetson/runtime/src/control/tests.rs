@@ -116,7 +116,7 @@ impl Drivers {
         drivers.check_senses();
         // The first turn greets the control loop's plugin.
         drivers.turn(now);
-        drivers.lockstep.companion.plugin_ready(now);
+        drivers.lockstep.companion.plugin_ready();
         drivers.message(now, FromPlugin::Ready { name: bounded("test") });
         drivers
     }
@@ -139,7 +139,7 @@ impl Drivers {
     fn event(&mut self, now: HostTime, kind: EventKind) {
         let stamp = ServerTime::from_ns(now.as_ns());
         let event = Event::ending(stamp, kind);
-        self.lockstep.companion.handle_event(now, event.clone());
+        self.lockstep.companion.handle_event(now, &event);
         self.control.handle(now, ControlInput::Stream(StreamEvent::Event(event)));
     }
 

@@ -1,18 +1,19 @@
 //! Inputs of the flight: the arena, the server's events, the link, and the plugin's replies.
 
-use vizflyt_protocol::flight_end::EndReason;
+use vizflyt_protocol::flight_end::{EndReason, PluginFault};
 use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint, bounded};
 use vizflyt_protocol::time::HostTime;
 
-use super::Flight;
-use crate::guard::check_arena;
+use super::{Flight, Views};
+use crate::guard::{VehicleMotion, check_arena};
 use crate::link::{LOST_AFTER_S, LinkEvent};
 
 /// STATUSTEXT of this severity or worse is worth a person's attention.
 const SEVERITY_WARNING: u8 = 4;
 
 impl Flight {
-    pub(super) fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
+    /// Handles the description of the arena from the server.
+    pub fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
         self.settings.tighten(&mut arena);
         if let Err(why) = check_arena(&arena) {
             return self.end_for(now, EndReason::ArenaRefused(bounded(&why)));
@@ -29,8 +30,16 @@ impl Flight {
         }
     }
 
-    pub(super) fn handle_server(&mut self, now: HostTime, at: HostTime, event: &Event) {
-        self.end.handle(at, &event.kind);
+    /// Handles the motion of the vehicle, as localization gives it.
+    pub fn handle_pose(&mut self, vehicle: VehicleMotion) {
+        if vehicle.is_valid() {
+            self.vehicle = Some(vehicle);
+        }
+    }
+
+    /// Handles an event of the server's that happened at `at`, by our clock.
+    pub fn handle_event(&mut self, now: HostTime, event: &Event, at: HostTime) {
+        self.end.handle(at.min(now), &event.kind);
         match event.kind {
             EventKind::Start if self.phase == FlightPhase::Waiting => {
                 self.waits_for_start = false;
@@ -49,7 +58,24 @@ impl Flight {
         }
     }
 
-    pub(super) fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
+    /// Takes note that there is no connection to the server, or that it refuses us for now; `why` in a sentence.
+    pub fn server_down(&mut self, why: &str) {
+        self.server_down = Some(bounded(why));
+    }
+
+    /// Ends the flight because the server refuses us, and retrying will not help; `why` in a sentence.
+    pub fn refuse(&mut self, now: HostTime, why: &str) {
+        self.end_for(now, EndReason::ServerRefused(bounded(why)));
+    }
+
+    /// Ends the flight because a person interrupts it.
+    pub fn interrupt(&mut self, now: HostTime) {
+        self.interrupted_at.get_or_insert(now);
+        self.end_for(now, EndReason::Interrupted);
+    }
+
+    /// Handles an event of the link to the autopilot.
+    pub fn handle_link(&mut self, now: HostTime, event: LinkEvent) {
         match event {
             LinkEvent::Refused(why) => {
                 self.end_for(now, EndReason::AutopilotRefused(bounded(&why)));
@@ -71,7 +97,24 @@ impl Flight {
         }
     }
 
-    pub(super) fn handle_reply(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
+    /// Takes note that the plugin waits for images.
+    pub fn plugin_ready(&mut self) {
+        self.plugin_ready = true;
+    }
+
+    /// Takes note that observation `seq` went to the plugin; `views` has the age of its images.
+    pub fn published(&mut self, now: HostTime, seq: u64, views: Views) {
+        self.sight.shown(now, seq, &views);
+        self.unanswered.get_or_insert((seq, now));
+    }
+
+    /// Ends the flight because the plugin has failed for good.
+    pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
+        self.end_for(now, EndReason::Plugin(fault));
+    }
+
+    /// Handles the plugin's reply to observation `seq`: its setpoint, if it sent one.
+    pub fn replied(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
         self.replied_at = Some(now);
         self.sight.answered(seq);
         if self.unanswered.is_some_and(|(oldest, _)| oldest <= seq) {
@@ -93,7 +136,8 @@ impl Flight {
         }
     }
 
-    pub(super) fn handle_restart(&mut self, now: HostTime, why: String) {
+    /// Takes note that the plugin is started again; `why` in a sentence. The vehicle holds until it replies.
+    pub fn plugin_restarts(&mut self, now: HostTime, why: String) {
         if !self.can_wait_for_plugin() {
             return;
         }

@@ -26,16 +26,15 @@ pub(crate) mod tests;
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
-use vizflyt_protocol::flight_end::{EndReason, FlightEnd, PluginFault};
+use vizflyt_protocol::flight_end::{EndReason, FlightEnd};
 use vizflyt_protocol::mavlink::GuidedSetpoint;
 use vizflyt_protocol::messages::{
-    ArenaInfo, Event, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Setpoint, Text,
-    bounded,
+    ArenaInfo, EventKind, FlightPhase, InvalidSetpoint, Limits, PoseAges, Text,
 };
 use vizflyt_protocol::time::{Host, HostTime};
 
 use crate::guard::{Guard, GuardMode, HoldReason, Lagging, LandReason, Response, VehicleMotion};
-use crate::link::{Goal, Link, LinkEvent};
+use crate::link::{Goal, Link};
 
 use sight::Sight;
 pub use sight::{MAX_IMAGE_AGE_S, MIN_IMAGE_RATE_HZ, Views};
@@ -60,46 +59,6 @@ impl FlightSettings {
     pub fn tighten(&self, arena: &mut ArenaInfo) {
         arena.limits = arena.limits.stricter(&self.limits);
     }
-}
-
-/// An input of the flight.
-#[derive(Clone, Debug)]
-#[allow(clippy::large_enum_variant)] // Why: handed on by value at once, never stored.
-pub enum FlightInput {
-    /// The server described the arena.
-    Arena(Box<ArenaInfo>),
-    /// Localization gave the vehicle's motion.
-    Pose(VehicleMotion),
-    /// An event of the server's; when it happened, by our clock.
-    Server(Event, HostTime),
-    /// An event of the link to the autopilot.
-    Link(LinkEvent),
-    /// The plugin waits for images.
-    PluginReady,
-    /// An image was handed to the plugin.
-    ImagePublished {
-        /// Its number.
-        seq: u64,
-        /// How old it is, by camera.
-        views: Views,
-    },
-    /// The plugin replied to an image.
-    Replied {
-        /// Its number.
-        seq: u64,
-        /// Its setpoint, if it sent one.
-        setpoint: Option<Setpoint>,
-    },
-    /// There is no connection to the server, or it refuses us for now; why, in a sentence.
-    ServerDown(String),
-    /// The server refuses us, and retrying will not help; why, in a sentence.
-    ServerRefused(String),
-    /// The plugin has failed for good.
-    PluginFailed(PluginFault),
-    /// The plugin is being started again; why, in a sentence. The vehicle holds until it replies.
-    PluginRestarts(String),
-    /// A person ends the flight.
-    Interrupt,
 }
 
 /// The link's state at a tick.
@@ -282,36 +241,6 @@ impl Flight {
     /// Returns the next notice.
     pub fn poll_notice(&mut self) -> Option<FlightNotice> {
         self.notices.pop_front()
-    }
-
-    /// Handles an input.
-    pub fn handle(&mut self, now: HostTime, input: FlightInput) {
-        match input {
-            FlightInput::Arena(arena) => self.handle_arena(now, arena),
-            FlightInput::Pose(vehicle) => {
-                if vehicle.is_valid() {
-                    self.vehicle = Some(vehicle);
-                }
-            }
-            FlightInput::Server(event, at) => self.handle_server(now, at.min(now), &event),
-            FlightInput::Link(event) => self.handle_link(now, event),
-            FlightInput::ServerDown(why) => self.server_down = Some(bounded(&why)),
-            FlightInput::ServerRefused(why) => {
-                self.end_for(now, EndReason::ServerRefused(bounded(&why)));
-            }
-            FlightInput::PluginReady => self.plugin_ready = true,
-            FlightInput::ImagePublished { seq, views } => {
-                self.sight.shown(now, seq, &views);
-                self.unanswered.get_or_insert((seq, now));
-            }
-            FlightInput::Replied { seq, setpoint } => self.handle_reply(now, seq, setpoint),
-            FlightInput::PluginFailed(fault) => self.end_for(now, EndReason::Plugin(fault)),
-            FlightInput::PluginRestarts(why) => self.handle_restart(now, why),
-            FlightInput::Interrupt => {
-                self.interrupted_at.get_or_insert(now);
-                self.end_for(now, EndReason::Interrupted);
-            }
-        }
     }
 
     /// Does what is due at `now`; 50 to 200 Hz, see [`crate::steering`].

@@ -1,13 +1,16 @@
 //! The flight on a virtual clock, with a vehicle that follows every command.
 
 use glam::{DQuat, DVec3};
-use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle};
+use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle, PluginFault};
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion};
-use vizflyt_protocol::messages::{Limits, OutcomeKind, PoseAges, YawTarget, bounded};
+use vizflyt_protocol::messages::{
+    Event, Limits, OutcomeKind, PoseAges, Setpoint, YawTarget, bounded,
+};
 use vizflyt_protocol::time::ServerTime;
 
 use super::*;
+use crate::link::LinkEvent;
 use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
 
 /// The vehicle's own limits: slower than the arena, otherwise laxer.
@@ -92,8 +95,8 @@ impl Script {
     fn waiting() -> Self {
         let mut script = Self::new();
         script.flight.wait_for_start();
-        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-        script.flight.handle(script.now, FlightInput::PluginReady);
+        script.flight.handle_arena(script.now, Box::new(arena()));
+        script.flight.plugin_ready();
         script.run(4.0);
         assert_eq!(script.flight.phase(), FlightPhase::Waiting, "{:?}", script.notices);
         script
@@ -101,8 +104,8 @@ impl Script {
 
     fn flying() -> Self {
         let mut script = Self::new();
-        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-        script.flight.handle(script.now, FlightInput::PluginReady);
+        script.flight.handle_arena(script.now, Box::new(arena()));
+        script.flight.plugin_ready();
         script.run(4.0);
         assert_eq!(script.flight.phase(), FlightPhase::Flying, "{:?}", script.notices);
         script
@@ -120,26 +123,23 @@ impl Script {
                     sigma_m: 0.0,
                     allowance_s: 0.0,
                 };
-                self.flight.handle(self.now, FlightInput::Pose(vehicle));
+                self.flight.handle_pose(vehicle);
             }
             if self.images && self.flight.arena.is_some() {
                 self.seq += 1;
                 let mut views = Views::default();
                 views[0] = Some(self.now.plus_seconds(-self.image_age_s));
-                let shown = FlightInput::ImagePublished { seq: self.seq, views };
-                self.flight.handle(self.now, shown);
+                self.flight.published(self.now, self.seq, views);
                 let setpoint = match self.replies.clone() {
                     Replies::Never => None,
                     Replies::Without => Some(None),
                     Replies::With(setpoint) => Some(Some(setpoint)),
                 };
                 if let Some(setpoint) = setpoint {
-                    let answer = FlightInput::Replied { seq: self.seq, setpoint };
-                    self.flight.handle(self.now, answer);
+                    self.flight.replied(self.now, self.seq, setpoint);
                 }
                 if self.next_is_shown {
-                    let next = FlightInput::ImagePublished { seq: self.seq + 1, views };
-                    self.flight.handle(self.now, next);
+                    self.flight.published(self.now, self.seq + 1, views);
                 }
             }
             self.orders = self.flight.tick(self.now, &self.link);
@@ -188,7 +188,7 @@ impl Script {
 
     fn server(&mut self, kind: EventKind, text: &str) {
         let event = Event { stamp: ServerTime::ZERO, kind, text: bounded(text) };
-        self.flight.handle(self.now, FlightInput::Server(event, self.now));
+        self.flight.handle_event(self.now, &event, self.now);
     }
 
     fn phases(&self) -> Vec<FlightPhase> {
@@ -237,8 +237,8 @@ fn nothing_is_armed_before_all_are_ready() {
     for (spoil, expected) in checks {
         let mut script = Script::new();
         spoil(&mut script);
-        script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-        script.flight.handle(script.now, FlightInput::PluginReady);
+        script.flight.handle_arena(script.now, Box::new(arena()));
+        script.flight.plugin_ready();
         for _ in 0..18 {
             script.run(1.0);
             assert_eq!(script.orders.goal, Goal::Prepare, "{expected}");
@@ -258,7 +258,7 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
     let mut script = Script::new();
     script.run(6.0);
     assert!(script.notices.iter().any(|notice| notice.text.contains("no answer from the server")));
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle_arena(script.now, Box::new(arena()));
     script.run(6.0);
     assert!(script.notices.iter().any(|notice| notice.text.contains("on_start")));
     assert_eq!(script.flight.phase(), FlightPhase::Connecting);
@@ -268,7 +268,7 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
 fn ends_with_the_words_of_a_server_that_refuses() {
     let mut script = Script::new();
     let why = "the server refuses: another runtime flies wasp".to_owned();
-    script.flight.handle(script.now, FlightInput::ServerDown(why));
+    script.flight.server_down(&why);
     script.run(21.0);
     assert!(!script.notices.iter().any(|notice| notice.text.contains("no answer")));
     let end = script.flight.outcome().expect("it gives up").to_string();
@@ -329,13 +329,11 @@ fn outcome_is_the_earliest_event_though_it_arrives_later() {
     script.run(1.0);
     let touched_at = script.now;
     script.run(0.1);
-    script
-        .flight
-        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("exit status 3")));
+    script.flight.plugin_failed(script.now, PluginFault::ended("exit status 3"));
     script.run(0.1);
     let kind = EventKind::Collision(touch());
     let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
-    script.flight.handle(script.now, FlightInput::Server(event, touched_at));
+    script.flight.handle_event(script.now, &event, touched_at);
     script.check_end(OutcomeKind::Collided, "collision with an obstacle");
     // The server receives what the runtime saw; the earlier stamp wins there as well.
     let ended = script.notices.iter().filter(|n| matches!(n.kind, EventKind::Ended(_))).count();
@@ -387,9 +385,7 @@ fn on_the_ground_only_the_stop_button_ends_it() {
 fn failed_plugin_lands_the_vehicle_and_reports_why() {
     let mut script = Script::flying();
     script.replies = Replies::Never;
-    script
-        .flight
-        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("killed by SIGSEGV")));
+    script.flight.plugin_failed(script.now, PluginFault::ended("killed by SIGSEGV"));
     script.check_end(OutcomeKind::PluginFailed, "killed by SIGSEGV");
     let is_failure = |notice: &&FlightNotice| {
         matches!(notice.kind, EventKind::Ended(EndReason::Plugin(_)))
@@ -398,9 +394,7 @@ fn failed_plugin_lands_the_vehicle_and_reports_why() {
     assert_eq!(script.notices.iter().filter(is_failure).count(), 1);
 
     let mut script = Script::new();
-    script
-        .flight
-        .handle(script.now, FlightInput::PluginFailed(PluginFault::ended("exit status 1")));
+    script.flight.plugin_failed(script.now, PluginFault::ended("exit status 1"));
     assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::PluginFailed);
 }
 
@@ -441,8 +435,8 @@ fn reports_why_no_setpoint_comes() {
 fn takes_off_only_with_fresh_images() {
     let mut script = Script::new();
     script.image_age_s = 0.3;
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.handle_arena(script.now, Box::new(arena()));
+    script.flight.plugin_ready();
     script.run(8.0);
     assert_eq!(script.flight.phase(), Preparing);
     let told = "waiting: images are 300 ms old when they come; take-off allows 250";
@@ -467,8 +461,8 @@ fn takes_off_only_from_the_start_box_and_at_rest() {
     let mut script = Script::new();
     let start = Volume::aabb(DVec3::splat(-0.5), DVec3::splat(0.5));
     let arena = ArenaInfo { start_box: Some(start), ..arena() };
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena)));
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.handle_arena(script.now, Box::new(arena));
+    script.flight.plugin_ready();
     let told = |script: &Script, text: &str| {
         script.notices.iter().any(|notice| notice.text == format!("waiting: {text}"))
     };
@@ -492,7 +486,7 @@ fn takes_off_only_from_the_start_box_and_at_rest() {
 fn a_camera_that_is_not_there_is_named() {
     let mut script = Script::new();
     script.flight.settings.cameras = vec!["left".into()];
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle_arena(script.now, Box::new(arena()));
     let reason = script.flight.outcome().unwrap().to_string();
     assert!(reason.contains("no camera here is called left"), "{reason}");
 }
@@ -511,13 +505,11 @@ fn lost_poses_hold_then_land() {
 #[test]
 fn a_take_off_that_goes_wrong_is_landed() {
     let mut script = Script::new();
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.handle_arena(script.now, Box::new(arena()));
+    script.flight.plugin_ready();
     script.run(1.0);
     assert_eq!(script.flight.phase(), FlightPhase::TakingOff);
-    script
-        .flight
-        .handle(script.now, FlightInput::Link(LinkEvent::Refused("take-off denied".into())));
+    script.flight.handle_link(script.now, LinkEvent::Refused("take-off denied".into()));
     script.check_end(OutcomeKind::Error, "take-off denied");
 }
 
@@ -525,13 +517,13 @@ fn a_take_off_that_goes_wrong_is_landed() {
 fn a_lost_link_or_a_restart_ends_the_flight() {
     for (event, expected) in [(LinkEvent::Lost, "silent"), (LinkEvent::Rebooted, "restarted")] {
         let mut script = Script::flying();
-        script.flight.handle(script.now, FlightInput::Link(event));
+        script.flight.handle_link(script.now, event);
         script.check_end(OutcomeKind::Error, expected);
     }
     // Nothing comes any more at all: the flight still ends.
     let mut script = Script::flying();
     script.link.connected = false;
-    script.flight.handle(script.now, FlightInput::Link(LinkEvent::Lost));
+    script.flight.handle_link(script.now, LinkEvent::Lost);
     script.run(12.0);
     assert_eq!(script.flight.outcome().unwrap().outcome(), OutcomeKind::Error);
 }
@@ -549,8 +541,8 @@ fn hands_are_off_in_every_phase_once_the_mode_is_another() {
     for phase in [TakingOff, Flying, Holding, Landing] {
         for mode in modes.into_iter().filter(|&mode| (phase, mode) != (Landing, CopterMode::Land)) {
             let mut script = Script::new();
-            script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-            script.flight.handle(script.now, FlightInput::PluginReady);
+            script.flight.handle_arena(script.now, Box::new(arena()));
+            script.flight.plugin_ready();
             while script.flight.phase() != TakingOff {
                 script.run(0.02);
             }
@@ -610,7 +602,7 @@ fn sends_nothing_after_a_pilot_takes_over() {
 #[test]
 fn an_interrupt_lands_first_and_leaves_soon() {
     let mut script = Script::flying();
-    script.flight.handle(script.now, FlightInput::Interrupt);
+    script.flight.interrupt(script.now);
     script.run(0.02);
     assert_eq!(script.orders.goal, Goal::Land);
     script.run(1.2);
@@ -637,15 +629,15 @@ fn time_limits_count_from_take_off_and_the_shorter_wins() {
 #[test]
 fn another_arena_ends_the_flight() {
     let mut script = Script::flying();
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
+    script.flight.handle_arena(script.now, Box::new(arena()));
     assert_eq!(script.flight.phase(), FlightPhase::Flying, "the same arena is welcome");
     let other = ArenaInfo { body_radius_m: 0.3, ..arena() };
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(other)));
+    script.flight.handle_arena(script.now, Box::new(other));
     script.check_end(OutcomeKind::Error, "another arena");
 
     let mut script = Script::new();
     let broken = ArenaInfo { takeoff_height_m: f64::NAN, ..arena() };
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(broken)));
+    script.flight.handle_arena(script.now, Box::new(broken));
     assert!(script.flight.outcome().unwrap().to_string().contains("takeoff_height_m"));
 }
 
@@ -663,7 +655,7 @@ fn the_stricter_limit_wins() {
 
 impl Script {
     fn restart(&mut self, why: &str) {
-        self.flight.handle(self.now, FlightInput::PluginRestarts(why.to_owned()));
+        self.flight.plugin_restarts(self.now, why.to_owned());
     }
 
     fn notice_count(&self, text: &str) -> usize {
@@ -683,7 +675,7 @@ fn a_plugin_that_is_started_again_is_waited_for_in_the_air() {
     assert_eq!(script.flight.phase(), Holding, "{:?}", script.notices);
     assert!(script.v_mps.length() < 1e-3, "it stands still: {}", script.v_mps);
     assert_eq!(script.notice_count("exit status 3; the plugin is started again"), 1);
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.plugin_ready();
     script.replies = replies;
     script.run(1.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
@@ -721,19 +713,19 @@ fn lands_a_vehicle_that_a_former_runtime_left_in_the_air() {
 fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
     let mut script = Script::new();
     script.link.ready_to_arm = Err("the compass is confused".into());
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.handle_arena(script.now, Box::new(arena()));
+    script.flight.plugin_ready();
     script.run(1.0);
     assert!(script.flight.is_on_ground() && script.flight.can_wait_for_plugin());
     script.restart("no model file");
     script.link.ready_to_arm = Ok(());
     script.run(3.0);
     assert_eq!(script.orders.goal, Goal::Prepare, "nobody is armed without a plugin");
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.plugin_ready();
     script.run(4.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
     // Once the flight is over, there is nothing to be started for.
-    script.flight.handle(script.now, FlightInput::PluginFailed(PluginFault::ended("it is broken")));
+    script.flight.plugin_failed(script.now, PluginFault::ended("it is broken"));
     assert!(!script.flight.can_wait_for_plugin());
     script.restart("no");
     script.check_end(OutcomeKind::PluginFailed, "it is broken");
@@ -743,8 +735,8 @@ fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
 fn setpoint_out_of_the_fence_is_reported_once_and_not_flown() {
     let mut script = Script::new();
     script.flight.settings.limits = arena().limits;
-    script.flight.handle(script.now, FlightInput::Arena(Box::new(arena())));
-    script.flight.handle(script.now, FlightInput::PluginReady);
+    script.flight.handle_arena(script.now, Box::new(arena()));
+    script.flight.plugin_ready();
     script.run(4.0);
     let p_world_m = DVec3::new(1000.0, 0.0, 1.0);
     script.replies = Replies::With(Setpoint::Position { p_world_m, yaw: YawTarget::Keep });

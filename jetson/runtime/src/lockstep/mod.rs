@@ -126,7 +126,7 @@ impl Lockstep {
         }
         let result = process.begin(&start, line);
         if self.unless_failed(now, result, line)?.is_some() {
-            self.companion.plugin_ready(now);
+            self.companion.plugin_ready();
         }
         Ok(())
     }

@@ -134,7 +134,7 @@ fn logged(path: &Path, images: LoggedImages) {
         if seq == 7 {
             let kind = EventKind::Phase(FlightPhase::Flying);
             let event = Event { stamp, kind, text: bounded("the plugin flies") };
-            lockstep.companion.handle_event(now, event);
+            lockstep.companion.handle_event(now, &event);
         }
         let (mount, body) = (&cameras[0].body_from_cam, Pose::IDENTITY);
         let header = ImageHeader::new(seq, 0, stamp, &cameras[0].intrinsics, mount, &body);

@@ -117,10 +117,10 @@ impl Runtime {
         }
         while let Some(event) = wires.events.receive(now) {
             self.events.push((now, event.clone()));
-            self.companion.handle_event(now, event);
+            self.companion.handle_event(now, &event);
         }
         if self.server_lost_at.take_if(|at| *at <= now).is_some() {
-            self.companion.server_down(now, "server: timed out".to_owned());
+            self.companion.server_down("server: timed out");
         }
         while let Some(pose) = wires.images.receive(now) {
             self.seq += 1;
@@ -153,7 +153,7 @@ impl Runtime {
             Output::Attached => self.companion.greet_plugin(now),
             Output::Message(received) => match self.limiter.take(now, received) {
                 _ if self.is_leaving => {}
-                Some(FromPlugin::Ready { .. }) => self.companion.plugin_ready(now),
+                Some(FromPlugin::Ready { .. }) => self.companion.plugin_ready(),
                 Some(FromPlugin::Reply { seq, setpoint, .. }) => {
                     self.companion.replied(now, seq, setpoint);
                 }
