@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Prepares the sources of the documentation site: the documents, with links to other files of the repository led there, and the
-pages that are generated: the help of every command, and the Python package's reference.
+"""Prepares the sources of the documentation site: the documents, with links to other files led to the repository, and
+the generated pages: the help of every command, and the reference of the Python package.
 
 docs/site/prepare.py VIZFLYT FOLDER
 """
@@ -35,7 +35,7 @@ def led(name: str, text: str) -> str:
     def lead(match: re.Match[str]) -> str:
         begin, target, anchor, end = match.groups()
         path = posixpath.normpath(posixpath.join(folder, target))
-        if re.match(r"[a-z]+:", target) or path.startswith("docs/") and (ROOT / path).is_file():
+        if re.match(r"[a-z]+:", target) or (path.startswith("docs/") and (ROOT / path).is_file()):
             return match[0]
         kind = "tree" if (ROOT / path).is_dir() else "blob"
         return f"{begin}{REPOSITORY}/{kind}/main/{path}{anchor or ''}{end}"
@@ -49,10 +49,11 @@ def commands(program: str) -> str:
     """Returns a page with the help of every command."""
     parts = ["# Commands\n\nThe help of each command, as `vizflyt COMMAND --help` prints it.\n"]
 
+    environment = {**os.environ, "COLUMNS": "100"}
+
     def add(*names: str) -> None:
-        text = subprocess.run(
-            [program, *names, "--help"], check=True, capture_output=True, text=True, env={**os.environ, "COLUMNS": "100"}
-        ).stdout
+        call = [program, *names, "--help"]
+        text = subprocess.run(call, check=True, capture_output=True, text=True, env=environment).stdout
         level = "#" * min(max(len(names), 1) + 1, 4)
         parts.append(f"{level} {' '.join(('vizflyt', *names))}\n\n```text\n{text.rstrip()}\n```\n")
         section = re.search(r"^Commands:\n(.*?)(?:^\S|\Z)", text, re.M | re.S)
