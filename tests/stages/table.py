@@ -118,6 +118,7 @@ STAGES = [
           when_quick="tests/rust/test --crates {crates}"),
     Stage("doc", "examples in the documentation", EVERYDAY, COMPUTE, f"cargo test {WORKSPACE} --doc", 15),
     Stage("links", "links in the documents", QUICK, COMPUTE, "tests/docs/links.py", 1),
+    Stage("prose", "words of the documents", QUICK, COMPUTE, "tests/docs/prose.py", 1),
     Stage("commands", "commands in the documents", QUICK, COMPUTE, f"tests/docs/commands.py {PROGRAM}", 1),
     Stage("lint-page", "the page's scripts: lints, types, unit tests", QUICK, COMPUTE, "tests/page/lint", 5,
           [NODE, NPM]),
