@@ -13,7 +13,8 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 # Code, quotes and links' targets are not prose.
 CODE = re.compile(r"^(```|~~~).*?^\1[^\n]*$|`[^`\n]*`|<!--.*?-->|\]\([^)]*\)|\"[^\"\n]*\"|<[^>\n]*>", re.M | re.S)
 RULES = [
-    (r"(?<!there )\b(?:is|are|was|were) (?:no|none)\b(?! longer| more)|\bthat (?:is|are) none\b", "'is no X': say 'is not an X', or what it is"),
+    (r"(?<!there )\b(?:is|are|was|were) (?:no|none)\b(?! longer| more)|\bthat (?:is|are) none\b",
+     "say 'is not an X', or what it is"),
     (r"\bso (?:long|many|often|far)\b(?! as| that)", "'so long', 'so many' as a measure: give the measure"),
     (r"\b(?:server|runtime|page|program|plugin|log|guard|bridge|it) (?:tells|says|knows|believes|asks|forgets)\b",
      "software prints, reports, sends, estimates"),
@@ -49,8 +50,9 @@ def findings(name: str, text: str) -> list[str]:
 
 
 def main() -> int:
-    listed = subprocess.run(["git", "ls-files", "README.md", "docs/*.md"], cwd=ROOT, check=True, capture_output=True, text=True)
-    documents = [name for name in listed.stdout.splitlines() if not name.startswith(LEFT_OUT) and (ROOT / name).exists()]
+    call = ["git", "ls-files", "README.md", "docs/*.md"]
+    listed = subprocess.run(call, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
+    documents = [name for name in listed if not name.startswith(LEFT_OUT) and (ROOT / name).exists()]
     lines = [line for name in documents for line in findings(name, (ROOT / name).read_text())]
     print("\n".join(lines) or f"{len(documents)} documents: nothing found")
     return 1 if lines else 0
