@@ -49,7 +49,7 @@ def commands(program: str) -> str:
     """Returns a page with the help of every command."""
     parts = ["# Commands\n\nThe help of each command, as `vizflyt COMMAND --help` prints it.\n"]
 
-    environment = {**os.environ, "COLUMNS": "100"}
+    environment = {**os.environ, "COLUMNS": "84"}
 
     def add(*names: str) -> None:
         call = [program, *names, "--help"]
