@@ -44,7 +44,7 @@ pub const STATE: usize = 22;
 /// Numbers that rewards are made of.
 pub const FIGURES: usize = 4;
 
-/// What an action asks for; its numbers are within -1 and 1.
+/// Quantity that an action commands; its numbers are within -1 and 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ActionKind {
     /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn.
@@ -55,33 +55,33 @@ pub enum ActionKind {
     BodyRates,
 }
 
-/// How an episode stands; its number goes to Python.
+/// State of an episode; its number goes to Python.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum End {
     /// In the air.
     Flying = 0,
-    /// It touched something.
+    /// Collision with an obstacle.
     Crashed = 1,
-    /// It left the fence.
+    /// Fence left.
     LeftFence = 2,
     /// All stages are passed.
     Finished = 3,
-    /// Its time is over.
+    /// Time limit reached.
     TimeUp = 4,
 }
 
-/// What episodes of one course have in common.
+/// Rules that all episodes of a course share.
 #[derive(Debug)]
 pub struct Rules {
     /// The room.
     pub arena: ArenaConfig,
-    /// What may be touched.
+    /// Obstacles that end an episode when touched.
     pub obstacles: Obstacles,
     boundaries: Boundaries,
     body: BodyShape,
     limits: Limits,
-    /// Where each stage is, and its direction; the goal behind them. [m, world]
+    /// Position and direction of each stage, then the goal. [m, world]
     targets: Vec<(DVec3, DVec3)>,
 }
 
@@ -102,16 +102,16 @@ impl Rules {
     }
 }
 
-/// How an episode is flown.
+/// Actions and time limit of an episode.
 #[derive(Clone, Copy, Debug)]
 pub struct Manner {
-    /// What actions ask for.
+    /// Quantity that actions command.
     pub action: ActionKind,
-    /// Controller's ticks a step.
+    /// Controller ticks per step.
     pub ticks: u32,
-    /// Steps until an action counts.
+    /// Steps until an action takes effect.
     pub delay: usize,
-    /// After so much an episode is over. [s]
+    /// Time limit of an episode. [s]
     pub seconds: f64,
 }
 

@@ -44,7 +44,7 @@ pub struct GymArgs {
     /// How many vehicles fly at once, each in an episode of its own
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
     envs: u32,
-    /// What an action asks for
+    /// Quantity that an action commands
     #[arg(long, value_enum, default_value_t)]
     action: Action,
     /// Steps a second
@@ -78,7 +78,7 @@ fn error_px(text: &str) -> Result<f32, String> {
     (0.0..=10.0).contains(&px).then_some(px).ok_or_else(|| "give 0 to 10 px".to_owned())
 }
 
-/// What an action asks for; its numbers are within -1 and 1.
+/// Quantity that an action commands; its numbers are within -1 and 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Action {
     /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn
