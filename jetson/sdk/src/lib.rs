@@ -27,6 +27,8 @@
 //!
 //! Read in this order: [`autonomy`](Autonomy), [`observation`](Observation), [`run`], [`ipc`].
 
+#![warn(missing_docs)]
+
 mod autonomy;
 mod clock;
 pub mod ipc;

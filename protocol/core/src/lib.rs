@@ -19,6 +19,7 @@
 //! Absent on purpose: sockets, clocks, threads, files.
 
 #![no_std]
+#![warn(missing_docs)]
 
 mod copter_mode;
 #[cfg(feature = "mavlink")]

@@ -29,6 +29,8 @@
 //! assert_eq!(depth_out, depth_mm);
 //! ```
 
+#![warn(missing_docs)]
+
 mod bits;
 mod color;
 mod decode;

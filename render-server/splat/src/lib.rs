@@ -32,6 +32,8 @@
 //!
 //! No network, no tokio, no clock but the stopwatch of [`PassTimes`]: a function of its arguments.
 
+#![warn(missing_docs)]
+
 mod atmosphere;
 mod backend;
 mod blocks;
