@@ -1,5 +1,5 @@
-//! What runtime and guardian say to each other over a socket that keeps messages apart: one byte for the kind,
-//! then the rest. Whole MAVLink packets are by far the most.
+//! Messages between runtime and guardian over a `SOCK_SEQPACKET` socket: one byte for the kind, then the body. Most
+//! messages are whole MAVLink packets.
 
 use std::io;
 use std::net::SocketAddr;
@@ -12,24 +12,24 @@ use vizflyt_protocol::packet::feed::FeedKey;
 
 use crate::port::{LinkSigning, Wanted};
 
-/// Larger than any datagram of MAVLink packets on an Ethernet. [bytes]
+/// Maximum message size, larger than any datagram of MAVLink packets on Ethernet. [bytes]
 pub(crate) const MAX_MESSAGE: usize = 2049;
 
-/// First byte of a message.
+/// Kind of a message: its first byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum MessageKind {
-    /// Both ways: bytes to or from the autopilot.
+    /// Both directions: bytes to or from the autopilot.
     Mavlink = b'M',
-    /// From the runtime, first: which autopilot, and the key; [`Setup`].
+    /// From the runtime, first message: wanted autopilot and signing key ([`Setup`]).
     Setup = b'S',
-    /// From the runtime: where poses come from, without it; [`Feed`].
+    /// From the runtime: source of poses that does not depend on the runtime ([`Feed`]).
     Feed = b'F',
-    /// From the guardian: the port is open; its local address.
+    /// From the guardian: the port is open; body: its local address.
     Ready = b'R',
-    /// From the guardian: the port cannot be opened; why.
+    /// From the guardian: the port cannot be opened; body: the reason.
     Refused = b'X',
-    /// From the guardian: a sentence that people should see.
+    /// From the guardian: a note for the user.
     Note = b'N',
 }
 
@@ -41,7 +41,7 @@ impl MessageKind {
     }
 }
 
-/// Which autopilot is waited for.
+/// Wanted autopilot and signing key, as sent to the guardian.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Setup {
     system: Option<u8>,
@@ -65,21 +65,21 @@ impl Setup {
     }
 }
 
-/// Where the guardian gets poses by itself.
+/// Source of poses for the guardian, independent of the runtime.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Feed {
-    /// The server's socket.
+    /// Socket address of the server.
     pub server: SocketAddr,
-    /// The flight's key.
+    /// Key of this flight.
     pub key: FeedKey,
-    /// What the server's clock is ahead of this computer's. [ns]
+    /// Offset of the server's clock relative to this computer's clock, positive if it is ahead. [ns]
     pub server_ahead_ns: i64,
 }
 
-/// Sends a message, if the other side is there and has room.
+/// Sends a message without blocking.
 ///
 /// # Errors
-/// The system's: nobody reads, or there is no room.
+/// Returns an error if the peer has ended or the socket's buffer is full.
 pub(crate) fn put(socket: BorrowedFd<'_>, kind: MessageKind, body: &[u8]) -> io::Result<()> {
     let mut message = [0; MAX_MESSAGE];
     let body = &body[..body.len().min(MAX_MESSAGE - 1)];
@@ -90,10 +90,10 @@ pub(crate) fn put(socket: BorrowedFd<'_>, kind: MessageKind, body: &[u8]) -> io:
     Ok(())
 }
 
-/// Sends a structure.
+/// Serializes `body` and sends it.
 ///
 /// # Errors
-/// As [`put`].
+/// See [`put`].
 pub(crate) fn put_body(
     socket: BorrowedFd<'_>,
     kind: MessageKind,
@@ -104,18 +104,17 @@ pub(crate) fn put_body(
     put(socket, kind, body)
 }
 
-/// What comes from the other side.
+/// Result of [`take`].
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Received<'a> {
-    /// A message.
     Message(MessageKind, &'a [u8]),
-    /// None within the socket's time-out, or one of no kind that we know.
+    /// No message within the socket's timeout, or a message of unknown kind.
     Nothing,
-    /// The other side has ended.
+    /// The peer has ended.
     Ended,
 }
 
-/// Waits for a message, for as long as the socket's time-out says.
+/// Waits for a message, at most for the socket's timeout.
 pub(crate) fn take<'a>(socket: BorrowedFd<'_>, buffer: &'a mut [u8; MAX_MESSAGE]) -> Received<'a> {
     match recv(socket.as_raw_fd(), &mut buffer[..], MsgFlags::empty()) {
         Ok(0) => Received::Ended,

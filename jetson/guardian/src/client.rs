@@ -1,4 +1,4 @@
-//! The runtime's end: starts the guardian, and speaks with it instead of with the autopilot's port.
+//! Runtime's end of the guardian: starts its process, and exchanges messages with it.
 
 use std::io;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
@@ -19,32 +19,33 @@ use nix::sys::time::{TimeVal, TimeValLike};
 use crate::channel::{Feed, MAX_MESSAGE, MessageKind, Received, Setup, put, put_body, take};
 use crate::port::{MavlinkAddress, Wanted};
 
-/// The subcommand that runs a guardian.
+/// Subcommand that runs a guardian.
 pub const SUBCOMMAND: &str = "guardian";
-/// So long may it take to open the port.
+/// Timeout for opening the port.
 const READY_WITHIN: Duration = Duration::from_secs(10);
-/// So long may it take to leave, where the vehicle stands.
+/// Timeout for the guardian's end after a flight, if the vehicle is on the ground.
 const LEAVES_WITHIN: Duration = Duration::from_secs(1);
-/// Longest wait for a message. [ms]
+/// Maximum wait for a message. [ms]
 const WAIT_MS: i64 = 100;
-/// Messages that may wait, both ways: a second of packets. [bytes]
+/// Size of the queue in each direction: one second of packets. [bytes]
 const QUEUE: usize = 256 << 10;
 
-/// What comes from the guardian.
+/// Message from the guardian.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Message<'a> {
-    /// Bytes of the autopilot's.
+    /// Bytes from the autopilot.
     Mavlink(&'a [u8]),
-    /// A sentence that people should see.
+    /// Note for the user.
     Note(String),
 }
 
-/// Where messages are received.
+/// Receive buffer for messages.
 pub type Buffer = [u8; MAX_MESSAGE];
-/// An empty one.
+/// Empty receive buffer.
 pub const BUFFER: Buffer = [0; MAX_MESSAGE];
 
-/// A guardian that runs, until this process ends or [`Self::leave`] is called, and the vehicle stands.
+/// Running guardian. Its process ends when this process has ended or called [`Self::leave`], and the vehicle is on the
+/// ground.
 #[derive(Debug)]
 pub struct Guardian {
     socket: OwnedFd,
@@ -54,10 +55,10 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Starts one, a process of `program`, which has the subcommand, on the port at `address`.
+    /// Starts a guardian for the port at `address`: `program` with the subcommand [`SUBCOMMAND`].
     ///
     /// # Errors
-    /// The system's refusal of a process or of the port.
+    /// Returns an error if the process cannot be started or the port cannot be opened.
     pub fn start(program: &Path, address: &MavlinkAddress, wanted: &Wanted) -> io::Result<Self> {
         let flag = SockFlag::SOCK_CLOEXEC;
         let (ours, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, flag)?;
@@ -69,7 +70,7 @@ impl Guardian {
             .args([SUBCOMMAND, &address.to_string()])
             .stdin(Stdio::from(theirs))
             .stdout(Stdio::null())
-            // Keys that end the runtime must not end it.
+            // Keys that end the runtime, such as Ctrl-C, must not end the guardian.
             .process_group(0)
             .spawn()?;
         put_body(ours.as_fd(), MessageKind::Setup, &Setup::of(wanted))?;
@@ -78,28 +79,28 @@ impl Guardian {
         Ok(Self { socket: ours, child, local, has_ended: AtomicBool::new(false) })
     }
 
-    /// Returns where others reach it: the socket's address, or the device.
+    /// Returns the local end of the link: the socket's address, or the device.
     pub fn local(&self) -> &str {
         &self.local
     }
 
-    /// Returns the number of its process.
+    /// Returns the process id of the guardian.
     pub fn pid(&self) -> u32 {
         self.child.lock().unwrap_or_else(PoisonError::into_inner).id()
     }
 
-    /// Sends a packet to the autopilot; loss is the protocol's concern.
+    /// Sends a packet to the autopilot. Errors are ignored: MAVLink tolerates loss.
     pub fn send(&self, packet: &[u8]) {
         let _ = put(self.socket.as_fd(), MessageKind::Mavlink, packet);
     }
 
-    /// Says where poses come from without the runtime; repeated, as the clocks drift apart.
+    /// Sends the source of poses for the time after the runtime's end. Repeated, because the clocks drift.
     pub fn feed(&self, feed: &Feed) {
         let _ = put_body(self.socket.as_fd(), MessageKind::Feed, feed);
     }
 
-    /// Tells it that the flight is over, and waits a second for it to leave: the next flight finds the port
-    /// free. Where the vehicle still lands, it goes on without us.
+    /// Ends the connection, and waits up to 1 s until the guardian has ended, so that the next flight finds the port
+    /// free. If the vehicle is still landing, the guardian keeps running.
     pub fn leave(&self) {
         self.has_ended.store(true, Ordering::Relaxed);
         let _ = shutdown(self.socket.as_raw_fd(), Shutdown::Both);
@@ -109,16 +110,16 @@ impl Guardian {
         }
     }
 
-    /// Whether its process has ended.
+    /// Whether the guardian's process has ended.
     pub fn has_left(&self) -> bool {
         let mut child = self.child.lock().unwrap_or_else(PoisonError::into_inner);
         !matches!(child.try_wait(), Ok(None))
     }
 
-    /// Waits for what comes, 100 ms at most.
+    /// Waits at most 100 ms for a message.
     ///
     /// # Errors
-    /// The guardian has ended; said once, then it waits in vain.
+    /// Returns an error once, if the guardian has ended. Later calls return `None` after 100 ms.
     pub fn receive<'a>(&self, buffer: &'a mut Buffer) -> io::Result<Option<Message<'a>>> {
         if self.has_ended.load(Ordering::Relaxed) {
             thread::sleep(Duration::from_millis(100));
@@ -130,7 +131,7 @@ impl Guardian {
                 Ok(Some(Message::Note(String::from_utf8_lossy(text).into_owned())))
             }
             Received::Message(..) | Received::Nothing => Ok(None),
-            // We have left it, or it us.
+            // Not an error if this end has called `leave`, or if the end was already reported.
             Received::Ended if self.has_ended.swap(true, Ordering::Relaxed) => Ok(None),
             Received::Ended => {
                 Err(io::Error::other("the guardian has ended: nothing reaches the autopilot"))
@@ -153,5 +154,5 @@ fn wait_until_ready(socket: &OwnedFd) -> io::Result<String> {
             Received::Ended => return Err(io::Error::other("the guardian ended at its start")),
         }
     }
-    Err(io::Error::other("the guardian does not open the port"))
+    Err(io::Error::other("the guardian did not open the port within 10 s"))
 }

@@ -1,4 +1,4 @@
-//! The guardian's own subscription to poses, over UDP: they go on when the runtime does not.
+//! Pose subscription of the guardian, over UDP: poses continue if the runtime has ended.
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
@@ -11,12 +11,12 @@ use vizflyt_protocol::time::{HostTime, ServerTime};
 
 use crate::channel::Feed;
 
-/// Subscriptions are renewed this often. [s]
+/// Interval at which the subscription is renewed. [s]
 const RENEW_S: f64 = 0.5;
-/// Longest wait for a pose.
+/// Maximum wait for a pose.
 const WAIT: Duration = Duration::from_millis(100);
 
-/// The subscription; `source` is set by the runtime, while it lives.
+/// Subscription to the poses of a `source`, which the runtime updates while it runs.
 pub(crate) struct Subscription {
     socket: UdpSocket,
     renew_at: HostTime,
@@ -38,7 +38,7 @@ impl Subscription {
         Ok(Some(Self { socket, renew_at: HostTime::ZERO, newest: ServerTime::ZERO, current: None }))
     }
 
-    /// Waits for a pose, 100 ms at most; returns it and when it was true, on this computer's clock.
+    /// Waits at most 100 ms for a pose. Returns it with the time of its measurement on this computer's clock.
     pub(crate) fn receive(
         &mut self,
         clock: impl Fn() -> HostTime,
@@ -46,7 +46,7 @@ impl Subscription {
     ) -> Option<(PoseSample, HostTime)> {
         let feed = (*source.lock().unwrap_or_else(PoisonError::into_inner))?;
         if self.current.is_none_or(|known| known.key != feed.key) {
-            // Another connection, perhaps to a server that was restarted: its clock begins anew.
+            // A new key means a new connection, perhaps to a restarted server, whose clock starts at zero.
             (self.newest, self.renew_at) = (ServerTime::ZERO, HostTime::ZERO);
         }
         self.current = Some(feed);

@@ -1,16 +1,16 @@
-//! The guardian: the last process of a flight to die. It owns the way to the autopilot, and it knows one thing to do:
-//! where the vehicle is in the air and the runtime says nothing for half a second, or has ended, it orders LAND,
-//! goes on with the heartbeats and, by a subscription of its own, with the poses, until the vehicle stands or a
-//! pilot has taken it. It restarts nothing and plans nothing.
+//! Guardian: process that owns the connection to the autopilot and outlives the runtime. If the runtime is silent for
+//! 0.5 s in flight, or has ended, the guardian orders LAND. It then continues the heartbeats and, with its own
+//! subscription, the poses, until the vehicle is on the ground or a pilot has taken over. It does not restart or plan
+//! anything.
 //!
 //! ```text
 //! runtime ── socket, one packet a message ──▶ watch ──▶ port ──▶ autopilot
 //!         ◀────────────────────────────────────────── port ◀──
-//! server ── sealed datagrams ── feed ────────▶ watch (where the runtime's poses have stopped)
+//! server ── sealed datagrams ── feed ────────▶ watch (if the runtime sends no poses)
 //! ```
-//! Three threads, one lock, no allocation once it runs (tested), no async. [`watch`] judges, sans-IO, by the same
-//! rules as the bridge on the vehicle ([`vizflyt_protocol::failsafe`]); [`port`] carries bytes; [`client`] is the
-//! runtime's end. Keys and signals that end the runtime do not reach it.
+//! Three threads, one lock, no allocation after the start (tested), no async. [`watch`] decides, sans-IO, by the same
+//! rules as the bridge on the vehicle ([`vizflyt_protocol::failsafe`]). [`port`] carries bytes. [`client`] is the
+//! runtime's end. Signals and keys that end the runtime do not reach the guardian.
 
 mod channel;
 pub mod client;
@@ -41,13 +41,13 @@ use feed::Subscription;
 use port::{MavlinkAddress, Port};
 use watch::{Out, Watch};
 
-/// Longest wait for the runtime: how late LAND may be. [ms]
+/// Maximum wait for a message of the runtime: maximum delay of LAND. [ms]
 const TICK_MS: i64 = 10;
 
-/// What to do about a port that is in use.
+/// Explanation and remedy if the port is in use.
 const TAKEN: &str = ": by another runtime, a ground station, or the guardian of an earlier flight, which leaves when its vehicle stands";
 
-/// What the threads share.
+/// State shared by the threads.
 struct Shared {
     port: Port,
     watch: Mutex<Watch>,
@@ -56,8 +56,8 @@ struct Shared {
     is_over: AtomicBool,
 }
 
-/// Guards one flight on the port at `address`, typed as after `--mavlink`, with the runtime on standard input.
-/// Returns when nothing is left to do.
+/// Guards one flight on the port at `address`, in the format of `--mavlink`, with the runtime on standard input.
+/// Returns when the flight is over and the vehicle is on the ground or lost.
 pub fn run(address: &str) -> ExitCode {
     match try_run(address) {
         Ok(()) => ExitCode::SUCCESS,
@@ -69,7 +69,7 @@ pub fn run(address: &str) -> ExitCode {
 }
 
 fn try_run(address: &str) -> io::Result<()> {
-    // Before any thread: all of them are deaf to what ends the runtime.
+    // Before any thread starts: every thread must inherit the blocked signals that end the runtime.
     SigSet::all().thread_block()?;
     let runtime = io::stdin().as_fd().try_clone_to_owned()?;
     let mut buffer = [0; MAX_MESSAGE];
@@ -107,7 +107,7 @@ fn try_run(address: &str) -> io::Result<()> {
     Ok(())
 }
 
-/// The main thread: the runtime's packets, and the clock.
+/// Main thread: handles the runtime's packets and runs the clock.
 fn hear_runtime(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE];
     let mut has_ended = false;
@@ -143,7 +143,7 @@ fn hear_runtime(shared: &Shared) {
     }
 }
 
-/// The autopilot's bytes: to the runtime first, whole as they came.
+/// Receives the autopilot's bytes, and forwards them to the runtime unchanged before decoding them.
 fn hear_autopilot(shared: &Shared) {
     let mut buffer = [0; MAX_MESSAGE - 1];
     while !shared.is_over.load(Ordering::Relaxed) {
@@ -152,18 +152,18 @@ fn hear_autopilot(shared: &Shared) {
         }
         match shared.port.receive(&mut buffer) {
             Ok(Some(len)) => {
-                // No room drops telemetry, as the network might.
+                // If the socket is full, telemetry is dropped, as on a network.
                 let _ = put(shared.runtime.as_fd(), MessageKind::Mavlink, &buffer[..len]);
                 shared.watch().handle_autopilot(host_now(), &buffer[..len]);
             }
             Ok(None) => {}
-            // A device that is gone comes back, perhaps.
+            // An unplugged device may come back.
             Err(_) => thread::sleep(Duration::from_millis(100)),
         }
     }
 }
 
-/// Poses, once the runtime has said where they come from.
+/// Receives poses once the runtime has sent their source.
 fn hear_poses(shared: &Shared) {
     let mut subscription = None;
     while !shared.is_over.load(Ordering::Relaxed) {
@@ -190,7 +190,7 @@ impl Shared {
     }
 }
 
-/// Where the watch's packets and sentences go.
+/// Output of the watch: packets to the port, notes to standard error and to the runtime.
 struct PortOut<'a> {
     port: &'a Port,
     runtime: BorrowedFd<'a>,
@@ -207,12 +207,12 @@ impl Out for PortOut<'_> {
     }
 }
 
-/// A line for whoever still reads; nobody may.
+/// Writes a line to standard error; ignores errors, because the reader may have ended.
 fn complain(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");
 }
 
-/// Returns the clock that the runtime stamps by: CLOCK_MONOTONIC.
+/// Returns the time of the clock that also stamps the runtime's events: CLOCK_MONOTONIC.
 fn host_now() -> HostTime {
     let time = clock_gettime(ClockId::CLOCK_MONOTONIC).expect("Linux has this clock");
     let ns = time.tv_sec() * 1_000_000_000 + time.tv_nsec();

@@ -1,9 +1,9 @@
-//! The guardian's judgement, sans-IO: what the runtime and the autopilot send passes through it; from `now` follow
-//! a stop, LAND, the heartbeats of a landing, and poses in the runtime's place.
+//! Decisions of the guardian, sans-IO. Packets of the runtime and the autopilot pass through [`Watch`]. From them and
+//! from `now` follow a stop, LAND, the heartbeats of a landing, and poses in place of the runtime's.
 //!
-//! It knows three things: whether the runtime speaks ([`Failsafe`]), what the autopilot's heartbeat says, and where
-//! the vehicle is. Once it has ordered LAND the runtime's orders no longer pass, should it wake up again; its poses
-//! and all else do. A pilot's mode ends the landing, as everywhere.
+//! The inputs are the runtime's packets ([`Failsafe`]), the autopilot's heartbeat and the pose of the vehicle. After
+//! LAND was ordered, orders of the runtime are blocked, even if the runtime recovers; its poses and all other packets
+//! still pass. As everywhere, a pilot's mode ends the landing.
 
 use glam::DVec3;
 use vizflyt_protocol::failsafe::{
@@ -20,52 +20,52 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::port::{Wanted, is_flown};
 
-/// The runtime's silence that ends in LAND, while the vehicle follows it. [ms]
+/// Silence of the runtime that leads to LAND, while the vehicle follows the runtime. [ms]
 pub const SILENCE_MS: u16 = 500;
-/// Silence in the midst of setpoints, which come 50 times a second, that ends in a stop. [s]
+/// Gap in the setpoints, which come at 50 Hz, that leads to a stop. [s]
 const STOP_S: f64 = 0.2;
-/// The stop is repeated this often. [s]
+/// Interval at which the stop is repeated. [s]
 const STOP_EVERY_S: f64 = 0.1;
-/// The component that we are: a second onboard computer, so that our packets are counted apart from the runtime's.
+/// MAVLink component of the guardian: a second onboard computer, so that its packets are counted separately from the
+/// runtime's.
 pub const COMPONENT_ID: u8 = 192;
-/// The runtime's system, until it has sent something; the one whose heartbeats an autopilot counts.
+/// System id until the runtime has sent a packet. An autopilot counts heartbeats from this id.
 const SYSTEM_ID: u8 = 255;
-/// Our link id in signatures; the runtime's is 0.
+/// Link id of the guardian in signatures. The runtime's is 0.
 const SIGNING_LINK: u8 = 1;
-/// So long without a pose of the runtime's, and ours go out. [s]
+/// Time without a pose from the runtime after which the guardian sends poses. [s]
 const NAVIGATION_S: f64 = 0.1;
-/// Poses older than this are not sent, as in the runtime. [s]
+/// Maximum age of a pose that is sent, as in the runtime. [s]
 const STALE_S: f64 = 0.5;
-/// At most so often. [s]
+/// Minimum interval between sent poses. [s]
 const POSE_EVERY_S: f64 = 0.018;
-/// An autopilot that is not heard for this long gives its place to another. [s]
+/// Silence after which another autopilot may take the place of this one. [s]
 const LOST_AFTER_S: f64 = 3.0;
-/// An autopilot that sends nothing at all for this long, once the runtime is gone, is given up: its own failsafes
-/// have begun by then. [s]
+/// Silence of the autopilot after which the guardian ends, if the runtime has ended. The autopilot's own failsafes have
+/// started by then. [s]
 const GIVEN_UP_S: f64 = 5.0;
-/// What the guardian itself was not run for counts as this much silence of the runtime at most: where the whole
-/// computer stands still, the runtime gets its turn first. [s]
+/// Maximum time per step that counts as silence of the runtime, if the guardian itself was not scheduled. If the whole
+/// computer stalls, the runtime gets a chance to send before LAND is ordered. [s]
 const LONGEST_STEP_S: f64 = 0.05;
 
-/// Sentences for people.
+/// Notes for the user.
 const SILENT: &str = "guardian: the runtime is silent: asks for LAND";
 const ENDED: &str = "guardian: the runtime has ended in flight: asks for LAND";
 const DESCENDING: &str = "guardian: the autopilot lands";
 const UNHEARD: &str = "guardian: LAND is not acknowledged";
 
-/// What goes out.
 pub trait Out {
-    /// A packet to the autopilot.
+    /// Sends a packet to the autopilot.
     fn send(&mut self, packet: &[u8]);
-    /// A sentence for people.
+    /// Prints a note for the user.
     fn say(&mut self, sentence: &'static str);
 }
 
-/// The state. See the module.
+/// State of the guardian's decisions; see the module.
 pub struct Watch {
     failsafe: Failsafe,
     runtime_is_gone: bool,
-    /// The runtime's system, by its packets.
+    /// MAVLink system of the runtime, from its packets.
     system: u8,
     wanted: Wanted,
     signer: Option<Signer>,
@@ -73,30 +73,29 @@ pub struct Watch {
     decoder: StreamDecoder,
     autopilot: Option<(u8, u8)>,
     autopilot_at: HostTime,
-    /// Any packet of it.
+    /// Time of the autopilot's newest packet of any kind.
     heard_at: HostTime,
     flight: Flight,
     sequence: u8,
     made_at: HostTime,
     polled_at: HostTime,
-    /// Our own time: the clock's, without what we were not run for.
+    /// Watch time: the clock without the time in which the guardian was not scheduled.
     own: HostTime,
     navigated_at: HostTime,
     steering: Option<Steering>,
 }
 
-/// The runtime's newest setpoint.
+/// Newest setpoint of the runtime.
 #[derive(Clone, Copy, Debug)]
 struct Steering {
-    /// In our own time.
+    /// Watch time at which it arrived.
     at: HostTime,
     yaw: YawTarget,
-    /// The next stop is due then, should no other setpoint come.
+    /// Watch time of the next stop, unless another setpoint arrives.
     stop_at: HostTime,
 }
 
 impl Watch {
-    /// Begins at `now`.
     pub fn new(now: HostTime, wanted: Wanted) -> Self {
         let signing = wanted.signing.as_ref();
         let signer = signing.map(|signing| Signer::new(signing.key.clone(), SIGNING_LINK));
@@ -123,7 +122,7 @@ impl Watch {
         }
     }
 
-    /// Passes on a packet of the runtime's, which sends them one by one; an order not while we land the vehicle.
+    /// Forwards one packet of the runtime. During a landing by the guardian, orders are dropped.
     pub fn handle_runtime(&mut self, now: HostTime, packet: &[u8], out: &mut impl Out) {
         let Some(head) = Head::of(packet) else { return };
         self.step(now);
@@ -146,7 +145,7 @@ impl Watch {
         }
     }
 
-    /// Takes note of what comes from the autopilot.
+    /// Handles bytes from the autopilot: heartbeats and the answer to LAND.
     pub fn handle_autopilot(&mut self, now: HostTime, bytes: &[u8]) {
         self.step(now);
         let Self { decoder, verifier, wanted, autopilot, .. } = self;
@@ -180,7 +179,7 @@ impl Watch {
             }
         });
         if let Some((from, flight)) = beat {
-            // The first one keeps its place while it speaks, as in the runtime.
+            // As in the runtime, the first autopilot keeps its place until it is silent.
             let is_kept = now.seconds_since(self.autopilot_at) < LOST_AFTER_S;
             if self.autopilot.is_none_or(|known| known == from || !is_kept) {
                 (self.autopilot, self.autopilot_at, self.flight) = (Some(from), now, flight);
@@ -194,12 +193,12 @@ impl Watch {
         }
     }
 
-    /// Takes note that the runtime has ended.
+    /// Records that the runtime has ended.
     pub fn handle_end(&mut self) {
         self.runtime_is_gone = true;
     }
 
-    /// Takes a pose that was true at `stamp`; sends it on if the runtime no longer does.
+    /// Handles a pose that was measured at `stamp`: sends it if the runtime sends no poses.
     pub fn handle_pose(
         &mut self,
         now: HostTime,
@@ -210,14 +209,14 @@ impl Watch {
         let runtime_sends = now.seconds_since(self.navigated_at) < NAVIGATION_S;
         let is_fresh = now.seconds_since(stamp) < STALE_S;
         if self.autopilot.is_some() && !runtime_sends && is_fresh && sample.is_valid() {
-            // The next one is due a period after this, not NAVIGATION_S after it.
+            // The next pose is due one period later, not NAVIGATION_S later.
             self.navigated_at = now.plus_seconds(POSE_EVERY_S - NAVIGATION_S);
             let message = vision_of_sample(sample, stamp);
             self.transmit(now, &MavMessage::VISION_POSITION_ESTIMATE(message), out);
         }
     }
 
-    /// Does what is due; called at least every 20 ms.
+    /// Performs due actions. Call it at least every 20 ms.
     pub fn handle_timeout(&mut self, now: HostTime, out: &mut impl Out) {
         self.step(now);
         let silence_ms = if self.runtime_is_gone { 1 } else { SILENCE_MS };
@@ -243,7 +242,7 @@ impl Watch {
         }
     }
 
-    /// Stops the vehicle where setpoints have ceased; the runtime's next one lets it fly on.
+    /// Stops the vehicle if setpoints are missing. The runtime's next setpoint resumes the flight.
     fn stop(&mut self, now: HostTime, out: &mut impl Out) {
         let is_stopping = self.flight.follows() && self.failsafe.stage().is_none();
         let (Some(target), Some(steering)) = (self.autopilot, &mut self.steering) else { return };
@@ -258,13 +257,13 @@ impl Watch {
         self.transmit(now, &MavMessage::SET_POSITION_TARGET_LOCAL_NED(stop), out);
     }
 
-    /// Whether nothing is left to do: the runtime has ended, and the vehicle stands, or is gone.
+    /// Whether the guardian can end: the runtime has ended, and the vehicle is disarmed or silent.
     pub fn is_over(&self, now: HostTime) -> bool {
         let is_heard = now.seconds_since(self.heard_at) < GIVEN_UP_S;
         self.runtime_is_gone && !(self.flight.armed && is_heard)
     }
 
-    /// Lets our own time pass.
+    /// Advances the watch time to `now`.
     fn step(&mut self, now: HostTime) {
         let step_s = now.seconds_since(self.polled_at).clamp(0.0, LONGEST_STEP_S);
         (self.polled_at, self.own) = (now, self.own.plus_seconds(step_s));
@@ -291,13 +290,13 @@ impl Watch {
 const HEARTBEAT: u32 = 0;
 const SET_POSITION_TARGET_LOCAL_NED: u32 = 84;
 
-/// Whether a message makes the autopilot do something: a setpoint, a mode, a command.
+/// Whether a message makes the autopilot act: a setpoint, a mode or a command.
 const fn is_order(id: u32) -> bool {
     // SET_MODE, COMMAND_INT, COMMAND_LONG.
     (is_stream(id) && !is_navigation(id)) || matches!(id, 11 | 75 | 76)
 }
 
-/// What a MAVLink 2 packet's first bytes say.
+/// Header and payload of a MAVLink 2 packet.
 struct Head<'a> {
     source: (u8, u8),
     id: u32,
@@ -313,7 +312,7 @@ impl<'a> Head<'a> {
         Some(Self { source: (system, component), id: u32::from_le_bytes([a, b, c, 0]), payload })
     }
 
-    /// Where the nose is to point, if this is a setpoint.
+    /// Returns the yaw to keep while stopped, if this is a setpoint.
     fn steers(&self) -> Option<YawTarget> {
         if self.id != SET_POSITION_TARGET_LOCAL_NED {
             return None;

@@ -1,4 +1,4 @@
-//! Once it runs, the guardian allocates nothing: neither for packets both ways, nor while it lands a vehicle.
+//! After its start, the guardian allocates no memory: neither while it forwards packets, nor while it lands a vehicle.
 
 use std::net::UdpSocket;
 
@@ -17,7 +17,7 @@ use vizflyt_protocol::time::{HostTime, ServerTime};
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// Sends into the port, as the process does.
+/// Sends to the port, as the process does.
 struct ToPort<'a> {
     port: &'a Port,
     lands: u32,
@@ -38,7 +38,7 @@ fn packet(source: (u8, u8), message: &MavMessage, buffer: &mut [u8; MAX_PACKET])
 }
 
 #[test]
-fn nothing_is_allocated_once_it_runs() {
+fn does_not_allocate_after_the_start() {
     let autopilot = UdpSocket::bind("127.0.0.1:0").unwrap();
     let port = Port::open(&"udpin:127.0.0.1:0".parse().unwrap(), Wanted::default()).unwrap();
     let to: std::net::SocketAddr = port.local().unwrap().parse().unwrap();
@@ -65,10 +65,10 @@ fn nothing_is_allocated_once_it_runs() {
         }
         if ms % 500 == 0 {
             autopilot.send_to(&down[..down_len], to).unwrap();
-            let len = port.receive(&mut received).unwrap().expect("its heartbeat");
+            let len = port.receive(&mut received).unwrap().expect("the autopilot's heartbeat");
             watch.handle_autopilot(at(ms), &received[..len]);
         }
-        // It speaks for 3 s, then it hangs; its server goes on.
+        // The runtime sends for 3 s, then hangs. The server's poses continue.
         if ms < 3000 {
             watch.handle_runtime(at(ms), &up[..up_len], &mut out);
         }
@@ -77,5 +77,5 @@ fn nothing_is_allocated_once_it_runs() {
         watch.handle_timeout(at(ms), &mut out);
     }
     assert_eq!(CountingAllocator::thread_allocations() - before, 0);
-    assert!(out.lands > 3, "it asked for LAND");
+    assert!(out.lands > 3, "LAND was sent");
 }

@@ -1,6 +1,6 @@
 //! ArduCopter's flight modes.
 
-/// Flight modes of ArduCopter that we name; the number is HEARTBEAT's `custom_mode`.
+/// Flight modes of ArduCopter that VizFlyt uses. The number is `custom_mode` of HEARTBEAT.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum CopterMode {
@@ -8,20 +8,20 @@ pub enum CopterMode {
     Stabilize = 0,
     /// Manual attitude, altitude held.
     AltHold = 2,
-    /// Flies what a companion computer asks.
+    /// Follows setpoints of a companion computer.
     Guided = 4,
-    /// Position held, sticks move it.
+    /// Position hold; the sticks move the position.
     Loiter = 5,
-    /// Returns to the launch point; dangerous in a room, it climbs first.
+    /// Returns to the launch point. Dangerous in a room, because it climbs first.
     Rtl = 6,
-    /// Comes down here.
+    /// Lands at the current position.
     Land = 9,
-    /// Stops at once.
+    /// Stops as fast as possible.
     Brake = 17,
 }
 
 impl CopterMode {
-    /// Returns the mode of a `custom_mode` number, if we name it.
+    /// Returns the mode of a `custom_mode` number, if it is one of these.
     pub fn from_number(number: u32) -> Option<Self> {
         use CopterMode::{AltHold, Brake, Guided, Land, Loiter, Rtl, Stabilize};
         [Stabilize, AltHold, Guided, Loiter, Rtl, Land, Brake]

@@ -1,41 +1,41 @@
-//! What follows when a companion falls silent in flight: LAND, ordered in its place. The guardian on the
-//! companion's computer runs it, and the bridge on the vehicle; sans-IO, no allocation.
+//! Failsafe for a companion that falls silent in flight: LAND is sent in its place. Used by the guardian on the
+//! companion's computer and by the bridge on the vehicle. Sans-IO, no allocation.
 //!
-//! Whoever streams setpoints or poses, ten within two seconds, is the companion; a ground station
-//! that sends one target now and then is not. While the vehicle is armed and follows a companion
-//! (GUIDED, or PX4's OFFBOARD), silence of the companion for the set time means LAND: repeated
-//! until the autopilot has left that mode. A companion that comes back meanwhile changes nothing:
-//! a vehicle that changes its mind halfway is harder to foresee than one that lands.
+//! A sender of a stream of setpoints or poses (ten within two seconds) is the companion. A ground station that sends an
+//! occasional target is not. While the vehicle is armed and follows a companion (GUIDED, or PX4's OFFBOARD), silence of
+//! the companion for the configured time leads to LAND, repeated until the autopilot has left that mode. If the
+//! companion recovers during the landing, the landing continues, because a vehicle that lands is easier to predict than
+//! one that resumes its flight halfway.
 //!
 //! ```text
 //! silent ─▶ asked ── acknowledged ─▶ accepted ── heartbeat in LAND ─▶ descending ── disarmed, or a
 //!             └─ not for a second: reported ─┘                          │           pilot's mode ─▶ over
-//!                                                        the companion's heartbeat, in its place
+//!                                                        the companion's heartbeat is sent for it
 //! ```
-//! While it descends the companion's heartbeat goes on: ArduCopter's own failsafe, some seconds late,
-//! would begin the landing anew, with its pause. Not before: should LAND go unheard, that failsafe is
-//! what lands the vehicle.
+//! During the descent, the companion's heartbeat is continued. Otherwise ArduCopter's own failsafe would restart the
+//! landing some seconds later, with a pause. The heartbeat is not continued before the descent: if LAND is not
+//! received, that failsafe must land the vehicle.
 
 use crate::mavlink::CopterMode;
 use crate::mavlink::dialect::{COMMAND_LONG_DATA, MavAutopilot, MavCmd, MavModeFlag};
 use crate::time::HostTime;
 
-/// Contents of the autopilot's heartbeat.
+/// State of the vehicle from the autopilot's heartbeat.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Flight {
-    /// Its motors may turn.
+    /// Whether the vehicle is armed.
     pub armed: bool,
-    /// `custom_mode`.
+    /// Mode number: `custom_mode` of the heartbeat.
     pub mode: u32,
-    /// PX4, whose modes are numbered otherwise.
+    /// Whether the autopilot is PX4, whose modes have other numbers.
     pub px4: bool,
 }
 
 impl Flight {
-    /// Before the first heartbeat; as the default, but `const`.
+    /// State before the first heartbeat. Equal to the default, but `const`.
     pub const UNKNOWN: Self = Self { armed: false, mode: 0, px4: false };
 
-    /// Returns what a heartbeat's fields say: `autopilot`, `base_mode`, `custom_mode`.
+    /// Returns the state from the fields of a heartbeat: `autopilot`, `base_mode`, `custom_mode`.
     pub fn of(autopilot: u8, base_mode: u8, mode: u32) -> Self {
         Self {
             armed: base_mode & MavModeFlag::MAV_MODE_FLAG_SAFETY_ARMED.bits() != 0,
@@ -44,60 +44,60 @@ impl Flight {
         }
     }
 
-    /// Whether the vehicle obeys a companion.
+    /// Whether the vehicle follows a companion's setpoints.
     pub fn follows(self) -> bool {
         let mode = if self.px4 { PX4_OFFBOARD } else { CopterMode::Guided as u32 };
         self.armed && self.mode == mode
     }
 
-    /// Whether the vehicle lands by itself.
+    /// Whether the vehicle is landing by itself.
     pub fn lands(self) -> bool {
         let mode = if self.px4 { PX4_LAND } else { CopterMode::Land as u32 };
         self.armed && self.mode == mode
     }
 }
 
-/// PX4's main mode 6 in `custom_mode`.
+/// PX4's main mode 6 (OFFBOARD) in `custom_mode`.
 const PX4_OFFBOARD: u32 = 6 << 16;
-/// PX4's main mode 4, sub-mode 6.
+/// PX4's main mode 4, sub-mode 6 (AUTO.LAND).
 const PX4_LAND: u32 = 4 << 16 | 6 << 24;
-/// Packets that make a stream, within [`STREAM_S`].
+/// Number of packets within [`STREAM_S`] that make a stream.
 const STREAM: u8 = 10;
 const STREAM_S: f64 = 2.0;
-/// A companion silent for this long has ended, if nothing follows it. Longer than the time from the
-/// last pose before arming to the heartbeat that reports it. [s]
+/// Silence after which a companion has ended, if the vehicle does not follow it. Must exceed the time from the last
+/// pose before arming to the heartbeat that reports the arming. [s]
 const ENDED_S: f64 = 5.0;
-/// LAND is repeated this often until it is acknowledged. [s]
+/// Interval at which LAND is repeated until it is acknowledged. [s]
 const REPEAT_S: f64 = 0.3;
-/// And this often from then on, until the mode has changed: heartbeats come once a second. [s]
+/// Interval at which LAND is repeated after that, until the mode has changed. Heartbeats arrive once a second. [s]
 const REPEAT_ACKNOWLEDGED_S: f64 = 1.5;
 
-/// What nothing has acknowledged for this long is reported; a second's heartbeat may tell it too. [s]
+/// Time without an acknowledgement after which it is reported. The heartbeat, once a second, may also confirm LAND. [s]
 const UNANSWERED_S: f64 = 1.1;
-/// And this often from then on. [s]
+/// Interval at which the report is repeated. [s]
 const REPORT_S: f64 = 5.0;
-/// The companion's heartbeat is sent in its place this often: two may be lost before `FS_GCS_TIMEOUT`, whose
-/// least is 2 s. [s]
+/// Interval at which the companion's heartbeat is sent in its place. Two may be lost before `FS_GCS_TIMEOUT`, whose
+/// minimum is 2 s. [s]
 const BEAT_S: f64 = 0.5;
-/// And for no longer than this: a landing from the height of a hall takes a quarter of it. [s]
+/// Maximum time for which it is sent. A landing from the ceiling of a hall takes a quarter of this. [s]
 const LONGEST_S: f64 = 120.0;
 
-/// Whether a message is one of a stream by which a vehicle flies: setpoints and external
-/// navigation. Of these the newest counts.
+/// Whether a message belongs to a stream that flies the vehicle: setpoints and external navigation. Only the newest one
+/// of a stream is relevant.
 pub const fn is_stream(message_id: u32) -> bool {
     // SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT,
     // MANUAL_CONTROL, RC_CHANNELS_OVERRIDE.
     matches!(message_id, 82 | 84 | 86 | 69 | 70) || is_navigation(message_id)
 }
 
-/// Whether a message tells the autopilot where it is.
+/// Whether a message sends the autopilot its pose or velocity (external navigation).
 pub const fn is_navigation(message_id: u32) -> bool {
     // GLOBAL_VISION_POSITION_ESTIMATE, VISION_POSITION_ESTIMATE, VISION_SPEED_ESTIMATE,
     // VICON_POSITION_ESTIMATE, ATT_POS_MOCAP, GPS_INPUT, ODOMETRY.
     matches!(message_id, 101..=104 | 138 | 232 | 331)
 }
 
-/// Returns the order to land, for `target` (system, component).
+/// Returns the command to land, for `target` (system, component).
 pub fn land(target: (u8, u8), confirmation: u8) -> COMMAND_LONG_DATA {
     COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_NAV_LAND,
@@ -111,7 +111,7 @@ pub fn land(target: (u8, u8), confirmation: u8) -> COMMAND_LONG_DATA {
 /// Payload of a HEARTBEAT.
 pub type Beat = [u8; 9];
 
-/// The companion and its silence.
+/// State of the companion and of a landing after its silence.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Failsafe {
     streamer: Option<Streamer>,
@@ -124,18 +124,18 @@ struct Streamer {
     received_at: HostTime,
     counted: u8,
     counting_since: HostTime,
-    /// Its newest heartbeat.
+    /// Newest heartbeat of the streamer.
     beat: Option<Beat>,
 }
 
-/// How far a landing is.
+/// Progress of a landing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LandingStage {
-    /// The autopilot was asked, and has not answered.
+    /// LAND was sent, but not acknowledged.
     Asked,
-    /// It has accepted.
+    /// The autopilot has acknowledged LAND.
     Accepted,
-    /// Its heartbeat is in LAND.
+    /// The autopilot's heartbeat reports the mode LAND.
     Descending,
 }
 
@@ -143,12 +143,12 @@ pub enum LandingStage {
 struct Landing {
     stage: LandingStage,
     asked_at: HostTime,
-    /// The next LAND; descending, the next heartbeat.
+    /// Time of the next LAND; while descending, of the next heartbeat.
     act_at: HostTime,
-    /// The next report that nothing has answered.
+    /// Time of the next report of a missing acknowledgement.
     report_at: HostTime,
     confirmation: u8,
-    /// It was said that the vehicle lands.
+    /// Whether the landing was announced.
     is_announced: bool,
 }
 
@@ -165,32 +165,32 @@ impl Landing {
     }
 }
 
-/// What is to be done.
+/// Action to perform.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FailsafeAction {
-    /// Send LAND with this count of repetitions; zero means it begins: announce it.
+    /// Send LAND. If `confirmation` is 0, the landing begins and should be announced.
     Land {
-        /// MAVLink's count of repetitions.
+        /// Number of repetitions, as in MAVLink's `confirmation`.
         confirmation: u8,
     },
-    /// Say that the autopilot lands.
+    /// Announce that the autopilot is landing.
     AnnounceLanding,
-    /// Say that nothing has acknowledged LAND.
+    /// Report that LAND was not acknowledged.
     ReportSilence,
-    /// Send the companion's heartbeat, of its system.
+    /// Send the companion's heartbeat, from its system id.
     Beat(u8, Beat),
 }
 
 impl Failsafe {
-    /// No companion yet; as the default, but `const`.
+    /// No companion yet. Equal to the default, but `const`.
     pub const NONE: Self = Self { streamer: None, landing: None };
 
-    /// Returns who streams, if anybody does.
+    /// Returns the companion (system, component): the sender of a stream, if there is one.
     pub fn companion(&self) -> Option<(u8, u8)> {
         self.streamer.filter(|streamer| streamer.counted >= STREAM).map(|streamer| streamer.source)
     }
 
-    /// Takes note of a packet from the network; `streams`: it is a setpoint or a pose.
+    /// Records a packet from the network. `streams`: the packet is a setpoint or a pose ([`is_stream`]).
     pub fn note_packet(&mut self, now: HostTime, source: (u8, u8), streams: bool) {
         match &mut self.streamer {
             Some(streamer) if streamer.source == source => {
@@ -203,7 +203,7 @@ impl Failsafe {
                     streamer.counted += 1;
                 }
             }
-            // Another companion takes over only from a silent one, or from no companion.
+            // A second sender becomes the companion only if the first is silent or was no companion yet.
             Some(streamer)
                 if streamer.counted >= STREAM
                     && now.seconds_since(streamer.received_at) < STREAM_S => {}
@@ -220,14 +220,14 @@ impl Failsafe {
         }
     }
 
-    /// Takes note of a heartbeat from the network.
+    /// Records a heartbeat from the network.
     pub fn note_heartbeat(&mut self, source: (u8, u8), beat: Beat) {
         if let Some(streamer) = self.streamer.as_mut().filter(|known| known.source.0 == source.0) {
             streamer.beat = Some(beat);
         }
     }
 
-    /// Takes note of the autopilot's answer to LAND.
+    /// Records that the autopilot has acknowledged LAND.
     pub fn note_acknowledged(&mut self, now: HostTime) {
         if let Some(landing) = &mut self.landing
             && landing.stage == LandingStage::Asked
@@ -237,12 +237,12 @@ impl Failsafe {
         }
     }
 
-    /// Returns how far its landing of the vehicle is, if it lands it.
+    /// Returns the progress of the landing, if there is one.
     pub fn stage(&self) -> Option<LandingStage> {
         self.landing.map(|landing| landing.stage)
     }
 
-    /// Whether nothing has acknowledged LAND for too long.
+    /// Whether LAND has been unacknowledged for too long.
     pub fn is_unanswered(&self, now: HostTime) -> bool {
         self.landing.is_some_and(|landing| {
             landing.stage == LandingStage::Asked
@@ -250,7 +250,7 @@ impl Failsafe {
         })
     }
 
-    /// Returns when [`Self::poll`] has something to do, if `flight` stays.
+    /// Returns the time at which [`Self::poll`] next returns an action, if `flight` does not change.
     pub fn due(&self, flight: Flight, loss_ms: u16) -> Option<HostTime> {
         if let Some(landing) = self.landing {
             return Some(match landing.stage {
@@ -263,13 +263,13 @@ impl Failsafe {
         (flies && loss_ms > 0).then(|| streamer.received_at.plus_ns(i64::from(loss_ms) * 1_000_000))
     }
 
-    /// Returns what is to be done at `now`; called until nothing is.
+    /// Returns an action due at `now`. Call it until it returns `None`.
     pub fn poll(&mut self, now: HostTime, flight: Flight, loss_ms: u16) -> Option<FailsafeAction> {
         let ended = |streamer: &Streamer| now.seconds_since(streamer.received_at) > ENDED_S;
         match &mut self.landing {
             Some(_) if !flight.follows() && !flight.lands() => {
                 self.landing = None;
-                // Its stream must be seen again before it is followed.
+                // The companion must stream again before its silence leads to LAND again.
                 self.streamer = None;
             }
             Some(landing) => {
@@ -282,8 +282,8 @@ impl Failsafe {
                     return Some(FailsafeAction::AnnounceLanding);
                 }
             }
-            // On the ground or in a pilot's mode a companion may end as it likes; whoever takes off
-            // later without one is not landed for its silence.
+            // On the ground or in a pilot's mode, a companion may end. A later flight without a companion must not be
+            // landed because of its silence.
             None if !flight.follows()
                 && !flight.lands()
                 && self.streamer.as_ref().is_some_and(ended) =>
@@ -297,7 +297,7 @@ impl Failsafe {
         }
         let landing = match &mut self.landing {
             Some(landing) => landing,
-            // The companion, or a pilot, has ordered it: only the heartbeat is missing.
+            // The companion or a pilot has ordered the landing: only the heartbeat must be continued.
             none if flight.lands() => none.insert(Landing {
                 is_announced: true,
                 ..Landing::begun(now, LandingStage::Descending)
@@ -322,7 +322,7 @@ impl Failsafe {
             LandingStage::Descending => {
                 landing.act_at = now.plus_seconds(BEAT_S);
                 let takes_too_long = now.seconds_since(landing.asked_at) > LONGEST_S;
-                // One that is back beats itself.
+                // A companion that has recovered sends its own heartbeat.
                 let silent = |streamer: &Streamer| {
                     let silent_ms = now.seconds_since(streamer.received_at) * 1e3;
                     silent_ms >= f64::from(loss_ms)
@@ -349,7 +349,7 @@ mod tests {
         HostTime::from_ns(ms * 1_000_000)
     }
 
-    /// Streams from 0 to 1 s, then is silent; returns when LAND was sent, to `until_ms`.
+    /// Streams from 0 to 1 s, then is silent. Returns the times of LAND and their repetition counts up to `until_ms`.
     fn landings(
         flight: impl Fn(u64) -> Flight,
         loss_ms: u16,
@@ -372,37 +372,37 @@ mod tests {
     }
 
     #[test]
-    fn silence_lands_and_repeats_until_the_mode_changes() {
+    fn repeats_land_until_the_mode_changes() {
         let land_at = |ms| if ms < 2700 { GUIDED } else { Flight { mode: 9, ..GUIDED } };
         assert_eq!(landings(land_at, 1000, 20, 9000), [(2000, 0), (2300, 1), (2600, 2)]);
     }
 
     #[test]
-    fn nothing_happens_where_nothing_follows() {
+    fn does_not_land_a_vehicle_without_a_companion() {
         for flight in [Flight { armed: false, ..GUIDED }, Flight { mode: 5, ..GUIDED }] {
             assert_eq!(landings(|_| flight, 1000, 20, 5000), []);
         }
         assert_eq!(landings(|_| GUIDED, 0, 20, 5000), []);
-        // One target each 400 ms is a ground station's.
+        // One target every 400 ms: a ground station.
         assert_eq!(landings(|_| GUIDED, 1000, 400, 5000), []);
         let px4 = Flight { armed: true, mode: 6 << 16, px4: true };
         assert_eq!(landings(|_| px4, 1000, 20, 2200), [(2000, 0)]);
-        // ArduCopter's number means nothing to PX4.
+        // ArduCopter's mode number is not valid for PX4.
         assert_eq!(landings(|_| Flight { mode: 4, ..px4 }, 1000, 20, 5000), []);
     }
 
     #[test]
-    fn a_companion_that_ended_on_the_ground_lands_no_vehicle_later() {
+    fn does_not_land_later_for_a_companion_that_ended_on_the_ground() {
         let pilot = |ms| Flight { mode: 5, armed: ms < 3000, ..GUIDED };
         let later = |ms| if ms < 7000 { pilot(ms) } else { GUIDED };
         assert_eq!(landings(later, 1000, 20, 12_000), []);
-        // One that falls silent while the vehicle is being armed does.
+        // A companion that falls silent during arming does lead to LAND.
         let soon = |ms| if ms < 4000 { pilot(ms) } else { GUIDED };
         assert_eq!(landings(soon, 1000, 20, 4200), [(4000, 0)]);
     }
 
     #[test]
-    fn only_packets_of_the_companion_count() {
+    fn counts_only_packets_of_the_companion() {
         let mut loss = Failsafe::default();
         for ms in (0..500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);
@@ -413,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn an_acknowledged_landing_is_repeated_slowly() {
+    fn repeats_land_slowly_after_an_acknowledgement() {
         let mut loss = Failsafe::default();
         for ms in (0..=500).step_by(20) {
             loss.note_packet(at(ms), RUNTIME, true);
@@ -425,7 +425,7 @@ mod tests {
         loss.note_acknowledged(at(1510));
         assert_eq!(loss.poll(at(1510), GUIDED, 1000), Some(FailsafeAction::AnnounceLanding));
         assert_eq!(loss.due(GUIDED, 1000), Some(at(3010)));
-        // It comes back: the landing goes on.
+        // The companion recovers; the landing continues.
         loss.note_packet(at(1600), RUNTIME, true);
         assert_eq!(
             loss.poll(at(3010), GUIDED, 1000),

@@ -1,11 +1,11 @@
-//! Durations counted by their logarithm: quantiles to within 1.6 %, in 3 KB however many.
+//! Histogram of durations with logarithmic bins: quantiles to within 1.6 % in 3 KB, for any number of samples.
 //!
-//! Both ends of the wire count with it, so that their percentiles mean the same. Adding one costs
-//! some nanoseconds: the bucket is the upper bits of the number itself.
+//! Both ends of the wire use it, so that their percentiles are comparable. Adding a sample takes a few nanoseconds: the
+//! bin number is the upper bits of the floating-point number.
 
 use crate::messages::StageTimes;
 
-/// Counts of durations from 1 us to 16 s; shorter and longer ones count as those.
+/// Histogram of durations from 1 us to 16 s. Shorter and longer durations count in the first and last bin.
 #[derive(Clone, Debug)]
 pub struct Histogram {
     counts: [u32; BUCKETS],
@@ -13,12 +13,12 @@ pub struct Histogram {
     max_ms: f32,
 }
 
-/// Buckets of an octave: the upper 5 bits of the mantissa.
+/// Bits of the mantissa that select one of the bins of an octave.
 const OCTAVE_BITS: u32 = 5;
-/// 24 octaves above a microsecond are 16.8 s.
+/// Number of bins: 24 octaves above 1 us reach 16.8 s.
 const BUCKETS: usize = 24 << OCTAVE_BITS;
 const SHIFT: u32 = f32::MANTISSA_DIGITS - 1 - OCTAVE_BITS;
-/// What `1.0` has above the kept bits: the exponent's bias.
+/// Bits of `1.0` above the dropped ones: the exponent's bias.
 const BIAS: u32 = 127 << OCTAVE_BITS;
 const US_PER_MS: f32 = 1e3;
 
@@ -29,7 +29,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Takes one duration; one that is negative or no number counts as 0. [ms]
+    /// Adds one duration. A negative duration or NaN counts as 0. [ms]
     pub fn add(&mut self, ms: f64) {
         let ms = if ms > 0.0 { ms as f32 } else { 0.0 };
         let counted = &mut self.counts[bucket(ms)];
@@ -38,7 +38,7 @@ impl Histogram {
         self.max_ms = self.max_ms.max(ms);
     }
 
-    /// Adds everything that `other` counted.
+    /// Adds all samples of `other`.
     pub fn merge(&mut self, other: &Self) {
         for (mine, theirs) in self.counts.iter_mut().zip(&other.counts) {
             *mine = mine.saturating_add(*theirs);
@@ -47,22 +47,22 @@ impl Histogram {
         self.max_ms = self.max_ms.max(other.max_ms);
     }
 
-    /// Forgets everything.
+    /// Removes all samples.
     pub fn clear(&mut self) {
         *self = Self::default();
     }
 
-    /// Returns how many were counted.
+    /// Returns the number of samples.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Returns the longest; 0 if there is none. [ms]
+    /// Returns the longest duration, or 0 without samples. [ms]
     pub fn max_ms(&self) -> f64 {
         f64::from(self.max_ms)
     }
 
-    /// Returns the duration that a share `q` of all do not exceed; 0 if there is none. [ms]
+    /// Returns the quantile `q` (0 to 1), or 0 without samples. [ms]
     pub fn quantile_ms(&self, q: f64) -> f64 {
         let rank = libm::ceil(q * self.count as f64).max(1.0) as u64;
         let mut seen = 0;
@@ -75,7 +75,7 @@ impl Histogram {
         f64::from(self.max_ms)
     }
 
-    /// Returns the percentiles that are reported. [ms]
+    /// Returns the percentiles for reports. [ms]
     pub fn times(&self) -> StageTimes {
         StageTimes {
             p50: self.quantile_ms(0.5) as f32,
@@ -124,9 +124,9 @@ mod tests {
     }
 
     proptest! {
-        /// Against the sorted durations themselves.
+        /// Compares quantiles with those of the sorted durations.
         #[test]
-        fn quantiles_are_those_of_the_durations(
+        fn quantiles_match_the_sorted_durations(
             mut durations in prop::collection::vec(0.001f64..16_000.0, 1..500),
             split in 0usize..500,
             q in 0.0f64..1.0,

@@ -1,22 +1,23 @@
-//! The contract of VizFlyt: what the render server, the runtime on the Jetson, a plugin, the
-//! simulated lab and the bridge agree on. `no_std`, no allocation, imports nothing of ours.
+//! Protocol of VizFlyt: types shared by the render server, the runtime on the Jetson, plugins, the simulated lab and
+//! the bridge. `no_std`, no allocation, no dependency on other VizFlyt crates.
 //!
-//! Read in this order:
-//! - [`geometry`]: frames as types, [`geometry::Pose`], [`geometry::Intrinsics`], and
-//!   [`geometry::Volume`], the solids that geofence, truth and tests are made of;
-//! - [`time`]: one stamp type per clock, and the filter that relates two clocks;
-//! - [`histogram`]: durations counted, the same way at both ends;
-//! - [`flight_end`]: how a flight ended, and why: reasons as data, and the one rule that decides;
-//! - [`failsafe`]: who is silent in flight, since when, and what follows; guardian and bridge run the same;
-//! - [`messages`]: what travels on the ordered QUIC stream and to the plugin, in postcard;
-//! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared
-//!   memory, framing of messages on a stream;
-//! - [`random`]: random numbers that follow from a seed;
-//! - [`sensor`]: sensors beside the cameras, by kind; their readings on the wire and in shared memory;
-//! - [`mavlink`]: setpoints and telemetry to and from MAVLink; the only NED/FRD code there is. It and [`failsafe`] are the
-//!   feature `mavlink`: a plugin needs neither, and its dialect takes as long to compile as all the rest.
+//! Recommended reading order:
+//! - [`geometry`]: frames as types, [`geometry::Pose`], [`geometry::Intrinsics`], and [`geometry::Volume`], the solids
+//!   for geofence, ground truth and tests;
+//! - [`time`]: one stamp type per clock, and estimation of the offset between two clocks;
+//! - [`histogram`]: histogram of durations, used at both ends of the wire;
+//! - [`flight_end`]: how and why a flight ended: reasons as data, and the one rule that decides;
+//! - [`failsafe`]: reaction to a silent companion in flight, shared by guardian and bridge;
+//! - [`messages`]: postcard messages of the ordered QUIC stream and of the plugin;
+//! - [`packet`]: zerocopy headers: version preamble, image on the wire, observation in shared memory, framing of
+//!   messages on a stream;
+//! - [`random`]: random numbers from a seed;
+//! - [`sensor`]: sensors other than cameras, by kind; their readings on the wire and in shared memory;
+//! - [`mavlink`]: setpoints and telemetry to and from MAVLink, with the only NED/FRD code in the project. This module
+//!   and [`failsafe`] need the feature `mavlink`: plugins do not use them, and the MAVLink dialect takes as long to
+//!   compile as the rest of the crate.
 //!
-//! Absent on purpose: sockets, clocks, threads, files.
+//! Excluded on purpose: sockets, clocks, threads, files.
 
 #![no_std]
 #![warn(missing_docs)]
@@ -39,6 +40,6 @@ pub use copter_mode::CopterMode;
 
 /// Version of everything in this crate that crosses a wire or shared memory.
 ///
-/// Raise it with any change that an older peer would misread. Peers compare it first
-/// ([`packet::Preamble`]) and refuse a mismatch by name.
+/// Raise it with any change that an older peer would misread. Peers compare it first ([`packet::Preamble`]), and reject
+/// a mismatch with a message that names both versions.
 pub const PROTOCOL_VERSION: u16 = 13;

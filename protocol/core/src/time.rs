@@ -1,5 +1,4 @@
-//! Stamps: when a measurement was valid, in a clock that its type names. Only this module
-//! converts between clocks.
+//! Time stamps of measurements, with the clock in the type. Only this module converts between clocks.
 
 mod civil;
 mod offset;
@@ -13,9 +12,9 @@ use serde::{Deserialize, Serialize};
 pub use civil::Civil;
 pub use offset::OffsetFilter;
 
-/// A clock domain; implemented by empty marker types only.
+/// Clock domain. Implemented only by empty marker types.
 pub trait Clock: Copy + 'static {
-    /// The clock's name in messages and documents.
+    /// Name of the clock in messages and documents.
     const NAME: &'static str;
 }
 
@@ -33,17 +32,17 @@ macro_rules! clocks {
 }
 
 clocks! {
-    /// The monotonic clock of the computer this code runs on.
+    /// Monotonic clock of the computer that runs this code.
     Host, HostTime = "host";
-    /// The monotonic clock of the render server's computer; stamps poses and images.
+    /// Monotonic clock of the render server's computer. It stamps poses and images.
     Server, ServerTime = "server";
-    /// The autopilot's time since boot.
+    /// Time since boot of the autopilot.
     Autopilot, AutopilotTime = "autopilot";
-    /// The motion capture system's frame clock.
+    /// Frame clock of the motion capture system.
     Mocap, MocapTime = "mocap";
 }
 
-/// Nanoseconds on the clock `C`.
+/// Time stamp on the clock `C`, in nanoseconds.
 #[derive(Serialize, Deserialize)]
 #[serde(bound = "", transparent)]
 pub struct Stamp<C> {
@@ -53,15 +52,15 @@ pub struct Stamp<C> {
 }
 
 impl<C: Clock> Stamp<C> {
-    /// The clock's zero.
+    /// Zero of the clock.
     pub const ZERO: Self = Self::from_ns(0);
 
-    /// Makes a stamp from nanoseconds on this clock. [ns]
+    /// Returns the stamp of a number of nanoseconds on this clock. [ns]
     pub const fn from_ns(ns: u64) -> Self {
         Self { ns, clock: PhantomData }
     }
 
-    /// Returns nanoseconds on this clock. [ns]
+    /// Returns the nanoseconds on this clock. [ns]
     pub const fn as_ns(self) -> u64 {
         self.ns
     }
@@ -72,18 +71,18 @@ impl<C: Clock> Stamp<C> {
         self.ns.wrapping_sub(earlier.ns).cast_signed() as f64 * 1e-9
     }
 
-    /// Returns the stamp `seconds` later (earlier if negative), held at the clock's ends. [s]
+    /// Returns the stamp `seconds` later (earlier if negative), clamped to the clock's range. [s]
     pub fn plus_seconds(self, seconds: f64) -> Self {
         self.plus_ns((seconds * 1e9) as i64)
     }
 
-    /// Returns the stamp `ns` later (earlier if negative), held at the clock's ends. [ns]
+    /// Returns the stamp `ns` later (earlier if negative), clamped to the clock's range. [ns]
     pub fn plus_ns(self, ns: i64) -> Self {
         Self::from_ns(self.ns.saturating_add_signed(ns))
     }
 }
 
-// Written out because `derive` would ask the same of the clock tags.
+// Implemented by hand, because `derive` would require the same traits of the marker types.
 impl<C> Clone for Stamp<C> {
     fn clone(&self) -> Self {
         *self

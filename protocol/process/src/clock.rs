@@ -1,31 +1,32 @@
-//! CLOCK_MONOTONIC, as a test may hold it: it follows tokio's clock, which is the system's except in a test that pauses it.
-//! There minutes of traffic pass in seconds, and stamps must pass with them.
+//! CLOCK_MONOTONIC, which tests can pause. It follows tokio's clock, which is the system's, except in tests that pause
+//! it. There, minutes of traffic pass in seconds, and time stamps must follow.
 
 use std::sync::OnceLock;
 use std::time::Instant;
 
 use nix::time::{ClockId, clock_gettime};
 
-/// Returns the present on CLOCK_MONOTONIC. [ns]
+/// Returns the current time of CLOCK_MONOTONIC. [ns]
 ///
-/// It never jumps when the wall clock is set, and is the same for every process of one machine, so that a runtime on the
-/// server's machine measures an offset of zero.
+/// The clock does not jump if the wall clock is set. It is the same for all processes of a machine, so that a runtime
+/// on the server's machine measures an offset of zero.
 pub fn monotonic_ns() -> u64 {
     static ANCHOR: OnceLock<(Instant, u64)> = OnceLock::new();
     let (instant, ns) = *ANCHOR.get_or_init(anchor);
-    // `Instant` is CLOCK_MONOTONIC too, but hides its value.
+    // `Instant` is also CLOCK_MONOTONIC, but does not expose its value.
     let present = tokio::time::Instant::now().into_std();
     match present.checked_duration_since(instant) {
         Some(since) => ns + since.as_nanos() as u64,
-        // A clock that was held before it was first read here.
+        // The clock was paused before its first use here.
         None => ns - (instant - present).as_nanos() as u64,
     }
 }
 
-/// Returns an instant and its value on CLOCK_MONOTONIC, to within the time of one reading: of a
-/// few tries that which nothing interrupted. [ns]
+/// Returns an instant and its value on CLOCK_MONOTONIC. Of several readings, the shortest is used, because it was not
+/// interrupted. [ns]
 ///
 /// # Panics
+/// Never on Linux: the clock always exists.
 /// Never on Linux: the clock always exists.
 fn anchor() -> (Instant, u64) {
     let read = || {
@@ -46,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_clock_never_runs_backwards() {
+    fn never_runs_backwards() {
         let stamps: Vec<_> = (0..1000).map(|_| monotonic_ns()).collect();
         assert!(stamps.is_sorted());
         assert!(stamps[0] > 0);
@@ -58,8 +59,7 @@ mod tests {
             let time = clock_gettime(ClockId::CLOCK_MONOTONIC).unwrap();
             time.tv_sec() as u64 * 1_000_000_000 + time.tv_nsec() as u64
         };
-        // Interrupted anywhere, a reading lies between its neighbours; a microsecond covers the
-        // anchor's own error.
+        // A reading lies between its neighbours, even if interrupted. One microsecond allows for the anchor's error.
         for _ in 0..1000 {
             let (before, found, after) = (system(), monotonic_ns(), system());
             assert!((before - 1000..=after + 1000).contains(&found), "{before} {found} {after}");

@@ -1,11 +1,11 @@
-//! Descriptors: how many this process may have, and some kept back for when they run out.
+//! File descriptors: the limit of this process, and a reserve for when they run out.
 
 use std::fs::File;
 use std::io;
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-/// Raises the soft limit to the hard one, or as far as is of use, and returns what it is then.
+/// Raises the soft limit to the hard limit, but at most to 65536. Returns the new limit.
 pub fn raise_limit() -> usize {
     let Ok((soft, hard)) = getrlimit(Resource::RLIMIT_NOFILE) else { return USUAL };
     let wanted = hard.min(ENOUGH).max(soft);
@@ -14,19 +14,19 @@ pub fn raise_limit() -> usize {
     usize::try_from(limit).unwrap_or(usize::MAX)
 }
 
-/// Whether an error says that there are no more descriptors: of this process, or of the system.
+/// Whether an error means that this process or the system is out of descriptors or memory.
 pub fn are_used_up(error: &io::Error) -> bool {
     use nix::errno::Errno;
     let errors = [Errno::EMFILE, Errno::ENFILE, Errno::ENOBUFS, Errno::ENOMEM];
     error.raw_os_error().is_some_and(|code| errors.contains(&Errno::from_raw(code)))
 }
 
-/// Descriptors of nothing, given up one by one when others are needed.
+/// Open descriptors of `/dev/null` that can be released when others are needed.
 #[derive(Debug, Default)]
 pub struct Reserve(Vec<File>);
 
 impl Reserve {
-    /// Opens as many as there should be, if there are any left.
+    /// Opens descriptors until the reserve is full or none are left.
     pub fn fill(&mut self) {
         while self.0.len() < RESERVED {
             let Ok(file) = File::open("/dev/null") else { break };
@@ -34,15 +34,15 @@ impl Reserve {
         }
     }
 
-    /// Gives one up; returns whether there was one.
+    /// Releases one descriptor. Returns whether there was one.
     pub fn release(&mut self) -> bool {
         self.0.pop().is_some()
     }
 }
 
-/// Where the system does not say.
+/// Assumed limit if the system does not report it.
 const USUAL: usize = 1024;
-/// A limit of a billion makes some programs, started from here, close a billion descriptors.
+/// Upper bound: with a limit of a billion, some child programs close a billion descriptors.
 const ENOUGH: u64 = 65_536;
 const RESERVED: usize = 8;
 
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_limit_is_raised_and_not_lowered() {
+    fn raises_the_limit_and_never_lowers_it() {
         let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
         let raised = raise_limit() as u64;
         assert!(raised >= soft && raised <= hard.max(soft));
@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reserve_is_given_up_and_filled_again() {
+    fn releases_and_refills_the_reserve() {
         let mut reserve = Reserve::default();
         assert!(!reserve.release());
         reserve.fill();
@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_lack_of_descriptors_or_memory_is_one() {
+    fn detects_a_lack_of_descriptors_or_memory() {
         assert!(are_used_up(&io::Error::from_raw_os_error(24)), "EMFILE");
         assert!(!are_used_up(&io::Error::from_raw_os_error(103)), "ECONNABORTED");
         assert!(!are_used_up(&io::Error::other("x")));

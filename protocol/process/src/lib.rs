@@ -1,13 +1,13 @@
-//! What each of our programs does as a process: prints lines, ends when it is asked to, opens a page in a browser.
+//! Functions that every program needs as a process: print lines, stop on signals, open a page in a browser.
 //!
 //! ```text
-//! print_line, print_fmt!, print_error   lines that survive a reader who has gone
-//! on_interrupt                          SIGINT and SIGTERM, each time
-//! stop_flag                             a flag that they set, or the end of standard input: then the parent has gone
-//! lock                                  a mutex, also where a thread has panicked
-//! descriptors                           how many there may be, and some kept back
-//! monotonic_ns                          the clock, as a test may hold it
-//! processor_seconds                     what this process has used
+//! print_line, print_fmt!, print_error   print lines; no panic if the reader has ended
+//! on_interrupt                          calls back on each SIGINT and SIGTERM
+//! stop_flag                             flag set by these signals, or when standard input ends (end of the parent)
+//! lock                                  locks a mutex, even after a thread has panicked
+//! descriptors                           limit of file descriptors, and a reserve
+//! monotonic_ns                          clock, which tests can pause
+//! processor_seconds                     processor time of this process
 //! ```
 
 mod clock;
@@ -27,28 +27,28 @@ pub use lock::lock;
 use tokio::signal::unix::{SignalKind, signal};
 pub use usage::processor_seconds;
 
-/// Prints a line on standard output; unlike `println!` it does not panic when nobody reads any more.
+/// Prints a line on standard output. Unlike `println!`, it does not panic if the reader has closed the pipe.
 pub fn print_line(line: impl Display) {
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
 }
 
-/// Prints a line on standard error; unlike `eprintln!` it does not panic when nobody reads any more.
+/// Prints a line on standard error. Unlike `eprintln!`, it does not panic if the reader has closed the pipe.
 pub fn print_error(line: impl Display) {
     let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
 
-/// Prints a line for people, formatted as by `println!`; see [`print_line`].
+/// Prints a line, formatted as by `println!`. See [`print_line`].
 #[macro_export]
 macro_rules! print_fmt {
     ($($text:tt)*) => { $crate::print_line(format_args!($($text)*)) };
 }
 
-/// Calls `notice` on SIGINT and SIGTERM, on a thread of its own, until it returns false. The handlers are installed when this
-/// returns.
+/// Calls `notice` on each SIGINT and SIGTERM, on a separate thread, until it returns false. The handlers are installed
+/// when this function returns.
 ///
 /// # Errors
-/// If they cannot be installed.
+/// Returns an error if the handlers cannot be installed.
 pub fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -78,15 +78,15 @@ pub fn on_interrupt(mut notice: impl FnMut() -> bool + Send + 'static) -> Result
     Ok(())
 }
 
-/// Calls `notice` once, on a thread of its own, when standard input ends: the parent that held its other end has gone.
+/// Calls `notice` once, on a separate thread, when standard input ends: the parent process has ended.
 ///
 /// # Errors
-/// If there is no thread for it.
+/// Returns an error if the thread cannot be started.
 pub fn on_orphaned(notice: impl FnOnce() + Send + 'static) -> Result<()> {
     let wait = move || {
         let mut buffer = [0; 256];
         let mut input = std::io::stdin().lock();
-        // Bytes mean nothing; an error is an end, too.
+        // Received bytes are ignored. An error counts as the end.
         while matches!(input.read(&mut buffer), Ok(length) if length > 0) {}
         notice();
     };
@@ -98,10 +98,10 @@ pub fn on_orphaned(notice: impl FnOnce() + Send + 'static) -> Result<()> {
     Ok(())
 }
 
-/// Returns a flag that is set on SIGINT and SIGTERM, and with `lifeline` by the end of standard input.
+/// Returns a flag that is set on SIGINT and SIGTERM, and with `lifeline` also at the end of standard input.
 ///
 /// # Errors
-/// If the handlers cannot be installed.
+/// Returns an error if the handlers cannot be installed.
 pub fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     let set = Arc::clone(&flag);
@@ -116,7 +116,7 @@ pub fn stop_flag(lifeline: bool) -> Result<Arc<AtomicBool>> {
     Ok(flag)
 }
 
-/// Opens a page where there is a desktop; prints what to do where there is none.
+/// Opens a page in the browser. Without a desktop, prints a hint instead.
 pub fn open_browser(url: &str) {
     let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
     let spawned = std::process::Command::new(opener)

@@ -1,8 +1,8 @@
-//! Locking that survives a panic elsewhere.
+//! Lock a mutex even after a panic.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks, also where a thread has panicked: for values that are valid at any time.
+/// Locks the mutex, even after a thread has panicked. For values that are always consistent.
 pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

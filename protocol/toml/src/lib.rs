@@ -1,9 +1,8 @@
-//! TOML files that people write: what is not known is refused, and all errors are reported at
-//! once, each with its line, its key, and the nearest key that is known.
+//! Strict parser for TOML files that users write. Unknown keys are rejected. All errors are reported at once, each with
+//! its line, its key and the most similar known key.
 //!
-//! [`parse`] takes a text and returns a value or [`TomlErrors`]. Serde stops at the first error. So
-//! what it complains of is taken out of the parsed table, and the rest is tried again, until nothing
-//! is wrong or nothing can be taken out.
+//! [`parse`] returns a value or [`TomlErrors`]. Serde stops at the first error. Therefore the faulty entry is removed
+//! from the parsed table, and the rest is parsed again, until it is valid or nothing can be removed.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -13,22 +12,22 @@ use serde::de::DeserializeOwned;
 use toml::Spanned;
 use toml::de::{DeArray, DeTable, DeValue, Deserializer, Error};
 
-/// Errors that are looked for at most: more do not help.
+/// Maximum number of reported errors; more do not help.
 const MAX_ERRORS: usize = 20;
 
-/// One thing that is wrong: a place and one sentence.
+/// Error at a position, with one sentence.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}, column {column}: {what}")]
 pub struct TomlError {
-    /// From 1.
+    /// Line, from 1.
     pub line: usize,
-    /// From 1, in characters.
+    /// Column, from 1, in characters.
     pub column: usize,
-    /// What is wrong, and what to do.
+    /// Description of the error, with a remedy.
     pub what: String,
 }
 
-/// All that is wrong with a text, in its order; one at least. Prints one line for each.
+/// All errors of a text, in its order; at least one. Printed one per line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TomlErrors(pub Vec<TomlError>);
 
@@ -45,7 +44,7 @@ impl fmt::Display for TomlErrors {
 impl std::error::Error for TomlErrors {}
 
 impl TomlErrors {
-    /// Returns them in the text's order, each once.
+    /// Sorts the errors by position and removes duplicates.
     pub fn in_order(mut errors: Vec<TomlError>) -> Self {
         errors.sort_by_key(|error| (error.line, error.column));
         errors.dedup();
@@ -53,10 +52,10 @@ impl TomlErrors {
     }
 }
 
-/// Joins the results of checks: one error stands for itself, more are `several`, in their order.
+/// Joins the results of checks. A single error is returned unchanged; more are combined by `several`, in their order.
 ///
 /// # Errors
-/// What failed.
+/// Returns the errors of the checks.
 pub fn join_errors<E>(
     checks: impl IntoIterator<Item = Result<(), E>>,
     several: impl FnOnce(Vec<E>) -> E,
@@ -72,7 +71,7 @@ pub fn join_errors<E>(
     }
 }
 
-/// Returns an error at this byte of a text.
+/// Returns an error at byte `at` of a text.
 pub fn error_at(text: &str, at: usize, what: String) -> TomlError {
     let before = text.get(..at).unwrap_or(text);
     let start_of_line = before.rfind('\n').map_or(0, |newline| newline + 1);
@@ -80,10 +79,10 @@ pub fn error_at(text: &str, at: usize, what: String) -> TomlError {
     TomlError { line, column: before[start_of_line..].chars().count() + 1, what }
 }
 
-/// Returns `text` as a `T`, which is to carry `serde(deny_unknown_fields)` throughout.
+/// Parses `text` as a `T`, which should use `serde(deny_unknown_fields)` in all its tables.
 ///
 /// # Errors
-/// All that is wrong. Of keys that are missing, the first of each table.
+/// Returns all errors. Of missing keys, only the first of each table.
 pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
     let (mut table, syntax) = DeTable::parse_recoverable(text);
     let mut errors: Vec<_> = syntax.iter().map(|error| describe(text, error, None)).collect();
@@ -98,8 +97,8 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
             Ok(_) => break,
             Err(error) => error,
         };
-        // A key that was there and was taken out is not missing, nor is one that was misspelt: its table goes,
-        // of which all else has been looked at.
+        // A key is not reported as missing if it was removed after an error, or if it was misspelt. Its table is
+        // removed instead: all its other keys were already checked.
         let is_said = missing_key(&error).is_some_and(|key| {
             let meant = format!("did you mean '{key}'");
             removed.contains(key) || errors.iter().any(|error| error.what.contains(&meant))
@@ -116,7 +115,7 @@ pub fn parse<T: DeserializeOwned>(text: &str) -> Result<T, TomlErrors> {
     Err(TomlErrors::in_order(errors))
 }
 
-/// Takes the innermost entry that the span lies in out of a table, and returns its key.
+/// Removes the innermost entry at the span from a table. Returns its key.
 fn remove(table: &mut DeTable<'_>, span: &Range<usize>) -> Option<String> {
     for (key, value) in table.iter_mut() {
         match value.get_mut() {
@@ -141,7 +140,7 @@ fn remove(table: &mut DeTable<'_>, span: &Range<usize>) -> Option<String> {
     Some(key.into_inner().into_owned())
 }
 
-/// As [`remove`], in an array of tables of this name; a whole table has no key but that.
+/// Like [`remove`], for an array of tables with this name. If a whole table is removed, the name is its key.
 fn remove_in_array(name: &str, array: &mut DeArray<'_>, span: &Range<usize>) -> Option<String> {
     for element in array.iter_mut() {
         if let DeValue::Table(inner) = element.get_mut()
@@ -167,33 +166,33 @@ fn remove_in_array(name: &str, array: &mut DeArray<'_>, span: &Range<usize>) -> 
 fn describe(text: &str, error: &Error, key: Option<&str>) -> TomlError {
     let what = unknown_key(error.message()).unwrap_or_else(|| {
         let message = error.message().trim().replace('\n', "; ");
-        // One that is missing is named already, and the entry is only where it belongs.
+        // A missing key is already in the message, and the entry is only its table.
         let key = key.filter(|_| missing_key(error).is_none());
         key.map_or_else(|| message.clone(), |key| format!("{key}: {message}"))
     });
     error_at(text, error.span().map_or(0, |span| span.start), what)
 }
 
-/// Returns the key that an error calls missing, in serde's wording.
+/// Returns the key of a "missing field" error, in serde's wording.
 fn missing_key(error: &Error) -> Option<&str> {
     error.message().strip_prefix("missing field `")?.split('`').next()
 }
 
-/// Returns a better sentence for an unknown key. serde names it and then the known ones, each in
-/// backquotes; should its wording change, a test fails and people read serde's own sentence.
+/// Returns a better sentence for an unknown key. serde's message contains the unknown key and then the known keys, each
+/// in backquotes. If serde changes its wording, a test fails, and users see serde's own sentence.
 fn unknown_key(message: &str) -> Option<String> {
     let (unknown, rest) = message.strip_prefix("unknown field `")?.split_once("`, expected ")?;
-    // Between backquotes: every second part.
+    // Parts between backquotes: every second one.
     let known: Vec<&str> = rest.split('`').skip(1).step_by(2).collect();
     Some(unknown_among(unknown, &known))
 }
 
-/// Returns the sentence that refuses a key which is none of those known, with the nearest of them.
+/// Returns the error message for an unknown key, with the most similar known key.
 pub fn unknown_among(unknown: &str, known: &[&str]) -> String {
     let nearest = known.iter().min_by_key(|name| distance(unknown, name));
     let known_all = known.join(", ");
     match nearest {
-        // Farther than half of its letters it is another word.
+        // If more than half of the letters differ, it is a different word.
         Some(nearest) if distance(unknown, nearest) <= nearest.chars().count().div_ceil(2) => {
             format!("unknown key '{unknown}'; did you mean '{nearest}'? known here: {known_all}")
         }
@@ -201,9 +200,9 @@ pub fn unknown_among(unknown: &str, known: &[&str]) -> String {
     }
 }
 
-/// Returns how many letters must be changed, added or left out to make `a` of `b` (Levenshtein).
+/// Returns the Levenshtein distance: the number of letters to change, add or remove.
 fn distance(a: &str, b: &str) -> usize {
-    // A key of a megabyte must not cost its square.
+    // Limits the cost for very long keys, which is quadratic.
     let a: Vec<char> = a.chars().take(64).collect();
     let mut row: Vec<usize> = (0..=a.len()).collect();
     for (j, letter) in b.chars().take(64).enumerate() {
@@ -249,7 +248,7 @@ mod tests {
         max_tilt_deg: f64,
     }
 
-    /// Parses, and expects these lines of errors.
+    /// Parses `text`, and expects these errors, one per line.
     fn check(text: &str, expected: &[&str]) {
         let message = parse::<Room>(text).expect_err(text).to_string();
         let errors: Vec<&str> = message.lines().collect();
@@ -321,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn distances_are_those_of_levenshtein() {
+    fn computes_the_levenshtein_distance() {
         let check = |a, b, expected| assert_eq!(distance(a, b), expected, "{a} {b}");
         check("", "", 0);
         check("kitten", "sitting", 3);
@@ -332,7 +331,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_read_or_refused(
+        fn accepts_or_rejects_any_text_without_a_panic(
             text in "\\PC*|((\\[\\[?(cameras|limits|[a-z]*)\\]?\\]\n)?([a-z_]+ = [0-9\"a-z.\\[\\]{}=]*\n)*)*"
         ) {
             if let Err(errors) = parse::<Room>(&text) {

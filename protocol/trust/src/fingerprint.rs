@@ -1,4 +1,4 @@
-//! Who somebody is: the SHA-256 of a certificate.
+//! Fingerprints: SHA-256 of a certificate, which identifies a peer.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,7 +17,6 @@ impl Fingerprint {
         Self(Sha256::digest(certificate_der).into())
     }
 
-    /// Returns the bytes.
     pub fn as_bytes(&self) -> &[u8; 32] {
         &self.0
     }
@@ -35,9 +34,9 @@ impl FromStr for Fingerprint {
         let mut bytes = [0; 32];
         for (byte, pair) in bytes.iter_mut().zip(digits.as_bytes().chunks_exact(2)) {
             let pair = std::str::from_utf8(pair).map_err(|_| error())?;
-            // Why: `from_str_radix` would also take a sign.
+            // Why: `from_str_radix` would also accept a sign.
             if !pair.bytes().all(|digit| digit.is_ascii_hexdigit()) {
-                return Err(format!("{pair:?} in the fingerprint is no hex number"));
+                return Err(format!("{pair:?} in the fingerprint is not a hex number"));
             }
             *byte = u8::from_str_radix(pair, 16).map_err(|_| error())?;
         }
@@ -76,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fingerprints_are_read_and_written() {
+    fn parses_and_prints_fingerprints() {
         let text = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
         assert_eq!(Fingerprint::of(b"abc").to_string(), text);
         assert_eq!(text.parse(), Ok(Fingerprint::of(b"abc")));
@@ -85,7 +84,7 @@ mod tests {
         assert_eq!(colons.join(":").parse(), Ok(Fingerprint::of(b"abc")));
         assert!("abc".parse::<Fingerprint>().unwrap_err().contains("this has 3"));
         for wrong in [text.replace('b', "g"), text.replace("ba", "+a")] {
-            assert!(wrong.parse::<Fingerprint>().unwrap_err().contains("no hex"), "{wrong}");
+            assert!(wrong.parse::<Fingerprint>().unwrap_err().contains("not a hex number"), "{wrong}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The keys folder: for its owner alone, and every file in it whole or absent.
+//! Keys folder: accessible only to its owner, with files that are written completely or not at all.
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -7,53 +7,52 @@ use std::path::{Path, PathBuf};
 use std::process;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// Why keys cannot be used. Nothing is ever replaced silently.
+/// Reason why keys cannot be used. Existing files are never replaced silently.
 #[derive(Debug, thiserror::Error)]
 pub enum KeyError {
-    /// Neither `--keys` nor a home folder.
+    /// Neither `--keys` nor a home folder is set.
     #[error("no folder for keys: neither XDG_CONFIG_HOME nor HOME is set; pass --keys DIR")]
     NoHome,
     /// Reading or writing failed.
     #[error("{}: cannot {what}: {cause}", path.display())]
     Io {
-        /// What was tried.
+        /// Attempted operation.
         what: &'static str,
-        /// On what.
+        /// File or folder.
         path: PathBuf,
-        /// How it failed.
+        /// Error of the system.
         cause: io::Error,
     },
-    /// Others may read or write it.
+    /// Other users may read or write the file or folder.
     #[error("{} is open to other users (mode {mode:03o}); run `chmod {fix} {}`, and make a new key if others had access", path.display(), path.display())]
     Open {
-        /// The file or folder.
+        /// File or folder.
         path: PathBuf,
-        /// Its mode.
+        /// Current mode.
         mode: u32,
-        /// What the mode should be.
+        /// Required mode.
         fix: &'static str,
     },
-    /// What the file holds is not what it should hold.
+    /// The content of the file is invalid.
     #[error("{}: {what}", path.display())]
     Damaged {
-        /// The file.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// Description of the error, with a remedy.
         what: String,
     },
 }
 
-/// A folder of keys and of those they are shared with.
+/// Folder of keys and of lists of paired peers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct KeysFolder(PathBuf);
 
-/// One state of a file: another inode, change time or size is another state.
+/// State of a file: its inode, change time and size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileStamp([i128; 4]);
 
 impl KeysFolder {
-    /// Opens `path`, or the user's own folder (`$XDG_CONFIG_HOME/vizflyt`, `~/.config/vizflyt`),
-    /// and makes it if it is not there.
+    /// Opens `path`, or the user's folder (`$XDG_CONFIG_HOME/vizflyt`, `~/.config/vizflyt`). Creates the folder if it
+    /// does not exist.
     pub fn open(path: Option<&Path>) -> Result<Self, KeyError> {
         let path = match path {
             Some(path) => path.to_owned(),
@@ -76,22 +75,22 @@ impl KeysFolder {
         Ok(Self(path))
     }
 
-    /// Returns the path of a file in it.
+    /// Returns the path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
 
-    /// Reads a file that nobody else may write; `None` if there is none.
+    /// Reads a file that no other user may write; `None` if it does not exist.
     pub fn read(&self, name: &str) -> Result<Option<String>, KeyError> {
         self.read_as(name, 0o022)
     }
 
-    /// Reads a file that nobody else may read or write; `None` if there is none.
+    /// Reads a file that no other user may read or write; `None` if it does not exist.
     pub fn read_secret(&self, name: &str) -> Result<Option<String>, KeyError> {
         self.read_as(name, 0o077)
     }
 
-    /// Returns what distinguishes one state of a file from another; `None` if there is none.
+    /// Returns the state of a file, to detect changes; `None` if it does not exist.
     pub fn stamp(&self, name: &str) -> Option<FileStamp> {
         let about = fs::metadata(self.file(name)).ok()?;
         Some(FileStamp([
@@ -105,11 +104,11 @@ impl KeysFolder {
     fn read_as(&self, name: &str, forbidden: u32) -> Result<Option<String>, KeyError> {
         let path = self.file(name);
         let io = |what, cause| KeyError::Io { what, path: path.clone(), cause };
-        // First: to open a pipe is to wait for whoever writes into it.
+        // Check first: opening a pipe blocks until a process writes to it.
         match fs::metadata(&path) {
             Ok(about) if about.is_file() => {}
             Ok(_) => {
-                let what = "it is no file; move it away".to_owned();
+                let what = "it is not a file; move it away".to_owned();
                 return Err(KeyError::Damaged { path, what });
             }
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -128,13 +127,13 @@ impl KeysFolder {
         let mut text = String::new();
         file.take(MAX_BYTES + 1).read_to_string(&mut text).map_err(|error| io("read it", error))?;
         if text.len() as u64 > MAX_BYTES {
-            let what = format!("more than {MAX_BYTES} bytes; this is no file of ours");
+            let what = format!("more than {MAX_BYTES} bytes; VizFlyt did not write this file");
             return Err(KeyError::Damaged { path, what });
         }
         Ok(Some(text))
     }
 
-    /// Replaces a file, or makes it: readers see the old text or the new, never a part.
+    /// Creates or replaces a file atomically: readers see the old or the new text, never a part.
     pub fn write(&self, name: &str, text: &str) -> Result<(), KeyError> {
         let draft = self.draft(name, text)?;
         let path = self.file(name);
@@ -142,7 +141,7 @@ impl KeysFolder {
         self.settle(path, &draft, moved)
     }
 
-    /// Makes a file that must not be there yet; false if it is.
+    /// Creates a file; returns false if it already exists.
     pub fn create(&self, name: &str, text: &str) -> Result<bool, KeyError> {
         let draft = self.draft(name, text)?;
         let path = self.file(name);
@@ -155,7 +154,7 @@ impl KeysFolder {
         }
     }
 
-    /// Writes a file beside the one that is meant.
+    /// Writes the text to a temporary file in the same folder.
     fn draft(&self, name: &str, text: &str) -> Result<PathBuf, KeyError> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
@@ -167,7 +166,7 @@ impl KeysFolder {
                 .truncate(true)
                 .mode(0o600)
                 .open(&path)?;
-            // Why: a file that was left there by a crash keeps its own mode.
+            // Why: a file left by a crash keeps its own mode.
             file.set_permissions(fs::Permissions::from_mode(0o600))?;
             file.write_all(text.as_bytes())?;
             file.sync_all()
@@ -183,7 +182,7 @@ impl KeysFolder {
 
     fn settle(&self, path: PathBuf, draft: &Path, done: io::Result<()>) -> Result<(), KeyError> {
         let _ = fs::remove_file(draft);
-        // The name, too, must survive a power cut.
+        // Sync the folder, so that the name survives a power failure, too.
         done.and_then(|()| File::open(&self.0)?.sync_all()).map_err(|cause| KeyError::Io {
             what: "write it",
             path,
@@ -193,14 +192,14 @@ impl KeysFolder {
 }
 
 fn user_folder(config: Option<PathBuf>, home: Option<PathBuf>) -> Option<PathBuf> {
-    // A relative XDG_CONFIG_HOME is to be ignored (XDG Base Directory Specification).
+    // A relative XDG_CONFIG_HOME must be ignored (XDG Base Directory Specification).
     let config = config.filter(|path| path.is_absolute());
     let config = config
         .or_else(|| home.filter(|path| path.is_absolute()).map(|path| path.join(".config")))?;
     Some(config.join("vizflyt"))
 }
 
-/// No file of ours comes near.
+/// Maximum file size. VizFlyt's files are much smaller. [bytes]
 const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
@@ -212,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn the_folder_and_its_files_are_the_owners_alone() {
+    fn only_the_owner_can_access_the_folder_and_its_files() {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("a/keys");
         let folder = KeysFolder::open(Some(&path)).unwrap();
@@ -229,17 +228,17 @@ mod tests {
         let mut names: Vec<_> =
             fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         names.sort();
-        assert_eq!(names, ["x", "y"], "no draft stays");
+        assert_eq!(names, ["x", "y"], "no temporary file remains");
     }
 
     #[test]
-    fn looser_permissions_are_an_error_with_advice() {
+    fn rejects_loose_permissions_with_advice() {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("keys");
         let folder = KeysFolder::open(Some(&path)).unwrap();
         folder.write("x", "one").unwrap();
         fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o640)).unwrap();
-        assert!(folder.read("x").is_ok(), "what others may read is no secret, but not forged");
+        assert!(folder.read("x").is_ok(), "readable by others is accepted for files without secrets");
         let error = folder.read_secret("x").unwrap_err().to_string();
         assert!(error.contains("mode 640") && error.contains("chmod 600 "), "{error}");
         fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o620)).unwrap();
@@ -250,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_file_is_not_waited_for() {
+    fn rejects_folders_and_pipes_without_blocking() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         fs::create_dir(folder.file("folder")).unwrap();
@@ -258,7 +257,7 @@ mod tests {
         assert!(made.success());
         for name in ["folder", "pipe"] {
             let error = folder.read_secret(name).unwrap_err().to_string();
-            assert!(error.contains(name) && error.contains("it is no file"), "{error}");
+            assert!(error.contains(name) && error.contains("it is not a file"), "{error}");
         }
     }
 

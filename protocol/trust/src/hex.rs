@@ -1,8 +1,8 @@
-//! Bytes as hexadecimal digits, in small letters.
+//! Bytes as lower-case hexadecimal digits.
 
 use std::fmt::Write;
 
-/// Returns bytes in hexadecimal.
+/// Returns bytes as hexadecimal digits.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
         let _ = write!(text, "{byte:02x}");
@@ -10,7 +10,7 @@ pub fn hex(bytes: &[u8]) -> String {
     })
 }
 
-/// Returns `N` bytes from hexadecimal as [`hex`] writes it: there is one text for each value; `None` if it is anything else.
+/// Parses `N` bytes from digits as written by [`hex`]; `None` for any other text. Each value has exactly one text.
 pub fn from_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     let digits = text.as_bytes();
     let is_digit = |digit: &u8| matches!(digit, b'0'..=b'9' | b'a'..=b'f');

@@ -1,5 +1,5 @@
-//! An identity: a key and its self-signed certificate, made once and kept. Keys are Ed25519, but for the
-//! page's, since browsers take none of those: ECDSA with P-256.
+//! Identity: a key with its self-signed certificate, created once and stored. Keys are Ed25519, except the page's:
+//! browsers do not support Ed25519, so it is ECDSA with P-256.
 
 use std::str::FromStr;
 
@@ -10,19 +10,19 @@ use rustls::sign::CertifiedKey;
 use crate::fingerprint::Fingerprint;
 use crate::folder::{KeyError, KeysFolder};
 
-/// Whose identity; one machine may be both.
+/// Owner of an identity. One machine may have several.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Owner {
     /// The render server.
     Server,
-    /// The runtime, or another program that speaks to a server.
+    /// The runtime, or another client of a server.
     Runtime,
     /// The server's page, over HTTPS.
     Page,
 }
 
 impl Owner {
-    /// Returns the file's name in the keys folder.
+    /// Returns the name of the file in the keys folder.
     pub fn file(self) -> &'static str {
         match self {
             Self::Server => "server.key",
@@ -31,8 +31,8 @@ impl Owner {
         }
     }
 
-    /// Returns the names that its certificate is for: clients of ours look at the fingerprint alone, browsers
-    /// at these too.
+    /// Returns the names in the certificate. VizFlyt's clients check only the fingerprint; browsers check the names,
+    /// too.
     fn names(self) -> Vec<String> {
         if self != Self::Page {
             return vec!["vizflyt".to_owned()];
@@ -48,12 +48,12 @@ impl Owner {
     }
 }
 
-/// A certificate with its key.
+/// Certificate with its key.
 #[derive(Debug)]
 pub struct Identity {
-    /// DER.
+    /// Certificate in DER.
     pub certificate: CertificateDer<'static>,
-    /// PKCS#8.
+    /// Private key in PKCS#8.
     pub key: PrivateKeyDer<'static>,
 }
 
@@ -64,31 +64,31 @@ impl Clone for Identity {
 }
 
 impl Identity {
-    /// Returns the identity kept in `folder`; makes it at the first time.
+    /// Returns the identity stored in `folder`. Creates it on first use.
     ///
     /// # Errors
-    /// A file that is there and cannot be used, for its permissions or its content, is an error:
-    /// a new key in its place would silently part the computer from all it is paired with.
+    /// Returns an error if the file exists but cannot be used because of its permissions or content. It is not
+    /// replaced: a new key would silently invalidate all pairings of the computer.
     pub fn load_or_create(folder: &KeysFolder, owner: Owner) -> Result<Self, KeyError> {
         let name = owner.file();
         if folder.read_secret(name)?.is_none() {
             let text = Self::make(owner).map_err(|what| damaged(folder, owner, &what))?;
-            // Another process may have been first; then its key counts, and is read below.
+            // Another process may have created the file first. Then its key is used, and read below.
             folder.create(name, &text)?;
         }
         let text = folder.read_secret(name)?.unwrap_or_default();
         Self::parse(&text).map_err(|what| damaged(folder, owner, &what))
     }
 
-    /// Makes a fresh one for this run only.
+    /// Returns a new identity for this run only.
     ///
     /// # Errors
-    /// If the system gives no random numbers.
+    /// Returns an error if the system provides no random numbers.
     pub fn ephemeral() -> Result<Self, String> {
         Self::parse(&Self::make(Owner::Runtime)?)
     }
 
-    /// Returns who this is.
+    /// Returns the fingerprint of the certificate.
     pub fn fingerprint(&self) -> Fingerprint {
         Fingerprint::of(&self.certificate)
     }
@@ -132,14 +132,14 @@ impl Identity {
     }
 }
 
-/// Returns a fresh secret of 128 random bits, as 32 letters and digits.
+/// Returns a new secret of 128 random bits, as 32 hexadecimal digits.
 ///
 /// # Errors
-/// If the system gives no random numbers.
+/// Returns an error if the system provides no random numbers.
 pub fn secret() -> Result<String, String> {
     let mut bytes = [0; 16];
     let random = rustls::crypto::ring::default_provider().secure_random;
-    random.fill(&mut bytes).map_err(|_| "the system gives no random numbers".to_owned())?;
+    random.fill(&mut bytes).map_err(|_| "the system provides no random numbers".to_owned())?;
     Ok(format!("{:032x}", u128::from_le_bytes(bytes)))
 }
 
@@ -149,14 +149,14 @@ fn damaged(folder: &KeysFolder, owner: Owner, what: &str) -> KeyError {
     KeyError::Damaged { path: folder.file(owner.file()), what }
 }
 
-/// First line of a file; text between PEM sections is for people (RFC 7468, section 2).
+/// First line of a file. Text between PEM sections is ignored by parsers (RFC 7468, section 2).
 const HEAD: &str = "VizFlyt key, keep it secret. SHA-256 of the certificate: ";
 
-/// Returns a number that identifies this run of a program: random, so that two runs have the same
-/// with negligible probability; never 0.
+/// Returns a random number that identifies this run of a program; never 0. The probability of equal numbers is
+/// negligible.
 pub fn random_instance_id() -> u64 {
     use std::hash::{BuildHasher, RandomState};
-    // Keyed by the system's randomness.
+    // Keyed with the system's random numbers.
     RandomState::new().hash_one(std::process::id()) | 1
 }
 
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn an_identity_is_made_once_and_kept() {
+    fn creates_an_identity_once_and_keeps_it() {
         let (_root, folder) = folder();
         let first = Identity::load_or_create(&folder, Owner::Server).unwrap();
         let again = Identity::load_or_create(&folder, Owner::Server).unwrap();
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn every_damage_is_an_error_and_leaves_the_file_alone() {
+    fn rejects_damaged_files_without_changing_them() {
         let (_root, folder) = folder();
         Identity::load_or_create(&folder, Owner::Server).unwrap();
         let good = folder.read("server.key").unwrap().unwrap();
@@ -207,14 +207,14 @@ mod tests {
     }
 
     #[test]
-    fn a_flipped_letter_is_noticed() {
+    fn detects_a_changed_letter() {
         let good = Identity::make(Owner::Server).unwrap();
         let stated = Identity::parse(&good).unwrap();
         for at in 0..good.len() {
             let mut bytes = good.clone().into_bytes();
             bytes[at] ^= 1;
             let Ok(text) = String::from_utf8(bytes) else { continue };
-            // A letter of the prose may change; the identity may not.
+            // A letter of the comment may change, but not the identity.
             if let Ok(found) = Identity::parse(&text) {
                 assert_eq!(
                     (found.key, found.certificate),

@@ -1,18 +1,18 @@
-//! Who may speak with whom. Server and runtime both keep an identity, pin the other's, and pair once
-//! by a short code; this is what the two must agree on, and neither may do in its own way.
+//! Trust between server and runtime. Each has an identity and pins the other's certificate; they pair once with a short
+//! code. This crate contains everything that both sides must implement identically.
 //!
 //! ```text
-//! hex          bytes as digits
-//! folder       the keys folder: 0700, its files 0600, written whole or not at all
-//! identity     an Ed25519 key and its self-signed certificate: server.key, runtime.key
-//! fingerprint  SHA-256 of a certificate: who somebody is
-//! tls          mutual TLS 1.3 of self-signed certificates; a client pins its server
-//! paired       paired.toml on the server: which client may do what
-//! servers      servers.toml on a client: which server is which
-//! pairing      SPAKE2 over a connection whose ends nobody vouches for yet (sans-IO)
+//! hex          bytes as hexadecimal digits
+//! folder       keys folder: mode 0700, files 0600, written atomically
+//! identity     Ed25519 key with self-signed certificate: server.key, runtime.key
+//! fingerprint  SHA-256 of a certificate, which identifies a peer
+//! tls          mutual TLS 1.3 with self-signed certificates; a client pins its server
+//! paired       paired.toml on the server: rights of each client
+//! servers      servers.toml on a client: known servers
+//! pairing      SPAKE2 over a connection whose peers are not authenticated yet (sans-IO)
 //! ```
-//! Nothing here opens a socket or reads a clock. A client is authorised by its fingerprint alone,
-//! after TLS has proved that it holds the key.
+//! This crate does not open sockets or read clocks. Only the fingerprint authorizes a client, after TLS has proved that
+//! the client holds the key.
 
 pub mod fingerprint;
 pub mod folder;
@@ -30,7 +30,7 @@ pub use identity::{Identity, Owner, random_instance_id, secret};
 pub use paired::{Client, Paired, Role};
 pub use servers::{KnownServer, Servers};
 
-/// The protocol's name in the TLS handshake of a runtime.
+/// Name of the runtime's protocol in the TLS handshake.
 pub const ALPN: &[u8] = b"vizflyt";
-/// The same of a client that pairs.
+/// Name of the pairing protocol in the TLS handshake.
 pub const ALPN_PAIR: &[u8] = b"vizflyt-pair";

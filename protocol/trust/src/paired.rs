@@ -1,33 +1,33 @@
-//! `paired.toml`: whom the server knows, and what each may do.
+//! `paired.toml`: clients that are paired with the server, and their rights.
 //!
-//! Written by pairing, edited by hand, read again whenever it changes.
+//! The file is written by pairing, may be edited by hand, and is read again after each change.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Fingerprint;
 use crate::folder::{KeyError, KeysFolder};
 
-/// What a client may do.
+/// Rights of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Fly and watch its own vehicles.
+    /// May fly and watch its own vehicles.
     Team,
-    /// Everything.
+    /// May do everything.
     Instructor,
 }
 
-/// A paired client.
+/// Paired client.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Client {
-    /// What people call it.
+    /// Name for display.
     pub name: String,
-    /// Who it is.
+    /// Fingerprint of its certificate.
     pub fingerprint: Fingerprint,
-    /// What it may do.
+    /// Rights of the client.
     pub role: Role,
-    /// A team's vehicles; an instructor has all.
+    /// Vehicles of a team. An instructor may use all vehicles.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<String>,
 }
@@ -46,19 +46,19 @@ impl Client {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Paired {
-    /// In the order of the file.
+    /// Clients in the order of the file.
     #[serde(default, rename = "client")]
     pub clients: Vec<Client>,
 }
 
 impl Paired {
-    /// The file's name in the keys folder.
+    /// Name of the file in the keys folder.
     pub const FILE: &str = "paired.toml";
 
-    /// Reads and checks the text of the file.
+    /// Parses and checks the text of the file.
     ///
     /// # Errors
-    /// A sentence with the position and the error.
+    /// Returns a sentence with the position and the error.
     pub fn parse(text: &str) -> Result<Self, String> {
         let paired: Self = toml::from_str(text).map_err(|error| error.to_string())?;
         for (index, client) in paired.clients.iter().enumerate() {
@@ -77,25 +77,25 @@ impl Paired {
                 _ => {}
             }
             if let Some(wrong) = client.vehicles.iter().find(|vehicle| !is_name(vehicle)) {
-                return fail(&format!("'{wrong}' is no vehicle's name (1 to 32 bytes of text)"));
+                return fail(&format!("'{wrong}' is not a valid name of a vehicle (1 to 32 bytes of text)"));
             }
             let same = |other: &Client| other.fingerprint == client.fingerprint;
             if paired.clients[..index].iter().any(same) {
-                return fail("its fingerprint is there twice; keep one of the two");
+                return fail("its fingerprint occurs twice; keep one of the two entries");
             }
         }
         Ok(paired)
     }
 
-    /// Reads the file of a keys folder; nobody is paired where there is none.
+    /// Reads the file of a keys folder. Without a file, no client is paired.
     pub fn read(folder: &KeysFolder) -> Result<Self, KeyError> {
         let text = folder.read(Self::FILE)?.unwrap_or_default();
         Self::parse(&text).map_err(|what| KeyError::Damaged { path: folder.file(Self::FILE), what })
     }
 
-    /// Adds a client to the file, in place of an entry of the same fingerprint.
+    /// Adds a client to the file, and replaces an entry with the same fingerprint.
     ///
-    /// A new entry is appended, so that a person's comments stay.
+    /// New entries are appended, so that comments of the user are kept.
     pub fn add(folder: &KeysFolder, client: Client) -> Result<Self, KeyError> {
         let damaged = |what| KeyError::Damaged { path: folder.file(Self::FILE), what };
         let mut paired = Self::read(folder)?;
@@ -114,20 +114,20 @@ impl Paired {
         Ok(paired)
     }
 
-    /// Returns the client of a fingerprint.
+    /// Returns the client with this fingerprint.
     pub fn client(&self, fingerprint: Fingerprint) -> Option<&Client> {
         self.clients.iter().find(|client| client.fingerprint == fingerprint)
     }
 }
 
-/// Whether `text` can be a vehicle's or a client's name: it must fit a message, and a line of a log.
+/// Whether `text` is a valid name of a vehicle or client: it must fit in a message and in one line of a log.
 pub(crate) fn is_name(text: &str) -> bool {
     (1..=32).contains(&text.len()) && !text.chars().any(char::is_control)
 }
 
 const HEAD: &str = "\
-# Who may connect to this server, and for what. `vizflyt pair` adds an entry; remove one to end that
-# client's right and its connection, at once. A team has its own vehicles, an instructor everything.
+# Clients that may connect to this server, and their rights. `vizflyt pair` adds an entry. Removing one ends that
+# client's rights and its connection at once. A team may use its own vehicles, an instructor everything.
 ";
 
 #[cfg(test)]
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_team_has_its_own_vehicles_and_an_instructor_all() {
+    fn a_team_may_use_its_own_vehicles_and_an_instructor_all() {
         let team = client("ants", Role::Team, &["ant", "bee"]);
         assert!(team.may_use("ant") && team.may_use("bee"));
         assert!(!team.may_use("wasp") && !team.may_use("") && !team.may_use("Ant"));
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_are_appended_replaced_and_read() {
+    fn appends_replaces_and_reads_entries() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         assert_eq!(Paired::read(&folder).unwrap(), Paired::default());
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_of_the_hand_are_named() {
+    fn reports_errors_of_manual_edits() {
         let print = Fingerprint::of(b"x");
         let entry =
             |more: &str| format!("[[client]]\nname = \"a\"\nfingerprint = \"{print}\"\n{more}\n");
@@ -185,9 +185,9 @@ mod tests {
         check_refused(&entry("role = \"boss\""), "line 4");
         check_refused(&entry("role = \"instructor\"\nvehicles = [\"x\"]"), "remove vehicles");
         check_refused(&entry("role = \"instructor\"\nvehicle = \"x\""), "unknown field");
-        check_refused(&entry("role = \"team\"\nvehicles = [\"\"]"), "no vehicle's name");
+        check_refused(&entry("role = \"team\"\nvehicles = [\"\"]"), "not a valid name of a vehicle");
         let twice = entry("role = \"instructor\"").repeat(2);
-        check_refused(&twice, "there twice");
+        check_refused(&twice, "occurs twice");
         check_refused(&twice.replace(&print.to_string(), "12"), "64 hex digits");
         check_refused("[[clients]]", "unknown field");
     }

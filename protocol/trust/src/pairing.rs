@@ -1,11 +1,10 @@
-//! Pairing by a short code, sans-IO: each side's state machine, fed with the other's messages.
+//! Pairing with a short code, sans-IO: a state machine for each side, driven by the other's messages.
 //!
-//! Both run SPAKE2 with the code as password. Whoever sits in between without the code agrees on
-//! another key, and learns from one attempt that one guess was wrong, nothing more. Each side then
-//! proves the key with an HMAC over both certificates' fingerprints, both halves, the name, and
-//! the TLS exporter of this very connection: so a relay between two connections fails even while
-//! the code is right, and nothing recorded is of use later. The client proves first; the server
-//! counts a try before it answers.
+//! Both sides run SPAKE2 with the code as password. A man in the middle without the code gets a different key. One
+//! attempt shows him only that one guess was wrong. Each side then proves its key with an HMAC over both certificates'
+//! fingerprints, both shares, the name, and the TLS exporter of this connection. A relay between two connections
+//! therefore fails even with the correct code, and recorded messages are useless later. The client sends its proof
+//! first, and the server counts the attempt before it replies.
 
 mod client;
 mod server;
@@ -25,7 +24,7 @@ use crate::Fingerprint;
 pub use client::{Confirming, PairingClient};
 pub use server::{Admitted, Attempt, PairingServer, Refusal, TRIES, VALID, WindowState};
 
-/// Six digits that a person reads on one screen and types on another.
+/// Code of six digits that a person reads on one screen and types on another.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Code([u8; 6]);
 
@@ -33,14 +32,14 @@ impl Code {
     /// Returns a uniformly random code from the system's generator.
     ///
     /// # Errors
-    /// If the system gives none.
+    /// Returns an error if the system provides no random numbers.
     pub fn random() -> Result<Self, String> {
         let random = rustls::crypto::ring::default_provider().secure_random;
         loop {
             let mut bytes = [0; 4];
-            random.fill(&mut bytes).map_err(|_| "the system gives no random numbers".to_owned())?;
+            random.fill(&mut bytes).map_err(|_| "the system provides no random numbers".to_owned())?;
             let number = u32::from_le_bytes(bytes);
-            // Why: without this the low codes would be slightly likelier.
+            // Why: otherwise low codes would be slightly more likely.
             if number < u32::MAX / CODES * CODES {
                 return Ok(Self::from_number(number % CODES));
             }
@@ -60,12 +59,12 @@ impl Code {
 impl FromStr for Code {
     type Err = String;
 
-    /// Reads six digits; spaces and dashes between them are skipped.
+    /// Parses six digits; spaces and dashes are ignored.
     fn from_str(text: &str) -> Result<Self, String> {
         let digits: Vec<u8> = text.bytes().filter(|byte| !b" -\t\r\n".contains(byte)).collect();
         match <[u8; 6]>::try_from(digits) {
             Ok(digits) if digits.iter().all(u8::is_ascii_digit) => Ok(Self(digits)),
-            _ => Err("a pairing code is six digits, as 123 456".to_owned()),
+            _ => Err("a pairing code is six digits, for example 123 456".to_owned()),
         }
     }
 }
@@ -78,28 +77,28 @@ impl fmt::Display for Code {
 }
 
 impl fmt::Debug for Code {
-    /// A code does not belong in a log.
+    /// Hides the code: it must not be logged.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Code(..)")
     }
 }
 
-/// The connection that a pairing happens on.
+/// Connection on which a pairing takes place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Binding {
-    /// Whom the server sees.
+    /// Fingerprint of the client, as seen by the server.
     pub client: Fingerprint,
-    /// Whom the client sees.
+    /// Fingerprint of the server, as seen by the client.
     pub server: Fingerprint,
-    /// What TLS derives for both ends of this connection alone (RFC 8446, section 7.5), with
-    /// [`EXPORTER_LABEL`] and no context.
+    /// TLS exporter: derived by both ends of this connection only (RFC 8446, section 7.5), with [`EXPORTER_LABEL`] and
+    /// no context.
     pub exporter: [u8; 32],
 }
 
 /// Label of [`Binding::exporter`].
 pub const EXPORTER_LABEL: &[u8] = b"EXPORTER-vizflyt-pair";
 
-/// Which role in the key agreement.
+/// Role in the key agreement.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum PairingRole {
     /// The client.
@@ -118,18 +117,18 @@ fn start(role: PairingRole, code: Code) -> (Agreement, PairingShare) {
         PairingRole::A => Agreement::start_a(&password, &a, &b),
         PairingRole::B => Agreement::start_b(&password, &a, &b),
     };
-    // The crate's message is one letter for the side, then the group element.
+    // The crate's message is one letter for the role, then the group element.
     let share = message[1..].try_into().expect("an element of Ed25519 has 32 bytes");
     (agreement, share)
 }
 
-/// Both proofs of an agreement that came about.
+/// Proofs of both sides of a completed agreement.
 struct Proofs {
     client: Hmac<Sha256>,
     server: Hmac<Sha256>,
 }
 
-/// What both must have seen alike.
+/// Data that both sides must have seen identically.
 struct Transcript<'a> {
     binding: &'a Binding,
     name: &'a str,
@@ -138,7 +137,7 @@ struct Transcript<'a> {
 }
 
 impl Transcript<'_> {
-    /// Finishes the agreement of `role`; `None` if the other's half is no group element.
+    /// Completes the agreement in `role`; `None` if the other side's share is not a group element.
     fn prove(&self, role: PairingRole, agreement: Agreement) -> Option<Proofs> {
         let (letter, theirs) = match role {
             PairingRole::A => (b'B', self.server_share),
@@ -170,5 +169,5 @@ fn is(expected: Hmac<Sha256>, proof: &PairingProof) -> bool {
     expected.verify_slice(proof).is_ok()
 }
 
-/// How many codes there are.
+/// Number of possible codes.
 const CODES: u32 = 1_000_000;

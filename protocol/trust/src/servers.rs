@@ -1,55 +1,55 @@
-//! `servers.toml`: which server is which, on the computer of a runtime.
+//! `servers.toml`: servers known to the computer of a runtime.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Fingerprint;
 use crate::folder::{KeyError, KeysFolder};
 
-/// A server this computer is paired with.
+/// Server with which this computer is paired.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KnownServer {
-    /// `HOST:PORT`, as a person typed it.
+    /// `HOST:PORT`, as typed by the user.
     pub address: String,
-    /// Who it is.
+    /// Fingerprint of its certificate.
     pub fingerprint: Fingerprint,
 }
 
-/// All servers this computer is paired with.
+/// All servers with which this computer is paired.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Servers {
-    /// In the order of the file.
+    /// Servers in the order of the file.
     #[serde(default, rename = "server")]
     pub servers: Vec<KnownServer>,
 }
 
 impl Servers {
-    /// The file's name in the keys folder.
+    /// Name of the file in the keys folder.
     pub const FILE: &str = "servers.toml";
 
-    /// Reads and checks the text of the file.
+    /// Parses and checks the text of the file.
     ///
     /// # Errors
-    /// A sentence with the position and the error.
+    /// Returns a sentence with the position and the error.
     pub fn parse(text: &str) -> Result<Self, String> {
         let servers: Self = toml::from_str(text).map_err(|error| error.to_string())?;
         for (index, server) in servers.servers.iter().enumerate() {
             let address = &server.address;
             if servers.servers[..index].iter().any(|other| other.address == *address) {
-                return Err(format!("'{address}' is there twice; keep one of the two"));
+                return Err(format!("'{address}' occurs twice; keep one of the two entries"));
             }
         }
         Ok(servers)
     }
 
-    /// Reads the file of a keys folder; none is known where there is none.
+    /// Reads the file of a keys folder. Without a file, the list is empty.
     pub fn read(folder: &KeysFolder) -> Result<Self, KeyError> {
         let text = folder.read(Self::FILE)?.unwrap_or_default();
         Self::parse(&text).map_err(|what| KeyError::Damaged { path: folder.file(Self::FILE), what })
     }
 
-    /// Notes a server, in place of the one that was known at its address.
+    /// Adds a server, and replaces an entry with the same address.
     pub fn add(folder: &KeysFolder, server: KnownServer) -> Result<(), KeyError> {
         let mut known = Self::read(folder)?;
         known.servers.retain(|other| other.address != server.address);
@@ -61,8 +61,8 @@ impl Servers {
         folder.write(Self::FILE, &(HEAD.to_owned() + &text))
     }
 
-    /// Returns who answers at the first of `addresses` that is known: what a person typed, then
-    /// what it resolves to.
+    /// Returns the fingerprint of the first of `addresses` that is known: the address as typed by the user, then the
+    /// resolved one.
     pub fn fingerprint(&self, addresses: &[&str]) -> Option<Fingerprint> {
         let at = |wanted: &&str| {
             self.servers.iter().find(|server| server.address == *wanted).map(|s| s.fingerprint)
@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_server_is_found_by_what_was_typed_or_by_address() {
+    fn finds_a_server_by_typed_or_resolved_address() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         let server = |address: &str, who: &[u8]| KnownServer {

@@ -1,8 +1,7 @@
 //! Mutual TLS 1.3 between self-signed certificates.
 //!
-//! TLS proves that the other side holds the key of the certificate it shows; whether that
-//! certificate may do anything is decided afterwards, by its fingerprint. Sessions are never
-//! resumed: each connection proves it again.
+//! TLS proves that the peer holds the key of its certificate. The rights of that certificate are checked afterwards, by
+//! its fingerprint. Sessions are never resumed, so that each connection proves the key again.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -20,7 +19,7 @@ use rustls::{
 
 use crate::{Fingerprint, Identity};
 
-/// Returns the server's side: any client that holds a key may finish the handshake.
+/// Returns the server's configuration. Any client that holds the key of its certificate can complete the handshake.
 pub fn server_config(identity: &Identity, alpn: &[&[u8]]) -> Result<ServerConfig, Error> {
     let provider = provider();
     let mut config = ServerConfig::builder_with_provider(provider.clone())
@@ -32,10 +31,10 @@ pub fn server_config(identity: &Identity, alpn: &[&[u8]]) -> Result<ServerConfig
     Ok(config)
 }
 
-/// Returns the page's side: browsers show no certificate, and speak HTTP/1.1.
+/// Returns the configuration of the page's server, without client certificates and with HTTP/1.1.
 ///
 /// # Errors
-/// A key that is not the certificate's, or of a kind that TLS does not know.
+/// Returns an error if the key does not match the certificate or has an unsupported type.
 pub fn page_config(
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
@@ -48,10 +47,10 @@ pub fn page_config(
     Ok(config)
 }
 
-/// As [`page_config`], from PEM files; with the fingerprint of the certificate.
+/// Like [`page_config`], from PEM files. Also returns the fingerprint of the certificate.
 ///
 /// # Errors
-/// What is wrong with which file.
+/// Returns a message with the file and the error.
 pub fn page_config_of_files(
     certificate: &Path,
     key: &Path,
@@ -70,7 +69,7 @@ pub fn page_config_of_files(
     Ok((config, fingerprint))
 }
 
-/// Which server a client takes for its own.
+/// Server that a client accepts, and the server that it found.
 #[derive(Clone, Debug)]
 pub struct Pin {
     expected: Option<Fingerprint>,
@@ -79,27 +78,27 @@ pub struct Pin {
 }
 
 impl Pin {
-    /// Accepts the one server of this fingerprint.
+    /// Accepts only the server with this fingerprint.
     pub fn to(expected: Fingerprint) -> Self {
         Self { expected: Some(expected), found: Arc::default(), provider: provider() }
     }
 
-    /// Accepts any server, for pairing: who it is must be proved by the code.
+    /// Accepts any server, for pairing. The code must then prove the server's identity.
     pub fn none() -> Self {
         Self { expected: None, found: Arc::default(), provider: provider() }
     }
 
-    /// Returns who answered, accepted or not.
+    /// Returns the fingerprint of the server that replied, accepted or not.
     pub fn found(&self) -> Option<Fingerprint> {
         *self.found.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns who answered in place of the expected one.
+    /// Returns the fingerprint of the server that replied, if it is not the expected one.
     pub fn mismatch(&self) -> Option<Fingerprint> {
         self.found().filter(|found| self.expected.is_some_and(|expected| expected != *found))
     }
 
-    /// Returns the client's side.
+    /// Returns the client's configuration.
     pub fn client_config(&self, identity: &Identity, alpn: &[u8]) -> Result<ClientConfig, Error> {
         let mut config = ClientConfig::builder_with_provider(self.provider.clone())
             .with_protocol_versions(&[&rustls::version::TLS13])?
@@ -153,7 +152,7 @@ impl ServerCertVerifier for Pin {
     }
 }
 
-/// Takes any certificate whose key the client proves to hold.
+/// Accepts any certificate if the client proves that it holds the key.
 #[derive(Debug)]
 struct AnyClient(Arc<CryptoProvider>);
 
@@ -203,10 +202,10 @@ fn algorithms(provider: &CryptoProvider) -> &WebPkiSupportedAlgorithms {
 }
 
 fn no_tls12() -> Error {
-    Error::General("TLS 1.2 is not spoken here".to_owned())
+    Error::General("TLS 1.2 is not supported".to_owned())
 }
 
-/// All our keys are of one kind; what is never used is not offered.
+/// All keys are Ed25519; unused schemes are not offered.
 const SCHEMES: [SignatureScheme; 1] = [SignatureScheme::ED25519];
 
 #[cfg(test)]
@@ -214,7 +213,7 @@ mod tests {
     use super::*;
     use rustls::{ClientConnection, ServerConnection};
 
-    /// Shakes hands in memory; returns whom each side saw.
+    /// Performs a handshake in memory. Returns the fingerprint of the client that the server sees.
     fn handshake(
         client: ClientConfig,
         server: ServerConfig,
@@ -241,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn each_side_learns_who_the_other_is() {
+    fn each_side_gets_the_fingerprint_of_the_other() {
         let [one, two] = [(); 2].map(|()| Identity::ephemeral().unwrap());
         let server = || server_config(&one, &[b"x"]).unwrap();
         let pin = Pin::to(one.fingerprint());
@@ -262,7 +261,7 @@ mod tests {
         );
     }
 
-    /// Shows the certificate of a paired client without its key.
+    /// Presents the certificate of a paired client without its key.
     #[derive(Debug)]
     struct StolenCertificate(Arc<rustls::sign::CertifiedKey>);
 
@@ -281,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_client_without_a_certificate_or_with_a_stolen_one_is_refused() {
+    fn rejects_a_client_without_a_certificate_or_with_a_stolen_one() {
         let [one, two, three] = [(); 3].map(|()| Identity::ephemeral().unwrap());
         let pin = Pin::to(one.fingerprint());
         let builder = || {

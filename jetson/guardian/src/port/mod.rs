@@ -1,5 +1,5 @@
-//! Where the autopilot is, and the way to it: UDP either way round, TCP either way round, or a serial
-//! line. One thread receives, another sends; neither waits longer than a tenth of a second.
+//! Address of the autopilot and transport to it: UDP or TCP in either direction, or a serial line. One thread receives,
+//! another sends. Neither blocks for more than 100 ms, except that opening a TCP connection may take 500 ms.
 
 use std::fmt;
 use std::io;
@@ -21,44 +21,43 @@ use serial::SerialPort;
 use tcp::TcpPort;
 use udp::UdpPort;
 
-/// Where the autopilot is, as typed after `--mavlink`.
+/// Address of the autopilot, as typed after `--mavlink`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum MavlinkAddress {
-    /// `udpin:ADDR:PORT`: binds, and answers the wanted autopilot.
+    /// `udpin:ADDR:PORT`: binds, and replies to the wanted autopilot.
     UdpIn(SocketAddr),
-    /// `udpout:HOST:PORT`: sends there.
+    /// `udpout:HOST:PORT`: sends to this address.
     UdpOut(SocketAddr),
-    /// `tcpin:ADDR:PORT`: waits for one connection at a time.
+    /// `tcpin:ADDR:PORT`: accepts one connection at a time.
     TcpIn(SocketAddr),
-    /// `tcpout:HOST:PORT`: connects, and again when the connection breaks.
+    /// `tcpout:HOST:PORT`: connects, and reconnects if the connection breaks.
     TcpOut(SocketAddr),
     /// `serial:PATH:BAUD` or `serial:PATH:BAUD:rtscts`.
     Serial {
-        /// The device.
         path: PathBuf,
-        /// Its speed. [baud]
+        /// Baud rate. [baud]
         baud: u32,
-        /// Whether RTS and CTS are wired.
+        /// Whether to use hardware flow control (RTS, CTS).
         flow: bool,
     },
 }
 
-/// The parts of an address, nothing looked up yet.
+/// Parts of an address, before any name lookup.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shape<'a> {
     /// Kind and `HOST:PORT`.
     Net(&'a str, &'a str),
-    /// Path, baud and whether with flow control.
+    /// Path, baud rate, and whether to use flow control.
     Serial(&'a str, u32, bool),
 }
 
-/// What an address may look like.
+/// Help on the formats of an address.
 pub const SHAPES: &str = "write udpin:0.0.0.0:14550, udpout:HOST:PORT, tcpout:HOST:PORT, \
                                  tcpin:ADDR:PORT or serial:/dev/ttyTHS1:921600";
-/// What ArduCopter's telemetry ports and Wi-Fi bridges are set to. [baud]
+/// Default baud rate, as configured for ArduCopter's telemetry ports and Wi-Fi bridges. [baud]
 const USUAL_BAUD: u32 = 921_600;
 
-/// Takes an address apart; `None` if it is none.
+/// Splits an address into its parts; `None` if it is invalid.
 pub fn shape(text: &str) -> Option<Shape<'_>> {
     let (kind, rest) = text.split_once(':')?;
     match kind {
@@ -77,11 +76,11 @@ pub fn shape(text: &str) -> Option<Shape<'_>> {
     }
 }
 
-/// Where ground stations and companion computers wait for an autopilot.
+/// Default port of ground stations and companion computers.
 const USUAL_PORT: u16 = 14550;
 
 impl MavlinkAddress {
-    /// Returns the default.
+    /// Returns the default address.
     pub fn usual() -> Self {
         Self::UdpIn(([0, 0, 0, 0], USUAL_PORT).into())
     }
@@ -104,7 +103,7 @@ impl FromStr for MavlinkAddress {
             Some(Shape::Serial(path, baud, flow)) => {
                 Ok(Self::Serial { path: Path::new(path).to_owned(), baud, flow })
             }
-            None => Err(format!("{text:?} is no MAVLink address; {SHAPES}")),
+            None => Err(format!("{text:?} is not a MAVLink address; {SHAPES}")),
         }
     }
 }
@@ -124,7 +123,7 @@ impl fmt::Display for MavlinkAddress {
     }
 }
 
-/// The transport to the autopilot, shared by a receiving thread and the control loop.
+/// Transport to the autopilot, shared by a receiving thread and the control loop.
 #[derive(Debug)]
 pub struct Port(Transport);
 
@@ -136,11 +135,10 @@ enum Transport {
 }
 
 impl Port {
-    /// Opens it, for the `wanted` autopilot. A TCP server that is not there yet is no error: it is tried
-    /// again.
+    /// Opens the transport for the `wanted` autopilot. If a TCP server does not listen yet, the connection is retried.
     ///
     /// # Errors
-    /// The system's refusal of the socket or the device.
+    /// Returns an error if the socket or device cannot be opened.
     pub fn open(address: &MavlinkAddress, wanted: Wanted) -> io::Result<Self> {
         Ok(Self(match address {
             MavlinkAddress::UdpIn(local) => {
@@ -164,10 +162,10 @@ impl Port {
         }))
     }
 
-    /// Returns where others reach us: the socket's address, or the device.
+    /// Returns the local end of the link: the socket's address, or the device.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// Returns an error if the socket has no local address.
     pub fn local(&self) -> io::Result<String> {
         match &self.0 {
             Transport::Udp(udp, _) => Ok(udp.local_addr()?.to_string()),
@@ -176,11 +174,10 @@ impl Port {
         }
     }
 
-    /// Waits for bytes of the autopilot, 100 ms at most; `None` if none came, or if they are of somebody
-    /// else.
+    /// Waits at most 100 ms for bytes from the autopilot; `None` if none arrived, or if they came from another sender.
     ///
     /// # Errors
-    /// An error that waiting longer does not solve.
+    /// Returns an error if the socket fails for a reason other than a timeout.
     pub fn receive(&self, buffer: &mut [u8]) -> io::Result<Option<usize>> {
         match &self.0 {
             Transport::Udp(udp, partner) => {
@@ -193,13 +190,13 @@ impl Port {
         }
     }
 
-    /// Returns somebody whose datagrams are ignored, and who is to be reported now.
+    /// Returns an ignored sender that is due to be reported.
     pub fn poll_intruder(&self) -> Option<Intruder> {
         let Transport::Udp(_, partner) = &self.0 else { return None };
         partner.lock().unwrap_or_else(PoisonError::into_inner).poll_intruder(Instant::now())
     }
 
-    /// Sends whole packets, if anybody is there; loss is the protocol's concern.
+    /// Sends whole packets if the peer is known. Errors are ignored: MAVLink tolerates loss.
     pub fn send(&self, bytes: &[u8]) {
         match &self.0 {
             Transport::Udp(udp, partner) => {
@@ -220,7 +217,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_are_read_and_printed() {
+    fn parses_and_prints_addresses() {
         for text in [
             "udpin:127.0.0.1:14550",
             "udpout:127.0.0.1:14550",
@@ -248,11 +245,11 @@ mod tests {
         Port::open(&address.parse().unwrap(), Wanted::default()).unwrap()
     }
 
-    /// Packets go both ways between two ports.
+    /// Checks that packets pass in both directions between two ports.
     fn check(here: &Port, there: &Port) {
         let mut buffer = [0; 64];
         let mut exchange = |from: &Port, to: &Port, text: &[u8]| {
-            // The partner may have to be found first: the other side sends until something arrives.
+            // The partner may be unknown at first: the other side sends until a packet arrives.
             for _ in 0..100 {
                 from.send(text);
                 if let Some(len) = to.receive(&mut buffer).unwrap() {
@@ -261,21 +258,21 @@ mod tests {
                 }
                 let _ = from.receive(&mut buffer).unwrap();
             }
-            panic!("nothing came");
+            panic!("no packet arrived");
         };
         exchange(there, here, &heartbeat(1, None));
         exchange(here, there, b"pong");
     }
 
     #[test]
-    fn udp_carries_both_ways() {
+    fn udp_sends_in_both_directions() {
         let here = open("udpin:127.0.0.1:0");
         check(&here, &open(&format!("udpout:{}", here.local().unwrap())));
     }
 
-    /// Somebody sends first, and goes on.
+    /// A stranger sends first, and continues to send.
     #[test]
-    fn a_stranger_keeps_no_autopilot_out() {
+    fn accepts_the_autopilot_after_a_stranger() {
         let here = open("udpin:127.0.0.1:0");
         let to = here.local().unwrap();
         let [stranger, autopilot] =
@@ -296,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn tcp_carries_both_ways_and_reconnects() {
+    fn tcp_sends_in_both_directions_and_reconnects() {
         let here = open("tcpin:127.0.0.1:0");
         let address = format!("tcpout:{}", here.local().unwrap());
         for _ in 0..2 {
@@ -305,16 +302,16 @@ mod tests {
     }
 
     #[test]
-    fn a_serial_line_carries_both_ways() {
+    fn serial_sends_in_both_directions() {
         use std::io::{Read, Write};
         let pty = nix::pty::openpty(None, None).unwrap();
         let path = nix::unistd::ttyname(&pty.slave).unwrap();
         let address = format!("serial:{}:3000000", path.display());
         let here = open(&address);
         let second = Port::open(&address.parse().unwrap(), Wanted::default());
-        assert_eq!(second.unwrap_err().kind(), io::ErrorKind::AddrInUse, "one program has it");
+        assert_eq!(second.unwrap_err().kind(), io::ErrorKind::AddrInUse, "the device is locked");
         let mut far = std::fs::File::from(pty.master);
-        // Raw: no byte is changed, none is echoed.
+        // Raw mode: bytes are not changed or echoed.
         let sent: Vec<u8> = (0..=255).collect();
         far.write_all(&sent).unwrap();
         let (mut got, mut buffer) = (Vec::new(), [0; 100]);

@@ -1,9 +1,9 @@
-//! Whom to answer on a UDP port that waits for an autopilot: sans-IO, datagrams and `now` in.
+//! Partner on a UDP port that waits for an autopilot: the address to reply to. Sans-IO: input is datagrams and `now`.
 //!
-//! The partner is the sender of a valid heartbeat of the wanted autopilot; with signing on, of a signed one. Until
-//! there is one nobody is listened to. It keeps its place by its heartbeats: 3 s without one, and the next sender of
-//! one takes it, as a restarted bridge comes from a new port. Everybody else is an intruder: counted, named at growing
-//! intervals, and ignored.
+//! The partner is the first sender of a valid heartbeat of the wanted autopilot; with signing, of a signed heartbeat.
+//! Before that, all datagrams are ignored. If the partner sends no heartbeat for 3 s, the next sender of one replaces
+//! it, because a restarted bridge sends from a new port. Every other sender is an intruder: counted, reported at
+//! growing intervals, and ignored.
 
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
@@ -12,56 +12,56 @@ use std::time::{Duration, Instant};
 use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavMessage};
 use vizflyt_protocol::mavlink::{SigningFault, SigningKey, SigningTime, StreamDecoder, Verifier};
 
-/// Signing for one run of the link.
+/// Signing parameters for one run of the link.
 #[derive(Clone, Debug)]
 pub struct LinkSigning {
-    /// The secret.
+    /// Secret key.
     pub key: SigningKey,
-    /// The stamp of the moment at which the link is made.
+    /// Signing time at which the link was created.
     pub start: SigningTime,
-    /// Accepts unsigned packets too: only where a key is handed over, as USB is not signed.
+    /// Whether unsigned packets are accepted, too. Only for the transfer of a key, because USB is not signed.
     pub accepts_unsigned: bool,
 }
 
-/// Which autopilot is waited for.
+/// Autopilot to connect to.
 #[derive(Clone, Debug, Default)]
 pub struct Wanted {
-    /// Its system id; `None` takes any.
+    /// System id; `None` accepts any.
     pub system: Option<u8>,
-    /// Its heartbeats must be signed with this.
+    /// Signing of its heartbeats, if required.
     pub signing: Option<LinkSigning>,
 }
 
-/// Why a datagram is ignored.
+/// Reason why a datagram is ignored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum IntruderFault {
-    /// It is no MAVLink, or of no autopilot.
-    #[error("no heartbeat of an autopilot is in them")]
+    /// Not MAVLink, or not from an autopilot.
+    #[error("they contain no heartbeat of an autopilot")]
     NoHeartbeat,
-    /// Another vehicle's.
-    #[error("their heartbeats are of system {found}, not of {wanted}")]
+    /// Heartbeat of another vehicle.
+    #[error("they contain heartbeats of system {found}, expected {wanted}")]
     OtherSystem {
-        /// Whose they are.
+        /// System id in the heartbeat.
         found: u8,
-        /// Whose are wanted.
+        /// Wanted system id.
         wanted: u8,
     },
-    /// Signing is on.
+    /// Signature missing or invalid, while signing is on.
     #[error("{0}")]
     NotSigned(SigningFault),
-    /// There is a partner already.
+    /// Heartbeat of a second sender, while there is a partner.
     #[error("the autopilot is at {0}")]
     Second(SocketAddr),
 }
 
-/// Somebody whose datagrams are ignored.
+/// Sender whose datagrams are ignored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Intruder {
-    /// Where they come from; `None` stands for all for whom there was no room.
+    /// Address of the sender; `None` for all senders beyond the table's capacity.
     pub address: Option<IpAddr>,
-    /// How many came so far.
+    /// Number of datagrams up to this report.
     pub datagrams: u64,
-    /// What was wrong with the newest.
+    /// Reason for the newest one.
     pub fault: IntruderFault,
 }
 
@@ -77,7 +77,7 @@ impl fmt::Display for Intruder {
     }
 }
 
-/// The address to answer: a fixed one, or that of the wanted autopilot.
+/// Address to reply to: a fixed one, or that of the wanted autopilot.
 #[derive(Debug)]
 pub(super) struct Partner {
     fixed: bool,
@@ -85,12 +85,12 @@ pub(super) struct Partner {
     verifier: Option<Verifier>,
     made_at: Instant,
     current: Option<(SocketAddr, Instant)>,
-    /// Bytes of senders that may cut packets anywhere, as a bridge of a serial line does; newest last.
+    /// Decoders per sender, newest last. A sender may cut packets anywhere, as a bridge of a serial line does.
     streams: Vec<Stream>,
     intruders: Vec<Remembered>,
 }
 
-/// The bytes of one sender.
+/// Decoder for the bytes of one sender.
 struct Stream {
     from: SocketAddr,
     decoder: StreamDecoder,
@@ -105,16 +105,16 @@ impl fmt::Debug for Stream {
 #[derive(Clone, Copy, Debug)]
 struct Remembered {
     intruder: Intruder,
-    /// So many were reported.
+    /// Number of datagrams in the last report.
     reported: u64,
-    /// When others may be.
+    /// Earliest time of the next report.
     due_at: Instant,
-    /// From that report to the next.
+    /// Pause after the next report.
     pause: Duration,
 }
 
 impl Partner {
-    /// Whoever is the wanted autopilot.
+    /// Returns a partner that is found by heartbeats of the wanted autopilot.
     pub(super) fn waited_for(wanted: Wanted, now: Instant) -> Self {
         let signing = wanted.signing.as_ref().filter(|signing| !signing.accepts_unsigned);
         let verifier = signing.map(|signing| Verifier::new(signing.key.clone()));
@@ -129,12 +129,12 @@ impl Partner {
         }
     }
 
-    /// This one, whoever else sends.
+    /// Returns a partner with a fixed address; other senders are ignored.
     pub(super) fn fixed(to: SocketAddr, now: Instant) -> Self {
         Self { fixed: true, current: Some((to, now)), ..Self::waited_for(Wanted::default(), now) }
     }
 
-    /// Takes note of a datagram; returns whether it is the partner's.
+    /// Records a datagram. Returns whether it is the partner's.
     pub(super) fn accept(&mut self, from: SocketAddr, bytes: &[u8], now: Instant) -> bool {
         let current = self.current;
         if self.fixed {
@@ -152,7 +152,7 @@ impl Partner {
                 self.current = Some((from, now));
                 true
             }
-            // Its other packets; it keeps its place only by heartbeats.
+            // Other packets of the partner. Only heartbeats keep its place.
             (Some((partner, _)), Err(_)) if partner == from => true,
             (Some((partner, at)), Ok(())) if now.duration_since(at) < PARTNER_KEPT => {
                 self.note(from, IntruderFault::Second(partner), now);
@@ -169,13 +169,13 @@ impl Partner {
         }
     }
 
-    /// Returns where to send.
+    /// Returns the address to send to.
     pub(super) fn address(&self) -> Option<SocketAddr> {
         self.current.map(|(address, _)| address)
     }
 
-    /// Returns an intruder that is to be reported at `now`: each at once, then at growing intervals, and only if
-    /// more has come of it.
+    /// Returns an intruder that is due to be reported at `now`: the first datagram at once, later ones at growing
+    /// intervals.
     pub(super) fn poll_intruder(&mut self, now: Instant) -> Option<Intruder> {
         let is_due =
             |one: &&mut Remembered| one.intruder.datagrams > one.reported && now >= one.due_at;
@@ -186,7 +186,7 @@ impl Partner {
         Some(due.intruder)
     }
 
-    /// Whether a heartbeat of the wanted autopilot ends in these bytes.
+    /// Returns `Ok` if a heartbeat of the wanted autopilot ends in these bytes.
     fn heartbeat(
         &mut self,
         from: SocketAddr,
@@ -206,7 +206,7 @@ impl Partner {
             if found.is_ok() || !is_flown(heartbeat.autopilot) {
                 return;
             }
-            // As the link itself numbers systems: ids beyond a byte are nobody's.
+            // As in the link: system ids above 255 are invalid.
             let system = u8::try_from(packet.header.system_id).unwrap_or_default();
             if let Some(wanted) = wanted.system
                 && wanted != system
@@ -221,7 +221,7 @@ impl Partner {
                 _ => Ok(()),
             };
         });
-        // The one that has been silent longest makes room, never the partner.
+        // Evict the sender that has been silent longest, but never the partner.
         if self.streams.len() >= STREAMS {
             let partner = self.address();
             let oldest = self.streams.iter().position(|stream| Some(stream.from) != partner);
@@ -251,18 +251,18 @@ impl Partner {
     }
 }
 
-/// Whether it is an autopilot that we fly.
+/// Whether VizFlyt supports this autopilot.
 pub(crate) fn is_flown(autopilot: MavAutopilot) -> bool {
     matches!(autopilot, MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA | MavAutopilot::MAV_AUTOPILOT_PX4)
 }
 
-/// A partner without a heartbeat for this long may be replaced by another sender of one.
+/// Time without a heartbeat after which another sender may replace the partner.
 const PARTNER_KEPT: Duration = Duration::from_secs(3);
-/// Senders whose packets may come in parts.
+/// Maximum number of senders with a decoder.
 const STREAMS: usize = 8;
-/// Addresses named; the rest is counted together.
+/// Maximum number of addresses reported separately; further senders are counted together.
 const INTRUDERS: usize = 8;
-/// From the first report to the second; each further pause is twice as long.
+/// Pause between the first and second report. Each further pause is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_secs(10);
 const LONGEST_PAUSE: Duration = Duration::from_hours(1);
 
@@ -275,7 +275,7 @@ pub(super) mod tests {
 
     const SECOND: Duration = Duration::from_secs(1);
 
-    /// Returns a heartbeat of ArduPilot; signed, if there is a signer.
+    /// Returns a heartbeat of ArduPilot, signed if there is a signer.
     pub(crate) fn heartbeat(system: u8, signer: Option<(&mut Signer, SigningTime)>) -> Vec<u8> {
         let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
         let message = MavMessage::HEARTBEAT(HEARTBEAT_DATA { autopilot, ..Default::default() });
@@ -301,7 +301,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_byte_that_comes_first_keeps_no_autopilot_out() {
+    fn accepts_the_autopilot_after_other_datagrams() {
         let (start, intruder, autopilot) = (Instant::now(), from(9, 999), from(5, 14550));
         let mut partner = Partner::waited_for(Wanted::default(), start);
         for half_seconds in 0..20 {
@@ -319,15 +319,15 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn the_partner_keeps_its_place_by_heartbeats_alone() {
+    fn only_heartbeats_keep_the_partner() {
         let (start, a, b) = (Instant::now(), from(5, 1), from(5, 2));
         let beat = heartbeat(1, None);
         let radio = packet(1, &MavMessage::RADIO_STATUS(RADIO_STATUS_DATA::default()), None);
         let mut partner = Partner::waited_for(Wanted::default(), start);
         assert!(!partner.accept(a, &radio, start), "no heartbeat yet");
         assert!(partner.accept(a, &beat, start) && partner.accept(a, &radio, start + SECOND));
-        assert!(!partner.accept(b, &beat, start + 2 * SECOND), "the first one speaks");
-        assert!(partner.accept(a, &radio, start + 3 * SECOND), "other packets of it");
+        assert!(!partner.accept(b, &beat, start + 2 * SECOND), "the first partner sends heartbeats");
+        assert!(partner.accept(a, &radio, start + 3 * SECOND), "other packets of the partner");
         assert!(!partner.accept(b, &radio, start + 4 * SECOND) && partner.address() == Some(a));
         assert!(partner.accept(b, &beat, start + 4 * SECOND) && partner.address() == Some(b));
         let mut fixed = Partner::fixed(a, start);
@@ -336,7 +336,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn another_system_and_a_ground_station_are_no_partner() {
+    fn ignores_other_systems_and_ground_stations() {
         let start = Instant::now();
         let wanted = Wanted { system: Some(3), signing: None };
         let mut partner = Partner::waited_for(wanted, start);
@@ -355,7 +355,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn with_signing_on_only_a_signed_heartbeat_counts_and_only_once() {
+    fn rejects_unsigned_forged_and_replayed_heartbeats() {
         let (now, key) = (Instant::now(), SigningKey::new([7; 32]));
         let time = SigningTime::from_units(1_000_000);
         let signing = LinkSigning { key: key.clone(), start: time, accepts_unsigned: false };
@@ -368,12 +368,12 @@ pub(super) mod tests {
         let good = heartbeat(1, Some((&mut Signer::new(key, 0), time)));
         assert!(partner.accept(from(2, 1), &good, now));
         let later = now + 4 * SECOND;
-        assert!(!partner.accept(from(3, 1), &good, later), "recorded and sent again");
+        assert!(!partner.accept(from(3, 1), &good, later), "replayed heartbeat");
         assert_eq!(partner.address(), Some(from(2, 1)));
     }
 
     #[test]
-    fn a_heartbeat_may_come_in_parts() {
+    fn accepts_a_heartbeat_in_parts() {
         let (now, bytes) = (Instant::now(), heartbeat(1, None));
         let mut partner = Partner::waited_for(Wanted::default(), now);
         for byte in &bytes[..bytes.len() - 1] {
@@ -383,7 +383,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn intruders_are_named_at_growing_intervals_and_their_number_is_bounded() {
+    fn reports_intruders_at_growing_intervals_and_bounds_their_number() {
         let start = Instant::now();
         let mut partner = Partner::waited_for(Wanted::default(), start);
         let mut named = Vec::new();
@@ -403,9 +403,9 @@ pub(super) mod tests {
     }
 
     proptest! {
-        /// Bytes that are no heartbeat make nobody a partner, however they are cut and from how many places.
+        /// Bytes without a heartbeat never select a partner, for any datagram boundaries and senders.
         #[test]
-        fn noise_is_no_partner(datagrams in prop::collection::vec((0u8..20, prop::collection::vec(any::<u8>(), 0..300)), 0..50)) {
+        fn noise_does_not_select_a_partner(datagrams in prop::collection::vec((0u8..20, prop::collection::vec(any::<u8>(), 0..300)), 0..50)) {
             let start = Instant::now();
             let mut partner = Partner::waited_for(Wanted::default(), start);
             for (last, bytes) in &datagrams {
@@ -415,9 +415,9 @@ pub(super) mod tests {
             prop_assert!(partner.accept(from(100, 1), &heartbeat(1, None), start));
         }
 
-        /// The partner is not put out by whatever others send.
+        /// Datagrams of other senders never replace the partner.
         #[test]
-        fn noise_puts_out_no_partner(datagrams in prop::collection::vec((0u8..20, prop::collection::vec(any::<u8>(), 0..300)), 0..50)) {
+        fn noise_does_not_replace_the_partner(datagrams in prop::collection::vec((0u8..20, prop::collection::vec(any::<u8>(), 0..300)), 0..50)) {
             let start = Instant::now();
             let mut partner = Partner::waited_for(Wanted::default(), start);
             prop_assert!(partner.accept(from(100, 1), &heartbeat(1, None), start));

@@ -1,6 +1,5 @@
-//! MAVLink over a serial line: raw bytes, 8N1. A device that goes away is opened again when it is
-//! back. What the line cannot take at once waits; when too much waits, whole packets are dropped, as
-//! a datagram would be.
+//! MAVLink over a serial line: raw bytes, 8N1. An unplugged device is reopened when it is back. Bytes that the line
+//! cannot accept at once are queued. If the queue is full, whole packets are dropped, as datagrams would be.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -18,23 +17,22 @@ use nix::sys::termios::{
     BaudRate, ControlFlags, FlushArg, SetArg, cfmakeraw, cfsetspeed, tcflush, tcgetattr, tcsetattr,
 };
 
-/// Longest wait for bytes. [ms]
+/// Maximum wait for bytes. [ms]
 const WAIT_MS: u8 = 100;
-/// Bytes that may wait for the line: 20 ms at 921600 baud. Older setpoints are worth nothing.
+/// Size of the send queue: 20 ms at 921600 baud. Older setpoints are useless. [bytes]
 const BACKLOG: usize = 2048;
 
-/// The line.
 #[derive(Debug)]
 pub(super) struct SerialPort {
     path: PathBuf,
     baud: BaudRate,
     flow: bool,
-    /// Locked: what two programs read, each has half of.
+    /// Locked: if two programs read, each would get only some of the bytes.
     file: Mutex<Option<Arc<Flock<File>>>>,
     backlog: Mutex<Vec<u8>>,
 }
 
-/// Returns the system's name of a speed; `None` if it has none.
+/// Returns the system's constant for a baud rate; `None` if it is not supported.
 pub(super) fn speed(baud: u32) -> Option<BaudRate> {
     const SPEEDS: [(u32, BaudRate); 14] = [
         (9_600, BaudRate::B9600),
@@ -92,7 +90,7 @@ impl SerialPort {
             return None;
         };
         let mut fds = [PollFd::new(file.as_fd(), PollFlags::POLLIN)];
-        // Interrupted or timed out: the caller comes again.
+        // Interrupted or timed out: the caller retries.
         if !matches!(poll(&mut fds, WAIT_MS), Ok(ready) if ready > 0) {
             return None;
         }
@@ -117,7 +115,7 @@ impl SerialPort {
                 Ok(len) if len > 0 => {
                     backlog.drain(..len);
                 }
-                // No room now, or gone: the receiving thread notices the latter.
+                // Line busy or device gone; the receiving thread detects the latter.
                 _ => break,
             }
         }

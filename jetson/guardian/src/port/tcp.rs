@@ -1,5 +1,5 @@
-//! MAVLink over TCP, as a simulated ArduCopter (port 5760) and some bridges offer it. A broken
-//! connection is made again; bytes that cannot go out at once break it, as half a packet is none.
+//! MAVLink over TCP, as offered by a simulated ArduCopter (port 5760) and some bridges. A broken connection is made
+//! again. If bytes cannot be sent in time, the connection is closed, because a partial packet would corrupt the stream.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -7,14 +7,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-/// Longest wait for bytes, so that the receiving thread sees the end of the flight.
+/// Maximum wait for bytes, so that the receiving thread notices the end of the flight.
 const WAIT: Duration = Duration::from_millis(100);
-/// Longest wait of the control loop for room in the socket's buffer.
+/// Maximum time for which the control loop waits for space in the socket's buffer.
 const SEND_WAIT: Duration = Duration::from_millis(20);
-/// A server that is not there answers at once on this host, and within this elsewhere.
+/// Connection timeout. On this host, a missing server is refused at once.
 const CONNECT_WAIT: Duration = Duration::from_millis(500);
 
-/// One connection at a time.
+/// TCP transport with one connection at a time.
 #[derive(Debug)]
 pub(super) struct TcpPort {
     peer: Peer,
@@ -53,7 +53,7 @@ impl TcpPort {
         *self.stream.lock().unwrap_or_else(PoisonError::into_inner) = stream;
     }
 
-    /// Makes the connection, if it can be made within [`CONNECT_WAIT`].
+    /// Opens a connection, within [`CONNECT_WAIT`].
     fn open(&self) -> io::Result<Arc<TcpStream>> {
         let stream = match &self.peer {
             Peer::Waits(listener) => listener.accept()?.0,

@@ -14,14 +14,14 @@ const GUIDED: u32 = 4;
 const LOITER: u32 = 5;
 const LAND_MODE: u32 = 9;
 
-/// A flight on a clock of milliseconds: what went to the autopilot, and when.
+/// Simulated flight on a millisecond clock, with a record of the packets to the autopilot.
 struct Rig {
     watch: Watch,
     ms: u64,
     sent: Sent,
-    /// The runtime speaks until then. [ms]
+    /// Time at which the runtime falls silent. [ms]
     speaks_until: u64,
-    /// The server's poses come.
+    /// Whether the server's poses arrive.
     feed: bool,
     armed: bool,
     mode: u32,
@@ -106,8 +106,8 @@ impl Rig {
         self.packet((1, 1), &MavMessage::HEARTBEAT(beat))
     }
 
-    /// Lets time pass until `ms`: setpoints and poses of the runtime each 20 ms, its heartbeat each 250, the
-    /// autopilot's each second.
+    /// Advances the time to `until_ms`: setpoints and poses of the runtime every 20 ms, its heartbeat every 240 ms, the
+    /// autopilot's heartbeat every second.
     fn run(&mut self, until_ms: u64) {
         while self.ms < until_ms {
             let ms = self.ms;
@@ -136,7 +136,7 @@ impl Rig {
         }
     }
 
-    /// When we sent a message of this number since `from_ms`.
+    /// Returns the times at which the guardian sent messages with this id, since `from_ms`.
     fn ours(&self, id: u32, from_ms: u64) -> Vec<u64> {
         let is = |bytes: &[u8]| {
             Head::of(bytes).is_some_and(|head| head.id == id && head.source.1 == COMPONENT_ID)
@@ -151,14 +151,14 @@ const VISION: u32 = 102;
 const SET_POSITION_TARGET: u32 = SET_POSITION_TARGET_LOCAL_NED;
 
 #[test]
-fn silence_of_half_a_second_is_land_and_an_end_is_at_once() {
+fn orders_land_after_half_a_second_of_silence_and_at_once_after_an_end() {
     let mut rig = Rig::flying();
-    assert_eq!(rig.ours(COMMAND_LONG, 0), [], "nothing of our own while it speaks");
+    assert_eq!(rig.ours(COMMAND_LONG, 0), [], "no command while the runtime sends");
     rig.speaks_until = 2001;
     rig.run(3000);
     let lands = rig.ours(COMMAND_LONG, 0);
     assert!((2500..=2520).contains(&lands[0]), "{lands:?}");
-    assert!(lands.len() > 1 && rig.sent.said == [SILENT], "repeated until the mode has changed");
+    assert!(lands.len() > 1 && rig.sent.said == [SILENT], "LAND is repeated until the mode has changed");
 
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;
@@ -169,7 +169,7 @@ fn silence_of_half_a_second_is_land_and_an_end_is_at_once() {
 }
 
 #[test]
-fn setpoints_that_cease_are_a_stop_until_they_come_again() {
+fn stops_without_setpoints_until_they_resume() {
     let mut rig = Rig::flying();
     rig.speaks_until = 2001;
     rig.run(2450);
@@ -188,43 +188,43 @@ fn setpoints_that_cease_are_a_stop_until_they_come_again() {
     assert!(matches!(stop.yaw, YawTarget::Angle(yaw) if (yaw - 0.5).abs() < 1e-5), "{stop:?}");
     rig.speaks_until = u64::MAX;
     rig.run(4000);
-    assert_eq!(rig.ours(SET_POSITION_TARGET, 0), stops, "and it flies on");
+    assert_eq!(rig.ours(SET_POSITION_TARGET, 0), stops, "no more stops after setpoints resume");
     assert_eq!(rig.ours(COMMAND_LONG, 0), []);
 }
 
 #[test]
-fn heartbeats_and_poses_go_on_until_it_stands() {
+fn continues_heartbeats_and_poses_until_disarmed() {
     let mut rig = Rig::flying();
     (rig.speaks_until, rig.feed) = (2000, true);
     rig.run(2600);
     let poses = rig.ours(VISION, 0);
-    // The runtime's go first; ours fill the gap within a tenth of a second, 50 a second.
+    // The runtime's poses have priority; the guardian's start 0.1 s after them, at 50 Hz.
     assert!((2080..=2120).contains(&poses[0]) && poses.len() >= 23, "{poses:?}");
     rig.mode = LAND_MODE;
     rig.run(6000);
     let beats = rig.ours(HEARTBEAT, 0);
     assert!(beats.windows(2).all(|w| w[1] - w[0] <= 510) && beats.len() >= 5, "{beats:?}");
     rig.watch.handle_end();
-    assert!(!rig.watch.is_over(at(rig.ms)), "it is in the air");
+    assert!(!rig.watch.is_over(at(rig.ms)), "the vehicle is in the air");
     rig.armed = false;
     rig.run(7100);
     assert!(rig.watch.is_over(at(rig.ms)));
 }
 
 #[test]
-fn a_landing_that_the_runtime_ordered_keeps_its_heartbeats() {
+fn continues_heartbeats_in_a_landing_ordered_by_the_runtime() {
     let mut rig = Rig::flying();
     rig.mode = LAND_MODE;
     rig.run(3100);
     rig.speaks_until = 3100;
     rig.watch.handle_end();
     rig.run(6000);
-    assert_eq!(rig.ours(COMMAND_LONG, 0), [], "it lands already");
+    assert_eq!(rig.ours(COMMAND_LONG, 0), [], "the vehicle is landing already");
     assert!(rig.ours(HEARTBEAT, 0).len() >= 4 && rig.sent.said.is_empty());
 }
 
 #[test]
-fn a_pilot_and_a_vehicle_on_the_ground_are_left_alone() {
+fn does_not_land_in_a_pilots_mode_or_on_the_ground() {
     for (mode, armed) in [(LOITER, true), (GUIDED, false)] {
         let mut rig = Rig::new(Wanted::default());
         (rig.mode, rig.armed, rig.feed) = (mode, armed, true);
@@ -232,15 +232,15 @@ fn a_pilot_and_a_vehicle_on_the_ground_are_left_alone() {
         rig.speaks_until = 2000;
         rig.run(5000);
         assert_eq!(rig.ours(COMMAND_LONG, 0), []);
-        // A pilot's LOITER needs to know where it is as much as ours.
+        // A pilot's LOITER needs poses, too.
         assert!(rig.ours(VISION, 0).len() > 100);
     }
 }
 
 #[test]
-fn another_autopilot_on_the_link_is_not_ours() {
+fn ignores_heartbeats_of_another_autopilot() {
     let mut rig = Rig::flying();
-    // System 7 says that it stands on the ground.
+    // System 7 reports that it is disarmed.
     let autopilot = MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA;
     let beat = HEARTBEAT_DATA { autopilot, ..HEARTBEAT_DATA::default() };
     let other = rig.packet((7, 1), &MavMessage::HEARTBEAT(beat));
@@ -251,7 +251,7 @@ fn another_autopilot_on_the_link_is_not_ours() {
 }
 
 #[test]
-fn a_runtime_that_wakes_up_orders_nothing_more() {
+fn blocks_orders_of_a_recovered_runtime_during_landing() {
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;
     rig.run(2600);
@@ -263,9 +263,9 @@ fn a_runtime_that_wakes_up_orders_nothing_more() {
     let ids: Vec<_> =
         rig.sent.packets.iter().filter_map(|(_, bytes)| Some(Head::of(bytes)?.id)).collect();
     assert!(!ids.contains(&SET_POSITION_TARGET), "{ids:?}");
-    assert!(ids.contains(&VISION) && ids.contains(&HEARTBEAT), "its poses pass");
+    assert!(ids.contains(&VISION) && ids.contains(&HEARTBEAT), "poses of the runtime pass");
     assert!(rig.ours(COMMAND_LONG, 0).len() == ids.iter().filter(|id| **id == 76).count());
-    // The pilot took it, and later gives it back: the runtime is heard again.
+    // The pilot takes over, and later returns control: the runtime's setpoints pass again.
     rig.mode = LOITER;
     rig.run(4100);
     rig.sent.packets.clear();
@@ -276,9 +276,9 @@ fn a_runtime_that_wakes_up_orders_nothing_more() {
 }
 
 #[test]
-fn a_computer_that_stood_still_is_no_silence() {
+fn does_not_land_after_the_computer_stalled() {
     let mut rig = Rig::flying();
-    // Nobody was run for 3 s; the guardian happens to be the first.
+    // No process was scheduled for 3 s, and the guardian runs first.
     rig.ms += 3000;
     rig.watch.handle_timeout(at(rig.ms), &mut rig.sent);
     rig.ms += 10;
@@ -288,7 +288,7 @@ fn a_computer_that_stood_still_is_no_silence() {
 }
 
 #[test]
-fn stale_poses_are_not_sent() {
+fn does_not_send_stale_or_invalid_poses() {
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;
     rig.run(2300);
@@ -300,7 +300,7 @@ fn stale_poses_are_not_sent() {
 }
 
 #[test]
-fn with_a_key_ours_is_signed_and_an_unsigned_heartbeat_is_nobodys() {
+fn signs_packets_and_ignores_unsigned_heartbeats() {
     let key = SigningKey::new([7; 32]);
     let start = SigningTime::from_units(1_000_000_000);
     let signing = LinkSigning { key: key.clone(), start, accepts_unsigned: false };
@@ -315,7 +315,7 @@ fn with_a_key_ours_is_signed_and_an_unsigned_heartbeat_is_nobodys() {
     };
     beat(&mut rig);
     rig.run(900);
-    // Somebody says, unsigned, that it stands on the ground.
+    // An unsigned heartbeat reports that the vehicle is disarmed.
     rig.armed = false;
     rig.speaks_until = 900;
     rig.run(2000);
@@ -326,17 +326,17 @@ fn with_a_key_ours_is_signed_and_an_unsigned_heartbeat_is_nobodys() {
         .filter(|(_, bytes)| Head::of(bytes).unwrap().source.1 == COMPONENT_ID)
         .collect();
     let mut verifier = Verifier::new(key);
-    assert!(!lands.is_empty(), "it is landed all the same");
+    assert!(!lands.is_empty(), "LAND despite the unsigned heartbeat");
     for (ms, bytes) in lands {
         verifier.check(start.plus_us(ms * 1000), bytes).unwrap();
     }
 }
 
 proptest! {
-    /// Whatever comes, and in whichever order, LAND is ordered within half a second of the runtime's last packet
-    /// while the vehicle follows it, and never while it speaks.
+    /// For any packets in any order: LAND is ordered within 0.5 s of the runtime's last packet while the vehicle
+    /// follows it, and never while the runtime sends.
     #[test]
-    fn land_comes_when_it_is_silent_and_then_alone(
+    fn orders_land_only_when_the_runtime_is_silent(
         gaps in prop::collection::vec(1..480_u64, 20..80),
         noise in prop::collection::vec(any::<u8>(), 0..400),
     ) {

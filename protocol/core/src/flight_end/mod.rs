@@ -1,20 +1,18 @@
-//! How a flight ended, and why: one enumeration of reasons, one function from what happened to the
-//! outcome, one table of sentences. Runtime, referee, server, page, crash card, grade and leaderboard
-//! all ask it, so that one flight has one end.
+//! End of a flight: one enumeration of reasons, one function from events to the outcome, one table of sentences.
+//! Runtime, referee, server, page, crash card, grade and leaderboard all use it, so that they report the same end.
 //!
 //! ```text
 //! events of the flight, in any order --> FlightEnd --> the first reason --> outcome, title, sentence
 //! ```
-//! The rules, as `docs/guides/course.md` has them:
-//! - the earliest reason by its stamp decides, whoever gives it; what comes later, a touch after LAND
-//!   was ordered among it, changes nothing;
-//! - what follows from poses alone (finish, collision, geofence, time limit, lost pose) counts from the take-off
-//!   on ([`EndReason::needs_take_off`]); people, plugin and autopilot end a flight on the ground as well;
-//! - a pose that comes back within the arena's `land_after_s` ends nothing; neither does a warning near
-//!   the fence.
+//! Rules, as in `docs/guides/course.md`:
+//! - The earliest reason by its stamp decides, from any sender. Later events change nothing, for example a collision
+//!   after LAND was ordered.
+//! - Reasons that need only poses (finish, collision, geofence, time limit, lost pose) count only after take-off
+//!   ([`EndReason::needs_take_off`]). Persons, plugin and autopilot can end a flight on the ground, too.
+//! - A pose that returns within the arena's `land_after_s` does not end the flight; nor does a warning near the fence.
 //!
-//! The order in which events arrive does not matter: an outage that delays one side's events does
-//! not change what that side reports in the end.
+//! The order in which events arrive does not matter: an outage that delays one side's events does not change that
+//! side's final result.
 
 mod reason;
 mod sentence;
@@ -26,7 +24,7 @@ pub use reason::{Boundary, Collision, EndReason, FenceBreach, Missing, Obstacle,
 use crate::messages::{Event, EventKind, FlightPhase};
 use crate::time::{Clock, Server, Stamp};
 
-/// The end of one flight by what has happened in it so far, on the clock `C`.
+/// End of one flight, from the events received up to now, on the clock `C`.
 ///
 /// ```
 /// use vizflyt_protocol::flight_end::{EndReason, FlightEnd};
@@ -37,21 +35,21 @@ use crate::time::{Clock, Server, Stamp};
 /// let mut end = FlightEnd::default();
 /// end.handle(at(1.0), &EventKind::Phase(FlightPhase::TakingOff));
 /// end.handle(at(9.5), &EventKind::TimeLimit { limit_s: 8.5 });
-/// // Pressed before the time was over, and received later.
+/// // The land button was pressed before the time was over, but received later.
 /// end.handle(at(9.0), &EventKind::Land);
 /// assert_eq!(end.decided(), Some((at(9.0), &EndReason::LandButton)));
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlightEnd<C: Clock = Server> {
     took_off: Option<Stamp<C>>,
-    /// The first reason that needs a take-off.
+    /// Earliest reason that requires a take-off.
     in_flight: Option<(Stamp<C>, EndReason)>,
-    /// The first of the others.
+    /// Earliest other reason.
     anywhere: Option<(Stamp<C>, EndReason)>,
 }
 
 impl<C: Clock> Default for FlightEnd<C> {
-    /// Nothing has happened yet.
+    /// Returns the state without any event.
     fn default() -> Self {
         Self { took_off: None, in_flight: None, anywhere: None }
     }
@@ -67,7 +65,7 @@ impl FlightEnd {
 }
 
 impl<C: Clock> FlightEnd<C> {
-    /// Takes what happened at a moment.
+    /// Processes one event.
     pub fn handle(&mut self, at: Stamp<C>, kind: &EventKind) {
         if *kind == EventKind::Phase(FlightPhase::TakingOff) {
             self.took_off = Some(at);
@@ -82,7 +80,7 @@ impl<C: Clock> FlightEnd<C> {
         }
     }
 
-    /// Returns when the flight was decided, and why; `None` while it is not.
+    /// Returns the time and reason of the end; `None` while the flight continues.
     pub fn decided(&self) -> Option<(Stamp<C>, &EndReason)> {
         let flies = |at: Stamp<C>| self.took_off.is_some_and(|took_off| at >= took_off);
         let in_flight = self.in_flight.as_ref().filter(|(at, _)| flies(*at));
@@ -90,7 +88,7 @@ impl<C: Clock> FlightEnd<C> {
         both.min_by_key(|(at, _)| *at).map(|(at, reason)| (*at, reason))
     }
 
-    /// Returns why the flight ended; `None` while it goes on.
+    /// Returns the reason of the end; `None` while the flight continues.
     pub fn reason(&self) -> Option<&EndReason> {
         self.decided().map(|(_, reason)| reason)
     }

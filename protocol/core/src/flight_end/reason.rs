@@ -1,29 +1,29 @@
-//! What can end a flight, as data; the sentences for people are in [`super::sentence`].
+//! Reasons that end a flight, as data. Their sentences are in [`super::sentence`].
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::messages::{InvalidSetpoint, Name, OutcomeKind, Text, bounded};
 
-/// Why a flight ended. New reasons go at the end; a change raises the protocol version.
+/// Reason for the end of a flight. Add new reasons at the end. A change raises the protocol version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EndReason {
-    /// The course was flown to its end.
+    /// The course was completed.
     Finished {
-        /// Since take-off. [s]
+        /// Time since take-off. [s]
         seconds: f64,
     },
-    /// The body touched something.
+    /// The vehicle's body touched an obstacle.
     Collision(Collision),
-    /// The vehicle left the space that it may be in, or could not have stopped inside.
+    /// The vehicle left the permitted space, or could not have stopped inside it.
     Geofence(FenceBreach),
-    /// The course's time is over.
+    /// The course's time limit was reached.
     TimeLimit {
-        /// What the course allows from take-off. [s]
+        /// Time limit of the course, from take-off. [s]
         limit_s: f64,
     },
-    /// No pose came for longer than the arena's `land_after_s`.
+    /// No pose arrived for longer than the arena's `land_after_s`.
     PoseLost {
         /// Age of the newest pose. [s]
         age_s: f64,
@@ -32,38 +32,38 @@ pub enum EndReason {
     StopButton,
     /// A person pressed the land button.
     LandButton,
-    /// A person or the parent process ended the runtime.
+    /// A person or the parent process stopped the runtime.
     Interrupted,
-    /// The time that a person asked for is over.
+    /// The flight time set by the user is over.
     TimeAsked {
-        /// What was asked for. [s]
+        /// Flight time set by the user. [s]
         seconds: f64,
     },
-    /// The plugin asked to land.
+    /// The plugin returned a setpoint to land.
     PluginLanded,
     /// The plugin failed.
     Plugin(PluginFault),
-    /// The plugin had no image to answer.
+    /// The plugin received no image.
     NoImage,
-    /// The vehicle was not in the air in time.
+    /// The vehicle did not take off in time.
     NotReady {
-        /// How long it could take. [s]
+        /// Time limit for the take-off. [s]
         within_s: f64,
-        /// What it waited for.
+        /// Missing condition for take-off.
         missing: Missing,
     },
-    /// The take-off did not reach its height.
+    /// The take-off did not reach its target height.
     ClimbFailed {
         /// Height gained. [m]
         risen_m: f64,
-        /// In so long. [s]
+        /// Time since the take-off began. [s]
         within_s: f64,
     },
-    /// The autopilot refused a command; which, and its own words.
+    /// The autopilot refused a command; the text names the command and the autopilot's reason.
     AutopilotRefused(Text),
     /// The autopilot fell silent in flight.
     AutopilotSilent {
-        /// For so long. [s]
+        /// Time without a packet from the autopilot. [s]
         silent_s: f64,
     },
     /// The autopilot restarted in flight.
@@ -75,151 +75,151 @@ pub enum EndReason {
         /// `ArduCopter`'s mode number.
         mode: u32,
     },
-    /// A former runtime left the vehicle in the air.
+    /// An earlier runtime left the vehicle in the air.
     LeftInAir,
-    /// The server, or what stands between it and the plugin, refused; its own words.
+    /// The server, or a connection between server and plugin, refused; with its message.
     ServerRefused(Text),
-    /// The arena cannot be flown in; which value, and why.
+    /// The arena is invalid for a flight; the text names the value and the reason.
     ArenaRefused(Text),
-    /// The server came back with another arena.
+    /// The server reconnected with another arena.
     ArenaChanged {
-        /// Its name.
+        /// Name of the new arena.
         name: Name,
     },
-    /// Nothing is known but that the vehicle never took off.
+    /// The vehicle never took off, for an unknown reason.
     NeverTookOff,
-    /// The record stops before the flight does.
+    /// The record ends before the flight.
     RecordEnds,
-    /// What the plugin saw was too old for too long.
+    /// The plugin's images were too old for too long.
     ImagesOld {
-        /// Age of what it answered last. [s]
+        /// Age of the image that it answered last. [s]
         age_s: f64,
     },
-    /// The pose may have been off by more than the guard keeps from the fence, for longer than the arena's
+    /// The possible error of the pose exceeded the guard's distance from the fence for longer than the arena's
     /// `land_after_s`.
     PoseUnsure {
-        /// How far it may have been off: three standard deviations along the worst axis. [m]
+        /// Possible error of the pose: three standard deviations along the worst axis. [m]
         off_m: f64,
     },
 }
 
-/// A contact of the vehicle's body.
+/// Contact of the vehicle's body with an obstacle.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Collision {
-    /// Where the body's centre was. [m, world]
+    /// Position of the body's centre. [m, world]
     pub p_world_m: DVec3,
-    /// Distance from the body's surface to the obstacle; negative is penetration. [m]
+    /// Distance from the body's surface to the obstacle; negative for penetration. [m]
     pub clearance_m: f64,
-    /// What it touched.
+    /// Touched obstacle.
     pub with: Obstacle,
-    /// How fast it was. [m/s]
+    /// Speed at the contact. [m/s]
     pub speed_mps: f64,
 }
 
-/// What a body can touch.
+/// Kind of obstacle.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Obstacle {
-    /// The scene.
+    /// The static scene.
     Scene,
-    /// The floor, too fast for a landing.
+    /// The floor, at a speed too high for a landing.
     Floor,
-    /// An object that moves, by its name in `arena.toml`.
+    /// A moving object, by its name in `arena.toml`.
     Object(Name),
     /// Another vehicle, by its name.
     Vehicle(Name),
-    /// Space that no ray of the scene's capture has passed, which its arena takes for solid.
+    /// Space through which no ray of the capture passed, in an arena that treats it as solid.
     Unseen,
 }
 
-/// A boundary left, or one before which the vehicle can no longer stop.
+/// Boundary that was left, or before which the vehicle can no longer stop.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FenceBreach {
-    /// Where the body's centre was. [m, world]
+    /// Position of the body's centre. [m, world]
     pub p_world_m: DVec3,
-    /// From the body's surface to the boundary; negative is beyond. [m]
+    /// Distance from the body's surface to the boundary; negative beyond it. [m]
     pub margin_m: f64,
-    /// Which boundary.
+    /// Boundary that was crossed or cannot be kept.
     pub boundary: Boundary,
-    /// How fast it was. [m/s]
+    /// Speed at that time. [m/s]
     pub speed_mps: f64,
-    /// How far beyond the boundary it would come to rest. [m]
+    /// Distance beyond the boundary at which the vehicle would stop. [m]
     pub overshoot_m: f64,
 }
 
-/// What bounds the space that a vehicle may be in.
+/// Boundary of the permitted space.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Boundary {
     /// The geofence.
     Geofence,
-    /// The greatest height.
+    /// The maximum altitude.
     Ceiling,
-    /// A no-fly box, by its name in `arena.toml`; empty where that is not known.
+    /// A no-fly box, by its name in `arena.toml`; empty if the name is unknown.
     NoFly(Name),
 }
 
-/// How a plugin failed.
+/// Reason why a plugin failed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PluginFault {
-    /// It ended or gave up: in its own words, or those of its supervisor.
+    /// The plugin ended or gave up; with its own message or that of its supervisor.
     Ended(Text),
-    /// It was started again and did not come back.
+    /// The plugin was restarted and did not become ready.
     NotBack {
-        /// How long it was waited for. [s]
+        /// Timeout for the restart. [s]
         within_s: f64,
-        /// Why it was started again.
+        /// Reason for the restart.
         why: Text,
     },
-    /// It does not answer.
+    /// The plugin does not answer images.
     NoAnswer {
-        /// The oldest image without an answer.
+        /// Oldest image without an answer.
         image: u64,
-        /// For so long. [s]
+        /// Time without an answer. [s]
         silent_s: f64,
     },
-    /// It answers images, but without a setpoint.
+    /// The plugin answers images without a setpoint.
     NoSetpoint,
-    /// The guard refuses all of its setpoints.
+    /// The guard rejects all of its setpoints.
     Refused(InvalidSetpoint),
 }
 
 impl PluginFault {
-    /// Makes the fault of a plugin that ended or gave up, by a sentence that describes it.
+    /// Returns the fault of a plugin that ended or gave up, described by `sentence`.
     pub fn ended(sentence: &str) -> Self {
         Self::Ended(bounded(sentence))
     }
 }
 
-/// What a flight waits for before its take-off.
+/// Missing condition for a take-off.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Missing {
-    /// The server's answer.
+    /// Reply of the server.
     Server,
-    /// The plugin's `on_start`.
+    /// Return of the plugin's `on_start`.
     Plugin,
-    /// The autopilot's heartbeat.
+    /// Heartbeat of the autopilot.
     Heartbeat,
-    /// The vehicle to be disarmed first.
+    /// Disarmed vehicle before the start.
     Disarmed,
-    /// A pose of the vehicle.
+    /// Pose of the vehicle.
     Pose,
-    /// The plugin's first answer.
+    /// First answer of the plugin.
     Answer,
-    /// The autopilot's pre-arm checks; in words.
+    /// Pre-arm checks of the autopilot; with the failed check.
     PreArm(Text),
-    /// A connection to the server, which failed; the last failure in words.
+    /// Connection to the server; with the last error.
     Connection(Text),
-    /// Images often and fresh enough; in words.
+    /// Sufficiently frequent and fresh images; with the details.
     Images(Text),
-    /// The vehicle to stand still in the start box; in words.
+    /// Vehicle at rest in the start box; with the details.
     Start(Text),
 }
 
 impl EndReason {
-    /// Returns the outcome of a flight that ends for this reason.
+    /// Returns the outcome of a flight with this reason.
     pub fn outcome(&self) -> OutcomeKind {
         match self {
             Self::Finished { .. } => OutcomeKind::Finished,
@@ -236,7 +236,7 @@ impl EndReason {
         }
     }
 
-    /// Whether the end is worth a crash card: every one but a finish and a landing in order.
+    /// Whether the end gets a crash card: every end except a finish and a regular landing.
     pub fn is_failure(&self) -> bool {
         match self.outcome() {
             OutcomeKind::Finished => false,
@@ -262,8 +262,8 @@ impl EndReason {
         )
     }
 
-    /// Whether it can only end a flight that has taken off: the poses of a vehicle that someone
-    /// carries does not count.
+    /// Whether the reason can only end a flight that has taken off: poses of a vehicle that a person carries do not
+    /// count.
     pub fn needs_take_off(&self) -> bool {
         matches!(
             self,

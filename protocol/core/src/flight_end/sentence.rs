@@ -1,4 +1,4 @@
-//! The one table of titles and sentences for people.
+//! Titles and sentences for each reason. This is the only table of them.
 
 use core::fmt;
 
@@ -6,7 +6,7 @@ use super::{Boundary, Collision, EndReason, FenceBreach, Missing, Obstacle, Plug
 use crate::copter_mode::CopterMode;
 
 impl EndReason {
-    /// Returns a few words, as a headline.
+    /// Returns a short title for a headline.
     pub fn title(&self) -> &'static str {
         match self {
             Self::Finished { .. } => "Finished",
@@ -42,7 +42,7 @@ impl fmt::Display for EndReason {
                 write!(f, "not in the air after {within_s:.0} s: {missing}")
             }
             Self::ClimbFailed { risen_m, within_s } => {
-                write!(f, "take-off rose {risen_m:.2} m in {within_s} s, not the height asked")
+                write!(f, "take-off rose {risen_m:.2} m in {within_s} s, less than the target height")
             }
             Self::AutopilotRefused(words)
             | Self::ServerRefused(words)
@@ -61,15 +61,15 @@ impl fmt::Display for EndReason {
                 }
             },
             Self::LeftInAir => f.write_str(
-                "the vehicle is armed and in GUIDED with nobody to guide it, as a former runtime left it",
+                "the vehicle is armed and in GUIDED without a companion; an earlier runtime left it in the air",
             ),
             Self::ArenaChanged { name } => {
                 write!(f, "the server came back with another arena, {name}")
             }
             Self::NeverTookOff => f.write_str("the vehicle never took off"),
-            Self::RecordEnds => f.write_str("not over when its record ends"),
+            Self::RecordEnds => f.write_str("the record ends before the flight"),
             Self::PoseUnsure { off_m } => write!(f, "the pose could be off by {off_m:.2} m"),
-            Self::ImagesOld { age_s } => write!(f, "what the plugin saw was {age_s:.1} s old"),
+            Self::ImagesOld { age_s } => write!(f, "the plugin's images were {age_s:.1} s old"),
         }
     }
 }

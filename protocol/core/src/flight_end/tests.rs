@@ -1,4 +1,4 @@
-//! The rules, each by a flight that it is made for; the order of hearing; the table of the guide.
+//! Tests of each rule with its own flight, of the order of arrival, and of the table in the guide.
 
 extern crate std;
 
@@ -30,7 +30,7 @@ fn breach(margin_m: f64, boundary: Boundary) -> FenceBreach {
     FenceBreach { p_world_m: DVec3::ONE, margin_m, boundary, speed_mps: 3.0, overshoot_m: 0.25 }
 }
 
-/// One of each reason.
+/// Returns one of each reason.
 fn each() -> Vec<EndReason> {
     use EndReason::*;
     vec![
@@ -64,7 +64,7 @@ fn each() -> Vec<EndReason> {
     ]
 }
 
-/// Returns the end of a flight that takes off after a second and then has `events`, in that order.
+/// Returns the end of a flight that takes off after one second and then has `events`, in that order.
 fn end_of(events: &[(f64, EventKind)]) -> FlightEnd {
     let mut end = FlightEnd::default();
     end.handle(at(1.0), &EventKind::Phase(FlightPhase::TakingOff));
@@ -87,7 +87,7 @@ fn the_earliest_reason_decides() {
     check(&[], None);
     check(&[(5.0, Phase(FlightPhase::Landing))], None);
     check(&[(5.0, hit()), (5.1, Ended(EndReason::PluginLanded))], Some(OutcomeKind::Collided));
-    // A touch on the way down, whoever ordered LAND.
+    // Contact during the descent, for each sender of the order to land.
     for order in [Land, EventKind::EmergencyStop, Ended(EndReason::PluginLanded)] {
         check(&[(5.0, order), (7.0, hit())], Some(OutcomeKind::Landed));
     }
@@ -100,13 +100,13 @@ fn the_earliest_reason_decides() {
 }
 
 #[test]
-fn before_the_take_off_only_people_plugin_and_autopilot_end_a_flight() {
+fn poses_end_a_flight_only_after_take_off() {
     for reason in each() {
         let mut end = FlightEnd::default();
         end.handle(at(0.5), &EventKind::Ended(reason.clone()));
         let counts = !reason.needs_take_off();
         assert_eq!(end.reason().is_some(), counts, "{reason:?}");
-        // Neither does a later take-off make it count.
+        // A later take-off does not make it count either.
         end.handle(at(1.0), &EventKind::Phase(FlightPhase::TakingOff));
         assert_eq!(end.reason().is_some(), counts, "{reason:?}");
         end.handle(at(2.0), &EventKind::TimeLimit { limit_s: 1.0 });
@@ -115,7 +115,7 @@ fn before_the_take_off_only_people_plugin_and_autopilot_end_a_flight() {
 }
 
 #[test]
-fn take_off_that_arrives_late_counts() {
+fn accepts_a_take_off_event_that_arrives_late() {
     let mut end = FlightEnd::default();
     end.handle(at(5.0), &EventKind::Collision(collision()));
     assert_eq!(end.decided(), None);
@@ -124,7 +124,7 @@ fn take_off_that_arrives_late_counts() {
 }
 
 #[test]
-fn a_reason_has_one_sentence() {
+fn each_reason_has_its_own_sentence() {
     let check = |reason: EndReason, expected: &str| assert_eq!(reason.to_string(), expected);
     let hit = |with| EndReason::Collision(Collision { with, ..collision() });
     let place = "at (1.00, 2.00, 0.50) m, at 2.0 m/s";
@@ -167,7 +167,7 @@ fn a_reason_has_one_sentence() {
 }
 
 #[test]
-fn event_text_is_cut_to_its_maximum() {
+fn truncates_event_text_to_the_maximum() {
     let event = Event::ending(at(1.0), EventKind::Collision(collision()));
     assert!(event.text.starts_with("collision with an obstacle at"), "{}", event.text);
     let why = PluginFault::NotBack { within_s: 10.0, why: bounded(&"ä".repeat(96)) };
@@ -176,7 +176,7 @@ fn event_text_is_cut_to_its_maximum() {
 }
 
 #[test]
-fn the_guide_has_every_rule() {
+fn the_guide_lists_every_reason() {
     const GUIDE: &str = include_str!("../../../../docs/guides/course.md");
     for reason in each() {
         let json = serde_json::to_value(&reason).unwrap();
@@ -197,13 +197,13 @@ fn the_guide_has_every_rule() {
 }
 
 #[test]
-fn reasons_arrive_as_they_were_sent() {
+fn reasons_survive_serialization() {
     for reason in each() {
         let kind = EventKind::Ended(reason);
         let mut buffer = [0; 512];
         let bytes = postcard::to_slice(&kind, &mut buffer).unwrap();
         assert_eq!(postcard::from_bytes::<EventKind>(bytes), Ok(kind.clone()));
-        // Cut anywhere, it is an error and nothing else.
+        // Cut at any length, it is an error.
         for len in 0..bytes.len() {
             assert!(postcard::from_bytes::<EventKind>(&bytes[..len]).is_err());
         }
@@ -223,7 +223,7 @@ proptest! {
                 2 => EventKind::Note,
                 kind => EventKind::Ended(each()[kind - 3].clone()),
             };
-            // After the take-off: on the ground the referee reports nothing that counts.
+            // After take-off: on the ground the referee reports nothing relevant.
             let stamp = |(k, event)| (2.0 + k as f64, event);
             let events: Vec<_> = kinds.into_iter().map(kind).enumerate().map(stamp).collect();
             (Just(events.clone()), Just(events).prop_shuffle())

@@ -1,56 +1,55 @@
-//! Lens distortion: from the slope of a ray to where the lens puts it.
+//! Lens distortion: map from the slope of a ray to its distorted slope.
 //!
-//! Slopes are `(x / z, y / z)` in `cam`, without a unit. A model maps the slope of a ray to the
-//! distorted slope, which focal lengths and principal point turn into pixels. Both models are the
-//! ones of OpenCV, so that its calibrations apply as they are.
+//! Slopes are `(x / z, y / z)` in `cam`, without a unit. A model maps the slope of a ray to the distorted slope. Focal
+//! lengths and principal point convert it to pixels. Both models are those of OpenCV, so that its calibrations can be
+//! used directly.
 
 use glam::{DMat2, DVec2};
 use serde::{Deserialize, Serialize};
 
-/// How a lens departs from the pinhole.
+/// Distortion model of a lens, relative to a pinhole.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub enum Distortion {
-    /// It does not.
+    /// No distortion: a pinhole.
     #[default]
     None,
-    /// Radial and tangential, as most lenses up to some 110 degrees are calibrated (Brown 1966,
-    /// "Decentering distortion of lenses"; OpenCV `calibrateCamera`). With `r = |s|`:
+    /// Radial and tangential distortion, for most lenses up to about 110 degrees (Brown 1966, "Decentering distortion
+    /// of lenses"; OpenCV `calibrateCamera`). With `r = |s|`:
     /// `s (1 + k1 r^2 + k2 r^4 + k3 r^6) + (2 p1 x y + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 x y)`.
     BrownConrady {
-        /// Radial, r^2.
+        /// Radial coefficient of r^2.
         k1: f64,
-        /// Radial, r^4.
+        /// Radial coefficient of r^4.
         k2: f64,
-        /// Tangential, along y.
+        /// Tangential coefficient along y.
         p1: f64,
-        /// Tangential, along x.
+        /// Tangential coefficient along x.
         p2: f64,
-        /// Radial, r^6.
+        /// Radial coefficient of r^6.
         k3: f64,
     },
     /// Fisheye (Kannala and Brandt 2006, "A generic camera model", equation 6; OpenCV
     /// `fisheye::calibrate`). With `t = atan r`: `s / r (t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9)`.
     KannalaBrandt {
-        /// t^3.
+        /// Coefficient of t^3.
         k1: f64,
-        /// t^5.
+        /// Coefficient of t^5.
         k2: f64,
-        /// t^7.
+        /// Coefficient of t^7.
         k3: f64,
-        /// t^9.
+        /// Coefficient of t^9.
         k4: f64,
     },
 }
 
 impl Distortion {
-    /// Returns the distorted slope, and how it changes with the slope: the Jacobian, column by
-    /// column.
+    /// Returns the distorted slope and its Jacobian with respect to the slope, column by column.
     ///
     /// ```
     /// use glam::DVec2;
     /// use vizflyt_protocol::geometry::Distortion;
     /// let lens = Distortion::BrownConrady { k1: 0.1, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 };
-    /// // r^2 = 0.25: everything moves out by 2.5 %.
+    /// // r^2 = 0.25: all slopes grow by 2.5 %.
     /// let (distorted, _) = lens.distort(DVec2::new(0.3, 0.4));
     /// assert!((distorted - DVec2::new(0.3075, 0.41)).length() < 1e-12);
     /// ```
@@ -86,7 +85,7 @@ impl Distortion {
                 let bend =
                     1.0 + tt * (3.0 * k1 + tt * (5.0 * k2 + tt * (7.0 * k3 + tt * 9.0 * k4)));
                 let scale = bent / r;
-                // Along the radius the slope grows by `along`, across it by `scale`.
+                // Along the radius, the slope grows by `along`; across it, by `scale`.
                 let along = bend / (1.0 + r * r);
                 let u = slope / r;
                 let d = along - scale;
@@ -99,15 +98,14 @@ impl Distortion {
         }
     }
 
-    /// Returns the slope whose distortion this is; `None` where the lens has none, beyond its
-    /// [`Self::reach`].
+    /// Returns the slope with this distorted slope; `None` if there is none within [`Self::reach`].
     pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
         if *self == Self::None {
             return Some(distorted);
         }
         let reach = self.reach();
-        // On the radius alone the map only grows: halve the interval that holds the answer, in
-        // angles, so that the far end is finite. Tangential terms are small: Newton takes them.
+        // The radial map is monotonic: bisect the interval that contains the solution, in angles, so that its far end
+        // is finite. Newton's method then handles the small tangential terms.
         let wanted = distorted.length();
         if wanted < NEAR_AXIS {
             return Some(distorted);
@@ -138,8 +136,8 @@ impl Distortion {
         (exact && slope.length() <= reach * (1.0 + 1e-9)).then_some(slope)
     }
 
-    /// Returns the greatest length of a slope that the lens images: beyond it the map would turn
-    /// back in some direction and show the same place twice. Infinite for a pinhole.
+    /// Returns the maximum length of a slope that the lens images; infinite for a pinhole. Beyond it, the map would
+    /// fold back in some direction and show the same place twice.
     ///
     /// ```
     /// use vizflyt_protocol::geometry::Distortion;
@@ -149,8 +147,7 @@ impl Distortion {
     /// ```
     pub fn reach(&self) -> f64 {
         let Some(growth) = self.growth() else { return f64::INFINITY };
-        // Its first root: by steps that are fine near the axis, where lenses have theirs, then by
-        // halving.
+        // First root of the growth: steps that are fine near the axis, where lenses have their roots, then bisection.
         let Some(past) = (1..=REACH_STEPS).find(|&i| !growth.is_positive(growth.place(i))) else {
             return libm::tan(MAX_ANGLE_RAD);
         };
@@ -167,8 +164,7 @@ impl Distortion {
         if growth.is_angle { libm::tan(root) } else { root }
     }
 
-    /// Returns whether the lens images a slope of this length: whether that is at most its
-    /// [`Self::reach`], in less time.
+    /// Whether the lens images a slope of this length: `length <= self.reach()`, but faster.
     pub fn reaches(&self, length: f64) -> bool {
         let Some(growth) = self.growth() else { return !length.is_nan() };
         let r = if growth.is_angle { libm::atan(length) } else { length };
@@ -179,14 +175,14 @@ impl Distortion {
             || length <= self.reach()
     }
 
-    /// `None` for a pinhole.
+    /// Returns the growth along the radius; `None` for a pinhole.
     fn growth(&self) -> Option<Growth> {
         let farthest = libm::tan(MAX_ANGLE_RAD);
         Some(match *self {
             Self::None => return None,
             Self::BrownConrady { k1, k2, p1, p2, k3 } => Growth {
                 factors: [3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0],
-                // The tangential part adds 3 r^2 |p| along the radius, or takes it away opposite.
+                // The tangential part adds 3 r^2 |p| along the radius on one side, and subtracts it on the other.
                 tilt: 6.0 * libm::hypot(p1, p2),
                 is_angle: false,
                 end: farthest,
@@ -200,8 +196,8 @@ impl Distortion {
         })
     }
 
-    /// Returns the coefficients in the order of OpenCV (`k1 k2 p1 p2 k3` or `k1 k2 k3 k4`), the
-    /// rest zero, and the number of the model: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
+    /// Returns the number of the model (0 none, 1 Brown-Conrady, 2 Kannala-Brandt) and the coefficients in OpenCV's
+    /// order (`k1 k2 p1 p2 k3` or `k1 k2 k3 k4`), padded with zeros.
     pub fn to_wire(&self) -> (u8, [f64; 5]) {
         match *self {
             Self::None => (0, [0.0; 5]),
@@ -210,7 +206,7 @@ impl Distortion {
         }
     }
 
-    /// Is the way back; `None` for a model of no number known here.
+    /// Inverse of [`Self::to_wire`]; `None` for an unknown model number.
     pub fn from_wire(model: u8, [a, b, c, d, e]: [f64; 5]) -> Option<Self> {
         Some(match model {
             0 => Self::None,
@@ -220,12 +216,12 @@ impl Distortion {
         })
     }
 
-    /// Whether every coefficient is finite and of a size that lenses have.
+    /// Whether all coefficients are finite and within the range of real lenses.
     pub(crate) fn is_valid(&self) -> bool {
         self.to_wire().1.iter().all(|k| k.abs() <= MAX_COEFFICIENT)
     }
 
-    /// Returns the distorted radius of a slope of this length; radial part alone.
+    /// Returns the distorted radius of a slope of this length, from the radial part only.
     fn radius(&self, r: f64) -> f64 {
         self.radial_only().distort(DVec2::new(r, 0.0)).0.x
     }
@@ -240,13 +236,13 @@ impl Distortion {
     }
 }
 
-/// The derivative of a lens's map along the radius, a polynomial in u: r^2, or t^2.
+/// Derivative of a lens's map along the radius, as a polynomial in u: r^2 or t^2.
 struct Growth {
     factors: [f64; 4],
     tilt: f64,
-    /// Whether u is of the angle t.
+    /// Whether u is the squared angle t^2.
     is_angle: bool,
-    /// The greatest r, or t, that is looked at.
+    /// Maximum r or t that is examined.
     end: f64,
 }
 
@@ -256,21 +252,21 @@ impl Growth {
         1.0 + radial - self.tilt * libm::sqrt(u) > 0.0
     }
 
-    /// Returns the u of a step.
+    /// Returns the value of u at a step.
     fn place(&self, step: u32) -> f64 {
         let share = f64::from(step) / f64::from(REACH_STEPS);
         self.end * self.end * share * share * share
     }
 }
 
-/// Slopes below this are distorted by less than f64 resolves.
+/// Slopes below this are distorted by less than the resolution of f64.
 const NEAR_AXIS: f64 = 1e-8;
-/// Rays further from the axis are not rendered: at 89 degrees a slope is 57, and depth along z loses
-/// its meaning. [rad]
+/// Maximum angle of a ray from the axis that is rendered. At 89 degrees the slope is 57, and depth along z is no longer
+/// meaningful. [rad]
 const MAX_ANGLE_RAD: f64 = 89.0 * core::f64::consts::PI / 180.0;
-/// Polynomials of degree four turn three times at most.
+/// Number of steps of the root search. Polynomials of degree four have at most three turning points.
 const REACH_STEPS: u32 = 256;
-/// Calibrations beyond this are slips of the pen.
+/// Maximum coefficient. Larger values are typing errors.
 const MAX_COEFFICIENT: f64 = 1e3;
 
 #[cfg(test)]
@@ -300,7 +296,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn undistort_is_the_way_back(lens in lenses(), angle in 0.0..core::f64::consts::TAU, share in 0.0..0.9f64) {
+        fn undistort_inverts_distort(lens in lenses(), angle in 0.0..core::f64::consts::TAU, share in 0.0..0.9f64) {
             let r = libm::tan(libm::atan(lens.reach().min(3.0)) * share);
             let slope = DVec2::from_angle(angle) * r;
             let back = lens.undistort(lens.distort(slope).0);
@@ -311,7 +307,7 @@ mod tests {
         }
 
         #[test]
-        fn the_jacobian_is_the_slope_of_the_map(
+        fn jacobian_matches_finite_differences(
             lens in lenses(), x in -0.8..0.8f64, y in -0.8..0.8f64,
         ) {
             let at = DVec2::new(x, y);
@@ -325,7 +321,7 @@ mod tests {
         }
 
         #[test]
-        fn what_it_reaches_is_within_its_reach(lens in lenses(), share in 0.0..2.0f64, r in 0.0..70.0f64) {
+        fn reaches_agrees_with_reach(lens in lenses(), share in 0.0..2.0f64, r in 0.0..70.0f64) {
             for length in [share * lens.reach().min(100.0), r] {
                 prop_assert_eq!(lens.reaches(length), length <= lens.reach(), "{}", length);
             }
@@ -333,25 +329,25 @@ mod tests {
         }
 
         #[test]
-        fn the_wire_keeps_a_lens(lens in lenses()) {
+        fn survives_the_wire_format(lens in lenses()) {
             let (model, numbers) = lens.to_wire();
             prop_assert_eq!(Distortion::from_wire(model, numbers), Some(lens));
         }
     }
 
     #[test]
-    fn a_barrel_lens_ends_where_it_turns_back() {
+    fn a_barrel_lens_ends_where_it_folds_back() {
         // r (1 - 0.3 r^2) grows until r^2 = 1 / 0.9.
         let lens = Distortion::BrownConrady { k1: -0.3, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 };
         assert!((lens.reach() - (1.0 / 0.9f64).sqrt()).abs() < 1e-9);
-        // 2/3 of that is the greatest distorted radius.
+        // 2/3 of that is the maximum distorted radius.
         assert_eq!(lens.undistort(DVec2::new(0.71, 0.0)), None);
         assert!(lens.undistort(DVec2::new(0.70, 0.0)).is_some());
     }
 
     #[test]
-    fn a_tangential_lens_shows_nothing_twice() {
-        // Without the limit, slopes around 33 to one side would appear in the image's middle.
+    fn a_tangential_lens_does_not_fold_back() {
+        // Without the limit, slopes around 33 to one side would appear in the middle of the image.
         let lens = Distortion::BrownConrady { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.01, k3: 0.0 };
         assert!((lens.reach() - 1.0 / 0.06).abs() < 1e-6);
         let mut last = f64::NEG_INFINITY;
@@ -363,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn the_equidistant_fisheye_puts_angles_on_the_radius() {
+    fn the_equidistant_fisheye_maps_angles_to_the_radius() {
         let lens = Distortion::KannalaBrandt { k1: 0.0, k2: 0.0, k3: 0.0, k4: 0.0 };
         let angle = 80f64.to_radians();
         let (distorted, _) = lens.distort(DVec2::new(0.0, angle.tan()));
@@ -372,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn poison_is_no_lens() {
+    fn rejects_invalid_lenses() {
         for k1 in [f64::NAN, f64::INFINITY, 1e4] {
             assert!(!Distortion::KannalaBrandt { k1, k2: 0.0, k3: 0.0, k4: 0.0 }.is_valid());
         }

@@ -1,8 +1,8 @@
-//! Coordinate frames as types. `docs/COORDINATES.md` draws them.
+//! Coordinate frames as types. See `docs/COORDINATES.md` for drawings.
 
-/// A right-handed coordinate frame; implemented by empty marker types only.
+/// Right-handed coordinate frame. Implemented only by empty marker types.
 pub trait Frame: Copy + 'static {
-    /// The frame's name as it stands in identifiers and documents.
+    /// Name of the frame in identifiers and documents.
     const NAME: &'static str;
 }
 
@@ -18,18 +18,18 @@ macro_rules! frames {
 }
 
 frames! {
-    /// The room: x east, y north, z up; origin stated in `arena.toml`.
+    /// Room: x east, y north, z up. `arena.toml` defines the origin.
     World = "world";
-    /// The vehicle: x forward, y left, z up.
+    /// Vehicle: x forward, y left, z up.
     Body = "body";
-    /// A camera, OpenCV convention: x right, y down, z forward.
+    /// Camera, OpenCV convention: x right, y down, z forward.
     Cam = "cam";
-    /// A splat scene as trained, before `world_from_scene` is baked in.
+    /// Splat scene as trained, before `world_from_scene` is applied.
     Scene = "scene";
-    /// Where a plugin's own estimate begins: z up, origin and heading as it likes.
+    /// Frame of a plugin's own estimate: z up, arbitrary origin and heading.
     Odom = "odom";
-    /// A sensor that is no camera: x forward, y left, z up.
+    /// Sensor other than a camera: x forward, y left, z up.
     Sensor = "sensor";
-    /// A rigid part of a scene that moves: a door, a clock's hand, another vehicle.
+    /// Moving rigid part of a scene: a door, a clock's hand, another vehicle.
     Object = "object";
 }

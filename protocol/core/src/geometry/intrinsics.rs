@@ -1,5 +1,5 @@
-//! The camera: a pinhole, with a lens before it or not. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel,
-//! pixel centres lie at +0.5.
+//! Camera model: a pinhole with optional lens distortion. Pixels are continuous: (0, 0) is the outer corner of the
+//! top-left pixel, and pixel centres are at +0.5.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -34,16 +34,16 @@ pub struct Intrinsics {
     pub cx_px: f64,
     /// Principal point, y. [px]
     pub cy_px: f64,
-    /// What the lens does to slopes before the focal lengths apply.
+    /// Lens distortion, applied to slopes before the focal lengths.
     pub distortion: Distortion,
 }
 
 impl Intrinsics {
-    /// Largest side of an image; 8K. Bounds every buffer sized from a header. [px]
+    /// Maximum width and height of an image (8K). Bounds every buffer that is sized from a header. [px]
     pub const MAX_SIDE_PX: u32 = 8192;
 
-    /// Returns square-pixel pinhole intrinsics with a centred principal point and the given horizontal
-    /// field of view, measured from the left edge to the right edge. [rad]
+    /// Returns pinhole intrinsics with square pixels, a centred principal point and this horizontal field of view, from
+    /// the left edge to the right edge. [rad]
     pub fn from_horizontal_fov(width_px: u32, height_px: u32, fov_rad: f64) -> Self {
         let f_px = f64::from(width_px) / 2.0 / libm::tan(fov_rad / 2.0);
         Self {
@@ -57,7 +57,7 @@ impl Intrinsics {
         }
     }
 
-    /// Returns the same view in a `by`-th of the width and height, at least one pixel each.
+    /// Returns the same view with width and height divided by `by`, at least one pixel each.
     ///
     /// ```
     /// use vizflyt_protocol::geometry::Intrinsics;
@@ -67,7 +67,7 @@ impl Intrinsics {
     pub fn shrunk(&self, by: u32) -> Self {
         let by = by.max(1);
         let (width_px, height_px) = ((self.width_px / by).max(1), (self.height_px / by).max(1));
-        // Pixels are continuous from the outer corner: everything scales with the size.
+        // Pixels are continuous from the outer corner, so all values scale with the size.
         let across = f64::from(width_px) / f64::from(self.width_px);
         let down = f64::from(height_px) / f64::from(self.height_px);
         Self {
@@ -86,8 +86,8 @@ impl Intrinsics {
         self.width_px as usize * self.height_px as usize
     }
 
-    /// Projects a point [m, cam] to continuous pixel coordinates; `None` unless it is ahead and
-    /// within the lens's reach.
+    /// Projects a point [m, cam] to continuous pixel coordinates; `None` if it is not in front of the camera or outside
+    /// the lens's range.
     pub fn project(&self, p_cam: DVec3) -> Option<DVec2> {
         if !(p_cam.z > 0.0) {
             return None;
@@ -103,20 +103,19 @@ impl Intrinsics {
         Some(focal * slope + DVec2::new(self.cx_px, self.cy_px))
     }
 
-    /// Returns the point [m, cam] seen at a continuous pixel with the given camera-z depth [m];
-    /// `None` where the lens shows nothing.
+    /// Returns the point [m, cam] at a continuous pixel with this camera-z depth [m]; `None` if the lens shows nothing
+    /// there.
     pub fn unproject(&self, pixel: DVec2, depth_m: f64) -> Option<DVec3> {
         Some((self.slope(pixel)? * depth_m).extend(depth_m))
     }
 
-    /// Returns `(x / z, y / z)` in `cam` of the ray through a continuous pixel; `None` where the
-    /// lens shows nothing.
+    /// Returns `(x / z, y / z)` in `cam` of the ray through a continuous pixel; `None` if the lens shows nothing there.
     pub fn slope(&self, pixel: DVec2) -> Option<DVec2> {
         let centre = DVec2::new(self.cx_px, self.cy_px);
         self.distortion.undistort((pixel - centre) / DVec2::new(self.fx_px, self.fy_px))
     }
 
-    /// Checks that every number is one a renderer and a receiver can work with.
+    /// Checks that all numbers are in the range that renderer and receiver support.
     pub fn validate(&self) -> Result<(), InvalidIntrinsics> {
         let side = 1..=Self::MAX_SIDE_PX;
         if !side.contains(&self.width_px) || !side.contains(&self.height_px) {
@@ -137,19 +136,19 @@ impl Intrinsics {
     }
 }
 
-/// Why intrinsics are refused.
+/// Reason for rejecting intrinsics.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum InvalidIntrinsics {
     /// A side is 0 or too large.
     #[error("image size {0}x{1} is outside 1x1 to 8192x8192")]
     Size(u32, u32),
-    /// A focal length is not a sensible positive number.
+    /// A focal length is not positive or out of range.
     #[error("focal length ({0}, {1}) px is outside 0.001 to 1e6; give fx and fy in pixels")]
     Focal(f64, f64),
     /// The principal point is not finite or far outside the image.
     #[error("principal point ({0}, {1}) px is outside -1e6 to 1e6; give cx and cy in pixels")]
     Centre(f64, f64),
-    /// A coefficient is not finite or larger than any lens has.
+    /// A coefficient is not finite, or larger than that of any lens.
     #[error("a distortion coefficient is outside -1000 to 1000; give them as OpenCV prints them")]
     Distortion,
 }
@@ -161,7 +160,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn unproject_then_project_is_the_same_pixel(
+        fn project_inverts_unproject(
             u in -100.0..1000.0f64, v in -100.0..1000.0f64, z in 0.05..100.0f64,
             fov in 0.2..2.8f64, cx in 0.0..640.0f64,
         ) {
@@ -173,14 +172,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_behind_the_camera_projects() {
+    fn does_not_project_points_behind_the_camera() {
         let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
         assert_eq!(k.project(DVec3::new(0.0, 0.0, 0.0)), None);
         assert_eq!(k.project(DVec3::new(0.0, 0.0, f64::NAN)), None);
     }
 
     #[test]
-    fn poison_is_refused() {
+    fn rejects_invalid_intrinsics() {
         let good = Intrinsics::from_horizontal_fov(320, 240, 1.2);
         assert_eq!(good.validate(), Ok(()));
         assert!(Intrinsics { width_px: 0, ..good }.validate().is_err());

@@ -1,44 +1,43 @@
-//! A lens as TOML and JSON files write it.
+//! Lens distortion, as written in TOML and JSON files.
 
 use serde::{Deserialize, Serialize};
 
 use super::Distortion;
 
-/// `distortion`: a lens, with the coefficients as OpenCV prints them; those not given are 0.
+/// `distortion` table of a camera: coefficients as printed by OpenCV. Missing ones are 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum LensConfig {
-    /// Radial and tangential, as most lenses up to some 110 degrees are calibrated (OpenCV
-    /// `calibrateCamera`).
+    /// Radial and tangential distortion, for most lenses up to about 110 degrees (OpenCV `calibrateCamera`).
     BrownConrady {
-        /// Radial, of r^2.
+        /// Radial coefficient of r^2.
         #[serde(default)]
         k1: f64,
-        /// Radial, of r^4.
+        /// Radial coefficient of r^4.
         #[serde(default)]
         k2: f64,
-        /// Tangential, along y.
+        /// Tangential coefficient along y.
         #[serde(default)]
         p1: f64,
-        /// Tangential, along x.
+        /// Tangential coefficient along x.
         #[serde(default)]
         p2: f64,
-        /// Radial, of r^6.
+        /// Radial coefficient of r^6.
         #[serde(default)]
         k3: f64,
     },
-    /// A fisheye (OpenCV `fisheye::calibrate`); of an angle t off the axis.
+    /// Fisheye (OpenCV `fisheye::calibrate`), with the angle t from the axis.
     KannalaBrandt {
-        /// Of t^3.
+        /// Coefficient of t^3.
         #[serde(default)]
         k1: f64,
-        /// Of t^5.
+        /// Coefficient of t^5.
         #[serde(default)]
         k2: f64,
-        /// Of t^7.
+        /// Coefficient of t^7.
         #[serde(default)]
         k3: f64,
-        /// Of t^9.
+        /// Coefficient of t^9.
         #[serde(default)]
         k4: f64,
     },
@@ -56,7 +55,7 @@ impl From<LensConfig> for Distortion {
 }
 
 impl LensConfig {
-    /// Returns how a file writes a lens; `None` for a pinhole, which is left out.
+    /// Converts a lens to its form in files; `None` for a pinhole, which is omitted.
     pub fn new(lens: Distortion) -> Option<Self> {
         match lens {
             Distortion::None => None,

@@ -1,12 +1,12 @@
 //! Frames, poses, cameras and solids. f64, SI units, no allocation.
 //!
-//! A transform is named `a_from_b` and typed [`Pose<A, B>`]; neighbours match or it does not
-//! compile. Vectors are plain [`glam`] values whose names carry the frame (`p_world`, `v_body`).
+//! A transform is named `a_from_b` and has the type [`Pose<A, B>`], so that mismatched frames do not compile. Vectors
+//! are plain [`glam`] values with the frame in their names (`p_world`, `v_body`).
 
 mod distortion;
 mod frame;
 mod intrinsics;
-// Parsing it needs allocation, which chips do not have.
+// Parsing needs allocation, which is not available on microcontrollers.
 #[cfg(feature = "std")]
 mod lens_config;
 mod pose;

@@ -10,16 +10,15 @@ use serde::{Deserialize, Serialize};
 
 use super::frame::{Body, Cam, Frame};
 
-/// A rigid transform that takes coordinates in `B` to coordinates in `A`; also the pose of `B`
-/// expressed in `A`. Name a value `a_from_b`.
+/// Rigid transform from coordinates in `B` to coordinates in `A`. Also the pose of `B` in `A`. Name values `a_from_b`.
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::geometry::{Body, Pose, World};
-/// // A vehicle at (1, 2, 3), nose to north (+90 degrees of yaw).
+/// // Vehicle at (1, 2, 3), facing north (yaw +90 degrees).
 /// let world_from_body: Pose<World, Body> =
 ///     Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::from_rotation_z(90f64.to_radians()));
-/// // One metre ahead of it lies one metre further north.
+/// // One metre ahead of the vehicle is one metre further north.
 /// let p_world = world_from_body.transform_point(DVec3::X);
 /// assert!((p_world - DVec3::new(1.0, 3.0, 3.0)).length() < 1e-12);
 /// ```
@@ -28,46 +27,46 @@ use super::frame::{Body, Cam, Frame};
 pub struct Pose<A, B> {
     /// Origin of `B` in `A`. [m, A]
     pub translation_m: DVec3,
-    /// Rotation that takes `B` axes to `A` axes; unit, Hamilton, xyzw in memory.
+    /// Rotation from `B` axes to `A` axes; unit quaternion, Hamilton, xyzw in memory.
     pub rotation: DQuat,
     #[serde(skip)]
     frames: PhantomData<fn() -> (A, B)>,
 }
 
 impl<A: Frame, B: Frame> Pose<A, B> {
-    /// Both frames coincide.
+    /// Identity: both frames coincide.
     pub const IDENTITY: Self =
         Self { translation_m: DVec3::ZERO, rotation: DQuat::IDENTITY, frames: PhantomData };
 
-    /// Makes the transform from the origin of `B` in `A` [m] and the rotation of `B` in `A`.
+    /// Returns the transform with the origin of `B` in `A` [m] and the rotation of `B` in `A`.
     pub const fn new(translation_m: DVec3, rotation: DQuat) -> Self {
         Self { translation_m, rotation, frames: PhantomData }
     }
 
-    /// Returns the transform the other way round.
+    /// Returns the inverse transform.
     pub fn inverse(&self) -> Pose<B, A> {
         let rotation = self.rotation.conjugate();
         Pose::new(-(rotation * self.translation_m), rotation)
     }
 
-    /// Takes a point [m] from `B` to `A`.
+    /// Transforms a point [m] from `B` to `A`.
     pub fn transform_point(&self, p_b: DVec3) -> DVec3 {
         self.rotation * p_b + self.translation_m
     }
 
-    /// Takes a free vector (velocity, direction) from `B` to `A`.
+    /// Rotates a free vector (velocity, direction) from `B` to `A`.
     pub fn rotate(&self, v_b: DVec3) -> DVec3 {
         self.rotation * v_b
     }
 
-    /// Whether every number is finite and the quaternion is of unit length within 1e-3.
+    /// Whether all numbers are finite and the quaternion has unit length within 1e-3.
     pub fn is_valid(&self) -> bool {
         self.translation_m.is_finite()
             && self.rotation.is_finite()
             && (self.rotation.length_squared() - 1.0).abs() < 2e-3
     }
 
-    /// Returns the pose between `self` (t = 0) and `other` (t = 1): straight line and slerp.
+    /// Interpolates between `self` (t = 0) and `other` (t = 1): linear in position, slerp in rotation.
     pub fn interpolate(&self, other: &Self, t: f64) -> Self {
         Self::new(
             self.translation_m.lerp(other.translation_m, t),
@@ -82,13 +81,13 @@ impl<A: Frame, B: Frame, C: Frame> Mul<Pose<B, C>> for Pose<A, B> {
     fn mul(self, b_from_c: Pose<B, C>) -> Pose<A, C> {
         Pose::new(
             self.transform_point(b_from_c.translation_m),
-            // Renormalised, so that long chains of products stay unit.
+            // Normalized, so that long products keep unit quaternions.
             (self.rotation * b_from_c.rotation).normalize(),
         )
     }
 }
 
-// Written out because `derive` would ask the same of the frame tags.
+// Implemented by hand, because `derive` would require the same traits of the frame types.
 impl<A, B> Clone for Pose<A, B> {
     fn clone(&self) -> Self {
         *self
@@ -108,17 +107,17 @@ impl<A: Frame, B: Frame> fmt::Debug for Pose<A, B> {
     }
 }
 
-/// Linear and angular velocity, both expressed in the same frame.
+/// Linear and angular velocity. The variable's name states the frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Twist {
-    /// Linear velocity. [m/s, the frame its variable names]
+    /// Linear velocity. [m/s, frame in the variable's name]
     pub linear_mps: DVec3,
-    /// Angular velocity. [rad/s, the frame its variable names]
+    /// Angular velocity. [rad/s, frame in the variable's name]
     pub angular_radps: DVec3,
 }
 
-/// Returns the extrinsics of a camera at `p_body_m` that looks along the vehicle's nose, tilted
-/// up by `tilt_rad`. Camera axes from body axes: (-y, -z, x).
+/// Returns the extrinsics of a camera at `p_body_m` that looks forward, tilted up by `tilt_rad`. Camera axes in body
+/// axes: (-y, -z, x).
 ///
 /// ```
 /// use glam::DVec3;
@@ -130,13 +129,13 @@ pub struct Twist {
 /// assert!((body_from_cam.transform_point(DVec3::Y) + DVec3::Z).length() < 1e-12);
 /// ```
 pub fn body_from_forward_cam(p_body_m: DVec3, tilt_rad: f64) -> Pose<Body, Cam> {
-    // Columns: the camera's x, y and z axes written in body axes.
+    // Columns: the camera's x, y and z axes in body axes.
     let level = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
     // Nose-up is a negative rotation about body y.
     Pose::new(p_body_m, DQuat::from_rotation_y(-tilt_rad) * DQuat::from_mat3(&level))
 }
 
-/// Returns the heading of a rotation: the angle of its x axis about z, from x, in (-pi, pi]. [rad]
+/// Returns the heading (yaw) of a rotation: the angle of its x axis about z, in (-pi, pi]. [rad]
 ///
 /// ```
 /// use glam::DQuat;
@@ -187,7 +186,7 @@ mod tests {
         }
 
         #[test]
-        fn composition_is_application_in_turn(a in pose(), b in pose(), p in prop::array::uniform3(-10.0..10.0f64)) {
+        fn composition_equals_successive_application(a in pose(), b in pose(), p in prop::array::uniform3(-10.0..10.0f64)) {
             let b: Pose<Body, Cam> = Pose::new(b.translation_m, b.rotation);
             let p_cam = DVec3::from(p);
             let in_turn = a.transform_point(b.transform_point(p_cam));
@@ -204,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn poison_is_seen() {
+    fn detects_invalid_poses() {
         let nan: Pose<World, Body> = Pose::new(DVec3::new(f64::NAN, 0.0, 0.0), DQuat::IDENTITY);
         let zero: Pose<World, Body> = Pose::new(DVec3::ZERO, DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0));
         assert!(!nan.is_valid() && !zero.is_valid());

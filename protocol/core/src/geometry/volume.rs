@@ -1,10 +1,9 @@
-//! Solids with a signed distance: the geofence, no-fly boxes, and the true geometry of generated
-//! scenes.
+//! Solids with a signed distance: geofence, no-fly boxes, and the true geometry of generated scenes.
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// A solid in the world frame. Signed distance: negative inside, positive outside. [m, world]
+/// Solid in the world frame. Its signed distance is negative inside and positive outside. [m, world]
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Volume {
@@ -15,7 +14,7 @@ pub enum Volume {
         /// Radius. [m]
         radius_m: f64,
     },
-    /// All points within `radius_m` of the segment from `a_m` to `b_m`: trunks, poles.
+    /// All points within `radius_m` of the segment from `a_m` to `b_m`, for example trunks and poles.
     Capsule {
         /// One end of the axis. [m, world]
         a_m: DVec3,
@@ -24,16 +23,16 @@ pub enum Volume {
         /// Radius. [m]
         radius_m: f64,
     },
-    /// A box of any orientation: walls, gate beams.
+    /// Box of any orientation, for example walls and gate beams.
     Cuboid {
         /// Centre. [m, world]
         center_m: DVec3,
-        /// Half of each side along the box's own axes. [m]
+        /// Half of each side, along the box's axes. [m]
         half_m: DVec3,
-        /// Rotation of the box's axes into the world's.
+        /// Rotation from the box's axes to the world's.
         rotation: DQuat,
     },
-    /// All points below a plane: `normal . p <= offset_m`. The floor is normal +z, offset 0.
+    /// All points below a plane: `normal . p <= offset_m`. For the floor, normal +z and offset 0.
     HalfSpace {
         /// Unit normal that points out of the solid. [world]
         normal: DVec3,
@@ -58,7 +57,7 @@ impl Volume {
     /// use glam::DVec3;
     /// use vizflyt_protocol::geometry::Volume;
     /// let room = Volume::aabb(DVec3::ZERO, DVec3::new(11.0, 4.5, 3.65));
-    /// // 0.65 m below the ceiling, and that is the nearest face.
+    /// // 0.65 m below the ceiling, which is the nearest face.
     /// assert!((room.signed_distance_m(DVec3::new(5.0, 2.0, 3.0)) + 0.65).abs() < 1e-12);
     /// assert!((room.signed_distance_m(DVec3::new(14.0, 2.0, 7.65)) - 5.0).abs() < 1e-12);
     /// ```
@@ -78,8 +77,8 @@ impl Volume {
         }
     }
 
-    /// Returns the outward unit normal at (or nearest to) a point, by central differences of the
-    /// distance over 1 mm. [world]
+    /// Returns the outward unit normal at or nearest to a point, from central differences of the distance over 1 mm.
+    /// [world]
     pub fn outward_normal(&self, p_m: DVec3) -> DVec3 {
         const STEP_M: f64 = 1e-3;
         let slope = |axis: DVec3| {
@@ -89,7 +88,7 @@ impl Volume {
         DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z)).normalize_or(DVec3::Z)
     }
 
-    /// Whether every number is finite, sizes are positive and directions of unit length.
+    /// Whether all numbers are finite, sizes are positive, and directions have unit length.
     pub fn is_valid(&self) -> bool {
         let unit = |length_squared: f64| (length_squared - 1.0).abs() < 2e-3;
         match *self {
@@ -138,17 +137,17 @@ mod tests {
     }
 
     proptest! {
-        /// A signed distance never changes faster than the point moves.
+        /// The signed distance never changes by more than the point moves.
         #[test]
         fn distance_is_one_lipschitz(v in volume(), p in vector(-8.0..8.0), q in vector(-8.0..8.0)) {
             let change = (v.signed_distance_m(p) - v.signed_distance_m(q)).abs();
             prop_assert!(change <= (p - q).length() + 1e-9);
         }
 
-        /// Walking the distance along the outward normal ends on the surface (outside, where the
-        /// distance is exact and smooth away from edges seen from inside).
+        /// From a point outside, moving by the distance along the normal ends on the surface. (Inside, the distance is
+        /// not smooth near edges.)
         #[test]
-        fn the_normal_leads_to_the_surface(v in volume(), p in vector(-8.0..8.0)) {
+        fn the_normal_points_from_the_surface(v in volume(), p in vector(-8.0..8.0)) {
             let d = v.signed_distance_m(p);
             prop_assume!(d > 0.05);
             let foot = p - v.outward_normal(p) * d;

@@ -1,8 +1,8 @@
-//! Commands and results in words.
+//! Names of commands and results, for messages.
 
 use super::dialect::{MavCmd, MavResult};
 
-/// Returns what a command does, in words.
+/// Returns the name of a command's action.
 pub fn command_name(command: MavCmd) -> &'static str {
     match command {
         MavCmd::MAV_CMD_DO_SET_MODE => "mode change",
@@ -15,7 +15,7 @@ pub fn command_name(command: MavCmd) -> &'static str {
     }
 }
 
-/// Returns a command's result in words.
+/// Returns the name of a command's result.
 pub fn result_name(result: MavResult) -> &'static str {
     match result {
         MavResult::MAV_RESULT_ACCEPTED => "accepted",

@@ -1,7 +1,8 @@
-//! Distances to MAVLink: DISTANCE_SENSOR (132) of range finders and sonars, OBSTACLE_DISTANCE (330) of a LiDAR.
+//! Distance readings to MAVLink: DISTANCE_SENSOR (132) for range finders and sonars, OBSTACLE_DISTANCE (330) for a
+//! LiDAR.
 //!
-//! Orientations are rotations of a forward-right-down frame, as ArduPilot's `Rotation` has them: YAW_90 looks to the
-//! right, PITCH_90 up, PITCH_270 down (ardupilot.org, "Distance sensors by MAVLink").
+//! Orientations are rotations of a forward-right-down frame, as in ArduPilot's `Rotation`: YAW_90 faces right, PITCH_90
+//! up, PITCH_270 down (ardupilot.org, "Distance sensors by MAVLink").
 
 use glam::{DQuat, DVec3};
 
@@ -10,17 +11,17 @@ use super::dialect::{
 };
 use crate::sensor::{LidarPoint, RangeReading, SensorInfo, SensorKind};
 
-/// Sectors of an OBSTACLE_DISTANCE about the vehicle.
+/// Number of sectors in an OBSTACLE_DISTANCE around the vehicle.
 const SECTORS: usize = 72;
-/// Of a sector. [deg]
+/// Width of a sector. [deg]
 const SECTOR_DEG: f64 = 360.0 / SECTORS as f64;
-/// What is further above or below the sensor than this is no obstacle to a level flight: floor and ceiling. [m]
+/// Maximum height difference to the sensor for an obstacle. Points beyond it are floor or ceiling. [m]
 const BAND_M: f64 = 0.3;
-/// A direction within this of a named one has its name. [cosine; 5 degrees]
+/// Minimum alignment with a named direction. [cosine; 5 degrees]
 const ALIGNED: f64 = 0.9962;
 
-/// Returns the message of a range finder's or a sonar's reading; without a return one centimetre beyond its range, which
-/// ArduPilot takes for "out of range high". `id` numbers the sensors.
+/// Returns the message for a reading of a range finder or sonar. Without a return, the distance is one centimetre above
+/// the maximum range, which ArduPilot interprets as "out of range high". `id` is the number of the sensor.
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
@@ -29,7 +30,7 @@ const ALIGNED: f64 = 0.9962;
 /// use vizflyt_protocol::mavlink::distance_to_mavlink;
 /// use vizflyt_protocol::messages::bounded;
 /// use vizflyt_protocol::sensor::{RangeReading, SensorInfo, SensorKind};
-/// // It looks down: its x axis is the body's -z.
+/// // The sensor looks down: its x axis is the body's -z.
 /// let down = SensorInfo {
 ///     name: bounded("down"),
 ///     kind: SensorKind::RangeFinder,
@@ -56,7 +57,7 @@ pub fn distance_to_mavlink(
     let max_distance = centimetres(sensor.max_range_m);
     let measured = reading.measured_m();
     let orientation = orientation(sensor.body_from_sensor.rotation);
-    // Twice the power at the threshold is a good one; 1 is an invalid signal, and 0 one that is not known.
+    // Twice the threshold power is a good signal. 1 means an invalid signal, 0 an unknown one.
     let quality = (reading.signal * 50.0).clamp(2.0, 100.0) as u8;
     DISTANCE_SENSOR_DATA {
         time_boot_ms,
@@ -79,9 +80,9 @@ pub fn distance_to_mavlink(
     }
 }
 
-/// Returns the message of a LiDAR's scan: in each of 72 sectors about the nose, clockwise, the distance of the nearest
-/// return within 0.3 m of the sensor's height. `level_from_body` is the vehicle's roll and pitch: without them a tilted
-/// scan would have the floor for an obstacle.
+/// Returns the message for a LiDAR's scan: for each of 72 sectors, clockwise from the nose, the distance of the nearest
+/// return within 0.3 m of the sensor's height. `level_from_body` is the vehicle's roll and pitch: without it, a tilted
+/// scan would report the floor as an obstacle.
 pub fn obstacles_to_mavlink(
     sensor: &SensorInfo,
     points: &[LidarPoint],
@@ -123,13 +124,13 @@ pub fn obstacles_to_mavlink(
     }
 }
 
-/// Returns the angle from the nose to the right, 0 to 360, of a vector that is level. [deg]
+/// Returns the angle of a level vector from the nose to the right, 0 to 360. [deg]
 fn clockwise_deg(v: DVec3) -> f64 {
     let left_deg = libm::atan2(v.y, v.x).to_degrees();
     if left_deg > 0.0 { 360.0 - left_deg } else { -left_deg }
 }
 
-/// Returns whole centimetres; of what is no distance 0.
+/// Rounds to whole centimetres. NaN and negative values give 0.
 fn centimetres(m: f32) -> u16 {
     libm::roundf(m * 100.0) as u16
 }
@@ -142,7 +143,7 @@ fn sensor_type(kind: SensorKind) -> MavDistanceSensor {
     }
 }
 
-/// Returns the name of the direction that a sensor looks in.
+/// Returns MAVLink's name of the sensor's direction.
 fn orientation(body_from_sensor: DQuat) -> MavSensorOrientation {
     use MavSensorOrientation as Named;
     const HALF: f64 = core::f64::consts::FRAC_1_SQRT_2;
@@ -163,10 +164,10 @@ fn orientation(body_from_sensor: DQuat) -> MavSensorOrientation {
     found.map_or(Named::MAV_SENSOR_ROTATION_CUSTOM, |(_, name)| name)
 }
 
-/// Returns a rotation between forward-left-up frames as one between forward-right-down frames, w first.
+/// Converts a rotation from forward-left-up to forward-right-down frames, w first.
 fn wxyz_frd(rotation: DQuat) -> [f32; 4] {
     let [x, y, z, w] = rotation.to_array().map(|part| part as f32);
-    // Never -0: a packet ends with its last byte that is not zero.
+    // Avoids -0: a packet ends with its last non-zero byte.
     [w, x, 0.0 - y, 0.0 - z]
 }
 
@@ -204,9 +205,9 @@ mod tests {
     }
 
     #[test]
-    fn directions_have_their_names() {
+    fn names_the_directions() {
         use MavSensorOrientation as Named;
-        // Our yaw is to the left, MAVLink's to the right.
+        // VizFlyt's yaw is to the left, MAVLink's to the right.
         for (yaw_deg, tilt_deg, expected) in [
             (0.0, 0.0, Named::MAV_SENSOR_ROTATION_NONE),
             (-90.0, 0.0, Named::MAV_SENSOR_ROTATION_YAW_90),
@@ -220,10 +221,10 @@ mod tests {
             let sensor = sensor(SensorKind::Sonar, yaw_deg, tilt_deg);
             let message = distance_to_mavlink(&sensor, 1, RangeReading::default(), 7);
             assert_eq!(message.orientation, expected, "yaw {yaw_deg}, tilt {tilt_deg}");
-            assert_eq!(message.current_distance, 1201, "nothing came back");
+            assert_eq!(message.current_distance, 1201, "no return");
             assert_eq!(message.mavtype, MavDistanceSensor::MAV_DISTANCE_SENSOR_ULTRASOUND);
         }
-        // 20 degrees nose-down is a pitch of -20 degrees in FRD: about y by -20.
+        // 20 degrees nose-down is a pitch of -20 degrees in FRD: a rotation about y by -20.
         let [w, x, y, z] =
             wxyz_frd(sensor(SensorKind::Sonar, 0.0, -20.0).body_from_sensor.rotation);
         let half = 10f32.to_radians();
@@ -234,7 +235,7 @@ mod tests {
     #[test]
     fn sectors_run_clockwise_from_the_nose() {
         let lidar = sensor(SensorKind::Lidar, 0.0, 0.0);
-        // Ahead, to the right, behind, to the left; the floor; nearer than it measures; and a further one ahead.
+        // Ahead, right, behind, left; the floor; below the minimum range; a more distant one ahead.
         let points = [
             at([2.0, 0.0, 0.1]),
             at([0.0, -3.0, 0.0]),
@@ -255,24 +256,24 @@ mod tests {
     }
 
     #[test]
-    fn a_tilted_vehicle_has_no_floor_for_an_obstacle() {
+    fn does_not_report_the_floor_of_a_tilted_vehicle() {
         let mut lidar = sensor(SensorKind::Lidar, 0.0, 0.0);
-        // Nose down by 20 degrees: what the body sees level ahead is the floor, 1 m below.
+        // Nose down by 20 degrees: the point straight ahead of the body is the floor, 1 m below.
         let level_from_body = DQuat::from_rotation_y(20f64.to_radians());
         let floor = level_from_body.inverse() * DVec3::new(2.75, 0.0, -1.0);
         let wall = level_from_body.inverse() * DVec3::new(4.0, 0.0, 0.0);
         let points = [floor, wall].map(|p| at(p.to_array().map(|part| part as f32)));
         let message = obstacles_to_mavlink(&lidar, &points, level_from_body, 9);
         assert_eq!(message.distances[0], 400);
-        // What it does not look at is not known to be free.
+        // Sectors outside the field of view are unknown.
         lidar.horizontal_fov_rad = 1.0;
         let message = obstacles_to_mavlink(&lidar, &[], DQuat::IDENTITY, 9);
         let known = message.distances.iter().filter(|&&cm| cm == 1201).count();
         assert_eq!((known, message.distances[36]), (11, u16::MAX));
     }
-    /// What pymavlink makes of the same sensors' readings, bit by bit: `tests/clients/capture.py`.
+    /// Compares packets bit by bit with those of pymavlink for the same readings: `tests/clients/capture.py`.
     #[test]
-    fn packets_are_pymavlinks() {
+    fn packets_match_those_of_pymavlink() {
         let level = DQuat::IDENTITY;
         let narrow =
             |kind, tilt_deg| SensorInfo { horizontal_fov_rad: 0.25, ..sensor(kind, 0.0, tilt_deg) };

@@ -1,7 +1,7 @@
-//! Polygons of an autopilot's fence, as the mission protocol carries them (MAVLink, "Mission Protocol",
-//! MAV_MISSION_TYPE_FENCE): one item for each corner, on the globe.
+//! Polygons of an autopilot's fence in the mission protocol (MAVLink, "Mission Protocol", MAV_MISSION_TYPE_FENCE): one
+//! item per corner, in global coordinates.
 
-// Why: MAV_FRAME_GLOBAL and MISSION_REQUEST are what ArduCopter speaks, whatever the dialect advises.
+// Why: ArduCopter uses MAV_FRAME_GLOBAL and MISSION_REQUEST, although the dialect deprecates them.
 #![allow(deprecated)]
 
 use glam::DVec2;
@@ -10,18 +10,18 @@ use super::dialect::{
     MISSION_ITEM_INT_DATA, MavCmd, MavFrame, MavMessage, MavMissionResult, MavMissionType,
 };
 
-/// A place on the globe, in the whole numbers of MAVLink. [1e-7 deg]
+/// Geographic position in MAVLink's integer units. [1e-7 deg]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct GlobalPoint {
-    /// North of the equator. [1e-7 deg]
+    /// Latitude, positive north. [1e-7 deg]
     pub latitude_e7: i32,
-    /// East of Greenwich. [1e-7 deg]
+    /// Longitude, positive east. [1e-7 deg]
     pub longitude_e7: i32,
 }
 
 impl GlobalPoint {
-    /// Returns the place that is `p_world_m` east and north of `self`, the local frame's origin; good
-    /// for a room, where the globe is flat. [m, world]
+    /// Returns the position `p_world_m` east and north of `self`, the origin of the local frame. Accurate at the size
+    /// of a room, where the globe is flat. [m, world]
     ///
     /// ```
     /// use glam::DVec2;
@@ -33,7 +33,7 @@ impl GlobalPoint {
     /// ```
     #[must_use]
     pub fn offset(self, p_world_m: DVec2) -> Self {
-        // Saturates: whoever asks for a place beyond the globe gets none of sense.
+        // Saturates: positions beyond the globe are invalid anyway.
         let moved = |from: i32, by: f64| (f64::from(from) + libm::round(by)) as i32;
         let (east_m, north_m) = (p_world_m.x, p_world_m.y);
         Self {
@@ -42,7 +42,7 @@ impl GlobalPoint {
         }
     }
 
-    /// Returns how far east and north of `origin` this place is. [m, world]
+    /// Returns this position relative to `origin`, east and north. [m, world]
     pub fn from_origin_m(self, origin: Self) -> DVec2 {
         let apart = |a: i32, b: i32| f64::from(a) - f64::from(b);
         let east_m = apart(self.longitude_e7, origin.longitude_e7) * origin.shrink();
@@ -50,33 +50,33 @@ impl GlobalPoint {
         DVec2::new(east_m, north_m) * METRES_PER_UNIT
     }
 
-    /// How much shorter a degree of longitude is than one of latitude.
+    /// Length of a degree of longitude relative to a degree of latitude.
     fn shrink(self) -> f64 {
         libm::cos((f64::from(self.latitude_e7) * 1e-7).to_radians()).max(1e-3)
     }
 }
 
-/// Which side of a polygon a vehicle must keep to.
+/// Side of a polygon on which the vehicle must stay.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FenceSide {
-    /// Inclusion: within.
+    /// Inclusion: inside the polygon.
     Inside,
-    /// Exclusion: out of it.
+    /// Exclusion: outside the polygon.
     Outside,
 }
 
-/// A corner of a polygon; those of one polygon follow each other.
+/// Corner of a polygon. Corners of one polygon are consecutive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FenceCorner {
-    /// What its polygon is for.
+    /// Side of the polygon for the vehicle.
     pub side: FenceSide,
-    /// How many corners its polygon has.
+    /// Number of corners of the polygon.
     pub corners: u16,
-    /// Where it is.
+    /// Position of the corner.
     pub place: GlobalPoint,
 }
 
-/// Returns the mission item of a corner, the `seq`-th of all, for `target`.
+/// Returns the mission item number `seq` for a corner, for `target`.
 pub fn fence_corner_to_mavlink(
     corner: &FenceCorner,
     seq: u16,
@@ -99,11 +99,11 @@ pub fn fence_corner_to_mavlink(
     }
 }
 
-/// Returns the corner that a mission item is.
+/// Returns the corner of a mission item.
 ///
 /// # Errors
-/// The answer of ArduCopter's to an item that it cannot take: another command, a frame that is not the
-/// globe's, a number of corners that is none.
+/// Returns ArduCopter's result for an item that it does not accept: another command, a frame that is not global, or an
+/// invalid number of corners.
 pub fn fence_corner_from_mavlink(
     item: &MISSION_ITEM_INT_DATA,
 ) -> Result<FenceCorner, MavMissionResult> {
@@ -122,8 +122,8 @@ pub fn fence_corner_from_mavlink(
     Ok(FenceCorner { side, corners: item.param1 as u16, place })
 }
 
-/// Returns which item of the fence an autopilot asks for, by either form of the request; `None` for
-/// any other message. ArduCopter sends MISSION_REQUEST, PX4 MISSION_REQUEST_INT.
+/// Returns the number of the fence item that an autopilot requests; `None` for any other message. ArduCopter sends
+/// MISSION_REQUEST, PX4 sends MISSION_REQUEST_INT.
 pub fn fence_request_from_mavlink(message: &MavMessage) -> Option<u16> {
     let (seq, kind) = match message {
         MavMessage::MISSION_REQUEST_INT(request) => (request.seq, request.mission_type),
@@ -133,24 +133,24 @@ pub fn fence_request_from_mavlink(message: &MavMessage) -> Option<u16> {
     (kind == MavMissionType::MAV_MISSION_TYPE_FENCE).then_some(seq)
 }
 
-/// Returns what an autopilot made of a fence, in words.
+/// Returns an autopilot's result for a fence as text.
 pub fn mission_result_name(result: MavMissionResult) -> &'static str {
     match result {
         MavMissionResult::MAV_MISSION_ACCEPTED => "accepted",
-        MavMissionResult::MAV_MISSION_UNSUPPORTED_FRAME => "it does not know the frame",
-        MavMissionResult::MAV_MISSION_UNSUPPORTED => "it does not know polygons",
-        MavMissionResult::MAV_MISSION_NO_SPACE => "it has no room for as many corners",
-        MavMissionResult::MAV_MISSION_INVALID_SEQUENCE => "items came in the wrong order",
+        MavMissionResult::MAV_MISSION_UNSUPPORTED_FRAME => "it does not support the frame",
+        MavMissionResult::MAV_MISSION_UNSUPPORTED => "it does not support polygons",
+        MavMissionResult::MAV_MISSION_NO_SPACE => "it has no space for this many corners",
+        MavMissionResult::MAV_MISSION_INVALID_SEQUENCE => "items arrived in the wrong order",
         MavMissionResult::MAV_MISSION_DENIED => "another program is writing it",
         MavMissionResult::MAV_MISSION_OPERATION_CANCELLED => "the upload was cancelled",
-        _ => "it finds a polygon invalid",
+        _ => "it rejects a polygon as invalid",
     }
 }
 
-/// One unit of latitude, as ArduPilot has it (Location.h, LOCATION_SCALING_FACTOR): an arc of 1e-7
-/// degrees on a globe of 6378.1 km. [m]
+/// Length of one unit of latitude, as in ArduPilot (Location.h, LOCATION_SCALING_FACTOR): an arc of 1e-7 degrees on a
+/// globe of 6378.1 km. [m]
 const METRES_PER_UNIT: f64 = 0.011_131_884_502_145_034;
-/// ArduPilot counts a polygon's corners in a byte.
+/// ArduPilot stores the number of corners in one byte.
 const MAX_CORNERS: f32 = 255.0;
 
 #[cfg(test)]
@@ -160,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_corners_on_the_globe_are_taken() {
+    fn accepts_only_polygon_corners_in_global_frames() {
         let place = GlobalPoint { latitude_e7: 1, longitude_e7: 2 };
         let corner = FenceCorner { side: FenceSide::Outside, corners: 4, place };
         let item = || fence_corner_to_mavlink(&corner, 3, (1, 1));
@@ -182,7 +182,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_room_comes_back_to_a_centimetre(
+        fn offsets_are_accurate_to_a_centimetre(
             latitude_e7 in -800_000_000..800_000_000, longitude_e7 in -1_790_000_000..1_790_000_000,
             x in -50.0..50.0, y in -50.0..50.0,
         ) {
@@ -193,7 +193,7 @@ mod tests {
         }
 
         #[test]
-        fn an_item_comes_back(x: i32, y: i32, corners in 3_u16..=255, is_inside: bool, seq: u16) {
+        fn corners_survive_the_wire(x: i32, y: i32, corners in 3_u16..=255, is_inside: bool, seq: u16) {
             let side = if is_inside { FenceSide::Inside } else { FenceSide::Outside };
             let place = GlobalPoint { latitude_e7: x, longitude_e7: y };
             let corner = FenceCorner { side, corners, place };

@@ -1,4 +1,4 @@
-//! World to NED, body to FRD. Each mapping of vectors is its own inverse.
+//! Conversions between world and NED, and between body and FRD. Each vector conversion is its own inverse.
 
 use core::f64::consts::{FRAC_1_SQRT_2, FRAC_PI_2};
 
@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 
 use crate::geometry::wrap_pi;
 
-/// Takes a vector from world (east, north, up) to NED axes.
+/// Converts a vector from world (east, north, up) to NED axes.
 ///
 /// ```
 /// use glam::DVec3;
@@ -17,7 +17,7 @@ pub fn ned_from_world(v_world: DVec3) -> DVec3 {
     DVec3::new(v_world.y, v_world.x, -v_world.z)
 }
 
-/// Takes a vector from NED axes to world.
+/// Converts a vector from NED axes to world.
 ///
 /// ```
 /// use glam::DVec3;
@@ -28,7 +28,7 @@ pub fn world_from_ned(v_ned: DVec3) -> DVec3 {
     ned_from_world(v_ned)
 }
 
-/// Takes a vector from body (forward, left, up) to FRD axes.
+/// Converts a vector from body (forward, left, up) to FRD axes.
 ///
 /// ```
 /// use glam::DVec3;
@@ -39,7 +39,7 @@ pub fn frd_from_body(v_body: DVec3) -> DVec3 {
     DVec3::new(v_body.x, -v_body.y, -v_body.z)
 }
 
-/// Takes a vector from FRD axes to body.
+/// Converts a vector from FRD axes to body.
 ///
 /// ```
 /// use glam::DVec3;
@@ -55,12 +55,12 @@ const NED_FROM_WORLD: DQuat = DQuat::from_xyzw(FRAC_1_SQRT_2, FRAC_1_SQRT_2, 0.0
 /// Half a turn about x: negates y and z.
 const FRD_FROM_BODY: DQuat = DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0);
 
-/// Takes an attitude from body-to-world to FRD-to-NED.
+/// Converts an attitude from body-to-world to FRD-to-NED.
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::mavlink::ned_rotation_from_world;
-/// // Level with the nose to the north (world yaw 90 degrees) is the NED identity.
+/// // Level and facing north (world yaw 90 degrees) is the NED identity.
 /// let ned_from_frd = ned_rotation_from_world(DQuat::from_rotation_z(90f64.to_radians()));
 /// assert!((ned_from_frd * DVec3::X - DVec3::X).length() < 1e-12);
 /// assert!((ned_from_frd * DVec3::Z - DVec3::Z).length() < 1e-12);
@@ -69,22 +69,22 @@ pub fn ned_rotation_from_world(world_from_body: DQuat) -> DQuat {
     (NED_FROM_WORLD * world_from_body * FRD_FROM_BODY).normalize()
 }
 
-/// Takes an attitude from FRD-to-NED to body-to-world.
+/// Converts an attitude from FRD-to-NED to body-to-world.
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::mavlink::world_rotation_from_ned;
-/// // NED identity: level, nose to the north, which is world y.
+/// // NED identity: level and facing north, which is world y.
 /// let world_from_body = world_rotation_from_ned(DQuat::IDENTITY);
 /// assert!((world_from_body * DVec3::X - DVec3::Y).length() < 1e-12);
 /// assert!((world_from_body * DVec3::Z - DVec3::Z).length() < 1e-12);
 /// ```
 pub fn world_rotation_from_ned(ned_from_frd: DQuat) -> DQuat {
-    // Both half turns are their own inverses (up to sign, which a rotation ignores).
+    // Both half turns are their own inverses (up to the sign, which does not change a rotation).
     (NED_FROM_WORLD * ned_from_frd * FRD_FROM_BODY).normalize()
 }
 
-/// Takes a heading from world (from east, counter-clockwise) to NED (from north, clockwise). [rad]
+/// Converts a heading from world (from east, counter-clockwise) to NED (from north, clockwise). [rad]
 ///
 /// ```
 /// use vizflyt_protocol::mavlink::yaw_ned_from_world;
@@ -95,7 +95,7 @@ pub fn yaw_ned_from_world(yaw_world_rad: f64) -> f64 {
     wrap_pi(FRAC_PI_2 - yaw_world_rad)
 }
 
-/// Takes a heading from NED to world. [rad]
+/// Converts a heading from NED to world. [rad]
 ///
 /// ```
 /// use vizflyt_protocol::mavlink::yaw_world_from_ned;
@@ -113,14 +113,14 @@ mod tests {
 
     proptest! {
         #[test]
-        fn attitudes_go_there_and_back(q in prop::array::uniform4(-1.0..1.0f64)) {
+        fn attitude_conversions_are_inverses(q in prop::array::uniform4(-1.0..1.0f64)) {
             prop_assume!(q.iter().map(|v| v * v).sum::<f64>() > 1e-3);
             let q = DQuat::from_array(q).normalize();
             let back = world_rotation_from_ned(ned_rotation_from_world(q));
             prop_assert!(back.dot(q).abs() > 1.0 - 1e-9);
         }
 
-        /// Rotating a vector agrees in both sets of axes.
+        /// Rotating a vector gives the same result in both sets of axes.
         #[test]
         fn attitude_and_vectors_agree(q in prop::array::uniform4(-1.0..1.0f64), v in prop::array::uniform3(-5.0..5.0f64)) {
             prop_assume!(q.iter().map(|v| v * v).sum::<f64>() > 1e-3);

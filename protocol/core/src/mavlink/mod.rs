@@ -1,8 +1,8 @@
-//! Our types to and from MAVLink (ardupilotmega). The only place that knows north-east-down and
-//! forward-right-down axes, wxyz quaternions and type masks.
+//! Conversions to and from MAVLink (ardupilotmega). The only code with north-east-down and forward-right-down axes,
+//! wxyz quaternions and type masks.
 //!
-//! Messages are those of the `mavlink` crate, re-exported as [`dialect`], so that the runtime, the
-//! simulator and the bridge agree on one version of it.
+//! Messages are those of the `mavlink` crate, re-exported as [`dialect`], so that runtime, simulator and bridge use the
+//! same version.
 
 mod command;
 mod distance;

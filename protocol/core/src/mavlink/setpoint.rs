@@ -1,6 +1,6 @@
-//! Guarded setpoints to and from SET_POSITION_TARGET_LOCAL_NED (message 84), as ArduCopter's
-//! GUIDED mode understands it: a group of three axes counts only whole, and yaw is always sent
-//! (an ignored yaw lets the nose turn into the direction of travel).
+//! Guarded setpoints to and from SET_POSITION_TARGET_LOCAL_NED (message 84), as interpreted by ArduCopter's GUIDED
+//! mode: a group of three axes is used only if it is complete. Yaw is always sent, because with an ignored yaw the
+//! vehicle turns into the direction of travel.
 
 use glam::DVec3;
 
@@ -8,7 +8,7 @@ use super::dialect::{MavFrame, PositionTargetTypemask, SET_POSITION_TARGET_LOCAL
 use super::frames::{ned_from_world, world_from_ned, yaw_ned_from_world, yaw_world_from_ned};
 use crate::messages::YawTarget;
 
-/// Motion in world axes that the guard has passed.
+/// Motion in world axes, after the guard.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum GuidedMotion {
     /// Fly to a point. [m, world]
@@ -17,16 +17,16 @@ pub enum GuidedMotion {
     Velocity(DVec3),
     /// Follow a moving point: position [m, world] with velocity feed-forward [m/s, world].
     PositionVelocity(DVec3, DVec3),
-    /// Accelerate, gravity compensated. [m/s^2, world]
+    /// Accelerate; gravity is compensated. [m/s^2, world]
     Acceleration(DVec3),
 }
 
-/// What is sent to the autopilot.
+/// Setpoint for the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GuidedSetpoint {
-    /// Motion.
+    /// Requested motion.
     pub motion: GuidedMotion,
-    /// Heading; never [`YawTarget::Keep`] on the wire: the guard resolves it to an angle.
+    /// Heading. Never [`YawTarget::Keep`] on the wire: the guard converts it to an angle.
     pub yaw: YawTarget,
 }
 
@@ -36,7 +36,7 @@ const IGNORE_ACCELERATION: u16 = 0x1C0;
 const IGNORE_YAW: u16 = 0x400;
 const IGNORE_YAW_RATE: u16 = 0x800;
 
-/// Makes the message for `target` (system, component).
+/// Returns the message for `target` (system, component).
 ///
 /// ```
 /// use glam::DVec3;
@@ -84,7 +84,7 @@ pub fn guided_to_mavlink(
             mask |= IGNORE_YAW_RATE;
             yaw = yaw_ned_from_world(yaw_world);
         }
-        // World counts counter-clockwise seen from above, NED clockwise.
+        // World yaw is counter-clockwise seen from above, NED yaw clockwise.
         YawTarget::Rate(rate_world) => {
             mask |= IGNORE_YAW;
             yaw_rate = -rate_world;
@@ -111,21 +111,21 @@ pub fn guided_to_mavlink(
     }
 }
 
-/// Why ArduCopter would ignore the message.
+/// Reason why ArduCopter would ignore the message.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum UnsupportedSetpoint {
-    /// A frame other than LOCAL_NED.
+    /// The frame is not LOCAL_NED.
     #[error("coordinate frame is not LOCAL_NED")]
     Frame,
-    /// A mask that leaves no whole group, or one that GUIDED has no mode for.
-    #[error("type mask {0:#05x} names no motion that GUIDED knows")]
+    /// The mask leaves no complete group, or a combination without a mode in GUIDED.
+    #[error("type mask {0:#05x} has no motion that GUIDED supports")]
     Mask(u16),
-    /// A number that is not finite.
+    /// A number is not finite.
     #[error("a target is not a finite number")]
     NotFinite,
 }
 
-/// Reads the message as ArduCopter does: an axis ignored drops its whole group.
+/// Reads the message as ArduCopter does: one ignored axis drops its whole group.
 pub fn guided_from_mavlink(
     message: &SET_POSITION_TARGET_LOCAL_NED_DATA,
 ) -> Result<GuidedSetpoint, UnsupportedSetpoint> {
@@ -180,9 +180,9 @@ mod tests {
         assert_eq!(message.type_mask.bits(), expected);
     }
 
-    /// The masks a real ArduCopter accepted.
+    /// Masks that a real ArduCopter accepted.
     #[test]
-    fn masks_are_those_arducopter_accepted() {
+    fn uses_masks_that_arducopter_accepts() {
         let z = DVec3::ZERO;
         check_mask(GuidedMotion::Position(z), YawTarget::Keep, 0xDF8);
         check_mask(GuidedMotion::Position(z), YawTarget::Angle(0.0), 0x9F8);
@@ -206,13 +206,13 @@ mod tests {
     }
 
     fn vector() -> impl Strategy<Value = DVec3> {
-        // Values that f32 holds exactly.
+        // Values that f32 represents exactly.
         prop::array::uniform3(-1000i16..1000).prop_map(|v| DVec3::from(v.map(|v| v as f64 / 16.0)))
     }
 
     proptest! {
         #[test]
-        fn a_setpoint_survives_the_wire(p in vector(), v in vector(), kind in 0..4, angle in -3.0..3.0f64, turn in any::<bool>()) {
+        fn setpoints_survive_the_wire(p in vector(), v in vector(), kind in 0..4, angle in -3.0..3.0f64, turn in any::<bool>()) {
             let motion = match kind {
                 0 => GuidedMotion::Position(p),
                 1 => GuidedMotion::Velocity(v),

@@ -1,8 +1,8 @@
-//! MAVLink 2 message signing: only holders of the key are accepted, and no packet can be replayed
-//! (MAVLink guide, "Message Signing"). Pure: bytes and the time in, bytes or a refusal out.
+//! MAVLink 2 message signing: only packets from holders of the key are accepted, and replayed packets are rejected
+//! (MAVLink guide, "Message Signing"). Pure: input is bytes and the time, output is bytes or an error.
 //!
-//! A signed packet carries 13 bytes more: link id, a 48-bit stamp in units of 10 us since 2015, and
-//! the first 6 bytes of SHA-256(key, header, payload, checksum, link id, stamp).
+//! A signed packet has 13 additional bytes: link id, a 48-bit time stamp in units of 10 us since 2015, and the first 6
+//! bytes of SHA-256(key, header, payload, checksum, link id, time stamp).
 
 use heapless::Vec;
 use sha2::{Digest, Sha256};
@@ -11,20 +11,20 @@ use super::dialect::MavMessage;
 use super::stream::{MAX_PACKET, STX_V2};
 use ::mavlink::{Message, calculate_crc};
 
-/// Bytes that a signature adds to a packet.
+/// Number of bytes that a signature adds to a packet.
 pub const SIGNATURE: usize = 13;
 
-/// The secret that both ends share.
+/// Secret shared by both ends.
 #[derive(Clone, PartialEq, Eq)]
 pub struct SigningKey([u8; 32]);
 
 impl SigningKey {
-    /// Makes a key of its bytes.
+    /// Returns the key with these bytes.
     pub const fn new(bytes: [u8; 32]) -> Self {
         Self(bytes)
     }
 
-    /// Returns its bytes, as SETUP_SIGNING carries them.
+    /// Returns the bytes of the key, as sent in SETUP_SIGNING.
     pub const fn bytes(&self) -> &[u8; 32] {
         &self.0
     }
@@ -36,17 +36,17 @@ impl core::fmt::Debug for SigningKey {
     }
 }
 
-/// A stamp of a signature: 10 us since 2015-01-01 00:00 UTC, 48 bits.
+/// Time stamp of a signature: units of 10 us since 2015-01-01 00:00 UTC, 48 bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct SigningTime(u64);
 
 impl SigningTime {
-    /// Makes a stamp of its number; beyond 48 bits it stays at the end (2104).
+    /// Returns the stamp with this number of units; saturates at 48 bits (in the year 2104).
     pub const fn from_units(units: u64) -> Self {
         Self(if units < 1 << 48 { units } else { (1 << 48) - 1 })
     }
 
-    /// Makes a stamp of microseconds since 1970; before 2015 it is zero. [us]
+    /// Returns the stamp for microseconds since 1970; zero before 2015. [us]
     ///
     /// ```
     /// use vizflyt_protocol::mavlink::SigningTime;
@@ -56,7 +56,7 @@ impl SigningTime {
         Self::from_units(unix_us.saturating_sub(1_420_070_400_000_000) / 10)
     }
 
-    /// Returns its number. [10 us]
+    /// Returns the number of units. [10 us]
     pub const fn units(self) -> u64 {
         self.0
     }
@@ -67,24 +67,24 @@ impl SigningTime {
     }
 }
 
-/// Why a packet is refused.
+/// Reason for rejecting a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SigningFault {
-    /// It carries no signature.
+    /// The packet has no signature.
     #[error("a packet is not signed")]
     Unsigned,
-    /// Its signature is not of our key, or the packet was changed.
+    /// The signature was made with another key, or the packet was changed.
     #[error("a packet is signed with another key, or was changed")]
     Forged,
-    /// Its stamp is not newer than one received before, or a minute old.
+    /// The stamp is not newer than that of an earlier packet, or it is more than a minute old.
     #[error("a packet is a replay")]
     Replayed,
-    /// More senders than can be kept apart.
-    #[error("more than 16 senders sign")]
+    /// There are more senders than the table can store.
+    #[error("more than 16 senders of signed packets")]
     TooMany,
 }
 
-/// Signs what one end sends.
+/// Signs the packets of one sender.
 #[derive(Clone, Debug)]
 pub struct Signer {
     key: SigningKey,
@@ -93,13 +93,13 @@ pub struct Signer {
 }
 
 impl Signer {
-    /// Makes a signer; `link` distinguishes several links of one sender.
+    /// Returns a signer. `link` distinguishes several links of one sender.
     pub const fn new(key: SigningKey, link: u8) -> Self {
         Self { key, link, next: 0 }
     }
 
-    /// Signs the MAVLink 2 packet that is the first `len` bytes of `buffer`; returns its new length.
-    /// A packet that is none, or signed already, stays as it is.
+    /// Signs the MAVLink 2 packet in the first `len` bytes of `buffer`. Returns its new length. An invalid or already
+    /// signed packet is not changed.
     pub fn sign(&mut self, now: SigningTime, buffer: &mut [u8; MAX_PACKET], len: usize) -> usize {
         let whole = len >= 12 && len + SIGNATURE <= MAX_PACKET;
         if !whole
@@ -113,7 +113,7 @@ impl Signer {
         let id = u32::from_le_bytes([buffer[7], buffer[8], buffer[9], 0]);
         let crc = calculate_crc(&buffer[1..len - 2], MavMessage::extra_crc(id));
         buffer[len - 2..len].copy_from_slice(&crc.to_le_bytes());
-        // Every packet needs a stamp of its own, also within 10 us, and when the clock falls back.
+        // Each packet needs a unique stamp, even within 10 us and if the clock steps back.
         let stamp = self.next.max(now.units());
         self.next = stamp + 1;
         buffer[len] = self.link;
@@ -124,37 +124,37 @@ impl Signer {
     }
 }
 
-/// Verifies what one end receives.
+/// Verifies received packets.
 #[derive(Clone, Debug)]
 pub struct Verifier {
     key: SigningKey,
     newest: u64,
-    /// Newest stamp of each (system, component, link).
+    /// Newest stamp for each (system, component, link).
     senders: Vec<([u8; 3], u64), SENDERS>,
 }
 
-/// Senders kept apart. A vehicle's link has two or three.
+/// Maximum number of senders. A vehicle's link has two or three.
 const SENDERS: usize = 16;
-/// A sender received for the first time may be this much behind. [10 us]
+/// Maximum age of the first packet from a sender. [10 us]
 const MINUTE: u64 = 6_000_000;
 
 impl Verifier {
-    /// Makes one that has received nothing.
+    /// Returns a verifier without known senders.
     pub const fn new(key: SigningKey) -> Self {
         Self { key, newest: 0, senders: Vec::new() }
     }
 
-    /// Judges a whole packet, whose checksum is right; remembers its stamp if it is accepted.
+    /// Verifies a complete packet with a valid checksum. Stores its stamp if it is accepted.
     ///
     /// # Errors
-    /// [`SigningFault`].
+    /// Returns the reason for rejecting the packet.
     pub fn check(&mut self, now: SigningTime, packet: &[u8]) -> Result<(), SigningFault> {
         if !is_signed(packet) {
             return Err(SigningFault::Unsigned);
         }
         let (signed_bytes, theirs) = packet.split_at(packet.len() - 6);
         let ours = signature(&self.key, signed_bytes);
-        // In constant time: a forger learns nothing from how long it took.
+        // Constant time: the duration gives a forger no information.
         if ours.iter().zip(theirs).fold(0, |differ, (a, b)| differ | (a ^ b)) != 0 {
             return Err(SigningFault::Forged);
         }
@@ -176,15 +176,15 @@ impl Verifier {
     }
 }
 
-/// Incompatibility flag of MAVLink 2: a signature follows.
+/// Incompatibility flag of MAVLink 2: the packet is signed.
 const SIGNED: u8 = 0x01;
 
-/// Whether a whole packet carries a signature, right or wrong.
+/// Whether a complete packet contains a signature, valid or not.
 pub fn is_signed(packet: &[u8]) -> bool {
     packet.len() >= 12 + SIGNATURE && packet[0] == STX_V2 && packet[2] & SIGNED != 0
 }
 
-/// Returns the signature of a packet up to and with its stamp.
+/// Returns the signature of a packet, computed over all bytes up to and including the stamp.
 fn signature(key: &SigningKey, signed_bytes: &[u8]) -> [u8; 6] {
     let mut hash = Sha256::new();
     hash.update(key.0);
@@ -235,14 +235,14 @@ mod tests {
     }
 
     #[test]
-    fn pymavlinks_signatures_are_accepted_and_made_alike() {
+    fn signatures_match_those_of_pymavlink() {
         let packets = their_packets();
         assert_eq!(packets.len(), 2);
         let mut verifier = Verifier::new(key());
         for packet in &packets {
             assert_eq!(verifier.check(NOW, packet), Ok(()));
         }
-        // Their unsigned packet, signed by us, is theirs to the bit.
+        // Packets signed by this module are identical to pymavlink's.
         let mut signer = Signer::new(key(), 3);
         for theirs in &packets {
             let len = theirs.len() - SIGNATURE;
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn unsigned_forged_and_replayed_packets_are_refused() {
+    fn rejects_unsigned_forged_and_replayed_packets() {
         let (mut signer, mut verifier) = (Signer::new(key(), 0), Verifier::new(key()));
         let (packet, len) = signed(&mut signer, NOW, 1);
         assert_eq!(verifier.check(NOW, &packet[..len]), Ok(()));
@@ -267,7 +267,7 @@ mod tests {
             let verdict = verifier.check(NOW, &changed[..len]);
             assert!(matches!(verdict, Err(SigningFault::Forged | SigningFault::Unsigned)), "{at}");
         }
-        assert_eq!(verifier.check(NOW, &packet[..len]), Ok(()), "stamps rise within 10 us");
+        assert_eq!(verifier.check(NOW, &packet[..len]), Ok(()), "stamps increase within 10 us");
         let (packet, len) = signed(&mut Signer::new(SigningKey::new([7; 32]), 0), NOW, 1);
         assert_eq!(verifier.check(NOW, &packet[..len]), Err(SigningFault::Forged));
         let (packet, len) = signed(&mut signer, NOW, 1);
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_sender_may_be_a_minute_late_and_no_more() {
+    fn accepts_a_new_sender_up_to_a_minute_late() {
         let check = |late_us: u64, expected| {
             let mut verifier = Verifier::new(key());
             let (packet, len) = signed(&mut Signer::new(key(), 0), NOW, 1);
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn senders_are_kept_apart_up_to_a_limit() {
+    fn tracks_senders_up_to_a_limit() {
         let mut verifier = Verifier::new(key());
         for system in 1..=17 {
             let (packet, len) = signed(&mut Signer::new(key(), 0), NOW, system);
@@ -297,7 +297,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_bytes_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+        fn rejects_any_bytes_without_a_panic(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
             prop_assert!(Verifier::new(key()).check(NOW, &bytes).is_err());
         }
     }

@@ -15,25 +15,25 @@ use crate::geometry::{Body, Pose, World};
 use crate::messages::PoseSample;
 use crate::time::HostTime;
 
-/// Returns (roll, pitch, yaw), FRD in NED, of an attitude. [rad]
+/// Returns the Euler angles (roll, pitch, yaw) of an attitude, FRD in NED. [rad]
 fn euler_ned(world_from_body: DQuat) -> (f64, f64, f64) {
     let (yaw, pitch, roll) = ned_rotation_from_world(world_from_body).to_euler(EulerRot::ZYX);
     (roll, pitch, yaw)
 }
 
-/// Returns the attitude of (roll, pitch, yaw), FRD in NED. [rad]
+/// Returns the attitude of Euler angles (roll, pitch, yaw), FRD in NED. [rad]
 fn attitude_of_euler(roll: f32, pitch: f32, yaw: f32) -> DQuat {
     world_rotation_from_ned(DQuat::from_euler(EulerRot::ZYX, yaw.into(), pitch.into(), roll.into()))
 }
 
-/// Makes the external navigation message from a localized pose that may be off by one standard
-/// deviation in position [m, world] and attitude [rad, body].
+/// Returns the external navigation message for a localized pose, with standard deviations of position [m, world] and
+/// attitude [rad, body].
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::geometry::Pose;
 /// use vizflyt_protocol::mavlink::{vision_from_mavlink, vision_to_mavlink};
-/// // At (1, 2, 3), level, nose east: NED (2, 1, -3), yaw 90 degrees.
+/// // At (1, 2, 3), level, facing east: NED (2, 1, -3), yaw 90 degrees.
 /// let sigma_m = DVec3::new(0.1, 0.2, 0.3);
 /// let pose = Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::IDENTITY);
 /// let message = vision_to_mavlink(&pose, 55, 0, sigma_m, DVec3::splat(0.01));
@@ -54,8 +54,8 @@ pub fn vision_to_mavlink(
     let p = ned_from_world(world_from_body.translation_m);
     let (roll, pitch, yaw) = euler_ned(world_from_body.rotation);
     let mut covariance = [0.0; 21];
-    // Upper triangle, row by row: the diagonal of (x, y, z, roll, pitch, yaw).
-    // Of a vehicle that is about level, errors of roll, pitch and yaw are those about body axes.
+    // Upper triangle, row by row: the diagonal of (x, y, z, roll, pitch, yaw). For a nearly level vehicle, errors of
+    // roll, pitch and yaw equal those about the body axes.
     let (p_sigma, r_sigma) = (ned_from_world(position_sigma_m), rotation_sigma_rad);
     let sigmas = [p_sigma.x, p_sigma.y, p_sigma.z, r_sigma.x, r_sigma.y, r_sigma.z];
     for (diagonal, sigma) in [0, 6, 11, 15, 18, 20].into_iter().zip(sigmas) {
@@ -74,20 +74,20 @@ pub fn vision_to_mavlink(
     }
 }
 
-/// Makes the external navigation message of a localized pose that was true at `stamp`, which no autopilot
-/// takes for better than it is.
+/// Returns the external navigation message for a localized pose that was measured at `stamp`. The stated uncertainty
+/// has a minimum, so that the autopilot does not overestimate the accuracy.
 pub fn vision_of_sample(sample: &PoseSample, stamp: HostTime) -> VISION_POSITION_ESTIMATE_DATA {
-    // The autopilot relates this clock to its own by itself.
+    // The autopilot converts this clock to its own.
     let usec = stamp.as_ns() / 1000;
     let p_sigma_m = sample.position_sigma_m.as_dvec3().max(VISION_SIGMA_M);
     let r_sigma_rad = sample.rotation_sigma_rad.as_dvec3().max(VISION_SIGMA_RAD);
     vision_to_mavlink(&sample.world_from_body, usec, sample.resets, p_sigma_m, r_sigma_rad)
 }
 
-/// Least standard deviation stated with a pose: fused poses err alike from one to the next, which
-/// the autopilot's filter takes for independent. [m]
+/// Minimum standard deviation stated with a pose. Errors of successive fused poses are correlated, but the autopilot's
+/// filter treats them as independent. [m]
 const VISION_SIGMA_M: DVec3 = DVec3::splat(0.02);
-/// The same of attitudes: one degree. [rad]
+/// Minimum standard deviation of attitudes: about one degree. [rad]
 const VISION_SIGMA_RAD: DVec3 = DVec3::splat(0.02);
 
 /// Reads the external navigation message.
@@ -98,12 +98,12 @@ pub fn vision_from_mavlink(message: &VISION_POSITION_ESTIMATE_DATA) -> Pose<Worl
     )
 }
 
-/// Makes ATTITUDE from an attitude and a rate [rad/s, body].
+/// Returns ATTITUDE for an attitude and an angular velocity [rad/s, body].
 ///
 /// ```
 /// use glam::{DQuat, DVec3};
 /// use vizflyt_protocol::mavlink::{attitude_from_mavlink, attitude_to_mavlink};
-/// // Nose north, rolled 10 degrees to the right: body x rotation is the same in FRD.
+/// // Facing north, rolled 10 degrees to the right: rotation about body x is the same in FRD.
 /// let q = DQuat::from_rotation_z(90f64.to_radians()) * DQuat::from_rotation_x(10f64.to_radians());
 /// let message = attitude_to_mavlink(q, DVec3::new(0.1, 0.2, 0.3), 7);
 /// assert!((message.roll - 10f32.to_radians()).abs() < 1e-6 && message.yaw.abs() < 1e-6);
@@ -129,14 +129,14 @@ pub fn attitude_to_mavlink(
     }
 }
 
-/// Reads ATTITUDE: body to world, and the rate. [rad/s, body]
+/// Reads ATTITUDE: body-to-world rotation and angular velocity. [rad/s, body]
 pub fn attitude_from_mavlink(message: &ATTITUDE_DATA) -> (DQuat, DVec3) {
     let rates =
         DVec3::new(message.rollspeed.into(), message.pitchspeed.into(), message.yawspeed.into());
     (attitude_of_euler(message.roll, message.pitch, message.yaw), body_from_frd(rates))
 }
 
-/// Makes LOCAL_POSITION_NED from a position [m, world] and a velocity [m/s, world].
+/// Returns LOCAL_POSITION_NED for a position [m, world] and a velocity [m/s, world].
 ///
 /// ```
 /// use glam::DVec3;
@@ -170,7 +170,7 @@ pub fn local_position_from_mavlink(message: &LOCAL_POSITION_NED_DATA) -> (DVec3,
 
 /// Reads RAW_IMU: specific force [m/s^2, body] and angular velocity [rad/s, body].
 ///
-/// MAVLink leaves its units open; ArduCopter sends mG and mrad/s (GCS_MAVLINK::send_raw_imu).
+/// MAVLink does not define its units. ArduCopter sends mG and mrad/s (GCS_MAVLINK::send_raw_imu).
 ///
 /// ```
 /// use glam::DVec3;
@@ -207,7 +207,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_pose_survives_the_wire(
+        fn poses_survive_the_wire(
             p in prop::array::uniform3(-50.0..50.0f64),
             yaw in -3.1..3.1f64, pitch in -1.4..1.4f64, roll in -3.1..3.1f64,
         ) {

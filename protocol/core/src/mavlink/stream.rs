@@ -1,13 +1,13 @@
-//! Cuts a byte stream (serial, UDP, TCP) into MAVLink packets and counts what is lost.
+//! Splits a byte stream (serial, UDP, TCP) into MAVLink packets and counts losses.
 //!
-//! A candidate that fails its checksum is retried from its second byte, so a good packet inside a
-//! broken one is never lost. Accepts MAVLink 1 and 2; unknown messages are counted, not errors.
+//! If a candidate fails its checksum, the search continues at its second byte, so that a good packet inside a broken
+//! one is not lost. Accepts MAVLink 1 and 2. Unknown messages are counted, but are not errors.
 
 use ::mavlink::{MAVLinkV2MessageRaw, MavHeader, MavlinkVersion, Message, calculate_crc};
 
 use super::dialect::MavMessage;
 
-/// Longest packet: MAVLink 2, full payload, signed. [bytes]
+/// Maximum packet size: MAVLink 2, full payload, signed. [bytes]
 pub const MAX_PACKET: usize = 280;
 
 /// One decoded packet.
@@ -19,18 +19,18 @@ pub struct Packet {
     pub message: MavMessage,
 }
 
-/// What a decoder has seen since it was made.
+/// Counters of a decoder since its creation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StreamStats {
     /// Packets decoded.
     pub packets: u64,
-    /// Packets that checked but are of no message we know, or hold an invalid value.
+    /// Valid packets of an unknown message or with an invalid value.
     pub unknown: u64,
-    /// Bytes that belonged to no valid packet.
+    /// Bytes outside valid packets.
     pub dropped_bytes: u64,
 }
 
-/// Bytes in, packets out.
+/// Decoder from bytes to packets.
 #[derive(Clone)]
 pub struct StreamDecoder {
     buffer: [u8; 2 * MAX_PACKET],
@@ -45,12 +45,12 @@ impl Default for StreamDecoder {
 }
 
 impl StreamDecoder {
-    /// Takes bytes and calls `sink` with each whole packet, in order.
+    /// Adds bytes and calls `sink` for each complete packet, in order.
     pub fn push(&mut self, bytes: &[u8], mut sink: impl FnMut(Packet)) {
         self.push_whole(bytes, |_, packet| sink(packet));
     }
 
-    /// As [`Self::push`]; `sink` gets the packet's bytes too, as a signature needs them.
+    /// Like [`Self::push`], but also passes the packet's bytes to `sink`, for example to verify a signature.
     pub fn push_whole(&mut self, mut bytes: &[u8], mut sink: impl FnMut(&[u8], Packet)) {
         while !bytes.is_empty() {
             let taken = bytes.len().min(self.buffer.len() - self.filled);
@@ -66,7 +66,7 @@ impl StreamDecoder {
         self.stats
     }
 
-    /// Takes every whole packet off the buffer; leaves less than one packet in it.
+    /// Removes all complete packets from the buffer. Leaves less than one packet.
     fn drain(&mut self, sink: &mut impl FnMut(&[u8], Packet)) {
         let mut start = 0;
         loop {
@@ -112,7 +112,7 @@ enum Candidate {
     Good { len: usize, packet: Option<Packet> },
 }
 
-/// Judges the bytes from a start marker on.
+/// Checks the bytes from a start marker on.
 fn candidate(bytes: &[u8]) -> Candidate {
     // (header, checksum end) sizes by version: MAVLink guide, "Packet serialization".
     let (version, header_len, flags_ok, signature) = match bytes {
@@ -180,7 +180,7 @@ mod tests {
     fn stream() -> (Vec<u8>, Vec<MavMessage>) {
         let messages = std::vec![
             MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()),
-            // Bytes that look like a start marker inside a payload.
+            // Bytes inside a payload that look like a start marker.
             MavMessage::TIMESYNC(TIMESYNC_DATA {
                 tc1: i64::from_le_bytes([0xFD; 8]),
                 ts1: i64::from_le_bytes([0xFE; 8]),
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_decodes_at_every_chunk_size() {
+    fn decodes_a_stream_at_every_chunk_size() {
         let (bytes, messages) = stream();
         for chunk in 1..=bytes.len() {
             let (found, stats) = decode(&bytes, chunk);
@@ -217,9 +217,9 @@ mod tests {
     }
 
     #[test]
-    fn a_packet_inside_a_broken_one_is_found() {
+    fn finds_a_packet_inside_a_broken_one() {
         let (good, messages) = stream();
-        // A header that promises 200 bytes of payload, then a whole good stream inside it.
+        // A header that announces 200 bytes of payload, followed by a complete good stream.
         let mut bytes = std::vec![0xFD, 200, 0, 0, 0, 1, 1, 0, 0, 0];
         bytes.extend_from_slice(&good);
         bytes.extend_from_slice(&[0; 300]);
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn our_encoder_equals_the_crates_writer() {
+    fn encoder_matches_the_mavlink_crate() {
         for message in stream().1 {
             let mut theirs = Vec::new();
             ::mavlink::write_v2_msg(&mut theirs, header(9), &message).unwrap();
@@ -239,11 +239,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn garbage_costs_at_most_itself(garbage in prop::collection::vec(any::<u8>(), 0..300), chunk in 1..64usize) {
+        fn garbage_does_not_affect_later_packets(garbage in prop::collection::vec(any::<u8>(), 0..300), chunk in 1..64usize) {
             let (good, messages) = stream();
             let mut bytes = garbage;
             bytes.extend_from_slice(&good);
-            // Push a candidate that starts in the garbage and waits for more bytes over its end.
+            // Complete a candidate that starts in the garbage and waits for more bytes.
             bytes.extend_from_slice(&[0; MAX_PACKET]);
             let (found, _) = decode(&bytes, chunk);
             prop_assert!(found.ends_with(&messages));

@@ -1,4 +1,4 @@
-//! What happened, for the guard, the plugin, the page and the log.
+//! Events for the guard, the plugin, the page and the log.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -7,26 +7,26 @@ use super::{Name, Text, displayed};
 use crate::flight_end::{Collision, EndReason, FenceBreach};
 use crate::time::ServerTime;
 
-/// One occurrence. Events travel in order and are never lost.
+/// Event. Events arrive in order and are never lost.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Event {
-    /// When, on the server's clock; zero if the runtime made it before it knew that clock.
+    /// Time on the server's clock; zero if the runtime created it before the clocks were synchronized.
     pub stamp: ServerTime,
-    /// The kind.
+    /// Kind, with its data.
     pub kind: EventKind,
-    /// One sentence for a person.
+    /// Sentence for a person.
     pub text: Text,
 }
 
 impl Event {
-    /// Makes an event that ends a flight, with the sentence for its reason.
+    /// Returns an event that ends a flight, with the sentence for its reason.
     pub fn ending(stamp: ServerTime, kind: EventKind) -> Self {
         let text = kind.end_reason().as_ref().map(displayed).unwrap_or_default();
         Self { stamp, kind, text }
     }
 }
 
-/// The kinds of [`Event`]. New kinds go at the end; a change raises the protocol version.
+/// Kind of an [`Event`]. Add new kinds at the end. A change raises the protocol version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap to box a reason on.
@@ -39,45 +39,45 @@ pub enum EventKind {
     Stage {
         /// Index in the course, from 0.
         index: u8,
-        /// Its name in `arena.toml`.
+        /// Name of the stage in `arena.toml`.
         name: Name,
     },
     /// The vehicle reached the goal.
     Finished {
-        /// Since take-off. [s]
+        /// Time since take-off. [s]
         seconds: f64,
     },
-    /// The course's time is up.
+    /// The course's time limit was reached.
     TimeLimit {
-        /// What the course allows from take-off. [s]
+        /// Time limit of the course, from take-off. [s]
         limit_s: f64,
     },
-    /// No pose has come for longer than the arena's `hold_after_s`: the guard holds. The flight goes on
-    /// if one comes before `land_after_s`.
+    /// No pose arrived for longer than the arena's `hold_after_s`: the guard holds. The flight continues if a pose
+    /// arrives before `land_after_s`.
     PoseLost {
         /// Age of the newest pose. [s]
         age_s: f64,
     },
-    /// Poses have come back.
+    /// Poses arrive again.
     PoseRegained,
     /// A person pressed the stop button. The guard lands.
     EmergencyStop,
     /// The vehicle's phase of flight changed.
     Phase(super::FlightPhase),
-    /// Something else ended the flight: plugin, autopilot, localization, the runtime's own limits.
+    /// Another reason ended the flight: plugin, autopilot, localization, or limits of the runtime.
     Ended(EndReason),
-    /// A line the plugin printed.
+    /// Line printed by the plugin.
     PluginOutput,
-    /// Anything else worth a person's attention.
+    /// Any other note for the user.
     Note,
-    /// A person lets a vehicle take off that waits for it ([`super::FlightPhase::Waiting`]).
+    /// A person starts a waiting vehicle ([`super::FlightPhase::Waiting`]).
     Start,
-    /// A person ends the flight: it brakes, then lands.
+    /// A person ends the flight: the vehicle brakes, then lands.
     Land,
 }
 
 impl EventKind {
-    /// Returns why a flight ends with this; `None` if it does not.
+    /// Returns the reason if this event ends a flight.
     pub fn end_reason(&self) -> Option<EndReason> {
         Some(match self {
             Self::Collision(collision) => EndReason::Collision(collision.clone()),
@@ -91,7 +91,7 @@ impl EventKind {
         })
     }
 
-    /// Returns the vehicle's place, where the event has one. [m, world]
+    /// Returns the vehicle's position, if the event contains one. [m, world]
     pub fn place_mut(&mut self) -> Option<&mut DVec3> {
         match self {
             Self::Collision(collision) | Self::Ended(EndReason::Collision(collision)) => {

@@ -1,4 +1,4 @@
-//! Which kinds of setpoint a course allows.
+//! Kinds of setpoint that a course allows.
 
 use core::fmt;
 
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Setpoint;
 
-/// A kind of setpoint. To hold, to land and to go back to the height of take-off are always allowed.
+/// Kind of setpoint. Hold, land and take-off setpoints are always allowed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SetpointKind {
@@ -18,16 +18,16 @@ pub enum SetpointKind {
     Velocity,
     /// An acceleration.
     Acceleration,
-    /// A point from where the vehicle is.
+    /// A point relative to the vehicle.
     Offset,
-    /// Body rates under a thrust.
+    /// Body rates and thrust.
     AttitudeRate,
     /// Waypoints or polynomials.
     Trajectory,
 }
 
 impl SetpointKind {
-    /// Every one.
+    /// All kinds.
     pub const ALL: [Self; 6] = [
         Self::Position,
         Self::Velocity,
@@ -37,7 +37,7 @@ impl SetpointKind {
         Self::Trajectory,
     ];
 
-    /// Returns the kind of a setpoint; `None` of one that is always allowed.
+    /// Returns the kind of a setpoint; `None` if it is always allowed.
     pub fn of(setpoint: &Setpoint) -> Option<Self> {
         match setpoint {
             Setpoint::Hold | Setpoint::Land | Setpoint::TakeOff => None,
@@ -50,7 +50,7 @@ impl SetpointKind {
         }
     }
 
-    /// Returns its name, as `arena.toml` has it.
+    /// Returns the name, as in `arena.toml`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Position => "position",
@@ -63,21 +63,21 @@ impl SetpointKind {
     }
 }
 
-/// A set of kinds of setpoint; in files a list of their names.
+/// Set of kinds of setpoint. In files, a list of their names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SetpointKinds(u8);
 
 impl SetpointKinds {
-    /// None but those that are always allowed.
+    /// The empty set: only setpoints that are always allowed.
     pub const NONE: Self = Self(0);
-    /// All but attitude rates: the default of a course.
+    /// Default of a course: all kinds except attitude rates.
     pub const USUAL: Self = Self(0b10_1111);
-    /// The default of a course that withholds the pose: what a vehicle flies by its own senses.
+    /// Default of a course that withholds the pose: kinds that do not need a position in the world.
     pub const BY_OWN_SENSES: Self = Self(0b10_1110);
-    /// Every one.
+    /// All kinds.
     pub const ALL: Self = Self(0b11_1111);
 
-    /// Returns the set with another kind in it.
+    /// Returns the set with `kind` added.
     ///
     /// ```
     /// use vizflyt_protocol::messages::{SetpointKind, SetpointKinds};
@@ -89,17 +89,17 @@ impl SetpointKinds {
         Self(self.0 | 1 << kind as u8)
     }
 
-    /// Whether a kind is in it.
+    /// Whether the set contains a kind.
     pub const fn contains(self, kind: SetpointKind) -> bool {
         self.0 & 1 << kind as u8 != 0
     }
 
-    /// Whether a setpoint may be asked for.
+    /// Whether a setpoint is allowed.
     pub fn allow(self, setpoint: &Setpoint) -> bool {
         SetpointKind::of(setpoint).is_none_or(|kind| self.contains(kind))
     }
 
-    /// Returns those in it.
+    /// Returns the kinds in the set.
     pub fn iter(self) -> impl Iterator<Item = SetpointKind> {
         SetpointKind::ALL.into_iter().filter(move |&kind| self.contains(kind))
     }
@@ -111,7 +111,7 @@ impl FromIterator<SetpointKind> for SetpointKinds {
     }
 }
 
-/// The names, with commas.
+/// Writes the names, separated by commas.
 impl fmt::Display for SetpointKinds {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, kind) in self.iter().enumerate() {
@@ -166,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_names_are_those_of_files() {
+    fn parses_the_names_used_in_files() {
         let kinds: SetpointKinds = serde_json::from_str(r#"["velocity", "position"]"#).unwrap();
         assert_eq!(kinds, [SetpointKind::Position, SetpointKind::Velocity].into_iter().collect());
         assert_eq!(kinds.to_string(), "position, velocity");
@@ -182,7 +182,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_sent_arrives(bits in 0_u8..0b100_0000) {
+        fn survives_serialization(bits in 0_u8..0b100_0000) {
             let kinds = SetpointKinds(bits);
             let mut buffer = [0; 16];
             let bytes = postcard::to_slice(&kinds, &mut buffer).unwrap();

@@ -1,21 +1,20 @@
-//! Messages: postcard types, one concern per file. Bounded, so that a hostile length costs
-//! nothing.
+//! Messages: postcard types, one concern per file. All sizes are bounded, so that a malicious length cannot cause an
+//! allocation.
 //!
 //! Control stream (one ordered, bidirectional QUIC stream, opened by the runtime):
-//! 1. each side sends its [`crate::packet::Preamble`] and checks the other's;
-//! 2. the runtime sends [`ToServer::Hello`]; the server answers [`ToRuntime::Welcome`] or
-//!    [`ToRuntime::Refused`];
-//! 3. then events, changed cameras and clock replies flow down; telemetry, events and clock
-//!    requests up.
+//! 1. Each side sends its [`crate::packet::Preamble`] and checks the other's.
+//! 2. The runtime sends [`ToServer::Hello`]; the server answers [`ToRuntime::Welcome`] or [`ToRuntime::Refused`].
+//! 3. Then the server sends events, camera changes and clock replies; the runtime sends telemetry, events and clock
+//!    requests.
 //!
-//! Events are numbered from 1 by who makes them, and acknowledged with `EventsReceived`. Each side states at
-//! the start what it has received of the other ([`ReceivedEvents`]), so that after an outage whatever is
-//! missing is sent again, and nothing twice.
+//! Each sender numbers its events from 1, and the receiver acknowledges them with `EventsReceived`. At the start, each
+//! side states the events that it has received from the other ([`ReceivedEvents`]). After an outage, missing events are
+//! sent again, and none is delivered twice.
 //!
-//! Poses come as datagrams ([`Datagram`]): a lost one holds up nothing, the newest by stamp counts.
+//! Poses are sent as datagrams ([`Datagram`]): a lost one delays nothing, and the newest stamp counts.
 //!
-//! Each message is framed by [`crate::packet::framing`]. Plugin messages ([`ToPlugin`],
-//! [`FromPlugin`]) use the same encoding over shared-memory queues.
+//! [`crate::packet::framing`] frames each message. Plugin messages ([`ToPlugin`], [`FromPlugin`]) use the same encoding
+//! over shared-memory queues.
 
 use core::fmt;
 
@@ -48,28 +47,28 @@ pub use trajectory::{
     COEFFICIENTS, MAX_PIECES, MAX_WAYPOINTS, Path, PathYaw, Piece, Trajectory, Waypoint,
 };
 
-/// Codes with which a server closes a connection and that a client acts on.
+/// QUIC close codes that a client handles.
 pub mod close {
-    /// This computer is not paired with the server, or no longer.
+    /// This computer is not paired with the server, or its pairing was removed.
     pub const UNPAIRED: u32 = 5;
 }
 
-/// A short name: of a vehicle, a camera, a stage.
+/// Short name of a vehicle, a camera or a stage.
 pub type Name = heapless::String<32>;
-/// A sentence for a person.
+/// Sentence for a person.
 pub type Text = heapless::String<192>;
 
-/// Most cameras of one vehicle.
+/// Maximum number of cameras per vehicle.
 pub const MAX_CAMERAS: usize = 8;
-/// Most no-fly boxes of an arena.
+/// Maximum number of no-fly boxes per arena.
 pub const MAX_NO_FLY: usize = 8;
 
-/// Returns `text` cut to what a bounded string holds, at a character boundary.
+/// Returns `text`, truncated to the capacity at a character boundary.
 pub fn bounded<const N: usize>(text: &str) -> heapless::String<N> {
     displayed(&text)
 }
 
-/// Returns what `value` displays, cut to what a bounded string holds, at a character boundary.
+/// Returns the displayed form of `value`, truncated to the capacity at a character boundary.
 pub fn displayed<const N: usize>(value: &impl fmt::Display) -> heapless::String<N> {
     struct Cut<const N: usize>(heapless::String<N>);
     impl<const N: usize> fmt::Write for Cut<N> {
@@ -78,7 +77,7 @@ pub fn displayed<const N: usize>(value: &impl fmt::Display) -> heapless::String<
         }
     }
     let mut out = Cut(heapless::String::new());
-    // The only error is that no more fits.
+    // The only possible error is a full string.
     let _ = fmt::Write::write_fmt(&mut out, format_args!("{value}"));
     out.0
 }

@@ -1,40 +1,40 @@
-//! Pairing: the conversation by which a computer and a server come to know each other, once.
+//! Pairing: one-time exchange by which a computer and a server trust each other.
 //!
-//! On a QUIC connection of its own protocol name, on one bidirectional stream that the client
-//! opens: preambles, then
+//! Uses a QUIC connection with its own protocol name and one bidirectional stream that the client opens. After the
+//! preambles:
 //! ```text
 //! client                                server
-//!   Begin { name, share }  ---------->          a window must be open
+//!   Begin { name, share }  ---------->          pairing must be open on the server
 //!                          <----------  Share { share }
-//!   Confirm { proof }      ---------->          counts as a try; wrong: Refused
+//!   Confirm { proof }      ---------->          counts as an attempt; if wrong: Refused
 //!                          <----------  Paired { proof, grant }
 //! ```
-//! `Refused` may come instead of any answer.
+//! The server may send `Refused` instead of any reply.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Name, Text};
 
-/// One side's half of the key agreement (SPAKE2, RFC 9382), without the letter of its side.
+/// Share of one side in the key agreement (SPAKE2, RFC 9382), without the letter that identifies the side.
 pub type PairingShare = [u8; 32];
-/// Proof of having agreed on the same key over the same connection.
+/// Proof that a side derived the same key on the same connection.
 pub type PairingProof = [u8; 32];
-/// Most vehicles a team is granted by one pairing.
+/// Maximum number of vehicles that one pairing grants to a team.
 pub const MAX_GRANTED: usize = 8;
 
 /// Client to server.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum PairingRequest {
-    /// Asks to be paired.
+    /// Request to be paired.
     Begin {
-        /// What people shall call this computer.
+        /// Name of this computer for display.
         name: Name,
-        /// Its half.
+        /// Share of the client.
         share: PairingShare,
     },
-    /// Shows that it has the key, and so the code.
+    /// Proof that the client has the key and therefore the code.
     Confirm {
-        /// The client's proof.
+        /// Proof of the client.
         proof: PairingProof,
     },
 }
@@ -43,31 +43,31 @@ pub enum PairingRequest {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap to box it on, and it comes once.
 pub enum PairingReply {
-    /// The server's half.
+    /// Share of the server.
     Share {
-        /// It.
+        /// Share of the server.
         share: PairingShare,
     },
-    /// Done.
+    /// Pairing succeeded.
     Paired {
-        /// The server's proof.
+        /// Proof of the server.
         proof: PairingProof,
-        /// What the client may do from now on.
+        /// Rights of the client.
         grant: Grant,
     },
-    /// Not done; the reason, and what to do.
+    /// Pairing failed; with the reason and a remedy.
     Refused(Text),
 }
 
-/// What a pairing gives.
+/// Rights that a pairing grants.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: as above.
 pub enum Grant {
-    /// Flying and watching these vehicles.
+    /// The right to fly and watch these vehicles.
     Team {
-        /// Their names.
+        /// Names of the vehicles.
         vehicles: heapless::Vec<Name, MAX_GRANTED>,
     },
-    /// Everything.
+    /// All rights.
     Instructor,
 }

@@ -1,4 +1,4 @@
-//! Between the runtime and the plugin process, beside the images.
+//! Messages between the runtime and the plugin process. Images are in shared memory.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,64 +6,64 @@ use super::{ArenaInfo, Event, Setpoint, Text};
 use crate::geometry::{Body, Odom, Pose};
 use crate::time::HostTime;
 
-/// Runtime to plugin. Ordered, never lost.
+/// Runtime to plugin. Ordered and reliable.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: `Start` comes once, and there is no heap to box it on.
 pub enum ToPlugin {
-    /// What the plugin flies in; comes before the first image.
+    /// Description of the arena; sent before the first image.
     Start(ArenaInfo),
-    /// Something happened.
+    /// Event of the flight.
     Event(Event),
-    /// End now: `on_stop`, then exit.
+    /// Stop: call `on_stop`, then exit.
     Stop,
 }
 
-/// Plugin to runtime. Ordered, never lost.
+/// Plugin to runtime. Ordered and reliable.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap here to box a trajectory on.
 pub enum FromPlugin {
-    /// `on_start` returned; the plugin waits for images.
+    /// `on_start` has returned. The plugin waits for images.
     Ready {
-        /// The plugin's name for people.
+        /// Name of the plugin for display.
         name: Text,
     },
-    /// The reply to one image.
+    /// Reply to one image.
     Reply {
-        /// The image's sequence number.
+        /// Sequence number of the image.
         seq: u64,
-        /// When `on_image` was entered.
+        /// Time at which `on_image` was called.
         entered: HostTime,
-        /// When it returned.
+        /// Time at which it returned.
         returned: HostTime,
-        /// What it returned; `None` leaves the former setpoint in force until its deadline.
+        /// Returned setpoint. `None` keeps the previous setpoint until its deadline.
         setpoint: Option<Setpoint>,
     },
-    /// The plugin gives up; why.
+    /// The plugin gives up.
     Failed {
-        /// One sentence.
+        /// Reason, one sentence.
         reason: Text,
     },
-    /// Where the plugin thinks it is. It is logged and evaluated; nothing is flown by it.
+    /// Pose estimated by the plugin. It is logged and evaluated, but not used for flying.
     Odometry(Odometry),
 }
 
-/// A pose that a plugin has estimated by itself.
+/// Pose estimated by a plugin.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Odometry {
-    /// The instant that it is of: of an estimate from an image, the one that the image shows.
+    /// Time for which the estimate is valid. For an estimate from an image, the time that the image shows.
     pub stamp: HostTime,
-    /// Where the vehicle was. z of the frame is up; origin and heading are the plugin's choice.
+    /// Pose of the vehicle. The frame's z axis is up; the plugin chooses origin and heading.
     pub odom_from_body: Pose<Odom, Body>,
 }
 
-/// Estimates that a plugin may publish with one reply: of each of a few cameras, say.
+/// Maximum number of estimates that a plugin may publish with one reply, for example one per camera.
 pub const MAX_ODOMETRY_PER_REPLY: usize = 4;
 
 impl Odometry {
-    /// No estimate is farther from its origin. [m]
+    /// Maximum distance from the origin. [m]
     pub const FARTHEST_M: f64 = 1e5;
 
-    /// Whether every number is finite, the quaternion of unit length within 1e-3, and the place within
+    /// Whether all numbers are finite, the quaternion has unit length within 1e-3, and the position is within
     /// [`Self::FARTHEST_M`].
     pub fn is_valid(&self) -> bool {
         let pose = &self.odom_from_body;

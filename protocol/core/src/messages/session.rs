@@ -1,4 +1,4 @@
-//! The conversation between runtime and server on the control stream.
+//! Messages between runtime and server on the control stream.
 
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
@@ -10,60 +10,61 @@ use crate::geometry::{Body, Cam, Intrinsics, Pose, Twist, Volume, World, body_fr
 use crate::sensor::{MAX_SENSORS, SensorInfo};
 use crate::time::{HostTime, ServerTime};
 
-/// What a client is there for.
+/// Purpose of a client.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Purpose {
-    /// Flies the vehicle: gets all, reports, sends events. One at a time.
+    /// Flies the vehicle: receives everything, reports, sends events. One client at a time.
     #[default]
     Fly,
-    /// Watches it: gets images, poses and events; what it sends but clock requests is ignored.
+    /// Watches the vehicle: receives images, poses and events. The server ignores everything it sends except clock
+    /// requests.
     Watch,
 }
 
 /// First message of a client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Hello {
-    /// The vehicle that it flies or watches: the object's name in the localization system.
+    /// Vehicle to fly or to watch: the name of the object in the localization system.
     pub vehicle: Name,
-    /// What it is there for.
+    /// Purpose of the client.
     pub purpose: Purpose,
-    /// The program and its version, for the page and the log.
+    /// Program and version, for the page and the log.
     pub program: Text,
-    /// Random, chosen when the program started: distinguishes its events from those of another run.
+    /// Random number of this run of the program. It distinguishes events of different runs.
     pub boot: u64,
-    /// What it has received of the server's events before.
+    /// Server events that were already received.
     pub received_events: ReceivedEvents,
 }
 
-/// Accepts a client.
+/// Reply that accepts a client.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Welcome {
-    /// Random, chosen when the server started: another one means that it was restarted.
+    /// Random number of this run of the server. A different number means that the server was restarted.
     pub boot: u64,
-    /// What the server has received of this client's events before.
+    /// Events of this client that the server has already received.
     pub received_events: ReceivedEvents,
-    /// What it must know of the arena.
+    /// Description of the arena.
     pub arena: ArenaInfo,
-    /// UDP port of the pose feed ([`crate::packet::feed`]) for the guardian of a flight; 0 is none.
+    /// UDP port of the pose feed ([`crate::packet::feed`]) for the guardian of a flight; 0 if there is none.
     pub feed_port: u16,
 }
 
-/// How many of the other side's events have been received.
+/// Progress of receiving the other side's events.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ReceivedEvents {
-    /// Whose they were: the other side's `boot`; 0 is nobody's.
+    /// Run of the sender: its `boot`; 0 before the first event.
     pub boot: u64,
-    /// Number of the newest; 0 is none.
+    /// Number of the newest event; 0 before the first.
     pub seq: u64,
 }
 
 impl ReceivedEvents {
-    /// Returns the newest number received of the run `boot`; 0 of any other.
+    /// Returns the newest number received from the run `boot`; 0 for any other run.
     pub fn of(&self, boot: u64) -> u64 {
         if self.boot == boot { self.seq } else { 0 }
     }
 
-    /// Takes note of an event of the run `boot`; returns whether it is new.
+    /// Records an event of the run `boot`. Returns whether it is new.
     pub fn receive(&mut self, boot: u64, seq: u64) -> bool {
         let is_new = seq > self.of(boot);
         if is_new {
@@ -73,19 +74,19 @@ impl ReceivedEvents {
     }
 }
 
-/// Asks the server's clock. The runtime sends one a second, four times as often at the start.
+/// Request for the server's time. The runtime sends one per second, and four per second at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClockRequest {
-    /// When the runtime asked.
+    /// Time at which the runtime sent the request.
     pub sent: HostTime,
 }
 
-/// Answers [`ClockRequest`].
+/// Reply to [`ClockRequest`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ClockReply {
     /// Copied from the request.
     pub sent: HostTime,
-    /// When the server answered.
+    /// Time at which the server replied.
     pub answered: ServerTime,
 }
 
@@ -93,47 +94,47 @@ pub struct ClockReply {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant)] // Why: the largest comes once a second, and there is no heap.
 pub enum ToServer {
-    /// Opens the conversation.
+    /// First message of a client.
     Hello(Hello),
-    /// Asks the time.
+    /// Request for the server's time.
     Clock(ClockRequest),
-    /// Reports. 10 Hz.
+    /// Report of the runtime, at 10 Hz.
     Telemetry(Telemetry),
-    /// Something the page should show.
+    /// Event for the page.
     Event {
-        /// Its number among this client's events, rising.
+        /// Sequence number among this client's events.
         seq: u64,
-        /// The event.
+        /// Event.
         event: Event,
     },
-    /// Every event of the server up to this number has been received.
+    /// Acknowledges all events of the server up to this number.
     EventsReceived(u64),
-    /// Reports where images get their age. 1 Hz.
+    /// Latency report by stage, at 1 Hz.
     Timing(Timing),
-    /// Readings of the autopilot's IMU, oldest first; each once. 25 to 50 Hz.
+    /// Readings of the autopilot's IMU, oldest first, each sent once. 25 to 50 Hz.
     Imu(heapless::Vec<ImuReading, MAX_IMU_BATCH>),
-    /// Reports what the guard keeps the vehicle within; once a connection, and when it changes. A server that does
-    /// not know it drops it.
+    /// Limits that the guard enforces. Sent once per connection and after each change. A server that does not support
+    /// this message drops it.
     Guarded(Guarded),
 }
 
-/// What the runtime keeps its vehicle within.
+/// Limits within which the runtime keeps its vehicle.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Guarded {
-    /// Keep-in volume of the guard, for the body's surface. [world]
+    /// Geofence of the guard, for the body's surface. [world]
     pub geofence: Volume,
-    /// Keep-out volumes of the guard.
+    /// Number of no-fly boxes of the guard.
     pub no_fly: u8,
     /// Height of the floor. [m, world]
     pub floor_z_m: f64,
     /// Limits of motion: the stricter ones of arena and vehicle.
     pub limits: Limits,
-    /// Polygons that the autopilot has accepted for its own fence in this flight; `None` if it accepted none.
+    /// Number of polygons that the autopilot has accepted for its own fence in this flight; `None` if it accepted none.
     pub polygons: Option<u8>,
 }
 
 impl Guarded {
-    /// Returns what a guard holds that flies by `arena`, with an autopilot that has accepted so many polygons.
+    /// Returns the limits of a guard in `arena`, with an autopilot that has accepted this number of polygons.
     pub fn of(arena: &ArenaInfo, polygons: Option<u8>) -> Self {
         Self {
             geofence: arena.geofence,
@@ -151,69 +152,68 @@ impl Guarded {
 pub enum ToRuntime {
     /// Accepts the client.
     Welcome(Welcome),
-    /// Declines it, with the reason and what to do.
+    /// Rejects the client, with the reason and a remedy.
     Refused(Text),
-    /// Returns the time.
+    /// Reply with the server's time.
     Clock(ClockReply),
-    /// Something happened.
+    /// Event for the runtime or a watcher.
     Event {
-        /// Its number among this server's events, rising; not every number is for every client.
+        /// Sequence number among this server's events. A client may not receive every number.
         seq: u64,
-        /// The event.
+        /// Event.
         event: Event,
     },
-    /// Every event of this client up to this number has been received.
+    /// Acknowledges all events of this client up to this number.
     EventsReceived(u64),
-    /// A camera was changed while flying. Images rendered with it may come before this does: each
-    /// states itself how it was rendered.
+    /// A camera was changed in flight. Images rendered with the new camera may arrive earlier than this message; each
+    /// image contains its own camera parameters.
     Camera {
         /// Index into [`ArenaInfo::cameras`].
         index: u8,
-        /// The camera as it is from now on; its name stays.
+        /// New parameters of the camera. The name does not change.
         camera: CameraInfo,
     },
-    /// A sensor was changed while flying.
+    /// A sensor was changed in flight.
     Sensor {
         /// Index into [`ArenaInfo::sensors`].
         index: u8,
-        /// The sensor as it is from now on; its name and its kind stay.
+        /// New parameters of the sensor. Name and kind do not change.
         sensor: SensorInfo,
     },
 }
 
-/// Server to client, unordered, possibly lost; [`crate::packet::framing::encode_body`] without a
-/// length.
+/// Server to client, unordered and unreliable. Encoded by [`crate::packet::framing::encode_body`] without a length.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Datagram {
-    /// The vehicle's pose. At most 100 Hz; the newest by stamp counts.
+    /// Pose of the vehicle, at most 100 Hz. The newest stamp counts.
     Pose(PoseSample),
 }
 
-/// The vehicle's pose as localized and fused by the server.
+/// Pose of the vehicle, localized and fused by the server.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseSample {
-    /// When the pose was true.
+    /// Time of the measurement.
     pub stamp: ServerTime,
-    /// Where the vehicle was.
+    /// Pose of the vehicle.
     pub world_from_body: Pose<World, Body>,
-    /// Linear velocity in world axes, angular in body axes.
+    /// Linear velocity in world axes, angular velocity in body axes.
     pub twist: Twist,
-    /// Raised by one whenever the pose jumped for another reason than motion.
+    /// Counter of jumps of the pose that are not motion.
     pub resets: u8,
-    /// How far the position may be off, one standard deviation an axis; 0 is not known. [m, world]
+    /// Standard deviation of the position per axis; 0 if unknown. [m, world]
     pub position_sigma_m: Vec3,
-    /// How far the attitude may be off, about each axis; 0 is not known. [rad, body]
+    /// Standard deviation of the attitude about each axis; 0 if unknown. [rad, body]
     pub rotation_sigma_rad: Vec3,
-    /// How much older it may grow than [`PoseAges`] say: by the delay that its source always has, and by the period of
-    /// a slow one. Within 0 and [`MAX_ALLOWANCE_S`]. [s]
+    /// Additional age that is allowed beyond [`PoseAges`], for the constant delay of the source and the period of a
+    /// slow source. Between 0 and [`MAX_ALLOWANCE_S`]. [s]
     pub allowance_s: f32,
 }
 
-/// No delay or period of a source makes ages of a pose count more than so much later. [s]
+/// Maximum additional age for the delay and period of a source. [s]
 pub const MAX_ALLOWANCE_S: f32 = 0.3;
 
 impl PoseSample {
-    /// Makes the sample of a vehicle that stands still, of unknown uncertainty.
+    /// Returns the sample of a vehicle at rest, of unknown uncertainty.
     pub const fn still(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
         let twist = Twist { linear_mps: DVec3::ZERO, angular_radps: DVec3::ZERO };
         let (position_sigma_m, rotation_sigma_rad) = (Vec3::ZERO, Vec3::ZERO);
@@ -228,7 +228,7 @@ impl PoseSample {
         }
     }
 
-    /// Whether every number in it is one to work with.
+    /// Whether all numbers are finite and in range.
     pub fn is_valid(&self) -> bool {
         let Twist { linear_mps, angular_radps } = self.twist;
         self.world_from_body.is_valid()
@@ -240,40 +240,40 @@ impl PoseSample {
     }
 }
 
-/// Ages of the newest pose, less its [`allowance_s`](PoseSample::allowance_s), from which a flight does not go on as
-/// it was.
+/// Ages of the newest pose at which the guard reacts. The pose's [`allowance_s`](PoseSample::allowance_s) is subtracted
+/// first.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseAges {
-    /// The guard holds. [s]
+    /// Age at which the guard holds. [s]
     pub hold_after_s: f64,
-    /// The guard lands. [s]
+    /// Age at which the guard lands. [s]
     pub land_after_s: f64,
 }
 
 impl PoseAges {
-    /// Returns the [`allowance_s`](PoseSample::allowance_s) of poses that come so late, one each `interval_s`: their delay,
-    /// and until a slow source has left out one and is late with the next. [s]
+    /// Returns the [`allowance_s`](PoseSample::allowance_s) of poses with this delay and interval. It is the delay,
+    /// plus the time in which a slow source may skip one pose and send the next one late. [s]
     pub fn allowance_s(&self, delay_s: f64, interval_s: f64) -> f64 {
         let slow_s = (MISSED_POSES * interval_s - self.hold_after_s).max(0.0);
         (delay_s.max(0.0) + slow_s).min(f64::from(MAX_ALLOWANCE_S))
     }
 }
 
-/// Intervals that pass while one pose is left out and the next is late.
+/// Intervals that pass if one pose is skipped and the next is late.
 const MISSED_POSES: f64 = 2.5;
 
 impl Default for PoseAges {
-    /// At 5 m/s 0.15 s are 0.75 m flown blind, and 30 packets of a 200 Hz mocap missed; after 0.5 s
-    /// ArduCopter's own estimate is still good for a landing in place (it lasts 7 s, measured).
+    /// At 5 m/s, the vehicle flies 0.75 m in 0.15 s, and a 200 Hz mocap misses 30 packets. After 0.5 s, ArduCopter's
+    /// own estimate is still good enough to land in place (it lasts 7 s, measured).
     fn default() -> Self {
         Self { hold_after_s: 0.15, land_after_s: 0.5 }
     }
 }
 
-/// A reading of the autopilot's accelerometer and gyroscope.
+/// Reading of the autopilot's accelerometer and gyroscope.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ImuReading {
-    /// When it was made.
+    /// Time of the measurement.
     pub stamp: ServerTime,
     /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
     pub accel_mps2: DVec3,
@@ -281,53 +281,52 @@ pub struct ImuReading {
     pub gyro_radps: DVec3,
 }
 
-/// Most readings of one [`ToServer::Imu`].
+/// Maximum number of readings in one [`ToServer::Imu`].
 pub const MAX_IMU_BATCH: usize = 8;
 
-/// One camera that the server draws.
+/// Camera that the server renders.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CameraInfo {
-    /// What plugins call it: `front`.
+    /// Name for plugins, for example `front`.
     pub name: Name,
     /// Size, focal lengths, principal point.
     pub intrinsics: Intrinsics,
-    /// Extrinsics.
+    /// Extrinsics: pose of the camera on the body.
     pub body_from_cam: Pose<Body, Cam>,
 }
 
 impl CameraInfo {
-    /// Makes a camera at the body's centre that looks straight ahead.
+    /// Returns a camera at the body's centre that looks straight ahead.
     pub fn forward(name: &str, intrinsics: Intrinsics) -> Self {
         let body_from_cam = body_from_forward_cam(DVec3::ZERO, 0.0);
         Self { name: bounded(name), intrinsics, body_from_cam }
     }
 }
 
-/// Limits that the guard enforces whatever a plugin asks.
+/// Limits that the guard enforces for any setpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Limits {
-    /// Greatest speed. [m/s]
+    /// Maximum speed. [m/s]
     pub max_speed_mps: f64,
-    /// Greatest acceleration; also what the guard counts on for stopping. [m/s^2]
+    /// Maximum acceleration. The guard also uses it to compute stopping distances. [m/s^2]
     pub max_acceleration_mps2: f64,
-    /// Greatest tilt from level; without it the acceleration alone limits tilt. [deg]
+    /// Maximum tilt from level. Without it, only the acceleration limits the tilt. [deg]
     pub max_tilt_deg: Option<f64>,
-    /// Greatest height of the body's centre; without it the geofence alone limits height.
-    /// [m, world]
+    /// Maximum height of the body's centre. Without it, only the geofence limits the height. [m, world]
     pub max_altitude_m: Option<f64>,
 }
 
 impl Limits {
-    /// No limit at all: what [`Self::stricter`] leaves any other as it is.
+    /// No limits. [`Self::stricter`] with these returns the other limits.
     pub const NONE: Self = Self::new(f64::INFINITY, f64::INFINITY);
 
-    /// Makes limits of speed [m/s] and acceleration [m/s^2] only.
+    /// Returns limits of speed [m/s] and acceleration [m/s^2] only.
     pub const fn new(max_speed_mps: f64, max_acceleration_mps2: f64) -> Self {
         Self { max_speed_mps, max_acceleration_mps2, max_tilt_deg: None, max_altitude_m: None }
     }
 
-    /// Returns limits that keep both: of each limit the stricter.
+    /// Returns the stricter value of each limit.
     ///
     /// ```
     /// use vizflyt_protocol::messages::Limits;
@@ -339,7 +338,7 @@ impl Limits {
     /// ```
     #[must_use]
     pub fn stricter(&self, other: &Self) -> Self {
-        // A NaN must not win over a limit, nor vanish: `check` refuses it where it is used.
+        // A NaN must neither override a limit nor disappear: `check` rejects it later.
         let least = |a: f64, b: f64| if a.is_nan() || a < b { a } else { b };
         let least_of = |a: Option<f64>, b: Option<f64>| match (a, b) {
             (Some(a), Some(b)) => Some(least(a, b)),
@@ -354,10 +353,10 @@ impl Limits {
     }
 }
 
-/// What a runtime must know of the arena to fly in it.
+/// Description of the arena for a runtime that flies in it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ArenaInfo {
-    /// The arena's name.
+    /// Name of the arena.
     pub name: Name,
     /// Keep-in volume for the body's surface. [world]
     pub geofence: Volume,
@@ -371,30 +370,30 @@ pub struct ArenaInfo {
     pub body_radius_m: f64,
     /// Height above the start to which the runtime climbs before the plugin flies. [m]
     pub takeoff_height_m: f64,
-    /// Where the flight shall end; the plugin gets it. [m, world]
+    /// Goal of the flight, which the plugin receives, too. [m, world]
     pub goal_m: Option<DVec3>,
-    /// How near counts as reached. [m]
+    /// Radius around the goal within which it is reached. [m]
     pub goal_radius_m: f64,
-    /// From take-off; 0 is none. [s]
+    /// Time limit from take-off; 0 for none. [s]
     pub time_limit_s: f64,
-    /// Where the body's centre must be for a take-off; anywhere without one. [world]
+    /// Box in which the body's centre must be for a take-off; `None` for anywhere. [world]
     pub start_box: Option<Volume>,
-    /// Whether plugins get the vehicle's pose and velocity. Where not, they are not in the plugin
-    /// process's memory at all.
+    /// Whether plugins receive the vehicle's pose and velocity. If not, these values are not present in the memory of
+    /// the plugin's process.
     pub ground_truth: bool,
-    /// When the guard holds, and when it lands, for want of a pose.
+    /// Ages of the pose at which the guard holds and lands.
     pub pose_ages: PoseAges,
-    /// What plugins may ask for; the guard refuses the rest.
+    /// Kinds of setpoint that plugins may use. The guard rejects others.
     pub setpoints: SetpointKinds,
     /// The cameras, in the order of their index on the wire.
     pub cameras: heapless::Vec<CameraInfo, MAX_CAMERAS>,
-    /// The sensors beside the cameras, in the order of their index on the wire.
+    /// The sensors other than cameras, in the order of their index on the wire.
     pub sensors: heapless::Vec<SensorInfo, MAX_SENSORS>,
 }
 
 impl ArenaInfo {
-    /// Makes an arena of a fence [world] and limits alone: the floor at zero, no goal, no time limit, no
-    /// camera; a body of 0.1 m that rises by 1 m, and a plugin that gets its pose.
+    /// Returns an arena with this fence [world] and these limits. Defaults: floor at zero, no goal, no time limit, no
+    /// camera, body radius 0.1 m, take-off height 1 m, and the plugin receives its pose.
     pub fn new(name: &str, geofence: Volume, limits: Limits) -> Self {
         Self {
             name: bounded(name),
@@ -422,12 +421,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_event_of_a_run_is_new_once() {
+    fn accepts_each_event_of_a_run_once() {
         let mut received = ReceivedEvents::default();
         assert!(received.receive(7, 1) && received.receive(7, 4));
         assert!(!received.receive(7, 1) && !received.receive(7, 4));
         assert_eq!((received.of(7), received.of(8)), (4, 0));
-        // The other side was restarted and counts from the start.
+        // The other side was restarted and counts from 1.
         assert!(received.receive(8, 1));
         assert_eq!((received.of(7), received.of(8)), (0, 1));
     }

@@ -1,39 +1,39 @@
-//! What a plugin asks of the vehicle.
+//! Setpoints that a plugin returns.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::{SetpointKind, SetpointKinds, Trajectory};
 
-/// The axes in which a vector of a setpoint is given.
+/// Axes of a setpoint's vector.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axes {
     /// x east, y north, z up.
     #[default]
     World,
-    /// x along the nose's heading, y left of it, z up: the body frame levelled, so that "ahead"
-    /// never means "into the floor" while the vehicle pitches.
+    /// x along the vehicle's heading, y to its left, z up: the levelled body frame. While the vehicle pitches, "ahead"
+    /// remains horizontal.
     Heading,
-    /// x forward, y left, z up of the body as it is tilted at the moment.
+    /// Body axes with the current tilt: x forward, y left, z up.
     Body,
 }
 
-/// Where the nose shall point.
+/// Target of the vehicle's yaw.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum YawTarget {
-    /// Keep the heading of the moment.
+    /// Keep the current heading.
     #[default]
     Keep,
-    /// This heading: angle from world x, counter-clockwise. [rad, world]
+    /// Heading: angle from world x, counter-clockwise. [rad, world]
     Angle(f64),
-    /// Turn at this rate, counter-clockwise. [rad/s]
+    /// Yaw rate, counter-clockwise. [rad/s]
     Rate(f64),
 }
 
 impl YawTarget {
-    /// Whether its number, if it has one, is finite.
+    /// Whether its number, if any, is finite.
     pub fn is_finite(self) -> bool {
         match self {
             Self::Keep => true,
@@ -42,95 +42,94 @@ impl YawTarget {
     }
 }
 
-/// A continuous target for the vehicle; the newest one holds until the guard's deadline.
+/// Target for the vehicle. The newest setpoint is valid until the guard's deadline.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap here to box a trajectory on.
 pub enum Setpoint {
-    /// Stop and stay.
+    /// Stop and hold the position.
     #[default]
     Hold,
-    /// Come down here and disarm.
+    /// Land here and disarm.
     Land,
-    /// Fly to a point and stay.
+    /// Fly to a point and hold there.
     Position {
-        /// Target. [m, world]
+        /// Target position. [m, world]
         p_world_m: DVec3,
         /// Heading.
         yaw: YawTarget,
     },
     /// Fly at a velocity.
     Velocity {
-        /// Target. [m/s, `axes`]
+        /// Target velocity. [m/s, `axes`]
         v_mps: DVec3,
         /// Axes of `v_mps`.
         axes: Axes,
         /// Heading.
         yaw: YawTarget,
     },
-    /// Accelerate, gravity already compensated: zero keeps the velocity.
+    /// Accelerate. Gravity is compensated: zero keeps the velocity.
     Acceleration {
-        /// Target. [m/s^2, `axes`]
+        /// Target acceleration. [m/s^2, `axes`]
         a_mps2: DVec3,
         /// Axes of `a_mps2`.
         axes: Axes,
         /// Heading.
         yaw: YawTarget,
     },
-    /// Fly to a point given from where the vehicle is when the runtime takes this setpoint, and
-    /// stay. For plugins that do not know their position.
+    /// Fly to a point relative to the vehicle, and hold there. The offset counts from the vehicle's pose when the
+    /// runtime receives the setpoint. For plugins without a position.
     Offset {
-        /// From the vehicle to the target. [m, `axes`]
+        /// Vector from the vehicle to the target. [m, `axes`]
         d_m: DVec3,
         /// Axes of `d_m`.
         axes: Axes,
         /// Heading.
         yaw: YawTarget,
     },
-    /// Turn at body rates under a thrust. Only where the course allows it
+    /// Fly with body rates and a thrust. Only if the course allows it
     /// ([`ArenaInfo::setpoints`](super::ArenaInfo::setpoints)).
     ///
-    /// The guard flies it: it keeps the attitude that the rates lead to, bounds its tilt, and asks
-    /// the autopilot for the motion that this attitude and thrust mean, within the same limits and
-    /// fence as any other.
+    /// The guard integrates the rates to an attitude, limits its tilt, and commands the autopilot the motion that
+    /// follows from attitude and thrust, within the same limits and fence as for other setpoints.
     AttitudeRate {
         /// Angular velocity. [rad/s, body]
         omega_body_radps: DVec3,
-        /// Thrust of all motors together over the vehicle's weight: 1 carries it when level.
+        /// Total thrust relative to the vehicle's weight: 1 carries the vehicle when level.
         thrust: f64,
     },
-    /// Go straight up or down to the height at which the plugin took over after take-off. (The
-    /// runtime takes off by itself as soon as the plugin answers images.)
+    /// Climb or descend vertically to the height at which the plugin took control after take-off. The runtime takes off
+    /// by itself as soon as the plugin answers images.
     TakeOff,
-    /// Follow a path.
+    /// Follow a trajectory.
     Trajectory(Trajectory),
 }
 
-/// Why a setpoint is refused, in words for the plugin's author.
+/// Reason for rejecting a setpoint, as a message for the plugin's author.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, thiserror::Error)]
 #[serde(rename_all = "snake_case")]
 pub enum InvalidSetpoint {
-    /// A NaN or an infinity.
+    /// A number is NaN or infinite.
     #[error("a number in it is not finite")]
     NotFinite,
-    /// A trajectory without points.
+    /// The trajectory has no points.
     #[error("the trajectory is empty; give it a waypoint or a piece")]
     Empty,
-    /// A waypoint's speed.
+    /// The speed of a waypoint is not positive.
     #[error("a waypoint's speed is {0} m/s; it must be above 0")]
     Speed(f64),
-    /// A piece's duration.
+    /// The duration of a piece is not positive.
     #[error("a trajectory's piece lasts {0} s; it must last longer than 0")]
     Duration(f64),
-    /// The course does not allow its kind.
+    /// The course does not allow this kind of setpoint.
     #[error("this course does not allow {}; it allows {allowed}", asked.name())]
     NotAllowed {
-        /// What was asked for.
+        /// Kind of the setpoint.
         asked: SetpointKind,
-        /// What may be.
+        /// Kinds that the course allows.
         allowed: SetpointKinds,
     },
-    /// It is given in the world's axes, and the course withholds the pose.
+    /// The setpoint is in world axes, but the course withholds the pose.
     #[error(
         "this course withholds the vehicle's pose, so setpoints count from the vehicle; give axes \"heading\" or \
          \"body\""
@@ -144,7 +143,7 @@ impl Setpoint {
         Self::Velocity { v_mps: v_world_mps, axes: Axes::World, yaw }
     }
 
-    /// Whether it counts in the world's axes; a heading does not matter.
+    /// Whether it is in world axes. The heading is not considered.
     pub fn is_in_world_axes(&self) -> bool {
         match self {
             Self::Position { .. } => true,
@@ -156,10 +155,10 @@ impl Setpoint {
         }
     }
 
-    /// Checks that every number in it is finite, and that a trajectory can be followed.
+    /// Checks that all numbers are finite, and that a trajectory is valid.
     ///
     /// # Errors
-    /// The first fault found.
+    /// Returns the first error found.
     pub fn check(&self) -> Result<(), InvalidSetpoint> {
         let is_finite = match *self {
             Self::Hold | Self::Land | Self::TakeOff => true,

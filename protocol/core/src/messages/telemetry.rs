@@ -1,9 +1,9 @@
-//! What the runtime reports to the server, the page and the log.
+//! Reports of the runtime to the server, the page and the log.
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Where a flight stands.
+/// Phase of a flight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FlightPhase {
@@ -12,7 +12,7 @@ pub enum FlightPhase {
     Connecting,
     /// Setting the origin, waiting for the pre-arm checks.
     Preparing,
-    /// Mode, arming and take-off commands under way.
+    /// Sending mode, arming and take-off commands.
     TakingOff,
     /// The plugin flies.
     Flying,
@@ -22,33 +22,32 @@ pub enum FlightPhase {
     Landing,
     /// On the ground and disarmed after a flight.
     Landed,
-    /// On the ground, everything ready; takes off when a person presses start.
+    /// On the ground and ready. Takes off when a person presses start.
     Waiting,
 }
 
-/// How a flight ended, for runtime, grades and leaderboard.
+/// Outcome of a flight for runtime, grades and leaderboard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OutcomeKind {
-    /// The course was flown to its end.
+    /// The course was completed.
     Finished,
-    /// The body touched an obstacle of the twin, or the floor too fast.
+    /// The body touched an obstacle of the twin, or the floor at too high a speed.
     Collided,
-    /// It left the geofence, or could not have stopped inside.
+    /// The vehicle left the geofence, or could not have stopped inside it.
     Geofence,
-    /// The course's time was over.
+    /// The course's time limit was reached.
     Timeout,
-    /// It was landed before the end: by the plugin, by a person, or as the time that a person asked
-    /// for was over.
+    /// Landed before the end: by the plugin, by a person, or after the flight time set by the user.
     Landed,
     /// The plugin crashed, hung or gave up.
     PluginFailed,
-    /// It never took off, or something else failed: link, localization, server.
+    /// The vehicle never took off, or something else failed: link, localization, server.
     Error,
 }
 
 impl OutcomeKind {
-    /// Returns the name as it stands in reports.
+    /// Returns the name, as in reports.
     pub fn name(self) -> &'static str {
         match self {
             Self::Finished => "finished",
@@ -61,7 +60,7 @@ impl OutcomeKind {
         }
     }
 
-    /// Whether the flight ended as wished: at the end of the course, or landed on purpose.
+    /// Whether the flight ended as intended: at the end of the course, or by a deliberate landing.
     pub fn is_good(self) -> bool {
         matches!(self, Self::Finished | Self::Landed)
     }
@@ -73,14 +72,14 @@ impl core::fmt::Display for OutcomeKind {
     }
 }
 
-/// The autopilot's state of the vehicle, in our frames.
+/// State of the vehicle from the autopilot, in VizFlyt's frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct VehicleState {
-    /// Motors may turn.
+    /// Whether the vehicle is armed.
     pub armed: bool,
     /// ArduCopter's mode number (4 is GUIDED, 9 is LAND).
     pub mode: u32,
-    /// Position by the autopilot's estimator. [m, world]
+    /// Position estimated by the autopilot. [m, world]
     pub p_world_m: DVec3,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
@@ -90,37 +89,37 @@ pub struct VehicleState {
     pub omega_body_radps: DVec3,
     /// Battery voltage; 0 if unknown. [V]
     pub battery_v: f32,
-    /// Battery left, 0 to 1; negative if unknown.
+    /// Remaining battery charge, 0 to 1; negative if unknown.
     pub battery_fraction: f32,
 }
 
-/// Delivery of images between the pose and the plugin, over the last second.
+/// Image delivery from pose to plugin, over the last second.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ImageStats {
-    /// Images handed to the plugin since the start.
+    /// Images delivered to the plugin since the start.
     pub delivered: u64,
-    /// Images that came but were replaced by a newer one before the plugin asked.
+    /// Images that were replaced by a newer one before the plugin could take them.
     pub skipped: u64,
-    /// Images handed to the plugin. [Hz]
+    /// Rate of images delivered to the plugin. [Hz]
     pub rate_hz: f32,
-    /// Pose stamp to plugin callback, median. [ms]
+    /// Time from pose stamp to plugin callback, median. [ms]
     pub age_ms_p50: f32,
-    /// Pose stamp to plugin callback, 99th percentile. [ms]
+    /// Time from pose stamp to plugin callback, 99th percentile. [ms]
     pub age_ms_p99: f32,
     /// Time inside the plugin's `on_image`, median. [ms]
     pub plugin_ms_p50: f32,
 }
 
-/// The runtime's regular report. 10 Hz.
+/// Regular report of the runtime, at 10 Hz.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Telemetry {
-    /// Phase of flight.
+    /// Phase of the flight.
     pub phase: FlightPhase,
-    /// The vehicle.
+    /// State of the vehicle.
     pub vehicle: VehicleState,
-    /// The images.
+    /// Image delivery.
     pub images: ImageStats,
-    /// What was asked of the autopilot last, after the guard. [m/s, world]
+    /// Last velocity commanded to the autopilot, after the guard. [m/s, world]
     pub v_setpoint_mps: DVec3,
     /// Setpoints sent to the autopilot since the start.
     pub setpoints_sent: u64,

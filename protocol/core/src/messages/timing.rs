@@ -1,4 +1,4 @@
-//! Where an image's age comes from: the way from pose to setpoint in nine stages.
+//! Latency from pose to setpoint, in nine stages.
 //!
 //! ```text
 //! measured  render  render   encode    first byte   last byte  decode  plugin  plugin  setpoint
@@ -8,40 +8,40 @@
 //!    |<------------------------------ age -------------------------->|
 //!    |<------------------------------------- total --------------------------------------->|
 //! ```
-//! A stage is what it *adds* after the one before it: where sending overlaps encoding, only the
-//! rest of it counts. So the stages of one image sum up to its total exactly.
+//! A stage counts only the time that it *adds* after the previous one: if sending overlaps encoding, only the remainder
+//! counts as sending. The stages of one image therefore add up to its total.
 
 use serde::{Deserialize, Serialize};
 
 use super::MAX_CAMERAS;
 
-/// A stage of an image's way. The names are those of tracing spans, reports and the page.
+/// Stage of an image's latency. The names are also used in tracing spans, reports and on the page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Stage {
-    /// The vehicle was measured, until rendering starts: localization, network, fusion, waiting
-    /// for the renderer.
+    /// From the measurement of the pose to the start of rendering: localization, network, fusion, waiting for the
+    /// renderer.
     Pose,
-    /// Drawing all cameras of the tick.
+    /// Rendering all cameras of the tick.
     Render,
     /// Waiting for the encoder, and encoding.
     Encode,
-    /// Until the image's first byte is on the runtime's computer.
+    /// Until the first byte of the image is on the runtime's computer.
     Send,
-    /// Until its last byte is.
+    /// Until the last byte is there.
     Receive,
     /// Waiting for the decoder, and decoding into shared memory.
     Decode,
-    /// Until the plugin's `on_image` is entered: other cameras of the tick, a plugin that is busy.
+    /// Until the call of the plugin's `on_image`: waiting for other cameras of the tick, or a busy plugin.
     Handover,
     /// Inside `on_image`.
     Plugin,
-    /// Until the MAVLink setpoint that carries the answer leaves.
+    /// Until the MAVLink setpoint with the answer is sent.
     Setpoint,
 }
 
 impl Stage {
-    /// All of them, in order.
+    /// All stages, in order.
     pub const ALL: [Self; 9] = [
         Self::Pose,
         Self::Render,
@@ -54,7 +54,7 @@ impl Stage {
         Self::Setpoint,
     ];
 
-    /// Returns the stage's name.
+    /// Returns the name of the stage.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Pose => "pose",
@@ -83,7 +83,7 @@ pub struct StageTimes {
     pub max: f32,
 }
 
-/// One value for each stage, by name.
+/// One value per stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[allow(missing_docs)] // Why: the fields are the stages, described there.
 pub struct Stages<T> {
@@ -99,7 +99,7 @@ pub struct Stages<T> {
 }
 
 impl<T> Stages<T> {
-    /// Makes one value for each stage.
+    /// Calls `value` for each stage.
     pub fn from_fn(mut value: impl FnMut(Stage) -> T) -> Self {
         Self {
             pose: value(Stage::Pose),
@@ -149,39 +149,39 @@ impl<T> core::ops::IndexMut<Stage> for Stages<T> {
     }
 }
 
-/// The ages of a number of images, by stage.
+/// Latency of a number of images, by stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Waterfall {
-    /// Images that the plugin was given.
+    /// Images delivered to the plugin.
     pub images: u64,
-    /// Those of them whose answer left as a setpoint; only they count in `setpoint` and `total`.
+    /// Number of these images whose answer was sent as a setpoint. Only they count in `setpoint` and `total`.
     pub answered: u64,
-    /// Each stage. [ms]
+    /// Latency of each stage. [ms]
     pub stages: Stages<StageTimes>,
-    /// Pose stamp to the start of the plugin. [ms]
+    /// Time from pose stamp to the start of the plugin. [ms]
     pub age: StageTimes,
-    /// Pose stamp to the setpoint. [ms]
+    /// Time from pose stamp to the setpoint. [ms]
     pub total: StageTimes,
-    /// Images that seemed to arrive before they were sent, by no more than the clocks' error
-    /// bound: their `send` counts as 0.
+    /// Images that seemed to arrive before they were sent, within the error bound of the clocks. Their `send` counts as
+    /// 0.
     pub clamped: u64,
-    /// The same by more than the bound: a clock was set, or the bound is wrong.
+    /// Images that seemed to arrive earlier than the bound allows: a clock was set, or the bound is wrong.
     pub out_of_bound: u64,
 }
 
-/// Edges of the bins of [`Intervals`]. [ms]
+/// Upper edges of the bins of [`Intervals`]. [ms]
 pub const INTERVAL_EDGES_MS: [f32; 19] = [
     2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 18.0, 20.0, 25.0, 30.0, 35.0, 40.0, 50.0, 70.0,
     100.0, 200.0, 500.0,
 ];
 
-/// Times between an image at the plugin and the next: their spread is the jitter.
+/// Intervals between consecutive images at the plugin. Their spread is the jitter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Intervals {
-    /// Their percentiles. [ms]
+    /// Percentiles of the intervals. [ms]
     pub times: StageTimes,
-    /// How many fell below each edge of [`INTERVAL_EDGES_MS`] and not below the one before; the
-    /// last bin has the rest.
+    /// Number of intervals in each bin. A bin ends below its edge in [`INTERVAL_EDGES_MS`]; the last bin has no upper
+    /// edge.
     pub bins: [u32; INTERVAL_EDGES_MS.len() + 1],
 }
 
@@ -192,61 +192,61 @@ impl Intervals {
     }
 }
 
-/// What became of the images of one camera that reached the runtime whole, since it started.
+/// Fate of the images of one camera that arrived completely at the runtime since its start.
 ///
-/// `arrived` is the sum of the others and of those still under way.
+/// `arrived` is the sum of the others and of the images in progress.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Arrivals {
-    /// Came whole.
+    /// Arrived completely.
     pub arrived: u64,
-    /// Given to the plugin.
+    /// Delivered to the plugin.
     pub delivered: u64,
-    /// Older than one that was there already, or of no known time.
+    /// Older than an image that was already there, or without a known time.
     pub stale: u64,
-    /// Did not decode.
+    /// Could not be decoded.
     pub broken: u64,
-    /// A newer one came while it waited for the decoder.
+    /// Replaced by a newer one while waiting for the decoder.
     pub superseded: u64,
-    /// Decoded; a newer one was there before the plugin, idle, had asked.
+    /// Decoded, but replaced by a newer one before the idle plugin took it.
     pub unasked: u64,
-    /// Decoded; a newer one was there before the plugin had done with an earlier one.
+    /// Decoded, but replaced by a newer one while the plugin was busy with an earlier one.
     pub overrun: u64,
 }
 
 impl Arrivals {
-    /// Returns how many have found their end.
+    /// Returns the number of images that are no longer in progress.
     pub fn ended(&self) -> u64 {
         self.delivered + self.stale + self.broken + self.superseded + self.unasked + self.overrun
     }
 }
 
-/// The relation of the server's clock to the runtime's.
+/// Offset of the server's clock from the runtime's clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ClockState {
-    /// What is added to the runtime's time to give the server's. [ns]
+    /// Value to add to the runtime's time to get the server's time. [ns]
     pub offset_ns: i64,
-    /// Bound of its error. [ms]
+    /// Bound of the offset's error. [ms]
     pub error_bound_ms: f32,
-    /// How much faster the server's clock runs. [ppm]
+    /// Drift, positive if the server's clock runs faster. [ppm]
     pub drift_ppm: f32,
-    /// Bound of its error. [ppm]
+    /// Bound of the drift's error. [ppm]
     pub drift_bound_ppm: f32,
-    /// How often a clock was set or restarted.
+    /// Number of times that a clock was set or restarted.
     pub steps: u32,
 }
 
-/// The runtime's report of times. 1 Hz.
+/// Latency report of the runtime, at 1 Hz.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Timing {
-    /// What `waterfall` and `intervals` cover: the last seconds, or the whole flight. [s]
+    /// Duration that `waterfall` and `intervals` cover: the last seconds, or the whole flight. [s]
     pub seconds: f32,
-    /// Ages.
+    /// Latency by stage.
     pub waterfall: Waterfall,
-    /// Jitter.
+    /// Intervals between images (jitter).
     pub intervals: Intervals,
-    /// The clocks; `None` before the first exchange.
+    /// Clock offset; `None` before the first exchange.
     pub clock: Option<ClockState>,
-    /// What became of the images, by camera.
+    /// Fate of the images, by camera.
     pub cameras: heapless::Vec<Arrivals, MAX_CAMERAS>,
 }
 
@@ -256,7 +256,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stages_are_named_as_their_fields() {
+    fn stages_have_the_names_of_their_fields() {
         let stages = Stages::from_fn(Stage::name);
         let json = serde_json::to_value(stages).unwrap();
         for stage in Stage::ALL {

@@ -1,43 +1,44 @@
-//! A path that the runtime follows on the plugin's behalf.
+//! Trajectories that the runtime follows for the plugin.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::setpoint::{Axes, InvalidSetpoint, YawTarget};
 
-/// Most waypoints of one trajectory.
+/// Maximum number of waypoints in a trajectory.
 pub const MAX_WAYPOINTS: usize = 32;
-/// Most polynomial pieces of one trajectory.
+/// Maximum number of polynomial pieces in a trajectory.
 pub const MAX_PIECES: usize = 8;
-/// Coefficients of a piece: degree 7, as minimum-snap planners make.
+/// Number of coefficients of a piece: degree 7, as in minimum-snap planners.
 pub const COEFFICIENTS: usize = 8;
 
-/// A path to follow from the moment the runtime takes it, to its end, where the vehicle stays.
+/// Path to follow from the time at which the runtime receives it to its end, where the vehicle stays.
 ///
-/// It is in force, without being sent again, as long as the plugin answers images at all, with
-/// `None` or with the same trajectory; any other setpoint ends it, and so does a trajectory of
-/// another `id`. A vehicle that the guard slows down does not lose its path: the path waits.
+/// A trajectory stays active without being sent again, while the plugin answers images with `None` or with the same
+/// trajectory. Any other setpoint or a trajectory with another `id` ends it. If the guard slows the vehicle down, the
+/// path waits for it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
-    /// The plugin's own number for it: the same one goes on, another one starts a new flight along it.
+    /// Number chosen by the plugin. The same number continues the flight along the path, another one starts a new
+    /// flight.
     pub id: u32,
-    /// Axes of the points. With [`Axes::Heading`] and [`Axes::Body`] they count from where the
-    /// vehicle is, and along how it points, when the runtime takes the trajectory.
+    /// Axes of the points. With [`Axes::Heading`] and [`Axes::Body`], they are relative to the vehicle's position and
+    /// orientation when the runtime receives the trajectory.
     pub axes: Axes,
-    /// The points.
+    /// Shape of the path.
     pub path: Path,
-    /// Where the nose shall point on the way.
+    /// Yaw along the path.
     pub yaw: PathYaw,
 }
 
-/// The shape of a [`Trajectory`].
+/// Shape of a [`Trajectory`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[allow(clippy::large_enum_variant)] // Why: there is no heap here to box it on.
 pub enum Path {
-    /// Straight from each point to the next, slower at corners, stopping at the last.
+    /// Straight lines between the points, slower at corners, with a stop at the last point.
     Waypoints(heapless::Vec<Waypoint, MAX_WAYPOINTS>),
-    /// One piece after the other, each in its time.
+    /// Polynomial pieces in sequence, each with its own duration.
     Polynomial(heapless::Vec<Piece, MAX_PIECES>),
 }
 
@@ -47,54 +48,54 @@ impl Default for Path {
     }
 }
 
-/// A point to pass, and how fast to fly there.
+/// Point to pass, with a maximum speed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Waypoint {
-    /// Where. [m, axes of the trajectory]
+    /// Position. [m, axes of the trajectory]
     pub p_m: DVec3,
-    /// Greatest speed on the way to it. [m/s]
+    /// Maximum speed on the way to this point. [m/s]
     pub speed_mps: f64,
 }
 
-/// A polynomial in time.
+/// Polynomial in time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Piece {
-    /// How long it lasts. [s]
+    /// Duration. [s]
     pub seconds: f64,
-    /// Position after `t` seconds of this piece is the sum of `coefficients[k] * t^k`.
+    /// Coefficients: the position `t` seconds after the start of this piece is the sum of `coefficients[k] * t^k`.
     /// [m/s^k, axes of the trajectory]
     pub coefficients: [DVec3; COEFFICIENTS],
 }
 
 impl Piece {
-    /// Returns the position after `t_s` seconds of this piece. [m, axes of the trajectory]
+    /// Returns the position `t_s` seconds after the start of this piece. [m, axes of the trajectory]
     pub fn position_m(&self, t_s: f64) -> DVec3 {
         self.coefficients.iter().rev().fold(DVec3::ZERO, |sum, &c| sum * t_s + c)
     }
 
-    /// Returns the velocity after `t_s` seconds of this piece. [m/s, axes of the trajectory]
+    /// Returns the velocity `t_s` seconds after the start of this piece. [m/s, axes of the trajectory]
     pub fn velocity_mps(&self, t_s: f64) -> DVec3 {
         let derivative = self.coefficients.iter().enumerate().skip(1).rev();
         derivative.fold(DVec3::ZERO, |sum, (k, &c)| sum * t_s + c * k as f64)
     }
 }
 
-/// Where the nose points on a [`Trajectory`].
+/// Yaw along a [`Trajectory`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PathYaw {
-    /// Into the direction of travel, so that the front camera sees what comes.
+    /// In the direction of travel, so that the front camera sees the path ahead.
     #[default]
     Ahead,
-    /// As for other setpoints.
+    /// A yaw target, as for other setpoints.
     Target(YawTarget),
 }
 
 impl Trajectory {
-    /// Checks that it can be followed.
+    /// Checks that the trajectory is valid.
     ///
     /// # Errors
-    /// The first fault found.
+    /// Returns the first error found.
     pub fn check(&self) -> Result<(), InvalidSetpoint> {
         let finite = |is: bool| if is { Ok(()) } else { Err(InvalidSetpoint::NotFinite) };
         if let PathYaw::Target(yaw) = self.yaw {
@@ -129,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_piece_is_its_polynomial() {
+    fn evaluates_a_polynomial_piece() {
         // x = 1 + 2 t + 3 t^2, z = t^7.
         let mut piece = Piece { seconds: 2.0, ..Piece::default() };
         piece.coefficients[0] = DVec3::X;
@@ -141,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn invalid_trajectories_are_refused() {
+    fn rejects_invalid_trajectories() {
         let way = |p_m, speed_mps| Trajectory {
             path: Path::Waypoints([Waypoint { p_m, speed_mps }].into_iter().collect()),
             ..Trajectory::default()

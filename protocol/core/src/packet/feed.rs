@@ -1,13 +1,13 @@
-//! The pose feed: a vehicle's poses as sealed datagrams, from the server to the guardian on the vehicle's computer.
-//! It outlives the QUIC connection of the runtime, of whose keys both ends derive the feed's
+//! Pose feed: the vehicle's poses as authenticated datagrams, from the server to the guardian on the vehicle's
+//! computer. It outlives the runtime's QUIC connection, from whose keys both ends derive the feed's key
 //! ([`FEED_LABEL`]).
 //!
 //! ```text
 //! guardian ── Subscribe, twice a second ──▶ server
 //!          ◀── Pose, at most 50 a second ──
 //! ```
-//! Each datagram is a postcard body and the first 16 bytes of its HMAC-SHA256. A body counts or carries a
-//! stamp: what is not newer than the newest is a replay.
+//! Each datagram is a postcard body and the first 16 bytes of its HMAC-SHA256. Each body has a counter or a stamp; a
+//! datagram that is not newer than the newest is a replay.
 
 use hmac::{Hmac, Mac};
 use serde::{Deserialize, Serialize};
@@ -15,29 +15,29 @@ use sha2::Sha256;
 
 use crate::messages::PoseSample;
 
-/// The label under which both ends of a flight's connection export the feed's key (RFC 8446, 7.5).
+/// Label for exporting the feed's key from the TLS connection of a flight, at both ends (RFC 8446, 7.5).
 pub const FEED_LABEL: &[u8] = b"EXPERIMENTAL vizflyt pose feed";
-/// The largest datagram. [bytes]
+/// Maximum datagram size. [bytes]
 pub const MAX_FEED: usize = 256;
-/// Bytes of a seal.
+/// Number of bytes of the authentication tag.
 const SEAL: usize = 16;
 
-/// Secret of one flight's feed.
+/// Secret key of one flight's feed.
 pub type FeedKey = [u8; 32];
 
-/// A datagram of the feed.
+/// Datagram of the feed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum FeedMessage {
-    /// The guardian wants poses; the number grows with each. Answered for 2 s.
+    /// Request for poses, valid for 2 s. The number increases with each request.
     Subscribe(u64),
-    /// The newest pose.
+    /// Newest pose.
     Pose(PoseSample),
 }
 
-/// Writes a sealed datagram into `buffer`; returns its bytes.
+/// Writes an authenticated datagram into `buffer`. Returns its bytes.
 ///
 /// # Panics
-/// Never: the widest message is bounded below [`MAX_FEED`] (tested).
+/// Never: the largest message is smaller than [`MAX_FEED`] (tested).
 pub fn seal<'a>(key: &FeedKey, message: &FeedMessage, buffer: &'a mut [u8; MAX_FEED]) -> &'a [u8] {
     let body = postcard::to_slice(message, &mut buffer[..MAX_FEED - SEAL])
         .expect("feed messages are bounded below MAX_FEED")
@@ -47,7 +47,7 @@ pub fn seal<'a>(key: &FeedKey, message: &FeedMessage, buffer: &'a mut [u8; MAX_F
     &buffer[..body + SEAL]
 }
 
-/// Returns the message of a datagram; `None` if it was not sealed with `key`, or is none.
+/// Returns the message of a datagram; `None` if its tag does not match `key` or it is invalid.
 pub fn open(key: &FeedKey, datagram: &[u8]) -> Option<FeedMessage> {
     let (body, seal) = datagram.split_at_checked(datagram.len().checked_sub(SEAL)?)?;
     mac(key, body).verify_truncated_left(seal).ok()?;
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sealed_opens_with_its_key_alone() {
+    fn opens_only_with_the_same_key() {
         let mut buffer = [0; MAX_FEED];
         for message in [widest(), FeedMessage::Subscribe(u64::MAX)] {
             let bytes = seal(&[7; 32], &message, &mut buffer);
@@ -90,7 +90,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_change_is_noticed(at in 0..200usize, flip in 1..=255u8, cut in 0..200usize) {
+        fn detects_any_change(at in 0..200usize, flip in 1..=255u8, cut in 0..200usize) {
             let mut buffer = [0; MAX_FEED];
             let len = seal(&[7; 32], &widest(), &mut buffer).len();
             prop_assert_eq!(open(&[7; 32], &buffer[..cut.min(len - 1)]), None);
@@ -99,7 +99,7 @@ mod tests {
         }
 
         #[test]
-        fn noise_opens_nothing(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+        fn rejects_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
             prop_assert_eq!(open(&[7; 32], &bytes), None);
         }
     }

@@ -1,28 +1,28 @@
-//! Messages on an ordered byte stream: a little-endian `u16` length, then that many bytes of
-//! postcard.
+//! Framing of messages on an ordered byte stream: a little-endian `u16` length, followed by that number of postcard
+//! bytes.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Largest encoded message, length prefix included. [bytes]
+/// Maximum size of an encoded message, including the length prefix. [bytes]
 pub const MAX_FRAMED: usize = 4096;
 const PREFIX: usize = 2;
 
-/// Why bytes are no message.
+/// Reason why bytes are not a valid message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FramingError {
-    /// The length prefix exceeds [`MAX_FRAMED`]; the stream cannot be followed further.
+    /// The length exceeds [`MAX_FRAMED`]. The rest of the stream cannot be decoded.
     #[error("message of {0} bytes exceeds the limit of 4094; the peer is faulty or hostile")]
     TooLong(usize),
-    /// The body is not a message of the expected type; the next one can still be read.
+    /// The body is not a message of the expected type. The next message can still be decoded.
     #[error("message body of {0} bytes does not decode; the peer is faulty or of another version")]
     Body(usize),
 }
 
-/// Encodes `message` with its prefix into `buffer`; returns the bytes to send.
+/// Encodes `message` with its length prefix into `buffer`. Returns the bytes to send.
 ///
 /// # Panics
-/// Never: every message type of this crate is bounded below [`MAX_FRAMED`] (tested).
+/// Never: every message type of this crate is smaller than [`MAX_FRAMED`] (tested).
 pub fn encode<'a, M: Serialize>(message: &M, buffer: &'a mut [u8; MAX_FRAMED]) -> &'a [u8] {
     let body = postcard::to_slice(message, &mut buffer[PREFIX..])
         .expect("message types are bounded below MAX_FRAMED")
@@ -31,22 +31,22 @@ pub fn encode<'a, M: Serialize>(message: &M, buffer: &'a mut [u8; MAX_FRAMED]) -
     &buffer[..PREFIX + body]
 }
 
-/// Encodes `message` without prefix, for carriers that keep message boundaries (shared memory).
+/// Encodes `message` without a prefix, for transports that preserve message boundaries (shared memory).
 ///
 /// # Panics
-/// Never, as [`encode`].
+/// Never, see [`encode`].
 pub fn encode_body<'a, M: Serialize>(message: &M, buffer: &'a mut [u8; MAX_FRAMED]) -> &'a [u8] {
     postcard::to_slice(message, buffer).expect("message types are bounded below MAX_FRAMED")
 }
 
-/// Decodes a message body that a carrier delivered whole.
+/// Decodes the body of a complete message.
 pub fn decode_body<M: DeserializeOwned>(body: &[u8]) -> Result<M, FramingError> {
     postcard::from_bytes(body).map_err(|_| FramingError::Body(body.len()))
 }
 
-/// Cuts a byte stream into messages.
+/// Splits a byte stream into messages.
 ///
-/// Give it bytes with [`Self::push`], take messages with [`Self::next`] until `None`, repeat.
+/// Add bytes with [`Self::push`], take messages with [`Self::next`] until it returns `None`, and repeat.
 #[derive(Clone)]
 pub struct Deframer {
     buffer: [u8; MAX_FRAMED],
@@ -60,8 +60,8 @@ impl Default for Deframer {
 }
 
 impl Deframer {
-    /// Takes as many of `bytes` as there is room for; returns how many. Room for at least one
-    /// byte is there whenever [`Self::next`] has returned `None`.
+    /// Adds as many of `bytes` as fit. Returns their number, which is at least one after [`Self::next`] has returned
+    /// `None`.
     pub fn push(&mut self, bytes: &[u8]) -> usize {
         let taken = bytes.len().min(MAX_FRAMED - self.filled);
         self.buffer[self.filled..self.filled + taken].copy_from_slice(&bytes[..taken]);
@@ -69,7 +69,7 @@ impl Deframer {
         taken
     }
 
-    /// Returns the next whole message, an error, or `None` if more bytes are needed.
+    /// Returns the next complete message, an error, or `None` if more bytes are needed.
     #[allow(clippy::should_implement_trait)] // Why: the item type is chosen per call.
     pub fn next<M: DeserializeOwned>(&mut self) -> Option<Result<M, FramingError>> {
         let prefix = self.buffer[..self.filled].first_chunk::<PREFIX>()?;
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stream_decodes_at_every_chunk_size() {
+    fn decodes_a_stream_at_every_chunk_size() {
         let mut stream = Vec::new();
         for message in messages() {
             stream.extend_from_slice(encode(&message, &mut [0; MAX_FRAMED]));
@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_body_is_dropped_and_the_next_message_is_read() {
+    fn reads_the_next_message_after_an_invalid_body() {
         let mut deframer = Deframer::default();
         deframer.push(&[3, 0, 0xff, 0xff, 0xff]);
         deframer.push(encode(&messages()[1], &mut [0; MAX_FRAMED]));
@@ -205,14 +205,14 @@ mod tests {
     }
 
     #[test]
-    fn an_absurd_length_is_an_error() {
+    fn rejects_a_length_above_the_maximum() {
         let mut deframer = Deframer::default();
         deframer.push(&[0xff, 0xff]);
         assert_eq!(deframer.next::<ToRuntime>(), Some(Err(FramingError::TooLong(0xffff))));
     }
 
     #[test]
-    fn the_widest_messages_fit() {
+    fn the_largest_messages_fit() {
         let mut buffer = [0; MAX_FRAMED];
         assert!(encode(&ToRuntime::Welcome(welcome()), &mut buffer).len() < MAX_FRAMED * 3 / 4);
         assert!(
@@ -280,7 +280,7 @@ mod tests {
             rotation_sigma_rad: Vec3::splat(5.5),
             allowance_s: 0.2,
         };
-        // Far below the smallest packet of QUIC, 1200 bytes.
+        // Far smaller than the minimum QUIC packet, 1200 bytes.
         let datagram = encode_body(&Datagram::Pose(pose), &mut buffer);
         assert!(datagram.len() < 200);
         assert_eq!(decode_body(datagram), Ok(Datagram::Pose(pose)));

@@ -1,5 +1,5 @@
-//! What frames every image on its own unidirectional QUIC stream: a header with all that is known
-//! when drawing has ended, the bitstream as it is made, slice by slice, and a trailer.
+//! Header and trailer of an image on its own unidirectional QUIC stream. The header contains everything known at the
+//! end of rendering. The bitstream follows slice by slice as it is encoded, then the trailer.
 
 use glam::{DQuat, DVec3};
 use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
@@ -9,11 +9,11 @@ use crate::PROTOCOL_VERSION;
 use crate::geometry::{Body, Cam, Distortion, Intrinsics, InvalidIntrinsics, Pose, World};
 use crate::time::ServerTime;
 
-/// Who, when, from where. The RGB-D bitstream (`vizflyt-rgbd`) follows as it is made, then an
-/// [`ImageTrailer`], then the stream ends.
+/// Header of an image: camera, time stamps and pose. The RGB-D bitstream (`vizflyt-rgbd`) follows while it is encoded,
+/// then an [`ImageTrailer`], then the stream ends.
 ///
-/// Stamps are on the server's clock. Depth in the payload is camera z in units of
-/// `depth_unit_m`, 0 where there is no return (REP 118).
+/// Stamps use the server's clock. Depth in the payload is camera z in units of `depth_unit_m`, and 0 without a return
+/// (REP 118).
 #[derive(
     Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
 )]
@@ -23,30 +23,30 @@ pub struct ImageHeader {
     version: U16,
     /// Index into [`crate::messages::ArenaInfo::cameras`].
     pub camera: u8,
-    /// The lens: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
+    /// Lens model: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
     pub distortion_model: u8,
-    /// Counts the server's ticks; equal for all cameras of a tick.
+    /// Number of the server's tick; equal for all cameras of a tick.
     pub seq: U64,
-    /// When the newest pose behind the image was measured: its age counts from here. [ns, server]
+    /// Time at which the newest pose used for the image was measured. The age of the image counts from here. [ns,
+    /// server]
     pub pose_ns: U64,
-    /// The instant the image shows: what was known of the motion is moved on to it, so it may be
-    /// later than all other stamps. [ns, server]
+    /// Time that the image shows. The pose is predicted to it, so it may be later than all other stamps. [ns, server]
     pub exposure_ns: U64,
-    /// Rendering began. [ns, server]
+    /// Start of rendering. [ns, server]
     pub render_start_ns: U64,
-    /// Rendering ended. [ns, server]
+    /// End of rendering. [ns, server]
     pub render_end_ns: U64,
     /// Camera position. [m, world]
     pub translation_m: [F64; 3],
-    /// Camera to world rotation, xyzw.
+    /// Camera-to-world rotation, xyzw.
     pub rotation_xyzw: [F64; 4],
-    /// Camera position in the body: cameras may be moved while flying. [m, body]
+    /// Camera position on the body. Cameras may be moved in flight. [m, body]
     pub mount_m: [F64; 3],
-    /// Camera to body rotation, xyzw.
+    /// Camera-to-body rotation, xyzw.
     pub mount_xyzw: [F64; 4],
     /// fx, fy, cx, cy. [px]
     pub intrinsics_px: [F64; 4],
-    /// Coefficients in the order of OpenCV, the rest 0.
+    /// Distortion coefficients in the order of OpenCV, padded with zeros.
     pub distortion: [F64; 5],
     /// Image width. [px]
     pub width_px: U32,
@@ -54,39 +54,39 @@ pub struct ImageHeader {
     pub height_px: U32,
     /// Metres per unit of depth; 0.001.
     pub depth_unit_m: F64,
-    /// The cameras whose images leave together with this one, bit by index: a receiver that has
-    /// them all need not wait for cameras of another rate. 0 is not known.
+    /// Bit mask of the cameras whose images are sent together with this one. A receiver that has all of them need not
+    /// wait for cameras of another rate. 0 if unknown.
     pub together: U32,
 }
 
-/// Why bytes are no image header.
+/// Reason why bytes are not a valid image header.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum InvalidImageHeader {
     /// Fewer bytes than a header.
     #[error("image header is cut short at {0} of {size} bytes", size = ImageHeader::SIZE)]
     Short(usize),
     /// Wrong magic or version.
-    #[error("these bytes are no image header of protocol {PROTOCOL_VERSION}")]
+    #[error("these bytes are not an image header of protocol {PROTOCOL_VERSION}")]
     Foreign,
-    /// Camera that makes no sense.
+    /// Invalid intrinsics of the camera.
     #[error("image header: {0}")]
     Intrinsics(InvalidIntrinsics),
-    /// Number of a lens model that this version does not know.
+    /// Lens model that this version does not support.
     #[error("image header: lens model {0} is unknown")]
     Lens(u8),
-    /// Pose or depth unit not finite, or quaternion not unit.
-    #[error("image header: camera pose or depth unit is not a number to work with")]
+    /// Pose or depth unit out of range, or quaternion without unit length.
+    #[error("image header: camera pose or depth unit is out of range")]
     Pose,
 }
 
 impl ImageHeader {
-    /// Bytes on the wire.
+    /// Size on the wire. [bytes]
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZIM";
-    /// The first protocol version whose images had this layout.
+    /// First protocol version with this layout.
     const SINCE: u16 = 13;
 
-    /// Makes a header of an image that shows the instant of its pose, with all other stamps zero.
+    /// Returns the header of an image that shows the time of its pose, with all other stamps zero.
     pub fn new(
         seq: u64,
         camera: u8,
@@ -120,12 +120,12 @@ impl ImageHeader {
         }
     }
 
-    /// Reads and validates a header at the start of `bytes`; returns it with what follows.
+    /// Reads and validates a header at the start of `bytes`. Returns it and the remaining bytes.
     pub fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), InvalidImageHeader> {
         Self::parse_logged(bytes, PROTOCOL_VERSION.into())
     }
 
-    /// As [`Self::parse`], of a header that a log of another protocol version holds: the layout has been the same since
+    /// Like [`Self::parse`], for a header in a log of another protocol version. The layout has not changed since
     /// version 13.
     pub fn parse_logged(bytes: &[u8], protocol: u32) -> Result<(Self, &[u8]), InvalidImageHeader> {
         let (header, rest) =
@@ -146,10 +146,9 @@ impl ImageHeader {
         Ok((header, rest))
     }
 
-    /// Returns the most bytes of bitstream that an image of this size can need: a receiver gives up
-    /// on more.
+    /// Returns the maximum number of bitstream bytes for an image of this size. A receiver aborts if it gets more.
     pub fn most_payload(&self) -> u64 {
-        // Eight bytes a pixel and some overhead exceed every mode of the bitstream.
+        // Eight bytes per pixel plus overhead exceed every mode of the bitstream.
         8 * u64::from(self.width_px.get()) * u64::from(self.height_px.get()) + 65536
     }
 
@@ -168,7 +167,7 @@ impl ImageHeader {
         }
     }
 
-    /// Returns where the camera was.
+    /// Returns the pose of the camera in the world.
     pub fn world_from_cam(&self) -> Pose<World, Cam> {
         Pose::new(
             DVec3::from_array(self.translation_m.map(F64::get)),
@@ -176,7 +175,7 @@ impl ImageHeader {
         )
     }
 
-    /// Returns where the camera sat on the body.
+    /// Returns the pose of the camera on the body.
     pub fn body_from_cam(&self) -> Pose<Body, Cam> {
         Pose::new(
             DVec3::from_array(self.mount_m.map(F64::get)),
@@ -184,23 +183,23 @@ impl ImageHeader {
         )
     }
 
-    /// Returns where the body was at the instant that the image shows.
+    /// Returns the pose of the body at the time that the image shows.
     pub fn world_from_body(&self) -> Pose<World, Body> {
         self.world_from_cam() * self.body_from_cam().inverse()
     }
 
-    /// Returns the instant that the image shows.
+    /// Returns the time that the image shows.
     pub fn exposure_stamp(&self) -> ServerTime {
         ServerTime::from_ns(self.exposure_ns.get())
     }
 
-    /// Returns the pose's stamp.
+    /// Returns the stamp of the pose.
     pub fn pose_stamp(&self) -> ServerTime {
         ServerTime::from_ns(self.pose_ns.get())
     }
 }
 
-/// What was known only when the last byte of the bitstream had been made; it ends the stream.
+/// Trailer at the end of the stream: values that are known only after the last byte of the bitstream.
 ///
 /// No checksum: QUIC authenticates every packet.
 #[derive(
@@ -209,37 +208,36 @@ impl ImageHeader {
 #[repr(C)]
 pub struct ImageTrailer {
     magic: [u8; 4],
-    /// Bytes of bitstream between header and trailer.
+    /// Number of bitstream bytes between header and trailer.
     pub payload_len: U32,
-    /// Encoding ended. [ns, server]
+    /// End of encoding. [ns, server]
     pub encode_end_ns: U64,
-    /// The first byte was handed to the transport, while the rest was still being made.
-    /// [ns, server]
+    /// Time at which the first byte was passed to the transport, during encoding. [ns, server]
     pub send_ns: U64,
 }
 
-/// Why bytes are no image trailer.
+/// Reason why bytes are not a valid image trailer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidImageTrailer {
-    /// Wrong magic: the image was cut short, or more follows than it announced.
+    /// Wrong magic: the image is incomplete or longer than announced.
     #[error("the image does not end with a trailer")]
     Foreign,
-    /// What came is not as long as what was sent.
-    #[error("image trailer: {announced} bytes were announced, {came} came")]
+    /// The number of received bytes differs from the number sent.
+    #[error("image trailer: {announced} bytes were announced, {came} arrived")]
     Length {
-        /// Bytes of bitstream by the trailer.
+        /// Number of bitstream bytes according to the trailer.
         announced: u32,
-        /// Bytes of bitstream received.
+        /// Number of bitstream bytes received.
         came: u64,
     },
 }
 
 impl ImageTrailer {
-    /// Bytes on the wire.
+    /// Size on the wire. [bytes]
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZIE";
 
-    /// Makes the trailer of a bitstream of so many bytes.
+    /// Returns the trailer of a bitstream of `payload_len` bytes.
     pub fn new(payload_len: u32, encode_end: ServerTime, send: ServerTime) -> Self {
         Self {
             magic: Self::MAGIC,
@@ -249,7 +247,7 @@ impl ImageTrailer {
         }
     }
 
-    /// Reads the trailer of an image of which `came` bytes of bitstream were received.
+    /// Reads the trailer of an image with `came` received bytes of bitstream.
     pub fn parse(bytes: &[u8; Self::SIZE], came: u64) -> Result<Self, InvalidImageTrailer> {
         let Ok(trailer) = Self::read_from_bytes(bytes) else {
             return Err(InvalidImageTrailer::Foreign);
@@ -265,7 +263,7 @@ impl ImageTrailer {
     }
 }
 
-// The layout is a contract between the two ends.
+// The layout is an interface between both ends.
 const _: () = assert!(ImageHeader::SIZE == 252 && ImageTrailer::SIZE == 24);
 
 #[cfg(test)]
@@ -287,14 +285,14 @@ mod tests {
         assert_eq!(found, sent);
         assert!(rest.is_empty());
         assert_eq!(found.pose_stamp(), ServerTime::from_ns(77));
-        // 1 m ahead of a body that is turned by 0.5 rad, 1 m up.
+        // 1 m ahead of a body that is rotated by 0.5 rad, 1 m up.
         let p = found.world_from_cam().translation_m;
         assert!((p - DVec3::new(0.87758, 0.47943, 1.0)).length() < 1e-5, "{p}");
         assert_eq!(found.body_from_cam().translation_m, DVec3::X);
     }
 
     #[test]
-    fn poison_is_refused() {
+    fn rejects_invalid_headers() {
         let mut h = header();
         h.rotation_xyzw = [0.0; 4].map(F64::new);
         assert_eq!(ImageHeader::parse(h.as_bytes()), Err(InvalidImageHeader::Pose));
@@ -308,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trailer_that_does_not_fit_is_refused() {
+    fn rejects_a_trailer_that_does_not_match() {
         let trailer = ImageTrailer::new(7, ServerTime::from_ns(3), ServerTime::from_ns(2));
         let mut bytes = [0; ImageTrailer::SIZE];
         bytes.copy_from_slice(trailer.as_bytes());

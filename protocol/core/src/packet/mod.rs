@@ -1,4 +1,4 @@
-//! Packets: fixed little-endian layouts read in place, and the framing of messages on a stream.
+//! Packets: fixed little-endian layouts that are read in place, and framing of messages on a stream.
 
 pub mod feed;
 pub mod framing;

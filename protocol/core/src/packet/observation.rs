@@ -1,11 +1,10 @@
-//! The layout of one observation in shared memory, from the runtime to the plugin.
+//! Layout of an observation in shared memory, from the runtime to the plugin.
 //!
-//! `ObservationHeader`, then for each camera its RGB plane (H x W x 3 bytes) and its depth plane
-//! (H x W u16 of millimetres), each at a 64-byte boundary; behind them the sensors' part, if there are
-//! sensors ([`crate::sensor::memory`]). Little-endian, fixed offsets: the C header for other languages
-//! mirrors this file.
+//! The memory contains `ObservationHeader`, then for each camera its RGB plane (H x W x 3 bytes) and its depth plane (H
+//! x W u16, in millimetres), each aligned to 64 bytes. If there are sensors, their section follows
+//! ([`crate::sensor::memory`]). Little-endian, fixed offsets. The C header for other languages mirrors this file.
 //!
-//! What the course withholds (pose, velocity) is not written: those bytes are zero.
+//! If the course withholds pose and velocity, those bytes are zero.
 
 use glam::{DQuat, DVec3};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -15,22 +14,22 @@ use crate::geometry::{Body, Cam, Distortion, Intrinsics, Pose, World};
 use crate::messages::MAX_CAMERAS;
 use crate::sensor::{SensorHeader, memory};
 
-/// Alignment of the payload and of each plane in it. [bytes]
+/// Alignment of the payload and of each of its planes. [bytes]
 pub const PLANE_ALIGN: usize = 64;
 
-/// One camera of an observation.
+/// Camera of an observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
 pub struct CameraHeader {
-    /// When the newest pose behind this image was measured. [ns, host]
+    /// Time at which the newest pose used for this image was measured. [ns, host]
     pub pose_ns: u64,
-    /// When the runtime had the decoded image. [ns, host]
+    /// Time at which the runtime had decoded the image. [ns, host]
     pub ready_ns: u64,
-    /// Tick of the server that made the image.
+    /// Number of the server's tick in which the image was made.
     pub seq: u64,
     /// fx, fy, cx, cy. [px]
     pub intrinsics_px: [f64; 4],
-    /// Coefficients in the order of OpenCV, the rest 0.
+    /// Distortion coefficients in the order of OpenCV, padded with zeros.
     pub distortion: [f64; 5],
     /// Camera position in the body. [m, body]
     pub translation_m: [f64; 3],
@@ -40,29 +39,29 @@ pub struct CameraHeader {
     pub width_px: u32,
     /// Image height. [px]
     pub height_px: u32,
-    /// Start of the RGB plane from the start of the header. [bytes]
+    /// Offset of the RGB plane from the start of the header. [bytes]
     pub rgb_offset: u32,
-    /// Start of the depth plane. [bytes]
+    /// Offset of the depth plane from the start of the header. [bytes]
     pub depth_offset: u32,
-    /// The lens: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
+    /// Lens model: 0 none, 1 Brown-Conrady, 2 Kannala-Brandt.
     pub distortion_model: u32,
-    /// By how much later than `pose_ns` the instant is that the image shows. [ns]
+    /// Time from `pose_ns` to the time that the image shows. [ns]
     pub ahead_ns: i32,
-    /// Where the body was at that instant; zero where the course withholds it. [m, world]
+    /// Position of the body at that time; zero if the course withholds it. [m, world]
     pub body_position_m: [f64; 3],
-    /// Body to world rotation at that instant, xyzw; zero where the course withholds it.
+    /// Body-to-world rotation at that time, xyzw; zero if the course withholds it.
     pub body_rotation_xyzw: [f64; 4],
 }
 
-/// Most IMU samples in one observation: 0.6 s at 100 Hz, so that a plugin that skips images for as
-/// long as the guard lets it still gets every sample.
+/// Maximum number of IMU samples in an observation: 0.6 s at 100 Hz. A plugin that skips images for as long as the
+/// guard permits still receives every sample.
 pub const MAX_IMU: usize = 64;
 
-/// One reading of the autopilot's accelerometer and gyroscope.
+/// Reading of the autopilot's accelerometer and gyroscope.
 #[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
 pub struct ImuRecord {
-    /// When it was measured. [ns, host]
+    /// Time of the measurement. [ns, host]
     pub stamp_ns: u64,
     /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
     pub accel_mps2: [f32; 3],
@@ -70,63 +69,63 @@ pub struct ImuRecord {
     pub gyro_radps: [f32; 3],
 }
 
-/// Head of an observation: the vehicle, and where the cameras' planes lie.
+/// Header of an observation: state of the vehicle, and offsets of the cameras' planes.
 #[derive(Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
 pub struct ObservationHeader {
     magic: [u8; 4],
     version: u16,
-    /// Cameras in use, from the front of `cameras`.
+    /// Number of valid entries in `cameras`.
     pub camera_count: u8,
     /// [`Self::HAS_ATTITUDE`] and [`Self::HAS_POSE`].
     pub flags: u8,
-    /// Bytes of header and planes together.
+    /// Total size of header and planes. [bytes]
     pub total_len: u32,
-    /// Samples in use, from the front of `imu`.
+    /// Number of valid samples in `imu`.
     pub imu_count: u32,
-    /// Counts observations of this runtime.
+    /// Sequence number of the observation in this runtime.
     pub seq: u64,
-    /// When the vehicle's state below was true. [ns, host]
+    /// Time at which the vehicle's state below was valid. [ns, host]
     pub vehicle_ns: u64,
-    /// Position, with [`Self::HAS_POSE`]. [m, world]
+    /// Position, if [`Self::HAS_POSE`] is set. [m, world]
     pub position_m: [f64; 3],
-    /// Velocity, with [`Self::HAS_POSE`]. [m/s, world]
+    /// Velocity, if [`Self::HAS_POSE`] is set. [m/s, world]
     pub velocity_mps: [f64; 3],
-    /// Body to world rotation, xyzw, with [`Self::HAS_ATTITUDE`].
+    /// Body-to-world rotation, xyzw, if [`Self::HAS_ATTITUDE`] is set.
     pub rotation_xyzw: [f64; 4],
-    /// Angular velocity, with [`Self::HAS_ATTITUDE`]. [rad/s, body]
+    /// Angular velocity, if [`Self::HAS_ATTITUDE`] is set. [rad/s, body]
     pub angular_radps: [f64; 3],
-    /// Battery left, 0 to 1; negative if unknown.
+    /// Remaining battery charge, 0 to 1; negative if unknown.
     pub battery_fraction: f64,
     /// Battery voltage; 0 if unknown. [V]
     pub battery_v: f64,
-    /// The newest IMU samples, oldest first. Those that came with the former observation are
-    /// there again: a reader that skipped it misses none, and finds new ones by their stamps.
+    /// Newest IMU samples, oldest first. Samples of the previous observation are repeated, so that a reader that
+    /// skipped it misses none. New samples can be found by their stamps.
     pub imu: [ImuRecord; MAX_IMU],
-    /// The cameras.
+    /// Cameras; the first `camera_count` are valid.
     pub cameras: [CameraHeader; MAX_CAMERAS],
-    /// Start of the table of sensors from the start of the header, if there are any. [bytes]
+    /// Offset of the table of sensors from the start of the header, if there are sensors. [bytes]
     pub sensors_offset: u32,
-    /// Sensors in the table.
+    /// Number of sensors in the table.
     pub sensor_count: u32,
 }
 
-// The layout is a contract with other languages and processes.
+// The layout is an interface to other languages and processes.
 const _: () = assert!(size_of::<CameraHeader>() == 232);
 const _: () = assert!(size_of::<ImuRecord>() == 32);
 const _: () = assert!(size_of::<ObservationHeader>() == 160 + 32 * MAX_IMU + 232 * MAX_CAMERAS);
 
-/// Where the planes of a set of images lie.
+/// Offsets of the planes of a set of images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ObservationLayout {
     /// (rgb offset, depth offset) of each camera. [bytes]
     pub planes: [(usize, usize); MAX_CAMERAS],
-    /// Bytes of header and planes together.
+    /// Total size of header and planes. [bytes]
     pub total_len: usize,
 }
 
 impl ObservationLayout {
-    /// Lays out images of the given (width, height), at most [`MAX_CAMERAS`]. [px]
+    /// Computes the layout for images of these (width, height), at most [`MAX_CAMERAS`]. [px]
     pub fn of(sizes: &[(u32, u32)]) -> Self {
         let mut planes = [(0, 0); MAX_CAMERAS];
         let mut end = align(size_of::<ObservationHeader>());
@@ -144,7 +143,7 @@ const fn align(offset: usize) -> usize {
     offset.next_multiple_of(PLANE_ALIGN)
 }
 
-/// Why shared memory does not hold an observation.
+/// Reason why shared memory does not contain a valid observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidObservation {
     /// Too short or misaligned.
@@ -155,25 +154,25 @@ pub enum InvalidObservation {
         "observation is not of protocol {PROTOCOL_VERSION}: rebuild the plugin with this runtime's SDK"
     )]
     Foreign,
-    /// More IMU samples than there is room for.
-    #[error("observation names {0} IMU samples; there is room for {MAX_IMU}")]
+    /// More IMU samples than the maximum.
+    #[error("observation has {0} IMU samples; the maximum is {MAX_IMU}")]
     Imu(u32),
     /// A plane lies outside the memory.
     #[error("camera {0} of the observation lies outside its memory")]
     Plane(usize),
-    /// A sensor of no kind, or a reading that lies outside the memory.
+    /// A sensor of an unknown kind, or a reading outside the memory.
     #[error("sensor {0} of the observation lies outside its memory, or is of an unknown kind")]
     Sensor(usize),
 }
 
 impl ObservationHeader {
     const MAGIC: [u8; 4] = *b"VZOB";
-    /// Bit of `flags`: the vehicle's rotation and angular velocity are filled in.
+    /// Bit of `flags`: rotation and angular velocity of the vehicle are valid.
     pub const HAS_ATTITUDE: u8 = 1;
-    /// Bit of `flags`: so are its position and velocity.
+    /// Bit of `flags`: position and velocity of the vehicle are valid.
     pub const HAS_POSE: u8 = 2;
 
-    /// Makes an empty header for `camera_count` cameras and `total_len` bytes.
+    /// Returns an empty header for `camera_count` cameras and `total_len` bytes.
     pub fn new(seq: u64, camera_count: u8, total_len: u32) -> Self {
         Self {
             magic: Self::MAGIC,
@@ -197,7 +196,7 @@ impl ObservationHeader {
         }
     }
 
-    /// Reads and validates the header in place; every plane and reading named in it then lies in `bytes`.
+    /// Reads and validates the header in place. In a valid header, all planes and readings lie within `bytes`.
     pub fn parse(bytes: &[u8]) -> Result<&Self, InvalidObservation> {
         let (header, _) =
             Self::ref_from_prefix(bytes).map_err(|_| InvalidObservation::Short(bytes.len()))?;
@@ -213,7 +212,7 @@ impl ObservationHeader {
         for (index, camera) in header.cameras[..header.camera_count.into()].iter().enumerate() {
             let pixels = u64::from(camera.width_px) * u64::from(camera.height_px);
             let fits = |offset: u32, bytes_per_pixel: u64, alignment: u32| {
-                // 3 * 2^64 cannot come up: sides are bounded first.
+                // No overflow (3 * 2^64): the sides are bounded below.
                 offset.is_multiple_of(alignment)
                     && u64::from(offset) + bytes_per_pixel * pixels <= bytes.len() as u64
             };
@@ -227,23 +226,23 @@ impl ObservationHeader {
         Ok(header)
     }
 
-    /// Returns the sensors of the observation in `bytes`, of which this is the header.
+    /// Returns the sensors of the observation in `bytes`, which starts with this header.
     pub fn sensors<'a>(&self, bytes: &'a [u8]) -> &'a [SensorHeader] {
         memory::parse(bytes, self.sensors_offset, self.sensor_count).unwrap_or_default()
     }
 
-    /// Returns the vehicle's attitude, body to world, if it is known.
+    /// Returns the vehicle's attitude, body to world, if known.
     pub fn attitude(&self) -> Option<DQuat> {
         (self.flags & Self::HAS_ATTITUDE != 0).then(|| DQuat::from_array(self.rotation_xyzw))
     }
 
-    /// Returns the vehicle's pose, if the course lets the plugin know it.
+    /// Returns the vehicle's pose, if the course allows it.
     pub fn world_from_body(&self) -> Option<Pose<World, Body>> {
         let attitude = self.attitude().filter(|_| self.flags & Self::HAS_POSE != 0)?;
         Some(Pose::new(DVec3::from(self.position_m), attitude))
     }
 
-    /// Returns the IMU samples there are, oldest first.
+    /// Returns the valid IMU samples, oldest first.
     pub fn imu(&self) -> &[ImuRecord] {
         &self.imu[..(self.imu_count as usize).min(MAX_IMU)]
     }
@@ -275,13 +274,13 @@ impl CameraHeader {
         }
     }
 
-    /// Returns where the body was at the instant that the image shows, if the course lets the plugin know it.
+    /// Returns the pose of the body at the time that the image shows, if the course allows it.
     pub fn pose_at_image(&self) -> Option<Pose<World, Body>> {
         let rotation = DQuat::from_array(self.body_rotation_xyzw);
         Some(Pose::new(DVec3::from(self.body_position_m), rotation)).filter(Pose::is_valid)
     }
 
-    /// Writes it.
+    /// Writes the pose of the body at the time that the image shows.
     pub fn set_pose_at_image(&mut self, world_from_body: &Pose<World, Body>) {
         self.body_position_m = world_from_body.translation_m.to_array();
         self.body_rotation_xyzw = world_from_body.rotation.to_array();
@@ -318,14 +317,14 @@ mod tests {
     }
 
     #[test]
-    fn a_laid_out_observation_parses() {
+    fn parses_a_valid_observation() {
         let header = header(30, 20);
         assert_eq!(ObservationHeader::parse(&memory(&header).0), Ok(&header));
         assert_eq!(header.world_from_body(), None);
     }
 
     #[test]
-    fn planes_outside_the_memory_are_refused() {
+    fn rejects_planes_outside_the_memory() {
         let mut h = header(30, 20);
         h.cameras[0].depth_offset = 8190;
         assert_eq!(ObservationHeader::parse(&memory(&h).0), Err(InvalidObservation::Plane(0)));
@@ -341,7 +340,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn planes_are_aligned_and_apart(sizes in prop::collection::vec((1u32..200, 1u32..200), 1..=MAX_CAMERAS)) {
+        fn planes_are_aligned_and_do_not_overlap(sizes in prop::collection::vec((1u32..200, 1u32..200), 1..=MAX_CAMERAS)) {
             let layout = ObservationLayout::of(&sizes);
             let mut end = size_of::<ObservationHeader>();
             for (&(rgb, depth), &(w, h)) in layout.planes.iter().zip(&sizes) {

@@ -1,18 +1,18 @@
-//! The first eight bytes each side sends: who speaks, and which version of this crate.
+//! Preamble: the first eight bytes that each side sends, with its role and the protocol version.
 
 use zerocopy::byteorder::little_endian::U16;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
 use crate::PROTOCOL_VERSION;
 
-/// Who speaks; its name stands in error messages.
+/// Role of a peer. Its name appears in error messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PeerRole {
     /// The render server.
     Server,
     /// The runtime on the Jetson.
     Runtime,
-    /// A plugin, through the SDK it was built with.
+    /// A plugin, by way of its SDK.
     Plugin,
 }
 
@@ -26,7 +26,7 @@ impl PeerRole {
         }
     }
 
-    /// The party's name in messages.
+    /// Returns the role's name, for messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Server => "server",
@@ -36,7 +36,7 @@ impl PeerRole {
     }
 }
 
-/// Magic, version, party. Its layout never changes, so that any two versions can check it.
+/// Magic bytes, version and role. The layout never changes, so that any two versions can check it.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
 )]
@@ -49,11 +49,11 @@ pub struct Preamble {
 }
 
 impl Preamble {
-    /// Bytes on the wire.
+    /// Size on the wire. [bytes]
     pub const SIZE: usize = size_of::<Self>();
     const MAGIC: [u8; 4] = *b"VZFL";
 
-    /// Returns what `party` of this build sends.
+    /// Returns the preamble of this build in the role `role`.
     pub fn of(role: PeerRole) -> Self {
         Self {
             magic: Self::MAGIC,
@@ -63,7 +63,7 @@ impl Preamble {
         }
     }
 
-    /// Checks the other side's preamble against this build, speaking as `me`.
+    /// Checks the other side's preamble against this build, whose role is `me`. Returns the peer's role.
     ///
     /// ```
     /// use vizflyt_protocol::packet::{PeerRole, Preamble};
@@ -98,24 +98,24 @@ impl Preamble {
     }
 }
 
-/// Why a peer is refused at its first bytes.
+/// Reason for rejecting a peer at its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PreambleError {
-    /// The bytes are no preamble.
+    /// The bytes are not a preamble.
     #[error("the other side does not speak VizFlyt; check the address and port")]
     NotVizflyt,
-    /// Another version.
+    /// The peer has another protocol version.
     #[error("{them} speaks protocol {theirs}, this {me} {ours}: update the {older}")]
     Version {
-        /// The other party.
+        /// Role of the peer.
         them: &'static str,
-        /// Its version.
+        /// Version of the peer.
         theirs: u16,
-        /// This party.
+        /// Role of this side.
         me: &'static str,
-        /// This version.
+        /// Version of this side.
         ours: u16,
-        /// Which of the two to update.
+        /// Role of the side that must be updated.
         older: &'static str,
     },
 }
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn the_older_side_is_named() {
+    fn names_the_side_to_update() {
         check(*b"VZFL\x0d\x00\x01\x00", PeerRole::Runtime, Ok(PeerRole::Server));
         check(
             *b"VZFL\x0e\x00\x01\x00",

@@ -1,4 +1,4 @@
-//! What there is of sensors beside the cameras.
+//! Descriptions of sensors other than cameras.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,32 +6,32 @@ use super::records::{LidarPoint, RadarDetection, RangeReading};
 use crate::geometry::{Body, Pose, Sensor};
 use crate::messages::Name;
 
-/// The kind of a sensor; its number is the same on the wire, in shared memory and in the C header. New kinds go
-/// at the end.
+/// Kind of a sensor. The number is the same on the wire, in shared memory and in the C header. Add new kinds at the
+/// end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum SensorKind {
-    /// Points, of a spinning or a solid-state scanner: [`LidarPoint`]s.
+    /// Points from a spinning or solid-state scanner: [`LidarPoint`]s.
     Lidar = 1,
-    /// One narrow beam of light: a [`RangeReading`].
+    /// One narrow light beam: a [`RangeReading`].
     RangeFinder = 2,
-    /// One wide cone of ultrasound: a [`RangeReading`].
+    /// One wide ultrasonic cone: a [`RangeReading`].
     Sonar = 3,
     /// Range, direction and radial speed: [`RadarDetection`]s.
     Radar = 4,
 }
 
 impl SensorKind {
-    /// Every one.
+    /// All kinds.
     pub const ALL: [Self; 4] = [Self::Lidar, Self::RangeFinder, Self::Sonar, Self::Radar];
 
-    /// Returns the kind of a number; `None` of one that this version does not know.
+    /// Returns the kind with this number; `None` if it is unknown.
     pub fn from_number(number: u32) -> Option<Self> {
         Self::ALL.into_iter().find(|&kind| kind as u32 == number)
     }
 
-    /// Returns its name, as `arena.toml` has it.
+    /// Returns the name, as in `arena.toml`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Lidar => "lidar",
@@ -41,7 +41,7 @@ impl SensorKind {
         }
     }
 
-    /// Returns the bytes of one of its records. [bytes]
+    /// Returns the size of one record. [bytes]
     pub const fn record_len(self) -> usize {
         match self {
             Self::Lidar => size_of::<LidarPoint>(),
@@ -50,7 +50,7 @@ impl SensorKind {
         }
     }
 
-    /// Returns the most records of one reading: of a LiDAR 128 rings of 1024 columns, which are 2.6 MB.
+    /// Returns the maximum number of records in a reading. For a LiDAR: 128 rings of 1024 columns, 2.6 MB.
     pub const fn max_records(self) -> usize {
         match self {
             Self::Lidar => 128 * 1024,
@@ -71,35 +71,35 @@ impl core::fmt::Display for SensorKind {
     }
 }
 
-/// A sensor as the runtime and plugins must know it.
+/// Sensor, as described to the runtime and plugins.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SensorInfo {
-    /// Its name in `arena.toml`.
+    /// Name in `arena.toml`.
     pub name: Name,
-    /// Its kind.
+    /// Kind of the sensor.
     pub kind: SensorKind,
-    /// Whether it measures; it can be switched in flight.
+    /// Whether it is switched on. It can be switched in flight.
     pub enabled: bool,
-    /// Whether the runtime passes its readings on to the autopilot.
+    /// Whether the runtime forwards its readings to the autopilot.
     pub to_autopilot: bool,
-    /// Readings a second. [Hz]
+    /// Rate of readings. [Hz]
     pub rate_hz: f32,
-    /// Nearest that it measures. [m]
+    /// Minimum range. [m]
     pub min_range_m: f32,
-    /// Furthest that it measures. [m]
+    /// Maximum range. [m]
     pub max_range_m: f32,
-    /// Width of what it sees, from side to side. [rad]
+    /// Horizontal field of view. [rad]
     pub horizontal_fov_rad: f32,
-    /// Height of what it sees. [rad]
+    /// Vertical field of view. [rad]
     pub vertical_fov_rad: f32,
-    /// Most records of one reading; memory is laid out for so many.
+    /// Maximum number of records in a reading, used for the memory layout.
     pub most_records: u32,
-    /// Where it sits: sensor axes are x forward, y left, z up.
+    /// Pose of the sensor on the body. Sensor axes: x forward, y left, z up.
     pub body_from_sensor: Pose<Body, Sensor>,
 }
 
 impl SensorInfo {
-    /// Returns the most bytes of one reading's records. [bytes]
+    /// Returns the maximum size of a reading's records. [bytes]
     pub fn most_bytes(&self) -> usize {
         (self.most_records as usize).min(self.kind.max_records()) * self.kind.record_len()
     }

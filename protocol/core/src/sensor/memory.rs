@@ -1,5 +1,5 @@
-//! The sensors' part of an observation in shared memory, behind the cameras' planes: a table of [`SensorHeader`]s, then
-//! each one's records, each at a 64-byte boundary. An observation without sensors has no such part.
+//! Sensor section of an observation in shared memory, after the cameras' planes: a table of [`SensorHeader`]s, then the
+//! records of each sensor, aligned to 64 bytes. An observation without sensors has no such section.
 
 use glam::{DQuat, DVec3};
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -9,68 +9,68 @@ use super::{MAX_SENSORS, SensorKind};
 use crate::geometry::{Body, Pose, Sensor, World};
 use crate::packet::PLANE_ALIGN;
 
-/// Most bytes of a sensor's name.
+/// Maximum length of a sensor's name. [bytes]
 const NAME: usize = 32;
 
-/// One sensor of an observation, and its newest reading.
+/// Sensor of an observation, with its newest reading.
 #[derive(Clone, Copy, Debug, Default, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C)]
 pub struct SensorHeader {
-    /// Counts this sensor's readings, from 1; 0 if there is none yet. The same number is the same reading again.
+    /// Sequence number of this sensor's readings, from 1; 0 before the first. The same number means the same reading.
     pub seq: u64,
-    /// When the newest pose behind the reading was measured. [ns, host]
+    /// Time at which the newest pose used for the reading was measured. [ns, host]
     pub pose_ns: u64,
-    /// The instant that the reading is of; a sweep's last. [ns, host]
+    /// Time of the reading; for a sweep, its end. [ns, host]
     pub stamp_ns: u64,
-    /// When the runtime had it. [ns, host]
+    /// Time at which the runtime received it. [ns, host]
     pub ready_ns: u64,
-    /// Sensor position in the body. [m, body]
+    /// Sensor position on the body. [m, body]
     pub translation_m: [f64; 3],
-    /// Sensor to body rotation, xyzw.
+    /// Sensor-to-body rotation, xyzw.
     pub rotation_xyzw: [f64; 4],
-    /// Where the body was at that instant; zero where the course withholds it. [m, world]
+    /// Position of the body at that time; zero if the course withholds it. [m, world]
     pub body_position_m: [f64; 3],
-    /// Body to world rotation at that instant, xyzw; zero where the course withholds it.
+    /// Body-to-world rotation at that time, xyzw; zero if the course withholds it.
     pub body_rotation_xyzw: [f64; 4],
-    /// Number of its [`SensorKind`].
+    /// Number of the [`SensorKind`].
     pub kind: u32,
-    /// Records of the reading.
+    /// Number of records in the reading.
     pub record_count: u32,
-    /// Start of the records from the start of the observation. [bytes]
+    /// Offset of the records from the start of the observation. [bytes]
     pub records_offset: u32,
-    /// Zero.
+    /// Always zero.
     pub reserved: u32,
-    /// Its name, zeros behind it.
+    /// Name, padded with zeros.
     pub name: [u8; NAME],
 }
 
-// The layout is a contract with other languages and processes.
+// The layout is an interface to other languages and processes.
 const _: () = assert!(size_of::<SensorHeader>() == 192);
 
-/// The records of a reading, by kind.
+/// Records of a reading, by kind.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Records<'a> {
-    /// Of [`SensorKind::Lidar`].
+    /// Records of [`SensorKind::Lidar`].
     Lidar(&'a [LidarPoint]),
-    /// Of [`SensorKind::RangeFinder`] and [`SensorKind::Sonar`].
+    /// Reading of [`SensorKind::RangeFinder`] or [`SensorKind::Sonar`].
     Range(RangeReading),
-    /// Of [`SensorKind::Radar`].
+    /// Records of [`SensorKind::Radar`].
     Radar(&'a [RadarDetection]),
 }
 
 impl SensorHeader {
-    /// Returns its kind; of a header in a validated observation it is known.
+    /// Returns the kind, which is known in a validated observation.
     pub fn kind(&self) -> Option<SensorKind> {
         SensorKind::from_number(self.kind)
     }
 
-    /// Returns its name; empty if the bytes are no text.
+    /// Returns the name; empty if the bytes are not valid UTF-8.
     pub fn name(&self) -> &str {
         let len = self.name.iter().position(|&byte| byte == 0).unwrap_or(NAME);
         core::str::from_utf8(&self.name[..len]).unwrap_or_default()
     }
 
-    /// Writes its name; bytes beyond 32 are left out.
+    /// Writes the name, truncated to 32 bytes.
     pub fn set_name(&mut self, name: &str) {
         self.name = [0; NAME];
         for (to, from) in self.name.iter_mut().zip(name.bytes()) {
@@ -78,18 +78,18 @@ impl SensorHeader {
         }
     }
 
-    /// Returns where it sits.
+    /// Returns the pose of the sensor on the body.
     pub fn body_from_sensor(&self) -> Pose<Body, Sensor> {
         Pose::new(DVec3::from(self.translation_m), DQuat::from_array(self.rotation_xyzw))
     }
 
-    /// Returns where the body was at the reading's instant, if the course lets the plugin know it.
+    /// Returns the pose of the body at the time of the reading, if the course allows it.
     pub fn pose_at_reading(&self) -> Option<Pose<World, Body>> {
         let rotation = DQuat::from_array(self.body_rotation_xyzw);
         Some(Pose::new(DVec3::from(self.body_position_m), rotation)).filter(Pose::is_valid)
     }
 
-    /// Returns its records in the observation's memory; `None` without a reading, and if they are not there.
+    /// Returns the records in the observation's memory; `None` without a reading or if they lie outside the memory.
     pub fn records<'a>(&self, observation: &'a [u8]) -> Option<Records<'a>> {
         let kind = self.kind().filter(|_| self.seq > 0)?;
         let len = (self.record_count as usize).checked_mul(kind.record_len())?;
@@ -105,25 +105,25 @@ impl SensorHeader {
     }
 }
 
-/// Returns the bytes of the sensors' part for readings of so many bytes of records each. [bytes]
+/// Returns the size of the sensor section for readings with these record sizes. [bytes]
 pub fn section_len(records: impl IntoIterator<Item = usize>) -> usize {
     let (count, bytes) =
         records.into_iter().fold((0, 0), |(count, bytes), len| (count + 1, bytes + align(len)));
     if count == 0 { 0 } else { align(count * size_of::<SensorHeader>()) + bytes }
 }
 
-/// Returns where in a section its records begin, for a table of so many sensors. [bytes]
+/// Returns the offset of the first records in a section with this number of sensors. [bytes]
 pub fn records_begin(sensors: usize) -> usize {
     align(sensors * size_of::<SensorHeader>())
 }
 
-/// Returns the next boundary.
+/// Rounds up to the next 64-byte boundary.
 pub const fn align(offset: usize) -> usize {
     offset.next_multiple_of(PLANE_ALIGN)
 }
 
-/// Returns the table of sensors at `offset`, if it and all that it names lie in `observation`; else the index of the
-/// first that does not.
+/// Returns the table of sensors at `offset`, if the table and all its readings lie within `observation`. Otherwise
+/// returns the index of the first invalid sensor.
 pub(crate) fn parse(observation: &[u8], offset: u32, count: u32) -> Result<&[SensorHeader], usize> {
     let count = count as usize;
     if count == 0 {
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_laid_out_is_read() {
+    fn reads_a_valid_section() {
         let memory = section();
         let table = parse(&memory.0, 64, 2).unwrap();
         assert_eq!((table[0].name(), table[1].name()), ("", "down"));
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_outside_is_refused() {
+    fn rejects_records_outside_the_memory() {
         let memory = section();
         assert_eq!(parse(&memory.0, 1024, 1), Err(0));
         assert_eq!(parse(&memory.0, 64, 9), Err(0), "more than there may be");
@@ -198,12 +198,12 @@ mod tests {
         assert_eq!(with(0, &|s| s.record_count = u32::MAX), Err(0));
         assert_eq!(with(0, &|s| s.records_offset = 449), Err(0), "misaligned records");
         assert_eq!(with(0, &|s| s.kind = 99), Err(0));
-        assert_eq!(with(0, &|s| (s.seq, s.records_offset) = (0, 9999)), Ok(2), "none yet");
+        assert_eq!(with(0, &|s| (s.seq, s.records_offset) = (0, 9999)), Ok(2), "no reading yet");
     }
 
     proptest! {
         #[test]
-        fn poisoned_tables_never_reach_outside(at in 64usize..448, value: u8) {
+        fn invalid_tables_are_never_read_outside_the_memory(at in 64usize..448, value: u8) {
             let mut memory = section();
             memory.0[at] = value;
             for sensor in parse(&memory.0, 64, 2).into_iter().flatten() {

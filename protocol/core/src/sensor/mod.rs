@@ -1,14 +1,14 @@
-//! Sensors beside the cameras: one list, each of a kind; their readings on the wire and in shared memory.
+//! Sensors other than cameras: a list of sensors by kind, and their readings on the wire and in shared memory.
 //!
 //! ```text
 //! server ── ReadingHeader, records ──▶ runtime ── SensorHeader, records ──▶ plugin
-//!           one QUIC stream a reading             behind the cameras' planes
+//!           one QUIC stream per reading           after the cameras' planes
 //! ```
-//! The records are the same at both places: fixed little-endian structs, some per reading ([`records`]). A
-//! reading is as long as its header says and its kind allows ([`SensorKind::max_records`]): a hostile length
-//! costs nothing. A sensor's axes are x forward, y left, z up ([`crate::geometry::Sensor`]).
+//! The records are the same in both places: fixed little-endian structs, one or more per reading ([`records`]). The
+//! size of a reading is limited by its header and its kind ([`SensorKind::max_records`]), so that a malicious length
+//! cannot cause an allocation. A sensor's axes are x forward, y left, z up ([`crate::geometry::Sensor`]).
 //!
-//! A new kind (an event camera, say) gets its number, its record and its bound here.
+//! To add a kind (for example an event camera), add its number, record and maximum here.
 
 mod info;
 pub mod memory;
@@ -20,5 +20,5 @@ pub use memory::SensorHeader;
 pub use reading::{InvalidReading, ReadingHeader};
 pub use records::{LidarPoint, RadarDetection, RangeReading};
 
-/// Most sensors beside the cameras of one vehicle.
+/// Maximum number of sensors per vehicle, not counting cameras.
 pub const MAX_SENSORS: usize = 8;

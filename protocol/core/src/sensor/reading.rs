@@ -1,4 +1,4 @@
-//! What frames every reading on its own unidirectional QUIC stream: a header, then its records, then the stream ends.
+//! Header of a sensor reading on its own unidirectional QUIC stream. Its records follow, then the stream ends.
 
 use glam::{DQuat, DVec3};
 use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
@@ -9,7 +9,7 @@ use crate::PROTOCOL_VERSION;
 use crate::geometry::{Body, Pose, Sensor, World};
 use crate::time::ServerTime;
 
-/// Whose reading it is, when and from where it was made. `record_count` records of its kind follow.
+/// Header of a reading: sensor, time and pose. `record_count` records of the sensor's kind follow.
 #[derive(
     Clone, Copy, Debug, PartialEq, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned,
 )]
@@ -20,60 +20,60 @@ pub struct ReadingHeader {
     /// Index into [`crate::messages::ArenaInfo::sensors`].
     pub sensor: u8,
     kind: u8,
-    /// Counts this sensor's readings, from 1.
+    /// Sequence number of this sensor's readings, from 1.
     pub seq: U64,
-    /// When the newest pose behind it was measured. [ns, server]
+    /// Time at which the newest pose used for the reading was measured. [ns, server]
     pub pose_ns: U64,
-    /// The instant that it is of; a sweep's last. [ns, server]
+    /// Time of the reading; for a sweep, its end. [ns, server]
     pub stamp_ns: U64,
-    /// Body position at that instant. [m, world]
+    /// Body position at that time. [m, world]
     pub position_m: [F64; 3],
-    /// Body to world rotation at that instant, xyzw.
+    /// Body-to-world rotation at that time, xyzw.
     pub rotation_xyzw: [F64; 4],
-    /// Sensor position in the body. [m, body]
+    /// Sensor position on the body. [m, body]
     pub mount_m: [F64; 3],
-    /// Sensor to body rotation, xyzw.
+    /// Sensor-to-body rotation, xyzw.
     pub mount_xyzw: [F64; 4],
-    /// Records that follow.
+    /// Number of records that follow.
     pub record_count: U32,
     reserved: U32,
 }
 
-/// Why bytes are no header of a reading.
+/// Reason why bytes are not a valid header of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidReading {
     /// Fewer bytes than a header.
     #[error("header of a sensor's reading is cut short at {0} of {size} bytes", size = ReadingHeader::SIZE)]
     Short(usize),
     /// Wrong magic or version.
-    #[error("these bytes are no sensor's reading of protocol {PROTOCOL_VERSION}")]
+    #[error("these bytes are not a sensor reading of protocol {PROTOCOL_VERSION}")]
     Foreign,
-    /// A kind that this version does not know.
+    /// Kind that this version does not support.
     #[error("reading of sensor kind {0}, which is unknown")]
     Kind(u8),
-    /// Of a sensor that no vehicle has.
+    /// Sensor index above the maximum.
     #[error("reading of sensor {0}; there are at most {MAX_SENSORS}")]
     Sensor(u8),
-    /// Records that its kind cannot have.
+    /// Number of records that the kind does not allow.
     #[error("reading of {count} records; a {kind} has at most {most}", most = kind.max_records())]
     Records {
-        /// Of the header.
+        /// Number of records in the header.
         count: u32,
-        /// Of the sensor.
+        /// Kind of the sensor.
         kind: SensorKind,
     },
-    /// A pose that is none.
-    #[error("reading: the pose of its sensor is not a number to work with")]
+    /// Invalid pose of the body or the sensor.
+    #[error("reading: the pose of the body or the sensor is out of range")]
     Pose,
 }
 
 impl ReadingHeader {
-    /// Bytes on the wire.
+    /// Size on the wire. [bytes]
     pub const SIZE: usize = size_of::<Self>();
-    /// The first bytes of every reading; images begin otherwise.
+    /// First bytes of every reading. Images start with other bytes.
     pub const MAGIC: [u8; 4] = *b"VZSR";
 
-    /// Makes the header of a reading of `record_count` records, of the instant of its pose.
+    /// Returns the header of a reading with `record_count` records, at the time of its pose.
     pub fn new(
         seq: u64,
         (sensor, kind): (u8, SensorKind),
@@ -99,10 +99,10 @@ impl ReadingHeader {
         }
     }
 
-    /// Reads and validates a header at the start of `bytes`; returns it with what follows.
+    /// Reads and validates a header at the start of `bytes`. Returns it and the remaining bytes.
     ///
     /// # Errors
-    /// The first fault found; of a valid one [`Self::payload_len`] is bounded.
+    /// Returns the first error found. In a valid header, [`Self::payload_len`] is bounded.
     pub fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), InvalidReading> {
         let (header, rest) =
             Self::read_from_prefix(bytes).map_err(|_| InvalidReading::Short(bytes.len()))?;
@@ -125,17 +125,17 @@ impl ReadingHeader {
         Ok((header, rest))
     }
 
-    /// Returns the kind; of a parsed header it is known.
+    /// Returns the kind, which is known for a parsed header.
     pub fn kind(&self) -> SensorKind {
         SensorKind::from_number(self.kind.into()).unwrap_or(SensorKind::Lidar)
     }
 
-    /// Returns the bytes of its records. [bytes]
+    /// Returns the size of its records. [bytes]
     pub fn payload_len(&self) -> usize {
         self.record_count.get() as usize * self.kind().record_len()
     }
 
-    /// Returns where the body was at the instant that it is of.
+    /// Returns the pose of the body at the time of the reading.
     pub fn world_from_body(&self) -> Pose<World, Body> {
         Pose::new(
             DVec3::from_array(self.position_m.map(F64::get)),
@@ -143,7 +143,7 @@ impl ReadingHeader {
         )
     }
 
-    /// Returns where the sensor sat on the body.
+    /// Returns the pose of the sensor on the body.
     pub fn body_from_sensor(&self) -> Pose<Body, Sensor> {
         Pose::new(
             DVec3::from_array(self.mount_m.map(F64::get)),
@@ -151,18 +151,18 @@ impl ReadingHeader {
         )
     }
 
-    /// Returns the pose's stamp.
+    /// Returns the stamp of the pose.
     pub fn pose_stamp(&self) -> ServerTime {
         ServerTime::from_ns(self.pose_ns.get())
     }
 
-    /// Returns the instant that it is of.
+    /// Returns the time of the reading.
     pub fn stamp(&self) -> ServerTime {
         ServerTime::from_ns(self.stamp_ns.get())
     }
 }
 
-// The layout is a contract between the two ends.
+// The layout is an interface between both ends.
 const _: () = assert!(ReadingHeader::SIZE == 152);
 
 #[cfg(test)]
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hostile_header_is_refused() {
+    fn rejects_invalid_headers() {
         let check = |change: &dyn Fn(&mut ReadingHeader), expected| {
             let mut h = header(SensorKind::Lidar, 5);
             change(&mut h);

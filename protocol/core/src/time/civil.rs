@@ -1,24 +1,24 @@
-//! The date and the time of day, in UTC.
+//! Date and time of day in UTC.
 
-/// A date and a time of day, in UTC.
+/// Date and time of day in UTC.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Civil {
-    /// 1970 or later.
+    /// Year, 1970 or later.
     pub year: u64,
-    /// 1 to 12.
+    /// Month, 1 to 12.
     pub month: u64,
-    /// 1 to 31.
+    /// Day of the month, 1 to 31.
     pub day: u64,
-    /// 0 to 23.
+    /// Hour, 0 to 23.
     pub hour: u64,
-    /// 0 to 59.
+    /// Minute, 0 to 59.
     pub minute: u64,
-    /// 0 to 59.
+    /// Second, 0 to 59.
     pub second: u64,
 }
 
 impl Civil {
-    /// Returns that of so many seconds since 1970.
+    /// Converts seconds since 1970 (Unix time).
     pub fn of_unix(seconds: u64) -> Self {
         let (days, second) = (seconds / 86_400, seconds % 86_400);
         // Civil date from days since 1970, after H. Hinnant, "chrono-compatible low-level date

@@ -1,15 +1,14 @@
-//! Relates two clocks from request-reply exchanges: offset, drift, and a bound of the error.
+//! Clock offset estimation from request-reply exchanges: offset, drift, and an error bound.
 //!
-//! An exchange shows that the remote clock was at `remote` at some moment between `sent` and
-//! `received`. As clocks run forward, their offset (remote less local) was at most
-//! `remote - sent` when it was sent, and at least `remote - received` when the answer was read.
-//! Over a window of exchanges these are half-planes in (offset, drift); what all of them leave is
-//! where the truth lies, and its middle is the estimate. No delay needs to be symmetric, and a
-//! slow exchange costs nothing: its bound is only wide.
+//! An exchange shows that the remote clock was at `remote` at some time between `sent` and `received`. Because clocks
+//! run forward, the offset (remote minus local) was at most `remote - sent` when the request was sent, and at least
+//! `remote - received` when the reply was read. Over a window of exchanges, these are half-planes in (offset, drift).
+//! The truth lies in their intersection, and its middle is the estimate. Delays need not be symmetric, and a slow
+//! exchange does no harm: its bounds are only wide.
 //!
-//! The bound rests on two assumptions: a clock runs wrong by at most [`MAX_DRIFT`], and over the
-//! window its drift changes by at most [`WANDER`]. Exchanges that contradict each other prove a
-//! step (a restart, a suspended computer): then only the newest counts.
+//! The bound rests on two assumptions: two clocks drift by at most [`MAX_DRIFT`], and over the window the drift changes
+//! by at most [`WANDER`]. Exchanges that contradict each other prove a step (a restart, a suspended computer). Then
+//! only the newest one is used.
 
 #[cfg(test)]
 mod tests;
@@ -18,7 +17,7 @@ use core::marker::PhantomData;
 
 use super::{Clock, Stamp};
 
-/// The relation of a remote clock to a local one. See the module.
+/// Estimate of the offset between a remote and a local clock. See the module.
 #[derive(Clone, Copy, Debug)]
 pub struct OffsetFilter<Local, Remote> {
     window: [Exchange; WINDOW],
@@ -37,31 +36,31 @@ struct Exchange {
     received_ns: u64,
 }
 
-/// The estimate of the window.
+/// Estimate from the window.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
-    /// When the offset was so: the end of the newest exchange. [ns, local]
+    /// Local time for which the offset is valid: the end of the newest exchange. [ns, local]
     at_ns: u64,
-    /// Remote less local. [ns]
+    /// Remote minus local time. [ns]
     offset_ns: i64,
-    /// Bound of its error at that time. [ns]
+    /// Bound of the offset's error at that time. [ns]
     error_ns: f64,
-    /// How much faster the remote clock runs.
+    /// Relative rate difference, positive if the remote clock runs faster.
     drift: f64,
-    /// Bound of its error.
+    /// Bound of the drift's error.
     drift_error: f64,
 }
 
-/// Exchanges remembered: a minute at one a second. Twice as many would know the drift twice as
-/// well, but by then it has changed by as much. 1.5 KB.
+/// Number of stored exchanges: about one minute at one per second, 1.5 KB. Twice the window would halve the error of
+/// the drift, but the drift itself changes by as much in that time.
 const WINDOW: usize = 64;
-/// No clock runs wrong by more: crystals are cut to 50 ppm or better, so two differ by at most
-/// 100, and time services that slew gently add as much.
+/// Maximum drift between two clocks. Crystals are accurate to 50 ppm or better, so two clocks differ by at most 100
+/// ppm, and time services that slew slowly add as much.
 const MAX_DRIFT: f64 = 200e-6;
-/// How far the drift strays from its mean over the window: a crystal that warms by 5 degrees as
-/// the computer gets busy changes by about 1 ppm.
+/// Maximum deviation of the drift from its mean over the window. A crystal that warms by 5 degrees, as the computer
+/// gets busy, changes by about 1 ppm.
 const WANDER: f64 = 1e-6;
-/// Clocks may count microseconds, as ArduPilot's does. [ns]
+/// Resolution of a clock that counts microseconds, as ArduPilot's does. [ns]
 const GRAIN_NS: f64 = 1_000.0;
 
 impl<Local: Clock, Remote: Clock> Default for OffsetFilter<Local, Remote> {
@@ -78,8 +77,8 @@ impl<Local: Clock, Remote: Clock> Default for OffsetFilter<Local, Remote> {
 }
 
 impl<Local: Clock, Remote: Clock> OffsetFilter<Local, Remote> {
-    /// Takes one exchange: asked at `sent`, answered by the remote at `remote`, answer read at
-    /// `received`. An exchange that ends before it began is dropped.
+    /// Adds one exchange: request sent at `sent`, answered by the remote at `remote`, reply read at `received`. An
+    /// exchange that ends before it began is dropped.
     pub fn update(&mut self, sent: Stamp<Local>, remote: Stamp<Remote>, received: Stamp<Local>) {
         if received < sent {
             return;
@@ -100,31 +99,29 @@ impl<Local: Clock, Remote: Clock> OffsetFilter<Local, Remote> {
         }
     }
 
-    /// Returns what was to be added to local time at `at` to give remote time; `None` before the
-    /// first exchange. [ns]
+    /// Returns the offset to add to local time at `at` to get remote time; `None` before the first exchange. [ns]
     pub fn offset_ns(&self, at: Stamp<Local>) -> Option<i64> {
         let fit = self.fit?;
         let drifted_ns = fit.drift * since(at.as_ns(), fit.at_ns);
         Some(fit.offset_ns.wrapping_add(libm::round(drifted_ns) as i64))
     }
 
-    /// Returns the bound of the offset's error at `at`: about half the best round trip when
-    /// exchanges come regularly, and growing by the drift's uncertainty in a silence; `None`
-    /// before the first exchange. [ns]
+    /// Returns the bound of the offset's error at `at`; `None` before the first exchange. With regular exchanges, it is
+    /// about half the shortest round trip. During a silence it grows with the uncertainty of the drift. [ns]
     pub fn error_bound_ns(&self, at: Stamp<Local>) -> Option<u64> {
         let fit = self.fit?;
         let away_ns = since(at.as_ns(), fit.at_ns).abs();
-        // Rounding up, of this and of the offset.
+        // For rounding of this value and of the offset.
         Some((fit.error_ns + fit.drift_error * away_ns) as u64 + 2)
     }
 
-    /// Returns how much faster the remote clock runs than the local one, and the bound of the
-    /// error of that; `None` before the first exchange. [ppm]
+    /// Returns the drift (positive if the remote clock runs faster) and the bound of its error; `None` before the first
+    /// exchange. [ppm]
     pub fn drift_ppm(&self) -> Option<(f64, f64)> {
         self.fit.map(|fit| (fit.drift * 1e6, fit.drift_error * 1e6))
     }
 
-    /// Returns how often exchanges contradicted each other: a clock was set or restarted.
+    /// Returns the number of times that exchanges contradicted each other: a clock was set or restarted.
     pub fn steps(&self) -> u64 {
         self.steps
     }
@@ -159,8 +156,8 @@ fn since(a: u64, b: u64) -> f64 {
     a.wrapping_sub(b).cast_signed() as f64
 }
 
-/// Bounds on the offset that one exchange sets: at most `above` at `sent`, at least `below` at
-/// `received`; all relative to the newest exchange. [ns]
+/// Bounds on the offset from one exchange: at most `above` at `sent`, at least `below` at `received`; all relative to
+/// the newest exchange. [ns]
 #[derive(Clone, Copy, Default)]
 struct Bounds {
     sent: f64,
@@ -169,7 +166,7 @@ struct Bounds {
     below: f64,
 }
 
-/// Returns the middle of what all exchanges leave possible; `None` if they contradict each other.
+/// Returns the middle of the intersection of all bounds; `None` if it is empty.
 fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
     let base_ns = newest.remote_ns.wrapping_sub(newest.sent_ns);
     let mut storage = [Bounds::default(); WINDOW];
@@ -182,7 +179,7 @@ fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
             below: since(e.remote_ns.wrapping_sub(e.received_ns), base_ns) - GRAIN_NS,
         };
     }
-    // The mean drift between any two of them; at 64 exchanges 4096 pairs a second.
+    // Mean drift between each pair of exchanges; with 64 exchanges, 4096 pairs per second.
     let (mut least, mut most) = (-MAX_DRIFT, MAX_DRIFT);
     for later in &*bounds {
         for earlier in &*bounds {
@@ -199,8 +196,7 @@ fn fit(window: &[Exchange], newest: Exchange) -> Option<Fit> {
     if !(least <= most) {
         return None;
     }
-    // From each exchange to the end of the newest: later by `span`, or earlier where answers
-    // overtook each other.
+    // From each exchange to the end of the newest: `span` is positive, or negative if replies overtook each other.
     let at = since(newest.received_ns, newest.sent_ns);
     let (slow, fast) = (least - WANDER, most + WANDER);
     let (mut low, mut high) = (f64::NEG_INFINITY, f64::INFINITY);

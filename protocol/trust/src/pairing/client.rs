@@ -1,4 +1,4 @@
-//! The client's side: it knows a code that somebody read to it.
+//! Client's side of pairing, with the code that the user typed.
 
 use hmac::{Hmac, Mac};
 use sha2::Sha256;
@@ -6,7 +6,7 @@ use vizflyt_protocol::messages::{Name, PairingProof, PairingRequest, PairingShar
 
 use super::{Agreement, Binding, Code, PairingRole, Transcript, is, start};
 
-/// A client that has begun and waits for the server's half.
+/// Client that has sent its share and waits for the server's.
 pub struct PairingClient {
     agreement: Agreement,
     binding: Binding,
@@ -14,11 +14,11 @@ pub struct PairingClient {
     share: PairingShare,
 }
 
-/// A client that has shown its proof and waits for the server's.
+/// Client that has sent its proof and waits for the server's.
 pub struct Confirming(Hmac<Sha256>);
 
 impl PairingClient {
-    /// Begins; returns what to send. A name too long for a message is cut.
+    /// Starts pairing. Returns the message to send. A name that is too long is truncated.
     pub fn begin(code: Code, name: &str, binding: Binding) -> (Self, PairingRequest) {
         let (agreement, share) = start(PairingRole::A, code);
         let name: Name = bounded(name);
@@ -26,7 +26,7 @@ impl PairingClient {
         (Self { agreement, binding, name, share }, message)
     }
 
-    /// Takes the server's half; returns what to send, `None` if it is no half.
+    /// Processes the server's share. Returns the message to send; `None` if the share is invalid.
     pub fn confirm(self, server_share: &PairingShare) -> Option<(Confirming, PairingRequest)> {
         let transcript = Transcript {
             binding: &self.binding,
@@ -41,7 +41,7 @@ impl PairingClient {
 }
 
 impl Confirming {
-    /// Whether the server has the key too: then it is the one that showed the code.
+    /// Whether the server has the same key, and is therefore the server that displayed the code.
     pub fn is_proof(self, proof: &PairingProof) -> bool {
         is(self.0, proof)
     }

@@ -1,4 +1,4 @@
-//! The server's side: one window at a time, two minutes, three tries, one success.
+//! Server's side of pairing. At most one window is open, for two minutes, three tries and one success.
 
 use std::time::{Duration, Instant};
 
@@ -10,16 +10,16 @@ use super::{Binding, Code, PairingRole, Transcript, is, start};
 use crate::paired::is_name;
 use crate::{Client, Fingerprint, Role};
 
-/// How long a code is good for.
+/// Time for which a code is valid.
 pub const VALID: Duration = Duration::from_mins(2);
-/// Wrong codes that a window bears.
+/// Maximum number of wrong codes per window.
 pub const TRIES: u32 = 3;
 
-/// Where computers are paired.
+/// Pairing state of the server.
 #[derive(Debug, Default)]
 pub struct PairingServer {
     window: Option<Window>,
-    /// Windows opened so far.
+    /// Number of windows opened since the start.
     opened: u64,
 }
 
@@ -32,20 +32,20 @@ struct Window {
     tries_left: u32,
 }
 
-/// The open window, for the one who opened it.
+/// Open window, for display to the user who opened it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WindowState {
-    /// What to type.
+    /// Code to type.
     pub code: Code,
-    /// What it gives.
+    /// Rights that the pairing grants.
     pub grant: Grant,
-    /// How long it is still good for.
+    /// Remaining time.
     pub left: Duration,
-    /// Wrong codes it still bears.
+    /// Remaining number of tries.
     pub tries_left: u32,
 }
 
-/// Why a computer is not paired, in a sentence for its user.
+/// Reason why a computer is not paired, as a sentence for its user.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// No window is open.
@@ -56,21 +56,21 @@ pub enum Refusal {
     /// The proof is wrong.
     #[error("wrong code, {left} of {TRIES} tries left")]
     Wrong {
-        /// Tries left.
+        /// Remaining tries.
         left: u32,
     },
-    /// The proof is wrong for the last time.
-    #[error("wrong code for the last time; open a new pairing for a new code")]
+    /// The proof is wrong, and no tries remain.
+    #[error("wrong code, no tries left; open a new pairing for a new code")]
     Shut,
-    /// The name cannot be shown to people.
+    /// The name cannot be displayed.
     #[error("the computer's name must be 1 to 32 bytes of text; pass --name NAME")]
     Name,
-    /// Not what is due.
-    #[error("the other side does not pair as this version does; update the older of the two")]
+    /// Unexpected or invalid message.
+    #[error("the other side uses another pairing protocol; update the older of the two")]
     Foreign,
 }
 
-/// A client that has begun and must now show its proof.
+/// Client that has started and must now send its proof.
 pub struct Attempt {
     window: u64,
     name: String,
@@ -79,7 +79,7 @@ pub struct Attempt {
     server: Hmac<Sha256>,
 }
 
-/// A client that knew the code.
+/// Client that has proved the code.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Admitted {
     /// The entry for `paired.toml`.
@@ -91,7 +91,7 @@ pub struct Admitted {
 }
 
 impl PairingServer {
-    /// Opens a window; false while one is open.
+    /// Opens a window; returns false if one is already open.
     pub fn open(&mut self, now: Instant, code: Code, grant: Grant) -> bool {
         if self.at(now).is_some() {
             return false;
@@ -103,12 +103,12 @@ impl PairingServer {
         true
     }
 
-    /// Shuts the window.
+    /// Closes the window.
     pub fn shut(&mut self) {
         self.window = None;
     }
 
-    /// Returns the open window.
+    /// Returns the open window, if there is one.
     pub fn state(&mut self, now: Instant) -> Option<WindowState> {
         self.at(now).map(|window| WindowState {
             code: window.code,
@@ -118,9 +118,9 @@ impl PairingServer {
         })
     }
 
-    /// Takes a client's first message; returns the attempt and the server's half.
+    /// Processes a client's first message. Returns the attempt and the server's share.
     ///
-    /// An attempt that ends here has revealed nothing about the code to the client.
+    /// An attempt that ends here reveals nothing about the code to the client.
     pub fn begin(
         &mut self,
         now: Instant,
@@ -146,7 +146,7 @@ impl PairingServer {
         Ok((attempt, server_share))
     }
 
-    /// Takes a client's proof. Right, it shuts the window; wrong, it takes one try.
+    /// Processes a client's proof. A correct proof closes the window; a wrong one uses one try.
     pub fn confirm(
         &mut self,
         now: Instant,
@@ -154,7 +154,7 @@ impl PairingServer {
         message: &PairingRequest,
     ) -> Result<Admitted, Refusal> {
         let PairingRequest::Confirm { proof } = message else { return Err(Refusal::Foreign) };
-        // The window may have shut meanwhile, and another one opened.
+        // The window may have been closed and another one opened.
         let window =
             self.at(now).filter(|window| window.number == attempt.window).ok_or(Refusal::Closed)?;
         if !is(attempt.client, proof) {
@@ -179,7 +179,7 @@ impl PairingServer {
         Ok(Admitted { client, grant, proof: attempt.server.finalize().into_bytes().into() })
     }
 
-    /// Returns the window, if it is open at `now`.
+    /// Returns the window if it is open at `now`.
     fn at(&mut self, now: Instant) -> Option<&mut Window> {
         if self.window.as_ref().is_some_and(|window| now >= window.until) {
             self.window = None;

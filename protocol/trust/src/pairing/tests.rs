@@ -1,4 +1,4 @@
-//! Pairing in memory: two honest sides, and those in between.
+//! Pairing in memory: between two honest sides, and with attackers.
 
 use std::time::Instant;
 
@@ -16,7 +16,7 @@ fn team() -> Grant {
     Grant::Team { vehicles: heapless_one("ant") }
 }
 
-/// One name in the message's own kind of list.
+/// Returns a list with one name, in the message's list type.
 fn heapless_one<const N: usize>(name: &str) -> heapless::Vec<vizflyt_protocol::messages::Name, N> {
     std::iter::once(bounded(name)).collect()
 }
@@ -34,12 +34,12 @@ struct Lab {
     now: Instant,
 }
 
-/// What a client received at the end.
+/// Result of a client's attempt.
 #[derive(Debug, PartialEq)]
 enum PairingOutcome {
     Paired(Box<Admitted>),
     Refused(Refusal),
-    /// The server's proof did not hold.
+    /// The server's proof was invalid.
     Deceived,
 }
 
@@ -58,7 +58,7 @@ impl Lab {
         self.server.begin(self.now, message, seen)
     }
 
-    /// Runs a client with `text` on a connection that the two ends may see differently.
+    /// Runs a client with `text` on a connection. The two ends may see it differently.
     fn pair(&mut self, text: &str, client_sees: Binding, server_sees: Binding) -> PairingOutcome {
         let (client, message) = PairingClient::begin(code(text), "jetson", client_sees);
         let (attempt, share) = match self.begin(&message, &server_sees) {
@@ -99,7 +99,7 @@ fn the_right_code_pairs_once() {
 }
 
 #[test]
-fn three_wrong_codes_shut_the_window() {
+fn closes_the_window_after_three_wrong_codes() {
     let mut lab = Lab::open("123456");
     assert_eq!(lab.try_code("123457"), PairingOutcome::Refused(Refusal::Wrong { left: 2 }));
     assert_eq!(lab.try_code("654321"), PairingOutcome::Refused(Refusal::Wrong { left: 1 }));
@@ -109,12 +109,12 @@ fn three_wrong_codes_shut_the_window() {
     lab.try_code("123457");
     assert!(
         matches!(lab.try_code("123456"), PairingOutcome::Paired(_)),
-        "a slip of the finger is no harm"
+        "one typing error does not prevent pairing"
     );
 }
 
 #[test]
-fn tries_in_parallel_are_no_more_tries() {
+fn parallel_attempts_share_the_three_tries() {
     let mut lab = Lab::open("123456");
     let seen = binding(1);
     let mut begun: Vec<_> = (0..9)
@@ -135,7 +135,7 @@ fn tries_in_parallel_are_no_more_tries() {
 }
 
 #[test]
-fn a_code_expires_also_between_two_messages() {
+fn a_code_expires_between_two_messages() {
     let mut lab = Lab::open("123456");
     let seen = binding(1);
     let (client, message) = PairingClient::begin(code("123456"), "jetson", seen);
@@ -146,23 +146,23 @@ fn a_code_expires_also_between_two_messages() {
     assert!(lab.is_open());
     lab.now = opened + VALID;
     assert!(!lab.is_open());
-    // Not even through the next window, should it have the same code.
+    // The attempt must not succeed in the next window, even with the same code.
     assert!(lab.server.open(lab.now, code("123456"), Grant::Instructor));
     let end = lab.server.confirm(lab.now, attempt, &message);
     assert_eq!(end, Err(Refusal::Closed));
 }
 
-/// The man in the middle has his own certificate toward each side, so each connection has its own
-/// exporter; he passes every message on as it is.
+/// A man in the middle has his own certificate on each side, so each connection has its own exporter. He forwards every
+/// message unchanged.
 #[test]
-fn a_relay_between_two_connections_fails_with_the_right_code() {
+fn rejects_a_relay_even_with_the_right_code() {
     let middle = Fingerprint::of(b"middle");
     let toward_client = Binding { server: middle, ..binding(1) };
     let toward_server = Binding { client: middle, ..binding(2) };
     let mut lab = Lab::open("123456");
     let end = lab.pair("123456", toward_client, toward_server);
     assert_eq!(end, PairingOutcome::Refused(Refusal::Wrong { left: 2 }));
-    // Each part of the binding counts by itself.
+    // Each part of the binding is checked.
     for other in [
         Binding { exporter: [2; 32], ..binding(1) },
         Binding { client: middle, ..binding(1) },
@@ -174,23 +174,23 @@ fn a_relay_between_two_connections_fails_with_the_right_code() {
     }
 }
 
-/// He plays the server to the client, with a guess of the code, and gets one proof to check it on.
+/// An attacker poses as the server with a guessed code, and gets one proof to test the guess.
 #[test]
-fn a_false_server_that_guesses_wrong_is_rejected() {
+fn rejects_a_false_server_with_a_wrong_guess() {
     let seen = Binding { server: Fingerprint::of(b"middle"), ..binding(1) };
     let (client, message) = PairingClient::begin(code("123456"), "jetson", seen);
     let mut false_server = Lab::open("111111");
     let (attempt, share) = false_server.begin(&message, &seen).unwrap();
     let (confirming, message) = client.confirm(&share).unwrap();
     let end = false_server.server.confirm(false_server.now, attempt, &message);
-    assert_eq!(end, Err(Refusal::Wrong { left: 2 }), "his guess was wrong, and he knows only that");
-    // He answers all the same, echoing the client's proof, or anything else.
+    assert_eq!(end, Err(Refusal::Wrong { left: 2 }), "the attacker gets only the result of one guess");
+    // The attacker replies anyway, with the client's proof or other data.
     let PairingRequest::Confirm { proof } = message else { panic!() };
-    assert!(!confirming.is_proof(&proof), "the two proofs differ, so an echo is none");
+    assert!(!confirming.is_proof(&proof), "the two proofs differ, so an echo is invalid");
 }
 
 #[test]
-fn recorded_messages_cannot_be_replayed() {
+fn rejects_replayed_messages() {
     let seen = binding(1);
     let mut lab = Lab::open("123456");
     let (client, begin) = PairingClient::begin(code("123456"), "jetson", seen);
@@ -198,20 +198,19 @@ fn recorded_messages_cannot_be_replayed() {
     let (confirming, confirm) = client.confirm(&share).unwrap();
     let admitted = lab.server.confirm(lab.now, attempt, &confirm).unwrap();
     assert!(confirming.is_proof(&admitted.proof));
-    // The same window of code, the same fingerprints, even the same exporter: the server's half is
-    // new every time.
+    // The same code, the same fingerprints, even the same exporter: the server's share is new in each attempt.
     let mut lab = Lab::open("123456");
     let (attempt, _) = lab.begin(&begin, &seen).unwrap();
     let end = lab.server.confirm(lab.now, attempt, &confirm);
     assert_eq!(end, Err(Refusal::Wrong { left: 2 }));
-    // And the server's old proof is worthless to a new client.
+    // The server's old proof is invalid for a new client.
     let (client, _) = PairingClient::begin(code("123456"), "jetson", seen);
     let (confirming, _) = client.confirm(&share).unwrap();
     assert!(!confirming.is_proof(&admitted.proof));
 }
 
 #[test]
-fn messages_out_of_order_are_refused() {
+fn rejects_messages_out_of_order() {
     let mut lab = Lab::open("123456");
     let seen = binding(1);
     let confirm = PairingRequest::Confirm { proof: [0; 32] };
@@ -228,13 +227,13 @@ fn messages_out_of_order_are_refused() {
 
 proptest! {
     #[test]
-    fn any_other_code_name_or_half_fails(
+    fn rejects_any_other_code_name_or_share(
         right in 0..CODES, wrong in 0..CODES, flip in 0..256_usize, other in "[a-z]{1,8}",
     ) {
         prop_assume!(right != wrong && other != "jetson");
         let (right, wrong) = (Code::from_number(right), Code::from_number(wrong));
         let seen = binding(1);
-        // (the client's code, what is done to its first message, does it pair)
+        // (the client's code, change of its first message, whether it pairs)
         let tampered = |message: PairingRequest, kind: u8| match (message, kind) {
             (PairingRequest::Begin { share, .. }, 1) => {
                 PairingRequest::Begin { name: bounded(&other), share }
@@ -258,7 +257,7 @@ proptest! {
     }
 
     #[test]
-    fn arbitrary_messages_neither_pair_nor_panic(share: PairingShare, proof: PairingProof) {
+    fn rejects_arbitrary_messages_without_a_panic(share: PairingShare, proof: PairingProof) {
         let mut lab = Lab::open("123456");
         let seen = binding(1);
         let begin = PairingRequest::Begin { name: bounded("x"), share };
@@ -273,7 +272,7 @@ proptest! {
     }
 
     #[test]
-    fn codes_are_read_as_they_are_written(number in 0..CODES) {
+    fn parses_printed_codes(number in 0..CODES) {
         let code = Code::from_number(number);
         prop_assert_eq!(code.to_string().parse(), Ok(code));
         prop_assert_eq!(format!("{number:06}").parse(), Ok(code));
@@ -281,7 +280,7 @@ proptest! {
 }
 
 #[test]
-fn codes_of_another_form_are_refused() {
+fn rejects_invalid_codes() {
     for wrong in ["", "12345", "1234567", "12345a", "١٢٣٤٥٦"] {
         assert!(wrong.parse::<Code>().is_err(), "{wrong}");
     }

@@ -9,7 +9,7 @@ use crate::time::{Host, HostTime, Server, ServerTime};
 const SECOND_NS: u64 = 1_000_000_000;
 const START_NS: u64 = 2_000 * SECOND_NS;
 
-/// A server's clock: an offset, a drift, and a slow wander around it.
+/// Clock of a server: an offset, a drift, and a slow variation of the drift.
 #[derive(Clone, Copy, Debug)]
 struct Truth {
     offset_ns: i64,
@@ -18,10 +18,10 @@ struct Truth {
 }
 
 impl Truth {
-    /// Returns remote less local at a local time. [ns]
+    /// Returns remote minus local time at a local time. [ns]
     fn offset_ns(&self, local_ns: u64) -> i64 {
         let seconds = (local_ns - START_NS) as f64 * 1e-9;
-        // The integral of `wander * sin(omega t)`: one swing in three minutes.
+        // Integral of `wander * sin(omega t)`, with a period of three minutes.
         let omega = std::f64::consts::TAU / 180.0;
         let wandered = self.wander_ppm * (1.0 - (omega * seconds).cos()) / omega;
         self.offset_ns + ((self.drift_ppm * seconds + wandered) * 1e3) as i64
@@ -32,7 +32,7 @@ impl Truth {
     }
 }
 
-/// Asks at `now_ns`, with these one-way delays.
+/// Performs an exchange that starts at `now_ns`, with these one-way delays. Returns its end.
 fn exchange(
     filter: &mut OffsetFilter<Host, Server>,
     truth: &Truth,
@@ -61,15 +61,15 @@ fn truths() -> impl Strategy<Value = Truth> {
         .prop_map(|(offset_ns, drift_ppm, wander_ppm)| Truth { offset_ns, drift_ppm, wander_ppm })
 }
 
-/// One-way delays: anything, with a tail; nothing is symmetric.
+/// One-way delays, asymmetric and with a long tail.
 fn delays() -> impl Strategy<Value = (u64, u64)> {
     let delay = prop_oneof![0u64..300_000, 0u64..20_000_000];
     (delay.clone(), delay)
 }
 
 proptest! {
-    /// Whatever the delays, the drift and the silences, the truth lies within the bound: when an
-    /// exchange has come, a little before, and long after.
+    /// For any delays, drift and silences, the truth lies within the bound: at the end of an exchange, shortly before
+    /// it, and long after it.
     #[test]
     fn the_error_bound_holds(
         truth in truths(),
@@ -97,9 +97,9 @@ proptest! {
         prop_assert!((drift_ppm - truth.drift_ppm).abs() <= drift_bound_ppm + truth.wander_ppm.abs());
     }
 
-    /// A clock that is set, or a server that restarts, is followed from the first exchange on.
+    /// After a clock is set or a server restarts, the estimate is correct from the first exchange on.
     #[test]
-    fn a_step_is_followed_at_once(
+    fn follows_a_step_at_once(
         truth in truths(),
         step_ns in prop_oneof![-500_000_000_000i64..-100_000_000, 100_000_000i64..500_000_000_000],
         before in prop::collection::vec(delays(), 1..100),
@@ -121,9 +121,9 @@ proptest! {
         prop_assert_eq!(filter.steps(), 1);
     }
 
-    /// Nonsense of a hostile peer costs nothing but its own sense.
+    /// Arbitrary stamps of a hostile peer do not cause a panic.
     #[test]
-    fn any_stamps_are_taken(stamps in prop::collection::vec(any::<(u64, u64, u64)>(), 1..200)) {
+    fn accepts_any_stamps(stamps in prop::collection::vec(any::<(u64, u64, u64)>(), 1..200)) {
         let mut filter = OffsetFilter::<Host, Server>::default();
         for (sent, remote, received) in stamps {
             let received = HostTime::from_ns(received);
@@ -134,8 +134,8 @@ proptest! {
     }
 }
 
-/// The filter before this one: of the last eight exchanges the one with the least round trip, its
-/// middle taken for the moment of the answer, no drift.
+/// Simple filter for comparison: of the last eight exchanges, it uses the one with the shortest round trip, and assumes
+/// that the reply was stamped in its middle. No drift.
 #[derive(Default)]
 struct MinimumDelay(Vec<(i64, u64)>);
 
@@ -156,17 +156,17 @@ impl MinimumDelay {
         (best.0 - truth.offset_ns(at_ns)).abs()
     }
 
-    /// Half the round trip, and the drift that two crystals may have since the oldest exchange.
+    /// Half the round trip, plus the drift that two crystals may have since the oldest exchange.
     fn bound_ns(&self) -> i64 {
         let best = self.0.iter().map(|(_, round_trip_ns)| round_trip_ns).min().unwrap();
         (best / 2) as i64 + 8 * 200_000
     }
 }
 
-/// Over ten minutes on a LAN with queues, error and bound are well below the former filter's.
+/// Over ten minutes on a LAN with queues, error and bound are well below those of the simple filter.
 #[test]
-fn on_a_long_run_it_beats_the_minimum_delay_alone() {
-    // A small generator: any will do.
+fn has_lower_error_and_bound_than_a_minimum_delay_filter() {
+    // A simple generator; its quality is not important.
     let mut state = 88_172_645_463_325_252_u64;
     let mut random = move || {
         state ^= state << 13;
@@ -180,7 +180,7 @@ fn on_a_long_run_it_beats_the_minimum_delay_alone() {
         let (mut ours, mut bounds, mut theirs, mut their_bounds) = (0, 0, 0, 0);
         let mut now_ns = START_NS;
         for second in 0..600 {
-            // 0.1 ms each way, and a queue that images fill on the way back.
+            // 0.1 ms each way, plus a queue that images fill on the way back.
             let mut delay = |queue_ns: f64| (100_000.0 - queue_ns * (1.0 - random()).ln()) as u64;
             let delays = (delay(100_000.0), delay(600_000.0));
             exchange(&mut filter, &truth, now_ns, delays);
@@ -196,7 +196,7 @@ fn on_a_long_run_it_beats_the_minimum_delay_alone() {
         }
         let mean_us = |sum: i64| sum as f64 / 540e3;
         std::println!(
-            "{drift_ppm:5} ppm: error {:.0} us of {:.0}, formerly {:.0} of {:.0}",
+            "{drift_ppm:5} ppm: error {:.0} us of {:.0}, simple filter {:.0} of {:.0}",
             mean_us(ours),
             mean_us(bounds),
             mean_us(theirs),
@@ -208,24 +208,24 @@ fn on_a_long_run_it_beats_the_minimum_delay_alone() {
 }
 
 #[test]
-fn one_exchange_bounds_the_error_by_half_its_round_trip() {
+fn bounds_the_error_by_half_the_round_trip() {
     let mut filter = OffsetFilter::<Host, Server>::default();
     assert_eq!(filter.error_bound_ns(HostTime::ZERO), None);
     assert_eq!(filter.drift_ppm(), None);
     let received = HostTime::from_ns(5_400_000);
     filter.update(HostTime::from_ns(5_000_000), ServerTime::from_ns(9_000_000), received);
-    // 0.2 ms, a microsecond of grain, and 200 ppm of 0.4 ms.
+    // 0.2 ms, 1 us of resolution, and 200 ppm of 0.4 ms.
     let bound = filter.error_bound_ns(received).unwrap();
     assert!((201_000..201_200).contains(&bound), "{bound}");
     let (drift_ppm, drift_bound_ppm) = filter.drift_ppm().unwrap();
     assert!(drift_ppm.abs() < 1e-9 && (200.0..205.0).contains(&drift_bound_ppm));
-    // After ten seconds of silence 2 ms more.
+    // After ten seconds of silence, 2 ms more.
     let bound = filter.error_bound_ns(received.plus_seconds(10.0)).unwrap();
     assert!((2_200_000..2_250_000).contains(&bound), "{bound}");
 }
 
 #[test]
-fn an_exchange_that_ends_before_it_began_is_dropped() {
+fn drops_an_exchange_that_ends_before_it_began() {
     let mut filter = OffsetFilter::<Host, Server>::default();
     filter.update(HostTime::from_ns(10), ServerTime::from_ns(0), HostTime::from_ns(9));
     assert_eq!(filter.to_local(ServerTime::from_ns(0)), None);
