@@ -1,11 +1,11 @@
-"""What a lab costs: sums of bill-of-materials.csv, for the tables of README.md.
+"""Cost of a lab: sums of bill-of-materials.csv, for the tables of README.md.
 
     python3 hardware/lab/costs.py             # prints the tables
     python3 hardware/lab/costs.py --write     # writes them into README.md
     python3 hardware/lab/costs.py --students 12 --offerings 1
 
-US dollars, before tax and freight. A row without a price needs a quote: it is named, and counts nothing. Over ten
-years a row is bought as often as it wears out (`years`), as the paper reckons.
+US dollars, before tax and freight. A row without a price needs a quote: it is listed, but not included in sums. Over
+ten years, an item is replaced after its lifetime (`years`), as in the paper.
 """
 
 import argparse
@@ -17,14 +17,14 @@ from typing import NamedTuple
 HERE = Path(__file__).resolve().parent
 BUDGETS = {"mocap": "motion capture", "uwb": "UWB", "webcams": "two webcams"}
 GROUPS = ("localization", "room", "computers", "vehicles", "safety")
-# Name, and the paper's total.
+# Name, and the total in the paper.
 VEHICLES = {
     "paper160": ("160 mm, as the paper's", 475),
     "basic160": ("160 mm, basic controllers", 300),
     "size220": ("220 mm", None),
 }
 
-# The paper's section "Logistics and Cost of Operation".
+# From the paper's section "Logistics and Cost of Operation".
 YEARS, STUDENTS, OFFERINGS, TEAM = 10, 30, 2, 3
 VEHICLE, VEHICLES_A_YEAR, UPKEEP_A_TEAM = 475.0, 2, 62.5
 
@@ -32,10 +32,10 @@ VEHICLE, VEHICLES_A_YEAR, UPKEEP_A_TEAM = 475.0, 2, 62.5
 class Row(NamedTuple):
     item: str
     group: str
-    counts: dict         # how many of it, by budget and by kind of vehicle
-    price: float | None  # of one
+    counts: dict         # number of pieces, by budget and by type of vehicle
+    price: float | None  # unit price
     currency: str
-    years: int           # until it is bought again
+    years: int           # lifetime
     seen: str
     source: str
     instead: str
@@ -51,7 +51,7 @@ def read(path: Path = HERE / "bill-of-materials.csv") -> list[Row]:
 
 
 def total(rows, column, group=None) -> float:
-    """What is bought at the start."""
+    """Initial cost of all priced items."""
     return sum(r.counts[column] * r.price for r in rows if r.price is not None and group in (None, r.group))
 
 
@@ -65,12 +65,12 @@ def ten_years(rows, budget, students) -> float:
 
 
 def a_student(rows, budget, students=STUDENTS, offerings=OFFERINGS) -> float:
-    """Of one offering, by the paper's reckoning: all of ten years over all students of ten years."""
+    """Cost per student and offering, computed like the paper: all costs of ten years over all students of ten years."""
     return ten_years(rows, budget, students) / (YEARS * offerings * students)
 
 
 def paper(mocap: float) -> float:
-    """The paper's cost a student and offering, from the numbers that it gives."""
+    """The paper's cost per student and offering, computed from its own numbers."""
     upkeep = UPKEEP_A_TEAM * STUDENTS / TEAM
     return (mocap + YEARS * (VEHICLES_A_YEAR * VEHICLE + upkeep)) / (YEARS * OFFERINGS * STUDENTS)
 
@@ -87,8 +87,8 @@ def table(head, lines) -> str:
 def blocks(rows, students=STUDENTS, offerings=OFFERINGS) -> dict[str, str]:
     names = list(BUDGETS.values())
     sums = [[g, *(money(total(rows, b, g)) if total(rows, b, g) else "quotes" for b in BUDGETS)] for g in GROUPS]
-    sums += [["**what has a price**", *(f"**{money(total(rows, b))}**" for b in BUDGETS)]]
-    sums += [["needs a quote as well", *(", ".join(unpriced(rows, b)) for b in BUDGETS)]]
+    sums += [["**sum of priced items**", *(f"**{money(total(rows, b))}**" for b in BUDGETS)]]
+    sums += [["also needs a quote", *(", ".join(unpriced(rows, b)) for b in BUDGETS)]]
     ours = [f"{a_student(rows, b, students, offerings):.2f}" for b in BUDGETS]
     without = [r._replace(price=0.0) if r.group == "localization" else r for r in rows]
     there = [f"{a_student(without, b, students, offerings):.2f}" for b in BUDGETS]
@@ -106,17 +106,17 @@ def blocks(rows, students=STUDENTS, offerings=OFFERINGS) -> dict[str, str]:
         kinds.append([name, f"{found:.2f}", ", ".join(unpriced(rows, column)), "" if stated is None else str(stated),
                       "" if stated is None else f"{stated - found:.2f}"])
     return {
-        "budgets": table(["USD, bought at the start", *names], sums),
-        "students": table(["USD a student and offering", *names], each),
-        "vehicles": table(["vehicle", "parts with a price", "parts without", "paper's total", "left for them"], kinds),
+        "budgets": table(["USD, initial cost", *names], sums),
+        "students": table(["USD per student and offering", *names], each),
+        "vehicles": table(["vehicle", "parts with a price", "parts without", "paper's total", "left for these"], kinds),
     }
 
 
 def main() -> None:
     args = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    args.add_argument("--write", action="store_true", help="into README.md, for the paper's class")
+    args.add_argument("--write", action="store_true", help="write the tables into README.md, for the paper's class")
     args.add_argument("--students", type=int, default=STUDENTS)
-    args.add_argument("--offerings", type=int, default=OFFERINGS, help="a year")
+    args.add_argument("--offerings", type=int, default=OFFERINGS, help="course offerings per year")
     given = args.parse_args()
     made = blocks(read(), given.students, given.offerings)
     for name, text in made.items():

@@ -1,10 +1,10 @@
-"""Drawings of what a lab cuts and prints: STL of every part, and DXF of the frames' plates.
+"""Drawings of parts to cut and print for a lab: STL of every part, and DXF of the frames' plates.
 
     python3 hardware/lab/drawings.py OUT          # writes all parts into the folder OUT
-    python3 hardware/lab/drawings.py OUT guard    # those whose name begins so
+    python3 hardware/lab/drawings.py OUT guard    # only parts whose names begin with "guard"
 
-Millimetres throughout; z is up, a part lies on z = 0. Nothing here was cut, printed or flown by us: what each number
-comes from stands beside it, and `drawings.md` says what to measure first. `tests/python/test_lab_book.py` reads the
+All lengths in millimetres; z is up, and parts lie on z = 0. No part was cut, printed or flown: the source of each
+number is next to it, and `drawings.md` lists what to measure first. `tests/python/test_lab_book.py` reads the
 files back.
 
 A part is a list of pieces. A piece is a polygon of the plan (corners counter-clockwise, shape (n, 2)) with holes, and
@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 EPS = 1e-9
-M2, M3 = 2.2, 3.2           # diameter of a hole that such a screw passes, printed or milled
+M2, M3 = 2.2, 3.2           # diameter of a clearance hole for such a screw, printed or milled
 STACK, MINI = 30.5, 20.0    # edge of the square of holes of autopilots and speed controllers, large and small
 
 
@@ -32,14 +32,14 @@ STACK, MINI = 30.5, 20.0    # edge of the square of holes of autopilots and spee
 class Size:
     """One size of vehicle."""
 
-    diagonal: float       # between the shafts of opposite motors; 160: the paper's. 220: usual for 5 inches
+    diagonal: float       # between opposite motor shafts; 160 as in the paper, 220 usual for 5 inches
     propeller: float      # diameter: 3 inches, 5 inches
-    motor_circle: float   # circle on which the motor's four screws stand: usual for 15xx and 22xx motors; measure yours
+    motor_circle: float   # circle of the motor's four screws: usual for 15xx and 22xx motors; measure yours
     motor_screw: float
-    motor_bore: float     # for the end of the shaft and its clip
+    motor_bore: float     # for the shaft's end and its clip
     pad: float            # radius of the arm's end
     arm: float            # width
-    plate: float          # thickness; 2: the paper's
+    plate: float          # thickness; 2 as in the paper
     plane: float          # propeller's plane above the arm, guard's foot included: measure yours
 
 
@@ -47,7 +47,7 @@ SIZES = {
     "160": Size(160, 76.2, 12, M2, 6, 10, 12, 2, 18),
     "220": Size(220, 127.0, 16, M3, 8, 13, 15, 4, 27),
 }
-BODY = 28.0                 # radius of the frame's middle: holds the large stack and the slots of the battery's strap
+BODY = 28.0                 # radius of the frame's center: space for the large stack and the slots of the battery strap
 CLEARANCE = 4.0             # from the propeller's tip to the guard: blades bend, prints warp
 XIAO = (17.8, 21.0)         # Seeed XIAO ESP32C3, across and along its USB plug (its page, rounded up)
 
@@ -61,7 +61,7 @@ class Circle:
     def corners(self) -> np.ndarray:
         n = 24
         turn = np.arange(n) * 2 * math.pi / n
-        # Outside the circle between its corners: the screw passes the polygon too.
+        # The circle lies inside the polygon, so that the screw passes the polygon too.
         r = self.diameter / 2 / math.cos(math.pi / n)
         return np.stack([self.x + r * np.cos(turn), self.y + r * np.sin(turn)], 1)
 
@@ -81,7 +81,7 @@ def box(x0, y0, x1, y1) -> np.ndarray:
 
 
 def arc(radius, start, end, n, middle=(0.0, 0.0)) -> np.ndarray:
-    """n corners from angle `start` to `end` (radians), both ends included."""
+    """Returns n corners from angle `start` to `end` (radians), both ends included."""
     turn = np.linspace(start, end, n)
     return np.stack([middle[0] + radius * np.cos(turn), middle[1] + radius * np.sin(turn)], 1)
 
@@ -99,7 +99,7 @@ def motor_holes(size: Size, x=0.0, y=0.0) -> list:
 
 
 def frame(size: Size) -> list:
-    """The plate: a disc with four arms at 45 degrees, holes for both stacks, motors and the battery's strap."""
+    """Returns the plate: a disc with four arms at 45 degrees, holes for both stacks, motors and the battery's strap."""
     half = size.arm / 2
     body, pad = math.asin(half / BODY), math.asin(half / size.pad)
     outline, holes = [], [*square_of_holes(STACK, M3), *square_of_holes(MINI, M2)]
@@ -114,20 +114,20 @@ def frame(size: Size) -> list:
 
 
 def guard(size: Size) -> list:
-    """A ring around one propeller's tips. It stands between motor and arm, held by the motor's screws."""
+    """Returns a ring around one propeller's tips. It sits between motor and arm, held by the motor's screws."""
     inner = size.propeller / 2 + CLEARANCE
     outer, half, posts = inner + 1.6, 2.5, [math.pi / 2 * k for k in range(4)]
     foot, arm, ring = 2.0, 3.0, (size.plane - 3, size.plane + 3)
 
     def turns(radius, n):
-        """Angles of corners at a radius: where arms meet it, and even ones between, none too near to those."""
+        """Returns angles of corners at a radius: at the arms, and evenly spaced ones between these."""
         ends = sorted((t + s * math.asin(half / radius)) % (2 * math.pi) for t in posts for s in (-1, 1))
         near = [t for t in np.arange(n) * 2 * math.pi / n
                 if all(abs(math.remainder(t - e, 2 * math.pi)) > math.pi / n for e in ends)]
         return np.array(sorted(near + ends))
 
     def between(all_turns, start, end):
-        """Those from start on to end, counter-clockwise."""
+        """Returns the angles from start to end, counter-clockwise."""
         ahead = (all_turns - start + 1e-7) % (2 * math.pi)
         order = np.argsort(ahead)
         return all_turns[order][ahead[order] <= (end - start) % (2 * math.pi) + 2e-7]
@@ -148,7 +148,7 @@ def guard(size: Size) -> list:
 
 
 def bridge_tray() -> list:
-    """Holds the XIAO between two holes of the large stack; its USB plug looks out at the open side."""
+    """Returns a tray for the XIAO between two holes of the large stack; its USB plug is at the open side."""
     wide, long, wall, gap = XIAO[0] / 2 + 0.3, XIAO[1] / 2 + 0.3, 1.6, 5.5
     x, y, ear, hole = wide + wall, long + wall, STACK / 2 + 4, STACK / 2
     floor = np.array([[-wide, -long], [-gap, -long], [gap, -long], [wide, -long], [wide, long], [-wide, long]])
@@ -161,7 +161,7 @@ def bridge_tray() -> list:
 
 
 def cube_carrier(face: float) -> list:
-    """A cross inside the cube of `vizflyt tags print cube --face-mm`, whose faces are on foam core of 5 mm."""
+    """Returns a cross inside the cube of `vizflyt tags print cube --face-mm`, with faces on 5 mm foam core."""
     reach, width, tab, deep = face / 2 - 5, 5.0, 20.0, 8.0
     side = np.array([[22, -width], [reach - deep, -width], [reach - deep, -tab], [reach, -tab],
                      [reach, tab], [reach - deep, tab], [reach - deep, width], [22, width], [22, 22]])
@@ -170,7 +170,7 @@ def cube_carrier(face: float) -> list:
 
 
 def leg() -> list:
-    """Holds an arm 90 mm above the floor: a lens 10 mm below the plate is 80 mm above the soles. Two ties hold it."""
+    """Returns a leg that holds an arm at 90 mm, by two ties. A lens 10 mm below the plate is then at 80 mm."""
     outline = np.array([[-9, 0], [9, 0], [9, 4], [3, 10], [3, 85], [10, 85], [10, 90], [-10, 90], [-10, 85], [-3, 85],
                         [-3, 10], [-9, 4]], float)
     return [Piece(outline, 0, 8, [box(x - 1.5, 86.5, x + 1.5, 88.5) for x in (-6.0, 6.0)])]
@@ -197,7 +197,7 @@ def cross(o, a, b):
 
 
 def sees(p, q, starts, ends) -> bool:
-    """Whether nothing of the edges lies between p and q; edges that begin or end in them do not count."""
+    """Whether no edge lies between p and q; edges that begin or end in them are ignored."""
     same = [np.abs(a - b).sum(1) < EPS for a in (starts, ends) for b in (p, q)]
     other = ~(same[0] | same[1] | same[2] | same[3])
     a, b = starts[other], ends[other]
@@ -208,7 +208,7 @@ def sees(p, q, starts, ends) -> bool:
 
 
 def triangles(outline, holes) -> np.ndarray:
-    """Corners of triangles, shape (n, 3, 2): holes are joined to the outline by bridges, then ears are cut off."""
+    """Returns triangles, shape (n, 3, 2): joins holes to the outline by bridges, then clips ears."""
     loops = sorted((h[::-1] for h in holes), key=lambda h: -h[:, 0].max())
     ring = list(outline)
     for i, hole in enumerate(loops):
@@ -216,7 +216,7 @@ def triangles(outline, holes) -> np.ndarray:
         closed = [np.array(ring), *loops[i:]]
         starts, ends = np.concatenate(closed), np.concatenate([np.roll(c, -1, 0) for c in closed])
         nearest = np.argsort(np.linalg.norm(np.array(ring) - hole[at], axis=1))
-        # Of corners that a bridge has doubled, the one at which the hole lies inside.
+        # A bridge doubles its corners; choose the copy with the hole on its inner side.
         to = next(j for j in nearest if sees(hole[at], ring[j], starts, ends)
                   and within(ring[j - 1], ring[j], ring[(j + 1) % len(ring)], hole[at]))
         turned = np.roll(hole, -at, 0)
@@ -230,7 +230,7 @@ def triangles(outline, holes) -> np.ndarray:
 
 
 def within(before, at, after, p) -> bool:
-    """Whether p lies within the corner's angle, on the polygon's side."""
+    """Whether p lies within the corner's angle, on the inner side of the polygon."""
     left_of = cross(before, at, p) > EPS, cross(at, after, p) > EPS
     return all(left_of) if cross(before, at, after) > 0 else any(left_of)
 
@@ -249,7 +249,7 @@ def is_ear(points, left, k) -> bool:
 # --- surface ---
 
 def surface(pieces) -> np.ndarray:
-    """The part's surface: corners of triangles, shape (n, 3, 3), counter-clockwise seen from outside."""
+    """Returns the surface of a part: triangles, shape (n, 3, 3), counter-clockwise seen from outside."""
     plan, spans = [], []
     for p in pieces:
         holes = [h.corners() if isinstance(h, Circle) else h for h in p.holes]
@@ -297,7 +297,7 @@ def write_stl(path: Path, faces: np.ndarray) -> None:
 
 
 def write_dxf(path: Path, piece: Piece) -> None:
-    """Outline and holes of a plate for a mill: DXF R12, closed polylines and circles, millimetres."""
+    """Writes outline and holes of a plate for milling: DXF R12, closed polylines and circles, millimetres."""
     lines = ["0", "SECTION", "2", "ENTITIES"]
     for shape in [piece.outline, *piece.holes]:
         if isinstance(shape, Circle):
@@ -327,7 +327,7 @@ def main() -> None:
     folder, wanted = Path(sys.argv[1]), sys.argv[2:] or [""]
     names = [n for n in PARTS if any(n.startswith(w) for w in wanted)]
     if not names:
-        sys.exit(f"no part begins with {' or '.join(wanted)}; there are {', '.join(PARTS)}")
+        sys.exit(f"no part begins with {' or '.join(wanted)}; parts are {', '.join(PARTS)}")
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         for path in write(name, folder):

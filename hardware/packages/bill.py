@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Writes what a program built by cargo is made of, by Cargo.lock, `cargo tree` and `cargo metadata`.
+"""Writes the bill of materials of a program built by cargo, from Cargo.lock, `cargo tree` and `cargo metadata`.
 
     bill.py PACKAGE --target TRIPLE [--features LIST] --version VERSION --date ISO8601 -o FOLDER
 
-Into FOLDER go `PACKAGE.cdx.json` (CycloneDX 1.5: every crate that is linked in, with licence, checksum and what it
-depends on), `copyright` (Debian's machine-readable form) and `licenses` (the texts that the crates bring, each once).
-Crates that bring C sources (SQLite, AprilTag, zstd) stand for these. What only runs at build time is left out.
+Output in FOLDER: `PACKAGE.cdx.json` (CycloneDX 1.5: every linked crate with licence, checksum and dependencies),
+`copyright` (Debian's machine-readable format) and `licenses` (the licence texts of the crates, each once). Crates
+with C sources (SQLite, AprilTag, zstd) represent these. Build-time dependencies are excluded.
 """
 
 import argparse
@@ -18,14 +18,14 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 
-# A name of SPDX's, as Debian's form writes it.
+# SPDX names, as written in Debian's format.
 DEBIAN_NAMES = {"BSD-2-Clause": "BSD-2-clause", "BSD-3-Clause": "BSD-3-clause", "MIT": "Expat", "Zlib": "zlib"}
-# Whose texts every Debian system has.
+# Licences whose texts every Debian system contains.
 COMMON = {"Apache-2.0", "MPL-2.0", "GPL-2.0", "GPL-3.0", "LGPL-2.1", "LGPL-3.0", "CC0-1.0"}
 
 
 def cargo(*arguments):
-    """Returns what cargo prints."""
+    """Returns the output of cargo."""
     return subprocess.run(["cargo", *arguments], cwd=ROOT, check=True, text=True, capture_output=True).stdout
 
 
@@ -37,16 +37,16 @@ def linked_crates(package, target, features):
 
 
 def expression_of(crate):
-    """Returns a crate's licence as an SPDX expression, or None where it has only a file."""
+    """Returns a crate's licence as an SPDX expression, or None if it has only a file."""
     licence = crate["license"]
-    # Older manifests write a slash for OR.
+    # Older manifests use a slash for OR.
     return licence and re.sub(r"\s*/\s*", " OR ", licence)
 
 
 def license_files(crate):
-    """Returns the files of a crate that say under which terms it comes, sorted by name."""
+    """Returns the licence files of a crate, sorted by name."""
     folder = Path(crate["manifest_path"]).parent
-    # Of ours all are under the files of the tree.
+    # All crates of this repository share the licence files of its root.
     folder = folder if crate["source"] else ROOT
     named = re.compile(r"(licen[cs]e|copying|copyright|notice|unlicense)([-._].*)?", re.IGNORECASE)
     return sorted(file for file in folder.iterdir() if file.is_file() and named.fullmatch(file.name))
@@ -90,12 +90,12 @@ def bill(package, crates, edges, checksums, arguments):
 
 
 def debian_expression(expression):
-    """Returns an SPDX expression as Debian's form writes it, and the names of its licences."""
-    # "C AND (A OR B)" has no brackets there: "A or B, and C".
+    """Returns an SPDX expression in Debian's format, and the names of its licences."""
+    # Debian's format has no brackets: "C AND (A OR B)" becomes "A or B, and C".
     plain = re.sub(r"^([^()]+) AND (\([^()]+\))$", r"\2 AND \1", expression)
     plain = re.sub(r"\) AND ", ", AND ", plain)
     plain = re.sub(r"[()]", " ", plain)
-    # "A WITH B" is one name there.
+    # Debian's format writes "A WITH B" as one name.
     plain = re.sub(r"(\S+)\s+WITH\s+(\S+)", r"\1-with-\2", plain)
     text = re.sub(r"[^\s,]+", lambda word: DEBIAN_NAMES.get(word[0], word[0]), " ".join(plain.split()))
     names = set(re.findall(r"[^\s,]+", text)) - {"OR", "AND"}
@@ -103,7 +103,7 @@ def debian_expression(expression):
 
 
 def copyright_file(crates):
-    """Returns the text of `copyright`: ours, then the crates of others, those of one licence together."""
+    """Returns the text of `copyright`: VizFlyt's, then third-party crates, grouped by licence."""
     ours = (HERE / "copyright").read_text()
     by_licence = {}
     for crate in crates:
@@ -132,7 +132,7 @@ def copyright_file(crates):
 
 
 def license_texts(crates):
-    """Returns all texts that the crates bring: each once, below the names of those that bring it."""
+    """Returns all licence texts of the crates: each once, below the names of its crates."""
     bringers = {}
     for crate in crates:
         for file in license_files(crate):
@@ -165,7 +165,7 @@ def main():
                      if dep["pkg"] in by_id and any(kind["kind"] is None for kind in dep["dep_kinds"])]
         for node in metadata["resolve"]["nodes"] if node["id"] in by_id
     }
-    # Cargo writes one key a line; a reader of TOML comes with Python from 3.11 on.
+    # Cargo writes one key per line; a TOML parser is only part of Python from 3.11 on.
     entries = (ROOT / "Cargo.lock").read_text().split("[[package]]")[1:]
     locked = (dict(re.findall(r'^(\w+) = "(.*)"$', entry, re.MULTILINE)) for entry in entries)
     checksums = {(entry["name"], entry["version"]): entry.get("checksum") for entry in locked}

@@ -1,10 +1,10 @@
-//! Who may change a bridge, and how they ask. Requests and answers travel in MAVLink's TUNNEL
-//! message, so any way that carries MAVLink carries them. Reading is open; changing needs the key.
+//! Access control of a bridge's configuration. Requests and answers travel in MAVLink's TUNNEL message, so every
+//! MAVLink connection carries them. Reading is open; changes need the key.
 //!
-//! A change carries a counter above the last one's and the first 16 bytes of HMAC-SHA256 over this
-//! start's random bytes, that counter and the request, by the bridge's key: nobody forges one, and
-//! a recorded one is worth nothing later. Until a bridge has a key it takes one change only: the
-//! key (claiming). While the vehicle is armed nothing changes.
+//! A change contains a counter, larger than that of the previous change, and the first 16 bytes of an HMAC-SHA256. The
+//! HMAC uses the bridge's key and covers a nonce of this start, the counter and the request. This prevents forgery and
+//! replay. A bridge without a key accepts only one change: the key itself (claiming). While the vehicle is armed, all
+//! changes are refused.
 //!
 //! ```text
 //! request   op, counter (u32), body, [16 bytes of HMAC if it changes something]
@@ -23,37 +23,37 @@ use crate::settings::Key;
 
 /// TUNNEL's payload type, of the range that MAVLink leaves to private use (32768 up).
 pub const TUNNEL_TYPE: u16 = 0x9F17;
-/// Bytes of a request or answer at most.
+/// Maximum length of a request or answer [bytes].
 pub const BODY: usize = 128;
-/// Bytes of the proof.
+/// Length of the proof [bytes].
 pub const PROOF: usize = 16;
-/// Bytes before a request's body.
+/// Length of the header before a request's body [bytes].
 pub const HEAD: usize = 5;
 
-/// What is asked.
+/// Operation of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Op {
-    /// Who are you.
+    /// Returns nonce, counter, flags and version.
     Hello = 1,
-    /// The counters.
+    /// Returns the counters.
     Stats = 2,
-    /// One setting.
+    /// Returns one setting.
     Read = 3,
-    /// Change a setting.
+    /// Changes a setting.
     Set = 4,
-    /// Keep the settings over a restart.
+    /// Saves the settings to flash.
     Save = 5,
-    /// Back to the settings of the first day; the key stays.
+    /// Restores the default settings, except keys and network password.
     Reset = 6,
-    /// Restart the bridge.
+    /// Restarts the bridge.
     Restart = 7,
-    /// Take this key; only while there is none.
+    /// Sets the bridge's key; refused if it already has one.
     Claim = 8,
 }
 
 impl Op {
-    /// Returns the request of a number.
+    /// Returns the operation with this number.
     pub fn from_number(number: u8) -> Option<Self> {
         use Op::{Claim, Hello, Read, Reset, Restart, Save, Set, Stats};
         [Hello, Stats, Read, Set, Save, Reset, Restart, Claim]
@@ -61,36 +61,36 @@ impl Op {
             .find(|&op| op as u8 == number)
     }
 
-    /// Whether it needs the key.
+    /// Whether the operation needs the key.
     pub fn changes(self) -> bool {
         matches!(self, Self::Set | Self::Save | Self::Reset | Self::Restart)
     }
 }
 
-/// How a request fared.
+/// Result of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Status {
-    /// Done.
+    /// The request was executed.
     Done = 0,
-    /// There is no such request or setting.
+    /// Unknown operation or setting.
     Unknown = 1,
-    /// The value cannot be read.
+    /// The value cannot be parsed.
     Malformed = 2,
     /// The value is outside its range.
     OutOfRange = 3,
-    /// The proof is wrong, or the counter old.
+    /// The proof is wrong, or its counter is too old.
     WrongKey = 4,
-    /// The bridge has no key yet: claim it first.
+    /// The bridge has no key yet; claim it first.
     Unclaimed = 5,
-    /// The bridge has a key already.
+    /// The bridge already has a key.
     Claimed = 6,
     /// The vehicle is armed.
     Armed = 7,
 }
 
 impl Status {
-    /// Returns the status of a number.
+    /// Returns the status with this number.
     pub fn from_number(number: u8) -> Option<Self> {
         use Status::{Armed, Claimed, Done, Malformed, OutOfRange, Unclaimed, Unknown, WrongKey};
         [Done, Unknown, Malformed, OutOfRange, WrongKey, Unclaimed, Claimed, Armed]
@@ -98,24 +98,24 @@ impl Status {
             .find(|&status| status as u8 == number)
     }
 
-    /// Returns it in words.
+    /// Returns the status in words.
     pub fn message(self) -> &'static str {
         match self {
             Self::Done => "done",
-            Self::Unknown => "the bridge does not know it",
+            Self::Unknown => "unknown request or setting",
             Self::Malformed => "the value cannot be read",
             Self::OutOfRange => "the value is out of range",
             Self::WrongKey => "the key is wrong",
             Self::Unclaimed => "the bridge has no key yet; claim it first",
             Self::Claimed => {
-                "the bridge has a key already; reset it at its button to claim it anew"
+                "the bridge has a key already; reset it at its button to claim it again"
             }
             Self::Armed => "the vehicle is armed; disarm it first",
         }
     }
 }
 
-/// A change that asks the shell for something.
+/// Request that the router passes to the shell or to the settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ShellRequest {
     Save,
@@ -123,7 +123,7 @@ pub(crate) enum ShellRequest {
     Restart,
 }
 
-/// What was proven so far in this start.
+/// Proofs that were accepted since the start.
 #[derive(Clone, Debug)]
 pub(crate) struct Access {
     pub(crate) nonce: [u8; 16],
@@ -137,7 +137,7 @@ impl Access {
         Self { nonce, counter: 0, signed_at: 0 }
     }
 
-    /// Whether a request (its proof at the end) proves the key; takes its counter.
+    /// Whether the proof at the end of a request is valid for the key and its counter is new. Stores the counter.
     pub(crate) fn proves(&mut self, key: &Key, request: &[u8]) -> bool {
         let Some(at) = request.len().checked_sub(PROOF).filter(|&at| at >= HEAD) else {
             return false;
@@ -152,8 +152,8 @@ impl Access {
         false
     }
 
-    /// Whether a packet is signed by the key, MAVLink's way, and newer than the last that was
-    /// (MAVLink guide, "Message Signing").
+    /// Whether a packet has a MAVLink signature by the key, newer than that of the last accepted packet (MAVLink guide,
+    /// "Message Signing").
     pub(crate) fn signed_by(&mut self, key: Option<&Key>, packet: Raw<'_>) -> bool {
         let Some(key) = key else { return false };
         let signed_at = packet.signed_at();
@@ -165,21 +165,21 @@ impl Access {
     }
 }
 
-/// Whether a packet is signed by the key, MAVLink's way, whenever that was.
+/// Whether a packet has a MAVLink signature by the key, of any age.
 pub(crate) fn is_signed_by(key: &Key, packet: Raw<'_>) -> bool {
     let Some(signed) = packet.signed_bytes() else { return false };
     let right = Sha256::new().chain_update(key).chain_update(signed).finalize();
-    // Why: six bytes are compared at once; how long that takes carries no information on a hash.
+    // Why: a comparison of hashes leaks no secret through its time.
     right[..6] == packet.bytes()[signed.len()..]
 }
 
-/// Returns what a bridge tells of its start's random bytes: proofs are over it, and the bytes themselves
-/// stay a secret.
+/// Returns the nonce of this start, derived from its random bytes. Proofs cover the nonce; the bytes themselves stay
+/// secret.
 pub fn nonce(random: &[u8; 16]) -> [u8; 16] {
     derived(b"vizflyt bridge nonce", random)
 }
 
-/// Returns random bytes for a key that people type.
+/// Returns random bytes for a key that users type.
 pub(crate) fn key_bytes(random: &[u8; 16]) -> [u8; 16] {
     derived(b"vizflyt bridge typed key", random)
 }
@@ -189,14 +189,14 @@ fn derived(purpose: &[u8], random: &[u8; 16]) -> [u8; 16] {
     core::array::from_fn(|at| whole[at])
 }
 
-/// Returns the proof of a request by a key, for [`PROOF`] bytes behind it.
+/// Returns the proof of a request: [`PROOF`] bytes to append to it.
 pub fn proof(key: &Key, nonce: &[u8; 16], signed: &[u8]) -> [u8; PROOF] {
     let whole = mac(key, nonce, signed).finalize().into_bytes();
     core::array::from_fn(|at| whole[at])
 }
 
 fn mac(key: &Key, nonce: &[u8; 16], signed: &[u8]) -> Hmac<Sha256> {
-    // HMAC fills a short key up with zeros to a block of the hash (RFC 2104, section 2).
+    // HMAC pads a short key with zeros to a block of the hash (RFC 2104, section 2).
     let mut block = [0; 64];
     block[..key.len()].copy_from_slice(key);
     let mut mac = <Hmac<Sha256> as Mac>::new(&block.into());

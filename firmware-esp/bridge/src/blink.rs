@@ -1,17 +1,17 @@
-//! How a bridge's one light shows its [`Light`]: the same on every chip.
+//! Blink patterns of a bridge's light for each [`Light`], the same on every chip.
 
 use embassy_time::{Duration, Timer};
 
 use crate::shell::Light;
 
-/// One blink: a fifth of a second on, as long off. Four, the most, leave a pause to count by.
+/// Time on, and time off, of one blink. The maximum of four blinks leaves a pause, so that they can be counted.
 const HALF: Duration = Duration::from_millis(200);
-/// A period of blinks and pause.
+/// Period of a pattern, including its pause.
 const PERIOD: Duration = Duration::from_secs(2);
-/// Fast: nobody takes it for counted blinks.
+/// Too fast to be confused with counted blinks.
 const FAST: Duration = Duration::from_millis(60);
 
-/// Shows `light` on `led`, for ever; a change shows after the period under way.
+/// Shows `light` on `led`, forever. A change takes effect after the current period.
 pub async fn run(light: impl Fn() -> Light, mut led: impl FnMut(bool)) -> ! {
     loop {
         match light() {

@@ -1,24 +1,24 @@
-//! Gives addresses to those who join the network that a bridge makes: the part of DHCP (RFC 2131)
-//! that one small network needs. Sans-IO: a request in, an answer out.
+//! DHCP server of the bridge's own network: the part of RFC 2131 that one small network needs. Sans-IO: a request in,
+//! an answer out.
 //!
-//! The bridge offers no router and no name server: a laptop keeps its own way to the internet.
+//! The bridge offers no router and no name server, so that a laptop keeps its own internet connection.
 
 use core::net::Ipv4Addr;
 
-/// Addresses at most; no chip's radio takes more stations.
+/// Maximum number of leases. No chip's radio accepts more stations.
 pub const LEASES: usize = 10;
-/// Last number of the first address given; the bridge itself is 1.
+/// Last byte of the first leased address; the bridge itself is 1.
 const FIRST: u8 = 2;
-/// How long an address is promised. [s]
+/// Duration of a lease [s].
 const LEASE_S: u32 = 24 * 3600;
-/// Bytes of an answer: what comes before the options, the cookie, ours and the end.
+/// Maximum length of an answer: fixed fields, cookie, options, end [bytes].
 pub const ANSWER: usize = OPTIONS + 4 + 22;
 
-/// Who has which address: place `i` is address `FIRST + i`.
+/// Leases by address: entry `i` is address `FIRST + i`.
 #[derive(Clone, Debug)]
 pub struct Leases {
     taken: [Option<Lease>; LEASES],
-    /// Counts requests: the smaller a lease's, the longer ago it was used.
+    /// Number of requests so far. A lease with a smaller number was used longer ago.
     turn: u32,
 }
 
@@ -35,13 +35,13 @@ impl Default for Leases {
 }
 
 impl Leases {
-    /// None given yet.
+    /// Returns an empty table.
     pub const fn new() -> Self {
         Self { taken: [None; LEASES], turn: 0 }
     }
 
-    /// Answers a datagram to port 67, as the bridge of `address`; returns the answer's length. It
-    /// is to be broadcast to port 68. `None` for what is no request, or meant for another server.
+    /// Answers a datagram to port 67 for a bridge at `address`. Returns the length of the answer, which is to be
+    /// broadcast to port 68. Returns `None` if the datagram is not a request or is for another server.
     pub fn answer(
         &mut self,
         address: Ipv4Addr,
@@ -55,7 +55,7 @@ impl Leases {
         let offered = with_last(address, FIRST + self.place(request.mac) as u8);
         let (kind, given) = match request.kind {
             DISCOVER => (OFFER, offered),
-            // Somebody who was on another network asks for what it had there.
+            // A station that comes from another network requests its old address.
             REQUEST if request.wanted.is_some_and(|wanted| wanted != offered) => {
                 (NAK, Ipv4Addr::UNSPECIFIED)
             }
@@ -65,7 +65,7 @@ impl Leases {
         out.fill(0);
         out[..4].copy_from_slice(&[BOOT_REPLY, ETHERNET, 6, 0]);
         out[4..8].copy_from_slice(&request.id);
-        // Answers are broadcast: the asker has no address yet.
+        // Answers are broadcast, because the station has no address yet.
         out[10..12].copy_from_slice(&BROADCAST.to_be_bytes());
         out[16..20].copy_from_slice(&given.octets());
         out[20..24].copy_from_slice(&address.octets());
@@ -88,8 +88,7 @@ impl Leases {
         Some(at + 1)
     }
 
-    /// Returns the place of a station: its own, else a free one, else that of whoever was silent
-    /// for longest.
+    /// Returns the entry of a station: its existing one, else a free one, else the least recently used.
     fn place(&mut self, mac: [u8; 6]) -> usize {
         self.turn = self.turn.wrapping_add(1);
         let own = self.taken.iter().position(|lease| lease.is_some_and(|lease| lease.mac == mac));
@@ -103,14 +102,14 @@ impl Leases {
     }
 }
 
-/// What counts of a request.
+/// Fields of a request that the server uses.
 struct Request {
     id: [u8; 4],
     mac: [u8; 6],
     kind: u8,
-    /// The address it asks for.
+    /// Requested address.
     wanted: Option<Ipv4Addr>,
-    /// The server it asks.
+    /// Server that the request is addressed to.
     server: Option<Ipv4Addr>,
 }
 
@@ -155,7 +154,7 @@ fn array<const N: usize>(bytes: &[u8]) -> Option<[u8; N]> {
     bytes.try_into().ok()
 }
 
-/// Returns an address; zeros are none.
+/// Returns an address; `None` for 0.0.0.0.
 fn address(bytes: &[u8]) -> Option<Ipv4Addr> {
     array::<4>(bytes).map(Ipv4Addr::from).filter(|address| !address.is_unspecified())
 }
@@ -212,7 +211,7 @@ mod tests {
         let mut out = [0xAA; ANSWER];
         let len = leases.answer(US, request, &mut out)?;
         assert_eq!(out[0], BOOT_REPLY);
-        assert_eq!(out[4..8], request[4..8], "the answer to another question");
+        assert_eq!(out[4..8], request[4..8], "transaction id differs");
         assert_eq!(out[28..34], request[28..34]);
         assert_eq!(out[OPTIONS..OPTIONS + 4], COOKIE);
         assert_eq!(out[len - 1], END);
@@ -221,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_gets_an_address_and_keeps_it() {
+    fn a_station_keeps_its_address() {
         let mut leases = Leases::new();
         let first = Ipv4Addr::new(192, 168, 4, 2);
         let second = Ipv4Addr::new(192, 168, 4, 3);
@@ -229,7 +228,7 @@ mod tests {
         assert_eq!(ask(&mut leases, &request(8, DISCOVER, &[])), Some((OFFER, second)));
         let take = [WANTED, 4, 192, 168, 4, 2, SERVER, 4, 192, 168, 4, 1];
         assert_eq!(ask(&mut leases, &request(7, REQUEST, &take)), Some((ACK, first)));
-        // Back again later, with the address of another network, then with its own.
+        // Later requests: for an address of another network, then for the leased one.
         let other = [WANTED, 4, 10, 0, 0, 5];
         let none = Ipv4Addr::UNSPECIFIED;
         assert_eq!(ask(&mut leases, &request(7, REQUEST, &other)), Some((NAK, none)));
@@ -253,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_lease_is_replaced() {
+    fn replaces_the_least_recently_used_lease() {
         let mut leases = Leases::new();
         for mac in 0..LEASES as u8 {
             let expected = Ipv4Addr::new(192, 168, 4, FIRST + mac);
@@ -266,7 +265,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_survived(
+        fn accepts_any_bytes(
             mut bytes in proptest::collection::vec(any::<u8>(), 0..600),
             valid_head in any::<bool>(),
         ) {

@@ -1,16 +1,16 @@
-//! Reads one HTTP request, of which little is kept: the first line, and the body of a form. Bytes come in
-//! any portions; whatever they are, memory is bounded.
+//! Parser of one HTTP request with bounded memory. It keeps only the first line and the body of a form. Bytes may be
+//! split anywhere.
 
-/// Bytes of the first line that are kept: our paths are short.
+/// Bytes kept of the first line; all served paths are shorter.
 const LINE: usize = 48;
-/// Bytes of another line that are looked at: longer than what we look for.
+/// Bytes kept of other lines; the fields that are read are shorter.
 const FIELD: usize = 64;
-/// Bytes of a head at most; browsers send a quarter of it.
+/// Maximum length of a head [bytes]; browsers send about a quarter of it.
 const HEAD: u32 = 4096;
-/// Bytes of a form at most.
+/// Maximum length of a form [bytes].
 pub const BODY: usize = 384;
 
-/// A request as far as it has come.
+/// Partially received request.
 #[derive(Clone, Debug)]
 pub struct Request {
     line: [u8; LINE],
@@ -19,12 +19,12 @@ pub struct Request {
     field_len: usize,
     body: [u8; BODY],
     body_len: usize,
-    /// Bytes of the head so far.
+    /// Bytes of the head received so far.
     head: u32,
-    /// Length of the body, as the head says. [bytes]
+    /// Length of the body according to the head [bytes].
     announced: usize,
     stage: Stage,
-    /// Another site's page has sent it.
+    /// Whether another site's page sent the request.
     is_foreign: bool,
 }
 
@@ -37,14 +37,14 @@ enum Stage {
     TooLong,
 }
 
-/// How far a request is.
+/// Progress of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Progress {
-    /// More is to come.
+    /// More bytes are needed.
     More,
-    /// It can be answered.
+    /// The request can be answered.
     Whole,
-    /// It brings a firmware (`POST /update`), which begins here in the bytes just given.
+    /// A firmware follows (`POST /update`). It begins at this index of the bytes just pushed.
     Firmware(usize),
 }
 
@@ -55,7 +55,7 @@ impl Default for Request {
 }
 
 impl Request {
-    /// Nothing yet; `const`, for a chip's static memory.
+    /// Returns an empty request; `const`, for a chip's static memory.
     pub const fn new() -> Self {
         Self {
             line: [0; LINE],
@@ -71,12 +71,12 @@ impl Request {
         }
     }
 
-    /// Begins anew: the connection is another one.
+    /// Resets the parser for a new connection.
     pub fn restart(&mut self) {
         *self = Self::new();
     }
 
-    /// Takes bytes; those behind a whole request are left.
+    /// Takes bytes. Bytes after the end of the request are ignored.
     pub fn push(&mut self, bytes: &[u8]) -> Progress {
         for (place, &byte) in bytes.iter().enumerate() {
             match self.stage {
@@ -101,22 +101,22 @@ impl Request {
         }
     }
 
-    /// Whether the first line begins so.
+    /// Whether the first line begins with `line`.
     pub fn is(&self, line: &[u8]) -> bool {
         self.line[..self.line_len].starts_with(line)
     }
 
-    /// Whether it is longer than anything that we serve.
+    /// Whether the request exceeds a length limit.
     pub fn is_too_long(&self) -> bool {
         self.stage == Stage::TooLong
     }
 
-    /// Whether a browser has said that another site's page sent it.
+    /// Whether the browser declared another site as the origin.
     pub fn is_foreign(&self) -> bool {
         self.is_foreign
     }
 
-    /// Returns the form that came with it; empty if none has.
+    /// Returns the body of a form; empty if there is none.
     pub fn body(&self) -> &[u8] {
         &self.body[..self.body_len]
     }
@@ -155,23 +155,23 @@ impl Request {
         }
     }
 
-    /// Looks at one field of the head.
+    /// Reads one field of the head.
     fn read_field(&mut self) {
         let Ok(field) = core::str::from_utf8(&self.field[..self.field_len]) else { return };
         let Some((name, value)) = field.split_once(':') else { return };
         let value = value.trim();
         if name.eq_ignore_ascii_case("content-length") {
-            // What is no number is no body; it is refused as a form without its fields.
+            // An invalid number counts as 0. The form is then refused for its missing fields.
             self.announced = value.parse().unwrap_or(0);
         } else if name.eq_ignore_ascii_case("sec-fetch-site") {
             self.is_foreign = matches!(value, "cross-site" | "same-site");
         }
     }
 
-    /// Looks whether the body is whole.
+    /// Ends the request if its body is complete or too long.
     fn settle_body(&mut self) {
         if self.is(b"POST /update ") {
-            // A firmware is not kept.
+            // A firmware is not buffered.
         } else if !self.is(b"POST /settings ") || self.body_len >= self.announced {
             self.stage = Stage::Whole;
         } else if self.announced > BODY {
@@ -208,7 +208,7 @@ mod tests {
         line we keep, as they are\r\n\r\nkey=abcmore";
 
     #[test]
-    fn requests_are_read_in_any_portions() {
+    fn parses_requests_split_anywhere() {
         let update = b"POST /update HTTP/1.0\r\n\r\nVZU1 and so on";
         for chunk in 1..FORM.len() {
             let (request, progress, _) = read(FORM, chunk);
@@ -233,7 +233,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_in_any_portions_read_alike(
+        fn parses_any_bytes_alike_however_split(
             bytes in prop::collection::vec(any::<u8>(), 0..2000),
             head in prop::sample::select(std::vec!["", "GET / ", "POST /settings HTTP/1.1\r\n"]),
             chunk in 1..700usize,
@@ -247,7 +247,7 @@ mod tests {
         }
 
         #[test]
-        fn endless_heads_end(byte in any::<u8>()) {
+        fn rejects_endless_heads(byte in any::<u8>()) {
             let (request, progress, used) = read(&std::vec![byte | 0x20; 10_000], 100);
             prop_assert!(progress == Progress::Whole && request.is_too_long() && used <= 4200);
         }

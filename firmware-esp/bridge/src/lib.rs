@@ -1,13 +1,13 @@
-//! Carries MAVLink between an autopilot's serial port and a network: the firmware of the Wi-Fi
-//! bridge on a vehicle, without what differs between chips.
+//! Firmware of the Wi-Fi bridge on a vehicle: carries MAVLink between an autopilot's serial port and a network. This
+//! crate contains everything that does not depend on the chip.
 //!
 //! ```text
 //! autopilot ══ UART ══▶ shell ─ bytes ─▶ Bridge ─ datagrams ─▶ shell ══ Wi-Fi ══▶ companion
 //!           ◀══════════        ◀────────        ◀────────────        ◀═════════
 //! ```
-//! [`Bridge`] is sans-IO: bytes and `now` in, packets out, no allocation; tests, fuzzers, the host's
-//! `vizflyt bridge emulate` and every chip run this one. [`shell`] (feature `net`) drives it over
-//! embassy-net and embedded-io-async. A chip's own part is its pins, its radio and its flash.
+//! [`Bridge`] is sans-IO: bytes and `now` in, packets out, no allocation. Tests, fuzzers, `vizflyt bridge emulate` on
+//! the host, and every chip run the same code. [`shell`] (feature `net`) drives it over embassy-net and
+//! embedded-io-async. Only pins, radio and flash are specific to a chip.
 
 #![no_std]
 

@@ -1,11 +1,11 @@
-//! Makes packets of our own: MAVLink 2, zeros at the end left out.
+//! Encodes the bridge's own packets: MAVLink 2 with truncated payloads.
 
 use vizflyt_protocol::mavlink::dialect::MavMessage;
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavlinkVersion, Message};
 
 use crate::packet::x25;
 
-/// Writes a packet of message `id` into `out`; returns its length. The dialect knows the message.
+/// Writes a packet of message `id` into `out`. Returns its length. The message must be in the dialect.
 pub fn write_packet(
     out: &mut [u8; MAX_PACKET],
     source: (u8, u8),
@@ -13,7 +13,7 @@ pub fn write_packet(
     id: u32,
     payload: &[u8],
 ) -> usize {
-    // One byte stays, even if it is zero (MAVLink guide, "Empty-byte payload truncation").
+    // At least one byte stays, even if it is zero (MAVLink guide, "Empty-byte payload truncation").
     let trailing = payload.iter().rev().take_while(|&&byte| byte == 0).count();
     let len = (payload.len() - trailing).max(1);
     let [id0, id1, id2, _] = id.to_le_bytes();
@@ -26,7 +26,7 @@ pub fn write_packet(
     12 + len
 }
 
-/// Writes a message of the dialect into `out`; returns its length.
+/// Writes a message into `out`. Returns its length.
 pub(crate) fn write_message(
     out: &mut [u8; MAX_PACKET],
     source: (u8, u8),
@@ -38,7 +38,7 @@ pub(crate) fn write_message(
     write_packet(out, source, sequence, message.id(), &payload[..len])
 }
 
-/// Gives an unsigned packet of ours another sequence number.
+/// Replaces the sequence number of one of the bridge's own unsigned packets.
 pub(crate) fn renumber(packet: &mut [u8], sequence: u8) {
     packet[4] = sequence;
     let id = u32::from_le_bytes([packet[7], packet[8], packet[9], 0]);
@@ -54,9 +54,9 @@ fn write_crc(packet: &mut [u8], id: u32) {
 
 macro_rules! bridge_messages {
     ($($name:ident($data:ident)),* $(,)?) => {
-        /// The messages we send. Not the dialect's own enum: that would bring all 300 of them
-        /// into a chip's flash.
-        #[allow(non_camel_case_types, clippy::upper_case_acronyms)] // Why: named as MAVLink names them.
+        /// Messages that the bridge sends. The dialect's own enum would link all of its 300 messages into a chip's
+        /// flash.
+        #[allow(non_camel_case_types, clippy::upper_case_acronyms)] // Why: MAVLink's names.
         #[derive(Clone, Debug)]
         pub(crate) enum BridgeMessage {
             $($name(vizflyt_protocol::mavlink::dialect::$data)),*
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ours_are_the_dialects_own_bytes() {
+    fn encodes_the_same_bytes_as_the_dialect() {
         let heartbeat = HEARTBEAT_DATA { custom_mode: 7, ..Default::default() };
         let timesync = TIMESYNC_DATA { ts1: 5, ..Default::default() };
         let empty = TIMESYNC_DATA::default();

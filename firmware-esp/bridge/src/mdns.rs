@@ -1,16 +1,16 @@
-//! Lets a bridge be found as `NAME.local`: answers questions for its address by multicast DNS
-//! (RFC 6762). Sans-IO: a query in, an answer out.
+//! Answers multicast DNS queries for `NAME.local` (RFC 6762), so that a bridge is found by name. Sans-IO: a query in,
+//! an answer out.
 
 use core::net::Ipv4Addr;
 
-/// Where queries come to and answers go.
+/// Multicast address and port of queries and answers.
 pub const GROUP: (Ipv4Addr, u16) = (Ipv4Addr::new(224, 0, 0, 251), 5353);
-/// Bytes of an answer at most: header, a name of 32 letters with `local`, the record.
+/// Maximum length of an answer: header, a name of 32 letters with `local`, the record [bytes].
 pub const ANSWER: usize = HEAD + 33 + 7 + 10 + 4;
-/// How long the answer may be remembered: as RFC 6762, section 10, advises for addresses. [s]
+/// Time to live of the answer, as RFC 6762, section 10, recommends for addresses [s].
 const KEEP_S: u32 = 120;
 
-/// Answers a query that asks for the address of `name`.local; returns the answer's length.
+/// Answers a query for the address of `name`.local. Returns the length of the answer.
 pub fn answer(
     query: &[u8],
     name: &str,
@@ -18,7 +18,7 @@ pub fn answer(
     out: &mut [u8; ANSWER],
 ) -> Option<usize> {
     let head = query.get(..HEAD)?;
-    // An answer itself, or something else than a standard query.
+    // Not a standard query.
     if head[2] & 0xF8 != 0 || name.is_empty() || name.len() > 32 {
         return None;
     }
@@ -29,7 +29,7 @@ pub fn answer(
         let &[kind_high, kind, class_high, class] = query.get(after..after + 4)? else {
             return None;
         };
-        // The top bit of the class asks for a reply to the sender alone; ours goes to all.
+        // The top bit of the class requests a unicast reply; a multicast reply is also valid.
         let for_address = kind_high == 0 && matches!(kind, KIND_A | KIND_ANY);
         asked |= is_ours && for_address && [class_high & 0x7F, class] == [0, CLASS_IN];
         at = after + 4;
@@ -42,12 +42,12 @@ pub fn answer(
         out[len..len + bytes.len()].copy_from_slice(bytes);
         len += bytes.len();
     };
-    // An authoritative answer, one record.
+    // Authoritative answer with one record.
     put(&[0, 0, 0x84, 0, 0, 0, 0, 1, 0, 0, 0, 0]);
     put(&[name.len() as u8]);
     put(name.as_bytes());
     put(b"\x05local\0");
-    // The top bit here: whoever remembers another address forgets it.
+    // The top bit is the cache-flush flag: receivers drop other cached addresses.
     put(&[0, KIND_A, 0x80, CLASS_IN]);
     put(&KEEP_S.to_be_bytes());
     put(&[0, 4]);
@@ -55,13 +55,13 @@ pub fn answer(
     Some(len)
 }
 
-/// Whether the name at `at` is `name`.local, and where what follows it begins.
+/// Returns whether the name at `at` is `name`.local, and the position after it.
 fn compare(query: &[u8], mut at: usize, name: &str) -> Option<(bool, usize)> {
     let wanted: [&[u8]; 2] = [name.as_bytes(), b"local"];
     let (mut is_ours, mut labels) = (true, 0);
-    // Where the name goes on behind its first pointer.
+    // Position after the name's first pointer.
     let mut after = None;
-    // A name of 255 bytes has 127 labels at most; pointers in a circle end here too.
+    // A name of 255 bytes has at most 127 labels; this also ends loops of pointers.
     for _ in 0..128 {
         let len = usize::from(*query.get(at)?);
         match len {
@@ -116,25 +116,25 @@ mod tests {
     }
 
     #[test]
-    fn the_own_name_is_answered_and_no_other() {
+    fn answers_only_queries_for_its_own_name() {
         check(1, b"\x07drone-3\x05local\0\0\x01\0\x01", true);
         check(1, b"\x07DRONE-3\x05Local\0\0\xFF\x80\x01", true);
         check(1, b"\x07drone-4\x05local\0\0\x01\0\x01", false);
         check(1, b"\x07drone-3\x03lan\0\0\x01\0\x01", false);
         check(1, b"\x01x\x07drone-3\x05local\0\0\x01\0\x01", false);
         check(1, b"\x07drone-3\0\0\x01\0\x01", false);
-        check(1, b"\x07drone-3\x05local\0\0\x1C\0\x01", false); // IPv6: we have none
+        check(1, b"\x07drone-3\x05local\0\0\x1C\0\x01", false); // IPv6: not supported
         check(0, b"\x07drone-3\x05local\0\0\x01\0\x01", false);
-        // The second of two questions, its end by a pointer into the first.
+        // The name of the second question ends with a pointer into the first.
         let two = b"\x04host\x05local\0\0\x01\0\x01\x07drone-3\xC0\x11\0\x01\0\x01";
         check(2, two, true);
         check(2, &two[..two.len() - 1], false);
-        // In a circle.
+        // A pointer to itself.
         check(1, b"\xC0\x0C\0\x01\0\x01", false);
     }
 
     #[test]
-    fn answers_of_others_are_not_answered() {
+    fn ignores_answers_of_other_hosts() {
         let mut bytes = query(1, b"\x07drone-3\x05local\0\0\x01\0\x01");
         bytes[2] = 0x84;
         assert_eq!(answer(&bytes, "drone-3", US, &mut [0; ANSWER]), None);
@@ -142,7 +142,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_survived(mut bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
+        fn accepts_any_bytes(mut bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
             if bytes.len() > 5 {
                 (bytes[2], bytes[4]) = (0, 0);
             }

@@ -1,9 +1,9 @@
-//! The target fields of a message. MAVLink sorts fields by size, so the place differs by
-//! message; this table holds it for every message of our dialect that is addressed. A message
-//! that is not here goes to everybody, as MAVLink's routing rules want.
+//! Positions of the target fields in messages. MAVLink sorts fields by size, so the positions differ by message. The
+//! table contains every message of the dialect with a target; all other messages are broadcasts, as MAVLink's routing
+//! rules require.
 
-/// Returns where the target system lies in the payload of message `id`, and whether the target
-/// component follows it; `None` if the message names no target.
+/// Returns the position of the target system in the payload of message `id`, and whether the target component follows
+/// it. Returns `None` if the message has no target.
 pub(crate) fn offset(id: u32) -> Option<(u8, bool)> {
     let id = u16::try_from(id).ok()?;
     let row = TARGETS.binary_search_by_key(&id, |&(id, _, _)| id).ok()?;
@@ -11,7 +11,7 @@ pub(crate) fn offset(id: u32) -> Option<(u8, bool)> {
     Some((at, has_component))
 }
 
-/// (message, place of the target system [bytes], whether the target component follows).
+/// (message, position of the target system [bytes], whether the target component follows).
 #[rustfmt::skip]
 const TARGETS: &[(u16, u8, bool)] = &[
     (4, 12, true), (5, 0, false), (11, 4, false), (20, 2, true), (21, 0, true), (23, 4, true),
@@ -55,9 +55,9 @@ mod tests {
         (0..a.len()).filter(|&at| a[at] != b[at]).collect()
     }
 
-    /// Each row is found again by writing a target into the message and looking where it went.
+    /// Verifies each row: writes a target into the message and finds the changed bytes.
     #[test]
-    fn the_table_is_the_dialects() {
+    fn table_matches_the_dialect() {
         for &id in MavMessage::all_ids() {
             let mut message = MavMessage::default_message_from_id(id).unwrap();
             let plain = payload(&message);

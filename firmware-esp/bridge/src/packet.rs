@@ -1,27 +1,26 @@
-//! Finds whole MAVLink packets in bytes and reads their headers; never their payload's meaning.
+//! Finds whole MAVLink packets in bytes and reads their headers, not their payloads.
 //!
-//! Unlike `vizflyt_protocol`'s decoder this one keeps the packet's own bytes, signature and all:
-//! what is forwarded is what came. A candidate that fails its checksum is retried from its second
-//! byte, so a good packet inside a broken one is never lost. Messages that our dialect does not
-//! know pass too: their checksum is held against every possible CRC_EXTRA, which still refuses
-//! 255 of 256 pieces of garbage.
+//! Unlike the decoder of `vizflyt_protocol`, this one keeps the bytes of each packet, signature included, so that
+//! packets are forwarded unchanged. If a candidate fails its checksum, the search continues at its second byte, so a
+//! good packet inside a broken one is not lost. Messages that are not in the dialect also pass: their checksum is
+//! tested with every possible CRC_EXTRA, which still rejects 255 of 256 random candidates.
 
 use vizflyt_protocol::mavlink::dialect::MavMessage;
 use vizflyt_protocol::mavlink::{MAX_PACKET, Message};
 
-/// One whole packet that checked.
+/// Whole packet with a valid checksum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Raw<'a> {
     bytes: &'a [u8],
 }
 
 impl<'a> Raw<'a> {
-    /// Returns all its bytes, signature included.
+    /// Returns all bytes of the packet, signature included.
     pub fn bytes(self) -> &'a [u8] {
         self.bytes
     }
 
-    /// Whether it is MAVLink 2.
+    /// Whether the packet is MAVLink 2.
     pub fn is_v2(self) -> bool {
         self.bytes[0] == STX_V2
     }
@@ -31,12 +30,12 @@ impl<'a> Raw<'a> {
         self.is_v2() && self.bytes[2] & SIGNED != 0
     }
 
-    /// Returns what a signature is made over: all bytes but the signature's own six.
+    /// Returns the bytes that a signature covers: all except the last six.
     pub(crate) fn signed_bytes(self) -> Option<&'a [u8]> {
         self.is_signed().then(|| &self.bytes[..self.bytes.len() - 6])
     }
 
-    /// Returns a signature's stamp; 0 without one. [10 us since 2015]
+    /// Returns the signature's time stamp; 0 without a signature [10 us since 2015].
     pub(crate) fn signed_at(self) -> u64 {
         let mut stamp = [0; 8];
         if let Some(signed) = self.signed_bytes() {
@@ -45,7 +44,7 @@ impl<'a> Raw<'a> {
         u64::from_le_bytes(stamp)
     }
 
-    /// Returns the sender's packet counter.
+    /// Returns the sender's sequence number.
     pub fn sequence(self) -> u8 {
         self.bytes[if self.is_v2() { 4 } else { 2 }]
     }
@@ -56,18 +55,18 @@ impl<'a> Raw<'a> {
         (self.bytes[at], self.bytes[at + 1])
     }
 
-    /// Returns the message's number.
+    /// Returns the message number.
     pub fn id(self) -> u32 {
         message_id(self.bytes)
     }
 
-    /// Returns the payload; MAVLink 2 leaves out zeros at its end.
+    /// Returns the payload. MAVLink 2 truncates zeros at its end.
     pub fn payload(self) -> &'a [u8] {
         let header = header_len(self.bytes[0]);
         &self.bytes[header..header + usize::from(self.bytes[1])]
     }
 
-    /// Returns the target (system, component); zero is everybody.
+    /// Returns the target (system, component); zero is a broadcast.
     pub fn target(self) -> (u8, u8) {
         let Some((system_at, has_component)) = crate::message_target::offset(self.id()) else {
             return (0, 0);
@@ -78,26 +77,26 @@ impl<'a> Raw<'a> {
     }
 }
 
-/// What a cutter has seen.
+/// Counters of a cutter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CutStats {
     /// Whole packets.
     pub packets: u32,
-    /// Packets of messages that our dialect does not know; among `packets`.
+    /// Packets of messages that are not in the dialect; included in `packets`.
     pub unknown: u32,
     /// Candidates that failed their checksum.
     pub bad_checksum: u32,
-    /// Bytes that belonged to no packet.
+    /// Bytes outside of packets.
     pub dropped_bytes: u32,
 }
 
 impl CutStats {
-    /// Nothing yet; as the default, but `const`.
+    /// All zero: the default as a `const`.
     pub(crate) const NONE: Self =
         Self { packets: 0, unknown: 0, bad_checksum: 0, dropped_bytes: 0 };
 }
 
-/// Bytes of a stream in, whole packets out.
+/// Splits a stream of bytes into whole packets.
 #[derive(Clone, Debug)]
 pub struct Cutter {
     buffer: [u8; BUFFER],
@@ -105,7 +104,7 @@ pub struct Cutter {
     stats: CutStats,
 }
 
-/// Room for one packet and what a read brings behind it.
+/// Space for one packet and the rest of a read.
 const BUFFER: usize = MAX_PACKET + 128;
 
 impl Default for Cutter {
@@ -115,7 +114,7 @@ impl Default for Cutter {
 }
 
 impl Cutter {
-    /// An empty one.
+    /// Returns an empty cutter.
     pub const fn new() -> Self {
         Self { buffer: [0; BUFFER], filled: 0, stats: CutStats::NONE }
     }
@@ -133,9 +132,8 @@ impl Cutter {
         }
     }
 
-    /// The line is silent within what may be a packet. A whole packet behind a false start comes out
-    /// now; what may still be a packet's beginning stays, however long the rest takes: its checksum
-    /// decides, not the clock.
+    /// Searches for whole packets behind a false start; call it when the line is silent inside a candidate. A possible
+    /// beginning of a packet stays in the buffer for any time, because its checksum decides, not a timeout.
     pub fn look_behind(&mut self, mut sink: impl FnMut(Raw<'_>)) {
         while let Some(at) = hidden(&self.buffer[..self.filled]) {
             self.stats.bad_checksum = self.stats.bad_checksum.wrapping_add(1);
@@ -147,28 +145,28 @@ impl Cutter {
         }
     }
 
-    /// Whether it waits for the rest of a packet.
+    /// Whether an incomplete packet waits for more bytes.
     pub fn is_waiting(&self) -> bool {
         self.filled > 0
     }
 
-    /// Forgets an unfinished packet: the connection is another one.
+    /// Discards an incomplete packet, for a new connection.
     pub fn restart(&mut self) {
         self.filled = 0;
     }
 
-    /// Returns the counters.
     pub fn stats(&self) -> CutStats {
         self.stats
     }
 }
 
-/// Calls `sink` with each whole packet of a datagram. Nothing waits: a datagram holds whole packets.
+/// Calls `sink` with each whole packet of a datagram. Incomplete packets are dropped: a datagram contains only whole
+/// ones.
 pub fn each_in_datagram(bytes: &[u8], stats: &mut CutStats, mut sink: impl FnMut(Raw<'_>)) {
     cut(bytes, true, stats, &mut sink);
 }
 
-/// Cuts `bytes`; returns how many are done with. `ended`: no more will come.
+/// Cuts `bytes` into packets. Returns the number of consumed bytes. `ended`: no more bytes will follow.
 fn cut(bytes: &[u8], ended: bool, stats: &mut CutStats, sink: &mut impl FnMut(Raw<'_>)) -> usize {
     let mut at = 0;
     while at < bytes.len() {
@@ -199,8 +197,8 @@ fn cut(bytes: &[u8], ended: bool, stats: &mut CutStats, sink: &mut impl FnMut(Ra
     bytes.len()
 }
 
-/// Returns where a whole packet of the dialect begins behind the unfinished one that `bytes` begin with.
-/// What follows it must be the next one's start, or nothing yet: then it is no part of a payload.
+/// Returns the start of a whole, known packet behind the unfinished one at the start of `bytes`. The next packet or the
+/// end of the bytes must follow it; otherwise it may be part of a payload.
 fn hidden(bytes: &[u8]) -> Option<usize> {
     (1..bytes.len()).find(|&at| match bytes[at] {
         STX_V1 | STX_V2 => match candidate(&bytes[at..]) {
@@ -221,7 +219,7 @@ enum Candidate {
 
 const STX_V1: u8 = 0xFE;
 const STX_V2: u8 = 0xFD;
-/// MAVLink 2's one incompatible feature: a signature of 13 bytes follows.
+/// MAVLink 2's only incompatibility flag: a signature of 13 bytes follows.
 const SIGNED: u8 = 0x01;
 const SIGNATURE: usize = 13;
 
@@ -230,7 +228,7 @@ fn header_len(marker: u8) -> usize {
     if marker == STX_V2 { 10 } else { 6 }
 }
 
-/// Returns the number of the message whose header begins `bytes`.
+/// Returns the message number of the header at the start of `bytes`.
 fn message_id(bytes: &[u8]) -> u32 {
     if bytes[0] == STX_V2 {
         u32::from_le_bytes([bytes[7], bytes[8], bytes[9], 0])
@@ -239,7 +237,7 @@ fn message_id(bytes: &[u8]) -> u32 {
     }
 }
 
-/// Judges the bytes from a start marker on.
+/// Classifies the bytes from a start marker on.
 fn candidate(bytes: &[u8]) -> Candidate {
     let &[marker, payload_len, ..] = bytes else { return Candidate::Incomplete };
     let mut signature = 0;
@@ -259,7 +257,7 @@ fn candidate(bytes: &[u8]) -> Candidate {
     }
     let expected = u16::from_le_bytes([bytes[crc_at], bytes[crc_at + 1]]);
     let body = bytes[1..crc_at].iter().fold(0xFFFF, |crc, &byte| x25(crc, byte));
-    // The dialect answers 0 for what it does not know, and for one message that it does (395).
+    // The dialect returns 0 for unknown messages, and for one known message (395).
     let known = match MavMessage::extra_crc(message_id(bytes)) {
         0 => {
             if (0..=255).all(|extra| x25(body, extra) != expected) {
@@ -273,8 +271,8 @@ fn candidate(bytes: &[u8]) -> Candidate {
     Candidate::Good { len, known }
 }
 
-/// Returns the checksum with one byte more: CRC-16/MCRF4XX as MAVLink's C code has it. No table,
-/// because a chip's constants lie in its scarce RAM.
+/// Returns the checksum `crc` updated with one byte: CRC-16/MCRF4XX as in MAVLink's C code. Without a table, because a
+/// chip's constants lie in its scarce RAM.
 pub(crate) fn x25(crc: u16, byte: u8) -> u16 {
     let mut t = byte ^ (crc as u8);
     t ^= t << 4;

@@ -1,5 +1,5 @@
-//! The bridge in a browser: its state, its counters, the same as JSON, and its settings, which change for
-//! whoever types the key; see [`form`]. A firmware comes here too, and its signature speaks for it.
+//! Web page of the bridge: state, counters (also as JSON) and settings. Changes of settings need the key, see [`form`].
+//! A firmware upload needs a valid signature.
 
 pub mod form;
 
@@ -14,19 +14,19 @@ use crate::bridge::{Bridge, LandingStage, Peer};
 use crate::http::Request;
 use crate::stats::REPORT;
 
-/// Bytes of a part of a response at most.
+/// Maximum length of a part of a response [bytes].
 pub const RESPONSE: usize = 2048;
-/// A part of a response.
+/// Part of a response.
 pub type Response = String<RESPONSE>;
 
-/// How every page begins. Nothing from elsewhere is loaded, framed, or sent to.
+/// Head of every page. The policy forbids foreign content, framing and foreign form targets.
 const HTML: &str = "HTTP/1.0 200 OK\r\nContent-Type: text/html; charset=utf-8\r\n\
     Cache-Control: no-store\r\nConnection: close\r\nX-Frame-Options: DENY\r\n\
     Content-Security-Policy: default-src 'none'; form-action 'self'\r\n\r\n<!doctype html>";
-/// How every other answer goes on behind its first line.
+/// Rest of the head of every other answer, after its first line.
 const TEXT: &str = "\r\nContent-Type: text/plain; charset=utf-8\r\nConnection: close\r\n\r\n";
 
-/// Does what a request asks for, once; returns how that fared, if it asks for a change.
+/// Executes the change that a request contains, once. Returns its status, or `None` if the request is not a change.
 #[inline(never)] // Why: as `respond`.
 pub fn act(bridge: &mut Bridge, now: HostTime, request: &Request) -> Option<Status> {
     if request.is_too_long() || !request.is(b"POST /settings ") {
@@ -36,9 +36,8 @@ pub fn act(bridge: &mut Bridge, now: HostTime, request: &Request) -> Option<Stat
     Some(form.map_or(Status::Malformed, |form| bridge.change_by_form(now, &form)))
 }
 
-/// Writes a part of the answer to a request into `out`, of which `done` is what [`act`] returned; returns
-/// false behind the last part.
-#[inline(never)] // Why: inlined, its frame would be its caller's for ever, and a chip's stack is small.
+/// Writes one part of the answer into `out`. `done` is the result of [`act`]. Returns false after the last part.
+#[inline(never)] // Why: inlined, its frame would stay on the caller's small stack.
 pub fn respond(
     bridge: &Bridge,
     now: HostTime,
@@ -57,7 +56,7 @@ pub fn respond(
         None => answer(bridge, now, request, out).map(|()| true),
     };
     written.unwrap_or_else(|fmt::Error| {
-        // More clients than fit: an error rather than half a page.
+        // More clients than fit: return an error instead of half a page.
         out.clear();
         let _ = writeln!(out, "HTTP/1.0 500 Internal Server Error{TEXT}too long");
         true
@@ -83,10 +82,10 @@ fn answer_change(status: Status, out: &mut Response) -> fmt::Result {
     writeln!(out, "HTTP/1.0 {line}{TEXT}{}; go back to see the settings", status.message())
 }
 
-/// Writes the answer to a request that brought a firmware into `out`.
+/// Writes the answer to a firmware upload into `out`.
 pub fn respond_firmware(taken: Result<(), &str>, out: &mut Response) {
     out.clear();
-    // Fits: the longest reason is a sentence.
+    // The longest reason is a sentence, so it fits.
     let _ = match taken {
         Ok(()) => out.write_str(
             "HTTP/1.0 200 OK\r\nConnection: close\r\n\r\nverified; it starts now, on trial\n",
@@ -101,7 +100,7 @@ fn counters(bridge: &Bridge, now: HostTime) -> impl Iterator<Item = (&'static st
     REPORT.iter().copied().zip(bridge.stats().report(bridge.uptime_s(now)))
 }
 
-/// What QGroundControl's page of a bridge asks for; `v` is the vehicle, `g` the ground.
+/// Counters in the format of QGroundControl's bridge page; `v` is the vehicle, `g` the ground.
 fn station_counters(bridge: &Bridge) -> [(&'static str, u32); 6] {
     let stats = bridge.stats();
     [
@@ -117,7 +116,7 @@ fn station_counters(bridge: &Bridge) -> [(&'static str, u32); 6] {
 fn page(bridge: &Bridge, now: HostTime, out: &mut Response) -> fmt::Result {
     out.write_str(HTML)?;
     out.write_str("<meta http-equiv=refresh content=2><title>bridge</title>")?;
-    // The name is letters, digits and hyphens: nothing to escape.
+    // The name contains only letters, digits and hyphens, so nothing needs escaping.
     write!(out, "<h1>{}</h1><a href=/settings>settings</a><pre>", bridge.settings().hostname)?;
     if bridge.is_transparent() {
         writeln!(out, "transparent: bytes pass unparsed; no priorities, no LAND")?;
@@ -146,7 +145,7 @@ fn page(bridge: &Bridge, now: HostTime, out: &mut Response) -> fmt::Result {
             Peer::Udp(address) => write!(out, "udp {address}")?,
             Peer::Tcp(slot) => write!(out, "tcp {slot}")?,
         }
-        writeln!(out, ": {sent} sent, {slow} too slow for")?;
+        writeln!(out, ": {sent} sent, {slow} dropped")?;
     }
     for (name, value) in counters(bridge, now) {
         writeln!(out, "{name:22}{value}")?;
@@ -189,7 +188,7 @@ mod tests {
         bridge
     }
 
-    /// Answers a request, all parts of it.
+    /// Returns all parts of the answer to a request.
     fn answered(bridge: &mut Bridge, request: &str) -> std::string::String {
         let mut whole = Request::new();
         whole.push(request.as_bytes());
@@ -204,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_and_its_figures_fit_and_tell_no_secret() {
+    fn pages_fit_and_reveal_no_secret() {
         let mut bridge = crowded();
         let mut check = |request: &str, expected: &[&str]| {
             let answer = answered(&mut bridge, request);
@@ -236,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_change_for_who_has_the_key_and_for_nobody_else() {
+    fn settings_change_only_with_the_key() {
         let mut bridge = crowded();
         let change = "name=LOSS_MS&value=800&key=";
         let check = |bridge: &mut Bridge, request: &str, line: &str, loss_ms: u16| {
@@ -244,7 +243,7 @@ mod tests {
             assert!(answer.starts_with(line), "{request}: {answer}");
             assert_eq!(bridge.settings().loss_ms, loss_ms, "{request}");
         };
-        // No key was ever given out: nobody has it, not even who sends none.
+        // A bridge without keys accepts no key, not even an empty one.
         check(&mut bridge, &post(change, ""), "HTTP/1.0 403", 1000);
         let mut settings = bridge.settings().clone();
         settings.set("page.key", "abcd-efgh-2345-6789").unwrap();
@@ -276,7 +275,7 @@ mod tests {
             "HTTP/1.0 403",
             700,
         );
-        // Whoever guesses waits, and so does everybody else for a moment.
+        // After a wrong key, all keys are rejected for a moment.
         check(&mut bridge, &right, "HTTP/1.0 403", 700);
         let mut armed = [0; 280];
         let payload = [4, 0, 0, 0, 2, 3, 0x80 | 0x09, 4, 3];

@@ -1,27 +1,27 @@
-//! Packets in a ring of bytes: first in, first out, several readers. Where it is full the writer
-//! decides what is dropped; what was is reported to the caller, so that every lost packet is counted.
+//! Ring buffer of packets: first in, first out, several readers. If it is full, the writer decides which packets to
+//! drop, so that it can count them.
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
-/// What the ring knows of a packet besides its bytes.
+/// Metadata of a packet in the ring.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Tag {
-    /// Number of the message; 65535 where it does not fit.
+    /// Message number; 65535 if it does not fit.
     pub kind: u16,
     /// Sender (system, component).
     pub source: (u8, u8),
-    /// Which clients it is for, a bit each.
+    /// Receiving clients, one bit each.
     pub to: u8,
-    /// We made it ourselves.
+    /// Whether the bridge itself made the packet.
     pub ours: bool,
-    /// When it came, modulo 65.5 s. [ms]
+    /// Arrival time, modulo 65.5 s [ms].
     pub stamp_ms: u16,
 }
 
-/// Bytes of a record before its packet: length and tag.
+/// Length of the header before each packet: length and tag [bytes].
 const HEAD: usize = 10;
 
-/// The ring. Places are byte counts since the start, wrapping.
+/// Ring buffer. Positions are byte counts since the start, and wrap.
 #[derive(Clone, Debug)]
 pub(crate) struct Ring<const N: usize> {
     bytes: [u8; N],
@@ -30,34 +30,34 @@ pub(crate) struct Ring<const N: usize> {
 }
 
 impl<const N: usize> Ring<N> {
-    /// An empty ring. `N` is a power of two, so that places may wrap.
+    /// Returns an empty ring. `N` must be a power of two, so that positions can wrap.
     pub(crate) const fn new() -> Self {
         assert!(N.is_power_of_two() && N >= 2 * (MAX_PACKET + HEAD));
         Self { bytes: [0; N], tail: 0, head: 0 }
     }
 
-    /// Returns the place of the oldest packet.
+    /// Returns the position of the oldest packet.
     pub(crate) fn tail(&self) -> u32 {
         self.tail
     }
 
-    /// Returns the place where the next packet will lie.
+    /// Returns the position of the next packet to be written.
     pub(crate) fn head(&self) -> u32 {
         self.head
     }
 
-    /// Whether no packet waits.
+    /// Whether the ring is empty.
     #[cfg(test)]
     pub(crate) fn is_empty(&self) -> bool {
         self.head == self.tail
     }
 
-    /// Whether a packet of `len` bytes fits without anything giving way.
+    /// Whether a packet of `len` bytes fits without dropping another.
     pub(crate) fn fits(&self, len: usize) -> bool {
         HEAD + len <= N - self.used()
     }
 
-    /// Adds a packet. The caller has made room.
+    /// Adds a packet. It must fit, see [`Self::fits`].
     pub(crate) fn push(&mut self, tag: Tag, packet: &[u8]) {
         assert!(self.fits(packet.len()), "the caller makes room");
         let [len0, len1] = (packet.len() as u16).to_le_bytes();
@@ -69,7 +69,7 @@ impl<const N: usize> Ring<N> {
         self.write(packet);
     }
 
-    /// Returns the packet at `place`: its tag, its length, and the place behind it.
+    /// Returns tag and length of the packet at `place`, and the position behind it.
     pub(crate) fn peek(&self, place: u32) -> Option<(Tag, usize, u32)> {
         if place == self.head {
             return None;
@@ -87,12 +87,12 @@ impl<const N: usize> Ring<N> {
         Some((tag, len, place.wrapping_add((HEAD + len) as u32)))
     }
 
-    /// Copies the packet at `place` to the start of `out`, which is long enough.
+    /// Copies the packet at `place` to the start of `out`, which must be long enough.
     pub(crate) fn copy(&self, place: u32, out: &mut [u8]) {
         self.read(place.wrapping_add(HEAD as u32), out);
     }
 
-    /// Lets the oldest packet go.
+    /// Removes the oldest packet.
     pub(crate) fn pop(&mut self) {
         if let Some((_, _, next)) = self.peek(self.tail) {
             self.tail = next;
@@ -144,7 +144,7 @@ mod tests {
     }
 
     proptest! {
-        /// Against a deque, over many turns of the ring and past the wrap of its places.
+        /// Compares the ring with a deque, over many rounds and across the wrap of the positions.
         #[test]
         fn behaves_like_a_queue(lengths in prop::collection::vec((1..280usize, any::<bool>()), 1..300), start in any::<u32>()) {
             let mut ring = Ring::<1024>::new();

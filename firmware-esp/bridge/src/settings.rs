@@ -1,6 +1,6 @@
-//! All settings of a bridge, and their names. Numbers are MAVLink parameters of our
-//! component as well; texts (networks, passwords, addresses) go through `vizflyt bridge configure`
-//! alone. Passwords and the key are written, never read back.
+//! Settings of a bridge, by name. Numbers are also MAVLink parameters of the bridge's component. Texts (networks,
+//! passwords, addresses) are set by `vizflyt bridge configure` and the web page; QGroundControl's parameters contain
+//! the networks and their passwords. Passwords and keys are write-only.
 
 mod numbers;
 
@@ -12,37 +12,37 @@ use heapless::String;
 
 pub use numbers::{NUMBERS, Number};
 
-/// Which network a bridge is part of.
+/// Role in the Wi-Fi network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WifiRole {
-    /// Makes a network of its own.
+    /// Opens an access point.
     AccessPoint,
-    /// Joins one; makes its own if it cannot for [`Settings::fallback_s`].
+    /// Joins a network; opens an access point if that fails for [`Settings::fallback_s`].
     Station,
 }
 
-/// The key that opens the configuration.
+/// Key that authorizes changes of the configuration.
 pub type Key = [u8; 32];
 
-/// Pins of an ESP32-C3's port, by their GPIO numbers.
+/// UART pins of an ESP32-C3, as GPIO numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct UartPins {
-    /// To the autopilot's RX.
+    /// Output to the autopilot's RX.
     pub tx: u8,
-    /// To its TX.
+    /// Input from the autopilot's TX.
     pub rx: u8,
-    /// To its CTS.
+    /// Output to the autopilot's CTS.
     pub rts: u8,
-    /// To its RTS.
+    /// Input from the autopilot's RTS.
     pub cts: u8,
 }
 
 impl UartPins {
-    /// As `hardware/bridge` has them.
+    /// Default pins, as in the wiring of `hardware/bridge`.
     pub const USUAL: Self = Self { tx: 4, rx: 5, rts: 6, cts: 7 };
 
-    /// Returns them, or the usual ones if two are the same: a bridge that cannot be reached by its
-    /// wires must still be reached by its network.
+    /// Returns the pins, or the defaults if two are the same. The bridge then stays reachable over its network, even if
+    /// its wires do not work.
     pub fn or_usual(self) -> Self {
         let [a, b, c, d] = [self.tx, self.rx, self.rts, self.cts];
         let distinct = a != b && a != c && a != d && b != c && b != d && c != d;
@@ -50,68 +50,68 @@ impl UartPins {
     }
 }
 
-/// All settings of a bridge. Lives in flash; see `storage`.
+/// All settings of a bridge, stored in flash by [`crate::storage`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// Speed of the autopilot's port, 57600 to 3000000. [baud]
+    /// Baud rate of the autopilot's port, 57600 to 3000000.
     pub baud: u32,
     /// Whether RTS and CTS are wired.
     pub flow_control: bool,
-    /// Packets for one client wait this long for each other at most, 0 to 20000. [us]
+    /// Maximum delay of a packet for batching, 0 to 20000 [us].
     pub batch_us: u32,
-    /// Bytes of a datagram at most, 300 to 1400. [bytes]
+    /// Maximum length of a datagram, 300 to 1400 [bytes].
     pub batch_bytes: u16,
-    /// A client that spoke first is forgotten after this silence, 2 to 600. [s]
+    /// Silence after which a client is removed, unless it is the fixed one, 2 to 600 [s].
     pub client_timeout_s: u16,
-    /// UDP port that clients send to, and that their packets come from.
+    /// UDP port for packets from and to clients.
     pub udp_port: u16,
     /// TCP port; 0 closes it.
     pub tcp_port: u16,
-    /// Port of the status page; 0 closes it.
+    /// TCP port of the web page; 0 closes it.
     pub page_port: u16,
-    /// LAND after a companion was silent for this long while the vehicle follows it, 200 to 10000;
-    /// 0 turns it off. [ms]
+    /// Silence of the companion after which the bridge sends LAND, while the vehicle follows it, 200 to 10000 [ms]. 0
+    /// turns this off.
     pub loss_ms: u16,
-    /// RADIO_STATUS each second.
+    /// Whether RADIO_STATUS is sent each second.
     pub radio_status: bool,
-    /// Until somebody answers, heartbeats are broadcast to port 14550 each second.
+    /// Whether heartbeats are broadcast to port 14550 each second until a client connects.
     pub beacon: bool,
-    /// Which network.
+    /// Role in the Wi-Fi network.
     pub wifi_role: WifiRole,
-    /// Channel of the network we make, 1 to 13.
+    /// Channel of the bridge's own network, 1 to 13.
     pub wifi_channel: u8,
-    /// A station that cannot join for this long makes its own network, 5 to 600. [s]
+    /// Time without connection after which a station opens its access point, 5 to 600 [s].
     pub fallback_s: u16,
-    /// Network to join.
+    /// Name of the network to join.
     pub ssid: String<32>,
-    /// Its password.
+    /// Password of the network to join.
     pub password: String<64>,
-    /// Name of the network we make; empty: `vizflyt-` and three bytes of the chip's address.
+    /// Name of the bridge's own network. If empty: `vizflyt-` and three bytes of the chip's address.
     pub ap_ssid: String<32>,
-    /// Its password, 8 characters at least. Empty: the bridge makes one at its first start, and tells it
-    /// by wire alone; see [`Self::wifi_open`].
+    /// Password of the bridge's own network, at least 8 characters. If empty, the bridge generates one at its first
+    /// start and announces it only by wire; see [`Self::wifi_open`].
     pub ap_password: String<64>,
-    /// The network we make has no password: only where somebody asked for that.
+    /// Whether the bridge's own network has no password; only by explicit request.
     pub wifi_open: bool,
-    /// Country whose rules the radio obeys, two letters; empty: what is allowed everywhere.
+    /// Country code of the radio's rules, two letters. If empty, only what all countries allow is used.
     pub country: String<2>,
-    /// Name that `NAME.local` finds us by.
+    /// Host name: the bridge is found as `NAME.local`.
     pub hostname: String<32>,
-    /// Our address and its prefix length as a station; `None` asks by DHCP.
+    /// Fixed address and prefix length as a station; `None` uses DHCP.
     pub address: Option<(Ipv4Addr, u8)>,
-    /// Where the way out is, with a fixed address.
+    /// Gateway that belongs to a fixed address.
     pub gateway: Option<Ipv4Addr>,
-    /// A client that is always sent to, whether it spoke or not.
+    /// Fixed client, which receives packets even if it never sent any.
     pub client: Option<SocketAddrV4>,
-    /// The key; `None` until a bridge is claimed.
+    /// Key of the bridge; `None` until it is claimed.
     pub key: Option<Key>,
-    /// The vehicle's key of MAVLink signing, for what we send to the autopilot.
+    /// MAVLink signing key of the vehicle, for packets that the bridge sends to the autopilot.
     pub vehicle_key: Option<Key>,
-    /// What a browser's settings form asks for, 8 characters at least; empty: only `key` opens it.
+    /// Key of the web page's settings form, at least 8 characters. If empty, only `key` is accepted.
     pub page_key: String<64>,
-    /// Bytes pass as they come, unparsed: no priorities, no LAND, nothing of our own.
+    /// Whether bytes are forwarded unparsed: no priorities, no LAND, no packets of the bridge.
     pub transparent: bool,
-    /// The port's pins, on an ESP32-C3.
+    /// UART pins, on an ESP32-C3.
     pub pins: UartPins,
 }
 
@@ -122,13 +122,13 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Back to the defaults.
-    #[inline(never)] // Why: the copy is on the stack while this runs, and no longer.
+    /// Restores the defaults.
+    #[inline(never)] // Why: the copy occupies the stack only during this call.
     pub(crate) fn restore(&mut self) {
         *self = Self::default();
     }
 
-    /// The defaults without a name; `const`, for a chip's static memory.
+    /// Defaults without a host name; `const`, for a chip's static memory.
     pub(crate) const fn unnamed() -> Self {
         Self {
             baud: 921_600,
@@ -164,18 +164,18 @@ impl Settings {
     }
 }
 
-/// A value that was refused.
+/// Why a value was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refused {
-    /// There is no setting of this name.
+    /// Unknown setting.
     Unknown,
-    /// The value is no number, address or text of the right length.
+    /// The value is not a number, an address, or a text of valid length.
     Malformed,
-    /// The number is outside its range.
+    /// The number is out of range.
     OutOfRange,
 }
 
-/// The texts' names, and whether they may be read back.
+/// Names of the texts, and whether they may be read back.
 pub const TEXTS: &[(&str, bool)] = &[
     ("wifi.ssid", true),
     ("wifi.password", false),
@@ -192,7 +192,7 @@ pub const TEXTS: &[(&str, bool)] = &[
 ];
 
 impl Settings {
-    /// Sets a number or text by its name; an empty text takes an address away.
+    /// Sets a number or text by its name. An empty text removes an address or key.
     ///
     /// # Errors
     /// See [`Refused`].
@@ -252,7 +252,7 @@ impl Settings {
         }
     }
 
-    /// Calls `sink` with every setting's name and value, secrets too: for flash.
+    /// Calls `sink` with the name and value of every setting, secrets included, for storage in flash.
     pub(crate) fn each(&self, mut sink: impl FnMut(&str, &str)) {
         let secrets: [(&str, &str); 3] = [
             ("wifi.password", &self.password),
@@ -273,11 +273,11 @@ impl Settings {
         }
     }
 
-    /// Returns a setting's value in words; `***` for what is never read back.
+    /// Returns the value of a setting as text; `***` for secrets.
     pub fn read(&self, name: &str) -> Option<String<64>> {
         let mut out = String::new();
         let shown = |out: &mut String<64>, value: &dyn core::fmt::Display| {
-            // The longest value is a name of 32 characters: it fits.
+            // The longest value is a name of 32 characters, so it fits.
             let _ = write!(out, "{value}");
         };
         if let Some(number) = NUMBERS.iter().find(|number| number.name == name) {
@@ -318,7 +318,7 @@ impl Settings {
     }
 }
 
-/// Reads a key of 64 hexadecimal digits.
+/// Parses a key of 64 hexadecimal digits.
 ///
 /// # Errors
 /// [`Refused::Malformed`].
@@ -329,7 +329,7 @@ pub const fn key_from_hex(text: &str) -> Result<Key, Refused> {
     }
     let mut key = [0; 32];
     let mut at = 0;
-    // No iterators in a constant, where chips have their key.
+    // No iterators: chips call this in a constant for their firmware key.
     while at < 64 {
         let digit = match digits[at] {
             digit @ b'0'..=b'9' => digit - b'0',
@@ -343,39 +343,38 @@ pub const fn key_from_hex(text: &str) -> Result<Key, Refused> {
     Ok(key)
 }
 
-/// Returns a key's 64 hexadecimal digits.
+/// Returns a key as 64 hexadecimal digits.
 pub fn key_to_hex(key: &Key) -> String<64> {
     let mut hex = String::new();
     for byte in key {
-        // 32 bytes are 64 digits: it fits.
+        // 32 bytes are 64 digits, so it fits.
         let _ = write!(hex, "{byte:02x}");
     }
     hex
 }
 
-/// Returns a key that people type, of 80 random bits: four groups of four letters and digits, none of
-/// which looks like another. It is a network's password, and opens the settings in a browser.
+/// Returns a key for typing, with 80 random bits: four groups of four letters and digits that are easy to distinguish.
+/// It is used as network password and as key of the web page.
 pub fn typed_key(random: &[u8; 16]) -> String<19> {
     const LETTERS: &[u8; 32] = b"abcdefghijkmnpqrstuvwxyz23456789";
     let mut key = String::new();
     for (place, byte) in random.iter().enumerate() {
         let dash = if place > 0 && place % 4 == 0 { "-" } else { "" };
-        // 16 letters and 3 dashes: it fits.
+        // 16 letters and 3 dashes fit.
         let _ = write!(key, "{dash}{}", LETTERS[usize::from(byte % 32)] as char);
     }
     key
 }
 
-/// Returns a short text.
 pub(crate) fn text<const N: usize>(value: &str) -> String<N> {
     let mut out = String::new();
-    // Why: callers give constants that fit.
+    // Why: all callers pass constants that fit.
     let _ = out.push_str(value);
     out
 }
 
 fn put<const N: usize>(to: &mut String<N>, value: &str) -> Result<(), Refused> {
-    // In flash a setting is a line.
+    // Each setting is one line in flash.
     if value.chars().any(char::is_control) {
         return Err(Refused::Malformed);
     }
@@ -383,7 +382,7 @@ fn put<const N: usize>(to: &mut String<N>, value: &str) -> Result<(), Refused> {
     Ok(())
 }
 
-/// WPA2 wants 8 to 63 characters.
+/// WPA2 requires 8 to 63 characters.
 fn put_password(to: &mut String<64>, value: &str) -> Result<(), Refused> {
     if value.is_empty() || (8..=63).contains(&value.len()) {
         put(to, value)
@@ -408,7 +407,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_number_is_named_in_range_and_kept() {
+    fn every_number_has_a_unique_name_and_a_checked_range() {
         for (index, number) in NUMBERS.iter().enumerate() {
             assert!(number.name.len() <= 16, "{}", number.name);
             assert!(NUMBERS[..index].iter().all(|other| other.name != number.name));
@@ -428,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_are_checked_and_secrets_stay() {
+    fn texts_are_validated_and_secrets_hidden() {
         let check = |name: &str, value: &str, expected: Result<&str, Refused>| {
             let mut settings = Settings::default();
             let result = settings.set(name, value);
@@ -468,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn typed_keys_are_passwords_and_every_bit_counts() {
+    fn typed_keys_are_valid_passwords() {
         let key = typed_key(&[0, 1, 2, 3, 4, 5, 6, 7, 28, 29, 30, 31, 32, 33, 255, 254]);
         assert_eq!(key, "abcd-efgh-6789-ab98");
         let mut settings = Settings::default();
@@ -477,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn pins_are_four_different_ones() {
+    fn equal_pins_fall_back_to_the_defaults() {
         let usual = UartPins::USUAL;
         assert_eq!(UartPins { tx: 21, rx: 20, ..usual }.or_usual().tx, 21);
         assert_eq!(UartPins { tx: 5, ..usual }.or_usual(), usual);

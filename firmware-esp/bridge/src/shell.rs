@@ -1,8 +1,7 @@
-//! Drives a [`Bridge`] over embassy-net and any asynchronous serial port: the loop that every chip
-//! runs. A chip's own crate makes the network stack, the port, the flash and the random numbers, and
-//! then awaits [`run`] for ever.
+//! Drives a [`Bridge`] over embassy-net and any asynchronous serial port: the main loop of every chip. A chip's crate
+//! creates network stack, port, flash and random numbers, and then awaits [`run`] forever.
 //!
-//! Everything runs in one task: futures side by side on one [`Shared`], no lock, no allocation.
+//! Everything runs in one task: concurrent futures on one [`Shared`], without locks or allocation.
 
 mod network;
 mod page;
@@ -29,61 +28,59 @@ use crate::page::Response;
 use crate::stats::RestartCause;
 use crate::storage::Store;
 
-/// What only the chip can do.
+/// Functions that only the chip can provide.
 pub trait Platform {
     /// Restarts the chip.
     fn restart(&mut self);
 
-    /// Shows how things are, by a light.
+    /// Shows the state of the bridge by a light.
     fn show(&mut self, light: Light);
 
-    /// Returns how well the radio receives its peer; `None` where it does not know. [dBm]
+    /// Returns the radio's received signal strength [dBm]; `None` if unknown.
     fn signal_dbm(&mut self) -> Option<i8>;
 
-    /// Returns how often the serial port's own buffer has run over since the start.
+    /// Returns the number of overruns of the serial port's own buffer since the start.
     fn overruns(&mut self) -> u32 {
         0
     }
 
-    /// Returns why the chip has started.
+    /// Returns the cause of the chip's start.
     fn restart_cause(&mut self) -> RestartCause {
         RestartCause::Unknown
     }
 
-    /// Forwarding has come round once more: the watchdog, if there is one, has no reason to bite. Called
-    /// each second at least by the task that carries the bytes, and by none else.
+    /// Resets the watchdog, if there is one. Called at least once a second, only by the task that forwards bytes.
     fn feed(&mut self) {}
 
-    /// Takes the next bytes of a new firmware, of which `first` are the beginning; returns true with
-    /// the last: it is verified, and the next start is its own; `update` does both.
+    /// Takes the next bytes of a new firmware; `first` marks its beginning. Returns true with the last bytes, when the
+    /// firmware is verified and will run at the next start; [`crate::update`] implements both.
     ///
-    /// # Errors
-    /// Why it is not taken, in words; the firmware that runs stays.
+    /// # Errors Why the firmware is rejected, in words. The running firmware stays.
     fn update(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
         let _ = (first, bytes);
-        Err("this bridge takes no firmware over the network; flash it by wire")
+        Err("this bridge does not accept firmware over the network; flash it by wire")
     }
 }
 
-/// State shown by the light; the number is how often it blinks in a period of two seconds.
+/// State that the light shows. The number is the count of blinks in a period of two seconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Light {
-    /// On: autopilot and a client are there.
+    /// On: autopilot and client are connected.
     Forwarding = 0,
     /// One blink: no network.
     NoNetwork = 1,
     /// Two blinks: no heartbeat from an autopilot.
     NoAutopilot = 2,
-    /// Three blinks: nobody listens.
+    /// Three blinks: no client.
     NoClient = 3,
     /// Four blinks: no key yet; `vizflyt bridge configure` claims it.
     Unclaimed = 4,
-    /// Fast: the companion is silent and the bridge has asked for LAND.
+    /// Fast: the companion is silent and the bridge has requested LAND.
     Landing = 10,
 }
 
-/// The bridge and what wakes its tasks.
+/// The bridge, and the signals that wake its tasks.
 #[allow(missing_debug_implementations)] // Why: embassy's signals have none.
 pub struct Shared {
     bridge: RefCell<Bridge>,
@@ -97,7 +94,6 @@ pub struct Shared {
 type Wake = Signal<NoopRawMutex, ()>;
 
 impl Shared {
-    /// Takes a bridge.
     pub const fn new(bridge: Bridge) -> Self {
         Self {
             bridge: RefCell::new(bridge),
@@ -109,7 +105,7 @@ impl Shared {
         }
     }
 
-    /// Gives the bridge something; wakes whoever may have something to do now.
+    /// Passes an input to the bridge, and wakes all tasks that may have work.
     pub fn with<T>(&self, f: impl FnOnce(&mut Bridge, HostTime) -> T) -> T {
         let result = f(&mut self.bridge.borrow_mut(), now());
         for wake in [&self.uart, &self.udp, &self.silent, &self.timer].into_iter().chain(&self.tcp)
@@ -119,13 +115,13 @@ impl Shared {
         result
     }
 
-    /// Takes something from the bridge; wakes nobody.
+    /// Reads an output of the bridge, without waking tasks.
     fn take<T>(&self, f: impl FnOnce(&mut Bridge, HostTime) -> T) -> T {
         f(&mut self.bridge.borrow_mut(), now())
     }
 }
 
-/// Memory of the sockets and of what goes through them.
+/// Memory of the sockets and their data.
 #[derive(Debug)]
 pub struct Buffers {
     udp_in_meta: [PacketMetadata; 16],
@@ -138,7 +134,7 @@ pub struct Buffers {
     page: PageBuffers,
 }
 
-/// Memory of the socket to those who do not speak: smaller datagrams, one at a time.
+/// Memory of the socket for silent clients: smaller datagrams, one at a time.
 #[derive(Debug)]
 struct SendOnly {
     meta: [PacketMetadata; 1],
@@ -146,7 +142,7 @@ struct SendOnly {
     datagram: [u8; SILENT],
 }
 
-/// The longest packet fits. [bytes]
+/// Length of the longest packet, rounded up [bytes].
 const SILENT: usize = 300;
 
 #[derive(Debug)]
@@ -198,19 +194,18 @@ impl Buffers {
     }
 }
 
-/// Sockets of a bridge, for a stack's `StackResources`: UDP in, out to those who speak and to the
-/// others; TCP; the page; and what the stack needs itself (DHCP).
+/// Number of sockets, for a stack's `StackResources`: UDP input, UDP output to active and to silent clients, TCP, the
+/// web page, and the stack's own (DHCP).
 pub const SOCKETS: usize = 5 + TCP_SLOTS;
 
-/// What a bridge of ours may take of a chip's RAM: state and buffers. The ESP8266 has the smaller set of
-/// `capacity`. [bytes]
+/// RAM budget of a bridge: state and buffers [bytes]. The ESP8266 uses the smaller set of `capacity`.
 pub const RAM_BUDGET: usize = 1024 * if cfg!(feature = "small") { 22 } else { 32 };
 const _: () = assert!(
     core::mem::size_of::<Shared>() + core::mem::size_of::<Buffers>() <= RAM_BUDGET,
     "the bridge outgrows its chip: shrink a ring or a buffer"
 );
 
-/// Runs the bridge for ever: serial port, network, flash and light.
+/// Runs the bridge forever: serial port, network, flash and light.
 pub async fn run<R: Read, W: Write, F: NorFlash, P: Platform>(
     shared: &Shared,
     stack: Stack<'_>,
@@ -219,7 +214,7 @@ pub async fn run<R: Read, W: Write, F: NorFlash, P: Platform>(
     platform: &mut P,
     buffers: &mut Buffers,
 ) -> ! {
-    // Borrowed for a call at a time, never while waiting.
+    // Borrowed only during a call, never across an await.
     let platform = RefCell::new(platform);
     join3(
         serial(shared, uart_in, uart_out),
@@ -227,7 +222,7 @@ pub async fn run<R: Read, W: Write, F: NorFlash, P: Platform>(
         mind(shared, stack, store, &platform),
     )
     .await;
-    // Each of the three is endless.
+    // Unreachable: none of the three ends.
     core::future::pending().await
 }
 
@@ -240,8 +235,8 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
                 Ok(len) if len > 0 => {
                     shared.with(|bridge, now| bridge.handle_uart(now, &bytes[..len]));
                 }
-                // An overrun, or a line that is not there: the checksum finds what is missing.
-                // A pause, so that a port that fails at once does not starve the rest.
+                // An overrun or a disconnected line: checksums detect the missing bytes. The pause keeps a port that
+                // fails immediately from starving other tasks.
                 _ => Timer::after(Duration::from_millis(1)).await,
             }
         }
@@ -263,7 +258,7 @@ async fn serial<R: Read, W: Write>(shared: &Shared, mut uart_in: R, mut uart_out
     join(receive, send).await;
 }
 
-/// Keeps the bridge's time, its settings and its light.
+/// Runs timeouts and events of the bridge, and updates the light.
 async fn mind<F: NorFlash, P: Platform>(
     shared: &Shared,
     stack: Stack<'_>,
@@ -278,7 +273,7 @@ async fn mind<F: NorFlash, P: Platform>(
     loop {
         platform.borrow_mut().feed();
         let overruns = platform.borrow_mut().overruns();
-        // Asking the radio is slow on some chips; this loop turns with every packet.
+        // Reading the radio is slow on some chips, and this loop runs for every packet.
         if asked_at.elapsed() > Duration::from_secs(1) {
             signal = platform.borrow_mut().signal_dbm();
             asked_at = Instant::now();
@@ -309,7 +304,7 @@ async fn mind<F: NorFlash, P: Platform>(
                 shared.with(|bridge, now| bridge.note_saved(now, saved));
             }
             Some(Event::Restart) => {
-                // The answer goes out first.
+                // Send the answer first.
                 Timer::after(Duration::from_millis(300)).await;
                 platform.borrow_mut().restart();
             }
@@ -320,10 +315,10 @@ async fn mind<F: NorFlash, P: Platform>(
     }
 }
 
-/// Ground stations and companions listen here.
+/// Port of ground stations and companions.
 const BEACON_PORT: u16 = 14550;
 
-/// Returns what the light shows.
+/// Returns the state for the light.
 pub fn light(bridge: &Bridge, network: bool) -> Light {
     if bridge.landing().is_some() {
         Light::Landing
@@ -340,7 +335,7 @@ pub fn light(bridge: &Bridge, network: bool) -> Light {
     }
 }
 
-/// Waits until woken, or until `due`.
+/// Waits until woken or until `due`.
 async fn wait(wake: &Wake, due: Option<HostTime>) {
     match due {
         Some(due) => {
@@ -354,8 +349,7 @@ fn now() -> HostTime {
     HostTime::from_ns(Instant::now().as_micros() * 1000)
 }
 
-/// Returns the moment on embassy's clock, a tick later rather than earlier: nothing is due yet
-/// just before it.
+/// Converts a time to embassy's clock. Rounds up, because nothing is due a tick earlier.
 fn instant(at: HostTime) -> Instant {
     Instant::from_micros(at.as_ns().div_ceil(1000))
 }

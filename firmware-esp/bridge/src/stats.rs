@@ -1,26 +1,26 @@
-//! What a bridge counts. Counters wrap; readers take differences.
+//! Counters of a bridge. They wrap; readers use differences.
 
 use crate::packet::CutStats;
 
-/// Why a packet did not go on.
+/// Why a packet was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Reason {
-    /// The autopilot's port was behind: more came than its baud rate carries.
+    /// The autopilot's port was overloaded: more data than its baud rate carries.
     UartFull,
-    /// A setpoint or pose waited for more than a period and a newer one of the same sender came.
+    /// A setpoint or pose waited longer than a period, and a newer one of the same sender arrived.
     Superseded,
-    /// A client took its packets too slowly, or its Wi-Fi did.
+    /// A client, or its Wi-Fi, was too slow.
     ClientSlow,
-    /// Nobody listens on the network.
+    /// No client is connected.
     NoClient,
-    /// All places for clients are taken.
+    /// The maximum number of clients is reached.
     TooManyClients,
-    /// Network or port refused it: no route, no link, a fault of the line.
+    /// Network or port refused it: no route, no link, or a line fault.
     NotSent,
 }
 
-/// Every reason with its name, as `vizflyt bridge stats` and the page show it.
+/// Names of all reasons, as shown by `vizflyt bridge stats` and the web page.
 pub const REASONS: [(Reason, &str); 6] = [
     (Reason::UartFull, "uart_full"),
     (Reason::Superseded, "superseded"),
@@ -30,18 +30,18 @@ pub const REASONS: [(Reason, &str); 6] = [
     (Reason::NotSent, "not_sent"),
 ];
 
-/// What went through one side.
+/// Counters of one side.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Side {
-    /// Bytes that came in.
+    /// Received bytes.
     pub bytes_in: u32,
-    /// Bytes that went out.
+    /// Sent bytes.
     pub bytes_out: u32,
-    /// Packets that went out.
+    /// Sent packets.
     pub packets_out: u32,
-    /// Packets missing in the senders' sequence numbers: lost before they reached us.
+    /// Gaps in the senders' sequence numbers: packets lost before they reached the bridge.
     pub lost: u32,
-    /// What came in, and what of it was no packet.
+    /// Received packets, and bytes outside of packets.
     pub cut: CutStats,
 }
 
@@ -54,41 +54,41 @@ pub struct Stats {
     pub net: Side,
     /// Packets dropped, by [`Reason`].
     pub drops: [u32; REASONS.len()],
-    /// Round trip to the autopilot by TIMESYNC, newest; 0 before the first. [us]
+    /// Newest round trip to the autopilot, measured by TIMESYNC; 0 before the first [us].
     pub round_trip_us: u32,
-    /// Times the link-loss action was taken.
+    /// Number of LAND requests because of a silent companion.
     pub landings: u32,
-    /// Configuration attempts refused: wrong key, no key, vehicle armed.
+    /// Refused changes of the configuration: wrong key, no key, vehicle armed.
     pub refused: u32,
-    /// Connections ended because they took nothing for too long.
+    /// Connections closed because they accepted no data for too long.
     pub stalled: u32,
-    /// Times the port's own buffer ran over: bytes were lost before anybody saw them.
+    /// Overruns of the port's own buffer: bytes lost before the bridge read them.
     pub overruns: u32,
-    /// Why the chip last started.
+    /// Cause of the chip's last start.
     pub restart_cause: RestartCause,
 }
 
-/// Why a chip started.
+/// Cause of a chip's start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum RestartCause {
-    /// It does not say.
+    /// Unknown.
     #[default]
     Unknown = 0,
-    /// Power came on.
+    /// Power on.
     Power = 1,
-    /// Somebody asked for it.
+    /// Requested restart.
     Asked = 2,
-    /// The program found itself wrong.
+    /// Panic of the program.
     Panic = 3,
-    /// The program hung.
+    /// The program hung, and the watchdog restarted it.
     Watchdog = 4,
-    /// The voltage fell.
+    /// Brownout: the supply voltage was too low.
     Brownout = 5,
 }
 
 impl RestartCause {
-    /// Returns what to tell of it, if it is worth telling: at most 50 characters.
+    /// Returns a status text of at most 50 characters for an abnormal cause.
     pub fn message(self) -> Option<&'static str> {
         match self {
             Self::Unknown | Self::Power | Self::Asked => None,
@@ -105,7 +105,7 @@ impl Side {
 }
 
 impl Stats {
-    /// Nothing yet; as the default, but `const`.
+    /// All zero: the default as a `const`.
     pub(crate) const NONE: Self = Self {
         uart: Side::NONE,
         net: Side::NONE,
@@ -124,7 +124,7 @@ impl Stats {
         *counter = counter.wrapping_add(packets);
     }
 
-    /// Returns every counter, in the order of [`REPORT`].
+    /// Returns all counters in the order of [`REPORT`].
     pub fn report(&self, uptime_s: u32) -> [u32; REPORT.len()] {
         let (uart, net) = (&self.uart, &self.net);
         let [full, superseded, slow, nobody, many, not_sent] = self.drops;
@@ -157,13 +157,13 @@ impl Stats {
         ]
     }
 
-    /// Returns how many packets were dropped for `reason`.
+    /// Returns the number of packets dropped for `reason`.
     pub fn dropped(&self, reason: Reason) -> u32 {
         self.drops[reason as usize]
     }
 }
 
-/// Names of the counters, as `vizflyt bridge stats`, the page and the wire have them.
+/// Names of the counters in `vizflyt bridge stats`, on the web page and on the wire.
 pub const REPORT: [&str; 25] = [
     "uptime_s",
     "uart_bytes_in",
@@ -192,7 +192,7 @@ pub const REPORT: [&str; 25] = [
     "restart_cause",
 ];
 
-/// Counts what is missing in the sequence numbers of a few senders.
+/// Counts gaps in the sequence numbers of a few senders.
 #[derive(Clone, Debug)]
 pub(crate) struct Sequences<const N: usize> {
     senders: [Option<Sender>; N],
@@ -205,8 +205,8 @@ struct Sender {
     last: u8,
 }
 
-/// A jump this far or further is taken for a restart or an overtaken packet: a loss of half the
-/// counter's range at once cannot be distinguished from either.
+/// A jump of at least this size counts as a restart or a reordered packet, because a loss of half the counter's range
+/// looks the same.
 const MAX_LOST: u8 = 128;
 
 impl<const N: usize> Sequences<N> {
@@ -214,7 +214,7 @@ impl<const N: usize> Sequences<N> {
         Self { senders: [None; N], oldest: 0 }
     }
 
-    /// Takes note of a packet; returns how many were lost before it.
+    /// Records a packet. Returns the number of packets lost before it.
     pub(crate) fn note(&mut self, source: (u8, u8), sequence: u8) -> u32 {
         let known = self.senders.iter_mut().flatten().find(|sender| sender.source == source);
         if let Some(sender) = known {
@@ -223,7 +223,7 @@ impl<const N: usize> Sequences<N> {
                 sender.last = sequence;
                 return missing.into();
             }
-            // Overtaken: 255 is the same number again, 254 the one before. A restart is far off.
+            // Reordered: 255 repeats the last number, 254 is the one before. A restart jumps further.
             if missing < 240 {
                 sender.last = sequence;
             }
@@ -251,14 +251,14 @@ mod tests {
     }
 
     #[test]
-    fn gaps_are_counted_also_across_the_wrap() {
+    fn counts_gaps_across_the_wrap() {
         check(&[0, 1, 2, 3], 0);
         check(&[7], 0);
         check(&[0, 2], 1);
         check(&[254, 255, 0, 1], 0);
         check(&[254, 1], 2);
         check(&[255, 0], 0);
-        // Twice the same, and overtaken by one: nothing is lost that way.
+        // A duplicate and a swap are not losses.
         check(&[5, 5, 6], 0);
         check(&[5, 7, 6, 8], 1);
         // Restarted.
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn senders_are_distinguished_and_a_third_replaces_one() {
+    fn counts_senders_separately_and_replaces_the_oldest() {
         let mut sequences = Sequences::<2>::new();
         assert_eq!(sequences.note((1, 1), 0), 0);
         assert_eq!(sequences.note((255, 191), 9), 0);
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn each_reason_has_its_own_counter() {
+    fn every_reason_has_its_own_counter() {
         let mut stats = Stats::default();
         for (reason, name) in REASONS {
             stats.drop(reason, 1 + reason as u32);

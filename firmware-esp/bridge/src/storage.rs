@@ -1,28 +1,28 @@
-//! Settings in flash: two sectors that take turns, so that a power cut while writing leaves the
-//! settings before. Names and values as text: a newer firmware's unknown names are skipped, an
-//! older one's missing names keep their defaults.
+//! Settings in flash. Two sectors are written alternately, so that a power failure during a write leaves the previous
+//! settings. Names and values are text: unknown names of a newer firmware are skipped, and missing names keep their
+//! defaults.
 
 use embedded_storage::nor_flash::NorFlash;
 use sha2::{Digest, Sha256};
 
 use crate::settings::Settings;
 
-/// Bytes of a record at most; all settings at their longest take three quarters of it.
+/// Maximum length of a record [bytes]; all settings at maximum length use three quarters of it.
 const RECORD: usize = 1280;
 /// Magic (4), sequence (4), length (2), zero (2), hash (8).
 const HEAD: usize = 20;
 const MAGIC: [u8; 4] = *b"VZB1";
 
-/// A flash that did not take the settings.
+/// Why settings were not saved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StoreError {
-    /// It refused to read, erase or write.
+    /// The flash failed to read, erase or write.
     Flash,
-    /// What was read back differs.
+    /// The bytes read back differ.
     Verify,
 }
 
-/// Two sectors of a flash.
+/// Two sectors of a flash that hold the settings.
 #[derive(Debug)]
 pub struct Store<F> {
     flash: F,
@@ -30,23 +30,23 @@ pub struct Store<F> {
 }
 
 impl<F: NorFlash> Store<F> {
-    /// Bytes it uses from `base` on.
+    /// Bytes used from `base` on.
     pub const SIZE: u32 = 2 * F::ERASE_SIZE as u32;
 
-    /// Uses [`Self::SIZE`] bytes from `base` on, which is the start of a sector.
+    /// Uses [`Self::SIZE`] bytes from `base` on, which must be the start of a sector.
     pub fn new(flash: F, base: u32) -> Self {
         const { assert!(F::ERASE_SIZE >= RECORD && RECORD.is_multiple_of(F::WRITE_SIZE)) };
         Self { flash, base }
     }
 
-    /// Returns the newest settings; `None` if none were ever saved.
+    /// Returns the newest settings; `None` if none are stored.
     pub fn load(&mut self) -> Option<Settings> {
         let mut settings = Settings::default();
         self.load_into(&mut settings).map(|()| settings)
     }
 
-    /// As [`Self::load`], over defaults that the caller has: a chip's stack has no room for a copy.
-    #[inline(never)] // Why: the record is on a chip's stack while this runs, and no longer.
+    /// Like [`Self::load`], but writes into existing defaults, because a chip's stack is too small for a copy.
+    #[inline(never)] // Why: the record occupies a chip's stack only during this call.
     pub fn load_into(&mut self, settings: &mut Settings) -> Option<()> {
         let mut record = [0; RECORD];
         let (slot, _) = self.newest(&mut record)?;
@@ -54,7 +54,7 @@ impl<F: NorFlash> Store<F> {
         let (_, body) = valid(&record)?;
         for line in body.lines() {
             if let Some((name, value)) = line.split_once('=') {
-                // A name of another firmware, or a value outside today's range.
+                // Ignore names of other firmware and values out of range.
                 let _ = settings.set(name, value);
             }
         }
@@ -64,7 +64,7 @@ impl<F: NorFlash> Store<F> {
     /// Writes settings over the older record.
     ///
     /// # Errors
-    /// See [`StoreError`]; the settings before are still there.
+    /// See [`StoreError`]; the previous settings stay.
     #[inline(never)] // Why: as `load_into`.
     pub fn save(&mut self, settings: &Settings) -> Result<(), StoreError> {
         let mut record = [0; RECORD];
@@ -86,7 +86,7 @@ impl<F: NorFlash> Store<F> {
         }
     }
 
-    /// Forgets everything, the key too: for the button, which takes a hand on the vehicle.
+    /// Erases all settings, keys included. For the button, which needs physical access.
     ///
     /// # Errors
     /// [`StoreError::Flash`].
@@ -94,7 +94,6 @@ impl<F: NorFlash> Store<F> {
         self.flash.erase(self.base, self.base + Self::SIZE).map_err(|_| StoreError::Flash)
     }
 
-    /// Returns the flash.
     pub fn into_flash(self) -> F {
         self.flash
     }
@@ -130,7 +129,7 @@ fn encode(settings: &Settings, sequence: u32, record: &mut [u8; RECORD]) -> usiz
     let mut len = HEAD;
     settings.each(|name, value| {
         for part in [name, "=", value, "\n"] {
-            // All settings at their longest fit: see the test.
+            // All settings at maximum length fit, see the test.
             if let Some(place) = record.get_mut(len..len + part.len()) {
                 place.copy_from_slice(part.as_bytes());
                 len += part.len();
@@ -145,7 +144,7 @@ fn encode(settings: &Settings, sequence: u32, record: &mut [u8; RECORD]) -> usiz
     len
 }
 
-/// Returns a record's sequence and body if it is whole.
+/// Returns sequence and body of a valid record.
 fn valid(record: &[u8; RECORD]) -> Option<(u32, &str)> {
     let len = HEAD + usize::from(u16::from_le_bytes([record[8], record[9]]));
     if record[..4] != MAGIC || len > RECORD || record[12..20] != hash(record, len) {
@@ -155,7 +154,7 @@ fn valid(record: &[u8; RECORD]) -> Option<(u32, &str)> {
     Some((sequence, core::str::from_utf8(&record[HEAD..len]).ok()?))
 }
 
-/// Returns what a record's bytes but the hash itself add up to.
+/// Returns the hash of a record: all bytes except the hash field.
 fn hash(record: &[u8; RECORD], len: usize) -> [u8; 8] {
     let whole =
         Sha256::new().chain_update(&record[..12]).chain_update(&record[HEAD..len]).finalize();

@@ -1,29 +1,29 @@
-//! Signed firmware, and the way back from one that does not work.
+//! Signed firmware updates with rollback.
 //!
 //! ```text
-//! header: signature right? for this chip? not older? ─▶ spare half: erase, write ─▶ read back, hash
-//!        ─▶ boot it on trial ─▶ healthy? keep it : after three starts, the half before
+//! header: signature valid? for this chip? not older? ─▶ spare slot: erase, write ─▶ read back, hash
+//!        ─▶ boot on trial ─▶ healthy? keep it : after three starts, roll back
 //! ```
-//! Nothing is erased before the signature has been verified, and the running half is never
-//! touched: power may fail at any moment. A chip without two halves has no [`Slots`] and no updates.
+//! Nothing is erased before the signature is verified, and the running slot is never written, so power may fail at any
+//! time. A chip without two slots implements no [`Slots`] and has no updates.
 
 use ed25519_dalek::{Signature, VerifyingKey};
 use embedded_storage::nor_flash::{NorFlash, ReadNorFlash};
 use sha2::{Digest, Sha256};
 
-/// Bytes before a firmware.
+/// Length of the header before a firmware [bytes].
 pub const HEADER: usize = 112;
-/// The header begins with it.
+/// First bytes of the header.
 pub const MAGIC: [u8; 4] = *b"VZU1";
-/// What is signed: everything before the signature, and what it is for.
+/// Length of the signed part of the header [bytes]. [`CONTEXT`] binds a signature to its purpose.
 const SIGNED: usize = 48;
 const CONTEXT: &[u8] = b"vizflyt bridge firmware 1";
 
-/// Which chip a firmware is for.
+/// Chip that a firmware is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Target {
-    /// `vizflyt bridge emulate`, and tests.
+    /// The host: `vizflyt bridge emulate`, and tests.
     Host = 0,
     /// ESP32-C3.
     Esp32C3 = 1,
@@ -34,18 +34,18 @@ pub enum Target {
 /// Header of a firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
-    /// Its chip, by number.
+    /// Number of the [`Target`].
     pub target: u8,
-    /// Counts up; a bridge takes no older one than it runs.
+    /// Build number; a bridge rejects firmware with a smaller one than it runs.
     pub build: u32,
-    /// Bytes behind the header.
+    /// Length of the firmware behind the header [bytes].
     pub len: u32,
-    /// SHA-256 of them.
+    /// SHA-256 of the firmware.
     pub hash: [u8; 32],
 }
 
 impl Header {
-    /// Returns what is to be signed: the header's bytes behind [`CONTEXT`].
+    /// Returns the message to sign: [`CONTEXT`] and the header's bytes.
     fn message(&self) -> [u8; CONTEXT.len() + SIGNED] {
         let mut message = [0; CONTEXT.len() + SIGNED];
         message[..CONTEXT.len()].copy_from_slice(CONTEXT);
@@ -58,7 +58,7 @@ impl Header {
         message
     }
 
-    /// Returns the header's bytes; `sign` signs what it is given by Ed25519.
+    /// Returns the header's bytes; `sign` must sign its argument with Ed25519.
     pub fn sign(&self, sign: impl FnOnce(&[u8]) -> [u8; 64]) -> [u8; HEADER] {
         let message = self.message();
         let mut bytes = [0; HEADER];
@@ -93,67 +93,67 @@ impl Header {
     }
 }
 
-/// Why a firmware is not taken.
+/// Why a firmware is rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
-    /// The bytes are no firmware of ours.
+    /// The bytes are not a bridge firmware.
     NoFirmware,
-    /// It is not signed by the key.
+    /// The signature is not by the bridge's firmware key.
     Signature,
-    /// It is for another chip.
+    /// The firmware is for another chip.
     OtherChip,
-    /// It is older than the one that runs.
+    /// The firmware is older than the running one.
     Older,
-    /// It does not fit the spare half.
+    /// The firmware does not fit the spare slot.
     TooLong,
-    /// The flash refused, or what was read back differs.
+    /// The flash failed, or the bytes read back differ.
     Flash,
-    /// What came is not what was signed.
+    /// The received bytes differ from the signed ones.
     Damaged,
 }
 
 impl Fault {
-    /// Returns it in words.
+    /// Returns the fault in words.
     pub fn message(self) -> &'static str {
         match self {
-            Self::NoFirmware => "these bytes are no firmware for a bridge",
+            Self::NoFirmware => "not a bridge firmware",
             Self::Signature => "the signature is not of this bridge's firmware key",
             Self::OtherChip => "the firmware is for another chip",
             Self::Older => "the firmware is older than the one that runs",
             Self::TooLong => "the firmware does not fit the chip",
-            Self::Flash => "the flash did not take it",
-            Self::Damaged => "what came is not what was signed",
+            Self::Flash => "the flash failed to erase, write or verify",
+            Self::Damaged => "the received bytes differ from the signed firmware",
         }
     }
 }
 
-/// A chip's two halves.
+/// Two firmware slots of a chip.
 pub trait Slots {
-    /// The half that does not run, from address 0 on.
+    /// Slot that is not running, from address 0 on.
     type Spare: NorFlash;
 
-    /// Returns the half that does not run.
+    /// Returns the slot that is not running.
     fn spare(&mut self) -> &mut Self::Spare;
 
-    /// Makes the chip start the spare half from now on, on trial; returns whether it could.
+    /// Makes the chip start the spare slot from now on, on trial. Returns whether that succeeded.
     fn start_spare(&mut self) -> bool;
 }
 
-/// What this bridge takes.
+/// Requirements on a firmware.
 #[derive(Clone, Copy, Debug)]
 pub struct Wanted {
-    /// Its chip.
+    /// Chip of this bridge.
     pub target: Target,
-    /// The build that runs.
+    /// Build number of the running firmware.
     pub build: u32,
-    /// The public half of the key that signs its firmware.
+    /// Public key that verifies firmware.
     pub key: [u8; 32],
 }
 
 /// Bytes written to flash at once: a page of every NOR flash.
 const PAGE: usize = 256;
 
-/// Takes a firmware in any portions.
+/// Receives a firmware in portions of any size.
 #[derive(Debug)]
 pub struct Updater {
     wanted: Wanted,
@@ -166,7 +166,7 @@ pub struct Updater {
 }
 
 impl Updater {
-    /// Waits for a firmware's first byte.
+    /// Returns an updater that waits for the first byte.
     pub fn new(wanted: Wanted) -> Self {
         Self {
             wanted,
@@ -179,7 +179,7 @@ impl Updater {
         }
     }
 
-    /// Takes bytes; returns true with the last: it is whole, verified, and starts next.
+    /// Takes bytes. Returns true with the last ones, when the firmware is complete and verified, and will start next.
     ///
     /// # Errors
     /// See [`Fault`]. The running firmware stays.
@@ -219,7 +219,7 @@ impl Updater {
         if slots.start_spare() { Ok(true) } else { Err(Fault::Flash) }
     }
 
-    /// Returns the build number of the firmware that comes, once its header is verified.
+    /// Returns the build number of the incoming firmware, once its header is verified.
     pub fn build(&self) -> Option<u32> {
         self.open.map(|header| header.build)
     }
@@ -252,7 +252,7 @@ impl Updater {
     }
 }
 
-/// Reads the spare half back.
+/// Verifies the hash of the spare slot.
 fn verify<F: NorFlash>(flash: &mut F, header: &Header) -> Result<(), Fault> {
     let (mut hash, mut at, mut page) = (Sha256::new(), 0, [0; PAGE]);
     while at < header.len {
@@ -265,26 +265,26 @@ fn verify<F: NorFlash>(flash: &mut F, header: &Header) -> Result<(), Fault> {
     if hash.finalize()[..] == header.hash { Ok(()) } else { Err(Fault::Damaged) }
 }
 
-/// Starts that a new firmware has to become healthy.
+/// Starts within which a new firmware must become healthy.
 pub const STARTS: u32 = 3;
 const ON_TRIAL: u32 = 0x7A17_5A17;
 
-/// The record of a trial: one sector of flash, whose bits only ever fall between two updates, so
-/// that a start is counted without erasing. For chips whose loader does not count by itself.
+/// Record of a trial in one sector of flash. Its bits only change from 1 to 0 between two updates, so that starts are
+/// counted without erasing. For chips whose loader does not count.
 #[derive(Debug)]
 pub struct Trial<F> {
     flash: F,
     base: u32,
 }
 
-/// What a start shall do.
+/// Action at a start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StartAction {
-    /// Run; nothing is on trial.
+    /// Run; not on trial.
     Settled,
     /// Run, and call [`Trial::keep`] once healthy.
     OnTrial,
-    /// Start the half before: this one had its starts.
+    /// Start the previous slot: this one used all its starts.
     GoBack,
 }
 
@@ -295,7 +295,7 @@ impl<F: NorFlash> Trial<F> {
         Self { flash, base }
     }
 
-    /// Begins a trial; call it before [`Slots::start_spare`] switches.
+    /// Begins a trial. Call it before [`Slots::start_spare`].
     ///
     /// # Errors
     /// [`Fault::Flash`].
@@ -305,10 +305,10 @@ impl<F: NorFlash> Trial<F> {
         self.write(0, ON_TRIAL)
     }
 
-    /// Counts a start and returns what to do.
+    /// Counts a start. Returns the action.
     ///
     /// # Errors
-    /// [`Fault::Flash`]; then run: a flash that cannot count cannot switch either.
+    /// [`Fault::Flash`]; run the firmware then, because a flash that cannot count cannot switch either.
     pub fn start(&mut self) -> Result<StartAction, Fault> {
         if self.read(0)? != ON_TRIAL || self.read(4)? == 0 {
             return Ok(StartAction::Settled);
@@ -323,7 +323,7 @@ impl<F: NorFlash> Trial<F> {
         Ok(StartAction::OnTrial)
     }
 
-    /// Ends the trial: the firmware works.
+    /// Ends the trial and keeps the firmware.
     ///
     /// # Errors
     /// [`Fault::Flash`].

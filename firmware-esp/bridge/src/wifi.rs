@@ -1,10 +1,10 @@
-//! Which network a bridge is part of: joins the one of the settings, falls back to its own, and
-//! comes back. Addresses, and the name to be found by, go with it.
+//! Wi-Fi connection of a bridge: joins the configured network, falls back to an access point, and returns. Includes
+//! addresses and name.
 //!
 //! ```text
 //! station: join ─ joined ─▶ address (DHCP or fixed) ─ lost ─▶ join ...
-//!            └─ not for `fallback_s` ─▶ own network ─ nobody there for a minute ─▶ join ...
-//! access point: own network, 192.168.4.1, which gives addresses to whoever joins
+//!            └─ fails for `fallback_s` ─▶ own network ─ no client for a minute ─▶ join ...
+//! access point: own network, 192.168.4.1, with a DHCP server
 //! ```
 
 use core::future::pending;
@@ -20,26 +20,26 @@ use crate::settings::{Settings, WifiRole};
 use crate::shell::Shared;
 use crate::{dhcp, mdns};
 
-/// The radio of a chip. It is one interface of the network stack, in whichever role.
-#[allow(async_fn_in_trait)] // Why: a bridge is one task; nothing needs to be `Send`.
+/// Radio of a chip. It is one interface of the network stack in both roles.
+#[allow(async_fn_in_trait)] // Why: a bridge is one task, so nothing must be `Send`.
 pub trait Radio {
-    /// Tries once to join a network, for ten seconds or so; returns whether it did. An empty
-    /// password: an open network.
+    /// Tries once to join a network, for about ten seconds. Returns whether it succeeded. An empty password means an
+    /// open network.
     async fn join(&mut self, ssid: &str, password: &str) -> bool;
 
-    /// Returns when the network that was joined is lost.
+    /// Returns when the joined network is lost.
     async fn lost(&mut self);
 
-    /// Makes a network of its own; returns whether it could. An empty password leaves it open.
+    /// Opens an access point. Returns whether it succeeded. An empty password leaves the network open.
     async fn open(&mut self, ssid: &str, password: &str, channel: u8) -> bool;
 }
 
-/// Address of a bridge in its own network.
+/// Address of a bridge as an access point.
 pub const OWN_ADDRESS: Ipv4Addr = Ipv4Addr::new(192, 168, 4, 1);
-/// Sockets that this module opens.
+/// Number of sockets that this module opens.
 pub const SOCKETS: usize = 2;
 
-/// Memory of its sockets.
+/// Memory of this module's sockets.
 #[derive(Debug)]
 pub struct Buffers {
     leases: dhcp::Leases,
@@ -55,9 +55,9 @@ struct Socket<const IN: usize, const OUT: usize> {
     bytes_out: [u8; OUT],
 }
 
-/// The longest request that a station may send before it knows us (RFC 2131, section 2). [bytes]
+/// Longest request that a station may send to an unknown server (RFC 2131, section 2) [bytes].
 const DHCP_REQUEST: usize = 548;
-/// A query for one name; those that ask for dozens of services are not for us. [bytes]
+/// Longest accepted query [bytes]: enough for one name; longer ones query many services.
 const MDNS_QUERY: usize = 256;
 
 impl<const IN: usize, const OUT: usize> Socket<IN, OUT> {
@@ -73,7 +73,7 @@ impl<const IN: usize, const OUT: usize> Socket<IN, OUT> {
     fn open<'a>(&'a mut self, stack: Stack<'a>, port: u16) -> UdpSocket<'a> {
         let Self { meta_in, bytes_in, meta_out, bytes_out } = self;
         let mut socket = UdpSocket::new(stack, meta_in, bytes_in, meta_out, bytes_out);
-        // The port is not 0 and the socket is new: nothing else is refused.
+        // Cannot fail: the port is not 0 and the socket is new.
         let _ = socket.bind(port);
         socket
     }
@@ -92,7 +92,7 @@ impl Buffers {
     }
 }
 
-/// Keeps the bridge on a network, for ever.
+/// Keeps the bridge on a network, forever.
 pub async fn run<R: Radio>(
     shared: &Shared,
     stack: Stack<'_>,
@@ -100,7 +100,7 @@ pub async fn run<R: Radio>(
     buffers: &mut Buffers,
 ) -> ! {
     let Buffers { leases, dhcp, mdns } = buffers;
-    // A group of its own for queries; where the stack has no place for it the name is not found.
+    // If the stack has no space for another multicast group, only the name is not found.
     let _ = stack.join_multicast_group(IpAddress::Ipv4(mdns::GROUP.0));
     join(
         keep(shared, stack, radio),
@@ -110,11 +110,11 @@ pub async fn run<R: Radio>(
         ),
     )
     .await;
-    // Each of the three is endless.
+    // Unreachable: none of the three ends.
     pending().await
 }
 
-/// Joins, falls back, comes back.
+/// Joins the configured network, falls back to the own one, and returns.
 async fn keep<R: Radio>(shared: &Shared, stack: Stack<'_>, radio: &mut R) {
     loop {
         let settings = shared.with(|bridge, now| {
@@ -136,7 +136,8 @@ async fn keep<R: Radio>(shared: &Shared, stack: Stack<'_>, radio: &mut R) {
         if !joins {
             pending::<()>().await;
         }
-        // Whoever flies by the fallback keeps it: back only when nobody is there.
+        // Do not leave the fallback network while it is in use: return only without clients and if the vehicle is
+        // disarmed.
         let mut lonely_since = Instant::now();
         while lonely_since.elapsed() < LONELY {
             Timer::after(Duration::from_secs(1)).await;
@@ -147,10 +148,10 @@ async fn keep<R: Radio>(shared: &Shared, stack: Stack<'_>, radio: &mut R) {
     }
 }
 
-/// How long nobody is there before the settings' network is tried again.
+/// Time without clients after which the configured network is tried again.
 const LONELY: Duration = Duration::from_secs(60);
 
-/// Returns when the network could not be had for the set time.
+/// Runs as a station. Returns after the fallback time without a connection.
 async fn be_station<R: Radio>(stack: Stack<'_>, radio: &mut R, settings: &Settings) {
     let patience = Duration::from_secs(settings.fallback_s.into());
     let mut without_since = Instant::now();
@@ -169,7 +170,7 @@ async fn be_station<R: Radio>(stack: Stack<'_>, radio: &mut R, settings: &Settin
             if has_address {
                 pending::<()>().await;
             }
-            // A network that gives no address is none.
+            // A network without an address counts as not joined.
         };
         select(radio.lost(), address).await;
         stack.set_config_v4(ConfigV4::None);
@@ -193,12 +194,12 @@ fn dhcp_config(settings: &Settings) -> DhcpConfig {
     config
 }
 
-/// Gives addresses to those in our own network.
+/// Serves DHCP in the bridge's own network.
 async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket: UdpSocket<'_>) {
     let everybody = SocketAddrV4::new(Ipv4Addr::BROADCAST, 68);
     let mut answer = [0; dhcp::ANSWER];
     loop {
-        // Asked first: the stack cannot be asked while it lends out a datagram.
+        // Wait before reading the address: the stack cannot be used while it lends out a datagram.
         socket.wait_recv_ready().await;
         let own = own_address(stack) == Some(OWN_ADDRESS);
         let len = socket
@@ -207,13 +208,13 @@ async fn give_addresses(stack: Stack<'_>, leases: &mut dhcp::Leases, mut socket:
             })
             .await;
         if let Some(len) = len {
-            // A lost answer is asked for again.
+            // If the answer is lost, the station repeats its request.
             let _ = socket.send_to(&answer[..len], everybody).await;
         }
     }
 }
 
-/// Lets the bridge be found by its name.
+/// Answers mDNS queries for the bridge's name.
 async fn answer_to_name(shared: &Shared, stack: Stack<'_>, mut socket: UdpSocket<'_>) {
     let group = SocketAddrV4::new(mdns::GROUP.0, mdns::GROUP.1);
     let mut answer = [0; mdns::ANSWER];

@@ -1,5 +1,5 @@
-//! The shell that chips run, on the host: two stacks of embassy-net joined by a cable in memory, and
-//! a serial line in memory.
+//! The shell of the chips on the host: two embassy-net stacks connected by a cable in memory, and a serial line in
+//! memory.
 
 use core::future::Future;
 use core::net::{Ipv4Addr, SocketAddrV4};
@@ -29,10 +29,10 @@ use vizflyt_protocol::time::HostTime;
 const MTU: usize = 1514;
 const BRIDGE: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 1);
 const COMPANION: Ipv4Addr = Ipv4Addr::new(10, 0, 0, 2);
-/// Longer than this only a hang takes.
+/// Exceeded only by a hang.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A chip whose flash is memory.
+/// A chip with flash in memory.
 struct Bare {
     lights: Vec<Light>,
     halves: Halves,
@@ -100,7 +100,7 @@ fn wanted() -> Wanted {
     Wanted { target: Target::Host, build: 3, key }
 }
 
-/// Flash in memory: erased bytes are ones, writing clears bits.
+/// Flash in memory: erased bytes are ones, writes clear bits.
 struct Ram(Vec<u8>);
 
 impl ErrorType for Ram {
@@ -168,12 +168,12 @@ fn fixed(address: Ipv4Addr) -> Config {
     })
 }
 
-/// Runs `test` with a bridge's companion and autopilot; returns the chip as it was left.
+/// Runs `test` as companion and autopilot of a bridge. Returns the final state of the chip.
 fn with_bridge<F>(test: impl FnOnce(Stack<'static>, LineIn<'static>, LineOut<'static>) -> F) -> Bare
 where
     F: Future<Output = ()>,
 {
-    // Why leaked: embassy's stacks want memory that outlives them, as a chip's static memory does.
+    // Why leaked: embassy's stacks need memory that outlives them, like a chip's static memory.
     let states = [(); 2].map(|()| Box::leak(Box::new(channel::State::<MTU, 4, 4>::new())));
     let [state_a, state_b] = states;
     let hardware = |last| channel::driver::HardwareAddress::Ethernet([2, 0, 0, 0, 0, last]);
@@ -192,7 +192,7 @@ where
     let from_bridge = Box::leak(Box::new(Line::new()));
     let (bridge_in, autopilot_out) = to_bridge.split();
     let (autopilot_in, bridge_out) = from_bridge.split();
-    // A client that is not there: nobody else waits for it.
+    // An absent client must not delay others.
     let absent = Some(SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 77), 14550));
     let settings = Settings { radio_status: false, client: absent, ..Settings::default() };
     let shared = Shared::new(Bridge::new(HostTime::ZERO, settings, Chip::default()));
@@ -207,14 +207,14 @@ where
         let world = join3(join(net_a.run(), net_b.run()), wires, bridge);
         let test = with_timeout(PATIENCE, test(stack_b, autopilot_in, autopilot_out));
         match embassy_futures::block_on(select(world, test)) {
-            Either::First(_) => panic!("the bridge runs for ever"),
-            Either::Second(done) => done.expect("everything comes in time"),
+            Either::First(_) => panic!("the bridge must not end"),
+            Either::Second(done) => done.expect("timeout"),
         }
     }
     bare
 }
 
-/// A whole packet of message `id`, distinguished by `number`.
+/// Returns a packet of message `id` that contains `number`.
 fn packet(from: (u8, u8), id: u32, number: u32) -> Vec<u8> {
     let mut payload = [0x5A; 28];
     payload[..4].copy_from_slice(&number.to_le_bytes());
@@ -229,7 +229,7 @@ const STATUSTEXT: u32 = 253;
 const COUNT: u32 = 1000;
 
 #[test]
-fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
+fn carries_a_thousand_packets_each_way_without_loss() {
     let chip = with_bridge(|stack, uart_in, mut uart_out| async move {
         let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 16]);
         let (mut rx, mut tx) = ([0; 8192], [0; 8192]);
@@ -255,7 +255,7 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
             for number in 0..COUNT {
                 uart_out.write_all(&packet((1, 1), ATTITUDE, number)).await.unwrap();
                 if number % 40 == 39 {
-                    // As many as the ring holds may be under way.
+                    // Do not exceed the capacity of the ring.
                     embassy_time::Timer::after(Duration::from_millis(8)).await;
                 }
             }
@@ -279,11 +279,11 @@ fn a_thousand_packets_each_way_over_udp_and_none_lost_or_changed() {
     assert!(chip.lights.contains(&Light::NoAutopilot), "{:?}", chip.lights);
 }
 
-/// Asks for a page, as a browser does.
+/// Requests a page like a browser.
 async fn ask_page(stack: Stack<'static>, path: &str) -> String {
     let (mut rx, mut tx) = ([0; 4096], [0; 1024]);
     let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
-    // Refused while the page still serves the one before, as a browser would try again.
+    // Refused while the page serves the previous connection; a browser would also retry.
     while socket.connect((BRIDGE, 80)).await.is_err() {
         embassy_time::Timer::after(Duration::from_millis(1)).await;
     }
@@ -297,7 +297,7 @@ async fn ask_page(stack: Stack<'static>, path: &str) -> String {
 }
 
 #[test]
-fn a_browser_sees_the_page() {
+fn serves_counters_to_a_browser() {
     with_bridge(|stack, _uart_in, _uart_out| async move {
         for _ in 0..2 {
             let answer = ask_page(stack, "/stats.json").await;
@@ -307,7 +307,7 @@ fn a_browser_sees_the_page() {
 }
 
 #[test]
-fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
+fn tcp_carries_packets_of_successive_clients() {
     with_bridge(|stack, uart_in, mut uart_out| async move {
         for _ in 0..3 {
             let (mut rx, mut tx) = ([0; 4096], [0; 4096]);
@@ -343,7 +343,7 @@ fn tcp_carries_the_same_and_a_second_client_follows_the_first() {
     });
 }
 
-/// Signs a firmware as `vizflyt bridge firmware sign` does.
+/// Signs a firmware like `vizflyt bridge firmware sign`.
 fn signed(body: &[u8]) -> Vec<u8> {
     let header = Header {
         target: Target::Host as u8,
@@ -355,7 +355,7 @@ fn signed(body: &[u8]) -> Vec<u8> {
     [&header.sign(|message| key.sign(message).to_bytes())[..], body].concat()
 }
 
-/// Brings a firmware and returns the answer.
+/// Uploads a firmware and returns the answer.
 async fn bring(stack: Stack<'static>, firmware: &[u8]) -> String {
     let (mut rx, mut tx) = ([0; 1024], [0; 1024]);
     let mut socket = TcpSocket::new(stack, &mut rx, &mut tx);
@@ -364,7 +364,7 @@ async fn bring(stack: Stack<'static>, firmware: &[u8]) -> String {
     }
     let mut request = b"POST /update HTTP/1.0\r\n\r\n".to_vec();
     request.extend_from_slice(firmware);
-    // A refusal may come before the last byte has gone.
+    // A rejection may arrive before the last byte is sent.
     let _ = socket.write_all(&request).await;
     socket.close();
     let (mut answer, mut bytes) = (Vec::new(), [0; 512]);
@@ -379,11 +379,11 @@ fn firmware() -> Vec<u8> {
 }
 
 #[test]
-fn a_signed_firmware_is_taken_over_the_network_and_started() {
+fn installs_a_signed_firmware_over_the_network() {
     let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
         let answer = bring(stack, &signed(&firmware())).await;
         assert!(answer.starts_with("HTTP/1.0 200 OK"), "{answer}");
-        // Served after the former is done with; a chip would be starting now.
+        // Served only after the first upload is complete; a chip would be restarting.
         bring(stack, b"").await;
     });
     assert!(chip.halves.starts_spare && chip.restarts > 0);
@@ -391,7 +391,7 @@ fn a_signed_firmware_is_taken_over_the_network_and_started() {
 }
 
 #[test]
-fn any_other_is_refused_in_words_and_nothing_is_written() {
+fn rejects_other_firmware_and_writes_nothing() {
     let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
         let mut forged = signed(&firmware());
         forged[60] ^= 1;
@@ -405,14 +405,14 @@ fn any_other_is_refused_in_words_and_nothing_is_written() {
 }
 
 #[test]
-fn an_armed_vehicle_keeps_its_firmware() {
+fn rejects_firmware_while_armed() {
     let chip = with_bridge(|stack, _uart_in, mut uart_out| async move {
-        // Custom mode GUIDED, a quadrotor of ArduPilot's, armed, active, MAVLink 2.
+        // Custom mode GUIDED, an ArduPilot quadrotor, armed, active, MAVLink 2.
         let payload = [4, 0, 0, 0, 2, 3, 0x80 | 0x09, 4, 3];
         let mut heartbeat = [0; 280];
         let len = write_packet(&mut heartbeat, (1, 1), 0, 0, &payload);
         uart_out.write_all(&heartbeat[..len]).await.unwrap();
-        // Accepted when the page confirms it.
+        // Repeat until the bridge has processed the heartbeat.
         loop {
             let answer = bring(stack, &signed(&firmware())[..50]).await;
             if answer.contains("the vehicle is armed") {
@@ -425,7 +425,7 @@ fn an_armed_vehicle_keeps_its_firmware() {
 }
 
 #[test]
-fn what_the_chip_counts_is_told_and_forwarding_feeds_the_watchdog() {
+fn reports_chip_counters_and_feeds_the_watchdog() {
     let chip = with_bridge(|stack, _uart_in, _uart_out| async move {
         let (mut rx_meta, mut tx_meta) = ([PacketMetadata::EMPTY; 16], [PacketMetadata::EMPTY; 16]);
         let (mut rx, mut tx) = ([0; 8192], [0; 8192]);

@@ -1,4 +1,4 @@
-//! A region of the flash behind `embedded-storage`'s traits.
+//! A region of the flash, with `embedded-storage`'s traits.
 
 use core::cell::RefCell;
 
@@ -7,15 +7,15 @@ use embedded_storage::nor_flash::{
 };
 use esp_storage::{FlashStorage, FlashStorageError};
 
-/// The whole flash, which several regions share. One task uses it: it is never borrowed twice.
+/// The complete flash, shared by several regions. Only one task uses it, so it is never borrowed twice.
 pub(crate) type Flash = RefCell<FlashStorage<'static>>;
 
-/// A region, addressed from its own start.
+/// A region with addresses relative to its start.
 pub(crate) struct Region {
     pub(crate) flash: &'static Flash,
-    /// Address of its first byte; a multiple of the sector.
+    /// Address of the first byte; a multiple of the sector size.
     pub(crate) start: u32,
-    /// Its length; a multiple of the sector. [bytes]
+    /// Length; a multiple of the sector size [bytes].
     pub(crate) len: u32,
 }
 

@@ -1,4 +1,4 @@
-//! What a person sees and presses, and what the bridge asks of the chip besides bytes.
+//! Light and button, and the chip's functions for the bridge.
 
 use core::sync::atomic::{AtomicU8, Ordering};
 
@@ -14,12 +14,12 @@ use crate::restart::Watchdog;
 use crate::update::Updates;
 use crate::{radio, serial};
 
-/// How long the button is held to forget the settings, the key among them.
+/// Time to hold the button until the settings, including the key, are erased.
 const HELD: Duration = Duration::from_secs(5);
 
 static LIGHT: AtomicU8 = AtomicU8::new(Light::NoNetwork as u8);
 
-/// Returns the state to show by the light.
+/// Returns the state for the light.
 pub(crate) fn light() -> Light {
     let code = LIGHT.load(Ordering::Relaxed);
     [Light::Forwarding, Light::NoAutopilot, Light::NoClient, Light::Unclaimed, Light::Landing]
@@ -28,9 +28,9 @@ pub(crate) fn light() -> Light {
         .unwrap_or(Light::NoNetwork)
 }
 
-/// The chip, for the bridge.
+/// The chip's implementation of [`Platform`].
 pub(crate) struct Front {
-    /// `None` if it takes no firmware over the network.
+    /// `None` if firmware over the network is not accepted.
     pub(crate) updates: Option<Updates>,
     pub(crate) watchdog: Watchdog,
     pub(crate) cause: RestartCause,
@@ -70,7 +70,7 @@ impl Platform for Front {
     }
 }
 
-/// Watches the button, for ever: held, it forgets the settings and restarts.
+/// Watches the button, forever. If it is held, erases the settings and restarts.
 pub(crate) async fn watch(button: Input<'static>, flash: &'static Flash) -> ! {
     let mut released_at = Instant::now();
     loop {
@@ -82,8 +82,8 @@ pub(crate) async fn watch(button: Input<'static>, flash: &'static Flash) -> ! {
             let mut settings = flash::settings(flash);
             let len = settings.len;
             match settings.erase(0, len) {
-                Ok(()) => println!("the settings are forgotten"),
-                Err(error) => println!("the settings stay: {error:?}"),
+                Ok(()) => println!("settings erased"),
+                Err(error) => println!("settings not erased: {error:?}"),
             }
             esp_hal::system::software_reset();
         }

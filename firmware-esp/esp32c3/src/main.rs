@@ -1,15 +1,15 @@
-//! The bridge on an ESP32-C3: pins, radio, flash and executor; what it does is the shared core.
+//! The bridge on an ESP32-C3: pins, radio, flash and executor around the shared core.
 //!
 //! ```text
 //! GPIO4 ──▶ autopilot RX      GPIO5 ◀── autopilot TX       UART1, 921600 baud
 //! GPIO6 RTS ──▶ CTS           GPIO7 CTS ◀── RTS            only with UART_FLOW
-//!                             others by UART_TX_PIN and its like
+//!                             other pins: UART_TX_PIN, ...
 //! GPIO10 LED to ground, GPIO8 LED to 3.3 V (on most boards)
-//! GPIO9 the BOOT button: held for five seconds it forgets the settings
+//! GPIO9 BOOT button: hold for five seconds to erase the settings
 //! USB: log, and flashing
 //! ```
-//! The autopilot's bytes are taken in an interrupt, the radio has the scheduler's threads, and the
-//! bridge is the tasks of the main thread. A panic restarts the chip, and so does forwarding that hangs.
+//! An interrupt receives the autopilot's bytes, the radio runs in threads of the scheduler, and the bridge runs in
+//! tasks of the main thread. A panic, or forwarding that hangs, restarts the chip.
 
 #![no_std]
 #![no_main]
@@ -49,13 +49,12 @@ use vizflyt_bridge::{Bridge, Chip, blink, wifi};
 
 esp_bootloader_esp_idf::esp_app_desc!();
 
-/// Memory of the radio's driver, its queues and the threads it runs in. The first part is what the
-/// chip's own loader used. [bytes]
+/// Heap for the radio's driver, its queues and threads [bytes]. The first part reuses memory of the chip's bootloader.
 const RECLAIMED_BYTES: usize = 64 * 1024;
 const HEAP_BYTES: usize = 48 * 1024;
-/// What is allowed everywhere: channels 1 to 11.
+/// Worldwide regulatory domain: channels 1 to 11.
 const ANYWHERE: &[u8; 2] = b"01";
-/// Time on the network after which a new firmware stays.
+/// Time on the network after which a new firmware is kept.
 const TRIAL: Duration = Duration::from_secs(30);
 
 #[esp_rtos::main]
@@ -76,7 +75,7 @@ async fn main(spawner: Spawner) -> ! {
     let on_trial = update::start(flash);
     esp_alloc::heap_allocator!(#[ram(reclaimed)] size: RECLAIMED_BYTES);
     esp_alloc::heap_allocator!(size: HEAP_BYTES);
-    // The radio's driver needs the scheduler before anything else.
+    // The radio's driver needs the scheduler first.
     esp_rtos::start(TimerGroup::new(chip.TIMG0).timer0, chip.FROM_CPU_INTR0);
 
     let mut store = Store::new(flash::settings(flash), 0);
@@ -95,9 +94,9 @@ async fn main(spawner: Spawner) -> ! {
         (21, Some(chip.GPIO21.degrade())),
     ])
     .take(settings.pins)
-    .unwrap_or_else(|| panic!("the settings name a pin that no port may have"));
+    .unwrap_or_else(|| panic!("the settings contain a pin that the port cannot use"));
     let port = Uart::new(chip.UART1, serial::config(settings.baud, settings.flow_control))
-        // The settings keep within what the port can do.
+        // Cannot fail: the settings limit the baud rate to the port's range.
         .unwrap_or_else(|error| panic!("the serial port refuses {} baud: {error}", settings.baud))
         .with_tx(pins.tx)
         .with_rx(pins.rx);
@@ -105,7 +104,7 @@ async fn main(spawner: Spawner) -> ! {
         if settings.flow_control { port.with_rts(pins.rts).with_cts(pins.cts) } else { port };
     let (receiver, sender) = port.split();
     let urgent = URGENT.init(InterruptExecutor::new(chip.FROM_CPU_INTR1));
-    // Each task is spawned once: its one place is free.
+    // Cannot fail: each task is spawned once.
     urgent.start(Priority::Priority3).spawn(serial::receive(receiver).unwrap());
 
     let rng = Rng::new();
@@ -115,7 +114,7 @@ async fn main(spawner: Spawner) -> ! {
     let config = ControllerConfig::default().with_country_info(CountryInfo::from(country));
     let controller = WifiController::new(chip.WIFI, config)
         .unwrap_or_else(|error| panic!("the radio does not start: {error:?}"));
-    // Random indeed only with the radio on.
+    // The generator is truly random only while the radio is on.
     rng.read(&mut random);
     rng.read(&mut seed);
     let (stack, runner) = embassy_net::new(
@@ -174,8 +173,7 @@ async fn forward(
     shell::run(shared, stack, port, &mut store, &mut front, buffers).await;
 }
 
-/// A new firmware that has been on the network for a while works: whoever does not like it can bring
-/// another.
+/// Keeps a new firmware after some time on the network: it then works well enough to accept another update.
 #[embassy_executor::task]
 async fn settle(stack: Stack<'static>, flash: &'static flash::Flash) {
     stack.wait_config_up().await;

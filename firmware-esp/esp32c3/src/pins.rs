@@ -1,12 +1,12 @@
-//! The port's pins, as the settings name them.
+//! UART pins according to the settings.
 
 use esp_hal::gpio::AnyPin;
 use vizflyt_bridge::settings::UartPins;
 
-/// The pins that a port may have, each until it is taken.
+/// Pins that a port may use, until they are taken.
 pub(crate) struct Pins(pub(crate) [(u8, Option<AnyPin<'static>>); 10]);
 
-/// The pins of a port.
+/// UART pins of a port.
 pub(crate) struct Port {
     pub(crate) tx: AnyPin<'static>,
     pub(crate) rx: AnyPin<'static>,
@@ -15,7 +15,7 @@ pub(crate) struct Port {
 }
 
 impl Pins {
-    /// Takes the settings' pins. They are four different ones of ours: the settings refuse others.
+    /// Takes the pins of the settings. Settings with other or duplicate pins are rejected earlier.
     pub(crate) fn take(mut self, pins: UartPins) -> Option<Port> {
         let pins = pins.or_usual();
         Some(Port {

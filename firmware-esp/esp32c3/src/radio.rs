@@ -1,8 +1,7 @@
-//! The radio as one Ethernet interface, whichever network it is part of.
+//! The radio as one Ethernet interface for all networks.
 //!
-//! The chip has an interface of its own for each role, with an address of its own. The network
-//! stack sees one that changes its address: a bridge that falls back to its own network goes on
-//! with the same sockets.
+//! The chip has a separate interface, with its own address, for each role. The network stack sees one interface that
+//! changes its address, so a bridge that falls back to its access point keeps its sockets.
 
 use core::cell::Cell;
 use core::sync::atomic::{AtomicI8, Ordering};
@@ -21,39 +20,38 @@ use esp_radio::wifi::{
 };
 use vizflyt_bridge::wifi;
 
-/// Which network the radio is part of.
+/// Current role of the radio.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
-    /// None: it is being changed.
+    /// Not connected, while the role changes.
     Off,
-    /// Somebody else's.
+    /// Joined another network.
     Station,
-    /// Its own.
+    /// Opened an access point.
     AccessPoint,
 }
 
 static ROLE: Mutex<Cell<Role>> = Mutex::new(Cell::new(Role::Off));
 static CHANGED: AtomicWaker = AtomicWaker::new();
 
-/// Sets which interface the network stack uses from now on.
+/// Sets the interface that the network stack uses.
 pub(crate) fn set_role(role: Role) {
     critical_section::with(|section| ROLE.borrow(section).set(role));
     CHANGED.wake();
 }
 
-/// Returns the role.
 pub(crate) fn role() -> Role {
     critical_section::with(|section| ROLE.borrow(section).get())
 }
 
-/// What the network stack drives.
+/// Network driver for the stack.
 pub(crate) struct Radio {
     station: Interface,
     access_point: Interface,
 }
 
 impl Radio {
-    /// Takes both interfaces of the chip. Once.
+    /// Takes both interfaces of the chip; call it once.
     pub(crate) fn new() -> Self {
         Self { station: Interface::station(), access_point: Interface::access_point() }
     }
@@ -96,17 +94,17 @@ impl Driver for Radio {
     }
 }
 
-/// The radio, for the bridge.
+/// Control of the radio for the bridge.
 pub(crate) struct Control {
     controller: WifiController<'static>,
 }
 
-/// Longer than any network takes that will let us in.
+/// Timeout of joining a network.
 const JOIN: Duration = Duration::from_secs(10);
 
 static SIGNAL_DBM: AtomicI8 = AtomicI8::new(0);
 
-/// Returns the signal strength of the network we have joined. [dBm]
+/// Returns the signal strength of the joined network [dBm].
 pub(crate) fn signal_dbm() -> Option<i8> {
     match SIGNAL_DBM.load(Ordering::Relaxed) {
         0 => None,
@@ -115,26 +113,25 @@ pub(crate) fn signal_dbm() -> Option<i8> {
 }
 
 impl Control {
-    /// Takes the chip's radio.
     pub(crate) fn new(controller: WifiController<'static>) -> Self {
         Self { controller }
     }
 
     fn configure(&mut self, config: &Config) -> bool {
         let done = self.controller.set_config(config);
-        // Sleeping between beacons costs 100 ms of latency and more.
+        // Power saving between beacons would add at least 100 ms of latency.
         let awake = self.controller.set_power_saving(PowerSaveMode::None);
         match done.and(awake) {
             Ok(()) => true,
             Err(error) => {
-                println!("the radio refuses: {error:?}");
+                println!("the radio rejected its configuration: {error:?}");
                 false
             }
         }
     }
 }
 
-/// An open network where there is no password.
+/// Returns WPA2, or an open network if the password is empty.
 fn authentication(password: &str) -> Option<AuthenticationMethodConfig> {
     if password.is_empty() {
         return Some(AuthenticationMethodConfig::Open);
@@ -189,7 +186,7 @@ impl wifi::Radio for Control {
             .with_channel(channel);
         let open = self.configure(&Config::AccessPoint(config));
         if open {
-            // Whoever holds the board may know it; the air never hears it.
+            // Printed only on USB, so reading it needs physical access to the board.
             println!("own network {ssid:?}, channel {channel}, password {password:?}");
             set_role(Role::AccessPoint);
         }

@@ -1,5 +1,5 @@
-//! Starts that nobody asked for: after a panic, and when the watchdog finds that forwarding hangs. A
-//! bridge on a vehicle has nobody near it who could press a button.
+//! Automatic restarts: after a panic, and by the watchdog if forwarding hangs. A bridge on a vehicle is out of reach
+//! for a manual restart.
 
 use core::sync::atomic::Ordering;
 
@@ -11,22 +11,22 @@ use esp_hal::timer::timg::{MwdtStage, Wdt};
 use portable_atomic::AtomicU32;
 use vizflyt_bridge::stats::RestartCause;
 
-/// Forwarding comes round once a second at least. Erasing a half of the flash, sector by sector, is what
-/// takes longest between: well under a second each.
+/// Timeout of the watchdog. Forwarding resets it at least once a second; the longest interruption, erasing a sector of
+/// flash, takes well under a second.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// What [`PANICKED`] holds after a panic; any other value is what the memory held when power came on.
+/// Value of [`PANICKED`] after a panic. Any other value is random content from power-on.
 const MARK: u32 = 0x50_41_4E_43;
 
-/// Lives through a reset, not through a loss of power.
+/// Persists over a reset, but not over a power loss.
 #[ram(unstable(rtc_fast, persistent))]
 static PANICKED: AtomicU32 = AtomicU32::new(0);
 
-/// The watchdog. It bites from its making on, so that a start that hangs is one more start; only the
-/// forwarding task feeds it.
+/// Watchdog. It runs from its creation on, so that a hanging start also restarts the chip. Only the forwarding task
+/// resets it.
 pub(crate) struct Watchdog(Wdt<TIMG1<'static>>);
 
 impl Watchdog {
-    /// Starts it.
+    /// Starts the watchdog.
     pub(crate) fn start(mut timer: Wdt<TIMG1<'static>>) -> Self {
         timer.enable();
         timer.set_timeout(MwdtStage::Stage0, PATIENCE);
@@ -34,13 +34,13 @@ impl Watchdog {
         Self(timer)
     }
 
-    /// Keeps it from biting for another while.
+    /// Resets the timeout.
     pub(crate) fn feed(&mut self) {
         self.0.feed();
     }
 }
 
-/// Returns why the chip has started; once, at the start.
+/// Returns the cause of the chip's start. Call it once, at the start.
 pub(crate) fn cause() -> RestartCause {
     use SocResetReason as Reason;
     let panicked = PANICKED.load(Ordering::Relaxed) == MARK;
@@ -66,7 +66,7 @@ pub(crate) fn cause() -> RestartCause {
     }
 }
 
-/// What a panic ends in, after its message has gone out over USB.
+/// Ends a panic, after its message was sent over USB.
 #[unsafe(no_mangle)]
 fn custom_halt() -> ! {
     PANICKED.store(MARK, Ordering::Relaxed);

@@ -1,5 +1,5 @@
-//! Firmware over the network: the half of the flash that does not run, and the trial of a new one.
-//! A firmware built without a key takes none.
+//! Firmware updates over the network: the spare slot of the flash, and the trial of new firmware. A firmware built
+//! without a key accepts no updates.
 
 use core::ops::DerefMut as _;
 
@@ -12,7 +12,7 @@ use vizflyt_bridge::update::{Fault, Slots, StartAction, Target, Trial, Updater, 
 
 use crate::flash::{self, Flash, Region};
 
-/// The public half of the key that signs, as `vizflyt bridge firmware key` prints it.
+/// Public key of the firmware's signer, as printed by `vizflyt bridge firmware key`.
 const KEY: Option<[u8; 32]> = match option_env!("VIZFLYT_FIRMWARE_KEY") {
     Some(text) => match key_from_hex(text) {
         Ok(key) => Some(key),
@@ -21,7 +21,7 @@ const KEY: Option<[u8; 32]> = match option_env!("VIZFLYT_FIRMWARE_KEY") {
     None => None,
 };
 
-/// This firmware's number; older ones are not taken.
+/// Build number of this firmware; older ones are rejected.
 const BUILD: u32 = match option_env!("VIZFLYT_FIRMWARE_BUILD") {
     Some(text) => match u32::from_str_radix(text, 10) {
         Ok(build) => build,
@@ -30,15 +30,15 @@ const BUILD: u32 = match option_env!("VIZFLYT_FIRMWARE_BUILD") {
     None => 0,
 };
 
-/// The record of a trial: the last sector of the settings' region.
+/// Returns the record of a trial: the last sector of the settings' region.
 fn trial(flash: &'static Flash) -> Trial<Region> {
     let settings = flash::settings(flash);
     let base = settings.len - 0x1000;
     Trial::new(settings, base)
 }
 
-/// Counts this start of a firmware on trial; one that had its starts gives way to the one before.
-/// Comes before everything that may fail. Returns whether this one is on trial.
+/// Counts this start of a firmware on trial, and rolls back after its last start. Call it before anything that may
+/// fail. Returns whether this firmware is on trial.
 pub(crate) fn start(flash: &'static Flash) -> bool {
     match trial(flash).start() {
         Ok(StartAction::OnTrial) => true,
@@ -52,13 +52,13 @@ pub(crate) fn start(flash: &'static Flash) -> bool {
     }
 }
 
-/// Ends the trial: this firmware stays.
+/// Ends the trial and keeps this firmware.
 pub(crate) fn keep(flash: &'static Flash) {
-    // A flash that does not take it sends the chip back to the firmware before: also a way.
+    // If the flash write fails, the chip rolls back to the previous firmware, which is acceptable.
     let _ = trial(flash).keep();
 }
 
-/// What takes a new firmware.
+/// Receiver of new firmware.
 pub(crate) struct Updates {
     wanted: Wanted,
     halves: Halves,
@@ -66,13 +66,13 @@ pub(crate) struct Updates {
 }
 
 impl Updates {
-    /// Returns `None` if this firmware has no key, or the flash does not show which half runs.
+    /// Returns `None` if this firmware has no key, or if the flash does not show which slot runs.
     pub(crate) fn new(flash: &'static Flash) -> Option<Self> {
         let wanted = Wanted { target: Target::Esp32C3, build: BUILD, key: KEY? };
         Some(Self { wanted, halves: Halves::of(flash)?, updater: None })
     }
 
-    /// Takes the next bytes; see `shell::Platform::update`.
+    /// Takes the next bytes; see [`vizflyt_bridge::shell::Platform::update`].
     pub(crate) fn take(&mut self, first: bool, bytes: &[u8]) -> Result<bool, &'static str> {
         if first {
             self.updater = None;
@@ -82,7 +82,7 @@ impl Updates {
     }
 }
 
-/// The half that does not run.
+/// Slot that is not running.
 struct Halves {
     flash: &'static Flash,
     region: Region,
@@ -90,7 +90,7 @@ struct Halves {
 }
 
 impl Halves {
-    /// Looks up what runs.
+    /// Finds the running slot, and the spare one.
     fn of(flash: &'static Flash) -> Option<Self> {
         let mut table = [0; PARTITION_TABLE_MAX_LEN];
         let table = read_partition_table(flash.borrow_mut().deref_mut(), &mut table).ok()?;
@@ -105,14 +105,14 @@ impl Halves {
         Some(Self { flash, region, name })
     }
 
-    /// Makes the loader start this half.
+    /// Makes the bootloader start the spare slot.
     fn select_spare(&mut self) -> Result<(), Error> {
         let mut flash = self.flash.borrow_mut();
         let mut table = [0; PARTITION_TABLE_MAX_LEN];
         let mut updater = OtaUpdater::new(flash.deref_mut(), &mut table)?;
         let mut choice = updater.ota_data()?;
         if choice.current_app_partition()? == AppPartitionSubType::Factory {
-            // Nothing was ever chosen, so the first half runs. Its number is counted on from.
+            // No slot was ever selected, so the first one runs. Its sequence number is the base of the next.
             choice.set_current_app_partition(AppPartitionSubType::Ota0)?;
         }
         choice.set_current_app_partition(self.name)

@@ -1,7 +1,7 @@
-/* Flash as the chip reads it: the core's constants lie where nothing answers. On the chip a load of a
- * whole word from flash is an instruction like any other; narrower ones are exceptions, which the SDK's
- * load_non_32_wide_handler takes: l8ui, l16ui and l16si. Here all are exceptions, so that each is seen.
- * Anything else, a store or what is not aligned, ends the emulator: it would end the chip. */
+/* Emulates the chip's reads from flash: the core's constants lie at addresses without memory. On the chip, a
+ * whole-word load from flash is an ordinary instruction; narrower loads are exceptions, handled by the SDK's
+ * load_non_32_wide_handler (l8ui, l16ui and l16si). Here every load is an exception, so that all are counted.
+ * Stores and unaligned loads stop the emulator, because they would crash the chip. */
 
 #include <stdint.h>
 
@@ -17,7 +17,7 @@ struct constant_loads constant_loads;
 
 uint32_t constant_load(uint32_t *registers, uint32_t at, uint32_t address)
 {
-    /* Instructions are two or three bytes at any address: two words hold one. */
+    /* An instruction has two or three bytes at any address: two words contain it. */
     const uint32_t *words = (const uint32_t *)(at & ~3u);
     uint32_t shift = at % 4 * 8;
     uint32_t code = shift ? words[0] >> shift | words[1] << (32 - shift) : words[0];

@@ -1,4 +1,4 @@
-/* How often the core has read its constants. */
+/* Counters of the core's reads of constants. */
 #ifndef VIZFLYT_CONSTANTS_H
 #define VIZFLYT_CONSTANTS_H
 
@@ -6,12 +6,12 @@
 
 struct constant_loads {
     uint32_t narrow; /* bytes and halves: exceptions on the chip */
-    uint32_t words;  /* instructions like any other there */
+    uint32_t words;  /* ordinary instructions on the chip */
 };
 
 extern struct constant_loads constant_loads;
 
-/* Ends the emulator: what the core did would end the chip. */
+/* Stops the emulator after an access that would crash the chip. */
 void constant_fault(void) __attribute__((noreturn));
 
 #endif

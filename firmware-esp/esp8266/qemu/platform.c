@@ -1,6 +1,6 @@
-/* The bridge's platform in QEMU: frames, serial line and flash are file descriptors of the
- * emulator's process, which whoever starts it has opened. Reads return at once (the descriptors
- * are non-blocking); the loop waits where nothing is due. */
+/* Platform of the bridge in QEMU: frames, serial line and flash are file descriptors of the emulator's
+ * process, opened by the process that starts it. Reads return at once (the descriptors are non-blocking); the
+ * main loop waits if nothing is due. */
 
 #include "../include/vizflyt_platform.h"
 #include "constants.h"
@@ -13,23 +13,23 @@ enum { SYS_EXIT = 1, SYS_READ = 3, SYS_WRITE = 4, SYS_LSEEK = 19, SYS_SELECT_ONE
 enum { SELECT_READ = 1 };
 enum { EAGAIN = 11 };
 
-/* The descriptors: an AF_UNIX socket of one Ethernet frame a packet, a raw pty, a file. */
+/* File descriptors: an AF_UNIX socket with one Ethernet frame per packet, a raw pty, a file. */
 enum { CONSOLE = 2, FRAMES = 100, SERIAL = 101, FLASH = 102 };
 
-/* QEMU does its I/O page by page, and a packet must be one read: a page of its own. A received frame
- * has another, because it waits while the first is used. Neither lies in the chip's memory. */
+/* QEMU does its I/O by page, and a packet must be one read, so buffers are page-aligned. A received frame has
+ * a separate page, because it waits while the first is used. Neither lies in the chip's memory. */
 #define EMULATORS_OWN __attribute__((aligned(4096), section(".emulator")))
 static uint8_t page[4096] EMULATORS_OWN;
 static uint8_t received[4096] EMULATORS_OWN;
 static uint32_t received_len;
 
-/* ccount runs at 40 MHz in QEMU's lx106 (its overlay's core frequency), by the emulator's clock: that
- * of the instructions with -icount. What is waited for outside is added. */
+/* ccount runs at 40 MHz in QEMU's lx106 (its overlay's core frequency), by the emulator's clock: that of the
+ * instructions with -icount. Time spent waiting outside is added. */
 #define CYCLES_PER_US 40u
 static uint32_t waited_us;
 
 static volatile int woken;
-static int closed; /* the radio has been closed: the end */
+static int closed; /* the radio's socket was closed: exit */
 
 static void copy(uint8_t *to, const uint8_t *from, uint32_t len)
 {
@@ -79,7 +79,7 @@ static void put_line(const char *line, uint32_t len)
     simcall(SYS_WRITE, CONSOLE, (int)page, len + 1);
 }
 
-/* The core has given up. */
+/* Fatal error of the core. */
 void abort(void)
 {
     put_line("abort", 5);
@@ -89,7 +89,7 @@ void abort(void)
 
 void platform_restart(void)
 {
-    /* Whoever started the emulator starts it again. */
+    /* The parent process restarts the emulator. */
     stop(2);
     __builtin_unreachable();
 }
@@ -121,7 +121,7 @@ uint32_t platform_uart_is_idle(void)
 
 uint32_t platform_uart_overruns(void)
 {
-    return 0; /* a pty waits */
+    return 0; /* a pty does not overrun */
 }
 
 void platform_uart_configure(uint32_t baud, uint32_t flow_control)
@@ -137,7 +137,7 @@ void platform_mac(uint8_t into[6])
     copy(into, mac, 6);
 }
 
-/* Reads a frame if none waits: as many wait in the socket as the radio would hold. */
+/* Reads a frame if none waits. Further frames wait in the socket, like in the radio. */
 uint8_t *platform_frame_waiting(uint32_t *len)
 {
     if (!received_len) {
@@ -155,7 +155,7 @@ void platform_frame_done(void)
     received_len = 0;
 }
 
-/* Not the page of all other I/O: settings may be read between the beginning and the sending. */
+/* Separate from the page of other I/O: settings may be read between begin and send. */
 static uint8_t sending[4096] EMULATORS_OWN;
 
 uint8_t *platform_frame_begin(void)
@@ -165,7 +165,7 @@ uint8_t *platform_frame_begin(void)
 
 void platform_frame_send(uint32_t len)
 {
-    /* A full socket: wait, as the radio's own queue would. */
+    /* A full socket: wait, like the radio's own queue. */
     while (simcall(SYS_WRITE, FRAMES, (int)sending, len) < 0)
         if (simcall_error != EAGAIN)
             stop(0);
@@ -205,7 +205,7 @@ void platform_led(uint32_t on)
     (void)on;
 }
 
-/* The flash is a file as long as the chip's; the same rules: written bits only go from 1 to 0. */
+/* The flash is a file of the chip's size, with the same rule: writes only change bits from 1 to 0. */
 
 int32_t platform_flash_read(uint32_t address, uint8_t *into, uint32_t len)
 {
@@ -262,11 +262,11 @@ void constant_fault(void)
 extern uint32_t _stack_bottom[], _stack_top[];
 
 enum { PAINT = 0xA5A5A5A5 };
-/* The chip's stack has 5328 bytes, from 0x3FFFEB30 to the end of its RAM; an interrupt within an
- * exception puts two frames of 256 onto it. */
+/* The chip's stack has 5328 bytes, from 0x3FFFEB30 to the end of its RAM; an interrupt inside an exception
+ * adds two frames of 256 bytes. */
 enum { STACK = 5328 - 2 * 256 };
 
-/* Writes a number at the end of a text; returns the new length. */
+/* Appends a number to a text; returns the new length. */
 static uint32_t put_number(char *line, uint32_t len, uint32_t value)
 {
     for (uint32_t scale = 1000000000; scale; scale /= 10)
@@ -282,7 +282,7 @@ static void report(const char *what, uint32_t len, uint32_t value)
     put_line(line, put_number(line, len, value));
 }
 
-/* How deep the stack has gone since it was painted; paints it again. */
+/* Returns the maximum depth of the stack since it was painted, and paints it again. */
 static uint32_t stack_used(void)
 {
     uint32_t *deepest = _stack_bottom;
@@ -326,7 +326,7 @@ int main(void)
             stop(0);
         }
         if (!woken && !len && !(events & VIZFLYT_UART_READABLE)) {
-            /* The serial line cannot be waited for at the same time: look at it every 0.2 ms. */
+            /* It cannot wait for the serial line at the same time: check that every 0.2 ms. */
             uint32_t wait[2] = {0, due_us < 200 ? due_us : 200};
             if (simcall(SYS_SELECT_ONE, FRAMES, SELECT_READ, (int)wait) == 0)
                 waited_us += wait[1];

@@ -1,5 +1,5 @@
-/* Where QEMU's lx106 begins and where its exceptions go. The chip itself starts in its ROM and in
- * the vendor's SDK; this file is for the emulator only. */
+/* Start and exception vectors for QEMU's lx106. Only for the emulator: the chip starts in its ROM and in the
+ * vendor's SDK. */
 
     .section .reset, "ax"
     .global _start
@@ -13,7 +13,7 @@ begin:
     isync
     movi    a1, _stack_top
     movi    a2, _stack_bottom
-    movi    a3, 0xA5A5A5A5  /* painted: how deep the stack went is read at the end */
+    movi    a3, 0xA5A5A5A5  /* paint the stack, to measure its depth later */
 1:  s32i    a3, a2, 0
     addi    a2, a2, 4
     bltu    a2, a1, 1b
@@ -28,9 +28,9 @@ begin:
     callx0  a0
 4:  j       4b
 
-/* Exceptions end the emulator with a status of their own: 0x60 + the vector's number; that of a load
- * from the constants' addresses goes to constant_load (constants.c). Offsets are the lx106's: debug
- * 0x10, NMI 0x20, kernel 0x30, user 0x50, double 0x70. */
+/* Exceptions stop the emulator with a distinct status: 0x60 + the vector's number. A load from the constants'
+ * addresses calls constant_load (constants.c) instead. Vector offsets of the lx106: debug 0x10, NMI 0x20,
+ * kernel 0x30, user 0x50, double 0x70. */
     .macro  vector offset, status
     .org    \offset
     movi    a2, 1
@@ -47,7 +47,7 @@ begin:
     vector  0x50, 0x65
     vector  0x70, 0x67
 
-    /* Registers into an array, a0 first, and the shift's behind them; then constant_load. */
+    /* Save the registers to an array, a0 first, then sar; call constant_load. */
     .align  4
     .literal_position
 load:
@@ -65,7 +65,7 @@ load:
     rsr     a4, excvaddr
     movi    a1, constant_stack_top
     movi    a0, constant_load
-    callx0  a0              /* returns where to go on */
+    callx0  a0              /* returns the address to continue at */
     wsr     a2, epc1
     movi    a2, constant_registers
     l32i    a0, a2, 64
@@ -77,7 +77,7 @@ load:
     rfe
 
     .section .text.simcall, "ax"
-    /* int simcall(int number, int a, int b, int c): the error number goes to simcall_error. */
+    /* int simcall(int number, int a, int b, int c): stores the error number in simcall_error. */
     .literal_position
     .global simcall
     .align  4

@@ -1,5 +1,5 @@
-/* What the SDK's lwIP wants of a C library besides what the chip's ROM has. Parts of lwIP that the
- * bridge never calls name them; they are right all the same. */
+/* C library functions that the SDK's lwIP needs and the chip's ROM lacks. Only parts of lwIP that the bridge
+ * never calls use them, but they are correct. */
 
 #include "sdk.h"
 
@@ -12,7 +12,7 @@ void *ICACHE_FLASH_ATTR memchr(const void *bytes, int wanted, size_t len)
     return NULL;
 }
 
-/* Newlib's <ctype.h>, which the SDK was compiled with: kinds of a letter, that of EOF (-1) first. */
+/* Newlib's <ctype.h>, which the SDK was compiled with: character classes, EOF (-1) first. */
 enum { UPPER = 1, LOWER = 2, DIGIT = 4, SPACE = 8, PUNCTUATION = 16, CONTROL = 32, HEX = 64, BLANK = 128 };
 
 static const uint8_t kinds[257] ICACHE_RODATA_ATTR STORE_ATTR = {

@@ -1,30 +1,30 @@
-/* The bridge's platform on the chip: the vendor's NONOS SDK underneath.
+/* Platform of the bridge on the chip, based on the vendor's NONOS SDK.
  *
- * The SDK has the radio, its association and its encryption, and an lwIP that we do not use: each
- * of its interfaces hands received frames to `netif->input`, which is pointed at `on_frame`, and
- * sends what `netif->linkoutput` is given. Everything runs in the SDK's one thread: its timers, its
- * radio callbacks, and one user task, in which the bridge is polled. Nothing here blocks: the SDK's
- * watchdog and its radio want the thread back within milliseconds.
+ * The SDK contains the radio, association, encryption, and an lwIP that is not used: each of its interfaces
+ * passes received frames to `netif->input`, which is set to `on_frame`, and sends frames given to
+ * `netif->linkoutput`. Everything runs in the SDK's only thread: its timers, its radio callbacks, and one
+ * user task that polls the bridge. Nothing here blocks, because the SDK's watchdog and radio need the thread
+ * within milliseconds.
  *
- * Written against the headers of SDK 3.0.5 (include/, third_party/include/, driver_lib/); functions
- * outside ICACHE_FLASH_ATTR lie in the instruction RAM, because interrupts use them.
+ * Written for the headers of SDK 3.0.5 (include/, third_party/include/, driver_lib/). Functions without
+ * ICACHE_FLASH_ATTR lie in the instruction RAM, because interrupts use them.
  *
- * The core's constants lie in flash. A byte read from there is an exception that the SDK takes; the ROM
- * lets interrupts in meanwhile, also where they were off. So interrupts here touch nothing of the
- * core's, and what they share with the rest is changed without reading flash. */
+ * The core's constants lie in flash. Reading a byte from there is an exception that the SDK handles;
+ * meanwhile the ROM allows interrupts, even if they were disabled. Therefore, interrupts here use no data of
+ * the core, and data shared with interrupts is changed without reading flash. */
 
 #include "sdk.h"
 
-/* --- the flash, 4 MB. Program at 0 and 0x10000 (eagle.app.v6.ld); the SDK's own at its end. */
+/* --- flash, 4 MB: program at 0 and 0x10000 (eagle.app.v6.ld), data of the SDK at the end */
 
 enum {
-    SETTINGS = 0x3F0000, /* the core's; see ../src/lib.rs */
+    SETTINGS = 0x3F0000, /* used by the core; see ../src/lib.rs */
     RF_CALIBRATION = 0x3FB000,
-    PHY_DATA = 0x3FC000,       /* esp_init_data_default_v08.bin of the SDK goes here */
+    PHY_DATA = 0x3FC000,       /* esp_init_data_default_v08.bin of the SDK */
     SYSTEM_PARAMETERS = 0x3FD000,
 };
 
-/* The SDK asks for them before anything else. */
+/* The SDK reads the partitions before anything else. */
 static const partition_item_t partitions[] ICACHE_RODATA_ATTR = {
     {SYSTEM_PARTITION_CUSTOMER_BEGIN + 1, 0x00000, 0x10000},
     {SYSTEM_PARTITION_CUSTOMER_BEGIN + 2, 0x10000, 0x5C000},
@@ -36,7 +36,7 @@ static const partition_item_t partitions[] ICACHE_RODATA_ATTR = {
 
 void ICACHE_FLASH_ATTR user_pre_init(void)
 {
-    /* A refusal leaves nothing that could run; the watchdog restarts the chip. */
+    /* Without partitions nothing can run; the watchdog restarts the chip. */
     while (!system_partition_table_regist(partitions, sizeof partitions / sizeof partitions[0],
                                           FLASH_SIZE_32M_MAP_512_512)) {
     }
@@ -49,8 +49,8 @@ enum { TASK = USER_TASK_PRIO_1, QUEUE = 4 };
 static os_event_t queue[QUEUE];
 static ETSTimer alarm;
 static volatile uint32_t pending; /* events, from interrupts and callbacks */
-static volatile uint8_t posted;   /* a poll is already asked for */
-static uint8_t running;           /* vizflyt_start is done */
+static volatile uint8_t posted;   /* a poll is already requested */
+static uint8_t running;           /* vizflyt_start has returned */
 
 uint32_t platform_interrupts_off(void)
 {
@@ -71,7 +71,7 @@ void platform_wake(void)
     posted = 1;
     platform_interrupts_restore(state);
     if (ask && !system_os_post(TASK, 0, 0))
-        posted = 0; /* the queue is full: a poll is on its way anyway */
+        posted = 0; /* the queue is full: a poll will come anyway */
 }
 
 void happened(uint32_t events)
@@ -102,7 +102,7 @@ static void ICACHE_FLASH_ATTR run(os_event_t *unused)
     uint32_t due_us = vizflyt_poll(events | VIZFLYT_FRAMES);
     os_timer_disarm(&alarm);
     if (due_us != UINT32_MAX) {
-        /* The SDK's timer takes 0.1 ms to 134 s. */
+        /* The SDK's timer accepts 0.1 ms to 134 s. */
         if (due_us < 100)
             due_us = 100;
         if (due_us > 100000000)
@@ -125,14 +125,14 @@ void ICACHE_FLASH_ATTR platform_restart(void)
 {
     system_restart();
     for (;;) {
-        /* It takes effect when this task returns to the SDK, or by the watchdog. */
+        /* The restart happens when this task returns to the SDK, or by the watchdog. */
         system_soft_wdt_feed();
     }
 }
 
-/* The core has given up. Why only a restart: both serial ports are taken, the one by the autopilot,
- * the other's pin by the LED. The bridge is back within a second; the autopilot's own failsafe
- * spans that. */
+/* Fatal error of the core. Why only a restart: no serial port is free for a message, because one belongs to
+ * the autopilot and the pin of the other to the LED. The bridge is back within a second; the autopilot's own
+ * failsafe takes longer. */
 void ICACHE_FLASH_ATTR abort(void)
 {
     platform_restart();
@@ -145,7 +145,7 @@ void ICACHE_FLASH_ATTR platform_led(uint32_t on)
     GPIO_OUTPUT_SET(GPIO_ID_PIN(2), on ? 0 : 1);
 }
 
-/* --- the flash: the SDK wants whole words from aligned memory */
+/* --- flash: the SDK requires whole words in aligned memory */
 
 int32_t ICACHE_FLASH_ATTR platform_flash_read(uint32_t address, uint8_t *into, uint32_t len)
 {
@@ -182,7 +182,7 @@ int32_t ICACHE_FLASH_ATTR platform_flash_erase(uint32_t sector)
     return spi_flash_erase_sector(sector) == SPI_FLASH_RESULT_OK ? 0 : -1;
 }
 
-/* --- the beginning */
+/* --- start */
 
 static void ICACHE_FLASH_ATTR started(void)
 {
@@ -198,8 +198,8 @@ static void ICACHE_FLASH_ATTR silence(char unused)
 
 void ICACHE_FLASH_ATTR user_init(void)
 {
-    system_timer_reinit(); /* timers may be in microseconds; before any is set */
-    /* Nothing but MAVLink on the autopilot's line. */
+    system_timer_reinit(); /* enables timers in microseconds; must precede all timers */
+    /* Only MAVLink on the autopilot's line. */
     os_install_putc1(silence);
     system_set_os_print(0);
     system_update_cpu_freq(SYS_CPU_160MHZ);

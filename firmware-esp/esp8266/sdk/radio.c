@@ -1,4 +1,4 @@
-/* The radio, at layer 2: the SDK's lwIP is there, but gets no frames. */
+/* The radio at layer 2: the SDK's lwIP exists, but receives no frames. */
 
 #include "sdk.h"
 
@@ -10,11 +10,11 @@ static uint8_t waiting_first, waiting_count;
 static err_t ICACHE_FLASH_ATTR on_frame(struct pbuf *packet, struct netif *from)
 {
     (void)from;
-    /* What the radio received is one piece; a chain would be copied together. */
+    /* Received frames are one piece; a chain would be merged. */
     if (packet->next)
         packet = pbuf_coalesce(packet, PBUF_RAW);
     if (waiting_count == FRAMES_WAITING || packet->next || packet->tot_len > FRAME) {
-        /* As one lost on the air: the packets' own numbers show what was lost. */
+        /* Like a loss on the air: the sequence numbers of the packets show it. */
         pbuf_free(packet);
     } else {
         waiting[(waiting_first + waiting_count++) % FRAMES_WAITING] = packet;
@@ -38,7 +38,7 @@ void ICACHE_FLASH_ATTR platform_frame_done(void)
     waiting_count--;
 }
 
-/* The SDK makes its interfaces anew as it changes roles and joins: looked at before each poll. */
+/* The SDK recreates its interfaces when it changes role or joins, so this is called before each poll. */
 void ICACHE_FLASH_ATTR radio_hook(void)
 {
     struct netif *ours = eagle_lwip_getif(role);
@@ -57,7 +57,7 @@ uint8_t *ICACHE_FLASH_ATTR platform_frame_begin(void)
 {
     if (!link_up || system_get_free_heap_size() < HEAP_LEFT)
         return NULL;
-    /* PBUF_LINK leaves room in front for what the radio puts there. */
+    /* PBUF_LINK reserves space for the radio's header. */
     sending = pbuf_alloc(PBUF_LINK, FRAME, PBUF_RAM);
     return sending ? sending->payload : NULL;
 }
@@ -67,7 +67,7 @@ void ICACHE_FLASH_ATTR platform_frame_send(uint32_t len)
     struct netif *ours = eagle_lwip_getif(role);
     sending->len = sending->tot_len = len;
     if (len < FRAME / 2) {
-        /* It may wait in the radio's queue: a small one takes what it needs, if that is to be had. */
+        /* The frame may wait in the radio's queue: give a small one a smaller buffer, if memory is available. */
         struct pbuf *fitting = pbuf_alloc(PBUF_LINK, len, PBUF_RAM);
         if (fitting) {
             os_memcpy(fitting->payload, sending->payload, len);
@@ -77,7 +77,7 @@ void ICACHE_FLASH_ATTR platform_frame_send(uint32_t len)
     }
     if (ours)
         ours->linkoutput(ours, sending);
-    platform_frame_drop(); /* the radio has taken its own hold of it */
+    platform_frame_drop(); /* the radio holds its own reference */
 }
 
 void ICACHE_FLASH_ATTR platform_frame_drop(void)
@@ -86,8 +86,8 @@ void ICACHE_FLASH_ATTR platform_frame_drop(void)
     sending = NULL;
 }
 
-/* The SDK's own stack wants an address before it counts an interface as up; nobody talks to it, as
- * it gets no frames: one of the link-local range (RFC 3927) that the bridge itself never takes. */
+/* The SDK's stack counts an interface as up only with an address. That stack receives no frames, so it gets a
+ * link-local address (RFC 3927) that the bridge never uses. */
 static void ICACHE_FLASH_ATTR keep_quiet(void)
 {
     struct ip_info address;
@@ -106,7 +106,7 @@ static void ICACHE_FLASH_ATTR on_wifi(System_Event_t *event)
     if (role == STATION_IF && event->event == EVENT_STAMODE_CONNECTED)
         link_up = 1;
     else if (role == STATION_IF && event->event == EVENT_STAMODE_DISCONNECTED)
-        link_up = 0; /* the SDK goes on trying: its reconnect policy is on */
+        link_up = 0; /* the SDK retries: its reconnect policy is on */
     else
         return;
     radio_hook();
@@ -131,12 +131,12 @@ int32_t ICACHE_FLASH_ATTR platform_wifi_station(const char *ssid, const char *pa
     fill(config.password, sizeof config.password, password);
     role = STATION_IF;
     link_up = 0;
-    /* _current: the SDK keeps a store of its own otherwise; ours is the only one. */
+    /* _current: do not save to the SDK's own settings; the bridge has its own. */
     if (!wifi_set_opmode_current(STATION_MODE) || !wifi_station_set_config_current(&config))
         return -1;
     keep_quiet();
     wifi_station_set_reconnect_policy(1);
-    wifi_set_sleep_type(NONE_SLEEP_T); /* sleeping costs 100 ms and more of latency */
+    wifi_set_sleep_type(NONE_SLEEP_T); /* sleep would add at least 100 ms of latency */
     radio_hook();
     happened(VIZFLYT_LINK);
     return wifi_station_connect() ? 0 : -1;
@@ -175,7 +175,7 @@ int32_t ICACHE_FLASH_ATTR platform_rssi_dbm(void)
     if (role != STATION_IF || !link_up)
         return 0;
     sint8 dbm = wifi_station_get_rssi();
-    return dbm < 0 ? dbm : 0; /* 31: it failed */
+    return dbm < 0 ? dbm : 0; /* 31: failed */
 }
 
 void ICACHE_FLASH_ATTR radio_begin(void)

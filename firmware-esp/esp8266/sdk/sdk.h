@@ -1,4 +1,5 @@
-/* What the shim's files share: the SDK's headers, what those leave out, and the loop's side of an event.
+/* Common to all files of the shim: the SDK's headers and missing declarations, and the function that passes
+ * events to the main loop.
  *
  * Types are those of SDK 3.0.5: a prototype that differs from its header does not compile. */
 #ifndef VIZFLYT_SDK_H
@@ -16,11 +17,11 @@
 
 #include "../include/vizflyt_platform.h"
 
-/* netif/wlan_lwip_if.h has it among types that no header defines. The SDK's own station and access
- * point by their numbers, STATION_IF and SOFTAP_IF; NULL while there is none. */
+/* Declared in netif/wlan_lwip_if.h, among types that no header defines. Returns the SDK's interface
+ * STATION_IF or SOFTAP_IF; NULL if it does not exist. */
 struct netif *eagle_lwip_getif(uint8 number);
 
-/* Functions of the pins by the chip's technical reference, appendix 1; the header has only some. */
+/* Pin functions from the chip's technical reference, appendix 1; the header has only some. */
 #ifndef FUNC_U0RXD
 #define FUNC_U0RXD 0
 #endif
@@ -28,21 +29,21 @@ struct netif *eagle_lwip_getif(uint8 number);
 #define FUNC_U0CTS 4
 #endif
 
-/* Every size of the code around the core. [bytes, where it is not said] */
+/* Sizes of the shim [bytes, unless noted]. */
 enum {
-    UART_IN = 2048,          /* from the autopilot: 22 ms at 921600 baud; a power of two */
-    UART_OUT = 512,          /* to it: 5 ms; a power of two */
-    FRAMES_WAITING = 4,      /* [frames] received and not yet read; they lie in the SDK's own buffers */
+    UART_IN = 2048,          /* from the autopilot: 22 ms at 921600 baud; must be a power of two */
+    UART_OUT = 512,          /* to the autopilot: 5 ms; must be a power of two */
+    FRAMES_WAITING = 4,      /* [frames] received but unread, in the SDK's own buffers */
     FRAME = 1514,            /* an Ethernet frame without its checksum */
-    HEAP_LEFT = 8 * 1024,    /* frames being sent lie in the SDK's heap, as do its own needs: below this no more */
-    FLASH_AT_ONCE = 64,      /* what is read or written of the flash in one go, over the stack */
+    HEAP_LEFT = 8 * 1024,    /* minimum free heap to send a frame: the SDK needs the rest */
+    FLASH_AT_ONCE = 64,      /* flash bytes read or written at once, through the stack */
 };
 
-/* Passes events of vizflyt_platform.h to the loop. From anywhere, interrupts included. */
+/* Passes events of vizflyt_platform.h to the main loop. May be called from anywhere, including interrupts. */
 void happened(uint32_t events);
-/* Looks again at the SDK's interfaces, which it makes anew as it changes roles and joins. */
+/* Updates the SDK's interfaces, which it recreates when it changes role or joins. */
 void radio_hook(void);
-/* Before everything else of the radio. */
+/* Initializes the radio; must be called before its other functions. */
 void radio_begin(void);
 
 #endif

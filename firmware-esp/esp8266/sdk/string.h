@@ -1,4 +1,4 @@
-/* The SDK's headers ask for it; Debian's compiler for the chip comes without a C library's headers. */
+/* Required by the SDK's headers; Debian's compiler for the chip has no C library headers. */
 #ifndef VIZFLYT_STRING_H
 #define VIZFLYT_STRING_H
 

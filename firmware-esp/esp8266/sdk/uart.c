@@ -1,17 +1,16 @@
-/* The autopilot's line: UART0 on its own pins, GPIO1 out, GPIO3 in; GPIO15 RTS, GPIO13 CTS. */
+/* Serial line to the autopilot: UART0 on its default pins, GPIO1 out, GPIO3 in; GPIO15 RTS, GPIO13 CTS. */
 
 #include "sdk.h"
 
 enum { FIFO = 128, RX_INTERRUPT_AT = 32, RX_PAUSE_AT = 100, TX_INTERRUPT_AT = 16 };
 enum { RX_INTERRUPTS = UART_RXFIFO_FULL_INT_ENA | UART_RXFIFO_TOUT_INT_ENA | UART_RXFIFO_OVF_INT_ENA };
 
-/* In the instruction RAM, of which the SDK leaves some: it can only be used by whole words (volatile
- * keeps the compiler to them). Each ring has one writer. The # hides the compiler's own flags of the
- * section, which are those of data. */
+/* The rings lie in free instruction RAM, which only supports whole-word accesses (volatile keeps the compiler
+ * to them). Each ring has one writer. The # hides the compiler's own section flags, which are those of data. */
 #define IN_INSTRUCTION_RAM __attribute__((section(".text.rings, \"ax\", @progbits #")))
 static volatile uint32_t rx_ring[UART_IN / 4] IN_INSTRUCTION_RAM = {0};
 static volatile uint32_t tx_ring[UART_OUT / 4] IN_INSTRUCTION_RAM = {0};
-static volatile uint32_t rx_in, rx_out, tx_in, tx_out; /* count up for ever */
+static volatile uint32_t rx_in, rx_out, tx_in, tx_out; /* never reset */
 static volatile uint32_t overruns;
 
 static inline void put(volatile uint32_t *ring, uint32_t at, uint8_t byte)
@@ -35,13 +34,13 @@ static uint32_t fifo_out(void)
     return (READ_PERI_REG(UART_STATUS(0)) >> UART_TXFIFO_CNT_S) & UART_TXFIFO_CNT;
 }
 
-/* With interrupts off, or in the interrupt. */
+/* Requires that interrupts are off, or that the interrupt is the caller. */
 static void drain(void)
 {
     while (fifo_in() && rx_in - rx_out < UART_IN)
         put(rx_ring, rx_in++ % UART_IN, READ_PERI_REG(UART_FIFO(0)) & 0xFF);
-    /* A full ring leaves the rest in the hardware, which pauses the autopilot by RTS where that is
-     * wired: reading turns the interrupts on again. What is lost until then is one overrun. */
+    /* A full ring leaves the rest in the hardware, which pauses the autopilot if RTS is wired. Reading enables
+     * the interrupts again. Bytes lost until then count as one overrun. */
     if (rx_in - rx_out == UART_IN)
         CLEAR_PERI_REG_MASK(UART_INT_ENA(0), RX_INTERRUPTS);
 }
@@ -111,7 +110,7 @@ uint32_t platform_uart_overruns(void)
 
 void ICACHE_FLASH_ATTR platform_uart_configure(uint32_t baud, uint32_t flow_control)
 {
-    /* What is in the hardware leaves at the old speed: 128 bytes, 22 ms at 57600 baud at most. */
+    /* Bytes in the hardware are sent at the old rate: at most 128 bytes, 22 ms at 57600 baud. */
     while (fifo_out())
         system_soft_wdt_feed();
     ETS_UART_INTR_DISABLE();

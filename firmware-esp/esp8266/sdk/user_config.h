@@ -1,1 +1,1 @@
-/* The SDK's headers include this file of the application; there is nothing to set. */
+/* Required by the SDK's headers; the bridge has no settings for it. */

@@ -1,4 +1,4 @@
-//! embassy's clock: the platform's 32 bits of microseconds made 64, and who waits until when.
+//! embassy's clock: extends the platform's 32-bit microseconds to 64 bits, and holds the queue of timers.
 
 use core::cell::RefCell;
 use core::task::Waker;
@@ -24,7 +24,7 @@ embassy_time_driver::time_driver_impl!(static CLOCK: Clock = Clock(Mutex::new(Re
 }))));
 
 impl State {
-    /// Brings the long count up to date. Right as long as it is called once in 71 minutes.
+    /// Updates the 64-bit count. Must be called at least once in 71 minutes.
     fn advance(&mut self) -> u64 {
         let read_us = platform::time_us();
         self.now_us += u64::from(read_us.wrapping_sub(self.read_us));
@@ -40,13 +40,13 @@ impl Driver for Clock {
 
     fn schedule_wake(&self, at: u64, waker: &Waker) {
         critical_section::with(|section| {
-            // The poll that is under way ends by asking `next_wake_us`: no alarm need be set.
+            // The current poll ends with `next_expiration`, so no alarm is necessary.
             let _ = self.0.borrow_ref_mut(section).queue.schedule_wake(at, waker);
         });
     }
 }
 
-/// Wakes the tasks whose time has come; returns how long until the next one. [us]
+/// Wakes the tasks with expired timers. Returns the time until the next one [us].
 pub(crate) fn wake_due() -> u32 {
     critical_section::with(|section| {
         let mut state = CLOCK.0.borrow_ref_mut(section);

@@ -1,4 +1,4 @@
-//! A region of the flash behind `embedded-storage`'s traits.
+//! A region of the flash, with `embedded-storage`'s traits.
 
 use embedded_storage::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash, check_erase, check_read,
@@ -7,18 +7,18 @@ use embedded_storage::nor_flash::{
 
 use crate::platform;
 
-/// What the flash erases at once. [bytes]
+/// Size of an erasable sector [bytes].
 pub(crate) const SECTOR: u32 = 4096;
 
-/// A region, addressed from its own start.
+/// A region with addresses relative to its start.
 pub(crate) struct Region {
-    /// Address of its first byte in the flash; a multiple of [`SECTOR`].
+    /// Address of the first byte in the flash; a multiple of [`SECTOR`].
     pub(crate) start: u32,
-    /// Its length in bytes; a multiple of [`SECTOR`].
+    /// Length; a multiple of [`SECTOR`] [bytes].
     pub(crate) len: u32,
 }
 
-/// The flash could not.
+/// A flash operation failed.
 #[derive(Debug)]
 pub(crate) struct Failed(NorFlashErrorKind);
 

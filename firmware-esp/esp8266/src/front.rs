@@ -1,4 +1,4 @@
-//! What a person sees, and what the bridge asks of the chip besides bytes.
+//! Light, and the chip's functions for the bridge.
 
 use core::sync::atomic::{AtomicU8, Ordering};
 
@@ -8,7 +8,7 @@ use crate::platform;
 
 static LIGHT: AtomicU8 = AtomicU8::new(Light::NoNetwork as u8);
 
-/// Returns the state to show by the light.
+/// Returns the state for the light.
 pub(crate) fn light() -> Light {
     let code = LIGHT.load(Ordering::Relaxed);
     [Light::Forwarding, Light::NoAutopilot, Light::NoClient, Light::Unclaimed, Light::Landing]
@@ -17,7 +17,7 @@ pub(crate) fn light() -> Light {
         .unwrap_or(Light::NoNetwork)
 }
 
-/// The chip, for the bridge.
+/// The chip's implementation of [`Platform`].
 pub(crate) struct Front;
 
 impl Platform for Front {

@@ -6,8 +6,8 @@
 //! radio ◀───── platform_frame_waiting, _send ───────▶ embassy-net ─▶ sockets
 //! UART ◀────── platform_uart_read, _write ──────────▶ bridge
 //! ```
-//! The loop calls [`vizflyt_poll`] after every event and when a timer is due; nothing here blocks,
-//! allocates, or runs in an interrupt.
+//! The main loop calls [`vizflyt_poll`] after every event and when a timer is due. Nothing here blocks, allocates, or
+//! runs in an interrupt.
 
 #![no_std]
 
@@ -29,26 +29,26 @@ use vizflyt_bridge::shell::{self, Buffers, Shared};
 use vizflyt_bridge::storage::Store;
 use vizflyt_bridge::{Bridge, Chip, Settings, blink, wifi};
 
-/// Where the settings lie in the flash; see the SDK's map in `sdk/platform.c`.
+/// Settings' region in the flash; see the SDK's map in `sdk/platform.c`.
 const SETTINGS: flash::Region = flash::Region { start: 0x3F_0000, len: 2 * flash::SECTOR };
 
-/// The executor, which belongs to the loop that calls [`vizflyt_poll`].
+/// The executor. It belongs to the loop that calls [`vizflyt_poll`].
 #[derive(Clone, Copy)]
 struct Loop(&'static Executor);
 
 #[expect(unsafe_code, reason = "one core and one thread of control")]
-// SAFETY: the chip has one core, and interrupts never touch the executor but through `pender`.
+// SAFETY: the chip has one core, and interrupts access the executor only through `pender`.
 unsafe impl Send for Loop {}
 
 static RUNNING: Mutex<Cell<Option<Loop>>> = Mutex::new(Cell::new(None));
 
-#[expect(unsafe_code, reason = "what the executor calls to be polled again")]
+#[expect(unsafe_code, reason = "called by the executor to request a poll")]
 #[unsafe(export_name = "__pender")]
 fn pender(_context: *mut ()) {
     platform::wake();
 }
 
-/// Builds the network, the bridge and their tasks. See `include/vizflyt_platform.h`.
+/// Builds network, bridge and tasks. See `include/vizflyt_platform.h`.
 #[expect(unsafe_code, reason = "called from C")]
 #[unsafe(no_mangle)]
 pub extern "C" fn vizflyt_start() {
@@ -58,7 +58,7 @@ pub extern "C" fn vizflyt_start() {
 
 type Network = Runner<'static, &'static mut radio::Radio>;
 
-/// Makes the network stack: the deepest place of the chip's stack, so nothing else lies there meanwhile.
+/// Creates the network stack. Not inlined, because it uses the most of the chip's stack.
 #[inline(never)]
 fn start_network() -> (Stack<'static>, Network) {
     static RESOURCES: StaticCell<StackResources<{ shell::SOCKETS + wifi::SOCKETS }>> =
@@ -85,7 +85,7 @@ fn start_tasks(stack: Stack<'static>, runner: Network) {
     let shared = SHARED.take();
     let mut store = Store::new(SETTINGS, 0);
     let load = |settings: &mut Settings| {
-        // Where none were saved, the defaults.
+        // Without saved settings, the defaults stay.
         let _ = store.load_into(settings);
         platform::uart_configure(settings.baud, settings.flow_control);
     };
@@ -94,14 +94,14 @@ fn start_tasks(stack: Stack<'static>, runner: Network) {
     let executor: &'static Executor = EXECUTOR.init(Executor::new(core::ptr::null_mut()));
     critical_section::with(|section| RUNNING.borrow(section).set(Some(Loop(executor))));
     let spawner = executor.spawner();
-    // Each is spawned once: the one place of its task is free.
+    // Cannot fail: each task is spawned once.
     spawner.spawn(network(runner).unwrap());
     spawner.spawn(join_networks(shared, stack, WIFI.take()).unwrap());
     spawner.spawn(forward(shared, stack, store, BUFFERS.take()).unwrap());
     spawner.spawn(light().unwrap());
 }
 
-/// Runs every task that can make progress; returns when the next one is due. [us]
+/// Runs every task that can make progress. Returns the time until the next timer [us].
 #[expect(unsafe_code, reason = "called from C")]
 #[unsafe(no_mangle)]
 pub extern "C" fn vizflyt_poll(events: u32) -> u32 {
@@ -157,7 +157,7 @@ async fn light() {
     blink::run(front::light, platform::led).await;
 }
 
-/// Never linked: panics abort where they are (see `build`); the compiler asks for it all the same.
+/// Never linked: panics abort in place (see `build`), but the compiler requires a handler.
 #[panic_handler]
 fn panic(_: &PanicInfo<'_>) -> ! {
     platform::abort()

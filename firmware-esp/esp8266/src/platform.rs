@@ -1,4 +1,4 @@
-//! What the C side offers, safely wrapped. `include/vizflyt_platform.h` documents each one.
+//! Safe wrappers of the C functions that `include/vizflyt_platform.h` documents.
 
 #![expect(unsafe_code, reason = "the seam to C")]
 
@@ -39,22 +39,22 @@ mod c {
     }
 }
 
-/// Returns microseconds since an arbitrary start; wraps after 71 minutes. [us]
+/// Returns the time since an arbitrary start [us]; wraps after 71 minutes.
 pub(crate) fn time_us() -> u32 {
     c::platform_time_us()
 }
 
-/// Returns random bits.
+/// Returns 32 random bits.
 pub(crate) fn random() -> u32 {
     c::platform_random()
 }
 
-/// Asks for another poll.
+/// Requests another poll.
 pub(crate) fn wake() {
     c::platform_wake();
 }
 
-/// Gives up: restarts the chip, or stops the emulator.
+/// Restarts the chip or stops the emulator, after a fatal error.
 pub(crate) fn abort() -> ! {
     c::abort()
 }
@@ -64,34 +64,34 @@ pub(crate) fn restart() -> ! {
     c::platform_restart()
 }
 
-/// Copies received bytes; returns how many.
+/// Copies received bytes. Returns their number.
 pub(crate) fn uart_read(into: &mut [u8]) -> usize {
     // SAFETY: the C side writes at most `len` bytes into the slice.
     unsafe { c::platform_uart_read(into.as_mut_ptr(), into.len() as u32) as usize }
 }
 
-/// Hands bytes over to be sent; returns how many were taken.
+/// Queues bytes to send. Returns the number of accepted bytes.
 pub(crate) fn uart_write(bytes: &[u8]) -> usize {
     // SAFETY: the C side reads at most `len` bytes of the slice.
     unsafe { c::platform_uart_write(bytes.as_ptr(), bytes.len() as u32) as usize }
 }
 
-/// Whether all bytes handed over have left.
+/// Whether all queued bytes were sent.
 pub(crate) fn uart_is_idle() -> bool {
     c::platform_uart_is_idle() != 0
 }
 
-/// Returns how often received bytes were lost because nobody read them in time. Wraps.
+/// Returns the number of overruns, each of which lost received bytes. Wraps.
 pub(crate) fn uart_overruns() -> u32 {
     c::platform_uart_overruns()
 }
 
-/// Sets rate and flow control.
+/// Sets baud rate and flow control.
 pub(crate) fn uart_configure(baud: u32, flow_control: bool) {
     c::platform_uart_configure(baud, u32::from(flow_control));
 }
 
-/// Returns the interface's address.
+/// Returns the MAC address of the interface.
 pub(crate) fn mac() -> [u8; 6] {
     let mut mac = [0; 6];
     // SAFETY: the C side writes six bytes.
@@ -99,7 +99,7 @@ pub(crate) fn mac() -> [u8; 6] {
     mac
 }
 
-/// An Ethernet frame without its checksum: 14 bytes of header, 1500 of payload.
+/// Length of an Ethernet frame without its checksum: 14 bytes of header, 1500 of payload.
 pub(crate) const FRAME: usize = 1514;
 
 /// Whether a received frame waits.
@@ -109,7 +109,7 @@ pub(crate) fn is_frame_waiting() -> bool {
     !unsafe { c::platform_frame_waiting(&raw mut len) }.is_null()
 }
 
-/// Gives `f` the received frame that has waited longest, an empty one if none waits, and lets it go.
+/// Passes the oldest received frame to `f` and releases it. The slice is empty if none waits.
 pub(crate) fn with_frame<R>(f: impl FnOnce(&mut [u8]) -> R) -> R {
     let mut len = 0;
     // SAFETY: the C side writes one number.
@@ -117,16 +117,16 @@ pub(crate) fn with_frame<R>(f: impl FnOnce(&mut [u8]) -> R) -> R {
     if frame.is_null() {
         return f(&mut []);
     }
-    // SAFETY: `len` bytes from there are ours until `platform_frame_done`, which comes after `f`.
+    // SAFETY: `len` bytes from there belong to this function until `platform_frame_done`, which follows `f`.
     let result = f(unsafe { core::slice::from_raw_parts_mut(frame, len as usize) });
     c::platform_frame_done();
     result
 }
 
-/// Room for a frame; dropped unsent it is given back.
+/// Buffer of a frame to send. Dropping it returns the buffer unsent.
 pub(crate) struct FrameToSend(*mut u8);
 
-/// Returns room for a frame of up to [`FRAME`] bytes, if one can be sent; for one at a time.
+/// Returns a buffer for a frame of up to [`FRAME`] bytes, if one can be sent; only one at a time.
 pub(crate) fn frame_to_send() -> Option<FrameToSend> {
     let room = c::platform_frame_begin();
     (!room.is_null()).then_some(FrameToSend(room))
@@ -136,7 +136,7 @@ impl FrameToSend {
     /// Lets `f` write a frame of `len` bytes, and sends it.
     pub(crate) fn send<R>(self, len: usize, f: impl FnOnce(&mut [u8]) -> R) -> R {
         assert!(len <= FRAME);
-        // SAFETY: the C side has room for `FRAME` bytes there until the frame is sent or dropped.
+        // SAFETY: the C side reserves `FRAME` bytes there until the frame is sent or dropped.
         let result = f(unsafe { core::slice::from_raw_parts_mut(self.0, len) });
         c::platform_frame_send(len as u32);
         core::mem::forget(self);
@@ -150,13 +150,11 @@ impl Drop for FrameToSend {
     }
 }
 
-/// Joins a network.
 pub(crate) fn wifi_station(ssid: &CStr, password: &CStr) -> bool {
     // SAFETY: both end in a zero and are only read.
     unsafe { c::platform_wifi_station(ssid.as_ptr().cast(), password.as_ptr().cast()) == 0 }
 }
 
-/// Opens a network.
 pub(crate) fn wifi_access_point(ssid: &CStr, password: &CStr, channel: u8) -> bool {
     // SAFETY: as above.
     unsafe {
@@ -168,12 +166,12 @@ pub(crate) fn wifi_access_point(ssid: &CStr, password: &CStr, channel: u8) -> bo
     }
 }
 
-/// Whether the radio is joined or open.
+/// Whether the radio has joined or opened a network.
 pub(crate) fn is_link_up() -> bool {
     c::platform_link_up() != 0
 }
 
-/// Returns the signal strength. [dBm]
+/// Returns the signal strength [dBm].
 pub(crate) fn rssi_dbm() -> Option<i8> {
     match c::platform_rssi_dbm() {
         0 => None,
@@ -181,24 +179,23 @@ pub(crate) fn rssi_dbm() -> Option<i8> {
     }
 }
 
-/// Switches the LED.
 pub(crate) fn led(on: bool) {
     c::platform_led(u32::from(on));
 }
 
-/// Reads flash; returns whether it could.
+/// Reads flash. Returns whether it succeeded.
 pub(crate) fn flash_read(address: u32, into: &mut [u8]) -> bool {
     // SAFETY: the C side writes at most `len` bytes into the slice.
     unsafe { c::platform_flash_read(address, into.as_mut_ptr(), into.len() as u32) == 0 }
 }
 
-/// Writes erased flash; returns whether it could.
+/// Writes erased flash. Returns whether it succeeded.
 pub(crate) fn flash_write(address: u32, bytes: &[u8]) -> bool {
     // SAFETY: the C side only reads the slice.
     unsafe { c::platform_flash_write(address, bytes.as_ptr(), bytes.len() as u32) == 0 }
 }
 
-/// Erases a sector of 4096 bytes; returns whether it could.
+/// Erases a sector of 4096 bytes. Returns whether it succeeded.
 pub(crate) fn flash_erase(sector: u32) -> bool {
     c::platform_flash_erase(sector) == 0
 }
@@ -206,8 +203,7 @@ pub(crate) fn flash_erase(sector: u32) -> bool {
 struct InterruptsOff;
 critical_section::set_impl!(InterruptsOff);
 
-// SAFETY: with interrupts off nothing else runs on the chip's one core; the state is restored in
-// reverse order.
+// SAFETY: with interrupts off, no other code runs on the chip's only core; the state is restored in reverse order.
 unsafe impl critical_section::Impl for InterruptsOff {
     unsafe fn acquire() -> u32 {
         c::platform_interrupts_off()

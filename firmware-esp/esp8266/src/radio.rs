@@ -1,4 +1,4 @@
-//! The radio as an Ethernet interface: frames are read and written where the platform has them.
+//! The radio as an Ethernet interface. Frames are read and written in the platform's buffers, without copying.
 
 use core::ffi::CStr;
 use core::task::Context;
@@ -12,12 +12,12 @@ use crate::platform;
 
 static WAKER: AtomicWaker = AtomicWaker::new();
 
-/// Looks again at the link, and whether frames have come or can be sent.
+/// Wakes the network stack after a change of the link or an event of frames.
 pub(crate) fn changed() {
     WAKER.wake();
 }
 
-/// What the network stack drives.
+/// Network driver for the stack.
 pub(crate) struct Radio {
     mac: [u8; 6],
 }
@@ -62,7 +62,7 @@ impl Driver for Radio {
     }
 }
 
-/// The frame that has waited longest.
+/// Oldest received frame.
 pub(crate) struct Received;
 
 impl RxToken for Received {
@@ -71,7 +71,7 @@ impl RxToken for Received {
     }
 }
 
-/// Room for one frame.
+/// Buffer of a frame to send.
 pub(crate) struct Sending(platform::FrameToSend);
 
 impl TxToken for Sending {
@@ -80,18 +80,17 @@ impl TxToken for Sending {
     }
 }
 
-/// The radio, for the bridge.
+/// Control of the radio for the bridge.
 pub(crate) struct Control;
 
-/// Longer than any network takes that will let us in.
+/// Timeout of joining a network.
 const JOIN: Duration = Duration::from_secs(10);
-/// How often the link is looked at while it is waited for.
+/// Interval at which the link is polled.
 const LOOK: Duration = Duration::from_millis(50);
-/// The SDK joins again by itself after a short loss; only one of this length counts.
+/// Minimum length of a loss that counts: the SDK rejoins after a shorter one.
 const GONE: Duration = Duration::from_secs(3);
 
-/// Calls `f` with two texts as C has them, each ended by a zero. A name has 32 bytes at most, a
-/// password 64.
+/// Calls `f` with two C strings. A name has at most 32 bytes, a password 64.
 fn with_texts(ssid: &str, password: &str, f: impl FnOnce(&CStr, &CStr) -> bool) -> bool {
     let (mut name, mut secret) = ([0; 33], [0; 65]);
     let (Some(to_name), Some(to_secret)) =

@@ -1,4 +1,4 @@
-//! The UART as embassy's streams; the bytes wait on the C side, where the interrupt puts them.
+//! The UART as embassy's streams. The C side buffers the bytes in its interrupt.
 
 use core::convert::Infallible;
 use core::future::poll_fn;
@@ -12,17 +12,17 @@ use crate::platform;
 static READABLE: AtomicWaker = AtomicWaker::new();
 static WRITABLE: AtomicWaker = AtomicWaker::new();
 
-/// Bytes have come.
+/// Wakes the reader: bytes were received.
 pub(crate) fn readable() {
     READABLE.wake();
 }
 
-/// There is room for bytes to send.
+/// Wakes the writer: there is space for bytes to send.
 pub(crate) fn writable() {
     WRITABLE.wake();
 }
 
-/// The receiving half.
+/// Receiving half of the UART.
 pub(crate) struct Receiver;
 
 impl ErrorType for Receiver {
@@ -45,7 +45,7 @@ impl Read for Receiver {
     }
 }
 
-/// The sending half.
+/// Sending half of the UART.
 pub(crate) struct Sender;
 
 impl ErrorType for Sender {

@@ -1,12 +1,12 @@
-//! Makes what is flashed of the ESP32-C3's bridge: one file with bootloader, partition table and
-//! program for the first time, over USB, and the program alone for updates over the network.
+//! Makes the files to flash of the ESP32-C3's bridge: one with bootloader, partition table and program for the first
+//! flashing over USB, and one with only the program for updates over the network.
 //!
-//! `vizflyt-bridge-image [--open | --key KEY] ELF PARTITIONS.csv FOLDER`
-//! `vizflyt-bridge-image [--open | --key KEY] --settings FILE`
+//! `vizflyt-bridge-image [--open | --key KEY] ELF PARTITIONS.csv FOLDER` `vizflyt-bridge-image [--open | --key KEY]
+//! --settings FILE`
 //!
-//! The file for the first time holds settings: the key of the bridge's own network, new for every file,
-//! which also opens its settings in a browser. It is printed, and is nowhere else. `--settings` makes the
-//! settings alone, for a chip whose program another tool writes.
+//! The first file contains settings: a key, new for every file, which is the password of the bridge's own network and
+//! opens its settings in a browser. The key is only printed, not stored elsewhere. `--settings` makes only the
+//! settings, for a chip whose program another tool writes.
 
 mod settings;
 
@@ -20,10 +20,10 @@ use espflash::flasher::{FlashData, FlashMode, FlashSettings, FlashSize};
 use espflash::image_format::idf::IdfBootloaderFormat;
 use espflash::target::{Chip, XtalFrequency};
 
-/// What every board of the guide has; an image for 4 MB runs on larger flash too.
+/// Flash size of all boards in the guide; an image for 4 MB also runs on larger flash.
 const FLASH: FlashSize = FlashSize::_4Mb;
 
-/// Where the settings lie: `settings` in `partitions.csv`.
+/// Address of the settings: `settings` in `partitions.csv`.
 const SETTINGS: usize = 0x9000;
 
 fn main() -> Result<()> {
@@ -55,13 +55,13 @@ fn main() -> Result<()> {
     };
     let bytes = fs::read(elf).with_context(|| format!("cannot read {elf}; build it first"))?;
     let folder = Path::new(folder);
-    fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
 
     let settings = FlashSettings::new(Some(FlashMode::Dio), Some(FLASH), None);
     let data = FlashData::new(settings, 0, None, Chip::Esp32c3, XtalFrequency::_40Mhz);
     let format = || {
         IdfBootloaderFormat::new(&bytes, &data, Some(Path::new(partitions)), None, None, None)
-            .with_context(|| format!("{elf} with {partitions} makes no image"))
+            .with_context(|| format!("cannot make an image of {elf} with {partitions}"))
     };
 
     let mut whole = Vec::new();
@@ -69,7 +69,7 @@ fn main() -> Result<()> {
         let start = segment.addr as usize;
         if start < whole.len() {
             bail!(
-                "the part at {start:#x} lies within the one before, which ends at {:#x}",
+                "the segment at {start:#x} overlaps the previous one, which ends at {:#x}",
                 whole.len()
             );
         }
@@ -77,7 +77,7 @@ fn main() -> Result<()> {
         whole.resize(start, 0xFF);
         whole.extend_from_slice(segment.data());
     }
-    // The loader leaves the settings' region out.
+    // The bootloader format does not include the settings' region.
     whole[SETTINGS..SETTINGS + first.flash.len()].copy_from_slice(&first.flash);
     let mut program = Vec::new();
     for segment in format()?.ota_segments() {
@@ -93,13 +93,13 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Prints what nobody can read from the bridge later.
+/// Prints the key, because it cannot be read from the bridge later.
 fn print_key(key: Option<&str>) {
     match key {
         Some(key) => {
             println!("key of its network, and of its settings in a browser: {key}");
             println!("write it down; another file has another key");
         }
-        None => println!("its network is open: whoever is near is in it"),
+        None => println!("its network is open: anyone in range can join"),
     }
 }

@@ -1,4 +1,4 @@
-//! The settings that a flash begins with: a key of its own for every file that is made.
+//! Initial settings of a flash, with a new key in every file.
 
 use std::fs::File;
 use std::io::Read;
@@ -9,26 +9,26 @@ use vizflyt_bridge::Settings;
 use vizflyt_bridge::settings::typed_key;
 use vizflyt_bridge::storage::Store;
 
-/// Which key the own network has.
+/// Password of the bridge's own network.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Access {
-    /// A new one.
+    /// A new random key.
     Random,
-    /// This one.
+    /// The given key.
     Given(String),
-    /// None: whoever is near is in.
+    /// No key: anyone in range can join.
     Open,
 }
 
-/// What a chip begins with.
+/// Initial settings.
 pub(crate) struct First {
-    /// What lies at the start of the settings' region: two sectors.
+    /// Content of the settings' region: two sectors.
     pub(crate) flash: Vec<u8>,
-    /// The key to print; `None` if the network is open.
+    /// Key to print; `None` if the network is open.
     pub(crate) key: Option<String>,
 }
 
-/// Makes the settings.
+/// Returns the initial settings.
 pub(crate) fn first(access: &Access) -> Result<First> {
     let mut settings = Settings::default();
     let mut set = |name: &str, value: &str| {
@@ -44,7 +44,7 @@ pub(crate) fn first(access: &Access) -> Result<First> {
             let mut random = [0; 16];
             File::open("/dev/urandom")
                 .and_then(|mut file| file.read_exact(&mut random))
-                .context("no random numbers for a key")?;
+                .context("no random numbers from /dev/urandom for a key")?;
             Some(typed_key(&random).to_string())
         }
         Access::Given(key) => Some(key.clone()),
@@ -58,7 +58,7 @@ pub(crate) fn first(access: &Access) -> Result<First> {
     Ok(First { flash: store.into_flash().0, key })
 }
 
-/// Flash in memory: erased bytes are ones, writing clears bits.
+/// Flash in memory: erased bytes are ones, writes clear bits.
 struct Memory(Vec<u8>);
 
 impl ErrorType for Memory {
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn every_image_has_a_key_of_its_own() {
+    fn every_image_has_a_new_key() {
         let made = [first(&Access::Random).unwrap(), first(&Access::Random).unwrap()];
         for one in &made {
             let (settings, key) = (read(one), one.key.as_deref().unwrap());
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn an_open_network_is_one_that_was_asked_for() {
+    fn opens_the_network_only_on_request() {
         let open = first(&Access::Open).unwrap();
         let settings = read(&open);
         assert!(settings.wifi_open && settings.ap_password.is_empty() && open.key.is_none());

@@ -1,5 +1,5 @@
-//! What a second of the lab costs: 400 ticks with the vehicle hovering among 300 obstacles, vision
-//! at 50 Hz. 1 s of time per 10 ms of result is 1 % of a core.
+//! Cost of one simulated second: 400 ticks, with the vehicle hovering among 300 obstacles and vision at 50 Hz. A result
+//! of 10 ms is 1 % of a core in real time.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use glam::{DQuat, DVec3};
@@ -41,7 +41,7 @@ fn second(lab: &mut Simulation) {
     }
 }
 
-// Why: SET_GPS_GLOBAL_ORIGIN is superseded in the dialect and what ArduCopter takes.
+// Why: SET_GPS_GLOBAL_ORIGIN is superseded in the dialect, but it is what ArduCopter accepts.
 #[allow(deprecated)]
 fn hovering() -> Simulation {
     let obstacles = (0..300)
@@ -64,7 +64,7 @@ fn hovering() -> Simulation {
     command(&mut lab, MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, 1.0, 0.0, 0.0);
     command(&mut lab, MavCmd::MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 1.5);
     (0..6).for_each(|_| second(&mut lab));
-    assert!(lab.state().p_world_m.z > 1.0, "it flies");
+    assert!(lab.state().p_world_m.z > 1.0, "must be flying");
     lab
 }
 

@@ -1,9 +1,9 @@
 //! The vehicle as a rigid body: motor commands in, pose, twist and specific force out.
 //!
-//! Runge-Kutta of fourth order, 800 turns a second, world frame z up. Forces: four rotors (lagged,
-//! see [`crate::motor`]), gravity, linear and quadratic drag against the wind, gyroscopic torque
-//! of the rotors, and the floor as springs under eight corners. The origin of `body` lies between
-//! the soles, so that it has z = floor when the vehicle stands.
+//! Fourth-order Runge-Kutta, 800 steps a second, world frame z up. Forces: four rotors with lag (see [`crate::motor`]),
+//! gravity, linear and quadratic drag against the wind, gyroscopic torque of the rotors, and the floor as springs under
+//! eight corners. The origin of `body` lies between the soles, so that its z is the floor's height when the vehicle
+//! stands.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -12,38 +12,38 @@ use crate::motor::{
     ARM_M, MAX_SPEED_RADPS, MOUNTS, ROTOR_INERTIA_KGM2, TORQUE_PER_THRUST_M, speed_rate, thrust_n,
 };
 
-/// Standard gravity. [m/s^2]
+/// Standard gravity [m/s^2].
 pub const GRAVITY_MPS2: f64 = 9.80665;
-/// Mass ready to fly; the published vehicle's figure. [kg]
+/// Mass ready to fly [kg]; value of the published vehicle.
 pub const MASS_KG: f64 = 0.4;
 
-/// Principal moments of inertia. Derived: four motors with propellers of 20 g each at +-0.0566 m
-/// (4 m d^2 = 2.56e-4 about x and y, 5.12e-4 about z), and 0.32 kg of battery, computer and frame
-/// as a box of 120 x 60 x 50 mm (m (b^2 + c^2) / 12 = 1.63e-4, 4.51e-4, 4.80e-4). [kg m^2, body]
+/// Principal moments of inertia [kg m^2, body]. Derived: four motors with propellers of 20 g each at +-0.0566 m (4 m
+/// d^2 = 2.56e-4 about x and y, 5.12e-4 about z), and 0.32 kg of battery, computer and frame as a box of 120 x 60 x 50
+/// mm (m (b^2 + c^2) / 12 = 1.63e-4, 4.51e-4, 4.80e-4).
 pub const INERTIA_KGM2: DVec3 = DVec3::new(4.2e-4, 7.1e-4, 9.9e-4);
 
-/// Rotor drag, linear in airspeed: 0.2 per second in the rotor plane is what quadrotors of this
-/// size show (Faessler, Franchi, Scaramuzza, RA-L 2018, table II), less along the axis. [N s/m, body]
+/// Rotor drag, linear in airspeed [N s/m, body]: 0.2 per second in the rotor plane is typical of quadrotors of this
+/// size (Faessler, Franchi, Scaramuzza, RA-L 2018, table II), less along the axis.
 const LINEAR_DRAG: DVec3 = DVec3::new(0.08, 0.08, 0.04);
-/// Frame drag, quadratic: rho C_d A / 2 with C_d = 1.1 and 100-150 cm^2 of frontal area. [N s^2/m^2, body]
+/// Frame drag, quadratic [N s^2/m^2, body]: rho C_d A / 2 with C_d = 1.1 and 100-150 cm^2 of frontal area.
 const QUADRATIC_DRAG: DVec3 = DVec3::new(0.0070, 0.0080, 0.0120);
 
-/// Stiffness of all soles together: they sink [`SINK_M`] under the weight. [N/m]
+/// Stiffness of all soles together [N/m]: they sink [`SINK_M`] under the weight.
 const FLOOR_STIFFNESS: f64 = MASS_KG * GRAVITY_MPS2 / SINK_M;
-/// How far the soles give when the vehicle stands. [m]
+/// Compression of the soles when the vehicle stands [m].
 const SINK_M: f64 = 0.004;
-/// Damping of all soles together, critical for the mass: 2 sqrt(k m). [N s/m]
+/// Damping of all soles together, critical for the mass: 2 sqrt(k m) [N s/m].
 const FLOOR_DAMPING: f64 = 40.0;
-/// Friction of rubber on a gym mat.
+/// Coefficient of friction of rubber on a gym mat.
 const FRICTION: f64 = 0.8;
-/// Creep speed up to which friction grows linearly; keeps the force smooth. [m/s]
+/// Creep speed up to which friction grows linearly, to keep the force smooth [m/s].
 const CREEP_MPS: f64 = 0.02;
-/// Deepest the soles can go: below it the vehicle is put back, whatever it hit the floor with. [m]
+/// Maximum depth of the soles below the floor [m]; the vehicle is reset to it after any impact.
 const DEEPEST_M: f64 = 0.05;
-/// Fastest turn the integrator follows at 800 Hz; a crash cannot exceed it. [rad/s]
+/// Maximum turn rate that the integrator follows at 800 Hz [rad/s]; crashes are limited to it.
 const FASTEST_RADPS: f64 = 60.0;
 
-/// The four soles, and four points of the propeller plane that stop a vehicle on its back.
+/// Contact points: the four soles, and four points of the propeller plane for a vehicle on its back.
 const CONTACTS: [DVec3; 8] = [
     DVec3::new(ARM_M, ARM_M, 0.0),
     DVec3::new(ARM_M, -ARM_M, 0.0),
@@ -55,16 +55,16 @@ const CONTACTS: [DVec3; 8] = [
     DVec3::new(-ARM_M, -ARM_M, 0.05),
 ];
 
-/// Everything that evolves.
+/// State of the integration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AirframeState {
-    /// Position of the body's origin. [m, world]
+    /// Position of the body's origin [m, world].
     pub p_world_m: DVec3,
-    /// Velocity. [m/s, world]
+    /// Velocity [m/s, world].
     pub v_world_mps: DVec3,
     /// Attitude, body to world.
     pub world_from_body: DQuat,
-    /// Angular velocity. [rad/s, body]
+    /// Angular velocity [rad/s, body].
     pub omega_body_radps: DVec3,
     /// Rotor speeds as fractions of full speed.
     pub rotor_speed: [f64; 4],
@@ -87,19 +87,19 @@ struct Derivative {
     rotor: [f64; 4],
 }
 
-/// The vehicle.
+/// Simulated vehicle.
 #[derive(Clone, Debug)]
 pub struct Airframe {
     state: AirframeState,
     floor_z_m: f64,
     wind_world_mps: DVec3,
-    /// What each rotor gives of what a sound one would.
+    /// Share of its nominal thrust that each rotor gives.
     soundness: [f64; 4],
     specific_force_body: DVec3,
 }
 
 impl Airframe {
-    /// Puts the vehicle down on the floor under `p_world_m`, whose z is the floor's height. [m, world]
+    /// Places the vehicle on the floor at `p_world_m` [m, world], whose z is the floor's height.
     pub fn standing(p_world_m: DVec3, yaw_rad: f64) -> Self {
         Self {
             state: AirframeState {
@@ -116,34 +116,33 @@ impl Airframe {
         }
     }
 
-    /// Puts the vehicle into the air, at rest and level, rotors carrying its weight. [m, world]
+    /// Places the vehicle in the air [m, world]: level, at rest, with rotors carrying its weight.
     pub fn hovering(p_world_m: DVec3, yaw_rad: f64, floor_z_m: f64) -> Self {
         let standing = Self::standing(p_world_m, yaw_rad);
         let rotor_speed = [(MASS_KG * GRAVITY_MPS2 / 4.0 / thrust_n(1.0)).sqrt(); 4];
         Self { state: AirframeState { rotor_speed, ..standing.state }, floor_z_m, ..standing }
     }
 
-    /// Returns the state.
     pub fn state(&self) -> &AirframeState {
         &self.state
     }
 
-    /// Returns the floor's height. [m, world]
+    /// Returns the floor's height [m, world].
     pub fn floor_z_m(&self) -> f64 {
         self.floor_z_m
     }
 
-    /// Sets the wind. [m/s, world]
+    /// Sets the wind [m/s, world].
     pub fn set_wind(&mut self, wind_world_mps: DVec3) {
         self.wind_world_mps = wind_world_mps;
     }
 
-    /// Breaks a motor, by ArduCopter's order from 0: from now on it gives this share of its thrust.
+    /// Reduces the thrust of a motor (ArduCopter's order, from 0) to this share from now on.
     pub fn break_motor(&mut self, motor: usize, share: f64) {
         self.soundness[motor] = share.clamp(0.0, 1.0);
     }
 
-    /// Returns the mean specific force over the last tick, as an ideal accelerometer measures it. [m/s^2, body]
+    /// Returns the mean specific force over the last tick [m/s^2, body], as an ideal accelerometer measures it.
     pub fn specific_force_body_mps2(&self) -> DVec3 {
         self.specific_force_body
     }
@@ -156,8 +155,8 @@ impl Airframe {
         })
     }
 
-    /// Flies on for `dt_s` with motor commands, fractions of full speed in ArduCopter's order.
-    /// `dt_s` is at most 2.5 ms: the floor's springs need it.
+    /// Simulates `dt_s` with motor commands: fractions of full speed, in ArduCopter's order. `dt_s` must be at most 2.5
+    /// ms, because of the floor's springs.
     pub fn tick(&mut self, commands: [f64; 4], dt_s: f64) {
         let commands = commands.map(|c| if c >= 0.0 { c.min(1.0) } else { 0.0 });
         let before = self.state;
@@ -183,7 +182,7 @@ impl Airframe {
             after.p_world_m.z += depth_m;
             after.v_world_mps.z = after.v_world_mps.z.max(0.0);
         }
-        // From the velocities, so that it holds for every force, contact included.
+        // Computed from the velocities, so that it includes every force, also contact.
         let a_world = (after.v_world_mps - before.v_world_mps) / dt_s;
         let midway =
             (before.world_from_body + after.world_from_body * sign(&before, &after)).normalize();
@@ -235,7 +234,7 @@ impl Airframe {
                 continue;
             }
             let v = s.v_world_mps + s.world_from_body * s.omega_body_radps.cross(corner);
-            // A quarter each; a floor pushes and never pulls.
+            // A quarter for each sole; a floor only pushes.
             let normal = (FLOOR_STIFFNESS * sunk_m - FLOOR_DAMPING * v.z).max(0.0) / 4.0;
             let slip = DVec3::new(v.x, v.y, 0.0);
             let friction = -slip * (FRICTION * normal / slip.length().max(CREEP_MPS));
@@ -259,7 +258,7 @@ fn advance(s: &AirframeState, d: &Derivative, dt_s: f64) -> AirframeState {
     }
 }
 
-/// +1 or -1, whichever makes both quaternions lie on one half of the sphere.
+/// Returns +1 or -1: the factor that brings both quaternions to the same half of the sphere.
 fn sign(before: &AirframeState, after: &AirframeState) -> f64 {
     1f64.copysign(before.world_from_body.dot(after.world_from_body))
 }

@@ -1,4 +1,4 @@
-//! The command line: `vizflyt sim`, and this crate's own binary.
+//! Command line of `vizflyt sim`, and of this crate's own binary.
 
 use std::fmt::Display;
 use std::io::Write;
@@ -23,135 +23,148 @@ use crate::startup::Startup;
 use crate::truth_feed::TruthFeed;
 use crate::wifi::WifiConfig;
 
-/// The simulated lab: vehicle, autopilot and motion capture.
+/// The simulated lab: vehicle, autopilot and motion capture
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Examples:\n  vizflyt sim --mavlink udpout:127.0.0.1:14550 --vicon 127.0.0.1:51001 --spawn 1,0,0,90\n  \
                   vizflyt sim --pty /tmp/uart --baud 921600 --vicon 127.0.0.1:51001"
 )]
 pub struct SimArgs {
-    /// Where MAVLink goes: udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait,
-    /// tcpout:HOST:PORT connects; serial:PATH[:BAUD] and pty:PATH[:BAUD] as below. May be given up
-    /// to four times, as telemetry ports of one autopilot [default: udpout:127.0.0.1:14550, unless
-    /// --serial or --pty is given].
+    /// Endpoint of MAVLink; up to four, like telemetry ports of one autopilot
+    ///
+    /// udpout:HOST:PORT sends first, udpin:HOST:PORT and tcpin:HOST:PORT wait, tcpout:HOST:PORT connects;
+    /// serial:PATH[:BAUD] and pty:PATH[:BAUD] are like --serial and --pty. Default: udpout:127.0.0.1:14550, unless
+    /// --serial or --pty is given.
     #[arg(long, value_name = "ENDPOINT")]
     pub mavlink: Vec<Endpoint>,
-    /// MAVLink over this serial device, or the pseudo-terminal somebody else made; waits until it
-    /// is there.
+    /// Serial device, or existing pseudo-terminal, for MAVLink
+    ///
+    /// Waits until the device exists.
     #[arg(long, value_name = "PATH")]
     pub serial: Option<PathBuf>,
-    /// MAVLink over a pseudo-terminal that is made and linked to by this name.
+    /// Create a pseudo-terminal for MAVLink, and a link to it with this name
     #[arg(long, value_name = "PATH", conflicts_with = "serial")]
     pub pty: Option<PathBuf>,
-    /// Baud rate of --serial and --pty; bytes leave no faster than that.
+    /// Baud rate of --serial and --pty; limits the speed of sending
     #[arg(long, value_name = "BAUD", default_value_t = DEFAULT_BAUD, value_parser = parse_baud)]
     pub baud: u32,
-    /// Where the motion capture sends Vicon's UDP object stream; nowhere if absent.
+    /// Destination of Vicon's UDP object stream; none if absent
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
     pub vicon: Option<SocketAddr>,
-    /// Where another system streams to: vicon, json or mavlink; natnet, where Motive waits for listeners,
-    /// or a multicast group. May be given several times.
+    /// Destination of another motion capture format; may be repeated
+    ///
+    /// Formats: vicon, json or mavlink with a destination; natnet with the address where Motive waits for listeners, or
+    /// with a multicast group.
     #[arg(long, value_name = "FORMAT:HOST:PORT")]
     pub mocap: Vec<FeedTarget>,
-    /// Where the true pose is sent at every tick, with its instant on CLOCK_MONOTONIC, as the JSON that
-    /// `vizflyt serve` reads poses from: what `vizflyt tags locate` draws its simulated cameras' images by. May be given several
-    /// times.
+    /// Destination of the true pose at every tick; may be repeated
+    ///
+    /// Sends the JSON that `vizflyt serve` reads poses from, with the instant on CLOCK_MONOTONIC. `vizflyt tags locate`
+    /// renders the images of its simulated cameras from it.
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_address)]
     pub truth_to: Vec<SocketAddr>,
-    /// Name of the vehicle in the motion capture.
+    /// Name of the vehicle in the motion capture
     #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = parse_object)]
     pub object: String,
-    /// Where the vehicle stands (metres, on the floor) and which way it looks (degrees from east).
+    /// Start of the vehicle: position on the floor [m], yaw from east [degrees]
     #[arg(long, value_name = "X,Y,Z,YAW", default_value = "0,0,0,0", value_parser = parse_numbers::<4>, allow_hyphen_values = true)]
     pub spawn: [f64; 4],
-    /// Seed of all noise.
+    /// Seed of all noise
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
-    /// True geometry of the scene (JSON list of volumes), to measure the flight against.
+    /// True geometry of the scene, for clearance (JSON list of volumes)
     #[arg(long, value_name = "FILE")]
     pub truth: Option<PathBuf>,
-    /// Radius of the vehicle's body in metres, to measure the flight with.
+    /// Radius of the vehicle's body, for clearance [m]
     #[arg(long, value_name = "METRES", default_value_t = 0.12)]
     pub body_radius: f64,
-    /// The vehicle moves as one set up by `hardware/airframe`; without this as ArduCopter's defaults have it, which
-    /// answer velocities late.
+    /// Use the parameters of `hardware/airframe`
+    ///
+    /// Otherwise, the defaults of ArduCopter apply, which respond late to velocity setpoints.
     #[arg(long)]
     pub airframe: bool,
-    /// Start-up times of a real autopilot: 2 s of alignment, 1 s of external navigation; without this the vehicle has
-    /// stood powered before the start, and its position counts after 0.2 s.
+    /// Start-up times of a real autopilot
+    ///
+    /// Alignment takes 2 s and external navigation 1 s. Otherwise, the vehicle was powered before the start, and its
+    /// position is valid after 0.2 s.
     #[arg(long)]
     pub realistic_startup: bool,
-    /// Changes a parameter of the autopilot at boot; may be given several times.
+    /// Change a parameter of the autopilot at boot; may be repeated
     #[arg(long = "param", value_name = "NAME=VALUE", value_parser = parse_param)]
     pub params: Vec<(String, f32)>,
-    /// Steady wind in metres per second, world axes.
+    /// Steady wind, world axes [m/s]
     #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = parse_numbers::<3>, allow_hyphen_values = true)]
     pub wind: [f64; 3],
-    /// Standard deviation of gusts along each horizontal axis, in metres per second.
+    /// Standard deviation of gusts along each horizontal axis [m/s]
     #[arg(long, value_name = "M/S", default_value_t = 0.0)]
     pub gusts: f64,
-    /// The autopilot's inertial sensor.
+    /// Inertial sensor of the autopilot
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The autopilot's inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
+        "Inertial sensor (frame: noise by a small frame; chips: by data sheet): {}",
         ImuModel::names()
     ))]
     pub imu: ImuModel,
-    /// How much each unbalanced rotor shakes the sensors at full throttle, in m/s^2; with 200 a hovering
-    /// vehicle reports about the 30 that ArduPilot warns of.
+    /// Vibration by each unbalanced rotor at full throttle [m/s^2]
+    ///
+    /// With 200, a hovering vehicle reports about 30, at which ArduPilot warns.
     #[arg(long, value_name = "M/S^2", default_value_t = 0.0)]
     pub vibration: f64,
-    /// Charge of the battery at the start, in percent.
+    /// Charge of the battery at the start [%]
     #[arg(long, value_name = "PERCENT", default_value_t = 100.0)]
     pub battery: f64,
-    /// A radio control is there: its receiver is connected and its transmitter is on.
+    /// Simulate a connected radio control with its transmitter on
     #[arg(long)]
     pub radio: bool,
-    /// The transmitter falls silent this many seconds after leaving the floor.
+    /// The transmitter falls silent this long after take-off [s]
     #[arg(long, value_name = "SECONDS", requires = "radio")]
     pub radio_lost_after: Option<f64>,
-    /// A motor (1 to 4, ArduCopter's order) fails so many seconds after leaving the floor; it gives
-    /// PERCENT of its thrust from then on, nothing if absent.
+    /// A motor (1 to 4, ArduCopter's order) fails this long after take-off [s]
+    ///
+    /// It then gives PERCENT of its thrust, or nothing if PERCENT is absent.
     #[arg(long, value_name = "MOTOR@SECONDS[,PERCENT]", value_parser = parse_motor_fault)]
     pub motor_failure: Option<MotorFault>,
-    /// The autopilot reboots this many seconds after leaving the floor: motors stop at once.
+    /// The autopilot reboots this long after take-off; motors stop at once [s]
     #[arg(long, value_name = "SECONDS")]
     pub reboot_after: Option<f64>,
-    /// MAVLink goes through a model of an ESP8266's Wi-Fi: batches of 2 to 5 ms, latency, bursts of
-    /// loss.
+    /// Send MAVLink through a model of an ESP8266's Wi-Fi
+    ///
+    /// Batches of 2 to 5 ms, latency, and bursts of loss.
     #[arg(long)]
     pub wifi: bool,
-    /// Latency of --wifi, in milliseconds.
+    /// Latency of --wifi [ms]
     #[arg(long, value_name = "MS", default_value_t = 2.0, requires = "wifi")]
     pub wifi_latency_ms: f64,
-    /// Mean latency that contention adds to it, in milliseconds.
+    /// Mean additional latency by contention with --wifi [ms]
     #[arg(long, value_name = "MS", default_value_t = 1.0, requires = "wifi")]
     pub wifi_jitter_ms: f64,
-    /// Share of --wifi's batches that are lost, in percent.
+    /// Share of lost batches with --wifi [%]
     #[arg(long, value_name = "PERCENT", default_value_t = 1.0, requires = "wifi")]
     pub wifi_loss_percent: f64,
-    /// Batches lost in a row, on average.
+    /// Mean number of batches lost in a row with --wifi
     #[arg(long, value_name = "BATCHES", default_value_t = 3.0, requires = "wifi")]
     pub wifi_burst: f64,
-    /// Simulated seconds per second.
+    /// Simulated seconds per second
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     pub realtime_factor: f64,
-    /// The motion capture falls silent after this many seconds.
+    /// The motion capture falls silent after this time [s]
     #[arg(long, value_name = "SECONDS")]
     pub mocap_stop_after: Option<f64>,
-    /// Latency added to the motion capture, in milliseconds.
+    /// Additional latency of the motion capture [ms]
     #[arg(long, value_name = "MS", default_value_t = 0.0)]
     pub mocap_delay_ms: f64,
-    /// Share of the motion capture's datagrams that are lost, in percent.
+    /// Share of lost datagrams of the motion capture [%]
     #[arg(long, value_name = "PERCENT", default_value_t = 0.0)]
     pub mocap_drop_percent: f64,
-    /// Instead of flying, somebody lifts the vehicle, pushes it forward, turns it left, raises its nose and its
-    /// left side, over and over; its IMU feels that: what `vizflyt doctor localization` asks for.
+    /// Move the vehicle by hand instead of flying
+    ///
+    /// Repeats: lift, push forward, turn left, raise the nose, raise the left side. The IMU measures these motions.
+    /// `vizflyt doctor localization` needs them.
     #[arg(long)]
     pub hand: bool,
-    /// Prints JSON lines on stdout: one when ready, one report at the end.
+    /// Print JSON lines on stdout: one when ready, one report at the end
     #[arg(long)]
     pub json: bool,
-    /// Ends when stdin ends.
+    /// End when stdin ends
     #[arg(long, hide = true)]
     pub lifeline: bool,
 }
@@ -162,7 +175,7 @@ fn parse_address(text: &str) -> Result<SocketAddr, String> {
 
 fn parse_baud(text: &str) -> Result<u32, String> {
     let baud = text.parse().ok().filter(|&baud| baud_rate(baud).is_some());
-    baud.ok_or_else(|| format!("'{text}' is no baud rate of a telemetry port; 57600 to 3000000"))
+    baud.ok_or_else(|| format!("'{text}' is not a baud rate of a telemetry port; give 57600 to 3000000"))
 }
 
 fn parse_object(text: &str) -> Result<String, String> {
@@ -203,7 +216,7 @@ fn parse_param(text: &str) -> Result<(String, f32), String> {
 }
 
 impl SimArgs {
-    /// Returns where MAVLink goes.
+    /// Returns the MAVLink endpoints.
     pub fn endpoints(&self) -> Vec<Endpoint> {
         let mut all = self.mavlink.clone();
         all.extend(self.serial.iter().map(|path| Endpoint::Serial(path.clone(), self.baud)));
@@ -214,7 +227,7 @@ impl SimArgs {
         all
     }
 
-    /// Returns the lab these arguments describe; reads the file of true geometry.
+    /// Returns the configuration of the lab. Reads the file of true geometry.
     ///
     /// # Errors
     /// Fails if that file cannot be read, or an argument is out of range.
@@ -289,7 +302,7 @@ impl SimArgs {
             format!("simulator: cannot read the true geometry {}", path.display())
         })?;
         let volumes: Vec<Volume> = serde_json::from_str(&text)
-            .with_context(|| format!("simulator: {} is no list of volumes", path.display()))?;
+            .with_context(|| format!("simulator: {} is not a list of volumes", path.display()))?;
         if let Some(index) = volumes.iter().position(|volume| !volume.is_valid()) {
             anyhow::bail!(
                 "simulator: {}: volume {index} has a size, direction or number that is not valid",
@@ -300,12 +313,12 @@ impl SimArgs {
     }
 }
 
-/// Runs the simulated lab until SIGINT, SIGTERM, or with `lifeline` the end of stdin. Prints the
-/// ready line and the report on stdout.
+/// Runs the simulated lab until SIGINT, SIGTERM, or with `lifeline` until the end of stdin. Prints the ready line and
+/// the report on stdout.
 ///
 /// # Errors
 /// Fails on arguments out of range, unreadable files, and sockets that cannot be opened.
-// Why: by value, as every run function of the command line.
+// Why: by value, like every run function of the command line.
 #[allow(clippy::needless_pass_by_value)]
 pub fn run(args: SimArgs) -> anyhow::Result<()> {
     let stop = vizflyt_process::stop_flag(args.lifeline)?;
@@ -330,13 +343,13 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
         }
         print(&"simulator ready; Ctrl-C ends it");
     }
-    // The loop has a thread of its own, whatever the caller's thread is busy with.
+    // The loop runs in a separate thread, because the caller's thread may be busy.
     let (simulation, lost_s) = std::thread::Builder::new()
         .name("simulator".into())
         .spawn(move || driver.run(&stop))
         .context("simulator: cannot start its thread")?
         .join()
-        .map_err(|_| anyhow::anyhow!("simulator: its thread ended by a panic"))?;
+        .map_err(|_| anyhow::anyhow!("simulator: its thread panicked"))?;
     let report = simulation.report();
     if args.json {
         let mut report = serde_json::to_value(&report).context("simulator: report")?;
@@ -359,7 +372,7 @@ pub fn run(args: SimArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints a line; unlike `println!` it does not panic when the reader has gone.
+/// Prints a line. Unlike `println!`, it does not panic if the reader has closed the pipe.
 fn print(line: &impl Display) {
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());
@@ -384,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn the_demo_s_arguments_are_understood() {
+    fn accepts_the_arguments_of_the_demo() {
         let args = parse(&[
             "--json",
             "--lifeline",
@@ -410,7 +423,7 @@ mod tests {
     }
 
     #[test]
-    fn mavlink_goes_to_the_given_endpoints() {
+    fn collects_all_mavlink_endpoints() {
         let check = |arguments: &[&str], expected: &[&str]| {
             let found = parse(arguments).unwrap().endpoints();
             assert_eq!(found.iter().map(ToString::to_string).collect::<Vec<_>>(), expected);
@@ -424,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn motor_faults_are_parsed() {
+    fn parses_faults_and_wifi() {
         let args =
             parse(&["--motor-failure", "2@5.5,30", "--reboot-after", "3", "--wifi"]).unwrap();
         let config = args.config().unwrap();
@@ -435,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_arguments_are_named() {
+    fn names_invalid_arguments() {
         let check = |arguments: &[&str], expected: &str| {
             let error = parse(arguments)
                 .map_err(anyhow::Error::msg)
@@ -450,13 +463,13 @@ mod tests {
         check(&["--wifi-latency-ms", "5"], "--wifi");
         check(&["--radio-lost-after", "5"], "--radio");
         check(&["--battery", "130"], "outside 0 to 100");
-        check(&["--baud", "1234"], "no baud rate");
+        check(&["--baud", "1234"], "not a baud rate");
         check(&["--serial", "/a", "--pty", "/b"], "cannot be used with");
         check(&["--object", "a name of more than twenty-four"], "1 to 24");
         check(&["--realtime-factor", "0"], "outside 0.01 to 20");
         check(
             &["--imu", "mpu"],
-            "no inertial sensor is called 'mpu'; there are frame, icm-42688-p",
+            "unknown inertial sensor 'mpu'; use one of frame, icm-42688-p",
         );
         check(&["--param", "NO_SUCH=1"], "no parameter NO_SUCH");
         check(&["--truth", "/does/not/exist.json"], "cannot read the true geometry");

@@ -1,20 +1,19 @@
-//! The flight battery: four lithium cells, drained by the rotors.
+//! Flight battery: four lithium cells in series, discharged by the rotors.
 
 use crate::motor::thrust_n;
 
-/// Cells in series.
 const CELLS: f64 = 4.0;
-/// Capacity of the published vehicle's pack. [Ah]
+/// Capacity of the published vehicle's battery [Ah].
 const CAPACITY_AH: f64 = 0.85;
-/// Internal resistance of the pack. [Ohm]
+/// Internal resistance of the battery [Ohm].
 const RESISTANCE_OHM: f64 = 0.04;
-/// Ideal hover power of one 102 mm propeller is T^1.5 / sqrt(2 rho A) with A = 0.0081 m^2; half of
-/// what the battery gives arrives there. [W / N^1.5]
+/// Electrical power per thrust [W / N^1.5]. Ideal hover power of one 102 mm propeller is T^1.5 / sqrt(2 rho A) with A =
+/// 0.0081 m^2; the efficiency from the battery is one half.
 const POWER_PER_THRUST: f64 = 1.0 / (0.141 * 0.5);
-/// Autopilot, companion computer and radio. [W]
+/// Power of autopilot, companion computer and radio [W].
 const ELECTRONICS_W: f64 = 8.0;
 
-/// Charge, and what the power module measures.
+/// Charge and current of the battery.
 #[derive(Clone, Copy, Debug)]
 pub struct Battery {
     left_ah: f64,
@@ -28,12 +27,12 @@ impl Default for Battery {
 }
 
 impl Battery {
-    /// Makes a battery charged to a share, 0 to 1.
+    /// Returns a battery charged to a share, 0 to 1.
     pub fn charged(share: f64) -> Self {
         Self { left_ah: CAPACITY_AH * share.clamp(0.0, 1.0), current_a: 0.0 }
     }
 
-    /// Drains the battery for `dt_s` with rotors at fractions of full speed.
+    /// Discharges the battery for `dt_s` with rotors at fractions of full speed.
     pub fn tick(&mut self, rotor_speed: [f64; 4], dt_s: f64) {
         let lift_w: f64 =
             rotor_speed.iter().map(|&s| POWER_PER_THRUST * thrust_n(s).max(0.0).powf(1.5)).sum();
@@ -41,23 +40,23 @@ impl Battery {
         self.left_ah = (self.left_ah - self.current_a * dt_s / 3600.0).max(0.0);
     }
 
-    /// Voltage without load: 4.2 V a cell full, 3.3 V empty. [V]
+    /// Returns the voltage without load [V]: 4.2 V a cell if full, 3.3 V if empty.
     fn open_voltage_v(&self) -> f64 {
         CELLS * (3.3 + 0.9 * self.left_ah / CAPACITY_AH)
     }
 
-    /// Returns the voltage under the load of the moment. [V]
+    /// Returns the voltage under the present load [V].
     pub fn voltage_v(&self) -> f64 {
         self.open_voltage_v() - self.current_a * RESISTANCE_OHM
     }
 
-    /// Returns the current. [A]
+    /// Returns the current [A].
     pub fn current_a(&self) -> f64 {
         self.current_a
     }
 }
 
-/// Returns the charge left as one may guess it from a resting voltage, 0 to 1.
+/// Returns the charge estimated from a voltage without load, 0 to 1.
 pub fn fraction_of(voltage_v: f64) -> f64 {
     ((voltage_v / CELLS - 3.3) / 0.9).clamp(0.0, 1.0)
 }

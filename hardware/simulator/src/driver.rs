@@ -1,8 +1,7 @@
-//! The one file with a clock: runs a [`Simulation`] in real time between sockets.
+//! Runs a [`Simulation`] in real time between sockets. Only this file has a clock.
 //!
-//! Own thread, 400 ticks a second by sleeping to the next one (a tokio timer would be a
-//! millisecond late). A machine too slow for real time loses simulated time instead of falling
-//! ever further behind: see [`MAX_BEHIND`].
+//! A separate thread runs 400 ticks a second and sleeps between them (a tokio timer would be a millisecond late). If
+//! the machine is too slow for real time, simulated time is dropped instead of accumulating delay: see [`MAX_BEHIND`].
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -17,13 +16,13 @@ use crate::mocap::feed::{Feed, FeedTarget};
 use crate::simulation::{MAX_LINKS, Simulation, TICK_HZ};
 use crate::truth_feed::TruthFeed;
 
-/// Time that is caught up after a pause. More is given up: a vehicle that lives through a second
-/// in an instant would answer to setpoints of the past.
+/// Maximum delay that is caught up. More is dropped: a vehicle that simulates a second in an instant would respond to
+/// outdated setpoints.
 const MAX_BEHIND: Duration = Duration::from_millis(100);
-/// Warnings of lost time come at most this often.
+/// Minimum interval between warnings of lost time.
 const WARN_EVERY: Duration = Duration::from_secs(5);
 
-/// The sockets of a running simulation.
+/// Running simulation with its sockets.
 pub struct Driver {
     simulation: Simulation,
     links: Vec<Link>,
@@ -34,11 +33,11 @@ pub struct Driver {
 }
 
 impl Driver {
-    /// Opens what MAVLink goes over, at most [`MAX_LINKS`] ways, and where mocap poses go, if
-    /// anywhere. `factor` is simulated seconds per second.
+    /// Opens at most [`MAX_LINKS`] MAVLink links and the sockets of the mocap feeds. `factor` is simulated seconds per
+    /// second.
     ///
     /// # Errors
-    /// Fails if something cannot be opened, or there are too many links.
+    /// Fails if a link or socket cannot be opened, or if there are too many links.
     pub fn open(
         simulation: Simulation,
         mavlink: &[Endpoint],
@@ -66,14 +65,14 @@ impl Driver {
         Ok(Self { simulation, links, mocap, truth: Vec::new(), factor })
     }
 
-    /// Also sends the true pose at every tick, for cameras that are simulated elsewhere.
+    /// Also sends the true pose at every tick, for simulated cameras of other programs.
     #[must_use]
     pub fn telling_truth(mut self, feeds: Vec<TruthFeed>) -> Self {
         self.truth = feeds;
         self
     }
 
-    /// Returns our address of each mocap feed.
+    /// Returns the local address of each mocap feed.
     ///
     /// # Errors
     /// If the operating system does not report it.
@@ -84,7 +83,7 @@ impl Driver {
             .collect()
     }
 
-    /// Returns our address or path of each MAVLink link.
+    /// Returns the local address or path of each MAVLink link.
     ///
     /// # Errors
     /// Fails if the operating system does not report it.
@@ -95,8 +94,7 @@ impl Driver {
             .collect()
     }
 
-    /// Runs until `stop` is set; returns the simulation for its report, and the time given up
-    /// because the machine was too slow. [s]
+    /// Runs until `stop` is set. Returns the simulation for its report, and the simulated time that was dropped [s].
     pub fn run(mut self, stop: &Arc<AtomicBool>) -> (Simulation, f64) {
         let mut pacer = Pacer::new(Instant::now(), self.factor);
         let mut warned: Option<(Instant, Duration)> = None;
@@ -136,8 +134,7 @@ impl Driver {
         }
     }
 
-    /// Sends the newest pose. After a pause the ones before it are history that nobody could tell
-    /// from the present.
+    /// Sends only the newest pose. After a pause, older poses would be indistinguishable from current ones.
     fn send_mocap(&mut self) {
         let mut newest = None;
         while let Some(sight) = self.simulation.poll_mocap() {
@@ -150,14 +147,14 @@ impl Driver {
     }
 }
 
-/// Returns how many ticks are due, and gives up what cannot be caught up.
+/// Computes the number of due ticks, and drops time that cannot be caught up.
 #[derive(Clone, Copy, Debug)]
 struct Pacer {
     tick: Duration,
     most_behind: Duration,
-    /// When the next tick is due.
+    /// Time of the next tick.
     next: Instant,
-    /// Given up since the start.
+    /// Dropped time since the start.
     lost: Duration,
 }
 
@@ -167,13 +164,13 @@ impl Pacer {
         Self { tick, most_behind: MAX_BEHIND.max(tick * 2), next: start, lost: Duration::ZERO }
     }
 
-    /// Returns for when the tick was due that `left` of those due are left behind.
+    /// Returns the due time of the tick after which `left` due ticks remain.
     fn at(&self, left: u32) -> Instant {
         let back = self.tick * (left + 1);
         self.next.checked_sub(back).unwrap_or(self.next)
     }
 
-    /// Returns the ticks due at `now` and counts them as done.
+    /// Returns the number of ticks due at `now`, and counts them as done.
     fn due(&mut self, now: Instant) -> u32 {
         let given_up = now.saturating_duration_since(self.next).saturating_sub(self.most_behind);
         self.lost += given_up;
@@ -194,10 +191,10 @@ mod tests {
     const MS: Duration = Duration::from_millis(1);
 
     #[test]
-    fn on_time_nothing_is_lost_and_late_wake_ups_are_made_good() {
+    fn catches_up_after_late_wake_ups_without_loss() {
         let start = Instant::now();
         let mut pacer = Pacer::new(start, 1.0);
-        // Wake-ups 1 to 30 ms late, as on a busy machine.
+        // Wake-ups that are 1 to 30 ms late, as on a busy machine.
         let mut ticks = 0;
         let mut now = start;
         for i in 0..1000u32 {
@@ -210,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_pause_is_given_up_but_for_a_tenth_of_a_second() {
+    fn drops_a_long_pause_except_a_tenth_of_a_second() {
         let start = Instant::now();
         let mut pacer = Pacer::new(start, 1.0);
         assert_eq!(pacer.due(start), 1);

@@ -1,7 +1,7 @@
-//! Sensors of the autopilot board: what is true in, what is measured out. 400 Hz.
+//! Sensors of the autopilot board: true values in, measured values out, 400 Hz.
 //!
-//! Accelerometer and gyro with white noise and a slowly walking bias, and a barometer that is only
-//! good enough to come down by. How much of each is a [`ImuModel`], by the name of a chip.
+//! Accelerometer and gyro have white noise and a slowly drifting bias. The barometer is only good enough for a descent.
+//! An [`ImuModel`], named after a chip, sets the errors.
 
 mod model;
 
@@ -12,33 +12,32 @@ pub use model::{ImuModel, MODELS, UnknownImu};
 use crate::motor::MAX_SPEED_RADPS;
 use crate::noise::Noise;
 
-/// The widest range of an accelerometer that an autopilot reads: where it clips by its own count. [m/s^2]
+/// Maximum range of an accelerometer that an autopilot reads, from which it counts clipping [m/s^2].
 pub const ACCEL_RANGE_MPS2: f64 = 157.0;
-/// White noise of the barometer per sample at 400 Hz, propeller wash included. [m]
+/// White noise of the barometer per sample at 400 Hz, including propeller wash [m].
 const BARO_SIGMA_M: f64 = 0.4;
-/// Random walk of the barometer with weather and doors. [m / sqrt(s)]
+/// Random walk of the barometer by weather and doors [m / sqrt(s)].
 const BARO_WALK: f64 = 0.02;
 
-/// Vibration of the gyro per vibration of the accelerometer: what shakes the board by 1 m/s^2 at
-/// 200 Hz with a lever of 20 mm turns it so fast. [rad/s / (m/s^2)]
+/// Vibration of the gyro per vibration of the accelerometer [rad/s / (m/s^2)]: 1 m/s^2 at 200 Hz with a lever of 20 mm.
 const GYRO_SHARE: f64 = 0.01;
 
 /// One sample of all sensors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SensorSample {
-    /// Specific force. [m/s^2, body]
+    /// Specific force [m/s^2, body].
     pub accel_body_mps2: DVec3,
-    /// Angular velocity. [rad/s, body]
+    /// Angular velocity [rad/s, body].
     pub gyro_body_radps: DVec3,
-    /// Barometric height over an arbitrary datum. [m]
+    /// Barometric height over an arbitrary datum [m].
     pub baro_m: f64,
-    /// Battery voltage by the power module. [V]
+    /// Battery voltage measured by the power module [V].
     pub battery_v: f64,
-    /// Battery current by the power module. [A]
+    /// Battery current measured by the power module [A].
     pub battery_a: f64,
 }
 
-/// The sensors with their errors.
+/// Simulated sensors with their errors.
 #[derive(Clone, Debug)]
 pub struct Imu {
     model: ImuModel,
@@ -46,21 +45,21 @@ pub struct Imu {
     gyro_bias: DVec3,
     accel_bias: DVec3,
     baro_bias_m: f64,
-    /// Amplitude at full throttle. [m/s^2]
+    /// Amplitude of vibration at full throttle [m/s^2].
     vibration_mps2: f64,
-    /// Angle of each rotor. [rad]
+    /// Angle of each rotor [rad].
     rotor_angle: [f64; 4],
 }
 
 impl Imu {
-    /// Makes sensors whose errors follow from `seed`.
+    /// Returns sensors whose errors follow from `seed`.
     pub fn new(model: ImuModel, seed: u64) -> Self {
         let mut noise = Noise::new(seed, 1);
         Self {
             model,
             gyro_bias: noise.gaussian3() * model.gyro_bias_radps,
             accel_bias: noise.gaussian3() * model.accel_bias_mps2,
-            // A datum far from the floor's, so that nobody takes it for one.
+            // A datum far from the floor's height, so that using it as height fails visibly.
             baro_bias_m: 100.0 + noise.gaussian(),
             noise,
             vibration_mps2: 0.0,
@@ -68,12 +67,12 @@ impl Imu {
         }
     }
 
-    /// Sets the amplitude with which unbalanced rotors shake the board at full throttle. [m/s^2]
+    /// Sets the amplitude of the board's vibration by unbalanced rotors at full throttle [m/s^2].
     pub fn set_vibration(&mut self, vibration_mps2: f64) {
         self.vibration_mps2 = vibration_mps2;
     }
 
-    /// Measures the truth `dt_s` after the last sample; the battery is measured elsewhere.
+    /// Measures the true values `dt_s` after the last sample. The battery is not included.
     pub fn sample(
         &mut self,
         specific_force_body_mps2: DVec3,
@@ -107,8 +106,8 @@ impl Imu {
 }
 
 impl Imu {
-    /// Each rotor shakes once a turn, by the square of its speed, sideways more than along its
-    /// axis. At 400 samples a second faster turns fold back, as they do in a real sensor.
+    /// Returns the vibration of the board. Each rotor excites once per turn, by the square of its speed, more sideways
+    /// than along its axis. At 400 samples a second, faster turns alias, as in a real sensor.
     fn shake_mps2(&mut self, rotor_speed: [f64; 4], dt_s: f64) -> DVec3 {
         let mut shake = DVec3::ZERO;
         if self.vibration_mps2 > 0.0 {

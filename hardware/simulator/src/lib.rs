@@ -1,5 +1,5 @@
-//! The lab in software: what the rest of VizFlyt sees of it are two protocols, MAVLink 2 of an
-//! ArduCopter and Vicon's UDP object stream, exactly as in a room.
+//! The lab in software. VizFlyt connects to it as to a real lab: MAVLink 2 of an ArduCopter, and Vicon's UDP object
+//! stream.
 //!
 //! ```text
 //! motors -> airframe (RK4, 800 Hz) -> imu (400 Hz) -> autopilot: estimator -> control -> motors
@@ -8,9 +8,9 @@
 //!                 +-> truth: clearance, speed, path; truth_feed (400 Hz) -> UDP, for simulated cameras
 //! ```
 //!
-//! Everything but [`driver`], `link`, [`truth_feed`] and `stop` is sans-IO: bytes, samples and `dt` in, bytes and
-//! commands out, so that a test flies minutes in milliseconds and the same seed gives the same
-//! flight. [`simulation`] holds the parts together on one virtual clock.
+//! Everything except [`driver`], `link`, [`truth_feed`] and `stop` is sans-IO: bytes, samples and `dt` in, bytes and
+//! commands out. Tests therefore fly minutes in milliseconds, and the same seed gives the same flight. [`simulation`]
+//! combines the parts on one virtual clock.
 
 pub mod airframe;
 pub mod battery;

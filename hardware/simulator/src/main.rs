@@ -1,4 +1,4 @@
-//! The simulated lab as a program of its own; `vizflyt sim` is the same.
+//! The simulated lab as a separate program, identical to `vizflyt sim`.
 
 use std::io::IsTerminal;
 

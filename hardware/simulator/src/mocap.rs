@@ -1,6 +1,6 @@
-//! Motion capture: the true pose in, what a system of cameras makes of it out. 200 Hz.
+//! Motion capture: the true pose in, measured poses out, 200 Hz.
 //!
-//! How that is written on the wire, by which vendor: [`formats`]; who sends it: [`feed`].
+//! [`formats`] encodes them for the wire, [`feed`] sends them.
 
 pub mod feed;
 pub mod formats;
@@ -13,25 +13,25 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use crate::noise::Noise;
 
-/// Longest object name. [bytes]
+/// Maximum length of an object name [bytes].
 pub const MAX_NAME: usize = 24;
-/// Time between two poses. [s]
+/// Interval between poses [s].
 const INTERVAL_S: f64 = 0.005;
-/// White noise of a marker cluster's position. [m]
+/// White noise of a marker cluster's position [m].
 const POSITION_SIGMA_M: f64 = 0.0003;
-/// White noise of a marker cluster's orientation: 0.1 degrees. [rad]
+/// White noise of a marker cluster's orientation [rad]: 0.1 degrees.
 const ROTATION_SIGMA_RAD: f64 = 0.1 * std::f64::consts::PI / 180.0;
 
-/// What is tracked, and how badly.
+/// Tracked object, and errors of the system.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MocapConfig {
     /// Object name, at most [`MAX_NAME`] bytes.
     pub object: String,
     /// Seed of noise and loss.
     pub seed: u64,
-    /// Nothing is sent after this. [s]
+    /// Time after which nothing is sent [s].
     pub stop_after_s: Option<f64>,
-    /// Added between exposure and sending. [s]
+    /// Latency between exposure and sending [s].
     pub latency_s: f64,
     /// Share of datagrams lost at random, 0 to 1.
     pub loss: f64,
@@ -43,18 +43,18 @@ impl Default for MocapConfig {
     }
 }
 
-/// What the cameras saw.
+/// Measured pose of one exposure.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sight {
-    /// Counts their images, from 1.
+    /// Frame number, from 1.
     pub frame: u32,
-    /// When they were exposed.
+    /// Time of the exposure.
     pub at: AutopilotTime,
-    /// Where the vehicle seemed to be.
+    /// Measured pose of the vehicle.
     pub world_from_body: Pose<World, Body>,
 }
 
-/// The motion capture system.
+/// Simulated motion capture system.
 #[derive(Clone, Debug)]
 pub struct Mocap {
     config: MocapConfig,
@@ -65,13 +65,13 @@ pub struct Mocap {
 }
 
 impl Mocap {
-    /// Makes a system that tracks one object.
+    /// Returns a system that tracks one object.
     pub fn new(config: MocapConfig) -> Self {
         let noise = Noise::new(config.seed, 2);
         Self { config, noise, frame: 0, due: AutopilotTime::ZERO, waiting: VecDeque::new() }
     }
 
-    /// Looks at the true pose; measures it if it is time to.
+    /// Measures the true pose if the next exposure is due.
     pub fn handle_truth(&mut self, now: AutopilotTime, pose: &Pose<World, Body>) {
         if now < self.due {
             return;
@@ -93,7 +93,7 @@ impl Mocap {
         }
     }
 
-    /// Returns the next sight whose time to be sent has come.
+    /// Returns the next measured pose that is due to be sent.
     pub fn poll_transmit(&mut self, now: AutopilotTime) -> Option<Sight> {
         match self.waiting.front() {
             Some(&(at, sight)) if at <= now => {
@@ -115,7 +115,7 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
-    /// Runs for `seconds` and returns (time sent [ms], frame, position [m]).
+    /// Runs for `seconds`. Returns (time sent [ms], frame, position [m]).
     fn run(config: MocapConfig, seconds: f64) -> Vec<(u64, u32, DVec3)> {
         let mut mocap = Mocap::new(config);
         let pose = Pose::new(DVec3::new(1.0, 2.0, 3.0), DQuat::IDENTITY);
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn two_hundred_poses_a_second_with_little_noise() {
+    fn sends_two_hundred_poses_a_second_with_the_given_noise() {
         let sent = run(MocapConfig::default(), 5.0);
         assert_eq!(sent.len(), 1000);
         let squares = sent.iter().map(|s| (s.2.x - 1.0).powi(2)).sum::<f64>();
@@ -141,13 +141,13 @@ mod tests {
     }
 
     #[test]
-    fn impairments_stop_delay_and_drop() {
+    fn stops_delays_and_drops_as_configured() {
         let stopped = run(MocapConfig { stop_after_s: Some(1.0), ..Default::default() }, 3.0);
         assert!(stopped.len() == 201 && stopped.last().unwrap().0 == 1000);
         let late = run(MocapConfig { latency_s: 0.03, ..Default::default() }, 1.0);
         assert_eq!(late[0].0, 30);
         let lossy = run(MocapConfig { loss: 0.3, ..Default::default() }, 10.0);
         assert!((1300..1500).contains(&lossy.len()), "{}", lossy.len());
-        assert!(lossy.last().unwrap().1 > 1990, "frame numbers go on over losses");
+        assert!(lossy.last().unwrap().1 > 1990, "frame numbers continue over losses");
     }
 }

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use vizflyt_protocol::random::{self, SplitMix64};
 
-/// A stream of pseudo-random numbers; Gaussian by Box and Muller (1958).
+/// Stream of pseudo-random numbers; Gaussian by Box and Muller (1958).
 #[derive(Clone, Debug)]
 pub(crate) struct Noise {
     random: SplitMix64,
@@ -11,19 +11,19 @@ pub(crate) struct Noise {
 }
 
 impl Noise {
-    /// Makes the stream `stream` of `seed`; streams of one seed are independent.
+    /// Returns stream number `stream` of `seed`; streams of one seed are independent.
     pub(crate) fn new(seed: u64, stream: u64) -> Self {
-        // One output as the start, so that near seeds and near streams do not overlap.
+        // The start is a hash of the seed, so that neighbouring seeds and streams do not overlap.
         let start = random::nth(seed, 0) ^ stream.wrapping_mul(0xD1B5_4A32_D192_ED03);
         Self { random: SplitMix64::new(start), spare: None }
     }
 
-    /// Returns a number in [0, 1), uniformly.
+    /// Returns a uniform number in [0, 1).
     pub(crate) fn uniform(&mut self) -> f64 {
         self.random.unit()
     }
 
-    /// Returns a number of zero mean and unit variance.
+    /// Returns a Gaussian number of zero mean and unit variance.
     pub(crate) fn gaussian(&mut self) -> f64 {
         if let Some(spare) = self.spare.take() {
             return spare;
@@ -46,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn moments_are_those_of_a_gaussian() {
+    fn gaussian_numbers_have_unit_variance() {
         let mut noise = Noise::new(3, 1);
         let values: Vec<f64> = (0..40_000).map(|_| noise.gaussian()).collect();
         let mean = values.iter().sum::<f64>() / values.len() as f64;
@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn streams_of_one_seed_differ_and_repeat() {
+    fn streams_are_independent_and_repeatable() {
         let draw = |seed, stream| Noise::new(seed, stream).gaussian3();
         assert_eq!(draw(7, 1), draw(7, 1));
         assert_ne!(draw(7, 1), draw(7, 2));

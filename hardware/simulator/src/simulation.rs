@@ -1,8 +1,8 @@
-//! The whole lab on one virtual clock: airframe, sensors, autopilot, mocap, referee. Sans-IO: the
-//! caller turns the crank with [`Simulation::tick`] and carries bytes.
+//! The whole lab on one virtual clock: airframe, sensors, autopilot, mocap, referee. Sans-IO: the caller runs
+//! [`Simulation::tick`] and transports the bytes.
 //!
-//! One tick is 2.5 ms: two physics steps, one sensor sample, one turn of the autopilot, and every
-//! second time a mocap pose. What breaks, and when, is in [`faults`].
+//! One tick is 2.5 ms: two physics steps, one sensor sample, one autopilot step, and every second time a mocap pose.
+//! [`faults`] contains simulated failures.
 
 pub mod faults;
 mod hand;
@@ -26,60 +26,60 @@ use crate::wifi::{Wifi, WifiConfig};
 use crate::wind::Wind;
 use faults::{Due, Faults};
 
-/// Ticks a second: the rate of ArduCopter's main loop. [Hz]
+/// Ticks a second: the rate of ArduCopter's main loop [Hz].
 pub const TICK_HZ: u64 = 400;
 const TICK_NS: i64 = 1_000_000_000 / TICK_HZ.cast_signed();
 pub(crate) const TICK_S: f64 = 1.0 / TICK_HZ as f64;
-/// Physics steps a tick: 800 Hz.
+/// Physics steps per tick: 800 Hz.
 const STEPS: u32 = 2;
 
-/// An autopilot that reboots is silent for this long. [s]
+/// Time for which a rebooting autopilot is silent [s].
 const BOOT_S: f64 = 1.5;
-/// With [`Startup::Quick`] the vehicle has stood powered for this long before the start: its estimator is aligned,
-/// and remembers the half second that late measurements are compared with. [s]
+/// Time powered before the start with [`Startup::Quick`] [s]: the estimator is aligned, and has stored the half second
+/// that late measurements need.
 const POWERED_S: f64 = ALIGN_S + 0.6;
 
-/// The lab as it stands at the start.
+/// Configuration of the lab.
 #[derive(Clone, Debug)]
 pub struct SimulationConfig {
-    /// Where the vehicle stands; z is the floor. [m, world]
+    /// Start position of the vehicle; z is the floor [m, world].
     pub spawn_m: DVec3,
-    /// Which way it looks. [rad, world]
+    /// Start yaw [rad, world].
     pub spawn_yaw_rad: f64,
     /// Seed of all noise.
     pub seed: u64,
-    /// Obstacles of the virtual scene, for the referee only: the vehicle flies through them.
+    /// Obstacles of the virtual scene, only for the referee: the vehicle flies through them.
     pub obstacles: Vec<Volume>,
-    /// Radius of the vehicle's body, for the referee. [m]
+    /// Radius of the vehicle's body, for the referee [m].
     pub body_radius_m: f64,
-    /// The motion capture; its seed is replaced by `seed`.
+    /// Motion capture; its seed is replaced by `seed`.
     pub mocap: MocapConfig,
-    /// The motion capture sees somebody carry the vehicle about instead.
+    /// Whether a person carries the vehicle instead of a flight.
     pub hand: bool,
-    /// How long the autopilot takes to be ready.
+    /// Start-up behaviour of the autopilot.
     pub startup: Startup,
     /// Autopilot parameters that differ from the defaults.
     pub params: Vec<(String, f32)>,
-    /// Steady wind. [m/s, world]
+    /// Steady wind [m/s, world].
     pub wind_world_mps: DVec3,
-    /// Standard deviation of gusts along each horizontal axis. [m/s]
+    /// Standard deviation of gusts along each horizontal axis [m/s].
     pub gust_mps: f64,
-    /// The errors of the autopilot's inertial sensor.
+    /// Errors of the autopilot's inertial sensor.
     pub imu: ImuModel,
-    /// Amplitude with which the rotors shake the sensors at full throttle. [m/s^2]
+    /// Amplitude of vibration by the rotors at full throttle [m/s^2].
     pub vibration_mps2: f64,
     /// Charge of the battery at the start, 0 to 1.
     pub battery_share: f64,
-    /// A receiver is connected and a transmitter is on.
+    /// Whether a receiver is connected and its transmitter is on.
     pub radio: bool,
-    /// What breaks, and when.
+    /// Simulated failures.
     pub faults: Faults,
-    /// MAVLink goes over this Wi-Fi; over a cable if absent.
+    /// Wi-Fi model for MAVLink; a cable if absent.
     pub wifi: Option<WifiConfig>,
 }
 
 impl SimulationConfig {
-    /// Returns the default lab with a vehicle that moves as one set up by `hardware/airframe`.
+    /// Returns the default lab with the motion parameters of `hardware/airframe`.
     pub fn airframe() -> Self {
         Self { params: airframe(), ..Self::default() }
     }
@@ -109,45 +109,45 @@ impl Default for SimulationConfig {
     }
 }
 
-/// What the simulation reports at its end.
+/// Final report of the simulation.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SimulationReport {
-    /// The referee's figures.
+    /// Figures of the referee.
     #[serde(flatten)]
     pub truth: TruthReport,
-    /// Horizontal error of the autopilot's estimate in flight, root mean square. [m]
+    /// Horizontal error of the autopilot's estimate in flight, root mean square [m].
     pub estimate_error_m_rms: f64,
-    /// Motors may turn.
+    /// Whether the vehicle is armed.
     pub armed: bool,
     /// ArduCopter's mode number.
     pub mode: u32,
-    /// Simulated time since the start. [s]
+    /// Simulated time since the start [s].
     pub seconds: f64,
-    /// MAVLink packets received.
+    /// Received MAVLink packets.
     pub mavlink_packets_in: u64,
-    /// MAVLink packets sent.
+    /// Sent MAVLink packets.
     pub mavlink_packets_out: u64,
-    /// MAVLink packets dropped unsent because nobody took them in time.
+    /// MAVLink packets dropped because they were not sent in time.
     pub mavlink_packets_dropped: u64,
     /// Packets ignored because they were not signed with the autopilot's key.
     pub mavlink_packets_refused: u64,
-    /// Mocap poses sent.
+    /// Sent mocap poses.
     pub mocap_poses: u64,
-    /// MAVLink packets that the simulated Wi-Fi lost, both ways.
+    /// MAVLink packets lost by the Wi-Fi model, in both directions.
     pub wifi_packets_lost: u64,
-    /// Times the autopilot has rebooted.
+    /// Number of reboots of the autopilot.
     pub reboots: u32,
 }
 
-/// The lab.
+/// Simulated lab.
 pub struct Simulation {
     now: AutopilotTime,
-    /// When the autopilot began to run; its clock counts from here.
+    /// Start of the autopilot's clock.
     booted_at: AutopilotTime,
-    /// Time for which the autopilot ran before the start. [ns]
+    /// Time for which the autopilot ran before the start [ns].
     powered_ns: u64,
     reboots: u32,
-    /// To the autopilot, and from it.
+    /// Wi-Fi model to and from the autopilot.
     wifi: Option<[Wifi; 2]>,
     airframe: Airframe,
     wind: Wind,
@@ -156,7 +156,7 @@ pub struct Simulation {
     battery: Battery,
     autopilot: Autopilot,
     mocap: Mocap,
-    /// Where it is carried from.
+    /// Start pose, if a person carries the vehicle.
     hand: Option<Pose<World, Body>>,
     truth: Truth,
     motors: [f64; 4],
@@ -167,7 +167,7 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// Puts the vehicle down and boots the autopilot.
+    /// Places the vehicle and boots the autopilot.
     ///
     /// # Errors
     /// Returns the first parameter name that the autopilot does not have.
@@ -206,7 +206,7 @@ impl Simulation {
         Ok(simulation)
     }
 
-    /// Runs the autopilot of the standing vehicle before the start. It sends nothing yet.
+    /// Runs the autopilot of the standing vehicle before the start, without sending.
     fn stand_powered(&mut self) {
         let state = *self.airframe.state();
         let felt_body = self.airframe.specific_force_body_mps2();
@@ -234,12 +234,11 @@ impl Simulation {
         self.airframe.state()
     }
 
-    /// Returns the autopilot.
     pub fn autopilot(&self) -> &Autopilot {
         &self.autopilot
     }
 
-    /// Returns the time on the autopilot's own clock, which restarts at 0 when it reboots.
+    /// Returns the time on the autopilot's clock, which restarts at 0 when it reboots.
     pub fn autopilot_now(&self) -> AutopilotTime {
         let since_ns = self.now.as_ns().saturating_sub(self.booted_at.as_ns());
         AutopilotTime::from_ns(since_ns + self.powered_ns)
@@ -249,12 +248,12 @@ impl Simulation {
         self.now.seconds_since(AutopilotTime::ZERO)
     }
 
-    /// Sets the steady wind. [m/s, world]
+    /// Sets the steady wind [m/s, world].
     pub fn set_wind(&mut self, wind_world_mps: DVec3) {
         self.wind.set_steady(wind_world_mps);
     }
 
-    /// Breaks a motor, from 0 in ArduCopter's order: it gives this share of its thrust.
+    /// Reduces the thrust of a motor (ArduCopter's order, from 0) to this share.
     pub fn break_motor(&mut self, motor: usize, share: f64) {
         self.airframe.break_motor(motor, share);
     }
@@ -264,7 +263,7 @@ impl Simulation {
         self.autopilot.set_radio(radio);
     }
 
-    /// The autopilot loses power for a moment: motors stop, it forgets all but its parameters, and
+    /// Interrupts the autopilot's power: motors stop, it loses all state except stored parameters, fence and key, and
     /// is silent for [`BOOT_S`].
     pub fn reboot(&mut self) {
         tracing::info!(target: "autopilot", "reboots");
@@ -279,8 +278,7 @@ impl Simulation {
         self.now < self.booted_at
     }
 
-    /// Takes bytes of a MAVLink link, one of [`MAX_LINKS`]. Each is a stream of its own; what is
-    /// sent goes to all.
+    /// Takes bytes of a MAVLink link, one of [`MAX_LINKS`]. Each link is a separate stream; sent packets go to all.
     pub fn handle_mavlink(&mut self, link: usize, bytes: &[u8]) {
         match &mut self.wifi {
             Some([up, _]) => up.send(self.now, link, bytes),
@@ -311,7 +309,7 @@ impl Simulation {
         Some(whole)
     }
 
-    /// Returns what the motion capture is to send next.
+    /// Returns the next pose that the motion capture sends.
     pub fn poll_mocap(&mut self) -> Option<Sight> {
         let sight = self.mocap.poll_transmit(self.now)?;
         self.mocap_poses += 1;
@@ -323,12 +321,12 @@ impl Simulation {
         self.mocap.object()
     }
 
-    /// Returns where the vehicle truly is.
+    /// Returns the true pose of the vehicle.
     pub fn true_pose(&self) -> Pose<World, Body> {
         self.airframe.state().pose()
     }
 
-    /// Goes on by one tick of 2.5 ms.
+    /// Advances by one tick of 2.5 ms.
     pub fn tick(&mut self) {
         let dt_s = TICK_S / f64::from(STEPS);
         let mut felt_body = DVec3::ZERO;
@@ -348,7 +346,7 @@ impl Simulation {
 
         let steps = f64::from(STEPS);
         let (felt_body, omega_body) = match &self.hand {
-            // In a hand it feels the hand, and stands on no floor.
+            // In a hand, the IMU measures the hand's motion, without contact to the floor.
             Some(world_from_start) => hand::felt(world_from_start, self.since_start_s(), TICK_S),
             None => (felt_body / steps, omega_body / steps),
         };
@@ -387,7 +385,7 @@ impl Simulation {
         }
     }
 
-    /// Returns the figures so far.
+    /// Returns the present figures.
     pub fn report(&self) -> SimulationReport {
         SimulationReport {
             truth: self.truth.report(),

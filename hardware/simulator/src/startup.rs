@@ -1,19 +1,19 @@
-//! How long the autopilot takes from power to flight.
+//! Time from power-on of the autopilot until it can fly.
 
-/// The autopilot's start.
+/// Start-up behaviour of the autopilot.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Startup {
-    /// As ArduCopter's: the estimator aligns after power-on, the position counts after a second of external
+    /// Like ArduCopter: the estimator aligns after power-on, the position is valid after a second of external
     /// navigation, and a state is reported when its stream is due.
     #[default]
     Realistic,
-    /// For flights that start at once: the vehicle has stood powered before the start, the position counts
-    /// after a few poses, and a change that a companion waits for is reported at once.
+    /// For flights that start at once: the vehicle was powered before the start, the position is valid after a few
+    /// poses, and state changes that a companion waits for are reported at once.
     Quick,
 }
 
 impl Startup {
-    /// Time for which vision must have been fused before the position counts. [s]
+    /// Time of fused vision until the position is valid [s].
     pub(crate) fn settle_s(self) -> f64 {
         match self {
             Self::Realistic => 1.0,

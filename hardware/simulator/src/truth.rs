@@ -1,7 +1,7 @@
-//! The referee: measures the true flight against the true geometry, every physics step.
+//! Referee: measures the true flight against the true geometry at every physics step.
 //!
-//! Distances never change faster than the vehicle moves, so an obstacle is measured again only
-//! when the way flown since could have made it the nearest.
+//! A distance cannot change faster than the vehicle moves. An obstacle is therefore measured again only if it could
+//! have become the nearest, given the distance flown.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -10,53 +10,52 @@ use vizflyt_protocol::mavlink::CopterMode;
 
 use crate::airframe::AirframeState;
 
-/// The vehicle counts as flying this far above the floor. [m]
+/// Height above the floor from which the vehicle counts as flying [m].
 const AIRBORNE_M: f64 = 0.05;
-/// A course starts when the vehicle first moves along the ground this fast. [m/s]
+/// Ground speed at which a course starts [m/s].
 const UNDER_WAY_MPS: f64 = 0.5;
 
-/// The figures of a flight. JSON keys are the field names.
+/// Figures of a flight. JSON keys are the field names.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TruthReport {
-    /// Least distance of the body's surface to an obstacle while airborne; absent without
-    /// obstacles or flight. [m]
+    /// Minimum distance of the body's surface to an obstacle while airborne [m]; absent without obstacles or flight.
     pub min_clearance_m: Option<f64>,
-    /// Where that was. [m, world]
+    /// Position of the minimum clearance [m, world].
     pub min_clearance_at_m: Option<DVec3>,
-    /// The body touched an obstacle.
+    /// Whether the body touched an obstacle.
     pub collided: bool,
-    /// Mean speed from leaving the floor until LAND was entered. [m/s]
+    /// Mean speed from take-off until LAND was entered [m/s].
     pub mean_speed_mps: f64,
-    /// The same from first moving along the ground, without the take-off. [m/s]
+    /// Mean speed from the first motion along the ground, without the take-off [m/s].
     pub mean_speed_under_way_mps: f64,
-    /// Largest speed while airborne. [m/s]
+    /// Maximum speed while airborne [m/s].
     pub max_speed_mps: f64,
-    /// Way flown while airborne. [m]
+    /// Distance flown while airborne [m].
     pub path_m: f64,
-    /// Time airborne. [s]
+    /// Time airborne [s].
     pub flight_seconds: f64,
-    /// The vehicle has flown, stands on the floor, and is disarmed.
+    /// Whether the vehicle has flown, stands on the floor, and is disarmed.
     pub landed: bool,
-    /// Position at the end. [m, world]
+    /// Position at the end [m, world].
     pub final_position_m: DVec3,
 }
 
-/// An obstacle with what is known of its distance.
+/// Obstacle with its last measured distance.
 #[derive(Clone, Debug)]
 struct Obstacle {
     volume: Volume,
-    /// Distance from the body's centre when it was measured, plus the way flown until then. [m]
+    /// Last measured distance from the body's centre, plus the distance travelled until then [m].
     distance_plus_path_m: f64,
 }
 
-/// The referee.
+/// Measures one flight.
 #[derive(Clone, Debug)]
 pub struct Truth {
     obstacles: Vec<Obstacle>,
     body_radius_m: f64,
     floor_z_m: f64,
     last_p: Option<DVec3>,
-    /// Way since the start, on the ground too. [m]
+    /// Distance travelled since the start, also on the ground [m].
     travelled_m: f64,
     nearest: Option<(f64, DVec3)>,
     airborne_s: f64,
@@ -69,7 +68,7 @@ pub struct Truth {
     landed: bool,
 }
 
-/// A mean speed in the making.
+/// Accumulator of a mean speed.
 #[derive(Clone, Copy, Debug, Default)]
 struct Mean {
     path_m: f64,
@@ -88,9 +87,8 @@ impl Mean {
 }
 
 impl Truth {
-    /// Makes a referee for a body of a radius [m] among obstacles, over a floor at a height [m,
-    /// world]. Floors among the obstacles (half-spaces facing up) are left out: landing is not a
-    /// collision.
+    /// Returns a referee for a body of a radius [m] among obstacles, over a floor at a height [m, world]. Floors among
+    /// the obstacles (half-spaces facing up) are excluded, because landing is not a collision.
     pub fn new(obstacles: &[Volume], body_radius_m: f64, floor_z_m: f64) -> Self {
         let is_floor =
             |v: &Volume| matches!(v, Volume::HalfSpace { normal, .. } if normal.z > 0.99);
@@ -116,7 +114,7 @@ impl Truth {
         }
     }
 
-    /// Looks at the vehicle after a step of `dt_s`.
+    /// Measures the vehicle after a step of `dt_s`.
     pub fn tick(&mut self, state: &AirframeState, armed: bool, mode: CopterMode, dt_s: f64) {
         let p = state.p_world_m;
         let step_m = (p - self.last_p.unwrap_or(p)).length();
@@ -146,7 +144,7 @@ impl Truth {
         self.measure(p);
     }
 
-    /// Returns the time since the vehicle first left the floor; 0 before. [s]
+    /// Returns the time since the first take-off; 0 before [s].
     pub fn since_take_off_s(&self) -> f64 {
         self.since_take_off_s
     }
@@ -167,7 +165,7 @@ impl Truth {
         }
     }
 
-    /// Returns the figures so far.
+    /// Returns the present figures.
     pub fn report(&self) -> TruthReport {
         TruthReport {
             min_clearance_m: self.nearest.map(|(clearance_m, _)| clearance_m),
@@ -204,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flight_past_a_post_is_measured() {
+    fn measures_a_flight_past_a_post() {
         let floor = Volume::HalfSpace { normal: DVec3::Z, offset_m: 0.0 };
         let mut truth = Truth::new(&[floor, post(5.0, 0.5)], 0.12, 0.0);
         let v = DVec3::X * 2.0;
@@ -224,16 +222,16 @@ mod tests {
     }
 
     #[test]
-    fn touching_is_colliding_and_the_ground_is_not() {
+    fn contact_with_an_obstacle_but_not_with_the_floor_is_a_collision() {
         let mut truth = Truth::new(&[post(1.0, 0.0)], 0.12, 0.0);
         truth.tick(&state(DVec3::new(0.85, 0.0, 0.0), DVec3::ZERO), true, CopterMode::Guided, 0.01);
-        assert_eq!(truth.report().min_clearance_m, None, "on the ground nothing is measured");
+        assert_eq!(truth.report().min_clearance_m, None, "not measured on the ground");
         truth.tick(&state(DVec3::new(0.85, 0.0, 1.0), DVec3::ZERO), true, CopterMode::Guided, 0.01);
         assert!(truth.report().collided);
     }
 
     proptest! {
-        /// Skipping far obstacles never changes the result.
+        /// Skipping far obstacles does not change the result.
         #[test]
         fn skipping_is_exact(
             posts in prop::collection::vec((-5.0..5.0f64, -5.0..5.0f64), 1..30),

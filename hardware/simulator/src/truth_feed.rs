@@ -1,7 +1,7 @@
-//! The true pose at every tick, as JSON over UDP: what a simulated camera draws the vehicle by. 400 Hz.
+//! Sends the true pose at every tick (400 Hz) as JSON over UDP, for programs that simulate cameras.
 //!
-//! One object a datagram, in the form of the pose packet that the render server reads, with the
-//! instant at which the pose is true on this computer's CLOCK_MONOTONIC:
+//! One object per datagram, in the format of the render server's pose packet. The stamp is the instant of the pose on
+//! this computer's CLOCK_MONOTONIC:
 //! ```json
 //! {"vizflyt_pose":1,"object":"vizflyt","seq":7,"stamp_ns":81250000,"clock":"server",
 //!  "position_m":[1.0,2.0,0.1],"rotation_xyzw":[0.0,0.0,0.0,1.0]}
@@ -23,12 +23,12 @@ pub struct TruthFeed {
     target: SocketAddr,
     object: String,
     seq: u64,
-    /// An instant, and what CLOCK_MONOTONIC was then. [ns]
+    /// An instant, and the value of CLOCK_MONOTONIC at it [ns].
     anchor: (Instant, u64),
 }
 
 impl TruthFeed {
-    /// Opens a socket to send to `target` where the vehicle named `object` is.
+    /// Opens a socket that sends poses of the vehicle named `object` to `target`.
     ///
     /// # Errors
     /// Fails if no socket can be opened, or the clock cannot be read.
@@ -45,14 +45,14 @@ impl TruthFeed {
         })
     }
 
-    /// Sends the pose that is true `at` an instant.
+    /// Sends the pose that is true at instant `at`.
     pub fn send(&mut self, at: Instant, world_from_body: &Pose<World, Body>) {
         self.seq += 1;
         let (instant, ns) = self.anchor;
         let since_ns = |a: Instant, b: Instant| a.saturating_duration_since(b).as_nanos() as u64;
         let stamp_ns = (ns + since_ns(at, instant)).saturating_sub(since_ns(instant, at));
         let datagram = packet(&self.object, self.seq, stamp_ns, world_from_body);
-        // Lost like any datagram if nobody listens.
+        // Without a receiver, the datagram is lost.
         let _ = self.socket.send_to(datagram.to_string().as_bytes(), self.target);
     }
 }
@@ -76,7 +76,7 @@ mod tests {
     use std::time::Duration;
 
     #[test]
-    fn poses_arrive_with_the_instant_they_were_true_at() {
+    fn poses_arrive_with_their_instant() {
         let listener = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut feed = TruthFeed::open(listener.local_addr().unwrap(), "drone").unwrap();
         let pose = Pose::new(DVec3::new(1.0, -2.0, 0.5), DQuat::from_rotation_z(0.3));

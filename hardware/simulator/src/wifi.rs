@@ -1,11 +1,11 @@
-//! The radio link of a Wi-Fi bridge, both ways: packets in, packets out later, or never. Sans-IO, a
-//! decorator between the autopilot and whatever carries its bytes.
+//! Model of a Wi-Fi bridge's radio link in one direction: delays or drops packets. Sans-IO, between the autopilot and
+//! its sockets.
 //!
-//! - Batching: a bridge sends what its UART brought when a batch has grown old enough or full.
-//! - Latency: a constant, and what contention for the air adds, exponentially distributed.
-//! - Loss in bursts: Gilbert's two states (E. N. Gilbert, BSTJ 1960), entered per batch.
+//! - Batching: a bridge sends UART data when a batch is old or large enough.
+//! - Latency: a constant, plus an exponentially distributed part for contention.
+//! - Loss in bursts: Gilbert's two states (E. N. Gilbert, BSTJ 1960), updated per batch.
 //!
-//! Order is kept, as one access point keeps it.
+//! Order is kept, as with one access point.
 
 use std::collections::VecDeque;
 
@@ -13,26 +13,25 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use crate::noise::Noise;
 
-/// How good the link is.
+/// Quality of the link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WifiConfig {
-    /// Seed of latency and loss.
     pub seed: u64,
-    /// Constant part of the latency. [s]
+    /// Constant part of the latency [s].
     pub latency_s: f64,
-    /// Mean of what is added to it. [s]
+    /// Mean of the variable part of the latency [s].
     pub jitter_s: f64,
-    /// Share of batches lost, 0 to 1.
+    /// Share of lost batches, 0 to 1.
     pub loss: f64,
-    /// Mean length of a burst of losses. [batches]
+    /// Mean length of a burst of losses [batches].
     pub burst: f64,
-    /// A batch waits at least and at most this long, uniformly. [s]
+    /// Minimum and maximum wait of a batch, uniformly distributed [s].
     pub batch_s: (f64, f64),
 }
 
 impl Default for WifiConfig {
-    /// An ESP8266 next to its access point: 2 ms over the air and 1 ms of contention, 1 % of the
-    /// batches lost, three in a row, batches of 2 to 5 ms as mavesp8266 makes them.
+    /// An ESP8266 next to its access point: 2 ms over the air, 1 ms of contention, 1 % of the batches lost in bursts of
+    /// three, and batches of 2 to 5 ms like mavesp8266.
     fn default() -> Self {
         Self {
             seed: 0,
@@ -45,9 +44,9 @@ impl Default for WifiConfig {
     }
 }
 
-/// Largest batch: what fits one Ethernet packet. [bytes]
+/// Maximum size of a batch: one Ethernet packet [bytes].
 const BATCH_BYTES: usize = 1400;
-/// Bytes under way at most; beyond it the newest are dropped, as by a bridge without memory. [bytes]
+/// Maximum data in transit [bytes]; more is dropped, as by a bridge with full memory.
 const MAX_QUEUED: usize = 32 * 1024;
 
 /// One direction of the link.
@@ -65,11 +64,11 @@ pub struct Wifi {
     lost: u64,
 }
 
-/// A packet, and which link it came by.
+/// Packet with the number of its MAVLink link.
 type Packet = (usize, Vec<u8>);
 
 impl Wifi {
-    /// Makes one direction; `direction` distinguishes the two.
+    /// Returns one direction; `direction` distinguishes the noise of the two.
     pub fn new(config: WifiConfig, direction: u64) -> Self {
         Self {
             config,
@@ -85,12 +84,11 @@ impl Wifi {
         }
     }
 
-    /// Returns packets lost.
+    /// Returns the number of lost packets.
     pub fn lost(&self) -> u64 {
         self.lost
     }
 
-    /// Takes a packet.
     pub fn send(&mut self, now: AutopilotTime, link: usize, packet: &[u8]) {
         if self.queued + packet.len() > MAX_QUEUED {
             self.lost += 1;
@@ -109,7 +107,7 @@ impl Wifi {
         self.queued += packet.len();
     }
 
-    /// Returns the next packet that has arrived, and which link it came by.
+    /// Returns the next packet that has arrived, with the number of its MAVLink link.
     pub fn poll(&mut self, now: AutopilotTime) -> Option<(usize, Vec<u8>)> {
         if !self.batch.is_empty() && now >= self.batch_ends {
             self.close_batch(now);
@@ -139,7 +137,7 @@ impl Wifi {
         if self.config.loss >= 1.0 {
             return true;
         }
-        // So that the share of time in a burst is the loss asked for.
+        // Chosen so that the share of time in a burst equals the configured loss.
         let enter = leave * self.config.loss / (1.0 - self.config.loss);
         self.in_burst = if self.in_burst { draw >= leave } else { draw < enter };
         self.in_burst
@@ -153,7 +151,7 @@ mod tests {
 
     const TICK_NS: u64 = 2_500_000;
 
-    /// Sends a numbered packet a tick; returns (tick sent, tick arrived).
+    /// Sends a numbered packet at every tick. Returns (tick sent, tick arrived).
     fn run(config: WifiConfig, ticks: u32) -> Vec<(u32, u32)> {
         let mut wifi = Wifi::new(config, 0);
         let mut arrived = Vec::new();
@@ -169,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn latency_loss_and_bursts_are_as_asked_for() {
+    fn latency_loss_and_bursts_match_the_configuration() {
         let config = WifiConfig { loss: 0.1, burst: 4.0, ..Default::default() };
         let arrived = run(config, 200_000);
         let share = 1.0 - arrived.len() as f64 / 200_000.0;
@@ -178,7 +176,7 @@ mod tests {
         ages.sort_unstable();
         let median_ms = f64::from(ages[ages.len() / 2]) * 2.5;
         assert!((2.0..10.0).contains(&median_ms), "{median_ms}");
-        // Gaps: a batch holds about two packets, a burst is four batches.
+        // Gaps: a batch contains about two packets, a burst is four batches.
         let gaps: Vec<u32> =
             arrived.windows(2).map(|w| w[1].0 - w[0].0 - 1).filter(|&gap| gap > 0).collect();
         let mean = f64::from(gaps.iter().sum::<u32>()) / gaps.len() as f64;
@@ -186,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_repeats_and_nothing_comes_through_a_dead_link() {
+    fn seeds_are_repeatable_and_a_dead_link_loses_everything() {
         let with = |seed| run(WifiConfig { seed, loss: 0.2, ..Default::default() }, 1000);
         assert_eq!(with(3), with(3));
         assert_ne!(with(3), with(4));
@@ -194,7 +192,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the link: packets come whole, once, in order, and no sooner than its latency.
+        /// For any link: packets arrive whole, once, in order, and not before the latency.
         #[test]
         fn packets_arrive_unchanged_and_in_order(
             seed in 0..1000u64, latency_ms in 0.0..50.0f64, jitter_ms in 0.0..20.0f64, loss in 0.0..=1.0f64,

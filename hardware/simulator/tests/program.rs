@@ -1,5 +1,4 @@
-//! The real program on loopback: it speaks first, streams the mocap, reports, and ends with its
-//! parent.
+//! The real program on loopback: it sends first, streams the mocap, reports, and ends with its parent.
 
 use std::io::{BufRead, BufReader};
 use std::net::UdpSocket;
@@ -10,7 +9,7 @@ use vizflyt_protocol::mavlink::dialect::{MavMessage, PARAM_REQUEST_READ_DATA};
 use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 use vizflyt_simulator::link::serial::SerialPort;
 
-/// Long enough for any machine: nothing here depends on how long it takes.
+/// Longer than any machine needs; no result depends on it.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 fn listen() -> (UdpSocket, String) {
@@ -33,7 +32,7 @@ fn start(mavlink: &[&str], vicon: &str) -> Child {
 }
 
 #[test]
-fn speaks_first_and_ends_with_its_parent() {
+fn sends_first_and_ends_with_its_parent() {
     let ((mavlink, mavlink_address), (vicon, vicon_address)) = (listen(), listen());
     let mavlink_endpoint = format!("udpout:{mavlink_address}");
     let mut child = start(&["--mavlink", &mavlink_endpoint], &vicon_address);
@@ -62,10 +61,9 @@ fn speaks_first_and_ends_with_its_parent() {
     assert!(child.wait().unwrap().success());
 }
 
-/// A telemetry port on a pseudo-terminal, and UDP beside it: what comes over each is understood, what
-/// is sent goes to both.
+/// A telemetry port on a pseudo-terminal, in addition to UDP: packets are accepted from both and sent to both.
 #[test]
-fn a_serial_line_carries_the_same() {
+fn serves_a_serial_line_and_udp() {
     let ((mavlink, mavlink_address), (_vicon, vicon_address)) = (listen(), listen());
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("uart");
@@ -107,5 +105,5 @@ fn a_serial_line_carries_the_same() {
     }
     drop(child.stdin.take());
     assert!(child.wait().unwrap().success());
-    assert!(!path.is_symlink(), "the link is gone with the simulator");
+    assert!(!path.is_symlink(), "the link must be removed");
 }

@@ -1,5 +1,4 @@
-//! What the bridge says by itself: each second's messages, what it does when the companion is silent, and
-//! what stations must hear of it.
+//! Messages that the bridge sends unprompted: once per second, when the companion is silent, and status texts.
 
 use core::fmt::Write as _;
 
@@ -19,17 +18,17 @@ use crate::mavlink_writer::{BridgeMessage, write_message, write_packet};
 use crate::ring::Tag;
 use crate::settings::typed_key;
 
-/// After this silence of clients' TIMESYNC we ask ourselves. [s]
+/// Time without a client's TIMESYNC after which the bridge sends one [s].
 const SYNC_S: f64 = 2.0;
-/// Changes of parameters are kept together after this. [s]
+/// Delay until changed parameters are saved; further changes within it are saved together [s].
 const SAVE_S: f64 = 1.0;
-/// The password that the bridge made is told this often. [s]
+/// Interval at which the generated password is announced [s].
 const TELL_S: f64 = 10.0;
-/// No reading, in RADIO_STATUS.
+/// "No reading" in RADIO_STATUS.
 const UNKNOWN: u8 = 255;
 
 impl PacketRouter {
-    /// Once a second, and when the companion is silent.
+    /// Sends the messages of each second, and acts when the companion is silent.
     pub(super) fn poll_component(&mut self, now: HostTime) {
         while let Some(act) = self.failsafe.poll(now, self.flight, self.settings.loss_ms) {
             self.act(now, act);
@@ -114,12 +113,12 @@ impl PacketRouter {
         }
     }
 
-    /// Keeps the settings in a moment: several changes come together.
+    /// Schedules a save of the settings, so that several changes are saved together.
     pub(super) fn save_soon(&mut self, now: HostTime) {
         self.save_at = Some(now.plus_seconds(SAVE_S));
     }
 
-    /// Makes the own network's password where there is none and nobody asked for an open one.
+    /// Generates the password of the bridge's own network, unless one is set or an open network is configured.
     pub(super) fn ensure_password(&mut self, now: HostTime) {
         if self.settings.wifi_open || !self.settings.ap_password.is_empty() {
             return;
@@ -136,14 +135,13 @@ impl PacketRouter {
         self.tell_key_at = Some(now);
     }
 
-    /// Tells the password that it made by itself, at the autopilot's wire and nowhere else, until
-    /// somebody has claimed the bridge.
+    /// Announces the generated password until the bridge is claimed. It is sent only to the autopilot's wire.
     fn tell_key(&mut self, now: HostTime) {
         let due = self.tell_key_at.is_some_and(|at| at <= now) && self.settings.key.is_none();
         if due && self.autopilot.is_some() {
             self.tell_key_at = Some(now.plus_seconds(TELL_S));
             let mut text = heapless::String::<50>::new();
-            // 27 characters and 19: it fits.
+            // 27 and 19 characters fit into 50.
             let _ = write!(text, "bridge: its network's key: {}", self.settings.ap_password);
             let message = status_text(MavSeverity::MAV_SEVERITY_NOTICE, &text);
             self.send_to_autopilot(now, &message);
@@ -158,8 +156,8 @@ impl PacketRouter {
     }
 
     fn radio_status(&self) -> RADIO_STATUS_DATA {
-        // The companion's, which the vehicle flies by; without one whoever is quickest: a client that
-        // does not take its packets must not slow the others down.
+        // Queue of the companion, which controls the vehicle. Without a companion, the shortest queue counts: a client
+        // that does not read its packets must not slow down the others.
         let companion = self.failsafe.companion();
         let is_companion = |client: &&Client| companion.is_some_and(|source| client.holds(source));
         let clients = || self.clients.iter().flatten();
@@ -167,7 +165,7 @@ impl PacketRouter {
             Some(client) => client.pending,
             None => clients().map(|client| client.pending).min().unwrap_or(0),
         };
-        // As SiK radios count: 1.9 steps per decibel above -127 dBm.
+        // Scale of SiK radios: 1.9 steps per decibel above -127 dBm.
         let rssi = self
             .signal_dbm
             .map_or(UNKNOWN, |dbm| ((f32::from(dbm) + 127.0) * 1.9).clamp(0.0, 254.0) as u8);
@@ -176,14 +174,14 @@ impl PacketRouter {
             fixed: 0,
             rssi,
             remrssi: UNKNOWN,
-            // What the autopilot slows its streams by.
+            // The autopilot throttles its streams by this value.
             txbuf: 100 - (waiting * 100 / crate::capacity::DOWN as u32).min(100) as u8,
             noise: UNKNOWN,
             remnoise: UNKNOWN,
         }
     }
 
-    /// Says a sentence of at most 50 characters to everybody.
+    /// Sends a status text of at most 50 characters to all clients and the autopilot.
     pub(super) fn send_status_text(&mut self, now: HostTime, severity: MavSeverity, text: &str) {
         if self.transparent {
             return;
@@ -193,7 +191,7 @@ impl PacketRouter {
         self.send_to_autopilot(now, &message);
     }
 
-    /// Sends a message to whoever asked.
+    /// Sends a message to the sender of the request.
     pub(super) fn reply(&mut self, now: HostTime, to: Option<usize>, id: u32, payload: &[u8]) {
         let mut packet = [0; MAX_PACKET];
         let len = write_packet(&mut packet, self.address(), 0, id, payload);
@@ -213,8 +211,7 @@ impl PacketRouter {
         self.deliver(now, None, message.id(), &packet[..len]);
     }
 
-    /// Puts a packet of ours into the queue of a client or of the autopilot; its number follows
-    /// when it goes out.
+    /// Queues a packet of the bridge for a client, or for the autopilot. Its sequence number is set when it is sent.
     pub(super) fn deliver(&mut self, now: HostTime, to: Option<usize>, id: u32, packet: &[u8]) {
         let source = self.address();
         if let Some(index) = to {

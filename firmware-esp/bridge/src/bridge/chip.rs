@@ -1,10 +1,10 @@
-//! The chip that a bridge runs on.
+//! Chip-specific inputs of a bridge.
 
-/// What a bridge knows of the chip it runs on.
+/// Identity of the chip, and its entropy.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Chip {
-    /// The radio's address.
+    /// MAC address of the radio.
     pub address: [u8; 6],
-    /// Random bytes of this start: nobody guesses the next.
+    /// Random bytes, fresh at each start and unpredictable.
     pub random: [u8; 16],
 }

@@ -1,4 +1,4 @@
-//! Who listens on the network: where, behind which systems' numbers, and how far each has read.
+//! Network clients: addresses, their MAVLink systems, and read positions.
 
 use core::net::SocketAddrV4;
 
@@ -8,48 +8,45 @@ use crate::packet::Raw;
 use crate::settings::Settings;
 use crate::stats::Sequences;
 
-/// Clients at once.
+/// Maximum number of clients.
 pub const CLIENTS: usize = 8;
 
-/// A connection that takes nothing for this long is ended: longer than Wi-Fi takes to come back, shorter
-/// than TCP takes to notice. [s]
+/// A connection that accepts no data for this long is closed: longer than a Wi-Fi reconnect, shorter than TCP's own
+/// timeout [s].
 const STALLED_S: f64 = 5.0;
 
-/// Where a client is.
+/// Address of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Peer {
-    /// A UDP address.
     Udp(SocketAddrV4),
-    /// A TCP connection, by its slot.
+    /// Slot of a TCP connection.
     Tcp(u8),
 }
 
-/// A client.
 #[derive(Clone, Debug)]
 pub(crate) struct Client {
     pub peer: Peer,
-    /// Given by the settings: stays, however silent.
+    /// From the settings: never removed for silence.
     pub fixed: bool,
     pub received_at: HostTime,
     pub has_spoken: bool,
-    /// Systems and components that spoke from here.
+    /// Systems and components that sent packets from this address.
     pub systems: heapless::Vec<(u8, u8), 4>,
     pub sequences: Sequences<3>,
-    /// Counter of our own packets to it.
+    /// Sequence number of the bridge's own packets to this client.
     pub sequence: u8,
-    /// Place in the ring of the next packet to look at.
+    /// Position in the ring of the next packet to check.
     pub cursor: u32,
-    /// Bytes in the ring that are for it.
+    /// Bytes in the ring for this client.
     pub pending: u32,
-    /// When the oldest of them came.
+    /// Arrival time of the oldest pending packet.
     pub since: HostTime,
-    /// When it last took something, or had nothing to take.
+    /// When the client last accepted data, or had none pending.
     pub taken_at: HostTime,
-    /// One of them must not wait.
+    /// Whether a pending packet must be sent at once.
     pub hurry: bool,
-    /// Packets sent.
     pub sent: u32,
-    /// Packets it was too slow for.
+    /// Packets dropped because the client was too slow.
     pub slow: u32,
 }
 
@@ -73,13 +70,13 @@ impl Client {
         }
     }
 
-    /// Takes note that it has spoken.
+    /// Records that the client sent something.
     pub(crate) fn note_heard(&mut self, now: HostTime) {
         self.received_at = now;
         self.has_spoken = true;
     }
 
-    /// Takes note of a packet that came from it; returns how many were lost before it.
+    /// Records a packet of the client. Returns the number of packets lost before it.
     pub(crate) fn note(&mut self, now: HostTime, packet: Raw<'_>) -> u32 {
         self.note_heard(now);
         let source = packet.source();
@@ -87,38 +84,36 @@ impl Client {
             if self.systems.is_full() {
                 self.systems.remove(0);
             }
-            // There is room now.
+            // The removal above made room.
             let _ = self.systems.push(source);
         }
         self.sequences.note(source, packet.sequence())
     }
 
-    /// Whether a system and component live here; zero is any component.
+    /// Whether the client holds a system and component; component 0 matches any.
     pub(crate) fn holds(&self, target: (u8, u8)) -> bool {
         self.systems.iter().any(|&(system, component)| {
             system == target.0 && (target.1 == 0 || component == target.1)
         })
     }
 
-    /// Whether it has taken nothing for too long of what waits for it. A datagram is gone once it is sent;
-    /// only a connection can refuse.
+    /// Whether pending data was not accepted for too long. Only a connection can stall; a datagram is gone once sent.
     pub(crate) fn is_stalled(&self, now: HostTime) -> bool {
         matches!(self.peer, Peer::Tcp(_))
             && self.pending > 0
             && now.seconds_since(self.taken_at) > STALLED_S
     }
 
-    /// Whether it is reached by datagrams.
     pub(crate) fn is_udp(&self) -> bool {
         matches!(self.peer, Peer::Udp(_))
     }
 
-    /// Whether it has spoken lately; only the settings' client stays when it has not.
+    /// Whether the client was active recently. Only the fixed client may stay without activity.
     pub(crate) fn speaks(&self, now: HostTime, settings: &Settings) -> bool {
         self.has_spoken && !self.is_silent(now, settings)
     }
 
-    /// Whether it has been silent for too long.
+    /// Whether the client's silence exceeds the timeout.
     pub(crate) fn is_gone(&self, now: HostTime, settings: &Settings) -> bool {
         self.is_udp() && !self.fixed && self.is_silent(now, settings)
     }
@@ -128,7 +123,7 @@ impl Client {
     }
 }
 
-/// Returns the bit of a client in a packet's tag.
+/// Returns the bit of a client in [`Tag::to`](crate::ring::Tag::to).
 pub(crate) fn bit(index: usize) -> u8 {
     1 << index
 }

@@ -1,5 +1,5 @@
-//! The bridge as a MAVLink component of the vehicle: what it learns from packets that pass, and what it
-//! does that somebody asks of it.
+//! The bridge as a MAVLink component of the vehicle: state that it derives from forwarded packets, and the requests
+//! that it serves.
 
 use vizflyt_protocol::failsafe::Flight;
 use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavCmd, MavResult, MavSeverity};
@@ -11,26 +11,26 @@ use crate::access::{self, Access};
 use crate::packet::Raw;
 use crate::settings::Settings;
 
-/// Our component: MAV_COMP_ID_UDP_BRIDGE.
+/// Component number of the bridge: MAV_COMP_ID_UDP_BRIDGE.
 pub const COMPONENT_ID: u8 = 240;
-/// The vehicle's system number before its first heartbeat.
+/// System number until the vehicle's first heartbeat.
 const SYSTEM_ID: u8 = 1;
 
-/// What the shell is to do; only it touches flash and chip.
+/// Task for the shell; only the shell accesses flash and chip.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event {
     /// Write [`Bridge::settings`](super::Bridge::settings) to flash.
     Save,
-    /// Restart the chip, once what is queued has gone out.
+    /// Restart the chip after all queued packets are sent.
     Restart,
 }
 
-/// What was asked of others and awaits its answer, and who may ask us.
+/// Requests that await a reply, and the access control of the bridge.
 #[derive(Clone, Debug)]
 pub(super) struct OutstandingRequests {
-    /// TIMESYNC requests under way: their `ts1`, and when they passed.
+    /// Pending TIMESYNC requests: `ts1`, and when they were forwarded.
     syncs: heapless::Deque<(i64, HostTime), 4>,
-    /// When a client last asked: then we need not.
+    /// When a client last sent TIMESYNC; a recent one makes the bridge's own unnecessary.
     pub(super) client_asked_at: Option<HostTime>,
     pub(super) access: Access,
 }
@@ -44,7 +44,7 @@ impl OutstandingRequests {
         if self.syncs.is_full() {
             self.syncs.pop_front();
         }
-        // There is room now.
+        // The removal above made room.
         let _ = self.syncs.push_back((ts1, now));
     }
 }
@@ -59,20 +59,19 @@ const TIMESYNC: u32 = 111;
 pub(super) const TUNNEL: u32 = 385;
 
 impl PacketRouter {
-    /// Returns our system and component.
+    /// Returns system and component of the bridge.
     pub(super) fn address(&self) -> (u8, u8) {
         (self.autopilot.map_or(SYSTEM_ID, |(system, _)| system), COMPONENT_ID)
     }
 
-    /// Whether a packet for `target` is for us alone; who does not know the vehicle's number yet
-    /// may leave it out.
+    /// Whether a packet for `target` is only for the bridge. A sender without the vehicle's system number may use 0.
     pub(super) fn is_ours(&self, target: (u8, u8)) -> bool {
         target == self.address() || target == (0, COMPONENT_ID)
     }
 
-    // ---- what passes by ----
+    // ---- forwarded packets ----
 
-    /// Takes note of a packet from the autopilot.
+    /// Records the state in a packet from the autopilot.
     pub(super) fn note_from_autopilot(&mut self, now: HostTime, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         match packet.id() {
@@ -106,7 +105,7 @@ impl PacketRouter {
         }
     }
 
-    /// Takes note of what clients ask the autopilot.
+    /// Records requests of clients to the autopilot.
     pub(super) fn note_to_autopilot(&mut self, now: HostTime, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         if packet.id() == TIMESYNC && field.i64(0) == 0 {
@@ -118,9 +117,9 @@ impl PacketRouter {
         }
     }
 
-    // ---- what is for us ----
+    // ---- packets for the bridge ----
 
-    /// Answers a packet for us, from the client `from` or from the autopilot.
+    /// Answers a packet for the bridge from client `from`, or from the autopilot.
     pub(super) fn handle_own(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
         match packet.id() {
             PARAM_REQUEST_LIST | PARAM_REQUEST_READ | PARAM_SET => {
@@ -134,7 +133,7 @@ impl PacketRouter {
         }
     }
 
-    /// Whether a packet may change us: signed with the bridge's key, and the vehicle disarmed.
+    /// Whether a packet may change the bridge: it is signed by an owner and the vehicle is disarmed.
     pub(super) fn may_change(&mut self, now: HostTime, packet: Raw<'_>) -> bool {
         let reason = if self.flight.armed {
             "bridge: nothing is changed while armed"
@@ -148,8 +147,8 @@ impl PacketRouter {
         false
     }
 
-    /// Whether a packet is signed with the bridge's key, or with the vehicle's: whoever has that commands
-    /// the vehicle itself.
+    /// Whether a packet is signed with the bridge's key or with the vehicle's key. The latter already gives control of
+    /// the vehicle.
     fn is_signed_by_owner(&mut self, packet: Raw<'_>) -> bool {
         let keys = [self.settings.key.as_ref(), self.settings.vehicle_key.as_ref()];
         let access = &mut self.outstanding.access;
@@ -185,16 +184,16 @@ impl PacketRouter {
         self.reply(now, from, COMMAND_ACK, &ack);
     }
 
-    /// Does what was rightfully asked.
+    /// Executes an authorized request.
     pub(super) fn grant(&mut self, now: HostTime, request: access::ShellRequest) {
         match request {
             access::ShellRequest::Save => {
-                // A request that comes twice counts once; four different ones do not exist.
+                // The queue holds four events: it is full only if the same request is already queued.
                 let _ = self.events.push_back(Event::Save);
             }
             access::ShellRequest::Reset => {
-                // Keys and the own network's password stay: who resets the settings neither opens the
-                // bridge to others nor locks its owner out.
+                // Keep the keys and the network's password: a reset neither opens the bridge to others nor locks its
+                // owner out.
                 let Settings { ap_password, wifi_open, key, vehicle_key, page_key, .. } =
                     self.settings.clone();
                 self.settings = Settings {

@@ -1,6 +1,6 @@
-//! Reads a message's fields by their place.
+//! Reads the fields of a message by byte offset.
 
-/// Reads a payload's fields; what MAVLink 2 left out is zero.
+/// Fields of a payload. Bytes that MAVLink 2 truncated read as zero.
 pub(super) struct Fields<'a>(pub &'a [u8]);
 
 impl<'a> Fields<'a> {
@@ -28,7 +28,7 @@ impl<'a> Fields<'a> {
         f32::from_le_bytes(self.bytes(at))
     }
 
-    /// A name of at most 16 characters; empty if it is no text.
+    /// Returns a name of at most 16 characters; empty if it is not UTF-8.
     pub(super) fn text(&self, at: usize) -> &'a str {
         let field = self.0.get(at..).unwrap_or_default();
         let field = &field[..field.len().min(16)];

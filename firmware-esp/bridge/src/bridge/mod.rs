@@ -1,13 +1,13 @@
-//! The bridge, sans-IO: bytes of both sides and `now` in, whole packets out.
+//! Sans-IO core of the bridge: bytes of both sides and `now` in, whole packets out.
 //!
 //! ```text
 //! UART ── handle_uart() ──▶ cut ──▶ ring ── poll_udp(), poll_tcp() ──▶ each client, batched
 //! network ── handle_datagram(), handle_stream() ──▶ cut ──▶ urgent │ normal ── poll_uart() ──▶ UART
 //! ```
-//! Packets go on byte for byte as they came, signature included, never split over datagrams. What
-//! the autopilot sends lies in one ring that every client reads at its own pace; who is too slow
-//! loses its oldest, counted. Towards the autopilot setpoints, poses and commands overtake the rest.
-//! Every packet that does not go on is counted with its reason ([`Stats`]).
+//! Packets are forwarded byte for byte, signature included, and never split over datagrams. Packets from the autopilot
+//! lie in one ring, which every client reads independently. A slow client loses its oldest packets, and the loss is
+//! counted. Towards the autopilot, setpoints, poses and commands overtake other packets. Every dropped packet is
+//! counted with its reason ([`Stats`]).
 
 mod announcements;
 mod chip;
@@ -42,32 +42,30 @@ use crate::page::form::Form;
 use crate::settings::Settings;
 use crate::stats::{RestartCause, Stats};
 
-/// Silence on the autopilot's port after which a batch goes out. Autopilots write packets whole; a
-/// byte at 57600 baud takes 0.17 ms. [ns]
+/// Silence on the autopilot's port after which a batch is sent [ns]. Autopilots write whole packets, and one byte at
+/// 57600 baud takes 0.17 ms.
 const IDLE_NS: i64 = 500_000;
-/// Silence within a candidate after which it may be a false start, with whole packets behind. [ns]
+/// Silence inside a packet candidate after which it may be a false start that hides whole packets [ns].
 const STALL_NS: i64 = 50_000_000;
 
-/// The bridge. See the module.
+/// MAVLink bridge; see the module documentation.
 #[derive(Clone, Debug)]
 pub struct Bridge {
     uart: Cutter,
-    /// Behind the candidate that waits was looked already.
+    /// Whether the bytes behind the waiting candidate were already searched.
     has_looked: bool,
     tcp: [Cutter; TCP_SLOTS],
     router: PacketRouter,
 }
 
 impl Bridge {
-    /// Makes a bridge at `now`.
     pub fn new(now: HostTime, settings: Settings, chip: Chip) -> Self {
         let mut bridge = Self::empty();
         bridge.begin(now, chip, |place| *place = settings);
         bridge
     }
 
-    /// A bridge that has not begun: `const`, for a chip's static memory, whose stack has no room
-    /// for one.
+    /// Returns a bridge that has not begun. `const`, for a chip's static memory: its stack is too small for a bridge.
     pub const fn empty() -> Self {
         Self {
             uart: Cutter::new(),
@@ -77,17 +75,17 @@ impl Bridge {
         }
     }
 
-    /// Begins at `now`; once, before anything else. `load` changes the default settings where they lie:
-    /// a chip's stack has no room for copies.
+    /// Begins at `now`. Call it once, before all other methods. `load` changes the default settings in place, because a
+    /// chip's stack is too small for copies.
     pub fn begin(&mut self, now: HostTime, chip: Chip, load: impl FnOnce(&mut Settings)) {
         self.router.settings.restore();
         load(&mut self.router.settings);
         self.router.begin(now, chip);
     }
 
-    // ---- what goes in ----
+    // ---- inputs ----
 
-    /// Takes bytes from the autopilot's port, in any portions.
+    /// Takes bytes from the autopilot's port. They may be split anywhere.
     pub fn handle_uart(&mut self, now: HostTime, bytes: &[u8]) {
         let Self { uart, router, has_looked, .. } = self;
         *has_looked &= bytes.is_empty();
@@ -100,7 +98,7 @@ impl Bridge {
         router.poll(now);
     }
 
-    /// Takes a datagram. Its sender becomes a client if it holds a packet.
+    /// Takes a datagram. If it contains a packet, its sender becomes a client.
     pub fn handle_datagram(&mut self, now: HostTime, from: SocketAddrV4, bytes: &[u8]) {
         let router = &mut self.router;
         let mut cut = router.stats.net.cut;
@@ -115,7 +113,7 @@ impl Bridge {
         router.poll(now);
     }
 
-    /// Somebody has connected by TCP to this slot.
+    /// Opens a TCP connection in this slot.
     pub fn open_stream(&mut self, now: HostTime, slot: u8) {
         if let Some(cutter) = self.tcp.get_mut(usize::from(slot)) {
             cutter.restart();
@@ -140,65 +138,65 @@ impl Bridge {
         router.poll(now);
     }
 
-    /// Whether a TCP connection is still served; one that takes nothing is not, and the shell ends it.
+    /// Whether a TCP connection is still served. The bridge stops serving stalled connections, and the shell closes
+    /// them.
     pub fn is_open(&self, slot: u8) -> bool {
         self.router.place_of(Peer::Tcp(slot)).is_some()
     }
 
-    /// The TCP connection of this slot has ended.
+    /// Closes the TCP connection of this slot.
     pub fn close_stream(&mut self, slot: u8) {
         self.router.close(Peer::Tcp(slot));
     }
 
-    /// Sets how well the radio receives its peer; `None` where it does not know. [dBm]
+    /// Sets the radio's received signal strength [dBm]; `None` if unknown.
     pub fn set_signal(&mut self, dbm: Option<i8>) {
         self.router.signal_dbm = dbm;
     }
 
-    /// Sets how often the port's own buffer has run over since the start; the chip counts.
+    /// Sets the number of overruns of the port's own buffer since the start, as counted by the chip.
     pub fn set_overruns(&mut self, overruns: u32) {
         self.router.stats.overruns = overruns;
     }
 
-    /// Sets why the chip has started; what is worth telling is told to the first who listens.
+    /// Sets the cause of the chip's start. An abnormal cause is announced to the first active client.
     pub fn set_restart_cause(&mut self, cause: RestartCause) {
         self.router.stats.restart_cause = cause;
         self.router.untold = cause.message();
     }
 
-    /// Reports whether the network is up, and the address to which heartbeats are broadcast until
-    /// somebody answers.
+    /// Sets the address to which heartbeats are broadcast until a client connects; `None` while the network is down.
     pub fn set_network(&mut self, broadcast: Option<SocketAddrV4>) {
         self.router.broadcast = broadcast;
     }
 
-    /// Sets our own address on the network.
+    /// Sets the bridge's own address on the network.
     pub fn set_address(&mut self, address: Option<Ipv4Addr>) {
         self.router.own_address = address;
     }
 
-    /// Makes the password of the network that we make, unless there is one or an open network is wanted;
-    /// before that network is made.
+    /// Generates a password for the bridge's own network, unless one is set or an open network is configured. Call it
+    /// before the network is opened.
     pub fn ensure_password(&mut self, now: HostTime) {
         self.router.ensure_password(now);
     }
 
-    /// Returns the name of the network that we make.
+    /// Returns the name of the bridge's own network.
     pub fn network_name(&self) -> heapless::String<32> {
         self.router.network_name()
     }
 
-    /// Whether bytes pass unparsed.
+    /// Whether bytes are forwarded unparsed.
     pub fn is_transparent(&self) -> bool {
         self.router.transparent
     }
 
-    /// Network or port refused what was taken from [`Self::poll_udp`] or [`Self::poll_uart`].
+    /// Counts a packet from [`Self::poll_udp`] or [`Self::poll_uart`] that network or port refused to send.
     pub fn note_not_sent(&mut self) {
         self.router.stats.drop(crate::stats::Reason::NotSent, 1);
     }
 
-    /// Changes a setting as a browser's form asks, if its key is right; returns how that fared.
+    /// Changes a setting as requested by a browser's form, if its key is right. Returns the status.
     pub fn change_by_form(&mut self, now: HostTime, form: &Form) -> access::Status {
         self.router.change_by_form(now, form)
     }
@@ -208,7 +206,7 @@ impl Bridge {
         self.router.note_saved(now, saved);
     }
 
-    /// Does what is due at `now`.
+    /// Runs all work that is due at `now`.
     pub fn handle_timeout(&mut self, now: HostTime) {
         if self.look_due().is_some_and(|due| due <= now) {
             let Self { uart, router, has_looked, .. } = self;
@@ -219,21 +217,20 @@ impl Bridge {
         self.router.poll(now);
     }
 
-    // ---- what comes out ----
+    // ---- outputs ----
 
-    /// Writes the next packet for the autopilot into `out`; returns its length, 0 if there is none.
+    /// Writes the next packet for the autopilot into `out`. Returns its length, or 0 if none waits.
     pub fn poll_uart(&mut self, now: HostTime, out: &mut [u8; MAX_PACKET]) -> usize {
         self.router.poll_uart(now, out)
     }
 
-    /// Writes the next datagram into `out` (300 bytes at least); returns its destination and its
-    /// length.
+    /// Writes the next datagram into `out` (at least 300 bytes). Returns its destination and length.
     pub fn poll_udp(&mut self, now: HostTime, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
         self.router.poll_udp(now, out, |_, _| true).or_else(|| self.router.beacon(out))
     }
 
-    /// As [`Self::poll_udp`], for those alone that have spoken lately: a network stack does not wait for
-    /// their address.
+    /// Like [`Self::poll_udp`], but only for clients that sent something recently: the network stack has their hardware
+    /// address and does not wait for it.
     pub fn poll_udp_speaking(
         &mut self,
         now: HostTime,
@@ -243,7 +240,7 @@ impl Bridge {
         self.router.poll_udp(now, out, speaks).or_else(|| self.router.beacon(out))
     }
 
-    /// As [`Self::poll_udp`], for all others.
+    /// Like [`Self::poll_udp`], for all other clients.
     pub fn poll_udp_silent(
         &mut self,
         now: HostTime,
@@ -252,33 +249,33 @@ impl Bridge {
         self.router.poll_udp(now, out, |client, settings| !client.speaks(now, settings))
     }
 
-    /// Writes what is due to a TCP client into `out` (300 bytes at least); returns its length, 0
-    /// if nothing is.
+    /// Writes data that is due to a TCP client into `out` (at least 300 bytes). Returns its length, or 0 if nothing is
+    /// due.
     pub fn poll_tcp(&mut self, now: HostTime, slot: u8, out: &mut [u8]) -> usize {
         self.router.poll_tcp(now, slot, out)
     }
 
-    /// Returns what the shell is to do: save, restart.
+    /// Returns the next task for the shell: save or restart.
     pub fn poll_event(&mut self) -> Option<Event> {
         self.router.events.pop_front()
     }
 
-    /// Returns when the next datagram is due; `None` while none waits.
+    /// Returns when the next datagram is due; `None` if none waits.
     pub fn udp_due(&self) -> Option<HostTime> {
         self.router.batches_due(|client, _| client.is_udp())
     }
 
-    /// Returns when one is due to a client that has spoken lately.
+    /// Returns when the next datagram to a recently active client is due.
     pub fn speaking_due(&self, now: HostTime) -> Option<HostTime> {
         self.router.batches_due(|client, settings| client.is_udp() && client.speaks(now, settings))
     }
 
-    /// Returns when one is due to another.
+    /// Returns when the next datagram to a silent client is due.
     pub fn silent_due(&self, now: HostTime) -> Option<HostTime> {
         self.router.batches_due(|client, settings| client.is_udp() && !client.speaks(now, settings))
     }
 
-    /// Returns when something is due to a TCP client; `None` while nothing waits.
+    /// Returns when data is due to a TCP client; `None` if none waits.
     pub fn tcp_due(&self, slot: u8) -> Option<HostTime> {
         self.router.batches_due(|client, _| client.peer == Peer::Tcp(slot))
     }
@@ -289,65 +286,63 @@ impl Bridge {
         self.look_due().map_or(due, |look| due.min(look))
     }
 
-    /// Returns when to look for packets behind the candidate that waits, if not done yet.
+    /// Returns when to search behind the waiting candidate; `None` if already done.
     fn look_due(&self) -> Option<HostTime> {
         let waits = self.uart.is_waiting() && !self.has_looked;
         waits.then(|| self.router.uart_at.plus_ns(STALL_NS))
     }
 
-    /// Returns the counters.
     pub fn stats(&self) -> &Stats {
         &self.router.stats
     }
 
-    /// Returns how long it has run. [s]
+    /// Returns the time since the start [s].
     pub fn uptime_s(&self, now: HostTime) -> u32 {
         now.seconds_since(self.router.started_at) as u32
     }
 
-    /// Returns the settings as they are now; the shell writes them to flash on [`Event::Save`].
+    /// Returns the current settings; the shell writes them to flash on [`Event::Save`].
     pub fn settings(&self) -> &Settings {
         &self.router.settings
     }
 
-    /// Returns what it knows of its chip.
     pub fn chip(&self) -> &Chip {
         &self.router.chip
     }
 
-    /// Returns the system and component of the autopilot, while its heartbeats come.
+    /// Returns system and component of the autopilot while its heartbeats arrive.
     pub fn autopilot(&self) -> Option<(u8, u8)> {
         self.router.autopilot
     }
 
-    /// Whether the vehicle is armed: then nothing about the bridge is changed.
+    /// Whether the vehicle is armed. While it is, all changes of the bridge are refused.
     pub fn is_armed(&self) -> bool {
         self.router.flight.armed
     }
 
-    /// Returns how far its landing of the vehicle is, because the companion is silent.
+    /// Returns the stage of a landing that a silent companion caused.
     pub fn landing(&self) -> Option<LandingStage> {
         self.router.failsafe.stage()
     }
 
-    /// Whether the autopilot has said that it lands because the bridge asked.
+    /// Whether the autopilot has acknowledged the bridge's LAND.
     pub fn is_landing(&self) -> bool {
         self.landing().is_some_and(|stage| stage != LandingStage::Asked)
     }
 
-    /// Whether nothing has acknowledged LAND for a second.
+    /// Whether LAND has been unacknowledged for a second.
     pub fn is_unanswered(&self, now: HostTime) -> bool {
         self.router.failsafe.is_unanswered(now)
     }
 
-    /// Returns each client: where, packets sent to it, packets it was too slow for.
+    /// Returns each client: address, packets sent, packets dropped because it was too slow.
     pub fn clients(&self) -> impl Iterator<Item = (Peer, u32, u32)> {
         self.router.clients.iter().flatten().map(|client| (client.peer, client.sent, client.slow))
     }
 }
 
-/// Whether a datagram is a request for the configuration and nothing else: the way out for whoever has
-/// made the bridge transparent.
+/// Whether a datagram contains exactly one configuration request. Such requests work in transparent mode too;
+/// otherwise, that mode could not be turned off over the network.
 fn is_request(datagram: &[u8]) -> bool {
     let (mut cut, mut requests) = (CutStats::default(), 0);
     each_in_datagram(datagram, &mut cut, |packet| {

@@ -1,4 +1,4 @@
-//! What comes out, and when: batches to clients, the autopilot's port with what is urgent first.
+//! Outputs of the bridge and their timing: batches to clients, and the autopilot's port with urgent packets first.
 
 use core::net::SocketAddrV4;
 
@@ -12,12 +12,11 @@ use crate::mavlink_writer::renumber;
 use crate::settings::Settings;
 use crate::stats::Reason;
 
-/// A setpoint or pose this old is not worth sending when a newer one waits behind it: a period at
-/// 50 Hz. [ms]
+/// Age from which a setpoint or pose is dropped if a newer one waits behind it: one period at 50 Hz [ms].
 const STALE_MS: u16 = 20;
 
 impl PacketRouter {
-    /// Returns when a datagram is due to the first client that `of` names; `None` while none waits.
+    /// Returns when the next datagram to a client that `of` accepts is due; `None` if none waits.
     pub(super) fn batches_due(&self, of: impl Fn(&Client, &Settings) -> bool) -> Option<HostTime> {
         self.clients
             .iter()
@@ -27,7 +26,7 @@ impl PacketRouter {
             .min()
     }
 
-    /// Returns when what is pending for a client goes out.
+    /// Returns when the pending bytes of a client are sent.
     fn batch_due(&self, client: &Client) -> HostTime {
         if client.hurry || client.pending >= u32::from(self.settings.batch_bytes) {
             return client.since;
@@ -50,7 +49,7 @@ impl PacketRouter {
         len
     }
 
-    /// Leaves out setpoints and poses that are late while a newer one of the same sender waits.
+    /// Drops late setpoints and poses if a newer one of the same sender waits.
     fn drop_stale(&mut self, now: HostTime) {
         while let Some((tag, _, mut next)) = self.urgent.peek(self.urgent.tail()) {
             let age_ms = millis(now).wrapping_sub(tag.stamp_ms);
@@ -70,7 +69,7 @@ impl PacketRouter {
         }
     }
 
-    /// Writes the next datagram to a client that `of` names.
+    /// Writes the next datagram to a client that `of` accepts.
     pub(super) fn poll_udp(
         &mut self,
         now: HostTime,
@@ -94,8 +93,7 @@ impl PacketRouter {
         None
     }
 
-    /// Writes the autopilot's newest heartbeat for everybody on the network, once a second, while
-    /// nobody listens.
+    /// Writes the autopilot's newest heartbeat as a broadcast, once a second, until a client connects.
     pub(super) fn beacon(&mut self, out: &mut [u8]) -> Option<(SocketAddrV4, usize)> {
         let due = core::mem::take(&mut self.beacon_due);
         let to = self.broadcast.filter(|_| due && self.clients.iter().all(Option::is_none))?;
@@ -108,7 +106,7 @@ impl PacketRouter {
         self.place_of(Peer::Tcp(slot)).map_or(0, |index| self.fill(now, index, out))
     }
 
-    /// Writes what is due to a client into `out`, whole packets only; returns its length.
+    /// Writes the due packets of a client into `out`, only whole ones. Returns the length.
     fn fill(&mut self, now: HostTime, index: usize, out: &mut [u8]) -> usize {
         let most = out.len().min(usize::from(self.settings.batch_bytes));
         let due = self.clients[index]

@@ -1,8 +1,8 @@
-//! The bridge's settings as MAVLink parameters: its own numbers, and the names under which
-//! QGroundControl's page of a Wi-Fi bridge reads and writes (its ESP8266ComponentController).
+//! Settings of the bridge as MAVLink parameters: its own numbers, and the names that QGroundControl's page for Wi-Fi
+//! bridges uses (its ESP8266ComponentController).
 //!
-//! Own numbers are floats. QGroundControl's are 32 bits whose bytes lie in the value's field; a text is
-//! four of them, 16 characters. Passwords are taken, never told: they read as nothing.
+//! The bridge's own numbers are floats. QGroundControl's parameters are 32 bits stored in the bytes of the value field;
+//! a text is four of them, 16 characters. Passwords are write-only: they read as empty.
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::mavlink::dialect::{MavParamType, PARAM_VALUE_DATA};
@@ -15,26 +15,26 @@ use crate::mavlink_writer::{BridgeMessage, write_message};
 use crate::packet::Raw;
 use crate::settings::{NUMBERS, Refused, WifiRole};
 
-/// What a parameter of QGroundControl's stands for.
+/// Meaning of a QGroundControl parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Station {
-    /// Major, minor, patch in 8, 8 and 16 bits; it shows the page for whoever has this.
+    /// Major, minor and patch in 8, 8 and 16 bits. QGroundControl shows the page if this parameter exists.
     Version,
-    /// Our own output that a wire carries: none.
+    /// Debug output on a wire: not available.
     Debug,
     /// 0 access point, 1 station.
     Mode,
-    /// Where our page is.
+    /// Address of the bridge.
     Address,
-    /// Where heartbeats are broadcast to.
+    /// Port to which heartbeats are broadcast.
     HostPort,
     ClientPort,
     Baud,
-    /// Four characters of a text, from this part on.
+    /// Four characters of a text: part number `.1`.
     Text(StationText, u8),
 }
 
-/// The texts of that page.
+/// Texts of QGroundControl's page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum StationText {
     OwnName = 0,
@@ -77,15 +77,15 @@ const SINGLE: [(&str, Station); 7] = [
     ("UART_BAUDRATE", Station::Baud),
 ];
 const PARTS: usize = 4;
-/// All parameters: our own first.
+/// Number of all parameters; the bridge's own are first.
 const COUNT: usize = NUMBERS.len() + SINGLE.len() + PARTS * StationText::ALL.len();
-/// Ground stations listen here.
+/// Port of ground stations.
 const STATION_PORT: u32 = 14550;
 
-/// Characters of one of that page's texts.
+/// Length of a text on QGroundControl's page.
 const TEXT: usize = 16;
 
-/// Texts as their parts come, one after the other.
+/// Partially received texts; their parts arrive one after the other.
 #[derive(Clone, Debug)]
 pub(super) struct TypedTexts([Option<[u8; TEXT]>; StationText::ALL.len()]);
 
@@ -94,7 +94,7 @@ impl TypedTexts {
 }
 
 impl PacketRouter {
-    /// Answers a question for parameters, or a change.
+    /// Answers a parameter request or change.
     pub(super) fn handle_parameter(&mut self, now: HostTime, from: Option<usize>, packet: Raw<'_>) {
         let field = Fields(packet.payload());
         match packet.id() {
@@ -117,7 +117,7 @@ impl PacketRouter {
                 if self.may_change(now, packet) {
                     let is_float = field.byte(22) == MavParamType::MAV_PARAM_TYPE_REAL32 as u8;
                     let number = if is_float { whole(field.f32(0)) } else { Some(field.u32(0)) };
-                    // A value out of range changes nothing, as the answer shows.
+                    // A value out of range is ignored; the reply shows the old value.
                     if let Some(number) = number
                         && self.set_param(index, number, field.f32(0)).is_ok()
                     {
@@ -126,7 +126,7 @@ impl PacketRouter {
                     }
                     let told = station(index).filter(|what| matches!(what, Station::Text(..)));
                     if let (Some(_), Some(number)) = (told, number) {
-                        // A secret is told to nobody but who just set it.
+                        // Confirm a secret only to the client that set it.
                         return self.send_value(now, from, index, number);
                     }
                 }
@@ -157,7 +157,7 @@ impl PacketRouter {
                 let (setting, secret) = text.setting();
                 let whole = typed.get_or_insert_with(|| {
                     if secret {
-                        // What was never told is typed from its beginning.
+                        // A secret cannot be read, so it is typed from the first part on.
                         [0; TEXT]
                     } else {
                         first_characters(&self.settings.read(setting).unwrap_or_default())
@@ -167,7 +167,7 @@ impl PacketRouter {
                 whole[from..from + 4].copy_from_slice(&bits.to_le_bytes());
                 let len = whole.iter().position(|&byte| byte == 0).unwrap_or(TEXT);
                 let text = core::str::from_utf8(&whole[..len]).map_err(|_| Refused::Malformed)?;
-                // Half a password is none yet.
+                // An incomplete password is rejected until its last part arrives.
                 self.settings.set(setting, text)
             }
         }
@@ -204,7 +204,7 @@ impl PacketRouter {
         self.send_value(now, to, index, bits);
     }
 
-    /// Sends a parameter whose value's field has these bits.
+    /// Sends a parameter with these bits in its value field.
     fn send_value(&mut self, now: HostTime, to: Option<usize>, index: usize, bits: u32) {
         let param_type = match station(index) {
             Some(_) => MavParamType::MAV_PARAM_TYPE_UINT32,
@@ -223,7 +223,7 @@ impl PacketRouter {
     }
 }
 
-/// Returns what a parameter stands for that is not our own.
+/// Returns the meaning of a QGroundControl parameter; `None` for the bridge's own.
 fn station(index: usize) -> Option<Station> {
     let index = index.checked_sub(NUMBERS.len())?;
     if let Some(&(_, what)) = SINGLE.get(index) {
@@ -234,10 +234,9 @@ fn station(index: usize) -> Option<Station> {
     Some(Station::Text(text, (index % PARTS) as u8))
 }
 
-/// Returns a parameter's name.
 fn name(index: usize) -> heapless::String<16> {
     let mut name = heapless::String::new();
-    // Every name has 16 characters at most.
+    // All names have at most 16 characters.
     let _ = match station(index) {
         None => name.push_str(NUMBERS[index].name),
         Some(Station::Text(text, part)) => {
@@ -248,12 +247,12 @@ fn name(index: usize) -> heapless::String<16> {
     name
 }
 
-/// Returns the place of a parameter by its name.
+/// Returns the index of a parameter by name.
 fn find(wanted: &str) -> Option<usize> {
     (0..COUNT).find(|&index| name(index) == wanted)
 }
 
-/// Returns a whole number that a float exactly is.
+/// Returns the value of a float that is a whole number.
 fn whole(value: f32) -> Option<u32> {
     ((0.0..=1e7).contains(&value) && value % 1.0 == 0.0).then_some(value as u32)
 }
@@ -263,7 +262,7 @@ fn first_characters(text: &str) -> [u8; TEXT] {
     core::array::from_fn(|at| bytes.get(at).copied().unwrap_or(0))
 }
 
-/// Returns our version as QGroundControl reads it.
+/// Returns the version in QGroundControl's format.
 fn version() -> u32 {
     let mut parts = env!("CARGO_PKG_VERSION").split('.').map(|part| part.parse().unwrap_or(0));
     let mut next = || parts.next().unwrap_or(0u32);

@@ -1,4 +1,4 @@
-//! Answers the requests of `access`.
+//! Handles the configuration requests of [`access`](crate::access).
 
 use vizflyt_protocol::time::HostTime;
 
@@ -8,7 +8,7 @@ use crate::page::form::Form;
 use crate::settings::{Refused, key_to_hex};
 
 impl PacketRouter {
-    /// Answers a request; returns the answer's length.
+    /// Answers a request. Returns the length of the answer.
     pub(super) fn handle_request(
         &mut self,
         now: HostTime,
@@ -90,7 +90,7 @@ impl PacketRouter {
         }
     }
 
-    /// Returns why a change is refused, if it is.
+    /// Returns why a change is refused; `None` if it is allowed.
     fn refusal(&mut self, op: Op, request: &[u8]) -> Option<Status> {
         if self.flight.armed {
             return Some(Status::Armed);
@@ -105,7 +105,7 @@ impl PacketRouter {
         }
     }
 
-    /// Changes a setting as a browser's form asks.
+    /// Changes a setting as requested by a browser's form.
     pub(super) fn change_by_form(&mut self, now: HostTime, form: &Form) -> Status {
         let refusal =
             if self.flight.armed { Some(Status::Armed) } else { self.form_refusal(now, &form.key) };
@@ -124,7 +124,7 @@ impl PacketRouter {
         status
     }
 
-    /// Returns why a typed key opens nothing, if so.
+    /// Returns why a typed key is refused; `None` if it is accepted.
     fn form_refusal(&mut self, now: HostTime, typed: &str) -> Option<Status> {
         let own = self.settings.key.as_ref().map(key_to_hex);
         let right = [Some(&self.settings.page_key), own.as_ref()]
@@ -163,11 +163,11 @@ impl PacketRouter {
     }
 }
 
-/// After a wrong key in the form nobody's is taken for this long: 80 bits are not guessed, and a short
-/// password of somebody's own is not either. [s]
+/// After a wrong key, the form rejects every key for this long [s]. This prevents guessing of 80-bit keys and of short
+/// passwords.
 const GUESS_S: f64 = 2.0;
 
-/// Compares in a time that says nothing of where two keys differ.
+/// Compares two keys in constant time.
 fn is_same(key: &str, typed: &str) -> bool {
     let differ = key.bytes().zip(typed.bytes()).fold(0, |differ, (a, b)| differ | (a ^ b));
     key.len() == typed.len() && differ == 0

@@ -1,4 +1,4 @@
-//! Where packets go: the state behind [`Bridge`](super::Bridge).
+//! Routing of packets: the state behind [`Bridge`](super::Bridge).
 
 use core::fmt::Write as _;
 use core::net::{Ipv4Addr, SocketAddrV4};
@@ -20,11 +20,11 @@ use crate::ring::{Ring, Tag};
 use crate::settings::Settings;
 use crate::stats::{Reason, Sequences, Stats};
 
-/// Between heartbeats, and between reports. [s]
+/// Interval of heartbeats and reports [s].
 pub(super) const SECOND_S: f64 = 1.0;
-/// An autopilot silent for this long is gone: three heartbeats. [s]
+/// Silence after which the autopilot counts as lost: three heartbeats [s].
 const LOST_AFTER_S: f64 = 3.5;
-/// A client silent for this long gives its place to a new one if there is no other. [s]
+/// Silence after which a client's place may be given to a new client, if no place is free [s].
 const REPLACEABLE_S: f64 = 2.0;
 
 #[derive(Clone, Debug)]
@@ -36,32 +36,32 @@ pub(super) struct PacketRouter {
     pub(super) urgent: Ring<URGENT>,
     pub(super) normal: Ring<NORMAL>,
     pub(super) clients: [Option<Client>; CLIENTS],
-    /// Where the next look for a due client begins, so that all get their turn.
+    /// Index of the client that is served next: round robin.
     pub(super) turn: usize,
     uart_sequences: Sequences<4>,
-    /// When the autopilot's port last spoke.
+    /// Time of the last byte from the autopilot's port.
     pub(super) uart_at: HostTime,
-    /// It is in the middle of a packet.
+    /// Whether the port is in the middle of a packet.
     pub(super) uart_busy: bool,
-    /// The autopilot, while its heartbeats come.
+    /// System and component of the autopilot, while its heartbeats arrive.
     pub(super) autopilot: Option<(u8, u8)>,
     pub(super) autopilot_at: HostTime,
     pub(super) flight: Flight,
-    /// Its newest heartbeat, as it came: what the beacon repeats.
+    /// Newest heartbeat of the autopilot, unchanged; the beacon repeats it.
     pub(super) heartbeat: heapless::Vec<u8, 48>,
     pub(super) failsafe: Failsafe,
     pub(super) signing: VehicleSigning,
     pub(super) typed: TypedTexts,
-    /// When changed settings are kept.
+    /// When changed settings are saved.
     pub(super) save_at: Option<HostTime>,
-    /// When the password that we made is told next.
+    /// When the generated password is next announced.
     pub(super) tell_key_at: Option<HostTime>,
-    /// Until then the browser's form takes no key.
+    /// Until then, the browser's form rejects every key.
     pub(super) form_opens_at: HostTime,
-    /// Bytes pass unparsed; as it was at the start.
+    /// Whether bytes are forwarded unparsed. Fixed at the start.
     pub(super) transparent: bool,
     pub(super) own_address: Option<Ipv4Addr>,
-    /// Why the chip has started, until somebody has heard it.
+    /// Cause of an abnormal start, until a client has received it.
     pub(super) untold: Option<&'static str>,
     pub(super) events: Deque<Event, 4>,
     pub(super) started_at: HostTime,
@@ -69,14 +69,13 @@ pub(super) struct PacketRouter {
     pub(super) beacon_due: bool,
     pub(super) broadcast: Option<SocketAddrV4>,
     pub(super) signal_dbm: Option<i8>,
-    /// Counter of our own packets to the autopilot.
+    /// Sequence number of the bridge's own packets to the autopilot.
     pub(super) uart_sequence: u8,
     pub(super) outstanding: super::component::OutstandingRequests,
 }
 
 impl PacketRouter {
-    /// One that has not begun; `const`, so that it lies in a chip's static memory from the start
-    /// and never on its stack.
+    /// Returns a router that has not begun. `const`, so that it lies in a chip's static memory and never on its stack.
     pub(super) const fn empty() -> Self {
         Self {
             chip: Chip { address: [0; 6], random: [0; 16] },
@@ -114,7 +113,7 @@ impl PacketRouter {
         }
     }
 
-    /// Begins at `now` with the settings that are there.
+    /// Begins at `now` with the current settings.
     pub(super) fn begin(&mut self, now: HostTime, chip: Chip) {
         self.outstanding = super::component::OutstandingRequests::new(access::nonce(&chip.random));
         self.chip = chip;
@@ -126,8 +125,7 @@ impl PacketRouter {
         self.apply_settings(now);
     }
 
-    /// Does what settings ask that count at once: a place for the client of the settings, the
-    /// vehicle's key.
+    /// Applies the settings that take effect at once: the fixed client and the vehicle's key.
     pub(super) fn apply_settings(&mut self, now: HostTime) {
         self.signing.set_key(self.settings.vehicle_key.as_ref());
         for place in &mut self.clients {
@@ -176,8 +174,8 @@ impl PacketRouter {
         if self.is_ours(packet.target()) {
             self.handle_own(now, None, packet);
         }
-        // To everybody, also what answers one of them or us: each counts the autopilot's numbers, and
-        // what is kept back is a loss to whoever does not get it.
+        // Forward to all clients, including replies to one of them or to the bridge: each client tracks the autopilot's
+        // sequence numbers, so a withheld packet would count as lost.
         self.push_down(
             now,
             packet.source(),
@@ -188,7 +186,7 @@ impl PacketRouter {
         );
     }
 
-    /// Puts a packet into the clients' ring.
+    /// Adds a packet to the clients' ring.
     pub(super) fn push_down(
         &mut self,
         now: HostTime,
@@ -219,7 +217,7 @@ impl PacketRouter {
         }
     }
 
-    /// Lets the oldest packet of the clients' ring go; who has not read it loses it.
+    /// Drops the oldest packet of the clients' ring. Clients that have not read it lose it.
     fn evict(&mut self) {
         let tail = self.down.tail();
         let Some((tag, len, next)) = self.down.peek(tail) else { return };
@@ -237,7 +235,7 @@ impl PacketRouter {
         self.down.pop();
     }
 
-    /// Returns every client's bit.
+    /// Returns a mask with the bit of every client.
     pub(super) fn everybody(&self) -> u8 {
         let there = |(index, client): (usize, &Option<Client>)| client.as_ref().map(|_| bit(index));
         self.clients.iter().enumerate().filter_map(there).fold(0, |all, one| all | one)
@@ -261,7 +259,7 @@ impl PacketRouter {
             return;
         }
         if target.0 == 0 || (target.0 == bridge_messages.0 && target.1 == 0) {
-            // For everybody, us among them.
+            // Broadcast, so also for the bridge.
             self.handle_own(now, Some(index), packet);
         }
         let holders = self.holders(target, index);
@@ -282,7 +280,7 @@ impl PacketRouter {
         self.push_up(tag, packet.bytes());
     }
 
-    /// Returns the other clients that hold `target`, if it is not the vehicle itself.
+    /// Returns the other clients that hold `target`; 0 if the target is the vehicle.
     fn holders(&self, target: (u8, u8), except: usize) -> u8 {
         let vehicle = self.autopilot.is_some_and(|(system, _)| system == target.0);
         if target.0 == 0 || vehicle {
@@ -297,7 +295,7 @@ impl PacketRouter {
         holders
     }
 
-    /// Puts a packet into one of the queues for the autopilot's port.
+    /// Adds a packet to one of the queues for the autopilot's port.
     pub(super) fn push_up(&mut self, tag: Tag, bytes: &[u8]) {
         if overtakes(tag.kind) {
             self.make_way(bytes.len());
@@ -309,8 +307,8 @@ impl PacketRouter {
         }
     }
 
-    /// Makes room among the urgent packets: the oldest setpoints and poses give way, for their
-    /// newer ones are there; commands stay as long as any of those is left.
+    /// Makes room in the urgent queue. The oldest setpoints and poses are dropped first, because newer ones supersede
+    /// them; commands are dropped only if none of those is left.
     fn make_way(&mut self, len: usize) {
         let mut commands = 0;
         while !self.urgent.fits(len) {
@@ -319,7 +317,7 @@ impl PacketRouter {
             if streams(tag.kind) {
                 self.stats.drop(Reason::Superseded, 1);
             } else if commands < URGENT / len {
-                // Behind the others: once round, and every stream packet has been met.
+                // Requeue it at the end. After one round, every stream packet has been checked.
                 commands += 1;
                 self.urgent.push(tag, &packet[..len]);
             } else {
@@ -328,7 +326,7 @@ impl PacketRouter {
         }
     }
 
-    /// Returns the place of a client, a new one if it is new and there is room.
+    /// Returns the index of a client. Adds a new client if a place is free or replaceable.
     pub(super) fn open(&mut self, now: HostTime, peer: Peer) -> Option<usize> {
         if let Some(index) = self.place_of(peer) {
             return Some(index);
@@ -339,13 +337,13 @@ impl PacketRouter {
         Some(index)
     }
 
-    /// Returns the place of a client.
+    /// Returns the index of a client.
     pub(super) fn place_of(&self, peer: Peer) -> Option<usize> {
         let here = |client: &Option<Client>| client.as_ref().is_some_and(|c| c.peer == peer);
         self.clients.iter().position(here)
     }
 
-    /// Returns the place of the UDP client that is silent for longest, if that is long.
+    /// Returns the index of the UDP client with the longest silence, if it exceeds [`REPLACEABLE_S`].
     fn replaceable(&self, now: HostTime) -> Option<usize> {
         self.clients
             .iter()
@@ -364,7 +362,7 @@ impl PacketRouter {
         }
     }
 
-    /// Returns the name of the network we make.
+    /// Returns the name of the bridge's own network.
     pub(super) fn network_name(&self) -> heapless::String<32> {
         if !self.settings.ap_ssid.is_empty() {
             return self.settings.ap_ssid.clone();
@@ -378,7 +376,7 @@ impl PacketRouter {
 
     // ---- time ----
 
-    /// Does what is due: silence of clients and autopilot, the seconds' messages, link loss.
+    /// Runs all due work: silence of clients and autopilot, the messages of each second, link loss.
     pub(super) fn poll(&mut self, now: HostTime) {
         for place in &mut self.clients {
             let Some(client) = place else { continue };
@@ -396,7 +394,7 @@ impl PacketRouter {
         self.poll_component(now);
     }
 
-    /// Returns when something other than sending is due next.
+    /// Returns when the next work other than sending is due.
     pub(super) fn due(&self) -> HostTime {
         let mut due = self.save_at.map_or(self.second_at, |at| at.min(self.second_at));
         if let Some(at) = self.failsafe.due(self.flight, self.settings.loss_ms) {
@@ -406,7 +404,7 @@ impl PacketRouter {
     }
 }
 
-/// Takes the oldest packet off a queue.
+/// Removes the oldest packet of a queue and copies it into `out`.
 pub(super) fn take<const N: usize>(
     ring: &mut Ring<N>,
     out: &mut [u8; MAX_PACKET],
@@ -417,7 +415,7 @@ pub(super) fn take<const N: usize>(
     Some((tag, len))
 }
 
-/// Returns a message's number as the ring keeps it.
+/// Returns a message number as stored in the ring.
 pub(super) fn kind(id: u32) -> u16 {
     u16::try_from(id).unwrap_or(u16::MAX)
 }
@@ -427,19 +425,18 @@ pub(super) fn millis(now: HostTime) -> u16 {
     (now.as_ns() / 1_000_000) as u16
 }
 
-/// Whether of this message the newest counts.
+/// Whether only the newest message of this kind matters.
 pub(super) fn streams(kind: u16) -> bool {
     is_stream(kind.into())
 }
 
-/// Whether a message overtakes others on the way to the autopilot: streams, commands and what
-/// measures time.
+/// Whether a message overtakes others on the way to the autopilot: streams, commands and time synchronization.
 fn overtakes(kind: u16) -> bool {
     // HEARTBEAT, SET_MODE, COMMAND_INT, COMMAND_LONG, COMMAND_CANCEL, TIMESYNC.
     streams(kind) || matches!(kind, 0 | 11 | 75 | 76 | 80 | 111)
 }
 
-/// Whether a message from the autopilot does not wait for a batch to fill.
+/// Whether a message from the autopilot is sent without waiting for a full batch.
 fn hurries_down(kind: u16) -> bool {
     // COMMAND_ACK, TIMESYNC.
     matches!(kind, 77 | 111)

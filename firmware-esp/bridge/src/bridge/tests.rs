@@ -62,7 +62,7 @@ fn param(index: u16) -> MavMessage {
     MavMessage::PARAM_VALUE(PARAM_VALUE_DATA { param_index: index, ..Default::default() })
 }
 
-/// Settings of a bridge that sends nothing by itself but what it must.
+/// Settings without optional messages of the bridge.
 fn quiet() -> Settings {
     Settings { radio_status: false, beacon: false, ..Settings::default() }
 }
@@ -72,7 +72,7 @@ pub(super) fn bridge(settings: Settings) -> Bridge {
     Bridge::new(at(0), settings, chip)
 }
 
-/// Returns every datagram due at `now`.
+/// Returns all datagrams due at `now`.
 pub(super) fn datagrams(bridge: &mut Bridge, now: HostTime) -> Vec<(SocketAddrV4, Vec<u8>)> {
     let mut out = [0; 1472];
     let mut all = Vec::new();
@@ -82,7 +82,7 @@ pub(super) fn datagrams(bridge: &mut Bridge, now: HostTime) -> Vec<(SocketAddrV4
     all
 }
 
-/// Returns every packet for the autopilot.
+/// Returns all packets for the autopilot.
 pub(super) fn uart(bridge: &mut Bridge, now: HostTime) -> Vec<Vec<u8>> {
     let mut out = [0; MAX_PACKET];
     let mut all = Vec::new();
@@ -100,18 +100,18 @@ pub(super) fn decode(bytes: &[u8]) -> Vec<Packet> {
     packets
 }
 
-/// Returns how many packets of others there are.
+/// Returns the number of packets that are not from the bridge.
 fn others(bytes: &[u8]) -> usize {
     decode(bytes).iter().filter(|packet| packet.header.component_id != COMPONENT_ID).count()
 }
 
-/// Returns what is not from the bridge itself.
+/// Returns the packets that are not from the bridge.
 fn foreign(packets: Vec<Vec<u8>>) -> Vec<Vec<u8>> {
     packets.into_iter().filter(|packet| packet[6] != COMPONENT_ID).collect()
 }
 
 #[test]
-fn packets_pass_both_ways_byte_for_byte() {
+fn forwards_packets_unchanged_in_both_directions() {
     let mut bridge = bridge(quiet());
     let from_runtime = bytes(0, RUNTIME, &setpoint(1.0));
     bridge.handle_datagram(at(1), address(2), &from_runtime);
@@ -119,7 +119,7 @@ fn packets_pass_both_ways_byte_for_byte() {
     let telemetry =
         [bytes(0, AUTOPILOT, &heartbeat(false, 0)), bytes(1, AUTOPILOT, &attitude(0.5))];
     bridge.handle_uart(at(5), &telemetry.concat());
-    // Nothing leaves before the line is silent for half a millisecond.
+    // Nothing is sent until the line has been silent for half a millisecond.
     assert_eq!(datagrams(&mut bridge, at(5)), []);
     assert_eq!(bridge.udp_due(), Some(at(5).plus_ns(500_000)));
     let sent = datagrams(&mut bridge, at(6));
@@ -128,7 +128,7 @@ fn packets_pass_both_ways_byte_for_byte() {
 }
 
 #[test]
-fn a_busy_line_is_batched_for_the_set_time_or_a_datagram() {
+fn batches_a_busy_line_until_timeout_or_full_datagram() {
     let mut bridge = bridge(Settings { batch_us: 5000, ..quiet() });
     bridge.handle_datagram(at(0), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
     let packet = bytes(0, AUTOPILOT, &attitude(0.25));
@@ -148,7 +148,7 @@ fn a_busy_line_is_batched_for_the_set_time_or_a_datagram() {
         }
     }
     assert!(sent.iter().skip(2).all(|&(_, packets)| packets == 11 || packets == 10), "{sent:?}");
-    // Large packets fill a datagram before its time is up.
+    // Large packets fill a datagram before the timeout.
     let large = bytes(0, AUTOPILOT, &param(1)).repeat(60);
     bridge.handle_uart(at(3000), &large);
     let whole = datagrams(&mut bridge, at(3000));
@@ -156,7 +156,7 @@ fn a_busy_line_is_batched_for_the_set_time_or_a_datagram() {
 }
 
 #[test]
-fn answers_do_not_wait_for_a_batch() {
+fn sends_replies_without_waiting_for_a_batch() {
     let mut bridge = bridge(quiet());
     bridge.handle_datagram(at(0), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
     let ack = MavMessage::COMMAND_ACK(COMMAND_ACK_DATA::default());
@@ -165,7 +165,7 @@ fn answers_do_not_wait_for_a_batch() {
 }
 
 #[test]
-fn setpoints_overtake_and_commands_too_but_nothing_is_lost() {
+fn setpoints_and_commands_overtake_without_loss() {
     let mut bridge = bridge(quiet());
     for index in 0..20 {
         bridge.handle_datagram(at(1), address(2), &bytes(index, RUNTIME, &param(index.into())));
@@ -179,14 +179,14 @@ fn setpoints_overtake_and_commands_too_but_nothing_is_lost() {
 }
 
 #[test]
-fn a_late_setpoint_gives_way_to_a_newer_one_and_is_counted() {
+fn drops_a_late_setpoint_when_a_newer_one_waits() {
     let mut bridge = bridge(quiet());
     let send = |bridge: &mut Bridge, ms: u64, x: f32, from: (u8, u8)| {
         bridge.handle_datagram(at(ms), address(2), &bytes(x as u8, from, &setpoint(x)));
     };
     send(&mut bridge, 0, 1.0, RUNTIME);
     send(&mut bridge, 10, 2.0, RUNTIME);
-    // A burst within a period stays whole.
+    // Two setpoints within a period are both sent.
     assert_eq!(foreign(uart(&mut bridge, at(20))).len(), 2);
     send(&mut bridge, 100, 3.0, RUNTIME);
     send(&mut bridge, 120, 4.0, RUNTIME);
@@ -198,7 +198,7 @@ fn a_late_setpoint_gives_way_to_a_newer_one_and_is_counted() {
 }
 
 #[test]
-fn a_full_port_keeps_the_newest_setpoints_every_command_and_the_oldest_rest() {
+fn full_port_keeps_newest_setpoints_all_commands_and_oldest_others() {
     let mut bridge = bridge(quiet());
     for round in 0..200u8 {
         bridge.handle_datagram(at(1), address(2), &bytes(round, RUNTIME, &param(round.into())));
@@ -219,7 +219,7 @@ fn a_full_port_keeps_the_newest_setpoints_every_command_and_the_oldest_rest() {
     let stats = bridge.stats();
     assert_eq!(stats.dropped(Reason::Superseded) as usize, 200 - from(200).len());
     assert_eq!(stats.dropped(Reason::UartFull) as usize, 200 - from(255).len());
-    // A flood of nothing but commands still ends, and is counted.
+    // A flood of commands only is also bounded and counted.
     for round in 0..200u8 {
         bridge.handle_datagram(at(2), address(4), &bytes(round, (201, 1), &heartbeat(false, 0)));
     }
@@ -229,7 +229,7 @@ fn a_full_port_keeps_the_newest_setpoints_every_command_and_the_oldest_rest() {
 }
 
 #[test]
-fn all_hear_the_autopilot_and_clients_reach_each_other() {
+fn all_clients_receive_telemetry_and_reach_each_other() {
     let mut bridge = bridge(quiet());
     bridge.handle_uart(at(0), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_datagram(at(1), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
@@ -242,7 +242,7 @@ fn all_hear_the_autopilot_and_clients_reach_each_other() {
             ..Default::default()
         })
     };
-    // What the autopilot answers one of them all may hear: its numbers have no gap for anybody.
+    // All clients receive replies to one of them, so that their sequence numbers have no gaps.
     for (now, target) in
         [(10, RUNTIME), (11, (254, 190)), (12, (255, 0)), (13, (0, 0)), (14, (77, 1))]
     {
@@ -252,7 +252,7 @@ fn all_hear_the_autopilot_and_clients_reach_each_other() {
         to.sort_unstable();
         assert_eq!(to, [2, 3], "{target:?}");
     }
-    // From one client to the other, and not to the autopilot.
+    // From one client to the other, but not to the autopilot.
     uart(&mut bridge, at(14));
     let to_station = bytes(1, RUNTIME, &ack((254, 190)));
     bridge.handle_datagram(at(20), address(2), &to_station);
@@ -261,22 +261,22 @@ fn all_hear_the_autopilot_and_clients_reach_each_other() {
 }
 
 #[test]
-fn clients_come_stay_while_they_speak_and_go() {
+fn replaces_and_removes_silent_clients() {
     let mut bridge = bridge(Settings { client: Some(address(99)), ..quiet() });
     assert_eq!(bridge.clients().count(), 1);
     for last in 2..9 {
         bridge.handle_datagram(at(0), address(last), &bytes(0, RUNTIME, &setpoint(0.0)));
     }
-    // No packet, no client.
+    // Without a valid packet, the sender does not become a client.
     bridge.handle_datagram(at(0), address(50), b"GET / HTTP/1.1");
     assert_eq!(bridge.clients().count(), CLIENTS);
-    // All places are taken by clients that speak.
+    // All places are taken by active clients.
     bridge.handle_datagram(at(100), address(60), &bytes(0, RUNTIME, &setpoint(0.0)));
     assert_eq!(bridge.stats().dropped(Reason::TooManyClients), 1);
     for last in 3..9 {
         bridge.handle_datagram(at(3000), address(last), &bytes(1, RUNTIME, &setpoint(0.0)));
     }
-    // The one that is silent for longest gives its place.
+    // The client with the longest silence is replaced.
     bridge.handle_datagram(at(3001), address(60), &bytes(0, RUNTIME, &setpoint(0.0)));
     let here: Vec<Peer> = bridge.clients().map(|(peer, _, _)| peer).collect();
     assert!(here.contains(&Peer::Udp(address(60))) && !here.contains(&Peer::Udp(address(2))));
@@ -315,7 +315,7 @@ fn a_slow_tcp_client_loses_only_its_own_oldest_packets() {
 }
 
 #[test]
-fn until_somebody_answers_heartbeats_are_broadcast() {
+fn broadcasts_heartbeats_until_a_client_connects() {
     let mut bridge = bridge(Settings { radio_status: false, ..Settings::default() });
     bridge.set_network(Some(address(255)));
     let beat = bytes(3, AUTOPILOT, &heartbeat(false, 0));
@@ -331,7 +331,7 @@ fn until_somebody_answers_heartbeats_are_broadcast() {
 }
 
 #[test]
-fn the_companions_silence_lands_the_vehicle_and_is_reported() {
+fn lands_when_the_companion_is_silent() {
     let mut bridge = bridge(quiet());
     let mut seen = Vec::new();
     for ms in (0..2500).step_by(10) {
@@ -371,7 +371,7 @@ fn the_companions_silence_lands_the_vehicle_and_is_reported() {
     assert!(reported);
     bridge.handle_uart(at(2700), &bytes(0, AUTOPILOT, &heartbeat(true, 9)));
     bridge.handle_timeout(at(2701));
-    assert!(bridge.is_landing(), "until it stands");
+    assert!(bridge.is_landing(), "until landed");
     bridge.handle_uart(at(9000), &bytes(0, AUTOPILOT, &heartbeat(false, 9)));
     bridge.handle_timeout(at(9001));
     assert!(!bridge.is_landing());
@@ -379,7 +379,7 @@ fn the_companions_silence_lands_the_vehicle_and_is_reported() {
 }
 
 #[test]
-fn the_round_trip_is_measured_in_passing_and_by_asking() {
+fn measures_the_round_trip_of_clients_and_its_own() {
     let mut bridge = bridge(quiet());
     let sync =
         |tc1: i64, ts1: i64| MavMessage::TIMESYNC(TIMESYNC_DATA { tc1, ts1, ..Default::default() });
@@ -387,10 +387,10 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
     bridge.handle_datagram(at(100), address(2), &bytes(0, RUNTIME, &sync(0, 4242)));
     bridge.handle_uart(at(107), &bytes(0, AUTOPILOT, &sync(9, 4242)));
     assert_eq!(bridge.stats().round_trip_us, 7000);
-    // The answer goes on to the client.
+    // The reply is forwarded to the client.
     assert!(datagrams(&mut bridge, at(108)).iter().any(|(_, b)| decode(b).len() == 1));
     uart(&mut bridge, at(108));
-    // Once clients have stopped asking, the bridge asks; the answer goes on like any packet.
+    // Without requests of clients, the bridge sends requests; the reply is forwarded like any packet.
     bridge.handle_timeout(at(5000));
     let outstanding = |bridge: &mut Bridge, now| -> Vec<i64> {
         uart(bridge, now)
@@ -405,7 +405,7 @@ fn the_round_trip_is_measured_in_passing_and_by_asking() {
     assert_eq!(
         outstanding(&mut bridge, at(5000)),
         [],
-        "the autopilot is silent, nobody is there to ask"
+        "no request while the autopilot is silent"
     );
     bridge.handle_uart(at(5500), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_timeout(at(6001));
@@ -423,10 +423,10 @@ mod landing;
 mod stations;
 
 proptest! {
-    /// Whatever comes in, in whatever order: whole packets come out, and what went in either came
-    /// out, waits, or is counted.
+    /// For any order of inputs: the outputs are whole packets, and each input packet is sent, waits, or is counted as
+    /// dropped.
     #[test]
-    fn nothing_is_lost_uncounted(steps in prop::collection::vec((0..4u8, 0..3u8, 1..60u16), 1..400), poll in 1..20usize) {
+    fn counts_every_dropped_packet(steps in prop::collection::vec((0..4u8, 0..3u8, 1..60u16), 1..400), poll in 1..20usize) {
         let mut bridge = bridge(quiet());
         bridge.handle_uart(at(0), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
         bridge.handle_datagram(at(0), address(1), &bytes(0, RUNTIME, &setpoint(0.0)));

@@ -1,4 +1,4 @@
-//! Bytes that pass as they come, where a bridge is transparent.
+//! Transparent mode: forwards bytes unparsed.
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 use vizflyt_protocol::time::HostTime;
@@ -8,18 +8,18 @@ use super::router::{PacketRouter, millis};
 use crate::ring::Tag;
 use crate::stats::Reason;
 
-/// Stands for a message's number where bytes are not parsed; no message that overtakes has it.
+/// Message number of unparsed bytes. No message with priority has this number.
 const RAW: u16 = u16::MAX;
 
 impl PacketRouter {
-    /// Takes bytes of the autopilot's port as they are.
+    /// Forwards bytes of the autopilot's port unchanged.
     pub(super) fn take_raw_uart(&mut self, now: HostTime, bytes: &[u8]) {
         for part in bytes.chunks(MAX_PACKET) {
             self.push_down(now, (0, 0), RAW, self.everybody(), false, part);
         }
     }
 
-    /// Takes bytes of a client as they are.
+    /// Forwards bytes of a client unchanged.
     pub(super) fn take_raw_client(&mut self, now: HostTime, peer: Peer, bytes: &[u8]) {
         let Some(index) = self.open(now, peer) else {
             self.stats.drop(Reason::TooManyClients, 1);

@@ -17,7 +17,7 @@ pub(crate) fn v2(sequence: u8, from: (u8, u8), message: &MavMessage) -> Vec<u8> 
     encode(header, message, &mut [0; MAX_PACKET]).to_vec()
 }
 
-/// Returns a packet of a message that no dialect knows, with the CRC_EXTRA `extra`.
+/// Returns a packet of a message outside of the dialect, with the CRC_EXTRA `extra`.
 fn unknown(id: u32, payload: &[u8], extra: u8) -> Vec<u8> {
     let mut bytes = vec![0xFD, payload.len() as u8, 0, 0, 7, 1, 1];
     bytes.extend_from_slice(&id.to_le_bytes()[..3]);
@@ -27,7 +27,7 @@ fn unknown(id: u32, payload: &[u8], extra: u8) -> Vec<u8> {
     bytes
 }
 
-/// Signs a packet as the wire has it; the signature's own bytes are not looked at.
+/// Returns a signed packet in wire format. Its signature is not valid, because it is not verified.
 fn signed(message: &MavMessage) -> Vec<u8> {
     let mut bytes = v2(3, (255, 190), message);
     let crc_at = bytes.len() - 2;
@@ -65,7 +65,7 @@ fn cut_up(bytes: &[u8], chunk: usize) -> (Vec<Vec<u8>>, CutStats) {
 }
 
 #[test]
-fn packets_come_out_as_they_went_in_at_every_chunk_size() {
+fn cuts_packets_unchanged_at_every_chunk_size() {
     let mut packets = stream();
     let v1 = packets.remove(3);
     let v1_crc = v1[1..15].iter().chain([&50]).fold(0xFFFF, |crc, &byte| x25(crc, byte));
@@ -81,7 +81,7 @@ fn packets_come_out_as_they_went_in_at_every_chunk_size() {
 }
 
 #[test]
-fn headers_are_read() {
+fn reads_headers() {
     let command = MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {
         command: MavCmd::MAV_CMD_NAV_LAND,
         target_system: 1,
@@ -100,7 +100,7 @@ fn headers_are_read() {
 }
 
 #[test]
-fn a_packet_behind_a_false_start_comes_out_when_the_line_falls_silent() {
+fn finds_a_packet_behind_a_false_start_after_silence() {
     let good = stream().swap_remove(0);
     let mut bytes = vec![0xFD, 250, 0];
     bytes.extend_from_slice(&good);
@@ -115,14 +115,14 @@ fn a_packet_behind_a_false_start_comes_out_when_the_line_falls_silent() {
 }
 
 #[test]
-fn a_packet_within_a_payload_stays_there_when_the_line_pauses() {
+fn does_not_cut_a_packet_out_of_a_payload() {
     let inner = stream().swap_remove(0);
     let mut payload = inner.clone();
     payload.extend_from_slice(&[7; 40]);
     let mut outer = [0; MAX_PACKET];
     let len = crate::mavlink_writer::write_packet(&mut outer, (1, 1), 0, 385, &payload);
     for pause in 1..len {
-        // Its last byte is the inner one's end: nobody can tell until more comes.
+        // The inner packet ends with the received bytes, so it could be a packet.
         if pause == 10 + inner.len() {
             continue;
         }
@@ -135,7 +135,7 @@ fn a_packet_within_a_payload_stays_there_when_the_line_pauses() {
 }
 
 #[test]
-fn a_datagram_with_a_cut_off_packet_yields_the_whole_ones() {
+fn cuts_whole_packets_of_a_truncated_datagram() {
     let packets = stream();
     let mut bytes = packets[0].clone();
     bytes.extend_from_slice(&packets[1][..20]);
@@ -146,10 +146,10 @@ fn a_datagram_with_a_cut_off_packet_yields_the_whole_ones() {
 }
 
 #[test]
-fn a_changed_byte_never_passes() {
+fn rejects_changed_bytes() {
     for packet in stream().into_iter().filter(|packet| packet[0] == 0xFD && packet[2] == 0) {
         if message_id(&packet) == 0x12_3456 {
-            continue; // Its CRC_EXTRA is not known: one change in 256 passes.
+            continue; // The CRC_EXTRA is unknown: one change in 256 passes.
         }
         for at in 0..packet.len() {
             let mut broken = packet.clone();
@@ -162,10 +162,10 @@ fn a_changed_byte_never_passes() {
 }
 
 proptest! {
-    /// Whatever the garbage promised to be: once as many bytes have come as a packet may have, every
-    /// good one behind it is out, and in order.
+    /// After garbage of any content, all good packets are returned in order, at the latest after as many bytes as a
+    /// packet may have.
     #[test]
-    fn garbage_costs_at_most_itself(
+    fn garbage_hides_no_good_packet(
         garbage in prop::collection::vec(any::<u8>(), 0..600),
         chunk in 1..64usize,
         pause in any::<bool>(),
@@ -183,7 +183,7 @@ proptest! {
             }
         }
         cutter.push(&[0; MAX_PACKET], |packet| found.push(packet.bytes().to_vec()));
-        // Of messages that no dialect knows one piece of garbage in 256 passes; see the module.
+        // For unknown messages, one in 256 pieces of garbage passes; see the module.
         prop_assume!(cutter.stats().unknown == 0);
         prop_assert_eq!(found, good);
     }

@@ -1,8 +1,7 @@
-//! The settings in a browser: shown to everybody, changed by whoever types the key.
+//! Settings form of the web page. Reading is open; changes need the key.
 //!
-//! The key goes with every change, in the form's own body: there is no session that another site's page
-//! could ride on. It crosses the network as it is typed, within WPA2; `vizflyt bridge configure` proves
-//! its key without sending it.
+//! Every change contains the key in the form's body. Without a session, another site's page cannot act for the user.
+//! The key crosses the network as typed, inside WPA2; `vizflyt bridge configure` proves its key without sending it.
 
 use core::fmt::{self, Write};
 
@@ -12,22 +11,22 @@ use crate::access::Status;
 use crate::bridge::Bridge;
 use crate::settings::{NUMBERS, TEXTS};
 
-/// A change that a form asks for.
+/// Change that a form requests.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Form {
-    /// What opens the settings.
+    /// Key that authorizes the change.
     pub key: String<64>,
-    /// The setting.
+    /// Name of the setting.
     pub name: String<64>,
-    /// Its new value.
+    /// New value of the setting.
     pub value: String<64>,
-    /// Whether the bridge restarts afterwards.
+    /// Whether to restart the bridge afterwards.
     pub restart: bool,
 }
 
 impl Form {
-    /// Reads `application/x-www-form-urlencoded`; `None` if a field is unknown, comes twice, is too long or
-    /// no text.
+    /// Parses `application/x-www-form-urlencoded`. Returns `None` if a field is unknown, repeated, too long or not
+    /// text.
     pub fn parse(body: &[u8]) -> Option<Self> {
         let mut form = Self::default();
         let mut seen = 0u8;
@@ -48,7 +47,7 @@ impl Form {
                 _ => form.restart = value == "1",
             }
         }
-        // The box that is not ticked does not come.
+        // Browsers omit a box that is not ticked, so `restart` is optional.
         (seen & 0b111 == 0b111).then_some(form)
     }
 }
@@ -71,7 +70,7 @@ fn decode(text: &[u8]) -> Option<String<64>> {
         };
         bytes.push(byte).ok()?;
     }
-    // A control character is in no setting, and would split a line in flash.
+    // No setting contains control characters, and a line break would split a line in flash.
     let text = core::str::from_utf8(&bytes).ok()?;
     if text.chars().any(char::is_control) {
         return None;
@@ -79,7 +78,7 @@ fn decode(text: &[u8]) -> Option<String<64>> {
     String::try_from(text).ok()
 }
 
-/// Writes one part of the page that shows the settings; returns false behind its last.
+/// Writes one part of the settings page. Returns false after the last part.
 pub(super) fn write_part(
     bridge: &Bridge,
     part: usize,
@@ -111,7 +110,7 @@ pub(super) fn write_part(
                  <p><input name=key type=password placeholder='key, as printed at flashing'>\
                  <p><label><input name=restart type=checkbox value=1> restart it now</label>\
                  <p><button>Change</button></form>\
-                 <p>Speed, ports, pins and Wi-Fi count from the next start on.",
+                 <p>Speed, ports, pins and Wi-Fi take effect after a restart.",
             )?;
         }
         _ => return Ok(false),
@@ -119,7 +118,7 @@ pub(super) fn write_part(
     Ok(true)
 }
 
-/// Writes text that is nothing but text to a browser.
+/// Writes text with HTML's special characters escaped.
 fn escape(out: &mut impl Write, text: &str) -> fmt::Result {
     for letter in text.chars() {
         match letter {
@@ -133,7 +132,7 @@ fn escape(out: &mut impl Write, text: &str) -> fmt::Result {
     Ok(())
 }
 
-/// Returns the line of HTTP that goes with a change's fate.
+/// Returns the HTTP status line for the status of a change.
 pub(super) fn status_line(status: Status) -> &'static str {
     match status {
         Status::Done => "200 OK",
@@ -155,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn forms_are_read_or_refused_whole() {
+    fn accepts_or_rejects_forms_as_a_whole() {
         let check = |body: &[u8], expected: Option<(&str, &str, &str, bool)>| {
             let form = Form::parse(body);
             let read = form.as_ref().map(|f| (&*f.key, &*f.name, &*f.value, f.restart));
@@ -181,7 +180,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_encoded_comes_back(text in "[ -~\u{e9}]{0,32}") {
+        fn decodes_percent_encoding(text in "[ -~\u{e9}]{0,32}") {
             let mut body = b"key=k&name=hostname&value=".to_vec();
             for byte in text.bytes() {
                 body.extend(std::format!("%{byte:02X}").bytes());
@@ -191,14 +190,14 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_a_form_or_none(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+        fn accepts_any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
             if let Some(form) = Form::parse(&bytes) {
                 prop_assert!(!form.value.chars().any(char::is_control));
             }
         }
 
         #[test]
-        fn nothing_of_a_name_is_markup(text in ".{0,32}") {
+        fn escapes_all_markup(text in ".{0,32}") {
             let mut out = Vec::new();
             let mut page = Text::new();
             escape(&mut page, &text).unwrap();

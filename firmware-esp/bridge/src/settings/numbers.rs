@@ -1,21 +1,21 @@
-//! The settings that are numbers, each a MAVLink parameter of our component as well.
+//! Numeric settings, each also a MAVLink parameter of the bridge's component.
 
 use super::{Refused, Settings, WifiRole};
 
-/// A number that is a MAVLink parameter.
+/// Numeric setting and its limits.
 #[derive(Clone, Copy, Debug)]
 pub struct Number {
     /// Name, at most 16 characters.
     pub name: &'static str,
-    /// Least value.
+    /// Minimum.
     pub least: u32,
-    /// Greatest value.
+    /// Maximum.
     pub most: u32,
-    /// Whether 0 is allowed besides: it turns the thing off.
+    /// Whether 0 is also allowed; it turns the feature off.
     pub zero: bool,
-    /// Values within the range that are not allowed, as bits: bit 3 is the value 3.
+    /// Forbidden values within the range, as bits: bit 3 is the value 3.
     pub except: u32,
-    /// It counts only after a restart of the bridge.
+    /// Whether a change takes effect only after a restart.
     pub at_restart: bool,
     read: fn(&Settings) -> u32,
     write: fn(&mut Settings, u32),
@@ -93,8 +93,7 @@ pub const NUMBERS: &[Number] = &[
     pin("UART_CTS_PIN", |s| s.pins.cts.into(), |s, v| s.pins.cts = v as u8),
 ];
 
-/// A pin of the ESP32-C3; others ignore it. GPIO8 to 10 are lights and button, 11 to 17 the flash, 18
-/// and 19 USB.
+/// Pin of the ESP32-C3; other chips ignore it. GPIO8 to 10 are lights and button, 11 to 17 the flash, 18 and 19 USB.
 const fn pin(
     name: &'static str,
     read: fn(&Settings) -> u32,
@@ -115,12 +114,11 @@ const fn number(
 }
 
 impl Number {
-    /// Returns its value.
     pub fn value(&self, settings: &Settings) -> u32 {
         (self.read)(settings)
     }
 
-    /// Sets it.
+    /// Sets the value.
     ///
     /// # Errors
     /// [`Refused::OutOfRange`].

@@ -1,4 +1,4 @@
-//! The bridge's sockets: datagrams in and out, TCP clients.
+//! Sockets of the bridge: datagrams in and out, TCP clients.
 
 use core::cell::RefCell;
 use core::net::SocketAddrV4;
@@ -14,7 +14,7 @@ use embedded_io_async::Write;
 use super::page::show_page;
 use super::{Buffers, Platform, SendOnly, Shared, TcpBuffers, wait};
 
-/// Serves the network on one stack.
+/// Serves UDP, TCP and the web page on one stack.
 pub(super) async fn serve<P: Platform>(
     shared: &Shared,
     stack: Stack<'_>,
@@ -26,13 +26,13 @@ pub(super) async fn serve<P: Platform>(
     let Buffers { udp_in_meta, udp_in, udp_out_meta, udp_out, datagram_out, silent, tcp, page } =
         buffers;
     let SendOnly { meta, bytes, datagram } = silent;
-    // One socket for each way, of one port: what comes in goes to the one made first.
+    // Three sockets on one port, one per direction. Input goes to the one bound first.
     let (mut no_meta, mut none) = ([[PacketMetadata::EMPTY]; 3], [[0]; 3]);
     let ([no_a, no_b, no_c], [none_a, none_b, none_c]) = (&mut no_meta, &mut none);
     let mut incoming = UdpSocket::new(stack, udp_in_meta, udp_in, no_a, none_a);
     let mut to_speaking = UdpSocket::new(stack, no_b, none_b, udp_out_meta, udp_out);
     let mut to_silent = UdpSocket::new(stack, no_c, none_c, meta, bytes);
-    // The port is not 0 and the sockets are new: nothing else is refused.
+    // Cannot fail: the port is not 0 and the sockets are new.
     let _ = incoming.bind(udp_port);
     let receive = receive_udp(shared, &mut incoming);
     let send_speaking = async {
@@ -52,8 +52,8 @@ pub(super) async fn serve<P: Platform>(
                     Err(_) => break,
                 }
             }
-            // Who is first in the queue has gone, and its address cannot be had any more: closing
-            // empties the queue.
+            // The receiver of the first datagram is gone and its address cannot be resolved. Closing the socket empties
+            // the queue.
             shared.take(|bridge, _| bridge.note_not_sent());
             to_speaking.close();
         }
@@ -79,11 +79,11 @@ pub(super) async fn serve<P: Platform>(
     join4(receive, send, join_array(connections), show_page(shared, stack, platform, page)).await;
 }
 
-/// A network stack keeps what it cannot send, and everything behind it: a datagram for whoever has
-/// gone waits for an address for ever. One that is still there answers at once.
+/// Maximum time to send a datagram. The stack blocks its queue forever on a datagram whose receiver is gone; the
+/// address of a connected receiver resolves at once.
 const STUCK: Duration = Duration::from_secs(1);
 
-/// Hands datagrams to the bridge, for ever, from where the stack has them.
+/// Passes received datagrams to the bridge, forever, without copying them.
 async fn receive_udp(shared: &Shared, socket: &mut UdpSocket<'_>) {
     loop {
         let take = |bytes: &[u8], meta: UdpMetadata| {
@@ -99,7 +99,7 @@ fn endpoint(to: SocketAddrV4) -> IpEndpoint {
     IpEndpoint::new(IpAddress::Ipv4(*to.ip()), to.port())
 }
 
-/// Serves one TCP client after another.
+/// Serves TCP clients, one after the other.
 async fn connection(
     shared: &Shared,
     stack: Stack<'_>,
@@ -118,7 +118,7 @@ async fn connection(
             Timer::after(Duration::from_millis(100)).await;
             continue;
         }
-        // Packets must not wait for each other, and a client that is gone must make room.
+        // Packets must not wait for each other, and a disconnected client must free its slot.
         socket.set_nagle_enabled(false);
         socket.set_timeout(Some(Duration::from_secs(10)));
         socket.set_keep_alive(Some(Duration::from_secs(3)));
@@ -152,7 +152,7 @@ async fn connection(
         }
         shared.with(|bridge, _| bridge.close_stream(slot));
         socket.abort();
-        // A connection that is reset already has nothing to flush.
+        // A reset connection has nothing to flush.
         let _ = socket.flush().await;
     }
 }

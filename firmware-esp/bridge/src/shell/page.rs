@@ -1,4 +1,4 @@
-//! The bridge's page, and the firmware that comes to it.
+//! Serves the web page and receives firmware.
 
 use core::cell::RefCell;
 
@@ -11,7 +11,7 @@ use super::{PageBuffers, Platform, Shared};
 use crate::http::Progress;
 use crate::page;
 
-/// Serves the status page, to one browser after another, and takes firmware.
+/// Serves the web page to one browser at a time, and receives firmware.
 pub(super) async fn show_page<P: Platform>(
     shared: &Shared,
     stack: Stack<'_>,
@@ -25,7 +25,7 @@ pub(super) async fn show_page<P: Platform>(
     let PageBuffers { receive, transmit, chunk, request, answer } = buffers;
     loop {
         let mut socket = TcpSocket::new(stack, receive, transmit);
-        // A browser that opens a connection for later must not keep others out.
+        // A browser that opens a connection in advance must not block others.
         socket.set_timeout(Some(Duration::from_secs(5)));
         if socket.accept(port).await.is_err() {
             Timer::after(Duration::from_millis(100)).await;
@@ -50,7 +50,7 @@ pub(super) async fn show_page<P: Platform>(
                 page::respond_firmware(taken, answer);
                 let _ = socket.write_all(answer.as_bytes()).await;
                 socket.close();
-                // Whoever still sends reads the answer only after that.
+                // A client that is still sending reads the answer only when it is done.
                 while let Ok(1..) = socket.read(chunk).await {}
             }
             Progress::Whole => {
@@ -59,7 +59,7 @@ pub(super) async fn show_page<P: Platform>(
                 while shared
                     .take(|bridge, now| page::respond(bridge, now, request, done, part, answer))
                 {
-                    // A browser that has gone wants no answer.
+                    // The browser has disconnected.
                     if socket.write_all(answer.as_bytes()).await.is_err() {
                         break;
                     }
@@ -78,7 +78,7 @@ pub(super) async fn show_page<P: Platform>(
     }
 }
 
-/// Takes a firmware whose first bytes are `chunk[from..to]`, the rest from the connection.
+/// Receives a firmware: first the bytes `chunk[from..to]`, then the rest from the connection.
 async fn take_firmware<P: Platform>(
     shared: &Shared,
     platform: &RefCell<&mut P>,
@@ -89,7 +89,7 @@ async fn take_firmware<P: Platform>(
 ) -> Result<(), &'static str> {
     let mut first = true;
     loop {
-        // Asked again and again: it takes seconds, and flash stops everything else while it erases.
+        // Checked for every portion: an upload takes seconds, and erasing flash stops everything else.
         if shared.take(|bridge, _| bridge.is_armed()) {
             return Err("the vehicle is armed; land and disarm it first");
         }

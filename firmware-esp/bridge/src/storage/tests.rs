@@ -9,7 +9,7 @@ use embedded_storage::nor_flash::{
 
 use super::*;
 
-/// A flash in memory that, like flash, only clears bits; its power fails after so many bytes.
+/// Flash in memory: writes only clear bits, and the power fails after `power` bytes.
 #[derive(Clone, Debug)]
 pub(crate) struct Memory {
     pub(crate) bytes: Vec<u8>,
@@ -43,7 +43,7 @@ impl ReadNorFlash for Memory {
 }
 
 impl Memory {
-    /// Erased, with power enough.
+    /// Returns erased flash with unlimited power.
     pub(crate) fn of(len: usize) -> Self {
         Self { bytes: vec![0xFF; len], power: usize::MAX }
     }
@@ -86,7 +86,7 @@ fn with_loss(loss_ms: u16) -> Settings {
 }
 
 #[test]
-fn settings_come_back_and_the_newest_count() {
+fn loads_the_newest_settings() {
     let mut store = store();
     assert_eq!(store.load(), None);
     for loss_ms in [300, 400, 500, 600, 700] {
@@ -121,9 +121,9 @@ fn the_longest_settings_fit() {
     assert_eq!(store.load(), Some(longest));
 }
 
-/// The power may fail at any byte: what is read afterwards is the settings before or the new ones.
+/// The power may fail at any byte: afterwards, either the old or the new settings are read.
 #[test]
-fn a_power_cut_leaves_old_or_new() {
+fn a_power_failure_leaves_old_or_new_settings() {
     let mut whole = store();
     whole.save(&with_loss(300)).unwrap();
     whole.save(&with_loss(400)).unwrap();
@@ -138,5 +138,5 @@ fn a_power_cut_leaves_old_or_new() {
         assert!(saved.is_err() || expected == 500);
         new += u32::from(expected == 500);
     }
-    assert!(new > 0, "with power enough it is saved");
+    assert!(new > 0, "saved if the power lasts");
 }

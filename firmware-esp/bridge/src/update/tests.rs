@@ -64,7 +64,7 @@ fn feed(halves: &mut Halves, bytes: &[u8], chunk: usize) -> Result<bool, Fault> 
 
 proptest! {
     #[test]
-    fn a_signed_firmware_is_taken_in_any_portions(len in 1..16384usize, chunk in 1..2000usize) {
+    fn accepts_a_signed_firmware_in_any_portions(len in 1..16384usize, chunk in 1..2000usize) {
         let body = firmware(len);
         let mut halves = halves();
         prop_assert_eq!(feed(&mut halves, &signed_firmware(&body, |_| {}), chunk), Ok(true));
@@ -74,7 +74,7 @@ proptest! {
 }
 
 #[test]
-fn nothing_else_is_taken_and_nothing_is_erased_for_it() {
+fn rejects_other_firmware_before_erasing() {
     let body = firmware(5000);
     let check = |bytes: &[u8], expected: Fault| {
         let mut halves = halves();
@@ -96,7 +96,7 @@ fn nothing_else_is_taken_and_nothing_is_erased_for_it() {
 }
 
 #[test]
-fn damage_behind_the_header_is_found() {
+fn detects_damage_behind_the_header() {
     let whole = signed_firmware(&firmware(5000), |_| {});
     let check = |bytes: &[u8], expected: Result<bool, Fault>| {
         let mut halves = halves();
@@ -107,7 +107,7 @@ fn damage_behind_the_header_is_found() {
     changed[3000] ^= 1;
     check(&changed, Err(Fault::Damaged));
     check(&whole[..whole.len() - 1], Ok(false));
-    // A flash whose power goes.
+    // The power fails during a write.
     let mut halves = halves();
     halves.spare.power = 6000;
     assert_eq!(feed(&mut halves, &whole, 100), Err(Fault::Flash));
@@ -115,7 +115,7 @@ fn damage_behind_the_header_is_found() {
 }
 
 #[test]
-fn a_firmware_that_never_gets_well_is_given_up_after_three_starts() {
+fn rolls_back_after_three_unhealthy_starts() {
     let mut trial = Trial::new(Memory::of(4096), 0);
     assert_eq!(trial.start(), Ok(StartAction::Settled), "nothing was ever updated");
     trial.begin().unwrap();
@@ -123,12 +123,12 @@ fn a_firmware_that_never_gets_well_is_given_up_after_three_starts() {
         assert_eq!(trial.start(), Ok(StartAction::OnTrial));
     }
     assert_eq!(trial.start(), Ok(StartAction::GoBack));
-    // The half before runs, for good.
+    // The previous slot runs permanently.
     assert_eq!(trial.start(), Ok(StartAction::Settled));
 }
 
 #[test]
-fn a_healthy_firmware_stays() {
+fn keeps_a_healthy_firmware() {
     let mut trial = Trial::new(Memory::of(4096), 0);
     trial.begin().unwrap();
     assert_eq!(trial.start(), Ok(StartAction::OnTrial));
@@ -136,14 +136,14 @@ fn a_healthy_firmware_stays() {
     for _ in 0..5 {
         assert_eq!(trial.start(), Ok(StartAction::Settled));
     }
-    // And the next one is tried again.
+    // The next update is on trial again.
     trial.begin().unwrap();
     assert_eq!(trial.start(), Ok(StartAction::OnTrial));
 }
 
-/// Power may fail within any write of a start: it is counted, or it was no start.
+/// The power may fail within any write of a start: the rollback still happens.
 #[test]
-fn a_power_cut_never_loses_the_way_back() {
+fn rolls_back_despite_power_failures() {
     for power in 0..40 {
         let mut trial = Trial::new(Memory::of(4096), 0);
         trial.begin().unwrap();

@@ -15,7 +15,7 @@ fn fly(airframe: &mut Airframe, commands: [f64; 4], seconds: f64) {
     }
 }
 
-/// In the air at 10 m with rotors already at hover speed.
+/// In the air at 10 m, with rotors at hover speed.
 fn hovering() -> Airframe {
     let mut airframe = Airframe::standing(DVec3::ZERO, 0.0);
     airframe.state.p_world_m.z = 10.0;
@@ -48,7 +48,7 @@ fn hovers_at_the_thrust_to_weight_fraction() {
 fn full_throttle_from_hover_accelerates_by_the_excess_thrust() {
     let mut airframe = hovering();
     fly(&mut airframe, [1.0; 4], 0.2);
-    // After 0.2 s = 5.7 time constants the rotors are within 0.3 % of full speed.
+    // After 0.2 s = 5.7 time constants, the rotors are within 0.3 % of full speed.
     let a = airframe.specific_force_body_mps2().z;
     // Drag at the speed reached by then: 4-5 m/s.
     let drag = airframe.state().v_world_mps.z * 0.3;
@@ -64,9 +64,9 @@ fn rotors_lag_by_their_time_constant() {
     assert!((airframe.state().rotor_speed[0] - expected).abs() < 1e-3);
 }
 
-/// ArduCopter's motor order: which way each pair turns the vehicle.
+/// Checks the direction in which each pair of ArduCopter's motor order turns the vehicle.
 #[test]
-fn motors_turn_the_vehicle_as_ardupilots_quad_x() {
+fn motors_turn_the_vehicle_like_ardupilots_quad_x() {
     let omega_after = |raised: [usize; 2]| {
         let mut airframe = hovering();
         let commands =
@@ -74,16 +74,16 @@ fn motors_turn_the_vehicle_as_ardupilots_quad_x() {
         fly(&mut airframe, commands, 0.05);
         airframe.state().omega_body_radps
     };
-    // Right side up (1 front right, 4 rear right): rolls left, which is -x in FLU.
+    // More thrust on the right (1 front right, 4 rear right): rolls left, which is -x in FLU.
     assert!(omega_after([0, 3]).x < -1.0);
-    // Rear up (2 rear left, 4 rear right): nose down, which is +y in FLU.
+    // More thrust at the rear (2 rear left, 4 rear right): nose down, which is +y in FLU.
     assert!(omega_after([1, 3]).y > 1.0);
     // Counter-clockwise propellers faster (1, 2): the frame turns clockwise, -z.
     assert!(omega_after([0, 1]).z < -0.1);
 }
 
 #[test]
-fn a_fall_reaches_terminal_speed_and_ends_on_the_floor_without_bouncing_high() {
+fn a_fall_ends_on_the_floor_without_a_high_bounce() {
     let mut airframe = hovering();
     airframe.state.rotor_speed = [0.0; 4];
     let mut lowest = f64::INFINITY;
@@ -101,8 +101,8 @@ fn a_fall_reaches_terminal_speed_and_ends_on_the_floor_without_bouncing_high() {
     assert!(airframe.state().v_world_mps.length() < 1e-3);
 }
 
-/// Without air and thrust only gravity acts: energy and angular momentum stay (this checks the
-/// integrator and the gyroscopic term together).
+/// Without air and thrust, only gravity acts: angular momentum is conserved. This checks the integrator and the
+/// gyroscopic term together.
 #[test]
 fn free_tumbling_conserves_angular_momentum() {
     let mut airframe = hovering();
@@ -120,7 +120,7 @@ fn free_tumbling_conserves_angular_momentum() {
 }
 
 #[test]
-fn drag_slows_a_glide_and_wind_carries() {
+fn drag_slows_a_glide_and_wind_carries_the_vehicle() {
     let mut airframe = hovering();
     airframe.state.v_world_mps = DVec3::new(5.0, 0.0, 0.0);
     fly(&mut airframe, [hover_speed(); 4], 1.0);
@@ -134,9 +134,9 @@ fn drag_slows_a_glide_and_wind_carries() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
-    /// Whatever the motor commands are, NaN included, the state stays finite and above the floor.
+    /// For any motor commands, including NaN, the state stays finite and above the floor.
     #[test]
-    fn no_command_breaks_the_state(
+    fn any_command_keeps_the_state_finite(
         commands in prop::collection::vec(
             prop::array::uniform4(prop_oneof![
                 8 => 0.0..1.0f64, 1 => Just(f64::NAN), 1 => Just(f64::INFINITY), 1 => Just(-5.0),

@@ -1,4 +1,4 @@
-//! Arming, disarming, take-off: the checks of a real ArduCopter and its texts when one fails.
+//! Arming, disarming and take-off: checks and status texts as in ArduCopter.
 
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::time::AutopilotTime;
@@ -10,14 +10,14 @@ use super::{Autopilot, Guided, Param, Radio, name_of};
 use crate::startup::Startup;
 
 impl Autopilot {
-    /// Why the vehicle may not be armed; `None` if it may.
+    /// Returns why arming is refused; `None` if it is allowed.
     pub(super) fn arming_refusal(&self, now: AutopilotTime) -> Option<&'static str> {
         let health = self.estimator.health(now);
         let value = |param| self.params.value(param);
         if !health.attitude {
             return Some("PreArm: AHRS: not healthy");
         }
-        // Any bit: which checks each one skips is not distinguished here.
+        // Any bit skips all checks: individual bits are not simulated.
         if value(Param::ArmingSkipChecks) != 0.0 {
             return None;
         }
@@ -28,7 +28,7 @@ impl Autopilot {
         } else if value(Param::VisoType) != 0.0 && !health.vision {
             Some("PreArm: VisOdom: not healthy")
         } else if value(Param::GpsType) != 0.0 {
-            // There is no receiver on board.
+            // There is no GPS receiver on board.
             Some("PreArm: GPS 1: not healthy")
         } else if self.failsafe.battery.is_some() {
             Some("PreArm: Battery 1 low voltage failsafe")
@@ -39,7 +39,7 @@ impl Autopilot {
         } else if self.is_fenced() && self.fence_breaches(now).any() {
             Some("PreArm: Vehicle breaching Fence")
         } else if needs_position(self.mode) && health.origin && !health.position {
-            // Without an origin a real ArduCopter arms all the same and refuses the take-off.
+            // Without an origin, a real ArduCopter arms but refuses the take-off.
             Some("PreArm: Need Position Estimate")
         } else {
             None
@@ -79,7 +79,7 @@ impl Autopilot {
         MavResult::MAV_RESULT_ACCEPTED
     }
 
-    /// Stops the motors.
+    /// Disarms: stops the motors.
     pub(super) fn disarm(&mut self) {
         if self.armed {
             self.armed = false;
@@ -118,7 +118,7 @@ impl Autopilot {
         MavResult::MAV_RESULT_ACCEPTED
     }
 
-    /// PREFLIGHT_REBOOT_SHUTDOWN: 1 reboots; in the air only if it must.
+    /// PREFLIGHT_REBOOT_SHUTDOWN: 1 reboots; while armed only if forced.
     pub(super) fn reboot_on_command(&mut self, what: f32, force: bool) -> MavResult {
         if what != 1.0 {
             MavResult::MAV_RESULT_UNSUPPORTED

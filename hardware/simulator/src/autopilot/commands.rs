@@ -1,4 +1,4 @@
-//! Messages of the link: commands with their acknowledgements, setpoints, vision, parameters.
+//! Handles received messages: commands with acknowledgements, setpoints, vision, parameters.
 
 use vizflyt_protocol::mavlink::{
     CopterMode, Packet, dialect, vision_from_mavlink, world_from_ned, world_rotation_from_ned,
@@ -17,16 +17,16 @@ use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::YawTarget;
 
-/// Passed as param2 to arm or disarm against all checks (ArduPilot's magic numbers).
+/// Values of param2 that force arming or disarming without checks (ArduPilot's magic numbers).
 const FORCE_ARM: f32 = 2989.0;
 const FORCE_DISARM: f32 = 21196.0;
-/// Passed as param6 to reboot while armed.
+/// Value of param6 that forces a reboot while armed.
 const FORCE_REBOOT: f32 = 20_190_226.0;
 
-/// EK3_SRC1_POSXY.
+/// Value of EK3_SRC1_POSXY for external navigation.
 const EXTERNAL_NAVIGATION: f64 = 6.0;
 
-/// One command, whichever message carried it.
+/// Command from COMMAND_LONG or COMMAND_INT.
 struct Command {
     kind: MavCmd,
     params: [f32; 7],
@@ -83,7 +83,7 @@ impl Autopilot {
             MavMessage::SET_GPS_GLOBAL_ORIGIN(m) if m.target_system == self.system_id() => {
                 self.handle_origin(now, (m.latitude, m.longitude, m.altitude));
             }
-            // tc1 = 0 asks; anything else is an answer to somebody.
+            // tc1 = 0 is a request; other values are replies to other systems.
             MavMessage::TIMESYNC(m)
                 if m.tc1 == 0 && self.is_for_us(m.target_system, m.target_component) =>
             {
@@ -195,7 +195,7 @@ impl Autopilot {
             self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
             return MavResult::MAV_RESULT_FAILED;
         };
-        // A disarmed vehicle may choose any mode; the arming checks judge it later.
+        // A disarmed vehicle accepts any mode; the arming checks follow later.
         if self.armed && needs_position(mode) && !self.estimator.health(now).position {
             let text = format!("Mode change to {} failed: requires position", name_of(mode));
             self.send_status_text(MavSeverity::MAV_SEVERITY_WARNING, &text);
@@ -205,7 +205,7 @@ impl Autopilot {
         MavResult::MAV_RESULT_ACCEPTED
     }
 
-    /// Changes the mode; entering the mode of the moment again changes nothing.
+    /// Enters a mode. Has no effect if the mode is the present one.
     pub(super) fn enter(&mut self, mode: CopterMode) {
         if mode != self.mode {
             tracing::info!(target: "autopilot", "mode {}", name_of(mode));
@@ -229,13 +229,13 @@ impl Autopilot {
         if self.params.value(Param::VisoType) == 0.0 {
             return;
         }
-        // Received, and not used, unless the sources are external navigation.
+        // Received, but not used, unless external navigation is the source.
         if self.params.value(Param::Ek3PosXy) != EXTERNAL_NAVIGATION {
             self.estimator.note_vision_alive(now);
             return;
         }
         let least_m = self.params.value(Param::VisoPosNoise);
-        // A sender that does not know its covariance sends NaN.
+        // Senders without a covariance send NaN.
         let sigma_m = f64::from(variance_m2).max(0.0).sqrt().clamp(least_m, 100.0);
         let measurement = VisionMeasurement {
             world_from_body,
@@ -256,7 +256,7 @@ impl Autopilot {
             self.origin = Some(origin);
             self.send_status_text(MavSeverity::MAV_SEVERITY_INFO, "EKF3 IMU0 origin set");
         }
-        // Answered even if it was set before: the first answer may have been lost.
+        // Answered even if already set, because the first answer may have been lost.
         if let Some(message) = self.message(now, super::streams::GPS_GLOBAL_ORIGIN) {
             self.send(message);
         }

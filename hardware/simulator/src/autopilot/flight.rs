@@ -1,4 +1,4 @@
-//! What the vehicle does in each mode, and whether it stands on the ground.
+//! Flight behaviour of each mode, and landing detection.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
@@ -15,39 +15,39 @@ use crate::control::position::{Horizontal, Vertical};
 use crate::control::shape::sqrt_rate;
 use crate::motor::THRUST_TO_WEIGHT;
 
-/// Less thrust than this share of the weight means that something else carries the vehicle.
+/// Thrust as a share of weight below which something else must carry the vehicle.
 const CARRIED: f64 = 0.35;
-/// It must hold this long. [s]
+/// Time until the vehicle counts as landed [s].
 const LANDED_S: f64 = 1.0;
-/// A vehicle on the ground moves less than this. [m/s]
+/// Maximum speed of a vehicle on the ground [m/s].
 const LANDED_MPS: f64 = 0.3;
-/// And is shaken less than this, filtered at [`SHAKE_CUTOFF`]. [m/s^2]
+/// Maximum acceleration of a vehicle on the ground, filtered at [`SHAKE_CUTOFF`] [m/s^2].
 const LANDED_MPS2: f64 = 1.5;
 const SHAKE_CUTOFF: f64 = 12.0; // [rad/s]
-/// A take-off is over this close to its height. [m]
+/// Height error at which a take-off is complete [m].
 const REACHED_M: f64 = 0.05;
-/// A failsafe's LAND hovers until so long after LAND began (ArduCopter's `LAND_WITH_DELAY_MS`). [s]
+/// A failsafe's LAND hovers until this time after LAND began (ArduCopter's `LAND_WITH_DELAY_MS`) [s].
 const LAND_PAUSE_S: f64 = 4.0;
-/// LAND sinks by so much of the height left over LAND_ALT_LOW_M (ArduCopter's `PSC_D_POS_P`). [1/s]
+/// Sink rate of LAND per height above LAND_ALT_LOW_M (ArduCopter's `PSC_D_POS_P`) [1/s].
 const LAND_GAIN_PER_S: f64 = 1.0;
-/// A nose that follows travel does so above this share of WP_SPD.
+/// Minimum speed, as a share of WP_SPD, at which the nose follows the direction of travel.
 const LOOK_AHEAD_SHARE: f64 = 0.05;
 
-/// What [`Autopilot::fly`] keeps between ticks.
+/// State of [`Autopilot::fly`] between ticks.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FlightState {
-    /// Thrust commanded over weight.
+    /// Commanded thrust divided by weight.
     lift: f64,
-    /// Acceleration, filtered. [m/s^2, world]
+    /// Filtered acceleration [m/s^2, world].
     shake: DVec3,
     carried_s: f64,
-    /// Time armed on the ground. [s]
+    /// Time armed on the ground [s].
     idle_s: f64,
-    /// Where the nose shall point.
+    /// Yaw target.
     pub(super) yaw: YawTarget,
-    /// Tilt beyond what is asked for, and for how long. [s]
+    /// Time tilted beyond recovery [s].
     pub(super) toppled_s: f64,
-    /// Time since arming; motors spool up first. [s]
+    /// Time since arming [s]; motors spool up first.
     pub(super) armed_s: f64,
 }
 
@@ -65,24 +65,22 @@ impl Default for FlightState {
     }
 }
 
-/// Returns the limits of a vehicle set up by `hardware/airframe`.
+/// Returns the limits of a vehicle with the parameters of `hardware/airframe`.
 ///
 /// # Panics
-/// If the autopilot lacks one of its parameters: a test sets them all.
+/// If the autopilot lacks one of these parameters; a test sets all of them.
 pub fn airframe_limits() -> Limits {
     Autopilot::with_params(&airframe()).expect("the airframe's parameters are known").limits()
 }
 
-/// What a mode asks for.
+/// Demand of a flight mode.
 enum Demand {
-    /// Motors idle.
     Idle,
-    /// Motion.
     Motion(Horizontal, Vertical),
 }
 
 impl Autopilot {
-    /// One tick of flight: returns the motor commands.
+    /// Runs one tick of flight. Returns the motor commands.
     pub(super) fn fly(&mut self, now: AutopilotTime, dt_s: f64) -> [f64; 4] {
         let yaw_rad = yaw_of(self.estimator.estimate().world_from_body);
         if !self.armed {
@@ -119,7 +117,7 @@ impl Autopilot {
         motors
     }
 
-    /// Keeps controllers fresh while nothing is flown.
+    /// Keeps the controllers reset while the vehicle does not fly.
     fn stand(&mut self, yaw_rad: f64) {
         let estimate = *self.estimator.estimate();
         self.position.reset(&estimate);
@@ -141,12 +139,12 @@ impl Autopilot {
         }
     }
 
-    /// What the mode asks for, in flight.
+    /// Returns the demand of the present mode in flight.
     fn demand(&mut self, now: AutopilotTime, dt_s: f64) -> Demand {
         let stay = Horizontal::Velocity(DVec3::ZERO);
         let stay_z = Vertical::Velocity(0.0);
         match self.mode {
-            // Nobody holds the sticks: throttle is at its lowest.
+            // Without pilot input, the throttle is at its minimum.
             CopterMode::Stabilize => Demand::Idle,
             CopterMode::AltHold => Demand::Motion(Horizontal::Level, stay_z),
             CopterMode::Loiter | CopterMode::Brake => {
@@ -162,7 +160,7 @@ impl Autopilot {
         }
     }
 
-    /// Without a position nothing can be held: stay level instead.
+    /// Returns `wanted`, or level flight without a position.
     fn or_level(&self, now: AutopilotTime, wanted: Horizontal) -> Horizontal {
         if self.estimator.health(now).position { wanted } else { Horizontal::Level }
     }
@@ -175,7 +173,7 @@ impl Autopilot {
             speed => speed,
         };
         let (slow, low_m) = (value(Param::LandSpeed), value(Param::LandAltLow));
-        // Slowed down on the way to LAND_ALT_LOW_M, not there.
+        // Slows down before LAND_ALT_LOW_M, not at it.
         let braked = sqrt_rate(height_m - low_m, LAND_GAIN_PER_S, value(Param::WpAccelerationZ));
         Vertical::Descend(braked.clamp(slow, fast.max(slow)))
     }
@@ -263,7 +261,7 @@ impl Autopilot {
         }
     }
 
-    /// Moves the heading towards what is asked for.
+    /// Moves the heading towards its target.
     fn steer(&mut self, now: AutopilotTime, horizontal: Horizontal, dt_s: f64) {
         let slew = (self.params.value(Param::SlewYaw) / 100.0).to_radians();
         let in_guided = self.mode == CopterMode::Guided;
@@ -286,7 +284,7 @@ impl Autopilot {
         self.heading.rate_radps = step / dt_s;
     }
 
-    /// The direction of travel, if an ignored yaw makes the nose follow it.
+    /// Returns the direction of travel, if the nose follows it because yaw is ignored.
     fn travel_heading(&self, now: AutopilotTime, horizontal: Horizontal) -> Option<f64> {
         let follows = self.params.value(Param::WpYawBehavior) != 0.0
             && self.mode == CopterMode::Guided
@@ -323,7 +321,7 @@ impl Autopilot {
         }
     }
 
-    /// Returns the throttle of the moment. [%]
+    /// Returns the present throttle [%].
     pub(super) fn throttle_percent(&self) -> u16 {
         (self.flight.lift / THRUST_TO_WEIGHT * 100.0).clamp(0.0, 100.0) as u16
     }

@@ -1,7 +1,6 @@
-//! The fence's polygons over the mission protocol, as ArduCopter takes, keeps and gives them
-//! (MissionItemProtocol.cpp, AC_PolyFence_loader.cpp): it asks for one item after the other, takes the
-//! whole or nothing, and remembers it over a reboot. Circles, return points, missions and rally points
-//! are not simulated, and refused.
+//! Fence polygons over the mission protocol, as in ArduCopter (MissionItemProtocol.cpp, AC_PolyFence_loader.cpp): it
+//! requests one item after the other, accepts all or nothing, and stores the fence over a reboot. Circles, return
+//! points, missions and rally points are not simulated and are refused.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::{
@@ -15,20 +14,20 @@ use super::dialect::{
     MavMissionResult, MavMissionType, MavSeverity,
 };
 
-/// Corners kept at most; ArduCopter's storage holds about as many.
+/// Maximum number of corners, about the capacity of ArduCopter's storage.
 const MAX_CORNERS: u16 = 70;
-/// An item that does not come is asked for again after this. [s]
+/// Time after which a missing item is requested again [s].
 const REPEAT_S: f64 = 1.0;
-/// A sender silent for this long has given up. [s]
+/// Silence of the sender after which an upload is cancelled [s].
 const TIMEOUT_S: f64 = 8.0;
 
-/// Somebody who sends or asks: system and component.
+/// Sender of a message: system and component.
 type Sender = (u8, u8);
 
-/// The polygons, and the upload under way.
+/// Stored polygons, and the upload in progress.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Polygons {
-    /// Those in force, one after the other.
+    /// Corners of all polygons in force, one after the other.
     corners: Vec<FenceCorner>,
     upload: Option<Upload>,
 }
@@ -43,12 +42,12 @@ struct Upload {
 }
 
 impl Polygons {
-    /// Returns those that are stored, as after a reboot.
+    /// Returns the polygons that are stored over a reboot.
     pub(super) fn stored(&self) -> Self {
         Self { corners: self.corners.clone(), upload: None }
     }
 
-    /// Whether a place is outside a polygon to stay in, or inside one to stay out of. [m, world]
+    /// Whether a position is outside an inclusion polygon, or inside an exclusion polygon [m, world].
     pub(super) fn are_breached_at(&self, origin: GlobalPoint, p_world_m: DVec2) -> bool {
         let mut rest = &self.corners[..];
         while let Some(first) = rest.first() {
@@ -74,7 +73,7 @@ fn is_inside(corners_m: impl Iterator<Item = DVec2> + Clone, p_m: DVec2) -> bool
     corners_m.zip(next).filter(|&side| crosses(side)).count() % 2 == 1
 }
 
-/// Whether the corners are whole polygons, each of one kind.
+/// Whether the corners form complete polygons, each of one kind.
 fn are_whole(mut corners: &[FenceCorner]) -> bool {
     while let Some(first) = corners.first() {
         let count = usize::from(first.corners);
@@ -88,7 +87,7 @@ fn are_whole(mut corners: &[FenceCorner]) -> bool {
 }
 
 impl Autopilot {
-    /// Takes a message of the mission protocol; returns whether it was one.
+    /// Handles a message of the mission protocol. Returns whether it was one.
     pub(super) fn handle_mission(
         &mut self,
         now: AutopilotTime,
@@ -180,7 +179,7 @@ impl Autopilot {
             return self.answer(from, MavMissionResult::MAV_MISSION_DENIED);
         }
         if usize::from(item.seq) != upload.got.len() {
-            // One that came twice: the upload goes on.
+            // A duplicate; the upload continues.
             return self.answer(from, MavMissionResult::MAV_MISSION_INVALID_SEQUENCE);
         }
         match fence_corner_from_mavlink(item) {
@@ -217,7 +216,7 @@ impl Autopilot {
         self.send(MavMessage::MISSION_REQUEST(request));
     }
 
-    /// Asks again for what does not come, and gives up in the end.
+    /// Requests missing items again, and cancels the upload after a timeout.
     pub(super) fn tend_upload(&mut self, now: AutopilotTime) {
         let Some(upload) = &self.polygons.upload else { return };
         if now.seconds_since(upload.received_at) > TIMEOUT_S {

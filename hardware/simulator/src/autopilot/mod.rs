@@ -1,20 +1,18 @@
-//! An autopilot that behaves as ArduCopter does in a lab with external navigation and no radio
-//! control: MAVLink bytes and sensor samples in, MAVLink bytes and motor commands out. Sans-IO:
-//! no socket, no clock.
+//! Simulated autopilot that behaves like ArduCopter in a lab with external navigation and without radio control:
+//! MAVLink bytes and sensor samples in, MAVLink bytes and motor commands out. Sans-IO: no sockets, no clock.
 //!
 //! - [`Autopilot::handle_sensors`], 400 Hz: estimate -> mode -> control -> motors ([`flight`]).
-//! - [`Autopilot::handle_input`]: bytes of the link -> signed by the key, if one was given
-//!   ([`signing`]) -> messages -> commands ([`commands`]).
-//!   The fence's polygons come by the mission protocol ([`mission`]).
+//! - [`Autopilot::handle_input`]: bytes of the link -> signature check, if a key is set ([`signing`]) -> messages ->
+//!   commands ([`commands`]). Fence polygons use the mission protocol ([`mission`]).
 //! - [`Autopilot::handle_timeout`]: heartbeats, streams, failsafes ([`telemetry`], [`failsafe`]).
 //! - [`Autopilot::poll_transmit`]: bytes for the link.
 //!
-//! What a real ArduCopter 4.8 was seen to do is reproduced, its pitfalls included: take-off
-//! without an origin is refused though it arms; an ignored yaw turns the nose into travel; a
-//! velocity setpoint dies after 3 s; lost vision is only noticed after seven seconds. One test a
-//! pitfall: `tests/pitfalls.rs`. Texts of fence and reboot are worded alike, not copied.
+//! The observed behaviour of a real ArduCopter 4.8 is reproduced, including its pitfalls: it arms without an origin but
+//! refuses take-off; an ignored yaw turns the nose into the direction of travel; a velocity setpoint expires after 3 s;
+//! lost vision is detected only after seven seconds. `tests/pitfalls.rs` has one test for each pitfall. Texts of fence
+//! and reboot are similar, not identical.
 
-// Why: what real ground stations still send is deprecated in the dialect and alive on the wire.
+// Why: real ground stations still send messages that are deprecated in the dialect.
 #![allow(deprecated)]
 
 mod arming;
@@ -49,19 +47,19 @@ pub use flight::airframe_limits;
 pub use params::{Param, ParamSpec, Params, TABLE, airframe};
 use streams::Streams;
 
-/// Links that are served at once, as telemetry ports: each has its own stream of bytes.
+/// Maximum number of links; each is a separate stream of bytes, like a telemetry port.
 pub const MAX_LINKS: usize = 4;
-/// Messages that wait for the link at most. A full parameter list fits; beyond it the oldest goes.
+/// Maximum number of queued messages. A full parameter list fits; beyond it, the oldest message is dropped.
 const OUTBOX: usize = 256;
 
-/// What GUIDED is doing.
+/// Activity of GUIDED.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Guided {
-    /// Nothing asked yet: stop and stay.
+    /// Stop and hold, without a setpoint.
     Hold,
-    /// Climbing to a height. [m, world]
+    /// Climb to a height [m, world].
     TakeOff { z_m: f64 },
-    /// Following a setpoint; `p_world_m` is where its point has moved to by now.
+    /// Follow a setpoint; `p_world_m` is the present position of its moving target.
     Setpoint { setpoint: GuidedSetpoint, since: AutopilotTime, p_world_m: DVec3 },
 }
 
@@ -73,27 +71,27 @@ enum Return {
     Land,
 }
 
-/// LAND of the moment.
+/// State of LAND.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Landing {
     began: AutopilotTime,
-    /// A failsafe entered it, or came during it: it hovers first.
+    /// Whether it hovers first, because a failsafe entered LAND or occurred during it.
     pauses: bool,
 }
 
-/// The receiver of a radio control.
+/// State of the radio-control receiver.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Radio {
-    /// None is connected: a lab without a pilot.
+    /// No receiver is connected: a lab without a pilot.
     #[default]
     Absent,
-    /// A transmitter is received.
+    /// The transmitter is received.
     Receiving,
-    /// The transmitter has fallen silent.
+    /// The transmitter is silent.
     Lost,
 }
 
-/// The autopilot.
+/// Simulated ArduCopter.
 pub struct Autopilot {
     params: Params,
     startup: Startup,
@@ -106,7 +104,7 @@ pub struct Autopilot {
     guided: Guided,
     returning: Return,
     landing: Landing,
-    /// Where the vehicle was armed. [m, world]
+    /// Position where the vehicle was armed [m, world].
     home: Option<DVec3>,
     /// Latitude and longitude [1e-7 deg] and altitude [mm], as set.
     origin: Option<(i32, i32, i32)>,
@@ -116,15 +114,15 @@ pub struct Autopilot {
     sample: SensorSample,
     flight: flight::FlightState,
     failsafe: failsafe::Failsafe,
-    /// The fence's, as uploaded.
+    /// Uploaded fence polygons.
     polygons: mission::Polygons,
     streams: Streams,
     decoders: [StreamDecoder; MAX_LINKS],
     outbox: VecDeque<MavMessage>,
     outbox_dropped: u64,
-    /// Since a key was given.
+    /// Present once a key was set.
     signing: Option<signing::Signing>,
-    /// Of the last [`Self::handle_timeout`].
+    /// Time of the last [`Self::handle_timeout`].
     now: AutopilotTime,
     sequence: u8,
     last_ground_station: Option<AutopilotTime>,
@@ -174,7 +172,7 @@ impl Default for Autopilot {
 }
 
 impl Autopilot {
-    /// Makes an autopilot that has just booted, with some parameters changed by name.
+    /// Returns an autopilot that has just booted, with some parameters changed by name.
     ///
     /// # Errors
     /// Returns the first name that is not a parameter.
@@ -187,13 +185,13 @@ impl Autopilot {
         Ok(autopilot)
     }
 
-    /// Makes it start as `startup` has it. Call it before it runs.
+    /// Sets the start-up behaviour. Call it before the autopilot runs.
     pub fn set_startup(&mut self, startup: Startup) {
         self.startup = startup;
         self.estimator = Estimator::new(startup);
     }
 
-    /// Makes an autopilot that boots with the parameters, the fence and the key this one has stored.
+    /// Returns the autopilot after a reboot: it keeps parameters, fence and key.
     pub fn rebooted(&self) -> Self {
         let signing = self.signing.as_ref().map(|signing| signing.rebooted(self.now));
         let (params, polygons) = (self.params.clone(), self.polygons.stored());
@@ -201,7 +199,7 @@ impl Autopilot {
         Self { params, polygons, radio: self.radio, signing, startup, estimator, ..Self::default() }
     }
 
-    /// Whether somebody has asked for a reboot.
+    /// Whether a reboot was requested.
     pub fn wants_reboot(&self) -> bool {
         self.wants_reboot
     }
@@ -211,9 +209,9 @@ impl Autopilot {
         self.radio = radio;
     }
 
-    /// Takes bytes from a link; there are [`MAX_LINKS`].
+    /// Takes bytes from a link, one of [`MAX_LINKS`].
     pub fn handle_input(&mut self, now: AutopilotTime, link: usize, bytes: &[u8]) {
-        // Taken out while it runs, because every packet changes the rest of the autopilot.
+        // Taken out temporarily, because packets change the rest of the autopilot.
         let mut decoder = std::mem::take(&mut self.decoders[link]);
         decoder.push_whole(bytes, |bytes, packet| {
             let mut signing = self.signing.as_mut();
@@ -224,8 +222,8 @@ impl Autopilot {
         self.decoders[link] = decoder;
     }
 
-    /// Takes one sensor sample, `dt_s` after the last, and returns the motor commands: rotor
-    /// speeds as fractions of full speed in ArduCopter's order. 400 Hz.
+    /// Takes one sensor sample, `dt_s` after the last one. Returns the motor commands: rotor speeds as fractions of
+    /// full speed, in ArduCopter's order. 400 Hz.
     pub fn handle_sensors(
         &mut self,
         now: AutopilotTime,
@@ -239,7 +237,7 @@ impl Autopilot {
         self.fly(now, dt_s)
     }
 
-    /// Does what is due: heartbeat, streams, failsafes. Call at least 100 times a second.
+    /// Runs due work: heartbeat, streams, failsafes. Call it at least 100 times a second.
     pub fn handle_timeout(&mut self, now: AutopilotTime) {
         self.now = now;
         self.check_failsafes(now);
@@ -247,7 +245,7 @@ impl Autopilot {
         self.stream(now);
     }
 
-    /// Returns the next packet for the link.
+    /// Returns the next packet for the links.
     pub fn poll_transmit<'a>(&mut self, buffer: &'a mut [u8; MAX_PACKET]) -> Option<&'a [u8]> {
         let message = self.outbox.pop_front()?;
         let header = MavHeader {
@@ -263,12 +261,12 @@ impl Autopilot {
         Some(&buffer[..len])
     }
 
-    /// Whether the motors may turn.
+    /// Whether the vehicle is armed.
     pub fn is_armed(&self) -> bool {
         self.armed
     }
 
-    /// Whether the autopilot estimates that it stands on the ground.
+    /// Whether the autopilot's landing detection reports ground contact.
     pub fn is_landed(&self) -> bool {
         self.landed
     }
@@ -278,22 +276,21 @@ impl Autopilot {
         self.mode
     }
 
-    /// Returns the estimator.
     pub fn estimator(&self) -> &Estimator {
         &self.estimator
     }
 
-    /// Returns packets received over all links.
+    /// Returns the number of packets received over all links.
     pub fn packets_in(&self) -> u64 {
         self.decoders.iter().map(|decoder| decoder.stats().packets).sum()
     }
 
-    /// Returns packets refused because they were not signed with the key; each is one of those received.
+    /// Returns the number of received packets that were refused because they were not signed with the key.
     pub fn packets_refused(&self) -> u64 {
         self.signing.as_ref().map_or(0, signing::Signing::refused)
     }
 
-    /// Returns messages dropped because the link did not take them.
+    /// Returns the number of messages dropped because the outbox was full.
     pub fn outbox_dropped(&self) -> u64 {
         self.outbox_dropped
     }
@@ -310,7 +307,7 @@ impl Autopilot {
         self.outbox.push_back(message);
     }
 
-    /// Says something to people, at most 50 characters.
+    /// Sends a status text of at most 50 characters.
     fn send_status_text(&mut self, severity: MavSeverity, text: &str) {
         tracing::info!(target: "autopilot", "{text}");
         self.send(MavMessage::STATUSTEXT(dialect::STATUSTEXT_DATA {
@@ -324,12 +321,12 @@ impl Autopilot {
 /// MAV_COMP_ID_AUTOPILOT1.
 const AUTOPILOT_COMPONENT: u8 = 1;
 
-/// A parameter name that the autopilot does not have.
+/// Parameter name that the autopilot does not have.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("autopilot: no parameter {0}; PARAM_REQUEST_LIST names those there are")]
+#[error("autopilot: no parameter {0}; PARAM_REQUEST_LIST returns all names")]
 pub struct UnknownParam(pub String);
 
-/// ArduCopter's name of a mode.
+/// Returns ArduCopter's name of a mode.
 fn name_of(mode: CopterMode) -> &'static str {
     match mode {
         CopterMode::Stabilize => "STABILIZE",

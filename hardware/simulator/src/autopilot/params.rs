@@ -1,28 +1,28 @@
-//! The parameters of ArduCopter that this autopilot honours, by the names of 4.8, and those of `hardware/airframe`.
+//! ArduCopter parameters that this autopilot implements, by their names in 4.8, and those of `hardware/airframe`.
 //!
-//! Defaults are a lab's (`docs` of ArduCopter: external navigation, no GPS, no compass), not
-//! ArduCopter's own, wherever the comment states it.
+//! Defaults marked "(lab)" are for a lab (ArduCopter documentation: external navigation, no GPS, no compass); the
+//! others are ArduCopter's.
 
 use super::dialect::MavParamType;
 
-/// One parameter: name on the wire, default, range, type.
+/// Name, default, range and type of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParamSpec {
     /// Name, at most 16 characters.
     pub name: &'static str,
     /// Value at boot.
     pub default: f32,
-    /// Least value taken.
+    /// Minimum.
     pub least: f32,
-    /// Largest value taken.
+    /// Maximum.
     pub most: f32,
-    /// Type on the wire; values travel as floats whatever it is.
+    /// Type on the wire; all values are sent as floats.
     pub kind: MavParamType,
 }
 
 macro_rules! params {
     ($($(#[$doc:meta])* $variant:ident = $name:literal, $default:literal, $least:literal..$most:literal, $kind:ident;)*) => {
-        /// A parameter by what it does.
+        /// Parameters by purpose.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub enum Param { $($(#[$doc])* $variant,)* }
 
@@ -38,9 +38,9 @@ macro_rules! params {
 }
 
 params! {
-    /// Our system id.
+    /// System ID of the autopilot.
     SystemId = "MAV_SYSID", 1.0, 1.0..255.0, MAV_PARAM_TYPE_INT16;
-    /// System id whose heartbeats count for the ground station failsafe.
+    /// System ID whose heartbeats count for the ground station failsafe.
     GcsSystemId = "MAV_GCS_SYSID", 255.0, 1.0..255.0, MAV_PARAM_TYPE_INT16;
     /// Frame: 1 is quad.
     FrameClass = "FRAME_CLASS", 1.0, 0.0..20.0, MAV_PARAM_TYPE_INT8;
@@ -48,7 +48,7 @@ params! {
     FrameType = "FRAME_TYPE", 1.0, 0.0..20.0, MAV_PARAM_TYPE_INT8;
     /// Estimator: 3 is EKF3.
     AhrsEkfType = "AHRS_EKF_TYPE", 3.0, 0.0..11.0, MAV_PARAM_TYPE_INT8;
-    /// EKF3 on.
+    /// EKF3 is enabled.
     Ek3Enable = "EK3_ENABLE", 1.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
     /// Source of horizontal position; 6 is external navigation (lab).
     Ek3PosXy = "EK3_SRC1_POSXY", 6.0, 0.0..6.0, MAV_PARAM_TYPE_INT8;
@@ -60,117 +60,117 @@ params! {
     Ek3VelZ = "EK3_SRC1_VELZ", 6.0, 0.0..6.0, MAV_PARAM_TYPE_INT8;
     /// Source of heading (lab).
     Ek3Yaw = "EK3_SRC1_YAW", 6.0, 0.0..8.0, MAV_PARAM_TYPE_INT8;
-    /// No compass indoors (lab).
+    /// Compass; none indoors (lab).
     CompassEnable = "COMPASS_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
-    /// No GPS indoors (lab).
+    /// GPS; none indoors (lab).
     GpsType = "GPS1_TYPE", 0.0, 0.0..25.0, MAV_PARAM_TYPE_INT8;
-    /// Vision over MAVLink (lab).
+    /// Type of external navigation: 1 is MAVLink (lab).
     VisoType = "VISO_TYPE", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
-    /// Constant latency of vision. [ms]
+    /// Constant latency of vision [ms].
     VisoDelayMs = "VISO_DELAY_MS", 10.0, 0.0..250.0, MAV_PARAM_TYPE_INT16;
-    /// Least standard deviation given to vision positions (lab). [m]
+    /// Minimum standard deviation of vision positions (lab) [m].
     VisoPosNoise = "VISO_POS_M_NSE", 0.1, 0.05..10.0, MAV_PARAM_TYPE_REAL32;
-    /// Least standard deviation given to vision velocities (lab). [m/s]
+    /// Minimum standard deviation of vision velocities (lab) [m/s].
     VisoVelNoise = "VISO_VEL_M_NSE", 0.1, 0.05..5.0, MAV_PARAM_TYPE_REAL32;
-    /// Least standard deviation given to vision headings (lab). [rad]
+    /// Minimum standard deviation of vision headings (lab) [rad].
     VisoYawNoise = "VISO_YAW_M_NSE", 0.1, 0.05..1.0, MAV_PARAM_TYPE_REAL32;
-    /// Speed towards position targets (lab). [m/s]
+    /// Speed towards position targets (lab) [m/s].
     WpSpeed = "WP_SPD", 1.0, 0.1..20.0, MAV_PARAM_TYPE_REAL32;
-    /// Climb rate towards position targets (lab). [m/s]
+    /// Climb rate towards position targets (lab) [m/s].
     WpSpeedUp = "WP_SPD_UP", 0.5, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
-    /// Sink rate towards position targets (lab). [m/s]
+    /// Sink rate towards position targets (lab) [m/s].
     WpSpeedDown = "WP_SPD_DN", 0.5, 0.1..5.0, MAV_PARAM_TYPE_REAL32;
-    /// Horizontal acceleration of all guided motion. [m/s^2]
+    /// Horizontal acceleration of all guided motion [m/s^2].
     WpAcceleration = "WP_ACC", 2.5, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
-    /// Vertical acceleration of all guided motion. [m/s^2]
+    /// Vertical acceleration of all guided motion [m/s^2].
     WpAccelerationZ = "WP_ACC_Z", 1.0, 0.5..8.0, MAV_PARAM_TYPE_REAL32;
-    /// Nose when a setpoint ignores yaw: 0 keeps it, else it turns into the direction of travel.
+    /// Yaw behaviour if a setpoint ignores yaw: 0 keeps it; other values turn the nose into the direction of travel.
     WpYawBehavior = "WP_YAW_BEHAVIOR", 2.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
-    /// Horizontal jerk; with ArduCopter's default a vehicle answers a velocity after some 0.7 s. [m/s^3]
+    /// Horizontal jerk [m/s^3]; with ArduCopter's default, the response to a velocity takes about 0.7 s.
     JerkHorizontal = "PSC_JERK_NE", 5.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
-    /// Vertical jerk. [m/s^3]
+    /// Vertical jerk [m/s^3].
     JerkVertical = "PSC_JERK_D", 5.0, 1.0..200.0, MAV_PARAM_TYPE_REAL32;
-    /// Largest tilt (lab). [deg]
+    /// Maximum tilt (lab) [deg].
     AngleMax = "ATC_ANGLE_MAX", 45.0, 10.0..60.0, MAV_PARAM_TYPE_REAL32;
-    /// Fastest turn of the nose to an angle (lab). [cdeg/s]
+    /// Maximum yaw rate towards a target angle (lab) [cdeg/s].
     SlewYaw = "ATC_SLEW_YAW", 12000.0, 500.0..24000.0, MAV_PARAM_TYPE_REAL32;
-    /// Velocity and acceleration setpoints die after this. [s]
+    /// Timeout of velocity and acceleration setpoints [s].
     GuidTimeout = "GUID_TIMEOUT", 3.0, 0.1..5.0, MAV_PARAM_TYPE_REAL32;
-    /// Sink rate near the ground. [m/s]
+    /// Sink rate near the ground [m/s].
     LandSpeed = "LAND_SPD_MS", 0.5, 0.3..2.0, MAV_PARAM_TYPE_REAL32;
-    /// Sink rate above LAND_ALT_LOW_M; 0 takes WP_SPD_DN (lab). [m/s]
+    /// Sink rate above LAND_ALT_LOW_M; 0 uses WP_SPD_DN (lab) [m/s].
     LandSpeedHigh = "LAND_SPD_HIGH_MS", 1.0, 0.0..5.0, MAV_PARAM_TYPE_REAL32;
-    /// Height below which the slow sink rate applies (lab). [m]
+    /// Height below which the slow sink rate applies (lab) [m].
     LandAltLow = "LAND_ALT_LOW_M", 1.0, 0.5..100.0, MAV_PARAM_TYPE_REAL32;
-    /// Height that RTL climbs to first; ArduCopter's default, dangerous in a room. [m]
+    /// Height that RTL climbs to first [m]; ArduCopter's default, dangerous in a room.
     RtlAlt = "RTL_ALT_M", 15.0, 0.3..3000.0, MAV_PARAM_TYPE_REAL32;
-    /// An armed vehicle that stays on the ground disarms after this; 0 never. [s]
+    /// Time until an armed vehicle on the ground disarms [s]; 0 is never.
     DisarmDelay = "DISARM_DELAY", 10.0, 0.0..127.0, MAV_PARAM_TYPE_INT8;
-    /// What a lost ground station causes: 0 nothing, 1 RTL, 5 LAND (lab).
+    /// Action if the ground station is lost: 0 nothing, 1 RTL, 5 LAND (lab).
     FsGcsEnable = "FS_GCS_ENABLE", 5.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
-    /// Silence that counts as lost. [s]
+    /// Silence after which the ground station is lost [s].
     FsGcsTimeout = "FS_GCS_TIMEOUT", 5.0, 2.0..120.0, MAV_PARAM_TYPE_REAL32;
-    /// Lost radio control: 0 lets the vehicle arm without a receiver (lab), 1 RTL, 3 LAND.
+    /// Action if radio control is lost: 0 allows arming without a receiver (lab), 1 RTL, 3 LAND.
     FsThrEnable = "FS_THR_ENABLE", 0.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
-    /// Lost estimate: 1 lands, 2 holds the height.
+    /// Action if the estimate is lost: 1 lands, 2 holds the height.
     FsEkfAction = "FS_EKF_ACTION", 1.0, 0.0..3.0, MAV_PARAM_TYPE_INT8;
-    /// Exceptions: 4 goes on in GUIDED without radio control, 8 goes on landing whatever is lost,
-    /// 16 (ArduCopter's default) flies on by hand without a ground station.
+    /// Exceptions: 4 continues in GUIDED without radio control, 8 continues a landing despite further failsafes, 16
+    /// (ArduCopter's default) continues pilot control without a ground station.
     FsOptions = "FS_OPTIONS", 16.0, 0.0..63.0, MAV_PARAM_TYPE_INT32;
-    /// Silence of the radio control that counts as lost. [s]
+    /// Silence after which radio control is lost [s].
     RcFsTimeout = "RC_FS_TIMEOUT", 1.0, 0.5..10.0, MAV_PARAM_TYPE_REAL32;
-    /// Crash detection disarms.
+    /// Whether crash detection disarms.
     FsCrashCheck = "FS_CRASH_CHECK", 1.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
-    /// Skips arming checks; any bit skips all of them here.
+    /// Skips arming checks; here any bit skips all of them.
     ArmingSkipChecks = "ARMING_SKIPCHK", 0.0, -1.0..1048575.0, MAV_PARAM_TYPE_INT32;
-    /// Bits of the attitude reference: 16 takes the recorded origin below at boot.
+    /// Bits of the attitude reference: 16 uses the recorded origin below at boot.
     AhrsOptions = "AHRS_OPTIONS", 0.0, 0.0..65535.0, MAV_PARAM_TYPE_INT16;
-    /// Recorded origin. [deg]
+    /// Latitude of the recorded origin [deg].
     AhrsOriginLat = "AHRS_ORIGIN_LAT", 0.0, -90.0..90.0, MAV_PARAM_TYPE_REAL32;
-    /// Recorded origin. [deg]
+    /// Longitude of the recorded origin [deg].
     AhrsOriginLon = "AHRS_ORIGIN_LON", 0.0, -180.0..180.0, MAV_PARAM_TYPE_REAL32;
-    /// Recorded origin. [m]
+    /// Altitude of the recorded origin [m].
     AhrsOriginAlt = "AHRS_ORIGIN_ALT", 0.0, -1000.0..10000.0, MAV_PARAM_TYPE_REAL32;
-    /// The autopilot's own fence, around home.
+    /// Whether the autopilot's fence around home is enabled.
     FenceEnable = "FENCE_ENABLE", 0.0, 0.0..1.0, MAV_PARAM_TYPE_INT8;
-    /// Sides: 1 ceiling, 2 circle, 4 polygons, 8 floor.
+    /// Bits of the fence type: 1 ceiling, 2 circle, 4 polygons, 8 floor.
     FenceType = "FENCE_TYPE", 7.0, 0.0..15.0, MAV_PARAM_TYPE_INT8;
-    /// A breach: 0 is only reported, 1 RTL, 2 LAND, 4 BRAKE.
+    /// Action at a fence breach: 0 only reports, 1 RTL, 2 LAND, 4 BRAKE.
     FenceAction = "FENCE_ACTION", 1.0, 0.0..5.0, MAV_PARAM_TYPE_INT8;
-    /// Ceiling over home. [m]
+    /// Ceiling above home [m].
     FenceAltMax = "FENCE_ALT_MAX", 100.0, 0.5..1000.0, MAV_PARAM_TYPE_REAL32;
-    /// Floor over home. [m]
+    /// Floor above home [m].
     FenceAltMin = "FENCE_ALT_MIN", -10.0, -100.0..100.0, MAV_PARAM_TYPE_REAL32;
-    /// Radius around home. [m]
+    /// Radius around home [m].
     FenceRadius = "FENCE_RADIUS", 300.0, 0.5..10000.0, MAV_PARAM_TYPE_REAL32;
-    /// RTL stays this far under the ceiling; the floor counts once the vehicle was this far over it. [m]
+    /// Distance of RTL below the ceiling, and height above the floor that activates it [m].
     FenceMargin = "FENCE_MARGIN", 2.0, 0.1..10.0, MAV_PARAM_TYPE_REAL32;
     /// Battery monitor: 4 measures voltage and current (lab).
     BattMonitor = "BATT_MONITOR", 4.0, 0.0..30.0, MAV_PARAM_TYPE_INT8;
-    /// Battery capacity. [mAh]
+    /// Battery capacity [mAh].
     BattCapacity = "BATT_CAPACITY", 850.0, 0.0..100000.0, MAV_PARAM_TYPE_INT32;
-    /// Low voltage; 0 is off. Four cells of 3.5 V (lab). [V]
+    /// Low voltage; 0 is off. Four cells of 3.5 V (lab) [V].
     BattLowVolt = "BATT_LOW_VOLT", 14.0, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
-    /// Critical voltage; 0 is off. Four cells of 3.3 V (lab). [V]
+    /// Critical voltage; 0 is off. Four cells of 3.3 V (lab) [V].
     BattCrtVolt = "BATT_CRT_VOLT", 13.2, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
-    /// Low charge left; 0 is off. [mAh]
+    /// Low remaining charge; 0 is off [mAh].
     BattLowMah = "BATT_LOW_MAH", 0.0, 0.0..100000.0, MAV_PARAM_TYPE_REAL32;
-    /// Critical charge left; 0 is off. [mAh]
+    /// Critical remaining charge; 0 is off [mAh].
     BattCrtMah = "BATT_CRT_MAH", 0.0, 0.0..100000.0, MAV_PARAM_TYPE_REAL32;
-    /// A voltage must be low for this long. [s]
+    /// Time for which a voltage must be low [s].
     BattLowTimer = "BATT_LOW_TIMER", 10.0, 0.0..120.0, MAV_PARAM_TYPE_INT16;
-    /// Low: 0 is only reported, 1 LAND (lab), 2 RTL, 5 motors off, 7 BRAKE.
+    /// Action at low battery: 0 only reports, 1 LAND (lab), 2 RTL, 5 motors off, 7 BRAKE.
     BattFsLowAct = "BATT_FS_LOW_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
-    /// Critical: likewise (lab).
+    /// Action at critical battery, with the same values (lab).
     BattFsCrtAct = "BATT_FS_CRT_ACT", 1.0, 0.0..7.0, MAV_PARAM_TYPE_INT8;
-    /// No arming below this; 0 is off. [V]
+    /// Minimum voltage for arming; 0 is off [V].
     BattArmVolt = "BATT_ARM_VOLT", 0.0, 0.0..120.0, MAV_PARAM_TYPE_REAL32;
-    /// Throttle at hover; reported from the airframe's thrust-to-weight.
+    /// Hover throttle; reported according to the airframe's thrust-to-weight ratio.
     MotHover = "MOT_THST_HOVER", 0.16, 0.05..0.8, MAV_PARAM_TYPE_REAL32;
 }
 
-/// Returns how a vehicle set up by `hardware/airframe` moves: what its file sets of this table's parameters for flying
-/// in a room. The rest of the file is about parts that a simulated lab does not have, or sets for itself.
+/// Returns the motion parameters of the file in `hardware/airframe`, as far as this table contains them. The other
+/// parameters of the file concern parts that a simulated lab does not have, or sets itself.
 pub fn airframe() -> Vec<(String, f32)> {
     const FILE: &str = include_str!("../../../airframe/whippet-copter-4.8.param");
     const MOTION: [&str; 4] = ["WP_", "PSC_", "LAND_", "GUID_"];
@@ -182,7 +182,7 @@ pub fn airframe() -> Vec<(String, f32)> {
         .collect()
 }
 
-/// The values of the moment.
+/// Present values of all parameters.
 #[derive(Clone, Debug)]
 pub struct Params {
     values: Vec<f32>,
@@ -195,23 +195,21 @@ impl Default for Params {
 }
 
 impl Params {
-    /// Returns a value.
     pub fn value(&self, param: Param) -> f64 {
         f64::from(self.values[param as usize])
     }
 
-    /// Returns what stands at an index, if there is something.
+    /// Returns specification and value at an index; `None` if it is out of range.
     pub fn at(&self, index: usize) -> Option<(&'static ParamSpec, f32)> {
         Some((TABLE.get(index)?, *self.values.get(index)?))
     }
 
-    /// Returns the index of a name.
+    /// Returns the index of a parameter by name.
     pub fn index_of(name: &str) -> Option<usize> {
         TABLE.iter().position(|spec| spec.name == name)
     }
 
-    /// Sets a value, held within its range and rounded if it is a whole number; poison changes
-    /// nothing.
+    /// Sets a value, limited to its range and rounded for integer types. A value that is not finite is ignored.
     pub fn set(&mut self, index: usize, value: f32) {
         if let (Some(spec), Some(slot)) = (TABLE.get(index), self.values.get_mut(index))
             && value.is_finite()
@@ -227,7 +225,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_is_sound() {
+    fn the_table_is_valid() {
         for (i, spec) in TABLE.iter().enumerate() {
             assert!(spec.name.len() <= 16, "{}", spec.name);
             assert!((spec.least..=spec.most).contains(&spec.default), "{}", spec.name);
@@ -236,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn the_airframes_file_sets_how_the_lab_moves() {
+    fn airframe_sets_the_motion_parameters() {
         let set = airframe();
         for name in
             ["PSC_JERK_NE", "PSC_JERK_D", "WP_ACC", "WP_ACC_Z", "GUID_TIMEOUT", "LAND_SPD_MS"]

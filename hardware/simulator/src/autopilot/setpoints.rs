@@ -1,5 +1,4 @@
-//! SET_POSITION_TARGET_LOCAL_NED as GUIDED takes it: which frames, which groups of axes, and when
-//! it is dropped without a word.
+//! Handles SET_POSITION_TARGET_LOCAL_NED in GUIDED: accepted frames and masks, and setpoints that are dropped silently.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::yaw_of;
@@ -15,15 +14,15 @@ type Message = dialect::SET_POSITION_TARGET_LOCAL_NED_DATA;
 
 impl Autopilot {
     pub(super) fn handle_setpoint(&mut self, now: AutopilotTime, m: &Message) {
-        // Outside GUIDED, and on the ground, ArduCopter drops setpoints without a word.
+        // Outside of GUIDED, and on the ground, ArduCopter drops setpoints silently.
         if self.mode != CopterMode::Guided || !self.armed || self.landed {
             return;
         }
         let Some(m) = self.in_local_frame(m.clone()) else { return };
         let setpoint = match guided_from_mavlink(&m) {
             Ok(setpoint) => setpoint,
-            // A mask that GUIDED knows no motion for means: stop. One axis ignored drops its group;
-            // position with acceleration but without velocity is such a mask.
+            // An unsupported mask means stop. If one axis is ignored, its group is dropped; position with acceleration
+            // but without velocity is also unsupported.
             Err(UnsupportedSetpoint::Mask(_)) => {
                 let all = [m.x, m.y, m.z, m.vx, m.vy, m.vz, m.afx, m.afy, m.afz, m.yaw, m.yaw_rate];
                 if all.iter().all(|value| value.is_finite()) {
@@ -37,7 +36,7 @@ impl Autopilot {
             GuidedMotion::Position(p) | GuidedMotion::PositionVelocity(p, _) => p,
             GuidedMotion::Velocity(_) | GuidedMotion::Acceleration(_) => DVec3::ZERO,
         };
-        // A point beyond the fence is not flown to; velocities are, until the fence is breached.
+        // A position beyond the fence is rejected. Velocities are accepted until the fence is breached.
         if matches!(setpoint.motion, GuidedMotion::Position(_)) && !self.is_within_fence(p_world_m)
         {
             return;
@@ -46,8 +45,8 @@ impl Autopilot {
         self.guided = Guided::Setpoint { setpoint, since: now, p_world_m };
     }
 
-    /// Turns offsets and body axes into LOCAL_NED, as ArduCopter does: BODY_* turn by the heading,
-    /// all but LOCAL_NED count positions from where the vehicle is. `None` for other frames.
+    /// Converts offsets and body axes to LOCAL_NED like ArduCopter: BODY_* frames are rotated by the heading, and
+    /// positions in all frames except LOCAL_NED are relative to the vehicle. Returns `None` for other frames.
     fn in_local_frame(&self, mut m: Message) -> Option<Message> {
         let (turns, is_offset) = match m.coordinate_frame {
             MavFrame::MAV_FRAME_LOCAL_NED => (false, false),

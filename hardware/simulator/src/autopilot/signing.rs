@@ -1,15 +1,15 @@
-//! MAVLink 2 signing as ArduPilot does it: a key given by SETUP_SIGNING lasts over reboots; from then
-//! on everything sent is signed, and what is not signed with the key is ignored, except on the
-//! first link, which stands for USB, and RADIO_STATUS, as a bridge has no key.
+//! MAVLink 2 signing like ArduPilot. SETUP_SIGNING sets a key, which is stored over reboots. From then on, all sent
+//! packets are signed, and packets without a valid signature are ignored. Exceptions: the first link, which stands for
+//! USB, and RADIO_STATUS, because a bridge has no key.
 
 use vizflyt_protocol::mavlink::dialect::{MavMessage, SETUP_SIGNING_DATA};
 use vizflyt_protocol::mavlink::{MAX_PACKET, Signer, SigningKey, SigningTime, Verifier};
 use vizflyt_protocol::time::AutopilotTime;
 
-/// The link that needs no signatures: ArduPilot trusts its USB port.
+/// Link that needs no signatures: ArduPilot trusts its USB port.
 pub(super) const USB_LINK: usize = 0;
 
-/// Signs and judges from the moment a key was given.
+/// Signs and verifies packets after a key was set.
 #[derive(Clone, Debug)]
 pub(super) struct Signing {
     key: SigningKey,
@@ -32,7 +32,7 @@ impl Signing {
         }
     }
 
-    /// Takes SETUP_SIGNING: a key, or by a key and a stamp of zeros the end of signing.
+    /// Handles SETUP_SIGNING: sets the key; a key and a time stamp of zeros end signing.
     pub(super) fn set_up(now: AutopilotTime, message: &SETUP_SIGNING_DATA) -> Option<Self> {
         let wanted = message.initial_timestamp != 0 || message.secret_key != [0; 32];
         wanted.then(|| {
@@ -41,13 +41,13 @@ impl Signing {
         })
     }
 
-    /// Returns what the storage keeps over a reboot at `now`. The autopilot has no clock of its own: its
-    /// stamps go on from where they were.
+    /// Returns the state that is stored over a reboot at `now`. The autopilot has no real-time clock: its time stamps
+    /// continue from the last ones.
     pub(super) fn rebooted(&self, now: AutopilotTime) -> Self {
         Self::new(AutopilotTime::ZERO, self.key.clone(), self.time(now))
     }
 
-    /// Returns the new length of the packet in `buffer`.
+    /// Signs the packet in `buffer`. Returns its new length.
     pub(super) fn sign(
         &mut self,
         now: AutopilotTime,
@@ -58,7 +58,7 @@ impl Signing {
         self.signer.sign(time, buffer, len)
     }
 
-    /// Whether a packet that came over a link is accepted.
+    /// Whether a packet from a link is accepted.
     pub(super) fn accepts(
         &mut self,
         now: AutopilotTime,
@@ -75,7 +75,7 @@ impl Signing {
         accepted
     }
 
-    /// Returns packets refused so far.
+    /// Returns the number of refused packets.
     pub(super) fn refused(&self) -> u64 {
         self.refused
     }

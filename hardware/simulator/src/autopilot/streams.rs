@@ -1,4 +1,4 @@
-//! Which message is due when: intervals by SET_MESSAGE_INTERVAL, and the older groups.
+//! Schedule of sent messages: intervals of SET_MESSAGE_INTERVAL, and the older stream groups.
 
 use vizflyt_protocol::time::AutopilotTime;
 
@@ -25,7 +25,7 @@ pub(super) const EKF_STATUS_REPORT: u32 = 193;
 pub(super) const HOME_POSITION: u32 = 242;
 pub(super) const EXTENDED_SYS_STATE: u32 = 245;
 
-/// Everything that can be streamed, with its interval at boot; 0 is off. [us]
+/// All streams with their interval at boot [us]; 0 is off.
 const DEFAULTS: [(u32, i32); 17] = [
     (HEARTBEAT, 1_000_000),
     (SYS_STATUS, 250_000),
@@ -46,10 +46,10 @@ const DEFAULTS: [(u32, i32); 17] = [
     (EXTENDED_SYS_STATE, 500_000),
 ];
 
-/// Fastest stream: the main loop's rate. [us]
+/// Minimum interval: the period of the main loop [us].
 const MIN_INTERVAL_US: i32 = 2_500;
 
-/// When each message is due.
+/// Streams with their due times.
 #[derive(Clone, Debug)]
 pub(super) struct Streams {
     rows: [Stream; DEFAULTS.len()],
@@ -66,7 +66,7 @@ struct Readiness {
 #[derive(Clone, Copy, Debug)]
 struct Stream {
     id: u32,
-    /// 0 is off. [us]
+    /// Interval [us]; 0 is off.
     interval_us: i32,
     due: AutopilotTime,
 }
@@ -80,14 +80,14 @@ impl Default for Streams {
 }
 
 impl Streams {
-    /// Sets an interval as SET_MESSAGE_INTERVAL does: 0 is the default, -1 is off. [us]
+    /// Sets an interval like SET_MESSAGE_INTERVAL [us]: 0 is the default, -1 is off.
     pub(super) fn set_interval(&mut self, id: u32, interval_us: f32) -> bool {
         let Some(index) = self.rows.iter().position(|row| row.id == id) else { return false };
         if !interval_us.is_finite() {
             return false;
         }
         let row = &mut self.rows[index];
-        // Starts at once, not when the old interval would have ended.
+        // Starts at once, not at the end of the old interval.
         row.due = AutopilotTime::ZERO;
         row.interval_us = if interval_us < 0.0 {
             0
@@ -99,13 +99,13 @@ impl Streams {
         true
     }
 
-    /// Returns an interval as MESSAGE_INTERVAL reports it: -1 is off; `None` if unknown. [us]
+    /// Returns an interval like MESSAGE_INTERVAL [us]: -1 is off; `None` if the message is unknown.
     pub(super) fn interval_us(&self, id: u32) -> Option<i32> {
         let row = self.rows.iter().find(|row| row.id == id)?;
         Some(if row.interval_us == 0 { -1 } else { row.interval_us })
     }
 
-    /// Sets the rate of one of the old stream groups; 0 is off. [Hz]
+    /// Sets the rate of an old stream group [Hz]; 0 is off.
     pub(super) fn request_group(&mut self, group: MavDataStream, rate_hz: u16) {
         let ids: &[u32] = match group {
             MavDataStream::MAV_DATA_STREAM_ALL => &[
@@ -138,12 +138,12 @@ impl Streams {
         }
     }
 
-    /// Makes the next heartbeat due at once: a change of mode or arming should not wait.
+    /// Makes the next heartbeat due at once, so that a change of mode or arming is reported without delay.
     pub(super) fn heartbeat_now(&mut self) {
         self.rows[0].due = AutopilotTime::ZERO;
     }
 
-    /// Makes the messages due at once whose flags say that the vehicle may be armed, if `readiness` has changed.
+    /// If `readiness` has changed, makes the messages that report it due at once.
     fn note_readiness(&mut self, readiness: Readiness) {
         if self.readiness != readiness {
             self.readiness = readiness;
@@ -157,7 +157,7 @@ impl Streams {
 }
 
 impl Autopilot {
-    /// Sends what is due.
+    /// Sends all due messages.
     pub(super) fn stream(&mut self, now: AutopilotTime) {
         if self.startup == Startup::Quick {
             let position = self.estimator.health(now).position;
@@ -169,7 +169,7 @@ impl Autopilot {
             if row.interval_us == 0 || now < row.due {
                 continue;
             }
-            // On the grid of its interval, unless it has fallen behind a whole one.
+            // Keeps the grid of the interval, unless it is late by a whole interval.
             let step_ns = i64::from(row.interval_us) * 1000;
             let on_grid = row.due.plus_ns(step_ns);
             self.streams.rows[index].due =

@@ -1,4 +1,4 @@
-//! What the autopilot reports by itself and on request; [`streams`](super::streams) has the rates.
+//! Messages that the autopilot sends in streams and on request; [`streams`](super::streams) has the rates.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::yaw_of;
@@ -22,7 +22,7 @@ use super::{Autopilot, Guided};
 use crate::airframe::GRAVITY_MPS2;
 
 impl Autopilot {
-    /// Makes a message by its id; `None` if unknown, or if there is nothing to report.
+    /// Returns a message by its id; `None` if it is unknown, or if its value is unknown.
     pub(super) fn message(&self, now: AutopilotTime, id: u32) -> Option<MavMessage> {
         let boot_ms = (now.as_ns() / 1_000_000) as u32;
         let estimate = self.estimator.estimate();
@@ -30,7 +30,7 @@ impl Autopilot {
             HEARTBEAT => self.heartbeat(),
             SYS_STATUS => self.sys_status(now),
             SYSTEM_TIME => MavMessage::SYSTEM_TIME(dialect::SYSTEM_TIME_DATA {
-                // No battery-backed clock on board.
+                // The simulated board lacks a battery-backed clock.
                 time_unix_usec: 0,
                 time_boot_ms: boot_ms,
             }),
@@ -81,7 +81,7 @@ impl Autopilot {
                 })
             }
             LOCAL_POSITION_NED => {
-                // Not reported before there is a position, nor once it is lost.
+                // Not sent without a valid position.
                 if !self.estimator.health(now).position {
                     return None;
                 }
@@ -198,7 +198,7 @@ impl Autopilot {
         if !self.has_gauge() {
             return None;
         }
-        // Cells that are not there read 65535.
+        // Cells that do not exist are 65535.
         let mut voltages = [u16::MAX; 10];
         voltages[0] = (self.sample.battery_v * 1000.0) as u16;
         Some(MavMessage::BATTERY_STATUS(dialect::BATTERY_STATUS_DATA {
@@ -212,7 +212,7 @@ impl Autopilot {
         }))
     }
 
-    /// GLOBAL_POSITION_INT on a sphere around the origin, good for a room.
+    /// Returns GLOBAL_POSITION_INT on a sphere around the origin, accurate enough for a room.
     fn global_position(&self, now: AutopilotTime, boot_ms: u32) -> Option<MavMessage> {
         const EARTH_RADIUS_M: f64 = 6_378_137.0;
         let (latitude, longitude, altitude_mm) = self.origin?;
@@ -265,7 +265,7 @@ impl Autopilot {
         })
     }
 
-    /// Accelerations [mg, FRD] and rates [mrad/s, FRD].
+    /// Returns accelerations [mg, FRD] and rates [mrad/s, FRD].
     fn imu_numbers(&self) -> ([i16; 3], [i16; 3]) {
         let whole = |v: DVec3| v.to_array().map(|x| x as i16);
         (
@@ -303,14 +303,14 @@ impl Autopilot {
     }
 }
 
-/// What the autopilot is: ArduCopter 4.8 in what it does.
+/// Returns AUTOPILOT_VERSION: the simulated ArduCopter 4.8.
 pub(super) fn autopilot_version() -> MavMessage {
     MavMessage::AUTOPILOT_VERSION(dialect::AUTOPILOT_VERSION_DATA {
         capabilities: MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
             | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_COMMAND_INT
             | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
             | MavProtocolCapability::MAV_PROTOCOL_CAPABILITY_MAVLINK2,
-        // The ArduCopter whose behaviour this follows: 4.8.0, development version.
+        // ArduCopter 4.8.0, development version.
         flight_sw_version: 4 << 24 | 8 << 16,
         ..Default::default()
     })

@@ -1,5 +1,5 @@
-//! How much the vehicle shakes: VIBRATION, computed as ArduPilot does (AP_InertialSensor,
-//! calc_vibration_and_clipping: the deviation from a 5 Hz low-pass, squared, through a 2 Hz one).
+//! Computes VIBRATION like ArduPilot (AP_InertialSensor, calc_vibration_and_clipping): the deviation from a 5 Hz
+//! low-pass, squared, through a 2 Hz low-pass.
 
 use glam::DVec3;
 use vizflyt_protocol::time::AutopilotTime;
@@ -10,7 +10,7 @@ use crate::imu::ACCEL_RANGE_MPS2;
 const FLOOR_HZ: f64 = 5.0;
 const MEAN_HZ: f64 = 2.0;
 
-/// The filters.
+/// State of the filters.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Vibration {
     floor: DVec3,

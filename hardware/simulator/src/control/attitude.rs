@@ -1,7 +1,7 @@
-//! From a wanted acceleration and heading to thrust and torque.
+//! Attitude control: from acceleration and heading targets to thrust and torque.
 //!
-//! The thrust axis is turned first, by the shortest way; the heading follows with less authority
-//! (Brescianini, D'Andrea, "Tilt-prioritized quadrocopter attitude control", 2018).
+//! The thrust axis turns first, by the shortest rotation; the heading follows with less authority (Brescianini,
+//! D'Andrea, "Tilt-prioritized quadrocopter attitude control", 2018).
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
@@ -11,48 +11,47 @@ use crate::airframe::{GRAVITY_MPS2, INERTIA_KGM2, MASS_KG};
 use crate::estimator::Estimate;
 use crate::motor::{MAX_THRUST_N, TIME_CONSTANT_S};
 
-/// Rate feedback and its damping. With motor lag tau the rate loop is
-/// tau s^2 + (1 + D) s + P: D = 0.8 and a damping of 0.8 give P = ((1 + D) / 1.6)^2 / tau. [1/s]
+/// Rate feedback [1/s] and its damping. With motor lag tau, the rate loop is tau s^2 + (1 + D) s + P: D = 0.8 and a
+/// damping of 0.8 give P = ((1 + D) / 1.6)^2 / tau.
 const RATE_GAIN: f64 = (1.0 + RATE_DAMPING) * (1.0 + RATE_DAMPING) / 2.56 / TIME_CONSTANT_S;
 const RATE_DAMPING: f64 = 0.8;
-/// Integral of the rate error: takes away imbalance in half a second. [1/s^2]
+/// Integral of the rate error [1/s^2]: compensates imbalance in half a second.
 const RATE_INTEGRAL: f64 = 40.0;
-/// Largest angular acceleration of the integral. [rad/s^2]
+/// Maximum angular acceleration of the integral [rad/s^2].
 const RATE_INTEGRAL_LIMIT: f64 = 30.0;
-/// Yaw is weaker: its torque comes from drag of the propellers alone. [1/s]
+/// Yaw gain [1/s]; small, because yaw torque comes only from drag of the propellers.
 const YAW_RATE_GAIN: f64 = 12.0;
 const YAW_RATE_INTEGRAL: f64 = 6.0;
-/// Attitude feedback: a third of the rate loop's bandwidth (32 rad/s). [1/s]
+/// Attitude feedback [1/s]: a third of the rate loop's bandwidth (32 rad/s).
 const TILT_GAIN: f64 = 11.0;
 const YAW_GAIN: f64 = 4.0;
-/// Rates asked for at most. [rad/s]
+/// Maximum rate targets [rad/s].
 const TILT_RATE_LIMIT: f64 = 8.0;
 const YAW_RATE_LIMIT: f64 = 4.0;
-/// Cut-off of the differentiated gyro. [rad/s]
+/// Cut-off of the differentiated gyro [rad/s].
 const DAMPING_CUTOFF: f64 = 250.0;
-/// Share of gravity that the vertical thrust never falls below in flight: below it there is
-/// nothing left to steer with.
+/// Minimum vertical thrust in flight, as a share of gravity; with less, there is no authority left for steering.
 const MIN_LIFT: f64 = 0.15;
-/// Share of the full thrust left for steering.
+/// Maximum thrust target, as a share of full thrust; the rest is for steering.
 const THRUST_SHARE: f64 = 0.85;
 
-/// Where the nose shall point.
+/// Heading target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Heading {
-    /// Angle. [rad, world]
+    /// Yaw [rad, world].
     pub yaw_rad: f64,
-    /// Rate of that angle. [rad/s]
+    /// Yaw rate [rad/s].
     pub rate_radps: f64,
 }
 
 /// Thrust and torque for the mixer.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Wrench {
-    /// All motors together, along body z. [N]
+    /// Thrust of all motors, along body z [N].
     pub thrust_n: f64,
-    /// Torque. [N m, body]
+    /// Torque [N m, body].
     pub torque_nm: DVec3,
-    /// The acceleration asked for was more than the limits allow.
+    /// Whether the acceleration target exceeded the limits.
     pub saturated: bool,
 }
 
@@ -65,12 +64,12 @@ pub struct AttitudeController {
 }
 
 impl AttitudeController {
-    /// Forgets integrals and filters.
+    /// Resets integrals and filters.
     pub fn reset(&mut self) {
         *self = Self::default();
     }
 
-    /// Returns the wrench that flies `a_world_mps2` (gravity not included) with the nose at `heading`.
+    /// Returns the wrench for acceleration `a_world_mps2` (without gravity) and `heading`.
     pub fn update(
         &mut self,
         estimate: &Estimate,
@@ -81,7 +80,7 @@ impl AttitudeController {
     ) -> Wrench {
         let (force_world, saturated) = limited_force(a_world_mps2, limits);
         let up_body = estimate.world_from_body.conjugate() * force_world.normalize_or(DVec3::Z);
-        // Shortest turn from body z to the wanted axis.
+        // Shortest rotation from body z to the target axis.
         let axis = DVec3::Z.cross(up_body);
         let angle = axis.length().atan2(up_body.z);
         let tilt_error = axis.normalize_or(DVec3::X) * angle;
@@ -92,7 +91,7 @@ impl AttitudeController {
         let tilt_rate = (tilt_error * TILT_GAIN).clamp_length_max(TILT_RATE_LIMIT);
         let omega_target = tilt_rate + turn_body;
 
-        // Thrust counts along the axis the vehicle has, not the one it is still turning to.
+        // Thrust along the present axis of the vehicle, not along the target axis.
         let along = (estimate.world_from_body * DVec3::Z).dot(force_world);
         let thrust_n = along.max(MIN_LIFT * MASS_KG * GRAVITY_MPS2);
         Wrench {
@@ -102,7 +101,7 @@ impl AttitudeController {
         }
     }
 
-    /// Returns thrust and torque for a turn. [rad/s, body; N]
+    /// Returns the wrench for a rate target [rad/s, body] and thrust [N].
     pub fn follow_rates(
         &mut self,
         omega_body_radps: DVec3,
@@ -132,8 +131,8 @@ impl AttitudeController {
     }
 }
 
-/// Returns the force [N, world] within tilt and thrust limits, and whether something was cut. The
-/// vertical part comes first: a vehicle that cannot do both keeps its height.
+/// Returns the force [N, world] within tilt and thrust limits, and whether it was limited. The vertical part has
+/// priority, so that a saturated vehicle keeps its height.
 fn limited_force(a_world_mps2: DVec3, limits: &Limits) -> (DVec3, bool) {
     let wanted = (a_world_mps2 + DVec3::Z * GRAVITY_MPS2) * MASS_KG;
     let most = 4.0 * MAX_THRUST_N * THRUST_SHARE;
@@ -162,7 +161,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_force_stays_within_tilt_and_thrust(a in prop::array::uniform3(-60.0..60.0f64)) {
+        fn force_stays_within_tilt_and_thrust_limits(a in prop::array::uniform3(-60.0..60.0f64)) {
             let (force, cut) = limited_force(DVec3::from(a), &LIMITS);
             prop_assert!(force.length() <= 4.0 * MAX_THRUST_N * THRUST_SHARE + 1e-9);
             prop_assert!(force.angle_between(DVec3::Z) <= LIMITS.tilt_rad + 1e-9);
@@ -172,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn level_at_rest_needs_weight_and_no_torque() {
+    fn level_hover_needs_weight_and_no_torque() {
         let estimate = Estimate {
             p_world_m: DVec3::ZERO,
             v_world_mps: DVec3::ZERO,

@@ -1,30 +1,30 @@
-//! From thrust and torque to four motor commands: roll and pitch before yaw, yaw before thrust.
+//! Mixer: from thrust and torque to four motor commands. Priority: roll and pitch, then yaw, then thrust.
 
 use glam::DVec3;
 
 use super::attitude::Wrench;
 use crate::motor::{ARM_M, MAX_THRUST_N, MOUNTS, TORQUE_PER_THRUST_M};
 
-/// Rotor speed of an armed vehicle on the ground (MOT_SPIN_ARM), and the least in flight.
+/// Rotor speed of an armed vehicle on the ground (MOT_SPIN_ARM), and minimum in flight.
 pub const IDLE_SPEED: f64 = 0.08;
 
 /// Returns rotor speeds as fractions of full speed, in ArduCopter's motor order.
 pub fn mix(wrench: &Wrench) -> [f64; 4] {
     let least_n = MAX_THRUST_N * IDLE_SPEED * IDLE_SPEED;
     let span_n = MAX_THRUST_N - least_n;
-    // Far beyond what motors can do, and small enough for sums to stay finite.
+    // Far beyond the motors' limits, but small enough for finite sums.
     let finite = |v: f64| if v.is_finite() { v.clamp(-1e3, 1e3) } else { 0.0 };
     let torque = DVec3::from(wrench.torque_nm.to_array().map(finite));
 
     let tilt: [f64; 4] = std::array::from_fn(|i| {
-        // p x (F z) = (y F, -x F): invert for four motors at equal arms.
+        // p x (F z) = (y F, -x F), inverted for four motors at equal arms.
         let side = MOUNTS[i].p_body_m / ARM_M;
         (side.y * torque.x - side.x * torque.y) / (4.0 * ARM_M)
     });
     let tilt = scaled_to(tilt, span_n);
     let yaw: [f64; 4] =
         std::array::from_fn(|i| -MOUNTS[i].spin * torque.z / (4.0 * TORQUE_PER_THRUST_M));
-    // Yaw takes the room that roll and pitch leave, and at least a tenth.
+    // Yaw gets the range that roll and pitch leave, and at least a tenth.
     let room_n = (span_n - spread(&tilt)).max(0.1 * span_n);
     let yaw = scaled_to(yaw, room_n);
 
@@ -32,7 +32,7 @@ pub fn mix(wrench: &Wrench) -> [f64; 4] {
     let turning = scaled_to(turning, span_n);
     let lowest = turning.iter().copied().fold(f64::INFINITY, f64::min);
     let highest = turning.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    // Thrust gives way so that every motor can do its turning part.
+    // Thrust is limited so that every motor can produce its torque part.
     let mean_n = finite(wrench.thrust_n / 4.0).min(MAX_THRUST_N - highest).max(least_n - lowest);
     turning.map(|part| ((mean_n + part) / MAX_THRUST_N).clamp(0.0, 1.0).sqrt())
 }
@@ -42,7 +42,7 @@ fn spread(parts: &[f64; 4]) -> f64 {
     parts.iter().copied().fold(f64::NEG_INFINITY, f64::max) - lowest
 }
 
-/// Shrinks the parts so that they differ by at most `span_n`.
+/// Scales the parts so that they differ by at most `span_n`.
 fn scaled_to(parts: [f64; 4], span_n: f64) -> [f64; 4] {
     let spread = spread(&parts);
     if spread <= span_n { parts } else { parts.map(|p| p * span_n / spread) }
@@ -54,7 +54,7 @@ mod tests {
     use crate::motor::thrust_n;
     use proptest::prelude::*;
 
-    /// What four rotor speeds do to the vehicle.
+    /// Returns thrust and torque of four rotor speeds.
     fn wrench_of(speeds: [f64; 4]) -> (f64, DVec3) {
         let mut torque = DVec3::ZERO;
         for (mount, speed) in MOUNTS.iter().zip(speeds) {
@@ -66,7 +66,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_modest_wrench_is_flown_exactly(
+        fn reproduces_a_moderate_wrench_exactly(
             thrust in 3.0..15.0f64, torque in prop::array::uniform3(-0.01..0.01f64),
         ) {
             let torque_nm = DVec3::from(torque);
@@ -76,9 +76,9 @@ mod tests {
             prop_assert!((turned - torque_nm).length() < 1e-9);
         }
 
-        /// Anything at all gives four speeds in range, and roll keeps its sign.
+        /// Any input gives four speeds in range.
         #[test]
-        fn nothing_leaves_the_range(
+        fn speeds_stay_in_range_for_any_input(
             thrust in prop::num::f64::ANY, torque in prop::array::uniform3(prop::num::f64::ANY),
         ) {
             let torque_nm = DVec3::from(torque);
@@ -87,7 +87,7 @@ mod tests {
         }
 
         #[test]
-        fn roll_and_pitch_win_over_yaw_and_thrust(
+        fn roll_and_pitch_have_priority(
             roll in 0.05..0.3f64, yaw in -1.0..1.0f64, thrust in 0.0..30.0f64,
         ) {
             let torque_nm = DVec3::new(roll, 0.0, yaw);

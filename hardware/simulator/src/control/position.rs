@@ -1,9 +1,9 @@
-//! From a demand of motion to an acceleration: horizontal and vertical on their own.
+//! Position and velocity control: from a motion demand to an acceleration, separately for horizontal and vertical.
 //!
-//! Position demands become velocities by the square root controller; velocities are shaped; the
-//! shaped velocity is followed by feed-forward of its acceleration plus proportional and integral
-//! feedback. The feedback compares with the shaped velocity *as a vehicle with an attitude lag can
-//! follow it*, so that the lag itself is not fought, and steps do not overshoot.
+//! The square-root controller turns position demands into velocities, which are then shaped. The shaped velocity is
+//! followed by feed-forward of its acceleration plus proportional and integral feedback. The feedback reference is the
+//! shaped velocity *after the vehicle's attitude lag*, so that the feedback does not fight the lag, and steps do not
+//! overshoot.
 
 use glam::DVec3;
 
@@ -11,70 +11,70 @@ use super::Limits;
 use super::shape::ShapedVelocity;
 use crate::estimator::Estimate;
 
-/// Position feedback, horizontal and vertical. [1/s]
+/// Position feedback, horizontal and vertical [1/s].
 const POSITION_GAIN: f64 = 1.3;
-/// Velocity feedback, horizontal: a third of what the attitude loop can follow. [1/s]
+/// Velocity feedback, horizontal [1/s]: a third of the attitude loop's bandwidth.
 const VELOCITY_GAIN: f64 = 4.5;
-/// Integral of the horizontal velocity error: takes drag and wind away in about 1.5 s. [1/s^2]
+/// Integral of the horizontal velocity error [1/s^2]: compensates drag and wind in about 1.5 s.
 const VELOCITY_INTEGRAL: f64 = 5.0;
-/// Velocity feedback, vertical: thrust lags only by the motors. [1/s]
+/// Velocity feedback, vertical [1/s]: thrust has only the lag of the motors.
 const CLIMB_GAIN: f64 = 5.0;
-/// Integral of the vertical velocity error. [1/s^2]
+/// Integral of the vertical velocity error [1/s^2].
 const CLIMB_INTEGRAL: f64 = 3.0;
-/// Largest integral. [m/s^2]
+/// Maximum integral [m/s^2].
 const INTEGRAL_LIMIT: f64 = 4.0;
-/// Lag of acceleration behind its demand: tilt horizontally, motors vertically. [s]
+/// Lag of acceleration behind its demand [s]: by tilt horizontally, by the motors vertically.
 const TILT_LAG_S: f64 = 0.12;
 const THRUST_LAG_S: f64 = 0.05;
-/// A velocity target below this means "stay": the position of the moment is then held. [m/s]
+/// Velocity target below which the present position is held [m/s].
 const STAY_MPS: f64 = 0.02;
-/// The vehicle counts as stopped below this speed. [m/s]
+/// Speed below which the vehicle counts as stopped [m/s].
 const STOPPED_MPS: f64 = 0.15;
-/// Fastest way back to a place, and to a height, that is held. [m/s]
+/// Maximum speed of the return to a held position, and to a held height [m/s].
 const RETURN_MPS: f64 = 1.0;
 const RETURN_Z_MPS: f64 = 0.5;
-/// How far the velocity demanded by an acceleration may run ahead of the vehicle. [m/s]
+/// Maximum lead of the velocity reference over the vehicle in acceleration control [m/s].
 const LEASH_MPS: f64 = 1.5;
 
-/// What to do along the ground.
+/// Horizontal demand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Horizontal {
-    /// Fly to a point (z unused) at most at a speed [m/s], on top of a velocity of the point itself.
+    /// Fly to a point (z unused) with a maximum speed, in addition to a velocity of the point itself.
     Position {
-        /// Target. [m, world]
+        /// Target [m, world].
         p: DVec3,
-        /// Velocity of the target. [m/s, world]
+        /// Velocity of the target [m/s, world].
         v: DVec3,
-        /// Largest speed towards it. [m/s]
+        /// Maximum speed towards the target [m/s].
         speed_mps: f64,
     },
-    /// Fly at a velocity; zero holds the place where the vehicle stops. [m/s, world]
+    /// Fly at a velocity [m/s, world]; zero stops and holds the position.
     Velocity(DVec3),
-    /// Accelerate. [m/s^2, world]
+    /// Accelerate [m/s^2, world].
     Acceleration(DVec3),
-    /// No position is known: stay level.
+    /// Stay level, because the position is unknown.
     Level,
 }
 
-/// What to do along the vertical.
+/// Vertical demand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Vertical {
-    /// Fly to a height within speeds up and down [m/s], on top of a velocity of the target itself.
+    /// Fly to a height with maximum speeds up and down, in addition to a velocity of the target itself.
     Position {
-        /// Target. [m, world]
+        /// Target [m, world].
         z: f64,
-        /// Velocity of the target. [m/s, world]
+        /// Velocity of the target [m/s, world].
         v: f64,
-        /// Largest climb rate. [m/s]
+        /// Maximum climb rate [m/s].
         up_mps: f64,
-        /// Largest sink rate, positive. [m/s]
+        /// Maximum sink rate, positive [m/s].
         down_mps: f64,
     },
-    /// Climb at a rate; zero holds the height where the vehicle stops. [m/s, up]
+    /// Climb at a rate [m/s, up]; zero stops and holds the height.
     Velocity(f64),
-    /// Accelerate. [m/s^2, up]
+    /// Accelerate [m/s^2, up].
     Acceleration(f64),
-    /// Sink at a rate until the ground stops it: nothing is held. [m/s, positive]
+    /// Sink at a rate until the ground stops the vehicle; holds no height [m/s, positive].
     Descend(f64),
 }
 
@@ -83,19 +83,19 @@ pub enum Vertical {
 pub struct PositionController {
     horizontal: Axis,
     vertical: Axis,
-    /// Place held since a velocity of zero was reached. [m, world]
+    /// Position held since a velocity target of zero was reached [m, world].
     held: Option<DVec3>,
-    /// Height held likewise. [m, world]
+    /// Height held since then [m, world].
     held_z: Option<f64>,
-    /// Reference height of a descent. [m, world]
+    /// Reference height of a descent [m, world].
     descent_z: Option<f64>,
 }
 
-/// Shaping and feedback of one group of axes.
+/// Shaping and feedback of horizontal or vertical axes.
 #[derive(Clone, Copy, Debug, Default)]
 struct Axis {
     shaped: ShapedVelocity,
-    /// The shaped velocity behind the vehicle's lag. [m/s]
+    /// Shaped velocity after the vehicle's lag [m/s].
     model: DVec3,
     integral: DVec3,
 }
@@ -125,7 +125,7 @@ impl Axis {
 }
 
 impl PositionController {
-    /// Starts again from what the vehicle does at the moment.
+    /// Restarts from the vehicle's present motion.
     pub fn reset(&mut self, estimate: &Estimate) {
         let v = estimate.v_world_mps;
         *self = Self {
@@ -135,13 +135,13 @@ impl PositionController {
         };
     }
 
-    /// Returns the velocity wanted at the moment, shaped. [m/s, world]
+    /// Returns the present shaped velocity target [m/s, world].
     pub fn velocity_target_mps(&self) -> DVec3 {
         self.horizontal.shaped.v + self.vertical.shaped.v
     }
 
-    /// Returns the acceleration to fly, gravity not included [m/s^2, world]. `saturated` means that
-    /// the last one could not be flown in full.
+    /// Returns the acceleration target without gravity [m/s^2, world]. `saturated` means that the last one exceeded the
+    /// limits.
     pub fn update(
         &mut self,
         estimate: &Estimate,
@@ -260,7 +260,7 @@ impl PositionController {
             }
             Vertical::Descend(rate) => {
                 axis.shaped.approach(DVec3::Z * -rate, a_limit, j_limit, dt_s);
-                // The reference sinks on below the ground: thrust falls away once it is met.
+                // The reference continues below the ground, so that thrust falls off after contact.
                 let reference = self.descent_z.unwrap_or(z) + axis.shaped.v.z * dt_s;
                 let reference = reference.clamp(z - 2.0, z + 2.0);
                 self.descent_z = Some(reference);

@@ -1,13 +1,12 @@
-//! Turns a step of the velocity target into a velocity that a vehicle can follow: acceleration
-//! and jerk stay within limits, and the end is reached without overshoot. The law is ArduPilot's
-//! (`libraries/AP_Math/control.cpp`, `shape_vel_accel_xy` and `shape_pos_vel_accel_xy`): the last part
-//! of every change closes at the rate of jerk over acceleration, so that the jerk limit, not the motors,
-//! decides how late a vehicle answers.
+//! Shapes steps of the velocity target into a velocity that a vehicle can follow: acceleration and jerk are limited,
+//! without overshoot. The algorithm is ArduPilot's (`libraries/AP_Math/control.cpp`, `shape_vel_accel_xy` and
+//! `shape_pos_vel_accel_xy`). The last part of every change closes at the rate of jerk over acceleration, so the jerk
+//! limit, not the motors, determines the response time.
 
 use glam::DVec3;
 
-/// Returns the rate at which an error may be closed: proportional when small, and along the square
-/// root curve of constant deceleration `limit` when large (ArduPilot's `sqrt_controller`).
+/// Returns the rate at which to close an error: proportional for small errors, and along the square-root curve of
+/// constant deceleration `limit` for large ones (ArduPilot's `sqrt_controller`).
 pub fn sqrt_rate(error: f64, gain: f64, limit: f64) -> f64 {
     let linear = limit / (gain * gain);
     if error.abs() <= linear {
@@ -17,30 +16,30 @@ pub fn sqrt_rate(error: f64, gain: f64, limit: f64) -> f64 {
     }
 }
 
-/// Applies [`sqrt_rate`] to a vector's length.
+/// Applies [`sqrt_rate`] to the length of a vector.
 pub fn sqrt_rate_vector(error: DVec3, gain: f64, limit: f64) -> DVec3 {
     error.normalize_or_zero() * sqrt_rate(error.length(), gain, limit)
 }
 
-/// A velocity on its way to a target.
+/// Shaped velocity and its acceleration.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ShapedVelocity {
-    /// Velocity. [m/s]
+    /// Velocity [m/s].
     pub v: DVec3,
-    /// Acceleration. [m/s^2]
+    /// Acceleration [m/s^2].
     pub a: DVec3,
 }
 
 impl ShapedVelocity {
-    /// Moves on by `dt_s` towards `target` within an acceleration and a jerk limit.
+    /// Moves towards `target` for `dt_s`, within an acceleration and a jerk limit.
     pub fn approach(&mut self, target: DVec3, a_limit: f64, j_limit: f64, dt_s: f64) {
         let wanted = sqrt_rate_vector(target - self.v, j_limit / a_limit, j_limit);
         self.accelerate(wanted.clamp_length_max(a_limit), j_limit, dt_s);
     }
 
-    /// Moves on by `dt_s` towards a point `error` away that itself moves by `v_point`; `gain` [1/s] closes small errors,
-    /// and `within` bounds the velocity towards it. As braking ends in time, the velocity is asked for that the way
-    /// will leave after the velocity's own lag.
+    /// Moves for `dt_s` towards a point at distance `error` that itself moves at `v_point`. `gain` [1/s] closes small
+    /// errors, and `within` bounds the velocity towards the point. The velocity target accounts for the lag of the
+    /// velocity itself, so that braking ends in time.
     pub fn approach_point(
         &mut self,
         error: DVec3,
@@ -51,7 +50,7 @@ impl ShapedVelocity {
         dt_s: f64,
     ) {
         let rate = j_limit / a_limit;
-        // Braking is planned softer than the limit, so that following it stays within.
+        // Braking is planned with half the limit, so that the actual deceleration stays within it.
         let braking = a_limit / 2.0;
         let towards = sqrt_rate_vector(error, gain, braking);
         let linear = braking / (gain * gain);
@@ -74,7 +73,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn limits_hold_and_the_target_is_met_without_overshoot(
+        fn respects_limits_and_reaches_the_target_without_overshoot(
             target in prop::array::uniform3(-6.0..6.0f64),
             start in prop::array::uniform3(-6.0..6.0f64),
             a_limit in 1.0..10.0f64, j_limit in 3.0..100.0f64,

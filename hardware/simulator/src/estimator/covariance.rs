@@ -1,9 +1,8 @@
-//! The 15-state error covariance: prediction and scalar updates.
+//! 15-state error covariance: prediction and scalar updates.
 //!
-//! Errors in order: position [m, world], velocity [m/s, world], attitude [rad, body], gyro bias
-//! [rad/s, body], accelerometer bias [m/s^2, body]. Attitude errors multiply on the right:
-//! `q_true = q * exp(error)` (Sola, "Quaternion kinematics for the error-state Kalman filter",
-//! arXiv 1711.02508, section 5).
+//! Order of the errors: position [m, world], velocity [m/s, world], attitude [rad, body], gyro bias [rad/s, body],
+//! accelerometer bias [m/s^2, body]. Attitude errors multiply on the right: `q_true = q * exp(error)` (Sola,
+//! "Quaternion kinematics for the error-state Kalman filter", arXiv 1711.02508, section 5).
 
 use glam::{DMat3, DQuat, DVec3};
 
@@ -16,8 +15,8 @@ pub(super) const ATTITUDE: usize = 6;
 pub(super) const GYRO_BIAS: usize = 9;
 pub(super) const ACCEL_BIAS: usize = 12;
 
-/// Noise densities. Larger than the sensors' own: they also cover vibration and the straight-line
-/// steps of the prediction.
+/// Noise densities. Larger than those of the sensors, because they also cover vibration and the linear steps of the
+/// prediction.
 const ACCEL_DENSITY: f64 = 0.05; // [m/s^2 / sqrt(Hz)]
 const GYRO_DENSITY: f64 = 0.002; // [rad/s / sqrt(Hz)]
 const GYRO_BIAS_WALK: f64 = 2e-4; // [rad/s / sqrt(s)]
@@ -25,7 +24,7 @@ const ACCEL_BIAS_WALK: f64 = 3e-3; // [m/s^2 / sqrt(s)]
 
 type Matrix = [[f64; N]; N];
 
-/// The covariance and the correction gathered from measurements but not yet applied.
+/// Covariance, and the correction that measurements gave but that is not applied yet.
 #[derive(Clone, Debug)]
 pub(super) struct Covariance {
     p: Box<Matrix>,
@@ -33,7 +32,7 @@ pub(super) struct Covariance {
 }
 
 impl Covariance {
-    /// Makes a diagonal covariance from one standard deviation per group.
+    /// Returns a diagonal covariance with one standard deviation per group.
     pub(super) fn new(sigmas: [f64; 5]) -> Self {
         let mut p = Box::new([[0.0; N]; N]);
         for i in 0..N {
@@ -42,7 +41,7 @@ impl Covariance {
         Self { p, correction: [0.0; N] }
     }
 
-    /// Forgets what is known of one axis and states its deviation.
+    /// Removes all correlations of one axis and sets its standard deviation.
     pub(super) fn reset(&mut self, index: usize, sigma: f64) {
         for i in 0..N {
             self.p[index][i] = 0.0;
@@ -56,7 +55,7 @@ impl Covariance {
         self.p[index][index] += sigma * sigma;
     }
 
-    /// Carries the covariance over `dt_s` of flight at a specific force and a turn rate.
+    /// Propagates the covariance over `dt_s` of flight with a specific force and a turn rate.
     pub(super) fn predict(
         &mut self,
         world_from_body: DQuat,
@@ -92,8 +91,8 @@ impl Covariance {
         }
     }
 
-    /// Normalises one scalar measurement: `innovation` is measured minus expected, `row` its derivative
-    /// by the errors as (index, value). Returns the innovation over its expected deviation.
+    /// Returns the innovation of one scalar measurement divided by its expected deviation. `innovation` is measured
+    /// minus expected; `row` contains its derivatives by the errors as (index, value).
     pub(super) fn normalized_innovation(
         &self,
         row: &[(usize, f64)],
@@ -107,7 +106,7 @@ impl Covariance {
         innovation / (variance + sigma * sigma).sqrt()
     }
 
-    /// Fuses one scalar measurement; the correction waits in [`Self::take_correction`].
+    /// Fuses one scalar measurement. The correction is returned by [`Self::take_correction`].
     pub(super) fn fuse(&mut self, row: &[(usize, f64)], innovation: f64, sigma: f64) {
         let mut ph = [0.0; N];
         for (i, value) in ph.iter_mut().enumerate() {
@@ -125,7 +124,7 @@ impl Covariance {
                 self.p[i][j] -= gain * ph[j];
             }
         }
-        // Rounding must not make it indefinite: keep it symmetric with a positive diagonal.
+        // Rounding must not make the matrix indefinite: keep it symmetric with a positive diagonal.
         for i in 0..N {
             for j in 0..i {
                 let mean = 0.5 * (self.p[i][j] + self.p[j][i]);
@@ -136,13 +135,13 @@ impl Covariance {
         }
     }
 
-    /// Returns the gathered correction of each group and forgets it.
+    /// Returns the accumulated correction of each group, and clears it.
     pub(super) fn take_correction(&mut self) -> [DVec3; 5] {
         let c = std::mem::replace(&mut self.correction, [0.0; N]);
         std::array::from_fn(|g| DVec3::new(c[3 * g], c[3 * g + 1], c[3 * g + 2]))
     }
 
-    /// Whether every deviation is a number.
+    /// Whether all variances are finite.
     pub(super) fn is_finite(&self) -> bool {
         (0..N).all(|i| self.p[i][i].is_finite())
     }
@@ -153,7 +152,7 @@ impl Covariance {
     }
 }
 
-/// The matrix m with m v = a x v.
+/// Returns the matrix m with m v = a x v.
 fn skew(a: DVec3) -> DMat3 {
     DMat3::from_cols(
         DVec3::new(0.0, a.z, -a.y),
@@ -167,7 +166,7 @@ fn product(a: &Matrix, b: &Matrix) -> Matrix {
     for i in 0..N {
         for k in 0..N {
             let aik = a[i][k];
-            // Most of the transition is zero.
+            // Most of the transition matrix is zero.
             if aik != 0.0 {
                 for j in 0..N {
                     out[i][j] += aik * b[k][j];

@@ -1,14 +1,14 @@
-//! The autopilot's own state estimate: IMU at 400 Hz in, pose and twist out, corrected by external
-//! navigation (vision poses from the companion) as ArduCopter's EKF3 with EK3_SRC1_* = 6.
+//! State estimator of the autopilot: IMU at 400 Hz in, pose and twist out. Corrected by external navigation (vision
+//! poses from the companion) like ArduCopter's EKF3 with EK3_SRC1_* = 6.
 //!
-//! - Boot: the vehicle stands still for two seconds; tilt and gyro bias are read off the sensors.
-//! - Vision and no origin: heading only. With vision and an origin: position, after a settling time ([`Startup`]).
-//! - A late measurement is compared with the state remembered for its time, and the correction is
-//!   applied to now and to what is remembered.
-//! - Vision gone: the IMU carries on; height soon leans on the barometer; after 7.1 s the
-//!   horizontal position counts as lost (seen in a real ArduCopter).
+//! - Boot: the vehicle stands still for two seconds, in which tilt and gyro bias are measured.
+//! - Vision without an origin: only heading. Vision with an origin: position, after a settling time ([`Startup`]).
+//! - A late measurement is compared with the stored state of its time. The correction is applied to the present and to
+//!   all stored states.
+//! - Vision lost: the IMU continues; after a second, the barometer corrects the height; after 7.1 s, the horizontal
+//!   position counts as lost (observed in a real ArduCopter).
 //!
-//! An error-state Kalman filter over the 15 errors of [`covariance`].
+//! The filter is an error-state Kalman filter with the 15 errors of [`covariance`].
 
 mod covariance;
 mod stamp;
@@ -25,70 +25,68 @@ use crate::startup::Startup;
 use covariance::{ATTITUDE, Covariance, POSITION, VELOCITY};
 use stamp::StampCorrector;
 
-/// Standing time before the filter starts. A real ArduCopter takes about 4 s; a laboratory
-/// waits for nothing here. [s]
+/// Standing time before the filter starts [s]. A real ArduCopter takes about 4 s, but waits for more than a lab has.
 pub const ALIGN_S: f64 = 2.0;
-/// Without vision for this long the position is lost. [s]
+/// Time without vision after which the position is lost [s].
 pub const POSITION_LOST_S: f64 = 7.1;
-/// Without vision for this long the height leans on the barometer. [s]
+/// Time without vision after which the barometer corrects the height [s].
 const BARO_AFTER_S: f64 = 1.0;
-/// The filter fuses at most 50 poses a second; a little less than 20 ms for rounded stamps. [s]
+/// Minimum interval of fused poses [s]: at most 50 a second, with a margin for rounded stamps.
 const MIN_INTERVAL_S: f64 = 0.018;
-/// Innovations beyond this many deviations are dropped (EK3_POS_I_GATE = 500 %).
+/// Innovations of more than this many deviations are rejected (EK3_POS_I_GATE = 500 %).
 const GATE: f64 = 5.0;
-/// A sample at the accelerometer's end hides a change of velocity of unknown size: inflate its sigma by this
-/// much. [m/s]
+/// Added velocity deviation for a clipped accelerometer sample, which hides an unknown change of velocity [m/s].
 const CLIPPED_MPS: f64 = 3.0;
-/// Beyond these the filter has diverged and is reset. [m], [m/s]
+/// Limits of position [m] and speed [m/s] beyond which the filter has diverged and is reset.
 const ABSURD_M: f64 = 1e5;
 const ABSURD_MPS: f64 = 300.0;
-/// How much of the past is remembered for late measurements. [s]
+/// Duration of stored states for late measurements [s].
 const HISTORY_S: f64 = 0.55;
 /// IMU samples per prediction of the covariance: 100 Hz.
 const SAMPLES_PER_PREDICTION: u32 = 4;
 
-/// A measurement of external navigation.
+/// Measurement of external navigation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisionMeasurement {
-    /// The pose.
+    /// Measured pose.
     pub world_from_body: Pose<World, Body>,
-    /// The sender's stamp on the sender's clock; 0 if it does not report it. [us]
+    /// The sender's time stamp on its own clock [us]; 0 if it sends none.
     pub usec: u64,
-    /// Raised by the sender when its poses jump on purpose.
+    /// Incremented by the sender at each intended jump of its poses.
     pub reset_counter: u8,
-    /// Standard deviation of the position. [m]
+    /// Standard deviation of the position [m].
     pub sigma_m: f64,
-    /// Standard deviation of the heading. [rad]
+    /// Standard deviation of the heading [rad].
     pub sigma_rad: f64,
-    /// Constant part of the latency (VISO_DELAY_MS). [s]
+    /// Constant part of the latency (VISO_DELAY_MS) [s].
     pub latency_s: f64,
 }
 
-/// The estimate of the moment.
+/// Present estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
-    /// Position. [m, world]
+    /// Position [m, world].
     pub p_world_m: DVec3,
-    /// Velocity. [m/s, world]
+    /// Velocity [m/s, world].
     pub v_world_mps: DVec3,
     /// Attitude, body to world.
     pub world_from_body: DQuat,
-    /// Angular velocity, bias removed. [rad/s, body]
+    /// Angular velocity without bias [rad/s, body].
     pub omega_body_radps: DVec3,
-    /// Acceleration, gravity removed, over the last sample. [m/s^2, world]
+    /// Acceleration without gravity over the last sample [m/s^2, world].
     pub a_world_mps2: DVec3,
 }
 
-/// What may be relied on.
+/// Validity of the parts of the estimate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct EstimatorHealth {
-    /// Tilt is known.
+    /// Whether tilt is known.
     pub attitude: bool,
-    /// Vision poses arrive (VisOdom: healthy).
+    /// Whether vision poses arrive (VisOdom: healthy).
     pub vision: bool,
-    /// Someone has set the origin.
+    /// Whether the origin is set.
     pub origin: bool,
-    /// Horizontal position and velocity are known.
+    /// Whether horizontal position and velocity are known.
     pub position: bool,
 }
 
@@ -99,7 +97,7 @@ struct Past {
     yaw: f64,
 }
 
-/// The filter.
+/// Error-state Kalman filter.
 #[derive(Clone, Debug)]
 pub struct Estimator {
     estimate: Estimate,
@@ -110,23 +108,23 @@ pub struct Estimator {
     align: Align,
     stamps: StampCorrector,
     origin: bool,
-    /// Added to the vision's height: see [`Estimator::reset_height_datum`]. [m]
+    /// Offset of the vision's height [m]; see [`Estimator::reset_height_datum`].
     height_offset_m: f64,
     yaw_known: bool,
     position: Position,
     reset_counter: u8,
     last_vision: Option<AutopilotTime>,
     last_measured: Option<AutopilotTime>,
-    /// The last two positions measured. [m, world]
+    /// Last two measured positions [m, world].
     measured: [Option<(AutopilotTime, DVec3)>; 2],
     prediction: Prediction,
     baro: Baro,
     last_still: Option<AutopilotTime>,
-    /// Vision must have been fused this long before the position counts. [s]
+    /// Duration of fused vision after which the position is valid [s].
     settle_s: f64,
 }
 
-/// Gathers the standing vehicle's sensors at boot.
+/// Sums of the standing vehicle's sensors at boot.
 #[derive(Clone, Debug, Default)]
 struct Align {
     seconds: f64,
@@ -136,11 +134,11 @@ struct Align {
     done: bool,
 }
 
-/// What is known of the horizontal position.
+/// State of the horizontal position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Position {
     Unknown,
-    /// Fused since `since`, last at `last`.
+    /// Fused since `since`, most recently at `last`.
     Fused {
         since: AutopilotTime,
         last: AutopilotTime,
@@ -156,7 +154,7 @@ struct Prediction {
     omega: DVec3,
 }
 
-/// The barometer against the vision's height.
+/// Barometer relative to the vision's height.
 #[derive(Clone, Copy, Debug, Default)]
 struct Baro {
     sum_m: f64,
@@ -197,17 +195,16 @@ impl Default for Estimator {
 }
 
 impl Estimator {
-    /// Makes an estimator that starts as `startup` has it.
+    /// Returns an estimator with a start-up behaviour.
     pub fn new(startup: Startup) -> Self {
         Self { settle_s: startup.settle_s(), ..Self::default() }
     }
 
-    /// Returns the estimate.
     pub fn estimate(&self) -> &Estimate {
         &self.estimate
     }
 
-    /// Returns what may be relied on at `now`.
+    /// Returns the validity of the estimate at `now`.
     pub fn health(&self, now: AutopilotTime) -> EstimatorHealth {
         EstimatorHealth {
             attitude: self.align.done,
@@ -224,16 +221,16 @@ impl Estimator {
         (sigma(POSITION), sigma(VELOCITY), sigma(ATTITUDE + 2))
     }
 
-    /// Takes the origin; `false` if the filter has not started or already has one.
+    /// Sets the origin. Returns `false` if the filter has not started or already has an origin.
     pub fn set_origin(&mut self) -> bool {
         let taken = self.align.done && !self.origin;
         self.origin |= taken;
         taken
     }
 
-    /// Adds the height of the moment to all heights from now on. ArduCopter does this when it
-    /// reports "Field Elevation Set": it takes where it stands for the new zero of the barometer,
-    /// but adds it where it should subtract, so that 0.59 m became 1.17 m. Harmless at z = 0.
+    /// Adds the present height to all later heights. ArduCopter does this when it reports "Field Elevation Set": the
+    /// present height should become zero, but it is added instead of subtracted, so that 0.59 m became 1.17 m. Harmless
+    /// at z = 0.
     pub fn reset_height_datum(&mut self) {
         let z = self.estimate.p_world_m.z;
         self.height_offset_m += z;
@@ -244,7 +241,7 @@ impl Estimator {
         self.baro.datum_m = None;
     }
 
-    /// Takes one sensor sample, `dt_s` after the last. `still` means that the motors are off.
+    /// Takes one sensor sample, `dt_s` after the last one. `still` means that the motors are off.
     pub fn handle_sensors(
         &mut self,
         now: AutopilotTime,
@@ -284,7 +281,7 @@ impl Estimator {
         self.hold_still(now, still);
     }
 
-    /// Records that external navigation sends, without using it.
+    /// Records that external navigation sends, without using its pose.
     pub fn note_vision_alive(&mut self, now: AutopilotTime) {
         self.last_vision = Some(now);
     }
@@ -292,7 +289,7 @@ impl Estimator {
     /// Takes one pose from external navigation.
     pub fn handle_vision(&mut self, now: AutopilotTime, m: &VisionMeasurement) {
         let pose = &m.world_from_body;
-        // A float can carry a number that is finite but absurd.
+        // A number may be finite but absurd.
         if !pose.is_valid() || pose.translation_m.abs().max_element() > ABSURD_M {
             return;
         }
@@ -356,7 +353,7 @@ impl Estimator {
         let accel = sample.accel_body_mps2 - self.accel_bias;
         let e = &mut self.estimate;
         let half_turn = DQuat::from_scaled_axis(omega * (dt_s / 2.0));
-        // The force acted, on average, at the attitude half-way through.
+        // The mean force acted at the mid-interval attitude.
         let midway = e.world_from_body * half_turn;
         let a_world = midway * accel - DVec3::Z * GRAVITY_MPS2;
         e.world_from_body = (midway * half_turn).normalize();
@@ -378,7 +375,7 @@ impl Estimator {
         }
     }
 
-    /// The state nearest to `stamp`; the oldest remembered for anything older.
+    /// Returns the stored state nearest to `stamp`; the oldest one for older stamps.
     fn past_at(&self, stamp: AutopilotTime) -> Option<Past> {
         let after = self.history.partition_point(|past| past.stamp < stamp);
         self.history.get(after).or(self.history.back()).copied()
@@ -395,7 +392,7 @@ impl Estimator {
         let attitude = self.estimate.world_from_body;
         let nose = attitude * DVec3::X;
         let level = nose.x * nose.x + nose.y * nose.y;
-        // A nose near the vertical has no heading to compare.
+        // A nearly vertical nose has no heading.
         if !(level > 0.1) {
             return;
         }
@@ -409,7 +406,7 @@ impl Estimator {
         }
     }
 
-    /// Turns the estimate and all that is remembered about the vertical.
+    /// Rotates the estimate and all stored states about the vertical.
     fn turn(&mut self, angle_rad: f64) {
         let turn = DQuat::from_rotation_z(angle_rad);
         self.estimate.world_from_body = (turn * self.estimate.world_from_body).normalize();
@@ -446,8 +443,8 @@ impl Estimator {
         self.baro.datum_m = None;
     }
 
-    /// A position found again after a loss comes with the velocity that vision shows, if it shows
-    /// one: the velocity of the IMU alone may be anything by then.
+    /// Sets the velocity after a lost position is found again: from two vision positions, if available, because the
+    /// velocity from only the IMU may be far off.
     fn reset_velocity(&mut self, p: DVec3, valid_at: AutopilotTime) {
         let Some((before, p_before)) = self.measured[0] else { return };
         let dt_s = valid_at.seconds_since(before);
@@ -463,8 +460,7 @@ impl Estimator {
         }
     }
 
-    /// Starts the filter again if its numbers have become absurd: from level, at rest, keeping the
-    /// heading if there is one left.
+    /// Restarts the filter if its state has become absurd: level and at rest, with the present heading if it is finite.
     fn recover(&mut self) {
         let e = &mut self.estimate;
         let sane = e.p_world_m.abs().max_element() < ABSURD_M
@@ -489,7 +485,7 @@ impl Estimator {
         };
     }
 
-    /// Applies the gathered correction to the estimate and to what is remembered.
+    /// Applies the accumulated correction to the estimate and to all stored states.
     fn apply(&mut self, now: Option<AutopilotTime>) {
         let [p, v, turn, gyro_bias, accel_bias] = self.covariance.take_correction();
         let e = &mut self.estimate;
@@ -507,8 +503,8 @@ impl Estimator {
         }
     }
 
-    /// Averages the barometer to 25 Hz; learns its datum while vision gives the height, and gives
-    /// the height while vision does not.
+    /// Averages the barometer to 25 Hz. With vision, estimates the barometer's datum; without vision, corrects the
+    /// height.
     fn handle_baro(&mut self, now: AutopilotTime, baro_m: f64) {
         const SAMPLES: u32 = 16;
         const SIGMA_M: f64 = 0.25;
@@ -536,8 +532,8 @@ impl Estimator {
         }
     }
 
-    /// Without a position something must keep the tilt honest: standing, the velocity is zero;
-    /// flying, it is small on average. 20 Hz.
+    /// Stabilizes the tilt without a position: the velocity is zero when standing, and small on average in flight. 20
+    /// Hz.
     fn hold_still(&mut self, now: AutopilotTime, still: bool) {
         if matches!(self.position, Position::Fused { .. })
             || self.last_still.is_some_and(|t| now.seconds_since(t) < 0.05)
@@ -553,7 +549,7 @@ impl Estimator {
         }
         self.apply(None);
         if still {
-            // The position is unknown; it must not wander off before vision sets it.
+            // The position is unknown; prevent it from drifting before vision sets it.
             for i in 0..3 {
                 self.covariance.reset(POSITION + i, 1.0);
             }

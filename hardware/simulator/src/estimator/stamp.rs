@@ -1,17 +1,17 @@
-//! When a vision measurement was valid, on the autopilot's clock.
+//! Converts the time stamps of vision measurements to the autopilot's clock.
 //!
-//! The companion stamps with its own clock, whose offset is unknown. As ArduPilot does, the
-//! least difference seen between arrival and stamp is taken for the offset, which removes jitter
-//! but not the constant part of the latency: that is what VISO_DELAY_MS is for.
+//! The offset of the companion's clock is unknown. Like ArduPilot, this module uses the minimum difference between
+//! arrival and stamp as the offset. That removes jitter, but not the constant part of the latency, which VISO_DELAY_MS
+//! compensates.
 
 use vizflyt_protocol::time::AutopilotTime;
 
-/// A measurement older than this is a clock that jumped, not a late packet. [ns]
+/// Maximum age of a measurement [ns]. An older one means that the clock jumped, not that the packet was late.
 const MAX_AGE_NS: i64 = 500_000_000;
-/// Packets after which the least difference is taken again, so that the estimate follows drift.
+/// Number of packets after which the minimum is restarted, to follow clock drift.
 const WINDOW: u32 = 100;
 
-/// Turns remote stamps into local ones.
+/// Converts remote time stamps to local ones.
 #[derive(Clone, Debug, Default)]
 pub(super) struct StampCorrector {
     offset_ns: Option<i64>,
@@ -20,8 +20,8 @@ pub(super) struct StampCorrector {
 }
 
 impl StampCorrector {
-    /// Returns when a measurement stamped `usec` by its sender and received `now` was valid; a
-    /// stamp of 0 means the sender does not report it.
+    /// Returns the time of a measurement stamped `usec` by its sender and received at `now`. A stamp of 0 means that
+    /// the sender sends none.
     pub(super) fn correct(&mut self, usec: u64, now: AutopilotTime) -> AutopilotTime {
         if usec == 0 {
             return now;
@@ -52,21 +52,21 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn jitter_is_removed_and_a_jump_is_survived() {
+    fn removes_jitter_and_survives_a_clock_jump() {
         let mut corrector = StampCorrector::default();
         let at = |ms: u64| AutopilotTime::from_ns(ms * 1_000_000);
         // A remote clock 1000 s ahead; transport takes 3 ms, then 8 ms.
         assert_eq!(corrector.correct(1_000_000_000 + 100_000, at(103)), at(103));
         assert_eq!(corrector.correct(1_000_000_000 + 120_000, at(128)), at(123));
         assert_eq!(corrector.correct(0, at(140)), at(140));
-        // The remote restarts: its clock is near zero now.
+        // The remote restarts: its clock is near zero.
         assert_eq!(corrector.correct(5_000, at(160)), at(160));
         assert_eq!(corrector.correct(25_000, at(185)), at(180));
     }
 
     proptest! {
         #[test]
-        fn the_result_is_never_in_the_future_nor_long_past(
+        fn the_result_is_never_in_the_future_or_too_old(
             packets in prop::collection::vec((any::<u64>(), 0u64..100_000_000), 1..300),
         ) {
             let mut corrector = StampCorrector::default();

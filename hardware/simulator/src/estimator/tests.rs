@@ -50,7 +50,7 @@ impl Bench {
 #[test]
 fn position_needs_alignment_origin_and_a_second_of_vision() {
     let mut bench = Bench::new();
-    assert!(!bench.estimator.set_origin(), "not before it has started");
+    assert!(!bench.estimator.set_origin(), "not before the start");
     let vision = vision_at(DVec3::new(3.0, -2.0, 0.5), 2.0);
     bench.stand(2.1, None);
     let health = bench.estimator.health(bench.now());
@@ -70,7 +70,7 @@ fn position_needs_alignment_origin_and_a_second_of_vision() {
 }
 
 #[test]
-fn a_gyro_bias_is_found_standing_and_flying_level() {
+fn estimates_the_gyro_bias_while_standing() {
     let mut bench = Bench::new();
     let bias = DVec3::new(0.01, -0.02, 0.015);
     let mut sample = standing();
@@ -91,7 +91,7 @@ fn a_gyro_bias_is_found_standing_and_flying_level() {
 }
 
 #[test]
-fn a_single_outlier_is_dropped_and_an_announced_jump_is_followed() {
+fn rejects_an_outlier_and_follows_an_announced_jump() {
     let mut bench = Bench::new();
     let here = vision_at(DVec3::ZERO, 0.0);
     bench.stand(2.1, None);
@@ -110,7 +110,7 @@ fn a_single_outlier_is_dropped_and_an_announced_jump_is_followed() {
 }
 
 #[test]
-fn a_persistent_jump_is_accepted_after_the_position_was_lost() {
+fn accepts_a_persistent_jump_after_the_position_was_lost() {
     let mut bench = Bench::new();
     bench.stand(2.1, None);
     bench.estimator.set_origin();
@@ -123,7 +123,7 @@ fn a_persistent_jump_is_accepted_after_the_position_was_lost() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..Default::default() })]
     #[test]
-    fn no_input_makes_the_estimate_anything_but_finite(
+    fn stays_finite_for_any_input(
         inputs in prop::collection::vec(
             (prop::array::uniform6(prop_oneof![8 => -200.0..200.0f64, 1 => prop::num::f64::ANY]),
              prop::array::uniform3(prop_oneof![8 => -20.0..20.0f64, 1 => prop::num::f64::ANY]),

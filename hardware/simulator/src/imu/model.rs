@@ -1,48 +1,49 @@
-//! How far an inertial sensor is off: densities and walks, by the name of a chip or as a small frame shakes one.
+//! Errors of inertial sensors: noise densities and random walks, by chip, or as dominated by a small frame's vibration.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// Standard gravity. [m/s^2]
+/// Standard gravity [m/s^2].
 const G: f64 = 9.806_65;
-/// Samples a second of the simulated board. [Hz]
+/// Sample rate of the simulated board [Hz].
 const RATE_HZ: f64 = 400.0;
 
-/// The errors of an accelerometer and a gyro.
+/// Errors of an accelerometer and a gyro.
 ///
-/// White noise has a density: sampled at a rate with its bandwidth at half of it, as autopilots filter, a sample's deviation
-/// is `density sqrt(rate / 2)`. Its Allan deviation is then `density / sqrt(2 tau)` (IEEE Std 952-1997, annex C.1: a one-sided
-/// density N makes angle random walk N / sqrt(2)). The bias walks: `walk sqrt(tau / 3)` (annex C.4).
+/// White noise is given by its density. For a sample rate and a bandwidth of half of it, as autopilots filter, the
+/// deviation of a sample is `density sqrt(rate / 2)`. Its Allan deviation is `density / sqrt(2 tau)` (IEEE Std
+/// 952-1997, annex C.1: a one-sided density N gives angle random walk N / sqrt(2)). The bias drifts by a random walk:
+/// `walk sqrt(tau / 3)` (annex C.4).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImuModel {
-    /// What `--imu` calls it.
+    /// Name for `--imu`.
     pub name: &'static str,
-    /// One-sided density of the gyro's white noise. [rad/s / sqrt(Hz)]
+    /// One-sided density of the gyro's white noise [rad/s / sqrt(Hz)].
     pub gyro_density: f64,
-    /// One-sided density of the accelerometer's white noise. [m/s^2 / sqrt(Hz)]
+    /// One-sided density of the accelerometer's white noise [m/s^2 / sqrt(Hz)].
     pub accel_density: f64,
-    /// Gyro bias left after the calibration at boot. [rad/s]
+    /// Gyro bias after the calibration at boot [rad/s].
     pub gyro_bias_radps: f64,
-    /// Accelerometer bias left after calibration. [m/s^2]
+    /// Accelerometer bias after calibration [m/s^2].
     pub accel_bias_mps2: f64,
-    /// Random walk of the gyro bias. [rad/s / sqrt(s)]
+    /// Random walk of the gyro bias [rad/s / sqrt(s)].
     pub gyro_walk: f64,
-    /// Random walk of the accelerometer bias. [m/s^2 / sqrt(s)]
+    /// Random walk of the accelerometer bias [m/s^2 / sqrt(s)].
     pub accel_walk: f64,
-    /// Range of the accelerometer. [m/s^2]
+    /// Range of the accelerometer [m/s^2].
     pub accel_range_mps2: f64,
-    /// Range of the gyro. [rad/s]
+    /// Range of the gyro [rad/s].
     pub gyro_range_radps: f64,
-    /// White noise per sample at 400 Hz where it is stated so, of gyro [rad/s] and accelerometer [m/s^2].
+    /// White noise per sample at 400 Hz, if given directly: gyro [rad/s] and accelerometer [m/s^2].
     pub(crate) stated_sigma: Option<[f64; 2]>,
 }
 
-/// Every model that has a name; the first flies where none is asked for.
+/// All named models; the first is the default.
 ///
-/// Data sheets state densities and the bias before calibration, but not how a bias walks within a flight; `bias` here is what
-/// is left after an autopilot's calibration, `walk` that of `frame` unless it was measured.
+/// Data sheets give densities and the bias before calibration, but not the drift of a bias during a flight. The bias
+/// here is what an autopilot's calibration leaves. The walk is that of `frame`, unless measured.
 pub const MODELS: [ImuModel; 4] = [
-    // An ICM-42688 class sensor on a small frame, where vibration and not the chip sets the noise.
+    // ICM-42688 class sensor on a small frame; vibration, not the chip, determines the noise.
     ImuModel {
         name: "frame",
         gyro_density: 0.01 / 14.142_135_623_730_951,
@@ -57,11 +58,11 @@ pub const MODELS: [ImuModel; 4] = [
     },
     // TDK InvenSense ICM-42688-P (DS-000347 rev 1.7, first page): 2.8 mdps/sqrt(Hz), 70 ug/sqrt(Hz); 2000 dps, 16 g.
     ImuModel::chip("icm-42688-p", 2.8e-3, 70e-6, 16.0),
-    // Bosch BMI088 (BST-BMI088-DS001 rev 1.3: 2000 dps, 24 g): 0.014 dps/sqrt(Hz) and 175 ug/sqrt(Hz), as public code
-    // that uses one quotes its maker: the sheet's tables of noise could not be read.
+    // Bosch BMI088 (BST-BMI088-DS001 rev 1.3: 2000 dps, 24 g): 0.014 dps/sqrt(Hz) and 175 ug/sqrt(Hz), as quoted from
+    // the manufacturer by public code, because the noise tables of the data sheet could not be read.
     ImuModel::chip("bmi088", 0.014, 175e-6, 24.0),
     // InvenSense MPU-6000 (PS-MPU-6000A-00 rev 3.4, sections 6.1 and 6.2): 0.005 dps/sqrt(Hz), 400 ug/sqrt(Hz), both at
-    // 10 Hz and in the narrowest range; that they hold in the widest, 2000 dps and 16 g, is an estimate.
+    // 10 Hz and in the smallest range; validity in the largest range, 2000 dps and 16 g, is an estimate.
     ImuModel::chip("mpu-6000", 0.005, 400e-6, 16.0),
 ];
 
@@ -81,13 +82,13 @@ impl ImuModel {
         }
     }
 
-    /// Returns the white noise of one sample at 400 Hz: of the gyro [rad/s] and the accelerometer [m/s^2].
+    /// Returns the white noise of one sample at 400 Hz: gyro [rad/s] and accelerometer [m/s^2].
     pub fn sigma(&self) -> [f64; 2] {
         let half = (RATE_HZ / 2.0).sqrt();
         self.stated_sigma.unwrap_or([self.gyro_density * half, self.accel_density * half])
     }
 
-    /// Returns the names of all, as help and messages list them.
+    /// Returns the names of all models, for help and messages.
     pub fn names() -> String {
         MODELS.map(|model| model.name).join(", ")
     }
@@ -105,9 +106,9 @@ impl fmt::Display for ImuModel {
     }
 }
 
-/// A name that is no [`ImuModel`].
+/// Name that matches no [`ImuModel`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no inertial sensor is called '{0}'; there are {all}", all = ImuModel::names())]
+#[error("unknown inertial sensor '{0}'; use one of {all}", all = ImuModel::names())]
 pub struct UnknownImu(pub String);
 
 impl FromStr for ImuModel {

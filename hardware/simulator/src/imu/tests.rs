@@ -1,4 +1,4 @@
-//! Noise by its Allan deviation, against the densities of data sheets; ranges and seeds.
+//! Noise measured by its Allan deviation and compared with data sheets; ranges and seeds.
 
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
@@ -7,8 +7,8 @@ use crate::simulation::{Simulation, SimulationConfig};
 
 const DT_S: f64 = 0.0025;
 
-/// Returns the Allan deviation of samples at averages of `count` of them: the root of half the mean square of what the mean
-/// changes by from one average to the next (IEEE Std 952-1997, annex C, equation C.5).
+/// Returns the Allan deviation of samples at averages of `count` of them: the root of half the mean square of the
+/// differences of successive averages (IEEE Std 952-1997, annex C, equation C.5).
 fn allan(samples: &[f64], count: usize) -> f64 {
     let means: Vec<f64> =
         samples.chunks_exact(count).map(|c| c.iter().sum::<f64>() / count as f64).collect();
@@ -16,7 +16,7 @@ fn allan(samples: &[f64], count: usize) -> f64 {
     (squares / (2.0 * (means.len() - 1) as f64)).sqrt()
 }
 
-/// Returns what a standing sensor measures along x: gyro and accelerometer.
+/// Returns the measurements of a standing sensor along x: gyro and accelerometer.
 fn standing(model: ImuModel, samples: usize) -> [Vec<f64>; 2] {
     let mut imu = Imu::new(model, 5);
     let mut sample = || imu.sample(DVec3::ZERO, DVec3::ZERO, 0.0, [0.0; 4], DT_S);
@@ -28,7 +28,7 @@ fn standing(model: ImuModel, samples: usize) -> [Vec<f64>; 2] {
 }
 
 #[test]
-fn white_noise_has_the_data_sheet_s_density() {
+fn white_noise_matches_the_data_sheet() {
     // (name, degrees a second and g per root hertz), as printed in the data sheets.
     for (name, gyro_dps, accel_g) in
         [("icm-42688-p", 0.0028, 70e-6), ("bmi088", 0.014, 175e-6), ("mpu-6000", 0.005, 400e-6)]
@@ -39,7 +39,7 @@ fn white_noise_has_the_data_sheet_s_density() {
         for (samples, density) in
             [(gyro, gyro_dps * std::f64::consts::PI / 180.0), (accel, accel_g * 9.80665)]
         {
-            // At 25 ms, 100 ms and 0.5 s; the fewest of the averages, 500, tell the deviation to some 4 %.
+            // At 25 ms, 100 ms and 0.5 s; the smallest number of averages, 500, gives the deviation to about 4 %.
             for count in [10, 40, 200] {
                 let tau_s = count as f64 * DT_S;
                 let ratio = allan(&samples, count) / (density / (2.0 * tau_s).sqrt());
@@ -50,7 +50,7 @@ fn white_noise_has_the_data_sheet_s_density() {
 }
 
 #[test]
-fn a_bias_walks_at_its_rate() {
+fn bias_drifts_at_the_configured_rate() {
     let model: ImuModel = "icm-42688-p".parse().unwrap();
     let quiet = ImuModel { gyro_density: 0.0, accel_density: 0.0, ..model };
     let [gyro, accel] = standing(quiet, 400_000);
@@ -65,7 +65,7 @@ fn a_bias_walks_at_its_rate() {
 }
 
 #[test]
-fn without_a_name_it_is_the_frame_s_noise() {
+fn the_default_model_has_the_noise_of_the_frame() {
     let [gyro, accel] = standing(ImuModel::default(), 4000);
     for (samples, sigma, bias) in [(gyro, 0.01, 0.003), (accel, 0.2, 0.03)] {
         let mean = samples.iter().sum::<f64>() / 4000.0;
@@ -73,12 +73,12 @@ fn without_a_name_it_is_the_frame_s_noise() {
         assert!(mean.abs() < 4.0 * bias, "bias {mean}");
         assert!((square.sqrt() / sigma - 1.0).abs() < 0.06, "sigma {}", square.sqrt());
     }
-    // To the bit as before there were models: these go into every grade.
+    // Bit-exact, because the noise affects every grade.
     assert_eq!(ImuModel::default().sigma(), [0.01, 0.2]);
 }
 
 #[test]
-fn a_seed_repeats_and_the_range_holds() {
+fn seeds_are_repeatable_and_ranges_limit() {
     let run = |model: ImuModel, seed| {
         let far = DVec3::splat(1e6);
         Imu::new(model, seed).sample(far, -far, 0.0, [0.0; 4], DT_S)
@@ -102,7 +102,7 @@ fn names_parse_and_print() {
 }
 
 #[test]
-fn the_lab_has_the_sensor_that_is_asked_for() {
+fn the_simulation_uses_the_selected_sensor() {
     let sent = |imu: ImuModel| {
         let mut lab = Simulation::new(SimulationConfig { imu, ..Default::default() }).unwrap();
         let mut bytes = Vec::new();

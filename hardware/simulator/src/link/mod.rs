@@ -1,5 +1,4 @@
-//! Where MAVLink goes and comes from: UDP, TCP, or a serial line. Non-blocking; a peer that is not
-//! there loses packets and nothing else.
+//! MAVLink links over UDP, TCP or a serial line. Non-blocking; packets to an absent peer are dropped.
 
 pub mod serial;
 
@@ -12,24 +11,24 @@ use std::time::{Duration, Instant};
 
 use serial::{DEFAULT_BAUD, SerialPort, baud_rate};
 
-/// How MAVLink is reached.
+/// Endpoint of MAVLink.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Endpoint {
-    /// Send to an address from a port of our own, as an autopilot's Wi-Fi bridge does.
+    /// Sends to an address from an own port, like an autopilot's Wi-Fi bridge.
     UdpOut(SocketAddr),
-    /// Wait for datagrams and answer their senders.
+    /// Waits for datagrams and answers their senders.
     UdpIn(SocketAddr),
-    /// Wait for one TCP client at a time.
+    /// Waits for one TCP client at a time.
     TcpIn(SocketAddr),
-    /// Connect to a TCP server, and again whenever it goes.
+    /// Connects to a TCP server, and reconnects if it closes.
     TcpOut(SocketAddr),
-    /// Open a serial device at a baud rate.
+    /// Opens a serial device at a baud rate.
     Serial(PathBuf, u32),
-    /// Make a pseudo-terminal with this name, as fast as this baud rate.
+    /// Creates a pseudo-terminal with this name and the speed of this baud rate.
     Pty(PathBuf, u32),
 }
 
-/// An endpoint that cannot be read.
+/// Text that is not a valid endpoint.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "mavlink endpoint '{0}': write udpout:HOST:PORT, udpin:HOST:PORT, tcpin:HOST:PORT, \
@@ -82,45 +81,41 @@ pub fn resolve(text: &str) -> Option<SocketAddr> {
     text.to_socket_addrs().ok()?.next()
 }
 
-/// A peer of a `udpin` link is forgotten after this silence.
+/// Silence after which a peer of a `udpin` link is removed.
 const PEER_SILENCE: Duration = Duration::from_secs(10);
-/// Peers answered at once at most.
+/// Maximum number of peers.
 const MAX_PEERS: usize = 8;
-/// Bytes a TCP client may be behind before it is let go.
+/// Maximum backlog of a TCP client [bytes]; beyond it, the client is disconnected.
 const MAX_BACKLOG: usize = 256 * 1024;
 
-/// A TCP server that is not there is tried again after this.
+/// Retry interval of a TCP server that does not answer.
 const RETRY: Duration = Duration::from_millis(500);
-/// A TCP server has this long to answer; the flight waits, so it is short.
+/// Timeout of a TCP connection; short, because the simulation waits.
 const CONNECT_PATIENCE: Duration = Duration::from_millis(20);
 
-/// Where TCP clients come from.
+/// Side of a TCP connection.
 pub enum TcpSide {
-    /// They knock here.
+    /// Accepts clients on this socket.
     Listens(TcpListener),
-    /// We knock there, next at this time.
+    /// Connects to this address, next at this time.
     Connects(SocketAddr, Instant),
 }
 
-/// An open link.
+/// Open link.
 pub enum Link {
-    /// Over UDP, either way.
     Udp {
-        /// Our socket.
         socket: UdpSocket,
-        /// The fixed peer of `udpout`.
+        /// Fixed peer of `udpout`.
         target: Option<SocketAddr>,
-        /// Who has spoken to us lately.
+        /// Recently active peers.
         peers: Vec<(SocketAddr, Instant)>,
     },
-    /// Over TCP.
     Tcp {
-        /// Who begins.
+        /// Whether it accepts or connects.
         side: TcpSide,
-        /// The peer, and what it has not taken yet.
+        /// Connected peer, and the bytes it has not accepted yet.
         client: Option<(TcpStream, Vec<u8>)>,
     },
-    /// Over a serial line.
     Serial(SerialPort),
 }
 
@@ -128,7 +123,7 @@ impl Link {
     /// Opens a link.
     ///
     /// # Errors
-    /// Returns the operating system's refusal, of a port in use above all.
+    /// Returns the error of the operating system, usually a port in use.
     pub fn open(endpoint: &Endpoint) -> io::Result<Self> {
         Ok(match *endpoint {
             Endpoint::UdpOut(target) => {
@@ -151,10 +146,10 @@ impl Link {
         })
     }
 
-    /// Returns where others reach us; for `udpout` where we send from, for `tcpout` where to.
+    /// Returns the local address; for `tcpout`, the remote one.
     ///
     /// # Errors
-    /// Returns the operating system's refusal.
+    /// Returns the error of the operating system.
     pub fn address(&self) -> io::Result<String> {
         Ok(match self {
             Self::Udp { socket, .. } => socket.local_addr()?.to_string(),
@@ -166,8 +161,7 @@ impl Link {
         })
     }
 
-    /// Hands everything that has come to `sink`; at most 64 pieces, so that a flood cannot stop
-    /// the flight.
+    /// Passes all received data to `sink`, at most 64 pieces, so that a flood cannot stop the simulation.
     pub fn receive(&mut self, mut sink: impl FnMut(&[u8])) {
         let mut buffer = [0; 2048];
         match self {
@@ -181,7 +175,7 @@ impl Link {
                             sink(&buffer[..length]);
                         }
                         Err(error) if error.kind() == ErrorKind::WouldBlock => break,
-                        // A peer that is not there yet reports itself as refused: go on.
+                        // A peer that does not exist yet causes an error: ignore it.
                         Err(_) => {}
                     }
                 }
@@ -192,7 +186,7 @@ impl Link {
                     && client.is_none()
                     && stream.set_nonblocking(true).is_ok()
                 {
-                    // Small packets must not wait for each other; failing that they merely do.
+                    // Small packets must not wait for each other. If this fails, they wait.
                     let _ = stream.set_nodelay(true);
                     *client = Some((stream, Vec::new()));
                 }
@@ -221,13 +215,13 @@ impl Link {
         }
     }
 
-    /// Sends one packet to everybody.
+    /// Sends one packet to all peers.
     pub fn send(&mut self, packet: &[u8]) {
         match self {
             Self::Udp { socket, target, peers } => {
                 peers.retain(|(_, received_at)| received_at.elapsed() < PEER_SILENCE);
                 for address in target.iter().chain(peers.iter().map(|(address, _)| address)) {
-                    // Lost like any datagram: the autopilot does not learn of it either.
+                    // Without a receiver, the datagram is lost.
                     let _ = socket.send_to(packet, address);
                 }
             }
@@ -260,10 +254,10 @@ impl Link {
 }
 
 impl TcpSide {
-    /// Returns a new peer, if there is one; `busy` means that one is being served.
+    /// Returns a new peer, if there is one. `busy` means that a peer is already connected.
     fn next_peer(&mut self, busy: bool) -> Option<TcpStream> {
         match self {
-            // Also while busy: a second client is let go at once, not left to wait for ever.
+            // Accepts also while busy, to disconnect a second client at once instead of letting it wait.
             Self::Listens(listener) => listener.accept().ok().map(|(stream, _)| stream),
             Self::Connects(address, due) => {
                 if busy || Instant::now() < *due {
@@ -280,7 +274,7 @@ impl TcpSide {
 /// Binds a non-blocking UDP socket.
 ///
 /// # Errors
-/// Returns the operating system's refusal.
+/// Returns the error of the operating system.
 pub fn bind_udp(address: impl ToSocketAddrs) -> io::Result<UdpSocket> {
     let socket = UdpSocket::bind(address)?;
     socket.set_nonblocking(true)?;
@@ -301,7 +295,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn endpoints_read_and_print() {
+    fn endpoints_parse_and_print() {
         for text in [
             "udpout:127.0.0.1:14550",
             "udpin:0.0.0.0:14550",
@@ -329,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn tcp_is_served_both_ways_round_and_again_after_a_break() {
+    fn tcp_works_in_both_directions_and_reconnects() {
         let any = SocketAddr::from(([127, 0, 0, 1], 0));
         let mut server = Link::open(&Endpoint::TcpIn(any)).unwrap();
         let address = server.address().unwrap().parse().unwrap();

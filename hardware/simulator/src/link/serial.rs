@@ -1,8 +1,7 @@
-//! MAVLink over a serial device, or over a pseudo-terminal that stands in for one: what an
-//! autopilot's telemetry port is to a bridge.
+//! MAVLink over a serial device, or over a pseudo-terminal that replaces one: the telemetry port of an autopilot.
 //!
-//! Bytes leave no faster than the baud rate allows, whatever the kernel would take: a
-//! pseudo-terminal has no speed of its own, and a bridge must be seen to keep up with a real one.
+//! Bytes are sent at most at the baud rate, even if the kernel accepts more: a pseudo-terminal has no speed, but tests
+//! must show that a bridge keeps up with a real port.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -16,17 +15,16 @@ use nix::pty::openpty;
 use nix::sys::termios::{BaudRate, SetArg, cfmakeraw, cfsetspeed, tcgetattr, tcsetattr};
 use nix::unistd::ttyname;
 
-/// Baud rate of a telemetry port where none is given.
+/// Default baud rate of a telemetry port.
 pub const DEFAULT_BAUD: u32 = 921_600;
 /// Bits on the line per byte: start, eight, stop.
 const BITS_PER_BYTE: f64 = 10.0;
-/// Bytes that wait for the line at most; a packet that does not fit is dropped whole, as by
-/// ArduPilot. Twice what 921600 baud carries in the tenth of a second that the driver catches up
-/// at once. [bytes]
+/// Maximum number of queued bytes; packets that do not fit are dropped whole, as by ArduPilot. Twice the bytes of
+/// 921600 baud in the tenth of a second that the driver may catch up.
 const MAX_WAITING: usize = 18 * 1024;
-/// A line that was idle may send this much at once: the FIFO of a UART and some ticks. [s]
+/// Time for which an idle line may send a burst [s]: the FIFO of a UART and a few ticks.
 const BURST_S: f64 = 0.005;
-/// A device that is not there, or gone, is tried again after this.
+/// Retry interval of a device that does not exist or was disconnected.
 const RETRY: Duration = Duration::from_millis(250);
 
 /// One end of a serial line.
@@ -34,19 +32,19 @@ pub struct SerialPort {
     path: PathBuf,
     baud: u32,
     line: Option<File>,
-    /// Ours to keep open, so that a client that leaves does not hang up the line.
+    /// Own pseudo-terminal, kept open so that a client that leaves does not hang up the line.
     made: Option<PseudoTerminal>,
     waiting: Vec<u8>,
-    /// Bytes that may leave now.
+    /// Number of bytes that may be sent now.
     allowance: f64,
     counted: Instant,
     retry_at: Instant,
-    /// A device that is not there is reported once.
+    /// Whether a missing device was already reported.
     is_reported: bool,
     dropped: u64,
 }
 
-/// A pseudo-terminal made by us.
+/// Pseudo-terminal created by this program.
 struct PseudoTerminal {
     _client: OwnedFd,
     link: PathBuf,
@@ -55,7 +53,7 @@ struct PseudoTerminal {
 
 impl Drop for PseudoTerminal {
     fn drop(&mut self) {
-        // Only if it is still ours: another simulator may have taken the name over.
+        // Only if the link is unchanged: another simulator may have replaced it.
         if std::fs::read_link(&self.link).is_ok_and(|target| target == self.target) {
             let _ = std::fs::remove_file(&self.link);
         }
@@ -63,18 +61,18 @@ impl Drop for PseudoTerminal {
 }
 
 impl SerialPort {
-    /// Opens the device at `path`; one that is not there yet is waited for.
+    /// Opens the device at `path`; retries if it does not exist yet.
     pub fn open(path: &Path, baud: u32) -> Self {
         let mut port = Self::new(path, baud);
         port.reopen();
         port
     }
 
-    /// Makes a pseudo-terminal and a symbolic link to it at `path`; an older link there is replaced.
+    /// Creates a pseudo-terminal and a symbolic link to it at `path`; an existing link is replaced.
     ///
     /// # Errors
-    /// Returns the operating system's refusal; `AlreadyExists` if something that is no symbolic
-    /// link has the name.
+    /// Returns the error of the operating system; `AlreadyExists` if the name belongs to something else than a symbolic
+    /// link.
     pub fn make(path: &Path, baud: u32) -> io::Result<Self> {
         let ends = openpty(None, None)?;
         set_raw(&ends.slave, None)?;
@@ -107,17 +105,17 @@ impl SerialPort {
         }
     }
 
-    /// Returns where the line is.
+    /// Returns the path of the line.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns packets dropped because the line could not take them.
+    /// Returns the number of dropped packets.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// Hands what has come to `sink`, and sends what waits.
+    /// Passes received bytes to `sink`, and sends queued ones.
     pub fn receive(&mut self, mut sink: impl FnMut(&[u8])) {
         if self.line.is_none() && Instant::now() >= self.retry_at {
             self.reopen();
@@ -136,7 +134,7 @@ impl SerialPort {
         }
     }
 
-    /// Sends one packet, or drops it whole.
+    /// Queues one packet, or drops it whole.
     pub fn send(&mut self, packet: &[u8]) {
         if self.line.is_none() || self.waiting.len() + packet.len() > MAX_WAITING {
             self.dropped += 1;
@@ -171,7 +169,7 @@ impl SerialPort {
             }
         };
         self.waiting.drain(..sent);
-        // What an idle line did not use is gone.
+        // An idle line does not accumulate its allowance.
         self.allowance = self.allowance.min(bytes_per_s * BURST_S);
         if gone {
             self.hang_up();
@@ -179,9 +177,9 @@ impl SerialPort {
     }
 
     fn hang_up(&mut self) {
-        // A pseudo-terminal of our own has no other end to lose.
+        // An own pseudo-terminal has no device that could disconnect.
         if self.made.is_none() {
-            tracing::warn!("simulator: {} hung up; waiting for it", self.path.display());
+            tracing::warn!("simulator: {} was disconnected; waiting for it to return", self.path.display());
             self.line = None;
             self.waiting.clear();
             self.retry_at = Instant::now() + RETRY;
@@ -197,7 +195,7 @@ impl SerialPort {
             Err(error) => {
                 if !self.is_reported {
                     tracing::warn!(
-                        "simulator: cannot open {}: {error}; trying again until it is there",
+                        "simulator: cannot open {}: {error}; retrying until it exists",
                         self.path.display()
                     );
                     self.is_reported = true;
@@ -215,7 +213,7 @@ fn open_device(path: &Path, baud: u32) -> io::Result<File> {
     Ok(line)
 }
 
-/// Lets every byte through as it is.
+/// Sets raw mode, so that all bytes pass unchanged.
 fn set_raw(line: &impl std::os::fd::AsFd, speed: Option<BaudRate>) -> io::Result<()> {
     let mut settings = tcgetattr(line)?;
     cfmakeraw(&mut settings);
@@ -226,7 +224,7 @@ fn set_raw(line: &impl std::os::fd::AsFd, speed: Option<BaudRate>) -> io::Result
     Ok(())
 }
 
-/// Returns the operating system's name of a baud rate that telemetry ports use.
+/// Returns the operating system's constant for a baud rate of telemetry ports.
 pub fn baud_rate(baud: u32) -> Option<BaudRate> {
     Some(match baud {
         57_600 => BaudRate::B57600,
@@ -247,14 +245,14 @@ pub fn baud_rate(baud: u32) -> Option<BaudRate> {
 mod tests {
     use super::*;
 
-    /// Long enough for any machine: nothing here depends on how long it takes.
+    /// Longer than any machine needs; no result depends on it.
     const PATIENCE: Duration = Duration::from_secs(30);
 
-    /// Turns both ends until `done`.
+    /// Runs both ends until `done`.
     fn until(mut done: impl FnMut() -> bool) {
         let end = Instant::now() + PATIENCE;
         while !done() {
-            assert!(Instant::now() < end, "nothing came");
+            assert!(Instant::now() < end, "timeout");
             std::thread::yield_now();
         }
     }
@@ -264,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn every_byte_passes_both_ways_and_a_client_may_come_back() {
+    fn passes_every_byte_in_both_directions_also_after_a_reconnect() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("uart");
         let all: Vec<u8> = (0..=255).collect();
@@ -282,14 +280,14 @@ mod tests {
             assert_eq!((&down, &up), (&all, &all));
         }
         drop(vehicle);
-        assert!(!path.is_symlink(), "the link goes with its maker");
+        assert!(!path.is_symlink(), "the link must be removed");
     }
 
     #[test]
-    fn a_device_that_hangs_up_is_waited_for() {
+    fn waits_for_a_disconnected_device() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("uart");
-        // Not there yet: what is sent is lost, and counted.
+        // Not there yet: packets are dropped and counted.
         let mut vehicle = SerialPort::open(&path, 921_600);
         vehicle.send(b"lost");
         assert_eq!(vehicle.dropped(), 1);
@@ -311,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn the_line_is_no_faster_than_its_baud_rate_and_drops_whole_packets() {
+    fn respects_the_baud_rate_and_drops_whole_packets() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("uart");
         let mut vehicle = SerialPort::make(&path, 57_600).unwrap();
@@ -323,7 +321,7 @@ mod tests {
         }
         let kept = sent - vehicle.dropped() as usize;
         assert!(kept >= MAX_WAITING / 200 && kept < sent, "{kept} of {sent} kept");
-        // A tenth of a second's worth: it cannot come sooner, however slow the machine.
+        // A tenth of a second of data; on a slow machine it only takes longer.
         let mut received = Vec::new();
         until(|| {
             vehicle.receive(|_| {});
@@ -335,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_not_overwritten() {
+    fn does_not_overwrite_a_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("notes.txt");
         std::fs::write(&path, "precious").unwrap();

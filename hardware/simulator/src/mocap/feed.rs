@@ -1,4 +1,4 @@
-//! Sends sights over UDP as one vendor's system or another does.
+//! Sends measured poses over UDP in the formats of several vendors.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
@@ -10,17 +10,15 @@ use super::Sight;
 use super::formats::{answer_natnet, encode_json, encode_mavlink, encode_natnet, encode_object};
 use crate::link::{bind_udp, resolve};
 
-/// A vendor's format, and where it goes: `json:127.0.0.1:51002`. NatNet's is where Motive takes
-/// commands, or the multicast group that it streams to.
+/// Format and destination, for example `json:127.0.0.1:51002`. For NatNet, the address is the one at which Motive takes
+/// commands, or its multicast group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FeedTarget {
-    /// Its format.
     pub format: Format,
-    /// Where it goes.
     pub address: SocketAddr,
 }
 
-/// How sights are written.
+/// Format of measured poses on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// Vicon Tracker's UDP object stream.
@@ -29,7 +27,7 @@ pub enum Format {
     Natnet,
     /// VizFlyt's own pose packet.
     Json,
-    /// An autopilot's own estimate.
+    /// The estimate of an autopilot, as MAVLink.
     Mavlink,
 }
 
@@ -65,20 +63,20 @@ impl FromStr for FeedTarget {
     }
 }
 
-/// One system on the network.
+/// One simulated system on the network.
 #[derive(Debug)]
 pub struct Feed {
     target: FeedTarget,
     socket: UdpSocket,
-    /// NatNet's listeners, and when they last sent something.
+    /// NatNet listeners by unicast, and when each last sent a command.
     listeners: Vec<(SocketAddr, AutopilotTime)>,
 }
 
 impl Feed {
-    /// Opens its socket.
+    /// Opens the socket.
     ///
     /// # Errors
-    /// If there is none, or NatNet's address is taken.
+    /// If no socket can be opened, or NatNet's address is in use.
     pub fn open(target: FeedTarget) -> std::io::Result<Self> {
         let ours = match target.address.ip() {
             ip if target.format == Format::Natnet && !ip.is_multicast() => target.address,
@@ -88,7 +86,7 @@ impl Feed {
         Ok(Self { target, socket: bind_udp(ours)?, listeners: Vec::new() })
     }
 
-    /// Returns the socket's own address.
+    /// Returns the local address of the socket.
     ///
     /// # Errors
     /// If the operating system does not report it.
@@ -96,7 +94,7 @@ impl Feed {
         self.socket.local_addr()
     }
 
-    /// Sends where the vehicle named `object` was seen; first answers who has asked.
+    /// Sends the measured pose of the vehicle named `object`. For NatNet, answers commands first.
     pub fn send(&mut self, object: &str, sight: &Sight, now: AutopilotTime) {
         let to = self.target.address;
         let datagram = match self.target.format {
@@ -115,15 +113,15 @@ impl Feed {
                 datagram
             }
         };
-        // Lost like any datagram if nobody listens.
+        // Without a receiver, the datagram is lost.
         let _ = self.socket.send_to(&datagram, to);
     }
 
     fn answer(&mut self, object: &str, now: AutopilotTime) {
         let mut buffer = [0; 2048];
-        // As many as may wait: a loop that another program could keep busy.
+        // Bounded, so that another program cannot keep this loop busy.
         for _ in 0..MAX_LISTENERS {
-            // Errors are an empty socket, or a complaint that someone has gone.
+            // An error means an empty socket, or that a receiver is gone.
             let Ok((length, from)) = self.socket.recv_from(&mut buffer) else { break };
             if let Some((_, received_at)) =
                 self.listeners.iter_mut().find(|(known, _)| *known == from)
@@ -150,9 +148,9 @@ fn any(like: IpAddr) -> IpAddr {
     }
 }
 
-/// Where Motive takes commands.
+/// Port on which Motive takes commands.
 const COMMAND_PORT: u16 = 1510;
-/// Listeners by unicast at most.
+/// Maximum number of listeners by unicast.
 const MAX_LISTENERS: usize = 16;
-/// Who is silent for so long is forgotten. [s]
+/// Silence after which a listener is removed [s].
 const FORGOTTEN_S: f64 = 5.0;

@@ -1,15 +1,14 @@
-//! How sights are written on the wire.
+//! Encodes measured poses for the wire.
 //!
-//! Vicon Tracker's UDP object stream, little-endian, packed: `u32 frame, u8 items`, then per item
-//! `u8 id = 0, u16 size = 72, char[24] name, f64 x, y, z [mm], f64 rx, ry, rz [rad]`; turns about the
-//! fixed x, then the fixed y, then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`.
+//! Vicon Tracker's UDP object stream, little-endian, packed: `u32 frame, u8 items`, then per item `u8 id = 0, u16 size
+//! = 72, char[24] name, f64 x, y, z [mm], f64 rx, ry, rz [rad]`; rotations about the fixed x, then y, then z axis, `R =
+//! Rz(rz) * Ry(ry) * Rx(rx)`.
 //!
 //! VizFlyt's own pose packet: a JSON object, described in `docs/guides/localization.md`.
 //!
-//! OptiTrack's NatNet 4.1, as Motive streams it by default: y up, so that the world's x, y
-//! and z are its x, -z and y.
+//! OptiTrack's NatNet 4.1, with Motive's default axes: y up, so that the world's x, y and z become x, -z and y.
 //!
-//! An autopilot's LOCAL_POSITION_NED and ATTITUDE_QUATERNION, as if it had a localization of its own.
+//! LOCAL_POSITION_NED and ATTITUDE_QUATERNION of an autopilot, as if it had its own localization.
 
 use glam::{DQuat, DVec3, EulerRot};
 use natnet::{
@@ -26,10 +25,10 @@ use vizflyt_protocol::time::AutopilotTime;
 
 use super::{MAX_NAME, Sight};
 
-/// Bytes of a Vicon datagram with one object.
+/// Length of a Vicon datagram with one object [bytes].
 pub const DATAGRAM: usize = 5 + 3 + 72;
 
-/// Returns a pose packet, stamped by the simulator's own clock.
+/// Returns a pose packet, stamped by the simulator's clock.
 pub fn encode_json(name: &str, sight: &Sight) -> Vec<u8> {
     let pose = &sight.world_from_body;
     let packet = json!({
@@ -43,12 +42,12 @@ pub fn encode_json(name: &str, sight: &Sight) -> Vec<u8> {
     packet.to_string().into_bytes()
 }
 
-/// The streaming id of the vehicle's rigid body.
+/// Streaming id of the vehicle's rigid body.
 const BODY_ID: i32 = 1;
-/// Ticks of Motive's clock. [Hz]
+/// Frequency of Motive's clock [Hz].
 const TICKS_HZ: u64 = 10_000_000;
 
-/// Returns a frame of NatNet, seen as in `sight` and sent `now`.
+/// Returns a NatNet frame with the pose in `sight`, sent at `now`.
 pub fn encode_natnet(sight: &Sight, now: AutopilotTime) -> Option<Vec<u8>> {
     let y_up = |v: DVec3| DVec3::new(v.x, v.z, -v.y);
     let pose = &sight.world_from_body;
@@ -63,7 +62,7 @@ pub fn encode_natnet(sight: &Sight, now: AutopilotTime) -> Option<Vec<u8>> {
     frame.to_datagram(Version::V4_1).ok()
 }
 
-/// Returns what Motive answers to a command.
+/// Returns Motive's answer to a command.
 pub fn answer_natnet(name: &str, command: &[u8]) -> Option<Vec<u8>> {
     match natnet::MessageHeader::parse(command).ok()?.message_id {
         natnet::NAT_CONNECT => {
@@ -95,7 +94,7 @@ pub fn answer_natnet(name: &str, command: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// Returns the packets of an autopilot that estimates what was seen.
+/// Returns the MAVLink packets of an autopilot that estimates the measured pose.
 pub fn encode_mavlink(sight: &Sight) -> Vec<u8> {
     let pose = &sight.world_from_body;
     let boot_ms = (sight.at.as_ns() / 1_000_000) as u32;
@@ -117,7 +116,7 @@ pub fn encode_mavlink(sight: &Sight) -> Vec<u8> {
     bytes
 }
 
-/// Returns a Vicon datagram with one object; a longer name is cut.
+/// Returns a Vicon datagram with one object. Longer names are truncated.
 pub fn encode_object(frame: u32, name: &str, pose: &Pose<World, Body>) -> [u8; DATAGRAM] {
     let mut datagram = [0; DATAGRAM];
     datagram[..4].copy_from_slice(&frame.to_le_bytes());
@@ -141,7 +140,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn the_json_is_the_guide_s() {
+    fn json_matches_the_guide() {
         let pose = Pose::new(DVec3::new(1.0, 2.0, 0.5), DQuat::IDENTITY);
         let at = AutopilotTime::from_ns(77);
         let bytes = encode_json("bee", &Sight { frame: 3, at, world_from_body: pose });
@@ -153,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn natnet_is_y_up_with_its_own_stamps() {
+    fn natnet_is_y_up_with_two_time_stamps() {
         let pose = Pose::new(DVec3::new(1.0, 2.0, 0.5), DQuat::from_rotation_z(0.5));
         let at = AutopilotTime::from_ns(2_000_000_000);
         let sight = Sight { frame: 3, at, world_from_body: pose };
@@ -180,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn the_layout_is_tracker_s() {
+    fn layout_matches_vicon_tracker() {
         let rotation = DQuat::from_rotation_z(0.3);
         let pose = Pose::new(DVec3::new(1.0, -2.0, 0.5), rotation);
         let datagram = encode_object(7, "vizflyt", &pose);

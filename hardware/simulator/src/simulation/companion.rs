@@ -1,7 +1,7 @@
-// Why: the messages a real ground station sends are deprecated in the dialect, not on the wire.
+// Why: real ground stations still send messages that are deprecated in the dialect.
 #![allow(deprecated)]
 
-//! A companion computer for tests: the other end of the link, on the virtual clock.
+//! Companion computer for tests: the other end of the link, on the virtual clock.
 
 use std::collections::BTreeMap;
 
@@ -18,14 +18,14 @@ use vizflyt_protocol::messages::YawTarget;
 
 use super::{Simulation, SimulationConfig, TICK_HZ, TICK_S};
 
-/// A companion computer on the virtual clock: feeds vision from the mocap, sends heartbeats, and
-/// remembers the autopilot's messages.
+/// Companion computer on the virtual clock: forwards vision from the mocap, sends heartbeats, and records the
+/// autopilot's messages.
 pub(crate) struct Companion {
     pub(crate) lab: Simulation,
     decoder: StreamDecoder,
     pub(crate) vision: bool,
     pub(crate) heartbeats: bool,
-    /// Sender's clock minus the autopilot's. [us]
+    /// Companion's clock minus the autopilot's [us].
     clock_offset_us: u64,
     pub(crate) texts: Vec<String>,
     pub(crate) acks: Vec<(MavCmd, MavResult)>,
@@ -33,14 +33,14 @@ pub(crate) struct Companion {
     pub(crate) counts: BTreeMap<u32, u32>,
     vision_due_ns: u64,
     heartbeat_due_ns: u64,
-    /// Setpoint resent at 20 Hz.
+    /// Setpoint, resent at 20 Hz.
     pub(crate) setpoint: Option<GuidedSetpoint>,
     setpoint_due_ns: u64,
-    /// Added to the vision's positions, with its counter of jumps. [m, world]
+    /// Offset of the vision's positions [m, world], and the reset counter.
     pub(crate) vision_shift: (DVec3, u8),
-    /// System id that all is sent from.
+    /// System ID of all sent messages.
     pub(crate) system_id: u8,
-    /// Vision poses come this much later than they were valid. [s]
+    /// Latency of vision poses [s].
     pub(crate) vision_latency_s: f64,
     late: std::collections::VecDeque<(u64, MavMessage)>,
 }
@@ -164,7 +164,7 @@ impl Companion {
         }
     }
 
-    /// Runs until `done` or for `seconds`; returns the time it took.
+    /// Runs until `done`, for at most `seconds`. Returns the elapsed time.
     pub(crate) fn until(&mut self, seconds: f64, what: &str, done: impl Fn(&Self) -> bool) -> f64 {
         for tick in 0..(seconds * TICK_HZ as f64) as u64 {
             if done(self) {
@@ -210,7 +210,7 @@ impl Companion {
         self.wait(1.5);
     }
 
-    /// A vehicle hovering at `height_m`.
+    /// Returns a companion with a vehicle that hovers at `height_m`.
     pub(crate) fn hovering(config: SimulationConfig, height_m: f64) -> Self {
         let mut companion = Self::new(config);
         companion.prepare();
@@ -222,7 +222,7 @@ impl Companion {
         companion
     }
 
-    /// When the next heartbeat is due. [s]
+    /// Returns when the next heartbeat is due [s].
     pub(crate) fn heartbeat_due_s(&self) -> f64 {
         self.heartbeat_due_ns as f64 * 1e-9
     }

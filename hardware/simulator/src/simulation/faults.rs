@@ -1,10 +1,9 @@
-//! What breaks in flight, and when: counted from leaving the floor, so that a slow start changes
-//! nothing.
+//! Simulated failures. Times count from take-off, so that a slow start changes nothing.
 
-/// What breaks. Times are from leaving the floor. [s]
+/// Failures, with times from take-off [s].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Faults {
-    /// A motor fails.
+    /// Failure of a motor.
     pub motor: Option<MotorFault>,
     /// The transmitter of the radio control falls silent.
     pub radio_lost_after_s: Option<f64>,
@@ -12,18 +11,18 @@ pub struct Faults {
     pub reboot_after_s: Option<f64>,
 }
 
-/// A motor that fails.
+/// Failure of a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotorFault {
-    /// Which one, from 0 in ArduCopter's order.
+    /// Number of the motor, from 0 in ArduCopter's order.
     pub motor: usize,
-    /// What it gives from then on of what it gave, 0 to 1.
+    /// Remaining share of its thrust, 0 to 1.
     pub share: f64,
-    /// When. [s]
+    /// Time of the failure [s].
     pub after_s: f64,
 }
 
-/// A fault whose time has come.
+/// Failure that is due.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Due {
     /// See [`MotorFault`].
@@ -35,7 +34,7 @@ pub(super) enum Due {
 }
 
 impl Faults {
-    /// Returns a fault that is due, once; 0 is before the flight.
+    /// Returns a due failure, each only once; `since_take_off_s` is 0 before the flight.
     pub(super) fn due(&mut self, since_take_off_s: f64) -> Option<Due> {
         let is_due = |after_s: &mut f64| since_take_off_s > 0.0 && since_take_off_s >= *after_s;
         if let Some(fault) = self.motor.take_if(|fault| is_due(&mut fault.after_s)) {
@@ -53,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_fault_comes_once_and_none_on_the_ground() {
+    fn each_failure_occurs_once_and_only_in_flight() {
         let motor = MotorFault { motor: 2, share: 0.5, after_s: 2.0 };
         let mut faults =
             Faults { motor: Some(motor), radio_lost_after_s: Some(0.0), reboot_after_s: Some(2.0) };

@@ -1,5 +1,5 @@
-//! A person carries the vehicle about in front of the motion capture: lifts it, pushes it forward,
-//! turns it left, raises its nose, then its left side instead, puts it back; over and over.
+//! Motion of a vehicle in a person's hand, in front of the motion capture: lift, push forward, turn left, raise the
+//! nose, raise the left side, put back; repeated.
 
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_6};
 
@@ -8,8 +8,7 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 
 use crate::airframe::GRAVITY_MPS2;
 
-/// What is done one after another: up [m], ahead [m], left [rad], nose up [rad], left side up [rad]; held until the
-/// next.
+/// Poses at the end of each motion: up [m], ahead [m], left [rad], nose up [rad], left side up [rad].
 const HELD: [[f64; 5]; 6] = [
     [0.0; 5],
     [0.5, 0.0, 0.0, 0.0, 0.0],
@@ -18,15 +17,15 @@ const HELD: [[f64; 5]; 6] = [
     [0.5, 0.6, FRAC_PI_2, FRAC_PI_6, 0.0],
     [0.5, 0.6, FRAC_PI_2, 0.0, FRAC_PI_6],
 ];
-/// Each takes so long, the last third of it at rest. [s]
+/// Duration of each motion, the last third at rest [s].
 const EACH_S: f64 = 3.0;
 
-/// Returns where the vehicle is after so many seconds.
+/// Returns the pose of the vehicle after `seconds`.
 pub(super) fn carried(world_from_start: &Pose<World, Body>, seconds: f64) -> Pose<World, Body> {
     let at = seconds / EACH_S;
     let index = at.floor() as usize % HELD.len();
     let (from, to) = (HELD[(index + HELD.len() - 1) % HELD.len()], HELD[index]);
-    // Before anything was done, it stands.
+    // Before the first motion, it stands.
     let from = if at < 1.0 { HELD[0] } else { from };
     let share = (at.fract() * 1.5).min(1.0);
     let smooth = share * share * (3.0 - 2.0 * share);
@@ -41,7 +40,7 @@ pub(super) fn carried(world_from_start: &Pose<World, Body>, seconds: f64) -> Pos
     Pose::new(p, world_from_start.rotation * turned)
 }
 
-/// Returns what the vehicle's IMU feels at that time, over a sample of `dt_s`: specific force [m/s^2, body] and angular
+/// Returns the IMU's measurements at that time over a sample of `dt_s`: specific force [m/s^2, body] and angular
 /// velocity [rad/s, body].
 pub(super) fn felt(
     world_from_start: &Pose<World, Body>,
@@ -53,7 +52,7 @@ pub(super) fn felt(
     let bend_m = before.translation_m + after.translation_m - 2.0 * now.translation_m;
     let felt_world = bend_m / (dt_s * dt_s) + DVec3::Z * GRAVITY_MPS2;
     let turned = (before.rotation.conjugate() * after.rotation).normalize();
-    // The short way round.
+    // Shortest rotation.
     let turned = if turned.w < 0.0 { -turned } else { turned };
     (now.rotation.conjugate() * felt_world, turned.to_scaled_axis() / (2.0 * dt_s))
 }
@@ -63,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_imu_in_the_hand_feels_what_is_done() {
+    fn the_imu_measures_the_motion_of_the_hand() {
         let start = Pose::new(DVec3::new(1.0, 2.0, 0.0), DQuat::from_rotation_z(0.3));
         let (mut turned_rad, mut risen_mps) = (0.0, 0.0);
         for step in 0..6000u32 {
@@ -73,14 +72,14 @@ mod tests {
             risen_mps += (felt.z - GRAVITY_MPS2) * 2.5e-3 * f64::from(u8::from(seconds < 4.0));
         }
         assert!((turned_rad - FRAC_PI_2).abs() < 1e-3, "{turned_rad}");
-        // Half-way up, at its fastest.
+        // Half-way up, at maximum speed.
         assert!((risen_mps - 0.375).abs() < 1e-2, "{risen_mps}");
         let (still, _) = felt(&start, 2.9, 2.5e-3);
         assert!((still - DVec3::Z * GRAVITY_MPS2).length() < 1e-6);
     }
 
     #[test]
-    fn each_is_held_at_its_end() {
+    fn each_motion_ends_at_rest_without_jumps() {
         let start = Pose::new(DVec3::new(1.0, 2.0, 0.0), DQuat::from_rotation_z(0.3));
         let at = |seconds| carried(&start, seconds);
         assert_eq!(at(2.9), start);
@@ -92,7 +91,7 @@ mod tests {
         assert!((at(14.9).rotate(DVec3::X).z - 0.5).abs() < 1e-9);
         assert!((at(17.9).rotate(DVec3::Y).z - 0.5).abs() < 1e-9);
         assert!((at(20.9).translation_m - start.translation_m).length() < 1e-9);
-        // Nothing jumps.
+        // No jumps.
         for step in 0..20_000u32 {
             let (a, b) = (at(f64::from(step) * 1e-3), at(f64::from(step + 1) * 1e-3));
             assert!((a.translation_m - b.translation_m).length() < 1e-3, "at {step} ms");

@@ -11,7 +11,7 @@ use vizflyt_protocol::mavlink::{CopterMode, GuidedMotion, MavHeader, encode};
 use vizflyt_protocol::messages::YawTarget;
 
 #[test]
-fn takes_off_hovers_and_lands_by_itself() {
+fn takes_off_hovers_and_lands() {
     let spawn_m = DVec3::new(2.0, -1.0, 0.0);
     let config = SimulationConfig { spawn_m, spawn_yaw_rad: 0.5, seed: 3, ..Default::default() };
     let mut c = Companion::hovering(config, 1.2);
@@ -37,7 +37,8 @@ fn takes_off_hovers_and_lands_by_itself() {
     assert!(c.p().z.abs() < 0.01 && c.v().length() < 0.01);
 }
 
-/// Returns when a companion that repeats what it wants ten times a second has it armed, and in the air. [s]
+/// Returns when the vehicle is armed, and when it is in the air [s], with a companion that repeats its commands ten
+/// times a second.
 fn started(startup: Startup) -> (f64, f64) {
     let config = SimulationConfig { startup, ..SimulationConfig::airframe() };
     let mut c = Companion::new(config);
@@ -58,11 +59,11 @@ fn started(startup: Startup) -> (f64, f64) {
             return (armed_s.unwrap_or(f64::NAN), now_s);
         }
     }
-    panic!("it does not rise: {:?}", c.texts);
+    panic!("no take-off: {:?}", c.texts);
 }
 
 #[test]
-fn a_quick_start_is_in_the_air_seconds_before_a_realistic_one() {
+fn a_quick_start_saves_seconds() {
     let (quick_armed_s, quick_risen_s) = started(Startup::Quick);
     let (armed_s, risen_s) = started(Startup::Realistic);
     println!(
@@ -70,14 +71,14 @@ fn a_quick_start_is_in_the_air_seconds_before_a_realistic_one() {
     );
     assert!(quick_armed_s <= 0.5, "armed after {quick_armed_s} s");
     assert!((3.0..3.5).contains(&armed_s), "a realistic start takes {armed_s} s");
-    // The climb is the same physics.
+    // The climb has the same physics.
     let climbs_s = (quick_risen_s - quick_armed_s, risen_s - armed_s);
     assert!((climbs_s.0 - climbs_s.1).abs() < 0.15, "{climbs_s:?}");
     assert!(quick_risen_s < 3.5, "in the air after {quick_risen_s} s");
 }
 
 #[test]
-fn a_quick_start_flies_as_well_as_a_realistic_one() {
+fn the_estimate_is_accurate_after_a_quick_start() {
     for seed in 0..4 {
         let startup = Startup::Quick;
         let mut c = Companion::new(SimulationConfig { seed, startup, ..Default::default() });
@@ -95,7 +96,7 @@ fn a_quick_start_flies_as_well_as_a_realistic_one() {
             worst_m = worst_m.max((p_world_m - c.p()).truncate().length());
         }
         assert!(worst_m < 0.1, "seed {seed}: the estimate is {worst_m:.3} m off");
-        // A power failure takes the alignment away.
+        // A power failure requires a new alignment.
         c.lab.reboot();
         c.wait(BOOT_S + 0.1);
         assert!(!attitude(&c), "it aligns again");
@@ -103,7 +104,7 @@ fn a_quick_start_flies_as_well_as_a_realistic_one() {
 }
 
 #[test]
-fn a_quick_start_reports_at_once_what_a_companion_waits_for() {
+fn a_quick_start_reports_readiness_at_once() {
     let position_reported_s = |startup| {
         let mut c = Companion::new(SimulationConfig { startup, ..Default::default() });
         c.wait(2.6);
@@ -146,7 +147,7 @@ fn velocity_steps_are_followed_with_little_overshoot() {
         assert!((c.v() - v).length() < 0.15, "{:?}", c.v());
         assert!(reached.unwrap() < 0.9 + speed / 6.0);
         assert!((c.p().z - 1.5).abs() < 0.15 && lowest > 1.2);
-        // And back: full reverse.
+        // Then full reverse.
         c.fly(GuidedMotion::Velocity(-v), YawTarget::Angle(yaw));
         let mut trough = 0f64;
         for _ in 0..2000 {
@@ -158,7 +159,7 @@ fn velocity_steps_are_followed_with_little_overshoot() {
 }
 
 #[test]
-fn position_steps_arrive_and_stay() {
+fn position_steps_are_reached_and_held() {
     let config = SimulationConfig {
         params: vec![("WP_SPD".into(), 3.0), ("WP_SPD_UP".into(), 1.5)],
         ..Default::default()
@@ -185,10 +186,10 @@ fn position_steps_arrive_and_stay() {
 }
 
 #[test]
-fn a_moving_point_is_followed() {
+fn follows_a_moving_point() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     let (start, v) = (c.p(), DVec3::new(0.0, 1.5, 0.0));
-    // Resent at 10 Hz, as a trajectory follower does.
+    // Resent at 10 Hz, like a trajectory follower.
     for i in 0..60 {
         let p = start + v * (f64::from(i) * 0.1);
         c.set_once(GuidedMotion::PositionVelocity(p, v), YawTarget::Angle(0.0));
@@ -213,9 +214,9 @@ fn accelerations_are_flown_and_zero_keeps_the_velocity() {
     assert!((c.v().x - kept).abs() < 0.35 && (c.p().z - 1.5).abs() < 0.3, "{:?}", c.v());
 }
 
-/// Zig-zag at 5 m/s with the hardest turns: the estimate must stay on the truth.
+/// Zigzag at 5 m/s with the hardest turns: the estimate must follow the truth.
 #[test]
-fn the_estimate_holds_in_aggressive_flight() {
+fn the_estimate_is_accurate_in_aggressive_flight() {
     let check = |latency_s: f64, set_ms: f32, most_m: f64| {
         let params = vec![("VISO_DELAY_MS".into(), set_ms)];
         let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.5);
@@ -238,21 +239,21 @@ fn the_estimate_holds_in_aggressive_flight() {
         assert!(median < most_m, "{median}");
         assert!(worst < 8.0 * most_m, "{worst}");
     };
-    // The companion here sends at once: nothing to compensate.
+    // This companion sends without delay: nothing to compensate.
     check(0.0, 0.0, 0.03);
-    // The parameter's default of 10 ms is then 5 cm too much at 5 m/s.
+    // The parameter's default of 10 ms then causes 5 cm of error at 5 m/s.
     check(0.0, 10.0, 0.08);
     check(0.06, 60.0, 0.06);
 }
 
 #[test]
-fn a_velocity_setpoint_dies_after_three_seconds_and_a_position_is_held() {
+fn a_velocity_setpoint_expires_after_three_seconds_but_a_position_is_held() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     let start = c.p();
     c.set_once(GuidedMotion::Velocity(DVec3::new(0.5, 0.0, 0.0)), YawTarget::Angle(0.0));
     c.wait(2.9);
     assert!((c.v().x - 0.5).abs() < 0.1);
-    // A real ArduCopter stood after 3.7 s and 1.4 m.
+    // A real ArduCopter stopped after 3.7 s and 1.4 m.
     c.wait(1.3);
     let stopped = c.p();
     assert!(c.v().length() < 0.1, "{:?}", c.v());
@@ -265,7 +266,7 @@ fn a_velocity_setpoint_dies_after_three_seconds_and_a_position_is_held() {
 }
 
 #[test]
-fn an_ignored_yaw_turns_the_nose_into_travel() {
+fn ignored_yaw_turns_the_nose_into_travel() {
     let turned_by = |behavior: f32, yaw: YawTarget| {
         let params = vec![("WP_YAW_BEHAVIOR".into(), behavior)];
         let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.2);
@@ -282,7 +283,7 @@ fn an_ignored_yaw_turns_the_nose_into_travel() {
 }
 
 #[test]
-fn wind_moves_nothing_for_long() {
+fn compensates_steady_wind() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     let start = c.p();
     c.lab.set_wind(DVec3::new(2.0, -1.0, 0.0));
@@ -310,8 +311,8 @@ fn the_same_seed_sends_the_same_bytes() {
     assert_ne!(run(4), run(5));
 }
 
-/// The shock clips the accelerometer; the estimate must not use what is left of it. (It once
-/// did, and climbed away while it thought to sink.)
+/// The impact clips the accelerometer, and the estimate must not integrate the clipped values; otherwise it estimates a
+/// descent and climbs away.
 #[test]
 fn a_crash_landing_does_not_end_in_a_fly_away() {
     let mut c = Companion::hovering(SimulationConfig::airframe(), 4.0);
@@ -331,7 +332,7 @@ fn a_crash_landing_does_not_end_in_a_fly_away() {
     assert!((estimate.p_world_m - c.p()).length() < 0.1);
 }
 
-/// One thing somebody could do to a flying vehicle.
+/// One operation on a flying vehicle.
 #[derive(Clone, Debug)]
 enum Operation {
     Setpoint(u16, [f32; 11]),
@@ -378,10 +379,10 @@ fn operation() -> impl Strategy<Value = Operation> {
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 128, failure_persistence: None, ..Default::default() })]
-    /// `Companion::tick` asserts after every tick that the state is finite and the attitude unit;
-    /// here also the estimate, and that bytes sent are always whole packets.
+    /// `Companion::tick` asserts after every tick that the state is finite and the attitude is normalized; here the
+    /// estimate is also checked.
     #[test]
-    fn nothing_that_is_sent_makes_the_flight_anything_but_finite(
+    fn the_flight_stays_finite_for_any_input(
         operations in prop::collection::vec(operation(), 1..40), seed in 0..1000u64,
     ) {
         let mut c = Companion::hovering(SimulationConfig { seed, ..Default::default() }, 1.0);
@@ -406,7 +407,7 @@ proptest! {
                 Operation::TakeOff(height) => { c.take_off(height); }
                 Operation::Garbage(bytes) => {
                     c.lab.handle_mavlink(0, &bytes);
-                    // Ends whatever packet the garbage pretended to begin.
+                    // Ends a packet that the garbage may have begun.
                     c.lab.handle_mavlink(0, &[0; 600]);
                 }
                 Operation::Wait(seconds) => c.wait(seconds),
@@ -418,10 +419,10 @@ proptest! {
             prop_assert!(estimate.world_from_body.is_normalized());
             prop_assert!(c.v().length() < 80.0, "{:?}", c.v());
         }
-        // And it can still be brought down, unless it was lost far away or high up.
+        // It can still land, unless it is far away or high up.
         c.lab.set_wind(DVec3::ZERO);
         c.vision = true;
-        // What garbage left waiting in the decoder is flushed by a few good packets.
+        // A few good packets flush garbage from the decoder.
         c.wait(2.0);
         if c.lab.autopilot().is_armed() && c.p().z < 20.0 && c.v().length() < 3.0 {
             c.set_mode(CopterMode::Land);
@@ -430,11 +431,11 @@ proptest! {
     }
 
     #[test]
-    fn packets_survive_garbage_around_them(garbage in prop::collection::vec(any::<u8>(), 0..600)) {
+    fn accepts_packets_after_garbage(garbage in prop::collection::vec(any::<u8>(), 0..600)) {
         let mut lab = Simulation::new(SimulationConfig::default()).unwrap();
         lab.tick();
         lab.handle_mavlink(0, &garbage);
-        // Flushes whatever the garbage pretended to be the start of.
+        // Ends a packet that the garbage may have begun.
         lab.handle_mavlink(0, &[0; 600]);
         while lab.poll_mavlink(&mut [0; MAX_PACKET]).is_some() {}
         let request = MavMessage::PARAM_REQUEST_LIST(

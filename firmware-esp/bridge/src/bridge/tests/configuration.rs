@@ -1,4 +1,4 @@
-//! Who may change a bridge.
+//! Authorization of configuration changes.
 
 use sha2::{Digest, Sha256};
 
@@ -9,7 +9,7 @@ use crate::stats::REPORT;
 
 pub(super) const KEY: Key = [0x42; 32];
 
-/// Asks the bridge; returns status and body of the answer.
+/// Sends a request to the bridge. Returns status and body of the answer.
 pub(super) fn ask(bridge: &mut Bridge, now: u64, request: &[u8]) -> (Status, Vec<u8>) {
     let [low, high] = TUNNEL_TYPE.to_le_bytes();
     let mut payload = vec![low, high, 1, COMPONENT_ID, request.len() as u8];
@@ -51,7 +51,7 @@ pub(super) fn request(op: Op, counter: u32, body: &[u8], key: Option<&Key>) -> V
 }
 
 #[test]
-fn a_bridge_is_claimed_once_and_then_obeys_its_key_alone() {
+fn accepts_changes_only_with_the_key_after_claiming() {
     let mut bridge = bridge(quiet());
     let mut check = |op, counter, body: &[u8], key: Option<&Key>, expected| {
         let now = 10 + 100 * u64::from(counter);
@@ -66,7 +66,7 @@ fn a_bridge_is_claimed_once_and_then_obeys_its_key_alone() {
     check(Op::Set, 4, b"LOSS_MS=700", Some(&[1; 32]), Status::WrongKey);
     check(Op::Set, 4, b"LOSS_MS=700", None, Status::WrongKey);
     assert_eq!(check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Status::Done).0, 700);
-    // The same once more, as somebody might have recorded it.
+    // A replay of the same request.
     check(Op::Set, 4, b"LOSS_MS=700", Some(&KEY), Status::WrongKey);
     check(Op::Set, 5, b"LOSS_MS=1", Some(&KEY), Status::OutOfRange);
     check(Op::Set, 6, b"LOSS_MS", Some(&KEY), Status::Malformed);
@@ -78,7 +78,7 @@ fn a_bridge_is_claimed_once_and_then_obeys_its_key_alone() {
 }
 
 #[test]
-fn reading_is_open_and_tells_no_secret() {
+fn reading_is_open_but_reveals_no_secret() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     let (status, hello) = ask(&mut bridge, 10, &request(Op::Hello, 0, b"", None));
     assert_eq!((status, &hello[..16], hello[20]), (Status::Done, &access::nonce(&[7; 16])[..], 1));
@@ -95,7 +95,7 @@ fn reading_is_open_and_tells_no_secret() {
 }
 
 #[test]
-fn nothing_changes_while_armed() {
+fn refuses_changes_while_armed() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     bridge.handle_uart(at(0), &bytes(0, AUTOPILOT, &heartbeat(true, 5)));
     let change = request(Op::Set, 1, b"LOSS_MS=0", Some(&KEY));
@@ -124,7 +124,7 @@ pub(super) fn sign(packet: &[u8], key: &Key, stamp: u64) -> Vec<u8> {
 }
 
 #[test]
-fn parameters_are_listed_and_set_by_who_signs_with_the_key() {
+fn sets_parameters_only_with_a_signature_by_the_key() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     let set = |value: f32| {
         MavMessage::PARAM_SET(PARAM_SET_DATA {
@@ -165,14 +165,14 @@ fn parameters_are_listed_and_set_by_who_signs_with_the_key() {
             _ => None,
         })
         .collect();
-    // Ours, and those by which a ground station knows a bridge.
+    // The bridge's own parameters, and those that QGroundControl expects of a bridge.
     assert_eq!(names, (0..crate::settings::NUMBERS.len() as u16 + 23).collect::<Vec<_>>());
-    // The autopilot is asked as well: the request was for everybody.
+    // The autopilot also receives the request, because it was a broadcast.
     assert_eq!(foreign(uart(&mut bridge, at(5010))).len(), 1);
 }
 
 #[test]
-fn commands_to_the_bridge_are_answered() {
+fn answers_commands_to_the_bridge() {
     let mut bridge = bridge(Settings { key: Some(KEY), ..quiet() });
     let command = |command, param1| {
         MavMessage::COMMAND_LONG(COMMAND_LONG_DATA {

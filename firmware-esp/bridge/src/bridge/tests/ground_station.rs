@@ -1,5 +1,5 @@
-//! What QGroundControl's page of a Wi-Fi bridge reads and writes: names, types and bytes as its
-//! ESP8266ComponentController has them. And bytes of any kind through a transparent bridge.
+//! QGroundControl's page for Wi-Fi bridges: names, types and bytes as in its ESP8266ComponentController. Also the
+//! transparent mode.
 
 use std::collections::BTreeMap;
 use std::string::{String, ToString};
@@ -16,7 +16,7 @@ fn chars(part: &[u8]) -> u32 {
     u32::from_le_bytes(bytes)
 }
 
-/// A station that has the key and its page open.
+/// QGroundControl with the key, and with the bridge's page open.
 struct Station {
     bridge: Bridge,
     now: u64,
@@ -56,7 +56,7 @@ impl Station {
         self.send(&packet);
     }
 
-    /// Writes a text as the page does: only parts that differ from what it has read.
+    /// Writes a text as the page does: only the parts that differ from those it has read.
     fn set_text(&mut self, prefix: &str, text: &str) {
         let mut whole = [0; 16];
         whole[..text.len()].copy_from_slice(text.as_bytes());
@@ -70,7 +70,7 @@ impl Station {
 }
 
 #[test]
-fn its_page_finds_every_name_and_a_version() {
+fn qgroundcontrol_finds_all_parameters_and_the_version() {
     let mut station = Station::new();
     station.bridge.set_address(Some(Ipv4Addr::new(192, 168, 4, 1)));
     let list = MavMessage::default_message_from_id(21).unwrap();
@@ -91,12 +91,12 @@ fn its_page_finds_every_name_and_a_version() {
     assert_eq!(station.values["WIFI_UDP_CPORT"].0, 14550);
     assert_eq!(station.values["WIFI_SSID1"].0, chars(b"vizf"));
     assert_eq!(station.values["WIFI_IPADDRESS"].0.to_le_bytes(), [192, 168, 4, 1]);
-    // Its channels are a number of ours, of the same name.
+    // The channel is one of the bridge's own parameters with the same name.
     assert_eq!(station.values["WIFI_CHANNEL"].0, 6f32.to_bits());
 }
 
 #[test]
-fn what_it_writes_is_set_and_kept_and_passwords_are_never_told() {
+fn stores_texts_written_by_qgroundcontrol_and_hides_passwords() {
     let mut station = Station::new();
     let list = MavMessage::default_message_from_id(21).unwrap();
     station.send(&bytes(0, RUNTIME, &list));
@@ -110,13 +110,13 @@ fn what_it_writes_is_set_and_kept_and_passwords_are_never_told() {
     assert_eq!((settings.baud, settings.wifi_role), (115_200, crate::settings::WifiRole::Station));
     assert_eq!((&*settings.ap_ssid, &*settings.ap_password), ("drone-3", "correct horse"));
     assert_eq!((&*settings.ssid, &*settings.password), ("lab", "12345678"));
-    // A shorter text in place of a longer one, part by part.
+    // Replace a text by a shorter one, part by part.
     station.set_text("WIFI_SSID", "d4");
     assert_eq!(&*station.bridge.settings().ap_ssid, "d4");
     station.bridge.handle_timeout(at(station.now + 1100));
     assert_eq!(station.bridge.poll_event(), Some(Event::Save));
-    assert_eq!(station.bridge.poll_event(), None, "once for all of them");
-    // What it cannot change stays.
+    assert_eq!(station.bridge.poll_event(), None, "one save for all changes");
+    // Read-only and out-of-range values stay.
     station.set("SW_VER", 9);
     station.set("UART_BAUDRATE", 1);
     assert_eq!(station.bridge.settings().baud, 115_200);
@@ -129,7 +129,7 @@ fn what_it_writes_is_set_and_kept_and_passwords_are_never_told() {
 }
 
 #[test]
-fn a_bridge_without_a_password_makes_one_and_tells_the_wire_alone() {
+fn announces_a_generated_password_only_to_the_wire() {
     let mut bridge = bridge(quiet());
     bridge.handle_uart(at(0), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_datagram(at(0), address(2), &bytes(0, RUNTIME, &setpoint(0.0)));
@@ -152,9 +152,9 @@ fn a_bridge_without_a_password_makes_one_and_tells_the_wire_alone() {
     assert_eq!(texts(wire), [std::format!("bridge: its network's key: {password}")]);
     let air = datagrams(&mut bridge, at(1010)).iter().flat_map(|(_, b)| decode(b)).collect();
     assert_eq!(texts(air), Vec::<String>::new());
-    // What it tells everybody of its start says nothing of it.
+    // The public nonce does not reveal the password.
     assert_ne!(access::nonce(&[7; 16]), access::key_bytes(&[7; 16]));
-    // Another start keeps it; an open network is one that was asked for.
+    // Another start keeps the password; an open network stays without one.
     bridge.ensure_password(at(2));
     assert_eq!(bridge.settings().ap_password, password.as_str());
     let mut open = super::bridge(Settings { wifi_open: true, ..quiet() });
@@ -163,9 +163,9 @@ fn a_bridge_without_a_password_makes_one_and_tells_the_wire_alone() {
 }
 
 proptest! {
-    /// A transparent bridge carries any bytes both ways, in order, and says nothing itself.
+    /// A transparent bridge forwards any bytes in both directions, in order, and adds none.
     #[test]
-    fn a_transparent_bridge_adds_and_takes_nothing(
+    fn transparent_mode_forwards_all_bytes_unchanged(
         parts in prop::collection::vec((any::<bool>(), prop::collection::vec(any::<u8>(), 1..300)), 1..20),
     ) {
         let mut bridge = bridge(Settings { transparent: true, ..Settings::default() });
@@ -194,7 +194,7 @@ proptest! {
 }
 
 #[test]
-fn a_transparent_bridge_still_obeys_its_key_and_lands_nothing() {
+fn transparent_mode_is_configurable_and_sends_no_land() {
     let mut bridge = bridge(Settings { transparent: true, key: Some(KEY), ..quiet() });
     for ms in (0..5000).step_by(20) {
         if ms % 1000 == 0 {
@@ -212,6 +212,6 @@ fn a_transparent_bridge_still_obeys_its_key_and_lands_nothing() {
     assert_eq!((status, hello[20]), (Status::Done, 0b101), "claimed, transparent");
     let change = request(Op::Set, 1, b"TRANSPARENT=0", Some(&KEY));
     assert_eq!(ask(&mut bridge, 5200, &change).0, Status::Done);
-    assert!(bridge.is_transparent() && !bridge.settings().transparent, "from the next start on");
-    assert_eq!(uart(&mut bridge, at(5300)), Vec::<Vec<u8>>::new(), "a request is not passed on");
+    assert!(bridge.is_transparent() && !bridge.settings().transparent, "takes effect at the next start");
+    assert_eq!(uart(&mut bridge, at(5300)), Vec::<Vec<u8>>::new(), "requests are not forwarded");
 }

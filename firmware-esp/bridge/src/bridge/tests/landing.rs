@@ -1,4 +1,4 @@
-//! What happens when the companion falls silent: asked, said, signed, and not before it is so.
+//! Landing when the companion is silent: conditions, announcements and signatures.
 
 use vizflyt_protocol::mavlink::dialect::{MavState, MavType};
 use vizflyt_protocol::mavlink::{Signer, SigningKey, SigningTime, Verifier};
@@ -8,10 +8,10 @@ use crate::settings::key_to_hex;
 
 const KEY: [u8; 32] = [0x17; 32];
 const LAND_MODE: u32 = 9;
-/// Some time in 2026. [10 us since 2015]
+/// A time in 2026 [10 us since 2015].
 const STAMP: u64 = 37_000_000_000_000;
 
-/// A vehicle in GUIDED and its companion, which falls silent after a second.
+/// A vehicle in GUIDED; its companion falls silent after a second.
 struct Loss {
     bridge: Bridge,
     now: u64,
@@ -19,9 +19,9 @@ struct Loss {
     mode: u32,
     armed: bool,
     signer: Option<Signer>,
-    /// What was sent to the autopilot: when, and the packet's bytes.
+    /// Packets sent to the autopilot, with their times [ms].
     sent: Vec<(u64, Vec<u8>)>,
-    /// Packets of ours that came to a station.
+    /// Packets of the bridge that a ground station received.
     heard: Vec<Vec<u8>>,
     texts: Vec<std::string::String>,
 }
@@ -107,7 +107,7 @@ impl Loss {
         self.bridge.handle_uart(at(self.now), &packet);
     }
 
-    /// Returns when heartbeats went to the autopilot, by our own component.
+    /// Returns when heartbeats of `system` were sent to the autopilot by the bridge [ms].
     fn beats(&self, system: u8) -> Vec<u64> {
         let ours = |packet: &&(u64, Vec<u8>)| {
             packet.1[7..10] == [0, 0, 0] && (packet.1[5], packet.1[6]) == (system, COMPONENT_ID)
@@ -121,7 +121,7 @@ impl Loss {
 }
 
 #[test]
-fn landing_is_said_when_the_autopilot_says_so() {
+fn announces_landing_only_after_the_autopilot_confirms() {
     let mut loss = Loss::new(quiet(), false);
     loss.run(2300);
     assert!(loss.says("bridge: the companion is silent: asks for LAND"), "{:?}", loss.texts);
@@ -129,7 +129,7 @@ fn landing_is_said_when_the_autopilot_says_so() {
     loss.acknowledge();
     loss.run(2400);
     assert!(loss.says("bridge: landing") && loss.bridge.is_landing(), "{:?}", loss.texts);
-    // A heartbeat says it as well.
+    // A heartbeat with the LAND mode also confirms.
     let mut loss = Loss::new(quiet(), false);
     loss.run(2300);
     loss.mode = LAND_MODE;
@@ -139,7 +139,7 @@ fn landing_is_said_when_the_autopilot_says_so() {
 }
 
 #[test]
-fn what_nobody_acknowledges_is_called_that() {
+fn reports_an_unacknowledged_land() {
     let mut loss = Loss::new(quiet(), false);
     loss.run(6000);
     assert!(loss.says("bridge: LAND is not acknowledged"), "{:?}", loss.texts);
@@ -152,7 +152,7 @@ fn what_nobody_acknowledges_is_called_that() {
 }
 
 #[test]
-fn a_vehicle_that_signs_is_not_landed_without_its_key_and_that_is_said() {
+fn reports_a_missing_vehicle_key() {
     let mut loss = Loss::new(quiet(), true);
     loss.run(6000);
     assert!(loss.says("bridge: LAND not acknowledged: vehicle.key missing"), "{:?}", loss.texts);
@@ -160,13 +160,13 @@ fn a_vehicle_that_signs_is_not_landed_without_its_key_and_that_is_said() {
 }
 
 #[test]
-fn with_the_vehicles_key_all_that_is_ours_is_signed() {
+fn signs_all_own_packets_with_the_vehicle_key() {
     let mut settings = quiet();
     settings.set("vehicle.key", &key_to_hex(&KEY)).unwrap();
     let mut loss = Loss::new(settings, true);
     loss.run(2300);
     let mut verifier = Verifier::new(SigningKey::new(KEY));
-    // What the autopilot knows of the time: a minute is what it lets pass.
+    // The autopilot's clock; signatures may be at most a minute old.
     let now = SigningTime::from_units(STAMP + 1000);
     let (mut ours, mut lands) = (0, 0);
     for (ms, packet) in &loss.sent {
@@ -179,7 +179,7 @@ fn with_the_vehicles_key_all_that_is_ours_is_signed() {
     assert!(ours > lands && lands == 1, "{ours} {lands}");
     let mut verifier = Verifier::new(SigningKey::new(KEY));
     for packet in &loss.heard {
-        assert_eq!(verifier.check(now, packet), Ok(()), "a station that signs hears it");
+        assert_eq!(verifier.check(now, packet), Ok(()), "accepted by a station with the key");
     }
     assert!(loss.heard.len() > 2);
     loss.acknowledge();
@@ -188,7 +188,7 @@ fn with_the_vehicles_key_all_that_is_ours_is_signed() {
 }
 
 #[test]
-fn a_key_alone_signs_nothing_where_nobody_signs() {
+fn sends_unsigned_packets_if_the_autopilot_does_not_sign() {
     let mut settings = quiet();
     settings.set("vehicle.key", &key_to_hex(&KEY)).unwrap();
     let mut loss = Loss::new(settings, false);
@@ -197,33 +197,33 @@ fn a_key_alone_signs_nothing_where_nobody_signs() {
 }
 
 #[test]
-fn while_it_lands_the_companions_heartbeat_goes_on() {
+fn repeats_the_companions_heartbeat_while_landing() {
     let mut loss = Loss::new(quiet(), false);
     loss.run(2200);
     loss.acknowledge();
-    // Acknowledged, and not in the mode yet: the autopilot's own failsafe must not be put to sleep.
+    // Acknowledged, but not yet in LAND mode: heartbeats would suppress the autopilot's own failsafe.
     loss.run(2990);
     assert_eq!(loss.beats(255), Vec::<u64>::new());
     loss.mode = LAND_MODE;
     loss.run(8000);
     let beats = loss.beats(255);
     assert!(beats.len() >= 9 && beats.windows(2).all(|w| w[1] - w[0] == 500), "{beats:?}");
-    // It is the companion's own, but for who sends it.
+    // Same content as the companion's own heartbeat.
     let (_, beat) =
         loss.sent.iter().find(|(ms, packet)| *ms == beats[0] && packet[5] == 255).unwrap();
     let MavMessage::HEARTBEAT(heartbeat) = &decode(beat)[0].message else { panic!() };
     assert_eq!(heartbeat.mavtype, MavType::MAV_TYPE_ONBOARD_CONTROLLER);
-    // No more LAND once it lands, and nothing more once it stands.
+    // No LAND while it lands, and no heartbeats after it has landed.
     let lands = loss.sent.iter().filter(|(ms, packet)| *ms > 3100 && packet[7] == 76).count();
     assert_eq!(lands, 0);
     loss.armed = false;
     loss.run(12_000);
-    assert_eq!(loss.beats(255).len(), beats.len(), "the heartbeat at 8 s says that it stands");
+    assert_eq!(loss.beats(255).len(), beats.len(), "the heartbeat at 8 s reports disarmed");
     assert!(!loss.bridge.is_landing());
 }
 
 #[test]
-fn it_beats_for_nobody_who_is_back_and_for_no_pilot() {
+fn stops_heartbeats_when_companion_or_pilot_takes_over() {
     let mut loss = Loss::new(quiet(), false);
     loss.run(2200);
     loss.mode = LAND_MODE;
@@ -232,10 +232,10 @@ fn it_beats_for_nobody_who_is_back_and_for_no_pilot() {
     assert!(before > 0);
     loss.companion_until = u64::MAX;
     loss.run(9000);
-    assert_eq!(loss.beats(255).len(), before, "the companion beats itself");
+    assert_eq!(loss.beats(255).len(), before, "the companion sends its own");
     loss.companion_until = 0;
     loss.run(12_000);
-    assert!(loss.beats(255).len() > before, "it is gone again");
+    assert!(loss.beats(255).len() > before, "silent again");
     loss.mode = 5;
     loss.run(13_100);
     let before = loss.beats(255).len();
@@ -245,7 +245,7 @@ fn it_beats_for_nobody_who_is_back_and_for_no_pilot() {
 }
 
 #[test]
-fn it_beats_no_longer_than_any_landing_takes() {
+fn stops_heartbeats_after_the_maximum_landing_time() {
     let mut loss = Loss::new(quiet(), false);
     loss.run(2200);
     loss.mode = LAND_MODE;

@@ -1,4 +1,4 @@
-//! What stations see of each other's company: no gap in the autopilot's numbers, no throttling.
+//! Independence of clients: no gaps in the autopilot's sequence numbers, no throttling by slow clients.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use super::*;
 
 const STATION: (u8, u8) = (254, 190);
 
-/// Counts what is missing in the autopilot's numbers, as a ground station does: pymavlink's `mav_loss`.
+/// Counts gaps in the autopilot's sequence numbers, as a ground station does: pymavlink's `mav_loss`.
 #[derive(Default)]
 struct StationLoss {
     next: Option<u8>,
@@ -37,7 +37,7 @@ fn ack(target: (u8, u8)) -> MavMessage {
 }
 
 #[test]
-fn no_station_counts_a_gap_whoever_is_answered() {
+fn clients_see_no_gaps_when_others_get_replies() {
     let mut bridge = bridge(quiet());
     let mut seen: BTreeMap<u8, StationLoss> = BTreeMap::new();
     let mut sequence = 0u8;
@@ -84,8 +84,8 @@ fn no_station_counts_a_gap_whoever_is_answered() {
     }
 }
 
-/// A bridge with a companion on UDP and a TCP client that never takes anything; returns each second's
-/// room as the autopilot was told, and the number of clients at its end.
+/// Runs a companion on UDP and a TCP client that never reads. Returns the `txbuf` values sent to the autopilot, the
+/// number of packets that the companion received, and the number of clients at the end.
 fn beside_a_client_that_does_not_read(seconds: u64) -> (Vec<u8>, usize, usize) {
     let mut bridge = bridge(Settings { beacon: false, ..Settings::default() });
     bridge.open_stream(at(0), 0);
@@ -110,23 +110,23 @@ fn beside_a_client_that_does_not_read(seconds: u64) -> (Vec<u8>, usize, usize) {
 }
 
 #[test]
-fn one_client_that_does_not_read_throttles_nobody() {
+fn a_stalled_client_does_not_throttle_others() {
     let (rooms, got, _) = beside_a_client_that_does_not_read(4);
     assert!(rooms.len() >= 3 && rooms.iter().all(|&room| room > 90), "{rooms:?}");
     assert!(got > 3900, "{got}");
 }
 
 #[test]
-fn a_client_that_takes_nothing_for_too_long_is_dropped() {
-    assert_eq!(beside_a_client_that_does_not_read(4).2, 2, "a pause is none");
+fn disconnects_a_stalled_client() {
+    assert_eq!(beside_a_client_that_does_not_read(4).2, 2, "a pause is tolerated");
     assert_eq!(beside_a_client_that_does_not_read(8).2, 1);
 }
 
 proptest! {
-    /// A line that pauses within packets: the checksum decides, not the clock. Of garbage that begins like a message which our
-    /// dialect does not know, one in 256 is passed on as such, with what it swallowed of the packets behind it.
+    /// Pauses inside packets lose nothing, because checksums decide, not timeouts. One in 256 pieces of garbage that
+    /// look like an unknown message is forwarded, together with the packets that it swallowed.
     #[test]
-    fn a_pause_inside_a_packet_costs_nothing(
+    fn a_pause_inside_a_packet_loses_nothing(
         pauses in prop::collection::vec((0..200u64, 1..40usize), 10),
         garbage in prop::collection::vec(any::<u8>(), 0..30),
     ) {
@@ -159,7 +159,7 @@ proptest! {
             now += 5;
             take(&mut bridge, now);
         }
-        // Whatever the garbage promised to be, it cannot be longer than a packet.
+        // Garbage cannot claim more bytes than a packet has.
         bridge.handle_uart(at(now), &[0; 300]);
         take(&mut bridge, now + 100);
         let swallowed = 10 - arrived.len() as u8;
@@ -169,8 +169,8 @@ proptest! {
 }
 
 #[test]
-fn why_the_chip_has_started_waits_for_somebody_who_hears_it() {
-    // The settings name one; it is not there.
+fn announces_the_restart_cause_to_the_first_active_client() {
+    // The fixed client of the settings is absent.
     let mut bridge = bridge(Settings { client: Some(address(9)), ..Settings::default() });
     bridge.set_restart_cause(crate::stats::RestartCause::Watchdog);
     let told = |bridge: &mut Bridge, now: HostTime| {
@@ -183,7 +183,7 @@ fn why_the_chip_has_started_waits_for_somebody_who_hears_it() {
         assert_eq!(told(&mut bridge, at(1000 * second)), 0);
     }
     bridge.handle_datagram(at(3500), address(2), &bytes(0, RUNTIME, &heartbeat(false, 0)));
-    // To the one who spoke, and to the other.
+    // To the active client and to the fixed one.
     assert_eq!(told(&mut bridge, at(4100)), 2);
     assert_eq!(told(&mut bridge, at(5200)), 0);
 }

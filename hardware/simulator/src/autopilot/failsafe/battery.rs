@@ -1,6 +1,6 @@
-//! The power module's readings, and what a low battery does (BATT_*).
+//! Readings of the power module, and the failsafe for a low battery (BATT_*).
 //!
-//! ArduCopter counts charge from boot: a half-empty pack reads 100 %. Only the voltage is reliable.
+//! ArduCopter counts charge from boot, so a half-empty battery is reported as 100 %. Only the voltage is reliable.
 
 use vizflyt_protocol::time::AutopilotTime;
 
@@ -8,16 +8,16 @@ use super::super::dialect::MavSeverity;
 use super::super::{Autopilot, Param};
 use super::Action;
 
-/// How low, and since when the voltage has been so.
+/// Used charge, and the times since which the voltage is low.
 #[derive(Clone, Copy, Debug, Default)]
 pub(in super::super) struct Gauge {
-    /// Charge taken since boot. [mAh]
+    /// Charge used since boot [mAh].
     pub(in super::super) used_mah: f64,
     low_since: Option<AutopilotTime>,
     critical_since: Option<AutopilotTime>,
 }
 
-/// Stages of an empty battery.
+/// Stages of a low battery.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
 pub(in super::super) enum Stage {
     Low,
@@ -30,7 +30,7 @@ impl Autopilot {
         self.params.value(Param::BattMonitor) != 0.0
     }
 
-    /// Charge left by the charge taken since boot; -1 if not measured. [%]
+    /// Returns the remaining charge, computed from the charge used since boot [%]; -1 if not measured.
     pub(in super::super) fn battery_percent(&self) -> i8 {
         let capacity = self.params.value(Param::BattCapacity);
         if !self.has_gauge() || capacity <= 0.0 {
@@ -68,7 +68,7 @@ impl Autopilot {
         let low = long_below(&mut self.gauge.low_since, value(Param::BattLowVolt))
             || value(Param::BattLowMah) > 0.0 && left_mah < value(Param::BattLowMah);
         let stage = if critical { Some(Stage::Critical) } else { low.then_some(Stage::Low) };
-        // It never gets better: a pack that rests reads more, and is as empty.
+        // The stage never decreases: without load, the voltage rises, but the battery stays empty.
         if stage <= self.failsafe.battery {
             return;
         }

@@ -1,8 +1,7 @@
-//! The autopilot's own fence: a cylinder around home with a ceiling and a floor, and polygons
-//! (AC_Fence.cpp).
+//! The autopilot's fence: a cylinder around home with a ceiling and a floor, and polygons (AC_Fence.cpp).
 //!
-//! The floor is there from when the vehicle has risen FENCE_MARGIN over it until it lands, so that
-//! standing on the ground is no breach.
+//! The floor is active from when the vehicle has risen FENCE_MARGIN above it until it lands, so that standing on the
+//! ground is not a breach.
 
 use glam::DVec3;
 use vizflyt_protocol::mavlink::{CopterMode, GlobalPoint};
@@ -17,10 +16,10 @@ const CEILING: u8 = 1;
 const CIRCLE: u8 = 2;
 const POLYGONS: u8 = 4;
 const FLOOR: u8 = 8;
-/// Beyond the fence by this much more, LAND whatever the action. [m]
+/// Distance beyond the fence at which LAND replaces the configured action [m].
 const GIVE_UP_M: f64 = 100.0;
 
-/// Which sides are breached, and how far at most. [m]
+/// Breached sides, and maximum distance beyond them [m].
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(in super::super) struct Breaches {
     ceiling: bool,
@@ -46,11 +45,11 @@ impl Breaches {
     }
 }
 
-/// What has been noticed of the fence.
+/// State of the fence.
 #[derive(Clone, Copy, Debug, Default)]
 pub(in super::super) struct Fence {
     breached: Breaches,
-    /// The floor counts.
+    /// Whether the floor is active.
     floor: bool,
     count: u16,
     at: Option<AutopilotTime>,
@@ -62,7 +61,7 @@ impl Autopilot {
     }
 
     fn breaches_at(&self, p_world_m: DVec3) -> Breaches {
-        // Before the first arming, home is wherever it stands.
+        // Before the first arming, home is the present position.
         let home = self.home.unwrap_or(p_world_m);
         let value = |param| self.params.value(param);
         let sides = value(Param::FenceType) as u8;
@@ -76,7 +75,7 @@ impl Autopilot {
         Breaches {
             ceiling: sides & CEILING != 0 && above_m > 0.0,
             circle: sides & CIRCLE != 0 && outside_m > 0.0,
-            // Without an origin a polygon is nowhere.
+            // Without an origin, polygons have no position.
             polygon: sides & POLYGONS != 0
                 && origin.is_some_and(|origin| {
                     self.polygons.are_breached_at(origin, p_world_m.truncate())
@@ -98,7 +97,7 @@ impl Autopilot {
         !self.is_fenced() || !self.breaches_at(p_world_m).any()
     }
 
-    /// RTL climbs no higher than this under a ceiling. [m, above home]
+    /// Returns the maximum height of RTL under the ceiling [m, above home].
     pub(in super::super) fn fence_ceiling_m(&self) -> f64 {
         let value = |param| self.params.value(param);
         if self.is_fenced() && value(Param::FenceType) as u8 & CEILING != 0 {
@@ -108,7 +107,7 @@ impl Autopilot {
         }
     }
 
-    /// Lets the floor count from when the vehicle is well over it until it lands.
+    /// Activates the floor when the vehicle is well above it, until it lands.
     fn check_floor(&mut self) {
         let value = |param| self.params.value(param);
         let comes_down = match self.mode {
@@ -151,7 +150,6 @@ impl Autopilot {
         }
     }
 
-    /// FENCE_STATUS.
     pub(in super::super) fn fence_status(&self) -> MavMessage {
         let fence = &self.failsafe.fence;
         MavMessage::FENCE_STATUS(dialect::FENCE_STATUS_DATA {

@@ -1,5 +1,4 @@
-//! What the autopilot does by itself when something is lost: position, ground station, radio
-//! control, battery, fence, upright attitude.
+//! Failsafes of the autopilot: loss of position, ground station or radio control, low battery, fence, crash.
 
 mod battery;
 mod fence;
@@ -12,11 +11,11 @@ use super::{Autopilot, Param, Radio};
 use crate::estimator::EstimatorHealth;
 pub(super) use battery::{Gauge, Stage};
 
-/// A lost position lands after this much longer (ArduCopter counts ten checks at 10 Hz). [s]
+/// Delay from a lost position to the action (ArduCopter counts ten checks at 10 Hz) [s].
 const EKF_S: f64 = 0.9;
-/// "Field Elevation Set" comes this long after the position. [s]
+/// Delay from the first position to "Field Elevation Set" [s].
 const DATUM_S: f64 = 1.0;
-/// A vehicle tilted this far for this long has crashed. [rad], [s]
+/// Tilt [rad], and its duration [s], at which the vehicle counts as crashed.
 const TOPPLED_RAD: f64 = 1.3;
 const TOPPLED_S: f64 = 2.0;
 
@@ -25,24 +24,24 @@ const CONTINUE_GUIDED_WITHOUT_RADIO: u8 = 4;
 const CONTINUE_LANDING: u8 = 8;
 const CONTINUE_BY_HAND: u8 = 16;
 
-/// What a failsafe does.
+/// Action of a failsafe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Action {
     Nothing,
     Land,
-    /// RTL; LAND without a position.
+    /// RTL, or LAND without a position.
     Return,
-    /// BRAKE; LAND without a position.
+    /// BRAKE, or LAND without a position.
     Brake,
-    /// Motors off, in the air too.
+    /// Motors off, also in the air.
     Terminate,
 }
 
-/// What has been noticed.
+/// State of all failsafes.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Failsafe {
     position_lost_at: Option<AutopilotTime>,
-    /// The failsafe has acted; it acts once.
+    /// Whether the failsafe has acted; it acts only once.
     pub(super) ekf: bool,
     pub(super) gcs: bool,
     pub(super) radio: bool,
@@ -93,7 +92,7 @@ impl Autopilot {
 
     fn check_ground_station(&mut self, now: AutopilotTime) {
         let action = self.params.value(Param::FsGcsEnable) as u8;
-        // Counts only after a ground station has sent something at all.
+        // Active only after the first heartbeat of a ground station.
         let Some(received_at) = self.last_ground_station else { return };
         if action == 0 || now.seconds_since(received_at) <= self.params.value(Param::FsGcsTimeout) {
             if self.failsafe.gcs {
@@ -125,7 +124,7 @@ impl Autopilot {
         self.failsafe("GCS", now, action);
     }
 
-    /// A receiver that falls silent (FS_THR_ENABLE). Without a receiver nothing can fall silent.
+    /// Checks for a silent receiver (FS_THR_ENABLE). Without a receiver, this failsafe cannot trigger.
     fn check_radio(&mut self, now: AutopilotTime) {
         let setting = self.params.value(Param::FsThrEnable) as u8;
         let lost = self.radio == Radio::Lost && setting != 0;
@@ -160,7 +159,7 @@ impl Autopilot {
         self.failsafe("Radio", now, action);
     }
 
-    /// Announces the loss and the action, and takes it.
+    /// Announces the loss and the action, and executes it.
     fn failsafe(&mut self, what: &str, now: AutopilotTime, action: Action) {
         let words = match action {
             _ if self.landed => "Disarming",
@@ -181,8 +180,8 @@ impl Autopilot {
         }
     }
 
-    /// A landing by failsafe hovers first, for a pilot to take over; one under way that is to go on is held up by it
-    /// too.
+    /// Executes an action. A landing by failsafe hovers first, so that a pilot can take over; this also delays a
+    /// landing that continues.
     fn act_with_pause(&mut self, now: AutopilotTime, action: Action) {
         self.act(now, action);
         if self.mode == CopterMode::Land && action != Action::Nothing {
@@ -190,7 +189,7 @@ impl Autopilot {
         }
     }
 
-    /// Whether a landing under way goes on whatever else is lost (FS_OPTIONS).
+    /// Whether a landing continues despite further failsafes (FS_OPTIONS).
     fn is_to_continue(&self) -> bool {
         let options = self.params.value(Param::FsOptions) as u8;
         self.mode == CopterMode::Land && options & CONTINUE_LANDING != 0
@@ -210,8 +209,7 @@ impl Autopilot {
         }
     }
 
-    /// AHRS_OPTIONS bit 4: the origin recorded in the parameters is taken at boot, as nobody
-    /// outside needs to set it then.
+    /// AHRS_OPTIONS bit 4: sets the origin recorded in the parameters at boot, so that no ground station must set it.
     fn restore_origin(&mut self, health: EstimatorHealth) {
         const USE_RECORDED_ORIGIN: u16 = 16;
         let value = |param| self.params.value(param);
@@ -238,7 +236,7 @@ impl Autopilot {
         }
     }
 
-    /// See [`crate::estimator::Estimator::reset_height_datum`].
+    /// Resets the height datum once; see [`crate::estimator::Estimator::reset_height_datum`].
     fn reset_datum_once(&mut self, now: AutopilotTime, health: EstimatorHealth) {
         if !health.position || self.armed || self.datum_reset {
             return;
@@ -252,7 +250,7 @@ impl Autopilot {
     }
 }
 
-/// Whether a mode flies by position.
+/// Whether a mode needs a position.
 pub(super) fn needs_position(mode: CopterMode) -> bool {
     matches!(mode, CopterMode::Guided | CopterMode::Loiter | CopterMode::Rtl | CopterMode::Brake)
 }

@@ -1,4 +1,4 @@
-//! Fence, battery, radio control, reboot, and a vehicle that is not sound.
+//! Fence, battery, radio control, reboot, and faults of the vehicle.
 
 use super::*;
 use crate::autopilot::Radio;
@@ -15,7 +15,7 @@ const FENCE: [(&str, f32); 4] =
     [("FENCE_ENABLE", 1.0), ("FENCE_RADIUS", 2.0), ("FENCE_ALT_MAX", 2.5), ("FENCE_ACTION", 2.0)];
 
 #[test]
-fn the_fence_lands_what_leaves_it() {
+fn a_fence_breach_lands() {
     for (velocity, side) in [
         (DVec3::X, FenceBreach::FENCE_BREACH_BOUNDARY),
         (DVec3::Z * 0.5, FenceBreach::FENCE_BREACH_MAXALT),
@@ -33,7 +33,7 @@ fn the_fence_lands_what_leaves_it() {
 }
 
 #[test]
-fn points_beyond_the_fence_are_not_flown_to() {
+fn rejects_position_targets_beyond_the_fence() {
     let mut c = Companion::hovering(config(&FENCE), 1.2);
     c.fly(GuidedMotion::Position(DVec3::new(5.0, 0.0, 1.2)), YawTarget::Angle(0.0));
     c.wait(5.0);
@@ -44,7 +44,7 @@ fn points_beyond_the_fence_are_not_flown_to() {
 }
 
 #[test]
-fn a_fence_can_be_set_to_report_only_and_is_switched_by_command() {
+fn the_fence_can_only_report_and_is_switched_by_command() {
     let mut quiet = FENCE;
     quiet[3].1 = 0.0;
     let mut c = Companion::hovering(config(&quiet), 1.2);
@@ -58,9 +58,9 @@ fn a_fence_can_be_set_to_report_only_and_is_switched_by_command() {
     assert!(!c.texts_contain("breached"));
 }
 
-/// RTL stays under a ceiling that the fence knows: the published failsafe with its fence on.
+/// RTL stays below the fence's ceiling: the published failsafe with an enabled fence.
 #[test]
-fn a_ceiling_bounds_the_climb_of_rtl() {
+fn the_ceiling_limits_the_climb_of_rtl() {
     let mut params = FENCE.to_vec();
     params.extend([("FS_GCS_ENABLE", 1.0), ("FENCE_MARGIN", 0.5)]);
     let mut c = Companion::hovering(config(&params), 1.0);
@@ -75,7 +75,7 @@ fn a_ceiling_bounds_the_climb_of_rtl() {
 }
 
 #[test]
-fn an_empty_battery_lands_by_voltage() {
+fn low_battery_voltage_lands() {
     let low = [("BATT_LOW_TIMER", 2.0), ("BATT_CRT_VOLT", 0.0)];
     let mut c = Companion::hovering(SimulationConfig { battery_share: 0.33, ..config(&low) }, 1.0);
     c.until(120.0, "LAND", |c| c.mode() == CopterMode::Land);
@@ -84,16 +84,16 @@ fn an_empty_battery_lands_by_voltage() {
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), FAILED);
     assert!(c.texts_contain("low voltage failsafe"));
-    // A third was in it at the start; the autopilot, which counts from boot, estimates otherwise.
+    // The battery started at a third; the autopilot counts from boot and reports more.
     let Some(MavMessage::SYS_STATUS(m)) = c.newest.get(&1) else { panic!() };
     assert!(m.battery_remaining > 60, "{}", m.battery_remaining);
 }
 
 #[test]
-fn a_battery_is_judged_by_charge_too_and_not_at_all_without_a_gauge() {
+fn low_charge_is_reported_and_no_monitor_means_no_failsafe() {
     let mah = [("BATT_LOW_MAH", 845.0), ("BATT_FS_LOW_ACT", 0.0), ("BATT_LOW_VOLT", 0.0)];
     let mut c = Companion::hovering(config(&mah), 1.0);
-    c.until(30.0, "the word", |c| c.texts_contain("Battery 1 is low"));
+    c.until(30.0, "the warning", |c| c.texts_contain("Battery 1 is low"));
     assert_eq!(c.mode(), CopterMode::Guided);
 
     let none = [("BATT_MONITOR", 0.0)];
@@ -113,7 +113,7 @@ fn a_battery_is_judged_by_charge_too_and_not_at_all_without_a_gauge() {
 }
 
 #[test]
-fn a_lost_radio_control_acts_after_its_timeout() {
+fn lost_radio_control_acts_after_its_timeout() {
     let faults = Faults { radio_lost_after_s: Some(8.0), ..Default::default() };
     for (setting, options, expected) in [
         (3.0, 16.0, CopterMode::Land),
@@ -135,9 +135,9 @@ fn a_lost_radio_control_acts_after_its_timeout() {
     }
 }
 
-/// Who flies by hand flies on without a ground station, if FS_OPTIONS is set so.
+/// A pilot continues without a ground station if FS_OPTIONS allows it.
 #[test]
-fn a_pilot_goes_on_if_configured() {
+fn pilot_control_continues_if_configured() {
     for (options, expected) in [(24.0, CopterMode::AltHold), (8.0, CopterMode::Land)] {
         let params = [("FS_GCS_ENABLE", 5.0), ("FS_OPTIONS", options)];
         let mut c = Companion::hovering(config(&params), 1.5);
@@ -148,9 +148,9 @@ fn a_pilot_goes_on_if_configured() {
     }
 }
 
-/// A landing goes on when more is lost, if FS_OPTIONS is set so; else the later failsafe acts.
+/// A landing continues despite further failsafes if FS_OPTIONS allows it; otherwise the later failsafe acts.
 #[test]
-fn a_landing_continues_if_configured() {
+fn a_landing_continues_if_configured_by_fs_options() {
     for (options, expected) in [(8.0, CopterMode::Land), (0.0, CopterMode::Rtl)] {
         let params = [("FS_GCS_ENABLE", 1.0), ("FS_OPTIONS", options)];
         let mut c = Companion::hovering(config(&params), 6.0);
@@ -162,7 +162,7 @@ fn a_landing_continues_if_configured() {
 }
 
 #[test]
-fn a_reboot_in_flight_is_a_fall_and_a_new_clock() {
+fn a_reboot_in_flight_drops_the_vehicle_and_restarts_its_clock() {
     let faults = Faults { reboot_after_s: Some(8.0), ..Default::default() };
     let params = [("GUID_TIMEOUT", 2.0)];
     let mut c = Companion::hovering(SimulationConfig { faults, ..config(&params) }, 1.2);
@@ -171,13 +171,13 @@ fn a_reboot_in_flight_is_a_fall_and_a_new_clock() {
     let (before, sent) = (c.lab.autopilot_now(), c.counts[&0]);
     assert_eq!(before.as_ns(), 0);
     c.wait(1.4);
-    assert_eq!(c.counts[&0], sent, "nothing is sent while it boots");
+    assert_eq!(c.counts[&0], sent, "no messages during the boot");
     assert!(c.p().z < 0.05 && (c.p() - start).truncate().length() < 0.3, "{:?}", c.p());
     c.wait(4.0);
     let Some(MavMessage::ATTITUDE(m)) = c.newest.get(&30) else { panic!() };
     assert!(m.time_boot_ms < 4000, "{}", m.time_boot_ms);
     assert!(!c.armed() && c.mode() == CopterMode::Stabilize);
-    // It has forgotten the origin, and kept its parameters.
+    // It has lost the origin, but kept its parameters.
     let health = c.lab.autopilot().estimator().health(c.lab.autopilot_now());
     assert!(health.attitude && !health.origin);
     c.set_origin();
@@ -189,7 +189,7 @@ fn a_reboot_in_flight_is_a_fall_and_a_new_clock() {
 }
 
 #[test]
-fn a_reboot_on_command_is_refused_while_armed_unless_forced() {
+fn rejects_a_reboot_while_armed_unless_forced() {
     let reboot = |force: f32| [1.0, 0.0, 0.0, 0.0, 0.0, force, 0.0];
     let command = MavCmd::MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN;
     let mut c = Companion::hovering(SimulationConfig::default(), 1.0);
@@ -201,18 +201,18 @@ fn a_reboot_on_command_is_refused_while_armed_unless_forced() {
 }
 
 #[test]
-fn a_dead_motor_is_a_crash_and_a_weak_one_is_flown_out() {
+fn a_dead_motor_crashes_and_a_weak_one_does_not() {
     let with = |share: f64| {
         let motor = Some(MotorFault { motor: 1, share, after_s: 8.0 });
         let faults = Faults { motor, ..Default::default() };
-        // One that climbs hard, and so topples when a motor is missing.
+        // Hard climbs, so that the vehicle topples with a dead motor.
         let hard =
             [("WP_ACC_Z", 4.0), ("PSC_JERK_D", 50.0), ("WP_ACC", 8.0), ("PSC_JERK_NE", 80.0)];
         let mut c = Companion::hovering(SimulationConfig { faults, ..config(&hard) }, 1.5);
         c.wait(9.0);
         c
     };
-    // Without any thrust it may fall on its feet; with a little it topples.
+    // Without any thrust it may land upright; with a little it topples.
     let dead = with(0.2);
     assert!(
         dead.p().z < 0.3 && !dead.armed() && dead.texts_contain("Crash: Disarming"),
@@ -225,7 +225,7 @@ fn a_dead_motor_is_a_crash_and_a_weak_one_is_flown_out() {
 }
 
 #[test]
-fn vibration_is_reported_and_flown_through() {
+fn reports_vibration_and_flies_with_it() {
     let level = |vibration_mps2: f64| {
         let config = SimulationConfig { vibration_mps2, ..SimulationConfig::airframe() };
         let mut c = Companion::hovering(config, 1.2);
@@ -236,12 +236,12 @@ fn vibration_is_reported_and_flown_through() {
     };
     let (still, shaken) = (level(0.0), level(200.0));
     assert!(still < 1.0, "{still}");
-    // Rotors of nearly the same speed beat: anything up to four times one of them.
+    // Rotors of nearly equal speed beat: up to four times the amplitude of one.
     assert!((8.0..100.0).contains(&shaken), "{shaken}");
 }
 
 #[test]
-fn gusts_push_and_are_held_against() {
+fn holds_position_in_gusts() {
     let config = SimulationConfig { gust_mps: 2.0, seed: 6, ..Default::default() };
     let mut c = Companion::hovering(config, 1.2);
     let start = c.p();
@@ -251,17 +251,17 @@ fn gusts_push_and_are_held_against() {
         worst = worst.max((c.p() - start).length());
         fastest = fastest.max(c.v().length());
     }
-    println!("gusts of 2 m/s: {worst:.2} m off at most, {fastest:.2} m/s at most");
+    println!("gusts of 2 m/s: maximum error {worst:.2} m, maximum speed {fastest:.2} m/s");
     assert!(worst < 0.4 && fastest > 0.1, "{worst} {fastest}");
 }
 
-/// Vision, commands and telemetry all go through the Wi-Fi model, and the vehicle still flies.
+/// Vision, commands and telemetry all pass the Wi-Fi model, and the vehicle still flies.
 #[test]
-fn a_bad_wifi_is_flown_over() {
+fn flies_over_a_lossy_wifi() {
     let wifi = WifiConfig { seed: 3, loss: 0.1, latency_s: 0.01, ..Default::default() };
     let mut c = Companion::new(SimulationConfig { wifi: Some(wifi), ..Default::default() });
     c.wait(2.5);
-    // Any packet may be lost: all is sent again until its effect is received.
+    // Any packet may be lost, so each request is repeated until its effect is visible.
     let until_heard =
         |c: &mut Companion, ask: &dyn Fn(&mut Companion), received: &dyn Fn(&Companion) -> bool| {
             for _ in 0..40 {

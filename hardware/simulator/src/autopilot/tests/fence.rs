@@ -1,4 +1,4 @@
-//! The fence's polygons and floor: uploaded, kept, and acted on, with nobody else to act.
+//! Fence polygons and floor: uploaded, stored, and enforced without a companion.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::dialect::{
@@ -10,7 +10,7 @@ use vizflyt_protocol::mavlink::{FenceCorner, FenceSide, GlobalPoint, fence_corne
 use super::*;
 
 const FENCE: MavMissionType = MavMissionType::MAV_MISSION_TYPE_FENCE;
-/// What [`Companion::set_origin`] sets.
+/// Origin that [`Companion::set_origin`] sets.
 const ORIGIN: GlobalPoint = GlobalPoint { latitude_e7: 423_000_000, longitude_e7: -718_000_000 };
 
 const ROOM: [(f64, f64); 4] = [(-3.0, -2.0), (4.0, -2.0), (4.0, 2.0), (-3.0, 2.0)];
@@ -29,7 +29,7 @@ fn room_with_a_box() -> Vec<FenceCorner> {
     [corners(FenceSide::Inside, &ROOM), corners(FenceSide::Outside, &BOX)].concat()
 }
 
-/// A vehicle with polygons and floor on, whose fence lands it.
+/// A vehicle with polygons and floor enabled, and LAND as fence action.
 fn config(kind: f32) -> SimulationConfig {
     let params = [
         ("FENCE_ENABLE", 1.0),
@@ -83,7 +83,7 @@ impl Companion {
         }
     }
 
-    /// Asks for the whole fence back.
+    /// Downloads the complete fence.
     fn download(&mut self) -> Vec<(i32, i32)> {
         let (target_system, target_component, mission_type) = (1, 1, FENCE);
         self.send(&MavMessage::MISSION_REQUEST_LIST(MISSION_REQUEST_LIST_DATA {
@@ -119,13 +119,13 @@ impl Companion {
 }
 
 #[test]
-fn a_no_fly_box_lands_what_flies_into_it() {
+fn a_no_fly_box_lands_the_vehicle_at_its_edge() {
     let mut c = Companion::new(config(4.0));
     c.prepare();
     c.upload(&room_with_a_box());
     assert_eq!(c.answered(), Some(MavMissionResult::MAV_MISSION_ACCEPTED));
     c.takes_off();
-    // A point in the box is not flown to; a velocity is, and is landed at its edge.
+    // A position inside the box is rejected; a velocity is flown until the edge.
     c.set_once(GuidedMotion::Position(DVec3::new(2.0, 0.0, 1.2)), YawTarget::Angle(0.0));
     c.wait(4.0);
     assert!(c.p().truncate().length() < 0.2, "{:?}", c.p());
@@ -138,13 +138,13 @@ fn a_no_fly_box_lands_what_flies_into_it() {
     assert_eq!((m.breach_count, m.breach_type), (1, FenceBreach::FENCE_BREACH_BOUNDARY));
     c.until(15.0, "the disarm", |c| !c.armed());
     assert!(c.p().x < 2.0, "{:?}", c.p());
-    // It stands in the box now, and is not to fly from there.
+    // It now stands in the box, so arming is refused.
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), FAILED);
 }
 
 #[test]
-fn the_room_s_own_shape_is_kept_where_a_circle_would_not() {
+fn the_inclusion_polygon_lands_the_vehicle_at_its_edge() {
     let mut c = Companion::new(config(4.0));
     c.prepare();
     c.upload(&room_with_a_box());
@@ -155,7 +155,7 @@ fn the_room_s_own_shape_is_kept_where_a_circle_would_not() {
 }
 
 #[test]
-fn the_fence_outlasts_a_reboot_and_is_given_back() {
+fn the_fence_survives_a_reboot_and_can_be_downloaded() {
     let mut c = Companion::new(config(4.0));
     c.prepare();
     c.upload(&room_with_a_box());
@@ -178,26 +178,26 @@ fn the_fence_outlasts_a_reboot_and_is_given_back() {
 }
 
 #[test]
-fn an_upload_that_is_not_whole_changes_nothing() {
+fn an_incomplete_upload_changes_nothing() {
     let mut c = Companion::new(config(4.0));
     c.prepare();
     c.upload(&room_with_a_box());
     let kept = c.download();
 
-    // A polygon short of a corner.
+    // A polygon that lacks a corner.
     c.upload(&room_with_a_box()[..7]);
     assert_eq!(c.answered(), Some(MavMissionResult::MAV_MISSION_ERROR));
-    // An item of another frame's ends it.
+    // An item in another frame ends the upload.
     c.announce(4);
     let mut item = fence_corner_to_mavlink(&room_with_a_box()[0], 0, (1, 1));
     item.frame = vizflyt_protocol::mavlink::dialect::MavFrame::MAV_FRAME_LOCAL_NED;
     c.send(&MavMessage::MISSION_ITEM_INT(item));
     c.tick();
     assert_eq!(c.answered(), Some(MavMissionResult::MAV_MISSION_UNSUPPORTED_FRAME));
-    // Too many, and missions of waypoints.
+    // Too many items.
     c.announce(1000);
     assert_eq!(c.answered(), Some(MavMissionResult::MAV_MISSION_NO_SPACE));
-    // An item that came twice does no harm; one that does not come is asked for again, and given up.
+    // A duplicate item is harmless; a missing one is requested again, until a timeout.
     c.announce(8);
     let first = room_with_a_box()[0];
     c.item(0, &first);
@@ -213,8 +213,8 @@ fn an_upload_that_is_not_whole_changes_nothing() {
 }
 
 #[test]
-fn the_floor_counts_between_rising_and_landing() {
-    // Standing below it is no breach, and neither is taking off or landing through it.
+fn the_floor_is_active_between_climb_and_landing() {
+    // Standing below the floor is not a breach, and neither is a take-off or landing through it.
     let mut c = Companion::new(config(8.0));
     c.prepare();
     c.takes_off();
@@ -229,7 +229,7 @@ fn the_floor_counts_between_rising_and_landing() {
     };
     c.wait(1.1);
     assert_eq!(breaches(&c), 1);
-    // So is one that was never high enough for the floor to count.
+    // Nor is a flight that was never high enough to activate the floor.
     c.setpoint = None;
     assert_eq!(c.set_mode(CopterMode::Guided), ACCEPTED);
     assert_eq!(c.arm(), ACCEPTED);

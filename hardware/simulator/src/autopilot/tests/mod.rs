@@ -49,7 +49,7 @@ impl Companion {
 }
 
 #[test]
-fn the_sequence_that_flies_a_real_one_flies_this_one() {
+fn the_start_sequence_of_a_real_autopilot_works() {
     let mut c = Companion::new(SimulationConfig::default());
     c.wait(3.0);
     assert!(c.flags().contains(EkfStatusFlags::EKF_CONST_POS_MODE));
@@ -72,7 +72,7 @@ fn the_sequence_that_flies_a_real_one_flies_this_one() {
 }
 
 #[test]
-fn without_an_origin_it_arms_and_refuses_to_take_off() {
+fn without_an_origin_arms_but_refuses_take_off() {
     let mut c = Companion::new(SimulationConfig::default());
     c.wait(4.0);
     assert!(c.prearm_good());
@@ -80,13 +80,13 @@ fn without_an_origin_it_arms_and_refuses_to_take_off() {
     assert_eq!(c.arm(), ACCEPTED);
     assert_eq!(c.take_off(1.0), FAILED);
     assert!(c.texts_contain("no EKF origin"));
-    // Left on the ground it gives up by itself.
+    // On the ground it disarms after a while.
     c.until(11.0, "the disarm", |c| !c.armed());
     assert!(c.p().z.abs() < 0.01);
 }
 
 #[test]
-fn refusals_have_their_reason() {
+fn refusals_state_their_reason() {
     let mut c = Companion::new(SimulationConfig::default());
     c.vision = false;
     assert_eq!(c.arm(), FAILED);
@@ -122,7 +122,7 @@ fn refusals_have_their_reason() {
     assert_eq!(c.command(MavCmd::MAV_CMD_COMPONENT_ARM_DISARM, disarm(21196.0)), ACCEPTED);
     assert!(!c.armed());
     c.wait(2.0);
-    assert!(c.p().z < 0.1, "it fell: {:?}", c.p());
+    assert!(c.p().z < 0.1, "it must have fallen: {:?}", c.p());
     assert_eq!(
         c.command(MavCmd::MAV_CMD_DO_CHANGE_SPEED, [0.0; 7]),
         MavResult::MAV_RESULT_UNSUPPORTED
@@ -130,7 +130,7 @@ fn refusals_have_their_reason() {
 }
 
 #[test]
-fn setpoints_on_the_ground_move_nothing() {
+fn ignores_setpoints_on_the_ground() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
     c.set_mode(CopterMode::Guided);
@@ -141,7 +141,7 @@ fn setpoints_on_the_ground_move_nothing() {
 }
 
 #[test]
-fn heartbeats_have_mode_and_arming() {
+fn heartbeats_contain_mode_and_arming() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.0);
     let Some(MavMessage::HEARTBEAT(m)) = c.newest.get(&0) else { panic!() };
     assert_eq!((m.mavtype as u8, m.autopilot as u8, m.custom_mode), (2, 3, 4));
@@ -155,7 +155,7 @@ fn heartbeats_have_mode_and_arming() {
 }
 
 #[test]
-fn lost_vision_is_noticed_after_seven_seconds_and_lands() {
+fn detects_lost_vision_after_seven_seconds_and_lands() {
     let mut c = Companion::hovering(SimulationConfig { seed: 2, ..Default::default() }, 1.5);
     let start = c.p();
     c.vision = false;
@@ -173,7 +173,7 @@ fn lost_vision_is_noticed_after_seven_seconds_and_lands() {
 }
 
 #[test]
-fn vision_that_comes_back_in_time_is_used() {
+fn continues_if_vision_returns_in_time() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.5);
     let start = c.p();
     c.vision = false;
@@ -185,7 +185,7 @@ fn vision_that_comes_back_in_time_is_used() {
 }
 
 #[test]
-fn lost_heartbeats_land_after_five_seconds() {
+fn lands_five_seconds_after_lost_heartbeats() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.5);
     c.heartbeats = false;
     let seconds = c.until(8.0, "LAND", |c| c.mode() == CopterMode::Land);
@@ -193,7 +193,7 @@ fn lost_heartbeats_land_after_five_seconds() {
     assert!(c.texts_contain("GCS Failsafe - Landing"));
     c.until(15.0, "the disarm", |c| !c.armed());
 
-    // Never received, never missed.
+    // Without any heartbeat, the failsafe is inactive.
     let mut c = Companion::new(SimulationConfig::default());
     c.heartbeats = false;
     c.prepare();
@@ -203,7 +203,7 @@ fn lost_heartbeats_land_after_five_seconds() {
     c.wait(12.0);
     assert_eq!(c.mode(), CopterMode::Guided);
 
-    // Switched off by parameter.
+    // Disabled by parameter.
     let params = vec![("FS_GCS_ENABLE".to_owned(), 0.0)];
     let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.0);
     c.heartbeats = false;
@@ -211,9 +211,9 @@ fn lost_heartbeats_land_after_five_seconds() {
     assert_eq!(c.mode(), CopterMode::Guided);
 }
 
-/// What a published lab's parameters would do inside a cage of 3.65 m.
+/// Behaviour with a published lab's parameters in a cage of 3.65 m.
 #[test]
-fn the_published_failsafe_climbs_through_the_ceiling() {
+fn the_published_failsafe_exceeds_the_ceiling() {
     let params = vec![("FS_GCS_ENABLE".to_owned(), 1.0)];
     let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.0);
     c.heartbeats = false;
@@ -222,7 +222,7 @@ fn the_published_failsafe_climbs_through_the_ceiling() {
 }
 
 #[test]
-fn rtl_comes_home_and_lands() {
+fn rtl_returns_home_and_lands() {
     let params = vec![("RTL_ALT_M".to_owned(), 1.5), ("WP_SPD".to_owned(), 2.0)];
     let mut c = Companion::hovering(SimulationConfig { params, ..Default::default() }, 1.2);
     c.set_once(GuidedMotion::Position(DVec3::new(3.0, 2.0, 1.2)), YawTarget::Angle(0.0));
@@ -253,9 +253,9 @@ fn brake_stops_and_stabilize_without_a_pilot_falls() {
     assert!(c.p().z < 0.1);
 }
 
-/// Ground vision at z = 0.59 became 1.17 on a real one, so that take-off to 1 m ends elsewhere.
+/// On a real vehicle, vision at z = 0.59 on the ground became 1.17, so a take-off to 1 m ended at another height.
 #[test]
-fn the_height_datum_is_reset_once() {
+fn resets_the_height_datum_once() {
     let spawn_m = DVec3::new(0.0, 0.0, 0.59);
     let mut c = Companion::new(SimulationConfig { spawn_m, ..Default::default() });
     c.prepare();
@@ -266,7 +266,7 @@ fn the_height_datum_is_reset_once() {
 }
 
 #[test]
-fn streams_run_at_the_rates_asked_for() {
+fn streams_have_the_requested_rates() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
     let count = |c: &mut Companion, id: u32, seconds: f64| {
@@ -284,7 +284,7 @@ fn streams_run_at_the_rates_asked_for() {
     }
     assert_eq!(c.command(set, interval(60_000.0, 1e4)), FAILED);
     assert_eq!(c.command(set, interval(30.0, f32::NAN)), FAILED);
-    // On request only.
+    // Only on request.
     assert!(!c.newest.contains_key(&148));
     let request = [148.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
     assert_eq!(c.command(MavCmd::MAV_CMD_REQUEST_MESSAGE, request), ACCEPTED);
@@ -296,7 +296,7 @@ fn streams_run_at_the_rates_asked_for() {
 }
 
 #[test]
-fn timesync_is_answered_with_the_time_of_boot() {
+fn answers_timesync_with_the_time_since_boot() {
     let mut c = Companion::new(SimulationConfig::default());
     c.wait(1.0);
     let now_ns = c.lab.now().as_ns().cast_signed();
@@ -305,14 +305,14 @@ fn timesync_is_answered_with_the_time_of_boot() {
     let Some(MavMessage::TIMESYNC(m)) = c.newest.get(&111) else { panic!() };
     assert_eq!((m.tc1, m.ts1, m.target_system), (now_ns, 4242, 255));
     let before = c.counts[&111];
-    // An answer to somebody else's question is none of ours.
+    // Replies to other systems are ignored.
     c.send(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 5, ts1: 4242, ..Default::default() }));
     c.wait(0.5);
     assert_eq!(c.counts[&111], before);
 }
 
 #[test]
-fn parameters_are_read_and_set_by_name() {
+fn reads_and_sets_parameters_by_name() {
     let mut c = Companion::new(SimulationConfig::default());
     c.wait(0.1);
     let newest = |c: &Companion| match c.newest.get(&22) {
@@ -348,7 +348,7 @@ fn parameters_are_read_and_set_by_name() {
 
 /// Messages for another vehicle on the same link.
 #[test]
-fn messages_to_other_systems_are_ignored() {
+fn ignores_messages_to_other_systems() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
     c.send(&MavMessage::SET_MODE(SET_MODE_DATA {

@@ -1,5 +1,4 @@
-//! What surprised people who flew a real ArduCopter 4.8 without GPS and compass, one test a
-//! surprise; the figures are the real one's.
+//! Pitfalls of a real ArduCopter 4.8 without GPS and compass, one test for each. The figures are those of the real one.
 
 use super::*;
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
@@ -13,7 +12,7 @@ fn config(params: &[(&str, f32)]) -> SimulationConfig {
 }
 
 impl Companion {
-    /// Sends a setpoint as it stands: mask, frame, position, velocity, acceleration, yaw. [NED]
+    /// Sends a setpoint with explicit fields: mask, frame, position, velocity, acceleration, yaw [NED].
     fn raw(&mut self, mask: u16, frame: MavFrame, p: [f32; 3], v: [f32; 3], a: [f32; 3], yaw: f32) {
         self.send(&MavMessage::SET_POSITION_TARGET_LOCAL_NED(SET_POSITION_TARGET_LOCAL_NED_DATA {
             type_mask: PositionTargetTypemask::from_bits_retain(mask),
@@ -42,10 +41,10 @@ impl Companion {
 const LOCAL: MavFrame = MavFrame::MAV_FRAME_LOCAL_NED;
 const NONE: [f32; 3] = [0.0; 3];
 
-/// Pitfall 1: Without an origin: `without_an_origin_it_arms_and_refuses_to_take_off`. The alternative is an
-/// origin recorded in the parameters.
+/// Pitfall 1: no origin, see `without_an_origin_arms_but_refuses_take_off`. The alternative is an origin recorded in
+/// the parameters.
 #[test]
-fn p1_a_recorded_origin_needs_nobody_to_set_it() {
+fn p1_uses_a_recorded_origin() {
     let recorded =
         [("AHRS_OPTIONS", 16.0), ("AHRS_ORIGIN_LAT", 42.25), ("AHRS_ORIGIN_LON", -71.75)];
     let mut c = Companion::new(config(&recorded));
@@ -55,16 +54,16 @@ fn p1_a_recorded_origin_needs_nobody_to_set_it() {
     assert_eq!((m.latitude, m.longitude), (422_500_000, -717_500_000));
     c.set_mode(CopterMode::Guided);
     assert_eq!((c.arm(), c.take_off(1.0)), (ACCEPTED, ACCEPTED));
-    // The option off, the same numbers do nothing.
+    // Without the option, the recorded origin is ignored.
     let mut c = Companion::new(config(&recorded[1..]));
     c.wait(8.0);
     assert!(!c.lab.autopilot().estimator().health(c.lab.now()).origin);
 }
 
-/// Pitfall 2: Height: `the_height_datum_is_reset_once`. Vision that begins after the text, or at z = 0, is
-/// left alone.
+/// Pitfall 2: height datum, see `resets_the_height_datum_once`. Vision that begins after the text, or at z = 0, is not
+/// changed.
 #[test]
-fn p2_vision_that_starts_after_the_datum_keeps_its_height() {
+fn p2_vision_after_the_datum_reset_keeps_its_height() {
     let mut c = Companion::new(SimulationConfig::default());
     c.prepare();
     c.until(5.0, "the text", |c| c.texts_contain("Field Elevation Set"));
@@ -75,10 +74,10 @@ fn p2_vision_that_starts_after_the_datum_keeps_its_height() {
     assert_eq!(c.texts.iter().filter(|text| text.contains("Field Elevation")).count(), 1);
 }
 
-/// Pitfall 3: Masks: those that were accepted fly; one axis ignored drops its group; position and
-/// acceleration without velocity hold.
+/// Pitfall 3: masks. Common masks are accepted; one ignored axis drops its group; position and acceleration without
+/// velocity hold.
 #[test]
-fn p3_masks() {
+fn p3_unsupported_masks_hold() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     let north = [1.0, 0.0, -1.2];
     let goes = |c: &mut Companion, mask: u16, p: [f32; 3], v: [f32; 3]| {
@@ -95,10 +94,10 @@ fn p3_masks() {
         assert!(goes(&mut c, mask, NONE, [0.6, 0.0, 0.0]), "{mask:#x}");
     }
     assert!(goes(&mut c, 0x9C0, [0.0, 0.0, -1.2], [0.6, 0.0, 0.0]));
-    // One axis of the group ignored: nothing is left to fly.
+    // One axis of the group is ignored, so no motion is left.
     assert!(!goes(&mut c, 0x9F8 | 1, north, NONE));
     assert!(!goes(&mut c, 0x9C7 | 0x20, NONE, [0.6, 0.0, 0.0]));
-    // Position and acceleration, velocity ignored: hold, also out of full flight.
+    // Position and acceleration with ignored velocity: hold, also in full flight.
     assert!(!goes(&mut c, 0x838, north, NONE));
     c.raw(0x9C7, LOCAL, NONE, [1.0, 0.0, 0.0], NONE, 0.0);
     c.wait(1.5);
@@ -108,14 +107,14 @@ fn p3_masks() {
     assert!(c.v().length() < 0.1, "{:?}", c.v());
 }
 
-/// Frames other than LOCAL_NED, which ground stations use: offsets and body axes are honoured, the
-/// rest is dropped without a change.
+/// Frames other than LOCAL_NED, as ground stations use them: offsets and body axes are supported, other frames are
+/// ignored.
 #[test]
-fn p3_frames() {
+fn p3_supports_offset_and_body_frames() {
     let spawn_yaw_rad = 0.5;
     let mut c = Companion::hovering(SimulationConfig { spawn_yaw_rad, ..Default::default() }, 1.2);
     let ahead = DVec3::new(spawn_yaw_rad.cos(), spawn_yaw_rad.sin(), 0.0);
-    // One metre ahead; yaw held by a zero rate.
+    // One metre ahead; a zero yaw rate holds the yaw.
     c.raw(0x5F8, MavFrame::MAV_FRAME_BODY_NED, [1.0, 0.0, 0.0], NONE, NONE, 0.0);
     c.wait(6.0);
     assert!((c.p() - ahead - DVec3::Z * 1.2).length() < 0.12, "{:?}", c.p());
@@ -129,12 +128,12 @@ fn p3_frames() {
     assert!((c.p() - expected).length() < 0.12, "{:?}", c.p());
 }
 
-/// Pitfall 4: Yaw ignored: the nose turned by 180 degrees into travel, above 5 % of WP_SPD.
+/// Pitfall 4: with ignored yaw, the nose turned by 180 degrees into the direction of travel, above 5 % of WP_SPD.
 #[test]
-fn p4_an_ignored_yaw_follows_travel_above_a_twentieth_of_the_speed() {
+fn p4_ignored_yaw_follows_travel_above_a_twentieth_of_the_speed() {
     let turned = |speed: f32| {
         let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
-        // West, the nose east.
+        // Fly west, with the nose to the east.
         for _ in 0..40 {
             c.raw(0xDC7, LOCAL, NONE, [0.0, -speed, 0.0], NONE, 0.0);
             c.wait(0.1);
@@ -142,12 +141,12 @@ fn p4_an_ignored_yaw_follows_travel_above_a_twentieth_of_the_speed() {
         wrap_pi(c.yaw()).abs()
     };
     assert!(turned(1.0) > 3.0);
-    assert!(turned(0.04) < 0.1, "slower than 5 cm/s it stays");
+    assert!(turned(0.04) < 0.1, "below 5 cm/s the yaw stays");
 }
 
-/// Pitfall 5: GUID_TIMEOUT is a parameter; a position outlives it.
+/// Pitfall 5: GUID_TIMEOUT is a parameter; it does not apply to positions.
 #[test]
-fn p5_the_timeout_is_a_parameter() {
+fn p5_the_setpoint_timeout_is_a_parameter() {
     let mut c = Companion::hovering(config(&[("GUID_TIMEOUT", 1.0)]), 1.2);
     let start = c.p();
     c.raw(0x9C7, LOCAL, NONE, [0.5, 0.0, 0.0], NONE, 0.0);
@@ -156,9 +155,9 @@ fn p5_the_timeout_is_a_parameter() {
     assert!((0.3..0.8).contains(&way) && c.v().length() < 0.1, "{way}");
 }
 
-/// Pitfall 6: Vision lost: `lost_vision_is_noticed_after_seven_seconds_and_lands`. No word before that.
+/// Pitfall 6: lost vision, see `detects_lost_vision_after_seven_seconds_and_lands`. Nothing is reported before that.
 #[test]
-fn p6_lost_vision_is_not_reported_for_seven_seconds() {
+fn p6_does_not_report_lost_vision_for_seven_seconds() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     c.vision = false;
     c.texts.clear();
@@ -166,14 +165,14 @@ fn p6_lost_vision_is_not_reported_for_seven_seconds() {
     assert_eq!((c.texts.len(), c.mode()), (0, CopterMode::Guided), "{:?}", c.texts);
 }
 
-/// Pitfall 7: Only heartbeats of MAV_GCS_SYSID count.
+/// Pitfall 7: only heartbeats of MAV_GCS_SYSID count.
 #[test]
-fn p7_another_system_s_heartbeats_do_not_count() {
+fn p7_ignores_heartbeats_of_other_systems() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     c.system_id = 42;
     let seconds = c.until(8.0, "LAND", |c| c.mode() == CopterMode::Land);
     assert!((4.0..6.1).contains(&seconds), "{seconds}");
-    // With its system id configured, the failsafe is satisfied.
+    // With the system ID configured, the heartbeats count.
     let mut c = Companion::new(config(&[("MAV_GCS_SYSID", 42.0)]));
     c.system_id = 42;
     c.prepare();
@@ -184,9 +183,9 @@ fn p7_another_system_s_heartbeats_do_not_count() {
     assert_eq!(c.mode(), CopterMode::Guided);
 }
 
-/// Pitfall 8: No radio control.
+/// Pitfall 8: no radio control.
 #[test]
-fn p8_without_a_receiver_it_does_not_arm_by_default() {
+fn p8_does_not_arm_without_a_receiver_by_default() {
     let armed = |throttle: f32, radio: bool| {
         let mut c =
             Companion::new(SimulationConfig { radio, ..config(&[("FS_THR_ENABLE", throttle)]) });
@@ -199,10 +198,10 @@ fn p8_without_a_receiver_it_does_not_arm_by_default() {
     assert_eq!(armed(1.0, true), (true, false));
 }
 
-/// Pitfall 9: A jump of the vision: announced by the counter it is taken over, and the vehicle flies the
-/// difference; unannounced it is thrown away as long as it lasts less than the estimator's patience.
+/// Pitfall 9: jumps of the vision. With a new reset counter, the jump is adopted, and the vehicle flies the difference.
+/// Without, it is rejected as an outlier, unless it lasts longer than the estimator's timeout.
 #[test]
-fn p9_a_jump_with_a_new_counter_is_followed_and_one_without_is_not() {
+fn p9_follows_only_announced_jumps() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     c.set_once(GuidedMotion::Position(DVec3::new(0.0, 0.0, 1.2)), YawTarget::Angle(0.0));
     c.wait(3.0);
@@ -217,9 +216,9 @@ fn p9_a_jump_with_a_new_counter_is_followed_and_one_without_is_not() {
     assert!((c.p() - start + DVec3::X * 0.8).length() < 0.15, "{:?}", c.p());
 }
 
-/// The sources of the estimator decide: vision that is not among them is received and not used.
+/// The estimator's sources decide: vision that is not a source is received but not used.
 #[test]
-fn vision_counts_only_as_a_source() {
+fn vision_counts_only_if_it_is_a_source() {
     let mut c = Companion::new(config(&[("EK3_SRC1_POSXY", 3.0)]));
     c.wait(3.0);
     c.set_origin();

@@ -1,14 +1,14 @@
-//! What a real ArduCopter 4.8 did in software, flown through `serve` and `fly` with the airframe's parameter file, beside
-//! what this one does, within 15 %. One figure is not reached: the way of a vehicle whose runtime died, blind for seconds,
-//! differed by half between two such flights of the real one; this one's is at its lower end, as `docs/guides/failsafe.md`
-//! says.
+//! Comparison with a real ArduCopter 4.8 in software (SITL), flown through `serve` and `fly` with the airframe's
+//! parameter file: figures must agree within 15 %. One exception: the drift of a vehicle whose runtime died. Without
+//! vision for seconds, it differed by half between two such real flights; the simulated one is at the lower end, as
+//! `docs/guides/failsafe.md` states.
 
 use super::*;
 
-/// How far a figure may be from the real one's.
+/// Maximum relative difference from the real figures.
 const SHARE: f64 = 0.15;
 
-/// The airframe's file as it was then: without `PSC_JERK_*`.
+/// The airframe's parameters as in the real flights: without `PSC_JERK_*`.
 fn as_flown() -> SimulationConfig {
     let mut config = SimulationConfig::airframe();
     config.params.retain(|(name, _)| !name.starts_with("PSC_JERK"));
@@ -17,7 +17,7 @@ fn as_flown() -> SimulationConfig {
     config
 }
 
-/// How a vehicle came down.
+/// Figures of a descent.
 #[derive(Debug)]
 struct Descent {
     land_s: f64,
@@ -26,7 +26,7 @@ struct Descent {
 }
 
 impl Companion {
-    /// A vehicle at 1.2 m that flies at a speed.
+    /// A vehicle at 1.2 m that flies at constant speed.
     fn cruising(config: SimulationConfig, speed_mps: f64) -> Self {
         let mut c = Self::hovering(config, 1.2);
         c.fly(GuidedMotion::Velocity(DVec3::X * speed_mps), YawTarget::Angle(0.0));
@@ -35,7 +35,7 @@ impl Companion {
         c
     }
 
-    /// Watches it come down.
+    /// Waits for the descent and returns its figures.
     fn comes_down(&mut self) -> Descent {
         let start = self.p();
         let land_s = self.until(12.0, "LAND", |c| c.mode() == CopterMode::Land);
@@ -50,7 +50,7 @@ impl Companion {
         Descent { land_s, down_s, drift_m }
     }
 
-    /// The runtime holds after 0.15 s, and orders LAND after 0.5 s.
+    /// Poses are lost: the runtime holds after 0.15 s and orders LAND after 0.5 s.
     fn loses_its_poses(&mut self) {
         self.vision = false;
         self.wait(0.15);
@@ -59,7 +59,7 @@ impl Companion {
         self.set_mode(CopterMode::Land);
     }
 
-    /// Everything from the companion ends; its last heartbeat was so long ago.
+    /// The companion dies: setpoints, poses and heartbeats end, `silent_s` after its last heartbeat.
     fn dies(&mut self, silent_s: f64) {
         let sent = self.heartbeat_due_s();
         self.until(2.0, "a heartbeat", |c| c.heartbeat_due_s() > sent);
@@ -74,10 +74,10 @@ fn near(what: &str, here: f64, real: f64) {
     assert!((here - real).abs() <= SHARE * real, "{what}: {here:.2} here, {real:.2} really");
 }
 
-/// A runtime that is killed: setpoints, poses and heartbeats end. LAND by the ground station's failsafe, with its pause,
-/// and in mid-descent the position is lost.
+/// Killed runtime: setpoints, poses and heartbeats end. The ground station failsafe enters LAND with its pause, and the
+/// position is lost during the descent.
 #[test]
-fn a_dead_runtime_is_down_as_late_as_really() {
+fn landing_after_a_dead_runtime_matches_the_real_one() {
     for (speed_mps, land_s, down_s, drift_m) in
         [(0.36, 2.3, 9.2, 1.01), (1.0, 3.0, 9.7, 3.4), (2.5, 2.8, 9.5, 5.2)]
     {
@@ -93,7 +93,7 @@ fn a_dead_runtime_is_down_as_late_as_really() {
 
 /// The runtime orders LAND after half a second without poses: no pause.
 #[test]
-fn a_landing_that_was_ordered_is_down_as_soon_as_really() {
+fn an_ordered_landing_matches_the_real_one() {
     let mut c = Companion::cruising(as_flown(), 0.35);
     c.loses_its_poses();
     near("down", 0.5 + c.comes_down().down_s, 3.4);
@@ -105,9 +105,9 @@ fn a_landing_that_was_ordered_is_down_as_soon_as_really() {
     near("drift", (c.p() - start).truncate().length(), 3.7);
 }
 
-/// Radio control is lost: LAND after a second, with the pause.
+/// Lost radio control: LAND after a second, with the pause.
 #[test]
-fn a_lost_radio_is_down_as_late_as_really() {
+fn landing_after_lost_radio_control_matches_the_real_one() {
     let config = SimulationConfig {
         radio: true,
         params: [as_flown().params, vec![("FS_THR_ENABLE".into(), 3.0)]].concat(),
@@ -120,10 +120,10 @@ fn a_lost_radio_is_down_as_late_as_really() {
     near("down", found.down_s, 7.6);
 }
 
-/// A bridge's LAND that the ground station's failsafe comes into is held up by it until 4 s after LAND began; with
-/// heartbeats from the bridge it is not.
+/// The ground station failsafe delays a bridge's LAND until 4 s after LAND began. Heartbeats from the bridge prevent
+/// that.
 #[test]
-fn a_late_failsafe_holds_up_a_landing_under_way() {
+fn a_late_failsafe_delays_a_landing() {
     for (heartbeats, down_s) in [(false, 6.1), (true, 3.9)] {
         let mut c = Companion::cruising(as_flown(), 0.35);
         c.dies(0.0);
@@ -135,9 +135,9 @@ fn a_late_failsafe_holds_up_a_landing_under_way() {
     }
 }
 
-/// How late a velocity is answered: the time to half of a small step.
+/// Response time to a velocity: the time to half of a small step.
 #[test]
-fn a_velocity_is_answered_as_late_as_really() {
+fn response_time_to_a_velocity_matches_the_real_one() {
     let lag_s = |jerk: f32| {
         let mut config = as_flown();
         config.params.push(("PSC_JERK_NE".into(), jerk));
@@ -149,10 +149,10 @@ fn a_velocity_is_answered_as_late_as_really() {
     near("lag at jerk 20", lag_s(20.0), 0.30);
 }
 
-/// Steps from rest and back to it, at both jerks: until two thirds are flown, and the way to standstill. (4.7, setpoints at
-/// 50 Hz.)
+/// Velocity steps from and to rest, at both jerks: time to two thirds of the speed, and stopping distance (4.7,
+/// setpoints at 50 Hz).
 #[test]
-fn steps_and_stops_are_as_really() {
+fn steps_and_stops_match_the_real_ones() {
     for (jerk, speed_mps, until_s, stop_m) in [
         (5.0, 0.5, 1.02, 0.56),
         (5.0, 1.0, 1.11, 1.19),
@@ -175,14 +175,14 @@ fn steps_and_stops_are_as_really() {
         c.wait(6.0);
         println!("jerk {jerk}, {speed_mps} m/s");
         near("way", (c.p() - from).x, stop_m);
-        // A tenth of a second later with a small jerk, earlier with a great one.
+        // At most a tenth of a second later with a small jerk, or earlier with a large one.
         assert!((found_s - until_s).abs() < (0.2 * until_s).max(0.1), "{found_s} {until_s}");
     }
 }
 
-/// With the defaults of both, a velocity sent once stands after its three seconds and 0.7 more.
+/// With the defaults of both, a velocity sent once ends after its timeout of three seconds and 0.7 s of braking.
 #[test]
-fn a_velocity_sent_once_stands_as_really() {
+fn a_single_velocity_setpoint_ends_like_the_real_one() {
     let mut c = Companion::hovering(SimulationConfig::default(), 1.2);
     let start = c.p();
     c.set_once(GuidedMotion::Velocity(DVec3::X * 0.5), YawTarget::Angle(0.0));

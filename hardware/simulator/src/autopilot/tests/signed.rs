@@ -1,4 +1,4 @@
-//! A key given over USB, and what is accepted afterwards.
+//! Signing: a key set over USB, and the packets accepted afterwards.
 
 use super::*;
 use vizflyt_protocol::mavlink::dialect::SETUP_SIGNING_DATA;
@@ -18,7 +18,7 @@ fn setup_signing(c: &mut Companion, secret_key: [u8; 32], initial_timestamp: u64
     }));
 }
 
-/// Asks for GUIDED over a link, and whether it was obeyed.
+/// Sends a change of mode over a link. Returns whether it was accepted.
 fn is_accepted(
     c: &mut Companion,
     link: usize,
@@ -42,10 +42,10 @@ fn is_accepted(
 }
 
 #[test]
-fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
+fn with_a_key_accepts_only_its_owner_also_after_a_reboot() {
     let mut c = Companion::new(SimulationConfig::default());
     let key = SigningKey::new([7; 32]);
-    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "everybody, before");
+    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "without a key, everything is accepted");
     setup_signing(&mut c, [7; 32], START.units());
     assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Stabilize, None), "unsigned");
     let mut other = Signer::new(SigningKey::new([8; 32]), 0);
@@ -58,7 +58,7 @@ fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
     assert!(is_accepted(&mut c, 0, CopterMode::AltHold, None), "USB is trusted");
     assert_eq!(c.lab.report().mavlink_packets_refused, 2);
 
-    // What it sends is signed, with stamps that go on after a reboot.
+    // Sent packets are signed, with time stamps that continue after a reboot.
     let mut judge = Verifier::new(key);
     let mut received = |c: &mut Companion| {
         let mut buffer = [0; MAX_PACKET];
@@ -78,8 +78,8 @@ fn with_a_key_only_its_owner_is_obeyed_also_after_a_reboot() {
         c.lab.tick();
     }
     assert!(received(&mut c) > 10);
-    assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is kept");
+    assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is stored");
 
     setup_signing(&mut c, [0; 32], 0);
-    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends it");
+    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends signing");
 }
