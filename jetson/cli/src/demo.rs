@@ -1,4 +1,4 @@
-//! `vizflyt demo`: the built-in example in the simulated lab, and its page in the browser.
+//! `vizflyt demo`: flies a built-in example in the simulated lab and opens its web page.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -12,39 +12,41 @@ use vizflyt_runtime::args::LogArgs;
 use crate::lab::{self, LabArgs, LabFlight};
 use crate::plugins;
 
-/// Flies the simulated lab on this machine: scene, render server, runtime, plugin, vehicle, page.
+/// Fly a simulated drone on this machine: scene, vehicle, plugin and web page
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt demo                                  fly the forest and watch it in the browser
-  vizflyt demo --scene race --seed 3            windows, a gap and a hand, by the plugin race
+  vizflyt demo --scene race --seed 3            windows, a gap and a hand; flown by the plugin race
   vizflyt demo --headless --report out.json     no browser; figures as JSON; status 0 if finished
   vizflyt demo --through-bridge                 MAVLink goes through the vehicle's Wi-Fi bridge, emulated
-  vizflyt demo --localization natnet            the motion capture is an OptiTrack
-  vizflyt demo --localization tags              no motion capture: two simulated webcams see AprilTags
-  vizflyt demo --localization mat               nor webcams in the room: one under the vehicle sees tags on the floor
+  vizflyt demo --localization natnet            simulated OptiTrack motion capture
+  vizflyt demo --localization tags              no motion capture: two simulated webcams track AprilTags
+  vizflyt demo --localization mat               no motion capture: a webcam under the vehicle sees tags on the floor
   vizflyt demo --plugin ./my_plugin             your plugin instead of the example")]
 pub(crate) struct DemoArgs {
     #[command(flatten)]
     lab: LabArgs,
-    /// Plugin to fly: whatever `vizflyt fly` takes [default: race where a course ends with its last stage, else avoid].
+    /// Plugin to fly, as for `vizflyt fly`
+    ///
+    /// [default: race if the course ends at its last stage, else avoid]
     #[arg(long)]
     plugin: Option<String>,
-    /// Lands after this many seconds of flight; without it the course's own time limit counts. [s]
+    /// Maximum flight time; then the vehicle lands [s] [default: limit of the course]
     #[arg(long)]
     seconds: Option<f64>,
-    /// Takes off when `start` is pressed on the page, not by itself.
+    /// Take off when `start` is pressed on the page, not automatically
     #[arg(long)]
     wait: bool,
-    /// Writes the flight's figures to this file as JSON.
+    /// File for the results of the flight, as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     #[command(flatten)]
     log: LogArgs,
 }
 
-/// Runs the demo; success only if the flight finished.
+/// Runs the demo; returns success only if the flight finished.
 pub(crate) fn run(args: &DemoArgs, log_level: &str) -> Result<ExitCode> {
-    // The demo is the same on every computer: nobody's jetson.toml counts.
+    // The demo is the same on every computer, so jetson.toml is not read.
     let plugin = args.plugin.as_deref().unwrap_or(plugins::default_for(args.lab.scene()));
     let mut fly = vec![plugin.into(), "--no-config".into()];
     if let Some(seconds) = args.seconds {

@@ -1,4 +1,4 @@
-//! `vizflyt doctor`: finds what is wrong before it flies.
+//! `vizflyt doctor`: checks of the vehicle before flight.
 
 mod localization;
 
@@ -21,7 +21,7 @@ use vizflyt_server::web::Evidence;
 use crate::server_page::ServerPage;
 use crate::vehicle::AutopilotArgs;
 
-/// Finds what is wrong before it flies.
+/// Check a vehicle before flight: autopilot parameters, localization axes
 #[derive(Args, Debug)]
 pub(crate) struct DoctorArgs {
     #[command(subcommand)]
@@ -30,26 +30,26 @@ pub(crate) struct DoctorArgs {
 
 #[derive(Subcommand, Debug)]
 enum CheckCommand {
-    /// Compares the autopilot's parameters with this airframe's, and names what is dangerous in a room.
+    /// Compare the autopilot's parameters with those of this airframe
     ///
-    /// Ends with status 1 if something is.
+    /// Lists parameters that are dangerous in a room. Ends with status 1 if there are any.
     #[command(after_help = "Examples:
   vizflyt doctor vehicle                              the autopilot of jetson.toml, or udpin:0.0.0.0:14550
   vizflyt doctor vehicle --mavlink serial:/dev/ttyACM0
-  vizflyt doctor vehicle --arena arena.toml --apply   with the fence that the arena's room asks for
+  vizflyt doctor vehicle --arena arena.toml --apply   also write the fence of the arena's room
   vizflyt doctor vehicle --ceiling 2.8 --radius 4 --apply
   vizflyt doctor vehicle --arena arena.toml --report http://192.168.10.2:8080 --key KEY   for `vizflyt lab`")]
     Vehicle(VehicleArgs),
-    /// Prints where the vehicle is and which way it points, while somebody lifts it, pushes it forward and
-    /// turns it left; then which setting is wrong.
+    /// Check axes, units and angles of the localization by moving the vehicle by hand
     ///
-    /// With --mavlink, the delay of the poses is measured by the autopilot's gyroscope, too. Ends with status 1 if a
-    /// setting is wrong.
+    /// Prints position and heading while the vehicle is lifted, pushed forward and turned left;
+    /// then the settings that are wrong. With --mavlink, also measures the delay of the poses with
+    /// the autopilot's gyroscope. Ends with status 1 if a setting is wrong.
     #[command(after_help = "Examples:
   vizflyt doctor localization arena.toml
-  vizflyt doctor localization arena.toml --mavlink udpin:0.0.0.0:14550     with the delay, for latency_ms
+  vizflyt doctor localization arena.toml --mavlink udpin:0.0.0.0:14550     also measure the delay (latency_ms)
   vizflyt doctor localization --pose natnet:239.255.42.99:1511,up=y
-  vizflyt doctor localization --pose vicon --watch        only prints the pose, until Ctrl-C")]
+  vizflyt doctor localization --pose vicon --watch        only print the pose, until Ctrl-C")]
     Localization(localization::LocalizationArgs),
 }
 
@@ -57,28 +57,30 @@ enum CheckCommand {
 struct VehicleArgs {
     #[command(flatten)]
     autopilot: AutopilotArgs,
-    /// Parameters as they should be [default: hardware/airframe's, for the autopilot's version]
+    /// File of correct parameters [default: hardware/airframe's, by autopilot version]
     #[arg(long, value_name = "FILE")]
     airframe: Option<PathBuf>,
-    /// arena.toml whose room, from its spawn, the autopilot's fence shall hold
+    /// arena.toml for the autopilot's fence: its room, relative to its spawn
     #[arg(long, value_name = "FILE", conflicts_with_all = ["ceiling", "radius"])]
     arena: Option<PathBuf>,
-    /// Height at which the autopilot's fence shall end, in metres
+    /// Maximum height of the autopilot's fence [m]
     #[arg(long, value_name = "METRES", value_parser = metres)]
     ceiling: Option<f64>,
-    /// Distance from the take-off point at which it shall end, in metres
+    /// Radius of the autopilot's fence around the take-off point [m]
     #[arg(long, value_name = "METRES", value_parser = metres)]
     radius: Option<f64>,
-    /// Writes the right values, after showing them
+    /// Write the correct values, after printing them
     #[arg(long)]
     apply: bool,
-    /// The page of a server whose lab day gets what was found, as evidence: http://HOST:PORT
+    /// Page of a server that records the result in its lab day: http://HOST:PORT
     #[arg(long, value_name = "URL", conflicts_with = "apply")]
     report: Option<String>,
-    /// The vehicle's name on that server
+    /// Name of the vehicle on that server
     #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "report")]
     vehicle: String,
-    /// The instructor's key of that page, as in its address /enter?key=KEY; not needed on the server's own computer
+    /// Instructor's key of that page; not needed on the server's own computer
+    ///
+    /// The key is in the address /enter?key=KEY.
     #[arg(long, value_name = "KEY", requires = "report")]
     key: Option<String>,
 }
@@ -88,7 +90,7 @@ fn metres(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| format!("'{text}': give metres, from 1 to 100"))
 }
 
-/// Runs the checks.
+/// Runs `vizflyt doctor`.
 pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let args = match &args.check {
         CheckCommand::Vehicle(args) => args,
@@ -112,7 +114,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
     let tuned = found.iter().filter(|f| f.is_tuned).count();
     let wrong: Vec<_> = found.iter().filter(|f| f.has.is_some() && !f.is_tuned).collect();
     print_line(format!(
-        "{dangers} dangerous, {} other differences, {absent} parameters that it does not have, {tuned} tuned",
+        "{dangers} dangerous, {} other differences, {absent} missing parameters, {tuned} tuned",
         wrong.len() - dangers,
     ));
     if let Some(page) = &args.report {
@@ -137,7 +139,7 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
             }
             None => {
                 failed += 1;
-                print_line(format!("FAILED   {name}: no answer"));
+                print_line(format!("FAILED   {name}: no reply"));
             }
         }
     }
@@ -145,17 +147,17 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         failed += usize::from(!upload_fence(&mut session, arena)?);
     }
     if !values.is_empty() {
-        print_line("restart the autopilot, then look again: some parameters appear only then");
+        print_line("restart the autopilot, then repeat the check: some parameters appear only then");
     }
     Ok(status(failed))
 }
 
 impl VehicleArgs {
-    /// Brings what was found to a server's lab day.
+    /// Sends the result to the lab day of a server.
     fn bring(&self, page: &str, finding: Finding, fence: Vec<FenceParameter>) -> Result<()> {
         let vehicle = self.vehicle.clone();
         let by = format!("vizflyt doctor vehicle {}", env!("CARGO_PKG_VERSION"));
-        // Without an arena nobody knows what its fence asks for.
+        // Without an arena, the required fence is unknown.
         let fence = if self.arena.is_some() { fence } else { Vec::new() };
         let json = serde_json::to_string(&Evidence { vehicle, finding, fence, by })?;
         let server = ServerPage::at(page).with_key(self.key.as_deref());
@@ -163,7 +165,7 @@ impl VehicleArgs {
         let said = String::from_utf8_lossy(&body);
         if status != 200 {
             bail!(
-                "{page} does not take the evidence: {said} (HTTP status {status}); --vehicle and --key say whose it is"
+                "{page} rejected the evidence: {said} (HTTP status {status}); check --vehicle and --key"
             );
         }
         print_line(format!("reported {page}: {said}"));
@@ -206,7 +208,7 @@ impl VehicleArgs {
     }
 }
 
-/// Returns what was found in a few words, as evidence: dangers with their reason.
+/// Returns the result in a few words as evidence: dangerous parameters with their values.
 fn finding(firmware: &str, count: usize, found: &[Difference]) -> Finding {
     let dangers: Vec<_> = found.iter().filter(|f| f.danger.is_some()).collect();
     let others =
@@ -226,7 +228,7 @@ fn finding(firmware: &str, count: usize, found: &[Difference]) -> Finding {
     Finding::of(evidence, todo.as_slice())
 }
 
-/// Returns the autopilot's FENCE_*, and what is right for the arena.
+/// Returns the autopilot's FENCE_* parameters, with the correct values for the arena.
 fn fence_parameters(
     wanted: &BTreeMap<String, f64>,
     found: &[Difference],
@@ -235,14 +237,14 @@ fn fence_parameters(
     let parameter = |name: &&str| {
         let (&file, has) = (wanted.get(*name)?, has.get(*name).copied());
         let differs = found.iter().find(|difference| difference.name == **name);
-        // What does not differ is right.
+        // A parameter without a difference has the correct value.
         let right = differs.map_or_else(|| has.unwrap_or(file), |difference| difference.right);
         Some(FenceParameter { name: (*name).to_owned(), has, right })
     };
     FENCE.iter().filter_map(parameter).collect()
 }
 
-/// What makes the autopilot's fence.
+/// Parameters of the autopilot's fence.
 const FENCE: [&str; 6] = [
     "FENCE_ENABLE",
     "FENCE_ACTION",
@@ -251,10 +253,10 @@ const FENCE: [&str; 6] = [
     "FENCE_ALT_MIN",
     "FENCE_RADIUS",
 ];
-/// Dangers that evidence names.
+/// Maximum number of dangerous parameters that the evidence names.
 const NAMED: usize = 8;
 
-/// Uploads the arena's polygons; returns whether the autopilot accepts them.
+/// Uploads the arena's polygons; returns whether the autopilot accepted them.
 fn upload_fence(session: &mut ParamSession, arena: &ArenaConfig) -> Result<bool> {
     let info = arena.info();
     let fence = AutopilotFence::of(&info);
@@ -275,7 +277,7 @@ fn status(wrong: usize) -> ExitCode {
 
 fn line(difference: &Difference) -> String {
     let Difference { name, has, right, danger, is_tuned } = difference;
-    // As MAVLink carries it: 0.135, not 0.13500000536441803.
+    // Printed with the precision of MAVLink: 0.135, not 0.13500000536441803.
     match (has.map(|has| has as f32), danger) {
         (Some(has), _) if *is_tuned => {
             format!("tuned    {name} is {has}, and stays; tuning begins at {right}")

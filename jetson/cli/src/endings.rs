@@ -1,5 +1,5 @@
-//! One flight has one end: whatever happens in it, and however late each side receives the other's events,
-//! runtime, server, page, crash card, leaderboard and grade report the same.
+//! One flight has one end: for all occurrences and delays of events, runtime, server, page, crash
+//! card, leaderboard and grade report the same end.
 
 use glam::{DQuat, DVec3};
 use proptest::prelude::*;
@@ -21,7 +21,7 @@ use vizflyt_server::flights::vehicle::VehicleFlight;
 const AHEAD_NS: u64 = 5_000_000_000;
 const TICK_NS: u64 = 20_000_000;
 
-/// An occurrence in flight, as the side that observes it first sees it.
+/// An occurrence in flight, on the side that observes it first.
 #[derive(Clone, Debug)]
 enum Occurrence {
     Server(Box<EventKind>),
@@ -63,12 +63,12 @@ fn touch() -> EventKind {
     EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps })
 }
 
-/// The end of a flight, as each side reports it.
+/// End of a flight, as each side reports it.
 #[derive(Debug)]
 struct ReportedEnds {
     runtime: EndReason,
     server: Option<EndReason>,
-    /// Written to leaderboard and crash card.
+    /// End on leaderboard and crash card.
     verdict: (OutcomeKind, String),
     grade: EndReason,
 }
@@ -83,8 +83,8 @@ impl ReportedEnds {
     }
 }
 
-/// Flies until the vehicle has landed and both sides have received every event; `delays_ms` are to the runtime and
-/// to the server.
+/// Flies until the vehicle has landed and both sides have received all events. `delays_ms`: delay
+/// of events to the runtime and to the server.
 fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds {
     let arena = arena();
     let info = arena.info();
@@ -111,7 +111,7 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
         response: Some(Response::smooth(0.2, 80.0)),
     };
     let (mut p_m, mut answer, mut poses) = (DVec3::new(1.0, 2.0, 0.0), Some(Setpoint::Hold), true);
-    // Each is a nanosecond off the runtime's ticks, and apart from the others.
+    // Each occurrence is a few nanoseconds off the runtime's ticks, and differs from the others.
     let mut waiting: Vec<(u64, Occurrence)> = occurrences
         .iter()
         .zip(1..)
@@ -187,7 +187,7 @@ fn fly(occurrences: &[(u64, Occurrence)], delays_ms: (u64, u64)) -> ReportedEnds
                 link.mode = CopterMode::Land as u32;
                 p_m.z -= 0.02;
             }
-            // A pilot lands it as well.
+            // A pilot may land the vehicle as well.
             Goal::Prepare if link.armed && p_m.z > 0.0 => p_m.z -= 0.02,
             Goal::Land | Goal::Prepare => link.armed = false,
             Goal::Fly => {}
@@ -270,7 +270,7 @@ fn all_sides_report_a_landing_for_a_touch_after_land_was_pressed() {
         let reported =
             fly(&landed.map(|(ms, kind)| (ms, Occurrence::Server(Box::new(kind)))), delays_ms);
         reported.check(&EndReason::LandButton);
-        // Pressed too late, it is a collision.
+        // If LAND is pressed after the touch, the flight ends with a collision.
         let touched = [(4001, EventKind::Land), (4000, touch())];
         let reported =
             fly(&touched.map(|(ms, kind)| (ms, Occurrence::Server(Box::new(kind)))), delays_ms);

@@ -1,4 +1,4 @@
-//! `vizflyt lab`: a lab day of a running server, its checklist in words and its report as a PDF.
+//! `vizflyt lab`: lab day of a running server, with its checklist as text and its report as a PDF.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -11,40 +11,45 @@ use vizflyt_process::print_line;
 
 use crate::server_page::ServerPage;
 
-/// A lab day: the checklist before flights, and the queue of teams.
+/// Show a lab day: checklist before flights, and the queue of teams
 ///
-/// The checklist is a page of the server, /lab: localization live and its axes, network, clocks, camera latency,
-/// battery, the autopilot's parameters, the fence in three places, STOP tried, each with its evidence and time; a
-/// queue in which teams book; the order of take-off and the separation of several vehicles, and one STOP for all.
-/// This prints where it is, and how it stands. Ends with status 1 if a check is not done, failed or outdated.
+/// The checklist is the page /lab of the server. It covers localization and its axes, network,
+/// clocks, camera latency, battery, autopilot parameters, the fence in three places and STOP, each
+/// with evidence and time. The page also has the queue in which teams book, the order of take-off,
+/// the separation of several vehicles, and one STOP for all.
+///
+/// This command prints the address of the page and the state of the checks. It ends with status 1
+/// if a check is open, failed or outdated.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt lab                                       where the page is, what is still to do, and who waits
-  vizflyt lab report --out monday.pdf               every check with evidence and time, and the queue
+  vizflyt lab                                       print the page's address, open checks, and the queue
+  vizflyt lab report --out monday.pdf               write checks with evidence and time, and the queue
   vizflyt lab --page http://192.168.10.2:8080 --key KEY   from another computer
-  vizflyt doctor vehicle --arena arena.toml --report http://127.0.0.1:8080   brings the autopilot's parameters")]
+  vizflyt doctor vehicle --arena arena.toml --report http://127.0.0.1:8080   report the autopilot's parameters")]
 pub(crate) struct LabDayArgs {
     #[command(subcommand)]
     command: Option<LabDayCommand>,
-    /// The server's page
+    /// Address of the server's page
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080", global = true)]
     page: String,
-    /// The instructor's key, as in the address /enter?key=KEY; not needed on the server's own computer
+    /// Instructor's key; not needed on the server's own computer
+    ///
+    /// The key is in the address /enter?key=KEY.
     #[arg(long, value_name = "KEY", global = true)]
     key: Option<String>,
 }
 
 #[derive(Subcommand, Debug)]
 enum LabDayCommand {
-    /// Writes the day as a PDF: every check with evidence and time, the queue, what happened.
+    /// Write the lab day as a PDF: checks with evidence and time, queue, events
     Report {
-        /// The PDF
+        /// PDF file
         #[arg(short, long, value_name = "FILE.pdf", default_value = "lab-day.pdf")]
         out: PathBuf,
     },
 }
 
-/// What `GET /api/lab` says, as far as it is printed.
+/// Response of `GET /api/lab`, only the printed fields.
 #[derive(Debug, Deserialize)]
 struct Day {
     arena: String,
@@ -70,7 +75,7 @@ struct Booking {
     place: Option<usize>,
 }
 
-/// Prints how the day stands, or writes its report.
+/// Prints the state of the lab day, or writes its report.
 pub(crate) fn run(args: &LabDayArgs) -> Result<ExitCode> {
     let page = ServerPage::at(&args.page).with_key(args.key.as_deref());
     if let Some(LabDayCommand::Report { out }) = &args.command {
@@ -80,7 +85,7 @@ pub(crate) fn run(args: &LabDayArgs) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let day: Day = serde_json::from_slice(&ask(&page, args, "/api/lab")?)
-        .context("the server's answer is not understood: another version?")?;
+        .context("cannot parse the server's reply; does it have another version?")?;
     print_line(format!("page     {}/lab", args.page.trim_end_matches('/')));
     print_line(words(&day).trim_end());
     Ok(if day.checks.iter().all(|check| check.state == "ok") {
@@ -96,19 +101,19 @@ fn ask(page: &ServerPage<'_>, args: &LabDayArgs, path: &str) -> Result<Vec<u8>> 
         200 => Ok(body),
         401 | 403 => {
             let todo = match args.key {
-                Some(_) => "the --key that was given is another: page-keys.toml has it",
+                Some(_) => "the --key is wrong; the right one is in page-keys.toml",
                 None => "give --key",
             };
-            bail!("{} opens this for its instructor alone: {todo}", args.page)
+            bail!("{} shows this only to its instructor: {todo}", args.page)
         }
         404 => {
-            bail!("{} has no lab day: it is no VizFlyt server, or one from before it", args.page)
+            bail!("{} has no lab day: it is not a VizFlyt server, or an older version", args.page)
         }
         status => bail!("{}: {} (HTTP status {status})", args.page, String::from_utf8_lossy(&body)),
     }
 }
 
-/// Returns the day in words: each check, then who waits.
+/// Returns the lab day as text: each check, then the queue.
 fn words(day: &Day) -> String {
     let mut text = format!("arena    {}\n", day.arena);
     for check in &day.checks {
@@ -140,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_day_in_words() {
+    fn prints_a_lab_day() {
         let day: Day = serde_json::from_str(
             r#"{"arena": "hall", "more": 1, "checks": [
                 {"title": "net closed", "vehicle": "", "state": "ok",

@@ -1,5 +1,5 @@
-//! `vizflyt leaderboard`: teams, runs and standings of the lab's flights, from the database that `vizflyt serve`
-//! writes; and signed grades, which are added here.
+//! `vizflyt leaderboard`: teams, runs and standings of the lab's flights, from the database that
+//! `vizflyt serve` writes. Also adds signed grades.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -14,19 +14,21 @@ use vizflyt_server::flights::leaderboard::{
     standings, write_csv,
 };
 
-/// Shows who flew what how well, keeps the teams, and exports the runs.
+/// Show standings, manage teams, and export runs
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt leaderboard                                who leads on each course
-  vizflyt leaderboard team add wasps                 prints the token by which the team checks in
+  vizflyt leaderboard                                show the standings of each course
+  vizflyt leaderboard team add wasps                 add a team and print its token for check-in
   vizflyt leaderboard export --course race runs.csv
-  vizflyt leaderboard team export wasps wasps.json   all that is kept of a team; `team erase wasps` erases it
-  vizflyt leaderboard archive autumn.zip             a term in one file
-  vizflyt leaderboard add grade.json --team wasps    a grade of `vizflyt grade`, if it is as it was signed
+  vizflyt leaderboard team export wasps wasps.json   export all data of a team; `team erase wasps` deletes it
+  vizflyt leaderboard archive autumn.zip             archive a term in one file
+  vizflyt leaderboard add grade.json --team wasps    add a grade of `vizflyt grade` if its signature is valid
   vizflyt leaderboard --database postgres://user:password@db.example.edu/vizflyt")]
 pub(crate) struct LeaderboardArgs {
-    /// A file, or postgres://USER:PASSWORD@HOST/NAME
-    /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite]
+    /// Database: a file, or postgres://USER:PASSWORD@HOST/NAME
+    ///
+    /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or
+    /// ~/.local/share/vizflyt/leaderboard.sqlite]
     #[arg(long, value_name = "FILE|URL", global = true)]
     database: Option<Database>,
     #[command(subcommand)]
@@ -35,34 +37,34 @@ pub(crate) struct LeaderboardArgs {
 
 #[derive(Subcommand, Debug)]
 enum LeaderboardCommand {
-    /// Who leads, and the newest runs; what `vizflyt leaderboard` alone shows.
+    /// Show the standings and the newest runs; the default command
     Show(ShowArgs),
-    /// Adds and retires teams.
+    /// Add, list, retire, export and erase teams
     Team {
         #[command(subcommand)]
         command: TeamCommand,
     },
-    /// Writes the runs as CSV.
+    /// Write the runs as CSV
     Export(ExportArgs),
-    /// Writes a term into one file: every team's records, all runs.
+    /// Archive a term in one file: records of all teams, all runs
     Archive {
-        /// A ZIP
+        /// ZIP file
         #[arg(value_name = "FILE.zip")]
         out: PathBuf,
     },
-    /// Adds a signed grade of `vizflyt grade`; once, and only as it was signed.
+    /// Add a signed grade of `vizflyt grade`, if its signature is valid
     Add(AddArgs),
 }
 
 #[derive(Args, Debug)]
 struct AddArgs {
-    /// The grade: the whole, as `vizflyt grade -o` or `vizflyt grade merge -o` wrote it
+    /// Complete grade, as `vizflyt grade -o` or `vizflyt grade merge -o` wrote it
     #[arg(value_name = "GRADE.json")]
     file: PathBuf,
-    /// Whose it is
+    /// Name of the team
     #[arg(long, value_name = "NAME")]
     team: String,
-    /// Whose signature counts: a public key or a file with one [default: this computer's own]
+    /// Public key of the signature, or a file with one [default: this computer's key]
     #[arg(long, value_name = "KEY")]
     key: Option<String>,
     /// Folder of this computer's own key [default: ~/.config/vizflyt]
@@ -72,41 +74,41 @@ struct AddArgs {
 
 #[derive(Args, Debug, Default)]
 struct ShowArgs {
-    /// Only this course: the arena's name, or of grades the project's
+    /// Only this course: name of the arena, or for grades, of the project
     #[arg(long)]
     course: Option<String>,
-    /// One JSON object instead of tables
+    /// Print one JSON object instead of tables
     #[arg(long)]
     json: bool,
 }
 
 #[derive(Subcommand, Debug)]
 enum TeamCommand {
-    /// Adds a team and prints its token, which is shown this once.
+    /// Add a team and print its token, which is shown only once
     Add {
-        /// Up to 40 characters
+        /// Name of the team, up to 40 characters
         name: String,
     },
-    /// Lists the teams.
+    /// List the teams
     List,
-    /// Takes a team's token away; its runs stay.
+    /// Revoke a team's token; its runs stay
     Retire {
-        /// Its name
+        /// Name of the team
         name: String,
     },
-    /// Writes all that is kept of a team: runs with their verdicts, signed grades.
+    /// Export all data of a team: runs with their verdicts, signed grades
     Export {
-        /// Its name
+        /// Name of the team
         name: String,
-        /// Where to write; standard output without it
+        /// Output file [default: standard output]
         #[arg(value_name = "FILE.json")]
         out: Option<PathBuf>,
     },
-    /// Erases a team with its runs and grades, for good.
+    /// Erase a team with its runs and grades, permanently
     Erase {
-        /// Its name
+        /// Name of the team
         name: String,
-        /// Erases; without it, only says what there is
+        /// Erase; without this option, only show what would be erased
         #[arg(long)]
         yes: bool,
     },
@@ -114,15 +116,15 @@ enum TeamCommand {
 
 #[derive(Args, Debug)]
 struct ExportArgs {
-    /// Only this course: the arena's name
+    /// Only this course: name of the arena
     #[arg(long)]
     course: Option<String>,
-    /// Where to write; standard output without it
+    /// Output file [default: standard output]
     #[arg(value_name = "FILE")]
     out: Option<PathBuf>,
 }
 
-/// Does what is asked.
+/// Runs `vizflyt leaderboard`.
 pub(crate) fn run(args: &LeaderboardArgs) -> Result<ExitCode> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -136,11 +138,11 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
     let database = match &args.database {
         Some(database) => database.clone(),
         None => Database::File(Database::default_file().context(
-            "there is no home folder to keep the leaderboard in; name a file with --database",
+            "no home folder for the leaderboard; give a file with --database",
         )?),
     };
     if let Some(LeaderboardCommand::Add(add)) = &args.command {
-        // What does not count opens no database.
+        // An invalid grade does not open a database.
         let grade = verified(&add.file, add.key.as_deref(), add.keys.as_deref())?;
         let entry = entry(&grade, &add.team)?;
         let board = Leaderboard::open(&database).await?;
@@ -152,7 +154,7 @@ async fn answer(args: &LeaderboardArgs) -> Result<()> {
         LeaderboardCommand::Show(show) => self::show(&board, show).await,
         LeaderboardCommand::Team { command } => team(&board, command).await,
         LeaderboardCommand::Archive { out } => archive(&board, out).await,
-        // Dealt with above.
+        // Handled above.
         LeaderboardCommand::Add(_) => Ok(()),
         LeaderboardCommand::Export(export) => {
             let runs = board.runs(export.course.as_deref()).await?;
@@ -175,7 +177,7 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
     match command {
         TeamCommand::Add { name } => {
             let token = board.add_team(name).await?;
-            print_line(format!("team '{name}' is added; its token, shown this once:"));
+            print_line(format!("added team '{name}'; its token, shown only once:"));
             print_line(&token);
             print_line("the team checks in with it on the server's page before it flies");
         }
@@ -194,7 +196,7 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
         }
         TeamCommand::Retire { name } => {
             board.retire_team(name).await?;
-            print_line(format!("the token of team '{name}' opens nothing any more; its runs stay"));
+            print_line(format!("the token of team '{name}' is revoked; its runs stay"));
         }
         TeamCommand::Export { name, out } => {
             let text = records_text(board, name).await?;
@@ -204,20 +206,21 @@ async fn team(board: &Leaderboard, command: &TeamCommand) -> Result<()> {
             };
             std::fs::write(path, text)
                 .with_context(|| format!("cannot write {}", path.display()))?;
-            print_line(format!("all that is kept of '{name}' is in {}", path.display()));
+            print_line(format!("all data of '{name}' written to {}", path.display()));
         }
         TeamCommand::Erase { name, yes: false } => {
             let records = board.records_of(name).await?;
             print_line(format!(
-                "'{name}' has {} runs and {} grades here; `--yes` erases them for good. Logs, reports and hand-ins are files \
-                 of their own: docs/guides/records.md",
+                "'{name}' has {} runs and {} grades here; `--yes` erases them permanently. \
+                 Logs, reports and submissions are separate \
+                 files: docs/guides/records.md",
                 records.runs.len(),
                 records.grades.len()
             ));
         }
         TeamCommand::Erase { name, yes: true } => {
             let Erased { runs, grades } = board.erase_team(name).await?;
-            print_line(format!("team '{name}', {runs} runs and {grades} grades are erased"));
+            print_line(format!("team '{name}', {runs} runs and {grades} grades erased"));
         }
     }
     Ok(())
@@ -227,7 +230,8 @@ async fn records_text(board: &Leaderboard, team: &str) -> Result<String> {
     Ok(serde_json::to_string_pretty(&board.records_of(team).await?)?)
 }
 
-/// Writes a term: `runs.csv`, and a file for each team, numbered, as a name need not be one of a file.
+/// Archives a term: `runs.csv`, and a numbered file for each team, because a team's name may be
+/// invalid as a file name.
 async fn archive(board: &Leaderboard, out: &Path) -> Result<()> {
     let mut files = Files::new();
     let runs = board.runs(None).await?;
@@ -250,12 +254,12 @@ async fn archive(board: &Leaderboard, out: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Returns what the leaderboard keeps of a grade.
+/// Returns the leaderboard's entry for a grade.
 fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
     if let Some(shard) = grade.shard {
         let (index, count) = (shard.index, shard.count);
         anyhow::bail!(
-            "this is part {index} of {count} of a grade; `vizflyt grade merge` makes the whole"
+            "this is part {index} of {count} of a grade; combine all parts with `vizflyt grade merge`"
         );
     }
     ensure!(!grade.runs.is_empty(), "this grade has no flights");
@@ -288,7 +292,7 @@ fn entry(grade: &Grade, team: &str) -> Result<GradeEntry> {
 
 async fn add(board: &Leaderboard, entry: &GradeEntry, document: &str) -> Result<()> {
     board.add_grade(entry, document).await?;
-    print_line(format!("the grade {} of team '{}' is added", entry.hash, entry.team));
+    print_line(format!("added grade {} of team '{}'", entry.hash, entry.team));
     let boards = grade_boards(&board.grades().await?);
     let own = boards.iter().filter(|board| {
         (&board.project, &board.level, &board.conditions)
@@ -338,8 +342,8 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
     }
     if courses.is_empty() && graded.is_empty() {
         print_line(match &args.course {
-            Some(course) => format!("nobody has flown '{course}' yet"),
-            None => format!("nobody has flown yet; runs are kept in {}", board.database()),
+            Some(course) => format!("no runs on '{course}' yet"),
+            None => format!("no runs yet; runs are stored in {}", board.database()),
         });
     }
     for course in courses {
@@ -355,7 +359,7 @@ async fn show(board: &Leaderboard, args: &ShowArgs) -> Result<()> {
         let of_course: Vec<&Run> = runs.iter().filter(|run| run.course == course).collect();
         let nobodys = of_course.iter().filter(|run| run.team.is_none()).count();
         print_line(format!(
-            "{course}: {} runs, {nobodys} of them by nobody who had checked in",
+            "{course}: {} runs, {nobodys} of them without a checked-in team",
             of_course.len()
         ));
     }

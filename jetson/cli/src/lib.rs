@@ -1,14 +1,14 @@
-//! `vizflyt`: the one command people type. Each subcommand is a library of its own; this file only
-//! reads the command line and starts one.
+//! The command line of `vizflyt`. Each subcommand is a separate module or crate; this file parses
+//! the command line and starts one.
 
-// `println!` panics where its reader has gone, as `head` does.
+// `println!` panics if the reader of the pipe has closed it, as `head` does.
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 
 mod bench;
 mod bridge;
 #[cfg(feature = "crazyflie")]
 mod crazyflie;
-// What of it needs no radio is tested in every build.
+// The part that needs no radio is tested in every build.
 #[cfg(all(test, not(feature = "crazyflie")))]
 #[path = "crazyflie/estimate.rs"]
 mod crazyflie_estimate;
@@ -47,79 +47,81 @@ use vizflyt_studio::{arena, dataset, evaluate, export, scene};
 #[command(version, propagate_version = true)]
 #[command(after_help = "Start here:
   vizflyt demo                       fly a simulated drone through a forest and watch it in the browser
-  vizflyt new first                  a plugin of your own that flies
+  vizflyt new first                  make a plugin that flies
   vizflyt fly first                  fly it in the simulated lab")]
 struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// What to log on standard error: error, warn, info, debug, trace; or a filter as
-    /// `vizflyt_runtime=debug`. Without it: info, and warn in `demo` and `fly`.
+    /// Log level of standard error: error, warn, info, debug, trace, or a filter
+    ///
+    /// A filter is for example `vizflyt_runtime=debug`. Default: info; in commands that print their
+    /// own report (`demo`, `fly`, `grade`, ...) warn.
     #[arg(long, global = true, value_name = "LEVEL")]
     log_level: Option<String>,
 }
 
 #[derive(Subcommand, Debug)]
-#[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
+#[allow(clippy::large_enum_variant)] // Why: only one value exists, for a short time.
 enum Command {
-    /// Everything on this machine: generated scene, simulated vehicle, example plugin, page.
+    /// Fly a simulated drone on this machine: scene, vehicle, plugin and web page
     Demo(demo::DemoArgs),
-    /// Makes a folder with a plugin that flies.
+    /// Make a folder with a plugin that flies
     New(new::NewArgs),
-    /// Flies a plugin: in the simulated lab, or in the real one if it is configured.
+    /// Fly a plugin in the simulated lab, or in the real one if it is configured
     Fly(fly::FlyArgs),
-    /// Flies a project's course in lock-step, once for each seed, and scores the plugin.
+    /// Fly a course once per seed in lock-step, and score the plugin
     Grade(vizflyt_grading::GradeArgs),
-    /// Packs a plugin's folder as a team hands it in.
+    /// Pack the folder of a plugin for submission
     Submit(class::SubmitArgs),
-    /// Grades every team of a class, and makes one table of all.
+    /// Grade every team of a class, and write one table of results
     GradeClass(class::ClassArgs),
-    /// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
+    /// Run courses for reinforcement learning; started by Python's `vizflyt.Env`
     Gym(vizflyt_gym::GymArgs),
-    /// The render server: pose in, RGB-D out, page and events.
+    /// Run the render server: poses in, RGB-D images out, web page and events
     Serve(vizflyt_server::ServeArgs),
-    /// Pairs this computer with a render server, once, by a short code.
+    /// Pair this computer with a render server by a short code
     Pair(pair::PairArgs),
     Password(password::PasswordArgs),
-    /// Finds what is wrong before it flies: the autopilot's parameters, the localization's axes.
+    /// Check a vehicle before flight: autopilot parameters, localization axes
     Doctor(doctor::DoctorArgs),
     #[cfg(feature = "crazyflie")]
     Crazyflie(crazyflie::CrazyflieArgs),
     #[cfg(feature = "ros2")]
     Ros2(vizflyt_ros2::Ros2Args),
-    /// Sets up the vehicle: the key for MAVLink signing.
+    /// Set up the vehicle: key for MAVLink signing
     Vehicle(vehicle::VehicleArgs),
     Lab(lab_day::LabDayArgs),
-    /// Teams, runs and standings of the lab's flights.
+    /// Show teams, runs and standings of the lab's flights
     Leaderboard(leaderboard::LeaderboardArgs),
-    /// The simulated lab: vehicle, autopilot, motion capture.
+    /// Run the simulated lab: vehicle, autopilot, motion capture
     Sim(vizflyt_simulator::SimArgs),
-    /// The Wi-Fi bridge of a vehicle: emulated here, or configured over the network.
+    /// Emulate, inspect and configure the Wi-Fi bridge of a vehicle
     Bridge(bridge::BridgeArgs),
-    /// Makes, inspects and renders scenes.
+    /// Make, inspect, edit and render scenes
     Scene(scene::SceneArgs),
     Arena(arena::ArenaArgs),
     Tags(tags::TagsArgs),
-    /// Measures how fast this machine renders.
+    /// Measure this machine: rendering, streaming, decoding, bridge latency
     Bench(bench::BenchArgs),
-    /// Latency of images, stage by stage, and why images were skipped.
+    /// Show the latency of images by stage, and why images were skipped
     Stats(stats::StatsArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
     Dataset(Box<dataset::DatasetArgs>),
-    /// Feeds a flight's recorded images to a plugin and reports where its answers differ.
+    /// Feed recorded images to a plugin, and report where its answers differ
     Replay(replay::ReplayArgs),
-    /// Runs a built-in example plugin; started by `vizflyt fly`.
+    /// Run a built-in example plugin; started by `vizflyt fly`
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
-    /// The last process of a flight to die; started by `vizflyt fly`.
+    /// Land the vehicle if the runtime dies; started by `vizflyt fly`
     #[command(hide = true, name = vizflyt_guardian::SUBCOMMAND)]
     Guardian {
-        /// Where the autopilot is.
+        /// Address of the autopilot
         mavlink: String,
     },
 }
 
-/// Reads the command line, runs what it says, and returns the exit status.
+/// Parses the command line, runs the command and returns the exit status.
 pub fn main() -> ExitCode {
     quiet_mesa();
     let cli = match command_line() {
@@ -131,11 +133,12 @@ pub fn main() -> ExitCode {
         }
     };
     let log_level = cli.log_level.unwrap_or_else(|| match cli.command {
-        // These print their own report; logs would bury it.
+        // These commands print their own report; logs would hide it.
         Command::Demo(_) | Command::Fly(_) | Command::Replay(_) | Command::Grade(_) => {
             "warn".to_owned()
         }
-        // What they print is the result; a load of seconds still shows its progress.
+        // These print results on standard output; loading a scene takes seconds and still shows
+        // progress.
         Command::Bench(_) | Command::Dataset(_) | Command::Gym(_) => {
             "warn,vizflyt_server::scene=info".to_owned()
         }
@@ -156,8 +159,8 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Reads the command line, with what the file of `serve --config` adds; `None` if the settings were
-/// only to be printed.
+/// Parses the command line and adds the settings of `serve --config`. Returns `None` if the
+/// settings were only printed (`--print-config`).
 fn command_line() -> Result<Option<Cli>> {
     let mut matches = Cli::command().get_matches();
     if let Some(("serve", serve)) = matches.subcommand() {
@@ -209,12 +212,13 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
     }
 }
 
-/// Keeps one of Mesa's Vulkan layers from looking for a screen where there is none: it would print
-/// `error: XDG_RUNTIME_DIR is invalid` at every start, and we render to memory.
+/// Stops a Vulkan layer of Mesa from looking for a display: without one it prints `error:
+/// XDG_RUNTIME_DIR is invalid` at every start. Rendering goes to memory and needs no display.
 #[allow(unsafe_code, reason = "sets an environment variable before any thread starts")]
 fn quiet_mesa() {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
-        // SAFETY: the first statement of `main`: no other thread reads the environment yet.
+        // SAFETY: this is the first statement of `main`, so no other thread reads the environment
+        // yet.
         unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     }
 }
@@ -223,11 +227,11 @@ fn quiet_mesa() {
 fn start_log(filter: &str) -> Result<()> {
     let printed = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
-        // No colours into files and pipes.
+        // No colours in files and pipes.
         .with_ansi(std::io::stderr().is_terminal())
-        // Told on standard error itself, which may be what is gone.
+        // Internal errors are printed to standard error, which may itself be closed.
         .log_internal_errors(false);
-    // What wgpu says of a card that works; errors reach the user as the renderer's.
+    // wgpu logs messages about cards that work; the renderer reports real errors to the user.
     let filter = format!("wgpu_core::instance=error,wgpu_hal=error,{filter}").parse::<Targets>()?;
     tracing_subscriber::registry().with(printed).with(filter).init();
     Ok(())

@@ -1,4 +1,5 @@
-//! `vizflyt`. All of it is in the library, which compiles while those that it links still do.
+//! The `vizflyt` program. All code is in the library, which compiles in parallel with its
+//! dependencies.
 
 use std::process::ExitCode;
 

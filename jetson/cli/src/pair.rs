@@ -1,4 +1,4 @@
-//! `vizflyt pair`: makes this computer and a server known to each other, once, by a short code.
+//! `vizflyt pair`: exchanges identities between this computer and a server, once, by a short code.
 
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -12,31 +12,31 @@ use vizflyt_runtime::args::ServerAddress;
 use vizflyt_trust::KeysFolder;
 use vizflyt_trust::pairing::Code;
 
-/// Pairs this computer with a render server, once.
+/// Pair this computer with a render server by a short code
 ///
-/// On the server's page, `pair a computer` shows a code of six digits; without a page,
-/// `vizflyt serve --pair` prints one.
+/// On the server's page, `pair a computer` shows a code of six digits. `vizflyt serve --pair`
+/// prints one in the terminal.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt pair 192.168.10.2:4433                      asks for the code
+  vizflyt pair 192.168.10.2:4433                      prompts for the code
   vizflyt pair lab:4433 --code 123456 --name jetson-3")]
 pub(crate) struct PairArgs {
-    /// The server
+    /// Address of the server
     #[arg(value_name = "HOST:PORT")]
     server: ServerAddress,
-    /// The code that the server shows; asked for without it
+    /// Code that the server shows; without this option the command prompts for it
     #[arg(long, value_name = "DIGITS")]
     code: Option<Code>,
-    /// What the server shall call this computer [default: its host name]
+    /// Name of this computer on the server [default: its host name]
     #[arg(long)]
     name: Option<String>,
     /// Folder of this computer's key and of servers.toml
+    ///
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
 }
 
-/// Pairs.
 pub(crate) fn run(args: &PairArgs) -> Result<ExitCode> {
     let folder = KeysFolder::open(args.keys.as_deref())?;
     let code = match args.code {
@@ -65,7 +65,7 @@ fn ask() -> Result<Code> {
         let mut out = std::io::stdout();
         write!(out, "code: ")
             .and_then(|()| out.flush())
-            .context("cannot ask for the code; pass --code")?;
+            .context("cannot prompt for the code; pass --code")?;
     }
     let mut line = String::new();
     std::io::stdin().read_line(&mut line).context("cannot read the code; pass --code")?;

@@ -10,27 +10,29 @@ use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
 use vizflyt_process::{print_error, print_line};
 use vizflyt_trust::KeysFolder;
 
-/// Sets the password by which the instructor logs in on the server's page.
+/// Set the password with which the instructor logs in on the server's page
 ///
-/// Run it on the server's computer. A server that runs takes the new password at once, and whoever had
-/// logged in with the former one is out.
+/// Run this command on the server's computer. A running server uses the new password immediately
+/// and ends all sessions of the old one.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt password                        asks for it twice
-  pass show lab | vizflyt password        takes the first line of standard input")]
+  vizflyt password                        prompts for the password twice
+  pass show lab | vizflyt password        reads the first line of standard input")]
 pub(crate) struct PasswordArgs {
-    /// Folder of the server's keys [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
+    /// Folder of the server's keys
+    ///
+    /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
 }
 
-/// Sets it.
+/// Sets the password.
 pub(crate) fn run(args: &PasswordArgs) -> Result<ExitCode> {
     let folder = KeysFolder::open(args.keys.as_deref())?;
     let password = if std::io::stdin().is_terminal() {
         let first = ask("password: ")?;
         if ask("once more: ")? != first {
-            bail!("these were two different passwords; try again");
+            bail!("the two passwords differ; try again");
         }
         first
     } else {
@@ -41,10 +43,10 @@ pub(crate) fn run(args: &PasswordArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Asks at the terminal, which shows nothing of what is typed.
+/// Prompts at the terminal without echo.
 fn ask(question: &str) -> Result<String> {
     let mut error = std::io::stderr();
-    write!(error, "{question}").and_then(|()| error.flush()).context("cannot ask")?;
+    write!(error, "{question}").and_then(|()| error.flush()).context("cannot prompt")?;
     let hidden = Hidden::begin()?;
     let password = line();
     drop(hidden);
@@ -54,22 +56,22 @@ fn ask(question: &str) -> Result<String> {
 
 fn line() -> Result<String> {
     let mut line = String::new();
-    // Bounded: a file that is no password must not fill the memory.
+    // Bounded: a wrong file on standard input must not fill the memory.
     let mut input = std::io::stdin().lock().take(4096);
     input.read_line(&mut line).context("cannot read the password")?;
     Ok(line.trim_end_matches(['\r', '\n']).to_owned())
 }
 
-/// A terminal that shows nothing of what is typed, until dropped.
+/// Disables the terminal's echo until dropped.
 struct Hidden(Termios);
 
 impl Hidden {
     fn begin() -> Result<Self> {
-        let former = tcgetattr(std::io::stdin()).context("cannot hide what is typed")?;
+        let former = tcgetattr(std::io::stdin()).context("cannot disable the terminal's echo")?;
         let mut hiding = former.clone();
         hiding.local_flags.remove(LocalFlags::ECHO);
         tcsetattr(std::io::stdin(), SetArg::TCSAFLUSH, &hiding)
-            .context("cannot hide what is typed")?;
+            .context("cannot disable the terminal's echo")?;
         Ok(Self(former))
     }
 }

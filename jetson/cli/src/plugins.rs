@@ -1,4 +1,5 @@
-//! The built-in example plugins. One runs as a child process like any other: `vizflyt plugin NAME`.
+//! The built-in example plugins. Each runs as a child process, like any other plugin: `vizflyt
+//! plugin NAME`.
 
 use std::process::ExitCode;
 
@@ -6,17 +7,16 @@ use clap::Args;
 use vizflyt_grading::plugin::built_in::BuiltIn;
 use vizflyt_scenes::projects::CourseProject;
 
-/// Returns the built-in that flies a scene or a project of the course.
+/// Returns the default built-in plugin for a scene or a project of the course.
 pub(crate) fn default_for(scene: &str) -> &'static str {
     let is_race = CourseProject::find(scene).map_or(scene == "race", |project| project.is_race());
     if is_race { "race" } else { "avoid" }
 }
 
-/// Arguments of the hidden `vizflyt plugin`.
 #[derive(Args, Debug)]
 pub(crate) struct PluginArgs {
     name: BuiltIn,
-    /// The shared memory of the runtime that started it.
+    /// Shared memory of the runtime that started the plugin
     #[arg(long = "vizflyt-service", value_name = "PREFIX")]
     service: String,
 }

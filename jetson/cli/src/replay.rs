@@ -1,4 +1,5 @@
-//! `vizflyt replay`: a flight's log to a plugin, and where its answers differ from the flight's.
+//! `vizflyt replay`: feeds a flight's log to a plugin, and compares its answers with those of the
+//! flight.
 
 mod poses;
 
@@ -20,55 +21,56 @@ use vizflyt_runtime::replay::{
 };
 use vizflyt_runtime::supervisor::{PluginLimits, Stream};
 
-/// Feeds a flight's recorded images to the plugin again, or to another one, and reports where the
-/// answers differ.
+/// Feed recorded images to a plugin, and report where its answers differ
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt replay flights/2026-11-21T04-09-21.123Z.mcap
-  vizflyt replay flight.mcap --plugin ./my_plugin.py    how another plugin had answered
-  vizflyt replay flight.mcap --answers one.jsonl        all answers; cmp compares two runs
-  vizflyt replay flight.mcap --poses-to 127.0.0.1:51002 only its poses, to `vizflyt serve ARENA --pose json`
+  vizflyt replay flight.mcap --plugin ./my_plugin.py    answers of another plugin
+  vizflyt replay flight.mcap --answers one.jsonl        write all answers; compare two runs with cmp
+  vizflyt replay flight.mcap --poses-to 127.0.0.1:51002 send only the poses, to `vizflyt serve ARENA --pose json`
 
-Nothing is flown. Status 0 if the plugin came to the end of the log, 1 if it failed.")]
+Nothing flies. Status 0 if the plugin reached the end of the log, 1 if it failed.")]
 pub(crate) struct ReplayArgs {
-    /// A flight's log
+    /// Log of a flight
     #[arg(value_name = "FLIGHT.mcap")]
     log: PathBuf,
-    /// The plugin, as for `vizflyt fly` [default: the one that flew]
+    /// Plugin, as for `vizflyt fly` [default: the plugin of the flight]
     #[arg(long, value_name = "PLUGIN")]
     plugin: Option<OsString>,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT", requires = "plugin")]
     plugin_arguments: Vec<OsString>,
-    /// The map that the flight's plugin was handed (map.json), if it was
+    /// Map file of the flight (map.json), if its plugin received one
     #[arg(long, value_name = "FILE")]
     map: Option<PathBuf>,
-    /// Sends the flight's poses there at its pace, as packets that `vizflyt serve --pose json` reads, and
-    /// nothing else
+    /// Send only the flight's poses to this address, at the pace of the flight
+    ///
+    /// The packets have the format of `vizflyt serve --pose json`.
     #[arg(long, value_name = "HOST:PORT", conflicts_with_all = ["plugin", "map", "all", "answers", "report"])]
     poses_to: Option<SocketAddr>,
-    /// The name of the vehicle in those packets
+    /// Name of the vehicle in those packets
     #[arg(long, value_name = "NAME", default_value = "vizflyt", requires = "poses_to")]
     object: String,
-    /// At the flight's pace, instead of as fast as the plugin answers
+    /// Replay at the pace of the flight, instead of as fast as the plugin answers
     #[arg(long)]
     realtime: bool,
-    /// Feeds the images, too, that the plugin skipped in flight because it was busy
+    /// Also feed the images that the plugin skipped in flight because it was busy
     #[arg(long)]
     all: bool,
-    /// An answer that takes longer than this ends the replay
+    /// Timeout of an answer; then the replay ends
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     within: f64,
-    /// Writes every answer there, one JSON object per line
-    /// [default: beside the log, ending in .answers.jsonl]
+    /// File for all answers, one JSON object per line
+    ///
+    /// [default: next to the log, ending in .answers.jsonl]
     #[arg(long, value_name = "FILE")]
     answers: Option<PathBuf>,
-    /// Writes what was found there as JSON
+    /// File for the results, as JSON
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
 }
 
-/// Replays a log and prints what came of it.
+/// Replays a log and prints the results.
 pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     let cannot = || format!("cannot replay {}", args.log.display());
     let reader = LogReader::open(&args.log).with_context(cannot)?;
@@ -83,7 +85,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         Some(plugin) => (plugin.clone(), args.plugin_arguments.clone()),
         None => flown(plan.flown.as_ref())?,
     };
-    // Confined as in flight: what it could not do there it cannot do here.
+    // Same sandbox as in flight, so that the plugin has the same rights.
     let mut limits = PluginLimits::default();
     let mut command = Plugin::find(&plugin)?.command(&limits)?;
     command.extend(arguments);
@@ -96,7 +98,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
         is_realtime: args.realtime,
         all: args.all,
         answer_within: Duration::try_from_secs_f64(args.within)
-            .with_context(|| format!("--within {}: that is no time", args.within))?,
+            .with_context(|| format!("--within {}: not a valid duration", args.within))?,
         answers: args.answers.clone().unwrap_or_else(|| args.log.with_extension("answers.jsonl")),
     };
     if plan.is_cut {
@@ -113,7 +115,7 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
             "found": report,
         }))?;
         std::fs::write(path, text + "\n")
-            .with_context(|| format!("report {} cannot be written", path.display()))?;
+            .with_context(|| format!("cannot write the report {}", path.display()))?;
     }
     for sentence in sentences(&report) {
         print_line(sentence);
@@ -122,8 +124,8 @@ pub(crate) fn run(args: &ReplayArgs) -> Result<ExitCode> {
     Ok(if report.plugin_failed.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }
 
-/// Returns the plugin that flew, if a log may choose it: a built-in, or something in this folder. A
-/// log of somebody else must not choose what this computer runs.
+/// Returns the plugin of the flight, if the log may select it: a built-in, or a file in the current
+/// folder. A log from another computer must not select what runs here.
 fn flown(flown: Option<&FlownPlugin>) -> Result<(OsString, Vec<OsString>)> {
     let Some(FlownPlugin { plugin, arguments }) = flown else {
         bail!("the log does not name the plugin that flew; give one with --plugin");
@@ -134,14 +136,14 @@ fn flown(flown: Option<&FlownPlugin>) -> Result<(OsString, Vec<OsString>)> {
     };
     if BuiltIn::find(plugin).is_none() && !is_here(Path::new(plugin)) {
         bail!(
-            "{plugin} flew, which is not in this folder; name a plugin with --plugin, as a log does \
-             not choose what runs here"
+            "{plugin} flew, which is not in this folder; give a plugin with --plugin: a log may not \
+             select other programs of this computer"
         );
     }
     Ok((plugin.into(), arguments.iter().map(OsString::from).collect()))
 }
 
-/// Returns what was found, for people.
+/// Returns the results as sentences.
 fn sentences(report: &ReplayReport) -> Vec<String> {
     let ReplayReport { images_logged, images_fed, images_missing, compared, differ, .. } = report;
     let ReplayReport { images_left_out, .. } = report;
@@ -151,20 +153,20 @@ fn sentences(report: &ReplayReport) -> Vec<String> {
     )];
     if *images_left_out > 0 {
         found.push(format!(
-            "a reduced log: it holds {} of {images_logged} images, each as it came. A plugin that \
-             answers every image by itself answers as in flight, one with a memory may not; fly \
-             with --log full for a replay of all",
+            "a reduced log: it holds {} of {images_logged} images, each unchanged. A plugin \
+             without state between images answers as in flight, one with state may not; for a replay \
+             of all images, fly with --log full",
             images_logged.saturating_sub(*images_left_out)
         ));
     }
     if *images_missing > 0 {
         found.push(format!(
-            "{images_missing} images that the plugin had in flight are not in the log; from there \
-             on a plugin with a memory may differ"
+            "{images_missing} images that the plugin had in flight are not in the log; after them, \
+             the answers of a plugin with state may differ"
         ));
     }
     if *compared == 0 {
-        found.push("the flight has no answer to compare with".into());
+        found.push("the log has no answers to compare with".into());
     } else if *differ == 0 {
         found.push(format!("all {compared} answers are those of the flight, bit by bit"));
     } else {
@@ -196,20 +198,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_does_not_choose_what_runs() {
+    fn a_log_does_not_select_other_programs() {
         let plugin = |name: &str| FlownPlugin { plugin: name.into(), arguments: vec!["x".into()] };
         assert_eq!(flown(Some(&plugin("avoid"))).unwrap().0, "avoid");
         for name in ["/bin/sh", "reboot", "../../elsewhere"] {
             let error = flown(Some(&plugin(name))).unwrap_err().to_string();
             assert!(error.contains("--plugin"), "{error}");
         }
-        // A test runs in its crate's folder.
+        // Tests run in the folder of their crate.
         assert_eq!(flown(Some(&plugin("./src/main.rs"))).unwrap().1, ["x"]);
         assert!(flown(None).is_err());
     }
 
     #[test]
-    fn findings_are_printed() {
+    fn prints_the_results() {
         let mut report = ReplayReport { compared: 3, ..ReplayReport::default() };
         assert!(sentences(&report).iter().any(|text| text.contains("all 3 answers")));
         report.differ = 1;

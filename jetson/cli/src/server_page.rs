@@ -1,4 +1,4 @@
-//! A running server's page, as commands ask it: plain HTTP, one request a connection.
+//! HTTP client for the page of a running server: plain HTTP, one request per connection.
 
 use std::io::{Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 
-/// A page, and the key that opens it from another computer.
+/// Address of a page, and the key that opens it from another computer.
 #[derive(Clone, Debug)]
 pub(crate) struct ServerPage<'a> {
     url: &'a str,
@@ -19,15 +19,16 @@ impl<'a> ServerPage<'a> {
         Self { url, key: None }
     }
 
-    /// Returns it with the key of its address `/enter?key=KEY`; the server's own computer needs none.
+    /// Returns the page with the key of `/enter?key=KEY`. On the server's own computer no key is
+    /// needed.
     pub(crate) fn with_key(self, key: Option<&'a str>) -> Self {
         Self { key, ..self }
     }
 
-    /// Gets `path`; returns status and body.
+    /// Requests `path`; returns status and body.
     ///
     /// # Errors
-    /// An address that is none, or where no server answers.
+    /// If the address is invalid or no server replies.
     pub(crate) fn get(&self, path: &str) -> Result<(u16, Vec<u8>)> {
         self.ask(&format!("GET {path}"), "", "")
     }
@@ -40,7 +41,7 @@ impl<'a> ServerPage<'a> {
         let mut heads =
             format!("Origin: http://{}\r\nContent-Type: application/json\r\n", self.host()?);
         if self.key.is_some() {
-            // What changes something takes the token that goes with the key.
+            // Changes require the token that belongs to the key.
             let (_, session) = self.get("/api/session")?;
             let session: serde_json::Value = serde_json::from_slice(&session).unwrap_or_default();
             if let Some(token) = session["token"].as_str() {
@@ -69,7 +70,7 @@ impl<'a> ServerPage<'a> {
         };
         let no_server = || {
             format!(
-                "no server answers at {url}; start `vizflyt serve` or `vizflyt demo`, and give the page \
+                "no server replies at {url}; start `vizflyt serve` or `vizflyt demo`, and give the page \
                  it prints with --page"
             )
         };
@@ -83,11 +84,11 @@ impl<'a> ServerPage<'a> {
                 format!("Cookie: vizflyt_key={key}\r\n")
             }
             Some(_) => {
-                bail!("a page's key is letters and digits alone, as in its address /enter?key=KEY")
+                bail!("a page's key consists of letters and digits, as in the address /enter?key=KEY")
             }
             None => String::new(),
         };
-        // HTTP/1.0: the answer ends with the connection.
+        // HTTP/1.0: the response ends with the connection.
         write!(
             stream,
             "{request} HTTP/1.0\r\nHost: {host}\r\n{cookie}{heads}Content-Length: {}\r\n\r\n{body}",
@@ -100,7 +101,7 @@ impl<'a> ServerPage<'a> {
     }
 }
 
-/// Returns status and body of an answer.
+/// Returns status and body of a response.
 fn parse(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
     let end = answer.windows(4).position(|window| window == b"\r\n\r\n")?;
     let head = std::str::from_utf8(&answer[..end]).ok()?;
@@ -108,9 +109,9 @@ fn parse(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
     Some((status, answer[end + 4..].to_vec()))
 }
 
-/// A server on the other side of the lab answers within this.
+/// Timeout for a response within the lab.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// The longest answer is a lab day's report. [bytes]
+/// Maximum size of a response; a lab day's report is the largest. [bytes]
 const MAX_BYTES: u64 = 8 << 20;
 
 #[cfg(test)]
@@ -120,15 +121,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_address_that_is_none_is_told() {
+    fn rejects_an_invalid_address() {
         let error = ServerPage::at("http://127.0.0.1:1").get("/").unwrap_err();
-        assert!(error.to_string().contains("no server answers at http://127.0.0.1:1"), "{error}");
+        assert!(error.to_string().contains("no server replies at http://127.0.0.1:1"), "{error}");
         let error = ServerPage::at("http://127.0.0.1:1/page").get("/").unwrap_err();
         assert!(error.to_string().contains("write http://HOST:PORT"), "{error}");
     }
 
     #[test]
-    fn an_answer_is_cut_at_its_head() {
+    fn splits_a_response_into_status_and_body() {
         assert_eq!(parse(b"HTTP/1.1 200 OK\r\nA: b\r\n\r\n\x00\xff"), Some((200, vec![0, 255])));
         assert_eq!(parse(b"HTTP/1.1 200 OK\r\n"), None);
         assert_eq!(parse(b"SSH-2.0\r\n\r\n"), None);
@@ -136,7 +137,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn noise_is_no_answer_and_no_panic(bytes in prop::collection::vec(any::<u8>(), 0..80)) {
+        fn rejects_noise_without_panic(bytes in prop::collection::vec(any::<u8>(), 0..80)) {
             let is_answer = parse(&bytes).is_some();
             prop_assert!(!is_answer || bytes.windows(4).any(|window| window == b"\r\n\r\n"));
         }

@@ -1,5 +1,5 @@
-//! `vizflyt stats`: where images get their age, what became of them, and how the connection fares;
-//! of a running server, or from a flight's log.
+//! `vizflyt stats`: image age by stage, image delivery, and connection quality, from a running
+//! server or a flight's log.
 
 use std::fmt::Write as _;
 use std::io::{IsTerminal, Write};
@@ -19,39 +19,39 @@ use vizflyt_server::web::VehicleStats;
 
 use crate::server_page::ServerPage;
 
-/// Where images get their age, stage by stage, and why images were skipped.
+/// Show the latency of images by stage, and why images were skipped
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:\n  vizflyt stats --watch\n  \
                         vizflyt stats --page http://192.168.10.2:8080 --vehicle wasp --json\n  \
                         vizflyt stats flights/2026-11-21T04-09-21.123Z.mcap\n\n\
                         The stages are explained in docs/guides/timing.md.")]
 pub(crate) struct StatsArgs {
-    /// A flight's log; without it a running server is asked
+    /// Log of a flight; without it, a running server is queried
     #[arg(value_name = "FLIGHT.mcap", conflicts_with_all = ["page", "vehicle", "watch"])]
     flight: Option<PathBuf>,
-    /// The server's page
+    /// Address of the server's page
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:8080")]
     page: String,
-    /// The vehicle; the server's first one without
+    /// Name of the vehicle [default: the first of the server]
     #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
-    /// Prints the figures as JSON
+    /// Print the statistics as JSON
     #[arg(long)]
     json: bool,
-    /// Prints them every second
+    /// Print the statistics every second
     #[arg(long)]
     watch: bool,
 }
 
-/// Prints what was asked for.
+/// Runs `vizflyt stats`.
 pub(crate) fn run(args: &StatsArgs) -> Result<ExitCode> {
     if let Some(path) = &args.flight {
         let timing = vizflyt_runtime::log::read_timing(path)
             .with_context(|| format!("cannot read {}", path.display()))?
             .with_context(|| {
                 format!(
-                    "{} has no /timing records: a runtime from before them wrote it, or no image \
-                     came in that flight",
+                    "{} has no /timing records: an older runtime wrote it, or the flight \
+                     had no images",
                     path.display()
                 )
             })?;
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &StatsArgs) -> Result<ExitCode> {
     loop {
         let text = if args.json { ask(args)? } else { of_vehicle(&parse(&ask(args)?)?)? };
         if args.watch && std::io::stdout().is_terminal() {
-            // Home, and clear what follows.
+            // Move the cursor home and clear the screen.
             print("\x1b[H\x1b[J");
         }
         print(&text);
@@ -77,7 +77,7 @@ pub(crate) fn run(args: &StatsArgs) -> Result<ExitCode> {
     }
 }
 
-/// Returns what the server answers, as one line of JSON.
+/// Returns the server's reply as one line of JSON.
 fn ask(args: &StatsArgs) -> Result<String> {
     let query = args.vehicle.as_ref().map_or_else(String::new, |name| {
         name.bytes().fold("?vehicle=".to_owned(), |mut query, byte| {
@@ -95,29 +95,29 @@ fn ask(args: &StatsArgs) -> Result<String> {
     match status {
         200 => Ok(body + "\n"),
         404 if body.is_empty() => {
-            bail!("{} has no /api/stats: it is no VizFlyt server, or one from before it", args.page)
+            bail!("{} has no /api/stats: it is not a VizFlyt server, or an older version", args.page)
         }
         status => bail!("{}: {body} (HTTP status {status})", args.page),
     }
 }
 
 fn parse(json: &str) -> Result<VehicleStats> {
-    serde_json::from_str(json).context("the server's answer is not understood: another version?")
+    serde_json::from_str(json).context("cannot parse the server's reply; does it have another version?")
 }
 
-/// Returns the figures of a running vehicle for a person.
+/// Returns the statistics of a flying vehicle as text.
 fn of_vehicle(answer: &VehicleStats) -> Result<String> {
     let Some(runtime) = &answer.runtime else {
         bail!(
-            "no runtime flies '{}': there are no figures; start one with `vizflyt fly`, or read a \
-             former flight with `vizflyt stats FLIGHT.mcap`",
+            "no runtime flies '{}': no statistics; start one with `vizflyt fly`, or read the \
+             log of a flight with `vizflyt stats FLIGHT.mcap`",
             answer.vehicle
         );
     };
     let mut out = format!("{}, flown by {runtime}\n\n", answer.vehicle);
     match &answer.timing {
         Some(timing) => out += &of_timing(timing, false),
-        None => out += "the runtime has not reported yet; it does once a second\n",
+        None => out += "no report of the runtime yet; it reports once a second\n",
     }
     out += "\nimages      of this flight\n";
     for camera in &answer.images {
@@ -130,7 +130,7 @@ fn of_vehicle(answer: &VehicleStats) -> Result<String> {
     Ok(out)
 }
 
-/// Returns how good the localization is.
+/// Returns the quality of the localization as text.
 fn of_pose(pose: &PoseQuality) -> String {
     let Some(age_ms) = pose.age_ms else { return "\npose        none yet\n".to_owned() };
     let mut out = format!(
@@ -160,7 +160,7 @@ fn of_pose(pose: &PoseQuality) -> String {
     out
 }
 
-/// Returns the reasons that occurred, in brackets.
+/// Returns the reasons for rejections, in brackets.
 fn of_rejects(rejects: &Rejects) -> String {
     let Rejects { invalid, stale, clock, outlier, jump, flip, frozen, disagree } = *rejects;
     let reasons = [
@@ -200,7 +200,7 @@ fn of_timing(timing: &Timing, with_arrivals: bool) -> String {
     out += &of_intervals(&timing.intervals);
     match &timing.clock {
         Some(clock) => out += &of_clock(clock, falls.clamped, falls.out_of_bound),
-        None => out += "clock       the server's is not known yet\n",
+        None => out += "clock       not synchronized with the server yet\n",
     }
     if with_arrivals {
         out += "\nimages      that reached the runtime\n";
@@ -216,13 +216,13 @@ fn row(name: &str, times: &StageTimes, bar: &str) -> String {
     format!("{name:<9} {p50:7.2} {p90:7.2} {p99:7.2} {max:7.2}  {bar}\n")
 }
 
-/// Returns a bar from where the stages before end in the median: the median full, the rest up to
-/// the 99th percentile light.
+/// Returns the bar of a stage, which starts where the earlier stages end (median): dark up to the
+/// median, light up to the 99th percentile.
 fn bar(start_ms: f32, times: &StageTimes, per_ms: f32) -> String {
     let column = |ms: f32| ((start_ms + ms) * per_ms).round().clamp(0.0, BAR) as usize;
     let (start, median, most) = (column(0.0), column(times.p50), column(times.p99));
     let (full, light) = (median.saturating_sub(start), most.saturating_sub(median));
-    // A stage that takes anything shows.
+    // A short stage still gets a mark.
     let mark = if full + light == 0 { "▏" } else { "" };
     format!("{}{}{}{mark}", " ".repeat(start), "█".repeat(full), "░".repeat(light))
 }
@@ -251,8 +251,8 @@ fn of_intervals(intervals: &Intervals) -> String {
 
 fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
     let mut out = format!(
-        "\nclock       the server's is {:.3} ms ahead, known to {:.3} ms; drifts by {:.1} ppm, known \
-         to {:.1}\n",
+        "\nclock       server is {:.3} ms ahead, error at most {:.3} ms; drift {:.1} ppm, error at \
+         most {:.1}\n",
         clock.offset_ns as f64 * 1e-6,
         clock.error_bound_ms,
         clock.drift_ppm,
@@ -261,8 +261,8 @@ fn of_clock(clock: &ClockState, clamped: u64, out_of_bound: u64) -> String {
     if clock.steps + u32::try_from(clamped + out_of_bound).unwrap_or(u32::MAX) > 0 {
         let _ = writeln!(
             out,
-            "            was set {} times; {clamped} images seemed to arrive before they were sent, by \
-             less than the bound, {out_of_bound} by more",
+            "            was set {} times; {clamped} images arrived before they were sent by less \
+             than the error bound, {out_of_bound} by more",
             clock.steps
         );
     }
@@ -309,22 +309,22 @@ fn of_connection(connection: &Connection) -> String {
     )
 }
 
-/// Prints; unlike `print!` it does not panic when nobody reads any more.
+/// Prints; unlike `print!` it does not panic if the reader has closed the pipe.
 fn print(text: &str) {
     let mut out = std::io::stdout().lock();
     let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
 }
 
-/// Why images are skipped, in the order of their way.
+/// Reasons for skipped images, in the order of the stages.
 const REASONS: [(&str, &str); 8] = [
     ("no_room", "a newer one was rendered before encoder and transport had room"),
     ("failed", "could not be encoded"),
-    ("late", "given up on the way: past its deadline, or the connection broke"),
-    ("stale", "a newer one was there already"),
-    ("broken", "did not decode"),
-    ("superseded", "a newer one came before the decoder was free"),
-    ("unasked", "a newer one was decoded before the plugin, idle, had asked"),
-    ("overrun", "a newer one was decoded while the plugin was still at an earlier one"),
+    ("late", "dropped on the way: past its deadline, or connection lost"),
+    ("stale", "a newer one had arrived already"),
+    ("broken", "could not be decoded"),
+    ("superseded", "a newer one arrived before the decoder was free"),
+    ("unasked", "a newer one was decoded before the idle plugin requested one"),
+    ("overrun", "a newer one was decoded while the plugin was busy with an earlier one"),
 ];
 /// Columns of the longest bar.
 const BAR: f32 = 40.0;
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn every_stage_has_its_line_and_they_fall_like_water() {
+    fn prints_a_line_for_every_stage() {
         let text = of_timing(&timing(), true);
         let lines: Vec<_> = text.lines().collect();
         let mut last = 0;
@@ -376,15 +376,15 @@ mod tests {
         }
         assert!(text.contains("16 to 18 ms     270"), "{text}");
         assert!(text.contains("is -1.500 ms ahead"), "{text}");
-        assert!(text.contains("2 images seemed to arrive before"), "{text}");
+        assert!(text.contains("2 images arrived before"), "{text}");
         assert!(text.contains("camera 0  9 arrived, 8 delivered"), "{text}");
         assert!(text.contains("overrun"), "{text}");
         let empty = of_timing(&Timing::default(), true);
-        assert!(empty.contains("not known yet"), "{empty}");
+        assert!(empty.contains("not synchronized"), "{empty}");
     }
 
     #[test]
-    fn an_account_names_its_reasons() {
+    fn names_the_reasons_for_skipped_images() {
         let skipped = Skipped { no_room: 3, overrun: 2, ..Skipped::default() };
         let text =
             of_account("front", &Delivery { rendered: 9, delivered: 4, under_way: 0, skipped });
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_parts_are_reported() {
+    fn reports_missing_parts() {
         let json = r#"{"vehicle": "wasp", "runtime": null, "server": SERVER, "timing": null,
                        "images": [], "connection": null, "pose": POSE}"#;
         let server = serde_json::to_string(&vizflyt_server::web::ServerStages::default());
@@ -406,6 +406,6 @@ mod tests {
         let error = of_vehicle(&answer).unwrap_err();
         assert!(error.to_string().contains("no runtime flies 'wasp'"), "{error}");
         answer.runtime = Some("runtime 0.1 at 127.0.0.1:9".to_owned());
-        assert!(of_vehicle(&answer).unwrap().contains("has not reported yet"));
+        assert!(of_vehicle(&answer).unwrap().contains("no report of the runtime yet"));
     }
 }

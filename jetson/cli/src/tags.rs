@@ -1,4 +1,4 @@
-//! `vizflyt tags`: localization by printed AprilTags, from the printer to the pose.
+//! `vizflyt tags`: localization by printed AprilTags.
 
 mod calibrate;
 mod locate;
@@ -11,15 +11,15 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 use vizflyt_tags::family::TagFamily;
 
-/// Localization by printed AprilTags: from the printer to the pose.
+/// Localize the vehicle by AprilTags: print, calibrate, survey, locate
 #[derive(Args, Debug)]
-#[command(after_help = "In this order:
-  vizflyt tags print cube -o cube.pdf       for the vehicle; print mat for the floor
-  vizflyt tags print board -o board.pdf     to calibrate with
+#[command(after_help = "Steps:
+  vizflyt tags print cube -o cube.pdf       cube for the vehicle; `print mat` for the floor
+  vizflyt tags print board -o board.pdf     board for the calibration
   vizflyt tags calibrate /dev/video0 --board board.toml -o left.toml
   vizflyt tags survey mat walk.mp4 --camera left.toml --layout mat.toml -o room.toml
   vizflyt tags survey cameras left.toml right.toml --mat room.toml --cube cube.toml
-  vizflyt tags locate lab.toml --to SERVER:PORT   the pose, live, to the render server")]
+  vizflyt tags locate lab.toml --to SERVER:PORT   send live poses to the render server")]
 pub(crate) struct TagsArgs {
     #[command(subcommand)]
     command: TagsCommand,
@@ -44,11 +44,11 @@ pub(crate) fn run(args: &TagsArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Reads the name of a family of tags.
+/// Parses the name of a tag family.
 fn family(name: &str) -> Result<TagFamily, String> {
     TagFamily::from_name(name).ok_or_else(|| {
         format!(
-            "no family of this name; there are {}",
+            "unknown tag family; known: {}",
             TagFamily::ALL.map(TagFamily::name).join(", ")
         )
     })

@@ -1,4 +1,4 @@
-//! `vizflyt vehicle`: sets up the vehicle once; and sessions with its autopilot for other commands.
+//! `vizflyt vehicle`: sets up the vehicle; also sessions with its autopilot for other commands.
 
 use std::fs::File;
 use std::io::Read;
@@ -15,14 +15,15 @@ use vizflyt_runtime::args::link_settings;
 use vizflyt_runtime::config::{self, JetsonConfig};
 use vizflyt_runtime::link::{LinkSettings, SigningFile};
 
-/// Which autopilot.
 #[derive(Args, Debug)]
 pub(crate) struct AutopilotArgs {
-    /// The autopilot: udpin:ADDR:PORT, udpout:, tcpin:, tcpout:HOST:PORT or serial:PATH:BAUD
+    /// Address: udpin:ADDR:PORT, udpout:, tcpin:, tcpout:HOST:PORT or serial:PATH:BAUD
+    ///
     /// [default: [vehicle] of jetson.toml, or udpin:0.0.0.0:14550]
     #[arg(long, value_name = "ADDRESS")]
     mavlink: Option<MavlinkAddress>,
-    /// The settings of this computer
+    /// Settings file of this computer
+    ///
     /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -34,7 +35,7 @@ impl AutopilotArgs {
         self.open_session_with(|_| {})
     }
 
-    /// As [`Self::open_session`], over a wire that nobody else uses: unsigned packets are accepted.
+    /// Like [`Self::open_session`], for a private cable: accepts unsigned packets.
     fn open_wired_session(&self) -> Result<ParamSession> {
         self.open_session_with(|settings| {
             if let Some(signing) = &mut settings.signing {
@@ -49,15 +50,15 @@ impl AutopilotArgs {
         Ok(ParamSession::open(&address, settings)?)
     }
 
-    /// Returns the autopilot at an address, with what this computer's settings say of it otherwise.
+    /// Returns an autopilot at this address, with all other settings of this computer.
     pub(crate) fn at(mavlink: MavlinkAddress, config: Option<PathBuf>) -> Self {
         Self { mavlink: Some(mavlink), config }
     }
 
-    /// Returns where it is, and how to talk to it.
+    /// Returns the address and link settings.
     ///
     /// # Errors
-    /// Settings that cannot be read.
+    /// If the settings cannot be read.
     pub(crate) fn link(&self) -> Result<(MavlinkAddress, LinkSettings)> {
         let file = self.config.clone().or_else(config::find);
         let vehicle = match file {
@@ -74,7 +75,7 @@ impl AutopilotArgs {
     }
 }
 
-/// What is set up on the vehicle once.
+/// Set up the vehicle: key for MAVLink signing
 #[derive(Args, Debug)]
 pub(crate) struct VehicleArgs {
     #[command(subcommand)]
@@ -83,11 +84,13 @@ pub(crate) struct VehicleArgs {
 
 #[derive(Subcommand, Debug)]
 enum VehicleCommand {
-    /// Makes a key for MAVLink 2 signing, and gives it to the autopilot; from then on each refuses what
-    /// the other did not sign.
+    /// Make a key for MAVLink 2 signing, and send it to the autopilot
     ///
-    /// Give it over USB or another wire that nobody listens to: the key travels in the clear. The
-    /// autopilot does not confirm it; with `signing_key` in jetson.toml, the next start shows.
+    /// From then on, autopilot and runtime reject packets that the other has not signed.
+    ///
+    /// Send the key over USB or another private cable: it is transmitted unencrypted. The autopilot
+    /// does not confirm it. If `signing_key` is set in jetson.toml, the next connection shows
+    /// whether it was accepted.
     #[command(after_help = "Examples:
   vizflyt vehicle sign --mavlink serial:/dev/ttyACM0 --key /etc/vizflyt/mavlink.key
   vizflyt vehicle sign --mavlink serial:/dev/ttyACM0 --off
@@ -101,20 +104,20 @@ Then, in jetson.toml:
 struct SignArgs {
     #[command(flatten)]
     autopilot: AutopilotArgs,
-    /// The key's file: made if it is not there, sent again if it is
+    /// Key file; created if it does not exist, otherwise sent again
     #[arg(long, value_name = "FILE", required_unless_present = "off")]
     key: Option<PathBuf>,
-    /// Takes signing back: the autopilot accepts everyone again
+    /// Turn signing off: the autopilot accepts unsigned packets again
     #[arg(long, conflicts_with = "key")]
     off: bool,
 }
 
-/// Sets up.
+/// Runs `vizflyt vehicle`.
 pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
     let VehicleCommand::Sign(args) = &args.command;
     let Some(path) = &args.key else {
         args.autopilot.open_wired_session()?.sign(None)?;
-        print_line("signing is off; take `signing_key` out of jetson.toml");
+        print_line("signing is off; remove `signing_key` from jetson.toml");
         return Ok(ExitCode::SUCCESS);
     };
     let file = SigningFile::new(path);
@@ -129,7 +132,7 @@ pub(crate) fn run(args: &VehicleArgs) -> Result<ExitCode> {
     let signing = file.open()?;
     let mut session = args.autopilot.open_wired_session()?;
     session.sign(Some(&signing))?;
-    print_line(format!("given    to system {}", session.link().system().unwrap_or(0)));
+    print_line(format!("sent     to system {}", session.link().system().unwrap_or(0)));
     print_line(format!(
         "now set signing_key = \"{}\" under [vehicle] in jetson.toml",
         path.display()

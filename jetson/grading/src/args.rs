@@ -1,4 +1,4 @@
-//! What `vizflyt grade` is told on its command line.
+//! Command-line arguments of `vizflyt grade`.
 
 use std::ffi::OsString;
 use std::num::NonZero;
@@ -14,7 +14,7 @@ use vizflyt_studio::shard::Shard;
 
 use super::judge;
 
-/// Flies a project's course in lock-step, once for each seed, and scores the plugin.
+/// Fly a course once per seed in lock-step, and score the plugin
 #[derive(Args, Clone, Debug)]
 #[command(
     args_conflicts_with_subcommands = true,
@@ -22,16 +22,16 @@ use super::judge;
     args_override_self = true
 )]
 #[command(after_help = "Examples:
-  vizflyt grade ./first --project p4 --seeds 20 --report out      flies 20 courses; open out/index.html
-  vizflyt grade avoid --project forest --variants day,night       in other light, too
-  vizflyt grade ./first --project p5 --variants random:20         in twenty lights and weathers that are drawn
+  vizflyt grade ./first --project p4 --seeds 20 --report out      fly 20 courses; open out/index.html
+  vizflyt grade avoid --project forest --variants day,night       also in other light
+  vizflyt grade ./first --project p5 --variants random:20         in 20 random combinations of light and weather
   vizflyt grade ./first --project p5 --level g --json > me.json   the signed grade, for programs
-  vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        an eighth of the flights, on a cluster
-  vizflyt grade merge *.json -o whole.json --report out           all eighths make the whole
-  vizflyt grade verify whole.json                                 checks its signature
-  vizflyt grade verify out                                        and every file of a report
-  vizflyt grade ./first --project p4 --report out --resume        goes on where it was interrupted
-  vizflyt grade ./first --project p4 --seeds 3 --watch            again whenever the plugin is saved
+  vizflyt grade ./first --project p5 --shard 1/8 -o 1.json        fly an eighth of the flights, on a cluster
+  vizflyt grade merge *.json -o whole.json --report out           combine all shards
+  vizflyt grade verify whole.json                                 check the signature
+  vizflyt grade verify out                                        check the signature and all files of a report
+  vizflyt grade ./first --project p4 --report out --resume        resume an interrupted grade
+  vizflyt grade ./first --project p4 --seeds 3 --watch            grade again when the plugin is saved
 
 The same plugin, program and seeds give the same hash on every run. Status 0 if all flights were flown,
 1 if --least was not reached.")]
@@ -44,65 +44,69 @@ pub struct GradeArgs {
 
 #[derive(Args, Clone, Debug)]
 pub(super) struct FlyArgs {
-    /// The plugin, as for `vizflyt fly`
+    /// Plugin, as for `vizflyt fly`
     #[arg(value_name = "PLUGIN", required = true)]
     pub(super) plugin: Option<OsString>,
     #[arg(long, value_name = "NAME|FILE", default_value = "p4", help = format!(
-        "The project whose course is flown: {}; or a file of your own, FILE.toml", projects::NAMES.join(", ")
+        "Course project: {}; or a file FILE.toml", projects::NAMES.join(", ")
     ))]
     pub(super) project: String,
-    /// Sensors: ug has depth, g has not
+    /// Sensors: ug with depth, g without depth
     #[arg(long, value_name = "ug|g", default_value_t)]
     pub(super) level: Level,
     #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "day", help = format!(
-        "Light and weather that each seed is flown in: {}; or random:20, so many that are drawn from the first \
+        "Light and weather for each seed: {}; or random:20, which draws 20 from the first \
          seed within the project's bounds", Variant::names()
     ))]
     pub(super) variants: Vec<VariantChoice>,
-    /// Number of seeds: each is another course
+    /// Number of seeds; each seed gives another course
     #[arg(long, value_name = "N", default_value_t = 10)]
     pub(super) seeds: u64,
-    /// The first seed, or a file that holds it: keep it secret, so that nobody prepares for the courses
+    /// First seed, or a file that contains it
+    ///
+    /// Keep it secret, so that teams cannot prepare for the courses.
     #[arg(long, value_name = "SEED|@FILE", default_value = "1")]
     pub(super) first_seed: FirstSeed,
-    /// Only part I of N of the flights; `merge` makes the whole of all parts
+    /// Fly only shard I of N; combine all shards with `grade merge`
     #[arg(long, value_name = "I/N")]
     pub(super) shard: Option<Shard>,
-    /// Flights at a time [default: the number of processors]
+    /// Number of flights at a time [default: number of processors]
     #[arg(long, value_name = "N")]
     pub(super) jobs: Option<NonZero<usize>>,
-    /// Images a second, of cameras without a rate of their own
+    /// Image rate of cameras without their own rate [Hz]
     #[arg(long, value_name = "HZ", default_value_t = 30.0)]
     pub(super) image_rate: f64,
-    /// Age of an image on arrival at the plugin
+    /// Delay from the pose until the image is delivered to the plugin
     #[arg(long, value_name = "MS", default_value_t = 30.0)]
     pub(super) image_delay: f64,
-    /// From then until the answer takes effect
+    /// Delay from delivery of the image until the plugin's answer takes effect
     #[arg(long, value_name = "MS", default_value_t = 10.0)]
     pub(super) answer_delay: f64,
-    /// The simulated inertial sensor
+    /// Simulated inertial sensor
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}",
+        "Simulated inertial sensor, with the noise of its data sheet; frame: with the vibration of a small frame: {}",
         ImuModel::names()
     ))]
     pub(super) imu: ImuModel,
-    /// A plugin that takes more of its own time for an answer has failed
+    /// Timeout of an answer, in time of the plugin's own; a timeout is a failure
     #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
     pub(super) answer_within: f64,
-    /// Writes a report there: index.html with a card for each flight, its images, flight logs, junit.xml, and
-    /// grade.json, which signs them all
+    /// Folder for a report: index.html with images, flight logs, signed grade.json
+    ///
+    /// index.html has a card for each flight. The folder also gets junit.xml. grade.json signs all
+    /// files.
     #[arg(long, value_name = "DIR")]
     pub(super) report: Option<PathBuf>,
-    /// Keeps the finished flights of a grade that was interrupted, and flies the others
+    /// Keep the finished flights of an interrupted grade, and fly the others
     #[arg(long, requires = "report")]
     pub(super) resume: bool,
-    /// Grades again whenever the plugin is saved, and says what changed
+    /// Grade again when the plugin is saved, and print what changed
     #[arg(long, conflicts_with_all = ["resume", "shard", "json", "junit", "least"])]
     pub(super) watch: bool,
-    /// Says what changed since this grade, or that of a report's folder [default: what the report replaces]
+    /// Compare with this grade or report [default: the report that --report replaces]
     #[arg(long, value_name = "FILE|DIR")]
     pub(super) since: Option<PathBuf>,
-    /// Images in the report's flight logs: as many as fit into 60 MB a minute, all, or no log
+    /// Images in the report's flight logs: up to 60 MB per minute, all, or no log
     #[arg(
         long,
         value_name = "reduced|full|none",
@@ -111,23 +115,24 @@ pub(super) struct FlyArgs {
         hide_possible_values = true
     )]
     pub(super) log: LogOption,
-    /// Writes depth into them a second time so that any viewer shows it (16UC1)
+    /// Also log depth in a format that all viewers show (16UC1)
     #[arg(long, requires = "report")]
     pub(super) log_depth: bool,
-    /// What the plugin shall not read, beside keys, seed and report; may be given more than once
+    /// Path to hide from the plugin, besides keys, seed and report; can be repeated
     #[arg(long, value_name = "PATH")]
     pub(super) hide: Vec<PathBuf>,
-    /// Writes JUnit XML there
+    /// File for results as JUnit XML
     #[arg(long, value_name = "FILE")]
     pub(super) junit: Option<PathBuf>,
-    /// Ends with status 1 if the mean score is less than this, 0 to 100
+    /// Minimum mean score (0 to 100); below it, the exit status is 1
     #[arg(long, value_name = "SCORE")]
     pub(super) least: Option<f64>,
     #[command(flatten)]
     pub(super) result: ResultArgs,
 }
 
-/// The first seed: typed, or of a file, so that it stands in no list of processes and no shell's history.
+/// First seed, from the command line or a file. A file keeps it out of the process list and the
+/// shell's history.
 #[derive(Clone, Debug)]
 pub(super) struct FirstSeed {
     pub(super) value: u64,
@@ -145,60 +150,64 @@ impl FromStr for FirstSeed {
             return Ok(Self { value, file: None });
         };
         let held = std::fs::read_to_string(path).map_err(|error| format!("{path}: {error}"))?;
-        // What it holds is a secret, whatever it is.
+        // The file's content is secret, so the message does not print it.
         let value = number(&held).map_err(|_| format!("{path} holds no seed; {advice}"))?;
         Ok(Self { value, file: Some(path.into()) })
     }
 }
 
-/// Where a grade goes, and who signs it.
+/// Destination and signer of a grade.
 #[derive(Args, Clone, Debug)]
 pub(super) struct ResultArgs {
-    /// Prints the signed grade as JSON instead of figures for people
+    /// Print the signed grade as JSON instead of text
     #[arg(long)]
     pub(super) json: bool,
-    /// Writes the signed grade there as JSON
+    /// File for the signed grade, as JSON
     #[arg(long, short, value_name = "FILE")]
     pub(super) output: Option<PathBuf>,
-    /// Folder of the key that grades are signed with [default: ~/.config/vizflyt]
+    /// Folder of the key that signs grades [default: ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     pub(super) keys: Option<PathBuf>,
 }
 
 #[derive(Subcommand, Clone, Debug)]
 pub(super) enum GradeCommand {
-    /// Verifies the signature of a grade, and all files of a report; status 1 if anything was changed
+    /// Verify the signature of a grade and all files of a report
+    ///
+    /// Ends with status 1 if anything was changed.
     Verify {
-        /// The grade, or the folder of its report
+        /// Grade, or the folder of its report
         #[arg(value_name = "FILE|DIR")]
         file: PathBuf,
-        /// Also checks that this JUnit XML is the grade's
+        /// JUnit XML file to compare with the grade
         #[arg(long, value_name = "FILE")]
         junit: Option<PathBuf>,
-        /// Accepted signer: a public key or a file with one [default: this computer's own]
+        /// Accepted signer: a public key or a file with one [default: this computer's key]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
         /// Folder of this computer's own key [default: ~/.config/vizflyt]
         #[arg(long, value_name = "DIR")]
         keys: Option<PathBuf>,
     },
-    /// Makes one grade of all its parts
+    /// Combine all shards of a grade
     Merge {
-        /// The parts, as `--shard` wrote them
+        /// Shards, as `--shard` wrote them
         #[arg(required = true)]
         files: Vec<PathBuf>,
-        /// Accepted signer: a public key or a file with one [default: this computer's own]
+        /// Accepted signer: a public key or a file with one [default: this computer's key]
         #[arg(long, value_name = "KEY")]
         key: Option<String>,
-        /// Writes a report of the whole there: index.html, grade.json; images are in the parts' reports
+        /// Folder for a report of the combined grade: index.html, grade.json
+        ///
+        /// Images stay in the reports of the shards.
         #[arg(long, value_name = "DIR")]
         report: Option<PathBuf>,
         #[command(flatten)]
         result: ResultArgs,
     },
-    /// Judges a logged flight of the lab by the rules that grades go by
+    /// Judge a logged flight of the lab by the rules of grades
     Judge(judge::JudgeArgs),
-    /// Prints the public key that this computer's grades are signed with
+    /// Print the public key of this computer's grades
     Key {
         /// Folder of the key [default: ~/.config/vizflyt]
         #[arg(long, value_name = "DIR")]

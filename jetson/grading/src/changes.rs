@@ -1,4 +1,4 @@
-//! What changed since an earlier attempt: flights of the same places, compared one by one.
+//! Changes since an earlier attempt: compares flights with the same seed and variant.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -11,22 +11,22 @@ use super::document::{Grade, Run, Subject, Summary};
 use super::figures::{NAMED, flight, outcome};
 use super::folder::GRADE;
 
-/// A score that differs by less is the same.
+/// Minimum score difference that counts as a change.
 const SAME_SCORE: f64 = 0.5;
-/// So does a time. [s]
+/// Minimum time difference that counts as a change. [s]
 const SAME_S: f64 = 0.5;
 
-/// Returns the attempt that this one is compared with: what `--since` names, or what lies where the report is about to be
-/// written; nothing where there is none.
+/// Returns the grade to compare with: that of `--since`, or of the report that `--report` replaces;
+/// `None` if there is none.
 ///
 /// # Errors
-/// If `--since` names no grade.
+/// If `--since` is not a grade.
 pub(super) fn earlier(args: &FlyArgs) -> Result<Option<Grade>> {
     if let Some(path) = &args.since {
         return read(path).map(Some).context("--since");
     }
     let report = args.report.as_deref().filter(|_| !args.resume);
-    // Whatever else lies there, the report says what it thinks of it.
+    // An unreadable grade there is ignored: opening the report's folder reports it.
     Ok(report.and_then(|folder| Grade::read(&folder.join(GRADE)).ok()))
 }
 
@@ -38,7 +38,7 @@ fn read(path: &Path) -> Result<Grade> {
 /// Checks that two grades can be compared.
 ///
 /// # Errors
-/// What differs.
+/// The first difference.
 pub(super) fn check(earlier: &Subject, now: &Subject) -> Result<()> {
     let differs = |what: &str, earlier: &str, now: &str| {
         ensure!(earlier == now, "the earlier attempt is of {what} {earlier}, this one of {now}");
@@ -48,7 +48,7 @@ pub(super) fn check(earlier: &Subject, now: &Subject) -> Result<()> {
     differs("level", &earlier.level, &now.level)
 }
 
-/// Returns what changed, a line for each thing; nothing where no place was flown both times.
+/// Returns the changes, one line each; empty if no flight was flown both times.
 pub(super) fn lines(earlier: &Grade, now: &Grade) -> Vec<String> {
     let key = |run: &Run| (run.variant.clone(), run.seed);
     let before: HashMap<(String, u64), &Run> =
@@ -103,7 +103,7 @@ enum Trend {
     Alike,
 }
 
-/// By the score, then by the time of two flights that finished.
+/// Compares scores, then the times of two finished flights.
 fn step(before: &Run, after: &Run) -> Trend {
     let finished = [before, after].iter().all(|run| run.outcome == OutcomeKind::Finished);
     let seconds = |run: &Run| run.seconds + run.penalty_s;
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn flights_are_compared_place_by_place() {
+    fn compares_flights_by_seed_and_variant() {
         use OutcomeKind::{Collided, Finished};
         let earlier = grade(vec![
             flown(1, Collided, 50.0, 8.0),
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_flights_and_other_places_say_so() {
+    fn reports_unchanged_flights_and_ignores_others() {
         let one = grade(vec![flown(1, OutcomeKind::Finished, 100.0, 9.0)]);
         assert_eq!(lines(&one, &one), ["nothing changed: 1 flights went as before"]);
         let other = grade(vec![flown(2, OutcomeKind::Finished, 100.0, 9.0)]);
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn many_are_counted() {
+    fn counts_many_flights() {
         let all =
             |score| (1..=9).map(|seed| flown(seed, OutcomeKind::Collided, score, 9.0)).collect();
         let lines = lines(&grade(all(10.0)), &grade(all(20.0)));
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn another_course_is_not_compared() {
+    fn rejects_another_course() {
         let p4 = subject();
         let p5 = Subject { project: "p5-other".into(), ..subject() };
         let error = check(&p4, &p5).unwrap_err().to_string();

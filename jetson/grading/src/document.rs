@@ -1,5 +1,5 @@
-//! The grade as a document: what was graded, by what, how each flight went, and a signature over all
-//! of it. The same plugin, program, project and seeds give the same text, signature included.
+//! The grade as a document: subject, results of each flight, and a signature. The same plugin,
+//! program, project and seeds give the same text, including the signature.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -19,12 +19,12 @@ use vizflyt_trust::{from_hex, hex};
 
 use super::statistics::{Interval, mean_interval, share_interval};
 
-/// What the first field holds; another layout is another number.
+/// Value of the first field; a new layout gets a new number.
 pub(crate) const FORMAT: &str = "vizflyt-grade-1";
 
-/// Seeds that are flown at most, and parts of a grade.
+/// Maximum number of seeds, and of shards.
 pub(crate) const MAX_SEEDS: u64 = 100_000;
-/// Variants that there are at most, in this version and those to come.
+/// Maximum number of variants, in this and later versions.
 const MAX_VARIANTS: usize = 64;
 
 /// A grade.
@@ -33,135 +33,137 @@ const MAX_VARIANTS: usize = 64;
 pub struct Grade {
     /// [`FORMAT`].
     pub format: String,
-    /// Over the flights' hashes, in their order.
+    /// Hash over the hashes of the flights, in order.
     pub hash: String,
-    /// What was graded, and by what.
+    /// Subject of the grade.
     pub subject: Subject,
-    /// Which part of the flights this is; absent if all.
+    /// Shard of the flights; absent if the grade has all flights.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shard: Option<Shard>,
-    /// The figures over all flights.
+    /// Results over all flights.
     pub summary: Summary,
-    /// What they are worth, by the project's table; absent if it has none.
+    /// Points by the project's table; absent if it has none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub points: Vec<PartPoints>,
-    /// And over those of each variant, in their order; absent if there is one.
+    /// Results of each variant, in order; absent if there is only one.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub by_variant: Vec<VariantSummary>,
-    /// The flights, by variant and seed.
+    /// Flights, by variant and seed.
     pub runs: Vec<Run>,
-    /// All other files of the report's folder, by path; none without a report.
+    /// All other files in the report's folder, by path; empty without a report.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub files: Vec<SignedFile>,
-    /// Over all of the above; absent before it is signed.
+    /// Signature over all other fields; absent before signing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signature: Option<Signed>,
 }
 
-/// What was graded, and by what. Grades of the same subject can be compared and merged.
+/// Subject of a grade: what was graded, and with what. Grades of the same subject can be compared
+/// and merged.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Subject {
-    /// What the command line called the plugin.
+    /// Name of the plugin on the command line.
     pub plugin: String,
-    /// SHA-256 over its files.
+    /// SHA-256 over the plugin's files.
     pub plugin_sha256: String,
-    /// The project's name.
+    /// Name of the project.
     pub project: String,
-    /// `ug` or `g`: which sensors it has.
+    /// Level of the sensors: `ug` or `g`.
     pub level: String,
-    /// Variants of the surroundings that were flown, in order.
+    /// Variants of light and weather, in order.
     pub variants: Vec<String>,
-    /// What those of them were that were drawn, as `[environment]` of an arena has it.
+    /// Settings of random variants, in the format of an arena's `[environment]`.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub environments: BTreeMap<String, EnvironmentConfig>,
-    /// The first seed.
+    /// First seed.
     pub first_seed: u64,
-    /// How many seeds each variant was flown with.
+    /// Number of seeds of each variant.
     pub seeds: u64,
-    /// What figures are worth; absent if the project says nothing.
+    /// Points table; absent if the project has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub points: Option<PointsTable>,
-    /// How long things took.
+    /// Time model.
     pub delays: DelaysMs,
-    /// The simulated inertial sensor; absent where it is the usual one.
+    /// Simulated inertial sensor; absent if it is the default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imu: Option<String>,
     /// Version of this program.
     pub program: String,
     /// SHA-256 of this program's file.
     pub program_sha256: String,
-    /// What drew, such as `cpu avx2`: another instruction set rounds differently.
+    /// Renderer, such as `cpu avx2`: other instruction sets round differently.
     pub renderer: String,
 }
 
-/// The time model. [ms]
+/// Time model: fixed delays of a graded flight. [ms]
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DelaysMs {
-    /// From one image to the next.
+    /// Interval between images.
     pub image_period: f64,
-    /// Age of an image when the plugin gets it.
+    /// Age of an image on delivery to the plugin.
     pub image: f64,
-    /// From then until its answer counts.
+    /// Delay from delivery until the plugin's answer takes effect.
     pub answer: f64,
 }
 
-/// How far off a flight's published estimate was; origin and heading are the plugin's choice, and found by least squares.
+/// Error of a flight's published estimate, after a least-squares alignment of origin and heading,
+/// which the plugin may choose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OdometryScore {
-    /// Estimates that were compared.
+    /// Number of compared estimates.
     pub poses: usize,
-    /// Distance from the truth, root of the mean square. [m]
+    /// Distance from the truth, root mean square. [m]
     pub ate_rmse_m: f64,
-    /// The greatest. [m]
+    /// Maximum distance from the truth. [m]
     pub ate_max_m: f64,
-    /// How the way of each second differs, root of the mean square; absent if the estimates are of less. [m]
+    /// Error of the motion in one second, root mean square; absent if the estimates cover less than
+    /// that. [m]
     pub rpe_trans_rmse_m: Option<f64>,
-    /// And the turn. [deg]
+    /// Error of the rotation in one second, root mean square. [deg]
     pub rpe_rot_rmse_deg: Option<f64>,
 }
 
-/// One flight.
+/// Results of one flight.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Run {
     /// Seed of the course and of the simulator's noise.
     pub seed: u64,
-    /// The surroundings.
+    /// Variant of light and weather.
     pub variant: String,
-    /// How it ended.
     pub outcome: OutcomeKind,
-    /// Why, in one sentence.
+    /// Reason of the outcome, as a sentence.
     pub reason: String,
-    /// What it probably was, in words; absent if it finished.
+    /// Probable cause of the failure, in words; absent if the flight finished.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cause: Option<String>,
-    /// How many stages were passed.
+    /// Number of stages passed.
     pub stages_passed: usize,
-    /// The stages in order.
+    /// Stages in order.
     pub stages: Vec<StageVerdict>,
-    /// From take-off to the end. [s]
+    /// Time from take-off to the end. [s]
     pub seconds: f64,
-    /// Added for offences. [s]
+    /// Time penalty. [s]
     pub penalty_s: f64,
-    /// 0 to 100.
+    /// Score, 0 to 100.
     pub score: f64,
-    /// Least distance of the body's surface to an obstacle. [m]
+    /// Minimum distance from the body's surface to an obstacle. [m]
     pub min_clearance_m: Option<f64>,
-    /// [m/s]
+    /// Maximum speed. [m/s]
     pub max_speed_mps: f64,
-    /// Way flown. [m]
+    /// Length of the flown path. [m]
     pub path_m: f64,
     /// Images that the plugin answered.
     pub images: u64,
-    /// How far off the plugin's own estimate was; absent if it published none.
+    /// Error of the plugin's own estimate; absent if it published none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub odometry: Option<OdometryScore>,
-    /// SHA-256 of the scene: its splats.
+    /// SHA-256 of the scene's splats.
     pub scene_sha256: String,
-    /// SHA-256 of its rules: `arena.toml`.
+    /// SHA-256 of the rules, `arena.toml`.
     pub rules_sha256: String,
     /// SHA-256 over all samples, setpoints, events and images of the flight.
     pub hash: String,
@@ -171,41 +173,40 @@ pub struct Run {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SignedFile {
-    /// Relative to the report's folder, with `/`.
+    /// Path relative to the report's folder, with `/`.
     pub path: String,
-    /// Its size. [bytes]
+    /// Size of the file. [bytes]
     pub bytes: u64,
-    /// SHA-256 of what it holds.
+    /// SHA-256 of the content.
     pub sha256: String,
 }
 
-/// The figures over all flights.
+/// Results over all flights.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Summary {
-    /// Flights.
+    /// Number of flights.
     pub runs: usize,
-    /// Those that finished.
+    /// Number of finished flights.
     pub finished: usize,
-    /// Share of flights that finish, 0 to 1, with its 95 % interval (Wilson).
+    /// Share of finished flights, 0 to 1, with its 95 % interval (Wilson).
     pub finish_share: Interval,
     /// Mean score, with its 95 % interval (bootstrap).
     pub score: Interval,
-    /// Mean time of the flights that finished, penalties included. [s]
+    /// Mean time of finished flights, penalties included. [s]
     pub mean_finish_s: Option<f64>,
-    /// Mean of the stages passed.
+    /// Mean number of stages passed.
     pub mean_stages_passed: f64,
-    /// Least clearance of all flights. [m]
+    /// Minimum clearance of all flights. [m]
     pub min_clearance_m: Option<f64>,
 }
 
-/// The figures over the flights of one variant.
+/// Results over the flights of one variant.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VariantSummary {
-    /// The surroundings.
+    /// Variant of light and weather.
     pub variant: String,
-    /// The figures.
     pub summary: Summary,
 }
 
@@ -213,14 +214,14 @@ pub struct VariantSummary {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Signed {
-    /// The public key, in hexadecimal.
+    /// Public key, in hexadecimal.
     pub key: String,
-    /// Over the grade's text without this field, in hexadecimal.
+    /// Signature over the grade's text without this field, in hexadecimal.
     pub signature: String,
 }
 
 impl Subject {
-    /// Returns variant and seed of every flight, in their order.
+    /// Returns variant and seed of every flight, in order.
     pub fn flights(&self) -> impl Iterator<Item = (&str, u64)> {
         let seeds = self.seeds();
         self.variants
@@ -228,14 +229,14 @@ impl Subject {
             .flat_map(move |variant| seeds.clone().map(move |seed| (variant.as_str(), seed)))
     }
 
-    /// Returns the seeds that each variant is flown with.
+    /// Returns the seeds of each variant.
     pub fn seeds(&self) -> Range<u64> {
         self.first_seed..self.first_seed.saturating_add(self.seeds)
     }
 }
 
 impl SignedFile {
-    /// Returns what is signed of a file that holds these bytes.
+    /// Returns the entry to sign for a file with this content.
     pub fn of(path: &str, bytes: &[u8]) -> Self {
         let sha256 = hex(&Sha256::digest(bytes));
         Self { path: path.to_owned(), bytes: bytes.len() as u64, sha256 }
@@ -265,7 +266,7 @@ impl Grade {
         }
     }
 
-    /// Signs it.
+    /// Signs the grade.
     pub fn sign(&mut self, key: &SigningKey) -> Result<()> {
         self.signature = None;
         let signature = key.sign(&self.bytes()?);
@@ -276,11 +277,10 @@ impl Grade {
         Ok(())
     }
 
-    /// Checks that the grade is as it was signed with `key`, and that its figures follow from its
-    /// flights.
+    /// Checks the signature with `key`, and that the results follow from the flights.
     ///
     /// # Errors
-    /// What does not hold, in a sentence.
+    /// The first failed check, as a sentence.
     pub fn verify(&self, key: &VerifyingKey) -> Result<()> {
         let Some(signed) = &self.signature else { bail!("the grade is not signed") };
         let public = hex(&key.to_bytes());
@@ -306,7 +306,7 @@ impl Grade {
             self.points == points_of(&self.subject, &self.runs),
             "the points do not follow from the flights"
         );
-        // An earlier version wrote none.
+        // Earlier versions wrote no results of variants.
         ensure!(
             self.by_variant.is_empty() || self.by_variant == by_variant(&self.subject, &self.runs),
             "the figures of the variants do not follow from the flights"
@@ -314,12 +314,12 @@ impl Grade {
         Ok(())
     }
 
-    /// Returns the median time of the flights that finished, penalties included. [s]
+    /// Returns the median time of finished flights, penalties included. [s]
     pub fn median_finish_s(&self) -> Option<f64> {
         median_of_finished(&self.runs, |run| run.seconds + run.penalty_s)
     }
 
-    /// Returns the points, and how many there could be; none where the project says nothing.
+    /// Returns the points and the maximum; `None` if the project has no table.
     pub fn all_points(&self) -> Option<(f64, f64)> {
         let most = self.subject.points?.most();
         Some((millionth(self.points.iter().map(|part| part.points).sum()), millionth(most)))
@@ -328,18 +328,18 @@ impl Grade {
     /// Reads a grade from a file.
     ///
     /// # Errors
-    /// If it cannot be read or is no grade of this format.
+    /// If the file cannot be read, or is not a grade of this format.
     pub fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read {}", path.display()))?;
-        Self::parse(&text).with_context(|| format!("{} is no grade", path.display()))
+        Self::parse(&text).with_context(|| format!("{} is not a grade", path.display()))
     }
 
-    /// Reads a grade from its text.
+    /// Parses a grade.
     ///
     /// # Errors
-    /// Text that is no grade, or one of more flights or parts than are ever flown: what it says is
-    /// counted through, also before its signature holds.
+    /// If the text is not a grade, or has more flights or shards than the maximum. Loops depend on
+    /// these numbers before the signature is verified.
     pub fn parse(text: &str) -> Result<Self> {
         let grade: Self = serde_json::from_str(text)?;
         let Subject { seeds, variants, .. } = &grade.subject;
@@ -351,39 +351,39 @@ impl Grade {
         let points = grade.subject.points.as_ref();
         points.map_or(Ok(()), PointsTable::check).map_err(anyhow::Error::msg)?;
         if let Some(Shard { index, count }) = grade.shard {
-            ensure!(Shard::is_one(index, count), "{index}/{count} is no part");
+            ensure!(Shard::is_one(index, count), "{index}/{count} is not a valid shard");
         }
         check_files(&grade.files)?;
         Ok(grade)
     }
 
-    /// Returns the text for files and people.
+    /// Returns the text for files.
     pub fn to_text(&self) -> Result<String> {
         Ok(serde_json::to_string_pretty(self)? + "\n")
     }
 
-    /// Returns what is signed: the document without spaces, its fields in the order of the type.
+    /// Returns the signed bytes: the document without spaces, fields in the order of the type.
     fn bytes(&self) -> Result<Vec<u8>> {
         Ok(serde_json::to_vec(self)?)
     }
 }
 
-/// Checks that each path stays in the report's folder, and is there once, in order.
+/// Checks that each path stays in the report's folder, and that the paths are sorted and unique.
 ///
 /// # Errors
-/// The first that does not.
+/// The first invalid path.
 pub(crate) fn check_files(files: &[SignedFile]) -> Result<()> {
     for SignedFile { path, .. } in files {
         let is_inside = path.split('/').all(|part| !matches!(part, "" | "." | ".."));
-        ensure!(is_inside && !path.contains('\0'), "{path:?} is no file of a report");
+        ensure!(is_inside && !path.contains('\0'), "{path:?} is not a valid path in a report");
     }
     let is_sorted = files.windows(2).all(|pair| pair[0].path < pair[1].path);
-    ensure!(is_sorted, "its files are not in the order of their paths, each once");
+    ensure!(is_sorted, "the files are not sorted by path, each once");
     Ok(())
 }
 
 impl OdometryScore {
-    /// Rounds figures to what a text of them holds.
+    /// Rounds the numbers to those of the text.
     pub fn round(&mut self) {
         let optional = self.rpe_trans_rmse_m.iter_mut().chain(&mut self.rpe_rot_rmse_deg);
         for number in [&mut self.ate_rmse_m, &mut self.ate_max_m].into_iter().chain(optional) {
@@ -391,22 +391,22 @@ impl OdometryScore {
         }
     }
 
-    /// Returns it in a sentence.
+    /// Returns the score as a sentence.
     pub fn text(&self) -> String {
         let relative = match (self.rpe_trans_rmse_m, self.rpe_rot_rmse_deg) {
-            (Some(m), Some(deg)) => format!("; a second's motion is off by {m:.3} m, {deg:.2} deg"),
+            (Some(m), Some(deg)) => format!("; error per second of motion: {m:.3} m, {deg:.2} deg"),
             _ => String::new(),
         };
         format!(
-            "its odometry was off by {:.3} m (rmse of {} poses, {:.3} at most){relative}",
+            "its odometry was off by {:.3} m (rmse of {} poses, maximum {:.3}){relative}",
             self.ate_rmse_m, self.poses, self.ate_max_m
         )
     }
 }
 
 impl Run {
-    /// Rounds every number to a millionth: such numbers come back from any reader of JSON to the last
-    /// bit, and the signature is over the text.
+    /// Rounds every number to a millionth. Any JSON reader returns such numbers exactly, and the
+    /// signature is over the text.
     pub fn round(&mut self) {
         let numbers = [&mut self.seconds, &mut self.penalty_s, &mut self.score];
         let others = [&mut self.max_speed_mps, &mut self.path_m].into_iter();
@@ -453,7 +453,7 @@ fn least_clearance_m<'a>(runs: impl Iterator<Item = &'a Run>) -> Option<f64> {
     runs.filter_map(|run| run.min_clearance_m).reduce(f64::min)
 }
 
-/// Returns the median of a figure of the flights that finished.
+/// Returns the median of a figure of the finished flights.
 fn median_of_finished(runs: &[Run], figure: impl Fn(&Run) -> f64) -> Option<f64> {
     let finished = runs.iter().filter(|run| is_finished(run));
     let mut values: Vec<f64> = finished.map(figure).collect();
@@ -463,7 +463,7 @@ fn median_of_finished(runs: &[Run], figure: impl Fn(&Run) -> f64) -> Option<f64>
     Some(millionth(f64::midpoint(lower, upper)))
 }
 
-/// Returns what the figures over these flights are worth, by the project's table.
+/// Returns the points of these flights, by the project's table.
 fn points_of(subject: &Subject, runs: &[Run]) -> Vec<PartPoints> {
     let Some(table) = &subject.points else { return Vec::new() };
     let summary = Summary::of(runs);
@@ -475,7 +475,7 @@ fn points_of(subject: &Subject, runs: &[Run]) -> Vec<PartPoints> {
     })
 }
 
-/// Returns the figures of each variant that was flown, where there are several.
+/// Returns the results of each variant, if there are several.
 fn by_variant(subject: &Subject, runs: &[Run]) -> Vec<VariantSummary> {
     if subject.variants.len() < 2 {
         return Vec::new();
@@ -492,7 +492,7 @@ fn by_variant(subject: &Subject, runs: &[Run]) -> Vec<VariantSummary> {
 fn hash_of(runs: &[Run]) -> String {
     let mut hash = Sha256::new();
     for run in runs {
-        // Lengths are fixed or written, so that no two lists give the same bytes.
+        // Lengths are fixed or included, so that different lists give different bytes.
         hash.update(run.seed.to_le_bytes());
         hash.update((run.variant.len() as u64).to_le_bytes());
         hash.update(run.variant.as_bytes());

@@ -1,4 +1,4 @@
-//! A grade as figures for people, on standard output, and as a file.
+//! Summary of a grade as text, and output as a file or JSON.
 
 use anyhow::{Context, Result};
 use vizflyt_process::print_line;
@@ -7,10 +7,10 @@ use vizflyt_protocol::messages::OutcomeKind;
 use super::args::ResultArgs;
 use super::document::{Grade, PartPoints, Run, VariantSummary};
 
-/// Flights that are named at most, of each kind.
+/// Maximum number of flights that are listed.
 pub(super) const NAMED: usize = 5;
 
-/// Writes a grade where it was asked for, and prints it: as JSON, or as [`print`] does.
+/// Writes a grade to the requested file, and prints it as JSON or text.
 pub(super) fn hand_over(grade: &Grade, args: &ResultArgs) -> Result<()> {
     if let Some(path) = &args.output {
         let text = grade.to_text()?;
@@ -24,7 +24,7 @@ pub(super) fn hand_over(grade: &Grade, args: &ResultArgs) -> Result<()> {
     Ok(())
 }
 
-/// Prints figures over all flights, what they are worth, and why flights did not finish.
+/// Prints the results over all flights, the points, and why flights did not finish.
 pub(super) fn print(grade: &Grade) {
     let summary = &grade.summary;
     print_line(format!(
@@ -49,10 +49,10 @@ pub(super) fn print(grade: &Grade) {
         ));
     }
     if let Some(mean_s) = summary.mean_finish_s {
-        print_line(format!("time        {mean_s:.1} s to the finish, on average"));
+        print_line(format!("time        {mean_s:.1} s to the finish, mean"));
     }
     if let Some((run, clearance_m)) = nearest(grade) {
-        print_line(format!("clearance   {clearance_m:.2} m at least, on {}", flight(grade, run)));
+        print_line(format!("clearance   {clearance_m:.2} m minimum, {}", flight(grade, run)));
     }
     if let Some((points, most)) = grade.all_points() {
         print_line(format!("points      {points:.1} of {most:.0}"));
@@ -72,7 +72,7 @@ pub(super) fn print(grade: &Grade) {
     print_line(format!("hash        {}", grade.hash));
 }
 
-/// Returns a line for each part of the points: what it gave, for which figure, and what would give more.
+/// Returns one line for each part of the points: points, figure, and what is missing for more.
 pub(super) fn points(grade: &Grade) -> Vec<String> {
     let line = |part: &PartPoints| {
         let name = name_of(&part.part);
@@ -84,12 +84,12 @@ pub(super) fn points(grade: &Grade) -> Vec<String> {
     grade.points.iter().map(line).collect()
 }
 
-/// Returns a row of a table of points as people call it.
+/// Returns the name of a row of a table of points.
 pub(super) fn name_of(part: &str) -> &str {
     part.rsplit_once('_').map_or(part, |(name, _)| name)
 }
 
-/// Returns a figure of a row of a table of points with its unit.
+/// Returns the figure of a row of a table of points, with its unit.
 pub(super) fn figure(part: &str, value: f64) -> String {
     match part {
         "time_s" => format!("{value:.1} s"),
@@ -99,7 +99,7 @@ pub(super) fn figure(part: &str, value: f64) -> String {
     }
 }
 
-/// Returns a flight as people call it: its seed, and its variant where there are several.
+/// Returns the name of a flight: its seed, and its variant if there are several.
 pub(super) fn flight(grade: &Grade, run: &Run) -> String {
     match &grade.subject.variants[..] {
         [_, _, ..] => format!("seed {}, {}", run.seed, run.variant),
@@ -107,7 +107,7 @@ pub(super) fn flight(grade: &Grade, run: &Run) -> String {
     }
 }
 
-/// Returns how a flight ended, and how far it came.
+/// Returns the outcome of a flight, and the next stage if it did not finish.
 pub(super) fn outcome(run: &Run) -> String {
     let name = run.outcome.name().replace('_', " ");
     let next = run.stages.iter().find(|stage| stage.passed_s.is_none());
@@ -119,7 +119,7 @@ pub(super) fn outcome(run: &Run) -> String {
     }
 }
 
-/// Returns the flight that came nearest to anything, and how near. [m]
+/// Returns the flight with the least clearance, and that clearance. [m]
 fn nearest(grade: &Grade) -> Option<(&Run, f64)> {
     let near = grade.runs.iter().filter_map(|run| Some((run, run.min_clearance_m?)));
     near.min_by(|a, b| a.1.total_cmp(&b.1))

@@ -1,4 +1,4 @@
-//! Flights that were flown and judged: written into the report's folder as they end, and kept for `--resume`.
+//! Finished flights: written into the report's folder when they end, and kept for `--resume`.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -14,37 +14,37 @@ use super::record::{FlightRecord, FlownWith, SealingKey};
 use super::trial::TrialResult;
 use super::{check_outputs, keys, report};
 
-/// A flight that was flown and judged.
+/// A finished and judged flight.
 #[derive(Clone)]
 pub(super) struct FlightDone {
     pub(super) run: Run,
-    /// Its card, as HTML; empty without a report.
+    /// Card as HTML; empty without a report.
     pub(super) card: String,
-    /// What lies of it in the report.
+    /// Files of the flight in the report.
     pub(super) files: Vec<SignedFile>,
-    /// Flown now: 0 if it is kept of an interrupted grade. [s]
+    /// Virtual time flown in this run; 0 if the flight is from an interrupted grade. [s]
     pub(super) virtual_s: f64,
 }
 
 impl FlightDone {
     pub(super) fn of(mut run: Run) -> Self {
-        // As it will be signed, and so as it is written.
+        // Rounded here, so that memory and the signed text agree.
         run.round();
         Self { run, card: String::new(), files: Vec::new(), virtual_s: 0.0 }
     }
 }
 
-/// The report while flights are flown.
+/// The report while flights are in progress.
 pub(super) struct LiveReport {
     pub(super) folder: ReportFolder,
     flown_with: FlownWith,
     key: SealingKey,
-    /// Flights of the grade that was interrupted.
+    /// Finished flights of the interrupted grade.
     kept: HashMap<(String, u64), FlightDone>,
 }
 
 impl LiveReport {
-    /// Opens the report's folder, if there is to be one.
+    /// Opens the report's folder, if a report is requested.
     pub(super) fn open(
         args: &FlyArgs,
         flown_with: FlownWith,
@@ -54,7 +54,7 @@ impl LiveReport {
         check_outputs(Some(root), &args.result, args.junit.as_deref())?;
         let folder =
             if args.resume { ReportFolder::resume(root)? } else { ReportFolder::begin(root)? };
-        // The grading key itself stays where it is until the last plugin has ended.
+        // The grading key itself is not held until the last plugin has ended.
         let key = SealingKey::of(&keys::signing_key(args.result.keys.as_deref())?);
         let mut report = Self { folder, flown_with, key, kept: HashMap::new() };
         let mut there = BTreeSet::new();
@@ -74,14 +74,15 @@ impl LiveReport {
             report.folder.records()?.into_iter().filter(|path| !there.contains(path)).collect();
         ensure!(
             other.is_empty(),
-            "{} holds flights that are not asked for ({}): give the same seeds, variants and part, or another folder",
+            "{} contains flights that were not requested ({}): give the same seeds, \
+             variants and part, or another folder",
             root.display(),
             folder::list(&other)
         );
         report.folder.keep_only(&there)?;
         if !report.kept.is_empty() {
             print_error(format_args!(
-                "{} of {} flights are finished already and are kept",
+                "{} of {} flights are finished already and kept",
                 report.kept.len(),
                 flights.len()
             ));
@@ -93,19 +94,19 @@ impl LiveReport {
         let record = FlightRecord::parse(text, &self.key, &self.flown_with)?;
         let (run, card, mut files) = (record.run, record.card, record.files);
         if (&*run.variant, run.seed) != (&*variant.to_string(), seed) {
-            bail!("it is the record of seed {}, {}", run.seed, run.variant);
+            bail!("the file is the record of seed {}, {}", run.seed, run.variant);
         }
         self.folder.check(&files)?;
         files.push(SignedFile::of(path, text.as_bytes()));
         Ok(FlightDone { card, files, ..FlightDone::of(run) })
     }
 
-    /// Returns a flight of the grade that was interrupted.
+    /// Returns a finished flight of the interrupted grade.
     pub(super) fn kept(&self, variant: Variant, seed: u64) -> Option<FlightDone> {
         self.kept.get(&(variant.to_string(), seed)).cloned()
     }
 
-    /// Writes what a flight leaves: images, log, and its record when they are on the medium.
+    /// Writes images, log and then the record of a flight, each flushed to disk.
     pub(super) fn write(
         &self,
         course: &CourseInstance,

@@ -1,4 +1,4 @@
-//! Flies a plugin through a project's course, once for each seed and variant, and makes the grade of all flights.
+//! Flies a plugin through a project's course once per seed and variant, and makes the grade.
 
 use std::cell::Cell;
 use std::collections::HashMap;
@@ -31,9 +31,9 @@ use super::trial::{AnotherWay, Delays, Trial, TrialLog, TrialResult};
 use super::{changes, figures, folder, junit, keys, pool, report};
 use crate::plugin::Plugin;
 
-/// Flies, judges, reports.
+/// Runs `vizflyt grade`: flies, judges, reports.
 pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
-    let typed = args.plugin.as_ref().context("no plugin is named")?;
+    let typed = args.plugin.as_ref().context("no plugin given")?;
     let plugin = Plugin::find(typed)?;
     let project = CourseProject::find(&args.project)?;
     let (delays, imu) = (delays(args)?, args.imu);
@@ -53,14 +53,15 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         .map(|(_, flight)| flight)
         .collect();
     let answer_within = Duration::try_from_secs_f64(args.answer_within)
-        .with_context(|| format!("--answer-within {}: that is no time", args.answer_within))?;
+        .with_context(|| format!("--answer-within {}: not a valid duration", args.answer_within))?;
     let stop: &AtomicBool = &*stop_flag(false)?;
-    // What a plugin of the same user could read, forge or look up: keys, our memory (proc(5)).
+    // Paths and memory that a plugin of the same user could read or forge: keys, and this process
+    // (proc(5)).
     let keys = vizflyt_trust::KeysFolder::open(args.result.keys.as_deref())?;
-    nix::sys::prctl::set_dumpable(false).context("this process cannot be kept to itself")?;
+    nix::sys::prctl::set_dumpable(false).context("cannot protect the memory of this process")?;
     let mut hide = vec![keys.file("")];
     hide.extend(args.first_seed.file.clone());
-    // It may lie in the plugin's own folder, and holds the logs of flights that are over.
+    // The report may be in the plugin's own folder, and contains logs of finished flights.
     hide.extend(args.report.clone());
     hide.extend(args.hide.clone());
     let limits = PluginLimits { hide, graded: true, ..PluginLimits::default() };
@@ -112,19 +113,19 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     let jobs =
         args.jobs.unwrap_or_else(|| available_parallelism().unwrap_or(NonZero::<usize>::MIN));
     let mut progress = Progress::new(flights.len());
-    // Which comes after which is nobody's business.
+    // Random order, so that a plugin cannot predict the next flight.
     let (mut order, lots): (Vec<usize>, _) = ((0..flights.len()).collect(), RandomState::new());
     order.sort_by_key(|index| lots.hash_one(index));
     let fly = |&index: &usize| fly(&flights[index]);
     let done = pool::run(&order, jobs, stop, fly, |done| progress.flown(&done.run, done.virtual_s));
     progress.end();
     let resumed = match &report {
-        Some(_) => "; --resume keeps the flights that are finished",
+        Some(_) => "; --resume keeps the finished flights",
         None => "",
     };
     let done = done.with_context(|| format!("nothing is graded{resumed}"))?;
     let Some(done) = done else {
-        print_error(format_args!("ended on request; nothing is graded{resumed}"));
+        print_error(format_args!("interrupted; nothing is graded{resumed}"));
         return Ok(ExitCode::FAILURE);
     };
     let mut done: Vec<(usize, FlightDone)> = order.into_iter().zip(done).collect();
@@ -137,12 +138,12 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
         runs.push(run);
     }
     let mut grade = Grade::new(subject, args.shard, runs);
-    // No plugin runs any more.
+    // All plugins have ended.
     let key = keys::signing_key(args.result.keys.as_deref())?;
     let unsealed = Confinement::prepare(&limits, &command).unsealed();
     if let Some(why) = &unsealed {
         print_error(format_args!(
-            "this grade is NOT signed: a plugin here could have reached what it must not ({why})"
+            "this grade is NOT signed: a plugin here could have accessed protected data ({why})"
         ));
     }
     let key = Some(&key).filter(|_| unsealed.is_none());
@@ -175,13 +176,13 @@ pub(super) fn grade(args: &FlyArgs) -> Result<ExitCode> {
     Ok(if is_enough { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// A flight is flown so often at most, where it fails for another reason than the plugin's.
+/// Maximum number of attempts, if a flight fails for reasons outside the plugin.
 const ATTEMPTS: u32 = 3;
-/// So long after the first failure; longer after the second.
+/// Pause after the first failure; longer after the second.
 const PAUSE: Duration = Duration::from_secs(2);
 
-/// Tries a flight again that failed for another reason than the plugin's: no memory, a process that somebody else
-/// killed. That is no grade; so it must not become one.
+/// Repeats a flight that failed for a reason outside the plugin: no memory, a process killed by
+/// another one. Such a failure must not become a grade.
 fn again_if_lost<T>(
     attempt: impl Fn() -> Result<Option<T>>,
     stop: &AtomicBool,
@@ -219,7 +220,7 @@ fn delays(args: &FlyArgs) -> Result<Delays> {
     })
 }
 
-/// Returns the variants that are flown, those that are drawn among them.
+/// Returns the variants to fly, including random ones.
 fn variants(args: &FlyArgs, project: &CourseProject) -> Result<Vec<Variant>> {
     let mut variants: Vec<Variant> = Vec::new();
     for choice in &args.variants {
@@ -233,7 +234,7 @@ fn variants(args: &FlyArgs, project: &CourseProject) -> Result<Vec<Variant>> {
         };
         for variant in chosen {
             let is_new = variants.iter().all(|other| other.to_string() != variant.to_string());
-            ensure!(is_new, "--variants: {variant} is there twice");
+            ensure!(is_new, "--variants: {variant} occurs twice");
             variants.push(variant);
         }
     }

@@ -1,11 +1,12 @@
-//! The folder of a report: what may lie in it, how it is written, and whether it is as it was signed.
+//! Folder of a report: allowed files, writing, and verification.
 //!
 //! ```text
-//! each flight  --> images/, logs/, then flights/NAME.json, its record: each whole and on the medium
-//! the end      --> index.html, junit.xml, then grade.json, which signs the hash of every file
-//! verify       --> what is changed, missing or added, by name
+//! each flight  --> images/, logs/, then flights/NAME.json, its record; each written atomically and flushed
+//! the end      --> index.html, junit.xml, then grade.json, with the signed hash of every file
+//! verify       --> names of changed, missing and added files
 //! ```
-//! Hashes are of what the grader wrote, not of what it finds: a plugin that can write there forges nothing.
+//! Hashes are of the bytes that the grader wrote, not of the files: a plugin that can write there
+//! cannot forge a report.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -18,24 +19,24 @@ use vizflyt_trust::hex;
 
 use super::document::{Grade, SignedFile};
 
-/// The signed document.
+/// Signed grade.
 pub(crate) const GRADE: &str = "grade.json";
-/// The page.
+/// Page of the report.
 pub(crate) const PAGE: &str = "index.html";
-/// For continuous integration.
+/// Results for continuous integration.
 pub(crate) const JUNIT: &str = "junit.xml";
-/// Folders of what each flight leaves.
+/// Folders with the files of each flight.
 pub(crate) const IMAGES: &str = "images";
 pub(crate) const LOGS: &str = "logs";
 pub(crate) const FLIGHTS: &str = "flights";
-/// What the name of a file begins with that is being written.
+/// Prefix of the name of a file that is being written.
 const DRAFT: &str = ".draft-";
-/// Names that a sentence lists at most.
+/// Maximum number of names in a message.
 const NAMED: usize = 12;
-/// A folder of more files than this is no report. [files]
+/// Maximum number of files; a folder with more is not a report.
 const MAX_FILES: usize = 5_000_000;
 
-/// A report's folder while it is written.
+/// Folder of a report that is being written.
 #[derive(Clone, Debug)]
 pub(crate) struct ReportFolder {
     root: PathBuf,
@@ -45,8 +46,8 @@ impl ReportFolder {
     /// Makes the folder, or empties that of an earlier report.
     ///
     /// # Errors
-    /// If it holds anything else: what lies in a report is signed. If it holds finished flights of a grade that
-    /// was interrupted.
+    /// If the folder contains other files, because all files in a report are signed, or finished
+    /// flights of an interrupted grade.
     pub(crate) fn begin(root: &Path) -> Result<Self> {
         let folder = Self::make(root)?;
         let there = files_of(root)?;
@@ -54,7 +55,7 @@ impl ReportFolder {
             let flown = there.iter().filter(|path| path.starts_with(FLIGHTS)).count();
             ensure!(
                 flown == 0,
-                "{} holds {flown} finished flights of a grade that was interrupted: --resume keeps them; or give \
+                "{} contains {flown} finished flights of an interrupted grade: keep them with --resume, or give \
                  another folder",
                 root.display()
             );
@@ -65,7 +66,7 @@ impl ReportFolder {
         let foreign: Vec<&String> = there.iter().filter(|path| !own.contains(*path)).collect();
         ensure!(
             foreign.is_empty() && (there.contains(GRADE) || there.is_empty()),
-            "{} holds other files than a report's ({}); all that lies in a report is signed: give an empty folder",
+            "{} contains other files than a report's ({}); all files in a report are signed: give an empty folder",
             root.display(),
             list(&if foreign.is_empty() { there.iter().collect() } else { foreign })
         );
@@ -75,29 +76,29 @@ impl ReportFolder {
         Ok(folder)
     }
 
-    /// Puts a whole report, which lies on the same disk, in the place of an earlier one.
+    /// Replaces an earlier report by a complete one on the same disk.
     ///
     /// # Errors
-    /// As [`Self::begin`], or if it cannot be moved.
+    /// As for [`Self::begin`], or if it cannot be moved.
     pub(crate) fn replace(root: &Path, with: &Path) -> Result<()> {
         Self::begin(root)?;
-        // Folders alone are left of the earlier one.
+        // Only folders remain of the earlier report.
         fs::remove_dir_all(root)
             .and_then(|()| fs::rename(with, root))
             .with_context(|| format!("cannot put the report into {}", root.display()))
     }
 
-    /// Opens the folder of a grade that was interrupted, or makes it.
+    /// Opens the folder of an interrupted grade, or makes it.
     ///
     /// # Errors
-    /// If it holds anything but what a grade leaves.
+    /// If it contains files that no grade writes.
     pub(crate) fn resume(root: &Path) -> Result<Self> {
         let folder = Self::make(root)?;
         let there = files_of(root)?;
         let foreign: Vec<&String> = there.iter().filter(|path| !is_ours(path)).collect();
         ensure!(
             foreign.is_empty(),
-            "{} holds other files than a report's ({}); all that lies in a report is signed: move them away",
+            "{} contains other files than a report's ({}); all files in a report are signed: move them away",
             root.display(),
             list(&foreign)
         );
@@ -109,12 +110,12 @@ impl ReportFolder {
         Ok(Self { root: root.to_owned() })
     }
 
-    /// Returns where a file of the folder is.
+    /// Returns the path of a file in the folder.
     pub(crate) fn at(&self, path: &str) -> PathBuf {
         self.root.join(path)
     }
 
-    /// Returns a file on the folder's disk that has no name: nobody else can open it.
+    /// Returns an unnamed file on the folder's disk: no other process can open it.
     ///
     /// # Errors
     /// If it cannot be made.
@@ -123,7 +124,7 @@ impl ReportFolder {
             .with_context(|| format!("cannot write in {}", self.root.display()))
     }
 
-    /// Writes a file whole: it is there on the medium as it is, or not at all.
+    /// Writes a file atomically: after a crash it is complete or absent.
     ///
     /// # Errors
     /// If it cannot be written.
@@ -131,12 +132,12 @@ impl ReportFolder {
         self.copy(path, &mut &*bytes)
     }
 
-    /// As [`Self::write`], of what a file holds from its start.
+    /// Like [`Self::write`], with the content of a file from its start.
     ///
     /// # Errors
     /// If it cannot be read or written.
     pub(crate) fn write_file(&self, path: &str, mut source: &File) -> Result<SignedFile> {
-        source.rewind().with_context(|| format!("cannot read what {path} is to hold"))?;
+        source.rewind().with_context(|| format!("cannot read the content for {path}"))?;
         self.copy(path, &mut source)
     }
 
@@ -147,7 +148,7 @@ impl ReportFolder {
         fs::create_dir_all(folder).with_context(cannot)?;
         let draft = tempfile::Builder::new().prefix(DRAFT).tempfile_in(folder);
         let mut draft = draft.with_context(cannot)?;
-        // Readable as any other file: a report is there to be shown.
+        // Readable for all users, like any other file: a report is for others.
         let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);
         draft.as_file().set_permissions(open).with_context(cannot)?;
         let (mut hash, mut bytes, mut buffer) = (Sha256::new(), 0, vec![0; 1 << 16]);
@@ -165,12 +166,12 @@ impl ReportFolder {
         }
         draft.as_file().sync_all().with_context(cannot)?;
         draft.persist(&to).map_err(|error| error.error).with_context(cannot)?;
-        // The name, too, is on the medium before anything is written that counts on it.
+        // Flush the directory entry too, before anything that depends on the file is written.
         File::open(folder).and_then(|folder| folder.sync_all()).with_context(cannot)?;
         Ok(SignedFile { path: path.to_owned(), bytes, sha256: hex(&hash.finalize()) })
     }
 
-    /// Returns the paths of the records that are there.
+    /// Returns the paths of the records in the folder.
     ///
     /// # Errors
     /// If the folder cannot be read.
@@ -182,7 +183,7 @@ impl ReportFolder {
         Ok(files_of(&self.root)?.into_iter().filter(is_record).collect())
     }
 
-    /// Removes what a grade has left there besides `kept`.
+    /// Removes all files of a grade except `kept`.
     ///
     /// # Errors
     /// If a file cannot be removed.
@@ -198,10 +199,10 @@ impl ReportFolder {
         fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))
     }
 
-    /// Checks that these files are as they were written.
+    /// Checks that these files are unchanged.
     ///
     /// # Errors
-    /// Which are not.
+    /// The names of changed or missing files.
     pub(crate) fn check(&self, files: &[SignedFile]) -> Result<()> {
         let found = differences(&self.root, files)?;
         let (changed, missing) = (list(&found.changed), list(&found.missing));
@@ -211,10 +212,10 @@ impl ReportFolder {
     }
 }
 
-/// Checks that a folder holds what its grade signs, and nothing else.
+/// Checks that a folder contains exactly the files that its grade signs.
 ///
 /// # Errors
-/// What is changed, missing or added, by name.
+/// The names of changed, missing and added files.
 pub(crate) fn verify(root: &Path, grade: &Grade) -> Result<()> {
     ensure!(
         !grade.files.is_empty(),
@@ -228,11 +229,11 @@ pub(crate) fn verify(root: &Path, grade: &Grade) -> Result<()> {
         .filter(|(_, paths)| !paths.is_empty())
         .map(|(kind, paths)| format!("{kind}: {}", list(paths)))
         .collect();
-    ensure!(told.is_empty(), "not as it was signed: {}", told.join("; "));
+    ensure!(told.is_empty(), "differs from the signed report: {}", told.join("; "));
     Ok(())
 }
 
-/// Returns whether a grade leaves a file of this name.
+/// Returns whether a grade writes a file of this name.
 fn is_ours(path: &str) -> bool {
     let in_folder = [IMAGES, LOGS, FLIGHTS]
         .iter()
@@ -240,7 +241,7 @@ fn is_ours(path: &str) -> bool {
     in_folder || [GRADE, PAGE, JUNIT].contains(&path) || path.starts_with(DRAFT)
 }
 
-/// How a folder differs from a list.
+/// Differences between a folder and a list of files.
 #[derive(Debug, Default)]
 struct Differences {
     changed: Vec<String>,
@@ -263,7 +264,7 @@ fn differences(root: &Path, files: &[SignedFile]) -> Result<Differences> {
 }
 
 fn is_same(path: &Path, expected: &SignedFile) -> Result<bool> {
-    // A link may lead to the right bytes today.
+    // A link may point to the right bytes now and to others later.
     let info = fs::symlink_metadata(path).with_context(|| path.display().to_string())?;
     if !info.is_file() || info.len() != expected.bytes {
         return Ok(false);
@@ -274,7 +275,7 @@ fn is_same(path: &Path, expected: &SignedFile) -> Result<bool> {
     Ok(hex(&hash.finalize()) == expected.sha256)
 }
 
-/// Returns the paths of all that lies in a folder but folders, relative to it.
+/// Returns the paths of all files in a folder, relative to it.
 fn files_of(root: &Path) -> Result<BTreeSet<String>> {
     let mut found = BTreeSet::new();
     let mut folders = vec![(root.to_owned(), String::new())];
@@ -286,7 +287,7 @@ fn files_of(root: &Path) -> Result<BTreeSet<String>> {
             if entry.file_type().with_context(cannot)?.is_dir() {
                 folders.push((entry.path(), path + "/"));
             } else if found.len() >= MAX_FILES {
-                bail!("{} holds more than {MAX_FILES} files; is it a report?", root.display());
+                bail!("{} contains more than {MAX_FILES} files; is it a report?", root.display());
             } else {
                 found.insert(path);
             }
@@ -295,7 +296,7 @@ fn files_of(root: &Path) -> Result<BTreeSet<String>> {
     Ok(found)
 }
 
-/// Returns the first of some names for people; names may hold anything.
+/// Returns the first names as text; names are escaped because they may contain any bytes.
 pub(crate) fn list<T: AsRef<str>>(paths: &[T]) -> String {
     let named: Vec<String> =
         paths.iter().take(NAMED).map(|path| path.as_ref().escape_debug().to_string()).collect();
@@ -305,7 +306,7 @@ pub(crate) fn list<T: AsRef<str>>(paths: &[T]) -> String {
     }
 }
 
-/// Returns the files by their paths, each once: those that come later take the place of earlier ones.
+/// Returns the files sorted by path, each once; later ones replace earlier ones.
 pub(crate) fn sorted(files: Vec<SignedFile>) -> Vec<SignedFile> {
     let by_path: BTreeMap<String, SignedFile> =
         files.into_iter().map(|file| (file.path.clone(), file)).collect();
@@ -342,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_changed_missing_or_added_is_named() {
+    fn names_changed_missing_and_added_files() {
         let temporary = tempfile::tempdir().unwrap();
         let root = temporary.path();
         let grade = report(root, &CONTENTS);
@@ -350,13 +351,13 @@ mod tests {
         for (path, bytes) in CONTENTS {
             let at = root.join(path);
             fs::write(&at, "other").unwrap();
-            assert_eq!(refusal(root, &grade), format!("not as it was signed: changed: {path}"));
+            assert_eq!(refusal(root, &grade), format!("differs from the signed report: changed: {path}"));
             fs::remove_file(&at).unwrap();
-            assert_eq!(refusal(root, &grade), format!("not as it was signed: missing: {path}"));
-            // The right bytes, by a link, are not the file.
+            assert_eq!(refusal(root, &grade), format!("differs from the signed report: missing: {path}"));
+            // A link to the right bytes is not the file.
             fs::write(root.join("other"), bytes).unwrap();
             std::os::unix::fs::symlink(root.join("other"), &at).unwrap();
-            let expected = format!("not as it was signed: changed: {path}; added: other");
+            let expected = format!("differs from the signed report: changed: {path}; added: other");
             assert_eq!(refusal(root, &grade), expected);
             fs::remove_file(&at).unwrap();
             fs::rename(root.join("other"), &at).unwrap();
@@ -364,14 +365,14 @@ mod tests {
         fs::create_dir(root.join("logs/deep")).unwrap();
         verify(root, &grade).unwrap();
         fs::write(root.join("logs/deep/\u{1b}[2J"), "").unwrap();
-        let expected = "not as it was signed: added: logs/deep/\\u{1b}[2J";
+        let expected = "differs from the signed report: added: logs/deep/\\u{1b}[2J";
         assert_eq!(refusal(root, &grade), expected);
         let bare = Grade { files: Vec::new(), ..grade };
         assert!(refusal(root, &bare).contains("signs no files"));
     }
 
     #[test]
-    fn a_report_takes_the_place_of_an_earlier_one_and_of_nothing_else() {
+    fn replaces_an_earlier_report_and_rejects_other_folders() {
         let temporary = tempfile::tempdir().unwrap();
         let root = temporary.path();
         report(root, &CONTENTS);
@@ -384,14 +385,14 @@ mod tests {
         assert!(error.contains("thesis.tex"), "{error}");
         assert!(root.join(PAGE).exists(), "nothing was removed");
         fs::remove_file(root.join("thesis.tex")).unwrap();
-        // Interrupted: flights, and no grade.
+        // Interrupted: flights without a grade.
         fs::remove_file(root.join(GRADE)).unwrap();
         fs::create_dir(root.join(FLIGHTS)).unwrap();
         fs::write(root.join("flights/day-1.json"), "{}").unwrap();
         fs::write(root.join("flights/.draft-abc"), "").unwrap();
         fs::write(root.join(".draft-abc"), "").unwrap();
         let error = ReportFolder::begin(root).unwrap_err().to_string();
-        assert!(error.contains("--resume keeps them"), "{error}");
+        assert!(error.contains("keep them with --resume"), "{error}");
         let folder = ReportFolder::resume(root).unwrap();
         assert_eq!(folder.records().unwrap(), ["flights/day-1.json"]);
         folder.keep_only(&["flights/day-1.json".to_owned()].into()).unwrap();
@@ -399,9 +400,9 @@ mod tests {
     }
 
     proptest! {
-        /// Any one change of any file is found, by its name.
+        /// Every change of any file is reported by name.
         #[test]
-        fn any_change_is_found(
+        fn detects_any_change(
             contents in proptest::collection::vec(proptest::collection::vec(any::<u8>(), 1..50), 1..6),
             which in any::<prop::sample::Index>(), at in any::<prop::sample::Index>(), bits in 1u8..,
         ) {
@@ -415,7 +416,7 @@ mod tests {
             let at = at.index(changed.len());
             changed[at] ^= bits;
             fs::write(temporary.path().join(&names[which]), changed).unwrap();
-            let expected = format!("not as it was signed: changed: {}", names[which]);
+            let expected = format!("differs from the signed report: changed: {}", names[which]);
             prop_assert_eq!(refusal(temporary.path(), &grade), expected);
         }
     }

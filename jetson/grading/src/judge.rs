@@ -1,10 +1,11 @@
-//! `vizflyt grade judge LOG`: judges the track of a flight that was logged in the lab by the rules that grades go by.
+//! `vizflyt grade judge LOG`: judges the logged track of a flight in the lab by the rules of
+//! grades.
 //!
 //! ```text
 //! LOG: poses, events of the runtime --> referee, with the scene's obstacles --> verdict
 //! ```
-//! What the lab's referee has decided is left out and decided once more. A log is the runtime's: it shows how a flight
-//! is judged, and proves nothing about who flew it.
+//! Decisions of the lab's referee in the log are ignored and made again. The runtime writes the
+//! log: the result shows how a flight is judged, and proves nothing about who flew it.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -26,27 +27,29 @@ use vizflyt_studio::stage::{Place, Stage};
 
 #[derive(Args, Clone, Debug)]
 pub(super) struct JudgeArgs {
-    /// The flight's log
+    /// Log of the flight
     #[arg(value_name = "FILE.mcap")]
     log: PathBuf,
-    /// The arena it was flown in: a scene folder, an arena.toml, a scene file or a generated scene's name [default: forest]
+    /// Arena of the flight: scene folder, arena.toml, scene file or generated scene
+    ///
+    /// [default: forest]
     #[arg(long, value_name = "SCENE")]
     scene: Option<String>,
-    /// The project whose course it was; takes the place of --scene
+    /// Course project of the flight; replaces --scene
     #[arg(long, value_name = "NAME")]
     project: Option<String>,
     /// Level of the project
     #[arg(long, value_name = "ug|g", requires = "project")]
     level: Option<Level>,
-    /// Its light and weather
+    /// Light and weather of the project
     #[arg(long, value_name = "NAME", requires = "project")]
     variant: Option<Variant>,
-    /// Its seed, of what is generated
+    /// Seed of a generated scene or course
     #[arg(long)]
     seed: Option<u64>,
     #[command(flatten)]
     bare: BareArgs,
-    /// Prints the verdict as JSON
+    /// Print the verdict as JSON
     #[arg(long)]
     json: bool,
 }
@@ -54,14 +57,14 @@ pub(super) struct JudgeArgs {
 /// Judges a logged flight, and prints the verdict.
 ///
 /// # Errors
-/// A log without a flight, a scene that cannot be loaded or in which something moves.
+/// If the log contains no flight, or if the scene cannot be loaded or has moving objects.
 pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
     let cannot = || format!("{} cannot be judged", args.log.display());
     let track = RecordedTrack::read(LogReader::open(&args.log).with_context(cannot)?)
         .with_context(cannot)?;
     ensure!(
         !track.poses.is_empty(),
-        "{} holds no flight of this version: poses, and what the plugin was told",
+        "{} does not contain a flight of this version, with poses and the plugin's course information",
         args.log.display()
     );
     let seed = args.seed.unwrap_or(Place::SEED);
@@ -77,7 +80,7 @@ pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
     let scene = load(&stage.arena, &BareArgs::default())?;
     ensure!(
         scene.arena.objects.iter().all(|object| object.motion.is_none()),
-        "something moves in {}, and a log does not tell where it was: such a flight is judged by its server alone",
+        "{} has moving objects, whose positions are not in a log; only its server can judge such a flight",
         scene.arena.name
     );
     let baked =
@@ -97,7 +100,7 @@ pub(super) fn run(args: &JudgeArgs) -> Result<ExitCode> {
         print_line(format!("            {}: {passed}", stage.name));
     }
     if let Some(clearance_m) = verdict.min_clearance_m {
-        print_line(format!("clearance   {clearance_m:.2} m at least"));
+        print_line(format!("clearance   {clearance_m:.2} m minimum"));
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -125,12 +128,12 @@ fn judge_track(arena: &ArenaConfig, obstacles: Obstacles, track: RecordedTrack) 
         events.extend(std::iter::from_fn(|| referee.poll_event()));
     }
     events.extend(told);
-    // Two stories, each in order, become one.
+    // Merge the two ordered lists into one.
     events.sort_by_key(|event| event.stamp);
     judge(arena, &events, &samples)
 }
 
-/// Whether it is the referee who reports this.
+/// Whether the referee reports this event.
 fn is_of_referee(kind: &EventKind) -> bool {
     matches!(
         kind,

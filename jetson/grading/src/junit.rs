@@ -1,4 +1,4 @@
-//! The grade as JUnit XML, which continuous integration shows: a test for each flight.
+//! Grade as JUnit XML, for continuous integration: one test per flight.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -9,15 +9,14 @@ use vizflyt_protocol::messages::OutcomeKind;
 use super::document::Grade;
 use super::report::escape;
 
-/// Writes the file.
 pub(crate) fn write(path: &Path, grade: &Grade) -> Result<()> {
     std::fs::write(path, text(grade)).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Checks that a file is what [`write`] makes of a grade.
+/// Checks that a file is the JUnit XML of a grade, as [`write`] makes it.
 ///
 /// # Errors
-/// If it cannot be read, or is not.
+/// If it cannot be read, or differs.
 pub(crate) fn verify(path: &Path, grade: &Grade) -> Result<()> {
     let found = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     ensure!(
@@ -28,7 +27,7 @@ pub(crate) fn verify(path: &Path, grade: &Grade) -> Result<()> {
     Ok(())
 }
 
-/// Returns what the file holds.
+/// Returns the content of the file.
 pub(crate) fn text(grade: &Grade) -> String {
     let subject = &grade.subject;
     let (plugin, project) = (escape(&subject.plugin), escape(&subject.project));
@@ -72,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_flight_is_a_test_and_words_are_escaped() {
+    fn writes_a_test_per_flight_and_escapes_text() {
         let mut grade = grade();
         grade.runs[0].cause = Some("a < b & \"c\"\nd".to_owned());
         let text = text(&grade);
@@ -81,7 +80,7 @@ mod tests {
             "<testcase classname=\"forest.day\" name=\"seed 3\" time=\"10.300\"/>",
             "<failure type=\"collided\" message=\"a &lt; b &amp; &quot;c&quot; d\">",
         ] {
-            assert!(text.contains(part), "no {part} in {text}");
+            assert!(text.contains(part), "{part} is missing in {text}");
         }
         assert_eq!(text.matches("<testcase").count(), 2);
         let file = tempfile::NamedTempFile::new().unwrap();

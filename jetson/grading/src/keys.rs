@@ -1,4 +1,4 @@
-//! Whose word a grade is: the key that it is signed with, and what the plugin and this program are.
+//! Signing key of grades, and the hashes of plugin and program.
 
 use std::fs::{self, File};
 use std::io::Read;
@@ -9,14 +9,14 @@ use ed25519_dalek::{SigningKey, VerifyingKey};
 use sha2::{Digest, Sha256};
 use vizflyt_trust::{KeysFolder, from_hex, hex};
 
-/// The file of the folder of keys that holds the secret, as 64 hexadecimal digits.
+/// File in the folder of keys with the secret key, as 64 hexadecimal digits.
 const KEY_FILE: &str = "grading.key";
-/// What no plugin is made of: what builds and interpreters leave behind.
+/// Folders that are not part of a plugin: output of builds and interpreters.
 const LEFT_ASIDE: [&str; 4] = ["target", "__pycache__", "node_modules", "venv"];
-/// A plugin of more files than this is some other folder.
+/// Maximum number of files in a plugin; a folder with more is not a plugin's.
 const MAX_FILES: usize = 20_000;
 
-/// Returns the key that grades are signed with; the first grade makes it.
+/// Returns the key that signs grades; the first grade makes it.
 pub(crate) fn signing_key(keys: Option<&Path>) -> Result<SigningKey> {
     let folder = KeysFolder::open(keys)?;
     if let Some(key) = read_key(&folder)? {
@@ -27,7 +27,7 @@ pub(crate) fn signing_key(keys: Option<&Path>) -> Result<SigningKey> {
         .and_then(|mut file| file.read_exact(&mut secret))
         .context("no random numbers from /dev/urandom")?;
     folder.write(KEY_FILE, &format!("{}\n", hex(&secret)))?;
-    // Of two that made one at the same time, the later counts for both.
+    // If two processes made a key at the same time, both use the later one.
     read_key(&folder)?.context("the key that was just written is not there")
 }
 
@@ -39,14 +39,14 @@ fn read_key(folder: &KeysFolder) -> Result<Option<SigningKey>> {
     Ok(Some(SigningKey::from_bytes(&secret)))
 }
 
-/// Returns the key that grades are to be signed with: as given, in hexadecimal or in a file; else this
+/// Returns the key to verify grades with: the given one, in hexadecimal or in a file, or this
 /// computer's own.
 pub(crate) fn verifying_key(given: Option<&str>, keys: Option<&Path>) -> Result<VerifyingKey> {
     let Some(given) = given else {
         let own = read_key(&KeysFolder::open(keys)?)?;
         let own = own.context(
-            "this computer has graded nothing yet; say with --key whose grades are to be trusted: the \
-             key that `vizflyt grade key` prints where they were made",
+            "this computer has graded nothing yet; give the accepted signer with --key: the \
+             key that `vizflyt grade key` prints on the computer that made the grade",
         )?;
         return Ok(own.verifying_key());
     };
@@ -55,11 +55,11 @@ pub(crate) fn verifying_key(given: Option<&str>, keys: Option<&Path>) -> Result<
     } else {
         given.to_owned()
     };
-    // As a person may have copied it.
+    // Accept upper case, as in a copied key.
     let bytes = from_hex::<32>(&text.trim().to_ascii_lowercase());
     let bytes = bytes.with_context(|| format!("--key {given}: not 64 hexadecimal digits"))?;
     let key = VerifyingKey::from_bytes(&bytes).ok();
-    key.with_context(|| format!("--key {given}: that is no key"))
+    key.with_context(|| format!("--key {given}: not a valid public key"))
 }
 
 /// Returns the SHA-256 of this program's file.
@@ -70,8 +70,8 @@ pub(crate) fn program_sha256() -> Result<String> {
     Ok(hex(&hash.finalize()))
 }
 
-/// Returns the SHA-256 over a plugin's files: names and contents, in the order of their names. What a grade itself writes
-/// is none of them, wherever it lies: `outputs`.
+/// Returns the SHA-256 over a plugin's files: names and contents, sorted by name. `outputs`, the
+/// files that a grade writes, are excluded.
 pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
     let mut files = Vec::new();
     if path.is_dir() {
@@ -87,7 +87,7 @@ pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
         let name = file.strip_prefix(path).ok().filter(|name| !name.as_os_str().is_empty());
         let name = name.unwrap_or(file.file_name().map_or(path, Path::new)).to_string_lossy();
         let len = fs::metadata(file).with_context(|| format!("{}", file.display()))?.len();
-        // Lengths first, so that no two folders give the same bytes.
+        // Lengths come first, so that different folders give different bytes.
         hash.update((name.len() as u64).to_le_bytes());
         hash.update(name.as_bytes());
         hash.update(len.to_le_bytes());
@@ -96,7 +96,7 @@ pub(crate) fn plugin_sha256(path: &Path, outputs: &[&Path]) -> Result<String> {
     Ok(hex(&hash.finalize()))
 }
 
-/// Returns where a bare name is on the path.
+/// Returns the path of a program in PATH.
 fn found(name: &Path) -> PathBuf {
     if name.exists() {
         return name.to_owned();
@@ -120,14 +120,15 @@ fn gather(folder: &Path, outputs: &[PathBuf], files: &mut Vec<PathBuf>) -> Resul
         {
             continue;
         }
-        // A link is what it leads to, but not a way out or round: links to folders are left aside.
+        // A link to a file counts as the file. Links to folders are ignored: they may lead outside
+        // or in circles.
         if kind.is_dir() {
             gather(&entry.path(), outputs, files)?;
         } else if entry.path().is_file() {
             files.push(entry.path());
         }
         if files.len() > MAX_FILES {
-            bail!("{} holds more than {MAX_FILES} files; is it a plugin's?", folder.display());
+            bail!("{} contains more than {MAX_FILES} files; is it a plugin's?", folder.display());
         }
     }
     Ok(())
@@ -144,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_key_is_made_once_and_is_secret() {
+    fn makes_a_secret_key_once() {
         use std::os::unix::fs::PermissionsExt;
         let folder = tempfile::tempdir().unwrap();
         fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o700)).unwrap();
@@ -163,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plugin_is_its_files_and_not_what_builds_leave_behind() {
+    fn hashes_the_plugins_files_without_build_output() {
         let folder = tempfile::tempdir().unwrap();
         let write = |name: &str, text: &str| {
             let path = folder.path().join(name);

@@ -1,14 +1,13 @@
-//! `vizflyt grade`: flies a plugin through a project's course, once for each seed, and scores
-//! it.
+//! `vizflyt grade`: flies a plugin through a project's course once per seed, and scores it.
 //!
 //! ```text
 //! project, level, variant, seed -> course  in memory: splats, arena, distance field
-//!                               -> trial   one flight in lock-step, a plugin process of its own
-//!                               -> vizflyt_arena::crash  what a failure probably was
-//! each flight                   -> folder    its card's images, its log, its record (record)
-//! flights                       -> document  figures, points, hash, signature -> report/, junit, JSON
-//! an earlier grade              -> changes   what is better and worse; `--watch` (watch) flies again and again
-//! parts of a grade              -> merge     the whole
+//!                               -> trial   one flight in lock-step, with a separate plugin process
+//!                               -> vizflyt_arena::crash  probable cause of a failure
+//! each flight                   -> folder    images of its card, log, record (record)
+//! flights                       -> document  results, points, hash, signature -> report/, junit, JSON
+//! an earlier grade              -> changes   what is better and worse; `--watch` (watch) repeats the grade
+//! shards of a grade             -> merge     the complete grade
 //! ```
 //! The guides are `docs/guides/grading.md` and `grading-at-scale.md`.
 
@@ -46,7 +45,7 @@ use self::args::{GradeCommand, ResultArgs};
 pub use self::document::Grade;
 use self::folder::ReportFolder;
 
-/// Does what was asked for.
+/// Runs `vizflyt grade`.
 pub fn run(args: &GradeArgs) -> Result<ExitCode> {
     match &args.command {
         None if args.fly.watch => watch::watch(&args.fly),
@@ -56,14 +55,14 @@ pub fn run(args: &GradeArgs) -> Result<ExitCode> {
             let document = if is_folder { file.join(folder::GRADE) } else { file.clone() };
             let grade = verified(&document, key.as_deref(), keys.as_deref())?;
             if is_folder {
-                let cannot = || format!("{} does not count", file.display());
+                let cannot = || format!("{} is not valid", file.display());
                 folder::verify(file, &grade).with_context(cannot)?;
             }
             if let Some(path) = junit {
                 junit::verify(path, &grade)?;
             }
             print_line(format!(
-                "{}: as signed with {}; score {:.1}, {} of {} finished",
+                "{}: valid signature of {}; score {:.1}, {} of {} finished",
                 file.display(),
                 grade.signature.as_ref().map_or("", |signed| &signed.key),
                 grade.summary.score.value,
@@ -74,7 +73,7 @@ pub fn run(args: &GradeArgs) -> Result<ExitCode> {
                 0 => {}
                 count if is_folder => print_line(format!("all {count} files are as signed")),
                 count => print_line(format!(
-                    "the report's {count} files were not looked at: give its folder for that"
+                    "the report's {count} files were not checked: give its folder to check them"
                 )),
             }
             Ok(ExitCode::SUCCESS)
@@ -108,19 +107,19 @@ pub fn run(args: &GradeArgs) -> Result<ExitCode> {
     }
 }
 
-/// Returns the grade of a file if it is as it was signed with a key: as given, in hexadecimal or in a
-/// file; else this computer's own.
+/// Returns the grade of a file if its signature is valid. `key` is in hexadecimal or a file;
+/// without it, this computer's own key is used.
 ///
 /// # Errors
-/// What does not hold, in a sentence.
+/// The first failed check, as a sentence.
 pub fn verified(file: &Path, key: Option<&str>, keys: Option<&Path>) -> Result<Grade> {
     let grade = Grade::read(file)?;
     let key = keys::verifying_key(key, keys)?;
-    grade.verify(&key).with_context(|| format!("{} does not count", file.display()))?;
+    grade.verify(&key).with_context(|| format!("{} is not valid", file.display()))?;
     Ok(grade)
 }
 
-/// Checks that what else is written does not lie in the report's folder, where all is signed.
+/// Checks that no other output is written into the report's folder, where all files are signed.
 fn check_outputs(report: Option<&Path>, result: &ResultArgs, junit: Option<&Path>) -> Result<()> {
     let Some(root) = report else { return Ok(()) };
     let made = std::fs::create_dir_all(root).and_then(|()| root.canonicalize());
@@ -134,7 +133,7 @@ fn check_outputs(report: Option<&Path>, result: &ResultArgs, junit: Option<&Path
         let is_own = parent == root && path.file_name() == Some(own.as_ref());
         ensure!(
             is_own || !parent.starts_with(&root),
-            "{option} {}: all that lies in a report is signed, and it holds {own} already; give another folder",
+            "{option} {}: all files in a report are signed, and it contains {own} already; give another folder",
             path.display()
         );
     }

@@ -1,27 +1,27 @@
-//! Several parts of a grade into the whole.
+//! Combines the shards of a grade.
 
 use anyhow::{Context, Result, bail, ensure};
 use ed25519_dalek::VerifyingKey;
 
 use super::document::{Grade, Run};
 
-/// Returns the grade that the parts make together, unsigned. Each must be signed with `key`, all must be
-/// of the same subject, and every part must be there once.
+/// Returns the unsigned grade of all shards. Each must be signed with `key`, all must have the same
+/// subject, and every shard must occur once.
 ///
 /// # Errors
-/// What does not fit, in a sentence.
+/// The first mismatch, as a sentence.
 pub fn merge(parts: &[(String, Grade)], key: &VerifyingKey) -> Result<Grade> {
     let Some((first_name, first)) = parts.first() else { bail!("there is nothing to merge") };
     let mut there = Vec::new();
     let mut runs: Vec<Run> = Vec::new();
     for (name, part) in parts {
-        part.verify(key).with_context(|| format!("{name} does not count"))?;
+        part.verify(key).with_context(|| format!("{name} is not valid"))?;
         ensure!(
             part.subject == first.subject,
-            "{name} and {first_name} are grades of different things: plugin, program, project, level, \
+            "{name} and {first_name} are grades of different subjects: plugin, program, project, level, \
              variants, seeds, delays and renderer must be the same"
         );
-        let shard = part.shard.with_context(|| format!("{name} is no part but a whole grade"))?;
+        let shard = part.shard.with_context(|| format!("{name} is a complete grade, not a shard"))?;
         let count = first.shard.map_or(0, |shard| shard.count);
         ensure!(shard.count == count, "{name} is part of {}, {first_name} of {count}", shard.count);
         ensure!(!there.contains(&shard.index), "part {} is given twice", shard.index);
@@ -31,13 +31,13 @@ pub fn merge(parts: &[(String, Grade)], key: &VerifyingKey) -> Result<Grade> {
     let count = first.shard.map_or(0, |shard| shard.count);
     let missing: Vec<String> =
         (1..=count).filter(|index| !there.contains(index)).map(|index| index.to_string()).collect();
-    ensure!(missing.is_empty(), "of {count} parts these are missing: {}", missing.join(", "));
+    ensure!(missing.is_empty(), "missing parts of {count}: {}", missing.join(", "));
     let subject = first.subject.clone();
     let expected: Vec<(&str, u64)> = subject.flights().collect();
     let grade = Grade::new(subject.clone(), None, runs);
     let found: Vec<(&str, u64)> =
         grade.runs.iter().map(|run| (run.variant.as_str(), run.seed)).collect();
-    ensure!(found == expected, "the parts do not hold every flight once");
+    ensure!(found == expected, "the parts do not contain every flight once");
     Ok(grade)
 }
 
@@ -59,11 +59,11 @@ mod tests {
 
     fn refused(parts: &[(String, Grade)], word: &str) {
         let error = format!("{:#}", merge(parts, &key().verifying_key()).unwrap_err());
-        assert!(error.contains(word), "no {word:?} in {error:?}");
+        assert!(error.contains(word), "{word:?} is missing in {error:?}");
     }
 
     #[test]
-    fn parts_make_the_whole_in_any_order() {
+    fn combines_shards_in_any_order() {
         let subject = subject();
         let parts = [part(&subject, 2, 2, &[2, 4]), part(&subject, 1, 2, &[3, 1])];
         let merged = merge(&parts, &key().verifying_key()).unwrap();
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_parts_that_do_not_fit() {
+    fn rejects_shards_that_do_not_match() {
         let subject = subject();
         let (one, two) = (part(&subject, 1, 2, &[1, 3]), part(&subject, 2, 2, &[2, 4]));
         refused(&[], "nothing");
@@ -81,13 +81,13 @@ mod tests {
         refused(&[one.clone(), part(&subject, 2, 3, &[2, 4])], "is part of 3");
         refused(&[one.clone(), part(&subject, 2, 2, &[2, 5])], "every flight once");
         let other = Subject { plugin_sha256: "00".repeat(32), ..subject.clone() };
-        refused(&[one.clone(), part(&other, 2, 2, &[2, 4])], "different things");
+        refused(&[one.clone(), part(&other, 2, 2, &[2, 4])], "different subjects");
         let mut forged = two.clone();
         forged.1.runs[0].score = 0.0;
-        refused(&[one.clone(), forged], "part-2.json does not count");
+        refused(&[one.clone(), forged], "part-2.json is not valid");
         let mut whole = two;
         whole.1.shard = None;
         whole.1.sign(&key()).unwrap();
-        refused(&[one, whole], "no part");
+        refused(&[one, whole], "not a shard");
     }
 }

@@ -1,17 +1,18 @@
-//! How far off a plugin's own estimate was in a graded flight: as `vizflyt evaluate --align yaw --delta 1s` measures it,
-//! against where the simulated vehicle truly was.
+//! Error of a plugin's own estimate in a graded flight, compared with the true pose, as in `vizflyt
+//! evaluate --align yaw --delta 1s`.
 
 use vizflyt_protocol::messages::Odometry;
 use vizflyt_studio::evaluate::{Alignment, Association, Delta, Evaluation, Stamped, associate};
 
 use super::document::OdometryScore;
 
-/// An estimate counts if the truth is known within so long of it. [s]
+/// Maximum time between an estimate and a true pose. [s]
 const MAX_DIFF_S: f64 = 0.01;
-/// Relative errors are taken over so long. [s]
+/// Interval of relative errors. [s]
 const STEP_S: f64 = 1.0;
 
-/// Returns the score of what a plugin published; `None` if that was nothing. Both ascend in time.
+/// Returns the score of published estimates; `None` for an empty list. Both lists are sorted by
+/// time.
 pub(crate) fn odometry_score(truth: &[Stamped], published: &[Odometry]) -> Option<OdometryScore> {
     let estimate: Vec<Stamped> = published
         .iter()
@@ -50,7 +51,7 @@ mod tests {
     }
 
     #[test]
-    fn origin_and_heading_are_the_plugins_choice_and_drift_is_not() {
+    fn ignores_origin_and_heading_and_measures_drift() {
         let truth = truth();
         let other =
             Pose::<vizflyt_protocol::geometry::Odom, vizflyt_protocol::geometry::World>::new(
@@ -68,7 +69,7 @@ mod tests {
         let exact = odometry_score(&truth, &estimate(0.0)).unwrap();
         assert_eq!(exact.poses, 286);
         assert!(exact.ate_rmse_m < 1e-6 && exact.rpe_trans_rmse_m.unwrap() < 1e-6, "{exact:?}");
-        // A drift of 2 cm a second over 10 s: uniform within 10 cm of the mean.
+        // A drift of 2 cm/s over 10 s: uniform within 10 cm of the mean.
         let drifted = odometry_score(&truth, &estimate(0.02)).unwrap();
         assert!((drifted.ate_rmse_m - 0.2 / 12f64.sqrt()).abs() < 1e-3, "{drifted:?}");
         assert!((drifted.rpe_trans_rmse_m.unwrap() - 0.02).abs() < 1e-3, "{drifted:?}");

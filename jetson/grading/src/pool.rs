@@ -1,5 +1,5 @@
-//! Flies many trials at a time, one thread each: which of them ends first changes nothing but the
-//! progress that is shown.
+//! Runs several flights at the same time, one per thread. The order in which they end affects only
+//! the displayed progress.
 
 use std::num::NonZero;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -8,11 +8,11 @@ use std::thread;
 
 use anyhow::{Context, Result, bail};
 
-/// Runs `work` on each of `tasks`, on `jobs` threads; returns the results in the order of the tasks.
-/// `notify` is called with each as it ends, on the calling thread. `None` if it is stopped before all are done.
+/// Runs `work` on each of `tasks`, on `jobs` threads; returns the results in the order of the
+/// tasks, or `None` if stopped earlier. Calls `notify` with each result on the calling thread.
 ///
 /// # Errors
-/// The first error of `work`; the others are stopped then.
+/// The first error of `work`; it stops the other tasks.
 pub(crate) fn run<T: Sync, R: Send>(
     tasks: &[T],
     jobs: NonZero<usize>,
@@ -54,7 +54,7 @@ pub(crate) fn run<T: Sync, R: Send>(
         }
         let all: Option<Vec<R>> = results.into_iter().collect();
         if all.is_none() && !stop.load(Ordering::Relaxed) {
-            bail!("a thread that flew has died; see its message above");
+            bail!("a flight's thread panicked; see its message above");
         }
         Ok(all)
     })
@@ -72,7 +72,7 @@ mod tests {
     const JOBS: NonZero<usize> = NonZero::new(3).unwrap();
 
     #[test]
-    fn results_come_in_the_order_of_the_tasks() {
+    fn returns_results_in_the_order_of_the_tasks() {
         let tasks: Vec<u64> = (0..50).collect();
         let mut notified = 0;
         let stop = AtomicBool::new(false);
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_or_a_stop_ends_all() {
+    fn stops_all_tasks_on_an_error_or_a_stop() {
         let tasks: Vec<u64> = (0..1000).collect();
         let stop = AtomicBool::new(false);
         let work = |n: &u64| if *n == 5 { bail!("five") } else { Ok(Some(*n)) };

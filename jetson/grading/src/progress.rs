@@ -1,4 +1,4 @@
-//! How far a grade has come: one line on a terminal, renewed; elsewhere a line for each flight.
+//! Progress of a grade: on a terminal one line that is updated, otherwise one line per flight.
 
 use std::io::{IsTerminal, Write};
 use std::time::Instant;
@@ -7,15 +7,15 @@ use vizflyt_protocol::messages::OutcomeKind;
 
 use super::document::Run;
 
-/// Of the bar. [characters]
+/// Width of the bar. [characters]
 const BAR: usize = 24;
 
-/// Progress on standard error; standard output is for the result.
+/// Progress output on standard error; standard output is for the result.
 pub(super) struct Progress {
     all: usize,
     done: usize,
     finished: usize,
-    /// Of all flights so far. [s]
+    /// Virtual time of all finished flights. [s]
     virtual_s: f64,
     started: Instant,
     is_terminal: bool,
@@ -33,13 +33,13 @@ impl Progress {
         }
     }
 
-    /// Takes note of a flight.
+    /// Counts a finished flight and updates the output.
     pub(super) fn flown(&mut self, run: &Run, virtual_s: f64) {
         self.done += 1;
         self.finished += usize::from(run.outcome == OutcomeKind::Finished);
         self.virtual_s += virtual_s;
         let mut out = std::io::stderr().lock();
-        // Nobody may be reading any more; the grade goes on.
+        // Write errors are ignored: the terminal may be closed, and the grade continues.
         let _ = if self.is_terminal {
             if run.outcome != OutcomeKind::Finished {
                 let _ = writeln!(out, "\r\x1b[K{}", line(run));
@@ -51,7 +51,7 @@ impl Progress {
         let _ = out.flush();
     }
 
-    /// Ends the line with the speed.
+    /// Ends the line with the simulation speed.
     pub(super) fn end(&self) {
         let mut out = std::io::stderr().lock();
         let clear = if self.is_terminal { "\r\x1b[K" } else { "" };
@@ -81,7 +81,7 @@ impl Progress {
     }
 }
 
-/// Returns a flight in a line.
+/// Returns the result of a flight as one line.
 fn line(run: &Run) -> String {
     let why = run.cause.as_deref().unwrap_or(&run.reason);
     format!(

@@ -1,8 +1,7 @@
-//! A flight that is over, as it lies on disk until the grade is made: so a grade that is interrupted goes on where
-//! it was.
+//! Record of a finished flight on disk, so that an interrupted grade can be resumed.
 //!
-//! It is sealed with a key that follows from the grading key and is nowhere on disk: a plugin that can write into the
-//! report's folder makes no flight.
+//! The record is sealed with a key that is derived from the grading key and is not on disk: a
+//! plugin that can write into the report's folder cannot forge a flight.
 
 use std::collections::BTreeMap;
 
@@ -15,41 +14,41 @@ use vizflyt_trust::{from_hex, hex};
 
 use super::document::{DelaysMs, Run, SignedFile, Subject, check_files};
 
-/// What the first field holds; another layout is another number.
+/// Value of the first field; a new layout gets a new number.
 const FORMAT: &str = "vizflyt-flight-1";
 
-/// What a flight depends on besides its seed and its variant.
+/// All inputs of a flight except its seed and its variant.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlownWith {
-    /// What the command line called the plugin: all built-in ones are the same file.
+    /// Name of the plugin on the command line: all built-in plugins are the same file.
     pub plugin: String,
     /// SHA-256 over the plugin's files.
     pub plugin_sha256: String,
-    /// The project's name.
+    /// Name of the project.
     pub project: String,
-    /// `ug` or `g`.
+    /// Level of the sensors: `ug` or `g`.
     pub level: String,
-    /// What drawn variants are.
+    /// Settings of random variants.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub environments: BTreeMap<String, EnvironmentConfig>,
-    /// How long things took.
+    /// Time model.
     pub delays: DelaysMs,
-    /// The simulated inertial sensor; absent where it is the usual one.
+    /// Simulated inertial sensor; absent if it is the default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imu: Option<String>,
     /// SHA-256 of this program's file.
     pub program_sha256: String,
-    /// What rendered.
+    /// Renderer.
     pub renderer: String,
-    /// What an answer may take of the plugin's own time. [s]
+    /// Timeout of an answer, in the plugin's own time. [s]
     pub answer_within_s: f64,
-    /// Which images the log keeps.
+    /// Images in the flight log.
     pub log: String,
 }
 
 impl FlownWith {
-    /// Returns what flights of this grade depend on.
+    /// Returns the inputs of the flights of this grade.
     pub fn new(subject: &Subject, answer_within_s: f64, log: &str) -> Self {
         let subject = subject.clone();
         Self {
@@ -67,7 +66,7 @@ impl FlownWith {
         }
     }
 
-    /// Returns what is another one there, for people.
+    /// Returns the names of the inputs that differ.
     fn other(&self, there: &Self) -> Vec<&'static str> {
         let differs = [
             (
@@ -88,20 +87,20 @@ impl FlownWith {
     }
 }
 
-/// A flight that is over.
+/// A finished flight.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlightRecord {
     format: String,
-    /// What it depends on.
+    /// Inputs of the flight.
     pub flown_with: FlownWith,
-    /// How it went.
+    /// Results of the flight.
     pub run: Run,
-    /// Its card, as HTML.
+    /// Card as HTML.
     pub card: String,
-    /// Its images and its log.
+    /// Images and log.
     pub files: Vec<SignedFile>,
-    /// Over all of the above, in hexadecimal (Ed25519).
+    /// Signature over all other fields, in hexadecimal (Ed25519).
     seal: String,
 }
 
@@ -111,46 +110,46 @@ impl FlightRecord {
         Self { format: FORMAT.to_owned(), flown_with, run, card, files, seal: String::new() }
     }
 
-    /// Returns its text, sealed.
+    /// Returns the sealed text.
     ///
     /// # Errors
-    /// If it has no text: never, for numbers that are finite.
+    /// If the record has no JSON representation; cannot occur with finite numbers.
     pub fn to_text(&self, key: &SealingKey) -> Result<String> {
         let bare = Self { seal: String::new(), ..self.clone() };
         let seal = hex(&key.0.sign(&serde_json::to_vec(&bare)?).to_bytes());
         Ok(serde_json::to_string_pretty(&Self { seal, ..bare })? + "\n")
     }
 
-    /// Reads a record that was sealed with `key` of a flight that depends on the same.
+    /// Parses a record that was sealed with `key`, of a flight with the same inputs.
     ///
     /// # Errors
-    /// Text that is no such record; which things are others.
+    /// If the text is not such a record; the message names inputs that differ.
     pub fn parse(text: &str, key: &SealingKey, flown_with: &FlownWith) -> Result<Self> {
-        let record: Self = serde_json::from_str(text).context("it is no record of a flight")?;
-        ensure!(record.format == FORMAT, "it is of the format {:?}", record.format);
+        let record: Self = serde_json::from_str(text).context("not a record of a flight")?;
+        ensure!(record.format == FORMAT, "unsupported format {:?}", record.format);
         let bare = Self { seal: String::new(), ..record.clone() };
         let seal = from_hex::<64>(&record.seal).map(|bytes| Signature::from_bytes(&bytes));
         let bytes = serde_json::to_vec(&bare)?;
         ensure!(
             seal.is_some_and(|seal| key.0.verifying_key().verify_strict(&bytes, &seal).is_ok()),
-            "it was changed after it was written, or another computer wrote it"
+            "the record was changed after it was written, or another computer wrote it"
         );
         check_files(&record.files)?;
         let other = flown_with.other(&record.flown_with);
         ensure!(
             other.is_empty(),
-            "it was flown with another {}: begin anew in another folder",
+            "the flight was made with another {}: use another folder for a new grade",
             other.join(", another ")
         );
         Ok(record)
     }
 }
 
-/// The key that records are sealed with.
+/// Key that seals records.
 pub struct SealingKey(SigningKey);
 
 impl SealingKey {
-    /// Returns the one that follows from a grading key; the other way nothing follows.
+    /// Derives the key from a grading key; the grading key cannot be derived from it.
     pub fn of(grading: &SigningKey) -> Self {
         let mut hash = Sha256::new();
         hash.update(FORMAT);
@@ -185,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_comes_back_and_no_other_does() {
+    fn parses_its_own_records_and_rejects_others() {
         let sealing = SealingKey::of(&key());
         let text = record().to_text(&sealing).unwrap();
         let read = FlightRecord::parse(&text, &sealing, &flown_with()).unwrap();
@@ -203,20 +202,20 @@ mod tests {
         let better = text.replacen("\"score\": 50.0", "\"score\": 100.0", 1);
         assert_ne!(better, text);
         refused(&better, &sealing, &flown_with(), "was changed after it was written");
-        refused("{}", &sealing, &flown_with(), "no record of a flight");
+        refused("{}", &sealing, &flown_with(), "not a record of a flight");
         let with = FlownWith { plugin_sha256: "00".repeat(32), ..flown_with() };
-        refused(&text, &sealing, &with, "with another plugin: begin anew");
+        refused(&text, &sealing, &with, "with another plugin: use another folder");
         let with = FlownWith { plugin: "race".into(), ..flown_with() };
-        refused(&text, &sealing, &with, "with another plugin: begin anew");
+        refused(&text, &sealing, &with, "with another plugin: use another folder");
         let with = FlownWith { project: "p5".into(), log: "full".into(), ..flown_with() };
         refused(&text, &sealing, &with, "another project, another --log");
-        // The grading key itself seals nothing.
+        // The grading key itself does not seal records.
         assert_ne!(sealing.0.to_bytes(), key().to_bytes());
     }
 
     proptest! {
         #[test]
-        fn any_change_of_a_byte_is_noticed(at in any::<prop::sample::Index>(), byte in 32u8..127) {
+        fn detects_any_changed_byte(at in any::<prop::sample::Index>(), byte in 32u8..127) {
             let sealing = SealingKey::of(&key());
             let text = record().to_text(&sealing).unwrap();
             let mut bytes = text.clone().into_bytes();

@@ -1,4 +1,4 @@
-//! Figures over flights, with how far they can be trusted.
+//! Statistics over flights, with confidence intervals.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::random::{GOLDEN, SplitMix64};
@@ -7,21 +7,20 @@ use vizflyt_protocol::random::{GOLDEN, SplitMix64};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Interval {
-    /// The value.
     pub value: f64,
-    /// The interval's lower end.
+    /// Lower end of the interval.
     pub low: f64,
-    /// Its upper end.
+    /// Upper end of the interval.
     pub high: f64,
 }
 
 /// Standard score of a two-sided 95 % interval.
 const Z: f64 = 1.959_963_984_540_054;
-/// Resamples of the bootstrap: the ends are then good to about a hundredth of the interval.
+/// Resamples of the bootstrap: the ends are accurate to about 1 % of the interval.
 const RESAMPLES: usize = 10_000;
 
-/// Returns the share `part` of `whole` with its interval by Wilson (1927), which holds for few flights and
-/// for shares of 0 and 1.
+/// Returns the share `part` of `whole` with its interval by Wilson (1927), which is valid for few
+/// flights and for shares of 0 and 1.
 pub(crate) fn share_interval(part: usize, whole: usize) -> Interval {
     if whole == 0 {
         return Interval { value: 0.0, low: 0.0, high: 1.0 };
@@ -32,8 +31,7 @@ pub(crate) fn share_interval(part: usize, whole: usize) -> Interval {
     Interval { value: p, low: (center - half).max(0.0), high: (center + half).min(1.0) }
 }
 
-/// Returns the mean with its interval by the percentile bootstrap (Efron 1979), always from the same
-/// random numbers.
+/// Returns the mean with its interval by the percentile bootstrap (Efron 1979), with a fixed seed.
 pub(crate) fn mean_interval(values: &[f64]) -> Interval {
     if values.is_empty() {
         return Interval { value: 0.0, low: 0.0, high: 0.0 };
@@ -60,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wilson_is_as_published() {
+    fn matches_published_wilson_intervals() {
         // Newcombe (1998), table I: 81 of 263 and 0 of 20.
         let found = share_interval(81, 263);
         assert!((found.low - 0.2553).abs() < 1e-4 && (found.high - 0.3662).abs() < 1e-4);
@@ -71,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bootstrap_is_close_to_the_normal_interval_and_always_the_same() {
+    fn bootstrap_is_reproducible_and_close_to_the_normal_interval() {
         let values: Vec<f64> = (0..100).map(|i| f64::from(i % 10)).collect();
         let found = mean_interval(&values);
         // Standard error of the mean: 2.872 / 10.

@@ -1,7 +1,7 @@
-//! `--watch`: grades again whenever the plugin is saved, and says what changed.
+//! `--watch`: grades again when the plugin is saved, and prints the changes.
 //!
-//! Each attempt is a process of its own, with what was asked for: it ends when the plugin is saved again, and leaves
-//! nothing. Its report is put in the place of the one before when it is whole.
+//! Each attempt is a separate process with the same options. It is killed when the plugin is saved
+//! again, and leaves no files. A complete report replaces the earlier one.
 
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, ExitStatus, Stdio};
@@ -20,9 +20,9 @@ use super::{changes, figures};
 use crate::plugin::Plugin;
 use crate::plugin::watch::{LOOK_EVERY, Sources};
 
-/// Grades until it is interrupted.
+/// Grades until interrupted.
 pub(super) fn watch(args: &FlyArgs) -> Result<ExitCode> {
-    let typed = args.plugin.as_ref().context("no plugin is named")?;
+    let typed = args.plugin.as_ref().context("no plugin given")?;
     let plugin = Plugin::find(typed)?;
     let stop: &AtomicBool = &*stop_flag(false)?;
     let mut earlier = changes::earlier(args)?;
@@ -33,7 +33,7 @@ pub(super) fn watch(args: &FlyArgs) -> Result<ExitCode> {
         match fly(args, stop, &is_saved)? {
             None => {
                 if !stop.load(Ordering::Relaxed) {
-                    print_error("saved meanwhile: begun again");
+                    print_error("saved meanwhile: started again");
                 }
                 continue;
             }
@@ -67,9 +67,9 @@ enum Attempt {
     Failed(ExitStatus),
 }
 
-/// Flies all flights once; nothing if it was interrupted, or the plugin saved.
+/// Flies all flights once; returns `None` if interrupted, or if the plugin is saved.
 fn fly(args: &FlyArgs, stop: &AtomicBool, is_saved: &dyn Fn() -> bool) -> Result<Option<Attempt>> {
-    // On the report's disk, so that it is moved at once.
+    // On the same disk as the report, so that it can be moved atomically.
     let beside = args.report.as_deref().map(Path::parent).unwrap_or_default();
     let beside = beside.filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let scratch = match &args.report {
@@ -80,7 +80,7 @@ fn fly(args: &FlyArgs, stop: &AtomicBool, is_saved: &dyn Fn() -> bool) -> Result
     let (document, report) = (scratch.path().join("grade.json"), scratch.path().join("report"));
     let mut command = Command::new(std::env::current_exe()?);
     command.args(std::env::args_os().skip(1).filter(|arg| arg != "--watch"));
-    // What is given once more takes the place of what was asked for.
+    // Options given twice: the last one counts (`args_override_self`).
     command.arg("--output").arg(&document).stdout(Stdio::null()).stdin(Stdio::null());
     if let Some(folder) = &args.report {
         command.arg("--report").arg(&report).arg("--hide").arg(folder);

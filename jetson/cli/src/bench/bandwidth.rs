@@ -1,4 +1,4 @@
-//! `vizflyt bench bandwidth`: what the images of a scene need of a network.
+//! `vizflyt bench bandwidth`: network bandwidth that the images of a scene need.
 
 use std::path::PathBuf;
 
@@ -15,53 +15,55 @@ use vizflyt_server::stream::rate_control::LEVELS;
 use vizflyt_splat::{Atmosphere, Camera, Chosen, DepthKind, RgbdImage};
 use vizflyt_studio::scene::camera::{self, ImageSize};
 
-/// Draws views of a scene and encodes them at each level that a slow link may get; prints what they
-/// need.
+/// Measure the network bandwidth that the images of a scene need
+///
+/// Renders views of a scene, encodes them at each quality level of the rate control, and prints
+/// sizes and bit rates.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The views are those of the cameras given; without any, eight from above the \
-start, all around, 90 degrees wide.
+    after_help = "The views are those of the given cameras, or eight views of 90 degrees in all \
+directions from above the start.
 
 Examples:
   vizflyt bench bandwidth forest/arena.toml
   vizflyt bench bandwidth room.ply --camera a.json --camera b.json --size 640x480 --json"
 )]
 pub(super) struct BandwidthArgs {
-    /// arena.toml, its folder, or a scene file
+    /// Arena (arena.toml or its folder) or scene file
     scene: PathBuf,
-    /// A view, as for `vizflyt scene render`; may be given several times
+    /// Camera of a view, as for `vizflyt scene render`; can be repeated
     #[arg(long = "camera", value_name = "CAM.json")]
     cameras: Vec<PathBuf>,
     #[command(flatten)]
     bare: BareArgs,
-    /// Images of this size; may be given several times [default: 320x240, 640x480, 1280x720]
+    /// Image size; can be repeated [default: 320x240, 640x480, 1280x720]
     #[arg(long, value_name = "WxH")]
     size: Vec<ImageSize>,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// Prints a JSON array
+    /// Print a JSON array
     #[arg(long)]
     json: bool,
 }
 
-/// One row: images of one size at one level.
+/// One row of the table: images of one size at one level.
 #[derive(Debug, Serialize)]
 struct Row {
     width_px: u32,
     height_px: u32,
     level: &'static str,
-    /// Mean over the views. [bytes]
+    /// Mean size over the views. [bytes]
     bytes: f64,
-    /// The largest. [bytes]
+    /// Size of the largest image. [bytes]
     bytes_most: usize,
-    /// Of the colour of the worst view. [dB]
+    /// PSNR of the colour of the worst view. [dB]
     psnr_db_least: f64,
-    /// By the mean, bitstream alone. [Mbit/s]
+    /// Bit rate from the mean size, bitstream only. [Mbit/s]
     mbit_s_at_30_hz: f64,
     mbit_s_at_60_hz: f64,
     mbit_s_at_100_hz: f64,
-    /// Cameras at 60 Hz that a gigabit carries, at [`USABLE_MBIT_S`].
+    /// Number of cameras at 60 Hz that fit on a gigabit link, at [`USABLE_MBIT_S`].
     cameras_on_a_gigabit: usize,
 }
 
@@ -118,7 +120,7 @@ pub(super) fn run(args: &BandwidthArgs) -> Result<()> {
     Ok(())
 }
 
-/// The levels that change how an image is encoded.
+/// Levels of the rate control that change only the encoding.
 fn levels() -> impl Iterator<Item = (&'static str, EncodeOptions)> {
     let as_large = LEVELS.iter().filter(|level| level.keep_one_in == 1 && level.shrink == 1);
     as_large.map(|level| (level.name(), level.options(&EncodeOptions::default())))
@@ -203,5 +205,6 @@ const USUAL_SIZES: [ImageSize; 3] = [
     ImageSize { width_px: 640, height_px: 480 },
     ImageSize { width_px: 1280, height_px: 720 },
 ];
-/// What a gigabit carries of bitstream, less the headers of QUIC, UDP, IP and Ethernet. [Mbit/s]
+/// Capacity of a gigabit link for the bitstream, without the headers of QUIC, UDP, IP and Ethernet.
+/// [Mbit/s]
 const USABLE_MBIT_S: f64 = 900.0;

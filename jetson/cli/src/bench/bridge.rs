@@ -1,9 +1,9 @@
-//! `vizflyt bench bridge`: what the bridge adds to a packet's way, and whether it loses any, with all
-//! that a flight sends at once: 50 Hz setpoints and 50 Hz poses up, telemetry down.
+//! `vizflyt bench bridge`: latency and packet loss that the bridge adds under the load of a flight:
+//! setpoints and poses at 50 Hz up, telemetry down.
 //!
-//! The emulated bridge runs between a pseudo-terminal and loopback sockets; its serial line takes as
-//! long as a real one. The same packets then go straight over loopback: the difference is the
-//! bridge's and its line's.
+//! The emulated bridge runs between a pseudo-terminal and loopback sockets; its serial line has the
+//! timing of a real one. The same packets are then sent directly over loopback. The difference is
+//! due to bridge and line.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
@@ -28,31 +28,31 @@ use vizflyt_protocol::mavlink::{MAX_PACKET, MavHeader, StreamDecoder, encode};
 
 use crate::bridge::{EmulateArgs, Emulation};
 
-/// Measures the latency that the emulated bridge adds, and counts what it loses.
+/// Measure the latency and packet loss of the emulated bridge
 #[derive(Args, Clone, Debug)]
 pub(crate) struct BridgeBenchArgs {
-    /// How long each way is measured.
+    /// Duration of each of the two measurements
     #[arg(long, value_name = "SECONDS", default_value_t = 20)]
     seconds: u32,
-    /// Speed of the serial line.
+    /// Baud rate of the serial line
     #[arg(long, value_name = "BAUD", default_value_t = 921_600)]
     baud: u32,
-    /// Prints the figures as JSON.
+    /// Print the results as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// One end of a way: a serial line or a socket.
+/// One end of a path: a serial line or a socket.
 trait End: Send {
-    /// Sends a packet; lost like any datagram if the other end is gone.
+    /// Sends a packet; it is lost if the other end is closed, like any datagram.
     fn send(&mut self, packet: &[u8]);
-    /// Waits a few milliseconds for bytes; returns how many came.
+    /// Waits a few milliseconds for bytes; returns the number received.
     fn receive(&mut self, bytes: &mut [u8]) -> usize;
 }
 
 impl End for File {
     fn send(&mut self, packet: &[u8]) {
-        // A full line shows as a lost packet.
+        // A full line counts as a lost packet.
         let _ = self.write(packet);
     }
 
@@ -77,7 +77,7 @@ impl End for UdpSocket {
     }
 }
 
-/// Runs it.
+/// Runs `vizflyt bench bridge`.
 pub(crate) fn run(args: &BridgeBenchArgs) -> Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let companion = socket()?;
@@ -123,8 +123,8 @@ pub(crate) fn run(args: &BridgeBenchArgs) -> Result<()> {
     for (name, way) in [
         ("bridge, to the autopilot", &through.0),
         ("bridge, to the companion", &through.1),
-        ("straight, one way", &straight.0),
-        ("straight, other way", &straight.1),
+        ("direct, one way", &straight.0),
+        ("direct, other way", &straight.1),
     ] {
         print_line(format!(
             "{name:24} {:6} {:7} {:7.2} {:7.2} {:7.2}",
@@ -153,11 +153,11 @@ fn socket() -> Result<UdpSocket> {
     Ok(socket)
 }
 
-/// The packets of one direction.
+/// Packets of one direction.
 #[derive(Default)]
 struct Direction {
     sent: usize,
-    /// Sorted. [ms]
+    /// Latencies, sorted. [ms]
     times_ms: Vec<f64>,
 }
 
@@ -178,14 +178,14 @@ impl Direction {
     }
 }
 
-/// Sends in both directions for `seconds`; returns the packets up, to the autopilot, and those down.
+/// Sends in both directions for `seconds`. Returns the packets up (to the autopilot) and down.
 fn measure(
     companion: Box<dyn End>,
     autopilot: Box<dyn End>,
     seconds: u32,
 ) -> (Direction, Direction) {
     let start = Instant::now();
-    // 100 Hz in two kinds up; 201 Hz in four kinds down, as the runtime asks for.
+    // 100 Hz in two types up; 201 Hz in four types down, the rates that the runtime requests.
     let up: MessagesAt = |tick, stamp| {
         let mut all = Vec::new();
         if tick % 4 == 0 {
@@ -226,11 +226,12 @@ fn direction(sent: &[u32], mut received: Vec<(u32, f64)>) -> Direction {
 
 type MessagesAt = fn(u32, u32) -> Vec<MavMessage>;
 
-/// A tick. [us]
+/// Period of sending. [us]
 const TICK_US: u32 = 5000;
 
-/// Sends at every tick and receives all the time. A stamp is the time of sending, to 10 us, which no two
-/// messages share; returns the stamps sent, and those received with the time they took. [ms]
+/// Sends at every tick and receives continuously. A stamp is the time of sending, rounded to 10 us;
+/// each message has a different one. Returns the stamps sent, and the stamps received with their
+/// latency. [ms]
 fn exchange(
     mut end: Box<dyn End>,
     start: Instant,
@@ -242,7 +243,7 @@ fn exchange(
     let (mut decoder, mut tick, mut sequence) = (StreamDecoder::default(), 0, 0u8);
     let ticks = seconds * 1_000_000 / TICK_US;
     let mut bytes = [0; 4096];
-    // A quarter of a second more, for what is under way.
+    // Receive for another 250 ms: packets may still be on their way.
     let until = start + Duration::from_secs(seconds.into()) + Duration::from_millis(250);
     let due = |tick: u32| start + Duration::from_micros(u64::from(tick) * u64::from(TICK_US));
     while Instant::now() < until {
@@ -270,7 +271,7 @@ fn exchange(
     (sent, received)
 }
 
-/// The first ticks find no client yet: what is sent before the bridge knows one is not counted.
+/// Packets of the first ticks are not counted: the bridge has no client yet.
 const SETTLED: u32 = 50_000;
 
 fn stamp_of(message: &MavMessage) -> Option<u32> {

@@ -1,4 +1,5 @@
-//! `vizflyt bench decode`: what the vehicle's computer takes for an image, from its last byte to the plugin's memory.
+//! `vizflyt bench decode`: time from the last byte of an image to the plugin's memory, on the
+//! vehicle's computer.
 
 use anyhow::Result;
 use clap::Args;
@@ -6,19 +7,21 @@ use vizflyt_process::print_fmt;
 use vizflyt_runtime::bench;
 use vizflyt_studio::scene::camera::ImageSize;
 
-/// Decodes images into the plugin's memory, on one processor; prints how long they take.
+/// Measure the time to decode an image into the plugin's memory
+///
+/// Runs on one processor.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt bench decode                          may this computer fly at 60 images a second?
+  vizflyt bench decode                          check that this computer can decode 60 images a second
   vizflyt bench decode --size 1280x720 --json")]
 pub(super) struct DecodeArgs {
-    /// Size of the images
+    /// Image size
     #[arg(long, value_name = "WxH", default_value = "640x480")]
     size: ImageSize,
-    /// How many are decoded
+    /// Number of images to decode
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     images: u32,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -38,17 +41,17 @@ pub(super) fn run(args: &DecodeArgs) -> Result<()> {
         figures.ms_p99,
         figures.ms_max
     );
-    // Decoding has a thread of its own, but an image is so much older when the plugin sees it.
+    // Decoding has its own thread, but its duration adds to the age of the image.
     let verdict = if figures.ms_p99 <= MOST_MS {
         "good"
     } else {
-        "too slow to fly with; end what else runs, or give smaller images"
+        "too slow for flight; close other programs, or use smaller images"
     };
     print_fmt!("at {RATE_HZ} Hz it may take {MOST_MS} ms (p99): {verdict}");
     Ok(())
 }
 
-/// What images come at. [Hz]
+/// Image rate of the requirement. [Hz]
 const RATE_HZ: f64 = 60.0;
-/// What decoding may take of it, for docs/guides/jetson.md. [ms]
+/// Maximum time for decoding, from docs/guides/jetson.md. [ms]
 const MOST_MS: f64 = 10.0;

@@ -1,4 +1,5 @@
-//! `vizflyt bench imaging`: what cameras with faults cost next to rendering, and a sheet of what they see.
+//! `vizflyt bench imaging`: cost of simulated camera effects relative to rendering, and a sheet of
+//! sample images.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -22,11 +23,11 @@ use vizflyt_studio::scene::camera::{self, ImageSize};
 
 use super::sheet::{Sheet, coarse, depth_color};
 
-/// Renders one camera many times over, as sensors take it; prints milliseconds of each, and of rendering.
+/// Measure the time of simulated image sensors, relative to rendering
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The camera turns to the left by 60 degrees a second and flies 1 m/s to its right.
-Ratios to rendering are of the same run.
+    after_help = "The camera turns left at 60 degrees a second and flies to its right at 1 m/s.
+Ratios to rendering come from the same run.
 
 Examples:
   vizflyt bench imaging forest/arena.toml --camera cam.json
@@ -35,27 +36,28 @@ Examples:
 pub(super) struct ImagingArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
-    /// The camera, as for `vizflyt scene render`
+    /// Camera, as for `vizflyt scene render`
     #[arg(long, value_name = "CAM.json")]
     camera: PathBuf,
-    /// Draws images of this size instead of the camera's; they show the same
+    /// Image size instead of the camera's; the field of view stays the same
     #[arg(long, value_name = "WxH")]
     size: Option<ImageSize>,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// Images of each kind that count
+    /// Measured images of each kind
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
-    /// Writes what each sees side by side, as one PNG
+    /// File for one PNG with sample images of all kinds, side by side
     #[arg(long, value_name = "FILE.png")]
     sheet: Option<PathBuf>,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// What is measured: a name, the camera as `[cameras.imaging]` has it, and whether its depth is what it shows.
+/// Kinds of cameras: name, settings as in `[cameras.imaging]`, and the part of the image that the
+/// sheet shows.
 const KINDS: &[(&str, &str, Shown)] = &[
     ("perfect", "{}", Shown::Color),
     (
@@ -94,7 +96,7 @@ enum Shown {
     Depth,
 }
 
-/// What `--json` prints.
+/// Output of `--json`.
 #[derive(Debug, Serialize)]
 struct Figures {
     scene: String,
@@ -146,7 +148,7 @@ pub(super) fn run(args: &ImagingArgs) -> Result<()> {
     } else {
         print(&figures);
     }
-    // Last: a file that cannot be written costs no figure.
+    // Written last, so that a write error does not lose the results.
     args.sheet.as_ref().map_or(Ok(()), |file| sheet.save(file))
 }
 
@@ -160,7 +162,7 @@ fn print(figures: &Figures) {
     }
 }
 
-/// Where the camera is, from where it is now.
+/// Pose of the camera after `at_s` on its path.
 fn path(camera: &Camera, at_s: f64) -> Pose<World, Cam> {
     let moved: Pose<Cam, Cam> =
         Pose::new(DVec3::X * at_s, DQuat::from_rotation_y(-60f64.to_radians() * at_s));
@@ -206,7 +208,7 @@ impl Measure<'_> {
         (image, median(&mut times))
     }
 
-    /// Events of 20 ms, of an image every 0.5 ms.
+    /// Simulates 20 ms of an event camera, with an image every 0.5 ms.
     fn events(&mut self, sheet: &mut Sheet) -> Result<(usize, f64)> {
         let (mut camera, mut events, mut times) = (EventCamera::default(), Vec::new(), Vec::new());
         let mut images = [RgbdImage::default()];

@@ -1,5 +1,5 @@
-//! `vizflyt bench`: how fast this machine renders, streams and decodes, and what its images need; what the
-//! bridge adds to a packet's way.
+//! `vizflyt bench`: measures rendering, streaming and decoding on this machine, the bandwidth of
+//! images, and the latency of the bridge.
 
 mod bandwidth;
 mod bridge;
@@ -15,7 +15,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-/// Measures this machine.
+/// Measure this machine: rendering, streaming, decoding, bridge latency
 #[derive(Args, Debug)]
 pub(crate) struct BenchArgs {
     #[command(subcommand)]

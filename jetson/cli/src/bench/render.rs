@@ -1,4 +1,4 @@
-//! `vizflyt bench render`: how fast this machine renders.
+//! `vizflyt bench render`: render time of this machine.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -21,10 +21,10 @@ use vizflyt_splat::{
 use vizflyt_studio::scene::MEMORY_MIB;
 use vizflyt_studio::scene::camera::{self, ImageSize};
 
-/// Draws a scene many times over; prints milliseconds per image and pass.
+/// Measure the time to render an image, in total and per pass
 #[derive(Args, Debug)]
 #[command(after_help = "Each image has RGB, alpha, and expected and median depth. With several \
-cameras, each is rendered in turn, --images times; the figures are over all of them.
+cameras, each renders --images images, in turn; the results are over all images.
 
 Examples:
   vizflyt bench render room.ply --camera cam.json
@@ -33,41 +33,45 @@ Examples:
   vizflyt bench render room.ply --camera cam.json --limits
   vizflyt bench render forest/arena.toml --camera cam.json --environment rain")]
 pub(super) struct RenderArgs {
-    /// Scene file of any format, a packed one (`scene pack`), or an arena.toml (then its scene)
+    /// Scene file, packed scene (`scene pack`), or arena.toml (then its scene)
     scene: PathBuf,
-    /// The camera, as for `vizflyt scene render`; may be given several times
+    /// Camera, as for `vizflyt scene render`; can be repeated
     #[arg(long = "camera", value_name = "CAM.json", required = true)]
     cameras: Vec<PathBuf>,
-    /// Draws images of this size instead of the camera's; they show the same
+    /// Image size instead of the camera's; the field of view stays the same
     #[arg(long, value_name = "WxH")]
     size: Option<ImageSize>,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     renderer: RendererKind,
-    /// How much of a large scene is rendered
+    /// Level of detail for large scenes
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     detail: DetailKind,
     #[arg(long, value_name = "NAME", help = format!(
-        "Also draws each image in this light and weather, in turn with a clear one, and prints their ratio: {}",
+        "Also render each image in this light and weather, alternating with a clear one, and print the ratio: {}",
         Variant::names()
     ))]
     environment: Option<Variant>,
-    /// Also counts what the images need, measures what the processor does at most, and prints beside each pass how long
-    /// it takes at least: its splats' pixels with no lane of a vector idle, or its bytes
+    /// Also measure the limits of this processor, and compare each pass with them
+    ///
+    /// Prints the minimum time of each pass: the time for the pixels of its splats if all lanes of
+    /// the vector units are used, or the time to transfer its bytes.
     #[arg(long, conflicts_with = "environment")]
     limits: bool,
-    /// Images per camera that count; a few before them do not
+    /// Measured images per camera, after a warm-up
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     images: u32,
-    /// Memory for the blocks of a packed scene; images that count wait for none [MiB]
+    /// Memory for the blocks of a packed scene [MiB]
+    ///
+    /// Measured images do not wait for blocks.
     #[arg(long, value_name = "MIB", default_value_t = MEMORY_MIB, value_parser = clap::value_parser!(u32).range(1..))]
     memory: u32,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// What `--json` prints; times in milliseconds, medians unless the name has another statistic.
+/// Output of `--json`. Times are medians in milliseconds, unless the name states another statistic.
 #[derive(Debug, Serialize)]
 struct Figures {
     scene: String,
@@ -82,44 +86,45 @@ struct Figures {
     least_ms: f32,
     median_ms: f32,
     p99_ms: f32,
-    /// Of all threads together, user and system, of one image: what it costs where others use the processors, too.
+    /// Processor time (user and system, all threads) of one image: the cost if other programs use
+    /// the processors.
     processor_ms: f64,
     passes: Passes,
     #[serde(skip_serializing_if = "Option::is_none")]
     limits: Option<Limits>,
-    /// With the light and the weather that were asked for.
+    /// Results with light and weather, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     environment: Option<EnvironmentFigures>,
-    /// Of the last image of each camera, the mean.
+    /// Mean over the last image of each camera.
     workload: Work,
 }
 
-/// The same images in an environment: what weather costs besides the renderer, and both in relation to clear images.
+/// Cost of light and weather: the same images with and without an environment.
 #[derive(Debug, Serialize)]
 struct EnvironmentFigures {
     name: String,
-    /// Of a whole image.
+    /// Time of a whole image.
     median_ms: f32,
-    /// Of what is done to the finished image.
+    /// Time of the effects that are applied to the finished image.
     effects_median_ms: f32,
-    /// Of the whole image's time to that of the clear one before it, the median.
+    /// Median ratio of the time of an image to that of the clear image before it.
     ratio: f32,
 }
 
-/// How long each pass takes at least on this machine, and from what that follows.
+/// Minimum time of each pass on this machine, and the values from which it is calculated.
 #[derive(Debug, Serialize)]
 struct Limits {
     bound_ms: f32,
     bound_passes: Passes,
-    /// Of all threads together, billions a second.
+    /// All threads together. [10^9 operations/s]
     vector_operations_g: f64,
     lanes: usize,
     bytes_g: f64,
-    /// (Pixel, splat) pairs of an image, the mean over the cameras.
+    /// (Pixel, splat) pairs of an image, mean over the cameras.
     evaluations: u64,
-    /// Of the lanes that blending must take along, those that do such a pair.
+    /// Fraction of the vector lanes in blending that evaluate such a pair.
     lanes_used: f64,
-    /// Of the (tile, splat) pairs, those before their tile's last pixel ends.
+    /// Fraction of the (tile, splat) pairs that come before the end of their tile's last pixel.
     pairs_used: f64,
 }
 
@@ -134,7 +139,7 @@ struct Passes {
 }
 
 impl Passes {
-    /// In run order.
+    /// Returns the passes in the order of execution.
     fn named(&self) -> [(&'static str, f32); 6] {
         [
             ("cull", self.cull_ms),
@@ -167,7 +172,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<()> {
 
 fn measure(args: &RenderArgs) -> Result<Figures> {
     if args.limits && args.renderer == RendererKind::Gpu {
-        bail!("--limits are the processor's: leave --renderer out");
+        bail!("--limits measures the processor; omit --renderer");
     }
     let cameras: Vec<Camera> = args
         .cameras
@@ -264,7 +269,7 @@ fn measure(args: &RenderArgs) -> Result<Figures> {
     })
 }
 
-/// A scene, ready to be rendered.
+/// A scene, ready for rendering.
 struct Opened {
     path: PathBuf,
     splats: usize,
@@ -277,7 +282,7 @@ fn opened(args: &RenderArgs) -> Result<Opened> {
     if PackedScene::is_packed(&args.scene) {
         let start = Instant::now();
         let memory_bytes = args.memory as usize * (1 << 20);
-        // What images need is read by those that do not count.
+        // The warm-up images load the blocks that the measured ones need.
         let renderer = open_packed(&args.scene, &[], args.renderer, memory_bytes, Loading::Whole)?;
         return Ok(Opened {
             path: args.scene.clone(),
@@ -296,7 +301,7 @@ fn opened(args: &RenderArgs) -> Result<Opened> {
     let (renderer, reason) = if args.limits {
         let scene = Scene::from(&loaded.splats);
         let renderer = CpuRenderer::with_detail(scene, args.detail.of(&scene));
-        (Renderer::Processor(Box::new(renderer)), "whose limits were asked for".to_owned())
+        (Renderer::Processor(Box::new(renderer)), "required by --limits".to_owned())
     } else {
         let Chosen { rasterizer, reason } = choose(&loaded.splats, args.renderer, args.detail)?;
         (Renderer::Chosen(rasterizer), reason)
@@ -305,7 +310,7 @@ fn opened(args: &RenderArgs) -> Result<Opened> {
     Ok(Opened { path, splats: loaded.splats.len(), renderer, reason, prepare_ms })
 }
 
-/// A renderer whose limits can be told, or any.
+/// Processor renderer, which can measure its limits, or any other.
 enum Renderer {
     Processor(Box<CpuRenderer>),
     Chosen(Box<dyn Rasterizer>),
@@ -320,10 +325,10 @@ impl Renderer {
     }
 }
 
-/// Returns the mean of what images need at least.
+/// Returns the mean minimum time of the images.
 fn limits(renderer: &CpuRenderer, needs: &[Need]) -> Limits {
     let count = needs.len().max(1) as u64;
-    // As much memory as an image takes.
+    // The memory bandwidth is measured over as many bytes as an image uses.
     let sum = |of: fn(&Need) -> u64| needs.iter().map(of).sum::<u64>();
     let share = |part: u64, whole: u64| part as f64 / whole.max(1) as f64;
     let machine = renderer.machine((sum(Need::bytes) / count) as usize);
@@ -349,7 +354,7 @@ fn limits(renderer: &CpuRenderer, needs: &[Need]) -> Limits {
     }
 }
 
-/// Returns the moment of an image: 30 a second.
+/// Returns the time of an image at 30 Hz.
 fn moment(image: u32) -> Moment {
     Moment { at_ns: i64::from(image) * 33_333_333, v_world_mps: DVec3::ZERO, seed: 7 }
 }
@@ -384,14 +389,14 @@ fn print(f: &Figures) {
         match &bounds {
             Some(bounds) if bounds[i].1 > 0.0 => {
                 let bound = bounds[i].1;
-                print_fmt!("  {name:<9} {ms:.2} ms, at least {bound:.2}: {:.1} times", ms / bound);
+                print_fmt!("  {name:<9} {ms:.2} ms, minimum {bound:.2}: {:.1} times", ms / bound);
             }
             _ => print_fmt!("  {name:<9} {ms:.2} ms"),
         }
     }
     if let Some(limits) = &f.limits {
         print_fmt!(
-            "at least    {:.2} ms: the images take {:.1} times as long",
+            "minimum     {:.2} ms; the images take {:.1} times as long",
             limits.bound_ms,
             f.median_ms / limits.bound_ms
         );
@@ -404,7 +409,8 @@ fn print(f: &Figures) {
             limits.bytes_g
         );
         print_fmt!(
-            "            of the lanes {:.0} % are such a pixel; of the tile pairs {:.0} % come before their tile's end",
+            "            {:.0} % of the vector lanes evaluate such a pixel; {:.0} % of the tile pairs come before \
+             their tile's end",
             limits.lanes_used * 1e2,
             limits.pairs_used * 1e2
         );
@@ -417,5 +423,5 @@ fn print(f: &Figures) {
     }
 }
 
-/// Buffers grow to their size, clocks to their speed.
+/// Images before the measurement: buffers grow to their size, and clocks reach their speed.
 const WARM_UP: u32 = 5;

@@ -1,4 +1,5 @@
-//! `vizflyt bench sensors`: what LiDARs, range finders, sonars and radars cost in a scene, and a sheet of what they see.
+//! `vizflyt bench sensors`: cost of LiDARs, range finders, sonars and radars in a scene, and a
+//! sheet of samples.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -20,18 +21,20 @@ use vizflyt_studio::scene::camera;
 
 use super::sheet::{Sheet, coarse, depth_color};
 
-/// Measures each named sensor many times over; prints milliseconds of each, beside an image of the same place.
+/// Measure the time of simulated LiDARs, range finders, sonars and radars
+///
+/// Compares each sensor with an image from the same place.
 #[derive(Args, Debug)]
 #[command(
-    after_help = "The sensor is where the camera is and looks along its axis; it flies 2 m/s forward and turns
-to the left by 90 degrees a second. Times are of all cores; where others use them, the least
-is the most meaningful, and with RAYON_NUM_THREADS=1 it is close to the processor's time.
+    after_help = "The sensor has the pose of the camera and looks along its axis. It flies forward at 2 m/s and
+turns left at 90 degrees a second. Times are for all cores. If other programs run, use the
+minimum; with RAYON_NUM_THREADS=1 it is close to the processor time.
 
-The sheet's pictures, in the order of the list: LiDARs that look all around, range finders,
-sonars and radars from above, the sensor in the middle looking up, with a ring each metre;
-other LiDARs as the image that their beams are. Grey is what a LiDAR without error sees. LiDAR
-points are blue below the sensor and red above it; a cone ends at its reading; a radar's
-detections are red where they come closer, blue where they go away.
+The sheet has one picture per sensor, in the order of the list. Spinning LiDARs, range finders,
+sonars and radars are drawn from above, sensor in the centre, forward up, one ring per metre;
+other LiDARs as the image of their beams. Grey: scan of a LiDAR without noise. LiDAR points are
+blue below the sensor and red above it. A cone ends at its reading. Radar detections are red if
+they approach, blue if they recede.
 
 Examples:
   vizflyt bench sensors forest/arena.toml --camera cam.json
@@ -40,19 +43,19 @@ Examples:
 pub(super) struct SensorsArgs {
     /// Scene file of any format, or an arena.toml (then its scene)
     scene: PathBuf,
-    /// Where the sensors are, as for `vizflyt scene render`
+    /// Camera file with the pose of the sensors, as for `vizflyt scene render`
     #[arg(long, value_name = "CAM.json")]
     camera: PathBuf,
-    /// Only this sensor; may be given more than once
+    /// Sensor to measure [default: all]; can be repeated
     #[arg(long, value_name = "NAME", value_parser = known)]
     sensor: Vec<String>,
-    /// Measurements of each that count
+    /// Measured records of each sensor
     #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     count: u32,
-    /// Writes what each sees side by side, as one PNG
+    /// File for one PNG with sample records of all sensors, side by side
     #[arg(long, value_name = "FILE.png")]
     sheet: Option<PathBuf>,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
@@ -60,11 +63,11 @@ pub(super) struct SensorsArgs {
 fn known(name: &str) -> Result<String, String> {
     match presets::preset(name) {
         Some(_) => Ok(name.to_owned()),
-        None => Err(format!("the named sensors are {}", presets::names())),
+        None => Err(format!("known sensors: {}", presets::names())),
     }
 }
 
-/// What `--json` prints.
+/// Output of `--json`.
 #[derive(Debug, Serialize)]
 struct Figures {
     scene: String,
@@ -78,7 +81,7 @@ struct Subject {
     name: String,
     least_ms: f64,
     median_ms: f64,
-    /// Records of the last measurement that are no gap.
+    /// Records of the last measurement, without gaps.
     records: usize,
 }
 
@@ -90,7 +93,7 @@ pub(super) fn run(args: &SensorsArgs) -> Result<()> {
     let packed = SensorScene::new(&loaded.splats);
     let packed_ms = start.elapsed().as_secs_f64() * 1e3;
     let motion = motion_from(&camera);
-    // Of many more beams than any sensor has: for pictures alone.
+    // Many more beams than any sensor has; used only for pictures.
     let seen = if args.sheet.is_some() { surroundings(&packed, &motion)? } else { Vec::new() };
     let around = TopView::new(&seen);
     let mut kinds = vec![image(Scene::from(&loaded.splats), &camera, args.count)?];
@@ -110,7 +113,7 @@ pub(super) fn run(args: &SensorsArgs) -> Result<()> {
     } else {
         print(&figures);
     }
-    // Last: a file that cannot be written costs no figure.
+    // Written last, so that a write error does not lose the results.
     args.sheet.as_ref().map_or(Ok(()), |file| sheet.save(file))
 }
 
@@ -123,7 +126,7 @@ fn print(figures: &Figures) {
     }
 }
 
-/// How the sensor flies from where the camera is, within a tenth of a second.
+/// Returns the sensor's motion from the camera's pose within 0.1 s.
 fn motion_from(camera: &Camera) -> SensorMotion<'static> {
     let body = camera.world_from_cam * body_from_forward_cam(DVec3::ZERO, 0.0).inverse();
     let begin: Pose<World, Sensor> = Pose::new(body.translation_m, body.rotation);
@@ -132,7 +135,7 @@ fn motion_from(camera: &Camera) -> SensorMotion<'static> {
     SensorMotion { world_from_sensor: [begin, begin * flown], objects: &[], duration_s: 0.1 }
 }
 
-/// What a LiDAR without error sees all around, from where the sensor is at first.
+/// Scans all around the start pose with a LiDAR without noise.
 fn surroundings(scene: &SensorScene, motion: &SensorMotion<'_>) -> Result<Vec<LidarPoint>> {
     let mut model = presets::os1(64);
     let elevations_rad = (0..64).map(|n| (60.0 - 1.9 * n as f32).to_radians()).collect();
@@ -154,7 +157,8 @@ fn image(scene: Scene<'_>, camera: &Camera, count: u32) -> Result<Subject> {
     })
 }
 
-/// Measures a sensor, and draws its last measurement into the view from above, unless it is an image: that is returned.
+/// Measures a sensor. Draws its last record into the top view, or, for a LiDAR with a grid of
+/// beams, returns it as a picture.
 fn measure(
     name: &str,
     preset: Preset,
@@ -226,9 +230,9 @@ fn timed(name: &str, count: u32, mut measure: impl FnMut(u64) -> Result<usize>) 
     Ok(Subject { name: name.to_owned(), least_ms, median_ms, records })
 }
 
-/// Beams in their places, coloured by range.
+/// Draws the beams in their grid, coloured by range.
 fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
-    // Beams are square, and the longer side fills the picture.
+    // Beams are square; the longer side fills the picture.
     let scale = TILE_PX as f32 / rows.max(columns) as f32;
     let (width, height) = (columns as f32 * scale, rows as f32 * scale);
     let (left, above) = ((TILE_PX as f32 - width) / 2.0, (TILE_PX as f32 - height) / 2.0);
@@ -242,7 +246,7 @@ fn raster(points: &[LidarPoint], rows: u32, columns: u32) -> RgbImage {
     })
 }
 
-/// The sensor's surroundings from above, x up and y to the left.
+/// Top view of the sensor's surroundings, x up and y to the left.
 #[derive(Clone)]
 struct TopView {
     picture: RgbImage,
@@ -250,7 +254,7 @@ struct TopView {
 }
 
 impl TopView {
-    /// Shows what most of the surroundings are within, 2 to 8 m.
+    /// Chooses a scale that shows most of the surroundings, 2 to 8 m.
     fn new(seen: &[LidarPoint]) -> Self {
         let mut aside_m: Vec<f32> = seen
             .iter()
@@ -300,7 +304,7 @@ impl TopView {
         }
     }
 
-    /// From one side of the sensor's axis to the other.
+    /// Draws an arc across the sensor's axis, from one side to the other.
     fn arc(&mut self, range_m: f32, half_rad: f32, color: Rgb<u8>) {
         let steps = (2.0 * half_rad * range_m * self.px_per_m).ceil().max(1.0);
         for n in 0..=steps as u32 {
@@ -309,7 +313,7 @@ impl TopView {
         }
     }
 
-    /// A square at a place; `wider_px` to each side of its pixel. [m, sensor]
+    /// Draws a square, `wider_px` to each side of its pixel. [m, sensor]
     fn dot(&mut self, [x_m, y_m]: [f32; 2], wider_px: i32, color: Rgb<u8>) {
         let middle = TILE_PX as f32 / 2.0;
         let (column, row) = (middle - y_m * self.px_per_m, middle - x_m * self.px_per_m);

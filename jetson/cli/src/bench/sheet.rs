@@ -1,4 +1,4 @@
-//! Pictures side by side, in rows of four at most.
+//! Sheet of pictures side by side, at most four in a row.
 
 use std::fs::File;
 use std::io::BufWriter;
@@ -12,7 +12,7 @@ use vizflyt_splat::RgbdImage;
 const COLUMNS: u32 = 4;
 const GAP_PX: u32 = 4;
 
-/// Pictures of one size, in the order in which they are added.
+/// Pictures of one size, in the order of `add`.
 pub(super) struct Sheet {
     pub(super) width_px: u32,
     pub(super) height_px: u32,
@@ -29,7 +29,7 @@ impl Sheet {
         self.tiles.push(tile);
     }
 
-    /// Writes all as one picture.
+    /// Writes all pictures as one.
     pub(super) fn save(&self, file: &Path) -> Result<()> {
         let count = self.tiles.len() as u32;
         let (columns, rows) = (count.min(COLUMNS), count.div_ceil(COLUMNS));
@@ -39,7 +39,7 @@ impl Sheet {
             let at = (i64::from(n % COLUMNS * width), i64::from(n / COLUMNS * height));
             image::imageops::replace(&mut all, tile, at.0, at.1);
         }
-        // A picture for a document: small rather than quickly written.
+        // Small size matters more than write time: the picture is for documents.
         File::create(file)
             .map_err(ImageError::from)
             .and_then(|out| {
@@ -51,7 +51,7 @@ impl Sheet {
     }
 }
 
-/// Near is bright and red, far is dark and blue; black is where there is no depth.
+/// Returns the colour of a depth: near is bright and red, far is dark and blue, no depth is black.
 pub(super) fn depth_color(depth_m: f32, alpha: f32) -> Rgb<u8> {
     if !(depth_m > 0.0 && alpha >= RgbdImage::MIN_DEPTH_ALPHA) {
         return Rgb([0; 3]);
@@ -60,7 +60,8 @@ pub(super) fn depth_color(depth_m: f32, alpha: f32) -> Rgb<u8> {
     coarse([near * near * 1.3, near * 0.9, 1.0 - 0.8 * near])
 }
 
-/// A colour from 0 to 1, in coarser steps than eight bits, which keep the file small.
+/// Returns a colour from values of 0 to 1, in coarser steps than eight bits, so that the file stays
+/// small.
 pub(super) fn coarse(rgb: [f32; 3]) -> Rgb<u8> {
     Rgb(rgb.map(|value| (value.clamp(0.0, 1.0) * 63.0 + 0.5) as u8 * 4))
 }

@@ -1,12 +1,12 @@
-//! `vizflyt bench stream`: how long an image takes to the plugin, over loopback and real sockets.
+//! `vizflyt bench stream`: latency of an image to the plugin, over loopback and real sockets.
 //!
 //! ```text
 //! packet  bytes handed to the transport -> QUIC -> shared memory -> plugin woken
 //! tcp     the same bytes, their length first, over TCP -> shared memory -> plugin woken
 //! pixels  rendered image -> encode -> QUIC -> decode -> shared memory -> plugin woken
 //! ```
-//! One after the other in one process, so that their ratio holds on a busy machine too. The plugin
-//! is a thread behind the real shared memory.
+//! The transfers run one after the other in one process, so that their ratio is valid on a busy
+//! machine too. The plugin is a thread behind the real shared memory.
 
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -45,27 +45,27 @@ use vizflyt_splat::RgbdImage;
 use vizflyt_studio::scene::camera::ImageSize;
 use vizflyt_trust::{Client, Identity, KeysFolder, Owner, Paired, Role};
 
-/// Streams images over loopback to a plugin; prints how long they take.
+/// Measure the latency of images to a plugin over loopback
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vizflyt bench stream
-  vizflyt bench stream --seconds 600 --rate 100     a soak: memory at start and end")]
+  vizflyt bench stream --seconds 600 --rate 100     soak test: compare the memory at start and end")]
 pub(super) struct StreamArgs {
-    /// How long to stream, each way
+    /// Duration of each of the three measurements
     #[arg(long, value_name = "SECONDS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86400))]
     seconds: u64,
-    /// Size of the images
+    /// Image size
     #[arg(long, value_name = "WxH", default_value = "640x480")]
     size: ImageSize,
-    /// Images a second
+    /// Image rate
     #[arg(long, value_name = "HZ", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=1000))]
     rate: u32,
-    /// Prints one JSON object
+    /// Print one JSON object
     #[arg(long)]
     json: bool,
 }
 
-/// The times of one kind of transfer.
+/// Results of one kind of transfer.
 #[derive(Debug, Serialize)]
 struct Transfer {
     name: &'static str,
@@ -118,7 +118,7 @@ pub(super) fn run(args: &StreamArgs) -> Result<()> {
     );
     for way in &figures.ways {
         print_fmt!(
-            "{:<7} {:>4} KB  p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} came",
+            "{:<7} {:>4} KB  p50 {:.2} ms, p99 {:.2}, max {:.2}; {} of {} arrived",
             way.name,
             way.bytes / 1000,
             way.ms_p50,
@@ -152,7 +152,7 @@ impl Bench {
             thread::sleep(due.saturating_duration_since(Instant::now()));
             send(seq)?;
         }
-        // What is on its way may arrive.
+        // Wait for images that are on their way.
         thread::sleep(SETTLE);
         Ok(())
     }
@@ -205,7 +205,7 @@ impl Bench {
         let ipc = plugin.runtime.clone();
         let copying = thread::spawn(move || -> Result<()> {
             let mut head = [0; 16];
-            // The end of the connection is the end.
+            // The sender closes the connection at the end.
             while receive.read_exact(&mut head).is_ok() {
                 let (handed, len) = head.split_at(8);
                 let len = u64::from_le_bytes(len.try_into()?) as usize;
@@ -271,7 +271,8 @@ impl Bench {
     }
 }
 
-/// Copies images from the stream to shared memory as they are, when they were handed over first.
+/// Copies images from the stream to shared memory as they are, with the time at which they were
+/// sent.
 fn copy(ipc: &RuntimeEnd, mailbox: &Mailbox, stop: &AtomicBool) -> Result<()> {
     let mut bytes = Vec::new();
     while !stop.load(Ordering::Relaxed) {
@@ -299,7 +300,7 @@ fn handed_first(bytes: &[u8]) -> Option<u64> {
     Some(u64::from_le_bytes(bytes.first_chunk().copied()?))
 }
 
-/// The plugin's side, on a thread.
+/// Plugin side, on a thread.
 struct Plugin {
     runtime: Arc<RuntimeEnd>,
     stop: Arc<AtomicBool>,
@@ -307,7 +308,7 @@ struct Plugin {
 }
 
 impl Plugin {
-    /// Starts it; `handed` reads from an observation when its image was handed over. [ns, server]
+    /// Starts the plugin. `handed` reads from an observation when its image was sent. [ns, server]
     fn start(len: usize, handed: impl Fn(&[u8]) -> Option<u64> + Send + 'static) -> Result<Self> {
         let runtime = Arc::new(RuntimeEnd::new(len));
         let plugin = PluginEnd::attach(runtime.connect()?)?;
@@ -329,14 +330,14 @@ impl Plugin {
         Ok(Self { runtime, stop, thread })
     }
 
-    /// Ends it; returns how long each image took. [ms]
+    /// Stops the plugin; returns the latency of each image. [ms]
     fn end(self) -> Result<Vec<f64>> {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().map_err(|_| anyhow!("the plugin thread failed"))?
     }
 }
 
-/// A server and a runtime, connected.
+/// A connected pair of server and runtime.
 struct Link {
     rooms: Rooms,
     shared: Shared,
@@ -391,7 +392,7 @@ impl Link {
         let deadline = Instant::now() + CONNECTED_WITHIN;
         let connected = || {
             let room = rooms.streaming.subscriptions.wait_for_room(PATIENCE).fly[0][0];
-            // Images that come before the clocks are related cannot be placed in time.
+            // Before the clocks are synchronized, images have no time on the runtime's clock.
             room && shared.clock.state(vizflyt_sdk::host_now()).is_some()
         };
         while !connected() {
@@ -421,7 +422,7 @@ fn payload([width, height]: [u32; 2]) -> Result<Bytes> {
     Ok(payload.into())
 }
 
-/// Returns a rendered image about as hard to encode as a captured scene: texture of every scale, and
+/// Returns a rendered image about as hard to encode as a captured scene: texture of every scale,
 /// depth with edges.
 fn picture([width_px, height_px]: [u32; 2]) -> RgbdImage {
     let pixels = (width_px * height_px) as usize;
@@ -448,7 +449,7 @@ fn picture([width_px, height_px]: [u32; 2]) -> RgbdImage {
     image
 }
 
-/// Returns the memory of this process. [MB]
+/// Returns the resident memory of this process. [MB]
 fn rss_mb() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
@@ -456,7 +457,7 @@ fn rss_mb() -> f64 {
     kb.unwrap_or(0.0) / 1e3
 }
 
-/// More images than are ever under way.
+/// Larger than the number of images on their way at any time.
 const RING: usize = 256;
 const PATIENCE: Duration = Duration::from_millis(100);
 const SETTLE: Duration = Duration::from_millis(300);

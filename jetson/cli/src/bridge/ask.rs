@@ -1,4 +1,5 @@
-//! Client of a bridge on the network: requests and replies in MAVLink's TUNNEL (`vizflyt_bridge::access`).
+//! Client of a bridge on the network: requests and replies in MAVLink's TUNNEL message
+//! (`vizflyt_bridge::access`).
 
 use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
@@ -11,13 +12,13 @@ use vizflyt_bridge::packet::{CutStats, each_in_datagram};
 use vizflyt_bridge::settings::Key;
 use vizflyt_protocol::mavlink::MAX_PACKET;
 
-/// TUNNEL's number.
+/// Message id of TUNNEL.
 const TUNNEL: u32 = 385;
-/// Our ids, a ground station's component of our own: MAV_COMP_ID_ONBOARD_COMPUTER4.
+/// System and component id of this client: MAV_COMP_ID_ONBOARD_COMPUTER4 of a ground station.
 const SOURCE: (u8, u8) = (255, 194);
-/// Maximum time for a reply; then the request is repeated.
+/// Timeout for a reply; then the request is repeated.
 const PATIENCE: Duration = Duration::from_millis(400);
-/// Repetitions.
+/// Maximum number of attempts.
 const ATTEMPTS: u8 = 6;
 
 /// A bridge on the network.
@@ -27,16 +28,16 @@ pub(crate) struct BridgeClient {
     sequence: u8,
     random: [u8; 16],
     counter: u32,
-    /// Whether it has a key.
+    /// Whether the bridge has a key.
     pub(crate) claimed: bool,
-    /// Whether bytes pass it unparsed.
+    /// Whether the bridge passes bytes unparsed.
     pub(crate) transparent: bool,
-    /// Its firmware's version.
+    /// Firmware version.
     pub(crate) version: String,
 }
 
 impl BridgeClient {
-    /// Finds the bridge at `address`.
+    /// Queries the bridge at `address`.
     pub(crate) fn open(address: &str) -> Result<Self> {
         let with_port =
             if address.contains(':') { address.to_owned() } else { format!("{address}:14550") };
@@ -63,7 +64,7 @@ impl BridgeClient {
             hello.get(16..20).and_then(|bytes| bytes.try_into().ok()),
             hello.get(20),
         ) else {
-            bail!("bridge: {address} answers as no bridge of ours does");
+            bail!("bridge: {address} replied, but not with the bridge protocol");
         };
         client.random = *random;
         client.counter = u32::from_le_bytes(counter);
@@ -73,7 +74,7 @@ impl BridgeClient {
         Ok(client)
     }
 
-    /// Asks, and returns status and body of the answer; `key` proves a change.
+    /// Sends a request and returns status and body of the reply. Changes need `key`.
     pub(crate) fn ask(
         &mut self,
         op: Op,
@@ -85,7 +86,7 @@ impl BridgeClient {
             bail!("bridge: a request of {} bytes is too long", body.len());
         }
         for _ in 0..ATTEMPTS {
-            // A repetition needs a counter of its own: the answer may have been lost, not the request.
+            // Each repetition has its own counter: possibly the reply was lost, not the request.
             self.counter += 1;
             let mut request = vec![op as u8];
             request.extend_from_slice(&self.counter.to_le_bytes());
@@ -103,14 +104,14 @@ impl BridgeClient {
             }
         }
         bail!(
-            "bridge: {} does not answer; is it on, and is this computer in its network?",
+            "bridge: {} does not reply; check that it is on, and that this computer is in its network",
             self.address
         )
     }
 
     fn send(&mut self, request: &[u8]) -> Result<()> {
         let [low, high] = TUNNEL_TYPE.to_le_bytes();
-        // The vehicle's number need not be known: zero is any.
+        // The vehicle's system id may be unknown: zero addresses any.
         let mut payload = vec![low, high, 0, COMPONENT_ID, request.len() as u8];
         payload.extend_from_slice(request);
         let mut packet = [0; MAX_PACKET];
@@ -122,10 +123,10 @@ impl BridgeClient {
         Ok(())
     }
 
-    /// Waits a moment for the answer; telemetry that comes too is left aside.
+    /// Waits up to the socket's timeout for the reply, and ignores telemetry.
     fn receive(&self, op: Op) -> Option<(Status, Vec<u8>)> {
         let mut bytes = [0; 2048];
-        // Nothing yet, or refused: asked again.
+        // Timeout or refused: the caller repeats the request.
         let (len, from) = self.socket.recv_from(&mut bytes).ok()?;
         if from != self.address {
             return None;

@@ -1,4 +1,5 @@
-//! `vizflyt bridge configure`: claims a bridge, shows its settings, changes them. And `stats`.
+//! `vizflyt bridge configure` (claims a bridge, shows and changes its settings) and `vizflyt bridge
+//! stats`.
 
 use std::io::Read;
 use std::path::PathBuf;
@@ -15,58 +16,60 @@ use vizflyt_trust::KeysFolder;
 
 use super::ask::BridgeClient;
 
-/// Shows and changes a bridge's settings.
+/// Show and change the settings of a bridge
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
-  vizflyt bridge configure --claim                                  once, with a new bridge
-  vizflyt bridge configure                                          shows every setting
+  vizflyt bridge configure --claim                                  once for a new bridge
+  vizflyt bridge configure                                          show all settings
   vizflyt bridge configure WIFI_STATION=1 wifi.ssid=lab wifi.password=... --restart
   vizflyt bridge configure --bridge vizflyt.local LOSS_MS=800
-  vizflyt bridge configure vehicle.key=@/etc/vizflyt/mavlink.key    signs its LAND; a key may be a file
+  vizflyt bridge configure vehicle.key=@/etc/vizflyt/mavlink.key    sign its LAND commands; the key is read from a file
   vizflyt bridge configure wifi.country=DE UART_TX_PIN=21 UART_RX_PIN=20 --restart
-  vizflyt bridge configure TRANSPARENT=1 --restart                  bytes of any kind, and no LAND
+  vizflyt bridge configure TRANSPARENT=1 --restart                  pass all bytes unparsed; the bridge sends no LAND
 
-A change is kept at once. Nothing changes while the vehicle is armed.")]
+Changes are saved at once. The bridge rejects changes while the vehicle is armed.")]
 pub(crate) struct ConfigureArgs {
-    /// Settings to change; none shows them all.
+    /// Settings to change; without any, all settings are shown
     #[arg(value_name = "NAME=VALUE")]
     changes: Vec<String>,
-    /// Where the bridge is: ADDRESS or ADDRESS:PORT.
+    /// Address of the bridge: ADDRESS or ADDRESS:PORT
     #[arg(long, value_name = "ADDRESS", default_value_t = super::emulate::DEFAULT_BRIDGE.to_string())]
     bridge: String,
-    /// Gives a new bridge its key: makes one if there is none yet. Do it where nobody else is in
-    /// the bridge's network.
+    /// Set the key of a new bridge, and make the key if there is none yet
+    ///
+    /// Do this when no other computer is in the bridge's network.
     #[arg(long)]
     claim: bool,
-    /// Puts every setting but the key back to what it was on the first day, before the changes.
+    /// Reset all settings except the key to their defaults, before the changes
     #[arg(long)]
     reset: bool,
-    /// Restarts the bridge afterwards: speed, ports and Wi-Fi count only then.
+    /// Restart the bridge afterwards
+    ///
+    /// Speed, ports and Wi-Fi settings take effect only after a restart.
     #[arg(long)]
     restart: bool,
-    /// Folder of keys; the bridge's is `bridge.key` in it.
+    /// Folder of keys; the bridge's key is `bridge.key` in it
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
 }
 
-/// Counters of a bridge: what passed, what was lost, and why.
+/// Show the counters of a bridge: packets passed, packets lost, and why
 #[derive(Args, Clone, Debug)]
 pub(crate) struct StatsArgs {
-    /// Where the bridge is: ADDRESS or ADDRESS:PORT.
+    /// Address of the bridge: ADDRESS or ADDRESS:PORT
     #[arg(value_name = "ADDRESS", default_value_t = super::emulate::DEFAULT_BRIDGE.to_string())]
     bridge: String,
-    /// Prints them as JSON.
+    /// Print the counters as JSON
     #[arg(long)]
     json: bool,
-    /// Prints what has changed, every second.
+    /// Print the changes every second
     #[arg(long, conflicts_with = "json")]
     watch: bool,
 }
 
-/// The key's file.
 const KEY_FILE: &str = "bridge.key";
 
-/// Runs `configure`.
+/// Runs `vizflyt bridge configure`.
 pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
     let mut client = BridgeClient::open(&args.bridge)?;
     if args.claim {
@@ -98,7 +101,7 @@ pub(crate) fn configure(args: &ConfigureArgs) -> Result<()> {
     Ok(())
 }
 
-/// Puts a file's content in the place of a key's `@FILE`: keys are not for a shell's history.
+/// Replaces `@FILE` of a key by the file's content, so that keys stay out of the shell's history.
 fn with_file(setting: &str) -> Result<String> {
     let file = setting.split_once("=@").filter(|(name, _)| name.ends_with("key"));
     let Some((name, path)) = file else { return Ok(setting.to_owned()) };
@@ -140,9 +143,9 @@ fn change(client: &mut BridgeClient, op: Op, body: &str, key: &Key) -> Result<()
     match client.ask(op, body.as_bytes(), Some(key))? {
         (Status::Done, _) => Ok(()),
         (status, _) => {
-            // A password must not end up in somebody's terminal log.
+            // Print only the name: a password must not end up in a terminal log.
             let name = body.split('=').next().unwrap_or_default();
-            bail!("bridge: {op:?} {name} is refused: {}", status.message())
+            bail!("bridge: {op:?} {name} was rejected: {}", status.message())
         }
     }
 }
@@ -155,7 +158,7 @@ fn show(client: &mut BridgeClient) -> Result<()> {
     }
     let names = NUMBERS.iter().map(|number| number.name);
     for name in names.chain(TEXTS.iter().map(|&(name, _)| name)) {
-        // An older firmware may not know a name of ours.
+        // Older firmware may not support this setting.
         if let (Status::Done, value) = client.ask(Op::Read, name.as_bytes(), None)? {
             print_line(format!("{name:18} {}", String::from_utf8_lossy(&value)));
         }
@@ -163,7 +166,7 @@ fn show(client: &mut BridgeClient) -> Result<()> {
     Ok(())
 }
 
-/// Runs `stats`.
+/// Runs `vizflyt bridge stats`.
 pub(crate) fn stats(args: &StatsArgs) -> Result<()> {
     let mut client = BridgeClient::open(&args.bridge)?;
     let mut before: Option<Vec<u32>> = None;

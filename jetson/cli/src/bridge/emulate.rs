@@ -1,6 +1,6 @@
-//! `vizflyt bridge emulate`: the bridge of the vehicle on this computer. The same core that chips
-//! run, here between a pseudo-terminal (or a real serial port) and this computer's sockets; only the
-//! shell around it is another: one thread that waits on file descriptors.
+//! `vizflyt bridge emulate`: the vehicle's bridge on this computer. The core is the same as on the
+//! chips; here it runs between a pseudo-terminal (or a real serial port) and sockets. Only the
+//! shell differs: one thread that waits on file descriptors.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream, UdpSocket};
@@ -29,55 +29,60 @@ use super::flash::FileFlash;
 use super::page::Page;
 use super::port::{Port, Uart};
 
-/// Runs the bridge's firmware on this computer.
+/// Emulate the vehicle's Wi-Fi bridge on this computer
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
   vizflyt bridge emulate --uart pty:/tmp/uart           then: vizflyt sim --serial /tmp/uart
-  vizflyt bridge emulate --uart /dev/ttyUSB0            this computer carries a real autopilot's port
-  vizflyt bridge emulate --client 127.0.0.1:14550       speaks first, to a runtime that waits there
+  vizflyt bridge emulate --uart /dev/ttyUSB0            with a real autopilot on this computer's port
+  vizflyt bridge emulate --client 127.0.0.1:14550       contact a waiting runtime first
   vizflyt bridge emulate --page 127.0.0.1:8090 --set page.key=abcd-efgh
-                                                        with its page; the key changes settings there
-  vizflyt bridge emulate --set TRANSPARENT=1            bytes of any kind, unparsed: no LAND")]
+                                                        with the status page; the key permits changes there
+  vizflyt bridge emulate --set TRANSPARENT=1            pass all bytes unparsed; the bridge sends no LAND")]
 pub(crate) struct EmulateArgs {
-    /// The autopilot's port: `pty` makes a pseudo-terminal, `pty:PATH` links to it by a name, PATH
-    /// is a serial device.
+    /// Serial port of the autopilot: `pty`, `pty:PATH` or a device
+    ///
+    /// `pty` makes a pseudo-terminal. `pty:PATH` also links PATH to it.
     #[arg(long, value_name = "UART", default_value = "pty")]
     uart: Uart,
-    /// UDP address that clients send to.
+    /// UDP address for clients
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:14555")]
     listen: SocketAddrV4,
-    /// TCP address that clients connect to; none without it.
+    /// TCP address for clients [default: no TCP]
     #[arg(long, value_name = "ADDR:PORT")]
     tcp: Option<SocketAddrV4>,
-    /// TCP address of the status page; none without it.
+    /// TCP address of the status page [default: no page]
     #[arg(long, value_name = "ADDR:PORT")]
     page: Option<SocketAddrV4>,
-    /// Takes firmware at the page that this key signed, as `vizflyt bridge firmware key` prints it;
-    /// verified as on a chip, but not run.
+    /// Accept firmware signed by this key, at the page
+    ///
+    /// `vizflyt bridge firmware key` prints the key. Firmware is verified as on a chip, but not
+    /// run.
     #[arg(long, value_name = "HEX", requires = "page", value_parser = firmware_key)]
     firmware_key: Option<Key>,
-    /// A client that is sent to before it speaks.
+    /// Client to which the bridge sends before it has received a packet
     #[arg(long, value_name = "ADDR:PORT")]
     client: Option<SocketAddrV4>,
-    /// Speed of the port; a pseudo-terminal takes as long as a line of this speed would.
+    /// Baud rate of the port
+    ///
+    /// A pseudo-terminal has the timing of a serial line at this rate.
     #[arg(long, value_name = "BAUD")]
     baud: Option<u32>,
-    /// Any other setting, as in `vizflyt bridge configure`; may be given several times.
+    /// Other setting, as in `vizflyt bridge configure`; can be repeated
     #[arg(long = "set", value_name = "NAME=VALUE")]
     settings: Vec<String>,
-    /// Keeps the bridge's flash in this file, so that saved settings outlive it.
+    /// File for the bridge's flash, so that saved settings persist
     #[arg(long, value_name = "FILE")]
     flash: Option<PathBuf>,
-    /// Prints JSON lines on stdout: one when ready, one report at the end.
+    /// Print JSON lines on stdout: one when ready, one report at the end
     #[arg(long)]
     json: bool,
-    /// Ends when stdin ends.
+    /// End when stdin closes
     #[arg(long, hide = true)]
     lifeline: bool,
 }
 
 impl EmulateArgs {
-    /// A bridge between a new pseudo-terminal and a free port of loopback.
+    /// Returns arguments for a bridge between a new pseudo-terminal and a free port on loopback.
     pub(crate) fn loopback(baud: u32) -> Self {
         Self {
             uart: Uart::Pty(None),
@@ -95,13 +100,13 @@ impl EmulateArgs {
     }
 }
 
-/// The loop wakes at least this often, to see that it shall end.
+/// Maximum time between checks of the stop flag.
 const WAKE: Duration = Duration::from_millis(50);
 
-/// What a TCP client may leave unread at a chip, two segments. [bytes]
+/// Send buffer of a TCP client on a chip: two segments. [bytes]
 const TCP_BUFFER: usize = 1072;
 
-/// Runs it until it is stopped.
+/// Runs the emulation until it is stopped.
 pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let mut emulation = Emulation::open(args)?;
@@ -146,7 +151,7 @@ pub(crate) fn run(args: &EmulateArgs) -> Result<()> {
     Ok(())
 }
 
-/// A bridge with its sockets and its port.
+/// An emulated bridge with its sockets and port.
 pub(crate) struct Emulation {
     bridge: Bridge,
     overrides: Vec<(String, String)>,
@@ -160,14 +165,14 @@ pub(crate) struct Emulation {
     booted: Instant,
 }
 
-/// A TCP client and what it has not taken yet.
+/// TCP client with the bytes that it has not read yet.
 struct Connection {
     stream: TcpStream,
     pending: Vec<u8>,
 }
 
 impl Emulation {
-    /// Opens port and sockets.
+    /// Opens the port and all sockets.
     pub(crate) fn open(args: &EmulateArgs) -> Result<Self> {
         let mut overrides = vec![("UDP_PORT".to_owned(), args.listen.port().max(1).to_string())];
         overrides.extend(args.client.map(|client| ("client".to_owned(), client.to_string())));
@@ -215,7 +220,7 @@ impl Emulation {
         })
     }
 
-    /// Carries what there is to carry now.
+    /// Handles all pending input, output and timers.
     pub(crate) fn turn(&mut self) -> Result<()> {
         let now = Instant::now();
         let at = self.host(now);
@@ -255,7 +260,7 @@ impl Emulation {
         Ok(())
     }
 
-    /// What a chip does when it restarts: everything but the flash is forgotten.
+    /// Restarts as a chip does: all state except the flash is lost.
     fn restart(&mut self, at: HostTime) -> Result<()> {
         tracing::info!("bridge: restarts");
         let settings = boot_settings(&mut self.store, &self.overrides)?;
@@ -267,14 +272,14 @@ impl Emulation {
 
     fn receive_udp(&mut self, at: HostTime) {
         let mut bytes = [0; 2048];
-        // A flood must not stop the autopilot's side.
+        // Bounded, so that a flood does not starve the autopilot's side.
         for _ in 0..64 {
             match self.udp.recv_from(&mut bytes) {
                 Ok((len, SocketAddr::V4(from))) => {
                     self.bridge.handle_datagram(at, from, &bytes[..len]);
                 }
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return,
-                // A client that is not there yet reports itself as refused: go on.
+                // A client that has not started yet causes "connection refused": continue.
                 _ => {}
             }
         }
@@ -286,9 +291,10 @@ impl Emulation {
             && let Some(slot) = self.streams.iter().position(Option::is_none)
             && stream.set_nonblocking(true).is_ok()
         {
-            // Small packets must not wait for each other; failing that they merely do.
+            // Avoids delays of small packets; without it, the connection still works.
             let _ = stream.set_nodelay(true);
-            // As little as a chip has: who does not read is known soon.
+            // Same small buffer as on a chip, so that a client that does not read is detected
+            // early.
             let _ = setsockopt(&stream, sockopt::SndBuf, &TCP_BUFFER);
             self.streams[slot] = Some(Connection { stream, pending: Vec::new() });
             self.bridge.open_stream(at, slot as u8);
@@ -317,8 +323,8 @@ impl Emulation {
             let Some(connection) = place else { continue };
             let gone = loop {
                 if !self.bridge.is_open(slot as u8) {
-                    tracing::warn!("bridge: a tcp client that takes nothing is dropped");
-                    // At once, as a chip aborts it: what it has not taken it will not take.
+                    tracing::warn!("bridge: dropped a tcp client that does not read");
+                    // Abort immediately, as a chip does; unread bytes are discarded.
                     let linger = linger { l_onoff: 1, l_linger: 0 };
                     let _ = setsockopt(&connection.stream, sockopt::Linger, &linger);
                     break true;
@@ -345,7 +351,7 @@ impl Emulation {
         }
     }
 
-    /// Waits until something comes in or falls due.
+    /// Waits for input or the next timer.
     pub(crate) fn wait(&self) -> Result<()> {
         let now = Instant::now();
         let mut due = now + WAKE;
@@ -384,7 +390,7 @@ impl Emulation {
         }
     }
 
-    /// Returns every counter by its name.
+    /// Returns all counters by name.
     pub(crate) fn report(&self) -> serde_json::Value {
         let counters = self.bridge.stats().report(self.booted.elapsed().as_secs() as u32);
         REPORT
@@ -401,16 +407,16 @@ impl Emulation {
 }
 
 fn firmware_key(text: &str) -> Result<Key, String> {
-    key_from_hex(text).map_err(|_| "it has 64 hexadecimal digits".to_owned())
+    key_from_hex(text).map_err(|_| "expected 64 hexadecimal digits".to_owned())
 }
 
-/// Returns the settings of a start: those in flash, then those of the command line.
+/// Returns the settings at startup: those in flash, overridden by those of the command line.
 fn boot_settings(store: &mut Store<FileFlash>, overrides: &[(String, String)]) -> Result<Settings> {
     let mut settings = store.load().unwrap_or_default();
     for (name, value) in overrides {
         if let Err(refused) = settings.set(name, value) {
             bail!(
-                "bridge: {name}={value} is refused: {refused:?}; see `vizflyt bridge configure --list`"
+                "bridge: {name}={value} was rejected: {refused:?}; see `vizflyt bridge configure --list`"
             );
         }
     }
@@ -425,6 +431,6 @@ fn chip() -> Result<Chip> {
     Ok(Chip { address: [2, 0, 0, random[0], random[1], random[2]], random })
 }
 
-/// Where a bridge in AP mode is, and the port it listens on.
+/// Default address of a bridge in AP mode.
 pub(crate) const DEFAULT_BRIDGE: SocketAddrV4 =
     SocketAddrV4::new(Ipv4Addr::new(192, 168, 4, 1), 14550);

@@ -1,4 +1,4 @@
-//! `vizflyt bridge firmware`: signs a bridge's firmware and brings it over the network.
+//! `vizflyt bridge firmware`: signs firmware for a bridge and uploads it over the network.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -15,10 +15,10 @@ use vizflyt_bridge::update::{Header, MAGIC, Target};
 use vizflyt_process::print_line;
 use vizflyt_trust::KeysFolder;
 
-/// Signs a bridge's firmware, and brings it over the network.
+/// Sign firmware for a bridge, and upload it over the network
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
-  export VIZFLYT_FIRMWARE_KEY=$(vizflyt bridge firmware key)      once; the bridges trust this key
+  export VIZFLYT_FIRMWARE_KEY=$(vizflyt bridge firmware key)      once; bridges built with this key trust it
   VIZFLYT_FIRMWARE_BUILD=7 firmware-esp/esp32c3/build
   vizflyt bridge firmware sign firmware-esp/esp32c3/target/image/bridge-esp32c3-update.bin \\
       --chip esp32c3 --build 7 -o bridge-7.signed
@@ -30,33 +30,35 @@ pub(crate) struct FirmwareArgs {
 
 #[derive(Subcommand, Clone, Debug)]
 enum FirmwareCommand {
-    /// Prints the public half of the key that signs, for the build; makes the key if there is none.
+    /// Print the public key for the build; make the key pair if there is none
     Key(KeyArgs),
-    /// Signs a firmware.
+    /// Sign a firmware image
     Sign(SignArgs),
-    /// Brings a signed firmware to a bridge, which verifies it and starts it on trial.
+    /// Upload signed firmware to a bridge, which verifies it and starts it on trial
     Send(SendArgs),
 }
 
 #[derive(Args, Clone, Debug)]
 struct KeyArgs {
-    /// Folder of keys; the firmware's is `firmware.key` in it. Whoever has it writes your bridges.
+    /// Folder of keys; the firmware key is `firmware.key` in it
+    ///
+    /// Keep it secret: the key can install firmware on all bridges that trust it.
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
 }
 
 #[derive(Args, Clone, Debug)]
 struct SignArgs {
-    /// The program alone: bridge-esp32c3-update.bin.
+    /// Firmware image without bootloader: bridge-esp32c3-update.bin
     #[arg(value_name = "IMAGE")]
     image: PathBuf,
-    /// The chip it is for.
+    /// Target chip
     #[arg(long)]
     chip: ChipName,
-    /// Its number, as it was built with; bridges take no older one than they run.
+    /// Build number of the image; bridges reject older builds than they run
     #[arg(long, value_name = "N")]
     build: u32,
-    /// The signed file.
+    /// Signed output file
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
@@ -65,28 +67,27 @@ struct SignArgs {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum ChipName {
-    /// ESP32-C3.
+    /// ESP32-C3
     Esp32c3,
-    /// This computer: `vizflyt bridge emulate --firmware-key`, to try it out.
+    /// This computer, for a test with `vizflyt bridge emulate --firmware-key`
     Host,
 }
 
 #[derive(Args, Clone, Debug)]
 struct SendArgs {
-    /// What `sign` wrote.
+    /// Signed firmware, written by `sign`
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Where the bridge is: ADDRESS, or ADDRESS:PORT of its status page.
+    /// Address of the bridge, or ADDRESS:PORT of its status page
     #[arg(long, value_name = "ADDRESS", default_value = "192.168.4.1")]
     bridge: String,
 }
 
-/// The key's file.
 const KEY_FILE: &str = "firmware.key";
-/// A bridge that is silent for so long is gone; erasing its flash takes less.
+/// Timeout for the bridge's reply; erasing its flash takes less.
 const PATIENCE: Duration = Duration::from_secs(15);
 
-/// Runs what was asked for.
+/// Runs `vizflyt bridge firmware`.
 pub(crate) fn run(args: &FirmwareArgs) -> Result<()> {
     match &args.command {
         FirmwareCommand::Key(args) => {
@@ -142,7 +143,7 @@ fn sign(args: &SignArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the file that a bridge takes.
+/// Returns the signed firmware file.
 fn signed(key: &SigningKey, target: Target, build: u32, image: &[u8]) -> Result<Vec<u8>> {
     let len = u32::try_from(image.len()).context("an image of more than 4 GB")?;
     let header = Header { target: target as u8, build, len, hash: Sha256::digest(image).into() };
@@ -164,7 +165,7 @@ fn send(args: &SendArgs) -> Result<()> {
     Ok(())
 }
 
-/// Brings a firmware to the page of a bridge; returns its answer.
+/// Uploads firmware to the page of a bridge; returns its reply.
 fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
     let resolved = address
         .to_socket_addrs()
@@ -172,11 +173,12 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
         .next()
         .with_context(|| format!("bridge: {address} has no address"))?;
     let mut stream = TcpStream::connect_timeout(&resolved, PATIENCE)
-        .with_context(|| format!("bridge: nobody answers at {address}; is its page on?"))?;
+        .with_context(|| format!("bridge: no reply from {address}; check that its page is enabled"))?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let head = format!("POST /update HTTP/1.0\r\nContent-Length: {}\r\n\r\n", firmware.len());
-    // A bridge that refuses replies before the last byte: its reply counts, not the broken connection.
+    // A bridge that rejects the firmware replies before the last byte: its reply counts, not the
+    // broken connection.
     let sent = stream.write_all(head.as_bytes()).and_then(|()| stream.write_all(firmware));
     let mut answer = Vec::new();
     let received = stream.read_to_end(&mut answer);
@@ -189,12 +191,12 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
             sent.and(received.map(|_| ())).with_context(|| {
                 format!("bridge: the connection broke while {} was on its way", name.display())
             })?;
-            bail!("bridge: it sent no reply; look at its page")
+            bail!("bridge: no reply after the upload; check the bridge's page")
         }
         "404" => {
-            bail!("bridge: its firmware is older than updates over the network; flash it by wire")
+            bail!("bridge: its firmware does not support updates over the network; flash it by wire")
         }
-        _ => bail!("bridge: not taken: {words}"),
+        _ => bail!("bridge: firmware was rejected: {words}"),
     }
 }
 
@@ -214,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signed_firmware_is_accepted_with_the_printed_key() {
+    fn accepts_signed_firmware_with_the_printed_key() {
         let (folder, key) = keys();
         let made = make_key(&key).unwrap();
         assert_eq!(read_key(&key).unwrap().unwrap().to_bytes(), made.to_bytes());
@@ -234,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bridges_own_words_are_shown() {
+    fn shows_the_reply_of_the_bridge() {
         let answers =
             ["200 OK\r\n\r\nverified", "409 Conflict\r\n\r\nthe vehicle is armed", "404 X"];
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();

@@ -1,5 +1,4 @@
-//! A chip's flash in a file, or in memory where no file is wanted: erased bytes are ones, writing
-//! clears bits.
+//! Emulated flash of a chip, in a file or in memory: erased bytes are 0xFF, writing clears bits.
 
 use std::fs;
 use std::io;
@@ -9,13 +8,13 @@ use embedded_storage::nor_flash::{
     ErrorType, NorFlash, NorFlashError, NorFlashErrorKind, ReadNorFlash,
 };
 
-/// The flash.
+/// Flash of the emulated bridge.
 pub(crate) struct FileFlash {
     bytes: Vec<u8>,
     path: Option<PathBuf>,
 }
 
-/// It was asked for a place that it has not, or its file was not written.
+/// Address out of range, or the file could not be written.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FlashError;
 
@@ -29,7 +28,7 @@ const SECTOR: usize = 4096;
 const SIZE: usize = 2 * SECTOR;
 
 impl FileFlash {
-    /// Opens it; a file that is not there yet is an erased flash.
+    /// Opens the flash; a missing file is an erased flash.
     pub(crate) fn open(path: Option<PathBuf>) -> io::Result<Self> {
         let mut bytes = match &path {
             Some(path) if path.exists() => fs::read(path)?,
@@ -39,7 +38,7 @@ impl FileFlash {
         Ok(Self { bytes, path })
     }
 
-    /// Makes the half of a flash that does not run, erased, in memory.
+    /// Returns an erased spare half in memory.
     pub(crate) fn spare(size: usize) -> Self {
         Self { bytes: vec![0xFF; size], path: None }
     }

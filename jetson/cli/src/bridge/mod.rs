@@ -1,4 +1,4 @@
-//! `vizflyt bridge`: the Wi-Fi bridge of a vehicle, on this computer or over the network.
+//! `vizflyt bridge`: the Wi-Fi bridge of a vehicle, emulated on this computer or over the network.
 
 mod ask;
 mod configure;
@@ -13,7 +13,7 @@ pub(crate) use self::emulate::{EmulateArgs, Emulation};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-/// The Wi-Fi bridge of a vehicle.
+/// Emulate, inspect and configure the Wi-Fi bridge of a vehicle
 #[derive(Args, Debug)]
 pub(crate) struct BridgeArgs {
     #[command(subcommand)]
@@ -21,19 +21,19 @@ pub(crate) struct BridgeArgs {
 }
 
 #[derive(Subcommand, Debug)]
-#[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
+#[allow(clippy::large_enum_variant)] // Why: only one value exists, for a short time.
 enum BridgeCommand {
-    /// Runs the bridge's firmware on this computer, between a pseudo-terminal or serial port and its sockets.
+    /// Emulate the bridge on this computer, between a serial port and sockets
     Emulate(EmulateArgs),
-    /// Counters of a bridge: what passed, what was lost, and why.
+    /// Show the counters of a bridge: packets passed, packets lost, and why
     Stats(configure::StatsArgs),
-    /// Shows and changes a bridge's settings.
+    /// Show and change the settings of a bridge
     Configure(configure::ConfigureArgs),
-    /// Signs a bridge's firmware, and brings it over the network.
+    /// Sign firmware for a bridge, and upload it over the network
     Firmware(firmware::FirmwareArgs),
 }
 
-/// Runs what was asked for.
+/// Runs `vizflyt bridge`.
 pub(crate) fn run(args: BridgeArgs) -> Result<()> {
     match args.command {
         BridgeCommand::Emulate(args) => emulate::run(&args),

@@ -1,5 +1,5 @@
-//! The emulated bridge's page, which takes settings and firmware too: one browser after another, as on a
-//! chip, without ever waiting for it.
+//! Web page of the emulated bridge, for status, settings and firmware. Serves one browser at a
+//! time, as a chip does, without blocking.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, SocketAddrV4, TcpListener, TcpStream};
@@ -16,27 +16,28 @@ use vizflyt_protocol::time::HostTime;
 
 use super::flash::FileFlash;
 
-/// The page.
+/// Server of the page.
 pub(crate) struct Page {
     listener: TcpListener,
     visitor: Option<Visitor>,
     halves: Option<Halves>,
 }
 
-/// A browser, or somebody who brings a firmware.
+/// A connected browser or firmware upload.
 struct Visitor {
     stream: TcpStream,
     heard_at: Instant,
     request: Request,
     updater: Option<Updater>,
     answer: Option<Vec<u8>>,
-    /// The answer is out; what still comes is read, so that it is not lost to a reset.
+    /// The reply has been sent; remaining input is read, so that a reset does not discard the
+    /// reply.
     answered: bool,
     restart: bool,
 }
 
-/// The spare half of a flash, and which firmware it takes. What is taken is verified as on a chip; this
-/// computer cannot run it, so only its number counts from then on.
+/// Spare half of the flash and the accepted firmware. An upload is verified as on a chip; this
+/// computer cannot run it, so that only its build number takes effect.
 struct Halves {
     key: Key,
     build: u32,
@@ -56,7 +57,7 @@ impl Slots for Halves {
 }
 
 impl Page {
-    /// Listens at `address`; takes firmware if there is the public half of the key that signs it.
+    /// Listens at `address`; accepts firmware if `key`, the public key of its signature, is given.
     pub(crate) fn open(address: SocketAddrV4, key: Option<Key>) -> Result<Self> {
         let listener = TcpListener::bind(address)
             .with_context(|| format!("bridge: cannot show its page at {address}; is it in use?"))?;
@@ -69,7 +70,7 @@ impl Page {
         self.listener.local_addr()
     }
 
-    /// Serves whoever is there; returns true if the bridge shall restart, with a new firmware.
+    /// Serves the current visitor. Returns true if the bridge must restart with new firmware.
     pub(crate) fn turn(&mut self, bridge: &mut Bridge, at: HostTime, now: Instant) -> bool {
         if self.visitor.is_none()
             && let Ok((stream, _)) = self.listener.accept()
@@ -86,7 +87,7 @@ impl Page {
         restart
     }
 
-    /// Returns what to wait for.
+    /// Returns the file descriptor to wait for.
     pub(crate) fn fd(&self) -> BorrowedFd<'_> {
         self.visitor.as_ref().map_or(self.listener.as_fd(), |visitor| visitor.stream.as_fd())
     }
@@ -105,7 +106,7 @@ impl Visitor {
         }
     }
 
-    /// Returns false once it is done with.
+    /// Serves the visitor; returns false if the connection can be closed.
     fn turn(
         &mut self,
         halves: &mut Option<Halves>,
@@ -116,7 +117,7 @@ impl Visitor {
         let mut bytes = [0; 2048];
         loop {
             match self.stream.read(&mut bytes) {
-                // Nothing more comes: whole or not, that was it.
+                // The peer has closed its side: the request is complete or broken.
                 Ok(0) if self.answered || self.answer.is_none() => return false,
                 Ok(0) => break,
                 Ok(len) => {
@@ -141,14 +142,14 @@ impl Visitor {
             }
             if answer.is_empty() {
                 self.answered = true;
-                // Whoever still sends reads the answer only after that.
+                // The peer may read the reply only after it has sent everything.
                 let _ = self.stream.shutdown(std::net::Shutdown::Write);
             }
         }
         now.saturating_duration_since(self.heard_at) < PATIENCE
     }
 
-    /// Takes bytes; returns the answer once there is one.
+    /// Adds received bytes; returns the reply once the request is complete.
     fn take(
         &mut self,
         halves: &mut Option<Halves>,
@@ -164,7 +165,7 @@ impl Visitor {
                 Progress::Firmware(from) => from,
             };
             let Some(halves) = halves else {
-                return Some(refuse("this bridge takes no firmware: no --firmware-key was given"));
+                return Some(refuse("this bridge accepts no firmware: started without --firmware-key"));
             };
             let wanted = Wanted { target: Target::Host, build: halves.build, key: halves.key };
             self.updater = Some(Updater::new(wanted));
@@ -186,7 +187,7 @@ impl Visitor {
     }
 }
 
-/// Does what a request asks for; returns the answer.
+/// Executes a request; returns the reply.
 fn answer(bridge: &mut Bridge, at: HostTime, request: &Request) -> Vec<u8> {
     let done = page::act(bridge, at, request);
     let (mut part, mut whole) = (page::Response::new(), Vec::new());
@@ -208,7 +209,7 @@ fn refuse(why: &str) -> Vec<u8> {
     answer_firmware(Err(why))
 }
 
-/// A browser that is silent for so long must not keep others out.
+/// Timeout of a silent browser; it must not block others.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Half of an ESP32-C3's flash of 4 MB, less what else is in it. [bytes]
+/// Half of the 4 MB flash of an ESP32-C3, without its other partitions. [bytes]
 const HALF: usize = 1536 * 1024;

@@ -1,5 +1,5 @@
-//! The autopilot's port of an emulated bridge: a serial device, or a pseudo-terminal that passes
-//! bytes no faster, and no sooner, than a line of its baud rate would.
+//! Serial port of the autopilot for an emulated bridge: a device, or a pseudo-terminal with the
+//! timing of a line at its baud rate.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
@@ -16,12 +16,12 @@ use nix::sys::termios::{SetArg, cfmakeraw, cfsetspeed, tcgetattr, tcsetattr};
 use nix::unistd::ttyname;
 use vizflyt_simulator::link::serial::baud_rate;
 
-/// Where the autopilot is.
+/// Location of the autopilot's port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Uart {
-    /// A new pseudo-terminal, with a symbolic link to it if wanted.
+    /// New pseudo-terminal, with an optional symbolic link to it.
     Pty(Option<PathBuf>),
-    /// A device.
+    /// Serial device.
     Device(PathBuf),
 }
 
@@ -37,26 +37,25 @@ impl FromStr for Uart {
     }
 }
 
-/// Bytes that come out of the line at once: what an ESP's UART gathers before it interrupts.
+/// Bytes that arrive at once: an ESP's UART collects this many before an interrupt. [bytes]
 const CHUNK: usize = 64;
-/// Bits on the line per byte: start, eight, stop.
+/// Bits on the line per byte: start bit, eight data bits, stop bit.
 const BITS_PER_BYTE: u64 = 10;
-/// A line that was busy until this long ago goes on without a gap: our own waking up late is not
-/// the line's doing.
+/// A line that was busy until this long ago continues without a gap: a late wake-up of this process
+/// is not a gap of the line.
 const GAP: Duration = Duration::from_millis(2);
 
-/// An open port.
 pub(crate) struct Port {
     line: File,
     path: PathBuf,
-    /// Ours to keep open, so that a client that leaves does not hang up the line.
+    /// Kept open, so that a client that disconnects does not hang up the line.
     _kept: Option<OwnedFd>,
     link: Option<(PathBuf, PathBuf)>,
-    /// Time of a byte on the line; zero where the device itself takes it.
+    /// Duration of a byte on the line; zero if the device itself has the timing.
     byte: Duration,
     incoming: [u8; CHUNK],
     came: usize,
-    /// The line's end of the last chunk.
+    /// End of the last chunk on the line.
     in_until: Instant,
     in_full: bool,
     outgoing: Vec<u8>,
@@ -64,7 +63,7 @@ pub(crate) struct Port {
 }
 
 impl Port {
-    /// Opens it.
+    /// Opens the port.
     pub(crate) fn open(uart: &Uart, baud: u32) -> Result<Self> {
         match uart {
             Uart::Pty(link) => Self::make(link.as_deref(), baud),
@@ -129,31 +128,31 @@ impl Port {
         }
     }
 
-    /// Returns the device that the autopilot's end is.
+    /// Returns the device path of the autopilot's end.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns what to wait on for input.
+    /// Returns the file descriptor to wait for.
     pub(crate) fn as_fd(&self) -> BorrowedFd<'_> {
         self.line.as_fd()
     }
 
-    /// Whether it is of use to wait for bytes: none is on the line already.
+    /// Whether to wait for input: no bytes are on the line.
     pub(crate) fn wants_input(&self) -> bool {
         self.came == 0
     }
 
-    /// Returns when the line's own time is up: a chunk is in, or a packet is out.
+    /// Returns when the line finishes its current chunk or packet.
     pub(crate) fn due(&self) -> Option<Instant> {
         let arriving = (self.came > 0).then_some(self.in_until);
         let leaving = (!self.outgoing.is_empty()).then_some(self.out_until);
         [arriving, leaving].into_iter().flatten().min()
     }
 
-    /// Hands what the line has carried by `now` to `sink`.
+    /// Passes the bytes that the line has carried by `now` to `sink`.
     pub(crate) fn receive(&mut self, now: Instant, mut sink: impl FnMut(&[u8])) -> Result<()> {
-        // A flood must not stop the rest.
+        // Bounded, so that a flood does not starve other work.
         for _ in 0..64 {
             if self.came == 0 {
                 match self.line.read(&mut self.incoming) {
@@ -183,8 +182,8 @@ impl Port {
         Ok(())
     }
 
-    /// Lets a packet that the line has carried by `now` out; returns whether it takes the next one.
-    /// A line without flow control loses what nobody reads.
+    /// Releases a packet that the line has carried by `now`; returns whether the line is free.
+    /// Without flow control, unread bytes are lost.
     pub(crate) fn is_free(&mut self, now: Instant) -> Result<bool> {
         if !self.outgoing.is_empty() {
             if self.out_until > now {
@@ -204,7 +203,7 @@ impl Port {
         Ok(true)
     }
 
-    /// Puts a packet on the free line.
+    /// Puts a packet on the line, which must be free.
     pub(crate) fn send(&mut self, now: Instant, packet: &[u8]) {
         let goes_on = now.duration_since(self.out_until) < GAP / 10;
         let from = if goes_on { self.out_until } else { now };
@@ -215,7 +214,7 @@ impl Port {
 
 impl Drop for Port {
     fn drop(&mut self) {
-        // Only if it is still ours: another bridge may have taken the name over.
+        // Removed only if the link still points here: another bridge may use the name.
         if let Some((link, target)) = &self.link
             && std::fs::read_link(link).is_ok_and(|found| found == *target)
         {
@@ -224,13 +223,13 @@ impl Drop for Port {
     }
 }
 
-/// Lets every byte through as it is.
+/// Sets the line to raw mode, so that every byte passes unchanged.
 fn raw(line: &impl AsFd, baud: Option<u32>) -> Result<()> {
     let mut settings = tcgetattr(line)?;
     cfmakeraw(&mut settings);
     if let Some(baud) = baud {
         let speed =
-            baud_rate(baud).with_context(|| format!("{baud} baud is no rate of this system"))?;
+            baud_rate(baud).with_context(|| format!("{baud} baud is not supported by this system"))?;
         cfsetspeed(&mut settings, speed)?;
     }
     tcsetattr(line, SetArg::TCSANOW, &settings)?;
@@ -242,7 +241,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn uarts_are_read() {
+    fn parses_uarts() {
         let check = |text: &str, expected: Uart| assert_eq!(text.parse(), Ok(expected), "{text}");
         check("pty", Uart::Pty(None));
         check("pty:/tmp/uart", Uart::Pty(Some("/tmp/uart".into())));
@@ -250,9 +249,9 @@ mod tests {
         check("ptyx", Uart::Device("ptyx".into()));
     }
 
-    /// On a clock of the test's own: what a line of 57600 baud carries, and when.
+    /// On a simulated clock: the bytes that a line of 57600 baud carries, and when.
     #[test]
-    fn bytes_take_their_time_on_the_line() {
+    fn has_the_timing_of_a_serial_line() {
         let mut port = Port::open(&Uart::Pty(None), 57_600).unwrap();
         let mut autopilot = OpenOptions::new().read(true).write(true).open(port.path()).unwrap();
         autopilot.write_all(&[7; 100]).unwrap();
@@ -268,7 +267,7 @@ mod tests {
             .unwrap();
         }
         assert_eq!(received, 100);
-        // 64 bytes are 11.1 ms, the other 36 are 6.25 ms more.
+        // 64 bytes take 11.1 ms, the other 36 another 6.25 ms.
         assert_eq!(arrivals, [(112, 64), (174, 36)]);
 
         assert!(port.is_free(start).unwrap());

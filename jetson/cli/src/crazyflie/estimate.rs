@@ -1,9 +1,10 @@
-//! A Crazyflie's estimate as it comes over its radio, as a pose packet of ours. No radio here.
+//! Conversion of a Crazyflie's estimate, as received over its radio, to a pose packet. Does not
+//! need a radio.
 
 use serde_json::{Value, json};
 
-/// Returns a pose packet of one record of the log: x, y, z \[mm\] and the packed quaternion of
-/// `stateEstimateZ`, as numbers.
+/// Returns the pose packet of one log record: x, y, z \[mm\] and the packed quaternion of
+/// `stateEstimateZ`.
 pub(crate) fn pose_packet(object: &str, seq: u64, at_ms: u32, [x, y, z, q]: [f64; 4]) -> Value {
     json!({
         "vizflyt_pose": 1,
@@ -16,10 +17,11 @@ pub(crate) fn pose_packet(object: &str, seq: u64, at_ms: u32, [x, y, z, q]: [f64
     })
 }
 
-/// Returns x, y, z, w of the firmware's 32 bits (`quatcompress.h`): the index of the largest, which is
-/// positive, then of each of the others its sign and 9 bits of its size.
+/// Returns x, y, z, w from the firmware's 32 bits (`quatcompress.h`): the index of the largest
+/// component, which is positive, then for each other component its sign and 9 bits of its
+/// magnitude.
 ///
-/// Exact to 0.002, or 0.2 degrees.
+/// Accurate to 0.002, or 0.2 degrees.
 fn unpacked(mut bits: u32) -> [f64; 4] {
     let largest = (bits >> 30) as usize;
     let mut q = [0.0; 4];
@@ -38,7 +40,7 @@ fn unpacked(mut bits: u32) -> [f64; 4] {
 mod tests {
     use super::*;
 
-    /// The firmware's own compression, from its description.
+    /// The firmware's compression, from its description.
     fn packed(q: [f64; 4]) -> u32 {
         let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap();
         let negate = q[largest] < 0.0;
@@ -50,7 +52,7 @@ mod tests {
     }
 
     #[test]
-    fn quaternions_come_back() {
+    fn unpacks_quaternions() {
         let halves = [[0.5, -0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0], [-0.1, 0.7, -0.3, 0.2]];
         for q in halves {
             let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -62,7 +64,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_is_a_pose_that_the_server_reads() {
+    fn makes_a_pose_packet_that_the_server_parses() {
         let q = [0.0, 0.0, 0.6, 0.8];
         let record = [1500.0, -250.0, 1020.0, f64::from(packed(q))];
         let text = pose_packet("bee", 7, 1234, record).to_string();

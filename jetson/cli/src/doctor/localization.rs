@@ -1,4 +1,5 @@
-//! `vizflyt doctor localization`: the pose in plain words, and the check by hand.
+//! `vizflyt doctor localization`: prints the pose in words, and checks it while the vehicle is
+//! moved by hand.
 
 mod delay;
 mod gyro;
@@ -21,34 +22,35 @@ use self::delay::{Delay, DelayMeter, NoDelay};
 use self::gyro::Gyro;
 use crate::vehicle::AutopilotArgs;
 
-/// What is looked at.
 #[derive(Args, Debug)]
 pub(crate) struct LocalizationArgs {
-    /// arena.toml, or its folder: its [[localization]] is checked
+    /// arena.toml or its folder; its [[localization]] is checked
     arena: Option<PathBuf>,
-    /// The source that is checked, as for `vizflyt serve`
+    /// Source to check, as for `vizflyt serve`
     #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", value_parser = LocalizationConfig::parse)]
     pose: Option<LocalizationConfig>,
-    /// The vehicle
+    /// Name of the vehicle
     #[arg(long, value_name = "NAME", default_value = "vizflyt")]
     vehicle: String,
-    /// The vehicle's autopilot: by its gyroscope the source's delay is measured, `latency_ms`. As for
-    /// `vizflyt doctor vehicle`
+    /// Autopilot whose gyroscope measures the delay of the source, `latency_ms`
+    ///
+    /// Address as for `vizflyt doctor vehicle`.
     #[arg(long, value_name = "ADDRESS", conflicts_with = "watch")]
     mavlink: Option<MavlinkAddress>,
-    /// The settings of the autopilot's link
+    /// File with the settings of the autopilot's link
+    ///
     /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
     #[arg(long, value_name = "FILE", requires = "mavlink")]
     config: Option<PathBuf>,
-    /// Only prints the pose, until Ctrl-C
+    /// Only print the pose, until Ctrl-C
     #[arg(long)]
     watch: bool,
-    /// Gives up after so long
+    /// Timeout of the check
     #[arg(long, value_name = "SECONDS", default_value_t = 180.0)]
     within: f64,
 }
 
-/// Runs the check.
+/// Runs `vizflyt doctor localization`.
 pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
     let config = args.source()?;
     let mut opened = drivers::open(std::slice::from_ref(&config))?;
@@ -98,10 +100,10 @@ pub(super) fn run(args: &LocalizationArgs) -> Result<ExitCode> {
             counters.bad_packets
         );
     }
-    bail!("the check was not done within {:.0} s; --within gives more time", args.within)
+    bail!("timeout: the check was not completed within {:.0} s; use a longer --within", args.within)
 }
 
-/// Waits for a pose, a tenth of a second at most; tells what is odd, and gives the delay's meter its share.
+/// Waits for a pose for at most 0.1 s, prints warnings, and passes data to the delay meter.
 fn receive(source: &mut dyn PoseSource, gyro: Option<&mut Vehicle>) -> Option<Measurement> {
     let measured = source.receive(Duration::from_millis(100)).last().copied();
     while let Some(warning) = source.next_warning() {
@@ -110,7 +112,7 @@ fn receive(source: &mut dyn PoseSource, gyro: Option<&mut Vehicle>) -> Option<Me
     if let Some(vehicle) = gyro {
         let heard = vehicle.gyro.take();
         if heard.is_connected && !std::mem::replace(&mut vehicle.was_connected, true) {
-            print_line("vehicle  its autopilot's heartbeats come");
+            print_line("vehicle  heartbeats of its autopilot received");
         }
         vehicle.clock_off_ms = heard.clock_off_ms;
         if heard.began_anew {
@@ -127,17 +129,17 @@ fn receive(source: &mut dyn PoseSource, gyro: Option<&mut Vehicle>) -> Option<Me
     measured
 }
 
-/// The vehicle's gyroscope, and what is made of it.
+/// Gyroscope of the vehicle, and the delay meter.
 struct Vehicle {
     gyro: Gyro,
     meter: DelayMeter,
     was_connected: bool,
-    /// How far the gyroscope's times may be off. [ms]
+    /// Error bound of the gyroscope's times. [ms]
     clock_off_ms: Option<f64>,
 }
 
-/// Returns the delay by which poses come beyond what is set; where the motions were too gentle, after some
-/// quicker ones.
+/// Returns the delay of the poses in addition to the configured one. If the motions were too
+/// gentle, requests quicker ones.
 fn measure_delay(
     config: &LocalizationConfig,
     diagnosis: &Diagnosis,
@@ -146,13 +148,13 @@ fn measure_delay(
 ) -> Result<(Delay, Option<f64>), String> {
     if diagnosis.change.iter().any(|(key, _)| *key == "euler") {
         return Err(
-            "its angles must be read rightly first: set `euler`, and do it again".to_owned()
+            "the delay needs correct angles: set `euler`, and repeat the check".to_owned()
         );
     }
     let mut found = vehicle.meter.delay();
     if found == Err(NoDelay::Gentle) {
         print_line(format!(
-            "do       turn it left and right by a quarter turn, quickly, for {:.0} seconds",
+            "do       turn the vehicle left and right by a quarter turn, quickly, for {:.0} seconds",
             SHAKE.as_secs_f64()
         ));
         let end = Instant::now() + SHAKE;
@@ -164,24 +166,25 @@ fn measure_delay(
     match found {
         Ok(delay) => Ok((delay, vehicle.clock_off_ms)),
         Err(NoDelay::Gentle) => {
-            Err("it was turned too gently for the noise of its poses; do it again, quicker"
+            Err("the turns were too slow for the noise of the poses; repeat them, faster"
                 .to_owned())
         }
         Err(NoDelay::Unlike) => Err(format!(
-            "poses and gyroscope turned otherwise: is it '{}' whose autopilot that is, and is the delay \
-             less than half a second?",
+            "poses and gyroscope do not show the same motion; check that the autopilot belongs to '{}', and that \
+             the delay is less than 0.5 s",
             config.objects.values().next().map_or("the vehicle", String::as_str)
         )),
         Err(NoDelay::Silent) if !vehicle.was_connected => {
-            Err("no heartbeat of an autopilot came; check power, link and address".to_owned())
+            Err("received no heartbeat of an autopilot; check power, link and address".to_owned())
         }
         Err(NoDelay::Silent) => {
-            Err("the autopilot's gyroscope was not heard throughout; look at its link".to_owned())
+            Err("gaps in the data of the autopilot's gyroscope; check its link".to_owned())
         }
     }
 }
 
-/// A delay beyond what is set, and how far the gyroscope's times may be off [ms]; or why there is none.
+/// Delay in addition to the configured one, and error bound of the gyroscope's times [ms]; or why
+/// it was not measured.
 type Measured = Result<(Delay, Option<f64>), String>;
 
 fn report(
@@ -203,31 +206,31 @@ fn report(
     }
     if !diagnosis.others.is_empty() {
         print_line(
-            "each of these explains all that was seen: set one, and do it again with the vehicle looking \
-             another way",
+            "each of these settings explains all motions: set one, and repeat the check with another heading \
+             of the vehicle",
         );
     }
     match delay {
         None => print_line(
             "note     the delay of the poses was not measured: power the vehicle, and add --mavlink \
-             udpin:0.0.0.0:14550, or where its autopilot is",
+             udpin:0.0.0.0:14550, or the autopilot's address",
         ),
         Some(Err(why)) => print_line(format!("note     the delay was not measured: {why}")),
         Some(Ok(_)) => {}
     }
     if is_laid_right {
-        print_line("right    axes, units and turns are as they must be");
+        print_line("right    axes, units and turns are correct");
     } else if !explained {
         print_line(
             "no setting explains all of it: do it again, one motion at a time, straight up, straight \
-             towards the nose, a quarter turn to the left; then look whether the object's axes were laid \
+             towards the nose, a quarter turn to the left; then check that the object's axes were laid \
              along the vehicle's when it was made",
         );
     }
     if diagnosis.faults.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Prints what to set: one line for each key, and all of them for the command line.
+/// Prints the settings to change: one line for each key, and all of them as a command line.
 fn print_change(word: &str, config: &LocalizationConfig, change: &Change) {
     if change.is_empty() {
         return;
@@ -245,7 +248,7 @@ fn print_change(word: &str, config: &LocalizationConfig, change: &Change) {
     ));
 }
 
-/// Says what the delay is, and adds what to set.
+/// Prints the delay, and adds the settings to change.
 fn judge_delay(
     config: &LocalizationConfig,
     delay: &Delay,
@@ -255,7 +258,7 @@ fn judge_delay(
     let uncertain_ms = delay.uncertain_ms + clock_off_ms.unwrap_or(0.0);
     let link = match clock_off_ms {
         Some(_) => "",
-        None => ", and more by what the autopilot's link takes, which answers no TIMESYNC",
+        None => ", plus the unknown delay of the autopilot's link: it does not reply to TIMESYNC",
     };
     let total_ms = config.latency_ms + delay.ms;
     print_line(format!(
@@ -271,7 +274,7 @@ fn judge_delay(
         return;
     }
     diagnosis.faults.push(format!(
-        "poses are {:.0} ms {} than their stamps say",
+        "poses are {:.0} ms {} than their stamps",
         delay.ms.abs(),
         if delay.ms > 0.0 { "older" } else { "younger" }
     ));
@@ -281,7 +284,7 @@ fn judge_delay(
 }
 
 impl LocalizationArgs {
-    /// Opens the way to the vehicle's gyroscope, if one was named.
+    /// Opens the connection to the vehicle's gyroscope, if --mavlink is given.
     fn gyro(&self) -> Result<Option<Vehicle>> {
         let Some(mavlink) = &self.mavlink else { return Ok(None) };
         let (address, settings) = AutopilotArgs::at(mavlink.clone(), self.config.clone()).link()?;
@@ -291,7 +294,7 @@ impl LocalizationArgs {
         Ok(Some(Vehicle { gyro, meter, was_connected: false, clock_off_ms: None }))
     }
 
-    /// Returns the source: that of the command line, else the arena's first, else Vicon.
+    /// Returns the source of the command line, or the first of the arena, or Vicon.
     fn source(&self) -> Result<LocalizationConfig> {
         if let Some(config) = &self.pose {
             return Ok(config.clone());
@@ -300,7 +303,7 @@ impl LocalizationArgs {
         let sources = settings::of_arena(arena)?;
         if sources.len() > 1 {
             print_line(format!(
-                "note     the first of {} sources is checked; --pose names another",
+                "note     the first of {} sources is checked; select another with --pose",
                 sources.len()
             ));
         }
@@ -308,11 +311,11 @@ impl LocalizationArgs {
     }
 }
 
-/// So long is it shaken.
+/// Duration of the quick turns.
 const SHAKE: Duration = Duration::from_secs(6);
-/// A smaller error of `latency_ms` is lost in the rest: 5 mm at 1 m/s. [ms]
+/// Smaller errors of `latency_ms` are negligible: 5 mm at 1 m/s. [ms]
 const DELAY_MATTERS_MS: f64 = 5.0;
-/// The greatest `latency_ms`. [ms]
+/// Maximum of `latency_ms`. [ms]
 const MAX_LATENCY_MS: f64 = 500.0;
-/// Period of the printed poses: often enough to follow, slow enough to read.
+/// Period of the printed poses: frequent enough to follow, slow enough to read.
 const PRINT_PERIOD: Duration = Duration::from_secs(1);

@@ -1,5 +1,5 @@
-//! `vizflyt fly PLUGIN`: the same command in the simulated lab and in the real one. Which of the two
-//! it is, one line reports before anything is armed.
+//! `vizflyt fly PLUGIN`: the same command for the simulated and the real lab. One line prints which
+//! lab it is before the vehicle is armed.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -13,19 +13,20 @@ use vizflyt_server::scene::BareArgs;
 
 use crate::lab::{self, LabArgs, LabFlight};
 
-/// Flies a plugin: in the simulated lab, or in the real one if `jetson.toml` or --server names a
-/// render server.
+/// Fly a plugin in the simulated lab, or in the real one if it is configured
+///
+/// The real lab is used if `jetson.toml` or --server names a render server.
 ///
 /// PLUGIN is a folder made by `vizflyt new`, a `.py` file, a Cargo project, a program, or the name
 /// of a built-in (avoid, race).
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
-  vizflyt new first && vizflyt fly first                   your own plugin in the simulated lab
-  vizflyt fly first --watch                                a saved file takes over in flight
-  vizflyt fly race --scene race --seed 3                   a built-in example, another scene
+  vizflyt new first && vizflyt fly first                   a new plugin in the simulated lab
+  vizflyt fly first --watch                                reload the plugin in flight when a file is saved
+  vizflyt fly race --scene race --seed 3                   a built-in plugin in another scene
   vizflyt fly first --headless --seconds 20 --report r.json
-                                                           figures; status 0 if finished or landed
-  vizflyt fly --attach                                     waits for `python my_plugin.py` or a debugger
+                                                           results as JSON; status 0 if finished or landed
+  vizflyt fly --attach                                     wait for `python my_plugin.py` or a debugger
   vizflyt fly first --server 192.168.10.2:4433 --mavlink udpin:0.0.0.0:14550
                                                            the real lab
 
@@ -34,23 +35,23 @@ Options that are not given come from jetson.toml.")]
 pub(crate) struct FlyArgs {
     #[command(flatten)]
     runtime: vizflyt_runtime::FlyArgs,
-    /// Starts the plugin again whenever one of its files is saved; the vehicle holds meanwhile.
+    /// Restart the plugin when one of its files is saved; the vehicle holds meanwhile
     #[arg(long, conflicts_with = "attach")]
     watch: bool,
-    /// Flies the simulated lab even where jetson.toml names a real one.
+    /// Fly in the simulated lab even if jetson.toml names a real one
     #[arg(long, conflicts_with = "at")]
     sim: bool,
     #[command(flatten, next_help_heading = "The simulated lab")]
     lab: LabArgs,
 }
 
-/// Flies; success only if the flight finished or landed as asked.
+/// Flies; returns success only if the flight finished, or landed as commanded.
 pub(crate) fn run(mut args: FlyArgs, log_level: &str) -> Result<ExitCode> {
     let file = args.runtime.settle()?;
     let name = args.runtime.plugin.clone().unwrap_or_default();
     let plugin = if args.runtime.attach { None } else { Some(Plugin::find(&name)?) };
     let plugin = plugin.as_ref();
-    // The parent has reported which lab it is.
+    // In a child process the parent has already printed which lab it is.
     if args.runtime.server.at.is_some() && !args.sim {
         fly_real(&args, plugin, file.as_deref())
     } else {
@@ -71,7 +72,7 @@ fn fly_real(args: &FlyArgs, plugin: Option<&Plugin>, file: Option<&Path>) -> Res
     let limits = runtime.jetson.plugin.limits();
     let mut command = plugin.map_or(Ok(Vec::new()), |plugin| plugin.command(&limits))?;
     command.extend(runtime.plugin_arguments.iter().cloned());
-    // The parent has reported which lab it is.
+    // In a child process the parent has already printed which lab it is.
     if !runtime.lifeline {
         let server = runtime.server.address()?;
         let from = file.map_or("the command line".into(), |file| file.display().to_string());
@@ -100,7 +101,7 @@ fn fly_simulated(
     log_level: &str,
 ) -> Result<ExitCode> {
     let runtime = &args.runtime;
-    // By the command line only: the file may well name the vehicle of another day.
+    // Only options of the command line are rejected: jetson.toml may describe the real vehicle.
     for (given, option) in [
         (runtime.server.fingerprint.is_some() && !args.sim, "--fingerprint"),
         (runtime.server.keys.is_some() && !args.sim, "--keys"),
@@ -114,7 +115,8 @@ fn fly_simulated(
             );
         }
     }
-    // What is built here is not built again behind the server's back.
+    // Build the plugin here, so that the child process does not build it after the server has
+    // started.
     plugin.map(|plugin| plugin.command(&runtime.jetson.plugin.limits())).transpose()?;
     if let Some(lab) = plugin.and_then(Plugin::lab) {
         if args.lab.scene.is_none() && args.lab.project.is_none() {
@@ -163,7 +165,7 @@ fn fly_simulated(
     Ok(if report.outcome.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// The line that reports which of the two labs it is.
+/// Prints which of the two labs is used.
 fn print_lab(json: bool, which: &str, what: &str) {
     if json {
         print_line(json!({"lab": which, "text": what}));

@@ -1,5 +1,5 @@
-//! One child process of the simulated lab: the same binary with another subcommand, its standard output
-//! read as JSON lines, its life bound to ours by the pipe on its standard input.
+//! A child process of the simulated lab: this program with another subcommand. Its standard output
+//! is read as JSON lines. The pipe to its standard input ends it when the parent ends.
 
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader};
@@ -12,23 +12,23 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 
-/// Which child speaks.
+/// Which child process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
-    /// `vizflyt serve`.
+    /// `vizflyt serve`
     Server,
-    /// `vizflyt fly`.
+    /// `vizflyt fly`
     Runtime,
-    /// `vizflyt sim`.
+    /// `vizflyt sim`
     Simulator,
-    /// `vizflyt bridge emulate`.
+    /// `vizflyt bridge emulate`
     Bridge,
-    /// `vizflyt tags locate`.
+    /// `vizflyt tags locate`
     Tags,
 }
 
 impl Role {
-    /// The child's name for people.
+    /// Returns the child's name for messages.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Server => "render server",
@@ -40,27 +40,26 @@ impl Role {
     }
 }
 
-/// What the one loop waits for.
+/// Message to the main loop.
 #[derive(Debug)]
 pub(crate) enum Notice {
     /// A child printed a JSON line.
     Line(Role, Value),
     /// A child closed its standard output: it has ended or is about to.
     Closed(Role),
-    /// A person asked for the end.
+    /// The user pressed Ctrl-C.
     Interrupted,
 }
 
-/// A running child.
 pub(crate) struct Child {
     role: Role,
     process: Process,
-    /// Closing this is the child's sign to end; the kernel closes it if we die.
+    /// The child ends when this pipe is closed; the kernel closes it if the parent dies.
     lifeline: Option<ChildStdin>,
 }
 
 impl Child {
-    /// Starts `vizflyt ARGS`; its lines and its end arrive at `notices`.
+    /// Starts `vizflyt ARGS`. The child's lines and its end are sent to `notices`.
     pub(crate) fn start(role: Role, args: &[OsString], notices: &Sender<Notice>) -> Result<Self> {
         let program = std::env::current_exe().context("cannot find this program's own path")?;
         let mut process = Command::new(program)
@@ -75,7 +74,7 @@ impl Child {
             std::thread::spawn(move || {
                 for line in BufReader::new(stdout).lines().map_while(Result::ok) {
                     if let Ok(value) = serde_json::from_str(&line) {
-                        // It may all have ended; then nobody needs the line.
+                        // The receiver may have ended; then the line is not needed.
                         drop(notices.send(Notice::Line(role, value)));
                     } else {
                         tracing::warn!("{} printed: {line}", role.name());
@@ -87,11 +86,11 @@ impl Child {
         Ok(Self { role, process, lifeline })
     }
 
-    /// Asks the child to end: signal and lifeline both.
+    /// Requests the child's end by signal and by closing the lifeline.
     pub(crate) fn ask_to_end(&mut self) {
         self.lifeline = None;
         if let Ok(None) = self.process.try_wait() {
-            // The child was alive a moment ago and is not reaped, so the pid is still its own.
+            // The child has not been reaped, so the pid still belongs to it.
             let _ = kill(Pid::from_raw(self.process.id() as i32), Signal::SIGTERM);
         }
     }
@@ -105,7 +104,7 @@ impl Child {
                     std::thread::sleep(Duration::from_millis(10));
                 }
                 Ok(None) => {
-                    tracing::warn!("the {} did not end in time and is killed", self.role.name());
+                    tracing::warn!("the {} did not end in time; killed it", self.role.name());
                     let _ = self.process.kill();
                     return self.process.wait().ok();
                 }

@@ -1,11 +1,12 @@
-//! What the children report, in the order in which it comes, and how many of them may still report something.
+//! Messages of the children in the order of arrival, and the number of children that may still send
+//! some.
 
 use std::sync::mpsc::{Receiver, RecvError, RecvTimeoutError};
 use std::time::Duration;
 
 use super::child::Notice;
 
-/// The one place where notices are received.
+/// Receiver of all notices.
 #[derive(Debug)]
 pub(super) struct Inbox {
     notices: Receiver<Notice>,
@@ -13,17 +14,17 @@ pub(super) struct Inbox {
 }
 
 impl Inbox {
-    /// Makes the inbox of children that are still to be started.
+    /// Returns an inbox for children that are started later.
     pub(super) fn new(notices: Receiver<Notice>) -> Self {
         Self { notices, open: 0 }
     }
 
-    /// Notes that a child was started.
+    /// Counts a started child.
     pub(super) fn child_started(&mut self) {
         self.open += 1;
     }
 
-    /// Returns the number of children whose standard output is open, as far as notices have been received.
+    /// Returns the number of children with open standard output, according to the received notices.
     pub(super) fn open(&self) -> usize {
         self.open
     }
@@ -55,7 +56,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_child_that_closed_during_the_flight_is_not_waited_for_at_its_end() {
+    fn does_not_wait_for_a_child_that_closed_during_the_flight() {
         let (notices, receiver) = mpsc::channel();
         let mut inbox = Inbox::new(receiver);
         for _ in 0..2 {

@@ -1,5 +1,5 @@
-//! Pairs the simulated lab's server and runtime: the same files that pairing by hand writes, in a folder that
-//! ends with the flight.
+//! Pairs the server and runtime of the simulated lab: writes the same files as `vizflyt pair`, in a
+//! folder that is deleted after the flight.
 
 use std::ffi::OsString;
 use std::fs::Permissions;
@@ -9,7 +9,7 @@ use anyhow::{Context, Result};
 use tempfile::TempDir;
 use vizflyt_trust::{Client, Identity, KeysFolder, KnownServer, Owner, Paired, Role, Servers};
 
-/// The folder and who is in it.
+/// Folder of keys.
 pub(crate) struct Keys {
     folder: KeysFolder,
     server: Identity,
@@ -17,13 +17,13 @@ pub(crate) struct Keys {
 }
 
 impl Keys {
-    /// Makes both identities, and gives the runtime the vehicle.
+    /// Creates both identities, and gives the runtime the right to fly the vehicle.
     pub(crate) fn make() -> Result<Self> {
         let scratch = tempfile::Builder::new()
             .prefix("vizflyt-keys-")
             .permissions(Permissions::from_mode(0o700))
             .tempdir()
-            .context("cannot make a folder for its keys")?;
+            .context("cannot create a temporary folder for keys")?;
         let folder = KeysFolder::open(Some(&scratch.path().join("keys")))?;
         let server = Identity::load_or_create(&folder, Owner::Server)?;
         let runtime = Identity::load_or_create(&folder, Owner::Runtime)?;
@@ -37,14 +37,14 @@ impl Keys {
         Ok(Self { folder, server, scratch })
     }
 
-    /// Returns the option that gives a child this folder.
+    /// Returns the option that passes this folder to a child.
     pub(crate) fn option(&self) -> OsString {
         let mut option = OsString::from("--keys=");
         option.push(self.scratch.path().join("keys"));
         option
     }
 
-    /// Notes the server's address for the runtime, once it is known.
+    /// Stores the server's address for the runtime.
     pub(crate) fn note_server(&self, address: &str) -> Result<()> {
         let fingerprint = self.server.fingerprint();
         Servers::add(&self.folder, KnownServer { address: address.to_owned(), fingerprint })?;
@@ -52,5 +52,5 @@ impl Keys {
     }
 }
 
-/// The default name of the vehicle, for server and runtime.
+/// Default name of the vehicle on server and runtime.
 const VEHICLE: &str = "vizflyt";

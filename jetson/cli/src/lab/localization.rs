@@ -1,4 +1,4 @@
-//! How the simulated lab localizes its vehicle, as arguments for those who take part.
+//! Localization of the vehicle in the simulated lab, as arguments for the child processes.
 
 use std::ffi::OsString;
 use std::net::UdpSocket;
@@ -8,29 +8,29 @@ use clap::ValueEnum;
 use glam::DVec3;
 use vizflyt_tags::print::Pad;
 
-/// Where the server's poses come from.
+/// Source of the server's poses.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Localization {
-    /// Vicon Tracker's UDP object stream.
+    /// Vicon Tracker's UDP object stream
     #[default]
     Vicon,
-    /// OptiTrack Motive's NatNet, y up.
+    /// OptiTrack Motive's NatNet, y up
     Natnet,
-    /// VizFlyt's own JSON packets.
+    /// VizFlyt's JSON pose packets
     Json,
-    /// AprilTags on the vehicle, in the images of two simulated webcams.
+    /// AprilTags on the vehicle, seen by two simulated webcams in the room
     Tags,
-    /// A mat of AprilTags on the floor, in the images of one simulated webcam under the vehicle.
+    /// AprilTags on the floor, seen by one simulated webcam under the vehicle
     Mat,
 }
 
 impl Localization {
-    /// Whether AprilTags are all there is.
+    /// Whether AprilTags are the only localization.
     pub(crate) fn is_by_tags(self) -> bool {
         matches!(self, Self::Tags | Self::Mat)
     }
 
-    /// Refuses a fence that reaches beyond where the vehicle can be seen, or sees. [m, world]
+    /// Rejects a fence that is larger than the area with tag localization. [m, world]
     pub(crate) fn check(self, fence_m: (DVec3, DVec3)) -> Result<()> {
         let (least_m, most_m) = fence_m;
         let seen =
@@ -43,7 +43,7 @@ impl Localization {
         if !seen {
             let size_m = most_m - least_m;
             bail!(
-                "{why}, and this scene is flown in {:.0} x {:.0} m; take --scene room or race",
+                "{why}, and the fence of this scene is {:.0} x {:.0} m; use --scene room or race",
                 size_m.x,
                 size_m.y
             );
@@ -51,7 +51,7 @@ impl Localization {
         Ok(())
     }
 
-    /// Returns the server's option: it reports the address that it got.
+    /// Returns the server's option. With port 0 the server prints the chosen address.
     pub(crate) fn of_server(self) -> OsString {
         match self {
             Self::Vicon => "--pose=vicon:127.0.0.1:0".into(),
@@ -60,7 +60,7 @@ impl Localization {
         }
     }
 
-    /// Returns the simulator's option: its motion capture streams to the server at `poses`.
+    /// Returns the simulator's option: motion capture streams to the server at `poses`.
     pub(crate) fn of_simulator(self, poses: &str) -> String {
         match self {
             Self::Vicon => format!("--vicon={poses}"),
@@ -69,9 +69,9 @@ impl Localization {
         }
     }
 
-    /// Returns the command that sees tags and sends poses to the server at `poses`; it reports where it waits
-    /// for the true poses that its cameras' images are rendered from. A mat has pads where the vehicle takes off and lands, and
-    /// its survey errors of this seed.
+    /// Returns the command that locates tags and sends poses to the server at `poses`. It prints
+    /// the address at which it receives the true poses, from which its cameras' images are
+    /// rendered. A mat has pads for take-off and landing, and survey errors by `seed`.
     pub(crate) fn of_tags(self, poses: &str, pads: &[Pad], seed: u64) -> Vec<OsString> {
         let words = ["tags", "locate", "--json", "--lifeline", "--simulated"];
         let mut args: Vec<OsString> = words.map(OsString::from).to_vec();
@@ -86,13 +86,13 @@ impl Localization {
     }
 }
 
-/// What the webcams of `vizflyt_tags::simulated` see, and its mat covers. [m, world]
+/// Volume that the webcams of `vizflyt_tags::simulated` see, and that its mat covers. [m, world]
 const HALL_M: (DVec3, DVec3) = (DVec3::new(0.0, -2.25, 0.0), DVec3::new(11.0, 2.25, 3.65));
-/// Nobody flies to the very net.
+/// Part of the fence next to the net, in which the vehicle does not fly.
 const SLACK_M: DVec3 = DVec3::splat(0.5);
 
-/// Returns an address of this computer that nobody uses: Motive waits at its own, and starts after the
-/// server, which asks it. Where even that fails, Motive's usual one.
+/// Returns a free address of this computer for Motive, which starts after the server that connects
+/// to it. If that fails, Motive's usual address.
 fn unused() -> String {
     let found = UdpSocket::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
     found.map_or_else(|_| "127.0.0.1:1510".to_owned(), |address| address.to_string())
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tags_are_for_rooms_that_are_seen() {
+    fn rejects_rooms_that_the_cameras_do_not_cover() {
         let (room, forest) = (DVec3::new(11.0, 2.25, 3.5), DVec3::new(40.0, 5.0, 4.0));
         let least_m = DVec3::new(0.0, -2.25, 0.0);
         assert!(Localization::Tags.check((least_m, room)).is_ok());
@@ -111,7 +111,7 @@ mod tests {
         assert!(Localization::Vicon.check((least_m, forest)).is_ok());
         for (by, what) in [(Localization::Tags, "webcams see"), (Localization::Mat, "mat covers")] {
             let error = by.check((least_m, forest)).unwrap_err().to_string();
-            assert!(error.contains("flown in 40 x 7 m; take --scene room"), "{error}");
+            assert!(error.contains("the fence of this scene is 40 x 7 m; use --scene room"), "{error}");
             assert!(error.contains(what), "{error}");
         }
     }

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Samples the sum of resident set sizes five times a second. Pages that processes share count
-/// once for each of them, so the figure is an upper bound.
+/// Samples the sum of resident set sizes five times a second. Shared pages count once per process,
+/// so the sum is an upper bound.
 pub(crate) struct MemoryWatch {
     peak_kb: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
@@ -28,7 +28,7 @@ impl MemoryWatch {
         watch
     }
 
-    /// Returns the peak so far; 0 where there is no `/proc`. [MB]
+    /// Returns the peak; 0 without `/proc`. [MB]
     pub(crate) fn peak_mb(&self) -> f64 {
         self.peak_kb.load(Ordering::Relaxed) as f64 / 1024.0
     }
@@ -57,7 +57,7 @@ fn family(root: u32) -> HashMap<u32, u64> {
         })
         .collect();
     let descends = |mut pid: u32| {
-        // The chain of parents ends at pid 0; a bound guards against a torn reading.
+        // The chain of parents ends at pid 0. The bound protects against inconsistent data.
         for _ in 0..64 {
             if pid == root {
                 return true;
@@ -82,12 +82,12 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn a_child_is_counted() {
+    fn counts_a_child() {
         use std::io::{BufRead, BufReader};
         use std::process::{Command, Stdio};
 
-        // It has memory of its own once it speaks, and waits until its input closes. A sum over this process would
-        // prove nothing: other tests of it take memory and give it back meanwhile.
+        // The child has memory once it has printed, and waits until its input closes. A sum over
+        // this process would prove nothing: other tests allocate and free memory at the same time.
         let mut child = Command::new("sh")
             .args(["-c", "echo up; read -r line"])
             .stdin(Stdio::piped())
@@ -104,12 +104,12 @@ mod tests {
         assert_eq!(line, "up\n");
         assert!(together[&own] > 500, "this process has {} kB", together[&own]);
         assert!(together[&child.id()] > 0, "the child is not counted: {together:?}");
-        assert!(!stranger.contains_key(&own), "a child's family holds its parent");
-        assert!(!family(own).contains_key(&child.id()), "a child that is gone is counted");
+        assert!(!stranger.contains_key(&own), "the family of a child contains its parent");
+        assert!(!family(own).contains_key(&child.id()), "an ended child is counted");
     }
 
     #[test]
-    fn fields_are_found() {
+    fn finds_fields() {
         assert_eq!(field("Name:\tx\nPPid:\t12\nVmRSS:\t  345 kB\n", "VmRSS:"), Some(345));
         assert_eq!(field("Name:\tx\n", "VmRSS:"), None);
     }

@@ -1,19 +1,19 @@
-//! The simulated lab: render server, runtime and simulator as processes on this machine. `vizflyt
-//! demo` and `vizflyt fly` start it here.
+//! The simulated lab: render server, runtime and simulator as processes on this machine. Started by
+//! `vizflyt demo` and `vizflyt fly`.
 //!
 //! ```text
 //! prepare   generate (or find) the scene: scene.ply, arena.toml, truth.json
 //! keys      pair server and runtime, for this flight only
 //! serve     start the render server; it reports its ports
 //! fly       start the runtime with the plugin; it reports its MAVLink port
-//! bridge    start the Wi-Fi bridge, if it is wanted; it reports its serial port
-//! tags      start AprilTag localization, if it is wanted; it reports its address for true poses
+//! bridge    start the Wi-Fi bridge, if enabled; it reports its serial port
+//! tags      start AprilTag localization, if enabled; it reports its address for true poses
 //! sim       start the vehicle: airframe, autopilot, mocap
-//! watch     print events and status, until the runtime ends (or a person ends it all)
-//! report    join what the three measured
+//! watch     print events and status, until the runtime ends (or the user presses Ctrl-C)
+//! report    join the measurements of the three
 //! ```
-//! All are real processes that talk over UDP, QUIC and shared memory. This one only starts
-//! them, listens, and ends them.
+//! All are real processes that communicate over UDP, QUIC and shared memory. This process only
+//! starts them, reads their output, and stops them.
 
 mod child;
 mod inbox;
@@ -51,24 +51,24 @@ use self::memory::MemoryWatch;
 pub(crate) use self::report::LabReport;
 use self::report::Parts;
 
-/// What the simulated lab looks like.
+/// Options of the simulated lab.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct LabArgs {
     #[arg(long, help = format!(
-        "{}; or the path of a scene folder, an arena.toml or a scene file [default: forest; room with \
+        "Scene: {}; or the path of a scene folder, an arena.toml or a scene file [default: forest; room with \
          --localization tags or mat]", SceneKind::names()
     ))]
     pub scene: Option<String>,
     #[arg(long, value_name = "NAME|FILE", value_parser = project_name, help = format!(
-        "A project of the course, with its place, sensors and rules: {}; or a file of your own, FILE.toml; takes the place of --scene",
+        "Course project, with its scene, sensors and rules: {}; or a file FILE.toml; replaces --scene",
         projects::NAMES.join(", ")
     ))]
     pub project: Option<String>,
-    /// Level of the project: ug, with depth, or g, without [default: ug].
+    /// Level of the project: ug (with depth) or g (without depth) [default: ug]
     #[arg(long, value_name = "LEVEL", requires = "project")]
     pub level: Option<Level>,
     #[arg(long, value_name = "NAME", requires = "project", help = format!(
-        "The project's light and weather: {} [default: day]", Variant::names()
+        "Light and weather of the project: {} [default: day]", Variant::names()
     ))]
     pub variant: Option<Variant>,
     #[arg(long, value_name = "NAME", conflicts_with = "project", help = format!(
@@ -77,50 +77,56 @@ pub(crate) struct LabArgs {
     pub environment: Option<Variant>,
     #[command(flatten)]
     pub bare: BareArgs,
-    /// Seed of the generated scene and of the simulator's noise [default: 7].
+    /// Seed of the generated scene and of the simulator's noise [default: 7]
     #[arg(long)]
     pub seed: Option<u64>,
-    /// Renderer: a graphics card if one is usable, the processor, or any graphics adapter.
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
-    /// How much of a large scene is rendered.
+    /// Level of detail for large scenes
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file.
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
+    ///
+    /// auto: as in the arena, or else as in the scene's file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
-    /// Draws at most this often, as `vizflyt-server` does [Hz] [default: 120].
+    /// Maximum render rate [Hz] [default: 120]
     #[arg(long, value_name = "HZ", value_parser = vizflyt_server::args::rate)]
     pub max_rate: Option<f64>,
-    /// Opens no browser.
+    /// Open no browser
     #[arg(long)]
     pub headless: bool,
-    /// Localization: a motion capture that streams in one of these formats, AprilTags on the vehicle that two
-    /// simulated webcams see, or a mat of them on the floor that a simulated webcam under the vehicle sees.
+    /// Localization of the vehicle: simulated motion capture or AprilTags
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub localization: Localization,
-    /// Every MAVLink byte passes through the vehicle's Wi-Fi bridge, emulated on this computer.
+    /// Route all MAVLink bytes through the vehicle's Wi-Fi bridge, emulated here
     #[arg(long)]
     pub through_bridge: bool,
-    /// The simulated inertial sensor.
+    /// Simulated inertial sensor
     #[arg(long, value_name = "NAME", default_value_t, help = format!(
-        "The simulated inertial sensor, with its data sheet's noise; frame: as a small frame shakes one: {}.",
+        "Simulated inertial sensor, with the noise of its data sheet; frame: with the vibration of a small frame: {}",
         ImuModel::names()
     ))]
     pub imu: ImuModel,
-    /// Start-up times of a real autopilot, as of `vizflyt sim --realistic-startup`.
+    /// Start-up times of a real autopilot, as in `vizflyt sim --realistic-startup`
     #[arg(long)]
     pub realistic_startup: bool,
-    /// Also sends the vehicle's true pose here, as `vizflyt sim --truth-to` does: to measure localization by.
+    /// Also send the vehicle's true pose to this address, to measure localization
+    ///
+    /// As in `vizflyt sim --truth-to`.
     #[arg(long, value_name = "ADDR:PORT")]
     pub truth_to: Option<SocketAddr>,
-    /// Port of the page; without it 8377, where a browser finds the flights that it has kept, or a free one.
+    /// Port of the page; 0: port 8377, or a free one if it is in use
+    ///
+    /// A browser stores flights by address, so it finds them again at the same port.
     #[arg(long, default_value_t = 0)]
     pub port: u16,
 }
 
 impl LabArgs {
-    /// Returns where the page is served: where it was the last time, if a person looks and nobody else has the place.
+    /// Returns the address of the page: the usual port if the page opens in a browser and the port
+    /// is free.
     fn page_address(&self) -> String {
         let is_usual = self.port == 0
             && !self.headless
@@ -133,12 +139,12 @@ impl LabArgs {
         if let Some(project) = &self.project {
             return project;
         }
-        // A forest is larger than what two webcams see, and than a mat.
+        // The forest is larger than the area of the two webcams and of the mat.
         let default = if self.localization.is_by_tags() { "room" } else { "forest" };
         self.scene.as_deref().unwrap_or(default)
     }
 
-    /// Returns the project of the course that is flown, if one is.
+    /// Returns the project of the course, if one is flown.
     pub(crate) fn project(&self) -> Option<CourseProject> {
         self.project.as_deref().and_then(|name| CourseProject::find(name).ok())
     }
@@ -153,7 +159,7 @@ impl LabArgs {
         self.variant.unwrap_or_default()
     }
 
-    /// Returns what is flown in.
+    /// Returns the place of the flight.
     fn place(&self) -> Place<'_> {
         Place {
             scene: self.scene(),
@@ -176,27 +182,26 @@ fn project_name(name: &str) -> Result<String, NoProject> {
     CourseProject::find(name).map(|_| name.to_owned())
 }
 
-/// One flight in the simulated lab.
+/// A flight in the simulated lab.
 #[derive(Debug)]
 pub(crate) struct LabFlight<'a> {
-    /// The lab.
     pub lab: &'a LabArgs,
-    /// The plugin, and other arguments of `vizflyt fly`.
+    /// Plugin and other arguments of `vizflyt fly`.
     pub fly: Vec<OsString>,
     /// Arguments for the plugin.
     pub plugin_arguments: &'a [OsString],
-    /// What is logged, and where.
+    /// Options of the flight log.
     pub log: &'a LogArgs,
-    /// Prints the runtime's JSON lines instead of lines for people.
+    /// Whether to print the runtime's JSON lines instead of text.
     pub json: bool,
-    /// What the children log.
+    /// Log level of the children.
     pub log_level: &'a str,
 }
 
-/// Flies it to the end; `None` if a person ends it first.
+/// Flies until the end; returns `None` if the user ends it first.
 ///
 /// # Errors
-/// If the lab cannot be started. What goes wrong in flight is an outcome of the report.
+/// If the lab cannot be started. Failures in flight are outcomes in the report.
 pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<LabReport>> {
     let memory = MemoryWatch::start();
     let (notices, inbox) = mpsc::channel();
@@ -235,25 +240,25 @@ pub(crate) fn fly(flight: &LabFlight<'_>) -> Result<Option<LabReport>> {
     }
 }
 
-/// How long a child may take to report that it is ready: a large scene is loaded and baked.
+/// Timeout until a child is ready: large scenes take long to load and bake.
 const READY_LIMIT: Duration = Duration::from_mins(2);
-/// How long all children together may take to end.
+/// Timeout for the end of all children together.
 const END_LIMIT: Duration = Duration::from_millis(1500);
 
-/// How the flight part ended.
+/// End of the flight part.
 enum LabEnd {
-    /// The runtime ended; the log is there.
+    /// The runtime ended; the log is complete.
     To { log: String },
-    /// A person ended it.
+    /// The user ended it.
     Interrupted,
 }
 
-/// The running children and what they have reported.
-/// A browser keeps what it keeps by address.
+/// Default port of the page. It is fixed because a browser stores data by address.
 const USUAL_PORT: u16 = 8377;
 
+/// Running children and their reports.
 struct Show {
-    /// The option that gives the children our log level.
+    /// Option that passes the log level to the children.
     log_level: OsString,
     notices: Sender<Notice>,
     inbox: Inbox,
@@ -267,7 +272,7 @@ impl Show {
     fn fly(&mut self, flight: &LabFlight<'_>, stage: &Stage, keys: &Keys) -> Result<LabEnd> {
         let lab = flight.lab;
         let page = lab.page_address();
-        // The server would name an option of its own.
+        // Checked here because the server's message would name its own option, not --port.
         if let Err(error) = TcpListener::bind(&page) {
             bail!(
                 "port {} of the page: {error}; give another --port, or 0 for a free one",
@@ -280,11 +285,11 @@ impl Show {
             keys.option(),
             "--json".into(),
             "--lifeline".into(),
-            // What is simulated is nobody's run.
+            // Simulated flights do not count for the leaderboard.
             "--leaderboard=none".into(),
             "--quic=127.0.0.1:0".into(),
             lab.localization.of_server(),
-            // The simulator's, whoever else the arena names.
+            // Only the simulator's vehicle, even if the arena lists others.
             "--vehicle=vizflyt".into(),
             format!("--http={page}").into(),
             format!("--renderer={}", lab.renderer).into(),
@@ -396,7 +401,7 @@ impl Show {
         }
     }
 
-    /// Starts a child and returns its `ready` line; `None` if a person ends it meanwhile.
+    /// Starts a child and returns its `ready` line; `None` if the user ends the flight meanwhile.
     fn start(&mut self, role: Role, args: &[OsString]) -> Result<Option<Value>> {
         let child = Child::start(role, args, &self.notices)?;
         self.children.push((role, child));
@@ -423,13 +428,13 @@ impl Show {
         }
     }
 
-    /// Prints events until the runtime ends; false if a person ends it first.
+    /// Prints events until the runtime ends; returns false if the user ends the flight first.
     fn watch(&mut self) -> bool {
         loop {
             match self.inbox.recv() {
                 Ok(Notice::Line(from, line)) => self.note(from, &line),
                 Ok(Notice::Closed(Role::Runtime)) => return true,
-                // The runtime notices a dead server or vehicle by itself, and lands: let it.
+                // The runtime detects a dead server or vehicle, and lands.
                 Ok(Notice::Closed(from)) => {
                     self.screen.line(&format!("            the {} has ended", from.name()));
                 }
@@ -438,7 +443,7 @@ impl Show {
         }
     }
 
-    /// Keeps a child's report; prints what is for people.
+    /// Stores a child's report, or prints its event or status.
     fn note(&mut self, from: Role, line: &Value) {
         if let Some(report) = line.get("report") {
             *match from {
@@ -449,12 +454,12 @@ impl Show {
                 Role::Tags => &mut self.parts.localization,
             } = report.clone();
         }
-        // The server repeats the runtime's events to its page: take each from its source.
+        // The server repeats the runtime's events for its page: print each only once.
         if from != Role::Runtime {
             return;
         }
         if self.json {
-            // The report comes later, joined.
+            // The report is printed later, joined.
             if line.get("report").is_none() {
                 print_line(line);
             }
@@ -469,7 +474,7 @@ impl Show {
         }
     }
 
-    /// Ends every child and keeps the reports they print on the way out.
+    /// Stops all children and stores the reports that they print at the end.
     fn end(&mut self) {
         self.screen.end();
         let deadline = Instant::now() + END_LIMIT;
@@ -482,7 +487,7 @@ impl Show {
                 self.parts.killed.push((*role, signal));
             }
         }
-        // Each child's reader closes behind its last line, so this ends.
+        // Each child's reader closes after the last line, so this loop ends.
         while self.inbox.open() > 0 {
             match self.inbox.recv_timeout(END_LIMIT) {
                 Ok(Notice::Line(from, line)) => self.note(from, &line),

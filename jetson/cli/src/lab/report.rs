@@ -1,5 +1,5 @@
-//! The report of a flight in the simulated lab: what the runtime, the server and the simulator each measured, in one JSON
-//! object.
+//! Report of a flight in the simulated lab: measurements of runtime, server and simulator in one
+//! JSON object.
 
 use anyhow::{Context, Result};
 use nix::sys::signal::Signal;
@@ -9,86 +9,84 @@ use vizflyt_protocol::messages::OutcomeKind;
 
 use super::child::Role;
 
-/// One flight. Written by `--report`.
+/// Results of one flight, written by `--report`.
 #[derive(Clone, Debug, Serialize, PartialEq)]
 pub(crate) struct LabReport {
-    /// How it ended.
     pub outcome: OutcomeKind,
-    /// Why, in a sentence.
+    /// Reason of the outcome, as a sentence.
     pub reason: String,
-    /// The seed of scene and simulator.
+    /// Seed of scene and simulator.
     pub seed: u64,
-    /// Take-off to the end of the flight. [s]
+    /// Duration from take-off to the end of the flight. [s]
     pub seconds: f64,
-    /// Images the plugin was given.
+    /// Images delivered to the plugin.
     pub images_delivered: u64,
-    /// Images given to the plugin per second of flight. [Hz]
+    /// Images delivered to the plugin per second of flight. [Hz]
     pub image_hz: f64,
     /// Width of the first camera's images. [px]
     pub image_width: u64,
     /// Height of the first camera's images. [px]
     pub image_height: u64,
-    /// Pose stamp to plugin callback, median. [ms]
+    /// Age of images: pose stamp to plugin callback, median. [ms]
     pub age_ms_p50: f64,
-    /// Pose stamp to plugin callback, 99th percentile. [ms]
+    /// Age of images: pose stamp to plugin callback, 99th percentile. [ms]
     pub age_ms_p99: f64,
     /// Time to render all cameras of a tick, median. [ms]
     pub render_ms_p50: f64,
-    /// What each stage adds to the age, by name, as `p50`, `p90`, `p99`, `max`. [ms]
+    /// Contribution of each stage to the age, by name, as `p50`, `p90`, `p99`, `max`. [ms]
     pub stages: Value,
-    /// Pose stamp to plugin callback, in the same way. [ms]
+    /// Age of images, with the same statistics. [ms]
     pub age: Value,
-    /// Pose stamp to the setpoint that carries the answer. [ms]
+    /// Pose stamp to the setpoint that answers the image. [ms]
     pub total: Value,
-    /// Times between an image at the plugin and the next: `times` and `bins`.
+    /// Intervals between images at the plugin: `times` and `bins`.
     pub intervals: Value,
-    /// The server's clock by the runtime's.
+    /// Server's clock relative to the runtime's.
     pub clock: Value,
     /// Delivery of the images rendered for the runtime, by vehicle and camera.
     pub images: Value,
-    /// Mean speed in flight, by the simulator's truth. [m/s]
+    /// Mean speed in flight, from the simulator's truth. [m/s]
     pub mean_speed_mps: f64,
-    /// Greatest speed, by the simulator's truth. [m/s]
+    /// Maximum speed, from the simulator's truth. [m/s]
     pub max_speed_mps: f64,
-    /// Least distance of the body's surface to the true geometry; absent where a scene has none. [m]
+    /// Minimum distance of the body's surface to the true geometry; absent if the scene has none.
+    /// [m]
     pub min_clearance_m: Option<f64>,
-    /// Simulated time that was given up because this machine stood still or was too busy. [s]
+    /// Simulated time that was skipped because this machine was suspended or too busy. [s]
     pub seconds_given_up: f64,
-    /// How good the localization was in the end, by vehicle: rate, age, sigma, what each source
-    /// delivered and what of it was rejected.
+    /// Quality of the localization at the end, by vehicle: rate, age, sigma, and for each source
+    /// delivered and rejected poses.
     pub pose: Value,
-    /// Setpoints sent to the autopilot.
+    /// Number of setpoints sent to the autopilot.
     pub setpoints_sent: u64,
-    /// MAVLink packets sent and received by the runtime.
+    /// Number of MAVLink packets sent and received by the runtime.
     pub mavlink_packets: u64,
-    /// The bridge's counters, where MAVLink passed through one.
+    /// Counters of the bridge, if one was used.
     pub bridge: Value,
-    /// What AprilTag localization saw, where it was flown on.
+    /// Results of AprilTag localization, if it was used.
     pub localization: Value,
     /// Peak of the summed resident memory of all processes. [MB]
     pub peak_rss_mb: f64,
-    /// The renderer that drew, such as `cpu avx2`.
+    /// Renderer that was used, such as `cpu avx2`.
     pub renderer: String,
-    /// Why it was this one.
+    /// Reason for the choice of the renderer.
     pub renderer_reason: String,
-    /// Where the flight log is.
+    /// Path of the flight log.
     pub log: String,
 }
 
-/// What the processes reported, as far as they did.
+/// Reports of the processes; null if a process did not report.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Parts {
-    /// The runtime's report.
     pub runtime: Value,
-    /// The server's report.
     pub server: Value,
-    /// The simulator's report: the truth.
+    /// Report of the simulator: the true values.
     pub simulator: Value,
-    /// The bridge's report, if there was one.
+    /// Report of the bridge, if there was one.
     pub bridge: Value,
-    /// The report of AprilTag localization, if it was flown on.
+    /// Report of AprilTag localization, if there was one.
     pub localization: Value,
-    /// Which signal ended which process.
+    /// Processes that were killed, with the signal.
     pub killed: Vec<(Role, Signal)>,
 }
 
@@ -97,22 +95,22 @@ impl Parts {
         let killed = self.killed.iter().find(|(killed, _)| *killed == role);
         let name = role.name();
         match killed {
-            // Memory that is shared has no room behind it when it is first touched.
+            // The kernel allocates shared memory when it is first written.
             Some((_, Signal::SIGBUS)) => {
                 format!(
-                    "the {name} was killed by SIGBUS, as where /dev/shm is full; free some of it"
+                    "the {name} was killed by SIGBUS; probably /dev/shm is full: free some of it"
                 )
             }
             Some((_, Signal::SIGKILL)) => {
-                format!("the {name} was killed by SIGKILL, as where the memory is full")
+                format!("the {name} was killed by SIGKILL; probably the memory is full")
             }
             Some((_, signal)) => format!("the {name} was killed by {signal}"),
             None => format!("the {name} ended without a report"),
         }
     }
 
-    /// Joins the parts. A true collision outranks the referee's decision; a missing part is an
-    /// error by name.
+    /// Joins the parts. A collision in the simulator's truth overrides the referee's decision. A
+    /// missing part is an error that names the part.
     pub(crate) fn join(&self, seed: u64, peak_rss_mb: f64, log: &str) -> LabReport {
         let number = |part: &Value, key: &str| part[key].as_f64().unwrap_or(0.0);
         let count = |part: &Value, key: &str| part[key].as_u64().unwrap_or(0);
@@ -178,7 +176,7 @@ impl LabReport {
             .with_context(|| format!("cannot write the report to {}", path.display()))
     }
 
-    /// Returns the report as a few lines for a person.
+    /// Returns the report as text.
     pub(crate) fn summary(&self) -> String {
         let clearance = match self.min_clearance_m {
             Some(clearance_m) => format!("{clearance_m:.2} m"),
@@ -188,7 +186,7 @@ impl LabReport {
         let tags = &self.localization;
         let tags = match (tags["located"].as_u64(), tags["error_mm_rms"].as_f64()) {
             (Some(located), Some(error_mm)) => format!(
-                "\x20 tags        {located} poses at {:.0} Hz, {error_mm:.1} mm from the truth, {:.1} ms an image\n",
+                "\x20 tags        {located} poses at {:.0} Hz, error {error_mm:.1} mm, {:.1} ms an image\n",
                 tags["rate_hz"].as_f64().unwrap_or(0.0),
                 tags["image_ms_p50"].as_f64().unwrap_or(0.0),
             ),
@@ -196,7 +194,7 @@ impl LabReport {
         };
         let stalled = if self.seconds_given_up > NOTICEABLE_S {
             format!(
-                "\x20 too busy    this machine stood still for {:.1} s; close other programs for figures that count\n",
+                "\x20 too busy    the simulation stood still for {:.1} s; close other programs for valid figures\n",
                 self.seconds_given_up
             )
         } else {
@@ -206,7 +204,7 @@ impl LabReport {
             if self.reason.is_empty() { String::new() } else { format!(": {}", self.reason) };
         format!(
             "{outcome}{reason}\n\
-             \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, top {top:.2} m/s, least clearance {clearance}\n\
+             \x20 flight      {seconds:.1} s, mean {mean:.2} m/s, maximum {top:.2} m/s, minimum clearance {clearance}\n\
              \x20 images      {delivered} of {width}x{height} RGB-D at {hz:.1} Hz, rendered in {render:.1} ms ({renderer})\n\
              \x20 age         pose to plugin p50 {p50:.1} ms, p99 {p99:.1} ms; to the setpoint {setpoint:.1} ms\n\
              \x20 vehicle     {setpoints} setpoints, {packets} MAVLink packets\n{tags}{stalled}\
@@ -233,7 +231,7 @@ impl LabReport {
     }
 }
 
-/// Less is no reason to doubt a flight's figures. [s]
+/// Minimum skipped time for a warning in the summary. [s]
 const NOTICEABLE_S: f64 = 0.1;
 
 #[cfg(test)]
@@ -253,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn the_truth_outranks_the_referee() {
+    fn a_true_collision_overrides_the_referee() {
         let mut parts = parts();
         assert_eq!(parts.join(7, 1.0, "").outcome, OutcomeKind::Finished);
         parts.simulator["collided"] = json!(true);
@@ -261,16 +259,16 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_stood_still_is_named() {
+    fn names_a_machine_that_stood_still() {
         let mut parts = parts();
         assert!(!parts.join(7, 1.0, "").summary().contains("stood still"));
         parts.simulator["seconds_given_up"] = json!(0.45);
         let summary = parts.join(7, 1.0, "").summary();
-        assert!(summary.contains("this machine stood still for 0.5 s"), "{summary}");
+        assert!(summary.contains("the simulation stood still for 0.5 s"), "{summary}");
     }
 
     #[test]
-    fn a_missing_part_is_an_error_by_name() {
+    fn names_a_missing_part() {
         let report = Parts { server: Value::Null, ..parts() }.join(7, 1.0, "");
         assert_eq!(report.outcome, OutcomeKind::Error);
         assert_eq!(report.reason, "the render server ended without a report");

@@ -1,14 +1,14 @@
-//! Projects of a course that is not ours: folders `projects/NAME` with an `arena.toml`.
+//! Projects of other courses: folders `projects/NAME` with an `arena.toml`.
 
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 
-/// Returns the folder of the course's project `name`: `projects/NAME` with an `arena.toml`, in the
-/// folder people work in or in one of `roots`.
+/// Returns the folder of the project `name`: `projects/NAME` with an `arena.toml`, below the
+/// current folder or one of `roots`.
 ///
 /// # Errors
-/// If there is none of that name; the sentence lists `ours` and those that exist.
+/// If no such project exists; the message lists `ours` and the projects found.
 pub(super) fn find(name: &str, ours: &[&str], roots: &[PathBuf]) -> Result<PathBuf> {
     let roots: Vec<PathBuf> =
         std::iter::once(PathBuf::new()).chain(roots.iter().cloned()).collect();
@@ -31,7 +31,7 @@ pub(super) fn find(name: &str, ours: &[&str], roots: &[PathBuf]) -> Result<PathB
     known.dedup();
     let all = ours.iter().copied().chain(known.iter().map(String::as_str)).collect::<Vec<_>>();
     bail!(
-        "there is no project '{name}'; there are: {}; one of your own is a folder projects/{name} with an arena.toml",
+        "there is no project '{name}'; there are: {}; to add one, make a folder projects/{name} with an arena.toml",
         all.join(", ")
     )
 }
@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn projects_of_the_course_are_found_by_name() {
+    fn finds_projects_by_name() {
         let root = tempfile::tempdir().unwrap();
         let roots = [root.path().to_owned()];
         let error = |name: &str| find(name, &["p1"], &roots).unwrap_err().to_string();
@@ -50,12 +50,12 @@ mod tests {
         for name in ["p3", "p2"] {
             std::fs::create_dir_all(root.path().join("projects").join(name)).unwrap();
         }
-        assert!(error("p2").starts_with(none), "a folder without an arena.toml is no project");
+        assert!(error("p2").starts_with(none), "a folder without an arena.toml is not a project");
         for name in ["p3", "p2"] {
             std::fs::write(root.path().join("projects").join(name).join("arena.toml"), "").unwrap();
         }
         assert!(find("p2", &["p1"], &roots).unwrap().ends_with("projects/p2"));
         assert!(error("p9").contains("there are: p1, p2, p3; "), "{}", error("p9"));
-        assert!(error("../p2").contains("no project"), "no path");
+        assert!(error("../p2").contains("no project"), "a path is not a name");
     }
 }

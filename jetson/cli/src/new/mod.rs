@@ -1,7 +1,7 @@
-//! `vizflyt new NAME`: a folder with a plugin that flies, its test, and what an editor needs.
+//! `vizflyt new NAME`: makes a folder with a plugin that flies, its test and editor settings.
 //!
-//! The files are the ones under `jetson/cli/templates`, with the names filled in; for a project of the course that has a
-//! starter, its plugin, modules and tests instead of the template's.
+//! The files come from `jetson/cli/templates`, with the names filled in. A project of the course
+//! with a starter uses the starter's plugin, modules and tests instead.
 
 mod course_folder;
 mod starter;
@@ -18,34 +18,36 @@ use vizflyt_process::print_line;
 use vizflyt_scenes::SceneKind;
 use vizflyt_scenes::projects::{self, CourseProject};
 
-/// Makes a folder with a plugin that flies: it climbs to 1 m and follows the depth gradient.
+/// Make a folder with a plugin that flies
+///
+/// The plugin climbs to 1 m and follows the depth gradient.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  vizflyt new first                    in Python; then: vizflyt fly first
-  vizflyt new my-p4 --project p4       for the course: its starter, with tests
+  vizflyt new first                    a plugin in Python; then: vizflyt fly first
+  vizflyt new my-p4 --project p4       the starter of a course project, with tests
   vizflyt new ../second --lang rust")]
 pub(crate) struct NewArgs {
-    /// The folder to make; its last part names the plugin
+    /// Folder to make; its last part is the name of the plugin
     #[arg(value_name = "NAME")]
     path: PathBuf,
-    /// What it is written in
+    /// Programming language
     #[arg(long, value_enum, default_value_t)]
     lang: Language,
     #[arg(long, value_name = "NAME", help = format!(
-        "The course's project that it is for: {}, {}; or a folder projects/NAME",
+        "Course project: {}, {}; or a folder projects/NAME",
         starter::IN_THE_NET.join(", "),
         projects::NAMES.join(", ")
     ))]
     project: Option<String>,
 }
 
-/// A language of plugins.
+/// Programming language of a plugin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 enum Language {
-    /// plugin.py
+    /// Python: plugin.py
     #[default]
     Python,
-    /// src/main.rs
+    /// Rust: src/main.rs
     Rust,
 }
 
@@ -56,7 +58,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     if let (Some(project), Some(_), Language::Rust) = (&args.project, &starter, args.lang)
         && starter::IN_THE_NET.contains(&&**project)
     {
-        bail!("{project} is done in Python: leave --lang out");
+        bail!("{project} supports only Python; omit --lang");
     }
     let place = match &args.project {
         Some(name) if starter::IN_THE_NET.contains(&&**name) => {
@@ -73,7 +75,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
         None => "scene = \"forest\"".to_owned(),
     };
     if args.path.exists() {
-        bail!("{} is there already; give another name, or delete it", args.path.display());
+        bail!("{} exists already; choose another name, or delete it", args.path.display());
     }
     let folder = args.path.display().to_string();
     let files = match args.lang {
@@ -88,8 +90,8 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
         };
         write().with_context(|| format!("cannot write {}", path.display()))?;
     }
-    print_line(format!("{folder} is made; now"));
-    // Installed by pip, it has brought the package; where it was built, the package is built too.
+    print_line(format!("{folder} created; next"));
+    // pip has installed the package with this program; in a source tree the package must be built.
     if args.lang == Language::Python && own_python().is_none() {
         let package = sources().map(|root| format!("{} ", root.join("jetson/python").display()));
         let package = package.unwrap_or_default();
@@ -101,7 +103,7 @@ pub(crate) fn run(args: &NewArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// A file of the folder, and its text.
+/// Name and text of a file.
 type File = (&'static str, String);
 
 fn python(
@@ -133,7 +135,7 @@ fn python(
 }
 
 fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
-    // As JSON: a path in TOML is quoted alike.
+    // Formatted as a JSON string: TOML quotes paths in the same way.
     let sources = sources().context("a plugin in Rust is built with VizFlyt's own crates")?;
     let sdk = format!("path = {:?}", sources.join("jetson/sdk").display().to_string());
     let fill = |text: &str| {
@@ -142,7 +144,7 @@ fn rust(name: &str, folder: &str, place: &str) -> Result<Vec<File>> {
     };
     Ok(vec![
         ("Cargo.toml", fill(include_str!("../../templates/rust/Cargo.toml"))),
-        // The versions that the SDK is tested with; cargo drops what the plugin does not need.
+        // Versions that the SDK is tested with; cargo drops those that the plugin does not need.
         ("Cargo.lock", include_str!("../../../../Cargo.lock").to_owned()),
         ("src/main.rs", fill(include_str!("../../templates/rust/main.rs"))),
         ("README.md", fill(include_str!("../../templates/rust/README.md"))),
@@ -160,7 +162,7 @@ fn lab(plugin: &str, place: &str) -> String {
         .replace("{{projects}}", &projects::NAMES.join(", "))
 }
 
-/// Returns the plugin's name, if it can be one: of a folder, a crate and a class at once.
+/// Returns the plugin's name if it is valid as a folder, a crate and a class.
 fn name_of(path: &Path) -> Result<String> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let is_good = name.starts_with(|c: char| c.is_ascii_alphabetic())
@@ -168,23 +170,23 @@ fn name_of(path: &Path) -> Result<String> {
         && name.len() <= MAX_NAME_BYTES;
     if !is_good {
         bail!(
-            "'{name}' is no name for a plugin: a letter, then letters, digits, - and _, at most \
+            "'{name}' is not a valid plugin name: use a letter, then letters, digits, - and _, at most \
              {MAX_NAME_BYTES}"
         );
     }
     if BuiltIn::from_str(&name, true).is_ok() {
-        bail!("'{name}' is a built-in plugin; give yours another name");
+        bail!("'{name}' is a built-in plugin; choose another name");
     }
     let words = [name.to_ascii_lowercase(), class(&name)];
     if words.iter().any(|word| TAKEN.contains(&word.as_str())) {
-        bail!("'{name}' is the name of something that your plugin needs; give yours another");
+        bail!("'{name}' is the name of a package that the plugin needs; choose another name");
     }
     Ok(name)
 }
 
-/// As long as an arena's names.
+/// Same limit as for the names in an arena.
 const MAX_NAME_BYTES: usize = 32;
-/// Names that cargo refuses, or that would hide what the plugin imports.
+/// Names that cargo rejects, or that would shadow imports of the plugin.
 const TAKEN: [&str; 18] = [
     "vizflyt",
     "vizflyt-sdk",
@@ -221,7 +223,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_checked() {
+    fn rejects_invalid_names() {
         let check = |name: &str, good: bool| {
             assert_eq!(name_of(Path::new(name)).is_ok(), good, "{name}");
         };
@@ -243,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn every_blank_is_filled_and_the_readme_has_ten_lines() {
+    fn fills_every_placeholder_and_keeps_the_readme_within_ten_lines() {
         let both = [
             python("a-b", "x/a-b", "scene = \"room\"", None),
             rust("a-b", "x/a-b", "project = \"p5\"").unwrap(),

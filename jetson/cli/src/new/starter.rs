@@ -1,4 +1,5 @@
-//! What `vizflyt new --project pN` puts into a folder: the course's starters, as `docs/course` has them.
+//! Files that `vizflyt new --project pN` copies into a folder: the course's starters in
+//! `docs/course`.
 
 use super::File;
 
@@ -9,17 +10,17 @@ macro_rules! files {
     };
 }
 
-/// One project's starter: the folders of `docs/course` that it is made of.
+/// Starter of one project, and the folders of `docs/course` that it consists of.
 struct Starter {
     project: &'static str,
-    /// What is flown.
+    /// File that is flown.
     plugin: &'static str,
     parts: &'static [&'static [(&'static str, &'static str)]],
 }
 
-/// Quaternions, files, the flight: what needs no filling in.
+/// Complete helper modules: quaternions, files, the flight.
 const GIVEN: &[(&str, &str)] = files!("given" "attitude.py" "estimate.py" "flight.py");
-/// The flight's rules and the scores of an attitude.
+/// Rules of the flight, and scoring of an attitude.
 const ATTITUDE: &[(&str, &str)] = files!("." "attitude.toml" "score_attitude.py");
 
 const STARTERS: &[Starter] = &[
@@ -74,9 +75,9 @@ const STARTERS: &[Starter] = &[
     },
 ];
 
-/// The projects that are not flown through a course of their own, but through the empty net.
+/// Projects that are flown in the empty net instead of on a course.
 pub(super) const IN_THE_NET: [&str; 2] = ["p0", "p1"];
-/// Their rules, in the folder.
+/// File with the rules of these projects.
 pub(super) const NET: &str = "attitude.toml";
 
 /// Returns the plugin and the files of a project's starter, if it has one.
@@ -92,9 +93,9 @@ mod tests {
     use std::collections::BTreeSet;
     use std::path::Path;
 
-    /// A file that is added to a starter is handed out.
+    /// Catches a file that is added to a starter in `docs/course` but not here.
     #[test]
-    fn every_file_of_a_starter_is_in_the_program() {
+    fn includes_every_file_of_each_starter() {
         let course = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/course");
         let names = |folder: &Path| -> BTreeSet<String> {
             let entries = std::fs::read_dir(folder).unwrap().map(Result::unwrap);
@@ -110,7 +111,7 @@ mod tests {
             }
             with_starter += 1;
             let project = project.file_name().to_string_lossy().into_owned();
-            let (plugin, files) = of(&project).expect("it has a starter");
+            let (plugin, files) = of(&project).expect("the project has a starter");
             let files: BTreeSet<String> =
                 files.iter().map(|(file, _)| (*file).to_owned()).collect();
             assert!(files.contains(plugin), "{project}");

@@ -1,4 +1,4 @@
-//! A recorded flight as a source of poses.
+//! Sends the poses of a recorded flight.
 
 use std::io::Read;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -8,7 +8,7 @@ use anyhow::{Context, Result, bail};
 use serde_json::json;
 use vizflyt_runtime::log::read::{RecordedPose, RecordedPoses};
 
-/// Sends the poses of a log at the flight's pace; returns how many.
+/// Sends the poses of a log at the pace of the flight; returns their number.
 pub(super) fn send<R: Read>(
     mut poses: RecordedPoses<R>,
     to: SocketAddr,
@@ -35,11 +35,11 @@ pub(super) fn send<R: Read>(
             "position_m": pose.translation_m.to_array(),
             "rotation_xyzw": pose.rotation.to_array(),
         });
-        // Nobody may listen yet.
+        // An error means that no receiver listens yet: continue.
         let _ = socket.send_to(packet.to_string().as_bytes(), to);
     }
     if seq == 0 {
-        bail!("it holds no pose");
+        bail!("the log contains no pose");
     }
     Ok(seq)
 }

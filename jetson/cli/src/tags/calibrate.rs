@@ -1,4 +1,4 @@
-//! `vizflyt tags calibrate`: a camera's lens, from images of the printed board.
+//! `vizflyt tags calibrate`: calibrates a camera's lens with images of the printed board.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,27 +11,29 @@ use vizflyt_tags::calibrate::{Board, Calibrator, LensModel, Session, ViewOutcome
 use vizflyt_tags::camera::{Mounting, TagCamera};
 use vizflyt_tags::capture;
 
-/// Finds a camera's focal lengths, principal point and distortion from images of the printed board, and
-/// writes the camera's file.
+/// Calibrate a camera's lens with images of the printed board
+///
+/// Estimates focal lengths, principal point and distortion, and writes the camera's file.
 #[derive(Args, Debug)]
 #[command(after_help = "Focus and zoom must not change afterwards: turn autofocus off
 (v4l2-ctl -d /dev/video0 --set-ctrl focus_automatic_continuous=0).
-Move the board slowly through the whole image, near and far, tilted to all sides; the command reports
-where next, and ends by itself.")]
+Move the board slowly through the whole image, near and far, tilted to all sides. The command prints
+where to hold it next, and ends automatically.")]
 pub(super) struct CalibrateArgs {
-    /// Where images come from: /dev/video0, /dev/video0:1280x720@60, a folder, a video file, - or
-    /// '| COMMAND' for YUV4MPEG2.
+    /// Source of images: device, folder, video file, or a command's output
+    ///
+    /// Devices are /dev/video0 or /dev/video0:1280x720@60. - and '| COMMAND' read YUV4MPEG2.
     source: String,
-    /// The board's layout, as `vizflyt tags print board` or `print checkers` wrote it.
+    /// Layout of the board, written by `vizflyt tags print board` or `print checkers`
     #[arg(long, value_name = "FILE.toml")]
     board: PathBuf,
-    /// The camera's file.
+    /// Camera file to write
     #[arg(short, long, value_name = "FILE.toml")]
     output: PathBuf,
-    /// What the camera is called; without it, the file's name.
+    /// Name of the camera [default: name of the file]
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// The lens is a fisheye of more than some 110 degrees.
+    /// Fisheye lens with a field of view of more than about 110 degrees
     #[arg(long)]
     fisheye: bool,
 }
@@ -40,7 +42,7 @@ pub(super) struct CalibrateArgs {
 pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     let stem = args.output.file_stem().and_then(|stem| stem.to_str());
     let Some(name) = args.name.as_deref().or(stem) else {
-        bail!("{}: give the camera's file a name", args.output.display());
+        bail!("{}: the camera file needs a name", args.output.display());
     };
     let model = if args.fisheye { LensModel::KannalaBrandt } else { LensModel::BrownConrady };
     let mut session = Session::new(Board::read(&args.board)?, model);
@@ -77,7 +79,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     }
     drop(source);
     if let Some(calibrator) = session.progress() {
-        print_line(format_args!("{} views; where corners were seen:", calibrator.views()));
+        print_line(format_args!("{} views; corners per image region:", calibrator.views()));
         for row in calibrator.coverage().map() {
             print_line(format_args!("  {row}"));
         }
@@ -107,7 +109,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns what to do next, in one line.
+/// Returns the next instruction for the user, in one line.
 fn guide(calibrator: &Calibrator, verdict: ViewOutcome, is_live: bool) -> String {
     let wanted = calibrator.wanted();
     let next = match (verdict, wanted.first()) {
@@ -116,16 +118,16 @@ fn guide(calibrator: &Calibrator, verdict: ViewOutcome, is_live: bool) -> String
             verdict.to_string()
         }
         (_, Some(wanted)) => wanted.clone(),
-        (_, None) => "more views, near and far, make it surer".into(),
+        (_, None) => "more views, near and far, improve the accuracy".into(),
     };
     let share = 100.0 * calibrator.coverage().share();
     format!("{:>3} views, {share:>3.0} % of the image: {next}", calibrator.views())
 }
 
-/// Whether a source will be the same one tomorrow.
+/// Whether a source is a device, which stays the same across runs.
 fn is_device(source: &str) -> bool {
     source.starts_with("/dev/") || source.starts_with('|')
 }
 
-/// A live calibration ends once it has so many views and has seen everything.
+/// A live calibration ends after this many views if all regions and tilts are covered.
 const LIVE_VIEWS: usize = 30;

@@ -1,9 +1,10 @@
-//! `vizflyt tags locate`: images in, the vehicle's pose out, over UDP to the render server.
+//! `vizflyt tags locate`: locates the vehicle in images, and sends its pose over UDP to the render
+//! server.
 //!
 //! ```text
-//! sources   one thread a camera: images with their exposure stamps --> mailbox, newest wins
+//! sources   one thread per camera: images with their exposure stamps --> mailbox, newest wins
 //! locator   this thread: vizflyt_tags::locate                      --> pose packets, status lines
-//! view      a page with images, detections and residuals, if asked for
+//! view      a page with images, detections and residuals, if requested
 //! ```
 
 mod sources;
@@ -25,56 +26,60 @@ use vizflyt_tags::print::Pad;
 use self::sources::{CameraEvent, CameraImage, Sources};
 use self::view::LiveView;
 
-/// Locates the vehicle by tags and sends its pose.
+/// Locate the vehicle by AprilTags and send its pose to the server
 #[derive(Args, Debug)]
-#[command(after_help = "A file names cameras and layouts, relative to itself:
+#[command(after_help = "The configuration file lists cameras and layouts, relative to its folder:
   object  = \"vizflyt\"
   cameras = [\"west.toml\", \"east.toml\"]   # from `tags calibrate` and `tags survey`
-  layouts = [\"cube.toml\"]                # from `tags print`; a surveyed mat likewise")]
+  layouts = [\"cube.toml\"]                # from `tags print`; or a surveyed mat")]
 pub(crate) struct LocateArgs {
-    /// The file; not needed with --simulated.
+    /// Configuration file; not needed with --simulated
     #[arg(required_unless_present = "simulated", conflicts_with = "simulated")]
     config: Option<PathBuf>,
-    /// Two simulated webcams at the ends of the netted hall, which see a cube of tags where the truth
-    /// says the vehicle is; cameras whose source is "simulated" in a file do likewise.
+    /// Use simulated webcams at the ends of the netted hall
+    ///
+    /// They see a cube of tags at the true pose of the vehicle. In a configuration file, cameras
+    /// with the source "simulated" do the same.
     #[arg(long)]
     simulated: bool,
-    /// How many simulated webcams, 1 to 4.
+    /// Number of simulated webcams, 1 to 4
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(1..=4), requires = "simulated")]
     webcams: u8,
-    /// The simulated webcam is under the vehicle, and sees a mat of tags on the hall's floor.
+    /// Simulate a webcam under the vehicle that sees a mat of tags on the floor
     #[arg(long, requires = "simulated", conflicts_with = "webcams")]
     inside_out: bool,
-    /// Where that mat has small tags, for a vehicle that stands there: east, north, and how far it reaches [default: 0.5,0.35].
-    /// May be given several times. [m, world]
+    /// Pad of small tags on that mat: centre east, north and size; can be repeated
+    ///
+    /// In metres, world frame. [default size: 0.5,0.35]
     #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = super::print::pad, allow_hyphen_values = true, requires = "inside_out")]
     pads: Vec<Pad>,
-    /// Seed of what survey and mount have left wrong in that lab.
+    /// Seed of the simulated errors of survey and mount
     #[arg(long, default_value_t = 7, requires = "inside_out")]
     seed: u64,
-    /// Name of the vehicle; that of the file without it.
+    /// Name of the vehicle [default: that of the file]
     #[arg(long)]
     object: Option<String>,
-    /// Takes a camera's images from another source than its file's: a device, a folder, a video. May be given
-    /// several times.
+    /// Source of a camera's images instead of its file's; can be repeated
+    ///
+    /// A device, a folder or a video.
     #[arg(long = "source", value_name = "CAMERA=SOURCE", value_parser = parse_source)]
     sources: Vec<(String, String)>,
-    /// Address at which simulated cameras receive the true pose: `vizflyt sim --truth-to` this.
+    /// Address for true poses, for simulated cameras: `vizflyt sim --truth-to` this
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:0")]
     truth: SocketAddr,
-    /// Sends the pose here: `vizflyt serve --pose json:ADDR` listens. May be given several times.
+    /// Destination of the poses: `vizflyt serve --pose json:ADDR`; can be repeated
     #[arg(long, value_name = "HOST:PORT", value_parser = resolve)]
     to: Vec<SocketAddr>,
-    /// Prints JSON lines: `ready`, `status` once a second, `report`.
+    /// Print JSON lines: `ready`, `status` once a second, `report`
     #[arg(long)]
     json: bool,
-    /// Prints every pose as a JSON line, as it is sent.
+    /// Print every pose as a JSON line when it is sent
     #[arg(long)]
     poses: bool,
-    /// Serves the live view here: images, detections, residuals.
+    /// Address of the live view: images, detections, residuals
     #[arg(long, value_name = "ADDR:PORT")]
     http: Option<SocketAddr>,
-    /// Ends when standard input closes.
+    /// End when standard input closes
     #[arg(long, hide = true)]
     lifeline: bool,
 }
@@ -83,7 +88,7 @@ fn resolve(text: &str) -> Result<SocketAddr, String> {
     text.to_socket_addrs()
         .map_err(|error| format!("{error}; give HOST:PORT"))?
         .next()
-        .ok_or_else(|| "no address of this name".into())
+        .ok_or_else(|| "the host name has no address".into())
 }
 
 fn parse_source(text: &str) -> Result<(String, String), String> {
@@ -92,7 +97,7 @@ fn parse_source(text: &str) -> Result<(String, String), String> {
         .ok_or_else(|| "give CAMERA=SOURCE".into())
 }
 
-/// Runs until the images end, or a person or the parent ends it.
+/// Runs until the images end, the user presses Ctrl-C, or the parent ends.
 pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     let stop = stop_flag(args.lifeline)?;
     let mut setup = match &args.config {
@@ -109,7 +114,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
         let Some(camera) = setup.cameras.iter_mut().find(|camera| camera.name == *name) else {
             let known: Vec<&str> =
                 setup.cameras.iter().map(|camera| camera.name.as_str()).collect();
-            bail!("tags: no camera is called {name:?}; there are {}", known.join(", "));
+            bail!("tags: unknown camera {name:?}; known: {}", known.join(", "));
         };
         camera.source = Some(source.clone());
     }
@@ -206,7 +211,7 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
         report["findings"] = findings(&locator, &names).into();
         print_line(json!({ "report": report }));
     } else {
-        print_line(format!("in all: {}", figures.to_line()));
+        print_line(format!("total: {}", figures.to_line()));
         for finding in findings(&locator, &names) {
             print_line(format!("  {finding}"));
         }
@@ -214,13 +219,13 @@ pub(crate) fn run(args: &LocateArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns what is wrong with the lab, in words.
+/// Returns the detected problems of the lab as sentences.
 fn findings(locator: &Locator, names: &[&str]) -> Vec<String> {
     locator.findings().iter().map(|finding| finding.words(names)).collect()
 }
 
-/// Cuts shots, which are in the order of their stamps, where their stamps are apart or a camera comes
-/// again.
+/// Splits images, which are sorted by stamp, into sets of one instant: a new set starts at a gap in
+/// the stamps, or when a camera repeats.
 fn together(shots: &[CameraImage]) -> impl Iterator<Item = &[CameraImage]> {
     let mut rest = shots;
     std::iter::from_fn(move || {
@@ -241,14 +246,13 @@ fn together(shots: &[CameraImage]) -> impl Iterator<Item = &[CameraImage]> {
     })
 }
 
-/// Sends poses.
 struct PoseSender {
     socket: UdpSocket,
     to: Vec<SocketAddr>,
     object: String,
-    /// Where the live view is, for the server's page.
+    /// Port of the live view, for the server's page.
     view_port: Option<u16>,
-    /// What people who look at the server's page should know.
+    /// Notes for users of the server's page.
     notes: Vec<String>,
     seq: std::cell::Cell<u64>,
 }
@@ -257,24 +261,24 @@ impl PoseSender {
     fn open(to: &[SocketAddr], object: &str, view_port: Option<u16>) -> Result<Self> {
         let any = if to.iter().any(SocketAddr::is_ipv6) { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any).context("tags: cannot open a socket for poses")?;
-        // A full buffer drops a pose; the next is better anyway.
+        // A full buffer drops a pose; the next one is newer anyway.
         socket.set_nonblocking(true).context("tags: the socket for poses")?;
         let (to, object, notes) = (to.to_vec(), object.into(), Vec::new());
         Ok(Self { socket, to, object, view_port, notes, seq: 0.into() })
     }
 
-    /// Sends a pose, and returns it as this computer's clock has it.
+    /// Sends a pose, and returns it with stamps of this computer's clock.
     fn send(&self, located: &Located, image_ms: f64, is_live: bool) -> Value {
         self.seq.set(self.seq.get() + 1);
         for &to in &self.to {
-            // Stamps of this computer's clock are the server's where it is this computer.
+            // On the same computer, server and sender have the same clock.
             let clock = if is_live && to.ip().is_loopback() { "server" } else { "sender" };
             let mut packet = packet(&self.object, self.seq.get(), clock, located, image_ms);
             packet["quality"]["view_port"] = self.view_port.into();
             if !self.notes.is_empty() {
                 packet["notes"] = self.notes.clone().into();
             }
-            // Lost like any datagram if nobody listens.
+            // Lost if no server listens, like any datagram.
             let _ = self.socket.send_to(packet.to_string().as_bytes(), to);
         }
         let clock = if is_live { "server" } else { "sender" };
@@ -303,16 +307,16 @@ fn packet(object: &str, seq: u64, clock: &str, located: &Located, image_ms: f64)
     })
 }
 
-/// What is counted over a second, and over all.
+/// Counters of one second, or of the whole run.
 #[derive(Debug, Default)]
 struct Figures {
     seconds: f64,
     images: usize,
     sets: usize,
     located: usize,
-    /// Sets in which no camera can see the vehicle, by where it should be.
+    /// Sets without a camera that can see the vehicle, according to its expected position.
     out_of_view: usize,
-    /// Sets older than a pose before them.
+    /// Sets that are older than an earlier pose.
     late: usize,
     no_tag: usize,
     residuals: usize,
@@ -374,7 +378,7 @@ impl Figures {
             (&mut self.off_mm, &other.off_mm),
         ] {
             mine.extend(theirs);
-            // Hours of flight are reported by their last part.
+            // After hours of flight, only the last values are kept for the report.
             let old = mine.len().saturating_sub(MAX_FIGURES);
             mine.drain(..old);
         }
@@ -421,7 +425,7 @@ impl Figures {
         );
         for (count, why) in [
             (self.no_tag, "without a tag"),
-            (self.ambiguous, "open between two poses"),
+            (self.ambiguous, "ambiguous between two poses"),
             (self.residuals, "that fit no pose: check layout, lens and camera's place"),
         ] {
             if count > 0 {
@@ -439,11 +443,11 @@ fn quantile(values: &[f64], share: f64) -> Option<f64> {
     sorted.get(((sorted.len() as f64 * share) as usize).min(sorted.len().max(1) - 1)).copied()
 }
 
-/// How long is waited for images before the stop flag is looked at.
+/// Maximum wait for images before the stop flag is checked.
 const WAIT: Duration = Duration::from_millis(100);
-/// Exposures closer than this are located as one. [s]
+/// Exposures closer than this are located together. [s]
 const TOGETHER_S: f64 = 0.002;
-/// Figures of the report rest on so many sets at most: an hour of two cameras at 30 Hz.
+/// Maximum number of sets for the report's statistics: an hour of two cameras at 30 Hz.
 const MAX_FIGURES: usize = 216_000;
 
 #[cfg(test)]
@@ -456,7 +460,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shots_are_cut_where_they_are_apart_and_where_a_camera_comes_again() {
+    fn splits_images_into_sets_of_one_instant() {
         let shot = |camera, ms: u64| CameraImage {
             camera,
             stamp: HostTime::from_ns(ms * 1_000_000),
@@ -477,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_is_what_the_server_s_driver_reads() {
+    fn sends_poses_that_the_servers_driver_parses() {
         let located = Located {
             stamp: HostTime::from_ns(81_250_000),
             world_from_body: Pose::new(DVec3::new(1.0, -2.0, 0.5), DQuat::from_rotation_z(0.3)),
@@ -498,7 +502,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_of_nothing_are_none() {
+    fn quantile_of_an_empty_list_is_none() {
         assert_eq!(quantile(&[], 0.5), None);
         assert_eq!(quantile(&[3.0], 0.99), Some(3.0));
         assert_eq!(quantile(&[3.0, 1.0, 2.0], 0.5), Some(2.0));

@@ -1,4 +1,4 @@
-//! `vizflyt tags print`: a PDF, and the layout file beside it.
+//! `vizflyt tags print`: writes a PDF, and the layout file next to it.
 
 use std::path::{Path, PathBuf};
 
@@ -13,12 +13,13 @@ use vizflyt_tags::print::{
 
 use super::family;
 
-/// Prints a cube for the vehicle, a mat for the floor, or a board or checkerboard to calibrate with: a
-/// PDF, and the layout file beside it.
+/// Print tags: cube for the vehicle, mat for the floor, calibration board
+///
+/// Writes a PDF, and the layout file next to it.
 #[derive(Args, Debug)]
-#[command(after_help = "Print at 100 %, then measure the bar at the foot of a sheet. If it is not
-100.0 mm long, run the same command again with --bar-mm: the sheets stay the same, and the layout
-file has the tags' real sizes.")]
+#[command(after_help = "Print at 100 %, then measure the bar at the bottom of a sheet. If it is not
+100.0 mm long, run the same command again with --bar-mm: the sheets do not change, and the layout
+file gets the real sizes of the tags.")]
 pub(super) struct PrintArgs {
     #[command(subcommand)]
     object: PrintCommand,
@@ -26,89 +27,97 @@ pub(super) struct PrintArgs {
 
 #[derive(Subcommand, Debug)]
 enum PrintCommand {
-    /// Faces with folds and flaps: tags on the vehicle, seen by cameras in the room.
+    /// Cube with tags for the vehicle, seen by cameras in the room
     Cube {
         #[command(flatten)]
         common: Common,
-        /// Id of the front face; left, back, right, top, bottom follow.
+        /// Id of the front face; left, back, right, top, bottom follow
         #[arg(long, value_name = "ID", default_value_t = 0)]
         first_id: u32,
-        /// How many faces; 5 leaves out the bottom.
+        /// Number of faces; 5: without the bottom
         #[arg(long, value_name = "N", default_value_t = 5)]
         faces: u32,
-        /// Edge of the cube. [mm]
+        /// Edge of the cube [mm]
         #[arg(long, value_name = "MM", default_value_t = 170.0)]
         face_mm: f64,
-        /// Edge of a tag's black square. [mm]
+        /// Edge of a tag's black square [mm]
         #[arg(long, value_name = "MM", default_value_t = 132.0)]
         tag_mm: f64,
-        /// The cube's middle from the vehicle's: forward, left, up. [m]
+        /// Centre of the cube relative to the vehicle's: forward, left, up [m]
         #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
     },
-    /// A grid of tags over as many sheets as it takes: tags on the floor or a wall, seen by a camera
-    /// on the vehicle; also what cameras in the room are surveyed with.
+    /// Grid of tags for floor or wall, seen by a camera on the vehicle
+    ///
+    /// Printed on as many sheets as needed. Cameras in the room are also surveyed with it.
     Mat {
         #[command(flatten)]
         common: Common,
-        /// Id of the first tag; ids count eastwards, then northwards.
+        /// Id of the first tag; ids increase eastwards, then northwards
         #[arg(long, value_name = "ID", default_value_t = 100)]
         first_id: u32,
-        /// Tags from west to east.
+        /// Number of tags from west to east
         #[arg(long, value_name = "N", default_value_t = 4)]
         columns: u32,
-        /// Tags from south to north.
+        /// Number of tags from south to north
         #[arg(long, value_name = "N", default_value_t = 6)]
         rows: u32,
-        /// From one tag's middle to the next one's. [mm]
+        /// Distance between the centres of neighbouring tags [mm]
         #[arg(long, value_name = "MM", default_value_t = 95.0)]
         pitch_mm: f64,
-        /// Edge of a tag's black square. [mm]
+        /// Edge of a tag's black square [mm]
         #[arg(long, value_name = "MM", default_value_t = 70.0)]
         tag_mm: f64,
-        /// Length, width and height of a hall [m]: tags as large as webcams in its upper corners need to be surveyed by, on
-        /// the paper that takes.
+        /// Size the tags for a hall of this length, width and height [m]
+        ///
+        /// The tags are large enough for a survey of webcams in the upper corners. The paper size
+        /// follows from the tag size.
         #[arg(long, value_name = "LxWxH", value_parser = hall,
             conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper", "fly_over"])]
         for_hall: Option<DVec3>,
-        /// Length (east) and width (north) of where the vehicle flies with a webcam under it [m]: large tags half a metre apart,
-        /// one on a sheet of A3.
+        /// Size of the area that a vehicle with a webcam under it flies over [m]
+        ///
+        /// Length is east, width is north. Prints large tags half a metre apart, one per sheet of
+        /// A3.
         #[arg(long, value_name = "LxW", value_parser = area,
             conflicts_with_all = ["columns", "rows", "pitch_mm", "tag_mm", "paper"])]
         fly_over: Option<DVec2>,
-        /// Where it takes off or lands there: small tags for a camera 80 mm above the floor and more; east, north, and how far
-        /// the pad reaches [default: 0.5,0.35]. May be given several times. [m, room]
+        /// Pad for take-off and landing: centre east, north and size; can be repeated
+        ///
+        /// Small tags for a camera 80 mm or more above the floor. In metres, frame of the room.
+        /// [default size: 0.5,0.35]
         #[arg(long = "pad", value_name = "X,Y[,LENGTH,WIDTH]", value_parser = pad, allow_hyphen_values = true, requires = "fly_over")]
         pads: Vec<Pad>,
-        /// Where the grid's middle lies in the room: east, north, up. [m]
+        /// Centre of the grid in the room: east, north, up [m]
         #[arg(long, value_name = "X,Y,Z", default_value = "0,0,0", value_parser = three, allow_hyphen_values = true)]
         middle_m: DVec3,
     },
-    /// One sheet full of tags, to be glued on something flat and stiff.
+    /// Calibration board: one sheet of tags, to glue on a flat, stiff surface
     Board {
         #[command(flatten)]
         common: Common,
-        /// Id of the first tag.
+        /// Id of the first tag
         #[arg(long, value_name = "ID", default_value_t = 300)]
         first_id: u32,
-        /// Edge of a tag's black square. [mm]
+        /// Edge of a tag's black square [mm]
         #[arg(long, value_name = "MM", default_value_t = 30.0)]
         tag_mm: f64,
     },
-    /// One sheet of black and white squares, to be glued on something flat and stiff: to calibrate with
-    /// where other programs are to use the same images. It must be seen as a whole, the board of tags
-    /// in any part.
+    /// Checkerboard: one sheet, to glue on a flat, stiff surface
+    ///
+    /// For use of the same images with other calibration programs. The whole checkerboard must be
+    /// visible in an image; of the board of tags, any part is enough.
     Checkers {
-        /// The PDF; what is on it goes into a .toml file of the same name.
+        /// PDF to write; its layout goes into a .toml file of the same name
         #[arg(short, long, value_name = "FILE.pdf")]
         output: PathBuf,
-        /// What to print on.
+        /// Paper size
         #[arg(long, value_enum, default_value_t = PaperName::A4)]
         paper: PaperName,
-        /// Edge of a square. [mm]
+        /// Edge of a square [mm]
         #[arg(long, value_name = "MM", default_value_t = 25.0)]
         square_mm: f64,
-        /// What the printed scale bar measures. [mm]
+        /// Measured length of the printed scale bar [mm]
         #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
         bar_mm: f64,
     },
@@ -116,16 +125,16 @@ enum PrintCommand {
 
 #[derive(Args, Debug)]
 struct Common {
-    /// The PDF; the layout goes into a .toml file of the same name.
+    /// PDF to write; its layout goes into a .toml file of the same name
     #[arg(short, long, value_name = "FILE.pdf")]
     output: PathBuf,
-    /// What to print on.
+    /// Paper size
     #[arg(long, value_enum, default_value_t = PaperName::A4)]
     paper: PaperName,
-    /// Which tags.
+    /// Tag family
     #[arg(long, value_name = "NAME", default_value = "tag36h11", value_parser = family)]
     family: TagFamily,
-    /// What the printed scale bar measures. [mm]
+    /// Measured length of the printed scale bar [mm]
     #[arg(long, value_name = "MM", default_value_t = BAR_MM)]
     bar_mm: f64,
 }
@@ -160,7 +169,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
                 print_line(format_args!("  {name:<6} {} {}", tag.family, tag.id));
             }
             print_line(format_args!(
-                "Glue it on a cube of {:.1} mm, each name where the vehicle has it.",
+                "Glue it on a cube of {:.1} mm, each face where its name says.",
                 face_mm * bar_mm / BAR_MM
             ));
         }
@@ -194,7 +203,8 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
                     ));
                     if px < READ_FROM_PX {
                         print_line(format_args!(
-                            "That is too few: lay the mat nearer to the cameras, one after the other, or take narrower lenses."
+                            "That is too small: put the mat nearer to the cameras, one after the other, \
+                             or use narrower lenses."
                         ));
                     }
                     mat
@@ -214,7 +224,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
             finish("mat", common, mat.paper, &mat.print()?)?;
             print_line(format_args!(
                 "Join the sheets edge to edge, columns to the east, rows to the north; then survey it: \
-                 glued paper is off by millimetres."
+                 glued paper has errors of millimetres."
             ));
         }
         PrintCommand::Board { ref common, first_id, tag_mm } => {
@@ -222,7 +232,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
             let board = Mat::board(family, first_id, tag_mm, paper.into(), bar_mm)?;
             finish("board", common, board.paper, &board.print()?)?;
             print_line(format_args!(
-                "Glue it on something flat and stiff: a lens is only as straight as the board."
+                "Glue it on a flat, stiff surface: a bent board gives a wrong calibration."
             ));
         }
         PrintCommand::Checkers { ref output, paper, square_mm, bar_mm } => {
@@ -238,18 +248,18 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
                 board.square_m * 1e3
             ));
             print_line(format_args!(
-                "{}: what is on it, for `tags calibrate --board`",
+                "{}: layout, for `tags calibrate --board`",
                 file.display()
             ));
             print_line(format_args!(
-                "Glue it on something flat and stiff: a lens is only as straight as the board."
+                "Glue it on a flat, stiff surface: a bent board gives a wrong calibration."
             ));
         }
     }
     Ok(())
 }
 
-/// Prints a mat to fly over, and says what lies where.
+/// Prints a mat to fly over, and the positions of its pads.
 fn print_floor(common: &Common, floor: &Floor) -> Result<()> {
     finish("mat", common, Paper::A3, &floor.print()?)?;
     for Mat { first_id, columns, rows, middle_m, .. } in floor.pads() {
@@ -261,17 +271,18 @@ fn print_floor(common: &Common, floor: &Floor) -> Result<()> {
         ));
     }
     print_line(format_args!(
-        "Lay each large tag's middle where its sheet says, and join a pad's sheets edge to edge; then survey it all: \
-         a tape is off by millimetres."
+        "Put the centre of each large tag at the position on its sheet, \
+         and join a pad's sheets edge to edge; then survey it all: \
+         a tape measure has errors of millimetres."
     ));
     Ok(())
 }
 
-/// Returns the file beside the PDF that describes its content.
+/// Returns the path of the layout file, next to the PDF.
 fn beside(pdf: &Path) -> Result<PathBuf> {
     let layout = pdf.with_extension("toml");
     if layout == *pdf {
-        anyhow::bail!("{}: the layout is to be written there; name the PDF .pdf", pdf.display());
+        anyhow::bail!("{}: this is the path of the layout; use a PDF name ending in .pdf", pdf.display());
     }
     Ok(layout)
 }
@@ -283,7 +294,7 @@ fn finish(title: &str, common: &Common, paper: Paper, printed: &Printed) -> Resu
     write(&layout, printed.layout.to_toml()?.as_bytes())?;
     let (sheets, tags) = (printed.sheets.len(), printed.layout.tags.len());
     print_line(format_args!("{}: {sheets} sheets of {paper}, {tags} tags", path.display()));
-    print_line(format_args!("{}: where they are", layout.display()));
+    print_line(format_args!("{}: their positions", layout.display()));
     Ok(())
 }
 
@@ -291,13 +302,13 @@ fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Reads the size of a hall: `11x4.5x3.65`. [m]
+/// Parses the size of a hall: `11x4.5x3.65`. [m]
 fn hall(text: &str) -> Result<DVec3, String> {
     three(&text.replace('x', ","))
         .map_err(|_| "give LENGTHxWIDTHxHEIGHT in metres: 11x4.5x3.65".into())
 }
 
-/// Reads an area: `11x4.5`. [m]
+/// Parses an area: `11x4.5`. [m]
 fn area(text: &str) -> Result<DVec2, String> {
     let numbers = numbers(&text.replace('x', ","));
     match numbers.as_deref() {
@@ -306,7 +317,7 @@ fn area(text: &str) -> Result<DVec2, String> {
     }
 }
 
-/// Reads a pad: `0.9,0` or `10,0,1.2,0.35`. [m]
+/// Parses a pad: `0.9,0` or `10,0,1.2,0.35`. [m]
 pub(super) fn pad(text: &str) -> Result<Pad, String> {
     match numbers(text)?[..] {
         [x, y] => Ok(Pad { middle_m: DVec2::new(x, y), size_m: Pad::SIZE_M }),
@@ -317,19 +328,19 @@ pub(super) fn pad(text: &str) -> Result<Pad, String> {
     }
 }
 
-/// Smaller tags are not read reliably. [px]
+/// Minimum size of a tag for reliable detection. [px]
 const READ_FROM_PX: f64 = 20.0;
 
-/// Reads three numbers with commas between them.
+/// Parses three numbers separated by commas.
 fn three(text: &str) -> Result<DVec3, String> {
     let [x, y, z] = numbers(text)?[..] else { return Err("give three numbers: X,Y,Z".into()) };
     Ok(DVec3::new(x, y, z))
 }
 
-/// Reads finite numbers with commas between them.
+/// Parses finite numbers separated by commas.
 fn numbers(text: &str) -> Result<Vec<f64>, String> {
     let number = |part: &str| part.trim().parse().ok().filter(|number: &f64| number.is_finite());
     text.split(',')
-        .map(|part| number(part).ok_or_else(|| format!("{part:?} is no number")))
+        .map(|part| number(part).ok_or_else(|| format!("{part:?} is not a number")))
         .collect()
 }

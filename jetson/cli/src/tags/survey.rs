@@ -1,4 +1,4 @@
-//! `vizflyt tags survey`: where the mat's tags really are, and where fixed cameras are.
+//! `vizflyt tags survey`: measures the poses of a mat's tags, and of fixed cameras.
 
 use std::io::BufRead as _;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use vizflyt_tags::family::TagFamily;
 use vizflyt_tags::layout::{LayoutFrame, TagLayout};
 use vizflyt_tags::survey::{self, CameraImages, CubeScale, Picker};
 
-/// Measures where a mat's tags really are, and where fixed cameras are.
+/// Survey the tags of a mat, or fixed cameras
 #[derive(Args, Debug)]
 pub(super) struct SurveyArgs {
     #[command(subcommand)]
@@ -26,49 +26,52 @@ enum SurveyCommand {
     Cameras(CamerasArgs),
 }
 
-/// Finds where each tag lies, from a video or images of one calibrated camera carried over them.
+/// Measure the pose of each tag of a mat, with one calibrated camera
 #[derive(Args, Debug)]
-#[command(after_help = "Carry the camera slowly, half a metre to a metre above the mat, along and
-across it, tilted now and then; every image must show two tags or more. A video of a minute is plenty.")]
+#[command(after_help = "Carry the camera slowly, 0.5 to 1 m above the mat, along and across it,
+sometimes tilted. Every image must show at least two tags. A video of one minute is enough.")]
 struct MatArgs {
-    /// Where images come from: a folder, a video file, or as for calibrate.
+    /// Source of images: a folder, a video file, or as for `tags calibrate`
     source: String,
-    /// The camera's file, from `vizflyt tags calibrate`.
+    /// Camera file from `vizflyt tags calibrate`
     #[arg(long, value_name = "FILE.toml")]
     camera: PathBuf,
-    /// The mat's layout, from `vizflyt tags print mat`: sizes, and the frame of the room.
+    /// Layout of the mat from `vizflyt tags print mat`
     #[arg(long, value_name = "FILE.toml")]
     layout: PathBuf,
-    /// The surveyed layout.
+    /// Surveyed layout to write
     #[arg(short, long, value_name = "FILE.toml")]
     output: PathBuf,
-    /// Lay the frame of the room by this tag alone, where the layout has it; without it, by the best
-    /// fit of all.
+    /// Tag that defines the frame of the room, at its pose in the layout
+    ///
+    /// Without this option, the frame is the best fit of all tags.
     #[arg(long, value_name = "ID")]
     anchor: Option<u32>,
-    /// Survey tags that are not on the layout, too: the edge of their black squares. [mm]
+    /// Edge of the black squares of tags outside the layout, to survey them too [mm]
     #[arg(long, value_name = "MM")]
     others_mm: Option<f64>,
-    /// Take images of a live camera for so long. [s]
+    /// Duration of the recording from a live camera [s]
     #[arg(long, value_name = "S", default_value_t = 60.0)]
     seconds: f64,
 }
 
-/// Finds where fixed cameras are, from what each sees of a surveyed mat, or of a cube that is carried
-/// where several see it; writes it into their files.
+/// Measure the poses of fixed cameras from a surveyed mat or a carried cube
+///
+/// Cameras that do not see the mat need the cube, carried where several cameras see it. Writes the
+/// poses into the camera files.
 #[derive(Args, Debug)]
 #[command(
     after_help = "Live cameras: hold the cube still, press Enter, carry it on; ten places all
-over the room are plenty. Folders: images of the same number belong together."
+over the room are enough. Folders: images with the same number belong together."
 )]
 struct CamerasArgs {
-    /// The cameras' files; FILE.toml=SOURCE where images come from another source than the file's.
+    /// Camera files; FILE.toml=SOURCE selects another source of images
     #[arg(required = true, value_name = "FILE.toml[=SOURCE]")]
     cameras: Vec<String>,
-    /// The mat's surveyed layout.
+    /// Surveyed layout of the mat
     #[arg(long, value_name = "FILE.toml")]
     mat: PathBuf,
-    /// The cube's layout, for cameras that do not see the mat.
+    /// Layout of the cube, for cameras that do not see the mat
     #[arg(long, value_name = "FILE.toml")]
     cube: Option<PathBuf>,
 }
@@ -146,7 +149,7 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
         };
         let camera = TagCamera::read(&path)?;
         let Some(source) = source.or_else(|| camera.source.clone()) else {
-            bail!("{}: it names no source; give {}=SOURCE", path.display(), path.display());
+            bail!("{}: no source in the file; give {}=SOURCE", path.display(), path.display());
         };
         sources.push(capture::open(&source)?);
         files.push((path, source, camera));
@@ -220,16 +223,17 @@ fn cameras(args: &CamerasArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns what is known of the cube's size, and what to do.
+/// Returns the estimated size of the cube, and what to do.
 fn cube_size(CubeScale { scale, sigma }: CubeScale) -> String {
     let (percent, give_or_take) = (1e2 * scale, 1e2 * sigma);
     if !(sigma < UNKNOWN_SCALE) {
-        "cube: its size cannot be known from these images, as no two cameras see the mat: measure its tags with a \
-         ruler, or lay the mat where two cameras see it"
+        "cube: its size cannot be estimated from these images, as no two cameras see the mat: measure its tags with a \
+         ruler, or put the mat where two cameras see it"
             .into()
     } else if (scale - 1.0).abs() > (4.0 * sigma).max(WRONG_SCALE) {
         format!(
-            "cube: it has {percent:.1} +- {give_or_take:.1} % of its layout's size; cameras are placed by that. Print it \
+            "cube: it has {percent:.1} +- {give_or_take:.1} % of its layout's size; the survey uses this size. \
+             Print it \
              again at 100 %, or its layout with --bar-mm {percent:.1}"
         )
     } else {
@@ -237,7 +241,7 @@ fn cube_size(CubeScale { scale, sigma }: CubeScale) -> String {
     }
 }
 
-/// Returns the next image; of a live camera the newest, past those that its driver has kept.
+/// Returns the next image; of a live camera the newest, without those in the driver's buffer.
 fn newest(
     source: &mut dyn ImageSource,
     is_live: bool,
@@ -280,7 +284,7 @@ fn check_size(camera: &TagCamera, image: &vizflyt_tags::image::Gray, source: &st
     let k = &camera.intrinsics;
     if (image.width_px(), image.height_px()) != (k.width_px, k.height_px) {
         bail!(
-            "{source}: images of {}x{}, but camera {:?} was calibrated at {}x{}; a calibration holds \
+            "{source}: images of {}x{}, but camera {:?} was calibrated at {}x{}; a calibration is valid \
              for one size",
             image.width_px(),
             image.height_px(),
@@ -292,11 +296,11 @@ fn check_size(camera: &TagCamera, image: &vizflyt_tags::image::Gray, source: &st
     Ok(())
 }
 
-/// Of a size that is known worse nothing is said.
+/// Maximum uncertainty of an estimated size.
 const UNKNOWN_SCALE: f64 = 0.02;
-/// A cube that is off by less is as printers and scissors are.
+/// Maximum deviation of the size that is due to printers and scissors.
 const WRONG_SCALE: f64 = 0.004;
-/// Images that a driver has buffered before the newest.
+/// Number of images in the driver's buffer.
 const STALE: usize = 4;
-/// Images of a mat that does not move: noise averages out.
+/// Number of images of a mat that does not move: averages the noise.
 const STILLS: usize = 20;

@@ -1,4 +1,5 @@
-//! A hand-in as one ZIP. Whoever made it: it names no place outside and no link, and holds no more than [`MOST_BYTES`].
+//! A submission as a ZIP archive. Archives may be malicious: `open` rejects paths outside the
+//! archive, links, and more than [`MOST_BYTES`].
 
 use std::collections::BTreeMap;
 use std::io::{Cursor, Read, Write};
@@ -8,15 +9,15 @@ use anyhow::{Context, Result, ensure};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
-/// All files together. [bytes]
+/// Maximum size of all files together. [bytes]
 pub const MOST_BYTES: u64 = 200 << 20;
-/// How many they may be.
+/// Maximum number of files.
 pub const MOST_FILES: usize = 5000;
 
-/// A hand-in's files by their paths, with `/`.
+/// Files of a submission by path, with `/`.
 pub type Files = BTreeMap<String, Vec<u8>>;
 
-/// Makes an archive: the same files make the same bytes.
+/// Makes an archive; equal files give equal bytes.
 pub fn pack(files: &Files) -> Result<Vec<u8>> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default()
@@ -29,7 +30,7 @@ pub fn pack(files: &Files) -> Result<Vec<u8>> {
     Ok(archive.finish()?.into_inner())
 }
 
-/// Reads an archive that anybody may have made.
+/// Reads an untrusted archive.
 pub fn open(bytes: &[u8]) -> Result<Files> {
     let mut archive = ZipArchive::new(Cursor::new(bytes))?;
     ensure!(archive.len() <= MOST_FILES, "{} files are more than {MOST_FILES}", archive.len());
@@ -44,14 +45,14 @@ pub fn open(bytes: &[u8]) -> Result<Files> {
         let is_within = !name.contains(['\\', '\0'])
             && !name.is_empty()
             && Path::new(&name).components().all(|part| matches!(part, Component::Normal(_)));
-        ensure!(is_within, "'{}' leads out of it", name.escape_debug());
+        ensure!(is_within, "'{}' leads out of the archive", name.escape_debug());
         ensure!(part.is_file(), "'{}' is a link", name.escape_debug());
-        // What it says of its size is its own word.
+        // The size in the archive's header is not trusted.
         let mut content = Vec::new();
         part.take(left + 1).read_to_end(&mut content)?;
         left = left
             .checked_sub(content.len() as u64)
-            .with_context(|| format!("it holds more than {MOST_BYTES} bytes"))?;
+            .with_context(|| format!("the archive contains more than {MOST_BYTES} bytes"))?;
         let name = Path::new(&name)
             .components()
             .map(|part| part.as_os_str().to_string_lossy())
@@ -59,18 +60,18 @@ pub fn open(bytes: &[u8]) -> Result<Files> {
             .join("/");
         ensure!(
             files.insert(name.clone(), content).is_none(),
-            "'{}' is there twice",
+            "'{}' occurs twice",
             name.escape_debug()
         );
     }
     for path in files.keys() {
         let is_folder = path.match_indices('/').any(|(at, _)| files.contains_key(&path[..at]));
-        ensure!(!is_folder, "'{}' lies in a file", path.escape_debug());
+        ensure!(!is_folder, "'{}' has a file as its parent folder", path.escape_debug());
     }
     Ok(files)
 }
 
-/// Takes off the folder that other programs put about all files.
+/// Removes the outer folder that other programs put around all files.
 pub fn without_outer_folder(files: Files) -> Files {
     let outer = files
         .keys()
@@ -97,26 +98,26 @@ mod tests {
     }
 
     #[test]
-    fn the_folder_about_all_files_is_taken_off() {
+    fn removes_the_outer_folder() {
         let inner = files(&["net/w.onnx", "plugin.py"]);
-        // As a file manager packs a folder.
+        // File managers pack the folder itself.
         let outer = inner.iter().map(|(path, content)| (format!("p4/{path}"), content.clone()));
         assert_eq!(without_outer_folder(outer.collect()), inner);
         assert_eq!(without_outer_folder(inner.clone()), inner);
     }
 
     #[test]
-    fn an_archive_leads_nowhere_else_and_grows_to_no_size() {
+    fn rejects_paths_outside_the_archive_links_and_large_contents() {
         for path in ["../up", "/etc/x", "a/../../x", "a\\..\\x"] {
             let error = open(&pack(&files(&[path])).unwrap()).unwrap_err().to_string();
             assert!(error.contains("leads out"), "{path}: {error}");
         }
         let error = open(&pack(&files(&["a", "a/b"])).unwrap()).unwrap_err().to_string();
-        assert!(error.contains("lies in a file"), "{error}");
+        assert!(error.contains("has a file as its parent folder"), "{error}");
         let bomb = BTreeMap::from([("zeros".to_owned(), vec![0; (MOST_BYTES + 1) as usize])]);
         let bytes = pack(&bomb).unwrap();
         assert!(bytes.len() < 1 << 20, "{}", bytes.len());
-        assert!(open(&bytes).unwrap_err().to_string().contains("holds more than"));
+        assert!(open(&bytes).unwrap_err().to_string().contains("contains more than"));
         let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
         archive.add_symlink("x", "/etc/passwd", SimpleFileOptions::default()).unwrap();
         let bytes = archive.finish().unwrap().into_inner();
@@ -125,7 +126,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_bytes_are_read_or_refused(at in 0usize..300, value: u8, cut in 0usize..300) {
+        fn reads_or_rejects_any_bytes(at in 0usize..300, value: u8, cut in 0usize..300) {
             let mut bytes = pack(&files(&["plugin.py", "net/w.onnx"])).unwrap();
             let at = at % bytes.len();
             bytes[at] = value;

@@ -1,10 +1,12 @@
-//! A class's hand-ins: `vizflyt submit` makes a team's, `vizflyt grade-class` grades all of them.
+//! Submissions of a class: `vizflyt submit` packs one, `vizflyt grade-class` grades all.
 //!
 //! ```text
-//! roster.csv ── team ─▶ SUBMISSIONS/team.zip, or a folder ─▶ DIR/plugins/team ─▶ `vizflyt grade --resume`, a process of its own
-//! DIR/reports/team: each report, signed      DIR/grades.csv: the roster and what each has      DIR/index.html
+//! roster.csv ── team ─▶ SUBMISSIONS/team.zip, or a folder ─▶ DIR/plugins/team
+//!               ─▶ `vizflyt grade --resume` in a separate process
+//! DIR/reports/team: each report, signed      DIR/grades.csv: the roster with results      DIR/index.html
 //! ```
-//! It can be ended at any time and begun again: what is graded, of the same hand-in and with the same options, is kept.
+//! The command can be interrupted and repeated at any time: grades of the same submission with the
+//! same options are kept.
 
 pub mod archive;
 mod page;
@@ -28,43 +30,44 @@ pub use self::submission::{SubmitArgs, submit};
 use crate::GradeArgs;
 use crate::{Grade, verified};
 
-/// Grades every team of a class, one after the other, and makes one table of all.
+/// Grade every team of a class, and write one table of results
 #[derive(Args, Debug)]
 #[command(
-    after_help = "ROSTER.csv has a line of headings, among them `team`; its other columns are kept. A team's hand-in is
-SUBMISSIONS/TEAM.zip, as `vizflyt submit` makes it, or a folder SUBMISSIONS/TEAM. Whoever has none gets 0.
-What follows DIR is for `vizflyt grade`. Begun again, it grades what is new or was changed.
+    after_help = "ROSTER.csv has a line of headings, one of them `team`; its other columns are
+kept. A team's submission is SUBMISSIONS/TEAM.zip, as `vizflyt submit` makes it, or a folder SUBMISSIONS/TEAM.
+Without one, the score is 0. Options after DIR are for `vizflyt grade`. If repeated, the command grades new
+and changed submissions.
 
 Examples:
   vizflyt grade-class roster.csv submissions grades --project p4 --seeds 20 --first-seed @secret.txt
   vizflyt grade-class --own-seeds roster.csv submissions grades --project p5 --level g"
 )]
 pub struct ClassArgs {
-    /// Each team flies courses of its own, that follow from the first seed and its name
+    /// Different courses for each team; seeds follow from the first seed and team name
     #[arg(long)]
     own_seeds: bool,
-    /// The class, a team a line
+    /// Roster of the class, one team per line
     #[arg(value_name = "ROSTER.csv")]
     roster: PathBuf,
-    /// Where the hand-ins are
+    /// Folder of submissions
     #[arg(value_name = "SUBMISSIONS")]
     submissions: PathBuf,
-    /// Where grades.csv, index.html and the teams' reports go
+    /// Folder for grades.csv, index.html and the reports of the teams
     #[arg(value_name = "DIR")]
     output: PathBuf,
-    /// Options of `vizflyt grade`, the same for all
+    /// Options of `vizflyt grade`, the same for all teams
     #[arg(value_name = "OPTION OF GRADE", trailing_var_arg = true, allow_hyphen_values = true)]
     options: Vec<OsString>,
 }
 
-/// What a team has.
+/// Result of a team.
 struct Graded<'a> {
     team: &'a Team,
     submission: String,
     result: Result<Grade, String>,
 }
 
-/// Of which hand-in a report is, and how it was flown.
+/// Submission and options of a report.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Flown {
     submission_sha256: String,
@@ -75,7 +78,7 @@ struct Flown {
 pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
     let roster = Roster::read(&args.roster)?;
     check_options(&args.options)?;
-    ensure!(args.submissions.is_dir(), "{} is no folder of hand-ins", args.submissions.display());
+    ensure!(args.submissions.is_dir(), "{} is not a folder of submissions", args.submissions.display());
     let program = std::env::current_exe().context("cannot find this program's path")?;
     let mut all = Vec::with_capacity(roster.teams.len());
     for (index, team) in roster.teams.iter().enumerate() {
@@ -87,7 +90,7 @@ pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
             print_fmt!("    no grade: {why}");
         }
         all.push(Graded { team, submission, result });
-        // After each, so that one who looks in the morning sees how far it is.
+        // Written after each team, so that the table shows the progress.
         let table = roster.with_grades(&all)?;
         write(&args.output.join("grades.csv"), table.as_bytes())?;
         write(&args.output.join("index.html"), page::page(&all).as_bytes())?;
@@ -99,7 +102,8 @@ pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Refuses what `vizflyt grade` would refuse for every team, and what is given here.
+/// Rejects options that `vizflyt grade` would reject for every team, and options that this command
+/// sets.
 fn check_options(options: &[OsString]) -> Result<()> {
     let ours = [
         "--report", "--resume", "--output", "-o", "--json", "--least", "--junit", "--shard",
@@ -121,14 +125,14 @@ fn check_options(options: &[OsString]) -> Result<()> {
     Ok(())
 }
 
-/// The command line of `vizflyt grade`, to check options by.
+/// Command line of `vizflyt grade`, to check the options.
 #[derive(Parser)]
 struct GradeLine {
     #[command(flatten)]
     _args: GradeArgs,
 }
 
-/// Grades one team, or returns the grade that it has.
+/// Grades one team, or returns its earlier grade.
 fn grade_team(
     args: &ClassArgs,
     program: &Path,
@@ -143,7 +147,7 @@ fn grade_team(
     }
     let flown = Flown {
         submission_sha256: submission.clone(),
-        // The secret seed stays out of it.
+        // Options are stored as hashes, so that a secret seed is not stored.
         options: options.iter().map(|option| hash(option.as_encoded_bytes())).collect(),
     };
     let [plugin, report, kept] =
@@ -178,11 +182,12 @@ fn grade_team(
         .args(hidden.iter().flat_map(|path| [OsStr::new("--hide"), path.as_os_str()]))
         .status()
         .context("cannot start vizflyt grade")?;
-    ensure!(status.success(), "vizflyt grade ended with {status}; it says why above");
+    ensure!(status.success(), "vizflyt grade ended with {status}; see its messages above");
     Grade::read(&grade_file)
 }
 
-/// Returns the grade of an earlier run, if it is as it was signed; one without a signature says so in the table.
+/// Returns the grade of an earlier run, if its signature is valid. A grade without a signature is
+/// also returned; the table marks it.
 fn kept_grade(file: &Path, options: &[OsString]) -> Result<Grade> {
     let grade = Grade::read(file)?;
     if grade.signature.is_none() {
@@ -198,7 +203,8 @@ fn kept_grade(file: &Path, options: &[OsString]) -> Result<Grade> {
     verified(file, None, keys.as_deref())
 }
 
-/// Returns what a team's plugin must not read: what others have handed in, and how they fared.
+/// Returns the paths that a team's plugin must not read: submissions and results of the other
+/// teams.
 fn hidden(args: &ClassArgs, plugin: &Path) -> Result<Vec<PathBuf>> {
     let within = |folder: &Path| -> Result<Vec<PathBuf>> {
         let read =
@@ -213,7 +219,7 @@ fn hidden(args: &ClassArgs, plugin: &Path) -> Result<Vec<PathBuf>> {
     Ok(hidden)
 }
 
-/// Puts the team's own first seed in the place of the given one.
+/// Replaces the first seed by the team's own.
 fn own_seed(options: &mut Vec<OsString>, team: &str) -> Result<()> {
     let mut given = String::from("1");
     let mut index = 0;
@@ -233,7 +239,7 @@ fn own_seed(options: &mut Vec<OsString>, team: &str) -> Result<()> {
         given = fs::read_to_string(path).with_context(|| format!("cannot read {path}"))?;
     }
     let digest = Sha256::digest(format!("{}\0{team}", given.trim()));
-    // 48 bits: the seeds that follow stay whole numbers everywhere.
+    // 48 bits: JSON readers with floating-point numbers keep all following seeds exact.
     let seed = digest[..6].iter().fold(0, |seed: u64, byte| seed << 8 | u64::from(*byte));
     options.extend(["--first-seed".into(), seed.to_string().into()]);
     Ok(())
@@ -243,7 +249,7 @@ fn hash(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
-/// Writes a file whole, and its folder.
+/// Writes a file atomically, and makes its folder.
 fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let cannot = || format!("cannot write {}", path.display());
     let folder = path.parent().unwrap_or(Path::new("."));
@@ -259,7 +265,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_teams_seeds_are_its_own_and_follow_from_the_secret() {
+    fn a_teams_seeds_are_unique_and_follow_from_the_secret() {
         let seed = |options: &[&str], team: &str| {
             let mut options: Vec<OsString> = options.iter().map(OsString::from).collect();
             own_seed(&mut options, team).unwrap();

@@ -1,11 +1,11 @@
-//! All grades of a class on one page, best first.
+//! Page with all grades of a class, best first.
 
 use std::fmt::Write;
 
 use super::Graded;
 use crate::report::escape;
 
-/// Returns the page; its links lead to the teams' reports beside it.
+/// Returns the page. It links to the reports of the teams, in the folder next to it.
 pub(super) fn page(all: &[Graded<'_>]) -> String {
     let mut rows: Vec<&Graded<'_>> = all.iter().collect();
     let score =

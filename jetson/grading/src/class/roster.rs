@@ -1,4 +1,4 @@
-//! The class as a table: which teams there are; and the same table with what each has.
+//! Roster of a class: its teams, and the same table with their results.
 
 use std::path::Path;
 
@@ -6,23 +6,21 @@ use anyhow::{Context, Result, ensure};
 
 use super::Graded;
 
-/// A team.
 #[derive(Debug, PartialEq)]
 pub(super) struct Team {
-    /// Names its hand-in and its folders.
+    /// Name of the team, of its submission and of its folders.
     pub(super) name: String,
-    /// Its line of the roster.
+    /// Line of the roster.
     row: Vec<String>,
 }
 
-/// A class.
 #[derive(Debug, PartialEq)]
 pub(super) struct Roster {
     headings: Vec<String>,
     pub(super) teams: Vec<Team>,
 }
 
-/// Headings of what is added.
+/// Headings of the added columns.
 const ADDED: [&str; 12] = [
     "score",
     "score_low",
@@ -42,7 +40,7 @@ impl Roster {
     /// Reads a file.
     ///
     /// # Errors
-    /// What is wrong with it, by its line.
+    /// The first error, with its line.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let context = || format!("cannot use {} as a roster", path.display());
         let text = std::fs::read_to_string(path).with_context(context)?;
@@ -50,7 +48,7 @@ impl Roster {
     }
 
     fn parse(text: &str) -> Result<Self> {
-        // Spreadsheets begin with a mark.
+        // Spreadsheets write a byte order mark.
         let mut reader = csv::ReaderBuilder::new()
             .trim(csv::Trim::All)
             .from_reader(text.trim_start_matches('\u{feff}').as_bytes());
@@ -68,19 +66,19 @@ impl Roster {
                 && name.chars().all(|c| c.is_alphanumeric() || "-_. ".contains(c));
             ensure!(
                 is_good,
-                "line {line}: '{name}' names no team: give letters, digits, - _ . and blanks, at most 64"
+                "line {line}: '{name}' is not a valid team name: use letters, digits, - _ . and spaces, at most 64"
             );
             ensure!(
                 teams.iter().all(|team| team.name != name),
-                "line {line}: team '{name}' is there twice"
+                "line {line}: team '{name}' occurs twice"
             );
             teams.push(Team { name, row: record.iter().map(str::to_owned).collect() });
         }
-        ensure!(!teams.is_empty(), "no team is in it");
+        ensure!(!teams.is_empty(), "the roster contains no team");
         Ok(Self { headings, teams })
     }
 
-    /// Returns the table with the grades so far, for spreadsheets.
+    /// Returns the table with the present grades, for spreadsheets.
     pub(super) fn with_grades(&self, graded: &[Graded<'_>]) -> Result<String> {
         let mut table = csv::Writer::from_writer(Vec::new());
         table.write_record(self.headings.iter().map(String::as_str).chain(ADDED))?;
@@ -111,7 +109,7 @@ impl Roster {
                     let mut added: [String; 12] = Default::default();
                     "0".clone_into(&mut added[0]);
                     added[10].clone_from(&one.submission);
-                    // What a cell begins with is taken for a formula.
+                    // Prefix the text: spreadsheets execute a cell that begins with =.
                     added[11] = format!("no grade: {why}");
                     added
                 }
@@ -129,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_roster_keeps_its_columns_and_names_what_is_wrong() {
+    fn keeps_the_columns_and_reports_errors() {
         let roster =
             Roster::parse("\u{feff}Section, Team ,members\n1, red ,\"A, B\"\n2,blue-2,C\n")
                 .unwrap();
@@ -147,9 +145,9 @@ mod tests {
         for (text, told) in [
             ("name\nred\n", "headed 'team'"),
             ("team\n", "no team"),
-            ("team\nred\nred\n", "line 3: team 'red' is there twice"),
-            ("team\n../up\n", "line 2: '../up' names no team"),
-            ("team\n.git\n", "names no team"),
+            ("team\nred\nred\n", "line 3: team 'red' occurs twice"),
+            ("team\n../up\n", "line 2: '../up' is not a valid team name"),
+            ("team\n.git\n", "is not a valid team name"),
             ("team,x\nred\n", "1 field"),
         ] {
             let error = format!("{:#}", Roster::parse(text).unwrap_err());
@@ -159,7 +157,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_name_leads_out_of_a_folder(name in "\\PC{0,20}") {
+        fn rejects_names_that_lead_out_of_a_folder(name in "\\PC{0,20}") {
             if let Ok(roster) = Roster::parse(&format!("team\n{name}\n")) {
                 for team in roster.teams {
                     prop_assert!(std::path::Path::new(&team.name).components().count() == 1);

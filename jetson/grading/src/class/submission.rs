@@ -1,4 +1,5 @@
-//! A team's hand-in: the files of its plugin's folder, packed by `vizflyt submit` and unpacked by `vizflyt grade-class`.
+//! A team's submission: files of the plugin's folder, packed by `vizflyt submit` and unpacked by
+//! `vizflyt grade-class`.
 
 use std::fs::{self, File};
 use std::io::{self, Read};
@@ -15,23 +16,23 @@ use super::archive::{Files, MOST_BYTES, MOST_FILES, open, pack, without_outer_fo
 use super::{hash, write};
 use crate::plugin::Plugin;
 
-/// Folders that a computer makes by itself.
+/// Generated folders, which are not packed.
 const MADE: [&str; 4] = ["target", "__pycache__", "node_modules", "flights"];
 
-/// Packs a plugin's folder as a team hands it in.
+/// Pack the folder of a plugin for submission
 #[derive(Args, Debug)]
 #[command(
-    after_help = "What begins with a dot stays out (.venv, .git), and so do target, __pycache__, node_modules, flights, *.pyc and
-*.mcap. The same files make the same archive, so its SHA-256 says what was handed in.
+    after_help = "Not packed: names that begin with a dot (.venv, .git), target, __pycache__, node_modules, flights,
+*.pyc and *.mcap. The same files give the same archive, so its SHA-256 identifies the submission.
 
 Examples:
   vizflyt submit p4 -o red.zip            for team red; then hand red.zip in
   vizflyt grade p4 --project p4 --seeds 20 --first-seed 1000      before that: practice, on other seeds"
 )]
 pub struct SubmitArgs {
-    /// The plugin's folder
+    /// Folder of the plugin
     folder: PathBuf,
-    /// The archive; call it as your team is called [default: FOLDER.zip]
+    /// Archive to write; name it after the team [default: FOLDER.zip]
     #[arg(short, long, value_name = "TEAM.zip")]
     output: Option<PathBuf>,
 }
@@ -39,7 +40,7 @@ pub struct SubmitArgs {
 /// Runs `vizflyt submit`.
 pub fn submit(args: &SubmitArgs) -> Result<ExitCode> {
     let folder = &args.folder;
-    ensure!(folder.is_dir(), "{} is no folder; give that of your plugin", folder.display());
+    ensure!(folder.is_dir(), "{} is not a folder; give the folder of the plugin", folder.display());
     Plugin::find(folder.as_os_str())?;
     let files = read_folder(folder)?;
     let bytes = pack(&files)?;
@@ -57,32 +58,33 @@ pub fn submit(args: &SubmitArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What a team has handed in.
+/// Submission of a team.
 pub(super) enum Submission {
     Folder(PathBuf),
     Archive(PathBuf),
 }
 
-/// Finds a team's hand-in.
+/// Finds the submission of a team.
 ///
 /// # Errors
-/// There is none, or two.
+/// If there is none, or both a folder and an archive.
 pub(super) fn find(submissions: &Path, team: &str) -> Result<Submission> {
     let (folder, archive) = (submissions.join(team), submissions.join(format!("{team}.zip")));
     match (folder.is_dir(), archive.is_file()) {
         (true, true) => {
-            bail!("there are both {} and {}; leave one", folder.display(), archive.display())
+            bail!("{} and {} both exist; delete one of them", folder.display(), archive.display())
         }
         (true, false) => Ok(Submission::Folder(folder)),
         (false, true) => Ok(Submission::Archive(archive)),
         (false, false) => {
-            bail!("nothing handed in: neither {} nor a folder of that name", archive.display())
+            bail!("nothing submitted: neither {} nor a folder of that name", archive.display())
         }
     }
 }
 
 impl Submission {
-    /// Returns the hash of an archive, or of the archive that a folder would be.
+    /// Returns the hash of the archive; of a folder, the hash of the archive that `pack` makes of
+    /// it.
     pub(super) fn sha256(&self) -> Result<String> {
         match self {
             Self::Folder(folder) => Ok(hash(&pack(&read_folder(folder)?)?)),
@@ -96,15 +98,15 @@ impl Submission {
         }
     }
 
-    /// Writes its files into a folder of their own.
+    /// Writes the files into an empty folder.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// If the submission is invalid.
     pub(super) fn unpack(&self, to: &Path) -> Result<()> {
         let files = match self {
             Self::Folder(folder) => read_folder(folder)?,
             Self::Archive(path) => {
-                let cannot = || format!("{} is no hand-in", path.display());
+                let cannot = || format!("{} is not a valid submission", path.display());
                 let size = fs::metadata(path).with_context(cannot)?.len();
                 ensure!(
                     size <= MOST_BYTES,
@@ -124,7 +126,7 @@ impl Submission {
     }
 }
 
-/// Lets everybody read a folder.
+/// Makes a folder readable for all users.
 fn readable(folder: &Path) -> Result<()> {
     use std::os::unix::fs::PermissionsExt;
     for entry in fs::read_dir(folder)? {
@@ -157,7 +159,7 @@ fn read_folder(root: &Path) -> Result<Files> {
             let name = entry.file_name();
             let name = name
                 .to_str()
-                .with_context(|| format!("{}: a name that is no text", entry.path().display()))?;
+                .with_context(|| format!("{}: the name is not valid UTF-8", entry.path().display()))?;
             let (kind, path) = (entry.file_type().with_context(cannot)?, format!("{prefix}{name}"));
             let is_made =
                 Path::new(name).extension().is_some_and(|end| end == "pyc" || end == "mcap");
@@ -172,14 +174,14 @@ fn read_folder(root: &Path) -> Result<Files> {
             }
             ensure!(
                 kind.is_file(),
-                "{} is a link or no file; hand in the file itself",
+                "{} is a link or not a regular file; submit the file itself",
                 entry.path().display()
             );
             total += entry.metadata().with_context(cannot)?.len();
-            ensure!(total <= MOST_BYTES, "{} holds more than {MOST_BYTES} bytes", root.display());
+            ensure!(total <= MOST_BYTES, "{} contains more than {MOST_BYTES} bytes", root.display());
             ensure!(
                 files.len() < MOST_FILES,
-                "{} holds more than {MOST_FILES} files",
+                "{} contains more than {MOST_FILES} files",
                 root.display()
             );
             files.insert(path, fs::read(entry.path()).with_context(cannot)?);
@@ -197,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_packed_is_unpacked_and_what_a_computer_made_stays_out() {
+    fn unpacks_what_was_packed_without_generated_files() {
         let folder = tempfile::tempdir().unwrap();
         let all = [
             "plugin.py",
@@ -214,7 +216,7 @@ mod tests {
         let read = read_folder(folder.path()).unwrap();
         assert_eq!(read, files(&["net/w.onnx", "plugin.py", "vizflyt.toml"]));
         let bytes = pack(&read).unwrap();
-        assert_eq!(bytes, pack(&read).unwrap(), "no time is in it");
+        assert_eq!(bytes, pack(&read).unwrap(), "contains no times");
         assert_eq!(open(&bytes).unwrap(), read);
         std::os::unix::fs::symlink("/etc/passwd", folder.path().join("x")).unwrap();
         assert!(read_folder(folder.path()).unwrap_err().to_string().contains("is a link"));

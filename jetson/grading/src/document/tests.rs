@@ -61,7 +61,7 @@ pub(crate) fn grade() -> Grade {
 }
 
 #[test]
-fn paths_of_files_stay_in_the_folder() {
+fn rejects_paths_outside_the_folder() {
     let with = |paths: &[&str]| {
         let mut grade = grade();
         let file = grade.files[0].clone();
@@ -74,15 +74,15 @@ fn paths_of_files_stay_in_the_folder() {
     assert!(with(&[]).is_ok() && with(&["a", "b/c", "b/d.e"]).is_ok());
     for wrong in ["", "/etc/passwd", "../grade.json", "a/../../b", "a//b", "a/", "./a", "a\0b"] {
         let error = with(&[wrong]).unwrap_err().to_string();
-        assert!(error.contains("is no file of a report"), "{wrong}: {error}");
+        assert!(error.contains("is not a valid path in a report"), "{wrong}: {error}");
     }
     for wrong in [&["a", "a"][..], &["b", "a"]] {
-        assert!(with(wrong).unwrap_err().to_string().contains("in the order of their paths"));
+        assert!(with(wrong).unwrap_err().to_string().contains("sorted by path"));
     }
 }
 
 #[test]
-fn a_signed_grade_is_verified_also_after_it_was_written_and_read() {
+fn verifies_a_signed_grade_after_write_and_read() {
     let grade = grade();
     assert_eq!(grade.runs.iter().map(|run| run.seed).collect::<Vec<_>>(), [1, 3]);
     grade.verify(&key().verifying_key()).unwrap();
@@ -93,7 +93,7 @@ fn a_signed_grade_is_verified_also_after_it_was_written_and_read() {
     assert!(read.verify(&other).unwrap_err().to_string().contains("is signed with the key"));
 }
 
-/// Returns the paths of all values in a document that are not containers.
+/// Returns the paths of all values in a document, except containers.
 fn leaves(value: &Value, path: &str, found: &mut Vec<String>) {
     match value {
         Value::Object(fields) => {
@@ -112,7 +112,7 @@ fn is_refused(document: &Value) -> bool {
 }
 
 #[test]
-fn every_field_is_protected() {
+fn protects_every_field() {
     let document: Value = serde_json::from_str(&grade().to_text().unwrap()).unwrap();
     let mut paths = Vec::new();
     leaves(&document, "", &mut paths);
@@ -138,7 +138,7 @@ fn every_field_is_protected() {
 }
 
 #[test]
-fn flights_are_neither_left_out_nor_added_nor_is_anything_else() {
+fn rejects_missing_and_additional_flights_files_and_fields() {
     let document: Value = serde_json::from_str(&grade().to_text().unwrap()).unwrap();
     let mut fewer = document.clone();
     fewer["runs"].as_array_mut().unwrap().pop();
@@ -151,20 +151,20 @@ fn flights_are_neither_left_out_nor_added_nor_is_anything_else() {
         let mut added = document.clone();
         let place = added.pointer_mut(path).unwrap().as_object_mut().unwrap();
         place.insert("bonus".into(), 1.into());
-        assert!(is_refused(&added), "{path:?} takes another field");
+        assert!(is_refused(&added), "{path:?} accepts an additional field");
     }
     let mut unsigned = document.clone();
     unsigned["files"].as_array_mut().unwrap().pop();
-    assert!(is_refused(&unsigned), "a file can go");
+    assert!(is_refused(&unsigned), "a file can be removed");
     for field in ["shard", "files", "signature"] {
         let mut without = document.clone();
         without.as_object_mut().unwrap().remove(field);
-        assert!(is_refused(&without), "{field} can go");
+        assert!(is_refused(&without), "{field} can be removed");
     }
 }
 
 #[test]
-fn shards_hold_every_flight_once() {
+fn shards_contain_every_flight_once() {
     let subject = Subject { variants: vec!["day".into(), "night".into()], ..subject() };
     let flights: Vec<_> = subject.flights().collect();
     assert_eq!((flights.len(), flights[0], flights[7]), (8, ("day", 1), ("night", 4)));
@@ -177,7 +177,7 @@ fn shards_hold_every_flight_once() {
     }
 }
 
-/// A grade of two variants, one of which was drawn.
+/// Returns a grade of two variants, one of them random.
 fn of_two_variants() -> Grade {
     let drawn = vizflyt_scenes::Variant::drawn(1, 1, &vizflyt_scenes::DrawBounds::default());
     let subject = Subject {
@@ -196,7 +196,7 @@ fn of_two_variants() -> Grade {
 }
 
 #[test]
-fn each_variant_has_its_mean_and_interval_and_drawn_ones_their_numbers() {
+fn includes_the_results_of_each_variant_and_settings_of_random_ones() {
     let grade = of_two_variants();
     let [day, drawn] = &grade.by_variant[..] else { panic!("two variants") };
     assert_eq!((day.variant.as_str(), day.summary.finished), ("day", 4));
@@ -207,9 +207,9 @@ fn each_variant_has_its_mean_and_interval_and_drawn_ones_their_numbers() {
     assert_eq!((day.summary.score.value, drawn.summary.score.value), (100.0, 62.5));
     let Interval { low, high, .. } = drawn.summary.score;
     assert!((50.0..62.5).contains(&low) && 62.5 < high && high <= 100.0, "{low} {high}");
-    // One variant has the figures of the whole.
+    // With one variant there are no separate results.
     assert!(Grade::new(subject(), None, vec![run(1, OutcomeKind::Finished)]).by_variant.is_empty());
-    // As text and back, to the last bit: the signature is over the text.
+    // Exact after write and read: the signature is over the text.
     let read = Grade::parse(&grade.to_text().unwrap()).unwrap();
     assert_eq!(read, grade);
     read.verify(&key().verifying_key()).unwrap();
@@ -221,12 +221,12 @@ fn each_variant_has_its_mean_and_interval_and_drawn_ones_their_numbers() {
 }
 
 #[test]
-fn the_median_is_of_the_flights_that_finished() {
+fn median_is_over_finished_flights() {
     let of = |outcomes: &[OutcomeKind]| {
         let runs = outcomes.iter().zip(1..).map(|(&outcome, seed)| run(seed, outcome));
         Grade::new(subject(), None, runs.collect()).median_finish_s()
     };
-    // Seed n takes 10.5 s and n tenths, penalty included.
+    // Seed n takes 10.5 s plus n tenths, penalty included.
     let (done, hit) = (OutcomeKind::Finished, OutcomeKind::Collided);
     assert_eq!(of(&[hit, hit]), None);
     assert_eq!(of(&[hit, done]), Some(10.7));
@@ -235,7 +235,7 @@ fn the_median_is_of_the_flights_that_finished() {
 }
 
 #[test]
-fn numbers_that_would_be_counted_for_ever_make_no_grade() {
+fn rejects_numbers_above_the_maximum() {
     let parsed = |change: &dyn Fn(&mut Grade)| {
         let mut grade = grade();
         change(&mut grade);
@@ -244,7 +244,7 @@ fn numbers_that_would_be_counted_for_ever_make_no_grade() {
     assert!(parsed(&|_| ()).is_ok());
     for wrong in [Shard { index: 1, count: u64::MAX }, Shard { index: 0, count: 0 }] {
         let error = parsed(&|grade| grade.shard = Some(wrong)).unwrap_err().to_string();
-        assert!(error.ends_with("is no part"), "{error}");
+        assert!(error.ends_with("is not a valid shard"), "{error}");
     }
     let error = parsed(&|grade| grade.subject.seeds = u64::MAX).unwrap_err().to_string();
     assert!(error.contains("at most 100000"), "{error}");
@@ -252,7 +252,7 @@ fn numbers_that_would_be_counted_for_ever_make_no_grade() {
 }
 
 #[test]
-fn hexadecimal_comes_back_and_nonsense_does_not() {
+fn parses_hexadecimal_and_rejects_other_text() {
     assert_eq!(from_hex::<2>(&hex(&[0xab, 0x01])), Some([0xab, 0x01]));
     for text in ["", "abc", "abcg", "+bcd", "äb", "AB01"] {
         assert_eq!(from_hex::<2>(text), None, "{text}");
@@ -261,14 +261,14 @@ fn hexadecimal_comes_back_and_nonsense_does_not() {
 
 proptest! {
     #[test]
-    fn any_change_of_a_byte_is_noticed(at in 0usize..4000, byte in 32u8..127) {
+    fn detects_any_changed_byte(at in 0usize..4000, byte in 32u8..127) {
         let text = grade().to_text().unwrap();
         let mut bytes = text.clone().into_bytes();
         let at = at % bytes.len();
         bytes[at] = byte;
         let changed = String::from_utf8(bytes).unwrap();
         let same = |text: &str| serde_json::from_str::<Value>(text).ok();
-        // Other spaces, or another way to write the same number, are no change.
+        // Other spaces, or another notation of the same number, are not a change.
         prop_assume!(same(&changed) != same(&text));
         let refused = Grade::parse(&changed)
             .is_ok_and(|grade| grade == super::tests::grade())

@@ -1,8 +1,8 @@
-//! The build of a plugin that is a Cargo project: what its build scripts and macros do, they do confined.
+//! Builds a plugin that is a Cargo project. Its build scripts and macros run in the sandbox.
 //!
 //! ```text
-//! cargo metadata   from the root folder, so that no setting of the project's counts: finds and fetches what it needs
-//! cargo build      confined, without the network
+//! cargo metadata   run in the root folder, so that the project's settings do not apply; fetches dependencies
+//! cargo build      in the sandbox, without network
 //! ```
 
 use std::ffi::OsString;
@@ -19,7 +19,7 @@ use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 
 use super::sources;
 
-/// What Cargo says of a project.
+/// Description of a project by Cargo.
 #[derive(Deserialize)]
 struct Metadata {
     packages: Vec<Package>,
@@ -30,21 +30,22 @@ struct Metadata {
 #[derive(Deserialize)]
 struct Package {
     name: String,
-    /// Where it comes from; none of a folder of this computer's.
+    /// Source of the package; `None` for a folder on this computer.
     source: Option<String>,
     manifest_path: PathBuf,
 }
 
-/// A large library on a slow computer.
+/// Timeout of a build: enough for a large library on a slow computer.
 const BUILD_WITHIN: Duration = Duration::from_mins(30);
-/// A compiler starts one for each processor, and each of these some more.
+/// Maximum number of processes: the build starts a compiler per processor, with several threads
+/// each.
 const BUILD_PROCESSES: u32 = 4096;
 
-/// Builds a Cargo project and returns its program. Cargo's own messages go to standard error.
+/// Builds a Cargo project and returns its program. Cargo's messages go to standard error.
 ///
 /// # Errors
-/// A build that fails, a project of no program or of several; of one that is graded, packages from elsewhere on this
-/// computer.
+/// If the build fails, or if the project has no or several programs. For a grade, also if packages
+/// come from another folder on this computer.
 pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     let folder = folder.canonicalize().with_context(|| format!("{}", folder.display()))?;
     let metadata = metadata(&folder)?;
@@ -67,7 +68,7 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     };
     let confinement = Confinement::prepare(&limits, &[OsString::from("cargo")]);
     let target = match confinement.user_id() {
-        // Root has made the folder, and another user builds.
+        // Root made the folder, but another user builds.
         Some(user) => {
             let target = target.join("confined");
             fs::create_dir_all(&target)?;
@@ -81,7 +82,7 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
         .args(["build", "--release", "--offline", "--message-format=json-render-diagnostics"])
         .arg("--target-dir")
         .arg(&target)
-        // A service of another process, which is not there.
+        // The wrapper needs a server process, which is not in the sandbox.
         .env("RUSTC_WRAPPER", "")
         .env("CARGO_HOME", home_of("CARGO_HOME", ".cargo"))
         .env("RUSTUP_HOME", home_of("RUSTUP_HOME", ".rustup"))
@@ -95,9 +96,9 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     }
     let programs = programs(&String::from_utf8_lossy(&output.stdout));
     match programs.as_slice() {
-        // What the build says is student code's word.
+        // The output of the build is untrusted student code.
         [program] if program.starts_with(&target) => Ok(program.clone()),
-        [program] => bail!("{} builds {}, elsewhere", folder.display(), program.display()),
+        [program] => bail!("{} builds {}, outside its target folder", folder.display(), program.display()),
         [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
         several => bail!(
             "{} builds {} programs; fly one of them by its path, such as {}",
@@ -108,8 +109,8 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     }
 }
 
-/// Asks Cargo what the project needs, and lets it fetch that. No code of the project's runs: its settings and its
-/// toolchain file count in its own folder only, and this is another.
+/// Runs `cargo metadata`, which fetches dependencies. No code of the project runs: its settings and
+/// toolchain file apply only in its own folder, and this runs in another one.
 fn metadata(folder: &Path) -> Result<Metadata> {
     let mut cargo = Command::new("cargo");
     cargo.args(["metadata", "--format-version=1", "--quiet", "--manifest-path"]);
@@ -126,10 +127,10 @@ fn metadata(folder: &Path) -> Result<Metadata> {
 }
 
 impl Metadata {
-    /// Returns the folders of packages that lie outside the project.
+    /// Returns the folders of packages outside the project.
     ///
     /// # Errors
-    /// If it is graded, and they are not of VizFlyt's own.
+    /// If the plugin is graded, and the packages are not VizFlyt's own.
     fn elsewhere(&self, graded: bool) -> Result<Vec<PathBuf>> {
         let ours = sources().ok();
         let mut folders = Vec::new();
@@ -140,7 +141,8 @@ impl Metadata {
             let is_ours = ours.as_ref().is_some_and(|ours| folder.starts_with(ours));
             ensure!(
                 !graded || is_ours || !(is_cloned || is_here),
-                "its package {} lies outside it, at {}: what is graded holds all it needs, or takes it from a registry",
+                "its package {} is outside its folder, at {}: a graded plugin must contain its \
+                 packages, or use a registry",
                 package.name,
                 package.source.clone().unwrap_or_else(|| folder.display().to_string())
             );
@@ -152,7 +154,8 @@ impl Metadata {
     }
 }
 
-/// Returns what Cargo reads beside the project: compilers and packages, but not its credentials.
+/// Returns the paths that Cargo reads in addition to the project: compilers and packages, without
+/// credentials.
 fn toolchain() -> Vec<PathBuf> {
     let cargo = home_of("CARGO_HOME", ".cargo");
     let parts = ["bin", "registry", "git", "config.toml", "config"].map(|name| cargo.join(name));
@@ -164,7 +167,7 @@ fn home_of(variable: &str, folder: &str) -> PathBuf {
     given.unwrap_or_else(|| env::home_dir().unwrap_or_default().join(folder))
 }
 
-/// Returns the programs in cargo's messages.
+/// Returns the programs listed in Cargo's messages.
 fn programs(messages: &str) -> Vec<PathBuf> {
     let artifact = |line: &str| {
         let message: Value = serde_json::from_str(line).ok()?;
@@ -179,7 +182,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn programs_are_found_in_what_cargo_says() {
+    fn finds_programs_in_cargos_messages() {
         let text = "noise\n{\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"lib\"]}}\n\
             {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"custom-build\"]},\"executable\":\"/b\"}\n\
             {\"reason\":\"compiler-artifact\",\"target\":{\"kind\":[\"bin\"]},\"executable\":\"/t/first\"}\n\
@@ -189,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_graded_holds_all_it_needs() {
+    fn rejects_packages_outside_a_graded_plugin() {
         let package = |source: Option<&str>, manifest: &str| Package {
             name: "help".into(),
             source: source.map(str::to_owned),
@@ -212,9 +215,9 @@ mod tests {
         let cloned = package(Some("git+file:///home/x/solution"), "/home/x/.cargo/git/Cargo.toml");
         for bad in [solution(), cloned] {
             let error = of(bad).elsewhere(true).unwrap_err().to_string();
-            assert!(error.contains("lies outside it") && error.contains("solution"), "{error}");
+            assert!(error.contains("is outside its folder") && error.contains("solution"), "{error}");
         }
         let folders = of(solution()).elsewhere(false).unwrap();
-        assert_eq!(folders, [PathBuf::from("/home/x/solution")], "one's own computer");
+        assert_eq!(folders, [PathBuf::from("/home/x/solution")], "not graded");
     }
 }

@@ -1,4 +1,4 @@
-//! `vizflyt.toml`: what a student's folder flies, and where.
+//! `vizflyt.toml`: plugin of a student's folder, and its simulated lab.
 
 use std::path::{Path, PathBuf};
 
@@ -6,25 +6,25 @@ use anyhow::{Context, Result, bail};
 use serde::Deserialize;
 use vizflyt_scenes::projects::{CourseProject, Level};
 
-/// The whole of `vizflyt.toml`.
+/// Content of `vizflyt.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PluginManifest {
-    /// The plugin: `plugin.py`, `Cargo.toml`, or a program; relative to the folder.
+    /// Plugin file: `plugin.py`, `Cargo.toml`, or a program; relative to the folder.
     pub plugin: PathBuf,
-    /// The simulated lab it flies in.
+    /// Simulated lab of the plugin.
     #[serde(default)]
     pub lab: LabConfig,
 }
 
-/// `[lab]`: the simulated lab; the command line goes before it.
+/// `[lab]`: simulated lab; options of the command line take precedence.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabConfig {
-    /// A generated scene; or the path of a scene folder, an arena.toml or a scene file, relative to the
-    /// folder.
+    /// Generated scene, or the path of a scene folder, an arena.toml or a scene file, relative to
+    /// the folder.
     pub scene: Option<String>,
-    /// Instead of a scene, a project of the course, or the path of one's file, relative to the folder.
+    /// Course project instead of a scene, or the path of a project file, relative to the folder.
     project: Option<String>,
     /// Level of the project: ug or g.
     level: Option<String>,
@@ -33,10 +33,10 @@ pub struct LabConfig {
 }
 
 impl LabConfig {
-    /// Returns the name of the course's project, if one is flown.
+    /// Returns the name of the course project, if one is set.
     ///
     /// # Errors
-    /// If no project has this name, or a scene is given too.
+    /// If no project has this name, or a scene is also set.
     pub fn project(&self) -> Result<Option<String>> {
         let Some(name) = &self.project else { return Ok(None) };
         if self.scene.is_some() {
@@ -46,10 +46,10 @@ impl LabConfig {
         Ok(Some(name.clone()))
     }
 
-    /// Returns the level, if one is given.
+    /// Returns the level, if one is set.
     ///
     /// # Errors
-    /// If there is no such level.
+    /// If the level does not exist.
     pub fn level(&self) -> Result<Option<Level>> {
         self.level
             .as_deref()
@@ -58,14 +58,15 @@ impl LabConfig {
     }
 }
 
-/// Its file's name.
+/// File name.
 pub const FILE: &str = "vizflyt.toml";
 
 impl PluginManifest {
-    /// Reads the file in `folder`; `None` if there is none. Paths are returned from here.
+    /// Reads the file in `folder`; `None` if there is none. Returned paths are relative to the
+    /// current folder.
     ///
     /// # Errors
-    /// A file that cannot be read, or has settings that it must not have.
+    /// If the file cannot be read, or has invalid settings.
     pub fn read(folder: &Path) -> Result<Option<Self>> {
         let file = folder.join(FILE);
         if !file.is_file() {
@@ -76,7 +77,7 @@ impl PluginManifest {
         let mut manifest = Self::parse(&text).with_context(|| format!("{}", file.display()))?;
         manifest.plugin = folder.join(&manifest.plugin);
         let LabConfig { scene, project, .. } = &mut manifest.lab;
-        // A project's file; its name is no place.
+        // Path of a project file; a project's name is not a path.
         let is_file =
             |name: &&mut String| Path::new(&**name).extension().is_some_and(|end| end == "toml");
         let project = project.iter_mut().filter(is_file);
@@ -99,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paths_are_relative_to_the_folder() {
+    fn resolves_paths_relative_to_the_folder() {
         let root = tempfile::tempdir().unwrap();
         assert_eq!(PluginManifest::read(root.path()).unwrap(), None);
         let text = "plugin = \"plugin.py\"\n[lab]\nscene = \"forest\"\nseed = 3\n";

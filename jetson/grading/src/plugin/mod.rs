@@ -1,10 +1,10 @@
-//! What PLUGIN is, and the command that starts it.
+//! Plugins: resolves the argument PLUGIN, and returns the command that starts it.
 //!
 //! ```text
-//! avoid                 a built-in: this program again, as `vizflyt plugin avoid`
-//! first/                by first/vizflyt.toml (made by `vizflyt new`); or a Cargo project; or plugin.py
-//! first/plugin.py       the python3 of its own .venv, else that which this program was installed into, else the one on PATH
-//! target/release/first  a program; a bare name is looked up on PATH
+//! avoid                 a built-in plugin: this program, as `vizflyt plugin avoid`
+//! first/                folder with vizflyt.toml (made by `vizflyt new`); or a Cargo project; or plugin.py
+//! first/plugin.py       run by python3 of its .venv, or of this program's environment, or in PATH
+//! target/release/first  a program; a name without / is searched in PATH
 //! ```
 
 pub mod built_in;
@@ -24,7 +24,7 @@ use vizflyt_runtime::supervisor::{Confinement, PluginLimits};
 use self::built_in::BuiltIn;
 use self::manifest::{LabConfig, PluginManifest};
 
-/// A plugin that was found.
+/// A plugin that exists.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plugin {
     name: OsString,
@@ -35,18 +35,18 @@ pub struct Plugin {
 #[derive(Clone, Debug, PartialEq)]
 enum PluginKind {
     BuiltIn,
-    /// A file of Python.
+    /// Python file.
     Script(PathBuf),
-    /// The folder of a Cargo.toml.
+    /// Folder of a Cargo.toml.
     Cargo(PathBuf),
     Program,
 }
 
 impl Plugin {
-    /// Finds out what `name` is. Starts and builds nothing.
+    /// Determines the kind of plugin `name`. Starts and builds nothing.
     ///
     /// # Errors
-    /// If it is nothing that can be flown.
+    /// If it is not a plugin.
     pub fn find(name: &OsStr) -> Result<Self> {
         let found = |kind, lab| Ok(Self { name: name.to_owned(), kind, lab });
         let path = Path::new(name);
@@ -83,23 +83,23 @@ impl Plugin {
         )
     }
 
-    /// Returns what the command line called it.
+    /// Returns the name of the plugin on the command line.
     pub fn name(&self) -> &OsStr {
         &self.name
     }
 
-    /// Returns the simulated lab that its manifest asks for.
+    /// Returns the simulated lab of the plugin's manifest.
     pub fn lab(&self) -> Option<&LabConfig> {
         self.lab.as_ref()
     }
 
-    /// Returns the file or folder whose change means another plugin.
+    /// Returns the file or folder to watch for changes.
     pub fn watched(&self) -> PathBuf {
         match &self.kind {
             PluginKind::BuiltIn => std::env::current_exe().unwrap_or_default(),
             PluginKind::Program => PathBuf::from(&self.name),
             PluginKind::Cargo(folder) => folder.clone(),
-            // What it imports lies beside it.
+            // Imports are in the same folder.
             PluginKind::Script(script) => match script.parent() {
                 Some(folder) if folder != Path::new("") => folder.to_owned(),
                 _ => PathBuf::from("."),
@@ -107,11 +107,11 @@ impl Plugin {
         }
     }
 
-    /// Returns the command that starts it under `limits`. A script is checked and a Cargo project is built first, confined
-    /// as in flight: what runs then is student code too.
+    /// Returns the command that starts the plugin under `limits`. A script is checked and a Cargo
+    /// project is built first, in the same sandbox as in flight: both run student code.
     ///
     /// # Errors
-    /// A build that fails, a Python without the package `vizflyt`.
+    /// If the build fails, or Python does not find the package `vizflyt`.
     pub fn command(&self, limits: &PluginLimits) -> Result<Vec<OsString>> {
         match &self.kind {
             PluginKind::BuiltIn => {
@@ -120,7 +120,8 @@ impl Plugin {
             }
             PluginKind::Program => {
                 let path = Path::new(&self.name);
-                // A graded plugin starts in another folder; what is on PATH is looked up there.
+                // A graded plugin starts in another folder, so a relative path must be made
+                // absolute; a name in PATH stays.
                 Ok(vec![if path.is_file() { absolute(path)?.into() } else { self.name.clone() }])
             }
             PluginKind::Cargo(folder) => Ok(vec![cargo::build(folder, limits)?.into()]),
@@ -128,7 +129,7 @@ impl Plugin {
                 let path = absolute(script)?;
                 let python = python_of(&path);
                 check_python(&python, script, limits)?;
-                // Unbuffered: a print is seen when it is made, not when 8 kB are full.
+                // Unbuffered, so that printed lines appear immediately, not after 8 kB.
                 Ok(vec![python.into(), "-u".into(), path.into()])
             }
         }
@@ -139,7 +140,7 @@ fn absolute(path: &Path) -> Result<PathBuf> {
     std::path::absolute(path).context("cannot find the working folder")
 }
 
-/// Returns what an existing file is.
+/// Returns the kind of an existing file.
 fn kind_of(path: &Path) -> Result<PluginKind> {
     use std::os::unix::fs::PermissionsExt;
     if !path.is_file() {
@@ -163,14 +164,14 @@ fn on_path(name: &OsStr) -> bool {
     std::env::split_paths(&path).any(|folder| folder.join(name).is_file())
 }
 
-/// Returns the interpreter of the script's own virtual environment, else that which this program was installed into,
-/// else the one on PATH.
+/// Returns the interpreter of the script's virtual environment, or of the environment that this
+/// program was installed into, or the one in PATH.
 fn python_of(script: &Path) -> PathBuf {
     let own = script.parent().unwrap_or(Path::new("")).join(".venv/bin/python3");
     if own.exists() { own } else { own_python().unwrap_or_else(|| "python3".into()) }
 }
 
-/// Returns the interpreter beside this program, if `pip install` has put the program there.
+/// Returns the interpreter next to this program, if `pip install` has installed the program.
 pub fn own_python() -> Option<PathBuf> {
     let program = std::env::current_exe().ok()?;
     let python = program.with_file_name("python3");
@@ -180,8 +181,8 @@ pub fn own_python() -> Option<PathBuf> {
     (is_there && python.exists()).then_some(python)
 }
 
-/// Compiles the script, then finds the package as the script will: its own folder is the first that
-/// Python looks in.
+/// Compiles the script, then imports the package as the script will: Python searches the script's
+/// own folder first.
 const CHECK: &str = "
 import sys
 try:
@@ -194,10 +195,11 @@ import vizflyt
 vizflyt.run
 ";
 
-/// A package with a large library beside it, from a slow disk.
+/// Timeout of the check: enough for an import of a large library from a slow disk.
 const CHECK_WITHIN: Duration = Duration::from_mins(2);
 
-/// Finds out whether the plugin is Python and will find the package, before anything is started for it.
+/// Checks that the plugin is valid Python and finds the package, before other processes are
+/// started.
 fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<()> {
     let folder = script.parent().unwrap_or(Path::new(""));
     if folder.join("vizflyt.py").exists() {
@@ -206,7 +208,7 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
             folder.join("vizflyt.py").display()
         );
     }
-    // As a person named it, it stands in messages.
+    // Messages of the check show the path as the user typed it.
     let path = absolute(script)?;
     let folder = path.parent().unwrap_or(Path::new("/"));
     let confinement = Confinement::prepare(limits, &[python.into(), path.clone().into()]);
@@ -235,7 +237,7 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
     let last = words.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
     if let Some(user) = confinement.user_id().filter(|_| last.contains("PermissionError")) {
         bail!(
-            "{last}: a plugin that root starts runs as another user (uid {user}), who must be able to read it; \
+            "{last}: a plugin that root starts runs as another user (uid {user}), which must be able to read it; \
              `chmod -R a+rX {}` lets everybody",
             folder.display()
         );
@@ -253,7 +255,7 @@ fn check_python(python: &Path, script: &Path, limits: &PluginLimits) -> Result<(
     )
 }
 
-/// Returns the folder of this program's sources, if it is still there: where a plugin gets the SDK.
+/// Returns the folder of this program's sources with the SDK, if it still exists.
 pub fn sources() -> Result<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("/"));
     if !root.join("jetson/sdk/Cargo.toml").is_file() {
@@ -280,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn plugins_are_distinguished() {
+    fn distinguishes_plugins() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         let kind = |path: &Path| Plugin::find(path.as_os_str()).unwrap().kind;
@@ -310,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_its_own_python_uses_it() {
+    fn uses_the_python_of_the_folder() {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         assert_eq!(python_of(&script), Path::new("python3"));
@@ -321,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_called_like_the_package_is_named() {
+    fn names_a_file_that_hides_the_package() {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(folder.path().join("vizflyt.py"), "").unwrap();
@@ -332,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn a_script_that_is_not_python_is_shown_its_line() {
+    fn shows_the_line_of_a_syntax_error() {
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("plugin.py");
         fs::write(&script, "import vizflyt\nclass First(vizflyt.Plugin:\n").unwrap();
@@ -340,7 +342,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         for part in ["plugin.py is not Python", "line 2", "class First", "SyntaxError"] {
-            assert!(error.contains(part), "no {part:?} in {error}");
+            assert!(error.contains(part), "{part:?} is missing in {error}");
         }
     }
 }

@@ -1,5 +1,6 @@
-//! `--watch`: looks at a plugin's files and has it started again when one is saved. A Cargo project is
-//! built first, and a script compiled, while the old plugin flies on; what fails there changes nothing.
+//! `--watch`: watches a plugin's files and restarts the plugin after a change. A Cargo project is
+//! built first, and a script checked, while the old plugin keeps flying. If that fails, the old
+//! plugin stays.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -14,16 +15,15 @@ use vizflyt_runtime::supervisor::PluginLimits;
 
 use super::Plugin;
 
-/// Files are looked at this often: the hand is barely off the key, and a folder of sources costs
-/// nothing to list.
+/// Period of checks: shorter than the user notices, and cheap for a folder of sources.
 pub const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Folders deeper than this are not a student's sources.
+/// Maximum depth of folders.
 const DEEPEST: usize = 8;
 
-/// Starts looking; something arrives each time the plugin is to be started again.
+/// Starts to watch. The receiver gets a message each time the plugin must be restarted.
 ///
 /// # Errors
-/// If there is no thread for it.
+/// If the thread cannot be started.
 pub fn watch(plugin: Plugin, limits: PluginLimits) -> Result<Receiver<()>> {
     let (sender, receiver) = channel();
     let look = move || {
@@ -31,8 +31,8 @@ pub fn watch(plugin: Plugin, limits: PluginLimits) -> Result<Receiver<()>> {
         loop {
             thread::sleep(LOOK_EVERY);
             let found = Sources::of(&plugin.watched());
-            // An editor or a linker may still be writing: two looks must agree. A file that is
-            // gone is about to come back.
+            // An editor or linker may still be writing: two checks must agree. A missing file is
+            // about to be written again.
             if found == known || found.0.is_empty() {
                 continue;
             }
@@ -52,12 +52,12 @@ pub fn watch(plugin: Plugin, limits: PluginLimits) -> Result<Receiver<()>> {
     Ok(receiver)
 }
 
-/// Files with the time and size of their last change.
+/// Files with time and size of their last change.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Sources(BTreeMap<PathBuf, (SystemTime, u64)>);
 
 impl Sources {
-    /// Looks at a file, or at the sources under a folder.
+    /// Reads the state of a file, or of the sources in a folder.
     pub fn of(path: &Path) -> Self {
         let mut sources = Self(BTreeMap::new());
         if path.is_dir() {
@@ -81,7 +81,7 @@ impl Sources {
         for entry in entries.filter_map(std::result::Result::ok) {
             let path = entry.path();
             let name = entry.file_name().to_string_lossy().into_owned();
-            // Not followed: a link may lead back up.
+            // Links are not followed: they may point to a parent folder.
             let Ok(kind) = entry.file_type() else { continue };
             if kind.is_dir() && depth < DEEPEST {
                 let is_made = matches!(name.as_str(), "target" | "flights" | "__pycache__");
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_saved_source_is_a_change_and_what_is_made_is_not() {
+    fn detects_changed_sources_and_ignores_build_output() {
         let folder = tempfile::tempdir().unwrap();
         let write = |name: &str, text: &str| {
             let path = folder.path().join(name);

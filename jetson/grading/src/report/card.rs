@@ -1,4 +1,4 @@
-//! A flight's card: what a failed flight looked like at its end, and a finished one from take-off to its finish.
+//! Card of a flight: for a failed flight its last seconds, for a finished one the whole flight.
 
 use std::fmt::Write;
 
@@ -15,21 +15,21 @@ use super::super::folder::{IMAGES, LOGS, ReportFolder};
 use super::super::trial::{TrialImage, TrialResult};
 use super::escape;
 
-/// Of the images. [0 to 100]
+/// JPEG quality of the images. [0 to 100]
 const QUALITY: u8 = 85;
-/// Of a failed flight clearance and speed are plotted over so long. [s]
+/// Length of the plots of clearance and speed for a failed flight. [s]
 const PLOTTED_S: f64 = 4.0;
-/// Events that are shown of a failed flight, and of one that finished.
+/// Maximum number of listed events of a failed, and of a finished flight.
 const EVENTS: usize = 12;
 const EVENTS_OF_FINISHED: usize = 60;
 
-/// Returns what a flight's files are called, without their endings.
+/// Returns the base name of a flight's files.
 pub(crate) fn name(run: &Run) -> String {
     format!("{}-{}", run.variant, run.seed)
 }
 
-/// Writes the images of a flight into the report's folder; returns its card as HTML, and the images. `log` says
-/// whether its flight log is there.
+/// Writes the images of a flight into the report's folder; returns its card as HTML, and the image
+/// files. `log`: whether the report has the flight's log.
 pub(crate) fn write(
     folder: &ReportFolder,
     arena: &ArenaConfig,
@@ -50,7 +50,7 @@ pub(crate) fn write(
         } else {
             let shots: Vec<&TrialImage> = flown.shots.iter().collect();
             let ago = |stamp| format!("{:+.1} s", -at.seconds_since(stamp));
-            strip(folder, run, &shots, "its last images", ago)?
+            strip(folder, run, &shots, "last images", ago)?
         };
         card += &strip;
         files = images;
@@ -62,15 +62,15 @@ pub(crate) fn write(
         let height_m = if is_finished { middle_height_m(shown) } else { shown.last().map(height) };
         let height_m = height_m.unwrap_or(arena.takeoff_height_m);
         let (when, end) = if is_finished {
-            ("from take-off to the finish", "where it finished")
+            ("from take-off to the finish", "position at the finish")
         } else {
-            ("in its last seconds", "where it ended")
+            ("in the last seconds", "last position")
         };
         let _ = write!(
             card,
             "<div class=\"plots\"><figure>{}<figcaption>Clearance of the body (blue) and speed (orange) \
-             {when}</figcaption></figure><figure>{}<figcaption>From above: obstacles at \
-             {height_m:.2} m height, the way flown, and {end}, with its nose</figcaption>\
+             {when}</figcaption></figure><figure>{}<figcaption>Top view: obstacles at a \
+             height of {height_m:.2} m, flown path, and {end}, with heading</figcaption>\
              </figure></div>",
             plot::clearance(shown, at),
             plot::top_view(arena, &field.obstacle_slice(height_m), shown, way)
@@ -84,12 +84,12 @@ pub(crate) fn write(
         let before_s = at.map_or(0.0, |at| at.seconds_since(event.stamp));
         let _ = writeln!(story, "{:>8.2} s  {}", -before_s, escape(event.text.as_str()));
     }
-    let _ = write!(card, "<details><summary>What happened</summary><pre>{story}</pre></details>");
+    let _ = write!(card, "<details><summary>Events</summary><pre>{story}</pre></details>");
     if !flown.lines.is_empty() {
         let lines: Vec<String> = flown.lines.iter().map(|line| escape(line)).collect();
         let _ = write!(
             card,
-            "<details><summary>What the plugin printed</summary><pre>{}</pre></details>",
+            "<details><summary>Output of the plugin</summary><pre>{}</pre></details>",
             lines.join("\n")
         );
     }
@@ -104,12 +104,12 @@ pub(crate) fn write(
     Ok((card + "</section>\n", files))
 }
 
-/// Returns where a flight's log is in the report.
+/// Returns the path of a flight's log in the report.
 pub(crate) fn log_path(run: &Run) -> String {
     format!("{LOGS}/{}.mcap", name(run))
 }
 
-/// Returns the images of a whole flight, its last one included.
+/// Returns the images of a whole flight, including the last one.
 fn whole(flown: &TrialResult) -> Vec<&TrialImage> {
     let mut shots: Vec<&TrialImage> = flown.keyframes.iter().collect();
     let last = flown.shots.back();
@@ -117,7 +117,7 @@ fn whole(flown: &TrialResult) -> Vec<&TrialImage> {
     shots
 }
 
-/// Returns when it was, and the stages that had been passed by then.
+/// Returns the time of an image, and the stages passed by then.
 fn after_take_off(run: &Run, ended: ServerTime, stamp: ServerTime) -> String {
     let at_s = (run.seconds - ended.seconds_since(stamp)).max(0.0);
     let passed = |stage: &&vizflyt_arena::verdict::StageVerdict| {
@@ -134,14 +134,15 @@ fn height(sample: &Sample) -> f64 {
     sample.p_world_m.z
 }
 
-/// Returns the median height of a way. [m]
+/// Returns the median height of a path. [m]
 fn middle_height_m(way: &[Sample]) -> Option<f64> {
     let mut heights: Vec<f64> = way.iter().map(height).collect();
     heights.sort_by(f64::total_cmp);
     heights.get(heights.len() / 2).copied()
 }
 
-/// Returns the card of a flight that another computer has flown, of which only the grade is here.
+/// Returns the card of a flight from another computer's shard, of which only the grade is
+/// available.
 pub(crate) fn without_images(run: &Run) -> String {
     head(run)
         + "<p class=\"faint\">Merged from parts: its images, clearance, map and log are in the report of \
@@ -149,10 +150,10 @@ pub(crate) fn without_images(run: &Run) -> String {
            </section>\n"
 }
 
-/// Returns what begins a card: which flight, how it ended, and why.
+/// Returns the head of a card: flight, outcome, and reason.
 fn head(run: &Run) -> String {
     let Run { seed, variant, outcome, .. } = run;
-    // A part's text is another's: its variant is no name of ours until it is looked at.
+    // Text of a shard is untrusted: its variant must be escaped.
     let variant = escape(variant);
     let cause = run
         .cause
@@ -173,7 +174,7 @@ fn head(run: &Run) -> String {
     )
 }
 
-/// Writes images; returns them side by side, and their files.
+/// Writes images; returns them as HTML, side by side, and their files.
 fn strip(
     folder: &ReportFolder,
     run: &Run,
@@ -212,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn card_without_images_notes_it_and_escapes_a_plugins_markup() {
+    fn escapes_the_plugins_markup_without_images() {
         let mut failed = run(3, OutcomeKind::Collided);
         failed.reason = "bad <script>".to_owned();
         let card = without_images(&failed);

@@ -1,5 +1,5 @@
-//! The report as one folder that opens in any browser, without a network: figures, a table of all
-//! flights, and a card for each: those that did not finish, then those that did.
+//! The report: one folder that opens in any browser without network. Contains the results, a table
+//! of all flights, and a card for each flight, failed ones first.
 
 pub(crate) mod card;
 
@@ -17,8 +17,9 @@ use super::statistics::Interval;
 
 const CSS: &str = include_str!("page.css");
 
-/// Writes `index.html` and `junit.xml` into the folder, and signs the grade with all files: `files` are those that are
-/// there already, `cards` those of [`card::write`], as the flights are ordered. `grade.json` comes last.
+/// Writes `index.html` and `junit.xml` into the folder, signs the grade with all files, and writes
+/// `grade.json` last. `files`: existing files; `cards`: HTML of [`card::write`], in the order of
+/// the flights.
 ///
 /// # Errors
 /// If a file cannot be written.
@@ -30,7 +31,7 @@ pub(crate) fn write(
     mut files: Vec<SignedFile>,
 ) -> Result<()> {
     if let Some(key) = key {
-        // The page names the key.
+        // Signed here because the page contains the public key.
         grade.sign(key)?;
     }
     files.push(folder.write(PAGE, page(grade, cards).as_bytes())?);
@@ -110,12 +111,12 @@ fn figures(grade: &Grade) -> String {
     text + "</dl>\n"
 }
 
-/// What the figures are worth, where the project says it, and what stands in the way of more.
+/// Returns the table of points with what is missing for more, if the project has points.
 fn points(grade: &Grade) -> String {
     let Some((points, most)) = grade.all_points() else { return String::new() };
     let mut text = format!(
         "<div class=\"wide\"><table><thead><tr><th class=\"text\">Part</th><th>Points</th><th>Figure</th>\
-         <th class=\"text\">What is missing</th></tr></thead><tbody>\n<tr><td class=\"text\">all</td>\
+         <th class=\"text\">Missing</th></tr></thead><tbody>\n<tr><td class=\"text\">all</td>\
          <td>{points:.1} of {most:.0}</td><td></td><td></td></tr>\n"
     );
     for part in &grade.points {
@@ -132,13 +133,13 @@ fn points(grade: &Grade) -> String {
     text + "</tbody></table></div>\n"
 }
 
-/// The variants, where there are several, and what those were that were drawn.
+/// Returns the table of variants, if there are several, with the settings of random ones.
 fn variants(grade: &Grade) -> String {
     if grade.by_variant.is_empty() {
         return String::new();
     }
     let mut text = "<div class=\"wide\"><table><thead><tr><th class=\"text\">Variant</th>\
-                    <th>Finished</th><th>Score</th><th>95 %</th><th class=\"text\">What it is</th>\
+                    <th>Finished</th><th>Score</th><th>95 %</th><th class=\"text\">Description</th>\
                     </tr></thead><tbody>\n"
         .to_owned();
     for VariantSummary { variant, summary } in &grade.by_variant {
@@ -208,12 +209,12 @@ fn table(runs: &[Run], with_cards: bool) -> String {
     text + "</tbody></table></div>\n"
 }
 
-/// What was graded by what: for whoever wants to repeat it.
+/// Returns the section with all inputs of the grade, for reproduction.
 fn origins(grade: &Grade) -> String {
     let subject = &grade.subject;
     let mut text =
-        "<h2>What this rests on</h2><p>In lock-step: nothing in it depends on how fast a \
-                    computer was.</p><div class=\"wide\"><table><tbody>"
+        "<h2>Reproducibility</h2><p>Flown in lock-step: the result does not depend on the speed of the \
+                    computer.</p><div class=\"wide\"><table><tbody>"
             .to_owned();
     let delays = subject.delays;
     let rows = [
@@ -224,7 +225,7 @@ fn origins(grade: &Grade) -> String {
         (
             "Time model",
             format!(
-                "an image every {:.1} ms, {:.1} ms old when the plugin gets it; its answer counts {:.1} ms \
+                "an image every {:.1} ms, {:.1} ms old when the plugin receives it; its answer takes effect {:.1} ms \
                  later",
                 delays.image_period, delays.image, delays.answer
             ),
@@ -249,7 +250,7 @@ fn origins(grade: &Grade) -> String {
     text + "</tbody></table></div>\n"
 }
 
-/// Makes text of a plugin, or of anybody else, text of a page.
+/// Escapes text of a plugin, or other untrusted text, for HTML.
 pub(crate) fn escape(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for letter in text.chars() {
@@ -259,7 +260,7 @@ pub(crate) fn escape(text: &str) -> String {
             '>' => safe += "&gt;",
             '"' => safe += "&quot;",
             '\'' => safe += "&#39;",
-            // Not even line breaks reach an attribute.
+            // Control characters except line breaks and tabs are replaced.
             c if c.is_control() && c != '\n' && c != '\t' => safe.push('\u{fffd}'),
             c => safe.push(c),
         }
@@ -273,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn output_of_a_plugin_is_escaped() {
+    fn escapes_output_of_a_plugin() {
         assert_eq!(
             escape("<b onload='x'>&\"\u{7}"),
             "&lt;b onload=&#39;x&#39;&gt;&amp;&quot;\u{fffd}"
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_needs_no_network_and_names_every_flight() {
+    fn needs_no_network_and_names_every_flight() {
         let temporary = tempfile::tempdir().unwrap();
         let folder = ReportFolder::begin(temporary.path()).unwrap();
         let image = folder.write("images/day-1-00.jpg", b"image").unwrap();
@@ -295,11 +296,11 @@ mod tests {
         let cards = ["day-1", "day-3"].map(|id| format!("<section id=\"{id}\"></section>"));
         super::write(&folder, &mut grade, Some(&key()), &cards, vec![image]).unwrap();
         let page = std::fs::read_to_string(folder.at(PAGE)).unwrap();
-        assert!(!page.contains("://"), "it names no other place");
+        assert!(!page.contains("://"), "no links to other hosts");
         for part in ["1 of 2", "href=\"#day-1\"", "id=\"day-1\"", "too fast", "reached the goal"] {
-            assert!(page.contains(part), "no {part}");
+            assert!(page.contains(part), "{part} is missing");
         }
-        // Those that failed come first.
+        // Failed flights come first.
         let place = |text: &str| page.find(text).unwrap();
         assert!(place("did not finish") < place("id=\"day-1\""));
         assert!(place("id=\"day-1\"") < place("Flights that finished"));
@@ -313,7 +314,7 @@ mod tests {
         assert_eq!(paths, ["images/day-1-00.jpg", PAGE, JUNIT]);
         let flown = table(&[run(5, OutcomeKind::Finished)], false);
         for part in ["<td class=\"text\">5</td>", "<th class=\"text\">Outcome</th>"] {
-            assert!(flown.contains(part), "no {part}: {flown}");
+            assert!(flown.contains(part), "{part} is missing: {flown}");
         }
     }
 }

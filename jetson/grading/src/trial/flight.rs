@@ -1,4 +1,4 @@
-//! A graded flight as it happens, tick by tick: the loop of `trial`.
+//! The loop of a graded flight, tick by tick.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -38,35 +38,36 @@ use super::kept::{Keyframes, Lines};
 use super::pending::{Pending, Picture};
 use super::{AnotherWay, Delays, Reached, Trial, TrialImage, TrialLog, TrialResult};
 
-/// Where the clocks start: far enough from zero that nothing is before it. [ns]
+/// Start of the clocks: so far above zero that no time is negative. [ns]
 const START_NS: u64 = 10_000_000_000;
-/// A vehicle that is not in the air by then never will be. [s]
+/// Timeout until the vehicle is in the air. [s]
 const READY_WITHIN_S: f64 = 60.0;
-/// A flight that takes longer than that, landing included, is given up. [s]
+/// Maximum duration of a flight, including landing. [s]
 const LONGEST_S: f64 = 900.0;
-/// Before take-off a plugin sees a picture of standing still: so many are enough. [ns]
+/// Minimum image period on the ground: a plugin needs few images before take-off. [ns]
 const GROUND_PERIOD_NS: i64 = 200_000_000;
-/// The runtime gets every second pose: 100 Hz, as over the network.
+/// The runtime receives every second pose: 100 Hz, as over the network.
 const POSES_PER_SENT: u64 = 2;
-/// How long before the end the report shows images. [s]
+/// Length of the images before the end in the report. [s]
 const SHOWN_S: f64 = 2.0;
-/// The time between two of them. [s]
+/// Interval between these images. [s]
 const SHOT_PERIOD_S: f64 = 0.1;
-/// Between two poses of the truth. [s]
+/// Interval between stored true poses. [s]
 const TRUTH_PERIOD_S: f64 = 4e-3;
-/// So many are kept before the first estimate: more than 10 s, the age that one may have.
+/// Maximum number of true poses before the first estimate: more than 10 s, the maximum age of an
+/// estimate.
 const TRUTH_BEFORE_FIRST: usize = 2500;
 
-/// The sensors beside the cameras, in a course that has some.
+/// Simulated sensors other than cameras, if the course has any.
 struct Sensing {
     scene: SensorScene,
     sensors: VehicleSensors,
-    /// Readings on their way to the plugin, and when they are there.
+    /// Readings on their way to the plugin, with the time of arrival.
     pending: VecDeque<(HostTime, MadeReading)>,
 }
 
 impl Sensing {
-    /// Returns `None` of a course without sensors.
+    /// Returns `None` for a course without sensors.
     fn of(set: SensorSet, scene: Scene<'_>, seed: u64) -> Option<Self> {
         if set.configs.is_empty() {
             return None;
@@ -87,7 +88,7 @@ pub(super) struct Flight<'a> {
     renderer: CpuRenderer,
     weather: WeatherPass,
     images: Vec<RgbdImage>,
-    /// Of each camera.
+    /// Effects of each camera.
     imaging: Vec<CameraEffects>,
     now: HostTime,
     schedule: CameraSchedule,
@@ -107,7 +108,7 @@ pub(super) struct Flight<'a> {
     pub(super) answered: u64,
     odometry: Vec<Odometry>,
     truth: VecDeque<Stamped>,
-    /// How it ends, by all that happened so far.
+    /// End of the flight, according to all events.
     end: FlightEnd,
 }
 
@@ -121,7 +122,7 @@ impl<'a> Flight<'a> {
             seed: trial.seed,
             body_radius_m: arena.body_radius_m,
             imu: trial.imu,
-            // The hash of a flight holds every packet since the start.
+            // The hash of a flight contains every packet since the start.
             startup: Startup::Realistic,
             ..SimulationConfig::airframe()
         };
@@ -185,7 +186,7 @@ impl<'a> Flight<'a> {
         })
     }
 
-    /// Logs what the plugin has printed since the last call.
+    /// Logs the lines that the plugin has printed since the last call.
     pub(super) fn log_lines(&mut self) {
         let Some(log) = self.lockstep.log() else { return self.lines.fresh.clear() };
         for (stream, text) in self.lines.fresh.drain(..) {
@@ -197,7 +198,7 @@ impl<'a> Flight<'a> {
         }
     }
 
-    /// Flies to the end; false if it is stopped.
+    /// Flies to the end; returns false if stopped.
     pub(super) fn run(&mut self) -> Result<bool> {
         self.lockstep.begin(self.now, &mut self.lines.sink())?;
         self.log_lines();
@@ -205,7 +206,8 @@ impl<'a> Flight<'a> {
             if self.trial.stop.load(Ordering::Relaxed) {
                 return Ok(false);
             }
-            // Once at least: a plugin that fails at its start is an event of the flight as well.
+            // At least one tick: a plugin that fails at its start also causes an event of the
+            // flight.
             self.tick()?;
             if self.lockstep.companion.flight().outcome().is_some() {
                 return Ok(true);
@@ -245,7 +247,7 @@ impl<'a> Flight<'a> {
         Ok(())
     }
 
-    /// Poses from the motion capture through filter and rules.
+    /// Passes poses from motion capture through pose filter and rules.
     fn localize(&mut self) {
         let (referee, companion) = (&mut self.referee, &mut self.lockstep.companion);
         let mut readings = Vec::new();
@@ -288,7 +290,7 @@ impl<'a> Flight<'a> {
         }
     }
 
-    /// Draws the cameras that are due.
+    /// Renders the cameras that are due.
     fn draw(&mut self) -> Result<()> {
         let phase = self.lockstep.companion.flight().phase();
         if matches!(phase, FlightPhase::Landing | FlightPhase::Landed) {
@@ -319,7 +321,7 @@ impl<'a> Flight<'a> {
         let cameras: Vec<Camera> = due.iter().map(camera).collect();
         self.images.resize_with(cameras.len().max(self.images.len()), RgbdImage::default);
         let images = &mut self.images[..cameras.len()];
-        // What moves is where it is at the instant that the images show, as for the referee.
+        // Moving objects are placed for the instant that the images show, as for the referee.
         let since_start_ns = exposure.at.as_ns().wrapping_sub(START_NS).cast_signed();
         let placements = self.trial.course.obstacles.objects.placements(since_start_ns);
         self.renderer
@@ -332,7 +334,7 @@ impl<'a> Flight<'a> {
             let mut picture = Picture::default();
             let (config, info) = (&self.arena.cameras[index], &self.cameras[index]);
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
-            // What truly is ahead, whatever weather and camera make of it.
+            // True clearance ahead, before effects of weather and camera.
             let width = info.intrinsics.width_px as usize;
             picture.ahead_m = ahead_m(&picture.depth_mm, width, &mut self.scratch);
             self.weather.apply(&weather, camera, &moment, image);
@@ -342,7 +344,8 @@ impl<'a> Flight<'a> {
             image.write_rgb8(&mut picture.rgb);
             image.write_depth_mm(DepthKind::Median, &mut picture.depth_mm);
             if withholds_depth(&self.arena.cameras[index]) {
-                // As in flight: what the course withholds is "no return" everywhere.
+                // Same as in live flight: if the course withholds depth, all pixels are "no
+                // return".
                 picture.depth_mm.fill(0);
             }
             rendered[index] = Some(picture);
@@ -354,7 +357,7 @@ impl<'a> Flight<'a> {
         Ok(())
     }
 
-    /// Measures with the sensors that are due, and hands over what has come as far as the plugin.
+    /// Measures with the sensors that are due, and delivers readings that have arrived.
     fn sense(&mut self) {
         if self.sensing.is_none() {
             return;
@@ -392,7 +395,7 @@ impl<'a> Flight<'a> {
         }
     }
 
-    /// Shows the plugin an image and takes its reply.
+    /// Delivers an image to the plugin and takes its reply.
     fn show(&mut self, pending: &Pending) -> Result<()> {
         let (cameras, hash) = (&self.cameras, &mut self.hash);
         let ahead_ns = pending.shown.as_ns().wrapping_sub(pending.pose.as_ns()) as i32;
@@ -428,7 +431,8 @@ impl<'a> Flight<'a> {
         Ok(())
     }
 
-    /// Takes note of how far it came; an attempt before has come this far, too, and by the same way.
+    /// Records the progress of the flight. A repeated flight must be equal to the earlier attempt
+    /// up to the point where that was lost.
     fn come_by(&self) -> Result<()> {
         let here = Reached { images: self.answered, hash: self.hash.clone().finalize().into() };
         match self.trial.reached.get() {
@@ -500,13 +504,13 @@ impl<'a> Flight<'a> {
         self.keep_truth(position_m, rotation);
     }
 
-    /// Keeps where the vehicle truly is, for estimates that the plugin may publish.
+    /// Stores the true pose, for comparison with estimates that the plugin may publish.
     fn keep_truth(&mut self, position_m: DVec3, rotation: DQuat) {
         let at_s = self.now.as_ns() as f64 * 1e-9;
         if self.truth.back().is_some_and(|last| at_s - last.at_s < TRUTH_PERIOD_S) {
             return;
         }
-        // Of a plugin that has published nothing, only what its first estimate may be of.
+        // Before the first estimate, only the poses that it may refer to are kept.
         if self.odometry.is_empty() && self.truth.len() >= TRUTH_BEFORE_FIRST {
             self.truth.pop_front();
         }
@@ -523,7 +527,7 @@ impl<'a> Flight<'a> {
 
     pub(super) fn end(mut self) -> TrialResult {
         let virtual_s = self.virtual_s();
-        // Server's and runtime's, each in order, become one story.
+        // Merge the events of server and runtime, each in order, into one list.
         self.events.sort_by_key(|event| event.stamp);
         TrialResult {
             verdict: judge_ended(self.arena, &self.end, &self.events, &self.samples),

@@ -1,4 +1,4 @@
-//! What of a flight is kept for its report: the plugin's last lines, and images of the whole way.
+//! Data of a flight for its report: last lines of the plugin, and images of the whole flight.
 
 use std::collections::VecDeque;
 
@@ -7,24 +7,25 @@ use vizflyt_runtime::supervisor::Stream;
 
 use super::TrialImage;
 
-/// Images of a whole flight that the report shows, at most; at least half as many of any that takes a few seconds.
+/// Maximum number of images of a whole flight in the report; any flight of a few seconds has at
+/// least half as many.
 const KEYFRAMES: usize = 16;
-/// Two of them are at least so far apart. [s]
+/// Minimum interval between two of them. [s]
 const KEYFRAME_PERIOD_S: f64 = 0.25;
-/// Lines of the plugin that are kept.
+/// Maximum number of stored lines of the plugin.
 const LINES: usize = 200;
 
-/// What the plugin prints.
+/// Output of the plugin.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
-    /// The last lines.
+    /// Last lines.
     pub(super) kept: VecDeque<String>,
-    /// Those that are not logged yet.
+    /// Lines that are not logged yet.
     pub(super) fresh: Vec<(Stream, String)>,
 }
 
 impl Lines {
-    /// Returns who hears them.
+    /// Returns the receiver of lines.
     pub(super) fn sink(&mut self) -> impl FnMut(Stream, &str) {
         |stream, text| {
             if self.kept.len() == LINES {
@@ -36,7 +37,7 @@ impl Lines {
     }
 }
 
-/// Images spread evenly over a flight, however long it takes.
+/// Images evenly spread over a flight of any duration.
 #[derive(Debug)]
 pub(super) struct Keyframes {
     pub(super) images: Vec<TrialImage>,
@@ -50,7 +51,7 @@ impl Default for Keyframes {
 }
 
 impl Keyframes {
-    /// Takes the image of this instant if one is due.
+    /// Stores the image of this instant if one is due.
     pub(super) fn take(&mut self, stamp: ServerTime, image: impl FnOnce() -> TrialImage) {
         let is_due = self
             .images
@@ -76,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keyframes_are_spread_over_any_flight() {
+    fn spreads_keyframes_over_any_flight() {
         for seconds in [3, 10, 60, 600] {
             let mut keyframes = Keyframes::default();
             for image in 0..seconds * 30 {

@@ -1,18 +1,18 @@
-//! One graded flight on a virtual clock: simulated vehicle, runtime, referee, renderer in one thread,
-//! and the plugin in a process of its own that is waited for.
+//! One graded flight on a virtual clock: simulated vehicle, runtime, referee and renderer in one
+//! thread, with the plugin in a separate process. The simulation waits for each answer.
 //!
 //! ```text
 //! tick of 2.5 ms:  Simulation ──MAVLink──▶ Lockstep ──MAVLink──▶ Simulation
 //!                  mocap ─▶ Referee (filter, rules) ─▶ poses, events ─▶ Lockstep
-//! image is due:    Referee's motion ─▶ where the vehicle will be when it is seen ─▶ CpuRenderer
-//! sensor is due:   likewise ─▶ reading, on its way as long as an image
-//! image is seen:   observation ─▶ plugin ─▶ answer; it counts `answer` later
+//! image is due:    Referee's motion ─▶ pose of the vehicle when it is delivered ─▶ CpuRenderer
+//! sensor is due:   same ─▶ reading, with the delay of an image
+//! image arrives:   observation ─▶ plugin ─▶ answer; takes effect `answer` later
 //! ```
-//! No wall clock decides anything but that a plugin is hung, and no order of threads anything at
-//! all: the same program, plugin, course and seed give the same bits on the same kind of processor.
-//! [`TrialResult::hash`] is over all of them.
+//! The wall clock only decides whether a plugin hangs, and the order of threads decides nothing:
+//! the same program, plugin, course and seed give the same bits on the same kind of processor.
+//! [`TrialResult::hash`] covers all of them.
 //!
-//! `flight` is the loop, `pending` an image between camera and plugin, `kept` what the report shows of it.
+//! `flight`: the loop; `pending`: an image between camera and plugin; `kept`: data for the report.
 
 mod flight;
 mod kept;
@@ -39,116 +39,115 @@ use vizflyt_studio::evaluate::Stamped;
 
 use self::flight::Flight;
 
-/// How long things take in a graded flight, always the same.
+/// Fixed delays of a graded flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Delays {
-    /// From one image to the next, of cameras that have no rate of their own. [ns]
+    /// Image period of cameras without their own rate. [ns]
     pub image_period_ns: i64,
-    /// From the start of rendering until the plugin is given the image, which shows the vehicle where
-    /// it is by then, as far as can be foretold. [ns]
+    /// Delay from the start of rendering until the image is delivered to the plugin. The image
+    /// shows the predicted pose of the vehicle at delivery. [ns]
     pub image_ns: i64,
-    /// From when the plugin is given an image until its answer counts. [ns]
+    /// Delay from delivery of an image until the plugin's answer takes effect. [ns]
     pub answer_ns: i64,
 }
 
-/// What is flown, and how.
+/// Parameters of a graded flight.
 pub(crate) struct Trial<'a> {
-    /// Where.
     pub course: &'a CourseInstance,
     /// Seed of the course and of the simulator's noise.
     pub seed: u64,
-    /// The command that starts the plugin.
+    /// Command that starts the plugin.
     pub command: &'a [OsString],
-    /// What it may use.
+    /// Limits of the plugin's sandbox.
     pub limits: &'a PluginLimits,
-    /// A plugin that takes more of its own time for an answer has failed.
+    /// Timeout of an answer, in the plugin's own time; a timeout is a failure.
     pub answer_within: Duration,
-    /// The time model.
+    /// Time model.
     pub delays: Delays,
-    /// The simulated inertial sensor.
+    /// Simulated inertial sensor.
     pub imu: ImuModel,
-    /// Ends it.
+    /// Stop flag.
     pub stop: &'a AtomicBool,
-    /// Where it is logged, if it is.
+    /// Log of the flight, if requested.
     pub log: Option<TrialLog<'a>>,
-    /// How far it came, until it is over: the next attempt has to come by there.
+    /// Progress of an earlier, lost attempt: the repeated flight must pass the same state.
     pub reached: &'a Cell<Option<Reached>>,
 }
 
-/// How far a flight came.
+/// Progress of a flight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Reached {
-    /// Images that the plugin has answered.
+    /// Number of images that the plugin has answered.
     images: u64,
-    /// Over all until then.
+    /// Hash of the flight until then.
     hash: [u8; 32],
 }
 
-/// A flight that was lost and flown again went another way: a plugin that draws lots could have ended itself to draw
-/// again.
+/// A repeated flight differs from the lost one: otherwise a plugin with random behaviour could end
+/// itself to get another attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "flown again, it went another way before it came to where it was lost; a plugin that is not the same every time \
+    "the repeated flight differs before the point where the first one was lost; a plugin that is not deterministic \
      and is killed gets no grade"
 )]
 pub(crate) struct AnotherWay;
 
-/// Where a flight is logged.
+/// Log of a flight.
 pub(crate) struct TrialLog<'a> {
     /// An empty file.
     pub file: &'a File,
-    /// Which images it keeps.
+    /// Images to log.
     pub images: LoggedImages,
-    /// Whether depth is written for viewers, too.
+    /// Whether to log depth for viewers too.
     pub depth: bool,
-    /// The plugin as the command line names it.
+    /// Plugin as given on the command line.
     pub plugin: &'a OsString,
 }
 
-/// One image that the plugin was given, for the report.
+/// An image that was delivered to the plugin, for the report.
 #[derive(Clone, Debug)]
 pub(crate) struct TrialImage {
-    /// The instant that it shows.
+    /// Instant that the image shows.
     pub stamp: ServerTime,
-    /// H x W x 3.
+    /// RGB, H x W x 3.
     pub rgb: Vec<u8>,
-    /// Its size. [px]
+    /// Size of the image. [px]
     pub size_px: (u32, u32),
 }
 
 /// The result of a trial.
 #[derive(Clone, Debug)]
 pub(crate) struct TrialResult {
-    /// The score.
+    /// Verdict with the score.
     pub verdict: Verdict,
-    /// Over all samples, setpoints, events and images.
+    /// Hash over all samples, setpoints, events and images.
     pub hash: [u8; 32],
-    /// All that happened, in order.
+    /// All events, in order.
     pub events: Vec<Event>,
-    /// Where it was, 200 a second.
+    /// Track of the vehicle at 200 Hz.
     pub samples: Vec<Sample>,
-    /// The plugin's setpoints.
+    /// Setpoints of the plugin.
     pub asked: Vec<TimedSetpoint>,
-    /// What was ahead in the images that it answered.
+    /// Clearance ahead in the answered images.
     pub seen: Vec<ClearanceAhead>,
-    /// The newest images until the flight was decided.
+    /// Newest images until the end of the flight was decided.
     pub shots: VecDeque<TrialImage>,
     /// Images from take-off until then, evenly spread.
     pub keyframes: Vec<TrialImage>,
-    /// The last lines that the plugin printed.
+    /// Last lines that the plugin printed.
     pub lines: VecDeque<String>,
     /// Images that the plugin answered.
     pub images: u64,
-    /// Where the plugin thought it was.
+    /// Pose estimates of the plugin.
     pub odometry: Vec<Odometry>,
-    /// Where the simulated vehicle truly was, 200 a second, while a plugin publishes.
+    /// True poses of the simulated vehicle at 200 Hz, if the plugin publishes estimates.
     pub truth: Vec<Stamped>,
-    /// Virtual time. [s]
+    /// Virtual time of the flight. [s]
     pub virtual_s: f64,
 }
 
 impl TrialResult {
-    /// Returns the record from which its probable cause is found.
+    /// Returns the record from which the probable cause is determined.
     pub(crate) fn record(&self, delays: &Delays) -> Record<'_> {
         Record {
             verdict: &self.verdict,
@@ -162,12 +161,12 @@ impl TrialResult {
 }
 
 impl Trial<'_> {
-    /// Flies; `None` if it is ended by [`Self::stop`]. Call it on a thread that lives as long: the
+    /// Flies; returns `None` if stopped. The calling thread must live as long as the flight: the
     /// plugin dies with it.
     ///
     /// # Errors
-    /// If the plugin cannot be started at all, or shared memory fails. A plugin that fails is a
-    /// verdict.
+    /// If the plugin cannot be started, or shared memory fails. A failure of the plugin is a
+    /// verdict, not an error.
     pub(crate) fn fly(&self) -> Result<Option<TrialResult>> {
         let expected = self.reached.get();
         let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;

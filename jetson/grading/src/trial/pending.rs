@@ -8,41 +8,40 @@ use vizflyt_protocol::time::{HostTime, ServerTime};
 use vizflyt_runtime::log::GivenImage;
 use zerocopy::IntoBytes as _;
 
-/// An image on its way to the plugin.
 pub(super) struct Pending {
-    /// When the plugin is given it.
+    /// Time of delivery to the plugin.
     pub(super) due: HostTime,
     pub(super) seq: u64,
-    /// Of the newest pose behind it.
+    /// Stamp of the newest pose that the image is based on.
     pub(super) pose: ServerTime,
-    /// What it shows.
+    /// Instant that the image shows.
     pub(super) shown: ServerTime,
-    /// Where the vehicle is by then.
+    /// Predicted pose of the vehicle at that instant.
     pub(super) world_from_body: Pose<World, Body>,
-    /// By camera; those not rendered this time are `None`.
+    /// Images by camera; `None` if the camera was not due.
     pub(super) rendered: Vec<Option<Picture>>,
 }
 
-/// What a plugin gets of a camera.
+/// Image of one camera for the plugin.
 #[derive(Debug, Default)]
 pub(super) struct Picture {
     pub(super) rgb: Vec<u8>,
     pub(super) depth_mm: Vec<u16>,
-    /// What is ahead, for the report; also where the plugin gets no depth. [m, cam]
+    /// Clearance ahead, for the report; also known if the plugin gets no depth. [m, cam]
     pub(super) ahead_m: Option<f64>,
 }
 
 impl Picture {
     pub(super) fn add_to(&self, hash: &mut Sha256) {
         hash.update(&self.rgb);
-        // Little-endian, whatever computer grades.
+        // Little-endian, so that the hash is the same on every computer.
         const { assert!(cfg!(target_endian = "little")) };
         hash.update(self.depth_mm.as_bytes());
     }
 }
 
 impl Pending {
-    /// Returns what the log says of each camera's image.
+    /// Returns the header of each camera's image, for the log.
     pub(super) fn headers(&self, cameras: &[CameraInfo]) -> Vec<ImageHeader> {
         let header = |(index, camera): (usize, &CameraInfo)| {
             let CameraInfo { intrinsics, body_from_cam, .. } = camera;
@@ -55,7 +54,7 @@ impl Pending {
         cameras.iter().enumerate().map(header).collect()
     }
 
-    /// Returns the images that were rendered, for the log.
+    /// Returns the rendered images, for the log.
     pub(super) fn given<'a>(
         &'a self,
         cameras: &'a [CameraInfo],

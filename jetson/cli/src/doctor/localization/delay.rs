@@ -1,12 +1,13 @@
-//! The delay of a source: attitudes by its poses and the gyroscope's readings in, while somebody carries the
-//! vehicle; how much later the poses are out. Sans-IO.
+//! Measures the delay of a localization source while the vehicle is moved by hand: compares the
+//! attitudes of its poses with the readings of the gyroscope. Sans-IO.
 //!
 //! ```text
 //! poses -----> angle turned within 0.25 s --------\
 //! gyroscope -> the same, so much earlier ----------+-> correlation -> its peak: the delay
 //! ```
-//! Angles and not axes: no wrong setting but `euler` changes by how much a vehicle turned between two poses.
-//! Readings may come at another rate than poses, and unevenly: they are integrated over the poses' own times.
+//! The comparison uses angles, not axes: of all settings only `euler` changes the angle between two
+//! poses. Readings may have another rate than poses, also an uneven one: they are integrated over
+//! the times of the poses.
 
 use std::collections::VecDeque;
 
@@ -15,24 +16,24 @@ use glam::{DQuat, DVec3};
 /// A measured delay.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Delay {
-    /// How much later the poses show a turn. [ms]
+    /// Delay of the poses relative to the gyroscope. [ms]
     pub(super) ms: f64,
-    /// How far that may be off, two standard deviations. [ms]
+    /// Uncertainty, two standard deviations. [ms]
     pub(super) uncertain_ms: f64,
 }
 
-/// Why there is no delay.
+/// Why the delay could not be measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum NoDelay {
     /// Too few readings or poses.
     Silent,
-    /// It was turned too slowly, too little, or its poses are too noisy for that.
+    /// Motion too slow or too small, or poses too noisy.
     Gentle,
-    /// Poses and gyroscope turned otherwise.
+    /// Poses and gyroscope do not show the same motion.
     Unlike,
 }
 
-/// Collects both.
+/// Collects attitudes and gyroscope readings.
 #[derive(Debug, Default)]
 pub(super) struct DelayMeter {
     gyro: VecDeque<(f64, DVec3)>,
@@ -40,12 +41,12 @@ pub(super) struct DelayMeter {
 }
 
 impl DelayMeter {
-    /// Takes a reading of the gyroscope; stamps must rise. [s], [rad/s]
+    /// Adds a reading of the gyroscope; stamps must increase. [s], [rad/s]
     pub(super) fn add_gyro(&mut self, at_s: f64, gyro_radps: DVec3) {
         add(&mut self.gyro, at_s, gyro_radps);
     }
 
-    /// Takes the attitude of a pose; stamps must rise. [s]
+    /// Adds the attitude of a pose; stamps must increase. [s]
     pub(super) fn add_pose(&mut self, at_s: f64, rotation: DQuat) {
         add(&mut self.poses, at_s, rotation);
     }
@@ -53,7 +54,7 @@ impl DelayMeter {
     /// Returns the delay.
     ///
     /// # Errors
-    /// Why it cannot be said.
+    /// Why the delay could not be measured.
     pub(super) fn delay(&self) -> Result<Delay, NoDelay> {
         let turned = Turned::new(&self.gyro).ok_or(NoDelay::Silent)?;
         let windows = self.windows();
@@ -70,7 +71,7 @@ impl DelayMeter {
         let fits = tried.filter_map(|delay_s| Fit::new(&turned, &windows, delay_s));
         let best =
             fits.max_by(|a, b| a.correlation.total_cmp(&b.correlation)).ok_or(NoDelay::Silent)?;
-        // A peak, and no slope that goes on beyond what was tried.
+        // The best delay must be a peak inside the tried range, not at its edge.
         let is_inside = (EARLIEST_S + STEP_S..LATEST_S - STEP_S).contains(&best.delay_s);
         if best.correlation < ALIKE || !is_inside {
             return Err(NoDelay::Unlike);
@@ -84,7 +85,7 @@ impl DelayMeter {
             let moved = if bend < 0.0 { (-0.5 * slope / bend).clamp(-1.0, 1.0) } else { 0.0 };
             fit = at(fit.delay_s + moved * step_s)?;
         }
-        // Both measure the same angle: another ratio is another vehicle's gyroscope.
+        // Both measure the same angle: another ratio means another vehicle's gyroscope.
         if !(0.8..1.25).contains(&fit.ratio) {
             return Err(NoDelay::Unlike);
         }
@@ -93,7 +94,7 @@ impl DelayMeter {
         if delay.uncertain_ms <= MAX_UNCERTAIN_MS { Ok(delay) } else { Err(NoDelay::Gentle) }
     }
 
-    /// Returns by how much each pose and one a window later differ.
+    /// Returns the change of attitude between each pose and the one a window later.
     fn windows(&self) -> Vec<Window> {
         let mut windows = Vec::new();
         let mut end = 0;
@@ -107,7 +108,7 @@ impl DelayMeter {
                 windows.push(Window { from_s, to_s, angle_rad: before.angle_between(after) });
             }
         }
-        // What a fast source has more of says nothing more.
+        // More windows of a fast source add no information.
         let every = windows.len().div_ceil(MAX_WINDOWS).max(1);
         windows.into_iter().step_by(every).collect()
     }
@@ -123,7 +124,7 @@ fn add<T>(queue: &mut VecDeque<(f64, T)>, at_s: f64, value: T) {
     queue.push_back((at_s, value));
 }
 
-/// A stretch of time, and the angle between the poses at its ends.
+/// A time interval, and the angle between the poses at its ends.
 #[derive(Clone, Copy, Debug)]
 struct Window {
     from_s: f64,
@@ -131,9 +132,10 @@ struct Window {
     angle_rad: f64,
 }
 
-/// The attitude by the gyroscope alone.
+/// Attitude by integration of the gyroscope.
 struct Turned {
-    /// When, the rate then and till the next reading, the attitude then; and which unbroken stretch that is of.
+    /// Time, rate from then to the next reading, attitude at that time, and index of the unbroken
+    /// interval.
     knots: Vec<(f64, DVec3, DQuat, u32)>,
 }
 
@@ -143,7 +145,7 @@ impl Turned {
             gyro.iter().zip(gyro.iter().skip(1)).map(|(a, b)| b.0 - a.0).collect();
         intervals.sort_unstable_by(f64::total_cmp);
         let gap_s = MAX_GAP_S.max(2.5 * intervals.get(intervals.len() / 2)?);
-        // A bias turns all the time: what it reads half of the time or less is no motion.
+        // A bias is constant: the median reading is the bias, not a motion.
         let middle = |axis: usize| {
             let mut values: Vec<_> = gyro.iter().map(|(_, rate)| rate[axis]).collect();
             values.sort_unstable_by(f64::total_cmp);
@@ -169,20 +171,20 @@ impl Turned {
         Some(Self { knots })
     }
 
-    /// Returns the attitude at a time, and the stretch.
+    /// Returns the attitude at a time, and the index of the unbroken interval.
     fn at(&self, at_s: f64) -> Option<(DQuat, u32)> {
         let after = self.knots.partition_point(|knot| knot.0 <= at_s);
         let (a, b) = (self.knots.get(after.checked_sub(1)?)?, self.knots.get(after)?);
         if a.3 != b.3 {
             return None;
         }
-        // The rate changes evenly between two readings.
+        // The rate is assumed to change linearly between two readings.
         let (since_s, whole_s) = (at_s - a.0, b.0 - a.0);
         let turn = (a.1 + (b.1 - a.1) * (0.5 * since_s / whole_s)) * since_s;
         Some((a.2 * DQuat::from_scaled_axis(turn), a.3))
     }
 
-    /// Returns the angle turned within a window that began and ended so much earlier. [rad]
+    /// Returns the angle turned within a window shifted earlier by `earlier_s`. [rad]
     fn angle_rad(&self, window: &Window, earlier_s: f64) -> Option<f64> {
         let (before, from) = self.at(window.from_s - earlier_s)?;
         let (after, to) = self.at(window.to_s - earlier_s)?;
@@ -190,14 +192,14 @@ impl Turned {
     }
 }
 
-/// How well both agree under a delay.
+/// Agreement of poses and gyroscope under one delay.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
     delay_s: f64,
     correlation: f64,
-    /// Angle by the poses for one by the gyroscope.
+    /// Ratio of the angle by the poses to that by the gyroscope.
     ratio: f64,
-    /// What a pose's angle has without any turn: noise. [rad]
+    /// Residual angle between poses without a turn: noise. [rad]
     rest_rad: f64,
 }
 
@@ -213,7 +215,7 @@ impl Fit {
             xy += gyro_rad * window.angle_rad;
             yy += window.angle_rad * window.angle_rad;
         }
-        // Most of what was done must have been seen by both.
+        // Both sensors must have data for at least half of the windows.
         if n < 0.5 * windows.len() as f64 {
             return None;
         }
@@ -224,8 +226,8 @@ impl Fit {
         correlation.is_finite().then_some(Self { delay_s, correlation, ratio, rest_rad })
     }
 
-    /// Returns the delay's standard deviation. Errors last as long as windows overlap, and longer where a model is
-    /// wrong: those of one second count as one. [s]
+    /// Returns the delay's standard deviation. Errors are correlated while windows overlap, and
+    /// longer if a model is wrong: all errors within one second count as one. [s]
     fn sigma_s(&self, turned: &Turned, windows: &[Window]) -> Option<f64> {
         let (mut curvature, mut scores) = (0.0, Vec::<(i64, f64)>::new());
         for window in windows {
@@ -249,28 +251,28 @@ impl Fit {
     }
 }
 
-/// Angles are of so long a time: long enough to be above the noise, shorter than a motion. [s]
+/// Length of a window: long enough for angles above the noise, shorter than a motion. [s]
 const WINDOW_S: f64 = 0.25;
-/// Delays that are tried, and how far apart. [s]
+/// Range and step of the tried delays. [s]
 const EARLIEST_S: f64 = -0.55;
 const LATEST_S: f64 = 0.6;
 const STEP_S: f64 = 0.01;
-/// For slopes. [s]
+/// Step of numerical derivatives. [s]
 const NEAR_S: f64 = 0.005;
-/// So many windows turn at least as fast, half a second at 20 Hz. [rad/s]
+/// Number of windows that must turn at least at `LIVELY_RADPS`: half a second at 20 Hz.
 const LIVELY: usize = 10;
 const LIVELY_RADPS: f64 = 0.4;
-/// Correlation of the same motion.
+/// Minimum correlation for the same motion.
 const ALIKE: f64 = 0.85;
-/// Models of hands, filters and clocks are no better. [ms]
+/// Minimum uncertainty, due to the models of hands, filters and clocks. [ms]
 const LEAST_MS: f64 = 1.0;
-/// What is less sure is not said. [ms]
+/// Maximum uncertainty of a result; above it, none is returned. [ms]
 const MAX_UNCERTAIN_MS: f64 = 20.0;
-/// A bias is less; more is a vehicle that turned most of the time. [rad/s]
+/// Maximum bias; a larger median means that the vehicle turned most of the time. [rad/s]
 const MAX_BIAS_RADPS: f64 = 0.1;
-/// Readings further apart say nothing about the time between them. [s]
+/// Maximum interval between readings; a longer one is a gap. [s]
 const MAX_GAP_S: f64 = 0.08;
-/// Windows at least and at most; samples kept of each kind, three minutes at 200 Hz.
+/// Minimum and maximum number of windows; maximum samples of each kind, three minutes at 200 Hz.
 const MIN_WINDOWS: usize = 20;
 const MAX_WINDOWS: usize = 3000;
 const MAX_SAMPLES: usize = 36_000;

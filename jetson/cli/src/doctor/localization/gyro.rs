@@ -1,7 +1,7 @@
-//! The vehicle's gyroscope over MAVLink, read by a thread beside the poses.
+//! Readings of the vehicle's gyroscope over MAVLink, received by a separate thread.
 //!
-//! Each reading bears the time at which it was measured, on this computer's clock: by the autopilot's own clock,
-//! which the link relates to ours (TIMESYNC), else when it came.
+//! Each reading has its time of measurement on this computer's clock: from the autopilot's clock,
+//! which the link relates to this computer's (TIMESYNC), otherwise the time of arrival.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -15,21 +15,22 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_runtime::link::{Link, LinkSettings};
 use vizflyt_sdk::host_now;
 
-/// What has come.
+/// Data received since the last `take`.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Heard {
-    /// Readings since the last look: when [s, CLOCK_MONOTONIC], and the angular velocity [rad/s, body].
+    /// New readings: time [s, CLOCK_MONOTONIC] and angular velocity [rad/s, body].
     pub(super) readings: Vec<(f64, DVec3)>,
-    /// Whether an autopilot's heartbeats come.
+    /// Whether heartbeats of an autopilot arrive.
     pub(super) is_connected: bool,
-    /// How far the times may be off; `None` where the autopilot's clock is not known, and a reading is as old as its
-    /// arrival. [ms]
+    /// Error bound of the times; `None` if the autopilot's clock is unknown and times of arrival
+    /// are used. [ms]
     pub(super) clock_off_ms: Option<f64>,
-    /// The autopilot's clock became known since the last look: earlier readings have other times.
+    /// Whether the autopilot's clock became known since the last `take`: earlier readings have
+    /// other times.
     pub(super) began_anew: bool,
 }
 
-/// The thread.
+/// Receiver thread.
 #[derive(Debug)]
 pub(super) struct Gyro {
     heard: Arc<Mutex<Heard>>,
@@ -38,7 +39,7 @@ pub(super) struct Gyro {
 }
 
 impl Gyro {
-    /// Opens the link and begins to listen.
+    /// Opens the link and starts the thread.
     pub(super) fn open(address: &MavlinkAddress, settings: LinkSettings) -> Result<Self> {
         let port = Port::open(address, settings.wanted())
             .with_context(|| format!("{address} cannot be opened"))?;
@@ -53,7 +54,7 @@ impl Gyro {
         Ok(Self { heard, stop, thread: Some(thread) })
     }
 
-    /// Takes what has come since the last time.
+    /// Returns the data received since the last call.
     pub(super) fn take(&self) -> Heard {
         let mut heard = lock(&self.heard);
         let taken = heard.clone();
@@ -67,7 +68,7 @@ impl Drop for Gyro {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has reported it on standard error.
+            // A panic of the thread has been printed on standard error already.
             let _ = thread.join();
         }
     }
@@ -82,11 +83,11 @@ fn listen(port: &Port, mut link: Link, heard: &Mutex<Heard>, stop: &AtomicBool) 
         while let Some(datagram) = link.poll_transmit() {
             port.send(&datagram);
         }
-        // A failed socket receives nothing, as an autopilot that is off.
+        // A failed socket receives nothing, like an autopilot that is off.
         if let Ok(Some(len)) = port.receive(&mut buffer) {
             link.handle_input(host_now(), &buffer[..len]);
         }
-        // Nobody reads what happens on the link.
+        // Events of the link are not used.
         while link.poll_event().is_some() {}
         let clock_off_ms = link.clock().error_bound_ns(host_now()).map(|ns| ns as f64 * 1e-6);
         let mut heard = lock(heard);
@@ -107,12 +108,12 @@ fn listen(port: &Port, mut link: Link, heard: &Mutex<Heard>, stop: &AtomicBool) 
         for sample in link.imu() {
             take(sample.stamp, sample.gyro_radps);
         }
-        // An autopilot that sends no IMU sends its attitude's rates.
+        // If the autopilot sends no IMU data, use the rates of its attitude.
         if let Some(stamp) = link.attitude_at().filter(|_| link.imu().is_empty()) {
             take(stamp, link.state().omega_body_radps);
         }
     }
 }
 
-/// Readings that wait at most: ten seconds at 400 Hz.
+/// Maximum number of waiting readings: ten seconds at 400 Hz.
 const MAX_READINGS: usize = 4000;

@@ -1,6 +1,7 @@
-//! Where images come from: one thread a camera, newest wins; recorded images one after the other.
+//! Image sources: one thread per live camera, newest image wins; recorded images one after the
+//! other.
 //!
-//! A camera that fails does not end the others: its thread opens it again until it is back.
+//! A failed camera does not affect the others: its thread reopens it until it works again.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,51 +23,51 @@ use vizflyt_tags::simulated::{SimulatedCamera, Truth};
 /// An image of one camera.
 #[derive(Clone, Debug)]
 pub(super) struct CameraImage {
-    /// Its index.
+    /// Index of the camera.
     pub(super) camera: usize,
     /// Middle of the exposure.
     pub(super) stamp: HostTime,
     pub(super) image: Gray,
 }
 
-/// All cameras.
+/// Sources of all cameras.
 pub(super) struct Sources {
     mailbox: Arc<Mailbox>,
     truth: Option<(SocketAddr, Arc<SharedTruth>)>,
-    /// Recordings, whose images all count; none if the cameras are live.
+    /// Recordings, of which every image is located; empty if the cameras are live.
     recorded: Vec<Recording>,
-    /// What was last told to be wrong with each camera.
+    /// Last reported fault of each camera.
     told: Vec<Option<String>>,
 }
 
-/// A change of what is wrong with a camera.
+/// A change of a camera's fault.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct CameraEvent {
-    /// Its index.
+    /// Index of the camera.
     pub(super) camera: usize,
-    /// What is wrong; `None` if it is well again.
+    /// Fault; `None` if the camera works again.
     pub(super) fault: Option<String>,
 }
 
-/// A folder, a video: a camera of the past.
+/// Recording of one camera: a folder or a video.
 struct Recording {
     camera: TagCamera,
     source: Box<dyn ImageSource>,
     watch: CameraWatch,
-    /// Its next image; `None` at its end.
+    /// Next image; `None` at the end.
     head: Option<Exposure>,
 }
 
-/// The newest image of each camera that was not yet taken.
+/// Newest image of each camera that was not yet taken.
 #[derive(Default)]
 struct Mailbox {
     shots: Mutex<Vec<CameraImage>>,
     arrived: Condvar,
-    /// Of each live camera; none if they are simulated.
+    /// One per live camera; empty if they are simulated.
     watches: Mutex<Vec<CameraWatch>>,
 }
 
-/// What the simulated cameras render from.
+/// True poses, from which the simulated cameras render.
 #[derive(Default)]
 struct SharedTruth {
     truth: Mutex<Truth>,
@@ -94,7 +95,7 @@ impl Sources {
         }
         if simulated > 0 {
             bail!(
-                "tags: {simulated} of {} cameras are simulated; take all or none",
+                "tags: {simulated} of {} cameras are simulated; use all or none",
                 setup.cameras.len()
             );
         }
@@ -120,7 +121,7 @@ impl Sources {
         }
         if live < opened.len() {
             bail!(
-                "tags: {live} of {} cameras are live, the others recordings; take all or none",
+                "tags: {live} of {} cameras are live, the others recordings; use all or none",
                 opened.len()
             );
         }
@@ -158,24 +159,24 @@ impl Sources {
         Ok(())
     }
 
-    /// Returns where true poses are awaited, if a camera is simulated.
+    /// Returns the address for true poses, if a camera is simulated.
     pub(super) fn truth(&self) -> Option<SocketAddr> {
         self.truth.as_ref().map(|(address, _)| *address)
     }
 
-    /// Returns the true pose at an instant, if it is known.
+    /// Returns the true pose at an instant, if known.
     pub(super) fn true_pose(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
         let (_, shared) = self.truth.as_ref()?;
         lock(&shared.truth).at(stamp)
     }
 
-    /// Whether stamps are of this computer's clock.
+    /// Whether stamps are on this computer's clock.
     pub(super) fn is_live(&self) -> bool {
         self.recorded.is_empty()
     }
 
-    /// Returns the newest images in the order of their stamps, none if none came in time; `None` at the
-    /// end of all.
+    /// Returns the newest images sorted by stamp, or none after the timeout; `None` at the end of
+    /// all sources.
     pub(super) fn next(&mut self, wait: Duration) -> Result<Option<Vec<CameraImage>>> {
         if !self.recorded.is_empty() {
             return self.next_recorded();
@@ -188,7 +189,7 @@ impl Sources {
             .unwrap_or_else(PoisonError::into_inner);
         let mut taken = std::mem::take(&mut *shots);
         drop(shots);
-        // Without a thread that reads there will be none.
+        // Without a reader thread there are no more images.
         if taken.is_empty() && Arc::strong_count(&self.mailbox) == 1 {
             return Ok(None);
         }
@@ -196,18 +197,18 @@ impl Sources {
         Ok(Some(taken))
     }
 
-    /// Returns what has changed with cameras: named once, and again when they are well.
+    /// Returns a change of a camera's fault: each fault is reported once, and its end once.
     pub(super) fn poll_event(&mut self) -> Option<CameraEvent> {
         let faults: Vec<Option<String>> = if self.recorded.is_empty() {
             let now_ns = now_ns();
             lock(&self.mailbox.watches).iter().map(|watch| watch.fault(now_ns)).collect()
         } else {
-            // A recording is as late as it is.
+            // Recordings have no delay.
             let fault = |recording: &Recording| recording.watch.fault(0);
             self.recorded.iter().map(fault).collect()
         };
         for (camera, (fault, told)) in faults.into_iter().zip(&mut self.told).enumerate() {
-            // For how long there was none is told once.
+            // A longer duration of the same fault is not a change.
             let words = |fault: &Option<String>| {
                 fault.as_ref().map(|text| text.split(" for ").next().unwrap_or("").to_owned())
             };
@@ -219,7 +220,7 @@ impl Sources {
         None
     }
 
-    /// Returns the earliest images of the recordings, those of one instant together.
+    /// Returns the earliest images of the recordings; those of one instant together.
     fn next_recorded(&mut self) -> Result<Option<Vec<CameraImage>>> {
         let heads = self.recorded.iter().filter_map(|r| r.head.as_ref());
         let Some(first) = heads.map(|head| head.stamp_ns).min() else { return Ok(None) };
@@ -250,7 +251,7 @@ impl Mailbox {
     }
 }
 
-/// Reads one live camera until it is stopped; opens it again when it ended.
+/// Reads one live camera until stopped; reopens it after an error.
 fn read(
     index: usize,
     camera: &TagCamera,
@@ -284,14 +285,14 @@ fn read(
         if source.take().is_some() {
             lock(&mailbox.watches)[index].handle_end(ended);
         }
-        // Standard input does not come again.
+        // Standard input cannot be reopened.
         let Some(name) = camera.source.as_deref().filter(|name| *name != "-") else { return };
         std::thread::sleep(OPEN_AGAIN);
         source = capture::open(name).ok();
     }
 }
 
-/// Returns a source's next image, its stamp less the delay that its camera is known to have.
+/// Returns the next image of a source; its stamp is corrected by the camera's known delay.
 fn next_exposed(
     camera: &TagCamera,
     source: &mut dyn ImageSource,
@@ -301,7 +302,7 @@ fn next_exposed(
     Ok(next.map(|next| Exposure { stamp_ns: next.stamp_ns.saturating_sub(late_ns), ..next }))
 }
 
-/// Images of another size than the lens was calibrated in would be located wrongly.
+/// Images of another size than that of the calibration would be located incorrectly.
 fn check_size(camera: &TagCamera, image: &Gray) -> Result<(), String> {
     let (width, height) = (camera.intrinsics.width_px, camera.intrinsics.height_px);
     if (image.width_px(), image.height_px()) != (width, height) {
@@ -349,7 +350,7 @@ fn spawn_listener(
     });
 }
 
-/// Renders what one camera sees until it is stopped.
+/// Renders the images of one camera until stopped.
 fn draw(
     index: usize,
     mut camera: SimulatedCamera,
@@ -369,7 +370,7 @@ fn draw(
             if waited.timed_out() {
                 continue;
             }
-            // Drawing takes long; poses arrive meanwhile.
+            // Rendering is slow; poses arrive meanwhile.
             known.clone_from(&truth);
         }
         if let Some((stamp, image)) = camera.expose(&known, layouts, true) {
@@ -378,9 +379,9 @@ fn draw(
     }
 }
 
-/// Recorded images closer than this were exposed together.
+/// Maximum interval between recorded images that were exposed together.
 const TOGETHER_NS: u64 = 2_000_000;
-/// How often a camera that ended is tried again.
+/// Period of attempts to reopen a camera.
 const OPEN_AGAIN: Duration = Duration::from_millis(500);
-/// How often threads look whether they should end.
+/// Period at which threads check the stop flag.
 const LOOK_AT_STOP: Duration = Duration::from_millis(100);

@@ -1,5 +1,5 @@
-//! The live view: a page with what each camera sees, the tags found in it, and how far their corners are
-//! from where the pose puts them. It reads only; bind it to 127.0.0.1 unless the network is trusted.
+//! The live view: a page with the image of each camera, the detected tags, and the residuals of
+//! their corners. It is read-only; bind it to 127.0.0.1 unless the network is trusted.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -21,17 +21,17 @@ use vizflyt_tags::locate::{CameraResult, LocateOutcome};
 
 use super::CameraImage;
 
-/// The page and its server.
+/// Server of the live view.
 pub(super) struct LiveView {
     address: SocketAddr,
     shared: Arc<Mutex<Shown>>,
 }
 
-/// What is shown.
+/// Data of the page.
 struct Shown {
     cameras: Vec<Camera>,
     pose: Value,
-    /// When it was last looked at: images are kept only for someone.
+    /// Time of the last request: images are stored only while a browser shows them.
     asked: Option<Instant>,
 }
 
@@ -43,7 +43,7 @@ struct Camera {
 }
 
 impl LiveView {
-    /// Serves the page at an address; port 0 takes a free one.
+    /// Serves the page at an address; port 0 selects a free one.
     pub(super) fn serve(address: SocketAddr, cameras: &[TagCamera]) -> Result<Self> {
         let cameras = cameras.iter().map(|camera| Camera {
             name: camera.name.clone(),
@@ -74,12 +74,12 @@ impl LiveView {
         Ok(Self { address, shared })
     }
 
-    /// Returns where it is served.
+    /// Returns the address of the page.
     pub(super) fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Shows a set of images and what came of it.
+    /// Shows a set of images and the result.
     pub(super) fn show(&self, shots: &[CameraImage], outcome: &LocateOutcome, image_ms: f64) {
         let mut shown = lock(&self.shared);
         if shown.asked.is_none_or(|asked| asked.elapsed() > FORGET_AFTER) {
@@ -168,9 +168,8 @@ fn jpeg(image: &Gray) -> Option<Vec<u8>> {
     Some(bytes)
 }
 
-/// The page.
 const PAGE: &str = include_str!("view.html");
-/// Of JPEG, 1 to 100.
+/// JPEG quality, 1 to 100.
 const QUALITY: u8 = 70;
-/// Nobody looks if nobody asked for this long.
+/// No browser shows the page after this time without a request.
 const FORGET_AFTER: Duration = Duration::from_secs(3);

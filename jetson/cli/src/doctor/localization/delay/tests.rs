@@ -2,17 +2,17 @@ use super::*;
 use proptest::prelude::*;
 use vizflyt_protocol::random::SplitMix64;
 
-/// What happens in a hand, and how it is measured.
+/// Parameters of a motion by hand and its measurement.
 #[derive(Clone, Copy, Debug)]
 struct Lab {
     latency_s: f64,
     pose_hz: f64,
     gyro_hz: f64,
-    /// Of attitudes. [rad]
+    /// Noise of the attitudes. [rad]
     pose_sigma_rad: f64,
-    /// Of the gyroscope. [rad/s]
+    /// Noise of the gyroscope. [rad/s]
     gyro_sigma_radps: f64,
-    /// How long a motion takes. [s]
+    /// Duration of a motion. [s]
     motion_s: f64,
     seed: u64,
 }
@@ -27,7 +27,7 @@ const LAB: Lab = Lab {
     seed: 1,
 };
 
-/// Noise of about one standard deviation.
+/// Noise with a standard deviation of about one.
 struct Noise(SplitMix64);
 
 impl Noise {
@@ -44,7 +44,7 @@ impl Noise {
     }
 }
 
-/// Stands, turned left by a quarter, its nose raised: with rests between, as the check asks for. [s]
+/// Motion of the check: rest, a quarter turn left, nose raised, with rests in between.
 fn attitude(at_s: f64, motion_s: f64) -> DQuat {
     let eased = |from_s: f64| {
         let share = ((at_s - from_s) / motion_s).clamp(0.0, 1.0);
@@ -60,14 +60,14 @@ fn measure(lab: &Lab) -> Result<Delay, NoDelay> {
     let mut meter = DelayMeter::default();
     let end_s = 9.5 + 2.0 * lab.motion_s;
     let bias = noise.vector() * 0.005;
-    // Neither begins at the same instant.
+    // The two streams do not start at the same instant.
     for step in 0..(end_s * lab.gyro_hz) as u32 {
         let at_s = (f64::from(step) + 0.37) / lab.gyro_hz;
         let (a, b) = (attitude(at_s - 5e-4, lab.motion_s), attitude(at_s + 5e-4, lab.motion_s));
         let rate = (a.conjugate() * b).to_scaled_axis() / 1e-3;
         meter.add_gyro(100.0 + at_s, rate + bias + noise.vector() * lab.gyro_sigma_radps);
     }
-    // A frame turned against the body, and a stream in other axes.
+    // A rotated world frame, and another body frame of the stream.
     let (laid, body) = (DQuat::from_rotation_x(1.1), DQuat::from_rotation_y(-0.8));
     for step in 0..(end_s * lab.pose_hz) as u32 {
         let at_s = f64::from(step) / lab.pose_hz;
@@ -79,17 +79,17 @@ fn measure(lab: &Lab) -> Result<Delay, NoDelay> {
 }
 
 #[test]
-fn a_delay_is_measured() {
+fn measures_a_delay() {
     let found = measure(&LAB).unwrap();
     assert!((found.ms - 100.0).abs() < 3.0, "{found:?}");
     assert!(found.uncertain_ms < 6.0, "{found:?}");
-    // Too much was set.
+    // The configured delay is too large.
     let found = measure(&Lab { latency_s: -0.05, ..LAB }).unwrap();
     assert!((found.ms + 50.0).abs() < 3.0, "{found:?}");
 }
 
 #[test]
-fn what_was_too_gentle_is_not_said() {
+fn rejects_motions_that_are_too_gentle() {
     assert_eq!(measure(&Lab { motion_s: 12.0, ..LAB }), Err(NoDelay::Gentle));
     let noisy = Lab { pose_sigma_rad: 0.3, ..LAB };
     assert!(measure(&noisy).is_err());
@@ -97,7 +97,7 @@ fn what_was_too_gentle_is_not_said() {
 }
 
 #[test]
-fn another_vehicles_gyroscope_is_noticed() {
+fn rejects_another_vehicles_gyroscope() {
     let mut meter = DelayMeter::default();
     let mut noise = Noise(SplitMix64::new(7));
     for step in 0..1200u32 {
@@ -111,7 +111,7 @@ fn another_vehicles_gyroscope_is_noticed() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(96))]
 
-    /// Whatever the rates: the delay to within what is said of it, and that is little.
+    /// At any rates, the error of the delay is within its stated uncertainty, and that is small.
     #[test]
     fn delays_are_found_at_any_rate(
         latency_s in 0.0..0.3f64, pose_hz in 10.0..200.0f64, gyro_hz in 10.0..200.0f64,
@@ -120,7 +120,7 @@ proptest! {
         let lab = Lab { latency_s, pose_hz, gyro_hz, pose_sigma_rad, motion_s, seed, ..LAB };
         let found = measure(&lab);
         let off_ms = found.map(|found| (found.ms - latency_s * 1e3).abs());
-        // A noisy slow source may say nothing, but nothing wrong.
+        // For a noisy slow source there may be no result, but never a wrong one.
         if let (Ok(found), Ok(off_ms)) = (found, off_ms) {
             prop_assert!(off_ms < 10.0_f64.max(found.uncertain_ms), "{lab:?}: {found:?}");
         } else {
