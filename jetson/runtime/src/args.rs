@@ -1,4 +1,4 @@
-//! The command line of `vizflyt fly`.
+//! Command line of `vizflyt fly`.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -16,8 +16,9 @@ use crate::link::{LinkSettings, SigningFile, VISION_HZ};
 use crate::log::{LogSettings, LoggedImages};
 use vizflyt_guardian::port::MavlinkAddress;
 
-/// Flies a plugin: images from the render server to it, its setpoints through the guard to the
-/// autopilot.
+/// Flies a plugin with images from the render server
+///
+/// The guard checks the plugin's setpoints and sends them to the autopilot.
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Example:\n  vizflyt fly ./target/release/my-plugin --server 192.168.10.2:4433 \\\n    \
@@ -26,77 +27,83 @@ use vizflyt_guardian::port::MavlinkAddress;
                         and on Ctrl-C. Options that are not given come from jetson.toml."
 )]
 pub struct FlyArgs {
-    /// The plugin; started as a child process [default: `path` of [plugin] in jetson.toml]
+    /// Plugin, started as a child process [default: `path` of [plugin] in jetson.toml]
     #[arg(value_name = "PLUGIN")]
     pub plugin: Option<OsString>,
-    /// Starts no plugin but waits, for ever, for one that you start: `python my_plugin.py`, a debugger,
-    /// a notebook. At a breakpoint the vehicle holds
+    /// Waits for a plugin that you start yourself, instead of starting one
+    ///
+    /// For example `python my_plugin.py`, a debugger or a notebook. There is no timeout. At a breakpoint the vehicle
+    /// holds.
     #[arg(long, conflicts_with_all = ["plugin", "plugin_arguments"])]
     pub attach: bool,
     /// Arguments for the plugin, after `--`
     #[arg(last = true, value_name = "ARGUMENT")]
     pub plugin_arguments: Vec<OsString>,
-    /// The render server, and how it is known
+    /// Render server and keys
     #[command(flatten)]
     pub server: ServerArgs,
-    /// The autopilot: `udpin:ADDR:PORT` waits for it, `udpout:HOST:PORT` calls it; also `tcpin:`, `tcpout:`
-    /// and `serial:/dev/ttyTHS1:921600`, with `:rtscts` after it for flow control
-    /// [default: udpin:0.0.0.0:14550]
+    /// Connection to the autopilot [default: udpin:0.0.0.0:14550]
+    ///
+    /// `udpin:ADDR:PORT` waits for packets, `udpout:HOST:PORT` sends first; also `tcpin:`, `tcpout:` and
+    /// `serial:/dev/ttyTHS1:921600`, with `:rtscts` at the end for flow control.
     #[arg(long, value_name = "ADDRESS")]
     pub mavlink: Option<MavlinkAddress>,
-    /// The vehicle's name in the localization system [default: vizflyt]
+    /// Name of the vehicle in the localization system [default: vizflyt]
     #[arg(long)]
     pub vehicle: Option<String>,
-    /// The map of a course whose map is known (map.json), for the plugin
+    /// Map file for the plugin (map.json), for courses with a known map
     #[arg(long, value_name = "FILE")]
     pub map: Option<PathBuf>,
-    /// What is logged, and where
+    /// Flight log
     #[command(flatten)]
     pub log: LogArgs,
-    /// Shows the log's channels live to Foxglove, on this computer's port 8765 or at ADDR:PORT;
-    /// whoever reaches it sees the flight
+    /// Streams the log's channels live to Foxglove
+    ///
+    /// Listens on ADDR:PORT, by default on port 8765 of this computer only. Every viewer that can reach the port sees
+    /// the flight.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, require_equals = true,
           default_missing_value = "127.0.0.1:8765")]
     pub foxglove: Option<SocketAddr>,
-    /// Writes the report (JSON) there
+    /// Writes the report to this file (JSON)
     #[arg(long, value_name = "FILE")]
     pub report: Option<PathBuf>,
-    /// Lands this long after take-off; 0 leaves it to the arena
+    /// Time from take-off until the vehicle lands; 0: time limit of the arena
     #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
     pub seconds: f64,
-    /// Gives up if not in the air after this long; 0 waits for ever
+    /// Maximum time until the vehicle is in the air; 0: no timeout
     #[arg(long, value_name = "SECONDS", default_value_t = 120.0)]
     pub ready_within: f64,
-    /// Stays on the ground, once all is ready, until `start` is pressed on the server's page
+    /// Waits on the ground until `start` is pressed on the server's page
     #[arg(long)]
     pub wait: bool,
-    /// This vehicle's own limits, from `jetson.toml`
+    /// Limits of this vehicle, from `jetson.toml`
     #[arg(skip = Limits::NONE)]
     pub limits: Limits,
-    /// Prints one JSON object per line for programs, instead of lines for people
+    /// Prints one JSON object per line for programs, instead of text
     #[arg(long)]
     pub json: bool,
-    /// Ends when standard input does, so that it never outlives a killed parent
+    /// Ends when standard input closes, so that it never outlives its parent
     #[arg(long, hide = true)]
     pub lifeline: bool,
-    /// The settings of this computer
+    /// Settings file of this computer
+    ///
     /// [default: ./jetson.toml, ~/.config/vizflyt/jetson.toml or /etc/vizflyt/jetson.toml]
     #[arg(long, value_name = "FILE", conflicts_with = "no_config")]
     pub config: Option<PathBuf>,
     /// Reads no jetson.toml
     #[arg(long)]
     pub no_config: bool,
-    /// The settings of `jetson.toml`; [`FlyArgs::settle`] reads them.
+    /// Settings from `jetson.toml`; [`FlyArgs::settle`] reads them.
     #[arg(skip)]
     pub jetson: JetsonConfig,
 }
 
 impl FlyArgs {
-    /// Reads `jetson.toml`, and takes from it what the command line leaves out. Returns which file
-    /// it was, if there is one.
+    /// Reads `jetson.toml` and uses its values for options that are not on the command line. Returns the path of the
+    /// file, if one exists.
     ///
     /// # Errors
-    /// A file that is refused, an address that has no host, no plugin at all.
+    /// Fails if the file is invalid, an address has no host, or there is no plugin.
     pub fn settle(&mut self) -> anyhow::Result<Option<PathBuf>> {
         let file = match &self.config {
             Some(file) => Some(file.clone()),
@@ -108,7 +115,7 @@ impl FlyArgs {
         }
         let JetsonConfig { server, vehicle, plugin, .. } = &self.jetson;
         let parse_error = |error| anyhow::anyhow!("jetson.toml: {error}");
-        // A server by the command line is another one: the file's keys are not for it.
+        // A server on the command line is a different server, so the keys in the file do not apply.
         if let (None, Some(server)) = (&self.server.at, server) {
             self.server.at = Some(server.address.parse().map_err(parse_error)?);
             self.server.fingerprint = self.server.fingerprint.or(server.fingerprint);
@@ -129,8 +136,7 @@ impl FlyArgs {
         Ok(file)
     }
 
-    /// Returns the command that starts the plugin, before the runtime's own argument; empty if a
-    /// person starts it.
+    /// Returns the command that starts the plugin, without the runtime's own argument; empty with `--attach`.
     pub fn plugin_command(&self) -> Vec<OsString> {
         if self.attach {
             return Vec::new();
@@ -138,12 +144,12 @@ impl FlyArgs {
         self.plugin.iter().chain(&self.plugin_arguments).cloned().collect()
     }
 
-    /// Returns where the autopilot is.
+    /// Returns the address of the autopilot.
     pub fn mavlink_address(&self) -> MavlinkAddress {
         self.mavlink.clone().unwrap_or_else(MavlinkAddress::usual)
     }
 
-    /// Returns what `jetson.toml` sets of the link.
+    /// Returns the link settings of `jetson.toml`.
     ///
     /// # Errors
     /// As [`link_settings`].
@@ -157,22 +163,26 @@ impl FlyArgs {
     }
 }
 
-/// What is logged, and where.
+/// Flight log options.
 #[derive(Args, Clone, Debug, Default)]
 pub struct LogArgs {
-    /// Images in the flight log: `reduced` as many as fit into 60 MB a minute, `full` all, for a bit-exact replay,
-    /// `none` writes no log [default: `images` of [log] in jetson.toml, or else reduced]
+    /// Images in the flight log: `reduced`, `full`, or `none` for no log
+    ///
+    /// `reduced` stores as many images as fit into 60 MB a minute, `full` stores all images, for a bit-exact replay.
+    /// [default: `images` of [log] in jetson.toml, else reduced]
     #[arg(long = "log", value_name = "reduced|full|none", hide_possible_values = true)]
     pub option: Option<LogOption>,
     /// Folder for flight logs (MCAP) [default: flights]
     #[arg(long, value_name = "DIR")]
     pub log_dir: Option<PathBuf>,
-    /// Writes depth a second time so that any viewer shows it (16UC1); 150 kB more for each image of 320x240
+    /// Writes depth a second time as 16UC1, which every viewer shows
+    ///
+    /// This adds 150 kB per image of 320x240.
     #[arg(long)]
     pub log_depth: bool,
 }
 
-/// The value of `--log`.
+/// Value of `--log`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum LogOption {
     /// As many images as fit into 60 MB a minute.
@@ -194,7 +204,7 @@ impl LogOption {
         }
     }
 
-    /// Returns the word that is typed.
+    /// Returns the value as typed on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Reduced => "reduced",
@@ -205,7 +215,7 @@ impl LogOption {
 }
 
 impl LogArgs {
-    /// Returns the options for another `vizflyt fly` that is to log as this one does.
+    /// Returns the options with which another `vizflyt fly` logs in the same way.
     pub fn to_command_line(&self) -> Vec<OsString> {
         let pairs = [
             ("--log", self.option.map(|option| option.name().into())),
@@ -216,7 +226,7 @@ impl LogArgs {
         given.flatten().chain(depth).collect()
     }
 
-    /// Returns where and how to log; options that the command line leaves out come from `config`.
+    /// Returns the log settings; options that are not on the command line come from `config`.
     pub fn settings(&self, config: &LogConfig) -> LogSettings {
         let folder = self.log_dir.clone().unwrap_or_else(|| "flights".into());
         LogSettings {
@@ -228,12 +238,12 @@ impl LogArgs {
     }
 }
 
-/// Returns what a `[vehicle]` sets of the link to the autopilot of the vehicle with this name.
+/// Returns the link settings for the vehicle `name` from its section `[vehicle]`.
 ///
 /// # Errors
-/// If the key for signing cannot be used.
+/// Fails if the signing key cannot be used.
 pub fn link_settings(vehicle: &VehicleConfig, name: &str) -> anyhow::Result<LinkSettings> {
-    // Without the computer's name: the vehicle's own suffices.
+    // If the host name is unavailable, the name of the vehicle is enough.
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let key = vehicle.signing_key.as_deref();
     Ok(LinkSettings {
@@ -244,36 +254,37 @@ pub fn link_settings(vehicle: &VehicleConfig, name: &str) -> anyhow::Result<Link
     })
 }
 
-/// Which server, how this computer knows it, and who this computer is.
+/// Render server, its fingerprint, and this computer's keys.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
-    /// The render server's address; `vizflyt pair HOST:PORT` makes it known once
+    /// Address of the render server, once paired with `vizflyt pair HOST:PORT`
     #[arg(long = "server", value_name = "HOST:PORT")]
     pub at: Option<ServerAddress>,
-    /// SHA-256 of the server's certificate [default: the one this computer is paired with]
+    /// SHA-256 of the server's certificate [default: from pairing]
     #[arg(long, value_name = "HEX")]
     pub fingerprint: Option<Fingerprint>,
     /// Folder of this computer's key and of servers.toml
+    ///
     /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
 }
 
 impl ServerArgs {
-    /// Returns where the server is.
+    /// Returns the address of the server.
     ///
     /// # Errors
-    /// The default.
+    /// Fails if no server is configured.
     pub fn address(&self) -> anyhow::Result<&ServerAddress> {
         self.at.as_ref().ok_or_else(|| {
             anyhow::anyhow!("no server is known; give --server, or [server] in jetson.toml")
         })
     }
 
-    /// Returns who the server is and who we are.
+    /// Returns the fingerprint of the server and the identity of this computer.
     ///
     /// # Errors
-    /// No server, or one that this computer is not paired with; keys that cannot be used.
+    /// Fails without a server, if this computer is not paired with it, or if the keys cannot be used.
     pub fn known(&self) -> anyhow::Result<(Fingerprint, Identity)> {
         let at = self.address()?;
         let folder = KeysFolder::open(self.keys.as_deref())?;
@@ -298,7 +309,7 @@ impl ServerArgs {
 pub struct ServerAddress {
     /// `HOST:PORT`.
     pub typed: String,
-    /// The first address it has.
+    /// First address that the name resolves to.
     pub address: SocketAddr,
 }
 
@@ -330,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn the_command_line_is_consistent_and_reads() {
+    fn parses_the_command_line() {
         Program::command().debug_assert();
         let fingerprint = Fingerprint::of(b"x").to_string();
         let line = ["fly", "python3", "--server", "127.0.0.1:4433", "--fingerprint", &fingerprint];
@@ -344,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn the_command_line_goes_before_the_file() {
+    fn prefers_the_command_line_over_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("jetson.toml");
         let text = "[server]\naddress = \"127.0.0.1:1\"\nkeys = \"/keys\"\n\
@@ -391,12 +402,12 @@ mod tests {
         check(&["--log=full"], "", "flights", LoggedImages::Full);
         check(&["--log", "reduced", "--log-dir=d"], full, "d", LoggedImages::Reduced);
         assert_eq!(settle(&["--log=none", "--log-dir=d"], full).folder, None);
-        // Neither a typing error nor a folder is taken for one of them.
+        // Rejects typing errors and folders.
         for wrong in ["--log=nnoe", "--log=some/folder"] {
             let error = Program::try_parse_from(["fly", "x", wrong]).err().unwrap().to_string();
             assert!(error.contains("[possible values: reduced, full, none]"), "{error}");
         }
-        // A child with the same options does the same.
+        // A child process with the same options logs in the same way.
         let line = ["fly", "x", "--log=full", "--log-dir=d"];
         let args = Program::try_parse_from(line).unwrap().fly.log;
         assert_eq!(args.to_command_line(), ["--log", "full", "--log-dir", "d"]);
@@ -406,7 +417,7 @@ mod tests {
     }
 
     #[test]
-    fn a_server_is_known_by_pairing_or_by_hand() {
+    fn finds_the_fingerprint_by_pairing_or_option() {
         let root = tempfile::tempdir().unwrap();
         let keys = root.path().join("keys");
         let args = |fingerprint| ServerArgs {

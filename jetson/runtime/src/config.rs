@@ -1,4 +1,4 @@
-//! `jetson.toml`: which lab this computer belongs to, and how far a flight may go here.
+//! `jetson.toml`: settings of the vehicle's computer: server, vehicle, limits, plugin, log.
 //!
 //! ```toml
 //! [server]                            # without this section `vizflyt fly` flies the simulated lab
@@ -8,19 +8,19 @@
 //! name = "vizflyt"
 //! mavlink = "udpin:0.0.0.0:14550"     # or serial:/dev/ttyTHS1:921600
 //!
-//! [limits]                            # of these and the arena's, the stricter wins
+//! [limits]                            # the stricter of these and the arena's limits applies
 //! max_speed_mps = 2.0
 //!
 //! [plugin]
 //! path = "/home/team/first"
-//! memory_mb = 2000                    # what it may use: docs/guides/safety.md
+//! memory_mb = 2000                    # resource limits: docs/guides/safety.md
 //!
 //! [log]
-//! keep_gb = 20                        # when a flight begins, the oldest logs beyond it are deleted
+//! keep_gb = 20                        # older logs beyond it are deleted when a flight begins
 //! ```
-//! Text comes in through [`JetsonConfig::parse`], which refuses unknown keys (it names the nearest
-//! known one) and values that cannot work. The command line goes before the file. Nothing is
-//! resolved or opened here: a host name in the file is looked up when it is used.
+//! [`JetsonConfig::parse`] rejects unknown keys (the error suggests the nearest known key) and invalid values. The
+//! command line has priority over the file. This module resolves and opens nothing: a host name in the file is resolved
+//! when it is used.
 
 #[cfg(test)]
 mod tests;
@@ -40,80 +40,78 @@ use crate::log::{LoggedImages, Retention};
 use crate::supervisor::{PluginLimits, Restart};
 use vizflyt_guardian::port::{self, Shape};
 
-/// The whole of `jetson.toml`. Every section may be absent.
+/// Contents of `jetson.toml`. Every section is optional.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct JetsonConfig {
-    /// The render server; with it, `vizflyt fly` flies the real lab.
+    /// Render server. If it is set, `vizflyt fly` flies the real lab.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub server: Option<ServerConfig>,
-    /// The vehicle this computer sits on.
+    /// Vehicle of this computer.
     pub vehicle: VehicleConfig,
-    /// Limits of this vehicle; the arena has its own, and the stricter wins.
+    /// Limits of this vehicle; the stricter of these and the arena's limits applies.
     pub limits: LimitsConfig,
-    /// The plugin and what it may use.
+    /// Plugin and its resource limits.
     pub plugin: PluginConfig,
     /// Flight logs.
     pub log: LogConfig,
 }
 
-/// `[server]`: the render server.
+/// `[server]`: render server.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ServerConfig {
     /// `HOST:PORT`.
     pub address: String,
-    /// SHA-256 of its certificate; without it, the one this computer is paired with.
+    /// SHA-256 of the server's certificate. Default: the certificate from pairing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fingerprint: Option<Fingerprint>,
-    /// Folder of this computer's key and of `servers.toml`; without it the user's own.
+    /// Folder of this computer's key and of `servers.toml`. Default: the user's folder.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keys: Option<PathBuf>,
 }
 
-/// `[vehicle]`: the vehicle this computer sits on.
+/// `[vehicle]`: vehicle of this computer.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VehicleConfig {
-    /// Its name in the localization system.
+    /// Name of the vehicle in the localization system.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Its autopilot: `udpin:ADDR:PORT`, `udpout:HOST:PORT`, `tcpin:`, `tcpout:` or
-    /// `serial:PATH:BAUD`.
+    /// Connection to the autopilot: `udpin:ADDR:PORT`, `udpout:HOST:PORT`, `tcpin:`, `tcpout:` or `serial:PATH:BAUD`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mavlink: Option<String>,
-    /// Its autopilot's MAVLink system id, where several share a link; without it the only one.
+    /// MAVLink system id of the autopilot, if several share a link. Default: the only one on the link.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub system: Option<u8>,
-    /// Poses sent to the autopilot, 30 to 50; without it 50. [Hz]
+    /// Rate of poses sent to the autopilot, 30 to 50. Default: 50. [Hz]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vision_hz: Option<f64>,
-    /// File with the key for MAVLink 2 signing, made by `vizflyt vehicle sign`; with it, packets
-    /// that are not signed are refused.
+    /// Key file for MAVLink 2 signing, created by `vizflyt vehicle sign`. If it is set, unsigned packets are rejected.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub signing_key: Option<PathBuf>,
 }
 
-/// `[limits]`: what the guard keeps to beyond the arena's own limits.
+/// `[limits]`: limits of the guard in addition to those of the arena.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LimitsConfig {
-    /// Greatest speed. [m/s]
+    /// Maximum speed. [m/s]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_speed_mps: Option<f64>,
-    /// Greatest acceleration. [m/s^2]
+    /// Maximum acceleration. [m/s^2]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_acceleration_mps2: Option<f64>,
-    /// Greatest lean. [deg]
+    /// Maximum tilt. [deg]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_tilt_deg: Option<f64>,
-    /// Greatest height of the body's centre. [m, world]
+    /// Maximum height of the body's centre. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_altitude_m: Option<f64>,
 }
 
 impl From<LimitsConfig> for Limits {
-    /// What is not set does not limit.
+    /// Missing values become infinite or `None`: no limit.
     fn from(config: LimitsConfig) -> Self {
         Self {
             max_speed_mps: config.max_speed_mps.unwrap_or(f64::INFINITY),
@@ -124,50 +122,50 @@ impl From<LimitsConfig> for Limits {
     }
 }
 
-/// `[plugin]`: the plugin and what it may use.
+/// `[plugin]`: plugin and its resource limits.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PluginConfig {
-    /// The default plugin of `vizflyt fly`: a folder, a `.py`, a program, a built-in's name.
+    /// Default plugin of `vizflyt fly`: a folder, a `.py` file, a program, or the name of a built-in plugin.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub path: Option<PathBuf>,
-    /// Memory; without it half of this computer's. [MB]
+    /// Maximum memory. Default: half of this computer's memory. [MB]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_mb: Option<u64>,
-    /// Processors it may keep busy, 1.5 is one and a half; without it all but one.
+    /// Maximum processor use; 1.5 is one and a half processors. Default: all but one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpus: Option<f64>,
-    /// Processes and threads; without it 128.
+    /// Maximum number of processes and threads. Default: 128.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub processes: Option<u32>,
-    /// Maximum time of `on_image`, without it 100; what is beyond is shown. [ms]
+    /// Maximum duration of `on_image`; longer calls are reported. Default: 100. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline_ms: Option<f64>,
-    /// When it is started again: `never`, `on_ground` (without it), `in_flight`.
+    /// When the plugin is restarted: `never`, `on_ground` (default) or `in_flight`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub restart: Option<Restart>,
-    /// How often, in one flight; without it 3.
+    /// Maximum number of restarts in one flight. Default: 3.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub restarts: Option<u32>,
-    /// Whether it may use the network.
+    /// Whether the plugin may use the network.
     pub network: bool,
-    /// The user it runs as if the runtime is root; without it `vizflyt`, or else `nobody`.
+    /// User of the plugin's process if the runtime is root. Default: `vizflyt`, or `nobody` if there is no such user.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub user: Option<String>,
-    /// Folders it may write in, beside its own, the working folder and `/tmp`.
+    /// Folders that the plugin may write to, in addition to its own folder, the working folder and `/tmp`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub write: Vec<PathBuf>,
-    /// Files and folders of yours that it reads, beside its own folder, the working folder, its interpreter and the
-    /// system.
+    /// Files and folders that the plugin may read, in addition to its own folder, the working folder, its interpreter
+    /// and the system.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub read: Vec<PathBuf>,
-    /// The cameras that it flies by: each must be fresh. Without it one fresh camera is enough.
+    /// Cameras that the plugin needs: each must deliver fresh images. Default: one fresh camera is enough.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cameras: Vec<String>,
 }
 
 impl PluginConfig {
-    /// Returns what the plugin may use.
+    /// Returns the resource limits of the plugin.
     pub fn limits(&self) -> PluginLimits {
         let fair = PluginLimits::default();
         PluginLimits {
@@ -186,24 +184,24 @@ impl PluginConfig {
     }
 }
 
-/// `[log]`: which images flight logs hold, and how long they are kept.
+/// `[log]`: images in flight logs, and retention of the logs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
-    /// `reduced` (without it) or `full`.
+    /// `reduced` (default) or `full`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub images: Option<LoggedImages>,
-    /// Size of all logs of a folder together, without it 20. Beyond it the oldest are deleted when a
-    /// flight begins; `inf` keeps all. [GB]
+    /// Maximum size of all logs in a folder. When a flight begins, the oldest logs beyond it are deleted; `inf` keeps
+    /// all. Default: 20. [GB]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keep_gb: Option<f64>,
-    /// Age at which a log is deleted when a flight begins; without it none. [days]
+    /// Maximum age of a log. When a flight begins, older logs are deleted. Default: no limit. [days]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keep_days: Option<f64>,
 }
 
 impl LogConfig {
-    /// Returns how long logs are kept.
+    /// Returns the retention of logs.
     pub fn retention(&self) -> Retention {
         // 20 GB are five and a half hours of reduced logs.
         let max_bytes = (self.keep_gb.unwrap_or(20.0) * 1e9) as u64;
@@ -212,42 +210,39 @@ impl LogConfig {
     }
 }
 
-/// Why a `jetson.toml` is refused.
+/// Error in a `jetson.toml`.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("{path}: {why}", path = .path.display())]
     Unreadable {
-        /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         why: std::io::Error,
     },
-    /// Syntax, types, absent or unknown keys: all of them.
+    /// All errors of syntax, types, missing and unknown keys.
     #[error(transparent)]
     Toml(#[from] TomlErrors),
-    /// A value that cannot work.
+    /// Invalid value.
     #[error("{key} = {value}: {advice}")]
     Invalid {
-        /// Where in the file: `limits.max_speed_mps`.
+        /// Key in the file, such as `limits.max_speed_mps`.
         key: &'static str,
-        /// What it says.
+        /// Value in the file.
         value: String,
-        /// What is wrong and what to do.
+        /// Problem and solution.
         advice: String,
     },
-    /// Several of these; two at least.
+    /// Two or more errors.
     #[error("{}", lines(.0))]
     Several(Vec<Self>),
-    /// A limit of the plugin that leaves it no room to live.
+    /// Invalid resource limit of the plugin.
     #[error("{0}")]
     Plugin(String),
-    /// What is wrong in which file.
+    /// Error in the file `path`.
     #[error("{path}: {error}", path = .path.display())]
     In {
-        /// The file.
         path: PathBuf,
-        /// The error.
         error: Box<Self>,
     },
 }
@@ -263,7 +258,7 @@ impl JetsonConfig {
         Ok(config)
     }
 
-    /// Reads the settings of a file. Paths in it are relative to its folder.
+    /// Reads the settings from a file. Relative paths in it start at its folder.
     ///
     /// # Errors
     /// As [`JetsonConfig::parse`], with the path; [`ConfigError::Unreadable`].
@@ -279,10 +274,10 @@ impl JetsonConfig {
         if let Some(key) = &mut config.vehicle.signing_key {
             *key = folder.join(&*key);
         }
-        // A bare name may be a built-in: it stays as it is.
         for folder_of_plugin in &mut config.plugin.write {
             *folder_of_plugin = folder.join(&*folder_of_plugin);
         }
+        // A bare name may be a built-in plugin: keep it.
         if let Some(plugin) = &mut config.plugin.path
             && plugin.components().count() > 1
         {
@@ -291,15 +286,14 @@ impl JetsonConfig {
         Ok(config)
     }
 
-    /// Returns the text of a `jetson.toml` that parses to the same value.
+    /// Returns TOML text that parses to the same value.
     ///
     /// # Errors
-    /// If a path in it is not UTF-8.
+    /// Fails if a path is not UTF-8.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
         toml::to_string(self)
     }
 
-    /// Looks at every value.
     fn validate(&self) -> Result<(), ConfigError> {
         let Self { server, vehicle, limits, plugin, log } = self;
         let address = server.as_ref().map(|server| &server.address);
@@ -344,10 +338,10 @@ fn check_mavlink(address: &str) -> Result<(), ConfigError> {
     }
 }
 
-/// Returns the file that counts where none is named: `./jetson.toml`, the user's, the computer's.
+/// Returns the default settings file: `./jetson.toml`, the user's, or the computer's.
 pub fn find() -> Option<PathBuf> {
     let home = std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config"));
-    // A relative XDG_CONFIG_HOME is to be ignored (XDG Base Directory Specification).
+    // The XDG Base Directory Specification says to ignore a relative XDG_CONFIG_HOME.
     let user = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from).filter(|p| p.is_absolute());
     let folders = [Some(PathBuf::from(".")), user.or(home).map(|c| c.join("vizflyt"))];
     folders
@@ -358,7 +352,7 @@ pub fn find() -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
-/// Bytes of [`vizflyt_protocol::messages::Name`].
+/// Size of [`vizflyt_protocol::messages::Name`] in bytes.
 const MAX_NAME_BYTES: usize = 32;
 
 fn invalid(key: &'static str, value: impl Display, advice: impl Into<String>) -> ConfigError {

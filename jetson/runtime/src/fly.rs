@@ -1,4 +1,4 @@
-//! Starts everything, flies, reports.
+//! Starts all parts of a flight, flies, and writes the report.
 
 use std::fs;
 use std::hash::{BuildHasher, RandomState};
@@ -30,26 +30,25 @@ use crate::log::{FlightLog, Live, keep_going_when_files_are_full};
 use crate::report::FlightReport;
 use crate::stream::{self, Outbox, ServerClock, Shared, StreamEvent, StreamSettings};
 
-/// How long the last events may take to reach the server.
+/// Timeout for sending the last events to the server.
 const GOODBYE: Duration = Duration::from_millis(500);
-/// Exit status when a second signal cuts the landing short: 128 + SIGINT, as shells have it.
+/// Exit status after a second signal during the landing: 128 + SIGINT, as in shells.
 const CUT_SHORT: i32 = 130;
 
-/// Flies one flight to its end; returns why it ended. Blocks; call it on a thread that lives as
-/// long as the flight, as the plugin dies with it.
+/// Flies one flight to its end and returns its outcome. Blocks. Call it on a thread that lives as long as the flight,
+/// because the plugin ends with that thread.
 ///
 /// # Errors
-/// If sockets or threads cannot be made, or the report cannot be written. Everything that goes
-/// wrong later is an [`EndReason`].
+/// Fails if sockets or threads cannot be created, or the report cannot be written. Every later problem is an
+/// [`EndReason`].
 pub fn fly(mut args: FlyArgs) -> anyhow::Result<EndReason> {
     args.settle()?;
     let command = args.plugin_command();
     fly_command(&args, command, None)
 }
 
-/// As [`fly`], with `args` settled and the plugin's command given as a list; [`FlyArgs::plugin`]
-/// only names it. For everything that comes from `reloads` the plugin is restarted, while the
-/// vehicle holds.
+/// As [`fly`], with settled `args` and the plugin's command as a list; [`FlyArgs::plugin`] is only its name. Each
+/// message from `reloads` restarts the plugin, while the vehicle holds.
 ///
 /// # Errors
 /// As [`fly`].
@@ -68,10 +67,10 @@ pub fn fly_command(
     let (fingerprint, identity) = args.server.known()?;
     let mavlink = args.mavlink_address();
     let link = args.link_settings()?;
-    // Before any thread: a process that is to outlive this one.
+    // Before any thread starts: the guardian must outlive this process.
     let program = std::env::current_exe().context("cannot find this program's path")?;
     let guardian = Guardian::start(&program, &mavlink, &link.wanted())
-        .with_context(|| format!("{mavlink}: the way to the autopilot cannot be opened"))?;
+        .with_context(|| format!("{mavlink}: cannot open the connection to the autopilot"))?;
     let guardian = Arc::new(guardian);
     let tokio = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let live = args.foxglove.map(|address| listen(&tokio, address)).transpose()?;
@@ -152,7 +151,7 @@ pub fn fly_command(
     Ok(flown.outcome)
 }
 
-/// Shows the log's channels to viewers.
+/// Serves the log's channels to live viewers.
 fn listen(tokio: &Runtime, address: SocketAddr) -> anyhow::Result<Live> {
     let live = tokio.block_on(Live::start(address)).with_context(|| {
         format!("--foxglove={address}: cannot listen there; give another address or port")
@@ -190,7 +189,7 @@ fn receive_mavlink(
     Ok(())
 }
 
-/// The first signal lands and ends; the second ends at once.
+/// The first signal lands and ends the flight; the second ends the process at once.
 fn watch_signals(sender: SyncSender<ControlInput>) -> anyhow::Result<()> {
     let mut count = 0;
     on_interrupt(move || {
@@ -198,7 +197,7 @@ fn watch_signals(sender: SyncSender<ControlInput>) -> anyhow::Result<()> {
         if count > 1 {
             process::exit(CUT_SHORT);
         }
-        tracing::info!("landing, then leaving; once more to leave at once");
+        tracing::info!("landing, then ending; interrupt again to end at once");
         let _ = sender.try_send(ControlInput::Interrupt);
         true
     })
@@ -232,7 +231,8 @@ fn tell_stream(
             }
             _ => false,
         };
-        // Poses are many and stale soon. An event that finds no room is sent again by the server.
+        // Poses are frequent and soon outdated, so they may be dropped. The server sends an event again if the queue
+        // was full.
         let taken = sender.try_send(ControlInput::Stream(event)).is_ok();
         if !taken && !is_pose {
             tracing::error!("the control loop is stalled");
@@ -241,7 +241,7 @@ fn tell_stream(
     }
 }
 
-/// Tells the guardian once a second where poses come from, and how the server's clock stands to ours.
+/// Sends the source of poses and the offset of the server's clock to the guardian, once a second.
 #[derive(Default)]
 struct FeedTeller {
     source: Option<(SocketAddr, FeedKey)>,

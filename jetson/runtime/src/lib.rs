@@ -8,13 +8,13 @@
 //!                  control ─▶ companion: flight ─▶ guard ─▶ link ══MAVLink══▶ autopilot
 //!                    └─▶ log (MCAP), report, telemetry to the server
 //! ```
-//! The modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish),
-//! [`supervisor`] (the plugin's process, its limits), [`companion`] (every decision, sans-IO) and its two
-//! drivers, [`control`] (wall clock) and [`lockstep`] (virtual clock, for grades). The companion joins
-//! [`flight`] (phases and outcome), [`trajectory`] (follows paths), [`guard`] (the last word),
-//! [`link`] (MAVLink) and [`steering`] (when setpoints leave), all sans-IO. Then [`stats`] and
-//! [`waterfall`] (ages by stage), [`log`], `odometry` (the plugin's own estimate), [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts it
-//! all. [`airframe`] stands beside: the autopilot's parameters, read, judged and written before a flight; and [`bench`].
+//! Modules in the order of the data: [`stream`] (QUIC), [`images`] (decode, publish), [`supervisor`] (the plugin's
+//! process and its limits), [`companion`] (all decisions, sans-IO) and its two drivers, [`control`] (wall clock) and
+//! [`lockstep`] (virtual clock, for grades). The companion combines [`flight`] (phases and outcome), [`trajectory`]
+//! (path following), [`guard`] (limits and fence), [`link`] (MAVLink) and [`steering`] (timing of setpoints), all
+//! sans-IO. Then [`stats`] and [`waterfall`] (ages by stage), [`log`], `odometry` (the plugin's own estimate),
+//! [`replay`] (a log to a plugin), [`report`]. [`fly()`] starts everything. Outside this chain: [`airframe`] (reads,
+//! checks and writes the autopilot's parameters before a flight) and [`bench`].
 
 pub mod airframe;
 pub mod args;

@@ -1,4 +1,4 @@
-//! `vizflyt-jetson`: `vizflyt fly` alone, for an embedded computer that needs nothing else.
+//! `vizflyt-jetson`: only `vizflyt fly`, for embedded computers that need no other command.
 
 use std::io::IsTerminal;
 use std::process::ExitCode;

@@ -1,14 +1,14 @@
-//! What a plugin publishes of where it is: checked, then logged. Nothing is flown by it.
+//! Checks the odometry that a plugin publishes, before it is logged. It is not used for flying.
 
 use vizflyt_protocol::messages::Odometry;
 use vizflyt_protocol::time::HostTime;
 
-/// An estimate may be so old when it comes: a plugin that closes loops takes its time. [s]
+/// Maximum age of an estimate on arrival; a plugin that closes loops needs time. [s]
 const OLDEST_S: f64 = 10.0;
-/// And of an instant so far ahead: images show where the vehicle will be when they are seen. [s]
+/// Maximum time of a stamp in the future: images show the predicted position of the vehicle. [s]
 const AHEAD_S: f64 = 1.0;
 
-/// Lets through poses that are valid, of about now, and in the order of their instants.
+/// Accepts poses that are valid, recent, and in the order of their stamps.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct OdometryGate {
     newest: Option<HostTime>,
@@ -16,17 +16,17 @@ pub(crate) struct OdometryGate {
 }
 
 impl OdometryGate {
-    /// Whether an estimate that came at `now` counts.
+    /// Returns whether the estimate that arrived at `now` is accepted.
     pub(crate) fn takes(&mut self, now: HostTime, odometry: &Odometry) -> bool {
         let age_s = now.seconds_since(odometry.stamp);
         let is_next = self.newest.is_none_or(|newest| odometry.stamp > newest);
         if !(odometry.is_valid() && is_next && (-AHEAD_S..=OLDEST_S).contains(&age_s)) {
             self.refused += 1;
-            // The first, then ever fewer.
+            // Log at 1, 2, 4, 8 ... rejections, so that the log is not flooded.
             if self.refused.is_power_of_two() {
                 tracing::warn!(
-                    "odometry is dropped: an estimate is no pose, not newer than the one before, or not of \
-                     these {OLDEST_S} s ({} so far)",
+                    "odometry dropped: an estimate is not a valid pose, not newer than the one before, or not \
+                     of the last {OLDEST_S} s ({} dropped)",
                     self.refused
                 );
             }
@@ -44,7 +44,7 @@ mod tests {
     use vizflyt_protocol::geometry::Pose;
 
     #[test]
-    fn poses_of_about_now_pass_in_their_order() {
+    fn accepts_recent_poses_in_the_order_of_their_stamps() {
         let mut gate = OdometryGate::default();
         let now = HostTime::from_ns(100_000_000_000);
         let mut takes = |ms: i64, x_m: f64| {

@@ -1,12 +1,11 @@
-//! When setpoints leave: at once when the plugin has replied, else 50 times a second.
+//! Timing of setpoints: at once when the plugin has replied, otherwise at 50 Hz.
 //!
-//! With a fixed 50 Hz a reply waited up to 20 ms for its turn, 10 on average: as much as an
-//! image takes from pose to plugin. Now it leaves as soon as it is there, but no sooner than
-//! 5 ms after the one before: two images in a burst are two setpoints, and 200 a second are 13 kB/s,
-//! which a serial link of 230 400 baud carries beside the poses; the usual 60 images a second are
-//! 4 kB/s. Without replies the guard still sends every 20 ms, as its deadlines and ArduCopter's
-//! time-out (3 s) want it. The guard takes the time between two ticks
-//! as it is, so its limits hold at any rhythm.
+//! At a fixed 50 Hz a reply waited up to 20 ms, 10 ms on average: as long as an image takes from pose to plugin.
+//! Therefore a reply is sent at once, but at least 5 ms after the setpoint before it, because two images in a burst
+//! cause two setpoints. 200 setpoints a second are 13 kB/s, which a serial link of 230 400 baud carries in addition to
+//! the poses; the usual 60 images a second cause 4 kB/s. Without replies the guard still sends every 20 ms, as required
+//! by its deadlines and ArduCopter's timeout (3 s). The guard uses the measured time between two ticks, so its limits
+//! hold at any rate.
 
 use vizflyt_protocol::time::HostTime;
 
@@ -15,7 +14,7 @@ const MIN_PERIOD_S: f64 = 0.005;
 /// Maximum time between two setpoints. [s]
 const MAX_PERIOD_S: f64 = 0.020;
 
-/// The rhythm of setpoints.
+/// Schedule of setpoints.
 #[derive(Clone, Copy, Debug)]
 pub struct Steering {
     last: HostTime,
@@ -23,17 +22,18 @@ pub struct Steering {
 }
 
 impl Steering {
-    /// Makes one that is due at `now`.
+    /// Creates a schedule with the first setpoint due at `now`.
     pub fn new(now: HostTime) -> Self {
         Self { last: now.plus_seconds(-MAX_PERIOD_S), reply_waits: false }
     }
 
-    /// Takes note that the plugin has replied with a setpoint.
+    /// Records that the plugin has replied with a setpoint.
     pub fn replied(&mut self) {
         self.reply_waits = true;
     }
 
-    /// Takes note of something that must not wait for the rhythm, such as a decision of the referee.
+    /// Records an urgent event, such as a decision of the referee: the next setpoint is sent without waiting for the
+    /// period.
     pub fn hurry(&mut self) {
         self.reply_waits = true;
     }
@@ -43,10 +43,10 @@ impl Steering {
         self.last.plus_seconds(if self.reply_waits { MIN_PERIOD_S } else { MAX_PERIOD_S })
     }
 
-    /// Takes note that a setpoint was sent at `now`.
+    /// Records that a setpoint was sent at `now`.
     pub fn done(&mut self, now: HostTime) {
         let due = self.due();
-        // A timer's lateness does not add up; a stall is not made up for.
+        // The delay of a timer does not add up. Setpoints missed during a stall are not sent later.
         let is_rhythm = !self.reply_waits && now.seconds_since(due) < MIN_PERIOD_S;
         self.last = if is_rhythm { due } else { now };
         self.reply_waits = false;
@@ -57,8 +57,8 @@ impl Steering {
 mod tests {
     use super::*;
 
-    /// Runs a second in which the plugin replies every `replies_us`, and a timer is up to
-    /// `late_us` late; returns how many setpoints left, and the longest that a reply waited. [ms]
+    /// Simulates one second in which the plugin replies every `replies_us` and a timer is up to `late_us` late. Returns
+    /// the number of setpoints and the longest wait of a reply [ms].
     fn run(replies_us: u64, late_us: u64) -> (u32, f64) {
         let start = HostTime::from_ns(5_000_000_000);
         let mut steering = Steering::new(start);
@@ -81,23 +81,23 @@ mod tests {
     }
 
     #[test]
-    fn sends_at_50_hz_without_replies_however_late_timers_are() {
+    fn sends_at_50_hz_without_replies_even_with_late_timers() {
         assert_eq!(run(0, 0), (50, 0.0));
         assert!(run(0, 3000).0 >= 49);
     }
 
     #[test]
-    fn replies_leave_at_once() {
-        // 60 Hz: each reply on its own, and nothing between them.
+    fn sends_replies_at_once() {
+        // 60 Hz: one setpoint for each reply, and none between them.
         let (sent, longest_ms) = run(16_667, 0);
         assert!((60..=61).contains(&sent) && longest_ms == 0.0, "{sent}, {longest_ms} ms");
-        // 30 Hz: one more between two replies, which delays none.
+        // 30 Hz: one more setpoint between two replies, which does not delay them.
         let (sent, longest_ms) = run(33_333, 0);
         assert!((59..=61).contains(&sent) && longest_ms == 0.0, "{sent}, {longest_ms} ms");
     }
 
     #[test]
-    fn more_than_200_hz_is_not_sent() {
+    fn sends_at_most_200_hz() {
         let (sent, longest_ms) = run(1_500, 0);
         assert!((195..=201).contains(&sent) && longest_ms < 5.0, "{sent}, {longest_ms} ms");
     }

@@ -1,5 +1,5 @@
-//! The arena as the autopilot's own fence can express it: FENCE_* for heights and a circle about the
-//! start, polygons for the net and for no-fly boxes. A polygon has no height.
+//! The arena as far as the autopilot's own fence can express it: FENCE_* for heights and a circle around the start,
+//! polygons for the net and for no-fly boxes. A polygon has no height.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::Volume;
@@ -9,21 +9,21 @@ use vizflyt_protocol::messages::ArenaInfo;
 use super::names::{Version, param_spec};
 use crate::link::FencePolygon;
 
-/// The cylindrical part of the fence, where it differs from the one in the parameter files.
+/// Cylindrical part of the fence, where it differs from the parameter files.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FenceCylinder {
-    /// Height over the take-off point at which the fence ends. [m]
+    /// Maximum height above the take-off point. [m]
     pub ceiling_m: Option<f64>,
-    /// Height over the take-off point below which the vehicle is too low. [m]
+    /// Minimum height above the take-off point. [m]
     pub floor_m: Option<f64>,
-    /// Distance from the take-off point at which the fence ends. [m]
+    /// Maximum distance from the take-off point. [m]
     pub radius_m: Option<f64>,
 }
 
 impl FenceCylinder {
-    /// Returns the cylinder about the start that holds the arena's fence: the autopilot's own fence
-    /// acts where the guard's did not, never before it. `None` of a fence that is no upright box.
-    /// `start_m` is in the world.
+    /// Returns the cylinder around the start that contains the arena's fence: the autopilot's own fence acts if the
+    /// guard failed, never before the guard. `None` if the fence is not an upright box. `start_m` is in world
+    /// coordinates.
     pub fn of(arena: &ArenaInfo, start_m: DVec3) -> Option<Self> {
         let plan = Footprint::of(&arena.geofence)?;
         let from_start_m = |corner_m: DVec2| (corner_m - start_m.truncate()).length();
@@ -35,7 +35,7 @@ impl FenceCylinder {
         })
     }
 
-    /// Returns this cylinder's value of a parameter; `right`, the file's, where it has none.
+    /// Returns this cylinder's value of a parameter; `right`, the value of the file, if it has none.
     pub(super) fn fit(self, version: Version, name: &str, right: f64) -> f64 {
         let measure = match name {
             "FENCE_ALT_MAX" => self.ceiling_m,
@@ -48,13 +48,13 @@ impl FenceCylinder {
     }
 }
 
-/// The part of an arena that polygons can express.
+/// Part of an arena that polygons can express.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AutopilotFence {
     /// The net, and each no-fly box that reaches from the floor to the ceiling; for the body's centre.
     pub polygons: Vec<FencePolygon>,
-    /// Indices of no-fly boxes that a vehicle may fly over or under: a polygon would forbid that, so
-    /// they are left out.
+    /// Indices of no-fly boxes that a vehicle may fly over or under. They are omitted, because a polygon would forbid
+    /// that.
     pub omitted: Vec<usize>,
 }
 
@@ -73,7 +73,7 @@ impl AutopilotFence {
         }
         high_m = below_ceiling_m(arena, high_m);
         for (index, volume) in arena.no_fly.iter().enumerate() {
-            // Heights of the body's centre: from `low_m` to `high_m` it may fly.
+            // The height of the body's centre may be from `low_m` to `high_m`.
             let spans = |plan: &Footprint| {
                 plan.bottom_m - radius_m <= low_m && plan.top_m + radius_m >= high_m
             };
@@ -88,7 +88,7 @@ impl AutopilotFence {
         fence
     }
 
-    /// Returns a sentence about the omitted boxes, if there are any.
+    /// Returns a warning about the omitted boxes, if there are any.
     pub fn warning(&self, arena: &ArenaInfo) -> Option<String> {
         if self.omitted.is_empty() {
             return None;
@@ -99,17 +99,17 @@ impl AutopilotFence {
         };
         let places: Vec<_> = self.omitted.iter().map(place).collect();
         Some(format!(
-            "the autopilot's own fence does not know the no-fly boxes about {}: one can fly over or under \
-             them, and its polygons have no height; guard and referee keep them",
+            "the autopilot's own fence does not contain the no-fly boxes at {}: one can fly over or under \
+             them, and its polygons have no height; guard and referee check them",
             places.join(", ")
         ))
     }
 }
 
-/// The footprint of an upright box.
+/// Footprint of an upright box.
 struct Footprint {
     center_m: DVec2,
-    /// Of the sides along `axis` and across it. [m]
+    /// Half lengths of the sides along `axis` and across it. [m]
     half_m: DVec2,
     axis: DVec2,
     bottom_m: f64,
@@ -130,7 +130,7 @@ impl Footprint {
         })
     }
 
-    /// Returns the corners, grown by so much on each side. [m, world]
+    /// Returns the corners after growing each side by `grown_m`. [m, world]
     fn corners_m(&self, grown_m: f64) -> Vec<DVec2> {
         let half_m = self.half_m + grown_m;
         let (along, across) = (self.axis * half_m.x, self.axis.perp() * half_m.y);
@@ -139,15 +139,15 @@ impl Footprint {
     }
 }
 
-/// A box that leans by less is upright: 0.1 degrees.
+/// Maximum tilt of an upright box, as 1 - cos: 0.1 degrees.
 const UPRIGHT: f64 = 1.5e-6;
 
-/// Returns the lower of `top_m` and the arena's own ceiling. [m, world]
+/// Returns the lower of `top_m` and the arena's ceiling. [m, world]
 fn below_ceiling_m(arena: &ArenaInfo, top_m: f64) -> f64 {
     arena.limits.max_altitude_m.map_or(top_m, |max_m| max_m.min(top_m))
 }
 
-/// Returns the floor position at which a message names a volume. [m, world]
+/// Returns the floor position that a message gives for a volume. [m, world]
 fn place_m(volume: &Volume) -> DVec2 {
     match *volume {
         Volume::Sphere { center_m, .. } | Volume::Cuboid { center_m, .. } => center_m.truncate(),
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_that_one_can_fly_over_or_under_are_omitted() {
+    fn omits_boxes_that_a_vehicle_can_fly_over_or_under() {
         let check = |bottom_m: f64, top_m: f64, sent: bool| {
             let (min_m, max_m) = (DVec3::new(2.0, -1.0, bottom_m), DVec3::new(3.0, 1.0, top_m));
             let arena = with_box(min_m, max_m);
@@ -206,7 +206,7 @@ mod tests {
             assert_eq!(fence.polygons.len(), 1 + usize::from(sent));
             assert_eq!(fence.warning(&arena).is_none(), sent);
         };
-        // The body's centre may fly from 0.1 m to 2.6 m; its radius is 0.1 m.
+        // The height of the body's centre may be from 0.1 m to 2.6 m; its radius is 0.1 m.
         check(0.0, 3.6, true);
         check(0.0, 2.55, true);
         check(0.19, 3.6, true);
@@ -214,7 +214,7 @@ mod tests {
         check(1.5, 3.6, false);
         let table = with_box(DVec3::new(4.0, 1.0, 0.0), DVec3::new(4.6, 1.6, 0.9));
         let text = AutopilotFence::of(&table).warning(&table).unwrap();
-        assert!(text.contains("about (4.3, 1.3)"), "{text}");
+        assert!(text.contains("at (4.3, 1.3)"), "{text}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! What an autopilot has, against what it should have.
+//! Compares an autopilot's parameters with the wanted ones.
 
 use std::collections::BTreeMap;
 
@@ -8,22 +8,22 @@ use super::rules::RULES;
 use super::tuning::is_tuned;
 use crate::link::same;
 
-/// A parameter that is not as it should be.
+/// Parameter with a wrong value.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
-    /// Its name in the autopilot's version.
+    /// Name in the autopilot's version.
     pub name: String,
-    /// What the autopilot has, in its own unit; `None` if it does not have the parameter.
+    /// Value of the autopilot, in its unit; `None` if it does not have the parameter.
     pub has: Option<f64>,
-    /// What it should have, in its own unit.
+    /// Wanted value, in its unit.
     pub right: f64,
-    /// What is dangerous about what it has.
+    /// Danger of the present value.
     pub danger: Option<String>,
-    /// What it has was found for this vehicle, by AUTOTUNE, a flight or a person: it is right, and stays.
+    /// The present value was tuned for this vehicle by AUTOTUNE, a flight or a person: it is kept.
     pub is_tuned: bool,
 }
 
-/// Returns the differences of what an autopilot `has` from what is `wanted`, the dangerous ones first.
+/// Returns the differences between an autopilot's values (`has`) and the `wanted` ones, the most dangerous first.
 pub fn compare(
     version: Version,
     wanted: &BTreeMap<String, f64>,
@@ -52,7 +52,7 @@ pub fn compare(
     found.into_iter().map(|(_, difference)| difference).collect()
 }
 
-/// Returns the rank of a value (0 is the most dangerous), and what is dangerous about it.
+/// Returns the rank of a value (0 is the most dangerous) and its danger.
 fn danger(version: Version, spec: &ParamSpec, value: f64, right: f64) -> (usize, Option<String>) {
     let Some(rank) = RULES.iter().position(|rule| rule.name == spec.name) else {
         return (usize::MAX, None);
@@ -75,8 +75,8 @@ mod tests {
         parse_params(shipped(version)).unwrap()
     }
 
-    /// The files: no unknown name, no value out of range, no contradiction, nothing that our
-    /// own rules call dangerous, and the same airframe in every version.
+    /// Shipped files: no unknown name, no value out of range, no contradiction, no dangerous value, and the same
+    /// airframe in every version.
     #[test]
     fn shipped_files_are_valid_consistent_and_safe() {
         let mut newest: Vec<BTreeMap<&'static str, f64>> = Vec::new();
@@ -84,11 +84,11 @@ mod tests {
             let mut values = BTreeMap::new();
             for (name, value) in wanted(version) {
                 let spec = param_spec(version, &name)
-                    .unwrap_or_else(|| panic!("{name} is no parameter of {version:?}"));
+                    .unwrap_or_else(|| panic!("{name} is not a parameter of {version:?}"));
                 let value = spec.newest(version, value);
                 let in_range = (spec.min..=spec.max).contains(&value);
                 assert!(in_range, "{name} = {value} is not from {} to {}", spec.min, spec.max);
-                assert!(!spec.whole || value.fract() == 0.0, "{name} = {value} is no whole number");
+                assert!(!spec.whole || value.fract() == 0.0, "{name} = {value} is not an integer");
                 values.insert(spec.name, value);
             }
             assert_eq!(contradictions(&values), Vec::<String>::new(), "{version:?}");
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn contradictions_are_found() {
+    fn finds_contradictions() {
         let check = |pairs: &[(&'static str, f64)], expected: &str| {
             let found = contradictions(&pairs.iter().copied().collect());
             assert!(found.len() == 1 && found[0].contains(expected), "{found:?}");
@@ -122,7 +122,7 @@ mod tests {
         check(&heights, "apart");
     }
 
-    /// The published lab's parameters, which would climb into the net.
+    /// Parameters of the published lab, with which the vehicle would climb into the net.
     #[test]
     fn reports_the_published_labs_dangerous_values() {
         for version in Version::ALL {
@@ -146,13 +146,13 @@ mod tests {
             assert_eq!(dangers, 6, "{found:?}");
             assert_eq!(found[0].name, "FS_GCS_ENABLE");
             assert!(found[0].danger.as_ref().unwrap().contains("into the ceiling"));
-            assert_eq!(found[6].danger, None, "a GPS alone is no danger: {found:?}");
+            assert_eq!(found[6].danger, None, "a GPS is not dangerous: {found:?}");
         }
     }
 
-    /// ArduCopter's own gains are dangerous on this airframe; gains that somebody found are not touched.
+    /// ArduCopter's default gains are dangerous on this airframe; tuned gains are not changed.
     #[test]
-    fn what_was_tuned_stays() {
+    fn keeps_tuned_values() {
         for version in Version::ALL {
             let check = |newest: f64| {
                 let mut has = wanted(version);

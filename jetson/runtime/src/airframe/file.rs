@@ -1,38 +1,38 @@
-//! Parameter files, as Mission Planner (`NAME,VALUE`), MAVProxy (`NAME VALUE`) and QGroundControl
-//! (five columns) write them. `#` begins a comment.
+//! Parameter files in the formats of Mission Planner (`NAME,VALUE`), MAVProxy (`NAME VALUE`) and QGroundControl (five
+//! columns). `#` starts a comment.
 
 use std::collections::BTreeMap;
 
-/// Why a parameter file is refused.
+/// Error of a parameter file.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ParamFileError {
-    /// A line that is no parameter.
-    #[error("line {line}: {text:?} is no parameter; write NAME,VALUE")]
+    /// A line is not a parameter.
+    #[error("line {line}: {text:?} is not a parameter; write NAME,VALUE")]
     Line {
-        /// Which, from 1.
+        /// Line number, from 1.
         line: usize,
-        /// Its beginning.
+        /// Beginning of the line.
         text: String,
     },
-    /// One parameter twice.
+    /// A parameter occurs twice.
     #[error("line {line}: {name} was set before")]
     Twice {
-        /// Which, from 1.
+        /// Line number, from 1.
         line: usize,
-        /// The parameter.
+        /// Name of the parameter.
         name: String,
     },
 }
 
-/// Characters of a parameter's name at most (MAVLink, PARAM_VALUE).
+/// Maximum length of a parameter's name (MAVLink, PARAM_VALUE).
 const MAX_NAME: usize = 16;
-/// Characters of a line that an error shows.
+/// Maximum length of a line in an error.
 const SHOWN: usize = 40;
 
 /// Returns the parameters of a file.
 ///
 /// # Errors
-/// [`ParamFileError`], with the line.
+/// Returns [`ParamFileError`] with the line.
 pub fn parse_params(text: &str) -> Result<BTreeMap<String, f64>, ParamFileError> {
     let mut params = BTreeMap::new();
     for (index, full) in text.lines().enumerate() {
@@ -74,7 +74,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn the_files_of_three_programs_are_read() {
+    fn reads_the_files_of_three_programs() {
         let expected = BTreeMap::from([("A_B".to_owned(), 1.5), ("C1".to_owned(), -2.0)]);
         for text in [
             "A_B,1.5\nC1,-2",
@@ -86,13 +86,13 @@ mod tests {
     }
 
     #[test]
-    fn errors_have_their_line() {
+    fn errors_contain_the_line() {
         let check = |text: &str, expected: &str| {
             assert_eq!(parse_params(text).unwrap_err().to_string(), expected);
         };
-        check("A,1\nB", "line 2: \"B\" is no parameter; write NAME,VALUE");
-        check("A,NaN", "line 1: \"A,NaN\" is no parameter; write NAME,VALUE");
-        check("a,1", "line 1: \"a,1\" is no parameter; write NAME,VALUE");
+        check("A,1\nB", "line 2: \"B\" is not a parameter; write NAME,VALUE");
+        check("A,NaN", "line 1: \"A,NaN\" is not a parameter; write NAME,VALUE");
+        check("a,1", "line 1: \"a,1\" is not a parameter; write NAME,VALUE");
         check("A,1\n\nA,2", "line 3: A was set before");
     }
 

@@ -1,9 +1,9 @@
-//! The autopilot's parameters as this airframe needs them: the files in `hardware/airframe`, what the
-//! names of three ArduCopter versions mean, and which values are dangerous in a room.
+//! The autopilot's parameters for this airframe: the files in `hardware/airframe`, the parameter names of three
+//! ArduCopter versions, and values that are dangerous in a room.
 //!
 //! ```text
 //! hardware/airframe/*.param ── file ──▶ wanted ────┐
-//! autopilot ── param_session ──▶ firmware, values ─┴─ compare ──▶ differences ──▶ a person; --apply
+//! autopilot ── param_session ──▶ firmware, values ─┴─ compare ──▶ differences ──▶ report; --apply
 //! arena ── autopilot_fence ──▶ heights and circle into `wanted`; polygons of the fence, uploaded
 //! ```
 
@@ -24,7 +24,7 @@ pub use names::{ParamSpec, Version, param_spec};
 pub use param_session::{ParamSession, ParamSessionError};
 pub use rules::{RULES, Rule, contradictions};
 
-/// Returns this airframe's file for a version.
+/// Returns the parameter file of this airframe for a version.
 pub fn shipped(version: Version) -> &'static str {
     match version {
         Version::V45 => include_str!("../../../../hardware/airframe/whippet-copter-4.5.param"),

@@ -1,9 +1,9 @@
-//! What ArduCopter's parameters are called in 4.5, 4.6 and 4.7 to 4.8, in which unit, and which values
-//! they take (ArduPilot's own list of name changes; SYSID_THISMAV as seen on 4.8.0-dev).
+//! Names, units and ranges of ArduCopter's parameters in 4.5, 4.6 and 4.7 to 4.8 (ArduPilot's list of renamed
+//! parameters; SYSID_THISMAV as observed on 4.8.0-dev).
 
 use crate::link::Firmware;
 
-/// A generation of names.
+/// Generation of parameter names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Version {
     /// ArduCopter 4.5 and older.
@@ -15,10 +15,10 @@ pub enum Version {
 }
 
 impl Version {
-    /// Every one.
+    /// All versions.
     pub const ALL: [Self; 3] = [Self::V45, Self::V46, Self::V48];
 
-    /// Returns the names that a program has.
+    /// Returns the generation of names of a firmware.
     pub fn of(firmware: Firmware) -> Self {
         match firmware.version {
             (major, minor, _) if (major, minor) < (4, 6) => Self::V45,
@@ -28,27 +28,27 @@ impl Version {
     }
 }
 
-/// A parameter: its names, and how the older values relate to the newest.
+/// Parameter: its names, and the conversion of older values to the newest unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParamSpec {
-    /// Name from 4.7 on; as rules and messages have it.
+    /// Name from 4.7 on, used in rules and messages.
     pub name: &'static str,
-    /// Name in 4.6; the same if empty.
+    /// Name in 4.6; empty if the same as in 4.7.
     pub v46: &'static str,
-    /// Name in 4.5; as in 4.6 if empty.
+    /// Name in 4.5; empty if the same as in 4.6.
     pub v45: &'static str,
-    /// Newest value = this times the older one: 0.01 where centimetres became metres.
+    /// Factor from the older value to the newest: 0.01 if centimetres became metres.
     pub scale: f64,
     /// Minimum, in the newest unit.
     pub min: f64,
     /// Maximum, in the newest unit.
     pub max: f64,
-    /// A whole number: an option, a set of bits, a count.
+    /// Whether the value is an integer: an option, a bit mask, a count.
     pub whole: bool,
 }
 
 impl ParamSpec {
-    /// Returns its name in a version.
+    /// Returns the name in a version.
     pub fn name_in(&self, version: Version) -> &'static str {
         let v46 = if self.v46.is_empty() { self.name } else { self.v46 };
         match version {
@@ -59,7 +59,7 @@ impl ParamSpec {
         }
     }
 
-    /// Returns a value of a version in the newest unit. ARMING_CHECK's is turned round.
+    /// Converts a value of a version to the newest unit. The meaning of ARMING_CHECK is inverted.
     pub fn newest(&self, version: Version, value: f64) -> f64 {
         if version == Version::V48 {
             value
@@ -70,12 +70,12 @@ impl ParamSpec {
         }
     }
 
-    /// Returns a newest value in the unit of a version.
+    /// Converts a value in the newest unit to the unit of a version.
     pub fn value_in(&self, version: Version, newest: f64) -> f64 {
         if version == Version::V48 {
             newest
         } else if self.name == ARMING {
-            // All checks, or the selected ones: the older parameter cannot express the rest.
+            // All checks, or none: the older parameter cannot express the rest.
             f64::from(u8::from(newest == 0.0))
         } else {
             newest / self.scale
@@ -83,25 +83,25 @@ impl ParamSpec {
     }
 }
 
-/// The parameter whose bits changed their meaning: checks to skip, formerly checks to make.
+/// Parameter with inverted bits: checks to skip, in older versions checks to run.
 const ARMING: &str = "ARMING_SKIPCHK";
 
-/// Returns the parameter that has this name in a version.
+/// Returns the parameter with this name in a version.
 pub fn param_spec(version: Version, name: &str) -> Option<&'static ParamSpec> {
     TABLE.iter().find(|spec| spec.name_in(version) == name)
 }
 
-/// An option or a count.
+/// Option or count.
 const fn whole(name: &'static str, min: f64, max: f64) -> ParamSpec {
     ParamSpec { name, v46: "", v45: "", scale: 1.0, min, max, whole: true }
 }
 
-/// A measure that kept its name.
+/// Measure with the same name in all versions.
 const fn real(name: &'static str, min: f64, max: f64) -> ParamSpec {
     ParamSpec { name, v46: "", v45: "", scale: 1.0, min, max, whole: false }
 }
 
-/// A measure whose name and unit changed in 4.7.
+/// Measure with another name and unit since 4.7.
 const fn renamed(
     name: &'static str,
     v46: &'static str,
@@ -198,8 +198,8 @@ const TABLE: &[ParamSpec] = &[
     whole("SERVO10_FUNCTION", -1.0, 190.0),
     whole("SERVO11_FUNCTION", -1.0, 190.0),
     whole("SERVO12_FUNCTION", -1.0, 190.0),
-    // Where tuning begins. Ranges from ArduPilot's sources; its tuning guide leaves them at ATC_RAT_YAW_FLTT (50) and
-    // PSC_D_ACC_* (0.02).
+    // Parameters for tuning. Ranges from ArduPilot's sources; its tuning guide exceeds them for ATC_RAT_YAW_FLTT (50)
+    // and PSC_D_ACC_* (0.02).
     whole("INS_GYRO_FILTER", 0.0, 256.0),
     whole("INS_ACCEL_FILTER", 0.0, 256.0),
     real("ATC_RAT_RLL_FLTD", 0.0, 100.0),
@@ -228,7 +228,7 @@ const TABLE: &[ParamSpec] = &[
     whole("SERIAL2_BAUD", 1.0, 12_500_000.0),
     whole("BRD_SER1_RTSCTS", 0.0, 2.0),
     whole("BRD_SER2_RTSCTS", 0.0, 2.0),
-    // The transmitter: modes by channel 5, motors off by channel 6.
+    // Transmitter: modes by channel 5, motors off by channel 6.
     whole("FLTMODE_CH", 0.0, 16.0),
     whole("FLTMODE1", 0.0, 28.0),
     whole("FLTMODE4", 0.0, 28.0),

@@ -1,13 +1,13 @@
-//! One table, `hardware/vehicle.toml`, and whatever repeats it: pages, drawings, parameter files, firmware.
+//! Tests that pages, drawings, parameter files and firmware agree with the table `hardware/vehicle.toml`.
 //!
 //! ```text
-//! vehicle.toml ──▶ the pages' tables, to the letter (VIZFLYT_PAGES=write writes them)
-//!              ──▶ ports and parameters named in the pages' sentences
+//! vehicle.toml ──▶ tables of the pages, character by character (VIZFLYT_PAGES=write writes them)
+//!              ──▶ ports and parameters in sentences of the pages
 //!              ──▶ wires and resistors of the drawings, from pin to pad
 //!              ──▶ the values of every parameter file; the pins that the firmware drives
 //! ```
 //!
-//! Each check returns what differs, so that a test can change the table and see that it is noticed.
+//! Each check returns the differences, so that a test can change the table and verify that the change is detected.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -87,7 +87,7 @@ struct Tuning {
 }
 
 impl Port {
-    /// Returns its parameters, by names that every version has.
+    /// Returns the parameters of the port, with names that every version has.
     fn params(&self) -> [(String, f64); 3] {
         let Self { serial, protocol, baud, rtscts, .. } = self;
         [
@@ -108,7 +108,7 @@ impl Table {
         self.port.iter().find(|port| port.device == device).expect("it has a port")
     }
 
-    /// Returns the tables that pages have between `<!-- vehicle.toml: NAME -->` and `<!-- end -->`.
+    /// Returns the tables of the pages, which are between `<!-- vehicle.toml: NAME -->` and `<!-- end -->`.
     fn blocks(&self) -> BTreeMap<&'static str, String> {
         let mut ports = "| from | to | wires | parameters |\n|---|---|---|---|\n".to_owned();
         for port in &self.port {
@@ -155,7 +155,7 @@ impl Table {
             let (old, old_value) =
                 (spec.name_in(Version::V46), spec.value_in(Version::V46, *value));
             let old = if old == name { "the same".to_owned() } else { format!("`{old}`") };
-            // A product of decimals has digits of its own at the end.
+            // Remove rounding errors of the product.
             let old_value = (old_value * 1e6).round() / 1e6;
             writeln!(tuning, "| `{name}` | {value} | {old} | {old_value} | {default} | {why} |")
                 .unwrap();
@@ -178,7 +178,7 @@ fn text(path: &str) -> String {
     std::fs::read_to_string(root().join(path)).unwrap_or_else(|e| panic!("{path}: {e}"))
 }
 
-/// Pages and the tables that they must have.
+/// Pages, and the tables that they must contain.
 const PAGES: &[(&str, &[&str])] = &[
     ("hardware/bridge/README.md", &["wires", "resistors", "supply"]),
     ("hardware/airframe/wiring.md", &["ports", "supply"]),
@@ -190,7 +190,7 @@ const PAGES: &[(&str, &[&str])] = &[
     ("docs/guides/jetson.md", &[]),
 ];
 
-/// Drawings, and the board that each shows.
+/// Drawings, and the board of each.
 const DRAWINGS: &[(&str, &[&str])] = &[
     ("hardware/bridge/wiring-esp32c3.svg", &["ESP32-C3"]),
     ("hardware/bridge/wiring-esp8266.svg", &["ESP8266"]),
@@ -198,7 +198,7 @@ const DRAWINGS: &[(&str, &[&str])] = &[
 
 const END: &str = "<!-- end -->";
 
-/// Returns a page with its tables as they should be, and the names of those it has.
+/// Returns a page with corrected tables, and the names of its tables.
 fn with_blocks(page: &str, blocks: &BTreeMap<&str, String>) -> (String, Vec<String>) {
     let (mut out, mut rest, mut names) = (String::new(), page, Vec::new());
     while let Some((before, after)) = rest.split_once("<!-- vehicle.toml: ") {
@@ -212,7 +212,7 @@ fn with_blocks(page: &str, blocks: &BTreeMap<&str, String>) -> (String, Vec<Stri
     (out + rest, names)
 }
 
-/// Pages whose tables are not the table's rows.
+/// Returns pages with tables that differ from the table.
 fn wrong_blocks(table: &Table) -> Vec<String> {
     let mut found = Vec::new();
     for (path, expected) in PAGES {
@@ -233,7 +233,7 @@ fn wrong_blocks(table: &Table) -> Vec<String> {
     found
 }
 
-/// Words of a line: names, numbers.
+/// Returns the names and numbers of a line.
 fn words(line: &str) -> Vec<&str> {
     line.split(|c: char| !(c.is_ascii_alphanumeric() || matches!(c, '_' | '.')))
         .map(|word| word.trim_matches('.'))
@@ -241,8 +241,8 @@ fn words(line: &str) -> Vec<&str> {
         .collect()
 }
 
-/// Sentences, in pages and drawings, that name another port for a device, or another value for a
-/// parameter of the table.
+/// Returns sentences in pages and drawings that give another port for a device, or another value for a parameter of the
+/// table.
 fn wrong_sentences(table: &Table) -> Vec<String> {
     let mut values: BTreeMap<String, f64> = table.port.iter().flat_map(Port::params).collect();
     for Tuning { name, value, .. } in &table.tuning {
@@ -254,7 +254,8 @@ fn wrong_sentences(table: &Table) -> Vec<String> {
     let mut found = Vec::new();
     for path in PAGES.iter().chain(DRAWINGS).map(|(path, ..)| path) {
         let about = table.port.iter().find(|port| path.contains(&port.device.to_lowercase()));
-        // A page speaks of one device, even where a line does not name it; a drawing shows the other's plug as well.
+        // A page is about one device, even if a line does not mention it; a drawing also shows the plug of the other
+        // device.
         let is_page = PAGES.iter().any(|(page, _)| page == path);
         for (number, line) in text(path).lines().enumerate() {
             let at = format!("{path}:{}", number + 1);
@@ -287,7 +288,7 @@ fn wrong_sentences(table: &Table) -> Vec<String> {
             }
         }
     }
-    // Each guide says what its port needs, all of it.
+    // Each guide must contain all parameters of its port.
     for (path, device) in
         [("docs/guides/flash-bridge.md", "bridge"), ("docs/guides/jetson.md", "Jetson")]
     {
@@ -301,7 +302,7 @@ fn wrong_sentences(table: &Table) -> Vec<String> {
     found
 }
 
-/// Values of the parameter files that are not the table's, and tuning that only one of them has.
+/// Returns values of the parameter files that differ from the table, and tuning parameters that only one of them has.
 fn wrong_params(table: &Table) -> Vec<String> {
     let mut found = Vec::new();
     for version in Version::ALL {
@@ -328,7 +329,7 @@ fn wrong_params(table: &Table) -> Vec<String> {
     found
 }
 
-/// A text of a drawing, and where it stands.
+/// Text of a drawing, and its position.
 struct Label<'a> {
     x: f64,
     y: f64,
@@ -354,7 +355,7 @@ fn labels(drawing: &str) -> Vec<Label<'_>> {
         .collect()
 }
 
-/// Returns where the path with this id begins and ends.
+/// Returns the start and the end of the path with this id.
 fn ends_of(drawing: &str, id: &str) -> Option<[(f64, f64); 2]> {
     let (_, rest) = drawing.split_once(&format!("id=\"{id}\""))?;
     let numbers: Vec<f64> = attribute(rest, "d")?
@@ -365,16 +366,16 @@ fn ends_of(drawing: &str, id: &str) -> Option<[(f64, f64); 2]> {
     Some([(x, y), (end_x, end_y)])
 }
 
-/// How far a text's baseline is below the middle of what it labels. [px]
+/// Distance of a text's baseline below the middle of the labelled object. [px]
 const BASELINE: f64 = 5.0;
-/// A wire ends this near to its pad, whose label stands beside it; rows are 38 apart. [px]
+/// Maximum distance of a wire's end from the label of its pad; rows are 38 apart. [px]
 const NEAR: (f64, f64) = (50.0, 10.0);
-/// The plug's numbers stand this far left of where its wires begin. [px]
+/// Distance of the plug's numbers to the left of its wires. [px]
 const NUMBER_LEFT: f64 = 98.0;
-/// A resistor's value stands this near to its middle. [px]
+/// Maximum distance of a resistor's value from its middle. [px]
 const LABEL_NEAR: f64 = 70.0;
 
-/// Wires and resistors of the drawings that do not lead from the table's pin to its pad.
+/// Returns wires and resistors of the drawings that do not connect the table's pin with its pad.
 fn wrong_drawings(table: &Table) -> Vec<String> {
     let mut found = Vec::new();
     for (path, boards) in DRAWINGS {
@@ -422,7 +423,7 @@ fn wrong_drawings(table: &Table) -> Vec<String> {
                 found.push(format!("{path} has no {id}"));
                 continue;
             };
-            // Either at the pad itself, or on the wire that leads there: on that wire's height.
+            // Either at the pad itself, or on the wire to it: at the height of that wire.
             let on_row = labels.iter().any(|label| {
                 label.text == resistor.pad && (label.y - BASELINE - start.1).abs() < NEAR.1
             });
@@ -447,7 +448,7 @@ fn wrong_drawings(table: &Table) -> Vec<String> {
     found
 }
 
-/// Pins that the ESP32-C3's firmware drives otherwise.
+/// Returns pins that the ESP32-C3's firmware uses differently.
 fn wrong_firmware(table: &Table) -> Vec<String> {
     let source = text("firmware-esp/bridge/src/settings.rs");
     let usual = source.lines().find(|line| line.contains("const USUAL")).unwrap_or_default();
@@ -494,15 +495,15 @@ fn firmware_drives_the_tables_pins() {
     assert_eq!(wrong_firmware(&Table::read()), Vec::<String>::new());
 }
 
-/// One thing changed in the table alone: whatever repeats it is found.
+/// Changes one value in the table, and expects every dependent check to report it.
 #[test]
-fn a_change_of_the_table_alone_is_noticed() {
+fn every_change_of_the_table_is_detected() {
     type Check = fn(&Table) -> Vec<String>;
     let check = |change: fn(&mut Table), checks: &[(&str, Check)]| {
         let mut table = Table::read();
         change(&mut table);
         for (name, check) in checks {
-            assert!(!check(&table).is_empty(), "{name} does not notice");
+            assert!(!check(&table).is_empty(), "{name} does not detect the change");
         }
     };
     let blocks: (&str, Check) = ("tables", wrong_blocks);

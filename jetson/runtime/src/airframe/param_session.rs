@@ -1,5 +1,5 @@
-//! A parameter session with an autopilot: identifies it, reads and writes its parameters, uploads a fence
-//! and a signing key. Drives the link's own state machine on one thread.
+//! Parameter session with an autopilot: identifies it, reads and writes its parameters, uploads a fence and a signing
+//! key. Drives the state machine of the link on one thread.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -13,25 +13,23 @@ use crate::link::{
 };
 use vizflyt_guardian::port::{MavlinkAddress, Port};
 
-/// Why a session failed.
+/// Error of a session.
 #[derive(Debug, thiserror::Error)]
 pub enum ParamSessionError {
     /// The port cannot be opened.
     #[error("{address}: {why}")]
     Open {
-        /// The address.
         address: MavlinkAddress,
-        /// The system's reason.
+        /// Error of the operating system.
         why: io::Error,
     },
-    /// No heartbeat came.
+    /// No heartbeat was received.
     #[error(
         "no heartbeat from an autopilot on {address} within {within_s} s; check power, link and address"
     )]
     NoHeartbeat {
-        /// The address.
         address: MavlinkAddress,
-        /// The time limit. [s]
+        /// Timeout. [s]
         within_s: f64,
     },
     /// Parameters are missing.
@@ -39,36 +37,36 @@ pub enum ParamSessionError {
         "the autopilot did not send its parameters within {within_s} s; {received} came; try again nearer or by USB"
     )]
     NoParams {
-        /// The time limit. [s]
+        /// Timeout. [s]
         within_s: f64,
-        /// How many came.
+        /// Number of parameters received.
         received: usize,
     },
-    /// Motors may turn.
+    /// The motors may turn.
     #[error("the vehicle is armed; land and disarm it before its parameters are written")]
     Armed,
-    /// Only ArduCopter's parameters are known.
+    /// Parameters are only known for ArduCopter.
     #[error("this is {0}; parameter files are for ArduCopter")]
     OtherProgram(Firmware),
 }
 
-/// A session with an autopilot that answers.
+/// Session with an autopilot that responds.
 pub struct ParamSession {
     port: Port,
     link: Link,
 }
 
-/// Time limit for a heartbeat; one comes every second. [s]
+/// Timeout of a heartbeat; one is sent every second. [s]
 const HEARTBEAT_WITHIN_S: f64 = 8.0;
-/// Time limit for the version, which comes after the streams are set up. [s]
+/// Timeout of the version, which arrives after the streams are configured. [s]
 const VERSION_WITHIN_S: f64 = 4.0;
-/// Time limit for all parameters: a thousand at 57600 baud, and some lost. [s]
+/// Timeout of all parameters: a thousand at 57600 baud, with losses. [s]
 const LIST_WITHIN_S: f64 = 90.0;
-/// Time limit for one write; it is requested five times. [s]
+/// Timeout of one write, which is requested five times. [s]
 const WRITE_WITHIN_S: f64 = 5.0;
-/// Time limit for a fence: the origin comes within some seconds of a start, a fence is offered for eight. [s]
+/// Timeout of a fence upload: the origin is known some seconds after a start, and a fence is offered for 8 s. [s]
 const FENCE_WITHIN_S: f64 = 20.0;
-/// A message has reached the autopilot by then, over any link. [s]
+/// Time in which a message reaches the autopilot over every link. [s]
 const DELIVERY_S: f64 = 1.0;
 
 impl ParamSession {
@@ -91,12 +89,12 @@ impl ParamSession {
         Ok(session)
     }
 
-    /// Returns the link, for its state.
+    /// Returns the link: the state of the autopilot.
     pub fn link(&self) -> &Link {
         &self.link
     }
 
-    /// Returns the version of the parameter names: by the firmware, or by the names themselves.
+    /// Returns the version of the parameter names, from the firmware or from the names themselves.
     ///
     /// # Errors
     /// [`ParamSessionError::OtherProgram`].
@@ -124,7 +122,7 @@ impl ParamSession {
     /// # Errors
     /// [`ParamSessionError::NoParams`].
     pub fn read(&mut self) -> Result<BTreeMap<String, f64>, ParamSessionError> {
-        // The few that a link reads by itself come first.
+        // First wait for the parameters that the link reads automatically.
         self.until(VERSION_WITHIN_S, |_, link| (!link.is_busy_with_params()).then_some(()));
         while self.link.poll_event().is_some() {}
         self.link.read_params(host_now());
@@ -140,10 +138,10 @@ impl ParamSession {
         }
     }
 
-    /// Writes parameters; returns for each the value that the autopilot confirms, `None` without a reply.
+    /// Writes parameters; returns for each the value confirmed by the autopilot, `None` without a reply.
     ///
     /// # Errors
-    /// [`ParamSessionError::Armed`]; nothing is written then.
+    /// [`ParamSessionError::Armed`]; then nothing is written.
     pub fn write(
         &mut self,
         values: &[(String, f64)],
@@ -172,8 +170,8 @@ impl ParamSession {
         Ok(written)
     }
 
-    /// Uploads polygons as the autopilot's own fence; returns how many it accepts, or why it rejects
-    /// them.
+    /// Uploads polygons as the autopilot's own fence; returns the number of accepted polygons, or the reason for a
+    /// rejection.
     ///
     /// # Errors
     /// [`ParamSessionError::Armed`].
@@ -190,7 +188,7 @@ impl ParamSession {
             Some(LinkEvent::Fence(FenceEvent::Rejected(why))) => Some(Err(why.clone())),
             _ => None,
         });
-        let silent = "it has no origin yet; start it in its localization, and try again";
+        let silent = "it has no origin yet; start it in the localization volume, and try again";
         Ok(done.unwrap_or_else(|| Err(silent.to_owned())))
     }
 
@@ -203,14 +201,14 @@ impl ParamSession {
             return Err(ParamSessionError::Armed);
         }
         self.link.setup_signing(host_now(), signing);
-        // The autopilot needs time to receive it: a connection closed at once, with unread telemetry in it,
-        // is reset, and the key is lost with it.
+        // Wait until the autopilot has received the message: a connection that is closed at once, with unread
+        // telemetry, is reset, and the key is lost.
         self.until(DELIVERY_S, |_, _| None::<()>);
         Ok(())
     }
 
-    /// Runs the link until `done` returns something, for `within_s` at most. `done` is called with every
-    /// event, and once per turn without one.
+    /// Runs the link until `done` returns a value, for at most `within_s`. Calls `done` with every event, and once per
+    /// turn without one.
     fn until<T>(
         &mut self,
         within_s: f64,
@@ -224,7 +222,7 @@ impl ParamSession {
             if let Some(intruder) = self.port.poll_intruder() {
                 tracing::warn!("mavlink: {intruder}");
             }
-            // A failed socket receives nothing; the time limit reports it.
+            // A failed socket receives nothing; the timeout reports it.
             if let Ok(Some(len)) = self.port.receive(&mut buffer) {
                 self.link.handle_input(host_now(), &buffer[..len]);
                 self.transmit();

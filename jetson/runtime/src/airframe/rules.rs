@@ -1,25 +1,24 @@
-//! Which values are dangerous in a room, and which contradict each other. Names and units are the
-//! newest ones.
+//! Dangerous values in a room, and contradictions between values. Names and units are the newest ones.
 
 use std::collections::BTreeMap;
 
 /// Values by newest name, in newest units.
 pub(super) type Values = BTreeMap<&'static str, f64>;
 
-/// A parameter that can make a flight in a room dangerous.
+/// Parameter that can make a flight in a room dangerous.
 #[derive(Clone, Copy)]
 pub struct Rule {
-    /// Its newest name.
+    /// Newest name.
     pub name: &'static str,
-    /// Returns what a value does, if that is dangerous.
+    /// Returns the danger of a value, if it is dangerous.
     pub danger: fn(f64) -> Option<&'static str>,
 }
 
-/// What a return to launch does here.
+/// Effect of a return to launch in a room.
 const RETURNS: &str =
     "the vehicle returns to launch: it climbs to RTL_ALT_M first, into the ceiling";
 
-/// The rules, worst first.
+/// Rules, most dangerous first.
 pub const RULES: &[Rule] = &[
     Rule {
         name: "FS_GCS_ENABLE",
@@ -146,8 +145,8 @@ pub const RULES: &[Rule] = &[
     Rule { name: "EK3_SRC1_YAW", danger: not_external },
 ];
 
-/// With 5 m/s^3, ArduCopter's own, a velocity follows its setpoint after 0.7 s; with 20 after 0.3 s, which is what the
-/// runtime's guard counts on (4.8.0-dev, software in the loop).
+/// With 5 m/s^3, ArduCopter's default, a velocity follows its setpoint after 0.7 s; with 20, after 0.3 s, which the
+/// runtime's guard assumes (4.8.0-dev, software in the loop).
 fn brakes_late(value: f64) -> Option<&'static str> {
     (value < 20.0).then_some(
         "the vehicle answers and brakes late: the runtime flies it at a part of the speed limit, so that it stops \
@@ -155,14 +154,14 @@ fn brakes_late(value: f64) -> Option<&'static str> {
     )
 }
 
-/// Asked only while the gain is ArduCopter's own: one that was found for this vehicle may be as high.
+/// Applied only while the gain is ArduCopter's default: a tuned gain may be as high.
 fn oscillates(value: f64) -> Option<&'static str> {
     (value > 0.1).then_some(
         "ArduCopter's own gain: a vehicle this light and strong may oscillate at its first take-off",
     )
 }
 
-/// Bit of FENCE_TYPE: polygons to stay in and out of.
+/// Bit of FENCE_TYPE: inclusion and exclusion polygons.
 const POLYGONS: i32 = 4;
 
 fn battery_action(value: f64) -> Option<&'static str> {
@@ -178,10 +177,10 @@ fn battery_action(value: f64) -> Option<&'static str> {
 }
 
 fn not_external(value: f64) -> Option<&'static str> {
-    (value != 6.0).then_some("the estimator does not navigate by the localization's poses alone")
+    (value != 6.0).then_some("the estimator does not navigate only by the localization's poses")
 }
 
-/// Returns what contradicts itself among values by newest name, each in a sentence.
+/// Returns the contradictions between values by newest name, one sentence each.
 pub fn contradictions(values: &Values) -> Vec<String> {
     let mut found = Vec::new();
     let get = |name: &str| values.get(name).copied();
@@ -269,7 +268,7 @@ pub fn contradictions(values: &Values) -> Vec<String> {
     );
     check(
         both(get("FS_THR_ENABLE"), get("FS_THR_VALUE"), |on, value| on != 0.0 && value < 925.0),
-        "FS_THR_VALUE below 925 does not see a transmitter that is off",
+        "FS_THR_VALUE below 925 does not detect a transmitter that is off",
     );
     found
 }

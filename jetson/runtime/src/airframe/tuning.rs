@@ -1,10 +1,10 @@
-//! Where tuning begins. AUTOTUNE, a flight or a person changes these parameters afterwards, and what they found is
-//! better than any file: a value that is no longer ArduCopter's own is theirs, and stays.
+//! Parameters that tuning changes. AUTOTUNE, a flight or a person may have set them, and such values are better than
+//! those of a file: a value that differs from ArduCopter's default is kept.
 
 use crate::link::same;
 
-/// Newest name, and ArduCopter's own value in the newest unit: the same in 4.5 to 4.8 (their sources, and the defaults
-/// that ArduPilot's Methodic Configurator 5.0.1 keeps of each version).
+/// Newest name, and ArduCopter's default in the newest unit. The defaults are the same in 4.5 to 4.8 (sources of
+/// ArduCopter, and the defaults that ArduPilot's Methodic Configurator 5.0.1 stores for each version).
 pub(super) const UNTUNED: &[(&str, f64)] = &[
     ("VISO_DELAY_MS", 10.0),
     ("INS_GYRO_FILTER", 20.0),
@@ -34,7 +34,7 @@ pub(super) const UNTUNED: &[(&str, f64)] = &[
     ("MOT_SPIN_MIN", 0.15),
 ];
 
-/// Returns whether a value, by newest name and in the newest unit, is what somebody found for this vehicle.
+/// Returns whether a value, by newest name and in the newest unit, was tuned for this vehicle.
 pub(super) fn is_tuned(name: &str, newest: f64) -> bool {
     UNTUNED.iter().any(|(untuned, default)| *untuned == name && !same(newest, *default))
 }
@@ -48,7 +48,7 @@ mod tests {
 
     use super::super::{Version, parse_params, shipped};
 
-    /// Rate gains of roll, and the filters in their way.
+    /// Rate gains of roll, and their filters.
     #[derive(Clone, Copy)]
     struct Loop {
         p: f64,
@@ -58,14 +58,16 @@ mod tests {
         d_hz: f64,
     }
 
-    /// From a gyro's sample to the motors: one turn at 400 Hz, held for another, of which half counts. [s]
+    /// Delay from a gyro sample to the motors: one cycle at 400 Hz, plus half of the cycle for which the output is
+    /// held. [s]
     const DELAY_S: f64 = 0.00375;
 
     impl Loop {
-        /// Returns by how much the gain may grow before roll oscillates, with motors of this lag: the open loop's
-        /// gain where its phase passes -180 degrees (Astrom and Murray, Feedback Systems, section 10.3).
+        /// Returns the factor by which the gain may grow before roll oscillates, with motors of this lag: the inverse
+        /// of the open loop's gain where its phase passes -180 degrees (Astrom and Murray, Feedback Systems, section
+        /// 10.3).
         fn gain_margin(&self, motor_s: f64) -> f64 {
-            // Two motors up and two down by half the output each, on arms of ARM_M. [rad/s^2]
+            // Two motors up and two down, each by half of the output, on arms of ARM_M. [rad/s^2]
             let authority = 4.0 * 0.5 * MAX_THRUST_N * ARM_M / INERTIA_KGM2.x;
             let (gyro, d) = (TAU * self.gyro_hz, TAU * self.d_hz);
             let mut omega: f64 = 20.0;
@@ -73,7 +75,7 @@ mod tests {
                 let rolled = 1.0 + (omega / d).powi(2);
                 let re = self.p + self.d * omega * (omega / d) / rolled;
                 let im = self.d * omega / rolled - self.i / omega;
-                // Second order, as ArduPilot's gyro filter is. [1]
+                // Second order, like ArduPilot's gyro filter. [1]
                 let (low_re, low_im) =
                     (1.0 - (omega / gyro).powi(2), 2.0_f64.sqrt() * omega / gyro);
                 let phase = im.atan2(re)
@@ -90,8 +92,8 @@ mod tests {
         }
     }
 
-    /// With the file's gains roll is stable by a factor of two, also with motors a third faster than the simulator's;
-    /// with ArduCopter's own, or with its filters, it is not.
+    /// With the file's gains roll is stable by a factor of two, also with motors a third faster than the simulator's.
+    /// With ArduCopter's default gains or filters it is not.
     #[test]
     fn first_gains_are_stable_by_a_factor_of_two() {
         let params = parse_params(shipped(Version::V48)).unwrap();

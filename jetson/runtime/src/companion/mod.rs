@@ -1,16 +1,16 @@
-//! The companion computer of one vehicle, sans-IO: [`link`](crate::link), [`flight`](crate::flight),
-//! [`guard`](crate::guard) and [`steering`](crate::steering) joined into one state machine.
+//! Companion computer of one vehicle, sans-IO: combines [`link`](crate::link), [`flight`](crate::flight),
+//! [`guard`](crate::guard) and [`steering`](crate::steering) into one state machine.
 //!
 //! ```text
 //! MAVLink bytes ──────▶┌───────────┐──▶ MAVLink bytes, setpoints (50 to 200 Hz)
 //! arena, poses, events▶│ Companion │──▶ events, IMU readings for the server
 //! plugin's replies ───▶│           │──▶ messages for the plugin
-//! now ────────────────▶└───────────┘──▶ senses, which go into every observation
+//! now ────────────────▶└───────────┘──▶ senses, written into every observation
 //! ```
-//! Two drivers run it: [`control`](crate::control) on the wall clock, with threads, sockets, a log and a
-//! supervised plugin, and [`lockstep`](crate::lockstep) on a virtual clock, with a plugin that is waited
-//! for. Every decision of a flight is made here, so the graded flight and the live one decide alike;
-//! `control/tests.rs` feeds both drivers the same inputs and compares what they send.
+//! It has two drivers: [`control`](crate::control) on the wall clock, with threads, sockets, a log and a supervised
+//! plugin, and [`lockstep`](crate::lockstep) on a virtual clock, which waits for the plugin. All decisions of a flight
+//! are made here, so that graded and live flights decide in the same way; `control/tests.rs` feeds the same inputs to
+//! both drivers and compares their outputs.
 
 mod senses;
 #[cfg(test)]
@@ -37,19 +37,18 @@ use crate::stream::{Reading, ServerClock};
 
 pub use senses::Senses;
 
-/// Period of the ticks, in which the link does its chores. [ns]
+/// Period of ticks, in which the link runs its periodic tasks. [ns]
 const TICK_NS: i64 = 20_000_000;
 
-/// A setpoint that was handed to the link.
+/// Setpoint that was passed to the link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SentSetpoint {
-    /// The setpoint.
     pub setpoint: GuidedSetpoint,
-    /// The image whose reply it carries; the same as long as that reply is in force.
+    /// Number of the image that the plugin answered with this setpoint; unchanged while the reply is in force.
     pub replies_to: Option<u64>,
 }
 
-/// The companion computer of one vehicle. See the module.
+/// Companion computer of one vehicle; see the module.
 pub struct Companion {
     settings: FlightSettings,
     clock: ServerClock,
@@ -59,14 +58,14 @@ pub struct Companion {
     arena: Option<Box<ArenaInfo>>,
     tick_due: HostTime,
     ticks: u64,
-    /// Stamp of the newest IMU reading that was drained.
+    /// Stamp of the newest IMU reading already drained.
     imu_drained: HostTime,
     vehicle: Option<Vehicle>,
     v_setpoint_mps: DVec3,
     setpoints_sent: u64,
-    /// Whether the present plugin process was greeted.
+    /// Whether the current plugin process has received the arena.
     is_greeted: bool,
-    /// Whether the present plugin process took the place of another one.
+    /// Whether the current plugin process replaced an earlier one.
     is_restarted: bool,
     link_events: VecDeque<LinkEvent>,
     events: VecDeque<Event>,
@@ -74,7 +73,7 @@ pub struct Companion {
 }
 
 impl Companion {
-    /// Makes the companion of a flight that begins at `now`; `clock` relates `now` to the server's stamps.
+    /// Creates the companion of a flight that begins at `now`; `clock` converts `now` to the server's stamps.
     pub fn new(
         now: HostTime,
         settings: FlightSettings,
@@ -109,11 +108,11 @@ impl Companion {
 
     // ---- inputs: the autopilot ----
 
-    /// Handles bytes from the autopilot, in any portions.
+    /// Handles bytes from the autopilot, in chunks of any size.
     pub fn handle_mavlink(&mut self, now: HostTime, bytes: &[u8]) {
         self.link.handle_input(now, bytes);
         self.handle_link_events(now);
-        // Where the course gives the pose, attitude comes with it.
+        // If the course gives the pose, the attitude is part of it.
         if let (Some(false), Some(stamp)) = (self.ground_truth(), self.link.attitude_at()) {
             let state = self.link.state();
             self.vehicle = Some(Vehicle {
@@ -126,8 +125,7 @@ impl Companion {
         }
     }
 
-    /// Uploads the arena's fence to the autopilot, once the arena is known; reports what polygons cannot
-    /// express.
+    /// Uploads the arena's fence to the autopilot, if the arena is known; reports boxes that polygons cannot express.
     pub fn upload_fence(&mut self, now: HostTime) {
         let Some(arena) = &self.arena else { return };
         let fence = AutopilotFence::of(arena);
@@ -140,16 +138,16 @@ impl Companion {
 
     // ---- inputs: the server ----
 
-    /// Handles the server's greeting, the first of a flight or one after an outage.
+    /// Handles the server's greeting: at the start of a flight, or after an outage.
     pub fn handle_arena(&mut self, now: HostTime, mut arena: Box<ArenaInfo>) {
-        // The plugin gets the limits that it is flown within.
+        // The plugin receives the limits that apply in this flight.
         self.settings.tighten(&mut arena);
         self.flight.handle_arena(now, arena.clone());
         self.arena.get_or_insert(arena);
     }
 
-    /// Handles a change of camera `index`. Images carry their own camera's description; this one is for a
-    /// plugin that has not been greeted yet.
+    /// Handles a change of camera `index`. Images contain the description of their camera; this one is for a plugin
+    /// that has not been greeted yet.
     pub fn handle_camera(&mut self, index: u8, camera: &CameraInfo) {
         let arena = self.arena.as_mut().filter(|_| !self.is_greeted);
         if let Some(known) = arena.and_then(|arena| arena.cameras.get_mut(usize::from(index))) {
@@ -165,7 +163,7 @@ impl Companion {
         }
     }
 
-    /// Handles a sensor's reading: passes it on to the autopilot where the sensor says so.
+    /// Handles a reading of a sensor: forwards it to the autopilot, if enabled for the sensor.
     pub fn handle_reading(&mut self, now: HostTime, reading: &Reading) {
         let index = reading.header.sensor;
         let sensor = self.arena.as_ref().and_then(|arena| arena.sensors.get(usize::from(index)));
@@ -174,11 +172,11 @@ impl Companion {
         }
     }
 
-    /// Handles a pose that the server has fused; `stamp` is its time on this computer's clock.
+    /// Handles a fused pose from the server; `stamp` is its time on this computer's clock.
     pub fn handle_pose(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         self.link.vision(now, sample, stamp);
         self.flight.handle_pose(VehicleMotion::of(sample, stamp));
-        // Before the course is known, no pose is let out.
+        // Before the course is known, no pose is published.
         if self.ground_truth() == Some(true) {
             self.vehicle = Some(Vehicle {
                 stamp,
@@ -190,23 +188,23 @@ impl Companion {
         }
     }
 
-    /// Handles an event of the server's, such as one of the referee.
+    /// Handles an event of the server, such as one of the referee.
     pub fn handle_event(&mut self, now: HostTime, event: &Event) {
         self.send_to_plugin(event);
         let at = self.clock.to_host(event.stamp).unwrap_or(now);
         self.flight.handle_event(now, event, at);
-        // It may have ended the flight: LAND does not wait for the next setpoint's turn.
+        // The event may have ended the flight: LAND must not wait for the next setpoint.
         self.steering.hurry();
     }
 
-    /// Takes note that there is no connection to the server, or that it refuses us for now; `why` in a
-    /// sentence, which stands in for the server's answer until it comes.
+    /// Records that the server is not connected, or that it rejects us temporarily; `why` is a sentence, used in place
+    /// of the server's reply.
     pub fn server_down(&mut self, why: &str) {
         self.flight.server_down(why);
     }
 
-    /// Ends the flight because it cannot be flown: the server refused it, or the plugin's shared memory
-    /// cannot be made; `why` in a sentence.
+    /// Ends the flight because it is impossible: the server rejected it, or the plugin's shared memory cannot be
+    /// created; `why` is a sentence.
     pub fn refuse(&mut self, now: HostTime, why: &str) {
         self.flight.refuse(now, why);
     }
@@ -218,12 +216,12 @@ impl Companion {
 
     // ---- inputs: the plugin ----
 
-    /// Greets a plugin process that has attached: puts the arena before all other messages to it.
+    /// Greets a plugin process that has attached: queues the arena before all other messages to it.
     pub fn greet_plugin(&mut self, now: HostTime) {
         let Some(arena) = &self.arena else { return };
         self.to_plugin.push_back(ToPlugin::Start((**arena).clone()));
         self.is_greeted = true;
-        // One that comes later learns where the flight is.
+        // A plugin that attaches later also needs the phase.
         if self.is_restarted {
             let stamp = self.clock.to_server(now);
             let kind = EventKind::Phase(self.flight.phase());
@@ -232,18 +230,18 @@ impl Companion {
         }
     }
 
-    /// The plugin process is gone, and another one will be greeted.
+    /// Handles the end of the plugin process, if another one will be greeted.
     pub fn plugin_gone(&mut self) {
         (self.is_greeted, self.is_restarted) = (false, true);
         self.to_plugin.clear();
     }
 
-    /// The plugin waits for images.
+    /// Records that the plugin waits for images.
     pub fn plugin_ready(&mut self) {
         self.flight.plugin_ready();
     }
 
-    /// Observation `seq` went to the plugin; `views` tells how old its images are.
+    /// Records that observation `seq` was sent to the plugin; `views` contains the ages of its images.
     pub fn published(&mut self, now: HostTime, seq: u64, views: Views) {
         self.flight.published(now, seq, views);
     }
@@ -256,29 +254,29 @@ impl Companion {
         self.flight.replied(now, seq, setpoint);
     }
 
-    /// The plugin has failed for good.
+    /// Ends the flight because the plugin has failed permanently.
     pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
         self.flight.plugin_failed(now, fault);
     }
 
-    /// The plugin is being started again, and the vehicle holds until it replies; `why` in a sentence.
+    /// Records that the plugin is restarting; the vehicle holds until it replies. `why` is a sentence.
     pub fn plugin_restarts(&mut self, now: HostTime, why: String) {
         self.flight.plugin_restarts(now, why);
     }
 
-    // ---- inputs: time, and notes of the driver's ----
+    // ---- inputs: time, and notes of the driver ----
 
     /// Returns when [`Self::handle_timeout`] is due next.
     pub fn poll_timeout(&self) -> HostTime {
         self.steering.due().min(self.tick_due)
     }
 
-    /// Does what is due at `now`: lets the flight decide, and ticks the link. Returns the setpoint that was
-    /// sent, if one was. A call before anything is due only collects events.
+    /// Runs everything due at `now`: the flight's decision, and a tick of the link. Returns the setpoint that was sent,
+    /// if any. A call before the due time only collects events.
     pub fn handle_timeout(&mut self, now: HostTime) -> Option<SentSetpoint> {
         let sent = if now >= self.steering.due() { self.steer(now) } else { None };
         if now >= self.tick_due {
-            // A stalled driver does not make up for lost ticks.
+            // After a stall, missed ticks are not made up for.
             self.tick_due = self.tick_due.plus_ns(TICK_NS).max(now.plus_ns(1));
             self.ticks += 1;
             self.link.handle_timeout(now);
@@ -290,7 +288,7 @@ impl Companion {
         sent
     }
 
-    /// Reports something that the driver noticed as an event of this companion.
+    /// Reports an observation of the driver as an event of this companion.
     pub fn note(&mut self, now: HostTime, text: &str) {
         self.report(now, EventKind::Note, text);
     }
@@ -307,19 +305,18 @@ impl Companion {
         self.link_events.pop_front()
     }
 
-    /// Returns the next event that this companion made; the server's are not repeated.
+    /// Returns the next event of this companion; events of the server are not repeated.
     pub fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
     }
 
-    /// Returns the next message for the plugin: the greeting, then events. They go before the next
-    /// observation.
+    /// Returns the next message for the plugin: the greeting, then events. Send them before the next observation.
     pub fn poll_plugin(&mut self) -> Option<ToPlugin> {
         self.to_plugin.pop_front()
     }
 
-    /// Calls `push` with each of the autopilot's IMU readings that is new, oldest first. Readings that
-    /// cannot be placed on the server's clock yet are left out.
+    /// Calls `push` with each new IMU reading of the autopilot, oldest first. Skips readings with a time that cannot be
+    /// converted to the server's clock yet.
     pub fn drain_imu(&mut self, mut push: impl FnMut(&ImuSample, ImuReading)) {
         for sample in self.link.imu().iter().filter(|sample| sample.stamp > self.imu_drained) {
             let stamp = self.clock.to_server(sample.stamp);
@@ -331,12 +328,12 @@ impl Companion {
         self.imu_drained = self.link.imu().back().map_or(self.imu_drained, |newest| newest.stamp);
     }
 
-    /// Brings `senses` up to date.
+    /// Updates `senses`.
     pub fn update_senses(&self, senses: &mut Senses) {
         let state = self.link.state();
         let (fraction, voltage_v) = (f64::from(state.battery_fraction), f64::from(state.battery_v));
         senses.vehicle = self.vehicle;
-        // Before the course is known, no pose is let out.
+        // Before the course is known, no pose is published.
         senses.gives_pose = self.ground_truth() == Some(true);
         senses.battery = Battery {
             fraction: (fraction >= 0.0).then_some(fraction),
@@ -349,27 +346,27 @@ impl Companion {
         }
     }
 
-    /// Returns the flight, for its phase and its end.
+    /// Returns the flight: its phase and its end.
     pub fn flight(&self) -> &Flight {
         &self.flight
     }
 
-    /// Returns the link, for the vehicle's state.
+    /// Returns the link: the vehicle's state.
     pub fn link(&self) -> &Link {
         &self.link
     }
 
-    /// Returns the arena, with the limits that are flown within.
+    /// Returns the arena with the limits that apply in this flight.
     pub fn arena(&self) -> Option<&ArenaInfo> {
         self.arena.as_deref()
     }
 
-    /// Whether the present plugin process was greeted.
+    /// Whether the current plugin process has been greeted.
     pub fn is_plugin_greeted(&self) -> bool {
         self.is_greeted
     }
 
-    /// Returns the number of ticks so far; one every 20 ms.
+    /// Returns the number of ticks, one every 20 ms.
     pub fn ticks(&self) -> u64 {
         self.ticks
     }
@@ -379,14 +376,14 @@ impl Companion {
         self.v_setpoint_mps
     }
 
-    /// Returns how many setpoints were sent.
+    /// Returns the number of setpoints sent.
     pub fn setpoints_sent(&self) -> u64 {
         self.setpoints_sent
     }
 
     // ---- private ----
 
-    /// Lets the flight decide, and hands its orders to the link.
+    /// Runs a tick of the flight and passes its orders to the link.
     fn steer(&mut self, now: HostTime) -> Option<SentSetpoint> {
         let orders = self.flight.tick(now, &LinkView::of(&self.link, now));
         self.steering.done(now);
@@ -422,8 +419,7 @@ impl Companion {
         }
     }
 
-    /// Returns whether the course lets the plugin know where the vehicle is; `None` before the course is
-    /// known.
+    /// Whether the course gives the pose to the plugin; `None` before the course is known.
     fn ground_truth(&self) -> Option<bool> {
         self.arena.as_ref().map(|arena| arena.ground_truth)
     }
@@ -435,8 +431,7 @@ impl std::fmt::Debug for Companion {
     }
 }
 
-/// Returns the event as the plugin may know it: without the place, in words too, where the course withholds
-/// it.
+/// Returns the event for the plugin: if the course withholds the pose, without positions, also in the text.
 fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
     let mut event = event.clone();
     if !arena.ground_truth {
@@ -448,8 +443,8 @@ fn for_plugin(event: &Event, arena: &ArenaInfo) -> Event {
     event
 }
 
-/// Returns `text` without the coordinates of points: "at (1.00, 2.00, 0.50) m" becomes "at (withheld) m". A
-/// phase's text repeats the sentence of what led to it, so all texts pass here.
+/// Returns `text` without coordinates of points: "at (1.00, 2.00, 0.50) m" becomes "at (withheld) m". All texts pass
+/// through here, because the text of a phase repeats the reason for the phase.
 fn without_points(text: &str) -> String {
     let mut parts = text.split('(');
     let mut kept = parts.next().unwrap_or_default().to_owned();

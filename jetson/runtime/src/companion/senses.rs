@@ -1,4 +1,4 @@
-//! What a plugin may know beside images.
+//! Data that a plugin receives in addition to images.
 
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::sensor::SensorInfo;
@@ -6,21 +6,19 @@ use vizflyt_sdk::{Battery, ImuSample, ObservationWriter, Vehicle};
 
 use crate::stream::NewestReadings;
 
-/// The vehicle's state as the plugin may know it. What the course withholds is never in it.
+/// State of the vehicle as given to the plugin. Never contains data that the course withholds.
 #[derive(Clone, Debug, Default)]
 pub struct Senses {
-    /// The vehicle.
     pub vehicle: Option<Vehicle>,
-    /// Its battery.
     pub battery: Battery,
-    /// The newest IMU samples, oldest first.
+    /// Newest IMU samples, oldest first.
     pub imu: Vec<ImuSample>,
-    /// Whether the course lets the plugin know where the vehicle is.
+    /// Whether the course gives the pose to the plugin.
     pub gives_pose: bool,
 }
 
 impl Senses {
-    /// Writes them into an observation.
+    /// Writes the senses into an observation.
     pub fn write(&self, writer: &mut ObservationWriter<'_>) {
         if let Some(vehicle) = &self.vehicle {
             writer.vehicle(vehicle);
@@ -29,14 +27,14 @@ impl Senses {
         writer.imu(&self.imu);
     }
 
-    /// Writes where an image was rendered from into an observation, where the course gives the pose.
+    /// Writes the pose from which an image was rendered into an observation, if the course gives the pose.
     pub fn write_pose_at_image(&self, writer: &mut ObservationWriter<'_>, header: &ImageHeader) {
         if self.gives_pose {
             writer.pose_at_image(header.camera.into(), &header.world_from_body());
         }
     }
 
-    /// Writes the sensors' newest readings into an observation.
+    /// Writes the newest sensor readings into an observation.
     pub fn write_readings(
         &self,
         writer: &mut ObservationWriter<'_>,

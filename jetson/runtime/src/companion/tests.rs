@@ -1,4 +1,4 @@
-//! The companion against inputs of an autopilot and a server, and what it lets a plugin know.
+//! Tests of the companion with inputs of an autopilot and a server, and of the data given to a plugin.
 
 use vizflyt_protocol::flight_end::{Collision, Obstacle};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
@@ -36,7 +36,7 @@ fn companion(ground_truth: bool) -> Companion {
     companion
 }
 
-/// A companion after a pose and a collision, and what its plugin was sent.
+/// Returns a companion after a pose and a collision, and the messages to its plugin.
 fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
     let mut companion = companion(ground_truth);
     companion.greet_plugin(at(0));
@@ -51,7 +51,7 @@ fn after_collision(ground_truth: bool) -> (Companion, Vec<ToPlugin>) {
     (companion, messages)
 }
 
-/// Where an image was rendered from.
+/// Returns the pose from which an image was rendered.
 fn at_image() -> Pose<World, Body> {
     Pose::new(DVec3::new(4.0, 5.0, 6.0), DQuat::IDENTITY)
 }
@@ -80,7 +80,7 @@ fn plugin_is_greeted_first_and_receives_events_in_order() {
 }
 
 #[test]
-fn plugin_never_gets_what_the_course_withholds() {
+fn plugin_never_receives_withheld_data() {
     let event = |messages: &[ToPlugin]| match &messages[1] {
         ToPlugin::Event(Event { kind: EventKind::Collision(it), text, .. }) => {
             (it.p_world_m, text.to_string())
@@ -98,7 +98,7 @@ fn plugin_never_gets_what_the_course_withholds() {
     let (companion, messages) = after_collision(false);
     let text = "collision with an obstacle at (withheld) m, at 1.0 m/s";
     assert_eq!(event(&messages), (DVec3::ZERO, text.to_owned()));
-    // No attitude of the autopilot's has come, and the pose is not let out.
+    // The autopilot has sent no attitude, and the pose is withheld.
     observed(&companion, |observation| {
         assert!(observation.vehicle().is_none());
         assert_eq!(observation.camera("front").unwrap().pose_at_image, None);
@@ -106,7 +106,7 @@ fn plugin_never_gets_what_the_course_withholds() {
 }
 
 #[test]
-fn takes_points_out_of_texts_and_nothing_else() {
+fn removes_only_points_from_texts() {
     let check = |text: &str, expected: &str| assert_eq!(without_points(text), expected);
     check(
         "landing: hit at (-1.50, 2, 3.0) m, and at (1,2)",
@@ -134,7 +134,7 @@ fn flight_without_an_autopilot_ends_at_its_time_limit() {
         beats += std::iter::from_fn(|| companion.poll_transmit()).count();
         companion.flight().outcome().is_some()
     });
-    // Nothing is in the air after 60 s, by the virtual clock alone.
+    // The vehicle is not in the air after 60 s of the virtual clock.
     let seconds = ended.unwrap().seconds_since(at(0));
     assert!((60.0..60.1).contains(&seconds), "{seconds}");
     assert!((4 * 55..4 * 62).contains(&beats), "four heartbeats a second: {beats}");
@@ -167,10 +167,10 @@ fn the_same_inputs_give_the_same_bytes() {
 }
 
 #[test]
-fn a_plugin_that_is_not_there_gets_no_messages_and_its_successor_learns_the_phase() {
+fn no_messages_without_a_plugin_and_the_next_one_receives_the_phase() {
     let (mut companion, _) = after_collision(true);
     companion.plugin_gone();
-    companion.note(at(10), "nobody reads this");
+    companion.note(at(10), "without a plugin");
     assert_eq!(companion.poll_plugin(), None);
     companion.greet_plugin(at(20));
     let messages: Vec<_> = std::iter::from_fn(|| companion.poll_plugin()).collect();
@@ -181,17 +181,17 @@ fn a_plugin_that_is_not_there_gets_no_messages_and_its_successor_learns_the_phas
 }
 
 #[test]
-fn a_camera_that_changes_before_the_greeting_is_in_it() {
+fn greeting_contains_earlier_camera_changes() {
     let mut companion = companion(true);
     let mut camera = companion.arena().unwrap().cameras[0].clone();
     camera.intrinsics = Intrinsics::from_horizontal_fov(16, 12, 1.5);
     companion.handle_camera(0, &camera);
-    // There is no such camera.
+    // Index without a camera.
     companion.handle_camera(9, &camera);
     companion.greet_plugin(at(0));
     let Some(ToPlugin::Start(arena)) = companion.poll_plugin() else { panic!("no greeting") };
     assert_eq!(arena.cameras[0], camera);
-    // Later changes come with the images themselves.
+    // Later changes arrive with the images.
     camera.intrinsics = Intrinsics::from_horizontal_fov(8, 6, 1.5);
     companion.handle_camera(0, &camera);
     assert_eq!(companion.arena().unwrap().cameras[0].intrinsics.width_px, 16);

@@ -1,7 +1,7 @@
 use super::*;
 use proptest::prelude::*;
 
-/// Parses `text`, expects a refusal that contains every part.
+/// Parses `text` and expects an error that contains all `parts`.
 fn check_refused(text: &str, parts: &[&str]) {
     let error = JetsonConfig::parse(text).expect_err(text).to_string();
     for part in parts {
@@ -11,14 +11,14 @@ fn check_refused(text: &str, parts: &[&str]) {
 }
 
 #[test]
-fn an_empty_file_is_the_simulated_lab() {
+fn an_empty_file_selects_the_simulated_lab() {
     let config = JetsonConfig::parse("").unwrap();
     assert_eq!(config, JetsonConfig::default());
     assert!(config.server.is_none());
 }
 
 #[test]
-fn reads_the_modules_example() {
+fn reads_the_example_in_the_module() {
     let text = include_str!("../config.rs");
     let example: String = text
         .lines()
@@ -37,7 +37,7 @@ fn reads_the_modules_example() {
 fn reads_the_shipped_file() {
     let config = JetsonConfig::parse(include_str!("../../../systemd/jetson.toml")).unwrap();
     assert!(config.server.is_some() && config.plugin.path.is_some());
-    // As a person who deletes the server's section flies the simulated lab.
+    // A person who deletes the server's section flies the simulated lab.
     let text = include_str!("../../../systemd/jetson.toml");
     let (before, after) = text.split_once("[server]").unwrap();
     let (_, after) = after.split_once("[vehicle]").unwrap();
@@ -46,7 +46,7 @@ fn reads_the_shipped_file() {
 }
 
 #[test]
-fn mistakes_are_explained() {
+fn explains_mistakes() {
     check_refused("[limit]\n", &["line 1, column 2", "'limit'", "did you mean 'limits'"]);
     check_refused(
         "[limits]\nmax_sped_mps = 2\n",
@@ -80,7 +80,7 @@ fn mistakes_are_explained() {
 }
 
 #[test]
-fn reads_the_plugins_limits_and_defaults_the_rest() {
+fn reads_the_plugins_limits_with_defaults_for_the_rest() {
     use crate::supervisor::{PluginLimits, Restart};
     let text = "[plugin]\nmemory_mb = 500\nrestart = \"in_flight\"\nnetwork = true\n";
     let found = JetsonConfig::parse(text).unwrap().plugin.limits();
@@ -91,7 +91,7 @@ fn reads_the_plugins_limits_and_defaults_the_rest() {
 }
 
 #[test]
-fn logs_are_kept_by_size_and_age() {
+fn reads_the_retention_by_size_and_age() {
     let check = |text: &str, max_bytes, max_age| {
         let found = JetsonConfig::parse(text).unwrap().log.retention();
         assert_eq!(found, Retention { max_bytes, max_age }, "{text}");
@@ -103,7 +103,7 @@ fn logs_are_kept_by_size_and_age() {
 }
 
 #[test]
-fn a_file_is_named_and_its_paths_are_its_own() {
+fn errors_name_the_file_and_paths_are_relative_to_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("jetson.toml");
     let error = JetsonConfig::read(&path).unwrap_err().to_string();
@@ -176,7 +176,7 @@ fn config() -> impl Strategy<Value = JetsonConfig> {
     )
 }
 
-/// Returns every key of a written file as `(section, key)`.
+/// Returns all keys of a file as `(section, key)`.
 fn keys(text: &str) -> Vec<(String, String)> {
     let table: toml::Table = text.parse().unwrap();
     let inner = |(section, value): (&String, &toml::Value)| {
@@ -188,14 +188,14 @@ fn keys(text: &str) -> Vec<(String, String)> {
 
 proptest! {
     #[test]
-    fn what_is_written_is_read(config in config()) {
+    fn written_text_is_read_back(config in config()) {
         let text = config.to_toml().unwrap();
         prop_assert_eq!(JetsonConfig::parse(&text).unwrap(), config);
     }
 
-    /// Every key, with any one letter replaced, is refused, and the answer names it.
+    /// Every key with any one letter replaced is rejected, and the error names it.
     #[test]
-    fn a_misspelt_key_is_named(
+    fn suggests_the_right_key_for_a_misspelt_one(
         config in config(),
         which in any::<prop::sample::Index>(),
         at in any::<prop::sample::Index>(),
@@ -214,7 +214,7 @@ proptest! {
     }
 
     #[test]
-    fn any_text_is_read_or_refused(text in "\\PC*|(\\[(server|limits|[a-z]*)\\]\n([a-z_]+ = [0-9\"a-z.]*\n)*)*") {
+    fn no_text_panics(text in "\\PC*|(\\[(server|limits|[a-z]*)\\]\n([a-z_]+ = [0-9\"a-z.]*\n)*)*") {
         if let Ok(config) = JetsonConfig::parse(&text) {
             prop_assert_eq!(JetsonConfig::parse(&config.to_toml().unwrap()).unwrap(), config);
         }

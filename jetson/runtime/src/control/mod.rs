@@ -1,5 +1,5 @@
-//! The companion on the wall clock: one thread drives a [`Companion`], waits for what the other threads
-//! send, and passes on what comes out.
+//! Driver of the companion on the wall clock: one thread drives a [`Companion`], waits for inputs of the other threads,
+//! and forwards the outputs.
 //!
 //! ```text
 //! stream (tokio) ─┐                                ┌─▶ MAVLink socket
@@ -9,9 +9,9 @@
 //! supervisor ─────┤                                └─▶ standard output
 //! signals ────────┘
 //! ```
-//! It wakes when the companion wants it (ticks at 50 Hz, a setpoint after each reply at once) and for every
-//! input. What the flight does is decided in [`companion`](crate::companion); here are only what the wall
-//! clock brings: queues, the plugin's process ([`plugin`]) and reports ([`reporting`]).
+//! The loop wakes when the companion is due (ticks at 50 Hz, a setpoint at once after each reply) and for every input.
+//! The decisions of the flight are in [`companion`](crate::companion). This module adds everything that needs the wall
+//! clock: queues, the plugin's process ([`plugin`]) and reports ([`reporting`]).
 
 mod plugin;
 mod reporting;
@@ -49,83 +49,81 @@ use crate::stats::ImageTimes;
 use crate::stream::{Outbox, Shared, StreamEvent};
 use crate::supervisor::{PluginEvent, PluginLimits, Stream};
 
-/// Something another thread sends to the control loop.
+/// Input of the control loop, sent by another thread.
 #[derive(Debug)]
-#[allow(clippy::large_enum_variant)] // Why: the queue of 0.7 MB is there anyway; a box is one per image.
+#[allow(clippy::large_enum_variant)] // Why: the queue of 0.7 MB exists anyway; a box costs one allocation per image.
 pub enum ControlInput {
     /// Bytes from the autopilot.
     Mavlink(Vec<u8>),
-    /// From the server.
+    /// Event of the stream from the server.
     Stream(StreamEvent),
-    /// An observation is about to reach the plugin.
+    /// An observation is about to be delivered to the plugin.
     Published(Published),
-    /// A message of the plugin's.
+    /// Message from the plugin.
     FromPlugin(Box<FromPlugin>),
-    /// The plugin's process; the first is 0, each one started after it one more.
+    /// Event of a plugin process; processes are numbered from 0.
     Plugin(u32, PluginEvent),
-    /// A driver has noticed something that people should see.
+    /// Message of a driver for people.
     Note(String),
-    /// A person wants the plugin restarted; the vehicle holds until it is back.
+    /// Request to restart the plugin; the vehicle holds until it is back.
     Reload,
-    /// A person wants it to end.
+    /// Request to end the flight.
     Interrupt,
 }
 
-/// Reports to the server every so many ticks: 10 Hz.
+/// Ticks between reports to the server: 10 Hz.
 const TELEMETRY_TICKS: u64 = 5;
-/// Where images get their age, to the server every so many ticks: 1 Hz.
+/// Ticks between timing reports (stages of the image age) to the server: 1 Hz.
 const TIMING_TICKS: u64 = 50;
-/// Lines of the plugin that the page gets in a second; console and log get more.
+/// Maximum lines of the plugin per second on the page; console and log get more.
 const PAGE_LINES_PER_SECOND: u64 = 50;
-/// The maximum number of inputs that wait. Poses and telemetry come at some 300 a second, the loop takes
-/// them within a tick.
+/// Maximum number of waiting inputs. Poses and telemetry arrive at about 300 a second, and the loop handles them within
+/// a tick.
 pub const QUEUE: usize = 1024;
-/// A loop without senders looks at its clock this often.
+/// Period at which a loop without senders checks its clock.
 const IDLE: Duration = Duration::from_millis(20);
 
 /// Sends a datagram to the autopilot.
 pub type SendMavlink = Box<dyn Fn(&[u8])>;
 
-/// The resources of the loop.
+/// Resources of the loop.
 pub struct Control {
-    /// The command that starts the plugin; empty if a person starts it.
+    /// Command that starts the plugin; empty with `--attach`.
     pub plugin_command: Vec<OsString>,
-    /// The plugin's limits, and when it is started again.
+    /// Resource limits and restart policy of the plugin.
     pub plugin_limits: PluginLimits,
-    /// Limits of the flight as a whole.
+    /// Settings of the flight.
     pub settings: FlightSettings,
-    /// A person must press start before it takes off.
+    /// Whether a person must press start before the take-off.
     pub waits_for_start: bool,
-    /// The way to the autopilot.
+    /// Connection to the autopilot.
     pub to_autopilot: SendMavlink,
-    /// The link's settings.
     pub link: LinkSettings,
     /// Clock and mailbox of the stream.
     pub shared: Shared,
-    /// To the server.
+    /// Queue to the server.
     pub to_server: Arc<Outbox>,
-    /// The log.
+    /// Flight log.
     pub log: FlightLog,
-    /// Prints events as JSON.
+    /// Whether to print events as JSON.
     pub json: bool,
-    /// Where people read, if not.
+    /// Console output, without JSON.
     pub screen: Screen,
 }
 
-/// The results of a flight.
+/// Result of a flight.
 #[derive(Debug)]
 pub struct FlightResult {
-    /// How it ended.
+    /// Reason for the end.
     pub outcome: EndReason,
-    /// The images.
+    /// Times of the images.
     pub times: ImageTimes,
-    /// The counters.
     pub counters: Counters,
-    /// The log, still open.
+    /// Log, still open.
     pub log: FlightLog,
 }
 
-/// The loop without its clock and its queue: inputs and `now` come as arguments.
+/// Control loop without clock and queue: inputs and `now` are arguments.
 struct ControlLoop {
     control: Control,
     sender: SyncSender<ControlInput>,
@@ -135,29 +133,29 @@ struct ControlLoop {
     times: ImageTimes,
     published: u64,
     image_seq: u64,
-    /// The server's tick of the newest image.
+    /// Server's tick of the newest image.
     image_tick: u64,
     image_size_px: (u32, u32),
-    /// Replies that took longer than the plugin's deadline.
+    /// Number of replies later than the plugin's deadline.
     overruns: u64,
     restarts: u32,
-    /// The silence of the plugin that was explained last: its oldest image, and whether the vehicle lands for it.
+    /// Last explained silence of the plugin: its oldest image, and whether the vehicle lands.
     explained: Option<(u64, bool)>,
-    /// Silences for which the vehicle has held.
+    /// Number of silences for which the vehicle has held.
     silences: u64,
-    /// Lines that went to the page in this second of ticks.
+    /// Lines sent to the page in the present second of ticks.
     page_lines: u64,
     odometry_gate: OdometryGate,
-    /// The companion's ticks so far.
+    /// Number of the companion's ticks.
     ticks: u64,
-    /// The newest reading of each sensor that the companion had, by its instant.
+    /// Stamp of the newest reading of each sensor passed to the companion.
     readings_taken: [HostTime; MAX_SENSORS],
-    /// Polygons that the autopilot has accepted for its own fence.
+    /// Number of polygons that the autopilot has accepted for its fence.
     polygons: Option<u8>,
 }
 
 impl Control {
-    /// Flies to the end. Call it on a thread that lives as long: the plugin dies with it.
+    /// Flies until the end. Call it on a thread that lives as long as the flight: the plugin ends with that thread.
     pub fn run(
         self,
         sender: SyncSender<ControlInput>,
@@ -210,8 +208,8 @@ impl ControlLoop {
         }
     }
 
-    /// Takes an input, and those that have come by then: after a stall of this loop, an answer that waits in the queue
-    /// counts before the plugin is judged silent, and a pose before it is judged old.
+    /// Handles an input and all further inputs in the queue. After a stall of this loop, a queued reply is thereby
+    /// handled before the plugin counts as silent, and a queued pose before the last one counts as old.
     fn handle_all(
         &mut self,
         first: ControlInput,
@@ -223,7 +221,7 @@ impl ControlLoop {
         }
     }
 
-    /// Takes an input.
+    /// Handles one input.
     fn handle(&mut self, now: HostTime, input: ControlInput) {
         match input {
             ControlInput::Mavlink(bytes) => {
@@ -254,7 +252,7 @@ impl ControlLoop {
         self.pass_on(now);
     }
 
-    /// Does what is due.
+    /// Runs everything that is due.
     fn handle_timeout(&mut self, now: HostTime) {
         let sent = self.companion.handle_timeout(now);
         self.pass_on(now);
@@ -271,7 +269,7 @@ impl ControlLoop {
         }
     }
 
-    /// Does the driver's own work of a tick.
+    /// Runs the driver's own tasks of a tick.
     fn tick(&mut self, now: HostTime) {
         self.tend_plugin(now);
         self.tend_by_hand(now);
@@ -286,7 +284,7 @@ impl ControlLoop {
         }
     }
 
-    /// Takes the sensors' readings that have come since the last tick.
+    /// Passes new sensor readings to the companion.
     fn take_readings(&mut self, now: HostTime) {
         if self.companion.arena().is_none_or(|arena| arena.sensors.is_empty()) {
             return;
@@ -300,7 +298,7 @@ impl ControlLoop {
         }
     }
 
-    /// Passes on what came out of the companion.
+    /// Forwards the outputs of the companion.
     fn pass_on(&mut self, now: HostTime) {
         while let Some(datagram) = self.companion.poll_transmit() {
             (self.control.to_autopilot)(&datagram);
@@ -332,7 +330,7 @@ impl ControlLoop {
             StreamEvent::Welcome(arena) => {
                 tracing::info!("server: arena {}", arena.name);
                 self.companion.handle_arena(now, arena);
-                // The first image may come before the first pose.
+                // The first image may arrive before the first pose.
                 self.share_senses();
                 self.companion.upload_fence(now);
                 self.report_guarded();
@@ -359,7 +357,7 @@ impl ControlLoop {
                 tracing::info!("sensor {} was changed", sensor.name);
                 self.companion.handle_sensor(index, &sensor);
             }
-            // The guardian's alone.
+            // Only for the guardian.
             StreamEvent::Feed(..) => {}
         }
     }
@@ -407,7 +405,7 @@ impl ControlLoop {
 
     fn handle_message(&mut self, now: HostTime, message: FromPlugin) {
         self.control.log.from_plugin(now, &message);
-        // A message of a process that is gone or going counts no more.
+        // Ignore messages of a process that has ended or is ending.
         let is_leaving = self.plugin.as_ref().is_none_or(|side| side.leaving.is_some());
         let counts = self.companion.is_plugin_greeted() && !is_leaving;
         match message {
@@ -445,7 +443,7 @@ impl ControlLoop {
         }
     }
 
-    /// Reports by how much a reply was late: the first, then ever fewer.
+    /// Reports a reply that missed the deadline: at 1, 2, 4, 8 ... occurrences.
     fn check_deadline(&mut self, now: HostTime, seq: u64, took_ms: f64) {
         let deadline_ms = self.control.plugin_limits.deadline_ms;
         if took_ms <= deadline_ms {
@@ -508,8 +506,8 @@ impl ControlLoop {
             }
             side.ipc.clean_up();
             side.stop.store(true, Ordering::Relaxed);
-            // Who drops the shared memory last removes its files, so they are waited for; and
-            // drained, as they may be waiting for room in the queue.
+            // The last owner of the shared memory removes its files, so wait for the threads. Drain the queue
+            // meanwhile, because they may be waiting for room in it.
             for thread in side.threads {
                 while !thread.is_finished() {
                     let _ = inputs.recv_timeout(Duration::from_millis(5));

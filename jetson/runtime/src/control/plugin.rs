@@ -1,5 +1,5 @@
-//! The plugin in the control loop: its process and shared memory, when it is started, replaced, tended and
-//! given up.
+//! Plugin in the control loop: its process and shared memory, and when it is started, restarted, monitored and given
+//! up.
 
 use std::ffi::OsString;
 use std::io;
@@ -19,36 +19,34 @@ use crate::images::ImagePublisher;
 use crate::replies::PluginReplies;
 use crate::supervisor::{Confinement, PluginEvent, Restart, Supervisor};
 
-/// A plugin that has reported a failure may still print why for this long, before it is started again. [s]
+/// Time in which a plugin that reported a failure may still print the reason, before it is restarted. [s]
 const LAST_WORDS_S: f64 = 0.3;
-/// Silence of such a plugin after which the vehicle holds; before the guard's own 0.5 s, after which
-/// it would land. [s]
+/// Silence of an attached plugin after which the vehicle holds. Shorter than the guard's 0.5 s, after which the vehicle
+/// would land later. [s]
 const BREAKPOINT_S: f64 = 0.4;
 
-/// The plugin's side, from the moment the arena is known.
+/// State of the plugin, once the arena is known.
 pub(super) struct PluginSide {
     pub(super) ipc: Arc<RuntimeEnd>,
     pub(super) command: Vec<OsString>,
     pub(super) confinement: Confinement,
     pub(super) supervisor: Option<Supervisor>,
-    /// Stands until a plugin has come that a person started.
+    /// Offer to plugins started by hand, until one has attached.
     pub(super) offer: Option<Offer>,
-    /// When a plugin that a person started last answered, or we on its behalf.
+    /// Time of the last reply of a plugin started by hand, or of our reply in its place.
     pub(super) by_hand_replied: Option<HostTime>,
-    /// Number of the present process.
+    /// Number of the current process.
     pub(super) run: u32,
-    /// The present process is on its way out, and another will be started; until when it may go
-    /// by itself.
+    /// Deadline for the current process to end by itself, if it is ending and will be replaced.
     pub(super) leaving: Option<HostTime>,
     pub(super) replies: Arc<PluginReplies>,
-    /// Ends its threads.
+    /// Signals its threads to end.
     pub(super) stop: Arc<AtomicBool>,
     pub(super) threads: Vec<JoinHandle<()>>,
 }
 
 impl ControlLoop {
-    /// Makes the plugin's shared memory and threads, and starts its process. Does nothing before the arena
-    /// is known.
+    /// Creates the plugin's shared memory and threads, and starts its process. Does nothing before the arena is known.
     pub(super) fn start_plugin(&mut self, now: HostTime) {
         let Some(arena) = self.companion.arena() else { return };
         let (cameras, sensors) = (arena.cameras.to_vec(), arena.sensors.to_vec());
@@ -69,7 +67,7 @@ impl ControlLoop {
                 Ok(made) => offer = Some(made),
                 Err(error) => {
                     let error = anyhow::Error::new(error);
-                    let sentence = format!("no plugin can find this runtime: {error:#}");
+                    let sentence = format!("cannot offer this runtime to plugins: {error:#}");
                     self.companion.plugin_failed(now, PluginFault::ended(&sentence));
                 }
             }
@@ -88,15 +86,15 @@ impl ControlLoop {
             threads,
         });
         if by_hand {
-            let text = "waiting for a plugin: start yours, as `python my_plugin.py`";
+            let text = "waiting for a plugin: start yours, for example `python my_plugin.py`";
             self.companion.note(now, text);
         } else {
             self.start_process(now);
         }
     }
 
-    /// Notes what a silent plugin's process does: when the vehicle lands for its silence, and when it holds, the first
-    /// time and then ever fewer.
+    /// Reports the activity of a silent plugin's process: when the vehicle lands because of its silence, and at the
+    /// holds 1, 2, 4, 8 ...
     pub(super) fn explain_silence(&mut self, now: HostTime) {
         let Some((image, since, lands)) = self.companion.flight().silence() else { return };
         if self.explained.replace((image, lands)) == Some((image, lands)) {
@@ -112,14 +110,13 @@ impl ControlLoop {
         }
     }
 
-    /// Watches a plugin that a person started: its end is noticed, and while it stands at a
-    /// breakpoint the vehicle holds instead of landing.
+    /// Monitors a plugin started by hand: detects its end, and holds instead of landing while it is at a breakpoint.
     pub(super) fn tend_by_hand(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
         let Some(answered) = side.by_hand_replied else { return };
         if !side.ipc.plugin_attached() {
             side.by_hand_replied = None;
-            let sentence = "the plugin that had attached has ended".to_owned();
+            let sentence = "the attached plugin has ended".to_owned();
             return self.companion.plugin_failed(now, PluginFault::ended(&sentence));
         }
         if now.seconds_since(answered) > BREAKPOINT_S {
@@ -128,14 +125,14 @@ impl ControlLoop {
         }
     }
 
-    /// Starts the plugin's process, the first or another.
+    /// Starts the plugin's process, the first or a later one.
     pub(super) fn start_process(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
         let (sender, replies, run) = (self.sender.clone(), Arc::clone(&side.replies), side.run);
-        // Lines and the end are never dropped: the loop always reads.
+        // Lines and exits are never dropped: the loop always reads.
         let handle = move |event| {
             if let PluginEvent::Exited(_) = &event {
-                // Its last messages are handled before its exit: they may have the reason.
+                // Handle its last messages before its exit: they may contain the reason.
                 replies.drain(|message| {
                     let _ = sender.send(ControlInput::FromPlugin(Box::new(message)));
                 });
@@ -155,7 +152,7 @@ impl ControlLoop {
         }
     }
 
-    /// The plugin reports that it has failed; its process ends soon after.
+    /// Handles a failure reported by the plugin; its process ends soon after.
     pub(super) fn plugin_failed(&mut self, now: HostTime, sentence: String) {
         if self.plugin.as_ref().is_some_and(|side| side.leaving.is_some()) {
             return;
@@ -186,7 +183,7 @@ impl ControlLoop {
         }
     }
 
-    /// Whether a plugin that failed is started again, by the policy.
+    /// Whether the policy allows a restart of a failed plugin.
     pub(super) fn may_restart(&self) -> bool {
         let (limits, flight) = (&self.control.plugin_limits, self.companion.flight());
         let is_there = match limits.restart {
@@ -194,12 +191,12 @@ impl ControlLoop {
             Restart::OnGround => flight.is_on_ground(),
             Restart::InFlight => true,
         };
-        // What a person started, a person starts again.
+        // Plugins started by hand are not restarted.
         let ours = !self.control.plugin_command.is_empty();
         ours && is_there && self.restarts < limits.restarts && flight.can_wait_for_plugin()
     }
 
-    /// Restarts the plugin, once its present process is gone; the vehicle holds meanwhile.
+    /// Restarts the plugin after its current process has ended; until then the vehicle holds.
     pub(super) fn replace_plugin(&mut self, now: HostTime, why: String) {
         let Some(side) = &mut self.plugin else { return };
         if side.leaving.is_some() || !self.companion.flight().can_wait_for_plugin() {
@@ -244,7 +241,7 @@ impl ControlLoop {
         images.into_iter().chain(reader).collect()
     }
 
-    /// Greets the plugin once it has attached.
+    /// Greets the plugin after it has attached.
     pub(super) fn tend_plugin(&mut self, now: HostTime) {
         let Some(side) = &mut self.plugin else { return };
         if side.leaving.is_some_and(|until| now > until)
@@ -268,7 +265,7 @@ impl ControlLoop {
         };
         self.control.log.to_plugin(now, message);
         if let Err(error) = side.ipc.send(message) {
-            // One that reads nothing is noticed by its silence.
+            // A plugin that reads nothing is detected by its silence.
             tracing::debug!("plugin: {error}");
         }
     }

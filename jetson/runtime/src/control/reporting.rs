@@ -1,4 +1,4 @@
-//! What the control loop reports to server, plugin, log and console.
+//! Reports of the control loop to server, plugin, log and console.
 
 use serde_json::json;
 use vizflyt_process::print_line;
@@ -10,11 +10,11 @@ use super::ControlLoop;
 use crate::console::Status;
 use crate::log::{Channel, sent_message};
 
-/// The status line is renewed every so many ticks, a multiple of those of the reports: 2 Hz.
+/// Ticks between updates of the status line, a multiple of [`super::TELEMETRY_TICKS`]: 2 Hz.
 const STATUS_TICKS: u64 = 25;
 
 impl ControlLoop {
-    /// Logs an event and shows it to the person.
+    /// Logs an event and prints it.
     pub(super) fn show_event(&mut self, now: HostTime, event: &Event) {
         self.control.log.event(now, event);
         if self.control.json {
@@ -56,14 +56,14 @@ impl ControlLoop {
         self.control.to_server.report_timing(timing);
     }
 
-    /// Reports what the guard keeps the vehicle within, and what the autopilot does.
+    /// Reports the limits of the guard and the fence of the autopilot to the server.
     pub(super) fn report_guarded(&self) {
         if let Some(arena) = self.companion.arena() {
             self.control.to_server.report_guarded(Guarded::of(arena, self.polygons));
         }
     }
 
-    /// Returns what became of images before they reached shared memory, by camera.
+    /// Returns the number of images that arrived, were dropped or failed before shared memory, by camera.
     pub(super) fn arrived(&self) -> Vec<Arrivals> {
         let cameras = self.companion.arena().map_or(0, |arena| arena.cameras.len());
         self.control.shared.mailbox.arrivals()[..cameras.min(MAX_CAMERAS)].to_vec()

@@ -1,5 +1,5 @@
-//! The companion's two drivers side by side: the control loop and the lock-step one get the same inputs at
-//! the same times, those of a simulated flight, and must put out the same.
+//! Compares the companion's two drivers: the control loop and the lock-step driver receive the same inputs of a
+//! simulated flight at the same times, and must produce the same outputs.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -23,9 +23,9 @@ use crate::stream::ServerClock;
 use crate::supervisor::Confinement;
 use crate::waterfall::Stamps;
 
-/// From an image until the plugin's reply to it. [ns]
+/// Delay from an image to the plugin's reply. [ns]
 const REPLY_NS: i64 = 10_000_000;
-/// Ticks of the simulation, of 2.5 ms, from one image to the next.
+/// Ticks of the simulation (2.5 ms) between images.
 const IMAGE_TICKS: u64 = 13;
 
 /// Both drivers, and the plugin's end of the control loop's shared memory.
@@ -33,9 +33,9 @@ struct Drivers {
     lockstep: Lockstep,
     control: ControlLoop,
     plugin: PluginEnd,
-    /// What the control loop sent to the autopilot.
+    /// Datagrams that the control loop sent to the autopilot.
     sent: Rc<RefCell<Vec<Vec<u8>>>>,
-    /// Replies on their way to the control loop.
+    /// Replies that the control loop has not received yet.
     replies: std::collections::VecDeque<(HostTime, Reply)>,
     _folder: tempfile::TempDir,
     _inputs: Receiver<ControlInput>,
@@ -50,7 +50,7 @@ fn arena(ground_truth: bool) -> ArenaInfo {
 }
 
 impl Drivers {
-    /// Makes both at `now`, in the same arena, each with a plugin that is ready.
+    /// Creates both at `now`, in the same arena, each with a ready plugin.
     fn new(now: HostTime, arena: &ArenaInfo) -> Self {
         let settings = FlightSettings {
             ready_within_s: 60.0,
@@ -85,7 +85,7 @@ impl Drivers {
             screen: Screen::default(),
         };
         let mut control = ControlLoop::new(now, control, sender);
-        // A plugin that has attached already, without a process of its own.
+        // Plugin that has already attached, without a process.
         let ipc = Arc::new(RuntimeEnd::new(1 << 16));
         let plugin = PluginEnd::attach(ipc.connect().unwrap()).unwrap();
         control.plugin = Some(PluginSide {
@@ -112,7 +112,7 @@ impl Drivers {
             _folder: folder,
             _inputs: inputs,
         };
-        // Before the first pose, too: an image may come before it.
+        // Also before the first pose: an image may arrive before it.
         drivers.check_senses();
         // The first turn greets the control loop's plugin.
         drivers.turn(now);
@@ -143,7 +143,7 @@ impl Drivers {
         self.control.handle(now, ControlInput::Stream(StreamEvent::Event(event)));
     }
 
-    /// The plugin is shown observation `seq`, and will ask for `setpoint`.
+    /// Shows observation `seq` to the plugin, which will reply with `setpoint`.
     fn image(&mut self, now: HostTime, seq: u64, setpoint: Option<Setpoint>) {
         let published = published(now, seq);
         let reply = Reply { seq, setpoint };
@@ -155,7 +155,7 @@ impl Drivers {
         self.replies.push_back((now.plus_ns(REPLY_NS), reply));
     }
 
-    /// Lets both do what is due; returns what they sent to the autopilot, which is the same.
+    /// Runs both drivers and compares their datagrams to the autopilot; returns these.
     fn turn(&mut self, now: HostTime) -> Vec<Vec<u8>> {
         self.lockstep.handle_timeout(now);
         while let Some((due, Reply { seq, setpoint })) =
@@ -174,8 +174,8 @@ impl Drivers {
         sent
     }
 
-    /// Returns the messages that both plugins were sent since the last call, without greetings. They hold
-    /// every event, the server's and the companion's own.
+    /// Returns the messages to both plugins since the last call, without greetings. They contain every event, of the
+    /// server and of the companion.
     fn take_messages(&mut self) -> Vec<ToPlugin> {
         let companion = &mut self.lockstep.companion;
         let lockstep: Vec<_> = std::iter::from_fn(|| companion.poll_plugin()).collect();
@@ -185,7 +185,7 @@ impl Drivers {
         lockstep
     }
 
-    /// Both plugins may know the same beside images.
+    /// Compares the data that both plugins receive in addition to images.
     fn check_senses(&self) {
         let mut senses = Senses::default();
         self.lockstep.companion.update_senses(&mut senses);
@@ -194,7 +194,7 @@ impl Drivers {
     }
 }
 
-/// Observation `seq`, of one camera, taken and published at `now`.
+/// Returns observation `seq` of one camera, measured and published at `now`.
 fn published(now: HostTime, seq: u64) -> Published {
     let stamps = Stamps {
         camera: 0,
@@ -212,7 +212,7 @@ fn published(now: HostTime, seq: u64) -> Published {
     Published { seq, tick: seq, pose: now, received: now, ready: now, images }
 }
 
-/// What the plugin asks for in reply to image `seq`: one of everything.
+/// Returns the plugin's reply to image `seq`: each kind in turn.
 fn setpoint(seq: u64, axes: Axes) -> Option<Setpoint> {
     let yaw = YawTarget::Keep;
     match seq / 40 % 5 {
@@ -227,7 +227,7 @@ fn setpoint(seq: u64, axes: Axes) -> Option<Setpoint> {
     }
 }
 
-/// Goes on by a tick of the simulation, whose packets and poses both drivers get; returns when.
+/// Advances the simulation by a tick and passes its packets and poses to both drivers; returns the time.
 fn simulate(simulation: &mut Simulation, drivers: &mut Drivers) -> HostTime {
     simulation.tick();
     let now = at(simulation.now().as_ns());
@@ -244,7 +244,7 @@ fn simulate(simulation: &mut Simulation, drivers: &mut Drivers) -> HostTime {
     now
 }
 
-/// Flies both drivers through a simulated flight until the last one has landed; returns the events.
+/// Flies both drivers through a simulated flight until both have landed; returns the events.
 fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
     let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
     let mut drivers = Drivers::new(at(0), &arena(ground_truth));
@@ -276,7 +276,7 @@ fn fly(ground_truth: bool, ends_with: &EventKind, seconds: u64) -> Vec<Event> {
     panic!("the flight does not end: {events:?}");
 }
 
-/// Returns how long after its start a simulated vehicle takes off, and when the plugin flies it. [s]
+/// Returns the times from the start to the take-off and to the plugin's control. [s]
 fn starts_after_s(startup: Startup) -> (f64, f64) {
     let config = SimulationConfig { startup, ..SimulationConfig::airframe() };
     let mut simulation = Simulation::new(config).unwrap();
@@ -300,9 +300,9 @@ fn starts_after_s(startup: Startup) -> (f64, f64) {
     panic!("it does not fly: {:?}", drivers.take_messages());
 }
 
-/// The virtual clock's seconds: the same on every computer.
+/// Times of the virtual clock: equal on every computer.
 #[test]
-fn a_simulated_vehicle_takes_off_half_a_second_after_a_quick_start() {
+fn simulated_vehicle_takes_off_within_half_a_second_of_a_quick_start() {
     let (takes_off_s, flies_s) = starts_after_s(Startup::Quick);
     assert!(takes_off_s < 0.5 && flies_s < 3.5, "{takes_off_s} s, {flies_s} s");
     let (takes_off_s, flies_s) = starts_after_s(Startup::Realistic);
@@ -321,7 +321,7 @@ fn both_drivers_send_the_same_setpoints_and_events() {
 }
 
 #[test]
-fn no_event_tells_a_plugin_in_words_where_it_is() {
+fn event_texts_do_not_contain_a_withheld_position() {
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
     let (clearance_m, with, speed_mps) = (-0.1, Obstacle::Scene, 1.0);
     let collision = EventKind::Collision(Collision { p_world_m, clearance_m, with, speed_mps });
@@ -333,7 +333,7 @@ fn no_event_tells_a_plugin_in_words_where_it_is() {
 }
 
 #[test]
-fn both_drivers_withhold_the_pose_alike() {
+fn both_drivers_withhold_the_pose() {
     let p_world_m = DVec3::new(1.0, 2.0, 3.0);
     let outside = EventKind::Geofence(FenceBreach {
         p_world_m,
@@ -346,7 +346,7 @@ fn both_drivers_withhold_the_pose_alike() {
     assert!(!events.iter().any(|event| event.kind == outside), "the place is withheld");
 }
 
-/// Packets and poses that the simulated vehicle and its localization have sent.
+/// Returns the packets and poses sent by the simulated vehicle and its localization.
 fn sent_by(simulation: &mut Simulation) -> Vec<ControlInput> {
     let (mut inputs, mut buffer) = (Vec::new(), [0; MAX_PACKET]);
     while let Some(packet) = simulation.poll_mavlink(&mut buffer) {
@@ -361,11 +361,11 @@ fn sent_by(simulation: &mut Simulation) -> Vec<ControlInput> {
 }
 
 #[test]
-fn answers_that_wait_in_the_queue_count_after_a_stall_of_the_loop() {
+fn handles_queued_replies_after_a_stall_of_the_loop() {
     let mut simulation = Simulation::new(SimulationConfig::default()).unwrap();
     let mut drivers = Drivers::new(at(0), &arena(true));
     let (queue, inputs) = sync_channel(4 * QUEUE);
-    // From one time that the loop runs to the next, in ticks of 2.5 ms: at last 2.5 s, longer than it waits for an answer.
+    // Time between runs of the loop, in ticks of 2.5 ms: finally 2.5 s, longer than the timeout of a reply.
     let (mut seq, mut flown, stall) = (0, 0, 1000);
     let mut wait = 1;
     while wait < stall {

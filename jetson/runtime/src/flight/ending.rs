@@ -1,4 +1,5 @@
-//! Why and how the flight ends: its own reasons, the guard's holds and landings, and a pilot who takes over.
+//! Reasons and procedure for the end of a flight: reasons of the runtime, holds and landings of the guard, and a pilot
+//! who takes over.
 
 use vizflyt_protocol::flight_end::{Boundary, EndReason, FenceBreach, PluginFault};
 use vizflyt_protocol::mavlink::CopterMode;
@@ -11,7 +12,7 @@ use crate::guard::{
 };
 
 impl Flight {
-    /// Sets and reports why the flight ends, if nothing has ended it yet.
+    /// Sets and reports the reason for the end, unless there already is one.
     pub(super) fn decide(&mut self, now: HostTime, reason: EndReason) {
         if self.end.reason().is_none() {
             let text = reason.to_string();
@@ -21,14 +22,14 @@ impl Flight {
         }
     }
 
-    /// Ends the flight, for a reason of our own.
+    /// Ends the flight for a reason of this runtime.
     pub(super) fn end_for(&mut self, now: HostTime, reason: EndReason) {
         let brakes_first = reason.brakes_first();
         self.decide(now, reason);
         self.come_down(now, brakes_first);
     }
 
-    /// Lands, by LAND or after braking; on the ground the flight is over.
+    /// Lands, by LAND or after braking; on the ground, ends the flight.
     pub(super) fn come_down(&mut self, now: HostTime, brakes_first: bool) {
         match self.phase {
             FlightPhase::Connecting | FlightPhase::Preparing | FlightPhase::Waiting => {
@@ -53,8 +54,8 @@ impl Flight {
         self.end.reason().map_or(how.to_owned(), |reason| format!("{how}: {reason}"))
     }
 
-    /// Someone else changed the mode, in whichever phase: a failsafe of the autopilot, a ground station, or a pilot, who
-    /// has priority. A landing goes on, whoever ordered it.
+    /// Handles a mode change by another party in any phase: a failsafe of the autopilot, a ground station, or a pilot,
+    /// who has priority. A landing continues, no matter who ordered it.
     pub(super) fn taken_over(&mut self, now: HostTime, mode: u32) {
         self.taken = Some(mode);
         self.pilot_flies |= mode != CopterMode::Land as u32;
@@ -65,7 +66,7 @@ impl Flight {
         self.end_for(now, reason);
     }
 
-    /// Follows the guard's mode: its holds and landings are the flight's.
+    /// Follows the guard's mode: its holds and landings become those of the flight.
     pub(super) fn follow_guard(&mut self, now: HostTime, mode: GuardMode) {
         let former = self.guard_mode.replace(mode);
         match mode {
@@ -98,7 +99,7 @@ impl Flight {
                             format!("the pose may be off by {off_m:.2} m")
                         }
                         HoldReason::ImagesOld => {
-                            format!("what the plugin sees is older than {SIGHT_HOLD_S} s")
+                            format!("the plugin's images are older than {SIGHT_HOLD_S} s")
                         }
                         HoldReason::Ending => {
                             self.end.reason().map_or(String::new(), ToString::to_string)
@@ -110,7 +111,7 @@ impl Flight {
         }
     }
 
-    /// Returns why the guard lands; `None` where the flight ordered it.
+    /// Returns the reason for the guard's landing; `None` if the flight ordered it.
     fn guard_end_reason(&self, now: HostTime, reason: LandReason) -> Option<EndReason> {
         let breach = |beyond_m: f64, boundary| {
             let vehicle = self.vehicle.as_ref();
@@ -139,12 +140,12 @@ impl Flight {
         })
     }
 
-    /// Returns why no setpoint comes: the plugin is silent, gets no image, or its answers cannot be flown.
+    /// Returns why the setpoint is missing: the plugin is silent, receives no image, or its replies are rejected.
     fn why_silent(&self, now: HostTime) -> EndReason {
         let answered_s = self.replied_at.map(|at| now.seconds_since(at));
         let is_answering = answered_s.is_some_and(|answered_s| answered_s < SETPOINT_HOLD_S);
         EndReason::Plugin(match self.unanswered {
-            // While others are answered, an image that has just come is no silence.
+            // While other images are answered, a new image without a reply does not count as silence.
             Some((image, at)) if !is_answering => {
                 PluginFault::NoAnswer { image, silent_s: now.seconds_since(at) }
             }

@@ -1,4 +1,4 @@
-//! Inputs of the flight: the arena, the server's events, the link, and the plugin's replies.
+//! Inputs of the flight: the arena, events of the server and the link, and the plugin's replies.
 
 use vizflyt_protocol::flight_end::{EndReason, PluginFault};
 use vizflyt_protocol::messages::{ArenaInfo, Event, EventKind, FlightPhase, Setpoint, bounded};
@@ -8,7 +8,7 @@ use super::{Flight, Views};
 use crate::guard::{VehicleMotion, check_arena};
 use crate::link::{LOST_AFTER_S, LinkEvent};
 
-/// STATUSTEXT of this severity or worse is worth a person's attention.
+/// Maximum severity number of STATUSTEXT messages that are reported to people.
 const SEVERITY_WARNING: u8 = 4;
 
 impl Flight {
@@ -23,34 +23,34 @@ impl Flight {
         }
         match &self.arena {
             Some(known) if **known != *arena => {
-                // The guard must not keep a fence that is no longer the room's.
+                // The guard must not enforce a fence that is no longer that of the room.
                 self.end_for(now, EndReason::ArenaChanged { name: arena.name.clone() });
             }
             _ => self.arena = Some(arena),
         }
     }
 
-    /// Handles the motion of the vehicle, as localization gives it.
+    /// Handles the localized motion of the vehicle.
     pub fn handle_pose(&mut self, vehicle: VehicleMotion) {
         if vehicle.is_valid() {
             self.vehicle = Some(vehicle);
         }
     }
 
-    /// Handles an event of the server's that happened at `at`, by our clock.
+    /// Handles an event of the server that happened at `at` on our clock.
     pub fn handle_event(&mut self, now: HostTime, event: &Event, at: HostTime) {
         self.end.handle(at.min(now), &event.kind);
         match event.kind {
             EventKind::Start if self.phase == FlightPhase::Waiting => {
                 self.waits_for_start = false;
             }
-            // Not kept for later: what made it unready may be a person in the net.
+            // Not stored: the vehicle may be unready because a person is in the net.
             EventKind::Start if self.waits_for_start => {
                 let why = "start was pressed before the vehicle was ready; press it again then";
                 self.notice(EventKind::Note, why.to_owned());
             }
             _ => {
-                // What cannot end it on the ground does not.
+                // Ignore events that cannot end a flight on the ground.
                 if let (Some(reason), Some(_)) = (event.kind.end_reason(), self.end.reason()) {
                     self.come_down(now, reason.brakes_first());
                 }
@@ -58,12 +58,12 @@ impl Flight {
         }
     }
 
-    /// Takes note that there is no connection to the server, or that it refuses us for now; `why` in a sentence.
+    /// Records that the server is not connected, or that it rejects us temporarily; `why` is a sentence.
     pub fn server_down(&mut self, why: &str) {
         self.server_down = Some(bounded(why));
     }
 
-    /// Ends the flight because the server refuses us, and retrying will not help; `why` in a sentence.
+    /// Ends the flight because the server rejects us permanently; `why` is a sentence.
     pub fn refuse(&mut self, now: HostTime, why: &str) {
         self.end_for(now, EndReason::ServerRefused(bounded(why)));
     }
@@ -97,18 +97,18 @@ impl Flight {
         }
     }
 
-    /// Takes note that the plugin waits for images.
+    /// Records that the plugin waits for images.
     pub fn plugin_ready(&mut self) {
         self.plugin_ready = true;
     }
 
-    /// Takes note that observation `seq` went to the plugin; `views` has the age of its images.
+    /// Records that observation `seq` was sent to the plugin; `views` contains the ages of its images.
     pub fn published(&mut self, now: HostTime, seq: u64, views: Views) {
         self.sight.shown(now, seq, &views);
         self.unanswered.get_or_insert((seq, now));
     }
 
-    /// Ends the flight because the plugin has failed for good.
+    /// Ends the flight because the plugin has failed permanently.
     pub fn plugin_failed(&mut self, now: HostTime, fault: PluginFault) {
         self.end_for(now, EndReason::Plugin(fault));
     }
@@ -127,7 +127,7 @@ impl Flight {
                 self.accepted_seq = Some(seq);
                 self.refused = None;
             }
-            // Once per series; the hold and the landing that follow name it again.
+            // Once per series; the hold and the landing that follow repeat the reason.
             Err(fault) if self.refused.is_none() => {
                 self.refused = Some(fault);
                 self.notice(EventKind::Note, format!("setpoint refused: {fault}"));
@@ -136,7 +136,7 @@ impl Flight {
         }
     }
 
-    /// Takes note that the plugin is started again; `why` in a sentence. The vehicle holds until it replies.
+    /// Records that the plugin is restarting; `why` is a sentence. The vehicle holds until it replies.
     pub fn plugin_restarts(&mut self, now: HostTime, why: String) {
         if !self.can_wait_for_plugin() {
             return;

@@ -1,5 +1,5 @@
-//! The flight from first contact to disarming: a sans-IO state machine that ties guard, link and
-//! plugin together. [`control`](crate::control) drives it at 50 to 200 Hz.
+//! Flight from first contact to disarming: a sans-IO state machine that connects guard, link and plugin.
+//! [`control`](crate::control) drives it at 50 to 200 Hz.
 //!
 //! ```text
 //! Connecting ──▶ Preparing ──▶ TakingOff ──▶ Flying ◀──▶ Holding
@@ -8,12 +8,11 @@
 //!  plugin         pose, image      │                  ▼
 //!                                  └────────────▶ Landing ──▶ Landed
 //! ```
-//! Where a person is to start it ([`Flight::wait_for_start`]), the flight stays `Waiting` between
-//! preparing and taking off, for as long as everything is ready.
-//! What ends the flight, and what its outcome is, [`vizflyt_protocol::flight_end`] decides; landing is
-//! never taken back.
+//! If a person must start the flight ([`Flight::wait_for_start`]), it stays `Waiting` between preparing and taking off
+//! while everything is ready. [`vizflyt_protocol::flight_end`] decides the end of the flight and its outcome. A landing
+//! is final.
 //!
-//! `inputs` handles what happens, `phases` has a function per phase, `sight` knows how old is what the plugin sees,
+//! `inputs` handles inputs, `phases` has a function for each phase, `sight` tracks the age of the plugin's images,
 //! `ending` decides why and how the flight ends.
 
 mod ending;
@@ -39,44 +38,44 @@ use crate::link::{Goal, Link};
 use sight::Sight;
 pub use sight::{MAX_IMAGE_AGE_S, MIN_IMAGE_RATE_HZ, Views};
 
-/// Settings of a person.
+/// Settings of a flight.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlightSettings {
-    /// Give up if not in the air after this long; 0 waits for ever. [s]
+    /// Maximum time until the vehicle is in the air; 0: no timeout. [s]
     pub ready_within_s: f64,
-    /// Land this long after take-off, whatever the arena allows; 0 leaves it to the arena. [s]
+    /// Maximum time from take-off to landing, in addition to the arena's limit; 0: only the arena's limit. [s]
     pub time_limit_s: f64,
-    /// This vehicle's own limits; of them and the arena's, the stricter wins.
+    /// Limits of this vehicle; the stricter of these and the arena's limits applies.
     pub limits: Limits,
-    /// Another in each flight, and secret: where places slip that a plugin gives without knowing the pose.
+    /// Secret seed, different for each flight, of the drift added to positions when the course hides the pose.
     pub slip_seed: u64,
-    /// The cameras that the plugin flies by, by name: each must be fresh. Empty: one fresh camera is enough.
+    /// Names of the cameras that the plugin needs: each must be fresh. Empty: one fresh camera is enough.
     pub cameras: Vec<String>,
 }
 
 impl FlightSettings {
-    /// Tightens an arena's limits to this vehicle's own.
+    /// Limits the arena's limits to those of this vehicle.
     pub fn tighten(&self, arena: &mut ArenaInfo) {
         arena.limits = arena.limits.stricter(&self.limits);
     }
 }
 
-/// The link's state at a tick.
+/// State of the link at a tick.
 #[derive(Clone, Debug)]
 pub struct LinkView {
-    /// Heartbeats arrive.
+    /// Whether heartbeats arrive.
     pub connected: bool,
-    /// Motors may turn.
+    /// Whether the motors may turn.
     pub armed: bool,
     /// ArduCopter's mode number.
     pub mode: u32,
-    /// The mode that somebody else has chosen last, after ours was confirmed.
+    /// Last mode chosen by a pilot, a ground station or a failsafe after our mode was confirmed.
     pub taken: Option<u32>,
-    /// The take-off was accepted.
+    /// Whether the take-off was accepted.
     pub took_off: bool,
-    /// What arming still waits for.
+    /// Condition that arming waits for.
     pub ready_to_arm: Result<(), Cow<'static, str>>,
-    /// How the vehicle answers velocities, by its parameters.
+    /// Response of the vehicle to velocities, according to its parameters.
     pub response: Option<Response>,
 }
 
@@ -96,27 +95,26 @@ impl LinkView {
     }
 }
 
-/// What the flight orders at a tick.
+/// Orders of the flight at a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Orders {
-    /// The state that the link is to reach.
+    /// State that the link must reach.
     pub goal: Goal,
-    /// The setpoint to send to the autopilot.
+    /// Setpoint to send to the autopilot.
     pub setpoint: Option<GuidedSetpoint>,
-    /// The image whose reply this setpoint carries; the same as long as the reply is in force.
+    /// Number of the image that the plugin answered with this setpoint; unchanged while the reply is in force.
     pub replies_to: Option<u64>,
 }
 
-/// Something to report to the server, the plugin, the log and the person.
+/// Report to the server, the plugin, the log and the console.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlightNotice {
-    /// What happened.
     pub kind: EventKind,
-    /// One sentence.
+    /// Text of one sentence.
     pub text: String,
 }
 
-/// One flight. See the module.
+/// One flight; see the module.
 #[derive(Debug)]
 pub struct Flight {
     settings: FlightSettings,
@@ -124,47 +122,47 @@ pub struct Flight {
     phase_at: HostTime,
     started_at: HostTime,
     arena: Option<Box<ArenaInfo>>,
-    /// Why the last attempt to connect to the server failed.
+    /// Error of the last attempt to connect to the server.
     server_down: Option<Text>,
     vehicle: Option<VehicleMotion>,
     start_z_m: f64,
     took_off_at: Option<HostTime>,
     plugin_ready: bool,
     replied_at: Option<HostTime>,
-    /// The image whose reply the guard accepted last.
+    /// Number of the last image with a reply that the guard accepted.
     accepted_seq: Option<u64>,
     sight: Sight,
-    /// Oldest image that the plugin has not replied to: its number, and when it got it.
+    /// Oldest image without a reply of the plugin: number, and time of its delivery.
     unanswered: Option<(u64, HostTime)>,
     guard: Option<Guard>,
     guard_mode: Option<GuardMode>,
     end: FlightEnd<Host>,
-    /// The mode that somebody else has chosen last.
+    /// Last mode chosen by a pilot, a ground station or a failsafe.
     taken: Option<u32>,
-    /// A pilot flies: nothing is sent any more.
+    /// Whether a pilot flies; then nothing more is sent.
     pilot_flies: bool,
     interrupted_at: Option<HostTime>,
     disarmed_at: Option<HostTime>,
     connected_at: HostTime,
-    /// A person must press start before it takes off.
+    /// Whether a person must press start before the take-off.
     waits_for_start: bool,
     reminded_at: Option<HostTime>,
-    /// Why all setpoints are being refused.
+    /// Reason for rejecting setpoints, while all are rejected.
     refused: Option<InvalidSetpoint>,
     landed_at: Option<HostTime>,
-    /// Why the plugin was last started again.
+    /// Reason for the plugin's last restart.
     restart_reason: Option<String>,
-    /// When the fence last limited the plugin's setpoint.
+    /// Time at which the fence last limited the plugin's setpoint.
     fence_stopped_at: Option<HostTime>,
-    /// When old images last did.
+    /// Time at which old images last limited it.
     slowed_at: Option<HostTime>,
-    /// What has been said of a vehicle that answers late.
+    /// Last reported response of a vehicle that responds late.
     lagging: Option<Lagging>,
     notices: VecDeque<FlightNotice>,
 }
 
 impl Flight {
-    /// Makes a flight that begins at `now`.
+    /// Creates a flight that begins at `now`.
     pub fn new(settings: FlightSettings, now: HostTime) -> Self {
         Self {
             settings,
@@ -211,7 +209,7 @@ impl Flight {
         self.phase
     }
 
-    /// Returns why the flight ended, once it is over.
+    /// Returns the reason for the end, after the flight is over.
     pub fn outcome(&self) -> Option<&EndReason> {
         if self.phase == FlightPhase::Landed { self.end.reason() } else { None }
     }
@@ -221,14 +219,14 @@ impl Flight {
         self.vehicle.as_ref()
     }
 
-    /// Returns seconds from take-off to `now` or the end of the landing; 0 before. [s]
+    /// Returns the time from take-off to `now` or to the end of the landing; 0 before. [s]
     pub fn seconds(&self, now: HostTime) -> f64 {
         let end = self.landed_at.unwrap_or(now);
         self.took_off_at.map_or(0.0, |at| end.seconds_since(at))
     }
 
-    /// Returns the oldest image that the plugin has not answered, and when it got it, where the guard holds or lands for
-    /// its silence; and whether it lands.
+    /// Returns the oldest image without a reply, the time of its delivery, and whether the vehicle lands, if the guard
+    /// holds or lands because of the plugin's silence.
     pub fn silence(&self) -> Option<(u64, HostTime, bool)> {
         let (image, since) = self.unanswered?;
         match self.guard_mode? {
@@ -243,7 +241,7 @@ impl Flight {
         self.notices.pop_front()
     }
 
-    /// Does what is due at `now`; 50 to 200 Hz, see [`crate::steering`].
+    /// Runs everything due at `now`; call it at 50 to 200 Hz, see [`crate::steering`].
     pub fn tick(&mut self, now: HostTime, link: &LinkView) -> Orders {
         if link.connected {
             self.connected_at = now;
@@ -276,7 +274,7 @@ impl Flight {
         }
     }
 
-    /// Whether the vehicle stands on the ground, before take-off.
+    /// Whether the vehicle is on the ground before take-off.
     pub fn is_on_ground(&self) -> bool {
         matches!(
             self.phase,
@@ -284,7 +282,7 @@ impl Flight {
         )
     }
 
-    /// Whether the flight can go on without a plugin for a while.
+    /// Whether the flight can continue without a plugin for a while.
     pub fn can_wait_for_plugin(&self) -> bool {
         self.end.reason().is_none() && (self.is_on_ground() || self.is_airborne())
     }
@@ -297,7 +295,7 @@ impl Flight {
         self.phase_flies() || self.phase == FlightPhase::TakingOff
     }
 
-    /// Ages of a pose that the arena allows.
+    /// Returns the maximum pose ages of the arena.
     fn pose_ages(&self) -> PoseAges {
         self.arena.as_ref().map(|arena| arena.pose_ages).unwrap_or_default()
     }

@@ -1,4 +1,4 @@
-//! What the flight does at a tick, by phase.
+//! Actions of the flight at a tick, by phase.
 
 use vizflyt_protocol::flight_end::{EndReason, Missing};
 use vizflyt_protocol::mavlink::CopterMode;
@@ -8,28 +8,28 @@ use vizflyt_protocol::time::HostTime;
 use super::{Flight, LinkView, Orders};
 use crate::guard::{Guard, GuardMode, GuardOutput, HoldReason, Lagging, Slowed};
 
-/// Share of the take-off height that counts as reached: ArduCopter hands over at 90 cm of a metre
-/// as it eases into the height.
+/// Share of the take-off height that counts as reached: near the height ArduCopter slows down, and hands over at 0.9 m
+/// of a metre.
 const REACHED: f64 = 0.9;
-/// A vehicle that stands still is measured at less than this. [m/s]
+/// Maximum measured speed of a vehicle at rest. [m/s]
 const AT_REST_MPS: f64 = 0.3;
-/// From the accepted take-off to the height. ArduCopter climbs at 0.5 m/s or more. [s]
+/// Maximum time from the accepted take-off to the height. ArduCopter climbs at 0.5 m/s or more. [s]
 const CLIMB_WITHIN_S: f64 = 20.0;
-/// Disarmed for this long: landed. Longer than packets take to overtake each other. [s]
+/// Time disarmed after which the vehicle has landed. Longer than the reordering of packets. [s]
 const DISARMED_S: f64 = 0.5;
-/// A landing that takes longer than this ends the flight all the same. From 4 m at ArduCopter's
-/// 0.3 to 0.5 m/s, plus the wait for touch-down. [s]
+/// Maximum duration of a landing, after which the flight ends: from 4 m at ArduCopter's 0.3 to 0.5 m/s, plus the
+/// detection of the touch-down. [s]
 const LAND_WITHIN_S: f64 = 60.0;
-/// Without a link, whether the vehicle has landed cannot be known; wait this long. [s]
+/// Without a link, a landing cannot be detected; the flight ends after this time. [s]
 const LOST_WHILE_LANDING_S: f64 = 10.0;
-/// After an interrupt: time for LAND to be confirmed. [s]
+/// After an interrupt: maximum time for the confirmation of LAND. [s]
 const INTERRUPT_S: f64 = 1.0;
 /// Minimum time between two notices of the same kind. [s]
 const REMIND_S: f64 = 5.0;
 
 impl Flight {
-    /// Lands a vehicle that a former runtime has left in the air, and returns whether there is one: our
-    /// heartbeats would keep the autopilot's own failsafe from landing it.
+    /// Lands a vehicle that an earlier runtime has left in the air, and returns whether there is one. Without this, our
+    /// heartbeats would prevent the autopilot's failsafe from landing it.
     fn lands_former_flight(&mut self, now: HostTime, link: &LinkView) -> bool {
         let left = link.connected && link.armed && link.mode == CopterMode::Guided as u32;
         if left {
@@ -54,7 +54,7 @@ impl Flight {
         };
         match missing {
             Some(missing) => self.wait_for(now, missing),
-            None => self.enter(now, FlightPhase::Preparing, "all are here; preparing"),
+            None => self.enter(now, FlightPhase::Preparing, "server, plugin and autopilot are ready; preparing"),
         }
     }
 
@@ -90,7 +90,7 @@ impl Flight {
             (missing, _) => {
                 let missing = missing.unwrap_or(Missing::Pose);
                 if self.phase == FlightPhase::Waiting {
-                    // The time to get ready starts again: it was ready.
+                    // The time limit for the preparation starts again, because the vehicle was ready.
                     self.started_at = now;
                     let why = format!("no longer ready: {missing}");
                     self.enter(now, FlightPhase::Preparing, &why);
@@ -100,7 +100,7 @@ impl Flight {
         }
     }
 
-    /// Returns why the vehicle does not stand where a flight begins; `None` if it does.
+    /// Returns why the vehicle is not in a valid state at the start; `None` if it is.
     fn why_not_at_start(&self) -> Option<String> {
         let (vehicle, arena) = (self.vehicle.as_ref()?, self.arena.as_ref()?);
         let outside_m =
@@ -171,7 +171,7 @@ impl Flight {
             GuardOutput::Guided(setpoint) => Some(setpoint),
             GuardOutput::Land => None,
         };
-        // In any other mode the setpoint is the guard's own.
+        // In other modes the setpoint is the guard's own.
         let is_reply =
             matches!(mode, GuardMode::Following | GuardMode::Holding(HoldReason::Requested));
         let replies_to = self.accepted_seq.filter(|_| is_reply && setpoint.is_some());
@@ -189,14 +189,14 @@ impl Flight {
         let released = self
             .interrupted_at
             .is_some_and(|at| (link.connected && in_land) || now.seconds_since(at) > INTERRUPT_S);
-        // Who flies it takes the time that it takes.
+        // A pilot who lands has no time limit.
         let landing_s = if self.pilot_flies { 0.0 } else { now.seconds_since(self.phase_at) };
         let silent = !link.connected && now.seconds_since(self.connected_at) > LOST_WHILE_LANDING_S;
         if landed {
             self.landed_at = self.disarmed_at;
             self.enter(now, FlightPhase::Landed, "on the ground, disarmed");
         } else if released {
-            self.enter(now, FlightPhase::Landed, "leaving; the autopilot lands by itself");
+            self.enter(now, FlightPhase::Landed, "ending; the autopilot completes the landing");
         } else if landing_s > LAND_WITHIN_S {
             self.enter(now, FlightPhase::Landed, "still armed a minute after landing began");
         } else if silent {
@@ -204,7 +204,7 @@ impl Flight {
         }
     }
 
-    /// Reports that the fence stops the vehicle; once, until it has not for [`REMIND_S`].
+    /// Reports that the fence stops the vehicle; again only after [`REMIND_S`] without a stop.
     fn notice_fence(&mut self, now: HostTime) {
         let former = self.fence_stopped_at.replace(now);
         if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
@@ -213,12 +213,12 @@ impl Flight {
         }
     }
 
-    /// Reports that old images slow the vehicle down; once, until they have not for [`REMIND_S`].
+    /// Reports that old images slow the vehicle down; again only after [`REMIND_S`] at full speed.
     fn notice_slowed(&mut self, now: HostTime, Slowed { age_s, share }: Slowed) {
         let former = self.slowed_at.replace(now);
         if former.is_none_or(|at| now.seconds_since(at) > REMIND_S) {
             let text = format!(
-                "what the plugin sees is {:.0} ms old: flown at {:.0} % of the speed limit until it is fresher",
+                "the plugin's images are {:.0} ms old: flown at {:.0} % of the speed limit until they are fresher",
                 age_s * 1e3,
                 share * 1e2
             );
@@ -226,13 +226,13 @@ impl Flight {
         }
     }
 
-    /// Reports that the vehicle answers late, or no longer.
+    /// Reports that the vehicle responds late, or no longer responds late.
     fn notice_lagging(&mut self, lagging: Option<Lagging>) {
         let Some(Lagging { response, measured, share }) = lagging else {
             let text = "the vehicle answers in time: flown at the full speed limit";
             return self.notice(EventKind::Note, text.to_owned());
         };
-        let knows = if measured { "answers" } else { "may answer, as nothing else is known," };
+        let knows = if measured { "answers" } else { "may answer (response unknown)" };
         let text = format!(
             "the vehicle {knows} {:.1} s late: flown at {:.0} % of the speed limit; ArduCopter answers sooner with \
              PSC_JERK_NE and PSC_JERK_D (before 4.7: PSC_JERK_XY, PSC_JERK_Z) of 20, as `vizflyt doctor vehicle --apply` sets",
@@ -242,7 +242,7 @@ impl Flight {
         self.notice(EventKind::Note, text);
     }
 
-    /// Reports what is being waited for every [`REMIND_S`], and gives up at the time limit.
+    /// Reports the missing condition every [`REMIND_S`], and gives up at the time limit.
     fn wait_for(&mut self, now: HostTime, missing: Missing) {
         let limit_s = self.settings.ready_within_s;
         if limit_s > 0.0 && now.seconds_since(self.started_at) > limit_s {
@@ -255,7 +255,7 @@ impl Flight {
         }
     }
 
-    /// Returns the time limits of the person and of the arena; infinite without one. [s]
+    /// Returns the time limits of the settings and of the arena; infinite without one. [s]
     fn time_limits_s(&self) -> (f64, f64) {
         let arena_s = self.arena.as_ref().map_or(0.0, |arena| arena.time_limit_s);
         let limit_s = |given_s: f64| if given_s > 0.0 { given_s } else { f64::INFINITY };

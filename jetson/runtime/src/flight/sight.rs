@@ -1,46 +1,46 @@
-//! How old is what the plugin flies by.
+//! Age of the images that the plugin uses.
 //!
-//! An image is as old as the pose that it was rendered from: nothing newer is in it. Before take-off images must come
-//! often and fresh ([`MIN_IMAGE_RATE_HZ`], [`MAX_IMAGE_AGE_S`]); in flight the age of what the plugin has answered
-//! last is what the guard slows the vehicle down by.
+//! The age of an image is the age of the pose from which it was rendered. Before take-off, images must be frequent and
+//! fresh ([`MIN_IMAGE_RATE_HZ`], [`MAX_IMAGE_AGE_S`]). In flight, the guard reduces the speed by the age of the image
+//! of the plugin's last reply.
 
 use std::collections::VecDeque;
 
 use vizflyt_protocol::messages::{ArenaInfo, MAX_CAMERAS};
 use vizflyt_protocol::time::HostTime;
 
-/// Of an observation: when the pose behind each camera's image was measured; none for a camera without an image.
+/// Measurement time of the pose behind each camera's image in an observation; `None` for a camera without an image.
 /// [host]
 pub type Views = [Option<HostTime>; MAX_CAMERAS];
 
-/// A vehicle takes off only if so many images came in the last second. [1/s]
+/// Minimum number of images in the last second before take-off. [1/s]
 pub const MIN_IMAGE_RATE_HZ: usize = 4;
-/// And only if half of them were no older than this when the plugin got them. [s]
+/// Maximum median age of these images on arrival at the plugin. [s]
 pub const MAX_IMAGE_AGE_S: f64 = 0.25;
 
-/// Observations that wait for an answer, at most; more are forgotten, oldest first.
+/// Maximum number of observations that wait for a reply; the oldest are dropped.
 const MAX_SHOWN: usize = 64;
 
-/// What the plugin has been shown and has answered.
+/// Images that were shown to the plugin, and that it has replied to.
 #[derive(Debug, Default)]
 pub(super) struct Sight {
-    /// The cameras that the plugin uses, each of which must be fresh; empty: one fresh camera is enough.
+    /// Cameras that the plugin needs, each of which must be fresh; empty: one fresh camera is enough.
     used: Vec<usize>,
-    /// Observations without an answer, oldest first.
+    /// Observations without a reply, oldest first.
     shown: VecDeque<(u64, Views)>,
-    /// The newest of each camera that reached the plugin.
+    /// Newest image of each camera that reached the plugin.
     newest: Views,
-    /// The newest of each camera that it has answered.
+    /// Newest image of each camera with a reply.
     answered: Views,
-    /// Observations of the last second: when they came, and how old they were. [s]
+    /// Observations of the last second: time of arrival, and age. [s]
     arrivals: VecDeque<(HostTime, f64)>,
 }
 
 impl Sight {
-    /// Takes the names of the cameras that the plugin uses.
+    /// Sets the cameras that the plugin needs, by name.
     ///
     /// # Errors
-    /// A sentence, if the arena has no such camera.
+    /// Returns a sentence if the arena has no such camera.
     pub(super) fn use_cameras(
         &mut self,
         names: &[String],
@@ -52,14 +52,14 @@ impl Sight {
                 let there: Vec<&str> =
                     arena.cameras.iter().map(|camera| camera.name.as_str()).collect();
                 let there = there.join(", ");
-                format!("[plugin] cameras: no camera here is called {name}; there are {there}")
+                format!("[plugin] cameras: this arena has no camera {name}; it has {there}")
             })
         };
         self.used = names.iter().map(find).collect::<Result<_, _>>()?;
         Ok(())
     }
 
-    /// Takes note that observation `seq` goes to the plugin at `now`.
+    /// Records that observation `seq` is shown to the plugin at `now`.
     pub(super) fn shown(&mut self, now: HostTime, seq: u64, views: &Views) {
         if self.shown.len() == MAX_SHOWN {
             self.shown.pop_front();
@@ -72,19 +72,19 @@ impl Sight {
         self.forget_arrivals(now);
     }
 
-    /// Takes note that the plugin has answered observation `seq`.
+    /// Records the plugin's reply to observation `seq`.
     pub(super) fn answered(&mut self, seq: u64) {
         while let Some((_, views)) = self.shown.pop_front_if(|(shown, _)| *shown <= seq) {
             keep_newest(&mut self.answered, &views);
         }
     }
 
-    /// Returns when the pose was measured behind what the plugin has answered last. [host]
+    /// Returns the measurement time of the pose behind the image of the plugin's last reply. [host]
     pub(super) fn answered_at(&self) -> Option<HostTime> {
         self.instant(&self.answered)
     }
 
-    /// Returns why a vehicle must not take off by what comes; `None` if it may.
+    /// Returns why the images do not allow a take-off; `None` if they do.
     pub(super) fn why_unfit(&mut self, now: HostTime) -> Option<String> {
         self.forget_arrivals(now);
         let rate_hz = self.arrivals.len();
@@ -109,12 +109,12 @@ impl Sight {
         while self.arrivals.pop_front_if(|(at, _)| now.seconds_since(*at) > 1.0).is_some() {}
     }
 
-    /// Returns the instant that counts of each camera's: the newest, or the oldest of those in use.
+    /// Returns the relevant time of these cameras: the newest, or the oldest of the cameras in use.
     fn instant(&self, views: &Views) -> Option<HostTime> {
         if self.used.is_empty() {
             return views.iter().flatten().max().copied();
         }
-        // None if one of them has never come.
+        // None if one of them has no image yet.
         let used: Option<Vec<HostTime>> = self.used.iter().map(|&camera| views[camera]).collect();
         used?.into_iter().min()
     }
@@ -158,23 +158,23 @@ mod tests {
     }
 
     #[test]
-    fn what_counts_is_the_pose_behind_the_last_answer() {
+    fn uses_the_pose_behind_the_last_reply() {
         let mut sight = Sight::default();
         assert_eq!(sight.answered_at(), None);
         for seq in 1..=5 {
             sight.shown(ms(seq * 30 + 20), seq, &view(0, ms(seq * 30)));
         }
-        assert_eq!(sight.answered_at(), None, "seen is what was answered");
+        assert_eq!(sight.answered_at(), None, "only images with a reply count");
         sight.answered(3);
         assert_eq!(sight.answered_at(), Some(ms(90)));
         sight.answered(2);
-        assert_eq!(sight.answered_at(), Some(ms(90)), "an old answer makes nothing older");
+        assert_eq!(sight.answered_at(), Some(ms(90)), "an old reply changes nothing");
         sight.answered(9);
         assert_eq!(sight.answered_at(), Some(ms(150)));
     }
 
     #[test]
-    fn take_off_needs_images_that_are_many_and_fresh() {
+    fn take_off_needs_frequent_and_fresh_images() {
         let unfit = |period_ms: u64, age_ms: u64| {
             let mut sight = Sight::default();
             for seq in 1..=100 {
@@ -196,7 +196,7 @@ mod tests {
     #[test]
     fn every_camera_in_use_must_be_fresh() {
         let error = using(&["left"]).unwrap_err();
-        assert_eq!(error, "[plugin] cameras: no camera here is called left; there are front, down");
+        assert_eq!(error, "[plugin] cameras: this arena has no camera left; it has front, down");
         for (names, expected) in [
             (&[][..], Some(ms(100))),
             (&["front"], Some(ms(100))),

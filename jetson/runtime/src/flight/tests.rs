@@ -1,4 +1,4 @@
-//! The flight on a virtual clock, with a vehicle that follows every command.
+//! Tests of the flight on a virtual clock, with a vehicle that follows every command.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::flight_end::{Boundary, Collision, FenceBreach, Obstacle, PluginFault};
@@ -13,10 +13,10 @@ use super::*;
 use crate::link::LinkEvent;
 use FlightPhase::{Flying, Holding, Landed, Landing, Preparing, TakingOff};
 
-/// The vehicle's own limits: slower than the arena, otherwise laxer.
+/// Limits of the vehicle: slower than the arena, otherwise less strict.
 const OWN: Limits = Limits::new(0.1, 50.0);
 
-/// What the plugin replies to an image.
+/// Reply of the plugin to an image.
 #[derive(Clone)]
 #[allow(clippy::large_enum_variant)] // Why: there is one.
 enum Replies {
@@ -31,15 +31,15 @@ struct Script {
     link: LinkView,
     p_m: DVec3,
     v_mps: DVec3,
-    /// How a hand moves it. [m/s]
+    /// Velocity of a hand that moves the vehicle. [m/s]
     hand_mps: DVec3,
     poses: bool,
-    /// Images are published, and answered so.
+    /// Whether images are published and answered with `replies`.
     images: bool,
     replies: Replies,
-    /// The next image is published before the tick, and not yet answered.
+    /// Whether the next image is published before the tick and has no reply yet.
     next_is_shown: bool,
-    /// Age of the images when they come. [s]
+    /// Age of the images on arrival. [s]
     image_age_s: f64,
     seq: u64,
     orders: Orders,
@@ -91,7 +91,7 @@ impl Script {
         }
     }
 
-    /// Ready, if a person is to start it.
+    /// Returns a script that is ready and waits for start.
     fn waiting() -> Self {
         let mut script = Self::new();
         script.flight.wait_for_start();
@@ -150,7 +150,7 @@ impl Script {
         }
     }
 
-    /// The vehicle.
+    /// Simulates the vehicle.
     fn obey(&mut self) {
         if !self.link.connected {
             return;
@@ -180,7 +180,7 @@ impl Script {
         self.p_m += self.v_mps * 0.02;
     }
 
-    /// Somebody else changes the mode.
+    /// Simulates a mode change by another party.
     fn take_over(&mut self, mode: CopterMode) {
         self.link.mode = mode as u32;
         self.link.taken = Some(mode as u32);
@@ -199,7 +199,7 @@ impl Script {
         self.notices.iter().filter_map(phase).collect()
     }
 
-    /// Lets it end and checks how.
+    /// Runs until the end and checks the outcome.
     fn check_end(&mut self, kind: OutcomeKind, reason: &str) {
         self.run(15.0);
         let outcome = self.flight.outcome().unwrap_or_else(|| panic!("{:?}", self.notices));
@@ -224,7 +224,7 @@ fn flies_from_first_contact_to_the_goal_and_lands() {
 }
 
 #[test]
-fn nothing_is_armed_before_all_are_ready() {
+fn does_not_arm_before_everything_is_ready() {
     type Spoil = fn(&mut Script);
     let checks: [(Spoil, &str); 6] = [
         (|script| script.link.connected = false, "no heartbeat"),
@@ -254,7 +254,7 @@ fn nothing_is_armed_before_all_are_ready() {
 }
 
 #[test]
-fn the_plugin_must_be_ready_and_the_arena_known() {
+fn waits_for_the_arena_and_the_plugin() {
     let mut script = Script::new();
     script.run(6.0);
     assert!(script.notices.iter().any(|notice| notice.text.contains("no answer from the server")));
@@ -265,7 +265,7 @@ fn the_plugin_must_be_ready_and_the_arena_known() {
 }
 
 #[test]
-fn ends_with_the_words_of_a_server_that_refuses() {
+fn reports_the_reason_of_a_server_that_rejects_the_runtime() {
     let mut script = Script::new();
     let why = "the server refuses: another runtime flies wasp".to_owned();
     script.flight.server_down(&why);
@@ -276,7 +276,7 @@ fn ends_with_the_words_of_a_server_that_refuses() {
 }
 
 #[test]
-fn each_event_has_its_outcome() {
+fn every_event_leads_to_its_outcome() {
     let check = |kind: EventKind, outcome| {
         let mut script = Script::flying();
         script.server(kind, "the server says so");
@@ -305,14 +305,14 @@ fn touch() -> Collision {
 }
 
 #[test]
-fn the_land_button_brakes_then_lands() {
+fn land_button_brakes_then_lands() {
     let mut script = Script::flying();
     script.server(EventKind::Land, "land");
     script.check_end(OutcomeKind::Landed, "the land button was pressed");
 }
 
 #[test]
-fn a_touch_after_land_was_ordered_lands_at_once_and_changes_no_outcome() {
+fn collision_after_land_lands_at_once_and_keeps_the_outcome() {
     let mut script = Script::flying();
     script.run(3.0);
     script.server(EventKind::Land, "land");
@@ -324,7 +324,7 @@ fn a_touch_after_land_was_ordered_lands_at_once_and_changes_no_outcome() {
 }
 
 #[test]
-fn outcome_is_the_earliest_event_though_it_arrives_later() {
+fn the_earliest_event_decides_even_if_it_arrives_late() {
     let mut script = Script::flying();
     script.run(1.0);
     let touched_at = script.now;
@@ -335,18 +335,18 @@ fn outcome_is_the_earliest_event_though_it_arrives_later() {
     let event = Event { stamp: ServerTime::ZERO, kind, text: bounded("") };
     script.flight.handle_event(script.now, &event, touched_at);
     script.check_end(OutcomeKind::Collided, "collision with an obstacle");
-    // The server receives what the runtime saw; the earlier stamp wins there as well.
+    // The server receives the runtime's reason; the earlier stamp wins there too.
     let ended = script.notices.iter().filter(|n| matches!(n.kind, EventKind::Ended(_))).count();
     assert_eq!(ended, 1);
 }
 
 #[test]
-fn a_flight_that_waits_takes_off_when_start_is_pressed_and_not_before() {
+fn takes_off_only_after_start_is_pressed() {
     let mut script = Script::waiting();
-    // Longer than it may take to get ready: waiting for a person has no end.
+    // Longer than the time limit of the preparation: waiting for a person has no timeout.
     script.run(60.0);
     assert_eq!((script.flight.phase(), script.orders.goal), (FlightPhase::Waiting, Goal::Prepare));
-    // It gets unready, and start is pressed: that start does not count when it is ready again.
+    // Start is pressed while the vehicle is not ready: it has no effect after the vehicle is ready again.
     script.link.ready_to_arm = Err("battery low".into());
     script.run(1.0);
     assert_eq!(script.flight.phase(), Preparing);
@@ -362,7 +362,7 @@ fn a_flight_that_waits_takes_off_when_start_is_pressed_and_not_before() {
 }
 
 #[test]
-fn a_flight_that_waits_ends_at_once_by_either_button() {
+fn both_buttons_end_a_waiting_flight_at_once() {
     for kind in [EventKind::Land, EventKind::EmergencyStop] {
         let mut script = Script::waiting();
         script.server(kind, "over");
@@ -371,7 +371,7 @@ fn a_flight_that_waits_ends_at_once_by_either_button() {
 }
 
 #[test]
-fn on_the_ground_only_the_stop_button_ends_it() {
+fn on_the_ground_only_the_stop_button_ends_the_flight() {
     let mut script = Script::new();
     script.server(EventKind::TimeLimit { limit_s: 30.0 }, "time");
     script.server(EventKind::Collision(touch()), "floor");
@@ -404,7 +404,7 @@ fn a_silent_plugin_holds_then_lands() {
     script.replies = Replies::Never;
     script.run(0.7);
     assert_eq!(script.flight.phase(), FlightPhase::Holding);
-    // One that comes back in time is given the vehicle back.
+    // A plugin that resumes in time controls the vehicle again.
     script.replies = Replies::With(Setpoint::Hold);
     script.run(0.5);
     assert_eq!(script.flight.phase(), FlightPhase::Flying);
@@ -413,8 +413,8 @@ fn a_silent_plugin_holds_then_lands() {
 }
 
 #[test]
-fn reports_why_no_setpoint_comes() {
-    // Also while an image is on its way to it.
+fn reports_why_there_is_no_setpoint() {
+    // Also while an image without a reply is in transit.
     for next_is_shown in [false, true] {
         let mut script = Script::flying();
         script.next_is_shown = next_is_shown;
@@ -444,16 +444,16 @@ fn takes_off_only_with_fresh_images() {
     script.image_age_s = 0.03;
     script.run(4.0);
     assert_eq!(script.flight.phase(), Flying, "fresh ones, and it takes off");
-    // In flight they are shown to be old, and it is told.
+    // In flight, old images are reported.
     script.image_age_s = 0.3;
     script.run(1.0);
-    let told = "what the plugin sees is";
+    let told = "the plugin's images are";
     assert!(script.notices.iter().any(|notice| notice.text.starts_with(told)));
     assert_eq!(script.flight.phase(), Flying);
     script.image_age_s = 1.0;
     script.run(1.0);
     assert_eq!(script.flight.phase(), Holding);
-    script.check_end(OutcomeKind::Error, "what the plugin saw was 1.0 s old");
+    script.check_end(OutcomeKind::Error, "the plugin's images were 1.0 s old");
 }
 
 #[test]
@@ -471,7 +471,7 @@ fn takes_off_only_from_the_start_box_and_at_rest() {
     assert_eq!(script.flight.phase(), Preparing);
     let outside = "the vehicle is 1.2 m outside the start box; carry it there";
     assert!(told(&script, outside), "{:?}", script.notices);
-    // Carried there, it does not start in a hand that moves.
+    // In the box it does not start while a hand moves it.
     script.p_m.x = 0.0;
     script.hand_mps = DVec3::Y;
     script.run(6.0);
@@ -483,12 +483,12 @@ fn takes_off_only_from_the_start_box_and_at_rest() {
 }
 
 #[test]
-fn a_camera_that_is_not_there_is_named() {
+fn reports_a_missing_camera_by_name() {
     let mut script = Script::new();
     script.flight.settings.cameras = vec!["left".into()];
     script.flight.handle_arena(script.now, Box::new(arena()));
     let reason = script.flight.outcome().unwrap().to_string();
-    assert!(reason.contains("no camera here is called left"), "{reason}");
+    assert!(reason.contains("this arena has no camera left"), "{reason}");
 }
 
 #[test]
@@ -503,7 +503,7 @@ fn lost_poses_hold_then_land() {
 }
 
 #[test]
-fn a_take_off_that_goes_wrong_is_landed() {
+fn lands_after_a_failed_take_off() {
     let mut script = Script::new();
     script.flight.handle_arena(script.now, Box::new(arena()));
     script.flight.plugin_ready();
@@ -520,7 +520,7 @@ fn a_lost_link_or_a_restart_ends_the_flight() {
         script.flight.handle_link(script.now, event);
         script.check_end(OutcomeKind::Error, expected);
     }
-    // Nothing comes any more at all: the flight still ends.
+    // The link stays silent: the flight still ends.
     let mut script = Script::flying();
     script.link.connected = false;
     script.flight.handle_link(script.now, LinkEvent::Lost);
@@ -529,7 +529,7 @@ fn a_lost_link_or_a_restart_ends_the_flight() {
 }
 
 #[test]
-fn hands_are_off_in_every_phase_once_the_mode_is_another() {
+fn sends_nothing_after_a_mode_change_in_any_phase() {
     let modes = [
         CopterMode::AltHold,
         CopterMode::Loiter,
@@ -573,7 +573,7 @@ fn hands_are_off_in_every_phase_once_the_mode_is_another() {
                 notice.text.contains(&told) && is_hands_off
             };
             assert!(script.notices.iter().any(is_told), "{phase:?} {mode:?}: {:?}", script.notices);
-            // Back in GUIDED by somebody's hand it is still theirs, however long.
+            // After a return to GUIDED by another party, the runtime stays passive, without a time limit.
             if mode != CopterMode::Land {
                 script.link.mode = CopterMode::Guided as u32;
                 script.run(90.0);
@@ -600,7 +600,7 @@ fn sends_nothing_after_a_pilot_takes_over() {
 }
 
 #[test]
-fn an_interrupt_lands_first_and_leaves_soon() {
+fn an_interrupt_lands_and_ends_soon() {
     let mut script = Script::flying();
     script.flight.interrupt(script.now);
     script.run(0.02);
@@ -612,7 +612,7 @@ fn an_interrupt_lands_first_and_leaves_soon() {
 }
 
 #[test]
-fn time_limits_count_from_take_off_and_the_shorter_wins() {
+fn time_limits_start_at_take_off_and_the_shorter_applies() {
     let mut script = Script::flying();
     script.flight.settings.time_limit_s = 5.0;
     script.run(1.0);
@@ -627,7 +627,7 @@ fn time_limits_count_from_take_off_and_the_shorter_wins() {
 }
 
 #[test]
-fn another_arena_ends_the_flight() {
+fn a_changed_arena_ends_the_flight() {
     let mut script = Script::flying();
     script.flight.handle_arena(script.now, Box::new(arena()));
     assert_eq!(script.flight.phase(), FlightPhase::Flying, "the same arena is welcome");
@@ -642,8 +642,8 @@ fn another_arena_ends_the_flight() {
 }
 
 #[test]
-fn the_stricter_limit_wins() {
-    // The plugin asks for 0.2 m/s, the arena allows 3, the vehicle 0.1.
+fn the_stricter_limit_applies() {
+    // The plugin requests 0.2 m/s, the arena allows 3, the vehicle 0.1.
     let mut script = Script::flying();
     script.run(1.0);
     let Some(GuidedSetpoint { motion: GuidedMotion::Velocity(v_mps), .. }) = script.orders.setpoint
@@ -664,13 +664,13 @@ impl Script {
 }
 
 #[test]
-fn a_plugin_that_is_started_again_is_waited_for_in_the_air() {
+fn holds_in_the_air_while_the_plugin_restarts() {
     let mut script = Script::flying();
     script.run(1.0);
     let replies = script.replies.clone();
     script.restart("the plugin ended with exit status 3");
     script.replies = Replies::Never;
-    // Longer than a silent plugin is given.
+    // Longer than the timeout of a silent plugin.
     script.run(6.0);
     assert_eq!(script.flight.phase(), Holding, "{:?}", script.notices);
     assert!(script.v_mps.length() < 1e-3, "it stands still: {}", script.v_mps);
@@ -685,7 +685,7 @@ fn a_plugin_that_is_started_again_is_waited_for_in_the_air() {
 }
 
 #[test]
-fn plugin_that_does_not_come_back_lands_the_vehicle() {
+fn lands_if_the_plugin_does_not_restart() {
     for replies in [Replies::Never, Replies::Without] {
         let mut script = Script::flying();
         script.restart("the plugin was killed by SIGSEGV");
@@ -700,17 +700,17 @@ fn plugin_that_does_not_come_back_lands_the_vehicle() {
 }
 
 #[test]
-fn lands_a_vehicle_that_a_former_runtime_left_in_the_air() {
+fn lands_a_vehicle_left_in_the_air_by_an_earlier_runtime() {
     let mut script = Script::new();
     (script.link.armed, script.link.mode) = (true, 4);
     script.run(0.1);
     assert_eq!((script.orders.goal, script.flight.phase()), (Goal::Land, Landing));
     assert!(script.flight.outcome().is_none(), "not before it is on the ground");
-    script.check_end(OutcomeKind::Error, "nobody to guide it");
+    script.check_end(OutcomeKind::Error, "GUIDED without a companion");
 }
 
 #[test]
-fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
+fn does_not_arm_after_the_plugin_failed_on_the_ground() {
     let mut script = Script::new();
     script.link.ready_to_arm = Err("the compass is confused".into());
     script.flight.handle_arena(script.now, Box::new(arena()));
@@ -720,11 +720,11 @@ fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
     script.restart("no model file");
     script.link.ready_to_arm = Ok(());
     script.run(3.0);
-    assert_eq!(script.orders.goal, Goal::Prepare, "nobody is armed without a plugin");
+    assert_eq!(script.orders.goal, Goal::Prepare, "does not arm without a plugin");
     script.flight.plugin_ready();
     script.run(4.0);
     assert_eq!(script.flight.phase(), Flying, "{:?}", script.notices);
-    // Once the flight is over, there is nothing to be started for.
+    // After the end of the flight, a restart is useless.
     script.flight.plugin_failed(script.now, PluginFault::ended("it is broken"));
     assert!(!script.flight.can_wait_for_plugin());
     script.restart("no");
@@ -732,7 +732,7 @@ fn plugin_that_fails_on_the_ground_ends_the_flight_before_arming() {
 }
 
 #[test]
-fn setpoint_out_of_the_fence_is_reported_once_and_not_flown() {
+fn setpoint_outside_the_fence_is_reported_once_and_not_flown() {
     let mut script = Script::new();
     script.flight.settings.limits = arena().limits;
     script.flight.handle_arena(script.now, Box::new(arena()));

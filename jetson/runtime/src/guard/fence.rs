@@ -1,5 +1,5 @@
-//! The geofence with stopping distance, by how this vehicle answers: how fast it may approach each face, the ceiling
-//! that `max_altitude_m` is, the floor, and the boxes that it must stay out of.
+//! Geofence with stopping distances, from the vehicle's response: maximum speed towards each face, the ceiling
+//! (`max_altitude_m`), the floor, and the no-fly boxes.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
@@ -7,70 +7,69 @@ use vizflyt_protocol::messages::{ArenaInfo, MAX_NO_FLY};
 
 use super::response::{Response, Stopping, largest};
 
-/// The keep-in volume, shrunk by the body and a margin, and what to keep out of.
+/// Keep-in volume, reduced by the body and a margin, and the no-fly boxes.
 #[derive(Clone, Debug)]
 pub(super) struct Fence {
     volume: Volume,
     keep_out: heapless::Vec<Volume, MAX_NO_FLY>,
     body_radius_m: f64,
-    /// Least height of the body's centre while a plugin flies. [m, world]
+    /// Minimum height of the body's centre while a plugin flies. [m, world]
     floor_m: f64,
-    /// Greatest height of the body's centre, if there is one. [m, world]
+    /// Maximum height of the body's centre, if limited. [m, world]
     ceiling_m: Option<f64>,
-    /// By which commands may change. [m/s^2]
+    /// Maximum rate of change of commands. [m/s^2]
     max_mps2: f64,
 }
 
-/// The vehicle's motion, and how it stops.
+/// Motion and response of the vehicle.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Momentum {
     /// Velocity. [m/s, world]
     pub v_mps: DVec3,
-    /// Acceleration, as far as it is known. [m/s^2, world]
+    /// Estimated acceleration. [m/s^2, world]
     pub a_mps2: DVec3,
-    /// How it answers a command.
     pub response: Response,
 }
 
-/// What the body's centre must not pass.
+/// Limit that the body's centre must not pass.
 #[derive(Clone, Copy, Debug)]
 enum Limit {
     Fence,
     Floor,
     Ceiling,
-    /// Of [`Fence::keep_out`].
+    /// Index in [`Fence::keep_out`].
     Box(usize),
 }
 
 impl Limit {
-    /// Returns what a stop shall leave of the room to it: half of the margin. [m]
+    /// Returns the distance that a stop must leave to the limit: half of the margin. [m]
     fn kept_m(self) -> f64 {
         0.5 * if matches!(self, Self::Floor) { FLOOR_MARGIN_M } else { MARGIN_M }
     }
 }
 
-/// Part of acceleration and jerk counted on for stopping before one face. Three faces at once
-/// (a corner) then need sqrt(3)/2 = 0.87 of the limit.
+/// Share of acceleration and jerk used for stopping before one face. Three faces at once (a corner) need sqrt(3)/2 =
+/// 0.87 of the limit.
 const STOPPING_SHARE: f64 = 0.5;
-/// And where it has to change more along the face than towards it, so much at least.
+/// Minimum share, if the velocity along the face must change more than the velocity towards it.
 const LEAST_SHARE: f64 = 0.1;
-/// Part of it counted on where the whole stop is flown ahead, in all directions at once.
+/// Share used if the whole stop is simulated, in all directions at once.
 const WHOLE_SHARE: f64 = 0.8;
-/// A vehicle that stands still is not moved by what numbers lose. [m]
+/// Tolerance for rounding errors, so that they do not move a vehicle at rest. [m]
 const ROUNDING_M: f64 = 1e-3;
-/// Kept free beyond the stopping distance, for localization and tracking errors: after braking hard
-/// an autopilot's integrators carry the vehicle a decimetre too far. [m]
+/// Free distance beyond the stopping distance, for localization and tracking errors: after hard braking, an autopilot's
+/// integrators carry the vehicle 0.1 m too far. [m]
 pub(super) const MARGIN_M: f64 = 0.2;
-/// Kept free under the body while a plugin flies; landing is the autopilot's. Less than the
-/// fence's: low flight is part of courses, and a touch there is a bump. [m]
+/// Free distance under the body while a plugin flies; the autopilot does the landing. Smaller than the margin of the
+/// fence, because courses contain low flight and a contact with the floor is only a bump. [m]
 const FLOOR_MARGIN_M: f64 = 0.05;
-/// Turns of keeping off boxes and fence in which a corner between them settles.
+/// Maximum iterations over boxes and fence, until corners between them are resolved.
 const SETTLING_TURNS: usize = 4;
-/// Along a curved face, the part of the distance left that one stopping path may not use up.
+/// At a curved face, share of the remaining distance that a stopping path must leave.
 const KEPT_SHARE: f64 = 0.9;
-/// Way back from beyond the margin, by how far beyond it is. [1/s]
+/// Gain from the violation of the margin to the speed back. [1/s]
 const BACK_PER_S: f64 = 2.0;
-/// Fastest way back. [m/s]
+/// Maximum speed back. [m/s]
 const BACK_MPS: f64 = 0.5;
 
 impl Fence {
@@ -85,36 +84,36 @@ impl Fence {
         }
     }
 
-    /// Whether its faces are flat and nothing in it is kept out of.
+    /// Whether all faces are flat and there are no no-fly boxes.
     pub(super) fn is_flat(&self) -> bool {
         matches!(self.volume, Volume::Cuboid { .. }) && self.keep_out.is_empty()
     }
 
-    /// Returns how far the body's surface is outside; negative inside. [m]
+    /// Returns the distance of the body's surface outside the fence; negative inside. [m]
     pub(super) fn outside_m(&self, p_m: DVec3) -> f64 {
         self.volume.signed_distance_m(p_m) + self.body_radius_m
     }
 
-    /// Returns how far the body's surface reaches into a box that it must stay out of; negative
-    /// outside of all. [m]
+    /// Returns the depth of the body's surface in a no-fly box; negative outside all boxes. [m]
     pub(super) fn inside_no_fly_m(&self, p_m: DVec3) -> f64 {
         let depth_m = |volume: &Volume| self.body_radius_m - volume.signed_distance_m(p_m);
         self.keep_out.iter().map(depth_m).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling, the floor, or into a
-    /// box. Motion along a face is left as it is, unless it takes what stopping before the face needs. [m/s, world]
+    /// Returns `v_mps` reduced so that the vehicle does not fly from `p_m` over the fence, the ceiling or the floor, or
+    /// into a box. Motion along a face is not changed, unless it uses acceleration that stopping before the face needs.
+    /// [m/s, world]
     pub(super) fn limit(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         self.leave_for_stopping(p_m, self.towards_faces(p_m, v_mps, vehicle), vehicle)
     }
 
-    /// [`Self::limit`], face by face: how fast towards each.
+    /// Part of [`Self::limit`]: limits the speed towards each face.
     fn towards_faces(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let mut v = self.within(p_m, v_mps, vehicle);
         if self.keep_out.is_empty() {
             return v;
         }
-        // What keeps one off a box may lead to another, or to the fence: some turns settle it.
+        // Moving away from a box may lead to another box or to the fence: iterate.
         for _ in 0..SETTLING_TURNS {
             let before = v;
             for volume in &self.keep_out {
@@ -126,7 +125,7 @@ impl Fence {
             }
             v = self.within(p_m, v, vehicle);
         }
-        // Where there is no way at all, less of it: the fence stays kept, and so do the boxes.
+        // If no direction is free, reduce the speed: fence and boxes are both respected.
         let share = self.keep_out.iter().fold(1.0, |share: f64, volume| {
             let (towards, most) = self.towards(volume, p_m, v, vehicle);
             let speed_mps = v.dot(towards);
@@ -135,8 +134,8 @@ impl Fence {
         v * share
     }
 
-    /// Returns the direction to a box, and the greatest speed that way: boxes are convex, so a
-    /// vehicle comes nearer by no more than it moves along the direction of the moment. [m/s]
+    /// Returns the direction to a box and the maximum speed in that direction. Boxes are convex, so the vehicle
+    /// approaches by at most its motion along the present direction. [m/s]
     fn towards(
         &self,
         volume: &Volume,
@@ -149,11 +148,11 @@ impl Fence {
         (towards, self.approach_mps(free_m, towards, v_mps, vehicle))
     }
 
-    /// Returns `v_mps` without what would carry the vehicle from `p_m` over the fence, the ceiling
-    /// or the floor. [m/s, world]
+    /// Returns `v_mps` reduced so that the vehicle does not fly from `p_m` over the fence, the ceiling or the floor.
+    /// [m/s, world]
     fn within(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         match self.volume {
-            // Each face on its own, so that the vehicle can slide along two into a corner.
+            // Each face separately, so that the vehicle can slide along two faces into a corner.
             Volume::Cuboid { center_m, half_m, rotation } => {
                 let q = rotation.conjugate() * (p_m - center_m);
                 let free_m = half_m - DVec3::splat(self.body_radius_m + MARGIN_M);
@@ -162,16 +161,16 @@ impl Fence {
                     let out = rotation * face;
                     let most = self.approach_mps(free_m[axis] - q[axis], out, v_mps, vehicle);
                     let least = -self.approach_mps(free_m[axis] + q[axis], -out, v_mps, vehicle);
-                    // A room narrower than its margins leaves no speed that suits both faces.
+                    // In a room narrower than its margins, no speed is valid for both faces.
                     v[axis] = if least > most { 0.0 } else { v[axis].clamp(least, most) };
                 }
                 let v = rotation * v;
                 let below = self.between_floor_and_ceiling(p_m, v, vehicle);
-                // Less climb changes the way towards the walls only of a room that leans.
+                // A smaller climb changes the motion towards the walls only in a tilted room.
                 let leans = (rotation * DVec3::Z).z.abs() < 1.0 - 1e-9;
                 if leans && below != v { self.shorten(p_m, below, vehicle) } else { below }
             }
-            // One face: the nearest. Then the whole stopping path, as faces may curve.
+            // One face, the nearest. Then the whole stopping path, because faces may be curved.
             volume => {
                 let outward = volume.outward_normal(p_m);
                 let free_m = -self.outside_m(p_m) - MARGIN_M;
@@ -182,8 +181,8 @@ impl Fence {
         }
     }
 
-    /// Returns `v_mps` without a climb that would not end below the ceiling, or a descent that would
-    /// not end over the floor. [m/s, world]
+    /// Returns `v_mps` with the vertical speed limited so that the vehicle stops below the ceiling and above the floor.
+    /// [m/s, world]
     fn between_floor_and_ceiling(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let approach = |free_m, out| self.approach_mps(free_m, out, v_mps, vehicle);
         let most = self.ceiling_m.map(|ceiling_m| approach(ceiling_m - MARGIN_M - p_m.z, DVec3::Z));
@@ -191,8 +190,8 @@ impl Fence {
         v_mps.with_z(v_mps.z.max(least).min(most.unwrap_or(f64::INFINITY)))
     }
 
-    /// Returns the greatest speed out to a face that is `free_m` away, of `v_mps` at most, from which the vehicle stops
-    /// before it. Negative (back) if the distance is. [m/s]
+    /// Returns the maximum speed towards a face at a distance of `free_m`, at most that of `v_mps`, from which the
+    /// vehicle stops before the face. Negative (back) if the distance is negative. [m/s]
     fn approach_mps(&self, free_m: f64, out: DVec3, v_mps: DVec3, vehicle: &Momentum) -> f64 {
         if !(free_m > 0.0) {
             return (BACK_PER_S * free_m).max(-BACK_MPS);
@@ -202,10 +201,10 @@ impl Fence {
             return 0.0;
         }
         let (flown_mps, a_mps2) = (vehicle.v_mps.dot(out), vehicle.a_mps2.dot(out));
-        // What it has to change along the face leaves less for stopping before it.
+        // Velocity changes along the face leave less acceleration for stopping before it.
         let along_mps = wanted_mps.max(flown_mps);
         let aside_mps = |v_mps: DVec3| (v_mps - vehicle.v_mps).reject_from_normalized(out).length();
-        // The next command may be to stop altogether.
+        // The next command may be a complete stop.
         let aside_mps = aside_mps(v_mps).max(aside_mps(DVec3::ZERO));
         let share = along_mps / along_mps.hypot(aside_mps).max(f64::MIN_POSITIVE);
         let share = share.clamp(LEAST_SHARE, STOPPING_SHARE);
@@ -213,23 +212,25 @@ impl Fence {
         stopping.most_mps(wanted_mps, free_m, flown_mps, a_mps2)
     }
 
-    /// Returns `v_mps` with less of all that does not lead back from the nearest limit, until the vehicle stops in time.
+    /// Returns `v_mps` with every component reduced that does not lead away from the nearest limit, until the vehicle
+    /// stops in time.
     ///
-    /// Each face is reckoned with by itself: what the vehicle has to change along it, and how it accelerates there already,
-    /// is missing for stopping before it, and a plugin may ask for more of it after the vehicle was told to stop. So the
-    /// whole stop is flown ahead, with all that the vehicle can; half of the margin is left for what is only reckoned.
-    /// [m/s, world]
+    /// [`Self::towards_faces`] treats each face separately. Velocity changes and acceleration along a face reduce the
+    /// capability to stop before it, and a plugin may request more of them after the stop command. Therefore this
+    /// function simulates the whole stop with the vehicle's full capability. Half of the margin is left for the errors
+    /// of this model. [m/s, world]
     fn leave_for_stopping(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let stopping = Stopping::new(vehicle.response, self.max_mps2, WHOLE_SHARE);
         let (flown_mps, a_mps2) = (vehicle.v_mps.length(), vehicle.a_mps2.length());
         let reach_m = stopping.bound_m(v_mps.length(), flown_mps, a_mps2);
-        // What is out of reach is not looked at again.
+        // Ignore limits that are out of reach.
         let mut near: heapless::Vec<(Limit, f64), { MAX_NO_FLY + 3 }> = heapless::Vec::new();
         let mut nearest = (f64::INFINITY, DVec3::ZERO);
         for limit in self.limits() {
             let (room_m, kept_m) = (self.room_m(limit, p_m), limit.kept_m());
             if room_m < kept_m + reach_m {
-                // Nearer than what is kept, or beyond, a stop must not lead still farther.
+                // If the vehicle is nearer than the kept distance, or beyond the limit, a stop must not increase the
+                // violation.
                 let near_m = if room_m > 0.0 { KEPT_SHARE * room_m } else { room_m };
                 let _ = near.push((limit, kept_m.min(near_m) - ROUNDING_M));
             }
@@ -251,14 +252,14 @@ impl Fence {
         back + rest * share
     }
 
-    /// Returns what there is here that the body's centre must not pass.
+    /// Returns the limits that exist in this arena.
     fn limits(&self) -> impl Iterator<Item = Limit> {
         let ceiling = self.ceiling_m.map(|_| Limit::Ceiling);
         let boxes = (0..self.keep_out.len()).map(Limit::Box);
         [Limit::Fence, Limit::Floor].into_iter().chain(ceiling).chain(boxes)
     }
 
-    /// Returns how far a limit is away from the body's centre at `p_m`; negative beyond. [m]
+    /// Returns the room left at `p_m` before a limit; negative beyond it. [m]
     fn room_m(&self, limit: Limit, p_m: DVec3) -> f64 {
         match limit {
             Limit::Fence => -self.outside_m(p_m),
@@ -278,7 +279,7 @@ impl Fence {
         }
     }
 
-    /// Scales `v_mps` down until its stopping path is inside. Nearer than the margin, the path must not come nearer still.
+    /// Scales `v_mps` until the stopping path is inside. Nearer than the margin, the path must not approach further.
     fn shorten(&self, p_m: DVec3, v_mps: DVec3, vehicle: &Momentum) -> DVec3 {
         let keep_m = (-KEPT_SHARE * self.outside_m(p_m)).clamp(0.0, MARGIN_M);
         let stopping = Stopping::new(vehicle.response, self.max_mps2, STOPPING_SHARE);

@@ -1,19 +1,18 @@
-//! The limits that the guard keeps, and whether it can keep those of an arena.
+//! Limits of the guard, and the check that the guard can enforce the limits of an arena.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::Volume;
 use vizflyt_protocol::messages::{ArenaInfo, Limits, Path, PoseAges, Setpoint};
 
-/// Where slew limit and fence disagree at a flat face, the command changes faster than the acceleration limit by at most
-/// this factor.
+/// If slew limit and fence contradict at a flat face, the acceleration limit may be exceeded by at most this factor.
 pub(super) const FENCE_EXCESS: f64 = 1.2;
 /// Standard gravity, ISO 80000-3. [m/s^2]
 pub(super) const GRAVITY_MPS2: f64 = 9.80665;
 
-/// Checks that limits and fence are such that the guard can keep them.
+/// Checks that the guard can enforce the limits and the fence.
 ///
 /// # Errors
-/// One sentence that names the setting.
+/// Returns one sentence that names the setting.
 pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
     let positive = |value: f64| value.is_finite() && value > 0.0;
     if !arena.geofence.is_valid() {
@@ -32,7 +31,7 @@ pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
         && !(ceiling_m.is_finite() && ceiling_m > arena.takeoff_height_m)
     {
         return Err(format!(
-            "limits.max_altitude_m = {ceiling_m}: the take-off alone rises to {} m; allow more",
+            "limits.max_altitude_m = {ceiling_m}: the take-off rises to {} m; allow more",
             arena.takeoff_height_m
         ));
     }
@@ -54,16 +53,16 @@ pub fn check_arena(arena: &ArenaInfo) -> Result<(), String> {
     Ok(())
 }
 
-/// Returns the acceleration that keeps both limits, of acceleration and of tilt: thrust that makes
-/// up for gravity and accelerates by `a` in the worst direction leans by asin(a / g). [m/s^2]
+/// Returns the acceleration that keeps the limits of both acceleration and tilt. Thrust that balances gravity and
+/// accelerates by `a` in the worst direction tilts the vehicle by asin(a / g). [m/s^2]
 pub(super) fn acceleration_within_tilt_mps2(limits: &Limits) -> f64 {
     let by_tilt = |tilt_deg: f64| GRAVITY_MPS2 * tilt_deg.to_radians().sin() / FENCE_EXCESS;
     let by_tilt_mps2 = limits.max_tilt_deg.map_or(f64::INFINITY, by_tilt);
     limits.max_acceleration_mps2.min(by_tilt_mps2)
 }
 
-/// Bounds every component, so that no product of two overflows to infinity. A million metres is
-/// beyond any fence, a million metres a second beyond any limit.
+/// Bounds all components, so that a product of two cannot overflow. A million metres is beyond every fence, a million
+/// metres per second beyond every limit.
 pub(super) fn bound_components(setpoint: Setpoint) -> Setpoint {
     let bound = |v: DVec3| v.clamp(DVec3::splat(-1e6), DVec3::splat(1e6));
     match setpoint {

@@ -1,18 +1,18 @@
-//! Checks and limits every setpoint before it is sent. Pure: state, `now` and the vehicle's motion in; one
-//! command out.
+//! Checks and limits each setpoint before it is sent. Sans-IO: state, `now` and the vehicle's motion in; one command
+//! out.
 //!
-//! Called at 50 to 200 Hz by [`flight`](crate::flight) while the plugin flies. In this order:
-//! 1. a landing, once begun, is never taken back;
-//! 2. deadlines: a pose older than the arena's `hold_after_s`, no setpoint for 0.5 s, or a setpoint by images older
-//!    than 0.7 s, holds; a pose older than `land_after_s`, no setpoint for 2 s, or 2 s of such images, lands;
-//! 3. the plugin's setpoint becomes a velocity in world axes (positions by a braking profile,
-//!    accelerations by integration, attitude rates by the acceleration that the attitude means,
-//!    trajectories by a moving point); numbers that are not finite were refused at [`Guard::handle_setpoint`];
-//! 4. speed limit, which falls with the age of what the plugin sees and with the lag of the vehicle, acceleration limit
-//!    (which also bounds tilt), then the geofence, the ceiling, the floor and the no-fly boxes: never faster towards a face
-//!    than the vehicle can stop before it, by how it is seen to answer.
+//! [`flight`](crate::flight) calls the guard at 50 to 200 Hz while the plugin flies. Order of the checks:
+//! 1. A landing is final once it has begun.
+//! 2. Deadlines. Hold: a pose older than the arena's `hold_after_s`, no setpoint for 0.5 s, or a setpoint computed from
+//!   images older than 0.7 s. Land: a pose older than `land_after_s`, no setpoint for 2 s, or 2 s of such images.
+//! 3. Convert the plugin's setpoint into a velocity in world axes: positions by a braking profile, accelerations by
+//!   integration, attitude rates by the acceleration that the attitude causes, trajectories by a moving point.
+//!   [`Guard::handle_setpoint`] has already rejected numbers that are not finite.
+//! 4. Speed limit, which falls with the age of the plugin's images and with the lag of the vehicle. Acceleration limit,
+//!   which also bounds the tilt. Then geofence, ceiling, floor and no-fly boxes: the speed towards a face is at most
+//!   the speed from which the vehicle can stop before it, given its measured response.
 //!
-//! Everything leaves as a velocity, so that one slew limit and one fence rule bound all motion.
+//! Every output is a velocity, so that one slew limit and one fence rule bound all motion.
 
 mod fence;
 mod limits;
@@ -39,10 +39,10 @@ pub use response::Response;
 use slip::Slip;
 use velocity::Resolved;
 
-/// The motion of the vehicle at one instant, as localization gives it.
+/// Localized motion of the vehicle at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VehicleMotion {
-    /// When this was true. [host]
+    /// Time of the measurement. [host]
     pub stamp: HostTime,
     /// Position of the body's centre. [m, world]
     pub p_world_m: DVec3,
@@ -50,14 +50,14 @@ pub struct VehicleMotion {
     pub v_world_mps: DVec3,
     /// Attitude: body to world.
     pub rotation: DQuat,
-    /// How far the position may be off, one standard deviation along the worst axis; 0 is not known. [m]
+    /// Uncertainty of the position: one standard deviation along the worst axis; 0 if unknown. [m]
     pub sigma_m: f64,
-    /// How much older it may grow than [`PoseAges`] say. [s]
+    /// Additional age that is allowed beyond [`PoseAges`]. [s]
     pub allowance_s: f64,
 }
 
 impl VehicleMotion {
-    /// Returns the motion of a localized pose whose stamp is `stamp` on this computer's clock.
+    /// Returns the motion of a localized pose with the stamp `stamp` on this computer's clock.
     pub fn of(sample: &PoseSample, stamp: HostTime) -> Self {
         Self {
             stamp,
@@ -74,7 +74,7 @@ impl VehicleMotion {
         now.seconds_since(self.stamp)
     }
 
-    /// Returns what [`PoseAges`] bound: its age beyond what its source always delays and leaves out. [s]
+    /// Returns the age that [`PoseAges`] bound: the pose's age minus the usual delay and gaps of its source. [s]
     pub fn overdue_s(&self, now: HostTime) -> f64 {
         self.age_s(now) - self.allowance_s
     }
@@ -84,12 +84,12 @@ impl VehicleMotion {
         yaw_of(self.rotation)
     }
 
-    /// Returns how far the position may be off: [`UNSURE_SIGMAS`] along the worst axis. [m]
+    /// Returns the possible position error: [`UNSURE_SIGMAS`] along the worst axis. [m]
     pub fn off_m(&self) -> f64 {
         UNSURE_SIGMAS * self.sigma_m
     }
 
-    /// Whether every number is finite and the rotation is one.
+    /// Whether all numbers are finite and the rotation is not degenerate.
     pub fn is_valid(&self) -> bool {
         self.p_world_m.is_finite()
             && self.v_world_mps.is_finite()
@@ -98,7 +98,7 @@ impl VehicleMotion {
     }
 }
 
-/// The output of the guard for one tick.
+/// Output of the guard for one tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum GuardOutput {
     /// Fly this setpoint.
@@ -107,49 +107,49 @@ pub enum GuardOutput {
     Land,
 }
 
-/// Why the vehicle is held in place.
+/// Reason for holding the vehicle in place.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HoldReason {
     /// The plugin requested it.
     Requested,
-    /// No setpoint has come for [`SETPOINT_HOLD_S`].
+    /// No setpoint has arrived for [`SETPOINT_HOLD_S`].
     NoSetpoint,
     /// The newest pose is overdue by more than [`PoseAges::hold_after_s`].
     PoseStale,
-    /// The pose may be off by more than the guard keeps from the fence: [`UNSURE_SIGMAS`].
+    /// The possible position error exceeds the margin to the fence: [`UNSURE_SIGMAS`].
     PoseUnsure,
-    /// What the plugin has answered last is older than [`SIGHT_HOLD_S`].
+    /// The image of the plugin's last reply is older than [`SIGHT_HOLD_S`].
     ImagesOld,
-    /// The plugin is being started again.
+    /// The plugin is restarting.
     Restarting,
-    /// The flight is over; it brakes before it lands.
+    /// The flight is over; the vehicle brakes before it lands.
     Ending,
 }
 
-/// Why the guard lands by itself.
+/// Reason for landing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LandReason {
     /// The plugin requested it.
     Requested,
-    /// No setpoint has come for so long. [s]
+    /// No setpoint has arrived for this long. [s]
     NoSetpoint(f64),
-    /// A plugin that was to be started again has not answered within [`RESTART_WITHIN_S`].
+    /// A restarted plugin has not replied within [`RESTART_WITHIN_S`].
     NoPlugin,
-    /// The newest pose is so old. [s]
+    /// Age of the newest pose. [s]
     PoseLost(f64),
-    /// The pose has been too unsure for as long as it may be away; how far it may be off. [m]
+    /// The pose has been too uncertain for [`PoseAges::land_after_s`]; possible position error. [m]
     PoseUnsure(f64),
-    /// What the plugin has answered last has been too old for [`SIGHT_LAND_S`]; now it is so old. [s]
+    /// The image of the plugin's last reply has been too old for [`SIGHT_LAND_S`]; its age. [s]
     ImagesOld(f64),
-    /// The body is outside the fence by so much. [m]
+    /// Distance of the body outside the fence. [m]
     OutsideFence(f64),
-    /// The body reaches into a no-fly box by so much. [m]
+    /// Depth of the body inside a no-fly box. [m]
     InNoFly(f64),
-    /// The caller of [`Guard::land`] or [`Guard::brake_and_land`] has its own reason.
+    /// Reason of the caller of [`Guard::land`] or [`Guard::brake_and_land`].
     Ordered,
 }
 
-/// The mode of the guard.
+/// Mode of the guard.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum GuardMode {
     /// Follows the plugin's setpoints, within the limits.
@@ -160,64 +160,63 @@ pub enum GuardMode {
     Landing(LandReason),
 }
 
-/// So many standard deviations of the pose must fit into what the guard keeps from the fence: hold; for `land_after_s`: land.
+/// Hold if this many standard deviations of the pose exceed the margin to the fence; land after `land_after_s`.
 pub const UNSURE_SIGMAS: f64 = 3.0;
-/// No setpoint for this long: hold. A plugin at 10 Hz may miss four images. [s]
+/// Hold without a setpoint for this long. A plugin at 10 Hz may miss four images. [s]
 pub const SETPOINT_HOLD_S: f64 = 0.5;
-/// No setpoint for this long: land. [s]
+/// Land without a setpoint for this long. [s]
 pub const SETPOINT_LAND_S: f64 = 2.0;
-/// A plugin that is started again may take so long until its first setpoint: an interpreter that
-/// loads numpy and a small model. [s]
+/// Maximum time from a plugin's restart to its first setpoint: an interpreter that loads numpy and a small model. [s]
 pub const RESTART_WITHIN_S: f64 = 10.0;
 
-/// What the plugin sees may be so old at full speed: four images of a 30 Hz camera. Beyond, the speed limit falls as
-/// the age rises, so that in this age no more way is flown. [s]
+/// Maximum age of the plugin's images at full speed: four images of a 30 Hz camera. Beyond it, the speed limit falls as
+/// the age rises, so that the distance flown within this age stays constant. [s]
 pub const SIGHT_FRESH_S: f64 = 0.15;
-/// What the plugin has answered last is older than this: hold. More than [`SETPOINT_HOLD_S`], so that a silent plugin
-/// is named as one. [s]
+/// Hold if the image of the plugin's last reply is older than this. Longer than [`SETPOINT_HOLD_S`], so that a silent
+/// plugin is reported as silent. [s]
 pub const SIGHT_HOLD_S: f64 = 0.7;
-/// And for this long: land. [s]
+/// Land after images have been too old for this long. [s]
 pub const SIGHT_LAND_S: f64 = 2.0;
 
-/// Up to this lag a vehicle is flown at the full speed limit; beyond, the limit falls as the lag rises. [s]
+/// Maximum lag at the full speed limit; beyond it, the limit falls as the lag rises. [s]
 pub const LAG_USUAL_S: f64 = 0.5;
 
-/// A plugin's commands may change by so much for any vehicle. [m/s^2]
+/// Minimum rate of change that is allowed for a plugin's commands, for every vehicle. [m/s^2]
 const LEAST_FOLLOWED_MPS2: f64 = 1.0;
-/// A share of the speed limit that is reported when images bring it down to less.
+/// Images that reduce the speed limit below this share are reported.
 const SLOWED_NOTICE: f64 = 0.8;
 /// Maximum time over which a pose is extrapolated by its velocity. [s]
 const MAX_EXTRAPOLATION_S: f64 = 0.5;
-/// A speed below which the vehicle counts as stopped. [m/s]
+/// Maximum speed of a stopped vehicle. [m/s]
 const STOPPED_MPS: f64 = 0.3;
-/// Maximum time of braking before an orderly landing. [s]
+/// Maximum braking time before an orderly landing. [s]
 const MAX_BRAKING_S: f64 = 2.0;
-/// Minimum reduction of speed by the fence that is reported. [m/s]
+/// Minimum speed reduction by the fence that is reported. [m/s]
 const FENCE_NOTICE_MPS: f64 = 0.1;
-/// Maximum time between two ticks that counts; after a stall the slew limit must not open. [s]
+/// Maximum time step of a tick; a stall must not widen the slew limit. [s]
 const MAX_TICK_S: f64 = 0.1;
 
-/// The vehicle flies slower than the plugin asks, because of old images.
+/// Reduction of the plugin's speed because of old images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Slowed {
-    /// Age of what the plugin has answered last. [s]
+    /// Age of the image of the plugin's last reply. [s]
     pub age_s: f64,
-    /// What is left of the speed limit, 0 to 1.
+    /// Remaining share of the speed limit, 0 to 1.
     pub share: f64,
 }
 
-/// The vehicle flies slower than the plugin may, because it answers late.
+/// Reduction of the speed limit because the vehicle responds late.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lagging {
-    /// How it answers.
+    /// Response of the vehicle.
     pub response: Response,
-    /// Seen in this flight; else it is what the autopilot's parameters say, or nothing is known.
+    /// Measured in this flight; otherwise taken from the autopilot's parameters, or unknown.
     pub measured: bool,
-    /// What is left of the speed limit, 0 to 1.
+    /// Remaining share of the speed limit, 0 to 1.
     pub share: f64,
 }
 
-/// The guard of one flight.
+/// Guard of one flight.
 #[derive(Clone, Debug)]
 pub struct Guard {
     rules: Rules,
@@ -227,77 +226,77 @@ pub struct Guard {
     end: End,
 }
 
-/// What holds for the whole flight.
+/// Rules for the whole flight.
 #[derive(Clone, Debug)]
 struct Rules {
     fence: Fence,
     max_speed_mps: f64,
-    /// Bounds acceleration, and by it the tilt.
+    /// Also bounds the tilt.
     max_acceleration_mps2: f64,
     /// Height of the vehicle when the plugin took over. [m, world]
     take_off_z_m: f64,
-    /// Kinds of setpoint that the course permits.
+    /// Setpoint kinds that the course allows.
     allowed: SetpointKinds,
     pose_ages: PoseAges,
 }
 
-/// How well the plugin sees, and how well the vehicle answers.
+/// Age and quality of the plugin's images and the vehicle's pose, and the vehicle's response.
 #[derive(Clone, Debug)]
 struct Sight {
-    /// The speed limit that the age of the plugin's images leaves.
+    /// Speed limit after the reductions for the age of images and the lag of the vehicle.
     speed_limit_mps: f64,
-    /// When the pose behind the image that the plugin has answered last was measured; `None` if unknown.
+    /// Time of the pose behind the image of the plugin's last reply; `None` if unknown.
     seen_at: Option<HostTime>,
-    /// Since when that image has been too old.
+    /// Time since which that image has been too old.
     blind_since: Option<HostTime>,
-    /// Since when the pose has been too uncertain.
+    /// Time since which the pose has been too uncertain.
     unsure_since: Option<HostTime>,
     slowed: Option<Slowed>,
-    /// The vehicle's response to commands.
     answers: Answers,
 }
 
-/// The plugin's newest setpoint.
+/// Newest setpoint of the plugin.
 #[derive(Clone, Debug)]
 struct Request {
     setpoint: Option<Setpoint>,
-    /// `setpoint` in the world, once the vehicle's position was known.
+    /// `setpoint` in world coordinates, resolved at its first tick.
     resolved: Resolved,
-    /// The drift added to positions where the course withholds the pose.
+    /// Drift added to positions if the course withholds the pose.
     slip: Option<Slip>,
-    /// When the setpoint came, or the plugin took over.
+    /// Time of the setpoint, or of the start of the plugin's control.
     at: HostTime,
 }
 
-/// The newest command to the autopilot.
+/// Newest command to the autopilot.
 #[derive(Clone, Debug)]
 struct Command {
-    /// The slew limit counts from it. [m/s, world]
+    /// Reference of the slew limit. [m/s, world]
     v_world_mps: DVec3,
     /// Heading to send: an angle or a rate.
     yaw: YawTarget,
-    /// The heading that [`YawTarget::Keep`] keeps, from when it was first requested. [rad]
+    /// Heading that [`YawTarget::Keep`] keeps, set at its first request. [rad]
     kept_yaw_rad: Option<f64>,
     hold_point_m: Option<DVec3>,
-    /// When it was made.
+    /// Time of the command.
     at: HostTime,
-    /// Whether the fence limited it.
+    /// Whether the fence limited the command.
     fence_stops: bool,
 }
 
-/// How the flight ends, once it does.
+/// End of the flight.
 #[derive(Clone, Debug, Default)]
 struct End {
-    /// Set when the flight is to end in order: when braking ends.
+    /// End of braking, in an orderly end.
     ending_until: Option<HostTime>,
-    /// Set while the plugin is started again: when the wait ends.
+    /// End of the wait for a restarting plugin.
     restarting_until: Option<HostTime>,
     landing: Option<LandReason>,
 }
 
 impl Guard {
-    /// Makes the guard of a flight in `arena` that takes over the vehicle at `now`, which answers as `response` says, by its
-    /// parameters, if they are known. Of `slip_seed` depends where places slip that a plugin gives without knowing the pose.
+    /// Creates the guard of a flight in `arena` that takes over the vehicle at `now`. `response` is the vehicle's
+    /// response according to its parameters, if known. `slip_seed` seeds the drift added to positions when the course
+    /// hides the pose.
     pub fn new(
         arena: &ArenaInfo,
         vehicle: &VehicleMotion,
@@ -341,11 +340,11 @@ impl Guard {
         }
     }
 
-    /// Takes a setpoint of the plugin at `now`.
+    /// Accepts a setpoint of the plugin at `now`.
     ///
     /// # Errors
-    /// Why it is refused, as for a number that is not finite; it then does not count against the
-    /// deadline.
+    /// Returns why the setpoint is rejected, for example a number that is not finite. A rejected setpoint does not
+    /// reset the deadline.
     pub fn handle_setpoint(
         &mut self,
         now: HostTime,
@@ -378,8 +377,8 @@ impl Guard {
         Ok(())
     }
 
-    /// Takes note that the plugin replied to an image at `now` without a setpoint: a trajectory that
-    /// is not over stays in force.
+    /// Records that the plugin replied to an image at `now` without a setpoint: an unfinished trajectory stays in
+    /// force.
     pub fn handle_empty_reply(&mut self, now: HostTime) {
         let is_under_way = match (&self.request.setpoint, &self.request.resolved) {
             (Some(Setpoint::Trajectory(_)), Resolved::Path(follower)) => !follower.is_over(),
@@ -391,36 +390,35 @@ impl Guard {
         }
     }
 
-    /// Lands now. Final.
+    /// Lands now. This is final.
     pub fn land(&mut self) {
         self.end.landing.get_or_insert(LandReason::Ordered);
     }
 
-    /// Holds until the plugin, being started again, sends a setpoint; lands if it does not within
-    /// [`RESTART_WITHIN_S`].
+    /// Holds until the restarting plugin sends a setpoint; lands if none arrives within [`RESTART_WITHIN_S`].
     pub fn wait_for_plugin(&mut self, now: HostTime) {
         (self.request.setpoint, self.request.at) = (None, now);
         self.request.resolved = Resolved::Nothing;
         self.end.restarting_until = Some(now.plus_seconds(RESTART_WITHIN_S));
     }
 
-    /// Brakes, then lands. Final; [`Self::land`] still cuts the braking short.
+    /// Brakes, then lands. This is final; [`Self::land`] ends the braking.
     pub fn brake_and_land(&mut self, now: HostTime) {
         self.end.ending_until.get_or_insert(now.plus_seconds(MAX_BRAKING_S));
     }
 
-    /// Takes when the pose was measured behind what the plugin has answered last: speed falls with its age. `None`
-    /// leaves it as it is.
+    /// Sets the measurement time of the pose behind the image of the plugin's last reply; the speed limit falls with
+    /// its age. `None` keeps the last value.
     pub fn see(&mut self, seen_at: Option<HostTime>) {
         self.sight.seen_at = seen_at.or(self.sight.seen_at);
     }
 
-    /// Returns how old images slow down the plugin's setpoint, if much.
+    /// Returns how much old images reduce the plugin's speed, if significantly.
     pub fn slowed(&self) -> Option<Slowed> {
         self.sight.slowed
     }
 
-    /// Returns how the vehicle answers, if that lowers the speed limit.
+    /// Returns the vehicle's response, if it lowers the speed limit.
     pub fn lagging(&self) -> Option<Lagging> {
         let (response, measured) =
             (self.sight.answers.response(), self.sight.answers.is_measured());
@@ -433,7 +431,7 @@ impl Guard {
         self.command.fence_stops
     }
 
-    /// Returns what to send at `now`, from the newest motion of the vehicle, and the mode.
+    /// Returns the command to send at `now`, and the mode, from the newest motion of the vehicle.
     pub fn tick(&mut self, now: HostTime, vehicle: &VehicleMotion) -> (GuardOutput, GuardMode) {
         let dt_s = now.seconds_since(self.command.at).clamp(0.0, MAX_TICK_S);
         self.command.at = now;
@@ -471,17 +469,18 @@ impl Guard {
             && v_target.length() > self.sight.speed_limit_mps;
         self.sight.slowed = is_slowed.then_some(Slowed { age_s: sight_age_s, share });
         let v_target = v_target.clamp_length_max(self.sight.speed_limit_mps);
-        // A turn waits for a vehicle that cannot follow it: what it has to change along a face is missing for stopping
-        // before it. To slow down, all that is allowed is asked for.
+        // Change direction only as fast as the vehicle can follow: acceleration along a face reduces the acceleration
+        // left for stopping before it. Slowing down may use the full limit.
         let followed_mps2 = response.acceleration_mps2.max(LEAST_FOLLOWED_MPS2);
         let slows = v_target.length() < self.command.v_world_mps.length();
         let asked_mps = if slows { slew_mps } else { slew_mps.min(followed_mps2 * dt_s) };
         let change = (v_target - self.command.v_world_mps).clamp_length_max(asked_mps);
         let v_slewed = self.command.v_world_mps + change;
-        // Where the vehicle is now, not when the pose was measured.
+        // Extrapolate from the measurement of the pose to the present.
         let age_s = vehicle.age_s(now).clamp(0.0, MAX_EXTRAPOLATION_S);
         let p_now = vehicle.p_world_m + vehicle.v_world_mps * age_s;
-        // The fence comes last: where it and the slew limit disagree, it wins, at flat faces within bounds.
+        // The fence comes last: if it contradicts the slew limit, the fence wins, at flat faces within
+        // [`FENCE_EXCESS`].
         let (v_mps, a_mps2) = (vehicle.v_world_mps, self.sight.answers.a_mps2());
         let momentum = Momentum { v_mps, a_mps2, response };
         let v_inside = self.within_bounds(p_now, v_slewed, &momentum, slew_mps);
@@ -493,8 +492,8 @@ impl Guard {
         (GuardOutput::Guided(GuidedSetpoint { motion, yaw: self.command.yaw }), mode)
     }
 
-    /// Returns what the fence leaves of `v_slewed` [m/s, world]. At flat faces it takes back speed by [`FENCE_EXCESS`] of
-    /// the slew limit at most, and what it takes back goes before what the plugin wants.
+    /// Returns `v_slewed` [m/s, world] reduced by the fence. At flat faces it reduces the speed by at most
+    /// [`FENCE_EXCESS`] of the slew limit, and this reduction has priority over the plugin's request.
     fn within_bounds(
         &self,
         p_m: DVec3,
@@ -574,7 +573,7 @@ impl Guard {
     }
 }
 
-/// Returns what is left of the speed limit for a vehicle that answers so, 0 to 1.
+/// Returns the remaining share of the speed limit for a vehicle with this response, 0 to 1.
 fn share_of_lag(response: Response) -> f64 {
     (LAG_USUAL_S / response.lag_s).min(1.0)
 }

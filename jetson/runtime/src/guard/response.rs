@@ -1,31 +1,31 @@
-//! How the vehicle answers a velocity command, and how far it goes on when it is told to stop.
+//! The vehicle's response to velocity commands, and its stopping distance.
 //!
-//! An autopilot does not fly a velocity at once: it closes the difference at a rate, within an acceleration and a jerk
-//! (ArduCopter: `WP_ACC` and `PSC_JERK_*`; jerk over acceleration is the rate). What the parameters say is believed until
-//! the flight contradicts it: a row of other answers is computed beside the vehicle from the commands that it was sent,
-//! and compared with how it moved.
+//! An autopilot does not reach a commanded velocity at once: it reduces the difference exponentially, with limited
+//! acceleration and jerk (ArduCopter: `WP_ACC` and `PSC_JERK_*`; the rate is jerk over acceleration). The parameters
+//! are used until the flight contradicts them: candidate responses are simulated with the same commands and compared
+//! with the vehicle's motion.
 
 use glam::DVec3;
 
-/// How a vehicle answers.
+/// Response of a vehicle to velocity commands.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Response {
     /// Time constant from a velocity command to the velocity. [s]
     pub lag_s: f64,
-    /// Greatest change of acceleration. [m/s^3]
+    /// Maximum jerk. [m/s^3]
     pub jerk_mps3: f64,
-    /// Greatest acceleration. [m/s^2]
+    /// Maximum acceleration. [m/s^2]
     pub acceleration_mps2: f64,
 }
 
 impl Response {
-    /// What is reckoned with while nothing is known: slower than ArduCopter with its own defaults.
+    /// Assumed response if it is unknown: slower than ArduCopter with its default parameters.
     pub const UNKNOWN: Self = Self { lag_s: 1.2, jerk_mps3: 5.0, acceleration_mps2: 0.6 };
-    /// Lag of attitude and motors behind what the autopilot shapes. [s]
+    /// Lag of attitude and motors behind the autopilot's shaped command. [s]
     const ATTITUDE_LAG_S: f64 = 0.12;
 
-    /// Returns the answer of an ArduCopter with these parameters: `PSC_JERK_NE` [m/s^3] and `WP_ACC` [m/s^2]. Values that
-    /// mean nothing are [`Self::UNKNOWN`].
+    /// Returns the response of an ArduCopter with these parameters: `PSC_JERK_NE` [m/s^3] and `WP_ACC` [m/s^2]. Invalid
+    /// values give [`Self::UNKNOWN`].
     pub fn of_ardupilot(jerk_mps3: f64, acceleration_mps2: f64) -> Self {
         let positive = |value: f64| value.is_finite() && value > 0.0;
         if !positive(jerk_mps3) || !positive(acceleration_mps2) {
@@ -36,47 +36,48 @@ impl Response {
         Self { lag_s, jerk_mps3, acceleration_mps2 }
     }
 
-    /// Returns an answer that does not overshoot: it closes differences at the rate of jerk over acceleration, as
-    /// ArduCopter's does.
+    /// Returns a response without overshoot: it reduces differences at the rate of jerk over acceleration, as
+    /// ArduCopter does.
     pub const fn smooth(lag_s: f64, jerk_mps3: f64) -> Self {
         Self { lag_s, jerk_mps3, acceleration_mps2: lag_s * jerk_mps3 }
     }
 }
 
-/// Slowest answer that is told apart: beyond it a vehicle does not fly by velocities. [s]
+/// Maximum lag that is distinguished; a slower vehicle cannot be flown by velocities. [s]
 const MAX_LAG_S: f64 = 2.4;
 const LEAST_JERK_MPS3: f64 = 2.0;
 const MAX_JERK_MPS3: f64 = 100.0;
-/// Answers that a flight is compared with. [s], [m/s^3]
+/// Candidate responses. [s], [m/s^3]
 const LAGS_S: [f64; 8] = [0.12, 0.2, 0.3, 0.45, 0.65, 0.9, 1.25, 1.8];
 const JERKS_MPS3: [f64; 7] = [3.0, 4.5, 6.5, 10.0, 16.0, 30.0, 80.0];
-/// What is measured lies between them: reckoned with this share of the acceleration and the jerk.
+/// The true response lies between the candidates: use this share of the measured acceleration and jerk.
 const MEASURED_SHARE: f64 = 0.7;
-/// The speed from which answers are told slow or quick. [m/s]
+/// Speed at which stopping distances are compared, to rank candidates from quick to slow. [m/s]
 const FAST_MPS: f64 = 3.0;
-/// What is seen counts for so long. [s]
+/// Time constant with which old measurements fade. [s]
 const MEMORY_S: f64 = 20.0;
-/// Error that localization alone makes. [m/s]
+/// Velocity error of localization. [m/s]
 const NOISE_MPS: f64 = 0.04;
-/// An answer is possible while its error is within so many times the best one's.
+/// A candidate is possible if its error is at most this factor times the smallest error.
 const POSSIBLE: f64 = 2.5;
-/// What must have been seen before anything is concluded: the squared difference between the quickest and the slowest
-/// answer, summed over time. [m^2/s]
+/// Evidence needed before a conclusion: the squared difference between the quickest and the slowest candidate, summed
+/// over time. [m^2/s]
 const ENOUGH: f64 = 0.15;
-/// If even the best answer misses this share of that, the vehicle did not follow the commands at all: somebody held it.
+/// If even the best candidate's error exceeds this share of the evidence, the vehicle did not follow the commands at
+/// all, for example because a person held it.
 const EXPLAINED: f64 = 0.2;
-/// From a command to the first answer: link and ticks. [s]
+/// Delay from a command to the first response: link and ticks. [s]
 const DELAY_S: f64 = 0.1;
-/// Step of the stopping path. [s]
+/// Time step of the simulated stopping path. [s]
 const STEP_S: f64 = 0.05;
-/// Turns until a command is known to a hundredth of a metre a second.
+/// Iterations until a command is exact to 0.01 m/s.
 const FALSE_POSITIONS: usize = 5;
-/// Longest stopping path: ends in any case. [s]
+/// Maximum duration of the simulated stopping path. [s]
 const LONGEST_S: f64 = 12.0;
-/// A speed that counts as stopped on it. [m/s]
+/// Maximum speed of a stopped vehicle on it. [m/s]
 const STOPPED_MPS: f64 = 0.02;
 
-/// A velocity on its way to a command.
+/// Velocity that approaches a command.
 #[derive(Clone, Copy, Debug, Default)]
 struct CommandedVelocity<V> {
     v_mps: V,
@@ -102,26 +103,26 @@ impl CommandedVelocity<f64> {
     }
 }
 
-/// One possible answer, flown beside the vehicle.
+/// Candidate response, simulated in parallel with the flight.
 #[derive(Clone, Copy, Debug)]
 struct Candidate {
     response: Response,
     motion: CommandedVelocity<DVec3>,
-    /// How far it goes on from full speed. [m]
+    /// Stopping distance from [`FAST_MPS`]. [m]
     stops_m: f64,
-    /// Squared error over time, fading. [m^2/s]
+    /// Squared error, summed over time with fading. [m^2/s]
     error: f64,
 }
 
-/// Watches how the vehicle answers.
+/// Estimates the vehicle's response.
 #[derive(Clone, Debug)]
 pub(super) struct Answers {
-    /// The first is what the parameters say.
+    /// The first is the response according to the parameters.
     candidates: Vec<Candidate>,
-    /// What has been seen, as [`ENOUGH`] counts it.
+    /// Evidence, as [`ENOUGH`] counts it.
     seen: f64,
     seen_s: f64,
-    /// By how much the vehicle is ahead of what the parameters say, towards what is commanded. [m^2/s]
+    /// Lead of the vehicle over the response of the parameters, in the direction of the command. [m^2/s]
     ahead: f64,
     max_mps2: f64,
     is_known: bool,
@@ -129,7 +130,7 @@ pub(super) struct Answers {
 }
 
 impl Answers {
-    /// Begins with what the autopilot's parameters say, for a vehicle that flies at `v_mps`.
+    /// Starts with the response according to the autopilot's parameters, for a vehicle that flies at `v_mps`.
     pub(super) fn new(parameters: Option<Response>, v_mps: DVec3, max_mps2: f64) -> Self {
         let others = LAGS_S.iter().flat_map(|&lag_s| {
             JERKS_MPS3.iter().map(move |&jerk_mps3| Response::smooth(lag_s, jerk_mps3))
@@ -147,7 +148,7 @@ impl Answers {
         Self { candidates, seen: 0.0, seen_s: 0.0, ahead: 0.0, max_mps2, is_known, in_use: 0 }
     }
 
-    /// Takes that the vehicle flew at `v_mps` after `dt_s` of a command.
+    /// Records that the vehicle flew at `v_mps` after `dt_s` of a command.
     pub(super) fn watch(&mut self, command_mps: DVec3, v_mps: DVec3, dt_s: f64) {
         if !(dt_s > 0.0) || !v_mps.is_finite() {
             return;
@@ -173,7 +174,7 @@ impl Answers {
             return 0;
         }
         let most = POSSIBLE * best + NOISE_MPS * NOISE_MPS * self.seen_s;
-        // Parameters that are too careful are kept to as well.
+        // Keep the parameters also if they are too careful.
         if self.candidates[0].error <= most || (self.is_known && self.ahead >= 0.0) {
             return 0;
         }
@@ -183,7 +184,7 @@ impl Answers {
             .map_or(0, |(index, _)| index)
     }
 
-    /// Returns the answer to reckon with.
+    /// Returns the response to calculate with.
     pub(super) fn response(&self) -> Response {
         let Response { lag_s, jerk_mps3, acceleration_mps2 } =
             self.candidates[self.in_use].response;
@@ -195,30 +196,31 @@ impl Answers {
         }
     }
 
-    /// Whether the flight has contradicted what the parameters say.
+    /// Whether the flight has contradicted the parameters.
     pub(super) fn is_measured(&self) -> bool {
         self.in_use != 0
     }
 
-    /// Returns the acceleration that it presumably has. [m/s^2, world]
+    /// Returns the estimated acceleration of the vehicle. [m/s^2, world]
     pub(super) fn a_mps2(&self) -> DVec3 {
         self.candidates[self.in_use].motion.a_mps2
     }
 }
 
-/// How a stop before one face is reckoned.
+/// Model of a stop before one face.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Stopping {
-    /// Jerk and acceleration of the vehicle are the part that counts for one face.
+    /// Its jerk is reduced to the share for one face.
     response: Response,
-    /// At which a command is taken back. [m/s^2]
+    /// Rate at which the command is reduced. [m/s^2]
     taken_back_mps2: f64,
-    /// What the vehicle brakes with at most. [m/s^2]
+    /// Maximum deceleration of the vehicle. [m/s^2]
     brakes_mps2: f64,
 }
 
 impl Stopping {
-    /// Makes the stop of a vehicle whose commands change by `max_mps2` at most, with `share` of what it can for one face.
+    /// Creates the stop of a vehicle with commands that change by at most `max_mps2`, with `share` of its capability
+    /// for one face.
     pub(super) fn new(response: Response, max_mps2: f64, share: f64) -> Self {
         let most_mps2 = max_mps2.min(response.acceleration_mps2);
         Self {
@@ -228,17 +230,17 @@ impl Stopping {
         }
     }
 
-    /// Returns how far a vehicle at `v_mps`, accelerating by `a_mps2`, still goes at most if it is sent `command_mps` now
-    /// and less from the next tick on. Along one axis. [m]
+    /// Returns the maximum distance that a vehicle at `v_mps`, accelerating by `a_mps2`, still covers if it receives
+    /// `command_mps` now and less from the next tick on. Along one axis. [m]
     pub(super) fn reach_m(&self, command_mps: f64, v_mps: f64, a_mps2: f64) -> f64 {
-        // That it brakes already is not counted on: how hard is only reckoned.
+        // Ignore a present deceleration: it is only an estimate.
         let mut motion = CommandedVelocity { v_mps, a_mps2: a_mps2.max(0.0) };
         let (mut way_m, mut most_m) = (0.0, 0.0_f64);
         let mut t_s = 0.0;
         while t_s < LONGEST_S {
             let less_mps = self.taken_back_mps2 * (t_s - DELAY_S).max(0.0);
             let command_mps = command_mps.signum() * (command_mps.abs() - less_mps).max(0.0);
-            // The greater of the two speeds of a step: never too short.
+            // Use the greater speed of the step, so that the distance is never too short.
             let before_mps = motion.v_mps;
             motion.advance(command_mps, self.response, self.brakes_mps2, STEP_S);
             way_m += before_mps.max(motion.v_mps) * STEP_S;
@@ -252,7 +254,7 @@ impl Stopping {
         most_m
     }
 
-    /// Returns a way that [`Self::reach_m`] never exceeds, without computing it. [m]
+    /// Returns an upper bound of [`Self::reach_m`] without the simulation. [m]
     pub(super) fn bound_m(&self, command_mps: f64, v_mps: f64, a_mps2: f64) -> f64 {
         let Response { lag_s, jerk_mps3, .. } = self.response;
         let builds_s = (self.brakes_mps2 + a_mps2.abs()) / jerk_mps3;
@@ -261,8 +263,8 @@ impl Stopping {
         speed_mps * (DELAY_S + 2.0 * STEP_S + builds_s + brakes_s + 2.0 * lag_s)
     }
 
-    /// Returns the greatest command up to `wanted_mps` from which the vehicle stops within `free_m`; 0 if none does. Along
-    /// one axis. [m/s]
+    /// Returns the greatest command up to `wanted_mps` from which the vehicle stops within `free_m`; 0 if there is
+    /// none. Along one axis. [m/s]
     pub(super) fn most_mps(&self, wanted_mps: f64, free_m: f64, v_mps: f64, a_mps2: f64) -> f64 {
         if self.bound_m(wanted_mps, v_mps, a_mps2) <= free_m {
             return wanted_mps;
@@ -275,7 +277,7 @@ impl Stopping {
         if good.1 >= 0.0 {
             return 0.0;
         }
-        // The reach is nearly straight over the command: false position, from the good side (Illinois).
+        // The distance is nearly linear in the command: false position, from the good side (Illinois).
         for _ in 0..FALSE_POSITIONS {
             let middle = good.0 + (bad.0 - good.0) * good.1 / (good.1 - bad.1);
             let over = over_m(middle);
@@ -290,7 +292,7 @@ impl Stopping {
         good.0
     }
 
-    /// Whether a vehicle on a straight or curved way stops while `is_inside` holds, as [`Self::reach_m`], in space.
+    /// Whether a vehicle on a straight or curved path stops while `is_inside` holds; [`Self::reach_m`] in space.
     pub(super) fn stays(
         &self,
         command_mps: DVec3,
@@ -318,7 +320,7 @@ impl Stopping {
     }
 }
 
-/// Returns the largest of 0 to `most` that is good, where everything below a good one is good; 0 if none is.
+/// Returns the largest good value from 0 to `most`, if all values below a good one are good; 0 if none is good.
 pub(super) fn largest(most: f64, is_good: impl Fn(f64) -> bool) -> f64 {
     if is_good(most) {
         return most;

@@ -1,27 +1,28 @@
-//! How places that a plugin gave from where it was slip away under it, where the course withholds the pose.
+//! Drift of positions that a plugin gives relative to the vehicle, if the course withholds the pose.
 //!
-//! The guard knows the true pose, a vehicle in such a course does not: it would fly a metre forward by what its own
-//! cameras and IMU say, and such odometry is off by about a hundredth of the way. So that nobody flies better blind than
-//! by looking, places slip by [`SHARE`] of the way flown, to a side that is another in each flight and turns on the way.
+//! The guard knows the true pose, but a vehicle in such a course does not: it would fly a metre forward by cameras and
+//! IMU, and such odometry is off by about 1 % of the distance. So that flying blind is not better than using images,
+//! positions drift by [`SHARE`] of the distance flown. The direction depends on the seed of the flight and turns along
+//! the way.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::wrap_pi;
 use vizflyt_protocol::random;
 
-/// Share of the way flown.
+/// Share of the distance flown.
 const SHARE: f64 = 0.01;
-/// The side turns once in so much of the way. [m]
+/// Distance in which the direction turns to the next random angle. [m]
 const TURN_M: f64 = 3.0;
 
-/// The slip of the place in force.
+/// Drift of the position in force.
 #[derive(Clone, Debug)]
 pub(super) struct Slip {
-    /// Another in each flight.
+    /// Different for each flight.
     seed: u64,
-    /// Since the flight began. [m]
+    /// Distance flown since the flight began. [m]
     way_m: f64,
     last_m: Option<DVec3>,
-    /// Since the place was given. [m, world]
+    /// Drift since the position was given. [m, world]
     slip_m: DVec3,
 }
 
@@ -30,7 +31,7 @@ impl Slip {
         Self { seed, way_m: 0.0, last_m: None, slip_m: DVec3::ZERO }
     }
 
-    /// Takes note that the vehicle is at `p_world_m`.
+    /// Records that the vehicle is at `p_world_m`.
     pub(super) fn advance(&mut self, p_world_m: DVec3) {
         let Some(last_m) = self.last_m.replace(p_world_m) else { return };
         let step_m = (p_world_m - last_m).length();
@@ -38,17 +39,17 @@ impl Slip {
         self.slip_m += self.side() * (SHARE * step_m);
     }
 
-    /// A new place was given: it is where it is.
+    /// Resets the drift, for a new position.
     pub(super) fn restart(&mut self) {
         self.slip_m = DVec3::ZERO;
     }
 
-    /// Returns by how much the place in force has slipped. [m, world]
+    /// Returns the drift of the position in force. [m, world]
     pub(super) fn slip_m(&self) -> DVec3 {
         self.slip_m
     }
 
-    /// Returns where to places slip now: level, as floor and barometer keep the height.
+    /// Returns the present direction of drift: horizontal, because floor and barometer give the height.
     fn side(&self) -> DVec3 {
         let turns = self.way_m / TURN_M;
         let (from, to) = (self.angle_rad(turns.floor()), self.angle_rad(turns.floor() + 1.0));
@@ -56,7 +57,7 @@ impl Slip {
         DVec3::new(angle_rad.cos(), angle_rad.sin(), 0.0)
     }
 
-    /// Returns the angle of this number, from 0 to a whole turn.
+    /// Returns the random angle with this number, from 0 to a whole turn.
     fn angle_rad(&self, number: f64) -> f64 {
         random::nth(self.seed, number as u64) as f64 / u64::MAX as f64 * std::f64::consts::TAU
     }
@@ -75,16 +76,16 @@ mod tests {
     }
 
     #[test]
-    fn places_slip_by_a_hundredth_of_the_way_to_a_side_that_nobody_knows() {
+    fn positions_drift_by_one_percent_in_a_random_direction() {
         let slips: Vec<DVec3> = (0..40).map(|seed| after(seed, 2.0)).collect();
         for slip_m in &slips {
             assert!((0.002..=0.0201).contains(&slip_m.length()) && slip_m.z == 0.0, "{slip_m}");
         }
         let mean_m = slips.iter().sum::<DVec3>() / slips.len() as f64;
-        assert!(mean_m.length() < 0.008, "no side is likelier: {mean_m}");
+        assert!(mean_m.length() < 0.008, "the direction is not uniform: {mean_m}");
         assert_eq!(after(7, 2.0), after(7, 2.0));
         let mut still = Slip::new(7);
         (0..100).for_each(|_| still.advance(DVec3::Z));
-        assert_eq!(still.slip_m(), DVec3::ZERO, "who stands does not slip");
+        assert_eq!(still.slip_m(), DVec3::ZERO, "no drift at rest");
     }
 }

@@ -10,7 +10,7 @@ use super::velocity::MAX_YAW_RATE_RADPS;
 use super::*;
 
 const TICK_S: f64 = 0.02;
-/// A vehicle that answers as [`Vehicle`] does.
+/// Response of a [`Vehicle`].
 const QUICK: Option<Response> = Some(Response::smooth(0.2, 80.0));
 
 fn arena(geofence: Volume, max_speed_mps: f64, max_acceleration_mps2: f64) -> ArenaInfo {
@@ -26,21 +26,21 @@ fn room() -> Volume {
     Volume::aabb(DVec3::new(-5.0, -3.0, 0.0), DVec3::new(5.0, 3.0, 4.0))
 }
 
-/// A vehicle that follows velocity commands: delay, first-order lag, bounded acceleration and jerk.
+/// Vehicle that follows velocity commands with delay, first-order lag, limited acceleration and jerk.
 struct Vehicle {
     response: Response,
     p_m: DVec3,
     v_mps: DVec3,
     yaw_rad: f64,
     max_acceleration_mps2: f64,
-    /// What it did in the last tick. [m/s^2]
+    /// Acceleration in the last tick. [m/s^2]
     a_mps2: DVec3,
     delayed: std::collections::VecDeque<DVec3>,
 }
 
-/// Ticks from command to the vehicle's first answer.
+/// Ticks from a command to the vehicle's first response.
 const DELAY_TICKS: usize = 2;
-/// A small quadrotor whose autopilot shapes nothing.
+/// Small quadrotor with an autopilot that does not shape commands.
 const UNSHAPED: Response = Response::smooth(0.12, f64::INFINITY);
 
 impl Vehicle {
@@ -63,7 +63,7 @@ impl Vehicle {
         self.a_mps2 = a;
     }
 
-    /// Angle of its thrust from upright.
+    /// Angle of the thrust from vertical.
     fn tilt_deg(&self) -> f64 {
         (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).angle_between(DVec3::Z).to_degrees()
     }
@@ -141,7 +141,7 @@ fn path() -> impl Strategy<Value = Path> {
     ]
 }
 
-/// Random flights: as many as `VIZFLYT_GUARD_CASES` says, 10,000 in `tests/run`.
+/// Number of random flights: `VIZFLYT_GUARD_CASES`, 10,000 in `tests/run`.
 fn cases() -> u32 {
     std::env::var("VIZFLYT_GUARD_CASES").ok().and_then(|n| n.parse().ok()).unwrap_or(5_000)
 }
@@ -163,7 +163,7 @@ fn volume() -> impl Strategy<Value = Volume> {
     ]
 }
 
-/// Boxes in the room, not where the vehicle starts.
+/// Boxes in the room, away from the vehicle's start.
 fn no_fly() -> impl Strategy<Value = Vec<Volume>> {
     let corner = (-5.0..5.0f64, -3.0..3.0f64, -1.0..4.0f64);
     let side = (0.05..2.0f64, 0.05..2.0f64, 0.05..3.0f64);
@@ -182,7 +182,7 @@ fn no_fly() -> impl Strategy<Value = Vec<Volume>> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: cases(), ..ProptestConfig::default() })]
 
-    /// Whatever a plugin asks, the vehicle stays inside, the limits hold and no NaN gets through.
+    /// For all setpoints of a plugin, the vehicle stays inside, the limits hold, and no NaN is sent.
     #[test]
     fn stays_inside_and_within_limits_for_any_setpoints(
         geofence in volume(),
@@ -197,7 +197,7 @@ proptest! {
         let mut arena = arena(geofence, max_speed_mps, max_acceleration_mps2);
         (arena.limits.max_tilt_deg, arena.limits.max_altitude_m) = (max_tilt_deg, max_altitude_m);
         (arena.floor_z_m, arena.no_fly) = (floor_z_m, no_fly.iter().copied().collect());
-        // It could do more than it may.
+        // The vehicle could accelerate more than the limits allow.
         let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 3.0 * max_acceleration_mps2);
         let mut guard = Guard::new(&arena, &vehicle.motion(time(0)), QUICK, time(0), 7);
         let mut v_before = DVec3::ZERO;
@@ -209,7 +209,7 @@ proptest! {
                 // The pose is 20 ms old, as over a network.
                 let (output, mode) = guard.tick(time(tick), &vehicle.motion(time(tick - 1)));
                 let GuardOutput::Guided(guided) = output else {
-                    // Two seconds of NaN are two seconds without a setpoint.
+                    // Two seconds of NaN count as two seconds without a setpoint.
                     let silent = matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(_)));
                     prop_assert!(silent, "{mode:?}");
                     return Ok(());
@@ -224,8 +224,8 @@ proptest! {
                 prop_assert!(turns, "{guided:?}");
                 prop_assert!(v.length() <= max_speed_mps + 1e-9);
                 let change_mps2 = (v - v_before).length() / TICK_S;
-                // Where slew limit and fence disagree the fence wins: at flat faces by a little,
-                // at curved ones by as much as it takes.
+                // If slew limit and fence contradict, the fence wins: at flat faces within FENCE_EXCESS, at curved
+                // faces without a bound.
                 let flat = matches!(geofence, Volume::Cuboid { .. }) && no_fly.is_empty();
                 let most_mps2 = FENCE_EXCESS * acceleration_within_tilt_mps2(&arena.limits);
                 prop_assert!(!flat || change_mps2 <= most_mps2 + 1e-9, "{change_mps2}");
@@ -245,7 +245,7 @@ proptest! {
                 prop_assert!(!climbs, "at {}", vehicle.p_m);
             }
         }
-        // Holding is reachable from anywhere, and it stops.
+        // Hold is possible from every state, and it stops the vehicle.
         for _ in 0..300 {
             tick += 1;
             guard.handle_setpoint(time(tick), Setpoint::Hold).unwrap();
@@ -255,7 +255,7 @@ proptest! {
             vehicle.fly(v);
         }
         prop_assert!(vehicle.v_mps.length() < 0.1, "{}", vehicle.v_mps);
-        // So is landing.
+        // Landing is also possible from every state.
         guard.handle_setpoint(time(tick), Setpoint::Land).unwrap();
         let (output, _) = guard.tick(time(tick + 1), &vehicle.motion(time(tick + 1)));
         prop_assert_eq!(output, GuardOutput::Land);
@@ -264,19 +264,19 @@ proptest! {
 
 /// Lags and jerks of vehicles.
 fn response() -> impl Strategy<Value = Response> {
-    // Most jerks near the small ones, which carry furthest.
+    // Most jerks are small: with them the vehicle needs the longest distance to stop.
     (0.2..1.0f64, (3f64.ln()..80f64.ln()).prop_map(f64::exp))
         .prop_map(|(lag_s, jerk_mps3)| Response::smooth(lag_s, jerk_mps3))
 }
 
-/// What the guard is told of a vehicle.
+/// Response that the guard receives as the vehicle's parameters.
 #[derive(Clone, Copy, Debug)]
 enum Told {
-    /// What is true.
+    /// The true response.
     Truth,
-    /// Nothing.
+    /// No response.
     Nothing,
-    /// That it answers as one set up by `hardware/airframe`.
+    /// Response of a vehicle configured with `hardware/airframe`.
     Wrong,
 }
 
@@ -294,7 +294,7 @@ impl Told {
     }
 }
 
-/// A localization that is late by some ticks.
+/// Localization with a latency of some ticks.
 struct Late(std::collections::VecDeque<VehicleMotion>);
 
 impl Late {
@@ -302,7 +302,7 @@ impl Late {
         Self((1..ticks).map(|_| vehicle.motion(time(0))).collect())
     }
 
-    /// Returns the newest pose at a tick; the vehicle is where it was at the end of the one before.
+    /// Returns the newest pose at a tick: the state at the end of the tick before, delayed.
     fn motion(&mut self, tick: usize, vehicle: &Vehicle) -> VehicleMotion {
         self.0.push_back(vehicle.motion(time(tick - 1)));
         self.0.pop_front().unwrap()
@@ -317,8 +317,8 @@ fn delay() -> impl Strategy<Value = usize> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: cases() / 5, ..ProptestConfig::default() })]
 
-    /// At 3 m/s into each face, through a long room: the body never leaves the fence, however late the vehicle answers. If
-    /// the parameters lie, it is found out on the way.
+    /// At 3 m/s into each face, through a long room: the body never leaves the fence, even if the vehicle responds
+    /// late. Wrong parameters are detected during the flight.
     #[test]
     fn a_late_vehicle_stops_before_each_face(
         truth in response(), told in told(), face in 0usize..6, aside in -1.0..1.0f64, delay in delay(),
@@ -343,12 +343,12 @@ proptest! {
             nearest_m = nearest_m.min(inside_m);
             prop_assert!(inside_m >= 0.0, "{inside_m} m inside, {:?}", guard.sight.answers.response());
         }
-        // And it gets there.
+        // The vehicle also reaches the face.
         let near_m = if matches!(told, Told::Truth) { 0.5 } else { 1.0 };
         prop_assert!(nearest_m < near_m, "{nearest_m} m from it, at {fastest_mps} m/s at most");
     }
 
-    /// Late vehicles anywhere, with random setpoints.
+    /// Late vehicles with random setpoints.
     #[test]
     fn late_vehicles_stay_inside_for_any_setpoints(
         geofence in volume(),
@@ -388,7 +388,7 @@ proptest! {
     }
 }
 
-/// What the parameters say is believed while the flight agrees; a vehicle that answers later is found out, and told.
+/// The parameters are used while the flight agrees with them; a later response is detected and reported.
 #[test]
 fn a_lag_is_measured_and_lowers_the_speed_limit() {
     let fly = |truth: Response, told: Option<Response>| {
@@ -406,14 +406,14 @@ fn a_lag_is_measured_and_lowers_the_speed_limit() {
     };
     let airframe = Response::of_ardupilot(20.0, 5.0);
     let late = Response::smooth(0.9, 5.0);
-    // As the parameters say: nothing is lowered.
+    // The parameters are right: no reduction.
     let guard = fly(airframe, Some(airframe));
     assert!(!guard.sight.answers.is_measured() && guard.lagging().is_none());
-    // They lie.
+    // The parameters are wrong.
     let lagging = fly(late, Some(airframe)).lagging().expect("it answers late");
     assert!(lagging.measured && (0.8..1.6).contains(&lagging.response.lag_s), "{lagging:?}");
     assert!((0.3..0.65).contains(&lagging.share), "{lagging:?}");
-    // Nothing is known, and it is quick: the limit is lifted.
+    // Unknown parameters and a quick vehicle: the reduction ends.
     let guard = fly(airframe, None);
     assert!(
         guard.sight.answers.is_measured() && guard.lagging().is_none(),
@@ -422,7 +422,7 @@ fn a_lag_is_measured_and_lowers_the_speed_limit() {
     );
     let lagging = fly(late, None).lagging().expect("it answers late");
     assert!(lagging.response.lag_s >= 0.8, "{lagging:?}");
-    // Somebody holds it: that says nothing of how it answers.
+    // A held vehicle gives no information about its response.
     let arena = arena(room(), 3.0, 4.0);
     let mut held = Guard::new(&arena, &at_rest(0), QUICK, time(0), 7);
     for tick in 1..500 {
@@ -448,7 +448,7 @@ fn velocity(v_mps: DVec3) -> Setpoint {
 fn output_velocity(output: GuardOutput) -> DVec3 {
     match output {
         GuardOutput::Guided(GuidedSetpoint { motion: GuidedMotion::Velocity(v), .. }) => v,
-        other => panic!("{other:?} is no velocity"),
+        other => panic!("{other:?} is not a velocity"),
     }
 }
 
@@ -462,13 +462,13 @@ fn silence_holds_then_lands() {
     assert_eq!(mode(&mut guard, 27), GuardMode::Holding(HoldReason::NoSetpoint));
     assert_eq!(mode(&mut guard, 101), GuardMode::Holding(HoldReason::NoSetpoint), "2 s");
     assert!(matches!(mode(&mut guard, 102), GuardMode::Landing(LandReason::NoSetpoint(_))));
-    // Latched: a plugin that comes back is not obeyed any more.
+    // Final: setpoints of a plugin that resumes are ignored.
     guard.handle_setpoint(time(103), velocity(DVec3::X)).unwrap();
     assert_eq!(guard.tick(time(103), &at_rest(103)).0, GuardOutput::Land);
 }
 
 #[test]
-fn a_plugin_that_never_answers_is_landed() {
+fn lands_if_the_plugin_never_replies() {
     let mut guard = guard();
     let (output, mode) = guard.tick(time(101), &at_rest(101));
     assert!(matches!(mode, GuardMode::Landing(LandReason::NoSetpoint(s)) if s > 2.0));
@@ -476,7 +476,7 @@ fn a_plugin_that_never_answers_is_landed() {
 }
 
 #[test]
-fn numbers_that_are_not_finite_do_not_count() {
+fn rejects_numbers_that_are_not_finite() {
     let mut guard = guard();
     for tick in 1..=27 {
         assert!(
@@ -497,7 +497,7 @@ fn numbers_that_are_not_finite_do_not_count() {
 #[test]
 fn old_images_slow_then_hold_then_land() {
     let mut guard = guard();
-    // It asks for more than the limit all the time, at 50 Hz; the images get old, a second each second.
+    // The plugin always requests more than the limit, at 50 Hz, while the age of the images rises.
     let seen_at = time(0);
     let (mut flown_mps, mut modes) = (Vec::new(), Vec::new());
     for tick in 1..=140 {
@@ -516,7 +516,7 @@ fn old_images_slow_then_hold_then_land() {
             }
             GuardMode::Holding(HoldReason::ImagesOld) => assert!(age_s > SIGHT_HOLD_S),
             GuardMode::Landing(LandReason::ImagesOld(old_s)) => {
-                // It is latched.
+                // The reason is latched.
                 assert!(old_s <= age_s && old_s > SIGHT_HOLD_S + SIGHT_LAND_S, "{old_s}");
             }
             other => panic!("{other:?}"),
@@ -527,21 +527,21 @@ fn old_images_slow_then_hold_then_land() {
     assert_eq!(modes.len(), 3, "each once, and in this order");
     assert!(flown_mps.len() > 30 && *flown_mps.last().unwrap() < 0.25 * 3.0);
 
-    // One that is shown fresh images again goes on.
+    // With fresh images the vehicle follows again.
     let mut guard = self::guard();
     for tick in 1..=100 {
         guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
         guard.see(Some(if tick > 60 { time(tick) } else { time(0) }));
         let (_, mode) = guard.tick(time(tick), &at_rest(tick));
         let holds = mode == GuardMode::Holding(HoldReason::ImagesOld);
-        // At tick 35 it is 0.7 s, to the last bit.
+        // At tick 35 the age is 0.7 s up to rounding.
         assert!(tick == 35 || holds == (36..=60).contains(&tick), "{tick} {mode:?}");
     }
 }
 
 #[test]
 fn an_unsure_pose_holds_then_lands() {
-    // 3 x 0.06 m fits into the 0.2 m before the fence, 3 x 0.07 m does not.
+    // 3 x 0.06 m fits into the margin of 0.2 m, 3 x 0.07 m does not.
     let unsure = |tick, sigma_m| VehicleMotion { sigma_m, ..at_rest(tick) };
     let mut guard = guard();
     for tick in 1..=60 {
@@ -551,7 +551,7 @@ fn an_unsure_pose_holds_then_lands() {
         let holds = mode == GuardMode::Holding(HoldReason::PoseUnsure);
         assert!(holds == (11..=30).contains(&tick), "{tick} {mode:?}");
     }
-    // A step of the clock more than the half a second that a pose may be away.
+    // At most a few ticks later than `land_after_s`.
     let lands = (61..200).find(|&tick| {
         guard.handle_setpoint(time(tick), velocity(DVec3::X)).unwrap();
         guard.tick(time(tick), &unsure(tick, 0.5)).0 == GuardOutput::Land
@@ -578,9 +578,9 @@ fn a_stale_pose_holds_then_lands() {
     }
 }
 
-/// What its source always delays and leaves out is no reason to hold, and no more.
+/// The usual delay and gaps of a source delay hold and land by exactly that time.
 #[test]
-fn a_pose_may_be_as_late_as_its_source_is() {
+fn allows_the_usual_latency_of_a_pose_source() {
     let PoseAges { hold_after_s, land_after_s } = arena(room(), 3.0, 4.0).pose_ages;
     for allowance_s in [0.0, 0.1, 0.3] {
         let mut guard = guard();
@@ -598,7 +598,7 @@ fn a_pose_may_be_as_late_as_its_source_is() {
 }
 
 #[test]
-fn outside_the_fence_it_lands() {
+fn lands_outside_the_fence() {
     let mut guard = guard();
     guard.handle_setpoint(time(1), velocity(DVec3::X)).unwrap();
     let out = VehicleMotion { p_world_m: DVec3::new(4.95, 0.0, 2.0), ..at_rest(1) };
@@ -609,7 +609,7 @@ fn outside_the_fence_it_lands() {
 }
 
 #[test]
-fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
+fn lands_inside_a_no_fly_box_and_slides_around_it() {
     let mut arena = arena(room(), 3.0, 4.0);
     let pillar = Volume::aabb(DVec3::new(1.0, -0.5, 0.0), DVec3::new(1.5, 0.4, 4.0));
     arena.no_fly.push(pillar).unwrap();
@@ -621,7 +621,7 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
         matches!(mode, GuardMode::Landing(LandReason::InNoFly(m)) if (m - 0.07).abs() < 1e-9),
         "{mode:?}"
     );
-    // Straight at it: it stops before it. Past its edge: it goes round.
+    // Straight towards the box: stops before it. Past its edge: slides around it.
     let mut guard = Guard::new(&arena, &at_rest(0), QUICK, time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
     let mut fly = |v_mps, ticks: std::ops::Range<usize>| {
@@ -639,8 +639,8 @@ fn inside_a_no_fly_box_it_lands_and_round_it_it_slides() {
 }
 
 #[test]
-fn a_plugin_does_not_fly_into_the_floor() {
-    // The fence reaches below it, as every arena's does: vehicles land there.
+fn stops_above_the_floor() {
+    // The fence reaches below the floor, as in every arena, because vehicles land there.
     let deep = Volume::aabb(DVec3::new(-5.0, -3.0, -0.5), DVec3::new(5.0, 3.0, 4.0));
     let mut guard = Guard::new(&arena(deep, 3.0, 4.0), &at_rest(0), QUICK, time(0), 7);
     let mut vehicle = Vehicle::new(DVec3::Z * 2.0, 4.0);
@@ -673,7 +673,7 @@ fn heading_axes_turn_with_the_nose() {
 }
 
 #[test]
-fn keep_keeps_the_heading_of_the_moment() {
+fn keep_holds_the_current_heading() {
     let mut guard = guard();
     let yaw_after = |guard: &mut Guard, tick, yaw, yaw_rad| {
         guard.handle_setpoint(time(tick), Setpoint::velocity(DVec3::X, yaw)).unwrap();
@@ -742,7 +742,7 @@ fn an_orderly_end_brakes_before_it_lands() {
     assert!(output_velocity(output).length() < 0.1);
     assert_eq!(guard.tick(time(3), &moving(3, 0.2)).0, GuardOutput::Land);
 
-    // A vehicle that does not stop is landed all the same.
+    // A vehicle that does not stop is also landed.
     let mut other = self::guard();
     other.brake_and_land(time(2));
     assert_ne!(other.tick(time(101), &moving(101, 2.0)).0, GuardOutput::Land);
@@ -750,7 +750,7 @@ fn an_orderly_end_brakes_before_it_lands() {
 }
 
 #[test]
-fn an_offset_counts_from_where_it_was_taken() {
+fn an_offset_starts_at_the_vehicles_position() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(1.0, -1.0, 2.0), 4.0);
     let offset = |axes| Setpoint::Offset { d_m: DVec3::X * 0.5, axes, yaw: YawTarget::Keep };
@@ -764,9 +764,9 @@ fn an_offset_counts_from_where_it_was_taken() {
     assert!((vehicle.p_m - from_m - ahead * 0.5).length() < 0.02, "{}", vehicle.p_m);
 }
 
-/// Flies a trajectory to its end, asked for once and then kept by answers without a setpoint.
+/// Flies a trajectory to its end: one setpoint, then replies without a setpoint.
 #[test]
-fn a_trajectory_is_flown_while_the_plugin_answers() {
+fn flies_a_trajectory_while_the_plugin_replies() {
     let corners = [DVec3::new(2.0, 0.0, 2.0), DVec3::new(2.0, 2.0, 2.0), DVec3::new(0.0, 0.0, 1.0)];
     let points = corners.map(|p_m| Waypoint { p_m, speed_mps: 1.5 });
     let path = Path::Waypoints(points.into_iter().collect());
@@ -788,12 +788,12 @@ fn a_trajectory_is_flown_while_the_plugin_answers() {
             *nearest_m = nearest_m.min((vehicle.p_m - corner_m).length());
         }
     };
-    // Over: the plugin says nothing new, and the usual deadline holds.
+    // After the end: the plugin sends nothing new, and the usual deadline applies.
     assert_eq!(end, GuardMode::Holding(HoldReason::NoSetpoint));
     assert!(nearest_m.iter().all(|&m| m < 0.25), "{nearest_m:?}");
     assert!((vehicle.p_m - corners[2]).length() < 0.15, "{}", vehicle.p_m);
 
-    // A plugin that stops answering is not followed through.
+    // If the plugin stops replying, the trajectory is not continued.
     let mut silent = self::guard();
     let path = Path::Waypoints(points.into_iter().collect());
     let again = Setpoint::Trajectory(Trajectory { path, ..Trajectory::default() });
@@ -815,7 +815,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
     let refused = InvalidSetpoint::NotAllowed { asked: SetpointKind::AttitudeRate, allowed };
     assert_eq!(forbidden.handle_setpoint(time(1), rates(0.0, 1.0)), Err(refused));
 
-    // Nose down for 0.2 s at 1 rad/s, then level rates: it accelerates ahead by g tan(0.2).
+    // Nose down for 0.2 s at 1 rad/s, then zero rates: accelerates forward by g tan(0.2).
     let mut guard = guard();
     let mut v = DVec3::ZERO;
     for tick in 1..=40 {
@@ -834,7 +834,7 @@ fn attitude_rates_tilt_and_accelerate_only_where_the_course_allows() {
 }
 
 #[test]
-fn only_what_the_course_allows_is_flown() {
+fn rejects_setpoints_that_the_course_does_not_allow() {
     let mut course = arena(room(), 3.0, 4.0);
     course.setpoints = [SetpointKind::Position].into_iter().collect();
     let mut guard = Guard::new(&course, &at_rest(0), QUICK, time(0), 7);
@@ -844,14 +844,14 @@ fn only_what_the_course_allows_is_flown() {
         guard.handle_setpoint(time(2), Setpoint::velocity(DVec3::X, YawTarget::Keep)).unwrap_err();
     let text = "this course does not allow velocity; it allows position";
     assert_eq!(refused.to_string(), text);
-    // It does not count against the deadline either: what was asked before stays in force.
+    // A rejected setpoint does not reset the deadline: the setpoint before it stays in force.
     for always in [Setpoint::Hold, Setpoint::TakeOff, Setpoint::Land] {
         assert_eq!(guard.handle_setpoint(time(3), always), Ok(()));
     }
 }
 
 #[test]
-fn without_the_pose_places_count_from_the_vehicle_and_slip() {
+fn positions_drift_if_the_pose_is_withheld() {
     let mut course = arena(room(), 3.0, 4.0);
     (course.ground_truth, course.setpoints) = (false, SetpointKinds::BY_OWN_SENSES);
     let fly = |seed| {
@@ -860,7 +860,7 @@ fn without_the_pose_places_count_from_the_vehicle_and_slip() {
         let d_m = DVec3::X * 2.0;
         let ahead = Setpoint::Offset { d_m, axes: Axes::Heading, yaw: YawTarget::Keep };
         for tick in 1..600 {
-            // Given once: what comes anew counts from where the vehicle is then.
+            // Sent once, because a new offset would start at the vehicle's new position.
             if tick == 1 {
                 guard.handle_setpoint(time(tick), ahead.clone()).unwrap();
             }
@@ -884,7 +884,7 @@ fn without_the_pose_places_count_from_the_vehicle_and_slip() {
 }
 
 #[test]
-fn take_off_goes_back_to_the_height_of_the_beginning() {
+fn take_off_returns_to_the_initial_height() {
     let mut guard = guard();
     let mut vehicle = Vehicle::new(DVec3::new(1.0, 1.0, 0.5), 4.0);
     for tick in 1..600 {
@@ -906,7 +906,7 @@ fn landing_is_final() {
 }
 
 #[test]
-fn arenas_the_guard_cannot_keep_are_refused() {
+fn rejects_arenas_that_the_guard_cannot_enforce() {
     assert_eq!(check_arena(&arena(room(), 3.0, 4.0)), Ok(()));
     assert!(check_arena(&arena(room(), f64::NAN, 4.0)).unwrap_err().contains("limits"));
     assert!(check_arena(&arena(room(), 3.0, 0.0)).unwrap_err().contains("limits"));

@@ -1,6 +1,6 @@
-//! The velocity that a setpoint amounts to, before the limits: positions by a braking profile,
-//! accelerations by integration, attitude rates by the acceleration of the attitude, trajectories by a
-//! moving point. And the heading to send with it.
+//! Converts a setpoint into a velocity before the limits: positions by a braking profile, accelerations by integration,
+//! attitude rates by the acceleration of the attitude, trajectories by a moving point. Also the heading to send with
+//! it.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{wrap_pi, yaw_of};
@@ -11,33 +11,32 @@ use super::slip::Slip;
 use super::{Guard, HoldReason, STOPPED_MPS, VehicleMotion};
 use crate::trajectory::{Follower, Start};
 
-/// Maximum rate of turn that is passed on: a racing turn of 180 degrees a second. ArduCopter's default
-/// limit is 202 (`ATC_RATE_Y_MAX`, `ATC_SLEW_YAW`). [rad/s]
+/// Maximum yaw rate that is passed on: a racing turn of 180 degrees a second. ArduCopter's default limit is 202
+/// (`ATC_RATE_Y_MAX`, `ATC_SLEW_YAW`). [rad/s]
 pub(super) const MAX_YAW_RATE_RADPS: f64 = std::f64::consts::PI;
-/// Gain from distance to speed when flying to a point. Slower than ArduCopter's own position
-/// loop (`PSC_NE_POS_P` = 1), so that the two do not fight. [1/s]
+/// Gain from distance to speed when flying to a point. Lower than that of ArduCopter's position loop (`PSC_NE_POS_P` =
+/// 1), so that the two loops do not oscillate. [1/s]
 const POSITION_GAIN_PER_S: f64 = 0.8;
 /// Speed at which a held vehicle returns to its point. [m/s]
 const RETURN_MPS: f64 = 0.5;
 /// Maximum magnitude of attitude rates: two turns a second. [rad/s]
 const MAX_RATE_RADPS: f64 = 4.0 * std::f64::consts::PI;
-/// Maximum tilt that attitude rates lead to: a little past it the thrust that carries the vehicle
-/// is twice its weight. [rad]
+/// Maximum tilt from attitude rates: slightly beyond it, the thrust that carries the vehicle is twice its weight. [rad]
 const MAX_TILT_RAD: f64 = 1.0;
 /// Maximum ratio of thrust to weight; small quadrotors have 2 to 5.
 const MAX_THRUST: f64 = 4.0;
 
-/// A setpoint that counts from where the vehicle was when it was taken, or from the one before.
+/// Setpoint resolved relative to the vehicle's motion at its first tick.
 #[derive(Clone, Debug, Default)]
 pub(super) enum Resolved {
-    /// Not yet, or nothing to resolve.
+    /// Not resolved yet, or nothing to resolve.
     #[default]
     Nothing,
     /// A position to fly to. [m, world]
     Point(DVec3),
     /// A path being followed.
     Path(Box<Follower>),
-    /// The attitude that rates have led to: body to world.
+    /// Attitude after integrating the rates: body to world.
     Attitude(DQuat),
 }
 
@@ -46,7 +45,7 @@ impl Guard {
     pub(super) fn hold_velocity(&mut self, vehicle: &VehicleMotion, reason: HoldReason) -> DVec3 {
         self.set_heading(vehicle, YawTarget::Keep);
         if reason == HoldReason::PoseStale {
-            // Blind: zero velocity is held by the autopilot's own estimate.
+            // The pose is stale: the autopilot holds zero velocity by its estimate.
             self.command.hold_point_m = None;
             return DVec3::ZERO;
         }
@@ -63,8 +62,7 @@ impl Guard {
         }
     }
 
-    /// Returns the velocity of the plugin's setpoint, before the limits, and sets
-    /// the heading. [m/s, world]
+    /// Returns the velocity of the plugin's setpoint before the limits, and sets the heading. [m/s, world]
     pub(super) fn setpoint_velocity(&mut self, vehicle: &VehicleMotion, dt_s: f64) -> DVec3 {
         let in_world = |v: DVec3, axes: Axes| match axes {
             Axes::World => v,
@@ -104,8 +102,7 @@ impl Guard {
         v_target
     }
 
-    /// Returns the point that the setpoint in force was resolved to; `p_m` if this is its first
-    /// tick. [m, world]
+    /// Returns the resolved point of the setpoint in force; `p_m` at its first tick. [m, world]
     fn resolved_point(&mut self, p_m: DVec3) -> DVec3 {
         if let Resolved::Point(resolved_m) = self.request.resolved {
             return resolved_m;
@@ -114,18 +111,18 @@ impl Guard {
         p_m
     }
 
-    /// Returns by how much the place in force has slipped. [m, world]
+    /// Returns the drift of the position in force. [m, world]
     fn slip_m(&self) -> DVec3 {
         self.request.slip.as_ref().map_or(DVec3::ZERO, Slip::slip_m)
     }
 
-    /// Returns the velocity that an acceleration of `a_mps2` leads to. [m/s, world]
+    /// Returns the velocity after an acceleration of `a_mps2` for `dt_s`. [m/s, world]
     fn velocity_by_acceleration(&self, a_mps2: DVec3, dt_s: f64) -> DVec3 {
         self.command.v_world_mps + a_mps2.clamp_length_max(self.rules.max_acceleration_mps2) * dt_s
     }
 
-    /// Rotates the resolved attitude by the rates, at most [`MAX_TILT_RAD`] from level; returns
-    /// the velocity that it and the thrust lead to, and its heading. [m/s, world]
+    /// Rotates the resolved attitude by the rates, at most [`MAX_TILT_RAD`] from level. Returns the velocity that
+    /// results from attitude and thrust, and the heading. [m/s, world]
     fn velocity_by_rates(
         &mut self,
         vehicle: &VehicleMotion,
@@ -167,8 +164,8 @@ impl Guard {
         (v_mps, if is_over { YawTarget::Keep } else { reference.yaw })
     }
 
-    /// Sets the heading to send; it is never left open, as ArduCopter would then turn the nose
-    /// into the direction of travel.
+    /// Sets the heading to send. It is always set, because ArduCopter would otherwise turn the nose into the direction
+    /// of travel.
     fn set_heading(&mut self, vehicle: &VehicleMotion, yaw: YawTarget) {
         let kept_yaw_rad = self.command.kept_yaw_rad.take();
         self.command.yaw = match yaw {

@@ -1,6 +1,6 @@
-//! What to send next: the command that the goal needs, and what is due every second.
+//! Next message to send: the command that the goal needs, and the messages due every second.
 
-// Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
+// Why: SET_GPS_GLOBAL_ORIGIN is formally superseded (2025-04), but every ArduCopter accepts it.
 #![allow(deprecated)]
 
 use glam::DVec3;
@@ -22,21 +22,21 @@ use super::params::Request;
 use super::rates::RateAction;
 use super::{FenceEvent, Goal, Link, LinkEvent, Rising, Target};
 
-/// Any position serves indoors: it only ties the local frame to the globe. ArduCopter's own
-/// test field. [1e-7 degrees, 1e-7 degrees, mm]
+/// Origin of the local frame on the globe. Indoors, any position works: ArduCopter's test field. [1e-7 degrees, 1e-7
+/// degrees, mm]
 const ORIGIN: (i32, i32, i32) = (-353_632_621, 1_491_652_374, 584_000);
-/// PX4 enters OFFBOARD only if setpoints have come at more than 2 Hz for a second: sent at 20. [s]
+/// Period of setpoints during take-off: 20 Hz. PX4 enters OFFBOARD only after a second of setpoints at more than 2 Hz.
+/// [s]
 const RISE_PERIOD_S: f64 = 0.05;
-/// Streamed for this long before the mode is asked for. [s]
+/// Duration of the stream before the mode change is requested. [s]
 const RISE_LEAD_S: f64 = 1.2;
-/// Our name is announced again this often while somebody else commands the vehicle. [s]
+/// Period of announcing our name while another companion commands the vehicle. [s]
 const ANNOUNCE_S: f64 = 5.0;
-/// Pre-arm texts are requested this often while checks fail; ArduCopter sends them by itself
-/// every 30 s. [s]
+/// Period of requests for pre-arm texts while checks fail; without requests, ArduCopter sends them every 30 s. [s]
 const PREARM_S: f64 = 5.0;
 
 impl Link {
-    /// Sends the command that the goal needs next, or repeats the one under way.
+    /// Sends the command that the goal needs next, or repeats the command in progress.
     pub(super) fn advance(&mut self, now: HostTime) {
         let Some(target) = self.autopilot else { return };
         if let CommandOutcome::GivenUp { command, why } = self.commands.handle_timeout(now) {
@@ -68,7 +68,7 @@ impl Link {
             Goal::TakeOff(_) if !guided => Some(Command::Mode(CopterMode::Guided)),
             Goal::TakeOff(_) if !self.state.armed => Some(Command::Arm),
             Goal::TakeOff(height_m) if !self.took_off => Some(Command::TakeOff(height_m)),
-            // By command first, by mode next, in turn until one of them works.
+            // Alternate between command and mode until one of them works.
             Goal::Land if self.state.armed && !landing => Some(if self.commands.is_odd_try() {
                 Command::Mode(CopterMode::Land)
             } else {
@@ -78,7 +78,7 @@ impl Link {
         }
     }
 
-    /// Streams the point to rise to; returns the command that is needed besides.
+    /// Streams the take-off setpoint; returns the command that is needed in addition.
     fn rise(&mut self, now: HostTime, target: Target, height_m: f32) -> Option<Command> {
         if !self.position_known {
             return self.chores.front().copied();
@@ -151,16 +151,16 @@ impl Link {
         }
     }
 
-    /// Offers the fence's polygons. Not to a vehicle that flies: what it flies within is not to change.
+    /// Offers the fence polygons, but only on the ground: the fence of a flying vehicle must not change.
     fn advance_fence(&mut self, now: HostTime, target: Target) {
         if !self.dialect.keeps_polygons() {
             if self.fence.give_up() {
-                let why = "it has no place on the globe when it flies by external navigation";
+                let why = "it has no global position when it flies by external navigation";
                 self.events.push_back(LinkEvent::Fence(FenceEvent::Rejected(why.to_owned())));
             }
             return;
         }
-        // Parameters first: a serial link carries one conversation at a time.
+        // Parameters first: a serial link has capacity for one conversation at a time.
         if self.state.armed || self.params.is_talking() {
             return;
         }
@@ -215,7 +215,7 @@ impl Link {
 
     fn check_rates(&mut self, now: HostTime) {
         let (chores, events) = (&mut self.chores, &mut self.events);
-        // A queue of chores is asked for already.
+        // A non-empty queue already requests the streams.
         let may_ask = chores.is_empty();
         self.rates.check(now, |action| match action {
             RateAction::Request((id, period_us)) if may_ask => {
@@ -226,7 +226,7 @@ impl Link {
         });
     }
 
-    /// Compares external navigation's latency with the autopilot's setting, once, on the ground.
+    /// Compares the latency of external navigation with the autopilot's setting, once, on the ground.
     fn report_delay(&mut self, now: HostTime) {
         if self.delay_reported || self.state.armed || self.params.is_busy() {
             return;
@@ -239,7 +239,7 @@ impl Link {
         }
     }
 
-    /// Announces our name to others on the vehicle: once, and again while there are some.
+    /// Announces our name to other companions on the vehicle: once, and periodically while there are others.
     fn announce(&mut self, now: HostTime) {
         let due = match self.announced_at {
             None => true,
@@ -267,7 +267,7 @@ impl Link {
         text
     }
 
-    /// Whether a text is an echo of our own announcement.
+    /// Whether a text is an echo of our announcement.
     pub(super) fn is_own_name(&self, text: &str) -> bool {
         !self.settings.name.is_empty() && text == self.own_name()
     }
@@ -292,7 +292,7 @@ impl Link {
 
     pub(super) fn send_heartbeat(&mut self, now: HostTime) {
         let heartbeat = HEARTBEAT_DATA {
-            // Unused by companions: distinguishes two runtimes.
+            // Companions do not use this field; we use it to distinguish two runtimes.
             custom_mode: self.companions.own(),
             mavtype: MavType::MAV_TYPE_ONBOARD_CONTROLLER,
             autopilot: MavAutopilot::MAV_AUTOPILOT_INVALID,
@@ -303,7 +303,7 @@ impl Link {
         self.send(now, &MavMessage::HEARTBEAT(heartbeat));
     }
 
-    /// Returns the message without target and confirmation.
+    /// Returns the message of a command, without target and confirmation.
     fn message(&self, command: Command) -> COMMAND_LONG_DATA {
         let mut message = COMMAND_LONG_DATA { command: command.mavlink(), ..Default::default() };
         match command {

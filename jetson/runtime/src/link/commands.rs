@@ -1,11 +1,11 @@
-//! One command at a time: sent, repeated with a growing confirmation count until acknowledged,
-//! tried again after a refusal, given up in the end.
+//! Sends one command at a time: repeats it with a growing confirmation count until it is acknowledged, retries it after
+//! a rejection, and finally gives up.
 
 use vizflyt_protocol::mavlink::dialect::{MavCmd, MavResult};
 use vizflyt_protocol::mavlink::{CopterMode, command_name, result_name};
 use vizflyt_protocol::time::HostTime;
 
-/// Whether a retry cannot succeed.
+/// Whether a retry is useless.
 pub(super) fn is_final(result: MavResult) -> bool {
     matches!(result, MavResult::MAV_RESULT_UNSUPPORTED)
 }
@@ -18,9 +18,9 @@ pub(super) enum Command {
     /// Height above the ground. [m]
     TakeOff(f32),
     Land,
-    /// Message id and its period. [us]
+    /// Id of a message and its period. [us]
     Interval(u32, f32),
-    /// A message once, by its id.
+    /// Id of a message to request once.
     Message(u32),
 }
 
@@ -29,7 +29,7 @@ impl Command {
         command_name(self.mavlink())
     }
 
-    /// Whether the flight goes on without it.
+    /// Whether the flight continues without it.
     pub(super) fn is_chore(self) -> bool {
         matches!(self, Self::Interval(..) | Self::Message(_))
     }
@@ -46,14 +46,14 @@ impl Command {
     }
 }
 
-/// How often to retry.
+/// Retry policy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Patience {
     Bounded,
     Endless,
 }
 
-/// What an acknowledgement or the passing of time led to.
+/// Result of an acknowledgement or a timeout.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum CommandOutcome {
     Pending,
@@ -61,17 +61,17 @@ pub(super) enum CommandOutcome {
     GivenUp { command: Command, why: String },
 }
 
-/// No acknowledgement for this long: send again. ArduCopter answers within 20 ms; a Wi-Fi bridge
-/// may add 100. [s]
+/// Timeout of an acknowledgement, after which the command is sent again. ArduCopter replies within 20 ms; a Wi-Fi
+/// bridge adds up to 100. [s]
 const REPEAT_S: f64 = 0.4;
-/// Unanswered this many times: given up. 2 s.
+/// Maximum number of transmissions without a reply: 2 s.
 const REPEATS: u8 = 5;
-/// Refused: try again after this long. [s]
+/// Delay from a rejection to the next attempt. [s]
 const RETRY_S: f64 = 1.0;
-/// Refused this many times: given up. Pre-arm checks may still settle for some seconds.
+/// Maximum number of rejections. Pre-arm checks may need some seconds to pass.
 const REFUSALS: u8 = 8;
 
-/// The command under way.
+/// Command in progress.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Commands {
     pending: Option<Pending>,
@@ -83,24 +83,24 @@ pub(super) struct Commands {
 struct Pending {
     command: Command,
     patience: Patience,
-    /// Counts transmissions of one attempt, from 0.
+    /// Transmissions of one attempt, from 0.
     confirmation: u8,
     refusals: u8,
     last_result: Option<MavResult>,
     due_at: HostTime,
-    /// Whether `due_at` is for an acknowledgement (else for the next attempt).
+    /// Whether `due_at` is the timeout of an acknowledgement; otherwise it is the time of the next attempt.
     waits: bool,
-    /// Given up already: reported once, not sent again until the goal changes.
+    /// Given up: reported once, not sent again until the goal changes.
     dead: bool,
 }
 
 impl Commands {
-    /// Forgets the command under way.
+    /// Drops the command in progress.
     pub(super) fn abandon(&mut self) {
         *self = Self::default();
     }
 
-    /// Whether the next attempt is the second, fourth, ...
+    /// Whether the number of commands started is odd.
     pub(super) fn is_odd_try(&self) -> bool {
         self.tries % 2 == 1
     }
@@ -109,7 +109,7 @@ impl Commands {
         self.pending.as_ref().filter(|pending| !pending.dead).map(|pending| pending.due_at)
     }
 
-    /// Starts or continues `command`. Returns the confirmation count if it is to be sent now.
+    /// Starts or continues `command`. Returns the confirmation count if the command must be sent now.
     pub(super) fn start(
         &mut self,
         now: HostTime,
@@ -130,7 +130,7 @@ impl Commands {
                 pending.due_at = now.plus_seconds(REPEAT_S);
                 Some(pending.confirmation)
             }
-            // An endless one alternates between two commands: each gets its time.
+            // Endless commands alternate between two commands: let each reach its timeout.
             Some(pending) if patience == Patience::Endless && now < pending.due_at => None,
             _ => {
                 self.tries += 1;
@@ -202,7 +202,7 @@ impl Commands {
             None => format!("not answered ({REPEATS} times)"),
         };
         if command.is_chore() {
-            // Not critical: the next one may go out at once.
+            // Not critical: the next command may be sent at once.
             self.pending = None;
         }
         CommandOutcome::GivenUp { command, why }

@@ -1,26 +1,26 @@
-//! Whether somebody else commands this vehicle. Two companions that steer one vehicle fight: the
-//! second is refused, by its name where it has announced one.
+//! Detects other companions that command this vehicle. Two companions that command one vehicle work against each other:
+//! the second is rejected, with the name that the other has announced.
 //!
-//! A ground station with our system id is no second companion, but hides that we are gone: the autopilot's failsafe
+//! A ground station with our system id is not a second companion, but it hides our absence: the autopilot's failsafe
 //! counts its heartbeats as ours.
 //!
-//! Signs of another one: heartbeats of a companion computer that are not an echo of ours (a number in
-//! their unused `custom_mode` differs), and replies of the autopilot to requests that we did not send.
+//! Signs of another companion: heartbeats of a companion computer that are not an echo of ours (a number in their
+//! unused `custom_mode` differs), and replies of the autopilot to requests that we did not send.
 
 use vizflyt_protocol::mavlink::dialect::{HEARTBEAT_DATA, MavType};
 use vizflyt_protocol::time::HostTime;
 
 use super::identity::{COMPONENT_ID, SYSTEM_ID};
 
-/// What a companion announces itself with, before its name.
+/// Prefix of the announced name.
 pub(super) const ANNOUNCES: &str = "companion ";
-/// Silent for this long: gone. [s]
+/// Timeout of another companion. [s]
 const GONE_AFTER_S: f64 = 5.0;
-/// Signs needed: one may be an answer to a former run of ours.
+/// Signs needed: one may be a reply to an earlier run of ours.
 const SIGNS: u32 = 3;
-/// Heartbeats of a station that make one: a single one may be left over in a bridge.
+/// Heartbeats needed to detect a ground station: a single one may be left over in a bridge.
 const BEATS: u32 = 2;
-/// Maximum number of others remembered.
+/// Maximum number of other companions stored.
 const MAX_OTHERS: usize = 8;
 /// MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4.
 const COMPANIONS: std::ops::RangeInclusive<u8> = 191..=194;
@@ -33,28 +33,28 @@ struct Other {
     received_at: HostTime,
 }
 
-/// The other companions on the vehicle.
+/// Other companions on the vehicle.
 #[derive(Clone, Debug)]
 pub(super) struct Companions {
-    /// Distinguishes our heartbeats from those of another that has our ids.
+    /// Distinguishes our heartbeats from those of another companion with our ids.
     own: u32,
     others: Vec<Other>,
-    /// A ground station with our system id: its component, its heartbeats so far, and when the last came.
+    /// Ground station with our system id: component, number of heartbeats, time of the last one.
     station: Option<(u8, u32, HostTime)>,
 }
 
 impl Companions {
-    /// Makes one; `own` differs from runtime to runtime.
+    /// Creates an empty list; `own` differs between runtimes.
     pub(super) fn new(own: u32) -> Self {
         Self { own, others: Vec::new(), station: None }
     }
 
-    /// Returns what goes into our heartbeats' `custom_mode`.
+    /// Returns the `custom_mode` of our heartbeats.
     pub(super) fn own(&self) -> u32 {
         self.own
     }
 
-    /// Takes a heartbeat that is not of the autopilot.
+    /// Handles a heartbeat that is not from the autopilot.
     pub(super) fn heartbeat(&mut self, now: HostTime, from: (u8, u8), heartbeat: &HEARTBEAT_DATA) {
         let echo = from == (SYSTEM_ID, COMPONENT_ID) && heartbeat.custom_mode == self.own;
         let companion = heartbeat.mavtype == MavType::MAV_TYPE_ONBOARD_CONTROLLER
@@ -68,20 +68,20 @@ impl Companions {
         }
     }
 
-    /// Returns the component of a ground station that has our system id, if one is there.
+    /// Returns the component of a ground station with our system id, if present.
     pub(super) fn station(&self, now: HostTime) -> Option<u8> {
         let (component, beats, at) = self.station?;
         (beats >= BEATS && now.seconds_since(at) < GONE_AFTER_S).then_some(component)
     }
 
-    /// Takes an answer of the autopilot that names `to` and that we did not ask for.
+    /// Handles an unrequested reply of the autopilot that is addressed to `to`.
     pub(super) fn answer(&mut self, now: HostTime, to: (u8, u8)) {
         if COMPANIONS.contains(&to.1) {
             self.sign(now, to);
         }
     }
 
-    /// Takes a text of somebody who is neither the autopilot nor we.
+    /// Handles a text that is neither from the autopilot nor from us.
     pub(super) fn text(&mut self, now: HostTime, from: (u8, u8), text: &str) {
         if let Some(name) = text.strip_prefix(ANNOUNCES)
             && COMPANIONS.contains(&from.1)
@@ -103,7 +103,7 @@ impl Companions {
         }
     }
 
-    /// Returns who else commands the vehicle, for a message.
+    /// Returns a description of another companion, if present.
     pub(super) fn other(&self, now: HostTime) -> Option<String> {
         let here = |other: &&Other| {
             other.signs >= SIGNS && now.seconds_since(other.received_at) < GONE_AFTER_S
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn another_is_named_an_echo_and_a_ground_station_are_not() {
+    fn detects_another_companion_but_not_an_echo_or_a_ground_station() {
         let computer = MavType::MAV_TYPE_ONBOARD_CONTROLLER;
         let check = |from: (u8, u8), heartbeat: HEARTBEAT_DATA, expected: Option<&str>| {
             let mut companions = Companions::new(77);
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_station_with_our_system_id_is_known_as_long_as_it_is_there() {
+    fn detects_a_ground_station_with_our_system_id() {
         let now = HostTime::from_ns(1_000_000_000);
         let station = beat(0, MavType::MAV_TYPE_GCS);
         let mut companions = Companions::new(77);
@@ -169,7 +169,7 @@ mod tests {
         assert_eq!(companions.station(later), None);
         companions.heartbeat(later, (255, 190), &station);
         assert_eq!(companions.station(later), None, "it counts from the start");
-        // Our own, by whatever way it comes back.
+        // Echo of our own heartbeats.
         let mut companions = Companions::new(77);
         for _ in 0..3 {
             companions.heartbeat(now, (255, 191), &beat(77, MavType::MAV_TYPE_ONBOARD_CONTROLLER));
@@ -186,7 +186,7 @@ mod tests {
         }
         let expected = "\"wasp-jetson\" (system 255, component 191)";
         assert_eq!(companions.other(now).as_deref(), Some(expected));
-        companions.text(now, (1, 1), "companion of nobody");
+        companions.text(now, (1, 1), "companion of no id");
         assert_eq!(companions.other(now).as_deref(), Some(expected));
     }
 }

@@ -1,5 +1,5 @@
-//! What differs between autopilots: ArduCopter in GUIDED, PX4 in OFFBOARD. One trait, so that the
-//! link reads the same for both; modes are ArduCopter's numbers everywhere outside.
+//! Differences between autopilots: ArduCopter in GUIDED, PX4 in OFFBOARD. One trait, so that the link has the same code
+//! for both. Outside this module, modes are ArduCopter's numbers.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -10,21 +10,20 @@ use vizflyt_protocol::mavlink::dialect::{MavAutopilot, MavParamType};
 use super::params::Param;
 use crate::guard::Response;
 
-/// A message to be streamed: its id and how often. [us]
+/// Message to stream: id and period. [us]
 pub(super) type Interval = (u32, f32);
 
-/// How an autopilot is made to rise.
+/// Take-off procedure of an autopilot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Rise {
-    /// By MAV_CMD_NAV_TAKEOFF, once armed.
+    /// MAV_CMD_NAV_TAKEOFF after arming.
     ByCommand,
-    /// By a setpoint above the ground, streamed before the mode may be entered.
+    /// A setpoint above the ground, streamed before the mode change.
     BySetpoint,
 }
 
-/// An autopilot's ways.
+/// Properties of an autopilot.
 pub(super) trait Dialect: Debug + Send + Sync {
-    /// Its name.
     fn name(&self) -> &'static str;
     /// Name of the mode in which it follows setpoints.
     fn follow(&self) -> &'static str;
@@ -32,21 +31,21 @@ pub(super) trait Dialect: Debug + Send + Sync {
     fn mode(&self, custom_mode: u32) -> u32;
     /// Returns parameters 2 and 3 of MAV_CMD_DO_SET_MODE.
     fn mode_parameters(&self, mode: CopterMode) -> (f32, f32);
-    /// How it rises.
+    /// Returns the take-off procedure.
     fn rise(&self) -> Rise;
-    /// Whether it needs SET_GPS_GLOBAL_ORIGIN before it has a position.
+    /// Whether the autopilot needs SET_GPS_GLOBAL_ORIGIN before it has a position.
     fn needs_origin(&self) -> bool;
-    /// Whether it keeps polygons as a fence of its own when it flies by external navigation.
+    /// Whether the autopilot enforces fence polygons when it flies by external navigation.
     fn keeps_polygons(&self) -> bool;
-    /// What to do if its estimator has no position.
+    /// Advice if the estimator has no position.
     fn navigation_advice(&self) -> &'static str;
     /// Name of the parameter for external navigation's latency in milliseconds.
     fn delay_parameter(&self) -> &'static str;
-    /// Returns how the vehicle answers velocities, by its parameters; `None` if they are not there.
+    /// Returns the vehicle's response to velocities according to its parameters; `None` if they are missing.
     fn response(&self, known: &BTreeMap<String, Param>) -> Option<Response>;
-    /// Parameters that flight safety depends on, read at every connection.
+    /// Parameters relevant for flight safety, read at every connection.
     fn watched(&self) -> &'static [&'static str];
-    /// What it is asked to stream.
+    /// Requested message streams.
     fn intervals(&self) -> &'static [Interval];
     /// Returns a parameter's value from the wire.
     fn value_from_wire(&self, value: f32, kind: MavParamType) -> f64;
@@ -54,7 +53,7 @@ pub(super) trait Dialect: Debug + Send + Sync {
     fn value_to_wire(&self, value: f64, kind: MavParamType) -> f32;
 }
 
-/// Returns the ways of an autopilot; `None` for one that we do not know.
+/// Returns the dialect of an autopilot; `None` if it is not supported.
 pub(super) fn of(autopilot: MavAutopilot) -> Option<&'static dyn Dialect> {
     match autopilot {
         MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA => Some(&ArduCopter),
@@ -104,7 +103,7 @@ impl Dialect for ArduCopter {
         "VISO_DELAY_MS"
     }
 
-    /// Their names and units changed with 4.7.
+    /// Names and units changed with ArduCopter 4.7.
     fn response(&self, known: &BTreeMap<String, Param>) -> Option<Response> {
         let value = |name: &str| known.get(name).map(|param| param.value);
         let jerk_mps3 = value("PSC_JERK_NE").or_else(|| value("PSC_JERK_XY"))?;
@@ -188,7 +187,7 @@ impl Dialect for Px4 {
             (px4::POSITION, _) | (px4::AUTO, px4::AUTO_LOITER) => CopterMode::Loiter as u32,
             (px4::ALTITUDE, _) => CopterMode::AltHold as u32,
             (px4::MANUAL | px4::STABILIZED, _) => CopterMode::Stabilize as u32,
-            // Beyond any of ArduCopter's, so that none is taken for it.
+            // Larger than all of ArduCopter's mode numbers, so that they cannot be confused.
             _ => custom_mode | 1 << 15,
         }
     }
@@ -214,7 +213,7 @@ impl Dialect for Px4 {
         false
     }
 
-    /// Its fence is checked against the global position, which external navigation does not give.
+    /// PX4 checks its fence against the global position, which external navigation does not provide.
     fn keeps_polygons(&self) -> bool {
         false
     }
@@ -227,7 +226,7 @@ impl Dialect for Px4 {
         "EKF2_EV_DELAY"
     }
 
-    /// Its parameters do not say; the flight does.
+    /// The parameters do not give it; the guard measures it in flight.
     fn response(&self, _: &BTreeMap<String, Param>) -> Option<Response> {
         None
     }
@@ -246,7 +245,7 @@ impl Dialect for Px4 {
         ]
     }
 
-    /// PX4 puts a whole number's bits where a float's are (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
+    /// PX4 stores the bits of an integer in the float field (MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE).
     fn value_from_wire(&self, value: f32, kind: MavParamType) -> f64 {
         let bits = value.to_bits();
         match kind {
@@ -282,7 +281,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn px4s_modes_are_arducopters_and_back() {
+    fn px4_modes_convert_to_arducopter_modes_and_back() {
         use CopterMode::{AltHold, Brake, Guided, Land, Loiter, Rtl, Stabilize};
         for mode in [Stabilize, AltHold, Guided, Loiter, Rtl, Land] {
             let (main, sub) = Px4.mode_parameters(mode);
@@ -295,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn px4s_whole_numbers_travel_as_bits() {
+    fn px4_integers_are_sent_as_bits() {
         use MavParamType::{
             MAV_PARAM_TYPE_INT8, MAV_PARAM_TYPE_INT32, MAV_PARAM_TYPE_REAL32, MAV_PARAM_TYPE_UINT16,
         };

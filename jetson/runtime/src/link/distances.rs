@@ -1,4 +1,4 @@
-//! Distances of the twin's sensors to the autopilot, at rates that its link carries.
+//! Sends distances of simulated sensors to the autopilot, at rates that its link can carry.
 
 use vizflyt_protocol::geometry::yaw_of;
 use vizflyt_protocol::mavlink::dialect::MavMessage;
@@ -10,20 +10,19 @@ use zerocopy::FromBytes;
 
 use super::Link;
 
-/// From one message of a sensor to its next, at least: 20 Hz, the rate at which ArduPilot's own range finders are
-/// read. [s]
+/// Minimum period of a sensor's messages: 20 Hz, the rate at which ArduPilot reads its range finders. [s]
 const DISTANCE_S: f64 = 0.05;
-/// As [`DISTANCE_S`], of a message of 167 bytes: 10 Hz. [s]
+/// As [`DISTANCE_S`], for a message of 167 bytes: 10 Hz. [s]
 const OBSTACLES_S: f64 = 0.1;
-/// What comes this much early, as jitter has it, is in time. [share of the period]
+/// A reading may be early by this share of the period, because of jitter.
 const EARLY: f64 = 0.2;
 
-/// When each sensor's next message may leave.
+/// Time of each sensor's next message.
 pub(super) type Due = [HostTime; MAX_SENSORS];
 
 impl Link {
-    /// Passes on what sensor `index` has measured, as DISTANCE_SENSOR or OBSTACLE_DISTANCE, unless it has done so a
-    /// moment ago. A radar's detections are neither.
+    /// Sends a reading of sensor `index` as DISTANCE_SENSOR or OBSTACLE_DISTANCE, unless the last message was too
+    /// recent. Detections of a radar are not sent.
     pub fn reading(&mut self, now: HostTime, index: u8, sensor: &SensorInfo, records: &[u8]) {
         let Some(due) = self.distances_due.get(usize::from(index)).copied() else { return };
         if self.autopilot.is_none() || now < due {

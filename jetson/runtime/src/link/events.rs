@@ -1,4 +1,4 @@
-//! What the link reports, and the sentences for refusals.
+//! Events of the link, and messages for rejected commands.
 
 use std::borrow::Cow;
 
@@ -10,12 +10,12 @@ use super::navigation::Delay;
 use super::params::ParamEvent;
 use super::rates::Rate;
 
-/// Something that happened on the link.
+/// Event on the link.
 #[derive(Clone, Debug, PartialEq)]
 pub enum LinkEvent {
-    /// Heartbeats of an autopilot began to come.
+    /// Heartbeats of an autopilot are received.
     Connected {
-        /// Its system id.
+        /// System id of the autopilot.
         system: u8,
     },
     /// No heartbeat for 3 s.
@@ -24,46 +24,45 @@ pub enum LinkEvent {
     Rebooted,
     /// The autopilot reported its firmware.
     Firmware(Firmware),
-    /// Motors may turn.
+    /// The motors may turn.
     Armed,
-    /// Motors are off.
+    /// The motors are off.
     Disarmed,
     /// The autopilot has accepted the take-off.
     TakingOff,
-    /// The mode changed to this number (ArduCopter's), by us or by someone else.
+    /// The mode changed to this number (ArduCopter's), by us or by another party.
     Mode(u32),
-    /// The autopilot refuses a command that the goal needs; why, in a sentence.
+    /// The autopilot rejects a command that the goal needs; the reason as a sentence.
     Refused(String),
-    /// A text of the autopilot.
+    /// Text message of the autopilot.
     Text {
-        /// 0 (emergency) to 7 (debug), as in syslog.
+        /// Severity from 0 (emergency) to 7 (debug), as in syslog.
         severity: u8,
-        /// The text.
         text: String,
     },
-    /// A stream comes too seldom, and asking again did not help.
+    /// The rate of a stream is too low, even after repeated requests.
     Slow(Rate),
-    /// External navigation is later than the autopilot's setting.
+    /// The latency of external navigation exceeds the autopilot's setting.
     Delay(Delay),
-    /// Packets are refused for their signature.
+    /// Packets are rejected for their signature.
     NotSigned {
-        /// What is wrong with it.
+        /// Fault of the signature.
         fault: SigningFault,
-        /// Packets refused for that since the start.
+        /// Packets rejected for this fault since the start.
         count: u64,
     },
-    /// The result of a fence upload.
+    /// Result of a fence upload.
     Fence(FenceEvent),
-    /// The result of reading or writing parameters.
+    /// Result of reading or writing parameters.
     Param(ParamEvent),
 }
 
 impl LinkEvent {
-    /// Returns a sentence for people about what they should look into; `None` for what needs nobody.
+    /// Returns a warning for the user; `None` if no action is needed.
     pub fn warning(&self) -> Option<String> {
         match self {
             Self::Slow(rate) => Some(format!(
-                "the autopilot sends message {} at {:.0} Hz, not at the {:.0} asked for; the link may be \
+                "the autopilot sends message {} at {:.0} Hz, {:.0} Hz requested; the link may be \
                  too slow: raise SERIALn_BAUD, or lower the rates of a ground station",
                 rate.id, rate.achieved_hz, rate.asked_hz
             )),
@@ -76,15 +75,14 @@ impl LinkEvent {
             )),
             Self::Fence(FenceEvent::Rejected(why)) => Some(format!(
                 "the autopilot's own fence is not the arena's: {why}; it flies within its FENCE_* \
-                 parameters, and guard and referee keep the rest"
+                 parameters, and guard and referee check the rest"
             )),
             _ => None,
         }
     }
 }
 
-/// Returns the sentence for a command that was given up; `guess` is a cause that the autopilot did
-/// not name.
+/// Returns the message for a command that was given up; `guess` is a cause that the autopilot did not report.
 pub(super) fn refusal(
     command: &str,
     why: &str,
@@ -104,14 +102,14 @@ pub(super) fn refusal(
     text
 }
 
-/// Returns what to do about a text of ArduCopter's or PX4's, where we know (AP_Arming.cpp,
-/// HealthAndArmingChecks, and seen on 4.8.0-dev).
+/// Returns advice for a text of ArduCopter or PX4, if known (AP_Arming.cpp, HealthAndArmingChecks, and observed on
+/// 4.8.0-dev).
 pub fn advice(text: &str) -> Option<&'static str> {
     let text = text.to_ascii_lowercase();
     ADVICE.iter().find(|(key, _)| text.contains(key)).map(|&(_, advice)| advice)
 }
 
-/// What a text contains, and what to do; the first that fits counts.
+/// Search text and advice; the first match counts.
 const ADVICE: [(&str, &str); 31] = [
     ("rc not found", "connect a receiver, or set FS_THR_ENABLE=0 to fly without one"),
     ("throttle below failsafe", "switch the transmitter on, and set FS_THR_VALUE below its lowest"),

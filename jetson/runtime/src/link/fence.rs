@@ -1,6 +1,6 @@
-//! The arena's polygons for the autopilot's own fence, uploaded by the mission protocol: their number
-//! is offered, the autopilot requests one corner after the other, and acknowledges them all in the
-//! end. Only to a vehicle on the ground, again after each restart, and again where an answer is lost.
+//! Upload of the arena's polygons as the autopilot's own fence, with the mission protocol: the link offers the number
+//! of corners, the autopilot requests each corner, and finally acknowledges all. The upload happens only on the ground,
+//! again after each restart, and again if a reply is lost.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::dialect::{MISSION_ACK_DATA, MavMissionResult, MavMissionType};
@@ -9,35 +9,34 @@ use vizflyt_protocol::time::HostTime;
 
 use super::identity::{COMPONENT_ID, SYSTEM_ID};
 
-/// A part of the floor plan that the vehicle must stay in, or out of.
+/// Polygon on the floor plan that the vehicle must stay inside or outside of.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FencePolygon {
-    /// In or out.
     pub side: FenceSide,
-    /// Three corners or more, in order. [m, world]
+    /// Three or more corners, in order. [m, world]
     pub corners_m: Vec<DVec2>,
 }
 
-/// The result of an upload.
+/// Result of an upload.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FenceEvent {
-    /// The autopilot has accepted this many polygons.
+    /// The autopilot has accepted this number of polygons.
     Accepted(usize),
-    /// It has not, and keeps its former fence; why, in a sentence.
+    /// The autopilot has rejected them and keeps its previous fence; the reason as a sentence.
     Rejected(String),
 }
 
-/// An offer or an item that nothing follows is offered again after this; ArduCopter repeats a request
-/// after a second. [s]
+/// Timeout after an offer or an item, after which the offer is repeated; ArduCopter repeats a request after a second.
+/// [s]
 const REPEAT_S: f64 = 1.5;
-/// Offered this many times: given up.
+/// Maximum number of offers.
 const TRIES: u8 = 5;
 
-/// The upload.
+/// State of the upload.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Upload {
     polygons: Vec<FencePolygon>,
-    /// As they are sent: about an origin.
+    /// Corners as sent, relative to the origin.
     corners: Vec<FenceCorner>,
     origin: Option<GlobalPoint>,
     stage: Stage,
@@ -45,17 +44,17 @@ pub(super) struct Upload {
 
 #[derive(Clone, Copy, Debug, Default)]
 enum Stage {
-    /// Nothing to do, or done, or given up.
+    /// Nothing to do, finished, or given up.
     #[default]
     Idle,
-    /// To be offered.
+    /// Offer due.
     Due { at: Option<HostTime>, tries: u8 },
-    /// Offered; so many corners have been asked for.
+    /// Offered; number of corners requested.
     Offered { asked: usize, repeat_at: HostTime, tries: u8 },
 }
 
 impl Upload {
-    /// Wants these polygons in the autopilot.
+    /// Sets the polygons to upload.
     pub(super) fn want(&mut self, polygons: Vec<FencePolygon>) {
         if self.polygons != polygons {
             self.polygons = polygons;
@@ -63,26 +62,26 @@ impl Upload {
         }
     }
 
-    /// Starts again, as after a restart of the autopilot.
+    /// Starts again, for example after a restart of the autopilot.
     pub(super) fn restart(&mut self) {
         self.origin = None;
         let wanted = !self.polygons.is_empty();
         self.stage = if wanted { Stage::Due { at: None, tries: 0 } } else { Stage::Idle };
     }
 
-    /// Takes it that this autopilot keeps no polygons.
+    /// Ends the upload, because this autopilot supports no polygons. Returns whether one was in progress.
     pub(super) fn give_up(&mut self) -> bool {
         let was_due = self.is_under_way();
         self.stage = Stage::Idle;
         was_due
     }
 
-    /// Whether it is not over yet.
+    /// Whether the upload is unfinished.
     pub(super) fn is_under_way(&self) -> bool {
         !matches!(self.stage, Stage::Idle)
     }
 
-    /// Takes the origin of the autopilot's local frame, which places the polygons on the globe.
+    /// Sets the origin of the autopilot's local frame, which gives the polygons global coordinates.
     pub(super) fn set_origin(&mut self, origin: GlobalPoint) {
         if self.origin == Some(origin) {
             return;
@@ -104,7 +103,7 @@ impl Upload {
         }
     }
 
-    /// Returns when [`Self::poll`] has something to do next.
+    /// Returns the time at which [`Self::poll`] is due next.
     pub(super) fn due_at(&self) -> Option<HostTime> {
         match self.stage {
             Stage::Offered { repeat_at, .. } => Some(repeat_at),
@@ -113,7 +112,7 @@ impl Upload {
         }
     }
 
-    /// Does what is due: returns the number of corners to offer, or that it has failed.
+    /// Runs what is due: returns the number of corners to offer, or a failure.
     pub(super) fn poll(&mut self, now: HostTime) -> Option<Result<u16, FenceEvent>> {
         self.origin?;
         let tries = match self.stage {
@@ -129,7 +128,7 @@ impl Upload {
         Some(Ok(self.corners.len() as u16))
     }
 
-    /// Returns the corner that is asked for.
+    /// Returns the requested corner.
     pub(super) fn asked(&mut self, now: HostTime, seq: u16) -> Option<FenceCorner> {
         let Stage::Offered { asked, repeat_at, .. } = &mut self.stage else { return None };
         let corner = *self.corners.get(usize::from(seq))?;
@@ -138,7 +137,7 @@ impl Upload {
         Some(corner)
     }
 
-    /// Handles the autopilot's acknowledgement; returns the result of the upload, once it is known.
+    /// Handles the autopilot's acknowledgement; returns the result when the upload is finished.
     pub(super) fn acknowledged(
         &mut self,
         now: HostTime,
@@ -151,12 +150,12 @@ impl Upload {
             return None;
         }
         match ack.mavtype {
-            // An answer to an earlier attempt otherwise.
+            // Otherwise it is a reply to an earlier attempt.
             MavMissionResult::MAV_MISSION_ACCEPTED if asked == self.corners.len() => {
                 self.stage = Stage::Idle;
                 Some(FenceEvent::Accepted(self.polygons.len()))
             }
-            // A corner came twice, and it goes on.
+            // A corner was sent twice; the upload continues.
             MavMissionResult::MAV_MISSION_ACCEPTED
             | MavMissionResult::MAV_MISSION_INVALID_SEQUENCE => None,
             MavMissionResult::MAV_MISSION_DENIED

@@ -1,15 +1,15 @@
-//! What a flight wants of the autopilot.
+//! Goal of the link.
 
-/// The state that the link is to reach.
+/// State that the link must reach.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Goal {
-    /// Watch only: heartbeats, telemetry, origin and external navigation.
+    /// Only watch: heartbeats, telemetry, origin and external navigation.
     #[default]
     Prepare,
-    /// GUIDED, armed, and risen by this much above the ground. [m]
+    /// GUIDED, armed, and this height above the ground reached. [m]
     TakeOff(f32),
     /// Stay in GUIDED and follow setpoints.
     Fly,
-    /// LAND mode, until disarmed. Never given up.
+    /// LAND mode, until disarmed. Retried without limit.
     Land,
 }

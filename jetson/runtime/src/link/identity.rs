@@ -1,15 +1,14 @@
-//! Who is who on the link.
+//! Ids of this runtime, and the autopilot's firmware.
 
-/// Our system id: the one whose heartbeats ArduCopter's ground station failsafe counts
-/// (`MAV_GCS_SYSID`, default 255).
+/// System id of the runtime. ArduCopter's ground station failsafe counts its heartbeats (`MAV_GCS_SYSID`, default 255).
 pub const SYSTEM_ID: u8 = 255;
-/// Our component: MAV_COMP_ID_ONBOARD_COMPUTER.
+/// Component id of the runtime: MAV_COMP_ID_ONBOARD_COMPUTER.
 pub const COMPONENT_ID: u8 = 191;
 
-/// An autopilot's firmware.
+/// Firmware of an autopilot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Firmware {
-    /// ArduCopter or PX4.
+    /// `ArduCopter` or `PX4`.
     pub name: &'static str,
     /// Major, minor, patch.
     pub version: (u8, u8, u8),

@@ -1,4 +1,4 @@
-//! Messages for people: what arming waits for, and why a command was refused.
+//! Messages for people: why the vehicle cannot be armed, and why a command was rejected.
 
 use std::borrow::Cow;
 
@@ -10,18 +10,18 @@ use super::commands::Command;
 use super::dialect::Rise;
 use super::{LOST_AFTER_S, Link, events};
 
-/// A text of the autopilot belongs to a refusal if it is no older than this. [s]
+/// Maximum age of an autopilot's text that explains a rejection. [s]
 const TEXT_WINDOW_S: f64 = 3.0;
-/// A pre-arm text this old has been taken back: ArduCopter repeats them every 30 s. [s]
+/// Maximum age of a valid pre-arm text: ArduCopter repeats them every 30 s. [s]
 const PREARM_TEXT_S: f64 = 35.0;
 
 impl Link {
-    /// Returns what arming waits for.
+    /// Returns the condition that arming waits for.
     pub(super) fn missing(&self, now: HostTime) -> Option<Cow<'static, str>> {
         if self.autopilot.is_none() {
             let refused = self.signatures.as_ref().map_or(0, super::Signatures::refused);
             return Some(if refused > 0 {
-                "packets come, but not signed with our key; run `vizflyt vehicle sign`".into()
+                "packets arrive, but not signed with our key; run `vizflyt vehicle sign`".into()
             } else {
                 "no heartbeat from an autopilot; check power, link and --mavlink".into()
             });
@@ -60,14 +60,14 @@ impl Link {
         }
     }
 
-    /// Returns why the autopilot does not know where it is.
+    /// Returns why the autopilot has no position.
     fn navigation_missing(&self) -> Option<Cow<'static, str>> {
         if self.dialect.needs_origin() && self.origin.is_none() {
-            // One that signs accepts only what is signed, but over USB.
+            // An autopilot that signs accepts unsigned packets only over USB.
             let is_deaf = self.autopilot_signs && self.signatures.is_none();
             return Some(if is_deaf { UNCONFIRMED_TO_UNSIGNED } else { UNCONFIRMED }.into());
         }
-        // PX4 calls a position that external navigation gives relative.
+        // In PX4, a position from external navigation is relative.
         let position = if self.dialect.rise() == Rise::BySetpoint {
             EkfStatusFlags::EKF_POS_HORIZ_ABS | EkfStatusFlags::EKF_POS_HORIZ_REL
         } else {
@@ -79,7 +79,7 @@ impl Link {
             return None;
         }
         let mut text = "the autopilot's estimator has no position yet; ".to_owned();
-        // A wrong setting that is known goes before general advice.
+        // A known wrong setting has priority over general advice.
         let off = |name: &str, right: f64| {
             let value = self.params().get(name)?.value;
             (value != right).then(|| format!("{name} is {value}, it must be {right}"))
@@ -110,7 +110,7 @@ impl Link {
         )
     }
 
-    /// Returns the sentence for a command that was given up.
+    /// Returns the message for a command that was given up.
     pub(super) fn refusal(&self, now: HostTime, command: Command, why: &str) -> String {
         let texts: Vec<&str> = self
             .texts
@@ -122,13 +122,13 @@ impl Link {
         events::refusal(command.name(), why, &texts, guess)
     }
 
-    /// Returns why the autopilot refuses, as far as its state shows: ArduCopter refuses some commands
+    /// Returns the cause of a rejection as far as the autopilot's state shows it: ArduCopter rejects some commands
     /// without a text.
     fn cause(&self, command: Command) -> Option<Cow<'static, str>> {
         let guided = self.state.mode == CopterMode::Guided as u32;
         match command {
             Command::TakeOff(height_m) if !(height_m > 0.0) => {
-                Some(format!("{height_m} m is no height; set takeoff_height_m of the arena").into())
+                Some(format!("{height_m} m is not a valid height; set takeoff_height_m of the arena").into())
             }
             Command::TakeOff(_) if self.dialect.needs_origin() && self.origin.is_none() => Some(
                 "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the link to the \
@@ -142,7 +142,7 @@ impl Link {
                 )
             }
             Command::TakeOff(_) if !self.state.armed => {
-                Some("it is disarmed; DISARM_DELAY passed, or a pilot did it".into())
+                Some("it is disarmed; DISARM_DELAY passed, or a pilot disarmed it".into())
             }
             Command::Mode(_) | Command::Arm | Command::TakeOff(_) => self.navigation_missing(),
             Command::Land | Command::Interval(..) | Command::Message(_) => None,

@@ -1,18 +1,18 @@
-//! The MAVLink link to an autopilot: a sans-IO state machine. Bytes, poses, setpoints and `now` in;
-//! datagrams and events out. The guardian carries the bytes.
+//! MAVLink link to an autopilot, as a sans-IO state machine. Bytes, poses, setpoints and `now` in; datagrams and events
+//! out. The guardian transports the bytes.
 //!
 //! ```text
-//! poses 100 Hz ── vision() ──▶ VISION_POSITION_ESTIMATE 30-50 Hz   what the autopilot flies by
-//! readings ── reading() ─────▶ DISTANCE_SENSOR, OBSTACLE_DISTANCE  of sensors that say so
+//! poses 100 Hz ── vision() ──▶ VISION_POSITION_ESTIMATE 30-50 Hz   external navigation
+//! readings ── reading() ─────▶ DISTANCE_SENSOR, OBSTACLE_DISTANCE  if enabled for the sensor
 //! guard 50 Hz ── setpoint() ─▶ SET_POSITION_TARGET_LOCAL_NED       yaw always sent
-//! flight ── set_goal() ──────▶ mode, arming, take-off, landing     acknowledged, repeated
+//! flight ── set_goal() ──────▶ mode, arming, take-off, landing     acknowledged or repeated
 //! autopilot ── handle_input() ▶ VehicleState, clock offset, parameters, LinkEvents
 //! ```
-//! Commands follow from what is observed, not from a script: whatever the goal needs next is
-//! sent, so a reboot of either side or a lost packet only repeats a step.
+//! Commands depend on the observed state, not on a script: the link sends the next command that the goal needs.
+//! Therefore a restart of either side or a lost packet only repeats a step.
 //!
-//! `receive` reads packets, `advance` decides what to send next, `messages` has the sentences for people;
-//! what differs between ArduCopter and PX4 is in `dialect`.
+//! `receive` handles packets, `advance` chooses the next message to send, `messages` contains the messages for people,
+//! and `dialect` contains the differences between ArduCopter and PX4.
 
 mod advance;
 mod commands;
@@ -70,16 +70,16 @@ pub use signing::{SigningFile, SigningFileError};
 pub use vizflyt_guardian::port::LinkSigning;
 use vizflyt_guardian::port::Wanted;
 
-/// Settings of a person.
+/// Settings of the link.
 #[derive(Clone, Debug)]
 pub struct LinkSettings {
-    /// Name that is announced to other companions on the same vehicle; empty announces none.
+    /// Name announced to other companions on the same vehicle; empty: no announcement.
     pub name: String,
-    /// System id of the autopilot; `None` takes the only one there is.
+    /// System id of the autopilot; `None` uses the only autopilot on the link.
     pub system: Option<u8>,
-    /// External navigation, held within [`VISION_HZ`]. [Hz]
+    /// Rate of external navigation, clamped to [`VISION_HZ`]. [Hz]
     pub vision_hz: f64,
-    /// Signs everything and refuses what is not signed.
+    /// If set, signs all packets and rejects unsigned ones.
     pub signing: Option<LinkSigning>,
 }
 
@@ -90,13 +90,13 @@ impl Default for LinkSettings {
 }
 
 impl LinkSettings {
-    /// Returns which autopilot is waited for.
+    /// Returns which autopilot the guardian accepts.
     pub fn wanted(&self) -> Wanted {
         Wanted { system: self.system, signing: self.signing.clone() }
     }
 }
 
-/// One UDP payload.
+/// Payload of one UDP datagram.
 #[derive(Clone, Copy, Debug)]
 pub struct Datagram {
     bytes: [u8; MAX_PACKET],
@@ -111,16 +111,16 @@ impl std::ops::Deref for Datagram {
     }
 }
 
-/// Heartbeats, origin and clock requests. [s]
+/// Period of clock requests, and of the origin until it is confirmed. [s]
 const SECOND_S: f64 = 1.0;
-/// Heartbeats go out this often: several may be lost before `FS_GCS_TIMEOUT`, whose least is 2, lands the vehicle. [s]
+/// Period of heartbeats. Several may be lost before `FS_GCS_TIMEOUT` (minimum 2 s) lands the vehicle. [s]
 const HEARTBEAT_S: f64 = 0.25;
-/// An autopilot silent for this long is lost: three heartbeats. [s]
+/// Timeout of the autopilot: three heartbeats. [s]
 pub(crate) const LOST_AFTER_S: f64 = 3.0;
-/// Datagrams waiting at most; the driver empties the queue at once, so this is never reached.
+/// Maximum number of waiting datagrams; the driver empties the queue at once, so it is never reached.
 const OUTBOX: usize = 512;
 
-/// The autopilot that we fly.
+/// Address of the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Target {
     system: u8,
@@ -134,18 +134,18 @@ impl Target {
     }
 }
 
-/// What is known of the pre-arm checks.
+/// State of the pre-arm checks.
 #[derive(Clone, Debug)]
 struct Prearm {
-    /// `None` before the first SYS_STATUS.
+    /// Result; `None` before the first SYS_STATUS.
     ok: Option<bool>,
     /// Texts about failing checks, newest last.
     texts: VecDeque<(HostTime, String)>,
-    /// Sensors that are in use and not healthy.
+    /// Enabled sensors that are unhealthy.
     unhealthy: MavSysStatusSensor,
-    /// When the checks were last requested; `None` if they may be requested.
+    /// Time of the last request for the checks; `None` if none was sent.
     asked_at: Option<HostTime>,
-    /// It does not support the request.
+    /// The autopilot does not support the request.
     is_unsupported: bool,
 }
 
@@ -161,7 +161,7 @@ impl Default for Prearm {
     }
 }
 
-/// A take-off by setpoints, under way.
+/// Take-off by setpoints in progress.
 #[derive(Clone, Copy, Debug)]
 struct Rising {
     setpoint: GuidedSetpoint,
@@ -169,7 +169,7 @@ struct Rising {
     due_at: HostTime,
 }
 
-/// The link. See the module.
+/// Link to the autopilot; see the module.
 pub struct Link {
     settings: LinkSettings,
     decoder: StreamDecoder,
@@ -179,38 +179,38 @@ pub struct Link {
     sequence: u8,
     sent_packets: u64,
     goal: Goal,
-    /// The goal is of before a restart of the autopilot: nothing is armed for it.
+    /// Goal from before a restart of the autopilot; the link does not arm for it.
     goal_is_stale: bool,
     own_mode: OwnMode,
     commands: Commands,
     chores: VecDeque<Command>,
-    /// What we commanded, and when last: an acknowledgement of anything else is not for us.
+    /// Commands sent, with the time of the last transmission. Acknowledgements of other commands are not ours.
     commanded: Vec<(MavCmd, HostTime)>,
-    /// `None` before the first heartbeat and after a silence.
+    /// `None` before the first heartbeat and after a timeout.
     autopilot: Option<Target>,
     dialect: &'static dyn Dialect,
     firmware: Option<Firmware>,
-    /// It signs what it sends.
+    /// Whether the autopilot signs its packets.
     autopilot_signs: bool,
-    /// Another autopilot on the same link, and when it last sent.
+    /// System id of another autopilot on the same link, and the time of its last packet.
     rival: Option<(u8, HostTime)>,
     companions: Companions,
     announced_at: Option<HostTime>,
     received_at: HostTime,
     state: VehicleState,
-    /// When the attitude in `state` was true.
+    /// Measurement time of the attitude in `state`.
     attitude_at: Option<HostTime>,
-    /// LOCAL_POSITION_NED has come.
+    /// Whether LOCAL_POSITION_NED has been received.
     position_known: bool,
-    /// The newest IMU samples, oldest first.
+    /// Newest IMU samples, oldest first.
     imu: VecDeque<ImuSample>,
-    /// HIGHRES_IMU comes: RAW_IMU, the same in whole numbers, is left aside.
+    /// Whether HIGHRES_IMU is received; then RAW_IMU, which has the same data as integers, is ignored.
     imu_is_fine: bool,
     clock: OffsetFilter<Host, Autopilot>,
     /// Stamps of our newest clock requests. [ns]
     clock_asked: VecDeque<i64>,
     boot_ms: u32,
-    /// Origin of the autopilot's local frame, as it reports it.
+    /// Origin of the autopilot's local frame, as reported by it.
     origin: Option<GlobalPoint>,
     fence: fence::Upload,
     ekf: EkfStatusFlags,
@@ -223,22 +223,20 @@ pub struct Link {
     params: Params,
     rates: Rates,
     beat_at: HostTime,
-    /// When the next heartbeat is due.
     heartbeat_at: HostTime,
     texts: VecDeque<(HostTime, String)>,
     text_parts: TextParts,
 }
 
 impl Link {
-    /// Makes a link at `now` that has received nothing yet, and takes the only autopilot there is.
+    /// Creates a link at `now` that uses the only autopilot present.
     pub fn new(now: HostTime) -> Self {
         Self::with(now, LinkSettings::default())
     }
 
-    /// Makes a link at `now` as a person has set it.
+    /// Creates a link at `now` with these settings.
     pub fn with(now: HostTime, settings: LinkSettings) -> Self {
-        // Two runtimes start in the same nanosecond of their computers' uptimes with negligible
-        // probability.
+        // Two runtimes start at the same nanosecond of their computers' uptimes with negligible probability.
         let nonce = (now.as_ns() ^ now.as_ns() >> 32) as u32 ^ u32::from(settings.name.len() as u8);
         Self {
             decoder: StreamDecoder::default(),
@@ -288,9 +286,9 @@ impl Link {
         }
     }
 
-    // ---- what goes in ----
+    // ---- input ----
 
-    /// Takes bytes from the autopilot, in any portions.
+    /// Accepts bytes from the autopilot, in chunks of any size.
     pub fn handle_input(&mut self, now: HostTime, bytes: &[u8]) {
         let mut packets = Vec::new();
         let signatures = &mut self.signatures;
@@ -308,11 +306,11 @@ impl Link {
         self.advance(now);
     }
 
-    /// Does what is due at `now`.
+    /// Runs everything due at `now`.
     pub fn handle_timeout(&mut self, now: HostTime) {
         if now >= self.heartbeat_at {
             self.heartbeat_at = now.plus_seconds(HEARTBEAT_S);
-            // It also gives our address to a bridge or an autopilot that waits for one.
+            // Heartbeats also give our address to a bridge or an autopilot that waits for it.
             self.send_heartbeat(now);
         }
         if now >= self.beat_at {
@@ -328,20 +326,20 @@ impl Link {
         self.advance(now);
     }
 
-    /// Says what to bring about from `now` on. Repeating the same goal changes nothing.
+    /// Sets the goal from `now` on. Setting the same goal again changes nothing.
     pub fn set_goal(&mut self, now: HostTime, goal: Goal) {
         if self.goal != goal {
             self.goal = goal;
             self.goal_is_stale = false;
             self.rising = None;
-            // A command of the former goal must not be repeated: arming after "land".
+            // Do not repeat a command of the old goal, for example arming after "land".
             self.commands.abandon();
             self.advance(now);
         }
     }
 
-    /// Feeds a localized pose, true at `stamp`, as external navigation. Call it with every pose;
-    /// it passes on as many a second as are set, and none that is half a second old.
+    /// Sends a localized pose, measured at `stamp`, as external navigation. Call it with every pose: it limits the rate
+    /// and drops poses older than 0.5 s.
     pub fn vision(&mut self, now: HostTime, sample: &PoseSample, stamp: HostTime) {
         if self.autopilot.is_some() && sample.is_valid() && self.feed.take(now, stamp) {
             let message = vision_of_sample(sample, stamp);
@@ -349,7 +347,7 @@ impl Link {
         }
     }
 
-    /// Sends a guarded setpoint; returns whether there is an autopilot to send it to.
+    /// Sends a guarded setpoint. Returns whether an autopilot is connected.
     pub fn setpoint(&mut self, now: HostTime, setpoint: &GuidedSetpoint) -> bool {
         let Some(target) = self.autopilot else { return false };
         let target = (target.system, target.component);
@@ -358,7 +356,7 @@ impl Link {
         true
     }
 
-    /// Reads all parameters; [`LinkEvent::Param`] reports when they have arrived.
+    /// Reads all parameters; [`LinkEvent::Param`] reports the end.
     pub fn read_params(&mut self, now: HostTime) {
         self.params.read_all(now);
         self.advance(now);
@@ -370,8 +368,8 @@ impl Link {
         self.advance(now);
     }
 
-    /// Has the autopilot keep these polygons as its own fence, from the next time that it is on the
-    /// ground; [`LinkEvent::Fence`] reports the result. Repeating the same changes nothing.
+    /// Uploads these polygons as the autopilot's own fence, when it is next on the ground; [`LinkEvent::Fence`] reports
+    /// the result. Repeating the same polygons changes nothing.
     pub fn set_fence(&mut self, now: HostTime, polygons: Vec<FencePolygon>) {
         self.fence.want(polygons);
         if let Some(origin) = self.origin {
@@ -380,8 +378,8 @@ impl Link {
         self.advance(now);
     }
 
-    /// Tells the autopilot the key for signing, or with `None` to sign no more; returns whether there
-    /// is an autopilot to tell. It does not answer. Only a wire that nobody listens to may carry this.
+    /// Sends the signing key to the autopilot; `None` disables signing. Returns whether an autopilot is connected. The
+    /// autopilot does not reply. Use this only over a link that cannot be intercepted.
     pub fn setup_signing(&mut self, now: HostTime, signing: Option<&LinkSigning>) -> bool {
         let Some(target) = self.autopilot else { return false };
         let message = SETUP_SIGNING_DATA {
@@ -390,37 +388,37 @@ impl Link {
             target_component: target.component,
             secret_key: signing.map_or([0; 32], |signing| *signing.key.bytes()),
         };
-        // Twice, as there is no acknowledgement.
+        // Twice, because the autopilot does not acknowledge it.
         self.send(now, &MavMessage::SETUP_SIGNING(message.clone()));
         self.send(now, &MavMessage::SETUP_SIGNING(message));
         true
     }
 
-    // ---- what comes out ----
+    // ---- output ----
 
     /// Returns the next datagram to send to the autopilot.
     pub fn poll_transmit(&mut self) -> Option<Datagram> {
         self.outbox.pop_front()
     }
 
-    /// Returns the next thing that happened.
+    /// Returns the next event.
     pub fn poll_event(&mut self) -> Option<LinkEvent> {
         self.events.pop_front()
     }
 
-    /// Returns when [`Self::handle_timeout`] is due next.
+    /// Returns the time at which [`Self::handle_timeout`] is due next.
     pub fn poll_timeout(&self) -> Option<HostTime> {
         let rising = self.rising.map(|rising| rising.due_at);
         let due = [self.commands.due_at(), self.params.due_at(), self.fence.due_at(), rising];
         Some(due.into_iter().flatten().fold(self.beat_at.min(self.heartbeat_at), Ord::min))
     }
 
-    /// Returns the vehicle's state as the autopilot last reported it, in our frames.
+    /// Returns the vehicle's state as last reported by the autopilot, in our frames.
     pub fn state(&self) -> &VehicleState {
         &self.state
     }
 
-    /// Returns when the attitude in [`Self::state`] was true; `None` if none has come. [host]
+    /// Returns the measurement time of the attitude in [`Self::state`]; `None` before the first. [host]
     pub fn attitude_at(&self) -> Option<HostTime> {
         self.attitude_at
     }
@@ -431,7 +429,7 @@ impl Link {
         &self.imu
     }
 
-    /// Whether the autopilot's heartbeats come.
+    /// Whether heartbeats of the autopilot are received.
     pub fn is_connected(&self) -> bool {
         self.autopilot.is_some()
     }
@@ -441,13 +439,13 @@ impl Link {
         self.autopilot.map(|target| target.system)
     }
 
-    /// Returns the autopilot's firmware, once it has reported it.
+    /// Returns the autopilot's firmware, after the autopilot has reported it.
     pub fn firmware(&self) -> Option<Firmware> {
         self.firmware
     }
 
-    /// Returns the mode that somebody else has chosen last, after ours was confirmed. Unless it is LAND, nothing is
-    /// commanded any more.
+    /// Returns the last mode chosen by a pilot, a ground station or a failsafe after our mode was confirmed. Unless it
+    /// is LAND, the link sends no more commands.
     pub fn taken_mode(&self) -> Option<u32> {
         self.own_mode.taken()
     }
@@ -457,7 +455,7 @@ impl Link {
         self.took_off
     }
 
-    /// Returns the relation of the autopilot's clock to ours.
+    /// Returns the offset between the autopilot's clock and ours.
     pub fn clock(&self) -> &OffsetFilter<Host, Autopilot> {
         &self.clock
     }
@@ -467,7 +465,8 @@ impl Link {
         self.params.known()
     }
 
-    /// Returns how the vehicle answers velocities, by the autopilot's parameters; `None` while they are not known.
+    /// Returns the vehicle's response to velocities according to the autopilot's parameters; `None` while they are
+    /// unknown.
     pub fn response(&self) -> Option<Response> {
         self.dialect.response(self.params.known())
     }
@@ -477,20 +476,20 @@ impl Link {
         self.params.is_busy()
     }
 
-    /// Whether the fence's polygons are on their way to the autopilot.
+    /// Whether the upload of the fence is in progress.
     pub fn is_busy_with_fence(&self) -> bool {
         self.fence.is_under_way()
     }
 
-    /// Returns the streams asked for, and how often they come.
+    /// Returns the requested streams and their rates.
     pub fn rates(&self) -> impl Iterator<Item = Rate> + '_ {
         self.rates.rates()
     }
 
-    /// Returns external navigation's latency, once it is measured: 5 s of poses and one answer of the
+    /// Returns the latency of external navigation, once it is measured: this needs 5 s of poses and one reply of the
     /// autopilot's clock.
     pub fn delay(&self, now: HostTime) -> Option<Delay> {
-        // About half the best round trip.
+        // About half of the best round trip.
         let link_s = self.clock.error_bound_ns(now)? as f64 * 1e-9;
         let measured_ms = self.feed.delay_ms(link_s)?;
         let parameter = self.dialect.delay_parameter();
@@ -498,12 +497,12 @@ impl Link {
         Some(Delay { parameter, measured_ms, set_ms })
     }
 
-    /// Returns packets sent and received since the start.
+    /// Returns the number of packets sent and received since the start.
     pub fn packets(&self) -> u64 {
         self.sent_packets + self.decoder.stats().packets
     }
 
-    /// Returns packets refused for their signature, and poses that came too late to be sent.
+    /// Returns the number of packets rejected for their signature, and of poses that were too old to send.
     pub fn refused(&self) -> (u64, u64) {
         (self.signatures.as_ref().map_or(0, Signatures::refused), self.feed.stale())
     }
@@ -511,7 +510,7 @@ impl Link {
     /// Whether the vehicle may be armed.
     ///
     /// # Errors
-    /// Returns what arming waits for, in a sentence.
+    /// Returns, as a sentence, the condition that arming waits for.
     pub fn ready_to_arm(&self, now: HostTime) -> Result<(), Cow<'static, str>> {
         match self.missing(now) {
             Some(missing) => Err(missing),
@@ -519,7 +518,7 @@ impl Link {
         }
     }
 
-    // ---- inside ----
+    // ---- internals ----
 
     fn send(&mut self, now: HostTime, message: &MavMessage) {
         if self.outbox.len() >= OUTBOX {

@@ -1,58 +1,58 @@
-//! The external navigation feed: which poses go to the autopilot, and how old they are when they
-//! get there. ArduCopter relates the stamps' clock to its own by the quickest packet, so the least
-//! latency is what it cannot measure and has to be set: VISO_DELAY_MS.
+//! External navigation: rate limit of the poses sent to the autopilot, and their latency. ArduCopter relates the clock
+//! of the stamps to its own by the fastest packet. It cannot measure the minimum latency, which must therefore be set:
+//! VISO_DELAY_MS.
 
 use vizflyt_protocol::time::HostTime;
 
-/// Rates that ArduCopter flew with; its filter takes at most 50 a second. [Hz]
+/// Allowed rates, tested with ArduCopter; its filter accepts at most 50 a second. [Hz]
 pub const VISION_HZ: std::ops::RangeInclusive<f64> = 30.0..=50.0;
 
 /// Poses older than this are not sent. [s]
 const STALE_S: f64 = 0.5;
-/// Poses over which the latency is measured: 5 s.
+/// Number of poses for the latency measurement: 5 s.
 const WINDOW: usize = 250;
-/// A pose is due when this much of the period is over: they come on a grid of their own.
+/// Share of the period by which a pose may be early, because the rate of poses differs from ours.
 const SLACK: f64 = 0.1;
-/// A setting this close to the measurement will do. [ms]
+/// Allowed difference between setting and measurement. [ms]
 const CLOSE_MS: f64 = 10.0;
 
-/// The feed.
+/// Rate limit and latency measurement.
 #[derive(Clone, Debug)]
 pub(super) struct Feed {
     period_s: f64,
     due_at: Option<HostTime>,
-    /// Ages of the newest poses when they were sent. [s]
+    /// Ages of the newest poses at transmission. [s]
     ages_s: Vec<f64>,
     next: usize,
     stale: u64,
 }
 
-/// What external navigation's latency is, and what the autopilot takes it to be.
+/// Latency of external navigation: measured, and set in the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Delay {
-    /// The autopilot's parameter for it.
+    /// Parameter of the autopilot.
     pub parameter: &'static str,
-    /// Least time from the measurement to the autopilot. [ms]
+    /// Minimum time from the measurement to the autopilot. [ms]
     pub measured_ms: f64,
-    /// What the autopilot is set to; `None` if it is not known. [ms]
+    /// Value of the parameter; `None` if unknown. [ms]
     pub set_ms: Option<f64>,
 }
 
 impl Delay {
-    /// Whether the setting is good enough.
+    /// Whether the setting is close enough to the measurement.
     pub fn is_close(&self) -> bool {
         self.set_ms.is_none_or(|set_ms| (set_ms - self.measured_ms).abs() <= CLOSE_MS)
     }
 }
 
 impl Feed {
-    /// Makes a feed of `hz` poses a second; held within [`VISION_HZ`].
+    /// Creates a feed with `hz` poses a second, clamped to [`VISION_HZ`].
     pub(super) fn new(hz: f64) -> Self {
         let hz = hz.max(*VISION_HZ.start()).min(*VISION_HZ.end());
         Self { period_s: 1.0 / hz, due_at: None, ages_s: Vec::new(), next: 0, stale: 0 }
     }
 
-    /// Whether a pose that was true at `stamp` is to be sent now.
+    /// Whether a pose measured at `stamp` must be sent now.
     pub(super) fn take(&mut self, now: HostTime, stamp: HostTime) -> bool {
         let age_s = now.seconds_since(stamp);
         if !(age_s < STALE_S) {
@@ -64,7 +64,7 @@ impl Feed {
         if now.plus_seconds(early_s) < due_at {
             return false;
         }
-        // On the grid, unless it has fallen behind.
+        // Keep a fixed grid, unless it has fallen behind.
         let next = due_at.plus_seconds(self.period_s);
         let behind = next.seconds_since(now) < early_s;
         self.due_at = Some(if behind { now.plus_seconds(self.period_s) } else { next });
@@ -77,13 +77,13 @@ impl Feed {
         true
     }
 
-    /// Returns poses that came too late to be sent.
+    /// Returns the number of poses that were too old to send.
     pub(super) fn stale(&self) -> u64 {
         self.stale
     }
 
-    /// Returns the least latency from measurement to autopilot, `link_s` of it on the link, once a
-    /// window is full. [ms]
+    /// Returns the minimum latency from measurement to autopilot, including `link_s` on the link, once the window is
+    /// full. [ms]
     pub(super) fn delay_ms(&self, link_s: f64) -> Option<f64> {
         if self.ages_s.len() < WINDOW {
             return None;
@@ -112,12 +112,12 @@ mod tests {
                 assert!(n <= hz_out + 0.2 && n > 0.85 * hz_out, "{hz_in} to {hz_out}: {n}");
             }
         }
-        assert_eq!(sent(25.0, 50.0), 250, "what comes slower all goes out");
+        assert_eq!(sent(25.0, 50.0), 250, "slower input is sent completely");
         assert_eq!(sent(100.0, 50.0), 500);
     }
 
     #[test]
-    fn the_least_latency_is_measured_and_compared() {
+    fn measures_the_minimum_latency() {
         let mut feed = Feed::new(50.0);
         let mut now = HostTime::from_ns(1_000_000_000);
         for i in 0..400 {

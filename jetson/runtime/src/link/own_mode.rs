@@ -1,23 +1,23 @@
-//! Whether the vehicle is still in a mode that we have asked for. Once the autopilot has confirmed ours by a heartbeat,
-//! another is the doing of a pilot, of a ground station or of a failsafe: nothing is taken back, in no phase of
-//! flight. To give the vehicle back is a person's to do.
+//! Detects that the vehicle left a mode that we requested. After a heartbeat has confirmed our mode, another mode was
+//! chosen by a pilot, a ground station or a failsafe. The link never changes it back, in any phase of flight. Only a
+//! person may give control back.
 
 use vizflyt_protocol::mavlink::CopterMode;
 
 use super::goal::Goal;
 
-/// What heartbeats tell of the mode.
+/// State derived from the modes in heartbeats.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct OwnMode {
-    /// GUIDED was confirmed.
+    /// GUIDED has been confirmed.
     guided: bool,
-    /// LAND was, since landing is the goal.
+    /// LAND has been confirmed since landing is the goal.
     land: bool,
     taken: Option<u32>,
 }
 
 impl OwnMode {
-    /// Takes the mode of a heartbeat. An acknowledgement is none: it may overtake an older heartbeat.
+    /// Records the mode of a heartbeat. Acknowledgements do not count, because they may overtake an older heartbeat.
     pub(super) fn handle_heartbeat(&mut self, goal: Goal, mode: u32, armed: bool) {
         let is_guided = mode == CopterMode::Guided as u32;
         let is_land = mode == CopterMode::Land as u32;
@@ -25,7 +25,7 @@ impl OwnMode {
             Goal::Prepare => false,
             Goal::TakeOff(_) | Goal::Fly => {
                 self.guided |= is_guided;
-                // One that disarms in flight, as by a restart, has not chosen anything.
+                // A vehicle that disarms in flight, for example after a restart, has not chosen a mode.
                 self.guided && !is_guided && (armed || goal != Goal::Fly)
             }
             Goal::Land => {
@@ -38,12 +38,13 @@ impl OwnMode {
         }
     }
 
-    /// Returns the mode that somebody else has chosen last.
+    /// Returns the mode last chosen by a pilot, a ground station or a failsafe.
     pub(super) fn taken(&self) -> Option<u32> {
         self.taken
     }
 
-    /// Whether nothing is to be commanded for `goal` any more. A landing that somebody else began is only landed.
+    /// Whether the link must not command anything for `goal`. If another party started a landing, only landing is
+    /// allowed.
     pub(super) fn is_hands_off(&self, goal: Goal) -> bool {
         let is_land = |mode: u32| mode == CopterMode::Land as u32;
         self.taken.is_some_and(|mode| goal != Goal::Land || !is_land(mode))
@@ -78,14 +79,14 @@ mod tests {
         check(&[(climb, GUIDED, true), (climb, LOITER, true)], Some(LOITER));
         check(&[(climb, GUIDED, true), (Goal::Fly, LAND, true)], Some(LAND));
         check(&[(climb, GUIDED, true), (Goal::Land, GUIDED, true), (Goal::Land, LAND, true)], None);
-        // Landing was ordered and something else is flown, before LAND was confirmed and after.
+        // Landing was ordered and another mode is active, before and after LAND was confirmed.
         check(&[(Goal::Land, GUIDED, true), (Goal::Land, LOITER, true)], Some(LOITER));
         check(&[(Goal::Land, LAND, true), (Goal::Land, GUIDED, true)], Some(GUIDED));
         check(&[(Goal::Land, LAND, true), (Goal::Land, LOITER, false)], None);
     }
 
     #[test]
-    fn what_was_taken_is_not_ours_again_by_itself() {
+    fn control_is_not_resumed_automatically() {
         let own = after(&[(Goal::Fly, GUIDED, true), (Goal::Fly, LOITER, true)]);
         assert!(own.is_hands_off(Goal::Fly) && own.is_hands_off(Goal::Land));
         let back = after(&[
@@ -94,7 +95,7 @@ mod tests {
             (Goal::Prepare, GUIDED, true),
         ]);
         assert!(back.is_hands_off(Goal::Fly));
-        // A failsafe's landing goes on, until a pilot takes the vehicle out of it.
+        // A landing by a failsafe continues until a pilot changes the mode.
         let mut landing = after(&[(Goal::Fly, GUIDED, true), (Goal::Fly, LAND, true)]);
         assert!(landing.is_hands_off(Goal::Fly) && !landing.is_hands_off(Goal::Land));
         landing.handle_heartbeat(Goal::Land, LAND, true);

@@ -1,5 +1,5 @@
-//! Parameters of the autopilot, read and written: each request is repeated until it is answered, and
-//! a value counts as written when the autopilot confirms it.
+//! Reads and writes parameters of the autopilot: each request is repeated until it is answered, and a value counts as
+//! written when the autopilot confirms it.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,44 +8,41 @@ use vizflyt_protocol::time::HostTime;
 
 use super::dialect::Dialect;
 
-/// A parameter as the autopilot reported it.
+/// Parameter as reported by the autopilot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Param {
-    /// Its value.
     pub value: f64,
-    /// Its type on the wire.
+    /// Type on the wire.
     pub kind: MavParamType,
 }
 
-/// The result of reading or writing.
+/// Result of reading or writing.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ParamEvent {
-    /// All that was asked for has been read, or has no answer.
+    /// All requested parameters have been read, or remained unanswered.
     Read {
-        /// Names that were not answered; the autopilot does not have them.
+        /// Names without a reply; the autopilot does not have them.
         missing: Vec<String>,
-        /// Parameters of a whole list that never came.
+        /// Number of parameters of a complete list that never arrived.
         lost: usize,
     },
-    /// The autopilot has the value now.
+    /// The autopilot has stored the value.
     Written {
-        /// The name.
         name: String,
-        /// The value that it confirms.
+        /// Confirmed value.
         value: f64,
     },
-    /// The autopilot kept another value, or does not answer.
+    /// The autopilot kept another value, or does not reply.
     NotWritten {
-        /// The name.
         name: String,
-        /// What was asked for.
+        /// Requested value.
         asked: f64,
-        /// What it has; `None` without an answer.
+        /// Value of the autopilot; `None` without a reply.
         has: Option<f64>,
     },
 }
 
-/// A request to be sent.
+/// Request to send.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Request {
     List,
@@ -54,15 +51,15 @@ pub(super) enum Request {
     Set { name: String, value: f64, kind: MavParamType },
 }
 
-/// Unanswered for this long: asked again. [s]
+/// Timeout of a request, after which it is repeated. [s]
 const REPEAT_S: f64 = 0.5;
-/// A list that pauses for this long has lost what is missing. [s]
+/// Maximum pause in a list; parameters that are missing then have been lost. [s]
 const LIST_PAUSE_S: f64 = 1.0;
-/// Unanswered this many times: the autopilot does not have it.
+/// Number of attempts, after which the autopilot counts as not having the parameter.
 const TRIES: u8 = 5;
-/// Requests in flight at once; a serial link's buffers hold as many answers.
+/// Maximum number of pending requests; the buffers of a serial link hold as many replies.
 const WINDOW: usize = 8;
-/// Maximum number of values kept; ArduCopter has some 1400.
+/// Maximum number of stored values; ArduCopter has about 1400.
 const MAX_PARAMS: usize = 4096;
 
 #[derive(Clone, Debug)]
@@ -76,7 +73,7 @@ struct PendingRead {
     key: ParamKey,
     tries: u8,
     due_at: HostTime,
-    /// A later request was answered: the autopilot may not have this one.
+    /// A later request was answered: the autopilot may not have this parameter.
     is_overtaken: bool,
 }
 
@@ -88,7 +85,7 @@ struct Writing {
     due_at: HostTime,
 }
 
-/// The list under way.
+/// List in progress.
 #[derive(Clone, Debug)]
 struct List {
     got: Vec<bool>,
@@ -96,7 +93,7 @@ struct List {
     due_at: HostTime,
 }
 
-/// Reader and writer.
+/// Reader and writer of parameters.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Params {
     known: BTreeMap<String, Param>,
@@ -107,17 +104,17 @@ pub(super) struct Params {
     writing: Option<Writing>,
     missing: Vec<String>,
     lost: usize,
-    /// Something was asked for and not yet reported.
+    /// A request has not been reported yet.
     open: bool,
 }
 
 impl Params {
-    /// Returns what is known, by name.
+    /// Returns the values read so far, by name.
     pub(super) fn known(&self) -> &BTreeMap<String, Param> {
         &self.known
     }
 
-    /// Forgets everything, as after a restart; requests under way are dropped.
+    /// Drops all values and pending requests, for example after a restart.
     pub(super) fn forget(&mut self) {
         *self = Self::default();
     }
@@ -128,24 +125,24 @@ impl Params {
         (self.open, self.lost) = (true, 0);
     }
 
-    /// Reads some by name.
+    /// Reads parameters by name.
     pub(super) fn read(&mut self, names: &[&str]) {
         self.queue.extend(names.iter().map(|&name| ParamKey::Name(name.to_owned())));
         self.open = true;
     }
 
-    /// Writes one; it is read first if its type is not known.
+    /// Writes a parameter; reads it first if its type is unknown.
     pub(super) fn write(&mut self, name: &str, value: f64) {
         self.writes.push_back((name.to_owned(), value));
     }
 
-    /// Whether anything is under way.
+    /// Whether reading or writing is in progress.
     pub(super) fn is_busy(&self) -> bool {
         self.open || !self.writes.is_empty() || self.writing.is_some()
     }
 
-    /// Whether the link is busy with parameters. Repeated requests for names that the autopilot may not have, two a
-    /// second, leave it free.
+    /// Whether parameters occupy the link. Repeated requests for names that the autopilot may not have, two a second,
+    /// do not.
     pub(super) fn is_talking(&self) -> bool {
         self.list.is_some()
             || !self.queue.is_empty()
@@ -154,7 +151,7 @@ impl Params {
             || self.writing.is_some()
     }
 
-    /// Takes a value; returns what it completes.
+    /// Handles a value; returns the event that it completes.
     pub(super) fn handle(
         &mut self,
         now: HostTime,
@@ -184,12 +181,12 @@ impl Params {
             self.writing = None;
             return Some(ParamEvent::Written { name, value });
         }
-        // Clamped or refused: asked again, as it may be an answer to an earlier request.
+        // Clamped or rejected: retry, because it may be the reply to an earlier request.
         writing.due_at = writing.due_at.min(now.plus_seconds(0.1));
         None
     }
 
-    /// Ticks an entry of the list off.
+    /// Marks an entry of the list as received.
     fn note(&mut self, now: HostTime, index: u16, count: u16) {
         let Some(list) = &mut self.list else { return };
         if list.got.is_empty() && count > 0 && usize::from(count) <= MAX_PARAMS {
@@ -201,7 +198,7 @@ impl Params {
         }
     }
 
-    /// Returns when [`Self::poll`] has something to do next.
+    /// Returns the time at which [`Self::poll`] is due next.
     pub(super) fn due_at(&self) -> Option<HostTime> {
         let list = self.list.as_ref().map(|list| list.due_at);
         let writing = self.writing.as_ref().map(|writing| writing.due_at);
@@ -209,7 +206,7 @@ impl Params {
         asked.chain(list).chain(writing).min_by(|a, b| a.as_ns().cmp(&b.as_ns()))
     }
 
-    /// Does what is due: hands requests to `send`, returns what is complete.
+    /// Runs what is due: passes requests to `send`, returns a completed event.
     pub(super) fn poll(
         &mut self,
         now: HostTime,
@@ -241,7 +238,7 @@ impl Params {
             list.due_at = now.plus_seconds(2.0 * LIST_PAUSE_S);
             return send(Request::List);
         }
-        // The holes one by one.
+        // Request the missing entries one by one.
         let holes = list.got.iter().enumerate().filter(|(_, got)| !**got);
         self.queue.extend(holes.map(|(index, _)| ParamKey::Index(index as u16)));
         if list.got.is_empty() {
@@ -304,7 +301,7 @@ impl Params {
                 let kind = known.kind;
                 Request::Set { name: writing.name.clone(), value: writing.value, kind }
             }
-            // Its type decides how the value travels.
+            // The encoding of the value depends on the type.
             None => Request::ByName(writing.name.clone()),
         });
         None
@@ -318,7 +315,7 @@ fn request(key: &ParamKey) -> Request {
     }
 }
 
-/// Whether two values are one to a float on the wire.
+/// Whether two values are equal within the precision of a float on the wire.
 pub fn same(a: f64, b: f64) -> bool {
     (a - b).abs() <= 1e-5 * a.abs().max(b.abs()).max(1e-3)
 }
@@ -338,7 +335,7 @@ mod tests {
         names
     };
 
-    /// An autopilot with 40 parameters on a line that loses every `loses`-th answer.
+    /// Autopilot with 40 parameters on a line that loses every `loses`-th reply.
     struct LossyLink {
         params: Params,
         now: HostTime,
@@ -389,7 +386,7 @@ mod tests {
                             }
                         }
                         Request::ByIndex(index) => self.answer(usize::from(index), index),
-                        // ArduCopter answers a name without its index.
+                        // ArduCopter replies to a name without the index.
                         Request::ByName(name) => {
                             if let Some(index) = find(&name) {
                                 self.answer(index, u16::MAX);

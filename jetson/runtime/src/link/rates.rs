@@ -4,31 +4,31 @@ use vizflyt_protocol::time::HostTime;
 
 use super::dialect::Interval;
 
-/// A stream and its rate.
+/// Stream and its rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rate {
     /// Message id.
     pub id: u32,
-    /// Requested. [Hz]
+    /// Requested rate. [Hz]
     pub asked_hz: f64,
-    /// Received, over the last window; 0 before the first. [Hz]
+    /// Received rate in the last window; 0 before the first. [Hz]
     pub achieved_hz: f64,
 }
 
-/// What to do about a stream that is too slow.
+/// Action for a stream that is too slow.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum RateAction {
     /// Request it again.
     Request(Interval),
-    /// Requests did not help.
+    /// The rate is still too low after the requests.
     Slow(Rate),
 }
 
-/// Counts over this long. [s]
+/// Duration of a counting window. [s]
 const WINDOW_S: f64 = 2.0;
-/// Share of the rate that will do: schedulers round intervals to their ticks.
+/// Sufficient share of the requested rate: schedulers round periods to their ticks.
 const ENOUGH: f64 = 0.8;
-/// Requested again this often before it is reported.
+/// Number of repeated requests before a report.
 const REQUESTS: u8 = 2;
 
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +40,7 @@ struct Row {
     reported: bool,
 }
 
-/// The requested streams.
+/// Requested streams.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Rates {
     rows: Vec<Row>,
@@ -48,7 +48,7 @@ pub(super) struct Rates {
 }
 
 impl Rates {
-    /// Watches a stream that the autopilot has agreed to.
+    /// Monitors a stream that the autopilot has accepted.
     pub(super) fn watch(&mut self, now: HostTime, (id, interval_us): Interval) {
         self.since = now;
         for row in &mut self.rows {
@@ -73,7 +73,7 @@ impl Rates {
         self.rows.iter().map(|row| row.rate)
     }
 
-    /// Checks the rates once a window is over; calls `act` with what is to be done.
+    /// Checks the rates at the end of a window; calls `act` for each necessary action.
     pub(super) fn check(&mut self, now: HostTime, mut act: impl FnMut(RateAction)) {
         let window_s = now.seconds_since(self.since);
         if window_s < WINDOW_S {
@@ -111,7 +111,7 @@ mod tests {
             for tick in 0..100 {
                 now = now.plus_seconds(0.02);
                 rates.received(30);
-                // 32 comes at 10 Hz, and recovers in the end.
+                // 32 arrives at 10 Hz, and recovers in the last window.
                 if tick % 5 == 0 || window == 5 {
                     rates.received(32);
                 }

@@ -1,6 +1,6 @@
-//! Handles packets of the autopilot, and of others on its network.
+//! Handles packets of the autopilot, and of other senders on its network.
 
-// Why: MISSION_REQUEST is superseded on paper, and what ArduCopter sends.
+// Why: MISSION_REQUEST is formally superseded, but ArduCopter sends it.
 #![allow(deprecated)]
 
 use std::collections::VecDeque;
@@ -25,15 +25,15 @@ use super::{
     COMPONENT_ID, Firmware, Link, LinkEvent, Prearm, SECOND_S, SYSTEM_ID, Target, dialect,
 };
 
-/// A boot clock that falls by more than this has restarted. [ms]
+/// Minimum decrease of the boot clock that counts as a restart. [ms]
 const REBOOT_MS: u32 = 1000;
-/// Texts remembered for refusals.
+/// Maximum number of texts stored for rejections.
 const TEXTS: usize = 8;
-/// Clock requests remembered: answers to them come within as many seconds.
+/// Maximum number of clock requests stored: replies arrive within as many seconds.
 const CLOCK_REQUESTS: usize = 8;
-/// An acknowledgement this long after our command is not ours. [s]
+/// Maximum time from our command to its acknowledgement; later ones are not ours. [s]
 const ACK_BELONGS_S: f64 = 10.0;
-/// What pre-arm texts begin with.
+/// Prefix of pre-arm texts.
 const PREARM: &str = "PreArm: ";
 
 impl Link {
@@ -43,7 +43,7 @@ impl Link {
             self.handle_heartbeat(now, from, heartbeat);
             return;
         }
-        // Packets of ground stations, gimbals and other vehicles on the same network are ignored.
+        // Ignore packets of ground stations, gimbals and other vehicles on the same network.
         if self.autopilot != Some(from) {
             if let MavMessage::STATUSTEXT(message) = &packet.message {
                 let text = message.text.to_str().unwrap_or_default();
@@ -84,7 +84,7 @@ impl Link {
             }
             MavMessage::SYS_STATUS(message) => self.handle_sys_status(message),
             MavMessage::EKF_STATUS_REPORT(message) => self.ekf = message.flags,
-            // The same bits by another name.
+            // The same bits with different names.
             MavMessage::ESTIMATOR_STATUS(message) => {
                 self.ekf = EkfStatusFlags::from_bits_truncate(message.flags.bits());
             }
@@ -127,7 +127,7 @@ impl Link {
                 self.forget();
                 self.params.read(dialect.watched());
                 self.announced_at = None;
-                // The origin and the clocks' relation need not wait for the next beat.
+                // Send the origin and a clock request now, not at the next second.
                 self.beat_at = self.beat_at.min(now);
                 self.events.push_back(LinkEvent::Connected { system: from.system });
             }
@@ -156,7 +156,7 @@ impl Link {
         self.own_mode.handle_heartbeat(self.goal, mode, armed);
     }
 
-    /// Drops what a restarted autopilot does not know any more.
+    /// Drops state that a restarted autopilot no longer has.
     fn forget(&mut self) {
         self.origin = None;
         self.fence.restart();
@@ -178,7 +178,7 @@ impl Link {
         let intervals = self.dialect.intervals().iter();
         self.chores = intervals.map(|&(id, period_us)| Command::Interval(id, period_us)).collect();
         self.chores.push_back(Command::Message(AUTOPILOT_VERSION));
-        // A vehicle that fell out of the sky is not to rise again by itself.
+        // A vehicle that crashed must not take off again by itself.
         self.goal_is_stale = matches!(self.goal, super::Goal::TakeOff(_) | super::Goal::Fly);
     }
 
@@ -186,7 +186,7 @@ impl Link {
         if boot_ms.saturating_add(REBOOT_MS) < self.boot_ms {
             self.events.push_back(LinkEvent::Rebooted);
             self.forget();
-            // In which mode it starts is nobody's choice.
+            // The mode after a restart was not chosen by anyone.
             self.own_mode = super::OwnMode::default();
             self.params.read(self.dialect.watched());
         }
@@ -206,7 +206,7 @@ impl Link {
             return;
         }
         let stamp = self.measured_at(now, boot_us.saturating_mul(1000));
-        // Readers find new samples by their stamps, so these must rise.
+        // Consumers detect new samples by their stamps, so these must increase.
         if self.imu.back().is_some_and(|newest| newest.stamp >= stamp) {
             return;
         }
@@ -216,8 +216,8 @@ impl Link {
         self.imu.push_back(ImuSample { stamp, accel_mps2: accel, gyro_radps: gyro });
     }
 
-    /// Returns when something was measured of which the autopilot says so on its clock; `now` as
-    /// long as that clock is not known, and never later.
+    /// Converts a time of the autopilot's clock; `now` while the offset of that clock is unknown, and never later than
+    /// `now`.
     fn measured_at(&self, now: HostTime, boot_ns: u64) -> HostTime {
         let at = self.clock.to_local(AutopilotTime::from_ns(boot_ns));
         at.filter(|&at| now.seconds_since(at).abs() < SECOND_S).map_or(now, |at| at.min(now))
@@ -261,7 +261,7 @@ impl Link {
         let to = (message.target_system, message.target_component);
         let is_ours = self.clock_asked.contains(&message.ts1);
         if !is_ours {
-            // Older autopilots do not name the receiver of their reply.
+            // Older autopilots do not set the receiver of their reply.
             if to != (0, 0) {
                 self.companions.answer(now, to);
             }
@@ -273,7 +273,7 @@ impl Link {
         }
     }
 
-    /// Remembers a clock request, so that its answer is known.
+    /// Stores a clock request, so that its reply is recognized.
     pub(super) fn note_clock_request(&mut self, stamp_ns: i64) {
         if self.clock_asked.len() == CLOCK_REQUESTS {
             self.clock_asked.pop_front();
@@ -292,7 +292,7 @@ impl Link {
     }
 
     fn handle_ack(&mut self, now: HostTime, ack: &COMMAND_ACK_DATA) {
-        // Acknowledgements to other companions name them; zero is the old form, for everyone.
+        // Acknowledgements contain the companion's address; zero is the old form, for all.
         let to = (ack.target_system, ack.target_component);
         let for_us = (to.0 == 0 || to.0 == SYSTEM_ID) && (to.1 == 0 || to.1 == COMPONENT_ID);
         let asked = self
@@ -313,7 +313,7 @@ impl Link {
         }
     }
 
-    /// Takes the commanded state as reached; the next heartbeat corrects it if it is not.
+    /// Assumes that the commanded state is reached; the next heartbeat corrects it if not.
     fn accepted(&mut self, now: HostTime, command: Command) {
         match command {
             Command::Mode(mode) => self.state.mode = mode as u32,
@@ -335,7 +335,7 @@ impl Link {
         }
     }
 
-    /// The take-off is under way.
+    /// Records that the take-off has begun.
     pub(super) fn rose(&mut self) {
         self.took_off = true;
         self.events.push_back(LinkEvent::TakingOff);
@@ -343,7 +343,7 @@ impl Link {
 
     pub(super) fn given_up(&mut self, now: HostTime, command: Command, why: &str) {
         if command.is_chore() {
-            // An autopilot that does not send it at our rate may still send it at its own.
+            // An autopilot that rejects our rate may still send the message at its own rate.
             self.chores.pop_front();
             return;
         }
@@ -351,13 +351,13 @@ impl Link {
         self.events.push_back(LinkEvent::Refused(text));
     }
 
-    /// Tells what became of reading and writing parameters.
+    /// Reports the result of reading or writing parameters.
     pub(super) fn param_event(&mut self, event: ParamEvent) {
         self.events.push_back(LinkEvent::Param(event));
     }
 }
 
-/// AUTOPILOT_VERSION's id.
+/// Message id of AUTOPILOT_VERSION.
 const AUTOPILOT_VERSION: u32 = 148;
 
 fn remember(texts: &mut VecDeque<(HostTime, String)>, now: HostTime, text: String) {
@@ -367,7 +367,7 @@ fn remember(texts: &mut VecDeque<(HostTime, String)>, now: HostTime, text: Strin
     texts.push_back((now, text));
 }
 
-/// Joins texts that came in several parts (STATUSTEXT's `id` and `chunk_seq`).
+/// Joins texts that arrive in several parts (`id` and `chunk_seq` of STATUSTEXT).
 #[derive(Clone, Debug, Default)]
 pub(super) struct TextParts {
     id: u16,
@@ -375,13 +375,13 @@ pub(super) struct TextParts {
     text: String,
 }
 
-/// Bytes of one part; a shorter one is the last.
+/// Size of one part in bytes; a shorter part is the last.
 const PART: usize = 50;
-/// Parts joined at most.
+/// Maximum number of parts.
 const PARTS: u8 = 8;
 
 impl TextParts {
-    /// Returns the whole text once its last part is there. A part that is missing is shown as "...".
+    /// Returns the text after its last part. A missing part is shown as "...".
     fn join(&mut self, message: &STATUSTEXT_DATA) -> Option<String> {
         let part = message.text.to_str().unwrap_or("(not UTF-8)");
         if message.id == 0 {

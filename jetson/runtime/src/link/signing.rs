@@ -1,8 +1,8 @@
-//! Signing on this link: the key and its file, and what is refused.
+//! Signing on this link: the key file, and rejected packets.
 //!
-//! The key is 64 hexadecimal digits in a file that only its owner reads; beside it stands the stamp
-//! that the next run starts from, so that a computer whose clock was reset does not sign with stamps
-//! that the autopilot has seen.
+//! The key is 64 hexadecimal digits in a file that only its owner can read. A second file next to it stores the time
+//! stamp from which the next run starts, so that a computer with a reset clock does not reuse stamps that the autopilot
+//! has already seen.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -26,24 +26,24 @@ pub(super) struct Signatures {
     made_at: HostTime,
     start: SigningTime,
     accepts_unsigned: bool,
-    /// By their faults.
+    /// Rejected packets by fault.
     refused: Vec<Refused>,
 }
 
-/// Packets refused for one fault.
+/// Packets rejected for one fault.
 #[derive(Clone, Copy, Debug)]
 struct Refused {
     fault: SigningFault,
     count: u64,
-    /// So many were reported.
+    /// Number of packets already reported.
     reported: u64,
-    /// When others may be.
+    /// Time of the next report.
     due_at: HostTime,
-    /// From that report to the next. [s]
+    /// Time between that report and the one after it. [s]
     pause_s: f64,
 }
 
-/// From the first report of a fault to the second; each further pause is twice as long. [s]
+/// Time between the first and the second report of a fault; each further interval is twice as long. [s]
 const FIRST_PAUSE_S: f64 = 10.0;
 
 impl Signatures {
@@ -72,8 +72,8 @@ impl Signatures {
         self.signer.sign(time, buffer, len)
     }
 
-    /// Whether a packet is accepted. RADIO_STATUS is, unsigned: a bridge has no key (MAVLink
-    /// guide, "Accepting Unsigned Packets").
+    /// Whether a packet is accepted. RADIO_STATUS is accepted unsigned, because a bridge has no key (MAVLink guide,
+    /// "Accepting Unsigned Packets").
     pub(super) fn accepts(&mut self, now: HostTime, bytes: &[u8], message: &MavMessage) -> bool {
         if self.accepts_unsigned || matches!(message, MavMessage::RADIO_STATUS(_)) {
             return true;
@@ -101,8 +101,8 @@ impl Signatures {
         self.refused.iter().map(|refused| refused.count).sum()
     }
 
-    /// Returns a fault that is to be reported at `now`, and how many packets had it so far: each fault
-    /// at once, then at growing intervals, and only if more packets came with it.
+    /// Returns a fault to report at `now` and its number of packets: each fault at once, then at growing intervals, and
+    /// only after further packets.
     pub(super) fn poll_refused(&mut self, now: HostTime) -> Option<(SigningFault, u64)> {
         let is_due =
             |refused: &&mut Refused| refused.count > refused.reported && now >= refused.due_at;
@@ -114,53 +114,50 @@ impl Signatures {
     }
 }
 
-/// The key's file.
+/// Key file.
 #[derive(Clone, Debug)]
 pub struct SigningFile {
     path: PathBuf,
 }
 
-/// Why the key's file cannot be used.
+/// Why the key file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum SigningFileError {
-    /// Not read or written.
+    /// Reading or writing failed.
     #[error("{path}: {why}", path = .path.display())]
     Unusable {
-        /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         why: std::io::Error,
     },
-    /// It holds something else.
+    /// The file does not contain a key.
     #[error(
-        "{path} holds no key of 64 hexadecimal digits; make one with `vizflyt vehicle sign`",
+        "{path} contains no key of 64 hexadecimal digits; create one with `vizflyt vehicle sign`",
         path = .path.display()
     )]
     NoKey {
-        /// The file.
         path: PathBuf,
     },
-    /// Others can read it.
-    #[error("{path} can be read by others; `chmod 600` it, and make a new key", path = .path.display())]
+    /// Other users can read the file.
+    #[error("{path} can be read by others; `chmod 600` it, and create a new key", path = .path.display())]
     Open {
-        /// The file.
         path: PathBuf,
     },
 }
 
-/// Put between the stamps of two runs where the clock fell back: longer than a flight. [us]
+/// Added to the last stamp if the clock was reset: longer than a flight. [us]
 const RESERVE_US: u64 = 3_600_000_000;
 
 impl SigningFile {
-    /// Names a file; nothing is read yet.
+    /// Creates a handle for a file; reads nothing.
     pub fn new(path: &Path) -> Self {
         Self { path: path.to_owned() }
     }
 
-    /// Writes a new key.
+    /// Writes a new key file.
     ///
     /// # Errors
-    /// If the file is there already, or cannot be written.
+    /// Fails if the file exists or cannot be written.
     pub fn create(&self, key: &SigningKey) -> Result<(), SigningFileError> {
         let hex = vizflyt_trust::hex(key.bytes());
         let written = OpenOptions::new()
@@ -172,10 +169,10 @@ impl SigningFile {
         written.map_err(|why| self.unusable(why))
     }
 
-    /// Reads the key, and takes the stamp that this run starts from.
+    /// Reads the key and determines the first time stamp of this run.
     ///
     /// # Errors
-    /// If there is no key, others can read it, or the stamp cannot be kept.
+    /// Fails if there is no key, other users can read it, or the stamp cannot be stored.
     pub fn open(&self) -> Result<LinkSigning, SigningFileError> {
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         self.open_at(SigningTime::from_unix_us(since_1970.as_micros() as u64))
@@ -219,7 +216,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_is_kept_for_its_owner_and_stamps_never_fall_back() {
+    fn keys_are_private_and_stamps_never_decrease() {
         let folder = tempfile::tempdir().unwrap();
         let file = SigningFile::new(&folder.path().join("mavlink.key"));
         let key = SigningKey::new(core::array::from_fn(|i| 200 + i as u8));

@@ -1,6 +1,6 @@
-//! The link against a scripted autopilot on a virtual clock.
+//! Tests of the link against a scripted autopilot on a virtual clock.
 
-// Why: SET_GPS_GLOBAL_ORIGIN is superseded on paper (2025-04) and what every ArduCopter accepts.
+// Why: SET_GPS_GLOBAL_ORIGIN is formally superseded (2025-04), but every ArduCopter accepts it.
 #![allow(deprecated)]
 
 mod distances;
@@ -25,7 +25,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::*;
 
-/// The autopilot's end of the link.
+/// Autopilot's end of the link.
 struct Script {
     link: Link,
     now: HostTime,
@@ -36,13 +36,13 @@ struct Script {
     kind: MavAutopilot,
     mode: u32,
     armed: bool,
-    /// How commands are answered; `None` is silence.
+    /// Reply to a command; `None`: the script stays silent.
     answer: fn(MavCmd) -> Option<MavResult>,
     chunk: usize,
 }
 
 const AUTOPILOT: (u8, u8) = (1, 1);
-/// Commands that no goal asks for.
+/// Commands that no goal needs.
 const CHORES: [MavCmd; 3] = [
     MavCmd::MAV_CMD_SET_MESSAGE_INTERVAL,
     MavCmd::MAV_CMD_REQUEST_MESSAGE,
@@ -76,7 +76,7 @@ impl Script {
         }
     }
 
-    /// One that is connected and may be armed.
+    /// Returns a script that is connected and ready to arm.
     fn ready() -> Self {
         let mut script = Self::new();
         script.heartbeat();
@@ -145,7 +145,7 @@ impl Script {
         }));
     }
 
-    /// Takes what the link sent, answers its commands.
+    /// Receives what the link sent and answers its commands.
     fn drain(&mut self) {
         loop {
             let mut received = Vec::new();
@@ -195,7 +195,7 @@ impl Script {
         }
     }
 
-    /// Lets time pass in ticks of 20 ms, with a heartbeat a second.
+    /// Advances time in ticks of 20 ms, with one heartbeat a second.
     fn run(&mut self, seconds: f64) {
         for tick in 0..(seconds * 50.0) as usize {
             self.now = self.now.plus_ns(20_000_000);
@@ -207,7 +207,7 @@ impl Script {
         }
     }
 
-    /// Lets time pass in silence.
+    /// Advances time without heartbeats and replies.
     fn run_silently(&mut self, seconds: f64) {
         let answer = std::mem::replace(&mut self.answer, |_| None);
         for _ in 0..(seconds * 50.0) as usize {
@@ -285,8 +285,8 @@ fn sends_the_sequence_that_a_real_arducopter_accepted() {
 }
 
 #[test]
-fn a_mode_that_somebody_else_chose_is_never_taken_back() {
-    // Of ArduCopter's: STABILIZE, ALT_HOLD, LOITER, RTL, LAND, BRAKE, and one that we have no name for.
+fn never_overrides_a_mode_that_was_not_requested() {
+    // ArduCopter's STABILIZE, ALT_HOLD, LOITER, RTL, LAND, BRAKE, and one without a name here.
     for mode in [0, 2, 5, 6, 9, 17, 16] {
         for phase in 0..4 {
             let mut script = Script::ready();
@@ -295,7 +295,7 @@ fn a_mode_that_somebody_else_chose_is_never_taken_back() {
             match phase {
                 1 => script.link.set_goal(script.now, Goal::Fly),
                 2 => script.link.set_goal(script.now, Goal::Land),
-                // LAND was ordered, and nobody has answered yet.
+                // LAND was ordered, but not acknowledged yet.
                 3 => {
                     script.answer = |_| None;
                     script.link.set_goal(script.now, Goal::Land);
@@ -308,7 +308,7 @@ fn a_mode_that_somebody_else_chose_is_never_taken_back() {
             script.drain();
             script.answer = accept;
             let before = script.commands().len();
-            // A heartbeat comes as soon as the mode changes.
+            // ArduCopter sends a heartbeat at once when the mode changes.
             script.mode = mode;
             script.heartbeat();
             script.run(20.0);
@@ -341,7 +341,7 @@ fn reports_what_arming_waits_for() {
 }
 
 #[test]
-fn the_origin_is_sent_every_second_until_confirmed() {
+fn sends_the_origin_every_second_until_confirmed() {
     let mut script = Script::new();
     script.heartbeat();
     let origins = |script: &Script| {
@@ -357,7 +357,7 @@ fn the_origin_is_sent_every_second_until_confirmed() {
 }
 
 #[test]
-fn an_autopilot_that_comes_later_gets_the_origin_at_once() {
+fn sends_the_origin_at_once_to_an_autopilot_that_connects_later() {
     let mut script = Script::new();
     script.run_silently(0.5);
     script.heartbeat();
@@ -367,7 +367,7 @@ fn an_autopilot_that_comes_later_gets_the_origin_at_once() {
 }
 
 #[test]
-fn an_unanswered_command_is_repeated_with_a_count_and_given_up() {
+fn repeats_an_unanswered_command_with_a_count_and_gives_up() {
     let mut script = Script::ready();
     script.answer = |_| None;
     script.link.set_goal(script.now, Goal::TakeOff(1.0));
@@ -407,7 +407,7 @@ fn refusal_is_retried_then_reported_with_the_autopilots_text_and_advice() {
 }
 
 #[test]
-fn temporary_refusal_does_no_harm() {
+fn retries_after_a_temporary_rejection() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_NAV_TAKEOFF => Some(MavResult::MAV_RESULT_TEMPORARILY_REJECTED),
@@ -442,7 +442,7 @@ fn landing_is_never_given_up_and_tries_both_ways() {
 }
 
 #[test]
-fn arming_under_way_is_dropped_when_the_goal_becomes_landing() {
+fn stops_arming_when_the_goal_becomes_landing() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_COMPONENT_ARM_DISARM => None,
@@ -464,11 +464,11 @@ fn silence_is_reported_and_the_connection_resumes() {
     assert!(!script.link.setpoint(script.now, &hover()));
     script.heartbeat();
     assert!(script.events.ends_with(&[LinkEvent::Connected { system: 1 }]));
-    assert!(script.link.ready_to_arm(script.now).is_err(), "it may have restarted meanwhile");
+    assert!(script.link.ready_to_arm(script.now).is_err(), "it may have restarted");
 }
 
 #[test]
-fn a_restart_is_noticed_by_its_boot_clock() {
+fn detects_a_restart_by_the_boot_clock() {
     let mut script = Script::ready();
     let at = |time_boot_ms| {
         MavMessage::LOCAL_POSITION_NED(LOCAL_POSITION_NED_DATA {
@@ -478,14 +478,14 @@ fn a_restart_is_noticed_by_its_boot_clock() {
     };
     script.inject(&at(90_000));
     script.inject(&at(89_990));
-    assert_eq!(script.link.ready_to_arm(script.now), Ok(()), "packets out of order are no restart");
+    assert_eq!(script.link.ready_to_arm(script.now), Ok(()), "reordered packets are not a restart");
     script.inject(&at(500));
     assert!(script.events.ends_with(&[LinkEvent::Rebooted]));
     assert!(script.link.ready_to_arm(script.now).unwrap_err().contains("origin"));
 }
 
 #[test]
-fn packets_of_others_on_the_network_are_ignored() {
+fn ignores_packets_of_other_senders_on_the_network() {
     let mut script = Script::new();
     let gcs = HEARTBEAT_DATA {
         mavtype: MavType::MAV_TYPE_GCS,
@@ -504,7 +504,7 @@ fn packets_of_others_on_the_network_are_ignored() {
     assert!(!script.link.state().armed, "that was another vehicle");
     script.inject_from((2, 1), &MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA::default()));
     let missing = |script: &Script| script.link.ready_to_arm(script.now).unwrap_err();
-    assert!(missing(&script).contains("systems 1 and 2"), "which one is meant");
+    assert!(missing(&script).contains("systems 1 and 2"), "two autopilots");
     script.run(4.0);
     assert!(missing(&script).contains("origin"), "it has gone");
 }
@@ -514,7 +514,7 @@ fn hover() -> GuidedSetpoint {
 }
 
 #[test]
-fn poses_are_passed_on_at_fifty_a_second() {
+fn sends_poses_at_50_hz() {
     let mut script = Script::ready();
     let pose = Pose::new(DVec3::new(1.0, 2.0, 0.05), DQuat::IDENTITY);
     let sample = PoseSample {
@@ -545,7 +545,7 @@ fn poses_are_passed_on_at_fifty_a_second() {
 }
 
 #[test]
-fn clocks_are_related_in_both_directions() {
+fn synchronizes_clocks_in_both_directions() {
     let mut script = Script::ready();
     let ahead_ns = 77_000_000_000i64;
     let request = script
@@ -566,16 +566,16 @@ fn clocks_are_related_in_both_directions() {
         let theirs = script.link.clock().to_remote(script.now).unwrap();
         theirs.as_ns() as i64 - script.now.as_ns() as i64
     };
-    // The answer came when the clock stood within 1.1 s of the request.
+    // The reply arrived when the clock was within 1.1 s of the request.
     assert!((offset(&script) - ahead_ns).abs() < 1_100_000_000, "{}", offset(&script));
-    // Its own request is answered.
+    // The link answers a request of the autopilot.
     script.sent.clear();
     script.inject(&MavMessage::TIMESYNC(TIMESYNC_DATA { tc1: 0, ts1: 4711, ..Default::default() }));
     assert!(matches!(script.sent[..], [MavMessage::TIMESYNC(ref m)]
         if m.ts1 == 4711 && m.tc1 == script.now.as_ns() as i64));
 }
 
-/// A flight's worth of telemetry, in bytes.
+/// Returns the telemetry of a flight as bytes.
 fn telemetry(script: &mut Script) -> Vec<u8> {
     let messages = [
         MavMessage::HEARTBEAT(HEARTBEAT_DATA {
@@ -595,7 +595,7 @@ fn telemetry(script: &mut Script) -> Vec<u8> {
 }
 
 #[test]
-fn telemetry_is_read_at_every_chunk_size() {
+fn parses_telemetry_in_chunks_of_every_size() {
     let bytes = telemetry(&mut Script::new());
     for chunk in 1..=bytes.len() {
         let mut link = Link::new(HostTime::ZERO);
@@ -613,7 +613,7 @@ fn telemetry_is_read_at_every_chunk_size() {
 }
 
 proptest! {
-    /// No bytes make the link panic, and none make it arm by itself.
+    /// No input makes the link panic or arm.
     #[test]
     fn garbage_is_harmless(garbage in prop::collection::vec(any::<u8>(), 0..600), chunk in 1usize..99) {
         let mut script = Script::ready();

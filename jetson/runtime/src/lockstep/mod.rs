@@ -1,5 +1,5 @@
-//! The companion on a virtual clock, with a plugin that is waited for: what graded flights run on
-//! (`vizflyt grade`). Replays use the same [`PluginProcess`].
+//! Driver of the companion on a virtual clock, which waits for the plugin: for graded flights (`vizflyt grade`).
+//! Replays use the same [`PluginProcess`].
 //!
 //! ```text
 //! MAVLink bytes, poses, events, now ──▶ Companion ──▶ MAVLink bytes, events
@@ -7,9 +7,8 @@
 //!                       messages, senses ▼      │ reply, a fixed virtual time later
 //! images ──▶ observation ──▶ PluginProcess (its own process, confined)
 //! ```
-//! Whoever calls it owns time: here nothing waits but [`PluginProcess`], for the plugin alone. So what
-//! is decided depends on what goes in, not on how fast a computer is. Server and companion are one
-//! computer here: their clocks are one.
+//! The caller controls time. Only [`PluginProcess`] blocks, and only for the plugin. Therefore the results depend on
+//! the inputs, not on the speed of the computer. Server and companion run on the same computer, with one clock.
 
 mod own_time;
 mod process;
@@ -34,38 +33,38 @@ use crate::stream::{NewestReadings, Reading, ServerClock};
 
 pub use process::{LineSink, PluginProcess, ProcessError};
 
-/// A plugin's reply to an observation.
+/// Reply of a plugin to an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reply {
-    /// The observation's number.
+    /// Number of the observation.
     pub seq: u64,
-    /// The plugin's setpoint, if it sent one.
+    /// Setpoint, if the plugin sent one.
     pub setpoint: Option<Setpoint>,
 }
 
-/// A companion and its plugin's process on a virtual clock. See the module.
+/// Companion and its plugin's process on a virtual clock; see the module.
 #[derive(Debug)]
 pub struct Lockstep {
-    /// The companion, for its inputs and outputs other than the plugin's.
+    /// Companion, for inputs and outputs other than the plugin's.
     pub companion: Companion,
     process: Option<PluginProcess>,
     senses: Senses,
-    /// From an observation until its reply counts. [ns]
+    /// Delay from an observation until its reply takes effect. [ns]
     reply_after_ns: i64,
-    /// Replies on their way to the companion, and when they count.
+    /// Replies that have not taken effect yet, with the time at which they do.
     replies: VecDeque<(HostTime, Reply)>,
     log: Option<VirtualLog>,
     sensors: Vec<SensorInfo>,
-    /// The newest of each sensor, for the next observation.
+    /// Newest reading of each sensor, for the next observation.
     readings: NewestReadings,
     odometry_gate: OdometryGate,
-    /// Estimates of the plugin that nobody has taken yet.
+    /// Estimates of the plugin that the caller has not taken yet.
     odometry: Vec<Odometry>,
 }
 
 impl Lockstep {
-    /// Makes the companion of a flight in `arena` that begins at `now`; its plugin is `process`, and each
-    /// reply counts `reply_after_ns` after its observation. [ns]
+    /// Creates the companion of a flight in `arena` that begins at `now`; its plugin is `process`, and each reply takes
+    /// effect `reply_after_ns` after its observation. [ns]
     pub fn new(
         now: HostTime,
         arena: &ArenaInfo,
@@ -93,30 +92,30 @@ impl Lockstep {
         }
     }
 
-    /// Logs this flight from now on.
+    /// Starts to log this flight.
     pub fn set_log(&mut self, log: VirtualLog) {
         self.log = Some(log);
     }
 
-    /// Returns the log, for what only the caller knows: poses, events, lines of the plugin.
+    /// Returns the log, for data of the caller: poses, events, lines of the plugin.
     pub fn log(&mut self) -> Option<&mut VirtualLog> {
         self.log.as_mut()
     }
 
-    /// Returns the log, to be finished.
+    /// Takes the log, to finish it.
     pub fn take_log(&mut self) -> Option<VirtualLog> {
         self.log.take()
     }
 
-    /// Returns the estimates that the plugin has published since the last call.
+    /// Takes the estimates that the plugin has published since the last call.
     pub fn take_odometry(&mut self) -> Vec<Odometry> {
         std::mem::take(&mut self.odometry)
     }
 
-    /// Greets the plugin and waits until it is ready. One that fails ends the flight.
+    /// Greets the plugin and waits until it is ready. If the plugin fails, the flight ends.
     ///
     /// # Errors
-    /// [`ProcessError`], except for a plugin that fails.
+    /// Returns [`ProcessError`], except for a failure of the plugin.
     pub fn begin(&mut self, now: HostTime, line: LineSink<'_>) -> Result<(), ProcessError> {
         let (Some(process), Some(start)) = (&mut self.process, self.companion.poll_plugin()) else {
             return Ok(());
@@ -131,7 +130,7 @@ impl Lockstep {
         Ok(())
     }
 
-    /// Takes a sensor's reading, which the plugin gets with its next images.
+    /// Handles a sensor's reading, which the plugin receives with its next images.
     pub fn take_reading(&mut self, now: HostTime, reading: Reading) {
         self.companion.handle_reading(now, &reading);
         if let Some(newest) = self.readings.get_mut(usize::from(reading.header.sensor)) {
@@ -139,12 +138,11 @@ impl Lockstep {
         }
     }
 
-    /// Shows the plugin observation `seq` and waits for its reply: `write` puts in the images, and the
-    /// senses are there already; `images` are the same, for the log. Returns `None` if there is no plugin any
-    /// more.
+    /// Shows observation `seq` to the plugin and waits for its reply. `write` writes the images; the senses are already
+    /// written. `images` are the same images, for the log. Returns `None` after the plugin has ended.
     ///
     /// # Errors
-    /// [`ProcessError`], except for a plugin that fails.
+    /// Returns [`ProcessError`], except for a failure of the plugin.
     pub fn show(
         &mut self,
         now: HostTime,
@@ -203,7 +201,7 @@ impl Lockstep {
         Ok(reply)
     }
 
-    /// Does what is due at `now`. Call it at least every few milliseconds of virtual time.
+    /// Runs everything due at `now`. Call it at least every few milliseconds of virtual time.
     pub fn handle_timeout(&mut self, now: HostTime) {
         while let Some((_, Reply { seq, setpoint })) =
             self.replies.pop_front_if(|(due, _)| *due <= now)
@@ -221,20 +219,20 @@ impl Lockstep {
         }
     }
 
-    /// Ends the plugin in order.
+    /// Stops the plugin in an orderly way.
     pub fn stop(&mut self, line: LineSink<'_>) {
         if let Some(process) = self.process.take() {
             process.stop(line);
         }
     }
 
-    /// Takes a reply to an observation that was shown at `now`; it counts later.
+    /// Handles a reply to an observation that was shown at `now`; it takes effect later.
     pub(crate) fn take_reply(&mut self, now: HostTime, reply: Reply) {
         self.replies.push_back((now.plus_ns(self.reply_after_ns), reply));
     }
 
-    /// Logs a reply to the observation that was shown at `now`: on the virtual clock it took no time. It stands behind
-    /// what was sent before it at the same instant, where a replay looks for it.
+    /// Logs a reply to the observation that was shown at `now`: on the virtual clock it took no time. It is written
+    /// after the messages sent before it at the same instant, where a replay expects it.
     fn log_reply(&mut self, now: HostTime, reply: &Reply) {
         let Some(log) = &mut self.log else { return };
         let Reply { seq, setpoint } = reply.clone();
@@ -243,7 +241,7 @@ impl Lockstep {
         log.from_plugin(now, &FromPlugin::Reply { seq, entered, returned: entered, setpoint });
     }
 
-    /// Returns the value, or `None` for a plugin that has failed: it is stopped, and the flight ends.
+    /// Returns the value, or `None` if the plugin has failed: then it is stopped, and the flight ends.
     fn unless_failed<T>(
         &mut self,
         now: HostTime,

@@ -1,69 +1,69 @@
-//! How much of its own time a plugin has taken for an answer: what it computed, and what it slept by its own choice.
+//! Own time of a plugin during a reply: its computing time, and its voluntary sleep.
 //!
 //! ```text
 //! /proc: its processes and threads --> Sample --> OwnTime --> taken, or lost
 //! ```
-//! Time that the computer took from it counts for nothing: while it waits for a processor or a disk, while somebody
-//! has stopped it, and while we are stopped ourselves. So a loaded, swapping or suspended computer fails no plugin.
+//! Time that the computer takes from the plugin does not count: waiting for a processor or a disk, being stopped by
+//! another process, and time in which this program itself is stopped. Therefore a plugin does not fail on a loaded,
+//! swapping or suspended computer.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::time::{Duration, Instant};
 
-/// A plugin that has not answered is looked at this often.
+/// Sampling period while a reply is awaited.
 pub(super) const SAMPLE_EVERY: Duration = Duration::from_millis(200);
-/// Between two looks so much counts at most: whatever is beyond, we were not there ourselves.
+/// Maximum time that counts between two samples: beyond it, this program itself was not running.
 const LONGEST: Duration = Duration::from_millis(400);
-/// A plugin that neither computes nor sleeps for so long, as far as we were there, has been stopped, or its computer has
-/// no time for it.
+/// A plugin that neither computes nor sleeps for this long was stopped, or the computer is overloaded. Counts only time
+/// in which this program was running.
 const LOST_AFTER: Duration = Duration::from_mins(10);
 
-/// What a plugin's processes and threads are doing.
+/// Activity of a plugin's processes and threads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Activity {
-    /// All of them sleep: each waits for something that it chose to wait for.
+    /// All sleep: each waits for something by its own choice.
     Sleeping,
-    /// One of them at least wants a processor or a disk, or is stopped.
+    /// At least one needs a processor or a disk, or is stopped.
     Wanting,
-    /// There are none.
+    /// There are no processes.
     Gone,
 }
 
-/// One look at a plugin.
+/// Sample of a plugin's processes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Sample {
-    /// Computed so far by all of them, also those that have ended.
+    /// Computing time of all processes, including those that have ended.
     pub cpu: Duration,
-    /// What they are doing.
     pub activity: Activity,
 }
 
-/// The time that a plugin has taken since it was asked.
+/// Own time of a plugin since an observation was published.
 #[derive(Debug)]
 pub(super) struct OwnTime {
     sampled: Instant,
-    /// Computed when it was looked at last; nothing is known before the first look.
+    /// Computing time at the last sample; unknown before the first one.
     cpu: Option<Duration>,
     taken: Duration,
     withheld: Duration,
 }
 
 impl OwnTime {
-    /// Begins to count.
+    /// Starts to count.
     pub(super) fn new(now: Instant) -> Self {
         Self { sampled: now, cpu: None, taken: Duration::ZERO, withheld: Duration::ZERO }
     }
 
-    /// Whether it is time for the next look.
+    /// Whether the next sample is due.
     pub(super) fn is_due(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.sampled) >= SAMPLE_EVERY
     }
 
-    /// Takes a look at `now`.
+    /// Adds a sample taken at `now`.
     pub(super) fn take(&mut self, now: Instant, sample: Sample) {
         let since = now.saturating_duration_since(self.sampled).min(LONGEST);
         self.sampled = now;
-        // What it computed before the first look is not known to be of this answer.
+        // Computing time before the first sample may belong to an earlier reply.
         let before = self.cpu.unwrap_or(sample.cpu);
         let computed = sample.cpu.saturating_sub(before);
         self.cpu = Some(sample.cpu.max(before));
@@ -79,18 +79,18 @@ impl OwnTime {
         self.withheld = Duration::ZERO;
     }
 
-    /// Returns what it has taken.
+    /// Returns the own time.
     pub(super) fn taken(&self) -> Duration {
         self.taken
     }
 
-    /// Whether the computer has given it no time for so long that this is not going to end.
+    /// Whether the plugin got no time for [`LOST_AFTER`], so that waiting longer is useless.
     pub(super) fn is_lost(&self) -> bool {
         self.withheld >= LOST_AFTER
     }
 }
 
-/// Looks at a process and all that it started.
+/// Samples a process and all its descendants.
 pub(super) fn look(root: u32) -> Sample {
     let ticks = nix::unistd::sysconf(nix::unistd::SysconfVar::CLK_TCK).ok().flatten();
     let ticks_per_s = ticks.unwrap_or(100).max(1) as f64;
@@ -110,17 +110,17 @@ pub(super) fn look(root: u32) -> Sample {
     Sample { cpu: Duration::from_secs_f64(ticks as f64 / ticks_per_s), activity }
 }
 
-/// What proc_pid_stat(5) says of a process or thread.
+/// Fields of proc_pid_stat(5) of a process or thread.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Stat {
     state: char,
     parent: u32,
     group: u32,
-    /// Of its own and of children that it has waited for. [clock ticks]
+    /// Computing time of the process and of children that it has waited for. [clock ticks]
     ticks: u64,
 }
 
-/// Parses a line of proc_pid_stat(5). The name in parentheses may hold anything.
+/// Parses a line of proc_pid_stat(5). The name in parentheses may contain any characters.
 fn parse(line: &str) -> Option<Stat> {
     let (_, fields) = line.rsplit_once(") ")?;
     let fields: Vec<&str> = fields.split_ascii_whitespace().collect();
@@ -143,9 +143,9 @@ fn processes() -> BTreeMap<u32, Stat> {
     entries.filter_map(stat).collect()
 }
 
-/// Whether a process was started by `root`, or by one that was.
+/// Whether a process is a descendant of `root`.
 fn descends(all: &BTreeMap<u32, Stat>, mut id: u32, root: u32) -> bool {
-    // Bounded: what is read while processes come and go may be a ring.
+    // Bounded, because entries read while processes start and end may form a cycle.
     for _ in 0..64 {
         if id == root {
             return true;
@@ -175,7 +175,7 @@ mod tests {
 
     const STEP: Duration = SAMPLE_EVERY;
 
-    /// Looks every [`STEP`] at a plugin that does this.
+    /// Samples a plugin with this behaviour every [`STEP`].
     fn after(looks: u32, activity: Activity, cpu_share: f64) -> OwnTime {
         let start = Instant::now();
         let mut time = OwnTime::new(start);
@@ -187,16 +187,16 @@ mod tests {
     }
 
     #[test]
-    fn what_it_computes_and_sleeps_counts_and_nothing_else() {
+    fn counts_only_computing_and_sleeping() {
         let close = |found: Duration, expected: Duration| {
             assert!(found.abs_diff(expected) < Duration::from_millis(1), "{found:?} {expected:?}");
         };
         close(after(50, Activity::Sleeping, 0.0).taken(), STEP * 50);
         close(after(50, Activity::Wanting, 1.0).taken(), STEP * 50);
-        // A starved one, with a tenth of a processor; one with four.
+        // A starved plugin, with a tenth of a processor; one with four processors.
         close(after(50, Activity::Wanting, 0.1).taken(), STEP * 5);
         close(after(50, Activity::Wanting, 4.0).taken(), STEP * 200);
-        // Stopped, or swapped out: not its doing, and in the end nobody waits for it.
+        // Stopped or swapped out: does not count, and is lost in the end.
         let stopped = after(2999, Activity::Wanting, 0.0);
         assert!(stopped.taken().is_zero() && !stopped.is_lost());
         assert!(after(3001, Activity::Wanting, 0.0).is_lost());
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn what_we_slept_ourselves_does_not_count() {
+    fn ignores_time_in_which_this_program_was_stopped() {
         let start = Instant::now();
         let mut time = OwnTime::new(start);
         let asleep = Sample { cpu: Duration::from_secs(5), activity: Activity::Sleeping };
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_parsed_with_any_name() {
+    fn parses_lines_with_any_name() {
         let line = "12 (a) R 9 (c) S 7 77 77 0 -1 4194560 1 2 3 4 50 6 7 8 20 0 9 0 123 456 789";
         let expected = Stat { state: 'S', parent: 7, group: 77, ticks: 71 };
         assert_eq!(parse(line), Some(expected));
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_process_and_its_children_are_seen() {
+    fn samples_a_process_and_its_children() {
         let mut sleeper = Command::new("sh")
             .args(["-c", "setsid sleep 60 & read line; kill $!"])
             .stdin(Stdio::piped())
@@ -242,7 +242,7 @@ mod tests {
         drop(sleeper.stdin.take());
         sleeper.wait().unwrap();
         assert_eq!(look(sleeper.id()).activity, Activity::Gone);
-        // The child computes, in a group of its own, while its parent waits.
+        // The child computes, in a separate process group, while its parent waits.
         let mut busy = Command::new("sh")
             .args(["-c", "setsid sh -c 'while :; do :; done' & trap 'kill $!' TERM; wait"])
             .spawn()

@@ -1,4 +1,4 @@
-//! A plugin's process that is waited for: started, greeted, fed one observation at a time, ended.
+//! Plugin process that the caller waits for: starts, greets, sends one observation at a time, stops.
 
 use std::ffi::OsString;
 use std::sync::mpsc::{Receiver, channel};
@@ -16,19 +16,19 @@ use vizflyt_sdk::ipc::{IpcError, LoanedObservation, RuntimeEnd};
 use super::own_time::{OwnTime, look};
 use crate::supervisor::{Confinement, PluginEvent, PluginLimits, Stream, Supervisor};
 
-/// How much of its own time a plugin may take to attach and to load what it needs: models take their time.
+/// Maximum own time of a plugin for attaching and loading, because models load slowly.
 const READY_WITHIN: Duration = Duration::from_mins(5);
 
-/// How long the last lines of one that has ended are waited for.
+/// Timeout for the last lines of a plugin that has ended.
 const LAST_LINES_WITHIN: Duration = Duration::from_secs(5);
 
-/// Why a plugin's process does not go on.
+/// Why a plugin's process cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
     /// Shared memory failed.
     #[error(transparent)]
     Ipc(#[from] IpcError),
-    /// The observation does not fit into the memory that was lent.
+    /// The observation does not fit into the shared memory.
     #[error(transparent)]
     TooLarge(#[from] ObservationTooLarge),
     /// The plugin's program cannot be started.
@@ -37,7 +37,7 @@ pub enum ProcessError {
     /// The plugin failed.
     #[error("{0}")]
     Failed(Box<PluginFault>),
-    /// The plugin was lost to something that is not its doing.
+    /// The plugin ended for a reason that it did not cause.
     #[error("{0}")]
     Lost(String),
 }
@@ -45,21 +45,21 @@ pub enum ProcessError {
 /// Receives the lines that the plugin prints.
 pub type LineSink<'a> = &'a mut dyn FnMut(Stream, &str);
 
-/// A plugin's process and our end of its shared memory. It dies with the thread that started it.
+/// Plugin process and the runtime's end of its shared memory. The process ends with the thread that started it.
 #[derive(Debug)]
 pub struct PluginProcess {
     ipc: RuntimeEnd,
     supervisor: Supervisor,
     events: Receiver<PluginEvent>,
-    /// An answer, or the reading of an event, that takes more of the plugin's own time is a failure.
+    /// Maximum own time of the plugin for a reply, or for reading an event; longer is a failure.
     within: Duration,
-    /// Estimates that it has published and nobody has taken yet.
+    /// Published estimates that the caller has not taken yet.
     odometry: Vec<Odometry>,
 }
 
 impl PluginProcess {
-    /// Starts `command` (program, then arguments), confined as in flight by `limits`. An answer may take `within` of the
-    /// plugin's own time: what it computes, and what it sleeps by its own choice.
+    /// Starts `command` (program, then arguments), confined as in flight by `limits`. A reply may take `within` of the
+    /// plugin's own time: computing time, and voluntary sleep.
     ///
     /// # Errors
     /// [`ProcessError::Start`] and [`ProcessError::Ipc`].
@@ -88,12 +88,12 @@ impl PluginProcess {
         self.supervisor.id()
     }
 
-    /// Greets the plugin with `start` when it has attached, and waits until it is ready, five minutes of its own
-    /// time at most.
+    /// Greets the plugin with `start` after it has attached, and waits until it is ready, at most five minutes of its
+    /// own time.
     ///
     /// # Errors
-    /// [`ProcessError::Failed`] if it ends, gives up or takes longer; [`ProcessError::Lost`] if somebody else ends or
-    /// stops it.
+    /// [`ProcessError::Failed`] if the plugin ends, gives up or takes longer; [`ProcessError::Lost`] if another process
+    /// ends or stops it.
     pub fn begin(&mut self, start: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
         let mut time = OwnTime::new(Instant::now());
         while !self.ipc.plugin_attached() {
@@ -119,15 +119,15 @@ impl PluginProcess {
         }
     }
 
-    /// Sends a message; waits for room if many have been sent since the last image.
+    /// Sends a message; waits for room in the queue if many messages were sent since the last image.
     ///
     /// # Errors
-    /// [`ProcessError::Failed`] if it has ended, or reads nothing.
+    /// [`ProcessError::Failed`] if the plugin has ended or does not read.
     pub fn send(&mut self, message: &ToPlugin, line: LineSink<'_>) -> Result<(), ProcessError> {
         let mut time = OwnTime::new(Instant::now());
         loop {
             match self.ipc.send(message) {
-                // The end of one that is gone is noticed when the next image is not answered.
+                // The end of the plugin is detected when the next image has no reply.
                 Ok(()) | Err(IpcError::Gone(_)) => return Ok(()),
                 Err(IpcError::QueueFull(_)) => {
                     if let Some(why) = self.pass_lines(line) {
@@ -145,19 +145,19 @@ impl PluginProcess {
         }
     }
 
-    /// Lends shared memory for one observation of `len` bytes: zeros, aligned to 64.
+    /// Lends shared memory for one observation of `len` bytes, zeroed and aligned to 64.
     ///
     /// # Errors
-    /// [`ProcessError::Ipc`] if there is not so much memory.
+    /// [`ProcessError::Ipc`] if there is not enough memory.
     pub fn loan(&self, len: usize) -> Result<LoanedObservation, ProcessError> {
         Ok(self.ipc.loan(len)?)
     }
 
-    /// Publishes observation `seq` and waits for its answer.
+    /// Publishes observation `seq` and waits for the reply.
     ///
     /// # Errors
-    /// [`ProcessError::Failed`] if the plugin ends, gives up or takes longer than it may; [`ProcessError::Lost`] if
-    /// somebody else ends or stops it.
+    /// [`ProcessError::Failed`] if the plugin ends, gives up or exceeds its time; [`ProcessError::Lost`] if another
+    /// process ends or stops it.
     pub fn ask(
         &mut self,
         seq: u64,
@@ -179,7 +179,7 @@ impl PluginProcess {
                 {
                     self.odometry.push(odometry);
                 }
-                // Also one that sends anything but the answer.
+                // Also if the plugin sends anything except the reply.
                 Some(_) | None => {
                     if self.has_taken(&mut time, self.within)? {
                         let silent_s = self.within.as_secs_f64();
@@ -191,19 +191,19 @@ impl PluginProcess {
         }
     }
 
-    /// Returns what the plugin has published of where it is, four estimates an observation at most.
+    /// Takes the published odometry, at most [`MAX_ODOMETRY_PER_REPLY`] estimates per observation.
     pub fn take_odometry(&mut self) -> Vec<Odometry> {
         std::mem::take(&mut self.odometry)
     }
 
-    /// Ends the plugin in order.
+    /// Stops the plugin in an orderly way.
     pub fn stop(self, line: LineSink<'_>) {
         if self.ipc.plugin_attached() {
             let _ = self.ipc.send(&ToPlugin::Stop);
         }
         self.supervisor.end();
         self.ipc.clean_up();
-        // Its last lines are on their way through pipes, which have closed with all that held them.
+        // The last lines are still in the pipes, which close after all their writers have ended.
         let until = Instant::now() + LAST_LINES_WITHIN;
         while let Ok(event) =
             self.events.recv_timeout(until.saturating_duration_since(Instant::now()))
@@ -214,28 +214,28 @@ impl PluginProcess {
         }
     }
 
-    /// Whether the plugin has taken so much of its own time; it is looked at now and then.
+    /// Whether the plugin has taken more than `within` of its own time; samples it periodically.
     fn has_taken(&self, time: &mut OwnTime, within: Duration) -> Result<bool, ProcessError> {
         if time.is_due(Instant::now()) {
             let sample = look(self.supervisor.id());
-            // Reading it took time, too.
+            // Reading the sample took time, too.
             time.take(Instant::now(), sample);
         }
         if time.is_lost() {
-            let why = "the plugin was given no time for ten minutes: it was stopped, or this computer is overloaded";
+            let why = "the plugin got no processor time for ten minutes: it was stopped, or the computer is overloaded";
             return Err(ProcessError::Lost(why.to_owned()));
         }
         Ok(time.taken() > within)
     }
 
-    /// Returns the plugin's next message; `None` after a while.
+    /// Returns the plugin's next message; `None` after a timeout.
     fn next(&mut self, line: LineSink<'_>) -> Result<Option<FromPlugin>, ProcessError> {
         if let Some(message) = self.receive()? {
             return Ok(Some(message));
         }
         self.ipc.wait(Duration::from_millis(50))?;
         let ended = self.pass_lines(line);
-        // Its messages before its end count.
+        // Messages sent before its end are still handled.
         match (self.receive()?, ended) {
             (Some(message), _) => Ok(Some(message)),
             (None, Some(why)) => Err(end_of(why)),
@@ -245,13 +245,13 @@ impl PluginProcess {
 
     fn receive(&self) -> Result<Option<FromPlugin>, ProcessError> {
         match self.ipc.receive() {
-            // A message that does not decode is the plugin's fault; the next one counts.
+            // A message that cannot be decoded is the plugin's fault; continue with the next one.
             Err(IpcError::Message(_)) => Ok(None),
             result => Ok(result?),
         }
     }
 
-    /// Passes on what the plugin printed; returns how it ended, if it has.
+    /// Passes printed lines to `line`; returns the reason for the plugin's end, if it has ended.
     pub fn pass_lines(&mut self, line: LineSink<'_>) -> Option<String> {
         let mut ended = None;
         for event in self.events.try_iter() {
@@ -265,8 +265,8 @@ impl PluginProcess {
     }
 }
 
-/// Returns what the end of a plugin is. SIGKILL comes from the kernel that is short of memory, or from a person: a plugin
-/// beyond its own limits ends with another sentence.
+/// Returns the error for the end of a plugin. SIGKILL comes from the kernel if memory is short, or from a person; a
+/// plugin that exceeds its own limits ends with another sentence.
 fn end_of(why: String) -> ProcessError {
     if why.starts_with("the plugin was killed by SIGKILL") {
         return ProcessError::Lost(why);

@@ -1,4 +1,4 @@
-//! Real plugin processes that are waited for: the example `misbehave`; and the log of what they were shown.
+//! Tests with real plugin processes (the example `misbehave`), and with the log of their observations.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -44,7 +44,7 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(10_000_000_000 + ms * 1_000_000)
 }
 
-/// Returns the process that was started last of all that one has started: within a cell, the plugin.
+/// Returns the innermost descendant of a process: within a cell, the plugin.
 fn innermost(id: u32) -> Pid {
     let children = std::fs::read_to_string(format!("/proc/{id}/task/{id}/children"));
     let child = children.unwrap_or_default();
@@ -54,7 +54,7 @@ fn innermost(id: u32) -> Pid {
     }
 }
 
-/// Asks a plugin once; `meanwhile` is called when it has the image.
+/// Sends one observation to a plugin; calls `meanwhile` when it has the image.
 fn asked(
     how: &str,
     within: Duration,
@@ -74,11 +74,11 @@ fn asked(
     result
 }
 
-/// Less than the example's `sleep`, and than it is stopped for.
+/// Shorter than the example's `sleep`, and than the time for which it is stopped.
 const SHORT: Duration = Duration::from_secs(1);
 
 #[test]
-fn a_plugin_that_takes_too_long_of_its_own_time_has_failed() {
+fn fails_a_plugin_that_exceeds_its_own_time() {
     for how in ["hang", "spin", "sleep"] {
         let error = asked(how, SHORT, |_| ()).unwrap_err();
         let ProcessError::Failed(fault) = error else { panic!("{how}: {error}") };
@@ -89,7 +89,7 @@ fn a_plugin_that_takes_too_long_of_its_own_time_has_failed() {
 }
 
 #[test]
-fn a_plugin_that_somebody_stops_has_not_failed() {
+fn does_not_fail_a_plugin_that_is_stopped_from_outside() {
     let stop = |plugin| {
         kill(plugin, Signal::SIGSTOP).unwrap();
         std::thread::sleep(4 * SHORT);
@@ -100,7 +100,7 @@ fn a_plugin_that_somebody_stops_has_not_failed() {
 }
 
 #[test]
-fn a_plugin_that_somebody_kills_is_lost_and_one_that_ends_has_failed() {
+fn a_killed_plugin_is_lost_and_an_ended_plugin_has_failed() {
     let error = asked("hang", SHORT, |plugin| kill(plugin, Signal::SIGKILL).unwrap());
     assert!(matches!(error, Err(ProcessError::Lost(_))), "{error:?}");
     for how in ["exit", "panic", "segfault", "abort"] {
@@ -109,7 +109,7 @@ fn a_plugin_that_somebody_kills_is_lost_and_one_that_ends_has_failed() {
     }
 }
 
-/// Shows a plugin twenty images in lock-step, and logs it.
+/// Shows twenty images to a plugin in lock-step, and logs them.
 fn logged(path: &Path, images: LoggedImages) {
     let command = misbehave("forward");
     let process =
@@ -156,13 +156,13 @@ fn logged(path: &Path, images: LoggedImages) {
 }
 
 #[test]
-fn a_log_on_the_virtual_clock_is_the_same_every_time_and_is_replayed() {
+fn logs_on_the_virtual_clock_are_reproducible_and_replayed() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("one.mcap");
     logged(&path, LoggedImages::Full);
     let again = folder.path().join("again.mcap");
     logged(&again, LoggedImages::Full);
-    assert!(fs::read(&path).unwrap() == fs::read(&again).unwrap(), "no clock is in it");
+    assert!(fs::read(&path).unwrap() == fs::read(&again).unwrap(), "the log contains no wall clock");
     let plan = ReplayPlan::read(RecordedFlight::new(LogReader::open(&path).unwrap(), false));
     let plan = plan.unwrap();
     assert_eq!(plan.flown.as_ref().unwrap().plugin, "misbehave");

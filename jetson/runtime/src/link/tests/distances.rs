@@ -1,4 +1,4 @@
-//! Readings of the twin's sensors on their way to the autopilot.
+//! Readings of simulated sensors, sent to the autopilot.
 
 use vizflyt_protocol::mavlink::dialect::MavSensorOrientation;
 use vizflyt_protocol::messages::bounded;
@@ -24,13 +24,13 @@ fn sensor(kind: SensorKind) -> SensorInfo {
 }
 
 #[test]
-fn distances_leave_at_the_rate_that_the_link_carries() {
+fn limits_the_rate_of_distances() {
     let mut script = Script::ready();
     let (down, scan) = (sensor(SensorKind::RangeFinder), sensor(SensorKind::Lidar));
     let range = RangeReading { range_m: 1.5, signal: 1.0 };
     let points = [LidarPoint { p_m: [0.0, 0.0, 2.0], ..LidarPoint::default() }];
     script.sent.clear();
-    // A second of readings at 100 Hz, of both.
+    // One second of readings at 100 Hz, of both sensors.
     for _ in 0..100 {
         script.now = script.now.plus_seconds(0.01);
         script.link.reading(script.now, 3, &down, range.as_bytes());
@@ -49,7 +49,7 @@ fn distances_leave_at_the_rate_that_the_link_carries() {
             }
             MavMessage::OBSTACLE_DISTANCE(m) => {
                 obstacles += 1;
-                // The sensor's z is the body's x: ahead.
+                // The sensor's z is the body's x: forward.
                 assert_eq!((m.distances[0], m.max_distance), (200, 1000));
             }
             _ => {}
@@ -62,7 +62,7 @@ fn distances_leave_at_the_rate_that_the_link_carries() {
 }
 
 #[test]
-fn nothing_leaves_without_an_autopilot_or_of_bytes_that_are_no_reading() {
+fn sends_nothing_without_an_autopilot_or_for_invalid_readings() {
     let mut script = Script::new();
     let range = RangeReading { range_m: 1.5, signal: 1.0 };
     script.link.reading(script.now, 0, &sensor(SensorKind::Sonar), range.as_bytes());

@@ -1,4 +1,4 @@
-//! The arena's polygons on their way to the autopilot.
+//! Upload of the arena's polygons to the autopilot.
 
 use glam::DVec2;
 use vizflyt_protocol::mavlink::dialect::{
@@ -13,7 +13,7 @@ use super::*;
 const ACCEPTED: MavMissionResult = MavMissionResult::MAV_MISSION_ACCEPTED;
 const DENIED: MavMissionResult = MavMissionResult::MAV_MISSION_DENIED;
 
-/// A square of 4 m to stay in, and a triangle to stay out of.
+/// Returns an inclusion square of 4 m and an exclusion triangle.
 fn fence() -> Vec<FencePolygon> {
     let at = |corners: &[(f64, f64)]| corners.iter().map(|&p| DVec2::from(p)).collect();
     let square = at(&[(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)]);
@@ -25,11 +25,11 @@ fn fence() -> Vec<FencePolygon> {
 }
 
 impl Script {
-    /// One whose fence is being uploaded.
+    /// Returns a script with a fence upload in progress.
     fn fenced() -> Self {
         let mut script = Self::ready();
         script.link.set_fence(script.now, fence());
-        // The parameters that it watches are asked for first; nobody answers.
+        // The monitored parameters are requested first; the script does not reply to these.
         while script.offers() == 0 {
             script.run(0.1);
         }
@@ -86,12 +86,12 @@ impl Script {
 }
 
 #[test]
-fn corners_are_placed_by_the_autopilots_origin() {
+fn converts_corners_with_the_autopilots_origin() {
     let mut script = Script::new();
     script.link.set_fence(script.now, fence());
     script.heartbeat();
     script.run(3.0);
-    assert_eq!(script.offers(), 0, "no origin, no place on the globe");
+    assert_eq!(script.offers(), 0, "no origin yet");
     let origin = GlobalPoint { latitude_e7: 480_000_000, longitude_e7: 110_000_000 };
     script.inject(&MavMessage::GPS_GLOBAL_ORIGIN(GPS_GLOBAL_ORIGIN_DATA {
         latitude: origin.latitude_e7,
@@ -119,7 +119,7 @@ fn corners_are_placed_by_the_autopilots_origin() {
     assert!(script.link.is_busy_with_fence());
     script.acknowledge(ACCEPTED);
     assert_eq!(script.fence_events(), [&FenceEvent::Accepted(2)]);
-    // Repeating the same, and a repeated origin, change nothing.
+    // Repeating the same polygons or the same origin changes nothing.
     let offers = script.offers();
     script.link.set_fence(script.now, fence());
     script.run(5.0);
@@ -127,7 +127,7 @@ fn corners_are_placed_by_the_autopilots_origin() {
 }
 
 #[test]
-fn arming_waits_for_the_upload_and_an_armed_vehicle_gets_none() {
+fn arming_waits_for_the_upload_and_an_armed_vehicle_gets_no_upload() {
     let mut script = Script::fenced();
     script.run(4.0);
     assert!(script.missing().contains("fence is being uploaded"), "{}", script.missing());
@@ -164,7 +164,7 @@ fn upload_does_not_wait_for_names_that_the_autopilot_lacks() {
         };
         script.sent.iter().filter_map(name).collect::<Vec<_>>()
     };
-    // Each answer makes room for another request.
+    // Each reply makes room for another request.
     let mut seen = 0;
     while let Some(name) = asked(&script).get(seen) {
         assert_eq!(script.offers(), 0, "parameters first: {name}");
@@ -178,15 +178,15 @@ fn upload_does_not_wait_for_names_that_the_autopilot_lacks() {
 }
 
 #[test]
-fn lost_offers_are_repeated_and_silence_ends_the_upload() {
+fn repeats_lost_offers_and_gives_up_without_replies() {
     let mut script = Script::fenced();
     script.run(3.5);
     assert_eq!(script.offers(), 3);
-    // One that stops in the middle is started again.
+    // An upload that stops halfway is started again.
     script.ask(0);
     script.run(2.0);
     assert_eq!(script.offers(), 4);
-    // An answer that belongs to no whole upload is none.
+    // An acknowledgement before the last corner is ignored.
     script.acknowledge(ACCEPTED);
     script.acknowledge(MavMissionResult::MAV_MISSION_INVALID_SEQUENCE);
     assert_eq!(script.fence_events(), [] as [&FenceEvent; 0]);
@@ -196,7 +196,7 @@ fn lost_offers_are_repeated_and_silence_ends_the_upload() {
         panic!("{:?}", script.fence_events())
     };
     assert_eq!(why, "it does not answer");
-    // The flight goes on without: guard and referee are there.
+    // The flight continues without it, because guard and referee check the fence.
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     let warnings: Vec<_> = script.events.iter().filter_map(LinkEvent::warning).collect();
     let expected = "own fence is not the arena's: it does not answer";
@@ -204,7 +204,7 @@ fn lost_offers_are_repeated_and_silence_ends_the_upload() {
 }
 
 #[test]
-fn refusal_is_reported_and_a_busy_autopilot_is_offered_again() {
+fn reports_a_rejection_and_retries_with_a_busy_autopilot() {
     let mut script = Script::fenced();
     script.run(1.0);
     script.acknowledge(DENIED);
@@ -212,7 +212,7 @@ fn refusal_is_reported_and_a_busy_autopilot_is_offered_again() {
     script.run(2.0);
     assert_eq!(script.offers(), offers + 1);
     script.acknowledge(MavMissionResult::MAV_MISSION_NO_SPACE);
-    let no_room = FenceEvent::Rejected("it has no room for as many corners".into());
+    let no_room = FenceEvent::Rejected("it has no space for this many corners".into());
     assert_eq!(script.fence_events(), [&no_room]);
     script.run(5.0);
     assert_eq!(script.offers(), offers + 1);
@@ -244,5 +244,5 @@ fn px4_gets_no_fence() {
     let [FenceEvent::Rejected(why)] = script.fence_events()[..] else {
         panic!("{:?}", script.fence_events())
     };
-    assert!(why.contains("no place on the globe"), "{why}");
+    assert!(why.contains("no global position"), "{why}");
 }

@@ -1,4 +1,4 @@
-//! IMU samples: when they were taken, and which of two messages counts.
+//! IMU samples: their stamps, and the choice between two messages.
 
 use glam::DVec3;
 use vizflyt_protocol::mavlink::dialect::{ATTITUDE_DATA, HIGHRES_IMU_DATA, RAW_IMU_DATA};
@@ -6,7 +6,7 @@ use vizflyt_protocol::packet::MAX_IMU;
 
 use super::*;
 
-/// How far the autopilot's clock is ahead of ours. [ns]
+/// Offset of the autopilot's clock from ours. [ns]
 const AHEAD_NS: i64 = 77_000_000_000;
 
 fn boot_us(now: HostTime) -> u64 {
@@ -39,11 +39,11 @@ fn newest(script: &Script) -> ImuSample {
 }
 
 #[test]
-fn samples_are_stamped_when_they_were_taken() {
+fn stamps_samples_with_their_measurement_time() {
     let mut script = Script::ready();
     let before = script.now;
     raw(&mut script, 12_345, -1000);
-    assert_eq!(newest(&script).stamp, before, "no clock yet: when it came");
+    assert_eq!(newest(&script).stamp, before, "unknown clock: time of arrival");
     assert_eq!(newest(&script).accel_mps2, DVec3::Z * 9.80665);
 
     relate_clocks(&mut script);
@@ -52,7 +52,7 @@ fn samples_are_stamped_when_they_were_taken() {
     raw(&mut script, boot_us(taken), -1000);
     let error_s = newest(&script).stamp.seconds_since(taken).abs();
     assert!(error_s < 2e-3, "{error_s}");
-    // From the future: never later than now. From another clock: when it came.
+    // A stamp in the future becomes `now`. A stamp of another clock becomes the time of arrival.
     script.now = script.now.plus_seconds(0.1);
     let future = boot_us(script.now.plus_seconds(0.3));
     raw(&mut script, future, -1000);
@@ -63,7 +63,7 @@ fn samples_are_stamped_when_they_were_taken() {
 }
 
 #[test]
-fn stamps_rise_and_the_newest_are_kept() {
+fn stamps_increase_and_the_newest_samples_are_kept() {
     let mut script = Script::ready();
     relate_clocks(&mut script);
     let start = script.now.plus_seconds(0.2);
@@ -74,7 +74,7 @@ fn stamps_rise_and_the_newest_are_kept() {
     let seen = |script: &Script| -> Vec<i64> {
         script.link.imu().iter().map(|s| (s.accel_mps2.z / -9.80665e-3).round() as i64).collect()
     };
-    assert_eq!(seen(&script), [0, 10, 20, 30], "late and repeated ones are left out");
+    assert_eq!(seen(&script), [0, 10, 20, 30], "late and repeated samples are dropped");
     for ms in 40..140 {
         raw(&mut script, boot_us(start.plus_ns(ms * 1_000_000)), ms as i16);
     }
@@ -104,17 +104,17 @@ fn highres_imu_is_preferred_until_a_restart() {
     );
     script.now = script.now.plus_ns(10_000_000);
     raw(&mut script, 2, -1000);
-    assert_eq!(newest(&script).accel_mps2, DVec3::Z * 5.0, "the coarse one is left aside");
+    assert_eq!(newest(&script).accel_mps2, DVec3::Z * 5.0, "RAW_IMU is ignored");
     assert_eq!(script.link.imu().len(), 2);
     for time_boot_ms in [90_000, 10] {
         script.inject(&MavMessage::ATTITUDE(ATTITUDE_DATA { time_boot_ms, ..Default::default() }));
     }
-    assert!(script.link.imu().is_empty(), "the clock of these is gone");
+    assert!(script.link.imu().is_empty(), "their clock has restarted");
     script.now = script.now.plus_ns(10_000_000);
     raw(&mut script, 3, -1000);
     assert_eq!(
         newest(&script).accel_mps2,
         DVec3::Z * 9.80665,
-        "it may not send the other any more"
+        "the autopilot may no longer send HIGHRES_IMU"
     );
 }

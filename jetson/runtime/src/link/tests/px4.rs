@@ -1,4 +1,4 @@
-//! PX4 as the second dialect: setpoints stream before OFFBOARD is asked for.
+//! PX4 dialect: setpoints are streamed before OFFBOARD is requested.
 
 use vizflyt_protocol::mavlink::CopterMode;
 use vizflyt_protocol::mavlink::dialect::{ESTIMATOR_STATUS_DATA, EstimatorStatusFlags};
@@ -22,7 +22,7 @@ fn px4() -> Script {
     script
 }
 
-/// Times at which setpoints and commands were sent, in order.
+/// Returns the setpoints and commands that were sent, in order.
 fn order(script: &Script) -> Vec<&'static str> {
     let name = |message: &MavMessage| match message {
         MavMessage::SET_POSITION_TARGET_LOCAL_NED(_) => Some("setpoint"),
@@ -37,7 +37,7 @@ fn order(script: &Script) -> Vec<&'static str> {
 }
 
 #[test]
-fn takes_off_by_setpoints_that_stream_before_offboard() {
+fn streams_setpoints_before_offboard_to_take_off() {
     let mut script = px4();
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     let origins = script.count(|m| matches!(m, MavMessage::SET_GPS_GLOBAL_ORIGIN(_)));
@@ -62,7 +62,7 @@ fn takes_off_by_setpoints_that_stream_before_offboard() {
     assert_eq!((target.x, target.y, target.type_mask.bits()), (2.0, 1.0, 0x9F8));
     assert!((target.z + 1.6).abs() < 1e-5, "{}", target.z);
 
-    // The guard's setpoints follow; ours end.
+    // The setpoints of the guard replace those of the link.
     script.link.set_goal(script.now, Goal::Fly);
     script.sent.clear();
     script.run(1.0);

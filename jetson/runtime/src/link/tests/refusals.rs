@@ -1,4 +1,4 @@
-//! What people read: why arming waits, why a command was refused, who else is on the vehicle.
+//! Messages for people: why arming waits, why a command was rejected, which other companions are present.
 
 use vizflyt_protocol::mavlink::dialect::{MavParamType, PARAM_VALUE_DATA};
 
@@ -49,17 +49,17 @@ fn reports_failing_pre_arm_checks() {
     let asked = |script: &Script| {
         script.count(|m| matches!(m, MavMessage::COMMAND_LONG(c) if c.command == MavCmd::MAV_CMD_RUN_PREARM_CHECKS))
     };
-    assert_eq!(asked(&script), 3, "asked for every 5 s");
+    assert_eq!(asked(&script), 3, "requested every 5 s");
     script.run(30.0);
     assert!(!script.missing().contains("RC not found"), "taken back");
     script.prearm(true);
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
     script.prearm(false);
-    assert!(!script.missing().contains("Battery 1"), "that was before");
+    assert!(!script.missing().contains("Battery 1"), "an old text");
 }
 
 #[test]
-fn autopilot_without_pre_arm_texts_is_asked_once() {
+fn requests_pre_arm_texts_only_once_if_unsupported() {
     let mut script = Script::ready();
     script.answer = |command| match command {
         MavCmd::MAV_CMD_RUN_PREARM_CHECKS => Some(MavResult::MAV_RESULT_UNSUPPORTED),
@@ -71,9 +71,9 @@ fn autopilot_without_pre_arm_texts_is_asked_once() {
     assert_eq!(asked, 1);
 }
 
-/// Refusals that ArduCopter sends without a text.
+/// Rejections that ArduCopter sends without a text.
 #[test]
-fn silent_refusal_is_explained_by_the_observed_state() {
+fn explains_a_rejection_without_text_by_the_observed_state() {
     let check = |spoil: fn(&mut Script), expected: &str| {
         let mut script = Script::new();
         script.heartbeat();
@@ -98,7 +98,7 @@ fn silent_refusal_is_explained_by_the_observed_state() {
 }
 
 #[test]
-fn a_second_companion_is_refused_by_name() {
+fn reports_a_second_companion_by_name() {
     let mut script = Script::ready();
     let own = script.sent.iter().find_map(|message| match message {
         MavMessage::HEARTBEAT(m) => Some(m.custom_mode),
@@ -132,7 +132,7 @@ fn a_second_companion_is_refused_by_name() {
 }
 
 #[test]
-fn replies_to_others_reveal_them() {
+fn detects_companions_by_replies_to_them() {
     let mut script = Script::ready();
     let answer = |ts1| {
         MavMessage::TIMESYNC(TIMESYNC_DATA {
@@ -150,7 +150,7 @@ fn replies_to_others_reveal_them() {
     assert!(script.missing().contains("another companion"));
     script.run(6.0);
     assert_eq!(script.link.ready_to_arm(script.now), Ok(()));
-    // Arming that we never asked for.
+    // Acknowledgement of arming that this runtime did not request.
     for _ in 0..3 {
         script.inject(&MavMessage::COMMAND_ACK(COMMAND_ACK_DATA {
             command: MavCmd::MAV_CMD_COMPONENT_ARM_DISARM,
@@ -163,7 +163,7 @@ fn replies_to_others_reveal_them() {
 }
 
 #[test]
-fn name_is_announced_once_and_again_to_another() {
+fn announces_the_name_once_and_again_to_another_companion() {
     let name = "wasp on jetson-1".to_owned();
     let mut script = Script::with(LinkSettings { name, ..LinkSettings::default() });
     let announced = |script: &Script| {
@@ -191,11 +191,11 @@ fn slow_streams_are_requested_again_then_reported() {
     let slow = |event: &&LinkEvent| matches!(event, LinkEvent::Slow(rate) if rate.id == 30);
     assert_eq!(script.events.iter().filter(slow).count(), 1);
     let warning = script.events.iter().find(slow).unwrap().warning().unwrap();
-    assert!(warning.contains("message 30 at 0 Hz, not at the 50"), "{warning}");
+    assert!(warning.contains("message 30 at 0 Hz, 50 Hz requested"), "{warning}");
 }
 
 #[test]
-fn the_latency_of_external_navigation_is_measured_and_suggested() {
+fn measures_the_latency_of_external_navigation() {
     let mut script = Script::ready();
     param(&mut script, "VISO_DELAY_MS", 10.0);
     let request = script.sent.iter().rev().find_map(|message| match message {
@@ -242,7 +242,7 @@ fn does_not_take_off_by_itself_after_a_restart() {
     script.run(5.0);
     assert!(script.events.contains(&LinkEvent::Rebooted));
     assert_eq!(script.commands(), [], "not even with the same goal");
-    // Streams are asked for again, and the parameters that matter.
+    // Streams and important parameters are requested again.
     let asks = |id: f32| {
         script.count(|m| {
             matches!(m, MavMessage::COMMAND_LONG(c)
@@ -258,11 +258,11 @@ fn does_not_take_off_by_itself_after_a_restart() {
 }
 
 #[test]
-fn one_of_two_vehicles_may_be_selected() {
+fn selects_one_of_two_vehicles() {
     let settings = LinkSettings { system: Some(2), ..LinkSettings::default() };
     let mut script = Script::with(settings);
     script.run(2.0);
-    assert!(!script.link.is_connected(), "system 1 is not meant");
+    assert!(!script.link.is_connected(), "system 1 is not selected");
     let beat = HEARTBEAT_DATA {
         autopilot: MavAutopilot::MAV_AUTOPILOT_ARDUPILOTMEGA,
         ..Default::default()

@@ -1,4 +1,4 @@
-//! A link that signs: unsigned, forged and replayed packets are refused.
+//! Signing: rejects unsigned, forged and replayed packets.
 
 use vizflyt_protocol::mavlink::{Signer, SigningFault, SigningKey, SigningTime, Verifier};
 
@@ -15,7 +15,7 @@ fn link(now: HostTime) -> Link {
     Link::with(now, LinkSettings { signing, ..LinkSettings::default() })
 }
 
-/// A heartbeat of the autopilot, signed if there is a signer.
+/// Returns a heartbeat of the autopilot, signed if there is a signer.
 fn beat(signer: Option<&mut Signer>, at: SigningTime) -> Vec<u8> {
     let header = MavHeader { system_id: 1, component_id: 1, sequence: 0 };
     let heartbeat = HEARTBEAT_DATA {
@@ -47,7 +47,7 @@ fn accepts_only_signed_packets_with_new_stamps() {
     link.handle_input(now, &good);
     assert!(link.is_connected() && link.state().armed);
     assert_eq!(link.refused().0, 2);
-    // The same again keeps nothing alive.
+    // A replayed packet does not keep the connection alive.
     let later = now.plus_seconds(4.0);
     link.handle_input(later, &good);
     link.handle_timeout(later);
@@ -74,7 +74,7 @@ fn reports_refused_packets_at_growing_intervals() {
         }
     }
     assert_eq!(reports, [0, 10, 30, 70]);
-    // Another fault is news, and nothing is repeated once it is over.
+    // Another fault is reported at once, and nothing is repeated after the fault ends.
     let mut other = Signer::new(SigningKey::new([1; 32]), 0);
     link.handle_input(now, &beat(Some(&mut other), START));
     for _ in 0..100 {
@@ -94,12 +94,12 @@ fn names_an_autopilot_that_signs_to_a_runtime_that_does_not() {
     let mut link = Link::new(now);
     let mut signer = Signer::new(key(), 0);
     link.handle_input(now, &beat(Some(&mut signer), START));
-    assert!(link.is_connected(), "without a key, signatures are not looked at");
+    assert!(link.is_connected(), "without a key, signatures are not checked");
     let waits_for = link.ready_to_arm(now).unwrap_err();
     assert!(waits_for.contains("not confirmed its origin"), "{waits_for}");
     assert!(waits_for.contains("it signs its packets and we do not"), "{waits_for}");
-    assert!(waits_for.len() < 165, "it fits into a report: {waits_for}");
-    // Signing was ended over USB.
+    assert!(waits_for.len() < 165, "fits into an event: {waits_for}");
+    // Signing was disabled over USB.
     link.handle_input(now, &beat(None, START));
     let waits_for = link.ready_to_arm(now).unwrap_err();
     assert!(!waits_for.contains("signs"), "{waits_for}");
@@ -134,7 +134,7 @@ fn accepts_unsigned_packets_over_a_trusted_wire() {
 fn sends_the_key_to_the_autopilot() {
     let mut script = Script::new();
     let signing = LinkSigning { key: key(), start: START, accepts_unsigned: false };
-    assert!(!script.link.setup_signing(script.now, Some(&signing)), "to nobody");
+    assert!(!script.link.setup_signing(script.now, Some(&signing)), "without an autopilot");
     script.heartbeat();
     assert!(script.link.setup_signing(script.now, Some(&signing)));
     script.drain();
