@@ -65,7 +65,7 @@ def test_a_class_gets_its_grades_and_nobody_sees_the_others(desk, tmp_path):
     # Points by the project's own table; nobody who has no grade has any.
     assert float(rows["red"]["points"]) == 0 and float(rows["red"]["points_of"]) > 0, rows
     assert rows["up"]["points"] == "", rows
-    assert "leads out" in rows["up"]["note"] and "nothing handed in" in rows["gone"]["note"], rows
+    assert "leads out" in rows["up"]["note"] and "nothing submitted" in rows["gone"]["note"], rows
     assert not (tmp_path / "up.py").exists() and not (tmp_path / "grades/up.py").exists()
     seeds = set()
     for team in ("red", "blue"):

@@ -115,7 +115,7 @@ def test_the_reference_flies_within_its_bound(finished):
 @pytest.mark.parametrize(
     ("estimate", "said"),
     [
-        ("", "is no MCAP file; give a flight's log"),
+        ("", "is not an MCAP file; give a flight's log"),
         ("none.tum", "No such file"),
         ("empty.tum", "no attitude of a time in the air"),
         ("words.tum", "could not convert"),

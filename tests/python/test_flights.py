@@ -135,7 +135,7 @@ def test_a_plugin_attaches_stops_at_a_breakpoint_and_dies(program, tmp_path):
         plugin.send_signal(signal.SIGSTOP)
         time.sleep(3.5)
         plugin.kill()
-        wait_for("the plugin that had attached has ended")
+        wait_for("the attached plugin has ended")
         assert not any("landing" in line for line in seen[:-1]), seen
         lab.communicate(timeout=60)
     finally:

@@ -135,7 +135,7 @@ def test_on_the_ground_one_looks_and_nothing_is_answered(ground):
     # The runtime takes off by either.
     assert (end.answers, end.named) == ([], [])
     lab.close()
-    assert end.failed_with == ["the notebook has let go of the lab before take-off"]
+    assert end.failed_with == ["the notebook has detached from the lab before take-off"]
     assert not lab.is_attached and lab.phase == "connecting"
 
 
@@ -155,7 +155,7 @@ def test_nobody_gets_an_old_image(air):
 
 def test_it_holds_whenever_nobody_asks(air):
     lab, end = air
-    with pytest.raises(RuntimeError, match="in the air already"):
+    with pytest.raises(RuntimeError, match="already in the air"):
         lab.take_off()
     assert end.newest() == Setpoint.hold()
     began = len(end.answers)
@@ -195,7 +195,7 @@ def test_an_interrupt_ends_a_call_and_it_holds(air):
 def test_what_is_no_setpoint_to_fly_by_is_a_sentence(air):
     lab, end = air
     for setpoint, kind, sentence in (
-        ((1, 0, 0), TypeError, "a tuple is no vizflyt.Setpoint"),
+        ((1, 0, 0), TypeError, "a tuple is not a vizflyt.Setpoint"),
         (Setpoint.land(), ValueError, r"call land\(\)"),
         (Setpoint.offset([1, 0, 0]), ValueError, r"give Setpoint.waypoints\(\[d_m\]"),
     ):
@@ -246,7 +246,7 @@ def test_a_landing_that_the_lab_begins_ends_a_call(air):
     lab, end = air
     landing = [Event("ended", "the time limit of 60 s is over"), Event("phase", phase="landing")]
     threading.Timer(0.1, end.messages.extend, ([("event", event) for event in landing],)).start()
-    with pytest.raises(ConnectionError, match="the vehicle lands: the time limit of 60 s is over"):
+    with pytest.raises(ConnectionError, match="the vehicle is landing: the time limit of 60 s is over"):
         lab.fly(AHEAD, 30)
     assert lab.look().seq, "one sees on the way down"
 
@@ -254,7 +254,7 @@ def test_a_landing_that_the_lab_begins_ends_a_call(air):
 def test_a_lab_that_is_gone_is_an_error_that_says_what_to_do(air):
     lab, end = air
     threading.Timer(0.1, end.messages.append, (("gone", None),)).start()
-    with pytest.raises(ConnectionError, match=r"the lab is gone, its program has ended.*`vizflyt fly --attach`"):
+    with pytest.raises(ConnectionError, match=r"the lab is gone: its program has ended.*`vizflyt fly --attach`"):
         lab.fly(AHEAD, 30)
     until(lambda: not lab._thread.is_alive())
     with pytest.raises(ConnectionError, match="the lab is gone"):
@@ -303,7 +303,7 @@ def attached(stage):
 
 def test_through_shared_memory_it_attaches_once_sees_and_lets_go(stage):
     lab = attached(stage)
-    with pytest.raises(RuntimeError, match=r"<Lab stage: connecting> is attached already.*by close\(\)"):
+    with pytest.raises(RuntimeError, match=r"<Lab stage: connecting> is already attached.*with close\(\)"):
         vizflyt.attach(service=stage.rehearsal.service)
     kept = []
     for seq in range(1, 8):
@@ -316,7 +316,7 @@ def test_through_shared_memory_it_attaches_once_sees_and_lets_go(stage):
     until(lambda: lab.events)
     assert [event.text for event in lab.events] == ["the net is open"]
     lab.close()
-    assert stage.rehearsal.receive()[:3:2] == ("failed", "the notebook has let go of the lab before take-off")
+    assert stage.rehearsal.receive()[:3:2] == ("failed", "the notebook has detached from the lab before take-off")
     until(lambda: not stage.rehearsal.is_attached)
     # And another one may be attached.
     other = Stage()
@@ -340,7 +340,7 @@ def test_without_a_lab_it_says_how_to_start_one():
 
 def test_where_several_labs_wait_it_asks_which():
     one, two = Stage(waiting=True), Stage(waiting=True)
-    with pytest.raises(ConnectionError, match="labs wait for a plugin: choose one by") as caught:
+    with pytest.raises(ConnectionError, match="labs wait for a plugin: choose one with") as caught:
         vizflyt.attach()
     services = [one.rehearsal.service, two.rehearsal.service]
     assert all(service in str(caught.value) for service in services)

@@ -188,10 +188,10 @@ def test_a_number_that_is_not_finite_is_refused_and_the_plugin_goes_on(stage, st
 
 
 CLASSES = {
-    "not a plugin": ("class P:\n    pass", "P is no plugin: define it as class P(vizflyt.Plugin)"),
+    "not a plugin": ("class P:\n    pass", "P is not a plugin: define it as class P(vizflyt.Plugin)"),
     "misspelt": (
         "class P(vizflyt.Plugin):\n    def on_imgae(self, obs): pass",
-        "P has no method on_image(self, obs); is on_imgae meant to be it?",
+        "P has no method on_image(self, obs); rename on_imgae to on_image?",
     ),
     "without self": (
         "class P(vizflyt.Plugin):\n    def on_image(obs): pass",
@@ -199,7 +199,7 @@ CLASSES = {
     ),
     "async": (
         "class P(vizflyt.Plugin):\n    async def on_image(self, obs): pass",
-        "P.on_image is async, and nobody awaits it: write def on_image(self, obs)",
+        "P.on_image is async, but is not awaited: write def on_image(self, obs)",
     ),
     "broken constructor": (
         "class P(vizflyt.Plugin):\n    def __init__(self): self.model = open('weights.pt')\n"

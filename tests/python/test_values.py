@@ -65,7 +65,7 @@ def test_whatever_holds_three_numbers_is_a_vector(value):
         (
             lambda: Setpoint.waypoints(np.zeros((33, 3))),
             ValueError,
-            "points_m has 33 points, and a path at most 32: send the rest, under another id",
+            "points_m has 33 points, but a path has at most 32: send the rest, under another id",
         ),
         (
             lambda: Setpoint.polynomial(1.0, np.zeros((1, 9, 3))),
@@ -75,7 +75,7 @@ def test_whatever_holds_three_numbers_is_a_vector(value):
         (lambda: Setpoint.polynomial(-1.0, np.zeros((1, 4, 3))), ValueError, "a trajectory's piece lasts -1 s"),
         (lambda: Setpoint.attitude_rate([0, 0, 0], "full"), TypeError, "thrust must be a number"),
         (lambda: Setpoint([1, 0, 0]), TypeError, "Setpoint.velocity([x, y, z])"),
-        (lambda: Pose("ned", "body", [0, 0, 0]), ValueError, "'ned' is no frame; there are 'world'"),
+        (lambda: Pose("ned", "body", [0, 0, 0]), ValueError, "unknown frame 'ned'; known frames: 'world'"),
         (
             lambda: Pose("world", "body", [0, 0, 0], [0, 0, 0, 0]),
             ValueError,
@@ -129,7 +129,7 @@ def test_poses_compose_only_where_frames_meet():
         world_from_body @ body_from_cam.inverse()
     with pytest.raises(TypeError, match="for points there is transform_point"):
         world_from_body @ np.zeros(3)
-    with pytest.raises(ValueError, match="world_from_body is wanted, and this is body_from_cam"):
+    with pytest.raises(ValueError, match="expected world_from_body, got body_from_cam"):
         vizflyt.Vehicle(body_from_cam)
 
 
@@ -159,7 +159,7 @@ def test_an_arena_for_tests_is_made_by_hand():
     assert info.no_fly == [table] and info.floor_z_m == 0.25
     assert info.setpoints == ["position", "attitude_rate"] and info.attitude_rate
     assert "velocity" in vizflyt.ArenaInfo().setpoints and not vizflyt.ArenaInfo().attitude_rate
-    with pytest.raises(ValueError, match=r"['\"]speed['\"] is no kind of setpoint"):
+    with pytest.raises(ValueError, match=r"unknown kind of setpoint ['\"]speed['\"]"):
         vizflyt.ArenaInfo(setpoints=["speed"])
     with pytest.raises(ValueError, match="at most 8 no-fly boxes"):
         vizflyt.ArenaInfo(no_fly=[table] * 9)

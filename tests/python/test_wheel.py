@@ -43,7 +43,7 @@ def test_pip_install_is_all_that_a_student_needs(wheel, tmp_path):
 
     made = run("new", "p4", "--project", "p4")
     # Its Python has the package: there is nothing left to install.
-    assert made.returncode == 0 and made.stdout.split() == "p4 is made; now vizflyt fly p4".split(), made.stdout
+    assert made.returncode == 0 and made.stdout.split() == "p4 created; next vizflyt fly p4".split(), made.stdout
     for file in (tmp_path / "p4").rglob("*"):
         # The folder goes to another computer as it is.
         assert file.is_dir() or str(Path(__file__).parents[2]) not in file.read_text(), file

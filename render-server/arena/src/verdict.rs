@@ -286,6 +286,6 @@ mod tests {
     fn a_record_that_stops_in_flight_is_no_landing() {
         let verdict = judge(&course(), &[take_off(), stage(2.0, 0)], &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Error, 1));
-        assert_eq!(verdict.reason, "not over when its record ends");
+        assert_eq!(verdict.reason, "the record ends before the flight");
     }
 }

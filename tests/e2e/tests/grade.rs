@@ -273,7 +273,7 @@ fn who_draws_lots_and_kills_itself_gets_no_second_lot() {
     fs::copy(&program, rig.at("misbehave")).unwrap();
     let lots = script(&rig, "lots", "exec \"$(dirname \"$0\")/misbehave\" lots \"$@\"");
     let args = [&lots, "--project=forest", "--seeds=1", "--image-rate=10"];
-    rig.refused(&args, "it went another way before it came to where it was lost");
+    rig.refused(&args, "differs before the point where the first one was lost");
 }
 
 /// Where a plugin gets no cell, its grade is worth no signature.
@@ -362,7 +362,7 @@ fn eight_at_a_time_beside_a_full_load_and_killed_and_resumed_give_one_hash() {
     let kept = fs::read_to_string(&record).unwrap();
 
     // Nothing is lost by accident, and nothing else is taken for it.
-    rig.refused(&one, "--resume keeps them");
+    rig.refused(&one, "keep them with --resume");
     let resumed = [&one[..], &["--resume"]].concat();
     let other = |args: &[&str], word: &str| {
         rig.refused(&[&resumed[..], args].concat(), &format!("with another {word}"));
@@ -440,7 +440,7 @@ fn a_report_is_signed_to_its_last_file_and_its_logs_are_replayed() {
     rig.refused(&["verify", &report, "--junit", &junit], "is not the JUnit XML of this grade");
     // The document alone still counts, wherever it is.
     let printed = rig.good(&["verify", at("grade.json").to_str().unwrap()]);
-    assert!(printed.contains("were not looked at"), "{printed}");
+    assert!(printed.contains("were not checked"), "{printed}");
 
     // The log is the flight: another plugin's process answers the same.
     let log = at("logs/day-1.mcap");
@@ -637,7 +637,7 @@ fn invalid_arguments_are_refused_before_any_flight() {
     rig.refused(&["./gone.py"], "there is no plugin");
     rig.refused(&["verify", &rig.at("gone.json")], "cannot read");
     fs::write(rig.at("noise.json"), "{}").unwrap();
-    rig.refused(&["verify", &rig.at("noise.json")], "is no grade");
+    rig.refused(&["verify", &rig.at("noise.json")], "is not a grade");
 }
 
 /// Returns the code block of this language in the guide to clusters.

@@ -238,7 +238,7 @@ fn other_ends_have_their_own_causes() {
     check(&end(EndReason::Interrupted), "stopped by hand: stopped by a person");
     check(&end(EndReason::PluginLanded), "it gave up: the plugin asked to land");
     check(&end(EndReason::PoseLost { age_s: 0.5 }), "not the plugin: pose lost for 0.5 s");
-    check(&case, "not the plugin: not over when its record ends");
+    check(&case, "not the plugin: the record ends before the flight");
     assert_eq!(cause_of(&end(EndReason::Finished { seconds: 12.0 })), None);
 
     // It never rose from the floor.

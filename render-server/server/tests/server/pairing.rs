@@ -113,7 +113,7 @@ async fn three_wrong_codes_end_it() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
     let jetson = Identity::ephemeral().unwrap();
-    for expected in ["2 of 3", "1 of 3", "for the last time"] {
+    for expected in ["2 of 3", "1 of 3", "no tries left"] {
         let refused = pair(server.quic, &jetson, other_than(code)).await.unwrap_err();
         assert!(refused.contains(expected), "{refused}");
     }

@@ -145,7 +145,7 @@ fn a_starved_server_slows_the_vehicle_and_nothing_is_touched() {
     let report = file.read();
     println!("{} after {} s", report["reason"], report["seconds"]);
     assert_ne!(report["outcome"], "collided", "{report:#} {:#?}", demo.seen);
-    let is_told = |line: &String| line.contains("what the plugin sees is") || line.contains("hold");
+    let is_told = |line: &String| line.contains("the plugin's images are") || line.contains("hold");
     assert!(demo.seen.iter().any(is_told), "{:#?}", demo.seen);
 }
 

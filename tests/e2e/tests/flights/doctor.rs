@@ -91,7 +91,7 @@ fn the_arena_becomes_the_autopilots_fence() {
         "written  FENCE_TYPE = 15",
         "written  FENCE_ALT_MIN = 0.1",
         "written  fence of 2 polygons",
-        "does not know the no-fly boxes about (6.5, 1.2)",
+        "does not contain the no-fly boxes at (6.5, 1.2)",
     ] {
         assert!(text.contains(expected), "no '{expected}' in:\n{text}");
     }
@@ -120,7 +120,7 @@ fn a_key_is_made_once_and_given() {
     let output = sign();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success() && text.contains("(new; only you can read it)"), "{output:?}");
-    assert!(text.contains("given    to system 1"), "{text}");
+    assert!(text.contains("sent     to system 1"), "{text}");
     let made = std::fs::read_to_string(&key).unwrap();
     let output = sign();
     assert!(output.status.success() && !String::from_utf8_lossy(&output.stdout).contains("new;"));

@@ -224,7 +224,7 @@ fn mistakes_are_explained() {
         .check_refused(&["new", "x", "--lang", "rust", "--project", "p99"], &["no project 'p99'"]);
     assert!(!student.path("x").exists(), "nothing is left behind");
     student.write("full/file", "");
-    student.check_refused(&["new", "full", "--lang", "python"], &["there already"]);
+    student.check_refused(&["new", "full", "--lang", "python"], &["exists already"]);
     student.write("projects/p99/arena.toml", "");
     let made = student.run(&["new", "x", "--lang", "rust", "--project", "p99"]);
     assert!(made.status.success(), "{made:?}");

@@ -197,5 +197,5 @@ fn the_room_is_flown_over_a_mat_alone() {
 #[test]
 fn what_is_larger_than_the_mat_is_refused() {
     let forest = ["demo", "--headless", "--localization=mat", "--scene=forest"];
-    check_refused(&forest, &["the mat covers a hall of 11 x 4.5 m", "take --scene room or race"]);
+    check_refused(&forest, &["the mat covers a hall of 11 x 4.5 m", "use --scene room or race"]);
 }

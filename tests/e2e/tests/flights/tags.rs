@@ -171,7 +171,7 @@ fn a_lab_is_set_up_from_the_printer_to_surveyed_cameras() {
         write_folder(&home.join(name), &images);
     }
     let no_source = ["survey", "cameras", "left.toml", "--mat", "room.toml"];
-    refused(home, &no_source, &["left.toml", "names no source"]);
+    refused(home, &no_source, &["left.toml", "no source in the file"]);
     let files = ["left.toml=left", "right.toml=right"];
     let printed = succeeds(home, &["survey", "cameras", files[0], files[1], "--mat", "room.toml"]);
     for (name, truth) in ["left", "right"].into_iter().zip(truth) {

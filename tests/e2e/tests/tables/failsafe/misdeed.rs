@@ -58,7 +58,7 @@ pub(crate) const CASES: [Case; 14] = [
         ..case(&[Deed::Outside], (4.0, None), "asks to leave the geofence; the vehicle stops")
     },
     case(&[Deed::Flood], AT_ONCE_S, "more than 400 setpoints a second"),
-    case(&[Deed::Types], AT_ONCE_S, "what it sends is no setpoint"),
+    case(&[Deed::Types], AT_ONCE_S, "it sends an invalid message"),
     case(&[Deed::Print], SILENT_S, "the plugin has not answered image"),
     Case {
         outcome: OutcomeKind::Landed,
