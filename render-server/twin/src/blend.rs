@@ -168,6 +168,127 @@ fn lanes<S: Simd>(s: S) -> (S::F, S::F) {
     (s.load(&x), s.load(&y))
 }
 
+/// One block of a tile.
+struct Block<S: Simd> {
+    s: S,
+    /// Centres of its pixels, from the tile's corner [px].
+    x: S::F,
+    y: S::F,
+    /// Index of its first pixel in a channel.
+    at: usize,
+}
+
+impl<S: Simd> Block<S> {
+    /// Returns block number `block`; `lanes` are the pixels of the first one.
+    #[inline(always)]
+    fn new(s: S, lanes: (S::F, S::F), block: usize) -> Self {
+        let (x, y) = block_origin(block, S::LANES / BLOCK_WIDTH);
+        let (x, y) = (lanes.0 + s.splat(x as f32), lanes.1 + s.splat(y as f32));
+        Self { s, x, y, at: block * S::LANES }
+    }
+
+    /// Blends a list onto the block. Returns whether a pixel still lets light through.
+    #[inline(always)]
+    fn forward(&self, batch: &Batch, list: &[u8], state: &mut [[f32; PIXELS]; CHANNELS]) -> bool {
+        let &Self { s, x, y, at } = self;
+        let mut sums = [s.splat(0.0); CHANNELS];
+        for channel in 0..CHANNELS {
+            sums[channel] = s.load(&state[channel][at..]);
+        }
+        let [mut red, mut green, mut blue, mut first, mut second, mut transmittance] = sums;
+        let mut goes_on = true;
+        for &i in list {
+            let i = usize::from(i) % BATCH;
+            let dy = y - s.splat(batch.mean_y[i]);
+            let u = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
+            let level =
+                s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
+            let level = s.neg_mul_add(u * s.splat(batch.falloff_x[i]), u, level);
+            let hit = s.lt(s.splat(MIN_LEVEL), level);
+            let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
+            let after = s.neg_mul_add(alpha, transmittance, transmittance);
+            let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
+            let weight = s.keep(live, alpha * transmittance);
+            red = s.mul_add(weight, s.splat(batch.rgb[0][i]), red);
+            green = s.mul_add(weight, s.splat(batch.rgb[1][i]), green);
+            blue = s.mul_add(weight, s.splat(batch.rgb[2][i]), blue);
+            let z = s.splat(batch.z[i]);
+            let deep = weight * z;
+            first = first + deep;
+            second = s.mul_add(deep, z, second);
+            transmittance = s.select(live, after, s.negative(transmittance));
+            if !s.any(live) {
+                goes_on = false;
+                break;
+            }
+        }
+        let sums = [red, green, blue, first, second, transmittance];
+        for channel in 0..CHANNELS {
+            s.store(sums[channel], &mut state[channel][at..]);
+        }
+        goes_on
+    }
+
+    /// Adds the derivatives at the block's pixels by Gaussian `i` to `sums`. `rest` is the light behind each pixel's
+    /// last Gaussian, weighted by `by`; `through` its transmittance. Returns whether a pixel still lets light through.
+    #[inline(always)]
+    fn backward(
+        &self,
+        batch: &Batch,
+        i: usize,
+        by: &[[f32; PIXELS]; BY_CHANNELS],
+        rest: &mut [f32; PIXELS],
+        through: &mut [f32; PIXELS],
+        sums: &mut [S::F; SUMS],
+    ) -> bool {
+        let &Self { s, x, y, at } = self;
+        let one = s.splat(1.0);
+        let dy = y - s.splat(batch.mean_y[i]);
+        let u = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
+        let level = s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
+        let level = s.neg_mul_add(u * s.splat(batch.falloff_x[i]), u, level);
+        let hit = s.lt(s.splat(MIN_LEVEL), level);
+        let full = s.exp2(level);
+        let alpha = s.keep(hit, s.min(full, s.splat(ALPHA_MAX as f32)));
+        let transmittance = s.load(&through[at..]);
+        let after = s.neg_mul_add(alpha, transmittance, transmittance);
+        let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
+        let weight = s.keep(live, alpha * transmittance);
+
+        let load = |channel: usize| s.load(&by[channel][at..]);
+        let (red, green, blue) = (load(0), load(1), load(2));
+        let (first, second) = (load(3), load(4));
+        let z = s.splat(batch.z[i]);
+        // What one unit of weight is worth here.
+        let worth = red * s.splat(batch.rgb[0][i]);
+        let worth = s.mul_add(green, s.splat(batch.rgb[1][i]), worth);
+        let worth = s.mul_add(blue, s.splat(batch.rgb[2][i]), worth);
+        let worth = s.mul_add(s.mul_add(second, z, first), z, worth);
+        let behind = s.neg_mul_add(weight, worth, s.load(&rest[at..]));
+        let by_alpha = s.neg_mul_add(behind, one / (one - alpha), transmittance * worth);
+        // Cut off at its greatest, alpha does not change with the level.
+        let free = live & s.lt(full, s.splat(ALPHA_MAX as f32));
+        let g = s.keep(free, by_alpha * alpha);
+        let (gu, gy) = (g * u, g * dy);
+        sums[0] = sums[0] + g;
+        sums[1] = sums[1] + gu;
+        sums[2] = sums[2] + gy;
+        sums[3] = s.mul_add(gu, u, sums[3]);
+        sums[4] = s.mul_add(gu, dy, sums[4]);
+        sums[5] = s.mul_add(gy, dy, sums[5]);
+        sums[6] = s.mul_add(weight, red, sums[6]);
+        sums[7] = s.mul_add(weight, green, sums[7]);
+        sums[8] = s.mul_add(weight, blue, sums[8]);
+        sums[9] = s.mul_add(weight, s.mul_add(second + second, z, first), sums[9]);
+
+        sums[10] = s.mul_add(weight, load(6), sums[10]);
+
+        s.store(behind, &mut rest[at..]);
+        s.store(s.select(live, after, s.negative(transmittance)), &mut through[at..]);
+        s.any(live)
+    }
+}
+
 /// Copies between a tile of a band, row by row, and a channel of blocks.
 #[inline(always)]
 fn for_rows(lanes: usize, stride: usize, tile_x: usize, mut copy: impl FnMut(usize, usize)) {
@@ -196,7 +317,7 @@ impl Kernel for Forward<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let blocks = PIXELS / S::LANES;
-        let (lane_x, lane_y) = lanes(s);
+        let lanes = lanes(s);
         let mut batch = Batch::new();
         let mut state = [[0.0; PIXELS]; CHANNELS];
         let mut lists = [[0u8; BATCH]; MAX_BLOCKS];
@@ -228,9 +349,7 @@ impl Kernel for Forward<'_> {
                     if list.is_empty() {
                         continue;
                     }
-                    let (x, y) = block_origin(block, S::LANES / BLOCK_WIDTH);
-                    let (x, y) = (lane_x + s.splat(x as f32), lane_y + s.splat(y as f32));
-                    if !forward_block(s, &batch, list, x, y, &mut state, block * S::LANES) {
+                    if !Block::new(s, lanes, block).forward(&batch, list, &mut state) {
                         live &= !(1 << block);
                     }
                 }
@@ -247,54 +366,6 @@ impl Kernel for Forward<'_> {
             }
         }
     }
-}
-
-/// Blends a list onto one block; returns whether any of its pixels goes on.
-#[inline(always)]
-fn forward_block<S: Simd>(
-    s: S,
-    batch: &Batch,
-    list: &[u8],
-    x: S::F,
-    y: S::F,
-    state: &mut [[f32; PIXELS]; CHANNELS],
-    at: usize,
-) -> bool {
-    let mut sums = [s.splat(0.0); CHANNELS];
-    for channel in 0..CHANNELS {
-        sums[channel] = s.load(&state[channel][at..]);
-    }
-    let [mut red, mut green, mut blue, mut first, mut second, mut transmittance] = sums;
-    let mut goes_on = true;
-    for &i in list {
-        let i = usize::from(i) % BATCH;
-        let dy = y - s.splat(batch.mean_y[i]);
-        let u = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
-        let level = s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
-        let level = s.neg_mul_add(u * s.splat(batch.falloff_x[i]), u, level);
-        let hit = s.lt(s.splat(MIN_LEVEL), level);
-        let alpha = s.keep(hit, s.min(s.exp2(level), s.splat(ALPHA_MAX as f32)));
-        let after = s.neg_mul_add(alpha, transmittance, transmittance);
-        let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
-        let weight = s.keep(live, alpha * transmittance);
-        red = s.mul_add(weight, s.splat(batch.rgb[0][i]), red);
-        green = s.mul_add(weight, s.splat(batch.rgb[1][i]), green);
-        blue = s.mul_add(weight, s.splat(batch.rgb[2][i]), blue);
-        let z = s.splat(batch.z[i]);
-        let deep = weight * z;
-        first = first + deep;
-        second = s.mul_add(deep, z, second);
-        transmittance = s.select(live, after, s.negative(transmittance));
-        if !s.any(live) {
-            goes_on = false;
-            break;
-        }
-    }
-    let sums = [red, green, blue, first, second, transmittance];
-    for channel in 0..CHANNELS {
-        s.store(sums[channel], &mut state[channel][at..]);
-    }
-    goes_on
 }
 
 /// Takes the derivative at the pixels of one band of tiles back to the pairs of its lists.
@@ -318,7 +389,7 @@ impl Kernel for Backward<'_> {
     fn run<S: Simd>(self, s: S) {
         let blocks = PIXELS / S::LANES;
         let tiles_x = self.bins.tiles_x;
-        let (lane_x, lane_y) = lanes(s);
+        let lanes = lanes(s);
         let mut batch = Batch::new();
         // The derivative by each channel, transmittance, and what is still to come.
         let mut by = [[0.0; PIXELS]; BY_CHANNELS];
@@ -361,20 +432,14 @@ impl Kernel for Backward<'_> {
                     while bits != 0 {
                         let block = bits.trailing_zeros() as usize % blocks;
                         bits &= bits - 1;
-                        let (x, y) = block_origin(block, S::LANES / BLOCK_WIDTH);
-                        let (x, y) = (lane_x + s.splat(x as f32), lane_y + s.splat(y as f32));
-                        let at = block * S::LANES;
-                        let (rest, through) = (&mut rest[at..], &mut transmittance[at..]);
-                        if !backward_block(
-                            s,
+                        let block_pixels = Block::new(s, lanes, block);
+                        let (rest, transmittance) = (&mut rest, &mut transmittance);
+                        if !block_pixels.backward(
                             &batch,
                             i % BATCH,
-                            x,
-                            y,
                             &by,
-                            at,
                             rest,
-                            through,
+                            transmittance,
                             &mut sums,
                         ) {
                             live &= !(1 << block);
@@ -387,65 +452,4 @@ impl Kernel for Backward<'_> {
             }
         }
     }
-}
-
-/// Adds what one block's pixels feel of one Gaussian; returns whether any of its pixels goes on.
-#[allow(clippy::too_many_arguments, reason = "inlined; a struct for one caller says no more")]
-#[inline(always)]
-fn backward_block<S: Simd>(
-    s: S,
-    batch: &Batch,
-    i: usize,
-    x: S::F,
-    y: S::F,
-    by: &[[f32; PIXELS]; BY_CHANNELS],
-    at: usize,
-    rest: &mut [f32],
-    through: &mut [f32],
-    sums: &mut [S::F; SUMS],
-) -> bool {
-    let one = s.splat(1.0);
-    let dy = y - s.splat(batch.mean_y[i]);
-    let u = s.neg_mul_add(dy, s.splat(batch.shear[i]), x - s.splat(batch.mean_x[i]));
-    let level = s.neg_mul_add(dy * s.splat(batch.falloff_y[i]), dy, s.splat(batch.level[i]));
-    let level = s.neg_mul_add(u * s.splat(batch.falloff_x[i]), u, level);
-    let hit = s.lt(s.splat(MIN_LEVEL), level);
-    let full = s.exp2(level);
-    let alpha = s.keep(hit, s.min(full, s.splat(ALPHA_MAX as f32)));
-    let transmittance = s.load(through);
-    let after = s.neg_mul_add(alpha, transmittance, transmittance);
-    let live = s.lt(s.splat(TRANSMITTANCE_MIN as f32), after);
-    let weight = s.keep(live, alpha * transmittance);
-
-    let load = |channel: usize| s.load(&by[channel][at..]);
-    let (red, green, blue) = (load(0), load(1), load(2));
-    let (first, second) = (load(3), load(4));
-    let z = s.splat(batch.z[i]);
-    // What one unit of weight is worth here.
-    let worth = red * s.splat(batch.rgb[0][i]);
-    let worth = s.mul_add(green, s.splat(batch.rgb[1][i]), worth);
-    let worth = s.mul_add(blue, s.splat(batch.rgb[2][i]), worth);
-    let worth = s.mul_add(s.mul_add(second, z, first), z, worth);
-    let behind = s.neg_mul_add(weight, worth, s.load(rest));
-    let by_alpha = s.neg_mul_add(behind, one / (one - alpha), transmittance * worth);
-    // Cut off at its greatest, alpha does not change with the level.
-    let free = live & s.lt(full, s.splat(ALPHA_MAX as f32));
-    let g = s.keep(free, by_alpha * alpha);
-    let (gu, gy) = (g * u, g * dy);
-    sums[0] = sums[0] + g;
-    sums[1] = sums[1] + gu;
-    sums[2] = sums[2] + gy;
-    sums[3] = s.mul_add(gu, u, sums[3]);
-    sums[4] = s.mul_add(gu, dy, sums[4]);
-    sums[5] = s.mul_add(gy, dy, sums[5]);
-    sums[6] = s.mul_add(weight, red, sums[6]);
-    sums[7] = s.mul_add(weight, green, sums[7]);
-    sums[8] = s.mul_add(weight, blue, sums[8]);
-    sums[9] = s.mul_add(weight, s.mul_add(second + second, z, first), sums[9]);
-
-    sums[10] = s.mul_add(weight, load(6), sums[10]);
-
-    s.store(behind, rest);
-    s.store(s.select(live, after, s.negative(transmittance)), through);
-    s.any(live)
 }

@@ -40,45 +40,39 @@ pub(super) struct Feeder<'a> {
     answer_within: Duration,
     process: Option<PluginProcess>,
     decoders: HashMap<u32, Decoder>,
+    /// Called with each line that the plugin prints.
+    line: &'a mut dyn FnMut(Stream, &str),
 }
 
 /// A plugin that failed: how, in a sentence.
 type Failed = String;
 
 impl<'a> Feeder<'a> {
-    pub(super) fn new(options: &'a ReplayOptions) -> Self {
+    pub(super) fn new(options: &'a ReplayOptions, line: &'a mut dyn FnMut(Stream, &str)) -> Self {
         let ReplayOptions { command, limits, answer_within, .. } = options;
         let answer_within = *answer_within;
-        Self { command, limits, answer_within, process: None, decoders: HashMap::new() }
+        Self { command, limits, answer_within, process: None, decoders: HashMap::new(), line }
     }
 
     /// Sends a message; a start begins a process, and ends the one before.
-    pub(super) fn send(
-        &mut self,
-        message: &ToPlugin,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<Result<(), Failed>, ReplayError> {
+    pub(super) fn send(&mut self, message: &ToPlugin) -> Result<Result<(), Failed>, ReplayError> {
         match message {
             ToPlugin::Start(_) => {
-                self.stop(line);
+                self.stop();
                 let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
-                split_failure(self.process.insert(process).begin(message, line))
+                split_failure(self.process.insert(process).begin(message, self.line))
             }
             // Ours comes at the end of the log.
             ToPlugin::Stop => Ok(Ok(())),
             ToPlugin::Event(_) => match &mut self.process {
-                Some(process) => split_failure(process.send(message, line)),
+                Some(process) => split_failure(process.send(message, self.line)),
                 None => Ok(Ok(())),
             },
         }
     }
 
     /// Publishes an observation and waits for the reply.
-    pub(super) fn feed(
-        &mut self,
-        observation: &Observation,
-        line: &mut dyn FnMut(Stream, &str),
-    ) -> Result<FeedOutcome, ReplayError> {
+    pub(super) fn feed(&mut self, observation: &Observation) -> Result<FeedOutcome, ReplayError> {
         let Some(process) = &mut self.process else { return Ok(FeedOutcome::Undecodable) };
         let Some(len) = observation_len(&observation.head) else {
             return Ok(FeedOutcome::Undecodable);
@@ -87,24 +81,24 @@ impl<'a> Feeder<'a> {
         if decode(observation, memory.memory(), &mut self.decoders).is_none() {
             return Ok(FeedOutcome::Undecodable);
         }
-        let answer = split_failure(process.ask(observation.seq, memory, line))?;
+        let answer = split_failure(process.ask(observation.seq, memory, self.line))?;
         Ok(answer.map_or_else(FeedOutcome::Failed, FeedOutcome::Replied))
     }
 
     /// Waits until then, and passes on what the plugin prints.
-    pub(super) fn idle_until(&mut self, due: Instant, line: &mut dyn FnMut(Stream, &str)) {
+    pub(super) fn idle_until(&mut self, due: Instant) {
         while Instant::now() < due {
             sleep_until(due.min(Instant::now() + LINES_EVERY));
             if let Some(process) = &mut self.process {
-                process.pass_lines(line);
+                process.pass_lines(self.line);
             }
         }
     }
 
     /// Ends the plugin in order.
-    pub(super) fn stop(&mut self, line: &mut dyn FnMut(Stream, &str)) {
+    pub(super) fn stop(&mut self) {
         if let Some(process) = self.process.take() {
-            process.stop(line);
+            process.stop(self.line);
         }
     }
 }

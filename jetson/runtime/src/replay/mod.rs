@@ -178,10 +178,10 @@ pub fn replay(
         log_is_cut: plan.is_cut,
         ..ReplayReport::default()
     };
-    let mut feeder = Feeder::new(options);
-    let failed = run(log, plan, options, &mut feeder, line, &mut report, &mut answers);
+    let mut feeder = Feeder::new(options, line);
+    let failed = run(log, plan, options, &mut feeder, &mut report, &mut answers);
     // What it printed last is on its way, also of one that failed.
-    feeder.stop(line);
+    feeder.stop();
     let failed = failed?;
     answers.flush().map_err(lost)?;
     report.plugin_failed = failed;
@@ -194,7 +194,6 @@ fn run(
     mut plan: ReplayPlan,
     options: &ReplayOptions,
     feeder: &mut Feeder<'_>,
-    line: &mut dyn FnMut(Stream, &str),
     report: &mut ReplayReport,
     answers: &mut impl Write,
 ) -> Result<Option<String>, ReplayError> {
@@ -212,7 +211,7 @@ fn run(
             continue;
         }
         while let Some((_, message)) = plan.messages.pop_front_if(|(sent, _)| *sent < time) {
-            if let Err(why) = feeder.send(&message, line)? {
+            if let Err(why) = feeder.send(&message)? {
                 return Ok(Some(why));
             }
         }
@@ -220,9 +219,9 @@ fn run(
         let at_s = published.seconds_since(first);
         if options.is_realtime {
             let due = began + Duration::from_secs_f64(at_s.max(0.0));
-            feeder.idle_until(due, line);
+            feeder.idle_until(due);
         }
-        let setpoint = match feeder.feed(&observation, line)? {
+        let setpoint = match feeder.feed(&observation)? {
             FeedOutcome::Replied(setpoint) => setpoint,
             FeedOutcome::Undecodable => {
                 report.images_missing += u64::from(answer.is_some());

@@ -1,6 +1,7 @@
 //! One image from its bands: every row at its own instants, then the sensor.
 
 use rayon::prelude::*;
+use vizflyt_protocol::geometry::{Cam, Pose, World};
 use vizflyt_splat::imaging::exposure::vignetting;
 use vizflyt_splat::imaging::shutter::{Moved, Seen};
 
@@ -46,28 +47,25 @@ impl Film {
             let n = self.bands.partition_point(|band| band.rows.end as usize <= y);
             line.clear();
             line.resize(3 * width, 0.0);
-            self.expose_row(&self.bands[n], &images[n], track, middle_s, exposure, y, line);
+            let instant_s = self.phone.row_instant_s(y as f64 + 0.5, middle_s);
+            let half_s = exposure.shutter_s / 2.0;
+            let path = [instant_s - half_s, instant_s + half_s].map(track);
+            self.expose_row(&self.bands[n], &images[n], path, y, line);
             self.read_row(line, exposure, y, seed, out);
         });
         bytes
     }
 
-    /// Adds up the light of a row while it is exposed.
-    #[expect(clippy::too_many_arguments, reason = "a row of all that an image is made of")]
+    /// Adds up the light of a row; `path` holds the camera's poses when its exposure begins and ends.
     fn expose_row(
         &self,
         band: &Band,
         image: &BandImage,
-        track: &Track<'_>,
-        middle_s: f64,
-        exposure: &Exposure,
+        path: [Pose<World, Cam>; 2],
         y: usize,
         line: &mut [f32],
     ) {
-        let instant_s = self.phone.row_instant_s(y as f64 + 0.5, middle_s);
-        let half_s = exposure.shutter_s / 2.0;
-        let moved = [instant_s - half_s, instant_s + half_s]
-            .map(|at_s| Moved::new(image.world_from_cam.inverse() * track(at_s)));
+        let moved = path.map(|pose| Moved::new(image.world_from_cam.inverse() * pose));
         let size = (band.intrinsics.width_px, band.intrinsics.height_px);
         let seen = Seen::new(size, &image.light, &image.depth_m, band.origin_px().as_vec2());
         let width = self.phone.intrinsics.width_px as usize;

@@ -41,6 +41,8 @@ const PREFETCH: usize = 12;
 /// Which part of the scene a slot is of, and what of it is wanted.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Tagged<'a> {
+    /// Slots.
+    pub(super) splats: &'a [Splat2d],
     /// What stands still, then the objects.
     pub(super) parts: &'a [Part],
     /// Per region of slots.
@@ -59,7 +61,6 @@ impl Tagged<'_> {
 pub(super) fn blend<S: Simd>(
     simd: S,
     view: &ObjectView,
-    splats: &[Splat2d],
     bins: &Bins,
     tagged: &Tagged<'_>,
     tiles: &mut Vec<f32>,
@@ -70,7 +71,6 @@ pub(super) fn blend<S: Simd>(
         let (index, pixels) = tile;
         let task = BlendTile {
             view,
-            splats,
             list: bins.list(index),
             tagged,
             origin: [index % bins.tiles_x * TILE, index / bins.tiles_x * TILE],
@@ -121,7 +121,6 @@ impl Scratch {
 /// One tile.
 struct BlendTile<'a> {
     view: &'a ObjectView,
-    splats: &'a [Splat2d],
     list: &'a [AtomicU64],
     tagged: &'a Tagged<'a>,
     /// The tile's first pixel, x and y.
@@ -135,7 +134,8 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Self { view, splats, list, tagged, origin, scratch, pixels } = self;
+        let Self { view, list, tagged, origin, scratch, pixels } = self;
+        let splats = tagged.splats;
         // Ids cost a twentieth of the pass: only where something moves.
         let has_ids = tagged.parts.len() > 1;
         let pixels = &mut pixels[..TILE_NUMBERS];

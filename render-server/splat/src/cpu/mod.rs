@@ -202,8 +202,13 @@ impl CpuRenderer {
         bins.bin(simd, &still, projected, sorter.order());
         times.bin_ms += milliseconds(start);
         let start = Instant::now();
-        let tagged = blend::Tagged { parts, visible, depth_alone: self.depth_alone };
-        blend::blend(simd, &still, &projected.splats, bins, &tagged, tiles, image);
+        let tagged = blend::Tagged {
+            splats: &projected.splats,
+            parts,
+            visible,
+            depth_alone: self.depth_alone,
+        };
+        blend::blend(simd, &still, bins, &tagged, tiles, image);
         times.blend_ms += milliseconds(start);
         Ok(())
     }

@@ -146,8 +146,9 @@ impl<const LENS: bool, const ANTIALIASED: bool> Kernel for ProjectBlock<'_, LENS
             let geometry = &geometry[group * GROUP_NUMBERS..][..GROUP_NUMBERS];
             let sh = &sh[group * sh_numbers..][..sh_numbers];
             for first in (0..GROUP).step_by(S::LANES) {
+                let columns = Columns { s, geometry, first };
                 let (view, out) = (self.view, &mut self.out);
-                count = vector::<S, LENS, ANTIALIASED>(s, view, geometry, sh, first, out, count);
+                count = vector::<S, LENS, ANTIALIASED>(columns, view, sh, out, count);
             }
         }
         count
@@ -158,15 +159,13 @@ impl<const LENS: bool, const ANTIALIASED: bool> Kernel for ProjectBlock<'_, LENS
 /// the new count.
 #[inline(always)]
 fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
-    s: S,
+    columns: Columns<'_, S>,
     view: &ObjectView,
-    geometry: &[f32],
     sh: &[u16],
-    first: usize,
     out: &mut Region,
     mut count: usize,
 ) -> usize {
-    let columns = Columns { s, geometry, first };
+    let Columns { s, first, .. } = columns;
     let mean = columns.vector(column::MEAN);
     // Relative to the camera before anything else: large coordinates cancel while still exact.
     let centre = view.center_m;

@@ -207,6 +207,8 @@ impl Imager {
         let rendered_from_world = shot.camera.world_from_cam.inverse();
         let moved = |at_s| Moved::new(rendered_from_world * (shot.path)(at_s));
         let (pixels, light) = (&self.pixels, &self.light);
+        let vignette = sensor.vignette as f32;
+        let rows = RowReader { readout: &readout, vignette, filter, key: shot.key, width, height };
         let lines = self.exposed.par_chunks_mut(3 * width);
         lines.zip(self.mosaic.par_chunks_mut(width)).enumerate().for_each(|(y, (line, mosaic))| {
             let middle_s = ((y as f64 + 0.5) / height as f64 - 0.5) * sensor.readout_s;
@@ -218,8 +220,7 @@ impl Imager {
                 line.fill(0.0);
                 seen.expose_row(&pixels[y * width..][..width], y, ends, line);
             }
-            let key = shot.key;
-            read_row(&readout, sensor, filter, key, (width, height), y, line, mosaic);
+            rows.read(y, line, mosaic);
         });
         let mut raw = if filter == ColorFilter::Rgb { &self.exposed } else { &self.mosaic };
         if sensor.denoise {
@@ -262,36 +263,39 @@ impl Sensor {
     }
 }
 
-/// Reads a row of light out: in place, or into its row of the mosaic.
-#[expect(clippy::too_many_arguments, reason = "a row of all that an image is made of")]
-fn read_row(
-    readout: &Readout,
-    sensor: &Sensor,
+/// Converts light to numbers, row by row.
+struct RowReader<'a> {
+    readout: &'a Readout,
+    vignette: f32,
     filter: ColorFilter,
     key: NoiseKey,
-    (width, height): (usize, usize),
-    y: usize,
-    line: &mut [f32],
-    mosaic: &mut [f32],
-) {
-    let table = Normals::table();
-    let vignette = sensor.vignette as f32;
-    let v = (y as f32 + 0.5) / height as f32 - 0.5;
-    for (x, (light, mosaic)) in line.chunks_exact_mut(3).zip(mosaic).enumerate() {
-        let bright = vignetting(vignette, (x as f32 + 0.5) / width as f32 - 0.5, v);
-        let bits = key.bits(y * width + x);
-        match filter {
-            ColorFilter::Rgb => {
-                for (c, light) in (0u32..).zip(light) {
-                    *light = readout.read(bright * *light, table.of(bits, c));
+    /// Size of the image [px].
+    width: usize,
+    height: usize,
+}
+
+impl RowReader<'_> {
+    /// Reads row `y` of light out: in place, or into its row of the mosaic.
+    fn read(&self, y: usize, line: &mut [f32], mosaic: &mut [f32]) {
+        let table = Normals::table();
+        let &Self { readout, vignette, filter, key, width, height } = self;
+        let v = (y as f32 + 0.5) / height as f32 - 0.5;
+        for (x, (light, mosaic)) in line.chunks_exact_mut(3).zip(mosaic).enumerate() {
+            let bright = vignetting(vignette, (x as f32 + 0.5) / width as f32 - 0.5, v);
+            let bits = key.bits(y * width + x);
+            match filter {
+                ColorFilter::Rgb => {
+                    for (c, light) in (0u32..).zip(light) {
+                        *light = readout.read(bright * *light, table.of(bits, c));
+                    }
                 }
-            }
-            ColorFilter::Bayer => {
-                *mosaic = readout.read(bright * light[bayer_color(x, y)], table.of(bits, 0));
-            }
-            ColorFilter::Mono => {
-                let light = luminance(light[0], light[1], light[2]);
-                *mosaic = readout.read(bright * light, table.of(bits, 0));
+                ColorFilter::Bayer => {
+                    *mosaic = readout.read(bright * light[bayer_color(x, y)], table.of(bits, 0));
+                }
+                ColorFilter::Mono => {
+                    let light = luminance(light[0], light[1], light[2]);
+                    *mosaic = readout.read(bright * light, table.of(bits, 0));
+                }
             }
         }
     }

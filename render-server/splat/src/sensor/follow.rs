@@ -418,7 +418,7 @@ fn touch<S: Simd>(
         far = s.min(middle + side, far);
     }
     let reach = s.mul_add(far_side, fan.footprint, wide) + fan.apart;
-    let beside = beside(s, fan, window, ahead - deep, far_side, sideways, reach);
+    let beside = beside(s, fan, window, [ahead - deep, far_side], sideways, reach);
     let mut nears = [0.0; WIDTH];
     s.store(near, &mut nears);
     (!s.bits(s.lt(far, near)) & s.bits(beside) & 0xff, nears)
@@ -431,8 +431,7 @@ fn beside<S: Simd>(
     s: S,
     fan: &Fan<S>,
     [low, high]: [S::F; 2],
-    near_side: S::F,
-    far_side: S::F,
+    [near_side, far_side]: [S::F; 2],
     at: S::F,
     reach: S::F,
 ) -> S::M {
@@ -513,7 +512,7 @@ fn overlap<S: Simd>(
     let ahead = s.lt(s.splat(0.0), end);
     let before = s.lt(near_side, s.splat(reach_m) + fan.apart);
     let across = s.lt(abs(s, at[2]), s.mul_add(far_side, fan.across, extent[2] + fan.apart));
-    let beside = beside(s, fan, window, near_side, far_side, at[1], extent[1] + fan.apart);
+    let beside = beside(s, fan, window, [near_side, far_side], at[1], extent[1] + fan.apart);
     ahead & before & across & beside
 }
 

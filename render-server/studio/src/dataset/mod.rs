@@ -264,14 +264,15 @@ fn plan(args: &DatasetArgs) -> Result<Plan> {
             classes.things().collect::<Vec<_>>().join(", ")
         );
     }
-    let asked = asked(args, &source, &poses, images, &randomize, &parts, &things)?;
     let intrinsics = Intrinsics::from_horizontal_fov(width_px, height_px, args.fov.to_radians());
+    let shooting = Shooting { seed: args.seed, intrinsics, poses, randomize };
+    let asked = asked(args, &source, &shooting, images, &parts, &things)?;
     let has = |layer| args.layers.contains(&layer);
     Ok(Plan {
         asked,
         source,
         parts,
-        shooting: Shooting { seed: args.seed, intrinsics, poses, randomize },
+        shooting,
         classes,
         things,
         min_area_px: args.min_area,
@@ -329,9 +330,8 @@ fn poses(args: &DatasetArgs) -> Result<Poses> {
 fn asked(
     args: &DatasetArgs,
     source: &SceneSource,
-    poses: &Poses,
+    shooting: &Shooting,
     images: u64,
-    randomize: &Randomize,
     parts: &PartsFile,
     things: &[String],
 ) -> Result<Value> {
@@ -353,7 +353,7 @@ fn asked(
             json!({"sha256": hex(&hash), "arena_sha256": arena, "up": bare.up.map(|up| format!("{up:?}")), "scale": bare.scale})
         }
     };
-    let poses = match poses {
+    let poses = match &shooting.poses {
         Poses::Random(bounds) => json!({"random": bounds}),
         Poses::Path { poses, of } => {
             let number = |pose: &Stamped| {
@@ -380,7 +380,7 @@ fn asked(
         "min_area_px": args.min_area,
         "val": args.val,
         "poses": poses,
-        "randomize": randomize,
+        "randomize": shooting.randomize,
         "parts": parts.parts,
         "classes": Classes::with(parts.parts.iter().map(|part| &*part.class))?.names(),
     }))
