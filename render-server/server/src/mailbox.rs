@@ -1,96 +1,54 @@
-//! A place for one item, where the newest wins, and old buffers come back to be filled again.
-//!
-//! Writer: [`Mailbox::spare`], fill, [`Mailbox::put`]. Reader: [`Mailbox::take`], use,
-//! [`Mailbox::recycle`]. With one writer and one reader three buffers circulate for ever, so the
-//! steady state allocates nothing. The lock is held for the swap of a few words only.
+//! A slot for one item between two threads: the newest item wins.
 
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use vizflyt_process::lock;
 
 /// A newest-wins slot for items of type `T`.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Mailbox<T> {
-    inner: Mutex<Inner<T>>,
+    slot: Mutex<Option<T>>,
     filled: Condvar,
 }
 
-#[derive(Debug, Default)]
-struct Inner<T> {
-    slot: Option<T>,
-    spares: Vec<T>,
-    replaced: u64,
-    closed: bool,
+impl<T> Default for Mailbox<T> {
+    fn default() -> Self {
+        Self { slot: Mutex::new(None), filled: Condvar::new() }
+    }
 }
 
-impl<T: Default> Mailbox<T> {
-    /// Returns a buffer to fill: a used one, or a fresh one as long as too few circulate.
-    pub fn spare(&self) -> T {
-        self.lock().spares.pop().unwrap_or_default()
-    }
-
-    /// Puts `item` in, in place of one that nobody took; returns whether it replaced one.
+impl<T> Mailbox<T> {
+    /// Stores `item`; returns whether it replaced one.
     pub fn put(&self, item: T) -> bool {
-        self.put_over(item, |_, _| {}).map(|old| self.recycle(old)).is_some()
+        self.put_over(item, |_, _| {}).is_some()
     }
 
-    /// As [`Self::put`]; what is replaced may hand over to `item` first, by `inherit(item, old)`,
-    /// and is returned for another use.
+    /// Stores `item` and returns the item that it replaced. `inherit(item, old)` first moves what is still needed from
+    /// the old item to the new one, under the lock.
     pub fn put_over(&self, mut item: T, inherit: impl FnOnce(&mut T, &mut T)) -> Option<T> {
-        let mut inner = self.lock();
-        let mut old = inner.slot.take();
+        let mut slot = lock(&self.slot);
+        let mut old = slot.take();
         if let Some(old) = &mut old {
             inherit(&mut item, old);
         }
-        inner.slot = Some(item);
-        inner.replaced += u64::from(old.is_some());
+        *slot = Some(item);
         self.filled.notify_one();
         old
     }
 
-    /// Waits at most `timeout` for an item; `None` if none came or the mailbox was closed.
+    /// Waits at most `timeout` for an item.
     pub fn take(&self, timeout: Duration) -> Option<T> {
         let deadline = Instant::now() + timeout;
-        let mut inner = self.lock();
+        let mut slot = lock(&self.slot);
         loop {
-            if let Some(item) = inner.slot.take() {
-                return Some(item);
-            }
             let left = deadline.saturating_duration_since(Instant::now());
-            if inner.closed || left.is_zero() {
-                return None;
+            if slot.is_some() || left.is_zero() {
+                return slot.take();
             }
-            inner = self.filled.wait_timeout(inner, left).unwrap_or_else(PoisonError::into_inner).0;
+            slot = self.filled.wait_timeout(slot, left).unwrap_or_else(PoisonError::into_inner).0;
         }
-    }
-
-    /// Gives a buffer back.
-    pub fn recycle(&self, item: T) {
-        let spares = &mut self.lock().spares;
-        if spares.len() < MAX_SPARES {
-            spares.push(item);
-        }
-    }
-
-    /// Makes every present and future [`Self::take`] return at once.
-    pub fn close(&self) {
-        self.lock().closed = true;
-        self.filled.notify_all();
-    }
-
-    /// Returns how many items were replaced unread.
-    pub fn replaced(&self) -> u64 {
-        self.lock().replaced
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Inner<T>> {
-        // Why: nothing panics while the lock is held; a poisoned mailbox is still a valid one.
-        lock(&self.inner)
     }
 }
-
-/// One being written, one in the slot, one being read; and two on their way back another way.
-const MAX_SPARES: usize = 5;
 
 #[cfg(test)]
 mod tests {
@@ -100,37 +58,17 @@ mod tests {
     const LONG: Duration = Duration::from_secs(30);
 
     #[test]
-    fn the_newest_wins_and_the_replaced_are_counted() {
+    fn keeps_the_newest_item() {
         let mailbox = Mailbox::default();
         assert!(!mailbox.put(1));
         assert!(mailbox.put(2));
         assert!(mailbox.put(3));
         assert_eq!(mailbox.take(LONG), Some(3));
         assert_eq!(mailbox.take(Duration::ZERO), None);
-        assert_eq!(mailbox.replaced(), 2);
     }
 
     #[test]
-    fn buffers_circulate() {
-        let mailbox = Mailbox::<Vec<u8>>::default();
-        let mut seen = std::collections::BTreeSet::new();
-        for round in 0..100usize {
-            let mut buffer = mailbox.spare();
-            buffer.clear();
-            buffer.resize(1000, 0);
-            seen.insert(buffer.as_ptr() as usize);
-            mailbox.put(buffer);
-            // The reader is slower than the writer: every third is read.
-            if round % 3 == 0 {
-                let taken = mailbox.take(LONG).unwrap();
-                mailbox.recycle(taken);
-            }
-        }
-        assert!(seen.len() <= 3, "{} buffers", seen.len());
-    }
-
-    #[test]
-    fn a_reader_on_another_thread_sees_rising_items_and_the_last_one() {
+    fn a_reader_on_another_thread_gets_rising_items_and_the_last_one() {
         let mailbox = Arc::new(Mailbox::<u32>::default());
         let reader = {
             let mailbox = mailbox.clone();
@@ -150,13 +88,13 @@ mod tests {
     }
 
     #[test]
-    fn closing_wakes_the_reader() {
+    fn putting_wakes_the_reader() {
         let mailbox = Arc::new(Mailbox::<u32>::default());
         let reader = {
             let mailbox = mailbox.clone();
             std::thread::spawn(move || mailbox.take(LONG))
         };
-        mailbox.close();
-        assert_eq!(reader.join().unwrap(), None);
+        mailbox.put(7);
+        assert_eq!(reader.join().unwrap(), Some(7));
     }
 }

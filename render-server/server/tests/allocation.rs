@@ -117,12 +117,10 @@ impl Rasterizer for Everyone {
                 let is_depth = slot.image.depth_median_m.iter().all(|&depth_m| depth_m == 2.0);
                 assert_eq!([is_perfect, is_depth], [slot.camera == 0; 2]);
             }
-            self.ticks.pass_on(tick, true);
+            self.ticks.offer_previews(tick);
         }
-        if self.calls.is_multiple_of(2)
-            && let Some(tick) = self.ticks.take_spent(Duration::ZERO)
-        {
-            self.ticks.recycle(tick);
+        if self.calls.is_multiple_of(2) {
+            drop(self.ticks.take_for_previews(Duration::ZERO));
         }
         Self::move_on(&self.localization, self.calls);
         Ok(PassTimes::default())

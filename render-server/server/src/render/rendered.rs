@@ -1,16 +1,16 @@
 //! Rendered ticks: from the render thread to the encode thread, then to the previews.
 //!
 //! ```text
-//! render --publish--> ready --take--> encode --pass_on--> spent --take_spent--> previews
-//!            \--- what no one took, if a page watches ------^                      |
-//!   ^---------------------------- buffers, reused -----------------------<---------/
+//! render --publish--> encoder --offer_previews--> previews
+//!            \--- replaced ticks, if a page watches --^
 //! ```
-//! Both places are newest-wins. The previews live on what the encoder has done with or had no room
-//! for: they never take a tick from it, and it never waits for them.
+//! In both places the newest tick wins. Previews are made of ticks that the encoder is done with or had no time for:
+//! they never take a tick from it, and it never waits for them. Buffers of dropped ticks are used again.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use vizflyt_process::lock;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_splat::RgbdImage;
@@ -20,10 +20,11 @@ use crate::render::cameras::CameraSet;
 
 /// The images rendered in one tick, and those of replaced ticks that nobody took; reused from tick to
 /// tick.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct RenderedTick {
     /// One per camera, vehicle by vehicle.
     pub slots: Vec<RenderedImage>,
+    pool: Arc<Pool>,
 }
 
 /// The newest image of one camera.
@@ -67,49 +68,55 @@ impl RenderedTick {
     }
 }
 
-/// The ticks between the threads.
+/// Rendered ticks between the threads.
 #[derive(Debug, Default)]
 pub struct RenderQueue {
-    ready: Mailbox<RenderedTick>,
-    spent: Mailbox<RenderedTick>,
+    for_encoder: Mailbox<RenderedTick>,
+    for_previews: Mailbox<RenderedTick>,
+    pool: Arc<Pool>,
 }
 
 impl RenderQueue {
-    /// Returns a tick to fill.
-    pub fn spare(&self) -> RenderedTick {
-        self.ready.spare()
+    /// Returns a tick to fill, with the buffers of a dropped one if there are any.
+    pub fn new_tick(&self) -> RenderedTick {
+        RenderedTick { slots: lock(&self.pool.0).pop().unwrap_or_default(), pool: self.pool.clone() }
     }
 
-    /// Puts a rendered tick in place of one that nobody took, which goes to the previews if someone
-    /// has them `watched`; returns whether it replaced one.
+    /// Hands a rendered tick to the encoder, in place of an older one, which goes to the previews if they are
+    /// `watched`. Returns whether it replaced one.
     pub fn publish(&self, tick: RenderedTick, watched: bool) -> bool {
-        let replaced = self.ready.put_over(tick, RenderedTick::inherit);
-        replaced.map(|old| self.pass_on(old, watched)).is_some()
+        let replaced = self.for_encoder.put_over(tick, RenderedTick::inherit);
+        let has_replaced = replaced.is_some();
+        if let Some(old) = replaced.filter(|_| watched) {
+            self.offer_previews(old);
+        }
+        has_replaced
     }
 
     /// Waits at most `timeout` for a tick to encode.
     pub fn take(&self, timeout: Duration) -> Option<RenderedTick> {
-        self.ready.take(timeout)
+        self.for_encoder.take(timeout)
     }
 
-    /// Gives a tick that the encoder has done with to the previews, if someone has them `watched`.
-    pub fn pass_on(&self, tick: RenderedTick, watched: bool) {
-        if !watched {
-            return self.ready.recycle(tick);
-        }
-        if let Some(old) = self.spent.put_over(tick, RenderedTick::inherit) {
-            self.ready.recycle(old);
-        }
+    /// Hands a tick that the encoder does not need (any more) to the previews.
+    pub fn offer_previews(&self, tick: RenderedTick) {
+        self.for_previews.put_over(tick, RenderedTick::inherit);
     }
 
     /// Waits at most `timeout` for a tick to make previews of.
-    pub fn take_spent(&self, timeout: Duration) -> Option<RenderedTick> {
-        self.spent.take(timeout)
+    pub fn take_for_previews(&self, timeout: Duration) -> Option<RenderedTick> {
+        self.for_previews.take(timeout)
     }
+}
 
-    /// Gives a tick back to be filled anew.
-    pub fn recycle(&self, tick: RenderedTick) {
-        self.ready.recycle(tick);
+/// Buffers of dropped ticks. At most five ticks exist at a time, so that none is freed: one each in the renderer, the
+/// encoder, the previews and the two mailboxes.
+#[derive(Debug, Default)]
+struct Pool(Mutex<Vec<Vec<RenderedImage>>>);
+
+impl Drop for RenderedTick {
+    fn drop(&mut self) {
+        lock(&self.pool.0).push(std::mem::take(&mut self.slots));
     }
 }
 
@@ -127,8 +134,10 @@ mod tests {
 
     #[test]
     fn slow_cameras_image_outlives_its_tick() {
-        let mut old = RenderedTick { slots: vec![slot(7, true), slot(7, true), slot(3, false)] };
-        let mut new = RenderedTick { slots: vec![slot(8, true), slot(1, false), slot(2, false)] };
+        let ticks = RenderQueue::default();
+        let (mut old, mut new) = (ticks.new_tick(), ticks.new_tick());
+        old.slots = vec![slot(7, true), slot(7, true), slot(3, false)];
+        new.slots = vec![slot(8, true), slot(1, false), slot(2, false)];
         new.inherit(&mut old);
         assert_eq!(found(&new), [(8, true), (7, true), (2, false)]);
     }
@@ -138,7 +147,7 @@ mod tests {
     fn fly(ticks: &RenderQueue, count: u64, nth: u64, watched: bool) -> (Vec<u64>, usize) {
         let (mut taken, mut made) = (Vec::new(), 0);
         for seq in 1..=count {
-            let mut tick = ticks.spare();
+            let mut tick = ticks.new_tick();
             made += usize::from(tick.slots.is_empty());
             tick.slots.resize_with(1, Default::default);
             (tick.slots[0].fresh, tick.slots[0].seq) = (true, seq);
@@ -146,37 +155,39 @@ mod tests {
             if seq.is_multiple_of(nth) {
                 let tick = ticks.take(Duration::ZERO).unwrap();
                 taken.push(tick.slots[0].seq);
-                ticks.pass_on(tick, watched);
+                if watched {
+                    ticks.offer_previews(tick);
+                }
             }
         }
         (taken, made)
     }
 
     #[test]
-    fn previews_that_nobody_makes_cost_the_encoder_no_tick_and_no_memory() {
+    fn slow_previews_cost_the_encoder_no_tick_and_no_memory() {
         for nth in [1, 3] {
             let expected: Vec<_> = (1..=99).filter(|seq| seq % nth == 0).collect();
             let ticks = RenderQueue::default();
             let unwatched = fly(&ticks, 99, nth, false);
             assert_eq!(unwatched.0, expected);
-            assert!(ticks.take_spent(Duration::ZERO).is_none(), "nobody watches");
+            assert!(ticks.take_for_previews(Duration::ZERO).is_none());
             // The preview thread is stuck on one tick for ever, and a second one waits for it.
             let ticks = RenderQueue::default();
             fly(&ticks, 1, 1, true);
-            let stuck = ticks.take_spent(Duration::ZERO).unwrap();
+            let stuck = ticks.take_for_previews(Duration::ZERO).unwrap();
             let watched = fly(&ticks, 99, nth, true);
             assert_eq!(watched.0, expected);
             assert!(watched.1 <= 4, "{} ticks made", watched.1);
             // What waits for it is the newest.
-            ticks.recycle(stuck);
-            assert_eq!(ticks.take_spent(Duration::ZERO).unwrap().slots[0].seq, 99);
+            drop(stuck);
+            assert_eq!(ticks.take_for_previews(Duration::ZERO).unwrap().slots[0].seq, 99);
         }
     }
 
     #[test]
-    fn previews_have_what_no_runtime_takes() {
+    fn previews_get_ticks_that_the_encoder_did_not_take() {
         let ticks = RenderQueue::default();
         fly(&ticks, 5, u64::MAX, true);
-        assert_eq!(ticks.take_spent(Duration::ZERO).unwrap().slots[0].seq, 4);
+        assert_eq!(ticks.take_for_previews(Duration::ZERO).unwrap().slots[0].seq, 4);
     }
 }

@@ -60,14 +60,11 @@ pub fn run<D: Demand>(
             localization.accepted.take(wait);
             continue;
         }
-        let mut tick = ticks.spare();
+        let mut tick = ticks.new_tick();
         let stamp = render.expose(wanted, &mut tick);
         match render.rasterize(renderer, stamp, &mut tick) {
             Ok(()) => render.publish(tick, ticks, renderer),
-            Err(error) => {
-                render.report_refused(&error);
-                ticks.recycle(tick);
-            }
+            Err(error) => render.report_refused(&error),
         }
     }
 }

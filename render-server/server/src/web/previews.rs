@@ -59,7 +59,7 @@ pub fn run(
     let mut stage = Stage::new();
     let mut turns = [[Turn { due: Instant::now(), seq: 0 }; MAX_CAMERAS]; MAX_VEHICLES];
     while !stop.is_set() {
-        let Some(tick) = ticks.take_spent(PATIENCE) else { continue };
+        let Some(tick) = ticks.take_for_previews(PATIENCE) else { continue };
         let watched = subscriptions.watched();
         for slot in tick.slots.iter().filter(|slot| slot.fresh) {
             let vehicle = &flights.vehicles[slot.vehicle];
@@ -85,7 +85,6 @@ pub fn run(
                 Err(error) => warn!("{}: camera {}: {error:#}", vehicle.name, slot.camera),
             }
         }
-        ticks.recycle(tick);
     }
 }
 

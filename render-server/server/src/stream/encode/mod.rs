@@ -77,7 +77,9 @@ pub fn run(
                 }
             }
         }
-        ticks.pass_on(tick, streaming.subscriptions.viewers() > 0 || flights.any_under_way());
+        if streaming.subscriptions.viewers() > 0 || flights.any_under_way() {
+            ticks.offer_previews(tick);
+        }
     }
 }
 
