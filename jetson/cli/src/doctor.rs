@@ -147,7 +147,9 @@ pub(crate) fn run(args: &DoctorArgs) -> Result<ExitCode> {
         failed += usize::from(!upload_fence(&mut session, arena)?);
     }
     if !values.is_empty() {
-        print_line("restart the autopilot, then repeat the check: some parameters appear only then");
+        print_line(
+            "restart the autopilot, then repeat the check: some parameters appear only then",
+        );
     }
     Ok(status(failed))
 }

@@ -137,9 +137,10 @@ pub(crate) fn run(args: &LeaderboardArgs) -> Result<ExitCode> {
 async fn answer(args: &LeaderboardArgs) -> Result<()> {
     let database = match &args.database {
         Some(database) => database.clone(),
-        None => Database::File(Database::default_file().context(
-            "no home folder for the leaderboard; give a file with --database",
-        )?),
+        None => Database::File(
+            Database::default_file()
+                .context("no home folder for the leaderboard; give a file with --database")?,
+        ),
     };
     if let Some(LeaderboardCommand::Add(add)) = &args.command {
         // An invalid grade does not open a database.

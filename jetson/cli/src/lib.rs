@@ -13,10 +13,12 @@ mod crazyflie;
 #[path = "crazyflie/estimate.rs"]
 mod crazyflie_estimate;
 mod demo;
+mod docs;
 mod doctor;
 #[cfg(test)]
 mod endings;
 mod fly;
+mod help;
 mod lab;
 mod lab_day;
 mod leaderboard;
@@ -46,9 +48,10 @@ use vizflyt_studio::{arena, dataset, evaluate, export, scene};
 #[derive(Parser, Debug)]
 #[command(version, propagate_version = true)]
 #[command(after_help = "Start here:
-  vizflyt demo                       fly a simulated drone through a forest and watch it in the browser
-  vizflyt new first                  make a plugin that flies
-  vizflyt fly first                  fly it in the simulated lab")]
+  vizflyt demo         fly a drone through a forest; watch it in the browser
+  vizflyt new first    make a plugin that flies
+  vizflyt fly first    fly it in the simulated lab
+  vizflyt docs         open the documentation, offline")]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -110,6 +113,13 @@ enum Command {
     Dataset(Box<dataset::DatasetArgs>),
     /// Feed recorded images to a plugin, and report where its answers differ
     Replay(replay::ReplayArgs),
+    /// Open the documentation in a browser, without the internet
+    Docs(docs::DocsArgs),
+    /// Print shell completions for bash, zsh, fish, ...
+    Completions(help::CompletionsArgs),
+    /// Write manual pages to a folder; used by the packages
+    #[command(hide = true)]
+    Man(help::ManArgs),
     /// Run a built-in example plugin; started by `vizflyt fly`
     #[command(hide = true)]
     Plugin(plugins::PluginArgs),
@@ -162,10 +172,10 @@ pub fn main() -> ExitCode {
 /// Parses the command line and adds the settings of `serve --config`. Returns `None` if the
 /// settings were only printed (`--print-config`).
 fn command_line() -> Result<Option<Cli>> {
-    let mut matches = Cli::command().get_matches();
+    let mut matches = help::grouped(Cli::command()).get_matches();
     if let Some(("serve", serve)) = matches.subcommand() {
         let line = settings::with_file(std::env::args_os().collect(), serve)?;
-        matches = Cli::command().get_matches_from(line);
+        matches = help::grouped(Cli::command()).get_matches_from(line);
     }
     if let Some(("serve", serve)) = matches.subcommand()
         && serve.get_flag("print_config")
@@ -207,6 +217,9 @@ fn run(command: Command, log_level: &str) -> Result<ExitCode> {
         Command::Export(args) => export::run(&args),
         Command::Dataset(args) => dataset::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Docs(args) => docs::run(&args),
+        Command::Completions(args) => help::print_completions(&args, Cli::command()),
+        Command::Man(args) => help::write_manual(&args, Cli::command()),
         Command::Plugin(args) => Ok(plugins::run(&args)),
         Command::Guardian { mavlink } => Ok(vizflyt_guardian::run(&mavlink)),
     }

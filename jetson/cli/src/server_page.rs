@@ -84,7 +84,9 @@ impl<'a> ServerPage<'a> {
                 format!("Cookie: vizflyt_key={key}\r\n")
             }
             Some(_) => {
-                bail!("a page's key consists of letters and digits, as in the address /enter?key=KEY")
+                bail!(
+                    "a page's key consists of letters and digits, as in the address /enter?key=KEY"
+                )
             }
             None => String::new(),
         };

@@ -95,14 +95,18 @@ fn ask(args: &StatsArgs) -> Result<String> {
     match status {
         200 => Ok(body + "\n"),
         404 if body.is_empty() => {
-            bail!("{} has no /api/stats: it is not a VizFlyt server, or an older version", args.page)
+            bail!(
+                "{} has no /api/stats: it is not a VizFlyt server, or an older version",
+                args.page
+            )
         }
         status => bail!("{}: {body} (HTTP status {status})", args.page),
     }
 }
 
 fn parse(json: &str) -> Result<VehicleStats> {
-    serde_json::from_str(json).context("cannot parse the server's reply; does it have another version?")
+    serde_json::from_str(json)
+        .context("cannot parse the server's reply; does it have another version?")
 }
 
 /// Returns the statistics of a flying vehicle as text.

@@ -47,9 +47,6 @@ pub(crate) fn run(args: &TagsArgs) -> Result<ExitCode> {
 /// Parses the name of a tag family.
 fn family(name: &str) -> Result<TagFamily, String> {
     TagFamily::from_name(name).ok_or_else(|| {
-        format!(
-            "unknown tag family; known: {}",
-            TagFamily::ALL.map(TagFamily::name).join(", ")
-        )
+        format!("unknown tag family; known: {}", TagFamily::ALL.map(TagFamily::name).join(", "))
     })
 }

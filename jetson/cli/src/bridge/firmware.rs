@@ -172,8 +172,9 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
         .with_context(|| format!("bridge: {address} has no address"))?
         .next()
         .with_context(|| format!("bridge: {address} has no address"))?;
-    let mut stream = TcpStream::connect_timeout(&resolved, PATIENCE)
-        .with_context(|| format!("bridge: no reply from {address}; check that its page is enabled"))?;
+    let mut stream = TcpStream::connect_timeout(&resolved, PATIENCE).with_context(|| {
+        format!("bridge: no reply from {address}; check that its page is enabled")
+    })?;
     stream.set_read_timeout(Some(PATIENCE))?;
     stream.set_write_timeout(Some(PATIENCE))?;
     let head = format!("POST /update HTTP/1.0\r\nContent-Length: {}\r\n\r\n", firmware.len());
@@ -194,7 +195,9 @@ fn bring(address: &str, firmware: &[u8], name: &Path) -> Result<String> {
             bail!("bridge: no reply after the upload; check the bridge's page")
         }
         "404" => {
-            bail!("bridge: its firmware does not support updates over the network; flash it by wire")
+            bail!(
+                "bridge: its firmware does not support updates over the network; flash it by wire"
+            )
         }
         _ => bail!("bridge: firmware was rejected: {words}"),
     }

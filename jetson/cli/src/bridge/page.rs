@@ -165,7 +165,9 @@ impl Visitor {
                 Progress::Firmware(from) => from,
             };
             let Some(halves) = halves else {
-                return Some(refuse("this bridge accepts no firmware: started without --firmware-key"));
+                return Some(refuse(
+                    "this bridge accepts no firmware: started without --firmware-key",
+                ));
             };
             let wanted = Wanted { target: Target::Host, build: halves.build, key: halves.key };
             self.updater = Some(Updater::new(wanted));

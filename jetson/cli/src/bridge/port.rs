@@ -228,8 +228,8 @@ fn raw(line: &impl AsFd, baud: Option<u32>) -> Result<()> {
     let mut settings = tcgetattr(line)?;
     cfmakeraw(&mut settings);
     if let Some(baud) = baud {
-        let speed =
-            baud_rate(baud).with_context(|| format!("{baud} baud is not supported by this system"))?;
+        let speed = baud_rate(baud)
+            .with_context(|| format!("{baud} baud is not supported by this system"))?;
         cfsetspeed(&mut settings, speed)?;
     }
     tcsetattr(line, SetArg::TCSANOW, &settings)?;

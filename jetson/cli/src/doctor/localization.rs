@@ -147,9 +147,7 @@ fn measure_delay(
     vehicle: &mut Vehicle,
 ) -> Result<(Delay, Option<f64>), String> {
     if diagnosis.change.iter().any(|(key, _)| *key == "euler") {
-        return Err(
-            "the delay needs correct angles: set `euler`, and repeat the check".to_owned()
-        );
+        return Err("the delay needs correct angles: set `euler`, and repeat the check".to_owned());
     }
     let mut found = vehicle.meter.delay();
     if found == Err(NoDelay::Gentle) {

@@ -111,7 +111,10 @@ mod tests {
         assert!(Localization::Vicon.check((least_m, forest)).is_ok());
         for (by, what) in [(Localization::Tags, "webcams see"), (Localization::Mat, "mat covers")] {
             let error = by.check((least_m, forest)).unwrap_err().to_string();
-            assert!(error.contains("the fence of this scene is 40 x 7 m; use --scene room"), "{error}");
+            assert!(
+                error.contains("the fence of this scene is 40 x 7 m; use --scene room"),
+                "{error}"
+            );
             assert!(error.contains(what), "{error}");
         }
     }

@@ -17,9 +17,11 @@ use super::family;
 ///
 /// Writes a PDF, and the layout file next to it.
 #[derive(Args, Debug)]
-#[command(after_help = "Print at 100 %, then measure the bar at the bottom of a sheet. If it is not
+#[command(
+    after_help = "Print at 100 %, then measure the bar at the bottom of a sheet. If it is not
 100.0 mm long, run the same command again with --bar-mm: the sheets do not change, and the layout
-file gets the real sizes of the tags.")]
+file gets the real sizes of the tags."
+)]
 pub(super) struct PrintArgs {
     #[command(subcommand)]
     object: PrintCommand,
@@ -247,10 +249,7 @@ pub(super) fn run(args: &PrintArgs) -> Result<()> {
                 board.rows,
                 board.square_m * 1e3
             ));
-            print_line(format_args!(
-                "{}: layout, for `tags calibrate --board`",
-                file.display()
-            ));
+            print_line(format_args!("{}: layout, for `tags calibrate --board`", file.display()));
             print_line(format_args!(
                 "Glue it on a flat, stiff surface: a bent board gives a wrong calibration."
             ));
@@ -282,7 +281,10 @@ fn print_floor(common: &Common, floor: &Floor) -> Result<()> {
 fn beside(pdf: &Path) -> Result<PathBuf> {
     let layout = pdf.with_extension("toml");
     if layout == *pdf {
-        anyhow::bail!("{}: this is the path of the layout; use a PDF name ending in .pdf", pdf.display());
+        anyhow::bail!(
+            "{}: this is the path of the layout; use a PDF name ending in .pdf",
+            pdf.display()
+        );
     }
     Ok(layout)
 }
