@@ -1,14 +1,13 @@
-//! A place for one item, where the newest wins, and old buffers come back to be filled again.
+//! Newest-wins slot for one item, with reuse of buffers.
 //!
-//! Writer: [`Mailbox::spare`], fill, [`Mailbox::put`]. Reader: [`Mailbox::take`], use,
-//! [`Mailbox::recycle`]. With one writer and one reader three buffers circulate for ever, so the
-//! steady state allocates nothing. The lock is held for the swap of a few words only.
+//! Writer: [`Mailbox::spare`], fill, [`Mailbox::put`]. Reader: [`Mailbox::take`], use, [`Mailbox::recycle`].
+//! With one writer and one reader, three buffers circulate, so that no memory is allocated in the steady state.
+//! The lock is held only to swap a few words.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use vizflyt_process::lock;
 
-/// A newest-wins slot for items of type `T`.
 #[derive(Debug, Default)]
 pub struct Mailbox<T> {
     inner: Mutex<Inner<T>>,
@@ -24,18 +23,18 @@ struct Inner<T> {
 }
 
 impl<T: Default> Mailbox<T> {
-    /// Returns a buffer to fill: a used one, or a fresh one as long as too few circulate.
+    /// Returns a buffer to fill: a used one, or a new one if too few circulate.
     pub fn spare(&self) -> T {
         self.lock().spares.pop().unwrap_or_default()
     }
 
-    /// Puts `item` in, in place of one that nobody took; returns whether it replaced one.
+    /// Stores `item` in place of an unread one; returns whether it replaced one.
     pub fn put(&self, item: T) -> bool {
         self.put_over(item, |_, _| {}).map(|old| self.recycle(old)).is_some()
     }
 
-    /// As [`Self::put`]; what is replaced may hand over to `item` first, by `inherit(item, old)`,
-    /// and is returned for another use.
+    /// Stores `item` like [`Self::put`], but first calls `inherit(item, old)` for the replaced item, and
+    /// returns that.
     pub fn put_over(&self, mut item: T, inherit: impl FnOnce(&mut T, &mut T)) -> Option<T> {
         let mut inner = self.lock();
         let mut old = inner.slot.take();
@@ -64,7 +63,7 @@ impl<T: Default> Mailbox<T> {
         }
     }
 
-    /// Gives a buffer back.
+    /// Returns a buffer for reuse.
     pub fn recycle(&self, item: T) {
         let spares = &mut self.lock().spares;
         if spares.len() < MAX_SPARES {
@@ -78,18 +77,18 @@ impl<T: Default> Mailbox<T> {
         self.filled.notify_all();
     }
 
-    /// Returns how many items were replaced unread.
+    /// Returns the number of items replaced unread.
     pub fn replaced(&self) -> u64 {
         self.lock().replaced
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner<T>> {
-        // Why: nothing panics while the lock is held; a poisoned mailbox is still a valid one.
+        // No code panics while the lock is held; a poisoned mailbox is still valid.
         lock(&self.inner)
     }
 }
 
-/// One being written, one in the slot, one being read; and two on their way back another way.
+/// Maximum of spare buffers: one being written, one in the slot, one being read, and two on other ways back.
 const MAX_SPARES: usize = 5;
 
 #[cfg(test)]
@@ -100,7 +99,7 @@ mod tests {
     const LONG: Duration = Duration::from_secs(30);
 
     #[test]
-    fn the_newest_wins_and_the_replaced_are_counted() {
+    fn newest_wins_and_replaced_items_are_counted() {
         let mailbox = Mailbox::default();
         assert!(!mailbox.put(1));
         assert!(mailbox.put(2));
@@ -130,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_on_another_thread_sees_rising_items_and_the_last_one() {
+    fn another_thread_reads_items_in_order_and_the_last_one() {
         let mailbox = Arc::new(Mailbox::<u32>::default());
         let reader = {
             let mailbox = mailbox.clone();
