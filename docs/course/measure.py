@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""What the bounds of projects 0 and 1 come from: the error of every filter on many data sets. For instructors.
+"""Measures the error of every filter on many data sets: the basis of the bounds of projects 0 and 1. For instructors.
 
     python measure.py sets/*/data            starters and solutions of this folder
-    python measure.py sets/*/data --ahrs     and the filters of the Python package `ahrs` (pip install ahrs)
+    python measure.py sets/*/data --ahrs     also the filters of the Python package `ahrs` (pip install ahrs)
 
-Each row is a filter in a case of `given/estimate.py`: the median of all data sets, and the worst.
+Each row is a filter in a case of `given/estimate.py`: median and maximum over all data sets.
 """
 
 import argparse
@@ -28,12 +28,12 @@ OURS = [
     ("UKF", "p1/solution/ukf.py"),
 ]
 SETTLE_S = {"calibrated": 0.0, "uncalibrated": 0.0, "restart": CASES["p1-g/ukf-restart"].settle_s}
-# The vehicle stands at least so long in the beginning. [s]
+# Minimum time at rest at the beginning. [s]
 STANDS_S = 2.0
 
 
 def ours(path):
-    """Returns a function from readings to attitudes."""
+    """Returns a function from samples to attitudes."""
     spec = importlib.util.spec_from_file_location(f"filter_{path.parts[-3]}_{path.parts[-2]}_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -41,7 +41,7 @@ def ours(path):
 
 
 def theirs(kind, **gains):
-    """Returns the same of a filter of `ahrs`, which has no calibration at rest: its gyroscope gets one before."""
+    """Returns such a function for a filter of `ahrs`. It has no calibration at rest, so the gyroscope is calibrated."""
     import ahrs
 
     def run(case, at_ns, gyro_radps, accel_mps2):

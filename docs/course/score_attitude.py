@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Says how far an estimated attitude is from the true one, and what it is worth in a project of the course.
+"""Computes the error of an estimated attitude, and its points in a project of the course.
 
     python score_attitude.py data/mav0/state_groundtruth_estimate0/data.csv my-p0/calibrated.tum --case p0/calibrated
     python score_attitude.py live/FLIGHT.mcap --case p0/live
 
-Tilt is the angle between where the estimate and the truth have up; it has roll and pitch in it, and no heading. Heading
-is what remains; an IMU cannot know where it is counted from, so its drift is what is scored: the slope of a line
-through its error. Only what was in the air counts, and nothing before the filter had its time to settle.
+Tilt is the angle between the estimated and the true up direction. It contains roll and pitch, but no heading. Heading
+is the remaining rotation. An IMU does not measure its origin, so the score is the drift: the slope of a line through
+the heading error. Only attitudes in the air count, after the filter's time to settle.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import numpy as np
 
 
 class Bounds(NamedTuple):
-    """What a case is worth: all points of a figure up to its first bound, half of them up to its second."""
+    """Points of a case: all points up to the first bound of a figure, half of them up to the second."""
 
     tilt_points: float
     tilt_deg: tuple[float, float]
@@ -30,7 +30,7 @@ class Bounds(NamedTuple):
 
 
 NEVER = (0.0, 0.0)
-# Measured over the seeds and sensors of docs/BENCHMARKS.md, "Attitude filters".
+# Measured for the seeds and sensors in docs/BENCHMARKS.md, "Attitude filters".
 CASES = {
     "p0/calibrated": Bounds(15, (1.5, 1.8), 5, (4.0, 8.0)),
     "p0/uncalibrated": Bounds(20, (1.5, 4.0), 10, (4.0, 8.0)),
@@ -44,18 +44,17 @@ CASES = {
     "p1-g/ukf-restart": Bounds(15, (2.0, 4.0), 0, NEVER, 15.0),
     "p1-g/live": Bounds(10, (1.5, 2.0), 0, NEVER),
 }
-# Nearer than this to where it stood, the vehicle is not in the air. [m]
+# Below this distance from its place on the ground, the vehicle is not in the air. [m]
 AIR_M = 0.3
-# How far in time two true poses may be, so that there is truth between them; and an attitude from an instant, so that
-# it says something of it. [s]
+# Maximum time between two true poses for interpolation, and between an attitude and an instant. [s]
 GAP_S = 0.2
-# An estimate tells this share of the flight at least: leaving out what is bad gains nothing.
+# Minimum fraction of the flight with an estimate, so that omitting bad estimates gains nothing.
 LEAST_TOLD = 0.95
 
 
 class Trajectory(NamedTuple):
     at_s: np.ndarray
-    """From the log's or the data set's first instant on."""
+    """Time since the first instant of the log or data set."""
     p_m: np.ndarray
     q_xyzw: np.ndarray
 
@@ -65,13 +64,13 @@ class Figures(NamedTuple):
     tilt_max_deg: float
     heading_drift_deg_per_min: float
     heading_rms_deg: float
-    """About its own mean."""
+    """Relative to its mean."""
     seconds: float
     poses: int
 
 
 def read(path, from_ns=0):
-    """Returns a trajectory of EuRoC's CSV or TUM's text; seconds are counted from `from_ns`."""
+    """Returns a trajectory from a CSV file of EuRoC or a text file of TUM; seconds count from `from_ns`."""
     rows = []
     with open(path, newline="") as file:
         for line in file:
@@ -83,7 +82,7 @@ def read(path, from_ns=0):
                 rows.append((int(row[0]), x, y, z, qx, qy, qz, qw))
             else:
                 stamp, *words = line.split()
-                # By hand: a float does not hold nanoseconds since 1970.
+                # Parsed as integers, because a float cannot represent nanoseconds since 1970.
                 seconds, _, part = stamp.partition(".")
                 x, y, z, qx, qy, qz, qw = (float(one) for one in words[:7])
                 rows.append((int(seconds) * 10**9 + int(part[:9].ljust(9, "0")), x, y, z, qx, qy, qz, qw))
@@ -101,7 +100,7 @@ def trajectory(at_ns, numbers, from_ns):
 
 
 def read_log(path):
-    """Returns the truth and the plugin's estimate of a flight's log."""
+    """Returns the true trajectory and the plugin's estimate from a flight's log."""
     import vizflyt  # Why: files can be scored without the package.
 
     log = vizflyt.Log(path)
@@ -113,14 +112,14 @@ def read_log(path):
 
 
 def truth_at(truth, at_s):
-    """Returns the true attitudes and heights at some instants, and where there are any."""
+    """Returns the true attitudes and heights at some instants, and whether they are known."""
     after = np.clip(np.searchsorted(truth.at_s, at_s), 1, len(truth.at_s) - 1)
     before = after - 1
     gap_s = truth.at_s[after] - truth.at_s[before]
     share = ((at_s - truth.at_s[before]) / np.maximum(gap_s, 1e-9))[:, None]
     a, b = truth.q_xyzw[before], truth.q_xyzw[after]
     b = b * np.where((a * b).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-    # Poses are some milliseconds apart: a straight line, brought back to unit length, is on the arc.
+    # Poses are some milliseconds apart, so linear interpolation with normalization is accurate.
     q_xyzw = a + share * (b - a)
     q_xyzw = q_xyzw / np.linalg.norm(q_xyzw, axis=1, keepdims=True)
     height_m = truth.p_m[before, 2] + share[:, 0] * (truth.p_m[after, 2] - truth.p_m[before, 2])
@@ -129,12 +128,12 @@ def truth_at(truth, at_s):
 
 
 def errors(q_xyzw, true_xyzw):
-    """Returns the error of each attitude: of tilt, of heading, and in all. [rad]"""
+    """Returns the error of each attitude: tilt, heading, and total. [rad]"""
     (ax, ay, az, aw), (bx, by, bz, bw) = q_xyzw.T, true_xyzw.T
-    # The turn from truth to estimate, in world axes: q conj(true).
+    # Rotation from truth to estimate, in world axes: q conj(true).
     x, y = -aw * bx + ax * bw - ay * bz + az * by, -aw * by + ax * bz + ay * bw - az * bx
     z, w = -aw * bz - ax * by + ay * bx + az * bw, aw * bw + ax * bx + ay * by + az * bz
-    # Turn = a turn about up, then a tilt: the two have these lengths (swing and twist).
+    # The rotation is a rotation about up followed by a tilt, with these angles (swing and twist).
     tilt = 2 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
     heading = 2 * np.arctan2(z, w)
     whole = 2 * np.arctan2(np.sqrt(x * x + y * y + z * z), abs(w))
@@ -144,7 +143,7 @@ def errors(q_xyzw, true_xyzw):
 def score(truth, estimate, settle_s=0.0):
     """Returns the figures of an estimate."""
     true_xyzw, height_m, known = truth_at(truth, estimate.at_s)
-    # What begins in the air counts from when it has settled; what does not, all the way.
+    # If the data begin in the air, the filter gets time to settle.
     from_s = estimate.at_s[0] + settle_s if settle_s and len(estimate.at_s) else -np.inf
     counted = known & (height_m > truth.p_m[0, 2] + AIR_M) & (estimate.at_s >= from_s)
     at_s = estimate.at_s[counted]

@@ -213,7 +213,7 @@ def check_refusals(vizflyt: str, log: pathlib.Path, folder: pathlib.Path) -> Non
     assert "camera 'nose'" in refused(vizflyt, "export", log, "--format", "tum", "--camera", "nose", "-o", out)
     text = folder / "text.mcap"
     text.write_text("hello")
-    assert "no MCAP file" in refused(vizflyt, "export", text, "--format", "tum", "-o", out)
+    assert "not an MCAP file" in refused(vizflyt, "export", text, "--format", "tum", "-o", out)
     # Cut before its first image, as that of a flight that was killed on the ground.
     cut = folder / "cut.mcap"
     cut.write_bytes(log.read_bytes()[:3000])

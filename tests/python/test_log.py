@@ -104,7 +104,7 @@ def test_what_is_no_log_is_refused_in_a_sentence(tmp_path):
     with pytest.raises(ValueError, match="is empty"):
         vizflyt.Log(path)
     path.write_bytes(b"hello" * 9)
-    with pytest.raises(ValueError, match="no MCAP file"):
+    with pytest.raises(ValueError, match="not an MCAP file"):
         vizflyt.Log(path)
     write_log(path, [])
     with pytest.raises(LookupError, match="fly with --log full"):

@@ -411,10 +411,10 @@ def check_commands(stage, sent, node):
     answer_of(stage, Setpoint.hold())
     check(time.monotonic() - began > 0.3, "a velocity ran out early")
     sent["cmd_vel"].write(twist("world", 1.0))
-    wait_for(lambda: [stage.publish(), node.said("frame 'world' is not known; give one of map, odom")][1],
+    wait_for(lambda: [stage.publish(), node.said("unknown frame 'world'; give one of map, odom")][1],
              "an unknown frame is not reported")
     sent["cmd_vel"].write(twist("map", float("nan")))
-    wait_for(lambda: [stage.publish(), node.said("a number of it is not finite")][1], "NaN is not reported")
+    wait_for(lambda: [stage.publish(), node.said("a number is not finite")][1], "NaN is not reported")
     check(stage.publish() == Setpoint.hold(), "what is not understood flies")
 
     header = ros.Header(ros.Time(0, 0), "map")

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Runs a filter over a data set, and writes its attitudes. Given; nothing is to be filled in here.
+"""Runs a filter on a data set, and writes its attitudes. Given; nothing is to be filled in here.
 
     python estimate.py ../data --filter complementary --case calibrated -o calibrated.tum
 
-Cases: what of the data set the filter gets to see.
+Cases determine the samples that the filter receives:
 
-    calibrated     all readings, as they were measured
-    uncalibrated   all readings; each axis of the gyroscope is off by another 1 deg/s, up or down
-    restart        as uncalibrated, but the readings begin in the air, 12 s after the data set does
+    calibrated     all samples, as measured
+    uncalibrated   all samples; each axis of the gyroscope has a bias of +1 or -1 deg/s
+    restart        as uncalibrated, but the samples begin in the air, 12 s after the start of the data set
 """
 
 import argparse
@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 from attitude import read_imu, write_tum
 
-# A BMI088's zero-rate offset before calibration, by its data sheet. [rad/s]
+# Zero-rate offset of a BMI088 before calibration, from its data sheet. [rad/s]
 OFFSET_RADPS = np.radians(np.array([1.0, -1.0, 1.0]))
-# By then the vehicle flies its figures. [s]
+# At this time the vehicle flies its figures. [s]
 RESTART_S = 12.0
 
 
 def estimate(filter_, at_ns, gyro_radps, accel_mps2):
-    """Returns the filter's attitude after each reading, shape (N, 4)."""
+    """Returns the filter's attitude after each sample, shape (N, 4)."""
     attitudes = []
     for ns, gyro, accel in zip(at_ns, gyro_radps, accel_mps2):
         filter_.update(float(ns - at_ns[0]) * 1e-9, gyro, accel)
@@ -33,7 +33,7 @@ def estimate(filter_, at_ns, gyro_radps, accel_mps2):
 
 
 def seen(imu, case):
-    """Returns instants, gyroscope and accelerometer as the filter gets to see them."""
+    """Returns instants, gyroscope and accelerometer samples of a case."""
     gyro_radps = imu.gyro_radps if case == "calibrated" else imu.gyro_radps + OFFSET_RADPS
     from_ns = imu.at_ns[0] + (int(RESTART_S * 1e9) if case == "restart" else 0)
     kept = imu.at_ns >= from_ns

@@ -1,4 +1,4 @@
-"""The flight: moves about, and runs a filter on the IMU's readings. Given; nothing is to be filled in here."""
+"""The flight: moves, and runs a filter on the IMU's samples. Given; nothing is to be filled in here."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import numpy as np
 import vizflyt
 from vizflyt import Setpoint
 
-# Ahead, then figures of eight, then ahead to the end. [s], [m/s]
+# Forward, then figures of eight, then forward to the end. [s], [m/s]
 AHEAD_S, EIGHTS_S, AHEAD_MPS = 3.0, 40.0, 0.7
-# A figure takes this long; greatest speeds along x and y. [s], [m/s]
+# Period of a figure; maximum speeds along x and y. [s], [m/s]
 EIGHT_S, X_MPS, Y_MPS = 4.0, 1.6, 1.3
-# The nose swings to both sides. [s], [rad]
+# Swing of the nose to both sides: period and amplitude. [s], [rad]
 SWING_S, SWING_RAD = 20 / 3, 0.6
 
 
 class AttitudeFlight(vizflyt.Plugin):
-    """Flies by the clock of the images, and publishes the filter's attitude at each.
+    """Flies by the clock of the images, and publishes the filter's attitude at each image.
 
-    `make` makes the filter: an object with `update(at_s, gyro_radps, accel_mps2)`, called once for each reading, and
-    `q_xyzw`.
+    `make` creates the filter: an object with `update(at_s, gyro_radps, accel_mps2)`, which is called once for each
+    sample, and with `q_xyzw`.
     """
 
     def __init__(self, make):
@@ -48,15 +48,15 @@ class AttitudeFlight(vizflyt.Plugin):
         return self.steer((obs.stamp_ns - self.since_ns) * 1e-9)
 
     def steer(self, t_s):
-        """Returns what is flown `t_s` after the plugin took over."""
+        """Returns the setpoint `t_s` after the plugin got control."""
         t_s -= AHEAD_S
         if not 0 < t_s < EIGHTS_S:
             return Setpoint.velocity([AHEAD_MPS, 0, 0], axes="heading")
-        # Both ends of the figures are smooth.
+        # Smooth transitions at both ends of the figures.
         share = min(t_s, EIGHTS_S - t_s, 1.0)
         phase = 2 * np.pi * t_s / EIGHT_S
         x_mps, y_mps = share * X_MPS * np.cos(phase), share * Y_MPS * np.sin(2 * phase)
-        # Heading axes turn with the nose; the figures shall not.
+        # Heading axes turn with the nose, but the figures must not.
         swing = 2 * np.pi * t_s / SWING_S
         yaw_rad = SWING_RAD * np.sin(swing)
         yaw_radps = SWING_RAD * 2 * np.pi / SWING_S * np.cos(swing)

@@ -175,7 +175,9 @@ fn parse_address(text: &str) -> Result<SocketAddr, String> {
 
 fn parse_baud(text: &str) -> Result<u32, String> {
     let baud = text.parse().ok().filter(|&baud| baud_rate(baud).is_some());
-    baud.ok_or_else(|| format!("'{text}' is not a baud rate of a telemetry port; give 57600 to 3000000"))
+    baud.ok_or_else(|| {
+        format!("'{text}' is not a baud rate of a telemetry port; give 57600 to 3000000")
+    })
 }
 
 fn parse_object(text: &str) -> Result<String, String> {
@@ -467,10 +469,7 @@ mod tests {
         check(&["--serial", "/a", "--pty", "/b"], "cannot be used with");
         check(&["--object", "a name of more than twenty-four"], "1 to 24");
         check(&["--realtime-factor", "0"], "outside 0.01 to 20");
-        check(
-            &["--imu", "mpu"],
-            "unknown inertial sensor 'mpu'; use one of frame, icm-42688-p",
-        );
+        check(&["--imu", "mpu"], "unknown inertial sensor 'mpu'; use one of frame, icm-42688-p");
         check(&["--param", "NO_SUCH=1"], "no parameter NO_SUCH");
         check(&["--truth", "/does/not/exist.json"], "cannot read the true geometry");
     }

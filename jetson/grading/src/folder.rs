@@ -351,9 +351,15 @@ mod tests {
         for (path, bytes) in CONTENTS {
             let at = root.join(path);
             fs::write(&at, "other").unwrap();
-            assert_eq!(refusal(root, &grade), format!("differs from the signed report: changed: {path}"));
+            assert_eq!(
+                refusal(root, &grade),
+                format!("differs from the signed report: changed: {path}")
+            );
             fs::remove_file(&at).unwrap();
-            assert_eq!(refusal(root, &grade), format!("differs from the signed report: missing: {path}"));
+            assert_eq!(
+                refusal(root, &grade),
+                format!("differs from the signed report: missing: {path}")
+            );
             // A link to the right bytes is not the file.
             fs::write(root.join("other"), bytes).unwrap();
             std::os::unix::fs::symlink(root.join("other"), &at).unwrap();

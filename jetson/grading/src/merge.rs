@@ -21,7 +21,8 @@ pub fn merge(parts: &[(String, Grade)], key: &VerifyingKey) -> Result<Grade> {
             "{name} and {first_name} are grades of different subjects: plugin, program, project, level, \
              variants, seeds, delays and renderer must be the same"
         );
-        let shard = part.shard.with_context(|| format!("{name} is a complete grade, not a shard"))?;
+        let shard =
+            part.shard.with_context(|| format!("{name} is a complete grade, not a shard"))?;
         let count = first.shard.map_or(0, |shard| shard.count);
         ensure!(shard.count == count, "{name} is part of {}, {first_name} of {count}", shard.count);
         ensure!(!there.contains(&shard.index), "part {} is given twice", shard.index);

@@ -1,4 +1,4 @@
-//! The images of a step. They are small: each core draws images of its own, by a renderer of its own.
+//! Renders the images of a step. They are small, so each core renders different images with a separate renderer.
 
 use std::io::Write;
 
@@ -16,16 +16,16 @@ use vizflyt_studio::scene::camera::ImageSize;
 use super::{Env, Place};
 use crate::episode::append_depth_mm;
 
-/// Which parts of images are asked for.
+/// Requested layers of the images.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Drawn {
     pub(super) depth: bool,
     pub(super) rgb: bool,
 }
 
-/// A course's renderer, and the camera on its vehicles.
+/// Renderers of a course, and the camera on its vehicles.
 pub(super) struct View {
-    /// One a core.
+    /// One per core.
     lanes: Vec<Lane>,
     intrinsics: Intrinsics,
     body_from_cam: Pose<Body, Cam>,
@@ -34,15 +34,15 @@ pub(super) struct View {
     images: Vec<RgbdImage>,
 }
 
-/// A renderer, and the one thread that it draws with.
+/// A renderer, and the single thread on which it renders.
 struct Lane {
     pool: ThreadPool,
     renderer: CpuRenderer,
 }
 
 impl View {
-    /// Makes one of the course's first camera, with another size and width of view; where nobody asks for colour, of depth
-    /// alone. [px, deg]
+    /// Creates a view of the course's first camera, with this size and field of view. With `depth_alone`, it renders
+    /// only depth. [px, deg]
     pub(super) fn new(
         course: &CourseInstance,
         size: ImageSize,
@@ -89,7 +89,7 @@ impl View {
     }
 }
 
-/// Draws what each vehicle sees, and writes depth of all, then colour of all.
+/// Renders the images of all vehicles, and writes depth of all, then colour of all.
 pub(super) fn images(
     out: &mut impl Write,
     envs: &[Env],
@@ -107,7 +107,7 @@ pub(super) fn images(
         let shares = here.par_chunks(share).zip(cameras.par_chunks(share));
         let shares = shares.zip(view.images.par_chunks_mut(share)).zip(&mut view.lanes);
         shares.try_for_each(|(((envs, cameras), images), lane)| {
-            // Where something moves, it is elsewhere in each episode.
+            // Moving objects have a different placement in each episode.
             let batch = if objects.is_empty() { cameras.len() } else { 1 };
             let batches =
                 envs.chunks(batch).zip(cameras.chunks(batch)).zip(images.chunks_mut(batch));
@@ -137,7 +137,7 @@ pub(super) fn images(
     Ok(())
 }
 
-/// Takes each environment's image, in their order.
+/// Passes the image of each environment, in their order, to `take`.
 fn each(
     envs: &[Env],
     places: &[Place],

@@ -1,9 +1,9 @@
-//! One vehicle that a policy flies through a course: setpoints in, true state and rules out. Pure, on a clock of its own.
-//! `vizflyt gym` flies many at once; a crate by itself, because what learns waits for it a million times: it is optimised as
-//! the renderer is, and the command around it is not.
+//! One vehicle that a policy flies through a course: actions in, true state and results out. Pure, on a virtual clock.
+//! `vizflyt gym` flies many at once. This is a library crate that is optimised like the renderer, in contrast to the
+//! command line, because learning runs it millions of times.
 //!
-//! What flies is the simulator's airframe under the simulator's own controllers, which are given the truth: no
-//! estimator, no MAVLink, no motion capture. Rules are the referee's: the same openings, obstacles, fence.
+//! The simulator's airframe flies under the simulator's controllers, which receive the true state: no estimator, no
+//! MAVLink, no motion capture. The rules are the referee's: the same openings, obstacles and fence.
 
 use glam::DVec3;
 use vizflyt_arena::course::{Course, Progress};
@@ -19,37 +19,37 @@ use vizflyt_simulator::control::mixer::mix;
 use vizflyt_simulator::control::position::{Horizontal, PositionController, Vertical};
 use vizflyt_simulator::estimator::Estimate;
 
-/// Physics at twice the rate of the controllers, as in the simulated lab. [s]
+/// Tick of the controllers; physics runs at twice this rate, as in the simulated lab. [s]
 const TICK_S: f64 = 1.0 / 400.0;
 const TICK_NS: i64 = 2_500_000;
 const STEPS: u32 = 2;
-/// Poses between two checks for contact: 100 a second, each a sweep of the body from the last.
+/// Poses between two collision checks: 100 checks per second, each a sweep of the body from the previous pose.
 const TICKS_PER_CHECK: u32 = 4;
-/// Fastest turns that an action of 1 asks for. [rad/s]
+/// Rates of turn for an action of 1. [rad/s]
 const YAW_RATE_RADPS: f64 = 2.0;
 const BODY_RATES_RADPS: DVec3 = DVec3::new(6.0, 6.0, 3.0);
-/// How far an episode's start is off the spawn, at most: sideways and in height. [m]
+/// Maximum offset of an episode's start from the spawn, sideways and in height. [m]
 pub const START_M: f64 = 0.3;
-/// How far its heading is.
+/// Maximum offset of the start's heading. [rad]
 const START_YAW_RAD: f64 = 0.3;
-/// So much room must be about a start. [m]
+/// Minimum clearance at a start. [m]
 const START_CLEARANCE_M: f64 = 0.15;
-/// A clearance beyond is told as this. [m]
+/// Maximum reported clearance. [m]
 const CLEARANCE_TOLD_M: f64 = 10.0;
 
 /// Numbers of an action.
 pub const ACTION: usize = 4;
-/// Numbers of a state, as [`Episode::write_state`] has them and `vizflyt.gym` explains them.
+/// Numbers of a state, in the order of [`Episode::write_state`]; documented in `vizflyt.gym`.
 pub const STATE: usize = 22;
-/// Numbers that rewards are made of.
+/// Number of figures for rewards.
 pub const FIGURES: usize = 4;
 
-/// Quantity that an action commands; its numbers are within -1 and 1.
+/// Quantity that an action commands. Its numbers are from -1 to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ActionKind {
-    /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn.
+    /// Velocity forward, left and up, as fractions of the course's limit, and a turn.
     Velocity,
-    /// Acceleration ahead, to the left, up, in shares of the course's limit, and a turn.
+    /// Acceleration forward, left and up, as fractions of the course's limit, and a turn.
     Acceleration,
     /// Body rates and thrust.
     BodyRates,
@@ -124,19 +124,19 @@ pub struct Episode {
     heading_rad: f64,
     saturated: bool,
     course: Course,
-    /// Of the controllers, since its start.
+    /// Controller ticks since the start.
     ticks: u64,
     checked: TimedPose,
-    /// Actions under way, the oldest first.
+    /// Delayed actions, the oldest first.
     waiting: Vec<[f64; ACTION]>,
-    /// Nearer to the target than a step before. [m]
+    /// Decrease of the distance to the target in the last step. [m]
     progress_m: f64,
     clearance_m: f64,
     end: End,
 }
 
 impl Episode {
-    /// Starts near the spawn: where, follows from the seed.
+    /// Starts near the spawn. The seed determines the exact pose.
     pub fn start(rules: &Rules, manner: &Manner, seed: u64) -> Self {
         let spawn = &rules.arena.spawn;
         let mut random = SplitMix64::new(seed);
@@ -145,7 +145,7 @@ impl Episode {
         let above_m = spawn.position_m + DVec3::Z * rules.arena.takeoff_height_m;
         let yaw_rad = spawn.yaw_deg.to_radians();
         let mut airframe = Airframe::hovering(above_m, yaw_rad, floor_z_m);
-        // Where there is no room for a start of its own it starts above the spawn.
+        // Without enough space after 20 draws, it starts exactly above the spawn.
         for _ in 0..20 {
             let offset_m = DVec3::new(signed(), signed(), signed()) * START_M;
             let turn_rad = signed() * START_YAW_RAD;
@@ -174,32 +174,32 @@ impl Episode {
         episode
     }
 
-    /// Since its start. [ns]
+    /// Returns the time since the start. [ns]
     pub fn elapsed_ns(&self) -> i64 {
         self.ticks as i64 * TICK_NS
     }
 
-    /// Since its start. [s]
+    /// Returns the time since the start. [s]
     fn elapsed_s(&self) -> f64 {
         self.ticks as f64 * TICK_S
     }
 
-    /// Returns the vehicle.
+    /// Returns the airframe of the vehicle.
     pub fn airframe(&self) -> &Airframe {
         &self.airframe
     }
 
-    /// Returns how it stands.
+    /// Returns the state of the episode.
     pub fn end(&self) -> End {
         self.end
     }
 
-    /// Flies one step; an action's numbers are within -1 and 1, others are cut.
+    /// Flies one step. The action's numbers are clamped to -1 to 1.
     pub fn step(&mut self, rules: &Rules, manner: &Manner, action: [f32; ACTION]) {
         if self.end != End::Flying {
             return;
         }
-        // NaN is no wish.
+        // NaN counts as 0.
         let action =
             action.map(|a| if a.is_finite() { f64::from(a).clamp(-1.0, 1.0) } else { 0.0 });
         self.waiting.push(action);
@@ -214,7 +214,7 @@ impl Episode {
             }
         }
         let after_m = self.airframe.state().p_world_m;
-        // A stage that was passed counts by the target that it was.
+        // Progress counts relative to the target before the step, even if that stage was passed.
         self.progress_m = before_m.map_or(0.0, |(target_m, from_m)| {
             from_m.distance(target_m) - after_m.distance(target_m)
         });
@@ -223,18 +223,18 @@ impl Episode {
         }
     }
 
-    /// Returns the next target's place and the vehicle's. [m, world]
+    /// Returns the positions of the next target and of the vehicle. [m, world]
     fn target_m(&self, rules: &Rules) -> Option<(DVec3, DVec3)> {
         let (target_m, _) = rules.targets.get(self.course.next())?;
         Some((*target_m, self.airframe.state().p_world_m))
     }
 
-    /// One tick of controllers and physics.
+    /// Runs one tick of controllers and physics.
     fn fly(&mut self, rules: &Rules, kind: ActionKind, action: [f64; ACTION]) {
         let truth = self.truth();
         let wish = DVec3::new(action[0], action[1], action[2]);
         let wrench = if kind == ActionKind::BodyRates {
-            // 1 more than the weight at most, and nothing at least.
+            // From zero to twice the weight.
             let thrust_n = (1.0 + action[3]) * MASS_KG * GRAVITY_MPS2;
             self.attitude.follow_rates(
                 truth.omega_body_radps,
@@ -274,7 +274,7 @@ impl Episode {
         self.ticks += 1;
     }
 
-    /// Holds the way since the last check against the rules.
+    /// Checks the path since the last check against the rules.
     fn judge(&mut self, rules: &Rules) -> End {
         let state = *self.airframe.state();
         let to = TimedPose { since_epoch_ns: self.elapsed_ns(), world_from_body: state.pose() };
@@ -299,7 +299,7 @@ impl Episode {
         self.end
     }
 
-    /// What the controllers are given: the truth.
+    /// Returns the true state as the controllers' estimate.
     fn truth(&self) -> Estimate {
         let state = self.airframe.state();
         Estimate {
@@ -312,8 +312,8 @@ impl Episode {
         }
     }
 
-    /// Writes the state, in the order that `vizflyt.gym` gives: velocity, up, turn, the way to the target and its
-    /// direction, position, sine and cosine of the heading, targets left, share of the time left.
+    /// Writes the state in the order documented in `vizflyt.gym`: velocity, up, angular velocity, vector to the target
+    /// and its direction, position, sine and cosine of the heading, remaining targets, remaining fraction of the time.
     pub fn write_state(&self, rules: &Rules, manner: &Manner, out: &mut [f32; STATE]) {
         let state = self.airframe.state();
         let yaw_rad = yaw_of(state.world_from_body);
@@ -342,7 +342,7 @@ impl Episode {
         ]);
     }
 
-    /// Returns what rewards are made of: progress [m], clearance [m], stages passed, time [s].
+    /// Returns the figures for rewards: progress [m], clearance [m], stages passed, time [s].
     pub fn figures(&self) -> [f32; FIGURES] {
         [
             self.progress_m as f32,
@@ -358,9 +358,10 @@ pub fn append(numbers: &[f32], out: &mut Vec<u8>) {
     out.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
 }
 
-/// Appends depths as `vizflyt gym` sends them: whole millimetres, little-endian, 65535 at most; 0 where nothing is seen. [m]
+/// Appends depths in the format of `vizflyt gym`: whole millimetres, little-endian, at most 65535; 0 means no return.
+/// [m]
 pub fn append_depth_mm(depth_m: &[f32], out: &mut Vec<u8>) {
-    // Clamped before the cast, in an order that vectorises.
+    // Clamped before the cast, in an order that can be vectorised.
     let mm = depth_m.iter().map(|m| (m * 1000.0 + 0.5).clamp(0.0, 65535.0) as u16);
     out.extend(mm.flat_map(u16::to_le_bytes));
 }

@@ -1,12 +1,14 @@
-//! `vizflyt gym`: courses as environments that a policy learns in, many at once, for `vizflyt.Env` of the Python package.
+//! `vizflyt gym`: courses as reinforcement-learning environments, many at once, for `vizflyt.Env` of the Python
+//! package.
 //!
 //! ```text
-//! Python ─ stdin ──▶ reset or not, seeds, actions ─▶ Episodes, each flown on (all cores)
+//! Python ─ stdin ──▶ reset flags, seeds, actions ──▶ Episodes, stepped on all cores
 //!        ◀ stdout ── states, figures, ends, images ◀─ one batch of cameras, one renderer a course
 //! ```
-//! A process of its own: Python's interpreter lock holds nothing up, what breaks here breaks no notebook, and the wheel
-//! holds simulator and renderer once. First comes a line of JSON that says how long each part is; then, for each step, as
-//! many bytes as that, little-endian, both ways. It ends with its input. The same seeds and actions give the same bytes.
+//! Runs as a separate process, so that Python's interpreter lock does not block it, a crash does not affect the
+//! notebook, and the wheel contains simulator and renderer only once. The first output is a line of JSON with the sizes
+//! of all parts. Each step then takes and returns that number of bytes, little-endian. The process ends when its input
+//! ends. The same seeds and actions give the same bytes.
 
 mod draw;
 pub mod episode;
@@ -29,10 +31,10 @@ use vizflyt_studio::scene::camera::ImageSize;
 use self::draw::{Drawn, View};
 use crate::episode::{ACTION, ActionKind, Episode, FIGURES, Manner, Rules, STATE, append};
 
-/// Ticks of the controllers in a second.
+/// Rate of the controllers. [Hz]
 const TICKS_HZ: u32 = 400;
 
-/// Flies courses for a program that learns; Python's `vizflyt.Env` starts it.
+/// Fly courses for a learning program; Python's `vizflyt.Env` starts it
 #[derive(Args, Debug)]
 pub struct GymArgs {
     /// The course: a project's name or file
@@ -41,31 +43,31 @@ pub struct GymArgs {
     /// Courses to fly, by their seeds
     #[arg(long, value_delimiter = ',', value_name = "SEED,...", default_value = "1")]
     courses: Vec<u64>,
-    /// How many vehicles fly at once, each in an episode of its own
+    /// Number of vehicles, each in a separate episode
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=4096))]
     envs: u32,
     /// Quantity that an action commands
     #[arg(long, value_enum, default_value_t)]
     action: Action,
-    /// Steps a second
+    /// Steps per second
     #[arg(long, value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(10..=400))]
     rate: u32,
-    /// Steps from an action until it counts
+    /// Steps until an action takes effect
     #[arg(long, value_name = "STEPS", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=40))]
     delay: u32,
-    /// An episode's longest time
+    /// Maximum time of an episode
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     seconds: f64,
-    /// Images by the first camera of the course, of this size
+    /// Image size; images are of the first camera of the course
     #[arg(long, value_name = "WxH")]
     camera: Option<ImageSize>,
-    /// Their width of view, if not the camera's own
+    /// Horizontal field of view (default: that of the course's camera)
     #[arg(long, value_name = "DEGREES", requires = "camera")]
     fov: Option<f64>,
-    /// How far splats may be drawn from where they are; 0 draws every one as it is
+    /// Maximum position error of rendered splats; 0 renders every splat exactly
     #[arg(long, value_name = "PX", default_value_t = 0.7, value_parser = error_px)]
     error_px: f32,
-    /// What images show
+    /// Layers of the images
     #[arg(long, value_enum, value_delimiter = ',', default_value = "depth", requires = "camera")]
     layers: Vec<Layer>,
     /// Light and weather
@@ -74,38 +76,38 @@ pub struct GymArgs {
 }
 
 fn error_px(text: &str) -> Result<f32, String> {
-    let px: f32 = text.parse().map_err(|_| format!("'{text}' is no number of pixels"))?;
+    let px: f32 = text.parse().map_err(|_| format!("'{text}' is not a number of pixels"))?;
     (0.0..=10.0).contains(&px).then_some(px).ok_or_else(|| "give 0 to 10 px".to_owned())
 }
 
-/// Quantity that an action commands; its numbers are within -1 and 1.
+/// Quantity that an action commands. Its numbers are from -1 to 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Action {
-    /// Velocity ahead, to the left, up, in shares of the course's limit, and a turn
+    /// Velocity forward, left and up, as fractions of the course's limit, and a turn
     #[default]
     Velocity,
-    /// Acceleration ahead, to the left, up, in shares of the course's limit, and a turn
+    /// Acceleration forward, left and up, as fractions of the course's limit, and a turn
     Acceleration,
     /// Body rates and thrust
     BodyRates,
 }
 
-/// What an image shows.
+/// Layer of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Layer {
-    /// Depth, 16 bits, millimetres; 0 is nothing seen
+    /// Depth, 16 bits, millimetres; 0 means no return
     Depth,
-    /// Colour, 8 bits a channel
+    /// Colour, 8 bits per channel
     Rgb,
 }
 
-/// A course, and who draws it.
+/// A course, and the view that renders it.
 struct Place {
     rules: Rules,
     view: Option<View>,
 }
 
-/// An episode, and in which course it is.
+/// An episode, and the index of its course.
 struct Env {
     place: usize,
     episode: Episode,
@@ -168,7 +170,7 @@ pub fn run(args: &GymArgs) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Makes the courses, on all cores.
+/// Creates the courses, on all cores.
 fn places(args: &GymArgs, project: &CourseProject) -> Result<Vec<Place>> {
     let limits = airframe_limits();
     let depth_alone = !args.layers.contains(&Layer::Rgb);
@@ -189,7 +191,7 @@ fn places(args: &GymArgs, project: &CourseProject) -> Result<Vec<Place>> {
     Ok(made)
 }
 
-/// Writes all that Python is told after a step.
+/// Writes the complete output of a step to Python.
 fn answer(
     out: &mut impl Write,
     envs: &[Env],
@@ -211,10 +213,10 @@ fn answer(
     if drawn.depth || drawn.rgb {
         draw::images(out, envs, places, drawn)?;
     }
-    out.flush().context("Python is gone")
+    out.flush().context("cannot write to Python")
 }
 
-/// What Python asks for.
+/// Input of one step from Python.
 struct Order {
     resets: Vec<bool>,
     seeds: Vec<u64>,
@@ -223,7 +225,7 @@ struct Order {
 }
 
 impl Order {
-    /// Bytes of each environment: begins it anew or not, with which seed, its action.
+    /// Bytes of each environment: reset flag, seed, action.
     const BYTES: usize = 1 + 8 + 4 * ACTION;
 
     fn for_envs(count: usize) -> Self {
@@ -235,7 +237,7 @@ impl Order {
         }
     }
 
-    /// Reads the next one; false at the end.
+    /// Reads the next input; returns false at the end.
     fn read(&mut self, input: &mut impl Read) -> Result<bool> {
         let mut read = 0;
         while read < self.bytes.len() {

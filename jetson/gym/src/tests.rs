@@ -1,4 +1,4 @@
-//! Episodes through the program's own courses.
+//! Tests of episodes in generated courses.
 
 use glam::DVec3;
 use vizflyt_scenes::Variant;
@@ -23,7 +23,7 @@ fn state(episode: &Episode, rules: &Rules) -> [f32; STATE] {
 }
 
 #[test]
-fn a_velocity_is_flown_and_the_fence_ends_it() {
+fn flies_the_commanded_velocity_and_ends_at_the_fence() {
     let rules = rules();
     let mut episode = Episode::start(&rules, &MANNER, 3);
     let most_mps = rules.arena.limits.max_speed_mps as f32;
@@ -31,7 +31,7 @@ fn a_velocity_is_flown_and_the_fence_ends_it() {
         episode.step(&rules, &MANNER, [0.4, 0.0, 0.0, 0.0]);
     }
     let flown = state(&episode, &rules);
-    // Ahead in its own axes, whichever way it looks.
+    // Forward in heading axes, for any heading.
     assert!((flown[0] - 0.4 * most_mps).abs() < 0.1, "{flown:?}");
     assert!(flown[1].abs() < 0.1 && flown[2].abs() < 0.1, "{flown:?}");
     assert_eq!(episode.end(), End::Flying);
@@ -41,11 +41,11 @@ fn a_velocity_is_flown_and_the_fence_ends_it() {
     assert!(matches!(episode.end(), End::LeftFence | End::Crashed), "{:?}", episode.end());
     let ended = state(&episode, &rules);
     episode.step(&rules, &MANNER, [-1.0; 4]);
-    assert_eq!(state(&episode, &rules), ended, "what is over stays as it is");
+    assert_eq!(state(&episode, &rules), ended, "an ended episode must not change");
 }
 
 #[test]
-fn the_seed_says_where_it_starts_and_time_ends_it() {
+fn seed_determines_the_start_and_the_time_limit_ends_an_episode() {
     let rules = rules();
     let begin = |seed| state(&Episode::start(&rules, &MANNER, seed), &rules);
     assert_eq!(begin(1), begin(1));
@@ -67,7 +67,7 @@ fn the_seed_says_where_it_starts_and_time_ends_it() {
 }
 
 #[test]
-fn an_action_counts_after_its_delay() {
+fn action_takes_effect_after_its_delay() {
     let rules = rules();
     let late = Manner { delay: 3, ..MANNER };
     let turned = |manner: &Manner, steps| {

@@ -1,17 +1,16 @@
 #!/usr/bin/env python3
-"""Flies to the goal through a forest, by a potential field on the depth image.
+"""Flies to the goal through a forest with a potential field on the depth image.
 
-The twin of the Rust plugin in jetson/plugins/avoid, step by step and with the same numbers; each states
-there where it comes from. What happens at every image:
+The same algorithm and numbers as the Rust plugin in jetson/plugins/avoid, where each number has a comment with its
+reason. Steps at every image:
 
-1. scan: depth pixels become obstacle points in the world; floor and sky do not;
-2. memory: points of the last seconds stay, for what the camera no longer sees;
-3. field: how near is an obstacle, and (ten times a second) how long is the way to the goal;
-4. steer: of all velocities, the one that gets on best without coming near anything;
-5. height, heading and arrival; the velocity goes out as a setpoint.
+1. scan: convert depth pixels to obstacle points in the world frame, without floor and sky;
+2. memory: keep the points of the last seconds, because the camera no longer sees some of them;
+3. field: compute the distance to obstacles and (10 times per second) the length of the way to the goal;
+4. steer: choose the velocity with the most progress and enough clearance;
+5. height, heading and arrival; return the velocity as a setpoint.
 
-All arithmetic is numpy's, on whole arrays: some 5 ms per image, where a loop over pixels would take a
-second.
+All arithmetic uses numpy on complete arrays: about 5 ms per image. A Python loop over pixels would take a second.
 """
 
 import math
@@ -64,8 +63,8 @@ COST_OF_TOUCH = 60.0
 UNREACHED_M = 1e6
 SETTLED_M = 0.02
 MAX_ROUNDS = 8
-# Where the Rust twin sweeps the whole field at every image (0.4 ms), this one does ten times a second
-# (8 ms): at 3.6 m/s the vehicle moves by a cell and a half meanwhile. [s]
+# The Rust plugin sweeps the complete field at every image (0.4 ms), this one 10 times per second (8 ms). At 3.6 m/s the
+# vehicle moves by 1.5 cells in that time. [s]
 WAY_EVERY_S = 0.1
 # --- steer
 DIRECTIONS = 72
@@ -105,18 +104,18 @@ class Avoid(vizflyt.Plugin):
             return Setpoint.hold()
         vehicle = obs.vehicle
         camera = obs.camera("front")
-        # Without a pose there is no way to a goal: no answer, and the guard holds, then lands.
+        # Without a pose, return no setpoint: the guard holds, then lands.
         if vehicle is None or vehicle.p_world_m is None or camera is None:
             return None
         now_s = vehicle.stamp_ns * 1e-9
         gap_s = 0.0 if self.last_s is None else min(max(now_s - self.last_s, 0.0), BLIND_S)
         dt_s = min(gap_s, MAX_DT_S)
         self.last_s = now_s
-        # A gap is forgotten over seconds: what starves once does so again.
+        # The longest gap decays over seconds, because gaps usually come in series.
         self.longest_gap_s = max(gap_s, self.longest_gap_s - GAP_FORGOTTEN_PER_S * gap_s)
         late_s = max(self.longest_gap_s - USUAL_GAP_S, 0.0)
 
-        # See.
+        # 1. Update the map.
         p_m, v_mps = vehicle.p_world_m, vehicle.v_world_mps
         view = View(vehicle, camera)
         points_m, valid_fraction = scan(view, p_m[2])
@@ -124,16 +123,16 @@ class Avoid(vizflyt.Plugin):
             self.seen_s = now_s
         self.memory.update(now_s, view, points_m)
 
-        # Understand.
+        # 2. Compute the field.
         self.field.update(now_s, p_m, goal_m[:2], self.memory.points_m)
 
-        # Decide.
+        # 3. Choose a velocity.
         to_goal_m = (goal_m - p_m)[:2]
         distance_m = math.hypot(*to_goal_m)
         if distance_m < ARRIVED * self.info.goal_radius_m:
             self.setpoint_mps = v_mps[:2]
             return Setpoint.position(goal_m)
-        # Before take-off nobody follows the setpoint: it must not run away from the vehicle.
+        # Before take-off the vehicle does not follow the setpoint, so limit their difference.
         lead_mps = shortened(self.setpoint_mps - v_mps[:2], MAX_LEAD_MPS)
         setpoint_mps = v_mps[:2] + lead_mps
         wanted_mps = np.zeros(2)
@@ -141,7 +140,7 @@ class Avoid(vizflyt.Plugin):
             cruise_mps = min(CRUISE_MPS, CRUISE_SHARE * self.info.limits.max_speed_mps)
             stop_mps = math.sqrt(2.0 * BRAKE_MPS2 * distance_m)
             heading_rad = vehicle.yaw_rad
-            # Between two images the last answer stands: no further by it than this.
+            # Between two images the last setpoint stays in force: limit the distance flown with it.
             blind_mps = BLIND_WAY_M / late_s if late_s > 0.0 else math.inf
             speed_mps = min(cruise_mps, stop_mps, blind_mps)
             wanted_mps = choose_velocity(
@@ -155,19 +154,19 @@ class Avoid(vizflyt.Plugin):
 
 
 def shortened(vector, length):
-    """Returns the vector, no longer than `length`."""
+    """Returns the vector, shortened to at most `length`."""
     now = math.hypot(*vector)
     return vector if now <= length else vector * (length / now)
 
 
 class View:
-    """A depth image and where its camera was: the vehicle's state is newer (or older) than the image
-    by some milliseconds, over which it moved and turned at a steady rate."""
+    """A depth image and the pose of its camera. The vehicle's state is some milliseconds newer or older than the image;
+    it is extrapolated with constant velocity and angular velocity."""
 
     def __init__(self, vehicle, camera):
         ahead_s = (camera.stamp_ns - vehicle.stamp_ns) * 1e-9
         ahead_s = min(max(ahead_s, -BLIND_S), BLIND_S)
-        self.depth_mm = camera.depth_mm  # (H, W) uint16, 0 is no return
+        self.depth_mm = camera.depth_mm  # (H, W) uint16, 0: no return
         self.k = camera.intrinsics
         now = vehicle.world_from_body
         body_from_cam = camera.body_from_cam
@@ -178,12 +177,12 @@ class View:
             + vehicle.v_world_mps * ahead_s
             + world_from_body @ body_from_cam.translation_m
         )
-        # Columns: the camera's right, down and forward in world axes.
+        # Columns: the camera's right, down and forward axes in world axes.
         self.axes = world_from_body @ body_from_cam.rotation_matrix
 
     def sees_through(self, points_m):
-        """Returns for each point (N, 3) whether the image shows something well behind it. Pixels
-        without a return are ignored: they are no proof of free space."""
+        """Returns for each point (N, 3) whether the image shows a surface well behind it, so that the point is free.
+        Pixels without a return do not count, because they do not prove free space."""
         k, (height, width) = self.k, self.depth_mm.shape
         p_cam_m = (points_m - self.origin_m) @ self.axes
         z_m = np.maximum(p_cam_m[:, 2], 1e-6)
@@ -193,7 +192,7 @@ class View:
         column = np.where(ahead, x, 2).astype(int)
         row = np.where(ahead, y, 2).astype(int)
         behind_m = z_m * (1.0 + SEE_THROUGH_RATIO) + SEE_THROUGH_M
-        # The point and four neighbours, so that one pixel beside a trunk's edge proves nothing.
+        # Check the point and four neighbours, because one pixel next to a trunk's edge proves nothing.
         for dx, dy in ((0, 0), (-2, 0), (2, 0), (0, -2), (0, 2)):
             ahead &= self.depth_mm[row + dy, column + dx] * 1e-3 > behind_m
         return ahead
@@ -210,9 +209,8 @@ def rotation_matrix(turn_rad):
 
 
 def scan(view, flight_z_m):
-    """Returns obstacle points (N, 3) [m, world], at most one per vertical strip of the image: the
-    nearest surface between the floor and a little above the vehicle; and the share of pixels that had
-    a return."""
+    """Returns obstacle points (N, 3) [m, world], at most one per vertical strip of the image: the nearest surface
+    between the floor and a little above the vehicle. Also returns the fraction of pixels with a return."""
     k = view.k
     height, width = view.depth_mm.shape
     columns = min(COLUMNS, width)
@@ -245,7 +243,7 @@ def scan(view, flight_z_m):
         return np.bincount(at, weights, columns * BINS).reshape(columns, BINS)
 
     count = binned()
-    # Two neighbours together, as a surface may lie on their border.
+    # Add two neighbouring bins, because a surface may lie on their border.
     pair = count[:, :-1] + count[:, 1:]
     strip = np.nonzero((pair >= SUPPORT).any(axis=1))[0]
     near = (pair[strip] >= SUPPORT).argmax(axis=1)
@@ -260,12 +258,12 @@ def scan(view, flight_z_m):
 
 
 class Memory:
-    """Obstacle points of the last seconds, in the world. Points are kept until they are old, far
-    behind, or the camera sees through the place where they were."""
+    """Obstacle points of the last seconds, in the world frame. A point is kept until it is old, far away, or the camera
+    sees through its position."""
 
     def __init__(self):
         self.points_m = np.empty((0, 3))
-        self.range_m = np.empty(0)  # at the sighting that placed it; nearer ones are more exact
+        self.range_m = np.empty(0)  # at the sighting that placed the point; nearer is more exact
         self.seen_s = np.empty(0)
 
     def update(self, now_s, view, points_m):
@@ -285,7 +283,7 @@ class Memory:
             self.points_m[known[better]] = points_m[same][better]
             self.range_m[known[better]] = range_m[same][better]
             points_m, range_m = points_m[~same], range_m[~same]
-        # Neighbouring strips of one trunk give one point.
+        # Neighbouring strips of one trunk give only one point.
         _, first = np.unique(np.round(points_m[:, :2] / MERGE_M), axis=0, return_index=True)
         self.points_m = np.concatenate([self.points_m, points_m[first]])
         self.range_m = np.concatenate([self.range_m, range_m[first]])
@@ -300,11 +298,11 @@ class Memory:
 
 
 class Field:
-    """For every place within 8 m: how near is an obstacle, and how far is the goal.
+    """Clearance and distance to the goal for every point within 8 m.
 
-    The way to the goal is the shortest around everything remembered, where a metre close to an
-    obstacle counts for several: a potential without a minimum but the goal. It solves the eikonal
-    equation |grad T| = cost by fast sweeping (H. Zhao, Math. Comp. 74, 2005).
+    The way to the goal is the shortest one around all remembered obstacles, where a metre close to an obstacle counts
+    several times. The only minimum of this potential is the goal. It solves the eikonal equation |grad T| = cost by
+    fast sweeping (H. Zhao, Math. Comp. 74, 2005).
     """
 
     def __init__(self, info):
@@ -314,13 +312,13 @@ class Field:
         self.to_go_m = np.zeros((SIDE, SIDE))
         self.way_origin_m = np.zeros(2)
         self.way_at_s = -math.inf
-        # Cells around a point, within reach of it.
+        # Cell offsets around a point, up to its reach.
         self.reach_m = COMFORT_M + info.body_radius_m
         reach = math.ceil(self.reach_m / CELL_M) + 1
         self.around = np.arange(-reach, reach + 1)
 
     def update(self, now_s, p_m, goal_m, points_m):
-        # On whole cells, so that the same obstacle falls on the same cells in every image.
+        # Aligned to whole cells, so that the same obstacle is in the same cells in every image.
         half_m = CELL_M * (SIDE - 1) / 2
         self.origin_m = np.round((p_m[:2] - half_m) / CELL_M) * CELL_M
         self._fill_clearance(p_m[2], points_m)
@@ -329,11 +327,11 @@ class Field:
             self._fill_to_go(goal_m)
 
     def clearance_at(self, p_m):
-        """Returns the distance from the body to the nearest obstacle at places (N, 2). [m]"""
+        """Returns the distance from the body to the nearest obstacle at points (N, 2). [m]"""
         return interpolate(self.clearance_m, self.origin_m, p_m)
 
     def to_go_at(self, p_m):
-        """Returns the length of the way to the goal from places (N, 2). [m]"""
+        """Returns the length of the way to the goal from points (N, 2). [m]"""
         return interpolate(self.to_go_m, self.way_origin_m, p_m)
 
     def _fill_clearance(self, z_m, points_m):
@@ -363,7 +361,7 @@ class Field:
         discomfort = np.maximum(1.0 - self.clearance_m / COMFORT_M, 0.0)
         cost = 1.0 + COST_OF_DISCOMFORT * discomfort * discomfort
         step_m = CELL_M * np.where(self.clearance_m < TOUCH_M, COST_OF_TOUCH, cost)
-        # With a rim of one cell that no way leads over.
+        # With a border of one cell that blocks all ways.
         to_go_m = np.full((SIDE + 2, SIDE + 2), UNREACHED_M)
         inner = to_go_m[1:-1, 1:-1]
         goal_cell = (goal_m - self.origin_m) / CELL_M
@@ -371,7 +369,7 @@ class Field:
             column, row = np.round(goal_cell).astype(int)
             inner[row, column] = 0.0
         else:
-            # The goal lies outside: leave over an edge that faces it, then go straight.
+            # The goal is outside the grid: leave over an edge on the goal's side, then fly straight.
             faces = np.zeros((SIDE, SIDE), bool)
             faces[:, 0] |= goal_cell[0] < 0
             faces[:, -1] |= goal_cell[0] > SIDE - 1
@@ -381,7 +379,7 @@ class Field:
             inner[row, column] = CELL_M * np.hypot(column - goal_cell[0], row - goal_cell[1])
         for _ in range(MAX_ROUNDS):
             before = inner.copy()
-            # The same sweep over the grid turned by quarter turns goes all four ways.
+            # The same sweep on the grid rotated by 90 degrees covers all four directions.
             for turned in range(4):
                 sweep(np.rot90(to_go_m, turned), np.rot90(step_m, turned))
             if (before - inner).max() < SETTLED_M:
@@ -390,8 +388,8 @@ class Field:
 
 
 def sweep(to_go_m, step_m):
-    """Updates every row from the one above it, in place. Where the way comes from between the cell
-    above and one beside that, T = above + sqrt(step^2 - (above - beside)^2)."""
+    """Updates every row from the row above, in place. If the way comes from a point between the cell above and its
+    neighbour: T = above + sqrt(step^2 - (above - beside)^2)."""
     diagonal_m, half_m = step_m * math.sqrt(2.0), step_m / math.sqrt(2.0)
     for row in range(SIDE):
         above = to_go_m[row, 1:-1]
@@ -405,7 +403,7 @@ def sweep(to_go_m, step_m):
 
 
 def interpolate(values, origin_m, p_m):
-    """Bilinear, and constant beyond the edges."""
+    """Interpolates bilinearly; constant outside the grid."""
     cell = np.clip((p_m - origin_m) / CELL_M, 0.0, SIDE - 1.0)
     corner = np.minimum(cell.astype(np.intp), SIDE - 2)
     fx, fy = (cell - corner).T
@@ -417,21 +415,20 @@ def interpolate(values, origin_m, p_m):
 
 
 def choose_velocity(field, p_m, v_mps, setpoint_mps, heading_rad, max_speed_mps, late_s=0.0):
-    """Returns the velocity (2,) to ask for: every candidate is flown ahead in the mind for 1.5 s with
-    the lag and acceleration of a real vehicle, and the best one wins (compare D. Fox et al., IEEE RAM
-    4(1), 1997). [m/s, world]"""
-    # The first candidate is to stop; the ring starts at the last choice, so that keeping it is one.
+    """Returns the best velocity (2,). Every candidate is simulated for 1.5 s with the lag and acceleration of a real
+    vehicle (compare D. Fox et al., IEEE RAM 4(1), 1997). [m/s, world]"""
+    # The first candidate is zero. The ring starts at the last velocity, so that keeping it is another candidate.
     start_rad = math.atan2(setpoint_mps[1], setpoint_mps[0])
     angle = start_rad + 2 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS
     off = np.abs((angle - heading_rad + math.pi) % (2 * math.pi) - math.pi)
-    # What is out of sight may have appeared since it was last seen.
+    # Obstacles outside the image may be new, so limit the speed there.
     cap_mps = np.where(off < IN_SIGHT_RAD, max_speed_mps, min(UNSEEN_MPS, max_speed_mps))
     speed = cap_mps[:, None] * np.arange(1, SPEEDS + 1) / SPEEDS
     ring = np.stack([speed * np.cos(angle)[:, None], speed * np.sin(angle)[:, None]], axis=2)
     wanted = np.concatenate([np.zeros((1, 2)), ring.reshape(-1, 2)])
 
     count = len(wanted)
-    p = np.tile(p_m + v_mps * (LATENCY_S + late_s), (count, 1))  # what is asked acts later
+    p = np.tile(p_m + v_mps * (LATENCY_S + late_s), (count, 1))  # the setpoint takes effect later
     v = np.tile(v_mps, (count, 1))
     asked = np.tile(setpoint_mps, (count, 1))
     start_m = field.to_go_at(p[:1])[0]
@@ -447,7 +444,7 @@ def choose_velocity(field, p_m, v_mps, setpoint_mps, heading_rad, max_speed_mps,
         p += v * STEP_S
         clearance_m = field.clearance_at(p)
         speed_mps = np.hypot(v[:, 0], v[:, 1])
-        # Among hits the later, the slower and the more glancing is the better.
+        # Collision. A later, slower and more glancing one gets a better score.
         first = (clearance_m < TOUCH_M) & np.isneginf(hit)
         left = (STEPS - step) / STEPS
         fault = -HIT_MPS * (1.0 + left) - speed_mps + np.maximum(clearance_m, -1.0)

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Hovers at the height of take-off, turns once around, and lands.
+"""Hovers at the take-off height, turns around once, and lands.
 
-The smallest plugin that does something: it needs no pose and works on every course.
+The smallest useful plugin: it needs no pose and works on every course.
 """
 
 import math
@@ -24,7 +24,7 @@ class Hover(vizflyt.Plugin):
             print("flying: once around, then down")
 
     def on_image(self, obs):
-        # Images come before take-off too; the turn begins when the vehicle is up.
+        # Images arrive before take-off too; the turn begins in flight.
         if not self.flying:
             return Setpoint.hold()
         if self.since_ns is None:

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Flies square, spiral or lemniscate by visual-inertial odometry: colour images and the IMU, no depth.
+"""Flies square, spiral or lemniscate with visual-inertial odometry: colour images and the IMU, no depth.
 
 A multi-state constraint Kalman filter (A. Mourikis and S. Roumeliotis, "A multi-state constraint Kalman filter for
-vision-aided inertial navigation", ICRA 2007). Its state is the body's motion and the IMU's biases, and the body's poses
-at the last key images. Between images the IMU carries it on; scale and up come from there. A corner that was seen in
-several of those images says how they lie to each other: its own place is eliminated (Schur complement), so it needs no
-room in the state. Corners that are followed for longer get a place in the state all the same (M. Li and A. Mourikis,
-"Optimization-based estimator design for vision-aided inertial navigation", RSS 2012): they remember how large the world
-is, when the images in which that was measured are long forgotten. Scale is known at once, as the vehicle stands before
-it takes off: velocity is 0 there, gravity is what the accelerometer feels, and the gyroscope's mean is its bias.
+vision-aided inertial navigation", ICRA 2007). Its state is the body's motion, the IMU's biases, and the body's poses at
+the last key images. The IMU propagates the state between images, and gives scale and the direction of gravity. A corner
+seen in several key images constrains their relative poses: its position is eliminated (Schur complement), so it needs
+no space in the state. Corners that are tracked for longer get a position in the state (M. Li and A. Mourikis,
+"Optimization-based estimator design for vision-aided inertial navigation", RSS 2012). They keep the scale after the
+images that measured it have left the state. The scale is known from the start, because the vehicle is at rest before
+take-off: its velocity is 0, the accelerometer measures gravity, and the gyroscope's mean is its bias.
 
 ::
 
@@ -40,39 +40,40 @@ from odometry_flight import (
 )
 
 GRAVITY_MPS2 = np.array([0.0, 0.0, -9.80665])
-# White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame. A reading is off by 0.2 m/s^2 and
-# 0.01 rad/s, and 100 come in a second: divided by the root of 100 Hz.
+# White noise and random walk of the IMU: an ICM-42688 class sensor on a small frame. The noise of a sample is 0.2 m/s^2
+# and 0.01 rad/s at 100 Hz; divided by the root of 100 Hz.
 # [m/s^2/sqrt(Hz)], [rad/s/sqrt(Hz)], [m/s^3/sqrt(Hz)], [rad/s^2/sqrt(Hz)]
 ACCEL_NOISE, GYRO_NOISE, ACCEL_WALK, GYRO_WALK = 0.02, 0.001, 1e-3, 1e-4
-# What is known where it stands: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2]; and the mean force felt. [m/s^2]
+# Initial standard deviations: tilt [rad], velocity [m/s], biases [rad/s], [m/s^2]; and of the mean specific force.
+# [m/s^2]
 TILT_SIGMA, V_SIGMA, GYRO_SIGMA, ACCEL_SIGMA, STANDING_SIGMA = 0.05, 0.003, 0.001, 0.05, 0.01
-# Heading and place are the frame's own, by definition.
+# Heading and position are zero in the frame's definition.
 OWN_SIGMA = 1e-4
-# Key images are so far apart, and so many are remembered. [s]
+# Interval between key images, and number of key images in the state. [s]
 KEY_S, KEYS = 0.09, 20
-# An image shows where the vehicle was predicted to be at its instant, not where it then was: how far the two are apart.
-# [rad], [m]
+# Standard deviation between the predicted pose, from which an image is rendered, and the true pose. [rad], [m]
 PREDICTED_RAD, PREDICTED_M = 0.0015, 0.001
-# Corners of each camera, and how far they are apart at least. [px]
+# Number of corners per camera, and minimum distance between them. [px]
 CORNERS, APART_PX = 220, 10
-# How far a followed corner is off. [px]
+# Standard deviation of a tracked corner. [px]
 SIGMA_PX = 0.5
-# So many corners have their places in the state; and how far such a corner is off, which drifts as it is followed. [px]
+# Number of corners with a position in the state, and standard deviation of such a corner, which drifts while it is
+# tracked. [px]
 PLACES, PLACE_SIGMA_PX = 50, 1.5
-# Corners whose residuals are beyond so many sigmas count less, or not at all; beyond the last, a place is forgotten.
+# Residuals beyond HUBER sigmas get a lower weight, beyond DROPPED none; beyond LOST, a position leaves the state.
 HUBER, DROPPED, LOST = 1.5, 6.0, 4.0
-# Seen in at least so many key images; and beyond this distance a corner's place is not believed. [m, cam]
+# Minimum number of key images of a corner, and range of accepted positions. [m, cam]
 FEWEST_SEEN, NEAREST_M, FARTHEST_M = 4, 0.1, 40.0
 TRIANGULATIONS = 5
 
-# The error state begins with turn of the body [rad, body], velocity, place, biases of gyroscope and accelerometer. Then
-# come the places of corners, and turn and place of each clone.
+# The error state begins with rotation of the body [rad, body], velocity, position, biases of gyroscope and
+# accelerometer. Then follow the positions of corners, and rotation and position of each clone.
 TURN, V, P, GYRO, ACCEL = (slice(n, n + 3) for n in (0, 3, 6, 9, 12))
 IMU_SIZE, PLACE_SIZE, CLONE_SIZE = 15, 3, 6
 
 
 class Motion(NamedTuple):
-    """The body's motion at an instant, in the frame `odom`, and what the IMU's readings are off by."""
+    """Motion of the body at an instant, in the frame `odom`, and biases of the IMU."""
 
     at_s: float
     rotation: F64
@@ -83,15 +84,15 @@ class Motion(NamedTuple):
 
 
 class Clone(NamedTuple):
-    """Where the body was at a key image."""
+    """Pose of the body at a key image."""
 
     key: int
     rotation: F64
     p_m: F64
     first_rotation: F64
-    """As it was first estimated: there all measurements are linearised, or the filter believes to know its heading (G.
-    Huang, A. Mourikis and S. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators",
-    IJRR 2010)."""
+    """First estimate. All measurements are linearised there; otherwise the filter would become too certain of its
+    heading (G. Huang, A. Mourikis and S. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
+    estimators", IJRR 2010)."""
     first_m: F64
 
 
@@ -102,39 +103,39 @@ class Sight(NamedTuple):
     slope: F64
 
 
-# A corner's name: its camera, and its number there.
+# Name of a corner: its camera, and its number.
 Name = tuple[str, int]
 
 
 class Place(NamedTuple):
-    """A corner whose place is in the state."""
+    """A corner with a position in the state."""
 
     name: Name
     p_m: F64
     first_m: F64
-    """As it was first estimated; see `Clone`."""
+    """First estimate; see `Clone`."""
 
 
 class Rays(NamedTuple):
-    """The sights of M corners, of each in up to N key images."""
+    """The sights of M corners, each in up to N key images."""
 
     seen: npt.NDArray[np.bool_]
-    """Which of them there are, shape (M, N): in each row the first ones."""
+    """Valid sights, shape (M, N): the first ones in each row."""
     clone: npt.NDArray[np.int64]
-    """Which clone saw it, shape (M, N)."""
+    """Index of the clone of each sight, shape (M, N)."""
     slopes: F64
     """Shape (M, N, 2)."""
     body_from_cam: F64
     """Rotation, shape (M, 1, 3, 3)."""
     camera_m: F64
-    """Where the camera sits, shape (M, 1, 3, 1). [m, body]"""
+    """Position of the camera, shape (M, 1, 3, 1). [m, body]"""
     sigma: F64
-    """How far slopes are off, shape (M,)."""
+    """Standard deviation of slopes, shape (M,)."""
 
 
 def moved(motion: Motion, accel_mps2: F64, gyro_radps: F64, dt_s: float) -> Motion:
-    """Returns the motion `dt_s` later, with readings that hold for that time: exact for a constant turn, and a force
-    that is constant in the axes of its middle."""
+    """Returns the motion after `dt_s` with constant samples. Exact for a constant angular velocity, and a force that is
+    constant in the axes at the middle of the step."""
     omega = gyro_radps - motion.gyro_bias
     middle = motion.rotation @ exp_so3(omega * dt_s / 2)
     a_mps2 = middle @ (accel_mps2 - motion.accel_bias) + GRAVITY_MPS2
@@ -147,7 +148,7 @@ def moved(motion: Motion, accel_mps2: F64, gyro_radps: F64, dt_s: float) -> Moti
 
 
 def transition(motion: Motion, accel_mps2: F64, gyro_radps: F64, dt_s: float) -> F64:
-    """Returns how an error of the motion (15,) goes on over `dt_s`, shape (15, 15)."""
+    """Returns the transition matrix of the motion's error over `dt_s`, shape (15, 15)."""
     omega = gyro_radps - motion.gyro_bias
     half = exp_so3(omega * dt_s / 2)
     force = motion.rotation @ half
@@ -162,11 +163,11 @@ def transition(motion: Motion, accel_mps2: F64, gyro_radps: F64, dt_s: float) ->
 
 
 def triangulate(axes: F64, from_m: F64, slopes: F64, seen: npt.NDArray[np.bool_]) -> tuple[F64, F64]:
-    """Returns the places (M, 3) that rays meet in [m, odom], and the residuals (M, N, 2) of their slopes.
+    """Returns the intersections (M, 3) of rays [m, odom], and the residuals (M, N, 2) of their slopes.
 
-    Cameras' axes (M, N, 3, 3) and places (M, N, 3), slopes (M, N, 2), and which of them there are (M, N). The midpoint
-    of the rays, then Gauss-Newton (R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed., chapter 12). NaN
-    where rays are parallel.
+    Inputs: axes (M, N, 3, 3) and positions (M, N, 3) of the cameras, slopes (M, N, 2), and valid sights (M, N). Starts
+    with the midpoint of the rays, then Gauss-Newton (R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed.,
+    chapter 12). NaN for parallel rays.
     """
     rays = np.einsum("mnij,mnj->mni", axes, np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=2))
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
@@ -178,7 +179,7 @@ def triangulate(axes: F64, from_m: F64, slopes: F64, seen: npt.NDArray[np.bool_]
     for _ in range(TRIANGULATIONS):
         residual, slope = _look(axes, from_m, slopes, seen, places_m)
         matrix = np.einsum("mnij,mnik->mjk", slope, slope)
-        # A little of its own size on the diagonal, or rays of one camera that stands leave it singular.
+        # Small relative damping, because rays of a single camera at rest give a singular matrix.
         matrix += (1e-9 + 1e-12 * np.trace(matrix, axis1=1, axis2=2))[:, None, None] * np.eye(3)
         places_m = places_m - np.linalg.solve(matrix, np.einsum("mnij,mni->mj", slope, residual)[..., None])[..., 0]
     residual, _ = _look(axes, from_m, slopes, seen, places_m)
@@ -191,7 +192,7 @@ def triangulate(axes: F64, from_m: F64, slopes: F64, seen: npt.NDArray[np.bool_]
 def _look(
     axes: F64, from_m: F64, slopes: F64, seen: npt.NDArray[np.bool_], places_m: F64
 ) -> tuple[F64, F64]:
-    """Returns residuals of slopes (M, N, 2), and how they change with the place, shape (M, N, 2, 3)."""
+    """Returns residuals of slopes (M, N, 2), and their derivatives by the position, shape (M, N, 2, 3)."""
     in_cam_m = np.einsum("mnji,mnj->mni", axes, places_m[:, None] - from_m)
     z_m = np.maximum(in_cam_m[..., 2:], 1e-3)
     residual = (in_cam_m[..., :2] / z_m - slopes) * seen[..., None]
@@ -202,14 +203,14 @@ def _look(
 
 
 def chi_square(freedom: int) -> float:
-    """Returns what 95 % of a chi-square variable's values are below, to 1 % (E. Wilson and M. Hilferty, PNAS 17(12),
+    """Returns the 95 % quantile of a chi-square variable, accurate to 1 % (E. Wilson and M. Hilferty, PNAS 17(12),
     1931)."""
     spread = 2 / (9 * freedom)
     return freedom * (1 - spread + 1.645 * spread**0.5) ** 3
 
 
 class InertialOdometry(Odometry):
-    """Where the body is, from images and IMU."""
+    """Pose of the body, from images and IMU."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -224,8 +225,9 @@ class InertialOdometry(Odometry):
         self._key_s: dict[str, float] = {}
 
     def begin(self, standing: Standing) -> None:
-        """Begins at rest."""
-        # Along the force felt the bias is known, as gravity is; across it, it cannot be told from tilt.
+        """Starts at rest."""
+        # The bias along the specific force is known, because gravity is. Across it, bias and tilt cannot be
+        # distinguished.
         accel_mps2 = standing.accel_mps2
         accel_bias = accel_mps2 * (1 + GRAVITY_MPS2[2] / float(np.linalg.norm(accel_mps2)))
         level, zero = level_from_body(accel_mps2), np.zeros(3)
@@ -234,20 +236,20 @@ class InertialOdometry(Odometry):
         for sigma in (V_SIGMA, OWN_SIGMA, GYRO_SIGMA, ACCEL_SIGMA):
             sigmas += [sigma] * 3
         covariance = np.diag(np.square(sigmas))
-        # What the standing accelerometer felt binds the two together.
+        # The accelerometer at rest correlates tilt and bias.
         by_error = np.zeros((3, IMU_SIZE))
         by_error[:, TURN], by_error[:, ACCEL] = skew(level.T @ -GRAVITY_MPS2), np.eye(3)
         expected = by_error @ covariance @ by_error.T + np.eye(3) * STANDING_SIGMA**2
         self._covariance = covariance - covariance @ by_error.T @ np.linalg.solve(expected, by_error @ covariance)
 
     def see(self, at_ns: int, views: list[View]) -> Estimate:
-        """Returns the estimate of an instant, from its images and the readings until then."""
+        """Returns the estimate at an instant, from its images and the samples until then."""
         self._propagate(at_ns * 1e-9)
         self._follow(at_ns * 1e-9, views)
         return self._estimate(at_ns, self._motion)
 
     def now(self) -> Estimate | None:
-        """Returns the motion at the newest reading, for steering; None while it stands."""
+        """Returns the motion at the newest sample, for steering; None before lift-off."""
         if self._motion is None:
             return None
         motion = self._motion
@@ -263,7 +265,7 @@ class InertialOdometry(Odometry):
     # --- the IMU
 
     def _propagate(self, to_s: float) -> None:
-        """Carries the state on to an instant up to which there are readings."""
+        """Propagates the state to an instant that the samples cover."""
         for dt_s, accel, gyro in self.between(self._motion.at_s, to_s):
             by_error = transition(self._motion, accel, gyro, dt_s)
             noise = np.repeat([GYRO_NOISE, ACCEL_NOISE, 0.0, GYRO_WALK, ACCEL_WALK], 3) ** 2 * dt_s
@@ -276,7 +278,7 @@ class InertialOdometry(Odometry):
     # --- images
 
     def _follow(self, at_s: float, views: list[View]) -> None:
-        """Follows corners into new images; at key images the filter takes what they say."""
+        """Tracks corners to new images; updates the filter at key images."""
         key_views = []
         for view in views:
             tracks = self._tracks.setdefault(view.camera, Tracks(CORNERS, APART_PX))
@@ -321,11 +323,11 @@ class InertialOdometry(Odometry):
     # --- what is in the state
 
     def _clone_at(self, index: int) -> int:
-        """Returns where a clone begins in the error state."""
+        """Returns the index of a clone in the error state."""
         return IMU_SIZE + PLACE_SIZE * len(self._places) + CLONE_SIZE * index
 
     def _clone(self) -> None:
-        """Remembers the present pose, and that the image shows it as it was predicted."""
+        """Adds the current pose to the state. The image shows the predicted pose."""
         self._keys += 1
         rotation, p_m = self._motion.rotation, self._motion.p_m
         self._clones.append(Clone(self._keys, rotation, p_m, rotation, p_m))
@@ -349,7 +351,7 @@ class InertialOdometry(Odometry):
         self._covariance = self._covariance[np.ix_(which, which)]
 
     def _place(self, names: list[Name]) -> None:
-        """Takes the places of corners into the state."""
+        """Adds positions of corners to the state."""
         if not names:
             return
         rays = self._rays(names)
@@ -359,7 +361,7 @@ class InertialOdometry(Odometry):
         added, by_error, own = [], [np.eye(size)], []
         for n in np.flatnonzero(np.isfinite(places_m).all(axis=1) & (off < HUBER)):
             count = int(rays.seen[n].sum())
-            # Least squares: how the place follows from what the rays are off by, and from what the clones are off by.
+            # Least squares: derivatives of the position by the errors of the rays and of the clones.
             by_slopes = np.linalg.pinv(by_place[n, :count].reshape(-1, 3))
             by_error.append(-by_slopes @ by_state[n, :count].reshape(-1, size))
             own.append(rays.sigma[n] ** 2 * by_slopes @ by_slopes.T)
@@ -369,13 +371,13 @@ class InertialOdometry(Odometry):
         for k, square in enumerate(own):
             at = slice(size + PLACE_SIZE * k, size + PLACE_SIZE * (k + 1))
             covariance[at, at] += square
-        # Places come before clones.
+        # Positions come before clones.
         at_clones = self._clone_at(0)
         order = np.r_[0:at_clones, size : len(covariance), at_clones:size]
         self._covariance = covariance[np.ix_(order, order)]
         self._places += added
 
-    # --- what corners say
+    # --- measurements of corners
 
     def _rays(self, names: list[Name]) -> Rays:
         """Returns the sights of corners."""
@@ -396,8 +398,8 @@ class InertialOdometry(Odometry):
         return Rays(seen, clone, slopes, body_from_cam, camera_m, sigma)
 
     def _meet(self, rays: Rays) -> tuple[F64, F64, F64]:
-        """Returns where rays meet (M, 3), NaN if nowhere [m, odom]; their residuals (M, N, 2); how many sigmas those
-        are (M,)."""
+        """Returns intersections of rays (M, 3), NaN if there is none [m, odom]; residuals (M, N, 2); residuals in
+        sigmas (M,)."""
         rotations = np.array([one.rotation for one in self._clones])[rays.clone]
         bodies_m = np.array([one.p_m for one in self._clones])[rays.clone]
         from_m = bodies_m + (rotations @ rays.camera_m)[..., 0]
@@ -408,7 +410,7 @@ class InertialOdometry(Odometry):
         return places_m, residual, off
 
     def _slopes_by(self, rays: Rays, places_m: F64) -> tuple[F64, F64]:
-        """Returns how residuals change with the error state (M, N, 2, S), and with the corner's place (M, N, 2, 3)."""
+        """Returns derivatives of residuals by the error state (M, N, 2, S) and the corner's position (M, N, 2, 3)."""
         rotations = np.array([one.first_rotation for one in self._clones])[rays.clone]
         bodies_m = np.array([one.first_m for one in self._clones])[rays.clone]
         from_m = bodies_m + (rotations @ rays.camera_m)[..., 0]
@@ -422,21 +424,21 @@ class InertialOdometry(Odometry):
         return by_state, by_place
 
     def _use(self, names: list[Name], looks: dict[Name, F64]) -> None:
-        """Corrects the state by corners that are complete, and by where those are seen now whose places it has."""
+        """Updates the state with complete corners, and with the current sights of corners in the state."""
         size = len(self._covariance)
         information, vector = np.zeros((size, size)), np.zeros(size)
         names = [name for name in names if len(self._sights[name]) >= FEWEST_SEEN]
         if names:
             self._take_rays(self._rays(names), information, vector)
         lost = self._take_looks(looks, information, vector)
-        # The Kalman filter's update in its information form: the measurements are many, the state is small.
+        # Kalman update in information form, because there are many measurements and a small state.
         covariance = self._covariance @ np.linalg.inv(np.eye(size) + information @ self._covariance)
         self._covariance = (covariance + covariance.T) / 2
         self._change(self._covariance @ vector)
         self._forget_places(lost)
 
     def _take_rays(self, rays: Rays, information: F64, vector: F64) -> None:
-        """Adds what rays say that meet somewhere, wherever that is."""
+        """Adds the constraints of rays that intersect, independent of the corner's position."""
         places_m, residual, off = self._meet(rays)
         weight = np.minimum(1.0, HUBER / np.maximum(off, 1e-9)) / rays.sigma**2
         by_state, by_place = self._slopes_by(rays, places_m)
@@ -444,10 +446,10 @@ class InertialOdometry(Odometry):
             count = int(rays.seen[n].sum())
             slope = by_state[n, :count].reshape(-1, len(vector))
             own, lack = by_place[n, :count].reshape(-1, 3), -residual[n, :count].reshape(-1)
-            # What is left of the rows when the corner's own place is free.
+            # Project out the corner's position.
             left = np.linalg.qr(own, mode="complete")[0][:, 3:].T
             rows, lack = left @ slope, left @ lack
-            # What the state makes most unlikely is not of a place that stands still (Mahalanobis' distance).
+            # Reject very unlikely measurements, which are of moving objects (Mahalanobis distance).
             expected = rows @ self._covariance @ rows.T + np.eye(len(rows)) / weight[n]
             if lack @ np.linalg.solve(expected, lack) > chi_square(len(rows)):
                 continue
@@ -455,7 +457,7 @@ class InertialOdometry(Odometry):
             vector += weight[n] * rows.T @ lack
 
     def _take_looks(self, looks: dict[Name, F64], information: F64, vector: F64) -> set[Name]:
-        """Adds where corners with a place are seen now; returns those that are too far from there."""
+        """Adds the current sights of corners in the state. Returns corners with too large residuals."""
         clone, at_clone = self._clones[-1], self._clone_at(len(self._clones) - 1)
         there = np.ones((1, 1), bool)
         lost = set()
@@ -484,7 +486,7 @@ class InertialOdometry(Odometry):
         return lost
 
     def _change(self, change: F64) -> None:
-        """Corrects all that is in the state."""
+        """Applies a correction to the complete state."""
         motion = self._motion
         self._motion = motion._replace(
             rotation=motion.rotation @ exp_so3(change[TURN]),
@@ -503,7 +505,7 @@ class InertialOdometry(Odometry):
 
 
 class Inertial(OdometryPlugin):
-    """Visual-inertial odometry: flies square, spiral or lemniscate without depth, or runs over a data set."""
+    """Visual-inertial odometry: flies square, spiral or lemniscate without depth, or runs on a data set."""
 
     make_estimator = InertialOdometry
 

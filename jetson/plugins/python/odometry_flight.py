@@ -1,5 +1,5 @@
-"""What both visual odometries share: their start, the paths of their projects, flight along them, a data set in a
-flight's place.
+"""Common parts of both visual odometry plugins: start, paths of the projects, flight along them, and data sets instead
+of a flight.
 
 ::
 
@@ -7,8 +7,8 @@ flight's place.
                                                   Odometry.now    -> Follower -> Setpoint.velocity
     data set: vizflyt export FLIGHT.mcap --format euroc -o DIR;  rgbd_odometry.py --dataset DIR -o estimate.tum
 
-The frame `odom` begins where the vehicle stands before take-off, with its nose along x and z up. What steers the
-vehicle is its own estimate alone: courses with a path withhold the pose.
+The origin of the frame `odom` is the vehicle's position before take-off, with x along the nose and z up. The plugin
+steers only by its own estimate, because courses with a path withhold the pose.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from vizflyt import Setpoint
 
 F64 = npt.NDArray[np.float64]
 
-# Of the vehicle along its path. [m/s]
+# Speed along the path. [m/s]
 SPEED_MPS = 0.8
-# How fast that is reached, and left before corners and the end. [m/s^2]
+# Acceleration, and deceleration before corners and the end. [m/s^2]
 RAMP_MPS2 = 0.8
-# Velocity towards the path per distance from it. [1/s]
+# Gain of the velocity towards the path. [1/s]
 TOWARDS_PER_S = 1.2
-# What is asked for is flown so much later. [s]
+# Delay until a setpoint is flown. [s]
 LAG_S = 0.3
-# The path's reference waits for a vehicle that is farther from it. [m]
+# The path's reference waits if the vehicle is further away. [m]
 WAIT_M = 0.4
-# Beyond its end the path goes straight on, so that the last gate is passed. [m]
+# Straight extension at the path's end, so that the last gate is passed. [m]
 BEYOND_M = 0.3
-# If the finish does not come within this time at the end, the vehicle lands. [s]
+# Timeout for the finish after the end of the path; then the vehicle lands. [s]
 PATIENCE_S = 5.0
-# A corner sharper than this is taken slowly. [rad]
+# Corners sharper than this are flown slowly. [rad]
 CORNER_RAD = 0.5
 CORNER_MPS = 0.25
 
 
 class Imu(NamedTuple):
-    """One reading of accelerometer and gyroscope."""
+    """One sample of accelerometer and gyroscope."""
 
     at_s: float
     accel_mps2: F64
@@ -60,26 +60,26 @@ class Imu(NamedTuple):
 
 
 class View(NamedTuple):
-    """One camera's image, and how the camera is mounted."""
+    """Image of one camera, and the pose of the camera on the body."""
 
     camera: str
     at_ns: int
-    """The instant that it shows. [ns]"""
+    """Instant that the image shows. [ns]"""
     grey: npt.NDArray[np.uint8]
-    """Shape (H, W), its contrast evened out."""
+    """Shape (H, W), with normalized contrast."""
     depth_m: npt.NDArray[np.float32] | None
-    """Along the optical axis, shape (H, W); 0 is no return. [m, cam]"""
+    """Along the optical axis, shape (H, W); 0 means no return. [m, cam]"""
     focal_px: F64
     """Focal lengths along x and y. [px]"""
     center_px: F64
-    """Principal point, as OpenCV counts: the centre of the first pixel is 0. [px]"""
+    """Principal point in OpenCV's convention: the centre of the first pixel is 0. [px]"""
     body_from_cam: F64
     """Rotation, shape (3, 3)."""
     camera_m: F64
-    """Where the camera sits. [m, body]"""
+    """Position of the camera. [m, body]"""
 
     def project(self, p_cam_m: F64) -> F64:
-        """Returns the pixels (N, 2) of points (N, 3) before the camera. [px]"""
+        """Returns the pixels (N, 2) of points (N, 3) in front of the camera. [px]"""
         return p_cam_m[:, :2] / p_cam_m[:, 2:] * self.focal_px + self.center_px
 
     def slopes(self, px: F64) -> F64:
@@ -88,7 +88,7 @@ class View(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Where the body is in the frame `odom`."""
+    """Pose and velocity of the body in the frame `odom`."""
 
     at_ns: int
     p_m: F64
@@ -117,7 +117,7 @@ def exp_so3(turn_rad: F64) -> F64:
 
 
 def quaternion_xyzw(rotation: F64) -> F64:
-    """Returns the unit quaternion of a rotation matrix, by its greatest element (S. Shepperd, J. Guidance and Control
+    """Returns the unit quaternion of a rotation matrix, from its largest element (S. Shepperd, J. Guidance and Control
     1(3), 1978)."""
     trace = float(np.trace(rotation))
     squares = np.array([*(1 - trace + 2 * np.diag(rotation)), 1 + trace]) / 4
@@ -142,27 +142,27 @@ def level_from_body(accel_mps2: F64) -> F64:
     return np.stack([np.cross(left, up), left, up])
 
 
-# --- from images and readings to estimates
+# --- from images and samples to estimates
 
-# It has left the ground when a tenth of a second's mean force or turn differs by so much. [m/s^2], [rad/s]
+# The vehicle has lifted off when the mean of 0.1 s differs by this much. [m/s^2], [rad/s]
 LIFT_MPS2, LIFT_RADPS = 0.4, 0.15
 LIFT_READINGS, FEWEST_STANDING, MOST_STANDING = 10, 30, 1000
-# An odometry begins so long before that was noticed. [s]
+# Odometry begins at this time before the lift-off was detected. [s]
 BEFORE_LIFT_S = 0.3
 
 
 class Standing(NamedTuple):
-    """What the IMU's readings are on the ground."""
+    """Mean IMU samples on the ground."""
 
     until_s: float
     accel_mps2: F64
     """Mean specific force, shape (3,). [m/s^2, body]"""
     gyro_bias: F64
-    """Mean of the gyroscope, which is what it is off by, shape (3,). [rad/s, body]"""
+    """Mean of the gyroscope at rest, which is its bias, shape (3,). [rad/s, body]"""
 
 
 def stood(readings: Sequence[Imu]) -> Standing | None:
-    """Returns how it stood before it left the ground; None while it stands."""
+    """Returns the means at rest before lift-off; None if the vehicle has not lifted off."""
     standing = len(readings) - LIFT_READINGS
     if standing < FEWEST_STANDING:
         return None
@@ -177,20 +177,20 @@ def stood(readings: Sequence[Imu]) -> Standing | None:
 
 
 class Odometry:
-    """What odometries have in common: readings and images in, estimates out, from when the vehicle leaves the ground.
+    """Base class of odometries: IMU samples and images in, estimates out, from lift-off on.
 
-    It must stand when it begins: there gravity is what the accelerometer feels, and the gyroscope's mean is its bias.
-    Each odometry has `begin`, `see` and `now`.
+    The vehicle must be at rest at the beginning, so that the accelerometer measures gravity and the gyroscope's mean
+    is its bias. Subclasses define `begin`, `see` and `now`.
     """
 
     def __init__(self) -> None:
         self.readings: list[Imu] = []
-        """From the last one before the newest estimate on."""
+        """Samples from the last one before the newest estimate."""
         self._pending: list[View] = []
         self._began = False
 
     def update(self, imu: Sequence[Imu], views: Sequence[View]) -> list[Estimate]:
-        """Takes what is new, each sorted by time; returns those of images up to which there are readings."""
+        """Adds new samples and images, sorted by time. Returns estimates of all images that the samples cover."""
         self.readings += imu
         self._pending += views
         if not self._began:
@@ -212,22 +212,22 @@ class Odometry:
         return estimates
 
     def begin(self, standing: Standing) -> None:
-        """Takes how it stood on the ground."""
+        """Starts with the means at rest."""
         raise NotImplementedError
 
     def see(self, at_ns: int, views: list[View]) -> Estimate:
-        """Returns the estimate of an instant, from its images and the readings until then."""
+        """Returns the estimate at an instant, from its images and the samples until then."""
         raise NotImplementedError
 
     def now(self) -> Estimate | None:
-        """Returns the estimate at the newest reading, for steering; None while it stands."""
+        """Returns the estimate at the newest sample, for steering; None before lift-off."""
         raise NotImplementedError
 
     def between(self, from_s: float, to_s: float) -> Iterator[tuple[float, F64, F64]]:
-        """Yields in steps from an instant to one up to which there are readings: how long the step is [s], and
-        accelerometer and gyroscope in its middle, between two readings. Forgets the readings before."""
+        """Yields steps from one instant to another that the samples cover: duration [s], and interpolated accelerometer
+        and gyroscope in the middle of the step. Removes earlier samples."""
         while from_s < to_s - 1e-9:
-            # The readings before and after where it is.
+            # The samples before and after the current instant.
             while len(self.readings) > 2 and self.readings[1].at_s <= from_s + 1e-9:
                 self.readings.pop(0)
             before, after = self.readings[:2]
@@ -245,12 +245,12 @@ class Odometry:
 
 
 class Tracks:
-    """Corners of one camera's images, followed from a key image to each later one.
+    """Corners of one camera's images, tracked from a key image to each later image.
 
-    Corners by J. Shi and C. Tomasi, "Good features to track" (CVPR 1994); followed by B. Lucas and T. Kanade's method
-    ("An iterative image registration technique", IJCAI 1981) in pyramids, there and back: what does not come back to
-    where it was is dropped. From image to image small errors would add up, so it is the key image that each is compared
-    with, until too few corners are left of it.
+    Corners by J. Shi and C. Tomasi, "Good features to track" (CVPR 1994). Tracking by B. Lucas and T. Kanade's method
+    ("An iterative image registration technique", IJCAI 1981) in pyramids, forwards and backwards; a corner that does
+    not return to its start is dropped. Tracking from image to image would accumulate small errors. Therefore each image
+    is compared with the key image, until too few of its corners are left.
     """
 
     def __init__(self, most: int = 120, apart_px: int = 14, renewed: float = 0.75):
@@ -263,7 +263,7 @@ class Tracks:
         self._fewest, self._next = 0.0, 0
 
     def follow(self, grey: npt.NDArray[np.uint8], guess_px: F64 | None = None) -> None:
-        """Finds the corners in the next image; `guess_px` (N, 2) is where they are likely to be. [px]"""
+        """Tracks the corners to the next image. `guess_px` (N, 2) are their predicted positions. [px]"""
         self._grey = grey
         if self._key is None or not len(self.ids):
             return
@@ -284,12 +284,12 @@ class Tracks:
         self.keep((found.ravel() == 1) & (found_back.ravel() == 1) & inside & same)
 
     def keep(self, which: npt.NDArray[np.bool_]) -> None:
-        """Drops all corners but these."""
+        """Keeps only these corners."""
         self.ids, self.px, self._key_px = self.ids[which], self.px[which], self._key_px[which]
 
     def add(self) -> int:
-        """Where too few are left, makes the present image the key image and looks for new corners where there are none;
-        returns how many were added, at the end."""
+        """If too few corners are left, makes the current image the key image and detects new corners in empty areas.
+        Returns the number of new corners, which are at the end."""
         if self._grey is None or len(self.ids) > self._fewest:
             return 0
         mask = np.full(self._grey.shape, 255, np.uint8)
@@ -308,20 +308,20 @@ class Tracks:
         return len(fresh)
 
 
-# What is finer than two pixels is not where it seems to be: rendered images alias, as those of sensors without an
-# optical low-pass do. Without the blur a flight of 10 m ahead was 1 to 4 % too long. [px]
+# Details finer than two pixels have position errors: rendered images alias, like images of sensors without an optical
+# low-pass filter. Without this blur, the estimate of a flight of 10 m was 1 to 4 % too long. [px]
 BLUR_PX = 1.5
 
 
-# Brightness is spread so that its standard deviation is this; one that is less than so many levels is spread less.
+# Target standard deviation of brightness, and lower limit of the measured one. [levels]
 SPREAD, LEAST_SPREAD = 50.0, 4.0
 
 
 def even_grey(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Returns brightness without its finest details, and with its contrast spread: fog and dusk leave little of it.
+    """Returns brightness without the finest details and with more contrast, because fog and dusk reduce it.
 
-    By one gain for the whole image. One that differs from place to place, as that of an adaptive equalization (CLAHE)
-    does, is a pattern that stays in the image while the world moves: corners were followed twice as badly by it.
+    Uses one gain for the complete image. A local gain, as in adaptive equalization (CLAHE), is a pattern that stays in
+    the image while the world moves: it doubled the tracking error.
     """
     grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), BLUR_PX)
     mean, spread = cv2.meanStdDev(grey)
@@ -333,9 +333,9 @@ def even_grey(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 
 def path_m(name: str) -> F64:
-    """Returns the path of a project, shape (N, 3), every 2 cm or so, from take-off at its height. [m, odom]
+    """Returns the path of a project, shape (N, 3), about every 2 cm, from take-off at its height. [m, odom]
 
-    Raises ValueError for a project that has none.
+    Raises ValueError for a project without a path.
     """
     s = np.linspace(0, 1, 801)
     if name == "square":
@@ -357,7 +357,7 @@ def path_m(name: str) -> F64:
 
 
 class Follower:
-    """Flies along a path: a reference goes ahead on it, and waits where the vehicle cannot follow."""
+    """Flies along a path: a reference point moves along the path, and waits if the vehicle cannot follow."""
 
     def __init__(self, points_m: F64):
         self._points_m = points_m
@@ -371,11 +371,11 @@ class Follower:
 
     @property
     def is_over(self) -> bool:
-        """Whether the reference is at the path's end."""
+        """Whether the reference point is at the path's end."""
         return self._at_m >= self._along_m[-1]
 
     def velocity(self, p_m: F64, dt_s: float) -> F64:
-        """Returns the velocity (3,) to fly with from a place, `dt_s` after the last call. [m/s, odom]"""
+        """Returns the velocity (3,) for a position, `dt_s` after the last call. [m/s, odom]"""
         reference_m = self._reference(self._at_m)
         if np.linalg.norm(reference_m - p_m) < WAIT_M:
             ahead_m = self._slow_m[self._slow_m > self._at_m] - self._at_m
@@ -386,7 +386,7 @@ class Follower:
         else:
             self._speed_mps = max(self._speed_mps - RAMP_MPS2 * dt_s, 0.0)
         next_m = self._reference(self._at_m)
-        # The velocity that is asked for now is flown a little later: farther along the path.
+        # The setpoint is flown after a delay, so use the direction further along the path.
         later_m = self._at_m + self._speed_mps * LAG_S
         before_m, after_m = self._reference(later_m - 0.02), self._reference(later_m + 0.02)
         ahead = (after_m - before_m) / max(float(np.linalg.norm(after_m - before_m)), 1e-9)
@@ -400,7 +400,7 @@ class Follower:
 
 
 class OdometryPlugin(vizflyt.Plugin):
-    """Flies the project's path by an estimator of its own, and publishes what that says of each image."""
+    """Flies the project's path with an estimator, and publishes its estimate of each image."""
 
     make_estimator: Callable[[], Odometry]
     needs_depth = False
@@ -429,7 +429,7 @@ class OdometryPlugin(vizflyt.Plugin):
         return self.steer(obs.stamp_ns)
 
     def steer(self, at_ns: int) -> Setpoint:
-        """Returns the setpoint: along the path by the estimate."""
+        """Returns the setpoint along the path, from the estimate."""
         now = self.estimator.now()
         dt_s = min(max(at_ns - self.last_ns, 0) * 1e-9, 0.1)
         self.last_ns = at_ns
@@ -438,10 +438,10 @@ class OdometryPlugin(vizflyt.Plugin):
         if self.follower.is_over:
             self.over_ns = self.over_ns or at_ns
             if at_ns - self.over_ns > PATIENCE_S * 1e9:
-                print("the end of the path is here, and no finish: landing")
+                print("end of the path without a finish: landing")
                 return Setpoint.land()
         v_odom_mps = self.follower.velocity(now.p_m, dt_s)
-        # Into the axes of the heading, as the estimate has it.
+        # Rotate to the axes of the estimated heading.
         x, y = now.rotation[0, 0], now.rotation[1, 0]
         length = math.hypot(x, y)
         ahead, left = np.array([x, y]) / length, np.array([-y, x]) / length
@@ -449,7 +449,7 @@ class OdometryPlugin(vizflyt.Plugin):
 
 
 def view_of(image: vizflyt.CameraImage, with_depth: bool) -> View:
-    """Returns a flight's image as estimators take it."""
+    """Converts an image of a flight to the estimator's input."""
     k, mount = image.intrinsics.opencv_matrix, image.body_from_cam
     return View(
         image.name,
@@ -467,14 +467,14 @@ def view_of(image: vizflyt.CameraImage, with_depth: bool) -> View:
 
 
 def data_set(folder: Path, with_depth: bool) -> Iterator[tuple[list[Imu], list[View]]]:
-    """Reads a folder that `vizflyt export --format euroc` wrote: yields, image instant by image instant, the IMU's
-    readings until then and the images.
+    """Reads a folder written by `vizflyt export --format euroc`. Yields for each image instant the IMU samples until
+    then and the images.
 
-    Raises ValueError if the folder lacks what is needed.
+    Raises ValueError if the folder is incomplete.
     """
     readings = folder / "mav0/imu0/data.csv"
     if not readings.exists() or not (folder / "images.csv").exists():
-        raise ValueError(f"{folder} lacks images.csv or mav0/imu0; write it by vizflyt export --format euroc")
+        raise ValueError(f"{folder} lacks images.csv or mav0/imu0; write it with vizflyt export --format euroc")
     numbers = np.loadtxt(readings, delimiter=",", skiprows=1, ndmin=2)
     stamps = np.loadtxt(readings, delimiter=",", skiprows=1, usecols=0, dtype=np.int64, ndmin=1)
     order = np.argsort(stamps, kind="stable")
@@ -517,8 +517,8 @@ def _view_of_row(folder: Path, row: dict[str, str], with_depth: bool) -> View:
 def main(plugin: type[OdometryPlugin]) -> None:
     """Flies the plugin, or runs its estimator over a data set: `--dataset DIR -o estimate.tum`."""
     parser = argparse.ArgumentParser(description=(plugin.__doc__ or "").splitlines()[0])
-    parser.add_argument("--dataset", type=Path, help="a folder by vizflyt export --format euroc; without it, fly")
-    parser.add_argument("-o", "--output", type=Path, default=Path("estimate.tum"), help="where the poses go (TUM)")
+    parser.add_argument("--dataset", type=Path, help="folder of vizflyt export --format euroc (default: fly)")
+    parser.add_argument("-o", "--output", type=Path, default=Path("estimate.tum"), help="output file (TUM poses)")
     arguments, _ = parser.parse_known_args()
     if arguments.dataset is None:
         vizflyt.run(plugin)

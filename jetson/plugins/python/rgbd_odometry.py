@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Flies square, spiral or lemniscate by RGB-D visual odometry.
+"""Flies square, spiral or lemniscate with RGB-D visual odometry.
 
-Corners are followed from image to image; each got its place in the frame `odom` from its depth when it was first seen.
-The body's pose is the one from which all of them, of all cameras together, are seen where they are: perspective-n-point
-with depth, by Gauss-Newton and Huber's weights (compare D. Nister, O. Naroditsky and J. Bergen, "Visual odometry", CVPR
-2004; R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed., section 7; P. Huber, Ann. Math. Statist. 35(1),
-1964). The accelerometer says before take-off where up is, and the gyroscope how the vehicle turns: the errors that
-corners have in common would else turn the pose, in fog by degrees.
+Corners are tracked from image to image. The depth at its first sighting gives each corner a position in the frame
+`odom`. The pose of the body minimizes the reprojection error of all corners of all cameras: perspective-n-point with
+depth, by Gauss-Newton with Huber weights (compare D. Nister, O. Naroditsky and J. Bergen, "Visual odometry", CVPR 2004;
+R. Hartley and A. Zisserman, "Multiple view geometry", 2nd ed., section 7; P. Huber, Ann. Math. Statist. 35(1), 1964).
+Before take-off, the accelerometer gives the direction of gravity. The gyroscope gives the rotation: otherwise common
+errors of the corners would rotate the pose, in fog by degrees.
 
 Fly:       vizflyt demo --project square --plugin jetson/plugins/python/rgbd_odometry.py
 Data set:  rgbd_odometry.py --dataset DIR -o estimate.tum
@@ -32,27 +32,26 @@ from odometry_flight import (
     skew,
 )
 
-# How far a followed corner is off in an image. [px]
+# Standard deviation of a tracked corner. [px]
 SIGMA_PX = 0.5
-# How far depth is off: a share of it, and a constant. [1], [m]
+# Standard deviation of depth: a fraction of it, and a constant. [1], [m]
 SIGMA_DEPTH, SIGMA_DEPTH_M = 0.001, 0.004
-# Residuals count less beyond this many sigmas, and corners beyond so many are dropped.
+# Residuals beyond HUBER sigmas get a lower weight; corners beyond DROPPED sigmas are dropped.
 HUBER, DROPPED = 0.7, 5.0
 ROUNDS = 10
-# Of corners that are placed in the frame. [m, cam]
+# Range of new corners. [m, cam]
 NEAREST_M, FARTHEST_M = 0.15, 15.0
-# Where depth differs by more than this share within two pixels is an edge.
+# Depths that differ by more than this fraction within two pixels are an edge.
 EDGE = 0.04
-# A pose stands on at least so many corners.
+# Minimum number of corners for a pose.
 FEWEST = 8
-# From one image to the next: how far the gyroscope's turn is off, and the place that the motion so far predicts.
-# Corners' errors go together, so what a hundred of them say of a turn is worth less than if they erred by chance.
-# [rad], [m]
+# Standard deviations of the gyroscope's rotation and of the predicted motion between two images. Errors of corners are
+# correlated, so 100 corners constrain a rotation less than with independent errors. [rad], [m]
 SIGMA_TURN_RAD, SIGMA_MOVE_M = 0.0001, 0.05
 
 
 class RgbdOdometry(Odometry):
-    """Where the body is, from images with depth and the gyroscope."""
+    """Pose of the body, from images with depth and the gyroscope."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -63,12 +62,12 @@ class RgbdOdometry(Odometry):
         self._at_s = 0.0
 
     def begin(self, standing: Standing) -> None:
-        """Begins at rest."""
+        """Starts at rest."""
         self._rotation, self._gyro_bias = level_from_body(standing.accel_mps2), standing.gyro_bias
         self._at_s = standing.until_s
 
     def now(self) -> Estimate | None:
-        """Returns the newest image's estimate as it goes on, for steering; None while it stands."""
+        """Returns the newest image's estimate, extrapolated for steering; None before lift-off."""
         if self._rotation is None:
             return None
         rotation, at_s = self._rotation, self._at_s
@@ -79,9 +78,9 @@ class RgbdOdometry(Odometry):
         return Estimate(round(at_s * 1e9), self._p_m + self._v_mps * (at_s - self._at_s), rotation, self._v_mps)
 
     def see(self, at_ns: int, views: list[View]) -> Estimate:
-        """Returns the estimate of an instant, from its images and the readings until then."""
+        """Returns the estimate at an instant, from its images and the samples until then."""
         dt_s = at_ns * 1e-9 - self._at_s
-        # It turns as the gyroscope says, and is as fast as until now.
+        # Prediction: rotation from the gyroscope, constant velocity.
         rotation, p_m = self._rotation, self._p_m + self._v_mps * dt_s
         for step_s, _, gyro_radps in self.between(self._at_s, at_ns * 1e-9):
             rotation = rotation @ exp_so3((gyro_radps - self._gyro_bias) * step_s)
@@ -98,7 +97,7 @@ class RgbdOdometry(Odometry):
             self._cameras[view.camera] = (tracks, places_m)
             seen.append((view, tracks.px, places_m, depth_at(view.depth_m, tracks.px)[0]))
         rotation, p_m, offs = solve_pose(rotation, p_m, seen)
-        # The velocity is a little smoothed, as it only predicts.
+        # Smoothed a little, because the velocity is only used for prediction.
         self._v_mps = 0.5 * self._v_mps + 0.5 * (p_m - self._p_m) / dt_s
         self._rotation, self._p_m, self._at_s = rotation, p_m, at_ns * 1e-9
         for (view, *_), off in zip(seen, offs):
@@ -106,7 +105,7 @@ class RgbdOdometry(Odometry):
         return Estimate(at_ns, p_m, rotation, self._v_mps)
 
     def _renew(self, view: View, off: F64) -> None:
-        """Drops corners that do not fit, and places new ones."""
+        """Drops corners with large residuals, and adds new ones."""
         tracks, places_m = self._cameras[view.camera]
         good = off < DROPPED
         tracks.keep(good)
@@ -129,8 +128,8 @@ def small_turn(rotation: F64) -> F64:
 
 
 def depth_at(depth_m: npt.NDArray[np.float32] | None, px: F64) -> tuple[F64, npt.NDArray[np.bool_]]:
-    """Returns the depth (N,) at pixels (N, 2), between four pixels, and whether the surface is smooth there; 0 and
-    False where there is no return. [m, cam]"""
+    """Returns the interpolated depth (N,) at pixels (N, 2), and whether the surface is smooth there; 0 and False
+    without a return. [m, cam]"""
     if depth_m is None:
         return np.zeros(len(px)), np.zeros(len(px), bool)
     height, width = depth_m.shape
@@ -148,10 +147,10 @@ def depth_at(depth_m: npt.NDArray[np.float32] | None, px: F64) -> tuple[F64, npt
 def solve_pose(
     rotation: F64, p_m: F64, seen: Sequence[tuple[View, F64, F64, F64]]
 ) -> tuple[F64, F64, list[F64]]:
-    """Returns the pose of the body from which places are seen where they are, from a first guess; and how many sigmas
-    each is off.
+    """Returns the pose of the body that fits the observed corners best, from a first guess, and the residual of each
+    corner in sigmas.
 
-    `seen` has for each camera its view, pixels (N, 2), places (N, 3) [m, odom] and depths (N,), 0 where unknown [m].
+    `seen` has for each camera its view, pixels (N, 2), positions (N, 3) [m, odom] and depths (N,), 0 if unknown [m].
     """
     if sum(len(px) for _, px, _, _ in seen) < FEWEST:
         return rotation, p_m, [np.zeros(len(px)) for _, px, _, _ in seen]
@@ -167,7 +166,7 @@ def solve_pose(
             in_body_m = (places_m - p_m) @ rotation
             in_cam_m = (in_body_m - view.camera_m) @ view.body_from_cam
             z_m = np.maximum(in_cam_m[:, 2], 0.05)
-            # Slopes and depth by the place in the camera, and that by turn (of the body) and place.
+            # Derivatives of pixel and depth by the position in the camera, then by rotation and position of the body.
             residual = np.empty((len(px), 3))
             residual[:, :2] = (view.project(np.column_stack([in_cam_m[:, :2], z_m])) - px) / SIGMA_PX
             sigma_m = SIGMA_DEPTH_M + SIGMA_DEPTH * z_m
@@ -194,7 +193,7 @@ def solve_pose(
 
 
 class Rgbd(OdometryPlugin):
-    """RGB-D visual odometry: flies square, spiral or lemniscate, or runs over a data set."""
+    """RGB-D visual odometry: flies square, spiral or lemniscate, or runs on a data set."""
 
     make_estimator = RgbdOdometry
     needs_depth = True

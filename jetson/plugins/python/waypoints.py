@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Flies a square around the place where it took off, looking where it flies, and lands.
+"""Flies a square around the take-off position with the nose in flight direction, and lands.
 
-It needs the vehicle's pose (the course's ground truth, or your own odometry in its place).
+It needs the vehicle's pose (the course's ground truth, or your own odometry instead).
 """
 
 import numpy as np
@@ -9,10 +9,10 @@ import numpy as np
 import vizflyt
 from vizflyt import Setpoint
 
-# Corners from the start, forward and left of where the nose pointed. [m]
+# Corners relative to the start: forward and left of the nose. [m]
 CORNERS_M = [(1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)]
 SPEED_MPS = 0.8
-# Near enough to a corner to count it. The path stops at its end only. [m]
+# Distance at which a corner counts as reached. The path stops only at its end. [m]
 REACHED_M = 0.25
 
 
@@ -30,14 +30,14 @@ class Waypoints(vizflyt.Plugin):
         if not self.flying or vehicle is None:
             return Setpoint.hold()
         if vehicle.p_world_m is None:
-            # Nothing to steer by: the guard holds, then lands.
+            # Without a pose: the guard holds, then lands.
             return None
         here_m = vehicle.p_world_m
         if self.corners_m is None:
             ahead = np.array([np.cos(vehicle.yaw_rad), np.sin(vehicle.yaw_rad), 0.0])
             left = np.array([-ahead[1], ahead[0], 0.0])
             self.corners_m = [here_m + x * ahead + y * left for x, y in CORNERS_M]
-            # The runtime follows the path by itself; None, below, lets it go on.
+            # The runtime follows the path. Returning None below continues it.
             return Setpoint.waypoints(self.corners_m, SPEED_MPS)
         if np.linalg.norm(self.corners_m[0] - here_m) < REACHED_M:
             print("reached", np.round(self.corners_m[0], 2))

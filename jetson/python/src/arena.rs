@@ -1,4 +1,4 @@
-//! What a plugin flies in.
+//! Description of the arena: `ArenaInfo`, cameras and limits.
 
 use numpy::PyArray1;
 use pyo3::exceptions::PyValueError;
@@ -19,8 +19,8 @@ use crate::sensor::SensorInfo;
 
 /// One camera of the vehicle.
 ///
-/// `CameraInfo(name, intrinsics, body_from_cam=None)` makes one, for tests; without a mounting it looks
-/// along the nose.
+/// `CameraInfo(name, intrinsics, body_from_cam=None)` creates one for tests. Without `body_from_cam` it looks
+/// forward.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct CameraInfo(pub(crate) SdkCameraInfo);
@@ -37,7 +37,7 @@ impl CameraInfo {
         Ok(Self(SdkCameraInfo { name: bounded(name), intrinsics: intrinsics.0, body_from_cam }))
     }
 
-    /// What `obs.camera(name)` calls it.
+    /// Name of the camera, the argument of `obs.camera(name)`.
     #[getter]
     fn name(&self) -> &str {
         &self.0.name
@@ -49,7 +49,7 @@ impl CameraInfo {
         Intrinsics(self.0.intrinsics)
     }
 
-    /// How it is mounted.
+    /// Pose of the camera on the body.
     #[getter]
     fn body_from_cam(&self) -> Pose {
         Pose::new("body", "cam", &self.0.body_from_cam)
@@ -61,7 +61,7 @@ impl CameraInfo {
     }
 }
 
-/// Limits that the guard enforces whatever a plugin asks.
+/// Limits that the guard enforces on every setpoint.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct Limits(SdkLimits);
@@ -81,25 +81,25 @@ impl Limits {
         Self(SdkLimits { max_speed_mps, max_acceleration_mps2, max_tilt_deg, max_altitude_m })
     }
 
-    /// Greatest speed. [m/s]
+    /// Maximum speed. [m/s]
     #[getter]
     fn max_speed_mps(&self) -> f64 {
         self.0.max_speed_mps
     }
 
-    /// Greatest acceleration; also what the guard counts on for stopping. [m/s^2]
+    /// Maximum acceleration; the guard also assumes it for stopping. [m/s^2]
     #[getter]
     fn max_acceleration_mps2(&self) -> f64 {
         self.0.max_acceleration_mps2
     }
 
-    /// Greatest tilt from level; None if the acceleration alone limits it. [deg]
+    /// Maximum tilt from level; None if only the acceleration limits it. [deg]
     #[getter]
     fn max_tilt_deg(&self) -> Option<f64> {
         self.0.max_tilt_deg
     }
 
-    /// Greatest height of the body's centre; None if the geofence alone limits it. [m, world]
+    /// Maximum height of the body's centre; None if only the geofence limits it. [m, world]
     #[getter]
     fn max_altitude_m(&self) -> Option<f64> {
         self.0.max_altitude_m
@@ -110,9 +110,9 @@ impl Limits {
     }
 }
 
-/// What a plugin must know of the arena it flies in.
+/// Description of the arena in which the plugin flies.
 ///
-/// `ArenaInfo(goal_m=[5, 0, 1], ...)` makes one, for tests; every keyword has a default.
+/// `ArenaInfo(goal_m=[5, 0, 1], ...)` creates one for tests; every keyword has a default.
 #[pyclass(frozen, module = "vizflyt")]
 #[derive(Clone, PartialEq)]
 pub(crate) struct ArenaInfo(pub(crate) SdkArenaInfo);
@@ -125,7 +125,7 @@ impl ArenaInfo {
         goal_m = None, goal_radius_m = 1.0, time_limit_s = 0.0, start_box = None, ground_truth = true,
         attitude_rate = false, setpoints = None, cameras = Vec::new(), sensors = Vec::new()
     ))]
-    #[allow(clippy::too_many_arguments)] // Why: keywords, all of them.
+    #[allow(clippy::too_many_arguments)] // Why: all are Python keywords.
     fn make(
         name: &str,
         geofence: Option<Volume>,
@@ -165,7 +165,7 @@ impl ArenaInfo {
         }
         if sensors.len() > MAX_SENSORS {
             return Err(PyValueError::new_err(format!(
-                "a vehicle has at most {MAX_SENSORS} sensors beside its cameras, not {}",
+                "a vehicle has at most {MAX_SENSORS} sensors in addition to its cameras, not {}",
                 sensors.len()
             )));
         }
@@ -191,19 +191,19 @@ impl ArenaInfo {
         }))
     }
 
-    /// The arena's name.
+    /// Name of the arena.
     #[getter]
     fn name(&self) -> &str {
         &self.0.name
     }
 
-    /// Keep-in volume of the body's surface. [world]
+    /// Volume in which the body's surface must stay. [world]
     #[getter]
     fn geofence(&self) -> Volume {
         Volume(self.0.geofence)
     }
 
-    /// Keep-out volumes of the body's surface. [world]
+    /// Volumes that the body's surface must not enter. [world]
     #[getter]
     fn no_fly(&self) -> Vec<Volume> {
         self.0.no_fly.iter().copied().map(Volume).collect()
@@ -227,62 +227,62 @@ impl ArenaInfo {
         self.0.body_radius_m
     }
 
-    /// Height above the start to which the runtime climbs before the plugin flies. [m]
+    /// Height above the start to which the runtime climbs before the plugin gets control. [m]
     #[getter]
     fn takeoff_height_m(&self) -> f64 {
         self.0.takeoff_height_m
     }
 
-    /// Where the flight shall end: shape (3,), float64; None if the course has no goal. [m, world]
+    /// Goal of the flight: shape (3,), float64; None if the course has no goal. [m, world]
     #[getter]
     fn goal_m<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
         self.0.goal_m.map(|goal_m| array3(py, goal_m))
     }
 
-    /// How near counts as reached. [m]
+    /// Distance at which the goal counts as reached. [m]
     #[getter]
     fn goal_radius_m(&self) -> f64 {
         self.0.goal_radius_m
     }
 
-    /// From take-off; 0 is none. [s]
+    /// Time limit from take-off; 0 means no limit. [s]
     #[getter]
     fn time_limit_s(&self) -> f64 {
         self.0.time_limit_s
     }
 
-    /// Where a flight begins; None if anywhere. [world]
+    /// Box in which a flight begins; None if anywhere. [world]
     #[getter]
     fn start_box(&self) -> Option<Volume> {
         self.0.start_box.map(Volume)
     }
 
-    /// Whether the plugin gets the vehicle's pose and velocity.
+    /// Whether the plugin receives the vehicle's pose and velocity.
     #[getter]
     fn ground_truth(&self) -> bool {
         self.0.ground_truth
     }
 
-    /// Whether the plugin may ask for `Setpoint.attitude_rate`.
+    /// Whether `Setpoint.attitude_rate` is allowed.
     #[getter]
     fn attitude_rate(&self) -> bool {
         self.0.setpoints.contains(SetpointKind::AttitudeRate)
     }
 
-    /// Kinds of setpoint that the plugin may ask for, of 'position', 'velocity', 'acceleration',
-    /// 'offset', 'attitude_rate' and 'trajectory'; hold, land and take_off it always may.
+    /// Allowed kinds of setpoint, of 'position', 'velocity', 'acceleration', 'offset', 'attitude_rate' and
+    /// 'trajectory'. hold, land and take_off are always allowed.
     #[getter]
     fn setpoints(&self) -> Vec<&'static str> {
         self.0.setpoints.iter().map(SetpointKind::name).collect()
     }
 
-    /// The vehicle's cameras.
+    /// Cameras of the vehicle.
     #[getter]
     fn cameras(&self) -> Vec<CameraInfo> {
         self.0.cameras.iter().cloned().map(CameraInfo).collect()
     }
 
-    /// The vehicle's sensors beside the cameras.
+    /// Sensors of the vehicle other than cameras.
     #[getter]
     fn sensors(&self) -> Vec<SensorInfo> {
         self.0.sensors.iter().cloned().map(SensorInfo).collect()
@@ -298,21 +298,20 @@ impl ArenaInfo {
     }
 }
 
-/// Returns every obstacle of the course, where its map is known; None where it is not. [world]
+/// Returns every obstacle of the course, or None if the course does not give the map. [world]
 ///
-/// # Errors
-/// `ValueError` for a map that cannot be read.
+/// Raises ValueError if the map cannot be read.
 #[pyfunction]
 pub(crate) fn course_map() -> PyResult<Option<Vec<Volume>>> {
     let map = vizflyt_sdk::map().map_err(|error| PyValueError::new_err(error.to_string()))?;
     Ok(map.map(|volumes| volumes.into_iter().map(Volume).collect()))
 }
 
-/// Returns the kind of setpoint of a name.
+/// Returns the kind of setpoint with this name.
 fn kind(name: &str) -> PyResult<SetpointKind> {
     let known = SetpointKind::ALL.into_iter().find(|kind| kind.name() == name);
     known.ok_or_else(|| {
         let all = SetpointKinds::ALL;
-        PyValueError::new_err(format!("{name:?} is no kind of setpoint; there are: {all}"))
+        PyValueError::new_err(format!("unknown kind of setpoint {name:?}; known kinds: {all}"))
     })
 }

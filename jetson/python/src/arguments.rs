@@ -1,5 +1,5 @@
-//! Arguments from Python: whatever converts to numbers is taken, and what does not is reported in one
-//! sentence that names it.
+//! Arguments from Python: accepts all values that convert to numbers, and reports others in one sentence with
+//! their name.
 
 use numpy::{AllowTypeChange, PyArray1, PyArrayDyn, PyArrayLikeDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -10,8 +10,8 @@ pyo3::create_exception!(
     vizflyt,
     NotFiniteError,
     PyValueError,
-    "A NaN or an infinity where a number must be finite. Out of `on_image` it counts as an answer that the\n\
-     runtime refuses: the vehicle holds after 0.5 s and lands after 2 s without a better one."
+    "A NaN or an infinity where a number must be finite. Raised by `on_image`, it counts as a reply that the\n\
+     runtime rejects: the vehicle holds after 0.5 s and lands after 2 s without a valid one."
 );
 
 /// Returns three finite numbers from a list, tuple, array or tensor called `name`.
@@ -46,9 +46,8 @@ pub(crate) fn quaternion(value: &Bound<'_, PyAny>, name: &str) -> PyResult<DQuat
     Ok(rotation.normalize())
 }
 
-/// One point or many, and a way to answer in the same form.
+/// One point or many points, with results in the same form.
 pub(crate) struct Points {
-    /// The points.
     pub(crate) points: Vec<DVec3>,
     single: bool,
 }
@@ -67,7 +66,7 @@ impl Points {
         Ok(Self { points: flat.chunks_exact(3).map(DVec3::from_slice).collect(), single })
     }
 
-    /// Whether it was one point, not an array of one.
+    /// Returns whether the input was a single point, not an array of one.
     pub(crate) fn is_single(&self) -> bool {
         self.single
     }
@@ -119,14 +118,14 @@ pub(crate) fn scalar(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyRe
     if number.is_finite() { Ok(number) } else { Err(not_finite(name, &[number])) }
 }
 
-/// Returns the numbers in a value called `name`, whatever their shape.
+/// Returns the numbers of a value called `name`, of any shape.
 pub(crate) fn numbers<'py>(
     value: &Bound<'py, PyAny>,
     name: &str,
     wanted: &str,
 ) -> PyResult<PyArrayLikeDyn<'py, f64, AllowTypeChange>> {
     if value.is_none() {
-        // Which numpy takes for NaN.
+        // numpy would convert None to NaN.
         return Err(wrong_type(value, name, wanted));
     }
     value.extract().map_err(|error: PyErr| {
@@ -136,12 +135,12 @@ pub(crate) fn numbers<'py>(
     })
 }
 
-/// Returns the error for an argument of a type that cannot be used.
+/// Returns the error for an argument of an unsupported type.
 pub(crate) fn wrong_type(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyErr {
     PyTypeError::new_err(format!("{name} must be {wanted}, not {}", describe(value)))
 }
 
-/// Returns the error for an array of a shape that cannot be used.
+/// Returns the error for an array of an unsupported shape.
 pub(crate) fn wrong_shape(value: &Bound<'_, PyAny>, name: &str, wanted: &str) -> PyErr {
     PyValueError::new_err(format!("{name} must be {wanted}, not {}", describe(value)))
 }
@@ -150,11 +149,11 @@ fn not_finite(name: &str, numbers: &[f64]) -> PyErr {
     let shown = if let [number] = numbers { format!("{number}") } else { format!("{numbers:?}") };
     NotFiniteError::new_err(format!(
         "{name} is {shown}: every number must be finite; look for a division by zero or the mean of \
-         nothing"
+         an empty array"
     ))
 }
 
-/// Returns what a value is, for a sentence: `a numpy.ndarray of shape (2,) and dtype int64`.
+/// Describes a value for an error message: `a numpy.ndarray of shape (2,) and dtype int64`.
 pub(crate) fn describe(value: &Bound<'_, PyAny>) -> String {
     let class = value.get_type();
     if value.is_none() {

@@ -1,4 +1,4 @@
-//! Observations made by hand: for a plugin's own tests and for notebooks.
+//! Observations created by hand, for a plugin's own tests and for notebooks.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -18,9 +18,10 @@ use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 use crate::sensor::SensorInfo;
 use crate::shared_memory::Memory;
 
-/// Observations made by hand: for a plugin's own tests and for notebooks.
+/// Observations created by hand, for a plugin's own tests and for notebooks.
 ///
-/// `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras, and room for these sensors.
+/// `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras and space for these
+/// sensors.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct ObservationBuffer {
     cameras: Vec<SdkCameraInfo>,
@@ -31,17 +32,17 @@ pub(crate) struct ObservationBuffer {
 }
 
 impl ObservationBuffer {
-    /// Returns the cameras it has planes for.
+    /// Returns the cameras of this buffer.
     pub(crate) fn cameras(&self) -> &[SdkCameraInfo] {
         &self.cameras
     }
 
-    /// Returns the sensors it has room for.
+    /// Returns the sensors of this buffer.
     pub(crate) fn sensors(&self) -> &[SdkSensorInfo] {
         &self.sensors
     }
 
-    /// Lets `f` read the bytes.
+    /// Calls `f` with the bytes.
     pub(crate) fn with_bytes<T>(&self, f: impl FnOnce(&[u8]) -> T) -> T {
         f(self.buffer.lock().unwrap_or_else(PoisonError::into_inner).as_bytes())
     }
@@ -56,39 +57,38 @@ impl ObservationBuffer {
         let sensors: Vec<_> = sensors.into_iter().map(|sensor| sensor.0).collect();
         let names = cameras.iter().map(|camera| camera.name.clone()).collect();
         let mut buffer = SdkBuffer::with_sensors(&cameras, &sensors);
-        // Which there are is known before the first reading.
+        // The list of sensors is available before the first reading.
         buffer.set_readings(&sensors.iter().map(|_| None).collect::<Vec<_>>());
         let readings = Mutex::new(sensors.iter().map(|_| None).collect());
         Self { cameras, sensors, names, readings, buffer: Mutex::new(buffer) }
     }
 
-    /// Empties it and numbers it.
+    /// Removes all content and sets the number of the observation.
     #[pyo3(signature = (seq = 0))]
     fn clear(&self, seq: u64) {
         self.buffer.lock().unwrap_or_else(PoisonError::into_inner).clear(seq);
     }
 
-    /// Fills in what is known of the vehicle.
+    /// Sets the state of the vehicle.
     fn set_vehicle(&self, vehicle: Vehicle) {
         self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_vehicle(&vehicle.0);
     }
 
-    /// Fills in the battery's state.
+    /// Sets the state of the battery.
     fn set_battery(&self, battery: Battery) {
         self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_battery(&battery.0);
     }
 
-    /// Fills in the newest IMU samples, oldest first; those with stamps that a plugin has had already, it
-    /// does not get again.
+    /// Sets the newest IMU samples, oldest first. A plugin receives each stamp only once.
     fn set_imu(&self, samples: Vec<ImuSample>) {
         let samples: Vec<_> = samples.into_iter().map(|sample| sample.0).collect();
         self.buffer.lock().unwrap_or_else(PoisonError::into_inner).set_imu(&samples);
     }
 
-    /// Fills in a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16; black and without
-    /// returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
+    /// Sets a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16. The default is black, without
+    /// returns. Stamps are `time.monotonic_ns()`. [ns]
     #[pyo3(signature = (name, rgb = None, depth_mm = None, *, seq = 0, stamp_ns = 0, ready_ns = None))]
-    #[allow(clippy::too_many_arguments)] // Why: keywords, most of them.
+    #[allow(clippy::too_many_arguments)] // Why: most are Python keywords.
     fn set_image(
         &self,
         name: &str,
@@ -126,7 +126,7 @@ impl ObservationBuffer {
         Ok(())
     }
 
-    /// Fills in where the body was at the instant that a camera's image shows.
+    /// Sets the pose of the body at the instant that a camera's image shows.
     fn set_pose_at_image(&self, name: &str, world_from_body: Pose) -> PyResult<()> {
         let index = self.cameras.iter().position(|camera| camera.name == name);
         let index = index.ok_or_else(|| {
@@ -137,8 +137,8 @@ impl ObservationBuffer {
         Ok(())
     }
 
-    /// Fills in a sensor's reading: `records` as bytes or as an array of the layout that `SensorReading.records`
-    /// documents. `pose_at_reading` is where the body was. Stamps are of `time.monotonic_ns()`. [ns]
+    /// Sets a sensor's reading: `records` as bytes, or as an array with the layout of `SensorReading.records`.
+    /// `pose_at_reading` is the pose of the body. Stamps are `time.monotonic_ns()`. [ns]
     #[pyo3(signature = (name, records, *, seq = 1, stamp_ns = 0, pose_at_reading = None))]
     fn set_reading(
         &self,
@@ -169,14 +169,14 @@ impl ObservationBuffer {
         Ok(())
     }
 
-    /// Returns what a plugin would see.
+    /// Returns the observation that a plugin would receive.
     fn observation(&self, py: Python<'_>) -> PyResult<Observation> {
         let memory = self.with_bytes(|bytes| Memory::copied(bytes, Arc::clone(&self.names)));
         Observation::new(py, memory, HostTime::ZERO)
     }
 }
 
-/// A reading that was filled in.
+/// Reading set by hand.
 struct OwnReading {
     seq: u64,
     stamp_ns: u64,

@@ -1,4 +1,4 @@
-//! What happened.
+//! Events of the flight.
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -6,23 +6,23 @@ use pyo3::types::{PyDict, PyList};
 use serde_json::Value;
 use vizflyt_sdk::Event as SdkEvent;
 
-/// One occurrence of the flight.
+/// One event of the flight.
 ///
-/// `Event(kind, text, stamp_ns=0, **details)` makes one, for tests.
+/// `Event(kind, text, stamp_ns=0, **details)` creates one for tests.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct Event {
     kind: String,
     details: Py<PyDict>,
-    /// One sentence for a person.
+    /// Description in words.
     #[pyo3(get)]
     text: String,
-    /// When, on the server's clock. [ns]
+    /// Time on the server's clock. [ns]
     #[pyo3(get)]
     stamp_ns: u64,
 }
 
 impl Event {
-    /// Converts the SDK's. The kind's fields become `details` by their own names.
+    /// Converts an event of the SDK. The kind's fields become `details` under their own names.
     pub(crate) fn new(py: Python<'_>, event: &SdkEvent) -> PyResult<Self> {
         let kind = serde_json::to_value(&event.kind)
             .map_err(|error| PyValueError::new_err(error.to_string()))?;
@@ -67,15 +67,15 @@ impl Event {
         Self { kind, details, text: text.to_owned(), stamp_ns }
     }
 
-    /// What happened: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
+    /// Kind of event: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
     /// 'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
     #[getter]
     fn kind(&self) -> &str {
         &self.kind
     }
 
-    /// What belongs to the kind, by name: `{'seconds': 12.4}` of 'finished', `{'phase': 'flying'}` of 'phase',
-    /// `{'index': 0, 'name': 'gate'}` of 'stage', `{'p_world_m': [...], 'clearance_m': ...}` of 'collision'.
+    /// Fields of the kind by name: `{'seconds': 12.4}` for 'finished', `{'phase': 'flying'}` for 'phase',
+    /// `{'index': 0, 'name': 'gate'}` for 'stage', `{'p_world_m': [...], 'clearance_m': ...}` for 'collision'.
     #[getter]
     fn details(&self, py: Python<'_>) -> Py<PyDict> {
         self.details.clone_ref(py)
@@ -87,7 +87,7 @@ impl Event {
     }
 }
 
-/// Returns a JSON value as Python's own.
+/// Converts a JSON value to a Python object.
 fn plain<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
     Ok(match value {
         Value::Null => py.None().into_bound(py),

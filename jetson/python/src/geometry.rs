@@ -9,14 +9,13 @@ use vizflyt_sdk::{Intrinsics as SdkIntrinsics, Pose as SdkPose, Volume as SdkVol
 
 use crate::arguments::{Points, array_of, array3, quaternion, vector, wrong_type};
 
-/// A rigid transform that knows its two frames: `world_from_body` takes body coordinates to world
-/// coordinates, and is the pose of the body in the world.
+/// A rigid transform between two named frames. `world_from_body` converts body coordinates to world coordinates,
+/// and is the pose of the body in the world.
 ///
-/// Frames are 'world' (x east, y north, z up), 'body' (x forward, y left, z up) and 'cam' (x right,
-/// y down, z forward). Composing is `@`, and works only where the frames meet:
-/// `world_from_body @ body_from_cam`.
+/// Frames are 'world' (x east, y north, z up), 'body' (x forward, y left, z up) and 'cam' (x right, y down, z
+/// forward). `@` composes poses. The inner frames must be the same: `world_from_body @ body_from_cam`.
 ///
-/// `Pose(into, from_, translation_m, rotation_xyzw)` makes one, for tests.
+/// `Pose(into, from_, translation_m, rotation_xyzw)` creates one for tests.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct Pose {
@@ -27,7 +26,7 @@ pub(crate) struct Pose {
 }
 
 impl Pose {
-    /// Returns the SDK's pose under the names of its frames.
+    /// Converts a pose of the SDK, with the names of its frames.
     pub(crate) fn new<A: Frame, B: Frame>(into: &str, from: &str, pose: &SdkPose<A, B>) -> Self {
         Self {
             into: into.to_owned(),
@@ -37,7 +36,7 @@ impl Pose {
         }
     }
 
-    /// Returns it as the SDK's, if the frames are these.
+    /// Converts to a pose of the SDK, if the frames match.
     pub(crate) fn typed<A: Frame, B: Frame>(
         &self,
         into: &str,
@@ -47,7 +46,7 @@ impl Pose {
             return Ok(SdkPose::new(self.translation_m, self.rotation));
         }
         Err(PyValueError::new_err(format!(
-            "{into}_from_{from} is wanted, and this is {}_from_{}",
+            "expected {into}_from_{from}, got {}_from_{}",
             self.into, self.from
         )))
     }
@@ -66,8 +65,8 @@ impl Pose {
         for frame in [&into, &from_] {
             if !FRAMES.contains(&frame.as_str()) {
                 return Err(PyValueError::new_err(format!(
-                    "'{frame}' is no frame; there are 'world' (x east, y north, z up), 'body' (x \
-                     forward, y left, z up) and 'cam' (x right, y down, z forward) and 'odom' (a plugin's own, z up)"
+                    "unknown frame '{frame}'; known frames: 'world' (x east, y north, z up), 'body' (x \
+                     forward, y left, z up), 'cam' (x right, y down, z forward) and 'odom' (plugin's own, z up)"
                 )));
             }
         }
@@ -99,7 +98,7 @@ impl Pose {
         array_of(py, &rows, vec![3, 3])
     }
 
-    /// The whole transform as a homogeneous matrix: shape (4, 4), float64.
+    /// Complete transform as a homogeneous matrix: shape (4, 4), float64.
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (r, t) = (DMat3::from_quat(self.rotation), self.translation_m);
@@ -115,7 +114,7 @@ impl Pose {
         yaw_of(self.rotation)
     }
 
-    /// Returns the transform the other way round.
+    /// Returns the inverse transform.
     fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self {
@@ -126,13 +125,13 @@ impl Pose {
         }
     }
 
-    /// Takes a point (3,) or points (N, 3) from the right frame to the left one. [m]
+    /// Converts a point (3,) or points (N, 3) from the right frame to the left one. [m]
     fn transform_point<'py>(&self, points_m: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let points = Points::take(points_m, "points_m")?;
         points.vectors(points_m.py(), |p| self.rotation * p + self.translation_m)
     }
 
-    /// Takes a direction or velocity (3,), or many (N, 3), from the right frame to the left one.
+    /// Rotates a direction or velocity (3,), or many (N, 3), from the right frame to the left one.
     fn rotate<'py>(&self, vectors: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         Points::take(vectors, "vectors")?.vectors(vectors.py(), |v| self.rotation * v)
     }
@@ -141,14 +140,14 @@ impl Pose {
         let Ok(other) = other.extract::<Self>() else {
             return Err(wrong_type(
                 other,
-                "what a Pose is multiplied with",
-                "a Pose (for points there is transform_point, for directions rotate)",
+                "the right operand of @",
+                "a Pose (for points use transform_point, for directions rotate)",
             ));
         };
         if self.from != other.into {
             return Err(PyValueError::new_err(format!(
                 "{0}_from_{1} @ {2}_from_{3}: the frames that meet, '{1}' and '{2}', must be the \
-                 same; is one of them the wrong way round (.inverse())?",
+                 same; does one of them need .inverse()?",
                 self.into, self.from, other.into, other.from
             )));
         }
@@ -178,7 +177,7 @@ const FRAMES: [&str; 5] = ["world", "body", "cam", "odom", "sensor"];
 
 /// Size, focal lengths, principal point and lens of a camera.
 ///
-/// Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, its centre is (0.5, 0.5).
+/// Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, (0.5, 0.5) is its centre.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct Intrinsics(pub(crate) SdkIntrinsics);
@@ -200,7 +199,7 @@ impl Intrinsics {
         Ok(Self(k))
     }
 
-    /// Makes a camera with square pixels, a centred principal point and this field of view. [px, rad]
+    /// Creates a camera with square pixels, a centred principal point and this field of view. [px, rad]
     #[staticmethod]
     fn from_horizontal_fov(width_px: u32, height_px: u32, fov_rad: f64) -> PyResult<Self> {
         let k = SdkIntrinsics::from_horizontal_fov(width_px, height_px, fov_rad);
@@ -244,7 +243,7 @@ impl Intrinsics {
         self.0.cy_px
     }
 
-    /// The lens: 'none', 'brown_conrady' (OpenCV's usual model) or 'kannala_brandt' (its fisheye).
+    /// Lens model: 'none', 'brown_conrady' (OpenCV's standard model) or 'kannala_brandt' (its fisheye model).
     #[getter]
     fn distortion_model(&self) -> &'static str {
         match self.0.distortion {
@@ -254,7 +253,7 @@ impl Intrinsics {
         }
     }
 
-    /// The lens's coefficients in OpenCV's order: shape (0,), (5,) or (4,), float64.
+    /// Distortion coefficients in OpenCV's order: shape (0,), (5,) or (4,), float64.
     #[getter]
     fn distortion<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         let (_, coefficients) = self.0.distortion.to_wire();
@@ -266,7 +265,7 @@ impl Intrinsics {
         PyArray1::from_slice(py, &coefficients[..used])
     }
 
-    /// The camera matrix: shape (3, 3), float64. [px]
+    /// Camera matrix: shape (3, 3), float64. [px]
     #[getter]
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let k = &self.0;
@@ -274,18 +273,18 @@ impl Intrinsics {
         array_of(py, &rows, vec![3, 3])
     }
 
-    /// The camera matrix for OpenCV, whose (0, 0) is the centre of the top-left pixel: half a pixel less.
-    /// Shape (3, 3), float64. [px]
+    /// Camera matrix for OpenCV, where (0, 0) is the centre of the top-left pixel: the principal point is
+    /// smaller by half a pixel. Shape (3, 3), float64. [px]
     #[getter]
     fn opencv_matrix<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        // OpenCV puts (0, 0) at the centre of the top-left pixel, we at its outer corner.
+        // OpenCV puts (0, 0) at the centre of the top-left pixel, VizFlyt at its outer corner.
         let k = &self.0;
         let rows = [k.fx_px, 0.0, k.cx_px - 0.5, 0.0, k.fy_px, k.cy_px - 0.5, 0.0, 0.0, 1.0];
         array_of(py, &rows, vec![3, 3])
     }
 
-    /// Returns where a point (3,) [m, cam] lies in the image: shape (2,) [px]; of points (N, 3), shape (N, 2).
-    /// NaN for what lies behind the camera or out of the lens's reach.
+    /// Returns the pixel of a point (3,) [m, cam]: shape (2,) [px]. For points (N, 3), shape (N, 2). NaN for
+    /// points behind the camera or outside the range of the lens model.
     fn project<'py>(
         &self,
         py: Python<'py>,
@@ -321,27 +320,27 @@ impl Intrinsics {
     }
 }
 
-/// A solid in the world frame: sphere, box, capsule or half space.
+/// A solid volume in the world frame: sphere, box, capsule or half space.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct Volume(pub(crate) SdkVolume);
 
 #[pymethods]
 impl Volume {
-    /// Makes a sphere. [m, world]
+    /// Creates a sphere. [m, world]
     #[staticmethod]
     fn sphere(center_m: &Bound<'_, PyAny>, radius_m: f64) -> PyResult<Self> {
         Ok(Self(SdkVolume::Sphere { center_m: vector(center_m, "center_m")?, radius_m }))
     }
 
-    /// Makes a box from two opposite corners, its sides along the axes. [m, world]
+    /// Creates a box from two opposite corners, with its sides along the axes. [m, world]
     #[staticmethod]
     fn aabb(min_m: &Bound<'_, PyAny>, max_m: &Bound<'_, PyAny>) -> PyResult<Self> {
         Ok(Self(SdkVolume::aabb(vector(min_m, "min_m")?, vector(max_m, "max_m")?)))
     }
 
-    /// Returns how far a point (3,), or each of points (N, 3), is from the surface: negative inside.
-    /// A float or shape (N,), float64. [m, world]
+    /// Returns the distance of a point (3,), or of points (N, 3), from the surface; negative inside. A float or
+    /// shape (N,), float64. [m, world]
     fn signed_distance_m<'py>(&self, p_world_m: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let points = Points::take(p_world_m, "p_world_m")?;
         points.scalars(p_world_m.py(), |p| self.0.signed_distance_m(p))

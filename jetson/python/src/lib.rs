@@ -1,9 +1,8 @@
-//! The Python face of the SDK: `vizflyt._vizflyt`, which the package `vizflyt` re-exports.
+//! Python bindings of the SDK: `vizflyt._vizflyt`, which the package `vizflyt` re-exports.
 //!
-//! Conversion only: what a plugin sees and answers is defined by `vizflyt-sdk`, and stays there.
-//! Images are read-only numpy arrays that lie in the runtime's shared memory; see
-//! [`shared_memory`]. The main loop, which calls the student's methods, is Python itself
-//! (`python/vizflyt/_run.py`), so that debuggers and tracebacks see nothing strange.
+//! This crate only converts types; `vizflyt-sdk` defines observations and setpoints. Images are read-only numpy
+//! arrays in the runtime's shared memory; see [`shared_memory`]. The main loop, which calls the student's
+//! methods, is written in Python (`python/vizflyt/_run.py`), so that debuggers and tracebacks work as usual.
 
 mod arena;
 mod arguments;
@@ -21,7 +20,7 @@ mod shared_memory;
 
 use pyo3::prelude::*;
 
-/// Everything of the package `vizflyt` that is compiled.
+/// All compiled parts of the package `vizflyt`.
 #[pymodule]
 mod _vizflyt {
     #[pymodule_export]

@@ -1,4 +1,4 @@
-//! Pixels of a flight's log; the file itself is read by `python/vizflyt/_log.py`.
+//! Decoder for the images of a flight log. `python/vizflyt/_log.py` reads the file itself.
 
 use numpy::ndarray::{Array2, Array3};
 use numpy::{IntoPyArray, PyArray2, PyArray3};
@@ -6,13 +6,13 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use vizflyt_rgbd::{DecodeError, Decoder, join_jpeg, peek};
 
-/// What an image decodes to.
+/// Colour and depth of a decoded image.
 type Arrays<'py> = (Bound<'py, PyArray3<u8>>, Bound<'py, PyArray2<u16>>);
 
-/// Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be
-/// apart.
+/// Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image in a log. `jpeg` is the colour if
+/// the log stores it separately.
 ///
-/// Raises ValueError for what does not decode.
+/// Raises ValueError if the image does not decode.
 #[pyfunction]
 #[pyo3(signature = (bitstream, jpeg = None))]
 pub(crate) fn decode_image<'py>(
@@ -37,7 +37,7 @@ fn decode(bitstream: &[u8], jpeg: Option<&[u8]>) -> Result<(Array3<u8>, Array2<u
     let (width, height) = (info.width as usize, info.height as usize);
     let mut rgb = Array3::zeros((height, width, 3));
     let mut depth_mm = Array2::zeros((height, width));
-    let rows = "arrays of ours are one piece";
+    let rows = "new arrays are contiguous";
     Decoder::new().decode(
         &whole,
         rgb.as_slice_mut().expect(rows),

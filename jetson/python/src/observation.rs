@@ -1,4 +1,4 @@
-//! What a plugin sees.
+//! Input of a plugin: observation, camera images, vehicle state, IMU and battery.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -22,17 +22,17 @@ use crate::geometry::{Intrinsics, Pose};
 use crate::sensor::SensorReading;
 use crate::shared_memory::{Memory, depth_array, rgb_array};
 
-/// The vehicle and its cameras' images at one moment.
+/// The vehicle and the images of its cameras at one moment.
 ///
-/// Images lie in shared memory and are not copied. Those you keep beyond `on_image` stay as they are; keep
-/// more than the newest two and later ones are copied, with a warning.
+/// Images lie in shared memory and are not copied. Images that you keep after `on_image` do not change. If you
+/// keep more than the newest two, later images are copied, with a warning.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct Observation {
     memory: Arc<Memory>,
-    /// The observation's number in this flight; numbers missing were skipped.
+    /// Number of the observation in this flight; missing numbers were skipped.
     #[pyo3(get)]
     seq: u64,
-    /// When the newest image's pose was measured. [ns, `time.monotonic_ns()`]
+    /// Measurement time of the newest image's pose. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     stamp_ns: u64,
     vehicle: Option<Py<Vehicle>>,
@@ -40,51 +40,51 @@ pub(crate) struct Observation {
     battery: SdkBattery,
     images: Vec<Py<CameraImage>>,
     readings: Vec<Py<SensorReading>>,
-    /// The sensors' names, with a reading or without.
+    /// Names of all sensors, with or without a reading.
     sensor_names: Vec<String>,
 }
 
-/// One camera's RGB-D image. Row 0 is the top; index arrays as [y, x].
+/// RGB-D image of one camera. Row 0 is the top; index arrays as [y, x].
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct CameraImage {
     memory: Arc<Memory>,
     rgb_at: usize,
     depth_at: usize,
-    /// The camera's name in `arena.toml`: 'front'.
+    /// Name of the camera in `arena.toml`, for example 'front'.
     #[pyo3(get)]
     name: String,
-    /// Tick of the server that made the image; equal for all cameras of a tick.
+    /// Server tick that rendered the image; equal for all cameras of a tick.
     #[pyo3(get)]
     seq: u64,
-    /// When the newest pose behind the image was measured. [ns, `time.monotonic_ns()`]
+    /// Measurement time of the newest pose behind the image. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     stamp_ns: u64,
-    /// The instant that the image shows, about now: where depth is to meet the vehicle's pose, take
-    /// the pose of this instant. [ns, `time.monotonic_ns()`]
+    /// Instant that the image shows, which is about now. To combine depth with the vehicle's pose, use the pose
+    /// at this instant. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     shown_ns: u64,
-    /// When the runtime had the decoded image. [ns, `time.monotonic_ns()`]
+    /// Time at which the runtime had decoded the image. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     ready_ns: u64,
     intrinsics: SdkIntrinsics,
     body_from_cam: SdkPose<Body, Cam>,
     pose_at_image: Option<SdkPose<World, Body>>,
-    /// Made when asked for the first time.
+    /// Created on first access.
     depth: PyOnceLock<Py<PyArray2<f32>>>,
 }
 
-/// What is known of the vehicle.
+/// State of the vehicle.
 ///
-/// `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` makes one, for tests.
+/// `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` creates one for tests.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone)]
 pub(crate) struct Vehicle(pub(crate) SdkVehicle);
 
 impl Observation {
-    /// Reads the observation that lies in `memory`, without the IMU samples that the plugin has had.
+    /// Reads the observation in `memory`, without IMU samples that the plugin already has.
     ///
     /// # Errors
-    /// If there is none in it.
+    /// If the memory contains no valid observation.
     pub(crate) fn new(py: Python<'_>, memory: Memory, imu_after: HostTime) -> PyResult<Self> {
         let memory = Arc::new(memory);
         let seen = SdkObservation::from_bytes(memory.bytes(), &memory.names)
@@ -109,7 +109,7 @@ impl Observation {
         Ok(Self { memory, seq, stamp_ns, vehicle, imu, battery, images, readings, sensor_names })
     }
 
-    /// Returns when its newest IMU sample was measured.
+    /// Returns the measurement time of the newest IMU sample.
     pub(crate) fn newest_imu(&self) -> Option<HostTime> {
         self.imu.last().map(|sample| sample.stamp)
     }
@@ -117,7 +117,7 @@ impl Observation {
 
 #[pymethods]
 impl Observation {
-    /// Returns the image of the camera of this name; None if it has none yet.
+    /// Returns the image of the camera with this name; None if there is no image yet.
     ///
     /// Raises LookupError if the vehicle has no such camera.
     fn camera(&self, py: Python<'_>, name: &str) -> PyResult<Option<Py<CameraImage>>> {
@@ -135,7 +135,7 @@ impl Observation {
         )))
     }
 
-    /// Returns the newest reading of the sensor of this name; None if it has none yet.
+    /// Returns the newest reading of the sensor with this name; None if there is no reading yet.
     ///
     /// Raises LookupError if the vehicle has no such sensor.
     fn sensor(&self, py: Python<'_>, name: &str) -> PyResult<Option<Py<SensorReading>>> {
@@ -153,40 +153,40 @@ impl Observation {
         )))
     }
 
-    /// The newest readings there are, in the order of the arena's sensors.
+    /// Newest available readings, in the order of the arena's sensors.
     #[getter]
     fn sensors(&self, py: Python<'_>) -> Vec<Py<SensorReading>> {
         self.readings.iter().map(|reading| reading.clone_ref(py)).collect()
     }
 
-    /// The images there are, in the order of the arena's cameras.
+    /// Available images, in the order of the arena's cameras.
     #[getter]
     fn cameras(&self, py: Python<'_>) -> Vec<Py<CameraImage>> {
         self.images.iter().map(|image| image.clone_ref(py)).collect()
     }
 
-    /// Where the body was at the instant that the newest image shows: the pose that belongs to its pixels. None
-    /// without an image, and where the course withholds the pose. [m, world]
+    /// Pose of the body at the instant that the newest image shows, which belongs to its pixels. None without an
+    /// image, and if the course withholds the pose. [m, world]
     #[getter]
     fn pose_at_image(&self) -> Option<Pose> {
         let newest = self.images.iter().max_by_key(|image| image.get().shown_ns)?;
         newest.get().pose_at_image()
     }
 
-    /// What is known of the vehicle; None before anything is.
+    /// State of the vehicle; None before the first one.
     #[getter]
     fn vehicle(&self, py: Python<'_>) -> Option<Py<Vehicle>> {
         self.vehicle.as_ref().map(|vehicle| vehicle.clone_ref(py))
     }
 
-    /// The autopilot's IMU samples since the image that the plugin got before this one, oldest first; at
-    /// most the newest 64 (0.6 s at 100 Hz).
+    /// IMU samples of the autopilot since the plugin's previous image, oldest first. At most the newest 64 (0.6
+    /// s at 100 Hz).
     #[getter]
     fn imu(&self) -> Vec<ImuSample> {
         self.imu.iter().copied().map(ImuSample).collect()
     }
 
-    /// The battery's state.
+    /// State of the battery.
     #[getter]
     fn battery(&self) -> Battery {
         Battery(self.battery)
@@ -207,7 +207,7 @@ impl Observation {
 }
 
 impl CameraImage {
-    /// Returns the memory that it keeps alive and unchanged.
+    /// Returns the memory that this image keeps alive and unchanged.
     pub(crate) fn memory(&self) -> &Memory {
         &self.memory
     }
@@ -243,29 +243,29 @@ impl CameraImage {
 impl CameraImage {
     /// Colour: a read-only view of shape (H, W, 3), uint8, sRGB, in the order red, green, blue.
     ///
-    /// OpenCV shows it right after `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
+    /// For OpenCV, convert it with `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
     #[getter]
     fn rgb<'py>(slf: &Bound<'py, Self>) -> Bound<'py, PyArray3<u8>> {
         let image = slf.get();
         rgb_array(slf, image.rgb_at, image.shape())
     }
 
-    /// Depth along the optical axis: a read-only view of shape (H, W), uint16; 0 is no return. [mm, cam]
+    /// Depth along the optical axis: a read-only view of shape (H, W), uint16; 0: no return. [mm, cam]
     #[getter]
     fn depth_mm<'py>(slf: &Bound<'py, Self>) -> Bound<'py, PyArray2<u16>> {
         let image = slf.get();
         depth_array(slf, image.depth_at, image.shape())
     }
 
-    /// Depth along the optical axis: read-only, shape (H, W), float32; 0 is no return. [m, cam]
+    /// Depth along the optical axis: read-only, shape (H, W), float32; 0 means no return. [m, cam]
     ///
-    /// Converted from `depth_mm` when asked for the first time (0.1 ms at 640x480).
+    /// Converted from `depth_mm` on first access (0.1 ms at 640x480).
     #[getter]
     fn depth(&self, py: Python<'_>) -> Py<PyArray2<f32>> {
         let make = || {
             let (height, width) = self.shape();
             let millimetres = &self.memory.bytes()[self.depth_plane()];
-            // Divided, not multiplied by 0.001, so that 2500 mm is 2.5 m to the last bit.
+            // A division, not a multiplication by 0.001, so that 2500 mm is exactly 2.5 m.
             let metres: Vec<f32> = millimetres
                 .as_chunks::<2>()
                 .0
@@ -281,7 +281,7 @@ impl CameraImage {
         self.depth.get_or_init(py, make).clone_ref(py)
     }
 
-    /// Returns the depth at column x, row y; None where there is no return. [m, cam]
+    /// Returns the depth at column x, row y; None without a return. [m, cam]
     ///
     /// Raises IndexError outside the image.
     fn depth_m(&self, x_px: usize, y_px: usize) -> PyResult<Option<f64>> {
@@ -315,14 +315,14 @@ impl CameraImage {
         Intrinsics(self.intrinsics)
     }
 
-    /// Where the body was at the instant that the image shows: what it was rendered from; None where the course
-    /// withholds the pose. [m, world]
+    /// Pose of the body at the instant that the image shows, from which the image was rendered. None if the
+    /// course withholds the pose. [m, world]
     #[getter]
     fn pose_at_image(&self) -> Option<Pose> {
         self.pose_at_image.map(|pose| Pose::new("world", "body", &pose))
     }
 
-    /// How the camera is mounted.
+    /// Pose of the camera on the body.
     #[getter]
     fn body_from_cam(&self) -> Pose {
         Pose::new("body", "cam", &self.body_from_cam)
@@ -368,14 +368,14 @@ impl Vehicle {
         }))
     }
 
-    /// When this was true. [ns, `time.monotonic_ns()`]
+    /// Time of this state. [ns, `time.monotonic_ns()`]
     #[getter]
     fn stamp_ns(&self) -> u64 {
         self.0.stamp.as_ns()
     }
 
     /// Attitude as a unit quaternion x, y, z, w that rotates vectors from body to world axes: shape (4,),
-    /// float64. The localized one where the course gives the pose, else the autopilot's estimate.
+    /// float64. From localization if the course gives the pose, otherwise the autopilot's estimate.
     #[getter]
     fn attitude_xyzw<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         PyArray1::from_slice(py, &self.0.attitude.to_array())
@@ -393,19 +393,19 @@ impl Vehicle {
         array3(py, self.0.omega_body_radps)
     }
 
-    /// Position and attitude as localized; None where the course withholds them. [m, world]
+    /// Position and attitude from localization; None if the course withholds them. [m, world]
     #[getter]
     fn world_from_body(&self) -> Option<Pose> {
         self.0.world_from_body.map(|pose| Pose::new("world", "body", &pose))
     }
 
-    /// Position: shape (3,), float64; None where the course withholds it. [m, world]
+    /// Position: shape (3,), float64; None if the course withholds it. [m, world]
     #[getter]
     fn p_world_m<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
         self.0.world_from_body.map(|pose| array3(py, pose.translation_m))
     }
 
-    /// Velocity: shape (3,), float64; None where the course withholds it. [m/s, world]
+    /// Velocity: shape (3,), float64; None if the course withholds it. [m/s, world]
     #[getter]
     fn v_world_mps<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
         self.0.v_world_mps.map(|v_mps| array3(py, v_mps))
@@ -427,9 +427,9 @@ impl Vehicle {
     }
 }
 
-/// One reading of the autopilot's accelerometer and gyroscope.
+/// One sample of the autopilot's accelerometer and gyroscope.
 ///
-/// `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` makes one, for tests.
+/// `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` creates one for tests.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone)]
 pub(crate) struct ImuSample(pub(crate) SdkImuSample);
@@ -450,7 +450,7 @@ impl ImuSample {
         }))
     }
 
-    /// When it was measured. [ns, `time.monotonic_ns()`]
+    /// Time of the measurement. [ns, `time.monotonic_ns()`]
     #[getter]
     fn stamp_ns(&self) -> u64 {
         self.0.stamp.as_ns()
@@ -474,9 +474,9 @@ impl ImuSample {
     }
 }
 
-/// The battery, as the autopilot measures it.
+/// State of the battery, as measured by the autopilot.
 ///
-/// `Battery(fraction=None, voltage_v=None)` makes one, for tests.
+/// `Battery(fraction=None, voltage_v=None)` creates one for tests.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone)]
 pub(crate) struct Battery(pub(crate) SdkBattery);
@@ -489,7 +489,7 @@ impl Battery {
         Self(SdkBattery { fraction, voltage_v })
     }
 
-    /// What is left, 0 to 1; None if the autopilot does not know.
+    /// Remaining charge, 0 to 1; None if the autopilot does not report it.
     #[getter]
     fn fraction(&self) -> Option<f64> {
         self.0.fraction

@@ -1,4 +1,4 @@
-//! A plugin's own estimate of where it is.
+//! Odometry that a plugin publishes.
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -6,14 +6,14 @@ use vizflyt_sdk::{HostTime, Pose};
 
 use crate::arguments::{quaternion, vector};
 
-/// Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is
-/// `image.shown_ns`. It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how
-/// far off it was. Nothing is flown by it.
+/// Publishes the plugin's estimate of the vehicle's pose at `stamp_ns`. For an estimate from an image, pass
+/// `image.shown_ns`. The estimate is sent with the reply to the image and logged on `/odometry`, and `vizflyt
+/// grade` reports its error. It does not control the flight.
 ///
-/// `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to
-/// odom axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
+/// `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` is the unit quaternion that rotates from
+/// body to odom axes, shape (4,). z of the frame `odom` is up; the plugin chooses its origin and heading.
 ///
-/// Raises NotFiniteError or ValueError for what is no pose, ValueError for more than four in one `on_image`.
+/// Raises NotFiniteError or ValueError for an invalid pose, ValueError for more than four in one `on_image`.
 #[pyfunction]
 pub(crate) fn publish_odometry(
     stamp_ns: u64,

@@ -1,4 +1,4 @@
-//! The plugin's end of the shared memory, as the main loop uses it.
+//! The plugin's end of the shared memory, for the main loop.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -18,13 +18,13 @@ use crate::observation::Observation;
 use crate::setpoint::Setpoint;
 use crate::shared_memory::Lender;
 
-/// Not for plugins: what `vizflyt.run` is made of.
+/// Not for plugins: connection to the runtime, used by `vizflyt.run`.
 #[pyclass(frozen, module = "vizflyt._vizflyt")]
 pub(crate) struct PluginEnd {
     end: SdkPluginEnd,
     lender: Lender,
     names: Mutex<Arc<[Name]>>,
-    /// Newest IMU sample that the plugin has had. [ns, host]
+    /// Stamp of the newest IMU sample that the plugin has received. [ns, host]
     imu_had: AtomicU64,
 }
 
@@ -39,7 +39,7 @@ impl PluginEnd {
         Ok(Self { end, lender: Lender::default(), names, imu_had: AtomicU64::default() })
     }
 
-    /// Waits until there is something to take, `timeout_s` at most; returns whether there is.
+    /// Waits for a message or an observation, at most `timeout_s`; returns whether there is one.
     fn wait(&self, py: Python<'_>, timeout_s: f64) -> PyResult<bool> {
         let timeout = Duration::try_from_secs_f64(timeout_s).unwrap_or_default();
         let woken = py.detach(|| self.end.wait(timeout)).map_err(|error| lost(&error))?;
@@ -47,8 +47,8 @@ impl PluginEnd {
         Ok(woken)
     }
 
-    /// Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
-    /// or None if there is none; ("gone", None) once the runtime has ended.
+    /// Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event) or ("stop", None). None if
+    /// no message is waiting; ("gone", None) after the runtime has ended.
     fn receive(&self, py: Python<'_>) -> PyResult<Option<(&'static str, Py<PyAny>)>> {
         let message = match self.end.receive() {
             Err(IpcError::Gone(_)) => return Ok(Some(("gone", py.None()))),
@@ -68,7 +68,7 @@ impl PluginEnd {
         })
     }
 
-    /// Returns the newest observation, if there is one not taken yet.
+    /// Returns the newest observation, unless it was returned before.
     fn observation(&self, py: Python<'_>) -> PyResult<Option<Observation>> {
         let Some(sample) = self.end.observation().map_err(|error| lost(&error))? else {
             return Ok(None);
@@ -76,7 +76,7 @@ impl PluginEnd {
         let names = Arc::clone(&self.names.lock().unwrap_or_else(PoisonError::into_inner));
         let memory = py.detach(|| self.lender.take(sample, names));
         let imu_had = HostTime::from_ns(self.imu_had.load(Ordering::Relaxed));
-        // A bad observation is the runtime's bug, and skipped.
+        // An invalid observation is a bug of the runtime and is skipped.
         let Ok(observation) = Observation::new(py, memory, imu_had) else { return Ok(None) };
         if let Some(newest) = observation.newest_imu() {
             self.imu_had.store(newest.as_ns(), Ordering::Relaxed);
@@ -89,7 +89,7 @@ impl PluginEnd {
         self.send(&FromPlugin::Ready { name: bounded(name) })
     }
 
-    /// Sends the answer to one observation.
+    /// Sends the reply to one observation.
     #[pyo3(signature = (seq, entered_ns, setpoint))]
     fn answer(&self, seq: u64, entered_ns: u64, setpoint: Option<Setpoint>) -> PyResult<()> {
         for odometry in vizflyt_sdk::take_odometry() {
@@ -103,7 +103,8 @@ impl PluginEnd {
         })
     }
 
-    /// Answers one observation with a setpoint that is not finite, which the runtime refuses by that name.
+    /// Replies to one observation with a setpoint that is not finite, so that the runtime rejects it with this
+    /// reason.
     fn answer_not_finite(&self, seq: u64, entered_ns: u64) -> PyResult<()> {
         let setpoint = SdkSetpoint::velocity(DVec3::NAN, YawTarget::Keep);
         self.answer(seq, entered_ns, Some(Setpoint(setpoint)))

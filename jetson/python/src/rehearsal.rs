@@ -1,4 +1,4 @@
-//! A runtime without a flight: tests and notebooks play its part.
+//! A runtime without a flight, for tests and notebooks.
 
 use std::time::Duration;
 
@@ -16,12 +16,12 @@ use crate::buffer::ObservationBuffer;
 use crate::geometry::Pose;
 use crate::setpoint::Setpoint;
 
-/// A runtime without a flight: plays the runtime's part for a plugin that runs on another thread, or in
-/// another process, attached to `service`. With `waiting`, `vizflyt.run` finds it by itself.
+/// A runtime without a flight, for a plugin that runs on another thread or in another process, attached to
+/// `service`. With `waiting`, `vizflyt.run` finds it automatically.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct Rehearsal {
     end: RuntimeEnd,
-    /// Stands as long as this lives.
+    /// Withdrawn when this is dropped.
     offer: Offer,
 }
 
@@ -39,42 +39,42 @@ impl Rehearsal {
         Ok(Self { offer: offer.map_err(|error| failed(&error))?, end })
     }
 
-    /// What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`.
+    /// Service that the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`.
     #[getter]
     fn service(&self) -> String {
         self.offer.service()
     }
 
-    /// Whether a plugin has attached: from then on messages reach it.
+    /// Whether a plugin is attached, so that messages reach it.
     #[getter]
     fn is_attached(&self) -> bool {
         self.end.plugin_attached()
     }
 
-    /// Sends the plugin its arena.
+    /// Sends the description of the arena to the plugin.
     fn start(&self, info: &ArenaInfo) -> PyResult<()> {
         self.send(&ToPlugin::Start(info.0.clone()))
     }
 
-    /// Tells it an event of kind 'note'.
+    /// Sends an event of kind 'note'.
     fn note(&self, text: &str) -> PyResult<()> {
         let stamp = ServerTime::from_ns(host_now().as_ns());
         self.send(&ToPlugin::Event(SdkEvent { stamp, kind: EventKind::Note, text: bounded(text) }))
     }
 
-    /// Tells it that the goal was reached after so many seconds.
+    /// Sends the event that the goal was reached after this time. [s]
     fn finish(&self, seconds: f64) -> PyResult<()> {
         let stamp = ServerTime::from_ns(host_now().as_ns());
         let kind = EventKind::Finished { seconds };
         self.send(&ToPlugin::Event(SdkEvent { stamp, kind, text: bounded("finished") }))
     }
 
-    /// Tells it to end.
+    /// Requests the plugin to stop.
     fn stop(&self) -> PyResult<()> {
         self.send(&ToPlugin::Stop)
     }
 
-    /// Hands it the buffer's images, through shared memory.
+    /// Publishes the buffer's images through shared memory.
     fn publish(&self, buffer: &ObservationBuffer) -> PyResult<()> {
         let mut loan = self
             .end
@@ -91,8 +91,8 @@ impl Rehearsal {
         self.end.publish(loan).map_err(|error| failed(&error))
     }
 
-    /// Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns),
-    /// ('answer', seq, setpoint, entered_ns) or ('failed', 0, reason, 0); None if none comes within this time. [s]
+    /// Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns), ('answer',
+    /// seq, setpoint, entered_ns) or ('failed', 0, reason, 0). None after a timeout. [s]
     #[pyo3(signature = (timeout_s = 10.0))]
     fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<PluginMessage>> {
         let deadline =
@@ -105,7 +105,7 @@ impl Rehearsal {
             if left.is_zero() {
                 return Ok(None);
             }
-            // Short, so that Ctrl-C is noticed.
+            // Short, so that Ctrl-C takes effect.
             let wait = left.min(Duration::from_millis(200));
             py.detach(|| self.end.wait(wait)).map_err(|error| failed(&error))?;
             py.check_signals()?;

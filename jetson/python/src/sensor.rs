@@ -1,4 +1,4 @@
-//! The sensors beside the cameras: their newest readings as structured arrays that lie in shared memory.
+//! Sensors other than cameras: their newest readings as structured arrays in shared memory.
 
 use std::sync::Arc;
 
@@ -17,9 +17,10 @@ use vizflyt_sdk::{
 use crate::geometry::Pose;
 use crate::shared_memory::Memory;
 
-/// One sensor of the vehicle that is no camera.
+/// One sensor of the vehicle other than a camera.
 ///
-/// `SensorInfo(name, kind, most_records=1, ...)` makes one, for tests; without a mounting it looks along the nose.
+/// `SensorInfo(name, kind, most_records=1, ...)` creates one for tests. Without `body_from_sensor` it points
+/// forward.
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct SensorInfo(pub(crate) SdkSensorInfo);
@@ -31,7 +32,7 @@ impl SensorInfo {
         name, kind, *, most_records = 1, rate_hz = 10.0, min_range_m = 0.0, max_range_m = 100.0,
         horizontal_fov_rad = 0.0, vertical_fov_rad = 0.0, body_from_sensor = None
     ))]
-    #[allow(clippy::too_many_arguments)] // Why: keywords, most of them.
+    #[allow(clippy::too_many_arguments)] // Why: most are Python keywords.
     fn make(
         name: &str,
         kind: &str,
@@ -50,7 +51,7 @@ impl SensorInfo {
         let kind =
             SensorKind::ALL.into_iter().find(|known| known.name() == kind).ok_or_else(|| {
                 let known = SensorKind::ALL.map(SensorKind::name).join(", ");
-                PyValueError::new_err(format!("{kind:?} is no kind of sensor; there are: {known}"))
+                PyValueError::new_err(format!("unknown kind of sensor {kind:?}; known kinds: {known}"))
             })?;
         Ok(Self(SdkSensorInfo {
             name: bounded(name),
@@ -67,49 +68,49 @@ impl SensorInfo {
         }))
     }
 
-    /// What `obs.sensor(name)` calls it.
+    /// Name of the sensor, the argument of `obs.sensor(name)`.
     #[getter]
     fn name(&self) -> &str {
         &self.0.name
     }
 
-    /// 'lidar', 'range_finder', 'sonar' or 'radar'.
+    /// Kind: 'lidar', 'range_finder', 'sonar' or 'radar'.
     #[getter]
     fn kind(&self) -> &'static str {
         self.0.kind.name()
     }
 
-    /// Readings a second. [Hz]
+    /// Rate of readings. [Hz]
     #[getter]
     fn rate_hz(&self) -> f32 {
         self.0.rate_hz
     }
 
-    /// Nearest that it measures. [m]
+    /// Minimum range. [m]
     #[getter]
     fn min_range_m(&self) -> f32 {
         self.0.min_range_m
     }
 
-    /// Furthest that it measures. [m]
+    /// Maximum range. [m]
     #[getter]
     fn max_range_m(&self) -> f32 {
         self.0.max_range_m
     }
 
-    /// Width of what it sees. [rad]
+    /// Horizontal field of view. [rad]
     #[getter]
     fn horizontal_fov_rad(&self) -> f32 {
         self.0.horizontal_fov_rad
     }
 
-    /// Height of what it sees. [rad]
+    /// Vertical field of view. [rad]
     #[getter]
     fn vertical_fov_rad(&self) -> f32 {
         self.0.vertical_fov_rad
     }
 
-    /// How it is mounted: sensor axes are x forward, y left, z up.
+    /// Pose of the sensor on the body. Sensor axes are x forward, y left, z up.
     #[getter]
     fn body_from_sensor(&self) -> Pose {
         Pose::new("body", "sensor", &self.0.body_from_sensor)
@@ -120,27 +121,27 @@ impl SensorInfo {
     }
 }
 
-/// The newest reading of one sensor. It stays in later observations until the next one comes: `seq` tells whether
-/// it is new.
+/// Newest reading of one sensor. It stays in later observations until the next one arrives; a changed `seq`
+/// marks a new reading.
 #[pyclass(frozen, module = "vizflyt")]
 pub(crate) struct SensorReading {
     memory: Arc<Memory>,
     records_at: usize,
     record_count: usize,
     kind: SensorKind,
-    /// The sensor's name in `arena.toml`.
+    /// Name of the sensor in `arena.toml`.
     #[pyo3(get)]
     name: String,
-    /// Counts this sensor's readings, from 1.
+    /// Number of the reading, from 1.
     #[pyo3(get)]
     seq: u64,
-    /// When the newest pose behind it was measured. [ns, `time.monotonic_ns()`]
+    /// Measurement time of the newest pose behind the reading. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     stamp_ns: u64,
-    /// The instant that it is of; of a sweep that of its last beam. [ns, `time.monotonic_ns()`]
+    /// Instant of the reading; for a sweep, the instant of its last beam. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     shown_ns: u64,
-    /// When the runtime had it. [ns, `time.monotonic_ns()`]
+    /// Time at which the runtime received the reading. [ns, `time.monotonic_ns()`]
     #[pyo3(get)]
     ready_ns: u64,
     range_m: Option<f32>,
@@ -170,7 +171,7 @@ impl SensorReading {
         }
     }
 
-    /// Whether it is the sensor of this name.
+    /// Returns whether the sensor has this name.
     pub(crate) fn is(&self, name: &str) -> bool {
         self.name == name
     }
@@ -178,16 +179,16 @@ impl SensorReading {
 
 #[pymethods]
 impl SensorReading {
-    /// 'lidar', 'range_finder', 'sonar' or 'radar'.
+    /// Kind: 'lidar', 'range_finder', 'sonar' or 'radar'.
     #[getter]
     fn kind(&self) -> &'static str {
         self.kind.name()
     }
 
-    /// What was measured: a read-only structured view of shape (N,). [sensor: x forward, y left, z up]
+    /// Measured values: a read-only structured view of shape (N,). [sensor: x forward, y left, z up]
     ///
     /// lidar: `p_m` (3 x float32, [m]), `before_ns` (uint32), `intensity` (uint16), `ring` (uint16);
-    /// range_finder, sonar (N is 1): `range_m` (0 is no echo), `signal` (float32);
+    /// range_finder, sonar (N is 1): `range_m` (0 means no echo), `signal` (float32);
     /// radar: `range_m`, `azimuth_rad`, `radial_mps`, `snr_db`, `cross_section_m2` (float32).
     #[getter]
     fn records<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
@@ -196,13 +197,13 @@ impl SensorReading {
         let bytes = &this.memory.bytes()[this.records_at..this.records_at + len];
         let view = ArrayView1::from(bytes);
         // SAFETY: `slf` becomes the array's base. It is frozen and owns the memory through an `Arc`, whose bytes
-        // neither move nor change while it lives. The array is made read-only before anyone sees it.
+        // neither move nor change while it lives. The array is made read-only before other code sees it.
         let array = unsafe { PyArray1::borrow_from_array(&view, slf.clone().into_any()) };
         array.readwrite().make_nonwriteable();
         array.call_method1("view", (record_type(slf.py(), this.kind)?,))
     }
 
-    /// The points of a LiDAR: a read-only view of shape (N, 3), float32; None of another sensor. [m, sensor]
+    /// Points of a LiDAR: a read-only view of shape (N, 3), float32; None for other sensors. [m, sensor]
     #[getter]
     fn points_m<'py>(slf: &Bound<'py, Self>) -> PyResult<Option<Bound<'py, PyAny>>> {
         if slf.get().kind != SensorKind::Lidar {
@@ -211,20 +212,19 @@ impl SensorReading {
         Self::records(slf)?.get_item("p_m").map(Some)
     }
 
-    /// The distance that a range finder or a sonar has measured; None where nothing came back, and of other
-    /// sensors. [m]
+    /// Distance measured by a range finder or sonar; None without a return, and for other sensors. [m]
     #[getter]
     fn range_m(&self) -> Option<f32> {
         self.range_m
     }
 
-    /// Where the sensor sits.
+    /// Pose of the sensor on the body.
     #[getter]
     fn body_from_sensor(&self) -> Pose {
         Pose::new("body", "sensor", &self.body_from_sensor)
     }
 
-    /// Where the body was at the instant that it is of; None where the course withholds the pose. [m, world]
+    /// Pose of the body at the instant of the reading; None if the course withholds the pose. [m, world]
     #[getter]
     fn pose_at_reading(&self) -> Option<Pose> {
         self.pose_at_reading.map(|pose| Pose::new("world", "body", &pose))
@@ -236,7 +236,7 @@ impl SensorReading {
     }
 }
 
-/// Returns the numpy dtype of a kind's records, as `vizflyt_protocol::sensor::records` lays them out.
+/// Returns the numpy dtype of a kind's records, in the layout of `vizflyt_protocol::sensor::records`.
 fn record_type(py: Python<'_>, kind: SensorKind) -> PyResult<Bound<'_, PyAny>> {
     static TYPES: [PyOnceLock<Py<PyAny>>; 4] = [const { PyOnceLock::new() }; 4];
     let fields: &[(&str, &str, usize)] = match kind {

@@ -1,4 +1,4 @@
-//! What a plugin asks of the vehicle.
+//! Setpoints that a plugin returns.
 
 use numpy::ndarray::ArrayViewD;
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -11,15 +11,15 @@ use vizflyt_sdk::{
 
 use crate::arguments::{NotFiniteError, Points, numbers, scalar, vector, wrong_shape, wrong_type};
 
-/// What a plugin asks of the vehicle; the newest one holds until the guard's deadline of 0.5 s.
+/// Requested motion of the vehicle. The newest setpoint stays in force until the guard's deadline of 0.5 s.
 ///
-/// `yaw` is where the nose shall point: an angle from world x, counter-clockwise [rad]. `yaw_rate` is how
-/// fast it shall turn, counter-clockwise [rad/s]. Without either the heading stays; on a path the nose
-/// points into the direction of travel.
+/// `yaw` is the direction of the nose: an angle from world x, counter-clockwise [rad]. `yaw_rate` is the rate of
+/// turn, counter-clockwise [rad/s]. Without either, the heading does not change; on a path the nose points in
+/// the direction of travel.
 ///
-/// `axes` are those in which a vector is given: 'world' (x east, y north, z up), 'heading' (x along the
-/// nose, y left, z up, levelled: ahead never means into the floor) or 'body' (x forward, y left, z up, as
-/// the vehicle is tilted at the moment).
+/// `axes` are the axes of a vector: 'world' (x east, y north, z up), 'heading' (x along the nose, y left, z up,
+/// level: forward never points at the floor) or 'body' (x forward, y left, z up, with the vehicle's current
+/// tilt).
 #[pyclass(frozen, module = "vizflyt", from_py_object)]
 #[derive(Clone, PartialEq)]
 pub(crate) struct Setpoint(pub(crate) SdkSetpoint);
@@ -32,7 +32,7 @@ impl Setpoint {
     #[pyo3(signature = (*_args, **_kwargs))]
     fn make(_args: &Bound<'_, PyAny>, _kwargs: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
         Err(PyTypeError::new_err(
-            "a Setpoint is made by what it asks for: Setpoint.velocity([x, y, z]), .position, .offset, \
+            "create a Setpoint with one of: Setpoint.velocity([x, y, z]), .position, .offset, \
              .acceleration, .waypoints, .hold() or .land()",
         ))
     }
@@ -43,14 +43,14 @@ impl Setpoint {
         Self(SdkSetpoint::Hold)
     }
 
-    /// Come down here and disarm.
+    /// Land here and disarm.
     #[staticmethod]
     fn land() -> Self {
         Self(SdkSetpoint::Land)
     }
 
-    /// Go straight up or down to the height at which the plugin took over after take-off. (The runtime
-    /// takes off by itself as soon as the plugin answers images.)
+    /// Climb or descend vertically to the height at which the plugin got control after take-off. (The runtime
+    /// takes off automatically as soon as the plugin replies to images.)
     #[staticmethod]
     fn take_off() -> Self {
         Self(SdkSetpoint::TakeOff)
@@ -68,8 +68,8 @@ impl Setpoint {
         Ok(Self(SdkSetpoint::Position { p_world_m, yaw: yaw_target(yaw, yaw_rate)? }))
     }
 
-    /// Fly to a point (3,) given from where the vehicle is when the runtime takes this, and stay: for
-    /// plugins that do not know their position. [m, axes]
+    /// Fly to a point (3,) relative to the vehicle's position at the time when the runtime takes the setpoint,
+    /// and stay: for plugins that do not have their position. [m, axes]
     #[staticmethod]
     #[pyo3(signature = (d_m, *, axes = None, yaw = None, yaw_rate = None))]
     fn offset(
@@ -95,7 +95,7 @@ impl Setpoint {
         Ok(Self(SdkSetpoint::Velocity { v_mps, axes, yaw: yaw_target(yaw, yaw_rate)? }))
     }
 
-    /// Accelerate (3,), gravity already compensated: zero keeps the velocity. [m/s^2, axes]
+    /// Accelerate (3,). Gravity is compensated: zero keeps the velocity. [m/s^2, axes]
     #[staticmethod]
     #[pyo3(signature = (a_mps2, *, axes = None, yaw = None, yaw_rate = None))]
     fn acceleration(
@@ -108,8 +108,8 @@ impl Setpoint {
         Ok(Self(SdkSetpoint::Acceleration { a_mps2, axes, yaw: yaw_target(yaw, yaw_rate)? }))
     }
 
-    /// Turn at body rates (3,) [rad/s, body] under a thrust, of all motors together over the vehicle's
-    /// weight: 1 carries it when level. Only where the course allows it (`ArenaInfo.attitude_rate`).
+    /// Turn at body rates (3,) [rad/s, body] with a thrust of all motors, relative to the vehicle's weight: 1
+    /// carries the level vehicle. Only if the course allows it (`ArenaInfo.attitude_rate`).
     #[staticmethod]
     fn attitude_rate(
         omega_body_radps: &Bound<'_, PyAny>,
@@ -120,12 +120,12 @@ impl Setpoint {
         Ok(Self(SdkSetpoint::AttitudeRate { omega_body_radps, thrust }))
     }
 
-    /// Follow straight lines through up to 32 points (N, 3) [m, axes], at most at `speed_mps` (one number,
-    /// or one per point for the way to it) [m/s], and stay at the last.
+    /// Follow straight lines through up to 32 points (N, 3) [m, axes], with a maximum speed of `speed_mps` (one
+    /// number, or one per point for the way to it) [m/s], and stay at the last point.
     ///
-    /// The runtime follows it as long as the plugin answers images, with None or the same path again. A
-    /// path of another `id` starts again. With axes 'heading' or 'body' the points count from where the
-    /// vehicle is when the runtime takes the path.
+    /// The runtime follows the path as long as the plugin replies to images, with None or the same path. A path
+    /// with another `id` starts from its first point. With axes 'heading' or 'body', the points are relative to
+    /// the vehicle's position at the time when the runtime takes the path.
     #[staticmethod]
     #[pyo3(signature = (
         points_m, speed_mps = None, *, id = 0, axes = None, yaw = None, yaw_rate = None
@@ -151,9 +151,9 @@ impl Setpoint {
         trajectory(id, axes, Path::Waypoints(path), yaw, yaw_rate)
     }
 
-    /// Follow up to 8 polynomial pieces, one after the other: piece i lasts `seconds[i]` [s], and after t
-    /// seconds of it the position is the sum of `coefficients[i, k] * t**k`. `coefficients` has the shape
-    /// (pieces, up to 8, 3). [m/s^k, axes]
+    /// Follow up to 8 polynomial pieces, one after the other. Piece i takes `seconds[i]` [s]; t seconds after
+    /// its start, the position is the sum of `coefficients[i, k] * t**k`. `coefficients` has the shape (pieces,
+    /// up to 8, 3). [m/s^k, axes]
     ///
     /// Otherwise as `waypoints`.
     #[staticmethod]
@@ -191,7 +191,7 @@ impl Setpoint {
         trajectory(id, axes, Path::Polynomial(pieces.collect()), yaw, yaw_rate)
     }
 
-    /// What it asks for: 'hold', 'land', 'take_off', 'position', 'offset', 'velocity', 'acceleration',
+    /// Kind of setpoint: 'hold', 'land', 'take_off', 'position', 'offset', 'velocity', 'acceleration',
     /// 'attitude_rate' or 'trajectory'.
     #[getter]
     fn kind(&self) -> &'static str {
@@ -236,7 +236,7 @@ impl Setpoint {
     }
 }
 
-/// Speed on a path if none is given: a walk. [m/s]
+/// Default speed on a path: walking speed. [m/s]
 const WAYPOINT_MPS: f64 = 1.0;
 
 fn trajectory(
@@ -298,7 +298,7 @@ fn one_or_each(
 
 fn too_many(name: &str, what: &str, found: usize, most: usize) -> PyErr {
     PyValueError::new_err(format!(
-        "{name} has {found} {what}, and a path at most {most}: send the rest, under another id, when \
+        "{name} has {found} {what}, but a path has at most {most}: send the rest, under another id, when \
          the vehicle is near its end"
     ))
 }

@@ -1,9 +1,8 @@
-//! The memory behind an observation, and numpy arrays that lie in it.
+//! Memory of an observation, and numpy arrays that lie in it.
 //!
-//! An array keeps its [`Memory`] alive through its base object, so whatever a plugin keeps stays what
-//! it was: the runtime does not write to memory that is borrowed. It can lend only
-//! [`BORROWED_OBSERVATIONS`] at once; when a plugin has kept all but the last of them, new ones are copied
-//! to memory of our own and given back at once ([`Lender::take`]).
+//! An array keeps its [`Memory`] alive through its base object, so kept arrays do not change: the runtime does
+//! not write to borrowed memory. It lends at most [`BORROWED_OBSERVATIONS`]. When a plugin has kept all but the
+//! last of them, new observations are copied to owned memory and returned at once ([`Lender::take`]).
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -17,10 +16,10 @@ use zerocopy::{FromBytes, IntoBytes};
 
 use crate::observation::CameraImage;
 
-/// The bytes of one observation, wherever they lie.
+/// Bytes of one observation, in shared or owned memory.
 pub(crate) struct Memory {
     bytes: Bytes,
-    /// The cameras' names, in the order of their index.
+    /// Names of the cameras, in the order of their index.
     pub(crate) names: Arc<[Name]>,
 }
 
@@ -29,11 +28,11 @@ enum Bytes {
         sample: ObservationSample,
         _loan: Loan,
     },
-    /// In units of 8 bytes, which is what the layout needs to be aligned to.
+    /// In units of 8 bytes, the alignment of the layout.
     Own(Vec<u64>),
 }
 
-/// Counts observations that are borrowed from the runtime.
+/// Counts observations borrowed from the runtime.
 #[derive(Clone, Default)]
 pub(crate) struct Lender(Arc<AtomicUsize>);
 
@@ -46,7 +45,7 @@ impl Drop for Loan {
 }
 
 impl Lender {
-    /// Returns the memory of an observation; a copy if with this one all that can be borrowed is.
+    /// Returns the memory of an observation; a copy if this one would use the last slot.
     pub(crate) fn take(&self, sample: ObservationSample, names: Arc<[Name]>) -> Memory {
         if self.0.load(Ordering::Relaxed) + 1 >= BORROWED_OBSERVATIONS {
             return Memory::copied(sample.bytes(), names);
@@ -72,13 +71,13 @@ impl Memory {
         }
     }
 
-    /// Whether it is a copy.
+    /// Returns whether it is a copy.
     pub(crate) fn is_copy(&self) -> bool {
         matches!(self.bytes, Bytes::Own(_))
     }
 }
 
-/// Returns the bytes of `memory` from `at` on as a read-only array (H, W, 3) whose base is `owner`.
+/// Returns the bytes of `memory` from `at` on as a read-only array (H, W, 3) with the base `owner`.
 pub(crate) fn rgb_array<'py>(
     owner: &Bound<'py, CameraImage>,
     at: usize,
@@ -86,15 +85,15 @@ pub(crate) fn rgb_array<'py>(
 ) -> Bound<'py, PyArray3<u8>> {
     let plane = &owner.get().memory().bytes()[at..at + 3 * height * width];
     let view = ArrayView3::from_shape((height, width, 3), plane).expect("sized above");
-    // SAFETY: `owner` becomes the array's base. It is frozen and owns the memory through an `Arc`,
-    // whose bytes neither move nor change while it lives: shared memory that is borrowed, or a
-    // vector nobody else has. The array is made read-only before anyone sees it.
+    // SAFETY: `owner` becomes the array's base. It is frozen and owns the memory through an `Arc`, whose bytes
+    // neither move nor change while it lives: borrowed shared memory, or a vector that no other code can access.
+    // The array is made read-only before other code sees it.
     let array = unsafe { PyArray3::borrow_from_array(&view, owner.clone().into_any()) };
     array.readwrite().make_nonwriteable();
     array
 }
 
-/// As [`rgb_array`], of 16-bit numbers (H, W).
+/// As [`rgb_array`], for 16-bit numbers (H, W).
 pub(crate) fn depth_array<'py>(
     owner: &Bound<'py, CameraImage>,
     at: usize,

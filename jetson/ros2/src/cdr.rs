@@ -1,8 +1,9 @@
-//! Common Data Representation (OMG, "CDR", version 1): what ROS 2 messages are on the wire.
+//! Common Data Representation (OMG, "CDR", version 1): the wire format of ROS 2 messages.
 //!
-//! Every number is aligned to its own size, counted from the first byte behind the encapsulation header, which the
-//! DDS library writes and reads. Strings carry their length with the NUL at their end; sequences their count. Written
-//! is little-endian; read is either. Ours and not `serde`'s: an image's megabyte is one copy here, not a call a byte.
+//! Every number is aligned to its size, counted from the first byte after the encapsulation header, which the DDS
+//! library writes and reads. Strings have their length and a terminating NUL; sequences have their count. The writer is
+//! little-endian; the reader accepts both byte orders. Not based on `serde`, so that an image of 1 MB is copied at once
+//! and not byte by byte.
 
 use thiserror::Error;
 
@@ -12,7 +13,7 @@ pub struct Writer {
     bytes: Vec<u8>,
 }
 
-/// Reads a message of either byte order. Never reads beyond its bytes, never allocates more than they can hold.
+/// Reads a message of either byte order. Never reads beyond its bytes, and never allocates more than they can hold.
 #[derive(Clone, Debug)]
 pub struct Reader<'a> {
     bytes: &'a [u8],
@@ -20,22 +21,22 @@ pub struct Reader<'a> {
     little: bool,
 }
 
-/// Why bytes are no message of their type.
+/// Why bytes do not decode.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 pub enum CdrError {
-    /// They end too early.
-    #[error("it ends at byte {0}, within a field")]
+    /// The bytes end within a field.
+    #[error("the message ends at byte {0}, within a field")]
     Short(usize),
-    /// A string is not UTF-8 with a NUL behind it.
+    /// A string is not UTF-8 with a terminating NUL.
     #[error("the string at byte {0} is not UTF-8 with a NUL at its end")]
     Text(usize),
-    /// A sequence claims more elements than are read here.
+    /// The count of a sequence exceeds the limit.
     #[error("the sequence at byte {0} claims {1} elements")]
     Long(usize, u32),
 }
 
 impl Writer {
-    /// Makes a writer with room for so many bytes.
+    /// Creates a writer with this capacity.
     pub fn with_capacity(bytes: usize) -> Self {
         Self { bytes: Vec::with_capacity(bytes) }
     }
@@ -49,18 +50,18 @@ impl Writer {
         self.bytes.resize(self.bytes.len().next_multiple_of(to), 0);
     }
 
-    /// Writes a byte; a `bool` is one of 0 or 1.
+    /// Writes a byte. A `bool` is 0 or 1.
     pub fn u8(&mut self, value: u8) {
         self.bytes.push(value);
     }
 
-    /// Writes 32 bits.
+    /// Writes an unsigned number of 32 bits.
     pub fn u32(&mut self, value: u32) {
         self.align(4);
         self.bytes.extend_from_slice(&value.to_le_bytes());
     }
 
-    /// Writes 32 bits with a sign.
+    /// Writes a signed number of 32 bits.
     pub fn i32(&mut self, value: i32) {
         self.u32(value as u32);
     }
@@ -71,7 +72,7 @@ impl Writer {
         self.bytes.extend_from_slice(&value.to_le_bytes());
     }
 
-    /// Writes an array of doubles, whose length both ends know.
+    /// Writes an array of doubles, without its length.
     pub fn f64s(&mut self, values: &[f64]) {
         for &value in values {
             self.f64(value);
@@ -115,12 +116,12 @@ impl<'a> Reader<'a> {
         self.take().map(u8::from_le_bytes)
     }
 
-    /// Reads 32 bits.
+    /// Reads an unsigned number of 32 bits.
     pub fn u32(&mut self) -> Result<u32, CdrError> {
         self.take().map(u32::from_le_bytes)
     }
 
-    /// Reads 32 bits with a sign.
+    /// Reads a signed number of 32 bits.
     pub fn i32(&mut self) -> Result<i32, CdrError> {
         self.take().map(i32::from_le_bytes)
     }
@@ -139,7 +140,7 @@ impl<'a> Reader<'a> {
         Ok(values)
     }
 
-    /// Reads a string. One of length 0, which the standard forbids and some senders write, is empty.
+    /// Reads a string. A string of length 0, which the standard forbids but some senders write, is empty.
     pub fn text(&mut self) -> Result<&'a str, CdrError> {
         let len = self.u32()? as usize;
         let begin = self.at;
@@ -165,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_aligned_and_strings_end_in_nul() {
+    fn aligns_numbers_and_ends_strings_with_nul() {
         let mut writer = Writer::default();
         writer.u8(1);
         writer.u32(2);
@@ -181,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn the_other_byte_order_is_read_too() {
+    fn reads_big_endian_messages() {
         let bytes = [&[0, 0, 0, 3, b'h', b'i', 0, 0][..], &2.5f64.to_be_bytes()].concat();
         let mut reader = Reader::new(&bytes, false);
         assert_eq!((reader.text(), reader.f64()), (Ok("hi"), Ok(2.5)));
@@ -189,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_string_is_refused() {
+    fn rejects_invalid_strings_and_long_sequences() {
         for (bytes, expected) in [
             (&[2, 0, 0, 0, b'a', b'b'][..], CdrError::Text(4)),
             (&[2, 0, 0, 0, 0xff, 0], CdrError::Text(4)),

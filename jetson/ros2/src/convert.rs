@@ -1,7 +1,7 @@
-//! Observations as ROS 2 messages. Pure: an observation and a clock in, messages out.
+//! Converts observations to ROS 2 messages. Pure: an observation and a clock in, messages out.
 //!
 //! World and body are ROS's `map` and `base_link` (REP 103, REP 105: x forward or east, y left or north, z up), and
-//! `cam` is an optical frame (z forward, x right, y down), so nothing is turned here.
+//! `cam` is an optical frame (z forward, x right, y down), so no rotation is necessary.
 
 use std::borrow::Cow;
 
@@ -21,16 +21,16 @@ pub struct Frames {
     prefix: String,
     /// The world.
     pub map: String,
-    /// The same: localization does not drift.
+    /// Identical to `map`, because localization does not drift.
     pub odom: String,
     /// The body.
     pub base_link: String,
-    /// The body levelled: x along the nose's heading, z up.
+    /// The levelled body: x along the heading, z up.
     pub base_stabilized: String,
 }
 
 impl Frames {
-    /// Makes them, with a prefix such as `drone1/` for one vehicle of several.
+    /// Creates the names with a prefix, for example `drone1/` for one vehicle of several.
     pub fn new(prefix: &str) -> Self {
         let named = |name: &str| format!("{prefix}{name}");
         Self {
@@ -42,28 +42,28 @@ impl Frames {
         }
     }
 
-    /// Returns a camera's frame.
+    /// Returns the frame of a camera.
     pub fn optical(&self, camera: &str) -> String {
         format!("{}{camera}_optical_frame", self.prefix)
     }
 
-    /// Returns a sensor's frame.
+    /// Returns the frame of a sensor.
     pub fn sensor(&self, sensor: &str) -> String {
         format!("{}{sensor}", self.prefix)
     }
 }
 
-/// This computer's monotonic clock as time since 1970, which is what ROS 2 stamps by.
+/// Converts this computer's monotonic clock to time since 1970, which ROS 2 uses for stamps.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RosClock {
     offset_ns: i64,
 }
 
 impl RosClock {
-    /// A step of the computer's calendar clock smaller than this is not followed, so that stamps stay even. [ns]
+    /// Smaller differences of the calendar clock are ignored, so that stamps stay regular. [ns]
     const STEP_NS: i64 = 5_000_000;
 
-    /// Takes both clocks at one moment. [ns since 1970; host]
+    /// Stores the difference of both clocks at one moment. [ns since 1970; host]
     pub fn relate(&mut self, unix_ns: i64, host: HostTime) {
         let offset_ns = unix_ns - host.as_ns() as i64;
         if (offset_ns - self.offset_ns).abs() > Self::STEP_NS {
@@ -71,20 +71,20 @@ impl RosClock {
         }
     }
 
-    /// Returns a stamp.
+    /// Returns the stamp of an instant.
     pub fn time(&self, host: HostTime) -> Time {
         Time::from_ns(host.as_ns() as i64 + self.offset_ns)
     }
 }
 
-/// How depth is sent (REP 118).
+/// Encoding of depth (REP 118).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum DepthEncoding {
-    /// Metres as 32-bit floats; NaN is no return
+    /// Metres as 32-bit floats; NaN means no return
     #[default]
     #[value(name = "32fc1")]
     Metres,
-    /// Millimetres as 16-bit integers; 0 is no return
+    /// Millimetres as 16-bit integers; 0 means no return
     #[value(name = "16uc1")]
     Millimetres,
 }
@@ -95,7 +95,7 @@ pub fn image<'a>(header: Header, intrinsics: &Intrinsics, rgb: &'a [u8]) -> Imag
     Image { header, height, width, encoding: "rgb8", step: 3 * width, data: Cow::Borrowed(rgb) }
 }
 
-/// Returns a depth image, on a computer that is little-endian, as all are that fly.
+/// Returns a depth image. Assumes a little-endian computer, as all supported ones are.
 pub fn depth<'a>(
     header: Header,
     intrinsics: &Intrinsics,
@@ -113,15 +113,15 @@ pub fn depth<'a>(
     Image { header, height, width, encoding, step: pixel * width, data }
 }
 
-/// Returns depth in metres; NaN where there is none.
+/// Returns depth in metres; NaN without a return.
 fn metres(depth_mm: u16) -> f32 {
     if depth_mm == 0 { f32::NAN } else { f32::from(depth_mm) / 1000.0 }
 }
 
-/// Returns how an image was rendered.
+/// Returns the calibration of an image.
 pub fn camera_info(header: Header, intrinsics: &Intrinsics) -> CameraInfo {
     let k = intrinsics;
-    // ROS, as OpenCV, puts the centre of the first pixel at 0; we its corner.
+    // ROS and OpenCV put the centre of the first pixel at 0, VizFlyt its corner.
     let (cx, cy) = (k.cx_px - 0.5, k.cy_px - 0.5);
     let coefficients = k.distortion.to_wire().1;
     let (distortion_model, d) = match k.distortion {
@@ -139,7 +139,7 @@ pub fn camera_info(header: Header, intrinsics: &Intrinsics) -> CameraInfo {
     }
 }
 
-/// Directions of a camera's pixels: `(x / z, y / z)`, NaN where the lens shows nothing; kept from image to image.
+/// Directions of a camera's pixels: `(x / z, y / z)`, NaN outside the lens's image. Cached between images.
 #[derive(Debug, Default)]
 pub struct Rays {
     of: Option<Intrinsics>,
@@ -163,7 +163,7 @@ impl Rays {
 const DEPTH_FIELDS: &[PointField] =
     &[("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32), ("rgb", 12, FLOAT32)];
 
-/// Returns an image's depth as points in its optical frame, one for each pixel; NaN where there is none.
+/// Returns an image's depth as points in its optical frame, one for each pixel; NaN without a return.
 pub fn depth_points<'a>(
     header: Header,
     intrinsics: &Intrinsics,
@@ -178,7 +178,7 @@ pub fn depth_points<'a>(
         for value in [x * z_m, y * z_m, z_m] {
             data.extend_from_slice(&value.to_le_bytes());
         }
-        // As PCL packs it: blue is the lowest byte.
+        // PCL's packing: blue is the lowest byte.
         data.extend_from_slice(&[color[2], color[1], color[0], 0]);
     }
     PointCloud2 {
@@ -223,7 +223,7 @@ pub fn imu(clock: RosClock, frames: &Frames, sample: &ImuSample) -> Imu {
     }
 }
 
-/// Returns pose and odometry of a vehicle; `None` where the course withholds them.
+/// Returns pose and odometry of a vehicle; `None` if the course withholds them.
 pub fn pose_and_odometry(
     clock: RosClock,
     frames: &Frames,
@@ -255,7 +255,7 @@ fn transform(
     TransformStamped { header, child_frame_id: child, translation, rotation }
 }
 
-/// Returns where the body is, and the levelled body below it.
+/// Returns the transforms of the body and of the levelled body.
 pub fn moving(stamp: Time, frames: &Frames, pose: &Pose<World, Body>) -> [TransformStamped; 2] {
     let levelled = DQuat::from_rotation_z(yaw_of(pose.rotation));
     let body_from_levelled = pose.rotation.inverse() * levelled;
@@ -266,7 +266,7 @@ pub fn moving(stamp: Time, frames: &Frames, pose: &Pose<World, Body>) -> [Transf
     ]
 }
 
-/// Returns where a camera or a sensor sits in the body.
+/// Returns the transform of a camera or sensor in the body.
 pub fn mounted<F: Frame>(
     stamp: Time,
     frames: &Frames,
@@ -276,12 +276,12 @@ pub fn mounted<F: Frame>(
     transform(stamp, &frames.base_link, child, mounting.translation_m, mounting.rotation)
 }
 
-/// Returns `odom` in `map`: the same.
+/// Returns the transform of `odom` in `map`: the identity.
 pub fn odom_in_map(stamp: Time, frames: &Frames) -> TransformStamped {
     transform(stamp, &frames.map, frames.odom.clone(), DVec3::ZERO, DQuat::IDENTITY)
 }
 
-/// Returns an image's header.
+/// Returns the header of an image.
 pub fn optical_header(stamp: Time, frames: &Frames, camera: &str) -> Header {
     Header { stamp, frame_id: frames.optical(camera) }
 }
@@ -312,9 +312,9 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_is_told_by_the_centres_of_its_pixels() {
+    fn camera_info_counts_from_pixel_centres() {
         let info = camera_info(Header::default(), &intrinsics());
-        // 90 degrees over 4 pixels: f = 2; the middle lies between the second and the third.
+        // 90 degrees over 4 pixels: f = 2; the middle lies between the second and the third pixel.
         for (found, expected) in [(info.k[0], 2.0), (info.k[2], 1.5), (info.k[5], 0.5)] {
             assert!((found - expected).abs() < 1e-12, "{found} is not {expected}");
         }
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixels_point_lies_on_its_ray() {
+    fn points_lie_on_the_rays_of_their_pixels() {
         let (camera, mut rays) = (intrinsics(), Rays::default());
         let (rgb, mut depth_mm) = ([7u8; 24], [0u16; 8]);
         depth_mm[3] = 2000;
@@ -340,8 +340,8 @@ mod tests {
     }
 
     #[test]
-    fn the_optical_frame_looks_ahead_and_the_levelled_one_is_level() {
-        // A camera that looks ahead: its z is the body's x.
+    fn optical_frame_points_forward_and_stabilized_frame_is_level() {
+        // A camera that points forward: its z is the body's x.
         let (frames, camera) = (Frames::new(""), body_from_forward_cam(DVec3::ZERO, 0.0));
         let fixed = mounted(Time::default(), &frames, frames.optical("front"), &camera);
         assert_eq!(fixed.child_frame_id, "front_optical_frame");
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_twist_is_given_in_the_body() {
+    fn odometry_twist_is_in_body_axes() {
         let north = DQuat::from_rotation_z(FRAC_PI_2);
         let mut vehicle = Vehicle {
             stamp: HostTime::from_ns(5),
@@ -374,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn stamps_stay_even_until_the_calendar_steps() {
+    fn stamps_stay_regular_until_the_calendar_clock_steps() {
         let mut clock = RosClock::default();
         clock.relate(1_000_000_000_000, HostTime::from_ns(100));
         assert_eq!(clock.time(HostTime::from_ns(100)).sec, 1000);

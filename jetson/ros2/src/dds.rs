@@ -1,10 +1,10 @@
-//! The one file that speaks DDS: a participant with a writer for each topic sent and a reader for each received.
+//! The only module that uses DDS: a participant with a writer for each sent topic and a reader for each received topic.
 //!
-//! By RustDDS, alone. It needs neither ROS nor C to build, is kept by its own company, is Apache-2.0, and sends an image
-//! as fragments (DATA_FRAG) without blocking who writes it. Looked at beside it: `ros2-client` adds nodes, services and
-//! the very same RustDDS, and an executor that has no place in a plugin; `dust_dds` derives its own types for each message,
-//! where a megabyte should be handed over as it is; Cyclone's bindings (`cyclonedds-rs`) name no licence and build C;
-//! Zenoh needs a bridge or `rmw_zenoh` on the other side.
+//! Uses only RustDDS. It needs neither ROS nor C for the build, a company maintains it, it is Apache-2.0, and it sends
+//! an image as fragments (DATA_FRAG) without blocking the writer. Alternatives: `ros2-client` adds nodes, services and
+//! an executor that does not fit into a plugin, on the same RustDDS; `dust_dds` derives types for each message, but 1
+//! MB should be passed as bytes; Cyclone's bindings (`cyclonedds-rs`) have no licence and build C; Zenoh needs a bridge
+//! or `rmw_zenoh` on the other side.
 
 use std::collections::HashMap;
 use std::convert::Infallible;
@@ -26,7 +26,7 @@ use crate::topics::{Qos, Topic};
 
 /// A participant in a domain.
 pub(crate) struct Dds {
-    /// By name in ROS.
+    /// By ROS name.
     writers: HashMap<String, Writer>,
     publisher: Publisher,
     subscriber: Subscriber,
@@ -37,18 +37,18 @@ pub(crate) struct Dds {
 
 struct Writer {
     writer: DataWriter<Bytes, Raw>,
-    /// Subscribers that match.
+    /// Number of matched subscribers.
     matched: i32,
 }
 
 /// A reader of one topic.
 pub(crate) struct Inbox {
-    /// The topic's name in ROS.
+    /// ROS name of the topic.
     pub(crate) name: String,
     reader: SimpleDataReader<Payload, Raw>,
 }
 
-/// A received message's bytes.
+/// Bytes of a received message.
 #[derive(Clone, Debug)]
 pub(crate) struct Payload {
     bytes: Vec<u8>,
@@ -56,7 +56,7 @@ pub(crate) struct Payload {
 }
 
 impl Dds {
-    /// Joins a domain; `interfaces` are the addresses that it uses, all without any.
+    /// Joins a domain. `interfaces` are the addresses to use; empty means all.
     pub(crate) fn join(
         domain: u16,
         interfaces: &[IpAddr],
@@ -85,7 +85,7 @@ impl Dds {
         Ok((made, qos))
     }
 
-    /// Announces a topic of the camera or sensor `of`, so that who waits for it is known before its first message.
+    /// Announces a topic of the camera or sensor `of`, so that its subscribers are known before the first message.
     pub(crate) fn announce(&mut self, topic: &Topic, of: &str) -> Result<()> {
         let name = topic.ros_name(&self.namespace, of);
         if self.writers.contains_key(&name) {
@@ -100,12 +100,12 @@ impl Dds {
         Ok(())
     }
 
-    /// Withdraws all topics that it sends.
+    /// Withdraws all sent topics.
     pub(crate) fn withdraw(&mut self) {
         self.writers.clear();
     }
 
-    /// Counts who has come and gone; called between images.
+    /// Updates the number of subscribers; called between images.
     pub(crate) fn count_subscribers(&mut self) {
         for (name, writer) in &mut self.writers {
             while let Some(status) = writer.writer.try_recv_status() {
@@ -115,8 +115,8 @@ impl Dds {
                     }
                     DataWriterStatus::OfferedIncompatibleQos { last_policy_id, .. } => {
                         tracing::warn!(
-                            "{name}: a subscriber asks for another quality of service \
-                             ({last_policy_id:?}) and gets nothing: docs/guides/ros2.md"
+                            "{name}: a subscriber requests an incompatible quality of service \
+                             ({last_policy_id:?}) and receives nothing: docs/guides/ros2.md"
                         );
                     }
                     _ => {}
@@ -125,21 +125,21 @@ impl Dds {
         }
     }
 
-    /// Whether anybody subscribes to a topic that was announced.
+    /// Returns whether an announced topic has a subscriber.
     pub(crate) fn is_wanted(&self, topic: &Topic, of: &str) -> bool {
         let name = topic.ros_name(&self.namespace, of);
         self.writers.get(&name).is_some_and(|writer| writer.matched > 0)
     }
 
-    /// Sends a message on a topic that was announced. What nobody waits for is not even encoded, but for what is kept
-    /// for who comes later.
+    /// Sends a message on an announced topic. Without subscribers it is not encoded, except for topics that DDS keeps
+    /// for late subscribers.
     pub(crate) fn send<M: Message>(&self, topic: &Topic, of: &str, message: &M) {
         if topic.qos == Qos::TfStatic || self.is_wanted(topic, of) {
             self.send_encoded(topic, of, message.encode());
         }
     }
 
-    /// Sends a message that was encoded before.
+    /// Sends an encoded message.
     pub(crate) fn send_encoded(&self, topic: &Topic, of: &str, message: Vec<u8>) {
         let name = topic.ros_name(&self.namespace, of);
         let Some(writer) = self.writers.get(&name) else { return };
@@ -161,8 +161,8 @@ impl Dds {
 }
 
 impl Inbox {
-    /// Returns the next message and how long ago it came [ns]; `None` if there is no more. Bytes that are no message of the
-    /// type are an error.
+    /// Returns the next message and the time since its arrival [ns]; `None` if the inbox is empty. Bytes that do not
+    /// decode are an error.
     pub(crate) fn next<M: Received>(&self) -> Option<Result<(M, u64), CdrError>> {
         self.reader.drain_read_notifications();
         let change = self.reader.try_take_one().ok().flatten()?;
@@ -205,12 +205,13 @@ fn policies(qos: Qos, reliable: bool) -> QosPolicies {
     }
 }
 
-/// RustDDS keeps all that a reliable subscriber has not acknowledged, whatever the depth: of one that has stopped, 8,192
-/// images. Of images it keeps these, and then leaves out what comes, without waiting, until that subscriber counts as gone.
+/// Limits the queue of reliable image topics. RustDDS keeps all messages that a reliable subscriber has not
+/// acknowledged, for any history depth: up to 8,192 images of a stopped subscriber. With this limit it drops new images
+/// without waiting, until that subscriber times out.
 const MOST_UNACKNOWLEDGED: ResourceLimits =
     ResourceLimits { max_samples: 32, max_instances: 1, max_samples_per_instance: 32 };
 
-/// Hands bytes over as they are: encoding is `cdr`'s.
+/// Passes bytes unchanged; `cdr` does the encoding.
 struct Raw;
 
 impl adapters::SerializerAdapter<Bytes> for Raw {
@@ -264,7 +265,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn images_that_wait_are_few_and_make_nobody_wait() {
+    fn image_queue_is_short_and_never_blocks() {
         let best_effort = policies(Qos::Bulk, false);
         assert_eq!(best_effort.history(), Some(History::KeepLast { depth: 2 }));
         let reliable = policies(Qos::Bulk, true);

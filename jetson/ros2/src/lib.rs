@@ -1,13 +1,15 @@
 //! A flight as a ROS 2 node, without ROS: `vizflyt ros2`, the command line's feature `ros2`.
 //!
-//! It is a plugin that attaches to `vizflyt fly --attach`: what a plugin sees goes out as ROS 2 messages over DDS, and
-//! velocities and paths come in as setpoints, which pass the guard as any plugin's do. `docs/guides/ros2.md` is the guide.
+//! The node is a plugin that attaches to `vizflyt fly --attach`. It sends observations as ROS 2 messages over DDS, and
+//! receives velocities and paths as setpoints, which pass the guard like those of any plugin. Guide:
+//! `docs/guides/ros2.md`.
 //!
 //! ```text
 //! runtime -> sdk -> node  on_image --> convert -> messages, cdr -> dds --> rviz2, Nav2, rosbag2 ...
 //!                         Setpoint <-- setpoint <- messages, cdr <- dds <--
 //! ```
-//! Only [`dds`] touches the network; conversions, messages and deadlines are pure. Why it is RustDDS stands there.
+//! Only [`dds`] uses the network; conversions, messages and deadlines are pure. [`dds`] also documents the choice of
+//! RustDDS.
 
 pub mod cdr;
 pub mod convert;
@@ -31,15 +33,15 @@ use self::convert::DepthEncoding;
 use self::dds::Dds;
 use self::node::{Node, Participants, Ros2};
 
-/// What the node logs unless told otherwise: the library's own steps are nobody's concern, nor that its end overtakes the
-/// removal of a writer.
+/// Default log filter. It hides the library's internal steps, and warnings about writers that are removed while it
+/// ends.
 pub const LOG_LEVEL: &str = "info,rustdds=error,rustdds::dds::pubsub=off";
-/// Between two looks for a runtime that waits.
+/// Interval between searches for a waiting runtime.
 const LOOK: Duration = Duration::from_millis(200);
 
 /// A flight as a ROS 2 node: images, poses and IMU out, velocities and paths in
 ///
-/// Attaches to `vizflyt fly --attach` on this computer, flight after flight, as a plugin does. The guide is
+/// Attaches to `vizflyt fly --attach` on this computer, flight after flight, as a plugin does. Guide:
 /// docs/guides/ros2.md.
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:
@@ -49,31 +51,31 @@ const LOOK: Duration = Duration::from_millis(200);
     '{header: {frame_id: base_stabilized}, twist: {linear: {x: 0.5}}}'
   ros2 topic pub --once /vizflyt/land std_msgs/msg/Empty")]
 pub struct Ros2Args {
-    /// The domain [default: $ROS_DOMAIN_ID, or 0]
+    /// DDS domain [default: $ROS_DOMAIN_ID, or 0]
     #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(..=232))]
     domain: Option<u16>,
-    /// Begins the names of topics, but for /tf and /tf_static
+    /// Prefix of all topic names except /tf and /tf_static
     #[arg(long, value_name = "NAME", default_value = "vizflyt", value_parser = namespace)]
     namespace: String,
-    /// Begins the names of frames: `drone1/` for one vehicle of several
+    /// Prefix of frame names, for example `drone1/` for one vehicle of several
     #[arg(long, value_name = "TEXT", default_value = "")]
     frame_prefix: String,
-    /// How depth is sent
+    /// Encoding of depth
     #[arg(long, value_name = "ENCODING", default_value = "32fc1")]
     depth: DepthEncoding,
-    /// Sends images, IMU and points reliably: for subscribers that ask for it, as rviz2 does unless told otherwise
+    /// Send images, IMU and points reliably, as rviz2 requests by default
     #[arg(long)]
     reliable: bool,
-    /// How fast paths are flown at most [m/s]
+    /// Maximum speed on paths [m/s]
     #[arg(long, value_name = "SPEED", default_value_t = 1.0, value_parser = speed)]
     path_speed: f64,
-    /// Uses only this address of this computer; may be given again
+    /// Use only this address of this computer; can be repeated
     #[arg(long, value_name = "ADDRESS")]
     interface: Vec<IpAddr>,
-    /// Ends with the first flight
+    /// End after the first flight
     #[arg(long)]
     once: bool,
-    /// Attaches to this runtime alone.
+    /// Attaches only to this runtime.
     #[arg(long = "vizflyt-service", value_name = "X", hide = true)]
     service: Option<String>,
 }
@@ -98,7 +100,7 @@ fn speed(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Runs the node: until a signal ends it, or with `--once` the flight.
+/// Runs the node until a signal ends it, or with `--once` until the flight ends.
 ///
 /// # Errors
 /// If the domain cannot be joined.
@@ -108,7 +110,7 @@ pub fn run(args: &Ros2Args) -> Result<ExitCode> {
         None => domain_of(std::env::var("ROS_DOMAIN_ID").ok().as_deref())?,
     };
     let dds = Arc::new(Participants::default());
-    // Before the first thread, which all inherit this.
+    // Before the first thread, because all threads inherit the signal mask.
     leave_on_signal(&dds)?;
     dds.join(|| Dds::join(domain, &args.interface, &args.namespace, args.reliable))?;
     let mut node = Node::new(args, &dds)?;
@@ -138,7 +140,7 @@ pub fn run(args: &Ros2Args) -> Result<ExitCode> {
     }
 }
 
-/// Returns the service of the only runtime that waits; else what it waits for, in a sentence.
+/// Returns the service of the only waiting runtime, or a sentence with the reason to wait.
 fn the_one(waiting: &[String]) -> Result<&str, String> {
     match waiting {
         [service] => Ok(service),
@@ -151,7 +153,7 @@ fn the_one(waiting: &[String]) -> Result<&str, String> {
     }
 }
 
-/// Returns the domain that the environment names.
+/// Returns the domain given by the environment variable.
 fn domain_of(variable: Option<&str>) -> Result<u16> {
     let Some(text) = variable.map(str::trim).filter(|text| !text.is_empty()) else { return Ok(0) };
     match text.parse() {
@@ -160,7 +162,7 @@ fn domain_of(variable: Option<&str>) -> Result<u16> {
     }
 }
 
-/// On SIGINT and SIGTERM says goodbye to all participants and ends the process; the runtime then lands the vehicle.
+/// On SIGINT and SIGTERM, leaves the DDS domain and ends the process; the runtime then lands the vehicle.
 fn leave_on_signal(dds: &Arc<Participants>) -> Result<()> {
     let mut signals = SigSet::empty();
     signals.add(Signal::SIGINT);
@@ -183,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_namespace_is_one_of_ros() {
+    fn accepts_only_valid_ros_namespaces() {
         assert_eq!(namespace("/lab/drone1/"), Ok("lab/drone1".to_owned()));
         for bad in ["", "1drone", "a//b", "a b", "é"] {
             assert!(namespace(bad).is_err(), "{bad}");
@@ -191,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn it_takes_no_flight_of_several() {
+    fn attaches_only_if_one_flight_waits() {
         let waiting = ["a".to_owned(), "b".to_owned()];
         assert_eq!(the_one(&waiting[..1]), Ok("a"));
         assert!(the_one(&[]).unwrap_err().contains("vizflyt fly --attach"));
@@ -199,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn the_domain_is_the_environments() {
+    fn reads_the_domain_from_the_environment() {
         assert_eq!(domain_of(None).unwrap(), 0);
         assert_eq!(domain_of(Some("42")).unwrap(), 42);
         assert!(domain_of(Some("233")).is_err() && domain_of(Some("x")).is_err());

@@ -1,4 +1,4 @@
-//! `vizflyt-ros2`: `vizflyt ros2` alone, for an embedded computer that needs nothing else.
+//! `vizflyt-ros2`: only `vizflyt ros2`, for an embedded computer that needs nothing else.
 
 use std::io::IsTerminal;
 use std::process::ExitCode;
@@ -20,7 +20,7 @@ fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
-    let filter: Targets = LOG_LEVEL.parse().expect("a filter of our own");
+    let filter: Targets = LOG_LEVEL.parse().expect("a valid filter");
     tracing_subscriber::registry().with(lines.with_filter(filter)).init();
     match run(&program.ros2) {
         Ok(code) => code,

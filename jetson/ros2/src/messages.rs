@@ -1,5 +1,5 @@
-//! The ROS 2 messages that are sent and received, field by field as their `.msg` files have them, which are the same from
-//! Humble to Rolling. Strings and sequences borrow where they can; what is always zero here has no field.
+//! The ROS 2 messages that are sent and received, field by field as in their `.msg` files, which are the same from
+//! Humble to Rolling. Strings and sequences borrow where possible; fields that are always zero here are omitted.
 
 use std::borrow::Cow;
 
@@ -9,18 +9,17 @@ use crate::cdr::{CdrError, Reader, Writer};
 
 /// A message that can be sent.
 pub trait Message {
-    /// Its type as people write it: `sensor_msgs/msg/Image`.
+    /// ROS name of the type, for example `sensor_msgs/msg/Image`.
     const TYPE: &'static str;
 
-    /// Writes it.
     fn write(&self, writer: &mut Writer);
 
-    /// Returns about how many bytes it takes, so that nothing is moved while it grows.
+    /// Returns the approximate size, to avoid reallocation. [bytes]
     fn size_hint(&self) -> usize {
         512
     }
 
-    /// Returns it as bytes, without the encapsulation header.
+    /// Returns the message as bytes, without the encapsulation header.
     fn encode(&self) -> Vec<u8> {
         let mut writer = Writer::with_capacity(self.size_hint());
         self.write(&mut writer);
@@ -42,14 +41,14 @@ impl<M: Message> Message for &M {
 
 /// A message that can be received.
 pub trait Received: Message + Sized {
-    /// Reads it.
+    /// Reads a message.
     ///
     /// # Errors
-    /// [`CdrError`] if the bytes are none.
+    /// [`CdrError`] if the bytes do not decode.
     fn read(reader: &mut Reader<'_>) -> Result<Self, CdrError>;
 }
 
-/// builtin_interfaces/Time: since 1970.
+/// builtin_interfaces/Time: time since 1970.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Time {
     /// [s]
@@ -59,7 +58,7 @@ pub struct Time {
 }
 
 impl Time {
-    /// Returns the time so many nanoseconds after 1970.
+    /// Returns the time this many nanoseconds after 1970.
     pub fn from_ns(ns: i64) -> Self {
         let (sec, nanosec) = (ns.div_euclid(1_000_000_000), ns.rem_euclid(1_000_000_000));
         Self { sec: sec.clamp(i32::MIN.into(), i32::MAX.into()) as i32, nanosec: nanosec as u32 }
@@ -69,9 +68,9 @@ impl Time {
 /// std_msgs/Header.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Header {
-    /// When it was true.
+    /// Time of the content.
     pub stamp: Time,
-    /// In whose axes.
+    /// Frame of the content.
     pub frame_id: String,
 }
 
@@ -103,7 +102,7 @@ fn read_vector(reader: &mut Reader<'_>) -> Result<DVec3, CdrError> {
 /// sensor_msgs/Image, little-endian.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Image<'a> {
-    /// Of the instant that it shows, in the optical frame.
+    /// Instant that the image shows, and the optical frame.
     pub header: Header,
     /// Rows.
     pub height: u32,
@@ -111,9 +110,9 @@ pub struct Image<'a> {
     pub width: u32,
     /// `rgb8`, `32FC1`, `16UC1`.
     pub encoding: &'static str,
-    /// Bytes of a row.
+    /// Bytes per row.
     pub step: u32,
-    /// Rows, the upper first.
+    /// Rows, the top one first.
     pub data: Cow<'a, [u8]>,
 }
 
@@ -138,11 +137,11 @@ impl Message for Image<'_> {
 /// sensor_msgs/CompressedImage.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CompressedImage {
-    /// As the image's.
+    /// The same as the image's.
     pub header: Header,
     /// `jpeg`.
     pub format: &'static str,
-    /// The file.
+    /// The JPEG file.
     pub data: Vec<u8>,
 }
 
@@ -163,7 +162,7 @@ impl Message for CompressedImage {
 /// sensor_msgs/CameraInfo, without binning and region of interest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraInfo {
-    /// As the image's.
+    /// The same as the image's.
     pub header: Header,
     /// Rows.
     pub height: u32,
@@ -171,7 +170,7 @@ pub struct CameraInfo {
     pub width: u32,
     /// `plumb_bob` or `equidistant`.
     pub distortion_model: &'static str,
-    /// Its coefficients.
+    /// Distortion coefficients.
     pub d: Vec<f64>,
     /// Intrinsics, 3 x 3, row by row; pixel centres are whole numbers, as in OpenCV.
     pub k: [f64; 9],
@@ -192,7 +191,7 @@ impl Message for CameraInfo {
         writer.f64s(&self.k);
         writer.f64s(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
         writer.f64s(&self.p);
-        // Binning and region of interest: none.
+        // No binning, and no region of interest.
         (0..6).for_each(|_| writer.u32(0));
         writer.u8(0);
     }
@@ -227,7 +226,7 @@ impl Received for PoseStamped {
     }
 }
 
-/// nav_msgs/Odometry. Its covariances are zero: not known.
+/// nav_msgs/Odometry. Its covariances are zero, which means unknown.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Odometry {
     /// Instant and frame of the pose.
@@ -268,7 +267,7 @@ impl Message for Odometry {
 pub struct TransformStamped {
     /// Instant and parent frame.
     pub header: Header,
-    /// The frame whose pose this is.
+    /// Frame that this transform places in the parent frame.
     pub child_frame_id: String,
     /// [m, parent]
     pub translation: DVec3,
@@ -279,7 +278,6 @@ pub struct TransformStamped {
 /// tf2_msgs/TFMessage.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TfMessage {
-    /// The transforms.
     pub transforms: Vec<TransformStamped>,
 }
 
@@ -297,7 +295,7 @@ impl Message for TfMessage {
     }
 }
 
-/// sensor_msgs/Imu without an orientation, which its first covariance of -1 says.
+/// sensor_msgs/Imu without an orientation, which a first covariance of -1 marks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imu {
     /// Instant and frame of both vectors.
@@ -323,7 +321,7 @@ impl Message for Imu {
     }
 }
 
-/// sensor_msgs/PointField: name, place in a point [bytes], and type by its constant.
+/// sensor_msgs/PointField: name, offset in a point [bytes], and datatype constant.
 pub type PointField = (&'static str, u32, u8);
 /// PointField.UINT16.
 pub const UINT16: u8 = 4;
@@ -339,15 +337,14 @@ pub struct PointCloud2<'a> {
     pub header: Header,
     /// Rows; 1 if the points have no order.
     pub height: u32,
-    /// Points of a row.
+    /// Points per row.
     pub width: u32,
-    /// What a point consists of.
+    /// Fields of a point.
     pub fields: &'static [PointField],
-    /// Bytes of a point.
+    /// Bytes per point.
     pub point_step: u32,
-    /// The points.
     pub data: Cow<'a, [u8]>,
-    /// Whether none of them is NaN.
+    /// Whether no point is NaN.
     pub is_dense: bool,
 }
 
@@ -380,7 +377,7 @@ impl Message for PointCloud2<'_> {
 /// geometry_msgs/TwistStamped.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TwistStamped {
-    /// In whose axes.
+    /// Frame of the vectors.
     pub header: Header,
     /// [m/s]
     pub linear: DVec3,
@@ -408,14 +405,14 @@ impl Received for TwistStamped {
 /// nav_msgs/Path.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Path {
-    /// In whose axes.
+    /// Frame of the points.
     pub header: Header,
-    /// Its points; those of which the frame is not empty must have the path's.
+    /// Points of the path. Each frame must be empty or equal to the path's frame.
     pub poses: Vec<PoseStamped>,
 }
 
 impl Path {
-    /// Poses that are read at most: more cannot be flown, and a claim of more is no reason to allocate.
+    /// Maximum number of poses that are read, because more cannot be flown; limits allocation.
     pub const MOST_POSES: u32 = 1024;
 }
 
@@ -482,7 +479,7 @@ mod tests {
     fn check<M: Received + PartialEq + std::fmt::Debug>(message: &M) {
         let bytes = message.encode();
         assert_eq!(&M::read(&mut Reader::new(&bytes, true)).unwrap(), message);
-        // No part of it is a whole message.
+        // No prefix is a complete message.
         for end in 0..bytes.len() {
             assert!(M::read(&mut Reader::new(&bytes[..end], true)).is_err());
         }
@@ -490,7 +487,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_was_written_is_read(
+        fn messages_round_trip(
             header in header(),
             linear in vector(),
             angular in vector(),
@@ -501,7 +498,7 @@ mod tests {
         }
 
         #[test]
-        fn no_bytes_are_too_much(bytes in proptest::collection::vec(any::<u8>(), 0..400), little: bool) {
+        fn arbitrary_bytes_never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..400), little: bool) {
             let _ = TwistStamped::read(&mut Reader::new(&bytes, little));
             let _ = PoseStamped::read(&mut Reader::new(&bytes, little));
             if let Ok(path) = Path::read(&mut Reader::new(&bytes, little)) {
@@ -511,7 +508,7 @@ mod tests {
     }
 
     #[test]
-    fn times_before_1970_are_times() {
+    fn converts_times_before_and_after_1970() {
         assert_eq!(Time::from_ns(-1), Time { sec: -1, nanosec: 999_999_999 });
         assert_eq!(Time::from_ns(1_500_000_000), Time { sec: 1, nanosec: 500_000_000 });
     }

@@ -1,4 +1,4 @@
-//! A flight as a ROS 2 node: a plugin that sends what it sees and flies as it is told.
+//! A flight as a ROS 2 node: a plugin that sends observations and flies received commands.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -21,8 +21,8 @@ use crate::messages::{
 use crate::setpoint::{Commands, Reported};
 use crate::topics::{self, Topic};
 
-/// The node's participants, which a signal takes away. They are two, as one sends and receives on a single thread: a command
-/// waits for no image.
+/// Participants of the node, which a signal removes. There are two, because a participant sends and receives on a
+/// single thread: a command never waits for an image.
 #[derive(Default)]
 pub(crate) struct Participants {
     /// Commands, poses, frames, IMU.
@@ -32,16 +32,16 @@ pub(crate) struct Participants {
 }
 
 impl Participants {
-    /// Joins.
+    /// Joins the domain with both participants.
     pub(crate) fn join(&self, join: impl Fn() -> Result<Dds>) -> Result<()> {
         *lock(&self.state) = Some(join()?);
         *lock(&self.images) = Some(join()?);
         Ok(())
     }
 
-    /// Says goodbye, behind what was sent last. A participant's is one packet, which may be lost, and which RustDDS does
-    /// not send if images still wait when it ends; subscribers then keep the node for 50 s. So topics are withdrawn first,
-    /// by writers that repeat what is not acknowledged, for a while.
+    /// Leaves the domain after the last message. A participant's goodbye is one packet, which may be lost, and RustDDS
+    /// does not send it if images are still queued when it ends; subscribers then keep the node for 50 s. Therefore the
+    /// topics are withdrawn first, by writers that repeat unacknowledged messages for a while.
     pub(crate) fn leave(&self) {
         let mut left = [lock(&self.state).take(), lock(&self.images).take()];
         thread::sleep(LAST_IMAGE);
@@ -55,14 +55,14 @@ fn lock(dds: &Mutex<Option<Dds>>) -> MutexGuard<'_, Option<Dds>> {
     dds.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Quality of JPEG, as image_transport's default is.
+/// Quality of JPEG, the default of image_transport.
 const JPEG_QUALITY: u8 = 95;
-/// The last image is under way for less.
+/// Maximum time to send the last image.
 const LAST_IMAGE: Duration = Duration::from_millis(100);
-/// How long the withdrawal of topics may take and be repeated. RustDDS sends it behind the images that wait, two of each
-/// topic: clouds of 5 MB take a tenth of a second each where the processor is free.
+/// Time to send and repeat the withdrawal of topics. RustDDS sends it after the queued images, two per topic. Clouds of
+/// 5 MB take 0.1 s each on an idle processor.
 const GOODBYE: Duration = Duration::from_millis(900);
-/// Images that wait to be sent; a further one takes nobody's place and is left out.
+/// Maximum number of queued images; further ones are dropped.
 const WAITING_IMAGES: usize = 4;
 const CAMERA_TOPICS: [Topic; 6] = [
     topics::IMAGE,
@@ -73,7 +73,7 @@ const CAMERA_TOPICS: [Topic; 6] = [
     topics::DEPTH_POINTS,
 ];
 
-/// What flies, from flight to flight.
+/// State of the node, kept from flight to flight.
 pub(crate) struct Node {
     dds: Arc<Participants>,
     frames: Frames,
@@ -100,7 +100,7 @@ struct Source<F> {
     sent: u64,
 }
 
-/// An image on its way out.
+/// An image in the queue.
 struct Shot {
     camera: String,
     stamp: Time,
@@ -110,7 +110,7 @@ struct Shot {
 }
 
 impl Node {
-    /// Announces what any vehicle has, and subscribes.
+    /// Announces the topics that every vehicle has, and subscribes to commands.
     pub(crate) fn new(args: &Ros2Args, dds: &Arc<Participants>) -> Result<Self> {
         let frames = Frames::new(&args.frame_prefix);
         let (images, waiting) = sync_channel(WAITING_IMAGES);
@@ -147,7 +147,7 @@ impl Node {
         })
     }
 
-    /// Whether a runtime has begun a flight with it.
+    /// Returns whether a flight has begun with this node.
     pub(crate) fn has_flown(&self) -> bool {
         self.has_flown
     }
@@ -177,7 +177,7 @@ impl Node {
         Ok(())
     }
 
-    /// Sends all that does not move in one message: who comes later gets the newest alone.
+    /// Sends all fixed transforms in one message, because late subscribers receive only the newest message.
     fn send_mountings(&self, dds: &Dds) {
         let (stamp, frames) = (self.clock.time(host_now()), &self.frames);
         let mut transforms = vec![convert::odom_in_map(stamp, frames)];
@@ -217,7 +217,7 @@ impl Node {
                 (known.mounting, remounted) = (camera.body_from_cam, true);
             }
             let stamp = self.clock.time(camera.shown);
-            // Cameras of one tick show one instant.
+            // Cameras of one tick show the same instant.
             if let Some(pose) = camera.pose_at_image.filter(|_| moved != Some(stamp)) {
                 moved = Some(stamp);
                 let transforms = convert::moving(stamp, &self.frames, &pose).to_vec();
@@ -265,7 +265,7 @@ impl Node {
         }
     }
 
-    /// Takes what has come since the last image, oldest first.
+    /// Processes the commands since the last image, oldest first.
     fn receive(&mut self, now: HostTime) {
         while let Some(found) = self.velocities.next::<TwistStamped>() {
             let taken = found.map_err(|error| error.to_string()).and_then(|(twist, age_ns)| {
@@ -304,13 +304,13 @@ fn report(reported: &mut Reported, name: &str, taken: Result<(), String>) {
     }
 }
 
-/// One flight of a node, as the runtime knows its plugin by name.
+/// One flight of a node. The runtime uses the name of this type as the plugin's name.
 pub(crate) struct Ros2<'n>(pub(crate) &'n mut Node);
 
 impl Autonomy for Ros2<'_> {
     fn on_start(&mut self, info: &ArenaInfo) {
         let Self(node) = self;
-        // What was sent before this flight is not meant for it.
+        // Discard commands that were sent before this flight.
         node.receive(host_now());
         if let Err(error) = node.begin(info) {
             tracing::error!("{error:#}");
@@ -336,7 +336,7 @@ impl Autonomy for Ros2<'_> {
     }
 }
 
-/// Encodes and sends images, so that a setpoint waits for none.
+/// Encodes and sends images on a separate thread, so that setpoints do not wait for them.
 struct Sender {
     dds: Arc<Participants>,
     frames: Frames,
@@ -347,7 +347,7 @@ struct Sender {
 impl Sender {
     fn run(mut self, waiting: &Receiver<Shot>) {
         for shot in waiting {
-            // Calibration first: who pairs both by stamp then waits for nothing.
+            // Calibration first, so that subscribers that pair both by stamp do not wait.
             let info = convert::camera_info(self.header(&shot), &shot.intrinsics);
             self.send(&topics::CAMERA_INFO, &shot, || Some(&info));
             self.send(&topics::DEPTH_INFO, &shot, || Some(&info));
@@ -375,7 +375,7 @@ impl Sender {
         convert::optical_header(shot.stamp, &self.frames, &shot.camera)
     }
 
-    /// Makes a message if somebody waits for it, and sends it; meanwhile others may send.
+    /// Creates and sends a message if there is a subscriber. The lock is free while the message is created.
     fn send<M: Message>(&self, topic: &Topic, shot: &Shot, make: impl FnOnce() -> Option<M>) {
         let images = || lock(&self.dds.images);
         if !images().as_ref().is_some_and(|dds| dds.is_wanted(topic, &shot.camera)) {
@@ -401,7 +401,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_jpeg_has_the_images_size() {
+    fn jpeg_keeps_size_and_colour() {
         let intrinsics = Intrinsics::from_horizontal_fov(16, 8, 1.0);
         let file = jpeg(&[99; 16 * 8 * 3], &intrinsics).unwrap();
         let mut decoder = zune_jpeg::JpegDecoder::new(std::io::Cursor::new(&file));

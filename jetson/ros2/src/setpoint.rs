@@ -1,4 +1,5 @@
-//! Commands from ROS 2 as setpoints: velocities with a deadline, paths, and the landing. Pure: what comes, and when.
+//! Converts commands from ROS 2 to setpoints: velocities with a deadline, paths, and landing. Pure: commands and times
+//! in.
 
 use std::fmt;
 
@@ -8,31 +9,31 @@ use vizflyt_sdk::{Axes, Path as FlownPath, PathYaw, Setpoint, Trajectory, Waypoi
 use crate::convert::Frames;
 use crate::messages::{Path, TwistStamped};
 
-/// A velocity counts for so long after it came; then the vehicle hovers. [ns]
+/// A velocity stays in force for this time after its arrival; then the vehicle hovers. [ns]
 pub const VELOCITY_LASTS_NS: u64 = 500_000_000;
-/// Points of a path that the runtime takes.
+/// Maximum number of points of a path.
 pub const MOST_POINTS: usize = 32;
 
-/// Why a command does not count.
+/// Why a command was rejected.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 pub enum CommandError {
-    /// Its frame is none of those in which commands are understood.
-    #[error("frame '{frame}' is not known; give one of {known}")]
+    /// Unknown frame.
+    #[error("unknown frame '{frame}'; give one of {known}")]
     Frame {
-        /// What its header has.
+        /// Frame in the header.
         frame: String,
-        /// What it may have.
+        /// Accepted frames.
         known: String,
     },
-    /// A number of it is NaN or infinite.
-    #[error("a number of it is not finite")]
+    /// A number is NaN or infinite.
+    #[error("a number is not finite")]
     NotFinite,
     /// A path without a point, or with too many.
     #[error("a path has 1 to {MOST_POINTS} points, not {0}")]
     Points(usize),
 }
 
-/// What was asked for last.
+/// Newest command, converted to a setpoint on request.
 #[derive(Debug, Default)]
 pub struct Commands {
     newest: Newest,
@@ -41,7 +42,7 @@ pub struct Commands {
 
 #[derive(Debug, Default)]
 enum Newest {
-    /// Nothing, or what has run out.
+    /// No command, or an expired one.
     #[default]
     Nothing,
     Velocity {
@@ -53,10 +54,10 @@ enum Newest {
 }
 
 impl Commands {
-    /// Takes a velocity that is `age_ns` old at `now_ns`. [ns, any one clock]
+    /// Processes a velocity that is `age_ns` old at `now_ns`. [ns, any one clock]
     ///
     /// # Errors
-    /// [`CommandError`]; the former command stays in force then.
+    /// [`CommandError`]; the previous command then stays in force.
     pub fn velocity(
         &mut self,
         frames: &Frames,
@@ -76,10 +77,10 @@ impl Commands {
         Ok(())
     }
 
-    /// Takes a path, which is flown once, at `speed_mps` at most.
+    /// Processes a path, which is flown once, at most at `speed_mps`.
     ///
     /// # Errors
-    /// [`CommandError`]; the former command stays in force then.
+    /// [`CommandError`]; the previous command then stays in force.
     pub fn path(
         &mut self,
         frames: &Frames,
@@ -110,12 +111,12 @@ impl Commands {
         Ok(())
     }
 
-    /// Lands; nothing that comes later in this flight counts.
+    /// Lands. Later commands of this flight are ignored.
     pub fn land(&mut self) {
         self.newest = Newest::Land;
     }
 
-    /// Forgets all: another flight begins.
+    /// Removes all commands before a new flight.
     pub fn clear(&mut self) {
         self.newest = Newest::Nothing;
     }
@@ -126,7 +127,7 @@ impl Commands {
         }
     }
 
-    /// Returns what the vehicle is to do at `now_ns`.
+    /// Returns the setpoint at `now_ns`.
     pub fn setpoint(&self, now_ns: u64) -> Setpoint {
         match &self.newest {
             Newest::Velocity { setpoint, until_ns } if now_ns < *until_ns => setpoint.clone(),
@@ -137,14 +138,14 @@ impl Commands {
     }
 }
 
-/// The same fault is reported once until another comes: a velocity comes fifty times a second.
+/// Suppresses repeated reports of the same fault, because velocities arrive at 50 Hz.
 #[derive(Debug, Default)]
 pub struct Reported(Option<String>);
 
 impl Reported {
-    /// Returns the sentence if it is not the one before.
+    /// Returns the message unless it equals the previous one.
     pub fn news(&mut self, topic: &str, fault: impl fmt::Display) -> Option<String> {
-        let sentence = format!("{topic}: {fault}; it does not count");
+        let sentence = format!("{topic}: {fault}; command ignored");
         if self.0.as_ref() == Some(&sentence) {
             return None;
         }
@@ -154,10 +155,10 @@ impl Reported {
 }
 
 impl Frames {
-    /// Returns the axes that a frame's name means in a command.
+    /// Returns the axes for the frame of a command.
     ///
     /// # Errors
-    /// [`CommandError::Frame`] for any other name, the empty one too.
+    /// [`CommandError::Frame`] for all other names, including the empty one.
     pub fn axes(&self, frame: &str) -> Result<Axes, CommandError> {
         let known = [
             (&self.map, Axes::World),
@@ -196,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn a_velocity_counts_in_its_frame_until_its_deadline() {
+    fn velocity_applies_in_its_frame_until_its_deadline() {
         let (frames, mut commands) = (Frames::new(""), Commands::default());
         assert_eq!(commands.setpoint(0), Setpoint::Hold);
         for (frame, axes) in [
@@ -211,18 +212,18 @@ mod tests {
             assert_eq!(commands.setpoint(VELOCITY_LASTS_NS + 899), expected);
             assert_eq!(commands.setpoint(VELOCITY_LASTS_NS + 900), Setpoint::Hold);
         }
-        // One that is older than the deadline never counts.
+        // A velocity older than the deadline is ignored.
         commands.velocity(&frames, &twist("map", DVec3::Y, 0.0), VELOCITY_LASTS_NS, 5000).unwrap();
         assert_eq!(commands.setpoint(5000), Setpoint::Hold);
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused_in_a_sentence() {
+    fn rejects_invalid_commands_with_a_clear_message() {
         let (frames, mut commands) = (Frames::new("drone1/"), Commands::default());
         let error = commands.velocity(&frames, &twist("map", DVec3::X, 0.0), 0, 0).unwrap_err();
         assert_eq!(
             error.to_string(),
-            "frame 'map' is not known; give one of drone1/map, drone1/odom, \
+            "unknown frame 'map'; give one of drone1/map, drone1/odom, \
              drone1/base_stabilized, drone1/base_link"
         );
         let nan = twist("drone1/map", DVec3::X * f64::NAN, 0.0);
@@ -239,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_goes_on_until_another_command_and_a_landing_is_the_end() {
+    fn path_stays_until_another_command_and_landing_is_final() {
         let (frames, mut commands) = (Frames::new(""), Commands::default());
         commands.path(&frames, &path(MOST_POINTS, "map"), 0.8).unwrap();
         let first = commands.setpoint(0);

@@ -1,4 +1,4 @@
-//! What is sent and received, in one table: the program makes its topics by it, and `docs/guides/ros2.md` lists it.
+//! Table of all sent and received topics. The program creates its topics from it, and `docs/guides/ros2.md` lists it.
 
 use crate::messages::{
     CameraInfo, CompressedImage, Empty, Image, Imu, Message, Odometry, Path, PointCloud2,
@@ -8,11 +8,11 @@ use crate::messages::{
 /// A topic's quality of service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Qos {
-    /// `SensorDataQoS`: best effort, volatile, keep last 5; with `--reliable` reliable instead, as REP 2003 has drivers
-    /// send, so that subscribers of both kinds get it.
+    /// `SensorDataQoS`: best effort, volatile, keep last 5. With `--reliable` it is reliable, as REP 2003 recommends
+    /// for drivers, so that both kinds of subscribers match.
     SensorData,
-    /// The same of what fills a network, keep last 2: messages that wait to be sent are soon old, and what is said behind
-    /// them waits for them.
+    /// As `SensorData` for large messages, keep last 2: queued messages soon become old, and later messages wait for
+    /// them.
     Bulk,
     /// The default of ROS 2: reliable, volatile, keep last 10.
     Default,
@@ -20,12 +20,12 @@ pub enum Qos {
     Tf,
     /// `StaticBroadcasterQoS` of tf2: reliable, transient local, keep last 1.
     TfStatic,
-    /// Of a command, where the newest alone counts: best effort, volatile, keep last 1; publishers of either kind match.
+    /// Commands, of which only the newest counts: best effort, volatile, keep last 1. Publishers of both kinds match.
     Command,
 }
 
 impl Qos {
-    /// Returns it in words.
+    /// Returns a description in words.
     pub fn words(self) -> &'static str {
         match self {
             Self::SensorData => "best effort, volatile, 5",
@@ -38,19 +38,19 @@ impl Qos {
     }
 }
 
-/// A topic.
+/// A ROS 2 topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Topic {
-    /// Its name, under the node's namespace unless it begins with a slash. `CAMERA` and `SENSOR` stand for the names of
+    /// Name, under the node's namespace unless it begins with a slash. `CAMERA` and `SENSOR` stand for names in
     /// `arena.toml`.
     pub name: &'static str,
-    /// Its type.
+    /// ROS name of the message type.
     pub ty: &'static str,
-    /// How it is sent or received.
+    /// Quality of service.
     pub qos: Qos,
-    /// Frame of its header, without a prefix; of what is received the frames that are understood.
+    /// Frame of its header, without prefix; for received topics, the accepted frames.
     pub frame: &'static str,
-    /// What it is.
+    /// Description for the guide.
     pub what: &'static str,
 }
 
@@ -64,116 +64,120 @@ impl Topic {
         Self { name, ty: M::TYPE, qos, frame, what }
     }
 
-    /// Returns its name in ROS, in this namespace, of the camera or sensor `of`.
+    /// Returns the ROS name in this namespace, for the camera or sensor `of`.
     pub fn ros_name(&self, namespace: &str, of: &str) -> String {
         let name = self.name.replace("CAMERA", of).replace("SENSOR", of);
         if name.starts_with('/') { name } else { format!("/{namespace}/{name}") }
     }
 
-    /// Returns its type as DDS knows it: `sensor_msgs::msg::dds_::Image_`.
+    /// Returns the DDS name of the type: `sensor_msgs::msg::dds_::Image_`.
     pub fn dds_type(&self) -> String {
         let (package, name) = self.ty.split_once("/msg/").unwrap_or((self.ty, ""));
         format!("{package}::msg::dds_::{name}_")
     }
 }
 
-/// Colour.
+/// Colour images.
 pub const IMAGE: Topic =
     Topic::new::<Image>("CAMERA/image_raw", Qos::Bulk, OPTICAL, "colour, `rgb8`");
-/// Colour as JPEG.
+/// Colour images as JPEG.
 pub const COMPRESSED: Topic = Topic::new::<CompressedImage>(
     "CAMERA/image_raw/compressed",
     Qos::SensorData,
     OPTICAL,
     "colour, `jpeg`, of the decoded image",
 );
-/// How colour was rendered.
+/// Calibration of colour images.
 pub const CAMERA_INFO: Topic = Topic::new::<CameraInfo>(
     "CAMERA/camera_info",
     Qos::SensorData,
     OPTICAL,
-    "intrinsics and lens of this very image",
+    "intrinsics and lens of the colour image",
 );
-/// Depth.
+/// Depth images.
 pub const DEPTH: Topic = Topic::new::<Image>(
     "CAMERA/depth/image_raw",
     Qos::Bulk,
     OPTICAL,
     "depth along the optical axis: `32FC1` [m], no return is NaN; or `16UC1` [mm], no return is 0",
 );
-/// How depth was rendered.
+/// Calibration of depth images.
 pub const DEPTH_INFO: Topic = Topic::new::<CameraInfo>(
     "CAMERA/depth/camera_info",
     Qos::SensorData,
     OPTICAL,
-    "the same of the depth",
+    "intrinsics and lens of the depth image",
 );
 /// Depth as points.
 pub const DEPTH_POINTS: Topic = Topic::new::<PointCloud2>(
     "CAMERA/depth/points",
     Qos::Bulk,
     OPTICAL,
-    "a point a pixel: x, y, z [m], rgb",
+    "one point per pixel: x, y, z [m], rgb",
 );
-/// A LiDAR's sweep.
+/// Sweeps of a LiDAR.
 pub const LIDAR: Topic = Topic::new::<PointCloud2>(
     "SENSOR/points",
     Qos::Bulk,
     "`SENSOR`",
-    "a LiDAR's sweep: x, y, z [m], before_ns, intensity, ring",
+    "sweep of a LiDAR: x, y, z [m], before_ns, intensity, ring",
 );
-/// The autopilot's inertial sensor.
+/// IMU of the autopilot.
 pub const IMU: Topic = Topic::new::<Imu>(
     "imu",
     Qos::SensorData,
     "`base_link`",
-    "the autopilot's, with gravity in it (REP 145)",
+    "IMU of the autopilot, including gravity (REP 145)",
 );
-/// Where the vehicle is.
+/// Pose of the vehicle.
 pub const POSE: Topic =
-    Topic::new::<PoseStamped>("pose", Qos::Default, "`map`", "where it was localized");
-/// The same with its motion.
+    Topic::new::<PoseStamped>("pose", Qos::Default, "`map`", "pose from localization");
+/// Pose and velocity of the vehicle.
 pub const ODOMETRY: Topic = Topic::new::<Odometry>(
     "odom",
     Qos::Default,
     "`odom`, twist in `base_link`",
-    "the same with its motion",
+    "pose and velocity",
 );
-/// Where frames are.
+/// Moving transforms.
 pub const TF: Topic = Topic::new::<TfMessage>(
     "/tf",
     Qos::Tf,
     "`odom`, `base_link`",
     "`base_link` at the instant of each image, and `base_stabilized`",
 );
-/// Where frames are that stay.
+/// Fixed transforms.
 pub const TF_STATIC: Topic = Topic::new::<TfMessage>(
     "/tf_static",
     Qos::TfStatic,
     "`map`, `base_link`",
     "`odom`, cameras, sensors",
 );
-/// A velocity to fly at.
+/// Velocity command.
 pub const VELOCITY: Topic = Topic::new::<TwistStamped>(
     "cmd_vel",
     Qos::Command,
     "`map`, `odom`, `base_stabilized`, `base_link`",
-    "a velocity [m/s] and a turn about z [rad/s]; for 0.5 s, then the vehicle hovers",
+    "velocity [m/s] and rate of turn about z [rad/s], for 0.5 s; then the vehicle hovers",
 );
-/// A path to follow.
+/// Path command.
 pub const PATH: Topic = Topic::new::<Path>(
     "path",
     Qos::Default,
     "`map`, `odom`, `base_stabilized`, `base_link`",
-    "a path of at most 32 points, flown once at `--path-speed`, nose ahead",
+    "path of at most 32 points, flown once at `--path-speed`, nose forward",
 );
-/// The end of a flight.
-pub const LAND: Topic =
-    Topic::new::<Empty>("land", Qos::Default, "", "comes down here, which ends the flight");
+/// Landing command, which ends a flight.
+pub const LAND: Topic = Topic::new::<Empty>(
+    "land",
+    Qos::Default,
+    "",
+    "lands at the current position, which ends the flight",
+);
 
 const OPTICAL: &str = "`CAMERA_optical_frame`";
 
-/// What is sent.
+/// Sent topics.
 pub const SENT: [Topic; 12] = [
     IMAGE,
     COMPRESSED,
@@ -188,7 +192,7 @@ pub const SENT: [Topic; 12] = [
     TF,
     TF_STATIC,
 ];
-/// What is received.
+/// Received topics.
 pub const RECEIVED: [Topic; 3] = [VELOCITY, PATH, LAND];
 
 #[cfg(test)]
@@ -196,14 +200,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_and_types_are_those_of_ros() {
+    fn names_and_types_match_ros() {
         assert_eq!(DEPTH.ros_name("vizflyt", "front"), "/vizflyt/front/depth/image_raw");
         assert_eq!(TF.ros_name("vizflyt", ""), "/tf");
         assert_eq!(IMAGE.dds_type(), "sensor_msgs::msg::dds_::Image_");
     }
 
     #[test]
-    fn the_guide_lists_every_topic_as_it_is() {
+    fn guide_lists_every_topic() {
         let guide = include_str!("../../../docs/guides/ros2.md");
         let rows: Vec<_> = guide.lines().filter(|line| line.starts_with("| `")).collect();
         for topic in SENT.iter().chain(&RECEIVED) {
@@ -212,6 +216,6 @@ mod tests {
             assert!(rows.contains(&&*row), "docs/guides/ros2.md lacks\n{row}");
         }
         let topics = rows.iter().filter(|row| row.contains("/msg/")).count();
-        assert_eq!(topics, SENT.len() + RECEIVED.len(), "the guide lists others besides");
+        assert_eq!(topics, SENT.len() + RECEIVED.len(), "the guide lists unknown topics");
     }
 }

@@ -1,5 +1,5 @@
-//! Decodes as many 640x480 RGB-D images as its argument says, for a plugin, and prints what they took; for counting its
-//! instructions, where a time means nothing.
+//! Decodes a number of 640x480 RGB-D images for a plugin, and prints the latency. Used to count instructions on
+//! computers where times are not meaningful.
 //!
 //! `cargo run -p vizflyt-runtime --example decode -- 20`
 

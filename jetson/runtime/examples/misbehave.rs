@@ -1,11 +1,10 @@
-//! A plugin that does what its first argument says, well or badly: for tests, and to see what the
-//! vehicle does.
+//! Plugin with a selectable fault (first argument), for tests and to observe the vehicle's reaction.
 //!
 //! `vizflyt fly target/debug/examples/misbehave --server ... -- late-panic`
 //!
-//! With `late-` it flies well for a moment before. Several, separated by commas, are done one after
-//! the other; what is left to do is kept in the file named by the second argument, so that a plugin
-//! that is started again goes on with the next. `world:3:0` asks for 3 m/s east, fence or not.
+//! With the prefix `late-` it flies well for a moment before. Several faults, separated by commas, follow
+//! one another; the second argument names a file for the remaining ones, so that a restarted plugin
+//! continues with the next. `world:3:0` requests 3 m/s east, regardless of the fence.
 
 #![allow(unsafe_code, reason = "it misbehaves: a bad pointer, a fork")]
 
@@ -27,16 +26,16 @@ use vizflyt_sdk::{
 
 struct Misbehave {
     how: Vec<String>,
-    /// Where `how` is kept for the next process.
+    /// File that stores `how` for the next process.
     kept: Option<PathBuf>,
     images: u64,
     flying: bool,
     leaked: Vec<Vec<u8>>,
 }
 
-/// Images flown well before the fault.
+/// Number of images before the fault.
 const GOOD_IMAGES: u64 = 20;
-/// Memory that is lost with each image, as with a list of all images that someone forgot. [bytes]
+/// Size of the leak per image, for example by a list of all images. [bytes]
 const LEAK: usize = 20_000_000;
 
 impl Autonomy for Misbehave {
@@ -47,7 +46,7 @@ impl Autonomy for Misbehave {
     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
         let forward =
             Setpoint::Velocity { v_mps: DVec3::X * 0.5, axes: Axes::Heading, yaw: YawTarget::Keep };
-        // On the ground everyone behaves, unless it shall fail there.
+        // On the ground, only faults without `late-` occur.
         let now = self.how.first().map_or("forward", String::as_str);
         let late = now.strip_prefix("late-");
         self.images += u64::from(self.flying || late.is_none());
@@ -75,7 +74,7 @@ impl Autonomy for Misbehave {
             "panic" => panic!("index {} out of range", obs.seq()),
             "abort" => abort(),
             "segfault" => {
-                // SAFETY: none; the fault is what is asked for.
+                // SAFETY: none; the fault is intended.
                 unsafe { black_box(std::ptr::without_provenance_mut::<u64>(8)).write_volatile(1) };
                 None
             }
@@ -98,7 +97,7 @@ impl Autonomy for Misbehave {
                 Some(forward)
             }
             "fork" => loop {
-                // SAFETY: the child runs nothing but this loop.
+                // SAFETY: the child runs only this loop.
                 let _ = unsafe { nix::unistd::fork() };
             },
             "nan" => Some(Setpoint::velocity(DVec3::NAN, YawTarget::Keep)),
@@ -143,7 +142,7 @@ impl Autonomy for Misbehave {
 }
 
 impl Misbehave {
-    /// The next misdeed is due, after another moment of good flight.
+    /// Selects the next fault, after another moment of good flight.
     fn next(&mut self) {
         self.how.remove(0);
         self.images = 0;
@@ -153,23 +152,22 @@ impl Misbehave {
     }
 }
 
-/// Returns the horizontal velocity that `east:north` says. [m/s, world]
+/// Parses a horizontal velocity `east:north`. [m/s, world]
 fn velocity(text: &str) -> DVec3 {
     let (east, north) = text.split_once(':').expect("two numbers");
     let number = |text: &str| text.parse().expect("a number");
     DVec3::new(number(east), number(north), 0.0)
 }
 
-/// Whether the vehicle is the plugin's now, if the event says so.
+/// Whether the plugin flies the vehicle after this event; `None` for other events.
 fn flies(event: &Event) -> Option<bool> {
     let EventKind::Phase(phase) = &event.kind else { return None };
     Some(matches!(phase, FlightPhase::Flying | FlightPhase::Holding))
 }
 
-/// A plugin that goes round the SDK's loop: it floods the runtime with setpoints, or with bytes
-/// that are invalid.
+/// Runs without the SDK's loop, and floods the runtime with setpoints or with invalid bytes.
 fn go_round(how: &str, service: &str) -> ExitCode {
-    let end = PluginEnd::open(service).expect("the runtime is there");
+    let end = PluginEnd::open(service).expect("the runtime runs");
     let (mut flying, mut images) = (false, 0);
     loop {
         let _ = end.wait(Duration::from_millis(100));
@@ -197,7 +195,7 @@ fn go_round(how: &str, service: &str) -> ExitCode {
         if how == "late-types" {
             let _ = end.send_bytes(b"\xff\xff\xff a list of strings, say");
         } else {
-            // 10,000 a second, for as long as the runtime reads.
+            // 10,000 a second.
             for _ in 0..10_000 {
                 let _ = end.send(&answer);
                 thread::sleep(Duration::from_micros(100));

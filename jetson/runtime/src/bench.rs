@@ -1,5 +1,5 @@
-//! How long this computer takes from an image's last byte to the plugin's memory: what [`crate::images`] does, on one
-//! thread, with images made here.
+//! Benchmark of the latency from an image's last byte to the plugin's memory: [`crate::images`] on one thread, with
+//! synthetic images.
 //!
 //! ```text
 //! picture -> bitstream -> mailbox -> ImagePublisher -> shared memory -> the plugin's end
@@ -22,31 +22,31 @@ use vizflyt_sdk::{Observation, ObservationWriter};
 use crate::images::ImagePublisher;
 use crate::stream::{Arrival, Mailbox, Whole};
 
-/// How long images took from their last byte to the plugin.
+/// Latency of images from their last byte to the plugin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DecodeFigures {
     /// Width of the images. [px]
     pub width_px: u32,
     /// Height of the images. [px]
     pub height_px: u32,
-    /// How many were timed.
+    /// Number of timed images.
     pub images: usize,
-    /// Of one image's bitstream. [bytes]
+    /// Size of one image's bitstream. [bytes]
     pub bytes: usize,
     /// Median. [ms]
     pub ms_p50: f64,
     /// 99th percentile. [ms]
     pub ms_p99: f64,
-    /// The longest. [ms]
+    /// Maximum. [ms]
     pub ms_max: f64,
 }
 
-/// Decodes `count` RGB-D images of a size, as the server sends them without adapting to a slow link, for a plugin.
+/// Decodes `count` RGB-D images of a size for a plugin, with the server's full quality.
 ///
 /// # Errors
-/// A size or a count of 0, no shared memory; an image that does not come, or comes with other depth than was sent.
+/// If size or count is 0, if shared memory is unavailable, or if an image does not arrive or has wrong depth.
 pub fn decode([width_px, height_px]: [u32; 2], count: usize) -> Result<DecodeFigures> {
-    ensure!(count > 0, "no images are asked for");
+    ensure!(count > 0, "the number of images is 0; give 1 or more");
     let intrinsics = Intrinsics::from_horizontal_fov(width_px, height_px, 1.5);
     let (rgb, depth_mm) = picture(width_px, height_px);
     let view = RgbdView { width: width_px, height: height_px, rgb: &rgb, depth_mm: &depth_mm };
@@ -61,14 +61,15 @@ pub fn decode([width_px, height_px]: [u32; 2], count: usize) -> Result<DecodeFig
     let mut publisher = ImagePublisher::new(ipc, cameras, Arc::default());
     let mailbox = Mailbox::default();
     let mut ms = Vec::with_capacity(count);
-    // The first ones meet cold caches and new memory.
+    // The first images are not timed: caches are cold, and memory is new.
     for seq in 1..=(WARM_UP + count) as u64 {
         let identity = (Pose::IDENTITY, Pose::IDENTITY);
         let header =
             ImageHeader::new(seq, 0, ServerTime::ZERO, &intrinsics, &identity.0, &identity.1);
         let stamp = HostTime::from_ns(seq);
         let arrival = Arrival { session: 1, header, pose: stamp, first: stamp };
-        let ticket = mailbox.open(&arrival).ok_or_else(|| anyhow!("image {seq} is not taken"))?;
+        let ticket =
+            mailbox.open(&arrival).ok_or_else(|| anyhow!("image {seq} was not accepted"))?;
         for piece in &pieces {
             mailbox.push(ticket, &mut piece.clone());
         }
@@ -76,16 +77,22 @@ pub fn decode([width_px, height_px]: [u32; 2], count: usize) -> Result<DecodeFig
         mailbox.end(ticket, Some(Whole { trailer, received: stamp }));
         let start = Instant::now();
         while publisher.step(&mailbox, Duration::ZERO, &mut |_| ())? {}
-        let sample = plugin.observation()?.ok_or_else(|| anyhow!("image {seq} did not come"))?;
+        let sample = plugin.observation()?.ok_or_else(|| anyhow!("image {seq} did not arrive"))?;
         if seq > WARM_UP as u64 {
             ms.push(start.elapsed().as_secs_f64() * 1e3);
         }
         let observation = Observation::from_bytes(sample.bytes(), &names)?;
-        let image = observation.cameras().next().ok_or_else(|| anyhow!("it has no image"))?;
+        let image = observation
+            .cameras()
+            .next()
+            .ok_or_else(|| anyhow!("observation {seq} has no image"))?;
         let (x, y) = (width_px / 2, height_px / 2);
         let sent_mm = depth_mm[(y * width_px + x) as usize];
         let came_m = image.depth_m(x, y).unwrap_or(f32::NAN);
-        ensure!((came_m * 1e3 - f32::from(sent_mm)).abs() < 1.0, "{sent_mm} mm came as {came_m} m");
+        ensure!(
+            (came_m * 1e3 - f32::from(sent_mm)).abs() < 1.0,
+            "{sent_mm} mm arrived as {came_m} m"
+        );
     }
     ms.sort_unstable_by(f64::total_cmp);
     let at = |share: f64| ms[(share * (count - 1) as f64).round() as usize];
@@ -100,7 +107,7 @@ pub fn decode([width_px, height_px]: [u32; 2], count: usize) -> Result<DecodeFig
     })
 }
 
-/// Cuts a bitstream as it arrives: its head, then slice by slice.
+/// Splits a bitstream as on arrival: its head, then slice by slice.
 fn pieces(bitstream: &[u8]) -> Result<Vec<Vec<u8>>> {
     let (head, mut rest) = bitstream.split_at(peek(bitstream)?.header_len);
     let mut pieces = vec![head.to_vec()];
@@ -112,7 +119,8 @@ fn pieces(bitstream: &[u8]) -> Result<Vec<Vec<u8>>> {
     Ok(pieces)
 }
 
-/// Returns colour and depth [mm] about as hard to encode as a captured scene: texture of every scale, depth with edges.
+/// Returns colour and depth [mm] that are about as hard to encode as a captured scene: texture of all scales, and depth
+/// with edges.
 fn picture(width_px: u32, height_px: u32) -> (Vec<u8>, Vec<u16>) {
     let (mut rgb, mut depth_mm) = (Vec::new(), Vec::new());
     for y in 0..height_px {
@@ -135,14 +143,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn images_of_any_size_come_to_the_plugin_and_are_timed() {
+    fn times_images_of_any_size() {
         for size in [[640, 480], [33, 17]] {
             let figures = decode(size, 3).unwrap();
             assert_eq!(([figures.width_px, figures.height_px], figures.images), (size, 3));
             assert!(0.0 < figures.ms_p50 && figures.ms_p50 <= figures.ms_max, "{figures:?}");
             assert!(figures.bytes > 100);
         }
-        assert_eq!(decode([32, 24], 0).unwrap_err().to_string(), "no images are asked for");
+        assert_eq!(
+            decode([32, 24], 0).unwrap_err().to_string(),
+            "the number of images is 0; give 1 or more"
+        );
         assert!(decode([0, 24], 1).is_err());
     }
 }

@@ -241,10 +241,7 @@ pub enum ConfigError {
     Plugin(String),
     /// Error in the file `path`.
     #[error("{path}: {error}", path = .path.display())]
-    In {
-        path: PathBuf,
-        error: Box<Self>,
-    },
+    In { path: PathBuf, error: Box<Self> },
 }
 
 impl JetsonConfig {

@@ -1,8 +1,7 @@
-//! What a person sees of a flight in a terminal: events as lines, and below them one line that is
-//! kept up to date. Where there is no terminal, plain lines: every event, and now and then the
-//! status.
+//! Terminal output of a flight: events as lines, and below them one status line that is updated. Without a
+//! terminal, plain lines: each event, and periodically the status.
 //!
-//! [`Console`] is pure: it returns what to write. [`Screen`] writes it.
+//! [`Console`] has no side effects: it returns the text. [`Screen`] writes it.
 
 use std::io::{IsTerminal, Write};
 use std::time::Instant;
@@ -10,14 +9,13 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::messages::{FlightPhase, Telemetry};
 
-/// The content of the status line.
+/// Content of the status line.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Status {
-    /// Where the flight stands.
     pub phase: FlightPhase,
-    /// Battery left, 0 to 1; `None` if unknown.
+    /// Battery charge, 0 to 1; `None` if unknown.
     pub battery_fraction: Option<f32>,
-    /// Images handed to the plugin. [Hz]
+    /// Rate of images delivered to the plugin. [Hz]
     pub image_hz: f32,
     /// Pose stamp to plugin callback, median of the last second. [ms]
     pub age_ms: f32,
@@ -26,7 +24,7 @@ pub struct Status {
 }
 
 impl Status {
-    /// Returns the part of a report that people watch.
+    /// Returns the status of a telemetry report.
     pub fn of(telemetry: &Telemetry) -> Self {
         let battery = telemetry.vehicle.battery_fraction;
         Self {
@@ -55,7 +53,6 @@ impl Status {
     }
 }
 
-/// Returns the name of the phase.
 pub fn phase_name(phase: FlightPhase) -> &'static str {
     match phase {
         FlightPhase::Connecting => "connecting",
@@ -69,25 +66,25 @@ pub fn phase_name(phase: FlightPhase) -> &'static str {
     }
 }
 
-/// Where it is written.
+/// Kind of output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Medium {
-    /// Understands cursor movements.
+    /// A terminal with escape sequences.
     Terminal,
     /// A file or a pipe.
     Plain,
 }
 
-/// Plain lines of status come this often at most. [s]
+/// Minimum period of plain status lines. [s]
 const PLAIN_EVERY_S: f64 = 5.0;
-/// To column 0, and clear the line.
+/// Escape sequence: to column 0, and clear the line.
 const CLEAR: &str = "\r\x1b[2K";
-/// Longer lines are cut, not wrapped: a wrapped line could not be cleared.
+/// Escape sequence: cut long lines instead of wrapping them, because a wrapped line could not be cleared.
 const WRAP_OFF: &str = "\x1b[?7l";
-/// And back.
+/// Escape sequence: wrap long lines again.
 const WRAP_ON: &str = "\x1b[?7h";
 
-/// What is on the screen.
+/// State of the output.
 #[derive(Debug)]
 pub struct Console {
     medium: Medium,
@@ -97,12 +94,11 @@ pub struct Console {
 }
 
 impl Console {
-    /// Makes an empty console.
     pub fn new(medium: Medium) -> Self {
         Self { medium, status: None, last_event: String::new(), told_at_s: None }
     }
 
-    /// Returns what to write for a line that stays, such as an event.
+    /// Returns the output for a permanent line.
     pub fn line(&mut self, text: &str) -> String {
         let text = printable(text);
         let status = self.status_line();
@@ -112,14 +108,13 @@ impl Console {
         }
     }
 
-    /// As [`Console::line`], for something that happened in the flight: the status line repeats the
-    /// last of these.
+    /// Returns the output for an event of the flight; the status line repeats the last event.
     pub fn event(&mut self, text: &str) -> String {
         self.last_event = printable(text.trim());
         self.line(text)
     }
 
-    /// Returns what to write for a new status at `now_s`.
+    /// Returns the output for a new status at `now_s`.
     pub fn status(&mut self, now_s: f64, status: &Status) -> String {
         let former = self.status.replace(status.clone());
         match self.medium {
@@ -136,7 +131,7 @@ impl Console {
         }
     }
 
-    /// Returns what to write when the flight is over: the status line goes.
+    /// Returns the output for the end of the flight, which removes the status line.
     pub fn end(&mut self) -> String {
         match (self.medium, self.status.take()) {
             (Medium::Terminal, Some(_)) => CLEAR.to_owned(),
@@ -146,12 +141,12 @@ impl Console {
 
     fn status_line(&self) -> String {
         let Some(status) = &self.status else { return String::new() };
-        // The cursor stays at the start, so that whatever else is printed begins there.
+        // Leaves the cursor at the start, so that other output begins there.
         format!("{WRAP_OFF}{}  | {}{WRAP_ON}\r", status.line(), self.last_event)
     }
 }
 
-/// A plugin's output must not move the cursor, or set the terminal's title.
+/// Replaces control characters, so that a plugin cannot move the cursor or set the terminal's title.
 fn printable(text: &str) -> String {
     text.chars().map(|c| if c.is_control() && c != '\t' { '\u{fffd}' } else { c }).collect()
 }
@@ -173,13 +168,13 @@ impl Default for Screen {
 }
 
 impl Screen {
-    /// Prints a line that stays.
+    /// Prints a permanent line.
     pub fn line(&mut self, text: &str) {
         let text = self.console.line(text);
         write(&text);
     }
 
-    /// Prints something that happened in the flight.
+    /// Prints an event of the flight.
     pub fn event(&mut self, text: &str) {
         let text = self.console.event(text);
         write(&text);
@@ -191,7 +186,7 @@ impl Screen {
         write(&text);
     }
 
-    /// Takes the status line away.
+    /// Removes the status line.
     pub fn end(&mut self) {
         let text = self.console.end();
         write(&text);
@@ -204,7 +199,7 @@ impl Drop for Screen {
     }
 }
 
-/// Unlike `print!` it does not panic when nobody reads any more.
+/// Writes to standard output. Unlike `print!`, does not panic if the reader has closed the pipe.
 fn write(text: &str) {
     if text.is_empty() {
         return;
@@ -230,7 +225,7 @@ mod tests {
     const LINE: &str = "flying      battery  87 %  images  59.9 Hz  age  12.3 ms  plugin   1.0 ms";
 
     #[test]
-    fn a_terminal_keeps_one_line_below_the_events() {
+    fn keeps_the_status_line_below_events_in_a_terminal() {
         let mut console = Console::new(Medium::Terminal);
         assert_eq!(console.event("taking off"), "taking off\n");
         let shown = format!("\x1b[?7l{LINE}  | taking off\x1b[?7h\r");
@@ -243,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_terminal_there_are_only_lines() {
+    fn prints_only_lines_without_a_terminal() {
         let mut console = Console::new(Medium::Plain);
         assert_eq!(console.status(0.0, &flying()), format!("{LINE}\n"));
         assert_eq!(console.status(0.5, &flying()), "", "nothing new");
@@ -256,13 +251,13 @@ mod tests {
     }
 
     #[test]
-    fn a_plugin_cannot_move_the_cursor() {
+    fn replaces_control_characters_of_a_plugin() {
         let mut console = Console::new(Medium::Plain);
         assert_eq!(console.line("\x1b[2Jgone\r\u{7}"), "\u{fffd}[2Jgone\u{fffd}\u{fffd}\n");
     }
 
     #[test]
-    fn an_unknown_battery_is_not_an_empty_one() {
+    fn shows_an_unknown_battery_as_unknown() {
         let telemetry = Telemetry {
             vehicle: vizflyt_protocol::messages::VehicleState {
                 battery_fraction: -1.0,

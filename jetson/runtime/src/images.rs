@@ -1,23 +1,21 @@
-//! From the mailbox to the plugin: decodes each image, slice by slice as it arrives, straight into
-//! shared memory.
+//! Decodes images from the mailbox, slice by slice as they arrive, directly into the plugin's shared memory.
 //!
-//! Budget at 640x480: 1.5 MB written once (JPEG and depth about 1.8 ms in four slices, of which the
-//! first three overlap with receiving), no copy afterwards, no allocation of ours but for the log's
-//! record: the pieces of an image go there when it is published, and their memory comes back. One
-//! thread of its own: a slow decode holds up neither poses nor events. Several cameras of one tick share one
-//! observation; it is published when all that were sent together have come, or when a later tick's
-//! image has come whole.
+//! Cost at 640x480: 1.5 MB written once (JPEG and depth about 1.8 ms in four slices, of which the first three
+//! overlap with receiving), and no copy afterwards. Nothing is allocated except for the log's record: the
+//! pieces of a published image go to the log, which returns their buffers. A separate thread decodes, so that
+//! a slow decode does not delay poses or events. The cameras of one tick share one observation. It is
+//! published when all images that were sent together are complete, or when an image of a later tick is.
 //!
-//! An image that is never finished (cut off, late, nonsense, given way to a newer one: see
-//! [`crate::stream::Mailbox`]) leaves its pixels in memory that no plugin sees: only a camera that
-//! is declared ready has a size. An image whose observation is published before it is finished is
-//! decoded again, from the pieces that have come, into the next one.
+//! An unfinished image (truncated, late, invalid, or replaced by a newer one: see [`crate::stream::Mailbox`])
+//! leaves its pixels in memory that the plugin does not see: only ready cameras have a size. If an
+//! observation is published before an image of it is finished, the received pieces of that image are decoded
+//! again into the next observation.
 //!
-//! Cameras may change while flying: each image carries the camera it was rendered with, and so does the
-//! observation that holds it. The plugin never sees an image with another one's intrinsics.
+//! Cameras may change during a flight: each image contains the camera with which it was rendered, and the
+//! observation does too. An image therefore never has the intrinsics of another one.
 //!
-//! The newest readings of the other sensors are copied behind the images as the observation is published; a vehicle
-//! without such sensors pays nothing.
+//! At publication, the newest readings of other sensors are copied behind the images. A vehicle without such
+//! sensors has no extra cost.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -36,34 +34,34 @@ use crate::log::{ImageLog, LoggedImage, LoggedSensors, observation_head};
 use crate::stream::{Arrival, DecodeStep, Mailbox, NewestReadings, Readings, Whole};
 use crate::waterfall::Stamps;
 
-/// The control loop writes them, the image publisher reads them.
+/// Vehicle state that the control loop writes and the image publisher reads.
 pub type SharedSenses = Arc<Mutex<Senses>>;
 
-/// An observation that went to the plugin.
+/// A published observation.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Published {
-    /// Its number, from 1.
+    /// Number of the observation, from 1.
     pub seq: u64,
-    /// The server's tick of its newest image.
+    /// Server's tick of the newest image.
     pub tick: u64,
-    /// When the pose of its newest image was measured. [host]
+    /// Measurement time of the newest image's pose. [host]
     pub pose: HostTime,
-    /// When the last byte of its newest image had been received. [host]
+    /// Arrival time of the newest image's last byte. [host]
     pub received: HostTime,
-    /// When it was decoded. [host]
+    /// Time at which decoding ended. [host]
     pub ready: HostTime,
-    /// Its images on their way.
+    /// Stamps of each image.
     pub images: heapless::Vec<Stamps, MAX_CAMERAS>,
 }
 
-/// Decodes and publishes. See the module.
+/// Decodes images and publishes observations. See the module.
 pub struct ImagePublisher {
     ipc: Arc<RuntimeEnd>,
     cameras: Vec<CameraInfo>,
     senses: SharedSenses,
     lanes: Vec<Lane>,
     seq: u64,
-    /// Counts memory lent.
+    /// Number of loaned memory blocks, used as their id.
     homes: u64,
     under_way: Option<UnderWay>,
     rejected: u64,
@@ -72,19 +70,19 @@ pub struct ImagePublisher {
     readings: Arc<Readings>,
 }
 
-/// One camera's decoder and the image it is at.
+/// One camera's decoder and its present image.
 #[derive(Default)]
 struct Lane {
     decoder: Decoder,
     image: Option<Arrival>,
-    /// The pieces of the image that have come.
+    /// Received pieces of the image.
     pieces: Vec<Vec<u8>>,
-    /// How many of them were decoded.
+    /// Number of decoded pieces.
     decoded: usize,
-    /// Into which memory.
+    /// Id of the memory that contains the decoded pieces.
     home: u64,
     info: Option<Info>,
-    /// Tick of the newest image that was decoded, and the stamp of its pose.
+    /// Tick of the newest decoded image, and stamp of its pose.
     newest: (u64, HostTime),
 }
 
@@ -93,27 +91,27 @@ struct UnderWay {
     tick: u64,
     home: u64,
     memory: LoanedObservation,
-    /// Bit per camera.
+    /// Ready cameras, one bit each.
     there: u8,
-    /// Bit per camera that the server sends together with the first one.
+    /// Cameras that the server sends together with the first one, one bit each.
     expected: u8,
     published: Published,
-    /// Of the images that are there.
+    /// Headers of the ready images.
     headers: heapless::Vec<ImageHeader, MAX_CAMERAS>,
-    /// For the log; empty without one.
+    /// Images for the log; empty without one.
     logged: Vec<LoggedImage>,
 }
 
 impl UnderWay {
-    /// Whether an image is of a later tick, or its camera's next: then this observation has waited
-    /// long enough. An earlier tick's image of another camera, overtaken on its way, comes along.
+    /// Whether an image ends the wait of this observation: it has a later tick, or is the next of a ready
+    /// camera. A late image of another camera with an earlier tick still joins the observation.
     fn is_over(&self, tick: u64, bit: u8) -> bool {
         tick > self.tick || self.there & bit != 0
     }
 }
 
 impl ImagePublisher {
-    /// Makes one for these cameras (at most 8); an image's own description of its camera replaces them later.
+    /// Makes a publisher for these cameras (at most 8). Each image updates the description of its camera.
     pub fn new(ipc: Arc<RuntimeEnd>, cameras: Vec<CameraInfo>, senses: SharedSenses) -> Self {
         Self {
             ipc,
@@ -130,17 +128,17 @@ impl ImagePublisher {
         }
     }
 
-    /// Puts the newest of `readings` of these sensors (at most 8) into what it publishes.
+    /// Adds the newest `readings` of these sensors (at most 8) to observations.
     pub fn with_sensors(self, sensors: Vec<SensorInfo>, readings: Arc<Readings>) -> Self {
         Self { sensors, readings, ..self }
     }
 
-    /// Logs what it publishes.
+    /// Logs published observations.
     pub fn with_log(self, log: Option<ImageLog>) -> Self {
         Self { log, ..self }
     }
 
-    /// Runs until `stop` returns true; `notify` is called before each observation is published.
+    /// Runs until `stop` returns true; calls `notify` before each publication.
     pub fn run(
         mut self,
         mailbox: &Mailbox,
@@ -154,18 +152,17 @@ impl ImagePublisher {
         }
     }
 
-    /// Waits at most `timeout` for the next thing to do, and does it; returns whether there was
-    /// one.
+    /// Waits for the next decode step, at most `timeout`, and runs it. Returns whether a step was run.
     ///
     /// # Errors
-    /// [`IpcError`] if there is no memory; the image is lost.
+    /// [`IpcError`] if no memory is available; the image is lost.
     pub fn step(
         &mut self,
         mailbox: &Mailbox,
         timeout: Duration,
         notify: &mut impl FnMut(Published),
     ) -> Result<bool, IpcError> {
-        // An image that would end the observation under way waits until it has come whole.
+        // An image that would end the present observation waits until it is complete.
         let may_begin = |header: &ImageHeader| {
             let (tick, bit) = (header.seq.get(), bit(header.camera.into()));
             !self.under_way.as_ref().is_some_and(|under_way| under_way.is_over(tick, bit))
@@ -204,8 +201,8 @@ impl ImagePublisher {
 
     fn begin(&mut self, camera: usize, arrival: &Arrival) -> Result<(), Fault> {
         let lane = self.lanes.get_mut(camera);
-        let lane = lane.ok_or_else(|| Fault::image("it is of no camera of this arena"))?;
-        // A server that restarted counts from the start again, but its poses are newer.
+        let lane = lane.ok_or_else(|| Fault::image("its camera is not in this arena"))?;
+        // A restarted server counts from 1 again, but its poses are newer.
         if arrival.header.seq.get() < lane.newest.0 && arrival.pose <= lane.newest.1 {
             return Err(Fault::Image("it is stale".to_owned(), |counts| counts.stale += 1));
         }
@@ -257,7 +254,7 @@ impl ImagePublisher {
         published.ready = ready;
         let own = [arrival.first, whole.received, ready];
         let stamps = Stamps::of(&arrival.header, &whole.trailer, arrival.pose, own);
-        // One image of each camera at most, so there is room.
+        // Cannot fail: at most one image of each camera.
         let _ = published.images.push(stamps);
         let _ = under_way.headers.push(arrival.header);
         if self.log.is_some() {
@@ -276,7 +273,7 @@ impl ImagePublisher {
         Ok(())
     }
 
-    /// Decodes what has come of a camera's image, and was not, into the observation under way.
+    /// Decodes the received and undecoded pieces of a camera's image into the present observation.
     fn place(&mut self, camera: usize, notify: &mut impl FnMut(Published)) -> Result<(), Fault> {
         let image = self.lanes.get(camera).and_then(|lane| lane.image);
         let Some(arrival) = image else { return Ok(()) };
@@ -303,8 +300,8 @@ impl ImagePublisher {
         Ok(lane.decode(&mut ImageMut { rgb, depth_mm, ..ImageMut::default() })?)
     }
 
-    /// Takes over the camera that the image was rendered with. Another size re-allocates memory,
-    /// and what this tick's observation has already moves there.
+    /// Updates the camera's description from its image. If the size has changed, allocates new memory, and
+    /// moves the ready images of the present observation there.
     fn follow(&mut self, index: usize, image: &Arrival) -> Result<(), Fault> {
         let camera = &mut self.cameras[index];
         let intrinsics = image.header.intrinsics();
@@ -351,7 +348,7 @@ impl ImagePublisher {
             let sensors = LoggedSensors::of(bytes, &self.sensors, &readings);
             (log, observation_head(bytes).to_vec(), sensors)
         });
-        // Told first: the answer must not overtake it.
+        // Notifies first: the plugin's reply must not arrive before the notification.
         notify(done.published.clone());
         let published_at = host_now();
         self.ipc.publish(done.memory)?;
@@ -361,13 +358,13 @@ impl ImagePublisher {
         Ok(())
     }
 
-    /// Returns how many bytes an observation takes now. [bytes]
+    /// Returns the present size of an observation. [bytes]
     fn observation_len(&mut self) -> usize {
         let len = ObservationWriter::len_for(&self.cameras);
         if self.sensors.is_empty() {
             return len;
         }
-        // A sensor that was changed in flight may see more than it was announced to.
+        // A sensor that was changed in flight may have more records than announced.
         let newest = self.readings.newest();
         for (sensor, reading) in self.sensors.iter_mut().zip(newest.iter()) {
             let Some(reading) = reading else { continue };
@@ -376,7 +373,7 @@ impl ImagePublisher {
         len + ObservationWriter::sensors_len(&self.sensors)
     }
 
-    /// Gives up a camera's image, and the observation if nothing else is or will be in it.
+    /// Discards a camera's image, and the observation if it contains and expects no other image.
     fn forget(&mut self, camera: usize) {
         if let Some(lane) = self.lanes.get_mut(camera) {
             lane.image = None;
@@ -391,9 +388,9 @@ impl ImagePublisher {
 
     fn reject(&mut self, why: &str) {
         self.rejected += 1;
-        // The first, then ever fewer.
+        // Reports the first, and then each doubling.
         if self.rejected.is_power_of_two() {
-            tracing::warn!("{} images dropped so far; the last because {why}", self.rejected);
+            tracing::warn!("{} images dropped; last reason: {why}", self.rejected);
         }
     }
 }
@@ -424,7 +421,7 @@ impl UnderWay {
 }
 
 impl Lane {
-    /// Decodes the pieces that were not: the bitstream's header first, then slices.
+    /// Decodes the undecoded pieces: first the bitstream's header, then slices.
     fn decode(&mut self, room: &mut ImageMut<'_>) -> Result<(), DecodeError> {
         while let Some(piece) = self.pieces.get(self.decoded) {
             if self.decoded == 0 {
@@ -438,11 +435,11 @@ impl Lane {
     }
 }
 
-/// Why a step came to nothing.
+/// Error of a step.
 enum Fault {
-    /// The image is of no use, and as what it counts.
+    /// The image cannot be used: reason, and the count to increase.
     Image(String, fn(&mut Arrivals)),
-    /// There is no memory.
+    /// No memory is available.
     Ipc(IpcError),
 }
 

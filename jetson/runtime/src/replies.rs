@@ -1,5 +1,5 @@
-//! The plugin's messages, from shared memory to the control loop, rate-limited: a plugin that replies to
-//! images has no more to send but, with each reply, its own estimate of where it is.
+//! Passes the plugin's messages from its socket to the control loop, with a rate limit. A correct plugin sends
+//! one reply for each image, and optionally one odometry estimate.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -12,30 +12,30 @@ use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::host_now;
 use vizflyt_sdk::ipc::{IpcError, RuntimeEnd};
 
-/// Maximum messages per second: twice 200 images a second, more than any camera here gives, and a
-/// fifth of what would keep the control loop busy.
+/// Maximum rate of messages: twice 200 images a second, which no camera exceeds, and a fifth of the rate that
+/// would saturate the control loop. [1/s]
 const MAX_PER_SECOND: u32 = 400;
-/// The window in which they are counted. [ms]
+/// Window in which messages are counted. [ms]
 const WINDOW_MS: u32 = 250;
 
-/// Limits the rate of messages; reports once when there are too many, or one cannot be decoded.
+/// Limits the rate of messages. Reports a failure once if there are too many, or if one cannot be decoded.
 #[derive(Debug)]
 pub struct RateLimiter {
     window_start: HostTime,
     count: u32,
-    /// Of estimates, which are dropped beyond the limit.
+    /// Number of odometry estimates in the window; further ones are dropped without a failure.
     odometry: u32,
-    /// A fault was reported; the process's further messages are dropped.
+    /// Whether a failure was reported; all further messages of the process are dropped.
     has_failed: bool,
 }
 
 impl RateLimiter {
-    /// Makes one for a process that starts at `now`.
+    /// Makes a limiter for a process that starts at `now`.
     pub fn new(now: HostTime) -> Self {
         Self { window_start: now, count: 0, odometry: 0, has_failed: false }
     }
 
-    /// Returns the message to pass on for what was received.
+    /// Returns the message to pass on: the received one, a failure, or none.
     pub fn take(
         &mut self,
         now: HostTime,
@@ -56,24 +56,24 @@ impl RateLimiter {
         let fault = match received {
             Ok(message) if self.count <= max => return Some(message),
             Ok(_) => format!(
-                "it sends more than {MAX_PER_SECOND} setpoints a second; one for each image is taken"
+                "it sends more than {MAX_PER_SECOND} setpoints a second; send one for each image"
             ),
             Err(why) => format!(
-                "what it sends is no setpoint ({why}); return a Setpoint, and build it against this \
+                "it sends an invalid message ({why}); return a Setpoint, and build it against this \
                  version of the SDK"
             ),
         };
-        // One is enough: a plugin that does this is not flying, and must not flood the control loop.
+        // Only one failure is reported, so that the plugin cannot flood the control loop.
         self.has_failed = true;
         Some(FromPlugin::Failed { reason: bounded(&fault) })
     }
 }
 
-/// Replies and other messages of a plugin, one process after another, through one shared-memory service.
+/// Replies and other messages of a plugin's consecutive processes.
 #[derive(Debug)]
 pub(crate) struct PluginReplies {
     ipc: Arc<RuntimeEnd>,
-    /// Another process begins: the limiter starts afresh.
+    /// Whether a new process has started, for which the limiter must be reset.
     restarted: AtomicBool,
     limiter: Mutex<RateLimiter>,
 }
@@ -87,7 +87,7 @@ impl PluginReplies {
         }
     }
 
-    /// Starts afresh: the next message is another process's.
+    /// Resets the limiter for the next process.
     pub(crate) fn restart(&self) {
         self.restarted.store(true, Ordering::Relaxed);
     }
@@ -96,18 +96,18 @@ impl PluginReplies {
     pub(crate) fn read(&self, stop: &AtomicBool, handle: impl Fn(FromPlugin)) {
         while !stop.load(Ordering::Relaxed) {
             if self.ipc.wait(Duration::from_millis(100)).is_err() {
-                // No event comes any more; poll instead.
+                // Waiting fails at once, so poll instead.
                 thread::sleep(Duration::from_millis(1));
             }
             self.drain(&handle);
         }
     }
 
-    /// Passes on what has arrived. When it returns, `handle` has been given all that was sent before the
-    /// call, by whichever thread: a plugin's last message is handled before its exit.
+    /// Passes on all received messages. After it returns, all messages sent before the call have been handled,
+    /// on this or another thread, so that a plugin's last message is handled before its exit.
     pub(crate) fn drain(&self, handle: impl Fn(FromPlugin)) {
         let mut limiter = lock(&self.limiter);
-        // At most a queue full, so that `stop` is seen whatever the plugin does.
+        // At most one full queue, so that a flood of messages does not delay `stop`.
         for _ in 0..256 {
             let received = match self.ipc.receive() {
                 Ok(Some(message)) => Ok(message),
@@ -135,7 +135,7 @@ mod tests {
         FromPlugin::Reply { seq, entered, returned, setpoint: Some(Setpoint::Hold) }
     }
 
-    /// Returns how many of a second's replies at `hz` pass, and the failure.
+    /// Sends replies at `hz` for a second; returns the number that passed, and the failure.
     fn second(hz: u32) -> (usize, Option<String>) {
         let start = host_now();
         let mut limiter = RateLimiter::new(start);
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn estimates_beyond_the_limit_are_dropped_and_replies_go_on() {
+    fn drops_estimates_beyond_the_limit_and_keeps_replies() {
         let now = host_now();
         let mut limiter = RateLimiter::new(now);
         let estimate = Odometry { stamp: HostTime::ZERO, odom_from_body: Pose::IDENTITY };
@@ -181,7 +181,7 @@ mod tests {
         let Some(FromPlugin::Failed { reason }) = limiter.take(now, Err("cut short".into())) else {
             panic!("nothing is reported")
         };
-        assert!(reason.contains("no setpoint (cut short)"), "{reason}");
+        assert!(reason.contains("an invalid message (cut short)"), "{reason}");
         assert_eq!(limiter.take(now, Err("cut short".into())), None);
         assert_eq!(limiter.take(now, Ok(reply(1))), None);
     }

@@ -1,4 +1,4 @@
-//! The report at the end of a flight: figures in one JSON object.
+//! Report of a flight as one JSON object.
 
 use std::fs;
 
@@ -10,14 +10,14 @@ use vizflyt_protocol::messages::{
 
 use crate::stats::ImageTimes;
 
-/// The report. Field names carry their units.
+/// Report of a flight. Field names contain their units.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FlightReport {
-    /// How the flight ended.
+    /// Outcome of the flight.
     pub outcome: OutcomeKind,
-    /// Why, in one sentence.
+    /// Reason of the end as one sentence.
     pub reason: String,
-    /// From take-off to the end. [s]
+    /// Duration from take-off to the end. [s]
     pub seconds: f64,
     /// Images that reached the plugin.
     pub images_delivered: u64,
@@ -33,36 +33,36 @@ pub struct FlightReport {
     pub age_ms_p99: f64,
     /// Time inside the plugin's `on_image`, median. [ms]
     pub plugin_ms_p50: f64,
-    /// What each stage adds to the age. [ms]
+    /// Contribution of each stage to the age. [ms]
     pub stages: Stages<StageTimes>,
     /// Pose stamp to plugin callback. [ms]
     pub age: StageTimes,
-    /// Pose stamp to the setpoint that carries the answer. [ms]
+    /// Pose stamp to the setpoint with the reply. [ms]
     pub total: StageTimes,
-    /// Times between an image at the plugin and the next.
+    /// Intervals between consecutive images at the plugin.
     pub intervals: Intervals,
-    /// The server's clock at the end; absent if it was never known.
+    /// State of the server's clock at the end; absent without a clock exchange.
     pub clock: Option<ClockState>,
-    /// What became of the images that came, by camera.
+    /// Counts of received images by outcome, for each camera.
     pub cameras: Vec<Arrivals>,
-    /// Answers that took longer than the plugin's deadline.
+    /// Replies that took longer than the plugin's deadline.
     pub plugin_overruns: u64,
-    /// How often the plugin was started again.
+    /// Restarts of the plugin.
     pub plugin_restarts: u32,
     /// Setpoints sent to the autopilot.
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
     pub mavlink_packets: u64,
-    /// Most memory this process has held. [MB]
+    /// Peak memory of this process. [MB]
     pub peak_rss_mb: f64,
-    /// The flight log, if one was written.
+    /// Path of the flight log, if one was written.
     pub log: Option<String>,
 }
 
-/// Counters that the report adds to the end.
+/// Counters for the report.
 #[derive(Clone, Debug, Default)]
 pub struct Counters {
-    /// From take-off to the end. [s]
+    /// Duration from take-off to the end. [s]
     pub seconds: f64,
     /// Width and height of the first camera's images. [px]
     pub image_size_px: (u32, u32),
@@ -70,18 +70,17 @@ pub struct Counters {
     pub setpoints_sent: u64,
     /// MAVLink packets sent and received.
     pub mavlink_packets: u64,
-    /// Answers that took longer than the plugin's deadline.
+    /// Replies that took longer than the plugin's deadline.
     pub plugin_overruns: u64,
-    /// How often the plugin was started again.
+    /// Restarts of the plugin.
     pub plugin_restarts: u32,
-    /// The server's clock.
+    /// State of the server's clock.
     pub clock: Option<ClockState>,
-    /// What became of the images that came, by camera.
+    /// Counts of received images by outcome, for each camera.
     pub cameras: Vec<Arrivals>,
 }
 
 impl FlightReport {
-    /// Makes the report.
     pub fn new(end: &EndReason, times: &ImageTimes, counters: &Counters) -> Self {
         let (waterfall, intervals) = times.flight();
         Self {
@@ -111,8 +110,7 @@ impl FlightReport {
     }
 }
 
-/// Returns the most memory this process has held (`VmHWM`); `None` where the system does not
-/// report it. [MB]
+/// Returns the peak memory of this process (`VmHWM`); `None` if the system does not report it. [MB]
 pub fn peak_rss_mb() -> Option<f64> {
     let status = fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
@@ -133,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_those_agreed_on() {
+    fn serializes_the_documented_field_names() {
         let end = EndReason::Plugin(PluginFault::NoSetpoint);
         let report = FlightReport::new(&end, &ImageTimes::default(), &Counters::default());
         let json = serde_json::to_value(&report).unwrap();

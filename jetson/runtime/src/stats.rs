@@ -1,4 +1,4 @@
-//! How images fare between the pose and the plugin: ages, rates, and what became of each.
+//! Statistics of images from the pose to the plugin: ages, rates, and outcome of each.
 
 use std::collections::VecDeque;
 
@@ -11,10 +11,10 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::waterfall::{RECENT_S, Stamps, Waterfalls};
 
-/// The images of one observation.
+/// Images of one observation.
 type Images = Bounded<Stamps, MAX_CAMERAS>;
 
-/// One answered image.
+/// One image with a reply.
 #[derive(Clone, Copy, Debug)]
 struct AnsweredImage {
     at: HostTime,
@@ -22,18 +22,18 @@ struct AnsweredImage {
     plugin_ms: f32,
 }
 
-/// An observation that was published and not answered.
+/// A published observation without a reply.
 #[derive(Debug)]
 struct Pending {
     seq: u64,
-    /// The pose it shows.
+    /// Stamp of the pose that it shows.
     pose: HostTime,
-    /// When it was there for the plugin to take.
+    /// Time from which on the plugin could take it.
     ready: HostTime,
     images: Images,
 }
 
-/// An answer whose setpoint has not left.
+/// A reply with an unsent setpoint.
 #[derive(Debug)]
 struct Unsent {
     seq: u64,
@@ -41,7 +41,7 @@ struct Unsent {
     images: Images,
 }
 
-/// How images fare. See the module.
+/// Statistics of images. See the module.
 #[derive(Debug, Default)]
 pub struct ImageTimes {
     pending: VecDeque<Pending>,
@@ -51,21 +51,20 @@ pub struct ImageTimes {
     ages: Histogram,
     plugin: Histogram,
     delivered: u64,
-    /// By camera: what the plugin got, and what it did not and why.
+    /// Counts of delivered and skipped images, by camera.
     cameras: [Arrivals; MAX_CAMERAS],
-    /// When the plugin last returned.
+    /// Time of the plugin's last return.
     returned_at: HostTime,
     first_at: Option<HostTime>,
     last_at: Option<HostTime>,
 }
 
-/// Observations published and unanswered that are remembered; a plugin has one at a time, so more
+/// Maximum number of stored observations without a reply. A plugin processes one at a time, so the others
 /// are skipped ones.
 const PENDING: usize = 256;
 
 impl ImageTimes {
-    /// Takes note of observation `seq`, which shows the pose of `pose` and was there for the
-    /// plugin at `ready`.
+    /// Records the publication of observation `seq`, with the pose stamp `pose`, at `ready`.
     pub fn published(&mut self, seq: u64, pose: HostTime, ready: HostTime, images: Images) {
         if self.pending.len() == PENDING {
             self.skip_first();
@@ -73,10 +72,10 @@ impl ImageTimes {
         self.pending.push_back(Pending { seq, pose, ready, images });
     }
 
-    /// Counts the oldest that waits for an answer as skipped.
+    /// Counts the oldest pending observation as skipped.
     fn skip_first(&mut self) {
         let Some(skipped) = self.pending.pop_front() else { return };
-        // Whether the plugin was still at an earlier one when this one was there to take.
+        // Whether the plugin was still busy with an earlier observation when this one was ready.
         let was_busy = skipped.ready < self.returned_at || self.pending.len() + 1 >= PENDING;
         for image in &skipped.images {
             let camera = &mut self.cameras[usize::from(image.camera) % MAX_CAMERAS];
@@ -88,7 +87,7 @@ impl ImageTimes {
         }
     }
 
-    /// Takes note of the plugin's answer; returns the image's age when the plugin got it. [ms]
+    /// Records the plugin's reply; returns the image's age at the plugin's callback. [ms]
     pub fn answered(&mut self, seq: u64, entered: HostTime, returned: HostTime) -> Option<f64> {
         while self.pending.front().is_some_and(|older| older.seq < seq) {
             self.skip_first();
@@ -115,16 +114,16 @@ impl ImageTimes {
         Some(age_ms)
     }
 
-    /// Takes note that a setpoint that carries the answer to observation `seq` left at `sent`; only
-    /// the first of them counts.
+    /// Records that a setpoint with the reply to observation `seq` was sent at `sent`; only the first one
+    /// counts.
     pub fn sent(&mut self, seq: u64, sent: HostTime) {
         if let Some(unsent) = self.unsent.take_if(|unsent| unsent.seq == seq) {
             self.waterfalls.sent(&unsent.images, unsent.returned, sent);
         }
     }
 
-    /// Returns the figures of the last second before `now`; `replaced` images were replaced by
-    /// newer ones before they reached shared memory.
+    /// Returns the statistics of the last second before `now`. `replaced`: number of images that were
+    /// replaced by newer ones before they reached shared memory.
     pub fn last_second(&mut self, now: HostTime, published: u64, replaced: u64) -> ImageStats {
         while self.recent.front().is_some_and(|image| now.seconds_since(image.at) > 1.0) {
             self.recent.pop_front();
@@ -145,23 +144,23 @@ impl ImageTimes {
         }
     }
 
-    /// Returns the regular report of times at `now`; `arrived` is what became of images before
-    /// they reached shared memory, by camera.
+    /// Returns the periodic latency report at `now`. `arrived`: counts of images before shared memory, by
+    /// camera.
     pub fn timing(&self, now: HostTime, clock: Option<ClockState>, arrived: &[Arrivals]) -> Timing {
         let (waterfall, intervals) = self.waterfalls.recent(now);
         let cameras = self.arrivals(arrived);
         Timing { seconds: RECENT_S as f32, waterfall, intervals, clock, cameras }
     }
 
-    /// Returns the report of times of the whole flight, as [`Self::timing`].
+    /// Returns the latency report of the complete flight; see [`Self::timing`].
     pub fn whole(&self, now: HostTime, clock: Option<ClockState>, arrived: &[Arrivals]) -> Timing {
         let (waterfall, intervals) = self.waterfalls.flight();
         let seconds = self.first_at.map_or(0.0, |first| now.seconds_since(first)) as f32;
         Timing { seconds, waterfall, intervals, clock, cameras: self.arrivals(arrived) }
     }
 
-    /// Returns what became of images, by camera: what is known here, added to `before`
-    /// of those that did not reach shared memory.
+    /// Returns the counts of images by camera: `before` for those before shared memory, completed by the
+    /// counts of this struct.
     pub fn arrivals(&self, before: &[Arrivals]) -> Bounded<Arrivals, MAX_CAMERAS> {
         let join = |(before, own): (&Arrivals, &Arrivals)| Arrivals {
             delivered: own.delivered,
@@ -172,17 +171,17 @@ impl ImageTimes {
         before.iter().zip(&self.cameras).map(join).collect()
     }
 
-    /// Returns the ages and intervals of the whole flight.
+    /// Returns the ages and intervals of the complete flight.
     pub fn flight(&self) -> (Waterfall, Intervals) {
         self.waterfalls.flight()
     }
 
-    /// Returns images that reached the plugin.
+    /// Returns the number of images that reached the plugin.
     pub fn delivered(&self) -> u64 {
         self.delivered
     }
 
-    /// Returns images that reached the plugin per second, from the first to the last. [Hz]
+    /// Returns the rate of images that reached the plugin, from the first to the last. [Hz]
     pub fn rate_hz(&self) -> f64 {
         match (self.first_at, self.last_at) {
             (Some(first), Some(last)) if last > first => {
@@ -192,12 +191,12 @@ impl ImageTimes {
         }
     }
 
-    /// Returns ages at the plugin's callback.
+    /// Returns the ages at the plugin's callback.
     pub fn ages(&self) -> &Histogram {
         &self.ages
     }
 
-    /// Returns times inside the plugin.
+    /// Returns the times inside the plugin.
     pub fn plugin(&self) -> &Histogram {
         &self.plugin
     }
@@ -212,7 +211,7 @@ mod tests {
         HostTime::from_ns(ms * 1_000_000)
     }
 
-    /// Images of these cameras, decoded at `ready`.
+    /// Returns images of these cameras, decoded at `ready`.
     fn images(cameras: &[u8], pose: HostTime, ready: HostTime) -> Images {
         let stamps = |&camera| Stamps {
             camera,
@@ -230,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn ages_belong_to_the_image_answered() {
+    fn assigns_ages_to_the_replied_image() {
         let mut times = ImageTimes::default();
         for seq in 0..5 {
             let pose = ms(1000 + 20 * seq);
@@ -249,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_is_skipped_because_the_plugin_was_busy_or_slept() {
+    fn distinguishes_images_skipped_by_a_busy_and_by_an_idle_plugin() {
         let mut times = ImageTimes::default();
         let publish = |times: &mut ImageTimes, seq, ready| {
             times.published(
@@ -261,7 +260,7 @@ mod tests {
         };
         publish(&mut times, 1, 100);
         times.answered(1, ms(100), ms(150));
-        // There while the plugin was at 1; there when it had done, but 4 was before it woke.
+        // 2 is ready while the plugin is busy with 1; 3 is ready afterwards, but replaced by 4 before it is taken.
         publish(&mut times, 2, 120);
         publish(&mut times, 3, 151);
         publish(&mut times, 4, 152);
@@ -272,11 +271,11 @@ mod tests {
             Arrivals { arrived: 4, delivered: 2, overrun: 1, unasked: 1, ..Arrivals::default() };
         assert_eq!((found[0], found[2]), (expected, expected));
         assert_eq!(found[0].ended(), 4);
-        assert_eq!(found[1], arrived[1], "no camera 1 here");
+        assert_eq!(found[1], arrived[1], "no images of camera 1");
     }
 
     #[test]
-    fn only_the_first_setpoint_of_an_answer_counts() {
+    fn counts_only_the_first_setpoint_of_a_reply() {
         let mut times = ImageTimes::default();
         times.published(1, ms(100), ms(110), images(&[0], ms(100), ms(110)));
         times.sent(1, ms(111));
@@ -291,9 +290,9 @@ mod tests {
     }
 
     proptest! {
-        /// Every image that was published is accounted for, whatever the plugin does.
+        /// Each published image is counted once, for any behaviour of the plugin.
         #[test]
-        fn every_image_has_one_end(script in prop::collection::vec((0u64..30, any::<bool>()), 1..600)) {
+        fn counts_each_image_once(script in prop::collection::vec((0u64..30, any::<bool>()), 1..600)) {
             let mut times = ImageTimes::default();
             let (mut now, mut seq, mut published) = (1000, 0, 0u64);
             for (pause, answers) in script {

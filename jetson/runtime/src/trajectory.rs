@@ -1,15 +1,15 @@
-//! Follows a plugin's trajectory: where the reference is, and how it moves. Pure: the vehicle's
-//! place and `dt` in, a moving point out, at the guard's rate (50 to 200 Hz). The guard steers
-//! towards that point and keeps all limits.
+//! Follows a plugin's trajectory: computes position and velocity of a reference point from the vehicle's
+//! position and `dt`, at the guard's rate (50 to 200 Hz). The guard steers towards the reference and applies
+//! all limits.
 //!
-//! The reference waits for the vehicle: its pace falls with the distance between the two. So a
-//! vehicle that the guard slows down, or that starts away from the path, loses nothing of it.
+//! The reference slows down with increasing distance to the vehicle. A vehicle that the guard slows down, or
+//! that starts away from the path, therefore still flies the complete path.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::yaw_of;
 use vizflyt_protocol::messages::{Axes, Path, PathYaw, Trajectory, YawTarget};
 
-/// The desired position, velocity and heading.
+/// Desired position, velocity and heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reference {
     /// Position. [m, world]
@@ -20,7 +20,7 @@ pub struct Reference {
     pub yaw: YawTarget,
 }
 
-/// Where a vehicle is that is to follow a path.
+/// Pose of the vehicle at the start of a path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Start {
     /// Position. [m, world]
@@ -29,17 +29,17 @@ pub struct Start {
     pub rotation: DQuat,
 }
 
-/// Up to this far behind, the reference keeps its pace: what a vehicle lags at 3 m/s. [m]
+/// Distance to the vehicle up to which the reference keeps its speed: the usual lag at 3 m/s. [m]
 const FREE_LAG_M: f64 = 0.5;
-/// This far behind, it stands. [m]
+/// Distance to the vehicle at which the reference stops. [m]
 const MAX_LAG_M: f64 = 1.5;
-/// Share of the acceleration limit that waypoints are flown with; the rest is for corrections.
+/// Share of the acceleration limit used for waypoints; the rest is for corrections.
 const SHARE: f64 = 0.5;
-/// A corner may change the velocity by what this time and that acceleration allow. [s]
+/// Duration of a turn at a corner: limits the change of velocity to this time at that acceleration. [s]
 const CORNER_S: f64 = 0.25;
-/// A path shorter than this has no direction. [m]
+/// Length below which a leg has no direction. [m]
 const MIN_M: f64 = 1e-6;
-/// Slower than this, level, there is no direction of travel for the nose. [m/s]
+/// Horizontal speed below which the direction of travel is undefined. [m/s]
 const MIN_MPS: f64 = 0.05;
 
 /// Follows one trajectory. See the module.
@@ -49,16 +49,16 @@ pub struct Follower {
     origin_m: DVec3,
     world_from_axes: DQuat,
     progress: Progress,
-    /// The nose's last direction of travel.
+    /// Last direction of travel, for the heading.
     ahead: YawTarget,
     is_over: bool,
 }
 
 #[derive(Clone, Debug)]
 enum Progress {
-    /// Legs between waypoints, and where on them.
+    /// Legs between waypoints, index of the present leg, distance on it, and speed.
     Legs { legs: Vec<Leg>, at: usize, way_m: f64, speed_mps: f64 },
-    /// Piece of the polynomial, and time in it.
+    /// Index of the present piece of the polynomial, and time in it.
     Piece { at: usize, t_s: f64 },
 }
 
@@ -72,7 +72,7 @@ struct Leg {
 }
 
 impl Follower {
-    /// Starts to follow `trajectory` from where the vehicle is.
+    /// Starts to follow `trajectory` from the vehicle's pose.
     pub fn new(trajectory: Trajectory, start: &Start) -> Self {
         let (origin_m, world_from_axes) = match trajectory.axes {
             Axes::World => (DVec3::ZERO, DQuat::IDENTITY),
@@ -101,18 +101,17 @@ impl Follower {
         Self { trajectory, origin_m, world_from_axes, progress, ahead, is_over: false }
     }
 
-    /// Returns what it follows.
     pub fn trajectory(&self) -> &Trajectory {
         &self.trajectory
     }
 
-    /// Whether the reference has come to the path's end.
+    /// Whether the reference has reached the end of the path.
     pub fn is_over(&self) -> bool {
         self.is_over
     }
 
-    /// Moves the reference on by `dt_s`, for a vehicle at `p_world_m` within these limits of speed
-    /// and acceleration; returns where it then is.
+    /// Advances the reference by `dt_s`, for a vehicle at `p_world_m` with these limits of speed and
+    /// acceleration; returns it.
     pub fn advance(
         &mut self,
         p_world_m: DVec3,
@@ -156,13 +155,13 @@ impl Follower {
         Reference { p_world_m, v_world_mps: v_world_mps * pace, yaw }
     }
 
-    /// Returns where the reference is and how it moves at full pace. [m, m/s, world]
+    /// Returns position and velocity of the reference without slowdown. [m, m/s, world]
     fn place(&self) -> (DVec3, DVec3) {
         match &self.progress {
             Progress::Legs { legs, at, way_m, speed_mps } => match (legs.get(*at), legs.last()) {
                 (Some(leg), _) => (leg.from_m + leg.direction * *way_m, leg.direction * *speed_mps),
                 (None, Some(last)) => (last.from_m + last.direction * last.length_m, DVec3::ZERO),
-                // Every waypoint is where the vehicle was.
+                // All waypoints are at the start position.
                 (None, None) => (self.only_point_m(), DVec3::ZERO),
             },
             Progress::Piece { at, t_s } => {
@@ -184,8 +183,8 @@ impl Follower {
     }
 }
 
-/// Returns the greatest speed `way_m` into the first leg with which every corner behind it, and the
-/// stop at the end, can still be kept. [m/s]
+/// Returns the maximum speed at the distance `way_m` on the first leg that still allows all later corners and
+/// the stop at the end. [m/s]
 fn most_mps(legs: &[Leg], way_m: f64, max_speed_mps: f64, acceleration_mps2: f64) -> f64 {
     let Some(first) = legs.first() else { return 0.0 };
     let mut most_mps = first.speed_mps.min(max_speed_mps);
@@ -193,7 +192,7 @@ fn most_mps(legs: &[Leg], way_m: f64, max_speed_mps: f64, acceleration_mps2: f64
     for (index, leg) in legs.iter().enumerate() {
         to_corner_m += leg.length_m;
         let corner_mps = legs.get(index + 1).map_or(0.0, |next| {
-            // v turned by an angle changes by 2 v sin(angle / 2) = v |d1 - d2|.
+            // Turning v by an angle changes it by 2 v sin(angle / 2) = v |d1 - d2|.
             let turn = (next.direction - leg.direction).length();
             next.speed_mps.min(acceleration_mps2 * CORNER_S / turn.max(MIN_M))
         });

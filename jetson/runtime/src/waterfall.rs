@@ -1,11 +1,11 @@
-//! Where images get their age: each image's stamps in, percentiles of every stage out.
+//! Latency by stage: computes percentiles of each stage from the stamps of images.
 //!
 //! ```text
-//! images ── Stamps (server's by the clock filter, and our own) ──▶ answered() ── sent() ──▶
-//!    histograms of the whole flight, and of each of the last seconds
+//! images ── Stamps (of the server, converted, and of the runtime) ──▶ answered() ── sent() ──▶
+//!    histograms of the complete flight, and of each of the last seconds
 //! ```
-//! Pure: all times come as arguments. 230 KB however long the flight. The stages and where they
-//! begin and end: [`vizflyt_protocol::messages::Stage`].
+//! No clock is read: all times are arguments. Memory is 230 KB for any length of flight. For the definition
+//! of the stages see [`vizflyt_protocol::messages::Stage`].
 
 use vizflyt_protocol::histogram::Histogram;
 use vizflyt_protocol::messages::{INTERVAL_EDGES_MS, Intervals, Stage, Stages, Waterfall};
@@ -13,43 +13,45 @@ use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::HostTime;
 use zerocopy::byteorder::little_endian::U64;
 
-/// When an image passed the ends of its stages, all on this computer's clock.
+/// Ends of an image's stages, all on this computer's clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamps {
     /// Index of the camera.
     pub camera: u8,
-    /// The pose it shows was measured.
+    /// Measurement of the pose.
     pub pose: HostTime,
-    /// Rendering began.
+    /// Start of rendering.
     pub render_start: HostTime,
-    /// Rendering ended.
+    /// End of rendering.
     pub render_end: HostTime,
-    /// Encoding ended.
+    /// End of encoding.
     pub encode_end: HostTime,
-    /// Its first byte was handed to the server's transport.
+    /// First byte passed to the server's transport.
     pub send: HostTime,
-    /// Its first byte came.
+    /// Arrival of the first byte.
     pub receive_first: HostTime,
-    /// Its last byte came.
+    /// Arrival of the last byte.
     pub receive: HostTime,
-    /// It was decoded.
+    /// End of decoding.
     pub decode_end: HostTime,
-    /// Bound of the error of the server's stamps among these. [ns]
+    /// Error bound of the converted server stamps. [ns]
     pub clock_error_ns: u64,
 }
 
-/// Whether an image came before it was sent.
+/// Relation between the times of sending and arrival of an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Causality {
+    /// Arrival after sending.
     Kept,
-    /// Broken by no more than the clocks' error bound.
+    /// Arrival before sending, within the clocks' error bound.
     WithinBound,
+    /// Arrival before sending, beyond the error bound.
     Broken,
 }
 
 impl Stamps {
-    /// Takes the server's stamps of an image whose pose was measured at `pose`, and when its first
-    /// byte came, its last byte came, and it was decoded. Trusts the clocks for now.
+    /// Makes the stamps of an image from the server's stamps, the measurement time `pose`, and `own`: arrival
+    /// of first and last byte, and end of decoding. Sets the clock error to 0.
     pub fn of(
         header: &ImageHeader,
         trailer: &ImageTrailer,
@@ -58,8 +60,8 @@ impl Stamps {
     ) -> Self {
         let [receive_first, receive, decode_end] = own;
         let mut last = pose;
-        // All of them are off by the same as the pose. One that the server did not set is zero:
-        // its stage then adds nothing.
+        // Converts relative to the pose, which has the same clock offset. An unset stamp is 0: its stage then
+        // adds nothing.
         let mut host = |stamp: U64| {
             if stamp.get() > 0 {
                 let after_ns = stamp.get().wrapping_sub(header.pose_ns.get()).cast_signed();
@@ -90,9 +92,9 @@ impl Stamps {
         }
     }
 
-    /// Returns what each stage up to the plugin adds, and the age at the plugin's start. [ms]
+    /// Returns the contribution of each stage up to the plugin, and the age at the plugin's start. [ms]
     fn stages(&self, plugin_start: HostTime, plugin_end: HostTime) -> (Stages<f64>, f64) {
-        // A stage that ends before its predecessor (they overlap, or the clocks err) adds nothing.
+        // A stage that ends before its predecessor (overlap, or clock error) adds nothing.
         let mut reached = self.pose;
         let mut until = |end: HostTime| {
             let added_ms = end.seconds_since(reached).max(0.0) * 1e3;
@@ -118,13 +120,13 @@ impl Stamps {
 #[derive(Debug, Default)]
 pub struct Waterfalls {
     flight: Box<Rows>,
-    /// The last seconds, each in the place of its number modulo their count.
+    /// Ring buffer of the last seconds, indexed by their number modulo [`RECENT_S`].
     recent: [Box<Second>; RECENT_S],
-    /// When the plugin was last given an image.
+    /// Time of the plugin's last callback.
     last_start: Option<HostTime>,
 }
 
-/// Seconds that [`Waterfalls::recent`] covers.
+/// Period covered by [`Waterfalls::recent`]. [s]
 pub const RECENT_S: usize = 5;
 
 #[derive(Debug, Default)]
@@ -145,7 +147,7 @@ struct Rows {
 }
 
 impl Waterfalls {
-    /// Takes note that the plugin worked on the images of one observation from `start` to `end`.
+    /// Records that the plugin processed the images of one observation from `start` to `end`.
     pub fn answered(&mut self, images: &[Stamps], start: HostTime, end: HostTime) {
         let interval_ms = self.last_start.map(|last| start.seconds_since(last) * 1e3);
         self.last_start = Some(start);
@@ -171,8 +173,7 @@ impl Waterfalls {
         });
     }
 
-    /// Takes note that the setpoint that answers these images, for which the plugin ended at
-    /// `end`, left at `sent`.
+    /// Records that the setpoint for these images was sent at `sent`, after the plugin had returned at `end`.
     pub fn sent(&mut self, images: &[Stamps], end: HostTime, sent: HostTime) {
         self.count(sent, |rows| {
             for image in images {
@@ -182,12 +183,12 @@ impl Waterfalls {
         });
     }
 
-    /// Returns the figures of the whole flight.
+    /// Returns the statistics of the complete flight.
     pub fn flight(&self) -> (Waterfall, Intervals) {
         self.flight.report()
     }
 
-    /// Returns the figures of the last [`RECENT_S`] seconds before `now`.
+    /// Returns the statistics of the last [`RECENT_S`] seconds before `now`.
     pub fn recent(&self, now: HostTime) -> (Waterfall, Intervals) {
         let this = number(now);
         let mut rows = Rows::default();
@@ -254,7 +255,7 @@ mod tests {
         HostTime::from_ns(1_000_000_000 + us * 1000)
     }
 
-    /// Stages of 4, 8, 2, 0.5, 1, 1.5 ms.
+    /// Returns stamps with stages of 4, 8, 2, 0.5, 1 and 1.5 ms.
     fn stamps(pose_us: u64) -> Stamps {
         let at = |after_us| us(pose_us + after_us);
         Stamps {
@@ -276,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn every_stage_gets_its_time() {
+    fn measures_each_stage() {
         let mut falls = Waterfalls::default();
         for n in 0..100 {
             let image = stamps(n * 20_000);
@@ -300,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn the_servers_stamps_are_placed_by_the_pose() {
+    fn converts_server_stamps_relative_to_the_pose() {
         let k = Intrinsics::from_horizontal_fov(4, 3, 1.0);
         let stamp = ServerTime::from_ns(77_000);
         let mut header = ImageHeader::new(1, 3, stamp, &k, &Pose::IDENTITY, &Pose::IDENTITY);
@@ -311,15 +312,15 @@ mod tests {
         let host = |us_: u64| us(100 + us_);
         assert_eq!((found.camera, found.pose), (3, us(100)));
         assert_eq!([found.render_start, found.render_end], [host(1), host(3)]);
-        assert_eq!(found.encode_end, host(3), "not set: as the one before");
+        assert_eq!(found.encode_end, host(3), "unset: equal to the previous stamp");
         assert_eq!([found.send, found.receive_first], [host(8), host(10)]);
     }
 
     #[test]
-    fn the_last_seconds_are_apart_from_the_flight() {
+    fn reports_the_last_seconds_separately() {
         let mut falls = Waterfalls::default();
         for n in 0..1000 {
-            // One in 20 ms: 20 s. The plugin gets slower from the tenth on.
+            // One in 20 ms for 20 s; the plugin is slower after 10 s.
             let image = stamps(n * 20_000);
             let start = image.pose.plus_ns(17_000_000);
             let end = start.plus_ns(if n < 500 { 1_000_000 } else { 9_000_000 });
@@ -335,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_that_came_before_it_was_sent_is_clamped_and_counted() {
+    fn clamps_and_counts_images_that_arrive_before_they_are_sent() {
         let mut falls = Waterfalls::default();
         let early = |ns: i64| Stamps { receive_first: us(14_100).plus_ns(-ns), ..stamps(0) };
         for image in [early(0), early(100_000), early(100_001), early(900_000_000)] {
@@ -347,9 +348,9 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the stamps, the stages up to the plugin and its handover sum up to the age.
+        /// For any stamps, the sum of the stages up to the handover is the age.
         #[test]
-        fn stages_sum_up(mut times in prop::collection::vec(0u64..1_000_000, 10), shuffle in any::<bool>()) {
+        fn sum_of_stages_is_the_age(mut times in prop::collection::vec(0u64..1_000_000, 10), shuffle in any::<bool>()) {
             if !shuffle {
                 times.sort_unstable();
             }

@@ -1,6 +1,6 @@
-//! An image on its way from the network to the plugin's shared memory allocates nothing of ours
-//! once the buffers have their size: into the mailbox, decoded in place, published.
-//! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
+//! Checks that the runtime allocates nothing per image from the mailbox to the plugin's shared memory, after
+//! its buffers have reached their size. Colour is lossless here, because the JPEG libraries allocate a few
+//! small buffers per image.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,7 +21,7 @@ static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 const SIZE: (u32, u32) = (64, 48);
 
-/// Returns an image's bitstream in the pieces that the receiver cuts it into.
+/// Returns an image's bitstream, split into pieces as by the receiver.
 fn pieces() -> Vec<Vec<u8>> {
     let (width, height) = SIZE;
     let pixels = (width * height) as usize;
@@ -43,7 +43,7 @@ fn pieces() -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
+fn allocates_nothing_per_image_in_the_steady_state() {
     let (width, height) = SIZE;
     let camera = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(width, height, 1.5));
     let cameras = vec![camera.clone()];
@@ -53,7 +53,7 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
     let mailbox = Mailbox::default();
     let (pieces, session) = (pieces(), mailbox.session());
     let len = pieces.iter().map(Vec::len).sum::<usize>() as u32;
-    // The receiver's own buffer; the mailbox leaves an empty one in its place.
+    // The receiver's buffer; the mailbox replaces it by an empty one.
     let mut piece = Vec::new();
     let mut publish = |seq: u64| {
         let stamp = ServerTime::from_ns(seq * 10_000_000);
@@ -85,7 +85,7 @@ fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
         let sample = plugin.observation().unwrap().expect("the plugin sees it");
         let seen = Observation::from_bytes(sample.bytes(), &names).unwrap();
         assert_eq!(seen.camera("front").unwrap().seq, seq);
-        // Buffers of all sizes have been everywhere after some turns.
+        // After some images, all reused buffers have reached their size.
         if seq > 20 {
             count += allocations;
         }

@@ -1,16 +1,16 @@
-//! A log on a disk that fills up, as the kernel has it: here the process's own limit of a file's
-//! size. In a process of its own, as the limit is the process's.
+//! Test of a log on a full disk, simulated by the process's limit of file sizes. A separate test binary,
+//! because the limit applies to the complete process.
 
 use nix::sys::resource::{Resource, setrlimit};
 use vizflyt_runtime::log::read::{Entry, LogReader};
 use vizflyt_runtime::log::{Channel, FlightLog, LogSettings, keep_going_when_files_are_full};
 use vizflyt_sdk::host_now;
 
-/// Largest file. [bytes]
+/// Maximum file size. [bytes]
 const ROOM: u64 = 3 << 20;
 
 #[test]
-fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
+fn full_disk_leaves_a_valid_file_and_a_running_process() {
     keep_going_when_files_are_full();
     let folder = tempfile::tempdir().unwrap();
     let log = FlightLog::open(&LogSettings::full(folder.path()), None);
@@ -21,7 +21,7 @@ fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
     let trouble = loop {
         log.write(Channel::Requested, host_now(), &line);
         written += 1;
-        // A chunk at least each second; the limit is that of a test that hangs.
+        // Chunks are written at least each second; this limit ends a hanging test.
         assert!(written < 1_000_000, "the disk is never full");
         if let Some(trouble) = log.poll_trouble()
             && trouble.contains("not logged any further")
@@ -29,7 +29,7 @@ fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
             break trouble;
         }
     };
-    // More records stop nobody.
+    // Further records do not block.
     log.write(Channel::Requested, host_now(), &line);
     drop(log);
     let len = std::fs::metadata(&path).unwrap().len();
@@ -42,6 +42,6 @@ fn a_file_that_may_not_grow_is_whole_and_the_process_goes_on() {
     while let Some(entry) = reader.next().unwrap() {
         found += u64::from(matches!(entry, Entry::Message(_)));
     }
-    assert!(!reader.is_cut(), "a whole file");
+    assert!(!reader.is_cut(), "a complete file");
     println!("{found} messages of {len} bytes are left: {trouble}");
 }

@@ -1,5 +1,5 @@
-//! A viewer as Foxglove is one: connects by WebSocket, receives the channels, subscribes to one,
-//! gets its messages. Written against the protocol (foxglove.sdk.v1), not against the library.
+//! Test with a viewer like Foxglove: it connects by WebSocket, receives the channels, subscribes to one, and
+//! receives its messages. Uses the protocol (foxglove.sdk.v1) instead of the library.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use vizflyt_runtime::log::{Channel, FlightLog, Live, LogSettings};
 use vizflyt_sdk::host_now;
 
 #[test]
-fn a_viewer_sees_the_logs_channels_and_their_messages() {
+fn viewer_receives_channels_and_messages_of_the_log() {
     let tokio = tokio::runtime::Runtime::new().unwrap();
     let live = tokio.block_on(Live::start("127.0.0.1:0".parse().unwrap())).unwrap();
     let address = live.address();
@@ -32,7 +32,7 @@ fn a_viewer_sees_the_logs_channels_and_their_messages() {
     assert_eq!(asked["encoding"], "json");
     let subscription = json!({"id": 7, "channelId": asked["id"]});
     viewer.send(&json!({"op": "subscribe", "subscriptions": [subscription]}).to_string());
-    // Whatever is logged before the subscription counts is not sent: go on until one comes.
+    // Messages logged before the subscription takes effect are not sent, so repeat until one arrives.
     viewer.stream().set_read_timeout(Some(Duration::from_millis(50))).unwrap();
     let mut first = [0; 1];
     let body = loop {

@@ -1,4 +1,4 @@
-// Flies ahead as fast as the way is free, and turns where it is not: a C++ plugin on vizflyt.h.
+// Flies forward at a speed that depends on the free distance, and turns at obstacles: a C++ plugin on vizflyt.h.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -25,7 +25,7 @@ void on_start(void *user, const VizflytArena *arena) {
     std::fflush(stdout);
 }
 
-// Returns the least depth in the middle ninth of the image, in metres; 20 if there is no return.
+// Returns the smallest depth in the middle ninth of the image, in metres; 20 without a return.
 double nearest_m(const VizflytObservation *obs, unsigned camera) {
     const VizflytCamera &head = obs->cameras[camera];
     const uint16_t *depth_mm = vizflyt_depth_mm(obs, camera);
@@ -37,7 +37,7 @@ double nearest_m(const VizflytObservation *obs, unsigned camera) {
     return nearest;
 }
 
-// Returns what a range finder "ahead" and a LiDAR "top" have ahead, in metres; 20 where there are none.
+// Returns the nearest distance ahead of a range finder "ahead" and a LiDAR "top", in metres; 20 without them.
 double sensed_m(const VizflytObservation *obs) {
     double nearest = 20.0;
     const VizflytSensor *ahead = vizflyt_sensor(obs, "ahead");

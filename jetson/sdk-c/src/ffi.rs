@@ -1,4 +1,4 @@
-//! The C interface. Types mirror `include/vizflyt.h` field by field; their meaning is documented there.
+//! C interface. Types mirror `include/vizflyt.h` field by field; see there for their meaning.
 
 #![allow(unsafe_code, reason = "the C interface: pointers from the caller")]
 
@@ -14,27 +14,27 @@ use vizflyt_sdk::{
     SetpointKind, Trajectory, Volume, Waypoint, YawTarget,
 };
 
-/// A point to pass.
+/// Waypoint of a path.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytWaypoint {
-    /// Where. [m, axes]
+    /// Position. [m, axes]
     pub p_m: [f64; 3],
-    /// Greatest speed on the way to it. [m/s]
+    /// Maximum speed on the way to it. [m/s]
     pub speed_mps: f64,
 }
 
-/// A polynomial in time.
+/// Polynomial in time.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytPiece {
-    /// How long it lasts. [s]
+    /// Duration. [s]
     pub seconds: f64,
-    /// Of `t^k`. [m/s^k, axes]
+    /// Coefficients of `t^k`. [m/s^k, axes]
     pub coefficients: [[f64; 3]; 8],
 }
 
-/// What a plugin answers.
+/// Setpoint that a plugin returns.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytSetpoint {
@@ -44,39 +44,39 @@ pub struct VizflytSetpoint {
     pub axes: u32,
     /// `VIZFLYT_YAW_KEEP` and so on.
     pub yaw_kind: u32,
-    /// Of waypoints or pieces.
+    /// Number of waypoints or pieces.
     pub count: u32,
-    /// By kind.
+    /// Vector; its meaning depends on `kind`.
     pub v: [f64; 3],
-    /// By `yaw_kind`. [rad or rad/s]
+    /// Yaw or yaw rate, by `yaw_kind`. [rad or rad/s]
     pub yaw: f64,
-    /// Over weight.
+    /// Thrust / weight.
     pub thrust: f64,
-    /// Of a trajectory.
+    /// Id of a trajectory.
     pub id: u32,
-    /// Zero.
+    /// Always zero.
     pub reserved: u32,
-    /// `count` of them.
+    /// `count` waypoints.
     pub waypoints: *const VizflytWaypoint,
-    /// `count` of them.
+    /// `count` pieces.
     pub pieces: *const VizflytPiece,
 }
 
-/// A solid.
+/// Solid volume.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytVolume {
     /// `VIZFLYT_SPHERE` and so on.
     pub kind: u32,
-    /// Zero.
+    /// Always zero.
     pub reserved: u32,
-    /// By kind. [m, world]
+    /// First vector; its meaning depends on `kind`. [m, world]
     pub a: [f64; 3],
-    /// By kind.
+    /// Second vector; its meaning depends on `kind`.
     pub b: [f64; 3],
-    /// Of a sphere and a capsule; the offset of a half space. [m]
+    /// Radius of a sphere or capsule; offset of a half space. [m]
     pub radius_m: f64,
-    /// Of a box into the world.
+    /// Rotation of a box to world.
     pub rotation_xyzw: [f64; 4],
 }
 
@@ -95,69 +95,69 @@ impl From<&Volume> for VizflytVolume {
     }
 }
 
-/// The description of the flight that a plugin gets at the start.
+/// Description of the flight, passed to `on_start`.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytArena {
-    /// Cameras there are.
+    /// Number of cameras.
     pub camera_count: u32,
     /// Whether `goal_m` is set.
     pub has_goal: u32,
-    /// Where the flight shall end. [m, world]
+    /// Goal of the flight. [m, world]
     pub goal_m: [f64; 3],
-    /// Greatest speed. [m/s]
+    /// Maximum speed. [m/s]
     pub max_speed_mps: f64,
-    /// Greatest acceleration. [m/s^2]
+    /// Maximum acceleration. [m/s^2]
     pub max_acceleration_mps2: f64,
-    /// Whether observations have the pose.
+    /// Whether observations contain the pose.
     pub ground_truth: u32,
     /// Whether attitude rates are allowed.
     pub attitude_rate: u32,
-    /// The arena's name, ending in 0.
+    /// Name of the arena, zero-terminated.
     pub name: [u8; 33],
-    /// The cameras' names, each ending in 0.
+    /// Names of the cameras, zero-terminated.
     pub cameras: [[u8; 33]; MAX_CAMERAS],
-    /// Kinds of setpoint that may be asked for: bit `VIZFLYT_POSITION` and so on.
+    /// Allowed kinds of setpoint: bit `VIZFLYT_POSITION` and so on.
     pub setpoints: u32,
     /// Height of the floor. [m, world]
     pub floor_z_m: f64,
-    /// Keep-in volume of the body's surface.
+    /// Volume in which the body's surface must stay.
     pub geofence: VizflytVolume,
-    /// Keep-out volumes there are.
+    /// Number of no-fly volumes.
     pub no_fly_count: u32,
-    /// Of the map; 0 where it is not known.
+    /// Number of volumes of the map; 0 if the course does not give it.
     pub map_count: u32,
-    /// Keep-out volumes of the body's surface.
+    /// Volumes that the body's surface must not enter.
     pub no_fly: [VizflytVolume; MAX_NO_FLY],
-    /// Every obstacle, where the course's map is known.
+    /// Every obstacle, if the course gives the map.
     pub map: *const VizflytVolume,
 }
 
-/// A plugin's callbacks.
+/// Callbacks of a plugin.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct VizflytPlugin {
-    /// Handed back to each.
+    /// Passed to each callback.
     pub user: *mut c_void,
-    /// Before the first image.
+    /// Called before the first image.
     pub on_start: Option<unsafe extern "C" fn(*mut c_void, *const VizflytArena)>,
-    /// At each image: the observation's memory, which begins with its [`ObservationHeader`].
+    /// Called for each image with the observation's memory, which begins with its [`ObservationHeader`].
     pub on_image:
         Option<unsafe extern "C" fn(*mut c_void, *const c_void, *mut VizflytSetpoint) -> c_int>,
-    /// When something happened.
+    /// Called for each event.
     pub on_event: Option<unsafe extern "C" fn(*mut c_void, *const c_char)>,
-    /// At the end.
+    /// Called at the end of the flight.
     pub on_stop: Option<unsafe extern "C" fn(*mut c_void)>,
 }
 
-/// Attaches to the runtime that started this program and runs to the end of the flight; returns the
-/// exit status for `main`.
+/// Attaches to the runtime that started this program and runs until the end of the flight. Returns the exit status for
+/// `main`.
 ///
 /// # Safety
-/// `plugin` points to a `VizflytPlugin` whose callbacks do what `vizflyt.h` asks of them.
+/// `plugin` points to a `VizflytPlugin` with callbacks that follow `vizflyt.h`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
-    // SAFETY: the caller promises it, or passes null.
+    // SAFETY: guaranteed by the caller, or null.
     let Some(&callbacks) = (unsafe { plugin.as_ref() }) else {
         eprintln!("vizflyt_run: the plugin is NULL");
         return NOT_ATTACHED;
@@ -167,11 +167,11 @@ pub unsafe extern "C" fn vizflyt_run(plugin: *const VizflytPlugin) -> c_int {
         return NOT_ATTACHED;
     }
     let code = vizflyt_sdk::run(CPlugin(callbacks));
-    // `ExitCode` does not give its number.
+    // `ExitCode` does not expose its number.
     [0, 1, 2, 101].into_iter().find(|&n| ExitCode::from(n) == code).unwrap_or(1).into()
 }
 
-/// Publishes where the plugin thinks the vehicle was; returns 1, or 0 for what is no pose or too many.
+/// Publishes the plugin's estimate of the vehicle's pose. Returns 1, or 0 for an invalid pose or too many calls.
 ///
 /// # Safety
 /// `p_odom_m` points to three numbers and `rotation_xyzw` to four, or either is null.
@@ -181,7 +181,7 @@ pub unsafe extern "C" fn vizflyt_publish_odometry(
     p_odom_m: *const [f64; 3],
     rotation_xyzw: *const [f64; 4],
 ) -> c_int {
-    // SAFETY: the caller promises it, or passes null.
+    // SAFETY: guaranteed by the caller, or null.
     let given = unsafe { p_odom_m.as_ref().zip(rotation_xyzw.as_ref()) };
     let published = given.map(|(&p_m, &xyzw)| {
         let pose = Pose::new(DVec3::from(p_m), DQuat::from_array(xyzw));
@@ -192,7 +192,7 @@ pub unsafe extern "C" fn vizflyt_publish_odometry(
 
 const NOT_ATTACHED: c_int = 2;
 
-/// Returns the number of a kind of setpoint in `vizflyt.h`; both kinds of trajectory have the first's.
+/// Returns the number of a kind of setpoint in `vizflyt.h`. Both kinds of trajectory share the first one's number.
 fn number(kind: SetpointKind) -> u32 {
     match kind {
         SetpointKind::Position => 2,
@@ -242,7 +242,7 @@ impl Autonomy for CPlugin {
             no_fly,
             map: if map.is_empty() { std::ptr::null() } else { map.as_ptr() },
         };
-        // SAFETY: the callback keeps to `vizflyt.h`; `arena` outlives the call.
+        // SAFETY: the callback follows `vizflyt.h`; `arena` outlives the call.
         unsafe { on_start(self.0.user, &raw const arena) }
     }
 
@@ -261,17 +261,17 @@ impl Autonomy for CPlugin {
             waypoints: std::ptr::null(),
             pieces: std::ptr::null(),
         };
-        // The header's address is the memory's, planes behind it: validated by `Observation`.
+        // The memory begins with the header, followed by the planes; `Observation` has validated it.
         let memory = obs.as_bytes().as_ptr().cast::<c_void>();
-        // SAFETY: the callback keeps to `vizflyt.h`; both pointers outlive the call.
+        // SAFETY: the callback follows `vizflyt.h`; both pointers outlive the call.
         let answered = unsafe { on_image(self.0.user, memory, &raw mut answer) };
         if answered == 0 {
             return None;
         }
-        // SAFETY: the callback has filled in `answer` as `vizflyt.h` asks.
+        // SAFETY: the callback has filled in `answer` according to `vizflyt.h`.
         let setpoint = unsafe { setpoint(&answer) };
         if setpoint.is_none() {
-            eprintln!("vizflyt: no such setpoint: {answer:?}");
+            eprintln!("vizflyt: invalid setpoint: {answer:?}");
         }
         setpoint
     }
@@ -281,19 +281,19 @@ impl Autonomy for CPlugin {
         else {
             return;
         };
-        // SAFETY: the callback keeps to `vizflyt.h`; `text` outlives the call.
+        // SAFETY: the callback follows `vizflyt.h`; `text` outlives the call.
         unsafe { on_event(self.0.user, text.as_ptr()) }
     }
 
     fn on_stop(&mut self) {
         if let Some(on_stop) = self.0.on_stop {
-            // SAFETY: the callback keeps to `vizflyt.h`.
+            // SAFETY: the callback follows `vizflyt.h`.
             unsafe { on_stop(self.0.user) }
         }
     }
 }
 
-/// Returns `name`, which has at most 32 bytes, with a 0 behind it.
+/// Returns `name`, of at most 32 bytes, with a terminating zero.
 fn zero_ended(name: &str) -> [u8; 33] {
     let mut out = [0; 33];
     for (to, from) in out[..32].iter_mut().zip(name.bytes()) {
@@ -302,10 +302,10 @@ fn zero_ended(name: &str) -> [u8; 33] {
     out
 }
 
-/// Returns the setpoint; `None` if a number names none, or a list is NULL or too long.
+/// Converts to a setpoint. `None` for an unknown number, or a list that is NULL or too long.
 ///
 /// # Safety
-/// `waypoints` or `pieces`, as the kind asks, is NULL or points to `count` of them.
+/// `waypoints` or `pieces`, depending on the kind, is NULL or points to `count` elements.
 unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
     let axes = match answer.axes {
         0 => Axes::World,
@@ -341,7 +341,7 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
             if answer.waypoints.is_null() || count > MAX_WAYPOINTS {
                 return None;
             }
-            // SAFETY: not null, so the caller promises `count` of them.
+            // SAFETY: not null, so the caller guarantees `count` elements.
             let given = unsafe { std::slice::from_raw_parts(answer.waypoints, count) };
             let point = |point: &VizflytWaypoint| Waypoint {
                 p_m: point.p_m.into(),
@@ -353,7 +353,7 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
             if answer.pieces.is_null() || count > MAX_PIECES {
                 return None;
             }
-            // SAFETY: not null, so the caller promises `count` of them.
+            // SAFETY: not null, so the caller guarantees `count` elements.
             let given = unsafe { std::slice::from_raw_parts(answer.pieces, count) };
             let piece = |piece: &VizflytPiece| Piece {
                 seconds: piece.seconds,
@@ -365,7 +365,7 @@ unsafe fn setpoint(answer: &VizflytSetpoint) -> Option<Setpoint> {
     })
 }
 
-// What `vizflyt.h` asserts on its side.
+// The same layout that `vizflyt.h` asserts.
 const _: () = assert!(size_of::<ObservationHeader>() == 4064);
 const _: () = assert!(std::mem::offset_of!(ObservationHeader, sensors_offset) == 4056);
 const _: () = assert!(size_of::<SensorHeader>() == 192);

@@ -1,8 +1,8 @@
-//! The SDK for C and C++: `include/vizflyt.h` documents its use, and is the contract.
+//! SDK for C and C++. `include/vizflyt.h` documents its use and defines the interface.
 //!
-//! A C++ plugin links `libvizflyt_c.a` and gives [`vizflyt_run`] four callbacks. Each observation
-//! is handed over as it lies in shared memory, after the SDK has validated it: no pixel is copied.
-//! The crate only converts; what attaches and waits is `vizflyt-sdk`.
+//! A C++ plugin links `libvizflyt_c.a` and gives [`vizflyt_run`] four callbacks. The SDK validates each observation and
+//! passes a pointer to the shared memory; no pixel is copied. This crate only converts types; `vizflyt-sdk` connects to
+//! the runtime and waits for images.
 
 mod ffi;
 

@@ -1,4 +1,4 @@
-//! The C++ example, built against the header and the static library, on real shared memory.
+//! Tests the C++ example, built with the header and the static library, on real shared memory.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -16,7 +16,7 @@ use zerocopy::IntoBytes;
 
 const WAIT: Duration = Duration::from_secs(20);
 
-/// Returns the newest static library beside this test.
+/// Returns the newest static library in the folder of this test.
 fn library() -> PathBuf {
     let test = std::env::current_exe().unwrap();
     let deps = test.parent().unwrap();
@@ -55,7 +55,7 @@ fn arena() -> ArenaInfo {
         no_fly: [Volume::aabb(DVec3::ZERO, DVec3::ONE)].into_iter().collect(),
         floor_z_m: 0.25,
         ground_truth: false,
-        // The plugin looks for its camera by name.
+        // The plugin finds its camera by name.
         cameras: ["rear", "front"]
             .map(|name| CameraInfo::forward(name, intrinsics))
             .into_iter()
@@ -86,7 +86,7 @@ struct Rig {
     ipc: RuntimeEnd,
     child: Child,
     seq: u64,
-    /// What the range finder measures; 0 is nothing. [m]
+    /// Measurement of the range finder; 0 means no return. [m]
     range_m: f32,
     points: Vec<LidarPoint>,
 }
@@ -133,7 +133,7 @@ impl Rig {
         }
     }
 
-    /// Shows the front camera so much free way; returns the answer.
+    /// Shows the front camera an image with this depth; returns the reply.
     fn see(&mut self, depth_mm: u16) -> Option<Setpoint> {
         self.seq += 1;
         let cameras = &arena().cameras;
@@ -167,7 +167,7 @@ impl Rig {
 }
 
 #[test]
-fn a_cpp_plugin_attaches_sees_and_answers() {
+fn cpp_plugin_attaches_and_replies_to_observations() {
     let folder = tempfile::tempdir().unwrap();
     let mut rig = Rig::start(&build(folder.path()));
     assert_eq!(rig.see(0), None, "no image of the front camera yet");
@@ -178,7 +178,7 @@ fn a_cpp_plugin_attaches_sees_and_answers() {
     assert_eq!(rig.see(9000), ahead(1.0, YawTarget::Keep));
     assert_eq!(rig.see(2000), ahead(0.5, YawTarget::Keep));
     assert_eq!(rig.see(900), ahead(0.0, YawTarget::Rate(0.5)));
-    // The other sensors: the nearest of all counts.
+    // Other sensors: the nearest return of all sensors counts.
     rig.range_m = 2.0;
     assert_eq!(rig.see(9000), ahead(0.5, YawTarget::Keep));
     let at = |x: f32, y: f32| LidarPoint { p_m: [x, y, 0.1], ..LidarPoint::default() };

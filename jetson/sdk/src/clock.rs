@@ -1,10 +1,9 @@
-//! The computer's monotonic clock.
+//! Monotonic clock of the computer.
 
 use nix::time::{ClockId, clock_gettime};
 use vizflyt_protocol::time::HostTime;
 
-/// Returns the time on this computer's monotonic clock (`CLOCK_MONOTONIC`), the same in every
-/// process on it. [ns, host]
+/// Returns the time on this computer's monotonic clock (`CLOCK_MONOTONIC`), which all its processes share. [ns, host]
 ///
 /// # Panics
 /// Never on Linux, where this clock always exists.
@@ -18,7 +17,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_clock_never_goes_back() {
+    fn clock_is_monotonic() {
         let (first, second) = (host_now(), host_now());
         assert!(second >= first && first > HostTime::ZERO);
     }

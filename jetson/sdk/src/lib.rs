@@ -1,9 +1,8 @@
-//! What a plugin links: the [`Autonomy`] trait, what it sees ([`Observation`]), what it answers
-//! ([`Setpoint`]), and the shared-memory transport to the runtime.
+//! Plugin API: the [`Autonomy`] trait, its input ([`Observation`]), its output ([`Setpoint`]), and the shared-memory
+//! transport to the runtime.
 //!
-//! A plugin is a program of its own. `vizflyt fly` starts it as a child process, hands it every
-//! image through shared memory, and checks each setpoint it returns. Whatever the plugin does,
-//! crash, stall or loop, the vehicle then holds and lands.
+//! A plugin is a separate program. `vizflyt fly` starts it as a child process, passes every image through shared
+//! memory, and checks each returned setpoint. If the plugin crashes, stalls or loops, the vehicle holds and then lands.
 //!
 //! ```no_run
 //! use vizflyt_sdk::glam::DVec3;
@@ -25,7 +24,7 @@
 //! }
 //! ```
 //!
-//! Read in this order: [`autonomy`](Autonomy), [`observation`](Observation), [`run`], [`ipc`].
+//! Reading order: [`autonomy`](Autonomy), [`observation`](Observation), [`run`], [`ipc`].
 
 #![warn(missing_docs)]
 
@@ -70,12 +69,12 @@ pub use odometry::{OdometryError, publish_odometry, take_odometry};
 pub use run::{attach, run};
 pub use sensor::{GivenReading, SensorReading};
 
-/// The plugin in the project's README compiles.
+/// Compiles the plugin in the project's README.
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]
 struct Readme;
 
-/// So does the one in the guide.
+/// Compiles the plugin in the guide.
 #[cfg(doctest)]
 #[doc = include_str!("../../../docs/guides/plugin.md")]
 struct Guide;

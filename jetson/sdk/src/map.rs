@@ -1,33 +1,33 @@
-//! The map of a course whose map is known.
+//! Obstacle map, for courses that give the map to the plugin.
 //!
-//! The runtime puts it into the environment of the plugin that it starts ([`VARIABLE`]), as `map.json`
-//! has it: whatever the plugin may not read or where the scene lies, the map is there.
+//! The runtime passes the content of `map.json` in an environment variable of the plugin ([`VARIABLE`]). The map is
+//! therefore available even if the sandbox hides the scene's folder.
 
 use vizflyt_protocol::geometry::Volume;
 
-/// The environment variable: a JSON array of volumes.
+/// Environment variable with the map: a JSON array of volumes.
 pub const VARIABLE: &str = "VIZFLYT_MAP";
 
-/// Why there is no map although one was handed over.
+/// Why the given map cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
-    /// It is not what `vizflyt scene generate` writes.
+    /// The text is not an array of volumes as `vizflyt scene generate` writes it.
     #[error("{VARIABLE}: {0}; it must be a JSON array of volumes, as in map.json")]
     Json(serde_json::Error),
-    /// A number in it is not finite, a size not positive.
-    #[error("{VARIABLE}: volume {0} is none; sizes must be positive and numbers finite")]
+    /// A volume has a number that is not finite, or a size that is not positive.
+    #[error("{VARIABLE}: volume {0} is invalid; sizes must be positive and numbers finite")]
     Volume(usize),
 }
 
-/// Returns every obstacle of the course, where its map is known; `None` where it is not. [world]
+/// Returns every obstacle of the course, or `None` if the course does not give the map. [world]
 ///
 /// # Errors
-/// A map that cannot be read.
+/// If the map cannot be read.
 pub fn map() -> Result<Option<Vec<Volume>>, MapError> {
     std::env::var(VARIABLE).ok().map(|text| parse_map(&text)).transpose()
 }
 
-/// Returns the obstacles of a map's text. [world]
+/// Parses the text of a map. [world]
 ///
 /// # Errors
 /// [`MapError`].

@@ -1,5 +1,5 @@
-//! Writes observations: into shared memory for the runtime, into owned memory for tests and
-//! replays. The mirror of [`observation`](crate::Observation).
+//! Writes observations: into shared memory for the runtime, into owned memory for tests and replays. Counterpart of
+//! [`observation`](crate::Observation).
 
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS, Name};
@@ -11,16 +11,16 @@ use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 use crate::observation::{Battery, ImuSample, Observation, Vehicle};
 use crate::sensor::GivenReading;
 
-/// When an image's pose was measured, when it was ready, and which tick made it.
+/// Stamps of one image and the server tick that rendered it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ImageStamps {
-    /// Tick of the server.
+    /// Server tick that rendered the image.
     pub seq: u64,
-    /// When the newest pose behind the image was measured. [host]
+    /// Measurement time of the newest pose behind the image. [host]
     pub pose: HostTime,
-    /// By how much later the instant is that the image shows. [ns]
+    /// Time from `pose` to the instant that the image shows. [ns]
     pub ahead_ns: i32,
-    /// When the image was decoded. [host]
+    /// Time at which the image was decoded. [host]
     pub ready: HostTime,
 }
 
@@ -31,32 +31,32 @@ pub struct ObservationWriter<'m> {
     layout: ObservationLayout,
 }
 
-/// The planes of one camera, to be filled in.
+/// Planes of one camera, to be filled in.
 #[derive(Debug)]
 pub struct PlanesMut<'m> {
-    /// H x W x 3.
+    /// Colour, H x W x 3.
     pub rgb: &'m mut [u8],
-    /// H x W, 0 is no return. [mm]
+    /// Depth, H x W; 0 means no return. [mm]
     pub depth_mm: &'m mut [u16],
 }
 
-/// The cameras' images do not fit in the memory given.
+/// The cameras' images do not fit in the given memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("observation needs {needed} bytes aligned to 8, the memory has {found}")]
 pub struct ObservationTooLarge {
-    /// Bytes the cameras need.
+    /// Bytes that the cameras need.
     pub needed: usize,
-    /// Bytes given.
+    /// Bytes of the given memory.
     pub found: usize,
 }
 
 impl<'m> ObservationWriter<'m> {
-    /// Returns how many bytes an observation of these cameras takes. [bytes]
+    /// Returns the size of an observation of these cameras. [bytes]
     pub fn len_for(cameras: &[CameraInfo]) -> usize {
         layout_of(cameras).total_len
     }
 
-    /// Starts observation `seq` in `memory`, with no image and no vehicle in it yet.
+    /// Starts observation `seq` in `memory`, without images and vehicle state.
     ///
     /// # Errors
     /// If `memory` is smaller than [`Self::len_for`] or not aligned to 8.
@@ -75,7 +75,7 @@ impl<'m> ObservationWriter<'m> {
         let count = cameras.len().min(MAX_CAMERAS);
         let mut header = ObservationHeader::new(seq, count as u8, total_len);
         for (head, &(rgb, depth)) in header.cameras[..count].iter_mut().zip(&layout.planes) {
-            // The rest is set when the image is there; see `image_ready`.
+            // `image_ready` sets the other fields.
             (head.rgb_offset, head.depth_offset) = (rgb as u32, depth as u32);
         }
         let (place, _) = ObservationHeader::mut_from_prefix(memory).map_err(|_| error)?;
@@ -83,9 +83,8 @@ impl<'m> ObservationWriter<'m> {
         Ok(Self { memory, layout })
     }
 
-    /// Starts `memory` as a copy of the observation `from` of `old_cameras`, laid out again for
-    /// `cameras`: for when one of them has changed its size. The images in `from` of cameras whose
-    /// size is the same come along.
+    /// Starts `memory` as a copy of the observation `from` of `old_cameras`, with a new layout for `cameras`, after a
+    /// camera has changed its size. Images of cameras with an unchanged size are copied.
     ///
     /// # Errors
     /// As [`Self::new`], for either memory.
@@ -120,7 +119,7 @@ impl<'m> ObservationWriter<'m> {
         Ok(new)
     }
 
-    /// Goes on writing an observation of these cameras that [`Self::new`] started in `memory`.
+    /// Continues an observation of these cameras that [`Self::new`] started in `memory`.
     ///
     /// # Errors
     /// As [`Self::new`].
@@ -136,7 +135,7 @@ impl<'m> ObservationWriter<'m> {
         Ok(Self { memory, layout })
     }
 
-    /// Returns where the last image ends. [bytes]
+    /// Returns the end of the last image. [bytes]
     pub(crate) fn images_end(&self) -> usize {
         self.layout.total_len
     }
@@ -149,7 +148,7 @@ impl<'m> ObservationWriter<'m> {
         ObservationHeader::mut_from_prefix(self.memory).expect("checked in `new`").0
     }
 
-    /// Fills in what the plugin may know of the vehicle; what is `None` stays zero.
+    /// Writes the vehicle state that the plugin may see. `None` fields stay zero.
     pub fn vehicle(&mut self, vehicle: &Vehicle) {
         let header = self.header();
         header.flags |= ObservationHeader::HAS_ATTITUDE;
@@ -163,14 +162,14 @@ impl<'m> ObservationWriter<'m> {
         }
     }
 
-    /// Fills in the battery's state.
+    /// Writes the state of the battery.
     pub fn battery(&mut self, battery: &Battery) {
         let header = self.header();
         header.battery_fraction = battery.fraction.unwrap_or(-1.0);
         header.battery_v = battery.voltage_v.unwrap_or(0.0);
     }
 
-    /// Fills in IMU samples, oldest first; of more than 64 the first ones.
+    /// Writes IMU samples, oldest first. Of more than 64, only the first 64 are written.
     pub fn imu<'s>(&mut self, samples: impl IntoIterator<Item = &'s ImuSample>) {
         let header = self.header();
         header.imu_count = 0;
@@ -185,8 +184,8 @@ impl<'m> ObservationWriter<'m> {
         debug_assert!(header.imu_count as usize <= MAX_IMU);
     }
 
-    /// Returns the planes of camera `index`, of the size in its [`CameraInfo`], to be decoded
-    /// into; `None` if there is no such camera. Call [`Self::image_ready`] afterwards.
+    /// Returns the planes of camera `index`, of the size in its [`CameraInfo`], to decode into. `None` for an
+    /// unknown index. Call [`Self::image_ready`] afterwards.
     pub fn planes(&mut self, index: usize, camera: &CameraInfo) -> Option<PlanesMut<'_>> {
         let count = usize::from(self.header().camera_count);
         let &(rgb_at, depth_at) = self.layout.planes[..count].get(index)?;
@@ -197,8 +196,8 @@ impl<'m> ObservationWriter<'m> {
         Some(PlanesMut { rgb, depth_mm })
     }
 
-    /// Fills in where the body was at the instant that camera `index`'s image shows: only where the course gives the
-    /// pose.
+    /// Writes the pose of the body at the instant that the image of camera `index` shows. Call it only if the course
+    /// gives the pose to the plugin.
     pub fn pose_at_image(&mut self, index: usize, world_from_body: &Pose<World, Body>) {
         let count = usize::from(self.header().camera_count);
         if let Some(head) = self.header().cameras[..count].get_mut(index) {
@@ -206,7 +205,7 @@ impl<'m> ObservationWriter<'m> {
         }
     }
 
-    /// Declares the planes of camera `index` filled in; only then does a plugin see them.
+    /// Marks the planes of camera `index` as filled. A plugin does not see the image before.
     pub fn image_ready(&mut self, index: usize, camera: &CameraInfo, stamps: ImageStamps) {
         let count = usize::from(self.header().camera_count);
         let Some(head) = self.header().cameras[..count].get_mut(index) else { return };
@@ -228,7 +227,7 @@ fn layout_of(cameras: &[CameraInfo]) -> ObservationLayout {
     ObservationLayout::of(&sizes[..cameras.len().min(MAX_CAMERAS)])
 }
 
-/// One observation in memory of its own: for tests, replays and tools.
+/// One observation in owned memory, for tests, replays and tools.
 ///
 /// ```
 /// use vizflyt_sdk::{CameraInfo, ImageStamps, Intrinsics, ObservationBuffer};
@@ -250,13 +249,13 @@ pub struct ObservationBuffer {
     names: Vec<Name>,
 }
 
-/// Memory in units of the alignment the layout promises.
+/// Memory in units of the layout's alignment.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, KnownLayout, Immutable)]
 #[repr(C, align(64))]
 struct Block([u8; 64]);
 
 impl ObservationBuffer {
-    /// Makes an empty observation number 0 of these cameras (at most 8).
+    /// Creates an empty observation with number 0 of these cameras (at most 8).
     ///
     /// # Panics
     /// If the cameras together need 4 GiB or more.
@@ -264,7 +263,7 @@ impl ObservationBuffer {
         Self::with_sensors(cameras, &[])
     }
 
-    /// As [`Self::new`], with room for the readings of these sensors (at most 8).
+    /// As [`Self::new`], with space for the readings of these sensors (at most 8).
     ///
     /// # Panics
     /// As [`Self::new`].
@@ -279,7 +278,7 @@ impl ObservationBuffer {
         buffer
     }
 
-    /// Empties it and numbers it `seq`.
+    /// Removes all content and sets the number to `seq`.
     ///
     /// # Panics
     /// As [`Self::new`].
@@ -293,22 +292,22 @@ impl ObservationBuffer {
         ObservationWriter { memory: self.blocks.as_mut_bytes(), layout }
     }
 
-    /// Fills in what the plugin may know of the vehicle.
+    /// Writes the vehicle state that the plugin may see.
     pub fn set_vehicle(&mut self, vehicle: &Vehicle) {
         self.writer().vehicle(vehicle);
     }
 
-    /// Fills in the battery's state.
+    /// Writes the state of the battery.
     pub fn set_battery(&mut self, battery: &Battery) {
         self.writer().battery(battery);
     }
 
-    /// Fills in IMU samples, oldest first; of more than 64 the first ones.
+    /// Writes IMU samples, oldest first. Of more than 64, only the first 64 are written.
     pub fn set_imu(&mut self, samples: &[ImuSample]) {
         self.writer().imu(samples);
     }
 
-    /// Fills in the image of camera `index` by `fill`; does nothing if there is no such camera.
+    /// Writes the image of camera `index` with `fill`. Does nothing for an unknown index.
     pub fn set_image(
         &mut self,
         index: usize,
@@ -323,12 +322,12 @@ impl ObservationBuffer {
         }
     }
 
-    /// Fills in where the body was at the instant that camera `index`'s image shows.
+    /// Writes the pose of the body at the instant that the image of camera `index` shows.
     pub fn set_pose_at_image(&mut self, index: usize, world_from_body: &Pose<World, Body>) {
         self.writer().pose_at_image(index, world_from_body);
     }
 
-    /// Fills in the newest readings, in the order of the sensors; `None` of one that has none yet.
+    /// Writes the newest readings, in the order of the sensors. `None` stands for a sensor without a reading.
     pub fn set_readings(&mut self, readings: &[Option<GivenReading<'_>>]) {
         let sensors = std::mem::take(&mut self.sensors);
         self.writer().sensors(&sensors, readings);
@@ -340,10 +339,10 @@ impl ObservationBuffer {
         self.blocks.as_bytes()
     }
 
-    /// Returns the view a plugin gets.
+    /// Returns the plugin's view of this observation.
     ///
     /// # Panics
-    /// Never: the buffer was laid out by this module.
+    /// Never, because this module creates the layout.
     pub fn observation(&self) -> Observation<'_> {
         Observation::from_bytes(self.as_bytes(), &self.names).expect("laid out in `new`")
     }
@@ -367,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn written_observation_reads_back_equal() {
         let cameras = [camera("front", 5, 3), camera("rear", 7, 4)];
         let mut buffer = ObservationBuffer::new(&cameras);
         assert_eq!(buffer.observation().cameras().count(), 0);
@@ -427,9 +426,9 @@ mod tests {
         );
     }
 
-    /// What the course withholds is nowhere in the plugin's memory, not just hidden by the API.
+    /// Withheld values are absent from the plugin's memory, not only hidden by the API.
     #[test]
-    fn withheld_depth_is_not_in_memory() {
+    fn withheld_pose_is_not_in_memory() {
         let secret = 1234.5678_f64;
         let holds = |buffer: &ObservationBuffer| {
             let bytes = buffer.as_bytes();
@@ -453,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn images_come_along_when_another_camera_grows() {
+    fn keeps_images_when_another_camera_changes_size() {
         let old = [camera("front", 5, 3), camera("rear", 7, 4), camera("down", 2, 2)];
         let mut buffer = ObservationBuffer::new(&old);
         buffer.clear(6);
@@ -464,7 +463,7 @@ mod tests {
                 planes.depth_mm.fill(1000 * (1 + index as u16));
             });
         }
-        // The first grows, the last shrinks, the middle one stays.
+        // The first camera grows, the last shrinks, the middle one keeps its size.
         let new = [camera("front", 50, 30), camera("rear", 7, 4), camera("down", 1, 2)];
         let mut grown = ObservationBuffer::new(&new);
         ObservationWriter::adopt(grown.blocks.as_mut_bytes(), &new, buffer.as_bytes(), &old)
@@ -479,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_too_small_is_refused() {
+    fn rejects_memory_that_is_too_small() {
         let cameras = [camera("front", 64, 48)];
         let needed = ObservationWriter::len_for(&cameras);
         let mut memory = vec![0; needed - 1];
@@ -491,9 +490,9 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever a header contains, a view stays within its bytes or is refused.
+        /// For any header, a view stays within its bytes or is rejected.
         #[test]
-        fn poisoned_headers_never_reach_outside(at in 0usize..size_of::<ObservationHeader>(), value in any::<u8>()) {
+        fn corrupt_headers_never_read_outside(at in 0usize..size_of::<ObservationHeader>(), value in any::<u8>()) {
             let mut buffer = ObservationBuffer::new(&[camera("front", 8, 6)]);
             buffer.set_image(0, ImageStamps::default(), |planes| planes.rgb.fill(9));
             buffer.blocks.as_mut_bytes()[at] = value;

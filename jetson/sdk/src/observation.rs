@@ -1,4 +1,4 @@
-//! What a plugin sees: typed views of shared memory, without a copy.
+//! Input of a plugin: typed views of shared memory, without a copy.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
@@ -7,7 +7,7 @@ use vizflyt_protocol::packet::{CameraHeader, ImuRecord, InvalidObservation, Obse
 use vizflyt_protocol::time::HostTime;
 use zerocopy::FromBytes;
 
-/// The vehicle and its cameras' images at one moment. Valid during the call it is given to.
+/// The vehicle and the images of its cameras at one moment. Valid only during the call that receives it.
 ///
 /// Built from bytes in the layout of [`ObservationHeader`]: shared memory in flight, an
 /// [`ObservationBuffer`](crate::ObservationBuffer) in a test.
@@ -16,31 +16,31 @@ pub struct Observation<'a> {
     header: &'a ObservationHeader,
     bytes: &'a [u8],
     names: &'a [Name],
-    /// IMU samples up to here were in an earlier observation.
+    /// IMU samples up to this stamp were in an earlier observation.
     imu_after: HostTime,
 }
 
-/// What is known of the vehicle: its attitude always, pose and velocity where the course allows.
+/// State of the vehicle: always the attitude; pose and velocity only if the course allows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vehicle {
-    /// When this was true. [host]
+    /// Time of this state. [host]
     pub stamp: HostTime,
-    /// Attitude: rotates vectors from body to world axes. The localized one where the course
-    /// gives the pose, else the autopilot's estimate.
+    /// Attitude: rotates vectors from body to world axes. From localization if the course gives the pose, otherwise the
+    /// autopilot's estimate.
     pub attitude: DQuat,
     /// Angular velocity. [rad/s, body]
     pub omega_body_radps: DVec3,
-    /// Position and attitude as localized; `None` where the course withholds them
+    /// Position and attitude from localization; `None` if the course withholds them
     /// ([`ArenaInfo::ground_truth`](crate::ArenaInfo::ground_truth)). [m, world]
     pub world_from_body: Option<Pose<World, Body>>,
-    /// Velocity; `None` where `world_from_body` is. [m/s, world]
+    /// Velocity; `None` if `world_from_body` is `None`. [m/s, world]
     pub v_world_mps: Option<DVec3>,
 }
 
-/// One reading of the autopilot's accelerometer and gyroscope.
+/// One sample of the autopilot's accelerometer and gyroscope.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ImuSample {
-    /// When it was measured. [host]
+    /// Time of the measurement. [host]
     pub stamp: HostTime,
     /// Specific force: at rest and level, +9.8 along z. [m/s^2, body]
     pub accel_mps2: DVec3,
@@ -48,29 +48,28 @@ pub struct ImuSample {
     pub gyro_radps: DVec3,
 }
 
-/// The battery, as the autopilot measures it.
+/// State of the battery, as measured by the autopilot.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Battery {
-    /// What is left, 0 to 1; `None` if the autopilot does not know.
+    /// Remaining charge, 0 to 1; `None` if the autopilot does not report it.
     pub fraction: Option<f64>,
     /// Voltage; `None` if it is not measured. [V]
     pub voltage_v: Option<f64>,
 }
 
-/// One camera's RGB-D image. Row-major; row 0 is the top.
+/// RGB-D image of one camera. Row-major; row 0 is the top.
 #[derive(Clone, Copy, Debug)]
 pub struct CameraImage<'a> {
-    /// The camera's name in `arena.toml`: `front`.
+    /// Name of the camera in `arena.toml`, for example `front`.
     pub name: &'a str,
-    /// Tick of the server that made the image; equal for all cameras of a tick.
+    /// Server tick that rendered the image; equal for all cameras of a tick.
     pub seq: u64,
-    /// When the newest pose behind the image was measured: its age counts from here. [host]
+    /// Measurement time of the newest pose behind the image. The image's age counts from here. [host]
     pub stamp: HostTime,
-    /// The instant that the image shows: the server moves the pose on to when the image is seen, so
-    /// this is about now. Where depth is to meet the vehicle's pose, take the pose of this instant.
-    /// [host]
+    /// Instant that the image shows. The server predicts the pose to the time at which the image is seen, so this is
+    /// about now. To combine depth with the vehicle's pose, use the pose at this instant. [host]
     pub shown: HostTime,
-    /// When the runtime had the decoded image. [host]
+    /// Time at which the runtime had decoded the image. [host]
     pub ready: HostTime,
     /// Width. [px]
     pub width_px: u32,
@@ -78,30 +77,30 @@ pub struct CameraImage<'a> {
     pub height_px: u32,
     /// Colour, H x W x 3, sRGB.
     pub rgb: &'a [u8],
-    /// Camera-z depth, H x W; 0 is no return. [mm, cam]
+    /// Camera-z depth, H x W; 0 means no return. [mm, cam]
     pub depth_mm: &'a [u16],
     /// Focal lengths and principal point. [px]
     pub intrinsics: Intrinsics,
     /// Extrinsics.
     pub body_from_cam: Pose<Body, Cam>,
-    /// Where the body was at the instant that the image shows: what the image was rendered from. `None` where the
-    /// course withholds the pose. [m, world]
+    /// Pose of the body at the instant that the image shows, from which the image was rendered. `None` if the course
+    /// withholds the pose. [m, world]
     pub pose_at_image: Option<Pose<World, Body>>,
 }
 
 impl<'a> Observation<'a> {
-    /// Reads an observation in place. `names` are the cameras' in the order of their index; a
-    /// camera beyond them is called by its number only.
+    /// Reads an observation in place. `names` are the cameras' names in the order of their index; a camera without a
+    /// name gets an empty one.
     ///
     /// # Errors
-    /// If the bytes are cut short, not aligned to 8, of another protocol version, or name a plane
-    /// outside themselves.
+    /// If the bytes are cut short, not aligned to 8, of another protocol version, or refer to a plane outside the
+    /// bytes.
     pub fn from_bytes(bytes: &'a [u8], names: &'a [Name]) -> Result<Self, InvalidObservation> {
         let header = ObservationHeader::parse(bytes)?;
         Ok(Self { header, bytes, names, imu_after: HostTime::ZERO })
     }
 
-    /// Leaves those IMU samples out that are not younger than `stamp`: the reader has had them.
+    /// Excludes IMU samples that are not newer than `stamp`, because the reader already has them.
     pub fn with_imu_after(self, stamp: HostTime) -> Self {
         Self { imu_after: stamp, ..self }
     }
@@ -110,18 +109,17 @@ impl<'a> Observation<'a> {
         self.header
     }
 
-    /// Returns the memory it lies in, in the layout of [`ObservationHeader`].
+    /// Returns the underlying memory, in the layout of [`ObservationHeader`].
     pub fn as_bytes(&self) -> &'a [u8] {
         self.bytes
     }
 
-    /// Returns the observation's number in this flight; numbers missing were skipped.
+    /// Returns the observation's number in this flight. Missing numbers were skipped.
     pub fn seq(&self) -> u64 {
         self.header.seq
     }
 
-    /// Returns when the newest image's pose was measured, or the vehicle's state if there is no
-    /// image. [host]
+    /// Returns the measurement time of the newest image's pose, or of the vehicle's state without an image. [host]
     pub fn stamp(&self) -> HostTime {
         self.cameras()
             .map(|camera| camera.stamp)
@@ -129,19 +127,18 @@ impl<'a> Observation<'a> {
             .unwrap_or(HostTime::from_ns(self.header.vehicle_ns))
     }
 
-    /// Returns where the body was at the instant that the newest image shows: the pose that belongs to its pixels.
-    /// `None` without an image, and where the course withholds the pose. [m, world]
+    /// Returns the pose of the body at the instant that the newest image shows, which belongs to its pixels. `None`
+    /// without an image, and if the course withholds the pose. [m, world]
     pub fn pose_at_image(&self) -> Option<Pose<World, Body>> {
         self.cameras().max_by_key(|camera| camera.shown)?.pose_at_image
     }
 
-    /// Returns the image of the camera of this name; `None` if there is no such camera or it has
-    /// no image yet.
+    /// Returns the image of the camera with this name. `None` for an unknown name, or without an image.
     pub fn camera(&self, name: &str) -> Option<CameraImage<'a>> {
         self.cameras().find(|camera| camera.name == name)
     }
 
-    /// Returns the images there are, in the order of the arena's cameras.
+    /// Returns the available images, in the order of the arena's cameras.
     pub fn cameras(&self) -> impl Iterator<Item = CameraImage<'a>> + use<'a> {
         let (bytes, names) = (self.bytes, self.names);
         self.header.cameras[..self.header.camera_count.into()]
@@ -150,7 +147,7 @@ impl<'a> Observation<'a> {
             .filter_map(move |(index, camera)| image(bytes, names.get(index), camera))
     }
 
-    /// Returns what is known of the vehicle; `None` before anything is.
+    /// Returns the state of the vehicle; `None` before the first one.
     pub fn vehicle(&self) -> Option<Vehicle> {
         let header = self.header;
         let world_from_body = header.world_from_body();
@@ -163,19 +160,19 @@ impl<'a> Observation<'a> {
         })
     }
 
-    /// Returns the IMU samples since the image that the plugin got before this one, oldest first;
-    /// at most the newest 64 (0.6 s at 100 Hz).
+    /// Returns the IMU samples since the plugin's previous image, oldest first. At most the newest 64 (0.6 s at 100
+    /// Hz).
     pub fn imu(&self) -> impl Iterator<Item = ImuSample> + use<'a> {
         let after_ns = self.imu_after.as_ns();
         self.header.imu().iter().filter(move |record| record.stamp_ns > after_ns).map(sample)
     }
 
-    /// Returns when the newest IMU sample was measured, had before or not. [host]
+    /// Returns the measurement time of the newest IMU sample, including excluded ones. [host]
     pub fn newest_imu(&self) -> Option<HostTime> {
         self.header.imu().last().map(|record| HostTime::from_ns(record.stamp_ns))
     }
 
-    /// Returns the battery's state.
+    /// Returns the state of the battery.
     pub fn battery(&self) -> Battery {
         let (fraction, voltage_v) = (self.header.battery_fraction, self.header.battery_v);
         Battery {
@@ -220,8 +217,8 @@ fn image<'a>(
 }
 
 impl CameraImage<'_> {
-    /// Returns the camera-z depth at column `x_px`, row `y_px`; `None` where there is no return
-    /// or outside the image. [m, cam]
+    /// Returns the camera-z depth at column `x_px`, row `y_px`. `None` for pixels without a return or outside the
+    /// image. [m, cam]
     pub fn depth_m(&self, x_px: u32, y_px: u32) -> Option<f32> {
         if x_px >= self.width_px || y_px >= self.height_px {
             return None;

@@ -1,4 +1,4 @@
-//! What a plugin publishes beside its setpoints: its own estimate of where it is.
+//! Odometry that a plugin publishes in addition to its setpoints.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -6,33 +6,34 @@ use vizflyt_protocol::geometry::{Body, Odom, Pose};
 use vizflyt_protocol::messages::{MAX_ODOMETRY_PER_REPLY, Odometry};
 use vizflyt_protocol::time::HostTime;
 
-/// Why an estimate is not published.
+/// Why an estimate was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum OdometryError {
-    /// It is no pose.
+    /// The estimate is not a valid pose.
     #[error(
-        "the estimate is no pose: numbers must be finite, the quaternion (xyzw) of unit length, the place within 100 km"
+        "the estimate is not a valid pose: numbers must be finite, \
+         the quaternion (xyzw) of unit length, the position within 100 km"
     )]
     Invalid,
-    /// There were too many since the last reply.
+    /// Too many estimates since the last reply.
     #[error(
         "more than {MAX_ODOMETRY_PER_REPLY} estimates since the last reply; publish one for each image"
     )]
     TooMany,
 }
 
-/// What waits for the next reply.
+/// Estimates to be sent with the next reply.
 static WAITING: Mutex<Vec<Odometry>> = Mutex::new(Vec::new());
 
-/// Publishes where the plugin thinks the vehicle was at `stamp`; of an estimate from an image that is
-/// [`CameraImage::shown`](crate::CameraImage::shown). It leaves with the reply to the image, is logged on `/odometry`,
-/// and `vizflyt grade` reports how far off it was. Nothing is flown by it.
+/// Publishes the plugin's estimate of the vehicle's pose at `stamp`. For an estimate from an image, use
+/// [`CameraImage::shown`](crate::CameraImage::shown) as the stamp. The estimate is sent with the reply to the image and
+/// logged on `/odometry`, and `vizflyt grade` reports its error. It does not control the flight.
 ///
-/// z of the frame `odom` is up; its origin and heading are the plugin's choice. Estimates are to come in the order of
-/// their stamps; the runtime drops what is older than 10 s.
+/// z of the frame `odom` is up; the plugin chooses its origin and heading. Publish estimates in the order of their
+/// stamps; the runtime drops estimates older than 10 s.
 ///
 /// # Errors
-/// [`OdometryError::Invalid`] for what is no pose, [`OdometryError::TooMany`] for more than four in one `on_image`.
+/// [`OdometryError::Invalid`] for an invalid pose, [`OdometryError::TooMany`] for more than four in one `on_image`.
 ///
 /// ```
 /// use vizflyt_sdk::{HostTime, Pose, publish_odometry};
@@ -54,7 +55,8 @@ pub fn publish_odometry(
     Ok(())
 }
 
-/// Takes what was published since the last call: for main loops in other languages, which send it before the reply.
+/// Takes the estimates published since the last call. For main loops in other languages, which send them before the
+/// reply.
 pub fn take_odometry() -> Vec<Odometry> {
     std::mem::take(&mut *WAITING.lock().unwrap_or_else(PoisonError::into_inner))
 }
@@ -65,7 +67,7 @@ mod tests {
     use glam::{DQuat, DVec3};
 
     #[test]
-    fn estimates_wait_for_the_reply_and_nonsense_is_refused() {
+    fn queues_estimates_for_the_reply_and_rejects_invalid_ones() {
         let publish =
             |ns, p_m, rotation| publish_odometry(HostTime::from_ns(ns), Pose::new(p_m, rotation));
         for (p_m, rotation) in [

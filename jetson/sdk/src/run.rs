@@ -1,4 +1,4 @@
-//! The plugin's main loop: waits for the runtime, calls the plugin, sends its answers.
+//! Main loop of a plugin: waits for the runtime, calls the plugin, sends its replies.
 
 use std::any::type_name;
 use std::ffi::OsString;
@@ -17,14 +17,14 @@ use crate::ipc::{IpcError, PluginEnd, SERVICE_OPTION, offers};
 use crate::observation::Observation;
 use crate::odometry::take_odometry;
 
-/// Runs a plugin to the end of the flight; call it from `main`.
+/// Runs a plugin until the end of the flight. Call it from `main`.
 ///
-/// The runtime passes `--vizflyt-service fd:N` on the command line. Started by hand (`cargo run`, a
-/// debugger) it attaches to the one runtime of yours that waits for a plugin: `vizflyt fly --attach`.
-/// Other arguments are left to the plugin.
+/// The runtime passes `--vizflyt-service fd:N` on the command line. A plugin started by hand (`cargo run`, a debugger)
+/// attaches to the user's only runtime that waits for a plugin (`vizflyt fly --attach`). Other arguments are left to
+/// the plugin.
 ///
-/// Returns 0 after a flight, 1 if the runtime vanished, 2 if there was none to attach to, 101
-/// after a panic in the plugin (which is reported to the runtime).
+/// Returns 0 after a flight, 1 if the runtime ended unexpectedly, 2 if there was no runtime to attach to, 101 after a
+/// panic in the plugin (which is reported to the runtime).
 pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
     let given = service_argument(std::env::args_os());
     let program = std::env::args().next().unwrap_or_default();
@@ -37,7 +37,7 @@ pub fn run<A: Autonomy>(plugin: A) -> ExitCode {
     }
 }
 
-/// Returns the service of the only runtime that waits; else what to do, in a sentence.
+/// Returns the service of the only waiting runtime, or an error message with the next step for the user.
 fn the_one_that_waits(waiting: &[String], program: &str) -> Result<String, String> {
     match waiting {
         [service] => Ok(service.clone()),
@@ -53,7 +53,7 @@ fn the_one_that_waits(waiting: &[String], program: &str) -> Result<String, Strin
     }
 }
 
-/// As [`run`], with the service given directly.
+/// As [`run`], for a given service.
 pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
     let end = match PluginEnd::open(service) {
         Ok(end) => end,
@@ -76,7 +76,7 @@ pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
         Err(_) => {
             let message = panic_message.lock().unwrap_or_else(PoisonError::into_inner).take();
             let reason = message.unwrap_or_else(|| "the plugin panicked".to_owned());
-            // If even this fails, the runtime still sees the exit status.
+            // If this fails too, the runtime still sees the exit status.
             let _ = end.send(&FromPlugin::Failed { reason: bounded(&reason) });
             ExitCode::from(PANICKED)
         }
@@ -85,9 +85,9 @@ pub fn attach<A: Autonomy>(mut plugin: A, service: &str) -> ExitCode {
 
 /// Exit status: no runtime to attach to.
 const NOT_ATTACHED: u8 = 2;
-/// Exit status after a panic, as Rust's own.
+/// Exit status after a panic, the same as Rust's.
 const PANICKED: u8 = 101;
-/// Between two looks at nothing: whatever comes wakes the plugin.
+/// Maximum wait between polls; any message or observation ends the wait earlier.
 const A_WHILE: Duration = Duration::from_secs(10);
 
 /// Why the loop ended.
@@ -127,7 +127,7 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
         }
         let Some(names) = &names else { continue };
         let Some(sample) = end.observation()? else { continue };
-        // The runtime validated nothing for us: a bad observation is its bug, and skipped.
+        // The runtime does not validate observations. An invalid one is a bug of the runtime and is skipped.
         let Ok(observation) = Observation::from_bytes(sample.bytes(), names) else { continue };
         let entered = host_now();
         let setpoint = plugin.on_image(&observation.with_imu_after(imu_had));
@@ -140,13 +140,13 @@ fn serve<A: Autonomy>(plugin: &mut A, end: &PluginEnd) -> Result<End, IpcError> 
     }
 }
 
-/// Returns the type's name without its path.
+/// Returns the name of the type without its path.
 fn short_name<A>() -> &'static str {
     let full = type_name::<A>();
     full.split('<').next().and_then(|path| path.rsplit("::").next()).unwrap_or(full)
 }
 
-/// Keeps the message of a panic on this thread, beside the usual print.
+/// Stores the message of a panic on this thread, in addition to the usual print.
 fn record_panics() -> Arc<Mutex<Option<String>>> {
     let slot = Arc::new(Mutex::new(None));
     let (kept, plugin_thread) = (Arc::clone(&slot), thread::current().id());
@@ -163,7 +163,7 @@ fn record_panics() -> Arc<Mutex<Option<String>>> {
     slot
 }
 
-/// Returns the value of `--vizflyt-service`, as `--vizflyt-service X` or `--vizflyt-service=X`.
+/// Returns the value of `--vizflyt-service`, given as `--vizflyt-service X` or `--vizflyt-service=X`.
 fn service_argument(arguments: impl Iterator<Item = OsString>) -> Option<String> {
     let mut arguments = arguments.filter_map(|argument| argument.into_string().ok());
     while let Some(argument) = arguments.next() {
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn the_service_is_found_among_other_arguments() {
+    fn finds_the_service_among_other_arguments() {
         check(&["me", "--vizflyt-service", "a/b"], Some("a/b"));
         check(&["me", "avoid", "--gain=2", "--vizflyt-service=a/b"], Some("a/b"));
         check(&["me", "--vizflyt-service"], None);
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn started_by_hand_it_takes_the_only_runtime_that_waits() {
+    fn attaches_to_the_only_waiting_runtime_when_started_by_hand() {
         let waiting = ["a".to_owned(), "b".to_owned()];
         assert_eq!(the_one_that_waits(&waiting[..1], "me"), Ok("a".to_owned()));
         let none = the_one_that_waits(&[], "me").unwrap_err();
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_short() {
+    fn plugin_name_has_no_path_and_no_type_arguments() {
         struct Avoid<T>(T);
         assert_eq!(short_name::<Avoid<String>>(), "Avoid");
     }

@@ -1,4 +1,4 @@
-//! The sensors beside the cameras, as a plugin sees them and as the runtime writes them.
+//! Sensors other than cameras: views for the plugin, and the writer for the runtime.
 
 use vizflyt_protocol::geometry::{Body, Pose, Sensor, World};
 use vizflyt_protocol::packet::ObservationHeader;
@@ -12,33 +12,33 @@ use zerocopy::{FromBytes, IntoBytes};
 use crate::memory::ObservationWriter;
 use crate::observation::Observation;
 
-/// The newest reading of one sensor.
+/// Newest reading of one sensor.
 ///
-/// A reading stays in later observations until the next one comes: `seq` tells whether it is new.
+/// A reading stays in later observations until the next one arrives. A changed `seq` marks a new reading.
 #[derive(Clone, Copy, Debug)]
 pub struct SensorReading<'a> {
-    /// The sensor's name in `arena.toml`.
+    /// Name of the sensor in `arena.toml`.
     pub name: &'a str,
-    /// Its kind.
+    /// Kind of the sensor; `records` has the matching variant.
     pub kind: SensorKind,
-    /// Counts this sensor's readings, from 1; numbers missing were not needed by anyone in time.
+    /// Number of the reading, from 1. Missing numbers were dropped, because no subscriber needed them in time.
     pub seq: u64,
-    /// When the newest pose behind it was measured. [host]
+    /// Measurement time of the newest pose behind the reading. [host]
     pub stamp: HostTime,
-    /// The instant that it is of; of a sweep that of its last beam. [host]
+    /// Instant of the reading; for a sweep, the instant of its last beam. [host]
     pub shown: HostTime,
-    /// When the runtime had it. [host]
+    /// Time at which the runtime received the reading. [host]
     pub ready: HostTime,
-    /// Where the sensor sits: its axes are x forward, y left, z up.
+    /// Pose of the sensor on the body. Its axes are x forward, y left, z up.
     pub body_from_sensor: Pose<Body, Sensor>,
-    /// Where the body was at that instant; `None` where the course withholds the pose. [m, world]
+    /// Pose of the body at `shown`; `None` if the course withholds the pose. [m, world]
     pub pose_at_reading: Option<Pose<World, Body>>,
-    /// What was measured.
+    /// Measured values.
     pub records: Records<'a>,
 }
 
 impl<'a> SensorReading<'a> {
-    /// Returns the points of a LiDAR; none of another sensor.
+    /// Returns the points of a LiDAR; empty for other sensors.
     pub fn points(&self) -> &'a [LidarPoint] {
         match self.records {
             Records::Lidar(points) => points,
@@ -46,8 +46,7 @@ impl<'a> SensorReading<'a> {
         }
     }
 
-    /// Returns the distance that a range finder or a sonar has measured; `None` where nothing came back, and of other
-    /// sensors. [m]
+    /// Returns the distance measured by a range finder or sonar. `None` without a return, and for other sensors. [m]
     pub fn range_m(&self) -> Option<f32> {
         match self.records {
             Records::Range(reading) => reading.measured_m(),
@@ -55,7 +54,7 @@ impl<'a> SensorReading<'a> {
         }
     }
 
-    /// Returns the detections of a radar; none of another sensor.
+    /// Returns the detections of a radar; empty for other sensors.
     pub fn detections(&self) -> &'a [RadarDetection] {
         match self.records {
             Records::Radar(detections) => detections,
@@ -65,12 +64,12 @@ impl<'a> SensorReading<'a> {
 }
 
 impl<'a> Observation<'a> {
-    /// Returns the newest reading of the sensor of this name; `None` if there is no such sensor or it has none yet.
+    /// Returns the newest reading of the sensor with this name. `None` for an unknown name, or without a reading.
     pub fn sensor(&self, name: &str) -> Option<SensorReading<'a>> {
         self.sensors().find(|reading| reading.name == name)
     }
 
-    /// Returns the newest readings there are, in the order of the arena's sensors.
+    /// Returns the newest available readings, in the order of the arena's sensors.
     pub fn sensors(&self) -> impl Iterator<Item = SensorReading<'a>> + use<'a> {
         let bytes = self.as_bytes();
         let table = self.header().sensors(bytes);
@@ -92,33 +91,34 @@ fn reading<'a>(bytes: &'a [u8], sensor: &'a SensorHeader) -> Option<SensorReadin
     })
 }
 
-/// A reading to be written.
+/// Reading to be written into an observation.
 #[derive(Clone, Copy, Debug)]
 pub struct GivenReading<'r> {
-    /// Its number, from 1.
+    /// Number of the reading, from 1.
     pub seq: u64,
-    /// When the newest pose behind it was measured. [host]
+    /// Measurement time of the newest pose behind the reading. [host]
     pub pose: HostTime,
-    /// The instant that it is of. [host]
+    /// Instant of the reading. [host]
     pub shown: HostTime,
-    /// When the runtime had it. [host]
+    /// Time at which the runtime received the reading. [host]
     pub ready: HostTime,
-    /// Where the sensor sits.
+    /// Pose of the sensor on the body.
     pub body_from_sensor: Pose<Body, Sensor>,
-    /// Where the body was, if the plugin may know it. [m, world]
+    /// Pose of the body, if the course gives the pose to the plugin. [m, world]
     pub world_from_body: Option<Pose<World, Body>>,
-    /// Its records, as many as its kind allows.
+    /// Records as bytes, at most the maximum number of the sensor's kind.
     pub records: &'r [u8],
 }
 
 impl ObservationWriter<'_> {
-    /// Returns how many bytes the largest readings of these sensors take behind an observation's images. [bytes]
+    /// Returns the maximum size of these sensors' readings after the images of an observation. [bytes]
     pub fn sensors_len(sensors: &[SensorInfo]) -> usize {
         section_len(sensors.iter().take(MAX_SENSORS).map(SensorInfo::most_bytes))
     }
 
-    /// Writes the newest readings behind the images, `None` of a sensor that has none yet: once, when all images are
-    /// there. Of those that do not fit into the memory, or that are none of their sensor, only the sensor is written.
+    /// Writes the newest readings after the images. `None` stands for a sensor without a reading. Call it once, when
+    /// all images are written. If a reading does not fit into the memory or is not valid for its sensor, only the
+    /// sensor's entry is written.
     pub fn sensors(&mut self, sensors: &[SensorInfo], readings: &[Option<GivenReading<'_>>]) {
         let count = sensors.len().min(MAX_SENSORS);
         let begin = self.images_end();
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn readings_are_read_as_they_were_written() {
+    fn readings_round_trip_through_memory() {
         let camera = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(5, 3, 1.5));
         let sensors = [
             sensor("top", SensorKind::Lidar, 3),
@@ -222,14 +222,14 @@ mod tests {
         assert_eq!(top.pose_at_reading.unwrap().translation_m, DVec3::X);
         assert_eq!(found.sensor("down").unwrap().range_m(), Some(1.25));
         assert!(found.sensor("nose").is_none() && found.sensors().count() == 2);
-        // A scan larger than its sensor said, and one that is cut in the middle of a record.
+        // A scan with more records than its kind allows, and one that is cut in the middle of a record.
         let many = [LidarPoint::default(); 300];
         buffer.set_readings(&[Some(given(5, many.as_bytes())), Some(given(5, &[0; 7])), None]);
         assert_eq!(buffer.observation().sensors().count(), 0);
     }
 
     #[test]
-    fn an_observation_without_sensors_is_as_long_as_ever() {
+    fn no_sensors_add_no_bytes_to_an_observation() {
         let camera = CameraInfo::forward("front", Intrinsics::from_horizontal_fov(5, 3, 1.5));
         assert_eq!(ObservationWriter::sensors_len(&[]), 0);
         let mut buffer = ObservationBuffer::new(std::slice::from_ref(&camera));

@@ -1,8 +1,8 @@
-//! Looks for tags so many times in one image of the cube, and prints what is found; for counting the instructions, where
-//! a time means nothing.
+//! Detects tags repeatedly in one image of the cube and prints them. Used to count instructions where time measurements
+//! are unreliable.
 //!
-//! `cargo run --release -p vizflyt-tags --example detect -- search 20`: in the whole image, 1280x720
-//! `cargo run --release -p vizflyt-tags --example detect -- look 20`: where the cube is expected, as it is tracked
+//! - `cargo run --release -p vizflyt-tags --example detect -- search 20`: in the whole image, 1280x720
+//! - `cargo run --release -p vizflyt-tags --example detect -- look 20`: in the region of the cube, as in tracking
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -17,12 +17,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let is_search = match arguments.next().as_deref() {
         Some("search") => true,
         Some("look") => false,
-        _ => return Err("say search or look, then how many times".into()),
+        _ => return Err("give search or look, then the number of repetitions".into()),
     };
-    let times: usize = arguments.next().ok_or("say how many times")?.parse()?;
+    let times: usize = arguments.next().ok_or("give the number of repetitions")?.parse()?;
     let (cube, camera) = (cube(), webcams(1).remove(0));
     let Mounting::World(world_from_cam) = camera.mounting else {
-        return Err("the simulated webcam has a place".into());
+        return Err("the simulated webcam has no pose".into());
     };
     let pose: Pose<World, Body> = Pose::new(DVec3::new(3.0, 0.2, 1.4), DQuat::from_rotation_z(0.6));
     let placed = [Placed::on_vehicle(&cube, [pose; 2])];
@@ -48,8 +48,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for tag in &found {
         println!("{} {} {:?}", tag.family, tag.id, tag.corners_px.map(|corner| corner.to_array()));
     }
-    if found.is_empty() { Err("no tag is found".into()) } else { Ok(()) }
+    if found.is_empty() { Err("no tag found".into()) } else { Ok(()) }
 }
 
-/// What a tracker leaves around the tags it expects.
+/// Margin of a tracker around the expected tags. [px]
 const MARGIN_PX: f64 = 30.0;

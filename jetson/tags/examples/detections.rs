@@ -1,9 +1,9 @@
-//! Renders images of tags and writes what is found in them beside what is there, for others to find the same:
+//! Renders images of tags and writes detected and true corners, for comparison with other detectors:
 //!
 //! `cargo run --release -p vizflyt-tags --example detections -- FOLDER`
 //!
-//! makes `N.pgm`, `found.csv` and `true.csv`: image, family, id, then x and y of the four corners in pixels, (0, 0)
-//! the image's outer corner, in the order of [`vizflyt_tags::layout::CORNERS`].
+//! writes `N.pgm`, `found.csv` and `true.csv`. Columns: image, family, id, then x and y of the four corners in pixels,
+//! in the order of [`vizflyt_tags::layout::CORNERS`]; (0, 0) is the image's outer corner.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for index in 0..IMAGES {
         let n = f64::from(index);
         let turn = DQuat::from_euler(EulerRot::ZYX, 0.7 * n, 0.2 * n.sin(), 0.2 * (2.0 * n).sin());
-        // The cube from 2 to 6.5 m away, then the mat from 0.6 to 1.5 m.
+        // The cube at distances from 2 to 6.5 m, then the mat from 0.6 to 1.5 m.
         let above = index >= IMAGES / 2;
         let (camera, layout, p_m) = if above {
             let z_m = 0.6 + 0.06 * (n - f64::from(IMAGES / 2));
@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let world_from_cam = match camera.mounting {
             Mounting::Body(body_from_cam) => pose * body_from_cam,
             Mounting::World(world_from_cam) => world_from_cam,
-            Mounting::Unknown => return Err("the simulated cameras have places".into()),
+            Mounting::Unknown => return Err("a simulated camera has no pose".into()),
         };
         let Sensor { light, blur_px, noise, .. } = Sensor::default();
         let image = Renderer::new(camera.intrinsics).render(&SyntheticExposure {

@@ -1,8 +1,8 @@
-//! Bundle adjustment: lenses, poses of tags and cameras, and poses that change from view to view, all
-//! at once, by Levenberg-Marquardt over the distances of corners in the image.
+//! Bundle adjustment: estimates lenses, poses of tags and cameras, and poses of single views together, by
+//! Levenberg-Marquardt over the reprojection errors of corners.
 //!
-//! A corner is seen at `lens(left * right * point)`. What is fixed, what is shared by many views and
-//! what belongs to one view differs:
+//! A corner is projected as `lens(left * right * point)`. Each problem defines which factors are fixed, shared by many
+//! views, or belong to one view:
 //!
 //! | | lens | left | right | point |
 //! |---|---|---|---|---|
@@ -10,10 +10,9 @@
 //! | survey a mat | fixed | `cam_from_world`, of one view | `world_from_tag`, shared | corner of the tag |
 //! | survey cameras | fixed | `cam_from_world`, shared | `world_from_body`, of one view | corner of the cube |
 //!
-//! Poses of views are eliminated (Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section
-//! 6.1): each touches few of the others, and what remains is a dense system of lenses and shared poses.
-//! Corners count by a Cauchy loss, so that a misread tag hardly pulls. A hundred tags in three hundred
-//! views take some seconds.
+//! Poses of views are eliminated (Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1): each is
+//! connected to few of the others, which leaves a dense system of lenses and shared poses. A Cauchy loss reduces the
+//! weight of misread tags. A hundred tags in three hundred views take some seconds.
 
 mod lens;
 pub(crate) mod matrix;
@@ -27,7 +26,7 @@ use lens::project;
 use matrix::Symmetric;
 use normal::{Normal, ViewNormal};
 
-/// A pose without its frames: which they are depends on the problem.
+/// A pose without frames, which depend on the problem.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Rigid {
     pub(crate) t_m: DVec3,
@@ -41,7 +40,7 @@ impl Rigid {
         self.q * p_m + self.t_m
     }
 
-    /// Returns it moved along the outer frame's axes and turned about its own.
+    /// Returns the pose, moved along the outer frame's axes and rotated about its own axes.
     fn moved(&self, change: &[f64]) -> Self {
         let turn = DVec3::new(change[3], change[4], change[5]);
         Self {
@@ -63,18 +62,18 @@ impl<A: Frame, B: Frame> From<Rigid> for Pose<A, B> {
     }
 }
 
-/// What may change.
+/// Role of a pose in the problem.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Parameter {
-    /// Nothing.
+    /// A constant pose.
     Fixed,
-    /// One pose of many views: a tag of a mat, a camera in the room.
+    /// One pose shared by many views: a tag of a mat, a camera in the room.
     Shared,
-    /// The pose of one view; no corner has two of these.
+    /// The pose of one view. A corner depends on at most one of these.
     View,
 }
 
-/// A corner in an image.
+/// Detection of a corner in an image.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CornerObservation {
     pub(crate) lens: usize,
@@ -84,43 +83,42 @@ pub(crate) struct CornerObservation {
     pub(crate) pixel: DVec2,
 }
 
-/// The problem, and after [`Bundle::solve`] its answer.
+/// The problem, and after [`Bundle::solve`] the solution.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bundle {
-    /// Lenses, and whether each is to be found.
+    /// Lenses, and whether each is estimated.
     pub(crate) lenses: Vec<(Intrinsics, bool)>,
     pub(crate) poses: Vec<(Rigid, Parameter)>,
     pub(crate) seen: Vec<CornerObservation>,
-    /// Corners further off than this hardly count. [px]
+    /// Distance at which a corner has half the weight. [px]
     pub(crate) loss_px: f64,
 }
 
-/// How well corners fit.
+/// Accuracy of a solution.
 #[derive(Clone, Debug)]
 pub(crate) struct Solution {
-    /// Root mean square distance of corners that count at least half. [px]
+    /// Root mean square residual of corners with at least half the weight. [px]
     pub(crate) rms_px: f64,
-    /// The same of all corners. [px]
+    /// Root mean square residual of all corners. [px]
     pub(crate) all_rms_px: f64,
-    /// Share of corners that count less than half: misread tags, or a model that does not fit.
+    /// Share of corners with less than half the weight: misread tags, or a wrong model.
     pub(crate) outliers: f64,
-    /// Variances of what is shared: lenses, then shared poses, as they stand in the bundle.
+    /// Covariance of the shared parameters: lenses, then shared poses, in the bundle's order.
     covariance: Symmetric,
-    /// Where each pose begins in it.
+    /// Offset of each pose in the covariance.
     place: Vec<UnknownBlock>,
 }
 
 impl Solution {
-    /// Returns one standard deviation of each number of a lens: fx, fy, cx, cy, then coefficients.
-    /// [px; none]
+    /// Returns the standard deviation of each parameter of a lens: fx, fy, cx, cy [px], then distortion coefficients.
     pub(crate) fn lens_sigma(&self, free_lens: usize) -> [f64; LENS] {
         std::array::from_fn(|i| {
             self.covariance.at(free_lens * LENS + i, free_lens * LENS + i).sqrt()
         })
     }
 
-    /// Returns one standard deviation of a shared pose's position, along the axes of its outer frame;
-    /// zero for one that is fixed. [m]
+    /// Returns the standard deviation of a shared pose's position, along the axes of its outer frame; zero for a fixed
+    /// one. [m]
     pub(crate) fn position_sigma_m(&self, pose: usize) -> DVec3 {
         match self.place[pose] {
             UnknownBlock::Shared(at) => {
@@ -132,7 +130,7 @@ impl Solution {
     }
 }
 
-/// The six unknowns of a pose in the normal equations.
+/// Position of a pose's six parameters in the normal equations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum UnknownBlock {
     Fixed,
@@ -141,25 +139,25 @@ enum UnknownBlock {
 }
 
 impl Bundle {
-    /// Adds a pose and returns its number.
+    /// Adds a pose and returns its index.
     pub(crate) fn pose(&mut self, pose: impl Into<Rigid>, role: Parameter) -> usize {
         self.poses.push((pose.into(), role));
         self.poses.len() - 1
     }
 
-    /// Returns how far each corner is from where it should be; `None` if that is behind the camera.
+    /// Returns the residual of a corner: projected minus detected position. `None` behind the camera.
     pub(crate) fn residual(&self, seen: &CornerObservation) -> Option<DVec2> {
         let (left, right) = (&self.poses[seen.left].0, &self.poses[seen.right].0);
         let p_cam = left.apply(right.apply(seen.point_m));
         Some(project(&self.lenses[seen.lens].0, p_cam)?.pixel - seen.pixel)
     }
 
-    /// Returns a corner's depth. [m, cam]
+    /// Returns the depth of a corner. [m, cam]
     pub(crate) fn depth_m(&self, seen: &CornerObservation) -> f64 {
         self.poses[seen.left].0.apply(self.poses[seen.right].0.apply(seen.point_m)).z
     }
 
-    /// Finds the nearest minimum; `None` if the corners do not determine one.
+    /// Computes the nearest minimum; `None` if the corners do not determine one.
     pub(crate) fn solve(&mut self) -> Option<Solution> {
         let places = self.places();
         let mut normal = self.normal(&places);
@@ -207,7 +205,7 @@ impl Bundle {
         }
         let unknowns = normal.shared + 6 * normal.views.len();
         let freedom = (2 * count as usize).saturating_sub(unknowns).max(1);
-        // Along one axis of the image.
+        // Variance along one axis of the image.
         let variance_px2 = sum / freedom as f64;
         let rms_px = (sum / f64::from(count)).sqrt();
         let total = self.seen.len() as f64;
@@ -252,12 +250,12 @@ impl Bundle {
         Places { lens, place, shared, views }
     }
 
-    /// Returns what all corners cost: Cauchy's loss. [px^2]
+    /// Returns the cost of all corners: Cauchy loss. [px^2]
     pub(crate) fn cost(&self) -> f64 {
         self.seen.iter().map(|seen| self.loss(self.residual(seen))).sum()
     }
 
-    /// Returns what a corner costs: Cauchy's loss; that of a corner far off for one behind the camera.
+    /// Returns the cost of a corner: Cauchy loss. A corner behind the camera counts as far off.
     fn loss(&self, residual: Option<DVec2>) -> f64 {
         let c2 = self.loss_px * self.loss_px;
         let r2 = residual.map_or(BEHIND_PX * BEHIND_PX, DVec2::length_squared);
@@ -281,7 +279,7 @@ impl Bundle {
         moved
     }
 
-    /// Returns the normal equations here.
+    /// Returns the normal equations at the present poses.
     fn normal(&self, places: &Places) -> Normal {
         let mut normal = Normal {
             shared: places.shared,
@@ -307,7 +305,7 @@ impl Bundle {
             let right_axes = left_axes * DMat3::from_quat(right.q);
             let by_right =
                 columns(&projected.by_point, left_axes, right_axes * cross(seen.point_m) * -1.0);
-            // (where, derivatives) of what is shared, and of the view.
+            // (offset, derivatives) of the shared parameters, and of the view.
             let mut shared: [(usize, &[DVec2]); 3] = [(0, &[]); 3];
             let mut view: Option<(usize, &[DVec2; 6])> = None;
             if let Some(at) = places.lens[seen.lens] {
@@ -335,7 +333,7 @@ struct Places {
     views: usize,
 }
 
-/// Returns what takes `v` to `p x v`.
+/// Returns the matrix that maps `v` to `p x v`.
 fn cross(p: DVec3) -> DMat3 {
     DMat3::from_cols(
         DVec3::new(0.0, p.z, -p.y),
@@ -344,17 +342,17 @@ fn cross(p: DVec3) -> DMat3 {
     )
 }
 
-/// Returns the derivatives of the pixel by position and turn of a pose, given those of the point.
+/// Returns the derivatives of the pixel by a pose's position and rotation, from those by the point.
 fn columns(by_point: &[DVec2; 3], by_position: DMat3, by_turn: DMat3) -> [DVec2; 6] {
     let through = |v: DVec3| by_point[0] * v.x + by_point[1] * v.y + by_point[2] * v.z;
     std::array::from_fn(|i| through(if i < 3 { by_position.col(i) } else { by_turn.col(i - 3) }))
 }
 
-/// Far more than any problem that converges takes.
+/// Maximum number of iterations, far more than a converging problem needs.
 const MAX_ROUNDS: usize = 100;
-/// Damping beyond which no step will help.
+/// Damping at which the solver gives up.
 const GIVE_UP: f64 = 1e9;
-/// What a corner behind its camera counts as. [px]
+/// Residual of a corner behind its camera. [px]
 const BEHIND_PX: f64 = 1e4;
 
 #[cfg(test)]

@@ -1,16 +1,15 @@
-//! A lens, from images of a board held before it: of tags, or a checkerboard.
+//! Lens calibration from images of a board of tags or a checkerboard.
 //!
 //! ```text
-//! corners of a view -> Calibrator::add   kept, or why not (too few tags, too like another, moving)
-//!                      Calibrator::wanted   where to hold the board next, in words
-//!                      Calibrator::finish   focal lengths, middle, distortion; or what to add
-//! images               Session              all of it, and a second look with the first lens
+//! corners of a view -> Calibrator::add      kept, or rejected (too few tags, similar view, motion)
+//!                      Calibrator::wanted   missing views, as instructions
+//!                      Calibrator::finish   focal lengths, principal point, distortion; or missing views
+//! images            -> Session              all steps, and a second detection with the first lens
 //! ```
 //!
-//! The start is closed: a homography per view, and of all of them the focal length (Zhang 2000, "A
-//! flexible new technique for camera calibration", section 3.1, with the middle of the image as
-//! principal point). Then [`crate::bundle`] finds lens and views together. Every fifth view is held
-//! back: its corners judge a lens that never saw them.
+//! The initial lens has a closed form: a homography per view, and the focal length from all of them (Zhang 2000, "A
+//! flexible new technique for camera calibration", section 3.1, with the middle of the image as principal point). Then
+//! [`crate::bundle`] estimates lens and views together. Every fifth view is held back to validate the lens.
 
 mod board;
 mod coverage;
@@ -31,32 +30,32 @@ use crate::camera::Calibration;
 use crate::detection::Detection;
 use homography::Plane;
 
-/// Which lens is looked for.
+/// Distortion model of the lens.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LensModel {
-    /// Most lenses: [`Distortion::BrownConrady`] with k3 = 0.
+    /// For most lenses: [`Distortion::BrownConrady`] with k3 = 0.
     #[default]
     BrownConrady,
-    /// Fisheyes of more than some 110 degrees: [`Distortion::KannalaBrandt`].
+    /// For fisheyes of more than about 110 degrees: [`Distortion::KannalaBrandt`].
     KannalaBrandt,
 }
 
-/// What became of a view.
+/// Result of adding a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ViewOutcome {
-    /// It is used.
+    /// The view is used.
     Kept,
-    /// Fewer than four of the board's tags are in it.
+    /// The view shows fewer than four of the board's tags.
     TooFewTags,
-    /// The checkerboard is not in it as a whole.
+    /// The view does not show the complete checkerboard.
     NoBoard,
-    /// Another checkerboard is, of so many inner corners each way.
+    /// The view shows another checkerboard, with this number of inner corners in each direction.
     AnotherBoard(u32, u32),
-    /// The board was nearly there before.
+    /// The view is similar to an earlier one.
     KnownView,
-    /// The board moves: its corners are smeared.
+    /// The board moves: its corners are blurred.
     Moving,
-    /// There are as many views as help.
+    /// The maximum number of views is reached.
     Enough,
 }
 
@@ -79,12 +78,11 @@ impl fmt::Display for ViewOutcome {
     }
 }
 
-/// Why there is no lens, and what to add.
+/// Reason for a rejected calibration, and the correction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Refused {
-    /// What is wrong.
     pub why: String,
-    /// What to do, each a sentence.
+    /// Corrections, one instruction each.
     pub add: Vec<String>,
 }
 
@@ -100,14 +98,13 @@ impl fmt::Display for Refused {
 
 impl std::error::Error for Refused {}
 
-/// A lens and how well it is known.
+/// A lens with its accuracy.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibrated {
-    /// The lens.
     pub intrinsics: Intrinsics,
-    /// How well it explains the views.
+    /// Residuals of the views.
     pub calibration: Calibration,
-    /// One standard deviation of the focal lengths and the principal point. [px]
+    /// Standard deviations of the focal lengths and the principal point. [px]
     pub sigma_px: [f64; 4],
 }
 
@@ -118,18 +115,19 @@ struct BoardView {
     corners: Vec<(DVec2, DVec2)>,
 }
 
-/// Gathers views of a board.
+/// Collects views of a board and computes the lens.
 #[derive(Clone, Debug)]
 pub struct Calibrator {
     board: Board,
     size_px: [u32; 2],
     views: Vec<BoardView>,
-    /// Corners of the image before, on the board and in it.
+    /// Corners of the previous image, on the board and in the image.
     last: Vec<(DVec2, DVec2)>,
 }
 
 impl Calibrator {
-    /// Begins, for images of this size; the board is flat, as `vizflyt tags print board` or `checkers` makes it.
+    /// Makes a calibrator for images of this size. The board is flat, as printed by `vizflyt tags print board` or
+    /// `checkers`.
     ///
     /// # Errors
     /// [`Refused`] if a tag of the board is tilted or raised.
@@ -139,19 +137,19 @@ impl Calibrator {
         Ok(Self { board, size_px: [width_px, height_px], views: Vec::new(), last: Vec::new() })
     }
 
-    /// Returns how many views are kept.
+    /// Returns the number of kept views.
     pub fn views(&self) -> usize {
         self.views.len()
     }
 
-    /// Takes the tags of an image. With `is_stream`, images follow one another closely, and one whose
-    /// corners moved since the one before is not kept.
+    /// Adds the tags of an image. With `is_stream`, images are consecutive, and an image whose corners moved since the
+    /// previous one is not kept.
     pub fn add(&mut self, detections: &[Detection], is_stream: bool) -> ViewOutcome {
         self.take(self.board.corners_of(detections), ViewOutcome::TooFewTags, is_stream)
     }
 
-    /// Takes the corners of the checkerboard in an image, as [`Checkerboard::find`] returns them; none if it is not
-    /// there. `is_stream` as for [`Self::add`].
+    /// Adds the corners of the checkerboard in an image, from [`Checkerboard::find`]; `None` if it was not found.
+    /// `is_stream` as in [`Self::add`].
     ///
     /// [`Checkerboard::find`]: crate::checkerboard::Checkerboard::find
     pub fn add_checkerboard(
@@ -163,7 +161,7 @@ impl Calibrator {
         self.take(corners, ViewOutcome::NoBoard, is_stream)
     }
 
-    /// Takes corners on the board and in the image; `absent` means that there are too few.
+    /// Adds corners on the board and in the image. Returns `absent` if there are too few.
     fn take(
         &mut self,
         corners: Vec<(DVec2, DVec2)>,
@@ -189,7 +187,7 @@ impl Calibrator {
         ViewOutcome::Kept
     }
 
-    /// Returns where corners were seen and how the board was tilted, by a rough lens.
+    /// Returns the coverage of the image by corners and the tilts of the board, computed with a rough lens.
     pub fn coverage(&self) -> Coverage {
         let mut coverage = Coverage::new(self.size_px);
         let rough = self.rough(LensModel::BrownConrady);
@@ -202,7 +200,7 @@ impl Calibrator {
         coverage
     }
 
-    /// Returns where to hold the board next, each a sentence; nothing if it has been everywhere.
+    /// Returns instructions for missing views; empty if none are missing.
     pub fn wanted(&self) -> Vec<String> {
         let mut wanted = self.coverage().wanted();
         if self.views.len() < MIN_VIEWS {
@@ -214,7 +212,7 @@ impl Calibrator {
     /// Returns the lens.
     ///
     /// # Errors
-    /// [`Refused`] for a set of views that does not determine one well: its message lists what to add.
+    /// [`Refused`] if the views do not determine the lens well; its message lists the missing views.
     pub fn finish(&self, model: LensModel) -> Result<Calibrated, Refused> {
         let wanted = self.wanted();
         if !wanted.is_empty() {
@@ -228,7 +226,7 @@ impl Calibrator {
         };
         let (used, held) = (pick(false), pick(true));
         let undetermined = || Refused {
-            why: "these views lead to no lens".into(),
+            why: "the solver found no lens for these views".into(),
             add: vec![
                 "check that the board's layout file is the one that was printed".into(),
                 "tilt the board more, by up to 45 degrees, to all sides".into(),
@@ -250,7 +248,7 @@ impl Calibrator {
         Ok(calibrated)
     }
 
-    /// Returns a lens to start from: the focal length of all homographies, and no distortion.
+    /// Returns an initial lens: the focal length from all homographies, without distortion.
     fn rough(&self, model: LensModel) -> Intrinsics {
         let [width_px, height_px] = self.size_px;
         let mut lens = Intrinsics::from_horizontal_fov(width_px, height_px, 1.2);
@@ -258,7 +256,7 @@ impl Calibrator {
         let planes: Vec<Plane> =
             self.views.iter().filter_map(|view| Plane::fit(&view.corners)).collect();
         if let Some(focal_px) = homography::focal_px(&planes, middle) {
-            // From a telephoto to a fisheye: what lies outside is a degenerate set.
+            // From a fisheye to a telephoto lens; values outside come from a degenerate set.
             let width = f64::from(width_px);
             let focal_px = focal_px.clamp(0.2 * width, 10.0 * width);
             (lens.fx_px, lens.fy_px) = (focal_px, focal_px);
@@ -275,13 +273,13 @@ impl Calibrator {
     }
 }
 
-/// Finds the poses of views, and the lens if it is free.
+/// Estimates the poses of views, and the lens if `is_free`.
 fn adjust(
     views: &[&BoardView],
     lens: Intrinsics,
     is_free: bool,
 ) -> Option<(Bundle, crate::bundle::Solution)> {
-    // A rough lens puts corners far off; the loss must not cut them away before the lens has bent.
+    // A rough lens has large residuals; the loss must not suppress them before the distortion has been estimated.
     let mut bundle =
         Bundle { lenses: vec![(lens, is_free)], loss_px: FIRST_LOSS_PX, ..Bundle::default() };
     let board = bundle.pose(Rigid::IDENTITY, Parameter::Fixed);
@@ -304,7 +302,7 @@ fn adjust(
     Some((bundle, solution))
 }
 
-/// Returns the root mean square distance of all corners, misread ones too.
+/// Returns the root mean square residual of all corners, including misread ones.
 fn rms_px(bundle: &Bundle, lens: Intrinsics) -> f64 {
     let mut bundle = bundle.clone();
     bundle.lenses = vec![(lens, false)];
@@ -317,13 +315,13 @@ fn rms_px(bundle: &Bundle, lens: Intrinsics) -> f64 {
     (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
 }
 
-/// Refuses a lens that would mislead.
+/// Rejects an inaccurate lens.
 fn check(found: &Calibrated, model: LensModel) -> Result<(), Refused> {
     let refuse = |why: String, add: &str| Err(Refused { why, add: vec![add.into()] });
     let Calibration { rms_px, held_out_rms_px, .. } = found.calibration;
     let other = match model {
         LensModel::BrownConrady => "if the lens is a fisheye, try that model",
-        LensModel::KannalaBrandt => "if the lens is no fisheye, try the other model",
+        LensModel::KannalaBrandt => "if the lens is not a fisheye, try the other model",
     };
     if !(rms_px <= GREATEST_RMS_PX) {
         let why = format!("corners are {rms_px:.2} px off, more than {GREATEST_RMS_PX} px");
@@ -334,22 +332,22 @@ fn check(found: &Calibrated, model: LensModel) -> Result<(), Refused> {
     if !(held_out_rms_px <= 1.5 * rms_px + 0.1) {
         let why = format!(
             "corners of views that were held back are {held_out_rms_px:.2} px off, those of the \
-             others {rms_px:.2} px: the lens fits its own views alone"
+             others {rms_px:.2} px: the lens fits only its own views"
         );
         return refuse(why, "add views, above all at the image's edges");
     }
     let share = found.sigma_px[0] / found.intrinsics.fx_px;
     if !(share <= GREATEST_FOCAL_SHARE) {
-        let why = format!("the focal length is known to {:.1} % only", 100.0 * share);
+        let why = format!("the focal length is uncertain by {:.1} %", 100.0 * share);
         return refuse(why, "tilt the board more, by up to 45 degrees, to all sides");
     }
     if found.intrinsics.validate().is_err() {
-        return refuse(format!("the lens found is none: {:?}", found.intrinsics), other);
+        return refuse(format!("the estimated lens is invalid: {:?}", found.intrinsics), other);
     }
     Ok(())
 }
 
-/// Whether no corner moved by more than those of a still image scatter.
+/// Returns whether no corner moved by more than the scatter of a still image.
 fn is_still(before: &[(DVec2, DVec2)], now: &[(DVec2, DVec2)]) -> bool {
     let mut common = 0;
     for (on_board, pixel) in now {
@@ -362,7 +360,7 @@ fn is_still(before: &[(DVec2, DVec2)], now: &[(DVec2, DVec2)]) -> bool {
     common > 0
 }
 
-/// Whether corners that both views have are this far apart, on average; or none are in both.
+/// Returns whether the mean distance of common corners is above the limit, or no corner is common.
 fn differs(a: &BoardView, b: &BoardView, least_px: f64) -> bool {
     let (mut sum, mut count) = (0.0, 0);
     for (on_board, pixel) in &a.corners {
@@ -374,30 +372,30 @@ fn differs(a: &BoardView, b: &BoardView, least_px: f64) -> bool {
     count == 0 || sum > least_px * f64::from(count)
 }
 
-/// Returns the pose whose axes these are.
+/// Returns the rotation with these x and y axes.
 fn rotation(x: DVec3, y: DVec3) -> DQuat {
     let x = x.normalize();
     let z = x.cross(y).normalize();
     DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).normalize()
 }
 
-/// Views that a set must have: twelve used, three held back.
+/// Minimum number of views: twelve used, three held back.
 const MIN_VIEWS: usize = 15;
-/// More views cost time and add nothing.
+/// Maximum number of views; more cost time without a gain in accuracy.
 const MAX_VIEWS: usize = 80;
-/// One view in so many is held back.
+/// Every fifth view is held back.
 const HELD_OUT: usize = 5;
-/// Views are alike if their corners are nearer than this. [share of the image's width]
+/// Views with a smaller mean distance of corners are similar. [share of the image's width]
 const NOVELTY: f64 = 0.02;
-/// Corners of a board held still scatter less than this from image to image. [px]
+/// Maximum motion of corners between images of a still board. [px]
 const STILL_PX: f64 = 1.5;
-/// Corners count half at this distance, once the lens is nearly right. [px]
+/// Distance at which a corner has half the weight, in the final adjustment. [px]
 const LOSS_PX: f64 = 2.0;
-/// Corners count half at this distance at first. [px]
+/// Distance at which a corner has half the weight, in the first adjustment. [px]
 const FIRST_LOSS_PX: f64 = 40.0;
-/// Corners of a good set are within 0.1 to 0.4 px; a bent board or blur makes more. [px]
+/// Maximum RMS error. Good sets have 0.1 to 0.4 px; a bent board or blur causes more. [px]
 const GREATEST_RMS_PX: f64 = 1.0;
-/// 0.5 % is 2 cm at 4 m.
+/// Maximum relative sigma of the focal length: 0.5 % is 2 cm at 4 m.
 const GREATEST_FOCAL_SHARE: f64 = 0.005;
 
 #[cfg(test)]

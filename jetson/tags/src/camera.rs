@@ -1,4 +1,4 @@
-//! A camera: where its images come from, its lens, and where it is.
+//! A camera: source of its images, lens, and pose.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use vizflyt_protocol::geometry::{Body, Cam, Distortion, Intrinsics, LensConfig, 
 
 use crate::file::{self, FileError, PoseConfig, check_number, invalid};
 
-/// A camera that looks at tags.
+/// A camera that detects tags.
 ///
 /// ```
 /// let text = r#"
@@ -27,43 +27,42 @@ use crate::file::{self, FileError, PoseConfig, check_number, invalid};
 /// "#;
 /// let camera = vizflyt_tags::camera::TagCamera::parse(text).unwrap();
 /// let vizflyt_tags::camera::Mounting::World(world_from_cam) = camera.mounting else { panic!() };
-/// // It looks along x, level.
+/// // The camera looks along x, level.
 /// assert!((world_from_cam.rotate(glam::DVec3::Z) - glam::DVec3::X).length() < 1e-12);
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagCamera {
-    /// What people call it.
+    /// Name in messages and on the page.
     pub name: String,
-    /// Where its images come from: `/dev/video0`, a folder, a video file; absent if the caller gives it.
+    /// Source of images: `/dev/video0`, a folder, or a video file. Absent if the caller supplies the images.
     pub source: Option<String>,
     /// Size, focal lengths, principal point, distortion.
     pub intrinsics: Intrinsics,
-    /// Where it is.
     pub mounting: Mounting,
-    /// How well the lens is known; absent if it was not calibrated here.
+    /// Accuracy of the lens; absent if it was not calibrated by this project.
     pub calibration: Option<Calibration>,
-    /// How well its place is known; absent if it was not surveyed here.
+    /// Accuracy of the pose; absent if it was not surveyed by this project.
     pub survey: Option<Survey>,
-    /// How much later than the exposure its images are stamped: a delay that is known and does not change. [ms]
+    /// Constant delay from the exposure to the image's stamp. [ms]
     pub latency_ms: f64,
 }
 
-/// How well a camera's place is known.
+/// Accuracy of a camera's pose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Survey {
-    /// One standard deviation of its position. [m]
+    /// Standard deviation of the position. [m]
     pub sigma_m: f64,
-    /// Root mean square distance of corners from where the answer puts them. [px]
+    /// Root mean square reprojection error of corners. [px]
     pub rms_px: f64,
-    /// Corners it rests on.
+    /// Number of corners used.
     pub corners: u32,
 }
 
-/// Where a camera is.
+/// Pose of a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Mounting {
-    /// Absent: calibrated, not yet surveyed.
+    /// No pose: calibrated, but not yet surveyed.
     Unknown,
     /// Fixed in the room: `world_from_cam`.
     World(Pose<World, Cam>),
@@ -71,19 +70,19 @@ pub enum Mounting {
     Body(Pose<Body, Cam>),
 }
 
-/// How well a lens is known.
+/// Accuracy of a lens.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
-    /// Root mean square distance of corners from where the lens puts them, in the images used. [px]
+    /// Root mean square reprojection error in the images used. [px]
     pub rms_px: f64,
-    /// The same in images that were held back: it must not be much larger. [px]
+    /// Root mean square reprojection error in images that were held back. Must not be much larger than `rms_px`. [px]
     pub held_out_rms_px: f64,
-    /// How many images were used.
+    /// Number of images used.
     pub images: u32,
 }
 
-/// As the file has it.
+/// Format of the file.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CameraFile {
@@ -111,11 +110,10 @@ struct CameraFile {
 }
 
 impl TagCamera {
-    /// Reads a camera from TOML.
+    /// Parses a camera from TOML.
     ///
     /// # Errors
-    /// [`FileError::Toml`] for what is no camera, [`FileError::Invalid`] for a value that cannot
-    /// work.
+    /// [`FileError::Toml`] if the text does not match the format, [`FileError::Invalid`] for a value out of range.
     pub fn parse(text: &str) -> Result<Self, FileError> {
         let file: CameraFile = vizflyt_toml::parse(text)?;
         let mounting = match (file.world_from_cam, file.body_from_cam) {
@@ -158,15 +156,15 @@ impl TagCamera {
     /// Reads a camera file.
     ///
     /// # Errors
-    /// As [`Self::parse`], and [`FileError::Io`]; the file is named.
+    /// As [`Self::parse`], and [`FileError::Io`]; the error contains the path.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         file::read(path, Self::parse)
     }
 
-    /// Returns it as TOML.
+    /// Returns the camera as TOML.
     ///
     /// # Errors
-    /// [`FileError::Unwritable`], if a number is none.
+    /// [`FileError::Unwritable`], if a number is NaN.
     pub fn to_toml(&self) -> Result<String, FileError> {
         let k = &self.intrinsics;
         let (world_from_cam, body_from_cam) = match self.mounting {
@@ -195,7 +193,7 @@ impl TagCamera {
     /// Writes a camera file.
     ///
     /// # Errors
-    /// [`FileError::Io`]; the file is named.
+    /// [`FileError::Io`]; the error contains the path.
     pub fn write(&self, path: &Path) -> Result<(), FileError> {
         file::write(path, &self.to_toml()?)
     }
@@ -230,13 +228,13 @@ impl TagCamera {
     }
 }
 
-/// A camera without a delay has no such key.
-#[allow(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+/// A delay of zero is omitted from the file.
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "required by serde")]
 fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
-/// As a camera's name in `arena.toml`.
+/// Same limit as for a camera's name in `arena.toml`.
 const MAX_NAME_BYTES: usize = 32;
 
 #[cfg(test)]
@@ -256,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_work_is_refused_by_name() {
+    fn rejects_invalid_values_with_their_key() {
         let pose = "{ position_m = [0.0, 0.0, 1.0], rotation_xyzw = [0.0, 0.0, 0.0, 1.0] }";
         let both = format!("{LEFT}world_from_cam = {pose}\nbody_from_cam = {pose}");
         check_refused(&both, &["body_from_cam", "remove one"]);
@@ -276,7 +274,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read_again(
+        fn camera_survives_a_round_trip_through_toml(
             focal_px in 100.0..2000.0f64, k1 in -0.5..0.5f64, fisheye: bool,
             p in prop::array::uniform3(-9.0..9.0f64), mounted in 0..3u8,
             source in prop::option::of("[a-z/]{1,12}"),

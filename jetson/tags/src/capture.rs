@@ -1,15 +1,15 @@
-//! Where images come from: a camera, a folder, a video file, another program.
+//! Sources of images: a camera, a folder, a video file, or another program.
 //!
-//! | source | what it is | stamps |
+//! | source | meaning | stamps |
 //! |---|---|---|
-//! | `/dev/video0` | a V4L2 camera, or `/dev/video0:1280x720@60` | the driver's, moved to mid-exposure |
-//! | `DIR` | PNG, JPEG, PGM files in the order of their names | `stamps.csv`, names of digits, or a rate |
-//! | `FILE` | a video, through the program `ffmpeg` | the video's rate |
-//! | `-` | YUV4MPEG2 on standard input | `XSTAMP_NS=` of each image, else arrival |
-//! | `\| COMMAND` | YUV4MPEG2 that a shell command prints, as of GStreamer | likewise |
+//! | `/dev/video0` | a V4L2 camera, or `/dev/video0:1280x720@60` | from the driver, moved to mid-exposure |
+//! | `DIR` | PNG, JPEG, PGM files in the order of their names | `stamps.csv`, numbers as names, or a fixed rate |
+//! | `FILE` | a video, decoded by the program `ffmpeg` | from the video's rate |
+//! | `-` | YUV4MPEG2 on standard input | `XSTAMP_NS=` of each image, or its arrival |
+//! | `\| COMMAND` | YUV4MPEG2 that a shell command prints, for example GStreamer | as for `-` |
 //!
-//! Stamps are the middle of the exposure. Those of a camera and of programs are on the monotonic
-//! clock of this computer; recorded ones count from anywhere.
+//! A stamp is the middle of the exposure. Stamps of cameras and programs use this computer's monotonic clock; stamps of
+//! recordings have an arbitrary origin.
 
 mod decode;
 mod folder;
@@ -31,44 +31,37 @@ pub use y4m::{Colours, Y4m};
 
 use crate::image::Gray;
 
-/// An image and when it was exposed.
+/// An image with its time of exposure.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Exposure {
-    /// When the exposure was half over. [ns, the source's clock]
+    /// Middle of the exposure. [ns, the source's clock]
     pub stamp_ns: u64,
-    /// What the camera saw.
     pub image: Gray,
 }
 
-/// Yields images.
+/// A source of images.
 pub trait ImageSource: Send {
-    /// Returns the next image; waits for it. `None` at the end.
+    /// Waits for the next image and returns it; `None` at the end.
     ///
     /// # Errors
-    /// [`CaptureError`] if there will be no more; a single damaged image is no error.
+    /// [`CaptureError`] if there will be no more images. A single damaged image is not an error.
     fn next(&mut self) -> Result<Option<Exposure>, CaptureError>;
 
-    /// Whether images come as they are exposed, on this computer's monotonic clock.
+    /// Returns whether images arrive as they are exposed, with stamps of this computer's monotonic clock.
     fn is_live(&self) -> bool;
 }
 
-/// Why there are no images.
+/// Why images are not available.
 #[derive(Debug, thiserror::Error)]
 pub enum CaptureError {
-    /// It cannot be opened, or ended.
+    /// The source cannot be opened, or ended.
     #[error("{source_name}: {error}")]
-    Io {
-        /// Which source.
-        source_name: String,
-        /// The system's error.
-        error: std::io::Error,
-    },
-    /// It is there and is not what is needed.
+    Io { source_name: String, error: std::io::Error },
+    /// The source exists but is unsuitable.
     #[error("{source_name}: {why}")]
     Unfit {
-        /// Which source.
         source_name: String,
-        /// What is wrong and what to do.
+        /// Problem and correction.
         why: String,
     },
 }
@@ -83,10 +76,10 @@ impl CaptureError {
     }
 }
 
-/// Opens a source by what a camera file or the command line calls it; see the table above.
+/// Opens a source by its name in a camera file or on the command line; see the table above.
 ///
 /// # Errors
-/// [`CaptureError`] if it is not there or cannot be used.
+/// [`CaptureError`] if it does not exist or cannot be used.
 pub fn open(source: &str) -> Result<Box<dyn ImageSource>, CaptureError> {
     if source == "-" {
         return Ok(Box::new(Pipe::stdin()));
@@ -110,7 +103,7 @@ pub fn open(source: &str) -> Result<Box<dyn ImageSource>, CaptureError> {
 
 /// Returns the time of this computer's monotonic clock. [ns]
 pub fn now_ns() -> u64 {
-    // Only a clock that does not exist fails, and this one does.
+    // The call fails only for unknown clocks.
     nix::time::clock_gettime(nix::time::ClockId::CLOCK_MONOTONIC)
         .map_or(0, |now| now.tv_sec() as u64 * 1_000_000_000 + now.tv_nsec() as u64)
 }

@@ -1,13 +1,13 @@
-//! A checkerboard: its file, and its inner corners in an image.
+//! Checkerboards: file format, and detection of inner corners in an image.
 //!
 //! ```text
-//! image -> corners wherever four squares meet (a ring of samples changes twice between dark and bright)
-//!       -> to a fraction of a pixel (every gradient around a corner is perpendicular to the way there)
-//!       -> grid: from corner to neighbour along edges, until there are no more
-//!       -> columns x rows of them, lower left first; or nothing
+//! image -> corners where four squares meet (samples on a ring change twice between dark and bright)
+//!       -> subpixel refinement (each gradient near a corner is perpendicular to the direction to the corner)
+//!       -> grid: from corner to neighbour along edges, until no more are found
+//!       -> columns x rows corners, the lower left first; or none
 //! ```
-//! The ring is that of Bennett and Lasenby 2014, "ChESS - Quick and robust detection of chess-board features", section
-//! 3. The board must be in the image as a whole: a part of it is ambiguous. 50 ms for 1280 x 720.
+//! The ring is from Bennett and Lasenby 2014, "ChESS - Quick and robust detection of chess-board features", section 3.
+//! The image must show the whole board, because a part of it is ambiguous. Takes 50 ms for 1280 x 720.
 
 mod corners;
 mod grid;
@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use crate::file::{self, FileError, check_number, invalid};
 use crate::image::Gray;
 
-/// A checkerboard by its inner corners: those where four squares meet.
+/// A checkerboard, described by its inner corners, where four squares meet.
 ///
 /// ```
 /// let text = "[checkerboard]\ncolumns = 9\nrows = 6\nsquare_m = 0.025\n";
@@ -30,9 +30,9 @@ use crate::image::Gray;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Checkerboard {
-    /// Inner corners side by side; one fewer than squares.
+    /// Number of inner corners in a row: the number of squares minus one.
     pub columns: u32,
-    /// Inner corners above one another.
+    /// Number of rows of inner corners.
     pub rows: u32,
     /// Edge of a square. [m]
     pub square_m: f64,
@@ -45,28 +45,28 @@ struct CheckerboardFile {
 }
 
 impl Checkerboard {
-    /// Reads it from TOML.
+    /// Parses a checkerboard from TOML.
     ///
     /// # Errors
-    /// [`FileError::Toml`] for what is none, [`FileError::Invalid`] for a value that cannot work.
+    /// [`FileError::Toml`] if the text does not match the format, [`FileError::Invalid`] for a value out of range.
     pub fn parse(text: &str) -> Result<Self, FileError> {
         let CheckerboardFile { checkerboard } = vizflyt_toml::parse(text)?;
         checkerboard.validate()?;
         Ok(checkerboard)
     }
 
-    /// Returns it as TOML.
+    /// Returns the checkerboard as TOML.
     ///
     /// # Errors
-    /// [`FileError::Unwritable`], if a number is none.
+    /// [`FileError::Unwritable`], if a number is NaN.
     pub fn to_toml(&self) -> Result<String, FileError> {
         Ok(toml::to_string(&CheckerboardFile { checkerboard: *self })?)
     }
 
-    /// Reads its file.
+    /// Reads a checkerboard file.
     ///
     /// # Errors
-    /// As [`Self::parse`], and [`FileError::Io`]; the file is named.
+    /// As [`Self::parse`], and [`FileError::Io`]; the error contains the path.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         file::read(path, Self::parse)
     }
@@ -83,13 +83,13 @@ impl Checkerboard {
         check_number("checkerboard.square_m", self.square_m, "m", 0.002..=1.0)
     }
 
-    /// Returns how many corners it has.
+    /// Returns the number of inner corners.
     pub fn count(&self) -> usize {
         self.columns as usize * self.rows as usize
     }
 
-    /// Returns its corners from the board's middle, x to the right and y up: lower left first, then to the right, then
-    /// up. [m, board]
+    /// Returns the corners relative to the board's middle, x to the right and y up. The order is lower left first, then
+    /// to the right, then up. [m, board]
     pub fn corners_m(&self) -> Vec<DVec2> {
         let middle = DVec2::new(f64::from(self.columns - 1), f64::from(self.rows - 1)) / 2.0;
         (0..self.rows)
@@ -100,8 +100,8 @@ impl Checkerboard {
             .collect()
     }
 
-    /// Returns where its corners are in an image, in the order of [`Self::corners_m`]; `None` unless all are there. Of
-    /// the ways to hold it that look alike, the one whose columns run most to the right in the image. [px]
+    /// Returns the corners in an image, in the order of [`Self::corners_m`]; `None` unless all are found. If several
+    /// orientations match, returns the one whose rows run most to the right in the image. [px]
     pub fn find(&self, image: &Gray) -> Option<Vec<DVec2>> {
         let found = corners::candidates(image);
         let grid = grid::grow(image, &found, self)?;
@@ -110,19 +110,19 @@ impl Checkerboard {
         grid.into_iter().map(|corner| corners::refine(image, corner, half_px)).collect()
     }
 
-    /// Returns the inner corners, the fewer first, of a whole checkerboard in an image that has other numbers of them
-    /// than this one.
+    /// Returns the numbers of inner corners, the smaller first, of a complete checkerboard in an image whose numbers
+    /// differ from this one's.
     pub fn find_another(&self, image: &Gray) -> Option<(u32, u32)> {
         let own = (self.columns.min(self.rows), self.columns.max(self.rows));
         grid::count(image, &corners::candidates(image)).filter(|counted| *counted != own)
     }
 }
 
-/// Fewer corners make no grid that can be distinguished from clutter.
+/// Minimum number of corners in a direction, to distinguish a grid from clutter.
 const MIN_CORNERS: u32 = 3;
-/// More are smaller than any camera sees.
+/// Maximum number of corners in a direction, which a camera can still resolve.
 const MAX_CORNERS: u32 = 100;
-/// A corner is measured within so many pixels to each side; further out the lens bends its edges. [px]
+/// Maximum half width of the refinement window; further out the lens bends the edges. [px]
 const MAX_HALF_PX: f64 = 8.0;
 
 #[cfg(test)]

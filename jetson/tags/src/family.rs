@@ -6,31 +6,30 @@ use serde::{Deserialize, Serialize};
 
 use crate::ffi;
 
-/// A set of tags that are distinguished by their cells.
+/// A set of tags that are told apart by their cells.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize,
 )]
 pub enum TagFamily {
-    /// 587 tags of 36 bits that differ in 11 at least: the one to take.
+    /// 587 tags of 36 bits, Hamming distance at least 11. Recommended.
     #[default]
     #[serde(rename = "tag36h11")]
     Tag36h11,
-    /// 35 tags of 25 bits that differ in 9: read from further away, mistaken more often.
+    /// 35 tags of 25 bits, Hamming distance 9: readable from further away, confused more often.
     #[serde(rename = "tag25h9")]
     Tag25h9,
-    /// 30 tags of 16 bits that differ in 5: mistaken often; for tests.
+    /// 30 tags of 16 bits, Hamming distance 5: often confused; for tests.
     #[serde(rename = "tag16h5")]
     Tag16h5,
-    /// 2115 tags of 41 bits that differ in 12; data also outside the border.
+    /// 2115 tags of 41 bits, Hamming distance 12; data also outside the border.
     #[serde(rename = "tagStandard41h12")]
     TagStandard41h12,
-    /// 48714 tags of 52 bits that differ in 13; data also outside the border.
+    /// 48714 tags of 52 bits, Hamming distance 13; data also outside the border.
     #[serde(rename = "tagStandard52h13")]
     TagStandard52h13,
 }
 
 impl TagFamily {
-    /// All of them.
     pub const ALL: [Self; 5] = [
         Self::Tag36h11,
         Self::Tag25h9,
@@ -55,12 +54,12 @@ impl TagFamily {
         Self::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
-    /// Returns how many tags it has; ids count up from 0.
+    /// Returns the number of tags; ids count up from 0.
     pub fn ids(self) -> u32 {
         ffi::ids(self)
     }
 
-    /// Returns the picture of a tag; `None` if the family has no such id.
+    /// Returns the cells of a tag; `None` if the family does not have this id.
     ///
     /// ```
     /// use vizflyt_tags::family::TagFamily;
@@ -80,7 +79,7 @@ impl fmt::Display for TagFamily {
     }
 }
 
-/// The cells of a tag, upright as a reader sees it: column 0 on the left, row 0 on top.
+/// Cells of an upright tag: column 0 on the left, row 0 on top.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Cells {
     across: u32,
@@ -89,22 +88,22 @@ pub struct Cells {
 }
 
 impl Cells {
-    /// Makes it from rows of cells, `across` wide and high.
+    /// Makes a tag from rows of cells, `across` wide and high.
     ///
     /// # Panics
-    /// If the number of cells is another.
+    /// If `white` does not have `across` x `across` cells.
     pub(crate) fn new(across: u32, border: u32, white: Vec<bool>) -> Self {
         assert_eq!(white.len(), (across * across) as usize);
         Self { across, border, white }
     }
 
-    /// Returns how many cells it is wide and high, with everything that must be printed.
+    /// Returns the width and height of the printed tag [cells], with the white rim.
     pub fn across(&self) -> u32 {
         self.across
     }
 
-    /// Returns how many cells wide the square is whose corners are detected and whose edge is a
-    /// layout's `size_m`. It lies in the middle.
+    /// Returns the width of the detected square, in cells. Its corners are detected, and its edge is a layout's
+    /// `size_m`. It is centred in the tag.
     pub fn border(&self) -> u32 {
         self.border
     }
@@ -112,7 +111,7 @@ impl Cells {
     /// Returns whether a cell is white.
     ///
     /// # Panics
-    /// If it is outside.
+    /// If the cell is outside the tag.
     pub fn is_white(&self, column: u32, row: u32) -> bool {
         assert!(column < self.across && row < self.across);
         self.white[(row * self.across + column) as usize]
@@ -124,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn families_are_as_large_as_published() {
+    fn families_have_the_published_sizes() {
         let sizes = TagFamily::ALL.map(|family| {
             let cells = family.cells(0).unwrap();
             (family.ids(), cells.across(), cells.border())
@@ -138,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn no_two_tags_of_a_family_are_alike_however_they_are_turned() {
+    fn tags_of_a_family_differ_in_every_rotation() {
         let family = TagFamily::Tag36h11;
         let turn = |cells: &Cells| {
             let n = cells.across();

@@ -1,4 +1,4 @@
-//! What is asked of the AprilTag C library about its families.
+//! Calls of the AprilTag C library that describe its tag families.
 
 #![allow(unsafe_code, reason = "calls the AprilTag C library")]
 
@@ -6,7 +6,7 @@ use apriltag_sys as sys;
 
 use crate::family::{Cells, TagFamily};
 
-/// A family of the C library; freed when dropped.
+/// A family of the C library, freed when dropped.
 struct Family {
     family: TagFamily,
     raw: *mut sys::apriltag_family_t,
@@ -14,7 +14,7 @@ struct Family {
 
 impl Family {
     fn new(family: TagFamily) -> Self {
-        // SAFETY: they take nothing and return a family of their own, on the heap.
+        // SAFETY: these functions have no arguments and return a newly allocated family.
         let raw = unsafe {
             match family {
                 TagFamily::Tag36h11 => sys::tag36h11_create(),
@@ -36,7 +36,7 @@ impl Family {
 
 impl Drop for Family {
     fn drop(&mut self) {
-        // SAFETY: each destroys what its `*_create` made in `new`, once.
+        // SAFETY: each call destroys the family that its `*_create` made in `new`, exactly once.
         unsafe {
             match self.family {
                 TagFamily::Tag36h11 => sys::tag36h11_destroy(self.raw),
@@ -49,12 +49,12 @@ impl Drop for Family {
     }
 }
 
-/// Returns how many tags a family has.
+/// Returns the number of tags in a family.
 pub(crate) fn ids(family: TagFamily) -> u32 {
     Family::new(family).get().ncodes
 }
 
-/// Returns the cells of a tag; `None` if the family has no such id.
+/// Returns the cells of a tag; `None` if the family does not have this id.
 pub(crate) fn cells(family: TagFamily, id: u32) -> Option<Cells> {
     let family = Family::new(family);
     let get = family.get();
@@ -62,7 +62,7 @@ pub(crate) fn cells(family: TagFamily, id: u32) -> Option<Cells> {
         return None;
     }
     let (across, border) = (get.total_width as u32, get.width_at_border as u32);
-    // SAFETY: the family lives, and `id` is one of its codes, as the function asks.
+    // SAFETY: the family is alive, and `id` is less than `ncodes`, as the function requires.
     let image = unsafe { sys::apriltag_to_image(family.raw, id) };
     assert!(!image.is_null(), "out of memory");
     let mut white = Vec::with_capacity((across * across) as usize);
@@ -76,7 +76,7 @@ pub(crate) fn cells(family: TagFamily, id: u32) -> Option<Cells> {
             white.push(cell != 0);
         }
     }
-    // SAFETY: made by the library above, destroyed once.
+    // SAFETY: the library made the image above; it is destroyed once.
     unsafe { sys::image_u8_destroy(image) };
     Some(Cells::new(across, border, white))
 }

@@ -1,4 +1,4 @@
-//! What layout and camera files have in common: how they are refused, and poses in them.
+//! Errors of layout and camera files, and poses in these files.
 
 use std::fmt::Display;
 use std::ops::RangeInclusive;
@@ -8,65 +8,57 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::geometry::{Frame, Pose};
 
-/// Why a layout or camera file is refused.
+/// Why a layout or camera file is rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
     /// The file cannot be read or written.
     #[error("{path}: {error}")]
     Io {
-        /// Which file.
         path: String,
         /// The system's error.
         error: std::io::Error,
     },
-    /// Syntax, types, absent or unknown keys: all of them, with line and column.
+    /// Syntax errors, wrong types, missing and unknown keys: all of them, with line and column.
     #[error(transparent)]
     Toml(#[from] vizflyt_toml::TomlErrors),
     /// The value cannot be written as TOML.
     #[error(transparent)]
     Unwritable(#[from] toml::ser::Error),
-    /// A value that cannot work.
+    /// A value is out of range.
     #[error("{key} = {value}: {advice}")]
     Invalid {
-        /// Where in the file: `tags[1].size_m`.
+        /// Key in the file: `tags[1].size_m`.
         key: String,
-        /// The message.
         value: String,
-        /// What is wrong and what to do.
+        /// Problem and correction.
         advice: String,
     },
-    /// Another of these, in a file.
+    /// An error in a named file.
     #[error("{path}: {error}")]
-    In {
-        /// Which file.
-        path: String,
-        /// What is wrong in it.
-        error: Box<FileError>,
-    },
+    In { path: String, error: Box<FileError> },
 }
 
-/// A pose as files write it.
+/// A pose in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PoseConfig {
-    /// Origin. [m]
+    /// Origin [m].
     pub position_m: DVec3,
     /// Unit quaternion, Hamilton, xyzw.
     pub rotation_xyzw: DQuat,
 }
 
 impl PoseConfig {
-    /// Returns it as files write it.
     pub fn new<A: Frame, B: Frame>(a_from_b: Pose<A, B>) -> Self {
         Self { position_m: a_from_b.translation_m, rotation_xyzw: a_from_b.rotation }
     }
 
-    /// Returns the pose; it has been [checked](Self::check).
+    /// Returns the pose. [`check`](Self::check) must have accepted it.
     pub fn pose<A: Frame, B: Frame>(&self) -> Pose<A, B> {
         Pose::new(self.position_m, self.rotation_xyzw.normalize())
     }
 
-    /// Checks that it is one; `key` names a field.
+    /// Checks position and rotation. `key` returns the full key of a field.
     ///
     /// # Errors
     /// [`FileError::Invalid`].
@@ -106,7 +98,7 @@ pub(crate) fn check_number(
     Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
 }
 
-/// Reads a file; errors name it.
+/// Reads a file; errors contain its path.
 pub(crate) fn read<T>(
     path: &Path,
     parse: impl Fn(&str) -> Result<T, FileError>,
@@ -117,13 +109,12 @@ pub(crate) fn read<T>(
     parse(&text).map_err(|error| FileError::In { path: named(), error: Box::new(error) })
 }
 
-/// Writes a file.
 pub(crate) fn write(path: &Path, text: &str) -> Result<(), FileError> {
     std::fs::write(path, text)
         .map_err(|error| FileError::Io { path: path.display().to_string(), error })
 }
 
-/// Positions further out than this are typing errors. [m]
+/// Positions beyond this are typing errors. [m]
 const MAX_COORDINATE_M: f64 = 1000.0;
-/// Files written by hand round a quaternion to three digits.
+/// Files written by hand round quaternions to three digits.
 const QUATERNION_TOLERANCE: f64 = 2e-3;

@@ -1,6 +1,6 @@
 //! A grey image.
 
-/// A grey image, row by row from the top, without padding.
+/// A grey image, rows from top to bottom, without padding.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Gray {
     width_px: u32,
@@ -9,12 +9,12 @@ pub struct Gray {
 }
 
 impl Gray {
-    /// Makes an image of one grey.
+    /// Makes an image of a single grey level.
     pub fn plain(width_px: u32, height_px: u32, grey: u8) -> Self {
         Self { width_px, height_px, pixels: vec![grey; width_px as usize * height_px as usize] }
     }
 
-    /// Makes an image of H x W pixels; `None` if their number is another.
+    /// Makes an image from H x W pixels; `None` if `pixels` has another length.
     pub fn new(width_px: u32, height_px: u32, pixels: Vec<u8>) -> Option<Self> {
         let count = (width_px as usize).checked_mul(height_px as usize)?;
         (pixels.len() == count).then_some(Self { width_px, height_px, pixels })
@@ -35,7 +35,7 @@ impl Gray {
         &self.pixels
     }
 
-    /// Returns the pixels, H x W, to be changed.
+    /// Returns the pixels, H x W, mutably.
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         &mut self.pixels
     }
@@ -43,7 +43,7 @@ impl Gray {
     /// Returns a pixel.
     ///
     /// # Panics
-    /// If it is outside.
+    /// If the pixel is outside the image.
     pub fn at(&self, x: u32, y: u32) -> u8 {
         assert!(x < self.width_px && y < self.height_px);
         self.pixels[y as usize * self.width_px as usize + x as usize]

@@ -1,9 +1,8 @@
-//! Where tags are: on a mat or wall in the room, or on a cube on the vehicle.
+//! Positions of tags: on a mat or wall in the room, or on a cube on the vehicle.
 //!
-//! A tag's own frame has its origin in the tag's middle: x to the right and y up as a reader of the
-//! upright tag sees it, z out of the printed face towards that reader. Its four corners are listed
-//! as in [`CORNERS`]: lower left, lower right, upper right, upper left, which is also the order in
-//! which detection finds them, whichever way the tag is turned.
+//! The frame of a tag has its origin in the middle of the tag. Seen upright, x points right, y up, and z out of the
+//! printed face towards the reader. The four corners are in the order of [`CORNERS`]: lower left, lower right, upper
+//! right, upper left. Detection returns the same order for every rotation of the tag.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,7 +14,7 @@ use vizflyt_protocol::geometry::{Frame, Pose};
 use crate::family::TagFamily;
 use crate::file::{self, FileError, PoseConfig, check_number, invalid};
 
-/// A tag's own frame: x right, y up, z towards the reader; the origin is its middle.
+/// Frame of a tag: x right, y up, z towards the reader; the origin is its middle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Square {}
 
@@ -28,17 +27,17 @@ impl Frame for Square {
 pub const CORNERS: [DVec2; 4] =
     [DVec2::new(-0.5, -0.5), DVec2::new(0.5, -0.5), DVec2::new(0.5, 0.5), DVec2::new(-0.5, 0.5)];
 
-/// Which frame a layout's tags are in.
+/// Frame of a layout's tags.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LayoutFrame {
-    /// The room: a mat on the floor, tags on a wall.
+    /// The room: tags on a mat on the floor, or on a wall.
     World,
-    /// The vehicle: a cube on it.
+    /// The vehicle: tags on its cube.
     Body,
 }
 
-/// Where tags are.
+/// Tags with their poses.
 ///
 /// ```
 /// use glam::DVec3;
@@ -53,7 +52,7 @@ pub enum LayoutFrame {
 /// rotation_xyzw = [0.0, 0.0, 0.0, 1.0]
 /// "#;
 /// let mat = vizflyt_tags::layout::TagLayout::parse(text).unwrap();
-/// // It lies on the floor, its upper edge to the north, and is read from above.
+/// // The tag lies on the floor, with its upper edge to the north, and is read from above.
 /// let tag = mat.find(mat.tags[0].family, 7).unwrap();
 /// assert_eq!(tag.corners_m()[0], DVec3::new(0.92, 1.92, 0.0));
 /// assert_eq!(tag.normal(), DVec3::Z);
@@ -61,9 +60,9 @@ pub enum LayoutFrame {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TagLayout {
-    /// Which frame poses of tags are in.
+    /// Frame of the tags' poses.
     pub frame: LayoutFrame,
-    /// The tags; each family's ids once.
+    /// The tags. Each pair of family and id is unique.
     pub tags: Vec<Tag>,
 }
 
@@ -71,18 +70,17 @@ pub struct TagLayout {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tag {
-    /// Its family.
     #[serde(default)]
     pub family: TagFamily,
-    /// Its number in the family.
+    /// Number in the family.
     pub id: u32,
-    /// Edge of its black square (of the square whose corners are detected, where data lies outside
-    /// it, too). [m]
+    /// Edge of the black square. If the family has data outside its border: edge of the square whose corners are
+    /// detected. [m]
     pub size_m: f64,
-    /// Its middle. [m, the layout's frame]
+    /// Middle of the tag. [m, the layout's frame]
     pub position_m: DVec3,
-    /// Rotation that takes the axes of the tag (x right, y up, z towards the reader) to those of the
-    /// layout's frame; unit, Hamilton, xyzw.
+    /// Rotation from the tag's axes (x right, y up, z towards the reader) to those of the layout's frame; unit
+    /// quaternion, Hamilton, xyzw.
     pub rotation_xyzw: DQuat,
 }
 
@@ -98,36 +96,35 @@ impl Tag {
         Self { family, id, size_m, position_m, rotation_xyzw }
     }
 
-    /// Returns its pose; the caller names the frame, which is [`TagLayout::frame`].
+    /// Returns the pose of the tag. The caller chooses `F`, which must match [`TagLayout::frame`].
     pub fn frame_from_tag<F: Frame>(&self) -> Pose<F, Square> {
         Pose::new(self.position_m, self.rotation_xyzw)
     }
 
-    /// Returns its corners, in the order of [`CORNERS`]. [m, the layout's frame]
+    /// Returns the corners, in the order of [`CORNERS`]. [m, the layout's frame]
     pub fn corners_m(&self) -> [DVec3; 4] {
         CORNERS.map(|c| self.position_m + self.rotation_xyzw * (c * self.size_m).extend(0.0))
     }
 
-    /// Returns where its printed face points. [the layout's frame]
+    /// Returns the direction in which the printed face points. [the layout's frame]
     pub fn normal(&self) -> DVec3 {
         self.rotation_xyzw * DVec3::Z
     }
 }
 
 impl TagLayout {
-    /// More tags than this are a slip: a hall of 30 x 30 m at one a metre has 900.
+    /// Maximum number of tags. A hall of 30 x 30 m with one tag per metre has 900.
     pub const MAX_TAGS: usize = 4096;
 
-    /// Reads a layout from TOML; quaternions come out of unit length.
+    /// Parses a layout from TOML and normalizes the quaternions.
     ///
     /// # Errors
-    /// [`FileError::Toml`] for what is no layout, [`FileError::Invalid`] for a value that cannot
-    /// work.
+    /// [`FileError::Toml`] if the text does not match the format, [`FileError::Invalid`] for a value out of range.
     pub fn parse(text: &str) -> Result<Self, FileError> {
         let mut layout: Self = vizflyt_toml::parse(text)?;
         layout.validate()?;
         for tag in &mut layout.tags {
-            // Already unit ones stay as they are, bit for bit.
+            // Unit quaternions are not normalized again, so that they stay identical bit for bit.
             if (tag.rotation_xyzw.length_squared() - 1.0).abs() > 1e-12 {
                 tag.rotation_xyzw = tag.rotation_xyzw.normalize();
             }
@@ -138,15 +135,15 @@ impl TagLayout {
     /// Reads a layout file.
     ///
     /// # Errors
-    /// As [`Self::parse`], and [`FileError::Io`]; the file is named.
+    /// As [`Self::parse`], and [`FileError::Io`]; the error contains the path.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         file::read(path, Self::parse)
     }
 
-    /// Returns it as TOML.
+    /// Returns the layout as TOML.
     ///
     /// # Errors
-    /// [`FileError::Unwritable`], if a number is none.
+    /// [`FileError::Unwritable`], if a number is NaN.
     pub fn to_toml(&self) -> Result<String, FileError> {
         Ok(toml::to_string(self)?)
     }
@@ -154,7 +151,7 @@ impl TagLayout {
     /// Writes a layout file.
     ///
     /// # Errors
-    /// [`FileError::Io`]; the file is named.
+    /// [`FileError::Io`]; the error contains the path.
     pub fn write(&self, path: &Path) -> Result<(), FileError> {
         file::write(path, &self.to_toml()?)
     }
@@ -164,10 +161,10 @@ impl TagLayout {
         self.tags.iter().find(|tag| tag.family == family && tag.id == id)
     }
 
-    /// Checks every tag, and that none is there twice.
+    /// Checks all values and rejects duplicate tags.
     ///
     /// # Errors
-    /// [`FileError::Invalid`] for the first value that cannot work.
+    /// [`FileError::Invalid`] for the first value out of range.
     pub fn validate(&self) -> Result<(), FileError> {
         if !(1..=Self::MAX_TAGS).contains(&self.tags.len()) {
             let advice = format!("give 1 to {} [[tags]]", Self::MAX_TAGS);
@@ -194,7 +191,7 @@ impl TagLayout {
     }
 }
 
-/// From what a macro lens sees to a poster. [m]
+/// Accepted edges of tags: from macro lens to poster. [m]
 const SIZES_M: std::ops::RangeInclusive<f64> = 0.002..=5.0;
 
 #[cfg(test)]
@@ -215,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_work_is_refused_by_name() {
+    fn rejects_invalid_values_with_their_key() {
         check_refused("id = 3", "id = 35", &["tags[0].id = 35", "tag25h9 has ids 0 to 34"]);
         check_refused("0.1\n", "0.0\n", &["tags[0].size_m = 0", "0.002 to 5 m"]);
         check_refused("0.1\n", "nan\n", &["tags[0].size_m = NaN"]);
@@ -232,8 +229,8 @@ mod tests {
     }
 
     #[test]
-    fn a_tag_on_the_cubes_front_is_read_from_ahead() {
-        // z of the tag is the vehicle's x, its right is the vehicle's left as seen from ahead: y.
+    fn places_corners_of_a_tag_on_the_cubes_front() {
+        // z of the tag is the vehicle's x; x of the tag is the vehicle's y.
         let axes = glam::DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
         let body_from_tag: Pose<vizflyt_protocol::geometry::Body, Square> =
             Pose::new(DVec3::X * 0.1, DQuat::from_mat3(&axes));
@@ -247,7 +244,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_read_again(
+        fn layout_survives_a_round_trip_through_toml(
             ids in prop::collection::hash_set(0u32..587, 1..9),
             size_m in 0.01..1.0f64,
             p in prop::array::uniform3(-20.0..20.0f64),

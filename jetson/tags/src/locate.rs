@@ -1,18 +1,18 @@
-//! From images to the vehicle's pose. Sans-IO.
+//! Pose of the vehicle from camera images. Sans-IO.
 //!
-//! What enters: grey images with the instant of their exposure, as many cameras at once as have one. What
-//! leaves: the vehicle's pose at the newest of these instants with its covariance, or why there is none;
-//! and what was seen where, for the live view. Called once per set of images, 30 to 120 times a second.
+//! Input: grey images of one or more cameras, with the time of exposure. Output: the vehicle's pose at the newest of
+//! these times with its covariance, or the reason why there is none; and the detections of each camera, for the live
+//! view. Called once per set of images, 30 to 120 times per second.
 //!
-//! - [`config`]: the file that names cameras and layouts;
-//! - [`outcome`]: what comes of a set of images;
-//! - [`region`]: where tags should be in an image, by where the vehicle should be;
-//! - [`room`]: whether tags of the room are where a camera in the room had them;
-//! - [`track`]: how the vehicle moves, and both answers where corners leave two open;
-//! - [`monitor`]: what is wrong with clocks, cameras' places and tags' sizes, and what that leaves open of the pose.
+//! - [`config`]: file that lists cameras and layouts
+//! - [`outcome`]: result of a set of images
+//! - [`region`]: expected region of tags in an image, from the predicted pose of the vehicle
+//! - [`room`]: checks whether a camera in the room still sees the room's tags at their expected positions
+//! - [`track`]: motion of the vehicle, and both solutions if the corners are ambiguous
+//! - [`monitor`]: estimates errors of clocks, camera poses and tag sizes, and their effect on the pose
 //!
-//! Cameras that were not exposed together are carried to one instant by the vehicle's motion: webcams
-//! run free, and at 2 m/s half an image's interval is 3 cm.
+//! Images of different exposure times are combined with the vehicle's motion. Webcams run unsynchronized, and at 2 m/s
+//! half an image interval is 3 cm.
 
 mod config;
 mod monitor;
@@ -42,23 +42,22 @@ use monitor::{Linear, Monitor};
 use region::{Expected, project_tag, sees};
 use track::Track;
 
-/// What locating needs to know beside tags and cameras; the defaults serve.
+/// Settings of a locator, apart from tags and cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocateSettings {
-    /// How tags are looked for.
     pub detector: DetectorSettings,
-    /// How far a corner may be off, one standard deviation. [px]
+    /// Standard deviation of a detected corner. [px]
     pub corner_sigma_px: f64,
-    /// Poses that leave corners further off than this are refused: a layout, a lens or a camera's place is
-    /// wrong. Root mean square. [px]
+    /// Maximum root mean square reprojection error. Poses above it are rejected, because a layout, a lens or a camera's
+    /// pose is wrong. [px]
     pub most_rms_px: f64,
     /// The maximum tilt of the vehicle: rejects inverted poses. [rad]
     pub most_tilt_rad: f64,
-    /// Uncertainty of print, survey and lens, independent of the corners; added to the covariance. [m]
+    /// Position uncertainty from print, survey and lens, independent of the corners; added to the covariance. [m]
     pub floor_m: f64,
-    /// Likewise. [rad]
+    /// Rotation uncertainty from print, survey and lens. [rad]
     pub floor_rad: f64,
-    /// Images of other cameras are used up to this long after their exposure. [s]
+    /// Maximum age difference between combined images. [s]
     pub most_lag_s: f64,
 }
 
@@ -80,29 +79,29 @@ impl Default for LocateSettings {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LocateError {
     /// No camera, or no layout.
-    #[error("{0} cameras and {1} layouts: give one of each at least")]
+    #[error("{0} cameras and {1} layouts: give at least one of each")]
     Nothing(usize, usize),
-    /// A camera whose place is not known.
+    /// A camera without a pose.
     #[error(
-        "camera {0:?} has neither world_from_cam nor body_from_cam; `vizflyt tags survey` finds it"
+        "camera {0:?} has neither world_from_cam nor body_from_cam; `vizflyt tags survey` determines it"
     )]
     Unmounted(String),
     /// A tag that is in two layouts.
     #[error("tag {1} of {0} is in two layouts; print each once")]
     Twice(TagFamily, u32),
-    /// Tags that no camera can use.
+    /// No camera can use the tags of the layouts.
     #[error("{0}")]
     Useless(&'static str),
 }
 
-/// An image and when it was exposed.
+/// An image with its time of exposure.
 #[derive(Clone, Copy, Debug)]
 pub struct StampedImage<'a> {
     /// Index of the camera.
     pub camera: usize,
     /// Middle of the exposure.
     pub stamp: HostTime,
-    /// What it saw, in the size of the camera's intrinsics.
+    /// The image, in the size of the camera's intrinsics.
     pub image: &'a Gray,
 }
 
@@ -113,23 +112,23 @@ pub struct Locator {
     detector: Detector,
     track: Track,
     monitor: Monitor,
-    /// Middle of the tags that cameras look at: what they grow about. [m, body or world]
+    /// Mean position of the tags that cameras look at: the centre of their scale. [m, body or world]
     middle_m: DVec3,
     settings: LocateSettings,
 }
 
 struct CameraState {
     camera: TagCamera,
-    /// What it saw in its last images, the newest last, by the stamps that came with them.
+    /// Detections of the latest images, the newest last, with the original stamps.
     kept: VecDeque<(HostTime, Vec<Detection>)>,
-    /// Images since it last saw a tag.
+    /// Number of images since the last detected tag.
     misses: u32,
-    /// When it was last looked whether tags of the room are where they were.
+    /// Time of the last check of the room's tags.
     room_seen: Option<HostTime>,
 }
 
 impl Locator {
-    /// Makes a locator of these cameras, whose indices views have, and tags.
+    /// Makes a locator. Views refer to `cameras` by index.
     ///
     /// # Errors
     /// See [`LocateError`].
@@ -188,7 +187,7 @@ impl Locator {
                     (sigma_m, sigma_m / ARM_M)
                 }
             };
-        // Tags of the room alone are the room's only measure: nothing is larger or smaller than they say.
+        // If only tags in the room are used, they define the scale, so their size cannot be estimated.
         let is_measure = !(fixed && on_vehicle);
         let places = stations.iter().map(place_sigma).collect::<Vec<_>>();
         let monitor = Monitor::new(&places, is_measure);
@@ -196,7 +195,7 @@ impl Locator {
         Ok(Self { stations, tags, detector, track, monitor, middle_m, settings })
     }
 
-    /// Returns what is found to be wrong with the lab.
+    /// Returns errors found in the lab's setup.
     pub fn findings(&self) -> Vec<Finding> {
         let places: Vec<DAffine3> = self
             .stations
@@ -212,15 +211,16 @@ impl Locator {
         self.monitor.findings(&places)
     }
 
-    /// Returns the cameras, in the order of their indices.
+    /// Returns the cameras in the order of their indices.
     pub fn cameras(&self) -> impl ExactSizeIterator<Item = &TagCamera> {
         self.stations.iter().map(|station| &station.camera)
     }
 
-    /// Takes images of one or more cameras, at most one of each, exposed at nearly the same time.
+    /// Processes images of one or more cameras, at most one per camera, exposed at nearly the same time.
     ///
     /// # Panics
-    /// If there is no view, a camera has no such index, or an image is not of the camera's size.
+    /// If `views` is empty, a camera index is out of range, or an image does not have the size of the camera's
+    /// intrinsics.
     pub fn handle_images(&mut self, views: &[StampedImage]) -> LocateOutcome {
         let exposed = views.iter().map(|view| self.exposed(view.camera, view.stamp));
         let stamp = exposed.max().expect("there is a view");
@@ -231,7 +231,7 @@ impl Locator {
             self.look_at_room(view);
             looks.push(self.look(view, expected.as_ref()));
             if expected.is_none() && looks.iter().any(|look: &CameraResult| !look.seen.is_empty()) {
-                // Found by one camera, it is looked for in the right place by the others.
+                // After one camera has found the vehicle, the others look in the expected region.
                 let (sightings, _) = self.sightings(stamp);
                 let motion = self.track.motion(stamp).unwrap_or_default();
                 if let Some(solved) = solve::solve(&sightings, &motion, None)
@@ -266,16 +266,16 @@ impl Locator {
                 self.tags.values().filter(|(frame, _)| sees(&station.camera.mounting, *frame));
             region::expect(&station.camera, tags.map(|(_, tag)| tag), pose, *uncertainty_m)
         });
-        // Where it is not found, the whole image is searched, but seldom: something is in the way. Not while
-        // another camera sees the vehicle: then the place is right, and a search of this image (140 ms at
-        // every pixel) would only hold up the other's.
+        // If no tag is found, the whole image is searched, but rarely: the view may be blocked. No search if another
+        // camera sees the vehicle: then the region is right, and a search of this image (140 ms at full resolution)
+        // would only delay the other camera.
         let search = match expected {
             Expected::Unknown => true,
             Expected::OutOfView => false,
             Expected::Within(_) => !is_seen_elsewhere && station.misses % 7 == 2,
         };
         let (region, found) = if search {
-            // Every other search is a fine one: it finds tags half as large, in four times the time.
+            // Every second search is at full resolution: it finds tags of half the size, in four times the time.
             let fine = station.misses % 2 == 1;
             (None, self.detector.search(view.image, &k, fine))
         } else if let Expected::Within(region) = expected {
@@ -306,7 +306,7 @@ impl Locator {
         CameraResult { camera, stamp, region, out_of_view, seen, strangers }
     }
 
-    /// Whether a camera other than this view's saw the vehicle in its newest image, not long ago.
+    /// Returns whether another camera saw the vehicle recently, in its newest image.
     fn is_seen_elsewhere(&self, view: &StampedImage) -> bool {
         self.stations.iter().enumerate().any(|(index, station)| {
             let newest = station.kept.back().filter(|_| index != view.camera);
@@ -316,19 +316,20 @@ impl Locator {
         })
     }
 
-    /// Returns when an image was exposed that bears a stamp.
+    /// Returns the exposure time of an image with this stamp.
     fn exposed(&self, camera: usize, stamp: HostTime) -> HostTime {
         stamp.plus_seconds(-self.monitor.correction(camera).late_s)
     }
 
-    /// Returns what all cameras saw around an instant, and which camera each.
+    /// Returns the detections of all cameras around an instant, and the camera of each.
     fn sightings(&self, stamp: HostTime) -> (Vec<Sighting<'_>>, Vec<usize>) {
         let (mut all, mut cameras) = (Vec::new(), Vec::new());
         let scale = self.monitor.scale();
         for (index, station) in self.stations.iter().enumerate() {
             let wrong = self.monitor.correction(index);
             let lag_s = |at: HostTime| stamp.seconds_since(self.exposed(index, at));
-            // The newest image up to the instant, and the first one after it: motion in between cancels out.
+            // The newest image up to the instant and the first one after it: errors of the motion in between cancel
+            // out.
             let before = station.kept.iter().rfind(|(at, _)| lag_s(*at) >= 0.0);
             let after = station.kept.iter().find(|(at, _)| lag_s(*at) < 0.0);
             let near = before.into_iter().chain(after).map(|(at, tags)| (lag_s(*at), tags));
@@ -351,8 +352,8 @@ impl Locator {
                     },
                     Mounting::Unknown => continue,
                 };
-                // What the motion in between may be off moves all corners together: as much is learnt from
-                // them all as from one.
+                // An error of the motion shifts all corners together: all corners give as much information as one,
+                // hence the factor sqrt(corners).
                 let edge_px = tag.corners_px[0].distance(tag.corners_px[2]) / 2f64.sqrt();
                 let px_per_m = edge_px / placed.size_m;
                 let corners = (4 * tags.len()) as f64;
@@ -375,9 +376,9 @@ impl Locator {
         (all, cameras)
     }
 
-    /// Returns how far apart in time images are used together. [s]
+    /// Returns the maximum time difference between combined images. [s]
     fn most_lag_s(&self, stamp: HostTime) -> f64 {
-        // What moves in an unknown way is where it was for one exposure only.
+        // With unknown motion, only images of the same exposure can be combined.
         if self.track.motion(stamp).is_some() { self.settings.most_lag_s } else { TOGETHER_S }
     }
 
@@ -396,7 +397,7 @@ impl Locator {
         let most_off = sightings.len() / 3;
         let mut off = 0;
         let mut solved = solve::solve(&sightings, &motion, expected.as_ref());
-        // Corners that fit no pose tell why.
+        // Corners that fit no pose still show what is wrong.
         let learnt = solved.as_ref().filter(|solved| solved.other.is_none());
         let learnt = learnt.and_then(|solved| linear(&sightings, &cameras, solved));
         let solved = loop {
@@ -404,7 +405,7 @@ impl Locator {
             if found.best.rms_px <= self.settings.most_rms_px {
                 break Ok(*found);
             }
-            // A few tags that do not fit the others are misread, or have moved: without them.
+            // A few tags that do not fit are misread or have been moved: continue without them.
             let pose = &found.best.world_from_body;
             let worst = sightings
                 .iter()
@@ -434,7 +435,7 @@ impl Locator {
             self.monitor.judge(stamp);
         }
         if is_old {
-            // Of a camera whose images come late: between two of another's they tell the motion well.
+            // Late images of one camera lie between two images of another and improve the motion estimate.
             if let Ok(Solved { best, other: None }) = solved {
                 self.track.insert(stamp, &best);
             }
@@ -465,7 +466,7 @@ impl Locator {
         })
     }
 
-    /// Fills in where the pose puts the corners.
+    /// Sets the expected corners of the detections from the pose.
     fn expect(&self, look: &mut CameraResult, located: &Located) {
         let camera = &self.stations[look.camera].camera;
         let lag_s = located.stamp.seconds_since(self.exposed(look.camera, look.stamp));
@@ -479,28 +480,28 @@ impl Locator {
     }
 }
 
-/// Three images of a slow webcam: what one of them saw then is still a reason to trust the track. [s]
+/// Maximum age of another camera's detection that makes the track trustworthy: three images of a slow webcam. [s]
 const SEEN_LATELY_S: f64 = 0.2;
-/// Exposures closer than this are one. [s]
+/// Exposures closer than this are treated as simultaneous. [s]
 const TOGETHER_S: f64 = 0.001;
-/// How far a camera may be off whose file has no survey, along an axis. [m]
+/// Position sigma per axis of a camera in the room without a survey. [m]
 const UNSURVEYED_M: f64 = 0.001;
-/// And one under a vehicle: 1.5 mm where a ruler has placed it, and more, for it is off in the same way all along, and who
-/// filters these poses takes that for noise, which averages out. [m]
+/// Position sigma per axis of a camera on the vehicle without a survey. A ruler places it within 1.5 mm. The value is
+/// larger because this error is constant, and filters of these poses treat it as noise, which averages out. [m]
 const CARRIED_M: f64 = 0.0019;
-/// Likewise, of 1.5 mrad where the mat's own level has turned it. [rad]
+/// Rotation sigma of a camera on the vehicle without a survey. The mat's own level aligns it within 1.5 mrad. [rad]
 const CARRIED_RAD: f64 = 0.0019;
-/// What turns a camera in the room turns it about something so far away. [m]
+/// Lever arm that converts a position sigma of a camera into a rotation sigma. [m]
 const ARM_M: f64 = 3.0;
-/// Errors that all its corners share are not in a survey's sigma: so many of it.
+/// Factor on a survey's sigma, for errors that all its corners share.
 const SURVEY_SIGMAS: f64 = 1.0;
-/// Nor do stands hold better than this. [m]
+/// Minimum sigma of a survey: camera stands are not more stable. [m]
 const LEAST_SURVEY_M: f64 = 0.0002;
-/// Images of a camera that are kept: others' that come late lie between two of them.
+/// Number of images kept per camera. Late images of other cameras lie between two of them.
 const MAX_KEPT: usize = 4;
-/// What the vehicle's estimated velocity may be off. [m/s]
+/// Uncertainty of the vehicle's estimated velocity. [m/s]
 const SPEED_UNCERTAINTY_MPS: f64 = 0.02;
-/// And its acceleration. [m/s^2]
+/// Uncertainty of the vehicle's estimated acceleration. [m/s^2]
 const ACCELERATION_UNCERTAINTY_MPS2: f64 = 2.0;
 
 #[cfg(test)]

@@ -1,14 +1,14 @@
-//! Tags on paper: cubes with fold marks, mats over several sheets, as a PDF and a layout; and checkerboards.
+//! Printable tags as PDF and layout: cubes with fold marks, and mats over several sheets. Also checkerboards.
 //!
 //! ```text
 //! Cube, Mat or Floor -> sheets of shapes in millimetres -> PDF
-//!             -> TagLayout, as if everything were glued without a fault; a survey measures the rest
+//!                    -> TagLayout of a perfect assembly; a survey measures the real one
 //! ```
 //!
-//! Printers scale. Every sheet carries a bar of [`BAR_MM`] to be measured with a ruler; what it
-//! measures goes into `bar_mm`, and every size of the layout follows.
+//! Printers may scale. Each sheet has a scale bar of [`BAR_MM`]. Its length as measured with a ruler is the setting
+//! `bar_mm`, which scales all sizes in the layout.
 
-// Why: paper is sold, cut and measured in millimetres; lengths of sheets and shapes end in `_mm`.
+// Why: paper is sold, cut and measured in millimetres, so lengths of sheets and shapes end in `_mm`.
 
 mod checkerboard;
 mod cube;
@@ -29,75 +29,72 @@ use glam::DVec3;
 use crate::family::TagFamily;
 use crate::layout::TagLayout;
 
-/// What is printed, and where its tags then are.
+/// Printable sheets, and the layout of their tags.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Printed {
-    /// The sheets.
     pub sheets: Vec<Sheet>,
-    /// The tags, measured as printed.
+    /// Tags in their printed size.
     pub layout: TagLayout,
 }
 
-/// Length that the scale bar has when the printer does not scale. [mm]
+/// Nominal length of the scale bar. [mm]
 pub const BAR_MM: f64 = 100.0;
 
-/// Why something cannot be printed.
+/// Why an object cannot be printed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PrintError {
-    /// It does not fit on the paper.
+    /// The object does not fit on the paper.
     #[error(
         "{what} of {size_mm:.0} mm does not fit on {paper}, which has room for {room_mm:.0} mm; take larger paper, or \
          make it smaller"
     )]
     TooLarge {
-        /// A face, a tag with its gap.
+        /// Object: a face, or a tag with its gap.
         what: &'static str,
-        /// How large. [mm]
+        /// Size of the object. [mm]
         size_mm: f64,
-        /// Which paper.
         paper: Paper,
-        /// What fits. [mm]
+        /// Available size. [mm]
         room_mm: f64,
     },
-    /// The tag does not leave itself a white rim.
+    /// The tag has no space for its white rim.
     #[error(
         "a tag of {size_mm:.1} mm needs {needed_mm:.1} mm with its white rim, but {what} has {room_mm:.1} mm"
     )]
     NoRim {
-        /// A face, the distance from tag to tag.
+        /// Limiting object: a face, or the distance between tags.
         what: &'static str,
         /// Edge of the black square. [mm]
         size_mm: f64,
-        /// With the rim. [mm]
+        /// Size with the rim. [mm]
         needed_mm: f64,
-        /// What there is. [mm]
+        /// Available size. [mm]
         room_mm: f64,
     },
-    /// The family has not enough tags.
+    /// The family has too few tags.
     #[error("{family} has ids 0 to {last}; {count} tags from id {first} on are too many")]
     Ids {
-        /// Which family.
         family: TagFamily,
-        /// Its last id.
+        /// Last id of the family.
         last: u32,
-        /// The first asked for.
+        /// First requested id.
         first: u32,
-        /// How many.
+        /// Number of requested tags.
         count: u64,
     },
-    /// A number that makes no sense.
+    /// A number out of range.
     #[error("{name} = {value}: {advice}")]
     Invalid {
-        /// The name.
+        /// Name of the setting.
         name: &'static str,
-        /// What it is.
+        /// Value of the setting.
         value: f64,
-        /// What to give.
+        /// Correction.
         advice: &'static str,
     },
 }
 
-/// Checks that a family has these ids.
+/// Checks that a family contains these ids.
 fn check_ids(family: TagFamily, first: u32, count: u64) -> Result<(), PrintError> {
     let ids = family.ids();
     if u64::from(first) + count > u64::from(ids) || count > TagLayout::MAX_TAGS as u64 {
@@ -106,7 +103,7 @@ fn check_ids(family: TagFamily, first: u32, count: u64) -> Result<(), PrintError
     Ok(())
 }
 
-/// Checks that a tag and its white rim fit into this much.
+/// Checks that a tag with its white rim fits into `room_mm`.
 fn check_rim(
     family: TagFamily,
     what: &'static str,
@@ -121,9 +118,9 @@ fn check_rim(
     Ok(())
 }
 
-/// Returns the scale of all lengths from a measured bar.
+/// Returns the scale of all lengths from the measured scale bar.
 fn scale(bar_mm: f64) -> Result<f64, PrintError> {
-    // Beyond 10 % the wrong thing was measured.
+    // A deviation of more than 10 % is a measurement of another length.
     if !(90.0..=110.0).contains(&bar_mm) {
         let advice = "measure the scale bar from its first mark to its last, in mm: 90 to 110";
         return Err(PrintError::Invalid { name: "bar_mm", value: bar_mm, advice });
@@ -131,7 +128,7 @@ fn scale(bar_mm: f64) -> Result<f64, PrintError> {
     Ok(bar_mm / BAR_MM)
 }
 
-/// Checks that a mat lies in a room. [m, world]
+/// Checks that the middle of a mat is within a room. [m, world]
 fn check_middle(middle_m: DVec3) -> Result<(), PrintError> {
     if !(middle_m.is_finite() && middle_m.abs().max_element() <= 900.0) {
         let (name, value) = ("middle_m", middle_m.length());

@@ -1,10 +1,8 @@
-//! Simulated webcams: where the vehicle truly is goes in, images with the instant of their exposure come
-//! out. Sans-IO.
+//! Simulated webcams: true poses of the vehicle in, images with the time of exposure out. Sans-IO.
 //!
-//! [`Truth`] keeps the vehicle's true poses of the last second, as they arrive; [`SimulatedCamera`] renders an
-//! image once the truth reaches past the end of its exposure. Cameras run free, each with its own phase,
-//! as webcams do. The lab's two setups are here: webcams in the room and a [`cube`] on the vehicle, and [`over_mat`] a
-//! webcam under the vehicle.
+//! [`Truth`] keeps the true poses of the last second. [`SimulatedCamera`] renders an image when the truth covers its
+//! whole exposure. Cameras run unsynchronized, each with its own phase, as webcams do. This module contains the lab's
+//! two setups: webcams in the room with a [`cube`] on the vehicle, and in [`over_mat`] a webcam under the vehicle.
 
 pub mod over_mat;
 
@@ -20,15 +18,15 @@ use crate::image::Gray;
 use crate::layout::{LayoutFrame, Tag, TagLayout};
 use crate::synth::{Light, Placed, Renderer, SyntheticExposure};
 
-/// The vehicle's true poses, of the last second.
+/// True poses of the vehicle in the last second.
 #[derive(Clone, Debug, Default)]
 pub struct Truth {
     past: VecDeque<(HostTime, Pose<World, Body>)>,
 }
 
 impl Truth {
-    /// Takes a pose; one that is not newer than the last is dropped, unless it is so much older that a
-    /// clock was set: then all before is forgotten.
+    /// Adds a pose. A pose that is not newer than the last is dropped. If it is older by more than the kept span, the
+    /// clock was set back, and all earlier poses are removed.
     pub fn push(&mut self, stamp: HostTime, world_from_body: Pose<World, Body>) {
         if let Some(&(newest, _)) = self.past.back()
             && stamp <= newest
@@ -44,12 +42,12 @@ impl Truth {
         }
     }
 
-    /// Returns when the newest pose was true.
+    /// Returns the stamp of the newest pose.
     pub fn newest(&self) -> Option<HostTime> {
         self.past.back().map(|(stamp, _)| *stamp)
     }
 
-    /// Returns the pose at an instant; `None` before the first and after the last that is known.
+    /// Returns the interpolated pose at an instant; `None` outside the known span.
     pub fn at(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
         let after = self.past.partition_point(|(at, _)| *at < stamp);
         let (end, last) = self.past.get(after)?;
@@ -62,24 +60,24 @@ impl Truth {
     }
 }
 
-/// How a simulated camera takes images.
+/// Imaging parameters of a simulated camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sensor {
-    /// Images a second. [Hz]
+    /// Frame rate. [Hz]
     pub rate_hz: f64,
-    /// When the first is exposed after a whole second, of the interval between images.
+    /// Offset of the first exposure after a whole second, as a share of the interval between images.
     pub phase: f64,
-    /// How long the shutter is open. [s]
+    /// Exposure time. [s]
     pub exposure_s: f64,
-    /// Standard deviation of the optics' blur. [px]
+    /// Standard deviation of the optical blur. [px]
     pub blur_px: f64,
-    /// The distance at which the lens is focused. [m]
+    /// Focus distance of the lens. [m]
     pub focus_m: f64,
-    /// How wide its opening is: what is elsewhere than in focus is blurred by it; 0 is a pinhole. [m]
+    /// Aperture of the lens, which blurs objects outside the focus distance; 0 is a pinhole. [m]
     pub aperture_m: f64,
-    /// Standard deviation of the sensor's noise. [grey levels of 255]
+    /// Standard deviation of the sensor noise. [grey levels of 255]
     pub noise: f64,
-    /// How bright things appear.
+    /// Lighting of the scene.
     pub light: Light,
 }
 
@@ -98,24 +96,24 @@ impl Default for Sensor {
     }
 }
 
-/// A camera that sees tags where the true pose puts them.
+/// A camera that renders tags at their true poses.
 #[derive(Debug)]
 pub struct SimulatedCamera {
     camera: TagCamera,
     renderer: Renderer,
     sensor: Sensor,
-    /// Counts the intervals since the clock's zero.
+    /// Index of the next image since the clock's zero.
     next: Option<u64>,
     behind: Option<Background>,
 }
 
-/// Renders what is behind the tags for a camera that stands somewhere, an image of its own size.
+/// Renders the background behind the tags for a camera pose, in the size of the camera's image.
 pub struct Background(Box<RenderBackground>);
 
 type RenderBackground = dyn FnMut(&Pose<World, Cam>) -> Gray + Send;
 
 impl Background {
-    /// Renders by calling this.
+    /// Makes a background from a render function.
     pub fn new(render: impl FnMut(&Pose<World, Cam>) -> Gray + Send + 'static) -> Self {
         Self(Box::new(render))
     }
@@ -128,19 +126,17 @@ impl std::fmt::Debug for Background {
 }
 
 impl SimulatedCamera {
-    /// Makes a camera.
     pub fn new(camera: TagCamera, sensor: Sensor) -> Self {
         let renderer = Renderer::new(camera.intrinsics);
         Self { camera, renderer, sensor, next: None, behind: None }
     }
 
-    /// Makes a camera that sees a place behind the tags instead of a cluttered wall.
+    /// Makes a camera with a rendered background instead of a cluttered wall.
     #[must_use]
     pub fn before(camera: TagCamera, sensor: Sensor, behind: Background) -> Self {
         Self { behind: Some(behind), ..Self::new(camera, sensor) }
     }
 
-    /// Returns the camera.
     pub fn camera(&self) -> &TagCamera {
         &self.camera
     }
@@ -154,13 +150,13 @@ impl SimulatedCamera {
         };
         let first = truth.past.front().map(|(stamp, _)| *stamp)?;
         let half_s = 0.5 * self.sensor.exposure_s;
-        // What was missed is not made up for.
+        // Missed images are not rendered later.
         let earliest = (first.plus_seconds(half_s).as_ns() as f64 * 1e-9 / interval_s
             - self.sensor.phase)
             .ceil()
             .max(0.0) as u64;
         let next = self.next.map_or(earliest, |next| {
-            // After a clock was set, from there.
+            // If the clock was set back, restart from the earliest exposure.
             let latest = (newest.as_ns() as f64 * 1e-9 / interval_s).ceil() as u64 + 1;
             if next > latest { earliest } else { next.max(earliest) }
         });
@@ -169,8 +165,8 @@ impl SimulatedCamera {
         (stamp.plus_seconds(half_s) <= newest).then_some(stamp)
     }
 
-    /// Renders the image that is [due](Self::due); `None` if none is. `latest` leaves out all but the newest
-    /// of several that are.
+    /// Renders the image that is [due](Self::due); `None` if none is. With `latest`, only the newest of several due
+    /// images is rendered.
     pub fn expose(
         &mut self,
         truth: &Truth,
@@ -215,7 +211,7 @@ impl SimulatedCamera {
         Some((stamp, image))
     }
 
-    /// Returns the blur of a lens that is focused elsewhere, one standard deviation, at the tag that is nearest. [px]
+    /// Returns the standard deviation of the defocus blur at the nearest visible tag. [px]
     fn defocus_px(&self, placed: &[Placed], world_from_cam: &Pose<World, Cam>) -> f64 {
         let Sensor { focus_m, aperture_m, .. } = self.sensor;
         let k = &self.camera.intrinsics;
@@ -230,15 +226,15 @@ impl SimulatedCamera {
         if !nearest_m.is_finite() {
             return 0.0;
         }
-        // A disc has a deviation of a quarter of its diameter along an axis.
+        // The standard deviation of a disc along an axis is a quarter of its diameter.
         let disc = aperture_m * (nearest_m.recip() - focus_m.recip()).abs();
         0.25 * k.fx_px * disc
     }
 }
 
-/// Returns the cube of the simulated lab: 0.25 m, a tag of 0.2 m on each side and on top, as
-/// `vizflyt tags print cube --paper a3 --face-mm 250 --tag-mm 200` prints it; it stands on the vehicle's back.
-/// In a hall of 11 m smaller tags are too few pixels at its other end.
+/// Returns the cube of the simulated lab: 0.25 m, a tag of 0.2 m on each side and on top, as printed by `vizflyt tags
+/// print cube --paper a3 --face-mm 250 --tag-mm 200`. It is mounted on the vehicle's back. Smaller tags have too few
+/// pixels at the far end of a hall of 11 m.
 ///
 /// Ids 0 to 4: nose, left, tail, right, top.
 pub fn cube() -> TagLayout {
@@ -258,9 +254,9 @@ pub fn cube() -> TagLayout {
     TagLayout { frame: LayoutFrame::Body, tags: tags.collect() }
 }
 
-/// Returns one to four webcams of the simulated lab, the netted hall of 11 x 4.5 x 3.65 m (x from 0 to 11,
-/// y from -2.25 to 2.25): 1280 x 720, 62 degrees across, distorted as webcams are. The first two hang at
-/// the hall's ends in opposite corners, behind the net and under its ceiling.
+/// Returns one to four webcams of the simulated lab, the netted hall of 11 x 4.5 x 3.65 m (x from 0 to 11, y from -2.25
+/// to 2.25). They have 1280 x 720 pixels, a horizontal field of view of 62 degrees, and the distortion of a webcam. The
+/// first two are at the hall's ends in opposite corners, behind the net and under its ceiling.
 pub fn webcams(count: usize) -> Vec<TagCamera> {
     let places = [
         ("west", DVec3::new(-0.4, 2.0, 3.3), DVec3::new(5.5, -0.3, 1.0)),
@@ -269,7 +265,7 @@ pub fn webcams(count: usize) -> Vec<TagCamera> {
         ("northeast", DVec3::new(11.4, 2.0, 3.3), DVec3::new(5.5, -0.3, 1.0)),
     ];
     let made = places.into_iter().take(count).enumerate().map(|(i, (name, from, at))| {
-        // No two lenses are alike.
+        // Each lens differs slightly.
         let off = i as f64;
         let k = Intrinsics::from_horizontal_fov(1280, 720, 62f64.to_radians());
         let distortion = Distortion::BrownConrady {
@@ -297,20 +293,20 @@ pub fn webcams(count: usize) -> Vec<TagCamera> {
     made.collect()
 }
 
-/// Returns a camera at a point that looks at another, its right side level.
+/// Returns a camera at `from_m` that looks at `at_m`, with its x axis level.
 fn looking(from_m: DVec3, at_m: DVec3) -> Pose<World, Cam> {
     let z = (at_m - from_m).normalize();
     let x = z.cross(DVec3::Z).normalize();
     Pose::new(from_m, DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)))
 }
 
-/// How long true poses are kept. [s]
+/// Time span of kept true poses. [s]
 const TRUTH_SPAN_S: f64 = 1.0;
 /// Edge of the cube. [m]
 const CUBE_M: f64 = 0.25;
-/// Edge of its black squares: ten cells of 25 mm make a face, eight of them the square. [m]
+/// Edge of the black squares: a face has ten cells of 25 mm, the square eight. [m]
 const CUBE_TAG_M: f64 = 0.2;
-/// Its middle above the vehicle's. [m]
+/// Height of the cube's middle above the vehicle's origin. [m]
 const CUBE_HEIGHT_M: f64 = 0.165;
 
 #[cfg(test)]
@@ -322,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn truth_is_interpolated_and_forgotten() {
+    fn interpolates_true_poses_and_drops_old_ones() {
         let mut truth = Truth::default();
         let at = |ms: u64| HostTime::from_ns(ms * 1_000_000);
         assert!(truth.at(at(5)).is_none());
@@ -334,13 +330,13 @@ mod tests {
         assert!(truth.at(at(9_999)).is_none() && truth.at(at(10_021)).is_none());
         truth.push(at(11_015), pose(0.0));
         assert!(truth.at(at(10_012)).is_none(), "older than a second");
-        // A clock that was set back by an hour.
+        // The clock was set back by an hour.
         truth.push(at(1_000), pose(1.0));
         assert_eq!(truth.newest(), Some(at(1_000)));
     }
 
     #[test]
-    fn cameras_run_free_and_never_catch_up() {
+    fn cameras_keep_their_phase_and_skip_missed_images() {
         let camera = TagCamera {
             intrinsics: Intrinsics::from_horizontal_fov(64, 48, 1.0),
             ..webcams(1).remove(0)
@@ -367,11 +363,11 @@ mod tests {
     }
 
     #[test]
-    fn the_lab_s_tags_are_upright_and_its_layouts_valid() {
+    fn tags_of_the_cube_are_upright_and_valid() {
         cube().validate().unwrap();
         for tag in &cube().tags[..4] {
             assert!((tag.rotation_xyzw * DVec3::Y - DVec3::Z).length() < 1e-12);
-            // Outwards.
+            // The tag faces outwards.
             assert!(tag.normal().dot(tag.position_m) > 0.09);
         }
     }

@@ -1,10 +1,9 @@
-//! Where tags and cameras really are.
+//! Survey: measured poses of tags and cameras.
 //!
-//! Glued sheets are off by millimetres, cameras are screwed on somewhere. From images of one calibrated
-//! camera carried over a mat, [`mat`] finds where each tag lies: the scale is that of the printed tags,
-//! the `world` frame that of the layout they were printed by. From images of fixed cameras,
-//! [`cameras`] finds where each camera is: by the surveyed mat, or by a cube that is carried where
-//! several see it.
+//! Glued sheets deviate by millimetres, and cameras are mounted by eye. [`mat`] estimates the pose of each tag from
+//! images of one calibrated camera that is carried over the mat. The scale is that of the printed tags; the `world`
+//! frame is that of the printed layout. [`cameras`] estimates the poses of fixed cameras from their images, by the
+//! surveyed mat or by a cube that is carried through the view of several cameras.
 
 mod cameras;
 mod mat;
@@ -21,62 +20,56 @@ use crate::family::TagFamily;
 use crate::layout::Square;
 use crate::solve::{Geometry, Sighting, Solved, VehicleTwist, solve};
 
-/// Why nothing was surveyed.
+/// Why a survey failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SurveyError {
-    /// Not enough was seen.
+    /// Too few images or tags.
     #[error("{found} usable {what}, and {needed} are needed; {advice}")]
     TooFew {
-        /// Images, tags.
+        /// Counted items: images, tags.
         what: &'static str,
-        /// How many there are.
         found: usize,
-        /// How many there must be.
         needed: usize,
-        /// What to do.
+        /// Correction.
         advice: &'static str,
     },
-    /// What was seen contradicts itself.
-    #[error("corners are {rms_px:.2} px off where {most_px} px is much; {advice}")]
+    /// The detected corners are inconsistent.
+    #[error("corners are {rms_px:.2} px off, limit {most_px} px; {advice}")]
     Contradiction {
-        /// Root mean square. [px]
+        /// Root mean square reprojection error. [px]
         rms_px: f64,
-        /// What is allowed. [px]
+        /// Limit. [px]
         most_px: f64,
-        /// What to do.
+        /// Correction.
         advice: &'static str,
     },
-    /// A tag that is to be the origin was not surveyed.
+    /// The tag that defines the origin was not surveyed.
     #[error("tag {family} {id} is not among those surveyed; choose one that the images show")]
     Anchor {
-        /// Its family.
         family: TagFamily,
-        /// Its number.
+        /// Number in the family.
         id: u32,
     },
-    /// Nothing ties a camera to the room.
+    /// No detected tag connects the camera to the room.
     #[error(
         "camera {name:?} sees neither the mat nor a cube that a placed camera sees at the same time; \
          lay the mat where it sees it, or carry the cube where both see it"
     )]
-    Unplaced {
-        /// Which camera.
-        name: String,
-    },
+    Unplaced { name: String },
     /// The corners do not determine the answer.
     #[error("the images do not determine the answer; {advice}")]
     Undetermined {
-        /// What to do.
+        /// Correction.
         advice: &'static str,
     },
 }
 
-/// Returns the pose of a camera that sees these tags of the room.
+/// Returns the pose of a camera from detected tags of the room.
 fn camera_pose(
     lens: &Intrinsics,
     tags: &[(Pose<World, Square>, f64, [DVec2; 4])],
 ) -> Option<(Pose<World, Cam>, Solved)> {
-    // A vehicle that is the camera.
+    // The solver estimates a vehicle's pose: the camera stands in for the vehicle.
     let sightings: Vec<Sighting> = tags
         .iter()
         .map(|&(world_from_tag, size_m, corners_px)| Sighting {
@@ -94,11 +87,11 @@ fn camera_pose(
     Some((Pose::new(body.translation_m, body.rotation), solved))
 }
 
-/// A cube's tag in the image of a camera in the room: its lens and pose, the tag's pose and size, and
-/// its corners.
+/// A tag of the cube, detected by a camera in the room: lens and pose of the camera, pose and size of the tag, and its
+/// corners.
 type OnCube<'a> = (&'a Intrinsics, Pose<World, Cam>, Pose<Body, Square>, f64, [DVec2; 4]);
 
-/// Returns the pose of a cube of which cameras in the room see tags.
+/// Returns the pose of a cube from tags that cameras in the room detect.
 fn cube_pose(seen: &[OnCube<'_>]) -> Option<Solved> {
     let sightings: Vec<Sighting> = seen
         .iter()
@@ -115,12 +108,12 @@ fn cube_pose(seen: &[OnCube<'_>]) -> Option<Solved> {
     solve(&sightings, &VehicleTwist::default(), None)
 }
 
-/// Corners of a still camera are within a fraction of a pixel. [px]
+/// Standard deviation of corners in images of a still camera. [px]
 const SIGMA_PX: f64 = 0.3;
-/// Corners count half at this distance. [px]
+/// Distance at which a corner has half the weight. [px]
 const LOSS_PX: f64 = 1.5;
-/// Calibrated lenses leave 0.1 to 0.4 px, and hardly a corner beyond [`LOSS_PX`] but those of misread
-/// tags; a wrong camera file leaves many.
+/// Maximum share of corners beyond [`LOSS_PX`]. Calibrated lenses leave 0.1 to 0.4 px, so only misread tags exceed it.
+/// A wrong camera file produces many outliers.
 const MAX_OUTLIERS: f64 = 0.1;
 
 #[cfg(test)]

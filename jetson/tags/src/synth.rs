@@ -1,17 +1,17 @@
-//! Renders what a camera sees of tags, with known truth: for tests, benchmarks and the simulated lab.
+//! Renders images of tags with known ground truth, for tests, benchmarks and the simulated lab.
 //!
 //! ```text
-//! Renderer::new(intrinsics)    slope of the ray through every pixel, once per lens
-//! Renderer::render(&Shot)      per tag and pixel: samples over the pixel, the optics' blur and the
-//!                              exposure time, all at once; then light, then noise
+//! Renderer::new(intrinsics)             slope of the ray through every pixel, once per lens
+//! Renderer::render(&SyntheticExposure)  per tag and pixel: samples over the pixel, the optical blur and
+//!                                       the exposure time, all at once; then light, then noise
 //! ```
 //!
-//! A sample is a place in the pixel's footprint (the box of the pixel, spread by the blur) and an
-//! instant of the exposure; its ray meets the tag's plane by a homography. So blur of optics and of
-//! motion cost nothing beside antialiasing. Everything is determined by the shot and its seed.
+//! A sample is a position in the pixel's footprint (the box of the pixel, spread by the blur) and an instant of the
+//! exposure. A homography maps its ray to the tag's plane. So optical blur and motion blur cost no more than
+//! antialiasing. The result depends only on the exposure and its seed.
 //!
-//! Budget: 16 samples a pixel that shows an edge between cells, one where all is one colour, fewer where that is so
-//! over many pixels (`docs/BENCHMARKS.md`, "drawing").
+//! Cost: 16 samples for a pixel with an edge between cells, one for a pixel of one colour, fewer for large areas of one
+//! colour (`docs/BENCHMARKS.md`, "drawing").
 
 pub mod ink;
 mod pattern;
@@ -30,7 +30,7 @@ use pattern::Pattern;
 pub(crate) use pattern::Random;
 use rays::Rays;
 
-/// The frame of a layout, whichever it is.
+/// Frame of a layout, body or world.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {}
 
@@ -38,56 +38,56 @@ impl Frame for Layout {
     const NAME: &'static str = "layout";
 }
 
-/// A layout and where it is while the shutter is open.
+/// A layout with its poses during the exposure.
 #[derive(Clone, Copy, Debug)]
 pub struct Placed<'a> {
     layout: &'a TagLayout,
-    /// At the beginning and at the end of the exposure.
+    /// Poses at the beginning and at the end of the exposure.
     world_from_layout: [Pose<World, Layout>; 2],
 }
 
 impl<'a> Placed<'a> {
-    /// Places a mat or wall, whose tags are in `world` already.
+    /// Places a mat or wall with tags in the `world` frame.
     ///
     /// # Panics
-    /// If the layout is one on a vehicle.
+    /// If the layout is in the body frame.
     pub fn fixed(layout: &'a TagLayout) -> Self {
         assert_eq!(layout.frame, LayoutFrame::World, "this layout needs a vehicle's pose");
         Self { layout, world_from_layout: [Pose::IDENTITY; 2] }
     }
 
-    /// Places a cube on a vehicle, whose pose is given for the beginning and the end of the exposure.
+    /// Places a cube on a vehicle, with the vehicle's poses at the beginning and the end of the exposure.
     ///
     /// # Panics
-    /// If the layout is one of the room.
+    /// If the layout is in the world frame.
     pub fn on_vehicle(layout: &'a TagLayout, world_from_body: [Pose<World, Body>; 2]) -> Self {
         assert_eq!(layout.frame, LayoutFrame::Body, "this layout is fixed in the room");
         let pose = |p: Pose<World, Body>| Pose::new(p.translation_m, p.rotation);
         Self { layout, world_from_layout: world_from_body.map(pose) }
     }
 
-    /// Places it anywhere: for calibration boards that are waved before a camera.
+    /// Places a layout at any pose, for calibration boards that are moved in front of a camera.
     pub fn anywhere(layout: &'a TagLayout, world_from_layout: Pose<World, Layout>) -> Self {
         Self { layout, world_from_layout: [world_from_layout; 2] }
     }
 
-    /// Returns where its tags' middles are when the shutter opens. [m, world]
+    /// Returns the positions of the tags' middles at the beginning of the exposure. [m, world]
     pub(crate) fn middles_m(&self) -> impl Iterator<Item = DVec3> {
         self.layout.tags.iter().map(|tag| self.world_from_layout[0].transform_point(tag.position_m))
     }
 }
 
-/// How bright things appear.
+/// Lighting of the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Light {
-    /// Black ink in full light. [grey levels of 255]
+    /// Brightness of black ink in full light. [grey levels of 255]
     pub black: f64,
-    /// White paper in full light. [grey levels of 255]
+    /// Brightness of white paper in full light. [grey levels of 255]
     pub white: f64,
-    /// How much brighter it grows from the image's left edge to its right, and from its upper edge to
-    /// its lower; 0.5 is from 75 % to 125 %.
+    /// Relative increase in brightness from the image's left edge to its right, and from its upper edge to its lower;
+    /// 0.5 is from 75 % to 125 %.
     pub gradient: DVec2,
-    /// How much darker the corners are than the middle; 0.3 leaves 70 %.
+    /// Relative decrease in brightness from the middle to the corners; 0.3 leaves 70 %.
     pub vignette: f64,
 }
 
@@ -100,24 +100,24 @@ impl Default for Light {
 /// One synthetic exposure.
 #[derive(Clone, Copy, Debug)]
 pub struct SyntheticExposure<'a> {
-    /// What is there.
+    /// Visible layouts.
     pub placed: &'a [Placed<'a>],
-    /// The camera at the beginning and at the end of the exposure.
+    /// Camera poses at the beginning and at the end of the exposure.
     pub world_from_cam: [Pose<World, Cam>; 2],
-    /// What is behind the tags, of the image's size; absent is a cluttered grey wall.
+    /// Background behind the tags, in the image's size; `None` is a cluttered grey wall.
     pub background: Option<&'a Gray>,
-    /// How bright things appear.
+    /// Lighting of the scene.
     pub light: Light,
-    /// Standard deviation of the optics' blur. [px]
+    /// Standard deviation of the optical blur. [px]
     pub blur_px: f64,
-    /// Standard deviation of the sensor's noise. [grey levels of 255]
+    /// Standard deviation of the sensor noise. [grey levels of 255]
     pub noise: f64,
-    /// Determines the noise.
+    /// Seed of the noise.
     pub seed: u64,
 }
 
 impl<'a> SyntheticExposure<'a> {
-    /// A sharp still of these, without noise, in even light.
+    /// Returns a sharp exposure without motion and noise, in even light.
     pub fn still(placed: &'a [Placed<'a>], world_from_cam: Pose<World, Cam>) -> Self {
         Self {
             placed,
@@ -131,20 +131,20 @@ impl<'a> SyntheticExposure<'a> {
     }
 }
 
-/// Renders for one lens.
+/// Renderer for one lens.
 #[derive(Debug)]
 pub struct Renderer {
     intrinsics: Intrinsics,
     rays: Rays,
-    /// What is behind the tags, of unit white.
+    /// Default background, as a share of white.
     wall: Vec<f32>,
-    /// Standard normal numbers, of which every row takes some.
+    /// Table of standard normal numbers; each row of an image uses a part of it.
     normal: Vec<f32>,
     cells: Mutex<HashMap<(TagFamily, u32), Cells>>,
 }
 
 impl Renderer {
-    /// Prepares the rays of every pixel.
+    /// Computes the rays of all pixels.
     pub fn new(intrinsics: Intrinsics) -> Self {
         let mut random = Random::new(0x7469_6c65);
         Self {
@@ -156,7 +156,7 @@ impl Renderer {
         }
     }
 
-    /// Returns the lens it renders for.
+    /// Returns the lens of the renderer.
     pub fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics
     }
@@ -164,9 +164,9 @@ impl Renderer {
     /// Renders one exposure.
     ///
     /// # Panics
-    /// If a background is of another size.
+    /// If the background does not have the size of the image.
     pub fn render(&self, shot: &SyntheticExposure<'_>) -> Gray {
-        // Brightness of everything in even light: 0 is black ink, 1 white paper.
+        // Brightness in even light: 0 is black ink, 1 white paper.
         let mut albedo = match shot.background {
             None => self.wall.clone(),
             Some(image) => {
@@ -184,7 +184,7 @@ impl Renderer {
         self.expose(&albedo, shot)
     }
 
-    /// Returns the tags that face the camera, those behind others first.
+    /// Returns the tags that face the camera, the farthest first.
     fn farthest_first(shot: &SyntheticExposure<'_>) -> Vec<([DMat3; 2], Tag)> {
         let mut quads = Vec::new();
         for placed in shot.placed {
@@ -197,7 +197,7 @@ impl Renderer {
                     world_from_cam.inverse() * begin.interpolate(end, t) * layout_from_tag
                 };
                 let middle = cam_from_tag(0.5);
-                // Its printed face is seen from where its normal points.
+                // The printed face is visible from the side that its normal points to.
                 let faces = middle.rotate(DVec3::Z).dot(middle.translation_m) < 0.0;
                 let ahead = crate::layout::CORNERS.iter().all(|c| {
                     middle.transform_point((*c * 2.0 * tag.size_m).extend(0.0)).z > NEAR_M
@@ -239,7 +239,7 @@ impl Renderer {
             let [begin, end] = tag_from_slope.each_ref();
             Some([Spot::at(begin, slope, per_px)?, Spot::at(end, slope, per_px)?])
         };
-        // Most of a large tag is one colour over many pixels, and most pixels of it are one colour.
+        // Large areas of a tag, and most of its pixels, have a single colour.
         let plain = |spots: &[Spot; 2], around_px: f64| {
             let [begin, end] =
                 spots.each_ref().map(|spot| spot.reach(pattern.reach_px + around_px));
@@ -259,7 +259,7 @@ impl Renderer {
                     *pixel = shade;
                     continue;
                 }
-                // Behind the camera, and so not on the paper.
+                // Behind the camera, so not on the paper.
                 let Some(spots) = spots(x, y) else { continue };
                 if let Some(shade) = plain(&spots, 0.0) {
                     *pixel = shade;
@@ -274,7 +274,7 @@ impl Renderer {
                         continue;
                     }
                     covered += 1;
-                    // Columns go right, rows down; y of the tag is up.
+                    // Columns increase to the right, rows downwards; y of the tag points up.
                     let column = (at.x * border + half).floor() as i32;
                     let row = (half - at.y * border).floor() as i32;
                     let inside = (0..across).contains(&column) && (0..across).contains(&row);
@@ -288,7 +288,7 @@ impl Renderer {
         }
     }
 
-    /// Returns the pixels that a paper can reach: left, top, right, bottom; the last two past it.
+    /// Returns the pixel bounds of a paper: left, top, right, bottom; the last two are exclusive.
     fn bounds(
         &self,
         tag_from_slope: &[DMat3; 2],
@@ -326,7 +326,7 @@ impl Renderer {
         ])
     }
 
-    /// Returns what the sensor makes of the brightness.
+    /// Converts brightness to the sensor's grey levels.
     fn expose(&self, albedo: &[f32], shot: &SyntheticExposure<'_>) -> Gray {
         let (width, height) = (self.intrinsics.width_px, self.intrinsics.height_px);
         let mut image = Gray::plain(width, height, 0);
@@ -342,16 +342,16 @@ impl Renderer {
         for (y, row) in image.pixels_mut().chunks_exact_mut(width.max(1)).enumerate() {
             let v = across(y, height);
             let albedo = &albedo[y * width..][..width];
-            // A row's noise in one piece: without an index to wrap, the loop is vectorised.
+            // A row's noise is a contiguous part of the table: without index wrapping, the loop is vectorised.
             let from = random.next() as usize % (NORMALS - width);
             let normal = &self.normal[from..][..width];
             for x in 0..width {
                 let u = columns[x];
-                // In the corners it falls by all of the vignette.
+                // In the corners, brightness is reduced by the full vignette.
                 let fall = 2.0 * (u * u + v * v);
                 let gain = (1.0 + right * u + down * v) * (1.0 - vignette * fall);
                 let grey = (black + span * albedo[x]) * gain + noise * normal[x];
-                // Saturates, as a sensor does.
+                // The conversion saturates, as a sensor does.
                 row[x] = (grey + 0.5) as u8;
             }
         }
@@ -359,13 +359,13 @@ impl Renderer {
     }
 }
 
-/// Returns half the paper's edge, in edges of the black square.
+/// Returns half the edge of the paper, in edges of the black square.
 fn paper_edge(cells: &Cells) -> f64 {
     (f64::from(cells.across()) / 2.0 + PAPER_CELLS) / f64::from(cells.border())
 }
 
-/// Returns what takes a slope in `cam` to a place on the tag, in edges of its black square; the third
-/// component is positive ahead of the camera.
+/// Returns the matrix that maps a slope in `cam` to a position on the tag, in edges of its black square. The third
+/// component is positive in front of the camera.
 fn homography(cam_from_tag: Pose<Cam, Square>, size_m: f64) -> DMat3 {
     let axes = DMat3::from_quat(cam_from_tag.rotation);
     let cam_from_plane =
@@ -373,13 +373,13 @@ fn homography(cam_from_tag: Pose<Cam, Square>, size_m: f64) -> DMat3 {
     cam_from_plane.inverse()
 }
 
-/// Where a pixel's ray meets a tag's plane at an instant, to first order in pixels: of a footprint of some pixels the rest
-/// is less than a hundredth of one.
+/// Intersection of a pixel's ray with a tag's plane at an instant, to first order in pixels. In a footprint of some
+/// pixels, the error is below a hundredth of a pixel.
 #[derive(Clone, Copy)]
 struct Spot {
-    /// Of the pixel's middle. [edges of the black square]
+    /// Intersection for the pixel's middle. [edges of the black square]
     at: DVec2,
-    /// How it changes with a step of one pixel right or down.
+    /// Derivative by a step of one pixel right or down.
     by_px: DMat2,
 }
 
@@ -396,15 +396,15 @@ impl Spot {
         Some(Self { at, by_px: DMat2::from_cols(axes[0], axes[1]) * per_px })
     }
 
-    /// Returns between which places all is that lies so many pixels around it.
+    /// Returns the bounds of the area within `around_px` of the pixel.
     fn reach(&self, around_px: f64) -> (DVec2, DVec2) {
         let reach = (self.by_px.x_axis.abs() + self.by_px.y_axis.abs()) * around_px;
         (self.at - reach, self.at + reach)
     }
 }
 
-/// Returns the colour of all cells between two places of a tag, in edges of its black square: whether it is white. `None` if
-/// there are two colours, or if the paper, of half the edge `paper`, ends there.
+/// Returns whether all cells between two positions of a tag, in edges of its black square, are white (`true`) or black.
+/// `None` if both colours occur, or if the paper, of half the edge `paper`, ends there.
 fn colour(cells: &Cells, low: DVec2, high: DVec2, paper: f64) -> Option<bool> {
     if low.abs().max(high.abs()).max_element() > paper {
         return None;
@@ -412,7 +412,7 @@ fn colour(cells: &Cells, low: DVec2, high: DVec2, paper: f64) -> Option<bool> {
     let (border, half) = (f64::from(cells.border()), f64::from(cells.across()) / 2.0);
     let columns = [low.x, high.x].map(|x| (x * border + half).floor() as i32);
     let rows = [high.y, low.y].map(|y| (half - y * border).floor() as i32);
-    // Where a pixel sees many cells, they have two colours.
+    // A pixel that covers many cells contains both colours.
     if columns[1] - columns[0] > 1 || rows[1] - rows[0] > 1 {
         return None;
     }
@@ -428,7 +428,7 @@ fn colour(cells: &Cells, low: DVec2, high: DVec2, paper: f64) -> Option<bool> {
     is_one.then_some(first)
 }
 
-/// Returns a grey wall with shades and boxes, in which nothing is a tag.
+/// Returns a grey wall with shades and boxes that contains no tag.
 fn clutter(intrinsics: &Intrinsics) -> Vec<f32> {
     let (width, height) = (intrinsics.width_px, intrinsics.height_px);
     let mut random = Random::new(0x7761_6c6c);
@@ -454,22 +454,22 @@ fn clutter(intrinsics: &Intrinsics) -> Vec<f32> {
     wall
 }
 
-/// Samples a pixel: edges along the image's axes are then placed within 1/32 px.
+/// Samples per pixel: edges along the image's axes are then accurate to 1/32 px.
 const SAMPLES: usize = 16;
-/// Pixels along the edge of a block whose colour is looked at at once. [px]
+/// Edge of the blocks that are first tested for a single colour. [px]
 const BLOCK_PX: u32 = 4;
-/// Points along each edge of a paper whose images bound it; a lens bends edges.
+/// Number of segments of each paper edge for its bounds: a lens bends edges.
 const OUTLINE: u32 = 8;
-/// White paper beyond what must be printed. [cells]
+/// White margin around the printed cells. [cells]
 const PAPER_CELLS: f64 = 0.5;
-/// Tags that come nearer are left out. [m]
+/// Minimum distance of a rendered tag. [m]
 const NEAR_M: f64 = 0.02;
-/// Boxes on the wall.
+/// Number of boxes on the wall.
 const BOXES: usize = 40;
-/// Numbers in the table of noise; a row takes them from anywhere on.
+/// Size of the noise table; a row starts at any index.
 const NORMALS: usize = 1 << 16;
 
-/// A webcam of 1280x720, with the lens that tests look through.
+/// A webcam of 1280x720 with the lens used in tests.
 #[cfg(test)]
 pub(crate) fn webcam() -> Intrinsics {
     use vizflyt_protocol::geometry::Distortion;

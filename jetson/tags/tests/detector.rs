@@ -1,4 +1,4 @@
-//! The detector alone, on one image: a test that other processors run too (`tests/arm/run`).
+//! Test of the detector on one image; also run on other processors (`tests/arm/run`).
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -10,9 +10,11 @@ use vizflyt_tags::simulated::{cube, webcams};
 use vizflyt_tags::synth::{Placed, Renderer, SyntheticExposure};
 
 #[test]
-fn tags_of_the_cube_are_found_where_they_are() {
+fn finds_tags_of_the_cube_at_their_positions() {
     let (cube, camera) = (cube(), webcams(1).remove(0));
-    let Mounting::World(world_from_cam) = camera.mounting else { panic!("it stands in the room") };
+    let Mounting::World(world_from_cam) = camera.mounting else {
+        panic!("the camera is fixed in the room")
+    };
     let pose: Pose<World, Body> = Pose::new(DVec3::new(3.0, 0.2, 1.4), DQuat::from_rotation_z(0.6));
     let placed = [Placed::on_vehicle(&cube, [pose; 2])];
     let image = Renderer::new(camera.intrinsics).render(&SyntheticExposure {

@@ -1,20 +1,20 @@
-//! Bits in bytes, low ones first.
+//! Bit streams, low bits first.
 
 /// Writes numbers of up to 32 bits.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct BitWriter {
-    /// Whole bytes, then room.
+    /// Written bytes, then reserved space.
     bytes: Vec<u8>,
     len: usize,
     open: u64,
-    /// Bits in `open`, 0 to 31 between calls.
+    /// Number of bits in `open`, 0 to 31 between calls.
     used: u32,
 }
 
 impl BitWriter {
-    /// Forgets everything; makes room for so many bits, the most that may come.
+    /// Clears the writer and reserves space for at most `most_bits` bits.
     pub(crate) fn start(&mut self, most_bits: usize) {
-        // Eight bytes more, so that a whole word is written at any place.
+        // Eight extra bytes, so that a whole word can be written at any position.
         let room = most_bits.div_ceil(8) + 8;
         if self.bytes.len() < room {
             self.bytes.resize(room, 0);
@@ -22,7 +22,7 @@ impl BitWriter {
         (self.len, self.open, self.used) = (0, 0, 0);
     }
 
-    /// Adds the `count` low bits of `value`, 0 to 32; the others must be 0.
+    /// Appends the `count` low bits of `value`, 0 to 32; the others must be 0.
     #[inline(always)]
     pub(crate) fn push(&mut self, value: u32, count: u32) {
         debug_assert!(count <= 32 && (count == 32 || value >> count == 0));
@@ -36,14 +36,14 @@ impl BitWriter {
         }
     }
 
-    /// Appends the bits to `out`, up to a whole byte.
+    /// Appends all bits to `out`, padded to a whole byte.
     pub(crate) fn finish(&mut self, out: &mut Vec<u8>) {
         out.extend_from_slice(&self.bytes[..self.len]);
         out.extend_from_slice(&self.open.to_le_bytes()[..self.used.div_ceil(8) as usize]);
     }
 }
 
-/// Reads what [`BitWriter`] wrote; behind the end come zeros.
+/// Reads the output of [`BitWriter`]; returns zeros beyond its end.
 #[derive(Clone, Debug)]
 pub(crate) struct BitReader<'a> {
     bytes: &'a [u8],
@@ -55,7 +55,7 @@ impl<'a> BitReader<'a> {
         Self { bytes, at_bit: 0 }
     }
 
-    /// Takes `count` bits, 0 to 32.
+    /// Reads `count` bits, 0 to 32.
     #[inline(always)]
     pub(crate) fn pop(&mut self, count: u32) -> u32 {
         let from = self.at_bit / 8;
@@ -76,7 +76,7 @@ impl<'a> BitReader<'a> {
         u64::from_le_bytes(word)
     }
 
-    /// Returns whether as many bytes were taken as there are.
+    /// Returns whether exactly all bytes have been read.
     pub(crate) fn is_finished(&self) -> bool {
         self.at_bit.div_ceil(8) == self.bytes.len()
     }
@@ -89,7 +89,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn numbers_survive(numbers in prop::collection::vec((any::<u32>(), 0u32..=32), 0..200)) {
+        fn numbers_survive_a_round_trip(numbers in prop::collection::vec((any::<u32>(), 0u32..=32), 0..200)) {
             let numbers: Vec<(u32, u32)> = numbers
                 .into_iter()
                 .map(|(value, count)| (value & ((1u64 << count) - 1) as u32, count))

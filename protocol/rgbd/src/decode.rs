@@ -1,4 +1,4 @@
-//! Bytes to pixels: an image at once, as its bytes arrive, or slice by slice in any order.
+//! Decoding: an image at once, as its bytes arrive, or slice by slice in any order.
 
 use core::ops::Range;
 
@@ -13,15 +13,15 @@ use crate::ids;
 use crate::image::ImageMut;
 use crate::plane::{PlaneDecoder, Samples};
 
-/// Turns bitstreams into images; owns the scratch memory, which grows with the caller's room and
-/// never by a header's value.
+/// Decodes bitstreams to images. Owns the scratch memory, which grows with the caller's buffers and never by a value in
+/// a header.
 #[derive(Debug, Default)]
 pub struct Decoder {
-    /// The image under way.
+    /// Header of the present image.
     info: Option<Info>,
-    /// Bit per slice that was decoded.
+    /// One bit per decoded slice.
     done: u64,
-    /// Bytes of the image that [`Self::feed`] has dealt with.
+    /// Number of bytes of the image that [`Self::feed`] has decoded.
     consumed: usize,
     jpeg: JpegSliceDecoder,
     lossless: LosslessDecoder,
@@ -31,27 +31,27 @@ pub struct Decoder {
     samples: Vec<u16>,
 }
 
-/// How far [`Decoder::feed`] has come.
+/// Progress of [`Decoder::feed`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Progress {
-    /// Rows decoded by this call; more than one slice may have arrived.
+    /// Rows decoded by this call, of one or more slices.
     pub rows: Range<u32>,
     /// Whether all slices are decoded.
     pub complete: bool,
 }
 
 impl Decoder {
-    /// Makes a decoder.
+    /// Makes a decoder without scratch memory.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Decodes an image into the caller's slices: H x W x 3 colour and H x W depth [mm]. An empty
-    /// slice leaves its part undecoded. Sizes are checked before any pixel is written; after a
-    /// later error the slices hold part of an image.
+    /// Decodes an image into the caller's buffers: H x W x 3 colour and H x W depth [mm]. An empty buffer skips its
+    /// part. Sizes are checked before any pixel is written. After a later error the buffers contain a part of the
+    /// image.
     ///
     /// # Errors
-    /// Every [`DecodeError`], in time and memory bounded by the bytes and the slices.
+    /// Every [`DecodeError`]. Time and memory are bounded by the lengths of the bytes and the buffers.
     pub fn decode(
         &mut self,
         bytes: &[u8],
@@ -62,10 +62,10 @@ impl Decoder {
         self.decode_image(bytes, &mut out)
     }
 
-    /// Decodes an image of any parts into the caller's room. See [`Self::decode`].
+    /// Decodes an image with any parts into the caller's buffers. See [`Self::decode`].
     ///
     /// # Errors
-    /// Every [`DecodeError`], in time and memory bounded by the bytes and the room.
+    /// Every [`DecodeError`]. Time and memory are bounded by the lengths of the bytes and the buffers.
     pub fn decode_image(
         &mut self,
         bytes: &[u8],
@@ -83,18 +83,17 @@ impl Decoder {
         Err(DecodeError::Length { expected, found: bytes.len() })
     }
 
-    /// Forgets the image under way: another one is next.
+    /// Discards the present image, to begin the next one.
     pub fn restart(&mut self) {
         (self.info, self.done, self.consumed) = (None, 0, 0);
     }
 
-    /// Decodes what has arrived. `received` are all the bytes of the image so far, from its first;
-    /// every slice that they complete is decoded, each once. [`Self::restart`] comes before the
-    /// next image.
+    /// Decodes all slices that are complete and not yet decoded. `received` are all bytes of the image received until
+    /// now, from its first. Call [`Self::restart`] before the next image.
     ///
     /// # Errors
-    /// Every [`DecodeError`] but [`DecodeError::Length`], as more bytes may come; the image is lost
-    /// then.
+    /// Every [`DecodeError`] except [`DecodeError::Length`], because more bytes may arrive. After an error the image
+    /// cannot be decoded further.
     pub fn feed(
         &mut self,
         received: &[u8],
@@ -131,10 +130,10 @@ impl Decoder {
         Ok(progress)
     }
 
-    /// Begins an image from bytes that begin with its whole header ([`Info::header_len`]).
+    /// Begins an image. `bytes` must contain its whole header ([`Info::header_len`]).
     ///
     /// # Errors
-    /// Those of [`peek`], and [`DecodeError::Color`] for its tables.
+    /// Errors of [`peek`], and [`DecodeError::Color`] for invalid JPEG tables.
     pub fn start(&mut self, bytes: &[u8]) -> Result<Info, DecodeError> {
         self.restart();
         let info = peek(bytes)?;
@@ -147,11 +146,10 @@ impl Decoder {
         Ok(info)
     }
 
-    /// Decodes a slice, given whole and alone, after [`Self::start`]; slices may come in any order.
-    /// Returns the rows that it wrote.
+    /// Decodes one complete slice after [`Self::start`]; slices may arrive in any order. Returns the decoded rows.
     ///
     /// # Errors
-    /// Every [`DecodeError`] about slices, parts and room.
+    /// Every [`DecodeError`] about slices, parts and buffers.
     pub fn push_slice(
         &mut self,
         slice: &[u8],
@@ -204,7 +202,7 @@ impl Decoder {
         Ok(rows)
     }
 
-    /// Returns whether every slice of the image under way is decoded.
+    /// Returns whether every slice of the present image is decoded.
     pub fn is_complete(&self) -> bool {
         self.info.is_some_and(|info| self.done.count_ones() == u32::from(info.slices))
     }
@@ -226,7 +224,7 @@ impl Decoder {
     }
 }
 
-/// Checks that every room is empty or of its part's size.
+/// Checks that every buffer is empty or has the size of its part.
 fn check_room(info: &Info, out: &ImageMut<'_>) -> Result<(), DecodeError> {
     let &Info { width, height, .. } = info;
     let pixels = width as usize * height as usize;

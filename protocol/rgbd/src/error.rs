@@ -1,14 +1,14 @@
-//! What may be wrong with an image to encode, and with bytes to decode.
+//! Errors of encoding and decoding.
 
 use crate::header::{HEADER_BYTES, MAX_SIDE, MAX_SLICES, SLICE_HEADER_BYTES};
 
-/// Why an image is not encoded. All are the caller's to mend; none depends on pixel values.
+/// Why an image is not encoded. All errors depend on the arguments, none on pixel values.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum EncodeError {
     /// A side is 0 or too large.
     #[error("image size {0}x{1} is outside 1x1 to {MAX_SIDE}x{MAX_SIDE}")]
     Size(u32, u32),
-    /// Colour of another size.
+    /// Colour has the wrong length.
     #[error("colour has {found} bytes; {width}x{height} needs {expected}")]
     Rgb {
         /// Bytes given.
@@ -20,7 +20,7 @@ pub enum EncodeError {
         /// Image height. [px]
         height: u32,
     },
-    /// Depth of another size.
+    /// Depth has the wrong length.
     #[error("depth has {found} pixels; {width}x{height} needs {expected}")]
     Depth {
         /// Pixels given.
@@ -32,7 +32,7 @@ pub enum EncodeError {
         /// Image height. [px]
         height: u32,
     },
-    /// Alpha or object ids of another size.
+    /// Alpha or object ids have the wrong length.
     #[error("{part} has {found} pixels; {width}x{height} needs {expected}")]
     Plane {
         /// `alpha` or `ids`.
@@ -46,10 +46,10 @@ pub enum EncodeError {
         /// Image height. [px]
         height: u32,
     },
-    /// Quality out of range.
+    /// The JPEG quality is out of range.
     #[error("JPEG quality {0} is outside 1 to 100")]
     Quality(u8),
-    /// Slices out of range.
+    /// The number of slices is out of range.
     #[error("{0} slices are outside 1 to {MAX_SLICES}")]
     Slices(u8),
     /// The rows are not those of the next slice.
@@ -60,64 +60,64 @@ pub enum EncodeError {
     Rows {
         /// Width given. [px]
         width: u32,
-        /// Rows given; 0 if other parts were.
+        /// Rows given; 0 if the parts differ.
         found: u32,
-        /// Rows due; 0 if none is.
+        /// Rows expected; 0 if no slice is expected.
         expected: u32,
     },
 }
 
-/// Why bytes are no image, or not the one the caller has room for.
+/// Why bytes cannot be decoded into the caller's buffers.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
-    /// Fewer bytes than a header.
+    /// The bytes are shorter than a header.
     #[error("RGB-D image is cut short at {0} of {HEADER_BYTES} header bytes")]
     Short(usize),
-    /// Another kind of bytes.
-    #[error("these bytes are no RGB-D image: they start with {0:02x?}")]
+    /// The bytes are not an RGB-D image.
+    #[error("not an RGB-D image: the bytes start with {0:02x?}")]
     Foreign([u8; 4]),
-    /// A bitstream of another version.
+    /// The bitstream has an unknown version.
     #[error("RGB-D bitstream version {0} is unknown; update the older of the two programs")]
     Version(u8),
-    /// A mode of a part that this program does not know.
+    /// A part has an unknown mode.
     #[error("RGB-D image has unknown {0} mode {1}; update the older of the two programs")]
     Mode(&'static str, u8),
     /// A side is 0 or too large.
     #[error("RGB-D image size {0}x{1} is outside 1x1 to {MAX_SIDE}x{MAX_SIDE}")]
     Size(u32, u32),
-    /// Slices out of range.
+    /// The number of slices is out of range.
     #[error("RGB-D image in {0} slices of rows; 1 to {expected} are possible", expected = .1)]
     Slices(u8, u8),
-    /// A bound of the depth error out of range, or where there is no depth.
-    #[error("RGB-D image has depth bound {0}e-6, which is none")]
+    /// The bound of the depth error is out of range, or the image has no depth.
+    #[error("RGB-D image has invalid depth bound {0}e-6")]
     Bound(u32),
-    /// More or fewer bytes than the headers name.
+    /// The number of bytes differs from the lengths in the headers.
     #[error("RGB-D image has {found} bytes; its headers name {expected}")]
     Length {
-        /// Bytes that the headers name, with themselves; as far as they are known.
+        /// Length by the headers received, including the headers.
         expected: u64,
         /// Bytes given.
         found: usize,
     },
-    /// A slice that the image does not have, that came before, or without an image.
-    #[error("slice {0} is none of this image's, or came before")]
+    /// The image does not have this slice, the slice was decoded before, or no image was started.
+    #[error("slice {0} is not part of this image, or was decoded before")]
     Slice(u16),
-    /// A slice cut short, or with bytes to spare.
+    /// The length of a slice differs from its header.
     #[error("slice has {found} bytes; its header of {SLICE_HEADER_BYTES} names {expected}")]
     SliceLength {
-        /// Bytes that its header names, with itself.
+        /// Length by the header, including the header.
         expected: u64,
         /// Bytes given.
         found: usize,
     },
-    /// The caller asks for a part that is absent, or its room has another size.
-    #[error("{part} goes into room for {found}, but the {width}x{height} image has {expected}")]
+    /// The image does not have a requested part, or the buffer has another size.
+    #[error("the buffer for {part} has {found}, but the {width}x{height} image has {expected}")]
     Room {
         /// `colour`, `alpha` (bytes), `depth` or `ids` (pixels).
         part: &'static str,
-        /// Length of the caller's slice.
+        /// Length of the caller's buffer.
         found: usize,
-        /// Length needed; 0 if the part is absent.
+        /// Length of the part; 0 if it is absent.
         expected: usize,
         /// Image width. [px]
         width: u32,
@@ -132,10 +132,10 @@ pub enum DecodeError {
     Depth {
         /// Bytes of the part.
         found: usize,
-        /// Bytes that its own table needs.
+        /// Bytes needed according to the table of blocks.
         expected: usize,
     },
-    /// A block of depth that asks for more than 16 bits.
+    /// A block of depth has more than 16 bits.
     #[error("depth is damaged: no block is stored as {0:#04x}")]
     DepthBlock(u8),
     /// An entropy-coded plane is damaged.

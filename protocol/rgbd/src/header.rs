@@ -1,4 +1,4 @@
-//! The headers: what an image holds, how large it is, where each slice ends.
+//! Headers: parts and size of an image, and lengths of its slices.
 
 use core::ops::Range;
 
@@ -10,75 +10,76 @@ use crate::depth::bound::DepthBound;
 use crate::error::DecodeError;
 use crate::image::Parts;
 
-/// Largest side of an image; bounds every buffer. [px]
+/// Maximum side of an image, which bounds every buffer. [px]
 pub const MAX_SIDE: u32 = Intrinsics::MAX_SIDE_PX;
-/// Most slices of an image.
+/// Maximum number of slices of an image.
 pub const MAX_SLICES: u8 = 64;
-/// Bytes of the header that every image begins with.
+/// Length of the header at the beginning of an image. [bytes]
 pub const HEADER_BYTES: usize = size_of::<Header>();
-/// Bytes of the header that every slice begins with.
+/// Length of the header at the beginning of a slice. [bytes]
 pub const SLICE_HEADER_BYTES: usize = size_of::<SliceHeader>();
-/// Most bytes of JPEG tables in the header.
+/// Maximum length of JPEG tables in the header. [bytes]
 const MAX_TABLES_BYTES: usize = 2048;
-/// Slices begin at multiples of so many rows: the tallest JPEG block (4:2:0), and whole blocks of
+/// Slices begin at multiples of this number of rows: the height of the largest JPEG block (4:2:0), and whole blocks of
 /// depth. [px]
 const SLICE_STEP_ROWS: u32 = 16;
 
-/// How colour is stored.
+/// Storage of colour.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 #[repr(u8)]
 pub enum ColorMode {
-    /// Baseline JPEG, chroma in full resolution.
+    /// Baseline JPEG with full chroma resolution.
     #[default]
     Jpeg444 = 1,
-    /// Baseline JPEG, chroma halved both ways: a quarter smaller, colours bleed at edges.
+    /// Baseline JPEG with half the chroma resolution in both directions: a quarter smaller, with colour bleeding at
+    /// edges.
     Jpeg420 = 2,
-    /// Every value comes back.
+    /// Lossless colour.
     Lossless = 3,
 }
 
-/// How depth is packed; what is packed is exact, or rounded to a [`DepthBound`].
+/// Compression of depth, which is exact or rounded to a [`DepthBound`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum DepthMode {
-    /// Quick: [`crate::depth`].
+    /// Fast compression: [`crate::depth`].
     Fast = 1,
-    /// Entropy coded: a quarter smaller, several times slower: [`crate::plane`].
+    /// Entropy coding: a quarter smaller, several times slower: [`crate::plane`].
     Small = 2,
 }
 
-/// What a bitstream says of itself.
+/// Contents of an image's header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Info {
     /// Image width. [px]
     pub width: u32,
     /// Image height. [px]
     pub height: u32,
-    /// How it holds colour; `None` if it does not.
+    /// Storage of colour; `None` if absent.
     pub color: Option<ColorMode>,
-    /// How it holds depth; `None` if it does not.
+    /// Compression of depth; `None` if absent.
     pub depth: Option<DepthMode>,
-    /// How far depth may be off; `None`: not at all.
+    /// Maximum error of depth; `None` for lossless depth.
     pub depth_bound: Option<DepthBound>,
-    /// Whether it holds alpha.
+    /// Whether the image has alpha.
     pub has_alpha: bool,
-    /// Whether it holds object ids.
+    /// Whether the image has object ids.
     pub has_ids: bool,
-    /// Slices, from top to bottom.
+    /// Number of slices, from top to bottom.
     pub slices: u8,
-    /// Bytes before the first slice.
+    /// Length of the header including JPEG tables. [bytes]
     pub header_len: usize,
 }
 
 impl Info {
-    /// Returns the rows of a slice; empty if there is no such slice.
+    /// Returns the rows of a slice; empty if the image does not have this slice.
     pub fn slice_rows(&self, slice: u8) -> Range<u32> {
         let step = slice_step(self.height, self.slices);
         let at = |n: u32| (n * step).min(self.height);
         at(u32::from(slice))..at(u32::from(slice) + 1)
     }
 
-    /// Returns which parts the image has.
+    /// Returns the parts of the image.
     pub fn parts(&self) -> Parts {
         Parts {
             color: self.color.is_some(),
@@ -89,7 +90,7 @@ impl Info {
     }
 }
 
-/// Returns how many slices an image of so many rows is cut into when `wanted` are asked for.
+/// Returns the number of slices of an image with this height, if `wanted` are requested.
 pub(crate) fn slice_count(height: u32, wanted: u8) -> u8 {
     height.div_ceil(slice_step(height, wanted)) as u8
 }
@@ -98,7 +99,7 @@ fn slice_step(height: u32, slices: u8) -> u32 {
     height.div_ceil(u32::from(slices)).next_multiple_of(SLICE_STEP_ROWS)
 }
 
-/// The layout on the wire; `tables_len` bytes of JPEG tables follow, then the slices.
+/// Header in the bitstream. `tables_len` bytes of JPEG tables follow, then the slices.
 #[derive(Clone, Copy, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned)]
 #[repr(C)]
 pub(crate) struct Header {
@@ -138,10 +139,10 @@ impl Header {
     }
 }
 
-/// Reads the header, of which `bytes` hold at least the first [`HEADER_BYTES`].
+/// Parses the header; `bytes` must contain at least the first [`HEADER_BYTES`].
 ///
 /// # Errors
-/// Any [`DecodeError`] about headers; not whether the slices are whole.
+/// Any [`DecodeError`] about headers. Does not check that the slices are complete.
 pub fn peek(bytes: &[u8]) -> Result<Info, DecodeError> {
     let (header, _) =
         Header::read_from_prefix(bytes).map_err(|_| DecodeError::Short(bytes.len()))?;
@@ -204,7 +205,7 @@ pub fn peek(bytes: &[u8]) -> Result<Info, DecodeError> {
     })
 }
 
-/// The layout on the wire; the parts follow in this order, without gaps.
+/// Header of a slice in the bitstream. The parts follow in this order, without gaps.
 #[derive(Clone, Copy, Default, FromBytes, IntoBytes, KnownLayout, Immutable, Unaligned)]
 #[repr(C)]
 pub(crate) struct SliceHeader {
@@ -216,7 +217,7 @@ pub(crate) struct SliceHeader {
     pub(crate) ids_len: U32,
 }
 
-/// A slice cut into its parts.
+/// A slice split into its parts.
 pub(crate) struct SliceParts<'a> {
     pub(crate) index: u16,
     pub(crate) color: &'a [u8],
@@ -232,14 +233,13 @@ impl SliceHeader {
     }
 }
 
-/// Returns the length of the slice that begins so, with its header; `None` if fewer than
-/// [`SLICE_HEADER_BYTES`] are there. The length is what a sender says: compare it with a limit
-/// before making room for it.
+/// Returns the length of the slice at the beginning of `bytes`, including its header; `None` with fewer than
+/// [`SLICE_HEADER_BYTES`]. The length comes from the sender: check it against a limit before allocating memory.
 pub fn slice_len(bytes: &[u8]) -> Option<u64> {
     SliceHeader::read_from_prefix(bytes).ok().map(|(header, _)| header.len())
 }
 
-/// Cuts a slice, given whole and alone.
+/// Splits one complete slice into its parts.
 pub(crate) fn split_slice(bytes: &[u8]) -> Result<SliceParts<'_>, DecodeError> {
     let wrong = |expected| DecodeError::SliceLength { expected, found: bytes.len() };
     let (header, rest) =
@@ -250,7 +250,7 @@ pub(crate) fn split_slice(bytes: &[u8]) -> Result<SliceParts<'_>, DecodeError> {
     if header.reserved.get() != 0 {
         return Err(DecodeError::Mode("slice", header.reserved.get().to_le_bytes()[0].max(1)));
     }
-    // The lengths add up to that of `rest`.
+    // The sum of the lengths equals the length of `rest`.
     let (color, rest) = rest.split_at(header.color_len.get() as usize);
     let (depth, rest) = rest.split_at(header.depth_len.get() as usize);
     let (alpha, ids) = rest.split_at(header.alpha_len.get() as usize);

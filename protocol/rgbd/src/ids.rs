@@ -1,8 +1,8 @@
-//! Object ids: runs, of one id or of what the row above shows.
+//! Object ids as runs of one id, or of copies from the row above.
 //!
-//! A run is a number and, unless it copies the row above, its id: `(length - 1) << 1 | copies` and
-//! the id, both in groups of seven bits, low ones first, the eighth bit saying that more follow
-//! (LEB128). Copying goes on over the ends of rows, so an unchanged column of rows is one run.
+//! A run is a number, `(length - 1) << 1 | copies`. If `copies` is 0, the id follows. Both are encoded in groups of
+//! seven bits, low ones first; the eighth bit is set if more groups follow (LEB128). Copies continue over the ends of
+//! rows, so several unchanged rows are one run.
 
 use crate::error::DecodeError;
 
@@ -25,10 +25,10 @@ pub(crate) fn encode(ids: &[u16], width: usize, out: &mut Vec<u8>) {
     }
 }
 
-/// Decodes into a row-major plane.
+/// Decodes to a row-major plane.
 ///
 /// # Errors
-/// [`DecodeError::Ids`] unless the runs end where the plane and the bytes do.
+/// [`DecodeError::Ids`] unless the runs end exactly at the end of the plane and of the bytes.
 pub(crate) fn decode(mut bytes: &[u8], width: usize, ids: &mut [u16]) -> Result<(), DecodeError> {
     let mut at = 0;
     while at < ids.len() {
@@ -39,7 +39,7 @@ pub(crate) fn decode(mut bytes: &[u8], width: usize, ids: &mut [u16]) -> Result<
         }
         if run & 1 == 1 {
             let above = at.checked_sub(width).ok_or(DecodeError::Ids)?;
-            // A run longer than a row repeats what it wrote itself: row by row.
+            // A run that is longer than a row also copies its own output: row by row.
             let (mut from, mut left) = (above, length);
             while left > 0 {
                 let count = left.min(width);
@@ -65,7 +65,7 @@ fn push_number(out: &mut Vec<u8>, mut number: u32) {
     out.push(number as u8);
 }
 
-/// Takes a number of at most 32 bits.
+/// Reads a number of at most 32 bits.
 fn pop_number(bytes: &mut &[u8]) -> Option<u32> {
     let mut number = 0u64;
     for shift in [0, 7, 14, 21, 28] {
@@ -95,18 +95,18 @@ mod tests {
     }
 
     #[test]
-    fn still_images_cost_a_few_bytes_and_objects_little() {
+    fn compresses_uniform_planes_and_single_objects() {
         assert!(check_round_trip(&vec![0; 640 * 480], 640) < 8);
         let mut ids = vec![0; 640 * 480];
         for y in 100..200 {
             ids[y * 640 + 300..y * 640 + 350].fill(7);
         }
-        // Its first row makes three runs; the rest is copied.
+        // The first row of the object has three runs; the rest is copied.
         assert!(check_round_trip(&ids, 640) < 20);
     }
 
     #[test]
-    fn damage_is_an_error() {
+    fn rejects_damaged_bytes() {
         let mut out = [0; 12];
         for bytes in [&[][..], &[0], &[1], &[22], &[24, 0], &[22, 0, 0], &[22, 255, 255, 255, 0]] {
             assert_eq!(decode(bytes, 4, &mut out), Err(DecodeError::Ids), "{bytes:?}");
@@ -117,7 +117,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn ids_survive(width in 1usize..40, height in 1usize..40, seed: u32, few in 1u32..5) {
+        fn ids_survive_a_round_trip(width in 1usize..40, height in 1usize..40, seed: u32, few in 1u32..5) {
             let ids: Vec<u16> = (0..(width * height) as u32)
                 .map(|n| (n.wrapping_mul(seed) >> 27).wrapping_mul(60_000 / few) as u16)
                 .collect();
@@ -125,7 +125,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_survived(bytes in prop::collection::vec(any::<u8>(), 0..60), width in 1usize..9) {
+        fn does_not_panic_on_arbitrary_bytes(bytes in prop::collection::vec(any::<u8>(), 0..60), width in 1usize..9) {
             let mut out = vec![0; width * 7];
             let _ = decode(&bytes, width, &mut out);
         }

@@ -1,8 +1,8 @@
-//! The pixels that go in, and the room that they come out into.
+//! Input images and output buffers.
 
 use core::ops::Range;
 
-/// An RGB-D image to encode; row-major. An empty slice leaves that part out.
+/// A row-major RGB-D image to encode. An empty slice omits its part.
 #[derive(Clone, Copy, Debug)]
 pub struct RgbdView<'a> {
     /// Width. [px]
@@ -11,11 +11,11 @@ pub struct RgbdView<'a> {
     pub height: u32,
     /// H x W x 3, or empty.
     pub rgb: &'a [u8],
-    /// H x W camera-z depth, 0 where there is no return; or empty. [mm]
+    /// H x W camera-z depth, 0 for no return; or empty. [mm]
     pub depth_mm: &'a [u16],
 }
 
-/// An image of any of the four parts to encode; row-major. An empty slice leaves that part out.
+/// A row-major image with any of the four parts to encode. An empty slice omits its part.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct ImageView<'a> {
     /// Width. [px]
@@ -24,7 +24,7 @@ pub struct ImageView<'a> {
     pub height: u32,
     /// H x W x 3, or empty.
     pub rgb: &'a [u8],
-    /// H x W camera-z depth, 0 where there is no return; or empty. [mm]
+    /// H x W camera-z depth, 0 for no return; or empty. [mm]
     pub depth_mm: &'a [u16],
     /// H x W opacity, 255 is opaque; or empty.
     pub alpha: &'a [u8],
@@ -40,7 +40,7 @@ impl<'a> From<&RgbdView<'a>> for ImageView<'a> {
 }
 
 impl ImageView<'_> {
-    /// Returns what the image consists of.
+    /// Returns the parts of the image.
     pub fn parts(&self) -> Parts {
         Parts {
             color: !self.rgb.is_empty(),
@@ -50,10 +50,10 @@ impl ImageView<'_> {
         }
     }
 
-    /// Returns some rows as an image of their own.
+    /// Returns a range of rows as an image.
     ///
     /// # Panics
-    /// If a part that is there does not have these rows.
+    /// If a part does not contain these rows.
     pub fn rows(&self, rows: Range<u32>) -> Self {
         let width = self.width as usize;
         let pixels = rows.start as usize * width..rows.end as usize * width;
@@ -72,25 +72,25 @@ fn part<T>(all: &[T], range: Range<usize>) -> &[T] {
     if all.is_empty() { all } else { &all[range] }
 }
 
-/// Which parts an image has.
+/// Parts of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Parts {
-    /// Colour.
+    /// Whether the image has colour.
     pub color: bool,
-    /// Depth.
+    /// Whether the image has depth.
     pub depth: bool,
-    /// Opacity.
+    /// Whether the image has opacity.
     pub alpha: bool,
-    /// Object ids.
+    /// Whether the image has object ids.
     pub ids: bool,
 }
 
-/// Room for a decoded image; row-major. An empty slice leaves its part undecoded.
+/// Row-major buffers for a decoded image. An empty buffer skips its part.
 #[derive(Debug, Default)]
 pub struct ImageMut<'a> {
     /// H x W x 3, or empty.
     pub rgb: &'a mut [u8],
-    /// H x W camera-z depth, 0 where there is no return; or empty. [mm]
+    /// H x W camera-z depth, 0 for no return; or empty. [mm]
     pub depth_mm: &'a mut [u16],
     /// H x W opacity, or empty.
     pub alpha: &'a mut [u8],

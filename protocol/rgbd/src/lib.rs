@@ -1,6 +1,6 @@
-//! One self-describing bitstream for an RGB-D image: any of colour, depth in u16 millimetres, alpha
-//! and object ids, in slices, so that encoding, sending, receiving and decoding overlap. The server
-//! encodes, the runtime decodes straight into shared memory.
+//! Self-describing bitstream of RGB-D images with any of colour, depth in u16 millimetres, alpha and object ids. Images
+//! are divided into slices, so that encoding, sending, receiving and decoding overlap. The server encodes; the runtime
+//! decodes directly into shared memory.
 //!
 //! ```text
 //! ImageView -> Encoder -> header | slice | slice ... -> Decoder -> the caller's ImageMut
@@ -8,14 +8,14 @@
 //! ```
 //!
 //! Read in this order:
-//! - [`ImageView`], [`ImageMut`]: pixels;
-//! - [`Info`] and [`peek`]: the header; every choice is in it, so a decoder needs no settings;
-//! - `color`: JPEG whose tables are stored once, or exact planes; [`encode_jpeg`] for pictures;
-//! - [`depth`]: predicted, zig-zagged, bit-packed; a scalar reference and a fast path that give the
-//!   same bytes; [`DepthBound`] for depth that need not be exact;
-//! - `plane`: entropy-coded planes, for small depth, alpha and exact colour; `ids`: runs;
-//! - [`Encoder`], [`Decoder`]: the two ends. Keep one of each per stream: they own the scratch
-//!   memory, so that nothing of ours is allocated per image after the first.
+//! - [`ImageView`], [`ImageMut`]: pixels
+//! - [`Info`] and [`peek`]: the header; it contains all options, so a decoder needs no settings
+//! - `color`: JPEG with its tables stored once, or lossless planes; [`encode_jpeg`] for single pictures
+//! - [`depth`]: prediction, zig-zag and bit packing; a scalar reference and a fast path with identical output;
+//!   [`DepthBound`] for lossy depth
+//! - `plane`: entropy-coded planes, for small depth, alpha and lossless colour; `ids`: runs
+//! - [`Encoder`], [`Decoder`]: keep one of each per stream. They own the scratch memory, so this crate allocates
+//!   nothing per image after the first.
 //!
 //! ```
 //! use vizflyt_rgbd::{Decoder, EncodeOptions, Encoder, RgbdView, peek};

@@ -1,4 +1,4 @@
-//! The whole bitstream: round trips, slices, refusals.
+//! Tests of the whole bitstream: round trips, slices, errors.
 
 use proptest::prelude::*;
 use vizflyt_rgbd::{
@@ -18,7 +18,7 @@ const SMALLEST: EncodeOptions = EncodeOptions {
 };
 
 #[test]
-fn all_parts_come_back_at_odd_sizes_in_every_mode() {
+fn all_parts_survive_at_odd_sizes_in_every_mode() {
     let mut decoder = Decoder::new();
     for (width, height) in [(320, 240), (1, 1), (7, 5), (33, 65), (640, 1), (1, 480), (130, 200)] {
         let picture = Picture::new(width, height);
@@ -45,7 +45,7 @@ fn all_parts_come_back_at_odd_sizes_in_every_mode() {
 }
 
 #[test]
-fn bounded_depth_keeps_its_bound_and_its_holes() {
+fn bounded_depth_keeps_its_bound_and_holes() {
     let picture = Picture::new(160, 120);
     for depth_mode in [DepthMode::Fast, DepthMode::Small] {
         let mut lens = Vec::new();
@@ -67,7 +67,7 @@ fn bounded_depth_keeps_its_bound_and_its_holes() {
 }
 
 #[test]
-fn quality_trades_size_for_error_and_changes_from_image_to_image() {
+fn quality_sets_the_size_and_can_change_for_each_image() {
     let picture = Picture::new(160, 120);
     let mut encoder = Encoder::new(EncodeOptions::default());
     let mut lens = Vec::new();
@@ -87,7 +87,7 @@ fn quality_trades_size_for_error_and_changes_from_image_to_image() {
 }
 
 #[test]
-fn slices_are_pushed_as_rendered_and_decoded_in_any_order() {
+fn encodes_slices_one_by_one_and_decodes_them_in_any_order() {
     let picture = Picture::new(200, 150);
     let mut encoder = Encoder::new(SMALLEST);
     let mut bytes = Vec::new();
@@ -119,7 +119,7 @@ fn slices_are_pushed_as_rendered_and_decoded_in_any_order() {
 }
 
 #[test]
-fn bytes_are_decoded_as_they_arrive_in_chunks_of_any_length() {
+fn decodes_bytes_in_chunks_of_any_length() {
     let picture = Picture::new(96, 96);
     let bytes = picture.encode(SMALLEST);
     let mut decoder = Decoder::new();
@@ -142,7 +142,7 @@ fn bytes_are_decoded_as_they_arrive_in_chunks_of_any_length() {
 }
 
 #[test]
-fn slices_that_are_not_due_are_refused_and_the_image_goes_on() {
+fn rejects_unexpected_slices_and_continues_the_image() {
     let picture = Picture::new(40, 60);
     let mut encoder = Encoder::new(EncodeOptions { slices: 2, ..EncodeOptions::default() });
     let (mut out, view) = (Vec::new(), picture.view());
@@ -162,7 +162,7 @@ fn slices_that_are_not_due_are_refused_and_the_image_goes_on() {
 }
 
 #[test]
-fn parts_may_be_absent_or_unwanted() {
+fn parts_may_be_absent_or_skipped() {
     let picture = Picture::new(40, 30);
     let (rgb, depth) = (&picture.rgb, &picture.depth_mm);
     let mut decoder = Decoder::new();
@@ -186,7 +186,7 @@ fn parts_may_be_absent_or_unwanted() {
 }
 
 #[test]
-fn wrong_arguments_are_refused_precisely() {
+fn rejects_wrong_arguments_with_the_reason() {
     let picture = Picture::new(8, 8);
     let (rgb, depth) = (&picture.rgb, &picture.depth_mm);
     let mut encoder = Encoder::new(EncodeOptions::default());
@@ -206,7 +206,7 @@ fn wrong_arguments_are_refused_precisely() {
     assert!(matches!(error, DecodeError::Room { part: "colour", found: 5, expected: 192, .. }));
 }
 
-/// FNV-1a.
+/// FNV-1a hash.
 fn hash(bytes: &[u8]) -> u64 {
     let step = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, step)
@@ -219,7 +219,7 @@ fn pixels(bytes: &[u8]) -> [u64; 2] {
     [hash(&back.rgb), hash(&depth)]
 }
 
-/// A picture that no machine's own sine is in.
+/// A picture computed in integers only, because sine functions differ between machines.
 fn integers() -> Picture {
     let mut picture = Picture::blank(160, 120);
     for at in 0..160 * 120 {
@@ -235,9 +235,9 @@ fn integers() -> Picture {
     picture
 }
 
-/// Servers and runtimes are of different processors, each with instructions of its own.
+/// Servers and runtimes run on different processors, with different vector instructions.
 #[test]
-fn what_is_exact_is_the_same_on_every_processor() {
+fn colour_and_depth_have_the_same_bytes_on_every_processor() {
     let picture = integers();
     let mut noise = Picture::blank(160, 120);
     noise.fill_at_random(7, 11);
@@ -250,7 +250,7 @@ fn what_is_exact_is_the_same_on_every_processor() {
             found.push([hash(&bytes), colour, depth]);
         }
     }
-    // Of bitstream, colour and depth.
+    // Bitstream, colour, and depth.
     let expected = [
         [0x9c5a_d2af_faf3_0414, 0xc555_48f0_95d4_af01, 0x8112_1e6e_8dc8_5ad9],
         [0x4d29_fc70_4bd8_2428, 0xc555_48f0_95d4_af01, 0x8112_1e6e_8dc8_5ad9],
@@ -261,7 +261,7 @@ fn what_is_exact_is_the_same_on_every_processor() {
 }
 
 #[test]
-fn a_jpeg_is_the_same_bytes_on_every_processor() {
+fn jpeg_has_the_same_bytes_on_every_processor() {
     let picture = integers();
     let found = [ColorMode::Jpeg444, ColorMode::Jpeg420].map(|color_mode| {
         hash(&picture.encode(EncodeOptions { color_mode, ..EncodeOptions::default() }))
@@ -269,9 +269,9 @@ fn a_jpeg_is_the_same_bytes_on_every_processor() {
     assert_eq!(found, [0x27e1_ae4d_ed72_1b93, 0x2f62_453d_d46a_7605], "{found:#x?}");
 }
 
-/// What one computer records another one replays. (These images are of another encoder.)
+/// Recordings of one computer are replayed on another. (These images come from another encoder.)
 #[test]
-fn a_recorded_image_has_the_same_pixels_on_every_processor() {
+fn recorded_images_have_the_same_pixels_on_every_processor() {
     let found =
         [include_bytes!("data/444.rgbd").as_slice(), include_bytes!("data/420.rgbd")].map(pixels);
     let expected = [
@@ -282,7 +282,7 @@ fn a_recorded_image_has_the_same_pixels_on_every_processor() {
 }
 
 #[test]
-fn large_images_come_back() {
+fn large_images_survive_a_round_trip() {
     for (width, height) in [(4096, 3000), (4095, 17), (19, 3000)] {
         let picture = Picture::new(width, height);
         let options = EncodeOptions { slices: 64, ..EncodeOptions::default() };
@@ -296,9 +296,9 @@ fn large_images_come_back() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Every size, any number of slices, every mode that is exact, pixels without pattern.
+    /// All sizes, numbers of slices and lossless modes, with random pixels.
     #[test]
-    fn any_pixels_come_back(
+    fn random_pixels_survive_a_round_trip(
         width in 1u32..150, height in 1u32..150, slices in 1u8..=64, seed: u64,
         depth_mode in prop::sample::select(vec![DepthMode::Fast, DepthMode::Small]),
         bits in 0u32..=16,

@@ -1,5 +1,5 @@
-//! Encoder and decoder, of depth and of colour, allocate nothing once the scratch memory has grown to the
-//! image's size.
+//! Encoder and decoder of depth and colour allocate nothing after the scratch memory has grown to the size of the
+//! image.
 
 use vizflyt_fixtures::CountingAllocator;
 use vizflyt_rgbd::{ColorMode, Decoder, EncodeOptions, Encoder, RgbdView};
@@ -8,7 +8,7 @@ use vizflyt_rgbd::{ColorMode, Decoder, EncodeOptions, Encoder, RgbdView};
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 #[test]
-fn depth_allocates_for_the_first_image_only() {
+fn depth_allocates_only_for_the_first_image() {
     let depth_mm: Vec<u16> = (0..320 * 240).map(|n| (n * 7919 % 9000) as u16).collect();
     let view = RgbdView { width: 320, height: 240, rgb: &[], depth_mm: &depth_mm };
     let (mut encoder, mut decoder) = (Encoder::new(EncodeOptions::default()), Decoder::new());
@@ -27,7 +27,7 @@ fn depth_allocates_for_the_first_image_only() {
 }
 
 #[test]
-fn all_of_an_image_allocates_for_the_first_only() {
+fn colour_and_depth_allocate_only_for_the_first_image() {
     let rgb: Vec<u8> = (0..3 * 330 * 240).map(|n| (n * 7919 % 251) as u8).collect();
     let depth_mm: Vec<u16> = (0..330 * 240).map(|n| (n * 7919 % 9000) as u16).collect();
     let view = RgbdView { width: 330, height: 240, rgb: &rgb, depth_mm: &depth_mm };

@@ -1,5 +1,5 @@
-//! Bytes that are cut, damaged or made up: an error or an image, never a panic, and no more memory
-//! than the caller gave.
+//! Truncated, damaged or random bytes: an error or an image, never a panic, and no more memory than the caller's
+//! buffers.
 
 use proptest::prelude::*;
 use vizflyt_rgbd::{
@@ -21,7 +21,7 @@ const SMALL: EncodeOptions =
     EncodeOptions { color_mode: ColorMode::Lossless, depth_mode: DepthMode::Small, ..FAST };
 
 #[test]
-fn truncation_at_every_length_is_an_error() {
+fn rejects_truncation_at_every_length() {
     for options in [FAST, SMALL] {
         let bytes = Picture::new(24, 20).encode(options);
         let mut decoder = Decoder::new();
@@ -38,8 +38,8 @@ fn truncation_at_every_length_is_an_error() {
 }
 
 #[test]
-fn a_part_cut_short_inside_whole_bytes_is_an_error() {
-    // The headers agree with the length, so only the parts' decoders can notice.
+fn rejects_a_truncated_part_with_consistent_headers() {
+    // The headers match the length, so only the parts' decoders can detect the error.
     for options in [FAST, SMALL] {
         let bytes = Picture::new(24, 18).encode(EncodeOptions { slices: 1, ..options });
         let start = peek(&bytes).unwrap().header_len;
@@ -63,7 +63,7 @@ fn a_part_cut_short_inside_whole_bytes_is_an_error() {
 }
 
 #[test]
-fn the_size_of_the_jpeg_must_be_the_headers() {
+fn jpeg_size_must_match_the_header() {
     let mut bytes = Picture::new(24, 18).encode(FAST);
     bytes[12] = 25;
     let result = Picture::decode(&mut Decoder::new(), &bytes);
@@ -71,7 +71,7 @@ fn the_size_of_the_jpeg_must_be_the_headers() {
 }
 
 #[test]
-fn a_scan_that_leads_to_further_scans_is_refused() {
+fn rejects_a_scan_with_a_marker_inside() {
     let picture = Picture::new(24, 16);
     let bytes = picture.encode(FAST);
     let start = peek(&bytes).unwrap().header_len + SLICE_HEADER_BYTES;
@@ -82,7 +82,7 @@ fn a_scan_that_leads_to_further_scans_is_refused() {
 }
 
 #[test]
-fn strangers_are_refused_by_name() {
+fn rejects_unknown_headers_with_the_reason() {
     let bytes = Picture::new(8, 8).encode(FAST);
     let with = |at: usize, value: u8| {
         let mut bytes = bytes.clone();
@@ -128,7 +128,7 @@ proptest! {
 
     /// Flipped bits give an image or an error, never a panic.
     #[test]
-    fn flipped_bits_are_survived(
+    fn does_not_panic_on_flipped_bits(
         flips in prop::collection::vec((any::<prop::sample::Index>(), 0u8..8), 1..6), small: bool,
     ) {
         let mut bytes = Picture::new(33, 35).encode(if small { SMALL } else { FAST });
@@ -140,9 +140,9 @@ proptest! {
         let _ = Decoder::new().decode_image(&bytes, &mut out.room());
     }
 
-    /// Any parts after true headers.
+    /// Random parts after valid headers.
     #[test]
-    fn any_parts_are_survived(
+    fn does_not_panic_on_random_parts(
         parts in prop::collection::vec(any::<u8>(), 0..600),
         cuts in prop::array::uniform3(any::<prop::sample::Index>()), small: bool,
     ) {
@@ -157,7 +157,7 @@ proptest! {
         bytes.extend(&parts);
         let mut out = Picture::blank(16, 16);
         let _ = Decoder::new().decode_image(&bytes, &mut out.room());
-        // One part at a time, as a damaged colour must not hide the others.
+        // One part at a time, so that damaged colour does not hide errors of the others.
         let Picture { depth_mm, alpha, ids, .. } = &mut out;
         let _ = Decoder::new().decode(&bytes, &mut [], depth_mm);
         let _ = Decoder::new().decode_image(&bytes, &mut ImageMut { alpha, ..Default::default() });
@@ -165,7 +165,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_survived(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+    fn does_not_panic_on_arbitrary_bytes(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
         let _ = peek(&bytes);
         let _ = Decoder::new().decode(&bytes, &mut [0; 48], &mut [0; 16]);
     }

@@ -84,7 +84,10 @@ mod tests {
         assert_eq!(colons.join(":").parse(), Ok(Fingerprint::of(b"abc")));
         assert!("abc".parse::<Fingerprint>().unwrap_err().contains("this has 3"));
         for wrong in [text.replace('b', "g"), text.replace("ba", "+a")] {
-            assert!(wrong.parse::<Fingerprint>().unwrap_err().contains("not a hex number"), "{wrong}");
+            assert!(
+                wrong.parse::<Fingerprint>().unwrap_err().contains("not a hex number"),
+                "{wrong}"
+            );
         }
     }
 }

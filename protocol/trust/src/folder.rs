@@ -238,7 +238,10 @@ mod tests {
         let folder = KeysFolder::open(Some(&path)).unwrap();
         folder.write("x", "one").unwrap();
         fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o640)).unwrap();
-        assert!(folder.read("x").is_ok(), "readable by others is accepted for files without secrets");
+        assert!(
+            folder.read("x").is_ok(),
+            "readable by others is accepted for files without secrets"
+        );
         let error = folder.read_secret("x").unwrap_err().to_string();
         assert!(error.contains("mode 640") && error.contains("chmod 600 "), "{error}");
         fs::set_permissions(path.join("x"), fs::Permissions::from_mode(0o620)).unwrap();

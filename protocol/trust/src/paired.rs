@@ -77,7 +77,9 @@ impl Paired {
                 _ => {}
             }
             if let Some(wrong) = client.vehicles.iter().find(|vehicle| !is_name(vehicle)) {
-                return fail(&format!("'{wrong}' is not a valid name of a vehicle (1 to 32 bytes of text)"));
+                return fail(&format!(
+                    "'{wrong}' is not a valid name of a vehicle (1 to 32 bytes of text)"
+                ));
             }
             let same = |other: &Client| other.fingerprint == client.fingerprint;
             if paired.clients[..index].iter().any(same) {
@@ -185,7 +187,10 @@ mod tests {
         check_refused(&entry("role = \"boss\""), "line 4");
         check_refused(&entry("role = \"instructor\"\nvehicles = [\"x\"]"), "remove vehicles");
         check_refused(&entry("role = \"instructor\"\nvehicle = \"x\""), "unknown field");
-        check_refused(&entry("role = \"team\"\nvehicles = [\"\"]"), "not a valid name of a vehicle");
+        check_refused(
+            &entry("role = \"team\"\nvehicles = [\"\"]"),
+            "not a valid name of a vehicle",
+        );
         let twice = entry("role = \"instructor\"").repeat(2);
         check_refused(&twice, "occurs twice");
         check_refused(&twice.replace(&print.to_string(), "12"), "64 hex digits");

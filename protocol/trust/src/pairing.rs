@@ -37,7 +37,9 @@ impl Code {
         let random = rustls::crypto::ring::default_provider().secure_random;
         loop {
             let mut bytes = [0; 4];
-            random.fill(&mut bytes).map_err(|_| "the system provides no random numbers".to_owned())?;
+            random
+                .fill(&mut bytes)
+                .map_err(|_| "the system provides no random numbers".to_owned())?;
             let number = u32::from_le_bytes(bytes);
             // Why: otherwise low codes would be slightly more likely.
             if number < u32::MAX / CODES * CODES {

@@ -1,9 +1,9 @@
-//! Who has a place where there are fewer than callers: connections to the page, handshakes of runtimes; pure.
+//! Admission with a limited number of places, for connections to the page and handshakes of runtimes. Pure.
 //!
-//! Whoever has shown nothing yet stands in a place of its address, and the newest always gets one: of an
-//! address with too many the one that has waited longest gives way, and where all are taken, the one
-//! that has waited longest at the address with the most. So whoever comes with ten thousand
-//! connections pushes out its own. Who has shown a key moves to the places of its kind, which no other kind can take.
+//! An unidentified caller gets a place of its address, and the newest caller is always admitted. At the limit
+//! of its address, the one that has waited longest there gives way; if all places are taken, the one that has
+//! waited longest at the most crowded address. So an attacker with ten thousand connections displaces its own.
+//! A caller that has presented a key moves to the places of its kind, which no other kind can take.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -11,37 +11,37 @@ use std::time::{Duration, Instant};
 
 use crate::rate_limit::place;
 
-/// How many places there are.
+/// Numbers of places.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Limits {
-    /// Of those who have shown nothing, all of them.
+    /// All unidentified callers.
     pub(crate) strangers: usize,
-    /// Of those, at one address (an IPv6 /64).
+    /// Unidentified callers at one address (an IPv6 /64).
     pub(crate) by_address: usize,
-    /// Of all teams.
+    /// All teams.
     pub(crate) teams: usize,
-    /// Of one team.
+    /// One team.
     pub(crate) by_team: usize,
-    /// Of instructors.
+    /// All instructors.
     pub(crate) instructors: usize,
 }
 
-/// Who has a place.
+/// Identity of a place's holder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Holder {
-    /// Has shown nothing yet; from this address.
+    /// Unidentified, from this address.
     Stranger(IpAddr),
-    /// Has shown the key of this vehicle's team.
+    /// Presented the key of this vehicle's team.
     Team(String),
-    /// Has shown that it is an instructor.
+    /// Authenticated as an instructor.
     Instructor,
 }
 
-/// Names a place for as long as it is held.
+/// Id of a place while it is held.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct PlaceId(u64);
 
-/// The places that are taken. Each has a `T`, by which its holder is told to give way.
+/// Taken places. The `T` of each is a signal to its holder to give way.
 #[derive(Debug)]
 pub(crate) struct Admission<T> {
     limits: Limits,
@@ -52,20 +52,20 @@ pub(crate) struct Admission<T> {
 #[derive(Debug)]
 struct Place<T> {
     holder: Holder,
-    /// It waits for its caller; who is being served does not give way.
+    /// Waiting for its caller; a holder that is being served does not give way.
     is_waiting: bool,
     since: Instant,
     tell: T,
 }
 
 impl<T> Admission<T> {
-    /// Makes one with all places free.
+    /// Creates one with all places free.
     pub(crate) fn new(limits: Limits) -> Self {
         Self { limits, next: 0, places: HashMap::new() }
     }
 
-    /// Gives a caller from `address` a place, in which it waits, and returns who gives way. `None` if
-    /// nobody can.
+    /// Admits a caller from `address` as waiting, and returns the holder that gives way. `None` if no holder
+    /// can give way.
     pub(crate) fn admit(
         &mut self,
         now: Instant,
@@ -93,8 +93,8 @@ impl<T> Admission<T> {
         Some((id, told))
     }
 
-    /// Takes note of what the holder of a place has shown, and returns who gives way to it. It stays a
-    /// stranger if all places of its kind are being served.
+    /// Records the identity of a holder, and returns the holder that gives way to it. It stays unidentified if
+    /// all places of its kind are being served.
     pub(crate) fn recognise(&mut self, id: PlaceId, holder: Holder) -> Option<T> {
         if self.places.get(&id)?.holder == holder {
             return None;
@@ -104,7 +104,7 @@ impl<T> Admission<T> {
             Holder::Team(_) => (|other| matches!(other, Holder::Team(_)), self.limits.teams),
             Holder::Instructor => (|other| *other == Holder::Instructor, self.limits.instructors),
         };
-        // Taken out while the others are looked at: nobody gives way to itself.
+        // Removed temporarily, so that it does not give way to itself.
         let place = self.places.remove(&id)?;
         let of_team = matches!(holder, Holder::Team(_))
             && self.count(|other| *other == holder) >= self.limits.by_team;
@@ -121,14 +121,14 @@ impl<T> Admission<T> {
         told
     }
 
-    /// The holder of a place is being served from now on, and does not give way.
+    /// Marks the holder of a place as being served, so that it does not give way.
     pub(crate) fn serve(&mut self, id: PlaceId) {
         if let Some(place) = self.places.get_mut(&id) {
             place.is_waiting = false;
         }
     }
 
-    /// The holder of a place waits for its caller from `now` on.
+    /// Marks the holder of a place as waiting from `now` on.
     pub(crate) fn wait(&mut self, now: Instant, id: PlaceId) {
         if let Some(place) = self.places.get_mut(&id) {
             (place.is_waiting, place.since) = (true, now);
@@ -140,14 +140,14 @@ impl<T> Admission<T> {
         self.places.remove(&id);
     }
 
-    /// Takes one stranger's place away, of those who wait: descriptors have run out.
+    /// Removes one waiting unidentified holder, when file descriptors have run out.
     pub(crate) fn make_room(&mut self) -> Option<T> {
         let crowd = self.most_crowded_address();
         let id = self.oldest(|other| matches!(other, Holder::Stranger(a) if Some(*a) == crowd))?;
         self.give_way(id)
     }
 
-    /// Frees the places of those who have waited for `patience` or longer, and returns them.
+    /// Frees the places of all that have waited for `patience` or longer, and returns their signals.
     pub(crate) fn overdue(&mut self, now: Instant, patience: Duration) -> Vec<T> {
         let is_overdue = |_: &PlaceId, place: &mut Place<T>| {
             place.is_waiting && now.saturating_duration_since(place.since) >= patience
@@ -155,7 +155,7 @@ impl<T> Admission<T> {
         self.places.extract_if(is_overdue).map(|(_, place)| place.tell).collect()
     }
 
-    /// Returns how many places are taken.
+    /// Returns the number of taken places.
     pub(crate) fn len(&self) -> usize {
         self.places.len()
     }
@@ -164,7 +164,7 @@ impl<T> Admission<T> {
         self.places.values().filter(|place| is_meant(&place.holder)).count()
     }
 
-    /// Returns the address at which most strangers wait.
+    /// Returns the address with the most waiting unidentified holders.
     fn most_crowded_address(&self) -> Option<IpAddr> {
         let mut crowds: HashMap<IpAddr, usize> = HashMap::new();
         for place in self.places.values().filter(|place| place.is_waiting) {
@@ -175,7 +175,7 @@ impl<T> Admission<T> {
         crowds.into_iter().max_by_key(|&(address, count)| (count, address)).map(|(a, _)| a)
     }
 
-    /// Returns who of those meant has waited longest; `None` if none of them waits.
+    /// Returns the matching holder that has waited longest; `None` if none of them is waiting.
     fn oldest(&self, is_meant: impl Fn(&Holder) -> bool) -> Option<PlaceId> {
         let meant = self.places.iter().filter(|(_, p)| p.is_waiting && is_meant(&p.holder));
         meant.min_by_key(|(id, place)| (place.since, **id)).map(|(id, _)| *id)
@@ -220,7 +220,7 @@ mod tests {
             self.start + Duration::from_millis(self.clock_ms)
         }
 
-        /// Admits one; returns its place, and the number of who gave way.
+        /// Admits a caller; returns its place, and the number of the one that gave way.
         fn admit(&mut self, address: IpAddr) -> Option<(PlaceId, Option<u32>)> {
             let now = self.now();
             self.count += 1;
@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn ten_thousand_of_one_address_push_out_their_own_and_nobody_else() {
+    fn ten_thousand_of_one_address_displace_only_their_own() {
         let mut door = Door::new();
         let (other, _) = door.admit(ip(2)).unwrap();
         for _ in 0..10_000 {
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_served_does_not_give_way() {
+    fn a_served_holder_does_not_give_way() {
         let mut door = Door::new();
         let ids: Vec<_> = (0..4).map(|_| door.admit(ip(1)).unwrap().0).collect();
         door.admission.serve(ids[0]);
@@ -288,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_too_long_leaves() {
+    fn waiting_too_long_frees_the_place() {
         let mut door = Door::new();
         let (first, _) = door.admit(ip(1)).unwrap();
         door.admission.serve(first);
@@ -301,7 +301,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever happens, no limit is passed, and everybody who gave way is out.
+        /// For any calls, no limit is exceeded, and all that gave way are out.
         #[test]
         fn limits_hold(steps in prop::collection::vec((0u8..6, 0u8..5, 0usize..20), 0..400)) {
             let mut door = Door::new();

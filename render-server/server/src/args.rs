@@ -1,4 +1,4 @@
-//! The command line of the render server.
+//! Command line of the render server.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -16,79 +16,90 @@ use crate::stream::rate_control::Adaptation;
 use crate::stream::transport::Congestion;
 use crate::web::Login;
 
-/// Draws what the vehicle's cameras would see in the twin, and referees the flight.
+/// Render the cameras' view of the twin, and referee the flight
 ///
 /// Example: vizflyt serve forest/arena.toml --vicon 0.0.0.0:51001 --http 127.0.0.1:8080
 #[derive(Args, Clone, Debug)]
 pub struct ServeArgs {
-    /// arena.toml, its folder, or a bare scene file, for which an arena is made up
+    /// arena.toml, its folder, or a bare scene file, which gets a default arena
     #[arg(required = false, required_unless_present_any = ["config", "print_config"])]
     pub arena: PathBuf,
 
-    /// A file with these settings: each flag is a key of its name, with `_` for `-`; flags override it
+    /// File with these settings; options on the command line override it
+    ///
+    /// Each option is a key of its name, with `_` for `-`.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
 
-    /// Print the settings in effect as such a file, and end
+    /// Print the settings in effect as such a file, and exit
     #[arg(long)]
     pub print_config: bool,
 
-    /// Folder of scenes, each a folder with an arena.toml, among which the instructor chooses on the page
+    /// Folder of scenes from which the instructor chooses on the page
+    ///
+    /// Each scene is a folder with an arena.toml.
     #[arg(long, value_name = "DIR")]
     pub scenes: Option<PathBuf>,
 
-    /// Where runtimes connect (UDP)
+    /// Address for runtimes (UDP)
     #[arg(long, value_name = "ADDR", default_value = "0.0.0.0:4433")]
     pub quic: SocketAddr,
 
-    /// Where the page is served; port 0 takes a free one
+    /// Address of the page; port 0 selects a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080")]
     pub http: SocketAddr,
 
-    /// HTTPS for the page: `auto` makes a certificate and keeps it with the server's keys, or name a
-    /// certificate's PEM file, with --tls-key [default: plain HTTP]
+    /// HTTPS for the page: `auto`, or a certificate's PEM file [default: plain HTTP]
+    ///
+    /// `auto` creates a certificate and stores it with the server's keys. A file also needs --tls-key.
     #[arg(long, value_name = "auto|CERT", value_hint = ValueHint::FilePath)]
     pub tls: Option<PathBuf>,
 
-    /// The PEM file of the private key of --tls CERT
+    /// PEM file of the private key of --tls CERT
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub tls_key: Option<PathBuf>,
 
-    /// Serve the page over plain HTTP on a public address too: whoever is on the way reads keys and pictures
+    /// Serve the page over plain HTTP on a public address too
+    ///
+    /// Everyone on the network path can then read keys and images.
     #[arg(long)]
     pub plain_http: bool,
 
-    /// Where Vicon Tracker's UDP object stream arrives [default: 0.0.0.0:51001, unless arena.toml has
-    /// [[localization]] or --pose is given]
+    /// Address for Vicon Tracker's UDP object stream [default: 0.0.0.0:51001]
+    ///
+    /// The default applies unless arena.toml has [[localization]] or --pose is given.
     #[arg(long, value_name = "ADDR")]
     pub vicon: Option<SocketAddr>,
 
-    /// Sources of poses instead of those of `arena.toml`.
+    /// Pose sources instead of those of `arena.toml`
     #[arg(long, value_name = "DRIVER:ADDR[,KEY=VALUE]", help = pose_help(), value_parser = LocalizationConfig::parse)]
     pub pose: Vec<LocalizationConfig>,
 
-    /// A vehicle: its object's name in the localization system; repeat for more
-    /// [default: the [[vehicles]] of arena.toml, else vizflyt]
+    /// Name of a vehicle and its object in the localization system; may be repeated
+    ///
+    /// Default: the [[vehicles]] of arena.toml, else vizflyt.
     #[arg(long = "vehicle", value_name = "NAME")]
     pub vehicles: Vec<String>,
 
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    /// Renderer: a graphics card if available, the CPU, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
 
-    /// How much of a large scene is drawn
+    /// Level of detail in large scenes
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
-    /// Memory for the blocks of a packed scene, which is drawn from the disk [MiB]
+    /// Memory for the blocks of a packed scene, which is rendered from the disk [MiB]
     #[arg(long, value_name = "MIB", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..))]
     pub scene_memory: u32,
 
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
+    ///
+    /// auto: as set in its arena, else in its file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
 
-    /// Draw at most this often [Hz]
+    /// Maximum render rate [Hz]
     #[arg(long, value_name = "HZ", default_value_t = 120.0, value_parser = rate)]
     pub max_rate: f64,
 
@@ -96,16 +107,17 @@ pub struct ServeArgs {
     #[arg(long, value_name = "Q", default_value_t = 93, value_parser = clap::value_parser!(u8).range(1..=100))]
     pub quality: u8,
 
-    /// How the colour images are stored
+    /// Compression of colour
     #[arg(long, value_enum, default_value_t)]
     pub color: Color,
 
-    /// How depth is packed; both are exact
+    /// Compression of depth; both are exact
     #[arg(long, value_enum, default_value_t)]
     pub depth: Depth,
 
-    /// Lets depth z be off by up to K z², but 1 mm at least, for half the bytes or less; 0.001 is 25 mm
-    /// at 5 m [default: exact]
+    /// Maximum depth error K z², but at least 1 mm [default: exact]
+    ///
+    /// Saves half of the bytes or more; K = 0.001 is 25 mm at 5 m.
     #[arg(long, value_name = "K", value_parser = depth_bound)]
     pub depth_error: Option<DepthBound>,
 
@@ -113,16 +125,17 @@ pub struct ServeArgs {
     #[arg(long, value_enum, default_value_t)]
     pub congestion: Congestion,
 
-    /// What may be lowered when a runtime's link is too slow for its images: quality before rate, rate
-    /// before size
+    /// Image properties that may be reduced for a slow link
+    ///
+    /// Quality is reduced before rate, and rate before size.
     #[arg(long, value_enum, default_value_t)]
     pub adapt: Adaptation,
 
-    /// How a scene without an arena is put into the world
+    /// Placement of a scene without an arena
     #[command(flatten)]
     pub bare: BareArgs,
 
-    /// Vehicles are isolated from each other in the twin: they neither see nor touch each other
+    /// Isolate the vehicles: they neither see each other nor collide
     #[arg(long)]
     pub apart: bool,
 
@@ -134,31 +147,39 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ROLE", value_parser = parse_grant)]
     pub pair: Option<Grant>,
 
-    /// Print the addresses, with keys, by which other computers open the page; printed anyway if
-    /// --http is not this computer alone
+    /// Print the page's addresses with keys, for other computers
+    ///
+    /// They are always printed if --http is not only this computer.
     #[arg(long)]
     pub print_page_keys: bool,
 
-    /// Who must log in on the page; `vizflyt password` sets the instructor's password
+    /// Users that must log in on the page
+    ///
+    /// `vizflyt password` sets the instructor's password.
     #[arg(long, value_enum, default_value_t)]
     pub login: Login,
 
-    /// Folder of this server's key and of paired.toml, the list of who may connect
-    /// [default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt]
+    /// Folder of this server's key and of paired.toml, the list of paired computers
+    ///
+    /// Default: $XDG_CONFIG_HOME/vizflyt or ~/.config/vizflyt.
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
 
-    /// Where flights are written down: a file, postgres://USER:PASSWORD@HOST/NAME, or none
-    /// [default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite]
+    /// Database of flights: a file, postgres://USER:PASSWORD@HOST/NAME, or none
+    ///
+    /// Default: $XDG_DATA_HOME/vizflyt/leaderboard.sqlite or ~/.local/share/vizflyt/leaderboard.sqlite.
     #[arg(long, value_name = "FILE|URL|none", value_parser = run_storage, value_hint = ValueHint::FilePath)]
     pub leaderboard: Option<RunStorage>,
 
-    /// A team's official runs on a course, at most; further ones are practice [default: as many as it likes]
+    /// Maximum of a team's official runs on a course; further runs are practice
+    ///
+    /// Default: unlimited.
     #[arg(long, value_name = "N")]
     pub official_attempts: Option<u32>,
 
-    /// Where the lab day is kept, its checks and the queue: a file, or none
-    /// [default: lab-day.json beside the leaderboard's file; none without a leaderboard]
+    /// File of the lab day with its checks and queue, or none
+    ///
+    /// Default: lab-day.json next to the leaderboard's file; none without a leaderboard.
     #[arg(long, value_name = "FILE|none", value_parser = lab_storage, value_hint = ValueHint::FilePath)]
     pub lab_day: Option<LabStorage>,
 
@@ -166,17 +187,15 @@ pub struct ServeArgs {
     #[arg(long)]
     pub json: bool,
 
-    /// End when standard input ends
+    /// Exit when standard input closes
     #[arg(long, hide = true)]
     pub lifeline: bool,
 }
 
-/// Where runs are stored.
+/// Storage of runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum RunStorage {
-    /// In this database.
     In(Database),
-    /// Nowhere.
     Nowhere,
 }
 
@@ -184,35 +203,33 @@ fn run_storage(text: &str) -> Result<RunStorage, UnknownDatabase> {
     if text == "none" { Ok(RunStorage::Nowhere) } else { text.parse().map(RunStorage::In) }
 }
 
-/// Where the lab day is stored.
+/// Storage of the lab day.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum LabStorage {
-    /// In this file.
     In(PathBuf),
-    /// Nowhere.
     Nowhere,
 }
 
-#[allow(clippy::unnecessary_wraps)] // Why: what clap parses by may fail.
+#[allow(clippy::unnecessary_wraps)] // Why: clap's value parsers return a Result.
 fn lab_storage(text: &str) -> Result<LabStorage, String> {
     Ok(if text == "none" { LabStorage::Nowhere } else { LabStorage::In(text.into()) })
 }
 
-/// How colour is stored.
+/// Compression of colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Color {
-    /// JPEG, colour in full resolution
+    /// JPEG with colour at full resolution
     #[default]
     #[value(name = "444")]
     Jpeg444,
-    /// JPEG, colour in half resolution: a quarter smaller, bleeds at edges
+    /// JPEG with colour at half resolution: a quarter smaller, bleeds at edges
     #[value(name = "420")]
     Jpeg420,
-    /// Every value comes back: three times the size, 15 ms at 640x480
+    /// Lossless: three times the size, 15 ms at 640x480
     Lossless,
 }
 
-/// How depth is packed.
+/// Compression of depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Depth {
     /// Under a millisecond at 640x480
@@ -223,7 +240,7 @@ pub enum Depth {
 }
 
 impl ServeArgs {
-    /// Returns the sources of poses: those of the command line, else those of `arena.toml`, else Vicon.
+    /// Returns the pose sources: those of the command line, else those of `arena.toml`, else Vicon.
     pub fn localization(&self, arena: Vec<LocalizationConfig>) -> Vec<LocalizationConfig> {
         let vicon = self.vicon.map(|address| LocalizationConfig {
             address: Some(address.to_string()),
@@ -234,7 +251,7 @@ impl ServeArgs {
         [given, arena].into_iter().find(|sources| !sources.is_empty()).unwrap_or_else(vicon)
     }
 
-    /// Returns the file that keeps the lab day; `None` if none does.
+    /// Returns the file of the lab day; `None` if disabled.
     pub fn lab_day_file(&self) -> Option<PathBuf> {
         let runs = match (&self.lab_day, &self.leaderboard) {
             (Some(LabStorage::In(file)), _) => return Some(file.clone()),
@@ -245,7 +262,7 @@ impl ServeArgs {
         Some(runs.with_file_name("lab-day.json"))
     }
 
-    /// Returns how images are encoded.
+    /// Returns the options of the image encoder.
     pub fn encode_options(&self) -> EncodeOptions {
         EncodeOptions {
             jpeg_quality: self.quality,
@@ -267,8 +284,8 @@ impl ServeArgs {
 /// Returns the help of `--pose`, with the names of all drivers.
 fn pose_help() -> String {
     format!(
-        "A source of poses instead of arena.toml's: {}, with the keys of [[localization]], as \
-         natnet:239.255.42.99:1511,up=y or 'vicon,pivot_m=[0.02,0,0.05]'; repeat for more",
+        "Pose source instead of arena.toml's: {}, with the keys of [[localization]], for example \
+         natnet:239.255.42.99:1511,up=y or 'vicon,pivot_m=[0.02,0,0.05]'; may be repeated",
         Driver::names()
     )
 }
@@ -278,10 +295,10 @@ fn depth_bound(text: &str) -> Result<DepthBound, String> {
     DepthBound::new(k_per_m).ok_or_else(|| format!("{k_per_m} is outside 0.000001 to 0.1"))
 }
 
-/// Reads `--max-rate`. [Hz]
+/// Parses `--max-rate`. [Hz]
 ///
 /// # Errors
-/// In words, of what is no rate from 1 to 1000.
+/// Text that is not a rate from 1 to 1000.
 pub fn rate(text: &str) -> Result<f64, String> {
     number(text, 1.0, 1000.0)
 }
@@ -314,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn options_are_read_and_checked() {
+    fn options_are_parsed_and_checked() {
         let args =
             parse("room.ply --up -y --scale 0.2 --quic 127.0.0.1:0 --congestion bbr").unwrap();
         assert_eq!(args.bare, BareArgs { up: Some(Up::NegY), scale: Some(0.2) });

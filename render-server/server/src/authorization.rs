@@ -1,8 +1,8 @@
-//! Who may come in: this server's identity, and the rights of those paired with it.
+//! Authorization: this server's identity, and the rights of paired clients.
 //!
-//! `paired.toml` is read again whenever it changes, so that removing an entry ends that client's
-//! right and its connection. A file that cannot be read leaves the former rights as they are: a
-//! slip of the hand must not drop vehicles out of the air.
+//! `paired.toml` is read again whenever it changes, so that removing an entry ends that client's right and its
+//! connection. If the file cannot be read, the previous rights stay in effect: an editing error must not stop a
+//! flight.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -19,21 +19,20 @@ use vizflyt_trust::{Client, Fingerprint, Identity, KeyError, KeysFolder, Owner, 
 
 use vizflyt_process::lock;
 
-/// What every way into the server asks.
+/// Identity, rights and pairing of the server.
 #[derive(Debug)]
 pub struct Authorizer {
-    /// Who this server is.
     pub identity: Identity,
-    /// Where everything is kept.
+    /// Folder of keys and of `paired.toml`.
     pub folder: KeysFolder,
     paired: watch::Sender<Arc<Paired>>,
     desk: Mutex<PairingServer>,
-    /// What came of the newest attempt to pair.
+    /// Result of the newest pairing attempt.
     pairing_news: watch::Sender<String>,
 }
 
 impl Authorizer {
-    /// Opens the keys folder; makes this server's identity at its first start.
+    /// Opens the keys folder; creates this server's identity at its first start.
     ///
     /// # Errors
     /// Keys or a `paired.toml` that cannot be used.
@@ -44,12 +43,12 @@ impl Authorizer {
         Ok(Self { identity, folder, paired, desk, pairing_news })
     }
 
-    /// Returns who is paired.
+    /// Returns all paired clients.
     pub fn paired(&self) -> Arc<Paired> {
         self.paired.borrow().clone()
     }
 
-    /// Returns the paired client of a fingerprint.
+    /// Returns the paired client with this fingerprint.
     pub fn client(&self, fingerprint: Fingerprint) -> Option<Client> {
         self.paired.borrow().client(fingerprint).cloned()
     }
@@ -60,14 +59,14 @@ impl Authorizer {
         let lost = |paired: &Arc<Paired>| {
             !paired.client(fingerprint).is_some_and(|client| client.may_use(vehicle))
         };
-        // An error means that the sender is gone; `self` holds it.
+        // An error would mean that the sender is dropped, but `self` holds it.
         let _ = paired.wait_for(lost).await;
     }
 
-    /// Opens a pairing window with a fresh code.
+    /// Opens a pairing window with a new code.
     ///
     /// # Errors
-    /// A window that is open already; no random numbers.
+    /// A window is open already, or there are no random numbers.
     pub fn open_pairing(&self, grant: Grant) -> Result<WindowState, String> {
         let code = Code::random()?;
         let now = Instant::now();
@@ -90,20 +89,20 @@ impl Authorizer {
         self.pairing_news.send_replace("closed".to_owned());
     }
 
-    /// Returns what comes of attempts to pair, newest wins.
+    /// Returns a receiver of the results of pairing attempts; newest wins.
     pub fn pairing_news(&self) -> watch::Receiver<String> {
         self.pairing_news.subscribe()
     }
 
-    /// Returns what came of the newest attempt to pair.
+    /// Returns the result of the newest pairing attempt.
     pub fn newest_pairing_news(&self) -> String {
         self.pairing_news.borrow().clone()
     }
 
-    /// Takes the first message of a client that wants to be paired.
+    /// Processes the first message of a client that requests pairing.
     ///
     /// # Errors
-    /// The reason to refuse.
+    /// Reason of the refusal.
     pub fn begin_pairing(
         &self,
         message: &PairingRequest,
@@ -112,10 +111,10 @@ impl Authorizer {
         lock(&self.desk).begin(Instant::now(), message, binding)
     }
 
-    /// Takes its proof; if that is right, it is paired from now on.
+    /// Verifies the client's proof, and pairs it if the proof is right.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn confirm_pairing(
         &self,
         attempt: Attempt,
@@ -136,12 +135,12 @@ impl Authorizer {
             Err(error) => {
                 warn!("{error}");
                 self.pairing_news.send_replace(error.to_string());
-                Err("the server could not keep the pairing; its log has the reason".to_owned())
+                Err("the server could not store the pairing; see its log".to_owned())
             }
         }
     }
 
-    /// Follows `paired.toml`, for ever.
+    /// Monitors `paired.toml`; never returns.
     pub async fn follow(&self) {
         let mut tick = interval(LOOK_EVERY);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -150,7 +149,7 @@ impl Authorizer {
         loop {
             tick.tick().await;
             let found = self.folder.stamp(Paired::FILE);
-            // Two equal reads: a file that an editor has emptied and not yet filled is not accepted.
+            // Two equal stamps are required, so that a file is not read while an editor writes it.
             if found == seen && found != taken {
                 taken = found;
                 self.reread();
@@ -171,12 +170,14 @@ impl Authorizer {
                     info!("paired.toml has changed: {} paired", self.paired().clients.len());
                 }
             }
-            Err(error) => warn!("{error}; the former rights stay until this is mended"),
+            Err(error) => {
+                warn!("{error}; the previous rights stay in effect until the file is corrected")
+            }
         }
     }
 }
 
-/// Removing an entry counts after two of these.
+/// Interval of checks; a removed entry takes effect after two of them.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
 /// Parses `instructor` or `team:VEHICLE[,VEHICLE...]`.
@@ -188,10 +189,10 @@ pub(crate) fn parse_grant(text: &str) -> Result<Grant, String> {
     let mut vehicles = heapless::Vec::new();
     for name in names.split(',') {
         if name.is_empty() || name.len() > 32 || name.chars().any(char::is_control) {
-            return Err(format!("'{name}' is no vehicle's name (1 to 32 bytes of text)"));
+            return Err(format!("'{name}' is not a valid vehicle name (1 to 32 bytes of text)"));
         }
         if vehicles.push(bounded(name)).is_err() {
-            return Err(format!("a team has {MAX_GRANTED} vehicles at most"));
+            return Err(format!("a team has at most {MAX_GRANTED} vehicles"));
         }
     }
     Ok(Grant::Team { vehicles })
@@ -212,7 +213,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn a_right_ends_with_its_entry_but_not_with_a_slip_of_the_hand() {
+    async fn a_right_ends_with_its_entry_but_not_with_an_invalid_file() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         Paired::add(&folder, client("ants", "ant")).unwrap();
@@ -226,7 +227,7 @@ mod tests {
             let authorizer = authorizer.clone();
             async move { authorizer.right_ends(print, "ant").await }
         });
-        // A vehicle that is not its own: no right to begin with.
+        // Another team's vehicle: the client never had this right.
         authorizer.right_ends(print, "bee").await;
 
         let good = folder.read(Paired::FILE).unwrap().unwrap();

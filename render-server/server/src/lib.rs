@@ -1,4 +1,4 @@
-//! The render server: poses in, RGB-D out; referee's events, page, report.
+//! Render server: receives poses, streams RGB-D images, referees flights, serves the page.
 //!
 //! ```text
 //! serve  loads the scene, starts threads and tasks, prints the report
@@ -9,12 +9,12 @@
 //! flights   leases, events, runs            imports none of these
 //! scene     files -> splats, obstacles      imports none of these
 //! ```
-//! Beneath the rooms lie small files that import no room: clock, stop, lock, mailbox, timing,
-//! rate limits, admission, priority, authorization. `tests/arrows.rs` fails on an import that runs upwards.
+//! Modules below the rooms import no room: clock, stop, mailbox, timing, rate limits, admission,
+//! priority, authorization. `tests/server/arrows.rs` fails on an upward import.
 //!
-//! Four threads (poses, render, encode, previews) and a tokio runtime for sockets share the rooms'
-//! states ([`stream::Rooms`]). Everything is latest-wins but events, which are a log. [`serve()`]
-//! runs it all.
+//! Four threads (pose, render, encode, previews), one more with sensors, and a tokio runtime for sockets share
+//! the rooms' states ([`stream::Rooms`]). All data are latest-wins except events, which are a log. [`serve()`]
+//! starts everything.
 
 mod admission;
 pub mod args;

@@ -1,4 +1,4 @@
-//! `vizflyt-server`: the render server alone, without the rest of `vizflyt`.
+//! `vizflyt-server`: only the render server, without the rest of `vizflyt`.
 
 use std::io::{IsTerminal, Write};
 
@@ -21,7 +21,7 @@ fn main() -> anyhow::Result<()> {
     let line = settings::with_file(std::env::args_os().collect(), &matches)?;
     let matches = Cli::command().get_matches_from(line);
     if matches.get_flag("print_config") {
-        // A reader that has gone needs no more of it.
+        // A closed pipe is not an error.
         let _ = std::io::stdout().write_all(settings::to_toml(&matches).as_bytes());
         return Ok(());
     }

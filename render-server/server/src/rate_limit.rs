@@ -1,36 +1,35 @@
-//! What unknown peers may cost: attempts that came to nothing (connections, logins) are counted by
-//! address, pure.
+//! Rate limit for unknown peers: failed attempts (connections, logins) are counted by address. Pure.
 //!
-//! Only addresses that proved to be their own are charged (a handshake was completed), so nobody
-//! can use up another's. Memory is bounded: addresses that have paid back are forgotten, and when
-//! all places are taken, the rest of the world shares one.
+//! Only validated addresses are charged (after a complete handshake), so that an attacker cannot use up the
+//! attempts of another address. Memory is bounded: addresses without debt are removed, and when all entries are
+//! taken, all further addresses share one.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv6Addr};
 use std::time::{Duration, Instant};
 
-/// Remembers who was turned away.
+/// Failed attempts by address.
 #[derive(Debug, Default)]
 pub(crate) struct RateLimiter {
     debts: HashMap<IpAddr, Debt>,
-    /// Of all addresses that found no place.
+    /// Debt of all addresses without their own entry.
     others: Option<Debt>,
 }
 
-/// A token bucket, kept as the time at which it is full again.
+/// Token bucket, stored as the time at which it is full again.
 #[derive(Clone, Copy, Debug)]
 struct Debt {
     full_at: Instant,
 }
 
 impl RateLimiter {
-    /// Whether an address has attempts left.
+    /// Returns whether an address has attempts left.
     pub(crate) fn may_try(&self, now: Instant, address: IpAddr) -> bool {
         let debt = self.debts.get(&place(address)).or(self.others.as_ref());
         debt.is_none_or(|debt| debt.owed(now) + EACH <= EACH * BURST)
     }
 
-    /// Takes one attempt.
+    /// Charges one attempt.
     pub(crate) fn charge(&mut self, now: Instant, address: IpAddr) {
         let place = place(address);
         if self.debts.len() >= MAX_PLACES && !self.debts.contains_key(&place) {
@@ -52,7 +51,7 @@ impl Debt {
     }
 }
 
-/// Whoever has an IPv6 address has a whole /64 of them (RFC 6177).
+/// Returns the unit of the limit: of IPv6 a /64, because each user has a whole one (RFC 6177).
 pub(crate) fn place(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(v6) => Ipv6Addr::from_bits(v6.to_bits() >> 64 << 64).into(),
@@ -60,11 +59,11 @@ pub(crate) fn place(address: IpAddr) -> IpAddr {
     }
 }
 
-/// Attempts at once; a person who mistypes stays below.
+/// Attempts at once: more than the typing errors of a user.
 const BURST: u32 = 10;
-/// One attempt comes back after this long.
+/// Time until one attempt is available again.
 const EACH: Duration = Duration::from_secs(3);
-/// Some 100 KB.
+/// Maximum number of entries: about 100 KB.
 const MAX_PLACES: usize = 1024;
 
 #[cfg(test)]
@@ -76,7 +75,7 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// Returns how many attempts `address` has at `now`, and takes them.
+    /// Returns the number of attempts left to `address` at `now`, and charges them.
     fn attempts(limiter: &mut RateLimiter, now: Instant, address: IpAddr) -> u32 {
         let mut count = 0;
         while limiter.may_try(now, address) {
@@ -87,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn a_burst_then_one_at_a_time() {
+    fn allows_a_burst_then_one_attempt_at_a_time() {
         let (mut limiter, start) = (RateLimiter::default(), Instant::now());
         let stranger = ip("192.168.1.9");
         assert_eq!(attempts(&mut limiter, start, stranger), BURST);
@@ -98,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_of_ipv6_is_one_place() {
+    fn an_ipv6_network_counts_as_one_address() {
         let (mut limiter, now) = (RateLimiter::default(), Instant::now());
         assert_eq!(attempts(&mut limiter, now, ip("2001:db8::1")), BURST);
         assert_eq!(attempts(&mut limiter, now, ip("2001:db8::2:1")), 0);
@@ -106,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_million_addresses_cost_no_more_memory_than_a_thousand() {
+    fn memory_is_bounded_for_many_addresses() {
         let (mut limiter, start) = (RateLimiter::default(), Instant::now());
         for bits in 0..20_000 {
             limiter.charge(start, Ipv4Addr::from_bits(bits).into());
@@ -114,7 +113,7 @@ mod tests {
         assert_eq!(limiter.debts.len(), MAX_PLACES);
         let late = Ipv4Addr::from_bits(30_000).into();
         assert!(!limiter.may_try(start, late), "the rest shares what is left, and that is used up");
-        // Those who were charged once are free again, and make room.
+        // Addresses that were charged once are free again, and make room.
         let later = start + EACH * 20_000;
         assert_eq!(attempts(&mut limiter, later, late), BURST);
         assert_eq!(limiter.debts.len(), 1);

@@ -1,8 +1,8 @@
-//! `vizflyt serve --config server.toml` and `--print-config`: the flags as a file, and back.
+//! `vizflyt serve --config server.toml` and `--print-config`: conversion between options and a file.
 //!
-//! Every flag is a key of its long name, with `_` for `-`; the arena is `arena`. A key's value is read
-//! by its flag's own parser, so that file and command line take and refuse the same. What the command
-//! line has overrides the file. Paths in a file are relative to its folder.
+//! Every option is a key with its long name, with `_` for `-`; the arena is `arena`. The option's own parser
+//! reads the value of a key, so that file and command line accept the same values. The command line overrides
+//! the file. Paths in a file are relative to its folder.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -17,14 +17,14 @@ use vizflyt_toml::{TomlError, TomlErrors, error_at, unknown_among};
 
 use crate::args::ServeArgs;
 
-/// Flags that are no settings.
+/// Options that are not settings.
 const NO_KEYS: [&str; 5] = ["config", "print_config", "lifeline", "help", "version"];
 
-/// Returns a command line of `serve` with the settings of its file that it does not have; `matches` is what
-/// clap made of `line`. Without `--config` the line stays as it is.
+/// Returns a command line of `serve`, completed with the settings of its file. `matches` is clap's result for
+/// `line`. Without `--config` the line is unchanged.
 ///
 /// # Errors
-/// If the file cannot be read; all that is wrong in it.
+/// The file cannot be read; or all errors in it.
 pub fn with_file(mut line: Vec<OsString>, matches: &ArgMatches) -> Result<Vec<OsString>> {
     let Some(path) = matches.get_one::<PathBuf>("config") else { return Ok(line) };
     let text =
@@ -38,14 +38,13 @@ pub fn with_file(mut line: Vec<OsString>, matches: &ArgMatches) -> Result<Vec<Os
     if !has_arena && !matches.get_flag("print_config") {
         bail!("no arena: name one, or give `arena` in {}", path.display());
     }
-    // In front of what was typed, which may end with a `--`.
+    // Inserted before the user's arguments, which may contain a `--`.
     let at = line.iter().position(|word| word == "serve").map_or(1, |at| at + 1);
     line.splice(at..at, added.into_iter().flat_map(|setting| setting.arguments));
     Ok(line)
 }
 
-/// Returns the effective settings as TOML that [`with_file`] reads to the same; what has no value is
-/// a comment.
+/// Returns the effective settings as TOML that [`with_file`] reads back; keys without a value are comments.
 pub fn to_toml(matches: &ArgMatches) -> String {
     let mut text = String::new();
     for argument in command().get_arguments().filter(|argument| is_setting(argument)) {
@@ -63,7 +62,7 @@ pub fn to_toml(matches: &ArgMatches) -> String {
 
 const ARENA: &str = "arena";
 
-/// One key of a file, as the equivalent arguments.
+/// Key of a file, as the equivalent arguments.
 struct Setting {
     id: String,
     arguments: Vec<OsString>,
@@ -156,7 +155,7 @@ fn setting(argument: &Arg, value: &Spanned<DeValue<'_>>, folder: &Path) -> Resul
     Ok(Setting { id, arguments })
 }
 
-/// Lets the flag's own parser look at its values.
+/// Checks values with the option's own parser.
 fn check(arguments: &[OsString], is_flag: bool) -> Result<(), String> {
     let arena: &[OsString] = if is_flag { &["x".into()] } else { &[] };
     let line = [OsString::from("serve")].into_iter().chain(arguments.iter().chain(arena).cloned());
@@ -171,7 +170,7 @@ fn text_of(value: &DeValue<'_>) -> Result<String, String> {
         DeValue::String(text) => Ok(text.to_string()),
         DeValue::Integer(number) => Ok(number.as_str().to_owned()),
         DeValue::Float(number) => Ok(number.as_str().to_owned()),
-        other => Err(format!("write a text or a number, not {}", other.type_str())),
+        other => Err(format!("write a string or a number, not {}", other.type_str())),
     }
 }
 
@@ -183,7 +182,7 @@ mod tests {
         command().try_get_matches_from(line).unwrap()
     }
 
-    /// Returns the line that a file and these arguments make.
+    /// Returns the arguments that result from a file and these arguments.
     fn settled(text: &str, arguments: &[&str]) -> Result<Vec<String>> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("server.toml");
@@ -192,7 +191,7 @@ mod tests {
         line.extend(arguments.iter().map(OsString::from));
         line.extend(["--config".into(), path.into_os_string()]);
         let line = with_file(line.clone(), &matches(&line))?;
-        // What it makes is what clap takes.
+        // clap must accept the result.
         matches(&line);
         let here = format!("{}/", folder.path().display());
         let added = 1..line.len() - 2 - arguments.len();
@@ -237,7 +236,7 @@ mod tests {
             "line 1, column 1: unknown key 'qualty'; did you mean 'quality'?",
             "line 2, column 11: quality: invalid value '0'",
             "line 3, column 8: json: write true or false",
-            "line 4, column 12: max_rate: write a text or a number, not array",
+            "line 4, column 12: max_rate: write a string or a number, not array",
             "line 5, column 8: http: invalid value 'lab'",
             "line 7, column 2: unknown key 'page'",
         ] {
@@ -265,7 +264,7 @@ mod tests {
         let again = settled(&printed, &[]).unwrap();
         let again: Vec<OsString> =
             ["serve".into()].into_iter().chain(again.into_iter().map(Into::into)).collect();
-        // But for the arena, whose path is now the file's.
+        // Except the arena, whose path is relative to the file.
         let second: toml::Table = to_toml(&matches(&again)).parse().unwrap();
         let without = |mut table: toml::Table| {
             table.remove(ARENA);
@@ -275,11 +274,11 @@ mod tests {
     }
 
     #[test]
-    fn the_shipped_file_is_read() {
+    fn the_shipped_file_is_valid() {
         let text = include_str!("../server.toml");
         let line = settled(text, &[]).unwrap();
         assert!(line.iter().any(|word| word == "HERE/hall/arena.toml"), "{line:?}");
-        // Every key is in it, if only as a comment.
+        // Every key is in it, at least as a comment.
         for argument in command().get_arguments().filter(|argument| is_setting(argument)) {
             let key = key(argument);
             let is_there = text.lines().any(|line| {

@@ -1,4 +1,4 @@
-//! The end of the program: one flag that threads poll and tasks await.
+//! Stop signal of the program, which threads poll and tasks await.
 
 use std::sync::Arc;
 
@@ -6,7 +6,7 @@ use anyhow::Result;
 use tokio::sync::watch;
 use vizflyt_process::{on_interrupt, on_orphaned};
 
-/// A request to end, shared by all threads and tasks; set once, for good.
+/// Stop signal shared by all threads and tasks; set once and never reset.
 #[derive(Clone, Debug)]
 pub struct Stop(Arc<watch::Sender<bool>>);
 
@@ -17,8 +17,7 @@ impl Default for Stop {
 }
 
 impl Stop {
-    /// Returns one that is set when this one is, and may be set before. Must run within a tokio
-    /// runtime.
+    /// Returns a signal that is set when this one is, and may be set before. Must run within a tokio runtime.
     pub fn child(&self) -> Self {
         let (parent, child) = (self.clone(), Self::default());
         let heir = child.clone();
@@ -31,24 +30,24 @@ impl Stop {
         child
     }
 
-    /// Asks everything to end.
+    /// Sets the signal.
     pub fn set(&self) {
         self.0.send_replace(true);
     }
 
-    /// Whether the end was asked for.
+    /// Returns whether the signal is set.
     pub fn is_set(&self) -> bool {
         *self.0.borrow()
     }
 
-    /// Completes when the end is asked for.
+    /// Completes when the signal is set.
     pub async fn wait(&self) {
         let mut receiver = self.0.subscribe();
-        // An error means that the sender is gone; `self` holds it.
+        // An error would mean that the sender is dropped, but `self` holds it.
         let _ = receiver.wait_for(|set| *set).await;
     }
 
-    /// Sets the flag on SIGINT, SIGTERM, and with `lifeline` when standard input ends.
+    /// Sets the signal on SIGINT, SIGTERM, and with `lifeline` when standard input closes.
     pub fn on_signals(&self, lifeline: bool) -> Result<()> {
         let stop = self.clone();
         on_interrupt(move || {

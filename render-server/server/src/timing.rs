@@ -1,8 +1,8 @@
-//! How long stages take and how often things happen.
+//! Durations of stages, and rates.
 //!
-//! Stages bear the names of the tracing spans: `pose render encode send`. Each thread adds to its
-//! own [`StageDurations`]; the page reads the recent past, the report the whole run. These are the
-//! times that the server *works*; what a stage adds to an image's age the runtime reports
+//! Stages have the names of the tracing spans: `pose render encode send`. Each thread adds to its own
+//! [`StageDurations`]; the page reads the recent samples, the report the complete run. The durations count only
+//! the server's work; the runtime reports the contribution of each stage to an image's age
 //! ([`vizflyt_protocol::messages::Timing`]).
 
 use std::sync::Mutex;
@@ -21,7 +21,7 @@ pub struct StageDurations(Mutex<Samples>);
 struct Samples {
     recent: [f32; RECENT],
     next: usize,
-    /// Of the whole run.
+    /// Samples of the whole run.
     overall: Box<Histogram>,
 }
 
@@ -67,12 +67,12 @@ impl StageDurations {
     }
 }
 
-/// Measures the rate of a running total.
+/// Measures the rate of a counter.
 #[derive(Debug, Default)]
 pub struct RateMeter(Mutex<Option<(ServerTime, u64, f64)>>);
 
 impl RateMeter {
-    /// Takes a running total at `now`; returns its rate, renewed twice a second. [1/s]
+    /// Returns the rate of a counter with the value `total` at `now`, updated twice a second. [1/s]
     pub fn of(&self, total: u64, now: ServerTime) -> f64 {
         let mut state = lock(&self.0);
         let (since, then, rate) = *state.get_or_insert((now, total, 0.0));
@@ -86,7 +86,7 @@ impl RateMeter {
     }
 }
 
-/// Samples behind the page's figures: 4 s at 60 Hz.
+/// Number of samples for the page: 4 s at 60 Hz.
 const RECENT: usize = 256;
 
 #[cfg(test)]
@@ -107,7 +107,7 @@ mod tests {
         let overall = durations.overall();
         assert!((overall.p50 / 100.0 - 1.0).abs() < 0.03, "{overall:?}");
         assert!((overall.p99 / 198.0 - 1.0).abs() < 0.03, "{overall:?}");
-        // Extremes land in the end buckets.
+        // Extremes are in the end buckets.
         durations.add_ms(-1.0);
         durations.add_ms(f64::NAN);
         durations.add_ms(1e12);

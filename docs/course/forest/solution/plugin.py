@@ -1,4 +1,4 @@
-"""The forest, fast: keeps a map of what depth images have shown, and flies the best of many ways across it."""
+"""The forest at high speed: keeps a map of the depth images, and flies the best of many candidate paths."""
 
 import math
 
@@ -10,24 +10,24 @@ import vizflyt
 from vizflyt import Setpoint
 
 MOST_MPS = 8.5
-BRAKE_MPS2, BRAKE_LATE_S = 1.6, 0.55  # with which the guard stops before the fence: asking for more is no use
-GUARD_M = 0.2  # the guard's own distance from the fence
-FENCE_M = 0.9  # kept from the fence beside, where the guard would turn the vehicle
-# A short brake at the start shows the guard how soon this vehicle answers; else it counts on less all the flight.
+BRAKE_MPS2, BRAKE_LATE_S = 1.6, 0.55  # with which the guard stops in front of the fence, so more speed is useless
+GUARD_M = 0.2  # the guard's distance from the fence
+FENCE_M = 0.9  # distance from the fence at the sides, where the guard would turn the vehicle
+# A short brake at the start shows the guard the vehicle's actual response; otherwise the guard assumes a slower one.
 SHOW_S = (0.8, 1.0)
-LEAD_MPS = 1.2  # asked for beyond what is flown: enough for the guard, and the direction stays the one that is meant
-BAND_M = 0.5  # obstacles are what stands so far above and below the height of flight
-LATENCY_S = 0.06  # until an answer acts
-OVER_S = 0.1  # over which acceleration is measured
+LEAD_MPS = 1.2  # lead of the setpoint over the velocity: enough for the guard, and it keeps the direction
+BAND_M = 0.5  # obstacles are within this distance above and below the flight height
+LATENCY_S = 0.06  # until a setpoint takes effect
+OVER_S = 0.1  # time over which acceleration is measured
 CLIMB_PER_S, CLIMB_MPS = 2.0, 1.0
-LOOK_AHEAD = 9  # the nose follows the way, so many steps on
-AHEAD_M = 20.0  # the map that is measured
+LOOK_AHEAD = 9  # the nose points at the path, this number of steps ahead
+AHEAD_M = 20.0  # part of the map with distances
 
 
 def box_of(volume, near_m):
     """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
     away_m = 10_000.0
-    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    probes_m = away_m * np.eye(3)  # far out on an axis, the distance to the box is the distance to one face
     low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
     return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
@@ -72,7 +72,7 @@ class Forest(vizflyt.Plugin):
         return Setpoint.velocity([*asked_mps, climb_mps], yaw=math.atan2(ahead_m[1], ahead_m[0]))
 
     def look(self, front):
-        """Takes an image into the map, laid out from where it was seen."""
+        """Adds an image to the map, from the pose at which it was rendered."""
         world_from_cam = front.pose_at_image @ front.body_from_cam
         rotation, camera_m = world_from_cam.rotation_matrix, world_from_cam.translation_m
         height_m = self.info.goal_m[2]
@@ -84,7 +84,7 @@ class Forest(vizflyt.Plugin):
         self.map.add(seen_m[inside])
 
     def motion(self, now_s, p_m, v_mps):
-        """Returns how the vehicle moves, with its acceleration over the last images."""
+        """Returns the vehicle's motion, with its acceleration over the last images."""
         self.flown.append((now_s, v_mps))
         while len(self.flown) > 2 and now_s - self.flown[1][0] >= OVER_S:
             del self.flown[0]
@@ -93,7 +93,7 @@ class Forest(vizflyt.Plugin):
         return primitives.Motion.seen(p_m, v_mps, primitives.shortened(a_mps2, primitives.ACCELERATION_MPS2))
 
     def stop_mps(self, p_m):
-        """Returns how fast the guard lets the vehicle fly from `p_m` (2,) towards the fence behind the goal. [m/s]"""
+        """Returns the maximum speed from `p_m` (2,) towards the fence behind the goal that the guard allows. [m/s]"""
         ahead = self.info.goal_m[:2] - p_m
         ahead /= max(math.hypot(*ahead), 1e-9)
         out_m = np.where(ahead > 0, self.high_m[:2] - p_m, p_m - self.low_m[:2])
@@ -102,7 +102,7 @@ class Forest(vizflyt.Plugin):
         return math.sqrt(late_mps**2 + 2.0 * BRAKE_MPS2 * max(free_m, 0.1)) - late_mps
 
     def room_m(self, p_m):
-        """Room beside the body at points (..., 2): to what was seen, and to the fence. [m]"""
+        """Returns the clearance beside the body at points (..., 2), to obstacles and to the fence. [m]"""
         to_fence_m = np.minimum(p_m - self.low_m[:2], self.high_m[:2] - p_m).min(axis=-1) - FENCE_M
         return np.minimum(self.map.room_m(p_m), to_fence_m) - self.info.body_radius_m
 

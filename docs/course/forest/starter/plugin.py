@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The forest, fast: maps what depth images show, and asks at each image for the best velocity that there is."""
+"""The forest at high speed: maps depth images, and chooses the best velocity at each image."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import vizflyt
 from vizflyt import Setpoint
 
 MOST_MPS = 3.0  # the course allows 10
-BAND_M = 0.5  # obstacles are what stands so far above and below the height of flight
-FENCE_M = 0.9  # kept from the fence beside, where the guard would turn the vehicle
-LATENCY_S = 0.06  # until an answer acts
-OVER_S = 0.1  # over which acceleration is measured
+BAND_M = 0.5  # obstacles are within this distance above and below the flight height
+FENCE_M = 0.9  # distance from the fence at the sides, where the guard would turn the vehicle
+LATENCY_S = 0.06  # until a setpoint takes effect
+OVER_S = 0.1  # time over which acceleration is measured
 CLIMB_PER_S, CLIMB_MPS = 2.0, 1.0
-LOOK_AHEAD = 9  # the nose follows the way, so many steps on
-AHEAD_M = 20.0  # the map that is measured
+LOOK_AHEAD = 9  # the nose points at the path, this number of steps ahead
+AHEAD_M = 20.0  # part of the map with distances
 
 
 def box_of(volume, near_m):
     """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
     away_m = 10_000.0
-    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    probes_m = away_m * np.eye(3)  # far out on an axis, the distance to the box is the distance to one face
     low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
     return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
@@ -63,7 +63,7 @@ class Forest(vizflyt.Plugin):
         return Setpoint.velocity([*self.wanted_mps, climb_mps], yaw=math.atan2(ahead_m[1], ahead_m[0]))
 
     def look(self, front):
-        """Takes an image into the map, laid out from where it was seen."""
+        """Adds an image to the map, from the pose at which it was rendered."""
         world_from_cam = front.pose_at_image @ front.body_from_cam
         rotation, camera_m = world_from_cam.rotation_matrix, world_from_cam.translation_m
         height_m = self.info.goal_m[2]
@@ -75,7 +75,7 @@ class Forest(vizflyt.Plugin):
         self.map.add(seen_m[inside])
 
     def motion(self, now_s, p_m, v_mps):
-        """Returns how the vehicle moves, with its acceleration over the last images."""
+        """Returns the vehicle's motion, with its acceleration over the last images."""
         self.flown.append((now_s, v_mps))
         while len(self.flown) > 2 and now_s - self.flown[1][0] >= OVER_S:
             del self.flown[0]
@@ -84,7 +84,7 @@ class Forest(vizflyt.Plugin):
         return primitives.Motion.seen(p_m, v_mps, primitives.shortened(a_mps2, primitives.ACCELERATION_MPS2))
 
     def room_m(self, p_m):
-        """Room beside the body at points (..., 2): to what was seen, and to the fence. [m]"""
+        """Returns the clearance beside the body at points (..., 2), to obstacles and to the fence. [m]"""
         to_fence_m = np.minimum(p_m - self.low_m[:2], self.high_m[:2] - p_m).min(axis=-1) - FENCE_M
         return np.minimum(self.map.room_m(p_m), to_fence_m) - self.info.body_radius_m
 

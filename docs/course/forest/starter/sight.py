@@ -1,22 +1,22 @@
-"""What stands about: obstacles of depth images, kept on a map of the whole course, seen from above. No flight in it.
+"""Obstacles from depth images, kept on a map of the complete course, seen from above. No flight code.
 
-What an image does not show any more is kept, as in P. Florence, J. Carter, J. Ware and R. Tedrake, "NanoMap: fast,
-uncertainty-aware proximity queries with lazy search over local 3D data" (ICRA 2018); here the fence bounds a grid, and
-trunks stand upright. Distances by two passes, along one axis, then along the other: P. Felzenszwalb and
+Obstacles outside the image are kept, as in P. Florence, J. Carter, J. Ware and R. Tedrake, "NanoMap: fast,
+uncertainty-aware proximity queries with lazy search over local 3D data" (ICRA 2018). Here the fence bounds a grid, and
+trunks are vertical. Distances by two passes, along one axis, then along the other: P. Felzenszwalb and
 D. Huttenlocher, "Distance transforms of sampled functions" (Theory of Computing 8, 2012).
 """
 
 import numpy as np
 
-CELL_M = 0.1  # a trunk is two to five of them
-FAR_M = 18.0  # what is farther is none: a column of pixels is 11 cm wide there
-REACH = 12  # distances are known up to so many cells
-MOST_HITS = 6  # what was seen long is forgotten within a few images nevertheless, if one sees through it
-THROUGH_M = 0.4  # seen through: something so much farther is seen there
+CELL_M = 0.1  # a trunk is two to five cells wide
+FAR_M = 18.0  # maximum range of obstacles, where a column of pixels is 11 cm wide
+REACH = 12  # maximum distance [cells]
+MOST_HITS = 6  # limit, so that a few images that see through a cell remove it
+THROUGH_M = 0.4  # a surface this much further away means that the cell is free
 
 
 class Rays:
-    """Directions of a camera's pixels, of every second row: shape (3, H / 2, W), with 1 along the axis. [cam]"""
+    """Directions of a camera's pixels in every second row: shape (3, H / 2, W), with 1 along the axis. [cam]"""
 
     def __init__(self, intrinsics):
         v, u = np.meshgrid(np.arange(0, intrinsics.height_px, 2), np.arange(intrinsics.width_px), indexing="ij")
@@ -28,15 +28,15 @@ class Rays:
 def obstacles(depth_mm, rays, world_from_cam, camera_m, low_m, high_m):
     """Returns the nearest obstacle of each column of a depth image: shape (N, 2), from above. [m, world]
 
-    `depth_mm` has shape (H, W), 0 is no return; `world_from_cam` is a rotation (3, 3), `camera_m` (3,) the place of the
-    camera. What lies below `low_m` or above `high_m` is none. [m, world]
+    `depth_mm` has shape (H, W), where 0 means no return; `world_from_cam` is a rotation (3, 3), `camera_m` (3,) the
+    position of the camera. Points below `low_m` or above `high_m` are not obstacles. [m, world]
     """
-    # Yours: points of pixels, those that count, the nearest of each column. So far there is nothing to be seen.
+    # To do: points of the pixels, the relevant ones, the nearest of each column. For now there are no obstacles.
     return np.empty((0, 2))
 
 
 class Map:
-    """What was seen, on a grid from above: how often, less how often one saw through it."""
+    """Observations on a grid from above: hits of each cell, minus the times that the camera saw through it."""
 
     def __init__(self, low_m, high_m):
         """Covers `low_m` (2,) to `high_m` (2,). [m, world]"""
@@ -57,7 +57,7 @@ class Map:
         self.hits.flat[at] = np.minimum(self.hits.flat[at] + 1, MOST_HITS)
 
     def see_through(self, depth_mm, intrinsics, world_from_cam, camera_m, height_m):
-        """Takes away from what an image shows something well behind of, at the height of flight. [m, world]"""
+        """Reduces cells at the flight height if the image shows a surface well behind them. [m, world]"""
         cell = np.argwhere(self.hits > 0)
         p_m = np.column_stack([self.low_m + (cell + 0.5) * CELL_M, np.full(len(cell), height_m)])
         p_cam_m = (p_m - camera_m) @ world_from_cam
@@ -68,13 +68,13 @@ class Map:
         ahead = (p_cam_m[:, 2] > 0.3) & (u >= 3) & (v >= 0) & (u < columns - 3) & (v < rows)
         cell, z_m, u, v = cell[ahead], z_m[ahead], u[ahead].astype(int), v[ahead].astype(int)
         through = np.ones(len(cell), bool)
-        for beside in (-3, 0, 3):  # one pixel beside a trunk's edge proves nothing
+        for beside in (-3, 0, 3):  # one pixel next to a trunk's edge proves nothing
             through &= depth_mm[v, u + beside] * 1e-3 > z_m + THROUGH_M
         at = cell[through]
         self.hits[at[:, 0], at[:, 1]] -= 1
 
     def measure(self, p_m, ahead_m):
-        """Works out the distance to the nearest obstacle in all cells from 2 m before `p_m` (2,) along x to `ahead_m`
+        """Computes the distance to the nearest obstacle in all cells from 2 m before `p_m` (2,) along x to `ahead_m`
         beyond. [m, world]"""
         first, last = self.cells(np.array([[p_m[0] - 2.0, 0.0], [p_m[0] + ahead_m, 0.0]]))[:, 0]
         first = max(first - REACH, 0)

@@ -11,7 +11,7 @@ def at_speed(speed_mps, p_m=ZERO):
 
 
 def trunks(*centres_m, radius_m=0.2):
-    """Returns the room beside a body of 0.12 m among trunks, up to 1.2 m."""
+    """Returns the clearance of a body of 0.12 m among trunks, up to 1.2 m."""
 
     def room_m(p_m):
         away_m = [np.hypot(*np.moveaxis(p_m - np.array(centre), -1, 0)) - radius_m for centre in centres_m]
@@ -31,14 +31,14 @@ def test_a_vehicle_gets_to_what_is_asked_and_not_at_once():
 
 
 def test_nothing_in_the_way_is_straight_on_and_fast():
-    """So far fails: it goes straight, but no faster than 1 m/s."""
+    """So far fails: it flies straight, but at most at 1 m/s."""
     velocity_mps, way_m = primitives.best(at_speed(6.0), GOAL_M, 8.0, trunks((50.0, 50.0)))
     assert velocity_mps[0] > 7.5 and abs(velocity_mps[1]) < 0.9
     assert way_m.shape == (primitives.STEPS, 2) and way_m[-1, 0] > 12.0 and abs(way_m[-1, 1]) < 0.5
 
 
 def test_a_trunk_in_the_way_is_passed_without_a_touch():
-    """So far fails: it creeps."""
+    """So far fails: it flies too slowly."""
     for side_m in (-0.05, 0.05):
         room_m = trunks((8.0, side_m))
         velocity_mps, way_m = primitives.best(at_speed(6.0), GOAL_M, 8.0, room_m)
@@ -47,7 +47,7 @@ def test_a_trunk_in_the_way_is_passed_without_a_touch():
 
 
 def test_a_gap_between_trunks_is_taken_in_its_middle():
-    """So far fails: it goes straight on, and does not look."""
+    """So far fails: it flies straight and ignores the trunks."""
     room_m = trunks((9.0, -1.4), (9.0, -0.1), (9.0, 1.8), (9.0, 3.0))
     _, way_m = primitives.best(at_speed(5.0), GOAL_M, 7.0, room_m)
     assert room_m(way_m).min() > 0.35

@@ -6,7 +6,7 @@ import sight
 import vizflyt
 
 CAMERA = vizflyt.Intrinsics.from_horizontal_fov(320, 240, np.pi / 2)
-# Level, along world x: right is -y, down is -z.
+# A level camera along world x: right is -y, down is -z.
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 CAMERA_M = np.array([2.0, 1.0, 1.2])
 
@@ -16,7 +16,7 @@ def seen(depth_mm):
 
 
 def test_an_obstacle_is_where_it_stands():
-    """So far fails: nothing is seen. A trunk of 20 columns, 4 m ahead, and the nearest counts."""
+    """So far fails: there are no obstacles. A trunk of 20 columns, 4 m ahead; its nearest point counts."""
     depth_mm = np.full((240, 320), 9000)
     depth_mm[:, 150:170] = 4000
     points_m = seen(depth_mm)
@@ -27,7 +27,7 @@ def test_an_obstacle_is_where_it_stands():
 
 
 def test_floor_crowns_distance_and_no_return_are_no_obstacles():
-    """Of a floor 1.2 m below, of what hangs higher than the band, of 20 m, and of 0 nothing is left."""
+    """A floor 1.2 m below, a crown above the band, a distance of 20 m, and 0 are not obstacles."""
     rows = np.arange(240)[:, None] + 0.5 - CAMERA.cy_px
     down = np.where(rows > 0, CAMERA.fy_px * 1200.0 / np.maximum(rows, 1e-9), 0.0)
     floor_mm = np.broadcast_to(np.where(down < 60_000, down, 0.0), (240, 320))
@@ -39,7 +39,7 @@ def test_floor_crowns_distance_and_no_return_are_no_obstacles():
 
 
 def test_two_pixels_are_no_obstacle():
-    """So far fails: nothing is seen. Behind them something stands, and that is seen."""
+    """So far fails: there are no obstacles. The surface behind the two pixels is an obstacle."""
     depth_mm = np.full((240, 320), 9000)
     depth_mm[118:122:2, 40] = 1500
     points_m = seen(depth_mm)

@@ -1,4 +1,4 @@
-"""Project 1, the reference: Madgwick's filter for a gyroscope and an accelerometer.
+"""Project 1, reference solution: Madgwick's filter for a gyroscope and an accelerometer.
 
 S. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", report, University of
 Bristol, 2010: equations 25 and 26 (objective and gradient, here with z up and q from body to world), 44 (the step along
@@ -10,17 +10,17 @@ from __future__ import annotations
 import numpy as np
 from attitude import F64, IDENTITY, is_quiet, level, multiply
 
-# Rate of the step along the gradient, of the quaternion's parts, and growth of the bias. [1/s], [rad/s^2]
+# Step size along the gradient for the quaternion's components, and for the bias. [1/s], [rad/s^2]
 BETA, ZETA = 0.004, 2e-5
-# A filter that begins in the air knows neither tilt nor bias: until these over the time that has passed are less, they
-# count instead. [1], [rad/s]
+# A filter that starts in the air has neither tilt nor bias: these values, divided by the elapsed time, apply while they
+# are larger. [1], [rad/s]
 FIRST_BETA, FIRST_ZETA = 0.4, 0.1
-# The mean of so many readings at rest is believed, in steps of so many. [readings]
+# Number of samples at rest in one test, after which their mean is accepted. [samples]
 REST = 50
 
 
 def gradient(q_xyzw: F64, accel_mps2: F64) -> F64:
-    """Returns how |up_in_body(q) - accel / |accel||^2 / 2 grows with each part of the quaternion, shape (4,)."""
+    """Returns the gradient of |up_in_body(q) - accel / |accel||^2 / 2 by the quaternion's components, shape (4,)."""
     x, y, z, w = q_xyzw
     ax, ay, az = accel_mps2 / np.linalg.norm(accel_mps2)
     off = np.array([2 * (x * z - w * y) - ax, 2 * (y * z + w * x) - ay, 1 - 2 * (x * x + y * y) - az])
@@ -29,11 +29,11 @@ def gradient(q_xyzw: F64, accel_mps2: F64) -> F64:
 
 
 class Filter:
-    """Turns readings into an attitude, one after the other."""
+    """Estimates the attitude from one sample after the other."""
 
     def __init__(self) -> None:
         self.q_xyzw: F64 = IDENTITY
-        """The attitude: body to `odom`, x y z w."""
+        """Attitude: body to `odom`, x y z w."""
         self.bias_radps: F64 = np.zeros(3)
         self._at_s: float | None = None
         self._standing: list[tuple[F64, F64]] | None = []
@@ -41,7 +41,7 @@ class Filter:
         self._moving_s = 0.0
 
     def update(self, at_s: float, gyro_radps: F64, accel_mps2: F64) -> None:
-        """Takes a reading of the instant `at_s`: angular velocity and specific force, shape (3,), body axes."""
+        """Processes a sample at the instant `at_s`: angular velocity and specific force, shape (3,), body axes."""
         if self._standing is not None:
             self._stand(gyro_radps, accel_mps2)
         if self._at_s is not None:
@@ -49,7 +49,7 @@ class Filter:
         self._at_s = at_s
 
     def _stand(self, gyro_radps: F64, accel_mps2: F64) -> None:
-        """While it stands, means of the readings are the bias and the tilt; from the first motion on, no longer."""
+        """Sets bias and tilt to the means of the samples at rest. Stops at the first motion."""
         assert self._standing is not None
         self._standing.append((gyro_radps, accel_mps2))
         if len(self._standing) % REST:
@@ -70,7 +70,7 @@ class Filter:
             slope = gradient(q, accel_mps2)
             length = np.linalg.norm(slope)
             step = slope / length if length > 1e-9 else step
-        # What the step stands for, as an angular velocity in body axes.
+        # The step as an angular velocity in body axes.
         wrong_radps = 2 * multiply(q * [-1.0, -1.0, -1.0, 1.0], step)[:3]
         self.bias_radps = self.bias_radps + zeta * wrong_radps * dt_s
         rate = multiply(q, np.append(gyro_radps - self.bias_radps, 0.0)) / 2

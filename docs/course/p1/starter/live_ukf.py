@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The same filter in flight."""
+"""Runs the same filter in flight."""
 
 from flight import AttitudeFlight
 from ukf import Filter

@@ -1,4 +1,4 @@
-"""Project 1: attitude by Madgwick's filter. This is the file to work in; graduates also in ukf.py."""
+"""Project 1: attitude with Madgwick's filter. Work in this file; graduates also in ukf.py."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from attitude import F64, IDENTITY, exp, multiply
 
 
 class Filter:
-    """Turns readings into an attitude, one after the other."""
+    """Estimates the attitude from one sample after the other."""
 
     def __init__(self) -> None:
         self.q_xyzw: F64 = IDENTITY
-        """The attitude: body to `odom`, x y z w."""
+        """Attitude: body to `odom`, x y z w."""
         self._at_s: float | None = None
 
     def update(self, at_s: float, gyro_radps: F64, accel_mps2: F64) -> None:
-        """Takes a reading of the instant `at_s`: angular velocity and specific force, shape (3,), body axes."""
+        """Processes a sample at the instant `at_s`: angular velocity and specific force, shape (3,), body axes."""
         if self._at_s is not None:
-            # So far only the gyroscope counts. Madgwick's step along the gradient, and his bias, belong here.
+            # To do: only the gyroscope counts here. Add Madgwick's step along the gradient, and his bias.
             dt_s = at_s - self._at_s
             self.q_xyzw = multiply(self.q_xyzw, exp(gyro_radps * dt_s))
             self.q_xyzw /= (self.q_xyzw @ self.q_xyzw) ** 0.5
@@ -24,9 +24,9 @@ class Filter:
 
 
 def gradient(q_xyzw: F64, accel_mps2: F64) -> F64:
-    """Returns how |up_in_body(q) - accel / |accel||^2 / 2 grows with each part of the quaternion, shape (4,).
+    """Returns the gradient of |up_in_body(q) - accel / |accel||^2 / 2 by the quaternion's components, shape (4,).
 
-    So far by small differences, which is slow; the assignment derives it.
+    To do: this uses small differences, which is slow. Derive it, as in the assignment.
     """
     from attitude import up_in_body
 

@@ -1,6 +1,6 @@
-"""What the filters of project 1 have to do, on readings without noise: `python -m pytest` in your folder.
+"""Requirements of project 1's filters, on samples without noise: `python -m pytest` in your folder.
 
-Those marked "so far fails" are yours to mend.
+Tests marked "so far fails" pass with a correct solution.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ HZ = 100
 
 
 def run(filter_, seconds, gyro_radps, accel_mps2, from_s=0.0):
-    """Gives a filter the same reading for some seconds; returns when the last one was."""
+    """Passes the same sample to a filter for some seconds. Returns the time of the end."""
     count = round(seconds * HZ)
     for index in range(count):
         filter_.update(from_s + index / HZ, np.array(gyro_radps, float), np.array(accel_mps2, float))
@@ -45,7 +45,7 @@ def test_a_turn_that_begins_at_once_is_followed():
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_tilted_body_at_rest_is_seen_as_tilted(axis):
-    """So far fails: the accelerometer is not looked at."""
+    """So far fails: the accelerometer is ignored."""
     turn_rad = np.zeros(3)
     turn_rad[axis] = np.radians(12)
     true_xyzw = exp(turn_rad)
@@ -56,7 +56,7 @@ def test_a_tilted_body_at_rest_is_seen_as_tilted(axis):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_bias_does_not_add_up_at_rest(axis):
-    """So far fails: a bias of 1 deg/s is a minute's turn of 60 degrees."""
+    """So far fails: a bias of 1 deg/s adds up to 60 degrees in a minute."""
     bias_radps = np.zeros(3)
     bias_radps[axis] = np.radians(1.0)
     filter_ = Filter()
@@ -72,7 +72,7 @@ def test_a_short_push_is_no_tilt():
 
 
 def test_it_finds_level_and_bias_while_it_moves():
-    """So far fails: a filter that begins in the air knows neither."""
+    """So far fails: a filter that starts in the air has neither level nor bias."""
     filter_, bias_radps = Filter(), np.radians([1.0, -1.0, 0.0])
     true_xyzw = exp(np.radians([20.0, -15.0, 0.0]))
     for index in range(60 * HZ):
@@ -89,7 +89,7 @@ def test_the_gradient_is_that_of_the_objective():
         q, force = random.normal(size=4), random.normal(size=3)
         q, force = q / np.linalg.norm(q), force / np.linalg.norm(force)
         steps = 1e-6 * np.eye(4)
-        # Off the unit quaternions the objective is that of 1 - 2 (x^2 + y^2) for the last row, as in the assignment.
+        # For non-unit quaternions the objective uses 1 - 2 (x^2 + y^2) in the last row, as in the assignment.
         numeric = [(objective(q + step, force) - objective(q - step, force)) / 2e-6 for step in steps]
         across = np.eye(4) - np.outer(q, q)
         np.testing.assert_allclose(across @ gradient(q, 9.0 * force), across @ numeric, atol=1e-6)

@@ -1,4 +1,4 @@
-"""What the unscented Kalman filter has to do besides: `python -m pytest` in your folder. Of graduates."""
+"""Additional requirements of the unscented Kalman filter, for graduates: `python -m pytest` in your folder."""
 
 import numpy as np
 from attitude import GRAVITY_MPS2, conjugate, exp, log, multiply, up_in_body
@@ -8,7 +8,7 @@ HZ = 100
 
 
 def fly(seconds, bias_radps):
-    """Runs the filter in the air, on readings without noise; returns it, and the true attitude."""
+    """Runs the filter in the air, on samples without noise. Returns it, and the true attitude."""
     filter_ = Filter()
     true_xyzw = exp(np.radians([20.0, -15.0, 0.0]))
     for index in range(seconds * HZ):
@@ -32,7 +32,7 @@ def test_the_mean_of_turns_is_the_one_they_lie_around():
 
 
 def test_it_finds_level_and_bias_while_it_moves():
-    """So far fails: a filter that begins in the air knows neither."""
+    """So far fails: a filter that starts in the air has neither level nor bias."""
     bias_radps = np.radians([1.0, -1.0, 0.0])
     filter_, true_xyzw = fly(30, bias_radps)
     cosine = up_in_body(filter_.q_xyzw) @ up_in_body(true_xyzw)
@@ -41,7 +41,7 @@ def test_it_finds_level_and_bias_while_it_moves():
 
 
 def test_it_knows_what_it_knows():
-    """So far fails: the covariance stays as it was. What an accelerometer cannot tell is the heading."""
+    """So far fails: the covariance does not change. An accelerometer does not measure the heading."""
     filter_, _ = fly(20, np.zeros(3))
     covariance = filter_.covariance
     np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Project 2, the reference: a path through a known map by A*. No vehicle, no `vizflyt`: functions of room."""
+"""Project 2, reference solution: a path through a known map with A*. Uses neither the vehicle nor `vizflyt`."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
-# Room about the body's centre: points (N, 3) [m] to (N,) [m]; (1) of the assignment.
+# Clearance of the body's centre: points (N, 3) [m] to (N,) [m]; (1) of the assignment.
 Room = Callable[[F64], F64]
 
-# Halves of a segment that are shorter than this, and still not shown to be free, count as not free. [m]
+# Parts of a segment shorter than this that are not proven to be free count as blocked. [m]
 SHORTEST_M = 0.005
 
 
 def are_free(room: Room, from_m: F64, to_m: F64, margin_m: float = 0.0) -> npt.NDArray[np.bool_]:
-    """Says which segments from points (N, 3) to points (N, 3) have more than `margin_m` of room all along: shape (N,).
+    """Returns which segments from points (N, 3) to points (N, 3) have a clearance above `margin_m` everywhere: (N,).
 
-    Room changes by at most 1 m per metre. So what is left at the middle, if it is more than half of the length, is
-    enough for all of it; if not, the halves are asked.
+    Clearance changes by at most 1 m per metre. A segment is free if the clearance at its middle, minus the margin, is
+    more than half of its length. Otherwise both halves are checked.
     """
     free = np.ones(len(from_m), bool)
     of = np.arange(len(from_m))
@@ -38,7 +38,7 @@ def are_free(room: Room, from_m: F64, to_m: F64, margin_m: float = 0.0) -> npt.N
 
 
 def is_free(room: Room, from_m: F64, to_m: F64, margin_m: float = 0.0) -> bool:
-    """Says whether one segment, between points (3,), has more than `margin_m` of room all along."""
+    """Returns whether a segment between points (3,) has a clearance above `margin_m` everywhere."""
     return bool(are_free(room, np.asarray(from_m)[None], np.asarray(to_m)[None], margin_m)[0])
 
 
@@ -57,13 +57,13 @@ def astar(
     spacing_m: float = 0.1,
     margin_m: float = 0.3,
 ) -> F64 | None:
-    """Finds a path on a grid within the box from `low_m` to `high_m`, with more than `margin_m` of room all along.
+    """Finds a path on a grid within the box from `low_m` to `high_m`, with a clearance above `margin_m` everywhere.
 
-    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not
-    so much room. [m, world]
+    Returns its points (N, 3), `start_m` first and `goal_m` last. None if there is no path, or if start or goal have too
+    little clearance. [m, world]
     """
     start_m, goal_m = np.asarray(start_m, float), np.asarray(goal_m, float)
-    # The start is a node. A rim of nodes that are not free spares the search to look where the grid ends.
+    # The start is a node. A border of blocked nodes makes bounds checks unnecessary.
     before = np.floor((start_m - low_m) / spacing_m).astype(int) + 1
     after = np.floor((high_m - start_m) / spacing_m).astype(int) + 1
     shape = before + after + 1
@@ -87,7 +87,7 @@ def astar(
     offsets = steps @ np.array([shape[1] * shape[2], shape[2], 1])
     edges_m = spacing_m * np.linalg.norm(steps, axis=1)
     apart = np.sort(np.abs(nodes_m - nodes_m[end]), axis=1)
-    guess_m = apart @ np.array([3**0.5 - 2**0.5, 2**0.5 - 1, 1.0])  # (3): the least difference first
+    guess_m = apart @ np.array([3**0.5 - 2**0.5, 2**0.5 - 1, 1.0])  # (3): the smallest difference first
 
     cost_m = np.full(len(nodes_m), np.inf)
     parent = np.full(len(nodes_m), -1)
@@ -102,7 +102,7 @@ def astar(
             continue
         closed[here] = True
         there = here + offsets
-        # Along an edge room is nowhere less than half of what its ends have together, less half of its length.
+        # Lower bound of the clearance on an edge: half of the sum of its ends, minus half of its length.
         least_m = 0.5 * (room_m[here] + room_m[there] - edges_m)
         through_m = cost_m[here] + edges_m
         better = (least_m > margin_m) & (through_m < cost_m[there]) & ~closed[there]
@@ -121,12 +121,12 @@ def astar(
 
 
 def shorten(room: Room, path_m: F64, margin_m: float = 0.3) -> F64:
-    """Leaves out the points of a path (N, 3) that it can do without: from each on to the last that it sees freely."""
+    """Removes unnecessary points of a path (N, 3): connects each point with the last one that is freely visible."""
     kept = [0]
     while kept[-1] < len(path_m) - 1:
         here = kept[-1]
         later = np.arange(here + 1, len(path_m))
         seen = are_free(room, np.tile(path_m[here], (len(later), 1)), path_m[later], margin_m)
-        # The path's own next edge is free, whatever the last digit says.
+        # The path's next edge is always free, in spite of rounding.
         kept.append(int(later[seen].max(initial=here + 1)))
     return path_m[kept]

@@ -1,4 +1,4 @@
-"""Project 2, the reference for graduates: RRT*, and polynomials through its points. No vehicle, no `vizflyt`."""
+"""Project 2, reference solution for graduates: RRT*, and polynomials through its points. No vehicle, no `vizflyt`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from planner import F64, Room, are_free
 
 DEGREE = 7
-# Turns in which the pieces' times settle.
+# Iterations for the durations of the pieces.
 ROUNDS = 20
 
 
@@ -24,10 +24,10 @@ def rrt_star(
     margin_m: float = 0.3,
     eta_m: float = 1.0,
 ) -> F64 | None:
-    """Grows a tree of `nodes` nodes within the box from `low_m` to `high_m`, with more than `margin_m` of room.
+    """Grows a tree of `nodes` nodes within the box from `low_m` to `high_m`, with a clearance above `margin_m`.
 
-    More nodes from the same seed are the same tree, grown further. Returns the best path (N, 3), `start_m` first and
-    `goal_m` last; None if none was found in ten draws a node, or if start or goal have not so much room. [m, world]
+    More nodes with the same seed extend the same tree. Returns the best path (N, 3), `start_m` first and `goal_m` last.
+    None if none was found in ten draws per node, or if start or goal have too little clearance. [m, world]
     """
     random = np.random.default_rng(seed)
     start_m, goal_m = np.asarray(start_m, float), np.asarray(goal_m, float)
@@ -44,7 +44,7 @@ def rrt_star(
     for _ in range(10 * nodes):
         if count == nodes:
             break
-        # The goal is drawn now and then, until it is a node.
+        # Draw the goal from time to time, until it is a node.
         drawn_m = goal_m if goal < 0 and random.random() < 0.05 else random.uniform(low_m, high_m)
         apart_m = np.linalg.norm(points_m[:count] - drawn_m, axis=1)
         nearest = int(apart_m.argmin())
@@ -67,7 +67,7 @@ def rrt_star(
         points_m[new], cost_m[new], parent[new] = new_m, through_m[best], near[best]
         children[near[best]].append(new)
         goal = new if is_goal else goal
-        # What is reached more cheaply over the new node is hung there, and all that hangs below it gets cheaper.
+        # Rewire nodes that are cheaper to reach over the new node, and reduce the cost of all nodes below them.
         for other in near[cost_m[near] > cost_m[new] + apart_m[near] + 1e-9].tolist():
             children[parent[other]].remove(other)
             children[new].append(other)
@@ -95,9 +95,9 @@ def powers(at_s: F64, derivative: int = 0) -> F64:
 
 
 def minimum_snap(points_m: F64, seconds: F64) -> F64:
-    """Solves (6): polynomials through points (N + 1, 3), at rest at both ends, piece i of `seconds[i]`.
+    """Solves (6): polynomials through points (N + 1, 3), at rest at both ends, piece i with duration `seconds[i]`.
 
-    Returns coefficients (N, 8, 3): piece i is the sum of `coefficients[i, k] t^k`, t from its own beginning. [m/s^k]
+    Returns coefficients (N, 8, 3): piece i is the sum of `coefficients[i, k] t^k`, with t from its beginning. [m/s^k]
     """
     pieces, width = len(seconds), DEGREE + 1
     snap = np.zeros((pieces * width, pieces * width))
@@ -136,7 +136,7 @@ def minimum_snap(points_m: F64, seconds: F64) -> F64:
 
 
 def curve(seconds: F64, coefficients: F64, at_s: F64, derivative: int = 0) -> F64:
-    """Returns place, or a derivative of it, at times (N,) of the whole curve: shape (N, 3). [m/s^d]"""
+    """Returns position, or a derivative of it, at times (N,) of the complete curve: shape (N, 3). [m/s^d]"""
     ends_s = np.cumsum(seconds)
     at_s = np.clip(at_s, 0.0, ends_s[-1])
     piece = np.minimum(np.searchsorted(ends_s, at_s, side="right"), len(seconds) - 1)
@@ -145,12 +145,12 @@ def curve(seconds: F64, coefficients: F64, at_s: F64, derivative: int = 0) -> F6
 
 
 def stretch(seconds: F64, coefficients: F64, factor: float) -> tuple[F64, F64]:
-    """Returns the same curve, flown `factor` times as slowly."""
+    """Returns the same curve, slower by `factor`."""
     return seconds * factor, coefficients / factor ** np.arange(DEGREE + 1)[None, :, None]
 
 
 def share_of_limits(seconds: F64, coefficients: F64, max_mps: float, max_mps2: float) -> F64:
-    """Returns by which factor each piece would have to be stretched to keep speed and acceleration: shape (N,)."""
+    """Returns the factor by which to stretch each piece to keep the limits of speed and acceleration: shape (N,)."""
     shares = np.linspace(0.0, 1.0, 20)
     piece = np.arange(len(seconds))
     greatest = []
@@ -164,8 +164,8 @@ def share_of_limits(seconds: F64, coefficients: F64, max_mps: float, max_mps2: f
 def timed(points_m: F64, max_mps: float, max_mps2: float) -> tuple[F64, F64]:
     """Returns times (N,) and coefficients (N, 8, 3) of polynomials through points (N + 1, 3) that keep the limits.
 
-    Begins with length over speed. Pieces that are too fast get longer, the others shorter, so that all come to a limit;
-    of what is tried, stretched until no piece is beyond, the fastest is taken.
+    Starts with length over speed. Extends pieces that are too fast, and shortens the others, so that all reach a limit.
+    Returns the fastest of the tried curves, stretched until no piece exceeds the limits.
     """
     seconds = np.linalg.norm(np.diff(points_m, axis=0), axis=1) / max_mps
     best_s, best = np.inf, (seconds, np.zeros((len(seconds), DEGREE + 1, 3)))
@@ -181,10 +181,10 @@ def timed(points_m: F64, max_mps: float, max_mps2: float) -> tuple[F64, F64]:
 def smooth(
     room: Room, path_m: F64, *, margin_m: float, max_mps: float, max_mps2: float, most_pieces: int = 40
 ) -> tuple[F64, F64] | None:
-    """Lays polynomials through a path (N, 3), with more than `margin_m` of room all along, within these limits.
+    """Fits polynomials to a path (N, 3), with a clearance above `margin_m` everywhere, within these limits.
 
-    Where the curve leaves too little room, the line there gets a point in its middle. Returns the pieces' times (M,)
-    [s] and coefficients (M, 8, 3) [m/s^k]; None if it does not fit with `most_pieces`.
+    If the curve has too little clearance, the line there gets a point in its middle. Returns the pieces' times (M,) [s]
+    and coefficients (M, 8, 3) [m/s^k]; None if `most_pieces` are not enough.
     """
     while len(path_m) - 1 <= most_pieces:
         seconds, coefficients = timed(path_m, max_mps, max_mps2)
@@ -197,8 +197,8 @@ def smooth(
 
 
 def too_tight(room: Room, seconds: F64, coefficients: F64, margin_m: float, max_mps: float) -> np.ndarray:
-    """Returns the pieces that leave `margin_m` of room or less somewhere. None is missed: between two places that are
-    less than `step_m` of way apart, room is at most half of that less than at the nearer one."""
+    """Returns the pieces with a clearance of at most `margin_m` somewhere. None is missed: between two samples less
+    than `step_m` apart, clearance is at most half of that below the clearance at the nearer one."""
     step_m = 0.02
     at_s = np.arange(0.0, float(seconds.sum()) + step_m / max_mps, step_m / max_mps)
     tight = room(curve(seconds, coefficients, at_s)) - 0.5 * step_m <= margin_m

@@ -1,6 +1,6 @@
-"""Project 2, the reference: undergraduates' A*, flown by waypoints; graduates' RRT* and polynomials, by velocities.
+"""Project 2, reference solution: undergraduates' A* with waypoints; graduates' RRT* and polynomials with velocities.
 
-Which of the two follows from what the level allows to ask for.
+The setpoints that the level allows determine the variant.
 """
 
 from itertools import product
@@ -12,36 +12,36 @@ from planner_g import curve, rrt_star, smooth
 import vizflyt
 from vizflyt import Setpoint
 
-# Room to plan with: the first that leaves a way (ug); the one whose curve is flown in the least time (g). [m]
+# Margins of clearance: the first with a path (ug); the one with the fastest curve (g). [m]
 MARGINS_M = (0.40, 0.35, 0.30, 0.25)
 
-# By waypoints: on the lines; and round a corner so that the velocity turns by no more than this, as a vehicle that lags
-# passes it the further out the more its velocity has to turn. [m/s]
+# For waypoints: speed on lines, and maximum change of velocity at a corner. A vehicle with lag overshoots a corner the
+# more, the more its velocity changes. [m/s]
 LINE_MPS, TURN_MPS = 1.6, 0.4
-# So far behind a corner it may be faster again. [m]
+# Distance behind a corner at which the speed may increase again. [m]
 CORNER_M = 0.3
 
-# What a curve leaves at least. [m]
+# Minimum clearance of a curve. [m]
 LEAST_M = 0.22
-# Trees for each margin, and their nodes: one alone may lead by a long way round.
+# Number of trees for each margin, and their nodes. A single tree may find only a long detour.
 TREES, NODES = 2, 600
 
-# By velocities. What is left to the limits of 3 m/s and 6 m/s^2 is for corrections. [m/s], [m/s^2]
+# For velocities: limits of the curve. The reserve to the limits of 3 m/s and 6 m/s^2 is for corrections. [m/s], [m/s^2]
 CURVE_MPS, CURVE_MPS2 = 2.6, 3.0
-# From a velocity that is asked for to the velocity, along x, y, z; measured on flights' logs (`sent` and `motion`). [s]
+# Lag of the velocity behind the setpoint along x, y, z, measured in flight logs (`sent` and `motion`). [s]
 LAG_S = np.array([0.40, 0.40, 0.20])
-# From where the vehicle was seen to when the answer counts. [s]
+# Delay from the vehicle's state to the effect of the setpoint. [s]
 AHEAD_S = 0.07
 # k of (7). [1/s]
 GAIN_PER_S = 1.0
-# The reference gets slower from this far before the vehicle on, and stands so far before it. [m]
+# The reference slows down at the first distance from the vehicle, and stops at the second. [m]
 WAITS_M, STANDS_M = 0.10, 0.40
 
 
 def box_of(volume: vizflyt.Volume, near_m: F64) -> tuple[F64, F64]:
     """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
     away_m = 10_000.0
-    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    probes_m = away_m * np.eye(3)  # far out on an axis, the distance to the box is the distance to one face
     low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
     return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
@@ -49,7 +49,7 @@ def box_of(volume: vizflyt.Volume, near_m: F64) -> tuple[F64, F64]:
 def slow_corners(path_m: F64) -> tuple[F64, F64]:
     """Returns waypoints (N, 3) along a path [m, world], and the speeds (N,) on the way to each: slow at corners. [m/s]
 
-    The runtime comes to a corner no faster than the way behind it is flown.
+    The runtime reaches a corner at most with the speed of the next segment.
     """
     ways_m = np.diff(path_m, axis=0)
     lengths_m = np.linalg.norm(ways_m, axis=1)
@@ -66,7 +66,7 @@ class Planned(vizflyt.Plugin):
     def on_start(self, info):
         self.info = info
         self.low_m, self.high_m = box_of(info.geofence, info.goal_m)
-        # A solid that does not reach into the fence is nowhere nearer than the fence: it never counts.
+        # Ignore solids that do not reach into the fence: the fence is always nearer.
         axes = [np.arange(low, high + 0.2, 0.2) for low, high in zip(self.low_m, self.high_m)]
         places_m = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         self.solids = [solid for solid in vizflyt.course_map() if solid.signed_distance_m(places_m).min() < 0.2]
@@ -82,12 +82,12 @@ class Planned(vizflyt.Plugin):
         self.flying |= event.details.get("phase") == "flying"
 
     def room(self, points_m):
-        """Room about the body's centre at points (N, 3): shape (N,). [m]"""
+        """Returns the clearance of the body's centre at points (N, 3): shape (N,). [m]"""
         distances_m = [solid.signed_distance_m(points_m) for solid in self.solids]
         return np.min([*distances_m, -self.info.geofence.signed_distance_m(points_m)], axis=0) - self.info.body_radius_m
 
     def plan_lines(self):
-        """Returns the way (N, 3) with most room to the sides that there is. [m, world]"""
+        """Returns the path (N, 3) with the largest possible margin. [m, world]"""
         for margin_m in MARGINS_M:
             path_m = astar(self.room, self.start_m, self.info.goal_m, self.low_m, self.high_m, margin_m=margin_m)
             if path_m is not None:
@@ -95,7 +95,7 @@ class Planned(vizflyt.Plugin):
         raise RuntimeError(f"no way with {MARGINS_M[-1]} m of room")
 
     def plan_curve(self):
-        """Returns the points (N, 3) of the curve that is flown in the least time; that curve is `seconds, pieces`."""
+        """Returns the points (N, 3) of the fastest curve; `seconds, pieces` are the curve."""
         ends_m = self.start_m, self.info.goal_m, self.low_m, self.high_m
         fastest_s, best_m = np.inf, None
         for margin_m, seed in product(MARGINS_M, range(TREES)):
@@ -126,14 +126,14 @@ class Planned(vizflyt.Plugin):
         return Setpoint.waypoints(*slow_corners(self.path_m))
 
     def follow_curve(self, obs):
-        """(7), with the lag's own term; published where the reference is at the instant that the image shows."""
+        """Returns (7) with a term for the lag, and publishes the reference at the instant that the image shows."""
         vehicle, front = obs.vehicle, obs.camera("front")
         if self.seen_ns is None:
-            # The curve begins where the vehicle is.
+            # The curve begins at the vehicle.
             self.path_m[0] = vehicle.p_world_m
             self.seconds, self.pieces = self.lay(self.path_m) or (self.seconds, self.pieces)
             self.seen_ns = vehicle.stamp_ns
-        # A vehicle that the guard slows down is waited for.
+        # Wait for a vehicle that the guard slows down.
         self.at_s += self.pace * 1e-9 * (vehicle.stamp_ns - self.seen_ns)
         self.seen_ns = vehicle.stamp_ns
         off_m = self.reference(0.0) - vehicle.p_world_m
@@ -148,7 +148,7 @@ class Planned(vizflyt.Plugin):
         return Setpoint.velocity(v_mps + GAIN_PER_S * off_m)
 
     def reference(self, later_s, derivative=0):
-        """Where the reference is by so much later, or a derivative of it along the curve: shape (3,). [m/s^d, world]"""
+        """Returns the reference after this time, or a derivative of it along the curve: shape (3,). [m/s^d, world]"""
         at_s = np.array([self.at_s + self.pace * later_s])
         return curve(self.seconds, self.pieces, at_s, derivative)[0]
 

@@ -1,6 +1,6 @@
-"""Project 2: a path through a known map. This is the file to work in; it does not know the vehicle, nor `vizflyt`.
+"""Project 2: a path through a known map. Work in this file; it uses neither the vehicle nor `vizflyt`.
 
-A room is a function: it takes points (N, 3) [m, world] and returns the room about the body's centre there, (N,) [m]:
+`room` is a function: it takes points (N, 3) [m, world] and returns the clearance of the body's centre there, (N,) [m]:
 (1) of the assignment. All points are float64, in the world frame.
 """
 
@@ -21,8 +21,8 @@ def length_m(path_m: F64) -> float:
 
 
 def is_free(room: Room, from_m: F64, to_m: F64, margin_m: float = 0.0) -> bool:
-    """Says whether a segment, between points (3,), has more than `margin_m` of room all along."""
-    # So far only its ends are looked at.
+    """Returns whether a segment between points (3,) has a clearance above `margin_m` everywhere."""
+    # To do: for now it checks only the ends.
     return bool((room(np.stack([from_m, to_m])) > margin_m).all())
 
 
@@ -36,16 +36,16 @@ def astar(
     spacing_m: float = 0.1,
     margin_m: float = 0.3,
 ) -> F64 | None:
-    """Finds a path on a grid within the box from `low_m` to `high_m`, with more than `margin_m` of room all along.
+    """Finds a path on a grid within the box from `low_m` to `high_m`, with a clearance above `margin_m` everywhere.
 
-    Returns its points (N, 3), `start_m` first and `goal_m` last; None if there is no way, or if start or goal have not
-    so much room.
+    Returns its points (N, 3), `start_m` first and `goal_m` last. None if there is no path, or if start or goal have too
+    little clearance.
     """
-    # So far it is the straight line, whatever stands there.
+    # To do: for now it is the straight line, without regard to obstacles.
     return np.array([start_m, goal_m], float)
 
 
 def shorten(room: Room, path_m: F64, margin_m: float = 0.3) -> F64:
-    """Leaves out the points of a path (N, 3) that it can do without, so that it stays free; first and last remain."""
-    # So far all of them are kept.
+    """Removes unnecessary points of a path (N, 3), so that it stays free. Keeps the first and the last point."""
+    # To do: for now all points are kept.
     return path_m

@@ -1,4 +1,4 @@
-"""Project 2: plans on the ground, and flies its points once it is in the air. Runs at both levels as it is."""
+"""Project 2: plans on the ground, and flies the points in the air. Runs at both levels without changes."""
 
 import numpy as np
 import planner
@@ -6,14 +6,14 @@ import planner
 import vizflyt
 from vizflyt import Setpoint
 
-MARGIN_M = 0.3  # room to plan with
+MARGIN_M = 0.3  # planned clearance
 SPEED_MPS = 1.0  # on the way to each point
 
 
 def box_of(volume, near_m):
     """Returns the low and the high corner of a box with sides along the axes, from a point (3,) near it. [m, world]"""
     away_m = 10_000.0
-    probes_m = away_m * np.eye(3)  # so far out along an axis, the distance to the box is that to one face
+    probes_m = away_m * np.eye(3)  # far out on an axis, the distance to the box is the distance to one face
     low_m = near_m - away_m + volume.signed_distance_m(near_m - probes_m)
     return low_m, near_m + away_m - volume.signed_distance_m(near_m + probes_m)
 
@@ -22,7 +22,7 @@ class PathPlanner(vizflyt.Plugin):
     def on_start(self, info):
         self.info, self.map = info, vizflyt.course_map()
         self.low_m, self.high_m = box_of(info.geofence, info.goal_m)
-        # No pose yet: over the middle of the start box, where the take-off ends.
+        # There is no pose yet. Take-off ends above the middle of the start box.
         low_m, high_m = box_of(info.start_box, self.low_m)
         start_m = np.array([*(low_m + high_m)[:2] / 2, info.takeoff_height_m])
         self.flying = self.asked = False
@@ -37,7 +37,7 @@ class PathPlanner(vizflyt.Plugin):
         print(f"shortened to {len(self.path_m)} points, {planner.length_m(self.path_m):.2f} m")
 
     def room(self, points_m):
-        """Room about the body's centre at points (N, 3), the fence's too: shape (N,). [m]"""
+        """Returns the clearance of the body's centre at points (N, 3), with the fence: shape (N,). [m]"""
         solid_m = np.min([volume.signed_distance_m(points_m) for volume in self.map], axis=0)
         inside_m = -self.info.geofence.signed_distance_m(points_m)
         return np.minimum(solid_m, inside_m) - self.info.body_radius_m

@@ -1,6 +1,6 @@
-"""What the planner of project 2 has to do, in rooms made of boxes: `python -m pytest` in your folder. Add your own.
+"""Requirements of project 2's planner, in rooms made of boxes: `python -m pytest` in your folder. Add your own tests.
 
-Those marked "so far fails" are yours to mend.
+Tests marked "so far fails" pass with a correct solution.
 """
 
 from itertools import pairwise
@@ -12,7 +12,7 @@ from planner import astar, is_free, length_m, shorten
 BODY_M, MARGIN_M = 0.12, 0.1
 LOW_M, HIGH_M = np.array([0.0, -2.0, 0.0]), np.array([6.0, 2.0, 3.0])
 START_M, GOAL_M = np.array([1.0, -1.0, 1.0]), np.array([5.0, -1.0, 1.0])
-# A wall across the net; with a door in it, two metres high.
+# A wall across the net, and one with a door 2 m high.
 WALL = [([2.9, -2.0, 0.0], [3.1, 2.0, 3.0])]
 DOOR = [
     ([2.9, -2.0, 0.0], [3.1, 0.6, 3.0]),
@@ -22,13 +22,13 @@ DOOR = [
 
 
 def distance_m(points_m, low_m, high_m):
-    """Distance of points (N, 3) from a box, negative inside: shape (N,)."""
+    """Returns the distance of points (N, 3) from a box, negative inside: shape (N,)."""
     off_m = np.maximum(np.subtract(low_m, points_m), np.subtract(points_m, high_m))
     return np.linalg.norm(np.maximum(off_m, 0), axis=1) + np.minimum(off_m.max(axis=1), 0)
 
 
 def room_with(boxes):
-    """Makes a room: the net, and boxes in it."""
+    """Returns a room: the net with boxes in it."""
 
     def room(points_m):
         solids_m = [distance_m(points_m, low_m, high_m) for low_m, high_m in boxes]
@@ -38,7 +38,7 @@ def room_with(boxes):
 
 
 def least_room_m(room, path_m):
-    """Room at every millimetre of a path."""
+    """Returns the smallest clearance on a path, sampled at every millimetre."""
     found_m = []
     for from_m, to_m in pairwise(path_m):
         found_m.append(room(np.linspace(from_m, to_m, 2 + int(1000 * np.linalg.norm(to_m - from_m)))).min())
@@ -46,7 +46,7 @@ def least_room_m(room, path_m):
 
 
 def shortest_m():
-    """The shortest way through the door: a line, an arc about each of two edges with a line between, and a line."""
+    """Returns the length of the shortest path through the door: three lines, with an arc at each of two edges."""
     along_m, across_m, radius_m = 1.9, 1.6, BODY_M + MARGIN_M
     away_m = np.hypot(along_m, across_m)
     turn_rad = np.arctan2(across_m, along_m) + np.arcsin(radius_m / away_m)
@@ -67,7 +67,7 @@ def test_a_segment_that_ends_in_something_is_not_free():
 
 
 def test_no_segment_through_something_is_free():
-    """So far fails: what stands between the ends is not seen. Neither a thin post is missed, nor room denied."""
+    """So far fails: obstacles between the ends are ignored. Find thin posts, but do not reject free segments."""
     random, half_m = np.random.default_rng(1), np.array([0.01, 0.01, 1.0])
     missed, denied = [], []
     for _ in range(300):
@@ -95,7 +95,7 @@ def test_a_wall_is_passed_by_its_door():
 
 
 def test_a_goal_beside_the_grid_is_reached():
-    """So far fails. Start and goal lie where they lie."""
+    """So far fails. Start and goal are not on grid points."""
     start_m, goal_m = START_M + np.array([0.03, -0.07, 0.01]), GOAL_M + np.array([0.11, 0.05, 0.13])
     path_m = plan(DOOR, start_m, goal_m)
     np.testing.assert_allclose(path_m[[0, -1]], [start_m, goal_m])
@@ -109,13 +109,13 @@ def test_no_way_is_none():
 
 @pytest.mark.parametrize("near_m", [[2.7, -1.0, 1.0], [3.0, -1.0, 1.0], [1.0, -1.85, 1.0], [1.0, -1.0, 3.5]])
 def test_a_start_or_goal_too_near_to_something_is_none(near_m):
-    """So far fails: before the wall, in it, before the fence, beyond it."""
+    """So far fails: start or goal near the wall, in it, near the fence, or outside it."""
     assert plan(DOOR, start_m=np.array(near_m)) is None
     assert plan(DOOR, goal_m=np.array(near_m)) is None
 
 
 def test_points_that_it_can_do_without_are_left_out():
-    """So far fails: all are kept."""
+    """So far fails: all points are kept."""
     zigzag_m = np.array([START_M, [2, -1.2, 1], [3, 1, 1], [4, -1, 2], GOAL_M])
     np.testing.assert_allclose(shorten(room_with([]), zigzag_m, MARGIN_M), [START_M, GOAL_M])
 

@@ -1,4 +1,4 @@
-"""What the planner has to do besides: `python -m pytest` in your folder. Of graduates."""
+"""Additional requirements of the planner, for graduates: `python -m pytest` in your folder."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_the_tree_finds_the_door(seed):
     path_m = grow(DOOR, 1000, seed)
     np.testing.assert_allclose(path_m[[0, -1]], [START_M, GOAL_M])
     assert least_room_m(room_with(DOOR), path_m) > MARGIN_M - 1e-4
-    # Without the star it is half as long again, and more.
+    # Without rewiring, the path is at least 1.5 times as long.
     assert shortest_m() - 1e-3 < length_m(path_m) < 1.25 * shortest_m()
 
 
@@ -42,7 +42,7 @@ def test_no_tree_is_none():
 
 
 def test_one_piece_from_rest_to_rest():
-    """So far fails. (6) has one solution there: 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7."""
+    """So far fails. (6) has one solution here: 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7."""
     share = np.linspace(0, 1, 11)
     coefficients = minimum_snap(np.array([[0.0, 0, 0], [1, 2, 0]]), np.array([2.0]))
     expected = share**4 * (35 - 84 * share + 70 * share**2 - 20 * share**3)
@@ -57,7 +57,7 @@ def test_the_polynomials_go_through_the_points():
 
 
 def test_they_begin_and_end_at_rest():
-    """So far fails: lines begin at full speed."""
+    """So far fails: the lines begin at full speed."""
     coefficients = minimum_snap(POINTS_M, SECONDS)
     for derivative in (1, 2, 3):
         np.testing.assert_allclose(curve(SECONDS, coefficients, np.array([0.0, 4.5]), derivative), 0, atol=1e-6)
@@ -65,7 +65,7 @@ def test_they_begin_and_end_at_rest():
 
 @pytest.mark.parametrize("derivative", [1, 2, 3, 4, 5, 6])
 def test_pieces_meet_in_every_derivative(derivative):
-    """So far fails in the first. Up to the fourth it is asked for; the fifth and sixth follow where snap is least."""
+    """So far fails in the first derivative. (6) requires the first four; minimum snap implies the fifth and sixth."""
     coefficients = minimum_snap(POINTS_M, SECONDS)
     for piece, joint_s in enumerate(np.cumsum(SECONDS)[:-1]):
         before = curve(SECONDS[piece:], coefficients[piece:], np.array([SECONDS[piece] - 1e-9]), derivative)
@@ -74,7 +74,7 @@ def test_pieces_meet_in_every_derivative(derivative):
 
 
 def test_limits_are_kept_and_used():
-    """So far fails: the corners are not flown at all."""
+    """So far fails: the corners are not flown."""
     seconds, coefficients = timed(POINTS_M, 2.0, 3.0)
     at_s = np.linspace(0, seconds.sum(), 2000)
     mps, mps2 = (np.linalg.norm(curve(seconds, coefficients, at_s, derivative), axis=1) for derivative in (1, 2))
@@ -84,7 +84,7 @@ def test_limits_are_kept_and_used():
 
 
 def test_the_whole_curve_is_free():
-    """So far fails: it is no curve."""
+    """So far fails: there is no curve."""
     seconds, coefficients = smooth(room_with(DOOR), THROUGH_M, margin_m=MARGIN_M, max_mps=2.0, max_mps2=3.0)
     at_s = np.linspace(0, seconds.sum(), 5000)
     assert room_with(DOOR)(curve(seconds, coefficients, at_s)).min() > MARGIN_M
@@ -94,5 +94,5 @@ def test_the_whole_curve_is_free():
 
 
 def test_what_does_not_fit_is_none():
-    """So far fails: nothing is tested."""
+    """So far fails: the curve is not checked."""
     assert smooth(room_with(WALL), np.array([START_M, GOAL_M]), margin_m=MARGIN_M, max_mps=2.0, max_mps2=3.0) is None

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Project 3: a network finds the windows in each image; filters keep them; the way leads along their normals.
+"""Project 3: a network detects the windows in each image, filters track them, and the path follows their normals.
 
-The place of a window is known against a reckoning of the own way: axes `odom` with the origin where the plugin took
-over, x along the nose as it was then, z up. The reckoning is what was asked for, behind the vehicle's lag.
+Window positions are relative to the plugin's dead reckoning: axes `odom` with the origin where the plugin got control,
+x along the nose at that time, z up. The dead reckoning integrates the setpoints with the vehicle's lag.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from windows import F64, SIDE_M, SIDE_SD_M, Seen, WindowFilter, corners_of, nois
 import vizflyt
 from vizflyt import Setpoint
 
-# Image the network takes, and how far its masks reach beyond a frame's edges, in its pixels.
+# Input size of the network, and by how much its masks extend beyond a frame's edges, in its pixels.
 COLUMNS, ROWS, EXCESS_PX = 160, 120, 1.3
-# Of a mask with fewer pixels, at twice that size, nothing is taken.
+# Minimum number of pixels of a mask at twice that size.
 LEAST_PX = 150
-# Corners that are further off those of any window are of something else. [px]
+# Maximum residual of a window's corners. [px]
 MOST_OFF_PX = 3.0
-# Windows are turned by up to 20 degrees against the net. [rad]
+# Standard deviation of the windows' rotation against the net; at most 20 degrees. [rad]
 TURNED_RAD = 0.2
-# What the reckoning drifts by. [m in 1 s]
+# Drift of the dead reckoning. [m in 1 s]
 DRIFT_MPS = 0.12
-# Of a velocity that is asked for. [s]
+# Lag of the velocity behind the setpoint. [s]
 LAG_S = 0.35
-# How far ahead of the image it steers: delays, and most of the lag. [s]
+# Prediction time for steering: delays, and most of the lag. [s]
 AHEAD_S = 0.25
-# Along the line through a window; sideways at most, and for each metre beside the line. [m/s], [1/s]
+# Speed along the line through a window; maximum sideways speed, and its gain. [m/s], [m/s], [1/s]
 CRUISE_MPS, SIDE_MPS, OFF_PER_S = 2.0, 1.3, 1.8
-# Allowed beside the line at the window, and more for each metre before it.
+# Allowed offset from the line at the window, and its increase per metre before it.
 NECK_M, FUNNEL = 0.12, 0.6
-# Nearer than this the nose turns to the next window. [m]
+# Nearer than this, the nose turns to the next window. [m]
 NEAR_M = 1.0
 WINDOWS = 3
 
@@ -59,7 +59,7 @@ def about_up(angle_rad: float) -> F64:
 
 
 class Network:
-    """Which window a pixel is of."""
+    """Classifies pixels by window."""
 
     def __init__(self, path: Path) -> None:
         options = onnxruntime.SessionOptions()
@@ -70,12 +70,12 @@ class Network:
         """Returns 0 or a window's number for each pixel, (2 ROWS, 2 COLUMNS), of an image (H, W, 3)."""
         small = cv2.resize(rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
         logits = self.session.run(None, {"images": small[None]})[0][0]
-        # Between pixels the numbers change evenly, so the edge is found finer than they are.
+        # Interpolation between pixels gives the edge with sub-pixel accuracy.
         return np.argmax([cv2.resize(each, (2 * COLUMNS, 2 * ROWS)) for each in logits], axis=0)
 
 
 class Window:
-    """What is known of one window: its filter in `odom`, and the side of its opening."""
+    """State of one window: its filter in `odom`, and the side of its opening."""
 
     def __init__(self, z: F64, R: F64) -> None:
         self.filter = WindowFilter(z, R)
@@ -84,7 +84,7 @@ class Window:
     def measured_side(self, side_m: float, sd_m: float) -> None:
         gain = self.side_sd_m**2 / (self.side_sd_m**2 + sd_m**2)
         self.side_m += gain * (side_m - self.side_m)
-        # One image's error is the next one's, too, so many of them do not make it small.
+        # Errors of successive images are correlated, so the standard deviation has a lower limit.
         self.side_sd_m = max(math.sqrt(1 - gain) * self.side_sd_m, 0.02)
 
     @property
@@ -94,7 +94,7 @@ class Window:
 
 
 class Race(vizflyt.Plugin):
-    """One flight."""
+    """State and steps of one flight."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.network = Network(Path(__file__).parent / "windows.onnx")
@@ -122,7 +122,7 @@ class Race(vizflyt.Plugin):
             self.yaw_0_rad, self.last_s = vehicle.yaw_rad, now_s
         dt_s, self.last_s = min(now_s - self.last_s, 0.2), now_s
         self._reckon(dt_s)
-        # The attitude is some milliseconds older than what the image shows.
+        # The attitude is some milliseconds older than the image.
         turn = vehicle.omega_body_radps * (front.shown_ns - vehicle.stamp_ns) * 1e-9
         world_from_body = rotation(vehicle.attitude_xyzw) @ cv2.Rodrigues(turn)[0]
         odom_from_body = about_up(-self.yaw_0_rad) @ world_from_body
@@ -132,14 +132,14 @@ class Race(vizflyt.Plugin):
         return Setpoint.velocity(about_up(-yaw_rad) @ self.asked_mps, axes="heading", yaw=self.yaw_0_rad + to_rad)
 
     def _reckon(self, dt_s: float) -> None:
-        """Carries the own place on: the velocity follows what was asked."""
+        """Integrates the position: the velocity follows the setpoint with a lag."""
         share = 1 - math.exp(-dt_s / LAG_S)
         before = self.v_mps
         self.v_mps = before + share * (self.asked_mps - before)
         self.p_m = self.p_m + dt_s * (before + self.v_mps) / 2
 
     def _look(self, front: vizflyt.CameraImage, odom_from_body: F64, dt_s: float) -> None:
-        """Takes what the image shows of this window and the next into their filters."""
+        """Updates the filters of this window and the next from the image."""
         for window in self.windows.values():
             window.filter.predict(dt_s, DRIFT_MPS)
         shown = self.network(front.rgb)
@@ -176,12 +176,12 @@ class Race(vizflyt.Plugin):
             window.measured_side(seen.side_m, side_sd_m)
 
     def _steer(self, dt_s: float, yaw_rad: float) -> tuple[F64, float]:
-        """Returns velocity [m/s, odom] and heading [rad, odom] to be asked for."""
+        """Returns the next velocity [m/s, odom] and heading [rad, odom]."""
         if self.next > WINDOWS:
             return np.zeros(3), yaw_rad
         window = self.windows.get(self.next)
         if window is None:
-            # Stand, and turn to and fro.
+            # Stay, and turn left and right.
             self.search_s += dt_s
             return np.zeros(3), 0.8 * math.sin(0.8 * self.search_s)
         self.search_s = 0.0
@@ -207,7 +207,7 @@ class Race(vizflyt.Plugin):
 
 
 def by_depth(seen: Seen, front: vizflyt.CameraImage, mask: np.ndarray, odom_from_cam: F64) -> Seen:
-    """Returns a window as far away, and as large, as the depth of its bars says."""
+    """Scales a window's distance and size by the depth of its bars."""
     rows, columns = np.nonzero(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)))
     lens = front.intrinsics
     scale = front.width_px / (2 * COLUMNS)

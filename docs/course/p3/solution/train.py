@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Project 3: trains the network that tells the three windows apart, and writes it as ONNX.
+"""Project 3: trains the network that distinguishes the three windows, and writes it as ONNX.
 
     vizflyt dataset --project p3 --seed 500 --seeds 40 --images 1600 --size 160x120 --layers rgb,classes,instances \\
         --val 0 --gate-distance 0.8..8 --look-at-gate 0.9 --randomize my-p3/randomize.toml -o sets/p3-train
@@ -9,7 +9,7 @@
     python my-p3/train.py sets/p3-train sets/p3-other -o my-p3/windows.onnx
 
 The network takes a batch of images (N, 120, 160, 3), colour from 0 to 255, and returns (N, 4, 120, 160): a number for
-each pixel and class, 0 for the rest, 1 to 3 for the windows in their order. The greatest says what the pixel shows.
+each pixel and class, 0 for the background, 1 to 3 for the windows in their order. The largest number is the result.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SIZES = (12, 16, 24, 32)
 
 
 def load(folder: pathlib.Path) -> tuple[Tensor, Tensor]:
-    """Returns images (N, H, W, 3) uint8, and which window each pixel is of, (N, H, W), 0 for none."""
+    """Returns images (N, H, W, 3) uint8, and the window of each pixel, (N, H, W), 0 for none."""
     images, masks = [], []
     for path in sorted((folder / "records").glob("*/*.json")):
         name = f"{path.parent.name}/{path.stem}.png"
@@ -60,7 +60,7 @@ def block(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class WindowNet(nn.Module):
-    """A U-Net of few channels with three halvings, which sees and answers squares of 2 x 2 pixels."""
+    """A small U-Net with three downsampling steps; input and output are blocks of 2 x 2 pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ def varied(images: Tensor, masks: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def loss_of(logits: Tensor, masks: Tensor) -> Tensor:
-    """Cross entropy, and one minus Dice's coefficient of each window, which sees few pixels too."""
+    """Cross entropy, plus one minus Dice's coefficient of each window, which also works for small windows."""
     shares = logits.softmax(1)[:, 1:]
     true = nn.functional.one_hot(masks, logits.shape[1]).permute(0, 3, 1, 2)[:, 1:].float()
     dice = (2 * (shares * true).sum((0, 2, 3)) + 1) / (shares.sum((0, 2, 3)) + true.sum((0, 2, 3)) + 1)
@@ -100,7 +100,7 @@ def loss_of(logits: Tensor, masks: Tensor) -> Tensor:
 
 
 def score(network: nn.Module, images: Tensor, masks: Tensor) -> list[float]:
-    """Returns the intersection over union of all pixels: of any window, then of each."""
+    """Returns the intersection over union of all pixels: of all windows together, then of each."""
     network.eval()
     both, either = np.zeros(1 + len(WINDOWS)), np.zeros(1 + len(WINDOWS))
     with torch.no_grad():
@@ -114,7 +114,7 @@ def score(network: nn.Module, images: Tensor, masks: Tensor) -> list[float]:
 
 
 def write(network: nn.Module, path: pathlib.Path, rows: int, columns: int) -> None:
-    """Writes ONNX with weights of 16 bits; whoever reads it calculates with 32."""
+    """Writes ONNX with 16-bit weights; inference uses 32 bits."""
     network.eval()
     example = torch.zeros(1, rows, columns, 3)
     program = torch.onnx.export(
@@ -129,7 +129,7 @@ def write(network: nn.Module, path: pathlib.Path, rows: int, columns: int) -> No
         weights.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), f"{name}_16"))
         cast = onnx.helper.make_node("Cast", [f"{name}_16"], [name], to=onnx.TensorProto.FLOAT)
         model.graph.node.insert(0, cast)
-    # Where in whose program a node comes from is nobody's business.
+    # Remove the source locations of nodes, which contain local paths.
     for node in model.graph.node:
         del node.metadata_props[:]
         node.doc_string = ""

@@ -1,9 +1,9 @@
-"""Project 3: from a mask to a window's corners, from corners to its place and heading, and a filter over images.
+"""Project 3: window corners from a mask, window pose from corners, and a filter over images.
 
-Pixels are continuous: (0, 0) is the outer corner of the top-left one, and a camera's axis goes through the image's
-middle. The camera's axes are x right, y down, z ahead. *Level* axes begin at the camera, z up; where x points is the
-caller's choice, and `level_from_cam` (3, 3) turns the camera's directions into them. Corners stand in the order upper
-left, upper right, lower right, lower left, as one sees them who flies through; NaN is a corner that is not known.
+Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, and the camera's axis goes through the middle
+of the image. The camera's axes are x right, y down, z forward. *Level* axes have their origin at the camera, with z up;
+the caller chooses the direction of x, and `level_from_cam` (3, 3) rotates the camera's directions into them. The order
+of corners is upper left, upper right, lower right, lower left in the direction of passage; NaN is an unknown corner.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 
-# A frame's bars: how wide, and how thick along the passage. [m]
+# Bars of a frame: width, and thickness along the passage. [m]
 BAR_M, THICK_M = 0.16, 0.09
-# What is told of all windows: the side of the opening, and its standard deviation. [m]
+# Given for all windows: side of the opening, and its standard deviation. [m]
 SIDE_M, SIDE_SD_M = 1.175, 0.1
-# Left and up, for each corner of a square of side 2.
+# Left and up coordinates of the corners of a square with side 2.
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-# So much is a corner off, as it comes from two lines. [px]
+# Standard deviation of a corner, which is the intersection of two lines. [px]
 NOISE_PX = 0.7
-# Of four numbers, the squared distance that chance goes beyond in one of a hundred.
+# 99 % quantile of the squared distance of four numbers.
 BEYOND_CHANCE = 13.3
 
 
 class Corners(NamedTuple):
-    """The corners of a window in an image, (4, 2) each, NaN where not known. [px]"""
+    """Corners of a window in an image, (4, 2) each, NaN if unknown. [px]"""
 
     hole: F64
     outline: F64
 
 
 class Seen(NamedTuple):
-    """A window as one image shows it."""
+    """A window detected in one image."""
 
     p_m: F64
-    """The middle of its opening, (3,). [m, level]"""
+    """Middle of the opening, (3,). [m, level]"""
     heading_rad: float
-    """Where its passage leads, counter-clockwise about up from x. [rad, level]"""
+    """Direction of passage, counter-clockwise about up from x. [rad, level]"""
     side_m: float
-    """The side of its opening."""
+    """Side of the opening."""
     off_px: float
-    """What its corners are off those found, root mean square. [px]"""
+    """Root mean square of the corners' residuals. [px]"""
 
 
 # -- From a mask to corners --------------------------------------------------------------------------------------------
@@ -55,10 +55,10 @@ class Seen(NamedTuple):
 def corners_of(
     mask: npt.NDArray[np.bool_], focal_px: float, level_from_cam: F64, excess_px: float = 0.0
 ) -> Corners | None:
-    """Finds the corners of one window's frame in its mask (H, W); None if too little of it is seen.
+    """Finds the corners of one window's frame in its mask (H, W); None if too little of it is visible.
 
-    The mask reaches beyond the frame's edges by `excess_px`. A corner is where two neighbouring sides meet, so it is
-    found where it is hidden or just outside the image, too.
+    The mask extends beyond the frame's edges by `excess_px`. A corner is the intersection of two neighbouring sides, so
+    hidden corners and corners just outside the image are also found.
     """
     parts, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if parts < 2:
@@ -79,7 +79,7 @@ def corners_of(
         edge = max(
             cv2.findContours((labels == largest).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0], key=len
         )
-        # The line that closes a frame of which a part is seen is no side: it does not lie along the frame.
+        # The line that closes a partly visible frame is not a side, because it does not lie along the frame.
         near = cv2.dilate(frame.astype(np.uint8), np.ones((3, 3), np.uint8))
         along = edge[near[edge[:, 0, 1], edge[:, 0, 0]] > 0]
         hole = _corners(along, edge, mask.shape, focal_px, level_from_cam, 0.5 + excess_px)
@@ -97,10 +97,10 @@ def _corners(
     level_from_cam: F64,
     outwards_px: float,
 ) -> F64:
-    """Returns where neighbouring sides of a region meet, (4, 2), from its outermost pixels (N, 1, 2), those that count.
+    """Returns the intersections of neighbouring sides of a region, (4, 2), from its valid outermost pixels (N, 1, 2).
 
-    The sides are sought along `contour` (M, 1, 2). The region's true edge is `outwards_px` further out than the pixels'
-    middles.
+    The sides are detected along `contour` (M, 1, 2). The region's true edge is `outwards_px` outside of the pixels'
+    centres.
     """
     rows, columns = shape
     nan = np.full((4, 2), np.nan)
@@ -111,7 +111,7 @@ def _corners(
     if len(points) < 8 or len(polygon) < 3:
         return nan
     middle = polygon.mean(0)
-    # Of each side (left, top, right, bottom) the longest line that is one.
+    # The longest valid line of each side (left, top, right, bottom).
     best: dict[str, tuple[float, F64]] = {}
     for a, b in zip(polygon, np.roll(polygon, -1, 0)):
         long_px = float(np.hypot(*(b - a)))
@@ -121,7 +121,7 @@ def _corners(
         if line is None:
             continue
         line[2] += outwards_px
-        # The plane through the camera and the line: upright for the sides, else not.
+        # The plane through camera and line is vertical for left and right sides, otherwise not.
         at_axis = line @ [columns / 2, rows / 2, 1.0]
         normal = level_from_cam @ np.array([line[0] * focal_px, line[1] * focal_px, at_axis])
         normal /= np.linalg.norm(normal)
@@ -146,11 +146,11 @@ def _corners(
 
 
 def _line(points: F64, start: F64, along: F64, long_px: float, middle: F64) -> F64 | None:
-    """Fits a line to the points along an edge; returns (a, b, c), a u + b v + c = 0, positive on `middle`'s side."""
+    """Fits a line to the points along an edge. Returns (a, b, c), a u + b v + c = 0, positive on `middle`'s side."""
     across = np.array([-along[1], along[0]])
     for _ in range(2):
         s, d = (points - start) @ along, (points - start) @ across
-        # Corners are round.
+        # Exclude the ends, because corners are round.
         cut_px = min(3.0, 0.15 * long_px)
         near = points[(abs(d) < 2.0) & (s > cut_px) & (s < long_px - cut_px)]
         if len(near) < max(4, 0.35 * long_px):
@@ -177,7 +177,7 @@ def side_of(hole_px: F64, outline_px: F64) -> float:
 def square_pose(
     corners_px: F64, side_m: float, focal_px: float, size_px: tuple[int, int], level_from_cam: F64
 ) -> Seen:
-    """Returns where an upright square of a known side is, from its corners (4, 2) in an image of this size (W, H)."""
+    """Returns the pose of a vertical square with a known side, from its corners (4, 2) in an image of size (W, H)."""
     unknown = np.full((4, 2), np.nan)
     return _solve(Corners(corners_px, unknown), focal_px, size_px, level_from_cam, (side_m, 1e-6), None, 0.0)
 
@@ -190,9 +190,9 @@ def pose_of(
     side_m: tuple[float, float] = (SIDE_M, SIDE_SD_M),
     heading_rad: tuple[float, float] | None = None,
 ) -> Seen:
-    """Returns the window that has these corners; three of the eight or more are known.
+    """Returns the window with these corners; at least three of the eight must be known.
 
-    What is known of side [m] and heading [rad, level] before is given with its standard deviation.
+    Prior values of side [m] and heading [rad, level] are given with their standard deviations.
     """
     return _solve(corners, focal_px, size_px, level_from_cam, side_m, heading_rad, THICK_M)
 
@@ -206,7 +206,7 @@ def _solve(
     heading: tuple[float, float] | None,
     thick_m: float,
 ) -> Seen:
-    """Least squares over place, heading and side by Gauss and Newton, from several headings; the best one counts."""
+    """Least squares for position, heading and side by Gauss-Newton, from several headings. Returns the best result."""
     seen_px = np.concatenate([corners.hole, corners.outline])
     is_known = np.isfinite(seen_px).all(1)
     seen_px = seen_px[is_known]
@@ -223,7 +223,7 @@ def _solve(
         cam = (x[:3] + np.column_stack(off)) @ cam_from_level.T
         return focal_px * cam[:, :2] / np.maximum(cam[:, 2:], 0.05) + middle_px
 
-    # Left and upper edges lie where u and v are least; of the hole one sees the face that covers more.
+    # Left and upper edges have the smallest u and v; the visible face of the hole is the one that covers more.
     wants_greater = np.column_stack([square[:, 0] > 0, square[:, 1] > 0]) == inner[:, None]
 
     def residual(x: F64) -> F64:
@@ -237,7 +237,7 @@ def _solve(
             off.append([_wrapped(x[3] - heading[0]) / heading[1]])
         return np.concatenate(off)
 
-    # Begin along the middle's ray, as far as the corners' spread says.
+    # Start on the ray through the middle, at the distance given by the corners' spread.
     ray = level_from_cam @ np.array([*((seen_px.mean(0) - middle_px) / focal_px), 1.0])
     half_m = side[0] / 2 + np.where(inner, 0.0, BAR_M)
     spread_m = square[:, 1] * half_m
@@ -248,7 +248,7 @@ def _solve(
     best: tuple[float, F64] | None = None
     for start in starts:
         x = np.array([*(ray * away), start, side[0]])
-        # The mean of what is seen is not the middle, if not all is seen.
+        # If some corners are unknown, the mean of the known ones is not the middle.
         left_m = float(np.mean(square[:, 0] * half_m))
         x[:3] -= [-left_m * math.sin(start), left_m * math.cos(start), np.mean(spread_m)]
         r = residual(x)
@@ -273,7 +273,7 @@ def _solve(
 
 
 def _wrapped(angle_rad: float) -> float:
-    """Returns an angle within half a turn of 0. [rad]"""
+    """Returns the equivalent angle in [-pi, pi). [rad]"""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
@@ -281,9 +281,9 @@ def _wrapped(angle_rad: float) -> float:
 
 
 def noise(p_m: F64, side_m: float, focal_px: float, noise_px: float = NOISE_PX) -> F64:
-    """Returns the covariance (4, 4) of place [m] and heading [rad] of a window that is seen at `p_m` [m, level].
+    """Returns the covariance (4, 4) of position [m] and heading [rad] of a window detected at `p_m` [m, level].
 
-    (4), and beside it one part in a hundred of the distance, and 0.03 rad, for what (4) does not know of.
+    (4), plus 1 % of the distance and 0.03 rad for errors that (4) does not contain.
     """
     z = float(np.linalg.norm(p_m))
     ray = p_m / z
@@ -296,18 +296,18 @@ def noise(p_m: F64, side_m: float, focal_px: float, noise_px: float = NOISE_PX) 
 
 
 class WindowFilter:
-    """One window in axes that stand still: x = (p, psi) (4,) [m, m, m, rad], P (4, 4), by equations (6)."""
+    """One window in fixed axes: x = (p, psi) (4,) [m, m, m, rad], P (4, 4), by equations (6)."""
 
     def __init__(self, x: F64, P: F64) -> None:
         self.x, self.P = np.array(x, float), np.array(P, float)
         self.rejected = 0
 
     def predict(self, dt_s: float, drift: float) -> None:
-        """Lets the own reckoning drift by `drift` m in the first second, whose square adds up; headings by a tenth."""
+        """Adds the drift of the dead reckoning: `drift` m in the first second; squares add up; heading a tenth."""
         self.P = self.P + np.diag([1.0, 1.0, 1.0, 0.01]) * drift**2 * dt_s
 
     def update(self, z: F64, R: F64) -> bool:
-        """Takes a measurement z (4,) with covariance R (4, 4); returns False for one that chance does not explain."""
+        """Applies a measurement z (4,) with covariance R (4, 4). Returns False and ignores it if it is an outlier."""
         e = z - self.x
         e[3] = _wrapped(e[3])
         S = self.P + R

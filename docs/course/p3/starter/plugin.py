@@ -1,8 +1,9 @@
 #!/usr/bin/env python3
-"""Project 3: looks, creeps ahead, looks again, and lands; it prints what it finds. The way through is yours.
+"""Project 3: looks, flies forward a little, looks again, and lands; prints its detections. To do: the flight.
 
-The network is `windows.onnx` beside this file, once you have trained one: it takes images (1, 120, 160, 3), colour from
-0 to 255, and returns (1, 4, 120, 160), a number for each pixel and class, 0 for the rest, 1 to 3 for the windows.
+The network is `windows.onnx` next to this file, after you have trained one. It takes images (1, 120, 160, 3), colour
+from 0 to 255, and returns (1, 4, 120, 160): a number for each pixel and class, 0 for the background, 1 to 3 for
+windows.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ import vizflyt
 from vizflyt import Setpoint
 
 NETWORK = Path(__file__).parent / "windows.onnx"
-# How long it stands at first; how far it creeps, how often, and how fast. [s], [m], [m/s]
+# Time at rest at first; step length, number and speed of the steps. [s], [m], [m/s]
 SETTLE_S, CREEP_M, LOOKS, SPEED_MPS = 1.0, 0.3, 2, 0.5
 
-# One setpoint for each image; None leaves the last one in force.
+# One setpoint for each image; None keeps the previous one.
 Steps = Generator[Setpoint | None, None, None]
 
 
@@ -38,14 +39,14 @@ def rotation(xyzw: F64) -> F64:
 
 
 class Network:
-    """Which window a pixel is of; of none, as long as nothing is trained."""
+    """Classifies pixels by window; all 0 until a network is trained."""
 
     def __init__(self) -> None:
         self.session = None
         if not NETWORK.exists():
             print(f"there is no {NETWORK.name} yet, so no window is seen", flush=True)
             return
-        # Only here, so that the plugin flies where it is not installed yet.
+        # Imported here, so that the plugin also flies without it.
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -62,7 +63,7 @@ class Network:
 
 
 class Mine(vizflyt.Plugin):
-    """One flight. `_fly` is the way through its states, and gives the answer to one image after the other."""
+    """One flight. `_fly` goes through the states, and yields one reply for each image."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.network = Network()
@@ -78,7 +79,7 @@ class Mine(vizflyt.Plugin):
 
     def on_image(self, obs: vizflyt.Observation) -> Setpoint | None:
         front, vehicle = obs.camera("front"), obs.vehicle
-        # An image of the camera that looks down comes with the front camera's last one.
+        # Each image of the downward camera also contains the front camera's previous image.
         if front is None or vehicle is None or front.seq == self.seen:
             return None
         self.seen = front.seq
@@ -91,7 +92,7 @@ class Mine(vizflyt.Plugin):
         return next(self.steps, Setpoint.land())
 
     def _fly(self) -> Steps:
-        """Yours: filters, the line through the next window, the turn to the one after it."""
+        """To do: filters, the line through the next window, the turn to the one after it."""
         yield from self._for(SETTLE_S, Setpoint.hold())
         for _ in range(LOOKS):
             window = self._look()
@@ -108,7 +109,7 @@ class Mine(vizflyt.Plugin):
             yield setpoint
 
     def _look(self) -> Seen | None:
-        """Returns where the next window is, in axes `heading` of the flight's begin; None if it is not seen whole."""
+        """Returns the next window in the axes `heading` of the flight's begin; None if not completely visible."""
         mask = self.network(self.front.rgb) == self.next
         level_from_cam = self._heading_from_cam()
         focal_px = self.front.intrinsics.fx_px / 2
@@ -119,7 +120,7 @@ class Mine(vizflyt.Plugin):
         return square_pose(found.hole, side_m, focal_px, (mask.shape[1], mask.shape[0]), level_from_cam)
 
     def _heading_from_cam(self) -> F64:
-        """Turns directions from the front camera's axes into axes `heading` of the flight's begin, (3, 3)."""
+        """Returns the rotation (3, 3) from the front camera's axes to the axes `heading` of the flight's begin."""
         assert self.yaw_rad is not None
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         heading_from_world = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])

@@ -1,6 +1,6 @@
-"""What `windows.py` of project 3 has to do, on frames that are drawn here: `python -m pytest` in your folder.
+"""Requirements of `windows.py` of project 3, on drawn frames: `python -m pytest` in your folder.
 
-A frame is a flat square with bars of 0.16 m. "So far fails" is said where the starter does.
+A frame is a flat square with bars of 0.16 m. Tests marked "so far fails" pass with a correct solution.
 """
 
 import math
@@ -11,11 +11,11 @@ from windows import BAR_M, WindowFilter, corners_of, noise, side_of, square_pose
 
 ROWS, COLUMNS, FOCAL_PX = 240, 320, 160.0
 SIZE_PX = (COLUMNS, ROWS)
-# Left and up of the corners of a square of side 2.
+# Left and up coordinates of the corners of a square with side 2.
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-# Of a camera that looks along x, level.
+# Rotation of a level camera along x.
 LEVEL_FROM_CAM = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# Place [m, level], heading [deg], side [m], and roll and pitch of the camera [deg].
+# Position [m, level], heading [deg], side [m], and roll and pitch of the camera [deg].
 VIEWS = [
     ((3.0, 0.0, 0.0), 0, 1.2, 0, 0),
     ((2.5, 0.4, 0.2), 15, 1.0, 0, 0),
@@ -26,7 +26,7 @@ VIEWS = [
 
 
 def level_from_cam(roll_deg, pitch_deg):
-    """Returns the turn (3, 3) of a camera that looks along x, then looks up by `pitch_deg` and rolls."""
+    """Returns the rotation (3, 3) of a camera along x that is pitched up by `pitch_deg` and then rolled."""
     cos, sin = math.cos(math.radians(pitch_deg)), math.sin(math.radians(pitch_deg))
     up = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
@@ -35,7 +35,7 @@ def level_from_cam(roll_deg, pitch_deg):
 
 
 def axes_of(heading_rad):
-    """Returns along the passage, left and up, (3, 3) in columns. [level]"""
+    """Returns the directions of passage, left and up, (3, 3) in columns. [level]"""
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
 
@@ -48,7 +48,7 @@ def project(p_m, heading_rad, side_m, turn):
 
 
 def draw(p_m, heading_rad, side_m, turn):
-    """Returns the mask (H, W) of a frame: which pixels' middles show it."""
+    """Returns the mask (H, W) of a frame: the pixels with a centre on it."""
     v, u = np.mgrid[0:ROWS, 0:COLUMNS] + 0.5
     rays = np.stack([(u - COLUMNS / 2) / FOCAL_PX, (v - ROWS / 2) / FOCAL_PX, np.ones_like(u)], axis=-1) @ turn.T
     passage, left, _ = axes_of(heading_rad).T
@@ -70,7 +70,7 @@ def both(p_m, heading_rad, side_m, turn):
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_corners_of_a_frame_are_found(view):
-    """So far fails: none are. A corner from two lines is better than a pixel."""
+    """So far fails: there are none. Intersections of lines are more accurate than pixels."""
     found = corners_of(draw(*case(view)), FOCAL_PX, case(view)[3])
     assert found is not None
     for corners_px, true_px in zip(found, both(*case(view))):
@@ -78,7 +78,7 @@ def test_corners_of_a_frame_are_found(view):
 
 
 def test_a_corner_that_is_hidden_is_where_the_sides_meet():
-    """So far fails. Something stands before the frame's upper right corner, and something before a side."""
+    """So far fails. The frame's upper right corner and a part of a side are hidden."""
     view = case(VIEWS[1])
     mask, (hole_px, outline_px) = draw(*view), both(*view)
     u, v = ((hole_px[1] + outline_px[1]) / 2).astype(int)
@@ -91,7 +91,7 @@ def test_a_corner_that_is_hidden_is_where_the_sides_meet():
 
 
 def test_specks_move_no_corner():
-    """So far fails. A network finds a few pixels of a window anywhere."""
+    """So far fails. A network gives a few wrong pixels anywhere."""
     view = case(VIEWS[0])
     mask = draw(*view)
     for u, v in ((20, 30), (300, 200), (160, 118), (250, 15)):
@@ -104,7 +104,7 @@ def test_specks_move_no_corner():
 
 @pytest.mark.parametrize("place_m", [(1.3, 0.6, 0.1), (1.3, -0.2, 0.5)])
 def test_of_a_frame_that_leaves_the_image_corners_are_right_or_unknown(place_m):
-    """So far fails. The image's border is no side of a window."""
+    """So far fails. The image's border is not a side of a window."""
     view = (np.array(place_m), 0.1, 1.2, LEVEL_FROM_CAM)
     found, (hole_px, outline_px) = corners_of(draw(*view), FOCAL_PX, LEVEL_FROM_CAM), both(*view)
     assert found is not None
@@ -127,7 +127,7 @@ def test_where_no_window_is_there_are_no_corners():
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_square_is_where_its_corners_say(view):
-    """So far fails: it is taken to be straight ahead."""
+    """So far fails: the result is straight ahead."""
     p_m, heading_rad, side_m, turn = case(view)
     seen = square_pose(project(p_m, heading_rad, side_m, turn), side_m, FOCAL_PX, SIZE_PX, turn)
     assert seen.p_m == pytest.approx(p_m, abs=0.01)
@@ -136,7 +136,7 @@ def test_a_square_is_where_its_corners_say(view):
 
 
 def test_of_two_answers_the_upright_one_is_taken():
-    """So far fails. From below a square that leans looks nearly the same; the true one stands upright."""
+    """So far fails. From below, a leaning square looks similar; the true one is vertical."""
     turn = level_from_cam(0, 25)
     for heading_deg in (-40, -25, -10, 10, 25, 40):
         p_m, heading_rad = np.array([2.0, 0.2, 1.1]), math.radians(heading_deg)
@@ -145,7 +145,7 @@ def test_of_two_answers_the_upright_one_is_taken():
 
 
 def test_a_noisy_corner_moves_a_place_as_far_as_it_should():
-    """So far fails. Not twice what (4) says; and no less than half: that would be too good to be true."""
+    """So far fails. The error is at most twice the value of (4), and at least half of it."""
     random = np.random.default_rng(2)
     p_m, side_m, noise_px = np.array([3.0, 0.0, 0.0]), 1.2, 0.5
     off_m = []
@@ -160,13 +160,13 @@ def test_a_noisy_corner_moves_a_place_as_far_as_it_should():
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_the_frame_tells_how_large_the_opening_is(view):
-    """So far fails: it is the mean."""
+    """So far fails: the result is the mean."""
     hole_px, outline_px = both(*case(view))
     assert side_of(hole_px, outline_px) == pytest.approx(view[2], rel=0.005)
 
 
 def test_from_afar_one_knows_less():
-    """So far fails: it is the same everywhere. (4) is the least; what else is uncertain comes in addition."""
+    """So far fails: the covariance is constant. (4) is the minimum; other errors come in addition."""
     for z_m in (2.0, 4.0):
         for ray in (np.array([1.0, 0, 0]), np.array([0.8, 0.6, 0])):
             covariance = noise(z_m * ray, 1.2, FOCAL_PX, 0.7)
@@ -187,7 +187,7 @@ def measurements(count, R):
 
 
 def test_a_filter_comes_nearer_with_each_image():
-    """So far fails: the last image counts. After forty a place is known six times as well as after one."""
+    """So far fails: only the last image counts. After 40 images the error is a sixth of that of one image."""
     R = np.diag([0.2, 0.1, 0.1, 0.1]) ** 2
     true, seen = measurements(40, R)
     kept = WindowFilter(seen[0], R)
@@ -199,7 +199,7 @@ def test_a_filter_comes_nearer_with_each_image():
 
 
 def test_a_filter_takes_nothing_that_chance_does_not_explain():
-    """So far fails: it takes all. The next window's place is not this one's."""
+    """So far fails: all measurements are accepted. The position of the next window is an outlier for this one."""
     R = np.diag([0.1, 0.1, 0.1, 0.1]) ** 2
     kept = WindowFilter(np.array([3.0, 0.0, 1.0, 0.0]), R)
     assert kept.update(np.array([3.2, -0.2, 1.1, 0.1]), R)
@@ -209,7 +209,7 @@ def test_a_filter_takes_nothing_that_chance_does_not_explain():
 
 
 def test_while_nothing_is_seen_a_filter_knows_less():
-    """So far fails: it keeps all it knows."""
+    """So far fails: the uncertainty does not grow."""
     kept = WindowFilter(np.zeros(4), np.eye(4) * 0.01)
     for _ in range(30):
         kept.predict(1 / 30, 0.1)
@@ -218,7 +218,7 @@ def test_while_nothing_is_seen_a_filter_knows_less():
 
 
 def test_a_heading_of_a_full_turn_is_none():
-    """So far fails: 179 and -179 degrees are taken for far apart, or for each other."""
+    """So far fails: 179 and -179 degrees differ by only 2 degrees."""
     R = np.eye(4) * 0.01
     kept = WindowFilter(np.array([0, 0, 0, math.pi - 0.02]), R)
     assert kept.update(np.array([0, 0, 0, -math.pi + 0.04]), R)

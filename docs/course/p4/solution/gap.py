@@ -1,7 +1,7 @@
-"""Project 4: the gap, from one image with depth or from colour images that a sideways flight has taken.
+"""Project 4: the gap, from one image with depth, or from colour images of a sideways flight.
 
-Images are (H, W) or (H, W, 3). A camera looks along +z, x to the right, y down; its axis goes through the image's
-middle. Pixels are continuous: (0, 0) is the outer corner of the top-left one.
+Images are (H, W) or (H, W, 3). The camera's axes are x right, y down, z forward; its axis goes through the middle of
+the image. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -15,51 +15,51 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# A point is of the wall within this, and a share of its distance. [m], [1]
+# Maximum distance of a point from the wall: a constant, and a fraction of its range. [m], [1]
 NEAR_M, NEAR_SHARE = 0.04, 0.01
-# A ray that ends this far behind the wall's front has gone through: the wall is 0.12 m thick. [m]
+# A ray that ends this far behind the wall's front has passed through it; the wall is 0.12 m thick. [m]
 BEHIND_M = 0.35
-# Planes that are tried, and the least cosine between the wall's normal and the camera's axis.
+# Number of tried planes, and minimum cosine between the wall's normal and the camera's axis.
 DRAWS, FACING = 150, 0.8
-# A cell in the wall. [m]
+# Size of a cell of the wall. [m]
 CELL_M = 0.03
-# What is asked for: the vehicle's radius and 5 cm. [m]
+# Minimum radius of a gap: the vehicle's radius plus 5 cm. [m]
 LEAST_ROOM_M = 0.17
 
-# Distances at which the wall is looked for, evenly in 1 / Z. [m]
+# Range and number of tried distances of the wall, uniform in 1 / Z. [m]
 NEAREST_M, FARTHEST_M, DEPTHS = 0.9, 16.0, 56
-# Behind the wall is what has less than this share of its 1 / Z. [1]
+# Points with less than this fraction of the wall's 1 / Z are behind the wall. [1]
 BEHIND = 0.8
-# Halves of the windows in which images are compared, and in which the comparison is averaged. [px]
+# Half sizes of the windows for comparing images, and for averaging the comparison. [px]
 FINE_PX, WIDE_PX = 2, 6
-# By so much attitude and place may shift an image. [px]
+# Maximum shift of an image because of errors in attitude and position. [px]
 SLACK_PX = 3
-# More than this no two pixels differ. [grey levels of 255]
+# Upper limit of the difference of two pixels. [grey levels of 255]
 UNLIKE = 40.0
 
 
 class Gap(NamedTuple):
-    """Where the greatest circle that fits into the gap lies."""
+    """The largest circle that fits into the gap."""
 
     u_px: float
     v_px: float
-    """Its middle in the image. [px]"""
+    """Centre in the image. [px]"""
     wall_m: float
-    """The wall's depth there, along the camera's axis. [m]"""
+    """Depth of the wall there, along the camera's axis. [m]"""
     room_m: float
-    """Its radius. [m]"""
+    """Radius. [m]"""
 
 
 def level(image: npt.NDArray[np.uint8], focal_px: float, level_from_cam: F64) -> F64:
-    """Returns what a camera at the same place would show that is turned as `level_from_cam` says, (3, 3), in grey.
+    """Returns the grey image of a camera at the same position, rotated by `level_from_cam` (3, 3).
 
-    `image` is (H, W, 3); returned is (H, W), NaN where the image has nothing.
+    `image` is (H, W, 3). The result is (H, W), NaN outside the image.
     """
     grey = image @ np.array([0.299, 0.587, 0.114])
     rows, columns = grey.shape
     v, u = np.mgrid[:rows, :columns] + 0.5
     rays = np.stack([(u - columns / 2) / focal_px, (v - rows / 2) / focal_px, np.ones_like(u)], -1) @ level_from_cam
-    # Of the pixels' middles. A pixel behind the camera is none.
+    # Coordinates of the pixels' centres; pixels behind the camera are invalid.
     x = focal_px * rays[..., 0] / rays[..., 2] + columns / 2 - 0.5
     y = focal_px * rays[..., 1] / rays[..., 2] + rows / 2 - 0.5
     inside = (rays[..., 2] > 0) & (x >= 0) & (y >= 0) & (x <= columns - 1) & (y <= rows - 1)
@@ -72,7 +72,7 @@ def level(image: npt.NDArray[np.uint8], focal_px: float, level_from_cam: F64) ->
 
 
 def surrounded(free: Mask, solid: Mask) -> Mask:
-    """Returns those of the free cells that cannot be left for the edge without crossing solid ones; all (H, W)."""
+    """Returns the free cells that are enclosed by solid cells, so that no free path leads to the edge; all (H, W)."""
     outside = np.zeros_like(free)
     outside[[0, -1], :] = ~solid[[0, -1], :]
     outside[:, [0, -1]] |= ~solid[:, [0, -1]]
@@ -88,16 +88,16 @@ def surrounded(free: Mask, solid: Mask) -> Mask:
 
 
 def greatest_circle(free: Mask) -> tuple[float, float, float] | None:
-    """Returns column, row and radius of the greatest circle of free cells, (H, W): of their middles, in cells.
+    """Returns column, row and radius of the largest circle of free cells, (H, W), in cells from centre to centre.
 
-    A circle may not leave the image. None if nothing is free.
+    The circle stays in the image. None if nothing is free.
     """
     padded = np.pad(free, 1)
     neighbours = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     inner = np.argwhere(neighbours)
     if len(inner) == 0:
         return None
-    # Nearest to a free cell is a cell that is not free, and beside one that is.
+    # The nearest blocked cell of a free cell always has a free neighbour.
     beside = np.zeros_like(padded)
     for axis in (0, 1):
         for step in (1, -1):
@@ -109,7 +109,7 @@ def greatest_circle(free: Mask) -> tuple[float, float, float] | None:
 
 
 def without_specks(mask: Mask, times: int = 1) -> Mask:
-    """Returns a mask (H, W) in which each cell is what most of its 3 x 3 neighbourhood is."""
+    """Returns a mask (H, W) in which each cell has the majority value of its 3 x 3 neighbourhood."""
     for _ in range(times):
         padded = np.pad(mask, 1, mode="edge").astype(np.int32)
         rows = padded[:-2] + padded[1:-1] + padded[2:]
@@ -118,7 +118,7 @@ def without_specks(mask: Mask, times: int = 1) -> Mask:
 
 
 def find_wall(points_m: F64, random: np.random.Generator) -> tuple[F64, float] | None:
-    """Finds the plane n . p = d that most points (N, 3) lie in, of those that face the camera; returns n, d.
+    """Finds the plane n . p = d with the most points (N, 3) of all planes that face the camera. Returns n, d.
 
     M. Fischler and R. Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981.
     """
@@ -147,7 +147,7 @@ def find_wall(points_m: F64, random: np.random.Generator) -> tuple[F64, float] |
 
 
 def by_depth(depth_m: npt.NDArray[np.floating], focal_px: float) -> Gap | None:
-    """Finds the gap in an image of depth (H, W) along the camera's axis [m]; 0 is no return. None if there is none."""
+    """Finds the gap in a depth image (H, W) along the camera's axis [m]; 0: no return. None if there is no gap."""
     rows, columns = depth_m.shape
     v, u = np.mgrid[:rows, :columns] + 0.5
     rays = np.stack([(u - columns / 2) / focal_px, (v - rows / 2) / focal_px, np.ones_like(u)], -1)
@@ -157,7 +157,7 @@ def by_depth(depth_m: npt.NDArray[np.floating], focal_px: float) -> Gap | None:
         return None
     normal, distance_m = wall
 
-    # Cells in the wall, columns to the right and rows down, about the point that the camera's axis meets.
+    # Cells of the wall, columns to the right and rows down, around the intersection with the camera's axis.
     right = np.cross([0.0, 1.0, 0.0], normal)
     right /= np.linalg.norm(right)
     down = np.cross(normal, right)
@@ -167,7 +167,7 @@ def by_depth(depth_m: npt.NDArray[np.floating], focal_px: float) -> Gap | None:
     below, aside = np.mgrid[-half[0] : half[0] + 1, -half[1] : half[1] + 1] * cell_m
     cells_m = middle_m + aside[..., None] * right + below[..., None] * down
 
-    # Each cell is what its pixel has seen: nothing, something before the wall, the wall, or what is behind it.
+    # State of each cell from its pixel: unknown, in front of the wall, wall, or behind it.
     seen_u = (focal_px * cells_m[..., 0] / cells_m[..., 2] + columns / 2).astype(int)
     seen_v = (focal_px * cells_m[..., 1] / cells_m[..., 2] + rows / 2).astype(int)
     inside = (cells_m[..., 2] > 0) & (seen_u >= 0) & (seen_u < columns) & (seen_v >= 0) & (seen_v < rows)
@@ -188,7 +188,7 @@ def by_depth(depth_m: npt.NDArray[np.floating], focal_px: float) -> Gap | None:
 
 
 def box_mean(image: F64, half: int) -> F64:
-    """Returns the mean over (2 half + 1)^2 pixels about each of an image (H, W), which is continued at its edges."""
+    """Returns the mean over (2 half + 1)^2 pixels around each pixel of an image (H, W), padded at its edges."""
     size = 2 * half + 1
     sums = np.pad(image, ((half + 1, half), (half + 1, half)), mode="edge").cumsum(axis=0).cumsum(axis=1)
     return (sums[size:, size:] - sums[:-size, size:] - sums[size:, :-size] + sums[:-size, :-size]) / size**2
@@ -207,19 +207,19 @@ def shifted(image: F64, right_px: float, down_px: int = 0) -> F64:
 
 
 def difference(one: F64, other: F64) -> F64:
-    """Returns by how much two grey images (H, W) differ, bounded: what one of them does not show is unlike."""
-    # Any comparison with NaN is false.
+    """Returns the bounded difference of two grey images (H, W); pixels missing in one of them have the maximum."""
+    # Comparisons with NaN are always false.
     apart = abs(one - other)
     return np.where(apart < UNLIKE, apart, UNLIKE)
 
 
 class Views:
-    """Grey images (H, W) of level cameras beside each other; distances are tried on the first one.
+    """Grey images (H, W) of level cameras side by side; distances are tested on the first one.
 
-    A place at the distance Z is f X / Z further left in an image that was taken X further to the right: (2), with
-    V dt = X. Images from the left and from the right are taken apart, and those count that explain more: what the gap's
-    edge hides from one side is seen from the other (S. B. Kang, R. Szeliski and J. Chai, "Handling occlusions in dense
-    multi-view stereo", CVPR 2001). That several images decide together, by 1 / Z: M. Okutomi and T. Kanade, "A
+    A point at the distance Z moves left by f X / Z in an image taken X further to the right: (2), with V dt = X. Images
+    from the left and from the right are evaluated separately, and the better side counts: a part that the gap's edge
+    hides from one side is visible from the other (S. B. Kang, R. Szeliski and J. Chai, "Handling occlusions in dense
+    multi-view stereo", CVPR 2001). Combination of several images by 1 / Z: M. Okutomi and T. Kanade, "A
     multiple-baseline stereo", IEEE Transactions on Pattern Analysis and Machine Intelligence 15(4), 1993.
     """
 
@@ -229,7 +229,7 @@ class Views:
         self.widest_px_m = max(abs(step) for _, step in self.others)
 
     def cost(self, per_m: float, half_px: int) -> F64:
-        """Returns how badly the distance 1 / `per_m` [1/m] explains each pixel's window, (H, W) [grey levels]."""
+        """Returns the matching cost of the distance 1 / `per_m` [1/m] for each pixel's window, (H, W) [grey levels]."""
         sides: list[list[F64]] = [[], []]
         for image, step in self.others:
             sides[step > 0].append(difference(shifted(image, -step * per_m), self.first))
@@ -237,19 +237,19 @@ class Views:
         return np.minimum.reduce(means)
 
     def left_over(self, per_m: float, among: Mask) -> float:
-        """Returns what the distance 1 / `per_m` [1/m] leaves unexplained in all images, `among` some pixels (H, W)."""
+        """Returns the residual of the distance 1 / `per_m` [1/m] in all images, over the pixels `among` (H, W)."""
         moved = [shifted(image, -step * per_m) for image, step in self.others]
         return float(sum(difference(image, self.first)[among].sum() for image in moved))
 
     def align(self, per_m: float, of_wall: Mask) -> None:
-        """Shifts each image so that the wall fits best: by what attitude and place are off, some pixels."""
+        """Shifts each image by some pixels so that the wall fits best, to correct errors of attitude and position."""
         for index, (image, step) in enumerate(self.others):
             moved = shifted(image, -step * per_m)
 
             def off(right_px: float, down_px: int, moved: F64 = moved) -> float:
                 return float(difference(shifted(moved, right_px, down_px), self.first)[of_wall].sum())
 
-            # Across and down in turn: the wall has edges in both directions.
+            # Horizontal and vertical shifts in turn, because the wall has edges in both directions.
             right_px, down_px = 0.0, 0
             for _ in range(2):
                 right_px = min(np.arange(-SLACK_PX, SLACK_PX + 0.1, 0.5), key=lambda x: off(x, down_px))
@@ -260,18 +260,18 @@ class Views:
 def by_motion(
     images: Sequence[F64], right_m: Sequence[float], focal_px: float, margin: float = 0.0
 ) -> Gap | None:
-    """Finds the gap in grey images (H, W) that level cameras of one heading have taken beside each other.
+    """Finds the gap in grey images (H, W) of level cameras with the same heading, side by side.
 
-    `right_m` says how far to the right each was taken [m]. The gap's place is that in the first image. None if there is
-    none. A place counts as behind if that explains the images better by `margin` [grey levels]: of one colour alone,
-    the many distances behind fit a little better by chance.
+    `right_m` are their positions to the right [m]. The result refers to the first image. None if there is no gap. A
+    pixel is behind the wall if that explains the images better by `margin` [grey levels]: for areas of one colour, the
+    many distances behind the wall fit a little better by chance.
     """
     views = Views(images, right_m, focal_px)
     rows, columns = images[0].shape
     middle = np.zeros((rows, columns), bool)
     middle[rows // 5 : rows - rows // 5, columns // 5 : columns - columns // 5] = True
 
-    # The wall: the distance at which most of the middle is, first roughly, in every third row, then finely.
+    # Find the wall: the distance of most of the middle, first coarsely, in every third row, then finely.
     tried = np.linspace(1 / FARTHEST_M, 1 / NEAREST_M, DEPTHS)
     roughly = Views([image[::3] for image in images], right_m, focal_px)
     best = np.argmin([roughly.cost(per_m, FINE_PX) for per_m in tried], axis=0)
@@ -282,11 +282,12 @@ def by_motion(
     wall_per_m = fine[np.argmin([views.left_over(per_m, of_wall) for per_m in fine])]
     views.align(wall_per_m, of_wall)
 
-    # Two clusters: what moves as the wall does, and what moves less. Tried are distances behind, a pixel apart.
+    # Two clusters: pixels that move like the wall, and pixels that move less. Test distances behind the wall, one pixel
+    # apart.
     count = int(views.widest_px_m * wall_per_m) + 2
     behind = np.min([views.cost(per_m, FINE_PX) for per_m in np.linspace(0.0, BEHIND * wall_per_m, count)], axis=0)
     on_it = np.min([views.cost(wall_per_m * share, FINE_PX) for share in (0.98, 1.0, 1.02)], axis=0)
-    # One colour alone fits everywhere: there the neighbourhood decides.
+    # An area of one colour fits all distances, so use its neighbourhood.
     free = without_specks(box_mean(behind - on_it, WIDE_PX) < -margin)
     found = greatest_circle(surrounded(free, ~free))
     if found is None:

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Project 4: looks for the gap, flies before it, looks again from there, and goes through.
+"""Project 4: looks for the gap, flies in front of it, looks again from there, and flies through.
 
-With depth (`ug`) one image at rest is a look. Without (`g`) a look is a step to both sides: what is far behind the wall
-moves less in the image than the wall does. All that is known of the own place are the steps that were asked for.
+With depth (`ug`), a look is one image at rest. Without depth (`g`), a look is a step to both sides: points far behind
+the wall move less in the image than the wall. The position comes only from the requested steps.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from gap import F64, Gap, by_depth, by_motion, level
 import vizflyt
 from vizflyt import Setpoint
 
-# How far before the wall it stands when it looks for the last time, and how far behind it the way ends. [m]
+# Distance from the wall at the last look, and distance behind it at the end of the path. [m]
 STAND_M, BEYOND_M = 1.7, 0.9
-# From here on it flies straight, along the middle of the gap. [m]
+# From this distance it flies straight, along the middle of the gap. [m]
 NEAR_M = 1.2
-# On the way there; through the gap; sideways, to see. [m/s]
+# Speed to the wall, through the gap, and sideways for a look. [m/s]
 THERE_MPS, THROUGH_MPS, ASIDE_MPS = 1.2, 1.2, 0.8
-# Until the vehicle stands at the end of a way, after it would be there by its speed alone. [s]
+# Time to settle at the end of a path, in addition to length over speed. [s]
 SETTLE_S = 1.0
-# Where a look without depth takes its images: to the left of the first. [m]
+# Positions of a look without depth: to the left of the first image. [m]
 VIEWS_M = (0.35, -0.35)
-# The gap is decided on with this room: the vehicle, a near miss and what way and wall are off by. [m]
+# Minimum radius for a passage: the vehicle, a margin, and errors of path and wall. [m]
 ENOUGH_M = 0.22
-# So many images with depth are tried at one place.
+# Maximum number of images with depth at one position.
 PATIENCE = 15
-# Where it looks from if it has seen nothing: steps that lead back to where it began. [m, heading]
+# Positions for further looks if nothing was found: steps that end at the start. [m, heading]
 ABOUT_M = ((-0.4, 0.0, 0.3), (0.0, 0.5, 0.0), (0.0, -1.0, 0.0), (0.4, 0.5, -0.3))
 
 Steps = Generator[Setpoint | None, None, None]
@@ -49,12 +49,12 @@ def rotation(xyzw: F64) -> F64:
     )
 
 
-# A level camera that looks ahead: x right, y down, z ahead, in axes x ahead, y left, z up.
+# Axes of a level camera that looks forward (x right, y down, z forward), in axes x forward, y left, z up.
 HEADING_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Through(vizflyt.Plugin):
-    """One flight. `_fly` is the way through its states, and gives the answer to one image after the other."""
+    """One flight. `_fly` goes through the states, and yields one reply for each image."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.flying = False
@@ -92,7 +92,7 @@ class Through(vizflyt.Plugin):
             if to_m[0] < STAND_M + 0.3:
                 break
             yield from self._go(to_m - [STAND_M, 0, 0], THERE_MPS)
-        # Before its middle first, then straight.
+        # First to a point in front of the middle, then straight.
         before_m = np.array([max(to_m[0] - NEAR_M, 0.0), to_m[1], to_m[2]])
         yield from self._go(before_m, THERE_MPS)
         print("through", flush=True)
@@ -104,16 +104,16 @@ class Through(vizflyt.Plugin):
             yield Setpoint.hold()
 
     def _go(self, by_m: F64, speed_mps: float) -> Steps:
-        """Flies a straight way [m, heading], and waits until it is over and the vehicle stands."""
+        """Flies a straight path [m, heading], and waits until the vehicle is at rest at its end."""
         self.path += 1
         until_s = self.now_s + float(np.linalg.norm(by_m)) / speed_mps + SETTLE_S
         path = Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
-        # The same path again goes on, and holds its end; after None the vehicle stops half a second later, where it is.
+        # Returning the same path continues it, and holds at its end. With None the vehicle would stop 0.5 s later.
         while self.now_s < until_s:
             yield path
 
     def _look(self) -> Look:
-        """Returns the way from here to the gap's middle, (3,) [m, heading]; None if none is seen."""
+        """Returns the vector to the gap's middle, (3,) [m, heading]; None if there is no gap."""
         if self.front.depth_mm.any():
             for _ in range(PATIENCE):
                 found = by_depth(self.front.depth, self.front.intrinsics.fx_px)

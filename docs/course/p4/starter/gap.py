@@ -1,7 +1,7 @@
-"""Project 4: the gap in images. This is the file to work in; no flight is in it.
+"""Project 4: the gap in images. Work in this file; it contains no flight code.
 
-Images are (H, W) or (H, W, 3). A camera looks along +z, x to the right, y down; its axis goes through the image's
-middle. Pixels are continuous: (0, 0) is the outer corner of the top-left one.
+Images are (H, W) or (H, W, 3). The camera's axes are x right, y down, z forward; its axis goes through the middle of
+the image. Pixels are continuous: (0, 0) is the outer corner of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -16,43 +16,43 @@ F64 = npt.NDArray[np.float64]
 
 
 class Gap(NamedTuple):
-    """Where the greatest circle that fits into the gap lies."""
+    """The largest circle that fits into the gap."""
 
     u_px: float
     v_px: float
-    """Its middle in the image: the safe point. [px]"""
+    """Centre in the image: the safe point. [px]"""
     wall_m: float
-    """The wall's depth there, along the camera's axis. [m]"""
+    """Depth of the wall there, along the camera's axis. [m]"""
     room_m: float
-    """Its radius. [m]"""
+    """Radius. [m]"""
 
 
 def by_depth(depth_m: npt.NDArray[np.floating], focal_px: float) -> Gap | None:
-    """Finds the gap in an image of depth (H, W) along the camera's axis [m]; 0 is no return. None if there is none.
+    """Finds the gap in a depth image (H, W) along the camera's axis [m]; 0: no return. None if there is no gap.
 
-    `ug`. The wall need not be straight ahead: the camera may be turned.
+    `ug`. The camera may be rotated, so that it does not look straight at the wall.
     """
-    # So far: the image's middle, in which no room is known.
+    # To do: for now the middle of the image, with radius 0.
     rows, columns = depth_m.shape
     return Gap(columns / 2, rows / 2, float(depth_m[rows // 2, columns // 2]), 0.0)
 
 
 def level(image: npt.NDArray[np.uint8], focal_px: float, level_from_cam: F64) -> F64:
-    """Returns what a camera at the same place would show that is turned by `level_from_cam`, in grey.
+    """Returns the grey image of a camera at the same position, rotated by `level_from_cam`.
 
-    `g`. `image` is (H, W, 3); `level_from_cam` (3, 3) turns directions from the camera's axes into those of the camera
-    asked for. Returned is (H, W), 0 to 255, NaN where `image` does not show it.
+    `g`. `image` is (H, W, 3); `level_from_cam` (3, 3) rotates directions from the camera's axes to those of the new
+    camera. The result is (H, W), 0 to 255, NaN outside of `image`.
     """
-    # So far: the turn is not taken away.
+    # To do: for now the rotation is ignored.
     return image @ np.array([0.299, 0.587, 0.114])
 
 
 def by_motion(images: Sequence[F64], right_m: Sequence[float], focal_px: float) -> Gap | None:
-    """Finds the gap in grey images (H, W), 0 to 255, of level cameras beside each other that look ahead.
+    """Finds the gap in grey images (H, W), 0 to 255, of level cameras side by side that look forward.
 
-    `g`. There are two or more; `right_m` says how far to the right each was taken [m], all at one height and distance.
-    A pixel may be NaN: nothing is known there. The gap's place is that in the first image. None if there is none.
+    `g`. There are at least two. `right_m` are their positions to the right [m], all at the same height and distance. A
+    pixel may be NaN, which means unknown. The result refers to the first image. None if there is no gap.
     """
-    # So far: the image's middle, in which no room is known.
+    # To do: for now the middle of the image, with radius 0.
     rows, columns = images[0].shape
     return Gap(columns / 2, rows / 2, 0.0, 0.0)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Project 4: looks, creeps ahead, looks again, and lands; it prints what `gap.py` finds. The way through is yours."""
+"""Project 4: looks, flies forward a little, looks again, lands, and prints results of `gap.py`. To do: the flight."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from gap import F64, Gap, by_depth, by_motion, level
 import vizflyt
 from vizflyt import Setpoint
 
-# Until the vehicle stands at the end of a way, after it would be there by its speed alone. [s]
+# Time to settle at the end of a path, in addition to length over speed. [s]
 SETTLE_S = 1.0
-# How far it creeps, how often, and how fast; how far it steps aside where it gets no depth. [m], [m/s]
+# Length, number and speed of forward steps; length of a step to the side if there is no depth. [m], [m/s]
 CREEP_M, LOOKS, SPEED_MPS, ASIDE_M = 0.4, 2, 0.6, 0.3
 
-# One setpoint for each image; None leaves the last one in force.
+# One setpoint for each image; None keeps the previous one.
 Steps = Generator[Setpoint | None, None, None]
 Look = Generator[Setpoint | None, None, F64 | None]
 
-# A level camera that looks ahead (x right, y down, z ahead) in axes `heading` (x ahead, y left, z up).
+# Axes of a level camera that looks forward (x right, y down, z forward), in axes `heading` (x forward, y left, z up).
 HEADING_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
@@ -37,7 +37,7 @@ def rotation(xyzw: F64) -> F64:
 
 
 class Mine(vizflyt.Plugin):
-    """One flight. `_fly` is the way through its states, and gives the answer to one image after the other."""
+    """One flight. `_fly` goes through the states, and yields one reply for each image."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.flying = False
@@ -51,7 +51,7 @@ class Mine(vizflyt.Plugin):
 
     def on_image(self, obs: vizflyt.Observation) -> Setpoint | None:
         front, vehicle = obs.camera("front"), obs.vehicle
-        # An image of the camera that looks down comes with the front camera's last one.
+        # Each image of the downward camera also contains the front camera's previous image.
         if front is None or vehicle is None or front.seq == self.seen:
             return None
         self.seen = front.seq
@@ -64,7 +64,7 @@ class Mine(vizflyt.Plugin):
         return next(self.steps, Setpoint.land())
 
     def _fly(self) -> Steps:
-        """Yours: where does it stand to look again, when does it decide, what leads back?"""
+        """To do: where to look again, when to decide, and how to return."""
         yield from self._rest(SETTLE_S)
         for _ in range(LOOKS):
             to_m = yield from self._look()
@@ -78,17 +78,17 @@ class Mine(vizflyt.Plugin):
             yield Setpoint.hold()
 
     def _go(self, by_m: F64, speed_mps: float) -> Steps:
-        """Flies a straight way [m, heading], and waits until it is over and the vehicle stands."""
+        """Flies a straight path [m, heading], and waits until the vehicle is at rest at its end."""
         self.path += 1
         until_s = self.now_s + float(np.linalg.norm(by_m)) / speed_mps + SETTLE_S
         path = Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
-        # The same path again goes on, and holds its end; after None the vehicle stops half a second later, where it is.
+        # Returning the same path continues it, and holds at its end. With None the vehicle would stop 0.5 s later.
         while self.now_s < until_s:
             yield path
 
     def _look(self) -> Look:
-        """Returns the way from here to the gap's middle, (3,) [m, heading]; None if none is seen. Without depth it
-        steps aside to see, and ends there."""
+        """Returns the vector to the gap's middle, (3,) [m, heading]; None if there is no gap. Without depth it steps to
+        the side for a second image, and stays there."""
         focal_px = self.front.intrinsics.fx_px
         if self.front.depth_mm.any():
             found = by_depth(self.front.depth, focal_px)
@@ -100,7 +100,7 @@ class Mine(vizflyt.Plugin):
         return None if found is None else self._way(found, HEADING_FROM_LEVEL) + np.array([0, ASIDE_M, 0])
 
     def _heading_from_cam(self) -> F64:
-        """Turns directions from the front camera's axes into axes `heading` of the flight's begin, (3, 3)."""
+        """Returns the rotation (3, 3) from the front camera's axes to the axes `heading` of the flight's begin."""
         assert self.yaw_rad is not None
         cos, sin = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         heading_from_world = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])

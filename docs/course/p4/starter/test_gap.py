@@ -1,6 +1,7 @@
-"""What `gap.py` of project 4 has to do, on images that are made here: `python -m pytest` in your folder.
+"""Requirements of `gap.py` of project 4, on generated images: `python -m pytest` in your folder.
 
-Those marked "so far fails" are yours to mend: `ug` the ones by depth, `g` the others too. Add your own.
+Tests marked "so far fails" pass with a correct solution: for `ug` those by depth, for `g` also the others. Add your
+own.
 """
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from gap import by_depth, by_motion, level
 
 ROWS, COLUMNS, FOCAL_PX = 240, 320, 160.0
-# The camera's height, the wall's upper edge, and what is behind the wall. [m]
+# Height of the camera, height of the wall's upper edge, and distance from the wall to the hall behind it. [m]
 HEIGHT_M, TOP_M, HALL_M = 1.2, 3.1, 9.0
 VEHICLE_M = 0.12
 
@@ -18,13 +19,13 @@ def circle(x, y):
 
 
 def wandering(x, y):
-    """A circle's edge that wanders."""
+    """A circle with an irregular edge."""
     angle = np.arctan2(y, x)
     return np.hypot(x, y) < 0.55 + 0.09 * np.sin(3 * angle + 1) + 0.05 * np.sin(7 * angle)
 
 
 def banana(x, y):
-    """Its centroid lies in the wall."""
+    """A shape with its centroid in the wall."""
     ring = abs(np.hypot(x, y) - 0.65) < 0.3
     return ring & (x + 0.2 * y < 0.1)
 
@@ -34,12 +35,12 @@ def nothing(x, y):
 
 
 def slot(x, y):
-    """A square metre in which the vehicle fits nowhere."""
+    """An area of one square metre that is too narrow for the vehicle."""
     return (abs(x) < 2.5) & (abs(y) < 0.1)
 
 
 SHAPES = [circle, wandering, banana]
-# Where its middle is, to the right of the camera's axis and below it; the wall's distance. [m]
+# Position of the gap's middle to the right of the camera's axis and below it; distance of the wall. [m]
 PLACES = [(0.0, 0.0, 3.0), (-0.7, -0.4, 3.0), (0.6, 0.1, 4.6), (0.1, -0.3, 1.9)]
 
 
@@ -51,7 +52,7 @@ def rays(cam_from_level):
 
 
 def cast(shape, place_m, right_m=0.0, cam_from_level=None, top_m=TOP_M):
-    """Returns for each pixel the distance along the level axis, and whether it is of wall (0), floor (1), hall (2)."""
+    """Returns for each pixel the distance along the level axis, and its surface: wall (0), floor (1), hall (2)."""
     directions = rays(np.eye(3) if cam_from_level is None else cam_from_level)
     x_m, y_m, wall_m = place_m
     at = directions / directions[..., 2:] * wall_m
@@ -65,7 +66,7 @@ def cast(shape, place_m, right_m=0.0, cam_from_level=None, top_m=TOP_M):
 
 
 def depth(shape, place_m, cam_from_level=None, top_m=TOP_M):
-    """Returns depth along the camera's own axis, (H, W). [m]"""
+    """Returns depth along the camera's axis, (H, W). [m]"""
     turn = np.eye(3) if cam_from_level is None else cam_from_level
     along_m, _, directions = cast(shape, place_m, 0.0, cam_from_level, top_m)
     points_m = directions / directions[..., 2:] * along_m[..., None]
@@ -94,7 +95,7 @@ def colour(shape, place_m, right_m=0.0, cam_from_level=None, plain_hall=False):
 
 
 def clearance_m(shape, x_m, y_m):
-    """Returns how far a place in the wall is from the edge of a shape. [m]"""
+    """Returns the distance of a point of the wall from the edge of a shape. [m]"""
     ring = np.linspace(0, 2 * np.pi, 180)
     for radius_m in np.arange(0.0, 1.0, 0.01):
         if not shape(x_m + radius_m * np.cos(ring), y_m + radius_m * np.sin(ring)).all():
@@ -103,7 +104,7 @@ def clearance_m(shape, x_m, y_m):
 
 
 def greatest_m(shape):
-    """Returns the radius of the greatest circle in a shape. [m]"""
+    """Returns the radius of the largest circle in a shape. [m]"""
     return max(clearance_m(shape, x, y) for x in np.arange(-1, 1, 0.05) for y in np.arange(-1, 1, 0.05))
 
 
@@ -113,7 +114,7 @@ def check(found, shape, place_m, off_m):
     x_m = (found.u_px - COLUMNS / 2) / FOCAL_PX * place_m[2] - place_m[0]
     y_m = (found.v_px - ROWS / 2) / FOCAL_PX * place_m[2] - place_m[1]
     best_m = greatest_m(shape)
-    # Nearly as much room as there is anywhere, and no more is said than that.
+    # The clearance must be close to the maximum, and the radius must not exceed it.
     assert clearance_m(shape, x_m, y_m) > best_m - off_m
     assert best_m - 2 * off_m < found.room_m < best_m + off_m
 
@@ -121,13 +122,13 @@ def check(found, shape, place_m, off_m):
 @pytest.mark.parametrize("place_m", PLACES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_gap_is_found_by_depth(shape, place_m):
-    """So far fails: it is taken for the image's middle."""
+    """So far fails: the result is the middle of the image."""
     check(by_depth(depth(shape, place_m), FOCAL_PX), shape, place_m, 0.06)
 
 
 @pytest.mark.parametrize("place_m", PLACES[1:])
 def test_noise_and_pixels_without_return_hide_no_gap(place_m):
-    """So far fails. Depth is off by 1 %, every twentieth pixel has none, nor has a spot on the wall."""
+    """So far fails. Depth has an error of 1 %; every 20th pixel and a spot on the wall have no return."""
     random = np.random.default_rng(3)
     seen_m = depth(wandering, place_m) * random.normal(1, 0.01, (ROWS, COLUMNS))
     seen_m[random.random((ROWS, COLUMNS)) < 0.05] = 0
@@ -136,7 +137,7 @@ def test_noise_and_pixels_without_return_hide_no_gap(place_m):
 
 
 def test_a_wall_that_is_seen_from_the_side_has_its_gap_where_it_is():
-    """So far fails: the camera's nose is turned by 15 degrees, and lowered by 5."""
+    """So far fails: the camera is yawed by 15 degrees and pitched down by 5."""
     cos, sin = np.cos(np.radians(15)), np.sin(np.radians(15))
     yaw = np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
     cos, sin = np.cos(np.radians(5)), np.sin(np.radians(5))
@@ -152,7 +153,7 @@ def test_a_wall_that_is_seen_from_the_side_has_its_gap_where_it_is():
 @pytest.mark.parametrize("shape", [nothing, slot])
 @pytest.mark.parametrize("top_m", [TOP_M, 1.9])
 def test_a_wall_without_a_gap_has_none_by_depth(shape, top_m):
-    """Above a wall one sees far, too; and through a slot no vehicle fits."""
+    """Above the wall the distance is also large, and a slot is too narrow for the vehicle."""
     found = by_depth(depth(shape, PLACES[0], top_m=top_m), FOCAL_PX)
     assert found is None or found.room_m < VEHICLE_M
 
@@ -170,7 +171,7 @@ def test_a_level_image_stays_what_it_is():
 
 
 def test_a_turn_is_taken_away():
-    """So far fails: it stays. The camera rolls by 6 degrees and looks down by 4."""
+    """So far fails: the rotation is ignored. The camera is rolled by 6 degrees and pitched down by 4."""
     cos, sin = np.cos(np.radians(6)), np.sin(np.radians(6))
     roll = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     cos, sin = np.cos(np.radians(4)), np.sin(np.radians(4))
@@ -191,19 +192,19 @@ def views(shape, place_m, right_m, **kind):
 @pytest.mark.parametrize("place_m", PLACES)
 @pytest.mark.parametrize("shape", [circle, wandering])
 def test_a_gap_is_found_by_motion(shape, place_m):
-    """So far fails: it is taken for the image's middle."""
+    """So far fails: the result is the middle of the image."""
     right_m = (0.0, -0.35, 0.35)
     check(by_motion(views(shape, place_m, right_m), right_m, FOCAL_PX), shape, place_m, 0.13)
 
 
 def test_two_images_are_enough():
-    """So far fails. What the gap's edge hides from one of them is on one side: the middle is off by some of it."""
+    """So far fails. The gap's edge hides a part on one side of one image, so the middle has a small error."""
     right_m = (0.0, 0.3)
     check(by_motion(views(wandering, PLACES[1], right_m), right_m, FOCAL_PX), wandering, PLACES[1], 0.2)
 
 
 def test_one_colour_in_the_middle_of_the_hall_hides_no_gap():
-    """So far fails. There is no flow to be seen where all is of one colour; around it there is."""
+    """So far fails. An area of one colour has no optical flow, but its surroundings have."""
     right_m = (0.0, -0.35, 0.35)
     images = views(wandering, PLACES[0], right_m, plain_hall=True)
     check(by_motion(images, right_m, FOCAL_PX), wandering, PLACES[0], 0.2)

@@ -1,7 +1,7 @@
-"""Project 5: the hand that turns: its angle, its speed, and when a place is free of it.
+"""Project 5: the turning hand: its angle, its speed, and the times at which a point is free.
 
-In the hand's plane a point is (right, up) of the axle [m], as one sees it who flies through; angles count from right
-towards up [rad].
+In the hand's plane a point is (right, up) relative to the axle [m], in the direction of passage; angles count from
+right towards up [rad].
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 
-# From the axle to its free end, and half its width. [m]
+# Distance from the axle to the free end, and half of the width. [m]
 LENGTH_M, HALF_WIDTH_M = 0.95, 0.035
-# How finely a start is looked for. [s]
+# Step of the search for a start. [s]
 STEP_S = 0.02
 
 
 class Turning(NamedTuple):
-    """An even turning: theta(t) = theta_rad + omega_radps (t - at_s)."""
+    """A uniform rotation: theta(t) = theta_rad + omega_radps (t - at_s)."""
 
     at_s: float
     theta_rad: float
@@ -37,10 +37,10 @@ def wrapped(angle_rad: float) -> float:
 
 
 def in_plane(rays: F64, axle_m: F64, facing_rad: float) -> F64:
-    """Returns where rays meet the hand's plane, (N, 2) [m].
+    """Returns the intersections of rays with the hand's plane, (N, 2) [m].
 
-    `rays` (N, 3) begin in the camera, in level axes: x ahead, y left, z up. In these is the axle, (3,) [m]. The plane
-    stands upright; one flies through it in the direction `facing_rad`, from x towards y. No ray is along the plane.
+    `rays` (N, 3) begin at the camera, in level axes: x forward, y left, z up, like the axle (3,) [m]. The plane is
+    vertical; the direction of passage is `facing_rad`, from x towards y. No ray is parallel to the plane.
     """
     normal = np.array([np.cos(facing_rad), np.sin(facing_rad), 0.0])
     right = np.array([np.sin(facing_rad), -np.cos(facing_rad), 0.0])
@@ -49,15 +49,15 @@ def in_plane(rays: F64, axle_m: F64, facing_rad: float) -> F64:
 
 
 def angle_rad(points_m: F64) -> float:
-    """Returns the hand's angle from points (N, 2) on it: it points from the axle to where it is free."""
+    """Returns the hand's angle from points (N, 2) on it, in the direction from the axle to the free end."""
     right_m, up_m = points_m.mean(axis=0)
     return float(np.arctan2(up_m, right_m))
 
 
 def follow(at_s: F64, theta_rad: F64) -> Turning:
-    """Returns the turning by (1), from two or more angles (N,) in [-pi, pi) at times (N,) in their order.
+    """Returns the rotation by (1), from two or more angles (N,) in [-pi, pi) at times (N,) in their order.
 
-    Between two of them it turns by less than half a turn.
+    Between two angles the hand turns by less than half a turn.
     """
     unwrapped = theta_rad[0] + np.concatenate([[0.0], np.cumsum([wrapped(step) for step in np.diff(theta_rad)])])
     middle_s, middle_rad = at_s.mean(), unwrapped.mean()
@@ -67,15 +67,15 @@ def follow(at_s: F64, theta_rad: F64) -> Turning:
 
 
 def sigma_omega_radps(sigma_theta_rad: float, count: int, seconds: float) -> float:
-    """Returns how well omega is known by (2): from `count` angles with `sigma_theta_rad`, evenly over `seconds`."""
+    """Returns the standard deviation of omega by (2), from `count` angles with `sigma_theta_rad` over `seconds`."""
     return float(sigma_theta_rad * np.sqrt(12.0 / count) / seconds)
 
 
 def blocked_rad(rho_m: float, room_m: float) -> float:
-    """Returns beta of (3): how near in angle the hand's direction is to that of a place it blocks, to either side.
+    """Returns beta of (3): angles between hand and point below this are blocked, on either side.
 
-    The place is `rho_m` from the axle, and has to be `room_m` from the hand's middle line: r + w + m. Beyond the
-    hand's length its free end is what is near. Pi: it is always blocked; 0: never.
+    The point is `rho_m` from the axle, and needs the distance `room_m` from the hand's middle line: r + w + m. Beyond
+    the hand's length, its free end is nearest. Pi: always blocked; 0: never.
     """
     if rho_m <= room_m:
         return float(np.pi)
@@ -83,12 +83,12 @@ def blocked_rad(rho_m: float, room_m: float) -> float:
         return float(np.arcsin(room_m / rho_m))
     if rho_m >= LENGTH_M + room_m:
         return 0.0
-    # Three sides of a triangle: axle, free end, place.
+    # Three sides of a triangle: axle, free end, point.
     return float(np.arccos((rho_m**2 + LENGTH_M**2 - room_m**2) / (2 * rho_m * LENGTH_M)))
 
 
 def is_away(turning: Turning, place_m: F64, room_m: float, from_s: float, to_s: float) -> bool:
-    """Whether the hand does not block a place (2,) at any time from `from_s` to `to_s`."""
+    """Returns whether the hand does not block a point (2,) at any time from `from_s` to `to_s`."""
     beta_rad = blocked_rad(float(np.hypot(*place_m)), room_m)
     if beta_rad == 0.0:
         return True
@@ -100,9 +100,9 @@ def is_away(turning: Turning, place_m: F64, room_m: float, from_s: float, to_s: 
 def start_s(
     turning: Turning, place_m: F64, room_m: float, now_s: float, takes_s: float, early_s: float, late_s: float
 ) -> float | None:
-    """Returns when to start at the earliest, not before now; None if not within one turn of the hand.
+    """Returns the earliest time to start, not before now; None if there is none within one turn of the hand.
 
-    `takes_s` after its start the vehicle is in the hand's plane, `early_s` sooner or `late_s` later.
+    `takes_s` after its start the vehicle is in the hand's plane, at most `early_s` sooner or `late_s` later.
     """
     for start in np.arange(now_s, now_s + 2 * np.pi / abs(turning.omega_radps), STEP_S):
         there_s = start + takes_s

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Project 5: two windows, a gap, and a window with a turning hand, from colour; with depth (`ug`) the gap by that.
+"""Project 5: two windows, a gap, and a window with a turning hand, from colour; at level `ug` the gap from depth.
 
-It looks at rest and flies straight ways between looks. What it knows of its own place are the ways that it asked for:
-`home` are level axes at the place of take-off, x along the first heading, y left, z up. The nose always points along x.
-`gap.py` is that of project 4.
+It looks at rest and flies straight paths between looks. Its position comes only from the requested paths: `home` are
+level axes at the take-off position, x along the first heading, y left, z up. The nose always points along x. `gap.py`
+is that of project 4.
 """
 
 from __future__ import annotations
@@ -19,49 +19,49 @@ from windows import Mask, Window, find_window, of_colour
 import vizflyt
 from vizflyt import Setpoint
 
-# What is flown through, in this order: windows by the colour of their bars.
+# Order of the stages: windows by the colour of their bars.
 ORDER = ("red", "blue", "gap", "orange")
-# The usual width and height of an opening. [m]
+# Usual width and height of an opening. [m]
 SQUARE_M, WIDE_M = (1.17, 1.17), (1.375, 1.25)
-# Ways and passages; sideways, to see; past the hand. [m/s]
+# Speed of paths and passages; sideways for a look; past the hand. [m/s]
 THERE_MPS, ASIDE_MPS, HAND_MPS = 1.4, 0.8, 2.0
-# Until the vehicle stands at the end of a way, after it would be there by its speed alone. [s]
+# Time to settle at the end of a path, in addition to length over speed. [s]
 SETTLE_S = 0.8
-# The same where images are compared by the places that they were taken from. [s]
+# The same for looks that compare images from several positions. [s]
 STILL_S = 1.3
-# Where it stands before it flies through, and where a passage ends: steps aside come out longer than they were asked
-# for, so the wall is farther off than it seems. How much further it flies if it is not through by then. [m]
+# Distance before a passage, and length behind it. Sideways steps come out longer than requested, so that the wall seems
+# nearer than it is. Additional length if the passage is not complete at its end. [m]
 STAND_M = {"red": 1.25, "blue": 1.25, "gap": 1.1, "orange": 1.35}
 BEYOND_M = {"red": 0.45, "blue": 0.45, "gap": 0.75, "orange": 0.6}
 ON_M = 0.4
-# A place that was seen from farther off than this is looked at again. [m]
+# A detection from a larger distance is repeated from nearby. [m]
 SURE_M = 1.7
-# Where a look at the gap without depth takes its images: to the left of the first. [m]
+# Positions of a look at the gap without depth: to the left of the first image. [m]
 VIEWS_M = (0.35, -0.35)
-# The gap is decided on with this room, and no wall is taken that is farther off. [m]
+# Minimum radius of the gap, and maximum distance of the wall. [m]
 ENOUGH_M, WALL_M = 0.22, 3.0
-# Images with depth that are tried at one place.
+# Maximum number of images with depth at one position.
 PATIENCE = 15
-# Where it looks from if it has seen nothing: left and up of where it took off; before anything is passed, further back,
-# too. [m, home]
+# Positions for further looks if nothing was found: left and up of the take-off position, before the first passage also
+# further back. [m, home]
 ABOUT_M = ((0.3, 0.3), (-0.3, 0.1), (0.6, 0.1), (-0.6, 0.3))
 BACK_M = 0.3
-# What only looks like the wall behind does not explain the images so much better. [grey levels]
+# Margin of the gap's detection, against areas that only look like the wall. [grey levels]
 MARGIN = 1.0
 
-# The hand turns so far before the window's middle. [m]
+# Distance of the hand in front of the window's middle. [m]
 AHEAD_OF_WINDOW_M = 0.1
-# Where one flies past it: beside the axle, and above it. [m]
+# Point to pass the hand: beside the axle, and above it. [m]
 PAST_M = (0.32, 0.80)
-# The vehicle's radius, half the hand's width, and a margin. [m]
+# Radius of the vehicle, half of the hand's width, and a margin. [m]
 ROOM_M = 0.12 + HALF_WIDTH_M + 0.08
-# Angles are taken from pixels at such distances from the axle, where only the hand is: so many, in nearly one
-# direction. [m], [px], [rad]. A turning is taken from so many angles, with pauses no longer than this. [s]
+# Angles use pixels at these distances from the axle, where only the hand is: a minimum number, and a maximum spread of
+# their directions. [m], [px], [rad]. A rotation needs this number of angles, with pauses of at most this length. [s]
 NEAR_AXLE_M, LEAST_PX, SPREAD_RAD = (0.1, 0.7), 30, 0.25
 LEAST_ANGLES, PAUSE_S = 45, 0.3
-# A start at rest costs so much more than the way at the speed that is reached; measured on flights. [s], [m/s]
+# Additional time of a start from rest, and the speed that is reached; measured in flights. [s], [m/s]
 START_S, REACHED_MPS = 0.65, 1.9
-# How much sooner and later the vehicle may be in the hand's plane than reckoned: half of its length, and errors. [s]
+# Tolerance of the predicted time in the hand's plane: half of the vehicle's length, and errors. [s]
 EARLY_S, LATE_S = 0.25, 0.3
 
 Steps = Generator[Setpoint | None, None, bool]
@@ -80,22 +80,22 @@ def rotation(xyzw: F64) -> F64:
     )
 
 
-# A level camera that looks ahead: x right, y down, z ahead, in axes x ahead, y left, z up.
+# Axes of a level camera that looks forward (x right, y down, z forward), in axes x forward, y left, z up.
 HOME_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Race(vizflyt.Plugin):
-    """One flight. Each state of the table is a method that gives an answer to one image after the other."""
+    """One flight. Each state of the table is a method that yields one reply for each image."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.flying = False
         self.seen = -1
         self.yaw_rad: float | None = None
         self.path = 0
-        # Where it is by its own reckoning; how many stages are passed. [m, home]
+        # Position by dead reckoning; number of passed stages. [m, home]
         self.at_m = np.zeros(3)
         self.passed = 0
-        # What has been seen of each: the place to fly through, and how far off it was then. [m, home], [m]
+        # Detections: point to fly through, and its distance at that time. [m, home], [m]
         self.places: dict[str, tuple[F64, float]] = {}
         self.window: Window | None = None
         self.looked = 0
@@ -137,15 +137,15 @@ class Race(vizflyt.Plugin):
             print(f"{self.now_s - self.begun_s:.1f} s: {ORDER[self.target]}, {state}", flush=True)
             well = yield from timed(states[state](), TABLE[state].most_s, lambda: self.now_s)
             state = TABLE[state].well if well else TABLE[state].otherwise
-            # Through without having noticed: what comes next is looked for.
+            # The stage was passed without notice: look for the next one.
             if self.passed > self.target and state in ("search", "elsewhere"):
                 state = "next"
 
     def _search(self) -> Steps:
-        """Looks from here, and trusts what was seen earlier if nothing is to be seen now."""
+        """Looks from here; uses an earlier detection if nothing is visible now."""
         what = ORDER[self.target]
         if what == "gap":
-            # From the net's middle the whole wall is to be seen.
+            # The complete wall is visible from the net's middle.
             if self.looked == 0:
                 yield from self._go(np.array([self.at_m[0], 0.0, 0.2]), THERE_MPS, STILL_S)
             return (yield from self._look_for_gap())
@@ -154,22 +154,22 @@ class Race(vizflyt.Plugin):
         return what in self.places
 
     def _elsewhere(self) -> Steps:
-        """Goes where more may be seen."""
+        """Flies to another position for the next look."""
         self.places.pop(ORDER[self.target], None)
         left_m, up_m = ABOUT_M[self.looked % len(ABOUT_M)]
-        # What was passed stands behind.
+        # Passed stages are behind.
         back_m = BACK_M if self.target == 0 else 0.0
         self.looked += 1
         yield from self._go(np.array([self.at_m[0] - back_m, left_m, up_m]), THERE_MPS, STILL_S)
         return True
 
     def _approach(self) -> Steps:
-        """Flies before the place, and looks again from there, until it was seen from near."""
+        """Flies in front of the point, and looks again from there, until it was detected from nearby."""
         what = ORDER[self.target]
         for _ in range(4):
             place_m, _ = self.places[what]
             stand_m = place_m - [STAND_M[what], 0, 0]
-            # Never back for it: what is near has been seen from near.
+            # Never fly back for this: near points were detected from nearby.
             stand_m[0] = max(stand_m[0], self.at_m[0] - 0.3)
             yield from self._go(stand_m, THERE_MPS)
             if what == "gap":
@@ -181,7 +181,7 @@ class Race(vizflyt.Plugin):
         return True
 
     def _pass(self) -> Steps:
-        """Flies straight on through the place. It ends well if the runtime has seen that, too."""
+        """Flies straight through the point. Ends well if the runtime reports the stage."""
         what = ORDER[self.target]
         place_m, _ = self.places[what]
         before_m = self.at_m.copy()
@@ -204,7 +204,7 @@ class Race(vizflyt.Plugin):
         self.target += 1
         return True
 
-    # ---- ways
+    # ---- paths
 
     def _rest(self, seconds: float) -> Way:
         until_s = self.now_s + seconds
@@ -212,20 +212,20 @@ class Race(vizflyt.Plugin):
             yield Setpoint.hold()
 
     def _go(self, to_m: F64, speed_mps: float, settle_s: float = SETTLE_S) -> Way:
-        """Flies straight to a place [m, home], and waits until it is there."""
+        """Flies straight to a point [m, home], and waits until the vehicle is there."""
         self.path += 1
         from_m, by_m = self.at_m.copy(), to_m - self.at_m
         takes_s = max(float(np.linalg.norm(by_m)) / speed_mps, 0.01)
         begun_s = self.now_s
         path = Setpoint.waypoints([by_m], speed_mps, id=self.path, axes="heading", yaw=self.yaw_rad)
-        # The same path again goes on, and holds its end.
+        # Returning the same path continues it, and holds at its end.
         while self.now_s < begun_s + takes_s + settle_s:
             self.at_m = from_m + by_m * min((self.now_s - begun_s) / takes_s, 1.0)
             yield path
         self.at_m = to_m.copy()
 
     def _off_m(self, place_m: F64) -> float:
-        """Returns how far it is from a place, sideways and up. [m]"""
+        """Returns the distance to a point, sideways and vertically. [m]"""
         return float(np.hypot(*(place_m - self.at_m)[1:]))
 
     # ---- looks
@@ -237,11 +237,11 @@ class Race(vizflyt.Plugin):
         return home_from_world @ self.world_from_body @ self.front.body_from_cam.rotation_matrix
 
     def _camera_m(self) -> F64:
-        """Returns where the camera is. [m, home]"""
+        """Returns the position of the camera. [m, home]"""
         return self.at_m + self.front.body_from_cam.translation_m
 
     def _look_for_window(self, colour: str) -> bool:
-        """Notes where to fly through a window, if it is in the image."""
+        """Stores the point to fly through a window, if the window is in the image."""
         if colour == "gap":
             return False
         mask: Mask = of_colour(self.front.rgb, colour)
@@ -293,19 +293,19 @@ class Race(vizflyt.Plugin):
     # ---- the hand
 
     def _axle_m(self, window: Window) -> F64:
-        """Returns where the hand's axle is. [m, home]"""
+        """Returns the position of the hand's axle. [m, home]"""
         ahead = np.array([np.cos(window.facing_rad), np.sin(window.facing_rad), 0.0])
         return window.middle_m - AHEAD_OF_WINDOW_M * ahead - [0, 0, window.size_m[1] / 2]
 
     def _past_hand(self, window: Window) -> F64:
-        """Returns the place in the hand's plane to fly through: on the side where the vehicle is. [m, home]"""
+        """Returns the point in the hand's plane to fly through, on the vehicle's side. [m, home]"""
         right = np.array([np.sin(window.facing_rad), -np.cos(window.facing_rad), 0.0])
         axle_m = self._axle_m(window)
         side = 1.0 if (self.at_m - axle_m) @ right > 0 else -1.0
         return axle_m + side * PAST_M[0] * right + [0, 0, PAST_M[1]]
 
     def _angle(self, window: Window) -> float | None:
-        """Returns the hand's angle in this image; None if too little of it is seen."""
+        """Returns the hand's angle in this image; None if too little of it is visible."""
         v, u = np.nonzero(of_colour(self.front.rgb, "teal"))
         if len(u) < LEAST_PX:
             return None
@@ -320,13 +320,13 @@ class Race(vizflyt.Plugin):
         if len(points_m) < LEAST_PX:
             return None
         theta_rad = angle_rad(points_m)
-        # Something else that is teal, far behind, is not in line with it.
+        # Other teal objects, far behind, are not on the hand's line.
         across_m = points_m @ np.array([-np.sin(theta_rad), np.cos(theta_rad)])
         off_rad = np.arctan2(across_m, points_m @ np.array([np.cos(theta_rad), np.sin(theta_rad)]))
         return theta_rad if float(np.std(off_rad)) < SPREAD_RAD else None
 
     def _wait_for_hand(self) -> Way:
-        """Stays until it can start."""
+        """Waits until the start."""
         assert self.window is not None
         window = self.window
         off_m = self.places["orange"][0] - self._axle_m(window)
@@ -341,7 +341,7 @@ class Race(vizflyt.Plugin):
         while True:
             theta_rad = self._angle(window)
             if theta_rad is not None:
-                # Out of sight it may have turned by any angle: what was seen before says nothing of the line.
+                # While out of sight, the hand may have turned by any angle, so discard earlier angles.
                 if at_s and self.now_s - at_s[-1] > PAUSE_S:
                     at_s, angles_rad = [], []
                 at_s.append(self.now_s)

@@ -1,4 +1,4 @@
-"""Project 5: what a change brings, by numbers."""
+"""Project 5: the effect of a change in numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from math import comb
 
 
 def mean_score(chances: Sequence[float]) -> float:
-    """Returns the mean score by (4), 0 to 100, of stages that succeed with these chances, in their order."""
+    """Returns the mean score by (4), 0 to 100, for stages with these chances of success, in their order."""
     passed, total = 1.0, 0.0
     for chance in chances:
         passed *= chance
@@ -16,8 +16,8 @@ def mean_score(chances: Sequence[float]) -> float:
 
 
 def by_luck(better: int, worse: int) -> float:
-    """Returns how often equal versions differ so much or more, either way: of the seeds on which they differ, one
-    version wins `better` and the other `worse`."""
+    """Returns the probability that equal versions differ at least by this much, in either direction: of the seeds on
+    which they differ, one version wins `better` and the other `worse`."""
     differ = better + worse
     one_side = sum(comb(differ, wins) for wins in range(max(better, worse), differ + 1)) / 2**differ
     return min(1.0, 2 * one_side)

@@ -1,4 +1,4 @@
-"""Project 5: the table of states, and what leaves one of them when its time is over."""
+"""Project 5: the table of states, and their timeouts."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
 
-# Where every flight begins, and what no state leads back from.
+# First state of every flight, and the final state.
 FIRST, END = "search", "end"
 
 
 class State(NamedTuple):
-    """One line of the table."""
+    """One row of the table."""
 
     most_s: float
-    """After this it has not ended well. [s]"""
+    """Timeout, after which the state has failed. [s]"""
     well: str
-    """The state after it has ended well."""
+    """Next state after success."""
     otherwise: str
-    """The state after it has not."""
+    """Next state after failure or timeout."""
 
 
-# What is looked for, and flown through, is a matter of the stage; the states are the same for all.
+# The stage determines what to look for and fly through; the states are the same for all stages.
 TABLE = {
     "search": State(most_s=20.0, well="approach", otherwise="elsewhere"),
     "elsewhere": State(most_s=5.0, well="search", otherwise="search"),
@@ -33,10 +33,10 @@ TABLE = {
 
 
 def timed(steps: Generator[T, None, bool], most_s: float, clock: Callable[[], float]) -> Generator[T, None, bool]:
-    """Goes through the steps of a state, as long as it may take; returns whether it ended well.
+    """Runs the steps of a state until its timeout; returns whether it succeeded.
 
-    `steps` gives one answer for each image, and returns whether it ended well. `clock` tells the time of the image
-    [s]. Once `most_s` have gone by since the first image, no further step is asked for, and it has not ended well.
+    `steps` yields one reply for each image, and returns whether it succeeded. `clock` returns the time of the image
+    [s]. After `most_s` since the first image, no further step is requested, and the state has failed.
     """
     until_s = clock() + most_s
     while clock() < until_s:

@@ -1,7 +1,7 @@
-"""Project 5: racing windows in colour images: which pixels have a window's colour, and where its frame stands.
+"""Project 5: racing windows in colour images: pixels with a window's colour, and the pose of its frame.
 
-Axes are level: x ahead, y left, z up. A camera looks along +z, x to the right, y down. Pixels are continuous: (0, 0) is
-the outer corner of the top-left one.
+Axes are level: x forward, y left, z up. A camera looks along +z, x to the right, y down. Pixels are continuous: (0, 0)
+is the outer corner of the top-left pixel.
 """
 
 from __future__ import annotations
@@ -14,43 +14,43 @@ import numpy.typing as npt
 F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Hues of bars and hand in daylight, from and to. [deg]
+# Ranges of the hues of bars and hand in daylight. [deg]
 HUES = {"red": (345.0, 369.0), "blue": (208.0, 240.0), "orange": (22.0, 45.0), "teal": (162.0, 190.0)}
-# What is darker has no sure hue; what is greyer is brick, mats, paint. [of 255], [1]
+# Darker pixels have no reliable hue; less saturated pixels are brick, mats, paint. [of 255], [1]
 DARKEST, SATURATION = 40, 0.68
-# A bar's width, of which the outermost 2 cm are pale; half its thickness. [m]
+# Width of a bar, pale border of the bar, half of its thickness. [m]
 BAR_M, PALE_M, HALF_THICK_M = 0.16, 0.02, 0.045
-# Bands beside a bar in which nothing has its colour: as wide as this. [m]
+# Width of the bands beside a bar without its colour. [m]
 BESIDE_M = 0.08
-# Along a bar stripes and gaps follow each other by this, an arrowhead after two of colour. [m]
+# Period of stripes and gaps along a bar, with an arrowhead after two stripes. [m]
 STRIPE_M = 0.11
-# Draws of the fit: so many at a time, so often; of each the best are kept. Each time they are drawn nearer together.
+# Random search: draws per round, rounds, number of kept frames, and reduction of the spread per round.
 DRAWS, ROUNDS, KEPT, NEARER = 64, 20, 8, 0.8
-# The first draws are so far apart: distance [1], left, up [m], facing [rad], width, height [m].
+# Initial spread: distance [1], left, up [m], facing [rad], width, height [m].
 SPREAD = np.array([0.2, 0.1, 0.1, 0.2, 0.1, 0.05])
-# Fewer pixels are no window, nor is what explains less, or is farther off. [px], [1], [m]
+# Minimum number of pixels of a window, minimum score, maximum distance. [px], [1], [m]
 LEAST_PX, LEAST_SCORE, FARTHEST_M = 60, 0.3, 5.0
 
 
-# Pixels hang together within and between neighbouring cells of this; a window is in one of the greatest groups. [px]
+# Pixels in the same or neighbouring cells of this size belong together; a window is in one of the largest groups. [px]
 CELL_PX, GROUPS = 12, 3
 
 
 class Window(NamedTuple):
-    """A frame as it stands."""
+    """Pose and size of a frame."""
 
     middle_m: F64
-    """Of its opening, from the camera, (3,). [m, level]"""
+    """Middle of the opening relative to the camera, (3,). [m, level]"""
     facing_rad: float
-    """The direction of passage, from x towards y. [rad]"""
+    """Direction of passage, from x towards y. [rad]"""
     size_m: F64
     """Width and height of the opening, (2,). [m]"""
     score: float
-    """How well it explains what is seen: 0 not at all, 0.7 a frame in full view."""
+    """Quality of the fit: 0 for none, 0.7 for a completely visible frame."""
 
 
 def of_colour(rgb: npt.NDArray[np.uint8], name: str) -> Mask:
-    """Returns which pixels of an image (H, W, 3) have one of the colours of `HUES`, (H, W)."""
+    """Returns the pixels of an image (H, W, 3) with one of the colours of `HUES`, (H, W)."""
     red, green, blue = np.moveaxis(rgb.astype(np.float32), -1, 0)
     most, least = rgb.max(axis=-1).astype(np.float32), rgb.min(axis=-1).astype(np.float32)
     chroma = np.maximum(most - least, 1.0)
@@ -61,8 +61,8 @@ def of_colour(rgb: npt.NDArray[np.uint8], name: str) -> Mask:
 
 
 def frame_samples() -> tuple[F64, F64, F64]:
-    """Returns places on a frame and beside it: which corner each counts from, (N, 2) of -1 to 1, how far outwards from
-    there, (N, 2) [m], and whether they are on a bar, in a corner, or beside: 1, 0, -1, (N,)."""
+    """Returns sample points on a frame and beside it: the corner that each refers to, (N, 2) of -1 to 1; the offset
+    outwards from there, (N, 2) [m]; and the kind: 1 on a bar, 0 in a corner, -1 beside a bar, (N,)."""
     along = np.linspace(-0.96, 0.96, 31)
     corners, outwards, kinds = [], [], []
     on = np.linspace(0.01, BAR_M - PALE_M - 0.01, 6)
@@ -83,13 +83,13 @@ def frame_samples() -> tuple[F64, F64, F64]:
 
 
 CORNERS, OUTWARDS, KINDS = frame_samples()
-# Of a bar's places: whether it is upright.
+# For points on a bar: whether the bar is vertical.
 UPRIGHT = abs(CORNERS[:, 0]) == 1.0
 
 
 def weights(coloured: Mask) -> F64:
-    """Returns what colour at each place counts for, (..., N): what has to be `coloured` sums up to one, what has not to
-    minus one."""
+    """Returns the weight of colour at each point, (..., N): the sum is one over points that must be `coloured`, and
+    minus one over points that must not."""
     positive = coloured / coloured.sum(axis=-1, keepdims=True)
     return positive - ~coloured / (~coloured).sum(axis=-1, keepdims=True)
 
@@ -98,7 +98,7 @@ ON_BARS = weights(KINDS == 1.0)
 
 
 def striped_weights(size_m: F64) -> F64:
-    """Returns the same for frames with these openings, (K, 2) [m], whose arrowheads count as not coloured, (K, N)."""
+    """Returns these weights for frames with openings (K, 2) [m], with arrowheads as not coloured, (K, N)."""
     # Arrowheads point to the middle of each bar.
     at_m = abs(CORNERS * size_m[:, None] / 2 + OUTWARDS)
     along = np.where(UPRIGHT, at_m[..., 1], at_m[..., 0])
@@ -108,7 +108,7 @@ def striped_weights(size_m: F64) -> F64:
 
 
 def scores(mask: Mask, cam_from_level: F64, focal_px: float, candidates: F64, striped: bool) -> F64:
-    """Returns how well each of some frames explains a colour's pixels, (K,).
+    """Returns the score of each frame for a colour's pixels, (K,).
 
     A frame is (6,): middle (3,) [m, level], facing [rad], width and height of the opening [m].
     """
@@ -130,7 +130,7 @@ def scores(mask: Mask, cam_from_level: F64, focal_px: float, candidates: F64, st
 
 
 def groups(mask: Mask) -> list[Mask]:
-    """Returns the pixels of a mask (H, W) that hang together, across gaps of a corner's size, the greatest first."""
+    """Returns connected groups of a mask's pixels (H, W), across gaps of a corner's size, the largest first."""
     rows, columns = (-(-side // CELL_PX) for side in mask.shape)
     padded = np.zeros((rows * CELL_PX, columns * CELL_PX), bool)
     padded[: mask.shape[0], : mask.shape[1]] = mask
@@ -152,7 +152,7 @@ def groups(mask: Mask) -> list[Mask]:
 
 
 def starts(mask: Mask, cam_from_level: F64, focal_px: float, size_m: F64) -> list[list[float]]:
-    """Returns frames from which a fit may begin, for the pixels of a mask (H, W): as in `scores`."""
+    """Returns initial frames for a fit to the pixels of a mask (H, W): as in `scores`."""
     rows, columns = mask.shape
     v, u = np.nonzero(mask)
     pixels = np.stack([u + 0.5 - columns / 2, v + 0.5 - rows / 2, np.full(len(u), focal_px)], 1) / focal_px
@@ -163,7 +163,7 @@ def starts(mask: Mask, cam_from_level: F64, focal_px: float, size_m: F64) -> lis
     aside, up = level[:, 1] / level[:, 0], level[:, 2] / level[:, 0]
     low, high = np.percentile([aside, up], [2, 98], axis=1)
     outer_m = size_m + 2 * BAR_M
-    # What is seen may be all of it, or end at the image's edge: then one side, or one corner, is where it is.
+    # The frame may be completely visible, or cut by the image's edge: then one side or one corner is known.
     found = []
     whole_m = float((outer_m / np.maximum(high - low, 1e-3)).min())
     for ahead_m in whole_m * np.array([0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1]):
@@ -177,10 +177,10 @@ def starts(mask: Mask, cam_from_level: F64, focal_px: float, size_m: F64) -> lis
 def find_window(
     mask: Mask, cam_from_level: F64, focal_px: float, square: bool, size_m: tuple[float, float]
 ) -> Window | None:
-    """Finds the frame whose bars are the pixels of a mask (H, W). None if there is none.
+    """Finds the frame whose bars are the pixels of a mask (H, W). None if there is no frame.
 
-    `cam_from_level` (3, 3) turns directions from level axes into the camera's. `size_m` is the usual width and height
-    of the opening; a `square` one has one size.
+    `cam_from_level` (3, 3) rotates directions from level axes to the camera's. `size_m` is the usual width and height
+    of the opening; a `square` frame has only one size.
     """
     begins = [
         start
@@ -196,7 +196,7 @@ def find_window(
     for turn in range(ROUNDS):
         drawn = kept[random.integers(len(kept), size=DRAWS)]
         step = random.normal(0.0, 1.0, drawn.shape) * spread
-        # Along the line of sight, where little changes, further than across it.
+        # Larger moves along the line of sight, where the score changes less, than across it.
         moved = drawn + np.concatenate([0 * step[:, :1], step[:, 1:]], 1)
         moved[:, :3] *= np.exp(step[:, :1])
         if square:
@@ -207,7 +207,7 @@ def find_window(
         points = scores(mask, cam_from_level, focal_px, everyone, turn >= ROUNDS // 2)
         order = points.argsort()[::-1][:KEPT]
         kept, spread = everyone[order], spread * NEARER
-    # Many are as good as the best: their mean is better than any.
+    # Many frames are as good as the best one, and their mean is better than each.
     score = float(points[order[0]])
     mean = kept.mean(axis=0)
     if score < LEAST_SCORE or mean[0] > FARTHEST_M:

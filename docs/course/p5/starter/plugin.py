@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Project 5: goes through the states of the table. So far there is one, which looks about, and the vehicle lands."""
+"""Project 5: goes through the states of the table. For now there is one, which looks around; then the vehicle lands."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from states import END, FIRST, TABLE, timed
 import vizflyt
 from vizflyt import Setpoint
 
-# The stages in their order, as `details["name"]` of their events says them.
+# Stages in their order, with the names in `details["name"]` of their events.
 STAGES = ("window 1", "window 2", "gap", "clock hand")
-# So far it looks so far to either side, and takes so long. [rad], [s]
+# For now: amplitude and duration of the look to both sides. [rad], [s]
 SWEEP_RAD, SWEEP_S = 0.5, 4.0
 
-# One setpoint for each image; None leaves the last one in force. A state returns whether it ended well.
+# One setpoint for each image; None keeps the previous one. A state returns whether it succeeded.
 Steps = Generator[Setpoint | None, None, bool]
 Flight = Generator[Setpoint | None, None, None]
 
 
 class Mine(vizflyt.Plugin):
-    """One flight. Each state of the table is a method that gives an answer to one image after the other."""
+    """One flight. Each state of the table is a method that yields one reply for each image."""
 
     def on_start(self, info: vizflyt.ArenaInfo) -> None:
         self.flying = False
@@ -39,21 +39,21 @@ class Mine(vizflyt.Plugin):
 
     def on_image(self, obs: vizflyt.Observation) -> Setpoint | None:
         front, vehicle = obs.camera("front"), obs.vehicle
-        # An image of the camera that looks down comes with the front camera's last one.
+        # Each image of the downward camera also contains the front camera's previous image.
         if front is None or vehicle is None or front.seq == self.seen:
             return None
         self.seen = front.seq
         if not self.flying:
             return Setpoint.hold()
         self.front, self.vehicle = front, vehicle
-        # The image's time, not that of this call: the hand is where it was then.
+        # Time of the image, not of this call, because the hand's position is of that time.
         self.now_s = front.shown_ns * 1e-9
         if self.yaw_rad is None:
             self.yaw_rad, self.begun_s = vehicle.yaw_rad, self.now_s
         return next(self.steps, Setpoint.land())
 
     def _fly(self) -> Flight:
-        """Goes from state to state: `search` is the method `_search`, and so on. It ends where the table says so."""
+        """Goes from state to state: `search` is the method `_search`, and so on. Ends at the table's final state."""
         state = FIRST
         while state != END:
             stage = STAGES[min(self.passed, len(STAGES) - 1)]
@@ -63,7 +63,7 @@ class Mine(vizflyt.Plugin):
             state = TABLE[state].well if well else TABLE[state].otherwise
 
     def _search(self) -> Steps:
-        """So far it turns to the left, to the right and back, and has nothing to look with: that is yours."""
+        """To do: for now it turns left, right and back, without any detection."""
         assert self.yaw_rad is not None
         begun_s = self.now_s
         while self.now_s < begun_s + SWEEP_S:

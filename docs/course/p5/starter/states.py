@@ -1,4 +1,4 @@
-"""Project 5: the table of states, and what leaves one of them when its time is over. Yours to fill in."""
+"""Project 5: the table of states, and their timeouts. Work in this file."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
 
-# Where every flight begins, and what no state leads back from.
+# First state of every flight, and the final state.
 FIRST, END = "search", "end"
 
 
 class State(NamedTuple):
-    """One line of the table."""
+    """One row of the table."""
 
     most_s: float
-    """After this it has not ended well. [s]"""
+    """Timeout, after which the state has failed. [s]"""
     well: str
-    """The state after it has ended well."""
+    """Next state after success."""
     otherwise: str
-    """The state after it has not."""
+    """Next state after failure or timeout."""
 
 
-# So far: it looks once, and gives up; and it may take forever over that. Your table is longer, and no state of it has
-# more time than the flight.
+# To do: for now it looks once, without a timeout, and gives up. Your table is longer, and each timeout is shorter than
+# the flight's.
 TABLE = {
     "search": State(most_s=float("inf"), well=END, otherwise=END),
 }
 
 
 def timed(steps: Generator[T, None, bool], most_s: float, clock: Callable[[], float]) -> Generator[T, None, bool]:
-    """Goes through the steps of a state, as long as it may take; returns whether it ended well.
+    """Runs the steps of a state until its timeout; returns whether it succeeded.
 
-    `steps` gives one answer for each image, and returns whether it ended well. `clock` tells the time of the image
-    [s]. Once `most_s` have gone by since the first image, no further step is asked for, and it has not ended well.
+    `steps` yields one reply for each image, and returns whether it succeeded. `clock` returns the time of the image
+    [s]. After `most_s` since the first image, no further step is requested, and the state has failed.
     """
-    # So far: it takes as long as it takes.
+    # To do: for now there is no timeout.
     return (yield from steps)

@@ -1,6 +1,6 @@
-"""What `hand.py` of project 5 has to do, with hands that are made here: `python -m pytest` in your folder.
+"""Requirements of `hand.py` of project 5, with generated hands: `python -m pytest` in your folder.
 
-Those marked "so far fails" are yours to mend. Add your own.
+Tests marked "so far fails" pass with a correct solution. Add your own.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from hand import LENGTH_M, Turning, angle_rad, blocked_rad, follow, in_plane, is
 
 AXLE_M = np.array([1.6, 0.2, -0.5])
 ROOM_M = 0.255
-# Turning either way, from an angle, seen from a time on. [rad/s], [rad], [s]
+# Rotations in both directions: speed, first angle, first time. [rad/s], [rad], [s]
 TURNS = [(0.96, 0.3, 0.0), (-0.96, 0.3, 100.0), (1.1, 3.0, 50.0), (-0.8, -3.1, 7.0)]
 
 
@@ -28,7 +28,7 @@ def rays(points_m, facing_rad):
 
 
 def angles(turn, seconds, sigma_rad=0.0, seed=2):
-    """Returns times and angles in [-pi, pi) of a hand that is seen 30 times a second, with noise."""
+    """Returns times and noisy angles in [-pi, pi) of a hand, at 30 Hz."""
     omega_radps, theta_rad, from_s = turn
     at_s = from_s + np.arange(0.0, seconds, 1 / 30)
     noise_rad = np.random.default_rng(seed).normal(0.0, sigma_rad, len(at_s))
@@ -41,26 +41,26 @@ def off(one_rad, other_rad):
 
 @pytest.mark.parametrize("facing_rad", [0.0, 0.3, -0.25])
 def test_rays_meet_the_plane_where_the_hand_is(facing_rad):
-    """So far fails: the plane is not asked."""
+    """So far fails: the plane is ignored."""
     points_m = hand(1.9)
     np.testing.assert_allclose(in_plane(rays(points_m, facing_rad), AXLE_M, facing_rad), points_m, atol=1e-9)
 
 
 @pytest.mark.parametrize("theta_rad", [0.0, 1.2, 2.9, -3.0, -1.4])
 def test_the_angle_is_where_the_free_end_is(theta_rad):
-    """So far fails: one pixel says little. The hand's other end looks out beyond the axle."""
+    """So far fails: one pixel is not sufficient. The hand's other end extends beyond the axle."""
     assert off(angle_rad(hand(theta_rad)), theta_rad) < 0.02
 
 
 @pytest.mark.parametrize("theta_rad", [1.2, 2.0])
 def test_a_part_of_the_hand_has_its_angle(theta_rad):
-    """So far fails. The image ends before the hand does."""
+    """So far fails. The image shows only a part of the hand."""
     assert off(angle_rad(hand(theta_rad, 0.1, 0.5)), theta_rad) < 0.02
 
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_a_turning_is_followed_either_way_and_across_pi(turn):
-    """So far fails: what lies beyond pi comes back from below."""
+    """So far fails: angles wrap at pi."""
     found = follow(*angles(turn, 5.0))
     assert found.omega_radps == pytest.approx(turn[0], abs=1e-6)
     assert off(found.at(turn[2] + 6.0), turn[1] + 6.0 * turn[0]) < 1e-6
@@ -68,16 +68,16 @@ def test_a_turning_is_followed_either_way_and_across_pi(turn):
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_noise_is_averaged(turn):
-    """So far fails: two angles are asked, not all."""
+    """So far fails: only two angles are used."""
     seconds, sigma_rad = 2.0, np.radians(3)
     found = [follow(*angles(turn, seconds, sigma_rad, seed)) for seed in range(60)]
     off_radps = np.std([one.omega_radps - turn[0] for one in found])
-    # What (2) says, and what 60 of them may scatter about it.
+    # The value of (2), and the scatter of 60 samples around it.
     assert off_radps == pytest.approx(sigma_rad * np.sqrt(12 / 60) / seconds, rel=0.35)
 
 
 def test_pauses_do_not_matter():
-    """So far fails. The hand is not seen evenly; the line is through what there is."""
+    """So far fails. The samples are not uniform; the line must fit the existing ones."""
     at_s, theta_rad = angles(TURNS[2], 6.0, np.radians(2))
     seen = (at_s < 51.0) | (at_s > 52.2)
     found = follow(at_s[seen], theta_rad[seen])
@@ -85,13 +85,13 @@ def test_pauses_do_not_matter():
 
 
 def test_it_is_known_how_well_it_turns():
-    """So far fails: nothing is known."""
+    """So far fails: the result is infinite."""
     assert sigma_omega_radps(np.radians(3), 30, 1.0) == pytest.approx(np.radians(1.897), rel=1e-3)
     assert sigma_omega_radps(np.radians(3), 90, 3.0) == pytest.approx(np.radians(0.365), rel=2e-3)
 
 
 def nearest_m(place_m, theta_rad):
-    """Returns the distance from a place to the hand's middle line. [m]"""
+    """Returns the distance from a point to the hand's middle line. [m]"""
     tip = np.array([np.cos(theta_rad), np.sin(theta_rad)])
     along_m = np.clip(place_m @ tip, 0.0, LENGTH_M)
     return np.hypot(*(place_m - along_m * tip))
@@ -99,16 +99,16 @@ def nearest_m(place_m, theta_rad):
 
 @pytest.mark.parametrize("rho_m", [0.4, 0.6, 0.9, 1.0, 1.15])
 def test_a_place_is_blocked_while_the_hand_is_too_near(rho_m):
-    """So far fails: it always is."""
+    """So far fails: the point is always blocked."""
     beta_rad = blocked_rad(rho_m, ROOM_M)
     assert 0 < beta_rad < np.pi / 2
-    # The tests go by (3): where the nearest point of the line would be beyond the free end, a little is given away.
+    # The tests use (3), which is slightly too strict if the nearest point of the line would be beyond the free end.
     assert nearest_m(np.array([rho_m, 0.0]), beta_rad + 0.01) > ROOM_M
     assert nearest_m(np.array([rho_m, 0.0]), beta_rad - 0.12) < ROOM_M
 
 
 def test_beyond_the_hand_nothing_is_blocked_and_at_the_axle_all():
-    """So far fails: it always is."""
+    """So far fails: the point is always blocked."""
     assert blocked_rad(LENGTH_M + ROOM_M + 0.01, ROOM_M) == 0.0
     assert blocked_rad(0.2, ROOM_M) == pytest.approx(np.pi)
 
@@ -119,13 +119,13 @@ PLACE_M = np.array([0.3, 0.8])
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("seconds", [0.0, 0.7])
 def test_away_is_what_keeps_its_distance_all_the_time(turn, seconds):
-    """So far fails: nothing is."""
+    """So far fails: the result is always False."""
     turning = Turning(turn[2], turn[1], turn[0])
     said = []
     for from_s in turn[2] + np.arange(0.0, 9.0, 0.1):
         least_m = min(nearest_m(PLACE_M, turning.at(t)) for t in np.linspace(from_s, from_s + seconds, 50))
         away = is_away(turning, PLACE_M, ROOM_M, from_s, from_s + seconds)
-        # Within a centimetre either may be said.
+        # Within 1 cm both results are accepted.
         assert away == (least_m > ROOM_M) or abs(least_m - ROOM_M) < 0.01
         said.append(away)
     assert 20 < sum(said) < len(said)
@@ -133,7 +133,7 @@ def test_away_is_what_keeps_its_distance_all_the_time(turn, seconds):
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_a_start_is_the_first_after_which_it_is_away(turn):
-    """So far fails: there is none."""
+    """So far fails: the result is None."""
     turning = Turning(turn[2], turn[1], turn[0])
     takes_s, early_s, late_s = 1.1, 0.3, 0.4
     waits = 0
@@ -142,7 +142,7 @@ def test_a_start_is_the_first_after_which_it_is_away(turn):
         assert found is not None and found >= now_s
         there_s = found + takes_s
         assert is_away(turning, PLACE_M, ROOM_M, there_s - early_s, there_s + late_s)
-        # Just before it, it is not: nobody waits for nothing.
+        # Just before that time the point is blocked: the start is the earliest possible.
         before_s = found - 0.06 + takes_s
         assert found == now_s or not is_away(turning, PLACE_M, ROOM_M, before_s - early_s, before_s + late_s)
         waits += found > now_s

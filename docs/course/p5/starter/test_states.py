@@ -1,15 +1,15 @@
-"""What `states.py` of project 5 has to do. Those marked "so far fails" are yours to mend."""
+"""Requirements of `states.py` of project 5. Tests marked "so far fails" pass with a correct solution."""
 
 import math
 
 from states import END, FIRST, TABLE, timed
 
-# The flight's own end. [s]
+# Time limit of the flight. [s]
 FLIGHT_S = 90.0
 
 
 class Clock:
-    """Time that goes on by 0.1 s with each image."""
+    """A clock that advances by 0.1 s with each image."""
 
     def __init__(self):
         self.now_s = 50.0
@@ -18,7 +18,7 @@ class Clock:
         return self.now_s
 
     def run(self, steps):
-        """Goes through steps; returns what they answered, and how they ended."""
+        """Runs steps. Returns their replies, and their result."""
         answers = []
         while True:
             try:
@@ -29,7 +29,7 @@ class Clock:
 
 
 def counting(most, well, closed=None):
-    """A state that answers 0, 1, 2, ... and ends."""
+    """A state that yields 0, 1, 2, ... and ends."""
     try:
         yield from range(most)
         return well
@@ -45,7 +45,7 @@ def test_a_state_ends_as_it_says():
 
 
 def test_a_state_that_takes_too_long_is_left():
-    """So far fails: it goes on."""
+    """So far fails: there is no timeout."""
     clock, closed = Clock(), []
     answers, well = clock.run(timed(counting(100, True, closed), 1.05, clock))
     assert answers == list(range(11)) and not well
@@ -53,7 +53,7 @@ def test_a_state_that_takes_too_long_is_left():
 
 
 def test_the_time_counts_from_the_first_image():
-    """So far fails: no time is counted. A state is made before it begins."""
+    """So far fails: there is no timeout. A state is created before it begins."""
     clock = Clock()
     steps = timed(counting(100, True), 1.05, clock)
     clock.now_s += 5.0
@@ -62,7 +62,7 @@ def test_the_time_counts_from_the_first_image():
 
 
 def test_every_state_is_left_in_time():
-    """So far fails: one may take forever."""
+    """So far fails: one state has no timeout."""
     for name, state in TABLE.items():
         assert math.isfinite(state.most_s) and 0 < state.most_s < FLIGHT_S, name
 
@@ -74,7 +74,7 @@ def test_every_state_leads_to_one_that_is_there():
 
 
 def reached(begin):
-    """Returns the states that may follow one, itself among them."""
+    """Returns the states that can follow one, including it."""
     found, new = set(), {begin}
     while new:
         found |= new
@@ -88,5 +88,5 @@ def test_every_state_is_reached_and_leads_to_the_end():
 
 
 def test_a_state_that_finds_nothing_does_not_end_the_flight():
-    """So far fails: after one look it gives up, and 80 s are left."""
+    """So far fails: it gives up after one look, with 80 s left."""
     assert TABLE[FIRST].otherwise != END

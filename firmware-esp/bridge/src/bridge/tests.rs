@@ -402,11 +402,7 @@ fn measures_the_round_trip_of_clients_and_its_own() {
             })
             .collect()
     };
-    assert_eq!(
-        outstanding(&mut bridge, at(5000)),
-        [],
-        "no request while the autopilot is silent"
-    );
+    assert_eq!(outstanding(&mut bridge, at(5000)), [], "no request while the autopilot is silent");
     bridge.handle_uart(at(5500), &bytes(0, AUTOPILOT, &heartbeat(false, 0)));
     bridge.handle_timeout(at(6001));
     let outstanding = outstanding(&mut bridge, at(6001));

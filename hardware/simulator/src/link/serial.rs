@@ -179,7 +179,10 @@ impl SerialPort {
     fn hang_up(&mut self) {
         // An own pseudo-terminal has no device that could disconnect.
         if self.made.is_none() {
-            tracing::warn!("simulator: {} was disconnected; waiting for it to return", self.path.display());
+            tracing::warn!(
+                "simulator: {} was disconnected; waiting for it to return",
+                self.path.display()
+            );
             self.line = None;
             self.waiting.clear();
             self.retry_at = Instant::now() + RETRY;

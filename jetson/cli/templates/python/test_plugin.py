@@ -8,7 +8,7 @@ from plugin import steer
 
 
 def room(left_m, right_m):
-    """Returns a depth image whose left and right half are that deep."""
+    """Returns a depth image with these depths in the left and right half."""
     depth_m = np.full((48, 64), left_m, np.float32)
     depth_m[:, 32:] = right_m
     return depth_m

@@ -1,4 +1,4 @@
-//! {{name}}: climbs to 1 m and follows the depth gradient: it turns to where there is more room.
+//! {{name}}: climbs to 1 m, flies forward, and turns towards larger depth.
 //!
 //! Fly it:   vizflyt fly {{folder}}
 //! Test it:  cargo test
@@ -8,9 +8,9 @@ use vizflyt_sdk::{Autonomy, Axes, CameraImage, Observation, Setpoint, YawTarget}
 
 /// Height to fly at. [m]
 const HEIGHT_M: f64 = 1.0;
-/// Farther than this, and where nothing is seen, all is the same. [m]
+/// Limit of depth; pixels without a return count as this far. [m]
 const FAR_M: f64 = 8.0;
-/// Nearer than this, only turn. [m]
+/// Below this distance, only turn. [m]
 const STOP_M: f64 = 1.2;
 
 struct {{class}};
@@ -24,16 +24,16 @@ impl Autonomy for {{class}} {
     }
 }
 
-/// Says where to fly by one image: the velocity as forward, left, up [m/s], and how fast to turn,
-/// left positive [rad/s]. `height_m` is `None` where the course withholds it.
+/// Returns a velocity (forward, left, up) [m/s] and a turn rate, positive to the left [rad/s], for one image.
+/// `height_m` is `None` if the course withholds it.
 fn steer(image: &CameraImage<'_>, height_m: Option<f64>) -> (DVec3, f64) {
     let depth_m = |x, y| image.depth_m(x, y).map_or(FAR_M, |depth_m| f64::from(depth_m).min(FAR_M));
     let (columns, rows) = (image.width_px, image.height_px);
-    // At the vehicle's own height.
+    // Rows at the height of the vehicle.
     let band = rows / 3..(2 * rows / 3).max(rows / 3 + 1);
 
-    // The gradient: how much the depth grows from the middle to the right edge, by least squares
-    // over the mean depth of each column.
+    // Gradient: the slope of the depth from the middle to the right edge, by least squares over the mean depth of each
+    // column.
     let (mut moment, mut spread) = (0.0, 0.0);
     for column in 0..columns {
         let x = 2.0 * (f64::from(column) + 0.5) / f64::from(columns) - 1.0;
@@ -43,7 +43,7 @@ fn steer(image: &CameraImage<'_>, height_m: Option<f64>) -> (DVec3, f64) {
     }
     let gradient_m = moment / spread;
 
-    // The room ahead: of the middle third all but the nearest twentieth, which may be noise.
+    // Free distance ahead: the 5 % quantile of the middle third, because the nearest pixels may be noise.
     let middle = columns / 3..(2 * columns / 3).max(columns / 3 + 1);
     let mut ahead: Vec<f64> =
         middle.flat_map(|column| band.clone().map(move |row| depth_m(column, row))).collect();
@@ -54,7 +54,7 @@ fn steer(image: &CameraImage<'_>, height_m: Option<f64>) -> (DVec3, f64) {
     let turn_radps = if ahead_m >= STOP_M {
         (-0.4 * gradient_m).clamp(-1.0, 1.0)
     } else if gradient_m > 0.0 {
-        -0.8 // a wall: turn on until there is room
+        -0.8 // a wall: turn until there is free space
     } else {
         0.8
     };
@@ -66,13 +66,13 @@ fn main() -> std::process::ExitCode {
     vizflyt_sdk::run({{class}})
 }
 
-/// These run without a vehicle.
+/// Tests that need no vehicle.
 #[cfg(test)]
 mod tests {
     use super::*;
     use vizflyt_sdk::{CameraInfo, HostTime, ImageStamps, Intrinsics, ObservationBuffer};
 
-    /// Steers by an image whose left and right half are that deep. [mm]
+    /// Steers with an image with these depths in the left and right half. [mm]
     fn see(left_mm: u16, right_mm: u16, height_m: Option<f64>) -> (DVec3, f64) {
         let intrinsics = Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians());
         let front = CameraInfo::forward("front", intrinsics);
@@ -91,7 +91,7 @@ mod tests {
     fn it_flies_where_there_is_room() {
         let (v_mps, turn_radps) = see(8000, 8000, Some(1.0));
         assert!(v_mps.x > 0.5 && turn_radps.abs() < 1e-9, "{v_mps} {turn_radps}");
-        assert!(see(0, 0, Some(1.0)).0.x > 0.5, "nothing seen is room");
+        assert!(see(0, 0, Some(1.0)).0.x > 0.5, "pixels without a return must count as free space");
     }
 
     #[test]

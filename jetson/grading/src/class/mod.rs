@@ -78,7 +78,11 @@ struct Flown {
 pub fn grade_class(args: &ClassArgs) -> Result<ExitCode> {
     let roster = Roster::read(&args.roster)?;
     check_options(&args.options)?;
-    ensure!(args.submissions.is_dir(), "{} is not a folder of submissions", args.submissions.display());
+    ensure!(
+        args.submissions.is_dir(),
+        "{} is not a folder of submissions",
+        args.submissions.display()
+    );
     let program = std::env::current_exe().context("cannot find this program's path")?;
     let mut all = Vec::with_capacity(roster.teams.len());
     for (index, team) in roster.teams.iter().enumerate() {

@@ -157,9 +157,9 @@ fn read_folder(root: &Path) -> Result<Files> {
         for entry in fs::read_dir(&folder).with_context(cannot)? {
             let entry = entry.with_context(cannot)?;
             let name = entry.file_name();
-            let name = name
-                .to_str()
-                .with_context(|| format!("{}: the name is not valid UTF-8", entry.path().display()))?;
+            let name = name.to_str().with_context(|| {
+                format!("{}: the name is not valid UTF-8", entry.path().display())
+            })?;
             let (kind, path) = (entry.file_type().with_context(cannot)?, format!("{prefix}{name}"));
             let is_made =
                 Path::new(name).extension().is_some_and(|end| end == "pyc" || end == "mcap");
@@ -178,7 +178,11 @@ fn read_folder(root: &Path) -> Result<Files> {
                 entry.path().display()
             );
             total += entry.metadata().with_context(cannot)?.len();
-            ensure!(total <= MOST_BYTES, "{} contains more than {MOST_BYTES} bytes", root.display());
+            ensure!(
+                total <= MOST_BYTES,
+                "{} contains more than {MOST_BYTES} bytes",
+                root.display()
+            );
             ensure!(
                 files.len() < MOST_FILES,
                 "{} contains more than {MOST_FILES} files",

@@ -98,7 +98,9 @@ pub(super) fn build(folder: &Path, limits: &PluginLimits) -> Result<PathBuf> {
     match programs.as_slice() {
         // The output of the build is untrusted student code.
         [program] if program.starts_with(&target) => Ok(program.clone()),
-        [program] => bail!("{} builds {}, outside its target folder", folder.display(), program.display()),
+        [program] => {
+            bail!("{} builds {}, outside its target folder", folder.display(), program.display())
+        }
         [] => bail!("{} builds no program; a plugin has a src/main.rs", folder.display()),
         several => bail!(
             "{} builds {} programs; fly one of them by its path, such as {}",
@@ -215,7 +217,10 @@ mod tests {
         let cloned = package(Some("git+file:///home/x/solution"), "/home/x/.cargo/git/Cargo.toml");
         for bad in [solution(), cloned] {
             let error = of(bad).elsewhere(true).unwrap_err().to_string();
-            assert!(error.contains("is outside its folder") && error.contains("solution"), "{error}");
+            assert!(
+                error.contains("is outside its folder") && error.contains("solution"),
+                "{error}"
+            );
         }
         let folders = of(solution()).elsewhere(false).unwrap();
         assert_eq!(folders, [PathBuf::from("/home/x/solution")], "not graded");

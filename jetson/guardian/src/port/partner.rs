@@ -326,7 +326,10 @@ pub(super) mod tests {
         let mut partner = Partner::waited_for(Wanted::default(), start);
         assert!(!partner.accept(a, &radio, start), "no heartbeat yet");
         assert!(partner.accept(a, &beat, start) && partner.accept(a, &radio, start + SECOND));
-        assert!(!partner.accept(b, &beat, start + 2 * SECOND), "the first partner sends heartbeats");
+        assert!(
+            !partner.accept(b, &beat, start + 2 * SECOND),
+            "the first partner sends heartbeats"
+        );
         assert!(partner.accept(a, &radio, start + 3 * SECOND), "other packets of the partner");
         assert!(!partner.accept(b, &radio, start + 4 * SECOND) && partner.address() == Some(a));
         assert!(partner.accept(b, &beat, start + 4 * SECOND) && partner.address() == Some(b));

@@ -158,7 +158,10 @@ fn orders_land_after_half_a_second_of_silence_and_at_once_after_an_end() {
     rig.run(3000);
     let lands = rig.ours(COMMAND_LONG, 0);
     assert!((2500..=2520).contains(&lands[0]), "{lands:?}");
-    assert!(lands.len() > 1 && rig.sent.said == [SILENT], "LAND is repeated until the mode has changed");
+    assert!(
+        lands.len() > 1 && rig.sent.said == [SILENT],
+        "LAND is repeated until the mode has changed"
+    );
 
     let mut rig = Rig::flying();
     rig.speaks_until = 2000;

@@ -1,40 +1,38 @@
-//! The potential field: for every place within 8 m, how near is an obstacle, and how far is the
-//! goal.
+//! Potential field: clearance and distance to the goal for every point within 8 m.
 //!
-//! A textbook potential field adds a pull to the goal and a push from each obstacle. The vehicle
-//! stops where they cancel: in front of a wall, in a dead end. So the pull here is not the straight
-//! distance to the goal but the length of the shortest way around everything remembered, where a
-//! metre close to an obstacle counts for several. That potential has no minimum but the goal. It
-//! solves the eikonal equation |grad T| = cost by fast sweeping (H. Zhao, "A fast sweeping method
-//! for eikonal equations", Math. Comp. 74, 2005): 64 x 64 cells in 0.4 ms.
+//! A textbook potential field adds an attraction to the goal and a repulsion from each obstacle. The vehicle stops
+//! where they cancel: in front of a wall, in a dead end. Therefore the attraction here is not the straight distance to
+//! the goal but the length of the shortest way around all remembered obstacles, where a metre close to an obstacle
+//! counts several times. The only minimum of this potential is the goal. It solves the eikonal equation |grad T| = cost
+//! by fast sweeping (H. Zhao, "A fast sweeping method for eikonal equations", Math. Comp. 74, 2005): 64 x 64 cells in
+//! 0.4 ms.
 
 use vizflyt_sdk::Volume;
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-/// What the field is made from.
+/// Input of the field.
 #[derive(Clone, Copy, Debug)]
 pub struct Surroundings<'a> {
-    /// The vehicle. [m, world]
+    /// Position of the vehicle. [m, world]
     pub p_m: DVec3,
-    /// Where it wants to go. [m, world]
+    /// Position of the goal. [m, world]
     pub goal_m: DVec2,
-    /// Keep-in volume of the body's surface. [world]
+    /// Volume in which the body's surface must stay. [world]
     pub geofence: &'a Volume,
     /// Radius of the vehicle. [m]
     pub body_radius_m: f64,
 }
 
-/// Clearance and distance to go on a square grid around the vehicle: [`SIDE`] x [`SIDE`] cells,
-/// row-major, with a rim of one cell that no way leads over.
+/// Clearance and distance to the goal on a square grid around the vehicle: [`SIDE`] x [`SIDE`] cells, row-major, with a
+/// border of one cell that blocks all ways.
 #[derive(Clone, Debug)]
-#[allow(clippy::struct_field_names)] // Why: `_m` is the unit, as everywhere.
+#[allow(clippy::struct_field_names)] // Why: `_m` is the unit.
 pub struct Field {
-    /// Corner with the least x and y, at the centre of its cell. [m, world]
+    /// Centre of the corner cell with the smallest x and y. [m, world]
     origin_m: DVec2,
-    /// From the body's surface to the nearest obstacle or to the fence, at most
-    /// [`COMFORT_M`]. [m]
+    /// Distance from the body's surface to the nearest obstacle or the fence, at most [`COMFORT_M`]. [m]
     clearance_m: Vec<f64>,
-    /// What crossing a cell counts for: its side, and more near an obstacle. [m]
+    /// Cost of crossing a cell: its side, and more near an obstacle. [m]
     step_m: Vec<f64>,
     /// Length of the way to the goal, in metres of free space.
     to_go_m: Vec<f64>,
@@ -52,24 +50,24 @@ impl Default for Field {
 }
 
 impl Field {
-    /// Computes the field again from obstacle points. [m, world]
+    /// Recomputes the field from obstacle points. [m, world]
     pub fn update(&mut self, around: &Surroundings<'_>, points_m: impl Iterator<Item = DVec3>) {
         let half_m = CELL_M * (SIDE as f64 - 1.0) / 2.0;
-        // On whole cells, so that the same obstacle falls on the same cells in every image.
+        // Aligned to whole cells, so that the same obstacle is in the same cells in every image.
         let corner_m = (around.p_m.truncate() - DVec2::splat(half_m)) / CELL_M;
         self.origin_m = corner_m.round() * CELL_M;
         self.fill_clearance(around, points_m);
         self.fill_to_go(around.goal_m);
     }
 
-    /// Returns the distance from the body's surface to the nearest obstacle, from negative inside
-    /// to [`COMFORT_M`] at most, for a vehicle at `p_m` [m, world]. [m]
+    /// Returns the distance from the body's surface to the nearest obstacle for a vehicle at `p_m` [m, world]. Negative
+    /// inside obstacles, at most [`COMFORT_M`]. [m]
     pub fn clearance_m(&self, p_m: DVec2) -> f64 {
         self.interpolate(&self.clearance_m, p_m)
     }
 
-    /// Returns the length of the way to the goal from `p_m` [m, world], detours around obstacles
-    /// and the discomfort of passing near them included. [m]
+    /// Returns the length of the way to the goal from `p_m` [m, world], with detours around obstacles and the cost of
+    /// passing near them. [m]
     pub fn to_go_m(&self, p_m: DVec2) -> f64 {
         self.interpolate(&self.to_go_m, p_m)
     }
@@ -109,7 +107,7 @@ impl Field {
             let (column, row) = (goal_cell.x.round() as usize, goal_cell.y.round() as usize);
             self.to_go_m[index(column, row)] = 0.0;
         } else {
-            // The goal lies outside: leave over an edge that faces it, then go straight.
+            // The goal is outside the grid: leave over an edge on the goal's side, then fly straight.
             for along in 0..SIDE {
                 let edges = [
                     (goal_cell.x < 0.0, 0, along),
@@ -125,8 +123,7 @@ impl Field {
                 }
             }
         }
-        // Each round sweeps in all four diagonal directions; a path that bends once more needs
-        // one round more.
+        // Each round sweeps in all four diagonal directions. Each additional bend of a path needs another round.
         for _ in 0..MAX_ROUNDS {
             let change_m = [(false, false), (true, false), (true, true), (false, true)]
                 .into_iter()
@@ -138,7 +135,7 @@ impl Field {
         }
     }
 
-    /// Updates every cell from its neighbours in one order; returns the greatest change. [m]
+    /// Updates every cell from its neighbours in one order. Returns the largest change. [m]
     fn sweep(&mut self, leftward: bool, downward: bool) -> f64 {
         let mut greatest_m = 0.0_f64;
         for i in 0..SIDE {
@@ -149,13 +146,12 @@ impl Field {
                 let old_m = self.to_go_m[at];
                 let x_m = least(self.to_go_m[at - 1], self.to_go_m[at + 1]);
                 let y_m = least(self.to_go_m[at - PITCH], self.to_go_m[at + PITCH]);
-                // Most visits change nothing: no way over these neighbours can be shorter.
+                // Most visits change nothing, because no way over these neighbours can be shorter.
                 let step_m = self.step_m[at];
                 if least(x_m, y_m) + step_m * MIN_STEP >= old_m {
                     continue;
                 }
-                // Solves (T - x)^2 + (T - y)^2 = step^2, upwind: from the one neighbour if the
-                // other is too far to matter.
+                // Solves (T - x)^2 + (T - y)^2 = step^2, upwind: from only one neighbour if the other one is too far.
                 let new_m = if (x_m - y_m).abs() >= step_m {
                     least(x_m, y_m) + step_m
                 } else {
@@ -175,7 +171,7 @@ impl Field {
         self.origin_m + DVec2::new(column as f64, row as f64) * CELL_M
     }
 
-    /// Bilinear, and constant beyond the edges.
+    /// Interpolates bilinearly; constant outside the grid.
     fn interpolate(&self, values: &[f64], p_m: DVec2) -> f64 {
         let last = SIDE as f64 - 1.0;
         let cell = ((p_m - self.origin_m) / CELL_M).clamp(DVec2::ZERO, DVec2::splat(last));
@@ -188,18 +184,17 @@ impl Field {
     }
 }
 
-/// Returns where a cell's value lies.
+/// Returns the index of a cell.
 fn index(column: usize, row: usize) -> usize {
     (row + 1) * PITCH + column + 1
 }
 
-/// Returns the lesser of two numbers. One instruction where `f64::min`, which must also answer
-/// for NaN, takes four; there is none here.
+/// Returns the smaller number. One instruction, while `f64::min` needs four because of NaN, which does not occur here.
 fn least(a: f64, b: f64) -> f64 {
     if a < b { a } else { b }
 }
 
-/// Returns how many metres one metre counts for at a clearance. [m]
+/// Returns the cost of one metre at a clearance. [m]
 fn cost(clearance_m: f64) -> f64 {
     if clearance_m < TOUCH_M {
         return COST_OF_TOUCH;
@@ -214,32 +209,31 @@ fn cells(low: f64, high: f64) -> std::ops::Range<usize> {
     bound(low.ceil())..bound(high.floor() + 1.0)
 }
 
-/// Cell of the grid. Distance is interpolated between centres; at 0.35 m from a point that is
-/// wrong by cell^2 / (8 * distance) = 2.2 cm, at most. [m]
+/// Size of a grid cell. Distances are interpolated between centres. At 0.35 m from a point, the maximum error is cell^2
+/// / (8 * distance) = 2.2 cm. [m]
 const CELL_M: f64 = 0.25;
-/// Cells along a side: 8 m to each side is 1.6 s at 5 m/s, more than it takes to stop.
+/// Cells per side: 8 m in each direction is 1.6 s at 5 m/s, more than the time to stop.
 const SIDE: usize = 64;
-/// Cells from one row to the next: a side and the rim.
+/// Cells from one row to the next: one side and the border.
 const PITCH: usize = SIDE + 2;
-/// Clearance beyond which more is no better: half of the narrowest gap of the forest (1.4 m),
-/// less the body. [m]
+/// More clearance than this has no benefit: half of the forest's narrowest gap (1.4 m), minus the body. [m]
 pub const COMFORT_M: f64 = 0.7;
-/// Nearer to a remembered point than this counts as a hit: 5 cm for the blur of a splat's surface
-/// and 3 cm for the pose. [m]
+/// Distances to a remembered point below this count as a collision: 5 cm for the blur of a splat's surface and 3 cm for
+/// the pose. [m]
 pub const TOUCH_M: f64 = 0.08;
-/// The fence is a wall this much nearer than it is, to stay clear of the guard's own limit. [m]
+/// The fence counts as this much nearer, to stay clear of the guard's limit. [m]
 const FENCE_MARGIN_M: f64 = 0.3;
-/// A metre at touching distance counts for five: a detour of that length is worth more clearance.
+/// A metre at touching distance counts as five metres: a detour of that length is accepted for more clearance.
 const COST_OF_DISCOMFORT: f64 = 4.0;
-/// A way through an obstacle is no way, but finite: a field that starts inside one leads out.
+/// Large but finite cost of a cell inside an obstacle, so that a field that starts inside leads out.
 const COST_OF_TOUCH: f64 = 60.0;
-/// With both neighbours equal a step leads on by 1 / sqrt(2) of its length, and never by less.
+/// With two equal neighbours, a step adds 1 / sqrt(2) of its length, and never less.
 const MIN_STEP: f64 = std::f64::consts::FRAC_1_SQRT_2;
-/// More than any way through the grid.
+/// Longer than any way through the grid.
 const UNREACHED_M: f64 = 1e6;
-/// Sweeping ends when no cell changes by more: a hundredth of what a track gains. [m]
+/// Sweeping ends when no cell changes by more: 1 % of a candidate's gain. [m]
 const SETTLED_M: f64 = 0.02;
-/// Bound of the work; forests settle in two to four rounds.
+/// Limits the computation; forests converge in two to four rounds.
 const MAX_ROUNDS: usize = 8;
 
 #[cfg(test)]

@@ -1,17 +1,18 @@
-//! Flies to the goal through a forest, by a potential field on the depth image.
+//! Flies to the goal through a forest with a potential field on the depth image.
 //!
-//! What happens at every image, 45 to 100 times a second, in this order:
-//! 1. [`scan`]: depth pixels become obstacle points in the world frame; floor and sky do not;
-//! 2. [`memory`]: points of the last seconds stay, for what the camera no longer sees;
-//! 3. [`field`]: around the vehicle, how near is an obstacle, and how long is the way to the goal;
-//! 4. [`steer`]: of all velocities, the one that gets on best without coming near anything, none faster than [`pace`] allows;
-//! 5. here: height, heading and arrival; the velocity goes out as a [`Setpoint`].
+//! Steps at every image, 45 to 100 times per second:
+//! 1. [`scan`]: convert depth pixels to obstacle points in the world frame, without floor and sky;
+//! 2. [`memory`]: keep the points of the last seconds, because the camera no longer sees some of them;
+//! 3. [`field`]: compute the distance to obstacles and the length of the way to the goal around the vehicle;
+//! 4. [`steer`]: choose the velocity with the most progress and enough clearance, at most the speed that [`pace`]
+//!    allows;
+//! 5. this file: height, heading and arrival; returns the velocity as a [`Setpoint`].
 //!
-//! The nose turns to where the vehicle flies, so that the camera sees it. The whole takes about
-//! 0.7 ms per image.
+//! The nose points in the direction of flight, so that the camera sees obstacles there. The computation takes about 0.7
+//! ms per image.
 //!
-//! To try an idea, change one of the constants at the foot of a file, or one step, and fly:
-//! `cargo run -- demo --plugin PATH`. Each constant states where it comes from.
+//! To try an idea, change a constant at the end of a file, or one step, and fly: `cargo run -- demo --plugin PATH`.
+//! Each constant has a comment with its reason.
 
 pub mod field;
 pub mod memory;
@@ -38,11 +39,11 @@ pub struct Avoid {
     scan: Scan,
     memory: Memory,
     field: Field,
-    /// Velocity asked for last, and when. [m/s, world]
+    /// Last returned velocity, and its time. [m/s, world]
     setpoint_mps: DVec2,
     last: Option<HostTime>,
     pace: Pace,
-    /// When the camera last showed something.
+    /// Last time at which the image had enough returns.
     seen: Option<HostTime>,
     finished: bool,
 }
@@ -53,7 +54,7 @@ impl Autonomy for Avoid {
     }
 
     fn on_image(&mut self, obs: &Observation<'_>) -> Option<Setpoint> {
-        // Without a pose there is no way to a goal: no answer, and the guard holds, then lands.
+        // Without a pose, return no setpoint: the guard holds, then lands.
         let vehicle = Located::of(&obs.vehicle()?)?;
         let camera = obs.camera("front").or_else(|| obs.cameras().next())?;
         self.decide(&vehicle, &camera)
@@ -66,7 +67,7 @@ impl Autonomy for Avoid {
     }
 }
 
-/// A vehicle that knows where it is.
+/// State of a vehicle with a known position.
 struct Located {
     stamp: HostTime,
     world_from_body: Pose<World, Body>,
@@ -84,7 +85,7 @@ impl Located {
         })
     }
 
-    /// Returns the pose at another instant, within 0.3 s, if velocity and turn rate stay as they are.
+    /// Extrapolates the pose to another instant, at most 0.3 s away, with constant velocity and angular velocity.
     fn at(&self, then: HostTime) -> Pose<World, Body> {
         let ahead_s = then.seconds_since(self.stamp).clamp(-BLIND_S, BLIND_S);
         Pose::new(
@@ -110,7 +111,7 @@ impl Avoid {
         let dt_s = gap_s.clamp(0.0, MAX_DT_S);
         self.last = Some(now);
 
-        // See.
+        // 1. Update the map.
         let p_m = vehicle.world_from_body.translation_m;
         let view = view_of(vehicle, camera);
         self.scan.update(&view, p_m.z);
@@ -120,7 +121,7 @@ impl Avoid {
         let now_s = now.as_ns() as f64 * 1e-9;
         self.memory.update(now_s, &view, &self.scan.points_m);
 
-        // Understand.
+        // 2. Compute the field.
         let around = Surroundings {
             p_m,
             goal_m: goal_m.truncate(),
@@ -129,7 +130,7 @@ impl Avoid {
         };
         self.field.update(&around, self.memory.points_m());
 
-        // Decide.
+        // 3. Choose a velocity.
         let to_goal_m = (goal_m - p_m).truncate();
         if to_goal_m.length() < ARRIVED * arena.goal_radius_m {
             self.setpoint_mps = vehicle.v_world_mps.truncate();
@@ -140,7 +141,7 @@ impl Avoid {
         let motion = PlanarState {
             p_m: p_m.truncate(),
             v_mps,
-            // Before take-off nobody follows the setpoint: it must not run away from the vehicle.
+            // Before take-off the vehicle does not follow the setpoint, so limit their difference.
             setpoint_mps: v_mps + (self.setpoint_mps - v_mps).clamp_length_max(MAX_LEAD_MPS),
             heading_rad: nose.to_angle(),
             late_s: self.pace.late_s(),
@@ -164,13 +165,13 @@ impl Avoid {
         if arena.setpoints.contains(SetpointKind::Velocity) {
             return Some(Setpoint::velocity(v_mps, yaw));
         }
-        // A course of points: one as far ahead as the guard flies to at this speed.
+        // The course allows only positions: fly to the point at which the guard flies at this speed.
         Some(Setpoint::Position { p_world_m: p_m + v_mps / POINT_PER_S, yaw })
     }
 }
 
-/// Returns the image with the pose that it was rendered from. The server predicts that pose; the vehicle's own state at the
-/// same instant may differ from it by decimetres at the obstacles if images are late.
+/// Returns the image with the pose from which it was rendered. The server predicts that pose. If images are late, the
+/// vehicle's state at the same instant may differ by decimetres at the obstacles.
 fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
     let world_from_body = camera.pose_at_image.unwrap_or_else(|| vehicle.at(camera.shown));
     View {
@@ -180,28 +181,27 @@ fn view_of<'a>(vehicle: &Located, camera: &CameraImage<'a>) -> View<'a> {
     }
 }
 
-/// Fast enough for 37 m in eleven seconds, slow enough to stop (2.9 m) in half of what the field
-/// holds (8 m). With 4.2 m/s, and 5 m/s^2 of slew,
-/// agile vehicles crossed every forest, but sluggish ones hit a tree in one of twenty. [m/s]
+/// Fast enough for 37 m in 11 s, slow enough to stop (2.9 m) within half of the field (8 m). With 4.2 m/s, and 5 m/s^2
+/// of slew, agile vehicles crossed every forest, but sluggish ones hit a tree in 1 of 20. [m/s]
 const CRUISE_MPS: f64 = 3.6;
-/// Of the arena's greatest speed: the rest is for overshoot.
+/// Fraction of the arena's maximum speed; the rest is a reserve for overshoot.
 const CRUISE_SHARE: f64 = 0.7;
 /// Deceleration at the goal. [m/s^2]
 const BRAKE_MPS2: f64 = 2.5;
-/// Within this share of the goal's radius the goal itself is the setpoint.
+/// Within this fraction of the goal's radius, the setpoint is the goal.
 const ARRIVED: f64 = 0.5;
-/// The setpoint leads the velocity by slew times lag, 1.2 m/s; a little more is allowed. [m/s]
+/// Maximum difference of setpoint and velocity: slew times lag is 1.2 m/s, plus a reserve. [m/s]
 const MAX_LEAD_MPS: f64 = 1.6;
-/// Images farther apart than this are a gap, not a step. [s]
+/// Maximum time step; a longer one counts as a gap between images. [s]
 const MAX_DT_S: f64 = 0.1;
-/// Without sight for this long, stop. [s]
+/// Stop if no image had enough returns for this long. [s]
 const BLIND_S: f64 = 0.3;
-/// Height is corrected with a time constant of 0.7 s, no faster than 1 m/s.
+/// Height control: time constant of 0.7 s, at most 1 m/s.
 const CLIMB_PER_S: f64 = 1.5;
 const CLIMB_MPS: f64 = 1.0;
-/// The guard flies to a point with its distance times this, at most. [1/s]
+/// The guard's speed towards a point is at most the distance times this. [1/s]
 const POINT_PER_S: f64 = 0.8;
-/// Slower than this the direction of travel means nothing, and the nose turns to the goal. [m/s]
+/// Below this speed the direction of travel is meaningless, and the nose points at the goal. [m/s]
 const LOOK_MPS: f64 = 0.3;
 
 #[cfg(test)]

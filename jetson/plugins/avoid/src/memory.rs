@@ -1,7 +1,7 @@
 //! Obstacle points of the last seconds, in the world frame.
 //!
-//! The camera sees 90 degrees; what passes out of the image is still there. Points are kept until
-//! they are old, far behind, or the camera sees through the place where they were.
+//! The camera has a field of view of 90 degrees, but obstacles outside the image still exist. A point is kept until it
+//! is old, far away, or the camera sees through its position.
 
 use vizflyt_sdk::glam::DVec3;
 
@@ -16,15 +16,15 @@ pub struct Memory {
 #[derive(Clone, Copy, Debug)]
 struct Remembered {
     p_m: DVec3,
-    /// Distance at the sighting that placed it; nearer sightings are more exact. [m]
+    /// Distance at the sighting that placed the point; nearer sightings are more exact. [m]
     range_m: f64,
-    /// Last sighting. [s]
+    /// Time of the last sighting. [s]
     seen_s: f64,
 }
 
 impl Memory {
-    /// Forgets what is old, far away or seen through, then adds what the newest image shows
-    /// (`points_m` [m, world]) at time `now_s` on any steady clock.
+    /// Removes points that are old, far away or seen through, then adds the points of the newest image (`points_m` [m,
+    /// world]). `now_s` is the time on any steady clock.
     pub fn update(&mut self, now_s: f64, view: &View<'_>, points_m: &[DVec3]) {
         let camera_m = view.world_from_cam.translation_m;
         self.points.retain(|point| {
@@ -61,15 +61,15 @@ impl Memory {
     }
 }
 
-/// Long enough to find the way out of a dead end as deep as the camera sees (10 m in and out at
-/// 1.5 m/s); points on moving things fade sooner, as they are seen through. [s]
+/// Long enough to find the way out of a dead end as deep as the camera's range (10 m in and out at 1.5 m/s). Points on
+/// moving objects disappear earlier, because the camera sees through them. [s]
 const KEEP_S: f64 = 15.0;
-/// The field reaches 8 m to each side; what lies behind its edge is not asked for. [m]
+/// The field extends 8 m in each direction and does not use points further away. [m]
 const KEEP_M: f64 = 9.0;
-/// Sightings this near to a point are the same point: half a thin trunk, and finer than the
-/// clearance of 0.3 m that is kept. [m]
+/// Sightings within this distance are the same point: half of a thin trunk, and finer than the minimum clearance of 0.3
+/// m. [m]
 const MERGE_M: f64 = 0.15;
-/// A wall all around the field, 4 * 16 m / 0.15 m = 427 points, and then some.
+/// Enough for a wall around the complete field: 4 * 16 m / 0.15 m = 427 points.
 const MAX_POINTS: usize = 512;
 
 #[cfg(test)]

@@ -1,28 +1,26 @@
-//! Depth image -> obstacle points: what could be hit at the height the vehicle flies at.
+//! Converts a depth image to obstacle points at the vehicle's flight height.
 //!
-//! The image is cut into [`COLUMNS`] vertical strips. Each strip gives at most one point: the
-//! nearest surface between the floor and a little above the vehicle. Heights are judged in the
-//! world frame with the camera's full attitude, so neither the floor nor a nose that dips while
-//! the vehicle accelerates makes a false obstacle. About 20 000 pixels are looked at, whatever
-//! the size of the image: 0.2 ms.
+//! The image is divided into [`COLUMNS`] vertical strips. Each strip gives at most one point: the nearest surface
+//! between the floor and a little above the vehicle. Heights are computed in the world frame with the camera's full
+//! attitude, so that neither the floor nor a pitched nose during acceleration makes a false obstacle. About 20 000
+//! pixels are read for any image size: 0.2 ms.
 
 use vizflyt_sdk::glam::{DVec3, Vec3};
 use vizflyt_sdk::{Cam, Intrinsics, Pose, World};
 
-/// A depth image and where it was taken from.
+/// A depth image and the pose of its camera.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// Camera-z depth, row-major H x W; 0 is no return. [mm, cam]
+    /// Camera-z depth, row-major H x W; 0 means no return. [mm, cam]
     pub depth_mm: &'a [u16],
     /// Size, focal lengths, principal point. [px]
     pub intrinsics: Intrinsics,
-    /// Where the camera was when the image was taken. [m, world]
+    /// Pose of the camera at the time of the image. [m, world]
     pub world_from_cam: Pose<World, Cam>,
 }
 
 impl View<'_> {
-    /// Returns the depth at a column and row; `None` outside the image or where nothing came
-    /// back. [m, cam]
+    /// Returns the depth at a column and row; `None` outside the image or without a return. [m, cam]
     fn depth_m(&self, x: f64, y: f64) -> Option<f64> {
         let (width, height) = (self.intrinsics.width_px, self.intrinsics.height_px);
         if !(x >= 0.0 && y >= 0.0 && x < f64::from(width) && y < f64::from(height)) {
@@ -33,32 +31,32 @@ impl View<'_> {
         (depth_mm > 0).then(|| f64::from(depth_mm) * 1e-3)
     }
 
-    /// Whether the image shows something well behind `p_world_m`, so that nothing can be there.
-    /// Pixels without a return are ignored: they are no proof of free space.
+    /// Returns whether the image shows a surface well behind `p_world_m`, so that the point is free. Pixels without a
+    /// return do not count, because they do not prove free space.
     pub fn sees_through(&self, p_world_m: DVec3) -> bool {
         let p_cam_m = self.world_from_cam.inverse().transform_point(p_world_m);
         let Some(pixel) = self.intrinsics.project(p_cam_m) else {
             return false;
         };
         let behind_m = p_cam_m.z * (1.0 + SEE_THROUGH_RATIO) + SEE_THROUGH_M;
-        // The point and four neighbours, so that one pixel beside a trunk's edge proves nothing.
+        // Check the point and four neighbours, because one pixel next to a trunk's edge proves nothing.
         [(0.0, 0.0), (-2.0, 0.0), (2.0, 0.0), (0.0, -2.0), (0.0, 2.0)].iter().all(|(dx, dy)| {
             self.depth_m(pixel.x + dx, pixel.y + dy).is_some_and(|depth_m| depth_m > behind_m)
         })
     }
 }
 
-/// What one image shows.
+/// Result of scanning one image.
 #[derive(Clone, Debug, Default)]
 pub struct Scan {
     /// Obstacle points, at most one per strip. [m, world]
     pub points_m: Vec<DVec3>,
-    /// Share of the pixels looked at that had a return, 0 to 1.
+    /// Fraction of the read pixels with a return, 0 to 1.
     pub valid_fraction: f64,
 }
 
 impl Scan {
-    /// Replaces the scan by that of a new image, for a vehicle at height `flight_z_m` [m, world].
+    /// Replaces the scan by the scan of a new image, for a vehicle at height `flight_z_m` [m, world].
     pub fn update(&mut self, view: &View<'_>, flight_z_m: f64) {
         self.points_m.clear();
         self.valid_fraction = 0.0;
@@ -101,7 +99,7 @@ impl Scan {
                     }
                 }
             }
-            // Two neighbours together, as a surface may lie on their border.
+            // Add two neighbouring bins, because a surface may lie on their border.
             let pair = bins.windows(2).find(|pair| pair[0].count + pair[1].count >= SUPPORT);
             if let Some([near, next]) = pair {
                 let found = if near.count >= SUPPORT { *near } else { near.merged(next) };
@@ -111,13 +109,13 @@ impl Scan {
         self.valid_fraction = f64::from(valid) / f64::from(looked_at.max(1));
     }
 
-    /// Whether there is too little in the image to fly by.
+    /// Returns whether the image has too few returns to fly by.
     pub fn is_blind(&self) -> bool {
         !(self.valid_fraction >= BLIND_FRACTION)
     }
 }
 
-/// Pixels of a strip that lie at about one range.
+/// Pixels of a strip at about the same range.
 #[derive(Clone, Copy, Default)]
 struct Bin {
     count: u32,
@@ -135,33 +133,33 @@ fn bin_of(range_m: f32) -> usize {
     ((octaves * BINS_PER_OCTAVE) as usize).min(BINS - 1)
 }
 
-/// Strips: 4 pixels of 320, so that a trunk of 0.12 m radius still fills one at 9 m
-/// (0.24 m / 9 m * 160 px = 4.3 px).
+/// Number of strips: 4 pixels of 320, so that a trunk of 0.12 m radius fills a strip at 9 m (0.24 m / 9 m * 160 px =
+/// 4.3 px).
 pub const COLUMNS: usize = 80;
-/// Nothing farther is an obstacle yet: the field reaches 8 m. At 3.6 m/s that is two seconds. [m]
+/// Maximum range of obstacles, because the field extends 8 m. At 3.6 m/s that is 2 s. [m]
 pub const FAR_M: f32 = 9.0;
-/// Nearer surfaces share the first bin. [m]
+/// All nearer surfaces are in the first bin. [m]
 const NEAR_M: f32 = 0.1;
-/// Nine bins an octave are 8 % of range each: wider than the noise of a surface, narrower than
-/// the distance between two trunks.
+/// With nine bins per octave, each is 8 % of the range: wider than the noise of a surface, narrower than the distance
+/// between two trunks.
 const BINS_PER_OCTAVE: f32 = 9.0;
 /// log2(9 m / 0.1 m) * 9 = 58.4.
 const BINS: usize = 60;
-/// Pixels that must agree on a surface; fewer are speckle or the blur along an edge.
+/// Minimum number of pixels on a surface; fewer are speckle or the blur along an edge.
 const SUPPORT: u32 = 3;
-/// Obstacles count within this much above and below the flight height: body radius 0.12 m,
-/// height error 0.1 m, and the rest for branches that hang in. [m]
+/// Surfaces within this distance above and below the flight height are obstacles: body radius 0.12 m, height error 0.1
+/// m, and the rest for hanging branches. [m]
 const HALF_BAND_M: f64 = 0.45;
-/// What lies lower is floor or undergrowth, which we fly over. [m, world]
+/// Lower surfaces are floor or undergrowth, which the vehicle flies over. [m, world]
 const FLOOR_M: f64 = 0.3;
-/// Raises that limit with range: 0.03 rad of attitude error lifts the floor by 3 cm per metre.
+/// Increases that limit with range: an attitude error of 0.03 rad lifts the floor by 3 cm per metre.
 const FLOOR_RATIO: f64 = 0.03;
-/// A point is gone if the image shows at least this much more depth, and this share more. Wider
-/// than the blur of a splat's surface; narrower than a trunk. [m]
+/// A point is removed if the image shows more depth by at least this distance plus this fraction. Wider than the blur
+/// of a splat's surface, narrower than a trunk. [m]
 const SEE_THROUGH_M: f64 = 0.25;
 const SEE_THROUGH_RATIO: f64 = 0.05;
-/// An image with less than one pixel in twenty is taken for a covered or broken camera; the
-/// emptiest real one, sky over a strip of floor, has more.
+/// With a smaller fraction of returns, the camera is covered or broken. The emptiest real image, sky over a strip of
+/// floor, has more.
 const BLIND_FRACTION: f64 = 0.05;
 
 #[cfg(test)]

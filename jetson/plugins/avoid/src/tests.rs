@@ -28,7 +28,7 @@ fn vehicle(p_m: DVec3, ms: u64) -> Vehicle {
     }
 }
 
-/// One observation: everything `depth_mm` deep.
+/// Passes one observation with a depth of `depth_mm` in all pixels.
 fn see(plugin: &mut Avoid, vehicle: Option<Vehicle>, depth_mm: u16) -> Option<Setpoint> {
     let mut buffer = ObservationBuffer::new(&arena(None).cameras);
     let stamp = vehicle.map_or(HostTime::ZERO, |vehicle| vehicle.stamp);
@@ -46,7 +46,7 @@ fn started(goal_m: Option<DVec3>) -> Avoid {
     plugin
 }
 
-/// Returns velocity and heading after a second of images `depth_mm` deep. [m/s, rad, world]
+/// Returns velocity and heading after 1 s of images with a depth of `depth_mm`. [m/s, rad, world]
 fn after_a_second(plugin: &mut Avoid, from_ms: u64, depth_mm: u16) -> (DVec3, f64) {
     let mut last = None;
     for ms in (from_ms..=from_ms + 1000).step_by(20) {
@@ -54,19 +54,19 @@ fn after_a_second(plugin: &mut Avoid, from_ms: u64, depth_mm: u16) -> (DVec3, f6
     }
     match last {
         Some(Setpoint::Velocity { v_mps, yaw: YawTarget::Angle(yaw_rad), .. }) => (v_mps, yaw_rad),
-        other => panic!("{other:?} is no velocity with a heading"),
+        other => panic!("expected a velocity with a heading, got {other:?}"),
     }
 }
 
 #[test]
-fn flies_and_points_towards_the_goal() {
+fn flies_and_looks_towards_the_goal() {
     let (v_mps, yaw_rad) = after_a_second(&mut started(Some(GOAL_M)), 1000, 20_000);
     assert!(v_mps.x > 1.0 && v_mps.y.abs() < 0.1 && yaw_rad.abs() < 0.05, "{v_mps} {yaw_rad}");
     assert!((v_mps.z - CLIMB_PER_S * 0.2).abs() < 1e-9, "climbs to the goal's height");
 }
 
 #[test]
-fn without_sight_it_stops_and_goes_on_when_sight_returns() {
+fn stops_without_returns_and_continues_with_them() {
     let mut plugin = started(Some(GOAL_M));
     after_a_second(&mut plugin, 1000, 20_000);
     let (v_mps, _) = after_a_second(&mut plugin, 2020, 0);
@@ -76,14 +76,14 @@ fn without_sight_it_stops_and_goes_on_when_sight_returns() {
 }
 
 #[test]
-fn at_the_goal_it_holds_the_goal() {
+fn holds_at_the_goal() {
     let p_m = GOAL_M + DVec3::new(0.2, 0.1, 0.0);
     let answer = see(&mut started(Some(GOAL_M)), Some(vehicle(p_m, 1000)), 20_000);
     assert!(matches!(answer, Some(Setpoint::Position { p_world_m: GOAL_M, .. })), "{answer:?}");
 }
 
 #[test]
-fn without_a_goal_or_after_the_finish_it_holds() {
+fn holds_without_a_goal_and_after_the_finish() {
     let here = Some(vehicle(DVec3::Z, 1000));
     assert_eq!(see(&mut started(None), here, 20_000), Some(Setpoint::Hold));
     let mut plugin = started(Some(GOAL_M));
@@ -96,17 +96,17 @@ fn without_a_goal_or_after_the_finish_it_holds() {
 }
 
 #[test]
-fn without_a_usable_pose_it_gives_no_answer() {
+fn returns_nothing_without_a_valid_pose() {
     let mut plugin = started(Some(GOAL_M));
     assert_eq!(see(&mut plugin, None, 20_000), None);
     let lost = vehicle(DVec3::new(f64::NAN, 0.0, 0.0), 1000);
     assert_eq!(see(&mut plugin, Some(lost), 20_000), None);
 }
 
-/// An image that is rendered ahead of a late vehicle state shows obstacles from the pose of the image. Placed from the
-/// state instead, carried over 0.25 s of a turn at 2 rad/s, a trunk 4 m ahead would be 2 m off.
+/// An image that is rendered ahead of a late vehicle state shows obstacles from the image's pose. With the state
+/// extrapolated over 0.25 s of a turn at 2 rad/s, the error of a trunk 4 m ahead would be 2 m.
 #[test]
-fn obstacles_are_placed_from_the_pose_that_the_image_was_rendered_from() {
+fn places_obstacles_by_the_pose_of_the_image() {
     let turning = Vehicle { omega_body_radps: DVec3::Z * 2.0, ..vehicle(DVec3::Z, 1000) };
     let rendered_from = Pose::new(DVec3::new(0.4, -0.1, 1.0), DQuat::IDENTITY);
     let shown = HostTime::from_ns(1_250_000_000);
@@ -119,7 +119,7 @@ fn obstacles_are_placed_from_the_pose_that_the_image_was_rendered_from() {
         let located = Located::of(&observation.vehicle().unwrap()).unwrap();
         view_of(&located, &observation.camera("front").unwrap()).world_from_cam
     };
-    // Without a pose in the image, the state is carried on.
+    // Without a pose in the image, the vehicle's state is extrapolated.
     let ahead = place(&buffer).rotate(DVec3::Z);
     assert!((ahead.y.atan2(ahead.x) - 0.5).abs() < 1e-9, "{ahead}");
     buffer.set_pose_at_image(0, &rendered_from);

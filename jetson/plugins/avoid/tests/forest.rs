@@ -1,5 +1,5 @@
-//! Closed loop: the plugin flies through generated forests by way of the SDK's own observations,
-//! and the true geometry judges. Autopilot and images are those of `world`: no splats.
+//! Closed loop: the plugin flies through generated forests with observations of the SDK, and the true geometry decides
+//! about collisions. Autopilot and images come from `world`, without splats.
 
 mod world;
 
@@ -32,13 +32,13 @@ fn on_seeds(count: u64, flight: impl Fn(u64) -> Outcome + Sync) -> Vec<Outcome> 
     outcomes.into_iter().map(|(_, outcome)| outcome).collect()
 }
 
-/// Our own forest: denser than the demo's.
+/// Flies the test's forest, which is denser than the demo's.
 fn fly_forest(seed: u64, trunks: usize, conditions: Conditions) -> Outcome {
     let volumes = world::forest(seed, trunks);
     flight::fly(&volumes, &flight::arena(), START_M, conditions, seed, 60.0)
 }
 
-/// The demo's forest, with its true trunks, branches, rocks and logs.
+/// Flies the demo's forest, with its true trunks, branches, rocks and logs.
 fn fly_generated(seed: u64) -> Outcome {
     let mut generated = vizflyt_scenes::generate(SceneKind::Forest, seed);
     generated.truth.retain(can_be_met);
@@ -48,7 +48,7 @@ fn fly_generated(seed: u64) -> Outcome {
     flight::fly(&generated.truth, &arena, start_m, TYPICAL, seed, 60.0)
 }
 
-/// Leaves out crowns above the fence and trees well outside it, so that tests are quick.
+/// Excludes crowns above the fence and trees far outside it, for speed.
 fn can_be_met(volume: &Volume) -> bool {
     match *volume {
         Volume::Capsule { a_m, b_m, .. } => {
@@ -63,17 +63,17 @@ fn good(outcomes: &[Outcome]) -> usize {
     outcomes.iter().filter(good).count()
 }
 
-/// The product's requirement.
+/// Requirement of the product.
 #[test]
-fn at_least_18_of_20_generated_forests_are_crossed_at_2_mps() {
+fn crosses_at_least_18_of_20_generated_forests_at_2_mps() {
     let outcomes = on_seeds(20, fly_generated);
     assert!(good(&outcomes) >= 18, "{outcomes:#?}");
     assert!(outcomes.iter().all(|o| o.min_fence_m > 0.0), "{outcomes:#?}");
 }
 
-/// Slower than by images that come in time, and as safe.
+/// Slower than with timely images, but as safe.
 #[test]
-fn a_starved_server_costs_speed_and_no_touch() {
+fn starved_server_reduces_speed_but_not_safety() {
     let outcomes = on_seeds(40, |seed| fly_forest(seed, 90, STARVED));
     let touched = outcomes.iter().filter(|o| o.collided).count();
     println!("{touched} touched");
@@ -83,21 +83,21 @@ fn a_starved_server_costs_speed_and_no_touch() {
 }
 
 #[test]
-fn dense_forests_are_crossed_too() {
+fn crosses_dense_forests() {
     let outcomes = on_seeds(10, |seed| fly_forest(seed, 90, TYPICAL));
     assert!(good(&outcomes) >= 9, "{outcomes:#?}");
 }
 
 #[test]
-fn a_sluggish_vehicle_with_a_poor_camera_gets_through() {
+fn sluggish_vehicle_with_a_poor_camera_crosses_forests() {
     let outcomes = on_seeds(10, |seed| fly_forest(seed, 60, SLUGGISH));
     assert!(good(&outcomes) >= 9, "{outcomes:#?}");
 }
 
-/// A pocket of trunks, too close to pass between, that opens towards the start: a plain potential
-/// field stays in it for ever.
+/// A pocket of trunks, too close to pass between, that opens towards the start. A plain potential field never leaves
+/// it.
 #[test]
-fn a_dead_end_is_left_again() {
+fn leaves_a_dead_end() {
     let mut volumes = vec![FLOOR];
     for n in 0..=12 {
         let along = f64::from(n) * 0.5;
@@ -111,7 +111,7 @@ fn a_dead_end_is_left_again() {
 }
 
 #[test]
-fn free_ground_is_crossed_fast_and_straight() {
+fn crosses_free_ground_fast_and_straight() {
     let outcome = flight::fly(&[FLOOR], &flight::arena(), START_M, TYPICAL, 1, 60.0);
     assert!(outcome.finished && outcome.mean_speed_mps > 2.5, "{outcome:?}");
     assert!((outcome.end_m - GOAL_M).y.abs() < 0.1, "{outcome:?}");

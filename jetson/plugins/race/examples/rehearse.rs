@@ -1,10 +1,9 @@
-//! Flies generated courses in lock-step, without autopilot and server, with images and attitude alone:
-//! `cargo run -p vizflyt-race --example rehearse -- p5 0 1 2`. One seed alone is reported
-//! every half second.
+//! Flies generated courses in lock-step, without autopilot and server, with images and attitude only: `cargo run -p
+//! vizflyt-race --example rehearse -- p5 0 1 2`. With a single seed it reports every 0.5 s.
 //!
-//! `-- race 1 twin=FOLDER` flies the race hall of a seed as it was rebuilt from a capture: images are the twin's
-//! (`FOLDER/scene.ply`), the truth is that of the hall, and the way flown is held against what a referee bakes of the
-//! twin and of what its capture has seen. `-- race 1` flies the hall itself.
+//! `-- race 1 twin=FOLDER` flies the race hall of a seed in its twin from a capture. The images are those of the twin
+//! (`FOLDER/scene.ply`), the true geometry is that of the hall. The flown path is compared with the obstacles that a
+//! referee bakes from the twin and its seen space. `-- race 1` flies the hall itself.
 
 #[path = "../tests/world/mod.rs"]
 mod world;
@@ -49,7 +48,7 @@ fn main() {
             }
         });
         if let Some(field) = field {
-            // Above the pad it is take-off.
+            // Exclude the take-off above the pad.
             let flown = way_m.iter().filter(|p_m| p_m.z > 0.5 && p_m.distance(way_m[0]) > 0.5);
             let room_m = |p_m: &DVec3| field.obstacle_distance_m(*p_m) - radius_m;
             let least = flown.min_by(|a, b| room_m(a).total_cmp(&room_m(b)));
@@ -68,14 +67,14 @@ fn main() {
     println!("{good} of {} finished", seeds.len());
 }
 
-/// Returns where to fly, and what a referee makes of it if it is a twin.
+/// Returns the course, and for a twin the referee's distance field.
 fn place(project: &str, seed: u64, twin: Option<&Path>) -> (Generated, Option<DistanceField>) {
     let of_course = |name| CourseProject::named(name).expect("a project of the course");
     if project != "race" {
         return (of_course(project).generate(seed, Level::Ug, Variant::DAY), None);
     }
     let mut hall = generate(SceneKind::Race, seed);
-    // By its own senses, as in the course.
+    // With the sensors and limits of the course.
     let rules = of_course("p5").generate(seed, Level::Ug, Variant::DAY).arena;
     hall.arena.cameras = rules.cameras;
     hall.arena.limits = rules.limits;

@@ -1,9 +1,9 @@
-//! Colour of a pixel -> which racing window it belongs to.
+//! Classifies pixels by the colour of the racing windows.
 //!
-//! The course's windows are known by their colours, as the real ones are. Hue distinguishes them;
-//! saturation keeps brick, mats and grey steel out. Light changes value much, hue little.
+//! The colours of the course's windows are known. Hue distinguishes the windows; saturation excludes brick, mats and
+//! grey steel. Light changes the value strongly, but the hue only a little.
 
-/// The coloured bars of the course's windows.
+/// Colours of the course's windows, and of the hand.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ColorClass {
     /// Red bars, white arrowheads.
@@ -14,7 +14,7 @@ pub enum ColorClass {
     Magenta,
     /// Orange bars, black arrowheads: the window with the hand.
     Orange,
-    /// The hand itself.
+    /// The hand.
     Teal,
 }
 
@@ -22,7 +22,7 @@ impl ColorClass {
     /// The colour classes of windows.
     pub const WINDOWS: [Self; 4] = [Self::Red, Self::Blue, Self::Magenta, Self::Orange];
 
-    /// Returns the class of an sRGB pixel; `None` if it is in none.
+    /// Returns the class of an sRGB pixel, or `None`.
     pub fn of(rgb: [u8; 3]) -> Option<Self> {
         let [r, g, b] = rgb.map(i32::from);
         let (most, least) = (r.max(g).max(b), r.min(g).min(b));
@@ -49,9 +49,9 @@ impl ColorClass {
     }
 }
 
-/// Darker pixels have no sure hue: noise of a JPEG is about 5. Of 255.
+/// Darker pixels have no reliable hue: the noise of a JPEG is about 5. Of 255.
 const DARKEST: i32 = 45;
-/// Bars have 70 % and more, brick and floor mats at most 55 %. [%]
+/// Bars have at least 70 %, brick and floor mats at most 55 %. [%]
 const SATURATION: i32 = 60;
 
 #[cfg(test)]

@@ -1,15 +1,14 @@
-//! The clock's hand in a window: its pivot, angle and speed, and when the way is clear of it.
+//! Rotating hand of a window: pivot, angle, speed, and the times at which the way is clear.
 //!
-//! What stands in cells of the window that are open at other times is the hand. Each image gives
-//! its line; lines of different angles cross at the pivot; angles over time give the speed, and the
-//! two of them when the hand is where.
+//! Points in cells of the window that are free at other times belong to the hand. Each image gives its line. Lines of
+//! different angles cross at the pivot. Angles over time give the speed, and both predict the hand.
 
 use std::collections::VecDeque;
 
 use vizflyt_sdk::glam::{DMat2, DVec2};
 use vizflyt_sdk::protocol::geometry::wrap_pi;
 
-/// Follows the hand of one window. Points are in the window's plane.
+/// Estimates the hand of one window. Points are in the window's plane.
 #[derive(Clone, Debug, Default)]
 pub struct Hand {
     sightings: VecDeque<Sighting>,
@@ -22,36 +21,36 @@ pub struct Hand {
 #[derive(Clone, Copy, Debug)]
 struct Sighting {
     at_s: f64,
-    /// Middle of what is seen of it. [m, plane]
+    /// Middle of the visible part. [m, plane]
     middle_m: DVec2,
-    /// Unit vector along it.
+    /// Unit vector along the hand.
     along: DVec2,
-    /// What is seen farthest along it from the middle, to either side. [m]
+    /// Half length of the visible part. [m]
     half_m: f64,
 }
 
-/// How the hand turns.
+/// Rotation of the hand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HandRotation {
-    /// What it turns about. [m, plane]
+    /// Pivot. [m, plane]
     pub pivot_m: DVec2,
     /// Angle at `at_s`, from the plane's left towards up. [rad]
     pub angle_rad: f64,
     /// Time of that angle. [s]
     pub at_s: f64,
-    /// Speed of turning. [rad/s]
+    /// Angular velocity. [rad/s]
     pub omega_radps: f64,
-    /// From the pivot to its tip. [m]
+    /// Distance from the pivot to the tip. [m]
     pub length_m: f64,
 }
 
 impl HandRotation {
-    /// Returns the hand's angle at a time. [rad]
+    /// Returns the angle of the hand at a time. [rad]
     pub fn angle_at(&self, at_s: f64) -> f64 {
         wrap_pi(self.angle_rad + self.omega_radps * (at_s - self.at_s))
     }
 
-    /// Returns the distance from a place to the hand's middle line at a time. [m]
+    /// Returns the distance from a point to the hand's middle line at a time. [m]
     pub fn distance_m(&self, within_m: DVec2, at_s: f64) -> f64 {
         let tip = DVec2::from_angle(self.angle_at(at_s)) * self.length_m;
         let from_pivot_m = within_m - self.pivot_m;
@@ -61,7 +60,7 @@ impl HandRotation {
 }
 
 impl Hand {
-    /// Takes the points of an image at which something stands in the opening. [m, plane]
+    /// Adds the hand's points of an image. [m, plane]
     pub fn update(&mut self, now_s: f64, points_m: &[DVec2]) {
         self.first_s.get_or_insert(now_s);
         self.last_s = now_s;
@@ -74,13 +73,13 @@ impl Hand {
         self.motion = self.fit();
     }
 
-    /// Returns how it turns, once that is known.
+    /// Returns the rotation of the hand, once it is estimated.
     pub fn motion(&self) -> Option<&HandRotation> {
         self.motion.as_ref()
     }
 
-    /// Whether a disc of `radius_m` at a place stays clear of the hand from one time to another.
-    /// A window that has been watched for long without anything in it has no hand.
+    /// Returns whether a disc of `radius_m` at a point stays clear of the hand during a time interval. A window without
+    /// any sighting for a long time has no hand.
     pub fn is_clear(&self, within_m: DVec2, radius_m: f64, from_s: f64, to_s: f64) -> bool {
         let Some(motion) = &self.motion else {
             let watched_s = self.first_s.map_or(0.0, |first_s| self.last_s - first_s);
@@ -94,11 +93,11 @@ impl Hand {
     }
 
     fn fit(&self) -> Option<HandRotation> {
-        // Pieces cut off aslant, by the image's edge, have another direction than the hand.
+        // Pieces that the image's edge cuts diagonally have another direction than the hand.
         let longest_m = self.sightings.iter().map(|sighting| sighting.half_m).fold(0.0, f64::max);
         let whole = |sighting: &&Sighting| sighting.half_m > WHOLE * longest_m;
         let pivot_m = pivot_m(self.sightings.iter().filter(whole))?;
-        // From the pivot to its middle: cut off aslant, its own line is a few degrees off.
+        // Use the direction from the pivot to the middle, because the line of a cut piece is a few degrees off.
         let angles: Vec<(f64, f64)> = self
             .sightings
             .iter()
@@ -106,7 +105,7 @@ impl Hand {
             .map(|sighting| (sighting.at_s, (sighting.middle_m - pivot_m).to_angle()))
             .collect();
         let omega_radps = while_in_sight_radps(&angles)?;
-        // Unseen it may have turned by any angle: that speed gives the number of whole turns.
+        // While out of sight, the hand may have turned by any angle; the speed gives the number of complete turns.
         let newest_s = self.sightings.back()?.at_s;
         let (mut last_s, mut last_rad) = *angles.first()?;
         let line = Line::through(angles.iter().map(|&(at_s, angle_rad)| {
@@ -126,14 +125,14 @@ impl Hand {
     }
 }
 
-/// Returns the speed of turning over those stretches in which the hand was always seen; `None` if
-/// they are too short. [(s, rad)] -> [rad/s]
+/// Returns the angular velocity over the intervals in which the hand was always visible; `None` if they are too short.
+/// [(s, rad)] -> [rad/s]
 fn while_in_sight_radps(angles: &[(f64, f64)]) -> Option<f64> {
     let (mut squares, mut products) = (0.0, 0.0);
     for stretch in angles.chunk_by(|before, after| after.0 - before.0 < OUT_OF_SIGHT_S) {
         let (first_s, first_rad) = stretch[0];
         let turned = |&(at_s, angle_rad): &(f64, f64)| {
-            // Less than half a turn, above the window's lower edge.
+            // Less than half a turn, because the hand is visible only above the window's lower edge.
             (at_s - first_s, wrap_pi(angle_rad - first_rad))
         };
         let count = stretch.len() as f64;
@@ -147,7 +146,7 @@ fn while_in_sight_radps(angles: &[(f64, f64)]) -> Option<f64> {
     (squares > 1e-3).then(|| products / squares)
 }
 
-/// A straight line, by least squares.
+/// A straight line, fitted by least squares.
 struct Line {
     at_zero: f64,
     slope: f64,
@@ -169,7 +168,7 @@ impl Line {
     }
 }
 
-/// Returns where the hand's lines cross; `None` while they hardly differ. [m, plane]
+/// Returns the crossing of the hand's lines; `None` if their directions are too similar. [m, plane]
 fn pivot_m<'a>(sightings: impl Iterator<Item = &'a Sighting>) -> Option<DVec2> {
     let (mut matrix, mut right, mut count) = (DMat2::ZERO, DVec2::ZERO, 0_u32);
     for sighting in sightings {
@@ -200,7 +199,7 @@ fn sighting(at_s: f64, points_m: &[DVec2]) -> Option<Sighting> {
     let across = |p_m: &DVec2| (*p_m - middle_m).dot(along.perp()).abs();
     let half_m = points_m.iter().map(reach).fold(0.0, f64::max);
     let wide_m = points_m.iter().map(across).sum::<f64>() / points_m.len() as f64;
-    // A speck has no direction.
+    // A small spot has no direction.
     (half_m > SHORTEST_M && half_m > 4.0 * wide_m).then_some(Sighting {
         at_s,
         middle_m,
@@ -209,17 +208,17 @@ fn sighting(at_s: f64, points_m: &[DVec2]) -> Option<Sighting> {
     })
 }
 
-/// Two turns at 60 degrees a second, and slower ones in part. [s]
+/// Sightings are kept for two turns at 60 degrees per second, or a part of a slower turn. [s]
 const REMEMBERED_S: f64 = 8.0;
-/// Not seen for so long, it was out of sight. [s]
+/// After a gap of this length between sightings, the hand was out of sight. [s]
 const OUT_OF_SIGHT_S: f64 = 0.5;
-/// Watched for so long without a hand, there is none: a turn at 40 degrees a second. [s]
+/// Without a sighting for this long, there is no hand: a turn at 40 degrees per second. [s]
 const NO_HAND_S: f64 = 9.0;
-/// Half a hand's width, and the error of its predicted place. [m]
+/// Half of the hand's width, plus the error of its prediction. [m]
 const HALF_WIDTH_M: f64 = 0.1;
-/// Half of the shortest piece that counts. [m]
+/// Half of the minimum length of a sighting. [m]
 const SHORTEST_M: f64 = 0.12;
-/// Share of the longest piece that is nearly the whole hand.
+/// Minimum length of a sighting for the fit, as a fraction of the longest.
 const WHOLE: f64 = 0.7;
 const FEWEST: u32 = 12;
 const FEWEST_POINTS: usize = 8;

@@ -1,4 +1,4 @@
-//! What has been found so far: the obstacles, which are passed, and which comes next.
+//! Detected obstacles, passed obstacles, and the next one.
 
 use vizflyt_sdk::glam::DVec3;
 
@@ -7,7 +7,7 @@ use crate::planar_obstacle::{ObstacleKind, PlanarObstacle, Plane};
 use crate::plane_detection;
 use crate::sampling::PixelGrid;
 
-/// The course as far as it has been seen.
+/// The course as far as it has been detected.
 #[derive(Clone, Debug, Default)]
 pub struct Known {
     obstacles: Vec<PlanarObstacle>,
@@ -15,8 +15,8 @@ pub struct Known {
 }
 
 impl Known {
-    /// Takes an image seen from `camera_m` [m, home] at `now_s`. The plane of `settled` stays as it
-    /// is: the vehicle is about to fly through it.
+    /// Processes an image seen from `camera_m` [m, home] at `now_s`. The plane of `settled` is not changed, because the
+    /// vehicle is about to fly through it.
     pub fn update(
         &mut self,
         now_s: f64,
@@ -42,7 +42,7 @@ impl Known {
             let Some(found) = found else { continue };
             match known {
                 Some(at) => self.obstacles[at].settle(found.plane, found.range_m),
-                // Arrowheads of one window may look like bars of another.
+                // Arrowheads of one window may look like bars of another window.
                 None if self.is_another(kind, &found.plane) => {}
                 None => {
                     self.obstacles.push(PlanarObstacle::new(
@@ -60,7 +60,7 @@ impl Known {
         self.forget(now_s, camera_m);
     }
 
-    /// Returns everything found, passed or not.
+    /// Returns all detected obstacles, passed or not.
     pub fn obstacles(&self) -> &[PlanarObstacle] {
         &self.obstacles
     }
@@ -70,22 +70,22 @@ impl Known {
         self.obstacles.iter().find(|obstacle| obstacle.kind == kind)
     }
 
-    /// Notes that the vehicle has flown through an obstacle.
+    /// Marks an obstacle as passed.
     pub fn pass(&mut self, kind: ObstacleKind) {
         self.passed.push(kind);
     }
 
-    /// Whether the vehicle has flown through it.
+    /// Returns whether the vehicle has flown through an obstacle.
     pub fn has_passed(&self, kind: ObstacleKind) -> bool {
         self.passed.contains(&kind)
     }
 
-    /// Whether the vehicle has flown through anything.
+    /// Returns whether the vehicle has flown through any obstacle.
     pub fn has_begun(&self) -> bool {
         !self.passed.is_empty()
     }
 
-    /// Returns the nearest obstacle ahead of `p_m` [m, home] that is not passed; `after` leaves one out.
+    /// Returns the nearest obstacle ahead of `p_m` [m, home] that is not passed and is not `after`.
     pub fn next(&self, p_m: DVec3, after: Option<ObstacleKind>) -> Option<&PlanarObstacle> {
         let before_m = |obstacle: &PlanarObstacle| -obstacle.plane.behind_m(p_m);
         self.obstacles
@@ -95,8 +95,8 @@ impl Known {
             .min_by(|a, b| before_m(a).total_cmp(&before_m(b)))
     }
 
-    /// What was never an opening, and is not seen any more, or turns out to be painted on a wall,
-    /// was something else; and so was what lies behind without having been passed.
+    /// Removes false detections: obstacles that never had an opening and are no longer visible or lie on a wall, and
+    /// obstacles behind the camera that were not passed.
     fn forget(&mut self, now_s: f64, camera_m: DVec3) {
         let walls: Vec<Plane> = self.walls().collect();
         let passed = &self.passed;
@@ -118,7 +118,7 @@ impl Known {
             .map(|obstacle| obstacle.plane)
     }
 
-    /// Whether a plane is that of an obstacle of another kind.
+    /// Returns whether a plane belongs to an obstacle of another kind.
     fn is_another(&self, kind: ObstacleKind, plane: &Plane) -> bool {
         self.obstacles.iter().filter(|obstacle| obstacle.kind != kind).any(|obstacle| {
             let aside_m = obstacle.plane.within_m(plane.origin_m).x.abs();
@@ -129,18 +129,18 @@ impl Known {
     }
 }
 
-/// Whether a plane is that of a wall, and not of a window before it.
+/// Returns whether a plane lies on a wall, so that it is not a window in front of the wall.
 fn lies_on(wall: &Plane, plane: &Plane) -> bool {
     wall.behind_m(plane.origin_m).abs() < 0.2
 }
 
-/// An obstacle is passed when the whole vehicle, and a hand's breadth, is behind it. [m]
+/// An obstacle is passed when the complete vehicle and a margin are behind it. [m]
 pub const PASSED_M: f64 = 0.32;
-/// Farther behind than anything that is being flown through. [m]
+/// Further behind than any obstacle during its passage. [m]
 const LEFT_BEHIND_M: f64 = 0.8;
-/// Two windows do not stand beside each other nearer than this. [m]
+/// Minimum distance between two windows side by side. [m]
 const SAME_M: f64 = 0.8;
-/// Long enough for a look elsewhere. [s]
+/// Long enough to look elsewhere. [s]
 const FORGET_S: f64 = 2.0;
 
 #[cfg(test)]
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_not_passed_comes_next() {
+    fn nearest_obstacle_not_passed_is_next() {
         let mut bricks = room();
         bricks.extend(window(DVec3::new(1.8, 0.1, 1.3), 0.6, RED));
         bricks.extend(window(DVec3::new(3.4, 0.0, 1.3), 0.6, BLUE));
@@ -179,9 +179,9 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_painted_on_a_wall_is_forgotten() {
+    fn removes_a_frame_painted_on_a_wall() {
         let mut bricks = room();
-        // 2 cm before the wall, of its thickness: paint.
+        // 2 cm in front of the wall, within its thickness: paint.
         bricks.extend(window(DVec3::new(2.5, 0.0, 1.3), 0.6, BLUE));
         bricks.push(Brick {
             min_m: DVec3::new(2.5, -2.2, 0.0),

@@ -1,16 +1,15 @@
 //! Flies a race course from images: windows, a gap, a window with a rotating hand.
 //!
-//! It knows no map and no place of anything, nor where it is itself: only what its camera shows,
-//! and how it is tilted. What happens at every image, in this order:
-//! 1. [`sampling`]: pixels become vectors and colour classes (bars of known windows), [`color_class`];
-//! 2. [`odometry`]: where the camera is, by registering its depth to an earlier image;
-//! 3. [`plane_detection`]: new windows by their colour, walls by their size;
-//! 4. [`planar_obstacle`]: what of each is solid and what is free, and where its opening is widest;
-//!    [`known`] keeps them, and selects the next one;
-//! 5. [`hand`]: what moves in that opening, and when it will be away;
-//! 6. [`steer`]: through the opening of the nearest, clear of everything solid.
+//! It has no map and no position: only camera images and the attitude. Steps at every image:
+//! 1. [`sampling`]: convert pixels to vectors and colour classes (bars of known windows), [`color_class`];
+//! 2. [`odometry`]: estimate the camera's position by registering its depth to an earlier image;
+//! 3. [`plane_detection`]: detect new windows by their colour, walls by their size;
+//! 4. [`planar_obstacle`]: find solid and free cells of each, and the widest place of its opening; [`known`] stores the
+//!    obstacles and selects the next one;
+//! 5. [`hand`]: estimate the motion of the hand in that opening, and when the way is clear;
+//! 6. [`steer`]: fly through the opening of the nearest obstacle, clear of everything solid.
 //!
-//! All is kept in the frame [`sampling::Home`], so a window that has left the image is still there.
+//! All positions are in the frame [`sampling::Home`], so that windows outside the image are not lost.
 
 pub mod color_class;
 pub mod hand;
@@ -43,26 +42,26 @@ use steer::Aim;
 /// The plugin.
 #[derive(Clone, Debug, Default)]
 pub struct Race {
-    /// Where the flight is to end, if the course has a goal. [m, world]
+    /// Goal of the flight, if the course has one. [m, world]
     goal_m: Option<DVec3>,
     grid: PixelGrid,
     odometry: Odometry,
-    /// Turn from world axes to home axes about z, set by the first image. [rad]
+    /// Rotation from world axes to home axes about z, set by the first image. [rad]
     home_yaw_rad: Option<f64>,
     known: Known,
     hand: Hand,
-    /// What it flies through now.
+    /// Obstacle that the vehicle flies through next.
     target: Option<ObstacleKind>,
-    /// Since when the passage is under way: nothing else counts any more. [s]
+    /// Start of the passage. During a passage the target does not change. [s]
     committed_s: Option<f64>,
-    /// Since when nothing has been found to fly through. [s]
+    /// Start of the search, if no obstacle is known. [s]
     searching_s: Option<f64>,
-    /// Asked for last. [m/s, home]
+    /// Last returned velocity. [m/s, home]
     setpoint_mps: DVec3,
-    /// Whether depth has ever come with an image, and how many images came without before.
+    /// Whether an image had depth, and the number of images without depth before.
     has_depth: bool,
     without_depth: u32,
-    /// Number of the image seen last.
+    /// Number of the last processed image.
     seen: Option<u64>,
     last_s: Option<f64>,
     finished: bool,
@@ -79,7 +78,7 @@ impl Autonomy for Race {
         if !(vehicle.attitude.is_finite() && vehicle.attitude.is_normalized()) {
             return None;
         }
-        // Another camera's image has come: this one has been answered.
+        // An image of another camera has arrived; this one is already processed.
         if self.seen.replace(camera.seq) == Some(camera.seq) {
             return None;
         }
@@ -96,49 +95,49 @@ impl Autonomy for Race {
     }
 }
 
-/// Where the vehicle is by its own reckoning.
+/// Position of the vehicle by its own estimate.
 #[derive(Clone, Copy, Debug)]
 pub struct Here {
-    /// Of the body. [m, home]
+    /// Position of the body. [m, home]
     pub p_m: DVec3,
-    /// Of the camera. [m, home]
+    /// Position of the camera. [m, home]
     pub camera_m: DVec3,
-    /// The course's goal, where the course gives it and the vehicle's position. [m, home]
+    /// Goal of the course, if the course gives the goal and the vehicle's pose. [m, home]
     pub goal_m: Option<DVec3>,
 }
 
 impl Race {
-    /// Returns where it thinks its camera is. [m, home]
+    /// Returns the estimated position of the camera. [m, home]
     pub fn here_m(&self) -> DVec3 {
         self.odometry.p_m
     }
 
-    /// Returns what it has found.
+    /// Returns the detected obstacles.
     pub fn known(&self) -> &Known {
         &self.known
     }
 
-    /// Returns what it flies through now.
+    /// Returns the obstacle that the vehicle flies through next.
     pub fn target(&self) -> Option<ObstacleKind> {
         self.target
     }
 
-    /// Returns how the hand turns, once that is known.
+    /// Returns the rotation of the hand, once it is estimated.
     pub fn hand(&self) -> Option<&hand::HandRotation> {
         self.hand.motion()
     }
 
-    /// Whether images come with depth; until one has, nothing is answered and the vehicle stays on the
-    /// ground.
+    /// Returns whether images contain depth. Until one does, the plugin returns no setpoint and the vehicle stays on
+    /// the ground.
     ///
     /// # Panics
-    /// If none has for a second: it cannot fly here, and the runtime reports this sentence.
+    /// If there is no depth for 1 s. The runtime reports this message, because the plugin cannot fly here.
     fn has_depth(&mut self, camera: &CameraImage<'_>) -> bool {
         self.has_depth |= camera.depth_mm.iter().any(|&depth_mm| depth_mm > 0);
         self.without_depth += u32::from(!self.has_depth);
         assert!(
             self.has_depth || self.without_depth < PATIENCE,
-            "race needs depth, and this course's level gives colour alone (g); fly it with --level ug"
+            "race needs depth, but this course's level has only colour (g); fly it with --level ug"
         );
         self.has_depth
     }
@@ -156,7 +155,7 @@ impl Race {
         let (wanted_mps, look_rad) = self.choose(now_s, &here);
         let solid = self.known.obstacles().iter();
         let wanted_mps = steer::clear_of(wanted_mps, here.p_m, solid).clamp_length_max(MAX_MPS);
-        // Before take-off nobody follows: the setpoint must not run away from the vehicle.
+        // Before take-off the vehicle does not follow the setpoint, so limit their difference.
         let from_mps = self.odometry.v_mps
             + (self.setpoint_mps - self.odometry.v_mps).clamp_length_max(MAX_LEAD_MPS);
         self.setpoint_mps = from_mps + (wanted_mps - from_mps).clamp_length_max(SLEW_MPS2 * dt_s);
@@ -169,9 +168,9 @@ impl Race {
         }
     }
 
-    /// Takes an image in: what it shows, and from where.
+    /// Processes an image, and returns the position from which it was taken.
     fn look(&mut self, now_s: f64, vehicle: &Vehicle, camera: &CameraImage<'_>) -> Here {
-        // The attitude is newer or older than the image by some milliseconds of steady turning.
+        // The attitude is some milliseconds newer or older than the image; extrapolate with constant angular velocity.
         let ahead_s = camera.shown.seconds_since(vehicle.stamp).clamp(-MAX_DT_S, MAX_DT_S);
         let turned = DQuat::from_scaled_axis(vehicle.omega_body_radps * ahead_s);
         let world_from_body = (vehicle.attitude * turned).normalize();
@@ -197,7 +196,7 @@ impl Race {
         }
     }
 
-    /// Returns a velocity [m/s, home] and where to look [rad, home].
+    /// Returns a velocity [m/s, home] and the direction of the nose [rad, home].
     fn choose(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
         let behind_m =
             |kind| self.known.obstacle(kind).map(|obstacle| obstacle.plane.behind_m(here.p_m));
@@ -216,7 +215,7 @@ impl Race {
         };
         self.searching_s = None;
         let Some(opening) = obstacle.opening else {
-            // Go where its middle can be seen from.
+            // Fly to a place from which the middle of the obstacle is visible.
             let middle_m = obstacle.plane.point_m(DVec2::new(0.0, VIEW_HEIGHT_M));
             let to_m = middle_m - obstacle.plane.normal() * VIEW_M - here.p_m;
             let look_rad = (middle_m - here.p_m).truncate().to_angle();
@@ -245,7 +244,7 @@ impl Race {
         (steer::through(&aim, &obstacle.plane, held && self.committed_s.is_none()), look_rad)
     }
 
-    /// Returns where the obstacle after this one is seen. [rad, home]
+    /// Returns the direction of the obstacle after this one. [rad, home]
     fn beyond_rad(&self, here: &Here, obstacle: &PlanarObstacle) -> Option<f64> {
         let next = self.known.next(here.p_m, Some(obstacle.kind))?;
         let middle_m = next.opening.map_or(next.plane.origin_m, |opening| opening.center_m);
@@ -253,7 +252,7 @@ impl Race {
         Some(look_rad.clamp(-MAX_LOOK_RAD, MAX_LOOK_RAD))
     }
 
-    /// Looks about for something to fly through.
+    /// Turns left and right to find an obstacle.
     fn search(&mut self, now_s: f64, here: &Here) -> (DVec3, f64) {
         let since_s = now_s - *self.searching_s.get_or_insert(now_s);
         let last =
@@ -266,41 +265,40 @@ impl Race {
     }
 }
 
-/// So many images without any depth, and there is none: a second of them. A camera that is covered
-/// shows none for a while.
+/// Maximum number of images without depth: 1 s. A covered camera has none for a while.
 const PATIENCE: u32 = 30;
-/// Images farther apart than this are a gap, not a step. [s]
+/// Maximum time step; a longer one counts as a gap between images. [s]
 const MAX_DT_S: f64 = 0.1;
-/// Ahead and sideways together. [m/s]
+/// Maximum speed in all directions. [m/s]
 const MAX_MPS: f64 = 1.3;
-/// Tilts the camera by atan(3.5 / 9.81) = 20 degrees. [m/s^2]
+/// Maximum rate of change of the setpoint. Tilts the camera by atan(3.5 / 9.81) = 20 degrees. [m/s^2]
 const SLEW_MPS2: f64 = 3.5;
-/// The setpoint leads the velocity by slew times lag, 0.9 m/s; a little more is allowed. [m/s]
+/// Maximum difference of setpoint and velocity: slew times lag is 0.9 m/s, plus a reserve. [m/s]
 const MAX_LEAD_MPS: f64 = 1.2;
-/// From here on, this near to the line, the passage has begun. [m]
+/// Within this distance to plane and line, the passage begins. [m]
 const COMMIT_M: f64 = 0.35;
 const COMMIT_OFF_M: f64 = 0.15;
-/// A passage that takes longer has failed, and is begun again: a metre takes 1.4 s. [s]
+/// A passage that takes longer has failed and starts again: a metre takes 1.4 s. [s]
 const THROUGH_S: f64 = 4.0;
-/// What is free must be as wide as the vehicle with half of it again on each side. [m]
+/// Minimum radius of an opening: the vehicle with half of its width on each side. [m]
 const WIDE_ENOUGH_M: f64 = 0.27;
-/// Nearer than this, the opening fills the image: look for the next. [m]
+/// Nearer than this, the opening fills the image, so look at the next obstacle. [m]
 const LOOK_M: f64 = 0.45;
 const MAX_LOOK_RAD: f64 = 1.0;
-/// A look to both sides and back. [s]
+/// Period of a look to both sides. [s]
 const SEARCH_S: f64 = 6.0;
 const GOAL_PER_S: f64 = 1.0;
-/// Where an opening that is not seen yet is looked for from: the image is 1.8 m high there. [m]
+/// Distance from which an unseen opening is observed: the image is 1.8 m high there. [m]
 const VIEW_M: f64 = 1.2;
 const VIEW_HEIGHT_M: f64 = 1.4;
 const VIEW_MPS: f64 = 0.5;
-/// From a decision to the speed asked for. [s]
+/// Delay from a decision to the requested speed. [s]
 const START_LAG_S: f64 = 0.35;
-/// Before and after the reckoned moment the hand must be away too: the vehicle is half a metre
-/// long with what it may be early and late by. [s]
+/// The hand must be away for this time before and after the predicted passage: it covers the vehicle's length of 0.5 m
+/// and the error in time. [s]
 const EARLY_S: f64 = 0.35;
 const LATE_S: f64 = 0.75;
-/// The vehicle's radius and the error of its way. [m]
+/// Radius of the vehicle plus the error of its path. [m]
 const HAND_ROOM_M: f64 = 0.2;
 
 #[cfg(test)]

@@ -1,13 +1,12 @@
-//! Where the camera is, from depth alone: each image is registered to a key image.
+//! Estimates the camera's position from depth: each image is registered to a key image.
 //!
-//! The attitude is known but for a fraction of a degree, so there is the place to find and a small
-//! turn. Each sample of the new image is looked up in
-//! the key image where it falls. Its distance to the surface there, along that surface's normal, is
-//! made small (point to plane: Y. Chen and G. Medioni, "Object modelling by registration of multiple
-//! range images", Image and Vision Computing 10(3), 1992), and so is the difference in brightness,
-//! which measures how a flat wall slides (F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual
-//! odometry from dense RGB-D images", ICCV Workshops, 2011). Where the image carries no information on a
-//! direction, the vehicle's own velocity does. The floor gives the height without drift.
+//! The attitude is known except for a fraction of a degree, so the unknowns are the position and a small rotation. Each
+//! sample of the new image is projected into the key image. The registration minimizes its distance to the surface
+//! there, along that surface's normal (point to plane: Y. Chen and G. Medioni, "Object modelling by registration of
+//! multiple range images", Image and Vision Computing 10(3), 1992). It also minimizes the difference in brightness,
+//! which measures motion along a flat wall (F. Steinbrücker, J. Sturm and D. Cremers, "Real-time visual odometry from
+//! dense RGB-D images", ICCV Workshops, 2011). In directions without information in the image, it uses the vehicle's
+//! velocity. The floor gives the height without drift.
 
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 
@@ -16,17 +15,17 @@ use crate::sampling::{PixelGrid, Sample, SampleCamera};
 /// Position and velocity of the camera.
 #[derive(Clone, Debug, Default)]
 pub struct Odometry {
-    /// Of the camera. [m, home]
+    /// Position of the camera. [m, home]
     pub p_m: DVec3,
-    /// Of the camera. [m/s, home]
+    /// Velocity of the camera. [m/s, home]
     pub v_mps: DVec3,
-    /// Turn that the attitude is off by, as the images have it. [rad, home axes]
+    /// Estimated error of the attitude. [rad, home axes]
     turn_rad: DVec3,
     last_s: Option<f64>,
     key: Option<Key>,
 }
 
-/// The image that later ones are registered to: every second sample of its grid.
+/// Reference image for the registration: every second sample of its grid.
 #[derive(Clone, Debug)]
 struct Key {
     camera: SampleCamera,
@@ -34,31 +33,31 @@ struct Key {
     columns: usize,
     rows: usize,
     cells: Vec<Cell>,
-    /// How many cells have a surface.
+    /// Number of cells with a surface.
     surfaces: usize,
 }
 
 /// A cell of the key image.
 #[derive(Clone, Copy, Debug, Default)]
 struct Cell {
-    /// From the key's camera. [m, home axes]
+    /// Vector from the key's camera. [m, home axes]
     offset_m: DVec3,
     normal: Option<DVec3>,
     grey: f64,
-    /// Of brightness, from cell to cell.
+    /// Gradient of the brightness, per cell.
     slope: DVec2,
 }
 
-/// The result of aligning an image with the key image.
+/// Result of registering an image to the key image.
 #[derive(Clone, Copy, Debug)]
 struct Alignment {
     p_m: DVec3,
     turn_rad: DVec3,
-    /// Share of the image's samples that met the key.
+    /// Fraction of the samples with a match in the key image.
     overlap: f64,
 }
 
-/// Sums of weighted squares over three numbers of place and three of turn.
+/// Normal equations for three numbers of position and three of rotation.
 #[derive(Clone, Copy, Debug, Default)]
 struct NormalEquations {
     matrix: [[f64; 6]; 6],
@@ -82,7 +81,7 @@ impl NormalEquations {
         self.add(&[slope.x, slope.y, slope.z, lever.x, lever.y, lever.z], residual, weight);
     }
 
-    /// Solves by Cholesky's L L^T; `None` if that has no finite answer.
+    /// Solves by Cholesky's L L^T; `None` if the result is not finite.
     fn solve(&self) -> Option<[f64; 6]> {
         let mut l = [[0.0; 6]; 6];
         for row in 0..6 {
@@ -107,8 +106,8 @@ impl NormalEquations {
 }
 
 impl Odometry {
-    /// Takes the image of time `now_s` on any steady clock, and turns it by what the attitude is
-    /// found to be off. Without depth the vehicle is taken to go on as it went.
+    /// Processes the image of time `now_s` on any steady clock, and rotates it by the estimated error of the attitude.
+    /// Without depth, the velocity is assumed to be constant.
     pub fn update(&mut self, now_s: f64, grid: &mut PixelGrid) {
         let Some(camera) = grid.camera else { return };
         let dt_s = self.last_s.map_or(0.0, |last_s| now_s - last_s).clamp(0.0, MAX_DT_S);
@@ -175,13 +174,13 @@ impl Key {
         }
     }
 
-    /// Returns where a camera with this grid is, near `expected_m`. [m, home]
+    /// Returns the position of a camera with this grid, near `expected_m`. [m, home]
     fn locate(&self, expected_m: DVec3, grid: &PixelGrid) -> Alignment {
         let (mut p_m, mut turn_rad, mut overlap) = (expected_m, DVec3::ZERO, 0.0);
         for round in 0..ROUNDS {
             let gate_m = GATE_M / f64::from(1 << round.min(2));
             let turn = DQuat::from_scaled_axis(turn_rad);
-            // The vehicle's motion and its attitude, as weak measurements.
+            // Priors: the predicted position and the attitude, with a low weight.
             let mut sums = NormalEquations::default();
             for axis in 0..3 {
                 let (mut place, mut angle) = ([0.0; 6], [0.0; 6]);
@@ -235,8 +234,7 @@ impl Key {
         Alignment { p_m, turn_rad, overlap }
     }
 
-    /// Returns the cell that a point [m, home axes, from the key's camera] is seen in, and where in
-    /// it, from its middle.
+    /// Returns the cell of a point [m, home axes, from the key's camera], and the offset from the cell's middle.
     fn cell_at(&self, from_key_m: DVec3) -> Option<(&Cell, DVec2)> {
         let at = self.camera.sample_at(from_key_m)?;
         let (column, row) = (at.x as usize, at.y as usize);
@@ -248,7 +246,7 @@ impl Key {
     }
 }
 
-/// Returns the sample in the middle of a cell of two by two.
+/// Returns the sample in the middle of a cell of two by two samples.
 fn sample_of(grid: &PixelGrid, column: usize, row: usize) -> Sample {
     grid.at(SKIP * column + 1, SKIP * row + 1).copied().unwrap_or_default()
 }
@@ -260,14 +258,13 @@ fn grey_of(grid: &PixelGrid, column: usize, row: usize) -> f64 {
     0.25 * f64::from(upper[0].grey + upper[1].grey + lower[0].grey + lower[1].grey)
 }
 
-/// Returns the weight of a residual, in deviations: beyond two of them it counts by its sign only
-/// (P. Huber, Ann. Math. Statist. 35(1), 1964). Neighbours err alike.
+/// Returns the weight of a residual, in standard deviations. Beyond two of them, only its sign counts (P. Huber, Ann.
+/// Math. Statist. 35(1), 1964). Errors of neighbours are correlated.
 fn huber(deviations: f64) -> f64 {
     1.0 / ((deviations.abs() / 2.0).max(1.0) * CORRELATED)
 }
 
-/// Returns the normal of the surface at a sample from its neighbours; `None` at an edge of
-/// something.
+/// Returns the normal of the surface at a sample from its neighbours; `None` at an edge.
 fn normal(grid: &PixelGrid, column: usize, row: usize) -> Option<DVec3> {
     let seen = |column: usize, row: usize| {
         grid.at(column, row).filter(|sample| sample.is_seen()).map(|sample| sample.offset_m)
@@ -281,11 +278,11 @@ fn normal(grid: &PixelGrid, column: usize, row: usize) -> Option<DVec3> {
         return None;
     }
     let normal = (right_m - left_m).cross(down_m - up_m).try_normalize()?;
-    // Seen at less than 6 degrees, a surface's place is unsure.
+    // At an angle below 6 degrees, the depth of a surface is unreliable.
     (normal.dot(p_m).abs() > 0.1 * range_m).then_some(normal)
 }
 
-/// Returns how high the camera is above the largest level surface below it. [m]
+/// Returns the height of the camera above the largest level surface below it. [m]
 fn height_over_floor_m(grid: &PixelGrid) -> Option<f64> {
     let mut bins = [0_u32; 200];
     for sample in grid.samples.iter().filter(|sample| sample.is_seen()) {
@@ -305,7 +302,7 @@ fn height_over_floor_m(grid: &PixelGrid) -> Option<f64> {
     (*count as usize > FLOOR_SAMPLES).then(|| all.iter().sum::<f64>() / all.len() as f64)
 }
 
-/// Returns how far the floor seems to lie above zero, or 0 if too little of it is seen. [m]
+/// Returns the apparent height of the floor, or 0 if too little of the floor is visible. [m]
 fn floor_error_m(grid: &PixelGrid, camera_z_m: f64) -> f64 {
     let (mut sum_m, mut count) = (0.0, 0);
     for sample in grid.samples.iter().filter(|sample| sample.is_seen()) {
@@ -320,37 +317,36 @@ fn floor_error_m(grid: &PixelGrid, camera_z_m: f64) -> f64 {
 
 /// Every second sample of the grid, so every fourth pixel: 80 x 60.
 const SKIP: usize = 2;
-/// Gauss-Newton needs three rounds from 5 cm away.
+/// Gauss-Newton needs three rounds for an error of 5 cm.
 const ROUNDS: u32 = 6;
-/// Residuals beyond are of something else, or of something that moves. [m]
+/// Larger residuals belong to other or moving objects. [m]
 const GATE_M: f64 = 0.2;
-/// Deviation of a splat's depth, near and per metre of range. [m]
+/// Standard deviation of a splat's depth: constant part, and part per metre of range. [m]
 const SIGMA_M: f64 = 0.006;
 const SIGMA_RATIO: f64 = 0.006;
-/// Deviation of brightness, and what is another thing.
+/// Standard deviation of brightness, and limit for outliers.
 const GREY: f64 = 0.03;
 const GREY_GATE: f64 = 0.2;
-/// Neighbouring samples err alike: so many count as one.
+/// Correlation of neighbouring samples: this number of samples counts as one.
 const CORRELATED: f64 = 20.0;
-/// By how much the vehicle may depart from steady motion between two images. [m]
+/// Standard deviation of the predicted position between two images. [m]
 const MOTION_M: f64 = 0.03;
-/// By how much the attitude's error may change between two images. [rad]
+/// Standard deviation of the change of the attitude's error between two images. [rad]
 const ATTITUDE_RAD: f64 = 0.002;
-/// Share of the found error that is kept from image to image: in the long run the attitude is right.
+/// Fraction of the estimated error that is kept from image to image, because the attitude is right on average.
 const STEADY: f64 = 0.995;
 const MAX_TURN_RAD: f64 = 0.05;
 const MAX_DT_S: f64 = 0.2;
-/// Of the velocity's smoothing. [s]
+/// Time constant of the velocity filter. [s]
 const VELOCITY_LAG_S: f64 = 0.08;
 const MAX_SPEED_MPS: f64 = 6.0;
-/// With less in common than this, after a turn of 14 degrees, or half a metre on, the image
-/// becomes the next key.
+/// The image becomes the next key if the overlap is smaller than this, after a turn of 14 degrees, or after 0.5 m.
 const OVERLAP: f64 = 0.55;
 const TURN_RAD: f64 = 0.25;
 const REACH_M: f64 = 0.5;
 const BIN_M: f64 = 0.02;
 const FLOOR_SAMPLES: usize = 150;
-/// Share of the floor's error that one image corrects.
+/// Fraction of the floor's error that one image corrects.
 const FLOOR_TRUST: f64 = 0.3;
 
 #[cfg(test)]

@@ -1,9 +1,8 @@
-//! Something upright with an opening in it, a window's frame or a wall, as a grid of what is solid
-//! and what is free.
+//! A vertical obstacle with an opening, a window's frame or a wall, as a grid of solid and free cells.
 //!
-//! Each image shows of each cell: a surface lies here, or the camera looked through. Where cells
-//! are free and the frame is around them, there is an opening; one flies through the place that is
-//! farthest from everything solid, so an unknown shape is as good as a square.
+//! Each image shows for each cell either a surface or free space behind the cell. Free cells with the frame around them
+//! are an opening. The vehicle flies through the point with the largest distance from everything solid, so an unknown
+//! shape works as well as a square.
 
 use std::ops::Range;
 
@@ -12,7 +11,7 @@ use vizflyt_sdk::glam::{DVec2, DVec3};
 use crate::color_class::ColorClass;
 use crate::sampling::{PixelGrid, Sample};
 
-/// What an obstacle is.
+/// Kind of an obstacle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ObstacleKind {
     /// A frame of bars of this colour.
@@ -22,7 +21,7 @@ pub enum ObstacleKind {
 }
 
 impl ObstacleKind {
-    /// Returns what to call it.
+    /// Returns a name for messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Window(ColorClass::Red) => "the red window",
@@ -35,12 +34,12 @@ impl ObstacleKind {
     }
 }
 
-/// An upright plane.
+/// A vertical plane.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plane {
-    /// A point of it; its z is not used. [m, home]
+    /// Point of the plane; its z is not used. [m, home]
     pub origin_m: DVec3,
-    /// Which way it is passed: angle of its normal from home x. [rad]
+    /// Direction of passage: angle of the normal from home x. [rad]
     pub yaw_rad: f64,
 }
 
@@ -50,43 +49,43 @@ impl Plane {
         DVec2::from_angle(self.yaw_rad).extend(0.0)
     }
 
-    /// Returns the level direction in it, to the left of who passes. [home]
+    /// Returns the horizontal direction in the plane, to the left in the direction of passage. [home]
     pub fn left(&self) -> DVec3 {
         DVec3::Z.cross(self.normal())
     }
 
-    /// Returns how far behind it a point lies; negative is before it. [m]
+    /// Returns the distance of a point behind the plane; negative in front of it. [m]
     pub fn behind_m(&self, p_m: DVec3) -> f64 {
         self.normal().dot(p_m - self.origin_m)
     }
 
-    /// Returns a point's place in it: to the left of the origin, and up from the floor. [m]
+    /// Returns the coordinates of a point in the plane: left of the origin, and up from the floor. [m]
     pub fn within_m(&self, p_m: DVec3) -> DVec2 {
         DVec2::new(self.left().dot(p_m - self.origin_m), p_m.z)
     }
 
-    /// Returns the point of a place in it. [m, home]
+    /// Returns the point with these coordinates in the plane. [m, home]
     pub fn point_m(&self, within_m: DVec2) -> DVec3 {
         self.origin_m.with_z(within_m.y) + self.left() * within_m.x
     }
 }
 
-/// What is known of one cell.
+/// State of one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cell {
-    /// Looked through (negative) or met (positive), newest counting most.
+    /// Seen through (negative) or surface (positive); recent images count most.
     evidence: i8,
-    /// How often a surface was met here that is a bar by its colour.
+    /// Number of surface samples with the colour of the window's bars.
     colored: u8,
 }
 
 impl Cell {
-    /// Whether something is here now.
+    /// Returns whether the cell is solid.
     pub fn is_solid(self) -> bool {
         self.evidence >= SURE
     }
 
-    /// Whether nothing is here.
+    /// Returns whether the cell is free.
     pub fn is_open(self) -> bool {
         self.evidence <= -SURE
     }
@@ -108,31 +107,31 @@ impl Cell {
 /// A place to fly through.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Opening {
-    /// Where to pass. [m, home]
+    /// Point to pass. [m, home]
     pub center_m: DVec3,
-    /// Radius of what is free around it. [m]
+    /// Radius of free space around it. [m]
     pub radius_m: f64,
 }
 
-/// An obstacle and what has been seen of it.
+/// An obstacle and its observed cells.
 #[derive(Clone, Debug)]
 pub struct PlanarObstacle {
-    /// What it is.
+    /// Kind of the obstacle.
     pub kind: ObstacleKind,
-    /// Where it is.
+    /// Plane of the obstacle.
     pub plane: Plane,
-    /// From how near the plane was measured. [m]
+    /// Range from which the plane was measured. [m]
     pub range_m: f64,
-    /// The best place to pass, if there is any yet.
+    /// Best place to pass, if one is known.
     pub opening: Option<Opening>,
-    /// When it was made or last seen, on the clock of [`Self::update`]. [s]
+    /// Time of creation or of the last observation, on the clock of [`Self::update`]. [s]
     pub seen_s: f64,
     cells: Vec<Cell>,
     room_m: Vec<f32>,
 }
 
 impl PlanarObstacle {
-    /// Makes an obstacle of which nothing is seen yet.
+    /// Creates an obstacle without observations.
     pub fn new(kind: ObstacleKind, plane: Plane, range_m: f64, now_s: f64) -> Self {
         let cells = vec![Cell::default(); COLUMNS * ROWS];
         Self {
@@ -146,7 +145,7 @@ impl PlanarObstacle {
         }
     }
 
-    /// Moves the plane to where a nearer look shows it; what was seen starts again if it moved.
+    /// Moves the plane to a measurement from a shorter range. If the plane moves, the cells are cleared.
     pub fn settle(&mut self, plane: Plane, range_m: f64) {
         let moved_m = self.plane.behind_m(plane.origin_m).abs();
         let turned_rad = (self.plane.yaw_rad - plane.yaw_rad).abs();
@@ -155,7 +154,7 @@ impl PlanarObstacle {
             && (moved_m > 0.03 || turned_rad > 0.04)
         {
             self.plane = Plane {
-                // The old place along the plane stays, so that the grid covers the same.
+                // Keep the position along the plane, so that the grid covers the same area.
                 origin_m: self.plane.origin_m
                     + plane.normal() * plane.behind_m(self.plane.origin_m) * -1.0,
                 yaw_rad: plane.yaw_rad,
@@ -165,7 +164,7 @@ impl PlanarObstacle {
         }
     }
 
-    /// Takes an image seen from `camera_m` [m, home].
+    /// Processes an image seen from `camera_m` [m, home].
     pub fn update(&mut self, now_s: f64, camera_m: DVec3, grid: &PixelGrid) {
         let before_m = -self.plane.behind_m(camera_m);
         if before_m < TOO_NEAR_M {
@@ -173,7 +172,7 @@ impl PlanarObstacle {
         }
         let (normal, left) = (self.plane.normal(), self.plane.left());
         let own_left_m = left.dot(camera_m - self.plane.origin_m);
-        // Moving samples carry no information on what stands still.
+        // Ignore the hand: moving samples carry no information on static cells.
         let still = |sample: &&Sample| sample.is_seen() && sample.color != Some(ColorClass::Teal);
         for sample in grid.samples.iter().filter(still) {
             let depth_m = normal.dot(sample.offset_m);
@@ -185,7 +184,7 @@ impl PlanarObstacle {
             if !met && deeper_m < THROUGH_M {
                 continue;
             }
-            // Where the ray meets the plane; of a surface beside it, where the surface is.
+            // Intersection of the ray with the plane; for a surface near the plane, the surface itself.
             let share = if met { 1.0 } else { before_m / depth_m };
             let across_m = own_left_m + left.dot(sample.offset_m) * share;
             let up_m = camera_m.z + sample.offset_m.z * share;
@@ -204,12 +203,12 @@ impl PlanarObstacle {
         }
     }
 
-    /// Returns the cell at a place in the plane.
+    /// Returns the cell at a point of the plane.
     pub fn cell(&self, within_m: DVec2) -> Option<Cell> {
         index_of(within_m).map(|at| self.cells[at])
     }
 
-    /// Returns the nearest solid place within `reach_m` of a point. [m, home]
+    /// Returns the nearest solid point within `reach_m` of a point. [m, home]
     pub fn nearest_solid_m(&self, p_m: DVec3, reach_m: f64) -> Option<DVec3> {
         let behind_m = self.plane.behind_m(p_m);
         if behind_m.abs() > reach_m {
@@ -234,7 +233,7 @@ impl PlanarObstacle {
             .map(|(_, at_m)| self.plane.point_m(at_m))
     }
 
-    /// Returns where an image seen from `camera_m` [m, home] shows a hand. [m, plane]
+    /// Returns the hand's points in an image seen from `camera_m` [m, home]. [m, plane]
     pub fn hand_m(&self, camera_m: DVec3, grid: &PixelGrid) -> Vec<DVec2> {
         let teal = |sample: &&Sample| sample.color == Some(ColorClass::Teal) && sample.is_seen();
         let points_m = grid.samples.iter().filter(teal).map(|sample| camera_m + sample.offset_m);
@@ -246,7 +245,7 @@ impl PlanarObstacle {
 
     fn find_opening(&mut self) {
         self.measure_room();
-        // The roomiest place that the frame is around.
+        // The framed cell with the largest distance to everything solid.
         let mut best: Option<(f32, usize)> = None;
         for row in 0..ROWS {
             for column in 0..COLUMNS {
@@ -261,14 +260,14 @@ impl PlanarObstacle {
             }
         }
         let Some((room_m, at)) = best else {
-            // What was open stays so, seen or not, until something is there.
+            // Keep the last opening, visible or not, until its cell is solid.
             let is_solid = |opening: &Opening| {
                 self.cell(self.plane.within_m(opening.center_m)).is_some_and(Cell::is_solid)
             };
             self.opening = self.opening.filter(|opening| !is_solid(opening));
             return;
         };
-        // The middle of all that is nearly as roomy: a longish opening has a line of best places.
+        // The mean of all cells that are nearly as good, because a long opening has a line of best cells.
         let top = place_of(at % COLUMNS, at / COLUMNS);
         let (mut sum_m, mut count) = (DVec2::ZERO, 0.0);
         for (near, &near_room_m) in self.room_m.iter().enumerate() {
@@ -282,8 +281,8 @@ impl PlanarObstacle {
         self.opening = Some(Opening { center_m, radius_m: f64::from(room_m) });
     }
 
-    /// Fills `room_m` with the distance from each open cell to the nearest that is not, by two
-    /// sweeps over the neighbours (chamfer distance: at most 4 % too small).
+    /// Fills `room_m` with the distance from each free cell to the nearest cell that is not free, by two sweeps over
+    /// the neighbours (chamfer distance: at most 4 % too small).
     fn measure_room(&mut self) {
         let (straight, diagonal) = (CELL_M as f32 * 0.96, CELL_M as f32 * 1.36);
         for (room_m, cell) in self.room_m.iter_mut().zip(&self.cells) {
@@ -332,8 +331,8 @@ impl PlanarObstacle {
         }
     }
 
-    /// Whether the frame is around a cell: something solid to both sides and above or below, which
-    /// in a window has its colour. Between a window's legs there is none.
+    /// Returns whether the frame surrounds a cell: solid cells on both sides and above or below, in a window with its
+    /// colour. The space between a window's legs is not framed.
     fn is_framed(&self, column: usize, row: usize) -> bool {
         let look = |along: &mut dyn Iterator<Item = usize>| self.is_met(along);
         let sides = look(&mut (0..column).rev().map(|c| row * COLUMNS + c))
@@ -349,7 +348,7 @@ impl PlanarObstacle {
         }
     }
 
-    /// Whether the way along cells leads to the frame.
+    /// Returns whether a line of cells meets the frame.
     fn is_met(&self, along: &mut dyn Iterator<Item = usize>) -> bool {
         let along = along.take(REACH).skip_while(|&at| !self.cells[at].is_solid());
         match self.kind {
@@ -377,35 +376,35 @@ fn span(at: f64, reach_m: f64, count: usize) -> Range<usize> {
     low..((at + reach).max(0.0) as usize).min(count)
 }
 
-/// Side of a cell: a quarter of a bar. [m]
+/// Side of a cell: a quarter of a bar's width. [m]
 pub const CELL_M: f64 = 0.04;
 const COLUMNS: usize = 120;
 const ROWS: usize = 84;
-/// Half the grid's width: all of the net's 4.5 m. [m]
+/// Half of the grid's width: all of the net's 4.5 m. [m]
 const HALF_M: f64 = 0.5 * CELL_M * COLUMNS as f64;
-/// Half of what counts as the plane: half a bar's thickness and the odometry's error. [m]
+/// Maximum distance of a surface from the plane: half of a bar's thickness plus the odometry's error. [m]
 const THICK_M: f64 = 0.1;
-/// A ray that ends this far behind has come through: more than a wall's thickness and the
-/// blur of its edge. [m]
+/// A ray that ends this far behind the plane has passed through it: more than a wall's thickness and the blur of its
+/// edge. [m]
 const THROUGH_M: f64 = 0.25;
-/// Nearer than this the rays graze the bars. [m]
+/// At a smaller distance, the rays graze the bars. [m]
 const TOO_NEAR_M: f64 = 0.25;
-/// Looks that make a cell sure, and the most that count.
+/// Evidence that makes a cell solid or free, and its limit.
 const SURE: i8 = 2;
 const MAX_EVIDENCE: i8 = 5;
-/// The hand turns this near to its window's plane, before it. [m]
+/// Maximum distance of the hand from its window's plane. [m]
 const HAND_M: f64 = 0.25;
-/// Nearer than this the frame is not in the image any more. [m]
+/// At a smaller distance, the frame is outside the image. [m]
 const SETTLE_FROM_M: f64 = 0.9;
-/// From here on the opening is known. [m]
+/// At a smaller distance, the opening is not recomputed. [m]
 const KNOWN_M: f64 = 0.6;
-/// A plane measured from this share of the range is the better one.
+/// A new plane must be measured from at most this fraction of the previous range.
 const SETTLE_SHARE: f64 = 0.8;
-/// The vehicle's radius and a hand's breadth. [m]
+/// Radius of the vehicle plus a margin. [m]
 const MIN_M: f32 = 0.2;
-/// The frame is at most this far from the middle: 1.6 m.
+/// Maximum distance from the middle to the frame: 1.6 m. [cells]
 const REACH: usize = 40;
-/// Cells of a bar's width, and one more.
+/// Width of a bar plus one cell. [cells]
 const BAR: usize = 5;
 
 #[cfg(test)]

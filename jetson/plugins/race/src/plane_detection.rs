@@ -1,4 +1,4 @@
-//! Finds upright planes in an image: bars by their colour, walls by their size.
+//! Detects vertical planes in an image: bars by their colour, walls by their size.
 
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
@@ -6,18 +6,18 @@ use crate::color_class::ColorClass;
 use crate::planar_obstacle::Plane;
 use crate::sampling::PixelGrid;
 
-/// A plane found in one image.
+/// A plane detected in one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DetectedPlane {
-    /// Where.
+    /// Vertical plane.
     pub plane: Plane,
-    /// From the camera to the middle of what was seen of it. [m]
+    /// Distance from the camera to the middle of its visible points. [m]
     pub range_m: f64,
-    /// Whether the whole width of a frame is seen, with nothing in its middle.
+    /// Whether the complete width of a frame is visible, with an empty middle.
     pub framed: bool,
 }
 
-/// Returns the nearest upright plane with enough of a colour. `camera_m` [m, home].
+/// Returns the nearest vertical plane with enough points of a colour. `camera_m` [m, home].
 pub fn window(grid: &PixelGrid, camera_m: DVec3, color: ColorClass) -> Option<DetectedPlane> {
     let mut points_m: Vec<DVec3> = grid
         .samples
@@ -28,7 +28,7 @@ pub fn window(grid: &PixelGrid, camera_m: DVec3, color: ColorClass) -> Option<De
         .filter(|p_m| p_m.z > LOWEST_M)
         .collect();
     let mut nearest: Option<DetectedPlane> = None;
-    // The colour may be seen on something else too, farther away: graffiti, mats.
+    // Other objects further away may have the same colour: graffiti, mats.
     for _ in 0..3 {
         let Some(line) = upright_line(&points_m) else { break };
         let (on, off): (Vec<DVec3>, Vec<DVec3>) =
@@ -42,7 +42,7 @@ pub fn window(grid: &PixelGrid, camera_m: DVec3, color: ColorClass) -> Option<De
     nearest
 }
 
-/// Returns the plane of a colour near where it is known to be.
+/// Returns the plane of a colour near its known plane.
 pub fn again(
     grid: &PixelGrid,
     camera_m: DVec3,
@@ -61,7 +61,7 @@ pub fn again(
     Some(describe(line, &points_m, camera_m)).filter(|found| found.framed)
 }
 
-/// Returns the nearest large wall across the way.
+/// Returns the nearest large wall across the flight direction.
 pub fn wall(grid: &PixelGrid, camera_m: DVec3) -> Option<DetectedPlane> {
     let mut areas_m2 = [0.0_f64; BINS];
     let camera = grid.camera?;
@@ -104,7 +104,7 @@ fn describe(plane: Plane, points_m: &[DVec3], camera_m: DVec3) -> DetectedPlane 
         off.x < 0.25 * size.x && off.y < 0.2 * size.y
     };
     let inner = points_m.iter().filter(within).count();
-    // A full plane would have a fifth of its points there.
+    // A full plane would have 20 % of its points in the middle.
     let hollow = inner * 20 < points_m.len();
     let wide = (0.8..2.2).contains(&size.x) && (0.45..2.2).contains(&size.y);
     let origin_m = plane.point_m(DVec2::new(middle.x, 0.0)).with_z(0.0);
@@ -115,21 +115,21 @@ fn describe(plane: Plane, points_m: &[DVec3], camera_m: DVec3) -> DetectedPlane 
     }
 }
 
-/// Returns the upright plane across the way with most points on it: tries lines through pairs of
-/// points seen from above (RANSAC: M. Fischler and R. Bolles, Comm. ACM 24(6), 1981), then fits.
+/// Returns the vertical plane across the flight direction with the most points: tries lines through pairs of points in
+/// the horizontal plane (RANSAC: M. Fischler and R. Bolles, Comm. ACM 24(6), 1981), then fits.
 fn upright_line(points_m: &[DVec3]) -> Option<Plane> {
     if points_m.len() < FEWEST {
         return None;
     }
     let mut state = 0x9e37_79b9_u32;
     let mut pick = || {
-        // xorshift32: the same tries for the same image.
+        // xorshift32: the same pairs for the same image.
         state ^= state << 13;
         state ^= state >> 17;
         state ^= state << 5;
         points_m[state as usize % points_m.len()]
     };
-    // Every so manyth point decides as well as all.
+    // A subset of about 400 points is sufficient for the decision.
     let some = points_m.len().div_ceil(400);
     let mut best: Option<(usize, Plane)> = None;
     for _ in 0..TRIES {
@@ -151,7 +151,7 @@ fn upright_line(points_m: &[DVec3]) -> Option<Plane> {
     let on = || points_m.iter().filter(|p_m| plane.behind_m(**p_m).abs() < ON_LINE_M);
     let n = on().count() as f64;
     let mean_m = on().sum::<DVec3>() / n;
-    // The longer axis of the points' spread, seen from above.
+    // Longer axis of the points' spread in the horizontal plane.
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for p_m in on() {
         let d = *p_m - mean_m;
@@ -163,8 +163,8 @@ fn upright_line(points_m: &[DVec3]) -> Option<Plane> {
     plane_along(mean_m, DVec2::from_angle(along_rad) * 10.0)
 }
 
-/// Returns the upright plane through a point along a level direction; `None` if the direction is
-/// too short, or the plane does not lie across the way.
+/// Returns the vertical plane through a point along a horizontal direction; `None` if the direction is too short, or
+/// the plane is not across the flight direction.
 fn plane_along(a_m: DVec3, along_m: DVec2) -> Option<Plane> {
     if along_m.length() < SPREAD_M {
         return None;
@@ -175,23 +175,23 @@ fn plane_along(a_m: DVec3, along_m: DVec2) -> Option<Plane> {
     (yaw_rad.abs() < MAX_YAW_RAD).then_some(Plane { origin_m: a_m.with_z(0.0), yaw_rad })
 }
 
-/// Bars farther away are a few pixels only. [m]
+/// Bars further away have only a few pixels. [m]
 const FAR_M: f64 = 4.5;
-/// Nothing lower is a bar. [m, home]
+/// Points below are not bars. [m, home]
 const LOWEST_M: f64 = 0.15;
-/// Half the thickness of what counts as one plane. [m]
+/// Maximum distance of a point from its plane. [m]
 const ON_LINE_M: f64 = 0.06;
-/// Points that make a plane.
+/// Minimum number of points of a plane.
 const FEWEST: usize = 60;
 const TRIES: usize = 48;
-/// Two points nearer to each other carry no information on the direction. [m]
+/// Pairs of points nearer to each other carry no information on the direction. [m]
 const SPREAD_M: f64 = 0.4;
-/// Windows face the way within 20 degrees; twice that is another thing. [rad]
+/// Windows are within 20 degrees of the flight direction; planes beyond twice that are other objects. [rad]
 const MAX_YAW_RAD: f64 = 0.7;
-/// Walls are looked for this near: 5 m.
+/// Maximum range of walls: 5 m.
 const BINS: usize = 50;
 const BIN_M: f64 = 0.1;
-/// The wall's two thirds; no frame has as much. [m^2]
+/// Two thirds of a wall; a frame has less. [m^2]
 const WALL_M2: f64 = 3.0;
 
 #[cfg(test)]

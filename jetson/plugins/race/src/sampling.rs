@@ -1,7 +1,7 @@
-//! Image -> grid: what each second pixel sees, as a vector in home axes and as a colour class.
+//! Converts an image to a grid of samples: a vector in home axes and a colour class for each second pixel.
 //!
-//! 160 x 120 samples of a 320 x 240 image are enough: a bar of 0.16 m is three samples wide at
-//! 4 m. Vectors are from the camera; where the camera is, [`crate::odometry`] finds out.
+//! 160 x 120 samples of a 320 x 240 image are enough: a bar of 0.16 m is three samples wide at 4 m. Vectors begin at
+//! the camera; [`crate::odometry`] estimates the camera's position.
 
 use vizflyt_sdk::Intrinsics;
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
@@ -9,8 +9,8 @@ use vizflyt_sdk::protocol::geometry::Frame;
 
 use crate::color_class::ColorClass;
 
-/// The frame that the plugin finds its way in: x along the nose as it was at the first image,
-/// z up, origin on the floor below the place of that image.
+/// Frame of the plugin's map: x along the nose at the first image, z up, origin on the floor below that image's
+/// position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Home {}
 
@@ -18,73 +18,73 @@ impl Frame for Home {
     const NAME: &'static str = "home";
 }
 
-/// One RGB-D image and how the camera was turned.
+/// One RGB-D image and the rotation of its camera.
 #[derive(Clone, Copy, Debug)]
 pub struct RgbdView<'a> {
     /// Colour, H x W x 3, sRGB.
     pub rgb: &'a [u8],
-    /// Camera-z depth, H x W; 0 is no return. [mm, cam]
+    /// Camera-z depth, H x W; 0 means no return. [mm, cam]
     pub depth_mm: &'a [u16],
     /// Size, focal lengths, principal point. [px]
     pub intrinsics: Intrinsics,
-    /// Takes camera axes to home axes.
+    /// Rotates camera axes to home axes.
     pub home_from_cam: DQuat,
 }
 
-/// What one pixel sees.
+/// Sample of one pixel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sample {
-    /// From the camera to the surface; zero where nothing came back. [m, home axes]
+    /// Vector from the camera to the surface; zero without a return. [m, home axes]
     pub offset_m: DVec3,
-    /// Colour of a bar, if it is one.
+    /// Colour class, if the pixel belongs to a bar or the hand.
     pub color: Option<ColorClass>,
-    /// Brightness of the pixels about it, 0 to 1.
+    /// Mean brightness of the surrounding pixels, 0 to 1.
     pub grey: f32,
 }
 
 impl Sample {
-    /// Whether something came back.
+    /// Returns whether the sample has a return.
     pub fn is_seen(&self) -> bool {
         self.offset_m != DVec3::ZERO
     }
 }
 
-/// Samples of an image, row-major; reused from image to image.
+/// Samples of an image, row-major; reused for each image.
 #[derive(Clone, Debug, Default)]
 pub struct PixelGrid {
-    /// Samples of a row.
+    /// Samples per row.
     pub columns: usize,
-    /// Rows of samples.
+    /// Number of rows.
     pub rows: usize,
-    /// Row-major.
+    /// Samples, row-major.
     pub samples: Vec<Sample>,
-    /// The lens, in samples instead of pixels, and how the camera was turned.
+    /// Projection of the grid and rotation of the camera.
     pub camera: Option<SampleCamera>,
     slopes: Vec<DVec2>,
     slopes_of: Option<Intrinsics>,
 }
 
-/// The lens of a grid and the camera's attitude.
+/// Projection of a grid and rotation of the camera.
 #[derive(Clone, Copy, Debug)]
 pub struct SampleCamera {
-    /// Of the image. [px]
+    /// Intrinsics of the image. [px]
     pub intrinsics: Intrinsics,
     /// Pixels from sample to sample.
     pub stride: usize,
-    /// Takes camera axes to home axes.
+    /// Rotates camera axes to home axes.
     pub home_from_cam: DQuat,
 }
 
 impl SampleCamera {
-    /// Returns where in the grid, column and row, the image is of what a vector from the camera falls on [m, home axes].
+    /// Returns column and row in the grid for a vector from the camera. [m, home axes]
     pub fn sample_at(&self, offset_m: DVec3) -> Option<DVec2> {
         let pixel = self.intrinsics.project(self.home_from_cam.conjugate() * offset_m)?;
         let at = pixel / self.stride as f64;
         (at.x >= 0.0 && at.y >= 0.0).then_some(at)
     }
 
-    /// Returns by how much a step of the point at `offset_m` [m, home axes] moves its image in the
-    /// direction `across`. [samples/m, home axes]
+    /// Returns the gradient of the projected position in the direction `across`, for a point at `offset_m` [m, home
+    /// axes]. [samples/m, home axes]
     pub fn slope_along(&self, offset_m: DVec3, across: DVec2) -> DVec3 {
         let p = self.home_from_cam.conjugate() * offset_m;
         let (x, y) = (
@@ -96,7 +96,7 @@ impl SampleCamera {
 }
 
 impl PixelGrid {
-    /// Takes a new image; an image whose planes are shorter than its size is not looked at.
+    /// Processes a new image. An image with planes shorter than its size is ignored.
     pub fn update(&mut self, view: &RgbdView<'_>) {
         let k = view.intrinsics;
         let (width, height) = (k.width_px as usize, k.height_px as usize);
@@ -129,7 +129,7 @@ impl PixelGrid {
         }
     }
 
-    /// Turns what is seen about the camera. [home axes]
+    /// Rotates all samples about the camera. [home axes]
     pub fn turn(&mut self, turn: DQuat) {
         for sample in &mut self.samples {
             sample.offset_m = turn * sample.offset_m;
@@ -144,7 +144,7 @@ impl PixelGrid {
         if column >= self.columns { None } else { self.samples.get(row * self.columns + column) }
     }
 
-    /// Slopes of the samples' rays; the same until the camera changes.
+    /// Computes the slopes of the samples' rays, once per camera.
     fn lay_out(&mut self, k: Intrinsics, stride: usize) {
         if self.slopes_of == Some(k) {
             return;
@@ -153,7 +153,7 @@ impl PixelGrid {
         for row in 0..self.rows {
             for column in 0..self.columns {
                 let pixel = DVec2::new((column * stride) as f64, (row * stride) as f64) + 0.5;
-                // Beyond the lens's reach: no way there, so nothing is seen there.
+                // Outside the range of the lens model, a sample has no return.
                 self.slopes.push(k.slope(pixel).unwrap_or(DVec2::ZERO));
             }
         }
@@ -171,5 +171,5 @@ fn grey_of(rgb: &[u8], width: usize, left: usize, top: usize, side: usize) -> f3
     sum as f32 / (3 * side * side * 255) as f32
 }
 
-/// Samples of a row, about: every second pixel of 320.
+/// Approximate number of samples per row: every second pixel of 320.
 const COLUMNS: usize = 160;

@@ -1,20 +1,20 @@
-//! The way through one opening: a funnel before it, straight through, clear of what is near.
+//! Steers through one opening: a funnel in front of it, straight through, clear of near surfaces.
 
 use vizflyt_sdk::glam::DVec3;
 
 use crate::planar_obstacle::{Opening, PlanarObstacle, Plane};
 
-/// How far it is to an obstacle and how far off the line through its opening.
+/// Distance to an obstacle's plane, and offset from the line through its opening.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aim {
-    /// Before the plane; negative is behind it. [m]
+    /// Distance in front of the plane; negative behind it. [m]
     pub before_m: f64,
-    /// From the vehicle to the line through the opening along the passage. [m, home]
+    /// Vector from the vehicle to the line through the opening along the direction of passage. [m, home]
     pub off_m: DVec3,
 }
 
 impl Aim {
-    /// Returns the aim from a place [m, home].
+    /// Returns the aim from a position [m, home].
     pub fn from(p_m: DVec3, plane: &Plane, opening: &Opening) -> Self {
         let to_m = opening.center_m - p_m;
         let before_m = plane.normal().dot(to_m);
@@ -22,13 +22,13 @@ impl Aim {
     }
 }
 
-/// Returns the velocity towards and through an opening: the farther off the line, the slower
-/// ahead. While `held`, it waits at a distance. [m/s, home]
+/// Returns the velocity towards and through an opening. The forward speed decreases with the offset from the line. With
+/// `held`, the vehicle waits at a distance. [m/s, home]
 pub fn through(aim: &Aim, plane: &Plane, held: bool) -> DVec3 {
     let off_m = aim.off_m.length();
     let sideways_mps = (aim.off_m * OFF_PER_S).clamp_length_max(SIDE_MPS);
     let allowed_m = NECK_M + FUNNEL * (aim.before_m - NEAR_M).max(0.0);
-    // Full speed within half of what is allowed, none at its edge, back beyond.
+    // Full speed within half of the allowed offset, zero at its limit, backwards beyond.
     let share = (2.0 * (1.0 - off_m / allowed_m)).clamp(-BACK, 1.0);
     let ahead_mps = if held {
         ((aim.before_m - WAIT_M) * WAIT_PER_S).clamp(-0.4, CRUISE_MPS) * share.max(0.0)
@@ -43,8 +43,7 @@ pub fn through(aim: &Aim, plane: &Plane, held: bool) -> DVec3 {
     plane.normal() * ahead_mps + sideways_mps
 }
 
-/// Returns `v_mps` without what would bring the vehicle near to anything solid of the obstacles, and
-/// with a push away from it. [m/s, home]
+/// Limits the velocity towards solid surfaces of the obstacles, and adds a push away from them. [m/s, home]
 pub fn clear_of<'a>(
     v_mps: DVec3,
     p_m: DVec3,
@@ -64,28 +63,27 @@ pub fn clear_of<'a>(
     v_mps
 }
 
-/// Through an opening and between two of them. A metre at this speed is left behind in the lag of
-/// the vehicle and of its image, 0.3 s, by 0.3 m. [m/s]
+/// Speed through an opening and between openings. The lag of vehicle and image, 0.3 s, is 0.3 m at this speed. [m/s]
 pub const CRUISE_MPS: f64 = 1.0;
-/// Where a vehicle waits for the hand to pass, from the plane. [m]
+/// Distance from the plane at which the vehicle waits for the hand to pass. [m]
 pub const WAIT_M: f64 = 0.95;
 const WAIT_PER_S: f64 = 1.5;
-/// Sideways and up: the time constant is twice the vehicle's lag.
+/// Gain of sideways and vertical motion: the time constant is twice the vehicle's lag.
 const OFF_PER_S: f64 = 1.8;
 const SIDE_MPS: f64 = 0.9;
-/// Allowed off the line at the opening, and more for each metre before it.
+/// Allowed offset from the line at the opening, and its increase per metre before it.
 const NECK_M: f64 = 0.1;
 const FUNNEL: f64 = 0.5;
 const NEAR_M: f64 = 0.35;
-/// Back out, at this share of the speed, where the line is too far off.
+/// Fraction of the speed for flying backwards if the offset is too large.
 const BACK: f64 = 0.4;
-/// From here on turning back would take longer than going through. [m]
+/// At a smaller distance, turning back would take longer than passing. [m]
 const COMMIT_M: f64 = 0.2;
-/// Nobody backs out from here: there is room to move sideways. [m]
+/// At a larger distance, the vehicle never flies backwards, because there is space to move sideways. [m]
 const FAR_M: f64 = 0.7;
-/// Solid things nearer than this push. [m]
+/// Solid surfaces nearer than this limit the velocity. [m]
 const KEEP_M: f64 = 0.6;
-/// Nothing solid comes nearer than this to the middle of the vehicle. [m]
+/// Minimum distance from a solid surface to the centre of the vehicle. [m]
 const MIN_M: f64 = 0.22;
 
 #[cfg(test)]

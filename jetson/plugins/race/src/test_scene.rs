@@ -1,4 +1,4 @@
-//! For tests: pictures of boxes, each of one colour, cast ray by ray.
+//! Test images of coloured boxes, rendered with one ray per sample.
 
 use vizflyt_sdk::glam::{DQuat, DVec2, DVec3};
 use vizflyt_sdk::protocol::geometry::body_from_forward_cam;
@@ -14,7 +14,7 @@ pub(crate) struct Brick {
     pub(crate) rgb: [u8; 3],
 }
 
-/// Returns a room of 12 x 6 x 4 m, its floor at z = 0, x ahead.
+/// Returns a room of 12 x 6 x 4 m with its floor at z = 0 and x forward.
 pub(crate) fn room() -> Vec<Brick> {
     let grey = [150, 150, 150];
     let wall = |min_m, max_m| Brick { min_m, max_m, rgb: grey };
@@ -27,7 +27,7 @@ pub(crate) fn room() -> Vec<Brick> {
     ]
 }
 
-/// Returns a square frame across x with its legs; bars are 0.16 m wide.
+/// Returns a square frame with legs, perpendicular to x; bars are 0.16 m wide.
 pub(crate) fn window(middle_m: DVec3, half_m: f64, rgb: [u8; 3]) -> Vec<Brick> {
     let bar = |low: DVec2, high: DVec2, rgb| Brick {
         min_m: middle_m + DVec3::new(-0.045, low.x, low.y),
@@ -48,7 +48,7 @@ pub(crate) fn window(middle_m: DVec3, half_m: f64, rgb: [u8; 3]) -> Vec<Brick> {
     ]
 }
 
-/// Returns what a level camera sees from a place [m, home], its heading from x [rad].
+/// Returns the samples of a level camera at a position [m, home], with its heading from x [rad].
 pub(crate) fn picture(bricks: &[Brick], camera_m: DVec3, yaw_rad: f64) -> PixelGrid {
     let intrinsics = Intrinsics::from_horizontal_fov(160, 120, 90_f64.to_radians());
     let home_from_cam =
@@ -73,7 +73,7 @@ pub(crate) fn picture(bricks: &[Brick], camera_m: DVec3, yaw_rad: f64) -> PixelG
     grid
 }
 
-/// Returns where a ray enters a box, in lengths of the ray.
+/// Returns the first intersection of a ray with a box, in lengths of the ray.
 fn hit(brick: &Brick, from_m: DVec3, ray: DVec3) -> Option<f64> {
     let (t1, t2) = ((brick.min_m - from_m) / ray, (brick.max_m - from_m) / ray);
     let (enter, leave) = (t1.min(t2).max_element(), t1.max(t2).min_element());

@@ -19,12 +19,12 @@ fn arena() -> ArenaInfo {
     }
 }
 
-/// One observation with a floor 1 m below and a wall 6.4 m ahead.
+/// Passes one observation with a floor 1 m below and a wall 6.4 m ahead.
 fn see(plugin: &mut Race, ms: u64, attitude: DQuat) -> Option<Setpoint> {
     see_at(plugin, ms, attitude, 32_000.0)
 }
 
-/// As [`see`], the floor and the wall by so much nearer or farther; 0 is no depth at all.
+/// As [`see`], with scaled distances of floor and wall; 0 means no depth.
 fn see_at(plugin: &mut Race, ms: u64, attitude: DQuat, far_mm: f64) -> Option<Setpoint> {
     let arena = arena();
     let mut buffer = ObservationBuffer::new(&arena.cameras);
@@ -48,7 +48,7 @@ fn see_at(plugin: &mut Race, ms: u64, attitude: DQuat, far_mm: f64) -> Option<Se
 }
 
 #[test]
-fn with_nothing_to_fly_through_it_stays_and_looks_about() {
+fn stays_and_looks_around_without_an_obstacle() {
     let mut plugin = Race::default();
     plugin.on_start(&arena());
     let mut looks_rad = Vec::new();
@@ -58,16 +58,16 @@ fn with_nothing_to_fly_through_it_stays_and_looks_about() {
                 assert!(v_mps.length() < 0.05, "{v_mps}");
                 looks_rad.push(yaw_rad);
             }
-            other => panic!("{other:?} is no velocity with a heading"),
+            other => panic!("expected a velocity with a heading, got {other:?}"),
         }
     }
     let most = looks_rad.iter().fold(0.0_f64, |most, look| most.max(*look));
     let least = looks_rad.iter().fold(0.0_f64, |least, look| least.min(*look));
-    assert!(most > 0.8 && least < -0.8, "it looks from {least} to {most} rad");
+    assert!(most > 0.8 && least < -0.8, "looks only from {least} to {most} rad");
 }
 
 #[test]
-fn without_depth_it_fails_on_the_ground_with_a_reason() {
+fn fails_on_the_ground_with_a_reason_if_there_is_no_depth() {
     let mut plugin = Race::default();
     plugin.on_start(&arena());
     for step in 0..u64::from(PATIENCE) - 1 {
@@ -77,8 +77,8 @@ fn without_depth_it_fails_on_the_ground_with_a_reason() {
     let ends = std::panic::catch_unwind(move || see_at(&mut other, 9000, DQuat::IDENTITY, 0.0));
     let sentence = ends.unwrap_err();
     let sentence = sentence.downcast_ref::<&str>().expect("a sentence");
-    assert!(sentence.contains("colour alone (g)") && sentence.contains("--level ug"), "{sentence}");
-    // A camera that is uncovered in time flies; later it may be covered for as long as it is.
+    assert!(sentence.contains("only colour (g)") && sentence.contains("--level ug"), "{sentence}");
+    // If the camera is uncovered in time, the plugin flies; later the camera may be covered for any time.
     assert!(see(&mut plugin, 9000, DQuat::IDENTITY).is_some());
     for step in 0..u64::from(2 * PATIENCE) {
         assert!(see_at(&mut plugin, 9040 + 40 * step, DQuat::IDENTITY, 0.0).is_some());
@@ -86,7 +86,7 @@ fn without_depth_it_fails_on_the_ground_with_a_reason() {
 }
 
 #[test]
-fn the_same_image_is_answered_once() {
+fn replies_once_to_each_image() {
     let mut plugin = Race::default();
     plugin.on_start(&arena());
     assert!(see(&mut plugin, 1000, DQuat::IDENTITY).is_some());
@@ -95,7 +95,7 @@ fn the_same_image_is_answered_once() {
 }
 
 #[test]
-fn after_the_finish_it_holds_and_a_broken_attitude_is_not_answered() {
+fn holds_after_the_finish_and_ignores_an_invalid_attitude() {
     let mut plugin = Race::default();
     plugin.on_start(&arena());
     assert_eq!(see(&mut plugin, 1000, DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0)), None);

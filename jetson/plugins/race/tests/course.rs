@@ -1,4 +1,4 @@
-//! Closed loop: the plugin flies generated courses by images of the twin, and the true geometry judges.
+//! Closed loop: the plugin flies generated courses with rendered images, and the true geometry decides.
 
 mod world;
 
@@ -9,16 +9,16 @@ fn check(project: &str, seed: u64) {
 }
 
 #[test]
-fn windows_gap_and_hand_are_flown_through() {
+fn flies_through_windows_gap_and_hand() {
     check("p5", 3);
 }
 
 #[test]
-fn three_windows_are_flown_through() {
+fn flies_through_three_windows() {
     check("p3", 5);
 }
 
 #[test]
-fn a_gap_alone_is_flown_through() {
+fn flies_through_a_single_gap() {
     check("p4", 2);
 }

@@ -1,6 +1,6 @@
 """Write a drone's autonomy in Python; fly it in a photorealistic world.
 
-A plugin is a class with one method that matters::
+A plugin is a class with the method ``on_image``::
 
     import vizflyt
 
@@ -19,8 +19,8 @@ Frames: ``world`` is x east, y north, z up; ``body`` is x forward, y left, z up;
 y down, z forward. Units are SI, and names end in them: ``_m _mps _rad _radps _ns _px``. Times are
 nanoseconds of ``time.monotonic_ns()``. Rotations are quaternions xyzw.
 
-Images are read-only numpy arrays that lie in shared memory: nothing is copied. To draw into one, or
-to keep it for long, take a ``.copy()``.
+Images are read-only numpy arrays in shared memory; nothing is copied. To draw into an image, or to keep it for a long
+time, take a ``.copy()``.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -99,7 +99,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # A plugin pays nothing for what needs Gymnasium.
+    # Plugins that do not use Gymnasium do not import it.
     if name in ("Env", "VectorEnv"):
         from . import gym
 

@@ -1,4 +1,4 @@
-"""What went wrong in a plugin, in one sentence that begins with the student's own line."""
+"""Describes the failure of a plugin in one sentence that begins with the student's line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sysconfig
 from types import TracebackType
 
 _OURS = os.path.dirname(os.path.abspath(__file__))
-# Where other people's code lives.
+# Folders of library code.
 _LIBRARIES = tuple(
     os.path.abspath(path) + os.sep
     for name in ("stdlib", "platstdlib", "purelib", "platlib")
@@ -17,7 +17,7 @@ _LIBRARIES = tuple(
 
 
 def sentence(error: BaseException, method: str) -> str:
-    """Returns the sentence for the runtime: place, what, and the line itself.
+    """Returns the sentence for the runtime: place, error, and the source line.
 
     ``my_plugin.py:12 in on_image: ZeroDivisionError: division by zero (speed = 1 / x)``
     """
@@ -28,7 +28,7 @@ def sentence(error: BaseException, method: str) -> str:
     if isinstance(error, SystemExit):
         what, detail = "the plugin called exit", f"status {error.code or 0}"
     if isinstance(error, SyntaxError) and error.filename:
-        # Its own place says more than the import that met it.
+        # The error's own file and line are more useful than those of the import.
         return f"{os.path.basename(error.filename)}:{error.lineno}: {what}: {error.msg}"
     if isinstance(error, AttributeError):
         detail += _what_it_has(getattr(error, "obj", None))
@@ -43,16 +43,16 @@ def sentence(error: BaseException, method: str) -> str:
 
 
 def without_our_frames(traceback: TracebackType | None) -> TracebackType | None:
-    """Returns the traceback from the student's first line on."""
+    """Returns the traceback, beginning with the student's first line."""
     at = traceback
     while at is not None and _path(at).startswith(_OURS + os.sep):
         at = at.tb_next
-    # Where there is nothing but ours, ours says what there is to say.
+    # If all frames are of this package, keep them.
     return at or traceback
 
 
 def _what_it_has(thing: object) -> str:
-    """Returns what a wrong name of one of our types may have meant: all names that there are."""
+    """Returns all names of one of our types, as a hint for a wrong name."""
     if not type(thing).__module__.startswith("vizflyt"):
         return ""
     names = [name for name in dir(type(thing)) if not name.startswith("_")]
@@ -60,7 +60,7 @@ def _what_it_has(thing: object) -> str:
 
 
 def _own_line(traceback: TracebackType | None) -> tuple[str, int, str] | None:
-    """Returns file, line and function of the innermost frame that is the student's."""
+    """Returns file, line and function of the innermost frame in the student's code."""
     own = None
     while traceback is not None:
         path = _path(traceback)
@@ -72,5 +72,5 @@ def _own_line(traceback: TracebackType | None) -> tuple[str, int, str] | None:
 
 def _path(traceback: TracebackType) -> str:
     name = traceback.tb_frame.f_code.co_filename
-    # `<stdin>` and a notebook's cell are no files.
+    # `<stdin>` and a notebook's cell are not files.
     return name if name.startswith("<") else os.path.abspath(name)

@@ -18,9 +18,10 @@ from ._vizflyt import PROTOCOL_VERSION, Pose, decode_image
 _F64 = npt.NDArray[np.float64]
 _I64 = npt.NDArray[np.int64]
 
-# The first protocol whose images have this layout.
+# Oldest protocol version with this layout of images.
 FIRST_PROTOCOL = 13
-# Of the header of an image: rotation and place of the camera in the world, of the camera on the body, intrinsics, lens.
+# Layout of an image's header: rotation and position of the camera in the world, of the camera on the body, intrinsics,
+# distortion.
 NUMBERS_AT, NUMBERS, SIZE_AT, HEADER = 48, struct.Struct("<23d"), 232, 252
 LENSES = {0: "none", 1: "brown_conrady", 2: "kannala_brandt"}
 
@@ -31,14 +32,14 @@ class Poses(NamedTuple):
     at_ns: _I64
     """Shape (N,). [ns, since 1970]"""
     p_m: _F64
-    """The body's position, shape (N, 3). [m]"""
+    """Position of the body, shape (N, 3). [m]"""
     q_xyzw: _F64
     """Unit quaternions from body axes to those of the frame, shape (N, 4)."""
     frame: Literal["world", "odom"] = "world"
-    """The frame that they are in."""
+    """Frame of the poses."""
 
     def at(self, at_ns: int) -> Pose | None:
-        """Returns the pose at an instant, interpolated between two at most 0.2 s apart; None elsewhere."""
+        """Returns the pose at an instant, interpolated between poses at most 0.2 s apart; otherwise None."""
         after = int(np.searchsorted(self.at_ns, at_ns))
         if after == len(self.at_ns):
             return None
@@ -52,7 +53,7 @@ class Poses(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """The localized motion that belongs to the poses, and how well it is known."""
+    """Velocities of the poses, and standard deviations."""
 
     at_ns: _I64
     v_world_mps: _F64
@@ -60,9 +61,9 @@ class Motion(NamedTuple):
     omega_body_radps: _F64
     """Shape (N, 3). [rad/s, body]"""
     position_sigma_m: _F64
-    """One standard deviation an axis, shape (N, 3); 0 is not known. [m, world]"""
+    """One standard deviation for each axis, shape (N, 3); 0 means unknown. [m, world]"""
     rotation_sigma_rad: _F64
-    """About each axis, shape (N, 3); 0 is not known. [rad, body]"""
+    """One standard deviation about each axis, shape (N, 3); 0 means unknown. [rad, body]"""
 
 
 class Imu(NamedTuple):
@@ -77,56 +78,56 @@ class Imu(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """What the guard let through."""
+    """Setpoints after the guard, as sent to the autopilot."""
 
     at_ns: _I64
     v_world_mps: _F64
     """Shape (N, 3). [m/s, world]"""
     yaw_rad: _F64
-    """Shape (N,); NaN where there is none. [rad, world]"""
+    """Shape (N,); NaN if not set. [rad, world]"""
     yaw_rate_radps: _F64
-    """Shape (N,); NaN where there is none. [rad/s]"""
+    """Shape (N,); NaN if not set. [rad/s]"""
 
 
 class LogImage(NamedTuple):
     """One image of a log, decoded."""
 
     camera: str
-    """The camera's name."""
+    """Name of the camera."""
     shown_ns: int
-    """The instant that it shows. [ns, since 1970]"""
+    """Instant that the image shows. [ns, since 1970]"""
     pose_stamp_ns: int
-    """When the newest pose behind it was measured. [ns, since 1970]"""
+    """Measurement time of the newest pose behind the image. [ns, since 1970]"""
     seq: int
-    """The observation that it was in."""
+    """Number of the observation with this image."""
     rgb: npt.NDArray[np.uint8]
     """Shape (H, W, 3), sRGB."""
     depth_mm: npt.NDArray[np.uint16]
-    """Along the optical axis, shape (H, W); 0 is no return. [mm, cam]"""
+    """Along the optical axis, shape (H, W); 0 means no return. [mm, cam]"""
     world_from_body: Pose
-    """Where the body was: what the image was rendered from."""
+    """Pose of the body from which the image was rendered."""
     body_from_cam: Pose
-    """How the camera was mounted."""
+    """Pose of the camera on the body."""
     k: _F64
     """OpenCV's camera matrix, shape (3, 3): the centre of the first pixel is 0. [px]"""
     lens: str
-    """'none', 'brown_conrady' (OpenCV's usual model) or 'kannala_brandt' (its fisheye)."""
+    """'none', 'brown_conrady' (OpenCV's standard model) or 'kannala_brandt' (its fisheye model)."""
     distortion: _F64
     """Coefficients in the order of OpenCV, shape (5,)."""
 
     @property
     def depth(self) -> npt.NDArray[np.float32]:
-        """Depth along the optical axis, shape (H, W); 0 is no return. [m, cam]"""
+        """Depth along the optical axis, shape (H, W); 0 means no return. [m, cam]"""
         return self.depth_mm.astype(np.float32) / np.float32(1000)
 
     @property
     def world_from_cam(self) -> Pose:
-        """Where the camera was."""
+        """Pose of the camera."""
         return self.world_from_body @ self.body_from_cam
 
 
 class Images(Sequence[LogImage]):
-    """The images of one camera, decoded when they are asked for."""
+    """The images of one camera, decoded on access."""
 
     def __init__(self, log: Log, found: list[_Found]):
         self._log, self._found = log, found
@@ -148,7 +149,7 @@ class Images(Sequence[LogImage]):
 
     @property
     def shown_ns(self) -> _I64:
-        """The instants that they show, shape (N,). [ns, since 1970]"""
+        """Instants that the images show, shape (N,). [ns, since 1970]"""
         return np.array([found.shown_ns for found in self._found], np.int64)
 
 
@@ -166,23 +167,22 @@ class Log:
 
         log = vizflyt.Log("flight.mcap")
         for image in log.images("front"):
-            pose = image.world_from_body                    # what the image was rendered from
+            pose = image.world_from_body                    # the image was rendered from it
             print(image.shown_ns, image.rgb.shape, image.depth.max(), pose.translation_m)
         print(log.imu.accel_mps2.mean(axis=0), log.poses.p_m[-1], log.sent.v_world_mps.max())
 
-    Times are nanoseconds since 1970, on the clock of the vehicle's computer; of graded flights, on their virtual
-    clock.
+    Times are nanoseconds since 1970, on the clock of the vehicle's computer; in graded flights, on their virtual clock.
 
-    Raises OSError if it cannot be read, ValueError if it is no log, or of a version that is not known here.
+    Raises OSError if the file cannot be read, ValueError if it is not a log or has an unknown version.
     """
 
     def __init__(self, path: str | os.PathLike[str]):
         self.path = Path(path)
         self._file = McapFile(self.path)
         self.flight: dict[str, str] = self._file.metadata.get("vizflyt.flight", {})
-        """Which flight it is: program, protocol, plugin, arguments, images."""
+        """Description of the flight: program, protocol, plugin, arguments, images."""
         self.is_cut = self._file.is_cut
-        """Whether the log ends early: its flight was killed, or the file is damaged."""
+        """Whether the log ends early, because the flight was killed or the file is damaged."""
         self._colors = {
             topic.removeprefix("/camera/").removesuffix("/image"): {one.log_time_ns: one for one in places}
             for topic, places in self._file.messages.items()
@@ -201,21 +201,21 @@ class Log:
                     found = _Found(place, index, camera, shown_ns + place.log_time_ns - published)
                     self._found.setdefault(camera, []).append(found)
             except (struct.error, IndexError, UnicodeDecodeError, DamagedMessageError):
-                # Damaged: the others are whole.
+                # Skip a damaged message; the others are valid.
                 continue
 
     @property
     def cameras(self) -> list[str]:
-        """Names of the cameras that have images in it."""
+        """Names of the cameras with images in the log."""
         return list(self._found)
 
     def images(self, camera: str | None = None) -> Images:
-        """Returns a camera's images, of the only camera without a name: a sequence, decoded when asked for.
+        """Returns the images of a camera as a sequence, decoded on access. The name is optional if there is only one.
 
-        Raises LookupError if there is no such camera, and what to do if there is no image at all.
+        Raises LookupError if there is no such camera, or no image at all; its message has the next step.
         """
         if not self._found:
-            raise LookupError(f"{self.path} holds no image: fly with --log full or --log reduced")
+            raise LookupError(f"{self.path} contains no image: fly with --log full or --log reduced")
         if camera is None and len(self._found) == 1:
             camera = next(iter(self._found))
         if camera not in self._found:
@@ -224,42 +224,42 @@ class Log:
 
     @property
     def poses(self) -> Poses:
-        """The localized poses, in the frame `world`."""
+        """Poses from localization, in the frame `world`."""
         return self._poses("/pose")
 
     @property
     def pose_at_image(self) -> Poses:
-        """What each instant's images were rendered from, in the frame `world`."""
+        """Poses from which the images were rendered, in the frame `world`."""
         return self._poses("/pose_at_image")
 
     @property
     def odometry(self) -> Poses:
-        """What the plugin published by `publish_odometry`, in its own frame `odom`."""
+        """Poses that the plugin published with `publish_odometry`, in the plugin's frame `odom`."""
         return self._poses("/odometry", "odom")
 
     @property
     def motion(self) -> Motion:
-        """Velocities, and how far poses may be off."""
+        """Velocities, and standard deviations of the poses."""
         stamps, rows = self._json("/motion")
         names = ("v_world_mps", "omega_body_radps", "position_sigma_m", "rotation_sigma_rad")
         return Motion(stamps, *(_vectors(rows, name) for name in names))
 
     @property
     def imu(self) -> Imu:
-        """The autopilot's accelerometer and gyroscope."""
+        """Accelerometer and gyroscope of the autopilot."""
         stamps, rows = self._json("/imu")
         return Imu(stamps, _vectors(rows, "accel_mps2"), _vectors(rows, "gyro_radps"))
 
     @property
     def sent(self) -> Sent:
-        """The setpoints that the guard let through."""
+        """Setpoints after the guard, as sent to the autopilot."""
         stamps, rows = self._json("/setpoint/sent")
         yaw, rate = (np.array([_number(row.get(name)) for row in rows]) for name in ("yaw_rad", "yaw_rate_radps"))
         return Sent(stamps, _vectors(rows, "v_world_mps"), yaw, rate)
 
     @property
     def asked(self) -> list[tuple[int, int, Any]]:
-        """What the plugin answered: when [ns, since 1970], to which observation, and its setpoint as JSON has it."""
+        """Replies of the plugin: time [ns, since 1970], number of the observation, setpoint in the log's JSON form."""
         stamps, rows = self._json("/setpoint/asked")
         return [(int(at_ns), row.get("seq", 0), row.get("setpoint")) for at_ns, row in zip(stamps, rows)]
 
@@ -309,7 +309,7 @@ class Log:
             jpeg = _first(fields(self._file.data(place)), 2, b"")
         rgb, depth_mm = decode_image(_first(image, 5, b""), jpeg)
         if rgb.shape[:2] != struct.unpack_from("<II", header, SIZE_AT)[::-1]:
-            raise ValueError(f"{self.path}: an image of {camera} is of another size than its header says")
+            raise ValueError(f"{self.path}: the size of an image of {camera} differs from its header")
         pose_ns, shown_ns = _first(image, 7, 0), _first(image, 8, 0)
         fx, fy, cx, cy = numbers[14:18]
         return LogImage(
@@ -321,7 +321,7 @@ class Log:
             depth_mm=depth_mm,
             world_from_body=_body(numbers),
             body_from_cam=_mount(numbers),
-            # OpenCV puts the centre of the first pixel at 0; the header its corner.
+            # In OpenCV, 0 is the centre of the first pixel; in the header, its corner.
             k=np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], np.float64),
             lens=LENSES.get(header[7], "unknown"),
             distortion=np.array(numbers[18:23], np.float64),
@@ -329,7 +329,7 @@ class Log:
 
 
 def _first(message: dict[int, list[Any]], number: int, otherwise: Any) -> Any:
-    """Returns a field that is there once; what protobuf leaves out is 0 or empty."""
+    """Returns the first value of a field, or `otherwise`, because protobuf omits fields that are 0 or empty."""
     found = message.get(number, [otherwise])[0]
     return found if isinstance(found, type(otherwise)) else otherwise
 

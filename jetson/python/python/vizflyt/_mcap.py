@@ -1,7 +1,7 @@
-"""Reads MCAP files as flights leave them (mcap.dev/spec, uncompressed chunks), and the protobuf messages in them.
+"""Reads the MCAP files of flights (mcap.dev/spec, uncompressed chunks), and their protobuf messages.
 
-A file that ends early, as that of a killed flight does, is read up to there. Lengths are checked before anything is
-taken: whatever a file holds, it is read or left out, and never more than it has.
+A truncated file, for example of a killed flight, is read up to its end. Every length is checked before use, so invalid
+records are skipped and nothing is read outside the file.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 0x04, 0x05, 0x06, 0x0C, 0x0F
 
 
 class DamagedMessageError(ValueError):
-    """A message of a log is no message."""
+    """A message of a log is invalid."""
 
 
 class Place(NamedTuple):
-    """Where a message lies in the file."""
+    """Position of a message in the file."""
 
     log_time_ns: int
     start: int
@@ -29,16 +29,16 @@ class Place(NamedTuple):
 
 
 class McapFile:
-    """The messages of a file by topic, in the order in which they were written."""
+    """The messages of a file by topic, in the order of writing."""
 
     def __init__(self, path: Path):
         with path.open("rb") as file:
             try:
                 self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             except ValueError:
-                raise ValueError(f"{path} is empty: no flight log") from None
+                raise ValueError(f"{path} is empty: not a flight log") from None
         if self._bytes[:8] != MAGIC:
-            raise ValueError(f"{path} is no MCAP file; give a flight's log, such as flights/DATE.mcap")
+            raise ValueError(f"{path} is not an MCAP file; give a flight's log, such as flights/DATE.mcap")
         self.messages: dict[str, list[Place]] = {}
         self.metadata: dict[str, dict[str, str]] = {}
         self.is_cut = False
@@ -53,11 +53,11 @@ class McapFile:
         return self._bytes[place.start : place.stop]
 
     def _index(self, at: int, end: int) -> None:
-        """Takes the records from `at` to `end`, where a chunk's or the file's are over."""
+        """Indexes the records from `at` to `end`, the end of a chunk or of the file."""
         data = self._bytes
         while at < end:
             if at + 9 > end:
-                # A file's own magic ends it.
+                # The file ends with the magic bytes.
                 self.is_cut = self.is_cut or end != len(data) or data[at:end] != MAGIC
                 return
             opcode, length = struct.unpack_from("<BQ", data, at)
@@ -66,7 +66,7 @@ class McapFile:
                 self.is_cut = True
                 if opcode != CHUNK:
                     return
-                # The messages that are there are whole.
+                # A truncated chunk: its messages up to here are complete.
                 length = end - at
             if opcode == MESSAGE and length >= 22:
                 channel, _, log_time_ns = struct.unpack_from("<HIQ", data, at)
@@ -77,7 +77,7 @@ class McapFile:
                 _, _, _, _, name = struct.unpack_from("<QQQII", data, at)
                 start = at + 32 + name + 8
                 if name != 0 or start > at + length:
-                    raise IndexError("a chunk is compressed, or cut")
+                    raise IndexError("a chunk is compressed or truncated")
                 (size,) = struct.unpack_from("<Q", data, start - 8)
                 self._index(start, min(start + size, at + length))
             elif opcode == CHANNEL:
@@ -94,7 +94,7 @@ class McapFile:
         (length,) = struct.unpack_from("<I", self._bytes, at)
         stop = at + 4 + length
         if stop > end:
-            raise IndexError("a text is cut")
+            raise IndexError("a text is truncated")
         return self._bytes[at + 4 : stop].decode(), stop
 
     def _map(self, at: int, end: int) -> dict[str, str]:
@@ -108,9 +108,9 @@ class McapFile:
 
 
 def fields(message: bytes) -> dict[int, list[Any]]:
-    """Returns a protobuf message's fields by number: integers of varints, bytes of all else.
+    """Returns the fields of a protobuf message by number: varints as integers, all others as bytes.
 
-    Raises DamagedMessageError for what is none.
+    Raises DamagedMessageError for an invalid message.
     """
     found: dict[int, list[Any]] = {}
     for number, value in _fields(message):
@@ -132,9 +132,9 @@ def _fields(message: bytes) -> Iterator[tuple[int, Any]]:
             elif kind in (1, 5):
                 length = 8 if kind == 1 else 4
             else:
-                raise DamagedMessageError(f"a protobuf field is of the unknown type {kind}")
+                raise DamagedMessageError(f"a protobuf field has the unknown type {kind}")
             if length > len(message) - at:
-                raise DamagedMessageError("a protobuf message is cut")
+                raise DamagedMessageError("a protobuf message is truncated")
             value, at = message[at : at + length], at + length
         yield key >> 3, value
 
@@ -149,4 +149,4 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value, at
-    raise DamagedMessageError("a protobuf number is cut")
+    raise DamagedMessageError("a protobuf number is truncated")

@@ -1,4 +1,4 @@
-"""Images as a notebook shows them: colour, and depth in colours with a scale."""
+"""Images for notebooks: colour, and depth as colours with a scale."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _U8 = npt.NDArray[np.uint8]
 _COLOURS = np.array([[255, 244, 168], [247, 157, 54], [205, 60, 70], [111, 30, 110], [24, 14, 62]])
 _NO_RETURN = (90, 90, 90)
 _GAP_PX, _BAR_PX, _SCALE_PX = 6, 10, 56
-# Digits of 3 x 5 pixels, a row in three bits, from the top; drawn at twice the size.
+# Digits of 3 x 5 pixels, one row in three bits, from the top; drawn at twice the size.
 _DIGITS = {
     "0": (7, 5, 5, 5, 7), "1": (2, 6, 2, 2, 7), "2": (7, 1, 7, 4, 7), "3": (7, 1, 7, 1, 7), "4": (5, 5, 7, 1, 1),
     "5": (7, 4, 7, 1, 7), "6": (7, 4, 7, 5, 7), "7": (7, 1, 1, 1, 1), "8": (7, 5, 7, 5, 7), "9": (7, 5, 7, 1, 7),
@@ -28,7 +28,7 @@ _DIGITS = {
 
 
 class Picture:
-    """A picture that a notebook shows as a cell's last line, or by `IPython.display.display`."""
+    """A picture that a notebook shows as the last line of a cell, or with `IPython.display.display`."""
 
     def __init__(self, pixels: _U8):
         self.pixels = pixels
@@ -37,7 +37,7 @@ class Picture:
     def png(self) -> bytes:
         """Returns the picture as a PNG file."""
         height, width, _ = self.pixels.shape
-        # Each row begins with its filter: none.
+        # Each row begins with its filter type, 0 for none.
         rows = np.zeros((height, 1 + 3 * width), np.uint8)
         rows[:, 1:] = self.pixels.reshape(height, -1)
         head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
@@ -61,11 +61,11 @@ class Picture:
 
 
 def show(seen: Observation | CameraImage | LogImage, *, far_m: float | None = None) -> Picture:
-    """Returns a picture of an image: colour, and beside it depth; of an observation, a row for each camera.
+    """Returns a picture of an image: colour, and depth next to it. An observation gets one row for each camera.
 
-    Depth goes from yellow, the nearest, to dark blue, at `far_m` and beyond [m]; without it at the farthest of the
-    image. The scale's two ends are in metres along the optical axis. Grey is no return; an image without any depth,
-    as of level `g`, is shown without.
+    The colours of depth go from yellow (nearest) to dark blue (`far_m` and beyond [m]; default: the farthest pixel of
+    the image). The ends of the scale are in metres along the optical axis. Grey means no return. An image without
+    depth, for example of level `g`, is shown without it.
 
     Raises ValueError for an observation without an image.
     """
@@ -77,7 +77,7 @@ def show(seen: Observation | CameraImage | LogImage, *, far_m: float | None = No
 
 
 def _depth(depth_m: npt.NDArray[np.float32], far_m: float | None) -> list[_U8]:
-    """Returns depth in colours and its scale; nothing where nothing came back."""
+    """Returns depth as colours, and its scale; empty if no pixel has a return."""
     returned = depth_m > 0
     if not returned.any():
         return []
@@ -89,13 +89,13 @@ def _depth(depth_m: npt.NDArray[np.float32], far_m: float | None) -> list[_U8]:
 
 
 def _coloured(share: npt.NDArray[np.floating]) -> _U8:
-    """Returns colours (..., 3) of shares between the nearest, 0, and the farthest, 1."""
+    """Returns colours (..., 3) of fractions between the nearest (0) and the farthest (1)."""
     at = np.clip(share, 0, 1) * (len(_COLOURS) - 1)
     return np.stack([np.interp(at, range(len(_COLOURS)), channel) for channel in _COLOURS.T], -1).astype(np.uint8)
 
 
 def _scale(height_px: int, near_m: float, far_m: float) -> _U8:
-    """Returns a bar of the colours, the farthest on top, with both ends in metres."""
+    """Returns a colour bar with the farthest on top, and both ends in metres."""
     pixels = np.full((height_px, _SCALE_PX, 3), 255, np.uint8)
     pixels[:, :_BAR_PX] = _coloured(np.linspace(1, 0, height_px))[:, None]
     for top, value_m in ((0, far_m), (height_px - 10, near_m)):

@@ -1,7 +1,7 @@
-"""The plugin's main loop: waits for the runtime, calls the plugin, sends its answers.
+"""Main loop of a plugin: waits for the runtime, calls the plugin, sends its replies.
 
-In Python, so that a debugger steps through it and a traceback shows the student's lines. Between two
-calls of the plugin it waits without holding the interpreter's lock.
+Written in Python, so that a debugger can step through it and a traceback shows the student's lines. While it waits, it
+does not hold the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from ._plugin import Plugin
 from ._vizflyt import NotFiniteError, PluginEnd, Setpoint, waiting_services
 
 SERVICE_OPTION = "--vizflyt-service"
-# Short, so that Ctrl-C is heard. [s]
+# Short, so that Ctrl-C takes effect. [s]
 WAIT_S = 0.1
 # Exit status: no runtime to attach to.
 NOT_ATTACHED = 2
-# What each method is called with, beside self.
+# Arguments of each method, without self.
 METHODS = {"on_start": ("info",), "on_image": ("obs",), "on_event": ("event",), "on_stop": ()}
 
 
@@ -33,18 +33,17 @@ class HeldImagesWarning(UserWarning):
 
 
 def run(plugin: type[Plugin] | Plugin, *, service: str | None = None) -> None:
-    """Runs a plugin to the end of the flight.
+    """Runs a plugin until the end of the flight.
 
-    ``vizflyt fly my_plugin.py`` starts the program and gives it the address of its images on the
-    command line. Started by hand (``python my_plugin.py``, a debugger, a notebook) it attaches to the one
-    runtime of yours that waits for a plugin: ``vizflyt fly --attach``. Where several wait,
-    ``service`` chooses.
+    ``vizflyt fly my_plugin.py`` starts the program and passes the address of its images on the command line. A plugin
+    started by hand (``python my_plugin.py``, a debugger, a notebook) attaches to the user's only runtime that waits for
+    a plugin (``vizflyt fly --attach``). If several wait, choose one with ``service``.
 
     ``plugin`` is a class derived from :class:`Plugin`, or an instance of one.
 
-    An exception in the plugin ends the flight with a landing: the runtime gets the reason, and the exception
-    goes on to the caller. Only a number that is not finite (:class:`NotFiniteError`) is printed and
-    counts as an answer that the runtime refuses: the vehicle holds, and flies on with the next good one.
+    An exception in the plugin ends the flight with a landing. The runtime receives the reason, and the exception is
+    raised to the caller. Only a number that is not finite (:class:`NotFiniteError`) is printed and counts as a reply
+    that the runtime rejects: the vehicle holds, and continues with the next valid setpoint.
     """
     end = _attach(service)
     where = "__init__"
@@ -102,13 +101,13 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
             answer = plugin.on_image(obs)
         except NotFiniteError as error:
             refused += 1
-            # The first, the tenth, the hundredth: a NaN seldom comes alone.
+            # Only the 1st, 10th, 100th and so on, because a NaN is usually followed by others.
             if str(refused).strip("0") == "1":
                 print(f"plugin: {sentence(error, 'on_image')} ({refused} so far)", file=sys.stderr)
             end.answer_not_finite(seq, entered_ns)
             continue
         finally:
-            # The memory goes back to the runtime unless the plugin keeps an image.
+            # Returns the memory to the runtime, unless the plugin keeps an image.
             del obs
         if answer is not None and not isinstance(answer, Setpoint):
             raise TypeError(_wrong_answer(answer))
@@ -116,7 +115,7 @@ def _serve(plugin: Plugin, end: PluginEnd) -> Iterator[str]:
 
 
 HELD = (
-    "the plugin keeps images of earlier calls, so new ones are copied until it lets go of some; "
+    "the plugin keeps images of earlier calls, so new ones are copied until it releases some; "
     "keep what you need with .copy(), or only the newest image"
 )
 
@@ -145,7 +144,7 @@ def _attach(service: str | None) -> PluginEnd:
 
 
 def _service_argument(arguments: list[str]) -> str | None:
-    """Returns the value of `--vizflyt-service`, as `--vizflyt-service X` or `--vizflyt-service=X`."""
+    """Returns the value of `--vizflyt-service`, given as `--vizflyt-service X` or `--vizflyt-service=X`."""
     for at, argument in enumerate(arguments):
         if argument == SERVICE_OPTION:
             return arguments[at + 1] if at + 1 < len(arguments) else None
@@ -155,30 +154,30 @@ def _service_argument(arguments: list[str]) -> str | None:
 
 
 def _prepare_output() -> None:
-    # Through a pipe, print would keep its lines until there are thousands.
+    # On a pipe, print would buffer thousands of lines.
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(line_buffering=True)
-    # A crash in compiled code shows the Python line it was called from.
+    # After a crash in compiled code, print the Python line that called it.
     if not faulthandler.is_enabled():
         try:
             faulthandler.enable()
         except (AttributeError, OSError, ValueError):
-            # A notebook's stderr is no file.
+            # The stderr of a notebook is not a file.
             pass
 
 
 def _instance(plugin: type[Plugin] | Plugin) -> Plugin:
-    """Checks the plugin's class before the vehicle is in the air; returns an instance of it."""
+    """Checks the plugin's class before take-off; returns an instance of it."""
     kind = plugin if isinstance(plugin, type) else type(plugin)
     if not issubclass(kind, Plugin):
         raise TypeError(
-            f"{kind.__name__} is no plugin: define it as class {kind.__name__}(vizflyt.Plugin)"
+            f"{kind.__name__} is not a plugin: define it as class {kind.__name__}(vizflyt.Plugin)"
         )
     if kind.on_image is Plugin.on_image:
         own = [name for name, value in vars(kind).items() if isinstance(value, FunctionType)]
         close = difflib.get_close_matches("on_image", own, n=1, cutoff=0.5)
-        hint = f"; is {close[0]} meant to be it?" if close else ""
+        hint = f"; rename {close[0]} to on_image?" if close else ""
         raise TypeError(f"{kind.__name__} has no method on_image(self, obs){hint}")
     if isinstance(plugin, type):
         plugin = plugin()
@@ -186,7 +185,7 @@ def _instance(plugin: type[Plugin] | Plugin) -> Plugin:
         method = getattr(plugin, name)
         wanted = f"def {name}({', '.join(('self', *arguments))})"
         if inspect.iscoroutinefunction(method):
-            raise TypeError(f"{kind.__name__}.{name} is async, and nobody awaits it: write {wanted}")
+            raise TypeError(f"{kind.__name__}.{name} is async, but is not awaited: write {wanted}")
         try:
             inspect.signature(method).bind(*arguments)
         except TypeError as error:

@@ -17,9 +17,9 @@ _F64 = npt.NDArray[np.float64]
 
 @final
 class ArenaInfo:
-    """What a plugin must know of the arena it flies in.
+    """Description of the arena in which the plugin flies.
 
-    `ArenaInfo(goal_m=[5, 0, 1], ...)` makes one, for tests; every keyword has a default.
+    `ArenaInfo(goal_m=[5, 0, 1], ...)` creates one for tests; every keyword has a default.
     """
 
     def __new__(
@@ -44,15 +44,15 @@ class ArenaInfo:
     ) -> ArenaInfo: ...
     @property
     def name(self) -> str:
-        """The arena's name."""
+        """Name of the arena."""
 
     @property
     def geofence(self) -> Volume:
-        """Keep-in volume of the body's surface. [world]"""
+        """Volume in which the body's surface must stay. [world]"""
 
     @property
     def no_fly(self) -> list[Volume]:
-        """Keep-out volumes of the body's surface. [world]"""
+        """Volumes that the body's surface must not enter. [world]"""
 
     @property
     def floor_z_m(self) -> float:
@@ -68,50 +68,51 @@ class ArenaInfo:
 
     @property
     def takeoff_height_m(self) -> float:
-        """Height above the start to which the runtime climbs before the plugin flies. [m]"""
+        """Height above the start to which the runtime climbs before the plugin gets control. [m]"""
 
     @property
     def goal_m(self) -> _F64 | None:
-        """Where the flight shall end: shape (3,), float64; None if the course has no goal. [m, world]"""
+        """Goal of the flight: shape (3,), float64; None if the course has no goal. [m, world]"""
 
     @property
     def goal_radius_m(self) -> float:
-        """How near counts as reached. [m]"""
+        """Distance at which the goal counts as reached. [m]"""
 
     @property
     def time_limit_s(self) -> float:
-        """From take-off; 0 is none. [s]"""
+        """Time limit from take-off; 0 means no limit. [s]"""
 
     @property
     def start_box(self) -> Volume | None:
-        """Where a flight begins; None if anywhere. [world]"""
+        """Box in which a flight begins; None if anywhere. [world]"""
 
     @property
     def ground_truth(self) -> bool:
-        """Whether the plugin gets the vehicle's pose and velocity."""
+        """Whether the plugin receives the vehicle's pose and velocity."""
     @property
     def attitude_rate(self) -> bool:
-        """Whether the plugin may ask for `Setpoint.attitude_rate`."""
+        """Whether `Setpoint.attitude_rate` is allowed."""
 
     @property
     def setpoints(self) -> list[str]:
-        """Kinds of setpoint that the plugin may ask for, of 'position', 'velocity', 'acceleration',
-        'offset', 'attitude_rate' and 'trajectory'; hold, land and take_off it always may."""
+        """Allowed kinds of setpoint, of 'position', 'velocity', 'acceleration', 'offset', 'attitude_rate' and
+        'trajectory'. hold, land and take_off are always allowed.
+        """
 
     @property
     def cameras(self) -> list[CameraInfo]:
-        """The vehicle's cameras."""
+        """Cameras of the vehicle."""
 
     @property
     def sensors(self) -> list[SensorInfo]:
-        """The vehicle's sensors beside the cameras."""
+        """Sensors of the vehicle other than cameras."""
 
 @final
 class CameraInfo:
     """One camera of the vehicle.
 
-    `CameraInfo(name, intrinsics, body_from_cam=None)` makes one, for tests; without a mounting it looks
-    along the nose.
+    `CameraInfo(name, intrinsics, body_from_cam=None)` creates one for tests. Without `body_from_cam` it looks
+    forward.
     """
 
     def __new__(
@@ -119,7 +120,7 @@ class CameraInfo:
     ) -> CameraInfo: ...
     @property
     def name(self) -> str:
-        """What `obs.camera(name)` calls it."""
+        """Name of the camera, the argument of `obs.camera(name)`."""
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -127,11 +128,11 @@ class CameraInfo:
 
     @property
     def body_from_cam(self) -> Pose:
-        """How it is mounted."""
+        """Pose of the camera on the body."""
 
 @final
 class Limits:
-    """Limits that the guard enforces whatever a plugin asks."""
+    """Limits that the guard enforces on every setpoint."""
 
     def __new__(
         cls,
@@ -143,81 +144,82 @@ class Limits:
     ) -> Limits: ...
     @property
     def max_tilt_deg(self) -> float | None:
-        """Greatest tilt from level; None if the acceleration alone limits it. [deg]"""
+        """Maximum tilt from level; None if only the acceleration limits it. [deg]"""
     @property
     def max_altitude_m(self) -> float | None:
-        """Greatest height of the body's centre; None if the geofence alone limits it. [m, world]"""
+        """Maximum height of the body's centre; None if only the geofence limits it. [m, world]"""
     @property
     def max_speed_mps(self) -> float:
-        """Greatest speed. [m/s]"""
+        """Maximum speed. [m/s]"""
 
     @property
     def max_acceleration_mps2(self) -> float:
-        """Greatest acceleration; also what the guard counts on for stopping. [m/s^2]"""
+        """Maximum acceleration; the guard also assumes it for stopping. [m/s^2]"""
 
 @final
 class Observation:
-    """The vehicle and its cameras' images at one moment.
+    """The vehicle and the images of its cameras at one moment.
 
-    Images lie in shared memory and are not copied. Those you keep beyond `on_image` stay as they are; keep
-    more than the newest two and later ones are copied, with a warning.
+    Images lie in shared memory and are not copied. Images that you keep after `on_image` do not change. If you
+    keep more than the newest two, later images are copied, with a warning.
     """
 
     @property
     def seq(self) -> int:
-        """The observation's number in this flight; numbers missing were skipped."""
+        """Number of the observation in this flight; missing numbers were skipped."""
 
     @property
     def stamp_ns(self) -> int:
-        """When the newest image's pose was measured. [ns, `time.monotonic_ns()`]"""
+        """Measurement time of the newest image's pose. [ns, `time.monotonic_ns()`]"""
 
     def camera(self, name: str) -> CameraImage | None:
-        """Returns the image of the camera of this name; None if it has none yet.
+        """Returns the image of the camera with this name; None if there is no image yet.
 
         Raises LookupError if the vehicle has no such camera.
         """
 
     @property
     def cameras(self) -> list[CameraImage]:
-        """The images there are, in the order of the arena's cameras."""
+        """Available images, in the order of the arena's cameras."""
 
     def sensor(self, name: str) -> SensorReading | None:
-        """Returns the newest reading of the sensor of this name; None if it has none yet.
+        """Returns the newest reading of the sensor with this name; None if there is no reading yet.
 
         Raises LookupError if the vehicle has no such sensor.
         """
 
     @property
     def sensors(self) -> list[SensorReading]:
-        """The newest readings there are, in the order of the arena's sensors."""
+        """Newest available readings, in the order of the arena's sensors."""
 
     @property
     def pose_at_image(self) -> Pose | None:
-        """Where the body was at the instant that the newest image shows: the pose that belongs to its pixels. None
-        without an image, and where the course withholds the pose. [m, world]
+        """Pose of the body at the instant that the newest image shows, which belongs to its pixels. None without an
+        image, and if the course withholds the pose. [m, world]
         """
 
     @property
     def vehicle(self) -> Vehicle | None:
-        """What is known of the vehicle; None before anything is."""
+        """State of the vehicle; None before the first one."""
 
     @property
     def imu(self) -> list[ImuSample]:
-        """The autopilot's IMU samples since the image that the plugin got before this one, oldest first; at
-        most the newest 64 (0.6 s at 100 Hz).
+        """IMU samples of the autopilot since the plugin's previous image, oldest first. At most the newest 64 (0.6
+        s at 100 Hz).
         """
     @property
     def battery(self) -> Battery:
-        """The battery's state."""
+        """State of the battery."""
     @property
     def is_copy(self) -> bool:
         """Whether the images are copies, because the plugin keeps too many earlier ones."""
 
 @final
 class SensorInfo:
-    """One sensor of the vehicle that is no camera.
+    """One sensor of the vehicle other than a camera.
 
-    `SensorInfo(name, kind, most_records=1, ...)` makes one, for tests; without a mounting it looks along the nose.
+    `SensorInfo(name, kind, most_records=1, ...)` creates one for tests. Without `body_from_sensor` it points
+    forward.
     """
 
     def __new__(
@@ -235,117 +237,116 @@ class SensorInfo:
     ) -> SensorInfo: ...
     @property
     def name(self) -> str:
-        """What `obs.sensor(name)` calls it."""
+        """Name of the sensor, the argument of `obs.sensor(name)`."""
 
     @property
     def kind(self) -> str:
-        """'lidar', 'range_finder', 'sonar' or 'radar'."""
+        """Kind: 'lidar', 'range_finder', 'sonar' or 'radar'."""
 
     @property
     def rate_hz(self) -> float:
-        """Readings a second. [Hz]"""
+        """Rate of readings. [Hz]"""
 
     @property
     def min_range_m(self) -> float:
-        """Nearest that it measures. [m]"""
+        """Minimum range. [m]"""
 
     @property
     def max_range_m(self) -> float:
-        """Furthest that it measures. [m]"""
+        """Maximum range. [m]"""
 
     @property
     def horizontal_fov_rad(self) -> float:
-        """Width of what it sees. [rad]"""
+        """Horizontal field of view. [rad]"""
 
     @property
     def vertical_fov_rad(self) -> float:
-        """Height of what it sees. [rad]"""
+        """Vertical field of view. [rad]"""
 
     @property
     def body_from_sensor(self) -> Pose:
-        """How it is mounted: sensor axes are x forward, y left, z up."""
+        """Pose of the sensor on the body. Sensor axes are x forward, y left, z up."""
 
 @final
 class SensorReading:
-    """The newest reading of one sensor. It stays in later observations until the next one comes: `seq` tells whether
-    it is new.
+    """Newest reading of one sensor. It stays in later observations until the next one arrives; a changed `seq`
+    marks a new reading.
     """
 
     @property
     def name(self) -> str:
-        """The sensor's name in `arena.toml`."""
+        """Name of the sensor in `arena.toml`."""
 
     @property
     def kind(self) -> str:
-        """'lidar', 'range_finder', 'sonar' or 'radar'."""
+        """Kind: 'lidar', 'range_finder', 'sonar' or 'radar'."""
 
     @property
     def seq(self) -> int:
-        """Counts this sensor's readings, from 1."""
+        """Number of the reading, from 1."""
 
     @property
     def stamp_ns(self) -> int:
-        """When the newest pose behind it was measured. [ns, `time.monotonic_ns()`]"""
+        """Measurement time of the newest pose behind the reading. [ns, `time.monotonic_ns()`]"""
 
     @property
     def shown_ns(self) -> int:
-        """The instant that it is of; of a sweep that of its last beam. [ns, `time.monotonic_ns()`]"""
+        """Instant of the reading; for a sweep, the instant of its last beam. [ns, `time.monotonic_ns()`]"""
 
     @property
     def ready_ns(self) -> int:
-        """When the runtime had it. [ns, `time.monotonic_ns()`]"""
+        """Time at which the runtime received the reading. [ns, `time.monotonic_ns()`]"""
 
     @property
     def records(self) -> npt.NDArray[np.void]:
-        """What was measured: a read-only structured view of shape (N,). [sensor: x forward, y left, z up]
+        """Measured values: a read-only structured view of shape (N,). [sensor: x forward, y left, z up]
 
         lidar: `p_m` (3 x float32, [m]), `before_ns` (uint32), `intensity` (uint16), `ring` (uint16);
-        range_finder, sonar (N is 1): `range_m` (0 is no echo), `signal` (float32);
+        range_finder, sonar (N is 1): `range_m` (0 means no echo), `signal` (float32);
         radar: `range_m`, `azimuth_rad`, `radial_mps`, `snr_db`, `cross_section_m2` (float32).
         """
 
     @property
     def points_m(self) -> npt.NDArray[np.float32] | None:
-        """The points of a LiDAR: a read-only view of shape (N, 3), float32; None of another sensor. [m, sensor]"""
+        """Points of a LiDAR: a read-only view of shape (N, 3), float32; None for other sensors. [m, sensor]"""
 
     @property
     def range_m(self) -> float | None:
-        """The distance that a range finder or a sonar has measured; None where nothing came back, and of other
-        sensors. [m]
-        """
+        """Distance measured by a range finder or sonar; None without a return, and for other sensors. [m]"""
 
     @property
     def body_from_sensor(self) -> Pose:
-        """Where the sensor sits."""
+        """Pose of the sensor on the body."""
 
     @property
     def pose_at_reading(self) -> Pose | None:
-        """Where the body was at the instant that it is of; None where the course withholds the pose. [m, world]"""
+        """Pose of the body at the instant of the reading; None if the course withholds the pose. [m, world]"""
 
 @final
 class CameraImage:
-    """One camera's RGB-D image. Row 0 is the top; index arrays as [y, x]."""
+    """RGB-D image of one camera. Row 0 is the top; index arrays as [y, x]."""
 
     @property
     def name(self) -> str:
-        """The camera's name in `arena.toml`: 'front'."""
+        """Name of the camera in `arena.toml`, for example 'front'."""
 
     @property
     def seq(self) -> int:
-        """Tick of the server that made the image; equal for all cameras of a tick."""
+        """Server tick that rendered the image; equal for all cameras of a tick."""
 
     @property
     def stamp_ns(self) -> int:
-        """When the newest pose behind the image was measured. [ns, `time.monotonic_ns()`]"""
+        """Measurement time of the newest pose behind the image. [ns, `time.monotonic_ns()`]"""
 
     @property
     def shown_ns(self) -> int:
-        """The instant that the image shows, about now: where depth is to meet the vehicle's pose, take
-        the pose of this instant. [ns, `time.monotonic_ns()`]"""
+        """Instant that the image shows, which is about now. To combine depth with the vehicle's pose, use the pose
+        at this instant. [ns, `time.monotonic_ns()`]
+        """
 
     @property
     def ready_ns(self) -> int:
-        """When the runtime had the decoded image. [ns, `time.monotonic_ns()`]"""
+        """Time at which the runtime had decoded the image. [ns, `time.monotonic_ns()`]"""
 
     @property
     def width_px(self) -> int:
@@ -359,22 +360,22 @@ class CameraImage:
     def rgb(self) -> npt.NDArray[np.uint8]:
         """Colour: a read-only view of shape (H, W, 3), uint8, sRGB, in the order red, green, blue.
 
-        OpenCV shows it right after `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
+        For OpenCV, convert it with `cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)`.
         """
 
     @property
     def depth(self) -> npt.NDArray[np.float32]:
-        """Depth along the optical axis: read-only, shape (H, W), float32; 0 is no return. [m, cam]
+        """Depth along the optical axis: read-only, shape (H, W), float32; 0 means no return. [m, cam]
 
-        Converted from `depth_mm` when asked for the first time (0.1 ms at 640x480).
+        Converted from `depth_mm` on first access (0.1 ms at 640x480).
         """
 
     @property
     def depth_mm(self) -> npt.NDArray[np.uint16]:
-        """Depth along the optical axis: a read-only view of shape (H, W), uint16; 0 is no return. [mm, cam]"""
+        """Depth along the optical axis: a read-only view of shape (H, W), uint16; 0: no return. [mm, cam]"""
 
     def depth_m(self, x_px: int, y_px: int) -> float | None:
-        """Returns the depth at column x, row y; None where there is no return. [m, cam]
+        """Returns the depth at column x, row y; None without a return. [m, cam]
 
         Raises IndexError outside the image.
         """
@@ -385,19 +386,19 @@ class CameraImage:
 
     @property
     def pose_at_image(self) -> Pose | None:
-        """Where the body was at the instant that the image shows: what it was rendered from; None where the course
-        withholds the pose. [m, world]
+        """Pose of the body at the instant that the image shows, from which the image was rendered. None if the
+        course withholds the pose. [m, world]
         """
 
     @property
     def body_from_cam(self) -> Pose:
-        """How the camera is mounted."""
+        """Pose of the camera on the body."""
 
 @final
 class Vehicle:
-    """What is known of the vehicle.
+    """State of the vehicle.
 
-    `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` makes one, for tests.
+    `Vehicle(world_from_body, v_world_mps, omega_body_radps, ...)` creates one for tests.
     """
 
     def __new__(
@@ -411,11 +412,11 @@ class Vehicle:
     ) -> Vehicle: ...
     @property
     def stamp_ns(self) -> int:
-        """When this was true. [ns, `time.monotonic_ns()`]"""
+        """Time of this state. [ns, `time.monotonic_ns()`]"""
     @property
     def attitude_xyzw(self) -> _F64:
         """Attitude as a unit quaternion x, y, z, w that rotates vectors from body to world axes: shape (4,),
-        float64. The localized one where the course gives the pose, else the autopilot's estimate.
+        float64. From localization if the course gives the pose, otherwise the autopilot's estimate.
         """
     @property
     def yaw_rad(self) -> float:
@@ -425,19 +426,19 @@ class Vehicle:
         """Angular velocity: shape (3,), float64. [rad/s, body]"""
     @property
     def world_from_body(self) -> Pose | None:
-        """Position and attitude as localized; None where the course withholds them. [m, world]"""
+        """Position and attitude from localization; None if the course withholds them. [m, world]"""
     @property
     def p_world_m(self) -> _F64 | None:
-        """Position: shape (3,), float64; None where the course withholds it. [m, world]"""
+        """Position: shape (3,), float64; None if the course withholds it. [m, world]"""
     @property
     def v_world_mps(self) -> _F64 | None:
-        """Velocity: shape (3,), float64; None where the course withholds it. [m/s, world]"""
+        """Velocity: shape (3,), float64; None if the course withholds it. [m/s, world]"""
 
 @final
 class ImuSample:
-    """One reading of the autopilot's accelerometer and gyroscope.
+    """One sample of the autopilot's accelerometer and gyroscope.
 
-    `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` makes one, for tests.
+    `ImuSample(accel_mps2, gyro_radps, stamp_ns=0)` creates one for tests.
     """
 
     def __new__(
@@ -445,7 +446,7 @@ class ImuSample:
     ) -> ImuSample: ...
     @property
     def stamp_ns(self) -> int:
-        """When it was measured. [ns, `time.monotonic_ns()`]"""
+        """Time of the measurement. [ns, `time.monotonic_ns()`]"""
     @property
     def accel_mps2(self) -> _F64:
         """Specific force: shape (3,), float64; at rest and level +9.8 along z. [m/s^2, body]"""
@@ -455,9 +456,9 @@ class ImuSample:
 
 @final
 class Battery:
-    """The battery, as the autopilot measures it.
+    """State of the battery, as measured by the autopilot.
 
-    `Battery(fraction=None, voltage_v=None)` makes one, for tests.
+    `Battery(fraction=None, voltage_v=None)` creates one for tests.
     """
 
     def __new__(
@@ -465,27 +466,27 @@ class Battery:
     ) -> Battery: ...
     @property
     def fraction(self) -> float | None:
-        """What is left, 0 to 1; None if the autopilot does not know."""
+        """Remaining charge, 0 to 1; None if the autopilot does not report it."""
     @property
     def voltage_v(self) -> float | None:
         """Voltage; None if it is not measured. [V]"""
 
 @final
 class Setpoint:
-    """What a plugin asks of the vehicle; the newest one holds until the guard's deadline of 0.5 s.
+    """Requested motion of the vehicle. The newest setpoint stays in force until the guard's deadline of 0.5 s.
 
-    `yaw` is where the nose shall point: an angle from world x, counter-clockwise [rad]. `yaw_rate` is how
-    fast it shall turn, counter-clockwise [rad/s]. Without either the heading stays; on a path the nose
-    points into the direction of travel.
+    `yaw` is the direction of the nose: an angle from world x, counter-clockwise [rad]. `yaw_rate` is the rate of
+    turn, counter-clockwise [rad/s]. Without either, the heading does not change; on a path the nose points in
+    the direction of travel.
 
-    `axes` are those in which a vector is given: 'world' (x east, y north, z up), 'heading' (x along the
-    nose, y left, z up, levelled: ahead never means into the floor) or 'body' (x forward, y left, z up, as
-    the vehicle is tilted at the moment).
+    `axes` are the axes of a vector: 'world' (x east, y north, z up), 'heading' (x along the nose, y left, z up,
+    level: forward never points at the floor) or 'body' (x forward, y left, z up, with the vehicle's current
+    tilt).
     """
 
     @property
     def kind(self) -> str:
-        """What it asks for: 'hold', 'land', 'take_off', 'position', 'offset', 'velocity', 'acceleration',
+        """Kind of setpoint: 'hold', 'land', 'take_off', 'position', 'offset', 'velocity', 'acceleration',
         'attitude_rate' or 'trajectory'.
         """
     @staticmethod
@@ -493,11 +494,11 @@ class Setpoint:
         """Stop and stay."""
     @staticmethod
     def land() -> Setpoint:
-        """Come down here and disarm."""
+        """Land here and disarm."""
     @staticmethod
     def take_off() -> Setpoint:
-        """Go straight up or down to the height at which the plugin took over after take-off. (The runtime
-        takes off by itself as soon as the plugin answers images.)
+        """Climb or descend vertically to the height at which the plugin got control after take-off. (The runtime
+        takes off automatically as soon as the plugin replies to images.)
         """
     @staticmethod
     def position(
@@ -515,8 +516,8 @@ class Setpoint:
         yaw: SupportsFloat | None = None,
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
-        """Fly to a point (3,) given from where the vehicle is when the runtime takes this, and stay: for
-        plugins that do not know their position. [m, axes]
+        """Fly to a point (3,) relative to the vehicle's position at the time when the runtime takes the setpoint,
+        and stay: for plugins that do not have their position. [m, axes]
         """
     @staticmethod
     def velocity(
@@ -535,11 +536,11 @@ class Setpoint:
         yaw: SupportsFloat | None = None,
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
-        """Accelerate (3,), gravity already compensated: zero keeps the velocity. [m/s^2, axes]"""
+        """Accelerate (3,). Gravity is compensated: zero keeps the velocity. [m/s^2, axes]"""
     @staticmethod
     def attitude_rate(omega_body_radps: _Vector, thrust: SupportsFloat) -> Setpoint:
-        """Turn at body rates (3,) [rad/s, body] under a thrust, of all motors together over the vehicle's
-        weight: 1 carries it when level. Only where the course allows it (`ArenaInfo.attitude_rate`).
+        """Turn at body rates (3,) [rad/s, body] with a thrust of all motors, relative to the vehicle's weight: 1
+        carries the level vehicle. Only if the course allows it (`ArenaInfo.attitude_rate`).
         """
     @staticmethod
     def waypoints(
@@ -551,12 +552,12 @@ class Setpoint:
         yaw: SupportsFloat | None = None,
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
-        """Follow straight lines through up to 32 points (N, 3) [m, axes], at most at `speed_mps` (one number,
-        or one per point for the way to it) [m/s], and stay at the last.
+        """Follow straight lines through up to 32 points (N, 3) [m, axes], with a maximum speed of `speed_mps` (one
+        number, or one per point for the way to it) [m/s], and stay at the last point.
 
-        The runtime follows it as long as the plugin answers images, with None or the same path again. A
-        path of another `id` starts again. With axes 'heading' or 'body' the points count from where the
-        vehicle is when the runtime takes the path.
+        The runtime follows the path as long as the plugin replies to images, with None or the same path. A path
+        with another `id` starts from its first point. With axes 'heading' or 'body', the points are relative to
+        the vehicle's position at the time when the runtime takes the path.
         """
     @staticmethod
     def polynomial(
@@ -568,51 +569,50 @@ class Setpoint:
         yaw: SupportsFloat | None = None,
         yaw_rate: SupportsFloat | None = None,
     ) -> Setpoint:
-        """Follow up to 8 polynomial pieces, one after the other: piece i lasts `seconds[i]` [s], and after t
-        seconds of it the position is the sum of `coefficients[i, k] * t**k`. `coefficients` has the shape
-        (pieces, up to 8, 3). [m/s^k, axes]
+        """Follow up to 8 polynomial pieces, one after the other. Piece i takes `seconds[i]` [s]; t seconds after
+        its start, the position is the sum of `coefficients[i, k] * t**k`. `coefficients` has the shape (pieces,
+        up to 8, 3). [m/s^k, axes]
 
         Otherwise as `waypoints`.
         """
 
 @final
 class Event:
-    """One occurrence of the flight.
+    """One event of the flight.
 
-    `Event(kind, text, stamp_ns=0, **details)` makes one, for tests.
+    `Event(kind, text, stamp_ns=0, **details)` creates one for tests.
     """
 
     def __new__(cls, kind: str, text: str = "", *, stamp_ns: int = 0, **details: Any) -> Event: ...
     @property
     def kind(self) -> str:
-        """What happened: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
+        """Kind of event: 'collision', 'geofence', 'stage', 'finished', 'time_limit', 'pose_lost', 'pose_regained',
         'emergency_stop', 'phase', 'plugin_failed', 'note', 'start' or 'land'.
         """
 
     @property
     def details(self) -> dict[str, Any]:
-        """What belongs to the kind, by name: `{'seconds': 12.4}` of 'finished', `{'phase': 'flying'}` of 'phase',
-        `{'index': 0, 'name': 'gate'}` of 'stage', `{'p_world_m': [...], 'clearance_m': ...}` of 'collision'.
+        """Fields of the kind by name: `{'seconds': 12.4}` for 'finished', `{'phase': 'flying'}` for 'phase',
+        `{'index': 0, 'name': 'gate'}` for 'stage', `{'p_world_m': [...], 'clearance_m': ...}` for 'collision'.
         """
 
     @property
     def text(self) -> str:
-        """One sentence for a person."""
+        """Description in words."""
 
     @property
     def stamp_ns(self) -> int:
-        """When, on the server's clock. [ns]"""
+        """Time on the server's clock. [ns]"""
 
 @final
 class Pose:
-    """A rigid transform that knows its two frames: `world_from_body` takes body coordinates to world
-    coordinates, and is the pose of the body in the world.
+    """A rigid transform between two named frames. `world_from_body` converts body coordinates to world coordinates,
+    and is the pose of the body in the world.
 
-    Frames are 'world' (x east, y north, z up), 'body' (x forward, y left, z up) and 'cam' (x right,
-    y down, z forward). Composing is `@`, and works only where the frames meet:
-    `world_from_body @ body_from_cam`.
+    Frames are 'world' (x east, y north, z up), 'body' (x forward, y left, z up) and 'cam' (x right, y down, z
+    forward). `@` composes poses. The inner frames must be the same: `world_from_body @ body_from_cam`.
 
-    `Pose(into, from_, translation_m, rotation_xyzw)` makes one, for tests.
+    `Pose(into, from_, translation_m, rotation_xyzw)` creates one for tests.
     """
 
     def __new__(
@@ -636,20 +636,20 @@ class Pose:
 
     @property
     def matrix(self) -> _F64:
-        """The whole transform as a homogeneous matrix: shape (4, 4), float64."""
+        """Complete transform as a homogeneous matrix: shape (4, 4), float64."""
 
     @property
     def yaw_rad(self) -> float:
         """Heading: angle of the right frame's x axis about z, from x, counter-clockwise. [rad]"""
 
     def inverse(self) -> Pose:
-        """Returns the transform the other way round."""
+        """Returns the inverse transform."""
 
     def transform_point(self, points_m: npt.ArrayLike) -> _F64:
-        """Takes a point (3,) or points (N, 3) from the right frame to the left one. [m]"""
+        """Converts a point (3,) or points (N, 3) from the right frame to the left one. [m]"""
 
     def rotate(self, vectors: npt.ArrayLike) -> _F64:
-        """Takes a direction or velocity (3,), or many (N, 3), from the right frame to the left one."""
+        """Rotates a direction or velocity (3,), or many (N, 3), from the right frame to the left one."""
 
     def __matmul__(self, other: Pose) -> Pose: ...
 
@@ -657,7 +657,7 @@ class Pose:
 class Intrinsics:
     """Size, focal lengths, principal point and lens of a camera.
 
-    Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, its centre is (0.5, 0.5).
+    Pixels are continuous: (0, 0) is the outer corner of the top-left pixel, (0.5, 0.5) is its centre.
     """
 
     def __new__(
@@ -665,7 +665,7 @@ class Intrinsics:
     ) -> Intrinsics: ...
     @staticmethod
     def from_horizontal_fov(width_px: int, height_px: int, fov_rad: float) -> Intrinsics:
-        """Makes a camera with square pixels, a centred principal point and this field of view. [px, rad]"""
+        """Creates a camera with square pixels, a centred principal point and this field of view. [px, rad]"""
 
     @property
     def width_px(self) -> int:
@@ -693,73 +693,71 @@ class Intrinsics:
 
     @property
     def distortion_model(self) -> Literal["none", "brown_conrady", "kannala_brandt"]:
-        """The lens: 'none', 'brown_conrady' (OpenCV's usual model) or 'kannala_brandt' (its fisheye)."""
+        """Lens model: 'none', 'brown_conrady' (OpenCV's standard model) or 'kannala_brandt' (its fisheye model)."""
 
     @property
     def distortion(self) -> _F64:
-        """The lens's coefficients in OpenCV's order: shape (0,), (5,) or (4,), float64."""
+        """Distortion coefficients in OpenCV's order: shape (0,), (5,) or (4,), float64."""
 
     @property
     def matrix(self) -> _F64:
-        """The camera matrix: shape (3, 3), float64. [px]"""
+        """Camera matrix: shape (3, 3), float64. [px]"""
 
     @property
     def opencv_matrix(self) -> _F64:
-        """The camera matrix for OpenCV, whose (0, 0) is the centre of the top-left pixel: half a pixel less.
-        Shape (3, 3), float64. [px]
+        """Camera matrix for OpenCV, where (0, 0) is the centre of the top-left pixel: the principal point is
+        smaller by half a pixel. Shape (3, 3), float64. [px]
         """
 
     def project(self, p_cam_m: npt.ArrayLike) -> _F64:
-        """Returns where a point (3,) [m, cam] lies in the image: shape (2,) [px]; of points (N, 3), shape (N, 2).
-        NaN for what lies behind the camera or out of the lens's reach.
+        """Returns the pixel of a point (3,) [m, cam]: shape (2,) [px]. For points (N, 3), shape (N, 2). NaN for
+        points behind the camera or outside the range of the lens model.
         """
 
 def course_map() -> list[Volume] | None:
-    """Returns every obstacle of the course, where its map is known; None where it is not. [world]
+    """Returns every obstacle of the course, or None if the course does not give the map. [world]
 
-    # Errors
-    `ValueError` for a map that cannot be read.
+    Raises ValueError if the map cannot be read.
     """
 
 @final
 class Volume:
-    """A solid in the world frame: sphere, box, capsule or half space."""
+    """A solid volume in the world frame: sphere, box, capsule or half space."""
 
     @staticmethod
     def sphere(center_m: _Vector, radius_m: float) -> Volume:
-        """Makes a sphere. [m, world]"""
+        """Creates a sphere. [m, world]"""
 
     @staticmethod
     def aabb(min_m: _Vector, max_m: _Vector) -> Volume:
-        """Makes a box from two opposite corners, its sides along the axes. [m, world]"""
+        """Creates a box from two opposite corners, with its sides along the axes. [m, world]"""
 
     def signed_distance_m(self, p_world_m: npt.ArrayLike) -> Any:
-        """Returns how far a point (3,), or each of points (N, 3), is from the surface: negative inside.
-        A float or shape (N,), float64. [m, world]
+        """Returns the distance of a point (3,), or of points (N, 3), from the surface; negative inside. A float or
+        shape (N,), float64. [m, world]
         """
 
 @final
 class ObservationBuffer:
-    """Observations made by hand: for a plugin's own tests and for notebooks.
+    """Observations created by hand, for a plugin's own tests and for notebooks.
 
-    `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras, and room for these sensors.
+    `ObservationBuffer([CameraInfo(...)], [SensorInfo(...)])` has planes for these cameras and space for these
+    sensors.
     """
 
     def __new__(
         cls, cameras: Sequence[CameraInfo], sensors: Sequence[SensorInfo] = ...
     ) -> ObservationBuffer: ...
     def clear(self, seq: int = 0) -> None:
-        """Empties it and numbers it."""
+        """Removes all content and sets the number of the observation."""
 
     def set_vehicle(self, vehicle: Vehicle) -> None:
-        """Fills in what is known of the vehicle."""
+        """Sets the state of the vehicle."""
 
     def set_battery(self, battery: Battery) -> None:
-        """Fills in the battery's state."""
+        """Sets the state of the battery."""
     def set_imu(self, samples: Sequence[ImuSample]) -> None:
-        """Fills in the newest IMU samples, oldest first; those with stamps that a plugin has had already, it
-        does not get again.
-        """
+        """Sets the newest IMU samples, oldest first. A plugin receives each stamp only once."""
     def set_image(
         self,
         name: str,
@@ -770,12 +768,12 @@ class ObservationBuffer:
         stamp_ns: int = 0,
         ready_ns: int | None = None,
     ) -> None:
-        """Fills in a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16; black and without
-        returns where not given. Stamps are of `time.monotonic_ns()`. [ns]
+        """Sets a camera's image: `rgb` (H, W, 3) uint8, `depth_mm` (H, W) uint16. The default is black, without
+        returns. Stamps are `time.monotonic_ns()`. [ns]
         """
 
     def set_pose_at_image(self, name: str, world_from_body: Pose) -> None:
-        """Fills in where the body was at the instant that a camera's image shows."""
+        """Sets the pose of the body at the instant that a camera's image shows."""
 
     def set_reading(
         self,
@@ -786,101 +784,103 @@ class ObservationBuffer:
         stamp_ns: int = 0,
         pose_at_reading: Pose | None = None,
     ) -> None:
-        """Fills in a sensor's reading: `records` as bytes or as an array of the layout that `SensorReading.records`
-        documents. `pose_at_reading` is where the body was. Stamps are of `time.monotonic_ns()`. [ns]
+        """Sets a sensor's reading: `records` as bytes, or as an array with the layout of `SensorReading.records`.
+        `pose_at_reading` is the pose of the body. Stamps are `time.monotonic_ns()`. [ns]
         """
 
     def observation(self) -> Observation:
-        """Returns what a plugin would see."""
+        """Returns the observation that a plugin would receive."""
 
 @final
 class Rehearsal:
-    """A runtime without a flight: plays the runtime's part for a plugin that runs on another thread, or in
-    another process, attached to `service`. With `waiting`, `vizflyt.run` finds it by itself.
+    """A runtime without a flight, for a plugin that runs on another thread or in another process, attached to
+    `service`. With `waiting`, `vizflyt.run` finds it automatically.
     """
 
     def __new__(cls, cameras: Sequence[CameraInfo], *, waiting: bool = False) -> Rehearsal: ...
     @property
     def service(self) -> str:
-        """What the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`."""
+        """Service that the plugin attaches to: `vizflyt.run(MyPlugin, service=...)`."""
 
     @property
     def is_attached(self) -> bool:
-        """Whether a plugin has attached: from then on messages reach it."""
+        """Whether a plugin is attached, so that messages reach it."""
 
     def start(self, info: ArenaInfo) -> None:
-        """Sends the plugin its arena."""
+        """Sends the description of the arena to the plugin."""
 
     def note(self, text: str) -> None:
-        """Tells it an event of kind 'note'."""
+        """Sends an event of kind 'note'."""
 
     def finish(self, seconds: float) -> None:
-        """Tells it that the goal was reached after so many seconds."""
+        """Sends the event that the goal was reached after this time. [s]"""
 
     def stop(self) -> None:
-        """Tells it to end."""
+        """Requests the plugin to stop."""
 
     def publish(self, buffer: ObservationBuffer) -> None:
-        """Hands it the buffer's images, through shared memory."""
+        """Publishes the buffer's images through shared memory."""
 
     def receive(
         self, timeout_s: float = 10.0
     ) -> tuple[Literal["ready", "odometry", "answer", "failed"], int, Any, int] | None:
-        """Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns),
-        ('answer', seq, setpoint, entered_ns) or ('failed', 0, reason, 0); None if none comes within this time. [s]
+        """Waits for a message of the plugin: ('ready', 0, name, 0), ('odometry', 0, pose, stamp_ns), ('answer',
+        seq, setpoint, entered_ns) or ('failed', 0, reason, 0). None after a timeout. [s]
         """
 
 class NotFiniteError(ValueError):
-    """A NaN or an infinity where a number must be finite. Out of `on_image` it counts as an answer that the
-    runtime refuses: the vehicle holds after 0.5 s and lands after 2 s without a better one.
+    """A NaN or an infinity where a number must be finite. Raised by `on_image`, it counts as a reply that the
+    runtime rejects: the vehicle holds after 0.5 s and lands after 2 s without a valid one.
     """
 
 @final
 class PluginEnd:
-    """Not for plugins: what `vizflyt.run` is made of."""
+    """Not for plugins: connection to the runtime, used by `vizflyt.run`."""
 
     def __new__(cls, service: str) -> PluginEnd: ...
     def wait(self, timeout_s: float) -> bool:
-        """Waits until there is something to take, `timeout_s` at most; returns whether there is."""
+        """Waits for a message or an observation, at most `timeout_s`; returns whether there is one."""
 
     def receive(self) -> tuple[Literal["start", "event", "stop", "gone"], Any] | None:
-        """Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event), ("stop", None),
-        or None if there is none; ("gone", None) once the runtime has ended.
+        """Returns the runtime's next message: ("start", `ArenaInfo`), ("event", Event) or ("stop", None). None if
+        no message is waiting; ("gone", None) after the runtime has ended.
         """
 
     def observation(self) -> Observation | None:
-        """Returns the newest observation, if there is one not taken yet."""
+        """Returns the newest observation, unless it was returned before."""
 
     def ready(self, name: str) -> None:
         """Reports that `on_start` has returned."""
 
     def answer(self, seq: int, entered_ns: int, setpoint: Setpoint | None) -> None:
-        """Sends the answer to one observation."""
+        """Sends the reply to one observation."""
 
     def answer_not_finite(self, seq: int, entered_ns: int) -> None:
-        """Answers one observation with a setpoint that is not finite, which the runtime refuses by that name."""
+        """Replies to one observation with a setpoint that is not finite, so that the runtime rejects it with this
+        reason.
+        """
 
     def failed(self, reason: str) -> None:
         """Reports that the plugin has failed, with the reason."""
 
 def publish_odometry(stamp_ns: int, p_odom_m: _Vector, rotation_xyzw: npt.ArrayLike) -> None:
-    """Publishes where the plugin thinks the vehicle was at `stamp_ns`; of an estimate from an image that is
-    `image.shown_ns`. It leaves with the answer to the image, is logged on `/odometry`, and `vizflyt grade` reports how
-    far off it was. Nothing is flown by it.
+    """Publishes the plugin's estimate of the vehicle's pose at `stamp_ns`. For an estimate from an image, pass
+    `image.shown_ns`. The estimate is sent with the reply to the image and logged on `/odometry`, and `vizflyt
+    grade` reports its error. It does not control the flight.
 
-    `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` the unit quaternion that rotates from body to
-    odom axes, shape (4,). z of the frame `odom` is up; its origin and heading are the plugin's choice.
+    `p_odom_m` is the body's position, shape (3,) [m]; `rotation_xyzw` is the unit quaternion that rotates from
+    body to odom axes, shape (4,). z of the frame `odom` is up; the plugin chooses its origin and heading.
 
-    Raises NotFiniteError or ValueError for what is no pose, ValueError for more than four in one `on_image`.
+    Raises NotFiniteError or ValueError for an invalid pose, ValueError for more than four in one `on_image`.
     """
 
 def decode_image(
     bitstream: bytes, jpeg: bytes | None = None
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image as logs hold it, whose colour may be
-    apart.
+    """Not for plugins: returns colour (H, W, 3) and depth (H, W) [mm] of an image in a log. `jpeg` is the colour if
+    the log stores it separately.
 
-    Raises ValueError for what does not decode.
+    Raises ValueError if the image does not decode.
     """
 
 def waiting_services() -> list[str]:

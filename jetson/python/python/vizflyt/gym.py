@@ -1,4 +1,4 @@
-"""Courses as environments to learn in: Gymnasium's API over vehicles that fly on a clock of their own, many at once.
+"""Courses as reinforcement-learning environments: Gymnasium's API for many simulated vehicles on a virtual clock.
 
 ::
 
@@ -6,28 +6,28 @@
     env = gymnasium.make("vizflyt/Forest-v0")                              # the state
     envs = gymnasium.make_vec("vizflyt/Race-v0", num_envs=16, camera=(64, 48), observation=("state", "depth"))
 
-``"vizflyt.gym:vizflyt/Forest-v0"`` imports this module where it is not yet: in the processes of Ray's RLlib.
+``"vizflyt.gym:vizflyt/Forest-v0"`` imports this module if necessary, for example in the processes of Ray's RLlib.
 
-What flies is the simulated airframe under the simulated autopilot's own controllers, on the true state; openings,
-obstacles and fence are judged as in a graded flight. What is not there: the estimator, the guard, and delays other than
-``delay``. The same seeds and actions give the same observations, bit for bit, on the same kind of processor.
+The simulated airframe flies under the controllers of the simulated autopilot, with the true state. Openings, obstacles
+and fence are judged as in a graded flight. There is no estimator, no guard, and no delay except ``delay``. The same
+seeds and actions give the same observations, bit for bit, on the same kind of processor.
 
-``state`` has 22 numbers: velocity (3, [m/s, heading]), up as the body sees it (3), turn (3, [rad/s, body]), the way to
-the next stage or the goal (3, [m, heading]), the direction in which it is passed (3, 0 of a goal), position (3, [m,
-world]), sine and cosine of the heading, stages and goal left, share of the time left. Heading axes: x along the nose, y
-left, z up. ``depth`` is height x width, float32: 0 at the camera, 1 at ``far_m`` and where nothing is. ``rgb`` is
-height x width x 3, uint8.
+``state`` has 22 numbers: velocity (3, [m/s, heading]), the world's up direction (3, [body]), angular velocity (3,
+[rad/s, body]), vector to the next stage or the goal (3, [m, heading]), direction in which to pass it (3, 0 for a goal),
+position (3, [m, world]), sine and cosine of the heading, remaining stages and goal, remaining fraction of the time.
+Heading axes: x along the nose, y left, z up. ``depth`` is height x width, float32: 0 at the camera, 1 at ``far_m`` and
+without a return. ``rgb`` is height x width x 3, uint8.
 
-An action has four numbers from -1 to 1. ``velocity``, ``acceleration``: ahead, left and up in shares of the course's
-limit, and a turn to the left, 1 is 2 rad/s. ``body-rates``: roll, pitch and yaw, 1 is 6, 6 and 3 rad/s, and thrust: -1
-none, 0 the weight, 1 twice that.
+An action has four numbers from -1 to 1. ``velocity`` and ``acceleration``: forward, left and up as fractions of the
+course's limit, and a turn to the left, where 1 is 2 rad/s. ``body-rates``: roll, pitch and yaw, where 1 is 6, 6 and 3
+rad/s, and thrust, where -1 is zero, 0 the weight and 1 twice the weight.
 
 An episode ends with a contact, outside the fence or at the finish (terminated), or after ``seconds`` (truncated).
 
-Keywords of both classes: ``project`` (a name or a FILE.toml), ``courses`` (seeds; an episode's seed chooses among
-them), ``action``, ``observation`` (one of state, depth, rgb, or several: then a ``Dict``), ``camera`` (width, height),
-``fov_deg``, ``far_m``, ``error_px`` (how far splats may be drawn from where they are: 0 is exact, and slower),
-``rate_hz``, ``delay`` (steps until an action counts), ``seconds``, ``variant`` (light and weather), ``reward`` (of a
+Keywords of both classes: ``project`` (a name or a FILE.toml), ``courses`` (seeds; the seed of an episode chooses one),
+``action``, ``observation`` (one of state, depth, rgb, or several as a ``Dict``), ``camera`` (width, height),
+``fov_deg``, ``far_m``, ``error_px`` (maximum position error of rendered splats; 0 is exact but slower), ``rate_hz``,
+``delay`` (steps until an action takes effect), ``seconds``, ``variant`` (light and weather), ``reward`` (function of a
 `Step`), ``program``.
 """
 
@@ -59,18 +59,18 @@ _ACTION, _STATE, _FIGURES = 4, 22, 4
 
 @dataclass(frozen=True)
 class Step:
-    """What rewards are made of, an entry for each environment."""
+    """Input of a reward function, with one entry for each environment."""
 
     progress_m: np.ndarray
-    """How much nearer the target of before came. [m]"""
+    """Decrease of the distance to the target of the previous step. [m]"""
     passed: np.ndarray
     """Stages passed in this step."""
     clearance_m: np.ndarray
-    """From the body's surface to the nearest obstacle, at most 10. [m]"""
+    """Distance from the body's surface to the nearest obstacle, at most 10. [m]"""
     end: np.ndarray
     """FLYING, CRASHED, LEFT_FENCE, FINISHED or TIME_UP."""
     time_s: np.ndarray
-    """Since the episode's start. [s]"""
+    """Time since the start of the episode. [s]"""
     action: np.ndarray
     """N x 4."""
     state: np.ndarray
@@ -78,22 +78,22 @@ class Step:
 
 
 def default_reward(step: Step) -> np.ndarray:
-    """A metre nearer is worth 2, a stage 5, the finish 10, a crash or the fence -4, a step -0.02."""
+    """Rewards: 2 for each metre closer, 5 for a stage, 10 for the finish, -4 for a crash or the fence, -0.02 a step."""
     lost = (step.end == CRASHED) | (step.end == LEFT_FENCE)
     return 2.0 * step.progress_m + 5.0 * step.passed + 10.0 * (step.end == FINISHED) - 4.0 * lost - 0.02
 
 
 def _program() -> str:
-    """The program that pip has installed beside this Python, else the one on PATH."""
+    """Returns the program that pip installed with this Python, otherwise the one on PATH."""
     beside = Path(sys.executable).with_name("vizflyt")
     found = str(beside) if beside.exists() else shutil.which("vizflyt")
     if found is None:
-        raise FileNotFoundError("the program vizflyt is neither beside this Python nor on PATH; give program=")
+        raise FileNotFoundError("the program vizflyt is neither next to this Python nor on PATH; give program=")
     return found
 
 
 class _Flights:
-    """`vizflyt gym`: vehicles that fly in a process of their own."""
+    """`vizflyt gym`: vehicles that fly in a separate process."""
 
     def __init__(
         self,
@@ -138,7 +138,7 @@ class _Flights:
             byte = self._out.read(1)
             if not byte:
                 self.close()
-                raise RuntimeError(f"vizflyt gym ended with status {self._process.wait()}; it says why above")
+                raise RuntimeError(f"vizflyt gym ended with status {self._process.wait()}; see its error above")
             head += byte
         self.about = json.loads(head)
         if (self.about["action"], self.about["state"], self.about["figures"]) != (_ACTION, _STATE, _FIGURES):
@@ -146,7 +146,7 @@ class _Flights:
         height, width = self.about["image"] or (0, 0)
         self._order = np.zeros(count * (1 + 8 + 4 * _ACTION), np.uint8)
         self._resets, seeds, actions = np.split(self._order, [count, 9 * count])
-        # Misaligned: written as bytes.
+        # Misaligned, so written as bytes.
         self._seeds, self._actions = seeds, actions
         lengths = {"state": 4 * _STATE, "figures": 4 * _FIGURES, "end": 1}
         lengths |= {"depth": 2 * height * width} if self.about["depth"] else {}
@@ -174,7 +174,7 @@ class _Flights:
         return self._process.stdout
 
     def fly(self, resets: np.ndarray, seeds: np.ndarray, actions: np.ndarray) -> tuple[Any, Step]:
-        """Begins anew or goes on by a step; returns observations of all, and what rewards are made of."""
+        """Starts episodes or flies one step; returns all observations, and the input of rewards."""
         self._resets[:] = resets
         self._seeds[:] = np.ascontiguousarray(seeds, "<u8").view(np.uint8)
         self._actions[:] = np.ascontiguousarray(actions, "<f4").reshape(-1).view(np.uint8)
@@ -214,7 +214,7 @@ class _Flights:
         return np.minimum(depth, np.float32(1.0), out=depth)
 
     def close(self) -> None:
-        # Its input ends, and so does it.
+        # The process ends when its input ends.
         self._process.stdin.close()  # type: ignore[union-attr]
         try:
             self._process.wait(5)
@@ -225,7 +225,7 @@ class _Flights:
 
 
 class Env(gymnasium.Env):
-    """One vehicle in a course; the module explains its keywords."""
+    """One vehicle in a course. Keywords: see the module's documentation."""
 
     metadata = {"render_modes": []}  # noqa: RUF012, as Gymnasium declares it
 
@@ -236,7 +236,7 @@ class Env(gymnasium.Env):
         self.action_space = self._flights.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode; course and start follow from the seed."""
+        """Begins an episode. The seed determines course and start."""
         super().reset(seed=seed)
         drawn = self.np_random.integers(0, 2**63, 1) if seed is None else np.array([seed])
         seen, step = self._flights.fly(np.ones(1, bool), drawn, np.zeros((1, _ACTION)))
@@ -250,7 +250,7 @@ class Env(gymnasium.Env):
         return _first(seen), float(self._flights.reward(step)[0]), bool(is_over), bool(end == TIME_UP), _info(step)
 
     def close(self) -> None:
-        """Ends the process that flies."""
+        """Ends the process of the flight."""
         self._flights.close()
 
 
@@ -268,14 +268,14 @@ def _info(step: Step) -> dict[str, Any]:
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """Many vehicles, each in an episode of its own, flown and drawn together."""
+    """Many vehicles, each in a separate episode, simulated and rendered together."""
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(self, num_envs: int = 1, project: str = "forest", render_mode: str | None = None, **how: Any) -> None:
         self.render_mode = render_mode
         self.num_envs = num_envs
-        # What has not begun to fly needs no closing.
+        # Nothing to close before the process has started.
         self.closed = True
         self._flights = _Flights(count=num_envs, project=project, **how)
         self.closed = False
@@ -288,7 +288,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins all episodes; of one seed they are seed, seed + 1, and so on. Later ones follow from these."""
+        """Begins all episodes. One seed gives seed, seed + 1, and so on. Later episodes follow from these seeds."""
         super().reset(seed=seed if isinstance(seed, int) else None)
         if seed is None:
             seeds = self._draw()
@@ -302,7 +302,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return seen, self._infos(step)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Flies one step; where an episode was over, the next one begins instead."""
+        """Flies one step. An environment whose episode has ended begins the next one instead."""
         began = self._is_over.copy()
         seen, step = self._flights.fly(began, self._draw(), np.asarray(actions))
         rewards = np.where(began, 0.0, self._flights.reward(step))
@@ -312,7 +312,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return seen, rewards, terminated, truncated, self._infos(step)
 
     def close_extras(self, **_: Any) -> None:
-        """Ends the process that flies."""
+        """Ends the process of the flights."""
         self._flights.close()
 
     def _draw(self) -> np.ndarray:
@@ -323,7 +323,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return {"end": step.end, "clearance_m": step.clearance_m, "passed": step.passed, "time_s": step.time_s}
 
 
-# The course's project of each.
+# Project of each environment.
 for _name, _project in {"Forest": "forest", "Windows": "p3", "Gap": "p4", "Race": "p5", "Pillars": "p2"}.items():
     gymnasium.register(
         id=f"vizflyt/{_name}-v0",

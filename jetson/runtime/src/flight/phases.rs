@@ -54,7 +54,11 @@ impl Flight {
         };
         match missing {
             Some(missing) => self.wait_for(now, missing),
-            None => self.enter(now, FlightPhase::Preparing, "server, plugin and autopilot are ready; preparing"),
+            None => self.enter(
+                now,
+                FlightPhase::Preparing,
+                "server, plugin and autopilot are ready; preparing",
+            ),
         }
     }
 

@@ -1,4 +1,4 @@
-//! Images from hand-made arrivals to the memory that a plugin reads.
+//! Tests from simulated arrivals of images to the memory that a plugin reads.
 
 use super::*;
 use crate::stream::Ticket;
@@ -33,7 +33,7 @@ fn sized_image(camera: u8, tick: u64, depth_mm: u16, [width, height]: [u32; 2]) 
     let view = RgbdView { width, height, rgb: &rgb, depth_mm: &depth_mm };
     let mut payload = Vec::new();
     Encoder::new(EncodeOptions::default()).encode(&view, &mut payload).unwrap();
-    // Mounted as far ahead as the tick number.
+    // Mounted `tick` metres ahead, so that each image has another camera.
     let mount = Pose::new(DVec3::X * tick as f64, DQuat::IDENTITY);
     let world_from_body = Pose::IDENTITY;
     TestImage {
@@ -65,13 +65,13 @@ impl Rig {
         Self { publisher, plugin, names, mailbox: Mailbox::default() }
     }
 
-    /// An image begins to arrive.
+    /// Begins the arrival of an image.
     fn open(&self, image: &TestImage) -> Option<Ticket> {
         let TestImage { header, pose, session, .. } = *image;
         self.mailbox.open(&Arrival { session, header, pose, first: pose })
     }
 
-    /// Pieces of an image arrive; a slice that was cut counts as one.
+    /// Delivers pieces of an image; a truncated slice counts as a piece.
     fn push(&self, ticket: Ticket, image: &TestImage, pieces: std::ops::Range<usize>) {
         let mut all = Vec::new();
         let head_len = peek(&image.payload).unwrap().header_len;
@@ -94,8 +94,7 @@ impl Rig {
         self.mailbox.end(ticket, Some(Whole { trailer, received }));
     }
 
-    /// Gives it an image; returns what was published and (tick, metres) of each camera the plugin
-    /// sees.
+    /// Delivers an image; returns the published observation and the images that the plugin sees.
     fn take(&mut self, image: &TestImage) -> Option<(Published, Vec<Seen>)> {
         let ticket = self.open(image)?;
         self.push(ticket, image, 0..99);
@@ -103,13 +102,13 @@ impl Rig {
         self.step()
     }
 
-    /// Does all there is to do; returns what was published and what the plugin sees.
+    /// Runs all possible steps; returns the published observation and the images that the plugin sees.
     fn step(&mut self) -> Option<(Published, Vec<Seen>)> {
         let mut notified = None;
         let notify = &mut |notice| notified = Some(notice);
         while self.publisher.step(&self.mailbox, Duration::ZERO, notify).unwrap() {}
         let sample = self.plugin.observation().unwrap();
-        assert_eq!(notified.is_some(), sample.is_some(), "notified of what is published");
+        assert_eq!(notified.is_some(), sample.is_some(), "notified of each publication");
         let sample = sample?;
         let observation = Observation::from_bytes(sample.bytes(), &self.names).unwrap();
         let seen = observation
@@ -122,14 +121,14 @@ impl Rig {
         for camera in observation.cameras() {
             let (k, x_m) = (camera.intrinsics, camera.body_from_cam.translation_m.x);
             assert_eq!((k.width_px, k.height_px), (camera.width_px, camera.height_px));
-            assert_eq!(x_m, camera.seq as f64, "the mounting is that of the image");
+            assert_eq!(x_m, camera.seq as f64, "mounting of the image");
         }
         Some((notified.unwrap(), seen))
     }
 }
 
 #[test]
-fn an_image_is_decoded_into_the_plugins_memory() {
+fn decodes_an_image_into_the_plugins_memory() {
     let mut rig = Rig::new(&["front"]);
     let (published, seen) = rig.take(&image(0, 5, 1250)).unwrap();
     assert_eq!(seen, [("front".to_owned(), 5, 1.25)]);
@@ -138,11 +137,11 @@ fn an_image_is_decoded_into_the_plugins_memory() {
     assert!(rig.take(&image(0, 4, 9)).is_none(), "stale");
     assert_eq!(rig.take(&image(0, 6, 2000)).unwrap().0.seq, 2);
     let restarted = TestImage { pose: HostTime::from_ns(99_000), session: 2, ..image(0, 1, 2000) };
-    assert_eq!(rig.take(&restarted).unwrap().0.seq, 3, "a server that counts anew");
+    assert_eq!(rig.take(&restarted).unwrap().0.seq, 3, "restarted server");
 }
 
 #[test]
-fn cameras_of_a_tick_come_together_and_a_missing_one_is_not_waited_for() {
+fn publishes_cameras_of_a_tick_together_without_waiting_for_a_missing_one() {
     let mut rig = Rig::new(&["front", "rear"]);
     assert!(rig.take(&image(0, 1, 1000)).is_none());
     let (_, seen) = rig.take(&image(1, 1, 2000)).unwrap();
@@ -156,10 +155,10 @@ fn cameras_of_a_tick_come_together_and_a_missing_one_is_not_waited_for() {
 }
 
 #[test]
-fn a_camera_that_changes_its_size_loses_no_image() {
+fn loses_no_image_if_a_camera_changes_its_size() {
     let mut rig = Rig::new(&["front"]);
     let mut at = 0;
-    // Up, beyond what the memory was made for, down again, and up by many steps.
+    // Grows beyond the allocated memory, shrinks, and grows by large factors.
     for size in [[32, 24], [640, 480], [8, 8], [32, 24], [1280, 720], [1, 1], [1920, 1080]] {
         at += 1;
         let depth_mm = 1000 + at as u16;
@@ -171,27 +170,27 @@ fn a_camera_that_changes_its_size_loses_no_image() {
 }
 
 #[test]
-fn one_of_two_cameras_grows_between_the_images_of_a_tick() {
+fn one_camera_may_change_its_size_within_a_tick() {
     let mut rig = Rig::new(&["front", "rear"]);
     assert!(rig.take(&image(0, 1, 1000)).is_none());
     let (_, seen) = rig.take(&sized_image(1, 1, 2000, [400, 300])).unwrap();
     assert_eq!(seen, [("front".to_owned(), 1, 1.0), ("rear".to_owned(), 1, 2.0)]);
-    // And both in the next.
+    // Both change in the next tick.
     assert!(rig.take(&sized_image(1, 2, 2100, [64, 48])).is_none());
     let (_, seen) = rig.take(&sized_image(0, 2, 1100, [500, 10])).unwrap();
     assert_eq!(seen, [("front".to_owned(), 2, 1.1), ("rear".to_owned(), 2, 2.1)]);
 }
 
 #[test]
-fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
+fn waits_for_cameras_of_other_rates_only_in_their_ticks() {
     let mut rig = Rig::new(&["front", "rear"]);
     let together = |mut image: TestImage, cameras: u32| {
         image.header.together = cameras.into();
         image
     };
-    // The front camera alone, at once.
+    // Only the front camera: published at once.
     assert_eq!(rig.take(&together(image(0, 1, 1000), 0b01)).unwrap().1.len(), 1);
-    // Both; the rear one rendered a tick before, as it may be when the encoder was busy.
+    // Both; the rear one was rendered a tick before, which happens if the encoder was busy.
     assert!(rig.take(&together(image(0, 3, 1100), 0b11)).is_none());
     let (_, seen) = rig.take(&together(image(1, 2, 2000), 0b11)).unwrap();
     assert_eq!(seen, [("front".to_owned(), 3, 1.1), ("rear".to_owned(), 2, 2.0)]);
@@ -201,7 +200,7 @@ fn cameras_of_other_rates_are_waited_for_only_when_they_come() {
 #[test]
 fn invalid_images_are_dropped() {
     let mut rig = Rig::new(&["front"]);
-    assert!(rig.take(&image(3, 1, 1000)).is_none(), "there is no camera 3");
+    assert!(rig.take(&image(3, 1, 1000)).is_none(), "invalid camera");
     let mut cut = image(0, 2, 1000);
     cut.payload.truncate(cut.payload.len() / 2);
     assert!(rig.take(&cut).is_none());
@@ -213,7 +212,7 @@ fn invalid_images_are_dropped() {
 }
 
 #[test]
-fn an_image_is_decoded_as_it_arrives_and_seen_when_it_is_whole() {
+fn decodes_an_image_while_it_arrives_and_publishes_it_when_complete() {
     let mut rig = Rig::new(&["front"]);
     let image = image(0, 1, 1500);
     let ticket = rig.open(&image).unwrap();
@@ -221,13 +220,13 @@ fn an_image_is_decoded_as_it_arrives_and_seen_when_it_is_whole() {
     assert!(rig.step().is_none());
     assert_eq!(rig.publisher.lanes[0].decoded, 2, "the first slice is decoded already");
     rig.push(ticket, &image, 2..99);
-    assert!(rig.step().is_none(), "not before it is whole");
+    assert!(rig.step().is_none(), "not before it is complete");
     rig.end(ticket, &image);
     assert_eq!(rig.step().unwrap().1, [("front".to_owned(), 1, 1.5)]);
 }
 
 #[test]
-fn an_image_that_is_cut_off_leaves_nothing_behind() {
+fn truncated_image_is_not_published() {
     let mut rig = Rig::new(&["front", "rear"]);
     assert!(rig.take(&image(1, 1, 2000)).is_none());
     let (cut, next) = (image(0, 1, 1000), image(0, 2, 1100));
@@ -236,7 +235,7 @@ fn an_image_that_is_cut_off_leaves_nothing_behind() {
     assert!(rig.step().is_none());
     rig.mailbox.end(ticket, None);
     assert!(rig.step().is_none());
-    // The next tick publishes the rear image alone; the front's half is not seen.
+    // The next tick publishes only the rear image, without the truncated front image.
     let (_, seen) = rig.take(&next).unwrap();
     assert_eq!(seen, [("rear".to_owned(), 1, 2.0)]);
     let (_, seen) = rig.take(&image(1, 2, 2100)).unwrap();
@@ -245,16 +244,16 @@ fn an_image_that_is_cut_off_leaves_nothing_behind() {
 }
 
 #[test]
-fn a_camera_whose_image_stalls_holds_up_no_other_and_its_image_comes_along_later() {
+fn stalled_image_does_not_delay_other_cameras_and_is_published_later() {
     let mut rig = Rig::new(&["front", "rear"]);
     let stalled = image(0, 1, 1000);
     let ticket = rig.open(&stalled).unwrap();
     rig.push(ticket, &stalled, 0..2);
     assert!(rig.take(&image(1, 1, 2000)).is_none());
-    // The rear camera's next image has come whole: what is there is published.
+    // The rear camera's next image is complete: the present observation is published.
     let (_, seen) = rig.take(&image(1, 2, 2100)).unwrap();
     assert_eq!(seen, [("rear".to_owned(), 1, 2.0)]);
-    // The rest of the front's was sent again: all of it is in the next observation.
+    // The rest of the front image arrives late: the complete image is in the next observation.
     rig.push(ticket, &stalled, 2..99);
     rig.end(ticket, &stalled);
     let (_, seen) = rig.step().unwrap();
@@ -271,12 +270,12 @@ fn replaced_image_is_not_mixed_with_its_successor() {
     assert!(rig.step().is_none());
     assert_eq!(rig.take(&new).unwrap().1, [("front".to_owned(), 2, 1.1)]);
     assert_eq!(rig.mailbox.replaced(), 1);
-    assert!(!rig.mailbox.push(ticket, &mut vec![0]), "its receiver learns it");
+    assert!(!rig.mailbox.push(ticket, &mut vec![0]), "the receiver gets `false`");
 }
 
 #[test]
-fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
-    // Numbers that nothing else in an observation has.
+fn writes_the_pose_at_image_only_if_the_course_gives_the_pose() {
+    // Numbers that occur nowhere else in an observation.
     let body =
         Pose::new(DVec3::new(12.345_678, -3.456_789, 2.345_678), DQuat::from_rotation_z(0.7));
     for gives_pose in [true, false] {
@@ -297,7 +296,7 @@ fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
         assert_eq!(found, observation.camera("down").unwrap().pose_at_image);
         let bytes = sample.bytes();
         let holds = |number: f64| {
-            // The last bits are lost on the way over the camera's pose.
+            // A tolerance, because the conversion over the camera's pose rounds.
             bytes
                 .as_chunks::<8>()
                 .0
@@ -316,7 +315,7 @@ fn pose_at_image_is_in_memory_only_where_the_course_gives_the_pose() {
 }
 
 #[test]
-fn the_newest_readings_come_along_with_images() {
+fn publishes_the_newest_readings_with_images() {
     use vizflyt_protocol::sensor::{
         LidarPoint, RangeReading, ReadingHeader, SensorInfo, SensorKind,
     };
@@ -346,7 +345,7 @@ fn the_newest_readings_come_along_with_images() {
     };
     let mut rig = Rig::new(&["front"]);
     let plain_len = rig.take(&image(0, 1, 900)).map(|_| rig.publisher.observation_len()).unwrap();
-    assert_eq!(plain_len, ObservationWriter::len_for(&[camera("front")]), "none, and no byte more");
+    assert_eq!(plain_len, ObservationWriter::len_for(&[camera("front")]), "no extra bytes");
     let readings: Arc<Readings> = Arc::default();
     let sensors = vec![sensor("top", SensorKind::Lidar), sensor("down", SensorKind::RangeFinder)];
     rig.publisher = rig.publisher.with_sensors(sensors, Arc::clone(&readings));
@@ -366,21 +365,21 @@ fn the_newest_readings_come_along_with_images() {
         });
         (top, down)
     };
-    assert_eq!(see(2, true), (None, None), "none has come");
+    assert_eq!(see(2, true), (None, None), "no reading yet");
     let range = RangeReading { range_m: 1.5, signal: 1.0 };
     readings.put(reading(1, SensorKind::RangeFinder, 5, range.as_bytes()));
     assert_eq!(see(3, true), (None, Some((5, Some(1.5), Some(body.translation_m)))));
     assert_eq!(
         see(4, false),
         (None, Some((5, Some(1.5), None))),
-        "the same again; the pose withheld"
+        "the same reading; the pose is withheld"
     );
-    // A scan of more points than the sensor was announced with.
+    // A scan with more points than announced.
     let points = [LidarPoint::default(); 500];
     readings.put(reading(0, SensorKind::Lidar, 6, points.as_bytes()));
     readings.put(reading(1, SensorKind::RangeFinder, 7, RangeReading::default().as_bytes()));
     assert_eq!(see(5, true), (Some((6, 500)), Some((7, None, Some(body.translation_m)))));
-    // One of the other kind than the sensor's: only it is missing.
+    // A reading of another kind than the sensor's: only this reading is missing.
     readings.put(reading(1, SensorKind::Lidar, 8, points.as_bytes()));
     assert_eq!(see(6, true), (Some((6, 500)), None));
 }

@@ -127,9 +127,10 @@ impl Link {
     fn cause(&self, command: Command) -> Option<Cow<'static, str>> {
         let guided = self.state.mode == CopterMode::Guided as u32;
         match command {
-            Command::TakeOff(height_m) if !(height_m > 0.0) => {
-                Some(format!("{height_m} m is not a valid height; set takeoff_height_m of the arena").into())
-            }
+            Command::TakeOff(height_m) if !(height_m > 0.0) => Some(
+                format!("{height_m} m is not a valid height; set takeoff_height_m of the arena")
+                    .into(),
+            ),
             Command::TakeOff(_) if self.dialect.needs_origin() && self.origin.is_none() => Some(
                 "no EKF origin; SET_GPS_GLOBAL_ORIGIN was not confirmed, so check the link to the \
                  autopilot, or set AHRS_OPTIONS=16 and AHRS_ORIGIN_*"

@@ -135,14 +135,10 @@ pub enum SigningFileError {
         "{path} contains no key of 64 hexadecimal digits; create one with `vizflyt vehicle sign`",
         path = .path.display()
     )]
-    NoKey {
-        path: PathBuf,
-    },
+    NoKey { path: PathBuf },
     /// Other users can read the file.
     #[error("{path} can be read by others; `chmod 600` it, and create a new key", path = .path.display())]
-    Open {
-        path: PathBuf,
-    },
+    Open { path: PathBuf },
 }
 
 /// Added to the last stamp if the clock was reset: longer than a flight. [us]

@@ -162,7 +162,10 @@ fn logs_on_the_virtual_clock_are_reproducible_and_replayed() {
     logged(&path, LoggedImages::Full);
     let again = folder.path().join("again.mcap");
     logged(&again, LoggedImages::Full);
-    assert!(fs::read(&path).unwrap() == fs::read(&again).unwrap(), "the log contains no wall clock");
+    assert!(
+        fs::read(&path).unwrap() == fs::read(&again).unwrap(),
+        "the log contains no wall clock"
+    );
     let plan = ReplayPlan::read(RecordedFlight::new(LogReader::open(&path).unwrap(), false));
     let plan = plan.unwrap();
     assert_eq!(plan.flown.as_ref().unwrap().plugin, "misbehave");

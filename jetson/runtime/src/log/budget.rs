@@ -1,24 +1,24 @@
-//! How many images a reduced log keeps: a token bucket of bytes.
+//! Selects the images of a reduced log by a token bucket of bytes.
 //!
-//! Everything that is written spends; time earns. An image is written, whole, while nothing is
-//! owed. So images are spread evenly, each is bit-exact, and all else always fits.
+//! Each write takes from the bucket, and time refills it. An image is written completely if the level is
+//! not negative. Kept images are therefore evenly spaced and bit-exact, and all other records are kept.
 
 use vizflyt_protocol::time::HostTime;
 
-/// What a log may grow by: 57 MB a minute, so that with a second's savings and the last image any
-/// minute stays within 60 MB. [bytes/s]
+/// Refill rate: 57 MB a minute, so that each minute stays within 60 MB including a full bucket and the
+/// last image. [bytes/s]
 const BYTES_PER_S: f64 = 0.95e6;
-/// The most that is saved up, and what a log begins with, so that it has the first images of a plugin
-/// that fails at once. [bytes]
+/// Capacity and initial level of the bucket, so that the log has the first images of a plugin that fails
+/// at once. [bytes]
 const MAX_SAVED: f64 = BYTES_PER_S;
-/// What MCAP adds to a message: its record's head (31 bytes) and its entry in the chunk's index (16)
+/// Overhead of MCAP per message: head of the record (31 bytes) and entry in the chunk's index (16)
 /// (MCAP specification, "Message", "Message Index"). [bytes]
 const OVERHEAD: usize = 47;
 
-/// The bytes that a log may still write.
+/// Token bucket of bytes that a log may still write.
 #[derive(Debug)]
 pub(super) struct Budget {
-    /// Negative: what is owed. [bytes]
+    /// Level; negative if overdrawn. [bytes]
     left: f64,
     earned_until: Option<HostTime>,
 }
@@ -30,12 +30,12 @@ impl Default for Budget {
 }
 
 impl Budget {
-    /// A message of this length has been written.
+    /// Takes a written message of length `len` from the bucket.
     pub(super) fn spend(&mut self, len: usize) {
         self.left -= (len + OVERHEAD) as f64;
     }
 
-    /// Returns whether an image that came `at` is to be written.
+    /// Returns whether to write an image that arrived at `at`.
     pub(super) fn allows_image(&mut self, at: HostTime) -> bool {
         let since_s = self.earned_until.map_or(0.0, |until| at.seconds_since(until)).max(0.0);
         self.earned_until = self.earned_until.max(Some(at));
@@ -49,8 +49,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Seconds at 60 Hz of images of `image` bytes and `rest` bytes beside each; returns the ticks of
-    /// those written and all bytes.
+    /// Simulates `seconds` at 60 Hz with images of `image` bytes and `rest` other bytes each. Returns the
+    /// ticks of the written images and the total size.
     fn fly(seconds: u64, image: usize, rest: usize) -> (Vec<u64>, usize) {
         let mut budget = Budget::default();
         let (mut kept, mut bytes) = (Vec::new(), 0);
@@ -71,19 +71,19 @@ mod tests {
         let (kept, bytes) = fly(60, 79_000, 6_000);
         assert!(bytes < 60_000_000, "{bytes}");
         assert!((400..600).contains(&kept.len()), "{}", kept.len());
-        assert_eq!(kept[..10], [0, 1, 2, 3, 4, 5, 6, 7, 8, 9], "what a log begins with");
+        assert_eq!(kept[..10], [0, 1, 2, 3, 4, 5, 6, 7, 8, 9], "initial level");
         let gaps: Vec<u64> = kept[20..].windows(2).map(|pair| pair[1] - pair[0]).collect();
         let (least, most) = (gaps.iter().min().unwrap(), gaps.iter().max().unwrap());
         assert!(most - least <= 1, "{least} to {most} ticks apart");
     }
 
     #[test]
-    fn small_images_are_all_kept() {
+    fn keeps_all_small_images() {
         assert_eq!(fly(10, 8_000, 4_000).0.len(), 600);
     }
 
     #[test]
-    fn a_pause_saves_for_a_second_only_and_a_clock_that_goes_back_earns_nothing() {
+    fn saves_at_most_one_second_and_ignores_backward_clock_jumps() {
         let mut budget = Budget::default();
         assert!(budget.allows_image(HostTime::from_ns(1_000_000_000)));
         assert!(budget.allows_image(HostTime::from_ns(60_000_000_000)));
@@ -94,9 +94,9 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the images' size, a minute is within 60 MB and one image.
+        /// For any size of images, a minute is within 60 MB and one image.
         #[test]
-        fn any_size_is_within_60_mb_a_minute(image in 0_usize..4_000_000, rest in 0_usize..10_000) {
+        fn keeps_any_image_size_within_60_mb_a_minute(image in 0_usize..4_000_000, rest in 0_usize..10_000) {
             let (kept, bytes) = fly(60, image, rest);
             prop_assert!(bytes <= 60_000_000 + image, "{}", bytes);
             prop_assert!(!kept.is_empty());

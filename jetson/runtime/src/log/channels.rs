@@ -1,7 +1,7 @@
-//! What is logged: topics, encodings, schemas.
+//! Channels of the log: topics, encodings, schemas.
 //!
-//! What Foxglove knows a message for is logged as that (protobuf); our own figures are JSON; and
-//! what replay needs bit by bit is protobuf of our own ([`super::messages`]).
+//! Data with a Foxglove message uses it (protobuf). Other values are JSON. Data that a replay needs
+//! bit by bit uses custom protobuf messages ([`super::messages`]).
 
 use foxglove::messages as fox;
 use foxglove::{Encode, Schema};
@@ -9,66 +9,66 @@ use serde_json::{Value, json};
 
 use super::messages;
 
-/// What is logged; each has its topic, the cameras' and sensors' have one for each of them.
+/// Channel of the log, with one topic; channels of cameras and sensors have one topic for each of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Channel {
     /// Localized pose: foxglove.PoseInFrame.
     Pose,
     /// Pose of body in world and of cameras in body: foxglove.FrameTransform.
     Transform,
-    /// Localized velocity and the pose's age.
+    /// Localized velocity, and age of the pose.
     Motion,
-    /// Where an image was rendered from, at the instant that it shows: foxglove.PoseInFrame.
+    /// Pose of the body from which an image was rendered, at the image's instant: foxglove.PoseInFrame.
     PoseAtImage,
     /// The autopilot's accelerometer and gyroscope.
     Imu,
-    /// Where the plugin thinks it is: foxglove.PoseInFrame.
+    /// Odometry estimate of the plugin: foxglove.PoseInFrame.
     Odometry,
-    /// What the plugin asked for.
+    /// Setpoint requested by the plugin.
     Requested,
-    /// What the guard sent on.
+    /// Setpoint sent by the guard.
     Sent,
     /// Events of server and runtime: foxglove.Log.
     Event,
-    /// The runtime's regular report.
+    /// Periodic report of the runtime.
     Telemetry,
-    /// Lines the plugin printed: foxglove.Log.
+    /// Lines printed by the plugin: foxglove.Log.
     PluginOutput,
-    /// Stamps of each image on its way.
+    /// Stamps of each image at the stages of its processing.
     Image,
-    /// Where images get their age, over the last seconds.
+    /// Contributions of the stages to the image age, over the last seconds.
     Timing,
-    /// How the log itself fares.
+    /// Status of the log itself.
     Log,
-    /// What went through shared memory to the plugin, images as encoded, colour apart.
+    /// Observations as sent through shared memory to the plugin, images as encoded, colour separate.
     Observation,
-    /// Messages to and from the plugin, as they were.
+    /// Messages to and from the plugin, unchanged.
     Plugin,
     /// Colour of a camera as encoded: foxglove.CompressedImage.
     Color(u8),
-    /// How a camera's images are rendered: foxglove.CameraCalibration.
+    /// Calibration of a camera: foxglove.CameraCalibration.
     Calibration(u8),
-    /// Each instant of a camera's image.
+    /// Stamps of a camera's images.
     Stamps(u8),
-    /// A camera's depth for viewers, if it is wanted: foxglove.RawImage.
+    /// Depth of a camera for viewers, if requested: foxglove.RawImage.
     Depth(u8),
-    /// What a LiDAR or a radar sees: foxglove.PointCloud.
+    /// Points of a LiDAR or a radar: foxglove.PointCloud.
     Points(u8),
-    /// What a range finder or a sonar measures: foxglove.LaserScan.
+    /// Range of a range finder or a sonar: foxglove.LaserScan.
     Range(u8),
 }
 
-/// How a channel presents itself in a file or to a viewer.
+/// Description of a channel in a file or for a viewer.
 #[derive(Clone, Debug)]
 pub(super) struct Description {
     pub(super) topic: String,
-    /// Of messages: `json` or `protobuf`.
+    /// Encoding of messages: `json` or `protobuf`.
     pub(super) encoding: &'static str,
     pub(super) schema: Schema,
 }
 
 impl Channel {
-    /// Those that every log has; cameras come when their first image does.
+    /// Channels of every log. Channels of cameras are added with their first image.
     pub(super) const FIXED: [Self; 16] = [
         Self::Pose,
         Self::Transform,
@@ -88,7 +88,7 @@ impl Channel {
         Self::Plugin,
     ];
 
-    /// Returns the topic; `camera` is the name of the camera or sensor whose channel it is.
+    /// Returns the topic; `camera` is the name of the channel's camera or sensor.
     pub(super) fn topic(self, camera: &str) -> String {
         match self {
             Self::Pose => "/pose".into(),
@@ -115,7 +115,6 @@ impl Channel {
         }
     }
 
-    /// Returns how the channel presents itself.
     pub(super) fn describe(self, camera: &str) -> Description {
         let topic = self.topic(camera);
         let foxglove = match self {
@@ -140,7 +139,7 @@ impl Channel {
         Description { topic, encoding: "json", schema }
     }
 
-    /// Name and properties of a JSON channel's messages, as far as viewers use them.
+    /// Returns name and properties of a JSON channel's messages, for viewers.
     fn json_schema(self) -> (&'static str, Value) {
         let number = json!({"type": "number"});
         let text = json!({"type": "string"});

@@ -1,5 +1,5 @@
-//! A flight log as data: images by the instant that they show, poses, IMU, setpoints, in the order in which they
-//! were written. What `vizflyt export` writes for other people's programs.
+//! Data of a flight log for `vizflyt export`: images with the instants that they show, poses, IMU and setpoints, in
+//! the order in which they were written.
 
 use std::io::Read;
 
@@ -13,51 +13,51 @@ use super::channels::Channel;
 use super::messages::Observation;
 use super::read::{LogError, LogMessage, LogReader, Next, Recorded, RecordedFlight, pose_of};
 
-/// Where the body was at an instant.
+/// Pose of the body at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StampedPose<A: Frame> {
-    /// Since 1970. [ns]
+    /// Time since 1970. [ns]
     pub at_ns: u64,
-    /// The body in the frame `A`.
+    /// Pose of the body in the frame `A`.
     pub from_body: Pose<A, Body>,
 }
 
-/// One image of a flight. Times count since 1970, on the clock of the log.
+/// One image of a flight. Times count from 1970, on the clock of the log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlightImage {
-    /// Its camera's name.
+    /// Name of the camera.
     pub camera: String,
-    /// The observation that it was in.
+    /// Number of the image's observation.
     pub seq: u64,
-    /// The instant that it shows. [ns]
+    /// Instant that the image shows. [ns]
     pub shown_ns: u64,
-    /// When the newest pose behind it was measured. [ns]
+    /// Measurement time of the newest pose used for the image. [ns]
     pub pose_ns: u64,
-    /// When its last byte had come. [ns]
+    /// Arrival time of the last byte. [ns]
     pub received_ns: u64,
-    /// Camera, lens, mounting, and where it was rendered from.
+    /// Camera, lens, mounting, and pose for rendering.
     pub header: ImageHeader,
-    /// The RGB-D bitstream; empty if images are not wanted.
+    /// RGB-D bitstream; empty if read without images.
     pub bitstream: Vec<u8>,
 }
 
-/// The localized motion of the vehicle, and how well it is known.
+/// Localized velocity of the vehicle, and uncertainty of its pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FlightMotion {
-    /// When it was true, since 1970. [ns]
+    /// Instant of the motion, since 1970. [ns]
     pub at_ns: u64,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
-    /// How far the position may be off, one standard deviation an axis; 0 is not known. [m, world]
+    /// Standard deviation of the position on each axis; 0 if unknown. [m, world]
     pub position_sigma_m: DVec3,
-    /// How far the attitude may be off, about each axis; 0 is not known. [rad, body]
+    /// Standard deviation of the attitude about each axis; 0 if unknown. [rad, body]
     pub rotation_sigma_rad: DVec3,
 }
 
 /// A reading of the IMU.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FlightImu {
-    /// When it was measured, since 1970. [ns]
+    /// Measurement time, since 1970. [ns]
     pub at_ns: u64,
     /// Specific force. [m/s^2, body]
     pub accel_mps2: DVec3,
@@ -65,51 +65,48 @@ pub struct FlightImu {
     pub gyro_radps: DVec3,
 }
 
-/// A new reading of a sensor beside the cameras.
+/// A new reading of a sensor other than a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FlightReading {
-    /// The instant that it is of, since 1970; a sweep's last. [ns]
+    /// Instant of the reading, for a sweep its end, since 1970. [ns]
     pub at_ns: u64,
-    /// The sensor, and what else the plugin knew of the reading; its times are of the computer that flew. [ns, host]
+    /// Header of the sensor as passed to the plugin; its times are on the clock of the flight's computer. [ns, host]
     pub sensor: SensorHeader,
-    /// As in shared memory, by the sensor's kind.
+    /// Records as in shared memory, in the format of the sensor's kind.
     pub records: Vec<u8>,
 }
 
-/// Something that a flight's log holds.
+/// Datum of a flight's log.
 #[derive(Clone, Debug, PartialEq)]
-#[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
+#[allow(clippy::large_enum_variant)] // Why: only one exists at a time.
 pub enum FlightDatum {
-    /// An image.
     Image(FlightImage),
-    /// Images that a reduced log left out.
+    /// Images omitted by a reduced log.
     LeftOut,
-    /// A sensor's reading; only with images, which a large one lies beside.
+    /// A reading of a sensor. Large readings require reading with images.
     Reading(FlightReading),
     /// A localized pose.
     Pose(StampedPose<World>),
-    /// What belongs to the pose of the same instant.
+    /// Velocity and uncertainty for the pose of the same instant.
     Motion(FlightMotion),
-    /// A reading of the IMU.
     Imu(FlightImu),
-    /// The plugin's own estimate.
+    /// An odometry estimate of the plugin.
     Odometry(StampedPose<Odom>),
-    /// What the plugin answered, as JSON, and when. [ns, since 1970]
+    /// Time and JSON of a setpoint requested by the plugin. [ns, since 1970]
     Asked(u64, Vec<u8>),
-    /// What the guard let through, as JSON, and when. [ns, since 1970]
+    /// Time and JSON of a setpoint sent by the guard. [ns, since 1970]
     Sent(u64, Vec<u8>),
-    /// An image of a protocol whose images are not known here.
+    /// An image of an unsupported protocol version.
     Foreign {
-        /// The protocol.
         protocol: u32,
     },
 }
 
-/// Reads them.
+/// Reads the data of a flight log.
 pub struct FlightData<R> {
     flight: RecordedFlight<R>,
     topics: [(String, Topic); 6],
-    /// What came with the message before.
+    /// Data of the last message, not yet returned.
     ready: std::collections::VecDeque<FlightDatum>,
     /// Number of each sensor's newest reading.
     readings_had: [u64; MAX_SENSORS],
@@ -126,7 +123,7 @@ enum Topic {
 }
 
 impl<R: Read> FlightData<R> {
-    /// Reads from `reader`; without images, theirs are empty bitstreams.
+    /// Reads from `reader`; without images, their bitstreams are empty.
     pub fn new(reader: LogReader<R>, with_images: bool) -> Self {
         let topics = [
             (Channel::Pose, Topic::Pose),
@@ -144,16 +141,16 @@ impl<R: Read> FlightData<R> {
         }
     }
 
-    /// Whether the log ended before its end; known when [`Self::next`] has returned `None`.
+    /// Whether the log is truncated or damaged; valid after [`Self::next`] has returned `None`.
     pub fn is_cut(&self) -> bool {
         self.flight.is_cut()
     }
 
-    /// Returns the next thing; `None` at the end. What does not decode is left out.
+    /// Returns the next datum; `None` at the end. Skips messages that do not decode.
     ///
     /// # Errors
-    /// As [`LogReader::next`].
-    #[allow(clippy::should_implement_trait)] // Why: as `LogReader::next`.
+    /// If the file cannot be read.
+    #[allow(clippy::should_implement_trait)] // Why: `Result<Option>` ends at an error.
     pub fn next(&mut self) -> Result<Option<FlightDatum>, LogError> {
         loop {
             if let Some(datum) = self.ready.pop_front() {
@@ -201,12 +198,12 @@ impl<R: Read> FlightData<R> {
         })
     }
 
-    /// Takes the readings that are new in an observation.
+    /// Queues the new readings of an observation.
     fn readings(&mut self, offset_ns: u64, observation: &Observation) {
         let table = observation.sensors.chunks_exact(size_of::<SensorHeader>());
         let table = table.filter_map(|bytes| SensorHeader::read_from_bytes(bytes).ok());
         for (index, (sensor, had)) in table.zip(&mut self.readings_had).enumerate() {
-            // Points that are apart were not asked for, or are not in a reduced log.
+            // Separate points are missing if read without images, or in a reduced log.
             let records = observation
                 .records
                 .iter()
@@ -223,7 +220,7 @@ impl<R: Read> FlightData<R> {
     }
 
     fn observation(&mut self, at_ns: u64, observation: Observation) {
-        // From this computer's clock to time since 1970.
+        // Offset from the host clock to time since 1970.
         let offset_ns = at_ns.wrapping_sub(observation.published_ns);
         self.readings(offset_ns, &observation);
         let Observation { seq, protocol, images, .. } = observation;
@@ -254,7 +251,7 @@ fn vector(value: &serde_json::Value) -> Option<DVec3> {
 }
 
 fn stamped<A: Frame>(message: &LogMessage) -> Option<StampedPose<A>> {
-    // A topic of poses says in which frame they are.
+    // The topic determines the frame of its poses.
     let (at_ns, pose) = pose_of(message)?;
     Some(StampedPose { at_ns, from_body: Pose::new(pose.translation_m, pose.rotation) })
 }
@@ -274,7 +271,7 @@ mod tests {
     use super::super::messages::{ObservedImage, ObservedRecords};
     use super::*;
 
-    /// From the clock of the computer that flew to 1970. [ns]
+    /// Offset from the clock of the flight's computer to time since 1970. [ns]
     const OFFSET_NS: u64 = 1_700_000_000_000_000_000;
 
     fn observation(n: u64) -> Observation {
@@ -325,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn images_have_the_instants_that_they_show() {
+    fn returns_the_instants_that_images_show() {
         let observations: Vec<_> = (1..20).map(observation).collect();
         let found = read(log(&observations));
         let images = found.iter().filter_map(|datum| match datum {
@@ -342,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reading_comes_once_by_the_instant_that_it_is_of() {
+    fn returns_each_reading_once_with_its_instant() {
         let observed = |n: u64, seq: u64, is_apart: bool| {
             let header = SensorHeader { seq, stamp_ns: 1_000 * seq, ..SensorHeader::default() };
             let bytes = if is_apart { Vec::new() } else { vec![seq as u8] };
@@ -361,11 +358,11 @@ mod tests {
             _ => None,
         });
         let found: Vec<_> = readings.collect();
-        assert_eq!(found, [(4_000, &[4][..]), (6_000, &[6])], "a reduced log lacks the fifth");
+        assert_eq!(found, [(4_000, &[4][..]), (6_000, &[6])], "a reduced log omits the fifth");
     }
 
     #[test]
-    fn images_of_a_protocol_that_is_not_known_are_said_to_be() {
+    fn reports_images_of_unsupported_protocols() {
         let foreign = Observation { protocol: 99, ..observation(1) };
         assert_eq!(read(log(&[foreign])), [FlightDatum::Foreign { protocol: 99 }]);
         let left_out = Observation { images: Vec::new(), ..observation(1) };

@@ -1,10 +1,10 @@
 //! Depth for viewers (`--log-depth`): the only pixels that the log decodes.
 //!
-//! Budget: a decode of the whole image for each that is kept, on the log's own thread; 614 kB more of file at 640x480.
+//! Cost per kept image: one decode on the thread of the log, and 614 kB of file size at 640x480.
 
 use vizflyt_rgbd::{Decoder, peek};
 
-/// Decodes depth from images as received. Keeps its memory from one image to the next.
+/// Decodes depth from received images. Reuses its buffers.
 #[derive(Debug, Default)]
 pub(super) struct DepthReader {
     decoder: Decoder,
@@ -14,8 +14,8 @@ pub(super) struct DepthReader {
 }
 
 impl DepthReader {
-    /// Returns the depth of an image, row-major H x W, 0 where there is no return; `None` if its pieces do not
-    /// decode. [mm, cam]
+    /// Returns the depth of an image, row-major H x W, 0 without a return; `None` if its pieces do not decode.
+    /// [mm, cam]
     pub(super) fn read(&mut self, pieces: &[Vec<u8>]) -> Option<&[u16]> {
         self.bitstream.clear();
         for piece in pieces {

@@ -1,10 +1,10 @@
-//! A file that is a whole MCAP file between writes: when its writer is killed, and when the disk is
-//! full.
+//! Writes a file that is a valid MCAP file after each write, also if the process is killed or the disk
+//! is full.
 //!
-//! What is written gathers in memory until a chunk is complete, and then goes to disk in one write
-//! with an end behind it; the next chunk overwrites that end. So the file is never half a chunk,
-//! but in the middle of that one write: readers that stream then get all before it. A write that
-//! fails is taken back: the file is cut to the last whole chunk.
+//! Data is collected in memory until a chunk is complete, and then written to disk in one write together
+//! with an MCAP end; the next chunk overwrites that end. The file contains an incomplete chunk only during
+//! that write, and streaming readers can then read all data before it. After a failed write, the file is
+//! truncated to the last complete chunk.
 
 use std::fs::File;
 use std::io::{self, Error, ErrorKind, Seek, SeekFrom, Write};
@@ -12,8 +12,8 @@ use std::os::unix::fs::FileExt;
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread;
 
-/// The shortest end of an MCAP file: a `DataEnd` record without a checksum, a `Footer` without a
-/// summary, the magic bytes (MCAP specification, "DataEnd", "Footer").
+/// Shortest end of an MCAP file: a `DataEnd` record without a checksum, a `Footer` without a summary, and
+/// the magic bytes (MCAP specification, "DataEnd", "Footer").
 const END: [u8; 50] = {
     let mut end = [0; 50];
     (end[0], end[1]) = (0x0f, 4);
@@ -26,18 +26,18 @@ const END: [u8; 50] = {
     end
 };
 
-/// What file operations are needed; tests make disks that are full.
+/// File operations; tests simulate full disks.
 pub(super) trait Disk {
     /// Writes all of `bytes` at `offset`.
     fn write_at(&mut self, bytes: &[u8], offset: u64) -> io::Result<()>;
-    /// Cuts the file.
+    /// Truncates the file to `len`.
     fn cut(&mut self, len: u64) -> io::Result<()>;
-    /// Tells that a chunk has been written: it should reach the medium soon.
+    /// Called after each chunk, which should then be synchronized to the medium.
     fn written(&mut self) {}
 }
 
-/// A file whose chunks a thread of its own carries to the medium, so that a flat battery costs
-/// seconds only and the writer never waits for it.
+/// File with a thread that synchronizes its chunks to the medium, so that a power failure loses only
+/// seconds, and the writer never waits.
 pub(super) struct RealFile {
     file: File,
     due: SyncSender<()>,
@@ -49,7 +49,7 @@ impl RealFile {
         let same = file.try_clone()?;
         thread::Builder::new().name("flight-log-sync".into()).spawn(move || {
             while chunks.recv().is_ok() {
-                // A disk that fails is noticed by the next write.
+                // The next write reports a failed disk.
                 let _ = same.sync_data();
             }
         })?;
@@ -67,13 +67,13 @@ impl Disk for RealFile {
     }
 
     fn written(&mut self) {
-        // Full: one is due already.
+        // If the channel is full, a synchronization is pending already.
         let _ = self.due.try_send(());
     }
 }
 
-/// Makes writes to a file that may not grow any further (`ulimit -f`) errors, as of any full disk,
-/// instead of the process's end. Call it before threads start: it is the whole process's.
+/// Ignores SIGXFSZ, so that writes beyond a size limit (`ulimit -f`) fail like those to a full disk,
+/// instead of ending the process. Call it before threads start: it applies to the complete process.
 #[allow(unsafe_code, reason = "sets how a signal is handled")]
 pub fn keep_going_when_files_are_full() {
     use nix::sys::signal::{SigHandler, Signal, signal};
@@ -84,19 +84,19 @@ pub fn keep_going_when_files_are_full() {
     }
 }
 
-/// Returns how much more fits on a file's disk, if known. [bytes]
+/// Returns the free space of a file's disk, if available. [bytes]
 pub(super) fn free_bytes(file: &File) -> Option<u64> {
     let stat = nix::sys::statvfs::fstatvfs(file).ok()?;
     Some(stat.blocks_available().saturating_mul(stat.fragment_size()))
 }
 
-/// The file. `flush` completes a chunk.
+/// File that is valid after each chunk. `flush` completes a chunk.
 pub(super) struct SafeFile<D> {
     disk: D,
-    /// Where on disk `waiting` will begin.
+    /// Offset of `waiting` on disk.
     start: u64,
     waiting: Vec<u8>,
-    /// Where in `waiting` the next byte goes.
+    /// Position of the next byte in `waiting`.
     at: usize,
 }
 
@@ -120,7 +120,7 @@ impl<D: Disk> Write for SafeFile<D> {
             return Ok(());
         }
         let len = self.waiting.len();
-        // A file that was ended properly has its end already.
+        // A finished file has an end already.
         if !self.waiting.ends_with(mcap::MAGIC) {
             self.waiting.extend_from_slice(&END);
         }
@@ -128,7 +128,7 @@ impl<D: Disk> Write for SafeFile<D> {
         self.waiting.clear();
         self.at = 0;
         if let Err(error) = result {
-            // Cutting makes room for the end.
+            // Truncating frees space for the end.
             self.disk.cut(self.start)?;
             if self.start > 0 {
                 self.disk.write_at(&END, self.start)?;
@@ -149,7 +149,7 @@ impl<D: Disk> Seek for SafeFile<D> {
             SeekFrom::End(offset) => end.checked_add_signed(offset),
             SeekFrom::Current(offset) => (self.start + self.at as u64).checked_add_signed(offset),
         };
-        // What is on disk is done with.
+        // Data on disk cannot be changed any more.
         let target = target
             .filter(|target| (self.start..=end).contains(target))
             .ok_or_else(|| Error::new(ErrorKind::InvalidInput, "outside the chunk"))?;
@@ -164,7 +164,7 @@ mod tests {
     use std::cell::RefCell;
     use std::rc::Rc;
 
-    /// A disk of so many bytes.
+    /// Disk with a size limit. [bytes]
     #[derive(Clone)]
     struct Small {
         bytes: Rc<RefCell<Vec<u8>>>,
@@ -205,21 +205,21 @@ mod tests {
         writer.write_to_known_channel(&header, &[b'x'; 300]).unwrap();
     }
 
-    /// Reads strictly: everything must be in order, to the end.
+    /// Reads with a strict reader, to the end.
     fn read(bytes: &Rc<RefCell<Vec<u8>>>) -> usize {
         let bytes = bytes.borrow();
         mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).count()
     }
 
     #[test]
-    fn the_file_is_whole_after_every_chunk() {
+    fn file_is_valid_after_each_chunk() {
         let (bytes, mut writer, channel) = writer(usize::MAX);
         let mut sequence = 0;
         for chunk in 1..5 {
             for _ in 0..chunk {
                 sequence += 1;
                 write(&mut writer, channel, sequence);
-                // What waits is not on disk; what is, is whole.
+                // The file on disk is valid, without the waiting messages.
                 if chunk > 1 {
                     read(&bytes);
                 }
@@ -229,13 +229,13 @@ mod tests {
         }
         writer.finish().unwrap();
         assert_eq!(read(&bytes), 10);
-        let summary = mcap::Summary::read(&bytes.borrow()).unwrap().expect("it has an index");
+        let summary = mcap::Summary::read(&bytes.borrow()).unwrap().expect("the file has an index");
         assert_eq!(summary.stats.unwrap().message_count, 10);
     }
 
     #[test]
-    fn a_disk_that_is_full_leaves_the_chunks_before() {
-        // Some room more each time: wherever the disk ends, the file is whole.
+    fn full_disk_keeps_the_chunks_before_it() {
+        // Tries many disk sizes: the file is always valid.
         let mut most = 0;
         for room in (400..4000).step_by(7) {
             let (bytes, mut writer, channel) = writer(room);
@@ -247,7 +247,7 @@ mod tests {
                 }
                 chunks += 1;
             }
-            // A writer that has failed writes nothing more when it is dropped.
+            // After a failed write, dropping the writer writes nothing.
             drop(writer);
             if chunks > 0 {
                 assert_eq!(read(&bytes), chunks as usize, "room for {room}");

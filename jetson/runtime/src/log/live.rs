@@ -1,7 +1,7 @@
-//! The log's channels live over WebSocket, for Foxglove (`--foxglove`).
+//! Serves the log's channels live over WebSocket, for Foxglove (`--foxglove`).
 //!
-//! Fed by the thread that writes the log, so it costs the flight nothing; a viewer that is too
-//! slow misses messages. Only what a viewer subscribes to travels.
+//! The thread that writes the log also sends to viewers, so the flight is not delayed. A viewer that is
+//! too slow misses messages. Only subscribed channels are sent.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -11,10 +11,10 @@ use foxglove::{Context, FoxgloveError, PartialMetadata, RawChannel, WebSocketSer
 
 use super::channels::{Channel, Description};
 
-/// Messages that wait for a viewer at most.
+/// Maximum number of messages queued for a viewer.
 const BACKLOG: usize = 256;
 
-/// A WebSocket server with the log's channels.
+/// WebSocket server with the log's channels.
 pub struct Live {
     context: Arc<Context>,
     server: WebSocketServerHandle,
@@ -29,8 +29,8 @@ impl std::fmt::Debug for Live {
 }
 
 impl Live {
-    /// Listens on `address`; port 0 takes a free one. Needs the context of a tokio runtime that
-    /// lives as long.
+    /// Listens on `address`; port 0 selects a free port. Call it in the context of a tokio runtime that
+    /// outlives the result.
     ///
     /// # Errors
     /// If the address cannot be listened on.
@@ -48,7 +48,7 @@ impl Live {
         Ok(Self { context, server, address, channels: BTreeMap::new() })
     }
 
-    /// Returns where it listens.
+    /// Returns the address on which it listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }

@@ -1,17 +1,18 @@
-//! What stands for [`Live`] in a program built without the feature `foxglove`: there is never one.
+//! Replacement for [`Live`] in a program built without the feature `foxglove`.
 
 use std::net::SocketAddr;
 
 use super::channels::{Channel, Description};
 
-/// A WebSocket server with the log's channels; this build has none.
+/// WebSocket server with the log's channels; not available in this build.
 #[derive(Debug)]
 pub enum Live {}
 
-/// Why there is none.
+/// Error of a build without [`Live`].
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "this program was built without it; build it with `cargo build --release --features foxglove`"
+    "this program was built without the feature foxglove; build it with `cargo build --release --features \
+     foxglove`"
 )]
 pub struct Absent;
 
@@ -19,13 +20,12 @@ impl Live {
     /// Always fails.
     ///
     /// # Errors
-    /// [`Absent`]: how to build a program that can.
-    #[allow(clippy::unused_async)] // Why: it stands for one that waits.
+    /// [`Absent`], with the build command.
+    #[allow(clippy::unused_async)] // Why: same signature as the real one.
     pub async fn start(_: SocketAddr) -> Result<Self, Absent> {
         Err(Absent)
     }
 
-    /// Returns where it listens.
     pub fn address(&self) -> SocketAddr {
         match *self {}
     }

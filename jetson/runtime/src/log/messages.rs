@@ -1,51 +1,51 @@
-//! Messages of our own in the log, as protobuf: what replay feeds a plugin, bit by bit.
+//! Custom protobuf messages of the log, from which a replay reproduces a plugin's inputs bit by bit.
 //!
-//! A field's number is its meaning for ever; new ones go at the end.
+//! Field numbers never change their meaning; new fields get new numbers.
 
 use foxglove::Schema;
 use prost::Message;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet};
 
-/// One observation as it went to the plugin.
+/// One observation as sent to the plugin.
 #[derive(Clone, PartialEq, Message)]
 pub struct Observation {
-    /// Its number in this flight.
+    /// Number of the observation in this flight.
     #[prost(uint64, tag = "1")]
     pub seq: u64,
-    /// The protocol version of `head`.
+    /// Protocol version of `head`.
     #[prost(uint32, tag = "2")]
     pub protocol: u32,
-    /// When it was published. [ns, host]
+    /// Time of publication. [ns, host]
     #[prost(uint64, tag = "3")]
     pub published_ns: u64,
-    /// Shared memory up to the first image plane: `ObservationHeader` and what belongs to it.
+    /// Shared memory up to the first image plane, which begins with `ObservationHeader`.
     #[prost(bytes = "vec", tag = "4")]
     pub head: Vec<u8>,
-    /// Its images; none where a reduced log left them out.
+    /// Images; empty if a reduced log has omitted them.
     #[prost(message, repeated, tag = "5")]
     pub images: Vec<ObservedImage>,
-    /// The table of its sensors: one `SensorHeader` after the other.
+    /// Table of sensors: consecutive `SensorHeader`s.
     #[prost(bytes = "vec", tag = "6")]
     pub sensors: Vec<u8>,
-    /// Their records, of those that have a reading.
+    /// Records of the sensors that have a reading.
     #[prost(message, repeated, tag = "7")]
     pub records: Vec<ObservedRecords>,
 }
 
-/// The records of one sensor's newest reading.
+/// Records of one sensor's newest reading.
 #[derive(Clone, PartialEq, Message)]
 pub struct ObservedRecords {
     /// Index of the sensor.
     #[prost(uint32, tag = "1")]
     pub sensor: u32,
-    /// Its name.
+    /// Name of the sensor.
     #[prost(string, tag = "2")]
     pub name: String,
-    /// They are those of the newest message on `/sensor/NAME`.
+    /// Whether the records are in the newest message on `/sensor/NAME` instead of `bytes`.
     #[prost(bool, tag = "3")]
     pub is_apart: bool,
-    /// As in shared memory; none if they are apart.
+    /// Records as in shared memory; empty if `is_apart`.
     #[prost(bytes = "vec", tag = "4")]
     pub bytes: Vec<u8>,
 }
@@ -56,25 +56,25 @@ pub struct ObservedImage {
     /// Index of the camera.
     #[prost(uint32, tag = "1")]
     pub camera: u32,
-    /// Its name.
+    /// Name of the camera.
     #[prost(string, tag = "2")]
     pub name: String,
     /// `ImageHeader` as received.
     #[prost(bytes = "vec", tag = "3")]
     pub header: Vec<u8>,
-    /// When its last byte had come. [ns, host]
+    /// Arrival time of the last byte. [ns, host]
     #[prost(uint64, tag = "4")]
     pub received_ns: u64,
-    /// The RGB-D bitstream as received; without its colour if that is apart.
+    /// RGB-D bitstream as received; without colour if `is_color_apart`.
     #[prost(bytes = "vec", tag = "5")]
     pub bitstream: Vec<u8>,
-    /// The colour is the camera's `/camera/NAME/image` of the same log time.
+    /// Whether the colour is in the message of the same log time on `/camera/NAME/image`.
     #[prost(bool, tag = "6")]
     pub is_color_apart: bool,
-    /// When the newest pose behind it was measured. [ns, host]
+    /// Measurement time of the newest pose used for the image. [ns, host]
     #[prost(uint64, tag = "7")]
     pub pose_ns: u64,
-    /// The instant that it shows. [ns, host]
+    /// Instant that the image shows. [ns, host]
     #[prost(uint64, tag = "8")]
     pub shown_ns: u64,
 }
@@ -82,21 +82,21 @@ pub struct ObservedImage {
 /// A message between runtime and plugin.
 #[derive(Clone, PartialEq, Message)]
 pub struct PluginMessage {
-    /// From the runtime to the plugin; else the other way.
+    /// Direction: `true` from the runtime to the plugin, `false` from the plugin.
     #[prost(bool, tag = "1")]
     pub is_to_plugin: bool,
-    /// The protocol version of `body`.
+    /// Protocol version of `body`.
     #[prost(uint32, tag = "2")]
     pub protocol: u32,
-    /// `ToPlugin` or `FromPlugin`, as it went through shared memory (postcard).
+    /// `ToPlugin` or `FromPlugin`, as sent through the socket (postcard).
     #[prost(bytes = "vec", tag = "3")]
     pub body: Vec<u8>,
-    /// When it was sent to the plugin or taken from it. [ns, host]
+    /// Time of sending to the plugin or of receiving from it. [ns, host]
     #[prost(uint64, tag = "4")]
     pub at_ns: u64,
 }
 
-/// Returns the schema of the message `name` for other people's readers.
+/// Returns the schema of the message `name`, for readers of other programs.
 pub(super) fn schema(name: &str) -> Schema {
     let field = |name: &str, number, kind: Type| FieldDescriptorProto {
         name: Some(name.into()),

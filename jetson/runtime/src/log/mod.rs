@@ -1,16 +1,16 @@
-//! The flight log: one MCAP file with Foxglove's schemas, and the same channels live over
-//! WebSocket (`--foxglove`). `docs/guides/logs.md` is the guide.
+//! Flight log: one MCAP file with Foxglove's schemas, and the same channels live over WebSocket
+//! (`--foxglove`). See `docs/guides/logs.md`.
 //!
 //! ```text
 //! control loop ── poses, setpoints, events, messages ─┐          ┌─▶ SafeFile ─▶ flights/*.mcap
 //! image thread ── pieces of each image, as received ──┴─▶ Queue ─┤     (chunk a second)
-//!                  (their memory goes back afterwards)   bounded └─▶ Live ─▶ viewers
+//!                  (their buffers are reused)            bounded └─▶ Live ─▶ viewers
 //! ```
-//! The flight never waits for it: records that do not fit are dropped, counted and reported. The file is a
-//! whole one whenever the process is killed, but within the one write of a chunk ([`file`]). Images are
-//! written as they came: the log neither decodes nor encodes them. A reduced log leaves some of them
-//! out whole ([`budget`]); the rest of every observation is always there. The oldest logs are deleted
-//! when a flight begins ([`retention`]). [`read`] is the way back, and [`crate::replay`] flies it.
+//! The flight never waits for the log: records that do not fit are dropped, counted and reported. If the
+//! process is killed, the file is complete, except during the single write of a chunk ([`file`]). Images are
+//! written as received: the log neither decodes nor encodes them. A reduced log omits some images
+//! ([`budget`]), but keeps the rest of each observation. When a flight begins, the oldest logs are deleted
+//! ([`retention`]). [`read`] reads logs, and [`crate::replay`] replays them.
 
 mod budget;
 mod channels;
@@ -69,59 +69,59 @@ pub use self::virtual_log::{GivenImage, VirtualLog};
 use self::writer::{LogSinks, LogWriter};
 use crate::stream::Mailbox;
 
-/// How much a line matters, as foxglove.Log has it.
+/// Severity of a line, with the values of foxglove.Log.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
-    /// What went as it should.
+    /// Normal operation.
     Info = 2,
-    /// Worth a look.
+    /// Needs attention.
     Warning = 3,
-    /// It ended the flight, or should have.
+    /// Ended the flight, or should have ended it.
     Error = 4,
 }
 
-/// Which images a log keeps.
+/// Images that a log keeps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum LoggedImages {
-    /// As many as fit into 60 MB a minute, spread evenly, each as it came.
+    /// Evenly spaced images, unchanged, up to a log size of 60 MB a minute.
     #[default]
     Reduced,
-    /// Every one: a replay is bit-exact.
+    /// All images, so that a replay is bit-exact.
     Full,
 }
 
-/// Where flights are logged, and how much of them.
+/// Settings of the flight log.
 #[derive(Clone, Debug)]
 pub struct LogSettings {
-    /// The folder; without one, only live viewers see the log.
+    /// Folder of the logs; without one, only live viewers receive the log.
     pub folder: Option<PathBuf>,
-    /// Which images are kept.
+    /// Images to keep.
     pub images: LoggedImages,
-    /// Whether depth is also written so that any viewer shows it.
+    /// Whether depth is also written in a format for viewers.
     pub depth: bool,
-    /// How long logs are kept.
+    /// Maximum size and age of logs.
     pub retention: Retention,
 }
 
 impl LogSettings {
-    /// Keeps every image and every log of `folder`.
+    /// Returns settings that keep every image and every log in `folder`.
     pub fn full(folder: impl Into<PathBuf>) -> Self {
         let (images, retention) = (LoggedImages::Full, Retention::FOREVER);
         Self { folder: Some(folder.into()), images, depth: false, retention }
     }
 }
 
-/// Makes the folder and the file of a log. Returns the file twice: to ask how much room is left, and to write to.
+/// Creates the folder and the file of a log. Returns the file twice: for reading the free disk space, and for writing.
 fn open_file(folder: &Path, path: &Path) -> io::Result<(File, RealFile)> {
     create_dir_all(folder)?;
     let file = File::create(path)?;
-    // Where the file system knows no locks, being the newest protects it.
+    // The lock protects the file from deletion. Without locks, its age does, as it is the newest log.
     let _ = file.try_lock();
     Ok((file.try_clone()?, RealFile::new(file)?))
 }
 
-/// The log of one flight. Cheap to call from the control loop; dropping it closes the file.
+/// Log of one flight. Calls do not block the control loop; dropping it closes the file.
 #[derive(Debug)]
 pub struct FlightLog {
     queue: Option<Arc<Queue>>,
@@ -130,8 +130,8 @@ pub struct FlightLog {
 }
 
 impl FlightLog {
-    /// Opens a log, named by the time of day (UTC), shows it to `live`'s viewers, and deletes logs
-    /// that are no longer to be kept. If it cannot be written, logs a warning and writes nothing.
+    /// Opens a log, named by date and time (UTC), also for `live`'s viewers, and deletes logs beyond the
+    /// retention. If the file cannot be written, prints a warning and writes nothing.
     pub fn open(settings: &LogSettings, live: Option<Live>) -> Self {
         let LogSettings { folder, images, depth, retention } = settings;
         let now = SystemTime::now();
@@ -152,7 +152,7 @@ impl FlightLog {
         };
         match Self::start(disk, probe, live, *images, *depth) {
             Ok((queue, writer)) => {
-                // Nothing to delete from a folder that cannot be listed.
+                // A folder that cannot be listed is not an error here.
                 let deleted =
                     folder.as_deref().map(|folder| retention::delete_old(folder, *retention, now));
                 let deleted = deleted.and_then(Result::ok).unwrap_or_default();
@@ -186,70 +186,68 @@ impl FlightLog {
         Ok((queue, handle))
     }
 
-    /// Returns the file, if one is written.
+    /// Returns the path of the file, if one is written.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Returns what was dropped so far because the disk was too slow.
+    /// Returns the counts of records dropped because of a slow disk.
     pub fn dropped(&self) -> Dropped {
         self.queue.as_ref().map_or_else(Dropped::default, |queue| queue.dropped())
     }
 
-    /// Returns a sentence about what is wrong with the log, once.
+    /// Returns the newest problem of the log as a sentence, once.
     pub fn poll_trouble(&self) -> Option<String> {
         self.queue.as_ref()?.poll_trouble()
     }
 
-    /// Logs `message`, on a channel of ours, as of `at`.
+    /// Logs `message` on a JSON channel with the time `at`.
     pub fn write(&self, channel: Channel, at: HostTime, message: &impl Serialize) {
         let Some(queue) = &self.queue else { return };
         let Ok(json) = serde_json::to_vec(message) else { return };
         queue.push(Record::Json { channel, at, json });
     }
 
-    /// Logs which flight this is.
+    /// Logs the identity of the flight: program, plugin and arguments.
     pub fn flight(&self, plugin: &OsString, arguments: &[OsString]) {
         let Some(queue) = &self.queue else { return };
         queue.push(flight_record(plugin, arguments));
     }
 
-    /// Logs a pose that came at `at` and was true at `stamp`.
+    /// Logs a pose of the instant `stamp` that arrived at `at`.
     pub fn pose(&self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         let Some(queue) = &self.queue else { return };
         queue.push(Record::Pose { at, stamp, sample: *sample });
     }
 
-    /// Logs the plugin's own estimate, which came at `at`.
+    /// Logs an odometry estimate of the plugin that arrived at `at`.
     pub fn odometry(&self, at: HostTime, odometry: &Odometry) {
         let Some(queue) = &self.queue else { return };
         queue.push(Record::Odometry { at, odometry: *odometry });
     }
 
-    /// Logs a reading of the IMU.
     pub fn imu(&self, sample: &ImuSample) {
         self.write(Channel::Imu, sample.stamp, &imu_message(sample));
     }
 
-    /// Logs an event.
     pub fn event(&self, at: HostTime, event: &Event) {
         let Some(queue) = &self.queue else { return };
         queue.push(event_record(at, event));
     }
 
-    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it had the
+    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it processed the
     /// image of the server's `tick`.
     pub fn line(&self, at: HostTime, stream: &str, line: &str, tick: u64) {
         let Some(queue) = &self.queue else { return };
         queue.push(line_record(at, stream, line, tick));
     }
 
-    /// Logs a message that was sent to the plugin at `at`; replay sends it again.
+    /// Logs a message to the plugin, sent at `at`; a replay sends it again.
     pub fn to_plugin(&self, at: HostTime, message: &ToPlugin) {
         self.message(at, true, message);
     }
 
-    /// Logs a message of the plugin; replay compares with it.
+    /// Logs a message of the plugin; a replay compares its replies with it.
     pub fn from_plugin(&self, at: HostTime, message: &FromPlugin) {
         self.message(at, false, message);
     }
@@ -259,7 +257,7 @@ impl FlightLog {
         queue.push(plugin_record(at, is_to_plugin, message));
     }
 
-    /// Returns the image thread's end of the log; the memory of images goes back to `home`.
+    /// Returns the image thread's handle of the log; buffers of images return to `home`.
     pub fn images(&self, home: &Arc<Mailbox>) -> Option<ImageLog> {
         let queue = Arc::clone(self.queue.as_ref()?);
         Some(ImageLog { queue, home: Arc::clone(home) })
@@ -276,15 +274,13 @@ impl Drop for FlightLog {
         let Dropped { images, records } = queue.dropped();
         if images + records > 0 {
             tracing::warn!(
-                "flight log: {images} images and {records} records are not in it; the disk is too \
-                 slow"
+                "flight log: {images} images and {records} records are missing: the disk is too slow"
             );
         }
     }
 }
 
-/// The image thread's end of the log: what is logged costs it a copy of the observation's head,
-/// and no wait.
+/// The image thread's handle of the log. Logging copies the head of the observation, and never waits.
 #[derive(Clone, Debug)]
 pub struct ImageLog {
     queue: Arc<Queue>,
@@ -292,7 +288,7 @@ pub struct ImageLog {
 }
 
 impl ImageLog {
-    /// Logs an observation: shared memory up to its first plane, its images as received, and its sensors' readings.
+    /// Logs an observation: shared memory up to the first plane, images as received, and sensor readings.
     pub fn observation(
         &self,
         at: HostTime,
@@ -307,7 +303,7 @@ impl ImageLog {
     }
 }
 
-/// Returns what the log says of a reading of the IMU.
+/// Returns the logged JSON of an IMU reading.
 fn imu_message(sample: &ImuSample) -> serde_json::Value {
     json!({
         "stamp_ns": sample.stamp.as_ns(),
@@ -316,7 +312,7 @@ fn imu_message(sample: &ImuSample) -> serde_json::Value {
     })
 }
 
-/// Returns the record of which flight this is.
+/// Returns the record of the flight's identity.
 fn flight_record(plugin: &OsString, arguments: &[OsString]) -> Record {
     let arguments: Vec<_> = arguments.iter().map(|text| text.to_string_lossy()).collect();
     Record::Flight(vec![
@@ -327,7 +323,6 @@ fn flight_record(plugin: &OsString, arguments: &[OsString]) -> Record {
     ])
 }
 
-/// Returns the record of an event.
 fn event_record(at: HostTime, event: &Event) -> Record {
     let (name, level) = match &event.kind {
         EventKind::Collision(_) => ("collision", Level::Error),
@@ -350,21 +345,19 @@ fn event_record(at: HostTime, event: &Event) -> Record {
     Record::Text { channel: Channel::Event, at, level, name, text }
 }
 
-/// Returns the record of a line that the plugin printed.
 fn line_record(at: HostTime, stream: &str, line: &str, tick: u64) -> Record {
     let level = if stream == "stderr" { Level::Warning } else { Level::Info };
     let (name, text) = (format!("{stream} at tick {tick}"), line.to_owned());
     Record::Text { channel: Channel::PluginOutput, at, level, name, text }
 }
 
-/// Returns the record of a message to or from the plugin.
 fn plugin_record(at: HostTime, is_to_plugin: bool, message: &impl Serialize) -> Record {
     let mut buffer = [0; MAX_FRAMED];
     let body = encode_body(message, &mut buffer).to_vec();
     Record::Plugin { at, is_to_plugin, body }
 }
 
-/// Returns what the log says of a setpoint that the guard let through; `None` of one that is no velocity.
+/// Returns the logged JSON of a setpoint accepted by the guard; `None` if it is not a velocity.
 pub(crate) fn sent_message(setpoint: &GuidedSetpoint) -> Option<serde_json::Value> {
     let GuidedMotion::Velocity(v_mps) = setpoint.motion else { return None };
     let (yaw_rad, yaw_rate_radps) = match setpoint.yaw {
@@ -377,7 +370,7 @@ pub(crate) fn sent_message(setpoint: &GuidedSetpoint) -> Option<serde_json::Valu
     }))
 }
 
-/// Returns the bytes of an observation before its first plane or sensor: header and what belongs to it.
+/// Returns the bytes of an observation before its first plane or sensor.
 pub fn observation_head(bytes: &[u8]) -> &[u8] {
     let Ok(header) = ObservationHeader::parse(bytes) else { return &[] };
     let cameras = &header.cameras[..header.camera_count.into()];
@@ -387,7 +380,7 @@ pub fn observation_head(bytes: &[u8]) -> &[u8] {
     &bytes[..len.min(bytes.len())]
 }
 
-/// Returns `2026-11-21T04-09-21.123Z`: sorts by time, and is a file name everywhere.
+/// Returns `2026-11-21T04-09-21.123Z`, which sorts by time and is a valid file name on all systems.
 fn utc_name(time: SystemTime) -> String {
     let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
     let Civil { year, month, day, hour, minute, second } = Civil::of_unix(since.as_secs());

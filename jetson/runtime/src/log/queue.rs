@@ -1,4 +1,4 @@
-//! From the threads that fly to the thread that writes: a bounded queue that nobody waits for.
+//! Bounded queue from the flight's threads to the log's thread. Senders never wait.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
@@ -12,34 +12,34 @@ use vizflyt_protocol::time::HostTime;
 use super::{Channel, Level, LoggedSensors};
 use crate::stream::Mailbox;
 
-/// Records waiting for the disk at most: some 10 s of flight. Beyond, they are dropped, counted.
+/// Maximum number of waiting records, about 10 s of flight. Further records are dropped and counted.
 const QUEUE: usize = 8192;
-/// Bytes of images waiting at most: some 5 s at 640x480 and 60 Hz. Beyond, images are dropped,
+/// Maximum size of waiting images, about 5 s at 640x480 and 60 Hz. Further images are dropped and
 /// counted. [bytes]
 pub(super) const MAX_IMAGE_BYTES: usize = 64 << 20;
 
-/// Something to be logged.
+/// Record to be logged.
 #[derive(Debug)]
 pub(super) enum Record {
-    /// A figure of ours, encoded.
+    /// An encoded message of a JSON channel.
     Json { channel: Channel, at: HostTime, json: Vec<u8> },
-    /// The vehicle was localized.
+    /// A localized pose of the instant `stamp`.
     Pose { at: HostTime, stamp: HostTime, sample: PoseSample },
-    /// The plugin's own estimate.
+    /// An odometry estimate of the plugin.
     Odometry { at: HostTime, odometry: Odometry },
-    /// A line for people.
+    /// A text line of foxglove.Log.
     Text { channel: Channel, at: HostTime, level: Level, name: String, text: String },
     /// A message to or from the plugin.
     Plugin { at: HostTime, is_to_plugin: bool, body: Vec<u8> },
-    /// What the plugin got to see.
+    /// An observation of the plugin.
     Observation(Box<ObservationRecord>),
-    /// Which flight this is: names and values.
+    /// Names and values that identify the flight.
     Flight(Vec<(&'static str, String)>),
-    /// The flight is over.
+    /// End of the flight.
     End,
 }
 
-/// One observation: its head, and its images as received.
+/// One observation: head, and images as received.
 #[derive(Debug)]
 pub(super) struct ObservationRecord {
     pub(super) at: HostTime,
@@ -47,7 +47,7 @@ pub(super) struct ObservationRecord {
     pub(super) head: Vec<u8>,
     pub(super) images: Vec<LoggedImage>,
     pub(super) sensors: LoggedSensors,
-    /// Where the memory of the images goes when they are written.
+    /// Mailbox that reuses the buffers of the images.
     pub(super) home: Arc<Mailbox>,
 }
 
@@ -56,7 +56,7 @@ impl ObservationRecord {
         self.images.iter().flat_map(|image| &image.pieces).map(Vec::len).sum()
     }
 
-    /// Gives the memory back to those who receive images.
+    /// Returns the buffers to the mailbox.
     pub(super) fn recycle(self) {
         for piece in self.images.into_iter().flat_map(|image| image.pieces) {
             self.home.recycle(piece);
@@ -64,20 +64,19 @@ impl ObservationRecord {
     }
 }
 
-/// One image as received, on its way to the log.
+/// One received image for the log.
 #[derive(Debug)]
 pub struct LoggedImage {
     /// Index of the camera.
     pub camera: usize,
-    /// Its name.
+    /// Name of the camera.
     pub name: String,
-    /// What came before the bitstream.
     pub header: ImageHeader,
-    /// When the newest pose behind it was measured. [host]
+    /// Measurement time of the newest pose used for the image. [host]
     pub pose: HostTime,
-    /// When its last byte had come. [host]
+    /// Arrival time of the last byte. [host]
     pub received: HostTime,
-    /// The bitstream's header and slices.
+    /// Header and slices of the bitstream.
     pub pieces: Vec<Vec<u8>>,
 }
 
@@ -88,22 +87,22 @@ impl LoggedImage {
     }
 }
 
-/// Returns the instant that an image shows, the newest pose behind which was measured at `pose`. [host]
+/// Returns the instant that an image shows; `pose` is the measurement time of its newest pose. [host]
 pub(super) fn shown(header: &ImageHeader, pose: HostTime) -> HostTime {
     let ahead_ns = header.exposure_ns.get().wrapping_sub(header.pose_ns.get());
     pose.plus_ns(ahead_ns.cast_signed())
 }
 
-/// What was dropped so far.
+/// Counts of dropped records.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Dropped {
     /// Observations with their images.
     pub images: u64,
-    /// All else.
+    /// All other records.
     pub records: u64,
 }
 
-/// The queue, and what its ends share.
+/// The queue, and the state shared by its two ends.
 #[derive(Debug)]
 pub(super) struct Queue {
     records: SyncSender<Record>,
@@ -130,7 +129,7 @@ impl Queue {
         (Arc::new(queue), receiver)
     }
 
-    /// Takes a record, or drops and counts it if there is no room.
+    /// Queues a record, or drops and counts it if the queue is full.
     pub(super) fn push(&self, record: Record) {
         let len = match &record {
             Record::Observation(observation) => observation.len(),
@@ -157,13 +156,13 @@ impl Queue {
         }
     }
 
-    /// Sends the end, however many records wait before it.
+    /// Queues the end; waits while the queue is full.
     pub(super) fn end(&self) {
-        // Nobody there: the writer has ended already.
+        // Fails only if the writer has ended already.
         let _ = self.records.send(Record::End);
     }
 
-    /// An observation of `len` bytes has left the queue.
+    /// Subtracts an observation of `len` bytes that has left the queue.
     pub(super) fn taken(&self, len: usize) {
         self.image_bytes.fetch_sub(len, Ordering::Relaxed);
     }
@@ -175,7 +174,7 @@ impl Queue {
         }
     }
 
-    /// Tells people of trouble; the newest counts.
+    /// Reports a problem; replaces an unread one.
     pub(super) fn complain(&self, text: String) {
         tracing::warn!("flight log: {text}");
         *lock(&self.trouble) = Some(text);

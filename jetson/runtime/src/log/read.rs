@@ -1,7 +1,7 @@
-//! Reads flight logs: record by record, in bounded memory, whatever the file holds.
+//! Reads flight logs: record by record, in bounded memory, also from invalid files.
 //!
-//! A log of a killed runtime ends early; one that is damaged is read up to there. Both are reported by
-//! [`LogReader::is_cut`], not as errors.
+//! A log of a killed runtime ends early, and a damaged log is read up to the damage. [`LogReader::is_cut`]
+//! reports both; they are not errors.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -26,39 +26,38 @@ use super::messages::{Observation, ObservedImage, PluginMessage};
 use super::sensors::points_of;
 use super::writer::FLIGHT;
 
-/// Longest record that is read: more than an image of the largest size needs. [bytes]
+/// Maximum length of a record; images of the largest size are smaller. [bytes]
 const LONGEST_RECORD: usize = 256 << 20;
-/// So much is read at once at most, whatever length a record announces. [bytes]
+/// Maximum size of one read, regardless of the announced length of a record. [bytes]
 const READ_AT_ONCE: usize = 1 << 20;
 
-/// Why a file is no log.
+/// Error of opening or reading a log.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
-    /// It cannot be opened or read.
+    /// The file cannot be opened or read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// It does not begin as an MCAP file.
-    #[error("this is no MCAP file: {0}")]
+    /// The file does not begin as an MCAP file.
+    #[error("this is not an MCAP file: {0}")]
     Foreign(mcap::McapError),
 }
 
 /// One message of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LogMessage {
-    /// Its channel's topic: `/pose`.
+    /// Topic of the channel, for example `/pose`.
     pub topic: Arc<str>,
-    /// Since 1970. [ns]
+    /// Time since 1970. [ns]
     pub log_time_ns: u64,
-    /// As the channel's encoding has it.
+    /// Payload in the channel's encoding.
     pub data: Vec<u8>,
 }
 
-/// What a log holds.
+/// Entry of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Entry {
-    /// A message.
     Message(LogMessage),
-    /// Names and values of which flight this is.
+    /// Names and values that identify the flight.
     Flight(std::collections::BTreeMap<String, String>),
 }
 
@@ -67,8 +66,9 @@ pub struct LogReader<R> {
     source: R,
     reader: LinearReader,
     topics: HashMap<u16, Arc<str>>,
-    /// The chunk that is being read, and how far.
+    /// Present chunk.
     chunk: Vec<u8>,
+    /// Position in `chunk`.
     at: usize,
     is_cut: bool,
     is_over: bool,
@@ -78,22 +78,22 @@ impl LogReader<BufReader<File>> {
     /// Opens a log.
     ///
     /// # Errors
-    /// If it cannot be opened, or is no MCAP file.
+    /// If the file cannot be opened, or is not an MCAP file.
     pub fn open(path: &Path) -> Result<Self, LogError> {
         Self::new(BufReader::new(File::open(path)?))
     }
 }
 
 impl<R: Read> LogReader<R> {
-    /// Reads a log from `source`.
+    /// Reads the header of a log from `source`.
     ///
     /// # Errors
-    /// If it cannot be read, or is no MCAP file.
+    /// If `source` cannot be read, or is not an MCAP file.
     pub fn new(source: R) -> Result<Self, LogError> {
         // A killed runtime may leave a file without an end.
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
-            // Taken apart here: the library trusts the lengths that a chunk's records announce.
+            // Chunks are parsed in this module: the library trusts the announced lengths of a chunk's records.
             .with_emit_chunks(true)
             .with_record_length_limit(LONGEST_RECORD);
         let reader = LinearReader::new_with_options(options);
@@ -106,7 +106,7 @@ impl<R: Read> LogReader<R> {
             is_cut: false,
             is_over: false,
         };
-        // The header comes first, and nothing but an MCAP file has one.
+        // An MCAP file begins with a header.
         match log.step() {
             Ok(_) => Ok(log),
             Err(Stop::Io(error)) => Err(LogError::Io(error)),
@@ -115,16 +115,16 @@ impl<R: Read> LogReader<R> {
         }
     }
 
-    /// Whether the log ended before its end; known when [`Self::next`] has returned `None`.
+    /// Whether the log is truncated or damaged; valid after [`Self::next`] has returned `None`.
     pub fn is_cut(&self) -> bool {
         self.is_cut
     }
 
-    /// Returns the next message or metadata; `None` at the end, and where the log is damaged.
+    /// Returns the next message or metadata; `None` at the end, or at the first damage.
     ///
     /// # Errors
     /// If the file cannot be read.
-    #[allow(clippy::should_implement_trait)] // Why: an error ends it.
+    #[allow(clippy::should_implement_trait)] // Why: `Result<Option>` ends at an error.
     pub fn next(&mut self) -> Result<Option<Entry>, LogError> {
         while !self.is_over {
             match self.step() {
@@ -144,7 +144,7 @@ impl<R: Read> LogReader<R> {
         Ok(None)
     }
 
-    /// Reads one record; `None` if it is of no interest.
+    /// Reads one record; `None` if it is not an entry.
     fn step(&mut self) -> Result<Option<Entry>, Stop> {
         if self.at < self.chunk.len() {
             let (record, rest) = split_record(&self.chunk[self.at..])?;
@@ -186,14 +186,14 @@ impl<R: Read> LogReader<R> {
     }
 }
 
-/// Why there is no next record.
+/// Reason for which no next record is available.
 enum Stop {
     End,
     Damaged(mcap::McapError),
     Io(std::io::Error),
 }
 
-/// Returns the first record of a chunk's bytes, if it is of interest, and how many bytes are behind it.
+/// Returns the first record of a chunk's bytes, if its kind is used, and the number of bytes after it.
 fn split_record(bytes: &[u8]) -> Result<(Option<Record<'_>>, usize), Stop> {
     let cut = || Stop::Damaged(mcap::McapError::UnexpectedEoc);
     let (head, rest) = bytes.split_first_chunk::<9>().ok_or_else(cut)?;
@@ -203,10 +203,10 @@ fn split_record(bytes: &[u8]) -> Result<(Option<Record<'_>>, usize), Stop> {
     Ok((parse(opcode, data)?, behind.len()))
 }
 
-/// Parses a record; `None` if it is of no interest.
+/// Parses a record; `None` if its kind is not used.
 ///
-/// The library allocates what a text announces before it looks whether that many bytes are there, so the lengths are
-/// checked first.
+/// The library allocates the announced length of a string before it checks that the bytes exist, so this function
+/// checks the lengths first.
 fn parse(opcode: u8, data: &[u8]) -> Result<Option<Record<'_>>, Stop> {
     let fits = match opcode {
         op::HEADER => skip_texts(data, 2).is_some(),
@@ -222,7 +222,7 @@ fn parse(opcode: u8, data: &[u8]) -> Result<Option<Record<'_>>, Stop> {
     mcap::parse_record(opcode, data).map(Some).map_err(Stop::Damaged)
 }
 
-/// Returns what is behind the first texts, if they are there whole.
+/// Returns the bytes after the first `texts` strings; `None` if one is incomplete.
 fn skip_texts(mut data: &[u8], texts: usize) -> Option<&[u8]> {
     for _ in 0..texts {
         let (len, rest) = data.split_first_chunk::<4>()?;
@@ -231,7 +231,7 @@ fn skip_texts(mut data: &[u8], texts: usize) -> Option<&[u8]> {
     Some(data)
 }
 
-/// Whether `data` begins with a map of texts, each there whole.
+/// Whether `data` begins with a complete map of strings.
 fn is_map(data: &[u8]) -> bool {
     let Some((len, rest)) = data.split_first_chunk::<4>() else { return false };
     let len = usize::try_from(u32::from_le_bytes(*len)).ok();
@@ -263,11 +263,11 @@ fn take(topics: &mut HashMap<u16, Arc<str>>, record: Record<'_>) -> Option<Entry
     }
 }
 
-/// Reads the times of a flight from its log: of the whole flight, or, where the runtime was killed
-/// in it, of its last seconds. `None` if the log has none.
+/// Reads the timing of a flight from its log: of the complete flight, or, if the runtime was killed, of
+/// the last seconds. `None` if the log has none.
 ///
 /// # Errors
-/// If the file cannot be read or is no MCAP file.
+/// If the file cannot be read or is not an MCAP file.
 pub fn read_timing(path: &Path) -> Result<Option<Timing>, LogError> {
     let mut reader = LogReader::open(path)?;
     let topic = Channel::Timing.topic("");
@@ -287,9 +287,8 @@ pub fn read_timing(path: &Path) -> Result<Option<Timing>, LogError> {
 /// One localized pose of a flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RecordedPose {
-    /// When it was true, since 1970. [ns]
+    /// Instant of the pose, since 1970. [ns]
     pub at_ns: u64,
-    /// Where the vehicle was.
     pub world_from_body: Pose<World, Body>,
 }
 
@@ -300,21 +299,20 @@ pub struct RecordedPoses<R> {
 }
 
 impl<R: Read> RecordedPoses<R> {
-    /// Reads them from a log.
     pub fn new(reader: LogReader<R>) -> Self {
         Self::of_topic(reader, Channel::Pose.topic(""))
     }
 
-    /// Reads those of another topic whose messages are poses.
+    /// Reads the poses of another topic of foxglove.PoseInFrame.
     pub fn of_topic(reader: LogReader<R>, topic: impl Into<String>) -> Self {
         Self { reader, topic: topic.into() }
     }
 
-    /// Returns the next pose; `None` at the end. What is no pose is left out.
+    /// Returns the next pose; `None` at the end. Skips invalid messages.
     ///
     /// # Errors
     /// If the file cannot be read.
-    #[allow(clippy::should_implement_trait)] // Why: an error ends it.
+    #[allow(clippy::should_implement_trait)] // Why: `Result<Option>` ends at an error.
     pub fn next(&mut self) -> Result<Option<RecordedPose>, LogError> {
         while let Some(entry) = self.reader.next()? {
             let Entry::Message(message) = entry else { continue };
@@ -329,18 +327,18 @@ impl<R: Read> RecordedPoses<R> {
     }
 }
 
-/// What a flight is judged by: where the vehicle was, and what happened.
+/// Poses and events of a flight, by which it is judged.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RecordedTrack {
-    /// Localized poses, as they came.
+    /// Localized poses in the order of arrival.
     pub poses: Vec<(ServerTime, Pose<World, Body>)>,
-    /// What the plugin was told of, as it was told; without places where the course withholds them.
+    /// Events as sent to the plugin; without positions if the course withholds them.
     pub events: Vec<Event>,
 }
 
 impl RecordedTrack {
-    /// Reads it from a log. Poses stand there by this computer's clock, events by the server's too: the least
-    /// difference is that of the clocks.
+    /// Reads a track from a log. Poses have stamps of the runtime's clock, events also of the server's: the smallest
+    /// difference of an event's two stamps is used as the clock offset.
     ///
     /// # Errors
     /// If the file cannot be read.
@@ -370,7 +368,7 @@ impl RecordedTrack {
     }
 }
 
-/// Returns the pose of a message of a channel of poses, and the instant that it is of. [ns, since 1970]
+/// Returns the pose of a foxglove.PoseInFrame message, and its instant. [ns, since 1970]
 pub(super) fn pose_of(message: &LogMessage) -> Option<(u64, Pose<World, Body>)> {
     let logged = PoseInFrame::decode(&*message.data).ok()?;
     let stamp = logged.timestamp.as_ref();
@@ -383,57 +381,56 @@ pub(super) fn pose_of(message: &LogMessage) -> Option<(u64, Pose<World, Body>)> 
     Some((at_ns, pose))
 }
 
-/// What replay needs of a log.
+/// Entry of a log for replay.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Recorded {
-    /// Which flight it was.
+    /// Names and values that identify the flight.
     Flight(std::collections::BTreeMap<String, String>),
     /// A message to or from the plugin.
     Plugin(PluginMessage),
-    /// What the plugin got to see, each image's bitstream whole.
+    /// An observation of the plugin, with complete bitstreams.
     Observation(Observation),
-    /// An observation that the log has only in part; its number.
+    /// Number of an observation that is incomplete in the log.
     Broken(u64),
 }
 
-/// The next thing of a log.
+/// Next entry of a log.
 pub(super) enum Next {
-    /// What replay needs.
+    /// An entry for replay.
     Recorded(Recorded),
-    /// Another message; none of a camera's channels.
+    /// Another message, except colour images.
     Other(LogMessage),
 }
 
-/// Reads from a log what replay needs.
+/// Reads the entries of a log that a replay uses.
 pub struct RecordedFlight<R> {
     reader: LogReader<R>,
     topics: [String; 2],
-    /// The newest colour of each camera, by topic.
+    /// Newest colour message of each camera, by topic.
     colors: HashMap<Arc<str>, (u64, Vec<u8>)>,
-    /// The newest points of each LiDAR, by topic, as they stand there.
+    /// Newest message of each sensor, by topic.
     points: HashMap<Arc<str>, Vec<u8>>,
-    /// Whether images are wanted.
     with_images: bool,
 }
 
 impl<R: Read> RecordedFlight<R> {
-    /// Reads from `reader`; without images, observations come with empty bitstreams.
+    /// Reads from `reader`; without images, the bitstreams of observations are empty.
     pub fn new(reader: LogReader<R>, with_images: bool) -> Self {
         let topics = [Channel::Observation, Channel::Plugin].map(|channel| channel.topic(""));
         let (colors, points) = (HashMap::new(), HashMap::new());
         Self { reader, topics, colors, points, with_images }
     }
 
-    /// Whether the log ended before its end.
+    /// Whether the log is truncated or damaged.
     pub fn is_cut(&self) -> bool {
         self.reader.is_cut()
     }
 
-    /// Returns the next thing; `None` at the end.
+    /// Returns the next entry; `None` at the end.
     ///
     /// # Errors
-    /// As [`LogReader::next`].
-    #[allow(clippy::should_implement_trait)] // Why: as `LogReader::next`.
+    /// If the file cannot be read.
+    #[allow(clippy::should_implement_trait)] // Why: `Result<Option>` ends at an error.
     pub fn next(&mut self) -> Result<Option<Recorded>, LogError> {
         while let Some((_, next)) = self.next_of_all()? {
             if let Next::Recorded(recorded) = next {
@@ -443,7 +440,7 @@ impl<R: Read> RecordedFlight<R> {
         Ok(None)
     }
 
-    /// Returns the next thing, wanted by replay or not, and when it was logged; `None` at the end. [ns, since 1970]
+    /// Returns the log time and the next entry, for replay or other; `None` at the end. [ns, since 1970]
     pub(super) fn next_of_all(&mut self) -> Result<Option<(u64, Next)>, LogError> {
         while let Some(entry) = self.reader.next()? {
             let message = match entry {
@@ -493,7 +490,7 @@ impl<R: Read> RecordedFlight<R> {
             }
             let topic = Channel::Points(0).topic(&records.name);
             let points = self.points.get(&*topic).and_then(|message| points_of(message));
-            // A reduced log that leaves the images out leaves out points, too.
+            // A reduced log that omits the images also omits the points.
             let is_left_out = observation.images.is_empty();
             match points {
                 Some(points) => (records.bytes, records.is_apart) = (points, false),
@@ -504,7 +501,7 @@ impl<R: Read> RecordedFlight<R> {
         Recorded::Observation(observation)
     }
 
-    /// Puts an image's colour back into its bitstream; `None` if the log does not have it.
+    /// Joins an image's colour with its bitstream; `None` if the log does not contain the colour.
     fn join(&self, at_ns: u64, image: &mut ObservedImage) -> Option<Result<(), DecodeError>> {
         let topic = Channel::Color(0).topic(&image.name);
         let (color_at_ns, color) = self.colors.get(&*topic)?;

@@ -1,29 +1,29 @@
-//! How long flight logs are kept: the oldest are deleted, when a flight begins, until the rest is
-//! within a size and an age.
+//! Retention of flight logs: when a flight begins, deletes the oldest logs until the rest is within a
+//! maximum size and age.
 //!
-//! Only files that carry the name of a log are looked at (`2026-11-21T04-09-21.123Z.mcap`): a flight
-//! that is to stay gets another name. A log that is being written is locked, and stays.
+//! Only files with the name of a log are deleted (`2026-11-21T04-09-21.123Z.mcap`): rename a log to keep
+//! it. A log that is being written is locked, and is kept.
 
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-/// How long flight logs are kept.
+/// Maximum size and age of flight logs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Retention {
-    /// Size of all of them together. [bytes]
+    /// Maximum total size. [bytes]
     pub max_bytes: u64,
-    /// Age since the flight's end; `None` for any.
+    /// Maximum age since the flight's end; `None` for no limit.
     pub max_age: Option<Duration>,
 }
 
 impl Retention {
-    /// Every log is kept.
+    /// No limits: keeps every log.
     pub const FOREVER: Self = Self { max_bytes: u64::MAX, max_age: None };
 }
 
-/// What was deleted.
+/// Number and size of deleted logs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Deleted {
     pub(super) logs: u64,
@@ -31,7 +31,7 @@ pub(super) struct Deleted {
 }
 
 impl Deleted {
-    /// Returns a sentence for people; `None` if nothing was deleted.
+    /// Returns a sentence for the operator; `None` if nothing was deleted.
     pub(super) fn sentence(self, retention: Retention) -> Option<String> {
         let Self { logs, bytes } = self;
         if logs == 0 {
@@ -48,10 +48,8 @@ impl Deleted {
     }
 }
 
-/// [s]
 const DAY_S: f64 = 86_400.0;
 
-/// A log on disk.
 struct Log {
     path: PathBuf,
     bytes: u64,
@@ -61,7 +59,7 @@ struct Log {
 /// Deletes the oldest logs of `folder` beyond `retention`.
 ///
 /// # Errors
-/// If the folder cannot be listed. A log that cannot be deleted is left.
+/// If the folder cannot be listed. Logs that cannot be deleted are skipped.
 pub(super) fn delete_old(
     folder: &Path,
     retention: Retention,
@@ -76,7 +74,7 @@ pub(super) fn delete_old(
             logs.push(Log { path, bytes: metadata.len(), ended: metadata.modified()? });
         }
     }
-    // Their names sort by time.
+    // Names sort by time.
     logs.sort_by(|a, b| a.path.cmp(&b.path));
     let mut total: u64 = logs.iter().map(|log| log.bytes).sum();
     let mut deleted = Deleted::default();
@@ -92,13 +90,13 @@ pub(super) fn delete_old(
     Ok(deleted)
 }
 
-/// Whether it was deleted.
+/// Deletes a log that is not locked; returns whether it was deleted.
 fn delete_unless_in_use(path: &Path) -> bool {
     let is_free = File::open(path).is_ok_and(|file| file.try_lock().is_ok());
     is_free && fs::remove_file(path).is_ok()
 }
 
-/// Whether a file of this name is a log that has not been renamed.
+/// Whether a file name is the original name of a log.
 fn is_log_name(name: &str) -> bool {
     const SHAPE: &[u8] = b"0000-00-00T00-00-00.000Z.mcap";
     name.len() == SHAPE.len()
@@ -116,7 +114,7 @@ mod tests {
         format!("2026-11-21T{hour:02}-00-00.000Z.mcap")
     }
 
-    /// A folder of logs of 1000 bytes that ended at these hours.
+    /// Makes a folder of logs of 1000 bytes that ended at these hours.
     fn folder(hours: std::ops::Range<u32>) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for hour in hours {
@@ -140,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_go_until_the_rest_fits() {
+    fn deletes_the_oldest_logs_above_the_maximum_size() {
         let folder = folder(0..6);
         let retention = Retention { max_bytes: 3500, max_age: None };
         let deleted = delete_old(folder.path(), retention, at(6)).unwrap();
@@ -158,12 +156,12 @@ mod tests {
         let retention = Retention { max_age: Some(Duration::from_hours(3)), ..Retention::FOREVER };
         assert_eq!(delete_old(folder.path(), retention, at(6)).unwrap().logs, 3);
         assert_eq!(left(&folder), [name(3), name(4), name(5)]);
-        // A clock that stands before the logs makes none old.
+        // With a clock earlier than the logs, none is old.
         assert_eq!(delete_old(folder.path(), retention, at(0)).unwrap().logs, 0);
     }
 
     #[test]
-    fn only_logs_that_nobody_writes_or_renamed_are_deleted() {
+    fn keeps_open_and_renamed_logs_and_other_files() {
         let folder = folder(0..2);
         let kept = ["the best.mcap", "2026-11-21T04-09-21.123Z.answers.jsonl", "notes.txt"];
         for name in kept {
@@ -177,7 +175,7 @@ mod tests {
         let deleted = delete_old(folder.path(), nothing, at(9)).unwrap();
         assert_eq!(deleted, Deleted { logs: 1, bytes: 1000 });
         assert_eq!(left(&folder).len(), kept.len() + 3);
-        assert!(folder.path().join(name(0)).exists(), "it is being written");
+        assert!(folder.path().join(name(0)).exists(), "locked");
         assert!(delete_old(Path::new("/no/such/folder"), nothing, at(0)).is_err());
     }
 

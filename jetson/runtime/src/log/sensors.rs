@@ -1,7 +1,7 @@
-//! Readings of the sensors beside the cameras, as viewers open them: a LiDAR's and a radar's as foxglove.PointCloud, a
-//! range finder's and a sonar's as foxglove.LaserScan of one beam; all on `/sensor/NAME`, in the sensor's axes.
+//! Readings of sensors other than cameras, as messages for viewers on `/sensor/NAME`, in the sensor's axes: LiDAR and
+//! radar as foxglove.PointCloud, range finder and sonar as foxglove.LaserScan of one beam.
 //!
-//! A LiDAR's points are the very bytes that the plugin had, so a replay takes them from there.
+//! A LiDAR's points have the same bytes as for the plugin, so that a replay reads them from these messages.
 
 use std::sync::Arc;
 
@@ -16,28 +16,27 @@ use super::channels::Channel;
 use super::convert::{BODY, parts, timestamp};
 use crate::stream::{NewestReadings, Reading};
 
-/// The sensors of an observation, on their way to the log.
+/// Sensors of an observation for the log.
 #[derive(Clone, Debug, Default)]
 pub struct LoggedSensors {
-    /// Their part of shared memory before the first record: what `vizflyt_protocol::sensor::SensorHeader` has of each.
+    /// Table of sensors in shared memory: one `vizflyt_protocol::sensor::SensorHeader` each.
     pub table: Vec<u8>,
-    /// Their newest readings.
+    /// Newest readings.
     pub readings: Vec<LoggedReading>,
 }
 
-/// One sensor's newest reading, on its way to the log.
+/// Newest reading of one sensor for the log.
 #[derive(Clone, Debug)]
 pub struct LoggedReading {
     /// Index of the sensor.
     pub sensor: u8,
-    /// Its name.
+    /// Name of the sensor.
     pub name: String,
-    /// The reading.
     pub reading: Arc<Reading>,
 }
 
 impl LoggedSensors {
-    /// Returns what an observation in shared memory has of these readings.
+    /// Returns the sensors of an observation in shared memory, with those readings that it contains.
     pub fn of(observation: &[u8], sensors: &[SensorInfo], readings: &NewestReadings) -> Self {
         if sensors.is_empty() {
             return Self::default();
@@ -59,7 +58,7 @@ impl LoggedReading {
         self.reading.header.kind()
     }
 
-    /// Whether the log keeps its records on the sensor's own topic alone.
+    /// Whether the log keeps the records only on the sensor's topic.
     pub(super) fn is_apart(&self) -> bool {
         self.kind() == SensorKind::Lidar
     }
@@ -72,7 +71,7 @@ impl LoggedReading {
         }
     }
 
-    /// Returns the message for viewers of a reading that is of the instant `at_ns`. [ns, since 1970]
+    /// Returns the message for viewers, with the instant `at_ns`. [ns, since 1970]
     pub(super) fn message(&self, at_ns: u64) -> Vec<u8> {
         let body_from_sensor = self.reading.header.body_from_sensor();
         let records = &self.reading.records;
@@ -89,7 +88,7 @@ impl LoggedReading {
                     pose: Some(fox_pose(&body_from_sensor)),
                     start_angle: 0.0,
                     end_angle: 0.0,
-                    // As in ROS (REP 117): nothing came back.
+                    // Infinity for no return, as in ROS (REP 117).
                     ranges: vec![range.measured_m().map_or(f64::INFINITY, f64::from)],
                     intensities: vec![range.signal.into()],
                 }
@@ -104,13 +103,13 @@ impl LoggedReading {
     }
 }
 
-/// Returns the points of a message that [`LoggedReading::message`] made of a LiDAR.
+/// Returns the points of a LiDAR's message from [`LoggedReading::message`].
 pub(super) fn points_of(message: &[u8]) -> Option<Vec<u8>> {
     let cloud = fox::PointCloud::decode(message).ok()?;
     Some(cloud.data.to_vec()).filter(|data| data.len() % size_of::<LidarPoint>() == 0)
 }
 
-/// Name, place and type of each number of a point.
+/// Name, offset and type of each field of a point.
 type Fields = &'static [(&'static str, u32, fox::packed_element_field::NumericType)];
 
 use fox::packed_element_field::NumericType::{Float32, Uint16, Uint32};
@@ -187,14 +186,14 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_is_a_point_cloud_of_its_own_bytes() {
+    fn lidar_points_keep_their_bytes_in_a_point_cloud() {
         let points = [LidarPoint { p_m: [1.0, 2.0, 3.0], before_ns: 9, intensity: 4, ring: 5 }; 3];
         let one = logged(SensorKind::Lidar, points.as_bytes());
         let message = one.message(7_000_000_001);
         assert_eq!(points_of(&message).as_deref(), Some(points.as_bytes()));
         let cloud = fox::PointCloud::decode(&*message).unwrap();
         assert_eq!((cloud.point_stride, &*cloud.frame_id), (20, "body"));
-        // What a viewer reads by the fields' own account of themselves.
+        // Reads values with the message's description of its fields, as viewers do.
         let at = |name: &str| {
             let field = cloud.fields.iter().find(|field| field.name == name).unwrap();
             let from = 20 + field.offset as usize;
@@ -209,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_range_is_a_scan_of_one_beam_and_a_detection_a_point() {
+    fn converts_ranges_to_scans_and_detections_to_points() {
         let range = RangeReading { range_m: 1.5, signal: 0.25 };
         let message = logged(SensorKind::Sonar, range.as_bytes()).message(0);
         let scan = fox::LaserScan::decode(&*message).unwrap();

@@ -1,5 +1,4 @@
-//! The log as a whole: what is written is read back, and nothing that happens to the disk reaches
-//! those who fly.
+//! Tests of the complete log: records can be read back, and disk errors do not affect the flight.
 
 use std::fs;
 use std::io::{self, Cursor, ErrorKind};
@@ -37,7 +36,7 @@ fn recorded(path: &Path) -> Vec<Recorded> {
     std::iter::from_fn(|| flight.next().unwrap()).collect()
 }
 
-/// An image of this colour mode, cut into pieces.
+/// Returns an image with this colour mode, split into pieces.
 fn image(seq: u64, color_mode: ColorMode) -> LoggedImage {
     let (width, height) = (64u32, 96u32);
     let pixels = (width * height) as usize;
@@ -96,7 +95,7 @@ fn records_survive_the_log() {
     let line = found.iter().find(|message| &*message.topic == "/plugin/output").unwrap();
     let line = <foxglove::messages::Log as prost::Message>::decode(&*line.data).unwrap();
     assert_eq!((&*line.message, &*line.name), ("hello", "stdout at tick 7"));
-    // An independent reader finds it in order, with an index and all schemas.
+    // The file is valid for an independent reader, with an index and all schemas.
     let bytes = fs::read(&path).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert!(summary.channels.values().all(|channel| channel.schema.is_some()));
@@ -111,7 +110,7 @@ fn records_survive_the_log() {
 }
 
 #[test]
-fn images_are_logged_as_they_came_and_their_memory_goes_back() {
+fn logs_images_as_received_and_returns_their_buffers() {
     let folder = tempfile::tempdir().unwrap();
     let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
@@ -132,32 +131,32 @@ fn images_are_logged_as_they_came_and_their_memory_goes_back() {
         assert_eq!(found.images[0].bitstream, sent.pieces.concat(), "{mode:?}: bit by bit");
         assert!(ImageHeader::parse(&found.images[0].header).is_ok());
     }
-    // What viewers open is a JPEG of its own; it is not in the log a second time.
+    // The colour is a separate JPEG for viewers, and is stored only once.
     let (found, _) = messages(&path);
     let colors: Vec<_> =
         found.iter().filter(|message| &*message.topic == "/camera/front/image").collect();
-    assert_eq!(colors.len(), 3, "lossless colour is no JPEG");
+    assert_eq!(colors.len(), 3, "lossless colour is not a JPEG");
     let color =
         <foxglove::messages::CompressedImage as prost::Message>::decode(&*colors[0].data).unwrap();
     assert!(color.data.starts_with(&[0xff, 0xd8]) && color.data.ends_with(&[0xff, 0xd9]));
     assert_eq!((&*color.format, &*color.frame_id), ("jpeg", "front"));
     let calibrations = found.iter().filter(|m| &*m.topic == "/camera/front/calibration").count();
-    assert_eq!(calibrations, 1, "once while it stays the same");
+    assert_eq!(calibrations, 1, "once while unchanged");
     let spares: Vec<Vec<u8>> = std::iter::from_fn(|| home.spare()).collect();
     assert_eq!(spares.len(), 4 * image(1, ColorMode::Jpeg444).pieces.len());
 }
 
-/// Where a vehicle is that flies a curve at some 1.5 m/s. [ns]
+/// Returns the pose of a vehicle on a circle at 1.5 m/s at the time `at_ns`.
 fn on_the_curve(at_ns: u64) -> Pose<World, Body> {
     let turn = 1.2 * at_ns as f64 * 1e-9;
     let place = DVec3::new(1.25 * turn.cos(), 1.25 * turn.sin(), 1.0);
     Pose::new(place, DQuat::from_rotation_z(turn))
 }
 
-/// By how much later an image's instant is than the newest pose behind it. [ns]
+/// Time from the newest pose to the instant of an image. [ns]
 const AHEAD_NS: u64 = 48_000_000;
 
-/// An image on the curve whose newest pose was measured at `pose_ns`, and what is known of it. [ns]
+/// Returns an image on the curve; `pose_ns` is the measurement time of its newest pose.
 fn image_on_the_curve(seq: u64, pose_ns: u64) -> LoggedImage {
     let mut image = image(seq, ColorMode::Jpeg444);
     let k = Intrinsics::from_horizontal_fov(64, 96, 1.5);
@@ -171,7 +170,7 @@ fn image_on_the_curve(seq: u64, pose_ns: u64) -> LoggedImage {
     image
 }
 
-/// Checks that each image of a log stands at the instant that it shows, by its clock's zero. [ns]
+/// Checks that each image of a log has the instant that it shows and the pose at that instant.
 fn check_instants(path: &Path, expected: usize) {
     let (found, _) = messages(path);
     let of =
@@ -191,7 +190,7 @@ fn check_instants(path: &Path, expected: usize) {
         let color =
             <foxglove::messages::CompressedImage as prost::Message>::decode(&*image.data).unwrap();
         let at_ns = stamped(image, color.timestamp);
-        // Where the vehicle truly was then, by the poses of the flight.
+        // True pose at that instant, interpolated from the poses of the flight.
         let next = poses.partition_point(|pose| pose.at_ns < at_ns);
         let (a, b) = (&poses[next - 1], &poses[next]);
         let share = (at_ns - a.at_ns) as f64 / (b.at_ns - a.at_ns) as f64;
@@ -201,7 +200,7 @@ fn check_instants(path: &Path, expected: usize) {
         let off_m = truth.translation_m.distance(at_image.world_from_body.translation_m);
         assert!(off_m < 1e-4, "{:.1} mm from where it was rendered", 1e3 * off_m);
         assert!(truth.rotation.angle_between(at_image.world_from_body.rotation) < 1e-4);
-        // It came before the instant that it shows, and its pose was measured before that.
+        // The image arrives before the instant that it shows, and its pose was measured before its arrival.
         let stamps: serde_json::Value = serde_json::from_slice(&stamps.data).unwrap();
         let ns = |key: &str| stamps[key].as_u64().unwrap();
         assert_eq!((ns("shown_ns"), ns("pose_ns")), (at_ns, at_ns - AHEAD_NS));
@@ -210,7 +209,7 @@ fn check_instants(path: &Path, expected: usize) {
 }
 
 #[test]
-fn an_image_is_stamped_with_the_instant_that_it_shows() {
+fn stamps_images_with_the_instant_that_they_show() {
     let folder = tempfile::tempdir().unwrap();
     let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
@@ -236,7 +235,7 @@ fn an_image_is_stamped_with_the_instant_that_it_shows() {
 }
 
 #[test]
-fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
+fn virtual_log_stamps_images_and_writes_depth_for_viewers() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("virtual.mcap");
     let file = File::create(&path).unwrap();
@@ -266,7 +265,7 @@ fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
     assert_eq!((depth.width, depth.height, depth.step), (64, 96, 128));
     assert_eq!(depth.encoding, "16UC1");
     let bytes: Vec<u8> = depth_mm.iter().flat_map(|mm| mm.to_le_bytes()).collect();
-    assert!(depth.data == bytes, "millimetres, row by row");
+    assert!(depth.data == bytes, "depth in millimetres, row by row");
     let imu = found.iter().filter(|message| &*message.topic == "/imu").nth(1).unwrap();
     assert_eq!(imu.log_time_ns, start_ns + 10_000_000);
     let imu: serde_json::Value = serde_json::from_slice(&imu.data).unwrap();
@@ -274,7 +273,7 @@ fn so_is_an_image_on_the_virtual_clock_and_its_depth_for_viewers() {
 }
 
 #[test]
-fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
+fn full_queue_drops_and_counts_without_waiting() {
     let (queue, records) = Queue::of(3);
     let home = Arc::new(Mailbox::default());
     let event = || Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: vec![] };
@@ -302,17 +301,17 @@ fn a_queue_that_is_full_drops_and_counts_and_nobody_waits() {
     queue.push(observation(11));
     queue.push(event());
     assert_eq!(queue.dropped(), Dropped { images: 1, records: 2 });
-    assert_eq!(home.spare().map(|piece| piece.len()), Some(11), "its memory goes back");
+    assert_eq!(home.spare().map(|piece| piece.len()), Some(11), "the buffer is returned");
     queue.taken(queue::MAX_IMAGE_BYTES - 10);
     queue.push(observation(11));
-    assert_eq!(queue.dropped().images, 1, "there is room again");
+    assert_eq!(queue.dropped().images, 1, "the queue has free space again");
     drop(records);
     queue.push(event());
-    assert_eq!(queue.dropped().records, 3, "a writer that is gone stops nobody");
+    assert_eq!(queue.dropped().records, 3, "without a writer, `push` does not block");
 }
 
 #[test]
-fn the_times_of_the_whole_flight_are_read_back() {
+fn reads_the_timing_of_the_complete_flight() {
     let folder = tempfile::tempdir().unwrap();
     let log = FlightLog::open(&LogSettings::full(folder.path()), None);
     let path = log.path().unwrap().to_owned();
@@ -326,7 +325,7 @@ fn the_times_of_the_whole_flight_are_read_back() {
     let found = read_timing(&path).unwrap().unwrap();
     assert_eq!((found.seconds, found.waterfall.images), (90.0, 2));
     assert_eq!(found.cameras[0].arrived, 2);
-    // Cut off, it has what was written before.
+    // A truncated log can be read up to its end.
     let bytes = fs::read(&path).unwrap();
     fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     assert!(read_timing(&path).is_ok());
@@ -335,7 +334,7 @@ fn the_times_of_the_whole_flight_are_read_back() {
 }
 
 #[test]
-fn a_folder_that_cannot_be_written_stops_nothing() {
+fn flies_without_a_log_if_the_folder_is_not_writable() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a file");
     fs::write(&file, "x").unwrap();
@@ -345,7 +344,7 @@ fn a_folder_that_cannot_be_written_stops_nothing() {
     assert!(log.images(&Arc::default()).is_none());
 }
 
-/// A disk that only counts how long the file gets.
+/// Disk that only counts the length of the file.
 #[derive(Clone, Default)]
 struct Counting(Arc<AtomicU64>);
 
@@ -360,8 +359,8 @@ impl Disk for Counting {
     }
 }
 
-/// Returns the megabytes of a minute at 60 Hz with images of 79 kB, what the demo's take at 320x240,
-/// and all that is logged beside them.
+/// Returns the size of a log of one minute at 60 Hz with images of 79 kB, as those of the demo at 320x240,
+/// including all other records. [MB]
 fn minute_mb(budget: Option<Budget>) -> f64 {
     let disk = Counting::default();
     let sinks = LogSinks::new(Some(disk.clone()), None, budget).unwrap();
@@ -398,7 +397,7 @@ fn minute_mb(budget: Option<Budget>) -> f64 {
 }
 
 #[test]
-fn a_reduced_log_takes_at_most_60_mb_a_minute() {
+fn reduced_log_is_at_most_60_mb_a_minute() {
     let (reduced, full) = (minute_mb(Some(Budget::default())), minute_mb(None));
     println!("reduced {reduced:.1} MB, full {full:.1} MB a minute");
     assert!((50.0..60.0).contains(&reduced), "{reduced} MB");
@@ -406,7 +405,7 @@ fn a_reduced_log_takes_at_most_60_mb_a_minute() {
 }
 
 #[test]
-fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() {
+fn reduced_log_keeps_all_heads_and_some_bit_exact_images() {
     let folder = tempfile::tempdir().unwrap();
     let settings =
         LogSettings { images: LoggedImages::Reduced, ..LogSettings::full(folder.path()) };
@@ -437,7 +436,7 @@ fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() 
         })
         .collect();
     assert_eq!(observations.len(), 10);
-    // The first spends more than the second that a log begins with.
+    // The first image uses more than the initial budget.
     assert_eq!(observations[0].images[0].bitstream, large.concat(), "bit by bit");
     for (seq, observation) in observations.iter().enumerate() {
         assert_eq!(observation.head, vec![seq as u8; 2000]);
@@ -450,11 +449,11 @@ fn a_reduced_log_has_the_head_of_every_observation_and_some_images_bit_by_bit() 
 }
 
 #[test]
-fn old_logs_are_deleted_when_a_flight_begins_and_it_is_reported() {
+fn deletes_and_reports_old_logs_when_a_flight_begins() {
     let folder = tempfile::tempdir().unwrap();
     for hour in 10..20 {
         let name = format!("2026-01-01T{hour}-00-00.000Z.mcap");
-        // Larger than what every log begins with.
+        // Larger than the start of each log.
         File::create(folder.path().join(name)).unwrap().set_len(1_000_000).unwrap();
     }
     let retention = Retention { max_bytes: 5_500_000, max_age: None };
@@ -463,11 +462,11 @@ fn old_logs_are_deleted_when_a_flight_begins_and_it_is_reported() {
     let notice = log.poll_trouble().unwrap();
     assert!(notice.contains("deleted the ") && notice.contains("[log] keeps"), "{notice}");
     let left = fs::read_dir(folder.path()).unwrap().count();
-    assert_eq!(left, 6, "five, and this flight's");
+    assert_eq!(left, 6, "five old logs and the new one");
     assert!(log.path().unwrap().exists());
 }
 
-/// A disk that fails once so much is on it.
+/// Disk with a maximum file length. [bytes]
 struct Failing(u64);
 
 impl Disk for Failing {
@@ -486,7 +485,7 @@ fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     let (queue, records) = Queue::of(64);
     let sinks = LogSinks::new(Some(Failing(100_000)), None, None).unwrap();
     let home = Arc::new(Mailbox::default());
-    // More than the disk holds, of which a chunk is made at once.
+    // Larger than the disk, and large enough to complete a chunk.
     let big = "x".repeat(5 << 20).into_bytes();
     queue.push(Record::Json { channel: Channel::Requested, at: HostTime::ZERO, json: big });
     let images = vec![image(1, ColorMode::Jpeg444)];
@@ -505,11 +504,11 @@ fn full_disk_ends_the_log_with_a_report_and_buffers_are_reused() {
     let trouble = queue.poll_trouble().unwrap();
     assert!(trouble.contains("not logged any further"), "{trouble}");
     assert_eq!(queue.poll_trouble(), None, "once");
-    assert!(home.spare().is_some(), "memory goes round all the same");
+    assert!(home.spare().is_some(), "the buffer is returned after the error");
 }
 
 #[test]
-fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
+fn nearly_full_disk_omits_only_images() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log.mcap");
     let (queue, records) = Queue::of(64);
@@ -544,8 +543,8 @@ fn a_disk_that_is_nearly_full_gets_no_images_but_the_rest() {
 }
 
 #[test]
-fn a_log_that_is_not_closed_is_a_whole_file() {
-    // What a killed process leaves: nobody finishes the writer.
+fn unclosed_log_is_a_valid_file() {
+    // As in a killed process, the writer is not finished.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log.mcap");
     let disk = RealFile::new(File::create(&path).unwrap()).unwrap();
@@ -562,13 +561,13 @@ fn a_log_that_is_not_closed_is_a_whole_file() {
     let strict: Vec<_> = mcap::MessageStream::new(&bytes).unwrap().collect();
     assert_eq!(strict.len(), 1);
     assert!(strict[0].is_ok());
-    assert_eq!(messages(&path), (messages(&path).0, false), "not even cut");
+    assert_eq!(messages(&path), (messages(&path).0, false), "not reported as cut");
 }
 
 proptest! {
-    /// Damaged, cut or hostile: read as far as it goes, without a panic.
+    /// Reads damaged, truncated and hostile files without a panic.
     #[test]
-    fn any_file_is_read_as_far_as_it_goes(
+    fn reads_damaged_files_without_a_panic(
         cut in any::<prop::sample::Index>(),
         flips in prop::collection::vec(any::<(prop::sample::Index, u8)>(), 0..8)
     ) {

@@ -1,8 +1,8 @@
-//! The log of a flight on a virtual clock ([`crate::lockstep`]): the same file, written by the thread that flies.
+//! Log of a flight on a virtual clock ([`crate::lockstep`]): the same format, written by the flight's thread.
 //!
-//! Nothing is dropped and no clock is read, so the same flight leaves the same bytes, but for where the plugin's own
-//! lines stand: they come as fast as a pipe brings them. Colour and depth are those that the plugin had, lossless; beside
-//! them each image that is kept stands as JPEG, for viewers. Times count as if the virtual clock began in 1970.
+//! Nothing is dropped and no real clock is read, so the same flight gives the same bytes, except for the positions of
+//! the plugin's printed lines, which depend on the timing of a pipe. Colour and depth are lossless; each kept image is
+//! also written as JPEG for viewers. The virtual clock starts in 1970.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -30,37 +30,37 @@ use super::{
     plugin_record,
 };
 
-/// A chunk is closed this often. [s]
+/// Maximum duration of a chunk. [s]
 const CHUNK_PERIOD_S: f64 = 1.0;
-/// Of the images for viewers. [0 to 100]
+/// JPEG quality of the images for viewers. [0 to 100]
 const QUALITY: u8 = 85;
 
-/// One camera's image as the plugin is given it.
+/// One camera's image as passed to the plugin.
 #[derive(Clone, Copy, Debug)]
 pub struct GivenImage<'a> {
-    /// What is known of it: camera, size, lens, stamps.
+    /// Camera, size, lens and stamps.
     pub header: &'a ImageHeader,
-    /// The camera's name.
+    /// Name of the camera.
     pub name: &'a str,
-    /// When the newest pose behind it was measured. [host]
+    /// Measurement time of the newest pose used for the image. [host]
     pub pose: HostTime,
     /// H x W x 3.
     pub rgb: &'a [u8],
-    /// H x W, camera z, 0 where there is no return. [mm]
+    /// H x W, camera z, 0 without a return. [mm]
     pub depth_mm: &'a [u16],
 }
 
-/// The log of one flight on a virtual clock. [`Self::finish`] completes the file.
+/// Log of one flight on a virtual clock. [`Self::finish`] completes the file.
 pub struct VirtualLog {
     writer: LogWriter<PlainFile>,
     closed_at: HostTime,
     encoder: Encoder,
-    /// What went wrong first: nothing is written from then on.
+    /// First error; nothing is written after it.
     failed: Option<mcap::McapError>,
 }
 
 impl VirtualLog {
-    /// Begins the log of a flight by `plugin` at `now` in `file`, which is empty; with `depth` for viewers.
+    /// Begins the log of a flight by `plugin` at `now` in the empty `file`. `depth`: also writes depth for viewers.
     ///
     /// # Errors
     /// If the file cannot be written.
@@ -87,49 +87,47 @@ impl VirtualLog {
         Ok(log)
     }
 
-    /// Logs `message`, on a channel of ours.
+    /// Logs `message` on a JSON channel.
     pub fn write(&mut self, channel: Channel, at: HostTime, message: &impl Serialize) {
         if let Ok(json) = serde_json::to_vec(message) {
             self.take(at, Record::Json { channel, at, json });
         }
     }
 
-    /// Logs a pose that came at `at` and was true at `stamp`.
+    /// Logs a pose of the instant `stamp` that arrived at `at`.
     pub fn pose(&mut self, at: HostTime, stamp: HostTime, sample: &PoseSample) {
         self.take(at, Record::Pose { at, stamp, sample: *sample });
     }
 
-    /// Logs the plugin's own estimate, which came at `at`.
+    /// Logs an odometry estimate of the plugin that arrived at `at`.
     pub fn odometry(&mut self, at: HostTime, odometry: &Odometry) {
         self.take(at, Record::Odometry { at, odometry: *odometry });
     }
 
-    /// Logs a reading of the IMU.
     pub fn imu(&mut self, sample: &ImuSample) {
         self.write(Channel::Imu, sample.stamp, &imu_message(sample));
     }
 
-    /// Logs an event.
     pub fn event(&mut self, at: HostTime, event: &Event) {
         self.take(at, event_record(at, event));
     }
 
-    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it had image `seq`.
+    /// Logs a line that the plugin printed on `stream` (`stdout` or `stderr`) while it processed image `seq`.
     pub fn line(&mut self, at: HostTime, stream: &str, line: &str, seq: u64) {
         self.take(at, line_record(at, stream, line, seq));
     }
 
-    /// Logs a message that was sent to the plugin; replay sends it again.
+    /// Logs a message to the plugin; a replay sends it again.
     pub fn to_plugin(&mut self, at: HostTime, message: &ToPlugin) {
         self.take(at, plugin_record(at, true, message));
     }
 
-    /// Logs a message of the plugin; replay compares with it.
+    /// Logs a message of the plugin; a replay compares its replies with it.
     pub fn from_plugin(&mut self, at: HostTime, message: &FromPlugin) {
         self.take(at, plugin_record(at, false, message));
     }
 
-    /// Logs an observation: shared memory up to its first plane, and its images, if the log keeps them.
+    /// Logs an observation: shared memory up to the first plane, and its images, if the log keeps them.
     pub fn observation(
         &mut self,
         at: HostTime,
@@ -175,7 +173,7 @@ impl VirtualLog {
         self.writer.observation(at, seq, head.to_vec(), &logged, sensors, is_kept)
     }
 
-    /// Writes an image's colour so that viewers open it.
+    /// Writes an image's colour as JPEG for viewers.
     fn show(
         &mut self,
         at: HostTime,
@@ -217,7 +215,7 @@ impl VirtualLog {
     /// Completes the file.
     ///
     /// # Errors
-    /// What went wrong first: a full disk, say. The file then lacks what came after.
+    /// The first error, for example a full disk. The file then lacks all later records.
     pub fn finish(self) -> McapResult<()> {
         match self.failed {
             None => self.writer.sinks.finish(),
@@ -232,7 +230,7 @@ impl std::fmt::Debug for VirtualLog {
     }
 }
 
-/// A file that whoever flies hands to the medium when all is written.
+/// File without synchronization to the medium; the caller synchronizes it at the end.
 struct PlainFile(File);
 
 impl Disk for PlainFile {

@@ -1,7 +1,7 @@
-//! The log's own thread: encodes records, writes them, shows them to viewers.
+//! Thread of the log: encodes records, writes them, and sends them to viewers.
 //!
-//! Budget at 640x480 and 60 Hz: 13 MB/s copied twice (into the chunk, and once more where a viewer
-//! is subscribed), one write to disk a second or every [`CHUNK_BYTES`].
+//! Cost at 640x480 and 60 Hz: 13 MB/s, copied into the chunk and again for a subscribed viewer; one write to
+//! disk each second or each [`CHUNK_BYTES`].
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -32,28 +32,28 @@ use super::messages::{Observation, ObservedImage, ObservedRecords, PluginMessage
 use super::queue::{Dropped, LoggedImage, ObservationRecord, Queue, Record};
 use super::sensors::LoggedSensors;
 
-/// A chunk is closed this often: what a killed process loses.
+/// Maximum duration of a chunk, which a killed process loses.
 const CHUNK_PERIOD: Duration = Duration::from_secs(1);
-/// Or when it is so large: what waits in memory. [bytes]
+/// Maximum size of a chunk in memory. [bytes]
 const CHUNK_BYTES: usize = 4 << 20;
-/// Below so much room on disk images are left out, so that the flight's figures still fit, and the
-/// rest of the computer works. [bytes]
+/// Free disk space below which images are omitted, so that the rest of the log still fits, and other
+/// programs can write. [bytes]
 const MIN_FREE: u64 = 256 << 20;
-/// Above so much they come back. [bytes]
+/// Free disk space above which images are logged again. [bytes]
 const ENOUGH_FREE: u64 = 512 << 20;
-/// A camera's calibration is written this often, for viewers that connect later.
+/// Period at which a camera's calibration is repeated, for viewers that connect later. [ns]
 const CALIBRATION_PERIOD_NS: u64 = 1_000_000_000;
 
-/// The sinks of messages: the file and the live viewers.
+/// Destinations of messages: the file and the live viewers.
 pub(super) struct LogSinks<D: Disk> {
     file: Option<Writer<SafeFile<D>>>,
     live: Option<Live>,
     ids: BTreeMap<Channel, u16>,
     sequence: u32,
-    /// Bytes of messages since the last chunk.
+    /// Size of the messages since the last chunk. [bytes]
     waiting: usize,
     written_bytes: u64,
-    /// What decides which images are written; all are without it.
+    /// Budget that selects images; without it, all are written.
     budget: Option<Budget>,
 }
 
@@ -69,9 +69,9 @@ impl<D: Disk> LogSinks<D> {
                 .compression(None)
                 .profile("")
                 .library(concat!("vizflyt ", env!("CARGO_PKG_VERSION")))
-                // Closed by time or size of ours.
+                // This module closes chunks by time or size.
                 .chunk_size(None)
-                // Chunks have their own; one over all would need the file to be written in order.
+                // Chunks have checksums; a checksum of the data section would require writing in order.
                 .calculate_data_section_crc(false)
                 .create(SafeFile::new(disk))
         });
@@ -103,7 +103,7 @@ impl<D: Disk> LogSinks<D> {
         Ok(())
     }
 
-    /// Shows a message to viewers, and writes it.
+    /// Sends a message to viewers, and writes it.
     pub(super) fn put(
         &mut self,
         channel: Channel,
@@ -127,7 +127,7 @@ impl<D: Disk> LogSinks<D> {
         file.write_to_known_channel(&header, message)
     }
 
-    /// Shows a message to viewers alone.
+    /// Sends a message to viewers without writing it.
     fn show(
         &mut self,
         channel: Channel,
@@ -155,7 +155,6 @@ impl<D: Disk> LogSinks<D> {
         self.file.as_mut().map_or(Ok(()), Writer::flush)
     }
 
-    /// Whether so much waits that the chunk is to be completed.
     pub(super) fn is_chunk_full(&self) -> bool {
         self.waiting >= CHUNK_BYTES
     }
@@ -168,10 +167,10 @@ impl<D: Disk> LogSinks<D> {
         self.file.take().map_or(Ok(()), |mut file| file.finish().map(|_| ()))
     }
 
-    /// Gives the file up: what is on disk stays as it is.
+    /// Closes the file without further writes.
     fn abandon(&mut self) {
         if let Some(file) = self.file.take() {
-            // Taken apart, as a writer that is dropped tries to finish.
+            // `into_inner`, because a dropped writer tries to finish the file.
             drop(file.into_inner());
         }
     }
@@ -180,40 +179,40 @@ impl<D: Disk> LogSinks<D> {
 /// Name of the metadata record that identifies the flight.
 pub(super) const FLIGHT: &str = "vizflyt.flight";
 
-/// The thread's state besides the sinks.
+/// State of the thread.
 pub(super) struct LogWriter<D: Disk> {
     pub(super) sinks: LogSinks<D>,
     queue: Arc<Queue>,
-    /// From this computer's clock to time since 1970. [ns]
+    /// Offset from this computer's clock to time since 1970. [ns]
     offset_ns: u64,
     free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
     images_fit: bool,
-    /// Observations whose images were left out.
+    /// Number of observations without their images.
     left_out: u64,
-    /// Drops that have been reported.
+    /// Reported drops.
     reported: Dropped,
     calibrations: BTreeMap<usize, (Vec<u8>, u64)>,
-    /// The newest reading of each sensor that was written, by its instant. [host]
+    /// Instant of the newest written reading of each sensor. [host]
     readings: BTreeMap<u8, HostTime>,
     rest: Vec<u8>,
-    /// Decodes depth for viewers, if that is wanted.
+    /// Decoder of depth for viewers, if requested.
     depth: Option<DepthReader>,
 }
 
 impl<D: Disk> LogWriter<D> {
-    /// `free_bytes` returns the free space on the disk, if it is known.
+    /// `free_bytes` returns the free disk space, if available.
     pub(super) fn new(
         sinks: LogSinks<D>,
         queue: Arc<Queue>,
         free_bytes: Box<dyn Fn() -> Option<u64> + Send>,
     ) -> Self {
-        // MCAP wants times since 1970.
+        // MCAP uses times since 1970.
         let wall = SystemTime::now().duration_since(UNIX_EPOCH);
         let wall_ns = wall.map_or(0, |since| since.as_nanos() as u64);
         Self::since(wall_ns.wrapping_sub(host_now().as_ns()), sinks, queue, free_bytes)
     }
 
-    /// As [`Self::new`], with a clock whose zero is `offset_ns` after 1970. [ns]
+    /// Same as [`Self::new`], with a clock that starts `offset_ns` after 1970.
     pub(super) fn since(
         offset_ns: u64,
         sinks: LogSinks<D>,
@@ -235,13 +234,13 @@ impl<D: Disk> LogWriter<D> {
         }
     }
 
-    /// Writes depth so that any viewer shows it, from now on.
+    /// Also writes depth for viewers.
     pub(super) fn show_depth(&mut self) {
         self.depth = Some(DepthReader::default());
     }
 
-    /// Writes until the flight is over. A disk that refuses ends the file, not this: viewers go on,
-    /// and the memory of images goes round.
+    /// Writes until the end of the flight. After a write error, only the file ends: viewers still receive
+    /// messages, and buffers of images are reused.
     pub(super) fn run(mut self, records: &Receiver<Record>) {
         let mut flushed = Instant::now();
         loop {
@@ -280,7 +279,7 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.abandon();
         let megabytes = self.sinks.written_bytes as f64 / 1e6;
         self.queue.complain(format!(
-            "the flight is not logged any further: {error}; the first {megabytes:.1} MB are a whole \
+            "the flight is not logged any further: {error}; the first {megabytes:.1} MB are a complete \
              file"
         ));
     }
@@ -296,21 +295,21 @@ impl<D: Disk> LogWriter<D> {
                 format!("images are logged again: {megabytes} MB are free")
             } else {
                 format!(
-                    "images are no longer logged: only {megabytes} MB are free on its disk; delete \
+                    "images are no longer logged: only {megabytes} MB are free on the disk; delete \
                      old flights"
                 )
             };
             self.queue.complain(text);
         }
         let dropped = self.queue.dropped();
-        // The first, then ever fewer.
+        // Reports the first drop, and then each doubling.
         let is_due = |now: u64, reported: u64| now > 0 && now >= 2 * reported && now != reported;
         if is_due(dropped.images, self.reported.images)
             || is_due(dropped.records, self.reported.records)
         {
             self.reported = dropped;
             self.queue.complain(format!(
-                "{} images and {} records were dropped so far: the disk is too slow",
+                "{} images and {} records were dropped: the disk is too slow",
                 dropped.images, dropped.records
             ));
         }
@@ -394,7 +393,7 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.put(Channel::Motion, "", at_ns, motion.to_string().as_bytes())
     }
 
-    /// Writes what the image thread has sent, if there is room on the disk.
+    /// Writes an observation of the image thread, if the disk has enough free space.
     fn queued(&mut self, record: &ObservationRecord) -> McapResult<()> {
         if !self.images_fit {
             return Ok(());
@@ -404,12 +403,12 @@ impl<D: Disk> LogWriter<D> {
         self.observation(*at, *seq, head.clone(), images, sensors, is_kept)
     }
 
-    /// Whether the images that came `at` are to be written.
+    /// Whether images that arrived at `at` fit into the budget.
     pub(super) fn keeps_image(&mut self, at: HostTime) -> bool {
         self.sinks.budget.as_mut().is_none_or(|budget| budget.allows_image(at))
     }
 
-    /// Writes an observation, with its images if they are kept.
+    /// Writes an observation, with its images if `is_kept`.
     pub(super) fn observation(
         &mut self,
         at: HostTime,
@@ -438,8 +437,8 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.put(Channel::Observation, "", at_ns, &observation.encode_to_vec())
     }
 
-    /// Writes the readings that are new on the sensors' topics: large ones only with images that are kept. Returns what
-    /// the observation holds of all.
+    /// Writes new readings on the sensors' topics, large ones only if images are kept. Returns the observation's
+    /// records of all readings.
     fn readings(
         &mut self,
         at_ns: u64,
@@ -462,7 +461,7 @@ impl<D: Disk> LogWriter<D> {
         Ok(records)
     }
 
-    /// Writes where images were rendered from, once for all of the same instant.
+    /// Writes the poses from which images were rendered, once for images of the same instant.
     fn poses_at_images(&mut self, at_ns: u64, images: &[LoggedImage]) -> McapResult<()> {
         let mut before = None;
         for image in images {
@@ -477,7 +476,7 @@ impl<D: Disk> LogWriter<D> {
         Ok(())
     }
 
-    /// Shows images that are not written to viewers.
+    /// Sends images that are not written to viewers.
     fn show_images(&mut self, at_ns: u64, images: &[LoggedImage]) -> McapResult<()> {
         if self.sinks.live.is_none() {
             return Ok(());
@@ -492,7 +491,7 @@ impl<D: Disk> LogWriter<D> {
         Ok(())
     }
 
-    /// Writes an image's colour and calibration; returns what is left of it.
+    /// Writes an image's colour and calibration; returns the rest of it.
     fn image(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<ObservedImage> {
         self.calibration(at_ns, image)?;
         self.stamps(at_ns, image)?;
@@ -519,7 +518,7 @@ impl<D: Disk> LogWriter<D> {
         })
     }
 
-    /// Writes each instant of an image.
+    /// Writes the stamps of an image.
     fn stamps(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
         let stamps = json!({
             "seq": image.header.seq.get(),
@@ -531,7 +530,7 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.put(channel, &image.name, at_ns, stamps.to_string().as_bytes())
     }
 
-    /// Writes an image's depth for viewers, if that is wanted; one that does not decode is left out.
+    /// Writes an image's depth for viewers, if requested; omits images that do not decode.
     fn depth(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
         let shown_ns = self.wall_ns(image.shown());
         let Some(reader) = &mut self.depth else { return Ok(()) };
@@ -550,8 +549,8 @@ impl<D: Disk> LogWriter<D> {
         self.sinks.put(channel, &image.name, at_ns, &raw.encode_to_vec())
     }
 
-    /// Returns an image's colour as viewers open it, and leaves what else it holds in `rest`; `None`
-    /// if its colour is no JPEG.
+    /// Returns an image's colour for viewers, and stores the rest of the bitstream in `rest`; `None` if
+    /// the colour is not a JPEG.
     fn color(&mut self, image: &LoggedImage) -> Option<Vec<u8>> {
         let mut jpeg = Vec::with_capacity(image.pieces.iter().map(Vec::len).sum());
         self.rest.clear();
@@ -568,7 +567,7 @@ impl<D: Disk> LogWriter<D> {
         Some(color.encode_to_vec())
     }
 
-    /// Writes how a camera's images are rendered, when that has changed and every [`CALIBRATION_PERIOD_NS`].
+    /// Writes a camera's calibration when it has changed, and each [`CALIBRATION_PERIOD_NS`].
     fn calibration(&mut self, at_ns: u64, image: &LoggedImage) -> McapResult<()> {
         let calibration = calibration(at_ns, &image.name, &image.header);
         let body_from_cam = image.header.body_from_cam();
@@ -593,7 +592,7 @@ impl<D: Disk> LogWriter<D> {
 const WORLD: &str = "world";
 const ODOM: &str = "odom";
 
-/// Whether images are to be logged with so much room on the disk.
+/// Whether the free disk space is enough for images, with hysteresis.
 fn images_fit(they_did: bool, free: Option<u64>) -> bool {
     free.is_none_or(|free| free >= if they_did { MIN_FREE } else { ENOUGH_FREE })
 }
@@ -625,7 +624,7 @@ fn transform<A, B>(
 
 fn calibration(at_ns: u64, name: &str, header: &ImageHeader) -> fox::CameraCalibration {
     let k = header.intrinsics();
-    // OpenCV, and so Foxglove, puts the centre of the first pixel at 0; we its corner.
+    // The origin is the centre of the first pixel in OpenCV and Foxglove, but its corner in VizFlyt.
     let (cx, cy) = (k.cx_px - 0.5, k.cy_px - 0.5);
     let (model, d) = match k.distortion {
         Distortion::None => ("", vec![]),

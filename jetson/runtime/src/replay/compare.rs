@@ -1,4 +1,4 @@
-//! How two answers differ, for people: where, and by how much.
+//! Compares two replies: field and amount of the largest difference.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -6,16 +6,16 @@ use vizflyt_protocol::messages::{FromPlugin, Setpoint};
 use vizflyt_protocol::packet::framing::{MAX_FRAMED, encode_body};
 use vizflyt_protocol::time::HostTime;
 
-/// By how much two setpoints differ.
+/// Largest difference between two setpoints.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
-    /// The number that differs most: `velocity.v_mps.1`; empty if they are of other kinds.
+    /// Path of the field, for example `velocity.v_mps.1`; empty between different kinds.
     pub field: String,
-    /// By how much, in the field's unit; infinite between kinds.
+    /// Difference in the field's unit; infinite between different kinds.
     pub amount: f64,
 }
 
-/// Returns how two answers differ; `None` if they are the same, bit by bit.
+/// Returns the largest difference between two replies; `None` if they are equal bit by bit.
 pub fn difference(recorded: Option<&Setpoint>, replayed: Option<&Setpoint>) -> Option<Difference> {
     if bits(recorded) == bits(replayed) {
         return None;
@@ -33,7 +33,7 @@ pub fn difference(recorded: Option<&Setpoint>, replayed: Option<&Setpoint>) -> O
     }
 }
 
-/// An answer's bytes: unlike numbers, they are equal to themselves even if they are no number.
+/// Returns the encoded bytes of a reply, for which NaN equals itself.
 fn bits(setpoint: Option<&Setpoint>) -> Vec<u8> {
     let zero = HostTime::ZERO;
     let answer =
@@ -41,7 +41,7 @@ fn bits(setpoint: Option<&Setpoint>) -> Vec<u8> {
     encode_body(&answer, &mut [0; MAX_FRAMED]).to_vec()
 }
 
-/// Looks for the largest difference of two numbers; false if the two are built differently.
+/// Finds the largest difference between numbers; returns `false` if the structures differ.
 fn walk(a: &Value, b: &Value, path: &mut String, largest: &mut Difference) -> bool {
     let len = path.len();
     let mut inside = |key: &str, a: &Value, b: &Value| {
@@ -66,7 +66,7 @@ fn walk(a: &Value, b: &Value, path: &mut String, largest: &mut Difference) -> bo
         (Value::Number(a), Value::Number(b)) => {
             let (a, b) = (a.as_f64().unwrap_or(0.0), b.as_f64().unwrap_or(0.0));
             let amount = (a - b).abs();
-            // Zeros of two signs differ by nothing, and differ.
+            // 0.0 and -0.0 have different bits, but their difference is 0.
             let is_first = largest.field.is_empty() && a.to_bits() != b.to_bits();
             if amount > largest.amount || is_first {
                 *largest = Difference { field: path.clone(), amount };
@@ -83,7 +83,7 @@ mod tests {
     use vizflyt_protocol::messages::YawTarget;
     use vizflyt_sdk::glam::DVec3;
 
-    #[allow(clippy::needless_pass_by_value)] // Why: the cases read better.
+    #[allow(clippy::needless_pass_by_value)] // Why: makes the cases easier to read.
     fn check(a: Option<Setpoint>, b: Option<Setpoint>, expected: Option<(&str, f64)>) {
         let found = difference(a.as_ref(), b.as_ref());
         let found = found.as_ref().map(|found| (&*found.field, found.amount));
@@ -91,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_difference_is_named() {
+    fn names_the_largest_difference() {
         let velocity = |x, y| Some(Setpoint::velocity(DVec3::new(x, y, 0.0), YawTarget::Keep));
         check(velocity(1.0, 2.0), velocity(1.0, 2.0), None);
         check(velocity(1.0, 2.0), velocity(1.5, 4.0), Some(("velocity.v_mps.1", 2.0)));

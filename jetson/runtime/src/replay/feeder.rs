@@ -1,4 +1,4 @@
-//! The runtime's end of a replay: starts the plugin, feeds it, waits for its replies.
+//! Runtime side of a replay: starts the plugin, feeds it, and waits for its replies.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -15,25 +15,24 @@ use crate::lockstep::{PluginProcess, ProcessError};
 use crate::log::Observation;
 use crate::supervisor::{PluginLimits, Stream};
 
-/// What the plugin prints is passed on this often.
+/// Period at which printed lines of the plugin are passed on.
 const LINES_EVERY: Duration = Duration::from_millis(400);
-/// Largest observation that is fed: what eight of the largest cameras need is a faulty log.
-/// [bytes]
+/// Maximum size of an observation; a larger one is a faulty log. [bytes]
 const LARGEST: usize = 1 << 30;
 
-/// The outcome of feeding an image.
+/// Outcome of feeding an image.
 #[derive(Debug)]
-#[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
+#[allow(clippy::large_enum_variant)] // Why: only one exists at a time.
 pub(super) enum FeedOutcome {
     /// The plugin replied.
     Replied(Option<Setpoint>),
-    /// The log does not hold it whole.
+    /// The observation is incomplete in the log.
     Undecodable,
-    /// The plugin failed: how, in a sentence.
+    /// The plugin failed, for the reason in this sentence.
     Failed(String),
 }
 
-/// Feeds one plugin process after the other, as the flight had them.
+/// Feeds the plugin; starts a new process where the flight did.
 pub(super) struct Feeder<'a> {
     command: &'a [OsString],
     limits: &'a PluginLimits,
@@ -44,7 +43,7 @@ pub(super) struct Feeder<'a> {
     line: &'a mut dyn FnMut(Stream, &str),
 }
 
-/// A plugin that failed: how, in a sentence.
+/// Failure of a plugin, as a sentence.
 type Failed = String;
 
 impl<'a> Feeder<'a> {
@@ -54,7 +53,7 @@ impl<'a> Feeder<'a> {
         Self { command, limits, answer_within, process: None, decoders: HashMap::new(), line }
     }
 
-    /// Sends a message; a start begins a process, and ends the one before.
+    /// Sends a message. A start message ends the present process and starts a new one.
     pub(super) fn send(&mut self, message: &ToPlugin) -> Result<Result<(), Failed>, ReplayError> {
         match message {
             ToPlugin::Start(_) => {
@@ -62,7 +61,7 @@ impl<'a> Feeder<'a> {
                 let process = PluginProcess::start(self.command, self.limits, self.answer_within)?;
                 split_failure(self.process.insert(process).begin(message, self.line))
             }
-            // Ours comes at the end of the log.
+            // The replay sends its own stop at the end of the log.
             ToPlugin::Stop => Ok(Ok(())),
             ToPlugin::Event(_) => match &mut self.process {
                 Some(process) => split_failure(process.send(message, self.line)),
@@ -85,7 +84,7 @@ impl<'a> Feeder<'a> {
         Ok(answer.map_or_else(FeedOutcome::Failed, FeedOutcome::Replied))
     }
 
-    /// Waits until then, and passes on what the plugin prints.
+    /// Waits until `due`, and passes on printed lines of the plugin.
     pub(super) fn idle_until(&mut self, due: Instant) {
         while Instant::now() < due {
             sleep_until(due.min(Instant::now() + LINES_EVERY));
@@ -95,7 +94,7 @@ impl<'a> Feeder<'a> {
         }
     }
 
-    /// Ends the plugin in order.
+    /// Stops the plugin and passes on its last lines.
     pub(super) fn stop(&mut self) {
         if let Some(process) = self.process.take() {
             process.stop(self.line);
@@ -103,7 +102,7 @@ impl<'a> Feeder<'a> {
     }
 }
 
-/// Separates a plugin's failure, which is a finding, from errors that end the replay.
+/// Separates a plugin's failure, which goes into the report, from errors that end the replay.
 fn split_failure<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>, ReplayError> {
     match result {
         Ok(value) => Ok(Ok(value)),
@@ -112,16 +111,16 @@ fn split_failure<T>(result: Result<T, ProcessError>) -> Result<Result<T, Failed>
     }
 }
 
-/// Returns how much shared memory an observation with this head takes; `None` if it makes no sense.
+/// Returns the size of an observation in shared memory; `None` if its head is invalid. [bytes]
 pub fn observation_len(head: &[u8]) -> Option<usize> {
     let (header, _) = ObservationHeader::ref_from_prefix(head).ok()?;
     let len = header.total_len as usize;
     (head.len() <= len && len <= LARGEST).then_some(len)
 }
 
-/// Writes an observation as it was: the recorded head, the sensors' readings, the images decoded again. `None` if the log
-/// does not hold it whole, or it makes no sense.
-#[allow(clippy::implicit_hasher)] // Why: nobody brings another one.
+/// Restores an observation: writes the recorded head and the sensors' readings, and decodes the images. `None` if the
+/// observation is incomplete or invalid.
+#[allow(clippy::implicit_hasher)] // Why: all callers use the default one.
 pub fn decode(
     observation: &Observation,
     memory: &mut [u8],
@@ -129,7 +128,7 @@ pub fn decode(
 ) -> Option<()> {
     memory.get_mut(..observation.head.len())?.copy_from_slice(&observation.head);
     write_sensors(observation, memory)?;
-    // A copy: the planes are in the same memory. It is small, and checked to be in there.
+    // A copy, because the planes are in the same memory.
     let header = *ObservationHeader::parse(memory).ok()?;
     let planes_begin = size_of::<ObservationHeader>();
     for (index, camera) in (0..).zip(&header.cameras[..header.camera_count.into()]) {
@@ -155,7 +154,7 @@ pub fn decode(
     Some(())
 }
 
-/// Writes the table of sensors and their records to where the head and the table say.
+/// Writes the table of sensors and their records to the offsets in the head and the table.
 fn write_sensors(observation: &Observation, memory: &mut [u8]) -> Option<()> {
     let (header, _) = ObservationHeader::ref_from_prefix(memory).ok()?;
     let (at, count) = (header.sensors_offset as usize, header.sensor_count as usize);
@@ -187,7 +186,7 @@ pub(super) mod tests {
     use super::*;
     use zerocopy::IntoBytes;
 
-    /// An observation is decoded as it was, and not if anything of it is out of place.
+    /// Checks that an observation is restored, and rejected if a part is missing or invalid.
     pub(crate) fn check(observation: &Observation) {
         let len = observation_len(&observation.head).unwrap();
         let mut blocks = vec![0u64; len.div_ceil(8)];
@@ -199,12 +198,12 @@ pub(super) mod tests {
         assert_eq!(observation_len(&observation.head[..20]), None);
         let mut longer = observation.clone();
         longer.head.resize(len + 1, 0);
-        assert_eq!(observation_len(&longer.head), None, "longer than the whole");
+        assert_eq!(observation_len(&longer.head), None, "head longer than the observation");
         assert!(decode(observation, &mut [0; 64], &mut HashMap::new()).is_none());
         let mut without = observation.clone();
         without.images.clear();
         assert!(decode(&without, memory, &mut HashMap::new()).is_none(), "its image is missing");
-        // Wherever a byte is another, nothing panics.
+        // Any changed byte is handled without a panic.
         for at in 0..observation.head.len() {
             let mut other = observation.clone();
             other.head[at] ^= 0x55;

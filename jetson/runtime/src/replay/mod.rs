@@ -1,17 +1,17 @@
-//! `vizflyt replay`: a flight's log to a plugin, in its own process over the same shared memory.
+//! `vizflyt replay`: feeds a flight's log to a plugin in a separate process, over the same shared memory.
 //!
 //! ```text
 //! log ─▶ ReplayPlan ─────────┐
 //! log ─▶ observations ─────┴─▶ Feeder: decode, publish ══shared memory══▶ plugin process
-//!                                 ▲      next image after the answer          │
+//!                                 ▲      next image after the reply           │
 //!                                 └───────────────────────────────────────────┘
-//!                                 └─▶ answers file, comparison with the flight
+//!                                 └─▶ file of replies, comparison with the flight
 //! ```
-//! The plugin sees what it saw in flight, bit by bit: the same bytes are decoded by the same code
-//! into the same layout, and the observation's head (vehicle, stamps, numbers) is the recorded one.
-//! A reduced log holds the images of some observations only: those are fed, bit by bit, and the report
-//! counts the others. In lock-step nothing depends on how fast this computer is, so a deterministic plugin answers
-//! the same every time. Nothing is flown: there is no link here.
+//! The plugin receives the same inputs as in flight, bit by bit: the same code decodes the same bytes into
+//! the same layout, and the observation's head (vehicle, stamps, numbers) is the recorded one. A reduced log
+//! contains the images of only some observations: those are fed, and the report counts the others. Lock-step
+//! makes the result independent of the computer's speed, so a deterministic plugin always gives the same
+//! replies. No vehicle is involved.
 
 mod compare;
 mod feeder;
@@ -41,94 +41,93 @@ use crate::lockstep::ProcessError;
 use crate::log::read::{LogError, LogReader, Recorded, RecordedFlight};
 use crate::supervisor::{PluginLimits, Stream};
 
-/// Why a log cannot be replayed.
+/// Reason for which a log cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
     /// The log cannot be read.
     #[error(transparent)]
     Log(#[from] LogError),
-    /// It was written with another layout of shared memory.
+    /// The log has another layout of shared memory.
     #[error(
         "the log is of protocol {found}, written by {program}, and this program is of protocol \
-         {PROTOCOL_VERSION}: replay it with the version that flew it; --poses-to and Foxglove read it as it is"
+         {PROTOCOL_VERSION}: replay it with the version that flew it; --poses-to and Foxglove can read it"
     )]
     Protocol {
-        /// The protocol's version.
+        /// Protocol version of the log.
         found: u32,
-        /// The program that wrote it, from the log.
+        /// Program that wrote the log.
         program: String,
     },
-    /// It has no images.
-    #[error("the log has no images: none came in that flight, or its disk was full")]
+    /// The log has no images.
+    #[error("the log has no images: none arrived in that flight, or its disk was full")]
     NoImages,
-    /// It does not say what the plugin flew in.
-    #[error("the log does not say what the plugin flew in: the plugin never attached")]
+    /// The log has no start message of a plugin.
+    #[error("the log has no start message: the plugin never attached")]
     NoStart,
     /// The plugin's process cannot be started, or shared memory failed.
     #[error(transparent)]
     Process(#[from] ProcessError),
-    /// The answers cannot be written.
+    /// The file of replies cannot be written.
     #[error("answers {0} cannot be written: {1}")]
     Answers(PathBuf, std::io::Error),
 }
 
-/// How to replay.
+/// Options of a replay.
 #[derive(Clone, Debug)]
 pub struct ReplayOptions {
-    /// The command that starts the plugin, before the runtime's own argument.
+    /// Command of the plugin, without the runtime's argument.
     pub command: Vec<OsString>,
-    /// What it may take, and the map that it is handed: as in flight.
+    /// Limits and map of the plugin, as in flight.
     pub limits: PluginLimits,
-    /// At the flight's pace instead of as fast as possible.
+    /// Whether to replay at the flight's pace instead of as fast as possible.
     pub is_realtime: bool,
-    /// Images that the plugin skipped in flight, too.
+    /// Whether to feed also images that the plugin skipped in flight.
     pub all: bool,
-    /// An answer that takes longer ends the replay.
+    /// Timeout of a reply, which ends the replay.
     pub answer_within: Duration,
-    /// Where all answers go, one JSON object per line.
+    /// Output file of the replies, one JSON object per line.
     pub answers: PathBuf,
 }
 
-/// Where an answer differs from the flight's.
+/// Reply that differs from the flight's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Differs {
-    /// The observation's number in the flight.
+    /// Number of the observation in the flight.
     pub image: u64,
-    /// Since the first observation. [s]
+    /// Time since the first observation. [s]
     pub at_s: f64,
-    /// What differs most.
+    /// Largest difference.
     pub difference: Difference,
-    /// The flight's answer.
+    /// Reply in the flight.
     pub recorded: Option<Setpoint>,
-    /// The replay's.
+    /// Reply in the replay.
     pub replayed: Option<Setpoint>,
 }
 
-/// What a replay found.
+/// Result of a replay.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ReplayReport {
     /// Observations in the log.
     pub images_logged: u64,
-    /// Those whose images are not in it, as it is a reduced log.
+    /// Observations without images, in a reduced log.
     pub images_left_out: u64,
-    /// Those that the plugin got.
+    /// Observations fed to the plugin.
     pub images_fed: u64,
-    /// Those that the plugin answered in flight, but whose images the log lacks: dropped, or
-    /// damaged.
+    /// Observations with a reply in flight but without intact images in the log: dropped or damaged.
     pub images_missing: u64,
-    /// Answers that the flight has, too.
+    /// Replies compared with the flight's.
     pub compared: u64,
-    /// Those that differ.
+    /// Replies that differ.
     pub differ: u64,
-    /// The first that differs.
+    /// First reply that differs.
     pub first: Option<Differs>,
-    /// The one that differs most.
+    /// Reply with the largest difference.
     pub largest: Option<Differs>,
-    /// How the plugin failed, in a sentence; `None` if it came to the end.
+    /// Failure of the plugin as a sentence; `None` if it reached the end.
     pub plugin_failed: Option<String>,
-    /// Whether the log ends early, as after a killed runtime.
+    /// Whether the log is truncated, for example because the runtime was killed.
     pub log_is_cut: bool,
-    /// How long it took. [s]
+    /// Duration of the replay. [s]
     pub seconds: f64,
 }
 
@@ -158,11 +157,11 @@ impl ReplayReport {
     }
 }
 
-/// Replays `log`; `line` is called with every line that the plugin prints. The calling thread must live as
-/// long: the plugin dies with it.
+/// Replays `log`; calls `line` with each line that the plugin prints. The kernel kills the plugin when the
+/// calling thread ends.
 ///
 /// # Errors
-/// [`ReplayError`], if it cannot begin or go on. A plugin that fails is in the report.
+/// [`ReplayError`], if the replay cannot begin or continue. The report contains a failure of the plugin.
 pub fn replay(
     log: &Path,
     plan: ReplayPlan,
@@ -180,7 +179,7 @@ pub fn replay(
     };
     let mut feeder = Feeder::new(options, line);
     let failed = run(log, plan, options, &mut feeder, &mut report, &mut answers);
-    // What it printed last is on its way, also of one that failed.
+    // Also after a failure, the last printed lines are still in the pipe.
     feeder.stop();
     let failed = failed?;
     answers.flush().map_err(lost)?;
@@ -207,7 +206,7 @@ fn run(
             continue;
         };
         if observation.images.is_empty() {
-            // Left out of a reduced log, as the report says.
+            // Omitted from a reduced log; counted in the report.
             continue;
         }
         while let Some((_, message)) = plan.messages.pop_front_if(|(sent, _)| *sent < time) {
@@ -230,7 +229,7 @@ fn run(
             FeedOutcome::Failed(why) => return Ok(Some(why)),
         };
         report.images_fed += 1;
-        // Only what is the same in every replay: no time of this computer.
+        // No times of this computer, so that all replays write the same bytes.
         let text = json!({"image": observation.seq, "at_s": at_s, "setpoint": setpoint});
         writeln!(answers, "{text}")
             .map_err(|error| ReplayError::Answers(options.answers.clone(), error))?;
@@ -242,7 +241,6 @@ fn run(
     Ok(None)
 }
 
-/// Sleeps until then, at most.
 fn sleep_until(due: Instant) {
     thread::sleep(due.saturating_duration_since(Instant::now()));
 }

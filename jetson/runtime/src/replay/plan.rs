@@ -1,9 +1,9 @@
-//! The replay's schedule: read from the log once, before the plugin starts, without the images.
+//! Schedule of a replay, read from the log before the plugin starts, without the images.
 //!
-//! In flight the plugin skips images that come while it works, and receives events in between. A
-//! replay repeats that: it feeds the images that were answered, each after the messages that the
-//! plugin had received before it entered `on_image`. After the last reply it feeds all images: if the
-//! plugin crashed or hung, then on one of those.
+//! In flight, the plugin skips images that arrive while it is busy, and receives events between images. A
+//! replay repeats this: it feeds the images with a reply, each after the messages that the plugin had
+//! received before it entered `on_image`. After the last reply it feeds all images, because the plugin may
+//! have crashed or hung on one of them.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Read;
@@ -17,7 +17,7 @@ use super::ReplayError;
 use crate::log::PluginMessage;
 use crate::log::read::{Recorded, RecordedFlight};
 
-/// A reply that the plugin gave in flight.
+/// Reply of the plugin in flight.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct RecordedReply {
     pub(super) seq: u64,
@@ -25,55 +25,55 @@ pub(super) struct RecordedReply {
     pub(super) setpoint: Option<Setpoint>,
 }
 
-/// The plugin that flew, as the person typed it.
+/// Command line of the plugin in the flight.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FlownPlugin {
-    /// The PLUGIN of `vizflyt fly`.
+    /// PLUGIN argument of `vizflyt fly`.
     pub plugin: String,
-    /// What came after `--`.
+    /// Arguments after `--`.
     pub arguments: Vec<String>,
 }
 
-/// What a replay feeds to the plugin, and when.
+/// Schedule of the inputs of a plugin in a replay.
 #[derive(Debug, Default)]
 pub struct ReplayPlan {
-    /// The plugin that flew, if the log names it.
+    /// Plugin of the flight, if the log names it.
     pub flown: Option<FlownPlugin>,
     /// Observations in the log.
     pub observations: u64,
-    /// Those of them whose images a reduced log left out.
+    /// Observations without images, in a reduced log.
     pub without_images: u64,
-    /// Whether the log ends early.
+    /// Whether the log is truncated or damaged.
     pub is_cut: bool,
-    /// Messages to the plugin, and when they were sent. [host]
+    /// Messages to the plugin, with their send times. [host]
     pub(super) messages: VecDeque<(HostTime, ToPlugin)>,
-    /// Replies by image number: numbers may come again when the plugin was restarted.
+    /// Replies by image number; after a restart of the plugin, numbers can occur again.
     replies: BTreeMap<u64, VecDeque<RecordedReply>>,
     last_entered: HostTime,
 }
 
-/// What to do with an observation.
+/// Action for an observation.
 #[derive(Clone, Debug, PartialEq)]
-#[allow(clippy::large_enum_variant)] // Why: there is one of it at a time.
+#[allow(clippy::large_enum_variant)] // Why: only one exists at a time.
 pub(super) enum FeedAction {
-    /// The plugin skipped it.
+    /// Skip it, as the plugin did in flight.
     Skip,
-    /// Feed it after the messages sent before this time; and what the plugin answered, if it did.
+    /// Feed it after the messages sent before this time. Contains the reply in flight, if any.
     After(HostTime, Option<RecordedReply>),
 }
 
 impl ReplayPlan {
-    /// Reads it from a log.
+    /// Reads the schedule from a log.
     ///
     /// # Errors
-    /// If the log cannot be read, is of another protocol version, or holds no images.
+    /// If the log cannot be read, has another protocol version, or contains no images.
     pub fn read<R: Read>(mut flight: RecordedFlight<R>) -> Result<Self, ReplayError> {
         let mut plan = Self::default();
         let mut program = None;
         while let Some(recorded) = flight.next()? {
             match recorded {
                 Recorded::Flight(values) => {
-                    // Checked before anything is read that may be laid out otherwise.
+                    // Checked first, because the layout of other records depends on it.
                     program = values.get("program").cloned();
                     let protocol = values.get("protocol").and_then(|text| text.parse().ok());
                     protocol
@@ -104,7 +104,7 @@ impl ReplayPlan {
 
     fn message(&mut self, message: &PluginMessage) {
         if message.is_to_plugin {
-            // One that does not decode is of a damaged file; the rest is still of use.
+            // Skips a damaged message; the rest of the log is still useful.
             if let Ok(decoded) = decode_body(&message.body) {
                 self.messages.push_back((HostTime::from_ns(message.at_ns), decoded));
             }
@@ -120,12 +120,12 @@ impl ReplayPlan {
         }
     }
 
-    /// Returns what to do with observation `seq` that was published then; `all` feeds those too
+    /// Returns the action for observation `seq`, published at `published`; `all` also feeds observations
     /// that the plugin skipped.
     pub(super) fn feed(&mut self, seq: u64, published: HostTime, all: bool) -> FeedAction {
         let replies = self.replies.get_mut(&seq);
         let reply = replies.and_then(|replies| {
-            // Earlier ones are another plugin process's.
+            // Earlier replies belong to a previous plugin process.
             while replies.front().is_some_and(|reply| reply.entered < published) {
                 replies.pop_front();
             }
@@ -138,7 +138,7 @@ impl ReplayPlan {
         }
     }
 
-    /// Returns how many replies have not been fed.
+    /// Returns the number of replies to observations that were not fed.
     pub(super) fn unfed(&self) -> u64 {
         self.replies.values().map(|replies| replies.len() as u64).sum()
     }
@@ -148,7 +148,7 @@ fn same_protocol(found: u32, program: Option<&str>) -> Result<(), ReplayError> {
     if found == u32::from(PROTOCOL_VERSION) {
         return Ok(());
     }
-    let program = program.unwrap_or("a program that it does not name").to_owned();
+    let program = program.unwrap_or("an unknown program").to_owned();
     Err(ReplayError::Protocol { found, program })
 }
 

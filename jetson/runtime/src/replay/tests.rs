@@ -1,4 +1,4 @@
-//! Replays of logs that these tests write, to a real plugin process: the example `misbehave`.
+//! Tests that write logs and replay them to a real plugin process, the example `misbehave`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -29,7 +29,7 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(ms * 1_000_000)
 }
 
-/// A log being written.
+/// Log that is being written.
 struct Flight {
     log: FlightLog,
     folder: tempfile::TempDir,
@@ -92,7 +92,7 @@ impl Flight {
         );
     }
 
-    /// An image as a reduced log has it that left it out.
+    /// Writes an observation without its image, as in a reduced log.
     fn left_out(&self, seq: u64, ms: u64) {
         let mut buffer = ObservationBuffer::new(&[camera()]);
         buffer.clear(seq);
@@ -154,7 +154,7 @@ fn feeds_answered_images_and_all_after_the_last_reply() {
     assert_eq!(feed(3, true), "30 -");
     assert_eq!(feed(4, false), "43 4");
     assert_eq!(feed(5, false), "50 -");
-    assert_eq!(feed(2, false), "skip", "its answer is used up");
+    assert_eq!(feed(2, false), "skip", "the reply is used up");
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn separates_replies_of_a_restarted_plugin() {
 }
 
 #[test]
-fn logs_that_cannot_be_replayed_have_a_reason() {
+fn reports_why_a_log_cannot_be_replayed() {
     let check = |flight: Flight, expected: &str| {
         let (path, _folder) = flight.close();
         let error = plan(&path).unwrap_err().to_string();
@@ -189,10 +189,10 @@ fn logs_that_cannot_be_replayed_have_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     fs::write(&path, "no log").unwrap();
-    assert!(plan(&path).unwrap_err().to_string().contains("no MCAP file"));
+    assert!(plan(&path).unwrap_err().to_string().contains("not an MCAP file"));
 }
 
-/// Writes a log as another version may have: its metadata, and one message to the plugin of `protocol`.
+/// Writes a log of another version: metadata, and one message to the plugin with version `protocol`.
 fn foreign_log(path: &Path, metadata: Option<&str>, protocol: u32) {
     let file = fs::File::create(path).unwrap();
     let mut log = mcap::WriteOptions::new().compression(None).create(file).unwrap();
@@ -216,15 +216,15 @@ fn foreign_log(path: &Path, metadata: Option<&str>, protocol: u32) {
 }
 
 #[test]
-fn log_of_another_version_is_refused_with_its_version() {
+fn rejects_a_log_of_another_version_and_names_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.mcap");
     let ours = u32::from(PROTOCOL_VERSION);
     for (metadata, protocol, expected) in [
         (Some("3"), ours, "of protocol 3, written by vizflyt 0.0.7, and this program"),
         (Some("3"), 3, "of protocol 3, written by vizflyt 0.0.7, and this program"),
-        (None, 3, "of protocol 3, written by a program that it does not name"),
-        // Its metadata is invalid: its messages decide.
+        (None, 3, "of protocol 3, written by an unknown program"),
+        // With invalid metadata, the version of the messages counts.
         (Some("x"), 70_000, "of protocol 70000, written by vizflyt 0.0.7"),
         (Some("x"), ours, "the log has no images"),
     ] {
@@ -234,7 +234,7 @@ fn log_of_another_version_is_refused_with_its_version() {
     }
 }
 
-/// Returns the command of the example plugin, which is built beside the tests.
+/// Returns the command of the example plugin.
 fn misbehave(how: &str) -> Vec<OsString> {
     let test = std::env::current_exe().unwrap();
     let program = test.ancestors().nth(2).unwrap().join("examples/misbehave");
@@ -267,7 +267,7 @@ fn replay_with(
 }
 
 #[test]
-fn a_map_is_handed_again() {
+fn passes_the_map_to_the_replayed_plugin() {
     let flight = Flight::new();
     flight.start(5);
     flight.image(1, 10);
@@ -295,7 +295,7 @@ fn finds_where_another_plugin_replies_differently() {
     flight.event(6);
     for seq in 1..=40 {
         flight.image(seq, 10 * seq);
-        // One answer of the flight was another.
+        // One reply of the flight differs.
         let x_mps = if seq == 30 { 0.25 } else { 0.5 };
         if seq % 3 != 0 || seq == 30 {
             flight.answer(seq, 10 * seq + 2, Some(forward(x_mps)));
@@ -338,8 +338,8 @@ fn replays_the_images_in_a_reduced_log() {
     assert_eq!(report.plugin_failed, None, "{lines:?}");
     assert_eq!((report.images_logged, report.images_left_out), (40, 30));
     assert_eq!((report.images_fed, report.compared, report.differ), (10, 10, 0));
-    assert_eq!(report.images_missing, 0, "left out is not missing");
-    // All left out is as good as none.
+    assert_eq!(report.images_missing, 0, "omitted images are not missing");
+    // A log with only omitted images is rejected.
     let flight = Flight::new();
     flight.start(5);
     flight.left_out(1, 10);
@@ -348,7 +348,7 @@ fn replays_the_images_in_a_reduced_log() {
 }
 
 #[test]
-fn a_plugin_that_fails_ends_the_replay_with_the_reason() {
+fn ends_the_replay_with_the_reason_if_the_plugin_fails() {
     let flight = Flight::new();
     flight.start(5);
     flight.event(6);
@@ -363,7 +363,7 @@ fn a_plugin_that_fails_ends_the_replay_with_the_reason() {
 }
 
 #[test]
-fn a_head_that_makes_no_sense_is_not_fed() {
+fn does_not_feed_an_invalid_head() {
     let flight = Flight::new();
     flight.start(5);
     flight.image(1, 10);
@@ -380,7 +380,7 @@ fn a_head_that_makes_no_sense_is_not_fed() {
 }
 
 #[test]
-fn readings_are_fed_as_they_were() {
+fn restores_readings_bit_by_bit() {
     use vizflyt_protocol::packet::ObservationHeader;
     use vizflyt_protocol::sensor::{
         LidarPoint, RangeReading, ReadingHeader, SensorInfo, SensorKind,
@@ -420,7 +420,7 @@ fn readings_are_fed_as_they_were() {
     for seq in 1..=4_u64 {
         let mut buffer = ObservationBuffer::with_sensors(&[], &sensors);
         buffer.clear(seq);
-        // A scan every other time.
+        // A new scan every other time.
         let scan = seq.div_ceil(2);
         let points = [LidarPoint { p_m: [scan as f32; 3], ring: 3, ..LidarPoint::default() }; 33];
         let range = RangeReading { range_m: seq as f32, signal: 0.5 };
@@ -454,7 +454,7 @@ fn readings_are_fed_as_they_were() {
             assert!(sensor.records(found).is_some());
         }
         seen += 1;
-        // Wherever a byte of the table is another, nothing panics, and nothing is written outside.
+        // Any changed byte of the table is handled without a panic and without a write outside.
         for place in 0..observation.sensors.len() {
             let mut other = observation.clone();
             other.sensors[place] ^= 0x55;
@@ -466,5 +466,5 @@ fn readings_are_fed_as_they_were() {
     let scans = mcap::MessageStream::new(&found)
         .unwrap()
         .filter(|message| message.as_ref().is_ok_and(|one| one.channel.topic == "/sensor/top"));
-    assert_eq!(scans.count(), 2, "each once");
+    assert_eq!(scans.count(), 2, "each scan once");
 }

@@ -1,20 +1,20 @@
-//! Images on their way from the network to the decoder, piece by piece; newest wins.
+//! Queue of images from the network to the decoder, piece by piece; newest wins.
 //!
 //! ```text
 //! receiver tasks: open, push, push, ... end ──▶ Mailbox ──▶ decode thread: next, next, ...
 //!                 (a piece is the bitstream's header or one slice)
 //! ```
-//! So decoding overlaps with receiving, and with encoding at the other end. Policy, per camera:
-//! - One image is decoded at a time. Once all its bytes have come it is decoded to its end.
-//! - It is dropped when a newer one has come whole while some of its own bytes have not: they are
-//!   being sent again, and the newer image is there. It is not dropped merely because a newer one
-//!   is under way: on a lossy link that would deliver nothing.
-//! - After it comes the newest that has come whole, else the oldest under way, which is nearest to
-//!   its end. Whole ones older than that are dropped.
-//! - Among cameras the earliest tick goes first.
+//! Decoding overlaps with receiving, and with encoding on the server. Policy, per camera:
+//! - One image is decoded at a time. A completely received image is decoded to its end.
+//! - An incomplete image is dropped if a newer image is complete: its missing bytes are being
+//!   retransmitted, and the newer image is available. It is not dropped only because a newer image
+//!   has started: on a lossy link, no image would then be completed.
+//! - The next image is the newest complete one, or else the oldest incomplete one, which will be
+//!   completed first. Older complete images are dropped.
+//! - Among cameras, the earliest tick goes first.
 //!
-//! Pieces circulate: nothing is allocated per image in the steady state. The lock is held for a few
-//! words; nobody decodes or reads from the network under it.
+//! Buffers of pieces are reused: in the steady state, nothing is allocated per image. The lock is held
+//! only for short updates, not during decoding or network reads.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -26,16 +26,15 @@ use vizflyt_protocol::messages::{Arrivals, MAX_CAMERAS};
 use vizflyt_protocol::packet::{ImageHeader, ImageTrailer};
 use vizflyt_protocol::time::HostTime;
 
-/// The head of an image, known from its first bytes.
+/// Start of an image, from its first bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Arrival {
-    /// Number of the connection it came over, from 1: a server that restarted counts ticks from 1 again.
+    /// Number of the connection, from 1. Needed to compare ages: a restarted server counts ticks from 1 again.
     pub session: u64,
-    /// Who, when, from where.
     pub header: ImageHeader,
-    /// The pose's stamp on this computer's clock.
+    /// Stamp of the pose on this computer's clock.
     pub pose: HostTime,
-    /// When the first byte had come. [host]
+    /// Arrival time of the first byte. [host]
     pub first: HostTime,
 }
 
@@ -45,51 +44,50 @@ impl Arrival {
     }
 }
 
-/// The end of an image, known from its last bytes.
+/// End of an image, from its last bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Whole {
-    /// The server's trailer.
     pub trailer: ImageTrailer,
-    /// When the last byte had come. [host]
+    /// Arrival time of the last byte. [host]
     pub received: HostTime,
 }
 
-/// The decoder's next step for a camera.
+/// Next step of the decoder for a camera.
 #[derive(Clone, Debug, PartialEq)]
 #[allow(clippy::large_enum_variant)] // Why: boxing would allocate per image.
 pub enum DecodeStep {
-    /// An image begins.
+    /// Begin an image.
     Begin(Arrival),
-    /// Its next piece: the bitstream's header first, then slice by slice. Give it back with
+    /// Decode the next piece: first the bitstream's header, then slice by slice. Return its buffer with
     /// [`Mailbox::recycle`].
     Piece(Vec<u8>),
-    /// All its pieces have been given.
+    /// End the image: all its pieces have been returned.
     End(Whole),
-    /// No more of it will come.
+    /// Drop the image: no further pieces follow.
     Drop,
 }
 
-/// An image that a receiver has opened.
+/// Handle of an image opened by a receiver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ticket {
     camera: usize,
     id: u64,
 }
 
-/// How the images of a camera have fared since the start.
+/// Statistics of a camera's images since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Fates {
-    /// Those that came whole.
+    /// Counts of complete images.
     pub arrivals: Arrivals,
-    /// Gave way to newer ones, whole or not.
+    /// Number of images, complete or not, that were replaced by newer ones.
     pub replaced: u64,
-    /// Cut off, late or nonsense.
+    /// Number of truncated, late or invalid images.
     pub lost: u64,
-    /// Bytes of bitstream that came. [bytes]
+    /// Received size of the bitstreams. [bytes]
     pub bytes: u64,
 }
 
-/// The images that wait or are under way.
+/// Images that wait for the decoder or are being received.
 #[derive(Debug, Default)]
 pub struct Mailbox {
     inner: Mutex<Inner>,
@@ -108,7 +106,7 @@ struct Inner {
 #[derive(Debug, Default)]
 struct Lane {
     images: Vec<Image>,
-    /// The image that the decoder has begun and not ended.
+    /// Id of the image that is being decoded.
     decoding: Option<u64>,
     fates: Fates,
 }
@@ -122,13 +120,13 @@ struct Image {
 }
 
 impl Mailbox {
-    /// Returns the number of a new connection.
+    /// Returns a number for a new connection.
     pub fn session(&self) -> u64 {
         self.sessions.fetch_add(1, Ordering::Relaxed) + 1
     }
 
-    /// Opens an image; `None` if it is of no possible camera, one that is newer has come whole
-    /// already, or too many are under way.
+    /// Opens an image. Returns `None` if the camera's index is invalid, if a newer image is complete
+    /// already, or if too many are being received.
     pub fn open(&self, arrival: &Arrival) -> Option<Ticket> {
         let mut inner = self.lock();
         let inner = &mut *inner;
@@ -151,8 +149,8 @@ impl Mailbox {
         Some(Ticket { camera, id })
     }
 
-    /// Takes an image's next piece and leaves an empty buffer in its place; returns whether more of
-    /// the image is wanted.
+    /// Appends a piece to an image and replaces it by an empty buffer. Returns `false` if the image was
+    /// dropped.
     pub fn push(&self, ticket: Ticket, piece: &mut Vec<u8>) -> bool {
         let mut inner = self.lock();
         let inner = &mut *inner;
@@ -168,7 +166,7 @@ impl Mailbox {
         true
     }
 
-    /// Ends an image: whole, or `None` if no more of it will come.
+    /// Ends an image: complete with its trailer, or lost if `whole` is `None`.
     pub fn end(&self, ticket: Ticket, whole: Option<Whole>) {
         let mut inner = self.lock();
         let inner = &mut *inner;
@@ -185,8 +183,8 @@ impl Mailbox {
         self.changed.notify_one();
     }
 
-    /// Returns the next thing to do and for which camera; `None` if there is nothing for `timeout`.
-    /// An image that has not come whole is begun only if `may_begin` returns true.
+    /// Waits for the next step and returns it with its camera; `None` after `timeout`. An incomplete
+    /// image is begun only if `may_begin` returns true.
     pub fn next(
         &self,
         timeout: Duration,
@@ -207,7 +205,7 @@ impl Mailbox {
         }
     }
 
-    /// Gives up the image of a camera that was begun: nothing of it is given any more.
+    /// Discards the image of a camera that is being decoded.
     pub fn give_up(&self, camera: usize) {
         let mut inner = self.lock();
         let inner = &mut *inner;
@@ -219,7 +217,7 @@ impl Mailbox {
         }
     }
 
-    /// Takes back the memory of a piece.
+    /// Stores the buffer of a piece for reuse.
     pub fn recycle(&self, piece: Vec<u8>) {
         let mut inner = self.lock();
         if inner.spare_pieces.len() < MAX_SPARES {
@@ -227,30 +225,30 @@ impl Mailbox {
         }
     }
 
-    /// Takes a piece of memory that waits to be used again.
+    /// Removes and returns a spare buffer.
     #[cfg(test)]
     pub(crate) fn spare(&self) -> Option<Vec<u8>> {
         self.lock().spare_pieces.pop()
     }
 
-    /// Counts what became of an image of a camera that came whole.
+    /// Updates the counts of a camera's complete images.
     pub fn note(&self, camera: usize, count: impl FnOnce(&mut Arrivals)) {
         if let Some(lane) = self.lock().lanes.get_mut(camera) {
             count(&mut lane.fates.arrivals);
         }
     }
 
-    /// Returns what became of images that came whole before they reached shared memory, by camera.
+    /// Returns the counts of complete images before shared memory, by camera.
     pub fn arrivals(&self) -> [Arrivals; MAX_CAMERAS] {
         self.fates().map(|fates| fates.arrivals)
     }
 
-    /// Returns how many images gave way to newer ones.
+    /// Returns the number of images of all cameras that were replaced by newer ones.
     pub fn replaced(&self) -> u64 {
         self.lock().lanes.iter().map(|lane| lane.fates.replaced).sum()
     }
 
-    /// Returns how the images of each camera have fared.
+    /// Returns the statistics of each camera.
     pub fn fates(&self) -> [Fates; MAX_CAMERAS] {
         let inner = self.lock();
         std::array::from_fn(|camera| inner.lanes[camera].fates)
@@ -288,7 +286,7 @@ impl Inner {
         if let Some(piece) = image.pieces.pop_front() {
             return Some((camera, DecodeStep::Piece(piece)));
         }
-        // `due` has seen to it that there is one or the other.
+        // `due` returns only images with a piece or an end.
         let whole = image.end?;
         lane.decoding = None;
         let image = lane.images.swap_remove(at);
@@ -298,8 +296,8 @@ impl Inner {
 }
 
 impl Lane {
-    /// Drops what has given way to a newer image that has come whole; returns whether that was the
-    /// one being decoded, or that one was cut off.
+    /// Drops images that are older than the newest complete one. Returns whether the image that was being
+    /// decoded is gone, either dropped here or lost.
     fn supersede(&mut self, mut keep: impl FnMut(VecDeque<Vec<u8>>)) -> bool {
         let whole = self.images.iter().filter(|image| image.end.is_some());
         if let Some(newest) = whole.map(|image| image.arrival.age_key()).max() {
@@ -307,8 +305,7 @@ impl Lane {
             while at < self.images.len() {
                 let image = &self.images[at];
                 let finishing = image.end.is_some() && self.decoding == Some(image.id);
-                // One that waits and has not come whole may yet be of use to nobody: the newest is
-                // decoded before it could be.
+                // An incomplete image that waits is dropped too: the newest is decoded before it.
                 if image.arrival.age_key() < newest && !finishing {
                     self.fates.replaced += 1;
                     self.fates.arrivals.superseded += u64::from(image.end.is_some());
@@ -322,7 +319,7 @@ impl Lane {
         self.decoding.take_if(|id| gone(*id)).is_some()
     }
 
-    /// Returns the place of the image of which something can be done now.
+    /// Returns the index of the image with a possible next step.
     fn due(&self, may_begin: &impl Fn(&ImageHeader) -> bool) -> Option<usize> {
         if let Some(id) = self.decoding {
             let at = self.images.iter().position(|image| image.id == id)?;
@@ -350,9 +347,9 @@ fn keep(
     }
 }
 
-/// The server keeps at most 8 in flight; more is a faulty peer.
+/// Maximum number of open images per camera. The server has at most 8 in flight; more is a faulty peer.
 const MAX_UNDER_WAY: usize = 8;
-/// Pieces of a few images of every camera at the usual four slices.
+/// Maximum number of spare buffers: a few images of each camera with the usual four slices.
 const MAX_SPARES: usize = 128;
 
 #[cfg(test)]
@@ -378,7 +375,7 @@ mod tests {
         Whole { trailer, received: HostTime::ZERO }
     }
 
-    /// Everything the decoder would do now: camera and `B7` begin, `2` a piece, `E` end, `D` drop.
+    /// Runs all steps that are possible without waiting: camera, then `B7` begin, `2` piece, `E` end, `D` drop.
     fn steps(mailbox: &Mailbox) -> String {
         let mut found = Vec::new();
         while let Some((camera, step)) = mailbox.next(Duration::ZERO, |_| true) {
@@ -397,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_is_decoded_as_it_arrives() {
+    fn decodes_an_image_while_it_arrives() {
         let mailbox = Mailbox::default();
         let image = mailbox.open(&arrival(0, 7)).unwrap();
         assert_eq!(steps(&mailbox), "0B7");
@@ -406,29 +403,29 @@ mod tests {
         assert!(push(&mailbox, image, 2) && push(&mailbox, image, 3));
         mailbox.end(image, Some(whole()));
         assert_eq!(steps(&mailbox), "02 03 0E");
-        assert!(!push(&mailbox, image, 4), "it is gone");
+        assert!(!push(&mailbox, image, 4), "the image has ended");
         let arrivals = Arrivals { arrived: 1, ..Arrivals::default() };
         assert_eq!(mailbox.fates()[0], Fates { arrivals, bytes: 3, ..Fates::default() });
     }
 
     #[test]
-    fn a_newer_image_wins_only_when_it_has_come_whole() {
+    fn newer_image_replaces_an_older_one_only_when_complete() {
         let mailbox = Mailbox::default();
         let old = mailbox.open(&arrival(0, 7)).unwrap();
         push(&mailbox, old, 1);
         assert_eq!(steps(&mailbox), "0B7 01");
         let new = mailbox.open(&arrival(0, 8)).unwrap();
         push(&mailbox, new, 2);
-        assert_eq!(steps(&mailbox), "", "the older one goes on");
+        assert_eq!(steps(&mailbox), "", "the older image continues");
         mailbox.end(new, Some(whole()));
         assert_eq!(steps(&mailbox), "0D 0B8 02 0E");
-        assert!(!push(&mailbox, old, 3), "and its receiver learns it");
+        assert!(!push(&mailbox, old, 3), "the receiver gets `false`");
         assert_eq!(mailbox.replaced(), 1);
-        assert!(mailbox.open(&arrival(0, 8)).is_some(), "nothing waits any more");
+        assert!(mailbox.open(&arrival(0, 8)).is_some(), "the mailbox is empty");
     }
 
     #[test]
-    fn an_image_that_has_come_whole_is_decoded_to_its_end() {
+    fn decodes_a_complete_image_to_its_end() {
         let mailbox = Mailbox::default();
         let old = mailbox.open(&arrival(0, 7)).unwrap();
         push(&mailbox, old, 1);
@@ -439,7 +436,7 @@ mod tests {
             push(&mailbox, new, seq as u8);
             mailbox.end(new, Some(whole()));
         }
-        assert!(mailbox.open(&arrival(0, 9)).is_none(), "10 has come whole");
+        assert!(mailbox.open(&arrival(0, 9)).is_none(), "10 is complete");
         assert_eq!(steps(&mailbox), "01 0E 0B10 010 0E");
         assert_eq!(mailbox.replaced(), 3);
         let arrivals = mailbox.arrivals()[0];
@@ -447,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn image_that_is_cut_off_is_dropped() {
+    fn drops_a_truncated_image() {
         let mailbox = Mailbox::default();
         let old = mailbox.open(&arrival(0, 7)).unwrap();
         push(&mailbox, old, 1);
@@ -462,14 +459,14 @@ mod tests {
     }
 
     #[test]
-    fn cameras_do_not_wait_for_each_other_and_the_earliest_tick_goes_first() {
+    fn cameras_are_independent_and_the_earliest_tick_goes_first() {
         let mailbox = Mailbox::default();
         let tickets: Vec<_> =
             [(0, 3), (1, 2)].map(|(c, seq)| mailbox.open(&arrival(c, seq)).unwrap()).into();
         push(&mailbox, tickets[0], 5);
         assert_eq!(steps(&mailbox), "1B2 0B3 05", "camera 1 stalls, camera 0 does not");
-        assert!(mailbox.open(&arrival(200, 1)).is_none(), "there is no camera 200");
-        // One that must wait is begun once it is whole.
+        assert!(mailbox.open(&arrival(200, 1)).is_none(), "invalid camera");
+        // An image that may not begin early is begun when it is complete.
         mailbox.end(tickets[0], Some(whole()));
         let next = mailbox.open(&arrival(0, 4)).unwrap();
         assert!(matches!(mailbox.next(Duration::ZERO, |_| false), Some((0, DecodeStep::End(_)))));
@@ -479,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restarted_servers_images_are_newer_and_a_flood_is_bounded() {
+    fn images_of_a_restarted_server_are_newer_and_their_number_is_bounded() {
         let mailbox = Mailbox::default();
         assert_eq!((mailbox.session(), mailbox.session()), (1, 2));
         let old = mailbox.open(&arrival(0, 1000)).unwrap();

@@ -1,4 +1,4 @@
-//! The QUIC link to the render server: poses, events and images down, telemetry up.
+//! QUIC connection to the render server: receives poses, events and images, and sends telemetry.
 //!
 //! ```text
 //! datagrams                     ── Pose 100 Hz, newest wins ──▶ control loop
@@ -7,10 +7,10 @@
 //! one uni stream per image      ── header, slices, trailer ──▶ Mailbox, newest wins ──▶ images
 //! one uni stream per reading    ── header, records ──▶ Readings, newest wins ──▶ images, control loop
 //! ```
-//! Runs on tokio. Any outage (3 s of silence, a server that restarts) ends in a new connection,
-//! tried for as long as the flight lasts. Events are numbered and acknowledged both ways: after an
-//! outage missing events are sent again, and none twice. Both sides show a certificate; each
-//! knows the other's by its SHA-256.
+//! Runs on tokio. After an outage (3 s of silence, a restarted server) the runtime reconnects, with
+//! retries during the whole flight. Events are numbered and acknowledged in both directions: after an
+//! outage, missing events are sent again, and each event is delivered once. Both sides present a
+//! certificate and check the SHA-256 of the other's.
 
 mod mailbox;
 mod outbox;
@@ -42,20 +42,20 @@ pub use outbox::Outbox;
 pub use pair::{NowPaired, pair};
 pub use readings::{NewestReadings, Reading, Readings};
 
-/// Where the server is, and who we are.
+/// Settings of the connection to the server.
 #[derive(Clone, Debug)]
 pub struct StreamSettings {
-    /// The server's address.
+    /// Address of the server.
     pub server: SocketAddr,
-    /// SHA-256 of its certificate (DER).
+    /// SHA-256 of the server's certificate (DER).
     pub fingerprint: Fingerprint,
-    /// Who we are.
+    /// Key and certificate of this computer.
     pub identity: Identity,
-    /// The vehicle's name in the localization system.
+    /// Name of the vehicle in the localization system.
     pub vehicle: Name,
-    /// To fly it, or to watch.
+    /// Flying or watching.
     pub purpose: Purpose,
-    /// This program and its version, for the server's page and log.
+    /// Name and version of this program, for the server's page and log.
     pub program: Text,
 }
 
@@ -63,25 +63,25 @@ pub struct StreamSettings {
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // Why: handed on by value at once, never stored.
 pub enum StreamEvent {
-    /// The conversation began.
+    /// The server accepted the connection.
     Welcome(Box<ArenaInfo>),
-    /// Where the flight's guardian gets poses without us, and the key.
+    /// Address and key of the server's pose feed for the guardian, which bypasses the runtime.
     Feed(SocketAddr, FeedKey),
-    /// Trying again will not help; why, in a sentence.
+    /// The connection failed permanently, for the reason in this sentence; no retry follows.
     Refused(String),
-    /// The connection failed or ended; it is tried again.
+    /// The connection failed or ended; a retry follows.
     Down(String),
-    /// The vehicle was localized; `stamp` is its time on this computer's clock.
+    /// A pose, and its stamp on this computer's clock.
     Pose(PoseSample, HostTime),
-    /// Something happened.
+    /// An event of the server.
     Event(Event),
-    /// A camera, by its index, was changed.
+    /// New settings of the camera with this index.
     Camera(u8, Box<CameraInfo>),
-    /// A sensor, by its index, was changed.
+    /// New settings of the sensor with this index.
     Sensor(u8, Box<SensorInfo>),
 }
 
-/// The relation of the server's clock to ours, shared by all who stamp.
+/// Relation between the server's clock and this computer's clock, shared by all threads.
 #[derive(Clone, Debug, Default)]
 pub struct ServerClock {
     filter: Arc<Mutex<OffsetFilter<Host, Server>>>,
@@ -89,7 +89,7 @@ pub struct ServerClock {
 }
 
 impl ServerClock {
-    /// Returns the relation to a server that shares this computer's clock: stamps stay as they are.
+    /// Returns the relation to a server with the same clock: stamps are not converted.
     pub fn same() -> Self {
         Self { is_same: true, ..Self::default() }
     }
@@ -137,40 +137,39 @@ impl ServerClock {
         self.filter().update(sent, answered, received);
     }
 
-    /// A server that restarted on another machine has another clock.
+    /// Discards all samples: a new connection may lead to a server with another clock.
     fn reset(&self) {
         *self.filter() = OffsetFilter::default();
     }
 }
 
-/// What a session shares with the rest of the runtime.
+/// State shared by a session and the rest of the runtime.
 #[derive(Clone, Debug)]
 pub struct Shared {
-    /// The clock relation.
     pub clock: ServerClock,
-    /// Where images go.
+    /// Destination of images.
     pub mailbox: Arc<Mailbox>,
-    /// Where readings of the other sensors go.
+    /// Destination of readings of other sensors.
     pub readings: Arc<Readings>,
 }
 
-/// Socket buffers: with the kernel's own 200 KB, large images lose packets (measured: 4000 lost
-/// to 0, p50 2.7 to 1.8 ms at 600 KB). [bytes]
+/// Size of the socket buffers. The kernel's default of 200 KB loses packets of large images (measured at
+/// 600 KB: 4000 lost packets instead of 0, p50 2.7 ms instead of 1.8 ms). [bytes]
 const SOCKET_BUFFER: usize = 4 << 20;
-/// Receive window of one stream: the largest image comes without waiting for credit. [bytes]
+/// Receive window of one stream; the largest image fits without waiting for credit. [bytes]
 const STREAM_WINDOW: u32 = 4 << 20;
-/// Images the server may have under way; it keeps to fewer itself.
+/// Maximum number of concurrent image streams; the server limits itself to fewer.
 const IMAGES_AT_ONCE: u32 = 64;
-/// Bytes of all streams that wait to be read: so much a hostile server can make us hold. [bytes]
+/// Maximum unread data of all streams, which bounds the memory that a hostile server can use. [bytes]
 const RECEIVE_WINDOW: u32 = 32 << 20;
-/// A few poses; when more wait, the oldest go. [bytes]
+/// Buffer for received poses, enough for a few; when full, the oldest are dropped. [bytes]
 const POSES_WAITING: usize = 4096;
-/// Pause before a new connection.
+/// Delay before reconnecting.
 const RETRY: Duration = Duration::from_millis(200);
 
 /// Runs the connection to the server until `outbox` is closed and all its events are acknowledged, or
-/// the caller drops the task. `handle` returns whether it took the event: one that it did not take is
-/// sent again by the server, on a new connection.
+/// the caller drops the task. `handle` returns whether it accepted the event. If not, the runtime
+/// reconnects, and the server sends the event again.
 pub async fn run(
     settings: StreamSettings,
     shared: Shared,
@@ -180,8 +179,8 @@ pub async fn run(
     run_over(endpoint, settings, shared, outbox, handle).await;
 }
 
-/// As [`run`], over endpoints that `open` makes, a new one for every connection: another network
-/// may be below.
+/// Same as [`run`], with a new endpoint from `open` for each connection, for example over a simulated
+/// network.
 pub async fn run_over(
     open: impl Fn(SocketAddr) -> std::io::Result<Endpoint>,
     settings: StreamSettings,
@@ -202,7 +201,7 @@ pub async fn run_over(
                 };
                 let error = session::run(&with, &mut past, &connection, &handle).await;
                 connection.close(VarInt::from_u32(0), b"bye");
-                // Lets the close travel, so that the server frees the vehicle at once.
+                // Waits until the close is sent, so that the server frees the vehicle at once.
                 let _ = tokio::time::timeout(RETRY, endpoint.wait_idle()).await;
                 error
             }
@@ -215,7 +214,7 @@ pub async fn run_over(
                 return;
             }
             SessionEnd::Retry(why) => {
-                // Once per cause, not five times a second.
+                // Reports each cause once, not five times a second.
                 if why != last || std::mem::take(&mut past.welcomed) {
                     handle(StreamEvent::Down(why.clone()));
                     last = why;
@@ -226,23 +225,23 @@ pub async fn run_over(
     }
 }
 
-/// What outlives a connection.
+/// State that outlives a connection.
 #[derive(Clone, Copy, Debug)]
 struct Past {
-    /// Distinguishes our events from those of another run.
+    /// Random id of this run, which distinguishes its events from those of other runs.
     boot: u64,
-    /// The server's events that we have received.
+    /// Received events of the server.
     received: ReceivedEvents,
-    /// The server has welcomed us since the last outage was reported.
+    /// Whether the server has sent a welcome since the last reported outage.
     welcomed: bool,
 }
 
-/// Why a session ended.
+/// Reason for the end of a session.
 #[derive(Debug)]
 enum SessionEnd {
-    /// Another attempt may work.
+    /// A retry may succeed.
     Retry(String),
-    /// It will not.
+    /// A retry cannot succeed.
     Final(String),
     /// Everything has been sent and acknowledged.
     Done,
@@ -266,8 +265,8 @@ async fn connect(
         Ok(connection) => Ok((endpoint, connection)),
         Err(error) => Err(match pin.mismatch() {
             Some(found) => SessionEnd::Final(format!(
-                "server {} is another than the one this computer is paired with: it is {found}; if \
-                 that is yours, pair again",
+                "server {} has another certificate than the server this computer is paired with: {found}; \
+                 if this server is yours, pair again",
                 settings.server
             )),
             None => retry("no connection", &error),
@@ -281,7 +280,7 @@ fn endpoint(server: SocketAddr) -> std::io::Result<Endpoint> {
         SocketAddr::V6(_) => ([0_u16; 8], 0).into(),
     };
     let socket = Socket::new(Domain::for_address(local), Type::DGRAM, Some(Protocol::UDP))?;
-    // Best effort: the kernel caps them at net.core.rmem_max.
+    // Best effort: the kernel limits the sizes to net.core.rmem_max and wmem_max.
     let _ = socket.set_recv_buffer_size(SOCKET_BUFFER);
     let _ = socket.set_send_buffer_size(SOCKET_BUFFER);
     socket.bind(&local.into())?;
@@ -297,7 +296,7 @@ fn client_config(pin: &Pin, identity: &Identity) -> Result<ClientConfig, rustls:
     Ok(config)
 }
 
-/// Settings as measured on loopback and over an impaired link.
+/// Returns transport settings, tuned by measurements on loopback and on an impaired link.
 fn transport() -> TransportConfig {
     let mut acks = AckFrequencyConfig::default();
     acks.ack_eliciting_threshold(VarInt::from_u32(10));

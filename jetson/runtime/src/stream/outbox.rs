@@ -1,5 +1,5 @@
-//! Messages to the server: the newest report, and every event until the server has acknowledged it,
-//! over any number of connections.
+//! Queue of messages to the server: the newest report, and each event until the server has acknowledged it,
+//! across reconnects.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard};
@@ -10,7 +10,7 @@ use vizflyt_protocol::messages::{
     Event, EventKind, Guarded, ImuReading, MAX_IMU_BATCH, Telemetry, Timing, ToServer,
 };
 
-/// Reports and events on their way to the server.
+/// Reports and events that wait to be sent to the server.
 #[derive(Debug, Default)]
 pub struct Outbox {
     inner: Mutex<Inner>,
@@ -21,25 +21,25 @@ pub struct Outbox {
 struct Inner {
     report: Option<Telemetry>,
     timing: Option<Timing>,
-    /// What the guard keeps the vehicle within; kept for the next connection.
+    /// Limits that the guard applies; kept for the next connection.
     guarded: Option<Guarded>,
-    /// It is to be sent on the present connection.
+    /// Whether `guarded` must still be sent on the present connection.
     guarded_due: bool,
-    /// Readings of the IMU that are not sent yet, oldest first.
+    /// Unsent readings of the IMU, oldest first.
     imu: heapless::Vec<ImuReading, MAX_IMU_BATCH>,
-    /// Not yet acknowledged, oldest first.
+    /// Unacknowledged events, oldest first.
     events: VecDeque<(u64, Event)>,
-    /// Number of the newest event made.
+    /// Number of the newest event.
     made: u64,
     /// Number of the newest event written on the present connection.
     written: u64,
     closed: bool,
 }
 
-/// Readings of the IMU that leave together: 50 messages a second at 100 Hz, 20 ms late at most.
+/// Number of IMU readings per message: 50 messages a second at 100 Hz, with a delay of at most 20 ms.
 const IMU_TOGETHER: usize = 2;
 
-/// The next step of the writer.
+/// Next step of the writer.
 #[allow(clippy::large_enum_variant)] // Why: it is taken apart at once.
 enum Next {
     Send(ToServer),
@@ -48,23 +48,23 @@ enum Next {
 }
 
 impl Outbox {
-    /// Maximum number of events, as many as the server's log keeps. Beyond that the oldest line that the
-    /// plugin printed is dropped, and only if there is none the oldest event.
+    /// Maximum number of events, equal to that of the server's log. Above it, the oldest printed line of the
+    /// plugin is dropped, or without such lines the oldest event.
     pub const MAX_EVENTS: usize = 4096;
 
-    /// Puts a report in place of an older one.
+    /// Queues a report; replaces an unsent one.
     pub fn report(&self, report: Telemetry) {
         self.lock().report = Some(report);
         self.changed.notify_one();
     }
 
-    /// Puts a report of where images get their age in place of an older one.
+    /// Queues a report of the stages of the image age; replaces an unsent one.
     pub fn report_timing(&self, timing: Timing) {
         self.lock().timing = Some(timing);
         self.changed.notify_one();
     }
 
-    /// Reports what the guard keeps the vehicle within, on this connection and on each later one.
+    /// Queues the guard's limits, for this connection and for each later one.
     pub fn report_guarded(&self, guarded: Guarded) {
         let mut inner = self.lock();
         inner.guarded_due |= inner.guarded != Some(guarded);
@@ -73,13 +73,13 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Queues a reading of the autopilot's IMU; of more than a batch the oldest is dropped.
+    /// Queues a reading of the autopilot's IMU. If a batch is full, drops the oldest reading.
     pub fn imu(&self, reading: ImuReading) {
         let mut inner = self.lock();
         if inner.imu.is_full() {
             inner.imu.remove(0);
         }
-        // There is room now.
+        // Cannot fail: a place is free.
         let _ = inner.imu.push(reading);
         let is_due = inner.imu.len() >= IMU_TOGETHER;
         drop(inner);
@@ -99,7 +99,7 @@ impl Outbox {
             let at = inner.events.iter().position(is_line).unwrap_or(0);
             if let Some((seq, event)) = inner.events.remove(at) {
                 tracing::warn!(
-                    "the server is away for too long: event {seq} is lost: {}",
+                    "the server has been unreachable for too long: event {seq} is lost: {}",
                     event.text
                 );
             }
@@ -108,14 +108,14 @@ impl Outbox {
         self.changed.notify_one();
     }
 
-    /// Ends the messages: the flight is over.
+    /// Closes the queue at the end of the flight.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_one();
     }
 
-    /// Begins on a new connection, whose server has received events up to number `received`. An old
-    /// report is stale.
+    /// Begins a new connection, whose server has received events up to number `received`. Discards
+    /// reports, which are stale.
     pub(super) fn resume(&self, received: u64) {
         let mut inner = self.lock();
         inner.forget(received);
@@ -125,13 +125,13 @@ impl Outbox {
         inner.imu.clear();
     }
 
-    /// Takes note that the server has received events up to number `seq`.
+    /// Removes events up to number `seq`, which the server has acknowledged.
     pub(super) fn acknowledged(&self, seq: u64) {
         self.lock().forget(seq);
         self.changed.notify_one();
     }
 
-    /// Returns the next message, events first; `None` once it is closed and all events are acknowledged.
+    /// Returns the next message, events first; `None` after the close when all events are acknowledged.
     pub(super) async fn next(&self) -> Option<ToServer> {
         loop {
             match self.lock().take() {
@@ -188,7 +188,7 @@ mod tests {
         Event { stamp: ServerTime::ZERO, kind, text: bounded(text) }
     }
 
-    /// Everything that would be written now: events by number, `R` a report, `-` the end.
+    /// Takes all messages that are ready: the number of an event, `R` a report, `-` the end.
     fn written(outbox: &Outbox) -> String {
         let mut found = Vec::new();
         loop {
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn events_are_sent_until_they_are_acknowledged() {
+    fn sends_events_until_they_are_acknowledged() {
         let outbox = Outbox::default();
         outbox.report(Telemetry::default());
         outbox.report(Telemetry::default());
@@ -216,12 +216,12 @@ mod tests {
         }
         assert_eq!(written(&outbox), "1 2 3 R");
         outbox.acknowledged(1);
-        // The connection is lost; the server had received one more than it could acknowledge.
+        // The connection is lost; the server has received event 2 but not acknowledged it.
         outbox.report(Telemetry::default());
-        outbox.send_event(event(EventKind::Note, "made meanwhile"));
+        outbox.send_event(event(EventKind::Note, "during the outage"));
         outbox.resume(2);
         assert_eq!(written(&outbox), "3 4");
-        // A server that was restarted has received nothing; what was acknowledged stays so.
+        // A restarted server has received nothing; acknowledged events are still not sent again.
         outbox.resume(0);
         assert_eq!(written(&outbox), "3 4");
         outbox.close();
@@ -231,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_guard_keeps_is_sent_once_a_connection_and_when_it_changes() {
+    fn sends_the_guards_limits_once_per_connection_and_on_change() {
         let outbox = Outbox::default();
         let arena = crate::flight::tests::arena();
         let guarded = |polygons| Guarded::of(&arena, polygons);
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn imu_readings_leave_together_and_the_newest_are_kept() {
+    fn sends_imu_readings_in_batches_and_keeps_the_newest() {
         let outbox = Outbox::default();
         let reading = |ns| ImuReading {
             stamp: ServerTime::from_ns(ns),

@@ -1,4 +1,4 @@
-//! Pairs this computer with a server: carries [`vizflyt_trust::pairing`]'s messages, and keeps
+//! Pairs this computer with a server: exchanges the messages of [`vizflyt_trust::pairing`], and stores
 //! the result.
 
 use std::sync::Arc;
@@ -17,20 +17,20 @@ use zerocopy::IntoBytes;
 
 use crate::args::ServerAddress;
 
-/// The result of a pairing.
+/// Result of a pairing.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NowPaired {
-    /// The server's, noted in `servers.toml`.
+    /// Fingerprint of the server, as stored in `servers.toml`.
     pub server: Fingerprint,
-    /// The rights of this computer.
+    /// Rights of this computer.
     pub grant: Grant,
 }
 
-/// Pairs with the server that shows `code`; afterwards this computer connects without it.
+/// Pairs with the server that shows `code`. Later connections need no code.
 ///
 /// # Errors
-/// A server that cannot be reached, refuses, or does not prove that it knows the code; keys that
-/// cannot be read or written.
+/// If the server cannot be reached, refuses, or gives a wrong proof of the code, or if keys cannot be
+/// read or written.
 pub fn pair(
     folder: &KeysFolder,
     server: &ServerAddress,
@@ -67,7 +67,7 @@ async fn connect(
         .await
         .with_context(|| format!("server {server}: no connection"))?;
     let result = converse(&connection, &pin, identity, code, name).await;
-    // The server's reason for closing is more precise than which of our calls failed first.
+    // The server's close reason is more precise than the error of the first failed call.
     let result = result.map_err(|error| match connection.close_reason() {
         Some(ConnectionError::ApplicationClosed(frame)) if !frame.reason.is_empty() => {
             anyhow::anyhow!("{}", String::from_utf8_lossy(&frame.reason))
@@ -113,8 +113,7 @@ async fn converse(
             Ok(NowPaired { server, grant })
         }
         PairingReply::Paired { .. } => bail!(
-            "it does not know the code it should have shown: somebody may sit in between; do not \
-             use this network"
+            "its proof of the code is wrong: possible man in the middle; do not use this network"
         ),
         PairingReply::Refused(why) => bail!("{why}"),
         PairingReply::Share { .. } => bail!(OUT_OF_TURN),
@@ -139,6 +138,6 @@ async fn read(recv: &mut RecvStream, deframer: &mut Deframer) -> Result<PairingR
     }
 }
 
-/// A connection and three messages, on a slow network.
+/// Timeout of a connection and three messages on a slow network.
 const WITHIN: Duration = Duration::from_secs(15);
-const OUT_OF_TURN: &str = "it does not pair as this version does; update the older of the two";
+const OUT_OF_TURN: &str = "it uses another pairing protocol; update the older of the two";

@@ -1,11 +1,10 @@
-//! Readings of the sensors beside the cameras: the newest of each, from whoever receives it to those who use it.
+//! Newest reading of each sensor other than cameras, shared by its receiver and its users.
 //!
 //! ```text
 //! receiver tasks (or a graded flight) ── put ──▶ Readings ──▶ image thread: into observations and the log
 //!                                                    └──────▶ control loop: to the autopilot
 //! ```
-//! Newest wins, by the instant that a reading is of. A reading is shared, not copied; its memory goes when its last user
-//! has done with it.
+//! Newest wins, by the instant of measurement. A reading is shared, not copied; its memory is freed after its last use.
 
 use std::sync::{Arc, Mutex};
 use vizflyt_process::lock;
@@ -14,18 +13,17 @@ use vizflyt_protocol::sensor::{InvalidReading, MAX_SENSORS, ReadingHeader};
 use vizflyt_protocol::time::HostTime;
 use vizflyt_sdk::GivenReading;
 
-/// One reading as it came.
+/// One received reading.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Reading {
-    /// Whose it is, when and from where it was made.
+    /// Sensor, time and pose of the reading.
     pub header: ReadingHeader,
-    /// When the newest pose behind it was measured. [host]
+    /// Measurement time of the newest pose used for it. [host]
     pub pose: HostTime,
-    /// The instant that it is of. [host]
+    /// Instant of the reading. [host]
     pub shown: HostTime,
-    /// When its last byte had come. [host]
+    /// Arrival time of the last byte. [host]
     pub received: HostTime,
-    /// Its records.
     pub records: Vec<u8>,
 }
 
@@ -33,7 +31,7 @@ pub struct Reading {
 pub type NewestReadings = [Option<Arc<Reading>>; MAX_SENSORS];
 
 impl Reading {
-    /// Returns what goes into an observation; where the body was only if the course `gives_pose`.
+    /// Returns the reading's part of an observation, with the pose of the body only if the course `gives_pose`.
     pub fn given(&self, gives_pose: bool) -> GivenReading<'_> {
         GivenReading {
             seq: self.header.seq.get(),
@@ -47,13 +45,12 @@ impl Reading {
     }
 }
 
-/// Where the newest readings are.
+/// The newest readings, behind a lock.
 #[derive(Debug, Default)]
 pub struct Readings(Mutex<NewestReadings>);
 
 impl Readings {
-    /// Puts a reading in the place of an older one of the same sensor; drops one that was overtaken. Returns whether it
-    /// was put.
+    /// Replaces the sensor's older reading; drops `reading` if a newer one has arrived. Returns whether it was stored.
     pub fn put(&self, reading: Reading) -> bool {
         let mut newest = lock(&self.0);
         let Some(place) = newest.get_mut(usize::from(reading.header.sensor)) else { return false };
@@ -70,10 +67,10 @@ impl Readings {
     }
 }
 
-/// Returns the header of a reading on the wire, and its bytes of records that follow.
+/// Returns the header of a reading, and the size of the records that follow. [bytes]
 ///
 /// # Errors
-/// As [`ReadingHeader::parse`].
+/// Returns the errors of [`ReadingHeader::parse`].
 pub(super) fn head(bytes: &[u8]) -> Result<(ReadingHeader, usize), InvalidReading> {
     let (header, _) = ReadingHeader::parse(bytes)?;
     Ok((header, header.payload_len()))
@@ -95,13 +92,13 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_of_each_sensor_counts() {
+    fn keeps_the_newest_reading_of_each_sensor() {
         let readings = Readings::default();
         assert!(readings.put(reading(0, 5, 50)) && readings.put(reading(3, 1, 10)));
-        assert!(!readings.put(reading(0, 4, 40)), "overtaken on its way");
-        // A server that was restarted counts from the start; its instants go on.
+        assert!(!readings.put(reading(0, 4, 40)), "older than the stored one");
+        // A restarted server counts from 1 again, but its stamps continue.
         assert!(readings.put(reading(0, 1, 60)));
-        assert!(!readings.put(reading(200, 1, 70)), "there is no such sensor");
+        assert!(!readings.put(reading(200, 1, 70)), "invalid sensor index");
         let newest = readings.newest();
         let seqs: Vec<_> = newest.iter().flatten().map(|one| one.header.seq.get()).collect();
         assert_eq!(seqs, [1, 1]);

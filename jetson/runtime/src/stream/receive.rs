@@ -1,8 +1,9 @@
-//! Image streams into the mailbox, piece by piece as they arrive; readings of other sensors whole.
+//! Receives image streams into the mailbox, piece by piece as they arrive, and readings of other sensors
+//! as a whole.
 //!
-//! A few tasks live as long as the connection and wait for the next stream; there is always one
-//! that waits, so no image waits for another. Bytes are copied once, from the transport's packets
-//! into a piece of the mailbox; nothing of ours is allocated per image in the steady state.
+//! A few tasks wait for the next stream until the connection ends. At least one task is always waiting, so
+//! images do not wait for each other. Bytes are copied once, from the transport's packets into a piece of
+//! the mailbox; in the steady state, the runtime allocates nothing per image.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -19,14 +20,12 @@ use super::readings::{self, Reading};
 use super::{IMAGES_AT_ONCE, Shared};
 use crate::clock;
 
-/// An image that has not come whole after this long is given up; it would be stale. The server
-/// gives up after 150 ms.
+/// Timeout of an image, which would then be stale. The server gives up after 150 ms.
 const IMAGE_WITHIN: Duration = Duration::from_millis(500);
-/// A buffer grows by so much ahead of the bytes that have come, whatever length a peer announces.
-/// [bytes]
+/// Maximum growth of a buffer ahead of the received bytes, regardless of the announced length. [bytes]
 const GROWTH: usize = 64 << 10;
 
-/// Why an image was given up.
+/// Reason for dropping an image.
 #[derive(Debug, thiserror::Error)]
 enum Lost {
     #[error(transparent)]
@@ -39,17 +38,17 @@ enum Lost {
     Trailer(#[from] vizflyt_protocol::packet::InvalidImageTrailer),
     #[error(transparent)]
     Reading(#[from] vizflyt_protocol::sensor::InvalidReading),
-    #[error("more bytes than an image of its size can need")]
+    #[error("more bytes than the maximum for its size")]
     Long,
-    #[error("its bitstream is of another size than its header")]
+    #[error("its bitstream has another size than its header")]
     Size,
-    #[error("it came before the server's clock was known")]
+    #[error("it arrived before the first clock exchange")]
     Clock,
-    #[error("a newer image came first")]
+    #[error("a newer image arrived first")]
     Stale,
 }
 
-/// Receives images until the connection ends. Returns at once; tasks go on.
+/// Starts tasks that receive images until the connection ends.
 pub(super) fn start(connection: &Connection, shared: &Shared) {
     let receivers = Receivers {
         connection: connection.clone(),
@@ -66,7 +65,7 @@ struct Receivers {
     connection: Connection,
     shared: Shared,
     session: u64,
-    /// Receivers that wait for a stream.
+    /// Number of tasks that wait for a stream.
     waiting: Arc<AtomicUsize>,
     all: Arc<AtomicUsize>,
 }
@@ -90,8 +89,7 @@ impl Receivers {
         }
     }
 
-    /// Receives one image or reading. One that is cut off, late or nonsense is dropped: the next one comes in
-    /// a moment.
+    /// Receives one image or reading. Drops it if it is truncated, late or invalid: the next one arrives shortly.
     async fn receive(&self, stream: &mut RecvStream, piece: &mut Vec<u8>) {
         let mut ticket = None;
         let result = timeout(IMAGE_WITHIN, self.whole(stream, piece, &mut ticket)).await;
@@ -103,17 +101,17 @@ impl Receivers {
                 return;
             }
             Ok(Err(lost)) => lost.to_string(),
-            Err(_) => "it did not come whole within 500 ms".to_owned(),
+            Err(_) => "it was not complete within 500 ms".to_owned(),
         };
         if let Some(ticket) = ticket {
             self.shared.mailbox.end(ticket, None);
         }
-        // Fails only if it has ended, or was stopped already.
+        // Fails only if the stream has ended or was stopped already.
         let _ = stream.stop(VarInt::from_u32(0));
         tracing::debug!("image dropped: {why}");
     }
 
-    /// Receives what a stream carries by its first bytes; returns the end of an image.
+    /// Receives an image or a reading, depending on the stream's first bytes. Returns the end of an image.
     async fn whole(
         &self,
         stream: &mut RecvStream,
@@ -129,7 +127,7 @@ impl Receivers {
         self.pieces(stream, magic, piece, ticket).await.map(Some)
     }
 
-    /// Receives a reading of a sensor that is no camera.
+    /// Receives a reading of a sensor other than a camera.
     async fn reading(&self, stream: &mut RecvStream, magic: [u8; 4]) -> Result<(), Lost> {
         let mut bytes = [0; ReadingHeader::SIZE];
         let (first, rest) = bytes.split_at_mut(magic.len());
@@ -209,7 +207,7 @@ impl Receivers {
     }
 }
 
-/// Reads until `piece` holds `len` bytes.
+/// Reads until `piece` contains `len` bytes.
 async fn read(
     stream: &mut RecvStream,
     piece: &mut Vec<u8>,

@@ -1,4 +1,4 @@
-//! One connection: handshake, then messages both ways and images, until it fails.
+//! One connection: handshake, then messages in both directions and images, until it fails.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
@@ -18,25 +18,25 @@ use zerocopy::IntoBytes;
 use super::{Outbox, Past, SessionEnd, Shared, StreamEvent, StreamSettings, receive};
 use crate::clock;
 
-/// Nothing from the server for this long: reconnect. Longer than a blackout of two seconds: a
-/// connection that lives on has the newest image through 15 ms after it, a new one would be in the
-/// middle of its handshake's time-outs. A server that was restarted reports it itself.
+/// Silence of the server after which the runtime reconnects. Longer than a blackout of 2 s: an existing
+/// connection delivers the newest image 15 ms after its end, whereas a new one would still wait for
+/// timeouts of its handshake. A restarted server reports the restart itself.
 const SILENCE: Duration = Duration::from_secs(3);
-/// The clock is asked this often: four times a second at the start and when the server is
-/// silent, else once.
+/// Period of clock requests at the start and while the server is silent.
 const CLOCK_FAST: Duration = Duration::from_millis(250);
+/// Period of clock requests at other times.
 const CLOCK_SLOW: Duration = Duration::from_secs(1);
-/// Requests at the start that fill the filter's window.
+/// Number of fast requests at the start, which fill the filter's window.
 const CLOCK_FIRST: u32 = 8;
 
-/// The context of every session.
+/// Context of a session.
 pub(super) struct SessionContext<'a> {
     pub(super) settings: &'a StreamSettings,
     pub(super) shared: &'a Shared,
     pub(super) outbox: &'a Outbox,
 }
 
-/// Runs the session until the connection fails; returns why.
+/// Runs the session until the connection fails; returns the reason.
 pub(super) async fn run(
     with: &SessionContext<'_>,
     past: &mut Past,
@@ -48,7 +48,7 @@ pub(super) async fn run(
         Ok(never) => match never {},
         Err(end) => end,
     };
-    // The server's reason for closing is more precise than which of our calls failed first.
+    // The server's close reason is more precise than the error of the first failed call.
     match (connection.close_reason(), end) {
         (Some(ConnectionError::ApplicationClosed(frame)), _)
             if frame.error_code == VarInt::from_u32(close::UNPAIRED) =>
@@ -148,7 +148,7 @@ struct Receiver<'a, T> {
     past: &'a mut Past,
     connection: &'a Connection,
     handle: &'a T,
-    /// The server's `boot`, once it has welcomed us.
+    /// The server's `boot`, after its welcome.
     server: Option<u64>,
     newest_pose: ServerTime,
 }
@@ -162,7 +162,7 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
                 self.with.outbox.resume(received_events.of(self.past.boot));
                 self.hand(StreamEvent::Welcome(Box::new(arena)))?;
             }
-            // Another runtime may be leaving: try again.
+            // Retry, because another runtime may be about to leave.
             Ok(ToRuntime::Refused(why)) => {
                 return Err(SessionEnd::Retry(format!("the server refuses: {why}")));
             }
@@ -190,7 +190,7 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
         Ok(())
     }
 
-    /// Says where the flight's guardian gets poses by itself.
+    /// Reports address and key of the pose feed for the guardian.
     fn offer_feed(&self, port: u16) -> Result<(), SessionEnd> {
         let mut key = FeedKey::default();
         if port == 0 || self.connection.export_keying_material(&mut key, FEED_LABEL, b"").is_err() {
@@ -200,17 +200,17 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
         self.hand(StreamEvent::Feed(server, key))
     }
 
-    /// Hands an event to the control loop; the server sends one that is not taken again on the next
-    /// connection.
+    /// Passes an event to the control loop. If it is not accepted, the session ends, and the server sends
+    /// the event again on the next connection.
     fn hand(&self, event: StreamEvent) -> Result<(), SessionEnd> {
         if (self.handle)(event) {
             Ok(())
         } else {
-            Err(SessionEnd::Retry("this runtime is too busy to listen".into()))
+            Err(SessionEnd::Retry("this runtime is too busy to accept events".into()))
         }
     }
 
-    /// A pose that is not newer than the newest was overtaken on its way: it is dropped.
+    /// Passes on a pose; drops it if a newer one has arrived before it.
     fn take_datagram(&mut self, bytes: &[u8]) {
         let Ok(Datagram::Pose(sample)) = decode_body(bytes) else {
             return tracing::debug!("server: a datagram of {} bytes does not decode", bytes.len());
@@ -218,7 +218,7 @@ impl<T: Fn(StreamEvent) -> bool> Receiver<'_, T> {
         if self.server.is_none() || sample.stamp <= self.newest_pose || !sample.is_valid() {
             return;
         }
-        // Before the first clock exchange a pose cannot be placed in time.
+        // Before the first clock exchange, the stamp cannot be converted.
         if let Some(stamp) = self.with.shared.clock.to_host(sample.stamp) {
             self.newest_pose = sample.stamp;
             (self.handle)(StreamEvent::Pose(sample, stamp));

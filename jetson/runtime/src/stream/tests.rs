@@ -1,4 +1,4 @@
-//! The client against a small server of its own, over real QUIC on loopback.
+//! Tests of the client with a small server over QUIC on loopback.
 
 use std::sync::mpsc::{Receiver, channel};
 
@@ -17,7 +17,7 @@ use zerocopy::IntoBytes;
 
 use super::*;
 
-/// Far beyond anything a loaded machine needs.
+/// Timeout of all waits, far above what a loaded machine needs.
 const WAIT: Duration = Duration::from_secs(30);
 
 struct Server {
@@ -36,7 +36,7 @@ impl Server {
         Self { endpoint, fingerprint }
     }
 
-    /// Accepts one runtime up to its Hello.
+    /// Accepts one runtime, before its Hello.
     async fn accept(&self, preamble: Preamble) -> Peer {
         let connection = self.endpoint.accept().await.unwrap().await.unwrap();
         let (mut send, mut receive) = connection.accept_bi().await.unwrap();
@@ -52,8 +52,8 @@ impl Server {
         self.welcome_as(BOOT, |_| 0).await.0
     }
 
-    /// Accepts one runtime and welcomes it as the run `boot` of a server, which has received as
-    /// many of the runtime's events as `received` returns.
+    /// Accepts one runtime and welcomes it as run `boot` of a server that has received the number of
+    /// events that `received` returns.
     async fn welcome_as(&self, boot: u64, received: impl Fn(&Hello) -> u64) -> (Peer, Hello) {
         let mut peer = self.accept(Preamble::of(PeerRole::Server)).await;
         let Some(ToServer::Hello(hello)) = peer.next().await else { panic!("no hello") };
@@ -101,7 +101,7 @@ impl Peer {
         self.send(&ToRuntime::Event { seq, event: note(text) }).await;
     }
 
-    /// Returns when the runtime acknowledges the event `seq`.
+    /// Waits until the runtime acknowledges the event `seq`.
     async fn acknowledged(&mut self, seq: u64) {
         while self.next_but_clock().await != Some(ToServer::EventsReceived(seq)) {}
     }
@@ -112,7 +112,7 @@ impl Peer {
         self.connection.send_datagram(bytes.into()).unwrap();
     }
 
-    /// Answers clock requests until something else comes.
+    /// Answers clock requests until another message arrives, and returns that message.
     async fn next_but_clock(&mut self) -> Option<ToServer> {
         loop {
             match self.next().await? {
@@ -121,7 +121,7 @@ impl Peer {
                     let answered = ServerTime::from_ns(host_now().as_ns() + AHEAD_NS);
                     let reply = ClockReply { sent: request.sent, answered };
                     let reply = ToRuntime::Clock(reply);
-                    // It may have closed behind its request: that is the end, as for whoever reads.
+                    // The runtime may have closed the connection after its request, which is the end.
                     self.send.write_all(encode(&reply, &mut [0; MAX_FRAMED])).await.ok()?;
                 }
                 other => return Some(other),
@@ -130,7 +130,7 @@ impl Peer {
     }
 }
 
-/// Of the usual server.
+/// `boot` of the server in most tests.
 const BOOT: u64 = 77;
 const AHEAD_NS: u64 = 100_000_000_000;
 
@@ -172,7 +172,7 @@ impl Client {
         Self { events, outbox, shared }
     }
 
-    /// Returns the next event; waits off the async threads.
+    /// Waits for the next event in a blocking section.
     fn next(&self) -> StreamEvent {
         tokio::task::block_in_place(|| self.events.recv_timeout(WAIT).unwrap())
     }
@@ -180,7 +180,7 @@ impl Client {
     fn refusal(&self) -> String {
         match self.next() {
             StreamEvent::Refused(why) => why,
-            other => panic!("{other:?} is no refusal"),
+            other => panic!("{other:?} is not a refusal"),
         }
     }
 }
@@ -192,7 +192,7 @@ async fn exchanges_messages_and_receives_an_image() {
     let mut peer = server.welcome().await;
     assert!(matches!(client.next(), StreamEvent::Welcome(a) if *a == arena()));
 
-    // The first message that is no clock request; by then the clocks are related.
+    // Answers clock requests until the client can convert stamps.
     client.outbox.report(Telemetry::default());
     while client.shared.clock.to_host(ServerTime::from_ns(AHEAD_NS)).is_none() {
         let got = tokio::time::timeout(Duration::from_millis(50), peer.next_but_clock()).await;
@@ -224,10 +224,10 @@ async fn exchanges_messages_and_receives_an_image() {
             stream.write_all(trailer.as_bytes()).await.unwrap();
         }
         stream.finish().unwrap();
-        // One after the other, so that the second is not taken for the older one.
+        // One after the other, so that the second does not arrive first.
         let _ = stream.stopped().await;
     }
-    // Nonsense on a stream harms nobody.
+    // Invalid bytes on a stream have no effect.
     let mut stream = peer.connection.open_uni().await.unwrap();
     stream.write_all(&[7; 500]).await.unwrap();
     stream.finish().unwrap();
@@ -253,7 +253,7 @@ async fn exchanges_messages_and_receives_an_image() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_pose_that_was_overtaken_is_dropped() {
+async fn drops_a_pose_older_than_the_newest() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut peer = server.welcome().await;
@@ -271,15 +271,15 @@ async fn a_pose_that_was_overtaken_is_dropped() {
     }
     let next = || match client.next() {
         StreamEvent::Pose(sample, _) => sample.stamp.as_ns() - AHEAD_NS,
-        other => panic!("{other:?} is no pose"),
+        other => panic!("{other:?} is not a pose"),
     };
     assert_eq!((next(), next()), (5, 8));
 }
 
-/// A regression: events sent while the server was away were lost, and the server sent everything since
-/// the flight's start again.
+/// Regression test: events made during an outage were lost, and the server sent all events since the
+/// start of the flight again.
 #[tokio::test(flavor = "multi_thread")]
-async fn events_survive_an_outage_both_ways_and_come_once() {
+async fn delivers_events_once_across_an_outage_in_both_directions() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let (mut peer, hello) = server.welcome_as(BOOT, |_| 0).await;
@@ -289,7 +289,7 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
     client.outbox.send_event(note("two"));
     assert_eq!(peer.event().await.unwrap(), (1, note("one")));
     assert_eq!(peer.event().await.unwrap(), (2, note("two")));
-    // Only the first is acknowledged before the outage; the second was received all the same.
+    // Only the first is acknowledged before the outage, although the second was also received.
     peer.send(&ToRuntime::EventsReceived(1)).await;
     for (seq, text) in [(4, "four"), (9, "nine")] {
         peer.send_event(seq, text).await;
@@ -312,15 +312,15 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
     peer.send_event(10, "ten").await;
     assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("ten")));
     assert_eq!(peer.event().await.unwrap(), (3, note("three")));
-    // The server is restarted: it has received nothing, and numbers its events anew.
+    // The server is restarted: it has received nothing, and numbers its events from 1.
     peer.connection.close(VarInt::from_u32(1), b"restart");
     assert!(matches!(client.next(), StreamEvent::Down(_)));
     let (mut peer, _) = server.welcome_as(BOOT + 1, |_| 0).await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
-    assert_eq!(peer.event().await.unwrap(), (3, note("three")), "what nobody acknowledged");
+    assert_eq!(peer.event().await.unwrap(), (3, note("three")), "unacknowledged");
     peer.send_event(1, "first").await;
     assert!(matches!(client.next(), StreamEvent::Event(event) if event == note("first")));
-    // It ends when the last event is acknowledged.
+    // The client ends when the last event is acknowledged.
     client.outbox.close();
     peer.send(&ToRuntime::EventsReceived(3)).await;
     while peer.next_but_clock().await.is_some() {}
@@ -328,7 +328,7 @@ async fn events_survive_an_outage_both_ways_and_come_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn event_that_was_not_taken_is_sent_again() {
+async fn requests_an_event_again_if_it_was_not_accepted() {
     let server = Server::start();
     let (sender, events) = channel();
     let shared =
@@ -342,7 +342,7 @@ async fn event_that_was_not_taken_is_sent_again() {
         program: bounded("test"),
     };
     let (sender, refused) = (Mutex::new(sender), std::sync::atomic::AtomicBool::new(false));
-    // The control loop is stalled when the event comes for the first time.
+    // The control loop is stalled when the event arrives for the first time.
     let handle = move |event| {
         let is_event = matches!(event, StreamEvent::Event(_));
         let stalled = is_event && !refused.swap(true, std::sync::atomic::Ordering::Relaxed);
@@ -360,7 +360,7 @@ async fn event_that_was_not_taken_is_sent_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn another_version_is_refused_by_name() {
+async fn rejects_another_protocol_version_by_name() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut bytes = [0; Preamble::SIZE];
@@ -373,7 +373,7 @@ async fn another_version_is_refused_by_name() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn another_certificate_is_refused_with_its_fingerprint() {
+async fn rejects_another_certificate_and_reports_its_fingerprint() {
     let server = Server::start();
     let client = Client::start(&server, Fingerprint::of(b"another"));
     let accepting = server.endpoint.clone();
@@ -395,7 +395,7 @@ async fn reconnects_after_an_outage_or_a_silence() {
     peer.connection.close(VarInt::from_u32(1), b"restarting");
     assert!(matches!(client.next(), StreamEvent::Down(_)));
 
-    // The second one falls silent: it does not even answer the clock.
+    // The second server is silent, also to clock requests.
     let silent = server.welcome().await;
     assert!(matches!(client.next(), StreamEvent::Welcome(_)));
     let StreamEvent::Down(why) = client.next() else { panic!("not down") };
@@ -409,7 +409,7 @@ async fn reconnects_after_an_outage_or_a_silence() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_refusal_is_tried_again() {
+async fn retries_after_a_refusal() {
     let server = Server::start();
     let client = Client::start(&server, server.fingerprint);
     let mut peer = server.accept(Preamble::of(PeerRole::Server)).await;

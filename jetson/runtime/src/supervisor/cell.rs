@@ -1,22 +1,22 @@
-//! A world of a plugin's own: namespaces in which there is the system, read-only, its own folder, and nobody else.
+//! Cell of a plugin: Linux namespaces that contain only the read-only system and the plugin's own folder.
 //!
-//! | namespace | what the plugin finds |
+//! | namespace | contents |
 //! |---|---|
-//! | mount | the system and what it is shown, read-only but for its folders; all else is empty scratch space |
-//! | PID | itself and what it starts; all of it ends with it |
-//! | network, IPC, UTS | nobody to talk to |
-//! | user | no power over any of these |
+//! | mount | the system and shown files, read-only except for writable folders; all others are empty scratch space |
+//! | PID | the plugin and its descendants; all of them end with the plugin |
+//! | network, IPC, UTS | no connection to other programs |
+//! | user | no capabilities in the other namespaces |
 //!
 //! ```text
-//! runtime ── fork ──▶ keeper ── fork ──▶ init (1 in its world) ── fork ──▶ plugin
+//! runtime ── fork ──▶ keeper ── fork ──▶ init (PID 1 of the cell) ── fork ──▶ plugin
 //! ```
-//! The keeper is what the supervisor waits for; it ends as the plugin ended. Init makes the world, and reaps what the
-//! plugin leaves behind. Neither runs anything else, and neither can be looked into: they hold a copy of the
-//! runtime's memory.
+//! The supervisor waits for the keeper, which ends with the plugin's exit status or signal. Init makes the mounts, and
+//! reaps the plugin's descendants. Both hold a copy of the runtime's memory, so they run no other program and cannot be
+//! inspected.
 //!
-//! As root the mounts are made by root, and the plugin becomes another user; otherwise by the powers that a user namespace
-//! gives over itself (user_namespaces(7)). Made between fork and exec, where nothing may be allocated: all is prepared
-//! before.
+//! If the runtime is root, root makes the mounts and the plugin becomes another user. Otherwise a user namespace gives
+//! the necessary capabilities (user_namespaces(7)). The cell is made between fork and exec, where allocation is not
+//! allowed, so everything is prepared before.
 
 #![allow(unsafe_code, reason = "system calls between fork and exec, where little is allowed")]
 
@@ -31,23 +31,23 @@ use landlock::{ABI, AccessFs};
 use nix::libc;
 use nix::unistd::{Gid, Pid, Uid, getegid, geteuid};
 
-/// What a world is made of. Good for any number of plugins.
+/// Prepared contents of a cell, for any number of starts.
 #[derive(Clone, Debug)]
 pub(super) struct Cell {
-    /// Whom the plugin becomes, if root makes it.
+    /// The plugin's user, if the runtime is root.
     user: Option<(Uid, Gid)>,
     network: bool,
-    /// Covered by empty scratch space, and where each one's share of it lies at first.
+    /// Folders covered by empty scratch space, each with the initial path of its part of that space.
     covered: Vec<(CString, CString)>,
-    /// `tmpfs` options of all that space.
+    /// `tmpfs` options of the scratch space.
     scratch: CString,
-    /// What is seen all the same, in order.
+    /// Files and folders shown inside covered folders, or writable, in the order of mounting.
     shown: Vec<Shown>,
-    /// What is not seen, wherever it lies; whether it is a folder.
+    /// Hidden paths, and whether each is a folder.
     hidden: Vec<(CString, bool)>,
-    /// Where the plugin starts, as a person's home that it is not shown: the way to it is there, empty.
+    /// Folder in which the plugin starts. If it is covered, for example a home folder, it exists but is empty.
     folder: Shown,
-    /// For `/proc/self/uid_map` and `gid_map`.
+    /// Content of `/proc/self/uid_map`, and below of `gid_map`.
     uid_map: CString,
     gid_map: CString,
 }
@@ -58,7 +58,7 @@ struct Shown {
     path: CString,
     is_folder: bool,
     is_writable: bool,
-    /// Folders on the way to it, outermost first; missing where the way is covered.
+    /// Covered parent folders, outermost first; they must be created before the mount.
     way: Vec<CString>,
 }
 
@@ -69,34 +69,34 @@ struct PathBeneath {
     folder: RawFd,
 }
 
-/// What is asked of a world.
+/// Requested contents of a cell.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Places {
-    /// Seen, read-only, though they lie where all is covered.
+    /// Paths shown read-only, also inside covered folders.
     pub readable: Vec<PathBuf>,
-    /// Seen, and written.
+    /// Paths shown writable.
     pub writable: Vec<PathBuf>,
-    /// Not seen, wherever they lie.
+    /// Hidden paths, also inside shown folders.
     pub hidden: Vec<PathBuf>,
-    /// Where the plugin starts.
+    /// Folder in which the plugin starts.
     pub folder: PathBuf,
 }
 
-/// The system's own folders: whoever is on this computer may read them. All others hold what is people's.
+/// Folders of the system in `/`, which every user of this computer may read. All others may hold private data.
 const SYSTEM: [&str; 14] = [
     "bin", "dev", "etc", "gnu", "lib", "lib32", "lib64", "libx32", "nix", "opt", "proc", "sbin",
     "sys", "usr",
 ];
-/// What is shared within these.
+/// Folders inside [`SYSTEM`] that programs share.
 const SHARED: [&str; 3] = ["/dev/shm", "/dev/mqueue", "/dev/pts"];
 
 impl Cell {
-    /// Prepares a world with `places` in it.
+    /// Prepares a cell with `places`, and makes it once as a test.
     ///
-    /// `scratch_mb` is what all its scratch space holds at most. [MB]
+    /// `scratch_mb`: maximum size of all scratch space together. [MB]
     ///
     /// # Errors
-    /// What this kernel refuses, in a sentence: it is tried.
+    /// The step that this kernel rejects, as a sentence.
     pub(super) fn prepare(
         user: Option<(Uid, Gid)>,
         network: bool,
@@ -107,7 +107,7 @@ impl Cell {
         let mut shown: Vec<Shown> = Vec::new();
         for (paths, is_writable) in [(&places.readable, false), (&places.writable, true)] {
             for path in paths {
-                // By its own name, and by that which the system gives it.
+                // By the given path, and by the canonical path.
                 let names = [std::path::absolute(path).ok(), path.canonicalize().ok()];
                 for path in names.into_iter().flatten().filter(|path| path.exists()) {
                     let under = covered.iter().find(|covered| path.starts_with(covered));
@@ -119,14 +119,15 @@ impl Cell {
                 }
             }
         }
-        // An outer folder must not hide an inner one that is shown differently, nor reading forbid writing.
+        // Outer folders first, so that they do not hide inner ones. A path in both lists is writable.
         shown.sort_by_key(|shown| (shown.path.as_bytes().len(), shown.is_writable));
         shown.dedup_by(|later, earlier| {
             let is_same = later.path == earlier.path;
             earlier.is_writable |= is_same && later.is_writable;
             is_same
         });
-        // Links within what is shown are there, and lead to what is shown by the name that the system gives it.
+        // Links inside shown folders need no mount: they exist there, and their targets are shown by their canonical
+        // paths.
         let paths: Vec<PathBuf> = shown.iter().map(Shown::path).collect();
         shown.retain(|shown| {
             let path = shown.path();
@@ -164,8 +165,8 @@ impl Cell {
         Ok(cell)
     }
 
-    /// Makes the world and enters it; returns in the process that is to become the plugin. Call it between fork and
-    /// exec. The error's text says which step failed.
+    /// Makes the cell and enters it; returns in the process that becomes the plugin. Call it between fork and exec.
+    /// The error contains the name of the failed step.
     pub(super) fn enter(&self) -> Result<(), Fault> {
         let root = self.user.is_some();
         let mut flags =
@@ -179,24 +180,25 @@ impl Cell {
         // SAFETY: numbers only.
         step("namespaces", unsafe { libc::unshare(flags) })?;
         if !root {
-            // SAFETY: numbers only. A grader keeps itself to itself, and its child is so too until this is said: it
-            // could not write its own map.
+            // SAFETY: numbers only. A grader is not dumpable, and its child inherits that; the child could then not
+            // write its `uid_map`.
             step("a new user", unsafe { libc::prctl(libc::PR_SET_DUMPABLE, 1, 0, 0, 0) })?;
             self.map_user()?;
         }
         die_with_parent()?;
         let mut pipe = [0; 2];
-        // SAFETY: two descriptors are written to an array of two.
+        // SAFETY: writes two descriptors to an array of two.
         step("a pipe", unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) })?;
         if fork()? != 0 {
             keep(pipe[0]);
         }
-        // Init, number 1 of its world.
+        // Init, PID 1 of the cell.
         die_with_parent()?;
         self.make_mounts()?;
         if let Some((uid, gid)) = self.user {
             become_user(uid, gid)?;
-            // SAFETY: numbers only. A change of user hides the process from itself until this is said.
+            // SAFETY: numbers only. A change of user clears the dumpable flag, without which the process cannot write
+            // its `uid_map`.
             step("a new user", unsafe { libc::prctl(libc::PR_SET_DUMPABLE, 1, 0, 0, 0) })?;
             // SAFETY: numbers only.
             step("a user namespace", unsafe { libc::unshare(libc::CLONE_NEWUSER) })?;
@@ -210,14 +212,14 @@ impl Cell {
         die_with_parent()
     }
 
-    /// Returns whom the plugin becomes, if root makes the world.
+    /// Returns the plugin's user, if the runtime is root.
     pub(super) fn user(&self) -> Option<(Uid, Gid)> {
         self.user
     }
 
-    /// Allows a Landlock ruleset's holder to write in the scratch space. In the plugin's process.
+    /// Adds the scratch space to a Landlock ruleset as writable. Call it in the plugin's process.
     pub(super) fn allow_scratch(&self, ruleset: RawFd) -> io::Result<()> {
-        // SAFETY: asks for a version, by numbers.
+        // SAFETY: numbers and a null pointer; returns the ABI version.
         let version =
             unsafe { libc::syscall(libc::SYS_landlock_create_ruleset, null::<u8>(), 0usize, 1u32) };
         let abi = match version {
@@ -232,8 +234,8 @@ impl Cell {
                 return Err(io::Error::last_os_error());
             }
             let rule = PathBeneath { allowed: AccessFs::from_write(abi).bits(), folder };
-            // SAFETY: a ruleset, and a structure of the kernel's layout that lives through the call; then the folder
-            // is closed.
+            // SAFETY: a ruleset, and a structure in the kernel's layout that lives through the call; then closes the
+            // folder.
             let done = unsafe {
                 let done = libc::syscall(
                     libc::SYS_landlock_add_rule,
@@ -252,10 +254,10 @@ impl Cell {
         Ok(())
     }
 
-    /// Covers what is hidden, and shows what is not. As init, with powers over the mounts.
+    /// Makes the mounts of the cell. Call it in init, with capabilities over the mount namespace.
     fn make_mounts(&self) -> Result<(), Fault> {
         let private = libc::MS_REC | libc::MS_PRIVATE;
-        mount("mounts of its own", None, c"/", None, private, None)?;
+        mount("private mounts", None, c"/", None, private, None)?;
         let mut trees = [-1; MAX_PLACES];
         for (tree, shown) in trees.iter_mut().zip(&self.shown) {
             *tree = clone_tree(&shown.path)?;
@@ -289,13 +291,13 @@ impl Cell {
             }
         }
         let hardened = libc::MS_NOSUID | libc::MS_NODEV | libc::MS_NOEXEC;
-        mount("/proc of its own", Some(c"proc"), c"/proc", Some(c"proc"), hardened, None)?;
+        mount("a private /proc", Some(c"proc"), c"/proc", Some(c"proc"), hardened, None)?;
         self.folder.make_place()?;
-        // SAFETY: a path that lives through the call. The former folder is that of the world outside.
+        // SAFETY: a path that lives through the call. Leaves the working folder, which is outside the cell.
         step("its folder", unsafe { libc::chdir(self.folder.path.as_ptr()) })
     }
 
-    /// Covers what is people's by shares of one scratch space, so that together they hold no more than it does.
+    /// Covers private folders with parts of one scratch space, so that its size limits them together.
     fn cover(&self) -> Result<(), Fault> {
         let what = "scratch space";
         let Some((base, _)) = self.covered.first() else { return Ok(()) };
@@ -308,7 +310,7 @@ impl Cell {
             step(what, unsafe { libc::chmod(share.as_ptr(), 0o1777) })?;
             *tree = clone_tree(share)?;
         }
-        // SAFETY: a path that lives through the call. The shares hold what they are part of.
+        // SAFETY: a path that lives through the call. The clones keep the file system alive.
         step(what, unsafe { libc::umount2(base.as_ptr(), libc::MNT_DETACH) })?;
         for (&tree, (path, _)) in shares.iter().zip(&self.covered) {
             move_mount(tree, path)?;
@@ -322,14 +324,14 @@ impl Cell {
         write_file(c"/proc/self/gid_map", &self.gid_map)
     }
 
-    /// Makes the world once, for nobody.
+    /// Makes the cell once in a child process that exits at once.
     fn try_out(&self) -> Result<(), String> {
         if self.shown.len().max(self.covered.len()) > MAX_PLACES {
             return Err(format!("there are more than {MAX_PLACES} folders to cover or to show"));
         }
         let (reader, writer) = io::pipe().map_err(|error| error.to_string())?;
         let number = writer.as_raw_fd();
-        // SAFETY: the child makes system calls only, on what was prepared, and exits.
+        // SAFETY: the child makes only system calls with prepared data, and exits.
         let child = unsafe { libc::fork() };
         if child == 0 {
             match self.enter() {
@@ -342,7 +344,7 @@ impl Cell {
                     }
                 }
             }
-            // SAFETY: ends this process, and nothing else.
+            // SAFETY: ends this process without running destructors.
             unsafe { libc::_exit(0) };
         }
         drop(writer);
@@ -380,7 +382,7 @@ impl Shown {
         PathBuf::from(OsStr::from_bytes(self.path.as_bytes()))
     }
 
-    /// Makes the way to it, and what it is mounted on, where these were covered.
+    /// Creates the parent folders and the mount point, if they are covered.
     fn make_place(&self) -> Result<(), Fault> {
         for folder in &self.way {
             make_folder(folder)?;
@@ -394,18 +396,18 @@ impl Shown {
         // SAFETY: a path that lives through the call.
         let file =
             unsafe { libc::open(self.path.as_ptr(), libc::O_CREAT | libc::O_CLOEXEC, 0o444) };
-        // Then it is there, or a link leads to where it is.
+        // The file exists already, or a link leads to it.
         if file < 0 {
             return Ok(());
         }
-        // SAFETY: ours, and not used any more.
+        // SAFETY: opened above, and not used any more.
         unsafe { libc::close(file) };
         Ok(())
     }
 }
 
-/// Returns the folders that hold what is people's: those at the root that are not the system's, what is shared, and
-/// homes and scratch space wherever they are.
+/// Returns the folders to cover: those in `/` that are not the system's, those in [`SHARED`], the home folder, and the
+/// folder of temporary files.
 fn covered() -> Vec<PathBuf> {
     let top = std::fs::read_dir("/").into_iter().flatten().flatten();
     let top = top.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
@@ -415,12 +417,12 @@ fn covered() -> Vec<PathBuf> {
     let others = others.chain([std::env::temp_dir()]).filter_map(|path| path.canonicalize().ok());
     all.extend(others.filter(|path| path.is_dir() && path.parent().is_some()));
     all.sort();
-    // What is within another one is covered with it, and comes after it.
+    // Removes folders inside other folders; sorting has put them directly after those.
     all.dedup_by(|inner, outer| inner.starts_with(&*outer));
     all
 }
 
-/// A step that failed, and how the system put it.
+/// A failed step and its system error.
 type Fault = (&'static str, io::Error);
 
 fn step(what: &'static str, result: i32) -> Result<(), Fault> {
@@ -429,23 +431,23 @@ fn step(what: &'static str, result: i32) -> Result<(), Fault> {
 
 /// Forks; 0 in the child.
 fn fork() -> Result<i32, Fault> {
-    // SAFETY: as vfork's, the child goes on with system calls only.
+    // SAFETY: the child makes only system calls, as after vfork.
     let child = unsafe { libc::fork() };
     step("another process", child)?;
     Ok(child)
 }
 
-/// Ends this process when its parent ends. A change of user or of powers takes that back.
+/// Kills this process when its parent ends. A change of user or of capabilities clears the setting.
 fn die_with_parent() -> Result<(), Fault> {
     // SAFETY: numbers only.
-    step("an end with its parent", unsafe {
+    step("a parent-death signal", unsafe {
         libc::prctl(libc::PR_SET_PDEATHSIG, libc::SIGKILL, 0, 0, 0)
     })
 }
 
-/// Lets nobody look into this process, and closes all files but one, which becomes number 3.
+/// Protects this process against inspection, and closes all files except `kept`, which becomes descriptor 3.
 fn shut(kept: RawFd) {
-    // SAFETY: numbers only; what is closed is this copy of the process's alone, and nothing uses it any more.
+    // SAFETY: numbers only; the closed descriptors belong only to this process, which does not use them any more.
     unsafe {
         libc::prctl(libc::PR_SET_DUMPABLE, 0, 0, 0, 0);
         libc::dup2(kept, 3);
@@ -458,11 +460,11 @@ fn shut(kept: RawFd) {
     }
 }
 
-/// The keeper: waits for init's word of how the plugin ended, and ends so itself.
+/// Keeper: waits for the plugin's wait status from init, and ends with the same exit status or signal.
 fn keep(report: RawFd) -> ! {
     shut(report);
     let mut status = 0i32;
-    // SAFETY: four bytes are read into an integer; then this process ends, by itself or by the plugin's signal.
+    // SAFETY: reads four bytes into an integer; then this process ends, by itself or by the plugin's signal.
     unsafe {
         let read = loop {
             let read = libc::read(3, (&raw mut status).cast(), 4);
@@ -470,7 +472,7 @@ fn keep(report: RawFd) -> ! {
                 break read;
             }
         };
-        // Without a word, somebody has killed init.
+        // Without a status, init was killed.
         let signal = if read != 4 {
             libc::SIGKILL
         } else if libc::WIFSIGNALED(status) {
@@ -485,7 +487,7 @@ fn keep(report: RawFd) -> ! {
     }
 }
 
-/// Init: reaps whatever ends, until the plugin does; its own end is that of all that are left.
+/// Init: reaps processes until the plugin ends; the kernel then kills the remaining processes of the cell.
 fn reap(plugin: i32, report: RawFd) -> ! {
     shut(report);
     let mut status = 0i32;
@@ -518,13 +520,13 @@ fn mount(
     options: Option<&CStr>,
 ) -> Result<(), Fault> {
     let pointer = |text: Option<&CStr>| text.map_or(null(), CStr::as_ptr);
-    // SAFETY: texts that live through the call, or null where mount(2) allows it.
+    // SAFETY: strings that live through the call, or null where mount(2) allows it.
     step(what, unsafe {
         libc::mount(pointer(source), target.as_ptr(), pointer(kind), flags, pointer(options).cast())
     })
 }
 
-/// Returns a copy of the mounts at `path`, attached nowhere.
+/// Returns a detached copy of the mounts at `path`.
 fn clone_tree(path: &CStr) -> Result<RawFd, Fault> {
     let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | libc::AT_RECURSIVE as u32;
     // SAFETY: a path that lives through the call.
@@ -574,7 +576,7 @@ fn move_mount(tree: RawFd, path: &CStr) -> Result<(), Fault> {
 fn make_folder(path: &CStr) -> Result<(), Fault> {
     // SAFETY: a path that lives through the call.
     match step("a folder on the way", unsafe { libc::mkdir(path.as_ptr(), 0o755) }) {
-        // It is there, or a link leads to where it is.
+        // The folder exists already, or a link leads to it.
         Err((_, error)) if matches!(error.raw_os_error(), Some(libc::EEXIST | libc::EROFS)) => {
             Ok(())
         }
@@ -588,7 +590,7 @@ fn write_file(path: &CStr, text: &CStr) -> Result<(), Fault> {
     let file = unsafe { libc::open(path.as_ptr(), libc::O_WRONLY | libc::O_CLOEXEC) };
     step(what, file)?;
     let bytes = text.to_bytes();
-    // SAFETY: bytes that live through the call, to a file that is open; then it is closed.
+    // SAFETY: bytes that live through the call, to a file that is open; then closes it.
     let written = unsafe {
         let written = libc::write(file, bytes.as_ptr().cast(), bytes.len());
         let error = *libc::__errno_location();
@@ -607,5 +609,5 @@ fn c_text(text: &str) -> Result<CString, String> {
     CString::new(text).map_err(|error| error.to_string())
 }
 
-/// Folders and files that are shown, or covered, at most.
+/// Maximum number of shown or covered paths.
 const MAX_PLACES: usize = 256;

@@ -1,9 +1,9 @@
-//! A control group of the plugin's own: memory, processors and processes of it and all it starts,
-//! and a list of them, so that none escapes its end.
+//! Control group of the plugin: limits memory, processors and processes of the plugin and its descendants,
+//! and lists them, so that all of them can be killed.
 //!
-//! Version 2 where it is mounted and lends its controllers, else version 1, controller by
-//! controller. Only where this process may make a group: as root, or where systemd delegates one
-//! to the user. What a group cannot limit, [`confine`](super::confine) limits another way.
+//! Uses version 2 if it is mounted and delegates its controllers, or else version 1 for each controller.
+//! Requires permission to make a group: root, or a group that systemd delegates to the user. Without a
+//! group, [`confine`](super::confine) limits the plugin by other means.
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
@@ -17,7 +17,7 @@ use nix::unistd::Pid;
 
 use super::limits::PluginLimits;
 
-/// The limits of a group.
+/// Controller of a control group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Controller {
     Memory,
@@ -37,7 +37,7 @@ impl Controller {
     }
 }
 
-/// The plugin's groups: one in version 2, up to three in version 1. Removed when dropped.
+/// The plugin's control groups: one in version 2, up to three in version 1. Removed when dropped.
 #[derive(Debug, Default)]
 pub(super) struct Cgroup {
     parts: Vec<GroupFolder>,
@@ -48,17 +48,17 @@ struct GroupFolder {
     folder: PathBuf,
     version: u8,
     limits: Vec<Controller>,
-    /// Open for writing since before the plugin became another user.
+    /// `cgroup.procs`, opened for writing before the plugin changes its user.
     procs: File,
 }
 
-/// Prefix of the groups' names; what follows is the runtime's process and a count.
+/// Prefix of the groups' names; the runtime's process id and a count follow.
 const NAME: &str = "vizflyt-plugin-";
 /// Period of the processors' quota. [us]
 const CPU_PERIOD_US: u64 = 20_000;
 
 impl Cgroup {
-    /// Makes the groups that can be made; none is no error.
+    /// Makes as many of the groups as possible; an empty result is valid.
     pub(super) fn make(limits: &PluginLimits) -> Self {
         let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
         let own = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
@@ -67,7 +67,7 @@ impl Cgroup {
         for place in &hierarchies {
             let missing: Vec<_> =
                 place.offers.iter().copied().filter(|&c| !group.limits(c)).collect();
-            // A group of version 2 is of use even without controllers: it knows its processes.
+            // A group of version 2 is useful even without controllers: it lists its processes.
             if missing.is_empty() && (place.version == 1 || group.has_version_2()) {
                 continue;
             }
@@ -80,17 +80,17 @@ impl Cgroup {
         self.parts.iter().any(|part| part.version == 2)
     }
 
-    /// Whether a group limits this.
+    /// Whether a group applies this limit.
     pub(super) fn limits(&self, controller: Controller) -> bool {
         self.parts.iter().any(|part| part.limits.contains(&controller))
     }
 
-    /// Returns the files into which a process writes `0` to become a member.
+    /// Returns the files into which a process writes `0` to join.
     pub(super) fn doors(&self) -> Vec<&File> {
         self.parts.iter().map(|part| &part.procs).collect()
     }
 
-    /// Whether the kernel ended a process of the group for its memory.
+    /// Whether the kernel killed a process of the group because of its memory.
     pub(super) fn ran_out_of_memory(&self) -> bool {
         self.events(Controller::Memory, |part| match part.version {
             2 => ("memory.events", "oom_kill"),
@@ -98,7 +98,7 @@ impl Cgroup {
         })
     }
 
-    /// Whether the kernel refused the group a process.
+    /// Whether the kernel rejected a new process of the group.
     pub(super) fn ran_out_of_processes(&self) -> bool {
         self.events(Controller::Pids, |_| ("pids.events", "max"))
     }
@@ -116,19 +116,19 @@ impl Cgroup {
         })
     }
 
-    /// Returns the members; none without a group.
+    /// Returns the member processes; empty without a group.
     pub(super) fn members(&self) -> Vec<Pid> {
         self.parts.first().map_or_else(Vec::new, GroupFolder::members)
     }
 
-    /// Kills every member, and those they start meanwhile.
+    /// Kills all members, including those that they start during the call.
     pub(super) fn kill(&self) {
         for part in &self.parts {
-            // Version 2 since Linux 5.14; it cannot be outrun.
+            // Version 2 since Linux 5.14; atomic, so a forking member cannot escape.
             if fs::write(part.folder.join("cgroup.kill"), "1").is_ok() {
                 continue;
             }
-            // Bounded: a member that forks faster than we read has a limit on its processes.
+            // Bounded: the limit on processes stops a member that forks faster than this loop kills.
             for _ in 0..64 {
                 let members = part.members();
                 if members.is_empty() {
@@ -144,7 +144,7 @@ impl Cgroup {
 
 impl Drop for Cgroup {
     fn drop(&mut self) {
-        // A member that dies stays one until it is reaped.
+        // An ended process stays a member until it is reaped.
         for part in &self.parts {
             for _ in 0..100 {
                 match fs::remove_dir(&part.folder) {
@@ -159,13 +159,13 @@ impl Drop for Cgroup {
 }
 
 impl GroupFolder {
-    /// Makes a group at the nearest place above us where it can be made and used.
+    /// Makes a group in the nearest ancestor of this process's group that permits it and its controllers.
     fn make(place: &Hierarchy, wanted: &[Controller], limits: &PluginLimits) -> Option<Self> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
         let name = format!("{NAME}{}-{count}", std::process::id());
-        // Version 2 refuses processes in a group that lends controllers to groups below it, and
-        // ours has one: us. So the parent's is tried first, then its parents'.
+        // Version 2 forbids processes in a group that delegates controllers to its children. This process
+        // is a member of its group, so the search starts at that group's parent.
         let own = place.root.join(place.own.trim_start_matches('/'));
         let above = own.ancestors().skip(usize::from(place.version == 2 && own != place.root));
         let mut best: Option<Self> = None;
@@ -204,14 +204,14 @@ impl GroupFolder {
         let _ = fs::remove_dir(&self.folder);
     }
 
-    /// Sets a limit; returns whether the kernel took it.
+    /// Sets a limit; returns whether the kernel accepted it.
     fn limit(&self, controller: Controller, limits: &PluginLimits) -> bool {
         let set = |file: &str, value: String| fs::write(self.folder.join(file), value).is_ok();
         let memory = (limits.memory_mb * 1_000_000).to_string();
         let quota_us = ((limits.cpus * CPU_PERIOD_US as f64) as u64).max(1000);
         match (controller, self.version) {
             (Controller::Memory, 2) => {
-                // Without swap accounting the file is not there, and all is memory.
+                // Without swap accounting the file does not exist, and all use counts as memory.
                 let _ = set("memory.swap.max", "0".into());
                 let _ = set("memory.oom.group", "1".into());
                 set("memory.max", memory)
@@ -236,13 +236,13 @@ impl GroupFolder {
     }
 }
 
-/// Removes groups of runtimes that were killed. One that has members refuses to go.
+/// Removes the groups of runtimes that were killed. The kernel keeps groups with members.
 fn remove_left_behind(parent: &Path) {
     let Ok(entries) = fs::read_dir(parent) else { return };
     for entry in entries.flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
         let pid = name.strip_prefix(NAME).and_then(|rest| rest.split('-').next()?.parse().ok());
-        // Another runtime may have made its group and not filled it yet.
+        // A running runtime may have made its group without members yet.
         let runs = |pid: u32| Path::new("/proc").join(pid.to_string()).exists();
         if pid.is_some_and(|pid| !runs(pid)) {
             let _ = fs::remove_dir(entry.path());
@@ -250,7 +250,7 @@ fn remove_left_behind(parent: &Path) {
     }
 }
 
-/// A hierarchy and where we are in it.
+/// A hierarchy and the group of this process in it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Hierarchy {
     root: PathBuf,
@@ -259,8 +259,8 @@ struct Hierarchy {
     offers: Vec<Controller>,
 }
 
-/// Returns the hierarchies of `/proc/self/mountinfo` (proc_pid_mountinfo(5)) and this process's
-/// place in each by `/proc/self/cgroup` (cgroups(7)), version 2 first.
+/// Returns the hierarchies in `/proc/self/mountinfo` (proc_pid_mountinfo(5)), each with the group of this
+/// process from `/proc/self/cgroup` (cgroups(7)), version 2 first.
 fn hierarchies(mounts: &str, own: &str) -> Vec<Hierarchy> {
     let mut hierarchies: Vec<Hierarchy> = mounts
         .lines()
@@ -291,7 +291,7 @@ fn hierarchies(mounts: &str, own: &str) -> Vec<Hierarchy> {
                 };
                 is_it.then_some(path)
             })?;
-            // Inside a container the mount shows a part of the hierarchy only.
+            // Inside a container, the mount shows only a part of the hierarchy.
             let path = path.strip_prefix(inner.trim_end_matches('/')).unwrap_or(path);
             Some(Hierarchy { root: root.into(), own: path.to_owned(), version, offers })
         })
@@ -317,7 +317,7 @@ mod tests {
 39 35 0:34 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw";
 
     #[test]
-    fn hierarchies_of_both_versions_are_found() {
+    fn finds_hierarchies_of_both_versions() {
         let own = "4:memory:/a/b\n2:cpu,cpuacct:/\n3:blkio:/\n0::/user.slice";
         let found = hierarchies(MOUNTS_1, own);
         let seen: Vec<_> =
@@ -339,11 +339,11 @@ mod tests {
     }
 
     #[test]
-    fn a_group_counts_its_own_and_is_gone_afterwards() {
+    fn removes_its_groups_when_dropped() {
         let limits = PluginLimits { processes: 9, ..PluginLimits::default() };
         let group = Cgroup::make(&limits);
         let folders: Vec<_> = group.parts.iter().map(|part| part.folder.clone()).collect();
-        // Where this user may make none there is nothing to see.
+        // Empty if this user may not make groups.
         for part in &group.parts {
             assert!(part.members().is_empty() && part.folder.exists());
         }
@@ -353,7 +353,7 @@ mod tests {
     }
 
     #[test]
-    fn counters_are_read() {
+    fn parses_event_counters() {
         assert_eq!(field("low 0\noom_kill 3\n", "oom_kill"), Some(3));
         assert_eq!(field("oom_kill_disable 0\noom_kill 1\n", "oom_kill"), Some(1));
         assert_eq!(field("", "max"), None);

@@ -1,15 +1,15 @@
-//! Between fork and exec of the plugin: what it loses before its first instruction.
+//! Confinement of the plugin, applied between fork and exec.
 //!
-//! | what | how | where it is not there |
+//! | restricts | mechanism | if unavailable |
 //! |---|---|---|
 //! | memory, processes | control group | `RLIMIT_DATA` and `RLIMIT_NPROC`, and counting by the supervisor |
-//! | processors | control group | it is kept off the first processor |
+//! | processors | control group | the plugin is kept off the first processor |
 //! | network, other programs' sockets, the system itself | seccomp | reported once |
-//! | writing outside its folders, reading what is hidden, signalling others | Landlock | reported once |
-//! | other processes, people's homes, what is shared | a [cell](super::cell) | said once |
-//! | the runtime's user | another user, if root | it keeps root's name without root's powers |
+//! | writing outside its folders, reading hidden files, signalling other processes | Landlock | reported once |
+//! | other processes, home folders, shared memory and files | a [cell](super::cell) | reported once |
+//! | the runtime's user | another user, if root | the plugin stays root without capabilities |
 //!
-//! All is prepared before the fork; after it only system calls are made.
+//! Everything is prepared before the fork; after it only system calls are made.
 
 #![allow(unsafe_code, reason = "system calls between fork and exec, where little is allowed")]
 
@@ -43,22 +43,22 @@ use super::cell::{Cell, Places};
 use super::cgroup::{Cgroup, Controller};
 use super::limits::PluginLimits;
 
-/// The confinement of a plugin, for any number of starts.
+/// Confinement of a plugin, for any number of starts.
 #[derive(Debug)]
 pub struct Confinement {
     pub(super) limits: PluginLimits,
     user: Option<(Uid, Gid)>,
-    /// Root that stays root by name.
+    /// Whether the plugin stays root without capabilities.
     drops_powers: bool,
     filters: Vec<BpfProgram>,
     landlock: Option<OwnedFd>,
-    /// Or why there is none.
+    /// The cell, or the reason why none is available.
     cell: Result<Cell, String>,
     own_folders: Vec<PathBuf>,
     notes: Vec<String>,
 }
 
-/// The limits of one process, beside the confinement.
+/// Limits of one process, in addition to the confinement.
 pub(super) struct Bounds {
     group: Cgroup,
     memory: Option<u64>,
@@ -68,22 +68,21 @@ pub(super) struct Bounds {
 }
 
 impl Confinement {
-    /// Finds out what this kernel and this user offer for `command` under `limits`.
+    /// Selects the mechanisms that this kernel and this user offer for `command` under `limits`.
     pub fn prepare(limits: &PluginLimits, command: &[OsString]) -> Self {
         let mut notes = Vec::new();
         let own_folders = own_folders(limits, command);
         let (mut user, mut drops_powers) = choose_user(limits, command, &mut notes);
         let cell = cell(limits, command, &own_folders);
         match &cell {
-            // Whatever people's folders allow: in a cell the way to what is shown is open.
+            // The cell's user: in a cell, the path to shown files is open regardless of folder permissions.
             Ok(cell) if geteuid().is_root() => {
                 (user, drops_powers) = (cell.user(), false);
                 notes.clear();
             }
             Ok(_) => {}
             Err(why) => notes.push(format!(
-                "this computer gives the plugin no namespaces of its own ({why}); it sees other processes and \
-                 shared folders"
+                "the plugin runs without namespaces ({why}); it sees other processes and shared folders"
             )),
         }
         let filters = match filters(limits, cell.is_ok()) {
@@ -97,8 +96,7 @@ impl Confinement {
         let landlock = match files(&own_folders, limits, cell.is_ok()) {
             Ok(Some(ruleset)) => Some(ruleset),
             Ok(None) => {
-                let note =
-                    "this kernel has no Landlock; the plugin may write wherever its user may";
+                let note = "this kernel has no Landlock; the plugin may write where its user may";
                 notes.push(note.to_owned());
                 None
             }
@@ -111,21 +109,21 @@ impl Confinement {
         Self { limits, user, drops_powers, filters, landlock, cell, own_folders, notes }
     }
 
-    /// Returns the user that the plugin becomes, if another.
+    /// Returns the plugin's user, if it differs from the runtime's.
     pub fn user_id(&self) -> Option<u32> {
         self.user.map(|(uid, _)| uid.as_raw())
     }
 
-    /// Whether the kernel lacks something that the plugin is confined by.
+    /// Whether the kernel lacks Landlock, seccomp, or what a cell needs.
     pub fn is_partial(&self) -> bool {
         self.landlock.is_none() || self.filters.is_empty() || self.cell.is_err()
     }
 
-    /// Returns what keeps a grade from being worth a signature here, in a sentence: without a cell, or a filter of
-    /// system calls, a plugin can look for what it is not shown.
+    /// Returns why this computer must not sign grades, as a sentence: without a cell, or without a filter of system
+    /// calls, a plugin can search for hidden data.
     pub fn unsealed(&self) -> Option<String> {
         match &self.cell {
-            Err(why) => Some(format!("plugins get no namespaces of their own here: {why}")),
+            Err(why) => Some(format!("plugins run without namespaces on this computer: {why}")),
             Ok(_) if self.filters.is_empty() => Some("this kernel has no seccomp".to_owned()),
             Ok(_) => None,
         }
@@ -136,7 +134,7 @@ impl Confinement {
         &self.own_folders
     }
 
-    /// Makes a control group, and what stands in for the limits that it lacks. Says what is amiss.
+    /// Makes a control group, and substitutes for the limits that it lacks. Also returns notes on missing mechanisms.
     pub(super) fn bounds(&self) -> (Bounds, Vec<String>) {
         let limits = &self.limits;
         let group = Cgroup::make(limits);
@@ -149,7 +147,7 @@ impl Confinement {
         };
         let memory = without(Controller::Memory, "memory").then_some(limits.memory_mb * 1_000_000);
         let processes = without(Controller::Pids, "processes").then(|| {
-            // The kernel counts all of the user's; the plugin's come on top of what runs.
+            // The kernel counts all processes of the user, so the limit is added to those that run.
             let uid = self.user.map_or(geteuid(), |(uid, _)| uid);
             tasks_of(uid) + u64::from(limits.processes)
         });
@@ -165,7 +163,7 @@ impl Confinement {
         (Bounds { group, memory, processes, processors, in_cell }, notes)
     }
 
-    /// Makes `process` lose all this before its first instruction.
+    /// Makes `process` confine itself between fork and exec.
     pub(super) fn apply(
         &self,
         process: &mut Command,
@@ -192,10 +190,11 @@ impl Confinement {
             if let Some(processors) = &processors {
                 nix::sched::sched_setaffinity(Pid::from_raw(0), processors)?;
             }
-            // Without the terminal, into which it could type; and a group of processes, which the supervisor ends.
+            // A new session has no terminal, into which the plugin could type, and is a process group that the
+            // supervisor can kill.
             nix::unistd::setsid()?;
             nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
-            // The parent may have died before that.
+            // The parent may have ended before the call.
             if getppid() != parent {
                 return Err(io::ErrorKind::BrokenPipe.into());
             }
@@ -211,7 +210,7 @@ impl Confinement {
             }
             if let Some((uid, gid)) = user.filter(|_| cell.is_none()) {
                 explained(become_user(uid, gid), "it cannot become another user")?;
-                // The change of user has cleared it.
+                // The change of user has cleared the setting.
                 nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
             }
             if drops_powers {
@@ -227,7 +226,7 @@ impl Confinement {
                 explained(check(done as isize), "Landlock refuses")?;
             }
             for filter in &filters {
-                // Its errors hold no memory; their text is for a kernel developer.
+                // seccompiler's errors hold no memory; their text is for kernel developers.
                 let applied = seccompiler::apply_filter(filter);
                 explained(
                     applied.map_err(|_| io::ErrorKind::Unsupported.into()),
@@ -237,7 +236,7 @@ impl Confinement {
             Ok(())
         };
         // SAFETY: between fork and exec only async-signal-safe calls are allowed. `steps` makes
-        // system calls on what was prepared before, and allocates nothing.
+        // system calls with data that was prepared before, and allocates nothing.
         unsafe { process.pre_exec(steps) };
     }
 }
@@ -251,18 +250,18 @@ impl Bounds {
         self.in_cell
     }
 
-    /// Whether memory and processes are to be counted by the supervisor, for want of a group.
+    /// Whether the supervisor must count memory and processes because no control group does.
     pub(super) fn counts_itself(&self) -> bool {
         self.memory.is_some() || self.processes.is_some()
     }
 }
 
-/// Passes a result on; before an error, writes to standard error, which the supervisor reads, what
-/// failed: only a number gets through exec.
+/// Returns `result`. On an error, first writes `what` to standard error, which the supervisor reads:
+/// the standard library passes only an error number to the parent.
 fn explained(result: io::Result<()>, what: &'static str) -> io::Result<()> {
     if result.is_err() {
         for part in ["confining the plugin: ", what, "\n"] {
-            // SAFETY: writes bytes that live for ever to the process's own standard error.
+            // SAFETY: writes static bytes to the process's standard error.
             unsafe { libc::write(2, part.as_ptr().cast(), part.len()) };
         }
     }
@@ -273,30 +272,30 @@ fn check(result: isize) -> io::Result<()> {
     if result < 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
 }
 
-/// Lowers a limit; one that is lower already stays.
+/// Lowers a limit; keeps a limit that is already lower.
 fn lower(resource: Resource, most: u64) -> io::Result<()> {
     let (_, hard) = nix::sys::resource::getrlimit(resource)?;
     let most = most.min(hard);
     Ok(setrlimit(resource, most, most)?)
 }
 
-/// Becomes another user for good.
+/// Changes to another user permanently.
 fn become_user(uid: Uid, gid: Gid) -> io::Result<()> {
     nix::unistd::setgroups(&[])?;
     nix::unistd::setresgid(gid, gid, gid)?;
     Ok(nix::unistd::setresuid(uid, uid, uid)?)
 }
 
-/// Empties the bounding set: exec then gives root's name nothing (capabilities(7)).
+/// Empties the bounding set, so that root has no capabilities after exec (capabilities(7)).
 fn drop_capabilities() {
     for capability in 0..64 {
-        // SAFETY: prctl(2) with numbers only. One that this kernel lacks, or may not be dropped, is
-        // an error that changes nothing.
+        // SAFETY: prctl(2) with numbers only. An unknown capability, or one that may not be dropped,
+        // is an error without effect.
         unsafe { libc::prctl(libc::PR_CAPBSET_DROP, capability, 0, 0, 0) };
     }
 }
 
-/// Makes the plugin's cell: it is shown its own folders, what it is started from, and where its interpreter finds packages.
+/// Makes the plugin's cell, with its folders, its program, and the folders of its interpreter's packages.
 fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<Cell, String> {
     let user = if geteuid().is_root() {
         let name = limits.user.as_deref().filter(|&name| name != "root");
@@ -315,7 +314,7 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
     }
     if let Some(program) = command.first().map(Path::new) {
         let is_bare = program.components().count() == 1;
-        // What lies beside a program is its own, as models and libraries are.
+        // Files next to a program belong to it, for example models and libraries.
         let beside = program.parent().and_then(|folder| folder.canonicalize().ok());
         readable.extend(beside.filter(|folder| !is_bare && is_somebodys(folder)));
         let program = is_bare.then(|| on_path(program)).flatten().unwrap_or(program.to_owned());
@@ -329,7 +328,7 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
     }
     readable.extend(std::env::home_dir().map(|home| home.join(".local/lib")));
     if limits.network {
-        // Where names are looked up.
+        // Configuration of the name resolver.
         readable.extend(["/run/systemd/resolve", "/run/resolvconf"].map(PathBuf::from));
     }
     let mut writable = limits.write.clone();
@@ -342,7 +341,7 @@ fn cell(limits: &PluginLimits, command: &[OsString], own: &[PathBuf]) -> Result<
     Cell::prepare(user, limits.network, &places, (limits.memory_mb / 4).max(16))
 }
 
-/// Returns `path`, and each file that it is a link to on the way to the last.
+/// Returns `path` and all targets of its chain of symbolic links, at most 16 paths.
 fn links(path: &Path) -> Vec<PathBuf> {
     let next = |path: &PathBuf| {
         Some(path.parent().unwrap_or(Path::new("")).join(fs::read_link(path).ok()?))
@@ -350,21 +349,21 @@ fn links(path: &Path) -> Vec<PathBuf> {
     std::iter::successors(Some(path.to_owned()), next).take(16).collect()
 }
 
-/// Returns the parts of the folder that a program was installed into with all that it needs, as Python's environments
-/// are: the one above its `bin`. Of managers of versions (pyenv, asdf, mise), who start another by a script in `shims`, all.
+/// Returns the folders of a program's installation, for example of a Python environment: those next to its `bin`. For a
+/// version manager (pyenv, asdf, mise), which starts programs by scripts in `shims`, returns its complete folder.
 fn installation(program: &Path) -> Vec<PathBuf> {
     if let Some(shims) = program.parent().filter(|folder| folder.ends_with("shims")) {
         return shims.parent().map(Path::to_owned).into_iter().collect();
     }
     let bin = program.parent().filter(|folder| folder.ends_with("bin"));
     let Some(prefix) = bin.and_then(Path::parent) else { return Vec::new() };
-    // An environment may be another folder's, by a link.
+    // An environment may be a link to another folder.
     let prefixes = [Some(prefix.to_owned()), prefix.canonicalize().ok()].into_iter().flatten();
     let parts = |prefix: PathBuf| ["bin", "lib", "lib64", "pyvenv.cfg"].map(|it| prefix.join(it));
     prefixes.flat_map(parts).collect()
 }
 
-/// Chooses whom the plugin runs as, and whether it stays root by name.
+/// Chooses the plugin's user. The flag is true if the plugin stays root and must drop its capabilities.
 fn choose_user(
     limits: &PluginLimits,
     command: &[OsString],
@@ -402,7 +401,7 @@ fn choose_user(
     }
 }
 
-/// Returns a file of the command that `user` cannot read.
+/// Returns the first file of the command that `user` cannot read.
 fn unreadable(command: &[OsString], user: &User) -> Option<PathBuf> {
     let mut files: Vec<PathBuf> = Vec::new();
     for (index, part) in command.iter().enumerate() {
@@ -413,7 +412,7 @@ fn unreadable(command: &[OsString], user: &User) -> Option<PathBuf> {
             files.push(path.to_owned());
         }
     }
-    // Where Python finds its packages.
+    // Folders of Python packages.
     for name in ["PYTHONPATH", "VIRTUAL_ENV"] {
         let folders = std::env::var_os(name).unwrap_or_default();
         files.extend(std::env::split_paths(&folders).filter(|folder| folder.exists()));
@@ -421,7 +420,7 @@ fn unreadable(command: &[OsString], user: &User) -> Option<PathBuf> {
     files.extend(std::env::current_dir());
     let (uid, gid) = (user.uid, user.gid);
     let look = move || {
-        // The kernel's own answer: this thread sees files as that user does, until it ends.
+        // Opens the files with the permissions of that user; the setting is limited to this thread.
         nix::unistd::setfsgid(gid);
         nix::unistd::setfsuid(uid);
         files.into_iter().find(|file| File::open(file).is_err())
@@ -429,14 +428,14 @@ fn unreadable(command: &[OsString], user: &User) -> Option<PathBuf> {
     std::thread::spawn(look).join().ok().flatten()
 }
 
-/// Returns where the system finds a program.
+/// Returns the path of a program in `PATH`.
 fn on_path(program: &Path) -> Option<PathBuf> {
     let folders = std::env::var_os("PATH")?;
     std::env::split_paths(&folders).map(|folder| folder.join(program)).find(|path| path.is_file())
 }
 
-/// Returns the folders that hold the student's own code: those of scripts and folders on the
-/// command line, and, if it is not graded, the working folder; never a whole home or the whole system.
+/// Returns the folders of the student's own code: folders and the folders of scripts on the command
+/// line, and, if not graded, the working folder; never a complete home folder or the root folder.
 fn own_folders(limits: &PluginLimits, command: &[OsString]) -> Vec<PathBuf> {
     let scripts = command.iter().map(Path::new).filter_map(|path| {
         if path.is_dir() {
@@ -458,16 +457,16 @@ fn own_folders(limits: &PluginLimits, command: &[OsString]) -> Vec<PathBuf> {
     folders
 }
 
-/// Whether a folder is neither a whole home nor the whole system.
+/// Whether a folder is neither the root folder nor one that contains the home folder.
 fn is_somebodys(folder: &Path) -> bool {
     let holds_home = std::env::home_dir().is_some_and(|home| home.starts_with(folder));
     !holds_home && folder.parent().is_some()
 }
 
-/// Makes the rules of files: writing in the plugin's folders, scratch space, and devices that compute;
-/// reading everywhere but what is hidden.
+/// Makes the Landlock ruleset: allows writing in the plugin's folders, scratch space and compute devices,
+/// and reading everything except hidden files.
 ///
-/// In a cell what is hidden is covered, and scratch space is made there.
+/// A cell itself covers hidden files and makes scratch space, so the ruleset then omits both.
 fn files(
     own: &[PathBuf],
     limits: &PluginLimits,
@@ -482,13 +481,13 @@ fn files(
     let nvidia = fs::read_dir("/dev").into_iter().flatten().flatten();
     let is_nvidia = |name: &OsString| name.to_string_lossy().starts_with("nv");
     places.extend(nvidia.filter(|entry| is_nvidia(&entry.file_name())).map(|entry| entry.path()));
-    // Truncation came with the third version, scopes with the sixth; older ones do what they can.
+    // Truncation needs ABI 3, scopes need ABI 6; older kernels apply the rest (best effort).
     let writing = AccessFs::from_write(ABI::V3);
     let rules = Ruleset::default()
         .set_compatibility(CompatLevel::BestEffort)
         .handle_access(writing)?
         .scope(Scope::from_all(ABI::V6))?;
-    // What lies where plugins make files cannot be hidden: those they make later must be readable.
+    // Files in scratch space cannot be hidden: plugins must be able to read files that they create there later.
     let is_hideable = |path: &&PathBuf| !scratch().iter().any(|place| path.starts_with(place));
     let hidden: Vec<PathBuf> =
         limits.hide.iter().filter_map(|path| path.canonicalize().ok()).collect();
@@ -501,19 +500,19 @@ fn files(
         .handle_access(reading | AccessFs::ReadDir)?
         .create()?
         .add_rules(path_beneath_rules(places, writing))?
-        // Names are no secret, and interpreters look for their modules by them.
+        // Names are not secret, and interpreters list folders to find modules.
         .add_rules(path_beneath_rules([Path::new("/")], AccessFs::ReadDir))?
         .add_rules(path_beneath_rules(all_but(Path::new("/"), &hidden), reading))?;
     Ok(rules.into())
 }
 
-/// Returns where plugins may always write: scratch space, and shared memory.
+/// Returns the folders in which plugins may always write: scratch space and shared memory.
 fn scratch() -> [PathBuf; 3] {
     ["/tmp".into(), "/dev/shm".into(), std::env::temp_dir()]
 }
 
-/// Returns what together holds everything beneath `folder` but what is hidden. The kernel's rules can only
-/// allow, so whatever lies beside the way to a hidden place is listed.
+/// Returns paths that together cover everything below `folder` except `hidden`. Landlock rules can only
+/// allow, so the siblings of each folder on the path to a hidden one are listed.
 fn all_but(folder: &Path, hidden: &[PathBuf]) -> Vec<PathBuf> {
     let mut listed = Vec::new();
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
@@ -530,7 +529,7 @@ fn all_but(folder: &Path, hidden: &[PathBuf]) -> Vec<PathBuf> {
     listed
 }
 
-/// Whether the kernel filters system calls, and answers with an error of our choice (seccomp(2)).
+/// Whether the kernel can filter system calls and return a chosen error (seccomp(2)).
 fn seccomp_is_there() -> bool {
     let action = libc::SECCOMP_RET_ERRNO;
     // SAFETY: SECCOMP_GET_ACTION_AVAIL reads four bytes, which live through the call.
@@ -560,7 +559,7 @@ fn filters(
         refused.insert(call, vec![when(argument, SeccompCmpOp::Ne, 0)?]);
     }
     if !in_cell {
-        // In a cell the numbers are those of the plugin's own threads, which libraries bind to processors.
+        // In a cell, all thread ids are the plugin's own, and libraries pin their threads to processors.
         let others = when(0, SeccompCmpOp::Ne, 0)?;
         refused.insert(libc::SYS_sched_setaffinity, vec![others]);
     }
@@ -568,19 +567,20 @@ fn filters(
         .iter()
         .map(|&flag| when(0, SeccompCmpOp::MaskedEq(u64::from(flag.cast_unsigned())), flag));
     refused.insert(libc::SYS_clone, namespaces.collect::<Result<_, _>>()?);
-    // A filter does not see into its arguments; libraries take clone(2) then.
+    // A filter cannot read clone3's arguments; libraries fall back to clone(2).
     let hidden = BTreeMap::from([(libc::SYS_clone3, Vec::new())]);
     let mut filters = vec![compile(refused, libc::EPERM)?, compile(hidden, libc::ENOSYS)?];
     if !limits.network {
-        // Pairs of sockets stay: they reach nobody else. All others, to the autopilot, to a desktop, to another
-        // program's service, are as if there were no network.
+        // `socketpair` stays allowed: it connects only the plugin's own processes. All other sockets (autopilot,
+        // desktop, services of other programs) fail as without a network.
         let rules = BTreeMap::from([(libc::SYS_socket, Vec::new())]);
         filters.push(compile(rules, libc::ENETUNREACH)?);
     }
     Ok(filters)
 }
 
-/// System calls that are for oneself alone, and which argument names another process. [0 is oneself]
+/// System calls that the plugin may use only on itself, with the index of the argument that selects the process (0:
+/// itself).
 const OF_OTHERS: [(i64, u8); 6] = [
     (libc::SYS_prlimit64, 0),
     (libc::SYS_setpriority, 1),
@@ -600,8 +600,8 @@ const NAMESPACES: [i32; 7] = [
     libc::CLONE_NEWNET,
 ];
 
-/// System calls that no plugin needs: to look into other processes, to change the system, and io_uring, whose
-/// requests a filter does not see.
+/// System calls that no plugin needs: inspecting other processes, changing the system, and io_uring, whose
+/// requests a filter cannot check.
 const FORBIDDEN: [i64; 31] = [
     libc::SYS_ptrace,
     libc::SYS_process_vm_readv,
@@ -636,7 +636,7 @@ const FORBIDDEN: [i64; 31] = [
     libc::SYS_userfaultfd,
 ];
 
-/// Returns the processors but the first, which stays the runtime's; `None` if there is one only.
+/// Returns up to `cpus` processors without the first, which is left for the runtime; `None` if there is only one.
 fn but_the_first(cpus: f64) -> Option<CpuSet> {
     let all = available_parallelism().map_or(1, std::num::NonZero::get);
     let own = nix::sched::sched_getaffinity(Pid::from_raw(0)).ok()?;
@@ -650,7 +650,7 @@ fn but_the_first(cpus: f64) -> Option<CpuSet> {
     any.then_some(set)
 }
 
-/// Returns how many processes and threads run as `uid`.
+/// Returns the number of processes and threads of `uid`.
 fn tasks_of(uid: Uid) -> u64 {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     entries
@@ -669,7 +669,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn everything_but_the_hidden_is_listed_once() {
+    fn lists_everything_except_hidden_files_once() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().canonicalize().unwrap();
         for name in ["a/keys", "a/code", "b", "c/deep/secret", "c/deep/open"] {

@@ -1,5 +1,4 @@
-//! Limits of a plugin, and what happens when it ends: the settings, from `[plugin]` in
-//! `jetson.toml`.
+//! Settings of a plugin from `[plugin]` in `jetson.toml`: limits and restarts.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,65 +7,62 @@ use std::thread::available_parallelism;
 use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 
-/// When a plugin that ended is started again.
+/// Restart policy for a plugin that has ended.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Restart {
-    /// Never: on the ground the flight is off, in the air the vehicle lands.
+    /// Never: on the ground the flight ends, in the air the vehicle lands.
     Never,
-    /// As long as the vehicle stands on the ground; in the air it lands.
+    /// Only on the ground; in the air the vehicle lands.
     #[default]
     OnGround,
-    /// In the air too: the vehicle holds until the plugin is back, and lands if it is not.
+    /// Also in the air: the vehicle holds until the plugin is ready again, and lands if it is not.
     InFlight,
 }
 
-/// Limits of a plugin. Memory, processors and processes count for it and all it starts.
+/// Limits of a plugin. Memory, processors and processes include its descendants.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PluginLimits {
-    /// Memory. [MB]
+    /// Maximum memory. [MB]
     pub memory_mb: u64,
-    /// Processors it may keep busy; 1.5 is one and a half.
+    /// Maximum number of busy processors, for example 1.5.
     pub cpus: f64,
-    /// Processes and threads.
+    /// Maximum number of processes and threads.
     pub processes: u32,
-    /// Maximum time of `on_image`; what is beyond is shown. [ms]
+    /// Maximum time of `on_image`; longer calls are reported. [ms]
     pub deadline_ms: f64,
-    /// When it is started again.
     pub restart: Restart,
-    /// How often, in one flight.
+    /// Maximum number of restarts in one flight.
     pub restarts: u32,
-    /// Whether it may use the network.
+    /// Whether the plugin may use the network.
     pub network: bool,
-    /// The user it runs as if the runtime is root; without it `vizflyt`, or else `nobody`.
+    /// User that the plugin runs as if the runtime is root. Default: `vizflyt`, or else `nobody`.
     pub user: Option<String>,
-    /// Folders it may write in, beside its own, the working folder and `/tmp`.
+    /// Writable folders in addition to the plugin's own, the working folder and `/tmp`.
     pub write: Vec<PathBuf>,
-    /// Files and folders that it sees beside its own, the system and its interpreter, in a cell.
+    /// Files and folders shown in a cell in addition to the plugin's own, the system and its interpreter.
     pub read: Vec<PathBuf>,
-    /// Where it starts; without it the working folder.
+    /// Folder in which the plugin starts. Default: the working folder.
     pub folder: Option<PathBuf>,
-    /// It is graded: its own folder cannot be changed, the working folder is not seen, nothing it writes outlives it,
-    /// and of the environment it gets what programs need.
+    /// Whether the plugin is graded: its own folder is read-only, the working folder is hidden, its files are deleted
+    /// at its end, and its environment has only the variables that programs need.
     pub graded: bool,
-    /// The map that it is handed, as JSON, where the course's map is known.
+    /// Map passed to the plugin as JSON, if the course's map is known.
     pub map: Option<String>,
-    /// Files and folders that it may not read, where it has a cell or the kernel has Landlock: what a grade must keep
-    /// from it.
+    /// Files and folders that the plugin must not read, such as a grade's secrets. Requires a cell or Landlock.
     pub hide: Vec<PathBuf>,
 }
 
 impl Default for PluginLimits {
     fn default() -> Self {
         Self {
-            // Half of what there is: the other half is for the runtime, and on one computer for
-            // the server.
+            // The other half is for the runtime, and on one computer for the server.
             memory_mb: (memory_total_mb() / 2).max(MIN_MEMORY_MB),
-            // One is left for the runtime, so that setpoints leave in time.
+            // One processor is left for the runtime, so that setpoints are sent in time.
             cpus: available_parallelism().map_or(1.0, |n| (n.get() as f64 - 1.0).max(1.0)),
             // numpy, OpenCV and torch start one to two threads per processor each.
             processes: 128,
-            // Six images at 60 Hz: the plugin flies on what was true 100 ms ago, at 2 m/s 20 cm.
+            // Six images at 60 Hz: an image is then 100 ms old, which is 20 cm at 2 m/s.
             deadline_ms: 100.0,
             restart: Restart::default(),
             restarts: 3,
@@ -82,10 +78,10 @@ impl Default for PluginLimits {
     }
 }
 
-/// Less than this, no interpreter starts. [MB]
+/// Minimum memory; no interpreter starts with less. [MB]
 pub const MIN_MEMORY_MB: u64 = 64;
 
-/// Variables that a graded plugin gets.
+/// Environment variables of a graded plugin.
 const KEPT: [&str; 9] = [
     "PATH",
     "HOME",
@@ -98,20 +94,20 @@ const KEPT: [&str; 9] = [
     "RUST_BACKTRACE",
 ];
 
-/// Linux takes environment variables of 128 KiB: some thousand obstacles.
+/// Maximum length of a map, some thousand obstacles: Linux limits an environment variable to 128 KiB. [bytes]
 const MAX_MAP: usize = 120 * 1024;
 
 impl PluginLimits {
-    /// Hands the plugin a map, if it is one.
+    /// Parses a map and stores it for the plugin.
     ///
     /// # Errors
-    /// The fault.
+    /// If the map is invalid or too large.
     pub fn hand_map(&mut self, text: &str) -> Result<(), String> {
         let volumes = vizflyt_sdk::parse_map(text).map_err(|error| error.to_string())?;
         let text = text.trim().to_owned();
         if text.len() > MAX_MAP {
             return Err(format!(
-                "the map of {} obstacles has {} kB, more than the {} kB that a plugin can be handed",
+                "the map of {} obstacles has {} kB, more than the maximum of {} kB",
                 volumes.len(),
                 text.len() / 1024,
                 MAX_MAP / 1024
@@ -121,10 +117,10 @@ impl PluginLimits {
         Ok(())
     }
 
-    /// As [`Self::hand_map`], of a file.
+    /// Same as [`Self::hand_map`], for a file.
     ///
     /// # Errors
-    /// The fault, and the name.
+    /// If the file cannot be read, or the map is invalid; the text contains the path.
     pub fn hand_map_file(&mut self, path: &Path) -> anyhow::Result<()> {
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("the map {} cannot be read", path.display()))?;
@@ -132,7 +128,7 @@ impl PluginLimits {
         handed.with_context(|| path.display().to_string())
     }
 
-    /// Leaves a graded plugin of our environment what programs need: tokens and courses may stand in the rest.
+    /// Reduces the environment of a graded plugin to [`KEPT`]: other variables may contain tokens or courses.
     pub(super) fn choose_environment(&self, process: &mut Command) {
         if self.graded {
             let is_kept = |name: &str| KEPT.contains(&name) || name.starts_with("LC_");
@@ -142,7 +138,7 @@ impl PluginLimits {
         }
     }
 
-    /// Checks that the limits leave a plugin room to live.
+    /// Checks that a plugin can run within the limits.
     ///
     /// # Errors
     /// One sentence that names the setting.
@@ -166,7 +162,7 @@ impl PluginLimits {
     }
 }
 
-/// Returns this computer's memory; 4 GB where the system does not report it. [MB]
+/// Returns this computer's memory; 4 GB if the system does not report it. [MB]
 fn memory_total_mb() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let kib = text.lines().find_map(|line| line.strip_prefix("MemTotal:"));
@@ -179,7 +175,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn defaults_leave_room_and_nonsense_is_refused() {
+    fn accepts_defaults_and_rejects_invalid_limits_and_maps() {
         let fair = PluginLimits::default();
         assert_eq!(fair.check(), Ok(()));
         assert!(!fair.network && fair.cpus >= 1.0);

@@ -1,10 +1,8 @@
-//! The plugin as a child process: confined before its first instruction, its output read line by
-//! line, its limits watched, its end noticed at once and reported in one sentence, never outliving
-//! the runtime.
+//! Runs the plugin as a confined child process: reads its output line by line, checks its limits,
+//! reports its end at once in one sentence, and kills it if the runtime ends.
 //!
-//! [`PluginLimits`] is what it may use, [`Confinement`] turns that into what this kernel offers,
-//! [`Supervisor`] is one running process. When to start the next one is for the
-//! [control loop](crate::control) to decide.
+//! [`PluginLimits`] holds the settings, [`Confinement`] applies them with the features of this kernel,
+//! [`Supervisor`] is one running process. The [control loop](crate::control) decides about restarts.
 
 mod cell;
 mod cgroup;
@@ -41,7 +39,7 @@ pub use limits::{MIN_MEMORY_MB, PluginLimits, Restart};
 pub use occupation::TimeSpent;
 pub use output::LINE_BYTES;
 
-/// Which of the two outputs a line came from.
+/// Output stream of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stream {
     /// `print`.
@@ -55,9 +53,9 @@ pub enum Stream {
 pub enum PluginEvent {
     /// A line that the plugin printed, cut at [`LINE_BYTES`].
     Line(Stream, String),
-    /// Something about how it runs that a person should know, in a sentence.
+    /// A missing protection or limit, as a sentence for the operator.
     Note(String),
-    /// The process ended; how, in a sentence.
+    /// The process ended, for the reason in this sentence.
     Exited(String),
 }
 
@@ -67,7 +65,7 @@ pub struct Supervisor {
     shared: Arc<SharedState>,
 }
 
-/// State that the supervisor's threads share.
+/// State shared by the supervisor's threads.
 struct SharedState {
     group: Pid,
     bounds: Bounds,
@@ -76,22 +74,22 @@ struct SharedState {
     changed: Condvar,
     /// The newest line on standard error.
     last_error: Mutex<String>,
-    /// Why the supervisor itself ended it.
+    /// Reason for which the supervisor killed the process.
     kill_reason: Mutex<Option<String>>,
     occupation: Mutex<Occupation>,
 }
 
-/// Time a plugin has to end when asked.
+/// Timeout of each step of an orderly end.
 const END_WITHIN: Duration = Duration::from_millis(300);
-/// Limits, and what the process does, are looked at this often: at 2 GB/s, 200 MB of a leak.
+/// Period at which limits and occupation are sampled: a leak of 2 GB/s adds 200 MB.
 const WATCH_EVERY: Duration = Duration::from_millis(100);
 
 impl Supervisor {
     /// Starts `command` (program, then arguments), confined, with its end of the socket to the runtime.
-    /// `handle` is called from the supervisor's threads.
+    /// The supervisor's threads call `handle`.
     ///
-    /// The child dies with the thread that calls this (`PR_SET_PDEATHSIG`): call it from one that
-    /// lives as long as the flight.
+    /// The kernel kills the child when the calling thread ends (`PR_SET_PDEATHSIG`): call this from a
+    /// thread that runs during the whole flight.
     ///
     /// # Errors
     /// If the program cannot be started.
@@ -107,7 +105,7 @@ impl Supervisor {
         let (bounds, notes) = confinement.bounds();
         let mut process = confinement.command(program);
         process.args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped());
-        // Not one that this process was handed itself.
+        // The runtime's own environment may contain a map of another course.
         process.env_remove(vizflyt_sdk::MAP_VARIABLE);
         if let Some(map) = &confinement.limits.map {
             process.env(vizflyt_sdk::MAP_VARIABLE, map);
@@ -165,13 +163,13 @@ impl Supervisor {
         lock(&self.shared.ended).is_none()
     }
 
-    /// Returns what the process, and all it started, has done since then; `None` if the time is too short to know.
+    /// Returns how the process and its descendants spent the time from `since` on; `None` with fewer than two samples.
     pub fn time_spent(&self, since: HostTime) -> Option<TimeSpent> {
         lock(&self.shared.occupation).since(since)
     }
 
-    /// Ends the process and all it started: waits 0.3 s (it was asked to end by a message), then
-    /// SIGTERM, 0.3 s more, then SIGKILL. Returns when it is gone.
+    /// Ends the process and its descendants: waits 0.3 s (a message has requested the end), sends
+    /// SIGTERM, waits 0.3 s more, and sends SIGKILL. Returns after the end, or 1 s after SIGKILL.
     pub fn end(&self) {
         if !self.shared.wait_ended(END_WITHIN) {
             self.signal(Signal::SIGTERM);
@@ -183,7 +181,7 @@ impl Supervisor {
         }
     }
 
-    /// Kills the process and all it started; does not wait for its end, which is reported.
+    /// Kills the process and its descendants without waiting; [`PluginEvent::Exited`] reports the end.
     pub fn kill(&self) {
         if self.is_running() {
             self.shared.kill();
@@ -192,7 +190,7 @@ impl Supervisor {
 
     fn signal(&self, signal: Signal) {
         if self.is_running() {
-            // ESRCH: it ended meanwhile.
+            // ESRCH: the process has just ended.
             let _ = killpg(self.shared.group, signal);
         }
     }
@@ -219,7 +217,7 @@ impl SharedState {
         state.is_some()
     }
 
-    /// Looks at the limits until the process has ended; ends it if it is beyond them.
+    /// Checks the limits until the process has ended; kills it if it exceeds one.
     fn watch(&self) {
         while !self.wait_ended(WATCH_EVERY) {
             self.look();
@@ -231,7 +229,7 @@ impl SharedState {
         }
     }
 
-    /// Looks at what the process, and all it started, does.
+    /// Samples the occupation of the process and its descendants.
     fn look(&self) {
         let members = self.bounds.group().members();
         let processes = if members.is_empty() {
@@ -248,17 +246,17 @@ impl SharedState {
         watch::beyond_limits(&self.limits, self.bounds.group(), counted)
     }
 
-    /// Waits for the end of the process, reports it at once, and ends what it left behind.
+    /// Waits for the end of the process, kills its remaining descendants, and reports the end.
     fn wait(&self, mut child: Child, handle: &impl Fn(PluginEvent)) {
         let status = child.wait();
-        // What it left behind would keep the pipes open and the processor busy.
+        // Remaining descendants would keep the pipes open and use the processor.
         self.kill();
-        // The last lines travel through a pipe that another thread reads; they are usually there.
-        // Waiting for them would delay the landing, so they are not waited for.
+        // Another thread reads the last lines from a pipe and has usually stored them by this time.
+        // Waiting for them would delay the landing.
         let last = lock(&self.last_error).clone();
         let kill_reason = lock(&self.kill_reason).take();
         let sentence = match &status {
-            // The kernel may have been faster than the watch.
+            // The kernel may have enforced a limit before the watch thread saw it.
             Ok(status) => kill_reason
                 .or_else(|| watch::beyond_limits(&self.limits, self.bounds.group(), None))
                 .unwrap_or_else(|| describe(*status, &last)),
@@ -280,7 +278,7 @@ fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> io::Result<thread::
     thread::Builder::new().name(name.into()).spawn(run)
 }
 
-/// Returns how a process ended, in a sentence.
+/// Returns the end of a process as a sentence.
 fn describe(status: ExitStatus, last_error: &str) -> String {
     let mut text = match (status.code(), status.signal()) {
         (Some(0), _) => "the plugin ended by itself (exit status 0)".to_owned(),
@@ -292,7 +290,7 @@ fn describe(status: ExitStatus, last_error: &str) -> String {
                 Ok(Signal::SIGABRT) => ": it aborted",
                 Ok(Signal::SIGILL) => ": it ran an instruction this processor lacks",
                 Ok(Signal::SIGFPE) => ": it divided by zero",
-                Ok(Signal::SIGKILL) => ": someone, or the kernel short of memory, ended it",
+                Ok(Signal::SIGKILL) => ": by a user, or by the kernel because memory ran out",
                 _ => "",
             };
             format!("the plugin was killed by {name}{meaning}")
@@ -300,18 +298,18 @@ fn describe(status: ExitStatus, last_error: &str) -> String {
         (None, None) => "the plugin ended".to_owned(),
     };
     if !status.success() && !last_error.is_empty() {
-        text = format!("{text}; it last said: {last_error}");
+        text = format!("{text}; last line on stderr: {last_error}");
     }
     text + hint(last_error)
 }
 
-/// Returns what lies behind an error that a limit causes.
+/// Returns the setting that causes an error, as a hint; empty if the error is not caused by a limit.
 fn hint(last_error: &str) -> &'static str {
     let mentions = |marks: &[&str]| marks.iter().any(|mark| last_error.contains(mark));
     if mentions(&["memory allocation of", "MemoryError", "bad_alloc"]) {
         " (memory_mb in [plugin] allows no more)"
     } else if mentions(&["Network is unreachable"]) {
-        " (a plugin has no network unless [plugin] says network = true)"
+        " (a plugin has no network unless [plugin] sets network = true)"
     } else if mentions(&["Permission denied", "PermissionError", "Read-only file system"]) {
         " (a plugin writes in its own folder, /tmp, and what [plugin] write lists)"
     } else if mentions(&["No such file", "ModuleNotFoundError", "FileNotFoundError"]) {

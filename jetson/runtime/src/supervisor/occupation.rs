@@ -1,5 +1,5 @@
-//! What the plugin's processes do with their time: compute, wait for a processor, or sleep. The supervisor's watch looks ten
-//! times a second; when the plugin is silent, the looks say why.
+//! Time budget of the plugin's processes: computing, waiting for a processor, or sleeping. The supervisor samples
+//! them at 10 Hz; the samples explain a silent plugin.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -8,30 +8,31 @@ use std::fs;
 use nix::unistd::Pid;
 use vizflyt_protocol::time::HostTime;
 
-/// Looks that are kept: more than the silence after which the vehicle lands.
+/// Number of samples kept: longer than the silence after which the vehicle lands.
 const LOOKS: usize = 40;
 
-/// Who computes for less, and wants more, is kept from it by others: twice the usual deadline of an answer. [s]
+/// Computing time below which a plugin that waits for a processor counts as starved: twice the default deadline of a
+/// reply. [s]
 const LITTLE_S: f64 = 0.2;
 
-/// The state of all threads at one moment.
+/// One sample: state of all threads at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Look {
     pub(super) at: HostTime,
     /// Processor time since each thread's start. [ns]
     pub(super) computed_ns: u64,
-    /// A thread runs, or would if it had a processor.
+    /// Whether a thread runs or is ready to run.
     pub(super) wants_processor: bool,
 }
 
-/// The newest looks.
+/// The newest samples, newest first.
 #[derive(Debug, Default)]
 pub(super) struct Occupation(VecDeque<Look>);
 
-/// Time of the plugin's processes, by what they did with it.
+/// Time of the plugin's processes, split by use.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TimeSpent {
-    /// Length of the time that was looked at. [s]
+    /// Time between the first and the last sample. [s]
     pub total_s: f64,
     /// Computing, on all processors. [s]
     pub computed_s: f64,
@@ -40,7 +41,7 @@ pub struct TimeSpent {
 }
 
 impl Look {
-    /// Looks at processes now. Those that have ended count no more.
+    /// Samples `processes`. Ended processes are not counted.
     pub(super) fn at(at: HostTime, processes: &[Pid]) -> Self {
         let mut look = Self { at, computed_ns: 0, wants_processor: false };
         for process in processes {
@@ -61,7 +62,7 @@ impl Occupation {
         self.0.push_front(look);
     }
 
-    /// Returns how the time from `since` on was spent; `None` if it was not looked at twice.
+    /// Returns how the time from `since` on was spent; `None` with fewer than two samples.
     pub(super) fn since(&self, since: HostTime) -> Option<TimeSpent> {
         let looks: Vec<_> = self.0.iter().take_while(|look| look.at >= since).collect();
         let (newest, oldest) = (*looks.first()?, *looks.last()?);
@@ -69,7 +70,7 @@ impl Occupation {
             return None;
         }
         let computed_s = newest.computed_ns.saturating_sub(oldest.computed_ns) as f64 * 1e-9;
-        // A state that is sampled counts for the time since the previous sample.
+        // A sampled state counts for the time since the previous sample.
         let wanted_s: f64 = looks
             .windows(2)
             .filter(|pair| pair[0].wants_processor)
@@ -106,12 +107,12 @@ impl fmt::Display for TimeSpent {
     }
 }
 
-/// Reads the time on a processor, the first field of `schedstat` (Linux, Documentation/scheduler/sched-stats.rst). [ns]
+/// Parses the processor time, the first field of `schedstat` (Linux, Documentation/scheduler/sched-stats.rst). [ns]
 fn computed_ns(schedstat: &str) -> u64 {
     schedstat.split(' ').next().and_then(|field| field.parse().ok()).unwrap_or(0)
 }
 
-/// Whether a thread's state, in its `stat`, is R (proc_pid_stat(5)). The name before it may hold anything.
+/// Whether a thread's state in its `stat` is R (proc_pid_stat(5)). The name before it may contain any characters.
 fn wants_processor(stat: &str) -> bool {
     stat.rsplit_once(") ").is_some_and(|(_, fields)| fields.starts_with('R'))
 }
@@ -120,12 +121,11 @@ fn wants_processor(stat: &str) -> bool {
 mod tests {
     use super::*;
 
-    /// Returns the sentence about a silence of 2 s in which each tenth of a second has this much computing, and wants a
-    /// processor or not.
+    /// Returns the sentence for a silence of 2 s, with `computed_ms` of processor time in each 0.1 s.
     fn sentence(computed_ms: u64, wants_processor: bool) -> String {
         let mut occupation = Occupation::default();
         let start = HostTime::from_ns(1_000_000_000);
-        // Before the silence it did the opposite.
+        // The opposite state before the silence must not count.
         for k in 0..15u32 {
             let at = start.plus_ns(i64::from(k) * 100_000_000 - 1_600_000_000);
             occupation.add(Look { at, computed_ns: 0, wants_processor: !wants_processor });
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn tells_starving_from_computing_and_sleeping() {
+    fn distinguishes_starving_computing_and_sleeping() {
         let expect = |sentence: String, times: &str, advice: &str| {
             assert!(sentence.contains(times) && sentence.contains(advice), "{sentence}");
         };
@@ -150,13 +150,13 @@ mod tests {
             "busy",
         );
         expect(sentence(95, true), "computed for 1.9 s and waited 0.1 s", "a loop or slow code");
-        // On a busy computer, too.
+        // Slow code is also named on a busy computer.
         expect(sentence(40, true), "computed for 0.8 s and waited 1.2 s", "a loop or slow code");
         expect(sentence(1, false), "slept for 2.0 s", "waits for");
     }
 
     #[test]
-    fn says_nothing_without_two_looks() {
+    fn returns_none_with_fewer_than_two_samples() {
         let mut occupation = Occupation::default();
         let at = HostTime::from_ns(5);
         assert_eq!(occupation.since(at), None);
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn reads_what_the_kernel_writes() {
+    fn parses_schedstat_and_stat() {
         assert_eq!(computed_ns("12345 678 9\n"), 12345);
         assert_eq!(computed_ns(""), 0);
         assert!(wants_processor("12 (a) b) R 1 77") && !wants_processor("12 (R) S 1 77"));

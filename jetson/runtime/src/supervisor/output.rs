@@ -1,18 +1,18 @@
-//! What a plugin prints, line by line: bounded in length and number whatever comes, and a Python
-//! traceback turned round, so that the student's own lines come first.
+//! Output of a plugin, line by line: limits length and rate, and reverses Python tracebacks so that
+//! the student's own lines come first.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Longest part of a line that is kept. [bytes]
+/// Maximum length of a line; the rest is cut. [bytes]
 pub const LINE_BYTES: usize = 1024;
-/// Lines passed on per stream and second; the rest is counted. A plugin that prints per image and
-/// camera stays below.
+/// Maximum rate of lines per stream; further lines are dropped and counted. A plugin that prints one
+/// line per image and camera stays below it. [1/s]
 const LINES_PER_SECOND: u32 = 200;
-/// Lines of a traceback that are held back to be turned round. Python itself shortens recursion.
+/// Maximum length of a traceback that is reversed [lines]. Python itself shortens recursion.
 const TRACEBACK_LINES: usize = 200;
-/// Calls of other people's code that are shown.
+/// Maximum number of calls in library code that are shown.
 const FOREIGN_CALLS: usize = 6;
 
 /// Reads lines to the end of the pipe, at most [`LINE_BYTES`] of each and [`LINES_PER_SECOND`].
@@ -21,7 +21,7 @@ pub(super) fn read_lines(pipe: impl Read, mut emit: impl FnMut(String)) {
     let (mut window, mut passed, mut dropped) = (Instant::now(), 0, 0u64);
     let mut first = true;
     let mut cut = |dropped: u64, emit: &mut dyn FnMut(String)| {
-        // The first message has the reason; the others are counts.
+        // Only the first message contains the advice.
         let why = if first { "; printing less per image shows more" } else { "" };
         first = false;
         emit(format!("({dropped} more lines in that second were dropped{why})"));
@@ -45,7 +45,7 @@ pub(super) fn read_lines(pipe: impl Read, mut emit: impl FnMut(String)) {
     }
 }
 
-/// Reads one line, keeps the start of it; `None` at the end. Memory stays bounded whatever comes.
+/// Reads one line and keeps its first [`LINE_BYTES`], so that memory stays bounded; `None` at the end.
 fn read_line(reader: &mut impl BufRead) -> io::Result<Option<String>> {
     let mut line = Vec::new();
     let mut any = false;
@@ -71,13 +71,13 @@ fn read_line(reader: &mut impl BufRead) -> io::Result<Option<String>> {
     }
 }
 
-/// Turns Python tracebacks round: what went wrong, then the student's own lines, innermost first,
-/// then how other people's code was reached. All else passes as it is.
+/// Reverses Python tracebacks: first the error, then the student's own lines, innermost first, then
+/// calls in library code. Passes all other lines unchanged.
 ///
 /// ```text
 /// Traceback (most recent call last):             ValueError: cannot reshape
 ///   File ".../vizflyt/_run.py", line 40, in run    first.py line 12, in on_image: x.reshape(7)
-///     answer = plugin.on_image(obs)          ->    in other people's code:
+///     answer = plugin.on_image(obs)          ->    in library code:
 ///   File "/home/me/first/first.py", line 12, ...     vizflyt/_run.py line 40, in run: answer = ...
 ///     x.reshape(7)
 /// ValueError: cannot reshape
@@ -99,12 +99,12 @@ struct Call<'a> {
 }
 
 impl Tracebacks {
-    /// `own` are the folders of the student's code.
+    /// `own`: folders of the student's code.
     pub(super) fn new(own: Vec<PathBuf>) -> Self {
         Self { own, held: None }
     }
 
-    /// Takes a line of the error output.
+    /// Processes a line of the error output.
     pub(super) fn take(&mut self, line: String, emit: &mut impl FnMut(String)) {
         let Some(held) = &mut self.held else {
             if line == FIRST {
@@ -121,7 +121,7 @@ impl Tracebacks {
         }
         let held = self.held.take().unwrap_or_default();
         match calls(&held) {
-            // A line at the margin ends it: `ValueError: ...`.
+            // A line without indent ends a traceback: `ValueError: ...`.
             Some(calls) if !line.starts_with(' ') && !line.is_empty() => {
                 self.innermost_first(&line, &calls, emit);
             }
@@ -129,7 +129,7 @@ impl Tracebacks {
         }
     }
 
-    /// The output has ended: emits the lines that were held back.
+    /// Emits the buffered lines at the end of the output.
     pub(super) fn end(self, emit: &mut impl FnMut(String)) {
         self.held.into_iter().flatten().for_each(emit);
     }
@@ -145,7 +145,7 @@ impl Tracebacks {
             return;
         }
         if !own.is_empty() {
-            emit("  in other people's code:".to_owned());
+            emit("  in library code:".to_owned());
         }
         for call in foreign.iter().take(FOREIGN_CALLS) {
             emit(format!("    {}", self.describe(call)));
@@ -164,7 +164,7 @@ impl Tracebacks {
         path.is_relative() || self.own.iter().any(|folder| path.starts_with(folder))
     }
 
-    /// `first.py line 12, in on_image: x.reshape(7)`, paths as short as they are clear.
+    /// Returns `first.py line 12, in on_image: x.reshape(7)`, with the path relative to its package.
     fn describe(&self, call: &Call) -> String {
         let path = Path::new(call.path);
         let short = self.own.iter().find_map(|folder| path.strip_prefix(folder).ok());
@@ -178,8 +178,8 @@ impl Tracebacks {
     }
 }
 
-/// Reads the calls of a traceback (CPython's `traceback` module, `StackSummary.format`); `None` if
-/// it is none.
+/// Parses the calls of a traceback (CPython's `traceback` module, `StackSummary.format`); `None` if the
+/// lines are not a traceback.
 fn calls(lines: &[String]) -> Option<Vec<Call<'_>>> {
     let mut calls: Vec<Call<'_>> = Vec::new();
     for line in &lines[1..] {
@@ -188,7 +188,7 @@ fn calls(lines: &[String]) -> Option<Vec<Call<'_>>> {
             let (line, function) = rest.split_once(", in ").unwrap_or((rest, "the file"));
             calls.push(Call { path, line, function, source: None });
         } else if let Some(call) = calls.last_mut() {
-            // The source, then marks below it.
+            // First the source line, then a line of marks.
             call.source = call.source.or(Some(line.trim()));
         }
     }
@@ -209,7 +209,7 @@ mod tests {
         seen
     }
 
-    /// As Python 3.11 prints it.
+    /// Output of Python 3.11.
     const TRACEBACK: &str = r#"before
 Traceback (most recent call last):
   File "/usr/lib/python3.11/runpy.py", line 196, in _run_module
@@ -226,7 +226,7 @@ ValueError: cannot reshape array
 after"#;
 
     #[test]
-    fn the_students_own_lines_come_first() {
+    fn shows_the_students_own_lines_first() {
         assert_eq!(
             turned(TRACEBACK),
             [
@@ -234,7 +234,7 @@ after"#;
                 "ValueError: cannot reshape array",
                 "  steering/steer.py line 12, in steer: return x.reshape(7)",
                 "  first.py line 30, in on_image: steer(obs)",
-                "  in other people's code:",
+                "  in library code:",
                 "    numpy/core.py line 5, in reshape: raise ValueError(text)",
                 "    /usr/lib/python3.11/runpy.py line 196, in _run_module: return run()",
                 "after"
@@ -243,20 +243,20 @@ after"#;
     }
 
     #[test]
-    fn without_own_lines_or_whole_it_is_all_there() {
+    fn keeps_incomplete_tracebacks_and_those_without_own_lines() {
         let syntax = "Traceback (most recent call last):\n  File \"<frozen x>\", line 1, in <module>\nImportError: no";
         assert_eq!(turned(syntax), ["ImportError: no", "    <frozen x> line 1, in <module>"]);
         let cut = "Traceback (most recent call last):\n  File \"a.py\", line 1, in f";
         assert_eq!(turned(cut), cut.lines().collect::<Vec<_>>());
         let odd = "Traceback (most recent call last):\nnothing";
         assert_eq!(turned(odd), odd.lines().collect::<Vec<_>>());
-        // One that never ends is not held for ever.
+        // An endless traceback is not buffered without limit.
         let endless = format!("{FIRST}\n{}", "  x\n".repeat(500));
         assert_eq!(turned(&endless).len(), 501);
     }
 
     #[test]
-    fn a_chain_of_two_is_turned_one_by_one() {
+    fn reverses_each_traceback_of_a_chain() {
         let one = "Traceback (most recent call last):\n  File \"a.py\", line 1, in f\nKeyError: 1";
         let two = one.replace("KeyError: 1", "ValueError: 2");
         let seen = turned(&format!("{one}\n\nDuring handling of it, another:\n\n{two}"));
@@ -267,10 +267,10 @@ after"#;
     }
 
     #[test]
-    fn a_flood_is_dropped_and_counted() {
+    fn drops_and_counts_lines_above_the_maximum_rate() {
         let mut seen = Vec::new();
         read_lines("x\n".repeat(100_000).as_bytes(), |line| seen.push(line));
-        // As long as the reading takes, a few seconds at most.
+        // Reading takes a few seconds at most, each with `LINES_PER_SECOND`.
         assert!(seen.len() < 20_000, "{}", seen.len());
         assert!(seen.last().unwrap().contains("more lines in that second were dropped"));
     }

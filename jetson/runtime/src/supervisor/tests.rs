@@ -1,4 +1,4 @@
-//! Real child processes: the shell, and the example plugin over real shared memory.
+//! Tests with real child processes: the shell, and the example plugin over shared memory.
 
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, channel};
@@ -19,7 +19,7 @@ use nix::unistd::geteuid;
 
 mod walls;
 
-/// Far beyond anything a loaded machine needs; tests end when the awaited thing happens.
+/// Timeout of all waits, far above what a loaded machine needs.
 const WAIT: Duration = Duration::from_mins(1);
 
 fn start(command: &[&str]) -> (Supervisor, Receiver<PluginEvent>) {
@@ -44,7 +44,7 @@ fn start_connected(
     (Supervisor::start(&command, &confinement, socket, handle).unwrap(), receiver)
 }
 
-/// Returns the lines and the last sentence of a child that ends by itself.
+/// Returns the lines of a child that ends by itself, and the sentence about its end.
 fn to_the_end(command: &[&str]) -> (Vec<(Stream, String)>, String) {
     to_the_end_with(&PluginLimits::default(), command)
 }
@@ -52,7 +52,7 @@ fn to_the_end(command: &[&str]) -> (Vec<(Stream, String)>, String) {
 fn to_the_end_with(limits: &PluginLimits, command: &[&str]) -> (Vec<(Stream, String)>, String) {
     let (_supervisor, receiver) = start_with(limits, command);
     let (mut lines, mut sentence) = (Vec::new(), String::new());
-    // Until all threads of the supervisor have dropped their sender.
+    // Ends when all threads of the supervisor have dropped their sender.
     while let Ok(event) = receiver.recv_timeout(WAIT) {
         match event {
             PluginEvent::Line(stream, line) => lines.push((stream, line)),
@@ -64,7 +64,7 @@ fn to_the_end_with(limits: &PluginLimits, command: &[&str]) -> (Vec<(Stream, Str
 }
 
 #[test]
-fn a_plugin_is_handed_its_own_map_and_no_other() {
+fn passes_only_the_plugins_own_map() {
     let look = |limits: &PluginLimits| {
         let (lines, _) = to_the_end_with(limits, &["sh", "-c", "echo \"map: $VIZFLYT_MAP\""]);
         lines.into_iter().map(|(_, line)| line).collect::<Vec<_>>()
@@ -82,17 +82,17 @@ fn check_sentence(script: &str, expected: &str) {
 }
 
 #[test]
-fn every_kind_of_exit_has_its_sentence() {
+fn reports_each_kind_of_exit() {
     check_sentence("exit 0", "the plugin ended by itself (exit status 0)");
     check_sentence("exit 7", "the plugin ended with exit status 7");
     check_sentence("kill -SEGV $$", "the plugin was killed by SIGSEGV: it touched memory");
     check_sentence("kill -ABRT $$", "the plugin was killed by SIGABRT: it aborted");
-    check_sentence("kill -KILL $$", "the plugin was killed by SIGKILL: someone");
+    check_sentence("kill -KILL $$", "the plugin was killed by SIGKILL: by a user");
     check_sentence("kill -TERM $$", "the plugin was killed by SIGTERM");
 }
 
 #[test]
-fn a_program_that_is_not_there_is_an_error() {
+fn fails_if_the_program_is_missing() {
     let command = [OsString::from("/nonexistent/plugin")];
     let confinement = Confinement::prepare(&PluginLimits::default(), &command);
     let error = Supervisor::start(&command, &confinement, None, |_| {}).unwrap_err();
@@ -101,7 +101,7 @@ fn a_program_that_is_not_there_is_an_error() {
 }
 
 #[test]
-fn output_comes_line_by_line_and_long_lines_are_cut() {
+fn splits_output_into_lines_and_cuts_long_ones() {
     let (lines, _) = to_the_end(&[
         "sh",
         "-c",
@@ -116,14 +116,14 @@ fn output_comes_line_by_line_and_long_lines_are_cut() {
 }
 
 #[test]
-fn a_flood_of_output_is_dropped_and_counted() {
+fn drops_and_counts_excess_output() {
     let (lines, _) = to_the_end(&["sh", "-c", "yes | head -n 100000"]);
     assert!(lines.len() < 20_000, "{}", lines.len());
     assert!(lines.iter().any(|(_, line)| line.contains("more lines in that second")));
 }
 
 #[test]
-fn a_plugin_that_does_not_end_is_ended_with_all_it_started() {
+fn kills_a_plugin_that_does_not_end_with_its_descendants() {
     let script = "trap '' TERM; sleep 1000.0625 & echo up; while :; do wait; done";
     let (supervisor, receiver) = start(&["sh", "-c", script]);
     let Ok(PluginEvent::Line(..)) = receiver.recv_timeout(WAIT) else { panic!() };
@@ -137,7 +137,7 @@ fn a_plugin_that_does_not_end_is_ended_with_all_it_started() {
     until_gone("1000.0625");
 }
 
-/// Whether a process with `argument` runs. Its number is another one in a cell.
+/// Whether a process with `argument` runs. In a cell, its process id differs, so it is found by its argument.
 fn runs(argument: &str) -> bool {
     let processes = std::fs::read_dir("/proc").unwrap().flatten();
     processes.filter(|entry| entry.file_name() != *std::process::id().to_string()).any(|entry| {
@@ -155,14 +155,14 @@ fn until_gone(argument: &str) {
 }
 
 #[test]
-fn the_child_dies_with_the_thread_that_started_it() {
+fn child_ends_with_the_thread_that_started_it() {
     let (sender, receiver) = channel();
     let starter = thread::spawn(move || {
         let command = ["sh", "-c", "echo up; sleep 1000"].map(OsString::from);
         let handle = move |event| {
             let _ = sender.send(event);
         };
-        // Forgotten, as by a runtime that is killed.
+        // `forget`: a killed runtime does not drop its supervisor either.
         let confinement = Confinement::prepare(&PluginLimits::default(), &command);
         std::mem::forget(Supervisor::start(&command, &confinement, None, handle).unwrap());
     });
@@ -173,12 +173,12 @@ fn the_child_dies_with_the_thread_that_started_it() {
     assert!(sentence.contains("SIGKILL"), "{sentence}");
 }
 
-// ---- what a plugin may not ----
+// ---- confinement ----
 
-/// Runs a Python program; returns what it printed, and how it ended. The tests need Python anyway.
+/// Runs a Python program; returns its output and the sentence about its end.
 fn python(limits: &PluginLimits, program: &str) -> (String, String) {
     let (mut lines, sentence) = to_the_end_with(limits, &["python3", "-c", program]);
-    // Two pipes: which is read first is chance.
+    // The order between the two pipes is random.
     lines.sort_by_key(|(stream, _)| *stream != Stream::Stdout);
     let lines: Vec<_> = lines.into_iter().map(|(_, line)| line).collect();
     (lines.join("\n"), sentence)
@@ -207,7 +207,7 @@ socket.create_connection(('192.0.2.1', 80), timeout=1)
     let expected = "Network is unreachable\nNetwork is unreachable\nNetwork is unreachable\npair\n\
                     unshare -1 Operation not permitted\nptrace -1 Operation not permitted";
     assert!(output.starts_with(expected), "{output}");
-    assert!(sentence.contains("no network unless [plugin] says network = true"), "{sentence}");
+    assert!(sentence.contains("no network unless [plugin] sets network = true"), "{sentence}");
     let allowed = PluginLimits { network: true, ..PluginLimits::default() };
     let (output, _) = python(&allowed, "import socket; socket.socket(); print('open')");
     assert_eq!(output, "open");
@@ -229,7 +229,7 @@ except PermissionError:
 open({file:?}, 'w').write('x'); print('written')"
     );
     let (output, sentence) = python(&PluginLimits::default(), &program);
-    // Where the kernel has no Landlock, a user of its own may still keep it out.
+    // Without Landlock, a separate user may still prevent the access.
     if !Confinement::prepare(&PluginLimits::default(), &[]).is_partial() {
         assert!(output.contains("scratch\nno signal"), "{output}");
         assert!(!file.exists(), "{output}");
@@ -284,7 +284,7 @@ print(os.geteuid() == 0, [line.split()[1] for line in status.splitlines() if 'Ca
         let limits = PluginLimits { user: user.clone(), ..PluginLimits::default() };
         let (output, _) = python(&limits, program);
         assert!(output.contains("0000000000000000"), "{user:?}: {output}");
-        // By name, if asked for, or if no other user could read what it runs.
+        // The plugin stays root if requested, or if no other user can read its files.
         let command = ["python3", "-c", program].map(OsString::from);
         let changes = Confinement::prepare(&limits, &command).user_id().is_some();
         assert_eq!(
@@ -296,19 +296,19 @@ print(os.geteuid() == 0, [line.split()[1] for line in status.splitlines() if 'Ca
 }
 
 #[test]
-fn memory_beyond_the_limit_ends_it_with_a_sentence() {
+fn kills_and_reports_a_plugin_above_its_memory_limit() {
     let limits = PluginLimits { memory_mb: 200, ..PluginLimits::default() };
     let program = "
 held = []
 while True: held.append(bytearray(5_000_000))";
     let (_, sentence) = python(&limits, program);
     assert!(sentence.contains("more than its 200 MB of memory"), "{sentence}");
-    // Without a control group the interpreter itself is refused, and reports it.
+    // Without a control group, the interpreter's allocation fails, and it reports this.
     assert_eq!(hint("MemoryError"), " (memory_mb in [plugin] allows no more)");
 }
 
 #[test]
-fn a_fork_bomb_is_stopped_with_all_its_processes() {
+fn stops_a_fork_bomb_with_all_its_processes() {
     let limits = PluginLimits { processes: 30, ..PluginLimits::default() };
     let program = "
 import os
@@ -333,7 +333,7 @@ fn arena() -> ArenaInfo {
     }
 }
 
-/// The example, built beside the tests by `cargo test`.
+/// Returns the path of the example, which `cargo test` builds.
 fn example() -> PathBuf {
     let tests = std::env::current_exe().unwrap();
     tests.parent().unwrap().parent().unwrap().join("examples/misbehave")
@@ -435,7 +435,7 @@ fn panic_is_reported_with_its_message() {
 }
 
 #[test]
-fn dying_in_the_middle_of_an_image_leaves_the_runtime_undisturbed() {
+fn runtime_continues_if_the_plugin_ends_during_an_image() {
     for (how, expected) in
         [("exit", "exit status 0"), ("exit-3", "exit status 3"), ("abort", "SIGABRT")]
     {
@@ -444,7 +444,7 @@ fn dying_in_the_middle_of_an_image_leaves_the_runtime_undisturbed() {
         assert_eq!(rig.next(), None, "{how} answers nothing");
         let sentence = rig.end();
         assert!(sentence.contains(expected), "{how}: {sentence}");
-        // The dead reader's slot is reclaimed and publishing goes on.
+        // The ended reader's slot is reclaimed, and publishing continues.
         rig.ipc.clean_up();
         assert!(!rig.ipc.plugin_attached());
         for _ in 0..20 {
@@ -454,7 +454,7 @@ fn dying_in_the_middle_of_an_image_leaves_the_runtime_undisturbed() {
 }
 
 #[test]
-fn a_hung_plugin_is_killed_and_blocks_nobody() {
+fn kills_a_hung_plugin_without_blocking() {
     let mut rig = Rig::start("hang");
     rig.publish();
     for _ in 0..500 {
@@ -464,7 +464,7 @@ fn a_hung_plugin_is_killed_and_blocks_nobody() {
             kind: EventKind::Phase(FlightPhase::Flying),
             text: bounded("flying"),
         };
-        // Full after a while: an error, not a wait.
+        // When the socket is full, sending fails and does not block.
         let _ = rig.ipc.send(&ToPlugin::Event(event));
     }
     rig.supervisor.end();
@@ -474,11 +474,11 @@ fn a_hung_plugin_is_killed_and_blocks_nobody() {
 }
 
 #[test]
-fn notes_what_a_process_does_with_its_time() {
+fn measures_computing_and_sleeping_time() {
     let looks_until = |script: &str, is_so: fn(&TimeSpent) -> bool| {
         let since = host_now();
         let (supervisor, _events) = start(&["sh", "-c", script]);
-        // Beside the watch, which looks ten times a second.
+        // In addition to the watch thread, which samples at 10 Hz.
         while !supervisor.time_spent(since).is_some_and(|spent| is_so(&spent)) {
             supervisor.shared.look();
         }

@@ -1,5 +1,4 @@
-//! A program that works on student code before it flies, as a check of its language and its build do: confined as the
-//! plugin is, and run to its end.
+//! Runs a tool on student code before a flight, for example a linter or a build, with the plugin's confinement.
 
 use std::ffi::OsStr;
 use std::io::{self, Read};
@@ -12,11 +11,11 @@ use nix::unistd::Pid;
 use super::confine::{Bounds, Confinement};
 use super::{WATCH_EVERY, watch};
 
-/// The most that is kept of what it prints. [bytes]
+/// Maximum output that is kept, per stream. [bytes]
 const MAX_OUTPUT: u64 = 64 << 20;
 
 impl Confinement {
-    /// Returns a command of `program` with the environment that student code gets, and no input.
+    /// Returns a command of `program` with the environment of student code and without input.
     pub fn command(&self, program: impl AsRef<OsStr>) -> Command {
         let mut process = Command::new(program);
         self.limits.choose_environment(&mut process);
@@ -24,12 +23,12 @@ impl Confinement {
         process
     }
 
-    /// Runs `process` to its end, confined, `within` at most, and returns what it printed into the pipes that it was
-    /// given. What it has started ends with it.
+    /// Runs `process` to its end, confined, with the timeout `within`. Returns its output, if its stdout and stderr are
+    /// pipes. Kills its descendants at its end.
     ///
     /// # Errors
-    /// If it cannot be started or waited for; [`io::ErrorKind::TimedOut`] and [`io::ErrorKind::OutOfMemory`], with a
-    /// sentence, if it was ended for its time or its limits.
+    /// If the process cannot be started or waited for. [`io::ErrorKind::TimedOut`] after the timeout, and
+    /// [`io::ErrorKind::OutOfMemory`] above a limit, both with a sentence.
     pub fn run(&self, mut process: Command, within: Duration) -> io::Result<Output> {
         let (bounds, _) = self.bounds();
         self.apply(&mut process, &bounds, None);
@@ -38,7 +37,7 @@ impl Confinement {
         let stdout = child.stdout.take().map(read).transpose()?;
         let stderr = child.stderr.take().map(read).transpose()?;
         let ended = self.wait(&mut child, group, &bounds, within);
-        // What it left behind would keep the pipes open.
+        // Remaining descendants would keep the pipes open.
         let _ = killpg(group, Signal::SIGKILL);
         bounds.group().kill();
         let status = match ended {
@@ -83,7 +82,7 @@ impl Confinement {
     }
 }
 
-/// Reads a pipe to its end in a thread of its own, and keeps the start.
+/// Reads a pipe to its end in a new thread, and keeps the first [`MAX_OUTPUT`].
 fn read(mut pipe: impl Read + Send + 'static) -> io::Result<std::thread::JoinHandle<Vec<u8>>> {
     let thread = std::thread::Builder::new().name("tool-output".into());
     thread.spawn(move || {

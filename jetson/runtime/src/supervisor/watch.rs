@@ -1,4 +1,4 @@
-//! Whether a plugin is beyond its limits: by its control group, else by counting its processes.
+//! Checks a plugin's limits: by its control group, or else by counting its processes.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,16 +8,16 @@ use nix::unistd::Pid;
 use super::cgroup::Cgroup;
 use super::limits::PluginLimits;
 
-/// The memory and the number of the processes of a group.
+/// Memory and number of the processes of a group.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Usage {
-    /// Memory of their own: shared pages count for whoever made them. [bytes]
+    /// Private memory, without shared pages. [bytes]
     pub memory: u64,
-    /// Processes and threads.
+    /// Number of processes and threads.
     pub tasks: u64,
 }
 
-/// Returns why the plugin must end, in a sentence, if it must.
+/// Returns the exceeded limit as a sentence; `None` if the plugin is within its limits.
 pub(super) fn beyond_limits(
     limits: &PluginLimits,
     cgroup: &Cgroup,
@@ -41,14 +41,14 @@ pub(super) fn beyond_limits(
     None
 }
 
-/// Counts the processes of a process group; in a cell, all that its init has started.
+/// Counts the processes of a process group; in a cell, all descendants of its init.
 pub(super) fn count(group: Pid, in_cell: bool) -> Usage {
     let page = nix::unistd::sysconf(nix::unistd::SysconfVar::PAGE_SIZE).ok().flatten();
     let page = page.map_or(4096, i64::unsigned_abs);
     let mut usage = Usage::default();
     for (id, stat) in found(group, in_cell) {
         let folder = format!("/proc/{id}");
-        // Resident less shared (proc_pid_statm(5)): the images lie in the runtime's memory.
+        // Resident minus shared (proc_pid_statm(5)): the images are in the runtime's memory.
         let statm = fs::read_to_string(format!("{folder}/statm")).unwrap_or_default();
         let mut pages = statm.split(' ').skip(1).map(|field| field.parse::<u64>().unwrap_or(0));
         let (resident, shared) = (pages.next().unwrap_or(0), pages.next().unwrap_or(0));
@@ -58,7 +58,7 @@ pub(super) fn count(group: Pid, in_cell: bool) -> Usage {
     usage
 }
 
-/// Returns the processes that [`count`] counts.
+/// Returns the processes counted by [`count`].
 pub(super) fn processes(group: Pid, in_cell: bool) -> Vec<Pid> {
     found(group, in_cell).into_iter().map(|(id, _)| Pid::from_raw(id)).collect()
 }
@@ -73,7 +73,7 @@ fn found(group: Pid, in_cell: bool) -> Vec<(i32, Stat)> {
     }
     let parent = |id: i32| all.get(&id).map(|stat: &Stat| stat.parent);
     let counts = |id: i32, stat: &Stat| {
-        // Keeper and init, which has the keeper's number as its parent's, hold copies of our own memory.
+        // Skips keeper and init, the keeper's child: they hold copies of the runtime's memory.
         if in_cell {
             let mut above = std::iter::successors(parent(id), |&id| parent(id)).skip(1);
             above.any(|id| id == group.as_raw())
@@ -84,7 +84,7 @@ fn found(group: Pid, in_cell: bool) -> Vec<(i32, Stat)> {
     all.iter().filter(|(id, stat)| counts(**id, stat)).map(|(&id, &stat)| (id, stat)).collect()
 }
 
-/// A process (proc_pid_stat(5)).
+/// Fields of a process (proc_pid_stat(5)).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Stat {
     parent: i32,
@@ -92,7 +92,7 @@ struct Stat {
     threads: u64,
 }
 
-/// Reads the kernel's line. The name in parentheses may hold anything.
+/// Parses a `stat` line. The name in parentheses may contain any characters.
 fn parse_stat(stat: &str) -> Option<Stat> {
     let (_, fields) = stat.rsplit_once(") ")?;
     let mut fields = fields.split(' ').skip(1);
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn each_limit_has_its_sentence() {
+    fn reports_each_exceeded_limit_with_its_value() {
         let limits = PluginLimits { memory_mb: 100, processes: 9, ..PluginLimits::default() };
         let verdict = |memory, tasks| {
             beyond_limits(&limits, &Cgroup::default(), Some(Usage { memory, tasks }))

@@ -16,7 +16,7 @@ fn way(points: &[(DVec3, f64)]) -> Trajectory {
     Trajectory { path: Path::Waypoints(points.iter().map(point).collect()), ..Default::default() }
 }
 
-/// Follows to the end with a vehicle that is where the reference is; returns the references.
+/// Follows to the end with a vehicle at the reference; returns the references.
 fn follow(trajectory: Trajectory, start: &Start) -> Vec<Reference> {
     let mut follower = Follower::new(trajectory, start);
     let (mut p_m, mut references) = (follower.place().0, Vec::new());
@@ -30,7 +30,7 @@ fn follow(trajectory: Trajectory, start: &Start) -> Vec<Reference> {
 }
 
 #[test]
-fn waypoints_are_passed_in_order_within_their_speeds() {
+fn passes_waypoints_in_order_within_their_speeds() {
     let points =
         [(DVec3::new(4.0, 0.0, 1.0), 2.0), (DVec3::new(4.0, 3.0, 1.0), 9.0), (DVec3::Z, 1.0)];
     let references = follow(way(&points), &start());
@@ -45,10 +45,10 @@ fn waypoints_are_passed_in_order_within_their_speeds() {
     };
     assert!((fastest(|p| p.y < 1e-9) - 2.0).abs() < 1e-9, "the first leg's speed");
     let second = fastest(|p| p.x > 4.0 - 1e-9 && p.y > 0.1);
-    assert!(second > 2.0 && second <= 3.0, "{second}: the limit, as far as the way allows");
+    assert!(second > 2.0 && second <= 3.0, "{second}: up to the limit");
     for pair in references.windows(2) {
         let change = pair[1].v_world_mps.length() - pair[0].v_world_mps.length();
-        // The last tick before a stop takes what is left; the guard smooths it.
+        // The last tick before a stop may change more; the guard smooths it.
         assert!(change.abs() <= 2.0 * LIMITS.1 * DT_S, "{change}");
     }
     let last = references.last().unwrap();
@@ -57,17 +57,17 @@ fn waypoints_are_passed_in_order_within_their_speeds() {
 }
 
 #[test]
-fn corners_are_taken_slowly() {
+fn slows_down_at_corners() {
     let points = [(DVec3::new(4.0, 0.0, 1.0), 3.0), (DVec3::new(4.0, 4.0, 1.0), 3.0)];
     let references = follow(way(&points), &start());
     let near = references.iter().filter(|r| (r.p_world_m - points[0].0).length() < 0.02);
     let fastest = near.map(|r| r.v_world_mps.length()).fold(0.0, f64::max);
-    // a CORNER_S / sqrt(2), and what it gains or loses within 2 cm.
+    // a CORNER_S / sqrt(2), and the change within 2 cm.
     assert!(fastest < 0.55, "{fastest} m/s");
 }
 
 #[test]
-fn relative_axes_count_from_the_vehicle() {
+fn relative_axes_start_at_the_vehicle() {
     let pitched = DQuat::from_rotation_z(FRAC_PI_2) * DQuat::from_rotation_y(0.5);
     let start = Start { p_world_m: DVec3::new(1.0, 2.0, 3.0), rotation: pitched };
     let end = |axes| {
@@ -82,7 +82,7 @@ fn relative_axes_count_from_the_vehicle() {
 }
 
 #[test]
-fn a_polynomial_is_flown_in_its_time() {
+fn follows_a_polynomial_in_its_time() {
     // Two seconds out by t^2, then two back at constant speed.
     let mut out = Piece { seconds: 2.0, coefficients: [DVec3::ZERO; COEFFICIENTS] };
     out.coefficients[2] = DVec3::X * 0.5;
@@ -100,14 +100,14 @@ fn a_polynomial_is_flown_in_its_time() {
 }
 
 #[test]
-fn the_reference_waits_for_the_vehicle() {
+fn reference_waits_for_the_vehicle() {
     let mut follower = Follower::new(way(&[(DVec3::new(9.0, 0.0, 1.0), 3.0)]), &start());
     for _ in 0..500 {
         let reference = follower.advance(DVec3::Z, LIMITS, DT_S);
         assert!(reference.p_world_m.x <= MAX_LAG_M, "{}", reference.p_world_m);
     }
     assert!(!follower.is_over());
-    // Far from the beginning of a polynomial it does not begin.
+    // The reference does not move if the vehicle is far from the start of a polynomial.
     let mut circle = Piece { seconds: TAU, coefficients: [DVec3::X * 7.0; COEFFICIENTS] };
     circle.coefficients[1] = DVec3::Y;
     let path = Path::Polynomial([circle].into_iter().collect());
@@ -117,7 +117,7 @@ fn the_reference_waits_for_the_vehicle() {
 }
 
 #[test]
-fn a_path_that_goes_nowhere_is_over_at_once() {
+fn path_without_length_ends_at_once() {
     let points = [(DVec3::Z, 1.0), (DVec3::Z, 1.0)];
     let references = follow(way(&points), &start());
     assert_eq!(references.len(), 1);

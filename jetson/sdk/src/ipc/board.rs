@@ -1,9 +1,9 @@
-//! Two words that both processes write: which slot is newest, and which the plugin has done with.
+//! Two atomic words that both processes write: the newest slot, and the slots that the plugin has returned.
 //!
-//! A slot belongs to whoever took it out of a word last. The runtime trusts neither: a plugin that writes nonsense gets
-//! images that change while it looks at them, and nothing else happens.
+//! A slot belongs to the process that last took it out of a word. The runtime trusts neither word: a plugin that writes
+//! invalid words gets images that change during reading, without any other effect.
 
-#![allow(unsafe_code, reason = "asks for the words by their type")]
+#![allow(unsafe_code, reason = "accesses the words by their type")]
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -12,19 +12,18 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::SLOTS;
 use super::sealed::AtomicMemory;
 
-/// Shared by both ends.
 #[derive(Debug)]
 pub(super) struct Board(AtomicMemory);
 
 #[repr(C)]
 struct Words {
-    /// 0, or the newest observation's slot + 1 in the low byte, its length above. [bytes]
+    /// 0, or the slot of the newest observation + 1 in the low byte, and its length in the higher bytes. [bytes]
     newest: AtomicU64,
-    /// Bit per slot.
+    /// One bit per slot.
     returned: AtomicU64,
 }
 
-/// Where an observation lies.
+/// Slot and length of an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Place {
     pub(super) slot: usize,
@@ -41,30 +40,30 @@ impl Board {
         Ok(Self(AtomicMemory::open::<Words>(descriptor)?))
     }
 
-    /// Posts the newest observation; returns the one before if nobody has taken it.
+    /// Publishes the newest observation. Returns the previous one if the plugin has not taken it.
     pub(super) fn post(&self, place: Place) -> Option<Place> {
         let word = (place.len as u64) << 8 | (place.slot as u64 + 1);
         place_in(self.words().newest.swap(word, Ordering::AcqRel))
     }
 
-    /// Takes the newest observation, if nobody has yet.
+    /// Takes the newest observation, unless it was taken before.
     pub(super) fn take(&self) -> Option<Place> {
         place_in(self.words().newest.swap(0, Ordering::AcqRel))
     }
 
-    /// Gives a slot back that was taken.
+    /// Returns a taken slot to the runtime.
     pub(super) fn give_back(&self, slot: usize) {
         self.words().returned.fetch_or(1 << slot, Ordering::AcqRel);
     }
 
-    /// Returns the slots that were given back since the last call.
+    /// Returns the slots that the plugin has given back since the last call.
     pub(super) fn returned(&self) -> impl Iterator<Item = usize> {
         let bits = self.words().returned.swap(0, Ordering::AcqRel);
         (0..SLOTS).filter(move |slot| bits & 1 << slot != 0)
     }
 
     fn words(&self) -> &Words {
-        // SAFETY: made or opened as `Words`, which are atomics.
+        // SAFETY: created or opened as `Words`, which consists of atomics.
         unsafe { self.0.get::<Words>() }
     }
 }
@@ -86,7 +85,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn the_newest_wins_and_slots_come_back() {
+    fn newest_observation_wins_and_slots_are_returned() {
         let board = Board::new().unwrap();
         let theirs = Board::open(board.as_fd().try_clone_to_owned().unwrap()).unwrap();
         let place = |slot| Place { slot, len: 1 << 20 };
@@ -102,7 +101,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_word_is_a_slot_or_none(word in any::<u64>()) {
+        fn any_word_decodes_to_a_valid_slot_or_none(word in any::<u64>()) {
             prop_assert!(place_in(word).is_none_or(|place| place.slot < SLOTS));
         }
     }

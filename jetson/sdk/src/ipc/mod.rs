@@ -1,24 +1,24 @@
-//! Images and messages between the runtime and one plugin process: sealed memory and a socket. No daemon, no copy
-//! of pixels, and a plugin that dies at any instruction leaves the runtime undisturbed.
+//! Images and messages between the runtime and one plugin process, over sealed memory and a socket. This
+//! needs no daemon and no copy of pixels, and a plugin that dies at any instruction does not affect the runtime.
 //!
 //! ```text
 //! runtime                                  plugin
-//! RuntimeEnd ── slots: pixels ───────────▶ PluginEnd   60 Hz and more; the plugin cannot write them
+//! RuntimeEnd ── slots: pixels ───────────▶ PluginEnd   60 Hz and more; read-only for the plugin
 //!            ── board: the newest slot ──▶             newest wins
-//!            ◀─ board: slots given back ──
+//!            ◀─ board: returned slots ────
 //!            ── bell ────────────────────▶             rings for each observation, 0.05 ms
 //!            ◀─ socket: messages ────────▶             start, events, stop; ready, replies, failure; never lost
 //! ```
-//! Slots and board are memory that neither side can resize ([`sealed`]): a plugin that truncated what the runtime has
-//! mapped would kill it. Everything is handed over by descriptor; nothing has a name that another process could
-//! open, and two flights on one computer never meet.
+//! Slots and board are memory that neither side can resize ([`sealed`]): if a plugin truncated memory that the runtime
+//! has mapped, the next access would kill the runtime. Both are passed as descriptors. They have no name that another
+//! process could open, so two flights on one computer cannot interfere.
 //!
-//! The runtime starts a plugin with its end of the socket open ([`RuntimeEnd::connect`]) and says which descriptor that is:
-//! `--vizflyt-service fd:N`. A plugin that a person starts finds the runtime by an [`Offer`]: a socket in a folder
-//! of the user's own, `--vizflyt-service PATH`.
+//! The runtime starts a plugin with the plugin's end of the socket open ([`RuntimeEnd::connect`]) and passes the number
+//! of the descriptor: `--vizflyt-service fd:N`. A plugin started by hand finds the runtime by an [`Offer`]: a socket in
+//! a folder owned by the user, `--vizflyt-service PATH`.
 //!
-//! Either side notices the other's end at once: the socket closes. No clock is involved; a runtime that is stopped
-//! for an hour is still there.
+//! Each side notices at once that the other has ended, because the socket closes. Without a timeout, a runtime
+//! that is stopped for an hour still counts as present.
 
 mod board;
 mod offer;
@@ -38,25 +38,26 @@ pub use offer::{Offer, offers};
 pub use plugin::{ObservationSample, PluginEnd};
 pub use runtime::{LoanedObservation, PluginSocket, RuntimeEnd};
 
-/// The command line option that says where the runtime is.
+/// Command line option with the address of the runtime.
 pub const SERVICE_OPTION: &str = "--vizflyt-service";
 
-/// Observations that a plugin may borrow at once: the one of the call, one that it keeps from call to
-/// call, and room to receive a third.
+/// Maximum number of observations that a plugin may borrow: the one of the current call, one kept between calls, and
+/// space to receive a third.
 pub const BORROWED_OBSERVATIONS: usize = 3;
 
-/// Observations that the runtime writes at once: one, and another while the first is laid out again.
+/// Maximum number of observations that the runtime writes at the same time: one, and a second one while the first gets
+/// a new layout.
 const LENT_OBSERVATIONS: usize = 2;
-/// Those and the borrowed ones, and the newest, which nobody has taken yet.
+/// Lent and borrowed observations, and the newest, which is not taken yet.
 const SLOTS: usize = BORROWED_OBSERVATIONS + LENT_OBSERVATIONS + 1;
 
-/// Why the other side cannot be reached.
+/// Error of the connection to the other side.
 #[derive(Debug, thiserror::Error)]
 pub enum IpcError {
-    /// Nobody is there.
+    /// No runtime listens at the address, or it already has a plugin.
     #[error("no runtime offers {0}; start the plugin with `vizflyt fly`")]
     NoRuntime(String),
-    /// The two sides were built from different protocols.
+    /// The two sides use different protocol versions.
     #[error(transparent)]
     Version(PreambleError),
     /// The socket is full: the other side does not read.
@@ -65,18 +66,18 @@ pub enum IpcError {
     /// The other side has closed the socket, or has died.
     #[error("the {0} is gone")]
     Gone(&'static str),
-    /// All slots are in use.
+    /// The maximum number of observations is in use.
     #[error("{0} observations are in use already: drop one before taking another")]
     NoSlot(usize),
     /// A message does not decode.
-    #[error("the socket holds no message: {0}")]
+    #[error("invalid message on the socket: {0}")]
     Message(FramingError),
-    /// The system refuses something.
+    /// A system call failed.
     #[error("{what} failed")]
     System {
-        /// What was tried.
+        /// The failed action.
         what: &'static str,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
 }
@@ -88,7 +89,7 @@ impl From<FramingError> for IpcError {
 }
 
 impl IpcError {
-    /// Returns the conversion of a system error met while trying `what`.
+    /// Returns a function that converts a system error during `what`.
     fn system<E: Into<io::Error>>(what: &'static str) -> impl FnOnce(E) -> Self {
         move |source| Self::System { what, source: source.into() }
     }

@@ -1,5 +1,5 @@
-//! How a plugin that a person starts finds the runtime that waits for it: a socket per waiting runtime, in a folder of
-//! the user's own, named by the process.
+//! Lets a plugin that was started by hand find the waiting runtime: each waiting runtime has a socket in a folder owned
+//! by the user, named after its process.
 
 use std::io;
 use std::os::fd::{AsRawFd, OwnedFd};
@@ -16,29 +16,29 @@ use nix::unistd::geteuid;
 
 use super::socket::owned;
 
-/// Begins the name of an offer that is not listed.
+/// Prefix of the name of an unlisted offer.
 const UNLISTED: &str = "unlisted-";
 
-/// A runtime's offer to a plugin that it waits for; withdrawn when dropped.
+/// Offer of a runtime that waits for a plugin. Withdrawn on drop.
 #[derive(Debug)]
 pub struct Offer {
     path: PathBuf,
 }
 
-/// Where plugins connect.
+/// Socket to which plugins connect.
 #[derive(Debug)]
 pub(super) struct Listener(OwnedFd);
 
 impl Offer {
-    /// Returns what a plugin gives as `--vizflyt-service`.
+    /// Returns the value for the plugin's `--vizflyt-service`.
     pub fn service(&self) -> String {
         self.path.display().to_string()
     }
 
-    /// Offers to whichever plugin of this user asks first; one that is not listed, to who knows its path.
+    /// Offers to the first plugin of this user that connects. An unlisted offer is found only by its path.
     pub(super) fn make(listed: bool) -> io::Result<(Self, Listener)> {
         let prefix = if listed { "" } else { UNLISTED };
-        // Whoever owns the outer folder could put another one into its place.
+        // The owner of the outer folder could replace the inner one.
         make_ours(&home())?;
         Self::make_in(&folder(), &format!("{prefix}{}", process::id()))
     }
@@ -48,7 +48,7 @@ impl Offer {
         make_ours(folder)?;
         let path = folder.join(format!("{name}-{}", MADE.fetch_add(1, Ordering::Relaxed)));
         let socket = new_socket(SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK)?;
-        // Of a killed process that had our number.
+        // Left by a killed process that had the same process id.
         let _ = fs::remove_file(&path);
         bind(socket.as_raw_fd(), &UnixAddr::new(&path)?)?;
         let offer = Self { path };
@@ -59,7 +59,7 @@ impl Offer {
 
 impl Drop for Offer {
     fn drop(&mut self) {
-        // What stays behind is ignored as soon as this process is gone.
+        // If the removal fails, the file is ignored after this process has ended.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -73,7 +73,6 @@ impl Listener {
     }
 }
 
-/// Connects to a runtime that offers.
 pub(super) fn connect(path: &Path) -> io::Result<OwnedFd> {
     let socket = new_socket(SockFlag::SOCK_CLOEXEC)?;
     connect_to(socket.as_raw_fd(), &UnixAddr::new(path)?)?;
@@ -101,7 +100,7 @@ fn offers_in(folder: &Path) -> Vec<String> {
             let number = name.strip_prefix(UNLISTED).unwrap_or(&name);
             let pid: u32 = number.split('-').next()?.parse().ok()?;
             if !Path::new(&format!("/proc/{pid}")).exists() {
-                // It was killed.
+                // The runtime was killed.
                 let _ = fs::remove_file(entry.path());
                 return None;
             }
@@ -116,7 +115,7 @@ fn offers_in(folder: &Path) -> Vec<String> {
     found.into_iter().map(|(_, service)| service).collect()
 }
 
-/// Makes a folder, unless it is there; follows no link.
+/// Creates a folder unless it exists. Does not follow links.
 fn make_ours(folder: &Path) -> io::Result<()> {
     match fs::DirBuilder::new().mode(0o700).create(folder) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
@@ -126,7 +125,7 @@ fn make_ours(folder: &Path) -> io::Result<()> {
         _ if is_ours(folder) => Ok(()),
         _ => {
             let text = format!(
-                "{} belongs to another user, or is no folder; have it removed",
+                "{} belongs to another user, or is not a folder; have it removed",
                 folder.display()
             );
             Err(io::Error::new(io::ErrorKind::PermissionDenied, text))
@@ -151,7 +150,7 @@ fn folder() -> PathBuf {
 mod tests {
     use super::*;
 
-    /// A folder of this test's own, removed behind it.
+    /// Temporary folder of one test, removed on drop.
     struct Scratch(PathBuf);
 
     impl Scratch {
@@ -167,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn an_offer_stands_until_it_is_dropped() {
+    fn offer_is_listed_until_it_is_dropped() {
         let scratch = Scratch::new("stands");
         assert!(offers_in(&scratch.0).is_empty());
         let (offer, mut listener) = Offer::make_in(&scratch.0, &process::id().to_string()).unwrap();
@@ -180,9 +179,9 @@ mod tests {
     }
 
     #[test]
-    fn the_offer_of_a_killed_runtime_does_not_count() {
+    fn ignores_and_removes_the_offer_of_a_killed_runtime() {
         let scratch = Scratch::new("killed");
-        // Larger than any process id Linux gives (2^22).
+        // Larger than the maximum process id of Linux (2^22).
         let (offer, _) = Offer::make_in(&scratch.0, &u32::MAX.to_string()).unwrap();
         std::mem::forget(offer);
         assert!(offers_in(&scratch.0).is_empty());
@@ -190,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_to_elsewhere_is_not_followed() {
+    fn does_not_follow_a_link() {
         let (real, link) = (Scratch::new("real"), Scratch::new("link"));
         let _offer = Offer::make_in(&real.0, "1").unwrap();
         std::os::unix::fs::symlink(&real.0, &link.0).unwrap();

@@ -20,7 +20,7 @@ use super::sealed::{map_read_only, take_inherited};
 use super::socket::{self, EMPTY, PacketKind, Received};
 use super::{BORROWED_OBSERVATIONS, IpcError, SLOTS, offer};
 
-/// The plugin's end.
+/// The plugin's end of the connection.
 #[derive(Debug)]
 pub struct PluginEnd {
     socket: OwnedFd,
@@ -29,7 +29,7 @@ pub struct PluginEnd {
     inbox: Mutex<Inbox>,
 }
 
-/// An observation in shared memory; as long as it lives, the runtime does not reuse the memory.
+/// An observation in shared memory. The runtime does not reuse the memory before this is dropped.
 #[derive(Debug)]
 pub struct ObservationSample {
     memory: Arc<Mmap>,
@@ -38,14 +38,14 @@ pub struct ObservationSample {
     borrowed: Arc<Borrowed>,
 }
 
-/// What is lent, and where it is given back.
+/// Number of borrowed observations, and the board on which they are returned.
 #[derive(Debug)]
 struct Borrowed {
     board: Board,
     count: AtomicUsize,
 }
 
-/// What has come over the socket.
+/// Packets received over the socket.
 #[derive(Debug, Default)]
 struct Inbox {
     slots: [Option<Arc<Mmap>>; SLOTS],
@@ -54,11 +54,11 @@ struct Inbox {
 }
 
 impl PluginEnd {
-    /// Attaches to the runtime at `service`: `fd:N`, a socket that this process was started with, or the path of one.
+    /// Attaches to the runtime at `service`: `fd:N`, an inherited socket, or the path of a socket.
     ///
     /// # Errors
-    /// [`IpcError::NoRuntime`] if there is none or it has a plugin already, [`IpcError::Version`] if it speaks another
-    /// protocol.
+    /// [`IpcError::NoRuntime`] if there is none or it already has a plugin, [`IpcError::Version`] if its protocol
+    /// version differs.
     pub fn open(service: &str) -> Result<Self, IpcError> {
         let nobody = || IpcError::NoRuntime(service.to_owned());
         let socket = match service.strip_prefix("fd:") {
@@ -79,7 +79,7 @@ impl PluginEnd {
         Self::greet(socket.into_inner())?.ok_or_else(|| IpcError::NoRuntime("this".to_owned()))
     }
 
-    /// Takes the runtime's first packet, and answers it; `None` if none comes.
+    /// Receives the runtime's first packet and replies to it. `None` if no packet arrives.
     fn greet(socket: OwnedFd) -> Result<Option<Self>, IpcError> {
         let attaching = "attaching to the runtime";
         socket::wait_readable(&[socket.as_fd()], HELLO_WITHIN)
@@ -103,8 +103,8 @@ impl PluginEnd {
         Ok(Some(end))
     }
 
-    /// Waits until there is something to take, `timeout` at most; returns whether there is. The runtime's end counts: it
-    /// is what [`Self::receive`] then returns.
+    /// Waits for a message or an observation, at most `timeout`. Returns whether there is one. It also returns true if
+    /// the runtime has ended, which [`Self::receive`] then returns as an error.
     ///
     /// # Errors
     /// [`IpcError::System`].
@@ -118,10 +118,10 @@ impl PluginEnd {
         }
     }
 
-    /// Takes the runtime's next message, if there is one.
+    /// Takes the next message of the runtime, if any.
     ///
     /// # Errors
-    /// [`IpcError::Gone`] once the runtime has ended and all it had sent is taken.
+    /// [`IpcError::Gone`] if the runtime has ended and all its messages are taken.
     pub fn receive(&self) -> Result<Option<ToPlugin>, IpcError> {
         let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
         inbox.fill(&self.socket)?;
@@ -132,10 +132,10 @@ impl PluginEnd {
         }
     }
 
-    /// Takes the newest observation, if there is one not taken yet.
+    /// Takes the newest observation, unless it was taken before.
     ///
     /// # Errors
-    /// [`IpcError::NoSlot`] if [`BORROWED_OBSERVATIONS`] are alive.
+    /// [`IpcError::NoSlot`] if [`BORROWED_OBSERVATIONS`] are in use.
     pub fn observation(&self) -> Result<Option<ObservationSample>, IpcError> {
         let borrowed = &self.borrowed;
         if borrowed.count.load(Ordering::Acquire) >= BORROWED_OBSERVATIONS {
@@ -143,7 +143,7 @@ impl PluginEnd {
         }
         let Some(place) = borrowed.board.take() else { return Ok(None) };
         let mut inbox = self.inbox.lock().unwrap_or_else(PoisonError::into_inner);
-        // The slot's memory was sent before anything was published in it.
+        // The slot's memory is sent before the first observation is published in it.
         inbox.fill(&self.socket)?;
         let memory = inbox.slots[place.slot].clone().filter(|memory| memory.len() >= place.len);
         let Some(memory) = memory else { return Ok(None) };
@@ -152,7 +152,8 @@ impl PluginEnd {
         Ok(Some(ObservationSample { memory, len: place.len, slot: place.slot, borrowed }))
     }
 
-    /// Sends a message; waits while the runtime is behind. What was sent is read even if this process ends at once.
+    /// Sends a message. Blocks while the socket is full. The runtime reads sent messages even if this process ends at
+    /// once.
     ///
     /// # Errors
     /// [`IpcError::Gone`] if the runtime has ended.
@@ -161,8 +162,8 @@ impl PluginEnd {
         self.send_bytes(framing::encode_body(message, &mut buffer))
     }
 
-    /// Sends bytes as they are: for plugins in other languages that encode messages themselves, and to test what a
-    /// runtime makes of nonsense.
+    /// Sends bytes without a check: for plugins in other languages that encode messages themselves, and for tests of
+    /// the runtime with invalid messages.
     ///
     /// # Errors
     /// As [`Self::send`].
@@ -189,7 +190,7 @@ impl PluginEnd {
 }
 
 impl Inbox {
-    /// Takes all that has come.
+    /// Receives all waiting packets.
     fn fill(&mut self, socket: &OwnedFd) -> Result<(), IpcError> {
         let mut buffer = EMPTY;
         loop {
@@ -202,7 +203,7 @@ impl Inbox {
                 Received::Packet(PacketKind::Slot, index, descriptors) => {
                     self.take_slot(index, descriptors)?;
                 }
-                // Of a newer runtime, perhaps; what counts comes as messages.
+                // Possibly of a newer runtime. Everything that matters arrives as messages.
                 Received::Packet(PacketKind::Hello, ..) | Received::Garbage => {}
                 Received::Nothing => return Ok(()),
                 Received::Closed => {
@@ -224,7 +225,7 @@ impl Inbox {
 }
 
 impl ObservationSample {
-    /// Returns the bytes, in the layout of [`vizflyt_protocol::packet::ObservationHeader`].
+    /// Returns the bytes in the layout of [`vizflyt_protocol::packet::ObservationHeader`].
     pub fn bytes(&self) -> &[u8] {
         &self.memory[..self.len]
     }
@@ -237,7 +238,7 @@ impl Drop for ObservationSample {
     }
 }
 
-/// Compares the runtime's protocol with ours.
+/// Compares the runtime's protocol version with the plugin's.
 fn check_version(theirs: u16) -> Result<(), IpcError> {
     if theirs == PROTOCOL_VERSION {
         return Ok(());
@@ -248,7 +249,7 @@ fn check_version(theirs: u16) -> Result<(), IpcError> {
     Err(IpcError::Version(error))
 }
 
-/// A runtime that is there sends its first packet before or as soon as somebody connects.
+/// Timeout for the runtime's first packet. A running runtime sends it before or as soon as a plugin connects.
 const HELLO_WITHIN: Duration = Duration::from_secs(5);
-/// Between two looks whether there is room.
+/// Maximum wait between checks for space in the socket.
 const A_WHILE: Duration = Duration::from_secs(1);

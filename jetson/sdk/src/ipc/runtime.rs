@@ -1,4 +1,4 @@
-//! The runtime's end: writes observations, sends messages, reads replies.
+//! The runtime's end of the connection: writes observations, sends messages, reads replies.
 
 use std::ffi::OsString;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
@@ -19,18 +19,18 @@ use super::sealed::{WrittenMemory, let_inherit};
 use super::socket::{self, EMPTY, PacketKind, Received};
 use super::{IpcError, SERVICE_OPTION, SLOTS};
 
-/// The runtime's end. All calls return at once, but for [`Self::wait`]; a plugin that hangs never blocks them.
+/// The runtime's end of the connection. All calls except [`Self::wait`] return at once; a plugin that hangs never
+/// blocks them.
 #[derive(Debug)]
 pub struct RuntimeEnd {
     slots: Arc<Mutex<Slots>>,
     connection: Mutex<Option<Arc<Connection>>>,
-    /// Where a plugin that a person starts connects.
+    /// Socket for plugins that are started by hand.
     listener: Mutex<Option<Listener>>,
     connections: AtomicU64,
 }
 
-/// Memory for one observation, to be written and then published. Dropped unpublished, it can be
-/// lent again.
+/// Memory for one observation, to be written and then published. If it is dropped before, it can be lent again.
 #[derive(Debug)]
 pub struct LoanedObservation {
     slot: Option<Slot>,
@@ -38,31 +38,31 @@ pub struct LoanedObservation {
     slots: Arc<Mutex<Slots>>,
 }
 
-/// The plugin's end of the socket, to be handed to its process.
+/// The plugin's end of the socket, to be passed to its process.
 #[derive(Debug)]
 pub struct PluginSocket(OwnedFd);
 
-/// The runtime's side of one plugin.
+/// Connection to one plugin.
 #[derive(Debug)]
 struct Connection {
     socket: OwnedFd,
     board: Board,
     bell: EventFd,
-    /// The plugin has said that it is complete.
+    /// The plugin has replied to the first packet.
     attached: AtomicBool,
     /// The plugin has closed its end.
     closed: AtomicBool,
-    /// Held while a packet is looked at and taken.
+    /// Held while a packet is inspected and taken.
     reading: Mutex<()>,
-    /// Counts connections.
+    /// Number of the connection.
     number: u64,
 }
 
-/// Memory for observations; each slot is in one place only.
+/// Memory for observations. Each slot has exactly one owner.
 #[derive(Debug)]
 struct Slots {
     free: heapless::Vec<Slot, SLOTS>,
-    /// Published: newest, or borrowed by the plugin.
+    /// Published slots: the newest, and those that the plugin has borrowed.
     published: [Option<Slot>; SLOTS],
     made: usize,
     observation_len: usize,
@@ -72,13 +72,12 @@ struct Slots {
 struct Slot {
     index: usize,
     memory: WrittenMemory,
-    /// The connection whose plugin has its descriptor.
+    /// Connection over which the memory's descriptor was sent.
     known_to: Option<u64>,
 }
 
 impl RuntimeEnd {
-    /// Makes an end that no plugin has attached to, for observations of `observation_len` bytes; larger ones are
-    /// possible.
+    /// Creates an end without a plugin, for observations of `observation_len` bytes. Larger observations are possible.
     pub fn new(observation_len: usize) -> Self {
         let slots = Slots {
             free: heapless::Vec::new(),
@@ -94,10 +93,10 @@ impl RuntimeEnd {
         }
     }
 
-    /// Connects the next plugin, in place of the one before.
+    /// Connects the next plugin and replaces the previous one.
     ///
     /// # Errors
-    /// [`IpcError::System`], as when too many files are open.
+    /// [`IpcError::System`], for example if too many files are open.
     pub fn connect(&self) -> Result<PluginSocket, IpcError> {
         let flags = SockFlag::SOCK_CLOEXEC;
         let (ours, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, flags)
@@ -106,7 +105,7 @@ impl RuntimeEnd {
         Ok(PluginSocket(theirs))
     }
 
-    /// Offers to be found by a plugin that a person of the same user starts.
+    /// Offers a connection to plugins that the same user starts by hand.
     ///
     /// # Errors
     /// [`IpcError::System`] if the socket cannot be made, or its folder is another user's.
@@ -114,7 +113,8 @@ impl RuntimeEnd {
         self.listen(true)
     }
 
-    /// As [`Self::offer`], for a plugin that is told the service: it is not among [`offers`](super::offers).
+    /// As [`Self::offer`], for a plugin that is started with the service's path. [`offers`](super::offers) does not
+    /// list it.
     ///
     /// # Errors
     /// As [`Self::offer`].
@@ -129,7 +129,7 @@ impl RuntimeEnd {
         Ok(offer)
     }
 
-    /// Whether a plugin is attached: messages reach it.
+    /// Returns whether a plugin is attached, so that messages reach it.
     pub fn plugin_attached(&self) -> bool {
         self.accept();
         let Some(connection) = self.connection() else { return false };
@@ -147,19 +147,19 @@ impl RuntimeEnd {
     /// Sends a message.
     ///
     /// # Errors
-    /// [`IpcError::QueueFull`] if the plugin has left so many unread that it must be hung, [`IpcError::Gone`] if there
-    /// is none.
+    /// [`IpcError::QueueFull`] if the socket is full of unread messages, because the plugin hangs; [`IpcError::Gone`]
+    /// without a plugin.
     pub fn send(&self, message: &ToPlugin) -> Result<(), IpcError> {
         let connection = self.connection().ok_or(IpcError::Gone("plugin"))?;
         let mut buffer = [0; MAX_FRAMED];
         connection.send(PacketKind::Message, framing::encode_body(message, &mut buffer), &[])
     }
 
-    /// Lends memory for one observation of `len` bytes: zeros, aligned to 64. More than ever before takes longer
-    /// once.
+    /// Lends memory for one observation of `len` bytes: zeros, aligned to 64. The first request for a larger size takes
+    /// longer, because memory is allocated.
     ///
     /// # Errors
-    /// [`IpcError::NoSlot`] if two are lent already, [`IpcError::System`] if there is not so much memory.
+    /// [`IpcError::NoSlot`] if two are lent already, [`IpcError::System`] if there is not enough memory.
     pub fn loan(&self, len: usize) -> Result<LoanedObservation, IpcError> {
         let mut slots = lock(&self.slots);
         if let Some(connection) = self.connection() {
@@ -174,11 +174,12 @@ impl RuntimeEnd {
         Ok(loan)
     }
 
-    /// Publishes an observation and rings the plugin's bell; the one before is replaced if nobody has taken it. Without a
-    /// plugin it is dropped.
+    /// Publishes an observation and rings the plugin's bell. Replaces the previous one if the plugin has not taken it.
+    /// Without a plugin, the observation is dropped.
     ///
     /// # Errors
-    /// [`IpcError::QueueFull`] if the plugin does not read, so that it cannot be told of new memory.
+    /// [`IpcError::QueueFull`] if the plugin does not read its messages, so that the descriptor of new memory cannot be
+    /// sent.
     pub fn publish(&self, mut observation: LoanedObservation) -> Result<(), IpcError> {
         let shared = Arc::clone(&self.slots);
         let mut slots = lock(&shared);
@@ -203,12 +204,12 @@ impl RuntimeEnd {
             slots.reclaim(unseen.slot);
         }
         drop(slots);
-        // Full only after 2^64 - 2 of them.
+        // Full only after 2^64 - 2 observations.
         let _ = connection.bell.write(1);
         Ok(())
     }
 
-    /// Waits until the plugin sends something, `timeout` at most; returns whether it did.
+    /// Waits for a message of the plugin, at most `timeout`. Returns whether there is one.
     ///
     /// # Errors
     /// [`IpcError::System`].
@@ -216,7 +217,6 @@ impl RuntimeEnd {
         self.accept();
         let Some(connection) = self.connection().filter(|connection| !connection.has_closed())
         else {
-            // Until the next one connects.
             std::thread::sleep(timeout.min(NOBODY_THERE));
             return Ok(false);
         };
@@ -224,17 +224,17 @@ impl RuntimeEnd {
             .map_err(IpcError::system("waiting for the plugin"))
     }
 
-    /// Takes the plugin's next message, if there is one.
+    /// Takes the next message of the plugin, if any.
     ///
     /// # Errors
-    /// [`IpcError::Message`] for one that does not decode; the next can still be read.
+    /// [`IpcError::Message`] for a message that does not decode. The next one can still be read.
     pub fn receive(&self) -> Result<Option<FromPlugin>, IpcError> {
         let Some(connection) = self.connection() else { return Ok(None) };
         let _reading = lock(&connection.reading);
         connection.next()
     }
 
-    /// Forgets a plugin that has ended, and takes back what it had borrowed. Call after each exit.
+    /// Disconnects a plugin that has ended, and reclaims its borrowed slots. Call it after each exit.
     pub fn clean_up(&self) {
         let mut slots = lock(&self.slots);
         *lock(&self.connection) = None;
@@ -245,7 +245,7 @@ impl RuntimeEnd {
         lock(&self.connection).clone()
     }
 
-    /// Accepts a plugin that a person has started, if there is none yet.
+    /// Accepts a plugin that was started by hand, unless a plugin is connected.
     fn accept(&self) {
         let mut listener = lock(&self.listener);
         let Some(waiting) = &mut *listener else { return };
@@ -253,12 +253,12 @@ impl RuntimeEnd {
             return;
         }
         if let Some(socket) = waiting.accept() {
-            // Refused, it reads that nobody is there, and the person tries again.
+            // If this fails, the plugin reports a missing runtime, and the user can retry.
             let _ = self.greet(socket);
         }
     }
 
-    /// Makes a socket the plugin's, and hands over board and bell.
+    /// Uses a socket for the next plugin, and sends it board and bell.
     fn greet(&self, socket: OwnedFd) -> Result<(), IpcError> {
         let flags = EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK;
         let bell =
@@ -283,15 +283,15 @@ impl RuntimeEnd {
 }
 
 impl PluginSocket {
-    /// Returns the option that tells the plugin's process where its end is.
+    /// Returns the option that passes the number of the descriptor to the plugin's process.
     pub fn argument(&self) -> OsString {
         format!("{SERVICE_OPTION}=fd:{}", self.0.as_raw_fd()).into()
     }
 
-    /// Has a child inherit it. Call it between fork and exec, in the child.
+    /// Lets a child process inherit the descriptor. Call it between fork and exec, in the child.
     ///
     /// # Errors
-    /// The system's.
+    /// Errors of the system.
     pub fn let_inherit(&self) -> std::io::Result<()> {
         let_inherit(self.0.as_fd())
     }
@@ -318,7 +318,7 @@ impl Connection {
         }
     }
 
-    /// Takes the next message; `reading` is held.
+    /// Takes the next message. The caller holds `reading`.
     fn next(&self) -> Result<Option<FromPlugin>, IpcError> {
         let mut buffer = EMPTY;
         loop {
@@ -347,7 +347,7 @@ impl Connection {
         self.attached.load(Ordering::Acquire)
     }
 
-    /// Whether the plugin has closed its end, and left nothing to be read.
+    /// Returns whether the plugin has closed its end and no unread message is left.
     fn has_closed(&self) -> bool {
         if matches!(socket::peek(self.socket.as_fd(), &mut [0]), Ok(Received::Closed)) {
             self.closed.store(true, Ordering::Release);
@@ -357,13 +357,13 @@ impl Connection {
 }
 
 impl Slots {
-    /// Takes a slot with room for `len` bytes.
+    /// Takes a slot with space for `len` bytes.
     fn take(&mut self, len: usize) -> Result<Slot, IpcError> {
         if let Some(fitting) = self.free.iter().position(|slot| slot.memory.len() >= len) {
             return Ok(self.free.swap_remove(fitting));
         }
         let memory = || {
-            // Cameras may grow while flying; the memory follows in few steps.
+            // Images may grow in flight. Powers of two limit the number of allocations.
             let len = len.max(self.observation_len).next_power_of_two().max(LEAST_SLOT);
             WrittenMemory::new(len).map_err(IpcError::system("making shared memory"))
         };
@@ -377,20 +377,20 @@ impl Slots {
         Ok(Slot { index: old.index, memory, known_to: None })
     }
 
-    /// Takes back what was published in slot `index`, if anything was.
+    /// Reclaims the observation published in slot `index`, if any.
     fn reclaim(&mut self, index: usize) {
-        // Each slot is in one place, so there is room.
+        // Each slot has one owner, so there is space.
         self.free.extend(self.published[index].take());
     }
 
-    /// Takes back all that was published.
+    /// Reclaims all published observations.
     fn reclaim_all(&mut self) {
         (0..SLOTS).for_each(|index| self.reclaim(index));
     }
 }
 
 impl LoanedObservation {
-    /// Returns what was written.
+    /// Returns the written bytes.
     pub fn bytes(&self) -> &[u8] {
         self.slot.as_ref().map_or(&[], |slot| &slot.memory.bytes()[..self.len])
     }
@@ -413,7 +413,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Where no plugin is connected, one is looked for this often.
+/// Maximum wait before the next check for a plugin, while none is connected.
 const NOBODY_THERE: Duration = Duration::from_millis(10);
-/// A page. [bytes]
+/// One page. [bytes]
 const LEAST_SLOT: usize = 4096;

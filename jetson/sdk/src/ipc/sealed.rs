@@ -1,4 +1,4 @@
-//! Memory that two processes share and neither can resize: memfd_create(2), sealed by fcntl(2) `F_ADD_SEALS`.
+//! Memory that two processes share and neither can resize: memfd_create(2), sealed with fcntl(2) `F_ADD_SEALS`.
 
 #![allow(unsafe_code, reason = "maps memory; it is sealed, so that no access can fault")]
 
@@ -10,7 +10,7 @@ use memmap2::{Mmap, MmapMut, MmapOptions, MmapRaw};
 use nix::fcntl::{FcntlArg, FdFlag, SealFlag, fcntl};
 use nix::sys::memfd::{MFdFlags, memfd_create};
 
-/// Memory that this process writes, and one that is handed the descriptor can only read.
+/// Memory that this process writes. A process that receives the descriptor can only read it.
 #[derive(Debug)]
 pub(super) struct WrittenMemory {
     file: File,
@@ -18,12 +18,12 @@ pub(super) struct WrittenMemory {
 }
 
 impl WrittenMemory {
-    /// Makes `len` bytes of zeros. [bytes]
+    /// Creates `len` bytes of zeros. [bytes]
     pub(super) fn new(len: usize) -> io::Result<Self> {
         let file = memory_file(c"vizflyt-observation", len)?;
-        // SAFETY: nobody else has the file yet, and it is sealed against shrinking below, before anybody gets it.
+        // SAFETY: no other process has the file yet, and it is sealed against shrinking below, before it is shared.
         let map = unsafe { MmapMut::map_mut(&file) }?;
-        // What is mapped already stays writable; nothing else becomes so.
+        // The existing mapping stays writable; new mappings cannot be.
         seal(&file, RESIZING | SealFlag::F_SEAL_FUTURE_WRITE)?;
         Ok(Self { file, map })
     }
@@ -47,7 +47,7 @@ impl AsFd for WrittenMemory {
     }
 }
 
-/// Memory that both processes write; only ever accessed by atomic operations.
+/// Memory that both processes write, accessed only by atomic operations.
 #[derive(Debug)]
 pub(super) struct AtomicMemory {
     file: File,
@@ -55,14 +55,14 @@ pub(super) struct AtomicMemory {
 }
 
 impl AtomicMemory {
-    /// Makes one `T`, all zeros.
+    /// Creates one `T`, all zeros.
     pub(super) fn new<T>() -> io::Result<Self> {
         let file = memory_file(c"vizflyt-board", size_of::<T>())?;
         seal(&file, RESIZING)?;
         Ok(Self { map: MmapRaw::map_raw(&file)?, file })
     }
 
-    /// Maps what the other side made.
+    /// Maps memory that the other side created.
     ///
     /// # Errors
     /// If it is not sealed, or too small for a `T`.
@@ -71,14 +71,14 @@ impl AtomicMemory {
         Ok(Self { map: MmapRaw::map_raw(&file)?, file })
     }
 
-    /// Returns the mapped `T`, which was made or opened with this size.
+    /// Returns the mapped `T`.
     ///
     /// # Safety
-    /// `T` must be made of atomics alone, and be the one given to [`Self::new`] or [`Self::open`].
+    /// `T` must consist of atomics only, and must be the type given to [`Self::new`] or [`Self::open`].
     pub(super) unsafe fn get<T>(&self) -> &T {
         assert!(self.map.len() >= size_of::<T>());
-        // SAFETY: a mapping begins on a page, is long enough, cannot shrink, and any bits are atomics' values; the
-        // other process changes them by atomic operations, or harms only itself.
+        // SAFETY: a mapping begins on a page, is long enough, cannot shrink, and any bits are valid for atomics. The
+        // other process changes them only by atomic operations; otherwise it harms only itself.
         unsafe { &*self.map.as_ptr().cast::<T>() }
     }
 }
@@ -89,35 +89,35 @@ impl AsFd for AtomicMemory {
     }
 }
 
-/// Maps the other side's memory to be read.
+/// Maps memory of the other side, read-only.
 ///
 /// # Errors
-/// If it is not sealed against shrinking: to read what has been cut off would kill this process.
+/// If it is not sealed against shrinking: reading a truncated part would kill this process.
 pub(super) fn map_read_only(descriptor: OwnedFd) -> io::Result<Mmap> {
     let file = sealed_file(descriptor, 1)?;
-    // SAFETY: it cannot shrink, and the runtime does not write what a plugin has borrowed.
+    // SAFETY: the file cannot shrink, and the runtime does not write observations that a plugin has borrowed.
     unsafe { MmapOptions::new().map(&file) }
 }
 
-/// Takes over a descriptor that this process was started with; its own children do not get it.
+/// Takes over an inherited descriptor, and closes it for child processes.
 ///
 /// # Errors
 /// If it is not open.
 pub(super) fn take_inherited(descriptor: RawFd) -> io::Result<OwnedFd> {
-    // SAFETY: asks the kernel about a number; one that is not open is an error.
+    // SAFETY: a query for a number; the kernel returns an error if it is not open.
     if descriptor < 0 || unsafe { nix::libc::fcntl(descriptor, nix::libc::F_GETFD) } < 0 {
         return Err(io::Error::from_raw_os_error(nix::libc::EBADF));
     }
-    // SAFETY: it is open, and named on the command line for us alone.
+    // SAFETY: it is open, and the command line gave it to this process only.
     let owned = unsafe { OwnedFd::from_raw_fd(descriptor) };
     fcntl(&owned, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC))?;
     Ok(owned)
 }
 
-/// Has a child inherit a descriptor, under the same number. Call it between fork and exec.
+/// Lets a child process inherit a descriptor under the same number. Call it between fork and exec.
 ///
 /// # Errors
-/// The system's.
+/// Errors of the system.
 pub(super) fn let_inherit(descriptor: BorrowedFd<'_>) -> io::Result<()> {
     fcntl(descriptor, FcntlArg::F_SETFD(FdFlag::empty()))?;
     Ok(())
@@ -142,7 +142,8 @@ fn sealed_file(descriptor: OwnedFd, least_len: usize) -> io::Result<File> {
     let file = File::from(descriptor);
     if !seals.contains(SealFlag::F_SEAL_SHRINK) || file.metadata()?.len() < least_len as u64 {
         let number = file.as_raw_fd();
-        let text = format!("descriptor {number} is no sealed memory of at least {least_len} bytes");
+        let text =
+            format!("descriptor {number} is not sealed memory of at least {least_len} bytes");
         return Err(io::Error::new(io::ErrorKind::InvalidData, text));
     }
     Ok(file)
@@ -154,7 +155,7 @@ mod tests {
     use std::os::unix::fs::FileExt;
 
     #[test]
-    fn a_reader_can_neither_resize_nor_write() {
+    fn reader_can_neither_resize_nor_write() {
         let mut memory = WrittenMemory::new(5000).unwrap();
         memory.bytes_mut()[4999] = 7;
         let theirs = memory.as_fd().try_clone_to_owned().unwrap();
@@ -163,20 +164,20 @@ mod tests {
             assert!(file.set_len(len).is_err(), "{len}");
         }
         assert!(file.write_at(b"x", 0).is_err());
-        // SAFETY: it is expected to fail; nothing else touches the mapping.
+        // SAFETY: expected to fail; no other code accesses the mapping.
         assert!(unsafe { MmapMut::map_mut(&file) }.is_err());
         let map = map_read_only(theirs).unwrap();
         assert_eq!(map[4999], 7);
-        assert!(map.make_mut().is_err(), "nor later");
+        assert!(map.make_mut().is_err(), "must stay read-only");
         memory.bytes_mut()[0] = 9;
         assert_eq!(memory.bytes()[..1], [9]);
     }
 
     #[test]
-    fn memory_that_could_shrink_is_refused() {
+    fn rejects_memory_that_could_shrink() {
         let file = memory_file(c"open", 100).unwrap();
         let error = map_read_only(file.into()).unwrap_err();
-        assert!(error.to_string().contains("no sealed memory"), "{error}");
+        assert!(error.to_string().contains("not sealed memory"), "{error}");
         let small = AtomicMemory::new::<u64>().unwrap();
         let theirs = small.as_fd().try_clone_to_owned().unwrap();
         assert!(AtomicMemory::open::<[u64; 1000]>(theirs).is_err());

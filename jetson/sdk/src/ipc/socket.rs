@@ -1,7 +1,7 @@
-//! The socket between both ends: packets in order, some with descriptors; local to this computer (unix(7),
+//! Socket between both ends: ordered packets, some with descriptors, local to this computer (unix(7),
 //! `SOCK_SEQPACKET`).
 
-#![allow(unsafe_code, reason = "owns the descriptors that the kernel hands over")]
+#![allow(unsafe_code, reason = "owns the descriptors that the kernel passes")]
 
 use std::io::{IoSlice, IoSliceMut};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
@@ -12,15 +12,15 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::socket::{ControlMessage, ControlMessageOwned, MsgFlags, recv, recvmsg, sendmsg};
 use vizflyt_protocol::packet::framing::MAX_FRAMED;
 
-/// What a packet is; its first byte.
+/// Kind of a packet; its first byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PacketKind {
-    /// The first packet each way. The runtime's: its protocol's version, with board and bell. The plugin's: it is
-    /// complete.
+    /// First packet in each direction. The runtime's contains its protocol version, board and bell. The plugin's
+    /// reports that it has attached.
     Hello,
-    /// A message of the protocol.
+    /// Message of the protocol.
     Message,
-    /// A slot's number, with its memory: it is new, or larger than it was.
+    /// Number and memory of a slot that is new or has grown.
     Slot,
 }
 
@@ -30,25 +30,25 @@ impl PacketKind {
     }
 }
 
-/// One packet at most.
+/// Maximum size of a packet.
 type Buffer = [u8; 1 + MAX_FRAMED];
 
 pub(super) const EMPTY: Buffer = [0; 1 + MAX_FRAMED];
 
-/// What came out of a socket.
+/// Result of reading a socket.
 #[derive(Debug)]
 pub(super) enum Received<'b> {
-    /// A packet, with its descriptors.
+    /// Packet with its descriptors.
     Packet(PacketKind, &'b [u8], Vec<OwnedFd>),
-    /// One of no kind.
+    /// Packet of unknown kind.
     Garbage,
-    /// There is none now.
+    /// No packet is waiting.
     Nothing,
     /// The other side has closed.
     Closed,
 }
 
-/// Sends a packet, or fails at once; an [`Errno::EAGAIN`] says that the socket is full.
+/// Sends a packet without waiting. Returns [`Errno::EAGAIN`] if the socket is full.
 pub(super) fn send(
     socket: BorrowedFd<'_>,
     kind: PacketKind,
@@ -63,12 +63,12 @@ pub(super) fn send(
     sendmsg::<()>(socket.as_raw_fd(), &parts, rights, flags, None).map(|_| ())
 }
 
-/// Receives a packet with its descriptors; does not wait.
+/// Receives a packet with its descriptors, without waiting.
 pub(super) fn receive_with_descriptors<'b>(
     socket: BorrowedFd<'_>,
     buffer: &'b mut Buffer,
 ) -> Result<Received<'b>, Errno> {
-    // Room for two descriptors; the kernel closes more.
+    // Space for two descriptors; the kernel closes further ones.
     let mut control = nix::cmsg_space!([RawFd; 2]);
     let (len, descriptors) = {
         let mut parts = [IoSliceMut::new(buffer)];
@@ -89,8 +89,8 @@ pub(super) fn receive_with_descriptors<'b>(
     Ok(packet(&buffer[..len], descriptors))
 }
 
-/// Receives a packet; does not wait. Descriptors that come with it are closed by the kernel: nobody can fill the
-/// runtime's table of files.
+/// Receives a packet without waiting. The kernel closes descriptors sent with it, so that a plugin cannot fill the
+/// runtime's file table.
 pub(super) fn receive<'b>(
     socket: BorrowedFd<'_>,
     buffer: &'b mut Buffer,
@@ -101,7 +101,7 @@ pub(super) fn receive<'b>(
     }
 }
 
-/// Returns the next packet's kind and leaves it there; does not wait.
+/// Returns the kind of the next packet without removing it. Does not wait.
 pub(super) fn peek<'b>(
     socket: BorrowedFd<'_>,
     buffer: &'b mut [u8; 1],
@@ -112,13 +112,13 @@ pub(super) fn peek<'b>(
     }
 }
 
-/// Owns a descriptor that the kernel has just opened for us.
+/// Owns a descriptor that the kernel has just opened for this process.
 pub(super) fn owned(number: RawFd) -> OwnedFd {
-    // SAFETY: it is open, and nobody else knows its number.
+    // SAFETY: it is open, and no other code has its number.
     unsafe { OwnedFd::from_raw_fd(number) }
 }
 
-/// Waits until one of them can be read, `timeout` at most; returns whether.
+/// Waits until one descriptor is readable, at most `timeout`. Returns whether one is.
 pub(super) fn wait_readable(
     descriptors: &[BorrowedFd<'_>],
     timeout: Duration,
@@ -126,7 +126,7 @@ pub(super) fn wait_readable(
     wait_for(descriptors, PollFlags::POLLIN, timeout)
 }
 
-/// Waits until the socket takes more, `timeout` at most; returns whether it does.
+/// Waits until the socket is writable, at most `timeout`. Returns whether it is.
 pub(super) fn wait_writable(socket: &OwnedFd, timeout: Duration) -> Result<bool, Errno> {
     wait_for(&[socket.as_fd()], PollFlags::POLLOUT, timeout)
 }
@@ -138,11 +138,11 @@ fn wait_for(
 ) -> Result<bool, Errno> {
     let mut polled: heapless::Vec<_, 2> =
         descriptors.iter().map(|&descriptor| PollFd::new(descriptor, flags)).collect();
-    // Rounded up: a wait of less than a millisecond is no busy loop.
+    // Rounded up, so that a wait of less than a millisecond does not become a busy loop.
     let timeout = timeout.as_nanos().div_ceil(1_000_000).try_into().unwrap_or(u16::MAX);
     match poll(&mut polled, PollTimeout::from(timeout)) {
         Ok(ready) => Ok(ready > 0),
-        // A signal, as Ctrl-C, is for whoever handles it.
+        // A signal such as Ctrl-C is left to its handler.
         Err(Errno::EINTR) => Ok(false),
         Err(error) => Err(error),
     }

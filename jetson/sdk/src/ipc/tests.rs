@@ -1,4 +1,4 @@
-//! Both ends in one process; the runtime's tests kill real plugin processes.
+//! Tests of both ends in one process. The tests of the runtime kill real plugin processes.
 
 use vizflyt_protocol::geometry::Intrinsics;
 use vizflyt_protocol::messages::{
@@ -12,7 +12,7 @@ use std::time::Duration;
 use crate::{ImageStamps, Observation, ObservationWriter};
 
 const WAIT: Duration = Duration::from_secs(10);
-/// What a plugin may leave unread while it thinks about one image.
+/// Messages that a plugin may leave unread during one `on_image`.
 const MESSAGES: usize = 128;
 
 fn cameras() -> Vec<CameraInfo> {
@@ -78,12 +78,13 @@ fn messages_arrive_both_ways_in_order() {
 }
 
 #[test]
-fn a_plugin_that_does_not_read_is_an_error_not_a_wait() {
+fn sending_to_a_plugin_that_does_not_read_fails_without_waiting() {
     let (runtime, plugin) = ends();
     let full = (0..100_000).find_map(|n| runtime.send(&event(n)).err().map(|error| (n, error)));
     let (sent, error) = full.expect("the socket has an end");
     assert!(sent >= MESSAGES && matches!(error, IpcError::QueueFull("plugin")), "{sent}: {error}");
-    // Nor does a bell that nobody hears ever block, or images nobody looks at: but new memory cannot be handed over.
+    // Publishing does not block either if the plugin takes no bell and no image, but the descriptor of new memory
+    // cannot be sent.
     assert!(publish_one(&runtime, 0).is_err());
     for n in 0..sent {
         assert_eq!(plugin.receive().unwrap(), Some(event(n)));
@@ -97,7 +98,7 @@ fn a_plugin_that_does_not_read_is_an_error_not_a_wait() {
 }
 
 #[test]
-fn a_flood_of_replies_waits_for_the_runtime() {
+fn plugin_waits_while_the_socket_is_full() {
     let (runtime, plugin) = ends();
     let failed = |n: usize| FromPlugin::Failed { reason: bounded(&n.to_string()) };
     std::thread::scope(|scope| {
@@ -113,7 +114,7 @@ fn a_flood_of_replies_waits_for_the_runtime() {
 }
 
 #[test]
-fn what_was_said_is_heard_after_the_end() {
+fn sent_messages_arrive_after_the_sender_has_ended() {
     let (runtime, plugin) = ends();
     let last = FromPlugin::Failed { reason: bounded("last words") };
     plugin.send(&last).unwrap();
@@ -127,7 +128,7 @@ fn what_was_said_is_heard_after_the_end() {
     drop(runtime);
     assert!(plugin.wait(WAIT).unwrap());
     assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
-    assert!(plugin.wait(WAIT).unwrap(), "its end is worth waking up for");
+    assert!(plugin.wait(WAIT).unwrap(), "the end of the runtime must wake the plugin");
     assert!(matches!(plugin.receive(), Err(IpcError::Gone("runtime"))));
     assert!(matches!(
         plugin.send(&FromPlugin::Ready { name: bounded("x") }),
@@ -136,7 +137,7 @@ fn what_was_said_is_heard_after_the_end() {
 }
 
 #[test]
-fn nonsense_is_refused_and_passed_over() {
+fn invalid_messages_are_errors_and_the_next_one_is_read() {
     let (runtime, plugin) = ends();
     for bytes in [&[][..], &[255; 9], &[7; vizflyt_protocol::packet::framing::MAX_FRAMED]] {
         plugin.send_bytes(bytes).unwrap();
@@ -161,7 +162,7 @@ fn the_newest_observation_wins_without_a_copy() {
     let front = observation.camera("front").unwrap();
     assert_eq!((front.rgb[0], front.depth_m(31, 23)), (9, Some(1.009)));
     assert_eq!((front.depth_m(32, 0), front.rgb_at(0, 24)), (None, None));
-    // The view lies in the shared memory itself, and stays while newer ones come.
+    // The view lies in the shared memory itself, and does not change when newer observations arrive.
     assert!(sample.bytes().as_ptr_range().contains(&front.rgb.as_ptr()));
     for seq in 10..=30 {
         publish(&runtime, seq);
@@ -174,7 +175,7 @@ fn the_newest_observation_wins_without_a_copy() {
 }
 
 #[test]
-fn a_plugin_keeps_three_observations_and_no_more() {
+fn plugin_can_keep_three_observations_and_no_more() {
     let (runtime, plugin) = ends();
     let mut kept = Vec::new();
     for seq in 1..=BORROWED_OBSERVATIONS as u64 {
@@ -183,7 +184,7 @@ fn a_plugin_keeps_three_observations_and_no_more() {
     }
     publish(&runtime, 9);
     assert!(matches!(plugin.observation(), Err(IpcError::NoSlot(BORROWED_OBSERVATIONS))));
-    // The runtime still has two to write, and no third.
+    // The runtime can still write two, but not a third.
     let (_one, _two) = (runtime.loan(100).unwrap(), runtime.loan(100).unwrap());
     assert!(matches!(runtime.loan(100), Err(IpcError::NoSlot(_))));
     kept.remove(0);
@@ -196,7 +197,7 @@ fn a_plugin_keeps_three_observations_and_no_more() {
 }
 
 #[test]
-fn memory_grows_with_the_cameras() {
+fn memory_grows_with_the_images() {
     let (runtime, plugin) = ends();
     for len in [100, 5_000, 1 << 20, 64, 3 << 20] {
         let mut kept = Vec::new();
@@ -216,7 +217,7 @@ fn memory_grows_with_the_cameras() {
 }
 
 #[test]
-fn a_second_plugin_can_follow_the_first() {
+fn several_plugins_can_attach_one_after_another() {
     let runtime = RuntimeEnd::new(4096);
     for seq in 1..=5 {
         let plugin = attach(&runtime);
@@ -224,19 +225,19 @@ fn a_second_plugin_can_follow_the_first() {
         assert_eq!(plugin.receive().unwrap(), Some(ToPlugin::Stop));
         publish(&runtime, seq);
         let sample = plugin.observation().unwrap().unwrap();
-        // What the former plugin has not given back does not run out.
+        // Slots that a plugin did not return are reclaimed after its end.
         std::mem::forget(sample);
         publish(&runtime, seq);
         drop(plugin);
         assert!(!runtime.plugin_attached());
         runtime.clean_up();
     }
-    // Without one, images go nowhere.
+    // Without a plugin, observations are dropped.
     (1..100).for_each(|seq| publish(&runtime, seq));
 }
 
 #[test]
-fn a_plugin_that_a_person_starts_finds_the_offer() {
+fn plugin_started_by_hand_finds_the_offer() {
     let runtime = RuntimeEnd::new(4096);
     let offer = runtime.offer().unwrap();
     assert!(offers().contains(&offer.service()));
@@ -255,7 +256,7 @@ fn a_plugin_that_a_person_starts_finds_the_offer() {
 }
 
 #[test]
-fn without_a_runtime_it_says_so() {
+fn reports_that_there_is_no_runtime() {
     for nobody in ["/nowhere/at/all", "fd:987", "fd:-1", "fd:x", ""] {
         let error = PluginEnd::open(nobody).unwrap_err().to_string();
         let expected = format!("no runtime offers {nobody}; start the plugin with `vizflyt fly`");
@@ -264,7 +265,7 @@ fn without_a_runtime_it_says_so() {
 }
 
 #[test]
-fn the_runtimes_end_is_shared_between_threads() {
+fn runtime_end_can_be_shared_between_threads() {
     fn check<T: Send>() {}
     check::<std::sync::Arc<RuntimeEnd>>();
     check::<LoanedObservation>();

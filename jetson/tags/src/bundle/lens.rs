@@ -1,21 +1,21 @@
-//! Projection through a lens with its derivatives, also by the lens's own numbers.
+//! Projection through a lens with its derivatives, also by the lens parameters.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
-/// Numbers of a lens that are found: fx, fy, cx, cy, then k1 k2 p1 p2 or k1 k2 k3 k4. k3 of
-/// Brown-Conrady stays as it is: boards do not reach far enough out to separate it from k2.
+/// Number of estimated lens parameters: fx, fy, cx, cy, then k1 k2 p1 p2 or k1 k2 k3 k4. k3 of Brown-Conrady stays
+/// constant: boards do not reach far enough outwards to separate it from k2.
 pub(crate) const LENS: usize = 8;
 
 pub(super) struct Projected {
     pub(super) pixel: DVec2,
-    /// By x, y, z of the point. [px/m]
+    /// Derivatives by x, y, z of the point. [px/m]
     pub(super) by_point: [DVec2; 3],
-    /// By the lens's numbers.
+    /// Derivatives by the lens parameters.
     pub(super) by_lens: [DVec2; LENS],
 }
 
-/// Returns where a point [m, cam] appears; `None` if that is not ahead.
+/// Returns the projection of a point [m, cam]; `None` unless it is in front of the camera.
 pub(super) fn project(k: &Intrinsics, p_cam: DVec3) -> Option<Projected> {
     if !(p_cam.z > 1e-6) {
         return None;
@@ -66,7 +66,7 @@ pub(super) fn project(k: &Intrinsics, p_cam: DVec3) -> Option<Projected> {
     (pixel.is_finite()).then_some(Projected { pixel, by_point, by_lens })
 }
 
-/// Returns the lens with its numbers changed.
+/// Returns the lens with changed parameters.
 pub(super) fn moved(k: &Intrinsics, change: &[f64]) -> Intrinsics {
     let distortion = match k.distortion {
         Distortion::None => Distortion::None,
@@ -99,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn derivatives_are_the_slopes_of_the_projection() {
+    fn derivatives_match_finite_differences() {
         let pinhole = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         for distortion in [
             Distortion::BrownConrady { k1: -0.2, k2: 0.05, p1: 0.001, p2: -0.002, k3: 0.01 },
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn tags_behind_the_camera_are_not_seen() {
+    fn points_behind_the_camera_have_no_projection() {
         let k = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         assert!(project(&k, DVec3::NEG_Z).is_none());
         assert!(project(&k, DVec3::splat(f64::NAN)).is_none());

@@ -1,6 +1,6 @@
-//! Symmetric positive definite systems, dense.
+//! Dense symmetric positive definite systems.
 
-/// A symmetric matrix; its lower triangle, row by row.
+/// A symmetric matrix, stored as its lower triangle, row by row.
 #[derive(Clone, Debug)]
 pub(crate) struct Symmetric {
     size: usize,
@@ -22,7 +22,7 @@ impl Symmetric {
         self.lower[row * (row + 1) / 2 + column] += value;
     }
 
-    /// Makes the diagonal larger by this share (Marquardt 1963).
+    /// Increases the diagonal by this share (Marquardt 1963).
     pub(crate) fn damp(&mut self, share: f64) {
         for i in 0..self.size {
             self.lower[i * (i + 1) / 2 + i] *= 1.0 + share;
@@ -34,17 +34,15 @@ impl Symmetric {
         self
     }
 
-    /// Multiplies it.
     pub(crate) fn scale(&mut self, by: f64) {
         self.lower.iter_mut().for_each(|x| *x *= by);
     }
 
-    /// Adds another one.
     pub(crate) fn add_all(&mut self, other: &Self) {
         self.lower.iter_mut().zip(&other.lower).for_each(|(x, y)| *x += y);
     }
 
-    /// Replaces it by its Cholesky factor; `false` if it is not positive definite.
+    /// Replaces the matrix by its Cholesky factor; `false` if it is not positive definite.
     fn factor(&mut self) -> bool {
         for i in 0..self.size {
             let start = i * (i + 1) / 2;
@@ -56,7 +54,7 @@ impl Symmetric {
                 let sum: f64 = rest[..j].iter().zip(above).map(|(a, b)| a * b).sum();
                 let value = self.lower[start + j] - sum;
                 if i == j {
-                    // What is left of the diagonal after subtraction must be more than rounding.
+                    // The rest of the diagonal after subtraction must be larger than rounding errors.
                     if !(value > 1e-13 * greatest && value > 0.0) {
                         return false;
                     }
@@ -69,12 +67,12 @@ impl Symmetric {
         true
     }
 
-    /// Solves for one right side, and is of no use afterwards; `None` if it is not positive definite.
+    /// Solves for one right side and destroys the matrix; `None` if it is not positive definite.
     pub(crate) fn solve(&mut self, right: &[f64]) -> Option<Vec<f64>> {
         self.factor().then(|| self.back(right.to_vec()))
     }
 
-    /// Solves with the factor.
+    /// Solves with the Cholesky factor.
     fn back(&self, mut x: Vec<f64>) -> Vec<f64> {
         for i in 0..self.size {
             let row = &self.lower[i * (i + 1) / 2..][..=i];
@@ -91,7 +89,7 @@ impl Symmetric {
         x
     }
 
-    /// Replaces it by its inverse; `false` if it is not positive definite.
+    /// Replaces the matrix by its inverse; `false` if it is not positive definite.
     pub(crate) fn invert(&mut self) -> bool {
         if !self.factor() {
             return false;
@@ -117,7 +115,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn solutions_solve_and_inverses_invert(
+        fn solve_and_invert_are_correct(
             rows in prop::collection::vec(prop::array::uniform5(-1.0..1.0f64), 7..12),
             right in prop::array::uniform5(-1.0..1.0f64),
         ) {
@@ -142,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn undetermined_systems_are_not_solved() {
+    fn rejects_singular_systems() {
         let mut flat = Symmetric::zero(2);
         flat.add(0, 0, 1.0);
         flat.add(1, 0, 1.0);

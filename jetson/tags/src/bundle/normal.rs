@@ -1,12 +1,11 @@
-//! The normal equations, and how the poses of views are eliminated from them.
+//! Normal equations, and elimination of the views' poses.
 
 use glam::DVec2;
 
 use super::matrix::Symmetric;
 
-/// The normal equations.
 pub(super) struct Normal {
-    /// Number of unknowns that are shared.
+    /// Number of shared parameters.
     pub(super) shared: usize,
     pub(super) matrix: Symmetric,
     pub(super) gradient: Vec<f64>,
@@ -14,12 +13,12 @@ pub(super) struct Normal {
     pub(super) cost: f64,
 }
 
-/// The part of one view.
+/// Normal equations of one view.
 #[derive(Clone, Default)]
 pub(super) struct ViewNormal {
     pub(super) matrix: [[f64; 6]; 6],
     pub(super) gradient: [f64; 6],
-    /// Rows of the block between shared unknowns and these, those that are not zero: sorted.
+    /// Nonzero rows of the block between shared parameters and the view, sorted.
     across: Vec<(usize, [f64; 6])>,
 }
 
@@ -75,9 +74,9 @@ impl Normal {
         }
     }
 
-    /// Returns the system of what is shared, without the views, and each view's inverse; `None` if a
-    /// view is not determined.
-    #[allow(clippy::type_complexity, reason = "used here alone")]
+    /// Returns the reduced system of the shared parameters, and each view's inverse; `None` if a view is not
+    /// determined.
+    #[allow(clippy::type_complexity, reason = "used only here")]
     pub(super) fn reduced(
         &self,
         damping: f64,
@@ -112,7 +111,7 @@ impl Normal {
         Some((matrix, gradient, inverses))
     }
 
-    /// Returns the change of everything; `None` if the equations do not determine it.
+    /// Returns the step of all parameters; `None` if the equations do not determine it.
     pub(super) fn step(&self, damping: f64) -> Option<(Vec<f64>, Vec<[f64; 6]>)> {
         let (mut matrix, gradient, inverses) = self.reduced(damping)?;
         let shared: Vec<f64> = matrix.solve(&gradient)?.into_iter().map(|x| -x).collect();

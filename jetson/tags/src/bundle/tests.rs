@@ -7,7 +7,7 @@ fn rigid(random: &mut Random, position_m: f64, turn_rad: f64) -> Rigid {
     Rigid { t_m: vector() * position_m, q: DQuat::from_scaled_axis(vector() * turn_rad) }
 }
 
-/// Cameras that look down on tags on the floor; corners exact but for `noise_px`.
+/// Cameras that look down at tags on the floor, with `noise_px` on the corners.
 fn floor(noise_px: f64) -> (Bundle, Bundle) {
     let mut random = Random::new(5);
     let lens = Intrinsics {
@@ -56,7 +56,7 @@ fn floor(noise_px: f64) -> (Bundle, Bundle) {
 }
 
 #[test]
-fn exact_corners_lead_back_to_the_truth() {
+fn exact_corners_give_the_true_poses() {
     let (truth, mut start) = floor(0.0);
     let solution = start.solve().unwrap();
     assert!(solution.rms_px < 1e-5, "{}", solution.rms_px);
@@ -70,7 +70,7 @@ fn exact_corners_lead_back_to_the_truth() {
 fn the_reported_covariance_matches_the_error() {
     let (truth, mut start) = floor(0.3);
     let solution = start.solve().unwrap();
-    // Two axes of 0.3 px each, less what the unknowns take up.
+    // 0.3 px on each of two axes, minus the share absorbed by the parameters.
     assert!((0.3..0.45).contains(&solution.rms_px), "{}", solution.rms_px);
     let mut square = 0.0;
     let mut count = 0.0;
@@ -86,7 +86,7 @@ fn the_reported_covariance_matches_the_error() {
 }
 
 #[test]
-fn a_misread_tag_hardly_pulls() {
+fn a_misread_tag_has_little_influence() {
     let (truth, mut start) = floor(0.05);
     for seen in &mut start.seen[40..44] {
         seen.pixel += DVec2::new(60.0, -25.0);
@@ -98,7 +98,7 @@ fn a_misread_tag_hardly_pulls() {
 }
 
 #[test]
-fn an_unseen_tag_is_not_determined() {
+fn rejects_a_problem_with_an_unseen_tag() {
     let (_, mut start) = floor(0.1);
     start.pose(Rigid::IDENTITY, Parameter::Shared);
     assert!(start.solve().is_none());

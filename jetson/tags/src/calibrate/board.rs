@@ -1,4 +1,4 @@
-//! What is held before a camera: where its corners are on it.
+//! Calibration boards and the positions of their corners.
 
 use std::path::Path;
 
@@ -10,12 +10,12 @@ use crate::detection::Detection;
 use crate::file::{self, FileError};
 use crate::layout::TagLayout;
 
-/// A board to calibrate with.
+/// A calibration board.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Board {
-    /// Tags on a plane, any of which may be seen.
+    /// Tags on a plane; a view may show some of them.
     Tags(TagLayout),
-    /// A checkerboard, which must be seen as a whole.
+    /// A checkerboard; a view must show all of it.
     Checkerboard(Checkerboard),
 }
 
@@ -32,7 +32,7 @@ impl From<Checkerboard> for Board {
 }
 
 impl Board {
-    /// Reads its file: a layout of tags, or a `[checkerboard]`.
+    /// Reads a board file: a layout of tags, or a `[checkerboard]`.
     ///
     /// # Errors
     /// As [`TagLayout::read`] and [`Checkerboard::read`].
@@ -60,7 +60,7 @@ impl Board {
         Err(Refused { why, add })
     }
 
-    /// Returns how many corners make a view: of fewer the homography is shaky.
+    /// Returns the minimum number of corners of a view, for a stable homography.
     pub(super) fn least_corners(&self) -> usize {
         match self {
             Self::Tags(_) => 4 * MIN_TAGS,
@@ -68,7 +68,7 @@ impl Board {
         }
     }
 
-    /// Returns the corners of its tags, on the board and in the image. [m, board] [px]
+    /// Returns the corners of the board's tags, on the board and in the image. [m, board] [px]
     pub(super) fn corners_of(&self, detections: &[Detection]) -> Vec<(DVec2, DVec2)> {
         let Self::Tags(layout) = self else { return Vec::new() };
         let known = detections.iter().filter_map(|detection| {
@@ -78,12 +78,12 @@ impl Board {
         known.flatten().collect()
     }
 
-    /// Returns the corners of a checkerboard likewise.
+    /// Returns the corners of a checkerboard, on the board and in the image. [m, board] [px]
     pub(super) fn checkerboard(&self, corners_px: &[DVec2]) -> Vec<(DVec2, DVec2)> {
         let Self::Checkerboard(board) = self else { return Vec::new() };
         board.corners_m().into_iter().zip(corners_px.iter().copied()).collect()
     }
 }
 
-/// Tags that a view must have.
+/// Minimum number of tags in a view.
 const MIN_TAGS: usize = 4;

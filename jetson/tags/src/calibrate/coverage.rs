@@ -1,14 +1,14 @@
-//! Where a board has been, and where it has not.
+//! Coverage of the image and of board tilts.
 
 use glam::{DVec2, DVec3};
 
-/// Where corners were seen, and how the board was tilted.
+/// Distribution of corners in the image, and tilts of the board.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Coverage {
     size_px: [u32; 2],
-    /// Corners in each part of the image, row by row.
+    /// Number of corners in each part of the image, row by row.
     counts: [u32; COLUMNS * ROWS],
-    /// Greatest tilt towards each of left, right, up, down. [rad]
+    /// Maximum tilt towards left, right, up, and down. [rad]
     tilts_rad: [f64; 4],
 }
 
@@ -27,7 +27,7 @@ impl Coverage {
         }
     }
 
-    /// Takes the board's normal in `cam`; it points to the camera.
+    /// Adds the board's normal in `cam`; it points to the camera.
     pub(super) fn tilt(&mut self, normal: DVec3) {
         let towards = -normal.z;
         let sides = [-normal.x, normal.x, -normal.y, normal.y];
@@ -36,13 +36,13 @@ impl Coverage {
         }
     }
 
-    /// Returns how much of the image has been covered, 0 to 1.
+    /// Returns the covered share of the image, 0 to 1.
     pub fn share(&self) -> f64 {
         let seen = self.counts.iter().filter(|&&count| count >= ENOUGH).count();
         seen as f64 / self.counts.len() as f64
     }
 
-    /// Returns the parts of the image, row by row, `#` where the board has been and `.` where not.
+    /// Returns the parts of the image, row by row: `#` if covered, `.` if not.
     pub fn map(&self) -> Vec<String> {
         self.counts
             .chunks(COLUMNS)
@@ -50,14 +50,14 @@ impl Coverage {
             .collect()
     }
 
-    /// Returns where to hold the board, each a sentence.
+    /// Returns instructions for missing views.
     pub fn wanted(&self) -> Vec<String> {
         let mut wanted = Vec::new();
         let missing = |rows: std::ops::Range<usize>, columns: std::ops::Range<usize>| {
             rows.flat_map(|row| columns.clone().map(move |column| row * COLUMNS + column))
                 .any(|part| self.counts[part] < ENOUGH)
         };
-        // Thirds of the image; corners first, which are the hardest to reach and constrain the lens most.
+        // Edges before the centre, corners first: they are hardest to reach and constrain the lens most.
         let [low, mid, high] = [0..1, 1..ROWS - 1, ROWS - 1..ROWS];
         let [left, middle, right] = [0..1, 1..COLUMNS - 1, COLUMNS - 1..COLUMNS];
         for (name, rows, columns) in [
@@ -85,10 +85,10 @@ impl Coverage {
     }
 }
 
-/// Parts of the image, across and down.
+/// Number of parts of the image, horizontally and vertically.
 const COLUMNS: usize = 5;
 const ROWS: usize = 4;
-/// Corners that a part of the image must have.
+/// Minimum number of corners in a part of the image.
 const ENOUGH: u32 = 4;
-/// Boards that face the camera carry little information on the focal length: 18 degrees at least. [rad]
+/// Minimum tilt: boards that face the camera give little information about the focal length. 18 degrees. [rad]
 const MIN_TILT_RAD: f64 = 0.314;

@@ -1,4 +1,4 @@
-//! The board's plane in an image: its homography, the focal length from it, its pose.
+//! Homography of the board's plane, and the focal length and pose from it.
 
 use glam::{DMat3, DVec2, DVec3};
 use vizflyt_protocol::geometry::Intrinsics;
@@ -9,17 +9,17 @@ use crate::bundle::Rigid;
 /// The homography from a plane [m] to the image [px].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Plane {
-    /// Its sign is any.
+    /// The homography, with arbitrary sign.
     pixel_from_plane: DMat3,
-    /// What makes the third component positive, and so depth.
+    /// Sign that makes the third component positive, so that it is the depth.
     depth_sign: f64,
-    /// Middle of the corners on the plane. [m]
+    /// Mean of the corners on the plane. [m]
     middle_m: DVec2,
 }
 
 impl Plane {
-    /// Fits it to corners on the plane and in the image, by least squares of the algebraic error in
-    /// normalised coordinates (Hartley and Zisserman 2004, algorithm 4.2), its last element 1.
+    /// Fits the homography to corners on the plane and in the image, by least squares of the algebraic error in
+    /// normalised coordinates (Hartley and Zisserman 2004, algorithm 4.2), with a last element of 1.
     pub(super) fn fit(corners: &[(DVec2, DVec2)]) -> Option<Self> {
         let (on_plane, plane_from) = normalise(corners.iter().map(|c| c.0))?;
         let (in_image, image_from) = normalise(corners.iter().map(|c| c.1))?;
@@ -49,7 +49,7 @@ impl Plane {
         whole.is_finite().then_some(Self { pixel_from_plane: whole, depth_sign, middle_m })
     }
 
-    /// Returns the plane's pose behind a lens, its distortion left out: a start, no answer.
+    /// Returns the plane's pose behind a lens, without distortion: only an initial pose.
     pub(super) fn pose(&self, lens: &Intrinsics) -> Option<Rigid> {
         let slope_from_pixel = DMat3::from_cols(
             DVec3::new(1.0 / lens.fx_px, 0.0, 0.0),
@@ -65,8 +65,8 @@ impl Plane {
     }
 }
 
-/// Returns the focal length that all homographies agree on best, for square pixels and this principal
-/// point: columns of a rotation are perpendicular and of one length.
+/// Returns the focal length that fits all homographies best, for square pixels and this principal point: columns of a
+/// rotation are perpendicular and of equal length.
 pub(super) fn focal_px(planes: &[Plane], middle: DVec2) -> Option<f64> {
     // Each view gives two equations a x + b = 0 for x = 1 / f^2.
     let (mut ab, mut aa) = (0.0, 0.0);
@@ -87,7 +87,7 @@ pub(super) fn focal_px(planes: &[Plane], middle: DVec2) -> Option<f64> {
     (x > 0.0).then(|| 1.0 / x.sqrt()).filter(|f| f.is_finite())
 }
 
-/// Shifts and scales points to mean 0 and mean distance sqrt 2; `None` for points all in one place.
+/// Shifts and scales points to mean 0 and mean distance sqrt 2; `None` if all points coincide.
 fn normalise(points: impl Iterator<Item = DVec2>) -> Option<(Vec<DVec2>, DMat3)> {
     let points: Vec<DVec2> = points.collect();
     let count = points.len() as f64;
@@ -101,7 +101,7 @@ fn normalise(points: impl Iterator<Item = DVec2>) -> Option<(Vec<DVec2>, DMat3)>
     Some((points.into_iter().map(|p| (p - mean) * scale).collect(), matrix))
 }
 
-/// Solves 8 equations by elimination with the greatest pivot.
+/// Solves 8 equations by elimination with partial pivoting.
 fn eliminate(m: &mut [[f64; 9]; 8]) -> Option<[f64; 8]> {
     for i in 0..8 {
         let pivot = (i..8).max_by(|&a, &b| m[a][i].abs().total_cmp(&m[b][i].abs()))?;

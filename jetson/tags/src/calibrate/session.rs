@@ -1,4 +1,4 @@
-//! From images to a lens: detection, choice of views, and a second look at the chosen ones.
+//! Calibration from images: detection, selection of views, and a second detection in the selected images.
 
 use super::{Board, Calibrated, Calibrator, LensModel, Refused, ViewOutcome};
 use crate::detect::{Detector, DetectorSettings};
@@ -6,23 +6,22 @@ use crate::family::TagFamily;
 use crate::image::Gray;
 use vizflyt_protocol::geometry::Intrinsics;
 
-/// Takes images of a board until they determine the lens.
+/// Collects images of a board until they determine the lens.
 ///
-/// Corners are measured along edges that are straight behind the lens; at first nobody knows the lens.
-/// So chosen images are kept, and looked at again once a first lens is found.
+/// Corners are measured along edges that are straight behind the lens, but the lens is unknown at first. So the
+/// selected images are kept, and detection runs again with the first lens.
 pub struct Session {
     board: Board,
     model: LensModel,
-    /// None for a checkerboard.
+    /// `None` for a checkerboard.
     detector: Option<Detector>,
     calibrator: Option<Calibrator>,
     kept: Vec<Gray>,
-    /// Inner corners of a checkerboard that is not the one of the file.
+    /// Inner corners of a detected checkerboard that does not match the file.
     another: Option<(u32, u32)>,
 }
 
 impl Session {
-    /// Begins with a board.
     pub fn new(board: impl Into<Board>, model: LensModel) -> Self {
         let board = board.into();
         let detector = match &board {
@@ -38,10 +37,10 @@ impl Session {
         Self { board, model, detector, calibrator: None, kept: Vec::new(), another: None }
     }
 
-    /// Takes an image; with `is_stream`, as [`Calibrator::add`].
+    /// Processes an image; `is_stream` as in [`Calibrator::add`].
     ///
     /// # Errors
-    /// [`Refused`] if it is of another size than those before, or the board is no board.
+    /// [`Refused`] if the image differs in size from the previous ones, or the board is invalid.
     pub fn take(&mut self, image: Gray, is_stream: bool) -> Result<ViewOutcome, Refused> {
         let size = [image.width_px(), image.height_px()];
         let calibrator = match &mut self.calibrator {
@@ -82,7 +81,7 @@ impl Session {
         Ok(verdict)
     }
 
-    /// Returns what has been gathered; `None` before the first image.
+    /// Returns the collected views; `None` before the first image.
     pub fn progress(&self) -> Option<&Calibrator> {
         self.calibrator.as_ref()
     }
@@ -90,11 +89,11 @@ impl Session {
     /// Returns the lens.
     ///
     /// # Errors
-    /// [`Refused`] for images that do not determine one well: its message lists what to add.
+    /// [`Refused`] if the images do not determine the lens well; its message lists the missing views.
     pub fn finish(mut self) -> Result<Calibrated, Refused> {
         let Some(calibrator) = self.calibrator else {
             return Err(Refused {
-                why: "there is no image".into(),
+                why: "no image was taken".into(),
                 add: vec!["show the board to the camera".into()],
             });
         };
@@ -105,13 +104,13 @@ impl Session {
             }
             _ => refused,
         })?;
-        // A checkerboard's corners are measured without a lens.
+        // Corners of a checkerboard are detected without a lens.
         let Some(detector) = &mut self.detector else { return Ok(first) };
         let mut again = Calibrator::new(self.board.clone(), calibrator.size_px)?;
         for image in &self.kept {
             again.add(&detector.search(image, &first.intrinsics, true), false);
         }
-        // The second look may lose a view that the first just found: then the first lens holds.
+        // The second detection may miss a view that the first one barely found: then the first lens is returned.
         match again.finish(self.model) {
             Ok(second) if second.calibration.rms_px <= first.calibration.rms_px => Ok(second),
             _ => Ok(first),

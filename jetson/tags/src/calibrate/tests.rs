@@ -27,7 +27,7 @@ fn webcam() -> Intrinsics {
     }
 }
 
-/// The board's tags as seen from a pose, corners off by `noise_px`; those outside are not seen.
+/// Returns the tags of a board at a pose, with `noise_px` on the corners; without tags outside the image.
 fn look(
     lens: &Intrinsics,
     cam_from_board: Rigid,
@@ -58,7 +58,7 @@ fn look(
     detections
 }
 
-/// A board in one of nine places of the image, tilted by up to `tilt_rad`.
+/// A board in one of nine parts of the image, tilted by up to `tilt_rad`.
 fn pose(lens: &Intrinsics, i: u32, tilt_rad: f64, random: &mut Random) -> Rigid {
     let place = |n: u32| f64::from(n) - 1.0;
     let depth_m = 0.32 + 0.1 * random.unit();
@@ -83,17 +83,17 @@ fn gather(lens: &Intrinsics, views: u32, tilt_rad: f64, noise_px: f64) -> Calibr
 }
 
 #[test]
-fn a_lens_is_found_to_a_thousandth() {
+fn calibrates_a_lens_to_a_thousandth() {
     let truth = webcam();
     let found = gather(&truth, 45, 0.7, 0.1).finish(LensModel::BrownConrady).unwrap();
     let k = found.intrinsics;
     assert!((k.fx_px / truth.fx_px - 1.0).abs() < 1e-3, "{k:?}");
     assert!((k.fy_px / truth.fy_px - 1.0).abs() < 1e-3, "{k:?}");
     assert!((k.cx_px - truth.cx_px).abs() < 1.0 && (k.cy_px - truth.cy_px).abs() < 1.0, "{k:?}");
-    // Two axes of 0.1 px each.
+    // 0.1 px on each of two axes.
     assert!((0.10..0.18).contains(&found.calibration.rms_px), "{:?}", found.calibration);
     assert!((0.10..0.20).contains(&found.calibration.held_out_rms_px), "{:?}", found.calibration);
-    // What counts: rays through the whole image, the corners too.
+    // Rays through the whole image must match, also in the corners.
     for (x, y) in [(20.0, 20.0), (1260.0, 30.0), (640.0, 360.0), (15.0, 700.0), (1270.0, 710.0)] {
         let pixel = DVec2::new(x, y);
         let off = truth.slope(pixel).unwrap() - k.slope(pixel).unwrap();
@@ -102,7 +102,7 @@ fn a_lens_is_found_to_a_thousandth() {
 }
 
 #[test]
-fn a_lens_is_found_from_images() {
+fn calibrates_a_lens_from_rendered_images() {
     let truth = Intrinsics {
         fx_px: 460.0,
         fy_px: 459.0,
@@ -116,7 +116,7 @@ fn a_lens_is_found_from_images() {
     let mut session = Session::new(board(), LensModel::BrownConrady);
     for i in 0..36 {
         let Rigid { t_m, q } = pose(&truth, i, 0.7, &mut random);
-        // The board moves; the camera is the world.
+        // The board moves; the camera's frame is the world.
         let board = board();
         let placed = [Placed::anywhere(&board, Pose::new(t_m, q))];
         let light = Light { gradient: DVec2::new(0.3, -0.2), vignette: 0.2, ..Light::default() };
@@ -138,7 +138,7 @@ fn a_lens_is_found_from_images() {
     );
     assert!(found.calibration.rms_px < 0.25, "{found:?}");
     assert!(found.calibration.held_out_rms_px < 0.3, "{found:?}");
-    // The sigmas that it states hold the truth.
+    // The error is within the returned sigmas.
     assert!((k.fx_px - truth.fx_px).abs() < 5.0 * found.sigma_px[0] + 0.2, "{found:?}");
     let other = Gray::plain(320, 240, 90);
     let mut session = Session::new(board(), LensModel::BrownConrady);
@@ -147,7 +147,7 @@ fn a_lens_is_found_from_images() {
 }
 
 #[test]
-fn a_fisheye_is_found_by_its_own_model() {
+fn calibrates_a_fisheye_with_its_model() {
     let truth = Intrinsics {
         fx_px: 420.0,
         fy_px: 420.0,
@@ -158,7 +158,7 @@ fn a_fisheye_is_found_by_its_own_model() {
     let mut calibrator = Calibrator::new(board(), [1280, 720]).unwrap();
     for i in 0..70 {
         let mut pose = pose(&truth, i, 0.6, &mut random);
-        // Nearer, and further out: its images are small.
+        // Closer and further out, because a fisheye shows the board small.
         pose.t_m *= DVec3::new(0.9, 0.9, 0.6);
         calibrator.add(&look(&truth, pose, 0.1, &mut random), false);
     }
@@ -168,14 +168,14 @@ fn a_fisheye_is_found_by_its_own_model() {
 }
 
 #[test]
-fn a_bad_set_is_refused_with_advice() {
+fn rejects_an_insufficient_set_with_instructions() {
     let refused = |calibrator: &Calibrator, parts: &[&str]| {
         let error = calibrator.finish(LensModel::BrownConrady).unwrap_err().to_string();
         for part in parts {
             assert!(error.contains(part), "{error:?} lacks {part:?}");
         }
     };
-    // Too few.
+    // Too few views.
     refused(&gather(&webcam(), 8, 0.7, 0.1), &["more views"]);
     // Never tilted: focal length and distance cannot be separated.
     refused(&gather(&webcam(), 45, 0.02, 0.1), &["turn the board to face to the left"]);
@@ -188,19 +188,19 @@ fn a_bad_set_is_refused_with_advice() {
         middle.add(&look(&webcam(), pose, 0.1, &mut random), false);
     }
     refused(&middle, &["upper left corner", "lower edge"]);
-    // Corners that scatter by pixels: a bent board, blur.
+    // Corners that scatter by pixels, as with a bent board or blur.
     refused(&gather(&webcam(), 45, 0.7, 1.5), &["px off", "flat"]);
 }
 
 #[test]
-fn views_that_add_nothing_are_not_kept() {
+fn keeps_only_still_and_new_views() {
     let mut random = Random::new(1);
     let lens = webcam();
     let mut calibrator = Calibrator::new(board(), [1280, 720]).unwrap();
     let at = pose(&lens, 4, 0.3, &mut random);
     let view = look(&lens, at, 0.1, &mut random);
     assert_eq!(calibrator.add(&view[..3], false), ViewOutcome::TooFewTags);
-    // The three tags have not moved since the image before.
+    // The three tags have not moved since the previous image.
     assert_eq!(calibrator.add(&view, true), ViewOutcome::Kept);
     assert_eq!(calibrator.add(&look(&lens, at, 0.1, &mut random), true), ViewOutcome::KnownView);
     let moved = pose(&lens, 0, 0.3, &mut random);
@@ -211,14 +211,14 @@ fn views_that_add_nothing_are_not_kept() {
 }
 
 #[test]
-fn a_board_that_is_no_plane_is_refused() {
+fn rejects_a_bent_board() {
     let mut bent = board();
     bent.tags[3].position_m.z = 0.01;
     assert!(Calibrator::new(bent, [1280, 720]).unwrap_err().to_string().contains("not flat"));
 }
 
 #[test]
-fn wrong_counts_of_a_checkerboard_are_named() {
+fn reports_wrong_corner_counts_of_a_checkerboard() {
     use crate::checkerboard::Checkerboard;
     use crate::checkerboard::tests::{BOARD, PAINTER, pose};
 
@@ -242,7 +242,7 @@ fn wrong_counts_of_a_checkerboard_are_named() {
 }
 
 #[test]
-fn a_lens_is_found_from_images_of_a_checkerboard() {
+fn calibrates_a_lens_from_images_of_a_checkerboard() {
     use crate::checkerboard::tests::{BOARD, PAINTER, pose, webcam};
 
     let truth = webcam();
@@ -250,7 +250,7 @@ fn a_lens_is_found_from_images_of_a_checkerboard() {
     let mut session = Session::new(BOARD, LensModel::BrownConrady);
     assert_eq!(session.take(Gray::plain(640, 480, 90), false).unwrap(), ViewOutcome::NoBoard);
     for i in 0..45 {
-        // Into the corners; where the image cuts the board, it is not found.
+        // Into the corners; a board that is cut by the image's border is not detected.
         let at = pose(i, 0.75, DVec2::new(158.0, 126.0), &mut random);
         session.take(PAINTER.paint(&BOARD, &at, 2.0, i.into()), false).unwrap();
     }

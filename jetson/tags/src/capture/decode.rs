@@ -11,10 +11,10 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 
 use crate::image::Gray;
 
-/// Returns the image in a file's bytes, whose format is detected; colours become grey.
+/// Decodes a PNG, JPEG or PGM file to grey. The format is detected.
 ///
 /// # Errors
-/// What is wrong with it, in words.
+/// A message about the problem.
 ///
 /// ```
 /// use vizflyt_tags::capture::decode;
@@ -48,7 +48,7 @@ fn png(bytes: &[u8]) -> Result<Gray, String> {
     Gray::new(width, height, pixels).ok_or_else(|| "damaged".into())
 }
 
-/// Returns the brightness of a JPEG; its colours are not even computed.
+/// Decodes the brightness of a JPEG, without its colours.
 pub(super) fn jpeg(bytes: &[u8]) -> Result<Gray, String> {
     let side = Intrinsics::MAX_SIDE_PX as usize;
     let options = DecoderOptions::new_fast()
@@ -61,12 +61,12 @@ pub(super) fn jpeg(bytes: &[u8]) -> Result<Gray, String> {
     Gray::new(info.width.into(), info.height.into(), pixels).ok_or_else(|| "damaged".into())
 }
 
-/// Reads a PGM (netpbm's pgm(5)) of 8 bits.
+/// Decodes an 8-bit PGM (netpbm's pgm(5)).
 fn pgm(bytes: &[u8]) -> Option<Gray> {
     let mut rest = bytes.strip_prefix(b"P5")?;
     let mut numbers = [0u32; 3];
     for number in &mut numbers {
-        // White space and comments to the end of a line, at least one byte.
+        // At least one byte of white space or comments, which end with the line.
         let mut spaces = 0;
         loop {
             match rest.first()? {
@@ -105,5 +105,5 @@ pub(super) fn check(width: u32, height: u32) -> Result<(), String> {
     Err(format!("{width}x{height} is outside 1x1 to {0}x{0}", Intrinsics::MAX_SIDE_PX))
 }
 
-/// An 8K image in three colours; a few bytes can claim far more. [bytes]
+/// Maximum decoded size: an 8K image in three colours. A small file can claim far more. [bytes]
 const MAX_DECODED: u64 = 128 << 20;

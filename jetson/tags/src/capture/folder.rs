@@ -5,19 +5,19 @@ use std::path::{Path, PathBuf};
 
 use super::{CaptureError, Exposure, ImageSource, decode};
 
-/// Yields the images of a folder in the order of their names.
+/// Returns the images of a folder in the order of their names.
 ///
-/// Stamps come from `stamps.csv` (lines of `name,stamp_ns`), or from names that are 16 digits or more
-/// (nanoseconds); without either, images are [`Folder::PERIOD_NS`] apart.
+/// Stamps come from `stamps.csv` (lines of `name,stamp_ns`), or from names of at least 16 digits (nanoseconds). Without
+/// either, images are [`Folder::PERIOD_NS`] apart.
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
-    /// Names and stamps, the next one last.
+    /// Remaining names and stamps, the next one last.
     rest: Vec<(String, u64)>,
 }
 
 impl Folder {
-    /// 30 images a second.
+    /// Interval of images without stamps: 30 Hz.
     pub const PERIOD_NS: u64 = 33_333_333;
 
     /// Lists a folder.
@@ -38,7 +38,7 @@ impl Folder {
         if names.is_empty() {
             return Err(CaptureError::unfit(named(), "no .png, .jpg or .pgm files in it"));
         }
-        // Shorter numbers come first: 9.png before 10.png.
+        // Sort by number: 9.png before 10.png.
         names.sort_by(|a, b| (digits(a), a).cmp(&(digits(b), b)));
         let table = path.join("stamps.csv");
         let stamps = match std::fs::read_to_string(&table) {
@@ -69,7 +69,7 @@ impl ImageSource for Folder {
         let path = self.path.join(name);
         let bytes = std::fs::read(&path)
             .map_err(|error| CaptureError::io(path.display().to_string(), error))?;
-        // Unlike a radio link, a folder should be complete: a damaged file is reported, not skipped.
+        // Unlike a network stream, a folder should be complete: a damaged file is an error and is not skipped.
         let image =
             decode(&bytes).map_err(|why| CaptureError::unfit(path.display().to_string(), why))?;
         Ok(Some(Exposure { stamp_ns, image }))
@@ -80,10 +80,10 @@ impl ImageSource for Folder {
     }
 }
 
-/// Reads `stamps.csv`: lines of a file's name and its stamp in nanoseconds, after a heading or not.
+/// Parses `stamps.csv`: lines of a file name and its stamp in nanoseconds, with an optional header.
 ///
 /// # Errors
-/// Which line is wrong, in words.
+/// A message with the number of the invalid line.
 ///
 /// ```
 /// let stamps = vizflyt_tags::capture::parse_stamps("name,stamp_ns\n1.png,5000\n").unwrap();
@@ -114,7 +114,7 @@ fn is_image(name: &str) -> bool {
     ["png", "jpg", "jpeg", "pgm"].iter().any(|known| ending.eq_ignore_ascii_case(known))
 }
 
-/// Returns how many digits a name begins with; names without one come last.
+/// Returns the number of leading digits in a name; names without digits are sorted last.
 fn digits(name: &str) -> usize {
     match name.bytes().take_while(u8::is_ascii_digit).count() {
         0 => usize::MAX,
@@ -122,7 +122,7 @@ fn digits(name: &str) -> usize {
     }
 }
 
-/// Returns a name's number if it is one of nanoseconds.
+/// Returns the stamp in a name, if it has enough digits for nanoseconds.
 fn stem_ns(name: &str) -> Option<u64> {
     let (stem, _) = name.rsplit_once('.')?;
     (stem.len() >= 16).then(|| stem.parse().ok())?

@@ -6,14 +6,14 @@ use std::process::{Child, Command, Stdio};
 
 use super::{CaptureError, Exposure, ImageSource, Y4m, now_ns};
 
-/// Yields the images of a YUV4MPEG2 stream.
+/// Reader of a YUV4MPEG2 stream.
 pub struct Pipe {
     name: String,
     reader: Box<dyn Read + Send>,
     stream: Y4m,
-    /// Ends with this source.
+    /// Process that writes the stream; killed with this source.
     child: Option<Child>,
-    /// Stamps count from the first image by the stream's rate; else images are stamped on arrival.
+    /// Whether stamps are computed from the stream's rate; otherwise images are stamped on arrival.
     is_recorded: bool,
     count: u64,
     buffer: Vec<u8>,
@@ -25,10 +25,10 @@ impl Pipe {
         Self::new("standard input", Box::new(std::io::stdin()), None, false)
     }
 
-    /// Runs a shell command and reads what it prints.
+    /// Runs a shell command and reads its output.
     ///
     /// # Errors
-    /// [`CaptureError::Io`] if there is no shell.
+    /// [`CaptureError::Io`] if the shell cannot be started.
     pub fn command(command: &str) -> Result<Self, CaptureError> {
         let mut shell = Command::new("sh");
         shell.args(["-c", command]);
@@ -57,8 +57,8 @@ impl Pipe {
             CaptureError::Io { source_name, error }
                 if error.kind() == std::io::ErrorKind::NotFound =>
             {
-                let why = "a video is read by the program ffmpeg, which is not installed; \
-                           `apt-get install ffmpeg` brings it";
+                let why = "video files need the program ffmpeg, which is not installed; \
+                           `apt-get install ffmpeg` installs it";
                 CaptureError::unfit(source_name, why)
             }
             other => other,
@@ -94,7 +94,7 @@ impl Pipe {
         }
     }
 
-    /// Reports why a stream ended: a program that failed has written more to standard error.
+    /// Handles the end of a stream. A failed program has already printed its own error.
     fn ended(&mut self) -> Result<Option<Exposure>, CaptureError> {
         if let Some(mut child) = self.child.take() {
             let status = child.wait().map_err(|error| CaptureError::io(&self.name, error))?;
@@ -143,7 +143,7 @@ impl ImageSource for Pipe {
 impl Drop for Pipe {
     fn drop(&mut self) {
         if let Some(child) = &mut self.child {
-            // It may be gone already.
+            // The process may have ended already.
             let _ = child.kill();
             let _ = child.wait();
         }

@@ -41,7 +41,7 @@ fn all(source: &mut dyn ImageSource) -> Vec<Exposure> {
 }
 
 #[test]
-fn files_of_each_kind_hold_the_image() {
+fn decodes_every_file_format() {
     let image = picture(13, 7, 1);
     assert_eq!(decode(&png(&image)).unwrap(), image);
     assert_eq!(decode(&pgm(&image)).unwrap(), image);
@@ -53,7 +53,7 @@ fn files_of_each_kind_hold_the_image() {
 }
 
 #[test]
-fn a_folder_is_read_in_the_order_of_its_numbers_with_its_stamps() {
+fn reads_a_folder_in_numeric_order_with_its_stamps() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
     for i in [10u8, 9, 1] {
@@ -94,7 +94,7 @@ fn a_folder_is_read_in_the_order_of_its_numbers_with_its_stamps() {
 }
 
 #[test]
-fn names_of_nanoseconds_are_stamps() {
+fn reads_stamps_from_file_names() {
     let folder = tempfile::tempdir().unwrap();
     let name = folder.path().join("1700000000000000123.pgm");
     std::fs::write(name, pgm(&picture(2, 2, 0))).unwrap();
@@ -103,7 +103,7 @@ fn names_of_nanoseconds_are_stamps() {
 }
 
 #[test]
-fn invalid_sources_are_refused_by_name() {
+fn rejects_invalid_sources_by_name() {
     let refused = |source: &str, part: &str| {
         let error = match open(source) {
             Err(error) => error.to_string(),
@@ -116,13 +116,13 @@ fn invalid_sources_are_refused_by_name() {
     refused(empty.path().to_str().unwrap(), "no .png, .jpg or .pgm");
     #[cfg(target_os = "linux")]
     refused("/dev/null", "/dev/null");
-    refused("| printf 'hello, this is no stream of images\\n'", "no YUV4MPEG2 stream");
+    refused("| printf 'hello, this is no stream of images\\n'", "not a YUV4MPEG2 stream");
     refused("| exit 3", "exit status: 3");
     refused("| true", "no image");
 }
 
 #[test]
-fn a_command_s_images_are_yielded_until_it_ends() {
+fn reads_images_of_a_command_until_it_ends() {
     let mut file = tempfile::NamedTempFile::new().unwrap();
     let images = [picture(4, 3, 1), picture(4, 3, 2)];
     file.write_all(&y4m(&images, "mono", 0)).unwrap();
@@ -135,7 +135,7 @@ fn a_command_s_images_are_yielded_until_it_ends() {
 
 proptest! {
     #[test]
-    fn a_stream_is_cut_the_same_at_any_chunk_size(chunk in 1usize..200, odd: bool) {
+    fn parses_a_stream_in_chunks_of_any_size(chunk in 1usize..200, odd: bool) {
         let (width, height) = if odd { (5, 3) } else { (6, 4) };
         let images: Vec<Gray> = (0..3).map(|i| picture(width, height, i)).collect();
         let chroma = 2 * (width.div_ceil(2) * height.div_ceil(2)) as usize;
@@ -154,13 +154,13 @@ proptest! {
     }
 
     #[test]
-    fn a_pgm_is_read_again(width in 1u32..40, height in 1u32..40, seed: u8) {
+    fn pgm_survives_a_round_trip(width in 1u32..40, height in 1u32..40, seed: u8) {
         let image = picture(width, height, seed);
         prop_assert_eq!(decode(&pgm(&image)).unwrap(), image);
     }
 
     #[test]
-    fn any_bytes_are_an_image_or_an_error(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+    fn does_not_panic_on_arbitrary_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
         let _ = decode(&bytes);
         let mut stream = Y4m::default();
         stream.push(&bytes);
@@ -170,8 +170,8 @@ proptest! {
 }
 
 #[test]
-fn a_video_is_read_through_ffmpeg() {
-    // tests/run installs it.
+fn reads_a_video_with_ffmpeg() {
+    // `tests/run` installs ffmpeg.
     let folder = tempfile::tempdir().unwrap();
     let images: Vec<Gray> = (0..5).map(|i| Gray::plain(32, 16, 40 * i + 20)).collect();
     std::fs::write(folder.path().join("plain.y4m"), y4m(&images, "420jpeg", 2 * 16 * 8)).unwrap();
@@ -193,7 +193,7 @@ fn a_video_is_read_through_ffmpeg() {
     );
     for (i, exposure) in found.iter().enumerate() {
         assert_eq!((exposure.image.width_px(), exposure.image.height_px()), (32, 16));
-        // Video leaves out the darkest and brightest levels; grey is spread over all.
+        // Video omits the darkest and brightest levels; grey uses the full range.
         let expected = ((40.0 * i as f64 + 20.0 - 16.0) / 219.0 * 255.0).clamp(0.0, 255.0);
         let grey = f64::from(exposure.image.at(5, 5));
         assert!(
@@ -209,7 +209,7 @@ fn a_video_is_read_through_ffmpeg() {
 }
 
 #[test]
-fn colours_are_three_planes_and_nothing_coarser() {
+fn returns_colours_as_three_full_planes_only() {
     let mut stream = Y4m::default();
     stream.push(b"YUV4MPEG2 W2 H1 F30:1 C444\nFRAME\n\x01\x02\x03\x04\x05");
     assert_eq!(stream.poll_colours(), Ok(None), "a byte is missing");

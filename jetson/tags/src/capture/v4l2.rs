@@ -1,9 +1,8 @@
-//! A camera of Linux (V4L2), and when its images were exposed.
+//! A V4L2 camera of Linux, with exposure times of its images.
 //!
-//! `/dev/video0`, or `/dev/video0:1280x720@60`. Grey, YUYV, NV12 and Motion JPEG are understood; of them,
-//! the one that the camera offers first in this order. Drivers stamp an image when its exposure began
-//! or when its last byte was read, and report which; the stamp is moved to the middle of the exposure of
-//! the middle row.
+//! `/dev/video0`, or `/dev/video0:1280x720@60`. Supported formats are grey, NV12, YUYV and Motion JPEG; the first in
+//! this order that the camera offers is used. Drivers stamp an image at the beginning of its exposure or when its last
+//! byte was read, and report which of these they use. The stamp is moved to the middle of the middle row's exposure.
 
 mod ffi;
 
@@ -15,44 +14,42 @@ use super::{CaptureError, Exposure, ImageSource};
 use crate::image::Gray;
 use ffi::{Buffers, Fourcc, StampKind};
 
-/// A V4L2 camera that streams.
+/// A streaming V4L2 camera.
 #[derive(Debug)]
 pub struct Camera {
     name: String,
     buffers: Buffers,
     layout: Pixels,
-    /// Period of images. [ns]
+    /// Interval of images. [ns]
     period_ns: u64,
-    /// Time that the shutter is open; 0 if the camera does not report it. [ns]
+    /// Exposure time; 0 if the camera does not report it. [ns]
     exposure_ns: u64,
 }
 
-/// How pixels lie in a buffer.
+/// Layout of pixels in a buffer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Pixels {
     width: u32,
     height: u32,
-    /// Bytes from row to row.
+    /// Offset between rows. [bytes]
     stride: usize,
     kind: Fourcc,
 }
 
 impl Camera {
-    /// Opens a camera and starts it.
+    /// Opens a camera and starts its stream.
     ///
     /// # Errors
-    /// [`CaptureError`] if it is not there, is no camera, is in use, or has no format known here.
+    /// [`CaptureError`] if it does not exist, is not a camera, is in use, or has no supported format.
     pub fn open(source: &str) -> Result<Self, CaptureError> {
         let (path, request) = parse(source).map_err(|why| CaptureError::unfit(source, why))?;
         let io = |error| CaptureError::io(path, error);
         let file: File = OpenOptions::new().read(true).write(true).open(path).map_err(io)?;
         if !ffi::streams(&file).map_err(|_| {
-            CaptureError::unfit(
-                path,
-                "this is no V4L2 device; `v4l2-ctl --list-devices` lists them",
-            )
+            CaptureError::unfit(path, "not a V4L2 device; `v4l2-ctl --list-devices` lists them")
         })? {
-            let why = "this device streams no images; cameras often have two, try the other";
+            let why =
+                "this device does not stream images; cameras often have two devices, try the other";
             return Err(CaptureError::unfit(path, why));
         }
         let mut layout = None;
@@ -65,13 +62,13 @@ impl Camera {
             }
         }
         let Some(layout) = layout else {
-            let why = "it offers none of GREY, YUYV, NV12, MJPG; read it through a command, as \
+            let why = "the camera does not offer GREY, YUYV, NV12 or MJPG; use a command, for example \
                        `| gst-launch-1.0 ...`";
             return Err(CaptureError::unfit(path, why));
         };
         if (layout.width, layout.height) != (request.width, request.height) {
             let why = format!(
-                "it gives {}x{} where {}x{} was asked for; a calibration holds for one size",
+                "the camera uses {}x{} instead of {}x{}; a calibration is valid for one size only",
                 layout.width, layout.height, request.width, request.height
             );
             return Err(CaptureError::unfit(path, why));
@@ -89,7 +86,7 @@ impl ImageSource for Camera {
         loop {
             let taken = self.buffers.take(WAIT, |bytes, stamp_ns, stamped| {
                 let stamp_ns = middle_ns(stamp_ns, stamped, period_ns, exposure_ns);
-                // A damaged image of a live camera is dropped; the next one comes at once.
+                // A damaged image of a live camera is dropped; the next one follows soon.
                 grey(bytes, layout).map(|image| Exposure { stamp_ns, image })
             });
             match taken {
@@ -109,7 +106,7 @@ impl ImageSource for Camera {
     }
 }
 
-/// What is asked of a camera.
+/// Requested size and rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct FormatRequest {
     width: u32,
@@ -117,11 +114,11 @@ struct FormatRequest {
     rate_hz: u32,
 }
 
-/// Reads `/dev/video0:1280x720@60`.
+/// Parses `/dev/video0:1280x720@60`.
 fn parse(source: &str) -> Result<(&str, FormatRequest), String> {
     let mut request = FormatRequest { width: 1280, height: 720, rate_hz: 60 };
     let Some((path, mode)) = source.split_once(':') else { return Ok((source, request)) };
-    let wrong = || format!("{mode:?} is no mode; write it as 1280x720 or 1280x720@60");
+    let wrong = || format!("mode {mode:?} is invalid; write it as 1280x720 or 1280x720@60");
     let (size, rate) = mode.split_once('@').unwrap_or((mode, "60"));
     let (width, height) = size.split_once('x').ok_or_else(wrong)?;
     request.width = width.parse().map_err(|_| wrong())?;
@@ -134,10 +131,10 @@ fn parse(source: &str) -> Result<(&str, FormatRequest), String> {
     Ok((path, request))
 }
 
-/// Returns when the middle row's exposure was half over.
+/// Returns the middle of the middle row's exposure.
 fn middle_ns(stamp_ns: u64, stamped: StampKind, period_ns: u64, exposure_ns: u64) -> u64 {
-    // Rows are read one after the other, over nearly the whole period: the middle row is half of it
-    // later than the first.
+    // Rows are read one after the other, over nearly the whole period: the middle row is half a period later than the
+    // first.
     let half_readout_ns = period_ns / 2;
     match stamped {
         StampKind::ExposureBegan => stamp_ns + exposure_ns / 2 + half_readout_ns,
@@ -155,16 +152,16 @@ fn grey(bytes: &[u8], layout: Pixels) -> Option<Gray> {
     for row in 0..height as usize {
         let row = bytes.get(row * stride..)?;
         match kind {
-            // NV12: the plane of brightness comes first.
+            // The first plane of NV12 is brightness.
             Fourcc::Grey | Fourcc::Nv12 => pixels.extend_from_slice(row.get(..width as usize)?),
-            // Brightness is every other byte.
+            // Every second byte is brightness.
             _ => pixels.extend(row.get(..2 * width as usize)?.iter().step_by(2)),
         }
     }
     Gray::new(width, height, pixels)
 }
 
-/// A camera that sends nothing for so long is gone.
+/// Time without images after which a camera counts as disconnected.
 const WAIT: Duration = Duration::from_secs(3);
 
 #[cfg(test)]
@@ -172,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn modes_are_read() {
+    fn parses_size_and_rate_of_a_mode() {
         let request = FormatRequest { width: 640, height: 480, rate_hz: 120 };
         assert_eq!(parse("/dev/video2:640x480@120"), Ok(("/dev/video2", request)));
         assert_eq!(
@@ -187,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn brightness_is_found_in_every_layout() {
+    fn reads_brightness_of_every_pixel_format() {
         let yuyv = [1, 0, 2, 0, 9, 9, 3, 0, 4, 0, 9, 9];
         let layout = Pixels { width: 2, height: 2, stride: 6, kind: Fourcc::Yuyv };
         assert_eq!(grey(&yuyv, layout).unwrap().pixels(), [1, 2, 3, 4]);
@@ -199,10 +196,10 @@ mod tests {
     }
 
     #[test]
-    fn stamps_are_moved_to_the_middle_of_the_exposure() {
+    fn moves_stamps_to_the_middle_of_the_exposure() {
         let ms = 1_000_000;
-        // Shutter open for 4 ms, images every 16 ms, the first row's exposure begins at 100 ms: the
-        // middle row is exposed from 108 to 112 ms, the last byte is read at 120 ms.
+        // Exposure 4 ms, interval 16 ms, and the first row's exposure begins at 100 ms: the middle row is exposed from
+        // 108 to 112 ms, and the last byte is read at 120 ms.
         let began = middle_ns(100 * ms, StampKind::ExposureBegan, 16 * ms, 4 * ms);
         let ended = middle_ns(120 * ms, StampKind::LastByte, 16 * ms, 4 * ms);
         assert_eq!((began, ended), (110 * ms, 110 * ms));

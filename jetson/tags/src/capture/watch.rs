@@ -1,14 +1,14 @@
-//! Is a camera still what it was? Sans-IO.
+//! Detects camera faults. Sans-IO.
 //!
-//! What enters: each image as it comes, why a source ended, and the time. What leaves: whether an image is one to be
-//! located by, and what is wrong in words. A driver that hangs sends nothing; one that is stuck sends an old image
-//! again under a new stamp; a lens that is covered sends black.
+//! Input: each image on arrival, the end of a source, and the time. Output: whether an image is usable for
+//! localization, and a message about the fault. A driver that hangs sends no images; a driver that is stuck repeats an
+//! old image with a new stamp; a covered lens gives black images.
 
 use std::collections::VecDeque;
 
 use crate::image::Gray;
 
-/// Watches one camera.
+/// Fault detection of one camera.
 ///
 /// ```
 /// use vizflyt_tags::capture::CameraWatch;
@@ -16,29 +16,29 @@ use crate::image::Gray;
 /// let mut camera = CameraWatch::new(0);
 /// let image = Gray::plain(64, 48, 200);
 /// assert!(camera.handle_image(1_000_000, &image));
-/// assert!(!camera.handle_image(34_000_000, &image), "no sensor sees the same twice");
+/// assert!(!camera.handle_image(34_000_000, &image), "images of a real sensor always differ");
 /// assert_eq!(camera.fault(35_000_000).unwrap(), "repeats an image: its driver is stuck");
 /// assert_eq!(camera.fault(900_000_000).unwrap(), "no image for 0.9 s");
 /// ```
 #[derive(Clone, Debug)]
 pub struct CameraWatch {
-    /// Of its last images.
+    /// Hashes of the latest images.
     hashes: VecDeque<u64>,
-    /// When the last image came. [ns]
+    /// Arrival of the last image. [ns]
     arrived_ns: u64,
-    /// What is wrong with the last image.
+    /// Fault of the last image.
     unfit: Option<&'static str>,
-    /// Why there are none, until there is one again.
+    /// Why the source ended, until the next image.
     ended: Option<String>,
 }
 
 impl CameraWatch {
-    /// Begins when a source was opened. [ns]
+    /// Makes a watch for a source opened at `now_ns`.
     pub fn new(now_ns: u64) -> Self {
         Self { hashes: VecDeque::new(), arrived_ns: now_ns, unfit: None, ended: None }
     }
 
-    /// Takes an image; returns whether it may be located by.
+    /// Checks an image; returns whether it is usable for localization.
     pub fn handle_image(&mut self, now_ns: u64, image: &Gray) -> bool {
         let hash = hash(image.pixels());
         let repeats = self.hashes.contains(&hash);
@@ -61,27 +61,27 @@ impl CameraWatch {
         self.unfit.is_none()
     }
 
-    /// Takes why there are no more images.
+    /// Records why the source ended.
     pub fn handle_end(&mut self, why: String) {
         self.ended = Some(why);
     }
 
-    /// Returns what is wrong now; `None` for a camera that is well.
+    /// Returns the present fault; `None` for a working camera.
     pub fn fault(&self, now_ns: u64) -> Option<String> {
         if let Some(why) = &self.ended {
             return Some(why.clone());
         }
         let silent_ns = now_ns.saturating_sub(self.arrived_ns);
         if silent_ns > SILENT_NS {
-            // In tenths, so that it does not change with every look.
+            // Rounded to tenths, so that the message does not change with every call.
             return Some(format!("no image for {:.1} s", silent_ns as f64 / 1e9));
         }
         self.unfit.map(str::to_owned)
     }
 }
 
-/// Returns a number that two different images hardly share (a multiplicative hash of eight bytes at a time; 1280 x 720
-/// take 0.1 ms).
+/// Returns a hash that is unlikely to be the same for two different images: multiplicative, eight bytes at a time. 1280
+/// x 720 take 0.1 ms.
 fn hash(bytes: &[u8]) -> u64 {
     let mut words = bytes.chunks_exact(8);
     let mut hash = 0xcbf2_9ce4_8422_2325u64;
@@ -95,13 +95,14 @@ fn hash(bytes: &[u8]) -> u64 {
         .fold(hash, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x9e37_79b9_7f4a_7c15))
 }
 
-/// A stuck driver hands out its buffers again, one or all of them in turn.
+/// Number of compared images: a stuck driver repeats its buffers, one or all in turn.
 const MAX_HASHES: usize = 8;
-/// The slowest camera takes 10 images a second; it is named within half a second. [ns]
+/// Time without images that is a fault. The slowest camera has 10 Hz, and the fault is reported within half a second.
+/// [ns]
 const SILENT_NS: u64 = 350_000_000;
-/// Where nothing is brighter no tag is read. [grey levels of 255]
+/// Maximum brightness of a dark image, in which no tag is readable. [grey levels of 255]
 const DARK: u8 = 24;
-/// One pixel of so many is looked at: of rows whose length is no multiple of it, all columns.
+/// Every 61st pixel is tested. Since row lengths are not multiples of it, this covers all columns.
 const SAMPLED: usize = 61;
 
 #[cfg(test)]
@@ -114,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_comes_back_is_well_again() {
+    fn clears_the_fault_when_a_camera_recovers() {
         let ms = 1_000_000;
         let mut camera = CameraWatch::new(0);
         let check = |camera: &CameraWatch, at_ms: u64, expected: Option<&str>| {
@@ -124,7 +125,7 @@ mod tests {
         check(&camera, 400, Some("no image for 0.4 s"));
         assert!(camera.handle_image(500 * ms, &picture(1)));
         check(&camera, 600, None);
-        // Its buffers, again and again.
+        // The buffers repeat.
         for (i, seed) in [2, 3, 4].into_iter().enumerate() {
             assert!(camera.handle_image((500 + i as u64) * ms, &picture(seed)));
         }

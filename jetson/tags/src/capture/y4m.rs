@@ -1,10 +1,10 @@
-//! YUV4MPEG2, raw images on a pipe: what `ffmpeg -f yuv4mpegpipe` and GStreamer's `y4menc` print
-//! (mjpegtools, yuv4mpeg(5)). Of it, the brightness; colours for those who ask.
+//! YUV4MPEG2: raw images on a pipe, as written by `ffmpeg -f yuv4mpegpipe` and GStreamer's `y4menc` (mjpegtools,
+//! yuv4mpeg(5)). Returns the brightness, or optionally the colours.
 
 use super::decode::check;
 use crate::image::Gray;
 
-/// Cuts a stream of bytes into images.
+/// Splits a stream of bytes into images.
 ///
 /// ```
 /// let mut stream = vizflyt_tags::capture::Y4m::default();
@@ -17,11 +17,11 @@ use crate::image::Gray;
 pub struct Y4m {
     bytes: Vec<u8>,
     head: Option<Head>,
-    /// Of the image whose pixels come next.
+    /// Header of the image that is being received.
     image: Option<ImageHead>,
 }
 
-/// What stands before an image.
+/// Header of an image.
 #[derive(Clone, Copy, Debug)]
 struct ImageHead {
     stamp_ns: Option<u64>,
@@ -35,7 +35,7 @@ struct Head {
     rate_hz: Option<f64>,
 }
 
-/// An image's head, its stamp [ns], and its bytes.
+/// Header, stamp [ns] and bytes of an image.
 type Planes = (Head, Option<u64>, Vec<u8>);
 
 impl Head {
@@ -51,7 +51,7 @@ pub struct Colours {
     pub width_px: u32,
     /// Height. [px]
     pub height_px: u32,
-    /// Y, then Cb, then Cr, H x W bytes each.
+    /// Planes Y, Cb, Cr, H x W bytes each.
     pub planes: Vec<u8>,
 }
 
@@ -63,20 +63,20 @@ impl Colours {
 }
 
 impl Y4m {
-    /// Takes bytes.
+    /// Adds received bytes.
     pub fn push(&mut self, bytes: &[u8]) {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// Returns images a second, once the header has come, if it has them.
+    /// Returns the frame rate in the header; `None` before the header, or if it has no rate.
     pub fn rate_hz(&self) -> Option<f64> {
         self.head.and_then(|head| head.rate_hz)
     }
 
-    /// Returns the next whole image, and its `XSTAMP_NS`; `None` if bytes are missing.
+    /// Returns the next complete image and its `XSTAMP_NS`; `None` if bytes are missing.
     ///
     /// # Errors
-    /// What is wrong, in words; the stream cannot be followed further.
+    /// A message about the problem; the stream cannot be continued.
     pub fn poll(&mut self) -> Result<Option<(Option<u64>, Gray)>, String> {
         let Some((head, stamp_ns, mut planes)) = self.planes()? else { return Ok(None) };
         planes.truncate(head.pixels());
@@ -84,11 +84,11 @@ impl Y4m {
         Ok(image.map(|image| (stamp_ns, image)))
     }
 
-    /// Returns the next whole image with its colours, of a stream of `C444`: one plane each of Y, Cb and Cr, H x W;
-    /// `None` if bytes are missing. An image is taken by this or by [`Self::poll`].
+    /// Returns the next complete image with its colours, from a `C444` stream: one plane each of Y, Cb and Cr, H x W.
+    /// `None` if bytes are missing. Each image is returned either by this function or by [`Self::poll`].
     ///
     /// # Errors
-    /// As of [`Self::poll`], and another stream than `C444`.
+    /// As [`Self::poll`], and if the stream is not `C444`.
     pub fn poll_colours(&mut self) -> Result<Option<Colours>, String> {
         let Some((head, _, planes)) = self.planes()? else { return Ok(None) };
         if head.chroma != 2 * head.pixels() {
@@ -97,7 +97,7 @@ impl Y4m {
         Ok(Some(Colours { width_px: head.width, height_px: head.height, planes }))
     }
 
-    /// Takes the bytes of the next image.
+    /// Removes and returns the bytes of the next image.
     fn planes(&mut self) -> Result<Option<Planes>, String> {
         let head = match self.head {
             Some(head) => head,
@@ -122,12 +122,12 @@ impl Y4m {
         Ok(Some((head, stamp_ns, planes)))
     }
 
-    /// Takes a line, without its end.
+    /// Removes and returns a line without its end.
     fn line(&mut self) -> Result<Option<String>, String> {
         let Some(end) = self.bytes.iter().take(MAX_LINE).position(|&b| b == b'\n') else {
             if self.bytes.len() >= MAX_LINE {
                 return Err(
-                    "this is no YUV4MPEG2 stream; let ffmpeg or GStreamer's y4menc write it".into(),
+                    "not a YUV4MPEG2 stream; write it with ffmpeg or GStreamer's y4menc".into()
                 );
             }
             return Ok(None);
@@ -141,14 +141,16 @@ impl Y4m {
 fn parse_head(line: &str) -> Result<Head, String> {
     let mut words = line.split(' ');
     if words.next() != Some("YUV4MPEG2") {
-        return Err("this is no YUV4MPEG2 stream; let ffmpeg or GStreamer's y4menc write it".into());
+        return Err("not a YUV4MPEG2 stream; write it with ffmpeg or GStreamer's y4menc".into());
     }
     let (mut width, mut height, mut rate_hz, mut colours) = (0, 0, None, "420");
     for word in words.filter(|word| !word.is_empty()) {
         let Some((tag, value)) = word.split_at_checked(1) else { continue };
         match tag {
-            "W" => width = value.parse().map_err(|_| format!("width {value:?} is no number"))?,
-            "H" => height = value.parse().map_err(|_| format!("height {value:?} is no number"))?,
+            "W" => width = value.parse().map_err(|_| format!("width {value:?} is not a number"))?,
+            "H" => {
+                height = value.parse().map_err(|_| format!("height {value:?} is not a number"))?
+            }
             "F" => rate_hz = parse_rate(value),
             "C" => colours = value,
             _ => {}
@@ -179,11 +181,13 @@ fn parse_rate(value: &str) -> Option<f64> {
 fn parse_image(line: &str) -> Result<ImageHead, String> {
     let mut words = line.split(' ');
     if words.next() != Some("FRAME") {
-        return Err("an image does not begin where the one before ends: bytes are missing".into());
+        return Err(
+            "an image does not begin at the end of the previous one: bytes are missing".into()
+        );
     }
     let mut stamps = words.filter_map(|word| word.strip_prefix("XSTAMP_NS="));
     Ok(ImageHead { stamp_ns: stamps.find_map(|ns| ns.parse().ok()) })
 }
 
-/// Heads are some 60 bytes long.
+/// Maximum length of a header; typical are 60 bytes.
 const MAX_LINE: usize = 1024;

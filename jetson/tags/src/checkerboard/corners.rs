@@ -1,10 +1,10 @@
-//! Corners where four squares meet, one by one.
+//! Detection of single corners where four squares meet.
 
 use glam::{DMat2, DVec2};
 
 use crate::image::Gray;
 
-/// Returns the places that look like such a corner, the clearest first. [px]
+/// Returns corner candidates, the clearest first. [px]
 pub(super) fn candidates(image: &Gray) -> Vec<DVec2> {
     let (width, height) = (image.width_px() as usize, image.height_px() as usize);
     if width <= 2 * BORDER || height <= 2 * BORDER {
@@ -37,8 +37,8 @@ pub(super) fn candidates(image: &Gray) -> Vec<DVec2> {
     kept.into_iter().filter_map(|at| refine(image, at, 3)).collect()
 }
 
-/// Returns how much a place looks like a corner: samples on a ring around it agree with those opposite, differ from
-/// those a quarter turn away, and their mean is that of the middle.
+/// Returns the corner response of a pixel. It is high if samples on a ring agree with the opposite ones and differ from
+/// those a quarter turn away, and if their mean equals that of the middle.
 fn response(smooth: &[f32], width: usize, x: usize, y: usize) -> f32 {
     let at = |dx: isize, dy: isize| {
         smooth[y.wrapping_add_signed(dy) * width + x.wrapping_add_signed(dx)]
@@ -56,7 +56,7 @@ fn response(smooth: &[f32], width: usize, x: usize, y: usize) -> f32 {
     quarters - opposite - 16.0 * (ring_mean - middle).abs()
 }
 
-/// Returns the image with each pixel mixed with its neighbours, 1 2 1 both ways.
+/// Returns the image smoothed by the kernel 1 2 1 in both directions.
 fn smoothed(image: &Gray) -> Vec<f32> {
     let (width, height) = (image.width_px() as usize, image.height_px() as usize);
     let pixels = image.pixels();
@@ -73,8 +73,8 @@ fn smoothed(image: &Gray) -> Vec<f32> {
     smooth
 }
 
-/// Returns a corner to a fraction of a pixel: the point to which all gradients within `half_px` are perpendicular (Forstner
-/// and Gulch 1987). `None` where there is none close by.
+/// Refines a corner to a fraction of a pixel: the point to which all gradients within `half_px` are perpendicular
+/// (Forstner and Gulch 1987). `None` if it does not converge nearby.
 pub(super) fn refine(image: &Gray, start: DVec2, half_px: i32) -> Option<DVec2> {
     let mut corner = start;
     for _ in 0..MAX_ROUNDS {
@@ -88,7 +88,7 @@ pub(super) fn refine(image: &Gray, start: DVec2, half_px: i32) -> Option<DVec2> 
                     sample(image, at + DVec2::X)? - sample(image, at - DVec2::X)?,
                     sample(image, at + DVec2::Y)? - sample(image, at - DVec2::Y)?,
                 );
-                // What lies at the window's border would pull as it comes and goes.
+                // Less weight towards the window's border: pixels that enter or leave the window would cause jumps.
                 let weight = (-off.length_squared() / f64::from(half_px * half_px)).exp();
                 let outer = DMat2::from_cols(gradient * gradient.x, gradient * gradient.y) * weight;
                 sum += outer;
@@ -111,7 +111,7 @@ pub(super) fn refine(image: &Gray, start: DVec2, half_px: i32) -> Option<DVec2> 
     Some(corner)
 }
 
-/// Returns the brightness between pixel centres; `None` outside.
+/// Returns the interpolated brightness; `None` outside the image.
 pub(super) fn sample(image: &Gray, px: DVec2) -> Option<f64> {
     let at = px - 0.5;
     let whole = at.floor();
@@ -127,7 +127,7 @@ pub(super) fn sample(image: &Gray, px: DVec2) -> Option<f64> {
     Some(row(y) * (1.0 - part.y) + row(y + 1) * part.y)
 }
 
-/// The ring, of radius 5, clockwise.
+/// Ring of radius 5, clockwise.
 const RING: [(isize, isize); 16] = [
     (0, -5),
     (2, -5),
@@ -146,15 +146,15 @@ const RING: [(isize, isize); 16] = [
     (-3, -3),
     (-2, -5),
 ];
-/// The ring's radius: corners are no closer together. [px]
+/// Radius of the ring, and minimum distance of corners. [px]
 const RADIUS_PX: f64 = 5.0;
-/// The ring and a pixel of smoothing around it. [px]
+/// Margin for the ring and one pixel of smoothing. [px]
 const BORDER: usize = 6;
-/// Four pairs of quarters that differ by ten grey levels. [grey levels]
+/// Minimum response: four pairs of quarters that differ by ten grey levels. [grey levels]
 const MIN_RESPONSE: f32 = 40.0;
-/// Where the board is lit worst its corners have at least this share of the clearest one's response.
+/// Minimum response of a corner relative to the clearest one, for uneven light.
 const MIN_SHARE: f32 = 0.15;
-/// A board and as much clutter.
+/// Maximum number of candidates: a board and a similar amount of clutter.
 const MAX_CANDIDATES: usize = 1500;
-/// It converges in three to six.
+/// Maximum number of iterations; typical are three to six.
 const MAX_ROUNDS: usize = 12;

@@ -1,4 +1,4 @@
-//! From single corners to the board's grid.
+//! Assembly of single corners into the board's grid.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -8,8 +8,8 @@ use super::Checkerboard;
 use super::corners::sample;
 use crate::image::Gray;
 
-/// Returns the board's corners in the order of [`Checkerboard::corners_m`]; `None` unless all of them, and no others, hang
-/// together. [px]
+/// Returns the board's corners in the order of [`Checkerboard::corners_m`]; `None` unless the connected corners are
+/// exactly those of the board. [px]
 pub(super) fn grow(image: &Gray, corners: &[DVec2], board: &Checkerboard) -> Option<Vec<DVec2>> {
     if corners.len() < board.count() {
         return None;
@@ -20,14 +20,14 @@ pub(super) fn grow(image: &Gray, corners: &[DVec2], board: &Checkerboard) -> Opt
     })
 }
 
-/// Returns columns and rows of the whole grid that hangs together, whatever board it is; the fewer first.
+/// Returns columns and rows of a complete connected grid of any board, the smaller first.
 pub(super) fn count(image: &Gray, corners: &[DVec2]) -> Option<(u32, u32)> {
     corners.iter().take(MAX_SEEDS).enumerate().find_map(|(seed, _)| {
         let cells = grow_from(image, corners, seed)?;
         let least = cells.keys().copied().reduce(IVec2::min)?;
         let size = cells.keys().copied().reduce(IVec2::max)? - least + 1;
         let is_whole = size.x * size.y == cells.len() as i32 && size.min_element() >= 3;
-        // One that the image cuts off may go on outside of it.
+        // A grid close to the image's border may continue outside it.
         let step_px = |cell: &IVec2| {
             let next = cells.get(&(*cell + IVec2::X))?;
             Some(corners[*next].distance(corners[cells[cell]]))
@@ -41,13 +41,13 @@ pub(super) fn count(image: &Gray, corners: &[DVec2]) -> Option<(u32, u32)> {
     })
 }
 
-/// Returns the least distance between neighbours of one row. [px]
+/// Returns the minimum distance between neighbours in a row. [px]
 pub(super) fn least_spacing_px(grid: &[DVec2], columns: usize) -> f64 {
     let rows = grid.chunks(columns).flat_map(|row| row.windows(2));
     rows.map(|pair| pair[0].distance(pair[1])).fold(f64::INFINITY, f64::min)
 }
 
-/// Walks along edges from one corner; returns which corner is in which cell.
+/// Follows edges from one corner; returns the corner in each cell.
 fn grow_from(image: &Gray, corners: &[DVec2], seed: usize) -> Option<HashMap<IVec2, usize>> {
     let start = corners[seed];
     let mut near: Vec<usize> = (0..corners.len()).filter(|&other| other != seed).collect();
@@ -91,7 +91,7 @@ fn grow_from(image: &Gray, corners: &[DVec2], seed: usize) -> Option<HashMap<IVe
     Some(cells)
 }
 
-/// Returns the step from a cell to a neighbour as the steps around it are.
+/// Returns the expected step from a cell to a neighbour, from nearby steps.
 fn step(
     cells: &HashMap<IVec2, usize>,
     corners: &[DVec2],
@@ -106,7 +106,8 @@ fn step(
         .or_else(|| between(cell - other, cell - other + side))
 }
 
-/// Whether an edge between squares joins two corners: one side dark, the other bright, all the way.
+/// Returns whether an edge between squares connects two corners: dark on one side and bright on the other, along its
+/// whole length.
 fn is_edge(image: &Gray, from: DVec2, to: DVec2) -> bool {
     let aside = (to - from).perp() * 0.2;
     let difference = |t: f64| {
@@ -126,7 +127,7 @@ fn order(
     if cells.len() != board.count() {
         return None;
     }
-    // Every way to lay columns and rows into the grid, without mirroring it.
+    // All mappings of columns and rows to the grid, without mirroring.
     let ways = [IVec2::X, IVec2::Y, IVec2::NEG_X, IVec2::NEG_Y]
         .into_iter()
         .flat_map(|x| [(x, x.perp()), (x, -x.perp())]);
@@ -145,17 +146,17 @@ fn order(
         let columns = board.columns as usize;
         let right = grid[columns - 1] - grid[0];
         let up = grid[grid.len() - columns] - grid[0];
-        // The image's y points down, the board's up.
+        // y points down in the image, and up on the board.
         (right.perp_dot(up) < 0.0).then_some((right.normalize().x, grid))
     });
     laid.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, grid)| grid)
 }
 
-/// Corners from which a board is looked for: if not among the clearest, it is not there.
+/// Maximum number of corners from which a grid is grown, the clearest first.
 const MAX_SEEDS: usize = 40;
-/// A neighbour is within this share of a step from where it should be.
+/// Maximum distance of a neighbour from its expected position, as a share of a step.
 const REACH: f64 = 0.35;
-/// Edges of one corner meet at 20 degrees at least, however the board is tilted.
+/// Minimum sine of the angle between edges of a corner: 20 degrees, for tilted boards.
 const MIN_SINE: f64 = 0.34;
-/// Between the squares on both sides of an edge. [grey levels]
+/// Minimum contrast between the squares on both sides of an edge. [grey levels]
 const MIN_CONTRAST: f64 = 12.0;

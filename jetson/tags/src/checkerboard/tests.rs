@@ -23,10 +23,10 @@ pub(crate) fn webcam() -> Intrinsics {
     }
 }
 
-/// Renders what the webcam sees; made once for all tests.
+/// Renderer of the test webcam, shared by all tests.
 pub(crate) static PAINTER: LazyLock<Painter> = LazyLock::new(|| Painter::new(webcam()));
 
-/// Renders the board: rays through nine places of each pixel.
+/// Renders the board with nine rays per pixel.
 pub(crate) struct Painter {
     lens: Intrinsics,
     slopes: Vec<DVec2>,
@@ -70,7 +70,7 @@ impl Painter {
                     }
                 })
                 .sum();
-            // Brighter to the right.
+            // Brightness increases to the right.
             let light = 0.85
                 + 0.3 * (index % self.lens.width_px as usize) as f64
                     / f64::from(self.lens.width_px);
@@ -81,10 +81,10 @@ impl Painter {
 }
 
 const RAYS: usize = 9;
-/// As far out as the whole board stays in the image, however it is tilted.
+/// Maximum offset at which the whole board stays in the image at any tilt.
 const WHOLE_PX: DVec2 = DVec2::new(105.0, 88.0);
 
-/// A board before the camera, tilted, in one of nine places of the image, up to `reach_px` from its middle.
+/// Pose of a tilted board in front of the camera, in one of nine parts of the image, up to `reach_px` from its middle.
 pub(crate) fn pose(i: u32, tilt_rad: f64, reach_px: DVec2, random: &mut Random) -> Rigid {
     let lens = webcam();
     let place = DVec2::new(f64::from(i % 3) - 1.0, f64::from(i / 3 % 3) - 1.0);
@@ -99,7 +99,7 @@ pub(crate) fn pose(i: u32, tilt_rad: f64, reach_px: DVec2, random: &mut Random) 
 }
 
 #[test]
-fn every_corner_is_found_where_it_is() {
+fn finds_all_corners_at_their_positions() {
     let (lens, painter) = (webcam(), &*PAINTER);
     let mut random = Random::new(5);
     let (mut found, mut square_sum, mut count) = (0, 0.0, 0);
@@ -125,14 +125,14 @@ fn every_corner_is_found_where_it_is() {
 }
 
 #[test]
-fn a_part_or_another_board_is_none() {
+fn rejects_a_partly_visible_or_different_board() {
     let painter = &*PAINTER;
     let mut random = Random::new(2);
     let at = pose(4, 0.2, WHOLE_PX, &mut random);
     let whole = painter.paint(&BOARD, &at, 2.0, 1);
     assert!(BOARD.find(&whole).is_some());
     assert!(Checkerboard { columns: 8, ..BOARD }.find(&whole).is_none());
-    // The same board on its side.
+    // The same board, rotated by 90 degrees.
     assert!(Checkerboard { columns: 6, rows: 9, ..BOARD }.find(&whole).is_some());
     let beside = Rigid { t_m: at.t_m + DVec3::X * 0.25, ..at };
     assert!(BOARD.find(&painter.paint(&BOARD, &beside, 2.0, 1)).is_none());
@@ -142,7 +142,7 @@ fn a_part_or_another_board_is_none() {
 }
 
 #[test]
-fn files_are_read_again_and_nonsense_is_refused_by_name() {
+fn file_survives_a_round_trip_and_invalid_values_are_rejected() {
     assert_eq!(Checkerboard::parse(&BOARD.to_toml().unwrap()).unwrap(), BOARD);
     let check = |text: &str, part: &str| {
         let error = Checkerboard::parse(text).unwrap_err().to_string();
@@ -155,9 +155,9 @@ fn files_are_read_again_and_nonsense_is_refused_by_name() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(32))]
-    /// Whatever the image, there is an answer, and if it is a board, then all of it.
+    /// For any image, the result is a complete board or none.
     #[test]
-    fn noise_is_no_board(seed in 0u64..1000, least in 0u32..3) {
+    fn finds_a_complete_board_or_none_in_noise(seed in 0u64..1000, least in 0u32..3) {
         let mut random = Random::new(seed);
         let pixels = (0..80 * 60).map(|_| (255.0 * random.unit()) as u8).collect();
         let image = Gray::new(80, 60, pixels).unwrap();

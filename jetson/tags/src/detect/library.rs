@@ -1,8 +1,7 @@
-//! The C library, made safe: the only module here with `unsafe`.
+//! Safe wrapper of the C library: the only module of `detect` with `unsafe`.
 //!
-//! `apriltag-sys` carries version 3.4.5 of the library's source and its generated bindings. What is
-//! handed to C is a copy of ours, never the caller's image: with some settings the library blurs its
-//! input in place.
+//! `apriltag-sys` contains the source of version 3.4.5 and generated bindings. C receives a copy of the image, never
+//! the caller's, because with some settings the library blurs its input in place.
 
 #![allow(unsafe_code, reason = "owns objects of the AprilTag C library")]
 
@@ -15,11 +14,11 @@ use super::DetectorSettings;
 use crate::detection::Detection;
 use crate::family::TagFamily;
 
-/// One detector of the C library with the families it knows.
+/// A detector of the C library with its families.
 pub(super) struct Library {
     detector: NonNull<c::apriltag_detector_t>,
     families: Vec<Known>,
-    /// What C reads, and may write.
+    /// Buffer that C reads and may write.
     pixels: Vec<u8>,
 }
 
@@ -28,8 +27,8 @@ struct Known {
     table: NonNull<c::apriltag_family_t>,
 }
 
-// SAFETY: the detector and its tables are reached through this struct alone, which is not `Sync`; the
-// library keeps no thread-local state, and with one thread it starts none.
+// SAFETY: the detector and its tables are reachable only through this struct, which is not `Sync`. The library keeps no
+// thread-local state and, with `nthreads` = 1, starts no threads.
 unsafe impl Send for Library {}
 
 impl Library {
@@ -38,7 +37,7 @@ impl Library {
         let detector = NonNull::new(unsafe { c::apriltag_detector_create() })
             .expect("the library returns a detector or the process is out of memory");
         let mut library = Self { detector, families: Vec::new(), pixels: Vec::new() };
-        // SAFETY: the detector was just made, and nothing else points to it.
+        // SAFETY: the detector was just made, and no other pointer to it exists.
         let d = unsafe { &mut *library.detector.as_ptr() };
         d.nthreads = 1;
         d.quad_sigma = 0.0;
@@ -52,7 +51,7 @@ impl Library {
             let table = NonNull::new(create(family))
                 .expect("the library returns a family or the process is out of memory");
             library.families.push(Known { family, table });
-            // SAFETY: both were made by the library; the table outlives the detector (see `drop`).
+            // SAFETY: the library made both; the table outlives the detector (see `drop`).
             unsafe {
                 c::apriltag_detector_add_family_bits(
                     library.detector.as_ptr(),
@@ -64,7 +63,7 @@ impl Library {
         library
     }
 
-    /// Returns what is in `width` x `height` pixels that `fill` writes, row after row.
+    /// Returns the tags in `width` x `height` pixels that `fill` writes, row by row.
     pub(super) fn detect(
         &mut self,
         width: usize,
@@ -79,7 +78,7 @@ impl Library {
         if width.min(height) < MIN_SIDE_PX || width.max(height) > MAX_SIDE_PX {
             return Vec::new();
         }
-        // SAFETY: ours alone, see `new`.
+        // SAFETY: no other pointer to the detector exists, see `new`.
         unsafe { (*self.detector.as_ptr()).quad_decimate = decimate };
         let mut image = c::image_u8_t {
             width: width as i32,
@@ -87,22 +86,21 @@ impl Library {
             stride: width as i32,
             buf: self.pixels.as_mut_ptr(),
         };
-        // SAFETY: `image` describes `pixels` exactly (asserted above), which live and are not touched
-        // until the call returns; the library keeps no pointer to them.
+        // SAFETY: `image` describes `pixels` exactly (asserted above). The pixels stay alive and unchanged until the
+        // call returns, and the library keeps no pointer to them.
         let list = unsafe { c::apriltag_detector_detect(self.detector.as_ptr(), &raw mut image) };
         let Some(list) = NonNull::new(list) else { return Vec::new() };
-        // SAFETY: the library returns a zarray of `size` pointers to detections, valid until they are
-        // destroyed below.
+        // SAFETY: the library returns a zarray of `size` pointers to detections, valid until they are destroyed below.
         let found = unsafe {
             let list = list.as_ref();
-            #[allow(clippy::cast_ptr_alignment)] // Why: read below without asking for alignment.
+            #[allow(clippy::cast_ptr_alignment)] // Why: read below without alignment.
             let items = list.data.cast::<*const c::apriltag_detection_t>();
             (0..list.size as usize)
                 .map(|i| &*items.add(i).read_unaligned())
                 .filter_map(|detection| self.read(detection))
                 .collect()
         };
-        // SAFETY: frees the list and its detections; nothing of them was kept.
+        // SAFETY: frees the list and its detections; no pointer to them was kept.
         unsafe { c::apriltag_detections_destroy(list.as_ptr()) };
         found
     }
@@ -110,7 +108,7 @@ impl Library {
     fn read(&self, detection: &c::apriltag_detection_t) -> Option<Detection> {
         let known = self.families.iter().find(|k| k.table.as_ptr() == detection.family)?;
         let corners_px = detection.p.map(|[x, y]| DVec2::new(x, y));
-        // Degenerate homographies make corners that are no numbers.
+        // Degenerate homographies yield corners that are not finite.
         let sane = corners_px.iter().all(|corner| corner.is_finite());
         sane.then(|| Detection {
             family: known.family,
@@ -124,7 +122,7 @@ impl Library {
 
 impl Drop for Library {
     fn drop(&mut self) {
-        // SAFETY: made by the library, destroyed once, the detector before the tables that it reads.
+        // SAFETY: the library made these objects. Each is destroyed once, the detector before the tables that it reads.
         unsafe {
             c::apriltag_detector_destroy(self.detector.as_ptr());
             for known in &self.families {
@@ -134,17 +132,17 @@ impl Drop for Library {
     }
 }
 
-/// Returns how many misread bits are corrected.
+/// Returns the number of misread bits to correct.
 fn corrected_bits(family: TagFamily, settings: &DetectorSettings) -> i32 {
     match family {
-        // The library lists every code with every error: these would be 2.6 million, 120 MB.
+        // The library lists every code with every error: here 2.6 million entries, 120 MB.
         TagFamily::TagStandard52h13 => 0,
         _ => i32::from(settings.corrected_bits.min(MAX_CORRECTED)),
     }
 }
 
 fn create(family: TagFamily) -> *mut c::apriltag_family_t {
-    // SAFETY: no precondition; they allocate a table.
+    // SAFETY: no precondition; each call allocates a table.
     unsafe {
         match family {
             TagFamily::Tag36h11 => c::tag36h11_create(),
@@ -159,7 +157,7 @@ fn create(family: TagFamily) -> *mut c::apriltag_family_t {
 /// # Safety
 /// `table` came from [`create`] with the same family, and is not used afterwards.
 unsafe fn destroy(family: TagFamily, table: *mut c::apriltag_family_t) {
-    // SAFETY: as the caller promises.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         match family {
             TagFamily::Tag36h11 => c::tag36h11_destroy(table),
@@ -171,9 +169,9 @@ unsafe fn destroy(family: TagFamily, table: *mut c::apriltag_family_t) {
     }
 }
 
-/// With 3 the list of 36h11 alone takes 150 MB.
+/// With 3, the list of 36h11 takes 150 MB.
 const MAX_CORRECTED: u8 = 2;
-/// Smaller images hold no tag that can be read, and the library's tiles need some room. [px]
+/// Smaller images cannot contain a readable tag, and the library's tiles need a minimum size. [px]
 const MIN_SIDE_PX: usize = 24;
-/// The largest side of an image anywhere here. [px]
+/// Maximum side of an image in this project. [px]
 const MAX_SIDE_PX: usize = 8192;

@@ -1,14 +1,13 @@
-//! Finds tags in an image, corners to a fraction of a pixel.
+//! Detection of tags in an image, with subpixel corners.
 //!
-//! A grey image comes in; what leaves is, for each tag, its family, its number and the corners of its
-//! black square, in the order of the layout: as seen from before the tag with its picture upright, lower
-//! left, lower right, upper right, upper left.
+//! The input is a grey image. The output for each tag is its family, its number, and the corners of its black square.
+//! Corners are in the order of the layout: with the tag upright, lower left, lower right, upper right, upper left.
 //!
-//! The C library finds and reads the quads: in the whole image in a coarser raster ([`Detector::search`]),
-//! or in a part of it ([`Detector::look`]), pixel by pixel or finer, where the tags are expected. Corners of
-//! large tags are measured again ([`refine`]), along edges that are straight behind the lens and curved
-//! in the image. Called once per image and camera; the time goes with the pixels looked at: 2 ms for a cube
-//! that is tracked, 35 to 140 ms for a search of 1280x720.
+//! The C library finds and decodes the quads. [`Detector::search`] scans the whole image at reduced resolution;
+//! [`Detector::look`] scans a region in which tags are expected, at full or doubled resolution. [`refine`] measures the
+//! corners of large tags again, along edges that are straight behind the lens but curved in the image. Called once per
+//! image and camera. The time is proportional to the pixels scanned: 2 ms for a tracked cube, 35 to 140 ms for a search
+//! of 1280x720.
 
 mod library;
 mod refine;
@@ -21,19 +20,19 @@ use crate::family::TagFamily;
 use crate::image::Gray;
 use library::Library;
 
-/// What to look for, and how.
+/// Settings of the detector.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DetectorSettings {
-    /// How coarse the raster of a search of the whole image is: 1 every pixel, 2 every other.
+    /// Decimation of a search of the whole image: 1 is every pixel, 2 every other.
     pub search_decimate: f32,
-    /// Bits of a tag that may be misread and are corrected, 0 to 2. More finds tags in bushes.
+    /// Maximum number of misread bits that are corrected, 0 to 2. Higher values cause false detections, for example in
+    /// bushes.
     pub corrected_bits: u8,
-    /// How much cells are sharpened before they are read; helps tags of few pixels.
+    /// Amount of sharpening before cells are read; helps tags of few pixels.
     pub sharpening: f64,
-    /// Tags read with less contrast than this are taken for chance. [grey levels]
+    /// Minimum contrast; tags below it are rejected as random matches. [grey levels]
     pub least_margin: f64,
-    /// Tags whose shortest edge is below this are enlarged in a part of the image before they are
-    /// looked for. [px]
+    /// In a region, the image is enlarged if the shortest edge of a tag is below this. [px]
     pub enlarge_below_px: f64,
 }
 
@@ -49,24 +48,24 @@ impl Default for DetectorSettings {
     }
 }
 
-/// A rectangle of pixels; may reach out of the image, and is cut to it.
+/// A rectangle of pixels. The part outside the image is cut off.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Region {
-    /// Least x and y. [px, image]
+    /// Minimum x and y. [px, image]
     pub least_px: DVec2,
-    /// Greatest x and y. [px, image]
+    /// Maximum x and y. [px, image]
     pub most_px: DVec2,
     /// Expected length of the shortest edge of the tags in it, if known. [px]
     pub tag_edge_px: Option<f64>,
 }
 
 impl Region {
-    /// Returns its pixels within an image: x and y of the first, and width and height.
+    /// Returns the pixels of the region within an image: x and y of the first pixel, width, and height.
     fn cut(&self, image: &Gray) -> Option<(usize, usize, usize, usize)> {
         let most = DVec2::new(f64::from(image.width_px()), f64::from(image.height_px()));
         let low = self.least_px.floor().clamp(DVec2::ZERO, most);
         let high = self.most_px.ceil().clamp(DVec2::ZERO, most);
-        // Also false where a bound is no number.
+        // Also false if a bound is NaN.
         (high.x > low.x && high.y > low.y).then(|| {
             let size = high - low;
             (low.x as usize, low.y as usize, size.x as usize, size.y as usize)
@@ -81,13 +80,12 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// Makes a detector of these families.
     pub fn new(families: &[TagFamily], settings: DetectorSettings) -> Self {
         Self { library: Library::new(families, &settings), settings }
     }
 
-    /// Returns the tags in the whole image, corners at full sharpness; looked for in a coarser raster, or,
-    /// if `fine`, at every pixel.
+    /// Returns the tags in the whole image, with corners at full resolution. Scans every pixel if `fine`, otherwise at
+    /// reduced resolution.
     pub fn search(&mut self, image: &Gray, camera: &Intrinsics, fine: bool) -> Vec<Detection> {
         let (width, height) = (image.width_px() as usize, image.height_px() as usize);
         let decimate = if fine { 1.0 } else { self.settings.search_decimate.clamp(1.0, 8.0) };
@@ -97,11 +95,11 @@ impl Detector {
         self.finish(raw, image, camera)
     }
 
-    /// Returns the tags in a part of the image, looked for at every pixel, and at twice as many where
-    /// they are small.
+    /// Returns the tags in a region of the image. Scans every pixel, or an image enlarged by two if the tags are small.
     pub fn look(&mut self, image: &Gray, region: &Region, camera: &Intrinsics) -> Vec<Detection> {
         let Some((x, y, width, height)) = region.cut(image) else { return Vec::new() };
-        // A large part full of tags, as a carried camera sees, takes long to enlarge, and can do without some of them.
+        // A large region full of tags, as a camera on the vehicle sees, takes long to enlarge. Some tags may be missed
+        // there.
         let is_large = 4 * width * height > (image.width_px() * image.height_px()) as usize;
         let share = if is_large { LARGE_PART_SHARE } else { 1.0 };
         let small =
@@ -140,7 +138,7 @@ impl Detector {
             .filter(|tag| shortest(&tag.corners_px) >= MIN_EDGE_PX)
             .filter(|tag| whole(&tag.corners_px, image))
             .map(|tag| {
-                // Edges of a small tag do not bend, and the library measures them as well.
+                // Edges of a small tag do not bend, and the library measures them equally well.
                 let large = shortest(&tag.corners_px) > REFINE_ABOVE_PX;
                 let refined = large.then(|| refine::refine(image, camera, &tag.corners_px));
                 Detection { corners_px: refined.flatten().unwrap_or(tag.corners_px), ..tag }
@@ -151,8 +149,8 @@ impl Detector {
     }
 }
 
-/// Whether a tag and some of the white around it are in the image. Where its border cuts a tag, the library
-/// takes the cut for an edge, and often still reads the tag: corners are then off by many pixels.
+/// Returns whether a tag and some of the white around it are inside the image. If the image's border cuts a tag, the
+/// library takes the border for an edge and often still decodes the tag. Its corners are then off by many pixels.
 fn whole(corners_px: &[DVec2; 4], image: &Gray) -> bool {
     let size = DVec2::new(f64::from(image.width_px()), f64::from(image.height_px()));
     let middle = corners_px.iter().sum::<DVec2>() / 4.0;
@@ -172,7 +170,7 @@ fn row_of(image: &Gray, y: usize) -> &[u8] {
     &image.pixels()[y * width..][..width]
 }
 
-/// Writes a part of an image in twice the width and height, interpolated between pixel centres.
+/// Writes a region of an image at twice the width and height, interpolated between pixel centres.
 fn enlarge(
     image: &Gray,
     (x, y, width, height): (usize, usize, usize, usize),
@@ -180,7 +178,7 @@ fn enlarge(
 ) {
     pixels.reserve(4 * width * height);
     for row in 0..2 * height {
-        // Centres of the fine rows lie a quarter of a pixel above and below those of the coarse.
+        // Centres of the fine rows are a quarter of a pixel above and below those of the coarse rows.
         let near = row_of(image, y + row / 2);
         let other = if row % 2 == 0 {
             (y + row / 2).saturating_sub(1)
@@ -199,16 +197,17 @@ fn enlarge(
     }
 }
 
-/// In more than a quarter of the image only tags smaller than this share of what is enlarged elsewhere are enlarged.
+/// In regions of more than a quarter of the image, the limit for enlarging is multiplied by this.
 const LARGE_PART_SHARE: f64 = 0.6;
-/// Half a cell of white around eight cells, as seen from the middle, and a little more for the perspective.
+/// Scale of the corners that must be in the image: half a cell of white around eight cells, and a margin for
+/// perspective.
 const RIM: f64 = 1.15;
-/// Tags smaller than this cannot be distinguished from noise: a cell of 36h11 has one pixel then. [px]
+/// Smaller tags look like noise: a cell of 36h11 is then one pixel wide. [px]
 const MIN_EDGE_PX: f64 = 8.0;
-/// From here on edges measured again, through the lens, are better than the library's: 0.05 px instead of
-/// 0.16 at 150 px behind a common webcam's lens, the same at 75 px (`detect/tests.rs`). [px]
+/// Above this edge length, corners refined through the lens are better than the library's: 0.05 px instead of 0.16 px
+/// at 150 px behind the lens of a common webcam, equal at 75 px (`detect/tests.rs`). [px]
 const REFINE_ABOVE_PX: f64 = 75.0;
-/// Tags larger than this are found at half the raster in a quarter of the time, twice as large ones at a quarter. [px]
+/// Tags larger than this are found at half resolution in a quarter of the time, tags twice as large at a quarter. [px]
 const COARSE_ABOVE_PX: f64 = 70.0;
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
-//! Measures the corners of a tag again, from its four edges.
+//! Refines the corners of a tag from its four edges.
 //!
-//! Points are measured along each edge: across the edge, brightness goes from the black of the border to
-//! the white around it, and the edge lies where the two areas balance: that is exact behind any
-//! symmetric blur, also of motion, while a search for the steepest place wanders with the noise. The
-//! points are taken through the lens to slopes, where edges are straight lines; their crossings are the
-//! corners. In the image the edge of a near tag behind a wide lens bends by pixels.
+//! Points are measured along each edge. Across the edge, brightness changes from the black of the border to the white
+//! around it, and the edge is where the two areas balance. This is exact for any symmetric blur, including motion blur;
+//! a search for the steepest gradient is sensitive to noise. The points are converted through the lens to slopes, where
+//! edges are straight lines; the corners are the intersections of these lines. In the image, the edge of a near tag
+//! behind a wide lens bends by pixels.
 
 use glam::DVec2;
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
@@ -12,8 +12,8 @@ use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 use super::row_of;
 use crate::image::Gray;
 
-/// Returns the corners again, or `None` where an edge has too few points that are good, or where a
-/// corner would move further than the edges were looked for.
+/// Returns the refined corners. `None` if an edge has too few good points, or if a corner would move further than the
+/// search range.
 pub(super) fn refine(
     image: &Gray,
     camera: &Intrinsics,
@@ -42,22 +42,22 @@ pub(super) fn refine(
     Some(refined)
 }
 
-/// A straight line of slopes, through `at` along `along`.
+/// A straight line in slopes, through `at` in direction `along`.
 #[derive(Clone, Copy, Debug, Default)]
 struct Line {
     at: DVec2,
     along: DVec2,
-    /// Sum of the squared distances of its points. [px^2]
+    /// Sum of the squared distances of the points. [px^2]
     sum_px2: f64,
     points: u32,
-    /// How far to each side of the expected edge was looked. [px]
+    /// Search range to each side of the expected edge. [px]
     reach_px: f64,
 }
 
 impl Line {
     fn crossing(&self, other: &Self) -> Option<DVec2> {
         let area = self.along.perp_dot(other.along);
-        // Lines of one tag cross at a clear angle, or it is seen from its edge.
+        // Lines of a tag that is not seen edge-on intersect at a clear angle.
         (area.abs() > 0.05)
             .then(|| self.at + self.along * ((other.at - self.at).perp_dot(other.along) / area))
     }
@@ -66,18 +66,17 @@ impl Line {
 fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2) -> Option<Line> {
     let (from_px, to_px) = (project(camera, from), project(camera, to));
     let length_px = from_px.distance(to_px);
-    // Widths of a cell along this edge and across it differ; the tag's centre gives the latter.
+    // The width of a cell differs along and across this edge; the tag's centre gives the latter.
     let across_px = 2.0 * distance_px(camera, from, to, centre);
-    // The black border and the white around it are one cell of eight each (fewer in small families,
-    // where cells are larger).
+    // The black border and the white around it are one cell of eight each. Small families have fewer, larger cells.
     let reach_px = (REACH_CELLS * across_px / 8.0).clamp(MIN_REACH_PX, MAX_REACH_PX);
     let count = ((length_px / SPACING_PX) as usize).clamp(MIN_POINTS + 2, MAX_POINTS);
-    // Neighbouring edges blur into the ends.
+    // Neighbouring edges blur the ends.
     let end = (reach_px / length_px).max(0.06);
     if end > 0.3 {
         return None;
     }
-    // The lens is followed from point to point: few steps of Newton's from a close start.
+    // The distortion is followed from point to point: a close start needs few Newton steps.
     let outward = {
         let middle = (from + to) / 2.0;
         let normal = (to - from).perp();
@@ -89,7 +88,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
         let slope = from.lerp(to, t);
         let (distorted, jacobian) = camera.distortion.distort(slope);
         let px = pixel(camera, distorted);
-        // The image's normal of a line is not the image of its normal.
+        // The normal of a line in the image is not the image of the line's normal.
         let along_px = (jacobian * (to - from)) * DVec2::new(camera.fx_px, camera.fy_px);
         let side = (jacobian * outward) * DVec2::new(camera.fx_px, camera.fy_px);
         let normal = along_px.perp().normalize_or_zero();
@@ -101,7 +100,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
     if profiles.len() < MIN_POINTS {
         return None;
     }
-    // Black and white vary slowly along the edge: two straight lines through all profiles' ends.
+    // Black and white vary slowly along the edge: two straight lines are fitted to the ends of all profiles.
     let black = Trend::of(profiles.iter().map(|(_, _, _, p)| p.inner));
     let white = Trend::of(profiles.iter().map(|(_, _, _, p)| p.outer));
     let mut points: Vec<(DVec2, f64)> = Vec::with_capacity(profiles.len());
@@ -111,7 +110,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
         if !(contrast.abs() >= MIN_CONTRAST) {
             continue;
         }
-        // The white part of the way from -reach to reach.
+        // White share of the distance from -reach to reach.
         let share = (profile.mean - black) / contrast;
         let offset_px = reach_px * (1.0 - 2.0 * share);
         if offset_px.abs() <= 0.8 * reach_px {
@@ -120,7 +119,7 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
         }
     }
     let mut line = fit(&points, camera, reach_px)?;
-    // Once more without what lies off: a cable before the edge, a highlight.
+    // Fit again without outliers: a cable in front of the edge, or a highlight.
     let rms_px = (line.sum_px2 / f64::from(line.points)).sqrt();
     let limit_px = (2.5 * rms_px).max(0.1);
     for (slope, weight) in &mut points {
@@ -134,11 +133,11 @@ fn edge(image: &Gray, camera: &Intrinsics, from: DVec2, to: DVec2, centre: DVec2
 
 /// Brightness across an edge.
 struct Profile {
-    /// At its inner end. [grey levels]
+    /// Brightness at the inner end. [grey levels]
     inner: f64,
-    /// At its outer end. [grey levels]
+    /// Brightness at the outer end. [grey levels]
     outer: f64,
-    /// All the way. [grey levels]
+    /// Mean brightness. [grey levels]
     mean: f64,
 }
 
@@ -148,7 +147,7 @@ fn profile(image: &Gray, px: DVec2, normal: DVec2, reach_px: f64) -> Option<Prof
     let (mut sum, mut inner, mut outer) = (0.0, 0.0, 0.0);
     for k in -steps..=steps {
         let value = sample(image, px + normal * (f64::from(k) * step_px))?;
-        // Trapezoids: both ends count half.
+        // Trapezoidal rule: both ends have half weight.
         if k == -steps {
             inner = value;
             sum += 0.5 * value;
@@ -162,7 +161,7 @@ fn profile(image: &Gray, px: DVec2, normal: DVec2, reach_px: f64) -> Option<Prof
     Some(Profile { inner, outer, mean: sum / f64::from(2 * steps) })
 }
 
-/// Returns the brightness between pixel centres, or `None` outside.
+/// Returns the brightness interpolated between pixel centres, or `None` outside the image.
 fn sample(image: &Gray, px: DVec2) -> Option<f64> {
     let at = px - 0.5;
     let (x, y) = (at.x.floor(), at.y.floor());
@@ -180,7 +179,7 @@ fn sample(image: &Gray, px: DVec2) -> Option<f64> {
     Some(mix(upper) * (1.0 - v) + mix(lower) * v)
 }
 
-/// A straight line through numbers in equal steps, by least squares.
+/// Straight line through equally spaced values, by least squares.
 struct Trend {
     mean: f64,
     slope: f64,
@@ -219,7 +218,7 @@ fn fit(points: &[(DVec2, f64)], camera: &Intrinsics, reach_px: f64) -> Option<Li
         xy += w * d.x * d.y;
         yy += w * d.y * d.y;
     }
-    // Direction of the greatest spread of a symmetric 2 x 2 matrix.
+    // Direction of the largest spread of a symmetric 2 x 2 matrix.
     let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
     let mut line = Line { at, along: DVec2::from_angle(angle), sum_px2: 0.0, points: 0, reach_px };
     for &(p, w) in points {
@@ -251,8 +250,8 @@ fn project(camera: &Intrinsics, slope: DVec2) -> DVec2 {
     pixel(camera, camera.distortion.distort(slope).0)
 }
 
-/// Returns the slope that is seen at a pixel, near a known one; a few steps of Newton's instead of the
-/// search that [`Intrinsics::slope`] makes.
+/// Returns the slope of a pixel near a known slope. Uses a few Newton steps instead of the search of
+/// [`Intrinsics::slope`].
 fn slope_near(camera: &Intrinsics, px: DVec2, near: DVec2) -> Option<DVec2> {
     let centre = DVec2::new(camera.cx_px, camera.cy_px);
     let wanted = (px - centre) / DVec2::new(camera.fx_px, camera.fy_px);
@@ -267,19 +266,19 @@ fn slope_near(camera: &Intrinsics, px: DVec2, near: DVec2) -> Option<DVec2> {
     slope.is_finite().then_some(slope)
 }
 
-/// How far across an edge is looked, of a cell; within a cell on both sides there is one colour.
+/// Search range across an edge, as a share of a cell. Within one cell on both sides the colour is constant.
 const REACH_CELLS: f64 = 0.6;
-/// Less would be within the blur of the sharpest lens. [px]
+/// A smaller range would be within the blur of the sharpest lens. [px]
 const MIN_REACH_PX: f64 = 1.5;
-/// More would gather uneven light, and costs time. [px]
+/// A larger range would include uneven light and cost time. [px]
 const MAX_REACH_PX: f64 = 5.0;
-/// Between samples across an edge. [px]
+/// Spacing of samples across an edge. [px]
 const STEP_PX: f64 = 0.5;
-/// Between points along an edge: closer, they see the same pixels. [px]
+/// Spacing of points along an edge. Closer points would use the same pixels. [px]
 const SPACING_PX: f64 = 1.0;
-/// Fewer points make no line.
+/// Minimum number of points for a line.
 const MIN_POINTS: usize = 5;
-/// More points than this add time, not sharpness.
+/// More points cost time without a gain in accuracy.
 const MAX_POINTS: usize = 64;
-/// Less between black and white is noise. [grey levels]
+/// A smaller contrast between black and white is noise. [grey levels]
 const MIN_CONTRAST: f64 = 12.0;

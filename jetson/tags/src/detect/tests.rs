@@ -4,7 +4,7 @@ use crate::synth::{Light, Placed, Renderer, SyntheticExposure, webcam};
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Cam, Pose, World};
 
-/// A tag of 0.16 m before a camera at the world's origin that looks along x.
+/// A tag of 0.16 m in front of a camera at the world's origin that looks along x.
 fn tag_at(p_cam: DVec3, tilt: DVec3) -> (TagLayout, Pose<World, Cam>, Pose<Cam, Square>) {
     let world_from_cam = Pose::new(
         DVec3::ZERO,
@@ -17,8 +17,8 @@ fn tag_at(p_cam: DVec3, tilt: DVec3) -> (TagLayout, Pose<World, Cam>, Pose<Cam, 
     (TagLayout { frame: LayoutFrame::World, tags: vec![tag] }, world_from_cam, cam_from_tag)
 }
 
-/// Returns the root mean square and the greatest error of corners over many views, and how many of
-/// them showed the tag; with the library's own corners, and refined. [px]
+/// Returns the number of views in which the tag was detected, and the root mean square and maximum error of its
+/// corners. [px]
 fn errors(distance_m: f64, views: u32) -> (usize, f64, f64) {
     let camera = webcam();
     let renderer = Renderer::new(camera);
@@ -60,7 +60,7 @@ fn errors(distance_m: f64, views: u32) -> (usize, f64, f64) {
 }
 
 #[test]
-fn corners_are_found_to_a_fraction_of_a_pixel() {
+fn finds_corners_to_a_fraction_of_a_pixel() {
     for (distance_m, most_rms_px) in
         [(1.0, 0.08), (2.0, 0.1), (4.0, 0.1), (6.0, 0.12), (8.0, 0.15), (10.0, 0.2)]
     {
@@ -72,7 +72,7 @@ fn corners_are_found_to_a_fraction_of_a_pixel() {
 }
 
 #[test]
-fn the_whole_image_is_searched_in_a_coarser_raster() {
+fn searches_the_whole_image_at_reduced_resolution() {
     let camera = webcam();
     let renderer = Renderer::new(camera);
     let mut detector = Detector::new(&[TagFamily::Tag36h11], DetectorSettings::default());
@@ -90,20 +90,20 @@ fn the_whole_image_is_searched_in_a_coarser_raster() {
         let truth = camera.project(p_cam).unwrap();
         assert!(seen.distance(truth) < 0.3, "{seen} for {truth}");
     }
-    // A part that reaches out of the image is cut; where the tag is not, it is not found.
+    // A region that extends beyond the image is cut. A region without the tag yields no detection.
     let beside =
         Region { least_px: DVec2::splat(-50.0), most_px: DVec2::splat(300.0), tag_edge_px: None };
     assert!(detector.look(&image, &beside, &camera).is_empty());
     let around =
         Region { least_px: DVec2::new(600.0, -1e9), most_px: DVec2::splat(1e9), tag_edge_px: None };
     assert_eq!(detector.look(&image, &around, &camera).len(), 1);
-    // Asked for another family, it sees nothing.
+    // A detector for another family finds no tag.
     let mut other = Detector::new(&[TagFamily::Tag25h9], DetectorSettings::default());
     assert!(other.search(&image, &camera, false).is_empty());
 }
 
 #[test]
-fn images_and_parts_of_any_size_are_taken() {
+fn accepts_images_and_regions_of_any_size() {
     let mut detector = Detector::new(&TagFamily::ALL, DetectorSettings::default());
     let all = Region { least_px: DVec2::ZERO, most_px: DVec2::splat(1e4), tag_edge_px: Some(10.0) };
     for (width, height) in [(0, 0), (1, 1), (3, 500), (24, 24), (25, 31), (641, 27)] {
@@ -123,7 +123,7 @@ fn images_and_parts_of_any_size_are_taken() {
 }
 
 #[test]
-fn a_family_with_data_outside_its_border_has_the_corners_of_its_border() {
+fn returns_border_corners_for_families_with_data_outside_the_border() {
     let camera = webcam();
     let renderer = Renderer::new(camera);
     for family in TagFamily::ALL {

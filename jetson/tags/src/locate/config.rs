@@ -1,4 +1,4 @@
-//! The file that `vizflyt tags locate` reads: which cameras, which tags.
+//! Configuration file of `vizflyt tags locate`: cameras and tags.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ use crate::layout::TagLayout;
 use crate::print::{Pad, PrintError};
 use crate::simulated::{Sensor, over_mat};
 
-/// What is located, by what. Paths are relative to the file.
+/// Cameras, tags and vehicle of a lab. Paths are relative to the file.
 ///
 /// ```
 /// use vizflyt_tags::locate::LocateConfig;
@@ -25,46 +25,46 @@ use crate::simulated::{Sensor, over_mat};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocateConfig {
-    /// Name of the vehicle in the poses that are sent.
+    /// Name of the vehicle in the sent poses.
     #[serde(default = "default_object")]
     pub object: String,
     /// One to eight camera files.
     pub cameras: Vec<PathBuf>,
-    /// Files with the tags of the vehicle's cube, of the mat, of the walls.
+    /// Files with the tags of the vehicle's cube, the mat, and the walls.
     pub layouts: Vec<PathBuf>,
-    /// How far a detected corner may be off, one standard deviation. [px]
+    /// Standard deviation of a detected corner. [px]
     #[serde(default = "default_sigma")]
     pub corner_sigma_px: f64,
-    /// Poses that leave corners further off than this, root mean square, are refused. [px]
+    /// Maximum root mean square reprojection error of a pose; above it the pose is rejected. [px]
     #[serde(default = "default_rms")]
     pub most_rms_px: f64,
-    /// The vehicle never leans further than this. [deg]
+    /// Maximum tilt of the vehicle. [deg]
     #[serde(default = "default_tilt")]
     pub most_tilt_deg: f64,
-    /// How far the layouts may be off that a survey has written, one standard deviation an axis; what
-    /// `tags survey mat` prints as sigma, or more for a mat that is longer than it is seen at once.
+    /// Standard deviation per axis of tag positions in surveyed layouts: the sigma that `tags survey mat` prints, or
+    /// more for a mat that is longer than the view of one image.
     #[serde(default = "default_survey")]
     pub survey_sigma_mm: f64,
-    /// How simulated cameras (`source = "simulated"`) take images.
+    /// Imaging of simulated cameras (`source = "simulated"`).
     #[serde(default)]
     pub simulated: SensorConfig,
 }
 
-/// As [`Sensor`], in the units of files.
+/// [`Sensor`] in the units of files.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorConfig {
-    /// Images a second.
+    /// Frame rate.
     pub rate_hz: f64,
-    /// How long the shutter is open.
+    /// Exposure time.
     pub exposure_ms: f64,
-    /// Standard deviation of the optics' blur.
+    /// Standard deviation of the optical blur.
     pub blur_px: f64,
-    /// Standard deviation of the sensor's noise, in grey levels of 255.
+    /// Standard deviation of the sensor noise, in grey levels of 255.
     pub noise: f64,
-    /// The distance at which the lens is focused.
+    /// Focus distance of the lens.
     pub focus_m: f64,
-    /// How wide its opening is; 0 is a pinhole, which is sharp everywhere.
+    /// Aperture of the lens; 0 is a pinhole, which is sharp at every distance.
     pub aperture_mm: f64,
 }
 
@@ -96,37 +96,32 @@ impl SensorConfig {
     }
 }
 
-/// All that a configuration names, read.
+/// A configuration with all files that it refers to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocateSetup {
-    /// Name of the vehicle in the poses that are sent.
+    /// Name of the vehicle in the sent poses.
     pub object: String,
-    /// The cameras.
     pub cameras: Vec<TagCamera>,
-    /// The tags.
     pub layouts: Vec<TagLayout>,
-    /// The rest.
     pub settings: LocateSettings,
-    /// How simulated cameras take images.
+    /// Imaging of simulated cameras.
     pub simulated: SensorConfig,
-    /// What simulated cameras truly are, and what they see, where that is other than stated above.
+    /// True cameras and tags of a simulated lab, if they differ from those above.
     pub truth: Option<SimulatedTruth>,
 }
 
-/// A simulated lab as it is, beside what its files say.
+/// Ground truth of a simulated lab, which can differ from its files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulatedTruth {
-    /// The cameras.
     pub cameras: Vec<TagCamera>,
-    /// The tags.
     pub layouts: Vec<TagLayout>,
 }
 
 impl LocateConfig {
-    /// Reads a configuration from TOML.
+    /// Parses a configuration from TOML.
     ///
     /// # Errors
-    /// [`FileError::Toml`] for what is none, [`FileError::Invalid`] for a value that cannot work.
+    /// [`FileError::Toml`] if the text does not match the format, [`FileError::Invalid`] for a value out of range.
     pub fn parse(text: &str) -> Result<Self, FileError> {
         let config: Self = vizflyt_toml::parse(text)?;
         for (key, count, most) in [
@@ -158,10 +153,10 @@ impl LocateConfig {
 }
 
 impl LocateSetup {
-    /// Reads a configuration file and the files that it names.
+    /// Reads a configuration file and the files that it refers to.
     ///
     /// # Errors
-    /// As [`LocateConfig::parse`], and [`FileError::Io`]; the file is named.
+    /// As [`LocateConfig::parse`], and [`FileError::Io`]; the error contains the path.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let config = file::read(path, LocateConfig::parse)?;
         let beside = |name: &PathBuf| path.parent().unwrap_or(Path::new("")).join(name);
@@ -183,7 +178,7 @@ impl LocateSetup {
         })
     }
 
-    /// Returns the simulated lab: webcams at both ends of the netted hall, a cube on the vehicle.
+    /// Returns the simulated lab: webcams at both ends of the netted hall, and a cube on the vehicle.
     pub fn simulated(cameras: usize, object: &str) -> Self {
         let simulated = |camera| TagCamera { source: Some(SIMULATED.into()), ..camera };
         Self {
@@ -196,11 +191,11 @@ impl LocateSetup {
         }
     }
 
-    /// Returns the simulated lab in which the vehicle carries a webcam over a mat, with errors of survey and mount of
-    /// this seed; or why there is no such mat.
+    /// Returns the simulated lab in which the vehicle carries a webcam over a mat. `seed` determines the errors of
+    /// survey and mount.
     ///
     /// # Errors
-    /// [`PrintError`] for pads that the mat's family has not tags enough for.
+    /// [`PrintError`] if the mat's family has too few tags for the pads.
     pub fn simulated_over_mat(pads: Vec<Pad>, seed: u64, object: &str) -> Result<Self, PrintError> {
         let layout = over_mat::floor(pads).print()?.layout;
         let camera = TagCamera { source: Some(SIMULATED.into()), ..over_mat::camera() };
@@ -241,13 +236,13 @@ fn default_tilt() -> f64 {
     LocateSettings::default().most_tilt_rad.to_degrees()
 }
 
-/// The source of a camera that is rendered from the truth.
+/// Source of a simulated camera: images are rendered from the ground truth.
 pub const SIMULATED: &str = "simulated";
-/// As many as one computer's USB carries.
+/// Maximum number of cameras on the USB of one computer.
 const MAX_CAMERAS: usize = 8;
-/// A cube, a mat, and some walls.
+/// Enough for a cube, a mat, and some walls.
 const MAX_LAYOUTS: usize = 16;
-/// As the motion capture's names.
+/// Same limit as for names in motion capture.
 const MAX_NAME_BYTES: usize = 24;
 
 #[cfg(test)]
@@ -255,7 +250,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_cannot_work_is_refused_by_name() {
+    fn rejects_invalid_values_with_their_key() {
         let good = "cameras = [\"a.toml\"]\nlayouts = [\"b.toml\"]\n";
         let check = |text: &str, part: &str| {
             let error = LocateConfig::parse(text).expect_err(text).to_string();
@@ -271,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_of_files_is_read_and_a_missing_one_is_named() {
+    fn reads_all_files_and_reports_a_missing_one_by_name() {
         let folder = std::env::temp_dir().join(format!("vizflyt-locate-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let setup = LocateSetup::simulated(2, "wasp");

@@ -1,18 +1,18 @@
-//! What is wrong with the lab, estimated while the vehicle flies. Sans-IO.
+//! Estimates errors of the lab's setup during flight. Sans-IO.
 //!
-//! What enters: for each set of images, how far corners are from where the pose puts them, and how that changes with
-//! the pose and with what may be wrong. What leaves: corrections, what they leave open of the pose, and findings
-//! for people. Called once per set; judged ten times a second.
+//! Input: for each set of images, the reprojection errors of the corners and their derivatives by the pose and by
+//! possible errors of the setup. Output: corrections, their contribution to the pose's covariance, and findings for the
+//! operator. Called once per set; evaluated ten times per second.
 //!
-//! The pose of each set is eliminated, as views are in [`crate::bundle`]; what is left are normal equations in what
-//! lasts: of each camera its clock, its readout, its place and direction; the scale of the tags. Each has a prior
-//! about "nothing is wrong", as narrow as things are when they are right, and widened to what is found until the
-//! corners are explained (MacKay 1992, "Bayesian interpolation", section 4: the evidence chooses the prior). What
-//! images cannot tell stays open, and the pose's covariance says so: of two cameras that disagree either may have
-//! been moved, unless one sees tags of the room.
+//! The pose of each set is eliminated, as in [`crate::bundle`]. This leaves normal equations of the lasting parameters:
+//! clock, readout, position and direction of each camera, and the scale of the tags. Each parameter has a prior around
+//! zero error. The prior is as narrow as a correct setup allows, and is widened to the estimate until it explains the
+//! corners (MacKay 1992, "Bayesian interpolation", section 4: the evidence chooses the prior). Parameters that images
+//! do not determine stay uncertain, which the pose's covariance includes. For example, if two cameras disagree, either
+//! may have been moved, unless one sees tags of the room.
 //!
-//! Of clocks only differences can be known. A stamp is written after the exposure, never before: the camera that is
-//! least late is taken to be right.
+//! Only differences between clocks are observable. A stamp is never earlier than its exposure, so the camera with the
+//! least delay is the reference.
 
 mod finding;
 mod normal;
@@ -27,34 +27,35 @@ use crate::bundle::matrix::Symmetric;
 use crate::solve::{CornerRow, Sighting, VehicleTwist, corner_rows};
 use normal::{Normal, eliminate, times, unknowns};
 
-/// What is known to be wrong with a camera.
+/// Estimated errors of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Correction {
-    /// How much later than the exposure its images are stamped. [s]
+    /// Delay of the image's stamp after the exposure. [s]
     pub(super) late_s: f64,
-    /// From its first row's exposure to its last one's. [s]
+    /// Time from the exposure of the first row to that of the last row. [s]
     pub(super) readout_s: f64,
-    /// How far it is from where its file has it. [m, world or body]
+    /// Displacement from the position in the camera's file. [m, world or body]
     pub(super) moved_m: DVec3,
-    /// How far it is turned, about its own axes. [rad, cam]
+    /// Rotation from the orientation in the file, about the camera's axes. [rad, cam]
     pub(super) turned_rad: DVec3,
 }
 
 impl Correction {
-    /// Returns where a camera is whose file has it elsewhere.
+    /// Returns the corrected pose of a camera, from the pose in its file.
     pub(super) fn apply<A: Frame, B: Frame>(&self, pose: &Pose<A, B>) -> Pose<A, B> {
         let turn = DQuat::from_scaled_axis(self.turned_rad);
         Pose::new(pose.translation_m + self.moved_m, (pose.rotation * turn).normalize())
     }
 }
 
-/// Corners of a set of images at its pose.
+/// Linearized corners of a set of images at its pose.
 pub(super) struct Linear {
     rows: Vec<(usize, f64, CornerRow)>,
 }
 
 impl Linear {
-    /// Returns how corners change with everything; `None` behind a camera. `cameras` are those of the sightings.
+    /// Returns the derivatives of the corners by all parameters; `None` if a corner is behind its camera. `cameras` are
+    /// the cameras of the sightings.
     pub(super) fn at(
         sightings: &[Sighting],
         cameras: &[usize],
@@ -71,30 +72,30 @@ impl Linear {
     }
 }
 
-/// Estimates what is wrong.
+/// Estimator of setup errors.
 #[derive(Debug)]
 pub(super) struct Monitor {
     cameras: usize,
-    /// Of the last seconds of motion, and of the last moment.
+    /// Normal equations of the last seconds of motion (`long`) and of the last moment (`short`).
     long: Normal,
     short: Normal,
-    /// When sets were learnt from, and when they were judged.
+    /// Stamps of the last set and of the last evaluation.
     learnt: Option<HostTime>,
     judged: Option<HostTime>,
-    /// What is wrong, as it is applied.
+    /// Estimated errors, as applied.
     wrong: Vec<f64>,
-    /// How sure that is; the prior before anything was judged.
+    /// Covariance of `wrong`; the prior before the first evaluation.
     covariance: Symmetric,
-    /// Variance of each unknown's prior, and what it is at least.
+    /// Variance of each parameter's prior, and its minimum.
     prior: Vec<f64>,
     floors: Vec<f64>,
-    /// The camera whose clock is right.
+    /// Camera with the reference clock.
     on_time: usize,
 }
 
 impl Monitor {
-    /// Makes a monitor of cameras whose places are known as well as this, one standard deviation an axis [m] and about one
-    /// [rad]; of tags that are as large as they say, or not.
+    /// Makes a monitor. `sigmas` are the position [m] and rotation [rad] sigma per axis of each camera's pose. With
+    /// `is_measure` the tags define the scale, and their size is not estimated.
     pub(super) fn new(sigmas: &[(f64, f64)], is_measure: bool) -> Self {
         let cameras = sigmas.len();
         let size = EACH * cameras + 1;
@@ -125,7 +126,7 @@ impl Monitor {
         }
     }
 
-    /// Returns what is known to be wrong with a camera.
+    /// Returns the estimated errors of a camera.
     pub(super) fn correction(&self, camera: usize) -> Correction {
         let own = &self.wrong[EACH * camera..][..EACH];
         Correction {
@@ -136,16 +137,17 @@ impl Monitor {
         }
     }
 
-    /// Returns the tags' size in units of their layout's.
+    /// Returns the ratio of the tags' true size to the size in their layout.
     pub(super) fn scale(&self) -> f64 {
         1.0 + self.wrong[EACH * self.cameras]
     }
 
-    /// Learns from a set at its pose.
+    /// Adds a set of images at its pose.
     pub(super) fn learn(&mut self, stamp: HostTime, set: &Linear, motion: &VehicleTwist) {
         let dt_s = self.learnt.map_or(0.0, |learnt| stamp.seconds_since(learnt).clamp(0.0, 1.0));
         self.learnt = self.learnt.max(Some(stamp));
-        // While it stands nothing is learnt of clocks and scale, and nothing forgotten.
+        // A vehicle that stands still gives no information about clocks and scale, so earlier information does not
+        // decay.
         let moves = (motion.v_world_mps.length() / MOVES_MPS).min(1.0);
         self.long.keep((-dt_s * moves / LONG_S).exp());
         self.short.keep((-dt_s / SHORT_S).exp());
@@ -156,7 +158,7 @@ impl Monitor {
         }
     }
 
-    /// Learns from tags of the room in the image of a camera in the room.
+    /// Adds tags of the room in the image of a fixed camera.
     pub(super) fn anchor(&mut self, camera: usize, set: &Linear) {
         let sigma = ANCHOR_SIGMAS;
         for normal in [&mut self.long, &mut self.short] {
@@ -185,7 +187,7 @@ impl Monitor {
         }
     }
 
-    /// Works out what is wrong, if it is time again.
+    /// Updates the estimate, if the interval has elapsed.
     pub(super) fn judge(&mut self, stamp: HostTime) {
         if self.judged.is_some_and(|judged| stamp.seconds_since(judged).abs() < JUDGE_S) {
             return;
@@ -196,7 +198,7 @@ impl Monitor {
             let short = self.short.solve(&self.prior, self.on_time);
             if let (Some((long, _)), Some((short, _))) = (long, short) {
                 let (old, new) = (self.short.cost(&long), self.short.cost(&short));
-                // What was learnt before does not explain what is seen now: something happened.
+                // The earlier estimate does not explain the latest images: the setup changed.
                 if old > CHANGED * new.max(0.1 * self.short.count) {
                     self.long = self.short.clone();
                 }
@@ -215,7 +217,7 @@ impl Monitor {
                     < -(FLOORS[LATE] + 3.0 * self.covariance.at(EACH * first, EACH * first).sqrt())
             {
                 self.on_time = first;
-                // Its differences to the others stay.
+                // Clock differences to the other cameras stay the same.
                 let by_s = late[first];
                 for camera in 0..self.cameras {
                     self.wrong[EACH * camera + LATE] -= by_s;
@@ -226,12 +228,12 @@ impl Monitor {
         }
     }
 
-    /// Widens priors to what was found, and narrows them where nothing was.
+    /// Sets the priors to the estimated errors, but not below their minimum.
     fn widen(&mut self, wrong: &[f64], covariance: &Symmetric) {
         let size = wrong.len();
         let mut i = 0;
         while i < size {
-            // What turns a camera moves it, too.
+            // A rotated camera is also displaced: position and rotation share one factor.
             let together = if kind(i, size) == PLACE { EACH - PLACE } else { 1 };
             let found: f64 = (i..i + together)
                 .map(|i| (wrong[i].powi(2) + covariance.at(i, i)) / self.floors[i])
@@ -245,7 +247,7 @@ impl Monitor {
         }
     }
 
-    /// Returns what the open questions add to the covariance of a set's pose. [m, world; rad, body]
+    /// Returns the contribution of the uncertain parameters to the covariance of a set's pose. [m, world; rad, body]
     pub(super) fn spread(&self, set: &Linear) -> [[f64; 6]; 6] {
         let zero = [[0.0; 6]; 6];
         let Some((inverse, across)) =
@@ -253,7 +255,7 @@ impl Monitor {
         else {
             return zero;
         };
-        // How the pose changes with what is wrong.
+        // Derivative of the pose by the parameters.
         let by: Vec<[f64; 6]> = across.iter().map(|column| times(&inverse, column)).collect();
         let mut spread = zero;
         for (i, by_i) in by.iter().enumerate() {
@@ -271,8 +273,7 @@ impl Monitor {
         spread
     }
 
-    /// Returns what people should know. `centres` are where the cameras are, `axes` what turns their axes into the
-    /// outer ones.
+    /// Returns the findings for the operator. `places` transform from the cameras' axes to the outer ones.
     pub(super) fn findings(&self, places: &[glam::DAffine3]) -> Vec<Finding> {
         let mut found = Vec::new();
         let sure = |i: usize, least: f64| {
@@ -306,7 +307,7 @@ impl Monitor {
         found
     }
 
-    /// Returns the two cameras that disagree most, if neither alone is known to have moved.
+    /// Returns the pair of cameras that disagree most, if no single camera is known to have moved.
     fn moved_against_another(&self, places: &[glam::DAffine3]) -> Option<Finding> {
         let mut most: Option<(f64, Finding)> = None;
         for a in 0..self.cameras {
@@ -314,7 +315,7 @@ impl Monitor {
                 let both = [a, b].map(|camera| EACH * camera + PLACE..EACH * camera + TURN + 3);
                 let surprise = self.surprise(&both.into_iter().flatten().collect::<Vec<_>>());
                 let (one, other) = (self.correction(a), self.correction(b));
-                // If the other stands right, the world moved by this.
+                // If the other camera has not moved, this one moved by this.
                 let turn = places[b].transform_vector3(other.turned_rad);
                 let arm_m = places[a].translation - places[b].translation;
                 let moved_m = (one.moved_m - other.moved_m - turn.cross(arm_m)).length();
@@ -332,7 +333,7 @@ impl Monitor {
         most.map(|(_, finding)| finding)
     }
 
-    /// Returns how far unknowns are from zero, squared, in units of how sure they are.
+    /// Returns the squared distance of parameters from zero, in sigmas (Mahalanobis).
     fn surprise(&self, unknowns: &[usize]) -> f64 {
         let mut part = Symmetric::zero(unknowns.len());
         for (i, row) in unknowns.iter().enumerate() {
@@ -345,7 +346,7 @@ impl Monitor {
     }
 }
 
-/// Returns what an unknown is: one of a camera's, or [`EACH`] for the scale.
+/// Returns the kind of a parameter: an offset within a camera's parameters, or [`EACH`] for the scale.
 fn kind(i: usize, size: usize) -> usize {
     match i % EACH {
         _ if i + 1 == size => EACH,
@@ -355,47 +356,48 @@ fn kind(i: usize, size: usize) -> usize {
     }
 }
 
-/// Unknowns of a camera, and where each begins.
+/// Number of parameters per camera, and offsets of each kind.
 const EACH: usize = 8;
 const LATE: usize = 0;
 const READOUT: usize = 1;
 const PLACE: usize = 2;
 const TURN: usize = 5;
-/// How far each is off where nothing is wrong, by its kind: stamps and shutters by a fraction of a millisecond, the
-/// ruler's reading by hundredths of a millimetre. Cameras: by what their survey left.
+/// Minimum sigma of a parameter by kind, valid for a correct setup: stamps and shutters a fraction of a millisecond,
+/// the ruler's reading hundredths of a millimetre. For cameras it comes from their survey.
 const FLOORS: [f64; EACH + 1] = [2e-4, 5e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-4];
-/// And how far before anything was seen.
+/// Initial sigma, before the first set.
 const FIRST: [f64; EACH + 1] = [1e-2, 1e-2, 2e-3, 0.0, 0.0, 7e-4, 0.0, 0.0, 7e-3];
-/// And how far at most: clocks by half a second, a readout by an image's interval, a camera by what still sees.
+/// Maximum sigma: half a second for clocks, one image interval for the readout, a displacement that still allows
+/// detection for cameras.
 const CEILINGS: [f64; EACH + 1] = [0.5, 0.05, 0.5, 0.0, 0.0, 0.2, 0.0, 0.0, 0.2];
-/// Tags of the room are seen 3 times a second over [`LONG_S`], always with the same error of survey and lens: all
-/// together count as one.
+/// Factor on the sigma of the room's tags. They are measured 3 times per second over [`LONG_S`], always with the same
+/// error of survey and lens, so all measurements together count as one.
 const ANCHOR_SIGMAS: f64 = 8.0;
-/// What is learnt lasts for so long of motion, [s]
+/// Time constant of the long memory, counting only motion at [`MOVES_MPS`] or faster. [s]
 const LONG_S: f64 = 8.0;
-/// at this speed or faster. [m/s]
+/// Speed at which the long memory decays at its full rate. [m/s]
 const MOVES_MPS: f64 = 0.3;
-/// The last moment. [s]
+/// Time constant of the short memory. [s]
 const SHORT_S: f64 = 0.5;
-/// So many numbers of it are needed to see that something happened.
+/// Minimum number of residuals in the short memory to detect a change.
 const LEAST_ROWS: f64 = 20.0;
-/// It happened if what was known leaves so many times the squares.
+/// Factor between the squared residuals of the earlier estimate and the new one that means a change.
 const CHANGED: f64 = 4.0;
-/// How often it is judged, [s]
+/// Interval of evaluations. [s]
 const JUDGE_S: f64 = 0.1;
-/// and priors are widened each time.
+/// Number of rounds that widen the priors in each evaluation.
 const ROUNDS: usize = 4;
-/// Findings are told from these on. [s]
+/// Minimum delay of stamps in a finding. [s]
 const LATE_S: f64 = 3e-3;
-/// [s]
+/// Minimum readout time in a finding. [s]
 const READOUT_S: f64 = 4e-3;
-/// [m]
+/// Minimum displacement of a camera in a finding. [m]
 const MOVED_M: f64 = 0.008;
-/// [rad]
+/// Minimum rotation of a camera in a finding. [rad]
 const TURNED_RAD: f64 = 0.003;
-/// Share of the size.
+/// Minimum deviation of the tags' size in a finding, as a share of the size.
 const SCALE: f64 = 0.007;
-/// And if they are so many of their sigmas from zero.
+/// Minimum ratio of a reported value to its sigma.
 const SURE_SIGMAS: f64 = 4.0;
-/// Likewise, of six numbers, squared.
+/// Minimum squared ratio of the six pose parameters of a camera.
 const MOVED_SURPRISE: f64 = 40.0;

@@ -1,4 +1,4 @@
-//! What comes of a set of images.
+//! Result of a set of images.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -7,12 +7,11 @@ use vizflyt_protocol::time::HostTime;
 use crate::detect::Region;
 use crate::detection::Detection;
 
-/// The vehicle's pose.
+/// Estimated pose of the vehicle.
 #[derive(Clone, Copy, Debug)]
 pub struct Located {
-    /// When it was there.
+    /// Time of the pose.
     pub stamp: HostTime,
-    /// Where.
     pub world_from_body: Pose<World, Body>,
     /// Standard deviation of the position. [m, world]
     pub position_sigma_m: DVec3,
@@ -20,60 +19,59 @@ pub struct Located {
     pub rotation_sigma_rad: DVec3,
     /// Covariance of both, position first, without the floors. [m, world; rad, body]
     pub covariance: [[f64; 6]; 6],
-    /// How many tags it rests on; one in two cameras counts twice.
+    /// Number of tags used; a tag in two cameras counts twice.
     pub tags: usize,
-    /// In how many cameras.
+    /// Number of cameras used.
     pub cameras: usize,
-    /// Root mean square distance of corners from where the pose puts them. [px]
+    /// Root mean square reprojection error. [px]
     pub rms_px: f64,
 }
 
-/// Why there is no pose.
+/// Why a pose is not available.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Unlocated {
     /// No tag of a layout is in the images.
     NoTag,
-    /// Tags do not lead to any pose.
+    /// The solver found no pose for the tags.
     NoPose,
-    /// Corners lie too far from where the best pose puts them, root mean square. [px]
+    /// The best pose has too large a root mean square reprojection error. [px]
     Residuals(f64),
-    /// One tag, and two poses that explain it: more images will decide.
+    /// A single tag with two possible poses; more images will decide.
     Ambiguous,
-    /// The images are older than those before.
+    /// The images are older than earlier ones.
     Old,
 }
 
-/// What one camera saw.
+/// Detections of one camera.
 #[derive(Clone, Debug)]
 pub struct CameraResult {
     /// Index of the camera.
     pub camera: usize,
-    /// When.
+    /// Stamp of the image.
     pub stamp: HostTime,
-    /// Where it was looked; the whole image if nothing.
+    /// Searched region; `None` for the whole image.
     pub region: Option<Region>,
-    /// Whether no tag should be in its image, by where the vehicle should be.
+    /// Whether the predicted pose puts all tags outside the image.
     pub out_of_view: bool,
     /// Tags of the layouts.
     pub seen: Vec<TagObservation>,
-    /// Tags of no layout, or of one that this camera cannot use.
+    /// Tags in no layout, or in one that this camera cannot use.
     pub strangers: Vec<Detection>,
 }
 
 /// A tag of a layout in an image.
 #[derive(Clone, Copy, Debug)]
 pub struct TagObservation {
-    /// The tag.
     pub detection: Detection,
-    /// Where the pose puts its corners; absent without one. [px]
+    /// Corners projected from the estimated pose; `None` without a pose. [px]
     pub expected_px: Option<[DVec2; 4]>,
 }
 
-/// What came of a set of images.
+/// Result of a set of images.
 #[derive(Clone, Debug)]
 pub struct LocateOutcome {
-    /// The pose, or why there is none.
+    /// The pose, or the reason why it is not available.
     pub located: Result<Located, Unlocated>,
-    /// What each camera saw.
+    /// Detections of each camera.
     pub looks: Vec<CameraResult>,
 }

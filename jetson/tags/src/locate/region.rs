@@ -1,4 +1,4 @@
-//! Where tags should be in an image.
+//! Expected position of tags in an image.
 
 use glam::{DMat3, DVec2};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -7,18 +7,18 @@ use crate::camera::{Mounting, TagCamera};
 use crate::detect::Region;
 use crate::layout::{CORNERS, LayoutFrame, Tag};
 
-/// What is expected of an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Expected {
-    /// Nothing is known of the vehicle.
+    /// The vehicle's pose is unknown.
     Unknown,
-    /// No tag should be in it.
+    /// All tags are outside the image.
     OutOfView,
-    /// Tags should be here.
+    /// Tags are inside this region.
     Within(Region),
 }
 
-/// Returns where tags that move against a camera should be if the vehicle is at a pose, give or take `uncertainty_m`.
+/// Returns the expected region of the tags that move relative to the camera, for a pose with uncertainty
+/// `uncertainty_m`.
 pub(super) fn expect<'a>(
     camera: &TagCamera,
     tags: impl Iterator<Item = &'a Tag>,
@@ -55,7 +55,7 @@ pub(super) fn expect<'a>(
         return Expected::OutOfView;
     }
     if let Mounting::Body(_) = camera.mounting {
-        // The room moves through a carried camera's image when the vehicle turns.
+        // When the vehicle turns, the room moves through the image of its camera.
         margin_px += TURN_UNCERTAINTY_RAD * k.fx_px;
     }
     let margin = DVec2::splat(margin_px + MIN_MARGIN_PX);
@@ -66,10 +66,11 @@ pub(super) fn expect<'a>(
     })
 }
 
-/// How large tags of each size are seen; a mat has several.
+/// Visible sizes of tags in the image; a mat has tags of several sizes.
 #[derive(Default)]
 struct Sizes {
-    /// Edge of the tags [m], the largest of their shortest edges [px], and of those that should be in the image as a whole.
+    /// Per size: edge of the tag [m], largest of the shortest edges in the image [px], and the same for tags completely
+    /// inside the image [px].
     all: Vec<(f64, f64, f64)>,
 }
 
@@ -82,8 +83,8 @@ impl Sizes {
         }
     }
 
-    /// Returns the edge of the tags to look for: of several sizes the smallest that is read with ease, for of these there are
-    /// many, and the border does not cut them all. [px]
+    /// Returns the edge of the tags to look for. With several sizes it is the smallest that is easy to decode: such
+    /// tags are numerous, and the image's border does not cut all of them. [px]
     fn edge_px(&self) -> f64 {
         let most_px = |of: fn(&(f64, f64, f64)) -> f64| self.all.iter().map(of).fold(0.0, f64::max);
         if let [(_, edge_px, _)] = self.all[..] {
@@ -94,7 +95,7 @@ impl Sizes {
         if easy_px.is_finite() {
             return easy_px;
         }
-        // Else what is largest of those that are whole, or that are there at all.
+        // Otherwise: the largest tag that is completely inside, or the largest of all.
         match most_px(|(.., whole_px)| *whole_px) {
             whole_px if whole_px > 0.0 => whole_px,
             _ => most_px(|(_, edge_px, _)| *edge_px),
@@ -110,8 +111,8 @@ pub(super) fn sees(mounting: &Mounting, frame: LayoutFrame) -> bool {
     )
 }
 
-/// Returns the corners of a tag, grown about its middle by `scale`, in a camera; `None` unless all are
-/// ahead of it and its printed face is seen at more than a grazing angle.
+/// Returns the projected corners of a tag, scaled about its middle by `scale`. `None` unless all corners are in front
+/// of the camera and the printed face is seen at more than a grazing angle.
 pub(super) fn project_tag(
     camera: &TagCamera,
     tag: &Tag,
@@ -143,17 +144,17 @@ pub(super) fn project_tag(
     Some(corners)
 }
 
-/// Tags of so many pixels are read pixel by pixel, without enlarging the image. [px]
+/// Tags with at least this edge are decoded without enlarging the image. [px]
 const EASY_PX: f64 = 30.0;
-/// What the first solution of a search may be off. [m]
+/// Uncertainty of the first pose after a search. [m]
 pub(super) const FOUND_UNCERTAINTY_M: f64 = 0.15;
-/// Tags are found by the white rim around them, one cell of eight, and some of the paper.
+/// Scale that includes the white rim, which detection needs (one cell of eight), and some paper.
 const WITH_RIM: f64 = 1.4;
-/// What the attitude may turn unforeseen between two images. [rad]
+/// Maximum unpredicted rotation between two images. [rad]
 const TURN_UNCERTAINTY_RAD: f64 = 0.03;
-/// What is added around in any case. [px]
+/// Minimum margin of the region. [px]
 const MIN_MARGIN_PX: f64 = 8.0;
-/// Cosine to a tag's normal below which it cannot be read: 81 degrees.
+/// Minimum cosine between a tag's normal and the view direction: 81 degrees.
 const GRAZING: f64 = 0.15;
 
 #[cfg(test)]
@@ -161,7 +162,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_several_sizes_those_are_looked_for_that_are_whole_and_read_with_ease() {
+    fn selects_the_smallest_complete_and_easily_decoded_tag_size() {
         let edge_px = |tags: &[(f64, f64, bool)]| {
             let mut sizes = Sizes::default();
             for &(size_m, edge_px, is_whole) in tags {
@@ -169,12 +170,12 @@ mod tests {
             }
             sizes.edge_px()
         };
-        // A cube's faces are of one size, and aslant.
+        // All faces of a cube have the same size; one is seen at an angle.
         assert_eq!(edge_px(&[(0.2, 80.0, true), (0.2, 20.0, true)]), 80.0);
-        // Standing on a pad: the large tags about it are cut.
+        // On a pad: the image's border cuts the large tags around it.
         assert_eq!(edge_px(&[(0.2, 500.0, false), (0.042, 120.0, true)]), 120.0);
         assert_eq!(edge_px(&[(0.2, 100.0, false), (0.042, 22.0, true)]), 22.0);
-        // Higher up both are seen, and small ones badly.
+        // Higher up: both sizes are visible, the small one at the limit of detection.
         assert_eq!(edge_px(&[(0.2, 150.0, true), (0.042, 32.0, true)]), 32.0);
         assert_eq!(edge_px(&[(0.2, 90.0, true), (0.042, 19.0, true)]), 90.0);
         assert_eq!(edge_px(&[(0.2, 25.0, true), (0.042, 5.0, true)]), 25.0);

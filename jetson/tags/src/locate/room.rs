@@ -1,4 +1,4 @@
-//! Tags of the room in the image of a camera in the room: whether it is still where it was.
+//! Checks by tags of the room whether a fixed camera was moved.
 
 use vizflyt_protocol::geometry::Pose;
 
@@ -10,7 +10,7 @@ use crate::layout::LayoutFrame;
 use crate::solve::{Geometry, Sighting, VehicleTwist};
 
 impl Locator {
-    /// Looks now and then whether tags of the room are still where a camera in the room had them.
+    /// Periodically compares the tags of the room with their expected positions in the image of a fixed camera.
     pub(super) fn look_at_room(&mut self, view: &StampedImage) {
         let wrong = self.monitor.correction(view.camera);
         let station = &mut self.stations[view.camera];
@@ -28,7 +28,7 @@ impl Locator {
             return;
         };
         let found = self.detector.look(view.image, &region, &station.camera.intrinsics);
-        // A vehicle that stays where it is, and is the camera's stand.
+        // The solver estimates a vehicle's pose: here the vehicle is the camera's stand, which does not move.
         let at = wrong.apply(&world_from_cam);
         let body_from_cam = Pose::new(at.translation_m, at.rotation);
         let sightings: Vec<Sighting> = found
@@ -58,7 +58,7 @@ impl Locator {
     }
 }
 
-/// How often tags of the room are looked at. [s]
+/// Interval of checks. [s]
 const ROOM_S: f64 = 0.3;
-/// They are looked for so far from where they were. [m]
+/// Position uncertainty of the room's tags, for the searched region. [m]
 const ROOM_UNCERTAINTY_M: f64 = 0.1;

@@ -7,7 +7,7 @@ fn at(ms: u64) -> HostTime {
     HostTime::from_ns(3_000_000_000 + ms * 1_000_000)
 }
 
-/// Returns what one camera sees of a vehicle that moves as given, by milliseconds.
+/// Returns the images of one camera of a vehicle that moves as given; the truth is updated every millisecond.
 fn images(
     camera: &TagCamera,
     layouts: &[TagLayout],
@@ -29,7 +29,7 @@ fn locator(cameras: Vec<TagCamera>, layouts: &[TagLayout]) -> Locator {
 }
 
 #[test]
-fn invalid_setups_are_refused_by_name() {
+fn rejects_invalid_setups_with_the_reason() {
     let check = |cameras: Vec<TagCamera>, layouts: &[TagLayout], part: &str| {
         let error = Locator::new(cameras, layouts, LocateSettings::default()).err();
         let error = error.expect(part).to_string();
@@ -46,9 +46,9 @@ fn invalid_setups_are_refused_by_name() {
 }
 
 #[test]
-fn one_far_face_is_open_until_it_is_decided_and_is_then_true() {
+fn resolves_the_ambiguity_of_one_far_face_to_the_true_pose() {
     let camera = webcams(1).remove(0);
-    // The tail's tag alone, seen nearly from the front, 5 m away.
+    // Only the tail's tag, seen nearly from the front at 5 m.
     let face = TagLayout { tags: vec![cube().tags[2]], ..cube() };
     let pose_at = |t_s: f64| {
         let turn = DQuat::from_rotation_z(-0.35 + 0.5 * t_s) * DQuat::from_rotation_y(0.3);
@@ -74,7 +74,7 @@ fn one_far_face_is_open_until_it_is_decided_and_is_then_true() {
 }
 
 #[test]
-fn unknown_tags_are_ignored_and_absence_is_reported() {
+fn ignores_unknown_tags_and_reports_no_tag() {
     let camera = webcams(1).remove(0);
     let mut other = cube();
     for tag in &mut other.tags {
@@ -91,9 +91,9 @@ fn unknown_tags_are_ignored_and_absence_is_reported() {
 }
 
 #[test]
-fn finds_the_vehicle_again_elsewhere_and_refuses_old_images() {
+fn finds_a_displaced_vehicle_again_and_rejects_old_images() {
     let camera = webcams(1).remove(0);
-    // It is carried away between two images.
+    // The vehicle is moved between two images.
     let pose_at = |t_s: f64| {
         let y_m = if t_s < 0.3 { -0.6 } else { 0.8 };
         Pose::new(DVec3::new(4.0, y_m, 1.5), DQuat::from_rotation_z(0.5))
@@ -107,7 +107,7 @@ fn finds_the_vehicle_again_elsewhere_and_refuses_old_images() {
             let truth = pose_at(stamp.seconds_since(at(0)));
             let off_m = found.world_from_body.translation_m.distance(truth.translation_m);
             assert!(off_m < 0.05, "{off_m} m at {stamp:?}");
-            // The pose predicts where the corners are.
+            // The pose predicts the corners.
             for seen in &outcome.looks[0].seen {
                 let expected = seen.expected_px.expect("there is a pose");
                 let off = expected[0].distance(seen.detection.corners_px[0]);
@@ -123,8 +123,8 @@ fn finds_the_vehicle_again_elsewhere_and_refuses_old_images() {
 }
 
 #[test]
-fn a_camera_at_whose_border_it_is_does_not_hold_up_the_one_that_sees_it() {
-    // Near the hall's east end: its own camera sees a part of the cube, and finds no whole tag.
+fn does_not_wait_for_a_camera_that_sees_the_vehicle_at_its_edge() {
+    // Near the hall's east end the east camera sees only a part of the cube and no complete tag.
     let cameras = webcams(2);
     let pose_at = |t_s: f64| {
         let drift = DVec3::new((3.0 * t_s).sin(), (2.0 * t_s).cos(), 0.0) * 0.03;
@@ -158,8 +158,8 @@ fn a_camera_at_whose_border_it_is_does_not_hold_up_the_one_that_sees_it() {
     assert!(found > 20 && hidden > 12, "{found} found by one, {hidden} hidden from the other");
 }
 
-/// Flies a circle before two webcams that are exposed in turn, the second's stamps late by `late_s`; returns what is
-/// found, and how far the last second's poses are from the truth: root mean square in metres, and in sigmas.
+/// Flies a circle in front of two webcams that are exposed in turn; stamps of the second are late by `late_s`. Returns
+/// the findings, and the position error in the last second: root mean square in metres, and mean square in sigmas.
 fn fly_before(
     files: Vec<TagCamera>,
     room: Option<&TagLayout>,
@@ -202,7 +202,7 @@ fn fly_before(
 }
 
 #[test]
-fn what_is_wrong_with_the_lab_is_found_named_and_corrected() {
+fn finds_names_and_corrects_errors_of_the_lab() {
     let moved = |index: usize| {
         let mut files = webcams(2);
         if let Mounting::World(pose) = &mut files[index].mounting {

@@ -1,9 +1,9 @@
-//! How the vehicle moves, and which of two answers is true.
+//! Motion of the vehicle, and the choice between two ambiguous poses.
 //!
-//! Where one square is all that is seen, two poses explain it. Both are kept, each with a penalty in the
-//! units of [`crate::solve::PoseFit::cost`]: what its corners cost more than the other's, summed over the
-//! images, and what it would have turned against its own motion. The false one tilts the other way with
-//! every motion, and its penalty grows; a second tag ends it at once.
+//! A single visible square has two possible poses. Both are kept as hypotheses, each with a penalty in the units of
+//! [`crate::solve::PoseFit::cost`]. The penalty sums two terms over the images: the additional cost of the hypothesis'
+//! corners, and the deviation of its rotation from its own motion. The false pose tilts against the true motion, so its
+//! penalty grows. A second tag resolves the ambiguity at once.
 
 use std::collections::VecDeque;
 
@@ -13,27 +13,27 @@ use vizflyt_protocol::time::HostTime;
 
 use crate::solve::{PoseFit, Solved, VehicleTwist};
 
-/// What is known of the vehicle's way.
+/// Recent poses of the vehicle.
 #[derive(Debug, Default)]
 pub(super) struct Track {
-    /// The likelier first; two at most.
+    /// At most two, the more likely one first.
     hypotheses: Vec<Hypothesis>,
 }
 
 #[derive(Clone, Debug)]
 struct Hypothesis {
-    /// Newest last, each with how much it counts.
+    /// Past poses with their weights, the newest last.
     past: VecDeque<(HostTime, Pose<World, Body>, f64)>,
     penalty: f64,
 }
 
 impl Track {
-    /// Returns when it was last seen.
+    /// Returns the stamp of the newest pose.
     pub(super) fn newest(&self) -> Option<HostTime> {
         self.hypotheses.first().and_then(Hypothesis::newest).map(|(stamp, _)| stamp)
     }
 
-    /// Returns where the vehicle should be; `None` if it was not seen for too long.
+    /// Returns the predicted pose; `None` if the last pose is too old.
     pub(super) fn predict(&self, stamp: HostTime) -> Option<Pose<World, Body>> {
         self.hypotheses.first()?.predict(stamp)
     }
@@ -47,20 +47,20 @@ impl Track {
             + 0.5 * ACCELERATION_UNCERTAINTY_MPS2 * dt_s * dt_s
     }
 
-    /// Takes a pose of the past, which tells how it moves since.
+    /// Adds a pose between older ones, which improves the motion estimate.
     pub(super) fn insert(&mut self, stamp: HostTime, fit: &PoseFit) {
         if let [only] = &mut self.hypotheses[..] {
             only.push(stamp, fit);
         }
     }
 
-    /// Returns how it moves; `None` before there are enough poses, and some time after the last.
+    /// Returns the motion; `None` with too few poses, or if the last pose is too old.
     pub(super) fn motion(&self, stamp: HostTime) -> Option<VehicleTwist> {
         let age_s = stamp.seconds_since(self.newest()?);
         (age_s <= MOTION_LASTS_S).then(|| self.hypotheses.first()?.motion())?
     }
 
-    /// Takes a solution; returns the accepted fit, or `None` while two are possible.
+    /// Processes a solution; returns the accepted fit, or `None` while it is ambiguous.
     pub(super) fn update(
         &mut self,
         stamp: HostTime,
@@ -130,8 +130,8 @@ impl Hypothesis {
         (dt_s.abs() <= FORGET_AFTER_S).then(|| self.motion().unwrap_or_default().carry(&pose, dt_s))
     }
 
-    /// Returns parabolas through the latest poses, by least squares; straight lines through a few. At the newest
-    /// pose: the velocity of a straight line is that of the middle of its span.
+    /// Fits parabolas to the latest poses by least squares, or straight lines if there are few poses. The result is the
+    /// motion at the newest pose; a straight line's velocity belongs to the middle of its span.
     fn motion(&self) -> Option<VehicleTwist> {
         let (_, pose) = self.newest()?;
         let (v_world_mps, a_world_mps2) =
@@ -141,7 +141,8 @@ impl Hypothesis {
         Some(VehicleTwist { v_world_mps, omega_body_radps, a_world_mps2 })
     }
 
-    /// Returns first and second derivative by time of a quantity at the newest pose, by those of the last `span_s`.
+    /// Returns the first and second time derivative of a quantity at the newest pose, from the poses of the last
+    /// `span_s`.
     fn slope(
         &self,
         span_s: f64,
@@ -156,7 +157,7 @@ impl Hypothesis {
         if count < 3 || !(span_s > 1e-3) {
             return None;
         }
-        // Time in spans, 0 is the newest: sums of powers of it, and of what changes times them.
+        // Time in units of the span, 0 at the newest pose: sums of its powers, also multiplied by the values.
         let (mut powers, mut sums) = ([0.0; 5], [DVec3::ZERO; 3]);
         for (stamp, past, weight) in recent() {
             let (t, value) = (-age_s(stamp) / span_s, value(past));
@@ -170,7 +171,7 @@ impl Hypothesis {
             }
         }
         let [n, t, t2, t3, t4] = powers;
-        // Rows of the inverse that yield slope and curvature.
+        // Rows of the inverse that give slope and curvature.
         let (slope, bend) = if count >= CURVED_FROM {
             let det = n * (t2 * t4 - t3 * t3) - t * (t * t4 - t3 * t2) + t2 * (t * t3 - t2 * t2);
             (
@@ -185,7 +186,7 @@ impl Hypothesis {
         Some((by(slope) / span_s, 2.0 * by(bend) / (span_s * span_s)))
     }
 
-    /// Returns what a pose costs as the next of this one's.
+    /// Returns the cost of `pose` as the continuation of this hypothesis.
     fn surprise(&self, stamp: HostTime, pose: &Pose<World, Body>) -> f64 {
         let (Some(expected), Some((newest, _))) = (self.predict(stamp), self.newest()) else {
             return MAX_SURPRISE;
@@ -197,44 +198,44 @@ impl Hypothesis {
     }
 }
 
-/// Returns the turn from one attitude to another about the axes of the first. [rad]
+/// Returns the rotation from one attitude to another about the axes of the first. [rad]
 fn turn(from: DQuat, to: DQuat) -> DVec3 {
     let q = from.conjugate() * to;
-    // Both signs are the same attitude; this one is the shorter way.
+    // Both signs are the same attitude; this one is the shorter rotation.
     (if q.w < 0.0 { -q } else { q }).to_scaled_axis()
 }
 
-/// Poses of this span make the motion: of two cameras at 30 Hz ten. [s]
+/// Time span of poses for velocity and acceleration: ten poses of two cameras at 30 Hz. [s]
 const MOTION_SPAN_S: f64 = 0.16;
-/// Turns change faster than velocities. [s]
+/// Time span of poses for the rate of rotation, which changes faster than velocity. [s]
 const TURN_SPAN_S: f64 = 0.12;
-/// After this long a motion is another one. [s]
+/// Maximum age of a motion estimate. [s]
 const MOTION_LASTS_S: f64 = 0.15;
-/// A parabola takes so many poses.
+/// Minimum number of poses for a parabola.
 const CURVED_FROM: usize = 6;
-/// Better than this poses do not count more. [m]
+/// Lower limit of a pose's sigma in its weight. [m]
 const MIN_SIGMA_M: f64 = 0.001;
-/// And no more than this many.
+/// Maximum number of kept poses.
 const MAX_KEPT: usize = 32;
-/// After this long a vehicle can be anywhere. [s]
+/// Maximum age of a pose for prediction. [s]
 const FORGET_AFTER_S: f64 = 0.4;
-/// Noise of the prediction from one image to the next. [m]
+/// Prediction noise from one image to the next. [m]
 const MIN_UNCERTAINTY_M: f64 = 0.04;
-/// Standard error of its velocity. [m/s]
+/// Standard error of the predicted velocity. [m/s]
 const SPEED_UNCERTAINTY_MPS: f64 = 0.5;
 /// Unpredicted acceleration. [m/s^2]
 const ACCELERATION_UNCERTAINTY_MPS2: f64 = 10.0;
 /// Noise of the predicted attitude. [rad]
 const TURN_SIGMA_RAD: f64 = 0.05;
-/// Unpredicted rate of turn. [rad/s]
+/// Unpredicted rate of rotation. [rad/s]
 const TURN_SIGMA_RADPS: f64 = 1.0;
-/// One image decides little against motion: it may have been misread.
+/// Maximum cost of one image against the motion: it may have been misread.
 const MAX_SURPRISE: f64 = 10.0;
-/// Of what was learnt before, how much stays from image to image.
+/// Share of the penalty that is kept from image to image.
 const KEPT: f64 = 0.97;
-/// A solution that is e^4 times likelier is accepted.
+/// A hypothesis that is e^4 times more likely is accepted.
 const DECIDED: f64 = 4.0;
-/// One that is e^14 times less likely is dropped.
+/// A hypothesis that is e^14 times less likely is dropped.
 const HOPELESS: f64 = 14.0;
-/// Penalty of an impossible pose.
+/// Penalty of a tilt above the maximum.
 const IMPOSSIBLE: f64 = 20.0;

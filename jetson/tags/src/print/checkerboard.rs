@@ -4,12 +4,13 @@ use super::sheet::{FOOT_MM, MARGIN_MM, Sheet};
 use super::{Paper, PrintError, check_positive, scale};
 use crate::checkerboard::Checkerboard;
 
-/// Returns a sheet full of squares of this edge, and what is then on it; `bar_mm` is what the printed scale bar measures.
+/// Returns a sheet filled with squares of this edge, and the printed board; `bar_mm` is the measured length of the
+/// printed scale bar.
 ///
-/// Columns and rows of squares are an odd and an even number, so that the board looks the same only after a whole turn.
+/// The numbers of columns and rows of squares are odd and even, so that the board has no rotational symmetry.
 ///
 /// # Errors
-/// [`PrintError`] for squares that are too large or make no sense.
+/// [`PrintError`] for squares that are too large or out of range.
 pub fn checkerboard(
     paper: Paper,
     square_mm: f64,
@@ -17,7 +18,7 @@ pub fn checkerboard(
 ) -> Result<(Sheet, Checkerboard), PrintError> {
     check_positive("square_mm", square_mm)?;
     let scale = scale(bar_mm)?;
-    // A white rim around it: its outermost corners must be seen as such.
+    // A white rim around the board makes its outermost corners detectable.
     let [width, height] = paper.room_mm().map(|room| room - 2.0 * RIM_MM);
     let [columns, rows] = [width, height].map(|room| (room / square_mm) as u32);
     let rows = if (columns + rows).is_multiple_of(2) { rows.saturating_sub(1) } else { rows };
@@ -42,9 +43,9 @@ pub fn checkerboard(
     Ok((sheet, Checkerboard { columns: columns - 1, rows: rows - 1, square_m }))
 }
 
-/// White around the board. [mm]
+/// White rim around the board. [mm]
 const RIM_MM: f64 = 5.0;
-/// Three inner corners.
+/// Minimum number of squares in a direction, for three inner corners.
 const MIN_SQUARES: u32 = 4;
 
 #[cfg(test)]
@@ -53,7 +54,7 @@ mod tests {
     use crate::print::{BAR_MM, Shape};
 
     #[test]
-    fn a_sheet_is_filled_within_its_margins() {
+    fn fills_a_sheet_within_its_margins() {
         for (paper, square_mm) in [(Paper::A4, 25.0), (Paper::Letter, 20.0), (Paper::A3, 30.0)] {
             let (sheet, board) = checkerboard(paper, square_mm, BAR_MM).unwrap();
             assert_eq!(Checkerboard::parse(&board.to_toml().unwrap()).unwrap(), board);
@@ -77,7 +78,7 @@ mod tests {
                 assert!(y >= MARGIN_MM + FOOT_MM && y + h <= height - MARGIN_MM, "{y} {h}");
             }
         }
-        // A printer that shrinks to 97 %.
+        // A printer that scales to 97 %.
         let (_, board) = checkerboard(Paper::A4, 25.0, 97.0).unwrap();
         assert!((board.square_m - 0.02425).abs() < 1e-12);
         let error = checkerboard(Paper::A4, 80.0, BAR_MM).unwrap_err().to_string();

@@ -1,4 +1,4 @@
-//! The cube on the vehicle.
+//! Cube of tags on the vehicle.
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose};
@@ -8,28 +8,26 @@ use super::{Paper, PrintError, Printed, check_ids, check_positive, check_rim, sc
 use crate::family::TagFamily;
 use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
 
-/// A cube of tags on the vehicle, its faces along the body's axes.
+/// A cube of tags on the vehicle, with faces along the body's axes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cube {
-    /// Which tags.
     pub family: TagFamily,
-    /// Id of the front face; the others follow in the order of [`CUBE_FACES`].
+    /// Id of the front face; the other faces follow in the order of [`CUBE_FACES`].
     pub first_id: u32,
-    /// How many faces, 1 to 6; 5 leaves out the one below.
+    /// Number of faces, 1 to 6; 5 omits the bottom.
     pub faces: u32,
     /// Edge of the cube. [mm]
     pub face_mm: f64,
     /// Edge of a tag's black square. [mm]
     pub tag_mm: f64,
-    /// The cube's middle. [m, body]
+    /// Middle of the cube. [m, body]
     pub middle_m: DVec3,
-    /// What to print on.
     pub paper: Paper,
-    /// What the printed scale bar measures. [mm]
+    /// Measured length of the printed scale bar. [mm]
     pub bar_mm: f64,
 }
 
-/// Name of each face; where it points and where its tag's upper edge is. [body]
+/// Name of each face, its normal, and the direction of its tag's upper edge. [body]
 pub const CUBE_FACES: [(&str, DVec3, DVec3); 6] = [
     ("front", DVec3::X, DVec3::Z),
     ("left", DVec3::Y, DVec3::Z),
@@ -40,10 +38,10 @@ pub const CUBE_FACES: [(&str, DVec3, DVec3); 6] = [
 ];
 
 impl Cube {
-    /// Returns its sheets and its layout.
+    /// Returns the sheets and the layout.
     ///
     /// # Errors
-    /// [`PrintError`] for what does not fit or makes no sense.
+    /// [`PrintError`] for values that do not fit or are out of range.
     pub fn print(&self) -> Result<Printed, PrintError> {
         check_positive("face_mm", self.face_mm)?;
         check_positive("tag_mm", self.tag_mm)?;
@@ -103,7 +101,7 @@ impl Cube {
         let id = self.first_id + index;
         let middle = [f64::midpoint(left, right), f64::midpoint(low, top)];
         sheet.tag(self.family, id, middle, self.tag_mm);
-        // Fold along the face; flaps to glue lie around it, bevelled at 45 degrees.
+        // Fold lines along the face, with glue flaps around it, bevelled at 45 degrees.
         let corners = [[left, low], [right, low], [right, top], [left, top]];
         let out = [[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]];
         for side in 0..4 {
@@ -121,10 +119,10 @@ impl Cube {
         let (name, _, _) = CUBE_FACES[index as usize];
         let up = if index < 4 { "this edge up" } else { "this edge to the nose" };
         let text = format!("{name}   {} {id}   {up}", self.family);
-        // On the flap above, where it does not show.
+        // On the upper flap, which is hidden after assembly.
         sheet.text([left + FLAP_MM + 2.0, top + 2.5], 2.6, &text);
     }
 }
 
-/// Width of the flaps to glue. [mm]
+/// Width of the glue flaps. [mm]
 const FLAP_MM: f64 = 8.0;

@@ -1,8 +1,8 @@
-//! A mat to fly over with a camera under the vehicle: large tags all over it, which are seen from aloft, and pads of
-//! small ones where the vehicle stands, whose camera then is a hand above them.
+//! A mat for flights with a camera under the vehicle. Large tags cover the area and are visible from above. Pads of
+//! small tags lie where the vehicle stands, with its camera a hand's breadth above them.
 //!
-//! Large tags come one on a sheet, and sheets lie apart: their places are measured with a tape. Pads are joined edge to
-//! edge, and no large tag is where one lies.
+//! Each large tag has its own sheet. These sheets are laid out separately, and their positions are measured with a
+//! tape. Pads are joined edge to edge, and replace the large tags at their position.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Pose, World};
@@ -12,42 +12,41 @@ use super::{Mat, Paper, PrintError, Printed, check_ids, check_middle, scale};
 use crate::family::TagFamily;
 use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
 
-/// Where the vehicle takes off or lands.
+/// Pad for take-off or landing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pad {
-    /// Its middle. [m, world]
+    /// Middle of the pad. [m, world]
     pub middle_m: DVec2,
-    /// How far it reaches at least, east and north. [m]
+    /// Minimum extent, east and north. [m]
     pub size_m: DVec2,
 }
 
 impl Pad {
-    /// Two sheets side by side: for a vehicle that a person puts down.
+    /// Size of a pad of two sheets side by side, for a vehicle that is placed by hand.
     pub const SIZE_M: DVec2 = DVec2::new(0.5, 0.35);
 }
 
-/// A mat with tags of two sizes, for A3.
+/// A mat with tags of two sizes, printed on A3.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Floor {
-    /// Which tags.
     pub family: TagFamily,
-    /// Id of the first large tag, in the south-west; large ones count east, then north, then the pads' small ones.
+    /// Id of the first large tag, in the south-west. Large tags count east, then north; the pads' small tags follow.
     pub first_id: u32,
-    /// Where it is flown, east and north. [m]
+    /// Extent of the flight area, east and north. [m]
     pub size_m: DVec2,
-    /// Middle of that. [m, world]
+    /// Middle of the flight area. [m, world]
     pub middle_m: DVec3,
-    /// Where the vehicle stands.
+    /// Pads at which the vehicle stands.
     pub pads: Vec<Pad>,
-    /// What the printed scale bar measures. [mm]
+    /// Measured length of the printed scale bar. [mm]
     pub bar_mm: f64,
 }
 
 impl Floor {
-    /// Returns its sheets, those of the large tags first, and its layout.
+    /// Returns the sheets, those of the large tags first, and the layout.
     ///
     /// # Errors
-    /// [`PrintError`] for what does not fit or makes no sense.
+    /// [`PrintError`] for values that do not fit or are out of range.
     pub fn print(&self) -> Result<Printed, PrintError> {
         let (least_m, most_m) = (self.size_m.min_element(), self.size_m.max_element());
         if !(least_m >= LARGE_PITCH_M && most_m <= MOST_M) {
@@ -75,7 +74,7 @@ impl Floor {
         Ok(Printed { sheets, layout: TagLayout { frame: LayoutFrame::World, tags } })
     }
 
-    /// Returns the pads as the mats they are, each with the ids that it has here.
+    /// Returns the pads as mats with their ids in this floor.
     pub fn pads(&self) -> Vec<Mat> {
         let mut first_id = self.first_id + self.large_m().len() as u32;
         let mats = self.pads.iter().map(|pad| {
@@ -87,7 +86,7 @@ impl Floor {
     }
 
     fn pad(&self, pad: &Pad, first_id: u32) -> Mat {
-        // Whole sheets: a part of one is as much work.
+        // Whole sheets only: a part of a sheet is as much work.
         let [across, up] = sheet_tags();
         let sheets = (pad.size_m * 1e3 / SMALL_PITCH_MM / DVec2::new(across.into(), up.into()))
             .round()
@@ -105,7 +104,7 @@ impl Floor {
         }
     }
 
-    /// Returns where the large tags lie: in rows and columns about the middle, none where a pad is. [m, world]
+    /// Returns the positions of the large tags: in rows and columns around the middle, except under pads. [m, world]
     fn large_m(&self) -> Vec<DVec2> {
         let count = (self.size_m / LARGE_PITCH_M + 1e-9).floor();
         let pads: Vec<(DVec2, DVec2)> = self
@@ -147,20 +146,20 @@ impl Floor {
     }
 }
 
-/// Returns how many small tags a sheet has side by side, and above one another.
+/// Returns the number of columns and rows of small tags on a sheet.
 fn sheet_tags() -> [u32; 2] {
     Paper::A3.room_mm().map(|room_mm| (room_mm / SMALL_PITCH_MM) as u32)
 }
 
-/// Edge of a large tag: 20 px from 2.7 m above for a lens of 100 degrees at 640 px. [mm]
+/// Edge of a large tag: 20 px from a height of 2.7 m for a lens of 100 degrees at 640 px. [mm]
 const LARGE_MM: f64 = 200.0;
-/// With its white rim. [mm]
+/// Edge of a large tag with its white rim. [mm]
 const LARGE_PAPER_MM: f64 = 255.0;
-/// From large tag to large tag: from 0.4 m on such a lens always sees one. [m]
+/// Spacing of large tags: from a height of 0.4 m, such a lens always sees one. [m]
 const LARGE_PITCH_M: f64 = 0.5;
-/// Edge of a small tag: from 60 mm on such a lens sees one, wherever it stands and however it is turned. [mm]
+/// Edge of a small tag: from a height of 60 mm, such a lens sees one at any position and orientation on a pad. [mm]
 const SMALL_MM: f64 = 42.0;
-/// From small tag to small tag. [mm]
+/// Spacing of small tags. [mm]
 const SMALL_PITCH_MM: f64 = 53.0;
-/// More is a slip. [m]
+/// Maximum extent of a flight area. [m]
 const MOST_M: f64 = 50.0;

@@ -1,5 +1,4 @@
-//! A mat of tags on the floor or a wall, over as many sheets as it takes; and the board to calibrate
-//! with, which is a mat on one sheet.
+//! A mat of tags on the floor or a wall, over one or more sheets; and the calibration board, a mat on one sheet.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Pose, World};
@@ -11,35 +10,33 @@ use super::{
 use crate::family::TagFamily;
 use crate::layout::{LayoutFrame, Square, Tag, TagLayout};
 
-/// A grid of tags, flat: columns to the east, rows to the north, its middle at `middle_m`.
+/// A flat grid of tags: columns to the east, rows to the north, the middle at `middle_m`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mat {
-    /// Which tags.
     pub family: TagFamily,
-    /// Id of the tag at the lower left; ids count to the right, then up.
+    /// Id of the lower left tag; ids count to the right, then up.
     pub first_id: u32,
-    /// Tags side by side.
+    /// Number of columns.
     pub columns: u32,
-    /// Tags above one another.
+    /// Number of rows.
     pub rows: u32,
-    /// From one tag's middle to the next one's. [mm]
+    /// Spacing between the middles of neighbouring tags. [mm]
     pub pitch_mm: f64,
     /// Edge of a tag's black square. [mm]
     pub tag_mm: f64,
     /// Middle of the grid. [m, world]
     pub middle_m: DVec3,
-    /// What to print on.
     pub paper: Paper,
-    /// What the printed scale bar measures. [mm]
+    /// Measured length of the printed scale bar. [mm]
     pub bar_mm: f64,
 }
 
 impl Mat {
-    /// Returns the board to calibrate with: as many tags of this size as one sheet has room for, from
-    /// `first_id` on, half a white cell more apart than they need.
+    /// Returns the calibration board: as many tags of this size as fit on one sheet, starting with `first_id`. Their
+    /// gap is half a white cell more than required.
     ///
     /// # Errors
-    /// [`PrintError`] for what does not fit or makes no sense.
+    /// [`PrintError`] for values that do not fit or are out of range.
     pub fn board(
         family: TagFamily,
         first_id: u32,
@@ -62,11 +59,11 @@ impl Mat {
         Ok(Self { family, first_id, columns, rows, pitch_mm, tag_mm, middle_m, paper, bar_mm })
     }
 
-    /// Returns the mat by which webcams in the upper corners of a hall are surveyed, laid in its middle: two by four
-    /// tags, as large as these see them well, and no larger than A3 has room for; and how many pixels the tags fill.
+    /// Returns the mat to survey webcams in the upper corners of a hall, placed in its middle, and the size of its tags
+    /// in the image [px]. It has two by four tags, large enough for these webcams, but at most as large as A3 allows.
     ///
     /// # Errors
-    /// [`PrintError::Invalid`] for a hall that is none.
+    /// [`PrintError::Invalid`] for an invalid hall size.
     pub fn for_hall(
         hall_m: DVec3,
         family: TagFamily,
@@ -81,7 +78,7 @@ impl Mat {
         }
         let away_m = (hall_m * DVec3::new(0.5, 0.5, 1.0)).length();
         let wanted_mm = 1e3 * WELL_SEEN_PX * away_m / WEBCAM_FOCAL_PX;
-        // In steps of a centimetre.
+        // Rounded up to whole centimetres.
         let tag_mm = ((wanted_mm / 10.0).ceil() * 10.0).clamp(70.0, A3_TAG_MM);
         let mat = Self {
             family,
@@ -97,10 +94,10 @@ impl Mat {
         Ok((mat, 1e-3 * tag_mm / away_m * WEBCAM_FOCAL_PX))
     }
 
-    /// Returns its sheets, row by row from the lower left, and its layout.
+    /// Returns the sheets, row by row from the lower left, and the layout.
     ///
     /// # Errors
-    /// [`PrintError`] for what does not fit or makes no sense.
+    /// [`PrintError`] for values that do not fit or are out of range.
     pub fn print(&self) -> Result<Printed, PrintError> {
         check_positive("pitch_mm", self.pitch_mm)?;
         check_positive("tag_mm", self.tag_mm)?;
@@ -114,7 +111,7 @@ impl Mat {
         check_rim(self.family, "the distance from tag to tag", self.tag_mm, self.pitch_mm)?;
         let scale = scale(self.bar_mm)?;
         let [width, height] = self.paper.room_mm();
-        // Whole tags on each sheet.
+        // Complete tags on each sheet.
         let (across, up) = ((width / self.pitch_mm) as u32, (height / self.pitch_mm) as u32);
         if across == 0 || up == 0 {
             let (what, size_mm, room_mm) = ("a tag with its gap", self.pitch_mm, width.min(height));
@@ -157,13 +154,13 @@ impl Mat {
         sheet.text([left + 8.0, top], 2.4, &text);
     }
 
-    /// Returns what stands at a sheet's upper edge, short enough to stay between the marks.
+    /// Returns the caption at a sheet's upper edge, short enough to fit between the marks.
     fn caption(&self, first: [u32; 2], count: [u32; 2]) -> String {
         let row =
             |row: u32| [first[0], first[0] + count[0] - 1].map(|c| self.id(c, first[1] + row));
         let [[from, to], [last_from, last]] = [row(0), row(count[1] - 1)];
         let ids = if count[0] == self.columns || count[1] == 1 {
-            // Rows that follow on one another.
+            // Consecutive ids over all rows.
             format!("{from} to {last}")
         } else {
             format!("{from} to {to}, ..., {last_from} to {last}")
@@ -184,7 +181,7 @@ impl Mat {
         let mut tags = Vec::new();
         for row in 0..self.rows {
             for column in 0..self.columns {
-                // From the grid's middle.
+                // Offset from the grid's middle.
                 let along = |i: u32, n: u32| {
                     (f64::from(i) - (f64::from(n) - 1.0) / 2.0) * self.pitch_mm * scale / 1000.0
                 };
@@ -198,12 +195,12 @@ impl Mat {
     }
 }
 
-/// A tag that lies on the floor is seen aslant, and is read from 20 px on. [px]
+/// Tag size in the image for the survey: tags on the floor are seen at an angle, and are readable from 20 px. [px]
 const WELL_SEEN_PX: f64 = 25.0;
-/// Of a webcam of 70 degrees at 1280 x 720. [px]
+/// Focal length of a webcam of 70 degrees at 1280 x 720. [px]
 const WEBCAM_FOCAL_PX: f64 = 900.0;
-/// From tag to tag in tags: white rims, and room for scissors.
+/// Spacing of tags relative to their edge: white rims, and a margin for cutting.
 const HALL_PITCH: f64 = 1.375;
-/// The largest tags of which one fits on a sheet at this pitch. [mm]
+/// Largest tags of which one fits on a sheet at this spacing. [mm]
 const A3_TAG_MM: f64 = 200.0;
 const A4_TAG_MM: f64 = 130.0;

@@ -4,7 +4,7 @@ use pdf_writer::{Content, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
 
 use super::{Shape, Sheet};
 
-/// Returns the sheets as a PDF, one a page.
+/// Returns the sheets as a PDF, one per page.
 pub fn pdf(title: &str, sheets: &[Sheet]) -> Vec<u8> {
     let mut next = 0;
     let mut reference = || {
@@ -16,12 +16,12 @@ pub fn pdf(title: &str, sheets: &[Sheet]) -> Vec<u8> {
     let mut pdf = Pdf::new();
     let mut root = pdf.catalog(catalog);
     root.pages(tree);
-    // Print dialogs that heed it come up with 100 %.
+    // Print dialogs that support this preference start at 100 %.
     root.viewer_preferences().pair(Name(b"PrintScaling"), Name(b"None"));
     root.finish();
     pdf.document_info(info).title(TextStr(title));
     pdf.pages(tree).kids(pages.iter().map(|&(page, _)| page)).count(pages.len() as i32);
-    // One of the fonts that every reader has.
+    // One of the standard fonts of every PDF reader.
     pdf.type1_font(font).base_font(Name(b"Helvetica"));
     for (sheet, &(page_ref, content_ref)) in sheets.iter().zip(&pages) {
         let [width, height] = sheet.paper.size_mm();
@@ -59,7 +59,7 @@ fn draw(sheet: &Sheet) -> Vec<u8> {
             }
             Shape::Text { at, size, text } => {
                 content.set_fill_gray(0.35).begin_text();
-                // Helvetica's capitals are 0.72 of its size.
+                // The capitals of Helvetica have 0.72 of the font size.
                 content.set_font(FONT, points(size / 0.72));
                 content.next_line(points(at[0]), points(at[1]));
                 content.show(Str(text.as_bytes())).end_text();
@@ -69,7 +69,7 @@ fn draw(sheet: &Sheet) -> Vec<u8> {
     content.finish().into_vec()
 }
 
-/// Returns PDF's unit of length, 1/72 inch.
+/// Converts to PDF's unit of length, 1/72 inch.
 fn points(mm: f64) -> f32 {
     (mm * 72.0 / 25.4) as f32
 }

@@ -1,11 +1,11 @@
-//! Sheets of paper and what is drawn on them.
+//! Sheets of paper and their shapes.
 
 use std::fmt;
 
 use super::BAR_MM;
 use crate::family::TagFamily;
 
-/// Sizes of paper, all upright.
+/// Paper sizes, in portrait orientation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Paper {
     /// 210 x 297 mm.
@@ -27,8 +27,7 @@ impl Paper {
         }
     }
 
-    /// Returns width and height of what tags may cover: within the margins that printers need, and
-    /// above the foot. [mm]
+    /// Returns width and height of the printable area: within the margins of printers, and above the foot. [mm]
     pub fn room_mm(self) -> [f64; 2] {
         let [width, height] = self.size_mm();
         [width - 2.0 * MARGIN_MM, height - 2.0 * MARGIN_MM - FOOT_MM]
@@ -45,28 +44,26 @@ impl fmt::Display for Paper {
     }
 }
 
-/// What is drawn; from the sheet's lower left corner, x right, y up. [mm]
+/// A shape. Coordinates are relative to the sheet's lower left corner, x right, y up. [mm]
 #[derive(Clone, Debug, PartialEq)]
 pub enum Shape {
-    /// Black cells of a tag: boxes of left, lower edge, width, height; drawn at once, so that no
-    /// seam shows between neighbours.
+    /// Black cells of a tag: boxes of left edge, lower edge, width, height. They are drawn together, to avoid seams
+    /// between neighbours.
     Boxes(Vec<[f64; 4]>),
-    /// A thin grey line to cut along, or a dashed one to fold.
+    /// A thin grey line for cutting, or a dashed line for folding.
     Line {
-        /// One end.
         from: [f64; 2],
-        /// The other.
         to: [f64; 2],
-        /// To fold, not to cut.
+        /// Whether the line is for folding.
         fold: bool,
     },
     /// A line of text.
     Text {
-        /// Where it begins, on its base line.
+        /// Start of the base line.
         at: [f64; 2],
-        /// Height of its letters.
+        /// Height of the capitals.
         size: f64,
-        /// The text; Latin letters.
+        /// Latin text.
         text: String,
     },
 }
@@ -74,22 +71,21 @@ pub enum Shape {
 /// A sheet of paper.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sheet {
-    /// Which paper.
     pub paper: Paper,
-    /// What is drawn on it.
+    /// Shapes on the sheet.
     pub shapes: Vec<Shape>,
 }
 
 impl Sheet {
-    /// Makes a sheet with its foot: the scale bar, what it is, and how to print it.
+    /// Makes a sheet with its foot: scale bar, title, and printing instruction.
     pub(super) fn new(paper: Paper, title: &str) -> Self {
         let mut sheet = Self { paper, shapes: Vec::new() };
         let [left, low] = [MARGIN_MM + 2.0, MARGIN_MM + 7.0];
-        // The bar's ends are the outer edges of its end marks: easy to hold a ruler to.
+        // The bar ends at the outer edges of its end marks, which are easy to measure with a ruler.
         let mut boxes = vec![[left, low, BAR_MM, 0.5]];
         for i in 0..=10 {
             let high = if i % 5 == 0 { 4.0 } else { 2.5 };
-            // Marks lie within the bar's ends.
+            // Marks are inside the bar's ends.
             let x = match i {
                 0 => left,
                 10 => left + BAR_MM - 0.3,
@@ -119,7 +115,7 @@ impl Sheet {
         self.shapes.push(Shape::Line { from, to, fold });
     }
 
-    /// Draws a tag about its middle, upright.
+    /// Draws an upright tag around its middle.
     pub(super) fn tag(&mut self, family: TagFamily, id: u32, middle: [f64; 2], size_mm: f64) {
         let Some(cells) = family.cells(id) else { return };
         let cell = size_mm / f64::from(cells.border());
@@ -143,7 +139,7 @@ impl Sheet {
         self.shapes.push(Shape::Boxes(boxes));
     }
 
-    /// Draws short lines outside the corners of a box, to cut along with ruler and knife.
+    /// Draws crop marks outside the corners of a box.
     pub(super) fn crop_marks(&mut self, [left, low, width, height]: [f64; 4]) {
         let (right, top) = (left + width, low + height);
         let [paper_width, paper_height] = self.paper.size_mm();
@@ -158,9 +154,9 @@ impl Sheet {
     }
 }
 
-/// Printers leave this much blank on every side. [mm]
+/// Unprintable margin of printers on every side. [mm]
 pub(super) const MARGIN_MM: f64 = 10.0;
-/// Scale bar and text, below everything else. [mm]
+/// Height of the foot, with scale bar and text. [mm]
 pub(super) const FOOT_MM: f64 = 18.0;
-/// Length of a mark to cut along. [mm]
+/// Length of a crop mark. [mm]
 const MARK_MM: f64 = 6.0;

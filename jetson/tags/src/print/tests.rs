@@ -29,7 +29,7 @@ fn mat() -> Mat {
     }
 }
 
-/// The shade at a place of a sheet: whether a black box covers it.
+/// Returns whether a black box covers a point of a sheet.
 fn is_black(sheet: &Sheet, [x, y]: [f64; 2]) -> bool {
     sheet.shapes.iter().any(|shape| match shape {
         Shape::Boxes(boxes) => {
@@ -40,7 +40,7 @@ fn is_black(sheet: &Sheet, [x, y]: [f64; 2]) -> bool {
 }
 
 #[test]
-fn a_cube_s_tags_sit_on_its_faces_upright_and_are_drawn_cell_by_cell() {
+fn places_and_draws_the_tags_of_a_cube() {
     let printed = cube().print().unwrap();
     assert_eq!(printed.sheets.len(), 5);
     assert_eq!(printed.layout.frame, LayoutFrame::Body);
@@ -52,7 +52,7 @@ fn a_cube_s_tags_sit_on_its_faces_upright_and_are_drawn_cell_by_cell() {
         assert_eq!(tag.size_m, 0.12);
     }
     let cells = TagFamily::Tag36h11.cells(4).unwrap();
-    // Middle of the only face: margin, flap, half a face; above the foot.
+    // Middle of the sheet's only face: margin, flap and half a face from the left and, above the foot, from below.
     let [x, y] = [10.0 + 8.0 + 80.0, 10.0 + 18.0 + 8.0 + 80.0];
     for row in 0..10 {
         for column in 0..10 {
@@ -64,9 +64,9 @@ fn a_cube_s_tags_sit_on_its_faces_upright_and_are_drawn_cell_by_cell() {
 }
 
 #[test]
-fn a_mat_over_several_sheets_has_every_tag_once_at_its_place() {
+fn splits_a_mat_over_sheets_with_each_tag_once() {
     let printed = mat().print().unwrap();
-    // Two by two tags on a sheet of 190 x 259 mm.
+    // A sheet of 190 x 259 mm has two by two tags.
     assert_eq!(printed.sheets.len(), 4);
     let tags = &printed.layout.tags;
     assert_eq!(tags.iter().map(|tag| tag.id).collect::<Vec<_>>(), (100..112).collect::<Vec<_>>());
@@ -91,17 +91,17 @@ fn a_mat_over_several_sheets_has_every_tag_once_at_its_place() {
 }
 
 #[test]
-fn a_printer_that_scales_scales_the_layout() {
+fn bar_length_scales_the_layout_only() {
     let printed = Mat { bar_mm: 98.0, ..mat() }.print().unwrap();
     let tags = &printed.layout.tags;
     assert!((tags[0].size_m - 0.0588).abs() < 1e-12);
     assert!((tags[1].position_m - tags[0].position_m - DVec3::X * 0.0882).length() < 1e-12);
-    // The sheets stay: they are what was printed.
+    // The sheets are unchanged, because they are already printed.
     assert_eq!(printed.sheets, mat().print().unwrap().sheets);
 }
 
 #[test]
-fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
+fn board_fills_one_sheet_within_the_paper() {
     for paper in [Paper::A4, Paper::Letter, Paper::A3] {
         for family in TagFamily::ALL {
             let board = Mat::board(family, 0, 30.0, paper, BAR_MM).unwrap();
@@ -126,7 +126,7 @@ fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
                     Shape::Line { from, to, .. } => {
                         assert!(inside(from[0], from[1]) && inside(to[0], to[1]));
                     }
-                    // Letters of Helvetica are half as wide as high, on average.
+                    // Letters of Helvetica are on average half as wide as high.
                     Shape::Text { at, size, text } => {
                         let end = at[0] + text.len() as f64 * size * 0.55;
                         assert!(inside(at[0], at[1]) && inside(end, at[1]), "{text}");
@@ -138,7 +138,7 @@ fn a_board_fills_a_sheet_and_nothing_leaves_the_paper() {
 }
 
 #[test]
-fn invalid_sheets_are_refused_by_name() {
+fn rejects_invalid_sheets_with_the_reason() {
     let refused = |result: Result<Printed, PrintError>, parts: &[&str]| {
         let error = result.unwrap_err().to_string();
         for part in parts {
@@ -157,7 +157,7 @@ fn invalid_sheets_are_refused_by_name() {
 }
 
 #[test]
-fn a_mat_is_sized_by_the_hall() {
+fn sizes_a_mat_for_the_hall() {
     let check = |hall_m: [f64; 3], tag_mm: f64, paper: Paper| {
         let middle_m = DVec3::ZERO;
         let (mat, px) =
@@ -174,7 +174,7 @@ fn a_mat_is_sized_by_the_hall() {
 }
 
 #[test]
-fn a_floor_has_large_tags_apart_and_small_ones_where_the_vehicle_stands() {
+fn floor_has_large_tags_and_pads_of_small_tags() {
     let pad = Pad { middle_m: DVec2::new(-0.4, 0.1), size_m: Pad::SIZE_M };
     let floor = Floor {
         family: TagFamily::Tag36h11,
@@ -190,15 +190,15 @@ fn a_floor_has_large_tags_apart_and_small_ones_where_the_vehicle_stands() {
     let ids: Vec<u32> = tags.iter().map(|tag| tag.id).collect();
     assert_eq!(ids, (100..100 + tags.len() as u32).collect::<Vec<_>>());
     let (large, small): (Vec<&Tag>, Vec<&Tag>) = tags.iter().partition(|tag| tag.size_m > 0.1);
-    // Two of six by five lie where the pad does; that is two sheets of five by seven.
+    // The pad covers two of the six by five large tags. It has two sheets of five by seven tags.
     assert_eq!((large.len(), small.len(), printed.sheets.len()), (28, 70, 30));
-    // The printer shrinks what is printed, not what a tape measures.
+    // Printer scaling changes the size of tags, but not positions measured with a tape.
     assert!((large[0].size_m - 0.198).abs() < 1e-12);
     assert!((large[0].position_m - DVec3::new(-1.25, -1.0, 0.0)).length() < 1e-12);
     let middle_m = small.iter().map(|tag| tag.position_m).sum::<DVec3>() / 70.0;
     assert!((middle_m - pad.middle_m.extend(0.0)).length() < 1e-12);
     assert!((small[1].position_m.x - small[0].position_m.x - 0.053 * 0.99).abs() < 1e-12);
-    // No paper on another.
+    // Sheets do not overlap.
     for (i, tag) in tags.iter().enumerate() {
         for other in &tags[..i] {
             let gap_m = (tag.position_m - other.position_m).abs().max_element();
@@ -214,7 +214,7 @@ fn a_floor_has_large_tags_apart_and_small_ones_where_the_vehicle_stands() {
 }
 
 #[test]
-fn a_pdf_has_a_page_for_each_sheet_of_its_size() {
+fn pdf_has_a_page_of_the_paper_size_per_sheet() {
     let printed = mat().print().unwrap();
     let bytes = pdf("mat", &printed.sheets);
     let text = String::from_utf8_lossy(&bytes);

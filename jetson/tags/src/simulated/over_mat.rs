@@ -1,9 +1,8 @@
-//! The simulated lab in which the vehicle carries the camera: what lies on the floor, what looks at it, and by how much
-//! both are other than their files say.
+//! The simulated lab in which the vehicle carries the camera: floor mat, camera, and their deviations from the files.
 //!
-//! Nobody knows a mat to the last tenth of a millimetre. A survey leaves each tag off by itself, and all of them bent
-//! together: it walks from one end of the hall to the other. A camera is screwed on, and its place is measured with a
-//! ruler. Locating by files that are exact would show accuracies, and sigmas, that no lab has.
+//! A real mat is not known to a tenth of a millimetre. A survey has an independent error for each tag, and a common
+//! bend that drifts from one end of the hall to the other. The camera's position on the vehicle is measured with a
+//! ruler. Exact files would give accuracies and sigmas that no real lab reaches.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics, Pose};
@@ -15,8 +14,8 @@ use crate::layout::{Tag, TagLayout};
 use crate::print::{BAR_MM, Floor, Pad};
 use crate::synth::Random;
 
-/// Returns the mat of the simulated hall of 11 x 4.5 m (x from 0 to 11, y from -2.25 to 2.25), as
-/// `vizflyt tags print mat --fly-over 11x4.5 --middle-m 5.5,0,0` prints it, with pads where the vehicle stands.
+/// Returns the mat of the simulated hall of 11 x 4.5 m (x from 0 to 11, y from -2.25 to 2.25), as printed by `vizflyt
+/// tags print mat --fly-over 11x4.5 --middle-m 5.5,0,0`, with pads where the vehicle stands.
 pub fn floor(pads: Vec<Pad>) -> Floor {
     Floor {
         family: TagFamily::Tag36h11,
@@ -28,8 +27,8 @@ pub fn floor(pads: Vec<Pad>) -> Floor {
     }
 }
 
-/// Returns the webcam under the vehicle: 640 x 480, 100 degrees across. It looks straight down, the image's top
-/// towards the nose, its lens 80 mm above the soles of the vehicle's legs.
+/// Returns the webcam under the vehicle: 640 x 480, horizontal field of view 100 degrees. It looks straight down, with
+/// the image's top towards the nose. The lens is 80 mm above the soles of the vehicle's legs.
 pub fn camera() -> TagCamera {
     let k = Intrinsics::from_horizontal_fov(640, 480, 100f64.to_radians());
     let distortion =
@@ -47,12 +46,12 @@ pub fn camera() -> TagCamera {
     }
 }
 
-/// Returns how it takes images: a lens of 2.1 mm and f/2.4 that is focused once, at 0.6 m, and sharp from there on.
+/// Returns the sensor of the webcam: a lens of 2.1 mm and f/2.4, focused at 0.6 m and sharp beyond.
 pub fn sensor() -> Sensor {
     Sensor { focus_m: 0.6, aperture_m: 0.0021 / 2.4, ..Sensor::default() }
 }
 
-/// Returns the mat as it truly lies, for a file that a survey has written.
+/// Returns the true mat for a surveyed file.
 pub fn as_laid(file: &TagLayout, seed: u64) -> TagLayout {
     let mut random = Random::new(seed ^ 0x6d61_745f);
     let phases = DVec3::from_array(std::array::from_fn(|_| std::f64::consts::TAU * random.unit()));
@@ -60,7 +59,7 @@ pub fn as_laid(file: &TagLayout, seed: u64) -> TagLayout {
         let angles = DVec3::splat(tag.position_m.x * std::f64::consts::TAU / BEND_M) + phases;
         let bent_m = BENT_M * 2f64.sqrt() * DVec3::from_array(angles.to_array().map(f64::sin));
         let place_m = bent_m + TAG_SIGMA_M * normal(&mut random);
-        // Corners, too, are known as well as that.
+        // Corners have the same accuracy.
         let turn = TURN_SHARE * TAG_SIGMA_M / tag.size_m * normal(&mut random);
         Tag {
             position_m: tag.position_m + place_m,
@@ -71,10 +70,10 @@ pub fn as_laid(file: &TagLayout, seed: u64) -> TagLayout {
     TagLayout { tags: tags.collect(), ..*file }
 }
 
-/// Returns the camera as it is truly mounted, for a file that a ruler and a level have written.
+/// Returns the true camera for a file from ruler and level.
 pub fn as_mounted(file: &TagCamera, seed: u64) -> TagCamera {
     let mut random = Random::new(seed ^ 0x6361_6d5f);
-    // There is one mount in a flight: off by as much as is said, in a direction of its own.
+    // A flight has a single mount: its error always has the stated size, in a random direction.
     let mut direction = || 3f64.sqrt() * normal(&mut random).normalize();
     let off_m = MOUNT_SIGMA_M * direction();
     let turn = DQuat::from_scaled_axis(MOUNT_SIGMA_RAD * direction());
@@ -92,21 +91,21 @@ fn normal(random: &mut Random) -> DVec3 {
     DVec3::from_array(std::array::from_fn(|_| random.normal()))
 }
 
-/// The lens above the soles. [m]
+/// Height of the lens above the soles. [m]
 const LENS_M: f64 = 0.08;
-/// What a survey leaves of a tag's own place, one standard deviation an axis. [m]
+/// Position error of a tag after a survey, standard deviation per axis. [m]
 const TAG_SIGMA_M: f64 = 0.0005;
-/// And of its turn, in units of that over its edge.
+/// Rotation error of a tag, in units of the position error divided by the edge.
 const TURN_SHARE: f64 = 0.5;
-/// How far it bends the whole, root mean square an axis, [m]
+/// Bend of the whole mat, root mean square per axis. [m]
 const BENT_M: f64 = 0.0015;
-/// and over which length to and fro. [m]
+/// Wavelength of the bend. [m]
 const BEND_M: f64 = 5.0;
-/// What the lab states of its mat: both together, 1.6 mm, and more, for what is bent is bent over metres. [m]
+/// Stated uncertainty of the mat: both errors together are 1.6 mm; more, because the bend is constant over metres. [m]
 pub const SURVEY_SIGMA_M: f64 = 0.0025;
-/// What a ruler leaves of the camera's place, one standard deviation an axis, [m]
+/// Position error of the camera after measurement by ruler, standard deviation per axis. [m]
 const MOUNT_SIGMA_M: f64 = 0.0015;
-/// and the mat's level of its direction. [rad]
+/// Rotation error of the camera after levelling by the mat. [rad]
 const MOUNT_SIGMA_RAD: f64 = 0.0015;
 
 #[cfg(test)]
@@ -115,7 +114,7 @@ mod tests {
     use vizflyt_protocol::geometry::{Body, World};
 
     #[test]
-    fn wherever_it_stands_on_a_pad_the_camera_sees_a_whole_tag() {
+    fn camera_sees_a_complete_tag_anywhere_on_a_pad() {
         let pad = Pad { middle_m: DVec2::new(0.9, 0.0), size_m: Pad::SIZE_M };
         let layout = floor(vec![pad]).print().unwrap().layout;
         layout.validate().unwrap();
@@ -146,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_are_of_the_size_that_is_said_and_repeat() {
+    fn errors_have_the_stated_size_and_are_reproducible() {
         let layout = floor(Vec::new()).print().unwrap().layout;
         let laid = as_laid(&layout, 3);
         assert_eq!(laid, as_laid(&layout, 3));

@@ -1,8 +1,8 @@
 //! Levenberg-Marquardt over the reprojection error of all corners.
 //!
-//! Six unknowns: the position moves in world axes, the attitude turns about body axes, so that the
-//! covariance comes out in the axes in which poses are sent and fused. Corners count by a Cauchy loss:
-//! one that is far off (a misread tag, a shadow over an edge) hardly pulls.
+//! Six parameters: the position in world axes, and rotations about body axes, so that the covariance has the axes in
+//! which poses are sent and fused. A Cauchy loss reduces the weight of outliers, such as a misread tag or a shadow over
+//! an edge.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
@@ -10,28 +10,27 @@ use vizflyt_protocol::geometry::{Body, Intrinsics, Pose, World};
 use super::{Geometry, Sighting, VehicleTwist};
 use crate::layout::CORNERS;
 
-/// A pose and how well it explains the corners.
+/// A pose and its fit to the corners.
 #[derive(Clone, Copy, Debug)]
 pub struct PoseFit {
-    /// The vehicle's pose.
     pub world_from_body: Pose<World, Body>,
     /// Covariance of position (three, world axes) and attitude (three, about body axes). [m, rad]
     pub covariance: [[f64; 6]; 6],
-    /// Root mean square distance of corners from where the pose puts them. [px]
+    /// Root mean square reprojection error. [px]
     pub rms_px: f64,
-    /// Half the sum of squares in units of sigma, robust.
+    /// Half the robust sum of squares in units of sigma.
     pub cost: f64,
 }
 
 impl PoseFit {
-    /// Returns one standard deviation of each of the six unknowns. [m, world; rad, body]
+    /// Returns the standard deviations of position and attitude. [m, world; rad, body]
     pub fn sigmas(&self) -> (DVec3, DVec3) {
         let sigma = |i: usize| self.covariance[i][i].max(0.0).sqrt();
         (DVec3::new(sigma(0), sigma(1), sigma(2)), DVec3::new(sigma(3), sigma(4), sigma(5)))
     }
 }
 
-/// Returns the robust cost of a pose; infinite where a tag would lie behind its camera.
+/// Returns the robust cost of a pose; infinite if a tag would be behind its camera.
 pub(super) fn cost(sightings: &[Sighting], motion: &VehicleTwist, pose: &Pose<World, Body>) -> f64 {
     let mut total = 0.0;
     for sighting in sightings {
@@ -61,7 +60,7 @@ pub(super) fn residual_px(
     (sum / 4.0).sqrt()
 }
 
-/// Returns the nearest minimum; `None` where the corners do not determine one.
+/// Returns the nearest minimum; `None` if the corners do not determine one.
 pub(super) fn adjust(
     sightings: &[Sighting],
     motion: &VehicleTwist,
@@ -102,8 +101,8 @@ pub(super) fn adjust(
         }
     }
     let mut covariance = invert6(&normal.matrix)?;
-    // Corners that scatter more than they should show that sigma was too small; never that it was
-    // too large: few corners agree by chance.
+    // A larger scatter of corners than expected means that sigma was too small. A smaller scatter does not mean that it
+    // was too large: a few corners can agree by chance.
     let freedom = (2 * normal.corners).saturating_sub(6).max(1);
     let scale = (normal.square_sum / freedom as f64).max(1.0);
     for row in &mut covariance {
@@ -121,25 +120,25 @@ pub(super) fn adjust(
     (pose.is_valid() && fit.cost.is_finite()).then_some(fit)
 }
 
-/// A corner's residual and how it changes with everything that may be wrong.
+/// Residual of a corner and its derivatives by the pose and by all possible errors.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CornerRow {
-    /// Where the pose puts the corner less where it was seen. [px]
+    /// Projected position minus detected position. [px]
     pub(crate) off_px: DVec2,
-    /// By the pose's position (world axes) and turns (body axes), for x and for y. [px/m, px/rad]
+    /// Derivatives by the pose's position (world axes) and rotation (body axes), for x and for y. [px/m, px/rad]
     pub(crate) by_pose: [[f64; 6]; 2],
-    /// By the time between exposure and pose. [px/s]
+    /// Derivative by the time between exposure and pose. [px/s]
     pub(crate) by_lag: DVec2,
-    /// By the camera's position (outer axes) and turns (its own axes). [px/m, px/rad]
+    /// Derivatives by the camera's position (outer axes) and rotation (its own axes). [px/m, px/rad]
     pub(crate) by_camera: [[f64; 6]; 2],
-    /// By the tags' scale about `middle_m`. [px]
+    /// Derivative by the tags' scale about `middle_m`. [px]
     pub(crate) by_scale: DVec2,
-    /// The row: -0.5 is the image's first, 0.5 its last.
+    /// Row in the image: -0.5 is the first, 0.5 the last.
     pub(crate) row_share: f64,
 }
 
-/// Returns the four corners of a tag at a pose; `None` behind the camera. Tags grow about `middle_m` of their
-/// layout's frame.
+/// Returns the four corners of a tag at a pose; `None` if one is behind the camera. The scale of the tags is about
+/// `middle_m` in the layout's frame.
 pub(crate) fn corner_rows(
     sighting: &Sighting,
     motion: &VehicleTwist,
@@ -166,7 +165,7 @@ pub(crate) fn corner_rows(
         row.row_share = sighting.row_share(measured.y);
         let v_mps = motion.v_world_mps - motion.a_world_mps2 * lag_s;
         let by_lag = -(by_position * v_mps + by_turn * motion.omega_body_radps);
-        // Where the camera goes everything else goes the other way.
+        // When the camera moves, points move the opposite way in its frame.
         let (outer, grown) = match sighting.sight {
             Geometry::OutsideIn { world_from_cam, body_from_tag } => {
                 let p_body = body_from_tag.transform_point(p_tag);
@@ -196,7 +195,7 @@ fn six(by_point: DVec3, by_position: DMat3, by_turn: DMat3) -> [f64; 6] {
     [position.x, position.y, position.z, turn.x, turn.y, turn.z]
 }
 
-/// Returns the inverse of a symmetric positive matrix, of which the lower triangle is read.
+/// Returns the inverse of a symmetric positive definite matrix. Reads only the lower triangle.
 pub(crate) fn invert6(matrix: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     let l = cholesky(matrix)?;
     let mut inverse = [[0.0; 6]; 6];
@@ -208,14 +207,14 @@ pub(crate) fn invert6(matrix: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     inverse.iter().flatten().all(|value| value.is_finite()).then_some(inverse)
 }
 
-/// The normal equations at a pose.
+/// Normal equations at a pose.
 struct Normal {
     /// Lower triangle of `J^T W J`.
     matrix: [[f64; 6]; 6],
     /// `J^T W r`.
     gradient: [f64; 6],
     cost: f64,
-    /// In units of sigma; a misread corner counts as [`MISREAD_SIGMAS`].
+    /// Sum in units of sigma; a misread corner counts as [`MISREAD_SIGMAS`].
     square_sum: f64,
     square_sum_px2: f64,
     corners: usize,
@@ -232,8 +231,8 @@ impl Normal {
             corners: 0,
         };
         for sighting in sightings {
-            // A turn of the pose that is asked for turns the earlier one about the same vehicle axes, up to
-            // what the vehicle turns in the lag: a degree, which costs a round, not exactness.
+            // A rotation of the pose is treated as a rotation of the earlier pose about the same vehicle axes. This
+            // neglects the rotation during the lag, about a degree, which costs an iteration but no accuracy.
             for (corner, measured) in CORNERS.iter().zip(sighting.corners_px) {
                 let at = motion.carry(pose, -sighting.lag_at_s(measured.y));
                 let p_tag = (*corner * sighting.size_m).extend(0.0);
@@ -270,8 +269,8 @@ impl Normal {
     }
 }
 
-/// Returns a point of the tag in the camera's frame, and how it changes with the vehicle's position and
-/// with turns about the vehicle's axes.
+/// Returns a point of the tag in the camera's frame, and its derivatives by the vehicle's position and by rotations
+/// about the vehicle's axes.
 fn in_cam(sighting: &Sighting, pose: &Pose<World, Body>, p_tag: DVec3) -> (DVec3, DMat3, DMat3) {
     let rotation = DMat3::from_quat(pose.rotation);
     match &sighting.sight {
@@ -293,13 +292,13 @@ fn in_cam(sighting: &Sighting, pose: &Pose<World, Body>, p_tag: DVec3) -> (DVec3
     }
 }
 
-/// Returns the pixel of a point and how it changes with the point: two rows.
+/// Returns the pixel of a point and its derivatives by the point: two rows.
 fn project(camera: &Intrinsics, p_cam: DVec3) -> Option<(DVec2, [DVec3; 2])> {
     if !(p_cam.z > NEAREST_M) {
         return None;
     }
     let slope = p_cam.truncate() / p_cam.z;
-    // Far outside of what a lens shows its polynomial turns back; starts there lead nowhere.
+    // Far outside the field of view the distortion polynomial folds back; initial poses there do not converge.
     if !(slope.length_squared() < 100.0) {
         return None;
     }
@@ -312,7 +311,7 @@ fn project(camera: &Intrinsics, p_cam: DVec3) -> Option<(DVec2, [DVec3; 2])> {
     Some((pixel, [row(x.x, y.x), row(x.y, y.y)]))
 }
 
-/// Returns the matrix whose product with `b` is `a x b`.
+/// Returns the matrix that maps `b` to `a x b`.
 fn cross(a: DVec3) -> DMat3 {
     DMat3::from_cols(
         DVec3::new(0.0, a.z, -a.y),
@@ -321,14 +320,14 @@ fn cross(a: DVec3) -> DMat3 {
     )
 }
 
-/// Returns the Cauchy loss of a squared residual in units of sigma, and the weight it leaves.
+/// Returns the Cauchy loss of a squared residual in units of sigma, and the resulting weight.
 fn loss(square: f64) -> (f64, f64) {
     let c2 = ROBUST_SIGMAS * ROBUST_SIGMAS;
     (0.5 * c2 * (square / c2).ln_1p(), 1.0 / (1.0 + square / c2))
 }
 
-/// Returns the lower triangle whose product with its transpose is the matrix (of which the lower
-/// triangle is read); `None` unless it is positive.
+/// Returns the lower triangle whose product with its transpose is the matrix. Reads only the lower triangle; `None`
+/// unless the matrix is positive definite.
 fn cholesky(matrix: &[[f64; 6]; 6]) -> Option<[[f64; 6]; 6]> {
     let mut l = [[0.0; 6]; 6];
     for i in 0..6 {
@@ -365,11 +364,11 @@ fn solve_with(l: &[[f64; 6]; 6], right: &[f64; 6]) -> [f64; 6] {
     x
 }
 
-/// Corners off by more than this many sigma lose their pull.
+/// Scale of the Cauchy loss, in sigma.
 const ROBUST_SIGMAS: f64 = 4.0;
-/// What is further off than this many sigma does not tell how far others may be off.
+/// Limit of residuals in the scatter, in sigma: a misread corner does not show the accuracy of others.
 const MISREAD_SIGMAS: f64 = 25.0;
-/// Nothing is in focus closer than this. [m]
+/// Minimum distance of a point in focus. [m]
 const NEAREST_M: f64 = 0.02;
-/// It converges in five to ten.
+/// Maximum number of iterations; typical are five to ten.
 const MAX_ROUNDS: usize = 40;

@@ -1,18 +1,18 @@
-//! The vehicle's pose from all tags in all cameras at once.
+//! Estimates the vehicle's pose from all tags in all cameras together.
 //!
-//! What enters: corners in pixels, each with the point of the layout it belongs to and the camera that
-//! saw it. What leaves: `world_from_body`, its covariance, and, where the corners leave two answers open,
-//! both. Called once per set of images; some 50 us for two cameras with three tags each.
+//! Input: corners in pixels, each with its point in the layout and its camera. Output: `world_from_body` with
+//! covariance, and the second solution if the corners are ambiguous. Called once per set of images; about 50 us for two
+//! cameras with three tags each.
 //!
-//! - [`plane`]: the two poses that one square can have, in closed form: where to begin;
-//! - [`adjust`]: Levenberg-Marquardt over the reprojection error of all corners with a robust loss, and
-//!   the covariance from its Jacobian;
-//! - `opencv`: the same starts by OpenCV's IPPE, and one more of all tags in an image by its SQPnP, where the feature of
-//!   that name is on.
+//! - [`plane`]: the two possible poses of one square, in closed form, as initial poses
+//! - [`adjust`]: Levenberg-Marquardt over the reprojection error of all corners with a robust loss, and the covariance
+//!   from its Jacobian
+//! - `opencv`: with feature `opencv`, the same initial poses by OpenCV's IPPE, and one from all tags of an image by
+//!   SQPnP
 //!
-//! A square far away looks nearly the same when it is tilted towards the camera and away from it: the
-//! reprojection error then has two minima. A second face of the cube, a second tag of the mat or a
-//! second camera decides; where there is none, [`Solved::other`] keeps the second one.
+//! A distant square looks nearly the same when tilted towards the camera or away from it, so the reprojection error has
+//! two minima. A second face of the cube, a second tag of the mat or a second camera resolves this ambiguity. Without
+//! one, [`Solved::other`] contains the second minimum.
 
 mod adjust;
 #[cfg(feature = "opencv")]
@@ -27,51 +27,40 @@ use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
 
 use crate::layout::Square;
 
-/// How camera and tag relate to the unknown pose.
+/// Known poses of camera and tag.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Geometry {
-    /// A camera fixed in the room sees a tag on the vehicle.
-    OutsideIn {
-        /// Where the camera is.
-        world_from_cam: Pose<World, Cam>,
-        /// Where the tag is.
-        body_from_tag: Pose<Body, Square>,
-    },
-    /// A camera on the vehicle sees a tag in the room.
-    InsideOut {
-        /// Where the camera is.
-        body_from_cam: Pose<Body, Cam>,
-        /// Where the tag is.
-        world_from_tag: Pose<World, Square>,
-    },
+    /// A camera fixed in the room, and a tag on the vehicle.
+    OutsideIn { world_from_cam: Pose<World, Cam>, body_from_tag: Pose<Body, Square> },
+    /// A camera on the vehicle, and a tag in the room.
+    InsideOut { body_from_cam: Pose<Body, Cam>, world_from_tag: Pose<World, Square> },
 }
 
-/// One tag seen by one camera.
+/// Detection of one tag by one camera.
 #[derive(Clone, Copy, Debug)]
 pub struct Sighting<'a> {
-    /// The camera's lens.
+    /// Lens of the camera.
     pub camera: &'a Intrinsics,
-    /// Camera and tag.
     pub sight: Geometry,
     /// Edge of the tag's square. [m]
     pub size_m: f64,
-    /// Its corners, in the layout's order. [px]
+    /// Corners in the layout's order. [px]
     pub corners_px: [DVec2; 4],
-    /// How far a corner may be off, one standard deviation along x or y. [px]
+    /// Standard deviation of a corner along x or y. [px]
     pub sigma_px: f64,
-    /// How much later the pose is asked for than the image's middle row was exposed. [s]
+    /// Time from the exposure of the image's middle row to the estimated pose. [s]
     pub lag_s: f64,
-    /// From the exposure of the image's first row to that of its last. [s]
+    /// Time from the exposure of the image's first row to that of its last row. [s]
     pub readout_s: f64,
 }
 
 impl Sighting<'_> {
-    /// Returns how much later the pose is asked for than a row of the image was exposed. [s]
+    /// Returns the time from the exposure of a row to the estimated pose. [s]
     pub(crate) fn lag_at_s(&self, row_px: f64) -> f64 {
         self.lag_s - self.readout_s * self.row_share(row_px)
     }
 
-    /// Returns where a row is in the image: -0.5 is the first, 0.5 the last.
+    /// Returns the relative position of a row in the image: -0.5 is the first, 0.5 the last.
     pub(crate) fn row_share(&self, row_px: f64) -> f64 {
         row_px / f64::from(self.camera.height_px) - 0.5
     }
@@ -81,7 +70,7 @@ impl Sighting<'_> {
     }
 }
 
-/// How the vehicle moves, to relate images that were not exposed together.
+/// Motion of the vehicle, to combine images of different exposure times.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VehicleTwist {
     /// Velocity. [m/s, world]
@@ -93,7 +82,7 @@ pub struct VehicleTwist {
 }
 
 impl VehicleTwist {
-    /// Returns where a vehicle is `dt_s` later; earlier where that is negative.
+    /// Returns the pose after `dt_s`, which can be negative.
     pub fn carry(&self, world_from_body: &Pose<World, Body>, dt_s: f64) -> Pose<World, Body> {
         Pose::new(
             world_from_body.translation_m
@@ -105,19 +94,18 @@ impl VehicleTwist {
     }
 }
 
-/// The answer, and the second one where there is one.
+/// The solution, and the second one if the corners are ambiguous.
 #[derive(Clone, Copy, Debug)]
 pub struct Solved {
     /// The pose that explains the corners best.
     pub best: PoseFit,
-    /// Another minimum, turned by more than a few degrees, that explains them nearly as well:
-    /// corners alone do not decide.
+    /// Another minimum, rotated by more than a few degrees, that fits nearly as well: the corners do not decide.
     pub other: Option<PoseFit>,
 }
 
-/// Returns the pose from all sightings; `None` where no start leads to one.
+/// Returns the pose from all sightings; `None` if no initial pose converges.
 ///
-/// `expected` is where the vehicle should be by its last motion: one more start.
+/// `expected` is the predicted pose, used as one more initial pose.
 pub fn solve(
     sightings: &[Sighting],
     motion: &VehicleTwist,
@@ -147,7 +135,7 @@ pub fn solve(
     let mut fits: Vec<PoseFit> = Vec::with_capacity(2);
     let mut tried: Vec<DQuat> = Vec::with_capacity(MAX_STARTS);
     for (_, start) in starts {
-        // Starts in the same valley end in the same place.
+        // Initial poses in the same valley converge to the same minimum.
         if tried.iter().any(|seen| seen.angle_between(start.rotation) < SAME_START_RAD) {
             continue;
         }
@@ -172,8 +160,7 @@ pub fn solve(
     Some(Solved { best, other })
 }
 
-/// Returns the root mean square distance of a tag's corners from where a pose puts them; infinite behind the
-/// camera. [px]
+/// Returns the root mean square reprojection error of a tag's corners; infinite behind the camera. [px]
 pub fn residual_px(
     sighting: &Sighting,
     motion: &VehicleTwist,
@@ -182,7 +169,7 @@ pub fn residual_px(
     adjust::residual_px(sighting, motion, world_from_body)
 }
 
-/// Returns the poses that one tag alone can have.
+/// Returns the possible poses from a single tag.
 fn square(Sighting { camera, size_m, corners_px, .. }: &Sighting) -> Vec<Pose<Cam, Square>> {
     #[cfg(feature = "opencv")]
     {
@@ -205,14 +192,14 @@ fn world_from_body(sight: &Geometry, cam_from_tag: &Pose<Cam, Square>) -> Pose<W
     }
 }
 
-/// Two valleys of one square lie further apart than this, or cannot be distinguished at all. [rad]
+/// Minimum rotation between two minima of one square; closer ones are indistinguishable. [rad]
 const SAME_ANSWER_RAD: f64 = 0.06;
-/// Starts closer together than this are one. [rad]
+/// Initial poses closer than this are treated as equal. [rad]
 const SAME_START_RAD: f64 = 0.1;
-/// More starts come from tags that are misread or hardly seen.
+/// Maximum number of initial poses; further ones come from misread or barely visible tags.
 const MAX_STARTS: usize = 5;
-/// A second answer whose cost (half the sum of squares in units of sigma) is greater by this is e^12 times less likely
-/// by the corners' noise; what light, blur and print add is covered by the rest.
+/// Maximum cost difference (half the sum of squares in units of sigma) of an ambiguous second solution. By corner
+/// noise, a larger one is at least e^12 times less likely; the margin covers errors of light, blur and print.
 const AMBIGUOUS_COST: f64 = 12.0;
 
 #[cfg(test)]

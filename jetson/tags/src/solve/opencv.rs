@@ -1,7 +1,7 @@
-//! Where to begin, by OpenCV: IPPE for one square, SQPnP for all tags that one camera sees (Terzakis and Lourakis 2020, "A
+//! Initial poses by OpenCV: IPPE for one square, SQPnP for all tags of one camera (Terzakis and Lourakis 2020, "A
 //! consistently fast and globally optimal solution to the perspective-n-point problem"). Feature `opencv`.
 //!
-//! OpenCV is given slopes behind the lens instead of pixels, and so needs none of its own lens models.
+//! OpenCV receives undistorted slopes instead of pixels, so its own lens models are not used.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use opencv::calib3d::{SolvePnPMethod, solve_pnp_generic};
@@ -12,19 +12,18 @@ use vizflyt_protocol::geometry::{Body, Cam, Frame, Intrinsics, Pose, World};
 use super::{Geometry, Sighting};
 use crate::layout::{CORNERS, Square};
 
-/// As [`super::plane::poses`], by IPPE.
+/// [`super::plane::poses`] by IPPE.
 pub(super) fn square(
     camera: &Intrinsics,
     size_m: f64,
     corners_px: &[DVec2; 4],
 ) -> Vec<Pose<Cam, Square>> {
-    // IPPE_SQUARE asks for the upper left corner first, and then clockwise.
+    // IPPE_SQUARE requires the upper left corner first, then clockwise order.
     let points = [3, 2, 1, 0].map(|i: usize| ((CORNERS[i] * size_m).extend(0.0), corners_px[i]));
     poses(camera, &points, SolvePnPMethod::SOLVEPNP_IPPE_SQUARE)
 }
 
-/// Returns the vehicle's pose at the exposure by all tags of each camera that sees several, and how much later it is
-/// asked for. [s]
+/// Returns the vehicle's pose at the exposure, from all tags of each camera that sees several, and the lag. [s]
 pub(super) fn joint(sightings: &[Sighting]) -> Vec<(Pose<World, Body>, f64)> {
     let mut found = Vec::new();
     for (index, first) in sightings.iter().enumerate() {
@@ -69,7 +68,7 @@ pub(super) fn joint(sightings: &[Sighting]) -> Vec<(Pose<World, Body>, f64)> {
     found
 }
 
-/// Whether two tags were seen in the same image.
+/// Returns whether two tags were detected in the same image.
 fn is_one_image(a: &Sighting, b: &Sighting) -> bool {
     let same_place = match (&a.sight, &b.sight) {
         (
@@ -85,7 +84,7 @@ fn is_one_image(a: &Sighting, b: &Sighting) -> bool {
     same_place && a.camera == b.camera && a.lag_s == b.lag_s
 }
 
-/// Returns where points were seen from; nothing where OpenCV finds no pose, or fails.
+/// Returns the camera's pose candidates; empty if OpenCV finds no pose or fails.
 fn poses<F: Frame>(
     camera: &Intrinsics,
     points: &[(DVec3, DVec2)],
@@ -103,7 +102,7 @@ fn poses<F: Frame>(
         .into_iter()
         .map(|(rotation, t)| Pose::new(t, DQuat::from_scaled_axis(rotation).normalize()))
         .filter(|pose: &Pose<Cam, F>| {
-            // All of it ahead of the camera: a plane has a mirrored answer behind it.
+            // All points are in front of the camera: a plane also has a mirrored solution behind it.
             pose.is_valid() && points.iter().all(|(p, _)| pose.transform_point(*p).z > 0.0)
         })
         .collect()
@@ -144,7 +143,7 @@ mod tests {
 
     const SIZE_M: f64 = 0.16;
 
-    /// Corners of a tag seen from the front, each off by some of `noise_px`.
+    /// Corners of a tag seen from the front, with `noise_px` added.
     fn corners(cam_from_tag: &Pose<Cam, Square>, noise_px: &[f64; 8]) -> Option<[DVec2; 4]> {
         let camera = webcam();
         let mut found = [DVec2::ZERO; 4];
@@ -155,16 +154,16 @@ mod tests {
         Some(found)
     }
 
-    /// A tag that looks at the camera, turned by as much.
+    /// A tag that faces the camera, rotated by `turn`.
     fn facing(turn: [f64; 3], t_m: [f64; 3]) -> Pose<Cam, Square> {
         let half = DQuat::from_rotation_x(std::f64::consts::PI);
         Pose::new(DVec3::from(t_m), DQuat::from_scaled_axis(DVec3::from(turn)) * half)
     }
 
     proptest! {
-        /// Both answers of one square, by their implementation and by ours.
+        /// Both solutions of one square: OpenCV's implementation against `plane`.
         #[test]
-        fn a_square_has_the_same_two_answers(
+        fn ippe_and_plane_return_the_same_two_poses(
             turn in prop::array::uniform3(-0.7..0.7f64),
             x in -0.6..0.6f64, y in -0.3..0.3f64, z in 0.8..4.0f64,
             noise in prop::array::uniform8(-0.2..0.2f64),
@@ -184,15 +183,15 @@ mod tests {
             }
         }
 
-        /// Several faces of a cube in one image: SQPnP finds the truth alone, and with it as a start the answer is the
-        /// one that our own starts lead to.
+        /// Several faces of a cube in one image: SQPnP finds the true pose, and the solver converges to the same pose
+        /// as from the initial poses of `plane`.
         #[test]
-        fn several_tags_of_one_image_lead_to_the_same_answer(
+        fn sqpnp_of_several_tags_leads_to_the_same_pose(
             yaw in -3.0..3.0f64, lean in -0.3..0.3f64,
             x in 1.5..4.0f64, y in -0.5..0.5f64,
         ) {
             let camera = webcam();
-            // It looks along x from 1.5 m height, level.
+            // The camera looks along x from 1.5 m height, level.
             let axes = DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X);
             let world_from_cam = Pose::new(DVec3::Z * 1.5, DQuat::from_mat3(&axes));
             let turn = DQuat::from_rotation_z(yaw) * DQuat::from_rotation_y(lean);
@@ -229,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn opencv_failures_yield_no_start() {
+    fn opencv_failures_return_valid_or_no_initial_poses() {
         let nowhere = [DVec2::new(640.0, 360.0); 4];
         assert!(square(&webcam(), SIZE_M, &nowhere).iter().all(Pose::is_valid));
         let nan = [DVec2::NAN; 4];

@@ -1,16 +1,16 @@
-//! The two poses of one square, in closed form.
+//! The two possible poses of one square, in closed form.
 //!
-//! Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation": the homography from the square
-//! to the image, to first order at the square's middle, leaves two rotations; the translation of each
-//! follows by linear least squares.
+//! Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation": the homography from the square to the image,
+//! to first order at the square's middle, leaves two rotations. The translation of each follows by linear least
+//! squares.
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::{Cam, Intrinsics, Pose};
 
 use crate::layout::{CORNERS, Square};
 
-/// Returns the poses, `cam_from_tag`, that a square of this edge [m] with these corners can have: two,
-/// or none for corners that are no square's.
+/// Returns the possible poses, `cam_from_tag`, of a square with this edge [m] and these corners: two, or none if the
+/// corners are not those of a square.
 pub(super) fn poses(
     camera: &Intrinsics,
     size_m: f64,
@@ -35,7 +35,7 @@ pub(super) fn poses(
         .collect()
 }
 
-/// Returns the homography from points of the square [m] to slopes, its last element 1.
+/// Returns the homography from points of the square [m] to slopes, normalized to a last element of 1.
 fn homography(slopes: &[DVec2; 4], size_m: f64) -> Option<DMat3> {
     // From the unit square (0,0), (1,0), (1,1), (0,1) to a quad: Heckbert 1989, "Fundamentals of texture
     // mapping and image warping", section 2.2.3.
@@ -47,7 +47,7 @@ fn homography(slopes: &[DVec2; 4], size_m: f64) -> Option<DMat3> {
     let h = d1.perp_dot(sum) / area;
     let (a, b) = (p1 - p0 + p1 * g, p3 - p0 + p3 * h);
     let from_unit = DMat3::from_cols(a.extend(g), b.extend(h), p0.extend(1.0));
-    // The square's own coordinates count from its middle.
+    // The origin of the square's coordinates is its middle.
     let unit_from_square = DMat3::from_cols(
         DVec3::new(1.0 / size_m, 0.0, 0.0),
         DVec3::new(0.0, 1.0 / size_m, 0.0),
@@ -60,7 +60,7 @@ fn homography(slopes: &[DVec2; 4], size_m: f64) -> Option<DMat3> {
 }
 
 fn rotations(h: &DMat3) -> Option<[DMat3; 2]> {
-    // Where the middle is seen, and how slopes change there with the square's coordinates.
+    // Slope of the middle, and the derivative of slopes by the square's coordinates there.
     let middle = h.z_axis.truncate();
     let jacobian = DMat2::from_cols(
         h.x_axis.truncate() - middle * h.x_axis.z,
@@ -76,7 +76,7 @@ fn rotations(h: &DMat3) -> Option<[DMat3; 2]> {
         return None;
     }
     let a = b.inverse() * jacobian;
-    // Its greatest singular value is one over the depth.
+    // The largest singular value is the inverse of the depth.
     let aa = a * a.transpose();
     let (p, q, r) = (aa.x_axis.x, aa.y_axis.y, aa.y_axis.x);
     let gain = (0.5 * (p + q + ((p - q).powi(2) + 4.0 * r * r).sqrt())).sqrt();
@@ -84,7 +84,7 @@ fn rotations(h: &DMat3) -> Option<[DMat3; 2]> {
         return None;
     }
     let flat = a * (1.0 / gain);
-    // What the first two columns lack to unit length is their third element, up to one sign.
+    // The third elements of the first two columns complete them to unit length, up to one common sign.
     let lack = DMat2::IDENTITY - flat.transpose() * flat;
     let b0 = lack.x_axis.x.max(0.0).sqrt();
     let b1 = lack.y_axis.y.max(0.0).sqrt();
@@ -96,8 +96,8 @@ fn rotations(h: &DMat3) -> Option<[DMat3; 2]> {
     }))
 }
 
-/// Returns where the square's middle is, by least squares over its corners: `t.xy - slope t.z` must be
-/// `slope r.z - r.xy` for a corner that lies at `r` from the middle.
+/// Returns the position of the square's middle by least squares over its corners. `t.xy - slope t.z` must equal `slope
+/// r.z - r.xy` for a corner at offset `r` from the middle.
 fn translation(slopes: &[DVec2; 4], size_m: f64, rotation: &DMat3) -> Option<DVec3> {
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;

@@ -5,12 +5,12 @@ use proptest::prelude::*;
 
 const SIZE_M: f64 = 0.16;
 
-/// A face of a cube of 0.2 m about the vehicle's origin: its printed side looks along `normal`.
+/// A face of a cube of 0.2 m around the vehicle's origin; its printed side points along `normal`.
 fn face(normal: DVec3) -> Pose<Body, Square> {
     Pose::new(normal * 0.1, DQuat::from_rotation_arc(DVec3::Z, normal))
 }
 
-/// A camera at `from` that looks at `at`, its right side level.
+/// A camera at `from` that looks at `at`, with its x axis level.
 fn looking(from: DVec3, at: DVec3) -> Pose<World, Cam> {
     let z = (at - from).normalize();
     let x = z.cross(DVec3::Z).normalize();
@@ -32,7 +32,7 @@ fn seen<'a>(
         }
     };
     let mut noise_px = noise_px;
-    // From behind nothing is seen.
+    // A tag is invisible from behind.
     let away = cam_from_tag.rotation * DVec3::Z;
     if away.dot(cam_from_tag.translation_m) > -0.2 * cam_from_tag.translation_m.length() {
         return None;
@@ -58,7 +58,7 @@ fn error(a: &Pose<World, Body>, b: &Pose<World, Body>) -> (f64, f64) {
 }
 
 fn noise(seed: u64, sigma_px: f64) -> impl FnMut() -> DVec2 {
-    // xorshift and the sum of twelve uniforms: near enough to normal.
+    // xorshift and the sum of twelve uniform values: close to a normal distribution.
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut uniform = move || {
         state ^= state << 13;
@@ -90,7 +90,7 @@ fn cube_seen<'a>(
 
 proptest! {
     #[test]
-    fn one_square_has_its_true_pose_among_its_two(
+    fn one_of_the_two_poses_of_a_square_is_true(
         x in -1.0..1.0f64, y in -0.6..0.6f64, z in 0.5..8.0f64,
         axis in prop::array::uniform3(-1.0..1.0f64),
     ) {
@@ -127,7 +127,7 @@ proptest! {
     }
 
     #[test]
-    fn poison_leads_to_no_pose_or_a_sound_one(
+    fn invalid_corners_give_no_pose_or_a_valid_one(
         corners in prop::array::uniform8(prop_oneof![Just(f64::NAN), Just(f64::INFINITY), -1e9..1e9f64, 0.0..1280.0f64]),
     ) {
         let camera = webcam();
@@ -143,13 +143,13 @@ proptest! {
 }
 
 #[test]
-fn inside_out_and_outside_in_are_one_mathematics() {
+fn inside_out_estimates_the_same_pose() {
     let camera = webcam();
     let truth = Pose::new(
         DVec3::new(0.3, -0.2, 1.1),
         DQuat::from_euler(glam::EulerRot::ZYX, 0.7, 0.1, -0.08),
     );
-    // Straight down, image's top towards the nose.
+    // The camera looks straight down; the top of the image points to the nose.
     let body_from_cam = Pose::new(
         DVec3::new(0.05, 0.0, -0.03),
         DQuat::from_mat3(&glam::DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_X, DVec3::NEG_Z)),
@@ -169,7 +169,7 @@ fn inside_out_and_outside_in_are_one_mathematics() {
 }
 
 #[test]
-fn errors_are_as_large_as_the_covariance_says() {
+fn covariance_matches_the_actual_errors() {
     let camera = webcam();
     let cameras = [
         looking(DVec3::new(-5.2, 2.0, 3.3), DVec3::new(0.0, 0.0, 1.2)),
@@ -190,13 +190,13 @@ fn errors_are_as_large_as_the_covariance_says() {
         let (sigma_m, sigma_rad) = fit.sigmas();
         sum += (p / sigma_m).length_squared() + (turn / sigma_rad).length_squared();
     }
-    // Six squares of one sigma each; a little less, as sigma only ever grows with the scatter.
+    // Expected: six squares of one sigma each; slightly less, because sigma only grows with the scatter.
     let mean = sum / f64::from(n);
     assert!((3.0..7.5).contains(&mean), "{mean} squared sigmas of 6");
 }
 
 #[test]
-fn a_far_square_seen_from_the_front_keeps_both_answers() {
+fn keeps_both_poses_of_a_far_square_seen_from_the_front() {
     let camera = webcam();
     let truth = Pose::new(DVec3::new(6.0, 0.0, 0.0), DQuat::from_rotation_y(0.12));
     let world_from_cam = looking(DVec3::ZERO, DVec3::X);
@@ -216,13 +216,13 @@ fn a_far_square_seen_from_the_front_keeps_both_answers() {
 }
 
 #[test]
-fn a_misread_tag_hardly_pulls() {
+fn a_misread_corner_has_little_influence() {
     let camera = webcam();
     let cameras = [looking(DVec3::new(-4.0, 1.5, 3.0), DVec3::new(0.0, 0.0, 1.2))];
     let truth = Pose::new(DVec3::new(0.0, 0.0, 1.5), DQuat::from_rotation_z(0.5));
     let mut all = cube_seen(&camera, &cameras, &truth, &mut noise(5, 0.1));
     assert!(all.len() >= 3);
-    // One corner covered by a cable: 6 pixels off.
+    // One corner is covered by a cable: 6 pixels off.
     all[0].corners_px[2] += DVec2::new(5.0, -3.0);
     let solved = solve(&all, &VehicleTwist::default(), None).unwrap();
     let (off_m, off_rad) = error(&solved.best.world_from_body, &truth);
@@ -230,7 +230,7 @@ fn a_misread_tag_hardly_pulls() {
 }
 
 #[test]
-fn images_of_other_instants_are_carried_along() {
+fn combines_images_of_different_exposure_times() {
     let camera = webcam();
     let cameras = [
         looking(DVec3::new(-5.2, 2.0, 3.3), DVec3::new(0.0, 0.0, 1.2)),

@@ -1,4 +1,4 @@
-//! Fixed cameras, from images of a surveyed mat or of a cube that is carried about.
+//! Survey of fixed cameras, from images of a surveyed mat or of a cube that is carried around.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::geometry::{Body, Cam, Intrinsics, Pose, World};
@@ -8,55 +8,52 @@ use crate::bundle::{Bundle, CornerObservation, Parameter, Rigid, Solution};
 use crate::detection::Detection;
 use crate::layout::{CORNERS, TagLayout};
 
-/// What a fixed camera saw. Images of the same number in all cameras were taken at the same time, while
-/// the cube was held still.
+/// Detections of a fixed camera. Images with the same index were taken at the same time in all cameras, while the cube
+/// was held still.
 #[derive(Clone, Debug)]
 pub struct CameraImages {
-    /// What it is called.
     pub name: String,
-    /// Its lens.
     pub intrinsics: Intrinsics,
     /// Tags in each image.
     pub images: Vec<Vec<Detection>>,
 }
 
-/// Where a fixed camera is.
+/// Surveyed pose of a fixed camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlacedCamera {
-    /// Its pose.
     pub world_from_cam: Pose<World, Cam>,
-    /// Root mean square distance of corners in its images from where the answer puts them, misread tags
-    /// left out. [px]
+    /// Root mean square reprojection error, without misread tags. [px]
     pub rms_px: f64,
-    /// One standard deviation of its position, about the world's axes as the camera sees them. [m]
+    /// Standard deviation of the position, over all axes. [m]
     pub sigma_m: f64,
-    /// Corners it saw.
+    /// Number of corners used.
     pub corners: usize,
 }
 
-/// How large the cube is in units of its layout.
+/// Size of the cube, relative to its layout.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CubeScale {
-    /// Its size.
+    /// Ratio of the true size to the size in the layout.
     pub scale: f64,
-    /// One standard deviation; large where only one camera sees the mat, as the others are then placed by the cube.
+    /// Standard deviation. Large if only one camera sees the mat, because the cube then determines the other cameras'
+    /// positions.
     pub sigma: f64,
 }
 
-/// Where fixed cameras are.
+/// Surveyed poses of fixed cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SurveyedCameras {
-    /// In the order of the images.
+    /// Cameras in the order of the images.
     pub cameras: Vec<PlacedCamera>,
-    /// The cube's size, if there is one: solved along where it can be known.
+    /// Size of the cube, if there is one. Estimated together with the poses, if it is observable.
     pub cube: Option<CubeScale>,
 }
 
-/// Returns where cameras are, and how large the cube is. The mat gives the `world` frame; cameras that do not see it are placed by
-/// the cube, at moments when cameras already placed see it, too.
+/// Returns the poses of cameras and the size of the cube. The mat defines the `world` frame. Cameras that do not see
+/// the mat are located by the cube, at moments when an already located camera also sees it.
 ///
 /// # Errors
-/// [`SurveyError`] if a camera is tied to nothing, or what was seen contradicts itself.
+/// [`SurveyError`] if a camera sees neither mat nor cube, or if the detections are inconsistent.
 pub fn cameras(
     cameras: &[CameraImages],
     mat: &TagLayout,
@@ -92,7 +89,7 @@ pub fn cameras(
     adjust(cameras, &start, mat, cube, &bodies)
 }
 
-/// Places a camera by the image that shows most of the mat.
+/// Locates a camera by the image that shows most of the mat.
 fn by_mat(camera: &CameraImages, mat: &TagLayout) -> Option<Pose<World, Cam>> {
     let known = |image: &Vec<Detection>| -> Vec<_> {
         image
@@ -107,7 +104,7 @@ fn by_mat(camera: &CameraImages, mat: &TagLayout) -> Option<Pose<World, Cam>> {
     camera_pose(&camera.intrinsics, &best).map(|(pose, _)| pose)
 }
 
-/// Returns where the cube was, by all cameras that are placed.
+/// Returns the pose of the cube, from all located cameras.
 fn cube_at(
     cameras: &[CameraImages],
     placed: &[Option<Pose<World, Cam>>],
@@ -125,11 +122,11 @@ fn cube_at(
         }
     }
     let solved = cube_pose(&seen)?;
-    // A single face may be seen in two ways: wait for an image that decides.
+    // A single face can be ambiguous: wait for an image that resolves it.
     solved.other.is_none().then_some(solved.best.world_from_body)
 }
 
-/// Places a camera by the cube at the moment that agrees best with the others.
+/// Locates a camera by the cube at the moment that agrees best with the others.
 fn by_cube(
     camera: &CameraImages,
     cube: &TagLayout,
@@ -150,7 +147,7 @@ fn by_cube(
             .collect()
     };
     let all: Vec<_> = seen.iter().flat_map(tags).collect();
-    // All moments at once are one large, spread-out mat.
+    // All moments together are one large mat.
     let by_all = camera_pose(&camera.intrinsics, &all).map(|(pose, _)| pose);
     let by_each = seen.iter().filter_map(|moment| camera_pose(&camera.intrinsics, &tags(moment)));
     let cost = |pose: &Pose<World, Cam>| -> f64 {
@@ -183,7 +180,7 @@ fn adjust(
     bodies: &[Option<Pose<World, Body>>],
 ) -> Result<SurveyedCameras, SurveyError> {
     let mut bundle = Bundle { loss_px: LOSS_PX, ..Bundle::default() };
-    // Which of what is seen is on the cube.
+    // Indices of corners on the cube.
     let mut cube_corners = Vec::new();
     let world = bundle.pose(Rigid::IDENTITY, Parameter::Fixed);
     let numbers: Vec<usize> =
@@ -251,8 +248,8 @@ fn adjust(
     Ok(SurveyedCameras { cameras: placed, cube: scale })
 }
 
-/// Returns the size of the cube that explains the corners best: where the parabola through their cost, each time with
-/// all poses solved again, is least; its curvature tells how sure that is.
+/// Returns the cube size with the least cost. A parabola is fitted to the cost at several sizes, each with all poses
+/// solved again; its curvature gives the standard deviation.
 fn scale_of(
     bundle: &Bundle,
     solution: &Solution,
@@ -265,7 +262,7 @@ fn scale_of(
         bundle.solve()?;
         Some(bundle.cost())
     };
-    // The robust cost is no parabola but near its least.
+    // The robust cost is a parabola only near its minimum.
     let mut found = CubeScale { scale: 1.0, sigma: f64::INFINITY };
     let mut least = cost(1.0)?;
     for percent in (-MOST_PERCENT..=MOST_PERCENT).filter(|percent| *percent != 0) {
@@ -284,14 +281,14 @@ fn scale_of(
         }
         let slope = (above - below) / (2.0 * step);
         let scale = at - (slope / bend).clamp(-0.01, 0.01);
-        // Half the squares of both axes, in units of the corners' variance along one.
+        // Half the squares of both axes, in units of the corners' variance along one axis.
         let variance_px2 = 0.5 * solution.rms_px.max(LEAST_RMS_PX).powi(2);
         found = CubeScale { scale, sigma: (2.0 * variance_px2 / bend).sqrt() };
     }
     Some(found)
 }
 
-/// Makes the cube as large, about the middle of its tags.
+/// Scales the cube about the middle of its tags.
 fn resize(bundle: &mut Bundle, cube_corners: &[usize], middle_m: DVec3, scale: f64) {
     for &index in cube_corners {
         let point_m = &mut bundle.seen[index].point_m;
@@ -303,9 +300,9 @@ fn middle_m(cube: &TagLayout) -> DVec3 {
     cube.tags.iter().map(|tag| tag.position_m).sum::<DVec3>() / cube.tags.len() as f64
 }
 
-/// A cube's size is used if it is known as well as this.
+/// Maximum sigma at which the estimated size is used.
 const KNOWN_SCALE: f64 = 0.003;
-/// A print that is off by more is another layout's. [%]
+/// Maximum deviation of a print; a larger one means another layout. [%]
 const MOST_PERCENT: i32 = 5;
-/// No corners are better than this. [px]
+/// Minimum RMS error of corners. [px]
 const LEAST_RMS_PX: f64 = 0.05;

@@ -1,4 +1,4 @@
-//! The tags of a mat, or of any room, from images of one camera.
+//! Survey of the tags of a mat or a room, from images of one camera.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,48 +11,47 @@ use crate::detection::Detection;
 use crate::family::TagFamily;
 use crate::layout::{CORNERS, LayoutFrame, Square, Tag, TagLayout};
 
-/// What names a tag.
+/// Identifier of a tag.
 type Key = (TagFamily, u32);
 
 /// A surveyed mat.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Surveyed {
-    /// Where the tags are. [world]
+    /// Surveyed tags. [world]
     pub layout: TagLayout,
-    /// What is known of each, in the layout's order.
+    /// Accuracy of each tag, in the layout's order.
     pub residuals: Vec<TagResidual>,
-    /// Images used.
+    /// Number of images used.
     pub images: usize,
-    /// Root mean square distance of corners from where the answer puts them, misread tags left out. [px]
+    /// Root mean square reprojection error, without misread tags. [px]
     pub rms_px: f64,
-    /// The same on the tags. [m]
+    /// Root mean square error on the tags. [m]
     pub rms_m: f64,
-    /// Tags that were seen or expected, and are not in the layout: why.
+    /// Tags that were detected or expected but are not in the layout, with the reason.
     pub left_out: Vec<(TagFamily, u32, &'static str)>,
 }
 
-/// How well a tag's place is known.
+/// Accuracy of a surveyed tag.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TagResidual {
-    /// Images that show it.
+    /// Number of images that show the tag.
     pub images: usize,
-    /// Root mean square distance of its corners from where the answer puts them. [m]
+    /// Root mean square reprojection error of its corners. [m]
     pub rms_m: f64,
-    /// One standard deviation of its position, seen from the tag best seen of all. [m]
+    /// Standard deviation of the position relative to the tag with most detections. [m]
     pub sigma_m: f64,
-    /// How far it lies from where the layout printed it; none for a tag that was not on it. [m]
+    /// Distance from the printed layout's position; `None` for a tag that is not in it. [m]
     pub moved_m: Option<f64>,
 }
 
-/// Returns where tags are, from what one camera saw of them.
+/// Returns the poses of tags from the images of one camera.
 ///
-/// `printed` is the layout they were printed by: it gives their sizes, a place to start from, and the
-/// `world` frame. Tags of the family and size of `others` that are not on it are surveyed, too. The
-/// frame is the one that fits all tags of `printed` best, or, with `anchor`, the one in which that tag
-/// lies exactly as printed.
+/// `printed` is the layout of the printed tags. It gives their sizes, initial positions, and the `world` frame. Tags of
+/// the family and size in `others` that are not in the layout are also surveyed. The frame is the best fit to all tags
+/// of `printed`. With `anchor`, it is the frame in which that tag has exactly its printed pose.
 ///
 /// # Errors
-/// [`SurveyError`] if too little was seen, or what was seen contradicts itself.
+/// [`SurveyError`] if there are too few detections, or if they are inconsistent.
 pub fn mat(
     lens: &Intrinsics,
     printed: &TagLayout,
@@ -64,7 +63,7 @@ pub fn mat(
         let on_mat = printed.find(key.0, key.1).map(|tag| tag.size_m);
         on_mat.or_else(|| others.and_then(|(family, size_m)| (family == key.0).then_some(size_m)))
     };
-    // Known tags of each image; one tag alone ties nothing together.
+    // Known tags of each image. An image with one tag connects no tags.
     let images: Vec<Vec<(Key, [DVec2; 4])>> = images
         .iter()
         .map(|image| {
@@ -152,10 +151,10 @@ pub fn mat(
     })
 }
 
-/// Where tags and cameras are, roughly.
+/// Initial poses of tags and cameras.
 struct Start {
     tags: BTreeMap<Key, Pose<World, Square>>,
-    /// Of each image, if it is tied to the others.
+    /// Camera pose of each image, if it is connected to the others.
     cameras: Vec<Option<Pose<World, Cam>>>,
 }
 
@@ -166,7 +165,7 @@ impl Start {
         Self { tags, cameras: Vec::new() }
     }
 
-    /// Places cameras by the tags known, and further tags by the cameras placed, until nothing is added.
+    /// Locates cameras by known tags, and further tags by located cameras, until nothing is added.
     fn grow(
         &mut self,
         lens: &Intrinsics,
@@ -174,7 +173,7 @@ impl Start {
         size_m: &impl Fn(Key) -> Option<f64>,
     ) {
         self.cameras = vec![None; images.len()];
-        // One tag leaves two poses open; cameras that see one only come last.
+        // A single tag leaves two possible poses: cameras with one tag come last.
         for least in [2, 1] {
             loop {
                 let mut grown = false;
@@ -213,7 +212,7 @@ impl Start {
         }
     }
 
-    /// Returns where a tag is: of the two poses that each image gives, the one that all agree on best.
+    /// Returns the pose of a tag: of the two candidates from each image, the one that fits all images best.
     fn place(
         &self,
         lens: &Intrinsics,
@@ -246,7 +245,7 @@ impl Start {
         };
         let mut best: Option<(f64, Pose<World, Square>)> = None;
         for (world_from_cam, corners_px) in sightings.iter().take(MAX_STARTS) {
-            // The camera's pose as seen from the tag, where the tag is the room.
+            // Pose of the camera relative to the tag: the tag's frame takes the place of the room.
             let Some((_, solved)) = camera_pose(lens, &[(Pose::IDENTITY, size_m, *corners_px)])
             else {
                 continue;
@@ -265,7 +264,7 @@ impl Start {
     }
 }
 
-/// Returns in how many placed images each tag is.
+/// Returns the number of located images that show each tag.
 fn count(
     images: &[Vec<(Key, [DVec2; 4])>],
     cameras: &[Option<Pose<World, Cam>>],
@@ -289,7 +288,7 @@ fn adjust(
     counts: &BTreeMap<Key, usize>,
 ) -> Result<Adjusted, SurveyError> {
     let mut bundle = Bundle { lenses: vec![(*lens, false)], loss_px: LOSS_PX, ..Bundle::default() };
-    // The tag best seen holds the frame while the others move.
+    // The tag with most detections is fixed and defines the frame.
     let held = start.tags.keys().max_by_key(|key| counts.get(key)).copied();
     let numbers: BTreeMap<Key, usize> = start
         .tags
@@ -303,7 +302,7 @@ fn adjust(
         let Some(world_from_cam) = camera else { continue };
         let tags =
             || image.iter().filter_map(|(key, px)| Some((numbers.get(key)?, size_m(*key)?, px)));
-        // Tags without a place may have left an image with too few.
+        // Without the removed tags, an image may contain none.
         if tags().count() < 1 {
             continue;
         }
@@ -321,7 +320,7 @@ fn adjust(
     Ok((bundle, numbers, solution))
 }
 
-/// Returns the distance of corners from where the answer puts them, at the corner. [m]
+/// Returns the root mean square reprojection error, scaled to the distance of the corner. [m]
 fn rms_m(bundle: &Bundle, lens: &Intrinsics, which: impl Fn(&CornerObservation) -> bool) -> f64 {
     let (mut sum, mut count) = (0.0, 0u32);
     for seen in bundle.seen.iter().filter(|seen| which(seen)) {
@@ -334,8 +333,7 @@ fn rms_m(bundle: &Bundle, lens: &Intrinsics, which: impl Fn(&CornerObservation) 
     (sum / f64::from(count.max(1))).sqrt()
 }
 
-/// Returns the motion that lays the corners found onto those printed, by least squares; only of tags
-/// that are both.
+/// Returns the rigid motion from the surveyed corners to the printed ones, by least squares over the common tags.
 fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> Pose<World, World> {
     let mut pairs: Vec<(DVec3, DVec3)> = Vec::new();
     for tag in &printed.tags {
@@ -347,7 +345,7 @@ fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> 
     let count = pairs.len().max(1) as f64;
     let middle_found = pairs.iter().map(|p| p.0).sum::<DVec3>() / count;
     let middle_printed = pairs.iter().map(|p| p.1).sum::<DVec3>() / count;
-    // Gauss and Newton: what was found lies within centimetres of what was printed.
+    // Gauss-Newton: surveyed corners are within centimetres of the printed ones.
     let mut q = DQuat::IDENTITY;
     for _ in 0..20 {
         let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
@@ -370,9 +368,9 @@ fn best_fit(printed: &TagLayout, found: &BTreeMap<Key, Pose<World, Square>>) -> 
     Pose::new(middle_printed - q * middle_found, q)
 }
 
-/// Fewer images constrain too little.
+/// Minimum number of images for a reliable survey.
 const MIN_IMAGES: usize = 5;
-/// A tag in fewer images is not checked by anything.
+/// Minimum number of images of a tag; with fewer, its position is not verified.
 const MIN_SIGHTINGS: usize = 2;
-/// Images from which a tag's place is tried.
+/// Maximum number of images that give candidates for a tag's pose.
 const MAX_STARTS: usize = 10;

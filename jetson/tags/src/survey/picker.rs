@@ -1,18 +1,18 @@
-//! Which images of a video are worth surveying with.
+//! Selection of a video's images for a survey.
 
 use vizflyt_protocol::geometry::Intrinsics;
 
 use crate::detection::Detection;
 
-/// Keeps images that differ from the one kept before: a video shows the same thing thirty times a
-/// second, and a survey takes as long as it has images.
+/// Keeps images that differ from the previously kept one. A video repeats the same view thirty times per second, and
+/// the time of a survey grows with the number of images.
 #[derive(Clone, Debug, Default)]
 pub struct Picker {
     images: Vec<Vec<Detection>>,
 }
 
 impl Picker {
-    /// Takes the tags of the next image, and keeps them if they add something new.
+    /// Adds the tags of the next image if they differ enough.
     pub fn offer(&mut self, image: Vec<Detection>, lens: &Intrinsics) {
         if image.len() < 2 || self.is_full() {
             return;
@@ -34,20 +34,20 @@ impl Picker {
         }
     }
 
-    /// Returns the tags of the images kept.
+    /// Returns the tags of the kept images.
     pub fn images(&self) -> &[Vec<Detection>] {
         &self.images
     }
 
-    /// Whether more images would not help any more.
+    /// Returns whether the maximum number of images is reached.
     pub fn is_full(&self) -> bool {
         self.images.len() >= MAX_IMAGES
     }
 }
 
-/// A tag must have moved by so much. [share of the image's width]
+/// Minimum motion of a tag. [share of the image's width]
 const MOVED: f64 = 0.03;
-/// Some seconds of computing for a mat of a hundred tags.
+/// Maximum number of images: a survey of a hundred tags then takes some seconds.
 const MAX_IMAGES: usize = 300;
 
 #[cfg(test)]
@@ -57,7 +57,7 @@ mod tests {
     use glam::DVec2;
 
     #[test]
-    fn an_image_is_kept_if_a_tag_moved_or_came() {
+    fn keeps_an_image_if_a_tag_moved_or_appeared() {
         let lens = Intrinsics::from_horizontal_fov(1000, 700, 1.2);
         let tag = |id: u32, x: f64| Detection {
             family: TagFamily::Tag36h11,
@@ -68,7 +68,7 @@ mod tests {
         };
         let mut picker = Picker::default();
         picker.offer(vec![tag(1, 0.0)], &lens);
-        assert!(picker.images().is_empty(), "one tag ties nothing together");
+        assert!(picker.images().is_empty(), "one tag does not connect images");
         picker.offer(vec![tag(1, 0.0), tag(2, 50.0)], &lens);
         picker.offer(vec![tag(1, 10.0), tag(2, 60.0)], &lens);
         assert_eq!(picker.images().len(), 1);

@@ -22,7 +22,7 @@ fn printed() -> TagLayout {
     mat.print().unwrap().layout
 }
 
-/// The mat as somebody glued it: off by millimetres, but for the first tag.
+/// The mat after gluing by hand: off by millimetres, except for the first tag.
 fn glued(random: &mut Random) -> TagLayout {
     let mut layout = printed();
     for tag in layout.tags.iter_mut().skip(1) {
@@ -34,13 +34,13 @@ fn glued(random: &mut Random) -> TagLayout {
     layout
 }
 
-/// A camera over the floor that looks about straight down.
+/// Pose of a camera above the floor that looks roughly straight down.
 fn over(x_m: f64, y_m: f64, height_m: f64, tilt: DVec3) -> Pose<World, Cam> {
     let down = DQuat::from_rotation_x(std::f64::consts::PI);
     Pose::new(DVec3::new(x_m, y_m, height_m), DQuat::from_scaled_axis(tilt) * down)
 }
 
-/// What a camera sees of tags, corners off by `noise_px`.
+/// Returns the detections of tags by a camera, with `noise_px` on the corners.
 fn look(
     lens: &Intrinsics,
     cam_from_layout: impl Fn(DVec3) -> DVec3,
@@ -87,10 +87,10 @@ fn flight(tags: &[Tag], lens: &Intrinsics, random: &mut Random) -> Vec<Vec<Detec
 }
 
 #[test]
-fn a_glued_mat_is_surveyed_to_a_millimetre_and_a_tag_beside_it_too() {
+fn surveys_a_glued_mat_and_an_extra_tag_to_a_millimetre() {
     let mut random = Random::new(2);
     let mut truth = glued(&mut random);
-    // A tag that no layout knows, tilted, beside the mat.
+    // A tilted tag next to the mat that is not in the layout.
     let pose: Pose<World, Square> =
         Pose::new(DVec3::new(0.3, 0.0, 0.05), DQuat::from_rotation_y(-0.6));
     truth.tags.push(Tag::new(TagFamily::Tag36h11, 7, 0.07, pose));
@@ -101,7 +101,7 @@ fn a_glued_mat_is_surveyed_to_a_millimetre_and_a_tag_beside_it_too() {
     let found = mat(&lens, &printed(), others, Some(anchor), &images).unwrap();
     assert_eq!(found.layout.tags.len(), 25);
     assert!(found.left_out.is_empty(), "{:?}", found.left_out);
-    // Two axes of 0.15 px.
+    // 0.15 px on each of two axes.
     assert!((0.15..0.25).contains(&found.rms_px), "{}", found.rms_px);
     for (tag, residual) in found.layout.tags.iter().zip(&found.residuals) {
         let expected = truth.find(tag.family, tag.id).unwrap();
@@ -110,7 +110,7 @@ fn a_glued_mat_is_surveyed_to_a_millimetre_and_a_tag_beside_it_too() {
         assert!(residual.sigma_m < 0.001 && residual.rms_m < 0.0003, "{residual:?}");
         assert_eq!(residual.moved_m.is_none(), tag.id == 7);
     }
-    // Without an anchor the whole lies on what was printed as well as it can.
+    // Without an anchor, the survey is the best fit to the printed layout.
     let found = mat(&lens, &printed(), None, None, &images).unwrap();
     let shift: DVec3 = found
         .layout
@@ -122,7 +122,7 @@ fn a_glued_mat_is_surveyed_to_a_millimetre_and_a_tag_beside_it_too() {
 }
 
 #[test]
-fn a_mat_is_surveyed_from_images() {
+fn surveys_a_mat_from_rendered_images() {
     let mut random = Random::new(4);
     let truth = glued(&mut random);
     let lens = webcam();
@@ -152,7 +152,7 @@ fn a_mat_is_surveyed_from_images() {
 }
 
 #[test]
-fn invalid_surveys_are_refused_by_name() {
+fn rejects_invalid_surveys_with_the_reason() {
     let mut random = Random::new(2);
     let lens = webcam();
     let images = flight(&printed().tags, &lens, &mut random);
@@ -166,7 +166,7 @@ fn invalid_surveys_are_refused_by_name() {
     refused(&lens, Some((TagFamily::Tag36h11, 9)), &images, &["tag36h11 9"]);
     let other = Intrinsics { fx_px: 700.0, fy_px: 930.0, distortion: Distortion::None, ..lens };
     refused(&other, None, &images, &["px off", "camera file"]);
-    // A tag in no image is left out by name.
+    // A tag without images is reported as left out.
     let few: Vec<Vec<Detection>> = images
         .iter()
         .map(|image| image.iter().copied().filter(|d| d.id != 110).collect())
@@ -189,7 +189,7 @@ fn cube() -> TagLayout {
     cube.print().unwrap().layout
 }
 
-/// A camera at a place that looks at another.
+/// Pose of a camera at `from_m` that looks at `to_m`.
 fn towards(from_m: DVec3, to_m: DVec3) -> Pose<World, Cam> {
     let z = (to_m - from_m).normalize();
     let x = z.cross(DVec3::Z).normalize();
@@ -197,7 +197,7 @@ fn towards(from_m: DVec3, to_m: DVec3) -> Pose<World, Cam> {
 }
 
 #[test]
-fn cameras_are_placed_by_the_mat_and_those_that_miss_it_by_the_cube() {
+fn locates_cameras_by_the_mat_or_else_by_the_cube() {
     let mut random = Random::new(9);
     let lens = webcam();
     let large = Mat {
@@ -261,7 +261,7 @@ fn cameras_are_placed_by_the_mat_and_those_that_miss_it_by_the_cube() {
         assert!(off_m < 5.0 * found.sigma_m && found.sigma_m < 0.01, "{off_m}: {found:?}");
         assert!(found.rms_px < 0.4, "{found:?}");
     }
-    // Printed at 97 %: two cameras that see the mat know.
+    // Printed at 97 %: two cameras that see the mat determine the size.
     let mut shrunk = cube();
     for tag in &mut shrunk.tags {
         tag.size_m /= 0.97;
@@ -274,14 +274,14 @@ fn cameras_are_placed_by_the_mat_and_those_that_miss_it_by_the_cube() {
         let off_m = found.world_from_cam.translation_m.distance(truth.translation_m);
         assert!(off_m < 0.005, "{off_m} m off: {found:?}");
     }
-    // One that sees the mat alone does not: the others' places grow with the cube.
+    // A single camera that sees the mat does not: the other camera's distance scales with the cube.
     let alone = [see(0, true, &mut random), see(1, false, &mut random)];
     let scale = cameras(&alone, &mat_layout, Some(&shrunk)).unwrap().cube.expect("there is a cube");
     assert!(scale.sigma > 0.02, "{scale:?}");
-    // Without the cube nothing ties the third camera to the room.
+    // Without the cube, the third camera has no connection to the room.
     let error = cameras(&all, &mat_layout, None).unwrap_err().to_string();
     assert!(error.contains("\"camera 2\"") && error.contains("cube"), "{error}");
-    // A cube that was printed larger contradicts the mat.
+    // A cube that is larger than its layout contradicts the mat.
     let mut larger = cube();
     for tag in &mut larger.tags {
         tag.size_m *= 1.1;

@@ -1,5 +1,5 @@
-//! Lays the ink of tags onto an image that shows white sheets where they are: the sheets' light, what stands before them and
-//! the lens are the image's own, and only what is black is made so.
+//! Draws the ink of tags onto an image that already shows white sheets. Light, occlusion and lens effects come from the
+//! image; only the black cells are darkened.
 
 use vizflyt_protocol::geometry::{Cam, Pose, World};
 
@@ -9,21 +9,21 @@ use crate::layout::TagLayout;
 /// An image that shows the sheets.
 #[derive(Debug)]
 pub struct Sheets<'a> {
-    /// Linear light, H x W x 3 of the lens's size.
+    /// Linear light, H x W x 3, in the size of the lens.
     pub light: &'a mut [f32],
-    /// Camera-z depth of what is seen, H x W; 0 where nothing is. [m, cam]
+    /// Camera-z depth, H x W; 0 for no surface. [m, cam]
     pub depth_m: &'a [f32],
-    /// Where it is seen from.
+    /// Pose of the camera.
     pub world_from_cam: Pose<World, Cam>,
 }
 
 impl Renderer {
-    /// Inks the tags of a layout in the room: light that leaves a sheet is multiplied by [`INK`] where it is black. A pixel
-    /// whose depth is not the sheet's shows something else, which stays as it is. `blur_px` is one standard deviation of
-    /// the image's own blur.
+    /// Draws the tags of a layout in the room: light from a black cell is multiplied by [`INK`]. A pixel whose depth
+    /// differs from the sheet's shows another object and is not changed. `blur_px` is the standard deviation of the
+    /// image's own blur.
     ///
     /// # Panics
-    /// If the image is of another size than the lens's, or the layout one on a vehicle.
+    /// If the image does not have the size of the lens, or the layout is in the body frame.
     pub fn ink(&self, layout: &TagLayout, sheets: Sheets<'_>, blur_px: f64) {
         let Sheets { light, depth_m, world_from_cam } = sheets;
         assert_eq!(light.len(), 3 * self.intrinsics.pixels());
@@ -35,7 +35,7 @@ impl Renderer {
             return;
         }
         let pattern = Pattern::new(SAMPLES, blur_px);
-        // White everywhere; each tag is drawn onto it, looked at, and wiped off.
+        // A white canvas: each tag is rendered onto it, read back, and erased.
         let mut white = vec![1f32; self.intrinsics.pixels()];
         let width = self.intrinsics.width_px;
         for (tag_from_slope, tag) in &tags {
@@ -53,7 +53,7 @@ impl Renderer {
                     continue;
                 }
                 let Some((slope, _)) = self.rays.at(x, y) else { continue };
-                // The homography's third component is one over the depth of the tag's plane.
+                // The homography's third component is the inverse depth of the tag's plane.
                 let near = (tag_from_slope[0] * slope.extend(1.0)).z;
                 if !(near > 0.0) {
                     continue;
@@ -72,12 +72,12 @@ impl Renderer {
     }
 }
 
-/// What a laser printer's black throws back, of what its paper does: 4 % of light to 85 %.
+/// Reflectance of a laser printer's black relative to its paper: 4 % to 85 %.
 pub const INK: f32 = 0.05;
-/// A pixel as far away as the sheet shows it: splats are some centimetres thick in depth at a grazing angle, and what stands
-/// before a sheet is further from it.
+/// Depth tolerance between pixel and sheet: at a grazing angle splats are some centimetres thick. Objects in front of a
+/// sheet are further away from it. [m]
 const SAME_M: f64 = 0.04;
-/// The same, of its distance.
+/// Additional depth tolerance, as a share of the distance.
 const SAME_SHARE: f64 = 0.01;
 
 #[cfg(test)]

@@ -1,21 +1,21 @@
-//! Where in a pixel, and when in the exposure, it is sampled; random numbers.
+//! Positions of samples in a pixel and in the exposure; random numbers.
 
 use glam::DVec2;
 use vizflyt_protocol::random::SplitMix64;
 
-/// Places of samples about a pixel's middle.
+/// Positions of samples relative to the middle of a pixel.
 pub(super) struct Pattern {
     pub(super) offsets_px: Vec<DVec2>,
-    /// When in the exposure each sample is taken, from 0 to 1.
+    /// Instant of each sample in the exposure, from 0 to 1.
     pub(super) instants: Vec<f64>,
-    /// No sample is further away along an axis. [px]
+    /// Largest offset of a sample along an axis. [px]
     pub(super) reach_px: f64,
 }
 
 impl Pattern {
-    /// Spreads samples over the box of the pixel convolved with a Gaussian of this deviation: x takes
-    /// every quantile once, y likewise in bit-reversed order (Hammersley), so that no edge in any
-    /// direction meets many at once.
+    /// Distributes samples over the pixel's box convolved with a Gaussian of this standard deviation. x uses every
+    /// quantile once, and y also, in bit-reversed order (Hammersley), so that an edge in any direction crosses few
+    /// samples at once.
     pub(super) fn new(samples: usize, blur_px: f64) -> Self {
         let quantiles: Vec<f64> =
             (0..samples).map(|i| quantile((i as f64 + 0.5) / samples as f64, blur_px)).collect();
@@ -27,12 +27,12 @@ impl Pattern {
     }
 }
 
-/// Returns when in the exposure a sample is taken, from 0 to 1.
+/// Returns the instant of a sample in the exposure, from 0 to 1.
 fn instant(sample: usize, samples: usize) -> f64 {
     (ranks(samples, 3)[sample] as f64 + 0.5) / samples as f64
 }
 
-/// Returns 0..samples in the order of their digits read backwards.
+/// Returns 0..samples ordered by their reversed digits.
 fn ranks(samples: usize, base: usize) -> Vec<usize> {
     let inverse = |mut i: usize| {
         let (mut sum, mut weight) = (0.0, 1.0);
@@ -69,8 +69,8 @@ fn quantile(share: f64, blur_px: f64) -> f64 {
     0.5 * (low + high)
 }
 
-/// Returns the share of a box of width 1 convolved with a Gaussian that lies below `x`: the integral
-/// of the Gaussian's own over the box.
+/// Returns the share of a box of width 1, convolved with a Gaussian, that is below `x`: the integral of the Gaussian's
+/// distribution over the box.
 fn below(x: f64, blur_px: f64) -> f64 {
     // The antiderivative of the normal distribution F is z F(z) + f(z).
     let antiderivative = |z: f64| {
@@ -80,7 +80,7 @@ fn below(x: f64, blur_px: f64) -> f64 {
     blur_px * (antiderivative((x + 0.5) / blur_px) - antiderivative((x - 0.5) / blur_px))
 }
 
-/// Returns the standard normal distribution at `z`, within 1e-7 (Abramowitz and Stegun 26.2.17).
+/// Returns the standard normal distribution at `z`, accurate to 1e-7 (Abramowitz and Stegun 26.2.17).
 fn normal_below(z: f64) -> f64 {
     let t = 1.0 / (1.0 + 0.2316419 * z.abs());
     let series = [1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.319381530];
@@ -89,7 +89,7 @@ fn normal_below(z: f64) -> f64 {
     if z > 0.0 { 1.0 - tail } else { tail }
 }
 
-/// Repeatable random numbers.
+/// Reproducible random numbers.
 #[derive(Clone, Debug)]
 pub(crate) struct Random(SplitMix64);
 
@@ -102,7 +102,7 @@ impl Random {
         self.0.bits()
     }
 
-    /// Returns a number from 0 to 1, without 1.
+    /// Returns a number in [0, 1).
     pub(crate) fn unit(&mut self) -> f64 {
         self.0.unit()
     }
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_have_the_pixels_middle_and_the_spread_of_box_and_blur() {
+    fn samples_have_mean_and_variance_of_box_and_blur() {
         for blur_px in [0.0, 0.3, 0.7, 1.5] {
             let pattern = Pattern::new(16, blur_px);
             let n = pattern.offsets_px.len() as f64;
@@ -127,13 +127,13 @@ mod tests {
             assert!(mean.length() < 1e-6, "{blur_px}: {mean}");
             let variance = pattern.offsets_px.iter().map(|o| *o * *o).sum::<DVec2>() / n;
             let expected = 1.0 / 12.0 + blur_px * blur_px;
-            // Sixteen quantiles miss the ends of the tails.
+            // Sixteen quantiles omit the ends of the tails.
             assert!((variance / expected - DVec2::ONE).abs().max_element() < 0.1, "{variance}");
         }
     }
 
     #[test]
-    fn every_instant_comes_once() {
+    fn uses_every_instant_once() {
         let mut instants: Vec<f64> = (0..16).map(|i| instant(i, 16)).collect();
         instants.sort_by(f64::total_cmp);
         assert_eq!((instants[0], instants[15]), (0.5 / 16.0, 15.5 / 16.0));

@@ -3,7 +3,7 @@
 use glam::{DMat2, DVec2};
 use vizflyt_protocol::geometry::{Distortion, Intrinsics};
 
-/// Slopes of the rays through the pixels' middles, row by row; NaN where the lens shows nothing.
+/// Slopes of the rays through the pixels' middles, row by row; NaN outside the lens's image.
 #[derive(Debug)]
 pub(super) struct Rays {
     width: u32,
@@ -17,7 +17,7 @@ impl Rays {
         let reach = k.distortion.reach();
         let mut slopes = Vec::with_capacity(k.pixels());
         for y in 0..k.height_px {
-            // The neighbour's slope is a good start; the first of a row has none.
+            // The neighbour's slope is a good initial value; the first pixel of a row has none.
             let mut start = None;
             for x in 0..k.width_px {
                 let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
@@ -31,12 +31,12 @@ impl Rays {
         Self { width: k.width_px, height: k.height_px, slopes, reach }
     }
 
-    /// Returns the slope of a pixel's ray, and how it changes with a step of one pixel right or down;
-    /// `None` where the lens shows nothing.
+    /// Returns the slope of a pixel's ray and its derivatives by one pixel right and down; `None` outside the lens's
+    /// image.
     pub(super) fn at(&self, x: u32, y: u32) -> Option<(DVec2, DMat2)> {
         let slope = |x: u32, y: u32| self.slopes[y as usize * self.width as usize + x as usize];
         let here = slope(x, y);
-        // The last column and row look back.
+        // The last column and row use backward differences.
         let right =
             if x + 1 < self.width { slope(x + 1, y) - here } else { here - slope(x.max(1) - 1, y) };
         let down = if y + 1 < self.height {
@@ -48,7 +48,7 @@ impl Rays {
             .then_some((here, DMat2::from_cols(right, down)))
     }
 
-    /// Returns where a slope appears; `None` beyond the lens's reach.
+    /// Returns the pixel of a slope; `None` beyond the lens's maximum slope.
     pub(super) fn pixel(&self, slope: DVec2, k: &Intrinsics) -> Option<DVec2> {
         if !(slope.length() <= self.reach) {
             return None;
@@ -58,8 +58,8 @@ impl Rays {
     }
 }
 
-/// Finds the slope of a pixel by Newton's method from a near one: exact, and without the halving that
-/// makes [`Intrinsics::slope`] safe from anywhere; `None` if that does not end.
+/// Computes the slope of a pixel by Newton's method from a nearby slope: accurate, without the bisection that makes
+/// [`Intrinsics::slope`] safe for any initial value. `None` if it does not converge.
 fn refine(k: &Intrinsics, pixel: DVec2, start: DVec2, reach: f64) -> Option<DVec2> {
     let centre = DVec2::new(k.cx_px, k.cy_px);
     let distorted = (pixel - centre) / DVec2::new(k.fx_px, k.fy_px);
@@ -86,12 +86,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_ray_is_the_lens_s_own() {
+    fn rays_match_the_lens_model() {
         let pinhole = Intrinsics::from_horizontal_fov(320, 240, 1.4);
         for distortion in [
             Distortion::None,
             Distortion::BrownConrady { k1: -0.3, k2: 0.1, p1: 0.001, p2: -0.002, k3: 0.0 },
-            // Shows nothing in its corners.
+            // The lens has no image in its corners.
             Distortion::BrownConrady { k1: -0.4, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 },
             Distortion::KannalaBrandt { k1: 0.01, k2: -0.002, k3: 0.0, k4: 0.0 },
         ] {

@@ -10,14 +10,14 @@ fn one_tag(size_m: f64) -> TagLayout {
     }
 }
 
-/// A camera this high above the origin that looks down, its upper edge to the north.
+/// A camera at this height above the origin that looks down, with the top of the image to the north.
 fn above(height_m: f64) -> Pose<World, Cam> {
-    // x stays east, y of the camera is south, z down.
+    // x of the camera points east, y south, z down.
     Pose::new(DVec3::Z * height_m, DQuat::from_rotation_x(std::f64::consts::PI))
 }
 
 #[test]
-fn cells_appear_where_the_lens_puts_them() {
+fn renders_cells_at_their_projected_positions() {
     let lens = Distortion::BrownConrady { k1: -0.2, k2: 0.05, p1: 0.001, p2: -0.001, k3: 0.0 };
     let k = Intrinsics { distortion: lens, ..Intrinsics::from_horizontal_fov(640, 480, 1.2) };
     let mat = one_tag(0.4);
@@ -29,7 +29,7 @@ fn cells_appear_where_the_lens_puts_them() {
     let mut seen = 0;
     for row in 0..10 {
         for column in 0..10 {
-            // The cell's middle, from the upper left of the paper's square.
+            // Middle of the cell, from the upper left of the tag.
             let along = |i: u32| (f64::from(i) + 0.5 - 5.0) * 0.4 / 8.0;
             let p_world = DVec3::new(along(column), -along(row), 0.0);
             let Some(pixel) = k.project(world_from_cam.inverse().transform_point(p_world)) else {
@@ -48,7 +48,7 @@ fn cells_appear_where_the_lens_puts_them() {
 }
 
 #[test]
-fn an_edge_lies_where_it_is_projected_within_a_thirtieth_of_a_pixel() {
+fn renders_edges_accurate_to_a_thirtieth_of_a_pixel() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
     let renderer = Renderer::new(k);
     let mat = one_tag(0.4);
@@ -56,7 +56,7 @@ fn an_edge_lies_where_it_is_projected_within_a_thirtieth_of_a_pixel() {
         let shift_m = f64::from(i) * 0.0007;
         let pose = Pose::new(DVec3::new(shift_m, 0.0, 1.0), above(1.0).rotation);
         let image = renderer.render(&SyntheticExposure::still(&[Placed::fixed(&mat)], pose));
-        // The black square's left edge along a row through its rim of black.
+        // Left edge of the black square, along a row through its black border.
         let y = k.project(pose.inverse().transform_point(DVec3::new(0.0, 0.175, 0.0))).unwrap().y;
         let edge = k.project(pose.inverse().transform_point(DVec3::new(-0.2, 0.0, 0.0))).unwrap().x;
         let white_px: f64 = (edge as u32 - 5..edge as u32 + 5)
@@ -68,13 +68,13 @@ fn an_edge_lies_where_it_is_projected_within_a_thirtieth_of_a_pixel() {
 }
 
 #[test]
-fn blur_of_optics_and_of_motion_soften_an_edge_and_leave_it_in_place() {
+fn optical_and_motion_blur_do_not_shift_an_edge() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
     let renderer = Renderer::new(k);
     let mat = one_tag(0.4);
     let placed = [Placed::fixed(&mat)];
     let still = SyntheticExposure::still(&placed, above(1.0));
-    // Moves by 6 px during the exposure, about the same middle.
+    // Motion of 6 px during the exposure, symmetric about the same middle.
     let shift = DVec3::X * 3.0 / k.fx_px;
     let moving = [-shift, shift].map(|s| Pose::new(DVec3::Z + s, above(1.0).rotation));
     let row = |shot: &SyntheticExposure<'_>| -> (f64, usize) {
@@ -89,13 +89,13 @@ fn blur_of_optics_and_of_motion_soften_an_edge_and_leave_it_in_place() {
     let (blurred_at, blurred) = row(&SyntheticExposure { blur_px: 1.2, ..still });
     let (moved_at, moved) = row(&SyntheticExposure { world_from_cam: moving, ..still });
     assert!(sharp <= 2 && blurred >= 4 && moved >= 5, "{sharp}, {blurred}, {moved}");
-    // Each is within 1/30 px of the truth.
+    // Each edge is accurate to 1/30 px.
     assert!((blurred_at - sharp_at).abs() < 0.07, "{blurred_at} instead of {sharp_at}");
     assert!((moved_at - sharp_at).abs() < 0.07, "{moved_at} instead of {sharp_at}");
 }
 
 #[test]
-fn light_and_noise_are_as_asked_and_repeat_by_seed() {
+fn light_and_noise_match_their_settings_and_repeat_by_seed() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
     let renderer = Renderer::new(k);
     let paper = Gray::plain(320, 240, 120);
@@ -120,7 +120,7 @@ fn light_and_noise_are_as_asked_and_repeat_by_seed() {
 }
 
 #[test]
-fn faces_are_seen_from_where_they_point_and_hide_what_is_behind() {
+fn faces_are_visible_from_the_front_and_occlude_others() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.2);
     let renderer = Renderer::new(k);
     let wall = Gray::plain(320, 240, 200);
@@ -136,7 +136,7 @@ fn faces_are_seen_from_where_they_point_and_hide_what_is_behind() {
     };
     // From below, looking up: the paper's back is not drawn.
     assert!(back(-1.0).pixels().iter().all(|&p| p == 200));
-    // A white cube face 0.5 m above the mat hides its middle, whichever is listed first.
+    // A white cube face 0.5 m above the mat occludes its middle, in any order of layouts.
     let world_from_body: Pose<World, Body> = Pose::new(DVec3::Z * 0.5, DQuat::IDENTITY);
     let body_from_tag: Pose<Body, Square> = Pose::IDENTITY;
     let lid = TagLayout {

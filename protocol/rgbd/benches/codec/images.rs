@@ -1,4 +1,4 @@
-//! What is encoded: the demo forest, captured scenes, and both with a camera's noise on depth.
+//! Benchmark images: the demo forest, captured scenes, and both with a depth camera's noise.
 
 use std::fs::File;
 use std::io::Read;
@@ -14,7 +14,7 @@ pub(crate) struct Image {
     pub(crate) depth_mm: Vec<u16>,
 }
 
-/// Returns the groups of images, with their names.
+/// Returns the groups of images with their names.
 pub(crate) fn groups() -> Vec<(&'static str, Vec<Image>)> {
     let mut groups = vec![("demo forest", vec![forest()])];
     let captured = captured();
@@ -26,8 +26,8 @@ pub(crate) fn groups() -> Vec<(&'static str, Vec<Image>)> {
     groups
 }
 
-/// The demo's forest, seed 7, from the start: rendered by `vizflyt-splat` at 640x480 with a field of
-/// view of 90 degrees, kept in this crate's own exact modes.
+/// The demo's forest, seed 7, from the start: rendered by `vizflyt-splat` at 640x480 with a field of view of 90
+/// degrees, stored in this crate's lossless modes.
 fn forest() -> Image {
     let bytes = include_bytes!("forest.vzrd");
     let info = peek(bytes).expect("a whole file");
@@ -38,7 +38,7 @@ fn forest() -> Image {
     Image { width: info.width, height: info.height, rgb, depth_mm }
 }
 
-/// Captured scenes as the oracle of `../shared` drew them at its reference poses, where present.
+/// Captured scenes, rendered by the oracle in `../shared` at its reference poses, if present.
 fn captured() -> Vec<Image> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/scenes/ref");
     let names = [
@@ -58,7 +58,7 @@ fn captured() -> Vec<Image> {
         let mut floats = |name: &str| {
             let mut bytes = Vec::new();
             arrays.by_name(name).expect("the array").read_to_end(&mut bytes).expect("whole");
-            // Magic and version, eight bytes; the length of the description; the description.
+            // Magic and version, eight bytes; length of the header; the header.
             let start = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
             let (floats, _) = bytes[start..].as_chunks();
             floats.iter().map(|float| f32::from_le_bytes(*float)).collect::<Vec<f32>>()
@@ -83,8 +83,8 @@ fn captured() -> Vec<Image> {
     images
 }
 
-/// Adds Gaussian noise of 1 mm + 1.425 mm z^2, z in metres (Khoshelham and Elberink, Sensors 2012,
-/// for a structured-light camera), and loses one pixel of 500.
+/// Adds Gaussian noise of 1 mm + 1.425 mm z^2, z in metres (Khoshelham and Elberink, Sensors 2012, for a
+/// structured-light camera), and invalidates one pixel in 500.
 fn with_noise(image: &Image) -> Image {
     let mut state = 7u64;
     let mut uniform = || {
@@ -92,7 +92,7 @@ fn with_noise(image: &Image) -> Image {
         (state >> 33) as f64 / (1u64 << 31) as f64
     };
     let depth_mm = image.depth_mm.iter().map(|&mm| {
-        // Twelve uniform numbers less six: near enough to a normal one.
+        // Twelve uniform numbers minus six: close to a normal distribution.
         let normal = (0..12).map(|_| uniform()).sum::<f64>() - 6.0;
         let z = f64::from(mm) / 1000.0;
         if mm == 0 || uniform() < 0.002 {

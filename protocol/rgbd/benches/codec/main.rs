@@ -1,13 +1,13 @@
-//! This crate beside its peers, in one run: milliseconds per 640x480 image on one core, bits per
-//! pixel, PSNR, and what a camera of that size sends at 100 Hz.
+//! Comparison of this crate with other codecs, in one run: milliseconds per 640x480 image on one core, bits per pixel,
+//! PSNR, and bandwidth of a camera of this size at 100 Hz.
 //!
 //! ```text
 //! cargo bench -p vizflyt-rgbd [--features turbo] [-- FILTER]
 //! ```
 //!
-//! Times are lower quartiles of [`ROUNDS`] turns in which every codec has one, so that a busy machine slows
-//! all of them alike: compare figures of one run with each other. Smaller images count by their
-//! pixels. FILTER keeps the codecs whose name contains it.
+//! Times are lower quartiles of [`ROUNDS`] rounds. Each round runs every codec once, so that a busy machine slows all
+//! of them equally: compare only figures of the same run. Times of smaller images are scaled to 640x480 by their
+//! pixels. FILTER selects codecs whose name contains it.
 
 mod images;
 mod peers;
@@ -20,12 +20,12 @@ use jpeg_encoder::SamplingFactor;
 use peers::{Codec, Given, Lz4, Ours, Png16, PureJpeg, Qoi, Rvl, Zstd};
 use vizflyt_rgbd::{ColorMode, DepthBound, DepthMode, EncodeOptions};
 
-/// Turns of every codec.
+/// Number of rounds of every codec.
 const ROUNDS: usize = 24;
-/// Pixels that the table speaks of.
+/// Number of pixels of the reference image size.
 const VGA: f64 = 640.0 * 480.0;
 
-/// A codec, what it is called, and how exact it must be.
+/// A codec with its name, and whether it is lossless.
 struct Entry {
     name: &'static str,
     given: Given,
@@ -33,7 +33,7 @@ struct Entry {
     codec: Box<dyn Codec>,
 }
 
-/// What one codec did to one image.
+/// Results of one codec for one image.
 #[derive(Default)]
 struct Figures {
     encode_ms: Vec<f64>,
@@ -44,7 +44,7 @@ struct Figures {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    // `cargo test` runs benches too, without this flag: nothing to test here.
+    // `cargo test` also runs benches, but without this flag: nothing to test here.
     if !arguments.iter().any(|argument| argument == "--bench") {
         return;
     }
@@ -87,13 +87,13 @@ fn main() {
     }
 }
 
-/// Has every codec encode and decode an image in turns.
+/// Encodes and decodes an image with every codec in turn.
 fn measure(image: &Image, entries: &mut [Entry]) -> Vec<Figures> {
     let (width, height, pixels) = (image.width, image.height, image.depth_mm.len());
     let mut back = Image { width, height, rgb: vec![0; 3 * pixels], depth_mm: vec![0; pixels] };
     let scale = 1e3 * VGA / pixels as f64;
     let mut all: Vec<Figures> = entries.iter().map(|_| Figures::default()).collect();
-    // The first turn warms up.
+    // The first round warms up.
     for round in 0..=ROUNDS {
         for (entry, figures) in entries.iter_mut().zip(&mut all) {
             let start = Instant::now();
@@ -184,7 +184,7 @@ fn entries() -> Vec<Entry> {
     entries
 }
 
-/// The quartile that others' use of the machine disturbs less than the median.
+/// Lower quartile, which other load on the machine disturbs less than the median.
 fn lower_quartile(times: &[f64]) -> f64 {
     let mut times = times.to_vec();
     times.sort_by(f64::total_cmp);

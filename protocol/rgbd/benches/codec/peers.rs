@@ -1,4 +1,4 @@
-//! The codecs side by side, behind one trait.
+//! Codecs behind a common trait.
 
 use std::io::Cursor;
 
@@ -11,15 +11,15 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 use crate::images::Image;
 use crate::rvl;
 
-/// One way to encode, with its scratch memory and what it encoded last.
+/// A codec with its scratch memory and its last output.
 pub(crate) trait Codec {
-    /// Encodes; returns the bytes it took.
+    /// Encodes an image; returns the number of bytes.
     fn encode(&mut self, image: &Image) -> usize;
-    /// Decodes what was encoded last.
+    /// Decodes the last output.
     fn decode(&mut self, back: &mut Image);
 }
 
-/// Which parts of an image a codec is given.
+/// Parts of an image that a codec receives.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Given {
     Color,
@@ -67,7 +67,6 @@ impl Codec for Ours {
     }
 }
 
-/// RVL.
 #[derive(Default)]
 pub(crate) struct Rvl(Vec<u32>);
 
@@ -82,7 +81,7 @@ impl Codec for Rvl {
     }
 }
 
-/// Zstandard, level 1, on the pixels' bytes.
+/// Zstandard, level 1, on the bytes of the pixels.
 pub(crate) struct Zstd {
     given: Given,
     compressor: zstd::bulk::Compressor<'static>,
@@ -123,7 +122,7 @@ impl Codec for Zstd {
     }
 }
 
-/// LZ4 blocks on the pixels' bytes.
+/// LZ4 blocks, on the bytes of the pixels.
 pub(crate) struct Lz4 {
     given: Given,
     bytes: Vec<u8>,
@@ -183,7 +182,6 @@ impl Codec for Png16 {
     }
 }
 
-/// QOI.
 #[derive(Default)]
 pub(crate) struct Qoi(Vec<u8>);
 
@@ -232,7 +230,7 @@ impl Codec for PureJpeg {
     }
 }
 
-/// libjpeg-turbo alone, quality 93.
+/// libjpeg-turbo, quality 93.
 #[cfg(feature = "turbo")]
 pub(crate) struct TurboJpeg {
     compressor: turbojpeg::Compressor,

@@ -1,6 +1,6 @@
-//! RVL (Wilson, Fast Lossless Depth Image Compression, ISS 2017), written here from the paper: runs
-//! of zeros and of values by turns; differences to the last valid value, zig-zagged, in groups of
-//! three bits and a continuation bit, eight groups a word.
+//! RVL (Wilson, Fast Lossless Depth Image Compression, ISS 2017), implemented from the paper. Runs of zeros and of
+//! values alternate. Differences to the last valid value are zig-zagged and stored in groups of three bits and a
+//! continuation bit, eight groups per word.
 
 #[derive(Default)]
 struct Nibbles {

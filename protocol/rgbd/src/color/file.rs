@@ -1,9 +1,9 @@
-//! The colour of a bitstream as one JPEG file that any viewer opens, and back: bytes are moved, not
-//! decoded. Logs keep images so: each byte once.
+//! Conversion of a bitstream's colour to one JPEG file that any viewer opens, and back. Bytes are moved, not decoded.
+//! Logs store images in this way, with each byte once.
 //!
-//! Slices hold scans of their own that share their tables. Whole blocks, each scan beginning again:
-//! that is what restart intervals are (ITU-T T.81, E.1.4), so scans joined by restart markers are
-//! the scan of the whole image.
+//! Each slice has a separate scan, and all scans share their tables. A scan has whole blocks and begins without
+//! prediction, like a restart interval (ITU-T T.81, E.1.4). So scans joined by restart markers are the scan of the
+//! whole image.
 
 use super::jpeg::{END_OF_IMAGE, Layout};
 use crate::error::DecodeError;
@@ -12,18 +12,18 @@ use crate::header::{
 };
 use zerocopy::FromBytes;
 
-/// DRI and its length (ITU-T T.81, B.2.4.4); the interval follows.
+/// DRI and its length (ITU-T T.81, B.2.4.4), without the interval.
 const RESTART_INTERVAL: [u8; 4] = [0xff, 0xdd, 0, 4];
-/// Bytes of that segment.
+/// Length of this segment. [bytes]
 const RESTART_INTERVAL_BYTES: usize = 6;
-/// RST0; up to seven more.
+/// RST0, the first of eight markers.
 const RESTART: u8 = 0xd0;
 
-/// Appends the colour of a bitstream to `jpeg`, as a whole JPEG, and all else of it to `rest`.
-/// `pieces` are its header and then its slices in order, as they travel.
+/// Splits a bitstream: appends its colour to `jpeg` as a complete JPEG, and all other bytes to `rest`. `pieces` are its
+/// header and then its slices in order, as transmitted.
 ///
-/// Returns `false`, and leaves both as they were, if the colour is no JPEG, or there is anything
-/// unusual about it. [`join_jpeg`] is the way back.
+/// Returns `false` and leaves both unchanged if the colour is not a JPEG or has an unexpected layout. [`join_jpeg`] is
+/// the inverse.
 pub fn split_jpeg<'a>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
     jpeg: &mut Vec<u8>,
@@ -84,10 +84,10 @@ fn try_split<'a>(
     pieces.next().is_none().then_some(())
 }
 
-/// Appends the bitstream that [`split_jpeg`] took apart to `out`.
+/// Appends the bitstream that [`split_jpeg`] has split to `out`.
 ///
 /// # Errors
-/// [`DecodeError::Short`] if the two do not belong together, and those of [`peek`].
+/// [`DecodeError::Short`] if the two parts do not match, and the errors of [`peek`].
 pub fn join_jpeg(jpeg: &[u8], rest: &[u8], out: &mut Vec<u8>) -> Result<(), DecodeError> {
     let info = peek(rest)?;
     let short = || DecodeError::Short(jpeg.len() + rest.len());
@@ -102,7 +102,7 @@ pub fn join_jpeg(jpeg: &[u8], rest: &[u8], out: &mut Vec<u8>) -> Result<(), Deco
         let others = usize::try_from(len).map_err(|_| short())?.checked_sub(color_len);
         let (slice, after) = rest.split_at_checked(others.ok_or_else(short)?).ok_or_else(short)?;
         let scan_len = color_len.checked_sub(END_OF_IMAGE.len()).ok_or_else(short)?;
-        // A restart marker, or the end of the image, is as long as the end that it stands for.
+        // A restart marker, or the end of the image, has the same length as the end marker that it replaces.
         let (scan, next) = scans.split_at_checked(color_len).ok_or_else(short)?;
         out.extend_from_slice(&slice[..SLICE_HEADER_BYTES]);
         out.extend_from_slice(&scan[..scan_len]);
@@ -119,7 +119,7 @@ mod tests {
     use crate::{Decoder, EncodeOptions, Encoder, RgbdView};
     use proptest::prelude::*;
 
-    /// A bitstream of a picture with smooth parts and edges, and its pieces.
+    /// Returns a bitstream of a picture with smooth parts and edges, and its pieces.
     fn bitstream(width: u32, height: u32, color: ColorMode, slices: u8) -> (Vec<u8>, Vec<Vec<u8>>) {
         let pixels = (width * height) as usize;
         let rgb: Vec<u8> = (0..3 * pixels)
@@ -145,14 +145,14 @@ mod tests {
     fn split(pieces: &[Vec<u8>]) -> Option<(Vec<u8>, Vec<u8>)> {
         let (mut jpeg, mut rest) = (vec![1, 2, 3], Vec::new());
         let is_split = split_jpeg(pieces.iter().map(Vec::as_slice), &mut jpeg, &mut rest);
-        assert!(is_split || (jpeg.len(), rest.len()) == (3, 0), "left as they were");
+        assert!(is_split || (jpeg.len(), rest.len()) == (3, 0), "both are unchanged");
         is_split.then(|| (jpeg.split_off(3), rest))
     }
 
     fn check(width: u32, height: u32, color: ColorMode, slices: u8) {
         let (all, pieces) = bitstream(width, height, color, slices);
         let (jpeg, rest) = split(&pieces).expect("it is a JPEG");
-        // An independent decoder of whole files sees the same pixels.
+        // An independent decoder of whole files returns the same pixels.
         let mut decoder = zune_jpeg::JpegDecoder::new(std::io::Cursor::new(&jpeg));
         let file = decoder.decode().unwrap();
         let info = decoder.info().unwrap();
@@ -160,7 +160,7 @@ mod tests {
         let mut rgb = vec![0; file.len()];
         let mut depth_mm = vec![0; (width * height) as usize];
         Decoder::default().decode(&all, &mut rgb, &mut depth_mm).unwrap();
-        // Chroma halved is smoothed over the rows around: there, slices differ from the whole.
+        // Halved chroma is smoothed over neighbouring rows: there, slices differ from the whole image.
         let most = if color == ColorMode::Jpeg444 { 2 } else { 90 };
         let off = file.iter().zip(&rgb).map(|(&a, &b)| a.abs_diff(b)).max().unwrap();
         assert!(off <= most, "{width}x{height} {color:?} {slices}: off by {off}");
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn colour_is_one_jpeg_and_every_byte_comes_back() {
+    fn splits_colour_as_one_jpeg_and_joins_it_again() {
         check(64, 48, ColorMode::Jpeg444, 1);
         check(64, 48, ColorMode::Jpeg444, 3);
         check(61, 43, ColorMode::Jpeg444, 2);
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_are_no_jpeg_are_kept() {
+    fn does_not_split_colour_that_is_not_a_jpeg() {
         let (_, pieces) = bitstream(64, 48, ColorMode::Lossless, 3);
         assert_eq!(split(&pieces), None);
         let (_, mut pieces) = bitstream(64, 48, ColorMode::Jpeg444, 3);
@@ -197,7 +197,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn halves_that_do_not_belong_together_are_errors_at_worst(
+        fn join_does_not_panic_on_parts_that_do_not_match(
             cut in any::<prop::sample::Index>(), byte in any::<(prop::sample::Index, u8)>()
         ) {
             let (_, pieces) = bitstream(40, 64, ColorMode::Jpeg444, 4);

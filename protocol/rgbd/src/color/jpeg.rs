@@ -1,8 +1,8 @@
-//! Where things are in a baseline JPEG: its segments, and a block's coefficients.
+//! Layout of a baseline JPEG: its segments, and the order of a block's coefficients.
 
 use crate::error::DecodeError;
 
-/// Where things are in a baseline JPEG of three components.
+/// Offsets in a baseline JPEG of three components.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Layout {
     /// Offset of the number of rows.
@@ -11,13 +11,13 @@ pub(super) struct Layout {
     pub(super) scan_header: usize,
     /// Offset of the first byte of the scan.
     pub(super) scan: usize,
-    /// Width and height of what is coded together. [px]
+    /// Width and height of a coding unit (MCU). [px]
     pub(super) block: (u32, u32),
 }
 
 impl Layout {
-    /// Reads the segments (ITU-T T.81, annex B) up to the first scan. `None` for anything that our
-    /// encoders do not write.
+    /// Parses the segments (ITU-T T.81, annex B) up to the first scan. `None` for segments that this crate's encoders
+    /// do not write.
     pub(super) fn of(jpeg: &[u8]) -> Option<Self> {
         let mut at = START_OF_IMAGE.len();
         if !jpeg.starts_with(&START_OF_IMAGE) {
@@ -65,13 +65,12 @@ pub(super) const START_OF_IMAGE: [u8; 2] = [0xff, 0xd8];
 /// ITU-T T.81, table B.1: EOI.
 pub(super) const END_OF_IMAGE: [u8; 2] = [0xff, 0xd9];
 
-/// Where the zigzag's n-th coefficient is: 8 times its vertical frequency, and its horizontal one
-/// (figure A.6).
+/// Position of the zigzag's n-th coefficient: 8 times its vertical frequency plus its horizontal one (figure A.6).
 pub(super) const ZIGZAG: [u8; 64] = {
     let mut order = [0; 64];
     let (mut at, mut diagonal) = (0, 0);
     while diagonal < 15 {
-        // Odd diagonals go down, even ones up.
+        // Odd diagonals go down, even diagonals go up.
         let mut step = 0;
         while step <= diagonal {
             let (v, u) =

@@ -1,10 +1,10 @@
-//! Exact colour: green, and red and blue less green, each an entropy-coded plane.
+//! Lossless colour: green, red minus green, and blue minus green, each as an entropy-coded plane.
 
 use super::jpeg::damaged;
 use crate::error::DecodeError;
 use crate::plane::{PlaneDecoder, PlaneEncoder, Samples};
 
-/// Encodes slices; owns the scratch memory.
+/// Encodes slices. Owns the scratch memory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LosslessEncoder {
     plane: PlaneEncoder,
@@ -13,7 +13,7 @@ pub(crate) struct LosslessEncoder {
 }
 
 impl LosslessEncoder {
-    /// Appends three planes, each behind its length, to `out`.
+    /// Appends three planes, each after its length, to `out`.
     pub(crate) fn encode(&mut self, rgb: &[u8], width: usize, out: &mut Vec<u8>) {
         for channel in [1, 0, 2] {
             self.samples.clear();
@@ -29,7 +29,7 @@ impl LosslessEncoder {
     }
 }
 
-/// Decodes slices; owns the scratch memory.
+/// Decodes slices. Owns the scratch memory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct LosslessDecoder {
     plane: PlaneDecoder,
@@ -37,7 +37,7 @@ pub(crate) struct LosslessDecoder {
 }
 
 impl LosslessDecoder {
-    /// Decodes some rows, H x W x 3.
+    /// Decodes a range of rows, H x W x 3.
     pub(crate) fn decode(
         &mut self,
         mut bytes: &[u8],

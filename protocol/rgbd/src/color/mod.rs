@@ -1,9 +1,9 @@
-//! Colour: baseline JPEG, or entropy-coded planes where it must be exact. `docs/BENCHMARKS.md` has
-//! the comparison that chose it.
+//! Colour: baseline JPEG, or entropy-coded planes for lossless colour. `docs/BENCHMARKS.md` contains the comparison
+//! behind this choice.
 //!
-//! A slice's JPEG is cut at the end of its scan's header: what comes before is the same for all
-//! slices but for the number of rows, and goes into the image's header once; the scan goes into
-//! the slice. Put together again they are a JPEG that any library decodes.
+//! A slice's JPEG is split after its scan header. The bytes before are the same for all slices except for the number of
+//! rows, and are stored once in the image's header. The scan is stored in the slice. Joined, they are a JPEG that any
+//! library decodes.
 
 mod decode;
 mod encode;

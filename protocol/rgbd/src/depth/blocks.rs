@@ -1,51 +1,51 @@
-//! Blocks of residuals to and from bits, 16 columns at a time.
+//! Packing of residual blocks to bits and back, 16 columns at a time.
 
 use super::layout::{BLOCK_COLUMNS, BLOCK_PIXELS, BLOCK_ROWS};
 use super::simd::Kernel;
 use crate::bits::{BitReader, BitWriter};
 
-/// One bit stream per column of a block: 16 lanes.
+/// One value per column of a block: 16 lanes with separate bit streams.
 pub(super) type Lanes = [u16; BLOCK_COLUMNS];
 /// The residuals of a block.
 pub(super) type Block = [Lanes; BLOCK_ROWS];
-/// Bytes of one vector of lanes.
+/// Size of one vector of lanes. [bytes]
 pub(super) const LANES_BYTES: usize = 2 * BLOCK_COLUMNS;
 
-/// How a block is stored: so many low bits of every residual, and so many more of those few that
-/// need them.
+/// Storage of a block: a number of low bits for every residual, and a number of high bits for the few larger ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Shape {
-    /// Low bits of every residual, 0 to 15.
+    /// Number of low bits of every residual, 0 to 15.
     pub(super) low: u32,
-    /// High bits of the residuals that the mask names, 0 to 15; 0: there is no mask.
+    /// Number of high bits of the residuals in the mask, 0 to 15; 0 means no mask.
     pub(super) high: u32,
 }
 
 impl Shape {
-    /// Returns the byte of the table.
+    /// Returns the byte for the table.
     pub(super) fn code(self) -> u8 {
         (self.low | self.high << 4) as u8
     }
 
-    /// Reads a byte of the table; `None` if it asks for more than 16 bits.
+    /// Parses a byte of the table; `None` if it has more than 16 bits.
     pub(super) fn of_code(code: u8) -> Option<Self> {
         let shape = Self { low: u32::from(code & 15), high: u32::from(code >> 4) };
         (shape.low + shape.high <= 16).then_some(shape)
     }
 
-    /// Returns the cheapest shape of a block of residuals, and which of them have high bits; of
-    /// equals, the shape with the most low bits. `top` is the length of the longest residual, and
-    /// `longer` counts, called for `top - 1` low bits and then ever fewer, which have more.
+    /// Returns the cheapest shape of a block of residuals, and the mask of residuals with high bits. Of equally cheap
+    /// shapes, returns the one with the most low bits. `top` is the length of the longest residual. `longer` returns
+    /// the mask of residuals with more than the given number of bits; it is called with decreasing numbers from `top -
+    /// 1`.
     #[inline(always)]
     pub(super) fn cheapest(top: u32, mut longer: impl FnMut(u32) -> u64) -> (Self, u64) {
-        // 16 low bits have no code; 15 and one high bit do.
+        // 16 low bits have no code; 15 low bits and one high bit do.
         let (mut best, mut best_bits) = if top == 16 {
             (Self { low: 15, high: 1 }, u32::MAX)
         } else {
             (Self { low: top, high: 0 }, BLOCK_PIXELS as u32 * top)
         };
         let mut best_mask = 0;
-        // High bits have a width of 15 at most.
+        // The width of high bits is at most 15.
         for low in (top.saturating_sub(15)..top).rev() {
             let mask = longer(low);
             let (count, high) = (mask.count_ones(), top - low);
@@ -53,7 +53,7 @@ impl Shape {
             if bits < best_bits {
                 (best, best_bits, best_mask) = (Self { low, high }, bits, mask);
             }
-            // With fewer low bits all have high ones too, which is never cheaper.
+            // With fewer low bits, all residuals also have high bits, which is never cheaper.
             if count == BLOCK_PIXELS as u32 {
                 break;
             }
@@ -62,27 +62,27 @@ impl Shape {
     }
 }
 
-/// Returns the bytes of low bits after blocks whose low widths sum to `low_sum`: each adds
-/// [`BLOCK_ROWS`] residuals to each of the 16 streams.
+/// Returns the length of the low bits, if the low widths of all blocks sum to `low_sum`: each block adds [`BLOCK_ROWS`]
+/// residuals to each of the 16 streams. [bytes]
 pub(super) fn low_len(low_sum: usize) -> usize {
     (low_sum * BLOCK_ROWS).div_ceil(16) * LANES_BYTES
 }
 
-/// Residuals to bits.
+/// Packs residuals to bits.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Packer {
-    /// Low bits: full vectors, then room for the worst case.
+    /// Low bits: full vectors, then space for the worst case.
     low: Vec<u8>,
     low_len: usize,
     open: Lanes,
-    /// Bits used in `open`, 0 to 15.
+    /// Number of bits in `open`, 0 to 15.
     used: u32,
     masks: Vec<u8>,
     high: BitWriter,
 }
 
 impl Packer {
-    /// Forgets everything; makes room for so many blocks.
+    /// Clears the packer and reserves space for this number of blocks.
     pub(super) fn start(&mut self, blocks: usize) {
         let room = low_len(blocks * 15);
         if self.low.len() < room {
@@ -96,7 +96,7 @@ impl Packer {
         self.high.start(blocks * BLOCK_PIXELS * 15);
     }
 
-    /// Adds a block; returns its shape.
+    /// Packs a block; returns its shape.
     #[inline(always)]
     pub(super) fn push_block<K: Kernel>(&mut self, block: &Block) -> Shape {
         let (shape, mut mask) = K::cheapest(block);
@@ -118,7 +118,7 @@ impl Packer {
     #[inline(always)]
     fn push_low(&mut self, block: &Block, width_bits: u32) {
         let kept = u16::MAX >> (16 - width_bits);
-        // In locals, so that they stay in registers from row to row.
+        // Local variables stay in registers from row to row.
         let (mut open, mut used) = (self.open, self.used);
         for row in block {
             let value = row.map(|value| value & kept);
@@ -129,7 +129,7 @@ impl Packer {
             if used >= 16 {
                 self.flush(&open);
                 used -= 16;
-                // What did not fit: the upper `used` bits.
+                // The remaining upper `used` bits.
                 let spent = width_bits - used;
                 open = value.map(|lane| lane >> spent);
             }
@@ -146,7 +146,7 @@ impl Packer {
         self.low_len += LANES_BYTES;
     }
 
-    /// Appends all bits to `out`: low ones, masks, high ones.
+    /// Appends all bits to `out`: low bits, masks, high bits.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         if self.used > 0 {
             let open = self.open;
@@ -158,11 +158,11 @@ impl Packer {
     }
 }
 
-/// Bits to residuals. The three streams must be as long as the shapes to come need.
+/// Unpacks bits to residuals. The three streams must have the lengths that the shapes require.
 pub(super) struct Unpacker<'a> {
     low: &'a [u8],
     open: Lanes,
-    /// Bits used up in `open`; 16 when the next vector must be loaded.
+    /// Number of consumed bits of `open`; 16 if the next vector must be loaded.
     used: u32,
     masks: &'a [u8],
     high: BitReader<'a>,
@@ -173,7 +173,7 @@ impl<'a> Unpacker<'a> {
         Self { low, open: [0; BLOCK_COLUMNS], used: 16, masks, high: BitReader::new(high) }
     }
 
-    /// Takes one block of this shape and writes its residuals at `column` of the rows.
+    /// Unpacks one block of this shape and writes its residuals at `column` of the rows.
     #[inline(always)]
     pub(super) fn pop_block(
         &mut self,
@@ -206,7 +206,7 @@ impl<'a> Unpacker<'a> {
     #[inline(always)]
     fn pop_low(&mut self, width_bits: u32, rows: &mut [u16], stride: usize, column: usize) {
         let mask = u16::MAX >> (16 - width_bits);
-        // In locals, so that they stay in registers from row to row.
+        // Local variables stay in registers from row to row.
         let (mut open, mut used) = (self.open, self.used);
         for row in 0..BLOCK_ROWS {
             if used == 16 {
@@ -215,7 +215,7 @@ impl<'a> Unpacker<'a> {
             let mut value: Lanes = open.map(|lane| lane >> used);
             used += width_bits;
             if used > 16 {
-                // The first part has `have` bits, 1 to 15 of them.
+                // The first part has `have` bits, 1 to 15.
                 let have = 16 + width_bits - used;
                 open = self.load();
                 for lane in 0..BLOCK_COLUMNS {

@@ -1,26 +1,26 @@
-//! How an image is cut into stripes and blocks.
+//! Division of an image into stripes and blocks.
 
-/// Stripes of an image.
+/// Number of stripes of an image.
 pub const STRIPES: usize = 8;
-/// Columns of a block.
+/// Number of columns of a block.
 pub const BLOCK_COLUMNS: usize = 16;
-/// Rows of a block.
+/// Number of rows of a block.
 pub const BLOCK_ROWS: usize = 4;
-/// Pixels of a block.
+/// Number of pixels of a block.
 pub(super) const BLOCK_PIXELS: usize = BLOCK_COLUMNS * BLOCK_ROWS;
 
-/// What each stripe starts from.
+/// First prediction of each stripe.
 pub(super) type Bases = [u16; STRIPES];
 pub(super) const BASES_BYTES: usize = 2 * STRIPES;
 
-/// Sizes that follow from the image's.
+/// Sizes derived from the size of the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) width: usize,
     pub(super) height: usize,
-    /// Columns of a stripe, a multiple of [`BLOCK_COLUMNS`].
+    /// Number of columns of a stripe, a multiple of [`BLOCK_COLUMNS`].
     pub(super) stripe_columns: usize,
-    /// Columns of all stripes.
+    /// Number of columns of all stripes.
     pub(super) stride: usize,
     pub(super) blocks_across: usize,
     pub(super) blocks_down: usize,

@@ -1,10 +1,9 @@
-//! Prediction while encoding: all neighbours are known, so each row is one vectorised loop.
+//! Prediction in the encoder: all neighbours are known, so each row is one vectorised loop.
 
 use super::layout::{BLOCK_ROWS, Bases, Layout};
 
-/// Returns the median edge detector's prediction. With `c` the corner clamped between left and
-/// upper, `left + upper - c` is their lesser or greater one at an edge and the plane through the
-/// three elsewhere.
+/// Returns the prediction of the median edge detector. `c` is the corner clamped between left and upper. `left + upper
+/// - c` is the minimum or maximum of left and upper at an edge, and otherwise the plane through all three.
 #[inline(always)]
 pub(crate) fn med(left: u16, up: u16, corner: u16) -> u16 {
     let clamped = corner.min(left.max(up)).max(left.min(up));
@@ -23,7 +22,7 @@ pub(crate) fn unzigzag(code: u16) -> u16 {
     (code >> 1) ^ (code & 1).wrapping_neg()
 }
 
-/// Returns what each stripe starts from: its first pixel, or 0 for a stripe beyond the image.
+/// Returns the base of each stripe: its first pixel, or 0 for a stripe beyond the image.
 pub(super) fn bases(depth: &[u16], layout: &Layout) -> Bases {
     std::array::from_fn(|stripe| {
         let x = stripe * layout.stripe_columns;
@@ -31,8 +30,8 @@ pub(super) fn bases(depth: &[u16], layout: &Layout) -> Bases {
     })
 }
 
-/// Writes the zig-zagged residuals of [`BLOCK_ROWS`] rows from `first_row` on; zero for rows below
-/// the image. Columns beyond the image are left as they are. `before` is the row above the image.
+/// Writes the zig-zagged residuals of [`BLOCK_ROWS`] rows from `first_row`; zero for rows below the image. Columns
+/// beyond the image are unchanged. `before` is the row above the image.
 #[inline(always)]
 pub(super) fn residual_rows(
     depth: &[u16],
@@ -55,7 +54,7 @@ pub(super) fn residual_rows(
             let predicted = med(current[0], above[1], above[0]);
             *out = zigzag(current[1].wrapping_sub(predicted));
         }
-        // The first pixel of a stripe knows only the one above.
+        // The first pixel of a stripe is predicted from the one above.
         for x in (0..width).step_by(stripe_columns) {
             out[x] = zigzag(current[x].wrapping_sub(above[x]));
         }

@@ -1,4 +1,4 @@
-//! The reference: the format a pixel and a bit at a time.
+//! Reference implementation of the format: one pixel and one bit at a time.
 
 use super::Parts;
 use super::blocks::Shape;
@@ -9,7 +9,7 @@ use crate::error::DecodeError;
 /// Appends the encoding of a row-major image to `out`. [mm]
 ///
 /// # Panics
-/// If `depth` is empty or no whole number of rows.
+/// If `depth` is empty or not a whole number of rows.
 pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
     assert!(width > 0 && !depth.is_empty() && depth.len().is_multiple_of(width));
     let layout = Layout::new(width, depth.len() / width);
@@ -53,13 +53,13 @@ pub fn encode(depth: &[u16], width: usize, out: &mut Vec<u8>) {
     }
 }
 
-/// Decodes into a row-major image. [mm]
+/// Decodes to a row-major image. [mm]
 ///
 /// # Errors
-/// [`DecodeError::Depth`] unless `bytes` are as long as in their own table.
+/// [`DecodeError::Depth`] unless the length of `bytes` matches their own table.
 ///
 /// # Panics
-/// If `depth` is empty or no whole number of rows.
+/// If `depth` is empty or not a whole number of rows.
 pub fn decode(bytes: &[u8], width: usize, depth: &mut [u16]) -> Result<(), DecodeError> {
     assert!(width > 0 && !depth.is_empty() && depth.len().is_multiple_of(width));
     let layout = Layout::new(width, depth.len() / width);
@@ -102,19 +102,19 @@ pub fn decode(bytes: &[u8], width: usize, depth: &mut [u16]) -> Result<(), Decod
     Ok(())
 }
 
-/// Returns which residuals have more than so many bits, the first in bit 0.
+/// Returns the mask of residuals with more than `bits` bits, the first in bit 0.
 pub(super) fn longer_than(residuals: &[u16], bits: u32) -> u64 {
     residuals.iter().rev().fold(0, |mask, &residual| mask << 1 | u64::from(residual >> bits != 0))
 }
 
-/// The pixels of a block, row by row.
+/// Returns the pixels of a block, row by row.
 fn pixels_of_block(layout: &Layout, block: usize) -> impl Iterator<Item = (usize, usize)> {
     let x0 = block % layout.blocks_across * BLOCK_COLUMNS;
     let y0 = block / layout.blocks_across * BLOCK_ROWS;
     (0..BLOCK_ROWS).flat_map(move |dy| (0..BLOCK_COLUMNS).map(move |dx| (x0 + dx, y0 + dy)))
 }
 
-/// What a pixel is predicted to be from those before it in its stripe.
+/// Returns the prediction of a pixel from earlier ones in its stripe.
 fn predicted(depth: &[u16], bases: &Bases, layout: &Layout, x: usize, y: usize) -> u16 {
     let base = bases[x / layout.stripe_columns];
     let above = |x: usize| if y == 0 { base } else { depth[(y - 1) * layout.width + x] };

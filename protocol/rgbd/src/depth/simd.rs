@@ -1,11 +1,11 @@
-//! What the machine's vectors do: the bit lengths of a block's residuals, and undoing the prediction.
+//! SIMD kernels: bit lengths of a block's residuals, and inversion of the prediction.
 //!
-//! The prediction is undone in all stripes at once: lane `s` of a vector is a pixel of stripe `s`.
+//! The prediction is inverted in all stripes at once: lane `s` of a vector is a pixel of stripe `s`.
 //!
-//! Residuals lie in rows, so 8 columns of 8 stripes are transposed in, predicted column after
-//! column, and transposed out: about one cycle a pixel, where a single stripe waits four cycles for
-//! each pixel's left neighbour. SSE2 and NEON belong to the base of their machines, so nothing is
-//! asked at run time; any other machine takes the plain version.
+//! Residuals are stored in rows. So 8 columns of 8 stripes are transposed, predicted column by column, and transposed
+//! back. This takes about one cycle per pixel; a single stripe would wait four cycles for each pixel's left neighbour.
+//! SSE2 and NEON are always available on their machines, so they need no detection at run time. Other machines use the
+//! plain version.
 
 #![allow(
     unsafe_code,
@@ -16,13 +16,13 @@ use super::blocks::{Block, Lanes, Shape};
 use super::layout::{BLOCK_COLUMNS, Layout, STRIPES};
 use super::{DepthDecoder, DepthEncoder, Parts};
 
-/// What a machine's vectors do.
+/// Operations with an implementation per instruction set.
 pub(super) trait Kernel {
-    /// Returns [`Shape::cheapest`] of a block, and which of its residuals have high bits.
+    /// Returns [`Shape::cheapest`] of a block, and the mask of residuals with high bits.
     fn cheapest(block: &Block) -> (Shape, u64);
 
-    /// Undoes the prediction in 8 columns of 8 stripes: residuals in, pixels out. `above` is what
-    /// lies above each column, `left` and `corner` what lies before the first; all three move on.
+    /// Inverts the prediction in 8 columns of 8 stripes: residuals in, pixels out. `above` is the row above the
+    /// columns; `left` and `corner` are the neighbours of the first column. All three are updated.
     fn columns(
         square: &mut Square,
         above: &mut [[u16; STRIPES]; STRIPES],
@@ -31,8 +31,7 @@ pub(super) trait Kernel {
     );
 }
 
-/// Writes the image whose zig-zagged residuals these are. `above` is one vector per column of a
-/// stripe: what lies above the image.
+/// Writes the image of zig-zagged residuals. `above` is the row above the image, one vector per column of a stripe.
 #[inline(always)]
 fn undo_prediction_by<K: Kernel>(
     residuals: &[u16],
@@ -44,7 +43,7 @@ fn undo_prediction_by<K: Kernel>(
     assert!(residuals.len() >= height * stride && above.len() == stripe_columns);
     assert!(depth.len() == width * height && stride == STRIPES * stripe_columns);
     for (residuals, depth) in residuals.chunks_exact(stride).zip(depth.chunks_exact_mut(width)) {
-        // The first pixel of a stripe knows only the one above: so do its left and corner.
+        // The first pixel of a stripe is predicted from the one above: left and corner get the same value.
         let mut left = above[0];
         let mut corner = above[0];
         for (group, above) in above.as_chunks_mut::<STRIPES>().0.iter_mut().enumerate() {
@@ -67,8 +66,8 @@ fn undo_prediction_by<K: Kernel>(
     }
 }
 
-/// Runs one of the loops below with AVX2 where the machine has it, and plain otherwise: the same
-/// code, compiled twice.
+/// Runs one of the loops below with AVX2 if available, otherwise with the base instruction set: the same code, compiled
+/// twice.
 macro_rules! widest {
     ($name:ident($($argument:ident: $kind:ty),*), $wide:expr, $plain:expr) => {
         pub(super) fn $name($($argument: $kind),*) {
@@ -84,7 +83,7 @@ macro_rules! widest {
                     && is_x86_feature_detected!("lzcnt")
                     && is_x86_feature_detected!("popcnt")
                 {
-                    // SAFETY: the machine has what the function is compiled for.
+                    // SAFETY: the machine supports the features for which the function is compiled.
                     return unsafe { wide($($argument),*) };
                 }
             }
@@ -124,7 +123,7 @@ fn longest(block: &Block) -> u32 {
 /// 8 columns of 8 stripes: rows are stripes outside the kernel.
 type Square = [[u16; STRIPES]; STRIPES];
 
-/// The plain version, compiled everywhere so that it is tested everywhere.
+/// The plain version, compiled on every machine, so that tests cover it.
 #[cfg_attr(any(target_arch = "x86_64", target_arch = "aarch64"), allow(dead_code))]
 mod plain {
     use super::super::blocks::{Block, Shape};
@@ -228,13 +227,12 @@ mod kernel {
         }
     }
 
-    /// What every machine of this kind has: SSE2.
+    /// Base instruction set of x86_64: SSE2.
     pub(super) struct Base;
 
     impl Kernel for Base {
-        /// A residual has more than n bits where any of its bits from n on is set: each is smeared
-        /// downwards, so bit n of the smear says it, and the sign mask of bytes collects 16 at a
-        /// time.
+        /// A residual has more than n bits if any bit from n upwards is set. The bits are smeared downwards, so that
+        /// bit n of the result shows this. The sign mask of bytes collects 16 residuals at a time.
         #[inline(always)]
         fn cheapest(block: &Block) -> (Shape, u64) {
             let top = longest(block);
@@ -256,7 +254,7 @@ mod kernel {
                     high[row] = _mm_packus_epi16(highs.0, highs.1);
                 }
                 Shape::cheapest(top, |bits| {
-                    // Brings the bit to the top of its byte; what moves between bytes stays below.
+                    // Shifts the bit to the top of its byte; bits that cross bytes stay below it.
                     let up = _mm_cvtsi32_si128(7 - (bits as i32 & 7));
                     let bytes = if bits < 8 { &low } else { &high };
                     let rows = bytes.map(|bytes| _mm_movemask_epi8(_mm_sll_epi16(bytes, up)));
@@ -284,7 +282,7 @@ mod kernel {
                         _mm_sub_epi16(_mm_setzero_si128(), sign),
                     );
                     let up = load(above);
-                    // SSE2 lacks unsigned minimum and maximum; saturating subtraction makes both.
+                    // SSE2 has no unsigned minimum and maximum; saturating subtraction gives both.
                     let left_over = _mm_subs_epu16(l, up);
                     let (greater, lesser) =
                         (_mm_add_epi16(up, left_over), _mm_sub_epi16(l, left_over));
@@ -312,7 +310,7 @@ mod kernel {
     }
 }
 
-/// The same with AVX2: two rows a vector.
+/// AVX2 implementation: two rows per vector.
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use core::arch::x86_64::{
@@ -333,7 +331,7 @@ mod wide {
         #[inline(always)]
         fn cheapest(block: &Block) -> (Shape, u64) {
             let top = longest(block);
-            // SAFETY: only code that is compiled for AVX2, and runs where it is, names this type.
+            // SAFETY: this type is used only by code that is compiled for AVX2 and runs where AVX2 was detected.
             let bytes = unsafe { smeared(block) };
             // SAFETY: as above.
             Shape::cheapest(top, |bits| unsafe { plane(&bytes, bits) })
@@ -348,7 +346,7 @@ mod wide {
         ) {
             let mut vectors = transpose(square.each_ref().map(load_half));
             let (mut l, mut c) = (load_half(left), load_half(corner));
-            // SAFETY: AVX2 includes SSE4.1; as above, these intrinsics work on values only.
+            // SAFETY: AVX2 includes SSE4.1; as above; these intrinsics work on values only.
             unsafe {
                 let one = _mm_set1_epi16(1);
                 for (vector, above) in vectors.iter_mut().zip(above) {
@@ -375,8 +373,7 @@ mod wide {
         }
     }
 
-    /// Returns the residuals with every bit below a set one set as well, as bytes: the low ones,
-    /// then the high ones.
+    /// Returns the residuals as bytes, first the low then the high ones, with every bit below a set bit also set.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn smeared(block: &Block) -> [[__m256i; 2]; 2] {
@@ -386,7 +383,7 @@ mod wide {
             let (first, second) = (smear(load(&rows[0])), smear(load(&rows[1])));
             let lows = (_mm256_and_si256(first, low_byte), _mm256_and_si256(second, low_byte));
             let highs = (_mm256_srli_epi16::<8>(first), _mm256_srli_epi16::<8>(second));
-            // The pack works within halves, which leaves the middle quarters swapped.
+            // The pack works within halves, which swaps the middle quarters.
             let low = _mm256_packus_epi16(lows.0, lows.1);
             bytes[0][at] = _mm256_permute4x64_epi64::<0b11_01_10_00>(low);
             let high = _mm256_packus_epi16(highs.0, highs.1);
@@ -404,11 +401,11 @@ mod wide {
         _mm256_or_si256(row, _mm256_srli_epi16::<8>(row))
     }
 
-    /// Returns which residuals have more than so many bits.
+    /// Returns the mask of residuals with more than `bits` bits.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn plane(bytes: &[[__m256i; 2]; 2], bits: u32) -> u64 {
-        // Brings the bit to the top of its byte; what moves between bytes stays below.
+        // Shifts the bit to the top of its byte; bits that cross bytes stay below it.
         let up = _mm_cvtsi32_si128(7 - (bits as i32 & 7));
         let [first, second] = bytes[usize::from(bits >= 8)];
         let first = _mm256_movemask_epi8(_mm256_sll_epi16(first, up)).cast_unsigned();
@@ -439,7 +436,7 @@ mod kernel {
     pub(super) struct Base;
 
     impl Kernel for Base {
-        // Why: NEON has no movemask; the plain loop serves until it is measured on such a machine.
+        // Why: NEON has no movemask; the plain loop is used until it is measured on such a machine.
         #[inline(always)]
         fn cheapest(block: &Block) -> (Shape, u64) {
             plain::Base::cheapest(block)
@@ -520,7 +517,7 @@ mod tests {
     proptest! {
         /// Residuals of every length.
         #[test]
-        fn lengths_agree(block: Block, shifts in prop::array::uniform32(0u32..17)) {
+        fn kernels_return_the_same_shapes(block: Block, shifts in prop::array::uniform32(0u32..17)) {
             let mut block = block;
             for (at, value) in block.as_flattened_mut().iter_mut().enumerate() {
                 *value = value.checked_shr(shifts[at % 32]).unwrap_or(0);
@@ -540,9 +537,9 @@ mod tests {
             }
         }
 
-        /// The machine's kernel and the plain one agree on every input.
+        /// The machine's kernel and the plain kernel agree for every input.
         #[test]
-        fn kernels_agree(
+        fn kernels_invert_the_prediction_identically(
             square: Square, above: Square, left: [u16; STRIPES], corner: [u16; STRIPES],
         ) {
             let (mut s, mut a, mut l, mut c) = (square, above, left, corner);

@@ -1,7 +1,7 @@
 use super::*;
 use proptest::prelude::*;
 
-/// Both encoders must give the same bytes, both decoders the same pixels as went in.
+/// Checks that both encoders return the same bytes, and that both decoders return the original pixels.
 #[track_caller]
 fn check_round_trip(depth: &[u16], width: usize) -> usize {
     let (mut fast, mut reference) = (vec![7], vec![7]);
@@ -18,7 +18,7 @@ fn check_round_trip(depth: &[u16], width: usize) -> usize {
     fast.len() - 1
 }
 
-/// A deterministic stream of numbers.
+/// Deterministic pseudorandom numbers.
 fn noise(seed: u64) -> impl FnMut() -> u16 {
     let mut state = seed.wrapping_mul(2).wrapping_add(1);
     move || {
@@ -28,7 +28,7 @@ fn noise(seed: u64) -> impl FnMut() -> u16 {
 }
 
 #[test]
-fn every_small_size_survives() {
+fn every_small_size_survives_a_round_trip() {
     for height in 1..=40 {
         for width in 1..=36 {
             let mut next = noise(height * 100 + width);
@@ -39,7 +39,7 @@ fn every_small_size_survives() {
 }
 
 #[test]
-fn adversarial_contents_survive_at_usual_sizes() {
+fn adversarial_contents_survive_a_round_trip_at_usual_sizes() {
     for (width, height) in [(320, 240), (321, 243), (640, 480), (4096, 3), (1, 3000), (17, 257)] {
         let mut next = noise(1);
         let of = |pixel: &mut dyn FnMut(usize, usize) -> u16| {
@@ -52,14 +52,14 @@ fn adversarial_contents_survive_at_usual_sizes() {
         of(&mut |x, _| (x * 40000) as u16);
         let constant_bpp = of(&mut |_, _| 5000);
         if width > 16 {
-            // A byte a block, and the bases.
+            // One byte per block, and the bases.
             assert!(constant_bpp < 0.3, "{constant_bpp} bits a pixel for a constant image");
         }
     }
 }
 
 #[test]
-fn an_encoder_and_a_decoder_are_reused_across_sizes() {
+fn encoder_and_decoder_can_be_reused_across_sizes() {
     let (mut encoder, mut decoder) = (DepthEncoder::default(), DepthDecoder::default());
     let mut next = noise(3);
     for (width, height) in [(64, 48), (5, 3), (100, 100), (1, 1), (64, 48)] {
@@ -73,9 +73,9 @@ fn an_encoder_and_a_decoder_are_reused_across_sizes() {
 }
 
 #[test]
-fn the_bytes_are_pinned() {
-    // 2x1: the base is 3, so the residuals are 0 and 4, zig-zagged 0 and 8: no low bit of any, a
-    // mask that names the second of 64, and its four bits.
+fn encoding_of_a_tiny_image_does_not_change() {
+    // 2x1: the base is 3, so the residuals are 0 and 4, zig-zagged 0 and 8. There are no low bits, a mask with the
+    // second of 64 residuals, and its four high bits.
     let mut bytes = Vec::new();
     DepthEncoder::default().encode(&[3, 7], 2, &mut bytes);
     let mut expected = vec![3, 0];
@@ -86,16 +86,16 @@ fn the_bytes_are_pinned() {
 
 #[test]
 fn a_few_large_residuals_do_not_widen_a_block() {
-    // One pixel of 64 stands out by 12 bits: a mask and the bits of its four neighbours.
+    // One pixel of 64 differs by 12 bits: a mask, and high bits for its four neighbours.
     let mut depth = vec![1000; 64];
     depth[21] = 3000;
     assert!(check_round_trip(&depth, 16) <= 16 + 1 + 8 + 4 * 2);
 }
 
 proptest! {
-    /// Piecewise-smooth images with holes, as a renderer gives them.
+    /// Piecewise smooth images with holes, as rendered.
     #[test]
-    fn images_survive(
+    fn images_survive_a_round_trip(
         width in 1usize..90, height in 1usize..90, seed: u64,
         bits in 0u32..=16, hole in 0u16..=u16::MAX,
     ) {
@@ -110,7 +110,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_decode_alike_or_fail_alike(
+    fn both_decoders_agree_on_arbitrary_bytes(
         width in 1usize..40, height in 1usize..40,
         bytes in prop::collection::vec(any::<u8>(), 0..3000),
     ) {
@@ -121,9 +121,9 @@ proptest! {
         prop_assert!(fast.is_err() || a == b);
     }
 
-    /// Damaged tables and bits of the right length: same pixels or same refusal.
+    /// Damaged tables and bits with correct lengths: both decoders return the same pixels or the same error.
     #[test]
-    fn damaged_bytes_decode_alike_or_fail_alike(
+    fn both_decoders_agree_on_damaged_bytes(
         seed: u64, flips in prop::collection::vec((any::<prop::sample::Index>(), 0u8..8), 1..4),
     ) {
         let (width, height) = (37, 21);

@@ -1,25 +1,25 @@
-//! Adaptive frequencies of 16 symbols, moved as one vector (after Giesen, "Models for adaptive
-//! arithmetic coding", 2015: cumulative frequencies step towards those of a certain symbol).
+//! Adaptive frequencies of 16 symbols, updated as one vector (after Giesen, "Models for adaptive arithmetic coding",
+//! 2015: cumulative frequencies move towards those of a certain symbol).
 
 #![allow(unsafe_code, reason = "SIMD loads and stores")]
 
-/// Symbols of an alphabet.
+/// Number of symbols in the alphabet.
 pub(super) const SYMBOLS: usize = 16;
-/// Frequencies add up to 2^15.
+/// The frequencies sum to 2^15.
 pub(super) const TOTAL_BITS: u32 = 15;
 const TOTAL: u16 = 1 << TOTAL_BITS;
 
-/// Where each symbol's share begins, from 0; [`TOTAL`] ends them.
+/// Start of each symbol's share, from 0; the last entry is [`TOTAL`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(align(64))]
 pub(super) struct Cdf {
     starts: [u16; SYMBOLS + 1],
-    /// Symbols seen, up to [`SETTLED`].
+    /// Number of learnt symbols, up to the last entry of [`RATES`].
     seen: u16,
 }
 
 impl Cdf {
-    /// Equal shares for the first `symbols`, the least for the others.
+    /// Makes a table with equal shares for the first `symbols`, and the minimum share for the others.
     pub(super) const fn even(symbols: usize) -> Self {
         let rest = SYMBOLS - symbols;
         let share = (TOTAL as usize - rest) / symbols;
@@ -39,20 +39,20 @@ impl Cdf {
         Self { starts, seen: 0 }
     }
 
-    /// Returns a symbol's share: where it begins, and how much it is.
+    /// Returns the start and the size of a symbol's share.
     #[inline(always)]
     pub(super) fn share(&self, symbol: usize) -> (u32, u32) {
         let start = self.starts[symbol % SYMBOLS];
         (u32::from(start), u32::from(self.starts[symbol % SYMBOLS + 1] - start))
     }
 
-    /// Returns the symbol in whose share this place is, 0 to 2^15 - 1.
+    /// Returns the symbol with this position in its share, 0 to 2^15 - 1.
     #[inline(always)]
     pub(super) fn symbol_at(&self, place: u32) -> usize {
         kernel::symbol_at(&self.starts, place as u16)
     }
 
-    /// Learns from a symbol: fast at first, then averaging over about 64.
+    /// Updates the frequencies with a symbol: quickly at first, then averaging over about 64 symbols.
     #[inline(always)]
     pub(super) fn learn(&mut self, symbol: usize) {
         let rate = RATES[usize::from(self.seen) % RATES.len()];
@@ -61,7 +61,7 @@ impl Cdf {
     }
 }
 
-/// A step is 2^-rate of the way; by symbols seen.
+/// Step size by number of learnt symbols: a step is 2^-rate of the distance.
 const RATES: [u16; 64] = {
     let mut rates = [5; 64];
     let mut seen = 0;
@@ -78,8 +78,8 @@ const RATES: [u16; 64] = {
     rates
 };
 
-/// What the shares would be were the symbol certain: the others have one each, so that none
-/// ever falls below 1. (Both steps round down alike, and shares of 1 or more stay so.)
+/// Shares if the symbol were certain: the others have a share of 1, so that no share falls below 1. (Both boundaries
+/// round down in the same way, so shares of at least 1 stay at least 1.)
 const CERTAIN: [[u16; SYMBOLS]; SYMBOLS] = {
     let mut certain = [[0; SYMBOLS]; SYMBOLS];
     let mut symbol = 0;
@@ -95,7 +95,7 @@ const CERTAIN: [[u16; SYMBOLS]; SYMBOLS] = {
     certain
 };
 
-/// The plain version, compiled everywhere so that it is tested everywhere.
+/// The plain version, compiled on every machine, so that tests cover it.
 #[cfg_attr(target_arch = "x86_64", allow(dead_code))]
 mod plain {
     use super::{CERTAIN, SYMBOLS};
@@ -112,7 +112,7 @@ mod plain {
     #[inline(always)]
     pub(super) fn learn(starts: &mut [u16; SYMBOLS + 1], symbol: usize, rate: u16) {
         for (start, certain) in starts.iter_mut().zip(CERTAIN[symbol]) {
-            // Both are below 2^15, so the difference is a signed number of 16 bits.
+            // Both are below 2^15, so the difference fits into a signed 16-bit number.
             let step = certain.wrapping_sub(*start).cast_signed() >> rate;
             *start = start.wrapping_add(step.cast_unsigned());
         }
@@ -122,7 +122,7 @@ mod plain {
 #[cfg(not(target_arch = "x86_64"))]
 use plain as kernel;
 
-/// SSE2 belongs to every x86_64: nothing is asked at run time.
+/// SSE2 is available on every x86_64, so no detection is needed at run time.
 #[cfg(target_arch = "x86_64")]
 mod kernel {
     use core::arch::x86_64::{
@@ -144,7 +144,7 @@ mod kernel {
                 _mm_cmpgt_epi16(high, place),
             ))
         };
-        // The first begins at 0, so at least one does not lie above.
+        // The first share begins at 0, so at least one start is not above the position.
         (above | 1 << SYMBOLS).trailing_zeros().saturating_sub(1) as usize
     }
 
@@ -185,7 +185,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn all_shares_are_positive_at_first_and_add_up() {
+    fn initial_shares_are_positive_and_sum_to_the_total() {
         for symbols in 1..=SYMBOLS {
             let cdf = Cdf::even(symbols);
             let shares: Vec<u32> = (0..SYMBOLS).map(|symbol| cdf.share(symbol).1).collect();
@@ -195,7 +195,7 @@ mod tests {
     }
 
     proptest! {
-        /// The machine's kernel and the plain one agree, no share vanishes, every place is found.
+        /// The machine's kernel and the plain kernel agree, shares stay positive, and every position has a symbol.
         #[test]
         fn kernels_agree(symbols in prop::collection::vec(0..SYMBOLS, 1..400), place in 0..TOTAL) {
             let mut cdf = Cdf::even(SYMBOLS);

@@ -1,20 +1,20 @@
-//! Entropy-coded planes: depth in its small mode, alpha, and each channel of lossless colour.
-//! Budget: 2 to 3 ms each way for a plane of 640x480 on one core, bound by the latency from one
-//! pixel to the next; four stripes run side by side to hide it.
+//! Entropy-coded planes: depth in its small mode, alpha, and each channel of lossless colour. Budget: 2 to 3 ms each
+//! for encoding and decoding a plane of 640x480 on one core. The latency from one pixel to the next is the bottleneck;
+//! four stripes are processed in parallel to hide it.
 //!
-//! 1. **Stripes.** The plane is cut into 4 stripes of columns, each with a coder state of its own;
-//!    they advance together, 16 columns (a run) at a time.
-//! 2. **Runs.** A symbol encodes whether all pixels of a run are as predicted, coded, invalid, or
-//!    mixed; in the context of the runs to the left and above. The mask of a mixed run follows as
-//!    four symbols. So flat areas cost next to nothing, and a mask only where it changes.
-//! 3. **Prediction.** By the median edge detector, or by the mean of left and above, whichever
-//!    leaves less in a sample of the rows (the mean, where noise rules). Invalid pixels count as
-//!    predicted exactly, so that what lies beyond a hole is not surprised by it.
-//! 4. **Symbols.** Zig-zagged residuals up to 7 are symbols, larger ones a symbol for their bit
-//!    length and raw bits. Frequencies adapt, in contexts by how rough the neighbourhood is.
+//! 1. **Stripes.** The plane is divided into 4 stripes of columns, each with its own coder state. They advance
+//!    together, 16 columns (a run) at a time.
+//! 2. **Runs.** A symbol encodes whether all pixels of a run are as predicted, coded, invalid, or mixed. Its context is
+//!    the runs to the left and above. The mask of a mixed run follows as four symbols. So flat areas need very few
+//!    bits, and masks only where validity changes.
+//! 3. **Prediction.** By the median edge detector, or by the mean of left and above. The encoder selects the one with
+//!    smaller residuals in a sample of the rows (the mean for noisy planes). Invalid pixels are replaced by their
+//!    prediction, so that pixels beyond a hole are predicted well.
+//! 4. **Symbols.** Zig-zagged residuals up to 7 are symbols. Larger ones have a symbol for their bit length, and raw
+//!    bits. Frequencies adapt, in contexts by the roughness of the neighbourhood.
 //!
-//! Bytes: predictor, what each stripe starts from, then [`rans`]. One function walks the pixels for
-//! both ends, so they cannot disagree.
+//! Bytes: predictor, base of each stripe, then [`rans`]. Encoder and decoder use the same function to walk the pixels,
+//! so their models cannot differ.
 
 mod cdf;
 mod rans;
@@ -24,16 +24,16 @@ use rans::{Coder, LANES, SymbolReader, SymbolWriter};
 
 use crate::depth::predict::{med, unzigzag, zigzag};
 
-/// What the samples of a plane are.
+/// Kind of samples in a plane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Samples {
-    /// 0 to 255; residuals wrap there.
+    /// 0 to 255; residuals wrap at 256.
     Bytes,
-    /// 0 to 65535, 0 is invalid.
+    /// 0 to 65535; 0 is invalid.
     Masked,
 }
 
-/// Encodes planes; owns the scratch memory.
+/// Encodes planes. Owns the scratch memory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PlaneEncoder {
     walk: Walk,
@@ -53,14 +53,14 @@ impl PlaneEncoder {
         let stripe = stripe_columns(width);
         let bases: [u16; LANES] = std::array::from_fn(|lane| {
             let row = &samples[(lane * stripe).min(width)..((lane + 1) * stripe).min(width)];
-            // A masked stripe starts from the first return, if there is one.
+            // The base of a masked stripe is its first return, if there is one.
             let first = row.iter().find(|&&sample| sample > 0 || kind == Samples::Bytes);
             first.copied().unwrap_or(0)
         });
         let mean = mean_is_better(samples, width, kind);
         out.push(u8::from(mean));
         out.extend(bases.iter().flat_map(|base| base.to_le_bytes()));
-        // 3 + 15 raw bits at most for a pixel.
+        // At most 3 + 15 raw bits per pixel.
         self.symbols.start(18 * samples.len());
         let end = Giving { symbols: &mut self.symbols, samples };
         self.walk.run(end, width, samples.len() / width, kind, mean, bases);
@@ -68,14 +68,14 @@ impl PlaneEncoder {
     }
 }
 
-/// Decodes planes; owns the scratch memory.
+/// Decodes planes. Owns the scratch memory.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PlaneDecoder {
     walk: Walk,
 }
 
 impl PlaneDecoder {
-    /// Decodes into a row-major plane; `None` if the bytes are damaged.
+    /// Decodes to a row-major plane; `None` if the bytes are damaged.
     pub(crate) fn decode(
         &mut self,
         bytes: &[u8],
@@ -98,15 +98,15 @@ impl PlaneDecoder {
     }
 }
 
-/// Which way pixels and symbols go.
+/// Direction of the walk: encoding or decoding.
 trait End {
     type Coder: Coder;
-    /// Whether this end knows the samples.
+    /// Whether the samples are known in advance, as in the encoder.
     const KNOWS: bool;
     fn coder(&mut self) -> &mut Self::Coder;
-    /// Copies samples, if this end knows them.
+    /// Copies samples to `run`, in the encoder.
     fn know(&self, at: usize, run: &mut [u16]);
-    /// Takes samples, if this end wants them.
+    /// Stores samples of `run`, in the decoder.
     fn put(&mut self, at: usize, run: &[u16]);
 }
 
@@ -150,27 +150,27 @@ impl<'b> End for Taking<'_, 'b> {
     }
 }
 
-/// What a run of pixels is.
+/// Kind of a run of pixels.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Run {
-    /// All valid, all as predicted.
+    /// All pixels are valid and as predicted.
     Flat = 0,
-    /// All valid.
+    /// All pixels are valid.
     Coded = 1,
-    /// No return in any.
+    /// All pixels are invalid.
     Invalid = 2,
-    /// Some valid.
+    /// Some pixels are valid.
     Mixed = 3,
 }
 
-/// The model and its walk over the pixels.
+/// Model and its walk over the pixels.
 #[derive(Clone, Debug)]
 struct Walk {
-    /// The row above, being overwritten; per lane, with one more column for the upper right.
+    /// Row above, overwritten by the present row; per lane, with one extra column for the upper right.
     row: Vec<u16>,
-    /// What the runs above were, per lane.
+    /// Kinds of the runs above, per lane.
     runs: Vec<u8>,
-    /// Frequencies of residuals, of runs, and of quarters of masks.
+    /// Frequencies of residuals, of run kinds, and of quarters of masks.
     residuals: [Cdf; ROUGHNESSES],
     run_kinds: [Cdf; 16],
     masks: [Cdf; 16],
@@ -188,21 +188,21 @@ impl Default for Walk {
     }
 }
 
-/// Where a lane is in its row, and the run under way.
+/// Position of a lane in its row, and its present run.
 #[derive(Clone, Copy, Default)]
 struct Lane {
-    /// First column of the stripe, columns there are.
+    /// First column of the stripe, and number of columns.
     first: usize,
     columns: usize,
     left: u16,
     corner: u16,
     left_run: u8,
-    /// Which pixels of the run are valid, and which have coded residuals.
+    /// Masks of valid pixels and of pixels with coded residuals.
     valid: u16,
     coded: u16,
-    /// Above the run and its upper right; replaced by the run, holes filled.
+    /// Row above the run including its upper right; overwritten by the run, with holes filled.
     row: [u16; RUN + 1],
-    /// The run's samples: known to the encoder, found by the decoder.
+    /// Samples of the run: input of the encoder, output of the decoder.
     samples: [u16; RUN],
 }
 
@@ -247,7 +247,7 @@ impl Walk {
         });
         for y in 0..rows {
             for (n, lane) in lanes.iter_mut().enumerate() {
-                // The first pixel knows only the one above: so do its left and corner.
+                // The first pixel is predicted from the one above: left and corner get the same value.
                 let above = self.row[n * (stripe + 1)];
                 (lane.left, lane.corner, lane.left_run) = (above, above, Run::Coded as u8);
             }
@@ -311,7 +311,7 @@ impl Walk {
     }
 }
 
-/// Codes what the run is, and its mask.
+/// Codes the kind of the run, and its mask.
 #[inline(always)]
 fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
     end: &mut E,
@@ -345,7 +345,7 @@ fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
             Run::Mixed
         };
     }
-    // A decoder may find any of 16 symbols in damaged bytes.
+    // A decoder may get any of 16 symbols from damaged bytes.
     run = match end.coder().symbol(n, kinds, run as usize) {
         0 => Run::Flat,
         2 if BITS == 16 => Run::Invalid,
@@ -360,7 +360,7 @@ fn begin_run<E: End, const BITS: u32, const MEAN: bool>(
             let (mut mask, mut before) = (0, 0);
             for quarter in 0..4 {
                 let bits = usize::from(valid >> (4 * quarter) & 15);
-                // By place, and whether the pixel before was valid.
+                // Context: the quarter, and whether the previous pixel was valid.
                 let context = &mut masks[(before >> 3 & 1) << 2 | quarter];
                 before = end.coder().symbol(n, context, bits);
                 mask |= (before as u16 & 15) << (4 * quarter);
@@ -399,7 +399,7 @@ fn pixel<E: End, const BITS: u32, const MEAN: bool>(
     (lane.corner, lane.left) = (up, sample);
 }
 
-/// Passes a pixel that is as predicted, or invalid.
+/// Processes a pixel that is as predicted, or invalid.
 #[inline(always)]
 fn predicted_pixel<const BITS: u32, const MEAN: bool>(lane: &mut Lane, column: usize) {
     let up = lane.row[column % RUN];
@@ -419,24 +419,24 @@ fn code_number(coder: &mut impl Coder, lane: usize, context: &mut Cdf, wanted: u
     if symbol == LONG as usize {
         return code_long_number(coder, wanted);
     }
-    // Without a branch, as half the residuals of a rough image go either way.
+    // Without a branch, because half the residuals of a rough image take either direction.
     let (first, bits) = NUMBERS[symbol];
     first + coder.raw(wanted.wrapping_sub(first) & ((1 << bits) - 1), bits)
 }
 
-/// Codes a number of 11 bits or more.
+/// Codes a number with at least 11 bits.
 #[cold]
 fn code_long_number(coder: &mut impl Coder, wanted: u32) -> u32 {
     let length = u32::BITS - wanted.leading_zeros();
-    // Lengths beyond 16 are damage; the bits read for them do no harm.
+    // Lengths above 16 occur only in damaged bytes; reading their bits is harmless.
     let length = (11 + coder.raw(length.wrapping_sub(11) & 7, 3)).min(16);
     let low = length - 1;
     1 << low | coder.raw(wanted & ((1 << low) - 1), low)
 }
 
-/// The symbol of numbers of 11 bits and more.
+/// Symbol of numbers with at least 11 bits.
 const LONG: u32 = 15;
-/// The first number of each symbol, and its raw bits: 0 to 7 alone, then by bit length.
+/// First number of each symbol, and its number of raw bits: single numbers from 0 to 7, then by bit length.
 const NUMBERS: [(u32, u32); SYMBOLS] = {
     let mut numbers = [(0, 0); SYMBOLS];
     let mut symbol = 0;
@@ -448,18 +448,18 @@ const NUMBERS: [(u32, u32); SYMBOLS] = {
     numbers
 };
 
-/// Returns what a pixel is predicted to be.
+/// Returns the prediction of a pixel.
 #[inline(always)]
 fn predict<const MEAN: bool>(left: u16, up: u16, corner: u16) -> u16 {
     if MEAN {
-        // Of samples of at most 16 bits.
+        // The samples have at most 16 bits.
         u32::midpoint(u32::from(left), u32::from(up)) as u16
     } else {
         med(left, up, corner)
     }
 }
 
-/// Returns the context of a roughness: half octaves.
+/// Returns the context of a roughness, in half octaves.
 #[inline(always)]
 fn roughness(rough: u32) -> usize {
     let length = u32::BITS - rough.leading_zeros();
@@ -467,8 +467,8 @@ fn roughness(rough: u32) -> usize {
     (context as usize).min(ROUGHNESSES - 1)
 }
 
-/// Returns whether the mean of left and above predicts this plane better than the median edge
-/// detector, by the bit lengths of the residuals in every eighth row.
+/// Returns whether the mean of left and above predicts this plane better than the median edge detector. Compares the
+/// bit lengths of the residuals in every eighth row.
 fn mean_is_better(samples: &[u16], width: usize, kind: Samples) -> bool {
     let (mut med_bits, mut mean_bits) = (0u32, 0u32);
     let length = |sample: u16, predicted: u16| {
@@ -493,9 +493,9 @@ fn stripe_columns(width: usize) -> usize {
     width.div_ceil(LANES).next_multiple_of(RUN)
 }
 
-/// Pixels of a run.
+/// Number of pixels in a run.
 const RUN: usize = 16;
-/// Contexts of residuals.
+/// Number of contexts of residuals.
 const ROUGHNESSES: usize = 24;
 
 #[cfg(test)]

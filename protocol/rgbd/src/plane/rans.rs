@@ -1,45 +1,45 @@
-//! Symbols and raw bits to bytes: range asymmetric numeral systems (Duda, arXiv:1311.2540),
-//! [`LANES`] states of 32 bits taking turns on one stream of 16-bit words.
+//! Entropy coder for symbols and raw bits: range asymmetric numeral systems (Duda, arXiv:1311.2540), with [`LANES`]
+//! states of 32 bits that alternate on one stream of 16-bit words.
 
 use super::cdf::{Cdf, TOTAL_BITS};
 use crate::bits::{BitReader, BitWriter};
 
-/// States, so that a processor has several symbols under way at once.
+/// Number of states, so that a processor works on several symbols at once.
 pub(super) const LANES: usize = 4;
-/// States lie in 2^16 to 2^32 - 1.
+/// States are in the range 2^16 to 2^32 - 1.
 const MIN_STATE: u32 = 1 << 16;
-/// Length of the words, then the states.
+/// Number of words, then the states.
 const HEADER_BYTES: usize = 4 + 4 * LANES;
 
-/// One end: the model that drives it is the same for both.
+/// Encoder or decoder. The same model drives both.
 pub(super) trait Coder {
-    /// Codes a symbol and has its frequencies learn. The encoder returns `symbol`, the decoder
-    /// what it finds instead.
+    /// Codes a symbol and updates its frequencies. The encoder returns `symbol`; the decoder ignores it and returns the
+    /// decoded symbol.
     fn symbol(&mut self, lane: usize, cdf: &mut Cdf, symbol: usize) -> usize;
-    /// Codes `count` bits, 0 to 16, as they are; returns like [`Self::symbol`].
+    /// Codes `count` raw bits, 0 to 16; returns the value as in [`Self::symbol`].
     fn raw(&mut self, value: u32, count: u32) -> u32;
 }
 
-/// Gathers symbols, then codes them from the last to the first.
+/// Collects symbols, then codes them from the last to the first.
 #[derive(Clone, Debug, Default)]
 pub(super) struct SymbolWriter {
-    /// Start, share - 1, lane: 15 + 15 + 2 bits.
+    /// Start, share - 1, and lane: 15 + 15 + 2 bits.
     symbols: Vec<u32>,
     raw: BitWriter,
     words: Vec<u16>,
 }
 
 impl SymbolWriter {
-    /// Forgets everything; makes room for so many raw bits.
+    /// Clears the writer and reserves space for at most `most_raw_bits` raw bits.
     pub(super) fn start(&mut self, most_raw_bits: usize) {
         self.symbols.clear();
         self.raw.start(most_raw_bits);
     }
 
-    /// Appends everything to `out`.
+    /// Appends the coded symbols and raw bits to `out`.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) {
         let mut states = [MIN_STATE; LANES];
-        // A word a symbol at most, and one more to write in vain.
+        // At most one word per symbol, and one extra for a write that is not kept.
         if self.words.len() <= self.symbols.len() {
             self.words.resize(self.symbols.len() + 1, 0);
         }
@@ -47,7 +47,7 @@ impl SymbolWriter {
         for &symbol in self.symbols.iter().rev() {
             let (start, share) = (symbol & 0x7fff, (symbol >> 15 & 0x7fff) + 1);
             let state = &mut states[(symbol >> 30) as usize % LANES];
-            // Without a branch: a word goes out as often as the bits have it, which is no pattern.
+            // Without a branch: whether a word is written depends on the data and is unpredictable.
             let full = u64::from(*state) >= u64::from(share) << (32 - TOTAL_BITS);
             self.words[len] = *state as u16;
             len += usize::from(full);
@@ -77,7 +77,7 @@ impl Coder for SymbolWriter {
     }
 }
 
-/// Takes symbols apart again. Behind the end come zeros; [`Self::is_finished`] detects it.
+/// Decodes symbols. Reads zeros beyond the end, which [`Self::is_finished`] detects.
 pub(super) struct SymbolReader<'a> {
     states: [u32; LANES],
     words: &'a [[u8; 2]],
@@ -86,7 +86,7 @@ pub(super) struct SymbolReader<'a> {
 }
 
 impl<'a> SymbolReader<'a> {
-    /// Returns `None` if the bytes are fewer than they state.
+    /// Returns `None` if there are fewer bytes than the header states.
     pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
         let (header, rest) = bytes.split_first_chunk::<HEADER_BYTES>()?;
         let number = |at: usize| {
@@ -101,7 +101,7 @@ impl<'a> SymbolReader<'a> {
         })
     }
 
-    /// Returns whether everything was taken and every state is where the encoder began.
+    /// Returns whether all data was read and every state has returned to its initial value.
     pub(super) fn is_finished(&self) -> bool {
         self.states == [MIN_STATE; LANES] && self.next == self.words.len() && self.raw.is_finished()
     }
@@ -114,7 +114,7 @@ impl Coder for SymbolReader<'_> {
         let place = *state & ((1 << TOTAL_BITS) - 1);
         let symbol = cdf.symbol_at(place);
         let (start, share) = cdf.share(symbol);
-        // At most 2^17 of 2^15 shares: no more than 32 bits.
+        // At most 2^17 times 2^15: no more than 32 bits.
         *state = share.wrapping_mul(*state >> TOTAL_BITS).wrapping_add(place - start);
         // Without a branch, as above.
         let word = self.words.get(self.next).copied().unwrap_or_default();

@@ -14,7 +14,7 @@ fn check_round_trip(samples: &[u16], width: usize, kind: Samples) -> usize {
 }
 
 #[test]
-fn every_small_size_survives() {
+fn every_small_size_survives_a_round_trip() {
     let mut state = 1u32;
     for height in 1..=12 {
         for width in 1..=150 {
@@ -32,7 +32,7 @@ fn every_small_size_survives() {
 }
 
 #[test]
-fn flat_planes_cost_next_to_nothing() {
+fn flat_planes_need_less_than_300_bytes() {
     for (value, kind) in [(255, Samples::Bytes), (0, Samples::Masked), (5000, Samples::Masked)] {
         let len = check_round_trip(&vec![value; 640 * 480], 640, kind);
         assert!(len < 300, "{len} bytes for a plane of {value}");
@@ -40,7 +40,7 @@ fn flat_planes_cost_next_to_nothing() {
 }
 
 #[test]
-fn adversarial_contents_survive() {
+fn adversarial_contents_survive_a_round_trip() {
     for (width, height) in [(640, 480), (321, 243), (4096, 3), (1, 3000)] {
         let of = |pixel: &dyn Fn(usize, usize) -> u16| {
             let samples: Vec<u16> =
@@ -56,7 +56,7 @@ fn adversarial_contents_survive() {
 
 proptest! {
     #[test]
-    fn any_bytes_are_survived(bytes in prop::collection::vec(any::<u8>(), 0..400), width in 1usize..80) {
+    fn does_not_panic_on_arbitrary_bytes(bytes in prop::collection::vec(any::<u8>(), 0..400), width in 1usize..80) {
         for kind in [Samples::Bytes, Samples::Masked] {
             let mut out = vec![0; width * 5];
             let _ = PlaneDecoder::default().decode(&bytes, width, kind, &mut out);
@@ -66,9 +66,9 @@ proptest! {
         }
     }
 
-    /// A changed bit is mostly noticed, and never a panic.
+    /// Most changed bits are detected, and none causes a panic.
     #[test]
-    fn flipped_bits_are_survived(seed: u32, at: prop::sample::Index, bit in 0u8..8) {
+    fn does_not_panic_on_flipped_bits(seed: u32, at: prop::sample::Index, bit in 0u8..8) {
         let samples: Vec<u16> = (0..70 * 9).map(|n: u32| (n.wrapping_mul(seed) >> 20) as u16).collect();
         let mut bytes = Vec::new();
         PlaneEncoder::default().encode(&samples, 70, Samples::Masked, &mut bytes);

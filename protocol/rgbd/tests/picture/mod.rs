@@ -14,7 +14,7 @@ pub(crate) struct Picture {
 }
 
 impl Picture {
-    /// All zero.
+    /// Makes a picture of zeros.
     pub(crate) fn blank(width: u32, height: u32) -> Self {
         let pixels = width as usize * height as usize;
         Self {
@@ -27,7 +27,7 @@ impl Picture {
         }
     }
 
-    /// Smooth colour with texture; depth and ids with edges and holes; alpha that falls off.
+    /// Makes a picture with textured smooth colour, depth and ids with edges and holes, and decreasing alpha.
     pub(crate) fn new(width: u32, height: u32) -> Self {
         let mut picture = Self::blank(width, height);
         for y in 0..height {
@@ -50,8 +50,8 @@ impl Picture {
         picture
     }
 
-    #[allow(dead_code)] // Why: one of the two tests that share this module needs it.
-    /// Values of so many bits, and holes, without pattern.
+    #[allow(dead_code)] // Why: used by only one of the two tests that share this module.
+    /// Fills all parts with random values of `bits` bits, and depth also with holes.
     pub(crate) fn fill_at_random(&mut self, seed: u64, bits: u32) {
         let mut state = seed;
         let mut next = || {
@@ -89,7 +89,7 @@ impl Picture {
 }
 
 /// Returns the peak signal-to-noise ratio of 8-bit values. [dB]
-#[allow(dead_code)] // Why: one of the two tests that share this module needs it.
+#[allow(dead_code)] // Why: used by only one of the two tests that share this module.
 pub(crate) fn psnr_db(a: &[u8], b: &[u8]) -> f64 {
     let squares: f64 = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
     10.0 * (255.0f64.powi(2) / (squares / a.len() as f64)).log10()

@@ -183,7 +183,11 @@ fn rejects_a_false_server_with_a_wrong_guess() {
     let (attempt, share) = false_server.begin(&message, &seen).unwrap();
     let (confirming, message) = client.confirm(&share).unwrap();
     let end = false_server.server.confirm(false_server.now, attempt, &message);
-    assert_eq!(end, Err(Refusal::Wrong { left: 2 }), "the attacker gets only the result of one guess");
+    assert_eq!(
+        end,
+        Err(Refusal::Wrong { left: 2 }),
+        "the attacker gets only the result of one guess"
+    );
     // The attacker replies anyway, with the client's proof or other data.
     let PairingRequest::Confirm { proof } = message else { panic!() };
     assert!(!confirming.is_proof(&proof), "the two proofs differ, so an echo is invalid");

@@ -1,8 +1,8 @@
-//! Who is checked in to fly a vehicle, and who may change that; pure.
+//! Check-in of teams at a vehicle, and permission to change it. Pure.
 //!
-//! A token says for which team a flight counts. It checks in at its vehicle: on a page with that vehicle's
-//! right, or at the computer that flies it. Who is checked in stays so until a flight has landed, unless
-//! somebody of the same team, the vehicle's computer or the instructor changes it.
+//! A token states for which team a flight counts. The team checks in at its vehicle: on a page with that
+//! vehicle's right, or at the computer that flies it. The check-in stays until a flight has landed, unless the
+//! same team, the vehicle's computer or the instructor changes it.
 
 use std::net::IpAddr;
 
@@ -11,36 +11,35 @@ use vizflyt_protocol::time::ServerTime;
 use super::leaderboard::Attempt;
 use super::vehicle::Flight;
 
-/// A team that flies a vehicle.
+/// Check-in of a team.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CheckIn {
-    /// Its name.
     pub team: String,
-    /// What its flights count as.
+    /// Type of its flights.
     pub attempt: Attempt,
-    /// Since when.
+    /// Time of the check-in.
     pub at: ServerTime,
-    /// From which computer; `None` if the instructor has set it.
+    /// Computer of the check-in; `None` if the instructor has set it.
     pub from: Option<IpAddr>,
 }
 
-/// Who wants to change who is checked in.
+/// Request to change a check-in.
 #[derive(Clone, Copy, Debug)]
 pub struct Claim<'a> {
-    /// Whose token was shown.
+    /// Team of the token.
     pub team: Option<&'a str>,
-    /// Where the request comes from.
+    /// Address of the sender.
     pub from: IpAddr,
-    /// It comes with the instructor's right.
+    /// The request has the instructor's right.
     pub is_instructor: bool,
-    /// It comes with the right to this vehicle's page.
+    /// The request has the right to this vehicle's page.
     pub has_vehicle: bool,
 }
 
-/// Why a check-in stays as it is.
+/// Why a check-in cannot be changed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CheckInRefusal {
-    /// Neither the vehicle's key nor its computer.
+    /// The request comes neither with the vehicle's key nor from its computer.
     #[error(
         "a team checks in at its vehicle: on a page with that vehicle's key, or at the computer that flies it"
     )]
@@ -52,11 +51,11 @@ pub enum CheckInRefusal {
     Taken(String),
 }
 
-/// Says whether a claim may replace or remove who is checked in. `runtime` is where the vehicle's runtime
-/// connects from.
+/// Checks whether a claim may replace or remove the present check-in. `runtime` is the address of the vehicle's
+/// runtime.
 ///
 /// # Errors
-/// Why not.
+/// Why it may not.
 pub fn judge(
     present: Option<&CheckIn>,
     claim: Claim<'_>,
@@ -104,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn another_team_takes_no_check_in_before_its_flight() {
+    fn check_in_is_protected_from_other_teams_until_its_flight() {
         let waiting = Flight::default();
         check(claim(Some("bees"), B), &waiting, false);
         check(claim(None, B), &waiting, false);
@@ -116,13 +115,13 @@ mod tests {
         check(claim(Some("bees"), B), &flying, false);
         let landed = Flight { landed: Some(ServerTime::from_ns(3_000)), ..flying };
         check(claim(Some("bees"), B), &landed, true);
-        // The former team's landing, before this one came.
+        // Landing of the previous team, before this check-in.
         let before = Flight { landed: Some(ServerTime::from_ns(500)), ..Flight::default() };
         check(claim(Some("bees"), B), &before, false);
     }
 
     #[test]
-    fn a_token_alone_checks_in_nowhere() {
+    fn a_token_without_a_vehicle_right_is_rejected() {
         let stranger = Claim { has_vehicle: false, ..claim(Some("bees"), B) };
         let elsewhere = Err(CheckInRefusal::Elsewhere);
         assert_eq!(judge(None, stranger, &Flight::default(), Some(JETSON)), elsewhere);

@@ -1,4 +1,4 @@
-//! Who flies a vehicle, and who watches: one runtime at a time, some watchers beside it.
+//! Leases of a vehicle: one runtime at a time, and several watchers.
 
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,7 +10,7 @@ use vizflyt_protocol::time::ServerTime;
 
 use vizflyt_process::lock;
 
-/// The leases of one vehicle, and the count of its flights, which changes with them.
+/// Leases of one vehicle, and the number of its flights, which changes with them.
 #[derive(Debug, Default)]
 pub struct Leases(Arc<Mutex<State>>);
 
@@ -20,21 +20,19 @@ struct State {
     holder: Option<RuntimeInfo>,
     /// Index of the first event of the present flight.
     first_event: u64,
-    /// Random number of the runtime that holds the lease, or held it last.
+    /// Random number of the present or last runtime.
     boot: u64,
-    /// Which of its events were received.
+    /// Received events of that runtime.
     received: ReceivedEvents,
     watchers: usize,
-    /// How many flights have begun; the pose thread restarts its referee with each.
+    /// Number of flights begun; the pose thread restarts its referee with each.
     flights: u64,
 }
 
-/// The runtime that flies.
+/// Runtime that flies the vehicle.
 #[derive(Clone, Debug)]
 pub struct RuntimeInfo {
-    /// Session number.
     pub id: u64,
-    /// Its address.
     pub address: SocketAddr,
     /// Name and version of the program.
     pub program: Text,
@@ -43,15 +41,15 @@ pub struct RuntimeInfo {
 }
 
 impl Leases {
-    /// Grants control of the vehicle called `vehicle` to a runtime at `now`.
+    /// Grants control of the vehicle `vehicle` to a runtime at `now`.
     ///
-    /// A runtime that has been silent for [`SILENT_S`] loses its lease to the newcomer: it is the
-    /// same one after an outage, or it is dead. If the former flight is `under_way`, or the newcomer
-    /// is the runtime of that flight, the flight is resumed. Otherwise a new one begins: `begin`
-    /// resets the flight's state and returns the index of its first event.
+    /// A runtime that has been silent for [`SILENT_S`] loses its lease to the new one: it is the same runtime
+    /// after an outage, or it has died. If the former flight is `under_way`, or the new runtime is the one of
+    /// that flight, the flight is resumed. Otherwise a new flight begins: `begin` resets the flight's state and
+    /// returns the index of its first event.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub(super) fn take_control(
         &self,
         vehicle: &str,
@@ -97,10 +95,10 @@ impl Leases {
         })
     }
 
-    /// Lets a watcher join the vehicle called `vehicle`.
+    /// Adds a watcher to the vehicle `vehicle`.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub(super) fn watch(&self, vehicle: &str) -> Result<WatchLease, String> {
         let mut state = lock(&self.0);
         if state.watchers >= MAX_WATCHERS {
@@ -114,8 +112,7 @@ impl Leases {
         Ok(WatchLease { leases: self.0.clone(), id, first_event })
     }
 
-    /// Begins a new flight of the same runtime unless `refuse` gives a reason not to, as
-    /// [`Self::take_control`] does.
+    /// Begins a new flight of the same runtime, like [`Self::take_control`], unless `refuse` returns a reason.
     pub(super) fn restart(
         &self,
         refuse: impl FnOnce() -> Option<String>,
@@ -135,7 +132,7 @@ impl Leases {
         lock(&self.0).holder.clone()
     }
 
-    /// Returns how many flights have begun.
+    /// Returns the number of flights begun.
     pub(super) fn flights(&self) -> u64 {
         lock(&self.0).flights
     }
@@ -146,29 +143,28 @@ impl Leases {
     }
 }
 
-/// Exclusive control of a vehicle; given back when dropped.
+/// Exclusive control of a vehicle; released when dropped.
 #[derive(Debug)]
 pub struct ControlLease {
     leases: Arc<Mutex<State>>,
-    /// The runtime that has it.
+    /// Runtime that has control.
     pub info: RuntimeInfo,
-    /// Whether the flight goes on after an outage.
+    /// Whether the flight continues after an outage.
     pub resumed: bool,
-    /// The first event to send.
+    /// Index of the first event to send.
     pub first_event: u64,
-    /// Tells this runtime's events from those of another run.
+    /// Distinguishes this runtime's events from those of another run.
     boot: u64,
-    /// Which of the runtime's events had been received.
+    /// Received events of the runtime.
     pub received_events: ReceivedEvents,
 }
 
-/// The right to watch a vehicle; given back when dropped.
+/// Right to watch a vehicle; released when dropped.
 #[derive(Debug)]
 pub struct WatchLease {
     leases: Arc<Mutex<State>>,
-    /// Session number.
     pub id: u64,
-    /// The first event to send.
+    /// Index of the first event to send.
     pub first_event: u64,
 }
 
@@ -179,17 +175,17 @@ impl Drop for WatchLease {
 }
 
 impl ControlLease {
-    /// Notes that the runtime's event `seq` was received; returns whether it is new.
+    /// Records that the runtime's event `seq` was received; returns whether it is new.
     pub fn receive_event(&self, seq: u64) -> bool {
         lock(&self.leases).received.receive(self.boot, seq)
     }
 
-    /// Notes that the runtime has sent something at `now`.
+    /// Records that the runtime sent a message at `now`.
     pub fn renew(&self, now: ServerTime) {
         self.info.received_ns.store(now.as_ns(), Ordering::Relaxed);
     }
 
-    /// Completes when a newcomer has taken control.
+    /// Completes when another runtime has taken control.
     pub async fn evicted(&self) {
         self.info.evicted.notified().await;
     }
@@ -204,8 +200,8 @@ impl Drop for ControlLease {
     }
 }
 
-/// The most watchers of one vehicle: a class that looks on; each costs a connection and its share
-/// of the network.
+/// Maximum number of watchers per vehicle; each costs a connection and bandwidth.
 pub const MAX_WATCHERS: usize = 8;
-/// Runtimes report ten times a second; ten reports missed are an outage. [s]
+/// Silence after which a runtime may be replaced: it reports ten times a second, so ten missed reports are an
+/// outage. [s]
 const SILENT_S: f64 = 1.0;

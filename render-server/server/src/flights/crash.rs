@@ -1,12 +1,12 @@
-//! Crash cards: what a live flight that failed looked like at its end, kept for the page.
+//! Crash cards: the last moments of a failed live flight, stored for the page.
 //!
 //! ```text
 //! previews --> RecentPreviews: two seconds of them, by camera ----\
 //! pose thread --> samples of the flight, with clearance ---> follow (a task for each vehicle) --> card
 //! referee, runtime --> the event that decided the flight /
 //! ```
-//! At most one card a vehicle, that of its last failed flight, and two seconds of previews (2 MB a
-//! camera). Cause and drawings are the autograder's ([`vizflyt_arena::crash`]).
+//! There is at most one card per vehicle, of its last failed flight, and two seconds of previews (2 MB per
+//! camera). Cause and plots are the autograder's ([`vizflyt_arena::crash`]).
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -31,8 +31,7 @@ pub(crate) async fn follow(
     let (arena, mut count) = (Arc::new(arena), 0);
     let mut log = vehicle.events.subscribe();
     let mut telemetry = vehicle.telemetry.subscribe();
-    // The flight and the end that were handled last; an earlier end that arrives later has a card
-    // of its own.
+    // Flight and end that were processed last. An earlier end that arrives later gets a separate card.
     let mut known: Option<(u64, ServerTime)> = None;
     loop {
         tokio::select! {
@@ -45,7 +44,7 @@ pub(crate) async fn follow(
             .decided()
             .filter(|(_, reason)| flight.took_off.is_some() && reason.is_failure())
         else {
-            // An earlier event that arrived later was no failure.
+            // An earlier event that arrived later was not a failure.
             if known.take_if(|(flight, _)| *flight == vehicle.flights()).is_some() {
                 vehicle.crash.send_replace(None);
             }
@@ -58,7 +57,7 @@ pub(crate) async fn follow(
         known = Some(end);
         tokio::time::sleep(IMAGES_LATE).await;
         if vehicle.flights() != end.0 {
-            // The next flight has begun: nothing of this one is left.
+            // The next flight has begun, and the data of this one are gone.
             continue;
         }
         count += 1;
@@ -159,13 +158,13 @@ fn line(sample: &Sample, before_s: f64) -> CardSample {
     }
 }
 
-/// The last image before the end is rendered, taken and shrunk by then.
+/// Delay until the last image before the end has been rendered and shrunk.
 const IMAGES_LATE: Duration = Duration::from_millis(300);
-/// Clearance and speed are plotted over so long. [s]
+/// Length of the plot of clearance and speed. [s]
 const PLOTTED_S: f64 = 4.0;
-/// Age of an image when its reply counts, where the runtime has not reported it. [s]
+/// Default of the images' age at the reply, if the runtime has not reported it. [s]
 const USUAL_DELAY_S: f64 = 0.04;
-/// Events that are shown.
+/// Maximum number of events shown.
 const EVENTS: usize = 12;
-/// Lines of the plugin that are shown.
+/// Maximum number of the plugin's lines shown.
 const LINES: usize = 30;

@@ -1,4 +1,4 @@
-//! What a failed flight looked like at its end, as the page shows it.
+//! Data of a crash card, as the page shows it.
 
 use std::sync::Arc;
 
@@ -7,79 +7,78 @@ use vizflyt_arena::verdict::Verdict;
 
 use super::recent_previews::{Preview, TimedPreview};
 
-/// What a failed flight looked like at its end.
+/// Crash card: the last moments of a failed flight.
 #[derive(Debug, Serialize)]
 pub struct CrashCard {
-    /// Counts the vehicle's cards, from 1.
+    /// Number of the vehicle's card, from 1.
     pub id: u64,
-    /// Whose.
+    /// Name of the vehicle.
     pub(super) vehicle: String,
-    /// The arena's name.
+    /// Name of the arena.
     pub(super) course: String,
-    /// The end, UTC. [ms since 1970]
+    /// Time of the end, UTC. [ms since 1970]
     pub(super) ended_unix_ms: u64,
-    /// What decided the flight, in a few words.
+    /// Cause of the flight's end, in a few words.
     pub(super) title: &'static str,
-    /// What the flight was worth.
+    /// Verdict of the flight.
     pub(super) verdict: Verdict,
-    /// What it probably failed of, in words.
+    /// Probable cause, as text.
     pub(super) cause: String,
-    /// What the cameras showed, oldest first.
+    /// Images of the cameras, oldest first.
     pub(super) images: Vec<CardImages>,
-    /// Where it was in its last seconds.
+    /// Positions in the last seconds.
     pub(super) samples: Vec<CardSample>,
-    /// SVG of clearance and speed in its last seconds.
+    /// SVG of clearance and speed in the last seconds.
     pub(super) clearance_svg: String,
-    /// SVG of the place from above, with the way flown.
+    /// SVG of the room from above, with the flown path.
     pub(super) top_svg: String,
-    /// At which height the obstacles of that are. [m, world]
+    /// Height of the section through the obstacles in that view. [m, world]
     pub(super) top_height_m: f64,
-    /// What happened, up to the end.
+    /// Events up to the end.
     pub(super) events: Vec<CardEvent>,
-    /// The last lines that the plugin printed.
+    /// Last lines printed by the plugin.
     pub(super) printed: Vec<String>,
     #[serde(skip)]
     pub(super) shots: Vec<Vec<TimedPreview>>,
 }
 
-/// The images of a camera.
 #[derive(Debug, Serialize)]
 pub(super) struct CardImages {
     pub(super) camera: String,
-    /// When they were, before the end. [s]
+    /// Times before the end. [s]
     pub(super) before_s: Vec<f64>,
 }
 
-/// Where it was at one moment.
+/// State of the vehicle at one time.
 #[derive(Debug, Serialize)]
 pub(super) struct CardSample {
-    /// Before the end. [s]
+    /// Time before the end. [s]
     pub(super) before_s: f64,
     /// [m, world]
     pub(super) p_world_m: [f64; 3],
     /// [m/s, world]
     pub(super) v_world_mps: [f64; 3],
-    /// From x, counter-clockwise. [rad, world]
+    /// Heading from x, counter-clockwise. [rad, world]
     pub(super) yaw_rad: f64,
-    /// From the body's surface to the nearest obstacle; absent where there is none. [m]
+    /// Distance from the body's surface to the nearest obstacle; absent if there is none. [m]
     pub(super) clearance_m: Option<f64>,
 }
 
 #[derive(Debug, Serialize)]
 pub(super) struct CardEvent {
-    /// Before the end. [s]
+    /// Time before the end. [s]
     pub(super) before_s: f64,
     pub(super) text: String,
 }
 
 impl CrashCard {
-    /// Returns an image of a camera, both by their number; `None` if there is none.
+    /// Returns an image of a camera by number, if it exists.
     pub fn image(&self, camera: usize, number: usize) -> Option<&Arc<Preview>> {
         Some(&self.shots.get(camera)?.get(number)?.preview)
     }
 }
 
-/// Returns what the page reads of cards, for the check of its scripts.
+/// Returns examples of cards, for the check of the page's scripts.
 #[cfg(test)]
 pub(crate) fn examples() -> Vec<serde_json::Value> {
     use vizflyt_protocol::flight_end::{Collision, EndReason, Obstacle};

@@ -1,8 +1,8 @@
-//! What happened, in order, for the runtime, the page and standard output.
+//! Event log of a vehicle, for the runtime, the page and standard output.
 //!
-//! Every reader has its own cursor and reads at its own pace; the log keeps the newest
-//! [`EventLog::KEPT`]. A reader that falls behind that learns it ([`Lagged`]), so that nothing is
-//! lost unnoticed: a runtime's session is then closed and opened anew.
+//! Every reader has its own cursor and reads at its own pace; the log keeps the newest [`EventLog::KEPT`]. A
+//! reader that falls behind receives [`Lagged`], so that no event is lost unnoticed: a runtime's session is
+//! then closed, and the runtime connects again.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -11,37 +11,34 @@ use vizflyt_process::lock;
 use tokio::sync::watch;
 use vizflyt_protocol::messages::Event;
 
-/// Who made an event.
+/// Origin of an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// This server: the referee, the localization, the stop button. Goes to the runtime.
+    /// This server: referee, localization, stop button. Sent to the runtime.
     Server,
-    /// The runtime, or this server about the runtime's connection. Goes to the page only.
+    /// The runtime, or this server about the runtime's connection. Shown only on the page.
     Page,
 }
 
-/// One line of the log.
+/// Entry of the log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
-    /// Counts from 0 since the server started.
+    /// Number of the event since the start of the server, from 0.
     pub index: u64,
-    /// Who made it.
     pub origin: Origin,
-    /// The event.
     pub event: Event,
 }
 
-/// A reader's next events are no longer kept.
+/// The reader's next events have been dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("reader at event {cursor} fell behind: the oldest kept is {oldest}")]
 pub struct Lagged {
-    /// Where the reader was.
+    /// Cursor of the reader.
     pub cursor: u64,
-    /// The oldest event still kept.
+    /// Oldest event in the log.
     pub oldest: u64,
 }
 
-/// The log of events.
 #[derive(Debug)]
 pub struct EventLog {
     entries: Mutex<VecDeque<Entry>>,
@@ -55,7 +52,7 @@ impl Default for EventLog {
 }
 
 impl EventLog {
-    /// Events kept: a plugin that prints a hundred lines a second has 40 s to be read.
+    /// Maximum number of events: a plugin that prints a hundred lines a second may be read 40 s late.
     pub const KEPT: usize = 4096;
 
     /// Appends an event; returns its index.
@@ -71,7 +68,7 @@ impl EventLog {
         index
     }
 
-    /// Returns the index that the next event will have.
+    /// Returns the index of the next event.
     pub fn next_index(&self) -> u64 {
         *self.next.borrow()
     }
@@ -81,7 +78,7 @@ impl EventLog {
         self.next.subscribe()
     }
 
-    /// Returns the events from `cursor` on, and moves it behind them.
+    /// Returns the events from `cursor` on, and moves the cursor past them.
     pub fn read(&self, cursor: &mut u64) -> Result<Vec<Entry>, Lagged> {
         let entries = lock(&self.entries);
         let oldest = entries.front().map_or(*cursor, |entry| entry.index);
@@ -94,7 +91,7 @@ impl EventLog {
         Ok(found)
     }
 
-    /// Returns the newest `most` events, and the cursor behind them.
+    /// Returns the newest events, at most `most`, and the cursor after them.
     pub fn newest(&self, most: usize) -> (Vec<Entry>, u64) {
         let entries = lock(&self.entries);
         let skip = entries.len().saturating_sub(most);

@@ -1,11 +1,11 @@
-//! Who flies, and how it goes: control leases, events, tracks, crash cards, the leaderboard, the lab day.
+//! Flights: control leases, events, tracks, crash cards, the leaderboard, the lab day.
 //!
 //! ```text
-//! in   poses and the referee's events, from the pose thread; reports of the runtimes; orders of
-//!      people (start, land, stop, reset), from the page
+//! in   poses and the referee's events, from the pose thread; reports of the runtimes; commands of
+//!      users (start, land, stop, reset), from the page
 //! out  events, to runtimes, page and standard output; runs, to the database; crash cards, to the page
 //! ```
-//! Imports none of the other rooms but the database's own files: they all report to this one.
+//! Imports no other room: all rooms report to this one.
 
 pub mod check_in;
 pub mod control_lease;
@@ -27,20 +27,19 @@ use std::sync::Arc;
 use self::leaderboard::Leaderboard;
 use self::vehicle::VehicleFlight;
 
-/// The flights of all vehicles.
 #[derive(Debug)]
 pub struct Flights {
-    /// Random: a runtime notices by it that the server was restarted.
+    /// Random number by which a runtime detects a restart of the server.
     pub instance_id: u64,
-    /// One for each vehicle, at its index; at least one, at most
+    /// Flights by index of the vehicle; at least one, at most
     /// [`MAX_VEHICLES`](vizflyt_arena::config::MAX_VEHICLES).
     pub vehicles: Vec<Arc<VehicleFlight>>,
-    /// The database of runs; `None` if none is kept.
+    /// Database of runs; `None` if disabled.
     pub leaderboard: Option<Leaderboard>,
 }
 
 impl Flights {
-    /// Returns the state of a server that has seen nothing yet.
+    /// Creates the state of a server at its start.
     pub fn new(vehicles: Vec<VehicleFlight>, leaderboard: Option<Leaderboard>) -> Self {
         Self {
             instance_id: vizflyt_trust::random_instance_id(),
@@ -49,10 +48,10 @@ impl Flights {
         }
     }
 
-    /// Returns the vehicle of this name.
+    /// Returns the vehicle with this name.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn vehicle(&self, name: &str) -> Result<&Arc<VehicleFlight>, String> {
         self.vehicles.iter().find(|vehicle| vehicle.name == name).ok_or_else(|| {
             let names: Vec<_> = self.vehicles.iter().map(|v| format!("'{}'", v.name)).collect();
@@ -71,7 +70,7 @@ impl Flights {
         }
     }
 
-    /// Whether any flight is under way.
+    /// Returns whether any flight is under way.
     pub fn any_under_way(&self) -> bool {
         self.vehicles.iter().any(|vehicle| vehicle.under_way())
     }
@@ -82,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_unknown_vehicle_is_refused_with_the_names_of_the_known_ones() {
+    fn rejects_an_unknown_vehicle_with_the_known_names() {
         let vehicles = ["wasp", "bee"].iter().enumerate();
         let vehicles = vehicles.map(|(index, name)| vehicle::tests::named(index, name));
         let flights = Flights::new(vehicles.collect(), None);

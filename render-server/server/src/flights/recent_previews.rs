@@ -1,28 +1,28 @@
-//! The previews of the last seconds, kept for crash cards.
+//! Previews of the last seconds, stored for crash cards.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use vizflyt_protocol::time::ServerTime;
 
-/// Two small pictures for the page.
+/// Small images for the page.
 #[derive(Debug, Default)]
 pub struct Preview {
     /// JPEG of the colour image.
     pub colour: Vec<u8>,
     /// JPEG of the depth image, coloured by distance.
     pub depth: Vec<u8>,
-    /// JPEG of which object is seen where, coloured by id; empty where none was seen yet.
+    /// JPEG of the object ids, as colours; empty before any object was seen.
     pub ids: Vec<u8>,
-    /// What is ahead: [`vizflyt_arena::crash::ahead_m`]. [m, cam]
+    /// Clearance ahead: [`vizflyt_arena::crash::ahead_m`]. [m, cam]
     pub ahead_m: Option<f64>,
 }
 
-/// The newest previews of a vehicle, by camera.
+/// Newest previews of a vehicle, by camera.
 #[derive(Debug, Default)]
 pub struct RecentPreviews(Vec<VecDeque<TimedPreview>>);
 
-/// A preview, and the instant that it shows.
+/// Preview with the time that it shows.
 #[derive(Clone, Debug)]
 pub struct TimedPreview {
     pub(super) shown: ServerTime,
@@ -30,12 +30,12 @@ pub struct TimedPreview {
 }
 
 impl RecentPreviews {
-    /// Makes room for all that this many cameras will ever keep.
+    /// Allocates the memory for all previews of this many cameras.
     pub fn of(cameras: usize) -> Self {
         Self((0..cameras).map(|_| VecDeque::with_capacity(MAX_PREVIEWS)).collect())
     }
 
-    /// Adds a camera's preview, in place of the oldest where there is no room.
+    /// Adds a camera's preview; drops the oldest if the buffer is full.
     pub fn add(&mut self, camera: usize, shown: ServerTime, preview: Arc<Preview>) {
         let Some(kept) = self.0.get_mut(camera) else { return };
         if kept.len() == MAX_PREVIEWS {
@@ -44,7 +44,7 @@ impl RecentPreviews {
         kept.push_back(TimedPreview { shown, preview });
     }
 
-    /// Returns what each camera showed in the last [`SHOWN_S`] until `at`, oldest first.
+    /// Returns the previews of each camera in the last [`SHOWN_S`] until `at`, oldest first.
     pub(super) fn until(&self, at: ServerTime) -> Vec<Vec<TimedPreview>> {
         let is_shown =
             |shot: &&TimedPreview| (0.0..=SHOWN_S).contains(&at.seconds_since(shot.shown));
@@ -52,9 +52,9 @@ impl RecentPreviews {
     }
 }
 
-/// Images are shown over so long. [s]
+/// Time span of the images on a card. [s]
 const SHOWN_S: f64 = 2.0;
-/// Previews kept of a camera: [`SHOWN_S`] and the delay until a card is made, at 15 Hz.
+/// Maximum previews per camera: [`SHOWN_S`] and the delay until a card is made, at 15 Hz.
 const MAX_PREVIEWS: usize = 36;
 
 #[cfg(test)]
@@ -66,17 +66,17 @@ mod tests {
     }
 
     #[test]
-    fn two_seconds_of_previews_are_kept_and_no_more_memory_is_taken() {
+    fn keeps_two_seconds_of_previews_in_bounded_memory() {
         let mut shots = RecentPreviews::of(2);
         let room = shots.0[1].capacity();
         for k in 0..200_u32 {
             let preview = Arc::new(Preview { colour: vec![k as u8], ..Preview::default() });
             shots.add(1, shown(f64::from(k) / 15.0), preview.clone());
-            // A camera that is not there is nobody's.
+            // Previews of a camera that does not exist are ignored.
             shots.add(7, shown(f64::from(k) / 15.0), preview);
         }
         assert_eq!((shots.0[1].len(), shots.0[1].capacity()), (MAX_PREVIEWS, room));
-        // The end was 0.3 s ago: what came after it is not shown, what came in time is.
+        // The end was 0.3 s ago: later previews are not shown, earlier ones are.
         let end = shown(199.0 / 15.0 - 0.3);
         let found = shots.until(end);
         let times: Vec<f64> = found[1].iter().map(|shot| end.seconds_since(shot.shown)).collect();

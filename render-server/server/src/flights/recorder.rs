@@ -1,8 +1,8 @@
-//! Writes one vehicle's flights down: a run from its take-off, its verdict when it is decided, once more when
-//! the vehicle has landed.
+//! Records one vehicle's flights in the leaderboard: a run at its take-off, its verdict when it is decided, and
+//! again when the vehicle has landed.
 //!
-//! The verdict is the autograder's ([`vizflyt_arena::verdict`]): a lab flight and a graded one are judged by the
-//! same code.
+//! The verdict is the autograder's ([`vizflyt_arena::verdict`]): lab flights and graded flights are judged by
+//! the same code.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,8 +19,8 @@ use super::leaderboard::{Attempt, Leaderboard, LeaderboardError, NewRun, RunEnd}
 use super::vehicle::VehicleFlight;
 use vizflyt_process::lock;
 
-/// Follows a vehicle's flights until the task is dropped.
-/// A team's official runs beyond `most_official` are practice.
+/// Records a vehicle's flights until the task is dropped. Official runs of a team beyond `most_official` become
+/// practice.
 pub(crate) async fn record(
     board: Leaderboard,
     vehicle: Arc<VehicleFlight>,
@@ -40,10 +40,10 @@ pub(crate) async fn record(
             _ = beat.tick() => true,
         };
         if let Err(error) = recorder.follow(is_beat).await {
-            // A flight is worth more than its record: logged, and tried again at the next change.
+            // A failure must not stop the flight: it is logged, and tried again at the next change.
             warn!("{error}");
             if is_beat {
-                vehicle.note(&format!("this flight is not written down: {error}"));
+                vehicle.note(&format!("this flight is not recorded: {error}"));
             }
         }
     }
@@ -55,28 +55,29 @@ struct Recorder {
     arena: ArenaConfig,
     most_official: Option<u32>,
     run: Option<Running>,
-    /// Number of the flight that was written down last.
+    /// Number of the last recorded flight.
     last: Option<u64>,
 }
 
-/// The run under way.
+/// Present run.
 struct Running {
     id: String,
     /// Number of its flight.
     flight: u64,
-    /// When it was decided, by what was written down: reported then, when it is decided otherwise by
-    /// something earlier, and when landed.
+    /// Time of the recorded decision. The run is recorded again if an earlier event changes the decision, and after
+    /// the landing.
     decided: Option<ServerTime>,
 }
 
 impl Recorder {
     async fn follow(&mut self, is_beat: bool) -> Result<(), LeaderboardError> {
         let (number, flight) = (self.vehicle.flights(), self.vehicle.flight());
-        // Another runtime has sat down: the flight before is over, whatever became of it.
+        // Another runtime has taken over: the previous flight is over.
         if self.run.as_ref().is_some_and(|run| run.flight != number) {
             self.run = None;
         }
-        // Where it begins is known once it is in the air; one that never gets there begins when it has ended.
+        // The start position is known once the vehicle is in the air. A flight that does not get there is
+        // recorded when it has ended.
         let start_m = lock(&self.vehicle.samples).kept().first().map(|sample| sample.p_world_m);
         let has_begun = start_m.is_some()
             || self.arena.rules.start_box.is_none()
@@ -128,7 +129,7 @@ impl Recorder {
 }
 
 fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {
-    // The goal is the course's last stage for whoever reads a leaderboard.
+    // On the leaderboard, the goal counts as the last stage of the course.
     let goal = u32::from(arena.goal.is_some());
     let reached = if verdict.outcome == OutcomeKind::Finished { goal } else { 0 };
     RunEnd {
@@ -138,10 +139,10 @@ fn end(verdict: &Verdict, arena: &ArenaConfig) -> RunEnd {
         seconds: Some(verdict.seconds),
         penalty_s: verdict.penalty_s,
         min_clearance_m: verdict.min_clearance_m,
-        // Why: a verdict has string keys and finite or absent numbers.
+        // A verdict has string keys and finite or absent numbers.
         verdict: serde_json::to_string(verdict).unwrap_or_default(),
     }
 }
 
-/// Period of a run's marks that it is still flown.
+/// Interval of keep-alives of a run.
 const HEARD_EVERY: Duration = Duration::from_secs(10);

@@ -1,10 +1,10 @@
-//! Where one flight was, for its verdict: kept while it flies, 50 a second at most.
+//! Samples of one flight for its verdict, at most 50 per second.
 
 use glam::EulerRot;
 use vizflyt_arena::verdict::Sample;
 use vizflyt_protocol::messages::PoseSample;
 
-/// The samples of a flight, oldest first.
+/// Samples of a flight, oldest first.
 #[derive(Debug)]
 pub struct Samples {
     kept: Vec<Sample>,
@@ -19,8 +19,8 @@ impl Default for Samples {
 }
 
 impl Samples {
-    /// Adds where the vehicle is, if the last is long enough ago; with its clearance there, and the least of the
-    /// flight so far, swept. [m]
+    /// Adds a pose unless the last one is too recent, with the clearance at the pose, and the least swept
+    /// clearance of the flight so far. [m]
     pub fn add(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
         let last = self.kept.last().map(|sample| sample.stamp);
         if last.is_some_and(|last| pose.stamp.seconds_since(last) < self.apart_s) {
@@ -30,11 +30,11 @@ impl Samples {
         self.end(pose, clearance_m, least_clearance_m);
     }
 
-    /// Adds where the vehicle is at the end of its flight, however short ago the last was.
+    /// Adds the pose at the end of the flight, even if the last one is recent.
     pub fn end(&mut self, pose: &PoseSample, clearance_m: f64, least_clearance_m: f64) {
         self.least_clearance_m = least_clearance_m;
         if self.kept.len() >= MAX_SAMPLES {
-            // An hour in the air keeps its shape at half the rate.
+            // Halves the rate, so that an hour in the air keeps its shape.
             let mut keep = false;
             self.kept.retain(|_| {
                 keep = !keep;
@@ -42,7 +42,7 @@ impl Samples {
             });
             self.apart_s *= 2.0;
         }
-        // All at once: growing would copy megabytes between two poses. What is not used yet is no memory.
+        // Allocated at once: growing would copy megabytes between two poses. Unused pages take no memory.
         self.kept.reserve_exact(MAX_SAMPLES - self.kept.len());
         self.kept.push(Sample {
             stamp: pose.stamp,
@@ -53,20 +53,19 @@ impl Samples {
         });
     }
 
-    /// Returns them.
     pub fn kept(&self) -> &[Sample] {
         &self.kept
     }
 
-    /// Returns the least clearance of the flight so far, swept between all poses; `None` before it. [m]
+    /// Returns the least clearance of the flight so far, swept between all poses; `None` before the first. [m]
     pub fn least_clearance_m(&self) -> Option<f64> {
         self.least_clearance_m.is_finite().then_some(self.least_clearance_m)
     }
 }
 
-/// 50 Hz: 10 cm at 5 m/s.
+/// Minimum time between samples: 50 Hz, 10 cm at 5 m/s.
 const MIN_APART_S: f64 = 0.019;
-/// A quarter of an hour at 50 Hz: 4 MB.
+/// Maximum samples: a quarter of an hour at 50 Hz, 4 MB.
 const MAX_SAMPLES: usize = 45_000;
 
 #[cfg(test)]
@@ -77,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn memory_is_bounded_and_the_flight_keeps_its_ends() {
+    fn memory_is_bounded_and_both_ends_are_kept() {
         let mut samples = Samples::default();
         let start = ServerTime::from_ns(1);
         for n in 0..200_000_u32 {
@@ -90,7 +89,7 @@ mod tests {
         assert!(kept.is_sorted_by(|a, b| a.stamp < b.stamp));
         assert!(kept[0].p_world_m.x < 100.0 && kept[kept.len() - 1].p_world_m.x > 199_900.0);
         assert_eq!(samples.least_clearance_m(), Some(0.5));
-        // The moment of the end is kept, though the last was a millisecond before.
+        // The last pose is added, although the one before is a millisecond older.
         let (count, last) = (kept.len(), kept[kept.len() - 1].stamp.plus_seconds(0.001));
         let end = PoseSample::still(last, Pose::new(glam::DVec3::X, glam::DQuat::IDENTITY));
         samples.add(&end, -0.01, -0.01);

@@ -1,9 +1,9 @@
-//! Where a vehicle was, for the page.
+//! Track of a vehicle, for the page.
 
 use glam::Vec3;
 use vizflyt_protocol::messages::PoseSample;
 
-/// The path of the vehicle since the flight began, thinned so that it stays small for ever.
+/// Path of the vehicle since the flight began, thinned to a bounded size.
 #[derive(Debug)]
 pub struct Track {
     /// (x, y, z [m, world], speed [m/s]), oldest first.
@@ -18,7 +18,7 @@ impl Default for Track {
 }
 
 impl Track {
-    /// Adds where the vehicle is, if it has moved enough.
+    /// Adds a pose, if the vehicle has moved enough.
     pub fn add(&mut self, sample: &PoseSample) {
         let p = sample.world_from_body.translation_m.as_vec3();
         let far = self
@@ -39,15 +39,15 @@ impl Track {
         self.points.push([p.x, p.y, p.z, sample.twist.linear_mps.length() as f32]);
     }
 
-    /// Forgets it.
+    /// Clears the track.
     pub(super) fn clear(&mut self) {
         *self = Self::default();
     }
 }
 
-/// About the vehicle's radius. [m]
+/// Minimum spacing: about the vehicle's radius. [m]
 const MIN_SPACING_M: f32 = 0.05;
-/// 32 KB; 100 m of path at the finest spacing.
+/// Maximum points: 32 KB; 100 m of path at the finest spacing.
 const MAX_POINTS: usize = 2048;
 
 #[cfg(test)]

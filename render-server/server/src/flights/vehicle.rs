@@ -1,4 +1,4 @@
-//! One vehicle's flight: who controls it, its events, its course through the room, and its outcome.
+//! Flight of one vehicle: control, events, track, and outcome.
 //!
 //! ```text
 //! pose thread -> track, samples, events --> session, page
@@ -6,7 +6,7 @@
 //! session -----> telemetry (watch), events -> page, pose thread (phase of flight)
 //! page --------> events (stop button) ----> session
 //! ```
-//! Telemetry is latest-wins; events are a log that every reader reads whole.
+//! Telemetry is latest-wins; events are a log that every reader reads completely.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -30,50 +30,50 @@ use super::track::Track;
 use crate::clock;
 use vizflyt_process::lock;
 
-/// One vehicle in the arena.
+/// Vehicle in the arena.
 #[derive(Debug)]
 pub struct VehicleFlight {
-    /// Its index in the state of every room.
+    /// Index of the vehicle in the state of every room.
     pub index: usize,
-    /// The object in the localization system.
+    /// Name of the vehicle, by default also of its object in the localization system.
     pub name: Name,
-    /// The arena as the runtime receives it; its cameras are those of the start.
+    /// Arena as sent to the runtime, with the cameras at the start.
     pub arena: ArenaInfo,
-    /// The events of all its flights.
+    /// Events of all flights.
     pub events: EventLog,
-    /// The runtime's newest report.
+    /// Newest report of the runtime.
     pub telemetry: watch::Sender<Option<Telemetry>>,
-    /// What the runtime's guard keeps it within, as reported.
+    /// Limits and fence of the runtime's guard, as reported.
     pub guarded: watch::Sender<Option<Guarded>>,
-    /// The server's events up to this number have reached the runtime; of the newest runtime.
+    /// Number of the last server event that the newest runtime has received.
     pub received: watch::Sender<u64>,
-    /// The previews of the last seconds.
+    /// Previews of the last seconds.
     pub previews: Mutex<RecentPreviews>,
-    /// The crash card of its last failed flight.
+    /// Crash card of the last failed flight.
     pub crash: watch::Sender<Option<Arc<CrashCard>>>,
-    /// Where it was in this flight, for the page.
+    /// Positions in this flight, for the page.
     pub track: Mutex<Track>,
-    /// Where it was in this flight, for its verdict.
+    /// Positions in this flight, for its verdict.
     pub samples: Mutex<Samples>,
-    /// The team whose its next flights are.
+    /// Team of the next flights.
     pub checked_in: Mutex<Option<CheckIn>>,
     leases: Leases,
     flight: Mutex<Flight>,
 }
 
-/// How the present flight goes.
+/// State of the present flight.
 #[derive(Clone, Debug, Default)]
 pub struct Flight {
-    /// When the runtime first reported taking off.
+    /// Time of the runtime's first report of a take-off.
     pub took_off: Option<ServerTime>,
-    /// When it first reported having landed.
+    /// Time of its first report after landing.
     pub landed: Option<ServerTime>,
-    /// How it ends, by all that happened so far.
+    /// End of the flight, from all events so far.
     pub end: FlightEnd,
 }
 
 impl VehicleFlight {
-    /// Returns the state of a vehicle that has not flown yet.
+    /// Creates the state of a vehicle before its first flight.
     pub fn new(index: usize, name: &str, arena: ArenaInfo) -> Self {
         let cameras = arena.cameras.len();
         Self {
@@ -97,27 +97,27 @@ impl VehicleFlight {
     /// Grants control to a runtime; see [`Leases::take_control`].
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn take_control(&self, hello: &Hello, address: SocketAddr) -> Result<ControlLease, String> {
         let (now, under_way) = (clock::now(), self.under_way());
         self.leases.take_control(&self.name, hello, address, now, under_way, || self.begin())
     }
 
-    /// Lets a watcher join.
+    /// Adds a watcher.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn watch(&self) -> Result<WatchLease, String> {
         self.leases.watch(&self.name)
     }
 
-    /// Appends to the log what the server or the runtime noticed.
+    /// Appends an event of the server or the runtime to the log.
     pub fn log(&self, origin: Origin, event: Event) {
         lock(&self.flight).end.handle(event.stamp, &event.kind);
         self.events.push(origin, event);
     }
 
-    /// Takes the runtime's report.
+    /// Processes the runtime's report.
     pub fn report(&self, report: Telemetry) {
         let now = clock::now();
         let phase = report.phase;
@@ -130,12 +130,12 @@ impl VehicleFlight {
         }
     }
 
-    /// Returns how the present flight goes.
+    /// Returns the state of the present flight.
     pub fn flight(&self) -> Flight {
         lock(&self.flight).clone()
     }
 
-    /// Returns what happened in the present flight, in order; of a very long story the end.
+    /// Returns the events of the present flight, in order; only the newest if there are too many.
     pub fn events_of_flight(&self) -> Vec<Event> {
         let mut cursor = self.first_event();
         let entries = self.events.read(&mut cursor).unwrap_or_else(|lagged| {
@@ -145,12 +145,12 @@ impl VehicleFlight {
         entries.into_iter().map(|entry| entry.event).collect()
     }
 
-    /// Judges the present flight by all that happened so far.
+    /// Judges the present flight by all events so far.
     pub fn verdict(&self, arena: &ArenaConfig) -> Verdict {
         let events = self.events_of_flight();
         let samples = lock(&self.samples);
         let mut verdict = judge_ended(arena, &self.flight().end, &events, samples.kept());
-        // Samples are 20 ms apart; what lay between them was swept.
+        // Samples are 20 ms apart; the clearance between them was swept.
         if let (Some(sampled_m), Some(swept_m)) =
             (verdict.min_clearance_m, samples.least_clearance_m())
         {
@@ -159,19 +159,19 @@ impl VehicleFlight {
         verdict
     }
 
-    /// Logs something this server noticed; it goes to the runtime, the page and standard output.
+    /// Logs an event of this server, for the runtime, the page and standard output.
     pub fn publish(&self, kind: EventKind, text: &str) {
         let event = Event { stamp: clock::now(), kind, text: bounded(text) };
         self.log(Origin::Server, event);
     }
 
-    /// Logs something for the page alone; the runtime has no use for it.
+    /// Logs a note only for the page.
     pub fn note(&self, text: &str) {
         let event = Event { stamp: clock::now(), kind: EventKind::Note, text: bounded(text) };
         self.log(Origin::Page, event);
     }
 
-    /// Returns the phase of flight by the runtime's newest report.
+    /// Returns the phase of flight from the runtime's newest report.
     pub fn phase(&self) -> FlightPhase {
         self.telemetry.borrow().as_ref().map_or(FlightPhase::Connecting, |report| report.phase)
     }
@@ -181,7 +181,7 @@ impl VehicleFlight {
         self.leases.holder()
     }
 
-    /// Returns how many flights have begun: rises when a runtime takes control on the ground.
+    /// Returns the number of flights begun; it rises when a runtime takes control on the ground.
     pub fn flights(&self) -> u64 {
         self.leases.flights()
     }
@@ -191,16 +191,16 @@ impl VehicleFlight {
         self.leases.first_event()
     }
 
-    /// Presses the stop button; returns whether a runtime is there to obey.
+    /// Triggers the emergency stop; returns whether a runtime is connected.
     pub fn emergency_stop(&self, by: &str) -> bool {
         self.publish(EventKind::EmergencyStop, &format!("emergency stop pressed on {by}: land"));
         self.runtime().is_some()
     }
 
-    /// Lets a runtime that waits for it take off.
+    /// Starts a runtime that waits for its start.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn start(&self, by: &str) -> Result<(), String> {
         if self.runtime().is_none() {
             return Err(format!("no runtime flies '{}'; start one with --wait", self.name));
@@ -220,19 +220,19 @@ impl VehicleFlight {
     /// Ends the flight: the vehicle brakes, then lands.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn land(&self, by: &str) -> Result<(), String> {
         if self.runtime().is_none() {
-            return Err(format!("no runtime flies '{}': nobody to land it", self.name));
+            return Err(format!("no runtime flies '{}', so it cannot be landed", self.name));
         }
         self.publish(EventKind::Land, &format!("land pressed on {by}"));
         Ok(())
     }
 
-    /// Begins the run anew, on the ground: course, clock, path and figures.
+    /// Restarts the run on the ground: course, clock, track and statistics.
     ///
     /// # Errors
-    /// The reason to refuse, for a person.
+    /// Reason of the refusal, for the user.
     pub fn reset(&self, by: &str) -> Result<(), String> {
         let refuse = || {
             self.under_way()
@@ -243,7 +243,7 @@ impl VehicleFlight {
         Ok(())
     }
 
-    /// Forgets the former flight; returns the index of the first event of the new one.
+    /// Resets the flight's state; returns the index of the first event of the new flight.
     fn begin(&self) -> u64 {
         self.telemetry.send_replace(None);
         self.guarded.send_replace(None);
@@ -253,14 +253,14 @@ impl VehicleFlight {
         self.events.next_index()
     }
 
-    /// Whether a flight had begun and not ended by its runtime's newest report.
+    /// Returns whether the runtime's newest report is of a flight in progress.
     pub fn under_way(&self) -> bool {
         use FlightPhase::{Flying, Holding, Landing, TakingOff};
         matches!(self.phase(), TakingOff | Flying | Holding | Landing)
     }
 }
 
-/// Returns the phase in a word or two.
+/// Returns the phase as text.
 fn word(phase: FlightPhase) -> &'static str {
     match phase {
         FlightPhase::Connecting => "connecting",

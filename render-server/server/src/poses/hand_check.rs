@@ -1,13 +1,13 @@
-//! The check by hand: poses of a vehicle that somebody carries in, the setting to change out. Sans-IO.
+//! Check by hand: determines wrong pose settings from motions of a vehicle that a person carries. Sans-IO.
 //!
 //! ```text
 //! it stands -> lift it -> push it forward -> turn it left -> raise its nose -> (raise its left side)
 //! ```
-//! A motion is over when the vehicle rests again; how far it went does not matter, so that wrong units
-//! are no hindrance. The poses at rest are converted back to the stream's own values, and every setting
-//! that there is (units, axes, body, quaternion, order of angles) is tried on it; where the nose points in
-//! the object follows from the push. The smallest change under which all motions look as they were done
-//! is the answer. The last motion is asked for only where several changes of the same size would do.
+//! A motion ends when the vehicle rests again. Its size does not matter, so that wrong units are no obstacle.
+//! The poses at rest are converted back to the values of the stream, and every combination of settings (units,
+//! axes, body, quaternion, order of angles) is tried on them. The direction of the nose in the object follows
+//! from the push. The result is the smallest change for which all motions look as requested. The last motion is
+//! requested only if several changes of the same size fit.
 
 pub mod description;
 
@@ -22,27 +22,27 @@ use vizflyt_protocol::geometry::{Body, Pose, World, wrap_pi, yaw_of};
 
 use self::description::direction;
 
-/// What is to be done next.
+/// Next step of the check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HandCheckStep {
-    /// It stands on the floor.
+    /// Place it on the floor.
     Stand,
-    /// Somebody lifts it,
+    /// Lift it.
     Lift,
-    /// pushes it the way its nose points,
+    /// Push it in the direction of its nose.
     Push,
-    /// turns it left by a quarter,
+    /// Turn it left by a quarter turn.
     Turn,
-    /// and raises its nose;
+    /// Raise its nose.
     Nose,
-    /// its left side only if that was not enough to tell settings apart.
+    /// Raise its left side; only if the earlier steps do not distinguish the settings.
     Roll,
-    /// All was seen.
+    /// All steps are complete.
     Done,
 }
 
 impl HandCheckStep {
-    /// Returns what a person is asked to do.
+    /// Returns the instruction for the user.
     pub fn ask(self) -> &'static str {
         match self {
             Self::Stand => "put it on the floor and let go",
@@ -61,48 +61,47 @@ impl HandCheckStep {
     }
 }
 
-/// The result of the check.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Diagnosis {
-    /// The faults, in sentences; empty if there are none.
+    /// Faults as sentences; empty if there are none.
     pub faults: Vec<String>,
-    /// Settings to change. Empty, too, if none would help.
+    /// Settings to change; also empty if no change would help.
     pub change: Change,
-    /// Other changes of the same size that would explain all that was seen as well.
+    /// Other changes of the same size that would explain all motions as well.
     pub others: Vec<Change>,
 }
 
-/// Settings to change: key and value.
+/// Settings to change, as key and value.
 pub type Change = Vec<(&'static str, String)>;
 
-/// Follows the motions.
+/// State of a check.
 #[derive(Debug)]
 pub struct Check {
     config: LocalizationConfig,
     step: HandCheckStep,
-    /// The last moments. [s]
+    /// Poses of the last [`REST_S`], with their times. [s]
     window: VecDeque<(f64, Pose<World, Body>)>,
-    /// Where it rested after each step.
+    /// Pose at rest after each step.
     rests: Vec<Pose<World, Body>>,
 }
 
 impl Check {
-    /// Begins; poses will come as these settings make them.
+    /// Starts a check; poses must be converted with these settings.
     pub fn new(config: LocalizationConfig) -> Self {
         Self { config, step: HandCheckStep::Stand, window: VecDeque::new(), rests: Vec::new() }
     }
 
-    /// Returns what is to be done.
+    /// Returns the current step.
     pub fn step(&self) -> HandCheckStep {
         self.step
     }
 
-    /// Takes a pose; returns whether a step was seen to its end. [s]
+    /// Processes a pose at time `at_s` [s]. Returns whether a step is complete.
     pub fn handle_pose(&mut self, at_s: f64, pose: &Pose<World, Body>) -> bool {
         if self.step == HandCheckStep::Done || !pose.is_valid() {
             return false;
         }
-        // Enough to judge by at any rate, and no more than fits.
+        // Limits the number of samples; enough to judge at any source rate.
         if self.window.back().is_none_or(|(last_s, _)| at_s - last_s >= SAMPLE_S) {
             self.window.push_back((at_s, *pose));
         }
@@ -126,7 +125,7 @@ impl Check {
         true
     }
 
-    /// Returns where it rests, if it does.
+    /// Returns the pose at rest; `None` while it moves.
     fn rest(&self) -> Option<Pose<World, Body>> {
         let (first, last) = (self.window.front()?, self.window.back()?);
         if self.window.len() < MIN_SAMPLES || last.0 - first.0 < REST_S * 0.9 {
@@ -141,8 +140,8 @@ impl Check {
         let off = |(_, pose): &(f64, Pose<World, Body>)| (pose.translation_m - middle).length();
         let extent = self.window.iter().map(off).fold(0.0, f64::max);
         let drift = (mean(count / 2, count) - mean(0, count / 2)).length();
-        // Noise goes to and fro, motion goes on: that holds in any unit. What is little beside the
-        // motions before is rest, too.
+        // Noise changes direction, motion continues in one: this holds in any unit. A motion that is small
+        // compared with the earlier ones also counts as rest.
         let far = self.rests.iter().map(|rest| (rest.translation_m - middle).length());
         let far = far.fold(0.0, f64::max);
         let rests = drift <= 0.25 * extent || extent <= 0.03 * far;
@@ -153,7 +152,7 @@ impl Check {
         (rests && turned_rad < STILL_RAD).then(|| Pose::new(middle, last.1.rotation))
     }
 
-    /// Returns whether the step's motion lies between the last rest and this one.
+    /// Returns whether the motion of this step lies between the last rest and this one.
     fn has_moved(&self, rest: &Pose<World, Body>) -> bool {
         let Some(last) = self.rests.last() else { return true };
         let moved = (rest.translation_m - last.translation_m).length();
@@ -165,7 +164,7 @@ impl Check {
         match self.step {
             HandCheckStep::Stand | HandCheckStep::Done => true,
             HandCheckStep::Lift => moved > 20.0 * noise + f64::MIN_POSITIVE,
-            // The lift has shown how much a motion is.
+            // The lift shows the size of a motion in the stream's unit.
             HandCheckStep::Push => moved > 0.3 * self.lifted(),
             HandCheckStep::Turn => turned_rad > MIN_TURN_RAD,
             HandCheckStep::Nose | HandCheckStep::Roll => turned_rad > MIN_NOSE_RAD,
@@ -179,7 +178,7 @@ impl Check {
         }
     }
 
-    /// Returns what the last step looked like.
+    /// Returns a description of the last motion.
     pub fn seen(&self) -> String {
         let moved = |a: &Pose<World, Body>, b: &Pose<World, Body>| {
             let v = b.translation_m - a.translation_m;
@@ -191,7 +190,7 @@ impl Check {
             [a, b] | [_, a, b] => moved(a, b),
             [.., a, b] => {
                 let turned = (b.rotation * a.rotation.conjugate()).normalize();
-                // The short way round.
+                // The shorter rotation.
                 let turned = if turned.w < 0.0 { -turned } else { turned };
                 let turned = turned.to_scaled_axis();
                 let degrees = turned.length().to_degrees();
@@ -200,7 +199,7 @@ impl Check {
         }
     }
 
-    /// Returns what is wrong, when all was seen.
+    /// Returns the diagnosis after all steps.
     pub fn diagnosis(&self) -> Diagnosis {
         let faults = faults(&self.rests);
         if faults.is_empty() {
@@ -215,7 +214,8 @@ impl Check {
         let mut told = vec![best];
         for trial in fitting {
             let is_as_small = self.change_to(&trial).len() == change.len();
-            // Orders of angles that differ by less than hands show are told apart by what vendors use.
+            // Among orders of angles that differ too little to be measured by hand, the vendors' usual ones are
+            // kept.
             let is_usual = USUAL_EULERS.contains(&trial.euler) || trial.euler == best.euler;
             if is_as_small && is_usual && told.iter().all(|other| !self.is_same(other, &trial)) {
                 told.push(trial);
@@ -225,13 +225,13 @@ impl Check {
         Diagnosis { faults, change, others }
     }
 
-    /// Returns every combination of settings but for the nose.
+    /// Returns every combination of settings except the nose.
     fn trials(&self) -> impl Iterator<Item = Trial> {
         let driver = self.config.driver;
         let eulers = if driver == Driver::Vicon { &Euler::ALL[..] } else { &Euler::ALL[..1] };
         let quaternions = &Quaternion::ALL[..if driver.has_quaternions() { 4 } else { 1 }];
         let laid = Axes::all().flat_map(|axes| {
-            // A mirror has no body by name.
+            // The named body axes do not apply to a mirrored frame.
             let bodies = &BodyAxes::ALL[..if axes.is_mirror() { 1 } else { 3 }];
             bodies.iter().map(move |&body| (axes, body))
         });
@@ -251,11 +251,11 @@ impl Check {
         })
     }
 
-    /// Returns a combination with every nose, named or as the push shows it, under which all looks as it was
-    /// done.
+    /// Returns a trial with every nose (named, or as measured from the push) for which all motions look as
+    /// requested.
     fn fit(&self, trial: &Trial) -> Vec<Trial> {
         let rests = self.under(trial);
-        // With the nose along x: the rest of it turns nothing but the body about its own up.
+        // Assumes the nose along x: another nose only turns the body about its own vertical axis.
         if !stands_and_rises(&rests) {
             return Vec::new();
         }
@@ -265,7 +265,7 @@ impl Check {
         let seen = Nose::from_deg(ahead.y.atan2(ahead.x).to_degrees().round());
         let mut noses = vec![self.config.nose];
         noses.extend(Nose::NAMED.into_iter().filter(|nose| *nose != self.config.nose));
-        // A hand pushes no straighter: what has a name is meant.
+        // A push by hand is not straighter: within this tolerance the named direction is used.
         if noses.iter().all(|nose| apart_deg(*nose, seen) > STRAIGHT_DEG) {
             noses.push(seen);
         }
@@ -284,7 +284,7 @@ impl Check {
         }
     }
 
-    /// Returns the rests as other settings had made them.
+    /// Returns the poses at rest, converted with the settings of a trial.
     fn under(&self, trial: &Trial) -> Vec<Pose<World, Body>> {
         let (was, would) = (self.config.alignment(), self.with(trial).alignment());
         let again = |pose: &Pose<World, Body>| {
@@ -294,7 +294,7 @@ impl Check {
         self.rests.iter().map(again).collect()
     }
 
-    /// Returns the settings with a trial's in their place.
+    /// Returns the settings with the values of a trial.
     fn with(&self, trial: &Trial) -> LocalizationConfig {
         LocalizationConfig {
             units: Some(trial.units),
@@ -307,7 +307,7 @@ impl Check {
         }
     }
 
-    /// Returns a streamed rotation with its angles in a trial's order.
+    /// Returns a streamed rotation with its angles in the order of a trial.
     fn reread(&self, trial: &Trial, rotation: DQuat) -> DQuat {
         if self.config.driver == Driver::Vicon {
             trial.euler.rotation(self.now().euler.angles(rotation))
@@ -316,8 +316,8 @@ impl Check {
         }
     }
 
-    /// Whether two trials make the same poses of any stream, but for which wall is called x, which nobody's
-    /// carrying shows, and for noses within a push of each other.
+    /// Returns whether two trials give the same poses for any stream. Ignored are the choice of the x axis,
+    /// which this check cannot determine, and noses that differ by less than the accuracy of a push.
     fn is_same(&self, a: &Trial, b: &Trial) -> bool {
         let nose = if apart_deg(a.nose, b.nose) > STRAIGHT_DEG { b.nose } else { a.nose };
         let b = Trial { nose, ..*b };
@@ -341,7 +341,7 @@ impl Check {
             })
     }
 
-    /// How much a trial changes: one for each setting, a little for what is less usual.
+    /// Returns the cost of a trial: one per changed setting, plus a little for unusual values.
     fn cost(&self, trial: &Trial) -> f64 {
         let now = self.now();
         let mut cost = 0.0;
@@ -405,7 +405,6 @@ impl Check {
     }
 }
 
-/// One combination of settings.
 #[derive(Clone, Copy, Debug)]
 struct Trial {
     units: Units,
@@ -416,7 +415,7 @@ struct Trial {
     euler: Euler,
 }
 
-/// Returns how far a vehicle was pushed, and its mean attitude on the way. [m, world]
+/// Returns the displacement of the push, and the mean attitude during it. [m, world]
 fn push(lifted: &Pose<World, Body>, pushed: &Pose<World, Body>) -> (DVec3, DQuat) {
     let ahead = pushed.translation_m - lifted.translation_m;
     (ahead, lifted.rotation.slerp(pushed.rotation, 0.5))
@@ -427,14 +426,14 @@ fn apart_deg(a: Nose, b: Nose) -> f64 {
     wrap_pi((a.deg() - b.deg()).to_radians()).abs().to_degrees()
 }
 
-/// Whether it stands with its up up, and was lifted upwards.
+/// Returns whether the vehicle stands upright and was lifted upwards.
 fn stands_and_rises(rests: &[Pose<World, Body>]) -> bool {
     let [stood, lifted, ..] = rests else { return false };
     let lift = lifted.translation_m - stood.translation_m;
     stood.rotate(DVec3::Z).z > NEARLY && lift.z > NEARLY * lift.length()
 }
 
-/// Returns what does not look as it was done.
+/// Returns the motions that do not look as requested.
 fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
     let [stood, lifted, pushed, turned, raised, rolled @ ..] = rests else {
         return vec!["not all was done".to_owned()];
@@ -493,36 +492,37 @@ fn faults(rests: &[Pose<World, Body>]) -> Vec<String> {
     faults
 }
 
-/// Returns a length in words, however wrong its unit may be. [m]
+/// Formats a length, in mm if it is short.
 fn length(m: f64) -> String {
     if m < 0.01 { format!("{:.2} mm", m * 1e3) } else { format!("{m:.2} m") }
 }
 
-/// Rest lasts so long. [s]
+/// Minimum duration of rest. [s]
 const REST_S: f64 = 0.8;
-/// The window's samples are this far apart; 40 Hz at most. [s]
+/// Minimum time between samples of the window: at most 40 Hz. [s]
 const SAMPLE_S: f64 = 0.025;
-/// 10 Hz is enough.
+/// Minimum samples of a rest; satisfied from 10 Hz.
 const MIN_SAMPLES: usize = 7;
-/// A hand trembles by less. [rad]
+/// Maximum rotation at rest: more than the tremor of a hand. [rad]
 const STILL_RAD: f64 = 0.06;
-/// A turn is at least 40 degrees, a raised nose 12. [rad]
+/// Minimum turn of 40 degrees, and minimum raise of the nose of 12 degrees. [rad]
 const MIN_TURN_RAD: f64 = 0.7;
 const MIN_NOSE_RAD: f64 = 0.21;
-/// How far a quarter turn by hand may be off: 35 degrees. [rad]
+/// Maximum error of a quarter turn by hand: 35 degrees. [rad]
 const QUARTER_OFF_RAD: f64 = 0.61;
-/// Cosine of 30 degrees: so far a hand's motion may be off an axis.
+/// Cosine of 30 degrees: maximum error of a motion along an axis.
 const NEARLY: f64 = 0.866;
-/// Vendors use these; the others are tried as well.
+/// Orders of angles that vendors use; the others are tried as well.
 const USUAL_EULERS: [Euler; 3] = [Euler::Xyz, Euler::Zyx, Euler::Vector];
-/// So straight does a hand push. [deg]
+/// Maximum error of a push's direction. [deg]
 const STRAIGHT_DEG: f64 = 15.0;
-/// Relative difference of what is the same.
+/// Maximum relative difference of equal poses.
 const SAME: f64 = 1e-6;
-/// Axes times angles, and places, by which combinations of settings are told apart; of no symmetry.
+/// Rotation vectors, also used as positions, by which combinations of settings are distinguished. They have no
+/// symmetry.
 const PROBES: [[f64; 3]; 4] =
     [[0.3, -0.7, 1.1], [1.9, 0.2, -0.4], [-0.6, 1.3, 0.5], [0.1, 0.4, -2.3]];
-/// What "half a metre or so" may be; centimetres and millimetres are a factor of ten apart. [m]
+/// Accepted length for "half a metre or so"; centimetres and millimetres differ by a factor of ten. [m]
 const HAND_M: (f64, f64) = (0.15, 1.5);
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
-//! Whether a source's poses are young and many enough for `[pose]`: what each source delivered in, one sentence
-//! about each that leaves no margin out. Sans-IO, looked at ten times a second.
+//! Warning about sources whose latency or rate leaves no margin for the limits of `[pose]`. Sans-IO, called ten
+//! times a second.
 
 use vizflyt_arena::pose::{MAX_SOURCES, SourceQuality};
 use vizflyt_protocol::messages::{MAX_ALLOWANCE_S, PoseAges};
 use vizflyt_protocol::time::ServerTime;
 
-/// Follows the sources of one vehicle.
+/// Margins of the sources of one vehicle.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct MarginWatch {
     sources: [Watched; MAX_SOURCES],
@@ -13,13 +13,13 @@ pub(super) struct MarginWatch {
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Watched {
-    /// Since when it has come without a pause.
+    /// Start of the present period without a pause.
     since: Option<ServerTime>,
     judged: bool,
 }
 
 impl MarginWatch {
-    /// Takes what a source delivered; returns what a person should know of it, once, when its rate is settled.
+    /// Checks a source; returns a warning once, when its rate has settled.
     pub(super) fn judge(
         &mut self,
         now: ServerTime,
@@ -42,8 +42,8 @@ impl MarginWatch {
     }
 }
 
-/// Returns the sentence for a source after which the vehicle holds though no more than one pose was lost: what is allowed
-/// for delay and rate does not suffice.
+/// Returns a warning if the vehicle would hold after at most one lost pose, because the allowance for delay and
+/// rate is not sufficient.
 fn no_margin(source: &SourceQuality, ages: &PoseAges) -> Option<String> {
     let PoseAges { hold_after_s, land_after_s } = *ages;
     let (latency_s, interval_s) = (source.latency_ms * 1e-3, 1.0 / source.rate_hz);
@@ -53,7 +53,7 @@ fn no_margin(source: &SourceQuality, ages: &PoseAges) -> Option<String> {
         hold if latency_s + 2.0 * interval_s > hold => "the vehicle will hold at each lost pose",
         _ => return None,
     };
-    // A lost pose, and one that is late, with all that is allowed.
+    // One lost pose and one late pose, with the full allowance.
     let most_s = f64::from(MAX_ALLOWANCE_S);
     let enough_s = latency_s + 3.0 * interval_s - latency_s.min(most_s);
     let enough_s = (enough_s * 100.0 - ROUNDED).ceil() / 100.0;
@@ -69,9 +69,9 @@ fn no_margin(source: &SourceQuality, ages: &PoseAges) -> Option<String> {
     ))
 }
 
-/// A rate is settled after so long. [s]
+/// Time until a rate has settled. [s]
 const SETTLED_S: f64 = 4.0;
-/// A share of a hundredth of a second that is no reason for one more.
+/// Fraction of a hundredth of a second that is not rounded up.
 const ROUNDED: f64 = 0.2;
 
 #[cfg(test)]
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn late_or_rare_poses_are_told() {
+    fn warns_of_late_or_rare_poses() {
         assert_eq!(
             no_margin(&source(420.0, 20.0), &AGES).unwrap(),
             "source vicon: 420 ms latency at 20 Hz leaves no margin before [pose] hold_after_s = 0.15: raise it \
@@ -102,19 +102,19 @@ mod tests {
         check(360.0, 20.0, Some("at least 0.21, or the vehicle will hold at each lost pose"));
         check(650.0, 10.0, Some("at least 0.65 (and land_after_s = 0.5 above that)"));
         check(5.0, 4.0, Some("5 ms latency at 4 Hz"));
-        // What is allowed suffices.
+        // The allowance is sufficient.
         for (latency_ms, rate_hz) in [(5.0, 200.0), (120.0, 20.0), (300.0, 20.0), (2.0, 10.0)] {
             check(latency_ms, rate_hz, None);
         }
     }
 
     #[test]
-    fn each_source_is_told_once_when_its_rate_is_settled() {
+    fn warns_once_per_source_when_its_rate_has_settled() {
         let mut watch = MarginWatch::default();
         let at = |seconds: f64| ServerTime::ZERO.plus_seconds(seconds);
         let late = source(420.0, 20.0);
         assert_eq!(watch.judge(at(1.0), &late, &AGES), None);
-        // A pause: it begins anew.
+        // After a pause, the time starts again.
         assert_eq!(watch.judge(at(3.0), &source(0.0, 0.0), &AGES), None);
         assert_eq!(watch.judge(at(5.5), &late, &AGES), None);
         assert_eq!(watch.judge(at(9.0), &late, &AGES), None);

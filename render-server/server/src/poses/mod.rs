@@ -1,12 +1,12 @@
-//! Where the vehicles are: drivers of localization systems, and the thread that fuses and judges.
+//! Localization: drivers of localization systems, and the thread that fuses and judges poses.
 //!
 //! ```text
 //! in   packets of Vicon, NatNet, JSON, MAVLink, VRPN; IMU readings of the autopilots
 //! out  each vehicle's newest pose, its quality, the drivers' counters;
 //!      to `flights`: the referee's events, track and samples
-//!      to `render`: that there is a newer pose
+//!      to `render`: a signal for each new pose
 //! ```
-//! Imports `flights`, and `scene` for the file that names the sources.
+//! Imports `flights`, and `scene` for the file that contains the sources.
 
 pub mod drivers;
 pub mod hand_check;
@@ -24,23 +24,23 @@ use crate::poses::drivers::SourceCounters;
 use crate::poses::newest::NewestPoses;
 use crate::timing::StageDurations;
 
-/// The localization of all vehicles.
+/// Poses and sources of all vehicles.
 #[derive(Debug)]
 pub struct Localization {
-    /// One for each vehicle, at its index.
+    /// Poses by index of the vehicle.
     pub vehicles: Vec<VehiclePose>,
-    /// What the sources of poses are called, by their index.
+    /// Names of the pose sources, by index.
     pub source_names: Vec<String>,
-    /// What the sources delivered, of all vehicles.
+    /// Counters of the sources, summed over all vehicles.
     pub counters: Mutex<SourceCounters>,
-    /// Filled with each new pose: wakes the render thread.
+    /// Filled with each new pose; wakes the render thread.
     pub accepted: Mailbox<()>,
-    /// From the arrival of a pose to the end of filter and referee.
+    /// Time from the arrival of a pose to the end of filter and referee.
     pub durations: StageDurations,
 }
 
 impl Localization {
-    /// Returns the state of vehicles that have not been seen yet.
+    /// Creates the state of vehicles without a pose.
     pub fn new(vehicles: usize, source_names: Vec<String>) -> Self {
         Self {
             vehicles: (0..vehicles).map(|_| VehiclePose::default()).collect(),

@@ -12,12 +12,12 @@ pub type NewestPoses = [Option<Localized>; MAX_VEHICLES];
 pub struct Localized {
     /// The newest accepted pose.
     pub sample: PoseSample,
-    /// The motion by all measurements until then.
+    /// The motion estimated from all measurements up to then.
     pub motion: Motion,
 }
 
 impl Localized {
-    /// Makes that of a vehicle that stands still.
+    /// Creates the state of a vehicle at rest.
     pub fn still(sample: PoseSample) -> Self {
         Self { sample, motion: Motion::at_rest(sample.stamp, sample.world_from_body) }
     }

@@ -1,11 +1,11 @@
-//! The pose thread: measurements of all drivers in, poses, track and events out.
+//! Pose thread: processes measurements of all drivers into poses, track and events.
 //!
 //! ```text
 //! source, IMUs -> a Referee for each vehicle (filter, rules) -> pose, track, events
 //!                                                           \-> the newest pose and motion
 //! ```
-//! Budget: 20 us a pose, at 200 Hz for each vehicle, bounded by the referee's swept query. It is a
-//! plain thread: tokio's timers are a millisecond late.
+//! Budget: 20 us a pose, at 200 Hz for each vehicle; the referee's swept query bounds it. It is a plain thread
+//! because tokio's timers are a millisecond late.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -28,21 +28,21 @@ use crate::flights::vehicle::VehicleFlight;
 use crate::stop::Stop;
 use vizflyt_process::lock;
 
-/// What the pose thread owns and whom it reports to.
+/// Inputs and outputs of the pose thread.
 #[derive(Debug)]
 pub struct PoseThread {
-    /// Where poses, quality and counters go.
+    /// Receives poses, quality and counters.
     pub localization: Arc<Localization>,
-    /// Where events, track and samples go.
+    /// Receives events, track and samples.
     pub flights: Arc<Flights>,
-    /// The referee of each vehicle, at its index.
+    /// Referees by index of the vehicle.
     pub referees: Vec<Referee>,
-    /// Whether the vehicles see and touch each other.
+    /// Whether the vehicles see and collide with each other.
     pub neighbours: bool,
 }
 
 impl PoseThread {
-    /// Takes measurements from `source` until the server stops.
+    /// Processes measurements from `source` until the server stops.
     pub fn run(mut self, source: &mut dyn PoseSource, stop: &Stop) {
         let mut watches: Vec<_> =
             self.flights.vehicles.iter().map(|vehicle| VehicleWatch::of(vehicle)).collect();
@@ -55,8 +55,8 @@ impl PoseThread {
             let measured = source.receive(due.min(PATIENCE));
             self.follow_flights(&mut watches);
             self.take_imu();
-            // While packets keep coming, time is theirs: after a pause they arrive in a burst, each
-            // old by now but followed by a newer one, and that is not a lost pose, of any vehicle.
+            // While packets keep arriving, their stamps are the current time. After a pause packets arrive in a
+            // burst: each is old, but followed by a newer one, and no vehicle has lost a pose.
             let mut judged_at = None;
             for measurement in measured {
                 let stamp = self.take(measurement, &mut watches);
@@ -76,8 +76,8 @@ impl PoseThread {
         }
     }
 
-    /// Restarts course and timer where a new flight has begun, a new runtime on the ground; passes on
-    /// what runtime and people do to the flight.
+    /// Restarts course and timer when a new flight has begun; passes events of runtime and users to the
+    /// referee.
     fn follow_flights(&mut self, watches: &mut [VehicleWatch]) {
         let vehicles = self.flights.vehicles.iter().zip(&mut self.referees).zip(watches);
         for ((vehicle, referee), watch) in vehicles {
@@ -86,7 +86,7 @@ impl PoseThread {
                 watch.flights = flights;
                 referee.restart();
             }
-            // What is no longer kept is a plugin's lines.
+            // Only log lines of plugins are dropped from the event log.
             let events = vehicle.events.read(&mut watch.event).unwrap_or_else(|lagged| {
                 watch.event = lagged.oldest;
                 vehicle.events.read(&mut watch.event).unwrap_or_default()
@@ -105,7 +105,7 @@ impl PoseThread {
         }
     }
 
-    /// Takes one measurement; returns its stamp, unless it was rejected for its contents.
+    /// Processes one measurement. Returns its stamp, unless its contents were rejected.
     fn take(
         &mut self,
         measurement: &Measurement,
@@ -126,7 +126,7 @@ impl PoseThread {
                 self.record(index, &sample, was_judging);
                 Some(sample.stamp)
             }
-            // Two frames of one burst may bear the same stamp: no fault of anyone's.
+            // Two frames of one burst may have the same stamp; this is not an error.
             Err(Rejected::Stale) => {
                 watches[index].rejected += 1;
                 Some(measurement.stamp)
@@ -143,7 +143,7 @@ impl PoseThread {
     fn record(&self, index: usize, sample: &PoseSample, was_judging: bool) {
         let (vehicle, referee) = (&self.flights.vehicles[index], &self.referees[index]);
         lock(&vehicle.track).add(sample);
-        // What ends the flight belongs to it.
+        // The pose that ends the flight belongs to it.
         let ends = was_judging && !referee.is_judging();
         if !(ends || referee.is_judging()) {
             return;
@@ -158,7 +158,7 @@ impl PoseThread {
         }
     }
 
-    /// Tells the other vehicles' referees where a vehicle is.
+    /// Passes a vehicle's motion to the referees of the other vehicles.
     fn share_neighbours(&mut self, index: usize) {
         if !self.neighbours {
             return;
@@ -173,7 +173,7 @@ impl PoseThread {
         }
     }
 
-    /// Lets the referees judge what the time alone decides, and logs their events.
+    /// Lets the referees check time limits, and logs their events.
     fn judge(&mut self, at: ServerTime) {
         for (vehicle, referee) in self.flights.vehicles.iter().zip(&mut self.referees) {
             referee.handle_timeout(at);
@@ -183,7 +183,7 @@ impl PoseThread {
         }
     }
 
-    /// Publishes what the source delivered, of each vehicle and of all.
+    /// Publishes the counters of the source, per vehicle and in total.
     fn count(&self, source: &dyn PoseSource, watches: &[VehicleWatch]) {
         let mut all = SourceCounters::default();
         let vehicles = self.localization.vehicles.iter().zip(watches).enumerate();
@@ -195,7 +195,7 @@ impl PoseThread {
         *lock(&self.localization.counters) = all;
     }
 
-    /// Publishes how good each vehicle's localization is; tells of sources that leave no margin.
+    /// Publishes the localization quality of each vehicle; warns of sources without a margin.
     fn publish_quality(&self, watches: &mut [VehicleWatch]) {
         let vehicles = self.localization.vehicles.iter().zip(&self.referees);
         let flights = self.flights.vehicles.iter().zip(watches);
@@ -217,11 +217,11 @@ impl PoseThread {
     }
 }
 
-/// What the pose thread remembers of one vehicle.
+/// State of the pose thread for one vehicle.
 #[derive(Debug, Default)]
 struct VehicleWatch {
     flights: u64,
-    /// Index of the first event that its referee has not seen.
+    /// Index of the first event that the referee has not processed.
     event: u64,
     rejected: u64,
     margins: MarginWatch,
@@ -235,13 +235,13 @@ impl VehicleWatch {
         Self { flights: vehicle.flights(), event, ..Self::default() }
     }
 
-    /// Counts a rejected measurement, and warns of it at a bounded rate.
+    /// Counts a rejected measurement, and warns of it at a limited rate.
     fn reject(&mut self, vehicle: &VehicleFlight, source: Option<&String>, reason: Rejected) {
         self.rejected += 1;
         if matches!(reason, Rejected::Outlier(_)) && !self.outliers.add(Instant::now()) {
             return;
         }
-        // Another kind of rejection than the last one is warned of sooner.
+        // A rejection for another reason is reported sooner.
         let kind = std::mem::discriminant(&reason);
         let repeated =
             self.warned.is_some_and(|(at, last)| last == kind && at.elapsed() < WARN_EVERY);
@@ -256,7 +256,7 @@ impl VehicleWatch {
     }
 }
 
-/// Outliers within [`WARN_EVERY`] of the first of them.
+/// Outliers within [`WARN_EVERY`] after the first one.
 #[derive(Debug, Default)]
 struct OutlierCount {
     since: Option<Instant>,
@@ -264,7 +264,7 @@ struct OutlierCount {
 }
 
 impl OutlierCount {
-    /// Counts an outlier at `now`; returns whether there are more than a touch-down or a bump makes.
+    /// Counts an outlier at `now`; returns whether there are more than a touch-down or a bump causes.
     fn add(&mut self, now: Instant) -> bool {
         if self.since.is_none_or(|since| now.duration_since(since) > WARN_EVERY) {
             (self.since, self.count) = (Some(now), 0);
@@ -274,13 +274,13 @@ impl OutlierCount {
     }
 }
 
-/// Maximum number of poses that a hard motion makes look like outliers; the next pose confirms the motion.
+/// Maximum number of poses that a hard motion turns into outliers; the next pose confirms the motion.
 const USUAL_OUTLIERS: u32 = 2;
-/// How long a stop may go unnoticed.
+/// Maximum delay until a stop is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);
-/// The period of a repeated warning: a bad source sends 200 packets a second.
+/// Minimum time between equal warnings: a bad source sends 200 packets a second.
 const WARN_EVERY: Duration = Duration::from_secs(5);
-/// The least time between two warnings: several bad sources alternate.
+/// Minimum time between two warnings: several bad sources alternate.
 const WARN_APART: Duration = Duration::from_secs(1);
 /// The period at which the localization's quality is published.
 const QUALITY_EVERY: Duration = Duration::from_millis(100);
@@ -290,7 +290,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_touch_down_is_no_reason_to_warn_and_a_bad_source_is() {
+    fn warns_of_a_bad_source_but_not_of_a_touch_down() {
         let (mut outliers, start) = (OutlierCount::default(), Instant::now());
         let mut add = |after_s| outliers.add(start + Duration::from_secs_f64(after_s));
         assert_eq!([0.0, 0.01].map(&mut add), [false; 2]);

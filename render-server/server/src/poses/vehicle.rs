@@ -1,4 +1,4 @@
-//! Where one vehicle is: its newest pose, and what the autopilot's IMU measured.
+//! Localization of one vehicle: newest pose, and IMU readings of the autopilot.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -11,16 +11,15 @@ use super::newest::Localized;
 use crate::poses::drivers::SourceCounters;
 use vizflyt_process::lock;
 
-/// The localization of one vehicle.
 #[derive(Debug)]
 pub struct VehiclePose {
-    /// The newest pose and motion; latest-wins. Kept here alone.
+    /// Newest pose and motion; latest wins. This is the only copy.
     pub newest: watch::Sender<Option<Localized>>,
-    /// What the sources delivered of it.
+    /// Counters of the sources for this vehicle.
     pub counters: Mutex<SourceCounters>,
-    /// How good it is, by the pose filter.
+    /// Quality estimated by the pose filter.
     pub quality: Mutex<PoseQuality>,
-    /// Readings of the autopilot's IMU that the pose thread has not taken yet, oldest first.
+    /// IMU readings that the pose thread has not processed yet, oldest first.
     imu: Mutex<VecDeque<ImuReading>>,
 }
 
@@ -58,7 +57,7 @@ impl VehiclePose {
     }
 }
 
-/// The most readings of the IMU in the queue: 0.6 s at 100 Hz.
+/// Capacity of the IMU queue: 0.6 s at 100 Hz.
 const IMU_CAPACITY: usize = 64;
 
 #[cfg(test)]

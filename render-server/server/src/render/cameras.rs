@@ -1,8 +1,8 @@
-//! The vehicle's cameras as they are at this moment; changed through the page and the API.
+//! Current cameras of a vehicle; they can be changed with the page and the API.
 //!
-//! The render thread takes the newest set at each tick, and every image keeps the camera it was
-//! rendered with: a change takes effect with the next tick, and no image is skipped or mislabelled.
-//! Sessions and pages receive each change.
+//! The render thread takes the newest set at each tick, and every image keeps the camera with which it was
+//! rendered. So a change takes effect at the next tick, and no image is skipped or mislabelled. Sessions and
+//! pages receive each change.
 
 use std::sync::Arc;
 
@@ -12,12 +12,12 @@ use vizflyt_arena::config::{CameraConfig, ConfigError};
 use vizflyt_protocol::messages::{CameraInfo, MAX_CAMERAS};
 use vizflyt_protocol::sensor::SensorKind;
 
-/// All cameras at one moment, in the order of their index on the wire.
+/// All cameras of a vehicle, in the order of their index in the protocol.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraSet {
-    /// As `arena.toml` has them.
+    /// Settings as in `arena.toml`.
     pub configs: Vec<CameraConfig>,
-    /// As the runtime receives them.
+    /// Data sent to the runtime.
     pub infos: Vec<CameraInfo>,
 }
 
@@ -28,7 +28,7 @@ impl CameraSet {
         Self { configs, infos }
     }
 
-    /// Returns the cameras with images of a `by`-th of their width and height, and the same view.
+    /// Returns the cameras with width and height divided by `by`, and the same view.
     fn shrunk(&self, by: u32) -> Self {
         let mut shrunk = self.clone();
         for info in &mut shrunk.infos {
@@ -38,7 +38,7 @@ impl CameraSet {
     }
 }
 
-/// The cameras of one vehicle as they are rendered: smaller where the link is too slow.
+/// Cameras of one vehicle as rendered: smaller if the link is slow.
 #[derive(Debug, Default)]
 pub struct RenderedCameras {
     of: Arc<CameraSet>,
@@ -47,8 +47,7 @@ pub struct RenderedCameras {
 }
 
 impl RenderedCameras {
-    /// Returns `newest` with images of a `by`-th of their width and height; made anew only when
-    /// either changes.
+    /// Returns `newest` with width and height divided by `by`; updated only when either changes.
     pub fn follow(&mut self, newest: Arc<CameraSet>, by: u32) -> Arc<CameraSet> {
         if by <= 1 {
             return newest;
@@ -61,49 +60,49 @@ impl RenderedCameras {
     }
 }
 
-/// The cameras, shared by all threads.
+/// Cameras of one vehicle, shared by all threads.
 #[derive(Debug)]
 pub struct Cameras(watch::Sender<Arc<CameraSet>>);
 
-/// Why a change is refused.
+/// Why a change is rejected.
 #[derive(Debug, thiserror::Error)]
 pub enum ChangeError {
     /// No camera has this name.
     #[error("there is no camera '{name}'; there are {}", known.join(", "))]
     Unknown {
-        /// What was asked for.
+        /// Requested name.
         name: String,
-        /// What there is.
+        /// Existing names.
         known: Vec<String>,
     },
     /// No sensor has this name.
     #[error("there is no sensor '{name}'; there are {}", known.join(", "))]
     UnknownSensor {
-        /// What was asked for.
+        /// Requested name.
         name: String,
-        /// What there is.
+        /// Existing names.
         known: Vec<String>,
     },
-    /// Plugins expect records of the kind that they were told of.
+    /// The kind of a sensor is fixed in flight, because plugins expect its records.
     #[error("model = {model:?} is a {is}, and the sensor a {was}; it stays one while flying")]
     Kind {
-        /// What was asked for.
+        /// Requested model.
         model: String,
-        /// Its kind.
+        /// Kind of the model.
         is: SensorKind,
-        /// The sensor's.
+        /// Kind of the sensor.
         was: SensorKind,
     },
-    /// The text is no camera.
+    /// The text is not valid JSON of a camera.
     #[error("settings cannot be read: {0}")]
     Json(serde_json::Error),
-    /// A value that cannot work.
+    /// Invalid value.
     #[error(transparent)]
     Value(#[from] ConfigError),
-    /// Plugins call cameras by name.
+    /// The name is fixed in flight, because plugins identify cameras by name.
     #[error("name = {0:?}: a camera or sensor keeps its name while flying; leave `name` out")]
     Renamed(String),
-    /// It would take so long to draw that the vehicle flies blind.
+    /// Rendering would take so long that the vehicle flies without images.
     #[error(
         "width_px x height_px = {0}x{1}: too large to change to while flying; give at most \
          {MAX_PIXELS} pixels, as 3840x2160"
@@ -118,28 +117,28 @@ impl From<serde_json::Error> for ChangeError {
 }
 
 impl Cameras {
-    /// Makes the cameras as the arena has them; at most [`MAX_CAMERAS`].
+    /// Creates the cameras of an arena; at most [`MAX_CAMERAS`].
     pub fn new(configs: Vec<CameraConfig>) -> Self {
         Self(watch::Sender::new(Arc::new(CameraSet::of(configs))))
     }
 
-    /// Returns the cameras of this moment.
+    /// Returns the current cameras.
     pub fn newest(&self) -> Arc<CameraSet> {
         self.0.borrow().clone()
     }
 
-    /// Returns a receiver of every change from now on.
+    /// Returns a receiver of every later change.
     pub fn subscribe(&self) -> watch::Receiver<Arc<CameraSet>> {
         self.0.subscribe()
     }
 
-    /// Replaces the camera `name` by `json`: the keys of `[[cameras]]` in `arena.toml`.
+    /// Replaces the camera `name` with `json`: the keys of `[[cameras]]` in `arena.toml`.
     pub fn put(&self, name: &str, json: &[u8]) -> Result<CameraConfig, ChangeError> {
         self.change(name, |_| Ok(serde_json::from_slice(json)?))
     }
 
-    /// Changes the keys in `json` of the camera `name`, null removing a key (RFC 7396, JSON merge
-    /// patch). A field of view takes the place of a calibration, and the other way round.
+    /// Changes the keys in `json` of the camera `name`; null removes a key (RFC 7396, JSON merge patch). A
+    /// field of view replaces a calibration, and vice versa.
     pub fn patch(&self, name: &str, json: &[u8]) -> Result<CameraConfig, ChangeError> {
         self.change(name, |old| {
             let patch: Map<String, Value> = serde_json::from_slice(json)?;
@@ -167,7 +166,7 @@ impl Cameras {
         make: impl FnOnce(&CameraConfig) -> Result<Value, ChangeError>,
     ) -> Result<CameraConfig, ChangeError> {
         let mut result = None;
-        // Under the lock, so that two changes at once do not undo each other.
+        // Under the lock, so that two concurrent changes do not overwrite each other.
         self.0.send_if_modified(|set| {
             let changed = changed(set, name, make);
             let modified = changed.as_ref().is_ok_and(|(index, new)| set.configs[*index] != *new);
@@ -197,7 +196,7 @@ fn changed(
         keys.entry("name").or_insert_with(|| name.into());
     }
     let mut new: CameraConfig = serde_json::from_value(value)?;
-    // Depth that the course withholds is not had by asking.
+    // Depth that the course withholds cannot be enabled.
     new.depth &= set.configs[index].depth;
     if new.name != name {
         return Err(ChangeError::Renamed(new.name));
@@ -211,7 +210,7 @@ fn changed(
 
 const FIELD_OF_VIEW: &str = "horizontal_fov_deg";
 const CALIBRATION: [&str; 5] = ["fx_px", "fy_px", "cx_px", "cy_px", "distortion"];
-/// 4K: a second's work for a small machine, and 40 MB of shared memory.
+/// Maximum pixels: 4K takes a small machine a second, and 40 MB of shared memory.
 const MAX_PIXELS: u64 = 3840 * 2160;
 
 #[cfg(test)]
@@ -230,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_link_gets_smaller_images_of_the_same_view() {
+    fn slow_links_get_smaller_images_of_the_same_view() {
         let cameras = Cameras::new(vec![CameraConfig::ahead("a", [640, 480], 90.0, DVec3::ZERO)]);
         let (newest, mut rendered) = (cameras.newest(), RenderedCameras::default());
         assert!(Arc::ptr_eq(&rendered.follow(newest.clone(), 1), &newest));
@@ -252,7 +251,7 @@ mod tests {
         let set = watcher.borrow_and_update().clone();
         assert_eq!(set.infos[1].intrinsics.width_px, 640);
         assert_eq!(set.infos[0], super::CameraSet::of(set.configs.clone()).infos[0]);
-        // The same again is no change.
+        // An identical patch is not a change.
         cameras.patch("rear", br#"{"width_px": 640}"#).unwrap();
         assert!(!watcher.has_changed().unwrap());
         cameras.patch("rear", br#"{"rate_hz": 10}"#).unwrap();
@@ -261,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_of_view_and_a_calibration_take_each_others_place() {
+    fn field_of_view_and_calibration_replace_each_other() {
         let cameras = cameras();
         let json = br#"{"fx_px": 200, "fy_px": 201, "cx_px": 160.5, "cy_px": 119,
                         "distortion": {"model": "brown-conrady", "k1": -0.1}}"#;
@@ -272,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sensor_is_taken_and_given_back() {
+    fn an_image_sensor_is_set_and_removed() {
         let cameras = cameras();
         let json = br#"{"imaging": {"sensor": "imx219", "depth": {"model": "d435"}}}"#;
         let new = cameras.patch("front", json).unwrap();
@@ -287,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_put_is_the_whole_camera() {
+    fn put_replaces_the_whole_camera() {
         let cameras = cameras();
         let json = br#"{"width_px": 64, "height_px": 48, "horizontal_fov_deg": 70,
                         "position_m": [0.1, 0, 0], "near_m": 0.2}"#;
@@ -297,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named_and_change_nothing() {
+    fn reports_errors_and_changes_nothing() {
         let cameras = cameras();
         let before = cameras.newest();
         let patch = |json: &str| cameras.patch("front", json.as_bytes());

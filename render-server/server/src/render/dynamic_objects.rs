@@ -1,11 +1,10 @@
-//! What moves in the twin, as images show it: the arena's objects, and every other vehicle.
+//! Moving objects in images: the arena's objects, and every other vehicle.
 //!
 //! ```text
-//! instant of an image, whose it is, everyone's newest motion -> a placement for each object
+//! instant and vehicle of an image, newest motions of all vehicles -> a placement for each object
 //! ```
-//! The clock is the referee's: nanoseconds since the arena's epoch, so that what is seen is what is
-//! judged. A vehicle does not see itself: it is left out of its own images. Budget: 1 us an image;
-//! allocates nothing.
+//! The clock is the referee's, in nanoseconds since the arena's epoch, so that images and referee agree. A
+//! vehicle does not appear in its own images. Budget: 1 us an image; no allocation.
 
 use vizflyt_arena::objects::MovingObjects;
 use vizflyt_protocol::geometry::Pose;
@@ -16,23 +15,23 @@ use vizflyt_splat::{Placement, RigidObject};
 use crate::poses::newest::NewestPoses;
 use crate::scene::bounds_m;
 
-/// The objects of the renderer's scene, in its order.
+/// Moving objects of the renderer's scene, in its order.
 #[derive(Clone, Debug, Default)]
 pub struct DynamicObjects {
-    /// From which the objects' motions count.
+    /// Start of the objects' motions.
     pub epoch: ServerTime,
-    /// The arena's own.
+    /// Objects of the arena.
     pub objects: MovingObjects,
-    /// How many vehicles come after them: all, or none where one flies alone.
+    /// Number of vehicles after the objects: all, or none if only one flies.
     pub vehicles: usize,
-    /// The size of each of the arena's objects, for the page.
+    /// Size of each of the arena's objects, for the page.
     pub bounds: Vec<ObjectBounds>,
 }
 
-/// The box about an object in its own frame.
+/// Bounding box of an object in its own frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ObjectBounds {
-    /// What images of ids hold where it is seen.
+    /// Value in images of ids.
     pub id: u16,
     /// Least corner. [m, object]
     pub min_m: [f32; 3],
@@ -47,7 +46,7 @@ impl ObjectBounds {
     }
 }
 
-/// Returns the vehicles as the others see them, numbered from [`VEHICLE_ID`]; none for one alone.
+/// Returns the models of the vehicles, numbered from [`VEHICLE_ID`]; none for a single vehicle.
 pub fn vehicle_models(vehicles: usize) -> Vec<RigidObject> {
     if vehicles < 2 {
         return Vec::new();
@@ -57,11 +56,11 @@ pub fn vehicle_models(vehicles: usize) -> Vec<RigidObject> {
     ids.map(|id| RigidObject { id, splats: splats.clone() }).collect()
 }
 
-/// In images of ids, the first vehicle; the arena's objects have lower numbers.
+/// Id of the first vehicle in images of ids; the arena's objects have lower ids.
 pub const VEHICLE_ID: u16 = 1000;
 
 impl DynamicObjects {
-    /// Takes the arena's objects, and the vehicles if there are several.
+    /// Creates the arena's objects, and the vehicles if there are several.
     pub fn new(
         epoch: ServerTime,
         objects: MovingObjects,
@@ -72,17 +71,17 @@ impl DynamicObjects {
         Self { epoch, objects, vehicles: if vehicles < 2 { 0 } else { vehicles }, bounds }
     }
 
-    /// Whether nothing moves.
+    /// Returns whether there are no moving objects.
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty() && self.vehicles == 0
     }
 
-    /// Returns an instant on the objects' clock. [ns]
+    /// Returns a time on the objects' clock. [ns]
     pub fn since_epoch_ns(&self, at: ServerTime) -> i64 {
         at.as_ns().wrapping_sub(self.epoch.as_ns()).cast_signed()
     }
 
-    /// Appends where everything is at an instant, as vehicle `own` sees it.
+    /// Appends the placements of all objects at an instant, as seen by vehicle `own`.
     pub fn place(
         &self,
         at: ServerTime,
@@ -93,7 +92,8 @@ impl DynamicObjects {
         self.objects.place(self.since_epoch_ns(at), placements);
         placements.extend(known.iter().enumerate().take(self.vehicles).map(|(index, known)| {
             let there = known.as_ref().filter(|_| index != own)?;
-            // No further than a motion is known: then it stands where it was last thought to be.
+            // Limited to the time for which the motion is predicted; then the vehicle stays at its last
+            // predicted pose.
             let body = there.motion.at(there.motion.reach(at));
             Some(Pose::new(body.translation_m, body.rotation))
         }));
@@ -109,7 +109,7 @@ mod tests {
     use vizflyt_protocol::messages::PoseSample;
 
     #[test]
-    fn a_vehicle_sees_the_others_and_the_objects_on_one_clock() {
+    fn vehicles_see_others_and_objects_on_the_referees_clock() {
         let hand = ObjectConfig {
             name: "hand".into(),
             scene: "hand.ply".into(),
@@ -131,11 +131,11 @@ mod tests {
         }
         let mut placements = Vec::new();
         moving.place(at, 0, &known, &mut placements);
-        // The very pose that the referee is asked about, to the last bit.
+        // Bit for bit the pose of the referee.
         assert_eq!(placements[0], Some(objects.placement(0, 1_234_567)));
         let x_m = |placement: &Placement| placement.map(|pose| pose.translation_m.x);
         assert_eq!(placements[1..].iter().map(x_m).collect::<Vec<_>>(), [None, Some(2.0), None]);
-        // Before the epoch, as a stamp of the past may be, the clock runs on.
+        // Before the epoch, as for an earlier stamp, the clock continues.
         assert_eq!(moving.since_epoch_ns(ServerTime::from_ns(4_999_999_999)), -1);
         assert!(vehicle_models(1).is_empty() && DynamicObjects::default().is_empty());
     }

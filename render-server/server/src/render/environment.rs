@@ -1,4 +1,4 @@
-//! The light and the weather of this moment: the arena's, until the page changes them.
+//! Current light and weather: the arena's, until the page changes them.
 
 use std::sync::Mutex;
 
@@ -14,32 +14,32 @@ use vizflyt_splat::weather::{
 
 use vizflyt_process::lock;
 
-/// What cameras see the scene through; the render thread asks once a tick.
+/// Current environment of the scene; the render thread reads it once per tick.
 #[derive(Debug, Default)]
 pub struct Environment(Mutex<EnvironmentConfig>);
 
 impl Environment {
-    /// Begins with the arena's.
+    /// Starts with the arena's settings.
     pub fn new(config: EnvironmentConfig) -> Self {
         Self(Mutex::new(config))
     }
 
-    /// Returns the one of this moment.
+    /// Returns the current settings.
     pub fn now(&self) -> EnvironmentConfig {
         *lock(&self.0)
     }
 
-    /// Changes it from the next tick on; returns whether it was another.
+    /// Changes the settings from the next tick on; returns whether they differ.
     ///
     /// # Errors
-    /// A number that cannot work, by its key; nothing is changed.
+    /// Names the key of an invalid number; the settings stay unchanged.
     pub fn change(&self, config: EnvironmentConfig) -> Result<bool, ConfigError> {
         config.check()?;
         Ok(std::mem::replace(&mut *lock(&self.0), config) != config)
     }
 }
 
-/// Returns what a renderer takes.
+/// Returns the atmosphere for a renderer.
 pub fn atmosphere(config: &EnvironmentConfig) -> Atmosphere {
     Atmosphere {
         light: single(config.light),
@@ -48,7 +48,7 @@ pub fn atmosphere(config: &EnvironmentConfig) -> Atmosphere {
     }
 }
 
-/// Returns what is done to a renderer's images.
+/// Returns the weather effects on rendered images.
 pub fn weather(config: &EnvironmentConfig) -> Weather {
     Weather {
         exposure_s: (config.exposure_ms * 1e-3) as f32,

@@ -1,10 +1,10 @@
-//! What becomes of a rendered image before anyone sees it: the camera that takes it. Pure, with state per camera, so that the
-//! render thread (wall clock) and graded flights (virtual clock) do the same.
+//! Camera effects on rendered images. Pure, with state per camera, so that the render thread (wall clock) and
+//! graded flights (virtual clock) have the same effects.
 //!
 //! ```text
-//! perfect image, its camera's config, the vehicle's motion ──▶ CameraEffects ──▶ the image as the camera gives it
+//! perfect image, its camera's config, the vehicle's motion ──▶ CameraEffects ──▶ the image of the camera
 //! ```
-//! A camera without `[cameras.imaging]` costs a comparison, and its image keeps its bits.
+//! Without `[cameras.imaging]`, the cost is one comparison, and the image is unchanged.
 
 use vizflyt_arena::config::CameraConfig;
 use vizflyt_arena::config::imaging::{DepthSensor, FilterKind, ImagingConfig, LightSensor};
@@ -21,32 +21,32 @@ use vizflyt_splat::{Atmosphere, Camera, RgbdImage};
 
 use crate::render::schedule;
 
-/// One rendered image, as far as effects depend on it.
+/// Properties of a rendered image that affect the camera effects.
 #[derive(Clone, Copy, Debug)]
 pub struct EffectInput<'a> {
-    /// Its camera.
+    /// Settings of the camera.
     pub config: &'a CameraConfig,
-    /// Its camera as it was rendered: smaller where the link is slow.
+    /// Camera as rendered: smaller if the link is slow.
     pub info: &'a CameraInfo,
-    /// How the vehicle moves.
+    /// Motion of the vehicle.
     pub motion: &'a Motion,
-    /// What it shows.
+    /// Instant and pose of the image.
     pub exposure: schedule::Exposure,
-    /// Of what is random: the flight's seed, the camera's index among all, the image's number.
+    /// Seeds of the noise: the flight's seed, the camera's index among all, the image's number.
     pub seeds: [u64; 3],
 }
 
-/// The state of one camera of one vehicle.
+/// State of one camera of one vehicle.
 #[derive(Debug, Default)]
 pub struct CameraEffects {
-    /// What the model is made from.
+    /// Settings from which the model was created.
     of: Option<(ImagingConfig, u32)>,
     model: CameraModel,
     imager: Imager,
 }
 
 impl CameraEffects {
-    /// Turns a perfect image into what the camera gives.
+    /// Applies the camera's effects to a perfect image.
     pub fn apply(&mut self, input: &EffectInput<'_>, image: &mut RgbdImage) {
         let Some(imaging) = &input.config.imaging else { return };
         let width_px = input.info.intrinsics.width_px;
@@ -67,7 +67,7 @@ impl CameraEffects {
     }
 }
 
-/// Returns what a camera's images of this width are like.
+/// Returns the model of a camera with images of this width.
 pub fn camera_model(imaging: &ImagingConfig, width_px: u32) -> CameraModel {
     let depth = match imaging.depth_sensor() {
         None => DepthModel::Perfect,
@@ -95,7 +95,7 @@ pub fn camera_model(imaging: &ImagingConfig, width_px: u32) -> CameraModel {
     CameraModel { sensor: imaging.light_sensor().map(|light| sensor(&light, width_px)), depth }
 }
 
-/// Returns a sensor whose pixels are those of an image of this width.
+/// Returns a sensor whose pixels match an image of this width.
 fn sensor(light: &LightSensor, width_px: u32) -> Sensor {
     let side = f64::from(light.binned(width_px));
     let exposure = match light.fixed_s {
@@ -126,9 +126,9 @@ fn sensor(light: &LightSensor, width_px: u32) -> Sensor {
     }
 }
 
-/// Mean linear light that automatic exposures aim at: a grey card's 18 % (ISO 2720:1974).
+/// Target mean linear light of the automatic exposure: 18 % of a grey card (ISO 2720:1974).
 const AIM: f64 = 0.18;
-/// Of the luminance within 3 x 3 pixels: a fiftieth is above the noise of a well exposed camera.
+/// Minimum contrast of the luminance within 3 x 3 pixels: 2 % is above the noise of a well exposed camera.
 const LEAST_TEXTURE: f64 = 0.02;
 
 #[cfg(test)]
@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn without_imaging_every_bit_stays() {
+    fn without_imaging_the_image_is_unchanged() {
         let perfect = image(&CameraConfig::ahead("front", [64, 48], 87.0, DVec3::ZERO));
         assert_eq!(taken(None, 1), perfect);
         assert_eq!(taken(Some(""), 1), perfect);
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_offers_every_name() {
+    fn the_page_lists_every_name() {
         let page = include_str!("../web/page/panels/camera_settings.js");
         let quoted = |names: Vec<&str>| {
             names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ")
@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_that_joins_many_has_their_electrons() {
+    fn a_binned_pixel_has_the_sum_of_the_electrons() {
         let config: ImagingConfig = toml::from_str("sensor = \"imx477\"").unwrap();
         let one = camera_model(&config, 4056).sensor.unwrap();
         let joined = camera_model(&config, 338).sensor.unwrap();

@@ -1,13 +1,13 @@
-//! What the threads of this room work with.
+//! Inputs of the threads of this room.
 
 use crate::flights::Flights;
 use crate::poses::Localization;
 use crate::render::Rendering;
 
-/// The states that rendering and measuring read and write; `demand` says what is wanted.
+/// State that rendering and measuring read and write.
 #[derive(Debug)]
 pub struct Inputs<'a, D> {
-    /// Cameras, sensors, light and objects; what is rendered and measured is counted here.
+    /// Cameras, sensors, light and objects, and counters of images and readings.
     pub rendering: &'a Rendering,
     /// Poses of the vehicles.
     pub localization: &'a Localization,

@@ -1,11 +1,11 @@
-//! What cameras and other sensors see: newest motions in, rendered ticks and readings out.
+//! Rendering of cameras and sensors: newest motions in, rendered ticks and readings out.
 //!
 //! ```text
 //! in   the newest motions of all vehicles, from `poses`; the demand for images, from `stream`
 //! out  rendered ticks (RGB, depth, object ids), to the encode thread and then to the previews;
 //!      readings of other sensors, to sessions and the page
 //! ```
-//! Imports `scene`, `poses` and `flights`; `stream` states its demand through [`demand::Demand`].
+//! Imports `scene`, `poses` and `flights`; `stream` implements [`demand::Demand`].
 
 pub mod cameras;
 pub mod demand;
@@ -31,27 +31,27 @@ pub use self::renderer::{DetailKind, RendererInfo, RendererKind, choose, open_pa
 use self::sensors::Sensors;
 use crate::timing::StageDurations;
 
-/// What is rendered, and how.
+/// State of rendering.
 #[derive(Debug, Default)]
 pub struct Rendering {
-    /// The cameras of each vehicle, at its index.
+    /// Cameras by index of the vehicle.
     pub cameras: Vec<Cameras>,
-    /// The sensors beside the cameras of each vehicle, at its index.
+    /// Sensors by index of the vehicle, without the cameras.
     pub sensors: Vec<Sensors>,
     /// Light and weather.
     pub environment: Environment,
-    /// What is where by chance in the weather: the same for all images.
+    /// Seed of the random positions in the weather: the same for all images.
     pub seed: u64,
-    /// Moving objects, and the vehicles as the others see them.
+    /// Moving objects, and the models of the vehicles.
     pub dynamic_objects: DynamicObjects,
-    /// The instant that images show.
+    /// Instant that images show.
     pub predict: Predict,
-    /// Which renderer renders, and why; another one may take over in flight.
+    /// Name of the renderer and reason for it; another one may take over in flight.
     pub renderer: Mutex<RendererInfo>,
-    /// Rendering all cameras of a tick.
+    /// Time to render all cameras of a tick.
     pub durations: StageDurations,
     /// Ticks rendered.
     pub ticks: AtomicU64,
-    /// Ticks rendered that were replaced by the next one before anyone took them.
+    /// Ticks replaced by the next one before the encoder took them.
     pub ticks_skipped: AtomicU64,
 }

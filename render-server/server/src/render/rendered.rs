@@ -18,11 +18,10 @@ use vizflyt_splat::RgbdImage;
 use crate::mailbox::Mailbox;
 use crate::render::cameras::CameraSet;
 
-/// The images rendered in one tick, and those of replaced ticks that nobody took; reused from tick to
-/// tick.
+/// Images rendered in one tick, and those of replaced ticks that were not taken; reused from tick to tick.
 #[derive(Debug)]
 pub struct RenderedTick {
-    /// One per camera, vehicle by vehicle.
+    /// Slots by camera, vehicle by vehicle.
     pub slots: Vec<RenderedImage>,
     pool: Arc<Pool>,
 }
@@ -30,35 +29,35 @@ pub struct RenderedTick {
 /// The newest image of one camera.
 #[derive(Debug, Default)]
 pub struct RenderedImage {
-    /// Whether there is one; everything else counts only then.
+    /// Whether the slot contains an image; otherwise the other fields are invalid.
     pub fresh: bool,
-    /// Whether a runtime flew when it was rendered, so that it counts.
+    /// Whether a runtime was flying at the time of rendering, so that the image counts.
     pub counted: bool,
     /// Index of the vehicle.
     pub vehicle: usize,
     /// Index into the vehicle's cameras.
     pub camera: usize,
-    /// Its tick, counted from 1.
+    /// Number of its tick, from 1.
     pub seq: u64,
-    /// When the newest pose behind it was measured.
+    /// Time of measurement of the newest pose used.
     pub pose: ServerTime,
-    /// The instant it shows.
+    /// Instant that the image shows.
     pub shown: ServerTime,
-    /// The pose rendered from: that of the instant.
+    /// Pose at that instant, from which it was rendered.
     pub world_from_body: Option<Pose<World, Body>>,
-    /// The vehicle's cameras that it was rendered with.
+    /// Cameras of the vehicle at the time of rendering.
     pub set: Option<Arc<CameraSet>>,
-    /// Rendering of the tick began.
+    /// Start of rendering the tick.
     pub render_start: ServerTime,
-    /// Rendering of the tick ended.
+    /// End of rendering the tick.
     pub render_end: ServerTime,
     /// The image.
     pub image: RgbdImage,
 }
 
 impl RenderedTick {
-    /// Takes over the images of `old`, which it replaces unread, of cameras that were not due
-    /// again: else a slow camera's images would be lost to a busy reader.
+    /// Takes over unread images of the replaced tick `old`, of cameras that were not due again. Otherwise a
+    /// busy reader would lose images of slow cameras.
     pub fn inherit(&mut self, old: &mut Self) {
         for (mine, theirs) in self.slots.iter_mut().zip(&mut old.slots) {
             if theirs.fresh && !(mine.fresh && mine.seq >= theirs.seq) {
@@ -79,7 +78,10 @@ pub struct RenderQueue {
 impl RenderQueue {
     /// Returns a tick to fill, with the buffers of a dropped one if there are any.
     pub fn new_tick(&self) -> RenderedTick {
-        RenderedTick { slots: lock(&self.pool.0).pop().unwrap_or_default(), pool: self.pool.clone() }
+        RenderedTick {
+            slots: lock(&self.pool.0).pop().unwrap_or_default(),
+            pool: self.pool.clone(),
+        }
     }
 
     /// Hands a rendered tick to the encoder, in place of an older one, which goes to the previews if they are
@@ -98,12 +100,12 @@ impl RenderQueue {
         self.for_encoder.take(timeout)
     }
 
-    /// Hands a tick that the encoder does not need (any more) to the previews.
+    /// Hands a tick that the encoder has finished to the previews.
     pub fn offer_previews(&self, tick: RenderedTick) {
         self.for_previews.put_over(tick, RenderedTick::inherit);
     }
 
-    /// Waits at most `timeout` for a tick to make previews of.
+    /// Waits at most `timeout` for a tick for previews.
     pub fn take_for_previews(&self, timeout: Duration) -> Option<RenderedTick> {
         self.for_previews.take(timeout)
     }
@@ -133,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn slow_cameras_image_outlives_its_tick() {
+    fn image_of_a_slow_camera_outlives_its_tick() {
         let ticks = RenderQueue::default();
         let (mut old, mut new) = (ticks.new_tick(), ticks.new_tick());
         old.slots = vec![slot(7, true), slot(7, true), slot(3, false)];
@@ -142,8 +144,8 @@ mod tests {
         assert_eq!(found(&new), [(8, true), (7, true), (2, false)]);
     }
 
-    /// Draws `count` ticks, of which the encoder takes every `nth`; returns what it took and the
-    /// ticks that were made.
+    /// Renders `count` ticks, of which the encoder takes every `nth`. Returns the ticks taken, and the number
+    /// of ticks allocated.
     fn fly(ticks: &RenderQueue, count: u64, nth: u64, watched: bool) -> (Vec<u64>, usize) {
         let (mut taken, mut made) = (Vec::new(), 0);
         for seq in 1..=count {
@@ -171,14 +173,14 @@ mod tests {
             let unwatched = fly(&ticks, 99, nth, false);
             assert_eq!(unwatched.0, expected);
             assert!(ticks.take_for_previews(Duration::ZERO).is_none());
-            // The preview thread is stuck on one tick for ever, and a second one waits for it.
+            // The preview thread is blocked on one tick, and a second one waits for it.
             let ticks = RenderQueue::default();
             fly(&ticks, 1, 1, true);
             let stuck = ticks.take_for_previews(Duration::ZERO).unwrap();
             let watched = fly(&ticks, 99, nth, true);
             assert_eq!(watched.0, expected);
             assert!(watched.1 <= 4, "{} ticks made", watched.1);
-            // What waits for it is the newest.
+            // The waiting tick is the newest.
             drop(stuck);
             assert_eq!(ticks.take_for_previews(Duration::ZERO).unwrap().slots[0].seq, 99);
         }

@@ -1,5 +1,5 @@
-//! `--renderer` and `--detail`: which renderer is used, and how much of a scene it renders, as the command line names
-//! it and as the page shows it.
+//! `--renderer` and `--detail`: choice of the renderer and its level of detail, with names for the command line
+//! and the page.
 
 use std::fmt;
 use std::path::Path;
@@ -11,25 +11,25 @@ use vizflyt_splat::{
     Backend, Chosen, CpuRenderer, Detail, Loading, PackedScene, RigidObject, Scene,
 };
 
-/// Which renderer renders, for reports and the page.
+/// Renderer in use, for reports and the page.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct RendererInfo {
-    /// What it runs on: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`; and where that is so, that it renders in
-    /// adaptive detail.
+    /// Device: `cpu avx2`, `gpu NVIDIA GeForce RTX 3080 (Vulkan)`; with a note if it renders in adaptive
+    /// detail.
     pub name: String,
-    /// Why it is this one.
+    /// Reason for this renderer.
     pub reason: String,
 }
 
 /// Values of `--renderer`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum RendererKind {
-    /// A graphics card if one answers, else the processor.
+    /// A graphics card if available, else the processor
     #[default]
     Auto,
-    /// The processor.
+    /// The processor
     Cpu,
-    /// Any graphics adapter, software Vulkan too.
+    /// Any graphics adapter, including software Vulkan
     Gpu,
 }
 
@@ -43,7 +43,7 @@ impl From<RendererKind> for Backend {
     }
 }
 
-/// As the command line spells it, for those who pass it on.
+/// The value on the command line.
 impl fmt::Display for RendererKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -57,15 +57,15 @@ impl fmt::Display for RendererKind {
 /// Values of `--detail`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum DetailKind {
-    /// Every splat.
+    /// Every splat
     Full,
-    /// Merged splats for what is small in the image, where the scene has a million and more.
+    /// Merged splats for small image parts, in scenes with a million splats or more
     #[default]
     Adaptive,
 }
 
 impl DetailKind {
-    /// Returns what the renderer of a scene is told.
+    /// Returns the level of detail for a scene.
     pub fn of(self, scene: &Scene<'_>) -> Detail {
         match self {
             Self::Full => Detail::Full,
@@ -74,7 +74,7 @@ impl DetailKind {
     }
 }
 
-/// As the command line spells it, for those who pass it on.
+/// The value on the command line.
 impl fmt::Display for DetailKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -84,11 +84,11 @@ impl fmt::Display for DetailKind {
     }
 }
 
-/// Returns the renderer of a packed scene ([`vizflyt_splat::pack`]), which has at most so many bytes of it in memory, and of
-/// what moves in it.
+/// Returns the renderer of a packed scene ([`vizflyt_splat::pack`]) and its moving objects. It keeps at most
+/// this many bytes of the scene in memory.
 ///
 /// # Errors
-/// If the file cannot be used, or a graphics adapter was asked for: they render what is in memory.
+/// If the file cannot be used, or a graphics adapter is required: they render only scenes in memory.
 pub fn open_packed(
     path: &Path,
     objects: &[RigidObject],
@@ -104,10 +104,10 @@ pub fn open_packed(
     CpuRenderer::streamed(scene, objects, memory_bytes, loading).with_context(cannot)
 }
 
-/// Returns the renderer of a scene, which it packs a copy of.
+/// Returns the renderer of a scene, with its own packed copy of it.
 ///
 /// # Errors
-/// If a graphics adapter was asked for and none can be used.
+/// If a graphics adapter is required and none can be used.
 pub fn choose<'a>(
     scene: impl Into<Scene<'a>>,
     kind: RendererKind,

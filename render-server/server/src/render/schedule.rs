@@ -1,9 +1,9 @@
-//! When each camera of a vehicle is due, and what its image shows: pure, with time as an argument, so that
-//! the render thread (wall clock) and graded flights (virtual clock) keep the same rules.
+//! Schedule and exposure of a vehicle's cameras. Pure, with time as an argument, so that the render thread
+//! (wall clock) and graded flights (virtual clock) follow the same rules.
 //!
 //! ```text
 //! periods, now ──▶ CameraSchedule ──▶ the cameras that are due
-//! newest motion, now ──▶ Exposure ──▶ the instant that images show, the pose by then, render cameras
+//! newest motion, now ──▶ Exposure ──▶ instant of the images, pose at that instant, render cameras
 //! ```
 
 use glam::DVec3;
@@ -17,19 +17,20 @@ use vizflyt_splat::{Atmosphere, Camera};
 
 use crate::poses::newest::Localized;
 
-/// From rendering to the plugin, as long as no runtime has reported it: of a usual machine. [ns]
+/// Default time from rendering to the plugin, until a runtime has reported it; typical for a common machine.
+/// [ns]
 const SEEN_AFTER_NS: i64 = 15_000_000;
-/// Where the twin ends: black, like the trainers' background.
+/// Colour outside the twin: black, like the trainers' background.
 const BACKGROUND: [f32; 3] = [0.0; 3];
 
-/// The times between images.
+/// Times between images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Periods {
-    /// Of a camera without a rate of its own. [ns]
+    /// Period of a camera without its own rate. [ns]
     pub default_ns: i64,
-    /// The shortest one, whatever a camera's own rate. [ns]
+    /// Minimum period of all cameras. [ns]
     pub least_ns: i64,
-    /// Cameras that are due within this time of each other are rendered together. [ns]
+    /// Cameras that are due within this time are rendered together. [ns]
     pub together_ns: i64,
 }
 
@@ -39,32 +40,31 @@ impl Periods {
     }
 }
 
-/// When each camera of one vehicle is due.
+/// Due times of one vehicle's cameras.
 #[derive(Clone, Debug)]
 pub struct CameraSchedule {
     due: [ServerTime; MAX_CAMERAS],
 }
 
 impl CameraSchedule {
-    /// Makes one in which every camera is due at `now`.
+    /// Creates a schedule in which every camera is due at `now`.
     pub fn new(now: ServerTime) -> Self {
         Self { due: [now; MAX_CAMERAS] }
     }
 
-    /// Lets no camera wait for longer than its present period: one that got faster need not wait out its
-    /// former one.
+    /// Limits each wait to the camera's present period, so that a faster rate takes effect at once.
     pub fn hasten(&mut self, cameras: &[CameraConfig], periods: &Periods, now: ServerTime) {
         for (due, camera) in self.due.iter_mut().zip(cameras) {
             *due = (*due).min(now.plus_ns(periods.of(camera)));
         }
     }
 
-    /// Returns when the first of the cameras is due; `None` if there are none.
+    /// Returns the earliest due time; `None` without cameras.
     pub fn next(&self, cameras: &[CameraConfig]) -> Option<ServerTime> {
         self.due[..cameras.len().min(MAX_CAMERAS)].iter().min().copied()
     }
 
-    /// Returns which cameras are rendered at `now`, and notes when they are due again.
+    /// Returns the cameras to render at `now`, and schedules their next images.
     pub fn take(
         &mut self,
         cameras: &[CameraConfig],
@@ -75,7 +75,7 @@ impl CameraSchedule {
         for ((taken, due), camera) in taken.iter_mut().zip(&mut self.due).zip(cameras) {
             *taken = *due <= now.plus_ns(periods.together_ns);
             if *taken {
-                // From when it was due, so that the mean rate is kept; from now, after a rest.
+                // Counted from the due time, to keep the mean rate; after a rest, from now.
                 *due = due.plus_ns(periods.of(camera)).max(now);
             }
         }
@@ -83,20 +83,20 @@ impl CameraSchedule {
     }
 }
 
-/// What the images of one vehicle show.
+/// Instant, pose and velocity of one vehicle's images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
-    /// The instant.
+    /// Instant that the images show.
     pub at: ServerTime,
-    /// Where the vehicle is by then.
+    /// Pose of the vehicle at that instant.
     pub world_from_body: Pose<World, Body>,
-    /// How it moves. [m/s, world]
+    /// Velocity of the vehicle. [m/s, world]
     pub v_world_mps: DVec3,
 }
 
 impl Exposure {
-    /// Returns what images rendered at `now` show, `seen_after_ns` before the plugin sees them; `None` takes
-    /// that of a usual machine. [ns]
+    /// Returns the exposure of images rendered at `now`, which the plugin receives `seen_after_ns` later;
+    /// `None` uses the default. [ns]
     pub fn new(
         predict: Predict,
         seen_after_ns: Option<i64>,
@@ -117,12 +117,12 @@ impl Exposure {
         Self { at, world_from_body: motion.at(at), v_world_mps }
     }
 
-    /// Returns the moment of the images, in a flight of a seed.
+    /// Returns the moment of the images, for a flight with this seed.
     pub fn moment(&self, seed: u64) -> Moment {
         Moment { at_ns: self.at.as_ns().cast_signed(), v_world_mps: self.v_world_mps, seed }
     }
 
-    /// Returns the camera to render, where it is at that instant.
+    /// Returns the camera to render, at its pose at that instant.
     pub fn camera(
         &self,
         config: &CameraConfig,
@@ -139,7 +139,7 @@ impl Exposure {
     }
 }
 
-/// Whether the course withholds a camera's depth: "no return" everywhere.
+/// Returns whether the course withholds a camera's depth: "no return" everywhere.
 pub fn withholds_depth(config: &CameraConfig) -> bool {
     !config.depth
 }
@@ -162,7 +162,7 @@ mod tests {
         rates_hz.iter().map(camera).collect()
     }
 
-    /// Runs a second in which each tick takes `tick_ms`; returns how often each camera was rendered.
+    /// Runs a second in which each tick takes `tick_ms`; returns the number of images of each camera.
     fn rendered_in_a_second(rates_hz: &[Option<f64>], tick_ms: i64) -> Vec<usize> {
         let (start, cameras) = (START, cameras(rates_hz));
         let mut schedule = CameraSchedule::new(start);
@@ -187,7 +187,7 @@ mod tests {
         let counts = rendered_in_a_second(&[Some(30.0), None, Some(10.0), Some(500.0)], 1);
         assert!(counts[0].abs_diff(30) <= 1 && counts[2].abs_diff(10) <= 1, "{counts:?}");
         assert!(counts[1].abs_diff(120) <= 1 && counts[3] == counts[1], "{counts:?}");
-        // A machine that renders 40 ticks a second gives every one to the camera without a rate.
+        // A machine that renders 40 ticks per second uses every one for the camera without a rate.
         let counts = rendered_in_a_second(&[Some(30.0), None], 25);
         assert!(counts[0].abs_diff(30) <= 1 && counts[1].abs_diff(40) <= 1, "{counts:?}");
     }
@@ -204,11 +204,11 @@ mod tests {
     }
 
     #[test]
-    fn images_show_the_moment_that_is_asked_for() {
+    fn images_show_the_configured_instant() {
         let measured = ServerTime::from_ns(1_000_000_000);
         let mut newest = Localized::still(PoseSample::still(measured, Pose::IDENTITY));
         newest.motion.v_world_mps = DVec3::X * 5.0;
-        // Drawn 10 ms after the measurement, seen 30 ms later; and a pose that is half a second old.
+        // Rendered 10 ms after the measurement, seen 30 ms later; and a pose that is half a second old.
         let now = measured.plus_ns(10_000_000);
         let x_m = |predict, seen_after_ns, now| {
             let shown = Exposure::new(predict, seen_after_ns, &newest, now);
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_gets_faster_need_not_wait() {
+    fn a_faster_rate_takes_effect_at_once() {
         let mut schedule = CameraSchedule::new(START);
         let (slow, fast) = (cameras(&[Some(0.1)]), cameras(&[Some(50.0)]));
         schedule.take(&slow, &LIVE, START);
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_virtual_clock_a_camera_is_rendered_at_the_first_tick_after_it_is_due() {
+    fn renders_at_the_first_tick_after_the_due_time() {
         let periods = Periods { default_ns: 33_333_333, least_ns: 0, together_ns: 0 };
         let one = cameras(&[None]);
         let (mut schedule, mut taken) = (CameraSchedule::new(START), Vec::new());

@@ -1,12 +1,12 @@
-//! The render thread: newest motions in, rendered ticks out.
+//! Render thread: newest motions in, rendered ticks out.
 //!
 //! ```text
-//! newest motions, moved on to when the image is seen -> the cameras that are due, all vehicles'
-//! in one call -> rendered ticks, as fast as the machine renders, at most --max-rate and each
-//! camera's own rate; rests while nobody wants images
+//! newest motions, predicted to the instant of the image -> due cameras of all vehicles
+//! in one call -> rendered ticks, as fast as possible, at most --max-rate and each
+//! camera's own rate; rests without demand for images
 //! ```
-//! Bounded by the renderer; it allocates nothing once every buffer has been used
-//! (tests/allocation.rs). It is a plain thread: rendering would block tokio's workers.
+//! The renderer limits the rate. After every buffer has been used once, no memory is allocated
+//! (tests/allocation.rs). It is a plain thread, because rendering would block tokio's workers.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -33,11 +33,10 @@ use crate::render::{RendererInfo, Rendering};
 use crate::stop::Stop;
 use vizflyt_process::lock;
 
-/// Renders the newest poses until the server stops: each tick the cameras that are due of the
-/// vehicles that someone wants images of.
+/// Renders the newest poses until the server stops: in each tick the due cameras of all vehicles with demand
+/// for images.
 ///
-/// # Errors
-/// None; a camera that the renderer refuses is logged once and the tick left out.
+/// Ticks that the renderer rejects are skipped; only the first error is logged.
 pub fn run<D: Demand>(
     inputs: Inputs<'_, D>,
     renderer: &mut dyn Rasterizer,
@@ -56,7 +55,7 @@ pub fn run<D: Demand>(
         render.newest = localization.newest();
         let wait = render.until_due(wanted);
         if !wait.is_zero() {
-            // A newer pose may be worth an image at once.
+            // A newer pose may make an image due at once.
             localization.accepted.take(wait);
             continue;
         }
@@ -69,32 +68,32 @@ pub fn run<D: Demand>(
     }
 }
 
-/// The loop's state; every buffer is used again.
+/// State of the loop; every buffer is reused.
 struct RenderLoop<'a, D> {
     rendering: &'a Rendering,
     flights: &'a Flights,
     demand: &'a D,
     periods: Periods,
-    /// When each vehicle's cameras are due.
+    /// Due times of each vehicle's cameras.
     schedules: Vec<CameraSchedule>,
-    /// Each vehicle's cameras, at the size that its link asks for.
+    /// Cameras of each vehicle, at the size for its link.
     sets: Vec<Arc<CameraSet>>,
     rendered_cameras: [RenderedCameras; MAX_VEHICLES],
     /// Poses of this tick.
     newest: NewestPoses,
-    /// Stamp of the pose that each vehicle was last rendered from.
+    /// Stamp of the pose from which each vehicle was last rendered.
     rendered: [Option<ServerTime>; MAX_VEHICLES],
-    /// The cameras of one tick, all vehicles'; which of them are whose.
+    /// Cameras of all vehicles in one tick, and their ranges by vehicle.
     cameras: Vec<Camera>,
     ranges: [CameraRange; MAX_VEHICLES],
-    /// The moment of each camera's image, and what they are all seen in.
+    /// Moment of each camera's image, and the common environment.
     moments: Vec<Moment>,
     environment: EnvironmentConfig,
     weather: WeatherPass,
-    /// Their images side by side, as the renderer wants them.
+    /// Images in the order of the cameras, as the renderer requires.
     images: Vec<RgbdImage>,
     placements: Vec<Placement>,
-    /// Of each camera of each vehicle, with [`MAX_CAMERAS`] places a vehicle.
+    /// Effects by camera and vehicle, with [`MAX_CAMERAS`] entries per vehicle.
     imaging: Vec<CameraEffects>,
     seq: u64,
     refused: bool,
@@ -129,7 +128,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         }
     }
 
-    /// Takes over what runtimes have changed of their cameras, and the sizes that links ask for.
+    /// Reads the runtimes' changes of cameras, and the image sizes for the links.
     fn follow_cameras(&mut self) {
         self.sets.clear();
         let vehicles = self.rendering.cameras.iter().zip(&mut self.rendered_cameras).enumerate();
@@ -138,13 +137,13 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         }));
     }
 
-    /// Returns the pose of a vehicle that nothing was rendered from yet.
+    /// Returns the pose of a vehicle if it is newer than the last rendered one.
     fn unrendered(&self, vehicle: usize) -> Option<Localized> {
         self.newest[vehicle].filter(|newest| Some(newest.sample.stamp) != self.rendered[vehicle])
     }
 
-    /// Returns how long no camera is due. Where nothing can be rendered, a newer pose is worth
-    /// waking up for: it may be another vehicle's.
+    /// Returns the time until a camera is due. If none can be rendered, a newer pose, also of another vehicle,
+    /// ends the wait.
     fn until_due(&mut self, wanted: [bool; MAX_VEHICLES]) -> Duration {
         let now = clock::now();
         let mut next: Option<ServerTime> = None;
@@ -161,8 +160,8 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         })
     }
 
-    /// Collects the cameras that are due, each where its vehicle will be when the image is seen, and
-    /// fills in what `tick` says of their images. Returns the newest pose's stamp.
+    /// Collects the due cameras, each at the predicted pose of its vehicle, and sets the metadata of their
+    /// images in `tick`. Returns the newest pose's stamp.
     fn expose(&mut self, wanted: [bool; MAX_VEHICLES], tick: &mut RenderedTick) -> ServerTime {
         self.seq += 1;
         let slots = self.sets.iter().map(|set| set.configs.len()).sum();
@@ -176,7 +175,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         self.ranges = Default::default();
         for (vehicle, set) in self.sets.iter().enumerate() {
             let mut due = [false; MAX_CAMERAS];
-            // A vehicle's pose is kept until a camera of it is due.
+            // A vehicle's pose is kept until one of its cameras is due.
             let sample = self.unrendered(vehicle).filter(|_| wanted[vehicle]).inspect(|_| {
                 due = self.schedules[vehicle].take(&set.configs, &self.periods, clock::now());
             });
@@ -216,7 +215,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         stamp
     }
 
-    /// Renders the collected cameras and puts their images into `tick`.
+    /// Renders the collected cameras into `tick`.
     fn rasterize(
         &mut self,
         renderer: &mut dyn Rasterizer,
@@ -231,7 +230,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
             if rendering.dynamic_objects.is_empty() {
                 renderer.render(&[], cameras, images)?;
             } else {
-                // Each vehicle sees the moment that its images show, and not itself.
+                // Each vehicle sees the instant of its images, and not itself.
                 let mut ranges =
                     self.ranges.iter().enumerate().filter(|(_, range)| range.first < range.end);
                 ranges.try_for_each(|(vehicle, &CameraRange { first, end, at })| {
@@ -260,7 +259,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         result.inspect(|()| rendering.durations.add(start, end))
     }
 
-    /// Hands the tick to the encoder, and counts it.
+    /// Passes the tick to the encoder, and counts it.
     fn publish(&self, tick: RenderedTick, ticks: &RenderQueue, renderer: &dyn Rasterizer) {
         if self.seq.is_multiple_of(NAME_TICKS) {
             note_renderer(self.rendering, self.flights, renderer);
@@ -274,7 +273,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
         self.rendering.ticks_skipped.fetch_add(u64::from(skipped), Ordering::Relaxed);
     }
 
-    /// Logs the first tick that the renderer refuses.
+    /// Logs the first tick that the renderer rejects.
     fn report_refused(&mut self, error: &RenderError) {
         if !std::mem::replace(&mut self.refused, true) {
             warn!("tick {} is not rendered: {error}; further errors are not logged", self.seq);
@@ -282,7 +281,7 @@ impl<'a, D: Demand> RenderLoop<'a, D> {
     }
 }
 
-/// Turns a rendered image into the one that its camera takes.
+/// Applies the effects of the camera to a rendered image.
 fn take_image(effects: &mut [CameraEffects], newest: &NewestPoses, slot: &mut RenderedImage) {
     let RenderedImage { vehicle, camera, seq, .. } = *slot;
     let (Some(set), Some(newest), Some(world_from_body)) =
@@ -299,7 +298,7 @@ fn take_image(effects: &mut [CameraEffects], newest: &NewestPoses, slot: &mut Re
     effects[camera].apply(&input, &mut slot.image);
 }
 
-/// Which of a tick's cameras are a vehicle's, and the instant that they show.
+/// Range of one vehicle's cameras in a tick, and the instant of their images.
 #[derive(Clone, Copy, Debug, Default)]
 struct CameraRange {
     first: usize,
@@ -307,7 +306,7 @@ struct CameraRange {
     at: ServerTime,
 }
 
-/// Reports when another renderer has taken over, as the processor does from a lost graphics device.
+/// Reports a change of the renderer, as when the processor takes over from a lost graphics device.
 fn note_renderer(rendering: &Rendering, flights: &Flights, renderer: &dyn Rasterizer) {
     let name = renderer.name();
     let mut info = lock(&rendering.renderer);
@@ -321,9 +320,9 @@ fn note_renderer(rendering: &Rendering, flights: &Flights, renderer: &dyn Raster
     }
 }
 
-/// How long a stop may go unnoticed.
+/// Maximum delay until a stop is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);
-/// The renderer is asked for its name this often: a second's worth.
+/// Number of ticks between checks of the renderer's name: about a second.
 const NAME_TICKS: u64 = 64;
-/// Less than any sensor notices, more than clocks round. [ns]
+/// Less than any sensor resolves, more than the rounding of clocks. [ns]
 const TOGETHER_NS: i64 = 1_000_000;

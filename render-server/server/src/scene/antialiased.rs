@@ -1,4 +1,4 @@
-//! `--antialiased`: whether a scene is rendered as one that was trained with anti-aliasing.
+//! `--antialiased`: whether the scene was trained with anti-aliasing.
 
 use std::fmt;
 
@@ -8,17 +8,21 @@ use vizflyt_splat::Splats;
 /// Values of `--antialiased`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Antialiased {
-    /// As `scene.antialiased` of the arena says, else the scene's file; many do not.
+    /// From the arena's `scene.antialiased`, else from the scene's file
+    ///
+    /// Many files do not state it.
     #[default]
     Auto,
-    /// Trained with anti-aliasing: mip-splatting, splatfacto's and gsplat's `antialiased`, brush's `mip`.
+    /// Trained with anti-aliasing (mip-splatting)
+    ///
+    /// Also `antialiased` of splatfacto and gsplat, and `mip` of brush.
     On,
-    /// Trained in the classic way.
+    /// Trained without anti-aliasing
     Off,
 }
 
 impl Antialiased {
-    /// Decides how splats are rendered.
+    /// Sets whether splats are rendered with anti-aliasing.
     pub fn apply(self, splats: &mut Splats) {
         splats.antialiased = match self {
             Self::Auto => splats.antialiased,
@@ -28,7 +32,7 @@ impl Antialiased {
     }
 }
 
-/// As the command line spells it, for those who pass it on.
+/// The value on the command line.
 impl fmt::Display for Antialiased {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -44,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_file_decides_unless_it_is_overruled() {
+    fn the_file_decides_unless_overridden() {
         let check = |choice: Antialiased, file: bool, expected: bool| {
             let mut splats = Splats { antialiased: file, ..Splats::default() };
             choice.apply(&mut splats);

@@ -1,15 +1,15 @@
-//! A captured scene without an `arena.toml`: finds its floor, its size, and a place to start.
+//! Default arena for a captured scene without an `arena.toml`: floor, size, and start.
 //!
-//! A capture has its own axes, unit and origin. What is assumed, and can be overruled on the
-//! command line:
+//! A capture has its own axes, unit and origin. The following is assumed, and can be overridden on the command
+//! line:
 //! - up is scene -y (`--up`): structure from motion starts from an upright camera, y down;
-//! - the scene's core is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a
-//!   room or a garden as far as a hand-held camera sees it. The unit itself cannot be known;
+//! - the scene's core is [`CAPTURED_HEIGHT_M`] high between its 2nd and 98th percentile (`--scale`): a room or
+//!   a garden as seen by a hand-held camera. The unit itself cannot be determined;
 //! - the start is where there is a floor and the twin looks best (see `best_view`);
-//! - the floor is the core's 2nd percentile of height; it becomes the world's z = 0, and the middle of
-//!   the core the origin.
+//! - the floor is the core's 2nd percentile of height; it becomes the world's z = 0, and the middle of the core
+//!   the origin.
 //!
-//! All of it is said in an [`ArenaConfig`] that could have been written by hand; `vizflyt arena new` writes it.
+//! The result is an [`ArenaConfig`] that could have been written by hand; `vizflyt arena new` writes it.
 
 use std::path::Path;
 
@@ -30,23 +30,27 @@ use super::core::{SOLID_OPACITY, bounds, core};
 use super::fit::LEAST_FLOOR;
 use super::floor::floor_share;
 
-/// What a command line says of a scene without an arena.
+/// Command-line options for a scene without an arena.
 #[derive(Args, Clone, Copy, Debug, Default, PartialEq)]
 pub struct BareArgs {
-    /// Scene without an arena.toml: the file's axis that points up: x, -x, y, -y, z or -z [default: -y]
+    /// Axis of the file that points up, for a scene without an arena.toml [default: -y]
+    ///
+    /// x, -x, y, -y, z or -z.
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     pub up: Option<Up>,
 
-    /// Scene without an arena.toml: metres per unit of the file [default: its core is taken to be 3 m high]
+    /// Metres per unit of the file, for a scene without an arena.toml
+    ///
+    /// By default, the core of the scene is assumed to be 3 m high.
     #[arg(long, value_name = "METRES", value_parser = parse_scale)]
     pub scale: Option<f64>,
 }
 
 impl BareArgs {
-    /// Refuses to turn or scale what an `arena.toml` places.
+    /// Rejects the options if an `arena.toml` places the scene.
     ///
     /// # Errors
-    /// A flag that was given, with what to do instead.
+    /// Names the option, and the alternative.
     pub fn check_unused(&self, arena_toml: &Path) -> Result<()> {
         let flags = match (self.up, self.scale) {
             (None, None) => return Ok(()),
@@ -61,7 +65,7 @@ impl BareArgs {
         );
     }
 
-    /// Returns what of a scene's placement is a guess, for people; `None` if nothing is.
+    /// Returns a description of the guessed parts of the placement; `None` if all was given.
     pub(super) fn guessed(&self, scene: &SceneConfig) -> Option<String> {
         let up = scene.up.unwrap_or(Up::Z);
         let unit =
@@ -78,7 +82,7 @@ impl BareArgs {
 /// Parses metres per unit of a scene.
 ///
 /// # Errors
-/// What is no number, or no scale that a scene has.
+/// Text that is not a number, or a scale out of range.
 pub fn parse_scale(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| format!("'{text}' is not a number"))?;
     if METRES_PER_UNIT.contains(&value) {
@@ -88,8 +92,8 @@ pub fn parse_scale(text: &str) -> Result<f64, String> {
     Err(format!("{value} is outside {least} to {most}"))
 }
 
-/// Returns the placement that puts a captured scene upright, to size, onto z = 0, its middle at the
-/// origin. What `args` leave open is guessed.
+/// Returns the placement that puts a captured scene upright, to scale, onto z = 0, with its middle at the
+/// origin. Values missing in `args` are guessed.
 pub fn place(splats: &Splats, file: &str, args: &BareArgs) -> SceneConfig {
     let up = args.up.unwrap_or_default();
     let rotation = up.world_from_scene();
@@ -101,17 +105,17 @@ pub fn place(splats: &Splats, file: &str, args: &BareArgs) -> SceneConfig {
     let metres_per_unit = args.scale.unwrap_or_else(|| to_digits(guess).clamp(least, most));
     let middle = (min + max) / 2.0;
     let base = DVec3::new(middle.x, middle.y, min.z);
-    // Written into arena.toml, and read by people: millimetres.
+    // Rounded to millimetres, because it is written into arena.toml.
     let origin_m = (-base * metres_per_unit * 1e3).round() / 1e3;
     SceneConfig { up: Some(up), metres_per_unit, origin_m, ..SceneConfig::in_world(file) }
 }
 
-/// Returns a positive number to three digits: a guess is not better.
+/// Rounds a positive number to three digits, the precision of a guess.
 fn to_digits(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 
-/// Returns an arena for a scene that already lies in the world (z up, metres), as `scene` placed it: the
+/// Returns an arena for a scene that is already in the world frame (z up, metres), as placed by `scene`: the
 /// fence around its core, the start on the floor where there is room and the view is best, one camera of
 /// 320x240, no goal.
 ///
@@ -127,7 +131,7 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
     let name = Path::new(&scene.file).file_stem();
     let name = name.map_or("scene".into(), |stem| stem.to_string_lossy());
     let name: String = name.chars().filter(char::is_ascii_graphic).take(32).collect();
-    // Something to fly in, however small the scene.
+    // Minimum space to fly, even for a small scene.
     let least = DVec3::new(1.0, 1.0, 0.0);
     let margin = OUTSIDE_M / 2.0;
     let min_m = (min - margin).min(spawn - least);
@@ -165,19 +169,19 @@ pub fn default_arena(splats: &Splats, scene: impl Into<SceneConfig>) -> Result<A
         objects: Vec::new(),
         rules: RulesConfig::default(),
     };
-    arena.validate().context("no arena can be made up for this scene")?;
+    arena.validate().context("cannot create an arena for this scene")?;
     Ok(arena)
 }
 
-/// Returns the side of the voxels that a scene of this size is baked into: as fine as the memory allows.
+/// Returns the voxel size for a scene of this size: as fine as the memory allows.
 ///
 /// # Errors
-/// A scene too large for the coarsest.
+/// A scene that is too large for the coarsest size.
 fn voxel_m(size_m: DVec3) -> Result<f64> {
     let usual_m = Occupancy::default().voxel_m;
     let volume_m3 = (size_m + 2.0 * OUTSIDE_M).max(DVec3::ONE).element_product();
     let fitting_m = (volume_m3 / VOXELS).cbrt();
-    // Up to the next centimetre.
+    // Rounded up to the next centimetre.
     let voxel_m = if fitting_m <= usual_m { usual_m } else { (fitting_m * 100.0).ceil() / 100.0 };
     if voxel_m <= COARSEST_M {
         return Ok(voxel_m);
@@ -197,8 +201,8 @@ fn to_cm(p_m: DVec3) -> DVec3 {
     (p_m * 100.0).round() / 100.0
 }
 
-/// Returns those of the places within the core that have a floor, if any has; else all. Beyond the core a
-/// few huge splats are a floor too, and nothing is to be seen.
+/// Returns the places within the core that have a floor, or all places if none has one. Outside the core, a few
+/// huge splats may look like a floor, but the view is empty.
 fn with_floor(
     places: Vec<(u32, DVec3)>,
     splats: &Splats,
@@ -214,7 +218,7 @@ fn with_floor(
     if standing.is_empty() { places } else { standing }
 }
 
-/// Returns the quarter of the places with the fewest splats in the way, and all that are as good as the
+/// Returns the quarter of the places with the fewest splats in the way, and all places that are as good as the
 /// best. [m, world]
 fn with_room(mut places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
     places.sort_by_key(|place| place.0);
@@ -225,12 +229,11 @@ fn with_room(mut places: Vec<(u32, DVec3)>) -> Vec<DVec3> {
     free.map(|(_, place)| place.1).collect()
 }
 
-/// Returns the place [m, world] and heading [rad] from which, at the height of the flight, the
-/// twin looks best: most detail, least right before the lens.
+/// Returns the place [m, world] and heading [rad] from which, at flight height, the twin looks best: most
+/// detail, least directly in front of the lens.
 ///
-/// A capture is sharp only near where its photographs were taken, and those places are not in the
-/// file. But seen from elsewhere it is blur and void, and that a picture shows: so small pictures
-/// are rendered from everywhere and compared.
+/// A capture is sharp only near the positions of its photos, which are not in the file. From elsewhere it is
+/// blurred or empty, which is visible in an image. So small images are rendered from all places and compared.
 fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
     let mut renderer = CpuRenderer::new(splats);
     let mut images = vec![RgbdImage::default(); HEADINGS];
@@ -264,9 +267,9 @@ fn best_view(splats: &Splats, places: &[DVec3]) -> (DVec3, f64) {
     ((found.1 * 100.0).round() / 100.0, found.2)
 }
 
-/// Returns how much there is to see: the sum of steps in brightness, each counted up to a tenth,
-/// times the share of the picture, squared, that shows something not too close. Where a capture
-/// ends, stray splats make sharp spikes before a void; the share keeps those from winning.
+/// Returns the amount of detail: the sum of steps in brightness, each at most a tenth, times the squared share
+/// of the image that is not too close. At the edge of a capture, stray splats make sharp spikes before empty
+/// space; the share prevents them from winning.
 fn detail(image: &RgbdImage) -> f32 {
     let width = image.width_px as usize;
     let grey: Vec<f32> = image.rgb.chunks_exact(3).map(|c| (c[0] + c[1] + c[2]) / 3.0).collect();
@@ -278,7 +281,7 @@ fn detail(image: &RgbdImage) -> f32 {
     (across + down) * share.powi(2)
 }
 
-/// How full each column of air is between the floor and above the flight.
+/// Number of splats in each column of air between the floor and the flight height.
 struct Plan {
     min: DVec3,
     cells: [usize; 2],
@@ -302,7 +305,7 @@ impl Plan {
         plan
     }
 
-    /// Returns the column and row of a point, which may lie outside the plan.
+    /// Returns the column and row of a point, which may be outside the plan.
     fn column_and_row(&self, p: DVec3) -> [i64; 2] {
         let at = (p - self.min) / CELL_M;
         [at.x.floor() as i64, at.y.floor() as i64]
@@ -313,7 +316,7 @@ impl Plan {
         Some(inside(y, self.cells[1])? * self.cells[0] + inside(x, self.cells[0])?)
     }
 
-    /// Returns places all over the plan, each with the splats in its way. [m, world]
+    /// Returns places on a grid over the plan, each with the number of splats in its way. [m, world]
     fn places(&self) -> Vec<(u32, DVec3)> {
         let span = DVec3::new(self.cells[0] as f64, self.cells[1] as f64, 0.0) * CELL_M;
         let low = DVec3::new(self.min.x, self.min.y, 0.0);
@@ -328,7 +331,7 @@ impl Plan {
         places
     }
 
-    /// Returns the number of splats within a body's reach of the column at `p`.
+    /// Returns the number of splats within the body's reach of the column at `p`.
     fn crowd(&self, p: DVec3) -> u32 {
         let [x, y] = self.column_and_row(p);
         let mut sum = 0;
@@ -341,31 +344,31 @@ impl Plan {
     }
 }
 
-/// A storey. [m]
+/// Assumed height of a capture: a storey. [m]
 const CAPTURED_HEIGHT_M: f64 = 3.0;
-/// Of an arena that is made up: 100 MB.
+/// Maximum number of voxels of a default arena: 100 MB.
 const VOXELS: f64 = 1e8;
-/// Coarser ones leave no room to fly. [m]
+/// Maximum voxel size; coarser voxels leave no room to fly. [m]
 const COARSEST_M: f64 = 0.5;
-/// A palm-sized quadrotor of the course. [m]
+/// Radius of a palm-sized quadrotor of the course. [m]
 const BODY_RADIUS_M: f64 = 0.12;
 const TAKEOFF_HEIGHT_M: f64 = 1.2;
 const FOV_DEG: f64 = 90.0;
-/// Places are tried this far outside the scene's bounds: whoever photographs a corner of a room
-/// stands away from it. [m]
+/// Places are tried up to this distance outside the scene's bounds: the photographer of a corner stands away
+/// from it. [m]
 const OUTSIDE_M: DVec3 = DVec3::new(1.0, 1.0, 0.0);
-/// At most 81 places, 8 pictures each: half a second.
+/// At most 81 places with 8 images each: half a second.
 const PLACES_PER_SIDE: f64 = 8.0;
 const HEADINGS: usize = 8;
-/// Single splats are no obstacle to taking off.
+/// Number of splats that does not obstruct a take-off.
 const FEW_SPLATS: u32 = 3;
-/// Nearer than this a thing hides the rest. [m]
+/// Objects nearer than this hide the rest. [m]
 const CLOSE_M: f32 = 0.7;
-/// A body's radius, and as much room again twice over: 0.45 m.
+/// A body's radius, plus twice as much free space: 0.45 m.
 const REACH_CELLS: i64 = 4;
-/// Fine against that reach. [m]
+/// Cell size: fine compared with that reach. [m]
 const CELL_M: f64 = 0.1;
-/// 40 m; larger captures are planned over their first corner only.
+/// Maximum cells per side: 40 m. Of larger captures only the first corner is used.
 const MAX_CELLS: usize = 400;
 
 #[cfg(test)]
@@ -374,8 +377,8 @@ mod tests {
     use super::*;
     use glam::{Quat, Vec3};
 
-    /// A hollow box of points in scene units, y down, four times as large as life, with a post in
-    /// its middle and haze above.
+    /// A hollow box of points in scene units, y down, at four times the real scale, with a post in its middle
+    /// and haze above.
     fn captured() -> Splats {
         let mut means = Vec::new();
         for i in 0..=40 {
@@ -405,7 +408,7 @@ mod tests {
         }
     }
 
-    /// Places it as the command line says, and returns how.
+    /// Places the scene with these options, and returns the placement.
     fn put(splats: &mut Splats, args: BareArgs) -> SceneConfig {
         let scene = place(splats, "rooms/kitchen.ply", &args);
         Placement::of(&scene).apply(splats);
@@ -413,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_capture_is_put_upright_and_to_size() {
+    fn places_a_capture_upright_and_to_scale() {
         let mut splats = captured();
         let scene = put(&mut splats, BareArgs::default());
         assert!((scene.metres_per_unit - 0.25).abs() < 0.01, "{scene:?}");
@@ -425,9 +428,9 @@ mod tests {
         assert_eq!(put(&mut captured(), half).metres_per_unit, 0.5);
     }
 
-    /// 4 % of opaque sky, 300 units out, used to make the sky's height the scene's.
+    /// 4 % of opaque sky, 300 units away, must not determine the scene's height.
     #[test]
-    fn sky_is_not_the_scenes_height() {
+    fn ignores_sky_in_the_scenes_height() {
         let mut with_sky = captured();
         let sky = (0..280).map(|k| {
             let angle = k as f32 * 2.4;
@@ -479,9 +482,9 @@ mod tests {
         }
     }
 
-    /// Memory is not asked for before it is known how much.
+    /// The size is checked before memory is allocated.
     #[test]
-    fn a_scene_too_large_to_bake_is_refused_with_the_figure() {
+    fn rejects_a_scene_too_large_to_bake_with_its_size() {
         let at = |scale: f64| {
             let mut splats = captured();
             let scene = put(&mut splats, BareArgs { up: None, scale: Some(scale) });

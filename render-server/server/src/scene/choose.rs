@@ -1,11 +1,11 @@
-//! The scenes that the page may change to: the arenas in one folder, by the names of theirs.
+//! Scenes that can be chosen on the page: the arenas in one folder, by the names of their folders.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use vizflyt_process::lock;
 
-/// The scenes to choose from, and the one chosen.
+/// Available scenes, and the chosen one.
 #[derive(Debug)]
 pub struct Scenes {
     folder: Option<PathBuf>,
@@ -14,12 +14,12 @@ pub struct Scenes {
 }
 
 impl Scenes {
-    /// Makes the choice of a server that shows the arena `now`; without a `folder` there is none.
+    /// Creates the list for a server that shows the arena `now`; empty without a `folder`.
     pub fn new(folder: Option<&Path>, now: &Path) -> Self {
         Self { folder: folder.map(Path::to_owned), now: now.to_owned(), chosen: Mutex::default() }
     }
 
-    /// Returns the scenes there are: the folders in the folder that hold an arena.toml, by name.
+    /// Returns the available scenes, sorted by name: subfolders that contain an arena.toml.
     pub fn list(&self) -> Vec<(String, PathBuf)> {
         let Some(folder) = &self.folder else { return Vec::new() };
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -35,7 +35,7 @@ impl Scenes {
         scenes
     }
 
-    /// Returns the name of the scene that is shown, if it is one of the list.
+    /// Returns the name of the present scene, if it is in the list.
     pub fn current(&self) -> Option<String> {
         let real = |path: &Path| {
             let arena = if path.is_dir() { path.join("arena.toml") } else { path.to_owned() };
@@ -48,10 +48,10 @@ impl Scenes {
             .map(|(n, _)| n)
     }
 
-    /// Chooses a scene by its name; it is loaded when this round of serving has ended.
+    /// Chooses a scene by name; it is loaded when the present round of serving has ended.
     ///
     /// # Errors
-    /// No scene of that name, or one that cannot be used; the reason, for a person.
+    /// The scene does not exist or cannot be used, as text for the user.
     pub fn choose(&self, name: &str) -> Result<(), String> {
         let scenes = self.list();
         let Some((_, arena)) = scenes.iter().find(|(known, _)| known == name) else {
@@ -62,19 +62,19 @@ impl Scenes {
                 names => format!("there is no scene '{name}'; there are {}", names.join(", ")),
             });
         };
-        // Errors in it are reported now, not after the present one is gone.
+        // Errors are reported before the present scene is closed.
         super::parse_arena(arena).map_err(|error| format!("{error:#}"))?;
         *lock(&self.chosen) = Some(arena.clone());
         Ok(())
     }
 
-    /// Returns what was chosen, once.
+    /// Returns the chosen scene, once.
     pub fn take_chosen(&self) -> Option<PathBuf> {
         lock(&self.chosen).take()
     }
 }
 
-/// More are no choice on a page.
+/// Maximum number of scenes in the list.
 const MAX_SCENES: usize = 100;
 
 #[cfg(test)]

@@ -1,17 +1,17 @@
-//! The core of a captured scene: what lies close together, without sky, backdrop and floaters.
+//! Core of a captured scene: dense parts, without sky, backdrop and floaters.
 //!
 //! ```text
 //! centres of solid splats -> median, reach -> counts in coarse cells -> largest connected part
 //! ```
-//! Extremes and percentiles are ruined by a few per cent of sky a hundred times further out. A median is
-//! not, nor is density: cells are a sixth of the median reach wide, one that holds its share of splats
-//! counts, and those that touch each other are one part.
+//! A few per cent of sky a hundred times further away distort extremes and percentiles, but neither a median
+//! nor density. Cells are a sixth of the median reach wide. A cell counts if it holds a minimum share of the
+//! splats, and touching cells form one part.
 
 use glam::{DVec3, IVec3, Vec3};
 use vizflyt_splat::Splats;
 
-/// Returns the centres of the scene's core, each moved by `place`: of splats at least half opaque, or of
-/// all where none is. All of them, where nothing lies close together.
+/// Returns the centres of the scene's core, each transformed by `place`: of splats with at least half opacity,
+/// or of all splats if there are none. Returns all centres if no dense part exists.
 pub fn core(splats: &Splats, place: impl Fn(Vec3) -> Vec3) -> Vec<Vec3> {
     let solid = |least: f32| -> Vec<Vec3> {
         let means = splats.means_m.iter().zip(&splats.opacities);
@@ -26,8 +26,8 @@ pub fn core(splats: &Splats, place: impl Fn(Vec3) -> Vec3) -> Vec<Vec3> {
     if part.len() as f64 >= LEAST_SHARE * points.len() as f64 { part } else { points }
 }
 
-/// Returns the corners of a box around all points but [`EDGE`] of them at either end of each axis; zeros
-/// without any.
+/// Returns the corners of a box around all points except [`EDGE`] of them at either end of each axis; zeros
+/// without points.
 pub fn bounds(mut points: Vec<Vec3>) -> [DVec3; 2] {
     let mut corners = [DVec3::ZERO; 2];
     let Some(last) = points.len().checked_sub(1) else { return corners };
@@ -42,14 +42,14 @@ pub fn bounds(mut points: Vec<Vec3>) -> [DVec3; 2] {
     corners
 }
 
-/// A cube of cells around the middle of the points.
+/// Cube of cells around the middle of the points.
 struct Cells {
     low: Vec3,
     side: f32,
 }
 
 impl Cells {
-    /// `None` where there is no extent to divide.
+    /// `None` if the points have no extent.
     fn around(points: &[Vec3]) -> Option<Self> {
         let median = |values: &mut Vec<f32>| {
             let middle = values.len() / 2;
@@ -63,17 +63,17 @@ impl Cells {
         let reach = median(&mut points.iter().map(away).collect())?;
         let side = reach / CELLS_PER_REACH;
         let low = middle - side * (SIDE / 2) as f32;
-        // A denormal reach has no sixth.
+        // A sixth of a denormal reach is not normal.
         (side.is_normal() && low.is_finite()).then_some(Self { low, side })
     }
 
-    /// Returns the cell that a point lies in; `None` beyond the cube.
+    /// Returns the cell of a point; `None` outside the cube.
     fn of(&self, p: Vec3) -> Option<usize> {
         index(((p - self.low) / self.side).floor().as_ivec3())
     }
 
-    /// Returns the points of the part that holds most of them: of cells that are full enough and touch
-    /// each other, by corners too.
+    /// Returns the points of the largest part: of cells that are full enough and touch each other, also at
+    /// corners.
     fn largest_part(&self, points: &[Vec3]) -> Option<Vec<Vec3>> {
         let mut counts = vec![0_u32; (SIDE * SIDE * SIDE) as usize];
         for cell in points.iter().filter_map(|p| self.of(*p)) {
@@ -112,7 +112,7 @@ fn index(cell: IVec3) -> Option<usize> {
     within.then(|| ((cell.x * SIDE + cell.y) * SIDE + cell.z) as usize)
 }
 
-/// Returns the cells around one, and itself.
+/// Returns the cells around a cell, including itself.
 fn neighbours(cell: usize) -> impl Iterator<Item = usize> {
     let cell = cell as i32;
     let at = IVec3::new(cell / (SIDE * SIDE), cell / SIDE % SIDE, cell % SIDE);
@@ -121,18 +121,18 @@ fn neighbours(cell: usize) -> impl Iterator<Item = usize> {
     offsets.filter_map(move |offset| index(at + IVec3::from(offset)))
 }
 
-/// Below it a splat is haze.
+/// Minimum opacity of a solid splat; below it, it is haze.
 pub(super) const SOLID_OPACITY: f32 = 0.5;
-/// Share of the core's splats left out at either end.
+/// Share of the core's splats omitted at either end.
 const EDGE: f64 = 0.02;
-/// Of a room of 29 x 17 x 15 units this makes cells of 1.4: walls hold together, sky does not.
+/// For a room of 29 x 17 x 15 units this gives cells of 1.4: walls stay connected, sky does not.
 const CELLS_PER_REACH: f32 = 6.0;
-/// Cells along the cube's side: what lies more than 12 times the reach away is no core.
+/// Cells along the cube's side: points more than 12 times the reach away do not belong to the core.
 const SIDE: i32 = 144;
-/// Share of all splats that a cell must hold: of `room.ply` (63 k solid ones) 4, of 1 M 50; 4 % of sky on a
+/// Minimum share of all splats in a cell, which is 4 for `room.ply` (63 k solid ones), 50 for 1 M. 4 % of sky on a
 /// sphere of twelve times the reach leaves 0.6 of 1 M in a cell.
 const DENSE_SHARE: f64 = 5e-5;
-/// A part that holds less of the scene is no core.
+/// Minimum share of the scene in the core.
 const LEAST_SHARE: f64 = 0.25;
 
 #[cfg(test)]
@@ -141,7 +141,7 @@ mod tests {
     use glam::Quat;
     use proptest::prelude::*;
 
-    /// Even numbers in 0..1 without a generator (Weyl sequences).
+    /// Evenly distributed numbers in 0..1 without a generator (Weyl sequences).
     fn even(k: usize) -> Vec3 {
         let at = |step: f64| (k as f64 * step).fract() as f32;
         Vec3::new(at(0.819_172_513_4), at(0.671_043_606_7), at(0.549_700_477_9))
@@ -160,7 +160,7 @@ mod tests {
         }
     }
 
-    /// The faces of a room of 8 x 6 x 3 units.
+    /// Faces of a room of 8 x 6 x 3 units.
     fn room(count: usize) -> Vec<Vec3> {
         let on_face = |k: usize| {
             let mut p = even(k);
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn sky_and_floaters_are_no_core() {
+    fn sky_and_floaters_are_not_in_the_core() {
         check_room(room(20_000));
         for radius in [40.0, 300.0, 1e3, 1e6, 1e30] {
             for count in [800, 4000] {
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_turned_has_the_same_core() {
+    fn rotated_scenes_have_the_same_core() {
         let turn = Quat::from_rotation_y(std::f32::consts::FRAC_PI_2);
         let turned = bounds(core(&splats(room(9000)), |p| turn * p));
         let size = turned[1] - turned[0];
@@ -202,7 +202,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever a file holds: no panic, and the core is part of it.
+        /// For any file contents: no panic, and the core is part of them.
         #[test]
         fn any_points_have_a_core(
             points in prop::collection::vec(

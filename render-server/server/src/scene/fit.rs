@@ -1,13 +1,13 @@
-//! Whether a scene and its arena can be meant together: a capture that lies on its side, far off or
-//! a hundred times too large bakes to nothing, and a course without obstacles can always be flown.
+//! Plausibility checks of a scene in its arena: a capture that lies on its side, far away or a hundred times
+//! too large has no obstacles, and a course without obstacles can always be flown.
 //!
 //! ```text
 //! Splats in the world, ArenaConfig, DistanceField -> findings, by key of arena.toml
 //! ```
-//! What is certain: most of the scene lies outside the fence, nothing level lies under the start, nothing
-//! of it became an obstacle. What is likely, for a scene that `up` has turned: it is upside down (what
-//! stands in a room stands on its floor), or on its side (higher than long). A wall that became the floor of
-//! a room of about equal sides is not noticed.
+//! Certain faults: most of the scene is outside the fence, no level floor is under the start, no part became an
+//! obstacle. Likely faults, for a scene rotated by `up`: it is upside down (objects in a room stand on its
+//! floor), or on its side (higher than long). A wall that became the floor of a room with similar sides is not
+//! detected.
 
 use glam::DVec3;
 use vizflyt_arena::check::Finding;
@@ -17,7 +17,7 @@ use vizflyt_splat::Splats;
 use super::core::{bounds, core};
 use super::floor::{REACH_M, floor_share};
 
-/// Returns what speaks against a scene in its arena; `field` is what was baked of it.
+/// Returns the findings against a scene in its arena; `field` is its baked distance field.
 pub fn check_fit(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Vec<Finding> {
     let mut findings = Vec::new();
     let mut found = |key: &str, text: String| findings.push(Finding { key: key.into(), text });
@@ -78,7 +78,7 @@ pub fn check_fit(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) ->
     findings
 }
 
-/// Returns the share of the points outside the fence and a margin, where walls stand.
+/// Returns the share of points outside the fence with a margin for walls.
 fn share_outside(points: &[glam::Vec3], arena: &ArenaConfig) -> f64 {
     let fence = &arena.geofence;
     let inside = points.iter().filter(|p| {
@@ -89,8 +89,8 @@ fn share_outside(points: &[glam::Vec3], arena: &ArenaConfig) -> f64 {
     if points.is_empty() { 0.0 } else { 1.0 - inside / points.len() as f64 }
 }
 
-/// Returns how full the scene is between floor and ceiling, in its lower and its upper half: the share of
-/// coarse cells that hold a splat.
+/// Returns the share of coarse cells that contain a splat, between floor and ceiling, for the lower and the
+/// upper half.
 fn fullness(points: &[glam::Vec3], min: DVec3, max: DVec3) -> [f64; 2] {
     let size = max - min;
     let side = size.max_element() / CELLS;
@@ -114,17 +114,17 @@ fn fullness(points: &[glam::Vec3], min: DVec3, max: DVec3) -> [f64; 2] {
     [mean(&between[..half]), mean(&between[between.len() - half..])]
 }
 
-/// More of it outside is no place to fly in. Of a generated hall 82 % are: its walls, beyond the net.
+/// Maximum share outside the fence. Of a generated hall, 82 % are outside: its walls, behind the net.
 const MOST: f64 = 0.95;
-/// Walls stand this far outside the fence. [m]
+/// Margin for walls outside the fence. [m]
 const WALL_M: f64 = 1.0;
-/// Captures have holes, under whatever stood there.
+/// Minimum share of level floor: captures have holes under objects.
 pub(super) const LEAST_FLOOR: f64 = 0.5;
-/// Fewer splats have no shape.
+/// Minimum number of splats to judge the shape.
 const MIN_CORE: usize = 1000;
-/// The captured room is 1.7 times as high as wide when it lies on its side, 0.6 upright.
+/// Minimum ratio of height to width on its side: the captured room has 1.7 then, and 0.6 upright.
 const TALL: f64 = 1.5;
-/// Of the captured room's halves upside down the lower is 0.52 as full as the upper; upright 1.9.
+/// Maximum ratio of lower to upper half when upside down: the captured room has 0.52 then, and 1.9 upright.
 const TOP_HEAVY: f64 = 0.67;
 /// Cells along the longest side.
 const CELLS: f64 = 40.0;
@@ -139,7 +139,8 @@ mod tests {
     use super::super::bake::bake_with;
     use super::super::{WorldFromScene, default_arena};
 
-    /// A room of 10 x 6 x 3 m, z up, of discs of 0.1 m: floor, ceiling, walls, and shelves of 1 m along one.
+    /// A room of 10 x 6 x 3 m, z up, of discs of 0.1 m: floor, ceiling, walls, and shelves of 1 m along one
+    /// wall.
     fn room() -> Splats {
         let mut means_m = Vec::new();
         let mut rotations = Vec::new();
@@ -175,7 +176,8 @@ mod tests {
         }
     }
 
-    /// The room turned so that `up`, of its own axes, is up, its lowest at 0 and its middle at the origin.
+    /// Returns the room rotated so that its axis `up` points up, with its lowest point at 0 and its middle at
+    /// the origin.
     fn turned(up: Up) -> (Splats, ArenaConfig) {
         let mut splats = room();
         let rotation = up.world_from_scene();
@@ -203,20 +205,20 @@ mod tests {
     }
 
     #[test]
-    fn a_room_upside_down_or_on_end_is_noticed() {
+    fn detects_a_room_upside_down_or_on_its_side() {
         let (splats, mut arena) = turned(Up::NegZ);
         assert_eq!(keys(&splats, &arena), ["scene.up"]);
-        // As whoever has aligned it writes it.
+        // As written by a user who has aligned it.
         arena.scene.rotation = Some(DQuat::IDENTITY.to_array());
         arena.scene.up = None;
         assert_eq!(keys(&splats, &arena), [""; 0]);
-        // 10 m high, 6 m at most wide.
+        // 10 m high, at most 6 m wide.
         let (splats, arena) = turned(Up::X);
         assert!(keys(&splats, &arena).contains(&"scene.up".to_owned()));
     }
 
     #[test]
-    fn no_floor_under_the_start_and_a_scene_elsewhere_are_noticed() {
+    fn detects_a_missing_floor_and_a_scene_elsewhere() {
         let (splats, arena) = turned(Up::Z);
         let moved = |by_m: Vec3, scale: f32| {
             let mut moved = splats.clone();
@@ -231,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_at_all_is_noticed() {
+    fn detects_an_empty_scene() {
         let (_, arena) = turned(Up::Z);
         assert_eq!(keys(&Splats::default(), &arena), ["scene", "spawn.position_m"]);
     }

@@ -1,14 +1,14 @@
-//! Whether the splats have a floor at a place: something level, seen from above.
+//! Detection of a floor in the splats at a place: a level surface, seen from above.
 //!
-//! The ground around the place is cells; a splat whose sheet is thin puts its height into those that it
-//! covers, and the fullest layer of 0.25 m counts. So a capture's floor may be a little off and inclined,
-//! and neither a wall nor clutter is one. Budget: 5 ms for 1 M splats that are elsewhere.
+//! The ground around the place is divided into cells. Each thin splat adds its height to the cells that it
+//! covers, and the fullest layer of 0.25 m counts. So a capture's floor may be slightly shifted and inclined,
+//! and neither a wall nor clutter counts as a floor. Budget: 5 ms for 1 M splats at other places.
 
 use glam::{DVec2, DVec3, Mat3, Vec2, Vec3, Vec3Swizzles};
 use vizflyt_splat::Splats;
 
-/// Returns the share of the ground within [`REACH_M`] of a place that lies level at about its height, of
-/// splats no fainter than `min_opacity`. [m, world]
+/// Returns the share of the ground within [`REACH_M`] of a place that is level at about its height, with splats
+/// of at least `min_opacity`. [m, world]
 pub(super) fn floor_share(splats: &Splats, place_m: DVec3, min_opacity: f32) -> f64 {
     let per_side = (2.0 * REACH_M / CELL_M).round() as usize;
     let offset = |n: usize| (n as f64 + 0.5) * CELL_M - REACH_M;
@@ -17,7 +17,7 @@ pub(super) fn floor_share(splats: &Splats, place_m: DVec3, min_opacity: f32) -> 
         .filter(|at| at.length() <= REACH_M)
         .map(glam::DVec2::as_vec2)
         .collect();
-    // A bit for each step of height.
+    // One bit per step of height.
     let mut heights = vec![0_u16; cells.len()];
     for k in 0..splats.len() {
         let p = (splats.means_m[k].as_dvec3() - place_m).as_vec3();
@@ -36,16 +36,16 @@ pub(super) fn floor_share(splats: &Splats, place_m: DVec3, min_opacity: f32) -> 
     fullest.unwrap_or(0) as f64 / cells.len() as f64
 }
 
-/// A splat seen from above: an ellipse, inclined.
+/// Splat seen from above: an inclined ellipse.
 struct Sheet {
     center: Vec3,
-    /// Inverse of its covariance across: xx, xy, yy.
+    /// Inverse of its horizontal covariance: xx, xy, yy.
     inverse: [f32; 3],
     slope: Vec2,
 }
 
 impl Sheet {
-    /// `None` for a splat that is too thick to be a surface seen from above.
+    /// Returns `None` for a splat that is too thick to be a surface seen from above.
     fn of(center: Vec3, scales_m: Vec3, axes: Mat3) -> Option<Self> {
         let covariance = axes * Mat3::from_diagonal(scales_m * scales_m) * axes.transpose();
         let widened = WIDENING_M * WIDENING_M;
@@ -59,7 +59,7 @@ impl Sheet {
         (determinant > 0.0 && thickness_m <= SHEET_M).then_some(Self { center, inverse, slope })
     }
 
-    /// Returns the step of height that it has at a place, if it is there.
+    /// Returns its step of height at a place, if it covers the place.
     fn step_at(&self, at: Vec2) -> Option<u32> {
         let away = at - self.center.xy();
         let height_m = self.center.z + self.slope.dot(away);
@@ -73,20 +73,21 @@ fn times([xx, xy, yy]: [f32; 3], v: Vec2) -> Vec2 {
     Vec2::new(xx * v.x + xy * v.y, xy * v.x + yy * v.y)
 }
 
-/// A vehicle and its climb, with room to drift. [m]
+/// Radius of a vehicle with its climb and drift. [m]
 pub(super) const REACH_M: f64 = 0.6;
 const CELL_M: f64 = 0.1;
-/// Splats finer than a cell cover it too: half a cell. [m]
+/// Splats that are finer than a cell still cover it: half a cell. [m]
 const WIDENING_M: f32 = 0.05;
-/// Standard deviation of a surface across itself; thicker ones are haze. [m]
+/// Maximum standard deviation of a surface across itself; thicker splats are haze. [m]
 const SHEET_M: f32 = 0.08;
-/// Extent of a splat, as the baker takes it. [standard deviations]
+/// Extent of a splat, as in the baker. [standard deviations]
 const CUTOFF: f32 = 2.0;
-/// A floor may be this far below the start, and up to 0.4 m above: the guess of a capture's height, grass. [m]
+/// A floor may be this far below the start, and up to 0.4 m above: because of the guessed height of a capture,
+/// or of grass. [m]
 const LOWEST_M: f32 = -0.3;
 const STEP_M: f32 = 0.05;
 const STEPS: u32 = 14;
-/// A floor is this even: 0.25 m. The captured room's is inclined by some degrees.
+/// Maximum unevenness of a floor: 0.25 m. The captured room's floor is inclined by some degrees.
 const STEPS_OF_LAYER: u32 = 5;
 
 #[cfg(test)]
@@ -94,7 +95,7 @@ mod tests {
     use super::*;
     use glam::Quat;
 
-    /// Discs of 5 cm, 10 cm apart, on a square of 2 m, turned, at heights.
+    /// Discs of 5 cm, 10 cm apart, on a square of 2 m, rotated, at heights.
     fn ground(rotation: Quat, height_m: impl Fn(f32, f32) -> f32) -> Splats {
         let on_line = |k: usize| k as f32 * 0.1 - 1.0;
         let places = (0..441).map(|k| (on_line(k % 21), on_line(k / 21)));
@@ -127,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_haze_steep_and_distant_ground_are_none() {
+    fn walls_haze_steep_and_distant_ground_are_not_a_floor() {
         let flat = || ground(Quat::IDENTITY, |_, _| 0.0);
         let upright = ground(Quat::from_rotation_x(1.5), |_, _| 0.0);
         assert_eq!(share(&upright), 0.0);

@@ -1,13 +1,13 @@
-//! From a path on the command line to everything the flight needs of the twin.
+//! Loading of a twin from a path on the command line.
 //!
 //! ```text
 //! arena.toml --> ArenaConfig ------------> [scene]: file, placement -> Splats --> renderer
-//! scene file --> ArenaConfig (made up) -/                                  \---> occupancy -> referee, map
-//! scene.ply.seen -----------------------> what the capture saw, if asked for --/
+//! scene file --> ArenaConfig (default) -/                                  \---> occupancy -> referee, map
+//! scene.ply.seen -----------------------> space seen by the capture, if needed --/
 //! ```
-//! Splats are placed here and nowhere else: whoever loads an arena sees its scene in the world.
-//! A scene file is of any format that [`vizflyt_splat::format`] knows, recognised by its content.
-//! Once, at the start; progress goes to the log.
+//! Splats are placed only here: every loaded scene is in the world frame. A scene file may have any format of
+//! [`vizflyt_splat::format`], recognised by its content. Loading happens once, at the start; progress is
+//! logged.
 
 mod antialiased;
 mod bake;
@@ -50,34 +50,32 @@ use vizflyt_arena::objects::MovingObjects;
 use vizflyt_splat::format::{self, Loaded, Progress};
 use vizflyt_splat::{PackedScene, RigidObject, Splats};
 
-/// A loaded twin.
+/// Loaded twin.
 #[derive(Debug)]
 pub struct Scene {
-    /// The room and its rules.
     pub arena: ArenaConfig,
-    /// The twin. [m, world]
+    /// Splats of the twin. [m, world]
     pub splats: Splats,
-    /// What moves in it, in the arena's order. [m, object]
+    /// Moving objects, in the arena's order. [m, object]
     pub objects: Vec<RigidObject>,
-    /// From the frame that `CAM.json` files are in: the world itself in an arena; of a bare scene, its
-    /// file's frame.
+    /// Transform from the frame of `CAM.json` files: the world in an arena; for a bare scene, its file's frame.
     pub world_from_scene: WorldFromScene,
-    /// What the capture has seen, where the arena takes all else for solid.
+    /// Space seen by the capture, if the arena treats all other space as solid.
     pub seen: Option<Seen>,
-    /// The whole twin as a packed file, where `splats` are those near the fence alone.
+    /// The complete twin as a packed file; `splats` are then only those near the fence.
     pub packed: Option<PathBuf>,
 }
 
-/// What a path on the command line names.
+/// Kind of a path on the command line.
 enum Named {
     Arena(PathBuf),
     Scene(PathBuf),
 }
 
-/// Reads an arena with its scene, or a bare scene, for which an arena is made up.
+/// Loads an arena with its scene, or a bare scene with a default arena.
 ///
 /// # Errors
-/// What cannot be read or used; `bare` for a scene that an arena places.
+/// Files that cannot be read or used; `bare` options for a scene that an arena places.
 pub fn load(path: &Path, bare: &BareArgs) -> Result<Scene> {
     match named(path)? {
         Named::Arena(path) => {
@@ -88,10 +86,10 @@ pub fn load(path: &Path, bare: &BareArgs) -> Result<Scene> {
     }
 }
 
-/// As [`load`], of an arena with a packed scene too: that is drawn from the disk.
+/// Loads like [`load`], but also accepts an arena with a packed scene, which is rendered from the disk.
 ///
 /// # Errors
-/// As [`load`]; more splats near the fence than fit into memory.
+/// As [`load`], or too many splats near the fence for the memory.
 pub fn load_to_fly(path: &Path, bare: &BareArgs) -> Result<Scene> {
     if let Named::Arena(path) = named(path)? {
         let (arena, scene) = parse_arena(&path)?;
@@ -103,7 +101,7 @@ pub fn load_to_fly(path: &Path, bare: &BareArgs) -> Result<Scene> {
     load(path, bare)
 }
 
-/// As [`load`], with splats in the place of those in the scene's file.
+/// Loads like [`load`], with these splats instead of those in the scene's file.
 ///
 /// # Errors
 /// As [`load`].
@@ -112,17 +110,17 @@ pub fn load_with(path: &Path, bare: &BareArgs, splats: Splats) -> Result<Scene> 
         Named::Arena(path) => {
             bare.check_unused(&path)?;
             let (arena, _) = parse_arena(&path)?;
-            // What was seen was seen of the scene's own file.
+            // The seen space belongs to the scene's own file.
             in_arena(arena, &path, splats, None)
         }
         Named::Scene(path) => in_the_open(&path, bare, splats),
     }
 }
 
-/// Returns the scene file that a path names: an arena's, or itself.
+/// Returns the scene file of a path: an arena's, or the path itself.
 ///
 /// # Errors
-/// There is none.
+/// The file does not exist.
 pub fn scene_file(path: &Path) -> Result<PathBuf> {
     match named(path)? {
         Named::Arena(path) => Ok(parse_arena(&path)?.1),
@@ -130,11 +128,11 @@ pub fn scene_file(path: &Path) -> Result<PathBuf> {
     }
 }
 
-/// Reads the splats that `CAM.json` cameras look at: of an arena its scene, in the world; a scene file
-/// as it is, neither turned nor scaled. Returns the file's path with what it holds.
+/// Reads the splats for `CAM.json` cameras: an arena's scene in the world frame, or a scene file without
+/// rotation and scale. Returns the file's path with its contents.
 ///
 /// # Errors
-/// What cannot be read or used.
+/// Files that cannot be read or used.
 pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
     match named(path)? {
         Named::Arena(path) => {
@@ -150,8 +148,8 @@ pub fn load_as_it_is(path: &Path) -> Result<(PathBuf, Loaded)> {
     }
 }
 
-/// Reads what moves in an arena, with those phases that its file leaves to the seed; of a bare scene,
-/// nothing.
+/// Reads the moving objects of an arena, with phases from the seed if its file sets none; empty for a bare
+/// scene.
 pub fn load_objects(path: &Path, seed: u64) -> Result<(Vec<RigidObject>, MovingObjects)> {
     match named(path)? {
         Named::Arena(path) => {
@@ -162,7 +160,7 @@ pub fn load_objects(path: &Path, seed: u64) -> Result<(Vec<RigidObject>, MovingO
     }
 }
 
-/// Returns the path and the text of an `arena.toml`, given it or its folder; `None` for a bare scene.
+/// Returns the path and the text of an `arena.toml`, given the file or its folder; `None` for a bare scene.
 pub(crate) fn arena_text(path: &Path) -> Result<Option<(PathBuf, String)>> {
     match named(path)? {
         Named::Arena(path) => {
@@ -177,7 +175,7 @@ fn read_text(path: &Path) -> Result<String> {
     std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
-/// Whether a path names an arena: then its scene is in metres.
+/// Returns whether a path is an arena, so that its scene is in metres.
 pub fn is_in_an_arena(path: &Path) -> bool {
     matches!(named(path), Ok(Named::Arena(_)))
 }
@@ -194,7 +192,7 @@ fn named(path: &Path) -> Result<Named> {
         if inside.is_file() {
             return Ok(Named::Arena(inside));
         }
-        // An unpacked SOG, or a streamed one.
+        // Unpacked SOG, or a streamed one.
         if ["meta.json", "lod-meta.json"].iter().any(|name| path.join(name).is_file()) {
             return Ok(Named::Scene(path.to_owned()));
         }
@@ -208,7 +206,7 @@ fn read_arena(path: &Path) -> Result<ArenaConfig> {
     ArenaConfig::parse(&read_text(path)?).with_context(|| format!("{} is wrong", path.display()))
 }
 
-/// Returns an arena and where its scene lies.
+/// Returns an arena and the path of its scene.
 fn parse_arena(path: &Path) -> Result<(ArenaConfig, PathBuf)> {
     let arena = read_arena(path)?;
     let scene = arena.scene_path(path);
@@ -242,7 +240,7 @@ fn in_arena(
     Ok(Scene { splats, arena, objects, world_from_scene, seen, packed: None })
 }
 
-/// Puts splats, as their file has them, where an arena wants them, to be rendered as it says.
+/// Transforms and crops splats as the arena requires, and sets their anti-aliasing.
 fn put(arena: &ArenaConfig, splats: &mut Splats) -> Result<()> {
     splats.antialiased = arena.scene.antialiased.unwrap_or(splats.antialiased);
     let cropped = Placement::of(&arena.scene).apply(splats);
@@ -276,7 +274,7 @@ fn in_the_open(path: &Path, bare: &BareArgs, mut splats: Splats) -> Result<Scene
     let arena = default_arena(&splats, scene).with_context(cannot)?;
     let size_m = arena.geofence.max_m - arena.geofence.min_m;
     info!(
-        "{} has no arena: made one up of {size_m:.1} m, start at {}",
+        "{} has no arena: using a default of {size_m:.1} m, start at {}",
         path.display(),
         arena.spawn.position_m
     );
@@ -291,7 +289,7 @@ pub(crate) fn read_splats(path: &Path) -> Result<Splats> {
     Ok(read(path)?.splats)
 }
 
-/// Reads a scene file of any format; how far it has come goes to the log, if it takes long.
+/// Reads a scene file of any format; the progress of a long read is logged.
 fn read(path: &Path) -> Result<Loaded> {
     let start = Instant::now();
     let mut logged_at = start;
@@ -317,7 +315,7 @@ fn read(path: &Path) -> Result<Loaded> {
     Ok(loaded)
 }
 
-/// Shorter loads need no progress.
+/// Interval of the progress.
 const LOG_PERIOD: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
@@ -344,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_and_wrong_files_have_advice() {
+    fn errors_of_missing_and_wrong_files_give_advice() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         check(&at("nothing.toml"), "make a scene with: vizflyt scene generate");
@@ -367,9 +365,9 @@ mod tests {
     }
 
     #[test]
-    fn the_arena_overrules_what_the_file_says_of_anti_aliasing() {
+    fn the_arena_overrides_the_files_anti_aliasing() {
         let folder = tempfile::tempdir().unwrap();
-        // No PLY of ours says it; brush's comment does.
+        // Our PLY files do not state it; the comment of brush does.
         let at = |name: &str| folder.path().join(name);
         ply::write(at("classic.ply"), &dot()).unwrap();
         let text = std::fs::read(at("classic.ply")).unwrap();
@@ -401,7 +399,7 @@ mod tests {
         std::fs::write(folder.path().join("arena.toml"), arena.to_toml().unwrap()).unwrap();
         let scene = load(folder.path(), &BareArgs::default()).unwrap();
         assert_eq!(scene.arena, arena);
-        // An arena's scene lies in the world already: it is not moved.
+        // An arena's scene is already in the world frame: it is not moved.
         assert!((scene.splats.means_m[0] - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-6);
         let z = BareArgs { up: Some(Up::Z), scale: Some(1.0) };
         let bare = load(&folder.path().join("dot.ply"), &z).unwrap();

@@ -1,7 +1,7 @@
-//! Things that stand or move in an arena beside its scene, made by their name: a course is set up without a modeller.
+//! Predefined models of an arena by name, so that a course can be set up without a modelling program.
 //!
 //! ```text
-//! models/gate-120x100.ply           a frame about an opening of 120 x 100 cm; x is the way through, its middle the origin
+//! models/gate-120x100.ply           frame, opening 120 x 100 cm; x is the flight direction, the origin its middle
 //! models/gate-120x100-blue.ply      in another colour: orange, blue, green, white
 //! models/box-40x40x180.ply          a box of 40 x 40 x 180 cm, standing on the origin
 //! models/quadrotor.ply              a small quadrotor, its nose along x
@@ -11,7 +11,7 @@ use glam::Vec3;
 use vizflyt_splat::Splats;
 use vizflyt_splat::builtin_models::{Part, QUADROTOR, boxes, boxes_in_patches};
 
-/// Returns the splats of the model that a file's name tells; `None` if it tells none. [m, object]
+/// Returns the splats of the model with this file name; `None` if the name is not one of a model. [m, object]
 ///
 /// ```
 /// use vizflyt_server::scene::model;
@@ -47,7 +47,7 @@ pub fn model(file: &str) -> Option<Splats> {
     }
 }
 
-/// Four bars about an opening, banded so that their turn is seen, and blocks at the corners.
+/// Returns four bars around an opening, striped so that a rotation is visible, with blocks at the corners.
 fn gate(width_m: f32, height_m: f32, first: [f32; 3], second: [f32; 3]) -> Vec<Part> {
     let mut parts = Vec::new();
     let bars = [(Vec3::Y, width_m, height_m, Vec3::Z), (Vec3::Z, height_m, width_m, Vec3::Y)];
@@ -75,7 +75,7 @@ fn gate(width_m: f32, height_m: f32, first: [f32; 3], second: [f32; 3]) -> Vec<P
     parts
 }
 
-/// Of what is banded, both colours. [as displayed, 0 to 1]
+/// Returns both colours of the stripes. [as displayed, 0 to 1]
 fn colours(name: &str) -> Option<([f32; 3], [f32; 3])> {
     Some(match name {
         "orange" => ([0.93, 0.42, 0.08], [0.94, 0.93, 0.90]),
@@ -86,11 +86,11 @@ fn colours(name: &str) -> Option<([f32; 3], [f32; 3])> {
     })
 }
 
-/// A gate's bar, seen at 3 m as 3 pixels of 160. [m]
+/// Width of a gate's bar: 3 of 160 pixels at 3 m. [m]
 const BAR_M: f32 = 0.06;
-/// Length of a band. [m]
+/// Length of a stripe. [m]
 const BAND_M: f32 = 0.2;
-/// Of plain faces: as sharp at their edges as half of a bar. [m]
+/// Patch size of plain faces: edges are as sharp as half of a bar. [m]
 const PATCH_M: f32 = 0.02;
 
 #[cfg(test)]
@@ -99,7 +99,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_model_has_the_size_that_its_name_tells() {
+    fn a_model_has_the_size_of_its_name() {
         let reach = |file: &str| {
             let splats = model(file).unwrap_or_else(|| panic!("{file}"));
             let low = splats.means_m.iter().fold(Vec3::MAX, |low, p| low.min(*p));
@@ -131,7 +131,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_name_is_too_much(name in "(models/)?(gate|box|quadrotor)?-?[0-9x-]{0,12}(.ply)?") {
+        fn any_name_gives_a_bounded_model_or_none(name in "(models/)?(gate|box|quadrotor)?-?[0-9x-]{0,12}(.ply)?") {
             if let Some(splats) = model(&name) {
                 prop_assert!((1..400_000).contains(&splats.len()), "{name}: {}", splats.len());
             }

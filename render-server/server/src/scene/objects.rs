@@ -1,4 +1,4 @@
-//! The objects of an arena: read from beside it, and baked into distance fields of their own.
+//! Moving objects of an arena: loading, and baking of their distance fields.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use vizflyt_arena::obstacles::Obstacles;
 use vizflyt_arena::{ArenaConfig, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_splat::{RigidObject, Splats};
 
-/// Reads an arena's objects; they are numbered from 1, in its order.
+/// Reads an arena's objects, numbered from 1 in its order. Paths are relative to the arena's folder.
 pub(super) fn read_all(
     arena: &ArenaConfig,
     arena_toml: &Path,
@@ -36,8 +36,8 @@ pub(super) fn read_all(
     objects.map(object).collect()
 }
 
-/// Returns what must not be touched: what stands still as baked already, and each object with a field
-/// baked in its own frame; phases that the arena does not set are random, from the seed.
+/// Returns all obstacles: the baked static ones, and each object with a field baked in its own frame. Phases
+/// that the arena does not set are random, from the seed.
 pub fn obstacles(
     arena: &ArenaConfig,
     objects: &[RigidObject],
@@ -53,7 +53,7 @@ pub fn obstacles(
     Obstacles::new(still, moving, MovingObjects::new(arena, seed))
 }
 
-/// Returns the least and greatest corner of an object's splats, to three deviations. [m, object]
+/// Returns the corners of a box around an object's splats, to three standard deviations. [m, object]
 pub fn bounds_m(splats: &Splats) -> (Vec3, Vec3) {
     let reach = |k: usize| Vec3::splat(3.0 * splats.scales_m[k].max_element());
     let (mut low, mut high) = (Vec3::splat(f32::MAX), Vec3::splat(f32::MIN));
@@ -64,7 +64,7 @@ pub fn bounds_m(splats: &Splats) -> (Vec3, Vec3) {
     if low.cmple(high).all() { (low, high) } else { (Vec3::ZERO, Vec3::ZERO) }
 }
 
-/// Bakes an object's splats in its own frame, as an arena bakes.
+/// Bakes an object's splats in its own frame, with the arena's settings.
 pub(crate) fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField {
     let (low_m, high_m) = bounds_m(splats);
     let (low_m, high_m) = (low_m.as_dvec3() - MARGIN_M, high_m.as_dvec3() + MARGIN_M);
@@ -84,9 +84,9 @@ pub(crate) fn bake_object(splats: &Splats, arena: &ArenaConfig) -> DistanceField
     DistanceField::of(OccupancyGrid::bake_object(ellipsoids, grid, min_opacity))
 }
 
-/// Finer than a scene's: objects are small, and a hand of 3 cm must not grow to 10. [m]
+/// Maximum voxel size: finer than a scene's, so that a hand of 3 cm does not grow to 10 cm. [m]
 const VOXEL_M: f64 = 0.02;
-/// Within this of an object its field has the distance to it; further away, a lower bound. [m]
+/// Margin in which the field has the distance to an object; further away, it has a lower bound. [m]
 const MARGIN_M: DVec3 = DVec3::splat(0.5);
-/// Larger objects get coarser voxels: 16 MB each.
+/// Maximum voxels of an object: 16 MB each. Larger objects get coarser voxels.
 const MAX_VOXELS: f64 = 1.6e7;

@@ -1,5 +1,5 @@
-//! Arenas of scenes larger than memory: the renderer draws the packed file from the disk; what needs splats one by one
-//! (obstacles, beams, map, page) gets those near the fence.
+//! Arenas of scenes larger than memory. The renderer reads the packed file from the disk; obstacles, beams, map
+//! and page get the splats near the fence.
 
 use std::path::{Path, PathBuf};
 
@@ -12,16 +12,16 @@ use vizflyt_splat::{PackedScene, Splats};
 
 use super::{Named, Placement, Scene, WorldFromScene, named, parse_arena, read_objects, seen};
 
-/// How far beyond the fence the scene is known splat by splat: beams, map and page see no further. [m]
+/// Margin around the fence in which splats are loaded: the range of beams, map and page. [m]
 const NEAR_M: f64 = 30.0;
-/// Splats near the fence at most: some 60 bytes each, and as much again for beams and the page.
+/// Maximum splats near the fence: about 60 bytes each, and as much again for beams and the page.
 const MOST: usize = 8_000_000;
 
-/// Reads an arena of a packed scene.
+/// Loads an arena of a packed scene.
 pub(super) fn near(arena: ArenaConfig, arena_toml: &Path, scene: PathBuf) -> Result<Scene> {
     if arena.scene.antialiased.is_some() || Placement::of(&arena.scene) != Placement::IDENTITY {
         bail!(
-            "{}: a packed scene lies where it was packed; leave out what [scene] has beside its file, and let \
+            "{}: a packed scene lies where it was packed; remove all keys of [scene] except the file, and let \
              `vizflyt scene pack` place it: it takes the arena.toml of the scene that is packed",
             arena_toml.display()
         );
@@ -50,16 +50,16 @@ pub(super) fn near(arena: ArenaConfig, arena_toml: &Path, scene: PathBuf) -> Res
 fn within(packed: &mut PackedScene, [min_m, max_m]: [Vec3; 2]) -> Result<Splats> {
     let splats = packed.splats_within(min_m, max_m, MOST).context("the fence is too large")?;
     if splats.is_empty() {
-        bail!("nothing of it is within {NEAR_M} m of the fence; are both in metres, in one frame?");
+        bail!("no splat is within {NEAR_M} m of the fence; are both in metres, in one frame?");
     }
     Ok(splats)
 }
 
-/// Returns the scene file that a path names, an arena's or itself, and what puts its splats into the world: an arena's
-/// `[scene]`; a scene file stays as it is.
+/// Returns the scene file of a path (an arena's, or the path itself), and the function that puts its splats
+/// into the world: by an arena's `[scene]`; a scene file stays unchanged.
 ///
 /// # Errors
-/// What cannot be read or used.
+/// Files that cannot be read or used.
 pub fn placed(path: &Path) -> Result<(PathBuf, impl Fn(&mut Splats) + use<>)> {
     let (scene, placement, antialiased) = match named(path)? {
         Named::Arena(path) => {
@@ -104,7 +104,7 @@ horizontal_fov_deg = 90.0
 position_m = [0.1, 0.0, 0.0]
 "#;
 
-    /// Splats at some places of a file's frame, in centimetres and with -y up.
+    /// Splats in a file's frame, in centimetres and with -y up.
     fn dots(places: &[[f32; 3]]) -> Splats {
         Splats {
             means_m: places.iter().copied().map(Vec3::from).collect(),
@@ -117,14 +117,14 @@ position_m = [0.1, 0.0, 0.0]
     }
 
     #[test]
-    fn it_lies_where_its_arena_has_put_it_and_what_is_near_is_there() {
+    fn keeps_its_placement_and_loads_splats_near_the_fence() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         let write = |name: &str, scene: &str| {
             std::fs::write(at(name), ARENA.replace("SCENE", scene)).unwrap();
             at(name)
         };
-        // One 2 m up, one outside the fence, one 50 m away.
+        // One splat 2 m up, one outside the fence, one 50 m away.
         let splats = dots(&[[100.0, -200.0, 0.0], [2000.0, -100.0, 0.0], [5000.0, -100.0, 0.0]]);
         ply::write(at("scene.ply"), &splats).unwrap();
         let turned = r#"{ file = "scene.ply", up = "-y", metres_per_unit = 0.01 }"#;
@@ -152,7 +152,7 @@ position_m = [0.1, 0.0, 0.0]
         assert!(moved.contains("a packed scene lies where it was packed"), "{moved}");
         pack(&at("scene.ply"), &at("raw.packed"), Detail::ADAPTIVE_PX, |_| (), |_| ()).unwrap();
         let lost = refused("lost.toml", r#""raw.packed""#);
-        assert!(lost.contains("nothing of it is within 30 m of the fence"), "{lost}");
+        assert!(lost.contains("no splat is within 30 m of the fence"), "{lost}");
         std::fs::write(at("cut.packed"), &std::fs::read(at("raw.packed")).unwrap()[..60]).unwrap();
         let cut = refused("cut.toml", r#""cut.packed""#);
         assert!(cut.contains("cannot use scene") && cut.contains("cut or damaged"), "{cut}");

@@ -1,5 +1,5 @@
-//! Parts of a scene named by boxes, for scenes whose splats nobody knows: `vizflyt dataset --parts` reads them,
-//! `vizflyt scene edit --page` makes them of what is selected.
+//! Named parts of a scene, given by boxes, for scenes without known geometry. `vizflyt dataset --parts` reads
+//! them, and `vizflyt scene edit --page` creates them from a selection.
 //!
 //! ```toml
 //! [[parts]]
@@ -9,7 +9,7 @@
 //! size_m = [0.3, 1.6, 1.6]
 //! yaw_deg = 12.0
 //! ```
-//! A splat belongs to the first box that holds its centre.
+//! A splat belongs to the first box that contains its centre.
 
 use std::path::{Path, PathBuf};
 
@@ -20,28 +20,28 @@ use vizflyt_splat::Splats;
 
 use super::edit::{file_name, replace};
 
-/// A file of named parts.
+/// File of named parts.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartsFile {
-    /// In order: a splat belongs to the first that holds it.
+    /// Parts in order: a splat belongs to the first that contains it.
     pub parts: Vec<BoxedPart>,
 }
 
-/// A box that names what is in it.
+/// Named box.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BoxedPart {
-    /// No two have the same.
+    /// Unique name.
     pub name: String,
-    /// What kind of thing it is, one of the data set's or one's own.
+    /// Class of the object: one of the data set's, or a custom one.
     #[serde(default = "part")]
     pub class: String,
-    /// Its middle. [m, world]
+    /// Centre. [m, world]
     pub center_m: DVec3,
-    /// Its sides. [m]
+    /// Side lengths. [m]
     pub size_m: DVec3,
-    /// Turn about z. [deg]
+    /// Rotation about z. [deg]
     #[serde(default)]
     pub yaw_deg: f64,
 }
@@ -50,14 +50,14 @@ fn part() -> String {
     "part".to_owned()
 }
 
-/// Returns where the parts of a scene are: beside it, by its full name.
+/// Returns the path of a scene's parts: next to it, with its full name.
 pub fn parts_path(scene: &Path) -> PathBuf {
     scene.with_file_name(format!("{}.parts.toml", file_name(scene)))
 }
 
 impl BoxedPart {
-    /// Returns the least upright box about points, turned about z as it fits them best. Of 200 points or more it leaves
-    /// out a hundredth at each end of each side, which in captures are strays.
+    /// Returns the smallest upright box around points, with the best rotation about z. From 200 points on, a
+    /// hundredth at each end of each side is left out, because captures contain strays.
     ///
     /// # Errors
     /// Fewer than four points.
@@ -65,7 +65,7 @@ impl BoxedPart {
         ensure!(points_m.len() >= 4, "{} splats are too few to name", points_m.len());
         let strays = if points_m.len() < 200 { 0 } else { points_m.len() / 100 };
         let mut along: Vec<f64> = Vec::with_capacity(points_m.len());
-        // From the box's least corner to its greatest, in axes that are turned by an angle.
+        // Corners of the box, in axes rotated by an angle.
         let mut ends = |turn: DQuat| {
             let mut ends = [DVec3::ZERO; 2];
             for axis in 0..3 {
@@ -89,7 +89,7 @@ impl BoxedPart {
         let yaw_deg = best.1;
         let world_from_box = DQuat::from_rotation_z(yaw_deg.to_radians());
         let [low, high] = ends(world_from_box);
-        // To the millimetre, as people write it; a centimetre about it.
+        // Rounded to millimetres for readability, with a margin of a centimetre.
         let rounded = |v: DVec3| (v * 1e3).round() / 1e3;
         Ok(Self {
             name: name.to_owned(),
@@ -109,10 +109,10 @@ impl std::fmt::Display for BoxedPart {
 }
 
 impl PartsFile {
-    /// Reads a file.
+    /// Reads a file of parts.
     ///
     /// # Errors
-    /// It cannot be read; what is wrong with it, by its line or its part.
+    /// The file cannot be read or is invalid; names its line or its part.
     pub fn read(path: &Path) -> Result<Self> {
         let context = || format!("cannot use {} as --parts", path.display());
         let text = std::fs::read_to_string(path).with_context(context)?;
@@ -137,18 +137,18 @@ impl PartsFile {
             ensure!(!known, "two parts are called '{name}'; give each its own name");
             ensure!(
                 size_m.cmpgt(DVec3::ZERO).all() && size_m.is_finite() && center_m.is_finite(),
-                "part '{name}': size_m = {size_m} about {center_m} is no box; sides are above 0, in metres"
+                "part '{name}': size_m = {size_m} about {center_m} is not a valid box; sides must be above 0, in metres"
             );
-            ensure!(yaw_deg.is_finite(), "part '{name}': yaw_deg = {yaw_deg} is no angle");
+            ensure!(yaw_deg.is_finite(), "part '{name}': yaw_deg = {yaw_deg} is not finite");
         }
         ensure!(self.parts.len() <= 10_000, "{} parts are more than 10,000", self.parts.len());
         Ok(())
     }
 
-    /// Adds a part, or puts it in the place of the one of its name, and writes the file.
+    /// Adds a part, or replaces the one with its name, and writes the file.
     ///
     /// # Errors
-    /// What is wrong with the part; the file cannot be written. Then nothing has changed.
+    /// The part is invalid, or the file cannot be written. Then nothing is changed.
     pub fn put(&mut self, part: BoxedPart, path: &Path) -> Result<()> {
         let mut next = self.clone();
         match next.parts.iter_mut().find(|known| known.name == part.name) {
@@ -156,14 +156,14 @@ impl PartsFile {
             None => next.parts.push(part),
         }
         next.check()?;
-        let text = toml::to_string(&next).context("parts are no TOML")?;
+        let text = toml::to_string(&next).context("cannot write the parts as TOML")?;
         let text = format!("# vizflyt dataset --scene ... --parts {}\n\n{text}", file_name(path));
         replace(path, &text).with_context(|| format!("cannot write {}", path.display()))?;
         *self = next;
         Ok(())
     }
 
-    /// Returns the index of the part that each splat of the world belongs to.
+    /// Returns the index of the part of each splat.
     pub fn label(&self, splats: &Splats) -> Vec<Option<usize>> {
         let boxes: Vec<(DQuat, &BoxedPart)> = self
             .parts
@@ -197,7 +197,7 @@ mod tests {
         let file = PartsFile::parse(&more).unwrap();
         assert_eq!(file.parts[0].class, "part");
         let splats = Splats {
-            // Along the turned box, across it, and beside everything.
+            // Along the rotated box, across it, and outside all boxes.
             means_m: vec![Vec3::new(1.0, 0.9, 0.0), Vec3::new(1.9, 0.0, 0.0), Vec3::splat(7.0)],
             scales_m: vec![Vec3::ONE; 3],
             rotations: vec![Quat::IDENTITY; 3],
@@ -209,12 +209,12 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn names_the_error() {
         for (text, told) in [
-            (GOOD.replace("[2, 0.2, 1]", "[2, 0, 1]"), "is no box"),
+            (GOOD.replace("[2, 0.2, 1]", "[2, 0, 1]"), "is not a valid box"),
             (GOOD.replace("name", "nam"), "nam"),
             (format!("{GOOD}{GOOD}"), "two parts are called 'table'"),
-            (GOOD.replace("90", "nan"), "no angle"),
+            (GOOD.replace("90", "nan"), "is not finite"),
             (GOOD.replace("table", ""), "give a name"),
         ] {
             let error = format!("{:#}", PartsFile::parse(&text).unwrap_err());
@@ -223,8 +223,8 @@ mod tests {
     }
 
     #[test]
-    fn a_box_lies_about_what_it_is_made_of() {
-        // A board of 2 x 0.1 x 1 m, turned by 30 degrees, and two strays.
+    fn a_box_encloses_its_points_without_strays() {
+        // A board of 2 x 0.1 x 1 m, rotated by 30 degrees, and two strays.
         let turn = DQuat::from_rotation_z(30_f64.to_radians());
         let board = |k: usize| {
             let (across, up) = (k % 21, k / 21);
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_put_is_read_again_and_a_name_is_taken_once() {
+    fn reads_back_stored_parts_and_keeps_names_unique() {
         let folder = tempfile::tempdir().unwrap();
         let path = parts_path(&folder.path().join("room.ply"));
         let part = |name: &str, x_m: f64| BoxedPart {
@@ -264,7 +264,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_text_is_read_or_refused(text in "(\\[\\[parts\\]\\]\n)?[a-z_=\\[\\]0-9., \"\n-]{0,120}") {
+        fn any_text_parses_or_fails_cleanly(text in "(\\[\\[parts\\]\\]\n)?[a-z_=\\[\\]0-9., \"\n-]{0,120}") {
             let _ = PartsFile::parse(&text);
         }
     }

@@ -1,28 +1,27 @@
-//! Puts a captured scene into the world, once at load: `[scene]` of `arena.toml`, the flags of a bare scene and
-//! of `scene convert` all end here.
+//! Placement of a captured scene in the world, once at load. `[scene]` of `arena.toml`, the options of a bare
+//! scene and those of `scene convert` all use it.
 //!
-//! Means and scales are multiplied, rotations turned, and the spherical harmonics of degree 1 to 3
-//! turned with them, so that highlights stay where they were.
+//! Means and scales are multiplied, rotations turned, and the spherical harmonics of degree 1 to 3 turned with
+//! them, so that highlights stay at their places.
 
 use glam::{DQuat, DVec3, Vec3};
 use vizflyt_arena::config::{Geofence, SceneConfig};
 use vizflyt_splat::Splats;
 use vizflyt_splat::edit::transform;
 
-/// How a scene comes to lie in the world: moved there, then cropped.
+/// Placement of a scene in the world: transform, then crop.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Placement {
-    /// Turns, scales and moves it.
     pub world_from_scene: WorldFromScene,
-    /// Splats whose centres lie outside are left out. [m, world]
+    /// Splats with their centres outside are removed. [m, world]
     pub crop: Option<Geofence>,
 }
 
 impl Placement {
-    /// Leaves everything where it is.
+    /// Leaves the scene unchanged.
     pub const IDENTITY: Self = Self { world_from_scene: WorldFromScene::IDENTITY, crop: None };
 
-    /// Returns the placement that an arena's `[scene]` asks for.
+    /// Returns the placement of an arena's `[scene]`.
     pub fn of(scene: &SceneConfig) -> Self {
         let world_from_scene = WorldFromScene {
             scale: scene.metres_per_unit,
@@ -32,15 +31,15 @@ impl Placement {
         Self { world_from_scene, crop: scene.crop }
     }
 
-    /// Moves the splats into the world and leaves out what is cropped; returns how many that were. Where
-    /// there is nothing to do, every bit stays.
+    /// Moves the splats into the world and crops them; returns the number of removed splats. An identity
+    /// changes no bit.
     pub fn apply(&self, splats: &mut Splats) -> usize {
         self.world_from_scene.apply(splats);
         self.crop.map_or(0, |crop| keep_within(splats, &crop))
     }
 }
 
-/// Leaves out the splats whose centres lie outside a box; returns how many.
+/// Removes the splats with their centres outside a box; returns their number.
 fn keep_within(splats: &mut Splats, crop: &Geofence) -> usize {
     let within = |mean: &Vec3| {
         let p_m = mean.as_dvec3();
@@ -57,23 +56,23 @@ fn keep_within(splats: &mut Splats, crop: &Geofence) -> usize {
 pub struct WorldFromScene {
     /// World metres per scene unit.
     pub scale: f64,
-    /// Scene axes to world axes.
+    /// Rotation from scene axes to world axes.
     pub rotation: DQuat,
-    /// Where the scene's origin comes to lie. [m, world]
+    /// Position of the scene's origin. [m, world]
     pub translation_m: DVec3,
 }
 
 impl WorldFromScene {
-    /// Leaves everything where it is.
+    /// Leaves the scene unchanged.
     pub const IDENTITY: Self =
         Self { scale: 1.0, rotation: DQuat::IDENTITY, translation_m: DVec3::ZERO };
 
-    /// Returns where a point of the scene comes to lie. [m, world]
+    /// Returns the position of a point of the scene. [m, world]
     pub fn point_m(&self, p_scene: DVec3) -> DVec3 {
         self.scale * (self.rotation * p_scene) + self.translation_m
     }
 
-    /// Moves every splat into the world; where nothing is to be moved, every bit stays.
+    /// Moves every splat into the world; an identity changes no bit.
     pub fn apply(&self, splats: &mut Splats) {
         if *self == Self::IDENTITY {
             return;
@@ -91,7 +90,7 @@ mod tests {
     use vizflyt_splat::{Atmosphere, Camera, render_reference};
 
     #[test]
-    fn a_scene_in_the_world_keeps_every_bit() {
+    fn an_identity_placement_changes_no_bit() {
         let mut placed = scene();
         let placement = Placement::of(&"scene.ply".into());
         assert_eq!((placement, placement.apply(&mut placed)), (Placement::IDENTITY, 0));
@@ -105,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_outside_the_crop_is_left_out_with_all_that_belongs_to_it() {
+    fn cropped_splats_are_removed_with_all_their_data() {
         let config = SceneConfig {
             metres_per_unit: 2.0,
             crop: Some(Geofence { min_m: DVec3::splat(-1e3), max_m: DVec3::new(0.0, 1e3, 1e3) }),
@@ -148,7 +147,7 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(16))]
-        /// A scene moved, seen by a camera moved along with it, looks the same; depth scales.
+        /// After moving scene and camera together, the image is the same; depth scales.
         #[test]
         fn a_moved_scene_looks_the_same_to_a_moved_camera(
             axis in prop::array::uniform3(-1.0..1.0f64), angle in -3.0..3.0f64,

@@ -1,4 +1,5 @@
-//! What the capture of a scene has seen: a file beside the scene, read where the arena takes all else for solid.
+//! Space that the capture of a scene has seen: a file next to the scene, for arenas that treat all other space
+//! as solid.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -10,18 +11,18 @@ use vizflyt_arena::grid::Grid;
 use vizflyt_arena::seen::ScenePlace;
 use vizflyt_arena::{ArenaConfig, SeenSpace};
 
-/// Returns where the seen space of a scene lies: `hall.ply.seen` beside `hall.ply`.
+/// Returns the path of a scene's seen space: `hall.ply.seen` next to `hall.ply`.
 pub fn seen_path(scene: &Path) -> PathBuf {
     let mut name = scene.as_os_str().to_owned();
     name.push(".seen");
     PathBuf::from(name)
 }
 
-/// Returns the hash by which seen space names its scene: the SHA-256 of the file; of a folder, of its files in the
-/// order of their names.
+/// Returns the hash by which seen space identifies its scene: the SHA-256 of the file; of a folder, of its
+/// files in the order of their names.
 ///
 /// # Errors
-/// What cannot be read.
+/// Files that cannot be read.
 pub fn scene_hash(scene: &Path) -> std::io::Result<[u8; 32]> {
     let mut hash = digest::Context::new(&digest::SHA256);
     let mut buffer = vec![0; 1 << 20];
@@ -47,11 +48,11 @@ pub fn scene_hash(scene: &Path) -> std::io::Result<[u8; 32]> {
     Ok(bytes)
 }
 
-/// Writes what was seen of a scene beside it, for arenas that take all else for solid: one bit a voxel of `grid`, low
-/// bit first, where the scene lies at `place`. The scene must be written before.
+/// Writes the seen space of a scene next to it, for arenas that treat all other space as solid: one bit per
+/// voxel of `grid`, lowest bit first, with the scene at `place`. The scene must be written before.
 ///
 /// # Errors
-/// What cannot be read or written.
+/// Files that cannot be read or written.
 pub fn write_seen(scene: &Path, grid: Grid, place: ScenePlace, bits: Vec<u8>) -> Result<Seen> {
     let hash = scene_hash(scene).with_context(|| format!("cannot read {}", scene.display()))?;
     let space = SeenSpace::new(grid, place, hash, bits);
@@ -61,19 +62,18 @@ pub fn write_seen(scene: &Path, grid: Grid, place: ScenePlace, bits: Vec<u8>) ->
     Ok(Seen { space, place })
 }
 
-/// What was seen of an arena's scene, and how that lies in the arena.
+/// Seen space of an arena's scene, and its placement in the arena.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
-    /// The file.
     pub space: SeenSpace,
-    /// Where the scene lies now.
+    /// Present placement of the scene.
     pub place: ScenePlace,
 }
 
-/// Returns what was seen of an arena's scene; `None` where the arena does not ask.
+/// Returns the seen space of an arena's scene; `None` if the arena does not need it.
 ///
 /// # Errors
-/// An arena that asks, and a file that is not there, is damaged or of another scene.
+/// The arena needs it, but the file is missing, damaged or of another scene.
 pub(super) fn read(arena: &ArenaConfig, scene: &Path) -> Result<Option<Seen>> {
     if arena.occupancy.unseen == Unseen::Free {
         return Ok(None);
@@ -83,7 +83,7 @@ pub(super) fn read(arena: &ArenaConfig, scene: &Path) -> Result<Option<Seen>> {
         "carve the scene by its capture (vizflyt scene carve), or set occupancy.unseen = \"free\"";
     if !path.is_file() {
         bail!(
-            "occupancy.unseen = \"solid\", but there is no {} that says what was seen; {otherwise}",
+            "occupancy.unseen = \"solid\", but there is no file {} of the seen space; {otherwise}",
             path.display()
         );
     }
@@ -91,7 +91,10 @@ pub(super) fn read(arena: &ArenaConfig, scene: &Path) -> Result<Option<Seen>> {
         std::fs::metadata(&path).with_context(|| format!("cannot read {}", path.display()))?;
     if about.len() > MAX_BYTES {
         let megabytes = about.len() >> 20;
-        bail!("{} has {megabytes} MB: that is no seen space; {otherwise}", path.display());
+        bail!(
+            "{} has {megabytes} MB: that is not a file of seen space; {otherwise}",
+            path.display()
+        );
     }
     let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
     let space =
@@ -107,7 +110,7 @@ pub(super) fn read(arena: &ArenaConfig, scene: &Path) -> Result<Option<Seen>> {
     Ok(Some(Seen { space, place: ScenePlace::of(&arena.scene) }))
 }
 
-/// As many voxels as an arena may have, one bit each, and more. [bytes]
+/// Maximum file size: more than one bit for each voxel that an arena may have. [bytes]
 const MAX_BYTES: u64 = 256 << 20;
 
 #[cfg(test)]
@@ -118,7 +121,7 @@ mod tests {
     use super::super::{BareArgs, load};
     use super::*;
 
-    /// A folder with an arena around a dot, to which unseen space is solid.
+    /// Returns a folder with an arena around a dot, with solid unseen space.
     fn arena() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let dot = vizflyt_splat::Splats {
@@ -145,18 +148,18 @@ mod tests {
     }
 
     #[test]
-    fn what_was_seen_is_read_where_it_is_asked_for() {
+    fn reads_the_seen_space_if_the_arena_needs_it() {
         let (folder, scene) = arena();
         let seen = write(&scene);
         let loaded = load(folder.path(), &BareArgs::default()).unwrap();
         assert_eq!(loaded.seen, Some(seen));
-        // Solid all around what was seen.
+        // Solid everywhere around the seen space.
         let field = super::super::bake(&loaded.splats, &loaded.arena, loaded.seen.as_ref());
         assert!(field.unseen_voxels() > 0);
     }
 
     #[test]
-    fn a_file_that_is_not_there_damaged_or_of_another_scene_is_refused_with_advice() {
+    fn rejects_a_missing_damaged_or_foreign_file_with_advice() {
         let (folder, scene) = arena();
         let check = |expected: &str| {
             let error = format!("{:#}", load(folder.path(), &BareArgs::default()).unwrap_err());

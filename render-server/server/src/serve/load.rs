@@ -1,4 +1,4 @@
-//! Loads the scene: renderer, referees, moving objects, top view.
+//! Loading of a scene: renderer, referees, moving objects, top view.
 
 use std::sync::Arc;
 
@@ -17,30 +17,30 @@ use crate::scene::{self, Antialiased, Scene};
 use crate::web::top_view::TopView;
 use crate::web::twin::TwinParts;
 
-/// Everything made from the scene.
+/// Everything created from the scene.
 pub(super) struct LoadedScene {
     pub(super) arena: ArenaConfig,
     pub(super) renderer: Chosen,
-    /// Each vehicle's name, and the arena as it has it.
+    /// Name and arena of each vehicle.
     pub(super) flying: Vec<(String, ArenaConfig)>,
     pub(super) referees: Vec<Referee>,
     pub(super) dynamic_objects: DynamicObjects,
-    /// Each vehicle's sensors beside the cameras.
+    /// Sensors of each vehicle, without the cameras.
     pub(super) sensors: Vec<SensorSet>,
-    /// What they measure in; `None` if there are none.
+    /// Scene for the sensors; `None` if there are none.
     pub(super) sensor_scene: Option<SensorScene>,
-    /// Whether the vehicles see and touch each other.
+    /// Whether the vehicles see and collide with each other.
     pub(super) neighbours: bool,
     pub(super) top_view: TopView,
     pub(super) twin: TwinParts,
-    /// What stands still.
+    /// Distances to static obstacles.
     pub(super) field: Arc<DistanceField>,
 }
 
-/// Loads the scene and makes all that follows from it.
+/// Loads the scene and creates everything from it.
 ///
 /// # Errors
-/// A scene or an arena that cannot be used, no such renderer.
+/// A scene or an arena that cannot be used, or an unavailable renderer.
 pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     let scene = scene::load_to_fly(&args.arena, &args.bare)?;
     let Scene { arena, mut splats, mut objects, seen, packed, .. } = scene;
@@ -60,7 +60,7 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     objects.extend(vehicle_models(together));
     let rendered = RenderedScene { splats: &splats, objects: &objects };
     let (renderer, (field, obstacles, top_view)) = rayon::join(
-        // Mostly waits for graphics drivers.
+        // Most of the time is spent in graphics drivers.
         || match &packed {
             None => choose(rendered, args.renderer, args.detail),
             Some(path) => {
@@ -89,7 +89,7 @@ pub(super) fn prepare(args: &ServeArgs) -> Result<LoadedScene> {
     let sensor_scene = has_sensors.then(|| SensorScene::new(rendered));
     // The renderer holds its own form of the scene; the file's form is no longer needed.
     drop(splats);
-    // Pictures and referees count what moves from the same instant.
+    // Images and referees use the same epoch for moving objects.
     let epoch = clock::now();
     let dynamic_objects = DynamicObjects::new(epoch, obstacles.objects.clone(), &objects, together);
     let referees =

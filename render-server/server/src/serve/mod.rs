@@ -1,4 +1,4 @@
-//! Starts everything, prints when it is ready, and ends it in order.
+//! Start and end of the server: creates all parts, prints when it is ready, and stops them in order.
 //!
 //! ```text
 //! sockets -> load (scene, renderer, referees) -> rooms' states -> threads and tasks -> report
@@ -45,17 +45,18 @@ use crate::web::{self, Access, Lab, Logins, Page, PageTls, Rates, TwinPictures};
 
 /// Runs the render server until SIGINT, SIGTERM or, with `--lifeline`, the end of stdin.
 ///
-/// With `--json` standard output carries one JSON line when ready, one per event of the server and
-/// one report at the end; without, the same for people.
+/// With `--json`, standard output has one JSON line when ready, one per event of the server, and one report at
+/// the end. Without it, the same is printed as text.
 ///
 /// # Errors
-/// Scene or arena that cannot be used, an address that cannot be bound.
+/// A scene or arena that cannot be used, or an address that cannot be bound.
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn serve(args: ServeArgs) -> Result<()> {
     descriptors::raise_limit();
     let stop = Stop::default();
     let mut args = args;
-    // Unnamed, they would be called as the thread that needs them first; an error says that they are there already.
+    // Sets names for the threads, which would otherwise inherit the first user's. Fails only if the pool
+    // already exists.
     let _ = rayon::ThreadPoolBuilder::new().thread_name(|i| format!("render-{i}")).build_global();
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
@@ -65,12 +66,12 @@ pub fn serve(args: ServeArgs) -> Result<()> {
         .context("cannot start tokio")?;
     let result = runtime.block_on(rounds(&mut args, &stop));
     stop.set();
-    // Not awaited: a task stuck in a system call must not hold up the end.
+    // Does not wait, because a task may be blocked in a system call.
     runtime.shutdown_background();
     result
 }
 
-/// Serves one scene after another, until the end of the program.
+/// Serves one scene after another, until the program ends.
 async fn rounds(args: &mut ServeArgs, stop: &Stop) -> Result<()> {
     stop.on_signals(args.lifeline)?;
     let logins = Logins::new().map_err(anyhow::Error::msg)?;
@@ -83,7 +84,7 @@ async fn rounds(args: &mut ServeArgs, stop: &Stop) -> Result<()> {
         }
         match (round, scenes.take_chosen(), former.take()) {
             (Ok(()), Some(arena), _) => former = Some(std::mem::replace(&mut args.arena, arena)),
-            // The new one cannot be loaded: the lab goes on with the one that could.
+            // If the new scene cannot be loaded, the previous one is served again.
             (Err(error), _, Some(arena)) => {
                 warn!("{error:#}; back to {}", arena.display());
                 args.arena = arena;
@@ -93,8 +94,8 @@ async fn rounds(args: &mut ServeArgs, stop: &Stop) -> Result<()> {
     }
 }
 
-/// Serves one scene, until it is to end or another one is chosen. With `again`, a former round was
-/// a moment ago, and its last tasks may still hold the sockets.
+/// Serves one scene, until the program ends or another scene is chosen. `again`: a previous round has just
+/// ended, and its last tasks may still hold the sockets.
 async fn run(
     args: &mut ServeArgs,
     scenes: &Arc<Scenes>,
@@ -110,7 +111,7 @@ async fn run(
     let http = listener.local_addr().context("the page has no address")?;
     let vicon = sources.iter().find(|source| source.driver() == Driver::Vicon);
     let vicon = vicon.and_then(Opened::socket);
-    // The next round is found where this one is.
+    // The next round uses the same addresses.
     (args.quic, args.http) = (quic, http);
     args.vicon = args.vicon.and(vicon);
     let pose = sources.iter().map(ReadySource::of).collect();
@@ -202,14 +203,14 @@ async fn run(
     tasks.shutdown().await;
     lab.close();
     for thread in threads {
-        // A thread that panicked has reported it on stderr; the report still comes.
+        // A thread that panicked has reported it on standard error; the report is still printed.
         let _ = tokio::task::spawn_blocking(move || thread.join()).await;
     }
     print::report(args.json, &print::ServerReport::of(&rooms));
     Ok(())
 }
 
-/// Everything that listens.
+/// All sockets of the server.
 struct Sockets {
     endpoint: Endpoint,
     listener: TcpListener,
@@ -217,7 +218,7 @@ struct Sockets {
     sources: Vec<Opened>,
 }
 
-/// Binds all addresses; `again` means that a former round may still hold them for a moment.
+/// Binds all addresses. `again`: a previous round may still hold them for a moment.
 async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) -> Result<Sockets> {
     let folder = &authorizer.folder;
     let tls = PageTls::open(args.tls.as_deref(), args.tls_key.as_deref(), folder)?;
@@ -237,7 +238,7 @@ async fn open_sockets(args: &ServeArgs, authorizer: &Authorizer, again: bool) ->
     }
 }
 
-/// Returns the state of every room, of a server that has seen nothing yet.
+/// Creates the state of every room at the start.
 async fn make_rooms(
     args: &ServeArgs,
     scene: &mut LoadedScene,
@@ -279,7 +280,7 @@ async fn make_rooms(
     }
 }
 
-/// Opens the database of runs. Without one the lab flies all the same: a warning has the reason.
+/// Opens the database of runs. If it fails, a warning is printed, and flights are possible without it.
 async fn open_leaderboard(args: &ServeArgs) -> Option<Leaderboard> {
     let database = match &args.leaderboard {
         Some(RunStorage::Nowhere) => return None,
@@ -289,13 +290,13 @@ async fn open_leaderboard(args: &ServeArgs) -> Option<Leaderboard> {
     match Leaderboard::open(&database).await {
         Ok(board) => Some(board),
         Err(error) => {
-            warn!("flights are not written down: {error}");
+            warn!("flights are not recorded: {error}");
             None
         }
     }
 }
 
-/// Opens the pairing that `--pair` asks for, and prints its code and what comes of it.
+/// Opens the pairing of `--pair`, and prints its code and its progress.
 fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bool) -> Result<()> {
     let window = authorizer.open_pairing(grant.clone()).map_err(anyhow::Error::msg)?;
     if json {
@@ -322,6 +323,6 @@ fn open_pairing(authorizer: &Arc<Authorizer>, grant: &Grant, port: u16, json: bo
     Ok(())
 }
 
-/// How often a socket that a former round may still hold is asked for, and how often at most.
+/// Interval and maximum number of attempts to bind a socket that a previous round may still hold.
 const BIND_EVERY: Duration = Duration::from_millis(100);
 const BIND_TRIES: u32 = 50;

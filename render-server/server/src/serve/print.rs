@@ -1,4 +1,4 @@
-//! What the server prints: ready, events, the report; JSON lines or text for people.
+//! Output of the server: ready line, events and report, as JSON lines or text.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -20,46 +20,46 @@ use crate::timing::StageDurations;
 use crate::web::{PageKeys, ServerStages};
 use vizflyt_process::lock;
 
-/// What is printed when the server is ready.
+/// Contents of the ready line.
 #[derive(Debug, Serialize)]
-#[allow(clippy::struct_field_names)] // Why: the key that every program's first line begins with.
+#[allow(clippy::struct_field_names)] // Why: the first key of every program's ready line.
 pub(super) struct Ready<'a> {
     pub(super) ready: &'static str,
     pub(super) quic: SocketAddr,
     pub(super) http: String,
-    /// The SHA-256 of the page's certificate, if it is served over HTTPS.
+    /// SHA-256 of the page's certificate, if served over HTTPS.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) page_certificate: Option<String>,
-    /// Where Vicon's stream must be sent, if that is a source.
+    /// Address for Vicon's stream, if it is a source.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) vicon: Option<SocketAddr>,
-    /// Where poses come from.
+    /// Pose sources.
     pub(super) pose: Vec<ReadySource>,
     pub(super) fingerprint: String,
-    /// How many computers may connect.
+    /// Number of paired computers.
     pub(super) paired: usize,
-    /// Where the first vehicle is expected to start: x, y, z [m, world], yaw [deg].
+    /// Expected start of the first vehicle: x, y, z [m, world], yaw [deg].
     pub(super) spawn: [f64; 4],
     pub(super) vehicles: Vec<ReadyVehicle>,
     pub(super) arena: &'a str,
-    /// What draws: `cpu avx2`.
+    /// Name of the renderer: `cpu avx2`.
     pub(super) renderer: &'a str,
-    /// Why it is this renderer.
+    /// Reason for this renderer.
     pub(super) renderer_reason: &'a str,
 }
 
-/// A source of poses, as it is printed when the server is ready.
+/// Pose source in the ready line.
 #[derive(Debug, Serialize)]
 pub(super) struct ReadySource {
     driver: Driver,
     address: String,
 }
 
-/// A vehicle, as it is printed when the server is ready.
+/// Vehicle in the ready line.
 #[derive(Debug, Serialize)]
 pub(super) struct ReadyVehicle {
     name: String,
-    /// Where it is expected to start: x, y, z [m, world], yaw [deg].
+    /// Expected start: x, y, z [m, world], yaw [deg].
     spawn: [f64; 4],
     cameras: Vec<String>,
 }
@@ -77,15 +77,15 @@ impl ReadyVehicle {
     }
 }
 
-/// Returns where a vehicle is expected to start: x, y, z [m, world], yaw [deg].
+/// Returns the expected start of a vehicle: x, y, z [m, world], yaw [deg].
 pub(super) fn spawn(arena: &ArenaConfig) -> [f64; 4] {
     let [x, y, z] = arena.spawn.position_m.to_array();
     [x, y, z, arena.spawn.yaw_deg]
 }
 
-/// Prints the addresses by which others open the page.
+/// Prints the page's addresses with keys.
 pub(super) fn page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool) {
-    // Bound to all addresses, none of which is more right than another.
+    // Unspecified addresses are printed as HOST.
     let page = http.replace("//0.0.0.0:", "//HOST:").replace("//[::]:", "//HOST:");
     for (whose, link) in keys.links(&page, names) {
         if json {
@@ -96,7 +96,7 @@ pub(super) fn page_keys(keys: &PageKeys, http: &str, names: &[&str], json: bool)
     }
 }
 
-/// Prints what happens to a vehicle; unless it is `alone`, each line names it.
+/// Prints the events of a vehicle, with its name unless it is `alone`.
 pub(super) async fn events(vehicle: Arc<VehicleFlight>, alone: bool, json: bool) {
     let mut log = vehicle.events.subscribe();
     log.mark_changed();
@@ -175,56 +175,56 @@ pub(super) fn line(value: &impl Serialize) {
     }
 }
 
-/// Prints a line; unlike `println!` it does not panic when the reader has gone.
+/// Prints a line. Unlike `println!`, it does not panic if the reader has closed the pipe.
 pub(super) fn plain(text: &str) {
     use std::io::Write;
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{text}").and_then(|()| out.flush());
 }
 
-/// The report printed when the server ends.
+/// Report at the end of the server.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct ServerReport {
-    /// Drawing one tick, median. [ms]
+    /// Time to render one tick, median. [ms]
     render_ms_p50: f32,
     /// 99th percentile. [ms]
     render_ms_p99: f32,
-    /// Encoding one image, median. [ms]
+    /// Time to encode one image, median. [ms]
     encode_ms_p50: f32,
     /// 99th percentile. [ms]
     encode_ms_p99: f32,
-    /// Handing over to acknowledgement, median. [ms]
+    /// Time from handing over to acknowledgement, median. [ms]
     send_ms_p50: f32,
     /// 99th percentile. [ms]
     send_ms_p99: f32,
-    /// What the server's own stages took. [ms]
+    /// Durations of the server's stages. [ms]
     stages: ServerStages,
-    /// What became of the images of the last flight, by vehicle and camera.
+    /// Delivery of the images of the last flight, by vehicle and camera.
     images: BTreeMap<String, Vec<CameraDelivery>>,
     /// Ticks rendered.
     ticks: u64,
-    /// Ticks rendered that no one took before the next.
+    /// Ticks replaced by the next one before the encoder took them.
     ticks_skipped: u64,
     /// Images that a runtime acknowledged.
     images_sent: u64,
-    /// Images given up past their deadline.
+    /// Images dropped after their deadline.
     images_late: u64,
     /// Megabytes of images acknowledged. [MB]
     sent_mb: f64,
-    /// What the localization delivered.
+    /// Counters of the pose sources.
     source: SourceCounters,
-    /// How good it was in the end, by vehicle.
+    /// Quality of the localization at the end, by vehicle.
     pose: BTreeMap<String, PoseQuality>,
     /// Peak resident memory of this process. [MB]
     peak_rss_mb: f64,
-    /// Which renderer drew.
+    /// Name of the renderer.
     renderer: String,
-    /// Why it was this one.
+    /// Reason for this renderer.
     renderer_reason: String,
 }
 
 impl ServerReport {
-    /// Returns the report over the whole run.
+    /// Returns the report of the complete run.
     pub(super) fn of(rooms: &Rooms) -> Self {
         let Rooms { flights, localization, rendering, streaming, .. } = rooms;
         let total = |counter: fn(&ImageCounters) -> &AtomicU64| -> u64 {
@@ -265,7 +265,7 @@ impl ServerReport {
     }
 }
 
-/// Returns the peak resident memory of this process; `None` where /proc is absent. [MB]
+/// Returns the peak resident memory of this process; `None` without /proc. [MB]
 fn peak_rss_mb() -> Option<f64> {
     parse_peak(&std::fs::read_to_string("/proc/self/status").ok()?)
 }
@@ -281,7 +281,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn peak_memory_is_read_from_the_status_file() {
+    fn parses_the_peak_memory_of_the_status_file() {
         assert_eq!(parse_peak("Name:\tx\nVmHWM:\t  1000 kB\n"), Some(1.024));
         assert_eq!(parse_peak("Name:\tx\n"), None);
         assert!(peak_rss_mb().is_some_and(|mb| mb > 1.0));

@@ -1,4 +1,4 @@
-//! Starts the threads: pose, render, encode, previews, and sensors where there are any.
+//! Start of the threads: pose, render, encode, previews, and sensors if there are any.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -17,16 +17,16 @@ use crate::stream::Rooms;
 use crate::web::previews::{self, Previews};
 use crate::{render, stream};
 
-/// What the threads share.
+/// Shared inputs of the threads.
 pub(super) struct Threads<'a> {
     pub(super) rooms: &'a Rooms,
     pub(super) previews: &'a Arc<Previews>,
-    /// Whether the vehicles see and touch each other.
+    /// Whether the vehicles see and collide with each other.
     pub(super) neighbours: bool,
 }
 
 impl Threads<'_> {
-    /// Starts them; they end when the server stops.
+    /// Starts the threads; they end when the server stops.
     pub(super) fn start(
         &self,
         args: &ServeArgs,
@@ -82,5 +82,6 @@ fn start(name: &str, run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<(
     thread.spawn(run).with_context(|| format!("cannot start the {name} thread"))
 }
 
-/// A tenth of a core that a flight's threads want, too; the rest of one that they leave.
+/// Niceness of the previews: they take a tenth of a core from the threads of a flight, and otherwise use idle
+/// time.
 const PREVIEWS_NICE: i32 = 10;

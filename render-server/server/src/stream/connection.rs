@@ -1,35 +1,35 @@
-//! The state of a runtime's QUIC connection, as figures.
+//! Statistics of a runtime's QUIC connection.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::time::ServerTime;
 
 use crate::clock;
 
-/// How a runtime's connection fares, from its start.
+/// Statistics of a runtime's connection since its start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Connection {
-    /// Round trip, smoothed. [ms]
+    /// Smoothed round-trip time. [ms]
     pub rtt_ms: f64,
-    /// Bytes that may be unacknowledged. [bytes]
+    /// Congestion window: maximum of unacknowledged bytes. [bytes]
     pub window: u64,
     /// Largest packet. [bytes]
     pub mtu: u16,
     /// Packets sent.
     pub packets_sent: u64,
-    /// Packets lost on the way; what they held was sent again.
+    /// Packets lost; their contents were sent again.
     pub packets_lost: u64,
     /// Congestion events that the controller received.
     pub congestion_events: u64,
-    /// Bytes sent on the network, everything included. [bytes]
+    /// Bytes sent on the network, including headers and retransmissions. [bytes]
     pub bytes_sent: u64,
-    /// How long it has lasted. [s]
+    /// Duration of the connection. [s]
     pub seconds: f64,
-    /// Sent on average since it began. [Mbit/s]
+    /// Mean rate sent since the start. [Mbit/s]
     pub mbit_s: f64,
 }
 
 impl Connection {
-    /// Returns how a connection that began at `since` fares.
+    /// Returns the statistics of a connection that began at `since`.
     pub fn of(connection: &quinn::Connection, since: ServerTime) -> Self {
         let stats = connection.stats();
         let seconds = clock::now().seconds_since(since);

@@ -1,12 +1,11 @@
-//! The delivery statistics of every image that was rendered for a runtime: delivered, in flight, or
-//! skipped and why.
+//! Delivery statistics of images rendered for a runtime: delivered, in flight, or skipped with the reason.
 //!
 //! ```text
 //! render ─ rendered ─▶ encode ─ handed ─▶ transport ─ late ─▶ .  counted here, by camera
 //! runtime ─ arrived, delivered, stale, ... ─▶ DeliveryStats             reported once a second
 //! ```
-//! Both sides only count up. What is handed over and has not arrived is in flight, or late as far
-//! as the transport has given it up; so the sum is the number of rendered images, at any moment.
+//! Both sides only count up. An image that was handed over and has not arrived is in flight, or late if the
+//! transport has given it up. So the counts add up to the number of rendered images at any moment.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -28,8 +27,8 @@ impl CameraCounters {
         self.rendered.fetch_add(1, Ordering::SeqCst);
     }
 
-    /// Counts an image handed to the runtime's transport; `counted` is whether it was when it was
-    /// rendered: the first one of a session may have been rendered for nobody.
+    /// Counts an image handed to the runtime's transport. `counted`: the image was already counted when it was
+    /// rendered. The first image of a session may have been rendered before the session began.
     pub fn count_sent(&self, counted: bool) {
         if !counted {
             self.count_rendered();
@@ -50,9 +49,9 @@ impl CameraCounters {
         self.late.fetch_add(1, Ordering::SeqCst);
     }
 
-    /// Returns the counts of this moment.
+    /// Returns the current counts.
     pub fn counts(&self) -> Counts {
-        // What ends an image is read before what begins it, so that no sum exceeds its parts.
+        // Ends of images are read before their starts, so that no sum exceeds its parts.
         let late = self.late.load(Ordering::SeqCst);
         let (failed, handed) =
             (self.failed.load(Ordering::SeqCst), self.handed.load(Ordering::SeqCst));
@@ -63,13 +62,13 @@ impl CameraCounters {
 /// Counts of one camera's images.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Rendered while a runtime flies.
+    /// Rendered during a runtime's flight.
     pub rendered: u64,
-    /// Handed to its transport.
+    /// Handed to the runtime's transport.
     pub handed: u64,
-    /// Not encoded for an error.
+    /// Not encoded because of an error.
     pub failed: u64,
-    /// Given up by the transport.
+    /// Dropped by the transport.
     pub late: u64,
 }
 
@@ -84,15 +83,15 @@ impl Counts {
     }
 }
 
-/// The delivery of one camera's images in the present flight; `rendered` is the sum of the rest.
+/// Delivery of one camera's images in the present flight; `rendered` is the sum of the other counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Delivery {
     /// Rendered.
     #[serde(rename = "drawn")]
     pub rendered: u64,
-    /// Given to the plugin.
+    /// Passed to the plugin.
     pub delivered: u64,
-    /// Neither ended nor reported yet.
+    /// Neither finished nor reported yet.
     pub under_way: u64,
     /// Skipped, by reason.
     pub skipped: Skipped,
@@ -101,36 +100,34 @@ pub struct Delivery {
 /// The delivery of one camera's images.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CameraDelivery {
-    /// Its name.
     pub camera: String,
-    /// The counts.
     #[serde(flatten)]
     pub account: Delivery,
 }
 
-/// Images skipped, by reason, in the order of their way.
+/// Skipped images by reason, in the order of the stages from renderer to plugin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Skipped {
-    /// Rendered, but a newer one was before the encoder was free and the transport had room.
+    /// Rendered, but replaced by a newer image before encoder and transport had room.
     pub no_room: u64,
     /// Could not be encoded.
     pub failed: u64,
-    /// Given up by the transport: past its deadline, reset, or the connection broke.
+    /// Dropped by the transport: deadline passed, stream reset, or connection lost.
     pub late: u64,
-    /// Arrived when a newer one was there already.
+    /// Arrived after a newer image.
     pub stale: u64,
     /// Arrived, but did not decode.
     pub broken: u64,
-    /// Arrived; a newer one came before the decoder was free.
+    /// Arrived, but replaced by a newer image before the decoder was free.
     pub superseded: u64,
-    /// Decoded; a newer one was there before the plugin, idle, had asked.
+    /// Decoded, but replaced by a newer image before the idle plugin requested one.
     pub unasked: u64,
-    /// Decoded; a newer one was there before the plugin had done with an earlier one.
+    /// Decoded, but replaced by a newer image while the plugin processed an earlier one.
     pub overrun: u64,
 }
 
 impl Skipped {
-    /// Returns all of them with their names, in order.
+    /// Returns all counts with their names, in order.
     pub fn each(&self) -> [(&'static str, u64); 8] {
         [
             ("no_room", self.no_room),
@@ -144,14 +141,13 @@ impl Skipped {
         ]
     }
 
-    /// Returns their sum.
     pub fn sum(&self) -> u64 {
         self.each().iter().map(|(_, count)| count).sum()
     }
 }
 
 impl Delivery {
-    /// Joins what the server counted with what the runtime reported before that.
+    /// Combines the server's counts with the runtime's earlier report.
     pub fn of(server: Counts, runtime: Arrivals) -> Self {
         let arrived = runtime.arrived.min(server.handed);
         let on_the_way = server.handed - arrived;
@@ -176,19 +172,18 @@ impl Delivery {
     }
 }
 
-/// The accounts of one vehicle's present flight.
+/// Delivery statistics of one vehicle's present flight.
 #[derive(Debug, Default)]
 pub struct DeliveryStats {
-    /// The server's counts when the flight began.
+    /// Counts of the server at the start of the flight.
     start: [Counts; MAX_CAMERAS],
     /// The runtime's newest report.
     newest: [Arrivals; MAX_CAMERAS],
-    /// What a runtime that was restarted in flight had reported before.
+    /// Sum of the reports before the runtime was restarted in flight.
     before: [Arrivals; MAX_CAMERAS],
 }
 
 impl DeliveryStats {
-    /// Begins a flight.
     pub fn begin(&mut self, counters: &[CameraCounters; MAX_CAMERAS]) {
         *self = Self {
             start: std::array::from_fn(|camera| counters[camera].counts()),
@@ -196,7 +191,7 @@ impl DeliveryStats {
         };
     }
 
-    /// Takes the runtime's report, by camera.
+    /// Records the runtime's report, by camera.
     pub fn report(&mut self, cameras: &[Arrivals]) {
         let restarted =
             cameras.iter().zip(&self.newest).any(|(now, last)| now.arrived < last.arrived);
@@ -211,7 +206,7 @@ impl DeliveryStats {
         }
     }
 
-    /// Returns the account of a camera.
+    /// Returns the delivery of a camera's images.
     pub fn account(&self, camera: usize, counters: &CameraCounters) -> Delivery {
         let runtime = add(self.before[camera], self.newest[camera]);
         Delivery::of(counters.counts().since(self.start[camera]), runtime)
@@ -235,14 +230,14 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Where an image's way ends.
+    /// Stage at which an image ends.
     #[derive(Clone, Copy, Debug, PartialEq)]
     enum End {
         NoRoom,
         Failed,
-        /// Handed over, given up, never arrives.
+        /// Handed over, dropped, never arrives.
         Late,
-        /// Given up by the server, and arrived all the same: the last acknowledgement was lost.
+        /// Dropped by the server but arrived: the last acknowledgement was lost.
         LateButDelivered,
         Delivered,
         Stale,
@@ -302,8 +297,8 @@ mod tests {
     }
 
     proptest! {
-        /// Every image that is rendered is accounted for: at any moment by the sum, in the end by its
-        /// own reason, though reports lag behind and the runtime is restarted in flight.
+        /// Every rendered image is counted: the sum is right at any moment, and in the end each image has its
+        /// own reason, even if reports are delayed and the runtime is restarted in flight.
         #[test]
         fn every_rendered_image_is_accounted_for(
             script in prop::collection::vec((0usize..ENDS.len(), any::<bool>(), 0u8..20), 1..400),
@@ -312,7 +307,7 @@ mod tests {
         ) {
             let counters: [CameraCounters; MAX_CAMERAS] = std::array::from_fn(|_| CameraCounters::default());
             let counter = &counters[3];
-            // A former flight leaves its counts behind.
+            // An earlier flight leaves its counts behind.
             for index in 0..former {
                 serve(counter, ENDS[index % ENDS.len()], true);
             }
@@ -370,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn a_runtime_that_reports_nonsense_breaks_nothing() {
+    fn inconsistent_reports_do_not_break_the_counts() {
         let counters = CameraCounters::default();
         counters.count_sent(false);
         let most = u64::MAX / 16;

@@ -1,9 +1,9 @@
-//! The place of one image on its way from the encoder to one subscriber's connection.
+//! Buffer slot for one image between the encoder and one subscriber's connection.
 //!
-//! The encode thread fills it slice by slice, a task of the transport empties it at the same time;
-//! it is free again when both have let go. Slots are made when a subscriber comes, a few per
-//! camera, so that nothing is allocated per image. A slice is a counted reference to the encoder's
-//! buffer: however many subscribers an image has, its bytes are there once.
+//! The encode thread fills it slice by slice, and a transport task empties it concurrently. It is free again
+//! when both have released it. Slots are allocated when a subscriber connects, a few per camera, so that no
+//! memory is allocated per image. A slice is a reference-counted part of the encoder's buffer: all subscribers
+//! share one copy of the bytes.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard};
@@ -14,21 +14,21 @@ use tokio::sync::Notify;
 use vizflyt_protocol::packet::ImageHeader;
 use vizflyt_protocol::time::ServerTime;
 
-/// What the transport does next.
+/// Next step of the transport.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// Sends these bytes of bitstream.
+    /// Send these bytes of bitstream.
     Bytes(Bytes),
-    /// Ends the image.
+    /// Finish the image.
     End {
-        /// Encoding ended.
+        /// End of encoding.
         encode_end: ServerTime,
     },
-    /// Resets it: the rest will not come.
+    /// Reset the image: no more bytes follow.
     Cut,
 }
 
-/// A place for an image in flight.
+/// Slot for an image in flight.
 #[derive(Debug, Default)]
 pub struct InFlightImage {
     state: Mutex<State>,
@@ -45,7 +45,7 @@ struct State {
 }
 
 impl InFlightImage {
-    /// Begins an image, which leaves with this priority; the place was free.
+    /// Begins an image with this stream priority. The slot must be free.
     pub(crate) fn begin(&self, header: ImageHeader, priority: i32) {
         let mut state = self.lock();
         state.parts.clear();
@@ -55,10 +55,9 @@ impl InFlightImage {
         self.changed.notify_one();
     }
 
-    /// Adds bytes to the image.
     pub(crate) fn push(&self, bytes: Bytes) {
         let mut state = self.lock();
-        // Nobody sends any more: past its deadline, or the connection is gone.
+        // If not sending: the deadline has passed, or the connection has ended.
         if state.sending {
             state.parts.push_back(Part::Bytes(bytes));
             drop(state);
@@ -66,8 +65,7 @@ impl InFlightImage {
         }
     }
 
-    /// Says that all bytes are there, or with `None` that no more will come; returns whether the
-    /// place is free now.
+    /// Ends the image: complete, or with `None` incomplete. Returns whether the slot is free.
     pub(crate) fn end(&self, encode_end: Option<ServerTime>) -> bool {
         let mut state = self.lock();
         state.encoding = false;
@@ -101,7 +99,7 @@ impl InFlightImage {
         }
     }
 
-    /// Lets go of the image, sent or not; returns whether the place is free now.
+    /// Releases the image, sent or not. Returns whether the slot is free.
     pub(crate) fn let_go(&self) -> bool {
         let mut state = self.lock();
         state.sending = false;
@@ -110,7 +108,7 @@ impl InFlightImage {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Why: nothing panics while the lock is held.
+        // No code panics while the lock is held.
         lock(&self.state)
     }
 }

@@ -1,9 +1,9 @@
-//! Images on their way: rendered ticks in, QUIC streams out.
+//! Image streaming: rendered ticks in, QUIC streams out.
 //!
 //! ```text
-//! in   rendered ticks, from `render`; what runtimes and watchers report over QUIC
+//! in   rendered ticks, from `render`; reports of runtimes and watchers over QUIC
 //! out  images slice by slice, poses and events, to every subscriber; delivery statistics;
-//!      to `render`: the demand for images, and the size that the link carries
+//!      to `render`: the demand for images, and the image size that fits the link
 //!      to `flights`: the runtimes' reports and events; to `poses`: IMU readings
 //! ```
 //! Imports `render`, `poses` and `flights`.

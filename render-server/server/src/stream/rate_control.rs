@@ -1,22 +1,23 @@
-//! What to give up when the link is too slow: quality before rate, rate before resolution.
+//! Rate control for slow links: reduces quality before rate, and rate before resolution.
 //!
 //! ```text
-//! every image that ends (bytes, handed, acknowledged or given up) -> capacity of the link
-//! four times a second: what each level would need of it            -> level
+//! every finished image (bytes, handed, acknowledged or dropped) -> capacity of the link
+//! four times a second: load of each level                          -> level
 //! level -> encoder's options, frame decimation, size
 //! ```
-//! Pure: no clock, no socket. One [`RateController`] per session, for all cameras of its vehicle share one
-//! link.
+//! Pure: no clock, no socket. There is one [`RateController`] per session, because all cameras of a vehicle
+//! share one link.
 //!
-//! The capacity is measured as of a queue with one server and a fixed way: an image that was handed
-//! over at `h` cannot be acknowledged before `h` + round trip, nor before the image ahead of it; what
-//! it took longer is its own time on the bottleneck. So it is known on an idle link too, and a raise
-//! need not be tried to be judged. The median over [`WINDOW_S`] is taken, so that single losses,
-//! which cost a retransmission, do not count as a slow link.
+//! The capacity is estimated with the model of a queue with one server and a fixed delay. An image that was
+//! handed over at `h` cannot be acknowledged before `h` + round trip, nor before the preceding image. Any
+//! additional time is its service time on the bottleneck. So the capacity is known on an idle link too, and a
+//! raise can be judged without trying it. The median over [`WINDOW_S`] is used, so that single losses, which
+//! cost a retransmission, do not count as a slow link.
 //!
-//! Down at once, to the first level that needs at most [`AIM`] of the capacity; up by one level when
-//! the next has needed at most [`RAISE`] of it for [`PATIENCE_S`], twice as long after every raise
-//! that did not last, unless the room is [`AMPLE`]. Without any acknowledgement (an outage) the level stays for [`OUTAGE_S`].
+//! The controller lowers at once, to the first level that needs at most [`AIM`] of the capacity. It raises by
+//! one level when the next level has needed at most [`RAISE`] of the capacity for [`PATIENCE_S`]. This delay
+//! doubles after every raise that did not last, unless the level needs at most [`AMPLE`]. Without any
+//! acknowledgement (an outage) the level stays for [`OUTAGE_S`].
 
 use std::collections::VecDeque;
 use std::net::IpAddr;
@@ -25,29 +26,28 @@ use std::time::Duration;
 use vizflyt_protocol::time::ServerTime;
 use vizflyt_rgbd::{ColorMode, DepthBound, EncodeOptions};
 
-/// What may be lowered when a link is too slow.
+/// Image properties that may be reduced on a slow link
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Adaptation {
-    /// `none` on this computer, `quality` to private addresses, `all` to all others.
+    /// `none` on this computer, `quality` to private addresses, `all` to all others
     #[default]
     Auto,
-    /// Nothing: images are as asked for, or do not come.
+    /// Nothing: images that do not fit are skipped
     None,
-    /// Compression of colour and depth.
+    /// Compression of colour and depth
     Quality,
-    /// Also the rate: to a half, then a third.
+    /// Also the rate: to a half, then a third
     Rate,
-    /// Also the size of images: to a half.
+    /// Also the size of images: to a half
     All,
 }
 
 impl Adaptation {
-    /// Returns what it means toward a peer at `address`.
+    /// Resolves `Auto` for a peer at `address`.
     ///
-    /// On one computer there is no link, only processors that may be busy. A plugin of the lab is
-    /// written for its camera: there rate and size stay, and a cable that is too slow even so shows
-    /// as skipped images. A remote one is better served by fewer and smaller images than by late
-    /// ones.
+    /// On one computer there is no link, only processors that may be busy. A plugin of the lab is written for
+    /// its camera, so rate and size stay, and a cable that is still too slow shows as skipped images. A remote
+    /// plugin is better served by fewer and smaller images than by late ones.
     pub fn toward(self, address: IpAddr) -> Self {
         match self {
             Self::Auto if address.to_canonical().is_loopback() => Self::None,
@@ -68,7 +68,7 @@ impl Adaptation {
     }
 }
 
-/// Whether `address` is this computer's or of a private network.
+/// Returns whether `address` belongs to this computer or to a private network.
 pub fn is_near(address: IpAddr) -> bool {
     match address.to_canonical() {
         IpAddr::V4(v4) => v4.is_loopback() || v4.is_private() || v4.is_link_local(),
@@ -76,27 +76,27 @@ pub fn is_near(address: IpAddr) -> bool {
     }
 }
 
-/// How images are made at one level.
+/// Encoding, rate and size of images at one level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Level {
-    /// JPEG quality at most.
+    /// Maximum JPEG quality.
     quality: u8,
     /// Colour in half resolution.
     half_colour: bool,
-    /// Depth error at least, as k. [1/m]
+    /// Minimum depth error, as k. [1/m]
     depth_k: Option<f64>,
-    /// One of so many images is sent.
+    /// One of this many images is sent.
     pub keep_one_in: u32,
-    /// Width and height are divided by this.
+    /// Divisor of width and height.
     pub shrink: u32,
-    /// Bytes of an image, as a share of level 0's: about what renders of captured scenes take. A
-    /// wrong share costs a second change, as what follows is measured.
+    /// Bytes of an image as a share of level 0's, typical for renders of captured scenes. A wrong share costs a
+    /// second change of level, because the sizes that follow are measured.
     pub share: f64,
     name: &'static str,
 }
 
 impl Level {
-    /// Returns `options` lowered to this level; what was asked for lower stays as it is.
+    /// Returns `options` reduced to this level. Options that are already lower stay unchanged.
     pub fn options(&self, options: &EncodeOptions) -> EncodeOptions {
         let mut lowered = *options;
         if self.share == 1.0 {
@@ -114,23 +114,23 @@ impl Level {
         lowered
     }
 
-    /// Returns its description for people: `JPEG 4:2:0 quality 80, depth within 0.001 z²`.
+    /// Returns a description for users: `JPEG 4:2:0 quality 80, depth within 0.001 z²`.
     pub fn name(&self) -> &'static str {
         self.name
     }
 
-    /// Returns the bytes per second it needs, as a share of level 0's.
+    /// Returns the bytes per second of this level, as a share of level 0's.
     fn load(&self) -> f64 {
         self.share / f64::from(self.keep_one_in)
     }
 }
 
-/// Returns the level of this number, 0 being the best; the smallest, if there are fewer.
+/// Returns a level by number; 0 is the best. Numbers that are too large give the smallest level.
 pub fn level(index: usize) -> &'static Level {
     &LEVELS[index.min(LEVELS.len() - 1)]
 }
 
-/// From the best to the smallest.
+/// All levels, from the best to the smallest.
 pub static LEVELS: [Level; 7] = {
     const FULL: Level = Level {
         quality: 100,
@@ -139,7 +139,7 @@ pub static LEVELS: [Level; 7] = {
         keep_one_in: 1,
         shrink: 1,
         share: 1.0,
-        name: "as asked for",
+        name: "the configured quality",
     };
     const LOW: Level = Level {
         quality: 60,
@@ -171,29 +171,29 @@ pub static LEVELS: [Level; 7] = {
     ]
 };
 
-/// The end of one image's way.
+/// Result of sending one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SentImage {
-    /// How large it was.
+    /// Size of the image.
     pub bytes: usize,
-    /// When its first byte was handed to the transport.
+    /// Time at which its first byte was handed to the transport.
     pub handed: ServerTime,
-    /// When the runtime had acknowledged it, or it was given up.
+    /// Time at which the runtime had acknowledged it, or the transport dropped it.
     pub ended: ServerTime,
-    /// Acknowledged.
+    /// Whether the runtime acknowledged it.
     pub delivered: bool,
-    /// The least round trip known.
+    /// Smallest round-trip time measured.
     pub min_rtt: Duration,
 }
 
 /// A change of level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Change {
-    /// Before.
+    /// Previous level.
     pub from: usize,
-    /// From now on.
+    /// New level.
     pub to: usize,
-    /// What the link carries, by the landings. [bit/s]
+    /// Estimated capacity of the link. [bit/s]
     pub capacity_bps: f64,
 }
 
@@ -217,16 +217,16 @@ struct Sample {
     service_s: f64,
 }
 
-/// The policy of one session.
+/// Rate controller of one session.
 #[derive(Clone, Debug)]
 pub struct RateController {
     levels: usize,
     level: usize,
     samples: VecDeque<Sample>,
     last_ended: ServerTime,
-    /// Since when images have only been given up.
+    /// Time since which all images were dropped.
     silent_since: Option<ServerTime>,
-    /// When the next better level began to fit.
+    /// Time at which the next better level began to fit.
     fits_since: Option<ServerTime>,
     changed: Option<ServerTime>,
     /// Whether the newest change was a raise.
@@ -235,7 +235,7 @@ pub struct RateController {
 }
 
 impl RateController {
-    /// Makes the policy; `adapt` limits how far it may go.
+    /// Creates the controller; `adapt` limits the levels.
     pub fn new(adapt: Adaptation) -> Self {
         Self {
             levels: adapt.levels(),
@@ -250,17 +250,17 @@ impl RateController {
         }
     }
 
-    /// Returns how images are to be made now.
+    /// Returns the current level.
     pub fn level(&self) -> &'static Level {
         &LEVELS[self.level]
     }
 
-    /// Returns the number of the present level; 0 is the best.
+    /// Returns the number of the current level; 0 is the best.
     pub fn index(&self) -> usize {
         self.level
     }
 
-    /// Takes note of an image's end.
+    /// Records the end of an image.
     pub fn landed(&mut self, image: &SentImage) {
         let (handed, ended) = (image.handed, image.ended);
         let way_s = image.min_rtt.as_secs_f64() + ACK_DELAY_S;
@@ -268,20 +268,20 @@ impl RateController {
         let took_s = if image.delivered {
             ended.seconds_since(way.max(self.last_ended))
         } else {
-            // How much of it had left is not known: at worst it had the link to itself.
+            // The part that had been sent is unknown: in the worst case the image had the link to itself.
             ended.seconds_since(way)
         };
         self.last_ended = self.last_ended.max(ended);
         if image.delivered {
             let since = self.silent_since.take();
             if since.is_some_and(|since| ended.seconds_since(since) > SILENT_S) {
-                // An outage has no information about the link that came back.
+                // An outage gives no information about the link after it.
                 self.samples.clear();
             }
         } else {
             self.silent_since.get_or_insert(ended);
         }
-        // What was under way when the level changed was made at the old one.
+        // Images in flight at a change were made at the old level.
         if self.changed.is_some_and(|then| handed <= then) {
             return;
         }
@@ -295,7 +295,7 @@ impl RateController {
         });
     }
 
-    /// Decides anew, for cameras that would like `wanted_hz` images a second in all; call it every
+    /// Updates the level, for cameras that render `wanted_hz` images per second in total. Call it every
     /// [`DECIDE_EVERY`].
     pub fn decide(&mut self, now: ServerTime, wanted_hz: f64) -> Option<Change> {
         while self.samples.front().is_some_and(|s| now.seconds_since(s.ended) > WINDOW_S) {
@@ -312,7 +312,7 @@ impl RateController {
 
         let to = if needs(self.level) > MAX_LOAD {
             self.fits_since = None;
-            // The first that fits, but one lower at least; the last if none does.
+            // The first level that fits, at least one lower; the last if none fits.
             let lower = self.level + 1..self.levels;
             lower.clone().find(|&level| needs(level) <= AIM).or(lower.last())
         } else if self.level > 0 && needs(self.level - 1) <= RAISE {
@@ -341,7 +341,7 @@ impl RateController {
         Change { from, to, capacity_bps }
     }
 
-    /// Returns what the link carries; `None` while that is not known.
+    /// Returns the estimated capacity of the link; `None` if unknown.
     fn capacity_bps(&self, now: ServerTime) -> Option<f64> {
         let silent_s = self.silent_since.map_or(0.0, |since| now.seconds_since(since));
         let is_out = silent_s > SILENT_S && silent_s < OUTAGE_S;
@@ -355,38 +355,38 @@ impl RateController {
     }
 }
 
-/// How often to [`RateController::decide`].
+/// Interval of calls of [`RateController::decide`].
 pub const DECIDE_EVERY: Duration = Duration::from_millis(250);
-/// Images of the last so many seconds count: enough for a median at 20 Hz, and an outage fits. [s]
+/// Window of the capacity estimate: enough for a median at 20 Hz, and longer than an outage. [s]
 const WINDOW_S: f64 = 3.0;
-/// An eighth of a second at 60 Hz; at the lowest rates half a second.
+/// Minimum samples: an eighth of a second at 60 Hz, half a second at the lowest rates.
 const MIN_SAMPLES: usize = 8;
-/// 640 bytes a session; a second and more at 60 Hz.
+/// Maximum samples: 640 bytes a session; more than a second at 60 Hz.
 const MAX_SAMPLES: usize = 64;
-/// Share of the capacity above which a level is too much: packets have headers (3 %), and a queue
-/// at full load never empties.
+/// Share of the capacity above which the level is lowered: packets have headers (3 %), and a queue at full load
+/// never empties.
 const MAX_LOAD: f64 = 0.9;
-/// Share of the capacity that a lower level is chosen by.
+/// Maximum share of the capacity for the level chosen when lowering.
 const AIM: f64 = 0.8;
-/// Share of the capacity that a raise may need: below [`MAX_LOAD`] by more than levels next to each
-/// other vary with the scene.
+/// Maximum share of the capacity for a raise. It is below [`MAX_LOAD`] by more than the sizes of adjacent
+/// levels vary with the scene.
 const RAISE: f64 = 0.7;
-/// Below this share of the capacity a raise that did not last before is no reason to wait.
+/// Below this share of the capacity, a raise does not wait longer because an earlier one did not last.
 const AMPLE: f64 = 0.4;
-/// How long the next better level must fit. [s]
+/// Time for which the next better level must fit. [s]
 const PATIENCE_S: f64 = 2.0;
-/// Where the link is just between two levels: one try in so long. [s]
+/// Maximum time between attempts to raise, for a link between two levels. [s]
 const MAX_PATIENCE_S: f64 = 32.0;
-/// A raise that is taken back within this did not last. [s]
+/// A raise that is reverted within this time did not last. [s]
 const LASTS_S: f64 = 10.0;
-/// Without any acknowledgement for so long it is no outage but a link that carries nothing of this
-/// size before its deadline. [s]
+/// Without any acknowledgement for this long, the cause is not an outage, but a link that carries no image of
+/// this size before its deadline. [s]
 const OUTAGE_S: f64 = 2.5;
-/// More than a few images given up in a row. [s]
+/// Time without an acknowledgement that counts as an outage: more than a few dropped images in a row. [s]
 const SILENT_S: f64 = 0.5;
-/// The runtime's `max_ack_delay`: not the link's doing. [s]
+/// `max_ack_delay` of the runtime, which is not a delay of the link. [s]
 const ACK_DELAY_S: f64 = 0.002;
-/// What is quicker cannot be distinguished from the clock's and the tasks' own delays. [s]
+/// Minimum service time: shorter ones are below the delays of clock and tasks. [s]
 const MIN_SERVICE_S: f64 = 0.0002;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What the encode thread, the sessions and the senders of images share.
+//! State shared by the encode thread, the sessions and the image senders.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU16, Ordering};
@@ -24,22 +24,21 @@ use crate::timing::StageDurations;
 /// The streams of all vehicles.
 #[derive(Debug)]
 pub struct Streaming {
-    /// Who wants images.
     pub subscriptions: Subscriptions,
-    /// One for each vehicle, at its index.
+    /// Streams by index of the vehicle.
     pub vehicles: Vec<VehicleStream>,
-    /// What may be lowered toward a runtime whose link is too slow.
+    /// Image properties that may be reduced on a slow link.
     pub adapt: Adaptation,
-    /// Quantising and encoding one camera's image.
+    /// Time to quantise and encode one camera's image.
     pub encode_durations: StageDurations,
-    /// Where guardians subscribe to poses; 0 is nowhere.
+    /// Port on which guardians subscribe to poses; 0 if closed.
     pub feed_port: AtomicU16,
-    /// Handing an image to the transport until the runtime has acknowledged all of it.
+    /// Time from handing an image to the transport until the runtime has acknowledged all of it.
     pub send_durations: StageDurations,
 }
 
 impl Streaming {
-    /// Returns the state for vehicles with this many cameras each, without a subscriber.
+    /// Creates the state for vehicles with this many cameras each, without subscribers.
     pub fn new(cameras: &[usize], adapt: Adaptation) -> Self {
         Self {
             subscriptions: Subscriptions::new(cameras),
@@ -74,23 +73,18 @@ impl Demand for Streaming {
     }
 }
 
-/// The state of this room and of those below it, as sessions and pages need it.
+/// State of this room and of those below it, for sessions and pages.
 #[derive(Clone, Debug)]
 pub struct Rooms {
-    /// Who flies, and how it goes.
     pub flights: Arc<Flights>,
-    /// Where the vehicles are.
     pub localization: Arc<Localization>,
-    /// What is rendered.
     pub rendering: Arc<Rendering>,
-    /// Who gets images.
     pub streaming: Arc<Streaming>,
-    /// The end of the program.
     pub stop: Stop,
 }
 
 impl Rooms {
-    /// Returns what the threads that render and measure work with.
+    /// Returns the inputs of the threads that render and measure.
     pub fn render_inputs(&self) -> Inputs<'_, Streaming> {
         Inputs {
             rendering: &self.rendering,
@@ -100,8 +94,8 @@ impl Rooms {
         }
     }
 
-    /// Returns the state of a server for vehicles, each with name, arena and cameras: without a
-    /// leaderboard, pose sources and objects, as benchmarks and tests serve them.
+    /// Creates the state of a server for vehicles, each with name, arena and cameras, without leaderboard, pose
+    /// sources and objects. Benchmarks and tests use it.
     pub fn bare(
         vehicles: Vec<(&str, ArenaInfo, Vec<CameraConfig>)>,
         adapt: Adaptation,
@@ -123,7 +117,7 @@ impl Rooms {
         }
     }
 
-    /// Returns how many ticks were rendered so far.
+    /// Returns the number of rendered ticks.
     pub fn ticks(&self) -> u64 {
         self.rendering.ticks.load(Ordering::Relaxed)
     }

@@ -1,15 +1,16 @@
-//! Who wants images at this moment, and the way out to them.
+//! Image subscriptions, and delivery to subscribers.
 //!
-//! A vehicle's images go to its runtime and to any number of watchers, at most [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS).
-//! For each camera at most K images may be in flight to each of them (handed to the transport, not
-//! yet acknowledged). The encode thread takes the newest rendered tick only when someone has room, so
-//! that what waits is always the newest, and nothing is encoded that could not leave; an image is
-//! encoded once, for all who have room ([`Subscriptions::begin`]).
+//! A vehicle's images go to its runtime and to at most
+//! [`MAX_WATCHERS`](crate::flights::control_lease::MAX_WATCHERS) watchers. At most K images per camera may be
+//! in flight to each subscriber (handed to the transport, not yet acknowledged). The encode thread takes the
+//! newest rendered tick only when a subscriber has room. So the waiting image is always the newest, and no
+//! image is encoded that could not be sent. An image is encoded once, for all subscribers with room
+//! ([`Subscriptions::begin`]).
 //!
-//! Watchers never delay the runtime: while one flies, its watchers get the images that it gets.
-//! Only if it has had no room for [`STALLED_S`] are images encoded for them alone.
+//! Watchers never delay the runtime: while a runtime is connected, its watchers get the same images. Images are
+//! encoded only for watchers if the runtime has had no room for [`STALLED_S`].
 //!
-//! Viewers of the page are counted. The render thread rests while nobody wants anything.
+//! Viewers of the page are counted. The render thread rests while there are neither subscribers nor viewers.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -24,25 +25,25 @@ use vizflyt_protocol::time::ServerTime;
 use crate::clock;
 pub use crate::stream::in_flight::{InFlightImage, Part};
 
-/// The images that the encode thread may make now.
+/// Images that the encode thread may encode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// By vehicle and camera: someone has room for an image.
+    /// By vehicle and camera: at least one subscriber has room for an image.
     pub stream: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
     /// By vehicle and camera: the runtime has room for an image.
     pub fly: [[bool; MAX_CAMERAS]; MAX_VEHICLES],
-    /// No runtime wants images, but a page does: rendered ticks go on to the previews.
+    /// No sessions, but at least one page: rendered ticks go on to the previews.
     pub pass_on: bool,
 }
 
 impl Wanted {
-    /// Whether anyone wants images.
+    /// Returns whether any images are wanted.
     pub fn anything(&self) -> bool {
         self.pass_on || self.stream.as_flattened().contains(&true)
     }
 }
 
-/// Demand, and the way out; shared by the render, encode and transport sides.
+/// Demand for images, and their slots; shared by the render, encode and transport sides.
 #[derive(Debug)]
 pub struct Subscriptions {
     state: Mutex<State>,
@@ -55,7 +56,7 @@ struct State {
     closed: bool,
 }
 
-/// Who wants the images of one vehicle.
+/// Subscribers of one vehicle's images.
 #[derive(Debug, Default)]
 struct VehicleSubscribers {
     cameras: usize,
@@ -63,7 +64,7 @@ struct VehicleSubscribers {
     viewers: u32,
 }
 
-/// A session that gets images.
+/// Session that receives images.
 #[derive(Debug)]
 struct Subscriber {
     id: u64,
@@ -72,20 +73,20 @@ struct Subscriber {
     cameras: Vec<CameraSlots>,
 }
 
-/// The images of one camera in flight to one subscriber.
+/// Images of one camera in flight to one subscriber.
 #[derive(Debug)]
 struct CameraSlots {
     all: Vec<Arc<InFlightImage>>,
-    /// Bit per place that is taken.
+    /// One bit per used slot.
     taken: u8,
-    /// When the last free place was taken.
+    /// Time at which the last free slot was taken.
     full_since: ServerTime,
 }
 
-/// The places of a subscriber's images, by camera, [`MAX_IN_FLIGHT`] of each.
+/// Image slots of a subscriber by camera, [`MAX_IN_FLIGHT`] of each.
 pub type Slots = Vec<Vec<Arc<InFlightImage>>>;
 
-/// An image on its way to all who had room when it began. Reused from image to image.
+/// Image in flight to all subscribers that had room when it began. Reused for the next image.
 #[derive(Debug, Default)]
 pub struct Broadcast {
     vehicle: usize,
@@ -94,12 +95,12 @@ pub struct Broadcast {
 }
 
 impl Broadcast {
-    /// Whether nobody had room.
+    /// Returns whether no subscriber had room.
     pub fn is_empty(&self) -> bool {
         self.to.is_empty()
     }
 
-    /// Hands the next bytes of bitstream to everyone.
+    /// Passes the next bytes of bitstream to all subscribers.
     pub fn push(&self, bytes: &Bytes) {
         for (.., image) in &self.to {
             image.push(bytes.clone());
@@ -120,7 +121,7 @@ impl VehicleSubscribers {
         self.subscribers.iter().any(|subscriber| subscriber.purpose == Purpose::Watch)
     }
 
-    /// Returns whether an image of this camera may be encoded for the runtime, and for anyone.
+    /// Returns whether an image of this camera may be encoded for the runtime, and for any subscriber.
     fn room(&self, camera: usize, now: ServerTime) -> (bool, bool) {
         let has_room = |subscriber: &Subscriber| subscriber.room(camera).is_some();
         let is_watcher = |subscriber: &&Subscriber| subscriber.purpose == Purpose::Watch;
@@ -135,7 +136,7 @@ impl VehicleSubscribers {
 }
 
 impl Subscriber {
-    /// Returns the number of a free place.
+    /// Returns the index of a free slot.
     fn room(&self, camera: usize) -> Option<usize> {
         let slots = self.cameras.get(camera)?;
         let free = (!slots.taken).trailing_zeros() as usize;
@@ -144,8 +145,8 @@ impl Subscriber {
 }
 
 impl Subscriptions {
-    /// Makes the subscriptions of vehicles with this many cameras each (at most [`MAX_CAMERAS`] of at
-    /// most [`MAX_VEHICLES`]).
+    /// Creates the subscriptions of vehicles with this many cameras each (at most [`MAX_CAMERAS`] of at most
+    /// [`MAX_VEHICLES`]).
     pub fn new(cameras: &[usize]) -> Self {
         let vehicle = |&cameras: &usize| VehicleSubscribers {
             cameras: cameras.min(MAX_CAMERAS),
@@ -155,8 +156,8 @@ impl Subscriptions {
         Self { state: Mutex::new(State { vehicles, closed: false }), changed: Condvar::new() }
     }
 
-    /// Lets images flow to session `id` of a vehicle, at most `allowed` in flight per camera; a
-    /// runtime takes the place of an earlier one. Returns where they will be.
+    /// Subscribes session `id` to a vehicle's images, at most `allowed` in flight per camera. A runtime
+    /// replaces an earlier one. Returns the image slots.
     pub fn open(&self, vehicle: usize, id: u64, purpose: Purpose, allowed: u32) -> Slots {
         let mut state = self.lock();
         let vehicle = &mut state.vehicles[vehicle];
@@ -173,13 +174,13 @@ impl Subscriptions {
         all
     }
 
-    /// Stops the flow to session `id` of a vehicle.
+    /// Ends the subscription of session `id` of a vehicle.
     pub fn close(&self, vehicle: usize, id: u64) {
         self.lock().vehicles[vehicle].subscribers.retain(|subscriber| subscriber.id != id);
         self.changed.notify_all();
     }
 
-    /// Sets how many images of each camera session `id` of a vehicle may have in flight.
+    /// Sets the maximum of images in flight per camera for session `id` of a vehicle.
     pub fn allow(&self, vehicle: usize, id: u64, allowed: u32) {
         if let Some(subscriber) = self.lock().vehicles[vehicle].subscriber(id) {
             subscriber.allowed = allowed;
@@ -187,8 +188,8 @@ impl Subscriptions {
         self.changed.notify_all();
     }
 
-    /// Begins an image of a vehicle's camera, which leaves with this priority, to all watchers with
-    /// room, and to the runtime if it has and `to_runtime`. [`Self::end`] comes after it.
+    /// Begins an image of a vehicle's camera with this stream priority, for all watchers with room, and for the
+    /// runtime if it has room and `to_runtime` is set. Call [`Self::end`] afterwards.
     pub fn begin(
         &self,
         (vehicle, camera): (usize, usize),
@@ -216,7 +217,7 @@ impl Subscriptions {
         }
     }
 
-    /// Ends the image: all its bytes were handed over, or with `None` no more will come.
+    /// Ends the image: complete, or with `None` incomplete.
     pub fn end(&self, broadcast: &mut Broadcast, encode_end: Option<ServerTime>) {
         let (vehicle, camera) = (broadcast.vehicle, broadcast.camera);
         for (id, place, image) in broadcast.to.drain(..) {
@@ -226,8 +227,7 @@ impl Subscriptions {
         }
     }
 
-    /// Tells that nothing more of the image in a place of session `id` will be sent: it was
-    /// acknowledged or given up.
+    /// Releases the slot of an image of session `id`, which was acknowledged or dropped.
     pub fn landed(
         &self,
         vehicle: usize,
@@ -248,13 +248,13 @@ impl Subscriptions {
         self.changed.notify_all();
     }
 
-    /// Counts a viewer of a vehicle's page until [`Self::viewer_left`].
+    /// Adds a viewer of a vehicle's page until [`Self::viewer_left`].
     pub fn viewer_came(&self, vehicle: usize) {
         self.lock().vehicles[vehicle].viewers += 1;
         self.changed.notify_all();
     }
 
-    /// Counts a viewer out.
+    /// Removes a viewer.
     pub fn viewer_left(&self, vehicle: usize) {
         let viewers = &mut self.lock().vehicles[vehicle].viewers;
         *viewers = viewers.saturating_sub(1);
@@ -265,7 +265,7 @@ impl Subscriptions {
         self.lock().vehicles.iter().map(|vehicle| vehicle.viewers).sum()
     }
 
-    /// Returns which vehicles' pages someone watches.
+    /// Returns the vehicles whose pages have viewers.
     pub fn watched(&self) -> [bool; MAX_VEHICLES] {
         let mut watched = [false; MAX_VEHICLES];
         for (watched, vehicle) in watched.iter_mut().zip(&self.lock().vehicles) {
@@ -274,7 +274,7 @@ impl Subscriptions {
         watched
     }
 
-    /// Waits at most `timeout` until someone wants images; returns of which vehicles.
+    /// Waits at most `timeout` for subscribers or viewers; returns their vehicles.
     pub fn wait_for_interest(&self, timeout: Duration) -> [bool; MAX_VEHICLES] {
         let idle = |state: &mut State| {
             !state.closed && !state.vehicles.iter().any(VehicleSubscribers::is_wanted)
@@ -290,8 +290,8 @@ impl Subscriptions {
         wanted
     }
 
-    /// Waits at most `timeout` until an image may be encoded: someone has room for one, or there is
-    /// nobody but a page that wants previews. Returns for whom.
+    /// Waits at most `timeout` until an image may be encoded: a subscriber has room, or there are only pages,
+    /// which want previews.
     pub fn wait_for_room(&self, timeout: Duration) -> Wanted {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
@@ -311,7 +311,7 @@ impl Subscriptions {
             if state.closed || wanted.anything() || left.is_zero() {
                 return if state.closed { Wanted::default() } else { wanted };
             }
-            // Nobody wakes us when a runtime has stalled for long enough.
+            // No notification arrives when a runtime has stalled for long enough.
             let left = if vehicles.iter().any(VehicleSubscribers::has_watcher) {
                 left.min(GLANCE)
             } else {
@@ -322,23 +322,24 @@ impl Subscriptions {
         }
     }
 
-    /// Wakes everyone who waits, for good.
+    /// Ends all present and future waits.
     pub fn shut(&self) {
         self.lock().closed = true;
         self.changed.notify_all();
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Why: no code panics while it holds the lock.
+        // No code panics while it holds the lock.
         lock(&self.state)
     }
 }
 
-/// 100 ms of round trip at 70 Hz; more would only queue.
+/// Maximum of images in flight: 100 ms of round trip at 70 Hz; more would only queue.
 pub const MAX_IN_FLIGHT: u32 = 8;
-/// The transport gives an image up after as long. [s]
+/// Time without room after which a runtime counts as stalled; the transport drops an image after the same time.
+/// [s]
 const STALLED_S: f64 = 0.15;
-/// How late a stalled runtime is noticed at most.
+/// Maximum delay until a stalled runtime is detected.
 const GLANCE: Duration = Duration::from_millis(20);
 
 #[cfg(test)]
@@ -356,7 +357,7 @@ mod tests {
         ImageHeader::new(1, camera as u8, pose, &k, &body_from_cam, &Pose::IDENTITY)
     }
 
-    /// Encodes an image of vehicle 0; returns to how many it goes.
+    /// Encodes an image of vehicle 0; returns the number of its receivers.
     fn send(subscriptions: &Subscriptions, camera: usize) -> usize {
         let mut broadcast = Broadcast::default();
         subscriptions.begin((0, camera), header(camera), 0, true, &mut broadcast);
@@ -386,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn an_old_session_does_not_disturb_a_new_one() {
+    fn replaced_session_does_not_affect_the_new_one() {
         let subscriptions = Subscriptions::new(&[1]);
         let old = subscriptions.open(0, 1, Purpose::Fly, 1);
         send(&subscriptions, 0);
@@ -402,7 +403,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_image_goes_out_while_it_is_being_made_and_to_all_at_once() {
+    async fn slices_are_sent_to_all_while_the_image_is_being_encoded() {
         let subscriptions = Subscriptions::new(&[1]);
         let places = [(1, Purpose::Fly), (2, Purpose::Watch), (3, Purpose::Watch)]
             .map(|(id, purpose)| subscriptions.open(0, id, purpose, 1));
@@ -415,7 +416,7 @@ mod tests {
             let Part::Bytes(bytes) = places[0][0].part().await else { panic!("no bytes") };
             assert_eq!(bytes.as_ptr(), slice.as_ptr(), "not a copy");
         }
-        // One gives up before the end: its place is free only when the encoder is done with it.
+        // One subscriber gives up before the end: its slot is free only when the encoder has finished.
         subscriptions.landed(0, 0, 1, 0, &places[0][0][0]);
         assert!(!subscriptions.wait_for_room(NOT_YET).fly[0][0]);
         broadcast.push(&slice);
@@ -426,7 +427,7 @@ mod tests {
     }
 
     #[tokio::test(start_paused = true)]
-    async fn watchers_get_what_the_runtime_gets_unless_it_has_stalled() {
+    async fn watchers_get_the_runtimes_images_unless_it_has_stalled() {
         let subscriptions = Subscriptions::new(&[1]);
         let watcher = subscriptions.open(0, 2, Purpose::Watch, 1);
         let wanted = subscriptions.wait_for_room(LONG);
@@ -437,7 +438,7 @@ mod tests {
         subscriptions.landed(0, 0, 1, 0, &runtime[0][0]);
         assert!(subscriptions.wait_for_room(LONG).fly[0][0]);
         assert_eq!(send(&subscriptions, 0), 1);
-        // The runtime is slow: nothing is encoded for the watcher alone.
+        // The runtime is slow: no image is encoded only for the watcher.
         subscriptions.landed(0, 0, 2, 0, &watcher[0][0]);
         assert_eq!(subscriptions.wait_for_room(NOT_YET), Wanted::default());
         tokio::time::advance(Duration::from_millis(200)).await;
@@ -447,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn a_page_alone_has_ticks_passed_on_and_a_session_has_them_first() {
+    fn ticks_pass_to_a_page_directly_unless_a_session_exists() {
         let subscriptions = Subscriptions::new(&[1]);
         assert!(!subscriptions.wait_for_interest(NOT_YET)[0]);
         subscriptions.viewer_came(0);

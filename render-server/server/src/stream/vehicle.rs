@@ -1,4 +1,4 @@
-//! One vehicle's stream: how its images are made, what became of them, and over which connection.
+//! Stream of one vehicle: quality level, delivery statistics and connection.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -17,24 +17,22 @@ use vizflyt_process::lock;
 /// The stream of one vehicle.
 #[derive(Debug, Default)]
 pub struct VehicleStream {
-    /// Where images get their age, by the runtime's newest report.
+    /// Stages of the image age, from the runtime's newest report.
     pub timing: watch::Sender<Option<Timing>>,
-    /// What became of its images.
     pub images: ImageCounters,
-    /// How its images are made, by what its runtime's link carries: number of a
-    /// [`rate_control::level`].
+    /// Level that fits the runtime's link: number of a [`rate_control::level`].
     pub level: AtomicUsize,
-    /// From the start of rendering until the plugin is given the image, by the runtime's newest
-    /// report; 0 is not known. [ns]
+    /// Time from the start of rendering until the plugin receives the image, from the runtime's newest report;
+    /// 0 if unknown. [ns]
     seen_after_ns: AtomicU64,
     delivery: Mutex<DeliveryStats>,
-    /// The runtime's session, its connection, and when that began.
+    /// Session of the runtime, its connection, and its start.
     connection: Mutex<Option<(u64, quinn::Connection, ServerTime)>>,
-    /// Key of the newest flight's pose feed; kept when its connection has ended.
+    /// Key of the newest flight's pose feed; kept after the connection has ended.
     feed_key: Mutex<Option<FeedKey>>,
 }
 
-/// What became of a vehicle's images.
+/// Image counters of a vehicle.
 #[derive(Debug, Default)]
 pub struct ImageCounters {
     /// Images that the runtime acknowledged.
@@ -43,23 +41,23 @@ pub struct ImageCounters {
     pub late: AtomicU64,
     /// Bytes of images acknowledged.
     pub bytes: AtomicU64,
-    /// What became of each, by camera.
+    /// Delivery counters by camera.
     pub cameras: [CameraCounters; MAX_CAMERAS],
 }
 
 impl VehicleStream {
-    /// Begins a flight: its figures count from now on.
+    /// Begins a flight: resets its statistics.
     pub fn begin_flight(&self) {
         self.timing.send_replace(None);
         lock(&self.delivery).begin(&self.images.cameras);
     }
 
-    /// Returns how its images are made now.
+    /// Returns the level at which images are made.
     pub fn level(&self) -> &'static Level {
         rate_control::level(self.level.load(Ordering::Relaxed))
     }
 
-    /// Takes the runtime's report of times.
+    /// Records the runtime's report of times.
     pub fn report_timing(&self, timing: Timing) {
         lock(&self.delivery).report(&timing.cameras);
         let seen = &timing.waterfall;
@@ -70,14 +68,14 @@ impl VehicleStream {
         self.timing.send_replace(Some(timing));
     }
 
-    /// Returns how long after the start of rendering the plugin is given an image, by the runtime's
+    /// Returns the time from the start of rendering until the plugin receives the image, from the runtime's
     /// newest report. [s]
     pub fn seen_after_s(&self) -> Option<f64> {
         let ns = self.seen_after_ns.load(Ordering::Relaxed);
         (ns > 0).then_some(ns as f64 * 1e-9)
     }
 
-    /// Returns what became of the images of the present flight, by camera.
+    /// Returns the delivery statistics of the present flight, by camera.
     pub fn deliveries(&self, cameras: &[CameraInfo]) -> Vec<CameraDelivery> {
         let delivery = lock(&self.delivery);
         let cameras = cameras.iter().zip(&self.images.cameras).enumerate();
@@ -89,7 +87,7 @@ impl VehicleStream {
         cameras.map(of).collect()
     }
 
-    /// Notes over which connection session `id` of the runtime speaks, until the guard is dropped.
+    /// Registers the connection of session `id` of the runtime, until the guard is dropped.
     pub fn connect(&self, id: u64, connection: &quinn::Connection) -> Connected<'_> {
         *lock(&self.connection) = Some((id, connection.clone(), clock::now()));
         Connected { stream: self, id }
@@ -105,7 +103,7 @@ impl VehicleStream {
         *lock(&self.feed_key)
     }
 
-    /// Returns the figures of the runtime's connection, if there is one.
+    /// Returns the statistics of the runtime's connection, if there is one.
     pub fn connection(&self) -> Option<Connection> {
         let connection = lock(&self.connection);
         let (_, connection, since) = connection.as_ref()?;
@@ -113,7 +111,7 @@ impl VehicleStream {
     }
 }
 
-/// The connection of a runtime; forgotten when dropped.
+/// Registration of a runtime's connection; removed when dropped.
 #[derive(Debug)]
 pub struct Connected<'a> {
     stream: &'a VehicleStream,
@@ -134,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_delay_of_images_is_what_the_runtime_reports() {
+    fn image_delay_comes_from_the_runtimes_report() {
         let stream = VehicleStream::default();
         stream.report_timing(Timing::default());
         assert_eq!(stream.seen_after_s(), None, "no image yet");

@@ -212,6 +212,9 @@ fn transparent_mode_is_configurable_and_sends_no_land() {
     assert_eq!((status, hello[20]), (Status::Done, 0b101), "claimed, transparent");
     let change = request(Op::Set, 1, b"TRANSPARENT=0", Some(&KEY));
     assert_eq!(ask(&mut bridge, 5200, &change).0, Status::Done);
-    assert!(bridge.is_transparent() && !bridge.settings().transparent, "takes effect at the next start");
+    assert!(
+        bridge.is_transparent() && !bridge.settings().transparent,
+        "takes effect at the next start"
+    );
     assert_eq!(uart(&mut bridge, at(5300)), Vec::<Vec<u8>>::new(), "requests are not forwarded");
 }

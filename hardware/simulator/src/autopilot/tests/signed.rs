@@ -45,7 +45,10 @@ fn is_accepted(
 fn with_a_key_accepts_only_its_owner_also_after_a_reboot() {
     let mut c = Companion::new(SimulationConfig::default());
     let key = SigningKey::new([7; 32]);
-    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "without a key, everything is accepted");
+    assert!(
+        is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None),
+        "without a key, everything is accepted"
+    );
     setup_signing(&mut c, [7; 32], START.units());
     assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Stabilize, None), "unsigned");
     let mut other = Signer::new(SigningKey::new([8; 32]), 0);
@@ -81,5 +84,8 @@ fn with_a_key_accepts_only_its_owner_also_after_a_reboot() {
     assert!(!is_accepted(&mut c, TELEMETRY, CopterMode::Guided, None), "the key is stored");
 
     setup_signing(&mut c, [0; 32], 0);
-    assert!(is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None), "a key of zeros ends signing");
+    assert!(
+        is_accepted(&mut c, TELEMETRY, CopterMode::AltHold, None),
+        "a key of zeros ends signing"
+    );
 }

@@ -19,7 +19,7 @@ fn field(p_m: DVec2, goal_m: DVec2, points_m: &[DVec2]) -> Field {
     field
 }
 
-/// A wall of points across x from `low_y` to `high_y`.
+/// Returns a wall of points at this x from `low_y` to `high_y`.
 fn wall(x: f64, low_y: f64, high_y: f64) -> Vec<DVec2> {
     let count = ((high_y - low_y) / 0.1) as usize;
     (0..=count).map(|n| DVec2::new(x, low_y + 0.1 * n as f64)).collect()
@@ -28,17 +28,17 @@ fn wall(x: f64, low_y: f64, high_y: f64) -> Vec<DVec2> {
 const P_M: DVec2 = DVec2::new(5.0, 0.0);
 
 #[test]
-fn in_the_open_the_way_is_straight() {
+fn way_is_straight_without_obstacles() {
     for goal_m in [DVec2::new(38.0, 0.0), DVec2::new(10.0, 3.0), DVec2::new(2.0, -4.0)] {
         let field = field(P_M, goal_m, &[]);
         let straight_m = P_M.distance(goal_m);
-        // The upwind scheme is of first order: it overrates diagonals by a few per cent.
+        // The upwind scheme is of first order: it overestimates diagonals by a few per cent.
         assert!((field.to_go_m(P_M) / straight_m - 1.0).abs() < 0.06, "{goal_m}");
     }
 }
 
 #[test]
-fn a_wall_lengthens_the_way_by_the_detour() {
+fn wall_adds_the_detour_to_the_way() {
     let field = field(P_M, DVec2::new(11.0, 0.0), &wall(8.0, -4.0, 3.0));
     let around_m = 2.0 * 3.0_f64.hypot(3.5);
     let found_m = field.to_go_m(P_M);
@@ -48,7 +48,7 @@ fn a_wall_lengthens_the_way_by_the_detour() {
 }
 
 #[test]
-fn clearance_is_from_the_body_to_the_nearest_point_or_the_fence() {
+fn clearance_is_the_distance_to_the_nearest_point_or_the_fence() {
     let field = field(P_M, DVec2::new(38.0, 0.0), &[DVec2::new(6.0, 0.0)]);
     for distance_m in [0.3, 0.5, 0.7] {
         let found_m = field.clearance_m(DVec2::new(6.0 - distance_m, 0.0));
@@ -60,7 +60,7 @@ fn clearance_is_from_the_body_to_the_nearest_point_or_the_fence() {
 }
 
 #[test]
-fn a_closed_ring_is_finite_inside() {
+fn way_out_of_a_closed_ring_is_finite() {
     let ring: Vec<DVec2> =
         (0..80).map(|n| P_M + DVec2::from_angle(f64::from(n) * 0.0785) * 2.0).collect();
     let field = field(P_M, DVec2::new(38.0, 0.0), &ring);
@@ -70,9 +70,9 @@ fn a_closed_ring_is_finite_inside() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
-    /// From every free cell there is a neighbour nearer to the goal: no local minimum.
+    /// Every free cell has a neighbour with a shorter way to the goal, so there are no local minima.
     #[test]
-    fn there_is_no_minimum_but_the_goal(
+    fn goal_is_the_only_minimum(
         points in prop::collection::vec((-2.0..14.0f64, -6.0..6.0f64), 0..120),
         goal in (-1.0..40.0f64, -5.0..5.0f64),
     ) {

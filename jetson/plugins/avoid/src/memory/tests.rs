@@ -3,7 +3,7 @@ use vizflyt_sdk::{Body, Intrinsics, Pose, World};
 
 use super::*;
 
-/// A view from the origin along world x that is `depth_mm` deep everywhere.
+/// Updates with a view from the origin along world x, with a depth of `depth_mm` in all pixels.
 fn check(memory: &mut Memory, now_s: f64, depth_mm: u16, points_m: &[DVec3], expected: usize) {
     let k = Intrinsics::from_horizontal_fov(64, 48, 90_f64.to_radians());
     let depth_mm = vec![depth_mm; k.pixels()];
@@ -21,7 +21,7 @@ const AHEAD_M: DVec3 = DVec3::new(3.0, 0.0, 0.0);
 const ASIDE_M: DVec3 = DVec3::new(0.5, 2.0, 0.0);
 
 #[test]
-fn points_that_leave_the_image_stay_until_they_are_old() {
+fn keeps_points_outside_the_image_until_they_are_old() {
     let mut memory = Memory::default();
     check(&mut memory, 1.0, 0, &[ASIDE_M], 1);
     check(&mut memory, 10.0, 9000, &[], 1);
@@ -29,7 +29,7 @@ fn points_that_leave_the_image_stay_until_they_are_old() {
 }
 
 #[test]
-fn cells_seen_through_are_forgotten() {
+fn removes_points_that_the_camera_sees_through() {
     let mut memory = Memory::default();
     check(&mut memory, 1.0, 3000, &[AHEAD_M, ASIDE_M], 2);
     check(&mut memory, 1.1, 0, &[], 2);
@@ -38,7 +38,7 @@ fn cells_seen_through_are_forgotten() {
 }
 
 #[test]
-fn the_same_point_is_kept_once_and_refreshed() {
+fn merges_sightings_of_the_same_point() {
     let mut memory = Memory::default();
     check(&mut memory, 0.0, 0, &[AHEAD_M], 1);
     check(&mut memory, 14.0, 0, &[AHEAD_M + DVec3::Y * 0.05], 1);
@@ -46,7 +46,7 @@ fn the_same_point_is_kept_once_and_refreshed() {
 }
 
 #[test]
-fn memory_is_bounded_and_gives_up_the_oldest() {
+fn full_memory_replaces_the_oldest_point() {
     let mut memory = Memory::default();
     let point_m = |n: usize| DVec3::new(0.2 * (n % 40) as f64 - 4.0, 0.2 * (n / 40) as f64, 0.0);
     for n in 0..MAX_POINTS {

@@ -17,7 +17,7 @@ fn intrinsics() -> Intrinsics {
     Intrinsics::from_horizontal_fov(320, 240, 90_f64.to_radians())
 }
 
-/// Draws the floor z = 0 and an upright trunk at `trunk_m` of radius 0.2 m; sky is 0.
+/// Draws the floor z = 0 and a vertical trunk at `trunk_m` with a radius of 0.2 m; sky is 0.
 fn picture(world_from_cam: &Pose<World, Cam>, trunk_m: Option<DVec2>) -> Vec<u16> {
     let k = intrinsics();
     let origin = world_from_cam.translation_m;
@@ -50,18 +50,18 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn the_floor_is_no_obstacle_at_any_tilt(pitch in -0.6..0.6f64, roll in -0.5..0.5f64) {
+    fn floor_is_not_an_obstacle_at_any_tilt(pitch in -0.6..0.6f64, roll in -0.5..0.5f64) {
         let world_from_cam = camera(pitch, roll);
         let found = scan(&picture(&world_from_cam, None), world_from_cam);
         prop_assert!(found.points_m.is_empty(), "{:?}", found.points_m);
     }
 
     #[test]
-    fn a_trunk_is_found_where_it_stands(
+    fn finds_a_trunk_at_its_position(
         pitch in -0.4..0.4f64, roll in -0.3..0.3f64, x in 1.0..9.0f64, slope in -0.5..0.5f64,
     ) {
         let trunk_m = DVec2::new(x, slope * x);
-        // Further away nothing is noted.
+        // Trunks beyond the maximum range are ignored.
         prop_assume!(trunk_m.length() < f64::from(FAR_M));
         let world_from_cam = camera(pitch, roll);
         let found = scan(&picture(&world_from_cam, Some(trunk_m)), world_from_cam);
@@ -84,14 +84,14 @@ proptest! {
 }
 
 #[test]
-fn an_image_without_returns_is_blind_and_shows_nothing() {
+fn image_without_returns_is_blind() {
     let found = scan(&vec![0; intrinsics().pixels()], camera(0.0, 0.0));
     assert!(found.is_blind() && found.points_m.is_empty());
     assert!(!scan(&picture(&camera(-0.4, 0.0), None), camera(-0.4, 0.0)).is_blind());
 }
 
 #[test]
-fn speckle_is_no_obstacle() {
+fn speckle_is_not_an_obstacle() {
     let mut depth_mm = picture(&camera(0.0, 0.0), None);
     for strip in 0..COLUMNS {
         depth_mm[120 * 320 + 4 * strip] = 1500;
@@ -100,7 +100,7 @@ fn speckle_is_no_obstacle() {
 }
 
 #[test]
-fn a_buffer_too_short_for_its_size_is_blind() {
+fn too_short_buffer_is_blind() {
     assert!(scan(&[1000; 7], camera(0.0, 0.0)).is_blind());
 }
 

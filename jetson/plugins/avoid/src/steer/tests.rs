@@ -28,12 +28,12 @@ fn moving(v_mps: DVec2) -> PlanarState {
 }
 
 #[test]
-fn over_free_ground_it_goes_straight_at_full_speed() {
+fn flies_straight_at_full_speed_without_obstacles() {
     let v_mps = choose_velocity(&field(&[]), &moving(DVec2::X * SPEED_MPS), SPEED_MPS);
     assert!(v_mps.distance(DVec2::X * SPEED_MPS) < 1e-9, "{v_mps}");
 }
 
-/// Flies on with an ideal vehicle and returns the least distance to the points. [m]
+/// Continues with an ideal vehicle and returns the smallest distance to the points. [m]
 fn least_distance_m(points_m: &[DVec2]) -> f64 {
     let field = field(points_m);
     let mut motion = moving(DVec2::X * SPEED_MPS);
@@ -57,7 +57,7 @@ fn swerves_around_an_obstacle_ahead() {
 }
 
 #[test]
-fn stops_before_a_wall() {
+fn stops_in_front_of_a_wall() {
     let wall_m: Vec<DVec2> = (-40..=40).map(|n| DVec2::new(3.5, f64::from(n) * 0.1)).collect();
     assert!(least_distance_m(&wall_m) > 0.15);
 }
@@ -70,7 +70,7 @@ fn flies_slowly_into_unseen_space() {
 }
 
 #[test]
-fn the_setpoint_moves_no_faster_than_the_vehicle_can() {
+fn setpoint_changes_no_faster_than_the_vehicle_can() {
     let step_mps = slew(DVec2::ZERO, DVec2::X * SPEED_MPS, 0.02);
     assert!((step_mps - DVec2::X * (SLEW_MPS2 * 0.02)).length() < 1e-12);
     assert_eq!(slew(DVec2::X, DVec2::X, 0.0), DVec2::X);

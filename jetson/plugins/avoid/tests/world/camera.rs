@@ -5,21 +5,21 @@ use vizflyt_sdk::{Cam, Intrinsics, Pose, Volume, World};
 
 use super::Random;
 
-/// Pixels of a side of the tiles in which solids are culled.
+/// Side of the tiles in which solids are culled. [px]
 const TILE_PX: u32 = 8;
-/// Beyond, everything is sky; the plugin looks 10 m far.
+/// Maximum range; everything beyond is sky. The plugin uses 10 m. [m]
 const FAR_M: f64 = 15.0;
 
 /// Faults of a depth image.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Faults {
-    /// Standard deviation of depth, as a share of it.
+    /// Standard deviation of depth, as a fraction of depth.
     pub(crate) noise: f64,
-    /// Share of pixels without a return.
+    /// Fraction of pixels without a return.
     pub(crate) holes: f64,
     /// Mixes foreground and background along edges, as a blending renderer does.
     pub(crate) blurred_edges: bool,
-    /// What a pixel of sky holds. [mm]
+    /// Value of a pixel of the sky. [mm]
     pub(crate) sky_mm: u16,
 }
 
@@ -88,7 +88,7 @@ fn spoil(width: usize, faults: Faults, random: &mut Random, depth_mm: &mut [u16]
         if random.unit() < faults.holes {
             *depth_mm = 0;
         } else if *depth_mm > 0 {
-            // Sum of three uniforms: nearly normal, deviation 1/2.
+            // Sum of three uniform numbers: nearly normal, with a deviation of 1/2.
             let normal = 2.0 * (random.unit() + random.unit() + random.unit() - 1.5);
             let noisy = f64::from(*depth_mm) * (1.0 + faults.noise * normal);
             *depth_mm = noisy.clamp(1.0, 65535.0) as u16;
@@ -96,17 +96,17 @@ fn spoil(width: usize, faults: Faults, random: &mut Random, depth_mm: &mut [u16]
     }
 }
 
-/// Whether a cone of rays may touch a solid; errs to yes.
+/// Returns whether a cone of rays may touch a solid. False positives are possible.
 fn may_hit(volume: &Volume, origin: DVec3, axis: DVec3, spread: f64) -> bool {
     let Volume::Capsule { a_m, b_m, radius_m } = *volume else { return true };
     let (on_ray_m, on_axis_m) = nearest_of_lines(origin, axis, a_m, b_m);
     let distance_m = on_ray_m.distance(on_axis_m);
     let ahead_m = (on_axis_m - origin).dot(axis) + radius_m;
-    // The cone's slope twice: the nearest point of the cone lies off the one of its axis.
+    // Twice the cone's slope, because the cone's nearest point differs from the nearest point of its axis.
     ahead_m > 0.0 && distance_m < radius_m + 2.0 * spread * (ahead_m + radius_m) + 0.05
 }
 
-/// Returns the points of least distance on a ray and on a segment.
+/// Returns the nearest points of a ray and a segment.
 fn nearest_of_lines(origin: DVec3, axis: DVec3, a: DVec3, b: DVec3) -> (DVec3, DVec3) {
     let segment = b - a;
     let w = origin - a;
@@ -118,7 +118,7 @@ fn nearest_of_lines(origin: DVec3, axis: DVec3, a: DVec3, b: DVec3) -> (DVec3, D
     (on_ray, on_segment)
 }
 
-/// Returns where a ray first enters a solid, in lengths of `direction`.
+/// Returns the first intersection of a ray with a solid, in lengths of `direction`.
 fn hit(volume: &Volume, origin: DVec3, direction: DVec3) -> Option<f64> {
     match *volume {
         Volume::Sphere { center_m, radius_m } => hit_sphere(origin - center_m, direction, radius_m),

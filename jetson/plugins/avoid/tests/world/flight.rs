@@ -1,4 +1,4 @@
-//! Flies the plugin through solids and measures by the truth.
+//! Flies the plugin through solids and measures the result with the true state.
 
 use std::collections::VecDeque;
 
@@ -14,28 +14,28 @@ use vizflyt_sdk::{
 use super::camera::{self, Faults};
 use super::{GOAL_M, Random};
 
-/// How the vehicle, the camera and the links behave.
+/// Behaviour of vehicle, camera and links.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Conditions {
     /// First-order lag of velocity. [s]
     pub(crate) lag_s: f64,
-    /// Greatest horizontal acceleration. [m/s^2]
+    /// Maximum horizontal acceleration. [m/s^2]
     pub max_acceleration_mps2: f64,
-    /// Greatest rate of turn. [rad/s]
+    /// Maximum rate of turn. [rad/s]
     pub(crate) max_yaw_rate_radps: f64,
-    /// Age of an image when the plugin gets it. [s]
+    /// Age of an image when the plugin receives it. [s]
     pub(crate) image_age_s: f64,
-    /// Age of the vehicle's state when the plugin gets it. [s]
+    /// Age of the vehicle's state when the plugin receives it. [s]
     pub(crate) state_age_s: f64,
-    /// From a setpoint's making to its taking effect. [s]
+    /// Delay until a setpoint takes effect. [s]
     pub(crate) setpoint_delay_s: f64,
-    /// Images come this often. [s]
+    /// Interval between images. [s]
     pub(crate) image_period_s: f64,
-    /// Of the camera.
+    /// Faults of the depth camera.
     pub(crate) faults: Faults,
 }
 
-/// A quadrotor under an autopilot that tracks velocities; 50 images a second, 40 ms old.
+/// A quadrotor with an autopilot that tracks velocities; 50 images per second, 40 ms old.
 pub(crate) const TYPICAL: Conditions = Conditions {
     lag_s: 0.25,
     max_acceleration_mps2: 7.0,
@@ -47,7 +47,7 @@ pub(crate) const TYPICAL: Conditions = Conditions {
     faults: Faults { noise: 0.01, holes: 0.02, blurred_edges: true, sky_mm: 0 },
 };
 
-/// A heavy vehicle behind a slow link, with a poor camera: half the agility, twice the delays.
+/// A heavy vehicle on a slow link, with a poor camera: half of the agility, twice the delays.
 pub(crate) const SLUGGISH: Conditions = Conditions {
     lag_s: 0.4,
     max_acceleration_mps2: 3.5,
@@ -59,26 +59,26 @@ pub(crate) const SLUGGISH: Conditions = Conditions {
     faults: Faults { noise: 0.02, holes: 0.1, blurred_edges: true, sky_mm: 60000 },
 };
 
-/// A server that gets a fifth of its processor: an image, then none for an eighth of a second, and poses no more often.
+/// A server with a fifth of its processor: images and poses arrive every 0.13 s.
 pub(crate) const STARVED: Conditions = Conditions { image_period_s: 0.13, ..TYPICAL };
 
-/// How a flight ended, by the truth.
+/// Result of a flight, from the true state.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Outcome {
     pub(crate) finished: bool,
     pub(crate) collided: bool,
     pub(crate) seconds: f64,
-    /// Straight distance from start to goal over time: no credit for detours. [m/s]
+    /// Straight distance from start to goal, divided by the time, so that detours do not count. [m/s]
     pub(crate) mean_speed_mps: f64,
     pub(crate) max_speed_mps: f64,
-    /// Least distance from the body's surface to a solid but the floor. [m]
+    /// Smallest distance from the body's surface to a solid other than the floor. [m]
     pub(crate) min_clearance_m: f64,
-    /// Least distance from the body's surface to the geofence. [m]
+    /// Smallest distance from the body's surface to the geofence. [m]
     pub(crate) min_fence_m: f64,
     pub(crate) end_m: DVec3,
 }
 
-/// The demo's camera with a ninth of its pixels, so that tests are quick.
+/// The demo's camera with a ninth of its pixels, for speed.
 pub(crate) fn small_camera() -> CameraInfo {
     CameraInfo {
         name: bounded("front"),
@@ -87,7 +87,7 @@ pub(crate) fn small_camera() -> CameraInfo {
     }
 }
 
-/// The arena of the forest, with a small camera so that tests are quick.
+/// The arena of the forest, with the small camera.
 pub(crate) fn arena() -> ArenaInfo {
     let geofence = Volume::Cuboid {
         center_m: DVec3::new(20.5, 0.0, 1.75),
@@ -104,7 +104,7 @@ pub(crate) fn arena() -> ArenaInfo {
     }
 }
 
-/// Flies from start to goal; ends at the goal, at the first collision, or after `limit_s`.
+/// Flies from start to goal. Ends at the goal, at the first collision, or after `limit_s`.
 pub(crate) fn fly(
     volumes: &[Volume],
     arena: &ArenaInfo,
@@ -190,10 +190,10 @@ pub(crate) fn fly(
 
 const DT_S: f64 = 0.0025;
 const GRAVITY_MPS2: f64 = 9.81;
-/// Lag of attitude behind the acceleration asked for. [s]
+/// Lag of the attitude behind the acceleration setpoint. [s]
 const TILT_LAG_S: f64 = 0.06;
 
-/// The vehicle's true state.
+/// True state of the vehicle.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Body {
     pub(crate) stamp: HostTime,
@@ -216,7 +216,7 @@ impl Body {
         }
     }
 
-    /// The thrust points along gravity-compensated acceleration; the nose at the yaw.
+    /// The thrust points along the gravity-compensated acceleration, the nose along the yaw.
     fn attitude(&self) -> DQuat {
         let up = (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).normalize();
         let left = up.cross(DQuat::from_rotation_z(self.yaw_rad) * DVec3::X).normalize();

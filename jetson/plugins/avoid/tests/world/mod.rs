@@ -1,5 +1,5 @@
-//! A small world to fly in without a renderer or an autopilot: solids, a depth camera that casts
-//! rays at them, and a vehicle that follows velocities with lag, tilt and limits.
+//! A small simulated world without a renderer or an autopilot: solids, a depth camera that casts rays at them, and a
+//! vehicle that follows velocities with lag, tilt and limits.
 
 pub(crate) mod camera;
 pub(crate) mod flight;
@@ -9,7 +9,7 @@ use std::f64::consts::TAU;
 use vizflyt_sdk::Volume;
 use vizflyt_sdk::glam::{DVec2, DVec3};
 
-/// SplitMix64: the same numbers everywhere.
+/// SplitMix64: the same numbers on every platform.
 #[derive(Clone, Debug)]
 pub(crate) struct Random(u64);
 
@@ -37,13 +37,13 @@ pub(crate) const START_M: DVec3 = DVec3::new(1.0, 0.0, 1.2);
 pub(crate) const GOAL_M: DVec3 = DVec3::new(38.0, 0.0, 1.2);
 pub(crate) const HALF_WIDTH_M: f64 = 6.0;
 
-/// A trunk that stands at `foot_m` and leans its top by `lean_m`.
+/// Returns a trunk at `foot_m` with its top displaced by `lean_m`.
 pub(crate) fn trunk(foot_m: DVec2, lean_m: DVec2, radius_m: f64) -> Volume {
     let (a_m, b_m) = (foot_m.extend(-0.2), (foot_m + lean_m).extend(5.0));
     Volume::Capsule { a_m, b_m, radius_m }
 }
 
-/// Floor and up to `trunks` trunks between start and goal, at least 1.4 m apart from bark to bark.
+/// Returns the floor and up to `trunks` trunks between start and goal, at least 1.4 m apart.
 pub(crate) fn forest(seed: u64, trunks: usize) -> Vec<Volume> {
     let mut random = Random::new(seed);
     let mut placed: Vec<(DVec2, f64)> = Vec::new();

@@ -2,7 +2,7 @@ use std::f64::consts::TAU;
 
 use super::*;
 
-/// A hand of 0.95 m that turns about (0.1, 1.1), seen above 1.2 m only.
+/// Returns a hand of 0.95 m that rotates about (0.1, 1.1) and is visible only above 1.2 m, and its true angle.
 fn watch(omega_radps: f64, seconds: f64) -> (Hand, impl Fn(f64) -> f64) {
     let pivot_m = DVec2::new(0.1, 1.1);
     let angle_at = move |at_s: f64| 0.4 + omega_radps * at_s;
@@ -21,20 +21,20 @@ fn watch(omega_radps: f64, seconds: f64) -> (Hand, impl Fn(f64) -> f64) {
 }
 
 #[test]
-fn a_turn_and_a_half_tells_pivot_speed_and_angle() {
+fn estimates_pivot_speed_and_angle_in_one_and_a_half_turns() {
     for omega_radps in [TAU / 6.0, -TAU / 8.0] {
         let (hand, angle_at) = watch(omega_radps, 11.0);
         let motion = hand.motion().expect("it turns");
         assert!(motion.pivot_m.distance(DVec2::new(0.1, 1.1)) < 0.03, "{motion:?}");
         assert!((motion.omega_radps / omega_radps - 1.0).abs() < 0.03, "{motion:?}");
         let off_rad = wrap_pi(motion.angle_at(13.0) - angle_at(13.0));
-        assert!(off_rad.abs() < 0.12, "{off_rad} rad off, seconds after it was seen");
+        assert!(off_rad.abs() < 0.12, "{off_rad} rad off, seconds after the last sighting");
         assert!((motion.length_m - 0.95).abs() < 0.15, "{motion:?}");
     }
 }
 
 #[test]
-fn the_way_is_clear_when_the_hand_is_elsewhere() {
+fn way_is_clear_only_while_the_hand_is_away() {
     let (hand, angle_at) = watch(TAU / 6.0, 11.0);
     let above_m = DVec2::new(0.1, 1.7);
     let mut seen = [false; 2];
@@ -46,16 +46,16 @@ fn the_way_is_clear_when_the_hand_is_elsewhere() {
         assert!(!clear || away || apart_m > 0.2, "at {at_s} s");
         seen[usize::from(clear)] = true;
     }
-    assert_eq!(seen, [true, true], "at times it is, at times it is not");
-    assert!(!hand.is_clear(above_m, 0.2, 11.0, 17.0), "never for a whole turn");
+    assert_eq!(seen, [true, true], "must be clear at some times and blocked at others");
+    assert!(!hand.is_clear(above_m, 0.2, 11.0, 17.0), "must not be clear for a complete turn");
 }
 
 #[test]
-fn unknown_cells_are_not_clear() {
+fn way_is_not_clear_before_the_motion_is_known() {
     let (hand, _) = watch(TAU / 6.0, 0.5);
     assert_eq!(hand.motion(), None);
     assert!(!hand.is_clear(DVec2::new(0.1, 1.7), 0.2, 0.5, 1.0));
-    // A window without a hand: watched for long, nothing there.
+    // A window without a hand is clear after a long time without a sighting.
     let mut none = Hand::default();
     none.update(0.0, &[]);
     assert!(!none.is_clear(DVec2::ZERO, 0.2, 0.0, 1.0));
@@ -63,9 +63,9 @@ fn unknown_cells_are_not_clear() {
     assert!(none.is_clear(DVec2::ZERO, 0.2, 0.0, 1.0));
 }
 
-/// The hand is out of sight for more than half a turn: which way it came back is determined by its speed.
+/// The hand is out of sight for more than half a turn; its speed determines the number of turns.
 #[test]
-fn a_turn_out_of_sight_is_counted() {
+fn counts_turns_while_out_of_sight() {
     for omega_radps in [TAU / 7.6, -TAU / 5.9] {
         let (mut hand, angle_at) = (Hand::default(), |at_s: f64| 0.3 + omega_radps * at_s);
         for step in 0..220 {

@@ -9,7 +9,7 @@ fn furnished() -> Vec<Brick> {
     bricks
 }
 
-/// Flies along points of time and returns where it thinks it is at the end, and where it is.
+/// Flies along a path and returns the estimated and the true position at the end.
 fn fly(seconds: f64, way: impl Fn(f64) -> (DVec3, f64)) -> (DVec3, DVec3) {
     let bricks = furnished();
     let mut odometry = Odometry::default();
@@ -26,7 +26,7 @@ fn fly(seconds: f64, way: impl Fn(f64) -> (DVec3, f64)) -> (DVec3, DVec3) {
 }
 
 #[test]
-fn the_floor_gives_the_height_at_once() {
+fn floor_gives_the_height_in_the_first_image() {
     for height_m in [0.15, 0.9, 1.6] {
         let mut odometry = Odometry::default();
         odometry.update(0.0, &mut picture(&furnished(), DVec3::new(0.3, 0.2, height_m), 0.0));
@@ -44,7 +44,7 @@ fn odometry_follows_a_flight_through_a_window_within_three_centimetres() {
 }
 
 #[test]
-fn without_depth_it_goes_on_as_it_went() {
+fn continues_with_constant_velocity_without_depth() {
     let bricks = furnished();
     let mut odometry = Odometry::default();
     for step in 0..20 {
@@ -60,7 +60,7 @@ fn without_depth_it_goes_on_as_it_went() {
 }
 
 #[test]
-fn an_empty_image_first_is_waited_out() {
+fn waits_while_the_first_images_are_empty() {
     let mut odometry = Odometry::default();
     odometry.update(0.0, &mut picture(&[], DVec3::ZERO, 0.0));
     assert_eq!(odometry.p_m, DVec3::ZERO);

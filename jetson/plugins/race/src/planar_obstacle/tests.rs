@@ -13,7 +13,7 @@ fn watched(bricks: &[Brick], kind: ObstacleKind, x_m: f64, from_m: DVec3) -> Pla
 }
 
 #[test]
-fn the_middle_of_a_window_is_its_opening() {
+fn opening_of_a_window_is_its_middle() {
     let middle_m = DVec3::new(2.0, 0.3, 1.5);
     let mut bricks = room();
     bricks.extend(window(middle_m, 0.55, BLUE));
@@ -24,9 +24,9 @@ fn the_middle_of_a_window_is_its_opening() {
     assert!((opening.radius_m - 0.55).abs() < 0.08, "{opening:?}");
 }
 
-/// Below the lower bar the legs frame a free place too; it is none to fly through.
+/// The legs below the lower bar also enclose free space, which is not an opening.
 #[test]
-fn between_the_legs_is_no_opening() {
+fn space_between_the_legs_is_not_an_opening() {
     let mut bricks = room();
     bricks.extend(window(DVec3::new(2.0, 0.0, 2.6), 0.5, BLUE));
     let obstacle =
@@ -39,14 +39,14 @@ fn between_the_legs_is_no_opening() {
 }
 
 #[test]
-fn a_gap_is_passed_where_it_is_widest() {
+fn opening_of_a_gap_is_its_widest_place() {
     let part = |low: DVec2, high: DVec2| Brick {
         min_m: DVec3::new(3.0, low.x, low.y),
         max_m: DVec3::new(3.1, high.x, high.y),
         rgb: [150, 80, 60],
     };
     let mut bricks = room();
-    // A hole of 1.4 x 0.5 m with one of 0.9 x 0.9 m at its left end.
+    // A hole of 1.4 x 0.5 m with a hole of 0.9 x 0.9 m at its left end.
     bricks.extend([
         part(DVec2::new(-2.2, 0.0), DVec2::new(2.2, 1.0)),
         part(DVec2::new(-2.2, 1.9), DVec2::new(2.2, 3.0)),
@@ -60,7 +60,7 @@ fn a_gap_is_passed_where_it_is_widest() {
 }
 
 #[test]
-fn a_whole_wall_has_none_and_pushes_back() {
+fn wall_without_a_gap_has_no_opening() {
     let mut bricks = room();
     bricks.push(Brick {
         min_m: DVec3::new(2.0, -2.2, 0.0),

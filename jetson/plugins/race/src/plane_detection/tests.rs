@@ -5,20 +5,20 @@ const RED: [u8; 3] = [200, 28, 40];
 const MAGENTA: [u8; 3] = [200, 30, 120];
 
 #[test]
-fn a_window_is_found_where_it_stands() {
+fn detects_a_window_at_its_position() {
     let mut bricks = room();
     bricks.extend(frame(DVec3::new(2.2, 0.5, 1.4), 0.6, RED));
     let camera_m = DVec3::new(0.0, 0.0, 1.2);
     let grid = picture(&bricks, camera_m, 0.0);
     let found = window(&grid, camera_m, ColorClass::Red).expect("a red window");
-    // Its front and the inner sides of its bars.
+    // The mean of the front and the inner sides of the bars.
     assert!((found.plane.origin_m.x - 2.2).abs() < 0.06, "{found:?}");
     assert!((found.plane.origin_m.y - 0.5).abs() < 0.1 && found.plane.yaw_rad.abs() < 0.05);
     assert_eq!(window(&grid, camera_m, ColorClass::Blue), None);
 }
 
 #[test]
-fn finds_the_frame_before_a_wall_of_the_same_colour() {
+fn detects_a_frame_in_front_of_a_wall_of_the_same_colour() {
     let mut bricks = room();
     bricks.extend(frame(DVec3::new(2.0, 0.0, 1.3), 0.6, MAGENTA));
     bricks.push(Brick {
@@ -33,9 +33,13 @@ fn finds_the_frame_before_a_wall_of_the_same_colour() {
 }
 
 #[test]
-fn a_wall_across_the_way_is_found_and_side_walls_are_not() {
+fn detects_a_wall_across_the_flight_direction_but_no_side_walls() {
     let camera_m = DVec3::new(0.0, 0.0, 1.3);
-    assert_eq!(wall(&picture(&room(), camera_m, 0.0), camera_m), None, "the end is too far");
+    assert_eq!(
+        wall(&picture(&room(), camera_m, 0.0), camera_m),
+        None,
+        "the end wall is too far away"
+    );
     let mut bricks = room();
     bricks.push(Brick {
         min_m: DVec3::new(2.5, -2.2, 0.0),

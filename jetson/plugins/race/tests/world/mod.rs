@@ -1,6 +1,5 @@
-//! A small world to race in without an autopilot: the twin's own renderer, what moves in it, and a
-//! vehicle that follows velocities with lag, tilt and limits. In lock-step: the vehicle moves on when
-//! the plugin has answered.
+//! A small simulated world for races without an autopilot: the twin's renderer, moving objects, and a vehicle that
+//! follows velocities with lag, tilt and limits. In lock-step: the vehicle moves after each reply of the plugin.
 
 pub(crate) mod vehicle;
 
@@ -19,7 +18,7 @@ use vizflyt_splat::{Camera, CpuRenderer, DepthKind, Rasterizer, RgbdImage, Scene
 
 use vehicle::Quadrotor;
 
-/// How a flight ended, by the truth.
+/// Result of a flight, from the true state.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
     pub(crate) stages: usize,
@@ -27,22 +26,22 @@ pub(crate) struct Outcome {
     pub(crate) collided: bool,
     pub(crate) seconds: f64,
     pub(crate) end_m: DVec3,
-    /// Least distance from the body's surface to anything but the floor, in flight. [m]
+    /// Smallest distance in flight from the body's surface to anything but the floor. [m]
     pub(crate) least_m: f64,
-    /// Greatest error of the plugin's own reckoning. [m]
+    /// Largest error of the plugin's position estimate. [m]
     pub(crate) drift_m: f64,
 }
 
 impl Outcome {
-    /// Whether all was passed and nothing touched.
+    /// Returns whether all stages were passed without a collision.
     pub(crate) fn is_good(&self) -> bool {
         self.stages == self.of_stages && !self.collided
     }
 }
 
-/// Flies a project's course of a seed: through its last stage, into something, or for `limit_s`.
-/// `watch` is given every image, its time [s] and where its camera was [m, home].
-#[allow(dead_code, reason = "the rehearsal takes a place of its own")]
+/// Flies a project's course of a seed until the last stage, a collision, or `limit_s`.
+/// Calls `watch` for every image with its time [s] and the position of its camera [m, home].
+#[allow(dead_code, reason = "the rehearsal calls fly_in")]
 pub(crate) fn fly(
     project: &str,
     seed: u64,
@@ -53,7 +52,7 @@ pub(crate) fn fly(
     fly_in(project.generate(seed, Level::Ug, Variant::DAY), seed, limit_s, watch)
 }
 
-/// As [`fly`], in any place; its splats may be others than those that its truth was made for.
+/// As [`fly`], in any scene. Its splats may differ from its true geometry.
 pub(crate) fn fly_in(
     mut generated: Generated,
     seed: u64,
@@ -161,7 +160,7 @@ pub(crate) fn fly_in(
     outcome
 }
 
-/// Leaves out what stands outside the net.
+/// Returns whether a volume is inside the net.
 fn is_near(volume: &Volume) -> bool {
     match volume {
         Volume::Cuboid { center_m, .. } => {
@@ -171,7 +170,7 @@ fn is_near(volume: &Volume) -> bool {
     }
 }
 
-/// Returns the distance from a point to the nearest of some solids. [m]
+/// Returns the distance from a point to the nearest solid. [m]
 fn least_m(solids: &[Volume], p_m: DVec3) -> f64 {
     solids.iter().map(|solid| solid.signed_distance_m(p_m)).fold(f64::INFINITY, f64::min)
 }
@@ -180,7 +179,7 @@ fn ns(seconds: f64) -> i64 {
     (seconds * 1e9).round() as i64
 }
 
-/// 25 images a second.
+/// Ticks per image, for 25 Hz.
 const IMAGE_TICKS: u64 = 16;
-/// From an image's instant to its answer's effect: rendering, the link, MAVLink. [s]
+/// Delay from an image's instant to the effect of its setpoint: rendering, link, MAVLink. [s]
 const SETPOINT_DELAY_S: f64 = 0.06;

@@ -1,4 +1,4 @@
-//! A quadrotor under an autopilot that tracks velocities.
+//! A quadrotor with an autopilot that tracks velocities.
 
 use vizflyt_sdk::glam::{DMat3, DQuat, DVec3};
 use vizflyt_sdk::protocol::geometry::wrap_pi;
@@ -6,14 +6,14 @@ use vizflyt_sdk::{Axes, Body, HostTime, Pose, Setpoint, Vehicle, World, YawTarge
 
 pub(crate) const DT_S: f64 = 0.0025;
 const GRAVITY_MPS2: f64 = 9.81;
-/// Lag of attitude behind the acceleration asked for. [s]
+/// Lag of the attitude behind the acceleration setpoint. [s]
 const TILT_LAG_S: f64 = 0.06;
 /// First-order lag of velocity. [s]
 const LAG_S: f64 = 0.25;
 const MAX_ACCELERATION_MPS2: f64 = 6.0;
 const MAX_YAW_RATE_RADPS: f64 = 1.6;
 
-/// The vehicle's true state.
+/// True state of the vehicle.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Quadrotor {
     pub(crate) stamp: HostTime,
@@ -36,14 +36,14 @@ impl Quadrotor {
         }
     }
 
-    /// The thrust points along gravity-compensated acceleration; the nose at the yaw.
+    /// The thrust points along the gravity-compensated acceleration, the nose along the yaw.
     fn attitude(&self) -> DQuat {
         let up = (self.a_mps2 + DVec3::Z * GRAVITY_MPS2).normalize();
         let left = up.cross(DQuat::from_rotation_z(self.yaw_rad) * DVec3::X).normalize();
         DQuat::from_mat3(&DMat3::from_cols(left.cross(up), left, up))
     }
 
-    /// As an autopilot knows it: half a degree off, slowly wandering.
+    /// Returns the attitude with an autopilot's error: half a degree, slowly varying.
     pub(crate) fn estimated_attitude(&self, now_s: f64) -> DQuat {
         let error_rad = DVec3::new((now_s * 0.4).sin(), (now_s * 0.3).cos(), (now_s * 0.2).sin());
         self.attitude() * DQuat::from_scaled_axis(error_rad * 0.006)

@@ -1,11 +1,11 @@
-//! Attacks from within: what a plugin tries that was possible once.
+//! Attacks by a plugin on its confinement.
 
 use std::fs;
 use std::os::unix::net::UnixListener;
 
 use super::*;
 
-/// Whether this computer gives cells; without them these tests say so, and pass.
+/// Whether this computer offers cells. If not, prints the reason, and the tests pass without checks.
 fn has_cells() -> bool {
     let why = Confinement::prepare(&PluginLimits::default(), &[]).unsealed();
     if let Some(why) = &why {
@@ -19,13 +19,13 @@ fn graded() -> PluginLimits {
 }
 
 #[test]
-fn it_sees_no_other_process_and_no_home() {
+fn hides_other_processes_and_homes() {
     if !has_cells() {
         return;
     }
     let home = std::env::home_dir().unwrap();
     let private = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in(&home).unwrap();
-    // Where the tests themselves were built within /tmp, their own folder is there.
+    // If the tests were built in /tmp, their own folder is visible there.
     let program = std::env::current_exe().unwrap();
     let own = program.strip_prefix("/tmp").ok().and_then(|path| path.iter().next());
     let own = own.map_or_else(String::new, |name| name.to_string_lossy().into_owned());
@@ -39,12 +39,12 @@ print(socket.gethostname() != '', os.listdir('/sys/class/net') and open('/proc/n
     let (output, _) = python(&graded(), &program);
     let lines: Vec<&str> = output.lines().collect();
     assert_eq!(&lines[..2], ["[1, 2]", "[] [] []"], "{output}");
-    assert_eq!(lines[2], "True 1", "its network is `lo` alone");
+    assert_eq!(lines[2], "True 1", "its only network is `lo`");
     drop(private);
 }
 
 #[test]
-fn a_daemon_that_it_leaves_behind_ends_with_it() {
+fn ends_daemons_of_the_plugin() {
     let (_, sentence) = to_the_end(&["sh", "-c", "setsid sleep 1000.125 & sleep 0.2"]);
     assert!(sentence.contains("exit status 0"), "{sentence}");
     if has_cells() {
@@ -53,7 +53,7 @@ fn a_daemon_that_it_leaves_behind_ends_with_it() {
 }
 
 #[test]
-fn other_programs_services_cannot_be_reached() {
+fn blocks_connections_to_other_programs() {
     let folder = tempfile::Builder::new().prefix("vizflyt-test-").tempdir_in("/tmp").unwrap();
     let path = folder.path().join("service");
     let _service = UnixListener::bind(&path).unwrap();
@@ -72,7 +72,7 @@ fn other_programs_services_cannot_be_reached() {
 }
 
 #[test]
-fn it_changes_no_other_process_and_makes_no_namespaces() {
+fn forbids_changing_other_processes_and_making_namespaces() {
     let program = "
 import ctypes, os, resource
 libc = ctypes.CDLL(None, use_errno=True)
@@ -103,7 +103,7 @@ resource.setrlimit(resource.RLIMIT_CORE, (0, 0)); print('own limits')";
 }
 
 #[test]
-fn a_graded_flight_begins_with_nothing_and_leaves_nothing() {
+fn graded_flights_start_clean_and_leave_no_files() {
     let folder = tempfile::tempdir_in("/var/tmp").unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o777);
     fs::set_permissions(folder.path(), open).unwrap();
@@ -119,7 +119,7 @@ open('left', 'w')";
         let command = ["python3", script.to_str().unwrap()];
         let (lines, sentence) = to_the_end_with(&graded(), &command);
         if has_cells() {
-            // What comes by the other pipe may come first.
+            // Lines of the other pipe may come first.
             let printed = lines.iter().filter(|(stream, _)| *stream == Stream::Stdout);
             let lines: Vec<&str> = printed.map(|(_, line)| line.as_str()).collect();
             let expected = format!("False False {}", folder.path().display());
@@ -130,9 +130,9 @@ open('left', 'w')";
     }
 }
 
-/// Whoever starts it from their home shows it no home, and it starts all the same.
+/// A plugin can start in a folder that its cell covers, for example a home folder.
 #[test]
-fn it_starts_where_nothing_is_shown() {
+fn starts_in_a_covered_folder() {
     if !has_cells() {
         return;
     }
@@ -146,9 +146,9 @@ fn it_starts_where_nothing_is_shown() {
     assert_eq!(lines, [deep.to_str().unwrap()], "{sentence}");
 }
 
-/// An environment of Python's within the folder that the plugin is started in has `lib64 -> lib`.
+/// Python environments contain the link `lib64 -> lib`.
 #[test]
-fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
+fn makes_a_cell_if_a_shown_folder_contains_links() {
     let folder = tempfile::tempdir().unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
     fs::set_permissions(folder.path(), open).unwrap();
@@ -160,7 +160,7 @@ fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
     fs::write(&bin, "#!/bin/sh\ncat \"$(dirname \"$0\")/../lib64/x\"\n").unwrap();
     fs::set_permissions(&bin, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     std::os::unix::fs::symlink("lib", folder.path().join("lib64")).unwrap();
-    // The environment may be another folder's, by a link.
+    // The environment itself may be a link to another folder.
     let own = tempfile::tempdir().unwrap();
     let open = std::os::unix::fs::PermissionsExt::from_mode(0o755);
     fs::set_permissions(own.path(), open).unwrap();
@@ -187,7 +187,7 @@ fn a_link_in_a_folder_that_is_shown_keeps_no_cell_away() {
 }
 
 #[test]
-fn memory_of_all_that_it_starts_counts() {
+fn counts_memory_of_all_descendants() {
     if !has_cells() {
         return;
     }
@@ -207,7 +207,7 @@ time.sleep(1000)";
 }
 
 #[test]
-fn a_tool_is_run_to_its_end_and_no_longer() {
+fn runs_a_tool_to_its_end_or_its_timeout() {
     let confinement = Confinement::prepare(&PluginLimits::default(), &[]);
     let shell = |script: &str| {
         let mut shell = confinement.command("sh");

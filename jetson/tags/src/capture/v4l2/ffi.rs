@@ -1,5 +1,5 @@
-//! The few requests of V4L2 that a camera needs (Linux kernel, `videodev2.h`; "Video for Linux API",
-//! chapters 1.3, 3.2 and 7), on 64-bit machines.
+//! The V4L2 requests for a camera, on 64-bit machines (Linux kernel, `videodev2.h`; "Video for Linux API", chapters
+//! 1.3, 3.2 and 7).
 
 #![allow(unsafe_code, reason = "ioctl and mmap of Video4Linux")]
 
@@ -13,21 +13,21 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
 use super::Pixels;
 
-/// Layouts of pixels that are understood.
+/// Supported pixel formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fourcc {
-    /// One byte of brightness a pixel.
+    /// One byte of brightness per pixel.
     Grey,
     /// Two pixels in four bytes: Y U Y V.
     Yuyv,
     /// A plane of brightness, then one of colours.
     Nv12,
-    /// A JPEG each.
+    /// A JPEG per image.
     MotionJpeg,
 }
 
 impl Fourcc {
-    /// What costs least first.
+    /// All formats, the cheapest to decode first.
     pub(super) const ALL: [Self; 4] = [Self::Grey, Self::Nv12, Self::Yuyv, Self::MotionJpeg];
 
     fn code(self) -> u32 {
@@ -40,12 +40,12 @@ impl Fourcc {
     }
 }
 
-/// What a driver's stamp means.
+/// Meaning of a driver's stamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum StampKind {
-    /// The first row's exposure began.
+    /// Beginning of the first row's exposure.
     ExposureBegan,
-    /// The last byte was read.
+    /// Time at which the last byte was read.
     LastByte,
 }
 
@@ -77,7 +77,7 @@ struct PixFormat {
 #[derive(Clone, Copy)]
 struct Format {
     kind: u32,
-    // The kernel's union holds pointers and is aligned as they are.
+    // The kernel's union contains pointers and has their alignment.
     padding: u32,
     pix: PixFormat,
 }
@@ -117,7 +117,7 @@ struct Buffer {
     timecode: [u32; 4],
     sequence: u32,
     memory: u32,
-    /// Of the union: where to map it.
+    /// Part of the union: offset for mmap.
     offset: u64,
     length: u32,
     reserved: [u32; 3],
@@ -160,7 +160,7 @@ pub(super) fn streams(file: &File) -> io::Result<bool> {
         device_caps: 0,
         reserved: [0; 3],
     };
-    // SAFETY: the request writes a `v4l2_capability`, whose layout the type above has.
+    // SAFETY: the request writes a `v4l2_capability`; the type above has the same layout.
     unsafe { query_cap(file.as_raw_fd(), &raw mut capability) }?;
     let caps = if capability.capabilities & HAS_DEVICE_CAPS != 0 {
         capability.device_caps
@@ -170,7 +170,7 @@ pub(super) fn streams(file: &File) -> io::Result<bool> {
     Ok(caps & CAN_CAPTURE != 0 && caps & CAN_STREAM != 0)
 }
 
-/// Asks for a format and returns what the driver makes of it; its kind is another if it has not this one.
+/// Requests a format and returns the driver's choice. Its kind differs from `kind` if the driver does not support it.
 pub(super) fn set_format(file: &File, kind: Fourcc, size: [u32; 2]) -> io::Result<Pixels> {
     let pix = PixFormat {
         width: size[0],
@@ -182,10 +182,10 @@ pub(super) fn set_format(file: &File, kind: Fourcc, size: [u32; 2]) -> io::Resul
         rest: [0; 44],
     };
     let mut format = Format { kind: VIDEO_CAPTURE, padding: 0, pix };
-    // SAFETY: the request reads and writes a `v4l2_format`, whose layout the type above has.
+    // SAFETY: the request reads and writes a `v4l2_format`; the type above has the same layout.
     unsafe { s_fmt(file.as_raw_fd(), &raw mut format) }?;
     let found = Fourcc::ALL.into_iter().find(|f| f.code() == format.pix.pixelformat);
-    // A kind that is not understood is distinguished from `kind` by being any other.
+    // An unknown kind is represented by any kind other than `kind`.
     let other = Fourcc::ALL[usize::from(kind == Fourcc::ALL[0])];
     let bytes = if kind == Fourcc::Yuyv { 2 } else { 1 };
     let least = format.pix.width as usize * bytes;
@@ -197,7 +197,7 @@ pub(super) fn set_format(file: &File, kind: Fourcc, size: [u32; 2]) -> io::Resul
     })
 }
 
-/// Asks for a rate and returns the period that the driver gives; `None` if it does not report it. [ns]
+/// Requests a rate and returns the driver's period; `None` if the driver does not report it. [ns]
 pub(super) fn set_rate(file: &File, rate_hz: u32) -> Option<u64> {
     let mut parm = StreamParm {
         kind: VIDEO_CAPTURE,
@@ -207,22 +207,22 @@ pub(super) fn set_rate(file: &File, rate_hz: u32) -> Option<u64> {
         denominator: rate_hz,
         rest: [0; 46],
     };
-    // SAFETY: the request reads and writes a `v4l2_streamparm`, whose layout the type above has.
+    // SAFETY: the request reads and writes a `v4l2_streamparm`; the type above has the same layout.
     unsafe { s_parm(file.as_raw_fd(), &raw mut parm) }.ok()?;
     let period_ns = u64::from(parm.numerator) * 1_000_000_000 / u64::from(parm.denominator).max(1);
     (1..=10_000_000_000).contains(&period_ns).then_some(period_ns)
 }
 
-/// Returns how long the shutter is open; `None` if the camera does not report it. [ns]
+/// Returns the exposure time; `None` if the camera does not report it. [ns]
 pub(super) fn exposure_ns(file: &File) -> Option<u64> {
     let mut control = Control { id: EXPOSURE_ABSOLUTE, value: 0 };
-    // SAFETY: the request reads and writes a `v4l2_control`, whose layout the type above has.
+    // SAFETY: the request reads and writes a `v4l2_control`; the type above has the same layout.
     unsafe { g_ctrl(file.as_raw_fd(), &raw mut control) }.ok()?;
-    // In 100 us.
+    // The unit is 100 us.
     u64::try_from(control.value).ok().map(|value| value * 100_000)
 }
 
-/// The driver's buffers, mapped, and streaming.
+/// The driver's mapped buffers of a running stream.
 #[derive(Debug)]
 pub(super) struct Buffers {
     file: File,
@@ -230,7 +230,7 @@ pub(super) struct Buffers {
 }
 
 impl Buffers {
-    /// Maps the driver's buffers and starts the stream. It ends when the file is closed.
+    /// Maps the driver's buffers and starts the stream. Closing the file ends it.
     pub(super) fn start(file: File) -> io::Result<Self> {
         let fd = file.as_raw_fd();
         let mut request = RequestBuffers {
@@ -240,32 +240,32 @@ impl Buffers {
             capabilities: 0,
             flags: 0,
         };
-        // SAFETY: the request reads and writes a `v4l2_requestbuffers`, whose layout the type has.
+        // SAFETY: the request reads and writes a `v4l2_requestbuffers`; the type has the same layout.
         unsafe { reqbufs(fd, &raw mut request) }?;
         let mut mapped = Vec::new();
         for index in 0..request.count {
             let mut buffer =
                 Buffer { index, kind: VIDEO_CAPTURE, memory: MMAP, ..Buffer::default() };
-            // SAFETY: the request reads and writes a `v4l2_buffer`, whose layout the type above has.
+            // SAFETY: the request reads and writes a `v4l2_buffer`; the type above has the same layout.
             unsafe { querybuf(fd, &raw mut buffer) }?;
-            // The union's other half is not written for mapped buffers.
+            // The other half of the union is not written for mapped buffers.
             let offset = buffer.offset & 0xffff_ffff;
             let length = buffer.length as usize;
-            // SAFETY: the memory is the driver's. It writes into a buffer only while that is queued,
-            // and `take` reads one only while it is not.
+            // SAFETY: the memory belongs to the driver. It writes to a buffer only while the buffer is queued, and
+            // `take` reads a buffer only while it is not queued.
             mapped.push(unsafe { MmapOptions::new().offset(offset).len(length).map(&file) }?);
-            // SAFETY: as above.
+            // SAFETY: as for `querybuf`.
             unsafe { qbuf(fd, &raw mut buffer) }?;
         }
         if mapped.is_empty() {
-            return Err(io::Error::other("the driver gave no buffer"));
+            return Err(io::Error::other("the driver provided no buffers"));
         }
         // SAFETY: the request reads an int.
         unsafe { stream_on(fd, &raw const STREAM_KIND) }?;
         Ok(Self { file, mapped })
     }
 
-    /// Waits for an image, reads it where it lies, and gives the buffer back; `None` if none came.
+    /// Waits for an image, reads it in place, and returns the buffer to the driver; `None` on timeout.
     pub(super) fn take<T>(
         &mut self,
         wait: Duration,
@@ -278,10 +278,10 @@ impl Buffers {
         }
         let fd = self.file.as_raw_fd();
         let mut buffer = Buffer { kind: VIDEO_CAPTURE, memory: MMAP, ..Buffer::default() };
-        // SAFETY: the request reads and writes a `v4l2_buffer`, whose layout the type above has.
+        // SAFETY: the request reads and writes a `v4l2_buffer`; the type above has the same layout.
         unsafe { dqbuf(fd, &raw mut buffer) }?;
         let Some(memory) = self.mapped.get(buffer.index as usize) else {
-            return Err(io::Error::other("the driver named a buffer that it does not have"));
+            return Err(io::Error::other("the driver returned an unknown buffer"));
         };
         let bytes = &memory[..(buffer.bytesused as usize).min(memory.len())];
         let stamp_ns = buffer.seconds as u64 * 1_000_000_000 + buffer.microseconds as u64 * 1000;
@@ -291,7 +291,7 @@ impl Buffers {
             StampKind::LastByte
         };
         let result = read(bytes, stamp_ns, stamped);
-        // SAFETY: as above; the slice is not used any more.
+        // SAFETY: as for `dqbuf`; the slice is no longer used.
         unsafe { qbuf(fd, &raw mut buffer) }?;
         Ok(Some(result))
     }
@@ -307,5 +307,5 @@ const HAS_DEVICE_CAPS: u32 = 0x8000_0000;
 const EXPOSURE_ABSOLUTE: u32 = 0x009a_0902;
 const STAMP_SOURCE: u32 = 0x0007_0000;
 const EXPOSURE_BEGAN: u32 = 0x0001_0000;
-/// One is filled, one is full, one is read, one is spare.
+/// Number of buffers: one is filled, one is full, one is read, and one is spare.
 const BUFFERS: u32 = 4;

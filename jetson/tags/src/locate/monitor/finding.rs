@@ -1,42 +1,42 @@
-//! What is wrong with a lab, in words.
+//! Errors of a lab's setup, as text.
 
 use std::fmt::Write as _;
 
-/// What is wrong, as people should know it.
+/// A detected error of the setup.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Finding {
-    /// A camera's images are stamped late; corrected. [s]
+    /// Stamps of a camera's images are late; corrected.
     Late {
         /// Index of the camera.
         camera: usize,
-        /// How much. [s]
+        /// Delay of the stamps. [s]
         late_s: f64,
     },
-    /// A camera reads its rows one after the other; corrected. [s]
+    /// A camera with rolling shutter; corrected.
     RollingShutter {
         /// Index of the camera.
         camera: usize,
-        /// From the first row to the last. [s]
+        /// Time from the first row to the last. [s]
         readout_s: f64,
     },
-    /// A camera is not where its file has it.
+    /// A camera was moved since its survey.
     Moved {
-        /// Index of the camera; of several, one of which was moved, all.
+        /// Index of the camera. If one of several was moved: all candidates.
         cameras: Vec<usize>,
-        /// How far. [m]
+        /// Displacement. [m]
         moved_m: f64,
-        /// And how far turned. [rad]
+        /// Rotation. [rad]
         turned_rad: f64,
     },
-    /// Tags are of another size than their layout says.
+    /// The tags do not have the size in their layout.
     Scale {
-        /// Their true size in units of the layout's.
+        /// Ratio of the true size to the size in the layout.
         scale: f64,
     },
 }
 
 impl Finding {
-    /// Returns it in words, with what to do.
+    /// Returns a message with the correction.
     pub fn words(&self, names: &[&str]) -> String {
         let name = |camera: &usize| names.get(*camera).copied().unwrap_or("?");
         match self {

@@ -1,10 +1,10 @@
-//! Least squares of what lasts: sets of images in, each with its pose eliminated.
+//! Least squares of the lasting parameters. The pose of each set of images is eliminated.
 
 use super::{EACH, LATE, Linear, PLACE, READOUT};
 use crate::bundle::matrix::Symmetric;
 use crate::solve::{CornerRow, invert6};
 
-/// Normal equations of what lasts, the poses eliminated.
+/// Normal equations of the lasting parameters, without the poses.
 #[derive(Clone, Debug)]
 pub(super) struct Normal {
     pub(super) matrix: Symmetric,
@@ -14,7 +14,7 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// Returns what is known of so many unknowns before anything was seen: nothing.
+    /// Returns empty normal equations of `size` parameters.
     pub(super) fn empty(size: usize) -> Self {
         Self { matrix: Symmetric::zero(size), right: vec![0.0; size], square: 0.0, count: 0.0 }
     }
@@ -33,11 +33,11 @@ impl Normal {
         self.count += other.count;
     }
 
-    /// Adds a set of images, its pose eliminated; `false` if that is not determined.
+    /// Adds a set of images with its pose eliminated. Returns `false` if the pose is not determined.
     pub(super) fn add_set(&mut self, set: &Linear, wrong: &[f64]) -> bool {
         let size = wrong.len();
         let cameras = size / EACH;
-        // Sets that fit badly count as badly: half their corners are within 1.18 sigma.
+        // Sets with large residuals get less weight. The median of residuals is 1.18 sigma.
         let mut off: Vec<f64> =
             set.rows.iter().map(|(_, sigma_px, row)| row.off_px.length() / sigma_px).collect();
         if off.is_empty() {
@@ -86,7 +86,7 @@ impl Normal {
         true
     }
 
-    /// Returns what is wrong under a prior, and its covariance.
+    /// Returns the estimated errors under a prior, and their covariance.
     pub(super) fn solve(&self, prior: &[f64], on_time: usize) -> Option<(Vec<f64>, Symmetric)> {
         let mut matrix = self.matrix.clone();
         for (i, variance) in prior.iter().enumerate() {
@@ -104,7 +104,7 @@ impl Normal {
         })
     }
 
-    /// Returns the sum of squares that is left.
+    /// Returns the remaining sum of squares.
     pub(super) fn cost(&self, wrong: &[f64]) -> f64 {
         let mut cost = self.square;
         for (i, x) in wrong.iter().enumerate() {
@@ -116,7 +116,7 @@ impl Normal {
     }
 }
 
-/// Returns which unknowns a corner depends on, sorted, and how.
+/// Returns the parameters that a corner depends on, sorted, with its derivatives.
 pub(super) fn unknowns(
     camera: usize,
     row: &CornerRow,
@@ -124,7 +124,7 @@ pub(super) fn unknowns(
 ) -> [(usize, glam::DVec2); EACH + 1] {
     let at = EACH * camera;
     std::array::from_fn(|i| match i {
-        // An image stamped late was exposed earlier.
+        // An image with a late stamp was exposed earlier.
         LATE => (at + LATE, row.by_lag),
         READOUT => (at + READOUT, -row.by_lag * row.row_share),
         EACH => (EACH * cameras, row.by_scale),
@@ -132,8 +132,9 @@ pub(super) fn unknowns(
     })
 }
 
-/// Returns the inverse of a set's normal equations in its pose, and the block between it and what lasts.
-#[allow(clippy::type_complexity, reason = "used here alone")]
+/// Returns the inverse of the normal equations of a set's pose, and the block between the pose and the lasting
+/// parameters.
+#[allow(clippy::type_complexity, reason = "used only here")]
 pub(super) fn eliminate(
     set: &Linear,
     size: usize,
@@ -168,7 +169,8 @@ fn dot(a: &[f64; 6], b: &[f64; 6]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// The clock that is right. [s]
+/// Sigma of the reference clock. [s]
 const RIGHT_S: f64 = 1e-6;
-/// Each image is in its own set and in the next of each other camera, and what is off in it lasts for some.
+/// Weight of a set. Each image is in its own set and in the next set of each other camera, and its errors persist over
+/// several images.
 const SHARED_IMAGES: f64 = 0.1;

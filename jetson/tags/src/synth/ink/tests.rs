@@ -1,4 +1,4 @@
-//! Ink on white sheets: found where the layout has it, and not where something stands before it.
+//! Ink on white sheets: detected at the layout's positions, and not drawn over objects in front of a sheet.
 
 use glam::{DQuat, DVec2, DVec3};
 use vizflyt_protocol::geometry::Intrinsics;
@@ -10,9 +10,10 @@ use crate::image::Gray;
 use crate::layout::{LayoutFrame, Square, Tag};
 use crate::synth::webcam;
 
-/// A tag 1.5 m ahead of a camera in the world's origin that looks along z, turned aside; on a white wall of its plane.
+/// A tag 1.5 m in front of a camera at the world's origin that looks along z; the tag is rotated, on a white wall in
+/// its plane.
 fn scene(k: &Intrinsics) -> (TagLayout, Vec<f32>, Vec<f32>) {
-    // Its face looks back at the camera.
+    // The face points back to the camera.
     let turn = DQuat::from_rotation_y(0.4) * DQuat::from_rotation_x(std::f64::consts::PI);
     let world_from_tag: Pose<World, Square> = Pose::new(DVec3::new(0.2, 0.1, 1.5), turn);
     let tag = Tag::new(TagFamily::Tag36h11, 7, 0.24, world_from_tag);
@@ -33,7 +34,7 @@ fn grey(k: &Intrinsics, light: &[f32]) -> Gray {
 }
 
 #[test]
-fn ink_is_where_the_layout_has_it() {
+fn draws_ink_at_the_layouts_positions() {
     let k = webcam();
     let (layout, mut light, depth_m) = scene(&k);
     let sheets = Sheets { light: &mut light, depth_m: &depth_m, world_from_cam: Pose::IDENTITY };
@@ -46,17 +47,17 @@ fn ink_is_where_the_layout_has_it() {
         let off_px = (*corner_px - k.project(corner_m).unwrap()).length();
         assert!(off_px < 0.1, "{off_px} px");
     }
-    // Black is black and white stays what it was.
+    // Black is darkened, and white is unchanged.
     let least = light.iter().copied().fold(1.0, f32::min);
     assert!((least - 0.6 * INK).abs() < 1e-6 && light[0] == 0.6, "{least}");
 }
 
 #[test]
-fn what_stands_before_a_sheet_or_is_nothing_stays() {
+fn does_not_draw_on_objects_or_pixels_without_depth() {
     let k = webcam();
     let (layout, white, sheet_m) = scene(&k);
     for depth_m in [0.8f32, 0.0, f32::NAN] {
-        // Something before the sheet's upper half.
+        // An object in front of the sheet's upper half.
         let covered = |n: usize| n / k.width_px as usize <= 390;
         let depth_m: Vec<f32> = sheet_m
             .iter()
@@ -74,7 +75,7 @@ fn what_stands_before_a_sheet_or_is_nothing_stays() {
 }
 
 #[test]
-fn the_back_of_a_board_is_blank() {
+fn does_not_draw_on_the_back_of_a_board() {
     let k = webcam();
     let (mut layout, mut light, depth_m) = scene(&k);
     let white = light.clone();

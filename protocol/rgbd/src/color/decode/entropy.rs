@@ -1,18 +1,18 @@
-//! Huffman codes of a scan (ITU-T T.81, annex F.2.2).
+//! Huffman decoding of a scan (ITU-T T.81, annex F.2.2).
 //!
-//! A look-up answers how many bits a code and the number behind it take together, so the next
-//! look-up waits for nothing else: the number is made beside that chain.
+//! One look-up returns the total number of bits of a code and the number after it. So the next look-up depends on
+//! nothing else, and the number is computed in parallel to this chain.
 
 use super::transform::{Basis, Lanes};
 
-/// Codes up to this long are found by one look-up. [bits]
+/// Maximum length of codes that are found by one look-up. [bits]
 const SHORT: u32 = 10;
-/// Longest code and number: 16 and 11. [bits]
+/// Maximum length of a code and its number: 16 and 11. [bits]
 const LONGEST: u32 = 27;
-/// What an end of block advances by: beyond every block.
+/// Advance of an end of block, larger than any block.
 const END_OF_BLOCK: u32 = 64;
 
-/// What a code is of.
+/// Kind of coefficients of a code.
 #[derive(Clone, Copy)]
 pub(super) enum CodeKind {
     Dc,
@@ -22,17 +22,17 @@ pub(super) enum CodeKind {
 /// Prefix codes of DC or AC coefficients.
 #[derive(Debug)]
 pub(super) struct Prefixes {
-    /// By the next bits; [`Entry::NONE`] where no code so short begins.
+    /// Entries by the next bits; [`Entry::NONE`] for longer codes.
     short: [Entry; 1 << SHORT],
-    /// By length less one: the first 16 bits that begin no code of this length, or shorter.
+    /// By length minus one: first 16 bits that do not begin a code of at most this length.
     ends: [u32; 16],
-    /// By length less one: what to add to a code to find its entry.
+    /// By length minus one: offset from a code to its entry.
     offsets: [u32; 16],
     entries: Vec<Entry>,
 }
 
-/// What a code means: bits of code and number; bits of the code; 63 less the bits of the number; how
-/// many coefficients on the number is. A byte each, the first one lowest.
+/// Meaning of a code. Four bytes, the first one lowest: bits of code and number; bits of the code; 63 minus the bits of
+/// the number; advance in coefficients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Entry(u32);
 
@@ -53,11 +53,11 @@ impl Entry {
         self.0 >> 24
     }
 
-    /// Returns the number behind the code that `bits` begin with (F.2.2.1, EXTEND).
+    /// Returns the number after the code at the beginning of `bits` (F.2.2.1, EXTEND).
     #[inline(always)]
     fn number(self, bits: u64) -> i32 {
         let number = bits << (self.0 >> 8 & 63);
-        // All ones if the number is negative, which is stored as the complement of its size.
+        // All ones for a negative number, which is stored as the complement of its magnitude.
         let negative = !(number.cast_signed() >> 63);
         let size = (number ^ negative.cast_unsigned()) >> 1 >> (self.0 >> 16 & 63);
         (size as i32 ^ negative as i32) - negative as i32
@@ -72,7 +72,7 @@ impl Default for Prefixes {
 }
 
 impl Prefixes {
-    /// Makes the codes (C.2) of these symbols from how many have each length.
+    /// Builds the codes (C.2) of these symbols from the number of codes of each length.
     pub(super) fn new(
         kind: CodeKind,
         counts: &[u8; 16],
@@ -90,7 +90,7 @@ impl Prefixes {
                     (CodeKind::Ac, 0, 0) => END_OF_BLOCK,
                     (CodeKind::Ac, 15, 0) | (CodeKind::Ac, _, 1..=10) => run + 1,
                     (CodeKind::Dc, 0, 0..=11) => 0,
-                    _ => return Err("a Huffman table has a symbol that baseline has not"),
+                    _ => return Err("a Huffman table has a symbol that baseline does not allow"),
                 };
                 let entry = Entry::new(len, size, advance);
                 if len <= SHORT {
@@ -110,7 +110,7 @@ impl Prefixes {
         Ok(prefixes)
     }
 
-    /// Returns what the code that `bits` begin with means; [`Entry::NONE`] if there is no such code.
+    /// Returns the meaning of the code at the beginning of `bits`; [`Entry::NONE`] for an unknown code.
     #[inline(always)]
     fn find(&self, bits: u64) -> Entry {
         let entry = self.short[(bits >> (64 - SHORT)) as usize];
@@ -126,35 +126,34 @@ impl Prefixes {
     }
 }
 
-const OVERFULL: &str = "a Huffman table has more codes than there are";
-const NO_CODE: &str = "a scan has a code that is none";
+const OVERFULL: &str = "a Huffman table has too many codes";
+const NO_CODE: &str = "a scan has an invalid code";
 
-/// The bits of a scan, high ones first.
+/// Bits of a scan, high bits first.
 ///
-/// A copy is as good as the original: the rare refill takes and returns one, so that the fields of
-/// the other lie in registers.
+/// The rare refill takes a copy and returns it, so that the fields of the original stay in registers.
 #[derive(Clone, Copy)]
 pub(super) struct Bits<'a> {
-    /// The next bits, first one highest. Below `len` of them are zeros, or bits of `plain`.
+    /// The next bits, the first one highest. After `len` bits come zeros, or bits of `plain`.
     next: u64,
-    /// How many of `next` were taken from the bytes. [bits]
+    /// Number of bits in `next` that were taken from the bytes. [bits]
     len: u32,
-    /// How many of them no byte had. [bits]
+    /// Number of these bits beyond the end of the bytes. [bits]
     missing: u32,
     /// Bytes before the next 0xff.
     plain: &'a [u8],
-    /// The next 0xff, if any, and all after it.
+    /// Bytes from the next 0xff, if any.
     rest: &'a [u8],
 }
 
 impl<'a> Bits<'a> {
-    /// Begins a scan without its end marker.
+    /// Begins a scan; `scan` does not include its end marker.
     pub(super) fn new(scan: &'a [u8]) -> Self {
         let (plain, rest) = split_plain(scan);
         Self { next: 0, len: 0, missing: 0, plain, rest }
     }
 
-    /// Makes `len` 56 or more.
+    /// Refills to at least 56 bits.
     #[inline(always)]
     fn refill(&mut self) {
         if let Some(eight) = self.plain.first_chunk() {
@@ -192,8 +191,8 @@ impl<'a> Bits<'a> {
         self.len -= bits;
     }
 
-    /// Decodes a block: its coefficients' share of every column, for the transform down columns.
-    /// `dc` is the block before's.
+    /// Decodes a block to its coefficients' contributions to every column, as input of the column transform. `dc` is
+    /// the DC of the previous block.
     #[inline(always)]
     pub(super) fn block(
         &mut self,
@@ -212,7 +211,7 @@ impl<'a> Bits<'a> {
         let mut at = 0;
         let (entry, number) = 'codes: loop {
             self.refill();
-            // Mostly these fit what a refill brings.
+            // A refill usually provides enough bits for three codes.
             for turn in 0..3 {
                 if turn > 0 && self.len < LONGEST {
                     break;
@@ -241,7 +240,7 @@ impl<'a> Bits<'a> {
         Ok(rows)
     }
 
-    /// Checks that nothing but padding is left: less than a byte of ones (F.1.2.3).
+    /// Checks that only padding is left: less than a byte of ones (F.1.2.3).
     pub(super) fn finish(&self) -> Result<(), &'static str> {
         if !self.rest.is_empty() && self.rest.get(1) != Some(&0) {
             return Err(MARKER);
@@ -250,15 +249,15 @@ impl<'a> Bits<'a> {
         if left >= 8 || !self.rest.is_empty() {
             return Err("a scan goes on after its pixels");
         }
-        // Bits that were never there are zero.
+        // Bits beyond the end are zero.
         if self.next.leading_ones() as usize != left {
-            return Err("a scan is padded by other bits than ones");
+            return Err("a scan has padding other than ones");
         }
         Ok(())
     }
 
-    /// Says what is wrong with a scan in which `seen` came up, from so many bits ahead: maybe only
-    /// as bits are missing.
+    /// Returns the error of a scan. `seen` is the error found in the next `ahead` bits; missing bits or a marker can be
+    /// its cause.
     #[cold]
     fn why(&self, seen: &'static str, ahead: u32) -> &'static str {
         if self.missing == 0 {
@@ -275,9 +274,9 @@ impl<'a> Bits<'a> {
 
 const MARKER: &str = "a scan has a marker inside";
 
-/// Splits bytes before the first 0xff.
+/// Splits off the bytes before the first 0xff.
 fn split_plain(bytes: &[u8]) -> (&[u8], &[u8]) {
-    // Chunks of a constant length are compared at once.
+    // Chunks of constant length are compared with vector instructions.
     let (chunks, _) = bytes.as_chunks::<32>();
     let is_plain = |chunk: &&[u8; 32]| chunk.iter().fold(0, |most, &byte| byte.max(most)) < 255;
     let start = 32 * chunks.iter().take_while(is_plain).count();

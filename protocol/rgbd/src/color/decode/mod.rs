@@ -1,8 +1,8 @@
-//! Our own decoder of baseline JPEG (ITU-T T.81), for slices: a scan at a time, straight from the
-//! slice's bytes into the caller's rows.
+//! Decoder of baseline JPEG (ITU-T T.81) for slices: one scan at a time, directly from the slice's bytes to the
+//! caller's rows.
 //!
-//! What other decoders make up for, grey where bytes are missing and all that follows damage, is
-//! an error here: a scan holds its pixels, less than a byte of padding, and nothing else.
+//! Unlike other decoders, which fill missing pixels with grey, this one returns an error. A scan contains its pixels,
+//! less than a byte of padding, and nothing else.
 
 #![allow(
     unsafe_code,
@@ -21,27 +21,27 @@ use entropy::Bits;
 use tables::Tables;
 use transform::Sample;
 
-/// Decodes slices; owns the scratch memory.
+/// Decodes slices. Owns the scratch memory.
 #[derive(Debug, Default)]
 pub(crate) struct JpegSliceDecoder {
-    /// What `tables` were read from.
+    /// Bytes from which `tables` were parsed.
     bytes: Vec<u8>,
     tables: Option<Box<Tables>>,
     scratch: Scratch,
 }
 
-/// Samples on their way to pixels.
+/// Samples before colour conversion.
 #[derive(Debug, Default)]
 struct Scratch {
-    /// Of Y, Cb and Cr: two rows of what is coded together, used in turns.
+    /// Y, Cb and Cr: two rows of coding units, used alternately.
     planes: [Vec<Sample>; 3],
-    /// Rows of Cb and Cr, doubled.
+    /// Rows of Cb and Cr at full resolution.
     doubled: [Vec<Sample>; 2],
     sums: Vec<u16>,
 }
 
 impl JpegSliceDecoder {
-    /// Takes the tables of the image to come.
+    /// Sets the tables of the next image.
     pub(crate) fn start(&mut self, tables: &[u8], width: u32) -> Result<(), DecodeError> {
         if self.tables.is_none() || self.bytes != tables {
             self.tables = None;
@@ -58,7 +58,7 @@ impl JpegSliceDecoder {
         Ok(())
     }
 
-    /// Decodes some rows, H x W x 3.
+    /// Decodes a range of rows, H x W x 3.
     pub(crate) fn decode(
         &mut self,
         scan: &[u8],
@@ -76,8 +76,8 @@ impl JpegSliceDecoder {
     }
 }
 
-/// Runs [`decode_scan_here`] with AVX2 where the machine has it, and plain otherwise: the same
-/// code, compiled twice.
+/// Runs [`decode_scan_here`] with AVX2 if available, otherwise with the base instruction set: the same code, compiled
+/// twice.
 fn decode_scan(
     tables: &Tables,
     scratch: &mut Scratch,
@@ -101,7 +101,7 @@ fn decode_scan(
             && is_x86_feature_detected!("lzcnt")
             && is_x86_feature_detected!("popcnt")
         {
-            // SAFETY: the machine has what the function is compiled for.
+            // SAFETY: the machine supports the features for which the function is compiled.
             return unsafe { wide(tables, scratch, scan, rgb_out) };
         }
     }
@@ -117,14 +117,14 @@ fn decode_scan_here(
 ) -> Result<(), &'static str> {
     let (width, halving) = (usize::from(tables.width), tables.halving);
     let height = rgb_out.len() / (3 * width);
-    // Of samples coded together (A.2.3): luma in both directions.
+    // Size of a coding unit (A.2.3), in luma samples of each direction.
     let side = 8 * halving;
     let groups = width.div_ceil(side);
     let stride = (groups * side).next_multiple_of(transform::GROUP);
     for (plane, rows) in scratch.planes.iter_mut().zip([side, 8, 8]) {
         plane.resize(2 * rows * stride, 0);
     }
-    // Component, and its block in the group: column and row.
+    // Component, and its block in the unit: column and row.
     let blocks = [(0, 0, 0), (0, 1, 0), (0, 0, 1), (0, 1, 1), (1, 0, 0), (2, 0, 0)];
     let blocks_444 = [blocks[0], blocks[4], blocks[5]];
     let blocks: &[_] = if halving == 1 { &blocks_444 } else { &blocks };
@@ -148,7 +148,7 @@ fn decode_scan_here(
                 }
             }
         }
-        // The last row's chroma is smoothed with the row to come.
+        // Chroma of the last row is smoothed with the next row of units.
         let decoded = (row + 1) * side;
         let ready = if decoded >= height { height } else { decoded + 1 - halving };
         for y in done..ready {
@@ -160,7 +160,7 @@ fn decode_scan_here(
     bits.finish()
 }
 
-/// Turns row y of an image of so many into pixels.
+/// Converts row y of an image with this height to pixels.
 #[inline(always)]
 fn write_row(
     tables: &Tables,

@@ -1,22 +1,22 @@
-//! The tables before a scan (ITU-T T.81, annex B), read once an image.
+//! The tables before a scan (ITU-T T.81, annex B), parsed once per image.
 
 use super::entropy::{CodeKind, Prefixes};
 use super::transform::Basis;
 
-/// What decoding a scan takes.
+/// Tables for the decoding of a scan.
 #[derive(Debug)]
 pub(super) struct Tables {
-    /// Columns of the image. [px]
+    /// Number of columns of the image. [px]
     pub(super) width: u16,
-    /// Luma samples per chroma sample, across and down: 1 (4:4:4) or 2 (4:2:0).
+    /// Luma samples per chroma sample, horizontally and vertically: 1 (4:4:4) or 2 (4:2:0).
     pub(super) halving: usize,
-    /// Of Y, Cb and Cr.
+    /// Y, Cb and Cr.
     pub(super) components: [Component; 3],
     dc: [Prefixes; 2],
     ac: [Prefixes; 2],
 }
 
-/// What one component's blocks are decoded with.
+/// Tables of one component.
 #[derive(Debug)]
 pub(super) struct Component {
     pub(super) basis: Basis,
@@ -25,11 +25,11 @@ pub(super) struct Component {
 }
 
 impl Tables {
-    /// Reads all up to the scan. Refuses what this bitstream's encoders never wrote: anything but
-    /// baseline with Y, Cb and Cr in one scan, chroma whole or halved both ways, no restarts.
+    /// Parses all segments up to the scan. Rejects features that this bitstream's encoders never use: only baseline
+    /// JPEG with Y, Cb and Cr in one scan, with 4:4:4 or 4:2:0 chroma and without restarts, is accepted.
     pub(super) fn read(bytes: &[u8]) -> Result<Self, &'static str> {
         let mut rest =
-            bytes.strip_prefix(&[0xff, 0xd8]).ok_or("its tables are those of no JPEG")?;
+            bytes.strip_prefix(&[0xff, 0xd8]).ok_or("its tables do not begin like a JPEG")?;
         let mut steps: [Option<&[u8; 64]>; 4] = [None; 4];
         // By class, DC or AC, and number.
         let mut codes: [[Option<Codes>; 2]; 2] = [[None; 2]; 2];
@@ -37,11 +37,11 @@ impl Tables {
         loop {
             let (marker, mut body) = segment(&mut rest)?;
             match marker {
-                // DQT (B.2.4.1): baseline has steps of 8 bits alone.
+                // DQT (B.2.4.1): baseline has only steps of 8 bits.
                 0xdb => {
                     while let Some((&number, after)) = body.split_first() {
                         let steps = steps.get_mut(usize::from(number));
-                        let steps = steps.ok_or("a quantisation table is none of baseline's")?;
+                        let steps = steps.ok_or("a quantisation table is not baseline")?;
                         let (table, after) = after.split_first_chunk().ok_or(CUT)?;
                         if table.contains(&0) {
                             return Err("a quantisation table has a step of 0");
@@ -54,7 +54,7 @@ impl Tables {
                     while let Some((&number, after)) = body.split_first() {
                         let class = codes.get_mut(usize::from(number >> 4));
                         let table = class.and_then(|class| class.get_mut(usize::from(number & 15)));
-                        let table = table.ok_or("a Huffman table is none of baseline's")?;
+                        let table = table.ok_or("a Huffman table is not baseline")?;
                         let (counts, after) = after.split_first_chunk().ok_or(CUT)?;
                         let symbols = counts.iter().map(|&count| usize::from(count)).sum();
                         let (symbols, after) = after.split_at_checked(symbols).ok_or(CUT)?;
@@ -95,7 +95,7 @@ impl Tables {
                 }
                 0xda => return Err("bytes follow its tables"),
                 0xdd => return Err("its JPEG has restart intervals"),
-                // APP14: Adobe's mark of colours that are not Y, Cb, Cr.
+                // APP14: Adobe's marker for colours other than Y, Cb, Cr.
                 0xee if body.starts_with(b"Adobe") && body.get(11) != Some(&1) => {
                     return Err("its colours are not Y, Cb and Cr");
                 }
@@ -112,12 +112,12 @@ impl Tables {
     }
 }
 
-/// How many codes have each length, and their symbols.
+/// Number of codes of each length, and their symbols.
 type Codes<'a> = (&'a [u8; 16], &'a [u8]);
 
 const CUT: &str = "its tables are cut short";
 
-/// Takes the next segment: its marker, and what follows its length.
+/// Takes the next segment; returns its marker and its bytes after the length.
 fn segment<'a>(bytes: &mut &'a [u8]) -> Result<(u8, &'a [u8]), &'static str> {
     let &[0xff, marker, high, low, ref rest @ ..] = *bytes else {
         return Err(if bytes.len() < 4 { CUT } else { "its tables have bytes between segments" });
@@ -128,7 +128,7 @@ fn segment<'a>(bytes: &mut &'a [u8]) -> Result<(u8, &'a [u8]), &'static str> {
     Ok((marker, body))
 }
 
-/// A component as the frame names it.
+/// A component in the frame.
 #[derive(Clone, Copy)]
 struct Part {
     id: u8,
@@ -136,14 +136,14 @@ struct Part {
     steps: usize,
 }
 
-/// Reads width, halving of chroma, and components.
+/// Parses width, chroma halving, and components.
 fn read_frame(body: &[u8]) -> Result<(u16, usize, [Part; 3]), &'static str> {
     let &[precision, _, _, high, low, 3, ref parts @ ..] = body else {
-        return Err("its JPEG has not three components");
+        return Err("its JPEG does not have three components");
     };
     let (&[luma, cb, cr], &[]) = parts.as_chunks::<3>() else { return Err(CUT) };
     if precision != 8 {
-        return Err("its JPEG has not 8 bits a sample");
+        return Err("its JPEG does not have 8 bits per sample");
     }
     let halving = match [luma[1], cb[1], cr[1]] {
         [0x11, 0x11, 0x11] => 1,
@@ -152,22 +152,22 @@ fn read_frame(body: &[u8]) -> Result<(u16, usize, [Part; 3]), &'static str> {
     };
     let parts = [luma, cb, cr].map(|[id, _, steps]| Part { id, steps: usize::from(steps) });
     if parts.iter().any(|part| part.steps > 3) {
-        return Err("a quantisation table is none of baseline's");
+        return Err("a quantisation table is not baseline");
     }
     Ok((u16::from_be_bytes([high, low]), halving, parts))
 }
 
-/// Reads the numbers of every component's DC and AC codes.
+/// Parses the numbers of every component's DC and AC codes.
 fn read_scan(body: &[u8], ids: [u8; 3]) -> Result<[[usize; 2]; 3], &'static str> {
     let &[3, a, a_codes, b, b_codes, c, c_codes, 0, 63, 0] = body else {
-        return Err("its scan is not all of three components");
+        return Err("its scan does not have three complete components");
     };
     if [a, b, c] != ids {
-        return Err("its scan has other components than its frame");
+        return Err("its scan and its frame have different components");
     }
     let codes = [a_codes, b_codes, c_codes].map(|both| [both >> 4, both & 15].map(usize::from));
     if codes.as_flattened().iter().any(|&number| number > 1) {
-        return Err("a Huffman table is none of baseline's");
+        return Err("a Huffman table is not baseline");
     }
     Ok(codes)
 }

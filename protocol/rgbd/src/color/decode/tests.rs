@@ -1,4 +1,4 @@
-//! Held to other decoders, to the definition of the inverse DCT, and to damage.
+//! Tests against other decoders, the definition of the inverse DCT, and damaged scans.
 
 use jpeg_encoder::{ColorType, SamplingFactor};
 use proptest::prelude::*;
@@ -9,7 +9,7 @@ use super::transform::{Basis, double_row, samples};
 use super::*;
 use crate::color::jpeg::Layout;
 
-/// Pixels of the kind that a scan costs much, and of the kind that it costs little.
+/// Pixels that need many bits or few bits in a scan, depending on `grain`.
 fn pixels(width: usize, height: usize, seed: u64, grain: u32) -> Vec<u8> {
     let mut state = seed;
     let mut pixels = Vec::new();
@@ -55,7 +55,7 @@ fn decode(jpeg: &[u8], width: u16, height: u16) -> Result<Vec<u8>, DecodeError> 
     Ok(rgb)
 }
 
-/// What zune-jpeg makes of it.
+/// Decodes with zune-jpeg.
 fn reference(jpeg: &[u8]) -> Vec<u8> {
     JpegDecoder::new(ZCursor::new(jpeg)).decode().unwrap()
 }
@@ -74,13 +74,13 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
 
     #[test]
-    fn others_decode_the_same(made in made(), seed: u64, grain in 0u32..200) {
+    fn decodes_the_same_as_zune_jpeg(made in made(), seed: u64, grain in 0u32..200) {
         let rgb = pixels(made.width.into(), made.height.into(), seed, grain);
         let jpeg = jpeg(&rgb, made);
         let ours = decode(&jpeg, made.width, made.height).unwrap();
         let reference = reference(&jpeg);
         if made.halved {
-            // Beside its own blocks, zune-jpeg smooths chroma in another way.
+            // Outside its own blocks, zune-jpeg smooths chroma differently.
             let off = ours.iter().zip(&reference).map(|(a, b)| u64::from(a.abs_diff(*b)));
             let mean = off.sum::<u64>() as f64 / ours.len() as f64;
             prop_assert!(mean < 2.0 || made.width.min(made.height) < 24, "off by {mean}");
@@ -90,9 +90,9 @@ proptest! {
         }
     }
 
-    /// Instructions make no difference, to damage neither.
+    /// The instruction set makes no difference, also for damaged scans.
     #[test]
-    fn plain_and_wide_agree(
+    fn plain_and_wide_decoders_agree(
         made in made(), seed: u64, grain in 0u32..200,
         damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..3),
     ) {
@@ -114,7 +114,7 @@ proptest! {
     }
 
     #[test]
-    fn any_tables_are_survived(
+    fn does_not_panic_on_damaged_tables(
         at in any::<prop::sample::Index>(), byte: u8, cut in any::<prop::sample::Index>(),
         scan in prop::collection::vec(any::<u8>(), 0..300), halved: bool,
     ) {
@@ -133,7 +133,7 @@ proptest! {
     }
 }
 
-/// The same through libjpeg-turbo at both ends, Huffman tables of the image's own among them.
+/// Comparison with libjpeg-turbo as encoder and decoder, also with optimized Huffman tables.
 #[cfg(feature = "turbo")]
 #[test]
 fn libjpeg_turbo_decodes_the_same() {
@@ -158,7 +158,7 @@ fn libjpeg_turbo_decodes_the_same() {
     }
 }
 
-/// T.81, A.3.3, term by term.
+/// Inverse DCT by T.81, A.3.3, term by term.
 fn inverse_dct(coefficients: &[[f64; 8]; 8]) -> [[f64; 8]; 8] {
     let part = |frequency: usize, at: usize| {
         let weight = if frequency == 0 { 0.5f64.sqrt() } else { 1.0 };
@@ -172,9 +172,9 @@ fn inverse_dct(coefficients: &[[f64; 8]; 8]) -> [[f64; 8]; 8] {
     std::array::from_fn(|y| std::array::from_fn(|x| both(y, x)))
 }
 
-/// In the manner of IEEE 1180: many blocks, each beside the sum of all basis functions.
+/// Similar to IEEE 1180: many blocks, each compared with the sum of all basis functions.
 #[test]
-fn the_inverse_dct_is_that_of_the_standard() {
+fn inverse_dct_matches_the_standard() {
     let zigzag = zigzag();
     let basis = Basis::new(&[1; 64]);
     let mut state = 1u64;
@@ -201,7 +201,7 @@ fn the_inverse_dct_is_that_of_the_standard() {
             }
         }
         let n = f64::from(64 * blocks);
-        // A sixteenth is rounded off by half at most, a twelfth of its square in the mean.
+        // In sixteenths: the rounding error is at most a half, with a mean square of a twelfth.
         let (peak, squares, error) = (16.0 * peak, 256.0 * squares / n, 16.0 * error / n);
         assert!(peak < 0.51, "{peak} at {range}");
         assert!(squares < 0.085 && error.abs() < 0.01, "{squares}, {error} at {range}");
@@ -213,7 +213,7 @@ fn the_inverse_dct_is_that_of_the_standard() {
 }
 
 #[test]
-fn doubled_chroma_is_that_of_a_triangle() {
+fn chroma_upsampling_is_a_triangle_filter() {
     for len in 1..70 {
         let row = |seed: usize| -> Vec<Sample> {
             (0..len).map(|at| ((at * 7919 + seed) * at % 4081) as Sample).collect()
@@ -231,7 +231,7 @@ fn doubled_chroma_is_that_of_a_triangle() {
     }
 }
 
-/// Row and column of each coefficient, walked.
+/// Row and column of each coefficient in zigzag order.
 fn zigzag() -> Vec<(usize, usize)> {
     let mut all: Vec<_> = (0..64).map(|at| (at / 8, at % 8)).collect();
     all.sort_by_key(|&(v, u)| (v + u, if (v + u) % 2 == 0 { u } else { v }));
@@ -239,7 +239,7 @@ fn zigzag() -> Vec<(usize, usize)> {
 }
 
 #[test]
-fn a_scan_cut_anywhere_or_longer_is_an_error() {
+fn rejects_truncated_and_extended_scans() {
     for halved in [false, true] {
         let made = Made { width: 21, height: 18, quality: 90, halved };
         let jpeg = jpeg(&pixels(21, 18, 3, 30), made);
@@ -259,7 +259,7 @@ fn a_scan_cut_anywhere_or_longer_is_an_error() {
         for len in 0..entropy.len() {
             whys.insert(refused(&entropy[..len]));
             let marker = [&entropy[..len], &[0xff, 0xd0], &entropy[len..]].concat();
-            // In the padding of a 0xff a marker is made of it.
+            // In the padding, 0xff and the inserted marker also form a marker.
             assert_eq!(refused(&marker), "a scan has a marker inside", "at {len}");
         }
         assert!(whys.iter().any(|why| why == "a scan ends before its pixels do"), "{whys:?}");
@@ -273,7 +273,7 @@ fn a_scan_cut_anywhere_or_longer_is_an_error() {
 }
 
 #[test]
-fn tables_are_those_of_the_latest_start() {
+fn uses_the_tables_of_the_latest_start() {
     let mut decoder = JpegSliceDecoder::default();
     let refused = decoder.decode(&END_OF_IMAGE, (21, 18), &mut [0; 3 * 21 * 18]);
     assert_eq!(refused, Err(damaged("it has no tables")));
@@ -291,7 +291,7 @@ fn tables_are_those_of_the_latest_start() {
     }
 }
 
-/// A JPEG's tables for one block: codes by their lengths, for DC and AC.
+/// JPEG tables for one block: numbers of codes by length, and symbols, for DC and AC.
 fn tables(dc: (&[u8], &[u8]), ac: (&[u8], &[u8])) -> Vec<u8> {
     let mut all = vec![0xff, 0xd8];
     let mut add = |marker, body: &[u8]| {
@@ -301,7 +301,7 @@ fn tables(dc: (&[u8], &[u8]), ac: (&[u8], &[u8])) -> Vec<u8> {
     };
     add(0xdb, &[&[1u8][..], &[1; 63], &[99]].concat());
     add(0xc0, &[8, 0, 0, 0, 8, 3, 71, 0x11, 1, 9, 0x11, 1, 200, 0x11, 1]);
-    // Both in one segment.
+    // Both tables in one segment.
     let mut codes = Vec::new();
     for (class, (counts, symbols)) in [(0x01, dc), (0x10, ac)] {
         codes.push(class);
@@ -313,7 +313,7 @@ fn tables(dc: (&[u8], &[u8]), ac: (&[u8], &[u8])) -> Vec<u8> {
     all
 }
 
-/// Decodes bits into 8x8 pixels.
+/// Decodes bits to 8x8 pixels.
 fn decode_bits(tables: &[u8], bits: &str) -> Result<Vec<u8>, String> {
     let mut scan = Vec::new();
     let bits: Vec<char> = bits.chars().filter(|bit| !bit.is_whitespace()).collect();
@@ -334,44 +334,44 @@ fn decode_bits(tables: &[u8], bits: &str) -> Result<Vec<u8>, String> {
 }
 
 #[test]
-fn codes_are_those_of_the_standard() {
-    // DC: 0 is no difference, 10 one of 7 bits. AC: 0 ends, 10 is 16 zeros, 110 four zeros and a
-    // number of 1 bit, and a code of 16 bits that begins with 1110 a number of 10 bits.
+fn decodes_codes_as_in_the_standard() {
+    // DC: 0 is no difference, 10 a difference of 7 bits. AC: 0 is the end, 10 is 16 zeros, 110 is four zeros and a
+    // number of 1 bit; a code of 16 bits that begins with 1110 has a number of 10 bits.
     let mut ac_counts = [0u8; 16];
     (ac_counts[0], ac_counts[1], ac_counts[2], ac_counts[15]) = (1, 1, 1, 1);
     let good = tables((&[1, 1], &[0, 7]), (&ac_counts, &[0, 0xf0, 0x41, 0x0a]));
-    // Y: DC 64. Cb, Cr: nothing.
+    // Y: DC 64. Cb, Cr: zero.
     let grey = decode_bits(&good, "10 1000000 0  00 00").unwrap();
     assert_eq!(grey, [136; 192]);
     let dark = decode_bits(&good, "10 0111111 0  00 00").unwrap();
     assert_eq!(dark, [120; 192], "negative numbers are complements");
-    // Three times sixteen zeros, ten more, and four: the last is coefficient 63 of nine.
+    // Three times sixteen zeros, ten more, and four: the last one is coefficient 63 with nine bits.
     let last = decode_bits(&good, "0 10 10 10 110 1 110 1 110 1 00 00").unwrap();
     assert_ne!(last, [128; 192]);
     let beyond = "a scan has a run beyond its block";
     assert_eq!(decode_bits(&good, "0 10 10 10 10 0 00 00"), Err(beyond.into()));
     assert_eq!(decode_bits(&good, "0 10 10 10 110 1 110 1 10 0 00 00"), Err(beyond.into()));
-    let none = "a scan has a code that is none";
+    let none = "a scan has an invalid code";
     assert_eq!(decode_bits(&good, "11 0 00 00 1111111111111111111111"), Err(none.into()));
     assert_eq!(decode_bits(&good, "0 1111 0000 0000 0000 1111 1111 1111 1111"), Err(none.into()));
-    // The longest code and number there are.
+    // The longest code and number.
     let long = decode_bits(&good, "0 1110000000000000 1111111111 0  00 00").unwrap();
     assert_eq!([long[0], long[21]], [255, 0]);
-    let padded = "a scan is padded by other bits than ones";
+    let padded = "a scan has padding other than ones";
     assert_eq!(decode_bits(&good, "000000 00"), Err(padded.into()));
 }
 
 #[test]
-fn tables_that_are_none_are_refused_by_name() {
+fn rejects_invalid_tables_with_the_reason() {
     let good = tables((&[1], &[0]), (&[1], &[0]));
     assert!(Tables::read(&good).is_ok());
     let why = |tables: &[u8]| Tables::read(tables).err().unwrap_or("nothing");
-    let overfull = "a Huffman table has more codes than there are";
+    let overfull = "a Huffman table has too many codes";
     assert_eq!(why(&tables((&[3], &[0, 1, 2]), (&[1], &[0]))), overfull);
     assert_eq!(why(&tables((&[1], &[0]), (&[2, 1], &[0, 1, 2]))), overfull);
     let many = [[0u8; 11].as_slice(), &[255]].concat();
     assert!(Tables::read(&tables((&[1], &[0]), (&many, &[1; 255]))).is_ok(), "not full is fine");
-    let symbol = "a Huffman table has a symbol that baseline has not";
+    let symbol = "a Huffman table has a symbol that baseline does not allow";
     assert_eq!(why(&tables((&[1], &[12]), (&[1], &[0]))), symbol);
     assert_eq!(why(&tables((&[1], &[0]), (&[1], &[0x0b]))), symbol);
     assert_eq!(why(&tables((&[1], &[0]), (&[1], &[0x10]))), symbol);
@@ -381,18 +381,18 @@ fn tables_that_are_none_are_refused_by_name() {
         Tables::read(&tables).err().unwrap_or("nothing")
     };
     let frame = 2 + 69;
-    assert_eq!(with(6, 0x11), "a quantisation table is none of baseline's", "16 bits");
+    assert_eq!(with(6, 0x11), "a quantisation table is not baseline", "16 bits");
     assert_eq!(with(6, 2), "a quantisation table is missing");
     assert_eq!(with(7, 0), "a quantisation table has a step of 0");
     assert_eq!(with(frame + 1, 0xc2), "its JPEG is not baseline, or has two frames");
-    assert_eq!(with(frame + 4, 12), "its JPEG has not 8 bits a sample");
-    assert_eq!(with(frame + 9, 1), "its JPEG has not three components");
+    assert_eq!(with(frame + 4, 12), "its JPEG does not have 8 bits per sample");
+    assert_eq!(with(frame + 9, 1), "its JPEG does not have three components");
     assert_eq!(with(frame + 11, 0x21), "its chroma is neither 4:4:4 nor 4:2:0");
     let scan = good.len() - 12;
-    assert_eq!(with(scan + 2 + 1, 5), "its scan has other components than its frame");
+    assert_eq!(with(scan + 2 + 1, 5), "its scan and its frame have different components");
     assert_eq!(with(scan + 2 + 2, 0x11), "a Huffman table is missing");
-    assert_eq!(with(scan + 2 + 2, 0x20), "a Huffman table is none of baseline's");
-    assert_eq!(with(scan + 2 + 8, 5), "its scan is not all of three components");
+    assert_eq!(with(scan + 2 + 2, 0x20), "a Huffman table is not baseline");
+    assert_eq!(with(scan + 2 + 8, 5), "its scan does not have three complete components");
     let with_segment = |segment: &[u8]| [&good[..2], segment, &good[2..]].concat();
     assert_eq!(why(&with_segment(&[0xff, 0xdd, 0, 4, 0, 1])), "its JPEG has restart intervals");
     let adobe = |kind: u8| {

@@ -1,24 +1,24 @@
-//! From coefficients to pixels: dequantisation, inverse DCT, upsampling, colours.
+//! Conversion of coefficients to pixels: dequantisation, inverse DCT, upsampling, colour conversion.
 //!
-//! Across rows, the inverse DCT is the sum of its basis functions, one for each coefficient that is
-//! not zero: most are, and adding one goes on beside the look-up of the next code. Down columns it
-//! is the fast algorithm, eight columns at once.
+//! Along rows, the inverse DCT is the sum of basis functions of the nonzero coefficients. Most coefficients are zero,
+//! and an addition runs in parallel to the look-up of the next code. Along columns, it is the fast algorithm, for eight
+//! columns at once.
 //!
-//! Products and sums are rounded one by one, as everywhere, so pixels are the same everywhere.
+//! Products and sums are rounded separately on every machine, so pixels are identical everywhere.
 
 use super::super::jpeg::ZIGZAG;
 
-/// A row of eight.
+/// A row of eight values.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(32))]
 pub(super) struct Lanes(pub(super) [f32; 8]);
 
-/// By coefficient in zigzag order: one step of it across a row, scaled for [`samples`].
+/// Basis functions by coefficient in zigzag order: values of one quantisation step along a row, scaled for [`samples`].
 #[derive(Debug)]
 pub(super) struct Basis([Lanes; 64]);
 
 impl Basis {
-    /// Makes the basis of coefficients with these quantisation steps, in zigzag order.
+    /// Makes the basis for these quantisation steps, in zigzag order.
     pub(super) fn new(steps: &[u8; 64]) -> Self {
         let mut basis = [Lanes([0.0; 8]); 64];
         for ((lanes, &step), &at) in basis.iter_mut().zip(steps).zip(&ZIGZAG) {
@@ -27,7 +27,7 @@ impl Basis {
             for (x, lane) in lanes.0.iter_mut().enumerate() {
                 *lane = (scale * cosine((2 * x + 1) * u)) as f32;
             }
-            // The algorithm down columns has the cosine of its frequency in its input.
+            // The column algorithm expects its input multiplied by the cosine of its frequency.
             if v > 0 {
                 lanes.0 = lanes.0.map(|lane| (f64::from(lane) * cosine(v)) as f32);
             }
@@ -35,7 +35,7 @@ impl Basis {
         Self(basis)
     }
 
-    /// Returns the rows of a block of which only DC is known.
+    /// Returns the rows of a block with only a DC coefficient.
     #[inline(always)]
     pub(super) fn start(&self, dc: i32) -> [Lanes; 8] {
         let mut rows = [Lanes([0.0; 8]); 8];
@@ -55,12 +55,12 @@ impl Basis {
     }
 }
 
-/// Returns the weight of a frequency (T.81, A.3.3), times the square root of 2.
+/// Returns the weight of a frequency (T.81, A.3.3), multiplied by the square root of 2.
 fn weight(frequency: usize) -> f64 {
     if frequency == 0 { 1.0 } else { core::f64::consts::SQRT_2 }
 }
 
-/// Returns the cosine of so many sixteenths of pi.
+/// Returns the cosine of a number of sixteenths of pi.
 fn cosine(sixteenths: usize) -> f64 {
     match sixteenths % 32 {
         n @ 0..=8 => COSINES[n],
@@ -70,7 +70,7 @@ fn cosine(sixteenths: usize) -> f64 {
     }
 }
 
-/// By sixteenths of pi: as numbers, since not every machine's cosine rounds alike.
+/// Cosines by sixteenths of pi. Constants, because cosine functions round differently on different machines.
 const COSINES: [f64; 9] = [
     1.0,
     0.9807852804032304,
@@ -83,18 +83,17 @@ const COSINES: [f64; 9] = [
     0.0,
 ];
 
-/// Samples from 0 to 255, in sixteenths: rounded here, colours would be off by two and more.
+/// Samples from 0 to 255, in sixteenths. Rounding them to integers would cause colour errors of two and more.
 pub(super) type Sample = u16;
 
-/// Transforms down columns (Arai, Agui and Nakajima, Trans. IEICE E71, 1988) and returns the
-/// samples, row by row.
+/// Transforms the columns (Arai, Agui and Nakajima, Trans. IEICE E71, 1988) and returns the samples, row by row.
 #[inline(always)]
 pub(super) fn samples(rows: &[Lanes; 8]) -> [[Sample; 8]; 8] {
     const C4: f32 = core::f32::consts::SQRT_2;
     const C2: f32 = (2.0 * COSINES[2]) as f32;
     const C2_LESS_C6: f32 = (2.0 * (COSINES[2] - COSINES[6])) as f32;
     const C2_AND_C6: f32 = (2.0 * (COSINES[2] + COSINES[6])) as f32;
-    // With this added, a float's low bits count sixteenths.
+    // Adding this to a float makes its low bits count sixteenths.
     const ROUND: f32 = 786_432.0;
     let mut out = [[0; 8]; 8];
     for x in 0..8 {
@@ -114,7 +113,7 @@ pub(super) fn samples(rows: &[Lanes; 8]) -> [[Sample; 8]; 8] {
         let odd = [odd0, odd1, odd2, odd3];
         for y in 0..4 {
             for (y, value) in [(y, even[y] + odd[y]), (7 - y, even[y] - odd[y])] {
-                // Not `clamp`, which asks for NaN.
+                // Not `clamp`, which also handles NaN.
                 let value = if value > 0.0 { value } else { 0.0 };
                 let value = if value < 255.0 { value } else { 255.0 };
                 out[y][x] = (value + ROUND).to_bits() as Sample;
@@ -124,9 +123,9 @@ pub(super) fn samples(rows: &[Lanes; 8]) -> [[Sample; 8]; 8] {
     out
 }
 
-/// Doubles a row of chroma both ways: a pixel is nine parts the sample that it lies in, and three
-/// and three and one part the nearest to the sides. `far` is the nearest row above or below;
-/// `sums` has room for two more than a row.
+/// Doubles a row of chroma in both directions. A pixel is the weighted mean of its own sample (weight 9), the nearest
+/// horizontal and vertical neighbours (3 each) and the diagonal one (1). `far` is the nearest row above or below;
+/// `sums` has space for the length of a row plus two.
 #[inline(always)]
 pub(super) fn double_row(near: &[Sample], far: &[Sample], sums: &mut [u16], out: &mut [Sample]) {
     let sums = &mut sums[..near.len() + 2];
@@ -142,10 +141,10 @@ pub(super) fn double_row(near: &[Sample], far: &[Sample], sums: &mut [u16], out:
     }
 }
 
-/// Pixels whose colours are computed at once, and then interleaved.
+/// Number of pixels whose colours are computed together and then interleaved.
 pub(super) const GROUP: usize = 32;
 
-/// Turns a row into RGB (ITU-T T.871, 7). Rows of samples end with a whole group.
+/// Converts a row to RGB (ITU-T T.871, 7). The sample rows are padded to whole groups.
 #[inline(always)]
 pub(super) fn color_row(luma: &[Sample], cb: &[Sample], cr: &[Sample], rgb_out: &mut [u8]) {
     let samples = [luma, cb, cr].map(|row| row.as_chunks::<GROUP>().0);
@@ -166,8 +165,7 @@ fn color_group([luma, cb, cr]: [&[Sample; GROUP]; 3], out: &mut [u8; 3 * GROUP])
     let (mut red, mut green, mut blue) = ([0; GROUP], [0; GROUP], [0; GROUP]);
     for x in 0..GROUP {
         let (y, cb, cr) = (luma[x] as i16 + 8, cb[x] as i16 - 16 * 128, cr[x] as i16 - 16 * 128);
-        // 1.402, 1.772, -0.344136 and -0.714136, less what whole numbers make of them: so factors
-        // have 16 bits.
+        // 1.402, 1.772, -0.344136 and -0.714136, without their integer parts, so that the factors have 16 bits.
         let part = |c: i16, factor: i32| ((i32::from(c) * factor) >> 16) as i16;
         let byte = |value: i16| (value >> 4).clamp(0, 255) as u8;
         red[x] = byte(y + cr + part(cr, 26_345));

@@ -4,15 +4,15 @@ use super::super::jpeg::ZIGZAG;
 use super::tables::Words;
 use super::transform::{ACROSS, Coefficients};
 
-/// Blocks that are coded before their bits are joined, at most.
+/// Maximum number of blocks that are coded before their bits are joined.
 pub(super) const GROUP_BLOCKS: usize = 12;
-/// More than their words: of each coefficient one, and the end's.
+/// Upper limit of their words: one per coefficient, and the end of block.
 const GROUP_WORDS: usize = 1024;
-/// More than their bytes, at 26 bits a word.
+/// Upper limit of their bytes, at 26 bits per word.
 const GROUP_BYTES: usize = GROUP_WORDS * 26 / 8 + 16;
 const _: () = assert!(GROUP_WORDS > GROUP_BLOCKS * 65);
 
-/// Where the zigzag's n-th coefficient of the first block is in [`Coefficients`].
+/// Position of the zigzag's n-th coefficient of the first block in [`Coefficients`].
 const PLACES: [u8; 64] = {
     let mut places = [0; 64];
     let mut n = 0;
@@ -24,7 +24,7 @@ const PLACES: [u8; 64] = {
     places
 };
 
-/// By horizontal frequency u and a set of vertical ones: the set of zigzag numbers.
+/// Set of zigzag numbers, by horizontal frequency u and set of vertical frequencies.
 static ZIGZAG_SETS: [[u64; 256]; 8] = {
     let mut sets = [[0; 256]; 8];
     let mut n = 0;
@@ -40,7 +40,7 @@ static ZIGZAG_SETS: [[u64; 256]; 8] = {
     sets
 };
 
-/// The words of a group of blocks: their bits times 32, and how many these are.
+/// Words of a group of blocks: their bits multiplied by 32, plus the number of bits.
 pub(super) struct Coded {
     words: [u32; GROUP_WORDS],
     len: usize,
@@ -51,15 +51,14 @@ impl Coded {
         Self { words: [0; GROUP_WORDS], len: 0 }
     }
 
-    /// Takes the words away, with one of no bits where they are odd in number.
+    /// Removes and returns the words, with an empty word appended if their number is odd.
     pub(super) fn take(&mut self) -> &[[u32; 2]] {
         self.words[self.len] = 0;
         let len = std::mem::take(&mut self.len).next_multiple_of(2);
         self.words[..len].as_chunks().0
     }
 
-    /// Adds a block, of those side by side; `last_dc` is the DC coefficient of the block before, of
-    /// the same component.
+    /// Codes one of the blocks side by side. `last_dc` is the DC coefficient of the previous block of this component.
     #[inline(always)]
     pub(super) fn block(
         &mut self,
@@ -70,9 +69,9 @@ impl Coded {
     ) {
         let (magnitudes, bits) = coefficients.of_block(block);
         let mut room = self.words[self.len..].iter_mut();
-        let mut push = |word| *room.next().expect("a group has not so many") = word;
+        let mut push = |word| *room.next().expect("the buffer is large enough for a group") = word;
 
-        // Where its bits are the magnitude, a number is not negative.
+        // A number is not negative if its bits equal the magnitude.
         let dc = i32::from(magnitudes[0]);
         let dc =
             if bits[0].cast_unsigned() >> 5 == magnitudes[0].cast_unsigned() { dc } else { -dc };
@@ -111,14 +110,14 @@ impl Coded {
 
 /// Joins words, high bits first, and writes a zero byte after every 0xff.
 pub(super) struct Bits<'a> {
-    /// What is written, then room.
+    /// Written bytes, then reserved space.
     out: &'a mut Vec<u8>,
     len: usize,
-    /// The last bits, high; below them are zeros.
+    /// The last bits, high ones first, followed by zeros.
     open: u64,
-    /// How many they are, less than 8 between calls.
+    /// Number of bits in `open`, less than 8 between calls.
     used: u32,
-    /// The bytes of a group, before zeros are put between.
+    /// Bytes of a group before byte stuffing.
     bytes: [u8; GROUP_BYTES],
 }
 
@@ -127,7 +126,7 @@ impl<'a> Bits<'a> {
         Self { len: out.len(), out, open: 0, used: 0, bytes: [0; GROUP_BYTES] }
     }
 
-    /// Adds the words of a group, in pairs: both have 52 bits at most.
+    /// Appends the words of a group, in pairs of at most 52 bits.
     #[inline(always)]
     pub(super) fn extend(&mut self, words: &[[u32; 2]]) {
         let (mut open, mut used, mut len) = (self.open, self.used, 0);
@@ -146,7 +145,7 @@ impl<'a> Bits<'a> {
         self.write(len);
     }
 
-    /// Writes the first bytes of the group.
+    /// Writes the first `len` bytes of the group.
     #[inline(always)]
     fn write(&mut self, len: usize) {
         if self.out.len() < self.len + 2 * GROUP_BYTES {
@@ -156,7 +155,7 @@ impl<'a> Bits<'a> {
         for eight in eights {
             const EVERY: u64 = 0x0101_0101_0101_0101;
             let word = u64::from_ne_bytes(*eight);
-            // A byte of 0xff loses its high bit when one is added, whatever is carried in.
+            // Adding one clears the high bit of a byte 0xff, with or without carry.
             if word & !word.wrapping_add(EVERY) & (EVERY << 7) == 0 {
                 self.out[self.len..self.len + 8].copy_from_slice(eight);
                 self.len += 8;
@@ -167,17 +166,17 @@ impl<'a> Bits<'a> {
         self.len = stuffed(self.out, self.len, rest);
     }
 
-    /// Fills the last byte with ones, and takes the room that is left away.
+    /// Fills the last byte with ones, and removes the reserved space.
     pub(super) fn finish(mut self) {
         self.extend(&[[0x7f << 5 | 7, 0]]);
         self.out.truncate(self.len);
     }
 }
 
-/// Writes bytes, and a zero after every 0xff; returns the new length.
+/// Writes bytes, with a zero after every 0xff; returns the new length.
 fn stuffed(room: &mut [u8], mut len: usize, bytes: &[u8]) -> usize {
     for &byte in bytes {
-        // The zero is overwritten where it is not needed.
+        // An unneeded zero is overwritten.
         room[len..len + 2].copy_from_slice(&[byte, 0]);
         len += 1 + usize::from(byte == 0xff);
     }

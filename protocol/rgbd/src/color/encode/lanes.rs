@@ -1,45 +1,45 @@
-//! Vectors of 16-bit integers: the same operations, hence the same bits, on every machine.
+//! Vectors of 16-bit integers: the same operations, and so the same results, on every machine.
 //!
-//! A row of a block is 8 lanes; a vector holds one row of each of one, two or four blocks.
+//! A row of a block has 8 lanes; a vector contains one row of one, two or four blocks.
 
 #![allow(unsafe_code, reason = "intrinsics, named only by code that is compiled for them")]
 
 /// A vector of [`Lanes::BLOCKS`] times 8 lanes. Sums wrap.
 pub(super) trait Lanes: Copy {
-    /// Blocks side by side.
+    /// Number of blocks side by side.
     const BLOCKS: usize;
 
-    /// Takes the first lanes of `from`, which must have so many.
+    /// Loads the first lanes of `from`, which must be long enough.
     fn load(from: &[i16]) -> Self;
-    /// Gives the lanes to the first of `to`, which must have so many.
+    /// Stores the lanes at the start of `to`, which must be long enough.
     fn store(self, to: &mut [i16]);
-    /// The same in every lane.
+    /// Returns the same value in every lane.
     fn all(value: i16) -> Self;
-    /// The same in every block.
+    /// Returns the same row in every block.
     fn every_block(row: &[i16; 8]) -> Self;
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn or(self, other: Self) -> Self;
     fn xor(self, other: Self) -> Self;
     fn and(self, other: Self) -> Self;
-    /// Magnitudes, unsigned.
+    /// Returns the magnitudes, unsigned.
     fn abs(self) -> Self;
     fn up<const BITS: i32>(self) -> Self;
-    /// Shifts zeros in.
+    /// Shifts right, filling with zeros.
     fn down<const BITS: i32>(self) -> Self;
-    /// Shifts signs in.
+    /// Shifts right, filling with the sign.
     fn down_signed<const BITS: i32>(self) -> Self;
-    /// Products over 2^15, rounded to the nearest, halves up.
+    /// Returns products divided by 2^15, rounded to the nearest, halves up.
     fn times(self, other: Self) -> Self;
-    /// Unsigned products over 2^16, rounded down.
+    /// Returns unsigned products divided by 2^16, rounded down.
     fn times_unsigned(self, other: Self) -> Self;
-    /// Block by block, `self` and `other` lane by lane in turns: the first halves, and the second.
+    /// Interleaves the lanes of `self` and `other`, block by block: the first halves, and the second halves.
     fn zip(self, other: Self) -> (Self, Self);
-    /// Which lanes are above zero, one byte a block, the first lane lowest.
+    /// Returns a mask of the lanes above zero, one byte per block, the first lane lowest.
     fn positive(self) -> [u8; 4];
 }
 
-/// Plain code, compiled everywhere so that it is tested everywhere.
+/// Plain code, compiled on every machine, so that tests cover it.
 #[cfg_attr(target_arch = "aarch64", allow(dead_code))]
 #[derive(Clone, Copy)]
 pub(super) struct Plain([i16; 8]);
@@ -144,8 +144,8 @@ pub(super) use arm::Neon;
 #[cfg(target_arch = "x86_64")]
 pub(super) use x86::{Avx2, Avx512};
 
-/// Makes a type of vectors, of which only functions that are compiled for its instructions,
-/// and run where they are, may have values.
+/// Defines a vector type. Only functions that are compiled for its instructions, and run where these are available, may
+/// have values of it.
 macro_rules! vectors {
     (
         $(#[$docs:meta])* $name:ident($vector:ty), $blocks:literal, $load:ident, $store:ident,
@@ -163,14 +163,14 @@ macro_rules! vectors {
             #[inline(always)]
             fn load(from: &[i16]) -> Self {
                 let from = &from[..8 * $blocks];
-                // SAFETY: the machine has the instruction, as everywhere below; so many lanes
-                // are readable, and the load needs no alignment.
+                // SAFETY: the machine has the instruction, as everywhere below; these lanes are readable, and the load
+                // needs no alignment.
                 Self(unsafe { $load(from.as_ptr().cast()) })
             }
             #[inline(always)]
             fn store(self, to: &mut [i16]) {
                 let to = &mut to[..8 * $blocks];
-                // SAFETY: so many lanes are writable; the store needs no alignment.
+                // SAFETY: these lanes are writable; the store needs no alignment.
                 unsafe { $store(to.as_mut_ptr().cast(), self.0) }
             }
             #[inline(always)]
@@ -245,7 +245,7 @@ mod x86 {
     use super::Lanes;
 
     vectors!(
-        /// With AVX2.
+        /// Two blocks, with AVX2.
         Avx2(__m256i), 2, _mm256_loadu_si256, _mm256_storeu_si256, _mm256_set1_epi16,
         _mm256_abs_epi16, zip: _mm256_unpacklo_epi16 _mm256_unpackhi_epi16,
         every_block: |row: *const i16| _mm256_broadcastsi128_si256(_mm_loadu_si128(row.cast())),
@@ -263,7 +263,7 @@ mod x86 {
     );
 
     vectors!(
-        /// With AVX-512BW.
+        /// Four blocks, with AVX-512BW.
         Avx512(__m512i), 4, _mm512_loadu_si512, _mm512_storeu_si512, _mm512_set1_epi16,
         _mm512_abs_epi16, zip: _mm512_unpacklo_epi16 _mm512_unpackhi_epi16,
         every_block: |row: *const i16| _mm512_broadcast_i32x4(_mm_loadu_si128(row.cast())),
@@ -276,7 +276,7 @@ mod x86 {
     );
 }
 
-/// One block with NEON, which every ARM64 has.
+/// One block with NEON, which is available on every ARM64.
 #[cfg(target_arch = "aarch64")]
 mod arm {
     use core::arch::aarch64::{
@@ -289,7 +289,7 @@ mod arm {
     use super::Lanes;
 
     vectors!(
-        /// With NEON.
+        /// One block, with NEON.
         Neon(int16x8_t), 1, vld1q_s16, vst1q_s16, vdupq_n_s16, vabsq_s16,
         zip: vzip1q_s16 vzip2q_s16, every_block: |row| vld1q_s16(row),
         up: |lanes, bits: i32| vshlq_s16(lanes, vdupq_n_s16(bits as i16)),

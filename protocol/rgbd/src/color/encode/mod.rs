@@ -1,13 +1,12 @@
-//! An encoder of baseline JPEG (ITU-T T.81), 32 pixels of 8 or 16 rows at a time.
+//! Encoder of baseline JPEG (ITU-T T.81), 32 pixels of 8 or 16 rows at a time.
 //!
 //! ```text
-//! pixels -> YCbCr -> cosine transform -> quotients, and which are not 0 -> words -> bytes
-//! |----------------- transform.rs, by lanes.rs ----------------|  |--- entropy.rs ---|
+//! pixels -> YCbCr -> cosine transform -> quotients and nonzero masks -> words -> bytes
+//! |------------------ transform.rs, by lanes.rs -------------------|    |-entropy.rs-|
 //! ```
 //!
-//! Tables are annex K's, so they depend on width, quality and mode alone, and a scan is written
-//! without them. All is integer arithmetic of stated rounding: a JPEG is encoded to the same bytes
-//! on x86-64 and ARM64.
+//! Tables are those of annex K, so they depend only on width, quality and mode, and a scan is written without them. All
+//! arithmetic is in integers with defined rounding: x86-64 and ARM64 encode the same bytes.
 
 #![allow(
     unsafe_code,
@@ -30,8 +29,8 @@ use super::jpeg::END_OF_IMAGE;
 use crate::error::EncodeError;
 use crate::header::{ColorMode, MAX_SIDE};
 
-/// Appends a baseline JPEG, 4:4:4, to `out`: the same bytes on every processor. `rgb` is
-/// row-major, three bytes a pixel; quality is 1 to 100.
+/// Appends a baseline JPEG, 4:4:4, to `out`: the same bytes on every processor. `rgb` is row-major, three bytes per
+/// pixel; quality is 1 to 100.
 ///
 /// # Errors
 /// [`EncodeError::Size`], [`EncodeError::Rgb`] or [`EncodeError::Quality`] for arguments out of
@@ -64,15 +63,15 @@ pub fn encode_jpeg(
 /// Encodes slices.
 #[derive(Debug, Default)]
 pub(crate) struct JpegSliceEncoder {
-    /// What `tables` and `scan` are of.
+    /// Width, quality and mode of `tables` and `scan`.
     made_for: Option<(u16, u8, ColorMode)>,
-    /// All up to the scan, for 0 rows.
+    /// All segments up to the scan, with 0 rows.
     tables: Vec<u8>,
     scan: Option<Scan>,
 }
 
 impl JpegSliceEncoder {
-    /// Returns the tables of images so wide, of this quality and mode, to be stored once.
+    /// Returns the tables of images with this width, quality and mode, to be stored once.
     pub(crate) fn tables(&mut self, width: u16, quality: u8, mode: ColorMode) -> &[u8] {
         if self.made_for != Some((width, quality, mode)) {
             self.made_for = Some((width, quality, mode));
@@ -83,7 +82,7 @@ impl JpegSliceEncoder {
         &self.tables
     }
 
-    /// Appends the scan of some rows to `out`, to be decoded with the latest [`Self::tables`].
+    /// Appends the scan of a range of rows to `out`, to be decoded with the latest [`Self::tables`].
     pub(crate) fn scan(&mut self, rgb: &[u8], out: &mut Vec<u8>) {
         self.scan.as_ref().expect("tables come before scans").write(rgb, out);
     }
@@ -94,7 +93,7 @@ impl JpegSliceEncoder {
 struct Scan {
     width: usize,
     mode: ColorMode,
-    /// Of luma and chroma.
+    /// Luma and chroma.
     quantisers: [Quantiser; 2],
 }
 
@@ -104,12 +103,12 @@ impl Scan {
         Self { width: usize::from(width), mode, quantisers }
     }
 
-    /// Appends the scan of these rows and its end.
+    /// Appends the scan of these rows and its end marker.
     fn write(&self, rgb: &[u8], out: &mut Vec<u8>) {
         widest()(self, rgb, out);
     }
 
-    /// The same by vectors of a kind.
+    /// Writes with vectors of type `V`.
     #[inline(always)]
     fn write_by<V: Lanes>(&self, rgb: &[u8], out: &mut Vec<u8>) {
         let is_halved = self.mode == ColorMode::Jpeg420;
@@ -149,16 +148,16 @@ impl Scan {
     }
 }
 
-/// A way to write a scan.
+/// Function that writes a scan.
 type Way = fn(&Scan, &[u8], &mut Vec<u8>);
 
-/// Returns the way by the machine's widest vectors.
+/// Returns the implementation with the machine's widest vectors.
 #[cfg(target_arch = "x86_64")]
 fn widest() -> Way {
     by_avx512().or_else(by_avx2).unwrap_or(Scan::write_by::<lanes::Plain>)
 }
 
-/// Returns the way by the machine's vectors.
+/// Returns the implementation with the machine's vectors.
 #[cfg(target_arch = "aarch64")]
 fn widest() -> Way {
     Scan::write_by::<lanes::Neon>
@@ -169,7 +168,7 @@ fn widest() -> Way {
     Scan::write_by::<lanes::Plain>
 }
 
-/// Makes a function that gives a way compiled for these instructions, where the machine has them.
+/// Defines a function that returns an implementation compiled for these instructions, if the machine has them.
 #[cfg(target_arch = "x86_64")]
 macro_rules! way {
     ($name:ident, $lanes:ident, $features:literal, [$($feature:tt),*]) => {
@@ -179,7 +178,7 @@ macro_rules! way {
                 scan.write_by::<lanes::$lanes>(rgb, out);
             }
             let is_there = $(is_x86_feature_detected!($feature))&&*;
-            // SAFETY: the machine has what the function is compiled for.
+            // SAFETY: the machine supports the features for which the function is compiled.
             is_there.then_some(|scan, rgb, out| unsafe { compiled(scan, rgb, out) })
         }
     };
@@ -195,8 +194,8 @@ way!(
     ["avx512bw", "avx512vl", "bmi1", "bmi2", "lzcnt", "popcnt"]
 );
 
-/// One block of those that are coded together: in its strip of blocks side by side, which one is
-/// the first unit's, and how many further the next unit's is.
+/// One block of a coding unit: its strip of blocks side by side, the index of the first unit's block, and the step to
+/// the next unit's block.
 struct Part {
     strip: usize,
     first: usize,
@@ -208,9 +207,9 @@ const fn part(strip: usize, first: usize, step: usize, component: usize) -> Part
     Part { strip, first, step, component }
 }
 
-/// 4:4:4: a strip for each component.
+/// 4:4:4: one strip per component.
 const FULL: [Part; 3] = [part(0, 0, 1, 0), part(1, 0, 1, 1), part(2, 0, 1, 2)];
-/// 4:2:0: two strips of luma, and one of both chromas.
+/// 4:2:0: two strips of luma, and one with both chroma components.
 const HALVED: [Part; 6] = [
     part(0, 0, 2, 0),
     part(0, 1, 2, 0),
@@ -220,7 +219,7 @@ const HALVED: [Part; 6] = [
     part(2, BLOCKS / 2, 1, 2),
 ];
 
-/// Pixels, and beyond the edges the last ones again.
+/// Pixels, with the last ones repeated beyond the edges.
 struct View<'a> {
     rgb: &'a [u8],
     width: usize,
@@ -237,7 +236,7 @@ impl View<'_> {
         }
     }
 
-    /// Fills strips for [`HALVED`]; chroma is the mean of four pixels'.
+    /// Fills strips for [`HALVED`]; chroma is the mean of four pixels.
     #[inline(always)]
     fn halved<V: Lanes>(&self, left: usize, top: usize, strips: &mut [Samples; 3]) {
         let [above, below, chroma] = strips;

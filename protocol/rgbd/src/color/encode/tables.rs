@@ -1,5 +1,5 @@
-//! Annex K of ITU-T T.81: what coefficients are divided by and the codes of what remains; and the
-//! segments before a scan (annex B), which say both.
+//! Tables of annex K of ITU-T T.81: divisors of coefficients and codes of the quotients; and the segments before a scan
+//! (annex B), which contain both.
 
 use super::super::jpeg::{START_OF_IMAGE, ZIGZAG};
 use crate::header::ColorMode;
@@ -28,8 +28,8 @@ const DIVISORS: [[u8; 64]; 2] = [
     ],
 ];
 
-/// Returns the divisors of luma and chroma, row by row, at a quality of 1 to 100: 50 is annex K's,
-/// others are scaled as the Independent JPEG Group's library does.
+/// Returns the divisors of luma and chroma, row by row, at a quality of 1 to 100. 50 gives those of annex K; others are
+/// scaled as in the Independent JPEG Group's library.
 pub(super) fn divisors(quality: u8) -> [[u8; 64]; 2] {
     let quality = u32::from(quality);
     let percent = if quality < 50 { 5000 / quality } else { 200 - 2 * quality };
@@ -37,14 +37,14 @@ pub(super) fn divisors(quality: u8) -> [[u8; 64]; 2] {
     DIVISORS.map(|table| table.map(scale))
 }
 
-/// A Huffman code as DHT states it: how many words of 1 to 16 bits there are, and what they mean.
+/// A Huffman code as in DHT: the number of words of 1 to 16 bits, and their meanings.
 struct Code {
     counts: [u8; 16],
-    /// The shorter words' meanings; the 16-bit words mean all others, in order of size.
+    /// Meanings of the shorter words; the 16-bit words have all other meanings, in ascending order.
     short: &'static [u8],
 }
 
-/// Tables K.3 and K.4: the categories of differences of DC coefficients, which are in order.
+/// Tables K.3 and K.4: categories of differences of DC coefficients, in order.
 const DC: [Code; 2] = [
     Code {
         counts: [0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0],
@@ -56,7 +56,7 @@ const DC: [Code; 2] = [
     },
 ];
 
-/// Tables K.5 and K.6: 16 times the zeros before an AC coefficient, and its category.
+/// Tables K.5 and K.6: 16 times the zeros before an AC coefficient, plus its category.
 const AC: [Code; 2] = [
     Code {
         counts: [0, 2, 1, 3, 3, 2, 4, 3, 5, 5, 4, 4, 0, 0, 1, 125],
@@ -78,7 +78,7 @@ const AC: [Code; 2] = [
 ];
 
 impl Code {
-    /// Returns what the words mean, shorter ones first: as many as there are, then zeros.
+    /// Returns the meanings of the words, shorter ones first, padded with zeros; and their number.
     const fn meanings(&self) -> ([u8; 162], usize) {
         let mut all = [0; 162];
         let mut is_short = [false; 256];
@@ -100,7 +100,7 @@ impl Code {
         (all, len)
     }
 
-    /// Returns word and length by meaning (annex C); 0 bits where no word means it.
+    /// Returns word and length by meaning (annex C); 0 bits for a meaning without a word.
     const fn words(&self) -> [(u16, u8); 256] {
         let mut words = [(0, 0); 256];
         let (meanings, _) = self.meanings();
@@ -120,16 +120,16 @@ impl Code {
     }
 }
 
-/// What is written for the coefficients of a component.
+/// Words for the coefficients of a component.
 pub(super) struct Words {
-    /// By category: the word, moved up by as many bits as follow it, times 32, and the length of
+    /// By category: the word, shifted up by the number of bits that follow it, multiplied by 32; plus the length of
     /// both. [bits]
     pub(super) dc: [u32; 12],
-    /// The same by 16 times the zeros before, and the leading zeros of the coefficient's magnitude
-    /// in 32 bits, less 256 where it is more.
+    /// As `dc`, but by 16 times the preceding zeros plus the leading zeros of the coefficient's magnitude in 32 bits,
+    /// modulo 256.
     pub(super) ac: [u32; 256],
     pub(super) sixteen_zeros: u32,
-    /// Nothing but zeros to the end.
+    /// End of block: only zeros follow.
     pub(super) end: u32,
 }
 
@@ -163,10 +163,10 @@ impl Words {
     }
 }
 
-/// Of luma and chroma.
+/// Luma and chroma.
 pub(super) static WORDS: [Words; 2] = [Words::new(&DC[0], &AC[0]), Words::new(&DC[1], &AC[1])];
 
-/// Appends all of a JPEG up to its scan.
+/// Appends all segments of a JPEG up to its scan.
 pub(super) fn write_segments(
     out: &mut Vec<u8>,
     (width, rows): (u16, u16),
@@ -188,7 +188,7 @@ pub(super) fn write_segments(
     for (id, table) in divisors(quality).iter().enumerate() {
         segment(0xdb, &[&[id as u8], &ZIGZAG.map(|at| table[usize::from(at)])]);
     }
-    // SOF0: of each component its sampling factors and its divisors.
+    // SOF0: sampling factors and divisors of each component.
     let [rows, width] = [rows, width].map(u16::to_be_bytes);
     let luma = if mode == ColorMode::Jpeg420 { 0x22 } else { 0x11 };
     segment(0xc0, &[&[8], &rows, &width, &[3, 1, luma, 0, 2, 0x11, 1, 3, 0x11, 1]]);
@@ -199,6 +199,6 @@ pub(super) fn write_segments(
             segment(0xc4, &[&[(16 * class + id) as u8], &code.counts, &meanings[..len]]);
         }
     }
-    // SOS: of each component its codes; all coefficients, all bits.
+    // SOS: codes of each component; all coefficients, all bits.
     segment(0xda, &[&[3, 1, 0, 2, 0x11, 3, 0x11, 0, 63, 0]]);
 }

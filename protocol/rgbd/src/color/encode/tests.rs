@@ -1,4 +1,4 @@
-//! The encoder against arithmetic in doubles, another encoder, and an independent decoder.
+//! Tests of the encoder against double-precision arithmetic, another encoder, and an independent decoder.
 
 use std::f64::consts::PI;
 use std::io::Cursor;
@@ -10,7 +10,7 @@ use super::lanes::Plain;
 use super::transform::{factors, frequencies};
 use super::*;
 
-/// Pixels of one kind: noise, steps, waves, black and white, one colour.
+/// Pixels of one kind: noise, steps, waves, black and white, or one colour.
 fn picture(width: usize, height: usize, kind: u32, seed: u64) -> Vec<u8> {
     let mut state = seed;
     let mut noise = || {
@@ -54,7 +54,7 @@ fn jpeg(rgb: &[u8], width: usize, quality: u8, mode: ColorMode, way: Way) -> Vec
     out
 }
 
-/// The same by another encoder.
+/// Encodes with jpeg-encoder.
 fn reference(rgb: &[u8], width: usize, quality: u8, mode: ColorMode) -> Vec<u8> {
     let mut out = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut out, quality);
@@ -93,7 +93,7 @@ fn segments(jpeg: &[u8], wanted: u8) -> Vec<Vec<u8>> {
     found
 }
 
-/// Returns the ways that the machine has.
+/// Returns the implementations that the machine supports.
 fn ways() -> Vec<Way> {
     #[cfg(target_arch = "x86_64")]
     return [by_avx2(), by_avx512()].into_iter().flatten().collect();
@@ -102,7 +102,7 @@ fn ways() -> Vec<Way> {
 }
 
 #[test]
-fn tables_are_those_of_another_encoder() {
+fn tables_match_those_of_another_encoder() {
     let rgb = picture(16, 16, 2, 1);
     for quality in 1..=100 {
         let mode = ColorMode::Jpeg444;
@@ -114,7 +114,7 @@ fn tables_are_those_of_another_encoder() {
 }
 
 #[test]
-fn pictures_lose_no_more_than_by_another_encoder() {
+fn quality_is_as_good_as_another_encoder() {
     for mode in [ColorMode::Jpeg444, ColorMode::Jpeg420] {
         for quality in [5, 12, 30, 75, 93, 100] {
             let (mut all_ours, mut all_theirs) = (0.0, 0.0);
@@ -131,7 +131,8 @@ fn pictures_lose_no_more_than_by_another_encoder() {
                 all_ours += ours;
                 all_theirs += theirs;
                 let loss = decibels(ours / theirs);
-                // Below, a step is so large that the other way to round a value may show it better by luck: black for one.
+                // At lower quality the steps are so large that a different rounding can be better by chance, for
+                // example for black.
                 assert!(quality < 30 || loss < 0.05, "{loss:.3} dB worse: {of}");
             }
             let loss = decibels(all_ours / all_theirs);
@@ -153,7 +154,7 @@ fn quotients_are_rounded_exactly() {
     }
 }
 
-/// Signs of a cosine wave each way: what gives its coefficient the largest value.
+/// Signs of a cosine wave in both directions, which give its coefficient the largest value.
 fn wave(u: usize, v: usize) -> impl Fn(usize, usize) -> bool {
     move |x, y| {
         let cos = |n: usize, k: usize| ((2 * n + 1) as f64 * k as f64 * PI / 16.0).cos();
@@ -162,7 +163,7 @@ fn wave(u: usize, v: usize) -> impl Fn(usize, usize) -> bool {
 }
 
 #[test]
-fn transform_is_near_that_in_doubles() {
+fn transform_is_close_to_double_precision() {
     let mut state = 5u32;
     let mut random = move || {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -226,8 +227,8 @@ fn transform_is_near_that_in_doubles() {
 }
 
 #[test]
-fn coefficients_of_the_largest_category_come_back() {
-    // Every block is the wave of one coefficient, or its opposite; and all black, then all white.
+fn coefficients_of_the_largest_category_survive() {
+    // Each block is the wave of one coefficient, or its opposite; then all black, and all white.
     let width = 8 * 65;
     let rgb: Vec<u8> = (0..8 * width * 3)
         .map(|at| {
@@ -245,7 +246,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(512))]
 
     #[test]
-    fn every_way_writes_the_same_decodable_bytes(
+    fn all_implementations_write_the_same_decodable_bytes(
         width in 1usize..=70, height in 1usize..=70, quality in 1u8..=100, kind in 0u32..6,
         seed: u64, halved: bool,
     ) {
@@ -256,15 +257,15 @@ proptest! {
             prop_assert!(jpeg(&rgb, width, quality, mode, way) == plain);
         }
 
-        // No marker but the end: whatever follows 0xff is 0.
+        // No marker except the end: a 0xff is always followed by 0.
         let layout = Layout::of(&plain).unwrap();
         let scan = plain[layout.scan..].strip_suffix(&END_OF_IMAGE).unwrap();
         for (at, _) in scan.iter().enumerate().filter(|byte| *byte.1 == 0xff) {
             prop_assert_eq!(scan.get(at + 1), Some(&0));
         }
 
-        // Few pixels, or few values of them, round as luck has it: of 60,000 pictures twelve were worse by a tenth and more,
-        // 1.17 times at most. What many lose together, another test holds to more closely.
+        // With few pixels, or few different values, rounding has random effects: of 60,000 pictures twelve were worse
+        // by a tenth or more, at most 1.17 times. Another test has a stricter limit for the sum of many pictures.
         let (ours, count) = (squares(&rgb, &plain), rgb.len() as f64);
         if kind < 4 && width.min(height) >= 24 {
             let theirs = squares(&rgb, &reference(&rgb, width, quality, mode));

@@ -1,24 +1,24 @@
-//! From pixels to quantised coefficients, 32 pixels of 8 rows at a time.
+//! Conversion of pixels to quantised coefficients, 32 pixels of 8 rows at a time.
 //!
-//! All is in 16 bits. Samples keep 3 bits below the point and coefficients 5, so that little is lost
-//! before quantisation: the transform's error is below 0.04 rms (a test holds it), where a colour
-//! conversion to whole numbers alone makes 0.29.
+//! All values have 16 bits. Samples have 3 fractional bits and coefficients 5, which limits losses before quantisation.
+//! The error of the transform is below 0.04 rms (checked by a test); a colour conversion to integers would already
+//! cause 0.29.
 
 use super::lanes::Lanes;
 
-/// Pixels side by side.
+/// Number of pixels side by side.
 pub(super) const ACROSS: usize = 32;
-/// Blocks side by side.
+/// Number of blocks side by side.
 pub(super) const BLOCKS: usize = ACROSS / 8;
 /// Samples of blocks side by side, row by row. [1/8]
 pub(super) type Samples = [[i16; ACROSS]; 8];
 
-/// Numbers below 1 in 2^-15.
+/// Converts a number below 1 to units of 2^-15.
 const fn fixed(value: f64) -> i16 {
     (value * 32768.0 + 0.5) as i16
 }
 
-/// Converts 32 pixels to `YCbCr` (ITU-T T.871) less its middle. [1/8]
+/// Converts 32 pixels to `YCbCr` (ITU-T T.871), shifted to be centred on 0. [1/8]
 #[inline(always)]
 pub(super) fn convert<V: Lanes>(
     rgb: &[u8; 3 * ACROSS],
@@ -26,7 +26,7 @@ pub(super) fn convert<V: Lanes>(
     cb_out: &mut [i16; ACROSS],
     cr_out: &mut [i16; ACROSS],
 ) {
-    // In units of 1/128, so that 255 is just below the sign.
+    // In units of 1/128, so that 255 fits below the sign bit.
     let mut planes = [[0i16; ACROSS]; 3];
     let [r, g, b] = &mut planes;
     for (((pixel, r), g), b) in rgb.as_chunks::<3>().0.iter().zip(r).zip(g).zip(b) {
@@ -47,13 +47,13 @@ pub(super) fn convert<V: Lanes>(
     }
 }
 
-/// What magnitudes of coefficients are multiplied by, twice; row by row of their horizontal
-/// frequency, as the transform leaves them.
+/// Two successive factors for the magnitudes of coefficients, row by row of their horizontal frequency, as the
+/// transform returns them.
 #[derive(Clone, Debug)]
 pub(super) struct Quantiser([[[i16; 8]; 8]; 2]);
 
 impl Quantiser {
-    /// Of divisors row by row of their vertical frequency.
+    /// Makes a quantiser from divisors, row by row of their vertical frequency.
     pub(super) fn new(divisors: &[u8; 64]) -> Self {
         let mut tables = [[[0; 8]; 8]; 2];
         for (at, &divisor) in divisors.iter().enumerate() {
@@ -65,27 +65,26 @@ impl Quantiser {
     }
 }
 
-/// Returns x and y such that floor(n x / 2^16) y / 2^15 is n / 32 d, both rounded to the nearest,
-/// halves up, for n up to 2^15.
+/// Returns x and y such that floor(n x / 2^16) y / 2^15 equals n / 32 d for n up to 2^15, with both rounded to the
+/// nearest, halves up.
 ///
-/// With 2^s the greatest power of two below 32 d, y is 2^(15 - s), so the second product is a
-/// rounding shift by s; x is 2^(16 + s) / 32 d, rounded up, so too large by less than 1. That adds
-/// less than n / 2^(16 + s) to the quotient, which is at most 1 / 32 d: to a multiple of 1 / 32 d
-/// it makes no difference.
+/// With 2^s as the greatest power of two below 32 d, y is 2^(15 - s), so the second product is a rounding shift by s. x
+/// is 2^(16 + s) / 32 d rounded up, so it is too large by less than 1. This adds less than n / 2^(16 + s) to the
+/// quotient, at most 1 / 32 d, which does not change the rounding of a multiple of 1 / 32 d.
 pub(super) fn factors(divisor: u8) -> (u16, i16) {
     let divisor = 32 * u32::from(divisor);
     let s = (divisor - 1).ilog2();
     ((1u32 << (16 + s)).div_ceil(divisor) as u16, 1 << (15 - s))
 }
 
-/// Quantised coefficients of blocks side by side. Rows are horizontal frequencies, a block's 8
-/// lanes of them vertical ones.
+/// Quantised coefficients of blocks side by side. Rows are horizontal frequencies; the 8 lanes of a block are vertical
+/// frequencies.
 pub(super) struct Coefficients {
-    /// Magnitudes; 24 lanes more, so that a block's window of all is whole.
+    /// Magnitudes, with 24 extra lanes, so that the window of every block is complete.
     pub(super) magnitudes: [i16; 8 * ACROSS + 24],
-    /// The bits that tell a number from others of its category (T.81, F.1.2.1.1), times 32.
+    /// Bits that distinguish a number from others of its category (T.81, F.1.2.1.1), multiplied by 32.
     pub(super) bits: [i16; 8 * ACROSS + 24],
-    /// Which are not zero: by horizontal frequency, of each block a byte.
+    /// Masks of nonzero coefficients: one byte per horizontal frequency and block.
     pub(super) nonzero: [[u8; BLOCKS]; 8],
 }
 
@@ -95,7 +94,7 @@ impl Coefficients {
         Self { magnitudes: lanes, bits: lanes, nonzero: [[0; BLOCKS]; 8] }
     }
 
-    /// Returns magnitudes and bits from a block on.
+    /// Returns magnitudes and bits, starting with a block.
     #[inline(always)]
     pub(super) fn of_block(&self, block: usize) -> (&[i16; 8 * ACROSS], &[i16; 8 * ACROSS]) {
         let from = 8 * block;
@@ -117,7 +116,7 @@ pub(super) fn transform<V: Lanes>(
         for (u, row) in frequencies(rows).into_iter().enumerate() {
             let [x, y] = quantiser.0.each_ref().map(|rows| V::every_block(&rows[u]));
             let magnitude = row.abs().times_unsigned(x).times(y);
-            // All bits below the highest one too, for numbers of up to 11 bits.
+            // Sets all bits below the highest one, for numbers of up to 11 bits.
             let ones = magnitude.or(magnitude.down::<1>());
             let ones = ones.or(ones.down::<2>());
             let ones = ones.or(ones.down::<4>());
@@ -131,21 +130,20 @@ pub(super) fn transform<V: Lanes>(
     }
 }
 
-/// Returns the coefficients of blocks: rows of samples in, rows of horizontal frequencies out.
-/// [1/32]
+/// Returns the coefficients of blocks: rows of samples in, rows of horizontal frequencies out. [1/32]
 #[inline(always)]
 pub(super) fn frequencies<V: Lanes>(rows: [V; 8]) -> [V; 8] {
     columns::<V, true>(transpose(columns::<V, false>(rows)))
 }
 
-/// Discrete cosine transform of all columns, times the square root of 8, or half of that.
+/// Discrete cosine transform of all columns, multiplied by the square root of 8, or half of that.
 ///
-/// The even half is the usual one. Of the odd half, with rotations a, b of the differences 0 and 3
-/// by 3 pi/16 and e, g of 1 and 2 by pi/16: a + g and b + e make coefficients 1 and 7, a - g and
-/// b - e 3 and 5 (Loeffler, Ligtenberg, Moschytz, ICASSP 1989).
+/// The even half is the usual one. In the odd half, a and b are the differences 0 and 3 rotated by 3 pi/16, e and g are
+/// 1 and 2 rotated by pi/16. Then a + g and b + e give coefficients 1 and 7, a - g and b - e give 3 and 5 (Loeffler,
+/// Ligtenberg, Moschytz, ICASSP 1989).
 ///
-/// Samples are within 2^10, [1/8]. So what comes of them is within 2^13 after the first pass, and
-/// within 2^15 after the second, halved one: -2^15 only where all samples are -2^10.
+/// Samples are within 2^10 [1/8]. So results are within 2^13 after the first pass, and within 2^15 after the second,
+/// halved one. -2^15 occurs only if all samples are -2^10.
 #[inline(always)]
 fn columns<V: Lanes, const HALVED: bool>(rows: [V; 8]) -> [V; 8] {
     let times = |row: V, factor: f64| row.times(V::all(fixed(factor)));
@@ -186,8 +184,7 @@ fn columns<V: Lanes, const HALVED: bool>(rows: [V; 8]) -> [V; 8] {
     ]
 }
 
-/// Swaps rows and columns of each block: each of three turns moves one bit of a row's number to
-/// the lane's.
+/// Transposes each block: each of the three turns moves one bit of the row's number to the lane's.
 #[inline(always)]
 fn transpose<V: Lanes>(mut rows: [V; 8]) -> [V; 8] {
     for _ in 0..3 {

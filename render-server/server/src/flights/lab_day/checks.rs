@@ -1,4 +1,4 @@
-//! The checks of a lab day: what there is to check, and what measurements are worth. Pure.
+//! Checks of a lab day, and evaluation of their measurements. Pure.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::pose::PoseQuality;
@@ -7,10 +7,10 @@ use vizflyt_protocol::messages::{ArenaInfo, ClockState, Guarded, VehicleState};
 
 use super::pose_window::PoseWindow;
 
-/// A check.
+/// Id of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-#[allow(missing_docs)] // Why: `CHECKS` says what each is.
+#[allow(missing_docs)] // Why: `CHECKS` describes each.
 pub enum CheckId {
     Net,
     People,
@@ -26,38 +26,37 @@ pub enum CheckId {
     Stop,
 }
 
-/// How a check comes to its evidence.
+/// Source of a check's evidence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum How {
-    /// A person looks, and signs.
+    /// A person inspects and signs.
     Signed,
-    /// The server measures it by itself, once a second.
+    /// The server measures it automatically, once a second.
     Live,
-    /// `vizflyt doctor` brings it.
+    /// `vizflyt doctor` sends it.
     Brought,
-    /// Somebody moves the vehicle, and the server watches.
+    /// A person moves the vehicle, and the server evaluates the poses.
     Guided,
-    /// The stop button is pressed, and the server watches what comes of it.
+    /// A person presses the stop button, and the server measures the reaction.
     Pressed,
 }
 
-/// What a check is.
+/// Description of a check.
 #[derive(Clone, Copy, Debug)]
 pub struct CheckInfo {
-    /// Which.
     pub id: CheckId,
-    /// Its name, in a few words.
+    /// Short name.
     pub title: &'static str,
-    /// Where its evidence comes from.
+    /// Source of its evidence.
     pub how: How,
-    /// It is of the room, not of each vehicle.
+    /// Whether the check is for the room instead of each vehicle.
     pub of_room: bool,
-    /// What to do for it.
+    /// Instruction for the user.
     pub ask: &'static str,
 }
 
-/// Every check, in the order of a lab's morning.
+/// All checks, in the usual order before flights.
 pub const CHECKS: [CheckInfo; 12] = [
     info(
         CheckId::Net,
@@ -150,13 +149,13 @@ const fn info(
 }
 
 impl CheckId {
-    /// Returns what it is.
+    /// Returns the description of the check.
     pub fn info(self) -> &'static CheckInfo {
-        // The order of `CHECKS` is that of the names; a test holds it.
+        // `CHECKS` has the order of the variants; a test checks this.
         &CHECKS[self as usize]
     }
 
-    /// Returns how long its evidence counts. [s]
+    /// Returns the validity of its evidence. [s]
     pub fn valid_s(self) -> f64 {
         match self.info().how {
             How::Live => LIVE_S,
@@ -165,27 +164,27 @@ impl CheckId {
     }
 }
 
-/// What a check has found.
+/// Result of a check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Finding {
-    /// Whether it is as it must be.
+    /// Whether the check passed.
     pub ok: bool,
-    /// What was measured, with units.
+    /// Measured values with units.
     pub evidence: String,
-    /// What to do where it is not; else empty.
+    /// Instruction if it failed; else empty.
     pub todo: String,
 }
 
 impl Finding {
-    /// Returns a finding of which nothing is wrong if `todo` has nothing to say.
+    /// Returns a finding that passes if `todo` is empty.
     pub fn of(evidence: String, todo: &[String]) -> Self {
         Self { ok: todo.is_empty(), evidence, todo: todo.join("; ") }
     }
 }
 
-/// Returns what the poses of the last seconds are worth; `None` if none has ever come. `quality` is the filter's;
-/// `now_s` is on the clock of the window.
+/// Evaluates the poses of the last seconds; `None` before the first. `quality` is the filter's; `now_s` is on
+/// the clock of the window.
 pub fn localization(
     now_s: f64,
     window: &PoseWindow,
@@ -232,12 +231,12 @@ pub fn localization(
     Some(Finding::of(evidence, &todo))
 }
 
-/// What a connection has done up to a moment.
+/// State of a connection at one time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Traffic {
-    /// When. [s]
+    /// Time. [s]
     pub at_s: f64,
-    /// Round trip, smoothed. [ms]
+    /// Smoothed round-trip time. [ms]
     pub rtt_ms: f64,
     /// Packets sent so far.
     pub sent: u64,
@@ -247,20 +246,20 @@ pub struct Traffic {
     pub bytes: u64,
 }
 
-/// Returns what the network between two moments is worth; `None` if too little was sent to tell.
+/// Evaluates the network between two times; `None` if too few packets were sent.
 pub fn network(before: &Traffic, now: &Traffic) -> Option<Finding> {
     let seconds = now.at_s - before.at_s;
     let sent = now.sent.checked_sub(before.sent)?;
     if seconds <= 0.0 || sent < MIN_PACKETS {
         return None;
     }
-    // What was lost may have been sent before.
+    // The lost packets may have been sent before the interval.
     let lost = now.lost.saturating_sub(before.lost).min(sent);
     let lost_percent = 100.0 * lost as f64 / sent as f64;
     let mbit_s = now.bytes.saturating_sub(before.bytes) as f64 * 8e-6 / seconds;
     let mut todo = Vec::new();
     if now.rtt_ms > MAX_RTT_MS {
-        todo.push(format!("a round trip takes more than {MAX_RTT_MS:.0} ms: by cable, or 5 GHz with nobody else on \
+        todo.push(format!("a round trip takes more than {MAX_RTT_MS:.0} ms: by cable, or 5 GHz with no other sender on \
              the channel (docs/guides/network.md)"));
     }
     if lost_percent > MAX_LOST_PERCENT {
@@ -276,7 +275,7 @@ pub fn network(before: &Traffic, now: &Traffic) -> Option<Finding> {
     Some(Finding::of(evidence, &todo))
 }
 
-/// Returns what the relation of the two clocks is worth.
+/// Evaluates the synchronization of the two clocks.
 pub fn clocks(clock: &ClockState) -> Finding {
     let mut todo = Vec::new();
     if !(clock.error_bound_ms <= MAX_CLOCK_MS) {
@@ -295,8 +294,8 @@ pub fn clocks(clock: &ClockState) -> Finding {
     Finding::of(evidence, &todo)
 }
 
-/// Returns what the ages of images are worth: from the pose to the plugin, of `images` in `seconds`; `None` without
-/// any.
+/// Evaluates the age of images, from the pose to the plugin, of `images` images in `seconds`; `None` without
+/// images.
 pub fn latency(p50_ms: f32, p99_ms: f32, images: u64, seconds: f32) -> Option<Finding> {
     if images == 0 {
         return None;
@@ -314,7 +313,7 @@ pub fn latency(p50_ms: f32, p99_ms: f32, images: u64, seconds: f32) -> Option<Fi
     Some(Finding::of(evidence, &todo))
 }
 
-/// Returns what the battery is worth, as the autopilot reports it.
+/// Evaluates the battery's state reported by the autopilot.
 pub fn battery(state: &VehicleState) -> Finding {
     let (volts, fraction) = (f64::from(state.battery_v), f64::from(state.battery_fraction));
     match (volts > 0.0, fraction >= 0.0) {
@@ -334,20 +333,20 @@ pub fn battery(state: &VehicleState) -> Finding {
     }
 }
 
-/// A parameter of the autopilot's fence, as `vizflyt doctor vehicle` found it.
+/// Parameter of the autopilot's fence, as read by `vizflyt doctor vehicle`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FenceParameter {
-    /// Its name in ArduCopter.
+    /// Name in ArduCopter.
     pub name: String,
-    /// What the autopilot has; absent if it has none.
+    /// Value in the autopilot; absent if it has none.
     pub has: Option<f64>,
-    /// What the arena asks for.
+    /// Value required by the arena.
     pub right: f64,
 }
 
-/// Returns whether arena, guard and autopilot keep the same fence. `parameters` are the autopilot's, `None` if nobody
-/// has brought them.
+/// Checks that arena, guard and autopilot have the same fence. `parameters` are the autopilot's; `None` if they
+/// were not sent.
 pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParameter]>) -> Finding {
     let mut todo = Vec::new();
     let no_fly = arena.no_fly.len();
@@ -368,12 +367,12 @@ pub fn fence(arena: &ArenaInfo, guard: &Guarded, parameters: Option<&[FenceParam
         Some(count) => format!("{count} polygons accepted"),
         None if matches!(arena.geofence, Volume::Cuboid { .. }) => {
             todo.push(
-                "the autopilot has not accepted the net as polygons: the page's events say why"
+                "the autopilot has not accepted the net as polygons: see the page's events"
                     .to_owned(),
             );
             "no polygons".to_owned()
         }
-        None => "no polygons, as the fence is no box".to_owned(),
+        None => "no polygons, because the fence is not a box".to_owned(),
     };
     match parameters {
         None => {
@@ -418,25 +417,25 @@ fn extent(volume: &Volume) -> String {
     }
 }
 
-/// Live evidence counts for so long after its last measurement. [s]
+/// Validity of live evidence after its last measurement. [s]
 const LIVE_S: f64 = 60.0;
-/// What people did counts for a day in the lab. [s]
+/// Validity of evidence from people: a day in the lab. [s]
 const DAY_S: f64 = 12.0 * 3600.0;
-/// Without a pose for so long nothing else is worth saying. [s]
+/// Time without a pose after which only the silence is reported. [s]
 const SILENT_S: f64 = 1.0;
-/// What the guard keeps free to the fence (docs/guides/safety.md). [mm]
+/// Distance that the guard keeps to the fence (docs/guides/safety.md). [mm]
 const KEPT_FREE_MM: f64 = 200.0;
-/// A good motion capture has a tenth of it, tags a half. [mm]
+/// Maximum jitter at rest: motion capture has a tenth of it, tags a half. [mm]
 const MAX_JITTER_MM: f64 = 10.0;
-/// A tenth of the age at which flight slows down, there and back. [ms]
+/// Maximum round trip: a tenth of the image age at which flight slows down, in both directions. [ms]
 const MAX_RTT_MS: f64 = 20.0;
-/// What is lost is sent again, a round trip later. [%]
+/// Maximum packet loss; lost data are sent again a round trip later. [%]
 const MAX_LOST_PERCENT: f64 = 1.0;
-/// Fewer say nothing of a loss of 1 %.
+/// Minimum packets for a measurement of a loss of 1 %.
 const MIN_PACKETS: u64 = 100;
-/// What ages of images may be off by. [ms]
+/// Maximum error of image ages. [ms]
 const MAX_CLOCK_MS: f32 = 5.0;
-/// From here on the guard slows the vehicle down (docs/guides/safety.md). [ms]
+/// Maximum image age: above it the guard slows the vehicle down (docs/guides/safety.md). [ms]
 const MAX_AGE_MS: f64 = 150.0;
-/// A flight of five minutes takes about so much of a pack.
+/// Minimum charge: about what a flight of five minutes uses.
 const LEAST_CHARGE: f64 = 0.5;

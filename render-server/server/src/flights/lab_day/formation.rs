@@ -1,45 +1,45 @@
-//! Several vehicles at once: the order of take-off, and how far they keep apart. Pure.
+//! Several vehicles at once: order of take-off, and separation in the air. Pure.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// Who takes off after whom.
+/// Order of take-off.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TakeOffOrder {
-    /// The vehicles' names, first to last; empty is no order.
+    /// Names of the vehicles, first to last; empty means no order.
     pub vehicles: Vec<String>,
-    /// How far the one before must be.
+    /// Condition for the preceding vehicle.
     pub until: Until,
 }
 
-/// How far the vehicle before must be.
+/// Condition for the preceding vehicle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Until {
-    /// In the air, its take-off over: all fly together.
+    /// Its take-off is complete: all fly together.
     #[default]
     Up,
-    /// On the ground again: one after the other.
+    /// It has landed: one flies after the other.
     Landed,
 }
 
-/// Where a vehicle's flight stands.
+/// Progress of a vehicle's flight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stand {
-    /// It has not taken off, or is taking off.
+    /// Before or during take-off.
     Below,
-    /// Its take-off is over.
+    /// Take-off complete.
     Up,
-    /// It has flown and landed.
+    /// Flown and landed.
     Landed,
 }
 
 impl TakeOffOrder {
-    /// Checks that every vehicle of it is one of `known`, once.
+    /// Checks that the order contains only vehicles of `known`, each once.
     ///
     /// # Errors
-    /// The name that is wrong, and those that there are.
+    /// The wrong name, and the valid ones.
     pub fn check(&self, known: &[&str]) -> Result<(), String> {
         for (at, name) in self.vehicles.iter().enumerate() {
             if !known.contains(&name.as_str()) {
@@ -55,7 +55,7 @@ impl TakeOffOrder {
         Ok(())
     }
 
-    /// Says whether `vehicle` may take off, where the others stand as `stand` says.
+    /// Checks whether `vehicle` may take off; `stand` returns the progress of the others.
     ///
     /// # Errors
     /// Why not yet, and what to do.
@@ -87,48 +87,49 @@ impl TakeOffOrder {
     }
 }
 
-/// A vehicle in the air.
+/// Vehicle in the air.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Airborne {
-    /// Its index.
+    /// Index of the vehicle.
     pub vehicle: usize,
-    /// Where its centre is. [m, world]
+    /// Position of its centre. [m, world]
     pub p_world_m: DVec3,
-    /// When it took off. [s]
+    /// Time of its take-off. [s]
     pub took_off_s: f64,
 }
 
 /// Two vehicles that are too close.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TooClose {
-    /// The one that took off first, by its index.
+    /// Index of the one that took off first.
     pub first: usize,
-    /// The one that took off later.
+    /// Index of the one that took off later.
     pub later: usize,
-    /// Between their centres. [m]
+    /// Distance between their centres. [m]
     pub apart_m: f64,
-    /// Whom to land for it.
+    /// Vehicles to land.
     pub land: Vec<usize>,
 }
 
-/// Watches that vehicles in the air keep apart.
+/// Monitors the separation of vehicles in the air.
 ///
-/// Of two that come too close the one that took off later is landed: two that brake and sink beside each other gain
-/// no distance, while the first knows its way and flies on out of it. If they come as close as half of it all the same,
-/// the first is landed, too.
+/// Of two vehicles that come too close, the one that took off later is landed. If both braked and sank next to
+/// each other, the distance would not grow, while the first one continues on its path and leaves. If the
+/// distance still falls below half of the minimum, the first is landed, too.
 #[derive(Clone, Debug, Default)]
 pub struct SeparationWatch {
-    /// Pairs that were told of: first, later, and whether both were landed.
+    /// Pairs already reported: first, later, and whether both were landed.
     told: Vec<(usize, usize, bool)>,
 }
 
 impl SeparationWatch {
-    /// Returns which pairs have come too close since the last call. `least_m` is between centres.
+    /// Returns the pairs that have come too close since the last call. `least_m` is the minimum distance
+    /// between centres.
     pub fn judge(&mut self, least_m: f64, airborne: &[Airborne]) -> Vec<TooClose> {
         let mut found = Vec::new();
         self.told.retain(|(first, later, _)| {
             let is_up = |vehicle| airborne.iter().find(|a| a.vehicle == vehicle);
-            // Apart again by a margin, or on the ground.
+            // Dropped when they are apart again by a margin, or on the ground.
             is_up(*first).zip(is_up(*later)).is_some_and(|(a, b)| apart_m(a, b) < least_m * AGAIN)
         });
         for (at, a) in airborne.iter().enumerate() {
@@ -160,14 +161,13 @@ impl SeparationWatch {
     }
 }
 
-/// Returns the distance between two vehicles' centres. [m]
 pub fn apart_m(a: &Airborne, b: &Airborne) -> f64 {
     a.p_world_m.distance(b.p_world_m)
 }
 
-/// So many times the separation are two apart before they can be too close again.
+/// Factor of the separation that a pair must reach before it is reported again.
 const AGAIN: f64 = 1.2;
-/// Bounds of a separation that can be set. [m]
+/// Valid range of the separation. [m]
 pub const SEPARATION_M: std::ops::RangeInclusive<f64> = 0.2..=20.0;
 
 #[cfg(test)]
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn each_waits_for_the_one_before() {
+    fn each_waits_for_the_preceding_vehicle() {
         let check = |until, vehicle: &str, before: Stand, expected: Option<&str>| {
             let found = order(&["wasp", "bee", "ant"], until).may_start(vehicle, |_| before);
             assert_eq!(found.as_ref().err().map(String::as_str), expected, "{vehicle} {before:?}");
@@ -215,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn an_order_names_vehicles_that_there_are_once() {
+    fn an_order_contains_known_vehicles_once() {
         let known = ["wasp", "bee"];
         assert_eq!(order(&["bee", "wasp"], Until::Up).check(&known), Ok(()));
         assert_eq!(
@@ -230,17 +230,17 @@ mod tests {
     }
 
     #[test]
-    fn the_later_lands_and_nearer_still_the_first_too() {
+    fn lands_the_later_vehicle_and_below_half_the_first_too() {
         let mut watch = SeparationWatch::default();
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 1.1, 3.0)]), []);
         let found = watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 0.9, 3.0)]);
         assert_eq!((found[0].first, found[0].later, &found[0].land), (1, 0, &vec![0]));
         assert!((found[0].apart_m - 0.9).abs() < 1e-9);
-        // Told once.
+        // Reported once.
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 0.8, 3.0)]), []);
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 0.4, 3.0)])[0].land, [1]);
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 0.3, 3.0)]), []);
-        // Apart again, or down: it counts anew.
+        // Apart again, or landed: reported again.
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 1.3, 3.0)]), []);
         assert_eq!(watch.judge(1.0, &[at(0, 0.0, 5.0), at(1, 0.9, 3.0)])[0].land, [0]);
         assert_eq!(watch.judge(1.0, &[at(1, 0.9, 3.0)]), []);
@@ -248,7 +248,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whoever is too close to another is in a pair that was told of, and each pair lands somebody.
+        /// Each vehicle that is too close to another is in a reported pair, and each pair lands at least one.
         #[test]
         fn no_pair_is_missed(places in prop::collection::vec((-2.0..2.0_f64, 0.0..9.0_f64), 0..6)) {
             let airborne: Vec<_> = places.iter().enumerate().map(|(n, (x_m, s))| at(n, *x_m, *s)).collect();

@@ -1,10 +1,10 @@
-//! A lab day: what is checked before flights with its evidence, who flies when, and how several vehicles keep apart.
+//! Lab day: checks before flights with their evidence, the queue of teams, and the separation of vehicles.
 //!
 //! ```text
-//! in   what the server measures, what `vizflyt doctor` brings, what people sign; the page's orders; the time
-//! out  the state of each check, the queue, why a vehicle may not start, whom to land; the file that keeps it all
+//! in   measurements of the server, reports of `vizflyt doctor`, signatures; commands of the page; the time
+//! out  the state of each check, the queue, why a vehicle may not start, vehicles to land; the stored file
 //! ```
-//! Pure: whoever measures and keeps it is `web/lab`.
+//! Pure: `web/lab` measures and stores.
 
 pub mod checks;
 pub mod formation;
@@ -22,67 +22,64 @@ pub use self::checks::{CHECKS, CheckId, CheckInfo, FenceParameter, Finding, How}
 pub use self::formation::{SEPARATION_M, Stand, TakeOffOrder, Until};
 pub use self::queue::{Booking, BookingState, Queue};
 
-/// A lab day, as it is kept in its file.
+/// Lab day, as stored in its file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LabDay {
     version: u32,
-    /// When it began. [ms since 1970]
+    /// Start of the day. [ms since 1970]
     pub began_unix_ms: u64,
     records: Vec<Record>,
-    /// Who flies when.
+    /// Queue of teams.
     pub queue: Queue,
-    /// Who takes off after whom.
+    /// Order of take-off.
     pub order: TakeOffOrder,
-    /// Least distance between the centres of two vehicles in the air; none is kept without one. [m]
+    /// Minimum distance between the centres of two vehicles in the air; not enforced if absent. [m]
     pub separation_m: Option<f64>,
-    /// FENCE_* of each vehicle's autopilot, as brought by `vizflyt doctor vehicle`.
+    /// FENCE_* of each vehicle's autopilot, from `vizflyt doctor vehicle`.
     fences: Vec<(String, Vec<FenceParameter>)>,
     story: VecDeque<Told>,
 }
 
-/// The newest evidence of a check.
+/// Newest evidence of a check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Record {
-    /// Which vehicle; empty is the room.
+    /// Name of the vehicle; empty for the room.
     pub vehicle: String,
-    /// Which check.
     pub check: CheckId,
-    /// What was found.
     pub finding: Finding,
-    /// When. [ms since 1970]
+    /// Time of the evidence. [ms since 1970]
     pub at_unix_ms: u64,
-    /// By whom.
+    /// Who or what gave the evidence.
     pub by: String,
 }
 
-/// Something that happened, for the report.
+/// Log entry for the report.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Told {
-    /// When. [ms since 1970]
     pub at_unix_ms: u64,
-    /// In a sentence.
+    /// Text of the entry.
     pub text: String,
 }
 
-/// Where a check stands.
+/// State of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// There is no evidence.
+    /// Without evidence.
     NotDone,
-    /// It is as it must be.
+    /// Passed.
     Ok,
-    /// It is not.
+    /// Failed.
     Failed,
     /// The evidence is too old.
     Outdated,
 }
 
 impl State {
-    /// Returns it in words.
+    /// Returns the state as text.
     pub fn words(self) -> &'static str {
         match self {
             Self::NotDone => "not done",
@@ -93,22 +90,22 @@ impl State {
     }
 }
 
-/// Why a kept day cannot be used.
+/// Why a stored day cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum BadDay {
-    /// It is no day of ours.
-    #[error("it is no lab day of this version: {0}")]
+    /// The file cannot be parsed.
+    #[error("it is not a lab day of this version: {0}")]
     Unreadable(#[from] serde_json::Error),
-    /// Of another version.
+    /// Unsupported version.
     #[error("it is of version {0}, this program reads {VERSION}")]
     Version(u32),
-    /// What it says cannot be.
+    /// Inconsistent contents.
     #[error("{0}")]
     Unsound(&'static str),
 }
 
 impl LabDay {
-    /// Returns a day on which nothing was done yet.
+    /// Creates an empty day.
     pub fn new(now_unix_ms: u64) -> Self {
         Self {
             version: VERSION,
@@ -122,10 +119,10 @@ impl LabDay {
         }
     }
 
-    /// Reads a day that was kept.
+    /// Parses a stored day.
     ///
     /// # Errors
-    /// Bytes that are none.
+    /// Invalid bytes.
     pub fn parse(bytes: &[u8]) -> Result<Self, BadDay> {
         let day: Self = serde_json::from_slice(bytes)?;
         if day.version != VERSION {
@@ -133,27 +130,27 @@ impl LabDay {
         }
         let is_finite = day.separation_m.is_none_or(|m| SEPARATION_M.contains(&m));
         if !is_finite {
-            return Err(BadDay::Unsound("its separation is outside what can be set"));
+            return Err(BadDay::Unsound("its separation is out of range"));
         }
         if !day.queue.is_sound() {
-            return Err(BadDay::Unsound("its queue cannot be"));
+            return Err(BadDay::Unsound("its queue is inconsistent"));
         }
         if day.records.len() > MAX_RECORDS
             || day.story.len() > MAX_STORY
             || day.fences.len() > MAX_RECORDS
         {
-            return Err(BadDay::Unsound("it is longer than any day"));
+            return Err(BadDay::Unsound("it has too many entries"));
         }
         Ok(day)
     }
 
-    /// Returns it as bytes to keep.
+    /// Returns the bytes of the file.
     pub fn to_bytes(&self) -> Vec<u8> {
-        // Why: it has string keys and finite numbers alone.
+        // It has only string keys and finite numbers.
         serde_json::to_vec_pretty(self).unwrap_or_default()
     }
 
-    /// Takes the evidence of a check; what changes is told. Returns whether something was.
+    /// Records the evidence of a check, and logs changes. Returns whether an entry was logged.
     pub fn record(
         &mut self,
         vehicle: &str,
@@ -185,7 +182,7 @@ impl LabDay {
         is_told
     }
 
-    /// Takes a signature back.
+    /// Removes a signature.
     pub fn unsign(&mut self, vehicle: &str, check: CheckId, by: &str, now_unix_ms: u64) {
         self.records.retain(|r| !(r.vehicle == vehicle && r.check == check));
         let of = if vehicle.is_empty() { String::new() } else { format!("{vehicle}: ") };
@@ -197,7 +194,7 @@ impl LabDay {
         self.records.iter().find(|r| r.vehicle == vehicle && r.check == check)
     }
 
-    /// Returns where a check stands.
+    /// Returns the state of a check.
     pub fn state(&self, vehicle: &str, check: CheckId, now_unix_ms: u64) -> State {
         let Some(record) = self.evidence(vehicle, check) else { return State::NotDone };
         let age_s = now_unix_ms.saturating_sub(record.at_unix_ms) as f64 * 1e-3;
@@ -210,7 +207,7 @@ impl LabDay {
         }
     }
 
-    /// Takes FENCE_* of a vehicle's autopilot.
+    /// Stores FENCE_* of a vehicle's autopilot.
     pub fn bring_fence(&mut self, vehicle: &str, fence: Vec<FenceParameter>) {
         self.fences.retain(|(name, _)| name != vehicle);
         if self.fences.len() < MAX_RECORDS {
@@ -218,7 +215,7 @@ impl LabDay {
         }
     }
 
-    /// Returns FENCE_* of a vehicle's autopilot, if they were brought and the evidence still counts.
+    /// Returns FENCE_* of a vehicle's autopilot, if stored and still valid.
     pub fn fence(&self, vehicle: &str, now_unix_ms: u64) -> Option<&[FenceParameter]> {
         let is_old = matches!(
             self.state(vehicle, CheckId::Parameters, now_unix_ms),
@@ -228,10 +225,10 @@ impl LabDay {
         found.map(|(_, fence)| fence.as_slice())
     }
 
-    /// Sets the least distance between vehicles in the air; `None` is none. [m]
+    /// Sets the minimum distance between vehicles in the air; `None` disables it. [m]
     ///
     /// # Errors
-    /// A distance that cannot be kept.
+    /// A distance out of range.
     pub fn set_separation(&mut self, least_m: Option<f64>) -> Result<(), String> {
         if let Some(least_m) = least_m.filter(|m| !SEPARATION_M.contains(m)) {
             let (from, to) = (SEPARATION_M.start(), SEPARATION_M.end());
@@ -243,7 +240,7 @@ impl LabDay {
         Ok(())
     }
 
-    /// Notes something for the report.
+    /// Adds an entry to the log of the report.
     pub fn tell(&mut self, text: String, now_unix_ms: u64) {
         if self.story.len() >= MAX_STORY {
             self.story.pop_front();
@@ -251,14 +248,14 @@ impl LabDay {
         self.story.push_back(Told { at_unix_ms: now_unix_ms, text });
     }
 
-    /// Returns what happened, oldest first.
+    /// Returns the log, oldest first.
     pub fn story(&self) -> impl Iterator<Item = &Told> {
         self.story.iter()
     }
 }
 
 const VERSION: u32 = 1;
-/// Checks of eight vehicles, and of some that were there before.
+/// Maximum records: for eight vehicles, and for some that were used before.
 const MAX_RECORDS: usize = 400;
-/// What is told of a day; of more the newest.
+/// Maximum log entries; the oldest are dropped.
 const MAX_STORY: usize = 1000;

@@ -1,41 +1,41 @@
-//! The poses of the last seconds: how long apart, how still. Pure.
+//! Poses of the last seconds: gaps and jitter. Pure.
 
 use std::collections::VecDeque;
 
 use glam::DVec3;
 use vizflyt_protocol::messages::PoseSample;
 
-/// The poses of the last seconds, and the newest for ever.
+/// Poses of the last [`WINDOW_S`]; the newest stays.
 #[derive(Clone, Debug, Default)]
 pub struct PoseWindow {
     poses: VecDeque<(f64, DVec3)>,
     allowance_s: f32,
-    /// When the first came since the last silence. [s]
+    /// Time of the first pose since the last silence. [s]
     since_s: f64,
 }
 
-/// What a [`PoseWindow`] shows.
+/// Summary of a [`PoseWindow`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseSummary {
-    /// Since the newest. [s]
+    /// Time since the newest pose. [s]
     pub age_s: f64,
-    /// Longest time between two, of those that were looked at. [s]
+    /// Longest time between two poses of the window, including the time since the newest. [s]
     pub gap_s: f64,
-    /// Spread about their middle, root mean square; `None` if it moves. [mm]
+    /// Root mean square distance from the mean; `None` if it moves. [mm]
     pub jitter_mm: Option<f64>,
-    /// The newest one's [`PoseSample::allowance_s`]. [s]
+    /// [`PoseSample::allowance_s`] of the newest pose. [s]
     pub allowance_s: f32,
 }
 
 impl PoseWindow {
-    /// Takes a pose.
+    /// Adds a pose.
     pub fn push(&mut self, pose: &PoseSample) {
         let at_s = pose.stamp.as_ns() as f64 * 1e-9;
         let last_s = self.poses.back().map(|(last_s, _)| *last_s);
         if last_s.is_some_and(|last_s| at_s <= last_s) {
             return;
         }
-        // A silence is told of while it lasts, and is over when poses come again.
+        // A silence is reported while it lasts; it ends when poses arrive again.
         if last_s.is_none_or(|last_s| at_s - last_s > WINDOW_S) {
             self.poses.clear();
             self.since_s = at_s;
@@ -49,7 +49,7 @@ impl PoseWindow {
         }
     }
 
-    /// Returns what it shows; `None` before there were poses for a second.
+    /// Returns the summary; `None` before poses have arrived for a second.
     pub fn summary(&self, now_s: f64) -> Option<PoseSummary> {
         let &(last_s, _) = self.poses.back()?;
         let age_s = (now_s - last_s).max(0.0);
@@ -72,11 +72,11 @@ impl PoseWindow {
     }
 }
 
-/// What is older is forgotten. [s]
+/// Length of the window. [s]
 const WINDOW_S: f64 = 3.0;
-/// Some 500 Hz.
+/// Maximum poses: about 500 Hz.
 const MAX_POSES: usize = 1500;
-/// Poses for so long say something. [s]
+/// Minimum time of poses for a summary. [s]
 const SETTLED_S: f64 = 1.0;
-/// What goes further from its middle moves. [m]
+/// Distance from the mean above which the vehicle moves. [m]
 const MOVING_M: f64 = 0.05;

@@ -1,8 +1,8 @@
-//! Who flies when: a queue of teams for each vehicle, by the time of their booking. Pure.
+//! Queue of teams for each vehicle, in the order of booking. Pure.
 
 use serde::{Deserialize, Serialize};
 
-/// The bookings of a day, in the order in which they are called.
+/// Bookings of a day, in the order in which they are called.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Queue {
@@ -10,56 +10,51 @@ pub struct Queue {
     bookings: Vec<Booking>,
 }
 
-/// A team's place.
+/// Booking of a team.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Booking {
-    /// Its number.
     pub id: u64,
-    /// Who flies.
     pub team: String,
-    /// On which vehicle.
     pub vehicle: String,
-    /// Where it stands.
     pub state: BookingState,
-    /// When it was booked. [ms since 1970]
+    /// Time of the booking. [ms since 1970]
     pub booked_unix_ms: u64,
-    /// When it was last called. [ms since 1970]
+    /// Time of the last call. [ms since 1970]
     pub called_unix_ms: Option<u64>,
-    /// When it was over. [ms since 1970]
+    /// Time of the end. [ms since 1970]
     pub ended_unix_ms: Option<u64>,
-    /// How often it was called and nobody came.
+    /// Number of calls for which the team did not appear.
     pub passed_over: u32,
 }
 
-/// Where a booking stands.
+/// State of a booking.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BookingState {
-    /// In the queue.
     Waiting,
-    /// Its turn.
+    /// Called to fly.
     Called,
-    /// It was its turn.
+    /// Turn ended.
     Done,
-    /// The team or the instructor took it out.
+    /// Withdrawn by the team or the instructor.
     Withdrawn,
 }
 
 impl BookingState {
-    /// Whether it is still to come or under way.
+    /// Returns whether it is waiting or called.
     fn is_open(self) -> bool {
         matches!(self, Self::Waiting | Self::Called)
     }
 }
 
 impl Queue {
-    /// Returns all bookings: open ones in the order in which they are called.
+    /// Returns all bookings, the open ones in the order in which they are called.
     pub fn bookings(&self) -> &[Booking] {
         &self.bookings
     }
 
-    /// Returns the team whose turn it is on a vehicle.
+    /// Returns the called booking of a vehicle.
     pub fn called(&self, vehicle: &str) -> Option<&Booking> {
         self.bookings.iter().find(|b| b.vehicle == vehicle && b.state == BookingState::Called)
     }
@@ -78,7 +73,7 @@ impl Queue {
     /// Books for a team; returns the booking's number.
     ///
     /// # Errors
-    /// A name that is none, a team that waits already, a queue that is full.
+    /// An invalid name, a team that is already in a queue, or a full queue.
     pub fn book(&mut self, team: &str, vehicle: &str, now_unix_ms: u64) -> Result<u64, String> {
         let team = team.trim();
         let length = team.chars().count();
@@ -116,7 +111,7 @@ impl Queue {
     /// Calls the next team of a vehicle; returns its name.
     ///
     /// # Errors
-    /// One is called already, or nobody waits.
+    /// A team is called already, or no team waits.
     pub fn call_next(&mut self, vehicle: &str, now_unix_ms: u64) -> Result<&str, String> {
         if let Some(called) = self.called(vehicle) {
             return Err(format!(
@@ -128,15 +123,15 @@ impl Queue {
             .bookings
             .iter_mut()
             .find(|b| b.vehicle == vehicle && b.state == BookingState::Waiting);
-        let next = next.ok_or_else(|| format!("nobody waits for {vehicle}"))?;
+        let next = next.ok_or_else(|| format!("no team waits for {vehicle}"))?;
         (next.state, next.called_unix_ms) = (BookingState::Called, Some(now_unix_ms));
         Ok(&next.team)
     }
 
-    /// Puts the called team of a vehicle back to the end of the queue: it did not come. Returns its name.
+    /// Moves the called team of a vehicle to the end of the queue, because it did not appear. Returns its name.
     ///
     /// # Errors
-    /// Nobody is called.
+    /// No team is called.
     pub fn pass_over(&mut self, vehicle: &str) -> Result<String, String> {
         let at = self.called_at(vehicle)?;
         let mut booking = self.bookings.remove(at);
@@ -150,7 +145,7 @@ impl Queue {
     /// Ends the turn of a vehicle's called team; returns its name.
     ///
     /// # Errors
-    /// Nobody is called.
+    /// No team is called.
     pub fn end(&mut self, vehicle: &str, now_unix_ms: u64) -> Result<String, String> {
         let at = self.called_at(vehicle)?;
         let booking = &mut self.bookings[at];
@@ -158,10 +153,10 @@ impl Queue {
         Ok(booking.team.clone())
     }
 
-    /// Takes a waiting booking out; returns its team.
+    /// Withdraws a waiting booking; returns its team.
     ///
     /// # Errors
-    /// There is no such booking, or it does not wait.
+    /// The booking does not exist, or is not waiting.
     pub fn withdraw(&mut self, id: u64, now_unix_ms: u64) -> Result<String, String> {
         let found =
             self.bookings.iter_mut().find(|b| b.id == id && b.state == BookingState::Waiting);
@@ -170,7 +165,7 @@ impl Queue {
         Ok(booking.team.clone())
     }
 
-    /// Whether a queue that was read is one that the orders above can make.
+    /// Returns whether a parsed queue is one that the methods above can produce.
     pub(super) fn is_sound(&self) -> bool {
         let open = self.bookings.iter().filter(|b| b.state.is_open()).count();
         let is_known = |b: &Booking| (1..=self.next_id).contains(&b.id) && !b.team.is_empty();
@@ -199,15 +194,15 @@ impl Queue {
             .bookings
             .iter()
             .position(|b| b.vehicle == vehicle && b.state == BookingState::Called);
-        found.ok_or_else(|| format!("nobody is called on {vehicle}"))
+        found.ok_or_else(|| format!("no team is called on {vehicle}"))
     }
 }
 
-/// Longest name of a team. [letters]
+/// Maximum length of a team's name. [characters]
 const MAX_NAME: usize = 40;
-/// Teams that wait or fly.
+/// Maximum of open bookings.
 const MAX_OPEN: usize = 64;
-/// Bookings that are kept, with those that are over.
+/// Maximum of stored bookings, including ended ones.
 const MAX_BOOKINGS: usize = 512;
 
 #[cfg(test)]
@@ -217,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn teams_are_called_in_turn_and_a_no_show_goes_to_the_end() {
+    fn calls_teams_in_turn_and_moves_a_no_show_to_the_end() {
         let mut queue = Queue::default();
         let ants = queue.book("ants", "wasp", 1).unwrap();
         let bees = queue.book(" bees ", "wasp", 2).unwrap();
@@ -232,8 +227,8 @@ mod tests {
         assert_eq!(queue.call_next("wasp", 12), Ok("bees"));
         assert_eq!(queue.end("wasp", 20), Ok("bees".to_owned()));
         assert_eq!(queue.withdraw(ants, 21), Ok("ants".to_owned()));
-        assert_eq!(queue.call_next("wasp", 22), Err("nobody waits for wasp".to_owned()));
-        assert_eq!(queue.end("wasp", 22), Err("nobody is called on wasp".to_owned()));
+        assert_eq!(queue.call_next("wasp", 22), Err("no team waits for wasp".to_owned()));
+        assert_eq!(queue.end("wasp", 22), Err("no team is called on wasp".to_owned()));
         let ants = queue.bookings().iter().find(|b| b.id == ants).unwrap();
         assert_eq!(
             (ants.passed_over, ants.called_unix_ms, ants.ended_unix_ms),
@@ -242,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_team_has_one_place_and_a_name() {
+    fn a_team_has_one_booking_and_a_valid_name() {
         let mut queue = Queue::default();
         queue.book("ants", "wasp", 1).unwrap();
         assert_eq!(
@@ -274,7 +269,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_is_ordered_the_queue_is_sound(orders in prop::collection::vec((0..6_u8, 0..4_u8, 0..2_u8), 0..80)) {
+        fn any_commands_leave_a_consistent_queue(orders in prop::collection::vec((0..6_u8, 0..4_u8, 0..2_u8), 0..80)) {
             let mut queue = Queue::default();
             for (at, (order, team, vehicle)) in orders.into_iter().enumerate() {
                 let (team, vehicle) = (["a", "b", "c", "d"][usize::from(team)], ["v", "w"][usize::from(vehicle)]);
@@ -288,7 +283,7 @@ mod tests {
                     _ => queue.withdraw(at / 2, at).is_ok().then_some(-1),
                 };
                 let now = queue.bookings().iter().filter(|b| b.state.is_open()).count();
-                // Nobody is lost, nobody appears.
+                // No booking is lost or added.
                 prop_assert_eq!(now as i64 - open as i64, done.unwrap_or(0));
                 prop_assert!(queue.is_sound());
             }

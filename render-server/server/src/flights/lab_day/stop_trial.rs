@@ -1,14 +1,14 @@
-//! The stop button tried: from the press to the runtime's receipt, its landing, and motors that stand. Pure.
+//! Trial of the stop button: delay until the runtime's receipt, its landing, and disarmed motors. Pure.
 
 use vizflyt_protocol::messages::FlightPhase;
 use vizflyt_protocol::time::ServerTime;
 
 use super::checks::Finding;
 
-/// A press of the stop button that is followed.
+/// Trial of one press of the stop button.
 #[derive(Clone, Copy, Debug)]
 pub struct StopTrial {
-    /// Number of the event.
+    /// Number of the stop event.
     seq: u64,
     pressed: ServerTime,
     received_ms: Option<f64>,
@@ -16,30 +16,30 @@ pub struct StopTrial {
     stands_ms: Option<f64>,
 }
 
-/// What is known of the vehicle at a moment.
+/// State of the vehicle at one time.
 #[derive(Clone, Copy, Debug)]
 pub struct Seen {
-    /// Number up to which the runtime has received events.
+    /// Number of the last event that the runtime has received.
     pub received: u64,
-    /// Phase by its newest report.
+    /// Phase of its newest report.
     pub phase: FlightPhase,
-    /// Motors may turn, by its newest report.
+    /// Whether the motors are armed, from its newest report.
     pub armed: bool,
 }
 
 impl StopTrial {
-    /// Begins with the press, event number `seq`.
+    /// Starts a trial at the press, event number `seq`.
     pub fn new(seq: u64, pressed: ServerTime) -> Self {
         Self { seq, pressed, received_ms: None, obeyed_ms: None, stands_ms: None }
     }
 
-    /// Takes what is known at `now`.
+    /// Processes the vehicle's state at `now`.
     pub fn handle(&mut self, now: ServerTime, seen: Seen) {
         let since_ms = now.seconds_since(self.pressed) * 1e3;
         if seen.received >= self.seq {
             self.received_ms.get_or_insert(since_ms);
         }
-        // A report from before the order cannot say that it was obeyed.
+        // A report from before the receipt does not show that the order was obeyed.
         if self.received_ms.is_some()
             && matches!(seen.phase, FlightPhase::Landing | FlightPhase::Landed)
         {
@@ -50,7 +50,7 @@ impl StopTrial {
         }
     }
 
-    /// Returns the result, when there is nothing more to wait for.
+    /// Returns the result when it is final.
     pub fn result(&self, now: ServerTime) -> Option<Finding> {
         let waited_s = now.seconds_since(self.pressed);
         if self.stands_ms.is_none() && waited_s < PATIENCE_S {
@@ -82,9 +82,9 @@ impl StopTrial {
     }
 }
 
-/// What the page's order may take to the runtime, and the runtime's report back, sent ten times a second. [ms]
+/// Maximum delay of the order to the runtime, and of its report, which is sent ten times a second. [ms]
 const MAX_MS: f64 = 500.0;
-/// A landing from a net's height is over by then. [s]
+/// Time limit for the landing from a net's height. [s]
 const PATIENCE_S: f64 = 15.0;
 
 #[cfg(test)]
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stop_on_the_ground_is_measured() {
+    fn measures_a_stop_on_the_ground() {
         use FlightPhase::{Landed, Waiting};
         let found =
             run(&[(0.01, 6, Waiting, false), (0.02, 7, Waiting, false), (0.12, 7, Landed, false)])
@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stop_in_flight_waits_for_motors_that_stand() {
+    fn a_stop_in_flight_waits_until_disarmed() {
         use FlightPhase::{Flying, Landed, Landing};
         let seen = [
             (0.02, 7, Flying, true),
@@ -133,13 +133,13 @@ mod tests {
     }
 
     #[test]
-    fn a_stop_that_nobody_hears_or_obeys_fails() {
+    fn an_unreceived_or_ignored_stop_fails() {
         use FlightPhase::{Flying, Landed, Landing};
         for seen in [
             &[(1.0, 6, Flying, true), (15.0, 6, Flying, true)][..],
             &[(0.7, 7, Flying, true), (0.8, 7, Landed, false)],
             &[(0.1, 7, Landing, true), (15.0, 7, Landing, true)],
-            // A landing of before is no answer.
+            // A landing from before does not count.
             &[(0.1, 6, Landed, false), (15.0, 6, Landed, false)],
         ] {
             let found = run(seen).unwrap();

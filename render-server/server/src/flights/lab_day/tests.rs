@@ -28,14 +28,14 @@ fn bad() -> Finding {
 }
 
 #[test]
-fn checks_stand_in_the_order_of_their_names() {
+fn checks_have_the_order_of_their_ids() {
     for (at, check) in CHECKS.iter().enumerate() {
         assert_eq!(check.id as usize, at);
         assert_eq!(check.id.info().title, check.title);
     }
 }
 
-/// Poses at a rate, still but for a step of noise, with one gap; looked at `later_s` after the last.
+/// Evaluates poses at a rate, at rest except for noise, with one gap, `later_s` after the last pose.
 fn localized(rate_hz: f64, noise_mm: f64, gap_s: f64, later_s: f64) -> Option<Finding> {
     let mut window = PoseWindow::default();
     let mut at_s = 100.0;
@@ -53,7 +53,7 @@ fn quality(rate_hz: f64) -> PoseQuality {
 }
 
 #[test]
-fn localization_is_judged_by_gaps_jitter_and_silence() {
+fn evaluates_localization_by_gaps_jitter_and_silence() {
     let good = localized(200.0, 0.5, 0.0, 0.005).unwrap();
     assert!(good.ok, "{good:?}");
     assert_eq!(good.evidence, "200 Hz, longest gap 5 ms, sigma 1.0 mm, 0.5 mm rms at rest");
@@ -87,7 +87,7 @@ fn localization_is_judged_by_gaps_jitter_and_silence() {
 }
 
 #[test]
-fn the_network_is_judged_between_two_moments() {
+fn evaluates_the_network_between_two_times() {
     let before = Traffic { at_s: 10.0, rtt_ms: 9.0, sent: 1000, lost: 50, bytes: 1_000_000 };
     let then = |rtt_ms, sent, lost| Traffic { at_s: 15.0, rtt_ms, sent, lost, bytes: 6_000_000 };
     let good = checks::network(&before, &then(1.2, 3000, 52)).unwrap();
@@ -100,7 +100,7 @@ fn the_network_is_judged_between_two_moments() {
 }
 
 #[test]
-fn clocks_images_and_battery_are_judged() {
+fn evaluates_clocks_images_and_battery() {
     let clock =
         ClockState { offset_ns: 1_500_000_000, error_bound_ms: 0.4, ..ClockState::default() };
     assert!(checks::clocks(&clock).ok);
@@ -122,7 +122,7 @@ fn clocks_images_and_battery_are_judged() {
 }
 
 #[test]
-fn the_fence_is_compared_in_three_places() {
+fn compares_the_fence_in_three_places() {
     let arena = arena();
     let guard = Guarded::of(&arena, Some(1));
     let parameter =
@@ -149,7 +149,7 @@ fn the_fence_is_compared_in_three_places() {
 }
 
 #[test]
-fn evidence_grows_old_and_changes_are_told_once() {
+fn evidence_expires_and_changes_are_logged_once() {
     let mut day = LabDay::new(0);
     assert_eq!(day.state("wasp", CheckId::Battery, 1000), State::NotDone);
     for at in [1000, 2000, 3000] {
@@ -171,7 +171,7 @@ fn evidence_grows_old_and_changes_are_told_once() {
 }
 
 #[test]
-fn the_autopilots_fence_counts_as_long_as_its_evidence() {
+fn the_autopilots_fence_expires_with_its_evidence() {
     let mut day = LabDay::new(0);
     let fence =
         vec![FenceParameter { name: "FENCE_ENABLE".to_owned(), has: Some(1.0), right: 1.0 }];
@@ -200,7 +200,7 @@ fn full_day() -> LabDay {
 }
 
 #[test]
-fn a_separation_is_one_that_can_be_kept() {
+fn rejects_a_separation_out_of_range() {
     let mut day = LabDay::new(0);
     for wrong in [0.0, -1.0, 0.1, 21.0, f64::NAN, f64::INFINITY] {
         assert!(day.set_separation(Some(wrong)).is_err(), "{wrong}");
@@ -210,7 +210,7 @@ fn a_separation_is_one_that_can_be_kept() {
 }
 
 #[test]
-fn a_day_that_is_kept_comes_back() {
+fn a_stored_day_is_read_back() {
     let day = full_day();
     assert_eq!(LabDay::parse(&day.to_bytes()).unwrap(), day);
     let text = String::from_utf8(day.to_bytes()).unwrap();
@@ -227,9 +227,10 @@ fn a_day_that_is_kept_comes_back() {
 }
 
 proptest! {
-    /// A file cut anywhere, or with any byte changed, is refused or is a sound day; it never panics.
+    /// A file truncated anywhere, or with any byte changed, is rejected or is a consistent day; the parser does
+    /// not panic.
     #[test]
-    fn a_damaged_file_is_refused_or_sound(cut in 0..4000_usize, at in 0..4000_usize, byte in any::<u8>()) {
+    fn a_damaged_file_is_rejected_or_consistent(cut in 0..4000_usize, at in 0..4000_usize, byte in any::<u8>()) {
         let mut bytes = full_day().to_bytes();
         let at = at % bytes.len();
         bytes[at] = byte;
@@ -241,7 +242,7 @@ proptest! {
     }
 
     #[test]
-    fn noise_is_no_day(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+    fn rejects_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         prop_assert!(LabDay::parse(&bytes).is_err());
     }
 }

@@ -1,22 +1,21 @@
-//! Where the database is.
+//! Address of the database.
 
 use std::fmt;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// A database of runs: a file, or a `PostgreSQL` server's URL.
+/// Database of runs: a file, or the URL of a `PostgreSQL` server.
 #[derive(Clone, PartialEq, Eq)]
 pub enum Database {
-    /// `SQLite`; made if it is not there.
+    /// `SQLite`; created if it does not exist.
     File(PathBuf),
     /// `postgres://USER:PASSWORD@HOST/NAME`.
     Postgres(String),
 }
 
 impl Database {
-    /// Returns the file where runs are stored by default, after the XDG base directory
-    /// specification; `None` without a home.
+    /// Returns the default file, by the XDG base directory specification; `None` without a home directory.
     pub fn default_file() -> Option<PathBuf> {
         let set = |name: &str| {
             std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from)
@@ -26,10 +25,10 @@ impl Database {
         Some(data.join("vizflyt").join("leaderboard.sqlite"))
     }
 
-    /// Returns the URL to open it by.
+    /// Returns the URL for the driver.
     pub(super) fn url(&self) -> String {
         match self {
-            // The driver undoes percent-encoding; a `?` or `%` in a path would be read as options.
+            // The driver decodes percent-encoding; a `?` or `%` in a path would be parsed as options.
             Self::File(path) => format!("sqlite://{}?mode=rwc", encoded(path)),
             Self::Postgres(url) => url.clone(),
         }
@@ -41,7 +40,7 @@ fn encoded(path: &Path) -> String {
         if byte.is_ascii_alphanumeric() || b"-._~/".contains(&byte) {
             out.push(char::from(byte));
         } else {
-            // Why: writing to a String cannot fail.
+            // Writing to a String cannot fail.
             let _ = write!(out, "%{byte:02X}");
         }
         out
@@ -55,7 +54,7 @@ impl FromStr for Database {
         match text.split_once("://") {
             Some(("postgres" | "postgresql", _)) => Ok(Self::Postgres(text.to_owned())),
             Some((scheme, _)) => Err(UnknownDatabase(scheme.to_owned())),
-            // A file of that name would hardly be meant.
+            // Probably not meant as the name of a file.
             None if text.starts_with("sqlite:") => Err(UnknownDatabase("sqlite:".to_owned())),
             None if text.is_empty() => Err(UnknownDatabase(String::new())),
             None => Ok(Self::File(PathBuf::from(text))),
@@ -63,21 +62,21 @@ impl FromStr for Database {
     }
 }
 
-/// No database that is known.
+/// Unsupported database.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' is no database that is known; give a file, or postgres://USER:PASSWORD@HOST/NAME")]
+#[error("'{0}' is not a supported database; give a file, or postgres://USER:PASSWORD@HOST/NAME")]
 pub struct UnknownDatabase(String);
 
-/// A password is not shown.
+/// Hides the password.
 impl fmt::Display for Database {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::File(path) => write!(f, "{}", path.display()),
             Self::Postgres(url) => {
                 let (scheme, rest) = url.split_once("://").unwrap_or(("postgres", url));
-                // Of several @ the last ends the password.
+                // The last of several @ ends the password.
                 let place = rest.rsplit_once('@').map_or(rest, |(_, place)| place);
-                // Options may hold a password too.
+                // Options may contain a password too.
                 let place = place.split('?').next().unwrap_or("");
                 write!(f, "{scheme}://{place}")
             }
@@ -104,7 +103,7 @@ mod tests {
         assert_eq!(server.to_string(), "postgres://db.example:5432/runs");
         assert!(!format!("{server:?}").contains("cret"));
         let error = "mysql://x".parse::<Database>().unwrap_err().to_string();
-        assert!(error.contains("'mysql' is no database"), "{error}");
+        assert!(error.contains("'mysql' is not a supported database"), "{error}");
         for none in ["", "sqlite:runs.sqlite", "sqlite:///runs.sqlite"] {
             assert!(none.parse::<Database>().is_err(), "{none}");
         }

@@ -1,14 +1,14 @@
-//! Runs as CSV (RFC 4180), for a spreadsheet.
+//! Export of runs as CSV (RFC 4180), for a spreadsheet.
 
 use std::io::Write;
 
 use super::Run;
 
-/// Writes the runs with a line of headings. Text that a spreadsheet would take for a formula is quoted by an
-/// apostrophe, as spreadsheets do themselves: teams choose their names.
+/// Writes the runs with a header line. Text that a spreadsheet would treat as a formula gets an apostrophe in
+/// front, as in spreadsheets: teams choose their names.
 ///
 /// # Errors
-/// Of `out`.
+/// Errors of `out`.
 pub fn write_csv(runs: &[Run], out: impl Write) -> Result<(), csv::Error> {
     let mut writer = csv::Writer::from_writer(out);
     writer.write_record([

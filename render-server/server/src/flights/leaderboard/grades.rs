@@ -1,6 +1,6 @@
-//! Signed grades on the leaderboard: kept once each, ranked apart from runs in the lab.
+//! Signed grades on the leaderboard: stored once each, ranked separately from runs in the lab.
 //!
-//! Whoever adds one has verified its signature: here it is figures and a text.
+//! The caller has verified the signature; this module stores figures and text.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -12,62 +12,60 @@ use sqlx::any::AnyRow;
 use super::store::unix_ms;
 use super::{Leaderboard, LeaderboardError};
 
-/// A grade as the leaderboard keeps it.
+/// Grade as stored by the leaderboard.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GradeEntry {
-    /// Whose.
     pub team: String,
-    /// Over all flights, as the grade has it.
+    /// Hash over all flights, from the grade.
     pub hash: String,
-    /// Of the plugin's files.
+    /// Hash of the plugin's files.
     pub plugin_sha256: String,
-    /// The project's name.
+    /// Name of the project.
     pub project: String,
-    /// `ug` or `g`: which sensors the plugin had.
+    /// `ug` or `g`: the sensors of the plugin.
     pub level: String,
-    /// Variants, seeds and delays in words: only grades of the same can be compared.
+    /// Variants, seeds and delays as text: only grades with equal conditions can be compared.
     pub conditions: String,
-    /// Flights.
+    /// Number of flights.
     pub flights: u32,
-    /// Those that finished.
+    /// Number of finished flights.
     pub finished: u32,
-    /// Stages that the course has.
+    /// Stages of the course.
     pub stages: u32,
     /// Mean of the stages passed.
     pub mean_stages_passed: f64,
-    /// Median time of the flights that finished, penalties added. [s]
+    /// Median time of the finished flights, with penalties. [s]
     pub median_s: Option<f64>,
     /// Mean score, 0 to 100.
     pub score: f64,
 }
 
-/// A team's place among the grades of the same course and conditions.
+/// Place of a team among the grades of the same course and conditions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GradePlace {
-    /// From 1; equal grades share it.
+    /// Rank from 1; equal grades share it.
     pub rank: u32,
-    /// How many grades the team has here; the best counts.
+    /// Number of the team's grades here; the best counts.
     pub grades: u32,
-    /// The best.
     #[serde(flatten)]
     pub best: GradeEntry,
 }
 
-/// The places on one course under the same conditions.
+/// Places on one course under the same conditions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GradeBoard {
-    /// The project's name.
+    /// Name of the project.
     pub project: String,
     /// `ug` or `g`.
     pub level: String,
-    /// Variants, seeds and delays in words.
+    /// Variants, seeds and delays as text.
     pub conditions: String,
-    /// The best first.
+    /// Places, best first.
     pub places: Vec<GradePlace>,
 }
 
-/// Ranks grades, apart for each project, level and conditions: most stages on average first, of
-/// equal ones the larger share that finished, then the least median time.
+/// Ranks grades separately for each project, level and conditions. Most stages on average first; then the larger
+/// share of finished flights; then the least median time.
 pub fn grade_boards(grades: &[GradeEntry]) -> Vec<GradeBoard> {
     let mut boards: BTreeMap<[&str; 3], BTreeMap<&str, (&GradeEntry, u32)>> = BTreeMap::new();
     for grade in grades {
@@ -90,7 +88,7 @@ pub fn grade_boards(grades: &[GradeEntry]) -> Vec<GradeBoard> {
 }
 
 fn places(mut best: Vec<(&GradeEntry, u32)>) -> Vec<GradePlace> {
-    // Stable: of equal grades the alphabet decides who is named first, not who wins.
+    // Stable: equal grades share a rank, in alphabetical order.
     best.sort_by(|(a, _), (b, _)| compare(a, b));
     let mut places: Vec<GradePlace> = Vec::with_capacity(best.len());
     for (index, (grade, grades)) in best.into_iter().enumerate() {
@@ -112,10 +110,10 @@ fn compare(a: &GradeEntry, b: &GradeEntry) -> Ordering {
 }
 
 impl Leaderboard {
-    /// Adds a grade whose signature was verified, with its whole text.
+    /// Adds a grade whose signature was verified, with its complete text.
     ///
     /// # Errors
-    /// No such team, or the grade is there already, whoever added it.
+    /// The team does not exist, or the grade has been added before, by any team.
     pub async fn add_grade(
         &self,
         grade: &GradeEntry,
@@ -155,7 +153,7 @@ impl Leaderboard {
     /// Returns all grades, the oldest first.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn grades(&self) -> Result<Vec<GradeEntry>, LeaderboardError> {
         let rows = sqlx::query(
             "SELECT team, hash, plugin_sha256, project, level, conditions, flights, finished, stages, \
@@ -167,7 +165,7 @@ impl Leaderboard {
         rows.iter().map(entry).collect::<Result<_, _>>().map_err(|error| self.failed(error))
     }
 
-    /// Says who has added a grade.
+    /// Returns the error that names the team which added a grade.
     async fn added_by(&self, grade: &GradeEntry) -> Result<LeaderboardError, LeaderboardError> {
         let row = sqlx::query("SELECT team FROM grades WHERE hash = $1 AND plugin_sha256 = $2")
             .bind(&grade.hash)
@@ -234,7 +232,7 @@ pub(crate) mod tests {
             grade("b", 4.5, 0, 0.0),
             grade("c", 4.0, 3, 40.0),
             grade("d", 4.0, 2, 19.0),
-            // Of two the better counts.
+            // The better of two counts.
             grade("d", 1.0, 0, 0.0),
             grade("e", 4.0, 2, 20.0),
         ];

@@ -1,4 +1,4 @@
-//! Who flew what how well: runs of lab flights, teams and their standings, in a database that outlives the server.
+//! Leaderboard: runs of lab flights, teams and their standings, in a database.
 //!
 //! ```text
 //! recorder (a task for each vehicle) -> begin, keep_alive, end -> runs
@@ -7,9 +7,9 @@
 //! runs -> standings (pure) -> page, wall view, command line;  runs -> CSV
 //! grades -> grade_boards (pure) -> page, command line
 //! ```
-//! SQLite in a file by default, `PostgreSQL` by URL for a department; one set of queries for both. A run is
-//! a row from its take-off on: a server killed in flight loses that run's end, which is then
-//! [`RunState::CutOff`], and nothing else.
+//! The database is SQLite in a file by default, or `PostgreSQL` by URL for a department, with the same queries.
+//! A run is a row from its take-off on. If a server is killed in flight, only that run's end is lost, and the
+//! run becomes [`RunState::CutOff`].
 
 mod database_url;
 mod export;
@@ -29,19 +29,19 @@ pub use store::{Leaderboard, LeaderboardError, MAX_RUNS};
 
 use serde::{Deserialize, Serialize};
 
-/// What a flight counts as.
+/// Type of a flight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Attempt {
-    /// As often as one likes; shown, not ranked first.
+    /// Unlimited; shown, but not ranked first.
     #[default]
     Practice,
-    /// Counts; a course may bound how many a team has.
+    /// Ranked; a course may limit the number per team.
     Official,
 }
 
 impl Attempt {
-    /// Returns its name as the database and the command line have it.
+    /// Returns the name used by the database and the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Practice => "practice",
@@ -50,7 +50,7 @@ impl Attempt {
     }
 }
 
-/// How far a run is.
+/// State of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RunState {
@@ -58,82 +58,78 @@ pub enum RunState {
     Flying,
     /// Ended, with a verdict.
     Ended,
-    /// Its server went away in flight: it has no verdict.
+    /// Its server stopped in flight: it has no verdict.
     CutOff,
 }
 
-/// What is known of a run when it begins.
+/// Data of a run at its start.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NewRun {
-    /// Whose; `None` where no team has checked in.
+    /// Name of the team; `None` if no team has checked in.
     pub team: Option<String>,
-    /// The arena's name.
+    /// Name of the arena.
     pub course: String,
     /// The vehicle's name.
     pub vehicle: String,
-    /// What it counts as.
     pub attempt: Attempt,
 }
 
-/// What a run came to.
+/// Result of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunEnd {
-    /// In a word or a sentence: `finished`, `collision`.
+    /// Word or sentence: `finished`, `collision`.
     pub outcome: String,
-    /// Stages passed, the goal among them.
+    /// Stages passed, including the goal.
     pub stages_passed: u32,
-    /// Stages that the course has.
+    /// Stages of the course.
     pub stages: u32,
-    /// From take-off to the end, penalties not added. [s]
+    /// Time from take-off to the end, without penalties. [s]
     pub seconds: Option<f64>,
-    /// To be added. [s]
+    /// Penalties. [s]
     pub penalty_s: f64,
     /// Least distance from the body's surface to an obstacle. [m]
     pub min_clearance_m: Option<f64>,
-    /// The whole verdict, JSON.
+    /// Complete verdict, JSON.
     pub verdict: String,
 }
 
-/// A run as the leaderboard keeps it.
+/// Run as stored by the leaderboard.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Run {
-    /// Random.
+    /// Random id.
     pub id: String,
-    /// Whose.
+    /// Name of the team, if one has checked in.
     pub team: Option<String>,
-    /// The arena's name.
+    /// Name of the arena.
     pub course: String,
     /// The vehicle's name.
     pub vehicle: String,
-    /// What it counts as.
     pub attempt: Attempt,
-    /// How far it is.
     pub state: RunState,
-    /// Its take-off, UTC. [ms since 1970]
+    /// Time of the take-off, UTC. [ms since 1970]
     pub began_unix_ms: i64,
-    /// Its end, UTC. [ms since 1970]
+    /// Time of the end, UTC. [ms since 1970]
     pub ended_unix_ms: Option<i64>,
-    /// In a word or a sentence; empty until it ends.
+    /// Word or sentence; empty until the run ends.
     pub outcome: String,
     /// Stages passed.
     pub stages_passed: u32,
-    /// Stages that the course has.
+    /// Stages of the course.
     pub stages: u32,
-    /// From take-off to the end, penalties not added. [s]
+    /// Time from take-off to the end, without penalties. [s]
     pub seconds: Option<f64>,
-    /// To be added. [s]
+    /// Penalties. [s]
     pub penalty_s: f64,
     /// Least distance from the body's surface to an obstacle. [m]
     pub min_clearance_m: Option<f64>,
 }
 
-/// A team as an instructor sees it.
+/// Team as shown to an instructor.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Team {
-    /// Its name.
     pub name: String,
-    /// When it was added, UTC. [ms since 1970]
+    /// Time of its creation, UTC. [ms since 1970]
     pub created_unix_ms: i64,
-    /// Whether its token opens nothing any more.
+    /// Whether its token is revoked.
     pub retired: bool,
 }

@@ -1,4 +1,4 @@
-//! What the leaderboard keeps of a team: read whole, and erased whole.
+//! Stored data of a team: complete export and deletion.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -6,51 +6,47 @@ use sqlx::Row;
 
 use super::{Database, GradeEntry, Leaderboard, LeaderboardError, Run, RunState, Team};
 
-/// All that is kept of a team; its token is not, only the hash that recognises it.
+/// All stored data of a team, except the hash of its token.
 #[derive(Debug, Serialize)]
 pub struct TeamRecords {
-    /// Its name, since when, and whether its token opens something.
+    /// Name, creation, and whether its token is revoked.
     pub team: Team,
-    /// Its flights in the lab, the newest first.
+    /// Flights in the lab, newest first.
     pub runs: Vec<RunRecord>,
-    /// Its grades, the oldest first.
+    /// Grades, oldest first.
     pub grades: Vec<GradeRecord>,
 }
 
 /// A flight with its verdict.
 #[derive(Debug, Serialize)]
 pub struct RunRecord {
-    /// Its figures.
     #[serde(flatten)]
     pub run: Run,
-    /// As the referee wrote it; nothing of one that was cut off.
+    /// Verdict of the referee; absent for a run that was cut off.
     pub verdict: Option<Value>,
 }
 
 /// A grade with its document.
 #[derive(Debug, Serialize)]
 pub struct GradeRecord {
-    /// Its figures.
     #[serde(flatten)]
     pub grade: GradeEntry,
-    /// The whole grade, letter by letter as it was signed.
+    /// Complete text of the grade, exactly as it was signed.
     pub document: String,
 }
 
-/// What was erased.
+/// Numbers of deleted records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Erased {
-    /// Flights.
     pub runs: u64,
-    /// Grades.
     pub grades: u64,
 }
 
 impl Leaderboard {
-    /// Returns all that is kept of a team.
+    /// Returns all stored data of a team.
     ///
     /// # Errors
-    /// No such team.
+    /// The team does not exist.
     pub async fn records_of(&self, name: &str) -> Result<TeamRecords, LeaderboardError> {
         let teams = self.teams().await?;
         let Some(team) = teams.into_iter().find(|team| team.name == name) else {
@@ -79,10 +75,11 @@ impl Leaderboard {
         Ok(TeamRecords { team, runs, grades })
     }
 
-    /// Erases a team with its flights and grades: all of it, or nothing; from a file's bytes, too. Places of others move up.
+    /// Deletes a team with its flights and grades in one transaction, also from the bytes of a file. Places of
+    /// others move up.
     ///
     /// # Errors
-    /// No such team, or one that is flying.
+    /// The team does not exist, or is flying.
     pub async fn erase_team(&self, name: &str) -> Result<Erased, LeaderboardError> {
         let runs = self.runs(None).await?;
         let flies = |run: &Run| run.team.as_deref() == Some(name) && run.state == RunState::Flying;
@@ -103,7 +100,7 @@ impl Leaderboard {
             }
             all.commit().await?;
             if matches!(self.database, Database::File(_)) {
-                // What was written ahead has the old rows still.
+                // The write-ahead log still contains the old rows.
                 sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)").execute(&self.pool).await?;
             }
             Ok(counts)

@@ -1,4 +1,4 @@
-//! Runs to places, pure: most stages first, of equal ones the least time; the paper's rule.
+//! Standings from runs, pure: most stages first, then the least time; the rule of the paper.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -7,26 +7,25 @@ use serde::Serialize;
 
 use super::{Attempt, Run, RunState};
 
-/// A team's place.
+/// Place of a team.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Standing {
-    /// From 1; equal runs share it.
+    /// Rank from 1; equal runs share it.
     pub rank: u32,
-    /// Whose.
     pub team: String,
     /// Stages passed in its best run.
     pub stages_passed: u32,
-    /// Stages that the course has.
+    /// Stages of the course.
     pub stages: u32,
-    /// Its best run's time, penalties added. [s]
+    /// Time of its best run, with penalties. [s]
     pub seconds: Option<f64>,
-    /// Ended runs that count here.
+    /// Number of ended runs that count here.
     pub runs: u32,
-    /// The best run.
+    /// Id of the best run.
     pub run: String,
 }
 
-/// Ranks the teams of one course by their best ended run of an attempt; runs without a team have no place.
+/// Ranks the teams of one course by their best ended run of this type; runs without a team have no place.
 pub fn standings(runs: &[Run], course: &str, attempt: Attempt) -> Vec<Standing> {
     let mut best: BTreeMap<&str, (&Run, u32)> = BTreeMap::new();
     for run in runs {
@@ -39,7 +38,7 @@ pub fn standings(runs: &[Run], course: &str, attempt: Attempt) -> Vec<Standing> 
         }
     }
     let mut best: Vec<_> = best.into_iter().collect();
-    // Stable: of equal runs the alphabet decides who is named first, not who wins.
+    // Stable: equal runs share a rank, in alphabetical order.
     best.sort_by(|(_, (a, _)), (_, (b, _))| compare(a, b));
     let mut places: Vec<Standing> = Vec::with_capacity(best.len());
     let mut before: Option<(&Run, u32)> = None;
@@ -109,7 +108,7 @@ mod tests {
     }
 
     proptest! {
-        /// No place depends on the order of the runs, and nobody behind is better.
+        /// No place depends on the order of the runs, and no later place is better.
         #[test]
         fn order_does_not_matter(
             flown in proptest::collection::vec((0..6_usize, 0..5_u32, 0..40_u32), 0..40), turn in 0..40_usize,

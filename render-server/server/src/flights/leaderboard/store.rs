@@ -1,4 +1,4 @@
-//! The database: teams and runs, each change one transaction that is on disk when the call returns.
+//! Database of teams and runs. Each change is one transaction that is on disk when the call returns.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -10,26 +10,25 @@ use vizflyt_trust::{Fingerprint, secret};
 
 use super::{Attempt, Database, NewRun, Run, RunEnd, RunState, Team};
 
-/// The open database.
 #[derive(Clone, Debug)]
 pub struct Leaderboard {
     pub(super) pool: AnyPool,
     pub(super) database: Database,
 }
 
-/// Why the leaderboard did not do as asked.
+/// Errors of the leaderboard.
 #[derive(Debug, thiserror::Error)]
 pub enum LeaderboardError {
-    /// It cannot be opened.
+    /// The database cannot be opened.
     #[error("cannot open the leaderboard {0}: {1}; give another with --leaderboard")]
     Open(Database, sqlx::Error),
-    /// It is on a server that this program cannot speak to.
+    /// The program has no support for this database.
     #[error(
         "this program was built without PostgreSQL, where the leaderboard {0} is; build it with \
          `cargo build --release --features postgres`"
     )]
     NoPostgres(Database),
-    /// Its tables are of a later version, or another program's.
+    /// The tables are of a later version, or of another program.
     #[error("cannot use the leaderboard {0}: {1}; was it made by a later version of this program?")]
     Migrate(Database, sqlx::migrate::MigrateError),
     /// The folder of a file cannot be made.
@@ -38,47 +37,45 @@ pub enum LeaderboardError {
     /// A query failed.
     #[error("the leaderboard {0} fails: {1}")]
     Query(Database, sqlx::Error),
-    /// A team's name that is none.
+    /// Invalid name of a team.
     #[error(
-        "{0:?} is no name for a team; give 1 to {MAX_NAME} characters, none of them a control character"
+        "{0:?} is not a valid team name; give 1 to {MAX_NAME} characters without control characters"
     )]
     Name(String),
-    /// A team of that name is there.
+    /// A team of this name exists.
     #[error("there is a team '{0}' already; take another name")]
     Taken(String),
-    /// No team has that name.
+    /// The team does not exist.
     #[error("there is no team '{0}'; the teams are: {1}")]
     NoTeam(String, String),
-    /// A team whose flight is not over.
+    /// The team's flight is not over.
     #[error(
-        "team '{0}' is flying; wait until its run has ended, or a minute where its server has gone"
+        "team '{0}' is flying; wait until its run has ended, or for a minute if its server has stopped"
     )]
     Flying(String),
-    /// No more official attempts.
+    /// No official attempts left.
     #[error("team '{team}' has flown its {most} official attempts on '{course}'; practice is free")]
     Spent {
-        /// Whose.
         team: String,
-        /// On which course.
         course: String,
-        /// As many it may fly.
+        /// Maximum number of attempts.
         most: u32,
     },
-    /// The same grade is there.
+    /// The grade has been added before.
     #[error("the grade {hash} is on the leaderboard already: team '{team}' has added it")]
     Added {
-        /// Over all flights.
+        /// Hash over all flights.
         hash: String,
-        /// Who has added it.
+        /// Team that added it.
         team: String,
     },
-    /// No randomness for a token.
+    /// No random numbers for a token.
     #[error("cannot draw a token: {0}")]
     Random(String),
 }
 
 impl Leaderboard {
-    /// Opens a database, makes or updates its tables, and settles runs whose server has gone.
+    /// Opens a database, creates or updates its tables, and ends runs whose server has stopped.
     ///
     /// # Errors
     /// A file or server that cannot be used.
@@ -94,27 +91,27 @@ impl Leaderboard {
                 .map_err(|error| LeaderboardError::Folder(database.clone(), error))?;
         }
         let is_file = matches!(database, Database::File(_));
-        // One writer is all that SQLite has; a department's server serves several labs.
+        // SQLite allows only one writer; a department's server serves several labs.
         let options = AnyPoolOptions::new()
             .max_connections(if is_file { 1 } else { 4 })
             .acquire_timeout(PATIENCE)
             .after_connect(move |connection, _| {
                 Box::pin(async move {
                     if is_file {
-                        // Readers, the command line among them, do not hold up a flight's end; FULL: on disk
-                        // when the call returns, also after a power cut.
+                        // Readers, including the command line, do not delay the end of a flight. FULL: data are
+                        // on disk when the call returns, even after a power cut.
                         connection.execute("PRAGMA busy_timeout = 5000").await?;
                         connection.execute("PRAGMA journal_mode = WAL").await?;
                         connection.execute("PRAGMA synchronous = FULL").await?;
                         connection.execute("PRAGMA foreign_keys = ON").await?;
-                        // What is erased is overwritten.
+                        // Deleted data are overwritten.
                         connection.execute("PRAGMA secure_delete = ON").await?;
                     }
                     Ok(())
                 })
             });
         let open = |error| LeaderboardError::Open(database.clone(), error);
-        // By itself first: a pool tries again and in the end knows only that it took too long.
+        // Connects once without the pool: the pool would retry, and report only a timeout.
         let mut first = AnyConnection::connect(&database.url()).await.map_err(open)?;
         if is_file {
             first.execute("PRAGMA schema_version").await.map_err(open)?;
@@ -130,15 +127,14 @@ impl Leaderboard {
         Ok(board)
     }
 
-    /// Returns where it is.
     pub fn database(&self) -> &Database {
         &self.database
     }
 
-    /// Adds a team; returns its token, which is shown this once.
+    /// Adds a team; returns its token, which cannot be shown again.
     ///
     /// # Errors
-    /// A name that is taken or none.
+    /// A name that is taken or invalid.
     pub async fn add_team(&self, name: &str) -> Result<String, LeaderboardError> {
         let is_name = (1..=MAX_NAME).contains(&name.chars().count());
         if !is_name || name.trim() != name || name.chars().any(char::is_control) {
@@ -160,10 +156,10 @@ impl Leaderboard {
         }
     }
 
-    /// Takes a team's token away; its runs stay.
+    /// Revokes a team's token; its runs stay.
     ///
     /// # Errors
-    /// No such team.
+    /// The team does not exist.
     pub async fn retire_team(&self, name: &str) -> Result<(), LeaderboardError> {
         let done = sqlx::query("UPDATE teams SET retired = 1 WHERE name = $1")
             .bind(name)
@@ -176,10 +172,10 @@ impl Leaderboard {
         Ok(())
     }
 
-    /// Returns the teams by name.
+    /// Returns the teams, sorted by name.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn teams(&self) -> Result<Vec<Team>, LeaderboardError> {
         let rows = sqlx::query("SELECT name, created_unix_ms, retired FROM teams ORDER BY name")
             .fetch_all(&self.pool)
@@ -195,12 +191,12 @@ impl Leaderboard {
         rows.iter().map(team).collect::<Result<_, _>>().map_err(|error| self.failed(error))
     }
 
-    /// Returns whose token this is; `None` if it opens nothing.
+    /// Returns the team of a token; `None` if it is unknown or revoked.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn team_of(&self, token: &str) -> Result<Option<String>, LeaderboardError> {
-        // Looked up by its hash: how long that takes reveals nothing about the token.
+        // The query uses the hash, so that its duration reveals nothing about the token.
         let row = sqlx::query("SELECT name FROM teams WHERE token_hash = $1 AND retired = 0")
             .bind(hash(token))
             .fetch_optional(&self.pool)
@@ -209,11 +205,11 @@ impl Leaderboard {
         row.map(|row| row.try_get(0)).transpose().map_err(|error| self.failed(error))
     }
 
-    /// Begins a run; returns its id. With `most_official`, a team's official run beyond that number is
-    /// refused; runs that were cut off do not count.
+    /// Begins a run; returns its id. With `most_official`, a team's official runs beyond that number are
+    /// rejected; runs that were cut off do not count.
     ///
     /// # Errors
-    /// No such team, no attempts left.
+    /// The team does not exist, or has no attempts left.
     pub async fn begin(
         &self,
         new: &NewRun,
@@ -255,10 +251,10 @@ impl Leaderboard {
         }
     }
 
-    /// Marks a run as still flown. Call every few seconds: a run without a mark for a minute is cut off.
+    /// Marks a run as still flown. Call every few seconds: after a minute without a mark, a run is cut off.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn keep_alive(&self, id: &str) -> Result<(), LeaderboardError> {
         sqlx::query("UPDATE runs SET heard_unix_ms = $1 WHERE id = $2 AND state = 'flying'")
             .bind(unix_ms())
@@ -269,10 +265,10 @@ impl Leaderboard {
         Ok(())
     }
 
-    /// Ends a run. Also one that was taken for cut off: its server was only silent.
+    /// Ends a run, also one that was cut off while its server was only silent.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn end(&self, id: &str, end: &RunEnd) -> Result<(), LeaderboardError> {
         sqlx::query(
             "UPDATE runs SET state = 'ended', ended_unix_ms = $1, outcome = $2, stages_passed = $3, \
@@ -282,7 +278,7 @@ impl Leaderboard {
         .bind(&end.outcome)
         .bind(i64::from(end.stages_passed))
         .bind(i64::from(end.stages))
-        // A database keeps no infinity that another reads alike.
+        // Infinity is not portable between databases.
         .bind(end.seconds.filter(|seconds| seconds.is_finite()))
         .bind(if end.penalty_s.is_finite() { end.penalty_s } else { 0.0 })
         .bind(end.min_clearance_m.filter(|clearance| clearance.is_finite()))
@@ -294,10 +290,10 @@ impl Leaderboard {
         Ok(())
     }
 
-    /// Returns the newest [`MAX_RUNS`] runs, newest first; of one course, if it is named.
+    /// Returns the newest [`MAX_RUNS`] runs, newest first, of all courses or of one.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn runs(&self, course: Option<&str>) -> Result<Vec<Run>, LeaderboardError> {
         self.cut_off_unheard(unix_ms()).await?;
         let rows = sqlx::query(
@@ -314,10 +310,10 @@ impl Leaderboard {
         rows.iter().map(run).collect::<Result<_, _>>().map_err(|error| self.failed(error))
     }
 
-    /// Returns the verdict of a run that has ended, JSON.
+    /// Returns the verdict of an ended run, JSON.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn verdict(&self, id: &str) -> Result<Option<String>, LeaderboardError> {
         let row = sqlx::query("SELECT verdict FROM runs WHERE id = $1")
             .bind(id)
@@ -328,10 +324,10 @@ impl Leaderboard {
         verdict.map(Option::flatten).map_err(|error| self.failed(error))
     }
 
-    /// Returns the names of the courses that were flown.
+    /// Returns the names of all flown courses.
     ///
     /// # Errors
-    /// Of the database.
+    /// Errors of the database.
     pub async fn courses(&self) -> Result<Vec<String>, LeaderboardError> {
         let rows = sqlx::query("SELECT DISTINCT course FROM runs ORDER BY course")
             .fetch_all(&self.pool)
@@ -343,7 +339,7 @@ impl Leaderboard {
             .map_err(|error| self.failed(error))
     }
 
-    /// Settles runs that no server flies any more.
+    /// Cuts off runs whose server has stopped.
     pub(super) async fn cut_off_unheard(&self, now_unix_ms: i64) -> Result<(), LeaderboardError> {
         sqlx::query(
             "UPDATE runs SET state = 'cut_off', ended_unix_ms = heard_unix_ms \
@@ -406,7 +402,7 @@ fn run(row: &AnyRow) -> Result<Run, sqlx::Error> {
     })
 }
 
-/// Returns what brings the tables to the last of these versions.
+/// Returns the migrations to the last of these versions.
 pub(super) fn migrations(versions: &[(&'static str, &'static str)]) -> Migrator {
     let migration = |(index, &(name, sql)): (usize, &(&'static str, &'static str))| {
         let version = index as i64 + 1;
@@ -415,13 +411,13 @@ pub(super) fn migrations(versions: &[(&'static str, &'static str)]) -> Migrator 
     Migrator::with_migrations(versions.iter().enumerate().map(migration).collect())
 }
 
-/// The tables' versions: a file each, never changed once released.
+/// Versions of the tables: one file each, never changed once released.
 pub(super) const MIGRATIONS: [(&str, &str); 2] = [
     ("teams and runs", include_str!("migrations/0001_teams_and_runs.sql")),
     ("grades", include_str!("migrations/0002_grades.sql")),
 ];
 
-/// Returns a token's hash; a token has 128 bits of its own, so nobody gains by a slow one.
+/// Returns a token's hash. A token has 128 random bits, so a slow hash would add no security.
 fn hash(token: &str) -> String {
     Fingerprint::of(token.as_bytes()).to_string()
 }
@@ -430,11 +426,11 @@ pub(super) fn unix_ms() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as i64)
 }
 
-/// Runs that are listed at most: some terms of a large class.
+/// Maximum number of runs listed: some terms of a large class.
 pub const MAX_RUNS: i64 = 20_000;
-/// Characters of a team's name.
+/// Maximum length of a team's name. [characters]
 const MAX_NAME: usize = 40;
-/// A run whose server is silent for so long has no server any more.
+/// Time without a mark after which a run is cut off.
 const UNHEARD: Duration = Duration::from_mins(1);
-/// How long the database may take to be there.
+/// Timeout of the database.
 const PATIENCE: Duration = Duration::from_secs(10);

@@ -1,9 +1,9 @@
-//! The database on a file, and on a `PostgreSQL` server where `VIZFLYT_TEST_POSTGRES` names one.
+//! The database in a file, and on a `PostgreSQL` server if `VIZFLYT_TEST_POSTGRES` names one.
 
 use super::grades::tests::grade;
 use super::*;
 
-/// An official run that has ended.
+/// Returns an official run that has ended.
 pub(crate) fn run(team: &str, stages_passed: u32, seconds: f64) -> Run {
     Run {
         id: format!("{team} {stages_passed} {seconds}"),
@@ -50,7 +50,7 @@ async fn file() -> (tempfile::TempDir, Leaderboard) {
     (folder, Leaderboard::open(&database).await.unwrap())
 }
 
-/// Everything that the two databases must do alike.
+/// Tests the common behaviour of both databases.
 async fn behaves(board: &Leaderboard) {
     let token = board.add_team("wasps").await.unwrap();
     assert_eq!(board.team_of(&token).await.unwrap().as_deref(), Some("wasps"));
@@ -84,7 +84,7 @@ async fn behaves(board: &Leaderboard) {
     assert_eq!(board.verdict("none").await.unwrap(), None);
     assert_eq!(standings(&runs, "race", Attempt::Official)[0].seconds, Some(33.5));
 
-    // Two minutes on, no mark of the runs that still fly has come.
+    // For two minutes, the flying runs have had no mark.
     board.cut_off_unheard(state(&practice).began_unix_ms + 120_000).await.unwrap();
     let runs = board.runs(None).await.unwrap();
     let cut_off = runs.iter().filter(|run| run.state == RunState::CutOff).count();
@@ -101,7 +101,7 @@ async fn behaves(board: &Leaderboard) {
     assert!(board.retire_team("bees").await.is_err());
 }
 
-/// All that is kept of a team is read, then erased: others keep theirs.
+/// Reads and deletes all data of a team; the data of others stay.
 async fn erases(board: &Leaderboard) {
     let records = board.records_of("wasps").await.unwrap();
     assert_eq!((records.runs.len(), records.grades.len()), (2, 1));
@@ -123,11 +123,11 @@ async fn erases(board: &Leaderboard) {
     }
 }
 
-/// The same for grades, with the team 'wasps' there.
+/// The same for grades, with an existing team 'wasps'.
 async fn grades_behave(board: &Leaderboard) {
     let own = grade("wasps", 4.25, 7, 31.5);
     board.add_grade(&own, "{}").await.unwrap();
-    // The same grade, also under another team's name, and the same flights by another plugin.
+    // The same grade, also under another team's name, and the same flights of another plugin.
     board.add_team("hornets").await.unwrap();
     let taken = GradeEntry { team: "hornets".into(), ..own.clone() };
     for again in [&own, &taken] {
@@ -142,9 +142,9 @@ async fn grades_behave(board: &Leaderboard) {
     assert_eq!(board.grades().await.unwrap(), [own, other]);
 }
 
-/// A database of before there were grades keeps its teams and runs and takes grades.
+/// A database without grades keeps its teams and runs, and accepts grades after the migration.
 #[tokio::test]
-async fn a_database_of_the_first_version_is_updated() {
+async fn migrates_a_database_of_the_first_version() {
     use sqlx::Connection;
     let folder = tempfile::tempdir().unwrap();
     let database = Database::File(folder.path().join("runs.sqlite"));
@@ -162,7 +162,7 @@ async fn a_database_of_the_first_version_is_updated() {
 }
 
 #[tokio::test]
-async fn a_file_keeps_teams_and_runs() {
+async fn a_file_stores_teams_and_runs() {
     let (folder, board) = file().await;
     behaves(&board).await;
     let database = board.database().clone();
@@ -179,7 +179,7 @@ async fn a_file_keeps_teams_and_runs() {
 }
 
 #[tokio::test]
-async fn a_postgres_server_keeps_them_alike() {
+async fn a_postgres_server_behaves_like_a_file() {
     let Ok(url) = std::env::var("VIZFLYT_TEST_POSTGRES") else {
         eprintln!(
             "skipped: VIZFLYT_TEST_POSTGRES names no server; tests/leaderboard/run starts one"
@@ -204,7 +204,7 @@ async fn two_programs_share_a_file() {
     let (_folder, board) = file().await;
     let other = Leaderboard::open(board.database()).await.unwrap();
     board.add_team("wasps").await.unwrap();
-    // Both begin and end runs at once; nothing is lost, nobody waits for ever.
+    // Both begin and end runs at the same time; no run is lost, and no call blocks for ever.
     let fly = |board: Leaderboard| async move {
         for _ in 0..20 {
             let id = board.begin(&new(Some("wasps"), Attempt::Practice), None).await.unwrap();

@@ -1,4 +1,4 @@
-//! The lease, the flight's outcome, orders and reports of one vehicle.
+//! Leases, outcome of a flight, commands and reports of one vehicle.
 
 use std::net::SocketAddr;
 
@@ -55,7 +55,7 @@ async fn silent_runtime_loses_its_lease_and_the_next_receives_the_flights_events
     assert_eq!((first.first_event, first.resumed, vehicle.flights()), (1, false, 1));
     vehicle.report(Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() });
     vehicle.publish(EventKind::EmergencyStop, "stop");
-    // As if its last message had come two seconds ago.
+    // Simulates that its last message came two seconds ago.
     first.renew(clock::now().plus_seconds(-2.0));
     let second = vehicle.take_control(&hello(5), address()).unwrap();
     first.evicted().await;
@@ -63,7 +63,7 @@ async fn silent_runtime_loses_its_lease_and_the_next_receives_the_flights_events
     drop(first);
     assert_eq!(vehicle.runtime().map(|runtime| runtime.id), Some(second.info.id));
     drop(second);
-    // After the landing the next runtime begins a new flight.
+    // After the landing, the next runtime begins a new flight.
     assert_eq!(vehicle.flight().end.reason(), Some(&EndReason::StopButton));
     vehicle.report(Telemetry { phase: FlightPhase::Landed, ..Telemetry::default() });
     let third = vehicle.take_control(&hello(6), address()).unwrap();
@@ -72,19 +72,19 @@ async fn silent_runtime_loses_its_lease_and_the_next_receives_the_flights_events
 }
 
 #[test]
-fn the_same_runtime_goes_on_with_its_flight_and_tells_each_event_once() {
+fn the_same_runtime_resumes_its_flight_and_each_event_counts_once() {
     let vehicle = vehicle();
     let first = vehicle.take_control(&hello(7), address()).unwrap();
     assert!(first.receive_event(1) && first.receive_event(2) && !first.receive_event(1));
     drop(first);
-    // An outage on the ground; the stop button is pressed meanwhile.
+    // An outage on the ground, during which the stop button is pressed.
     vehicle.publish(EventKind::EmergencyStop, "stop");
     let second = vehicle.take_control(&hello(7), address()).unwrap();
     assert_eq!((second.first_event, second.resumed, vehicle.flights()), (0, true, 1));
     assert_eq!(second.received_events, ReceivedEvents { boot: 7, seq: 2 });
     assert!(!second.receive_event(2) && second.receive_event(3));
     drop(second);
-    // Another run of the runtime: a new flight, and its events count anew.
+    // Another run of the runtime: a new flight, and its events are numbered from the start.
     let third = vehicle.take_control(&hello(8), address()).unwrap();
     assert_eq!((third.first_event, third.resumed, vehicle.flights()), (1, false, 2));
     assert_eq!(third.received_events.of(8), 0);
@@ -92,7 +92,7 @@ fn the_same_runtime_goes_on_with_its_flight_and_tells_each_event_once() {
 }
 
 #[test]
-fn only_a_vehicle_that_waits_is_started_and_only_one_on_the_ground_reset() {
+fn starts_only_a_waiting_vehicle_and_resets_only_on_the_ground() {
     let vehicle = vehicle();
     let phase = |phase| vehicle.report(Telemetry { phase, ..Telemetry::default() });
     assert!(vehicle.start("x").unwrap_err().contains("--wait"));
@@ -118,7 +118,7 @@ fn only_a_vehicle_that_waits_is_started_and_only_one_on_the_ground_reset() {
 }
 
 #[test]
-fn watchers_are_bounded_and_leave_room_behind() {
+fn limits_watchers_and_frees_their_slots() {
     let vehicle = vehicle();
     let mut watchers: Vec<_> = (0..MAX_WATCHERS).map(|_| vehicle.watch().unwrap()).collect();
     let refusal = vehicle.watch().unwrap_err();
@@ -129,7 +129,7 @@ fn watchers_are_bounded_and_leave_room_behind() {
 }
 
 #[test]
-fn a_pose_that_comes_back_ends_nothing_and_the_first_end_is_the_outcome() {
+fn the_first_end_is_the_outcome_and_a_returning_pose_is_not() {
     let vehicle = vehicle();
     let outcome = || vehicle.flight().end.reason().cloned();
     vehicle.publish(EventKind::Phase(FlightPhase::TakingOff), "up");

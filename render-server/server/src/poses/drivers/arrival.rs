@@ -1,7 +1,7 @@
-//! When a datagram came to this computer, by the kernel's own stamp (`SO_TIMESTAMPNS`, socket(7)).
+//! Arrival time of a datagram by the kernel's stamp (`SO_TIMESTAMPNS`, socket(7)).
 //!
-//! A process that waits for a processor reads a tenth of a second's poses at one instant; the kernel has stamped each as
-//! it came. At 3.6 m/s a stamp that is 100 ms off is a place that is 0.36 m off.
+//! A process that waits for a processor reads the poses of a tenth of a second at one instant; the kernel has
+//! stamped each when it arrived. At 3.6 m/s, an error of 100 ms is an error of 0.36 m.
 
 use std::io::IoSliceMut;
 use std::net::{SocketAddr, SocketAddrV4, SocketAddrV6, UdpSocket};
@@ -17,35 +17,34 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::clock;
 
-/// Receives datagrams with the instants at which they came.
+/// Receiver of datagrams with their arrival times.
 #[derive(Debug)]
 pub(super) struct Arrivals {
-    /// Where the kernel puts its stamp.
+    /// Buffer for the kernel's stamp.
     control: Vec<u8>,
 }
 
-/// A datagram's length, its sender, and when it came.
+/// Length, sender and arrival time of a datagram.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrival {
-    /// Bytes of the buffer that are the datagram's.
+    /// Length of the datagram in the buffer.
     pub(super) length: usize,
-    /// Who sent it.
     pub(super) from: SocketAddr,
-    /// When the kernel had it; when it was read, of a kernel that does not say. [server]
+    /// Time at which the kernel received it; if the kernel gives no stamp, time at which it was read. [server]
     pub(super) at: ServerTime,
 }
 
 impl Arrivals {
-    /// Asks the kernel for stamps of what comes to `socket`. One that has none leaves the instant of reading.
+    /// Enables kernel stamps for `socket`. If they are unavailable, the time of reading is used.
     pub(super) fn of(socket: &UdpSocket) -> Self {
         let _ = setsockopt(socket, sockopt::ReceiveTimestampns, &true);
         Self { control: cmsg_space!(TimeSpec) }
     }
 
-    /// Waits for the next datagram, as long as the socket's time-out.
+    /// Waits for the next datagram, at most for the socket's timeout.
     ///
     /// # Errors
-    /// The socket's: its time-out, or an ICMP complaint.
+    /// Errors of the socket: its timeout, or an ICMP error.
     pub(super) fn receive(
         &mut self,
         socket: &UdpSocket,
@@ -70,7 +69,7 @@ impl Arrivals {
     }
 }
 
-/// Returns how long ago `stamp` was on the wall clock, which is the kernel's for stamps. [s]
+/// Returns the age of `stamp` on the wall clock, which the kernel uses for stamps. [s]
 fn waited_s(stamp: TimeSpec) -> f64 {
     let Ok(wall) = clock_gettime(ClockId::CLOCK_REALTIME) else { return 0.0 };
     let seconds = (wall.tv_sec() - stamp.tv_sec()) as f64;
@@ -82,7 +81,8 @@ fn address(from: &SockaddrStorage) -> Option<SocketAddr> {
     v4.or_else(|| from.as_sockaddr_in6().map(|v6| SocketAddr::V6(SocketAddrV6::from(*v6))))
 }
 
-/// What waited longer was stamped before somebody set the wall clock: the buffer holds 3 s of a stream. [s]
+/// Maximum plausible wait: the buffer holds 3 s of a stream. A longer one means that the wall clock was set.
+/// [s]
 const MAX_WAIT_S: f64 = 3.0;
 
 #[cfg(test)]
@@ -91,7 +91,8 @@ mod tests {
 
     use super::*;
 
-    /// Sends three datagrams, then reads them; returns how far the worst stamp is outside its sending. [s]
+    /// Sends three datagrams, then reads them; returns how far the worst stamp is outside the time of sending.
+    /// [s]
     fn worst_s(local: &str) -> f64 {
         let socket = UdpSocket::bind(local).unwrap();
         let mut arrivals = Arrivals::of(&socket);
@@ -117,9 +118,10 @@ mod tests {
     }
 
     #[test]
-    fn what_waited_is_stamped_when_it_came() {
+    fn queued_datagrams_have_their_arrival_time() {
         for local in ["127.0.0.1:0", "[::1]:0"] {
-            // The two clocks are read one after the other: a preemption between them counts, and does not come every time.
+            // The two clocks are read one after the other; a preemption between them causes an error, but not
+            // every time.
             assert!((0..20).any(|_| worst_s(local) < 5e-3), "{local}");
         }
     }

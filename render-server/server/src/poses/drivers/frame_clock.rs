@@ -1,11 +1,10 @@
-//! Stamps frames that come with a counter but without a time. Sans-IO.
+//! Stamps for frames with a counter but without a time. Sans-IO.
 //!
-//! Frames are measured at a constant rate, but arrive late by a delay that varies: the network,
-//! and this computer waking up late. Over a window, arrival = offset + period * frame + delay with
-//! delay >= 0. The period is the slope of a line through the promptest frames; the offset is the least
-//! `arrival - period * frame`, as in the minimum-delay filter of NTP. What remains in the stamp is
-//! the constant delay only. Velocity from finite differences needs this: two packets read at the
-//! same instant would otherwise be an infinite speed.
+//! Frames are measured at a constant rate, but arrive with a varying delay of the network and of this
+//! computer's wake-up. Over a window, arrival = offset + period * frame + delay with delay >= 0. The period is
+//! the slope of a line through the frames with the least delay. The offset is the least `arrival - period *
+//! frame`, as in the minimum-delay filter of NTP. Only the constant delay remains in the stamp. Velocities from
+//! finite differences need this: two packets read at the same instant would otherwise give an infinite speed.
 
 use std::collections::VecDeque;
 
@@ -16,18 +15,18 @@ use vizflyt_protocol::time::ServerTime;
 pub struct FrameClock {
     /// (frame, arrival), oldest first, frames unwrapped relative to the first of the window.
     window: VecDeque<(u32, ServerTime)>,
-    /// Since when every frame has come late.
+    /// Time since which all frames have been late.
     late_since: Option<ServerTime>,
     last: Option<ServerTime>,
-    /// The slope of the last window that was long enough. [s]
+    /// Slope of the last window that was long enough. [s]
     period_s: Option<f64>,
-    /// Scratch for that slope.
+    /// Scratch memory for the slope.
     points: Vec<(f64, f64)>,
 }
 
 impl FrameClock {
-    /// Takes a frame that arrived at `arrival`; returns when it was measured. Never later than
-    /// `arrival`, never earlier than the last stamp.
+    /// Returns the time of measurement of a frame that arrived at `arrival`. It is never later than `arrival`,
+    /// and never earlier than the last stamp.
     pub fn stamp(&mut self, frame: u32, arrival: ServerTime) -> ServerTime {
         let jumped = self.window.back().is_some_and(|&(last, last_arrival)| {
             let ahead = frame.wrapping_sub(last);
@@ -41,8 +40,8 @@ impl FrameClock {
             self.window.pop_front();
         }
         let lateness_s = self.lateness_s();
-        // The counter's clock slipped against ours for good (the source paused): start over. Time
-        // separates this from a burst after a pause of our own, which is over in an instant.
+        // If the frames stay late, the source paused and its counter slipped: start over. A burst after a pause
+        // of this process also comes late, but ends at once.
         self.late_since =
             if lateness_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
         if self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S) {
@@ -64,7 +63,7 @@ impl FrameClock {
         stamp
     }
 
-    /// Returns by how much the newest frame came later than the promptest of the window. [s]
+    /// Returns the delay of the newest frame compared with the fastest one of the window. [s]
     fn lateness_s(&mut self) -> f64 {
         let (Some(&first), Some(&newest)) = (self.window.front(), self.window.back()) else {
             return 0.0;
@@ -72,7 +71,7 @@ impl FrameClock {
         let point = |(frame, arrival): (u32, ServerTime)| {
             (f64::from(frame.wrapping_sub(first.0)), arrival.seconds_since(first.1))
         };
-        // The period hardly changes: every few frames is often enough.
+        // The period hardly changes: an update every few frames is sufficient.
         if self.window.len() >= MIN_SAMPLES
             && (self.period_s.is_none() || newest.0.is_multiple_of(8))
         {
@@ -80,7 +79,7 @@ impl FrameClock {
             self.points.extend(self.window.iter().map(|&p| point(p)));
             self.period_s = slope_of_the_prompt(&mut self.points).or(self.period_s);
         }
-        // Before there ever was a slope, stamps are arrivals.
+        // Until there is a slope, the arrival is the stamp.
         let Some(period_s) = self.period_s else { return 0.0 };
         let offset = |(f, a): (f64, f64)| a - period_s * f;
         let least = self.window.iter().map(|&p| offset(point(p))).fold(f64::INFINITY, f64::min);
@@ -88,11 +87,11 @@ impl FrameClock {
     }
 }
 
-/// Returns the slope of a least-squares line through the prompter half of (frame, arrival) points.
+/// Returns the slope of a least-squares line through the faster half of (frame, arrival) points.
 ///
-/// Delays are one-sided and come in bursts, which tilt a line through all points. So the later
-/// half is left out, judged by the line before, a few times over (the concentration steps of least
-/// trimmed squares: Rousseeuw and Van Driessen, 1999). Reorders the points.
+/// Delays are one-sided and come in bursts, which tilt a line through all points. So the later half, relative
+/// to the previous line, is left out, in a few iterations (the concentration steps of least trimmed squares:
+/// Rousseeuw and Van Driessen, 1999). Reorders the points.
 fn slope_of_the_prompt(points: &mut [(f64, f64)]) -> Option<f64> {
     let mut kept = points.len();
     let mut slope = None;
@@ -119,15 +118,15 @@ fn slope_of_the_prompt(points: &mut [(f64, f64)]) -> Option<f64> {
 
 /// Two seconds at 200 Hz. The slope's error is then 1 us a frame for 2 ms of jitter.
 const WINDOW: usize = 400;
-/// Fewer frames than this give no slope worth using: the last one holds.
+/// Minimum frames for a slope; with fewer, the last slope is kept.
 const MIN_SAMPLES: usize = 20;
-/// A gap in the counter beyond this is another recording: a second at 200 Hz.
+/// A larger gap in the counter means another recording: a second at 200 Hz.
 const MAX_GAP: u32 = 200;
-/// Silence after which the counter is trusted no more. [s]
+/// Silence after which the counter is no longer trusted. [s]
 const MAX_SILENCE_S: f64 = 1.0;
-/// Enough for a burst of a quarter of the window.
+/// Iterations: enough for a burst of a quarter of the window.
 const STEPS: usize = 4;
-/// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
+/// A delay above this for [`SLIP_LASTS_S`] is not caused by the network of a lab. [s]
 const SLIP_S: f64 = 0.010;
 const SLIP_LASTS_S: f64 = 0.3;
 
@@ -143,8 +142,8 @@ mod tests {
     }
 
     proptest! {
-        /// With jitter of up to 4 ms, stamps settle to within 2 ms of the truth, 1 ms on average,
-        /// where arrivals are off by up to 4 and by 2.
+        /// With jitter of up to 4 ms, stamps settle to within 2 ms of the truth, 1 ms on average; arrivals are
+        /// off by up to 4 ms, 2 ms on average.
         #[test]
         fn jitter_is_removed(delays in prop::collection::vec(0u64..4_000_000, 400..600)) {
             let mut clock = FrameClock::default();
@@ -164,7 +163,7 @@ mod tests {
             prop_assert!(sum_s / (delays.len() as f64 - 201.0) < 1e-3);
         }
 
-        /// Whatever comes, stamps never run backwards nor ahead of the arrival.
+        /// For any input, stamps never run backwards and are never later than the arrival.
         #[test]
         fn stamps_are_monotone(input in prop::collection::vec((any::<u32>(), 0u64..50_000_000), 1..200)) {
             let mut clock = FrameClock::default();
@@ -178,8 +177,8 @@ mod tests {
         }
     }
 
-    /// A pause of ours: frames queue in the socket and are read all at once. Their stamps keep the
-    /// source's rhythm; were they the arrivals, the vehicle would seem to jump.
+    /// This process pauses: frames queue in the socket and are read all at once. Their stamps keep the source's
+    /// rhythm; with arrival times, the vehicle would seem to jump.
     #[test]
     fn a_burst_keeps_the_rhythm_of_the_source() {
         let mut clock = FrameClock::default();
@@ -194,12 +193,12 @@ mod tests {
     }
 
     #[test]
-    fn a_source_that_paused_is_followed() {
+    fn recovers_after_the_source_paused() {
         let mut clock = FrameClock::default();
         for frame in 0..300 {
             clock.stamp(frame, truth(frame));
         }
-        // From here on every frame comes 60 ms later than its number implies.
+        // From here on every frame arrives 60 ms later than its number implies.
         let late = |frame| truth(frame).plus_ns(60_000_000);
         let stamps: Vec<_> = (300..400).map(|frame| clock.stamp(frame, late(frame))).collect();
         let last = *stamps.last().unwrap();

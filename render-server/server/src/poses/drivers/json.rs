@@ -1,17 +1,17 @@
-//! VizFlyt's own pose packet: one JSON object a datagram, from any program. Sans-IO.
+//! VizFlyt's JSON pose packet: one JSON object per datagram, from any program. Sans-IO.
 //!
 //! ```json
 //! {"vizflyt_pose": 1, "object": "vizflyt", "seq": 12, "stamp_ns": 123456789, "clock": "sender",
 //!  "position_m": [1.0, 2.0, 0.5], "rotation_xyzw": [0, 0, 0, 1],
 //!  "position_sigma_m": [0.002, 0.002, 0.004], "rotation_sigma_rad": [0.01, 0.01, 0.01]}
 //! ```
-//! `seq`, `stamp_ns`, `clock` and the sigmas may be left out. Stamps are of this computer's
-//! CLOCK_MONOTONIC (`"clock": "server"`), or of any clock of the sender's (`"sender"`, also if
-//! nothing is given), which [`super::sender_clock`] relates to ours. Without a stamp, `seq` gives the
-//! rhythm; without either, a pose is as old as its arrival. `quality` is what `vizflyt tags locate` saw:
-//! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. `notes` are sentences for people,
-//! `["left camera moved by 2.4 cm: survey again"]`, in each packet for as long as they are true: the page shows each once.
-//! What else the object holds is ignored.
+//! `seq`, `stamp_ns`, `clock` and the sigmas are optional. Stamps use CLOCK_MONOTONIC of this computer
+//! (`"clock": "server"`), or any clock of the sender (`"sender"`, the default), which [`super::sender_clock`]
+//! maps to the server's. Without a stamp, `seq` gives the rhythm. Without either, the arrival is the stamp.
+//! `quality` is the evidence of `vizflyt tags locate`:
+//! `{"tags": 3, "cameras": 2, "rms_px": 0.2, "image_ms": 1.4, "view_port": 8091}`. `notes` are sentences for
+//! users, `["left camera moved by 2.4 cm: survey again"]`, repeated in each packet while they are true; the page
+//! shows each once. Other keys of the object are ignored.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -28,7 +28,7 @@ use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{FrameOrder, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
-/// A packet, as it is written.
+/// Pose packet as received.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct PosePacket<'a> {
     /// Version: 1.
@@ -36,18 +36,18 @@ pub struct PosePacket<'a> {
     /// Name of the object.
     #[serde(borrow)]
     pub object: Cow<'a, str>,
-    /// Counts packets of this object.
+    /// Counter of this object's packets.
     #[serde(default)]
     pub seq: Option<u64>,
-    /// When the pose was true. [ns, clock]
+    /// Time of measurement. [ns, clock]
     #[serde(default)]
     pub stamp_ns: Option<u64>,
-    /// Whose clock that is.
+    /// Clock of `stamp_ns`.
     #[serde(default)]
     pub clock: StampClock,
-    /// Where the object is. [m, world]
+    /// Position of the object. [m, world]
     pub position_m: [f64; 3],
-    /// Rotation of its axes into the world's.
+    /// Rotation from the object's axes to the world's.
     pub rotation_xyzw: [f64; 4],
     /// Standard deviation of the position. [m, world]
     #[serde(default)]
@@ -55,15 +55,15 @@ pub struct PosePacket<'a> {
     /// Standard deviation of the rotation. [rad, body]
     #[serde(default)]
     pub rotation_sigma_rad: Option<[f64; 3]>,
-    /// What the pose rests on, if that is tags.
+    /// Tags behind the pose, if it comes from tags.
     #[serde(default, deserialize_with = "tags_if_any")]
     pub quality: Option<TagsSeen>,
-    /// What its sender has to tell people.
+    /// Messages of the sender for users.
     #[serde(borrow, default)]
     pub notes: Vec<Cow<'a, str>>,
 }
 
-/// Reads the `quality` of `vizflyt tags locate`; what another program means by `quality` is its own affair.
+/// Reads the `quality` of `vizflyt tags locate`; other contents of `quality` are ignored.
 fn tags_if_any<'de, D: serde::Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<TagsSeen>, D::Error> {
@@ -71,35 +71,35 @@ fn tags_if_any<'de, D: serde::Deserializer<'de>>(
     Ok(TagsSeen::deserialize(value).ok())
 }
 
-/// Whose clock a stamp is of.
+/// Clock of a stamp.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StampClock {
     /// CLOCK_MONOTONIC of the render server's computer.
     Server,
-    /// Another.
+    /// Any other clock of the sender.
     #[default]
     Sender,
 }
 
-/// Why bytes are no packet.
+/// Why a packet is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum JsonError {
-    /// It is no such JSON object.
-    #[error("packet of {length} bytes is no pose packet: {error}")]
+    /// Not a valid JSON object of this format.
+    #[error("packet of {length} bytes is not a pose packet: {error}")]
     Json {
-        /// Its length.
+        /// Length of the packet.
         length: usize,
-        /// What the reader says.
+        /// Error of the JSON parser.
         error: serde_json::Error,
     },
-    /// A version this parser does not know.
+    /// Unsupported version.
     #[error("vizflyt_pose is {0}, this server knows 1")]
     Version(u32),
-    /// Numbers that are no position.
+    /// Position out of range.
     #[error("position_m {0:?} is absurdly large")]
     Position([f64; 3]),
-    /// A quaternion that is no rotation.
+    /// Quaternion without unit length.
     #[error("rotation_xyzw {0:?} is not of unit length")]
     Rotation([f64; 4]),
     /// Invalid sigmas.
@@ -107,25 +107,25 @@ pub enum JsonError {
     Sigma {
         /// The key.
         key: &'static str,
-        /// What it says.
+        /// Value of the key.
         value: [f64; 3],
     },
 }
 
 impl<'a> PosePacket<'a> {
-    /// Reads a packet and checks its numbers.
+    /// Parses a packet and checks its numbers.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, JsonError> {
         let packet: Self = serde_json::from_slice(bytes)
             .map_err(|error| JsonError::Json { length: bytes.len(), error })?;
         if packet.vizflyt_pose != 1 {
             return Err(JsonError::Version(packet.vizflyt_pose));
         }
-        // JSON has no NaN, but numbers that overflow.
+        // JSON has no NaN, but numbers may overflow.
         if !packet.position_m.iter().all(|value| value.abs() <= MAX_VALUE) {
             return Err(JsonError::Position(packet.position_m));
         }
         let length = DQuat::from_array(packet.rotation_xyzw).length();
-        // Three digits are enough to write a quaternion by.
+        // Tolerance: a quaternion written with three digits is accepted.
         if !((length - 1.0).abs() <= 0.01) {
             return Err(JsonError::Rotation(packet.rotation_xyzw));
         }
@@ -143,20 +143,20 @@ impl<'a> PosePacket<'a> {
     }
 }
 
-/// Selects our vehicles from the packets.
+/// Driver for JSON packets.
 #[derive(Debug)]
 pub struct JsonStream {
     names: VehicleNames,
-    /// Of each vehicle: its packets may come from different programs.
+    /// Clocks by vehicle: packets may come from different programs.
     clocks: Vec<SenderClock>,
-    /// What the newest pose of each vehicle rests on.
+    /// Tags behind the newest pose of each vehicle.
     tags: Vec<Option<TagsSeen>>,
     notes: Notes,
     warned_of_clock: bool,
 }
 
 impl JsonStream {
-    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    /// Creates a stream for the named vehicles; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let names = VehicleNames::new(config, source, vehicles);
         let clocks = vec![SenderClock::default(); names.len()];
@@ -235,7 +235,7 @@ impl PoseStream for JsonStream {
         let order = packet.seq.map(|seq| self.names.is_next(vehicle, seq as u32, now));
         match order {
             Some(FrameOrder::Old) => return &[],
-            // Its clock may have begun anew, too.
+            // The sender's clock may also have restarted.
             Some(FrameOrder::Restarted) => self.clocks[vehicle] = SenderClock::default(),
             Some(FrameOrder::Next) | None => {}
         }
@@ -245,8 +245,8 @@ impl PoseStream for JsonStream {
             .zip(packet.rotation_sigma_rad)
             .map(|(p, r)| PoseSigma { position_m: p.into(), rotation_rad: r.into() });
         self.tags[vehicle] = packet.quality.map(|seen| {
-            // A port, and not an address, as anyone on the network can send a packet: the page's link leads to
-            // the sender itself.
+            // The packet contains only a port, because any computer on the network can send a packet: the
+            // page's link leads to the sender itself.
             let view = seen.view_port.map(|port| SocketAddr::new(from.ip(), port));
             TagsSeen { view, ..seen }
         });
@@ -273,16 +273,16 @@ impl PoseStream for JsonStream {
     }
 }
 
-/// Which notes of senders people know already.
+/// Notes of senders that were shown recently.
 #[derive(Debug, Default)]
 struct Notes {
-    /// Without its numbers, and when it came last.
+    /// Text without digits, and time of the last arrival.
     told: VecDeque<(String, ServerTime)>,
     told_at: Option<ServerTime>,
 }
 
 impl Notes {
-    /// Returns a note as it is to be shown, unless it was not long ago but for its numbers.
+    /// Returns the text to show; `None` if the same note, apart from its numbers, was shown recently.
     fn news(&mut self, note: &str, now: ServerTime) -> Option<String> {
         let printable = note.chars().filter(|c| !c.is_control()).take(MAX_NOTE);
         let note: String = printable.collect();
@@ -294,7 +294,7 @@ impl Notes {
                 return None;
             }
         } else {
-            // Whoever can send poses must not flood the page.
+            // Limits the rate, so that a sender cannot flood the page.
             if self.told_at.is_some_and(|at| now.seconds_since(at) < NOTES_APART_S) {
                 return None;
             }
@@ -308,21 +308,21 @@ impl Notes {
     }
 }
 
-/// Longest note. [characters]
+/// Maximum length of a note. [characters]
 const MAX_NOTE: usize = 320;
-/// So many are remembered.
+/// Maximum number of stored notes.
 const MAX_NOTES: usize = 16;
-/// One that has not come for so long is news again. [s]
+/// A note that has not arrived for this long is shown again. [s]
 const FORGOTTEN_S: f64 = 30.0;
-/// New ones are this far apart; others wait for a later packet. [s]
+/// Minimum time between new notes; others wait for a later packet. [s]
 const NOTES_APART_S: f64 = 0.5;
-/// The default sender.
+/// Default sender.
 const NOBODY: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::UNSPECIFIED), 0);
-/// No lab is a thousand kilometres wide, not in millimetres either.
+/// Maximum coordinate: no lab is a thousand kilometres wide, even in millimetres.
 const MAX_VALUE: f64 = 1e9;
-/// Two readings of one clock, rounded. [s]
+/// Tolerance for two readings of one clock, rounded. [s]
 const FUTURE_S: f64 = 0.001;
-/// A pose that took longer is another clock's. [s]
+/// Maximum age of a pose; an older stamp is of another clock. [s]
 const OLDEST_S: f64 = 2.0;
 
 #[cfg(test)]

@@ -1,11 +1,9 @@
-//! An autopilot's own estimate, over MAVLink: what it makes of UWB, optical flow or a camera of its
-//! own. Sans-IO.
+//! The autopilot's own estimate over MAVLink, for example from UWB, optical flow or a camera. Sans-IO.
 //!
-//! Either ODOMETRY (331) alone, or LOCAL_POSITION_NED (32) for the position, each with the newest
-//! ATTITUDE_QUATERNION (31) or ATTITUDE (30) turned on to its instant by its own rates. Whoever
-//! streams is asked for 32 and 31 at 50 Hz. Stamps are the autopilot's time since boot, which
-//! [`super::sender_clock`] relates to ours. A vehicle's object is the number of its system; a vehicle
-//! alone takes whichever comes.
+//! Uses only ODOMETRY (331), or LOCAL_POSITION_NED (32) for the position with the newest ATTITUDE_QUATERNION
+//! (31) or ATTITUDE (30), extrapolated to its time with its own rates. The driver requests 32 and 31 at 50 Hz
+//! from each sender. Stamps are the autopilot's time since boot, which [`super::sender_clock`] maps to the
+//! server's clock. A vehicle's object is its system id; a single vehicle accepts any.
 
 use std::net::SocketAddr;
 
@@ -27,27 +25,27 @@ use super::udp::{PoseStream, Silence};
 use super::vehicle_names::VehicleNames;
 use crate::poses::settings::LocalizationConfig;
 
-/// Selects our vehicles' autopilots.
+/// Driver for MAVLink.
 pub struct MavlinkStream {
     names: VehicleNames,
     decoder: StreamDecoder,
-    /// Packets of one datagram, until they are looked at.
+    /// Packets of one datagram that are not processed yet.
     packets: Vec<Packet>,
     systems: Vec<System>,
     asks: u8,
 }
 
-/// One vehicle's autopilot.
+/// State of one vehicle's autopilot.
 #[derive(Clone, Debug, Default)]
 struct System {
     clock: SenderClock,
     attitude: Option<Attitude>,
-    /// Who it is, and where it is.
+    /// Header of its packets, and its address.
     from: Option<(MavHeader, SocketAddr)>,
     asked: Option<ServerTime>,
-    /// ODOMETRY comes: the other messages have the same, less precisely.
+    /// ODOMETRY arrives, so the other messages, which contain the same less precisely, are ignored.
     has_odometry: bool,
-    /// The newest stamp used. [ns, autopilot]
+    /// Newest stamp used. [ns, autopilot]
     last_ns: u64,
 }
 
@@ -59,7 +57,7 @@ struct Attitude {
 }
 
 impl MavlinkStream {
-    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    /// Creates a stream for the named vehicles; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let names = VehicleNames::new(config, source, vehicles);
         let systems = vec![System::default(); names.len().min(MAX_VEHICLES)];
@@ -102,7 +100,7 @@ impl MavlinkStream {
             MavMessage::ATTITUDE(message) => {
                 let (world_from_body, omega_body_radps) = attitude_from_mavlink(message);
                 let boot_ms = message.time_boot_ms;
-                // The quaternion is the better of the two where both come.
+                // If both messages arrive, the quaternion is preferred.
                 let newer =
                     system.attitude.is_none_or(|old| boot_ms.wrapping_sub(old.boot_ms) > 100);
                 if newer && world_from_body.is_normalized() && omega_body_radps.is_finite() {
@@ -113,7 +111,7 @@ impl MavlinkStream {
                 let (p_world_m, _) = local_position_from_mavlink(message);
                 let Some(attitude) = system.attitude else { return };
                 let dt_ms = message.time_boot_ms.wrapping_sub(attitude.boot_ms).cast_signed();
-                // An attitude of another moment is none.
+                // Reject attitudes of another time.
                 if dt_ms.unsigned_abs() > OLDEST_ATTITUDE_MS {
                     return;
                 }
@@ -140,7 +138,7 @@ impl MavlinkStream {
             let error = format!("ODOMETRY's rotation {rotation} is not of unit length");
             return self.names.bad(&error, "does the autopilot know its attitude yet?");
         }
-        // The diagonal of an upper triangle; NaN in its first place means unknown.
+        // Diagonal of an upper triangle; NaN as first element means unknown.
         let variance = |[a, b, c]: [usize; 3]| {
             let at = |index: usize| f64::from(message.pose_covariance[index]);
             DVec3::new(at(a), at(b), at(c))
@@ -165,11 +163,11 @@ impl MavlinkStream {
         sigma: Option<PoseSigma>,
     ) {
         if !(p_m.abs().cmple(DVec3::splat(MAX_POSITION_M)).all() && rotation.is_normalized()) {
-            let error = format!("position {p_m} with rotation {rotation} is no pose");
+            let error = format!("position {p_m} with rotation {rotation} is not a valid pose");
             return self.names.bad(&error, "has the autopilot an estimate yet?");
         }
         let system = &mut self.systems[vehicle];
-        // A routed link may bring a packet twice.
+        // A routed link may deliver a packet twice.
         if stamp_ns == system.last_ns
             || self.names.measured().iter().any(|measured| measured.vehicle == vehicle)
         {
@@ -198,7 +196,7 @@ impl MavlinkStream {
         let after = self.decoder.stats();
         if after.packets + after.unknown == before.packets + before.unknown {
             self.names.bad(
-                &format!("{} bytes hold no MAVLink packet", bytes.len()),
+                &format!("{} bytes contain no MAVLink packet", bytes.len()),
                 "is something else sent to this port?",
             );
         }
@@ -241,7 +239,7 @@ impl PoseStream for MavlinkStream {
             system.from.is_some()
                 && system.asked.is_none_or(|at| now.seconds_since(at) > ASK_EVERY_S)
         };
-        // One message at a time: the position first, the attitude on the next call.
+        // One message per call: first the position, then the attitude.
         let attitude = self.asks % 2 == 1;
         let system = self.systems.iter_mut().find(due)?;
         let (autopilot, to) = system.from?;
@@ -281,17 +279,17 @@ impl PoseStream for MavlinkStream {
 
 /// MAV_COMP_ID_AUTOPILOT1.
 const AUTOPILOT: u8 = 1;
-/// Ours: no ground station, so that nobody takes us for one.
+/// Our system id: not one of a ground station, so that the autopilot does not treat us as one.
 const OUR_SYSTEM: u32 = 246;
 /// MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
 const OUR_COMPONENT: u8 = 197;
 /// 50 Hz. [us]
 const INTERVAL_US: f32 = 20_000.0;
-/// A request may be lost, and a rebooted autopilot has forgotten it. [s]
+/// Interval of requests: a request may be lost, and a rebooted autopilot loses its settings. [s]
 const ASK_EVERY_S: f64 = 5.0;
-/// Attitudes turn on evenly for so long. [ms]
+/// Maximum extrapolation of an attitude. [ms]
 const OLDEST_ATTITUDE_MS: u32 = 100;
-/// No room is wider. [m]
+/// Maximum coordinate. [m]
 const MAX_POSITION_M: f64 = 1e6;
 
 #[cfg(test)]

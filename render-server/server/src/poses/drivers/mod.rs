@@ -1,14 +1,14 @@
-//! Sources of poses. A driver owns its socket; the parser beside it is sans-IO.
+//! Pose sources. A driver owns its socket; its parser is sans-IO.
 //!
 //! ```text
 //! datagrams -> udp (socket), arrival (the kernel's stamp) -> vicon, natnet, json, mavlink (bytes -> objects)
 //! bytes ----> vrpn::connection (TCP, arrival stamp) -> vrpn
-//!           -> vehicle_names (which vehicle's; into the world frame; counters; what is odd)
-//!           -> frame_clock, sender_clock (stamp without the network's jitter)
-//!           -> Measurements -> multi_source (where there are several) -> pose thread
+//!           -> vehicle_names (vehicle of an object; world frame; counters; warnings)
+//!           -> frame_clock, sender_clock (stamps without network jitter)
+//!           -> Measurements -> multi_source (for several sources) -> pose thread
 //! ```
-//! 30 to 300 Hz. The pose thread of [`crate::poses::thread`] owns the source and calls
-//! [`PoseSource::receive`]. Which sources there are: [`open`].
+//! Sources send 30 to 300 Hz. The pose thread of [`crate::poses::thread`] owns the source and calls
+//! [`PoseSource::receive`]. [`open`] creates the sources.
 
 mod arrival;
 pub mod frame_clock;
@@ -38,14 +38,14 @@ use self::vrpn::VrpnStream;
 use self::vrpn::connection::VrpnPoses;
 use crate::poses::settings::{Driver, LocalizationConfig};
 
-/// A source whose address is taken, and which waits for the names of the vehicles.
+/// Source with a bound address, before the names of the vehicles are known.
 #[derive(Debug)]
 pub struct Opened {
     config: LocalizationConfig,
     port: Port,
 }
 
-/// Where a driver's stream arrives, or is fetched.
+/// Socket or server address of a driver.
 #[derive(Debug)]
 enum Port {
     Vicon(UdpPort),
@@ -55,15 +55,15 @@ enum Port {
     Vrpn(SocketAddr),
 }
 
-/// Takes the addresses of sources, in their order.
+/// Binds the addresses of all sources, in order.
 ///
 /// # Errors
-/// Names an address that cannot be used, and what to do.
+/// Names an address that cannot be used, and the fix.
 pub fn open(configs: &[LocalizationConfig]) -> Result<Vec<Opened>> {
     configs.iter().map(Opened::open).collect()
 }
 
-/// Makes one source of several, which looks for the vehicles named, by their index.
+/// Combines all sources into one, for the named vehicles, by index.
 ///
 /// # Errors
 /// If a thread cannot be started.
@@ -74,7 +74,7 @@ pub fn track(opened: Vec<Opened>, vehicles: &[&str]) -> Result<Box<dyn PoseSourc
         .map(|(index, opened)| opened.track(index as u8, vehicles))
         .collect();
     if sources.len() == 1 {
-        // Without a thread between socket and referee.
+        // A single source needs no thread between socket and referee.
         return Ok(sources.remove(0));
     }
     Ok(Box::new(MultiSource::start(sources)?))
@@ -106,12 +106,12 @@ impl Opened {
         Ok(Self { config, port })
     }
 
-    /// Returns who sends.
+    /// Returns the driver.
     pub fn driver(&self) -> Driver {
         self.config.driver
     }
 
-    /// Returns where its stream must be sent, if it arrives at a socket of ours unasked.
+    /// Returns the address to which data must be sent; `None` if the driver requests them.
     pub fn socket(&self) -> Option<SocketAddr> {
         match &self.port {
             Port::Vicon(port)
@@ -122,7 +122,7 @@ impl Opened {
         }
     }
 
-    /// Returns where it arrives or is asked for, for people.
+    /// Returns the address for display: of the socket, or of the server that is queried.
     pub fn address(&self) -> String {
         match &self.port {
             Port::Natnet(_, Motive::Unicast(server)) | Port::Vrpn(server) => *server,
@@ -152,7 +152,7 @@ impl Opened {
     }
 }
 
-/// Joins Motive's multicast group, or makes a socket from which it is asked to stream to us alone.
+/// Joins Motive's multicast group, or opens a socket for unicast streaming.
 fn open_natnet(config: &LocalizationConfig, at: SocketAddr) -> Result<(UdpPort, Motive)> {
     let any: SocketAddr = match at {
         SocketAddr::V4(group) if group.ip().is_multicast() => {
@@ -166,10 +166,11 @@ fn open_natnet(config: &LocalizationConfig, at: SocketAddr) -> Result<(UdpPort, 
     Ok((UdpPort::bind(Driver::Natnet, any)?, Motive::Unicast(at)))
 }
 
-/// Returns a source's address, HOST:PORT, resolved.
+/// Resolves a source's address HOST:PORT.
 fn address(config: &LocalizationConfig) -> Result<SocketAddr> {
     let (driver, text) = (config.driver, config.address());
-    let advice = || format!("{driver}: '{text}' is no HOST:PORT, as {}", driver.usual_address());
+    let advice =
+        || format!("{driver}: '{text}' is not HOST:PORT, for example {}", driver.usual_address());
     text.to_socket_addrs().with_context(advice)?.next().with_context(advice)
 }
 
@@ -178,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_asked_has_a_usual_port_and_no_socket() {
+    fn queried_servers_have_a_default_port_and_no_socket() {
         for (pose, address) in [
             ("natnet:10.0.0.5", "10.0.0.5:1510"),
             ("vrpn:10.0.0.5", "10.0.0.5:3883"),

@@ -1,4 +1,4 @@
-//! Several sources side by side: each waits in a thread of its own.
+//! Several sources in parallel, each in its own thread.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
@@ -12,10 +12,10 @@ use vizflyt_arena::config::MAX_VEHICLES;
 use super::source::{Measurement, PoseSource, SourceCounters};
 use vizflyt_process::lock;
 
-/// What came together from one source.
+/// Measurements of one call of a source.
 type Batch = heapless::Vec<Measurement, MAX_VEHICLES>;
 
-/// Yields what several sources yield, in the order in which it comes.
+/// Source that combines several sources, in order of arrival.
 #[derive(Debug)]
 pub(super) struct MultiSource {
     inbox: Receiver<Batch>,
@@ -25,7 +25,7 @@ pub(super) struct MultiSource {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What a source's thread reports beside its poses.
+/// Counters and warnings of a source's thread.
 #[derive(Debug, Default)]
 struct Shared {
     counters: Mutex<[SourceCounters; MAX_VEHICLES]>,
@@ -33,7 +33,7 @@ struct Shared {
 }
 
 impl MultiSource {
-    /// Starts the sources.
+    /// Starts a thread per source.
     pub(super) fn start(sources: Vec<Box<dyn PoseSource>>) -> Result<Self> {
         let (sender, inbox) = sync_channel(WAITING);
         let stop = Arc::new(AtomicBool::new(false));
@@ -53,7 +53,7 @@ impl MultiSource {
     }
 }
 
-/// Passes on what one source yields until `stop`.
+/// Forwards the measurements of one source until `stop`.
 fn forward(
     mut source: Box<dyn PoseSource>,
     sender: &SyncSender<Batch>,
@@ -63,7 +63,8 @@ fn forward(
     while !stop.load(Ordering::Relaxed) {
         let batch: Batch = source.receive(PATIENCE).iter().take(MAX_VEHICLES).copied().collect();
         let yielded = !batch.is_empty();
-        // Nobody has read for a second: what is this old is of no use, and newer will come.
+        // A full queue means that no batch was read for a second: old measurements are of no use, and newer
+        // ones follow.
         if yielded && let Err(TrySendError::Disconnected(_)) = sender.try_send(batch) {
             return;
         }
@@ -112,9 +113,9 @@ impl Drop for MultiSource {
     }
 }
 
-/// Batches that wait at most: a second of one source at 200 Hz.
+/// Capacity of the queue: a second of one source at 200 Hz.
 const WAITING: usize = 256;
-/// How long a stop may go unnoticed.
+/// Maximum delay until a stop is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
@@ -124,7 +125,7 @@ mod tests {
     use vizflyt_protocol::geometry::Pose;
     use vizflyt_protocol::time::ServerTime;
 
-    /// Yields so many measurements, then nothing.
+    /// Source that yields `left` measurements, then none.
     struct Counted {
         source: u8,
         left: u64,
@@ -159,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn all_that_comes_is_yielded_with_its_source() {
+    fn yields_all_measurements_with_their_source() {
         let source = |source| -> Box<dyn PoseSource> {
             Box::new(Counted { source, left: 10, measured: Vec::new(), warned: false })
         };

@@ -1,14 +1,14 @@
-//! OptiTrack Motive's NatNet, 3 and 4: packets in, the poses of the named rigid bodies out. Sans-IO.
+//! Driver for OptiTrack Motive's NatNet, versions 3 and 4: poses of the named rigid bodies. Sans-IO.
 //!
 //! ```text
-//! ours -> CONNECT ------------> SERVERINFO: version, ticks per second of its clock
-//! ours -> REQUEST_MODELDEF ---> MODELDEF: names of rigid bodies and their streaming ids
-//!         FRAMEOFDATA, by multicast, or by unicast while we keep alive: ids, poses, stamps
+//! we send -> CONNECT ------------> SERVERINFO: version, ticks per second of its clock
+//! we send -> REQUEST_MODELDEF ---> MODELDEF: names of rigid bodies and their streaming ids
+//!         FRAMEOFDATA, by multicast, or by unicast while we send keep-alives: ids, poses, stamps
 //! ```
-//! The wire format is the crate `natnet`'s: no unsafe code, no dependency, every count checked
-//! against the bytes that are there, tested against captures of Motive 3.1; its sockets stay out. What
-//! is ours is the conversation, and time: Motive's clock is related to ours by the packets' `transmit`
-//! stamps, and a pose is as old as `transmit - mid exposure`.
+//! The crate `natnet` parses the wire format: no unsafe code, no dependency, every count checked against the
+//! available bytes, tested against captures of Motive 3.1. Its sockets are not used. This module implements the
+//! conversation and the time: the packets' `transmit` stamps map Motive's clock to the server's, and the age of
+//! a pose is `transmit - mid exposure`.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -27,24 +27,24 @@ use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{FrameOrder, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
-/// Who Motive is, and how it streams.
+/// Address and streaming mode of Motive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Motive {
-    /// By multicast; who sends is asked for names.
+    /// Multicast; names are requested from the sender.
     Multicast,
-    /// To us alone, because we ask; this is where it takes commands.
+    /// Unicast on request; address for commands.
     Unicast(SocketAddr),
 }
 
-/// The conversation with Motive.
+/// Driver for NatNet.
 #[derive(Debug)]
 pub struct NatnetStream {
     names: VehicleNames,
     motive: Motive,
-    /// Where commands go.
+    /// Address for commands.
     server: Option<SocketAddr>,
     session: Option<MotiveSession>,
-    /// What the server is asked to speak, if its own version is not known here.
+    /// Requested protocol version, if the server's own is unsupported.
     wanted: Option<Version>,
     clock: SenderClock,
     outbox: VecDeque<Vec<u8>>,
@@ -55,18 +55,18 @@ pub struct NatnetStream {
     warned_of_version: bool,
 }
 
-/// What is known of the Motive that sends.
+/// State of the connected Motive.
 #[derive(Debug)]
 struct MotiveSession {
     decoder: Decoder,
     ticks_hz: u64,
-    /// Whose rigid body has this id; none: nobody's.
+    /// Vehicle of each rigid body's id; `None` for other objects.
     vehicles: HashMap<i32, Option<usize>>,
     has_names: bool,
 }
 
 impl NatnetStream {
-    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    /// Creates a stream for the named vehicles; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str], motive: Motive) -> Self {
         Self {
             names: VehicleNames::new(config, source, vehicles),
@@ -96,7 +96,7 @@ impl NatnetStream {
         let version = options.stream_version(&info);
         let Ok(decoder) = Decoder::new(version) else {
             if self.motive != Motive::Multicast && self.wanted.is_none() {
-                // Motive can be asked to speak an older version to one listener.
+                // On request, Motive sends an older version to one listener.
                 self.wanted = Some(Version::V4_1);
                 self.asked = None;
             } else if !std::mem::replace(&mut self.warned_of_version, true) {
@@ -157,7 +157,7 @@ impl NatnetStream {
         for body in frame.rigid_bodies.iter().take(MAX_BODIES) {
             let named =
                 self.session.as_ref().and_then(|session| *session.vehicles.get(&body.id)?);
-            // A person may name a rigid body by its streaming id, too.
+            // A rigid body may also be configured by its streaming id.
             let vehicle = named.or_else(|| self.names.find(body.id.to_string().as_bytes()));
             if let Some(vehicle) = vehicle {
                 self.handle_body(vehicle, &frame, body, (stamp, now));
@@ -183,19 +183,21 @@ impl NatnetStream {
         }
         let p = DVec3::from(body.position.map(f64::from));
         let rotation = DQuat::from_array(body.orientation.map(f64::from));
-        // Single precision, so a few digits of unit length.
+        // Tolerance for single precision.
         if !(p.abs().cmple(DVec3::splat(MAX_VALUE)).all()
             && (rotation.length() - 1.0).abs() <= 0.01)
         {
-            let error =
-                format!("rigid body {} at {p} with rotation {rotation} is no pose", body.id);
+            let error = format!(
+                "rigid body {} at {p} with rotation {rotation} is not a valid pose",
+                body.id
+            );
             return self.names.bad(&error, NOT_MOTIVE);
         }
         let stamp = stamp.unwrap_or_else(|| self.names.stamp(vehicle, number, now));
         self.names.measure(vehicle, (stamp, now), (p, rotation.normalize()), None);
     }
 
-    /// Returns when the cameras were exposed for a frame; `None` if it does not state it.
+    /// Returns the time of exposure of a frame; `None` if the frame does not contain it.
     fn stamp(&mut self, frame: &FrameOfData, now: ServerTime) -> Option<ServerTime> {
         let ticks_hz = self.session.as_ref()?.ticks_hz;
         let timing = &frame.timing;
@@ -223,7 +225,7 @@ impl NatnetStream {
 
     fn ask(&mut self, now: ServerTime) {
         let unicast = matches!(self.motive, Motive::Unicast(_));
-        // Motive was restarted, or the network was away: it has forgotten us.
+        // Motive restarted, or the network was interrupted: register again.
         if unicast && self.received_at.is_some_and(|at| now.seconds_since(at) > FORGOTTEN_S) {
             (self.session, self.received_at) = (None, None);
         }
@@ -255,7 +257,7 @@ impl PoseStream for NatnetStream {
             Ok(NAT_SERVERINFO) => self.handle_info(bytes),
             Ok(NAT_MODELDEF) => self.handle_names(bytes),
             Ok(NAT_FRAMEOFDATA) => self.handle_frame(now, bytes),
-            // Chat between Motive and its clients.
+            // Other messages between Motive and its clients.
             Ok(id) if id <= MAX_ID => {}
             Ok(id) => self.names.bad(&format!("message {id} is not NatNet's"), NOT_MOTIVE),
             Err(error) => self.names.bad(&error, NOT_MOTIVE),
@@ -308,7 +310,7 @@ impl PoseStream for NatnetStream {
     }
 }
 
-/// Where Motive takes commands, unless someone changed it.
+/// Motive's default command port.
 pub const COMMAND_PORT: u16 = 1510;
 const NOT_MOTIVE: &str = "is something other than Motive's NatNet sent to this port?";
 const RENAME: &str = "rename the rigid body in Motive's Assets pane, or set `objects`";
@@ -316,16 +318,16 @@ const RENAME: &str = "rename the rigid body in Motive's Assets pane, or set `obj
 const LIST_CHANGED: u16 = 2;
 /// The highest id of a NatNet message (NAT_UNRECOGNIZED_REQUEST).
 const MAX_ID: u16 = 100;
-/// Rigid bodies of one Motive at most, as far as we look.
+/// Maximum rigid bodies processed per frame.
 const MAX_BODIES: usize = 256;
-/// No lab is a thousand kilometres wide, not in millimetres either.
+/// Maximum coordinate: no lab is a thousand kilometres wide, even in millimetres.
 const MAX_VALUE: f64 = 1e9;
-/// A frame is not sent later after its exposure. [ns]
+/// Maximum delay between exposure and sending. [ns]
 const OLDEST_NS: u64 = 1_000_000_000;
-/// How often is asked who is there, and for names. [s]
+/// Interval of connection requests, and of name requests. [s]
 const ASK_EVERY_S: f64 = 0.5;
 const NAMES_EVERY_S: f64 = 1.0;
-/// Motive forgets a unicast listener that is silent for some seconds. [s]
+/// Interval of keep-alives: Motive drops a unicast listener that is silent for some seconds. [s]
 const ALIVE_EVERY_S: f64 = 1.0;
 const FORGOTTEN_S: f64 = 3.0;
 

@@ -1,19 +1,20 @@
-//! Maps stamps of another computer's clock to the server's, from one-way packets. Sans-IO.
+//! Maps stamps of another computer's clock to the server's clock, from one-way packets. Sans-IO.
 //!
-//! arrival = stamp + offset + delay, with delay >= 0. The least `arrival - stamp` of the last
-//! seconds is the offset and the least delay together, so what remains in a mapped stamp is that
-//! constant delay (0.1 ms on a cable). Ten seconds of a crystal's 50 ppm are 0.5 ms.
+//! arrival = stamp + offset + delay, with delay >= 0. The least `arrival - stamp` of the last seconds is the
+//! sum of offset and least delay, so a mapped stamp contains only this constant delay (0.1 ms on a cable). With
+//! a crystal of 50 ppm, ten seconds are 0.5 ms.
 
 use vizflyt_protocol::time::ServerTime;
 
-/// Relates a sender's clock to ours.
+/// Maps a sender's clock to the server's clock.
 #[derive(Clone, Debug)]
 pub struct SenderClock {
-    /// The least `arrival - stamp` of each of the last seconds, and which second it was. [ns]
+    /// Least `arrival - stamp` of each of the last seconds, with the number of the second. [ns]
     buckets: [Option<(u64, i64)>; BUCKETS],
-    /// Since when everything has come late.
+    /// Time since which all packets have been late.
     late_since: Option<ServerTime>,
-    /// The newest packet that came too late for any network, when, and how many such have come evenly since.
+    /// Newest packet that came too late for any network: stamp, arrival, and number of such packets at even
+    /// intervals.
     fallen: Option<(u64, ServerTime, u32)>,
     last: Option<ServerTime>,
     jump_s: Option<f64>,
@@ -26,23 +27,23 @@ impl Default for SenderClock {
 }
 
 impl SenderClock {
-    /// Takes what the sender's clock showed when a packet left, and when the packet came; returns
-    /// when it left, on our clock. Never later than `arrival`. [ns, sender]
+    /// Maps the sender's time `sent_ns` of a packet that came at `arrival` to the server's clock. The result is
+    /// never later than `arrival`. [ns, sender]
     pub fn map(&mut self, sent_ns: u64, arrival: ServerTime) -> ServerTime {
         // Clocks of any two computers are less than 292 years apart.
         let offset_ns = arrival.as_ns().wrapping_sub(sent_ns).cast_signed();
         let second = arrival.as_ns() / 1_000_000_000;
         if let Some(least_ns) = self.least_ns(second) {
             let late_s = offset_ns.wrapping_sub(least_ns) as f64 * 1e-9;
-            // Set forward, a clock makes packets arrive before they could; set back, all of them
-            // late from then on, where a burst after a pause ends in an instant.
+            // A clock that was set forward makes packets arrive before they were sent. A clock that was set
+            // back makes all later packets late, but a burst after a pause ends at once.
             self.late_since =
                 if late_s > SLIP_S { self.late_since.or(Some(arrival)) } else { None };
             let slipped =
                 self.late_since.is_some_and(|since| arrival.seconds_since(since) > SLIP_LASTS_S);
             let restarted = self.has_restarted(sent_ns, arrival, late_s);
             if slipped || restarted || late_s < -SLIP_S {
-                // Its clock moved by as much as its packets seem to come early.
+                // The jump of the clock equals the apparent earliness of its packets.
                 self.jump_s = Some(-late_s);
                 self.buckets = [None; BUCKETS];
                 (self.late_since, self.fallen) = (None, None);
@@ -57,7 +58,7 @@ impl SenderClock {
         ServerTime::from_ns(sent_ns.wrapping_add_signed(least_ns)).min(arrival)
     }
 
-    /// As [`Self::map`], never earlier than what it returned before.
+    /// Maps like [`Self::map`], but never returns an earlier time than before.
     pub fn map_in_order(&mut self, sent_ns: u64, arrival: ServerTime) -> ServerTime {
         let mapped = self.map(sent_ns, arrival);
         let mapped = self.last.map_or(mapped, |last| mapped.max(last));
@@ -65,13 +66,13 @@ impl SenderClock {
         mapped
     }
 
-    /// Returns by how much the sender's clock has jumped, forward if positive; each jump once. [s]
+    /// Returns the jump of the sender's clock, positive if forward; each jump once. [s]
     pub fn take_jump_s(&mut self) -> Option<f64> {
         self.jump_s.take()
     }
 
-    /// Whether packets come evenly by a clock that fell back: its computer or program was restarted. A burst after a
-    /// pause comes all at once instead, and packets that were overtaken alone.
+    /// Returns whether packets with lower stamps arrive at even intervals: the sender or its computer
+    /// restarted. A burst after a pause arrives at once, and reordered packets arrive one at a time.
     fn has_restarted(&mut self, sent_ns: u64, arrival: ServerTime, late_s: f64) -> bool {
         if late_s < FALLEN_S {
             self.fallen = None;
@@ -95,12 +96,13 @@ impl SenderClock {
     }
 }
 
-/// Seconds remembered.
+/// Length of the history. [s]
 const BUCKETS: usize = 10;
-/// Lateness that no network of a lab explains for [`SLIP_LASTS_S`] on end. [s]
+/// A delay above this for [`SLIP_LASTS_S`] is not caused by the network of a lab. [s]
 const SLIP_S: f64 = 0.02;
 const SLIP_LASTS_S: f64 = 0.3;
-/// A clock that fell back by this, and ran on evenly for so many packets, began anew. [s]
+/// A clock restarted if it fell back by this, and at least [`EVEN_PACKETS`] packets followed at even intervals.
+/// [s]
 const FALLEN_S: f64 = 0.5;
 const EVEN_PACKETS: u32 = 3;
 
@@ -109,7 +111,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The sender's clock is ours less this. [ns]
+    /// The server's clock minus the sender's. [ns]
     const APART_NS: u64 = 77_000_000_000;
 
     fn truth(index: u64) -> ServerTime {
@@ -123,7 +125,7 @@ mod tests {
             for (index, delay) in delays.into_iter().enumerate() {
                 let sent = truth(index as u64);
                 let mapped = clock.map(sent.as_ns() - APART_NS, sent.plus_ns(delay));
-                // Once a prompt one has come, all are right but for the least delay.
+                // After the first fast packet, the only error is the least delay.
                 if index > 200 {
                     let off_s = mapped.seconds_since(sent);
                     prop_assert!((0.0..1.5e-3).contains(&off_s), "{off_s}");
@@ -146,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_is_followed_and_named() {
+    fn follows_and_reports_a_clock_that_was_set() {
         for jump_s in [3.0, -3.0, 0.05, -0.05] {
             let mut clock = SenderClock::default();
             let shown = |index: u64, set_s: f64| {
@@ -168,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_begins_anew_is_followed_within_three_packets() {
+    fn follows_a_restarted_clock_within_three_packets() {
         for hz in [10u64, 30, 100, 200] {
             let mut clock = SenderClock::default();
             let at = |index: u64| ServerTime::from_ns(100_000_000_000 + index * 1_000_000_000 / hz);
@@ -186,9 +188,9 @@ mod tests {
         }
     }
 
-    /// Old packets between new ones, as a network or a recording brings them, move no clock.
+    /// Old packets between new ones, due to a network or a recording, do not change the clock.
     #[test]
-    fn old_packets_between_new_ones_move_nothing() {
+    fn ignores_old_packets_between_new_ones() {
         let mut clock = SenderClock::default();
         for index in 0..400 {
             let mapped = clock.map(truth(index).as_ns() - APART_NS, truth(index));
@@ -202,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_burst_after_a_pause_is_no_jump() {
+    fn does_not_report_a_jump_after_a_burst() {
         let mut clock = SenderClock::default();
         for index in 0..100 {
             clock.map(truth(index).as_ns() - APART_NS, truth(index));

@@ -1,4 +1,4 @@
-//! The socket of a stream that comes over UDP: arrival stamps, and what silence means.
+//! UDP socket of a pose stream: arrival stamps, and warnings of silence.
 
 use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
@@ -13,13 +13,13 @@ use super::source::{Measurement, PoseSource, SourceCounters};
 use crate::clock;
 use crate::poses::settings::Driver;
 
-/// What is behind the socket: bytes in, poses out. Sans-IO.
+/// Parser of a pose stream: bytes in, poses out. Sans-IO.
 pub trait PoseStream: Send {
-    /// Takes one datagram that arrived at `now`; returns the poses of our vehicles that are in it
-    /// and newer than the last, at most one of each.
+    /// Processes one datagram that arrived at `now`. Returns the contained poses of the configured vehicles
+    /// that are newer than the last, at most one per vehicle.
     fn handle_packet(&mut self, now: ServerTime, bytes: &[u8]) -> &[Measurement];
 
-    /// As [`Self::handle_packet`], for streams that answer their sender.
+    /// Like [`Self::handle_packet`], for streams that reply to their sender.
     fn handle_packet_from(
         &mut self,
         now: ServerTime,
@@ -29,32 +29,32 @@ pub trait PoseStream: Send {
         self.handle_packet(now, bytes)
     }
 
-    /// Returns what is to be sent by now, and where to. Asked after each packet, and ten times a
+    /// Returns the next datagram to send, with its destination. Called after each packet, and ten times a
     /// second.
     fn poll_transmit(&mut self, _now: ServerTime) -> Option<(SocketAddr, Vec<u8>)> {
         None
     }
 
-    /// Returns what a person should know by now, once per occurrence.
+    /// Returns the next warning for the user, once per occurrence.
     fn next_warning(&mut self) -> Option<String>;
 
     /// Returns the counters of a vehicle.
     fn counters(&self, vehicle: usize) -> SourceCounters;
 
-    /// Returns what to do about silence.
+    /// Returns the advice for a silent stream.
     fn silence(&self) -> Silence;
 }
 
-/// What a person can do about a stream that is silent.
+/// Advice for the user about a silent stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Silence {
-    /// When nothing has ever come.
+    /// If no packet has ever arrived.
     pub at_first: &'static str,
-    /// When it has stopped.
+    /// If the stream has stopped.
     pub later: &'static str,
 }
 
-/// A bound socket without a stream yet.
+/// Bound socket without a stream yet.
 #[derive(Debug)]
 pub struct UdpPort {
     driver: Driver,
@@ -68,7 +68,7 @@ impl UdpPort {
         let open = || -> std::io::Result<UdpSocket> {
             let kind = Domain::for_address(address);
             let socket = Socket::new(kind, Type::DGRAM, Some(Protocol::UDP))?;
-            // A second of a stream, so that a busy computer loses no frame.
+            // Room for a second of a stream, so that a busy computer loses no frame.
             socket.set_recv_buffer_size(RECEIVE_BUFFER)?;
             socket.bind(&address.into())?;
             Ok(socket.into())
@@ -84,8 +84,8 @@ impl UdpPort {
         Ok(Self { driver, socket, address })
     }
 
-    /// Joins a multicast group on our address `interface`, or wherever the system's routes lead.
-    /// Others on this computer may listen too.
+    /// Joins a multicast group on this computer's address `interface`, or by the system's routes. Other
+    /// programs on this computer may listen too.
     pub fn join(driver: Driver, group: Ipv4Addr, port: u16, interface: Ipv4Addr) -> Result<Self> {
         let open = || -> std::io::Result<UdpSocket> {
             let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
@@ -106,12 +106,12 @@ impl UdpPort {
         Ok(Self { driver, socket, address })
     }
 
-    /// Returns where the stream must be sent.
+    /// Returns the address to which the stream must be sent.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Gives what comes to a stream.
+    /// Connects the socket to a stream's parser.
     pub fn with<S: PoseStream>(self, stream: S) -> UdpPoses<S> {
         UdpPoses {
             arrivals: Arrivals::of(&self.socket),
@@ -126,7 +126,7 @@ impl UdpPort {
     }
 }
 
-/// Receives a stream of poses.
+/// Receiver of a pose stream.
 #[derive(Debug)]
 pub struct UdpPoses<S> {
     port: UdpPort,
@@ -134,7 +134,7 @@ pub struct UdpPoses<S> {
     from: Option<SocketAddr>,
     stream: S,
     buffer: Box<[u8]>,
-    /// When anything last arrived; the start, before anything did.
+    /// Time of the last arrival; initially the start.
     received_at: ServerTime,
     silence_warned: bool,
     warnings: VecDeque<String>,
@@ -143,7 +143,7 @@ pub struct UdpPoses<S> {
 impl<S: PoseStream> UdpPoses<S> {
     fn send(&mut self, now: ServerTime) {
         while let Some((to, bytes)) = self.stream.poll_transmit(now) {
-            // Lost like any datagram; it is asked again.
+            // A lost request is repeated.
             let _ = self.port.socket.send_to(&bytes, to);
         }
     }
@@ -171,13 +171,13 @@ impl<S: PoseStream> UdpPoses<S> {
 
 impl<S: PoseStream> PoseSource for UdpPoses<S> {
     fn receive(&mut self, timeout: Duration) -> &[Measurement] {
-        // A zero time-out would mean "for ever" to the socket.
+        // A timeout of zero would mean no timeout for the socket.
         let timeout = timeout.max(Duration::from_millis(1));
         if self.port.socket.set_read_timeout(Some(timeout)).is_err() {
             return &[];
         }
         self.send(clock::now());
-        // Errors are the time-out, or an ICMP complaint about something else: both mean no pose.
+        // Errors are the timeout or an ICMP error: both mean no pose.
         let Ok(arrival) = self.arrivals.receive(&self.port.socket, &mut self.buffer) else {
             self.notice_silence(clock::now());
             return &[];
@@ -199,9 +199,9 @@ impl<S: PoseStream> PoseSource for UdpPoses<S> {
 
 /// 1 MiB holds 3 s of 1024-byte packets at 300 Hz.
 const RECEIVE_BUFFER: usize = 1 << 20;
-/// A hundred frames at 200 Hz. [s]
+/// Silence before a warning: a hundred frames at 200 Hz. [s]
 const SILENCE_S: f64 = 0.5;
-/// The simulator, or a person at Tracker, takes a while to start. [s]
+/// Silence before the first packet: the simulator, or a user at Tracker, needs time to start. [s]
 const FIRST_SILENCE_S: f64 = 5.0;
 
 #[cfg(test)]
@@ -211,7 +211,7 @@ mod tests {
     use crate::poses::settings::LocalizationConfig;
 
     #[test]
-    fn a_stream_over_a_real_socket_is_read_and_its_end_noticed() {
+    fn reads_a_real_socket_and_warns_when_the_stream_ends() {
         let port = UdpPort::bind(Driver::Vicon, "127.0.0.1:0".parse().unwrap()).unwrap();
         let to = port.address();
         let config = LocalizationConfig::new(Driver::Vicon);
@@ -227,7 +227,7 @@ mod tests {
         let pose = source.receive(Duration::from_secs(30))[0];
         assert_eq!(pose.world_from_body.translation_m.x, 1.0);
         assert_eq!(source.next_warning(), None);
-        // As if the last packet had come a second ago.
+        // Simulates that the last packet came a second ago.
         source.notice_silence(pose.arrival.plus_seconds(1.0));
         let from = sender.local_addr().unwrap();
         assert_eq!(

@@ -1,5 +1,5 @@
-//! What every stream needs beside its parser: which object is which vehicle, counters, the way into
-//! the world frame, and warnings for people. Sans-IO.
+//! Common parts of all drivers: objects by vehicle, counters, conversion to the world frame, and warnings for
+//! users. Sans-IO.
 
 use std::collections::VecDeque;
 use std::fmt::Display;
@@ -13,17 +13,17 @@ use super::frame_clock::FrameClock;
 use super::source::{Measurement, SourceCounters};
 use crate::poses::settings::{Alignment, Driver, LocalizationConfig};
 
-/// The vehicles of one stream.
+/// Objects and counters of one stream.
 #[derive(Debug)]
 pub(super) struct VehicleNames {
     driver: Driver,
     source: u8,
     alignment: Alignment,
-    /// What the source is late by, always. [s]
+    /// Constant delay of the source. [s]
     latency_s: f64,
     objects: Vec<Object>,
     bad_packets: u64,
-    /// What the newest packet yielded.
+    /// Measurements of the newest packet.
     measured: Vec<Measurement>,
     warned_of_others: bool,
     warned_of_bad: bool,
@@ -31,27 +31,27 @@ pub(super) struct VehicleNames {
     warnings: VecDeque<String>,
 }
 
-/// One vehicle's object. Tracker counts all objects' frames together, but several simulators that
-/// send to one server each count their own.
+/// Object of one vehicle. Tracker counts the frames of all objects together, but if several simulators send to
+/// one server, each has its own counter.
 #[derive(Debug)]
 struct Object {
     name: String,
     clock: FrameClock,
     last_frame: Option<u32>,
-    /// When that came, and how far apart frames come. [s]
+    /// Time of the last frame, and mean interval. [s]
     last_at: ServerTime,
     interval_s: f64,
-    /// The newest of frames that fell back and rise since, and how many.
+    /// Newest of the frames with lower numbers that rise again, and their count.
     fallen: Option<(u32, u32)>,
-    /// Since when the last frame has been repeated.
+    /// Time since which the last frame has been repeated.
     stuck_since: Option<ServerTime>,
     warned_of_stuck: bool,
     counters: SourceCounters,
 }
 
 impl VehicleNames {
-    /// Makes the table of the vehicles named, the first at index 0, and so on; at most
-    /// [`MAX_VEHICLES`]. Its measurements are of `source`.
+    /// Creates the table of the named vehicles, at most [`MAX_VEHICLES`]; the first has index 0, and so on. Its
+    /// measurements are marked with `source`.
     pub(super) fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let object = |vehicle: &&str| Object {
             name: config.object_of(vehicle).to_owned(),
@@ -79,28 +79,27 @@ impl VehicleNames {
         }
     }
 
-    /// Returns whose object has this name.
+    /// Returns the vehicle of the object with this name.
     pub(super) fn find(&self, name: &[u8]) -> Option<usize> {
         self.objects.iter().position(|object| object.name.as_bytes() == name)
     }
 
-    /// Returns how many vehicles there are.
     pub(super) fn len(&self) -> usize {
         self.objects.len()
     }
 
-    /// Begins a packet.
+    /// Starts a packet: clears the measurements.
     pub(super) fn begin(&mut self) {
         self.measured.clear();
     }
 
-    /// Returns what the packet yielded.
+    /// Returns the measurements of the packet.
     pub(super) fn measured(&self) -> &[Measurement] {
         &self.measured
     }
 
-    /// Takes the number of a vehicle's next frame; returns whether it is newer than the last, or of a sender that was
-    /// restarted, and counts.
+    /// Processes the frame number of a vehicle, and counts. Returns whether the frame is newer than the last
+    /// one, or the first of a restarted sender.
     pub(super) fn is_next(&mut self, vehicle: usize, frame: u32, now: ServerTime) -> FrameOrder {
         let object = &mut self.objects[vehicle];
         let mut order = FrameOrder::Next;
@@ -133,7 +132,7 @@ impl VehicleNames {
         order
     }
 
-    /// The very same frame again and again: the source is paused, or shows a still.
+    /// Warns if the same frame is repeated: the source is paused, or shows a still.
     fn notice_stuck(&mut self, vehicle: usize, frame: u32, now: ServerTime) {
         let object = &mut self.objects[vehicle];
         let since = *object.stuck_since.get_or_insert(now);
@@ -148,18 +147,18 @@ impl VehicleNames {
         }
     }
 
-    /// Returns when a frame without a time was measured.
+    /// Returns the time of measurement of a frame without a stamp.
     pub(super) fn stamp(&mut self, vehicle: usize, frame: u32, arrival: ServerTime) -> ServerTime {
         self.objects[vehicle].clock.stamp(frame, arrival)
     }
 
-    /// Counts a frame in which the vehicle was not seen.
+    /// Counts a frame in which the vehicle was occluded.
     pub(super) fn occluded(&mut self, vehicle: usize) {
         self.objects[vehicle].counters.occluded += 1;
     }
 
-    /// Adds a pose as it was streamed: position and rotation of the object, the position's sigma
-    /// along the stream's axes and the rotation's about the object's.
+    /// Adds a streamed pose: position and rotation of the object, with the position's sigma along the stream's
+    /// axes and the rotation's sigma about the object's axes.
     pub(super) fn measure(
         &mut self,
         vehicle: usize,
@@ -208,7 +207,8 @@ impl VehicleNames {
         }
     }
 
-    /// Notes that only objects stream that belong to no vehicle; reported once, unless ours has been seen.
+    /// Warns once that the stream contains only objects of no configured vehicle, unless one has been seen
+    /// before.
     pub(super) fn others<'a>(&mut self, names: impl Iterator<Item = &'a str>, advice: &str) {
         if self.warned_of_others || self.objects.iter().any(|object| object.counters.poses > 0) {
             return;
@@ -223,15 +223,15 @@ impl VehicleNames {
         ));
     }
 
-    /// Tells a person something.
+    /// Queues a warning for the user.
     pub(super) fn warn(&mut self, text: String) {
-        // What nobody reads must not pile up.
+        // Limits the queue in case it is not read.
         if self.warnings.len() < MAX_WARNINGS {
             self.warnings.push_back(text);
         }
     }
 
-    /// Returns the next thing a person should know, each once.
+    /// Returns the next warning for the user, once per occurrence.
     pub(super) fn next_warning(&mut self) -> Option<String> {
         self.warnings.pop_front()
     }
@@ -244,9 +244,9 @@ impl VehicleNames {
 }
 
 impl Object {
-    /// Whether a frame that fell back is of a sender that was restarted: after a silence, or where frames rise again
-    /// while those of before have stopped. A frame that was overtaken is alone, and a recording that is replayed beside
-    /// its living source finds no gap.
+    /// Returns whether a lower frame number comes from a restarted sender: after a silence, or if numbers rise
+    /// again after the earlier frames have stopped. A reordered frame comes alone, and a replayed recording
+    /// next to its live source finds no gap.
     fn is_restart(&mut self, frame: u32, now: ServerTime) -> bool {
         let silent_s = now.seconds_since(self.last_at);
         let count = match self.fallen {
@@ -271,18 +271,18 @@ impl Object {
     }
 }
 
-/// Where a frame stands among those of its object.
+/// Order of a frame among those of its object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum FrameOrder {
     /// Newer than the last.
     Next,
-    /// The first of a sender that was restarted.
+    /// First frame of a restarted sender.
     Restarted,
-    /// Not to be used.
+    /// Duplicate or older; must not be used.
     Old,
 }
 
-/// Returns the standard deviations along other axes of what has these along its own, uncorrelated.
+/// Returns the standard deviations along other axes, for uncorrelated ones along the original axes.
 fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
     let squared = sigma * sigma;
     let row = |index: usize| {
@@ -292,22 +292,22 @@ fn spread(axes: DMat3, sigma: DVec3) -> DVec3 {
     DVec3::new(row(0), row(1), row(2))
 }
 
-/// More missing frames than this are no loss but another count: ten seconds at 200 Hz.
+/// A larger gap means another counter instead of lost frames: ten seconds at 200 Hz.
 const MAX_LOST_FRAMES: i32 = 2000;
-/// So many frames that rise after a fall are a restarted sender's, if those of before have stopped for so many intervals
-/// or for so long. [s]
+/// A sender has restarted if this many frames rise after a fall, and the earlier frames have stopped for this
+/// many intervals, or for this time [s].
 const RISING_FRAMES: u32 = 3;
 const SILENT_INTERVALS: f64 = 2.5;
 const SILENT_S: f64 = 0.5;
-/// Of a new interval in their mean.
+/// Weight of a new interval in the mean.
 const INTERVAL_SHARE: f64 = 0.1;
-/// Names in a warning.
+/// Maximum number of names in a warning.
 pub(super) const MAX_NAMES: usize = 8;
-/// Maximum number of warnings that wait.
+/// Maximum number of queued warnings.
 const MAX_WARNINGS: usize = 16;
-/// No lab is wider. [m]
+/// Maximum plausible coordinate. [m]
 const FAR_M: f64 = 100.0;
-/// A repeated frame for so long is no hiccup. [s]
+/// Time of repetition of a frame that counts as stuck. [s]
 const STUCK_S: f64 = 1.0;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Vicon Tracker's UDP object stream: bytes in, the poses of the named objects out. Sans-IO.
+//! Driver for Vicon Tracker's UDP object stream. Sans-IO.
 //!
 //! Layout (Tracker 3 user guide, "UDP object stream"; little-endian, packed):
 //! ```text
@@ -9,13 +9,12 @@
 //! Tracker pads packets to a block size: bytes after the last item are ignored. Items with
 //! another id are skipped by their size.
 //!
-//! Rotation: unless the setting `euler` overrides it, turns about the fixed x, then the fixed y,
-//! then the fixed z axis, `R = Rz(rz) * Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on
-//! site.
+//! Rotation, unless the setting `euler` overrides it: about the fixed x, then y, then z axis, `R = Rz(rz) *
+//! Ry(ry) * Rx(rx)`. `vizflyt doctor localization` checks it on site.
 //!
-//! Stamps: the stream carries a frame counter but no time, and Tracker's clock is not ours. So a
-//! pose is stamped with its arrival on CLOCK_MONOTONIC, less the jitter that the frame counter
-//! reveals ([`super::frame_clock`]). The constant part of Tracker's own delay (a few ms) stays in.
+//! Stamps: the stream has a frame counter but no time, and Tracker's clock is independent. So the stamp is the
+//! arrival on CLOCK_MONOTONIC, less the jitter that [`super::frame_clock`] determines from the frame counter.
+//! The constant delay of Tracker (a few ms) remains.
 
 use glam::DVec3;
 use vizflyt_arena::config::MAX_VEHICLES;
@@ -26,45 +25,42 @@ use super::udp::{PoseStream, Silence};
 use super::vehicle_names::{FrameOrder, MAX_NAMES, VehicleNames};
 use crate::poses::settings::{Euler, LocalizationConfig};
 
-/// One object of a packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViconObject<'a> {
-    /// Name, without the padding; Tracker writes ASCII, but any byte may come.
+    /// Name without padding; Tracker writes ASCII, but any byte may occur.
     pub name: &'a [u8],
-    /// Where it is, in the stream's unit (Tracker's is the millimetre).
+    /// Position in the stream's unit (Tracker uses millimetres).
     pub p_stream: DVec3,
-    /// Angles about x, y and z, or `None` if Tracker did not see the object (it then sends zeros).
-    /// [rad]
+    /// Angles about x, y and z; `None` if Tracker did not see the object (it then sends zeros). [rad]
     pub angles_rad: Option<DVec3>,
 }
 
-/// Why bytes are no packet of the stream.
+/// Why a packet is invalid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ViconError {
-    /// Fewer bytes than the packet's head.
+    /// Packet shorter than its head.
     #[error("packet of {0} bytes is shorter than its head of 5")]
     Short(usize),
-    /// An item runs past the end.
+    /// Item that exceeds the packet.
     #[error("item {item} needs {need} bytes at offset {offset}, {have} are left")]
     Cut {
         /// Index of the item.
         item: u8,
-        /// Where it begins.
+        /// Start of the item.
         offset: usize,
-        /// What it needs.
+        /// Required bytes.
         need: usize,
-        /// What is left.
+        /// Remaining bytes.
         have: usize,
     },
-    /// An object of a size this parser does not know.
+    /// Object of unsupported size.
     #[error("item {item} is an object of {size} bytes instead of 72")]
     Size {
         /// Index of the item.
         item: u8,
-        /// Its stated size.
         size: u16,
     },
-    /// A coordinate or an angle is not a sensible number.
+    /// Coordinate or angle out of range.
     #[error("item {item} has a coordinate or angle that is not finite or absurdly large")]
     NotFinite {
         /// Index of the item.
@@ -72,7 +68,7 @@ pub enum ViconError {
     },
 }
 
-/// Returns the frame number and gives every object of a packet to `visit`, in order.
+/// Calls `visit` for every object of a packet, in order; returns the frame number.
 pub fn parse<'a>(
     bytes: &'a [u8],
     mut visit: impl FnMut(ViconObject<'a>),
@@ -118,7 +114,7 @@ fn object(body: &[u8; OBJECT_SIZE]) -> Option<ViconObject<'_>> {
     })
 }
 
-/// Selects our vehicles from the stream, keeps the counters, and notices what is wrong.
+/// Driver for the Vicon stream.
 #[derive(Debug)]
 pub struct ViconStream {
     names: VehicleNames,
@@ -126,8 +122,7 @@ pub struct ViconStream {
 }
 
 impl ViconStream {
-    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on;
-    /// at most [`MAX_VEHICLES`].
+    /// Creates a stream for the named vehicles, at most [`MAX_VEHICLES`]; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let names = VehicleNames::new(config, source, vehicles);
         Self { names, euler: config.euler.unwrap_or_default() }
@@ -193,7 +188,7 @@ const ITEM_HEAD: usize = 3;
 const OBJECT_ID: u8 = 0;
 const NAME_SIZE: usize = 24;
 const OBJECT_SIZE: usize = 72;
-/// No lab is a thousand kilometres wide [mm], and no angle has this many turns [rad].
+/// Maximum value: no lab is a thousand kilometres wide [mm], and no angle has this many turns [rad].
 const MAX_VALUE: f64 = 1e9;
 
 #[cfg(test)]

@@ -1,19 +1,19 @@
-//! VRPN 7, as Motive, Tracker and many others stream it: bytes of a server's TCP connection in, the poses of the
-//! named trackers out. Sans-IO; the connection itself is [`connection`].
+//! Driver for VRPN 7, as streamed by Motive, Tracker and many others: poses of the named trackers from the
+//! bytes of a server's TCP connection. Sans-IO; the connection itself is in [`connection`].
 //!
 //! ```text
 //! both ways    24 bytes: "vrpn: ver. 07.35  0", zeros
-//! server ->    messages, big-endian, each filled up to a multiple of 8 bytes:
-//!                u32 length without the filling, u32 s, u32 us, i32 sender, i32 type, 4 bytes, then the body
-//!   type -1    the sender of this number has this name: u32 length, the name, a zero
-//!   type -2    the type of this number has this name, likewise
+//! server ->    messages, big-endian, each padded to a multiple of 8 bytes:
+//!                u32 length without the padding, u32 s, u32 us, i32 sender, i32 type, 4 bytes, then the body
+//!   type -1    name of a sender number: u32 length, the name, a zero
+//!   type -2    name of a type number, in the same form
 //!   the type "vrpn_Tracker Pos_Quat"
 //!              i32 sensor, i32 again, f64 x, y, z, f64 qx, qy, qz, qw
 //! ```
-//! Nothing is asked for: a server sends all that it has to whoever connects. It uses UDP only toward a client that
-//! names a port for it, and this one names none: every pose comes over TCP, in order and without loss.
+//! The client sends no requests: a server sends everything to each client. It uses UDP only toward a client
+//! that names a port for it. This client names none, so every pose arrives over TCP, in order and without loss.
 //!
-//! Stamps are of the server's own clock, which [`super::sender_clock`] relates to ours.
+//! Stamps are of the server's own clock, which [`super::sender_clock`] maps to ours.
 
 pub mod connection;
 
@@ -27,73 +27,72 @@ use super::source::{Measurement, SourceCounters};
 use super::vehicle_names::{FrameOrder, MAX_NAMES, VehicleNames};
 use crate::poses::settings::LocalizationConfig;
 
-/// What both ends begin with; the two digits at the end of the version may differ, the last digit asks for no log.
+/// First bytes of both sides; the last two digits of the version may differ, and the last digit requests no
+/// log.
 pub const COOKIE: &[u8; 24] = b"vrpn: ver. 07.35  0\0\0\0\0\0";
 
-/// A message of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Message<'a> {
-    /// When it was true; 0 if it does not say. [ns, server's wall clock]
+    /// Time of the contents; 0 if unknown. [ns, server's wall clock]
     pub stamp_ns: u64,
-    /// Number of its sender, or what it describes.
+    /// Number of its sender, or of the described sender or type.
     pub sender: i32,
-    /// Number of its type; those of the protocol itself are negative.
+    /// Number of its type; types of the protocol itself are negative.
     pub kind: i32,
-    /// What it says.
     pub body: &'a [u8],
 }
 
-/// A report of a tracker.
+/// Report of a tracker.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrackerReport {
-    /// Which of the tracker's sensors.
+    /// Number of the tracker's sensor.
     pub sensor: i32,
-    /// Where it is, in the stream's unit.
+    /// Position in the stream's unit.
     pub p_stream: DVec3,
-    /// Rotation of its axes into the stream's, of unit length; `None` if the tracker did not see it (some servers then
-    /// send zeros).
+    /// Rotation from the sensor's axes to the stream's, of unit length; `None` if the tracker did not see it
+    /// (some servers then send zeros).
     pub rotation: Option<DQuat>,
 }
 
-/// Why bytes are no VRPN; after the first three nothing that follows can be read.
+/// Why data are invalid; after the first three the rest of the stream cannot be parsed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum VrpnError {
-    /// It begins differently.
+    /// The first bytes are not VRPN's.
     #[error("it does not begin as VRPN does")]
     Cookie,
-    /// Another version.
+    /// Unsupported version.
     #[error("it speaks VRPN {0}, this server knows 7")]
     Version(u8),
-    /// A message of no such length.
-    #[error("a message of {0} bytes is no VRPN")]
+    /// Invalid length of a message.
+    #[error("a message of {0} bytes is not VRPN")]
     Length(u32),
-    /// A name that is not there.
+    /// Name longer than its message.
     #[error("a name of {length} bytes is in a message of {have}")]
     Name {
-        /// What the message says.
+        /// Length according to the message.
         length: u32,
         /// Bytes of the message.
         have: usize,
     },
-    /// A report of another size.
+    /// Report of invalid size.
     #[error("a tracker's report of {0} bytes is shorter than 64")]
     Report(usize),
-    /// A report whose numbers are none.
-    #[error("a tracker reports a position or rotation that is none")]
+    /// Invalid numbers in a report.
+    #[error("a tracker reports an invalid position or rotation")]
     NotAPose,
 }
 
-/// Checks the first bytes of a connection; returns whether they are all there.
+/// Checks the first bytes of a connection; returns whether they are complete.
 ///
 /// # Errors
-/// It is no VRPN, or another version.
+/// The data are not VRPN, or of another version.
 pub fn check_cookie(bytes: &[u8]) -> Result<bool, VrpnError> {
     let known =
         bytes.iter().zip(COOKIE).take(FAMILY.len()).all(|(byte, expected)| byte == expected);
     if !known {
         return Err(VrpnError::Cookie);
     }
-    // "07.": the digits before the point must be ours.
+    // "07.": the digits before the point must match.
     let major = bytes.get(FAMILY.len()..FAMILY.len() + 3);
     match major {
         Some([b'0', b'7', b'.']) | None => Ok(bytes.len() >= COOKIE.len()),
@@ -104,10 +103,10 @@ pub fn check_cookie(bytes: &[u8]) -> Result<bool, VrpnError> {
     }
 }
 
-/// Returns the first message and how many bytes it takes; `None` if it is not there as a whole.
+/// Returns the first message and its size in bytes; `None` if it is incomplete.
 ///
 /// # Errors
-/// It has a length that no message has.
+/// The length is invalid.
 pub fn parse(bytes: &[u8]) -> Result<Option<(Message<'_>, usize)>, VrpnError> {
     let Some(length) = bytes.first_chunk().map(|bytes| u32::from_be_bytes(*bytes)) else {
         return Ok(None);
@@ -139,7 +138,7 @@ fn parse_name(body: &[u8]) -> Result<&[u8], VrpnError> {
     Ok(name.split(|&byte| byte == 0).next().unwrap_or_default())
 }
 
-/// Returns what the body of a tracker's report says.
+/// Parses the body of a tracker's report.
 fn parse_report(body: &[u8]) -> Result<TrackerReport, VrpnError> {
     let Some((body, _)) = body.split_first_chunk::<REPORT>() else {
         return Err(VrpnError::Report(body.len()));
@@ -158,61 +157,62 @@ fn parse_report(body: &[u8]) -> Result<TrackerReport, VrpnError> {
     if rotation == DQuat::from_array([0.0; 4]) {
         return Ok(TrackerReport { sensor, p_stream, rotation: None });
     }
-    // Some trackers measure in single precision.
+    // Tolerance: some trackers use single precision.
     if !((rotation.length() - 1.0).abs() <= 0.01) {
         return Err(VrpnError::NotAPose);
     }
     Ok(TrackerReport { sensor, p_stream, rotation: Some(rotation.normalize()) })
 }
 
-/// Selects our vehicles from what a server sends, keeps the counters, and notices what is wrong.
+/// Driver for VRPN.
 #[derive(Debug)]
 pub struct VrpnStream {
     names: VehicleNames,
     sensor: i32,
-    /// Of each vehicle.
+    /// Tracks by vehicle.
     tracks: Vec<Track>,
-    /// What came and is not read, and when its end came.
+    /// Received bytes that are not parsed yet, and time of the last arrival.
     unread: Vec<u8>,
     came: ServerTime,
-    /// What the server has said of itself.
+    /// State of the present connection.
     session: Session,
 }
 
-/// What a server says at the beginning of a connection, and what was seen on it.
+/// Descriptions sent by the server, and reports of one connection.
 #[derive(Debug, Default)]
 struct Session {
     has_cookie: bool,
-    /// Number of the type of trackers' reports.
+    /// Type number of trackers' reports.
     report_kind: Option<i32>,
     senders: BTreeMap<i32, Sender>,
-    /// When the first report came, of whatever tracker, and the newest.
+    /// Times of the first and the newest report of any tracker.
     first_at: Option<ServerTime>,
     newest_at: Option<ServerTime>,
     has_looked_for_ours: bool,
 }
 
-/// Who sends, on one connection.
+/// Sender of one connection.
 #[derive(Debug)]
 struct Sender {
     name: String,
     vehicle: Option<usize>,
-    /// A sensor of which it has reported.
+    /// Number of a sensor that it has reported.
     sensor: Option<i32>,
 }
 
-/// The reports of one vehicle's tracker. Each has a clock: a server may pass on what others have stamped.
+/// Reports of one vehicle's tracker. Each has its own clock, because a server may forward stamps of other
+/// computers.
 #[derive(Debug, Default)]
 struct Track {
     clock: SenderClock,
     stamp_ns: Option<u64>,
-    /// Counts reports with stamps of their own.
+    /// Number of reports with different stamps.
     number: u32,
     has_reported: bool,
 }
 
 impl VrpnStream {
-    /// Makes a stream that yields the poses of the vehicles named, the first at index 0, and so on.
+    /// Creates a stream for the named vehicles; the first has index 0, and so on.
     pub fn new(config: &LocalizationConfig, source: u8, vehicles: &[&str]) -> Self {
         let names = VehicleNames::new(config, source, vehicles);
         Self {
@@ -225,7 +225,7 @@ impl VrpnStream {
         }
     }
 
-    /// Forgets the last connection: another has begun, perhaps of a server that was restarted.
+    /// Resets the state for a new connection; the server may have been restarted.
     pub fn begin_connection(&mut self) {
         self.unread.clear();
         self.session = Session::default();
@@ -234,17 +234,17 @@ impl VrpnStream {
         }
     }
 
-    /// Takes bytes that arrived at `now`; [`Self::read`] is to read them all before more are given.
+    /// Adds bytes that arrived at `now`. [`Self::read`] must parse all of them before more are added.
     pub fn handle_bytes(&mut self, now: ServerTime, bytes: &[u8]) {
         self.came = now;
         self.unread.extend_from_slice(bytes);
     }
 
-    /// Reads on until it has a pose of each vehicle, or one of them has a second; returns whether there are any, in
-    /// [`Self::measured`]. None: all has been read that came.
+    /// Parses until each vehicle has a pose, or one of them would have a second. Returns whether there are
+    /// poses, in [`Self::measured`]; if not, all received bytes are parsed.
     ///
     /// # Errors
-    /// What came is no VRPN, and the connection of no use any more.
+    /// The data are not VRPN; the connection must be closed.
     pub fn read(&mut self) -> Result<bool, VrpnError> {
         self.names.begin();
         let unread = std::mem::take(&mut self.unread);
@@ -276,7 +276,7 @@ impl VrpnStream {
         Ok(())
     }
 
-    /// Whether a message is of a tracker that this round has yielded a pose of.
+    /// Returns whether a message is of a tracker whose vehicle already has a pose in this round.
     fn has_measured_of(&self, message: &Message<'_>) -> bool {
         self.session.report_kind == Some(message.kind)
             && self.session.senders.get(&message.sender).is_some_and(|sender| {
@@ -311,7 +311,7 @@ impl VrpnStream {
                 self.handle_report(message, &report);
                 self.look_for_ours();
             }
-            // The address for UDP, logs, answers, velocities, buttons.
+            // Ignored: address for UDP, logs, replies, velocities, buttons.
             _ => {}
         }
         Ok(())
@@ -324,7 +324,7 @@ impl VrpnStream {
         let Some(vehicle) = sender.vehicle.filter(|_| report.sensor == self.sensor) else { return };
         let track = &mut self.tracks[vehicle];
         track.has_reported = true;
-        // The same stamp again is the same report again, of a server that repeats what it has.
+        // A repeated stamp means a repeated report: some servers send their last report again.
         let stamp_ns = (message.stamp_ns > 0).then_some(message.stamp_ns);
         if stamp_ns.is_none() || track.stamp_ns != stamp_ns {
             track.number = track.number.wrapping_add(1);
@@ -344,7 +344,7 @@ impl VrpnStream {
         self.names.measure(vehicle, (stamp, now), (report.p_stream, rotation), None);
     }
 
-    /// Says once what reports instead, if nothing of ours has after a while.
+    /// Warns once about the available trackers, if none of the configured ones has reported after [`LOOK_S`].
     fn look_for_ours(&mut self) {
         let since = self.session.first_at.unwrap_or(self.came);
         if self.session.has_looked_for_ours || self.came.seconds_since(since) < LOOK_S {
@@ -367,22 +367,22 @@ impl VrpnStream {
         self.names.others(others, RENAME);
     }
 
-    /// Returns the poses that [`Self::read`] found, at most one of each vehicle.
+    /// Returns the poses that [`Self::read`] found, at most one per vehicle.
     pub fn measured(&self) -> &[Measurement] {
         self.names.measured()
     }
 
-    /// Returns how many bytes wait for the rest of their message: at most 64 KiB, once all is read.
+    /// Returns the number of bytes of an incomplete message: at most 64 KiB, once all is parsed.
     pub fn unread_bytes(&self) -> usize {
         self.unread.len()
     }
 
-    /// Returns when the newest report came on this connection, of whatever tracker.
+    /// Returns the time of the newest report on this connection, of any tracker.
     pub fn newest_at(&self) -> Option<ServerTime> {
         self.session.newest_at
     }
 
-    /// Returns what the server of this connection has, for people; `None` if it has not even begun.
+    /// Returns the senders of the present server for display; `None` before its first bytes.
     pub fn described(&self) -> Option<String> {
         if !self.session.has_cookie {
             return None;
@@ -397,12 +397,12 @@ impl VrpnStream {
         Some(if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
     }
 
-    /// Returns what a person should know by now, once per occurrence.
+    /// Returns the next warning for the user, once per occurrence.
     pub fn next_warning(&mut self) -> Option<String> {
         self.names.next_warning()
     }
 
-    /// Counts what is no VRPN.
+    /// Counts data that are not VRPN.
     fn refuse(&mut self, error: VrpnError) {
         self.names.bad(&error, NOT_VRPN);
     }
@@ -413,30 +413,30 @@ impl VrpnStream {
     }
 }
 
-/// Where VRPN servers listen, unless someone changed it.
+/// Default port of VRPN servers.
 pub const PORT: u16 = 3883;
-/// What every version's beginning has in common.
+/// Common beginning of all versions.
 const FAMILY: &[u8] = b"vrpn: ver. ";
 const NOT_VRPN: &str = "is that address a VRPN server's?";
 const RENAME: &str = "rename the object in the motion capture's program, or set `objects`";
 const REPORT_NAME: &[u8] = b"vrpn_Tracker Pos_Quat";
-/// What the senders begin with that are VRPN's own: "VRPN Control", "vrpn_Forwarder_Brain".
+/// Prefixes of VRPN's internal senders: "VRPN Control", "vrpn_Forwarder_Brain".
 const INTERNAL: [&str; 2] = ["VRPN ", "vrpn_"];
 const SENDER_DESCRIPTION: i32 = -1;
 const TYPE_DESCRIPTION: i32 = -2;
-/// A message's head, with its filling.
+/// Size of a message's head, with its padding.
 const HEAD: usize = 24;
-/// A tracker's report.
+/// Size of a tracker's report.
 const REPORT: usize = 64;
-/// A server's own buffer holds no larger message.
+/// Maximum size of a body; a server's own buffer holds no larger message.
 const MAX_BODY: usize = 64_000;
-/// A name's length at most, with its zero, by the protocol.
+/// Maximum length of a name with its zero, by the protocol.
 const MAX_NAME: usize = 100;
-/// Senders at most, by the protocol.
+/// Maximum number of senders, by the protocol.
 const MAX_SENDERS: usize = 2000;
-/// No lab is a thousand kilometres wide, not in millimetres either.
+/// Maximum coordinate: no lab is a thousand kilometres wide, even in millimetres.
 const MAX_VALUE: f64 = 1e9;
-/// After so long every tracker of a server has reported. [s]
+/// Time after which every tracker of a server has reported. [s]
 const LOOK_S: f64 = 1.0;
 
 #[cfg(test)]

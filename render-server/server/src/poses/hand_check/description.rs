@@ -1,9 +1,9 @@
-//! Descriptions of poses and motions for people.
+//! Descriptions of poses and motions for users.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
-/// Returns where a vehicle is and which way it points.
+/// Describes position and heading of a vehicle.
 pub fn describe_pose(pose: &Pose<World, Body>) -> String {
     let p = pose.translation_m;
     format!(
@@ -16,7 +16,7 @@ pub fn describe_pose(pose: &Pose<World, Body>) -> String {
     )
 }
 
-/// Returns the axis nearest to a direction, and how far it is off.
+/// Returns the axis nearest to a direction, and the angle to it.
 pub fn direction(v: DVec3) -> String {
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     let names = ["x", "y", "z"];

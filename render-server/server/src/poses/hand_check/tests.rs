@@ -9,8 +9,8 @@ fn config(text: &str) -> LocalizationConfig {
     LocalizationConfig::parse(text).unwrap()
 }
 
-/// What a person does, at 50 Hz: (up [m], ahead [m], left [rad], nose up [rad]), the last with its left side raised
-/// instead.
+/// Motions of the user, at 50 Hz: (up [m], ahead [m], left [rad], nose up [rad]); in the last one the left side
+/// is raised instead.
 fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body>)> {
     let held = [
         (0.0, 0.0, 0.0, 0.0),
@@ -26,7 +26,7 @@ fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body
         for tick in 0..120u32 {
             let share = (f64::from(tick) / 60.0).min(1.0);
             let mix = |a: f64, b: f64| a + (b - a) * share;
-            // A tremor, the same in every run.
+            // Tremor, the same in every run.
             let shake = DVec3::new((tick * 7 % 5) as f64, (tick * 3 % 7) as f64, (tick % 3) as f64);
             let p = start.translation_m
                 + DVec3::Z * mix(before.0, now.0)
@@ -44,7 +44,7 @@ fn carried(start: &Pose<World, Body>, jitter: f64) -> Vec<(f64, Pose<World, Body
     poses
 }
 
-/// Carries a vehicle whose stream has the settings `stream` before a server that has the settings `set`.
+/// Runs the check for a vehicle with the stream settings `stream`, on a server with the settings `set`.
 fn diagnosis(stream: &LocalizationConfig, set: &LocalizationConfig, yaw_rad: f64) -> Diagnosis {
     let start = Pose::new(DVec3::new(1.0, -2.0, 0.02), DQuat::from_rotation_z(yaw_rad));
     let mut check = Check::new(set.clone());
@@ -72,7 +72,7 @@ fn check(stream: &str, set: &str, expected: &[(&str, &str)]) {
 }
 
 #[test]
-fn right_values_are_left_alone() {
+fn keeps_correct_settings() {
     for settings in [
         "vicon",
         "json",
@@ -85,7 +85,7 @@ fn right_values_are_left_alone() {
 }
 
 #[test]
-fn the_setting_to_change_is_named() {
+fn names_the_setting_to_change() {
     // Swapped axes.
     check("natnet,up=y", "natnet", &[("up", "y")]);
     check("natnet", "natnet,up=y", &[("up", "z")]);
@@ -101,10 +101,10 @@ fn the_setting_to_change_is_named() {
     check("vicon", "vicon,euler=zyx", &[("euler", "xyz")]);
     check("vicon,euler=zyx", "vicon", &[("euler", "zyx")]);
     check("vicon,euler=vector", "vicon", &[("euler", "vector")]);
-    // The object's axes laid another way.
+    // Other axes of the object.
     check("json,nose=y", "json", &[("nose", "y")]);
     check("json", "json,nose=-x", &[("nose", "x")]);
-    // Two at once.
+    // Two changes at once.
     check("natnet,up=y,units=mm", "natnet", &[("units", "mm"), ("up", "y")]);
     check("vicon,units=m,nose=y", "vicon", &[("units", "m"), ("nose", "y")]);
 }
@@ -127,13 +127,13 @@ fn a_vehicle_that_moves_on_is_not_at_rest() {
         let pose = Pose::new(DVec3::X * t, DQuat::IDENTITY);
         assert!(!check.handle_pose(t, &pose), "at {t} s");
     }
-    // Turning on the spot neither.
+    // The same while it turns on the spot.
     let mut check = Check::new(config("json"));
     for tick in 0..500u32 {
         let t = f64::from(tick) * 0.01;
         assert!(!check.handle_pose(t, &Pose::new(DVec3::X, DQuat::from_rotation_z(t))), "at {t} s");
     }
-    // A still does not become a lift by waiting.
+    // Standing still for long does not count as a lift.
     let mut check = Check::new(config("json"));
     for tick in 0..2000u32 {
         let shake = DVec3::splat(f64::from(tick * 7 % 11) * 1e-4);
@@ -145,9 +145,9 @@ fn a_vehicle_that_moves_on_is_not_at_rest() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Whatever the stream and the settings: what is named makes it right.
+    /// For any stream and settings, the named change corrects the poses.
     #[test]
-    fn the_change_makes_it_right(axes in 0usize..48, nose in 0usize..4, unit in 0usize..3, yaw_rad in -3.0..3.0f64) {
+    fn the_change_corrects_the_poses(axes in 0usize..48, nose in 0usize..4, unit in 0usize..3, yaw_rad in -3.0..3.0f64) {
         let mut stream = config("json");
         stream.axes = Axes::all().nth(axes);
         stream.nose = Nose::NAMED[nose];

@@ -1,4 +1,4 @@
-//! What takes a stream's numbers to poses in the world, and back.
+//! Conversion between a stream's numbers and poses in the world.
 
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
@@ -6,38 +6,36 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 
 use super::conventions::{Axes, BodyAxes, Nose, Quaternion};
 
-/// `offset`: where the stream's origin is in the world.
+/// `offset`: position and heading of the stream's origin in the world.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Offset {
-    /// Where the stream's origin is. [m, world]
+    /// Position of the stream's origin. [m, world]
     pub position_m: DVec3,
-    /// How far its x axis is turned from the world's, counter-clockwise. [deg]
+    /// Rotation of its x axis from the world's, counter-clockwise. [deg]
     pub yaw_deg: f64,
 }
 
-/// What takes a stream's numbers to poses; made by [`LocalizationConfig::alignment`].
+/// Conversion from a stream's numbers to poses; made by [`LocalizationConfig::alignment`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Alignment {
     /// Metres per unit of the stream. [m]
     pub unit_m: f64,
-    /// The stream's axes.
     pub axes: Axes,
-    /// How its quaternions are meant.
+    /// Convention of its quaternions.
     pub quaternion: Quaternion,
     /// The object's axes.
     pub body: BodyAxes,
     /// The object's nose.
     pub nose: Nose,
-    /// The stream's origin.
     pub offset: Offset,
     /// The tracked point. [m, body]
     pub pivot_m: DVec3,
 }
 
 impl Alignment {
-    /// Returns where the vehicle is, given the object's position and the rotation of its axes into
-    /// the stream's, both as streamed.
+    /// Returns the vehicle's pose from the streamed position of the object and the streamed rotation from its
+    /// axes to the stream's.
     ///
     /// ```
     /// use glam::{DQuat, DVec3};
@@ -62,7 +60,7 @@ impl Alignment {
         Pose::new(p_m - rotation * self.pivot_m, rotation)
     }
 
-    /// Returns what was streamed: the way back.
+    /// Returns the streamed values of a pose: the inverse of [`Self::world_from_body`].
     pub fn streamed(&self, pose: &Pose<World, Body>) -> (DVec3, DQuat) {
         let turn = DQuat::from_rotation_z(self.offset.yaw_deg.to_radians()).conjugate();
         let back = self.axes.matrix().transpose();
@@ -75,7 +73,7 @@ impl Alignment {
         (back * (turn * p_m) / self.unit_m, self.quaternion.streamed(rotation))
     }
 
-    /// Returns the matrix that takes vectors along the object's own axes to the body's.
+    /// Returns the matrix from the object's own axes to the body's.
     pub fn body_from_object(&self) -> DMat3 {
         let laid = match self.object_from_flu() {
             None => self.axes.matrix(),
@@ -84,8 +82,8 @@ impl Alignment {
         DMat3::from_quat(self.nose.object_from_body().conjugate()) * laid
     }
 
-    /// Returns the rotation of forward, left and up into the object's own axes where these are laid by name;
-    /// `None` if as the stream's.
+    /// Returns the rotation from forward, left and up to the object's own axes, if these are named; `None` if
+    /// they follow the stream's.
     fn object_from_flu(&self) -> Option<DQuat> {
         match self.body {
             BodyAxes::Stream => None,
@@ -95,9 +93,9 @@ impl Alignment {
     }
 }
 
-/// Returns a rotation as seen from axes that are exchanged, turned or mirrored.
+/// Returns a rotation in axes that are exchanged, turned or mirrored.
 fn conjugated(axes: DMat3, rotation: DQuat) -> DQuat {
-    // The axis of a rotation is a pseudovector: a mirror turns the sense.
+    // The axis of a rotation is a pseudovector: a mirror reverses the direction of rotation.
     let axis = axes.determinant() * (axes * rotation.xyz());
     DQuat::from_xyzw(axis.x, axis.y, axis.z, rotation.w)
 }

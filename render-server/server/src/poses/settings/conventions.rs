@@ -1,4 +1,4 @@
-//! The words of a stream's conventions: units, axes, rotations, and how the tracked object lies in the vehicle.
+//! Conventions of a stream: units, axes, rotations, and the orientation of the tracked object in the vehicle.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,7 +6,6 @@ use std::str::FromStr;
 use glam::{DMat3, DQuat, DVec3, EulerRot};
 use serde::{Deserialize, Serialize};
 
-/// A length unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Units {
     /// Metres.
@@ -21,10 +20,9 @@ pub enum Units {
 }
 
 impl Units {
-    /// Every unit.
     pub const ALL: [Self; 3] = [Self::Metres, Self::Centimetres, Self::Millimetres];
 
-    /// Returns how many metres one is. [m]
+    /// Returns the metres per unit. [m]
     pub fn metres(self) -> f64 {
         match self {
             Self::Metres => 1.0,
@@ -44,18 +42,17 @@ impl fmt::Display for Units {
     }
 }
 
-/// Which axis of a stream points up.
+/// Axis of a stream that points up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum UpAxis {
     /// As in the world.
     Z,
-    /// As Motive does by default: x right, y up, z towards the viewer.
+    /// Default of Motive: x right, y up, z towards the viewer.
     Y,
 }
 
 impl UpAxis {
-    /// Returns the same as axes.
     pub fn axes(self) -> Axes {
         match self {
             Self::Z => Axes::IDENTITY,
@@ -64,13 +61,13 @@ impl UpAxis {
     }
 }
 
-/// Which of the stream's axes the world's x, y and z are, each possibly reversed: `x-zy` means
-/// that the world's y is the stream's -z, and its z the stream's y.
+/// Axes of the stream that correspond to the world's x, y and z, each possibly reversed. `x-zy` means that the
+/// world's y is the stream's -z, and its z the stream's y.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Axes([(usize, bool); 3]);
 
 impl Axes {
-    /// `xyz`: the stream's axes are the world's.
+    /// `xyz`: the stream's axes equal the world's.
     pub const IDENTITY: Self = Self([(0, false), (1, false), (2, false)]);
 
     /// Returns all 48, half of them mirrors.
@@ -83,7 +80,7 @@ impl Axes {
         })
     }
 
-    /// Returns the matrix that takes the stream's coordinates to the world's.
+    /// Returns the matrix from the stream's coordinates to the world's.
     pub fn matrix(self) -> DMat3 {
         let mut rows = [DVec3::ZERO; 3];
         for (row, (axis, turned)) in rows.iter_mut().zip(self.0) {
@@ -92,7 +89,7 @@ impl Axes {
         DMat3::from_cols(rows[0], rows[1], rows[2]).transpose()
     }
 
-    /// Whether left and right are exchanged.
+    /// Returns whether the axes are a mirror image.
     pub fn is_mirror(self) -> bool {
         self.matrix().determinant() < 0.0
     }
@@ -148,10 +145,10 @@ macro_rules! as_text {
 }
 as_text!(Axes, Euler, Quaternion);
 
-/// How three angles about x, y and z make a rotation.
+/// Convention of three angles about x, y and z.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Euler {
-    /// `xyz`: about the fixed x first, then the fixed y, then the fixed z: `Rz Ry Rx`.
+    /// `xyz`: first about the fixed x, then the fixed y, then the fixed z: `Rz Ry Rx`.
     #[default]
     Xyz,
     /// `xzy`: `Ry Rz Rx`.
@@ -162,23 +159,22 @@ pub enum Euler {
     Yzx,
     /// `zxy`: `Ry Rx Rz`.
     Zxy,
-    /// `zyx`: `Rx Ry Rz`, the same as turns about the object's own x, then y, then z.
+    /// `zyx`: `Rx Ry Rz`, the same as rotations about the object's own x, then y, then z.
     Zyx,
-    /// `vector`: the three are an axis, its length the angle.
+    /// `vector`: rotation vector; its length is the angle.
     Vector,
 }
 
 impl Euler {
-    /// Every way.
     pub const ALL: [Self; 7] =
         [Self::Xyz, Self::Xzy, Self::Yxz, Self::Yzx, Self::Zxy, Self::Zyx, Self::Vector];
 
-    /// Returns the name by which it is chosen.
+    /// Returns the name of the setting.
     pub fn name(self) -> &'static str {
         ["xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "vector"][self as usize]
     }
 
-    /// The same order as glam has it: about moving axes, so read backwards.
+    /// Returns the same order for glam, which uses moving axes, so in reverse.
     fn moving(self) -> Option<EulerRot> {
         Some(match self {
             Self::Xyz => EulerRot::ZYX,
@@ -191,7 +187,7 @@ impl Euler {
         })
     }
 
-    /// Returns where about x, y and z the order's first, second and third turn are, as glam has it.
+    /// Returns the axes of the first, second and third rotation in glam's order, as indices of x, y and z.
     fn places(self) -> [usize; 3] {
         match self {
             Self::Xyz | Self::Vector => [2, 1, 0],
@@ -237,31 +233,30 @@ impl FromStr for Euler {
     }
 }
 
-/// How a quaternion's four numbers are meant. Its reader takes them as x, y, z, w of the rotation of the
-/// object's axes into the stream's.
+/// Convention of a quaternion's four numbers. The parser reads them as x, y, z, w of the rotation from the
+/// object's axes to the stream's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Quaternion {
-    /// `xyzw`: just so.
+    /// `xyzw`: no conversion.
     #[default]
     Xyzw,
-    /// `wxyz`: w comes first, as Eigen's constructor, MAVLink and PX4 have it.
+    /// `wxyz`: w comes first, as in Eigen's constructor, MAVLink and PX4.
     Wxyz,
-    /// `xyzw-inverse`: the conjugate, the stream's axes into the object's.
+    /// `xyzw-inverse`: the conjugate, from the stream's axes to the object's.
     XyzwInverse,
     /// `wxyz-inverse`: both.
     WxyzInverse,
 }
 
 impl Quaternion {
-    /// Every way.
     pub const ALL: [Self; 4] = [Self::Xyzw, Self::Wxyz, Self::XyzwInverse, Self::WxyzInverse];
 
-    /// Returns the name by which it is chosen.
+    /// Returns the name of the setting.
     pub fn name(self) -> &'static str {
         ["xyzw", "wxyz", "xyzw-inverse", "wxyz-inverse"][self as usize]
     }
 
-    /// Returns the rotation that is meant by four numbers as they came, taken as x, y, z, w.
+    /// Returns the rotation for four received numbers, which were read as x, y, z, w.
     ///
     /// ```
     /// use glam::DQuat;
@@ -280,7 +275,7 @@ impl Quaternion {
         }
     }
 
-    /// Returns the four numbers as they come for a rotation: the way back.
+    /// Returns the four numbers to receive for a rotation: the inverse of [`Self::rotation`].
     pub fn streamed(self, rotation: DQuat) -> DQuat {
         let meant = match self {
             Self::Xyzw | Self::Wxyz => rotation,
@@ -308,22 +303,21 @@ impl FromStr for Quaternion {
     }
 }
 
-/// How the object's own axes are laid in the vehicle, before `nose` turns them.
+/// Orientation of the object's own axes in the vehicle, before `nose` turns them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BodyAxes {
-    /// As the stream's lie in the room while it stands: that axis up that points up there, as a motion capture
-    /// lays an object's axes when it is made.
+    /// Parallel to the stream's axes while the vehicle stands: the stream's up axis is also the object's.
+    /// Motion capture systems define an object's axes in this way.
     #[default]
     Stream,
-    /// x forward, y left, z up, whatever the stream's axes.
+    /// x forward, y left, z up, for any axes of the stream.
     Flu,
-    /// x forward, y right, z down, as autopilots have it, whatever the stream's axes.
+    /// x forward, y right, z down, as in autopilots, for any axes of the stream.
     Frd,
 }
 
 impl BodyAxes {
-    /// Every way.
     pub const ALL: [Self; 3] = [Self::Stream, Self::Flu, Self::Frd];
 }
 
@@ -337,29 +331,28 @@ impl fmt::Display for BodyAxes {
     }
 }
 
-/// Where the vehicle's nose points in the object's level axes: counter-clockwise from their x, seen from above.
-/// `x`, `y`, `-x` and `-y` are 0, 90, 180 and -90 degrees; any other angle is written as a number of degrees.
+/// Direction of the vehicle's nose in the object's level axes, counter-clockwise from their x, seen from above.
+/// `x`, `y`, `-x` and `-y` are 0, 90, 180 and -90 degrees; any other angle is a number of degrees.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Nose {
     deg: f64,
 }
 
 impl Nose {
-    /// Those with a name, counter-clockwise from x.
+    /// Named directions, counter-clockwise from x.
     pub const NAMED: [Self; 4] =
         [Self { deg: 0.0 }, Self { deg: 90.0 }, Self { deg: 180.0 }, Self { deg: -90.0 }];
 
-    /// Makes one from its angle. [deg]
+    /// Creates a direction from its angle. [deg]
     pub fn from_deg(deg: f64) -> Self {
         Self { deg }
     }
 
-    /// Returns its angle. [deg]
     pub fn deg(self) -> f64 {
         self.deg
     }
 
-    /// Returns the rotation of body axes into the object's level ones.
+    /// Returns the rotation from body axes to the object's level axes.
     pub fn object_from_body(self) -> DQuat {
         DQuat::from_rotation_z(self.deg.to_radians())
     }
@@ -401,7 +394,7 @@ impl<'de> Deserialize<'de> for Nose {
     }
 }
 
-/// Reads a name or a number.
+/// Parses a name or a number.
 struct NoseVisitor;
 
 impl serde::de::Visitor<'_> for NoseVisitor {
@@ -424,5 +417,5 @@ impl serde::de::Visitor<'_> for NoseVisitor {
     }
 }
 
-/// What a nose may be.
+/// Valid values of a nose.
 const NOSE_IS: &str = "write x, y, -x, -y or degrees from the object's x";

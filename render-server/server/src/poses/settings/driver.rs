@@ -1,5 +1,5 @@
-//! The registry of pose drivers: what each is called, and its usual settings. What opens a driver's
-//! socket and reads its stream is matched to it in [`crate::poses::drivers`].
+//! Registry of pose drivers: names and default settings. [`crate::poses::drivers`] opens the socket of each
+//! driver and parses its stream.
 
 use std::fmt;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Units;
 
-/// Who sends poses.
+/// Sender of poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Driver {
@@ -17,23 +17,23 @@ pub enum Driver {
     Natnet,
     /// VizFlyt's own pose packet: JSON over UDP, from any program.
     Json,
-    /// An autopilot's own estimate over MAVLink.
+    /// The autopilot's own estimate over MAVLink.
     Mavlink,
     /// Any server of the Virtual-Reality Peripheral Network, over TCP.
     Vrpn,
 }
 
-/// What is known of a driver without its code.
+/// Properties of a driver.
 struct Entry {
     driver: Driver,
     name: &'static str,
     usual_address: &'static str,
     usual_units: Units,
-    /// Keys of `[[localization]]` that only this driver has, and why no other has them.
+    /// Keys of `[[localization]]` that only this driver has, with the reason.
     own_keys: &'static [(&'static str, &'static str)],
 }
 
-/// One line for each driver.
+/// Entries in the order of the variants.
 const REGISTRY: [Entry; 5] = [
     Entry {
         driver: Driver::Vicon,
@@ -45,7 +45,7 @@ const REGISTRY: [Entry; 5] = [
     Entry {
         driver: Driver::Natnet,
         name: "natnet",
-        // Motive's multicast group and data port, unless someone changed them.
+        // Motive's default multicast group and data port.
         usual_address: "239.255.42.99:1511",
         usual_units: Units::Metres,
         own_keys: &[(
@@ -70,7 +70,7 @@ const REGISTRY: [Entry; 5] = [
     Entry {
         driver: Driver::Vrpn,
         name: "vrpn",
-        // A server is asked: one on this computer.
+        // The client connects to a server, by default on this computer.
         usual_address: "127.0.0.1:3883",
         usual_units: Units::Metres,
         own_keys: &[("sensor", "only VRPN's trackers have sensors")],
@@ -78,7 +78,6 @@ const REGISTRY: [Entry; 5] = [
 ];
 
 impl Driver {
-    /// Returns every driver.
     pub fn all() -> impl Iterator<Item = Self> {
         REGISTRY.iter().map(|entry| entry.driver)
     }
@@ -89,31 +88,31 @@ impl Driver {
     }
 
     fn entry(self) -> &'static Entry {
-        // The registry is in the order of the variants; a test holds it to that.
+        // The registry is in the order of the variants; a test checks this.
         &REGISTRY[self as usize]
     }
 
-    /// Returns the name by which it is chosen.
+    /// Returns the name of the setting.
     pub fn name(self) -> &'static str {
         self.entry().name
     }
 
-    /// Returns the address at which its stream usually arrives, or is asked for.
+    /// Returns the default address at which its stream arrives, or is requested.
     pub fn usual_address(self) -> &'static str {
         self.entry().usual_address
     }
 
-    /// Returns the length unit that it has unless somebody changed it.
+    /// Returns the driver's default length unit.
     pub fn usual_units(self) -> Units {
         self.entry().usual_units
     }
 
-    /// Whether its attitudes come as quaternions whose order is the sender's affair: MAVLink's is the standard's.
+    /// Returns whether the order of its quaternions depends on the sender; MAVLink's is standardized.
     pub fn has_quaternions(self) -> bool {
         !matches!(self, Self::Vicon | Self::Mavlink)
     }
 
-    /// Returns why a key of `[[localization]]` is refused for this driver; `None` if it is not.
+    /// Returns why a key of `[[localization]]` is invalid for this driver; `None` if it is valid.
     pub(super) fn refuses(self, key: &str) -> Option<&'static str> {
         let mut owned = REGISTRY.iter().flat_map(|entry| {
             entry.own_keys.iter().map(|&(own, reason)| (entry.driver, own, reason))
@@ -134,7 +133,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_registry_has_every_driver_once_and_the_guide_lists_it() {
+    fn registry_and_guide_list_every_driver_once() {
         let guide = include_str!("../../../../../docs/guides/localization.md");
         for (index, driver) in Driver::all().enumerate() {
             assert_eq!(driver as usize, index);

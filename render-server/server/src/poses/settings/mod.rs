@@ -1,12 +1,12 @@
-//! `[[localization]]`: where poses come from, and how the stream's numbers become poses of the
-//! vehicle in the `world` frame.
+//! `[[localization]]`: pose sources, and conversion of their numbers to poses of the vehicle in the `world`
+//! frame.
 //!
 //! ```text
 //! stream's position * units -> axes -> offset ----------------> position  [m, world]
 //! stream's rotation (euler, quaternion) -> axes, body -> nose --> attitude  (body to world)
 //! ```
-//! Each setting is something a person can see in the room, so that `vizflyt doctor localization`
-//! can name the one to change. `conventions` has the words, `alignment` what they do together.
+//! Each setting corresponds to a visible property of the room, so that `vizflyt doctor localization` can name
+//! the one to change. `conventions` contains the values, `alignment` the conversion.
 
 mod alignment;
 mod conventions;
@@ -27,59 +27,58 @@ pub use self::conventions::{Axes, BodyAxes, Euler, Nose, Quaternion, Units, UpAx
 pub use self::driver::Driver;
 use crate::scene;
 
-/// `[[localization]]`: one source of poses.
+/// `[[localization]]`: one pose source.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LocalizationConfig {
-    /// What sends poses.
     pub driver: Driver,
-    /// Address and port where they arrive, or are asked for; the driver's usual one by default.
+    /// Address and port where poses arrive, or are requested; default: depends on the driver.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
-    /// Length unit of the stream; the driver's own by default.
+    /// Length unit of the stream; default: depends on the driver.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub units: Option<Units>,
-    /// The stream's axis that points up; a short form of `axes`.
+    /// Axis of the stream that points up; a short form of `axes`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<UpAxis>,
-    /// How the stream's axes lie in the world; `xyz` by default, `x-zy` for y up.
+    /// Orientation of the stream's axes in the world; `xyz` by default, `x-zy` for y up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
-    /// Vicon: the order in which its three angles turn about the fixed axes.
+    /// Vicon: order of the rotations about the fixed axes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub euler: Option<Euler>,
-    /// NatNet, JSON: how the four numbers of a quaternion are meant.
+    /// NatNet, JSON, VRPN: order and direction of a quaternion's four numbers.
     #[serde(default, skip_serializing_if = "is_default")]
     pub quaternion: Quaternion,
-    /// How the object's own axes are laid; as the stream's by default.
+    /// Orientation of the object's own axes; as the stream's by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub body: BodyAxes,
-    /// How the object's axes lie to the vehicle's nose; it points along x by default.
+    /// Direction of the vehicle's nose in the object's axes; x by default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub nose: Nose,
-    /// Where the stream's origin is in the world, and how it is turned there.
+    /// Position and heading of the stream's origin in the world.
     #[serde(default, skip_serializing_if = "is_default")]
     pub offset: Offset,
-    /// Where the tracked point is on the vehicle. [m, body]
+    /// Position of the tracked point on the vehicle. [m, body]
     #[serde(default, skip_serializing_if = "is_default")]
     pub pivot_m: DVec3,
-    /// The source's own constant delay, 0 to 500: so much earlier than stamped, or than it arrived where it has no
-    /// stamp, a pose was true. [ms]
+    /// Constant delay of the source, 0 to 500. It is subtracted from the stamp, or from the arrival if there is
+    /// no stamp. [ms]
     #[serde(default, skip_serializing_if = "is_default")]
     pub latency_ms: f64,
-    /// Names of the vehicles' objects in the stream, where they differ from the vehicles' names.
+    /// Names of the vehicles' objects in the stream, if they differ from the vehicles' names.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub objects: BTreeMap<String, String>,
-    /// NatNet by multicast: our address in the network that it comes from, where there are several.
+    /// NatNet by multicast: address of this computer in Motive's network, if there are several networks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub interface: Option<Ipv4Addr>,
-    /// VRPN: which sensor of a tracker the vehicle is; 0 by default.
+    /// VRPN: sensor number of the tracker that is the vehicle; default: 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensor: Option<u16>,
 }
 
 impl LocalizationConfig {
-    /// Makes a source with everything as usual.
+    /// Creates a source with all defaults.
     pub fn new(driver: Driver) -> Self {
         Self {
             driver,
@@ -100,11 +99,11 @@ impl LocalizationConfig {
         }
     }
 
-    /// Reads `DRIVER[:ADDRESS][,KEY=VALUE...]`, as the command line has it; keys and values are those
-    /// of `[[localization]]`, lists in brackets: `pivot_m=[0.02,0,0.05]`.
+    /// Parses `DRIVER[:ADDRESS][,KEY=VALUE...]` of the command line. Keys and values are those of
+    /// `[[localization]]`, lists in brackets: `pivot_m=[0.02,0,0.05]`.
     ///
     /// # Errors
-    /// Says what is wrong, and what could stand there.
+    /// What is wrong, and the valid values.
     pub fn parse(text: &str) -> Result<Self, String> {
         let (head, settings) = text.split_once(',').unwrap_or((text, ""));
         let (driver, address) = head.split_once(':').map_or((head, None), |(d, a)| (d, Some(a)));
@@ -125,9 +124,9 @@ impl LocalizationConfig {
                 .ok_or_else(|| format!("'{setting}': write KEY=VALUE, as units=mm"))?;
             let read = toml::Value::from_str(value).ok();
             if value.starts_with('[') && read.is_none() {
-                return Err(format!("'{setting}': write a place as [x,y,z]"));
+                return Err(format!("'{setting}': write a position as [x,y,z]"));
             }
-            // Names are text even if they are numbers.
+            // Names are text even if they look like numbers.
             let value = read
                 .filter(|value| value.is_str() || !key.starts_with("objects."))
                 .unwrap_or_else(|| value.into());
@@ -144,17 +143,17 @@ impl LocalizationConfig {
         Ok(config)
     }
 
-    /// Returns where its stream arrives.
+    /// Returns the address where its stream arrives.
     pub fn address(&self) -> &str {
         self.address.as_deref().unwrap_or(self.driver.usual_address())
     }
 
-    /// Returns the axes, given in either form.
+    /// Returns the axes, from either form.
     pub fn stream_axes(&self) -> Axes {
         self.axes.unwrap_or_else(|| self.up.map_or(Axes::IDENTITY, UpAxis::axes))
     }
 
-    /// Returns what takes the stream's numbers to poses.
+    /// Returns the conversion from the stream's numbers to poses.
     pub fn alignment(&self) -> Alignment {
         Alignment {
             unit_m: self.units.unwrap_or(self.driver.usual_units()).metres(),
@@ -192,7 +191,7 @@ impl LocalizationConfig {
             return Err(invalid(format!("{key}.quaternion"), self.quaternion, advice));
         }
         if self.body != BodyAxes::Stream && self.stream_axes().is_mirror() {
-            let advice = "a mirrored stream has no such axes: leave `body` out, or mend `axes`";
+            let advice = "a mirrored stream has no such axes: leave `body` out, or correct `axes`";
             return Err(invalid(format!("{key}.body"), self.body, advice));
         }
         check_number(&format!("{key}.nose"), self.nose.deg(), "degrees", -360.0..=360.0)?;
@@ -208,16 +207,16 @@ impl LocalizationConfig {
     }
 }
 
-/// Cuts the first setting off several, KEY=VALUE and commas: those within a list's brackets, or quotes, part nothing.
+/// Splits the first setting KEY=VALUE off several, at a comma that is not in a list's brackets or in quotes.
 fn first_setting(settings: &str) -> (&str, &str) {
     let value = settings.find('=').map_or(settings.len(), |equals| equals + 1);
     let within = match settings[value..].chars().next() {
-        // Of nested lists nothing is made: no setting is one.
+        // Nested lists are not supported: no setting is one.
         Some('[') => Some(settings[value..].find(']').unwrap_or(settings.len() - value)),
         Some(quote @ ('"' | '\'')) => settings[value + 1..].find(quote).map(|end| end + 1),
         _ => None,
     };
-    // Before the sign there may be a comma still: of a setting without a value.
+    // A comma may come before the equals sign: after a setting without a value.
     let comma = settings[..value].find(',');
     let comma = comma.or_else(|| {
         let from = value + within.unwrap_or(0);
@@ -226,14 +225,14 @@ fn first_setting(settings: &str) -> (&str, &str) {
     comma.map_or((settings, ""), |comma| (&settings[..comma], &settings[comma + 1..]))
 }
 
-/// Puts a value under a key of one or several parts: `offset.yaw_deg`.
+/// Inserts a value under a key of one or several parts: `offset.yaw_deg`.
 fn insert(table: &mut toml::Table, key: &str, value: toml::Value) -> Result<(), String> {
     let Some((outer, inner)) = key.split_once('.') else {
         table.insert(key.to_owned(), value);
         return Ok(());
     };
     let inside = table.entry(outer).or_insert_with(|| toml::Table::new().into());
-    let inside = inside.as_table_mut().ok_or_else(|| format!("'{outer}' is no table"))?;
+    let inside = inside.as_table_mut().ok_or_else(|| format!("'{outer}' is not a table"))?;
     insert(inside, inner, value)
 }
 
@@ -241,17 +240,17 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
-/// The part of `arena.toml` that is read here; the rest is the arena's.
+/// Part of `arena.toml` that this module reads; other modules read the rest.
 #[derive(Deserialize)]
 struct ArenaToml {
     #[serde(default)]
     localization: Vec<LocalizationConfig>,
 }
 
-/// Reads every `[[localization]]` of the text of an `arena.toml`.
+/// Parses every `[[localization]]` of the text of an `arena.toml`.
 ///
 /// # Errors
-/// Points at the line: unknown keys, values that cannot work, more than [`MAX_SOURCES`].
+/// Names the line: unknown keys, invalid values, more than [`MAX_SOURCES`].
 pub fn read_all(arena_toml: &str) -> Result<Vec<LocalizationConfig>, ConfigError> {
     let ArenaToml { localization } = vizflyt_toml::parse(arena_toml)?;
     check_all(&localization).map_err(|error| error.in_text(arena_toml))?;
@@ -267,16 +266,16 @@ fn check_all(sources: &[LocalizationConfig]) -> Result<(), ConfigError> {
     sources.try_for_each(|(index, source)| source.check(&format!("localization[{index}]")))
 }
 
-/// Returns the sources of poses of an arena, by its file or folder; a bare scene names none.
+/// Returns the pose sources of an arena, given its file or folder; a bare scene has none.
 ///
 /// # Errors
-/// A file that cannot be read, or as [`read_all`].
+/// A file that cannot be read, or an error of [`read_all`].
 pub fn of_arena(path: &Path) -> Result<Vec<LocalizationConfig>> {
     let Some((path, text)) = scene::arena_text(path)? else { return Ok(Vec::new()) };
     read_all(&text).with_context(|| format!("{} is wrong", path.display()))
 }
 
-/// Sources of one server at most.
+/// Maximum number of sources of one server.
 pub const MAX_SOURCES: usize = 8;
 
 #[cfg(test)]

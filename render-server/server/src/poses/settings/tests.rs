@@ -12,7 +12,7 @@ fn check(text: &str, expected: &str) {
 #[test]
 fn command_line_and_file_are_equivalent() {
     let line = "natnet:0.0.0.0:1511,up=y,units=cm,nose=-y,offset.yaw_deg=90,pivot_m=[0.0;0.0]";
-    check(line, "write a place as [x,y,z]");
+    check(line, "write a position as [x,y,z]");
     let line = line.split_once(",pivot").unwrap().0;
     let found = LocalizationConfig::parse(&format!("{line},objects.bee=Body 7")).unwrap();
     let file = r#"
@@ -51,8 +51,8 @@ fn reports_invalid_settings_by_name() {
     check("json,units=yd", "unknown variant `yd`");
     check("json,units", "write KEY=VALUE");
     check("json,units,pivot_m=[0,0,0]", "'units': write KEY=VALUE");
-    check("json,pivot_m=[0,0,units=cm", "'pivot_m=[0,0,units=cm': write a place as [x,y,z]");
-    check("json,pivot_m=[0;0;0]", "write a place as [x,y,z]");
+    check("json,pivot_m=[0,0,units=cm", "'pivot_m=[0,0,units=cm': write a position as [x,y,z]");
+    check("json,pivot_m=[0;0;0]", "write a position as [x,y,z]");
     check("json,pivot_m=[0,0]", "write DRIVER:ADDRESS,KEY=VALUE");
     check("json,pivot_m=0", "write DRIVER:ADDRESS,KEY=VALUE");
     check("json,pivot_m=[0,0,nan]", "pivot_m");
@@ -79,7 +79,7 @@ fn reports_invalid_settings_by_name() {
 }
 
 #[test]
-fn a_nose_is_a_name_or_an_angle() {
+fn nose_is_a_name_or_an_angle() {
     for (text, deg, again) in [
         ("x", 0.0, "x"),
         ("-y", -90.0, "-y"),
@@ -96,9 +96,9 @@ fn a_nose_is_a_name_or_an_angle() {
     assert_eq!(quoted.nose.deg(), 45.0);
 }
 
-/// The words of COORDINATES.md: an autopilot's frames, and w first.
+/// Conventions of COORDINATES.md: an autopilot's frames, and w first.
 #[test]
-fn an_autopilots_attitude_is_read_by_its_axes() {
+fn converts_attitudes_in_an_autopilots_axes() {
     let read = |text: &str, p: [f64; 3], came: [f64; 4]| {
         let config = LocalizationConfig::parse(text).unwrap();
         config.alignment().world_from_body(DVec3::from(p), DQuat::from_array(came))
@@ -108,15 +108,15 @@ fn an_autopilots_attitude_is_read_by_its_axes() {
         let off = (pose.rotate(DVec3::X) - nose).length() + (pose.rotate(DVec3::Z) - up).length();
         assert!(off < 1e-9, "nose {}, up {}", pose.rotate(DVec3::X), pose.rotate(DVec3::Z));
     };
-    // Level, its nose north: no turn from NED to FRD.
+    // Level, nose to the north: no rotation from NED to FRD.
     let pose = read("json,axes=yx-z,body=frd", [2.0, 1.0, -3.0], [0.0, 0.0, 0.0, 1.0]);
     is(&pose, DVec3::Y, DVec3::Z);
     assert!((pose.translation_m - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-12);
-    // A quarter to the right from there is one about down: its nose east.
+    // A quarter turn to the right from there is one about down: nose to the east.
     is(&read("json,axes=yx-z,body=frd", [0.0; 3], [0.0, 0.0, half, half]), DVec3::X, DVec3::Z);
-    // FRD in ENU: level and its nose east is a half turn about x.
+    // FRD in ENU: level with the nose to the east is a half turn about x.
     is(&read("json,body=frd", [0.0; 3], [1.0, 0.0, 0.0, 0.0]), DVec3::X, DVec3::Z);
-    // A quarter to the left about z, w first; and its conjugate.
+    // A quarter turn to the left about z, w first; and its conjugate.
     is(&read("json,quaternion=wxyz", [0.0; 3], [half, 0.0, 0.0, half]), DVec3::Y, DVec3::Z);
     let inverse = "json,quaternion=xyzw-inverse";
     is(&read(inverse, [0.0; 3], [0.0, 0.0, -half, half]), DVec3::Y, DVec3::Z);
@@ -161,9 +161,9 @@ fn alignment() -> impl Strategy<Value = Alignment> {
 }
 
 proptest! {
-    /// Whatever is written, it is read or refused; and what has been read reads the same as a file.
+    /// Any text is parsed or rejected, and the result is the same after writing it to a file.
     #[test]
-    fn no_text_breaks_the_reader(text in r#"json(,(pivot_m|offset.position_m|objects.a|units|x)?=?[\[\]"',0-9.a-z-]{0,12}){0,4}"#) {
+    fn any_text_parses_or_fails_cleanly(text in r#"json(,(pivot_m|offset.position_m|objects.a|units|x)?=?[\[\]"',0-9.a-z-]{0,12}){0,4}"#) {
         if let Ok(found) = LocalizationConfig::parse(&text) {
             let again: LocalizationConfig = toml::from_str(&toml::to_string(&found).unwrap()).unwrap();
             prop_assert_eq!(again, found);
@@ -171,7 +171,7 @@ proptest! {
     }
 
     #[test]
-    fn poses_go_there_and_back(a in alignment(), q in rotation(), p in prop::array::uniform3(-5.0..5.0f64)) {
+    fn poses_survive_a_round_trip(a in alignment(), q in rotation(), p in prop::array::uniform3(-5.0..5.0f64)) {
         let pose = a.world_from_body(DVec3::from(p), q);
         prop_assert!(pose.is_valid());
         let (p_back, q_back) = a.streamed(&pose);
@@ -179,12 +179,12 @@ proptest! {
         prop_assert!(q_back.dot(q).abs() > 1.0 - 1e-9);
     }
 
-    /// Whatever the axes: a point of the object is at its streamed coordinates, and the sense
-    /// of turns is right in a mirror too.
+    /// For any axes: a point of the object is at its streamed coordinates, and the direction of rotations is
+    /// right in a mirror too.
     #[test]
-    fn points_of_the_object_are_carried_along(a in alignment(), q in rotation(), v in prop::array::uniform3(-1.0..1.0f64)) {
+    fn points_of_the_object_move_with_it(a in alignment(), q in rotation(), v in prop::array::uniform3(-1.0..1.0f64)) {
         let a = Alignment { unit_m: 1.0, pivot_m: DVec3::ZERO, ..a };
-        // A vector of the object, as the stream's axes have it, and as the world's do.
+        // A vector of the object in the stream's axes, and in the world's.
         let v = DVec3::from(v);
         let turn = DQuat::from_rotation_z(a.offset.yaw_deg.to_radians());
         let in_world = turn * (a.axes.matrix() * (q * v));
@@ -193,14 +193,14 @@ proptest! {
     }
 
     #[test]
-    fn angles_make_the_rotation_that_has_them(q in rotation(), which in 0usize..7) {
+    fn angles_survive_a_round_trip(q in rotation(), which in 0usize..7) {
         let euler = Euler::ALL[which];
         let again = euler.rotation(euler.angles(q));
         prop_assert!(again.dot(q).abs() > 1.0 - 1e-6, "{euler}");
     }
 
     #[test]
-    fn orders_are_of_fixed_axes(a in prop::array::uniform3(-1.5..1.5f64)) {
+    fn orders_use_fixed_axes(a in prop::array::uniform3(-1.5..1.5f64)) {
         let angles = DVec3::from(a);
         let [x, y, z] = [DQuat::from_rotation_x(a[0]), DQuat::from_rotation_y(a[1]), DQuat::from_rotation_z(a[2])];
         for (euler, expected) in [
@@ -213,7 +213,7 @@ proptest! {
 }
 
 #[test]
-fn the_file_is_read_strictly_and_errors_name_the_line() {
+fn reads_the_file_strictly_and_names_the_line_of_errors() {
     let arena = "name = \"x\"\n[[localization]]\ndriver = \"vicon\"\n[[localization]]\n";
     let read = |rest: &str| read_all(&format!("{arena}{rest}")).map_err(|e| e.to_string());
     let found = read("driver = \"json\"\n").unwrap();

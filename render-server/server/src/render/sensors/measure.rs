@@ -1,5 +1,5 @@
-//! Which sensors of a vehicle are due, and what they measure: pure, with time as an argument, so that the thread (wall
-//! clock) and graded flights (virtual clock) keep the same rules.
+//! Schedule and measurements of a vehicle's sensors. Pure, with time as an argument, so that the thread (wall
+//! clock) and graded flights (virtual clock) follow the same rules.
 
 use std::sync::Arc;
 
@@ -18,22 +18,22 @@ use super::model::SensorModel;
 use super::set::{MadeReading, SensorSet};
 use crate::render::schedule::Exposure;
 
-/// A radar's frame: the chirps over which it takes speeds. [s]
+/// Duration of a radar's frame: the chirps over which it measures speeds. [s]
 const RADAR_FRAME_S: f64 = 0.02;
 
-/// What a sensor is in the midst of.
+/// Environment of a sensor.
 pub struct Around<'a> {
-    /// The splats as rays meet them.
+    /// Splats for ray queries.
     pub scene: &'a SensorScene,
-    /// How the vehicle moves.
+    /// Motion of the vehicle.
     pub motion: &'a VehicleMotion,
-    /// When the newest pose was measured.
+    /// Time of measurement of the newest pose.
     pub pose: ServerTime,
-    /// Appends where each object of the scene is at an instant.
+    /// Appends the placements of all objects at an instant.
     pub place: &'a mut dyn FnMut(ServerTime, &mut Vec<Placement>),
 }
 
-/// The sensors of one vehicle: models, when each is due, and how many readings each has made.
+/// Sensors of one vehicle: models, due times, and numbers of readings.
 #[derive(Debug)]
 pub struct VehicleSensors {
     set: Arc<SensorSet>,
@@ -48,7 +48,7 @@ pub struct VehicleSensors {
 }
 
 impl VehicleSensors {
-    /// Makes sensors that are all due at `now`; all their noise follows from `seed`.
+    /// Creates sensors that are all due at `now`; `seed` determines their noise.
     pub fn new(set: Arc<SensorSet>, now: ServerTime, seed: u64) -> Self {
         Self {
             models: set.models.clone(),
@@ -63,7 +63,7 @@ impl VehicleSensors {
         }
     }
 
-    /// Takes over what was changed; one that got faster need not wait out its former period.
+    /// Applies changed settings; a faster rate takes effect at once.
     pub fn follow(&mut self, newest: Arc<SensorSet>, now: ServerTime) {
         if Arc::ptr_eq(&self.set, &newest) {
             return;
@@ -75,19 +75,19 @@ impl VehicleSensors {
         }
     }
 
-    /// Returns when the first of them is due; `None` if none measures.
+    /// Returns the earliest due time; `None` if no sensor is enabled.
     pub fn next(&self) -> Option<ServerTime> {
         let measuring = self.due.iter().zip(&self.set.configs).filter(|(_, config)| config.enabled);
         measuring.map(|(due, _)| *due).min()
     }
 
-    /// Returns which sensors measure at `now`, and notes when they are due again.
+    /// Returns the sensors that measure at `now`, and schedules their next readings.
     pub fn take(&mut self, now: ServerTime) -> [bool; MAX_SENSORS] {
         let mut taken = [false; MAX_SENSORS];
         for (index, config) in self.set.configs.iter().enumerate() {
             taken[index] = config.enabled && self.due[index] <= now;
             if taken[index] {
-                // From when it was due, so that the mean rate is kept; from now, after a rest.
+                // Counted from the due time, to keep the mean rate; after a rest, from now.
                 let next = self.due[index].plus_ns(period_ns(&self.models[index]));
                 self.due[index] = next.max(now);
             }
@@ -95,8 +95,8 @@ impl VehicleSensors {
         taken
     }
 
-    /// Measures with sensor `index` what there is at the instant of `exposure`. `None` if the vehicle or an object is at no
-    /// place that can be.
+    /// Returns the reading of sensor `index` at the instant of `exposure`. `None` if a pose of the vehicle or
+    /// of an object is invalid.
     pub fn measure(
         &mut self,
         index: usize,
@@ -150,7 +150,7 @@ impl VehicleSensors {
             }
             SensorModel::Radar(radar) => {
                 radar.measure(scene, &motion, seed, seq, &mut self.detections).ok()?;
-                // The nearest ones, where there are too many.
+                // Only the nearest, if there are too many.
                 let most = SensorKind::Radar.max_records();
                 made(header, self.detections.iter().take(most).map(radar_record))
             }
@@ -164,7 +164,7 @@ fn period_ns(model: &SensorModel) -> i64 {
     (1e9 / model.rate_hz()) as i64
 }
 
-// ---- from the models' records to those of plugins, which are told of no object what it is ----
+// ---- from the models' records to those of plugins, without the identity of objects ----
 
 fn lidar_record(point: &models::LidarPoint, sweep_ns: u32) -> LidarPoint {
     LidarPoint {
@@ -189,7 +189,7 @@ fn radar_record(detection: &models::RadarDetection) -> RadarDetection {
     }
 }
 
-/// Returns the reading of these records.
+/// Returns the reading with these records.
 fn made<R: IntoBytes + zerocopy::Immutable>(
     header: impl FnOnce(u32) -> ReadingHeader,
     records: impl Iterator<Item = R>,
@@ -216,7 +216,7 @@ mod tests {
 
     const START: ServerTime = ServerTime::from_ns(10_000_000_000);
 
-    /// A wall that is 3.9 m ahead where it stands as it is.
+    /// Wall at 3.9 m ahead in its original placement.
     fn scene() -> SensorScene {
         let wall = Part {
             center_m: Vec3::new(4.0, 0.0, 1.0),
@@ -239,7 +239,7 @@ mod tests {
         Arc::new(SensorSet::new(configs).unwrap())
     }
 
-    /// Measures with sensor `index` at `x_m`, 1 m up, the wall moved on by `wall_x_m` or away.
+    /// Measures with sensor `index` at `x_m`, at 1 m height, with the wall moved by `wall_x_m` or removed.
     fn measure(
         sensors: &mut VehicleSensors,
         index: usize,
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn ranges_are_those_of_the_geometry_and_what_moves_is_where_it_is() {
+    fn ranges_match_the_geometry_including_moved_objects() {
         let set = set(&[exact("ahead", "lidar-lite-v3"), exact("zones", "vl53l5cx")]);
         let mut sensors = VehicleSensors::new(set, START, 7);
         for (x_m, wall_x_m, expected_m) in [(0.0, 0.0, 3.8), (1.0, 0.0, 2.8), (0.5, 2.0, 5.3)] {
@@ -297,14 +297,14 @@ mod tests {
     }
 
     #[test]
-    fn sensors_keep_their_rates_and_one_that_is_off_measures_nothing() {
+    fn sensors_keep_their_rates_and_disabled_ones_measure_nothing() {
         let mut configs =
             ["os1-16", "tfmini"].map(|model| SensorConfig::ahead(model, model, DVec3::ZERO));
         configs[1].rate_hz = Some(30.0);
         let mut sensors = VehicleSensors::new(set(&configs), START, 0);
         let fly = |sensors: &mut VehicleSensors, from: i64| {
             let mut counts = [0; 2];
-            // A second of ticks of 2.5 ms.
+            // One second of ticks of 2.5 ms.
             for tick in from..from + 400 {
                 let taken = sensors.take(START.plus_ns(tick * 2_500_000));
                 for (count, taken) in counts.iter_mut().zip(taken) {

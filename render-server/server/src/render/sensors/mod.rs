@@ -1,16 +1,17 @@
-//! What the sensors beside the cameras measure: LiDAR, range finders, sonar, radar.
+//! Simulated sensors in addition to the cameras: LiDAR, range finders, sonar, radar.
 //!
 //! ```text
-//! [[sensors]] ─▶ SensorSet (changed in flight: Sensors) ─▶ VehicleSensors: which are due, readings
-//! newest motions, the splats as rays meet them ───────────┘        │ thread (wall clock), graded flights
+//! [[sensors]] ─▶ SensorSet (changed in flight: Sensors) ─▶ VehicleSensors: schedule, readings
+//! newest motions, splats for ray queries ─────────────────┘        │ thread (wall clock), graded flights
 //!                                                                  └▶ newest reading of each, to sessions and the page
 //! ```
-//! Policy: images come first. The thread has one core at most, of its own pool, and what it does not get done in time is
-//! left out: a sensor that is late is due again from then on. It rests while nobody wants a vehicle's images, and is not
-//! there at all in an arena without sensors.
+//! Policy: images have priority. The thread uses at most one core, of its own pool, and skips readings that it
+//! cannot make in time: a late sensor's next reading is counted from then on. It rests without demand for a
+//! vehicle's images, and is not started in an arena without sensors.
 //!
-//! A reading shows the instant that an image rendered at the same time would ([`Exposure`](super::schedule::Exposure)):
-//! the vehicle is where it will be when the plugin has it. A sweep ends then.
+//! A reading shows the same instant as an image rendered at the same time
+//! ([`Exposure`](super::schedule::Exposure)): the predicted pose of the vehicle when the plugin receives it. A
+//! sweep ends at that instant.
 
 mod measure;
 mod model;

@@ -1,4 +1,4 @@
-//! From `[[sensors]]` to a model of the renderer's: a preset by name, and what is other than its data sheet says.
+//! Conversion from `[[sensors]]` to a sensor model: a preset by name, and its changed values.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -12,7 +12,7 @@ use vizflyt_splat::sensor::{
     SonarModel,
 };
 
-/// A sensor's model, ready to measure.
+/// Model of a sensor, ready to measure.
 #[derive(Clone, Debug)]
 pub enum SensorModel {
     /// Of [`SensorKind::Lidar`].
@@ -26,10 +26,10 @@ pub enum SensorModel {
 }
 
 impl SensorModel {
-    /// Prepares the model of a sensor; `key` names a field of its configuration.
+    /// Creates the model of a sensor; `key` returns the name of a field of its configuration.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for a name that is none, keys that its kind does not have, and values that cannot be.
+    /// [`ConfigError::Invalid`] for an unknown name, keys that the kind does not have, and invalid values.
     pub fn new(config: &SensorConfig, key: impl Fn(&str) -> String) -> Result<Self, ConfigError> {
         let Some(preset) = preset(&config.model) else {
             let advice = format!("there is no such model; there are: {}", names());
@@ -76,7 +76,6 @@ impl SensorModel {
         Ok(model)
     }
 
-    /// Returns its kind.
     pub fn kind(&self) -> SensorKind {
         match self {
             Self::Lidar(_) => SensorKind::Lidar,
@@ -86,7 +85,7 @@ impl SensorModel {
         }
     }
 
-    /// Returns readings a second. [Hz]
+    /// Returns the rate of readings. [Hz]
     pub fn rate_hz(&self) -> f64 {
         match self {
             Self::Lidar(lidar) => lidar.model().rate_hz,
@@ -96,7 +95,7 @@ impl SensorModel {
         }
     }
 
-    /// Returns what runtime and plugins must know of the sensor.
+    /// Returns the description of the sensor for runtime and plugins.
     pub fn info(&self, config: &SensorConfig) -> SensorInfo {
         let ([min_range_m, max_range_m], [horizontal_fov_rad, vertical_fov_rad], most) = match self
         {
@@ -136,7 +135,7 @@ impl SensorModel {
     }
 }
 
-/// Returns width and height of what beams see. [rad]
+/// Returns width and height of the beams' field of view. [rad]
 fn field_of_view(beams: &Beams) -> [f32; 2] {
     match beams {
         Beams::Spinning { elevations_rad, .. } => {
@@ -152,12 +151,12 @@ fn field_of_view(beams: &Beams) -> [f32; 2] {
     }
 }
 
-/// Keys of a model that stand beside the sensor's own, not in its `settings`.
+/// Returns whether a key of a model is set next to `settings` instead of in it.
 fn is_common(field: &str) -> bool {
     matches!(field, "rate_hz" | "min_range_m" | "max_range_m")
 }
 
-/// Returns the model with what the configuration has of it.
+/// Returns the model with the changes of the configuration.
 fn changed<M: Serialize + DeserializeOwned>(
     model: &M,
     config: &SensorConfig,
@@ -173,7 +172,7 @@ fn changed<M: Serialize + DeserializeOwned>(
     };
     if let Some((name, value)) = settings.iter().find(|(name, _)| is_common(name)) {
         let advice =
-            format!("stands beside `settings`: give {name} = {value} of the sensor itself");
+            format!("belongs next to `settings`: set {name} = {value} of the sensor itself");
         return Err(invalid(key(&format!("settings.{name}")), value, advice));
     }
     keys.extend(settings);
@@ -191,7 +190,7 @@ fn changed<M: Serialize + DeserializeOwned>(
         .map_err(|error| invalid(key("settings"), &config.settings, error.to_string()))
 }
 
-/// Faster than any of them, and than a plugin gets images. [Hz]
+/// Maximum rate: higher than of any real sensor, and of the images for a plugin. [Hz]
 const MAX_HZ: f64 = 200.0;
 
 #[cfg(test)]
@@ -215,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn every_named_model_is_a_sensor() {
+    fn every_preset_is_a_valid_sensor() {
         for (name, ..) in vizflyt_splat::sensor::presets::PRESETS {
             let found = model(name, |_| {}).unwrap();
             let info = found.info(&SensorConfig::ahead("x", name, DVec3::ZERO));
@@ -225,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_file_says_goes_before_the_data_sheet() {
+    fn settings_override_the_data_sheet() {
         let found = model("tfmini", |config| {
             (config.rate_hz, config.max_range_m) = (Some(20.0), Some(6.0));
             set("sigma_m", 0.0)(config);
@@ -237,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named_with_key_and_advice() {
+    fn errors_name_the_key_with_advice() {
         let check = |found: Result<SensorModel, String>, expected: &str| {
             let error = found.unwrap_err();
             assert!(error.contains(expected), "'{error}' lacks '{expected}'");
@@ -246,7 +245,7 @@ mod tests {
         check(model("tfmini2", |_| {}), "os1-16");
         check(model("tfmini", set("gamma", 1.0)), "unknown field `gamma`, expected one of");
         check(model("tfmini", set("sigma_m", "much")), "sensors[0].settings");
-        check(model("tfmini", set("rate_hz", 5.0)), "stands beside `settings`");
+        check(model("tfmini", set("rate_hz", 5.0)), "belongs next to `settings`");
         check(model("tfmini", set("sigma_m", -1.0)), "sensors[0].settings.sigma_m = -1");
         check(model("tfmini", |config| config.max_range_m = Some(0.1)), "sensors[0].max_range_m");
     }

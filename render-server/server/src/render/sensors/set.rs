@@ -1,4 +1,4 @@
-//! The vehicle's sensors as they are at this moment; changed through the page and the API, as cameras are.
+//! Current sensors of a vehicle; like cameras, they can be changed with the page and the API.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,22 +12,21 @@ use vizflyt_protocol::sensor::{MAX_SENSORS, ReadingHeader, SensorInfo};
 use super::model::SensorModel;
 use crate::render::cameras::ChangeError;
 
-/// All sensors at one moment, in the order of their index on the wire.
+/// All sensors of a vehicle, in the order of their index in the protocol.
 #[derive(Clone, Debug, Default)]
 pub struct SensorSet {
-    /// As `arena.toml` has them.
+    /// Settings as in `arena.toml`.
     pub configs: Vec<SensorConfig>,
-    /// Their models.
     pub models: Vec<SensorModel>,
-    /// As the runtime receives them.
+    /// Data sent to the runtime.
     pub infos: Vec<SensorInfo>,
 }
 
 impl SensorSet {
-    /// Prepares sensors; at most [`MAX_SENSORS`].
+    /// Creates the models of sensors; at most [`MAX_SENSORS`].
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for the first whose model cannot be.
+    /// [`ConfigError::Invalid`] for the first invalid model.
     pub fn new(configs: &[SensorConfig]) -> Result<Self, ConfigError> {
         let configs = configs[..configs.len().min(MAX_SENSORS)].to_vec();
         let mut set = Self { configs, ..Self::default() };
@@ -40,39 +39,38 @@ impl SensorSet {
     }
 }
 
-/// A reading as it goes to the network.
+/// Reading as sent over the network.
 #[derive(Clone, Debug)]
 pub struct MadeReading {
-    /// Whose it is, when and from where it was made.
+    /// Sensor, time and pose of the reading.
     pub header: ReadingHeader,
-    /// Header and records, as they go over the wire.
+    /// Header and records as in the protocol.
     pub bytes: Bytes,
 }
 
 impl MadeReading {
-    /// Returns its records.
     pub fn records(&self) -> &[u8] {
         &self.bytes[ReadingHeader::SIZE..]
     }
 }
 
-/// What became of a sensor's readings.
+/// Counters of a sensor's readings.
 #[derive(Debug, Default)]
 pub struct SensorCounters {
     /// Readings made.
     pub made: AtomicU64,
     /// Readings that the runtime acknowledged.
     pub sent: AtomicU64,
-    /// Readings given up on their way to the runtime.
+    /// Readings dropped on their way to the runtime.
     pub late: AtomicU64,
 }
 
-/// A vehicle's sensors and their newest readings, shared by all threads.
+/// Sensors of a vehicle with their newest readings, shared by all threads.
 #[derive(Debug)]
 pub struct Sensors {
     set: watch::Sender<Arc<SensorSet>>,
     newest: [watch::Sender<Option<Arc<MadeReading>>>; MAX_SENSORS],
-    /// What became of each sensor's readings.
+    /// Counters by sensor.
     pub counters: [SensorCounters; MAX_SENSORS],
 }
 
@@ -83,7 +81,7 @@ impl Default for Sensors {
 }
 
 impl Sensors {
-    /// Makes the sensors as the arena has them.
+    /// Creates the sensors of an arena.
     pub fn new(set: SensorSet) -> Self {
         Self {
             set: watch::Sender::new(Arc::new(set)),
@@ -92,22 +90,22 @@ impl Sensors {
         }
     }
 
-    /// Returns the sensors of this moment.
+    /// Returns the current sensors.
     pub fn newest(&self) -> Arc<SensorSet> {
         self.set.borrow().clone()
     }
 
-    /// Returns a receiver of every change from now on.
+    /// Returns a receiver of every later change.
     pub fn subscribe(&self) -> watch::Receiver<Arc<SensorSet>> {
         self.set.subscribe()
     }
 
-    /// Returns a receiver of the newest reading of a sensor; `None` if there is none of this index.
+    /// Returns a receiver of the newest reading of a sensor; `None` if the sensor does not exist.
     pub fn readings(&self, index: usize) -> Option<watch::Receiver<Option<Arc<MadeReading>>>> {
         self.newest.get(index).map(watch::Sender::subscribe)
     }
 
-    /// Puts a reading in the place of the one before.
+    /// Publishes a reading in place of the last one.
     pub fn publish(&self, reading: MadeReading) {
         let index = usize::from(reading.header.sensor);
         if let Some(newest) = self.newest.get(index) {
@@ -116,15 +114,15 @@ impl Sensors {
         }
     }
 
-    /// Changes the keys in `json` of the sensor `name`, null removing a key (RFC 7396, JSON merge patch). Its name, and
-    /// the kind of its model, stay.
+    /// Changes the keys in `json` of the sensor `name`; null removes a key (RFC 7396, JSON merge patch). Its
+    /// name and the kind of its model cannot change.
     ///
     /// # Errors
-    /// [`ChangeError`]; nothing is changed then.
+    /// [`ChangeError`]; the sensors stay unchanged.
     pub fn patch(&self, name: &str, json: &[u8]) -> Result<SensorConfig, ChangeError> {
         let patch: Map<String, Value> = serde_json::from_slice(json)?;
         let mut result = None;
-        // Under the lock, so that two changes at once do not undo each other.
+        // Under the lock, so that two concurrent changes do not overwrite each other.
         self.set.send_if_modified(|set| {
             let changed = changed(set, name, patch);
             let modified =
@@ -187,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_changes_rate_range_and_whether_it_measures() {
+    fn patches_change_rate_range_and_enabled() {
         let sensors = sensors();
         let mut watcher = sensors.subscribe();
         let json = br#"{"rate_hz": 5, "max_range_m": 20, "enabled": false}"#;
@@ -197,18 +195,18 @@ mod tests {
         let info = &set.infos[0];
         assert_eq!((info.rate_hz, info.max_range_m, info.enabled), (5.0, 20.0, false));
         assert_eq!(set.models[0].rate_hz(), 5.0);
-        // The same again is no change; null takes a key back to the model's.
+        // An identical patch is not a change; null resets a key to the model's value.
         sensors.patch("top", json).unwrap();
         assert!(!watcher.has_changed().unwrap());
         sensors.patch("top", br#"{"rate_hz": null}"#).unwrap();
         assert_eq!(sensors.newest().infos[0].rate_hz, 10.0);
-        // Another model of the same kind will do.
+        // Another model of the same kind is valid.
         sensors.patch("down", br#"{"model": "lidar-lite-v3"}"#).unwrap();
         assert_eq!(sensors.newest().infos[1].max_range_m, 40.0);
     }
 
     #[test]
-    fn mistakes_are_named_and_change_nothing() {
+    fn reports_errors_and_changes_nothing() {
         let sensors = sensors();
         let before = sensors.newest();
         let refused = |name: &str, json: &str, expected: &str| {

@@ -1,6 +1,7 @@
-//! The sensors' thread: newest motions in, newest readings out, by each sensor's rate.
+//! Thread of the sensors: newest motions in, newest readings out, at each sensor's rate.
 //!
-//! A plain thread of its own with one core at most: images come first. What it does not get done in time is left out.
+//! A separate thread with at most one core: images have priority. Readings that it cannot make in time are
+//! skipped.
 
 use std::thread::sleep;
 use std::time::Duration;
@@ -16,10 +17,10 @@ use crate::render::inputs::Inputs;
 use crate::render::schedule::Exposure;
 use crate::stop::Stop;
 
-/// How long a stop, or somebody who wants readings, may go unnoticed.
+/// Maximum delay until a stop, or new demand, is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);
 
-/// Measures until the server stops: what is due of the vehicles that someone wants images of.
+/// Measures until the server stops: the due sensors of all vehicles with demand for images.
 pub fn run<D: Demand + Sync>(inputs: Inputs<'_, D>, scene: &SensorScene, stop: &Stop) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let pool = match pool {
@@ -53,7 +54,7 @@ pub fn run<D: Demand + Sync>(inputs: Inputs<'_, D>, scene: &SensorScene, stop: &
     }
 }
 
-/// Measures what is due of one vehicle.
+/// Measures with the due sensors of one vehicle.
 fn measure<D: Demand + Sync>(
     Inputs { rendering, localization, demand, .. }: Inputs<'_, D>,
     scene: &SensorScene,
@@ -81,5 +82,5 @@ fn measure<D: Demand + Sync>(
     }
 }
 
-/// Between two looks at what is due: while no pose has come, a sensor stays due. [ns]
+/// Minimum sleep: without a pose, a sensor stays due. [ns]
 const SHORTEST_NS: u64 = 1_000_000;

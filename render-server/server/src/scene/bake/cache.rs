@@ -1,9 +1,9 @@
-//! Baked obstacles, kept by what they were baked from.
+//! Cache of baked obstacles, by a hash of their inputs.
 //!
-//! A file's name is the hash of the splats' geometry and of how they are baked, so a scene or a
-//! setting that changed is another file. It begins with a checksum: what does not match, or does
-//! not read, is baked anew and replaced. Files come whole (written aside, then renamed); the ones
-//! used longest ago go when the folder grows over [`MAX_BYTES`].
+//! A file's name is the hash of the splats' geometry and of the bake's settings, so a changed scene or setting
+//! gives another file. A file begins with a checksum: if it does not match, or the file cannot be parsed, the
+//! obstacles are baked again, and the file is replaced. Files are written to a temporary name, then renamed.
+//! The least recently used ones are deleted when the folder exceeds [`MAX_BYTES`].
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -16,27 +16,27 @@ use vizflyt_splat::Splats;
 
 use super::super::seen::Seen;
 
-/// A folder of baked obstacles.
+/// Folder of baked obstacles.
 #[derive(Clone, Debug)]
 pub struct BakeCache {
     folder: PathBuf,
 }
 
-/// The identity of a bake.
+/// Hash of a bake's inputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BakeKey([u8; SHA256_OUTPUT_LEN]);
 
-/// The cache's entry of a key.
+/// Cache entry of a key.
 #[derive(Debug)]
 pub(super) enum CachedField {
     Field(DistanceField),
     Nothing,
-    /// Why the file is no good.
+    /// Why the file is invalid.
     Broken(String),
 }
 
 impl BakeKey {
-    /// Returns the key of a scene baked like this.
+    /// Returns the key of a bake.
     pub fn of(splats: &Splats, spec: &BakeSpec, seen: Option<&Seen>) -> Self {
         let mut hash = Context::new(&SHA256);
         hash.update(BAKER);
@@ -58,7 +58,7 @@ impl BakeKey {
                 hash.update(&number.to_le_bytes());
             }
         }
-        // A block of splats at a time: a call for each costs more than the hash.
+        // Hashes a block of splats at a time: a call for each splat would cost more than the hash.
         let mut block = Vec::with_capacity(SPLATS_AT_ONCE * SPLAT_BYTES);
         for first in (0..splats.len()).step_by(SPLATS_AT_ONCE) {
             block.clear();
@@ -82,13 +82,12 @@ impl BakeKey {
 }
 
 impl BakeCache {
-    /// Keeps files in a folder, which is made when there is something to keep.
+    /// Stores files in a folder, which is created at the first write.
     pub fn at(folder: impl Into<PathBuf>) -> Self {
         Self { folder: folder.into() }
     }
 
-    /// Keeps files in `$XDG_CACHE_HOME/vizflyt/obstacles`, or under `~/.cache`; `None` if neither is
-    /// known.
+    /// Stores files in `$XDG_CACHE_HOME/vizflyt/obstacles`, or under `~/.cache`; `None` if neither is known.
     pub fn of_user() -> Option<Self> {
         let path =
             |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
@@ -96,15 +95,15 @@ impl BakeCache {
         Some(Self::at(caches.join("vizflyt/obstacles")))
     }
 
-    /// Returns where the bake of a key lies, if it is kept.
+    /// Returns the path of a bake, whether or not it exists.
     pub fn path(&self, key: &BakeKey) -> PathBuf {
         self.folder.join(key.name())
     }
 
-    /// Throws away the bake of a scene, so that the next one is done anew.
+    /// Deletes the bake of a scene, so that it is baked again.
     ///
     /// # Errors
-    /// A file that is there and cannot be removed.
+    /// An existing file cannot be removed.
     pub fn forget(&self, splats: &Splats, spec: &BakeSpec, seen: Option<&Seen>) -> io::Result<()> {
         match fs::remove_file(self.path(&BakeKey::of(splats, spec, seen))) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
@@ -121,7 +120,7 @@ impl BakeCache {
         };
         match parse(&bytes) {
             Ok(field) => {
-                // What was used last is thrown away last; a clock that cannot be set costs a bake.
+                // Marks the file as recently used; if this fails, it may be deleted earlier.
                 let _ = File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
                 CachedField::Field(field)
             }
@@ -129,7 +128,7 @@ impl BakeCache {
         }
     }
 
-    /// Keeps a bake; returns where.
+    /// Stores a bake; returns its path.
     pub(super) fn write(&self, key: &BakeKey, field: &DistanceField) -> io::Result<PathBuf> {
         fs::create_dir_all(&self.folder)?;
         let path = self.path(key);
@@ -150,7 +149,7 @@ impl BakeCache {
         Ok(path)
     }
 
-    /// Throws away what was used longest ago while there is too much, but not `newest`.
+    /// Deletes the least recently used files above the limit, except `newest`.
     fn shrink(&self, newest: &Path) {
         let Ok(entries) = fs::read_dir(&self.folder) else { return };
         let mut files: Vec<_> = entries
@@ -173,10 +172,10 @@ impl BakeCache {
     }
 }
 
-/// Reads a file of the cache: a checksum, then the field.
+/// Parses a file of the cache: a checksum, then the field.
 ///
 /// # Errors
-/// Why it is no good.
+/// Why it is invalid.
 pub fn parse(bytes: &[u8]) -> Result<DistanceField, String> {
     let (sum, field) = bytes
         .split_first_chunk::<SHA256_OUTPUT_LEN>()
@@ -201,11 +200,11 @@ fn digest(hash: Context) -> [u8; SHA256_OUTPUT_LEN] {
     bytes
 }
 
-/// Names the baker: raise the number with any change of what is baked from the same splats.
+/// Version of the baker: increase it with any change of the result for the same splats.
 const BAKER: &[u8] = b"vizflyt obstacles 1";
 const EXTENSION: &str = "field";
-/// Splats hashed at once, and the bytes of one.
+/// Splats hashed at once, and bytes per splat.
 const SPLATS_AT_ONCE: usize = 4096;
 const SPLAT_BYTES: usize = 44;
-/// A forest is 24 MB. [bytes]
+/// Maximum size of the folder; a forest takes 24 MB. [bytes]
 const MAX_BYTES: u64 = 1 << 30;

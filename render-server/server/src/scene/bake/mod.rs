@@ -1,4 +1,4 @@
-//! Obstacles for the referee, from the splats; kept for the next start.
+//! Obstacles for the referee, baked from the splats and cached for the next start.
 
 mod cache;
 #[cfg(test)]
@@ -17,21 +17,20 @@ use super::seen::Seen;
 use cache::CachedField;
 pub use cache::{BakeCache, BakeKey, parse as parse_kept};
 
-/// Obstacles, and how they came about.
+/// Result of a bake.
 #[derive(Debug)]
 pub struct Baked {
-    /// The obstacles.
     pub field: DistanceField,
-    /// What the baker did; `None` if they were kept from an earlier bake.
+    /// Statistics of the baker; `None` if the obstacles came from the cache.
     pub counts: Option<BakeCounts>,
-    /// Where they are kept now.
+    /// Path in the cache.
     pub kept_at: Option<PathBuf>,
-    /// How long it took.
+    /// Duration of the bake.
     pub took: Duration,
 }
 
-/// Returns the obstacles of a scene as its arena asks: those kept by an earlier start, else baked
-/// and kept. What is not `seen`, if that is given, is solid.
+/// Returns the obstacles of a scene with the settings of its arena, from the cache or newly baked. If `seen` is
+/// given, all other space is solid.
 pub fn bake(splats: &Splats, arena: &ArenaConfig, seen: Option<&Seen>) -> DistanceField {
     let spec = BakeSpec::of(arena);
     info!("baking obstacles: {} splats into {} voxels", splats.len(), spec.grid.voxels());
@@ -53,8 +52,8 @@ pub fn bake(splats: &Splats, arena: &ArenaConfig, seen: Option<&Seen>) -> Distan
     baked.field
 }
 
-/// Returns the obstacles of splats: from `cache`, else baked and put there. What is not `seen`, if that is given, is
-/// solid. `progress` receives the share that is done, 0 to 1, from any thread.
+/// Returns the obstacles of splats, from `cache` or newly baked and stored. If `seen` is given, all other space
+/// is solid. `progress` receives the completed share, 0 to 1, from any thread.
 pub fn bake_with(
     splats: &Splats,
     spec: &BakeSpec,
@@ -73,7 +72,10 @@ pub fn bake_with(
             }
             CachedField::Nothing => {}
             CachedField::Broken(why) => {
-                warn!("{} is no good and is baked anew: {why}", cache.path(key).display());
+                warn!(
+                    "{} is invalid, so the obstacles are baked again: {why}",
+                    cache.path(key).display()
+                );
             }
         }
     }
@@ -91,7 +93,7 @@ pub fn bake_with(
     let kept_at = key.and_then(|(cache, key)| match cache.write(&key, &field) {
         Ok(path) => Some(path),
         Err(error) => {
-            warn!("the baked obstacles are not kept: {}: {error}", cache.path(&key).display());
+            warn!("cannot store the baked obstacles: {}: {error}", cache.path(&key).display());
             None
         }
     });
@@ -99,5 +101,5 @@ pub fn bake_with(
     Baked { field, counts, kept_at, took: start.elapsed() }
 }
 
-/// Part of the work that the grid is; the rest is distances.
+/// Share of the grid in the work; the rest is the distance transform.
 const GRID_SHARE: f64 = 0.7;

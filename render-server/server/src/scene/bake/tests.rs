@@ -23,7 +23,7 @@ fn scene(opacity: f32) -> (Splats, BakeSpec) {
 }
 
 #[test]
-fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
+fn a_bake_is_cached_by_its_inputs_and_read_back() {
     let folder = tempfile::tempdir().unwrap();
     let cache = BakeCache::at(folder.path().join("a/b"));
     let (splats, spec) = scene(0.9);
@@ -41,7 +41,7 @@ fn a_bake_is_kept_by_what_it_was_baked_from_and_comes_back_whole() {
     let again = bake_with(&splats, &spec, None, Some(&cache), &|_| ());
     assert_eq!((again.counts, &again.field), (None, &first.field));
     assert_eq!(again.kept_at, first.kept_at);
-    // Another scene, and another way of baking, are other files.
+    // Another scene, and other settings, are other files.
     let (fainter, _) = scene(0.8);
     assert_ne!(BakeKey::of(&fainter, &spec, None), BakeKey::of(&splats, &spec, None));
     let coarse = BakeSpec { min_opacity: 0.4, ..spec };
@@ -73,7 +73,7 @@ fn damaged_cache_file_is_baked_again() {
 }
 
 #[test]
-fn without_a_place_to_keep_it_it_is_baked_all_the_same() {
+fn bakes_without_a_usable_cache() {
     let (splats, spec) = scene(0.9);
     let bare = bake_with(&splats, &spec, None, None, &|_| ());
     assert!(bare.kept_at.is_none() && bare.counts.is_some());

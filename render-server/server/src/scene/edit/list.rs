@@ -13,63 +13,61 @@
 //! cell = 0.25
 //! least = 50
 //! ```
-//! Lengths are in the unit that the scene has when it is the step's turn.
+//! Lengths are in the unit of the scene at the time of the step.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_splat::edit::{EditStep, InvalidStep};
 use vizflyt_toml::TomlErrors;
 
-/// What is in the file.
+/// Contents of the file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EditList {
-    /// What is edited.
+    /// Edited scene.
     pub scene: OriginalScene,
-    /// In order.
+    /// Steps in order.
     #[serde(default)]
     pub steps: Vec<DoneStep>,
 }
 
-/// The scene that a list is about.
+/// Scene of a list of edits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OriginalScene {
-    /// Its file's name, in the folder of the list.
+    /// Name of its file, in the folder of the list.
     pub file: String,
-    /// Of the file's bytes, in hexadecimal.
+    /// SHA-256 of the file, in hexadecimal.
     pub sha256: String,
-    /// How many splats it has.
+    /// Number of its splats.
     pub splats: usize,
 }
 
-/// A step, and what it did.
+/// Step with its effect.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DoneStep {
-    /// How many splats it took away.
+    /// Number of splats removed.
     pub taken: usize,
-    /// The step.
     pub edit: EditStep,
 }
 
-/// Why a text is no list.
+/// Why a text is not a valid list.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EditListError {
-    /// Lines, keys or types.
+    /// Invalid lines, keys or types.
     #[error(transparent)]
     Toml(#[from] TomlErrors),
-    /// A step's numbers.
+    /// Invalid numbers of a step.
     #[error("step {number}: {cause}")]
     Step {
-        /// From 1.
+        /// Number of the step, from 1.
         number: usize,
-        /// What is wrong.
         cause: InvalidStep,
     },
-    /// No hash.
-    #[error("scene.sha256 = \"{0}\": 64 hexadecimal digits are wanted")]
+    /// Invalid hash.
+    #[error("scene.sha256 = \"{0}\": give 64 hexadecimal digits")]
     Hash(String),
-    /// More than anybody edits.
+    /// Limits exceeded.
     #[error(
         "it is too long: at most {} bytes and {} steps are read",
         EditList::MAX_BYTES,
@@ -79,20 +77,20 @@ pub enum EditListError {
 }
 
 impl EditList {
-    /// The longest file: lassos of hundred corners, thousand of them.
+    /// Maximum size of the file: a thousand lassos of a hundred corners.
     pub const MAX_BYTES: u64 = 16 << 20;
-    /// The most steps.
+    /// Maximum number of steps.
     pub const MAX_STEPS: usize = 1000;
 
-    /// Returns the list of a scene that nobody has edited.
+    /// Creates the empty list of a scene.
     pub fn new(file: String, sha256: String, splats: usize) -> Self {
         Self { scene: OriginalScene { file, sha256, splats }, steps: Vec::new() }
     }
 
-    /// Reads a file's text.
+    /// Parses a list.
     ///
     /// # Errors
-    /// What is wrong with it, and where.
+    /// The error and its position.
     pub fn parse(text: &str) -> Result<Self, EditListError> {
         if text.len() as u64 > Self::MAX_BYTES {
             return Err(EditListError::TooLong);
@@ -114,11 +112,11 @@ impl EditList {
 
     /// Returns the file's text.
     pub fn to_toml(&self) -> String {
-        // A comment holds no control characters; a name may.
+        // A comment must not contain control characters, but a name may.
         let file = self.scene.file.replace(char::is_control, " ");
         let head =
             format!("# Edits of {file}: vizflyt scene edit {file} --list, --undo, --apply\n\n");
-        // Strings, finite numbers and tables of a known shape: TOML holds them all.
+        // Strings, finite numbers and tables of a known shape are always valid TOML.
         head + &toml::to_string(self).unwrap_or_default()
     }
 }

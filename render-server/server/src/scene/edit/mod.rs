@@ -1,10 +1,11 @@
-//! A scene under edit: the original, which nobody overwrites, and a list of steps beside it.
+//! Editing of a scene: the original is never changed; a list of steps is stored next to it.
 //!
 //! ```text
 //! room.ply ------------ read, hashed --> Splats --> steps in order --> room.edited.ply, or any other file
 //! room.ply.edits.toml - EditList ----------------/
 //! ```
-//! The list names its original by hash, so the result can be made again from the two, and a step be taken back.
+//! The list identifies its original by hash, so that the result can be reproduced from the two, and a step can
+//! be undone.
 
 mod list;
 
@@ -20,7 +21,7 @@ use vizflyt_splat::Splats;
 use vizflyt_splat::edit::EditStep;
 use vizflyt_splat::format::{self, Format};
 
-/// A scene with its steps applied.
+/// Scene with its steps applied.
 #[derive(Debug)]
 pub struct Editor {
     original: PathBuf,
@@ -29,18 +30,18 @@ pub struct Editor {
 }
 
 impl Editor {
-    /// Reads a scene file and the list beside it, if there is one, and applies its steps.
+    /// Reads a scene file and the list next to it, if there is one, and applies its steps.
     ///
     /// # Errors
-    /// What cannot be read; a list of another file; a step that no longer works.
+    /// Files that cannot be read; a list of another file; a step that no longer works.
     pub fn open(original: &Path) -> Result<Self> {
         Self::open_without_last(original, 0)
     }
 
-    /// As [`Self::open`], with the last `steps` taken back.
+    /// Opens like [`Self::open`], with the last `steps` undone.
     ///
     /// # Errors
-    /// As [`Self::open`]; there are not as many steps.
+    /// As [`Self::open`]; or there are fewer steps.
     pub fn open_without_last(original: &Path, steps: usize) -> Result<Self> {
         let (mut splats, sha256) = read_with_hash(original)?;
         let mut list = match read_list(original)? {
@@ -48,8 +49,8 @@ impl Editor {
                 let path = list_path(original);
                 ensure!(
                     list.scene.sha256 == sha256,
-                    "{} is not the file that {} lists edits of: its SHA-256 is {sha256}, and {} is wanted; put the \
-                     original back, or remove the list to begin anew",
+                    "{} is not the file that {} lists edits of: its SHA-256 is {sha256}, expected is {}; put the \
+                     original back, or remove the list to start again",
                     original.display(),
                     path.display(),
                     list.scene.sha256
@@ -78,25 +79,25 @@ impl Editor {
         Ok(Self { original: original.to_owned(), list, splats })
     }
 
-    /// Returns the scene as the steps leave it, in the file's own axes and units.
+    /// Returns the scene after all steps, in the axes and units of the file.
     pub fn splats(&self) -> &Splats {
         &self.splats
     }
 
-    /// Returns the steps so far.
+    /// Returns all steps.
     pub fn steps(&self) -> &[DoneStep] {
         &self.list.steps
     }
 
-    /// Returns the scene's file.
+    /// Returns the path of the original.
     pub fn original(&self) -> &Path {
         &self.original
     }
 
-    /// Applies a step; returns how many splats it took away.
+    /// Applies a step; returns the number of removed splats.
     ///
     /// # Errors
-    /// Why not; then nothing has changed.
+    /// Why it is not possible; then nothing has changed.
     pub fn apply(&mut self, step: EditStep) -> Result<usize> {
         ensure!(
             self.list.steps.len() < EditList::MAX_STEPS,
@@ -108,16 +109,16 @@ impl Editor {
         Ok(taken)
     }
 
-    /// Takes the last step back, by reading the original again.
+    /// Undoes the last step, by reading the original again.
     ///
     /// # Errors
-    /// There is none; the original cannot be read any more.
+    /// No step exists, or the original cannot be read any more.
     pub fn undo(&mut self) -> Result<EditStep> {
         let last = self.list.steps.len().checked_sub(1).context("there is nothing to undo")?;
         let (mut splats, sha256) = read_with_hash(&self.original)?;
         ensure!(
             sha256 == self.list.scene.sha256,
-            "{} has been changed meanwhile",
+            "{} has been changed since it was opened",
             self.original.display()
         );
         for done in &self.list.steps[..last] {
@@ -127,10 +128,10 @@ impl Editor {
         Ok(self.list.steps.remove(last).edit)
     }
 
-    /// Writes the scene in the format of the file's name, and the list beside the original.
+    /// Writes the scene in the format of the file's name, and the list next to the original.
     ///
     /// # Errors
-    /// What cannot be written; the original itself.
+    /// A file that cannot be written, or the original itself.
     pub fn save(&self, to: &Path) -> Result<()> {
         let is_original = match (to.canonicalize(), self.original.canonicalize()) {
             (Ok(to), Ok(original)) => to == original,
@@ -141,7 +142,7 @@ impl Editor {
             "{} is the original, which stays as it is; give another file (-o)",
             to.display()
         );
-        // First, for it is what cannot be made again.
+        // The list first, because it cannot be reproduced.
         let path = list_path(&self.original);
         replace(&path, &self.list.to_toml())
             .with_context(|| format!("cannot write {}", path.display()))?;
@@ -149,12 +150,12 @@ impl Editor {
     }
 }
 
-/// Returns where the list of a scene's edits is: beside it, by its full name.
+/// Returns the path of a scene's list: next to it, with its full name.
 pub fn list_path(original: &Path) -> PathBuf {
     original.with_file_name(format!("{}.edits.toml", file_name(original)))
 }
 
-/// Returns where the edited scene goes if nobody says: beside the original, in its format where that is written.
+/// Returns the default path of the edited scene: next to the original, in its format if that can be written.
 pub fn result_path(original: &Path) -> PathBuf {
     let name = file_name(original);
     let format = Format::of_name(original);
@@ -163,10 +164,10 @@ pub fn result_path(original: &Path) -> PathBuf {
     original.with_file_name(format!("{stem}.edited.{extension}"))
 }
 
-/// Reads the list beside a scene, if there is one.
+/// Reads the list next to a scene, if there is one.
 ///
 /// # Errors
-/// A list that cannot be read, or is wrong, or names another file.
+/// A list that cannot be read, is invalid, or belongs to another file.
 pub fn read_list(original: &Path) -> Result<Option<EditList>> {
     let path = list_path(original);
     let cannot = || format!("cannot read {}", path.display());
@@ -188,7 +189,7 @@ pub(super) fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// Reads a scene file, and hashes it at the same time.
+/// Reads and hashes a scene file.
 fn read_with_hash(path: &Path) -> Result<(Splats, String)> {
     ensure!(
         !path.is_dir()
@@ -210,7 +211,7 @@ fn read_with_hash(path: &Path) -> Result<(Splats, String)> {
 }
 
 fn hash(path: &Path) -> std::io::Result<String> {
-    // A pipe would wait for its writer, and be empty the second time.
+    // A pipe would block, and be empty at the second read.
     if !std::fs::metadata(path)?.is_file() {
         return Err(std::io::Error::new(ErrorKind::InvalidInput, "not a regular file"));
     }
@@ -225,7 +226,7 @@ fn hash(path: &Path) -> std::io::Result<String> {
     }
 }
 
-/// Writes beside its place and then renames, so that a list is whole or the one before.
+/// Writes to a temporary file and renames it, so that the list is always complete.
 pub(super) fn replace(path: &Path, text: &str) -> std::io::Result<()> {
     let partial = path.with_extension("toml.part");
     let mut file = File::create(&partial)?;

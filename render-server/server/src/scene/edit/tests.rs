@@ -1,4 +1,4 @@
-//! Lists of edits, and scenes edited by them.
+//! Lists of edits, and scenes edited with them.
 
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
@@ -24,7 +24,7 @@ fn box_to(x: f64) -> Vec<Region> {
 }
 
 #[test]
-fn edits_are_applied_listed_and_taken_back() {
+fn edits_are_applied_listed_and_undone() {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("row.ply");
     ply::write(&scene, &row(100)).unwrap();
@@ -40,7 +40,7 @@ fn edits_are_applied_listed_and_taken_back() {
     let edited = std::fs::read(&result).unwrap();
     assert_eq!(format::read(&result).unwrap().splats.len(), 40);
 
-    // From the original and the list, the same again.
+    // Original and list give the same result again.
     std::fs::remove_file(&result).unwrap();
     let again = Editor::open(&scene).unwrap();
     let taken: Vec<usize> = again.steps().iter().map(|step| step.taken).collect();
@@ -62,7 +62,7 @@ fn edits_are_applied_listed_and_taken_back() {
 }
 
 #[test]
-fn a_list_is_of_one_file() {
+fn a_list_belongs_to_one_file() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let check = |path: &Path, expected: &str| {
@@ -75,7 +75,7 @@ fn a_list_is_of_one_file() {
     editor.save(&at("out.splat")).unwrap();
     ply::write(at("row.ply"), &row(10)).unwrap();
     check(&at("row.ply"), "put the original back");
-    assert!(editor.undo().unwrap_err().to_string().contains("changed meanwhile"));
+    assert!(editor.undo().unwrap_err().to_string().contains("changed since it was opened"));
     ply::write(at("other.ply"), &row(9)).unwrap();
     std::fs::copy(at("row.ply.edits.toml"), at("other.ply.edits.toml")).unwrap();
     check(&at("other.ply"), "lists edits of row.ply");
@@ -98,7 +98,7 @@ fn results_are_named_after_their_originals() {
 }
 
 #[test]
-fn what_is_wrong_in_a_list_is_said() {
+fn names_errors_of_a_list() {
     let scene = format!("[scene]\nfile = \"a.ply\"\nsha256 = \"{}\"\nsplats = 9\n", "0".repeat(64));
     let check = |steps: &str, expected: &str| {
         let error = EditList::parse(&format!("{scene}{steps}")).unwrap_err().to_string();
@@ -144,7 +144,7 @@ fn step() -> impl Strategy<Value = EditStep> {
 }
 
 proptest! {
-    /// What is written is read, to the last bit.
+    /// Written lists are read back exactly.
     #[test]
     fn lists_are_read_as_they_were_written(
         steps in prop::collection::vec((0..99_999usize, step()), 0..9), file in ".{1,12}",
@@ -154,7 +154,7 @@ proptest! {
         prop_assert_eq!(EditList::parse(&list.to_toml()), Ok(list));
     }
 
-    /// Texts with some of a list's words: an error or a list, and no panic.
+    /// Texts with some of a list's words: an error or a list, without a panic.
     #[test]
     fn any_text_is_a_list_or_an_error(text in "(\\[\\[?(scene|steps)\\]\\]?|edit|faint|=|[0-9.]|\n|\\{|\\}){0,40}") {
         let _ = EditList::parse(&text);

@@ -1,7 +1,7 @@
 //! The encode thread: rendered ticks in, image packets out; the ticks then go to the previews.
 //!
-//! Waits for room in the [`Subscriptions`](crate::stream::subscriptions), then takes the newest rendered tick: what was
-//! rendered meanwhile is skipped unencoded. How one image becomes bytes: [`crate::stream::encode::slices`].
+//! It waits for room in the [`Subscriptions`](crate::stream::subscriptions), then takes the newest rendered
+//! tick; older ticks are skipped unencoded. [`crate::stream::encode::slices`] encodes one image.
 
 pub mod slices;
 
@@ -28,7 +28,7 @@ pub fn run(
 ) {
     let mut encoder = SliceEncoder::new(options);
     let mut order: Vec<usize> = Vec::new();
-    // Images of each camera so far, where the link has no room for all.
+    // Image counters by camera, for links that do not have room for all images.
     let mut turns = [[0u32; MAX_CAMERAS]; MAX_VEHICLES];
     while !stop.is_set() {
         let wanted = streaming.subscriptions.wait_for_room(PATIENCE);
@@ -36,11 +36,11 @@ pub fn run(
             continue;
         }
         let Some(tick) = ticks.take(PATIENCE) else { continue };
-        // The newest tick's first: an older image joins what the runtime has begun.
+        // Images of the newest tick first: older images of other cameras follow.
         order.clear();
         order.extend((0..tick.slots.len()).filter(|&index| tick.slots[index].fresh));
         order.sort_by_key(|&index| std::cmp::Reverse(tick.slots[index].seq));
-        // A slow link gets one of so many images; watchers get what the runtime gets.
+        // A slow link gets one of `keep_one_in` images; watchers get the same images as the runtime.
         order.retain(|&index| {
             let slot = &tick.slots[index];
             let turn = &mut turns[slot.vehicle][slot.camera];
@@ -64,7 +64,7 @@ pub fn run(
             match encoder.send(&streaming.subscriptions, slot, together[vehicle]) {
                 Ok(Some((start, end))) => {
                     streaming.encode_durations.add(start, end);
-                    // What only watchers get is not the runtime's.
+                    // Images only for watchers do not count for the runtime.
                     if together[vehicle] >> camera & 1 == 1 {
                         streaming.vehicles[vehicle].images.cameras[camera].count_sent(slot.counted);
                     }
@@ -83,5 +83,5 @@ pub fn run(
     }
 }
 
-/// How long a stop may go unnoticed.
+/// Maximum delay until a stop is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);

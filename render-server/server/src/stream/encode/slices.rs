@@ -1,11 +1,11 @@
-//! One rendered image to bytes, slice by slice: quantise, encode, hand over, while what was handed over
-//! before is on its way already.
+//! Encoder of one rendered image, slice by slice: quantises and encodes a slice while earlier slices are being
+//! sent.
 //!
-//! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms a slice, so
-//! the first bytes leave after a quarter of the image's time. Each slice is quantised just before it
-//! is encoded: it is still in the cache. Its bytes (25 KB) are copied once, from the encoder's
-//! scratch memory into a buffer of the pool; all subscribers share that. In the steady state nothing
-//! of ours is allocated: a buffer is used again when the transport has let go of its last byte.
+//! Budget at 640x480 in four slices: quantise 0.1 ms, encode 0.4 ms a slice, so the first bytes leave after a
+//! quarter of the image's time. Each slice is quantised just before it is encoded, so that it is still in the
+//! cache. Its bytes (25 KB) are copied once, from the encoder's scratch memory into a buffer of the pool, which
+//! all subscribers share. In the steady state this module allocates no memory: a buffer is reused when the
+//! transport has released its last byte.
 
 use anyhow::{Context, Result};
 use bytes::BytesMut;
@@ -20,7 +20,7 @@ use crate::render::rendered::RenderedImage;
 use crate::render::schedule::withholds_depth;
 use crate::stream::subscriptions::{Broadcast, Subscriptions};
 
-/// Turns rendered images into bytes for [`Subscriptions`]; owns the scratch memory.
+/// Encodes rendered images for [`Subscriptions`]; owns the scratch memory.
 #[derive(Debug)]
 pub struct SliceEncoder {
     encoder: Encoder,
@@ -29,13 +29,12 @@ pub struct SliceEncoder {
     depth_mm: Vec<u16>,
     scratch: Vec<u8>,
     buffers: Vec<BytesMut>,
-    /// The largest image so far, and some room. [bytes]
+    /// Size of the largest image so far, with a reserve. [bytes]
     room: usize,
     broadcast: Broadcast,
 }
 
 impl SliceEncoder {
-    /// Makes an encoder.
     pub fn new(options: EncodeOptions) -> Self {
         Self {
             encoder: Encoder::new(options),
@@ -49,17 +48,16 @@ impl SliceEncoder {
         }
     }
 
-    /// Changes what the next image is encoded with.
+    /// Sets the options of the next image.
     pub fn set_options(&mut self, options: EncodeOptions) {
         self.options = options;
     }
 
-    /// Encodes the image of `slot` and hands it over; `together` are the cameras of its vehicle
-    /// that are sent to the runtime with it, as bits. Returns when encoding began and ended; `None`
-    /// if nobody has room.
+    /// Encodes the image of `slot` and passes it on. `together` is a bit set of the vehicle's cameras that are
+    /// sent to the runtime with it. Returns start and end of encoding; `None` if no subscriber has room.
     ///
     /// # Errors
-    /// If the image cannot be encoded; whoever had some of it resets it.
+    /// If the image cannot be encoded; subscribers that received a part of it reset it.
     pub fn send(
         &mut self,
         subscriptions: &Subscriptions,
@@ -93,8 +91,8 @@ impl SliceEncoder {
         result.map(|()| Some((start, end)))
     }
 
-    /// Depth that is `withheld` is sent as "no return" everywhere: for plugins that is an image like
-    /// any other, and it takes no room.
+    /// If the depth is `withheld`, sends "no return" for every pixel. Plugins decode it like any other image,
+    /// and it takes little space.
     fn slices(
         &mut self,
         image: &RgbdImage,
@@ -107,7 +105,8 @@ impl SliceEncoder {
         self.scratch.clear();
         let slices = (width * height / MIN_SLICE_PIXELS).clamp(1, self.options.slices.into());
         self.encoder.set_options(EncodeOptions { slices: slices as u8, ..self.options });
-        // The header leaves with the first slice: alone it would only wake the other end.
+        // The header is sent with the first slice: a packet with only the header would wake the receiver for
+        // nothing.
         let info = self.encoder.start(width, height, parts, &mut self.scratch)?;
         for slice in 0..info.slices {
             let rows = info.slice_rows(slice);
@@ -138,7 +137,7 @@ impl SliceEncoder {
         Ok(())
     }
 
-    /// Returns a buffer that nobody holds any part of, with room for the largest image so far.
+    /// Returns an unused buffer with room for the largest image so far.
     fn buffer(&mut self) -> BytesMut {
         let room = self.room;
         let free = self.buffers.iter_mut().position(|buffer| buffer.try_reclaim(room));
@@ -146,10 +145,10 @@ impl SliceEncoder {
     }
 }
 
-/// A slice is three wake-ups on its way: below a quarter of 640x480 they cost more than the overlap
-/// gains. [px]
+/// Minimum size of a slice. Each slice costs three wake-ups; below a quarter of 640x480 they cost more than the
+/// overlap gains. [px]
 const MIN_SLICE_PIXELS: u32 = 320 * 240;
-/// A small image; larger ones teach the encoder their size. [bytes]
+/// Initial buffer size: a small image. The encoder adapts it to larger images. [bytes]
 const MIN_BUFFER: usize = 64 << 10;
-/// Eight cameras of four vehicles with two images each in flight.
+/// Enough for eight cameras of four vehicles with two images each in flight.
 const MAX_BUFFERS: usize = 64;

@@ -1,27 +1,27 @@
-//! The policy on a simulated bottleneck: converges, rests, returns, and keeps what is pinned.
+//! Rate controller on a simulated bottleneck: convergence, stability, recovery, and pinned properties.
 
 use proptest::prelude::*;
 
 use super::*;
 
-/// A link that carries so much, with images handed over as the subscriptions does: newest wins, at most K
-/// in flight, given up past a deadline.
+/// Simulated link. Images are handed over as the subscriptions do it: newest wins, at most K in flight, dropped
+/// after a deadline.
 struct Bottleneck {
     pace: RateController,
     rtt_s: f64,
     rate_hz: f64,
     full_bytes: f64,
-    /// How this scene's sizes differ from the table's, by level.
+    /// Sizes of this scene relative to the table, by level.
     skew: [f64; 7],
     now_s: f64,
     ticks: u64,
-    /// When the link has sent all it was given. [s]
+    /// Time at which the link has sent all queued bytes. [s]
     busy_s: f64,
-    /// Handed and to be acknowledged at, of what is in flight. [s]
+    /// Images in flight: time handed over, and time of acknowledgement. [s]
     in_flight: VecDeque<(f64, f64, usize)>,
     decide_s: f64,
     changes: Vec<(f64, usize)>,
-    /// Ends of images, and whether they came in time. [s]
+    /// Ends of images, and whether they arrived in time. [s]
     ends: Vec<(f64, bool)>,
     due: Vec<f64>,
 }
@@ -60,7 +60,7 @@ impl Bottleneck {
             self.in_flight.pop_front();
             let delivered = acked <= handed + DEADLINE_S;
             if !delivered {
-                // What was given up no longer takes the link's time.
+                // Dropped images no longer use the link.
                 self.busy_s = self.busy_s.min(self.now_s);
             }
             self.ends.push((end, delivered));
@@ -93,7 +93,7 @@ impl Bottleneck {
                 continue;
             }
             self.due.push(self.now_s);
-            // Enough for the link to be full: what K costs is not judged here.
+            // Enough to fill the link: the cost of K is not tested here.
             let most = 3 + (self.rtt_s * self.rate_hz).ceil() as usize;
             if self.in_flight.len() < most {
                 let bytes = self.full_bytes * level.share * self.skew[self.pace.index()];
@@ -107,7 +107,7 @@ impl Bottleneck {
         }
     }
 
-    /// Returns the share of images due in the last `seconds` that came.
+    /// Returns the share of images due in the last `seconds` that arrived.
     fn share(&self, seconds: f64) -> f64 {
         let since = self.now_s - seconds;
         let came = self.ends.iter().filter(|(at, in_time)| *in_time && *at >= since).count();
@@ -133,8 +133,8 @@ fn quality_goes_first_then_rate_then_size() {
     const FULL_BYTES: f64 = 266e3;
     const RATE_HZ: f64 = 60.0;
     for index in 0..LEVELS.len() {
-        // A link just fast enough for the level of this number, from above and from below; from
-        // above only, where the better level needs so little more that it would be kept.
+        // A link just fast enough for the level of this number, approached from above and from below. Only from
+        // above if the better level needs so little more that it would be kept.
         let load = LEVELS[index].load();
         let close = index > 0 && LEVELS[index - 1].load() * RAISE < 1.05 * load * MAX_LOAD;
         let capacity = if close { 1.02 * load / AIM } else { 1.03 * load / RAISE };
@@ -182,23 +182,23 @@ fn options_are_only_ever_lowered() {
 }
 
 #[test]
-fn changes_have_a_sentence() {
+fn changes_have_a_description() {
     let down = Change { from: 0, to: 2, capacity_bps: 9.6e7 };
     assert_eq!(
         down.text(),
         "the link carries 96 Mbit/s: images lowered to JPEG 4:2:0 quality 80, depth within 0.001 z²"
     );
     let up = Change { from: 1, to: 0, capacity_bps: 9e8 };
-    assert_eq!(up.text(), "the link carries 900 Mbit/s: images raised to as asked for");
+    assert_eq!(up.text(), "the link carries 900 Mbit/s: images raised to the configured quality");
 }
 
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
 
-    /// On a link of any steady speed: settled in 30 s, at most four changes in any later minute,
-    /// and what is sent arrives; and back at the best level within 30 s of the link's return.
+    /// On a link of any constant speed: settles within 30 s, changes at most four times in any later minute,
+    /// and images arrive. Returns to the best level within 30 s after the link recovers.
     #[test]
-    fn rate_control_converges_rests_and_returns(
+    fn rate_control_converges_stays_and_recovers(
         mbit in 6.0..400.0_f64,
         kilobytes in 40.0..400.0_f64,
         rate_hz in 20.0..120.0_f64,
@@ -218,9 +218,9 @@ proptest! {
         prop_assert_eq!(link.pace.index(), 0, "{:?}", link.changes);
     }
 
-    /// What is pinned stays: nothing lower than allowed is ever used.
+    /// Pinned properties stay: no level below the lowest allowed one is ever used.
     #[test]
-    fn pinned_means_pinned(mbit in 1.0..100.0_f64, rate_hz in 20.0..120.0_f64) {
+    fn never_reduces_pinned_properties(mbit in 1.0..100.0_f64, rate_hz in 20.0..120.0_f64) {
         for (adapt, lowest) in
             [(Adaptation::None, 0), (Adaptation::Quality, 3), (Adaptation::Rate, 5), (Adaptation::All, 6)]
         {

@@ -1,4 +1,4 @@
-//! The control stream: framed messages, each way.
+//! Control stream: framed messages in both directions.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use vizflyt_protocol::packet::framing::{Deframer, FramingError, MAX_FRAMED, enco
 
 use super::{END, FOREIGN, SLOW};
 
-/// Why a session ends: the close code and the reason in words.
+/// End of a session: the close code and the reason as text.
 pub(super) type Ending = (VarInt, String);
 
 /// The server's half of the control stream.
@@ -35,12 +35,12 @@ impl Outbound {
     }
 }
 
-/// The other side's half of the control stream.
+/// The client's half of the control stream.
 pub(super) struct Incoming {
     recv: RecvStream,
     deframer: Deframer,
     bytes: [u8; 2048],
-    /// What of `bytes` the deframer has not taken yet.
+    /// Part of `bytes` that the deframer has not consumed yet.
     held: Range<usize>,
 }
 
@@ -70,7 +70,7 @@ impl Incoming {
                     Err(error) => return Err(gone(&error)),
                 }
             }
-            // After `None` the deframer has room for one byte at least.
+            // After `None` the deframer has room for at least one byte.
             self.held.start += self.deframer.push(&self.bytes[self.held.clone()]);
         }
     }
@@ -80,5 +80,5 @@ pub(super) fn gone(error: &dyn std::fmt::Display) -> Ending {
     (END, error.to_string())
 }
 
-/// Maximum time for a runtime's next message where one is due.
+/// Maximum wait for an expected message of a runtime.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);

@@ -1,5 +1,5 @@
-//! The pose feed: sealed datagrams to the guardian of each flight. It goes on when the runtime's connection has
-//! ended, for as long as its guardian asks for it.
+//! Pose feed: sealed datagrams to the guardian of each flight. It continues after the runtime's connection has
+//! ended, while the guardian renews its subscription.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -14,32 +14,32 @@ use crate::clock;
 use crate::stream::Rooms;
 use crate::stream::vehicle::VehicleStream;
 
-/// Poses are looked for this often.
+/// Interval of checks for a new pose.
 const TICK: Duration = Duration::from_millis(5);
-/// At most 50 a second, with room for the jitter of a source. [s]
+/// Minimum time between poses: at most 50 per second, with a margin for the jitter of a source. [s]
 const POSE_EVERY_S: f64 = 0.018;
-/// A subscription is good for so long. [s]
+/// Validity of a subscription. [s]
 const KEPT_S: f64 = 2.0;
 
-/// The guardian that subscribes to one vehicle.
+/// Guardian that subscribes to one vehicle.
 #[derive(Clone, Copy, Debug)]
 struct Subscriber {
     address: SocketAddr,
-    /// Its newest number: what is not newer is a replay.
+    /// Newest sequence number: a lower or equal number is a replay.
     number: u64,
     until: ServerTime,
-    /// The newest pose that it was sent.
+    /// Stamp of the newest pose sent.
     sent: ServerTime,
 }
 
-/// Returns the key of a flight's feed, which both ends derive of the secrets of their connection.
+/// Returns the key of a flight's feed, which both ends derive from the secrets of their connection.
 pub(super) fn key_of(connection: &quinn::Connection) -> Option<FeedKey> {
     let mut key = FeedKey::default();
     connection.export_keying_material(&mut key, FEED_LABEL, b"").ok()?;
     Some(key)
 }
 
-/// Opens the socket: on the port after QUIC's, so that a firewall can name it, or on any.
+/// Opens the socket on the port after QUIC's, so that a firewall rule can name it, or else on any port.
 pub(super) async fn bind(quic: SocketAddr) -> std::io::Result<UdpSocket> {
     let next = SocketAddr::new(quic.ip(), quic.port().wrapping_add(1));
     match UdpSocket::bind(next).await {
@@ -57,7 +57,7 @@ pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
     loop {
         tokio::select! {
             datagram = socket.recv_from(&mut received) => {
-                // An error is of an earlier datagram of ours that found nobody.
+                // The error belongs to an earlier datagram whose destination port was closed.
                 let Ok((len, address)) = datagram else { continue };
                 let keys = rooms.streaming.vehicles.iter().map(VehicleStream::feed_key);
                 subscribe(clock::now(), keys, &mut subscribers, address, &received[..len]);
@@ -87,7 +87,7 @@ pub(super) async fn serve(rooms: &Rooms, socket: UdpSocket) {
     }
 }
 
-/// Takes a datagram; one that no flight's key has sealed is nobody's.
+/// Processes a datagram. Datagrams that were not sealed with a flight's key are ignored.
 fn subscribe(
     now: ServerTime,
     keys: impl Iterator<Item = Option<FeedKey>>,
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_the_flight_s_guardian_subscribes_and_a_replay_moves_nothing() {
+    fn accepts_only_the_flights_guardian_and_rejects_replays() {
         let (ours, theirs) = (SocketAddr::from(([10, 0, 0, 2], 1)), ([10, 0, 0, 9], 1).into());
         let keys = [None, Some([1; 32]), Some([2; 32])];
         let mut subscribers = [None; 3];
@@ -127,7 +127,7 @@ mod tests {
         assert_eq!(take(ours, [2; 32], 5), [None, None, Some((ours, 5))]);
         assert_eq!(take(theirs, [2; 32], 5), [None, None, Some((ours, 5))], "recorded, sent again");
         assert_eq!(take(theirs, [2; 32], 4), [None, None, Some((ours, 5))], "an older one");
-        // Its own next one, from a new port.
+        // The guardian's own next subscription, from a new port.
         let moved = SocketAddr::from(([10, 0, 0, 2], 7));
         assert_eq!(take(moved, [2; 32], 6), [None, None, Some((moved, 6))]);
     }

@@ -1,8 +1,8 @@
-//! A connection from its first byte to its lease: who it is, preambles, `Hello`, and which vehicle,
-//! or why not.
+//! Connection setup, from the first byte to the lease: identity, preambles, `Hello`, and the vehicle, or the
+//! reason for a refusal.
 //!
-//! A client that is not paired receives instructions to pair, before a byte of it is read; one that is paired
-//! learns of no vehicle but those it may use.
+//! A client that is not paired receives instructions to pair before any of its bytes is read. A paired client
+//! learns only of the vehicles that it may use.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ use crate::authorization::Authorizer;
 use crate::flights::control_lease::{ControlLease, WatchLease};
 use crate::stream::Rooms;
 
-/// Speaks with one runtime until either side ends it.
+/// Serves one runtime until either side ends the connection.
 pub(super) async fn run(
     rooms: Rooms,
     authorizer: Arc<Authorizer>,
@@ -36,10 +36,10 @@ pub(super) async fn run(
         ending = talk(&rooms, &authorizer, port, &connection) => ending,
         () = rooms.stop.wait() => (END, "the server ends".to_owned()),
     };
-    // What the other side said on closing tells more than which of our calls failed first.
+    // The close reason of the other side is more informative than the first call that failed here.
     let reason = connection.close_reason().map_or(reason, |error| why(&error));
     info!("{address}: session ends: {reason}");
-    // Why: RFC 9000 lets a reason be of any length, but it must fit a packet.
+    // RFC 9000 does not limit the reason's length, but it must fit into a packet.
     let cut: String = reason.chars().take(200).collect();
     connection.close(code, cut.as_bytes());
 }
@@ -66,7 +66,7 @@ async fn talk(
         Ok(Err(ending)) => return ending,
         Err(_) => return (FOREIGN, "nothing was received for 5 s".to_owned()),
     };
-    // Ours goes out even to another version: its layout never changes, so that both can check it.
+    // The preamble is sent even to another version: its layout never changes, so that both sides can check it.
     if let Err(error) = send.write_all(Preamble::of(PeerRole::Server).as_bytes()).await {
         return gone(&error);
     }
@@ -122,14 +122,14 @@ async fn talk(
     }
 }
 
-/// Returns who is at the other end; TLS has made sure that it holds the key.
+/// Returns the fingerprint of the other end; TLS has verified that it holds the key.
 pub(super) fn peer(connection: &Connection) -> Option<Fingerprint> {
     let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
     chain.first().map(|certificate| Fingerprint::of(certificate))
 }
 
 fn unpaired(connection: &Connection, port: u16) -> String {
-    // The address by which the client reached us, as far as the system reports it.
+    // Address under which the client reached this server, if the system reports it.
     let host = match connection.local_ip().map(|ip| ip.to_canonical()) {
         Some(IpAddr::V6(ip)) => format!("[{ip}]"),
         Some(ip) => ip.to_string(),
@@ -149,7 +149,7 @@ fn permit(client: &Client, vehicle: &str) -> Result<(), String> {
     Err(format!("'{}' may use {} here, not '{vehicle}'", client.name, own.join(", ")))
 }
 
-/// What a client may do.
+/// Rights granted to a session.
 enum Lease {
     Fly(Box<ControlLease>),
     Watch(WatchLease),
@@ -168,7 +168,7 @@ pub(super) fn why(error: &ConnectionError) -> String {
     }
 }
 
-/// Gives the last words time to arrive: closing at once would discard them.
+/// Waits for the last message to arrive: closing at once would discard it.
 pub(super) async fn linger(connection: &Connection, ending: Ending) -> Ending {
     let _ = timeout(Duration::from_secs(2), connection.closed()).await;
     ending

@@ -1,13 +1,13 @@
-//! Images to one subscriber: a stream each, few in flight, reset past a deadline.
+//! Images to one subscriber: one stream per image, few in flight, reset after a deadline.
 //!
-//! In flight means handed to the transport and not yet acknowledged. Measured: resetting an older
-//! stream whenever a newer image is ready starves an overloaded link altogether; waiting for room
-//! with the newest image, and resetting only past [`DEADLINE`], delivers what the link carries.
+//! In flight means handed to the transport and not yet acknowledged. Measurements: resetting an older stream
+//! whenever a newer image is ready starves an overloaded link completely. Waiting for room with the newest
+//! image, and resetting only after [`DEADLINE`], uses the full capacity of the link.
 //!
-//! [`crate::stream::rate_control`] estimates what the link carries from how each image fared.
+//! [`crate::stream::rate_control`] estimates the capacity of the link from the delivery of each image.
 //!
-//! One task per place of the subscriptions, made when the subscriber comes or its K grows: it writes an
-//! image's slices as the encoder makes them, without a copy, and none waits for another camera's.
+//! There is one task per slot of the subscriptions, started when the subscriber connects or its K grows. It
+//! writes an image's slices as the encoder produces them, without a copy, and never waits for another camera.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
@@ -31,26 +31,26 @@ use crate::stream::vehicle::VehicleStream;
 use crate::timing::RateMeter;
 use vizflyt_process::lock;
 
-/// The senders of images to one session; ends its subscription when dropped.
+/// Image senders of one session; ends its subscription when dropped.
 pub(super) struct ImageSenders {
     context: SenderContext,
     places: Slots,
     allowed: u32,
 }
 
-/// What every sender knows.
+/// Context shared by all senders.
 #[derive(Clone)]
 struct SenderContext {
     rooms: Rooms,
     vehicle: usize,
     connection: Connection,
     id: u64,
-    /// The runtime's; a watcher far away has no influence on the flight.
+    /// Only for the runtime: a watcher's link does not affect the flight.
     rate_controller: Option<Arc<Mutex<RateController>>>,
 }
 
 impl ImageSenders {
-    /// Opens the subscriptions of `vehicle` for its session `id`.
+    /// Subscribes session `id` to the images of `vehicle`.
     pub(super) fn open(
         rooms: Rooms,
         vehicle: usize,
@@ -101,7 +101,7 @@ impl ImageSenders {
         }
     }
 
-    /// Starts the senders of the places from `before` to what is allowed, of every camera.
+    /// Starts the senders of slots `before` to `allowed` of every camera.
     fn spawn(&self, senders: &mut JoinSet<()>, before: u32) {
         for (camera, slots) in self.places.iter().enumerate() {
             for (place, image) in slots.iter().enumerate() {
@@ -118,7 +118,7 @@ impl SenderContext {
         &self.rooms.streaming.vehicles[self.vehicle]
     }
 
-    /// Lowers or raises how images are made; `wanted_hz` are rendered, of all cameras.
+    /// Updates the level of the images; `wanted_hz` is the render rate of all cameras in total.
     fn decide(&self, wanted_hz: f64) {
         let Some(rate_controller) = &self.rate_controller else { return };
         let change = lock(rate_controller).decide(clock::now(), wanted_hz);
@@ -136,13 +136,13 @@ impl Drop for ImageSenders {
     }
 }
 
-/// Returns K: one image being acknowledged, and as many as a round trip spans.
+/// Returns K: one image being acknowledged, plus the images of one round trip.
 fn in_flight(min_rtt: Duration, rate_hz: f64) -> u32 {
     let spanned = (min_rtt.as_secs_f64() * rate_hz).ceil();
     1 + (spanned as u32).clamp(1, MAX_IN_FLIGHT - 1)
 }
 
-/// Sends the images that come to one place, for ever.
+/// Sends the images of one slot until the task is aborted.
 async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<InFlightImage>) {
     let SenderContext { rooms, vehicle, connection, id, rate_controller } = &context;
     let streaming = &rooms.streaming;
@@ -152,7 +152,7 @@ async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<In
         let mut sent = Sent { bytes: 0, encode_end: None };
         let delivered = deliver(connection, &image, &header, priority, &mut sent).await;
         let end = clock::now();
-        // Figures are the runtime's.
+        // Statistics count only the runtime's images.
         if let Some(rate_controller) = rate_controller {
             let images = &context.stream().images;
             if delivered {
@@ -165,7 +165,7 @@ async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<In
             }
             lock(rate_controller).landed(&SentImage {
                 bytes: sent.bytes,
-                // The encoder's time is not the link's.
+                // Encoding time does not count for the link.
                 handed: sent.encode_end.unwrap_or(start),
                 ended: end,
                 delivered,
@@ -178,15 +178,15 @@ async fn send(context: SenderContext, camera: usize, place: usize, image: Arc<In
     }
 }
 
-/// How far an image has come.
+/// Progress of an image.
 struct Sent {
-    /// Of its bitstream.
+    /// Bytes of bitstream sent.
     bytes: usize,
-    /// Once it is known.
+    /// Set when encoding has ended.
     encode_end: Option<ServerTime>,
 }
 
-/// Sends an image on a stream of its own; returns whether all was acknowledged in time.
+/// Sends an image on a separate stream. Returns whether all of it was acknowledged in time.
 async fn deliver(
     connection: &Connection,
     image: &InFlightImage,
@@ -230,13 +230,13 @@ async fn write(
     let trailer = ImageTrailer::new(u32::try_from(sent.bytes).ok()?, encode_end, send);
     stream.write_all(trailer.as_bytes()).await.ok()?;
     stream.finish().ok()?;
-    // `None` inside is "acknowledged"; a code is "the other side does not want it".
+    // `None` means acknowledged; a code means that the receiver stopped the stream.
     stream.stopped().await.ok()?.is_none().then_some(())
 }
 
-/// Older than this, an image helps no pilot, and its retransmissions delay newer ones.
+/// Maximum age of an image: an older one is of no use to the vehicle, and its retransmissions delay newer ones.
 const DEADLINE: Duration = Duration::from_millis(150);
-/// What a vehicle's camera is drawn at on a small machine; K never assumes less. [Hz]
+/// Typical rate on a small machine, and the minimum assumed for K. [Hz]
 const USUAL_RATE_HZ: f64 = 60.0;
 
 #[cfg(test)]

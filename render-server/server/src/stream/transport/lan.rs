@@ -1,17 +1,15 @@
-//! Congestion control for a cable that is ours alone: a constant window that ignores loss.
+//! Congestion control for a dedicated cable: a constant window that ignores loss.
 //!
-//! On the lab's dedicated LAN loss means a bad cable or a full socket buffer, not a queue that
-//! others share; backing off only delays images that a newer one replaces anyway. What limits the
-//! load is the transport above: at most K images in flight, and a deadline. Measured against
-//! cubic over a link of 1 ms and 5 % loss: 100 % of images delivered instead of 15.
+//! On the lab's dedicated LAN, loss means a bad cable or a full socket buffer, not a shared queue. Backing off
+//! only delays images that a newer one replaces anyway. The transport above limits the load: at most K images
+//! in flight, and a deadline. Measured against cubic on a link of 1 ms and 5 % loss: 100 % of images delivered
+//! instead of 15 %.
 //!
-//! After a blackout the window is full of bytes that were never acknowledged, and a sender that
-//! may not send waits for the exponential probe time-out, a second or more. So the window grows by
-//! [`GROWTH`] for every [`GROWTH_EVERY`] without an acknowledgement: the newest image goes out
-//! within 100 ms of the link's return.
+//! After a blackout the window is full of unacknowledged bytes, and the sender waits for the exponential probe
+//! timeout, a second or more. So the window grows by [`GROWTH`] for every [`GROWTH_EVERY`] without an
+//! acknowledgement: the newest image is sent within 100 ms after the link's return.
 //!
-//! Overloading a 100 Mbit link with it loses a quarter of the packets: use `bbr` on
-//! networks that others share.
+//! On an overloaded 100 Mbit link it loses a quarter of the packets: use `bbr` on shared networks.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -20,17 +18,17 @@ use std::time::{Duration, Instant};
 use quinn::congestion::{Controller, ControllerFactory};
 use quinn_proto::RttEstimator;
 
-/// Makes [`Lan`] controllers.
+/// Factory of [`Lan`] controllers.
 #[derive(Clone, Copy, Debug)]
 pub struct LanConfig {
-    /// Bytes that may be in flight. [bytes]
+    /// Maximum bytes in flight. [bytes]
     pub window: u64,
 }
 
 impl Default for LanConfig {
     fn default() -> Self {
-        // A gigabit's worth of 8 ms; measured best up to 1 ms of round trip. Longer round trips
-        // get more, see `PER_US`.
+        // 8 ms at one gigabit; measured best for round trips up to 1 ms. Longer round trips get more, see
+        // `PER_US`.
         Self { window: 1 << 20 }
     }
 }
@@ -41,15 +39,15 @@ impl ControllerFactory for LanConfig {
     }
 }
 
-/// A window that loss does not change.
+/// Controller with a window that is independent of loss.
 #[derive(Clone, Debug)]
 pub struct Lan {
     base: u64,
-    /// When the newest acknowledgement came, or the first packet after silence was sent.
+    /// Time of the newest acknowledgement, or of the first packet after silence.
     last_ack: Instant,
-    /// Whether anything sent since then awaits acknowledgement.
+    /// Whether a packet sent since then is unacknowledged.
     waiting: bool,
-    /// Shortest round trip so far.
+    /// Smallest round-trip time so far.
     min_rtt: Duration,
 }
 
@@ -64,8 +62,8 @@ impl Lan {
         base + (steps * GROWTH).min(MAX_GROWTH)
     }
 
-    /// Returns the window while acknowledgements come: what is under way in a round trip, and the
-    /// base for what waits at its ends.
+    /// Returns the window while acknowledgements arrive: the bytes of one round trip, plus the base for the
+    /// queues at both ends.
     fn usual(&self) -> u64 {
         let beyond = self.min_rtt.saturating_sub(SHORT);
         let more = beyond.as_micros() as u64 * PER_US;
@@ -101,7 +99,7 @@ impl Controller for Lan {
     fn on_mtu_update(&mut self, _new_mtu: u16) {}
 
     fn window(&self) -> u64 {
-        // Tokio's clock, which the connection's own stamps are of.
+        // Tokio's clock, as for the stamps of the connection.
         self.window_at(tokio::time::Instant::now().into_std())
     }
 
@@ -118,17 +116,17 @@ impl Controller for Lan {
     }
 }
 
-/// Up to this round trip the base was measured best.
+/// Maximum round trip for which the base window was measured best.
 const SHORT: Duration = Duration::from_millis(1);
-/// At 20 ms 3 MB were measured best: 2 MB more for 19 ms, a gigabit nearly. [bytes/us]
+/// At 20 ms, 3 MB were measured best: 2 MB more for 19 ms, almost a gigabit. [bytes/us]
 const PER_US: u64 = 110;
-/// The transport's send window ends what is gained: 4 MB in all. [bytes]
+/// Maximum addition: the transport's send window of 4 MB limits the total. [bytes]
 const MAX_MORE: u64 = 3 << 20;
 /// Two images of 100 KB. [bytes]
 const GROWTH: u64 = 200 << 10;
 /// Longer than any round trip of a LAN with its acknowledgement delay.
 const GROWTH_EVERY: Duration = Duration::from_millis(100);
-/// The idle time-out ends a connection after five seconds of growth at most. [bytes]
+/// Maximum growth: five seconds of it, then the idle timeout ends the connection. [bytes]
 const MAX_GROWTH: u64 = 50 * GROWTH;
 
 #[cfg(test)]
@@ -153,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn loss_changes_nothing_and_silence_opens_the_window() {
+    fn loss_does_not_change_the_window_and_silence_enlarges_it() {
         let start = Instant::now();
         let mut lan = lan(start, Duration::from_micros(300));
         assert_eq!(lan.window_at(after(start, 10_000)), 1 << 20, "idle is not silence");

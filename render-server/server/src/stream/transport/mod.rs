@@ -1,13 +1,13 @@
 //! QUIC to the runtime: one endpoint, one session per connection.
 //!
 //! ```text
-//! accept -> limits: who may try at all; under load addresses prove themselves; few handshakes of one address
-//!        -> pairing, if that is what it asks for; else
-//!        -> greeting: who it is, preambles, Hello -> Welcome | Refused
+//! accept -> limits: attempts per address; address validation under load; handshakes per address
+//!        -> pairing, if the client requests it; else
+//!        -> greeting: identity, preambles, Hello -> Welcome | Refused
 //!        -> session: control stream: poses, events, clock down; telemetry, events, clock up
 //!        -> readings of other sensors: one uni stream each, the newest, behind images
-//!        -> images: one uni stream each, at most K in flight per camera, reset past a deadline
-//!        -> feed: sealed poses to the flight's guardian, over UDP, also when the connection has ended
+//!        -> images: one uni stream each, at most K in flight per camera, reset after a deadline
+//!        -> feed: sealed poses to the flight's guardian, over UDP, also after the connection has ended
 //! ```
 //! Settings and figures: docs/BENCHMARKS.md.
 
@@ -49,20 +49,20 @@ use crate::stream::Rooms;
 use crate::stream::rate_control::is_near;
 use vizflyt_process::lock;
 
-/// Who decides how fast to send.
+/// Congestion control of the image stream
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Congestion {
-    /// `lan` to private and loopback addresses, `bbr` to all others.
+    /// `lan` to private and loopback addresses, `bbr` to all others
     #[default]
     Auto,
-    /// A constant window that ignores loss; for a cable of our own.
+    /// Constant window that ignores loss; for a dedicated cable
     Lan,
-    /// Fair to others, less bothered by loss (experimental in quinn).
+    /// Fair to other senders, less sensitive to loss (experimental in quinn)
     Bbr,
 }
 
 impl Congestion {
-    /// Returns what suits a peer at `address`.
+    /// Resolves `Auto` for a peer at `address`.
     fn toward(self, address: IpAddr) -> Self {
         match self {
             Self::Auto if is_near(address) => Self::Lan,
@@ -102,9 +102,9 @@ pub fn bind(address: SocketAddr, identity: &Identity, congestion: Congestion) ->
 
 /// Returns the settings of the endpoint itself.
 ///
-/// Its secrets come of the identity, not of chance: a server that was killed and started again can
-/// answer packets of its former life with a stateless reset (RFC 9000, section 10.3), so that the
-/// runtime connects anew at once instead of after seconds of silence.
+/// Its secrets are derived from the identity instead of chosen at random. After a crash and restart, the server
+/// can thus answer packets of the previous process with a stateless reset (RFC 9000, section 10.3), and the
+/// runtime reconnects at once instead of after seconds of silence.
 pub fn endpoint_config(identity: &Identity) -> Result<EndpointConfig> {
     let secret = |purpose: &[u8]| {
         let key = hmac::Key::new(hmac::HMAC_SHA256, identity.key.secret_der());
@@ -116,7 +116,7 @@ pub fn endpoint_config(identity: &Identity) -> Result<EndpointConfig> {
     let ids = u64::from_le_bytes(ids);
     let mut endpoint = EndpointConfig::new(Arc::new(reset));
     endpoint.cid_generator(move || Box::new(HashedConnectionIdGenerator::from_key(ids)));
-    // Jumbo packets from a peer whose network carries them.
+    // Accepts jumbo packets, if the peer's network supports them.
     endpoint.max_udp_payload_size(MAX_MTU).context("cannot set the packet size")?;
     Ok(endpoint)
 }
@@ -165,7 +165,8 @@ pub async fn serve(
             incoming.refuse();
             continue;
         }
-        // Under load an address must first show that packets reach it; that costs us no memory, and no place.
+        // Under load an address must first prove that packets reach it; this costs the server no memory and no
+        // slot.
         if unknown_peers.handshakes_under_way() >= RETRY_ABOVE && incoming.may_retry() {
             if let Err(error) = incoming.retry() {
                 debug!("{address}: {error}");
@@ -227,13 +228,13 @@ pub async fn serve(
     let _ = tokio::time::timeout(Duration::from_millis(300), endpoint.wait_idle()).await;
 }
 
-/// Whether a client has come to be paired.
+/// Returns whether the client connected for pairing.
 fn is_pairing(connection: &Connection) -> bool {
     let data = connection.handshake_data().and_then(|data| data.downcast::<HandshakeData>().ok());
     data.is_some_and(|data| data.protocol.as_deref() == Some(ALPN_PAIR))
 }
 
-/// What those cost who are not known yet.
+/// Limits for clients that are not yet known.
 #[derive(Debug)]
 struct UnknownPeers {
     limiter: Mutex<RateLimiter>,
@@ -255,7 +256,7 @@ impl Default for UnknownPeers {
     }
 }
 
-/// A handshake under way; its place is free again when this is dropped.
+/// Handshake in progress; its slot is free again when this is dropped.
 struct Handshake {
     peers: Arc<UnknownPeers>,
     place: PlaceId,
@@ -270,7 +271,7 @@ impl UnknownPeers {
         lock(&self.handshakes).len()
     }
 
-    /// Begins a handshake with `address`; returns it, and what tells it to give way to a newer one.
+    /// Begins a handshake with `address`. Returns it, and the signal to give way to a newer one.
     fn handshake(self: &Arc<Self>, address: IpAddr) -> Option<(Handshake, Arc<Notify>)> {
         let gives_way = Arc::new(Notify::new());
         let admitted = lock(&self.handshakes).admit(Instant::now(), address, gives_way.clone());
@@ -309,12 +310,12 @@ fn transport_config(congestion: Congestion) -> TransportConfig {
     mtu.upper_bound(MAX_MTU - 48); // less the IPv6 and UDP headers
     let mut config = TransportConfig::default();
     config
-        .max_concurrent_bidi_streams(VarInt::from_u32(1)) // the control stream
+        .max_concurrent_bidi_streams(VarInt::from_u32(1)) // control stream
         .max_concurrent_uni_streams(VarInt::from_u32(0)) // a runtime sends no images
         .stream_receive_window(VarInt::from_u32(256 << 10)) // telemetry is small
         .receive_window(VarInt::from_u32(256 << 10))
         .send_window(4 << 20) // the default of 10 MB would queue stale images
-        .datagram_receive_buffer_size(Some(POSES_WAITING)) // none: and quinn would send none
+        .datagram_receive_buffer_size(Some(POSES_WAITING)) // with `None`, quinn would not send any
         .datagram_send_buffer_size(POSES_WAITING)
         .max_idle_timeout(Some(VarInt::from_u32(5_000).into()))
         .keep_alive_interval(Some(Duration::from_secs(1)))
@@ -325,7 +326,7 @@ fn transport_config(congestion: Congestion) -> TransportConfig {
     config
 }
 
-/// Close codes; the reason in words goes with them.
+/// Close codes; the reason follows as text.
 const END: VarInt = VarInt::from_u32(0);
 const FOREIGN: VarInt = VarInt::from_u32(1);
 const REFUSED: VarInt = VarInt::from_u32(2);
@@ -336,19 +337,19 @@ const UNPAIRED: VarInt = VarInt::from_u32(close::UNPAIRED);
 const SOCKET_BUFFER: usize = 4 << 20;
 /// Jumbo frames. [bytes]
 const MAX_MTU: u16 = 9000;
-/// Handshakes under way at most: each costs some 10 KB and a signature, before we know whose it is.
+/// Maximum handshakes in progress: each costs about 10 KB and a signature, before the client is identified.
 const MAX_HANDSHAKES: usize = 32;
-/// Of one address; the oldest gives way. At 40 half-open ones a second each has 0.2 s, many round trips.
+/// Maximum per address; the oldest gives way. At 40 half-open ones a second each has 0.2 s, many round trips.
 const MAX_HANDSHAKES_BY_ADDRESS: usize = 8;
-/// Conversations about pairing at a time; a person looks at one.
+/// Maximum pairings at a time.
 const MAX_PAIRINGS: usize = 4;
-/// Above this many under way, addresses must prove themselves first (RFC 9000, section 8.1).
+/// Above this number in progress, addresses must be validated first (RFC 9000, section 8.1).
 const RETRY_ABOVE: usize = 4;
-/// Far more than a network of 50 ms and some loss needs.
+/// Handshake timeout: far more than a network with 50 ms and some loss needs.
 const HANDSHAKE_WITHIN: Duration = Duration::from_secs(4);
-/// A few poses; when more wait for the network, the oldest go. [bytes]
+/// Buffer for a few poses; when more wait for the network, the oldest are dropped. [bytes]
 const POSES_WAITING: usize = 1024;
-/// A vehicle needs one; unknown peers must not exhaust memory.
+/// A vehicle needs one; unknown peers must not exhaust the memory.
 const MAX_CONNECTIONS: usize = 32;
 
 #[cfg(test)]
@@ -360,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lab_gets_the_lan_window_and_the_internet_a_fair_one() {
+    fn private_addresses_use_lan_and_public_ones_bbr() {
         check("127.0.0.1", Congestion::Lan);
         check("192.168.10.7", Congestion::Lan);
         check("::ffff:10.0.0.1", Congestion::Lan);

@@ -1,6 +1,6 @@
-//! Pairing over a connection: carries [`vizflyt_trust::pairing`]'s messages.
+//! Pairing over a connection: transports the messages of [`vizflyt_trust::pairing`].
 //!
-//! Nothing of the arena is revealed here, whether or not the code is right.
+//! No information about the arena is sent, whether or not the code is right.
 
 use std::time::Duration;
 
@@ -19,12 +19,12 @@ use super::greeting::{linger, peer};
 use super::{END, FOREIGN, REFUSED};
 use crate::authorization::Authorizer;
 
-/// Speaks with one client that wants to be paired.
+/// Serves one client that requests pairing.
 pub(super) async fn run(authorizer: &Authorizer, connection: &Connection) {
     let address = connection.remote_address();
     let ending = timeout(WITHIN, talk(authorizer, connection)).await;
     let (code, reason) =
-        ending.unwrap_or_else(|_| (FOREIGN, "pairing was not over within 10 s".to_owned()));
+        ending.unwrap_or_else(|_| (FOREIGN, "pairing did not finish within 10 s".to_owned()));
     if code != END {
         warn!("{address}: not paired: {reason}");
     }
@@ -41,7 +41,7 @@ async fn talk(authorizer: &Authorizer, connection: &Connection) -> Ending {
     }
 }
 
-/// Returns the client's name once it is paired and knows it.
+/// Returns the client's name when it is paired and has been informed.
 async fn pair(authorizer: &Authorizer, connection: &Connection) -> Result<String, Ending> {
     let foreign = |what: &str| (FOREIGN, what.to_owned());
     let mut exporter = [0; 32];
@@ -110,7 +110,7 @@ impl PairingStream {
             let Some(count) = count else {
                 return Err((FOREIGN, "the client left in the middle".to_owned()));
             };
-            // After `None` there is room for a byte at least; messages here are far shorter.
+            // After `None` there is room for at least one byte; messages here are far shorter.
             if self.deframer.push(&bytes[..count]) < count {
                 return Err((FOREIGN, "more was sent than pairing needs".to_owned()));
             }
@@ -118,5 +118,5 @@ impl PairingStream {
     }
 }
 
-/// A person has typed the code before the connection is made.
+/// Timeout of a pairing. It is short because the user types the code before the connection is made.
 const WITHIN: Duration = Duration::from_secs(10);

@@ -1,7 +1,9 @@
-//! Readings of sensors beside the cameras to one session: a stream each, one in flight per sensor, reset past a deadline.
+//! Sensor readings (except images) to one session: one stream per reading, one in flight per sensor, reset
+//! after a deadline.
 //!
-//! Newest wins: when a reading has been acknowledged or given up, the newest is sent next. They leave behind images, and
-//! take no part in the rate control: a LiDAR of 16 x 1024 beams at 10 Hz is 26 Mbit/s at most.
+//! Newest wins: when a reading has been acknowledged or dropped, the newest is sent next. Readings have a lower
+//! priority than images, and take no part in the rate control: a LiDAR of 16 x 1024 beams at 10 Hz needs at
+//! most 26 Mbit/s.
 
 use std::convert::Infallible;
 use std::sync::atomic::Ordering;
@@ -17,9 +19,9 @@ use vizflyt_protocol::sensor::MAX_SENSORS;
 use crate::render::sensors::MadeReading;
 use crate::stream::Rooms;
 
-/// Below every image's.
+/// Lower than the priority of every image.
 const PRIORITY: i32 = i32::MIN;
-/// Older than this, a reading helps no pilot.
+/// Maximum age of a reading.
 const DEADLINE: Duration = Duration::from_millis(250);
 
 /// Sends the newest readings of a vehicle until the session ends and drops this.
@@ -34,7 +36,7 @@ pub(super) async fn send(
         senders.spawn(send_of(rooms.clone(), vehicle, sensor, connection.clone(), purpose));
     }
     while senders.join_next().await.is_some() {}
-    // A vehicle without sensors.
+    // Vehicles without sensors wait here.
     std::future::pending().await
 }
 
@@ -50,7 +52,7 @@ async fn send_of(
     while newest.changed().await.is_ok() {
         let Some(reading) = newest.borrow_and_update().clone() else { continue };
         let delivered = deliver(&connection, &reading).await;
-        // Figures are the runtime's.
+        // Statistics count only the runtime's readings.
         if purpose == Purpose::Fly {
             let counters = &sensors.counters[sensor];
             let counter = if delivered { &counters.sent } else { &counters.late };
@@ -60,7 +62,7 @@ async fn send_of(
     }
 }
 
-/// Sends a reading on a stream of its own; returns whether all was acknowledged in time.
+/// Sends a reading on a separate stream. Returns whether all of it was acknowledged in time.
 async fn deliver(connection: &Connection, reading: &MadeReading) -> bool {
     let Ok(Ok(mut stream)) = timeout(DEADLINE, connection.open_uni()).await else {
         return false;
@@ -70,7 +72,7 @@ async fn deliver(connection: &Connection, reading: &MadeReading) -> bool {
     let write = async {
         stream.write_chunk(reading.bytes.clone()).await.ok()?;
         stream.finish().ok()?;
-        // `None` inside is "acknowledged"; a code is "the other side does not want it".
+        // `None` means acknowledged; a code means that the receiver stopped the stream.
         stream.stopped().await.ok()?.is_none().then_some(())
     };
     let delivered = timeout(DEADLINE, write).await.ok().flatten().is_some();

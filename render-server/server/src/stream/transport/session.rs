@@ -1,4 +1,4 @@
-//! The talk with one client, from its lease to its last byte.
+//! Session with one client, from its lease to the end of the connection.
 
 use std::sync::atomic::Ordering;
 
@@ -24,7 +24,7 @@ use crate::render::cameras::CameraSet;
 use crate::render::sensors::SensorSet;
 use crate::stream::Rooms;
 
-/// A granted conversation with one client.
+/// Session with one client after its lease was granted.
 pub(super) struct Session<'a> {
     pub(super) rooms: &'a Rooms,
     pub(super) vehicle: &'a VehicleFlight,
@@ -85,7 +85,7 @@ impl Session<'_> {
         send: SendStream,
         incoming: Incoming,
     ) -> Ending {
-        // Control goes out before images.
+        // Control messages have priority over images.
         let _ = send.set_priority(i32::MAX);
         let (clock_sender, clock_requests) = mpsc::channel(CLOCK_QUEUE);
         let (received_sender, received) = cell::channel(0);
@@ -106,8 +106,8 @@ impl Session<'_> {
         }
     }
 
-    /// Server to client: events first, then acknowledgements of its own, changed cameras, clock
-    /// replies, and the newest pose.
+    /// Sends to the client: events first, then acknowledgements, changed cameras, clock replies, and the newest
+    /// pose.
     async fn send(
         &self,
         send: SendStream,
@@ -179,7 +179,7 @@ impl Session<'_> {
         }
     }
 
-    /// Client to server; of a watcher only clock requests count.
+    /// Receives from the client; watchers may only send clock requests.
     async fn receive(
         &self,
         lease: Option<&ControlLease>,
@@ -197,7 +197,7 @@ impl Session<'_> {
                 lease.renew(clock::now());
             }
             match (message, lease) {
-                // A full queue means that replies cannot leave; a late reply would mislead anyway.
+                // A full queue means that replies cannot be sent; a late reply would be misleading anyway.
                 (ToServer::Clock(request), _) => drop(clock_requests.try_send(request)),
                 (ToServer::Telemetry(report), Some(_)) => vehicle.report(report),
                 (ToServer::Timing(timing), Some(_)) => {
@@ -227,7 +227,7 @@ impl Session<'_> {
         }
     }
 
-    /// Poses are datagrams: a lost one holds up nothing.
+    /// Sends a pose as a datagram, so that a lost one delays no other data.
     fn send_pose(&self, pose: &PoseSample) {
         let mut buffer = [0; MAX_FRAMED];
         let bytes = encode_body(&Datagram::Pose(*pose), &mut buffer);
@@ -280,7 +280,7 @@ async fn send_sensors(
     Ok(())
 }
 
-/// At most 100 Hz, with room for the jitter of a 200 Hz source. [s]
+/// Minimum time between poses: at most 100 Hz, with a margin for the jitter of a 200 Hz source. [s]
 const POSE_EVERY_S: f64 = 0.0095;
-/// Runtimes ask four times a second at most.
+/// Capacity of the queue; runtimes send at most four clock requests per second.
 const CLOCK_QUEUE: usize = 16;

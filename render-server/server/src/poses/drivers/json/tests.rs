@@ -16,7 +16,7 @@ fn packet(more: &str) -> String {
     )
 }
 
-/// Returns the one measurement of a packet.
+/// Returns the only measurement of a packet.
 fn only(stream: &mut JsonStream, now: ServerTime, text: &str) -> Option<Measurement> {
     let measured = stream.handle_packet(now, text.as_bytes());
     assert!(measured.len() <= 1);
@@ -24,7 +24,7 @@ fn only(stream: &mut JsonStream, now: ServerTime, text: &str) -> Option<Measurem
 }
 
 #[test]
-fn notes_of_the_sender_are_told_once() {
+fn reports_each_note_of_a_sender_once() {
     let mut stream = stream("");
     let mut told = Vec::new();
     let mut send = |ms, notes: &str| {
@@ -43,7 +43,7 @@ fn notes_of_the_sender_are_told_once() {
             },
         );
     }
-    // Gone for a minute, it is news again; a flood is not.
+    // After a minute of absence it is reported again; a flood is limited.
     send(62_000, &format!(r#"["{}"]"#, moved(9.0)));
     for (i, word) in ["a", "b", "c", "d"].iter().enumerate() {
         send(62_010 + i as u64, &format!(r#"["{}"]"#, word.repeat(500)));
@@ -55,7 +55,7 @@ fn notes_of_the_sender_are_told_once() {
 }
 
 #[test]
-fn the_packet_of_the_guide_is_read() {
+fn parses_the_packet_of_the_guide() {
     let text = r#"{"vizflyt_pose":1,"object":"wasp","seq":12,"stamp_ns":1000000000,"clock":"server",
         "position_m":[1.0,2.0,0.5],"rotation_xyzw":[0,0,0.7071,0.7071],"position_sigma_m":[0.1,0.2,0.3],
         "rotation_sigma_rad":[0.01,0.02,0.03],"quality":{"tags":3,"cameras":2,"rms_px":0.21,"image_ms":4.2}}"#;
@@ -70,7 +70,7 @@ fn the_packet_of_the_guide_is_read() {
 }
 
 #[test]
-fn a_constant_delay_is_taken_off_the_stamp() {
+fn subtracts_a_constant_delay_from_the_stamp() {
     let found = only(&mut stream("latency_ms=100"), at(250), &packet("")).unwrap();
     assert_eq!((found.stamp, found.arrival), (at(150), at(250)));
     for wrong in ["-1", "501", "nan"] {
@@ -91,13 +91,13 @@ fn sigmas_turn_with_the_axes() {
 }
 
 #[test]
-fn faults_are_named_once_and_counted() {
+fn reports_invalid_packets_once_and_counts_them() {
     for (text, expected) in [
-        ("hello".to_owned(), "is no pose packet"),
+        ("hello".to_owned(), "is not a pose packet"),
         (packet("").replace("pose\":1", "pose\":2"), "vizflyt_pose is 2, this server knows 1"),
         (packet("").replace("[1,2,3]", "[1,2,1e300]"), "absurdly large"),
         (packet("").replace("[0,0,0,1]", "[0,0,0,0]"), "is not of unit length"),
-        (packet("").replace("[0,0,0,1]", "[0,0,1]"), "is no pose packet"),
+        (packet("").replace("[0,0,0,1]", "[0,0,1]"), "is not a pose packet"),
         (
             packet(r#","position_sigma_m":[0,1,1],"rotation_sigma_rad":[1,1,1]"#),
             "give positive numbers",
@@ -141,7 +141,7 @@ fn warns_of_other_names_and_clocks() {
     assert_eq!(warnings.len(), 1);
     assert!(warnings[0].contains("has jumped by 0.500 s"), "{warnings:?}");
 
-    // Kilometres: somebody's millimetres.
+    // Kilometres: probably millimetres.
     let mut s = stream("");
     let text = packet("").replace("[1,2,3]", "[1200,2,3]");
     assert!(only(&mut s, at(0), &text).is_some());
@@ -149,7 +149,7 @@ fn warns_of_other_names_and_clocks() {
 }
 
 #[test]
-fn repeated_poses_are_left_out_and_a_frozen_stream_is_reported() {
+fn drops_repeated_poses_and_reports_a_frozen_stream() {
     let mut s = stream("");
     assert!(only(&mut s, at(0), &packet(r#","seq":5"#)).is_some());
     for ms in 1..1500 {
@@ -172,7 +172,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_written_is_read(p in prop::array::uniform3(-50.0..50.0f64), q in prop::array::uniform4(-1.0..1.0f64), seq in any::<u32>()) {
+    fn reads_back_written_packets(p in prop::array::uniform3(-50.0..50.0f64), q in prop::array::uniform4(-1.0..1.0f64), seq in any::<u32>()) {
         prop_assume!(q.iter().map(|v| v * v).sum::<f64>() > 1e-2);
         let q = DQuat::from_array(q).normalize();
         let text = serde_json::json!({"vizflyt_pose": 1, "object": "wasp", "seq": seq, "position_m": p, "rotation_xyzw": q.to_array()}).to_string();
@@ -181,9 +181,9 @@ proptest! {
         prop_assert!(found.world_from_body.rotation.dot(q).abs() > 1.0 - 1e-9);
     }
 
-    /// Any one byte changed: what comes out is valid.
+    /// After a change of any byte, all resulting poses are valid.
     #[test]
-    fn poses_that_come_out_are_valid(index in 0usize..90, value in any::<u8>()) {
+    fn returned_poses_are_valid(index in 0usize..90, value in any::<u8>()) {
         let mut bytes = packet(r#","seq":5,"stamp_ns":77"#).into_bytes();
         bytes[index] = value;
         for found in stream("").handle_packet(at(0), &bytes) {
@@ -205,9 +205,9 @@ fn reports_the_tags_of_a_pose_and_the_view() {
     let seen = quality_of(10, seen).expect("tags are reported");
     assert_eq!((seen.tags, seen.cameras, seen.rms_px), (3, 2, 0.25));
     assert_eq!(seen.view, Some("192.168.1.7:8091".parse().unwrap()));
-    // An address of the sender's choice is no link of ours.
+    // A sender cannot choose another address for the link.
     let seen = r#"{"tags":1,"cameras":1,"rms_px":0.2,"image_ms":1,"view":"10.0.0.1:80"}"#;
     assert_eq!(quality_of(20, seen).expect("tags are reported").view, None);
-    // Another program's quality is no reason to refuse its pose.
+    // An unknown `quality` of another program does not invalidate the pose.
     assert_eq!(quality_of(30, r#""good""#), None);
 }

@@ -41,7 +41,7 @@ fn quaternion(system: u8, boot_ms: u32, rotation: DQuat, yaw_rate_radps: f32) ->
 }
 
 #[test]
-fn a_position_takes_the_attitude_turned_to_its_instant() {
+fn extrapolates_the_attitude_to_the_positions_time() {
     let mut s = stream("", &["vizflyt"]);
     let (p, q) = (DVec3::new(1.0, 2.0, 0.5), DQuat::from_rotation_z(0.7));
     assert_eq!(s.handle_packet(at(0), &position(1, 5000, p)), [], "no attitude yet");
@@ -60,7 +60,7 @@ fn a_position_takes_the_attitude_turned_to_its_instant() {
 }
 
 #[test]
-fn odometry_is_taken_instead_with_its_covariance() {
+fn prefers_odometry_with_its_covariance() {
     let mut s = stream("", &["vizflyt"]);
     let mut message = ODOMETRY_DATA {
         time_usec: 7_000_000,
@@ -77,7 +77,7 @@ fn odometry_is_taken_instead_with_its_covariance() {
     }
     let found = s.handle_packet(at(5), &packet(1, &MavMessage::ODOMETRY(message.clone())))[0];
     assert_eq!(found.world_from_body.translation_m, DVec3::new(1.0, 2.0, 3.0));
-    // The nose north: y.
+    // Nose to the north: y.
     assert!((found.world_from_body.rotate(DVec3::X) - DVec3::Y).length() < 1e-6);
     let sigma = found.sigma.unwrap();
     assert!((sigma.position_m - DVec3::new(0.2, 0.1, 0.3)).length() < 1e-6, "{sigma:?}");
@@ -89,7 +89,7 @@ fn odometry_is_taken_instead_with_its_covariance() {
 }
 
 #[test]
-fn systems_are_distinguished_and_asked_for_their_messages() {
+fn distinguishes_systems_and_requests_their_messages() {
     let mut s = stream("objects.ant=1,objects.bee=2", &["ant", "bee"]);
     let from = "10.0.0.9:14550".parse().unwrap();
     assert_eq!(s.poll_transmit(at(0)), None);
@@ -106,14 +106,14 @@ fn systems_are_distinguished_and_asked_for_their_messages() {
         });
     }
     assert_eq!(asked, [(2, 32.0, 20_000.0), (2, 31.0, 20_000.0)]);
-    // Somebody else's.
+    // A system that is not configured.
     let heartbeat = packet(9, &MavMessage::HEARTBEAT(HEARTBEAT_DATA::default()));
     let mut s = stream("objects.ant=1", &["ant", "bee"]);
     s.handle_packet(at(1), &heartbeat);
     let warning = s.next_warning().unwrap();
     assert!(warning.contains("object '9' streams, but '1', 'bee' was asked for"), "{warning}");
     s.handle_packet(at(1), b"hello");
-    assert!(s.next_warning().unwrap().contains("5 bytes hold no MAVLink packet"));
+    assert!(s.next_warning().unwrap().contains("5 bytes contain no MAVLink packet"));
 }
 
 #[test]
@@ -134,7 +134,7 @@ proptest! {
     }
 
     #[test]
-    fn poses_that_come_out_are_valid(values in prop::array::uniform7(any::<f32>()), rate in any::<f32>(), apart in any::<i16>()) {
+    fn returned_poses_are_valid(values in prop::array::uniform7(any::<f32>()), rate in any::<f32>(), apart in any::<i16>()) {
         let mut s = stream("", &["v"]);
         let [w, x, y, z, a, b, c] = values;
         s.handle_packet(at(0), &packet(1, &MavMessage::ATTITUDE_QUATERNION(ATTITUDE_QUATERNION_DATA {

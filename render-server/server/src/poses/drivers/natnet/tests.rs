@@ -40,7 +40,7 @@ fn names(version: Version, bodies: &[(&str, i32)]) -> Vec<u8> {
     ModelDef { datasets: bodies.iter().map(body).collect() }.to_datagram(version).unwrap()
 }
 
-/// A frame exposed at `exposed_s` of Motive's clock, and sent 4 ms later.
+/// Returns a frame exposed at `exposed_s` of Motive's clock, and sent 4 ms later.
 fn frame(version: Version, number: i32, exposed_s: f64, bodies: &[PlannedBody]) -> Vec<u8> {
     let mut frame = SyntheticServer::new(version, 10_000_000).frame(number, exposed_s, bodies);
     frame.timing.transmit = frame.timing.camera_mid_exposure + 40_000;
@@ -59,7 +59,7 @@ fn sent(stream: &mut NatnetStream, now: ServerTime) -> Vec<u16> {
 }
 
 #[test]
-fn motive_is_asked_until_it_answers_and_kept_alive() {
+fn requests_are_repeated_until_motive_replies_and_then_kept_alive() {
     for version in [
         Version::new(3, 0, 0, 0),
         Version::new(3, 1, 0, 0),
@@ -78,7 +78,7 @@ fn motive_is_asked_until_it_answers_and_kept_alive() {
         let body = PlannedBody::tracked(7, [0.0, 1.0, 2.0], left);
         let found = s.handle_packet(at(650), &frame(version, 1, 50.0, &[body]))[0];
         assert_eq!((found.vehicle, found.source, found.arrival), (1, 2, at(650)));
-        // Sent when it came, exposed 4 ms before.
+        // Sent on arrival, exposed 4 ms before.
         assert_eq!(found.stamp, at(646));
         let pose = found.world_from_body;
         assert!((pose.translation_m - DVec3::new(0.0, -2.0, 1.0)).length() < 1e-6);
@@ -91,7 +91,7 @@ fn motive_is_asked_until_it_answers_and_kept_alive() {
 }
 
 #[test]
-fn by_multicast_whoever_streams_is_asked_for_names() {
+fn requests_names_from_a_multicast_sender() {
     let mut s = stream("", Motive::Multicast);
     assert_eq!(s.poll_transmit(at(0)), None);
     let body = [PlannedBody::tracked(7, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])];
@@ -102,7 +102,7 @@ fn by_multicast_whoever_streams_is_asked_for_names() {
     assert_eq!(sent(&mut s, at(4)), [natnet::NAT_REQUEST_MODELDEF]);
     s.handle_packet(at(5), &names(Version::V4_1, &[("bee", 7)]));
     assert_eq!(s.handle_packet(at(6), &frame(Version::V4_1, 2, 50.005, &body)).len(), 1);
-    // Nothing is kept alive, and a rigid body that is new is asked for.
+    // No keep-alive is sent, and the name of a new rigid body is requested.
     assert!(sent(&mut s, at(3000)).is_empty());
     let new = [PlannedBody::tracked(8, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])];
     s.handle_packet(at(3001), &frame(Version::V4_1, 3, 50.01, &new));
@@ -110,13 +110,13 @@ fn by_multicast_whoever_streams_is_asked_for_names() {
 }
 
 #[test]
-fn odd_packets_are_reported_and_counted() {
+fn reports_and_counts_invalid_packets() {
     let ready = || {
         let mut s = stream("objects.wasp=7", unicast());
         s.handle_packet(at(0), &info(Version::V4_1));
         s
     };
-    // By its id, without names; unseen; twice; not a pose.
+    // By id, without names; occluded; repeated; not a pose.
     let mut s = ready();
     let body = |p: f32| PlannedBody::tracked(7, [p, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0]);
     assert_eq!(s.handle_packet(at(1), &frame(Version::V4_1, 1, 1.0, &[body(1.0)])).len(), 1);
@@ -127,7 +127,7 @@ fn odd_packets_are_reported_and_counted() {
     let counters = s.counters(1);
     assert_eq!((counters.poses, counters.stale_packets, counters.occluded), (1, 1, 1));
     assert_eq!(counters.bad_packets, 1);
-    assert!(s.next_warning().unwrap().contains("is no pose"));
+    assert!(s.next_warning().unwrap().contains("is not a valid pose"));
 
     let mut s = ready();
     s.handle_packet(at(1), &names(Version::V4_1, &[("Drone 1", 1), ("wand", 3)]));
@@ -137,7 +137,7 @@ fn odd_packets_are_reported_and_counted() {
          body in Motive's Assets pane, or set `objects`"
     );
 
-    // A version of the future: asked to speak 4.1 to one listener; to all it cannot be.
+    // A newer version: with unicast, 4.1 is requested; with multicast it cannot be.
     let future = Version::new(5, 2, 0, 0);
     let mut s = stream("", unicast());
     assert_eq!(sent(&mut s, at(0)), [natnet::NAT_CONNECT]);
@@ -169,9 +169,9 @@ proptest! {
         }
     }
 
-    /// Any one byte of a good frame changed: what comes out is valid, and not from the future.
+    /// After a change of any byte of a valid frame, the resulting poses are valid and not in the future.
     #[test]
-    fn poses_that_come_out_are_valid(index in 0usize..220, value in any::<u8>()) {
+    fn returned_poses_are_valid(index in 0usize..220, value in any::<u8>()) {
         let mut s = stream("objects.wasp=7", unicast());
         s.handle_packet(at(0), &info(Version::V4_1));
         let mut bytes = frame(Version::V4_1, 9, 2.0, &[PlannedBody::tracked(7, [1.0, 2.0, 3.0], [0.0, 0.6, 0.0, 0.8])]);

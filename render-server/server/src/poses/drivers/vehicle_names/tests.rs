@@ -1,4 +1,4 @@
-//! Restarted senders are followed within three poses; old frames beside new ones are not.
+//! Restarted senders are followed within three poses; old frames between new ones are ignored.
 
 use proptest::prelude::*;
 use vizflyt_protocol::time::ServerTime;
@@ -10,7 +10,7 @@ fn names() -> VehicleNames {
     VehicleNames::new(&LocalizationConfig::new(Driver::Vicon), 0, &["v"])
 }
 
-/// When a frame comes, at a rate.
+/// Returns the arrival time of a frame.
 fn at(index: u32, rate_hz: f64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000).plus_seconds(f64::from(index) / rate_hz)
 }
@@ -36,9 +36,9 @@ proptest! {
         prop_assert_eq!(names.next_warning(), None);
     }
 
-    /// Frames that were overtaken, up to ten in a row, come between new ones.
+    /// Reordered frames, up to ten in a row, between new ones.
     #[test]
-    fn overtaken_frames_are_left_out(late in prop::collection::vec(0u32..10, 40), rate_hz in 10.0..300.0f64) {
+    fn ignores_reordered_frames(late in prop::collection::vec(0u32..10, 40), rate_hz in 10.0..300.0f64) {
         let (mut names, mut frame) = (names(), 0);
         for (index, late) in late.into_iter().enumerate() {
             let now = at(10 * index as u32, rate_hz * 10.0);
@@ -51,9 +51,9 @@ proptest! {
         prop_assert_eq!(names.next_warning(), None);
     }
 
-    /// A recording that is replayed beside its living source, three times as fast, is never believed.
+    /// A recording that is replayed next to its live source, up to three times as fast, is never accepted.
     #[test]
-    fn a_replay_beside_the_living_source_is_left_out(frames in 20u32..400, rate_hz in 10.0..300.0f64, faster in 1u32..4) {
+    fn ignores_a_replay_next_to_the_live_source(frames in 20u32..400, rate_hz in 10.0..300.0f64, faster in 1u32..4) {
         let mut names = names();
         for frame in 0..frames {
             let now = at(frame, rate_hz);

@@ -7,7 +7,7 @@ fn stream(vehicles: &[&str]) -> ViconStream {
     ViconStream::new(&LocalizationConfig::new(Driver::Vicon), 0, vehicles)
 }
 
-/// Writes a packet as Tracker does.
+/// Encodes a packet like Tracker.
 fn packet(frame: u32, objects: &[(&str, [f64; 6])]) -> Vec<u8> {
     let mut bytes = frame.to_le_bytes().to_vec();
     bytes.push(objects.len() as u8);
@@ -28,7 +28,7 @@ fn at(ms: u64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000 + ms * 1_000_000)
 }
 
-/// Returns what a packet yields, at most one measurement.
+/// Returns the measurement of a packet, at most one.
 fn only(stream: &mut ViconStream, now: ServerTime, bytes: &[u8]) -> Option<Measurement> {
     let measured = stream.handle_packet(now, bytes);
     assert!(measured.len() <= 1, "{measured:?}");
@@ -80,7 +80,7 @@ fn check(bytes: &[u8], expected: &str) {
     assert_eq!(error.to_string(), expected);
 }
 
-/// Returns (vehicle, x) of what a packet yields. [m]
+/// Returns (vehicle, x [m]) of each pose of a packet.
 fn found(stream: &mut ViconStream, bytes: &[u8]) -> Vec<(usize, f64)> {
     let line = |m: &Measurement| (m.vehicle, m.world_from_body.translation_m.x);
     stream.handle_packet(at(0), bytes).iter().map(line).collect()
@@ -92,13 +92,13 @@ fn each_vehicle_gets_its_own_object_from_one_packet_or_several() {
     let x = |x_m: f64| [x_m * 1e3, 0.0, 0.0, 0.0, 0.0, 0.0];
     let both = packet(1, &[("bee", x(2.0)), ("wand", x(9.0)), ("wasp", x(1.0))]);
     assert_eq!(found(&mut together, &both), [(0, 1.0), (1, 2.0)]);
-    // One unseen does not hold up the other, and each keeps its own count.
+    // An occluded object does not delay the other, and each has its own counter.
     let hidden = packet(2, &[("bee", [0.0; 6]), ("wasp", x(1.0))]);
     assert_eq!(found(&mut together, &hidden), [(0, 1.0)]);
     assert_eq!(found(&mut together, &packet(3, &[("wasp", x(1.0))])), [(0, 1.0)]);
     assert_eq!(found(&mut together, &packet(3, &[("bee", x(2.0))])), [(1, 2.0)]);
     assert_eq!(found(&mut together, &packet(3, &[("bee", x(2.0))])), []);
-    // Simulators of their own count their own frames.
+    // Simulators count their own frames.
     let mut apart = stream(&["wasp", "bee"]);
     for frame in 1..5 {
         assert_eq!(found(&mut apart, &packet(1000 + frame, &[("wasp", x(1.0))])), [(0, 1.0)]);
@@ -112,7 +112,7 @@ fn each_vehicle_gets_its_own_object_from_one_packet_or_several() {
 }
 
 #[test]
-fn faults_are_named() {
+fn reports_invalid_packets() {
     let good = packet(1, &[("vizflyt", [1.0; 6])]);
     check(&good[..4], "packet of 4 bytes is shorter than its head of 5");
     check(&good[..6], "item 0 needs 3 bytes at offset 5, 1 are left");
@@ -127,7 +127,7 @@ fn faults_are_named() {
 }
 
 #[test]
-fn another_objects_name_stands_in_the_warning_once() {
+fn warns_once_with_the_names_of_other_objects() {
     let mut stream = stream(&["vizflyt"]);
     for frame in 0..10 {
         let bytes = packet(frame, &[("drone", [1.0; 6])]);
@@ -146,7 +146,7 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
     let mut stream = stream(&["v"]);
     let mut ms = 0;
     let mut feed = |frame: u32, values: [f64; 6]| {
-        // Tracker is away for a second while it is restarted.
+        // Tracker is silent for a second while it restarts.
         ms += if frame == 1 { 1000 } else { 5 };
         !stream.handle_packet(at(ms), &packet(frame, &[("v", values)])).is_empty()
     };
@@ -154,7 +154,7 @@ fn stale_lost_occluded_and_bad_packets_are_counted_and_a_restart_is_followed() {
     assert!(!feed(100_000, [1.0; 6])); // twice
     assert!(feed(100_003, [1.0; 6])); // two lost
     assert!(!feed(100_001, [1.0; 6])); // late
-    assert!(!feed(100_004, [0.0; 6])); // not seen
+    assert!(!feed(100_004, [0.0; 6])); // occluded
     assert!(feed(1, [1.0; 6])); // Tracker restarted
     assert!(feed(2, [1.0; 6]));
     assert_eq!(stream.handle_packet(at(0), b"hello"), []);
@@ -183,9 +183,9 @@ proptest! {
         let _ = stream(&["v"]).handle_packet(at(0), &bytes);
     }
 
-    /// Any one byte changed in a good packet never panics, and poses stay valid.
+    /// After a change of any byte of a valid packet, the parser does not panic, and poses stay valid.
     #[test]
-    fn poses_that_come_out_are_valid(at_byte in 0usize..80, value in any::<u8>()) {
+    fn returned_poses_are_valid(at_byte in 0usize..80, value in any::<u8>()) {
         let mut bytes = packet(9, &[("v", [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])]);
         bytes[at_byte] = value;
         for pose in stream(&["v"]).handle_packet(at(0), &bytes) {

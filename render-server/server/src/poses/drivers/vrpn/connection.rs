@@ -1,4 +1,4 @@
-//! The connection to a VRPN server: made, watched and made again. Never waits longer than it is asked to.
+//! Connection to a VRPN server: connects, monitors and reconnects. Never waits longer than the given timeout.
 
 use std::collections::VecDeque;
 use std::io::{ErrorKind, Read, Write};
@@ -14,37 +14,41 @@ use super::{COOKIE, VrpnStream};
 use crate::clock;
 use crate::poses::drivers::source::{Measurement, PoseSource, SourceCounters};
 
-/// Receives the poses of a VRPN server.
+/// Receiver for the poses of a VRPN server.
 #[derive(Debug)]
 pub struct VrpnPoses {
     server: SocketAddr,
     stream: VrpnStream,
     link: Link,
-    /// Why there was no connection, the last time.
+    /// Reason of the last failed connection.
     fault: Option<String>,
-    /// When the last report came; the start, before any did.
+    /// Time of the last report; initially the start.
     received_at: ServerTime,
     has_received: bool,
     silence_warned: bool,
-    /// When the loss of a connection was last reported.
+    /// Time at which a lost connection was last reported.
     lost_at: Option<ServerTime>,
     warnings: VecDeque<String>,
     buffer: Box<[u8]>,
 }
 
-/// How far the connection is.
+/// State of the connection.
 #[derive(Debug)]
 enum Link {
-    /// There is none; the next attempt is then.
-    Apart { retry_at: ServerTime },
-    /// The server has not answered yet; it is given up then.
-    Connecting { socket: Socket, until: ServerTime },
-    /// It stands.
+    /// Not connected; next attempt at `retry_at`.
+    Apart {
+        retry_at: ServerTime,
+    },
+    /// Waiting for the server, at most until `until`.
+    Connecting {
+        socket: Socket,
+        until: ServerTime,
+    },
     Connected(Socket),
 }
 
 impl VrpnPoses {
-    /// Makes a source that connects to `server` when it is first asked.
+    /// Creates a source that connects to `server` on the first call of `receive`.
     pub fn new(server: SocketAddr, stream: VrpnStream) -> Self {
         let now = clock::now();
         Self {
@@ -61,7 +65,7 @@ impl VrpnPoses {
         }
     }
 
-    /// Does what the connection's state asks for, within `timeout`; returns whether bytes came.
+    /// Performs the next step of the connection, within `timeout`. Returns whether bytes arrived.
     fn advance(&mut self, now: ServerTime, timeout: Duration) -> bool {
         match std::mem::replace(&mut self.link, Link::Apart { retry_at: now }) {
             Link::Apart { retry_at } if retry_at > now => {
@@ -106,20 +110,20 @@ impl VrpnPoses {
         false
     }
 
-    /// Begins the conversation on a socket that is connected, or could not be.
+    /// Sends the first bytes on a socket that is connected or has failed.
     fn greet(&mut self, mut socket: Socket) {
         let error = socket.take_error().unwrap_or_else(Some);
-        // A socket that was just made has room for a few bytes.
+        // A new socket has room for a few bytes.
         match error.map_or_else(|| socket.write_all(COOKIE), Err) {
             Ok(()) => self.link = Link::Connected(socket),
             Err(error) => self.retry(&error.to_string(), RETRY_S),
         }
     }
 
-    /// Gives up the connection. Says so if it had brought poses.
+    /// Closes the connection, with a warning if it had delivered poses.
     fn lose(&mut self, fault: &str, retry_s: f64) {
         let (now, server) = (clock::now(), self.server);
-        // A server that comes and goes is not reported at every turn.
+        // Limits the warnings for a server that connects and disconnects repeatedly.
         let is_news = self.lost_at.is_none_or(|at| now.seconds_since(at) > WARN_EVERY_S);
         if is_news && self.stream.newest_at().is_some() {
             (self.lost_at, self.silence_warned) = (Some(now), true);
@@ -135,7 +139,7 @@ impl VrpnPoses {
         self.fault = Some(fault.to_owned());
     }
 
-    /// Reads on in what has come; returns whether there are poses.
+    /// Parses received bytes; returns whether there are poses.
     fn read(&mut self) -> bool {
         match self.stream.read() {
             Ok(has_poses) => {
@@ -147,7 +151,7 @@ impl VrpnPoses {
             }
             Err(error) => {
                 self.stream.refuse(error);
-                // It would say the same again at once.
+                // An immediate retry would fail in the same way.
                 self.lose(&error.to_string(), REFUSED_S);
                 false
             }
@@ -187,7 +191,7 @@ impl VrpnPoses {
 
 impl PoseSource for VrpnPoses {
     fn receive(&mut self, timeout: Duration) -> &[Measurement] {
-        // What came together with the last poses.
+        // Poses that arrived together with the last ones.
         let mut has_poses = self.read();
         if !has_poses {
             let came = self.advance(clock::now(), timeout.max(Duration::from_millis(1)));
@@ -206,14 +210,14 @@ impl PoseSource for VrpnPoses {
     }
 }
 
-/// Begins to connect; the socket can be written to once it has.
+/// Starts to connect; the socket becomes writable when it is connected.
 fn connect(server: SocketAddr) -> std::io::Result<Socket> {
     let socket = Socket::new(Domain::for_address(server), Type::STREAM, Some(Protocol::TCP))?;
-    // We only listen: without a question now and then a server that lost its power would be silent for ever.
+    // The client only receives: without keep-alives it would not detect a server that lost its power.
     let alive = TcpKeepalive::new().with_time(ALIVE_EVERY).with_interval(ALIVE_EVERY);
     socket.set_tcp_keepalive(&alive)?;
-    // Once a server has ended, its port is held for a minute where the other end says a proper goodbye, and VRPN's own server
-    // cannot be started again on a port that is held. A reset frees it at once; nothing that we send can be lost by it.
+    // After a regular close by the client, the port of an ended server is held for a minute, and VRPN's own
+    // server cannot restart on a held port. A reset frees the port at once; no sent data can be lost by it.
     socket.set_linger(Some(Duration::ZERO))?;
     socket.set_nonblocking(true)?;
     match socket.connect(&server.into()) {
@@ -222,33 +226,33 @@ fn connect(server: SocketAddr) -> std::io::Result<Socket> {
     }
 }
 
-/// Whether a socket is not ready, rather than broken.
+/// Returns whether a socket is not ready yet, instead of broken.
 fn is_early(error: &std::io::Error) -> bool {
     const IN_PROGRESS: i32 = nix::errno::Errno::EINPROGRESS as i32;
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
         || error.raw_os_error() == Some(IN_PROGRESS)
 }
 
-/// Waits until a socket is ready, or broken; returns whether it is.
+/// Waits until a socket is ready or broken; returns whether it is.
 fn wait(socket: &Socket, flags: PollFlags, timeout: Duration) -> bool {
     let ms = timeout.as_micros().div_ceil(1000).min(u128::from(u16::MAX)) as u16;
     let mut sockets = [PollFd::new(socket.as_fd(), flags)];
     poll(&mut sockets, PollTimeout::from(ms)).is_ok_and(|ready| ready > 0)
 }
 
-/// How soon a server that is gone is looked for again: a person restarts it in seconds. [s]
+/// Delay before reconnecting to a server that is gone: a user restarts it within seconds. [s]
 const RETRY_S: f64 = 0.2;
-/// How soon what is no VRPN server is tried again. [s]
+/// Delay before reconnecting to a server that does not speak VRPN. [s]
 const REFUSED_S: f64 = 2.0;
-/// How long a server may take to answer. [s]
+/// Timeout of a connection attempt. [s]
 const CONNECT_S: f64 = 2.0;
-/// How often the system asks a silent server whether it is there; of nine unanswered ones it makes an error.
+/// Interval of TCP keep-alives; after nine without a reply the system reports an error.
 const ALIVE_EVERY: Duration = Duration::from_secs(1);
-/// A hundred frames at 200 Hz. [s]
+/// Silence before a warning: a hundred frames at 200 Hz. [s]
 const SILENCE_S: f64 = 0.5;
-/// The server, or a person at it, takes a while to start. [s]
+/// Silence before the first report: the server, or a user at it, needs time to start. [s]
 const FIRST_SILENCE_S: f64 = 5.0;
-/// How often the loss of a connection is reported. [s]
+/// Minimum time between warnings of lost connections. [s]
 const WARN_EVERY_S: f64 = 5.0;
 const AT_FIRST: &str = "is that the address of the motion capture's computer? enable VRPN in its program, and open TCP 3883 in its firewall";
 const LATER: &str = "is the motion capture live, and its network there?";

@@ -1,8 +1,9 @@
 use super::*;
 use proptest::prelude::*;
 
-/// What a server of VRPN 7.38's own library sent over TCP to a client that began with [`COOKIE`] and said no more: a tracker
-/// "vizflyt" that goes about in a circle at 100 Hz, and a tracker "wasp" whose two sensors stand. The last report is cut.
+/// TCP data sent by a server with the library of VRPN 7.38 to a client that sent only [`COOKIE`]: a tracker
+/// "vizflyt" that moves in a circle at 100 Hz, and a tracker "wasp" with two sensors at rest. The last report
+/// is truncated.
 pub(super) const RECORDED: &[u8] = include_bytes!("recorded.bin");
 
 fn config(settings: &str) -> LocalizationConfig {
@@ -17,7 +18,7 @@ fn at(ms: u64) -> ServerTime {
     ServerTime::from_ns(1_000_000_000 + ms * 1_000_000)
 }
 
-/// Gives bytes to a stream; returns all poses that come out.
+/// Passes bytes to a stream; returns all resulting poses.
 fn poses_of(stream: &mut VrpnStream, now: ServerTime, bytes: &[u8]) -> Vec<Measurement> {
     let mut found = Vec::new();
     stream.handle_bytes(now, bytes);
@@ -47,7 +48,7 @@ fn described(number: i32, kind: i32, name: &str) -> Vec<u8> {
     message(5, number, kind, &body)
 }
 
-/// The beginning of a server that has these senders.
+/// Returns the first messages of a server with these senders.
 pub(super) fn beginning(senders: &[(&str, i32)]) -> Vec<u8> {
     let mut bytes = COOKIE.to_vec();
     bytes.extend(
@@ -70,14 +71,14 @@ fn warnings(stream: &mut VrpnStream) -> Vec<String> {
 }
 
 #[test]
-fn what_a_real_server_sent_is_read() {
+fn reads_a_recording_of_a_real_server() {
     let mut s = stream("");
     let found = poses_of(&mut s, at(5000), RECORDED);
     let of = |vehicle| found.iter().filter(move |pose| pose.vehicle == vehicle);
     assert_eq!((of(0).count(), of(1).count()), (11, 10));
     assert!(found.iter().all(|pose| pose.source == 3));
     for pose in of(0) {
-        // It goes about (1, -2) at 1 m, its x axis turned by half the angle of its place.
+        // It moves around (1, -2) with a radius of 1 m, its x axis turned by half the angle of its position.
         let from_middle = pose.world_from_body.translation_m - DVec3::new(1.0, -2.0, 0.5);
         assert!((from_middle.length() - 1.0).abs() < 1e-9, "{from_middle}");
         assert!((pose.world_from_body.rotate(DVec3::X) - from_middle).length() < 1e-9);
@@ -87,7 +88,7 @@ fn what_a_real_server_sent_is_read() {
         let q = DQuat::from_xyzw(0.5, 0.5, 0.5, 0.5);
         assert!(pose.world_from_body.rotation.dot(q).abs() > 1.0 - 1e-12);
     }
-    // All came at once, and of the server's clock nothing was known before.
+    // All arrived at once, and the server's clock was unknown before.
     assert!(found.iter().all(|pose| pose.stamp == at(5000)));
     assert_eq!(warnings(&mut s), Vec::<String>::new());
     assert_eq!(s.described().unwrap(), "'vizflyt', 'wasp'");
@@ -102,18 +103,18 @@ fn what_a_real_server_sent_is_read() {
 }
 
 #[test]
-fn stamps_are_the_servers() {
+fn uses_the_servers_stamps() {
     let mut s = stream("latency_ms=5");
     poses_of(&mut s, at(0), &beginning(&[("vizflyt", 1)]));
-    // A server whose clock is 77 s behind; the second report took 30 ms longer, and is 10 ms younger.
+    // A server whose clock is 77 s behind. The second report took 30 ms longer, and is 10 ms younger.
     let found = poses_of(&mut s, at(100), &report(77_000_000, 1, 0, STANDS));
     assert_eq!((found[0].stamp, found[0].arrival), (at(95), at(100)));
     let found = poses_of(&mut s, at(140), &report(77_010_000, 1, 0, STANDS));
     assert_eq!((found[0].stamp, found[0].arrival), (at(105), at(140)));
-    // Without a stamp it is as old as its arrival.
+    // Without a stamp, the arrival counts.
     let found = poses_of(&mut s, at(200), &report(0, 1, 0, STANDS));
     assert_eq!(found[0].stamp, at(195));
-    // A server that was restarted, its clock set by hours, is believed at once.
+    // A restarted server, with its clock changed by hours, is accepted at once.
     s.begin_connection();
     poses_of(&mut s, at(1000), &beginning(&[("vizflyt", 4)]));
     let found = poses_of(&mut s, at(1010), &report(11, 4, 0, STANDS));
@@ -137,10 +138,10 @@ fn each_batch_has_one_pose_of_a_vehicle() {
 }
 
 #[test]
-fn odd_reports_are_counted_and_named() {
+fn counts_and_reports_invalid_reports() {
     let mut s = stream("");
     poses_of(&mut s, at(0), &beginning(&[("vizflyt", 1)]));
-    // Again and again the same; unseen; a sensor of no interest; a sender that nobody described.
+    // A repeated report; occluded; another sensor; an unknown sender.
     for ms in 0..1500 {
         let found = poses_of(&mut s, at(ms), &report(10, 1, 0, STANDS));
         assert_eq!(found.len(), usize::from(ms == 0));
@@ -158,16 +159,13 @@ fn odd_reports_are_counted_and_named() {
     for (bytes, expected) in [
         (
             report(50, 1, 0, [1.0, 2.0, f64::NAN, 0.0, 0.0, 0.0, 1.0]),
-            "position or rotation that is none",
+            "an invalid position or rotation",
         ),
         (
             report(50, 1, 0, [1.0, 2.0, 1e300, 0.0, 0.0, 0.0, 1.0]),
-            "position or rotation that is none",
+            "an invalid position or rotation",
         ),
-        (
-            report(50, 1, 0, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.5]),
-            "position or rotation that is none",
-        ),
+        (report(50, 1, 0, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.5]), "an invalid position or rotation"),
         (message(50, 1, 9, &[0; 63]), "report of 63 bytes is shorter than 64"),
         (
             message(50, 1, SENDER_DESCRIPTION, &[0, 0, 1, 0, 65, 0]),
@@ -180,14 +178,14 @@ fn odd_reports_are_counted_and_named() {
         assert_eq!(poses_of(&mut s, at(1), &bytes), []);
         let said = warnings(&mut s);
         assert!(said.len() == 1 && said[0].contains(expected), "{said:?}");
-        // What follows is read.
+        // Later messages are parsed.
         assert_eq!(poses_of(&mut s, at(2), &report(60, 1, 0, STANDS)).len(), 1);
         assert_eq!(s.counters(0).bad_packets, 1);
     }
 }
 
 #[test]
-fn others_are_named_once_all_have_reported() {
+fn names_other_trackers_once_all_have_reported() {
     let said_of = |settings: &str| {
         let mut s = stream(settings);
         poses_of(&mut s, at(0), &beginning(&[("ant", 1), ("bee", 2), ("Button0", 3)]));
@@ -212,7 +210,7 @@ fn others_are_named_once_all_have_reported() {
 }
 
 #[test]
-fn a_type_that_is_described_anew_is_followed() {
+fn follows_a_renumbered_type() {
     let mut s = stream("");
     poses_of(&mut s, at(0), &beginning(&[("vizflyt", 1)]));
     poses_of(&mut s, at(1), &described(9, TYPE_DESCRIPTION, "vrpn_Tracker Velocity"));
@@ -224,7 +222,7 @@ fn a_type_that_is_described_anew_is_followed() {
 }
 
 #[test]
-fn what_is_no_vrpn_is_refused() {
+fn rejects_data_that_is_not_vrpn() {
     let begins = |bytes: &[u8]| {
         let mut s = stream("");
         s.handle_bytes(at(0), bytes);
@@ -239,13 +237,13 @@ fn what_is_no_vrpn_is_refused() {
         let bytes = [COOKIE.as_slice(), &length.to_be_bytes()].concat();
         assert_eq!(begins(&bytes), Err(VrpnError::Length(length)));
     }
-    // The longest there may be waits for its end.
+    // The longest valid message waits for its end.
     let bytes = [COOKIE.as_slice(), &(24 + 64_000u32).to_be_bytes(), &vec![0; 60_000]].concat();
     assert_eq!(begins(&bytes), Ok(false));
 }
 
 #[test]
-fn senders_without_end_are_not_remembered() {
+fn limits_the_number_of_senders() {
     let mut s = stream("");
     let mut bytes = COOKIE.to_vec();
     for number in 0..3000 {
@@ -256,9 +254,9 @@ fn senders_without_end_are_not_remembered() {
 }
 
 proptest! {
-    /// However the network cuts it, the recorded stream has the same poses.
+    /// The recorded stream gives the same poses for any segmentation.
     #[test]
-    fn cuts_change_nothing(cuts in prop::collection::vec(1usize..300, 14..60)) {
+    fn segmentation_does_not_change_the_poses(cuts in prop::collection::vec(1usize..300, 14..60)) {
         let mut s = stream("");
         let (mut rest, mut count) = (RECORDED, 0);
         for cut in cuts.iter().cycle() {
@@ -274,7 +272,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..600), greeted in any::<bool>()) {
+    fn any_bytes_parse_or_fail_cleanly(bytes in prop::collection::vec(any::<u8>(), 0..600), greeted in any::<bool>()) {
         let mut s = stream("");
         if greeted {
             poses_of(&mut s, at(0), &beginning(&[("vizflyt", 1)]));
@@ -285,9 +283,9 @@ proptest! {
         }
     }
 
-    /// Any one byte of a real stream changed: what comes out is valid, and not from the future.
+    /// After a change of any byte of a real stream, the resulting poses are valid and not in the future.
     #[test]
-    fn poses_that_come_out_are_valid(index in 0..RECORDED.len(), value in any::<u8>()) {
+    fn returned_poses_are_valid(index in 0..RECORDED.len(), value in any::<u8>()) {
         let mut s = stream("");
         let mut bytes = RECORDED.to_vec();
         bytes[index] = value;
@@ -300,7 +298,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_written_is_read(p in prop::array::uniform3(-50.0..50.0f64), q in prop::array::uniform4(-1.0..1.0f64), stamp_us in 1u64..4_000_000_000_000_000) {
+    fn reads_back_written_reports(p in prop::array::uniform3(-50.0..50.0f64), q in prop::array::uniform4(-1.0..1.0f64), stamp_us in 1u64..4_000_000_000_000_000) {
         prop_assume!(q.iter().map(|v| v * v).sum::<f64>() > 1e-2);
         let q = DQuat::from_array(q).normalize();
         let mut s = stream("");

@@ -1,5 +1,5 @@
-//! Set-ups of labs, streamed by a generator that shares nothing with our settings: plain matrices, its own
-//! quaternions, JSON text; read by the driver, and judged by the check.
+//! Lab set-ups, streamed by a generator that is independent of the settings' code: plain matrices, own
+//! quaternions, JSON text. The driver reads them, and the check judges them.
 
 use std::fmt::Write;
 
@@ -13,7 +13,7 @@ type Matrix = [[f64; 3]; 3];
 
 /// x east, y north, z up; or x forward, y left, z up.
 const SAME_AXES: Matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-/// Motive's room, as its coordinates follow from ours: x, z, -y.
+/// Motive's room axes from ours: x, z, -y.
 const Y_UP: Matrix = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]];
 /// North, east, down.
 const NED: Matrix = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]];
@@ -21,10 +21,10 @@ const NED: Matrix = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]];
 const FRD: Matrix = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]];
 /// Left-handed: y the other way.
 const MIRROR: Matrix = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]];
-/// Unity: x right, y up, z forward of a body; a room laid alike.
+/// Unity: x right, y up, z forward of a body; the same for the room.
 const UNITY: Matrix = [[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]];
 
-/// How four numbers are written.
+/// Order of a quaternion's numbers.
 #[derive(Clone, Copy, Debug)]
 enum Order {
     Xyzw,
@@ -33,17 +33,17 @@ enum Order {
     WxyzInverse,
 }
 
-/// A lab.
+/// Set-up of a lab.
 #[derive(Clone, Copy)]
 struct Setup {
-    /// Coordinates of the room as streamed, from ours.
+    /// Streamed room coordinates from ours.
     stream_from_world: Matrix,
-    /// Coordinates of the object, from forward, left, up.
+    /// Object coordinates from forward, left, up.
     object_from_flu: Matrix,
-    /// The object's x is so far clockwise of the nose, seen from above. [deg]
+    /// Angle of the object's x axis, clockwise from the nose, seen from above. [deg]
     nose_deg: f64,
     order: Order,
-    /// Numbers streamed for a metre.
+    /// Streamed units per metre.
     per_m: f64,
 }
 
@@ -63,25 +63,25 @@ fn transposed(a: &Matrix) -> Matrix {
     std::array::from_fn(|i| std::array::from_fn(|j| a[j][i]))
 }
 
-/// About z, to the left. [rad]
+/// Rotation about z, to the left. [rad]
 fn yawed(rad: f64) -> Matrix {
     let (s, c) = rad.sin_cos();
     [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
 }
 
-/// About y, its nose up. [rad]
+/// Rotation about y, nose up. [rad]
 fn pitched(rad: f64) -> Matrix {
     let (s, c) = rad.sin_cos();
     [[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]]
 }
 
-/// About x, its left side up. [rad]
+/// Rotation about x, left side up. [rad]
 fn rolled(rad: f64) -> Matrix {
     let (s, c) = rad.sin_cos();
     [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]
 }
 
-/// x, y, z, w of a rotation's matrix (Shepperd).
+/// Returns x, y, z, w of a rotation matrix (Shepperd).
 fn quaternion(m: &Matrix) -> [f64; 4] {
     let trace = m[0][0] + m[1][1] + m[2][2];
     let squared = [m[0][0], m[1][1], m[2][2], trace].map(|d| 1.0 + 2.0 * d - trace);
@@ -103,7 +103,8 @@ fn quaternion(m: &Matrix) -> [f64; 4] {
 }
 
 impl Setup {
-    /// Returns a packet of a vehicle at a place [m], with this attitude (forward, left, up to east, north, up).
+    /// Returns a packet of a vehicle at a position [m], with this attitude (forward, left, up to east, north,
+    /// up).
     fn packet(&self, p_m: [f64; 3], world_from_flu: &Matrix) -> String {
         let to = &self.stream_from_world;
         let p: [f64; 3] =
@@ -122,8 +123,8 @@ impl Setup {
     }
 }
 
-/// What a person does, from a start that looks along `yaw_rad`: places and attitudes, 50 a second. The hand is
-/// no machine: it pushes 4 degrees off, and tilts a little.
+/// Motions of the user, starting with heading `yaw_rad`: positions and attitudes at 50 Hz. The hand is not
+/// exact: it pushes 4 degrees off, and tilts a little.
 fn carried(yaw_rad: f64) -> Vec<([f64; 3], Matrix)> {
     // Up [m], ahead [m], left [rad], nose up [rad], left side up [rad]
     let held: [[f64; 5]; 6] = [
@@ -141,7 +142,7 @@ fn carried(yaw_rad: f64) -> Vec<([f64; 3], Matrix)> {
             let share = (f64::from(tick) / 60.0).min(1.0);
             let [up, ahead, left, nose, side] =
                 std::array::from_fn(|i| before[i] + (now[i] - before[i]) * share);
-            // A tremor, the same in every run. [m]
+            // Tremor, the same in every run. [m]
             let shake = [tick * 7 % 5, tick * 3 % 7, tick % 3].map(|v| f64::from(v) * 2e-4);
             let (sin, cos) = (yaw_rad + 0.07).sin_cos();
             let p_m = [1.0 + cos * ahead + shake[0], sin * ahead + shake[1] - 2.0, up + shake[2]];
@@ -158,8 +159,8 @@ fn read(stream: &mut JsonStream, tick: usize, packet: &str) -> Pose<World, Body>
     stream.handle_packet(now, packet.as_bytes())[0].world_from_body
 }
 
-/// Carries a vehicle of a lab before a server with these settings; returns the steps that it took, and what was
-/// found.
+/// Runs the check for a vehicle of a lab on a server with these settings; returns the number of steps, and the
+/// diagnosis.
 fn look(setup: &Setup, set: &str, yaw_rad: f64) -> (usize, Diagnosis) {
     let config = LocalizationConfig::parse(set).unwrap();
     let mut stream = JsonStream::new(&config, 0, &["v"]);
@@ -172,8 +173,8 @@ fn look(setup: &Setup, set: &str, yaw_rad: f64) -> (usize, Diagnosis) {
     (check.rests.len(), check.diagnosis())
 }
 
-/// Whether the settings make the vehicle's true attitudes of a stream, but for a turn about up, the same for
-/// all; the nose to within `nose_deg`.
+/// Returns whether the settings give the true attitudes of a stream, except for one common rotation about the
+/// vertical axis; the nose within `nose_deg`.
 fn is_true(setup: &Setup, set: &str, nose_deg: f64) -> bool {
     let config = LocalizationConfig::parse(set).unwrap();
     let mut stream = JsonStream::new(&config, 0, &["v"]);
@@ -185,7 +186,7 @@ fn is_true(setup: &Setup, set: &str, nose_deg: f64) -> bool {
         let pose = read(&mut stream, step as usize, &setup.packet(p_m, &truth));
         let up: [f64; 3] = std::array::from_fn(|i| truth[i][2]);
         let ahead: [f64; 3] = std::array::from_fn(|i| truth[i][0]);
-        // Up is exact in its height; where it points over the floor shows the turn.
+        // The height is compared exactly; the direction in the floor plane gives the rotation.
         let found_up = pose.rotate(DVec3::Z);
         let found_ahead = pose.rotate(DVec3::X);
         if (found_up.z - up[2]).abs() > 1e-6
@@ -196,7 +197,7 @@ fn is_true(setup: &Setup, set: &str, nose_deg: f64) -> bool {
         }
         let p = pose.translation_m;
         for (found, truth) in [(found_up, up), (p, p_m)] {
-            // What points up or down points nowhere over the floor.
+            // Vertical directions have no component in the floor plane.
             if truth[0].hypot(truth[1]) > 0.05 {
                 turns.push(wrap_pi(found.y.atan2(found.x) - truth[1].atan2(truth[0])));
             }
@@ -205,7 +206,8 @@ fn is_true(setup: &Setup, set: &str, nose_deg: f64) -> bool {
     turns.iter().all(|turn| wrap_pi(turn - turns[0]).abs() < 1e-6)
 }
 
-/// Looks from many sides: what is found must be that, must leave nothing to find, and must be the truth.
+/// Runs the check from many headings: it must give the expected change, which leaves no further change, and
+/// which is the truth.
 fn check(name: &str, setup: Setup, set: &str, expected: &[(&str, &str)]) {
     for step in 0..12 {
         let yaw_rad = f64::from(step) * 0.52 - 3.0;
@@ -220,7 +222,7 @@ fn check(name: &str, setup: Setup, set: &str, expected: &[(&str, &str)]) {
         assert_eq!(found.change.len(), expected.len(), "{about}");
         for ((key, value), (wanted, like)) in found.change.iter().zip(expected) {
             assert_eq!(key, wanted, "{about}");
-            // A nose is as good as a push.
+            // The nose is as accurate as a push.
             match (value.parse::<f64>(), like.parse::<f64>()) {
                 (Ok(value), Ok(like)) => assert!((value - like).abs() < 10.0, "{about}"),
                 _ => assert_eq!(value, like, "{about}"),
@@ -234,7 +236,7 @@ fn check(name: &str, setup: Setup, set: &str, expected: &[(&str, &str)]) {
 }
 
 #[test]
-fn what_is_right_stays() {
+fn keeps_correct_settings() {
     check("usual", USUAL, "json", &[]);
     check(
         "Motive",
@@ -296,9 +298,9 @@ fn an_autopilots_axes_are_found() {
         &[("body", "frd"), ("quaternion", "wxyz")],
     );
     let ned = Setup { stream_from_world: NED, object_from_flu: FRD, ..USUAL };
-    // North along x, the smallest change: nobody's carrying shows which wall is x.
+    // North along x is the smallest change: the motions do not show which wall is x.
     check("NED", ned, "json", &[("axes", "x-y-z")]);
-    // The same as body = "frd" there.
+    // Equivalent to body = "frd" there.
     check("NED", ned, "json,axes=yx-z", &[("nose", "y")]);
     check("usual", USUAL, "json,body=frd", &[("body", "flu")]);
     let level = Setup { stream_from_world: Y_UP, ..USUAL };

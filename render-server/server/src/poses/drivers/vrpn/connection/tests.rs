@@ -2,7 +2,7 @@ use super::super::tests::{RECORDED, STANDS, beginning, report, stream};
 use super::*;
 use std::net::{TcpListener, TcpStream};
 
-/// Waits for a pose of a source, at most for half a minute.
+/// Waits at most 30 s for a pose of a source.
 fn next_pose(source: &mut VrpnPoses) -> Measurement {
     for _ in 0..300 {
         if let Some(pose) = source.receive(Duration::from_millis(100)).first() {
@@ -12,7 +12,7 @@ fn next_pose(source: &mut VrpnPoses) -> Measurement {
     panic!("no pose came");
 }
 
-/// Waits for the next warning of a source, at most for half a minute.
+/// Waits at most 30 s for the next warning of a source.
 fn next_warning(source: &mut VrpnPoses) -> String {
     for _ in 0..300 {
         source.receive(Duration::from_millis(100));
@@ -23,7 +23,7 @@ fn next_warning(source: &mut VrpnPoses) -> String {
     panic!("no warning came");
 }
 
-/// Accepts a client, and reads how it begins.
+/// Accepts a client, and reads its first bytes.
 fn accept(listener: &TcpListener) -> TcpStream {
     let (mut client, _) = listener.accept().unwrap();
     let mut cookie = [0; 24];
@@ -32,7 +32,7 @@ fn accept(listener: &TcpListener) -> TcpStream {
     client
 }
 
-/// Receives until the server has said that it has a button.
+/// Receives until the server has announced its button.
 fn settle(source: &mut VrpnPoses) {
     for _ in 0..300 {
         source.receive(Duration::from_millis(100));
@@ -44,7 +44,7 @@ fn settle(source: &mut VrpnPoses) {
 }
 
 #[test]
-fn a_server_is_found_lost_and_found_again() {
+fn connects_and_reconnects_to_a_server() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let server = listener.local_addr().unwrap();
     let served = std::thread::spawn(move || {
@@ -70,12 +70,12 @@ fn a_server_is_found_lost_and_found_again() {
         )
     );
     assert_eq!(source.counters(0).poses, 11, "what had come was read to its end");
-    // The very first report of the server that is back is a pose.
+    // The first report after the reconnection gives a pose.
     let back = next_pose(&mut source);
     assert_eq!((back.vehicle, back.stamp), (1, back.arrival));
     let second = served.join().unwrap();
     assert_eq!(source.next_warning(), None);
-    // As if that had come a second ago.
+    // Simulates that it came a second ago.
     source.notice_silence(back.arrival.plus_seconds(1.0));
     assert_eq!(
         source.next_warning().unwrap(),
@@ -89,14 +89,14 @@ fn a_server_is_found_lost_and_found_again() {
 }
 
 #[test]
-fn a_server_that_is_not_there_or_no_vrpn_is_named() {
+fn reports_a_missing_server_and_one_without_vrpn() {
     let listen = || {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let server = listener.local_addr().unwrap();
         (listener, server, VrpnPoses::new(server, stream("")))
     };
     let later = || clock::now().plus_seconds(6.0);
-    // Nobody listens.
+    // No server listens.
     let (listener, server, mut source) = listen();
     drop(listener);
     for _ in 0..300 {
@@ -110,7 +110,7 @@ fn a_server_that_is_not_there_or_no_vrpn_is_named() {
     assert!(warning.starts_with(&format!("vrpn: cannot connect to {server} for ")), "{warning}");
     assert!(warning.contains("refused"), "{warning}");
 
-    // It accepts, and says nothing.
+    // The server accepts, and sends nothing.
     let (listener, server, mut source) = listen();
     let served = std::thread::spawn(move || accept(&listener));
     for _ in 0..300 {
@@ -124,7 +124,7 @@ fn a_server_that_is_not_there_or_no_vrpn_is_named() {
     assert!(warning.starts_with(&format!("vrpn: {server} has not answered for ")), "{warning}");
     drop(served.join().unwrap());
 
-    // It answers, but has no tracker.
+    // The server replies, but has no tracker.
     let (listener, server, mut source) = listen();
     let served = std::thread::spawn(move || {
         let mut client = accept(&listener);
@@ -138,7 +138,7 @@ fn a_server_that_is_not_there_or_no_vrpn_is_named() {
     assert!(warning.contains("it has 'Button0'"), "{warning}");
     drop(served.join().unwrap());
 
-    // It is something else.
+    // The server speaks another protocol.
     let (listener, _, mut source) = listen();
     let served = std::thread::spawn(move || {
         accept(&listener).write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n").unwrap();
