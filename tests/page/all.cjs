@@ -1,4 +1,4 @@
-// All tests of the page, in one process, which share a browser. See `harness.cjs` for the arguments.
+// All tests of the page in one process, which share a browser. Arguments: see `harness.cjs`.
 
 const fs = require("node:fs");
 const path = require("node:path");

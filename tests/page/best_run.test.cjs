@@ -1,4 +1,4 @@
-// The wall's ghost: the best official run, if this screen has watched it from its take-off on.
+// Tests of the wall's ghost: the best official run that this screen has recorded from take-off.
 //
 //   node --test tests/page/best_run.test.cjs
 
@@ -17,7 +17,7 @@ const fly = (all, from_s, to_s) => {
   for (let t_s = from_s; t_s <= to_s; t_s += 0.05) all.watch("bee", t_s, [t_s, 0, 1]);
 };
 
-test("the run that leads is the ghost of those that follow, also on another day", async () => {
+test("the best run is the ghost of later runs, also after a restart", async () => {
   const { BestRun, ghostAt, readGhost } = await best;
   const all = new BestRun(null);
   all.watch("bee", null, [0, 0, 0]);
@@ -31,10 +31,10 @@ test("the run that leads is the ghost of those that follow, also on another day"
   assert.equal(again.take(board([], "1", null)), false);
   assert.ok(Math.abs(ghostAt(again.ghost, 2.03).p_world_m[0] - 2.03) < 1e-6);
   again.take(board([], "2", null));
-  assert.equal(again.ghost, null, "another run leads, whose way nobody has watched");
+  assert.equal(again.ghost, null, "another run is best, without a recorded path");
 });
 
-test("a run that was watched from its middle on, and another vehicle's flight, are no ghost", async () => {
+test("an incomplete recording or another vehicle's flight is not a ghost", async () => {
   const { BestRun } = await best;
   const late = new BestRun(null);
   fly(late, 3, 5);
@@ -47,7 +47,7 @@ test("a run that was watched from its middle on, and another vehicle's flight, a
   assert.equal(former.ghost, null);
 });
 
-test("what was kept and is no ghost is none", async () => {
+test("invalid stored ghosts are ignored", async () => {
   const { readGhost, ghostAt } = await best;
   for (const text of [null, "", "{", "null", "[]", '{"run":1,"team":"a","moments":[]}', '{"run":"1","team":"a","moments":[[1,2,3]]}',
     '{"run":"1","team":"a","moments":[[1,2,3,null]]}', '{"run":"1","team":"a","moments":3}'])

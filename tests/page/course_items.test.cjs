@@ -1,4 +1,4 @@
-// What a drag makes of a course, without a browser.
+// Tests of dragging items of a course, without a browser.
 //
 //   node --test tests/page/course_items.test.cjs
 
@@ -18,13 +18,13 @@ function course() {
 }
 const find = (items, of, key) => items.items(of).find((item) => item.key === key);
 
-test("a gate stands on the floor, its frame about it, whatever is done with it", async () => {
+test("a gate stays on the floor inside its frame after every change", async () => {
   const items = await module_, of = course();
   const key = items.add(of, "gate", [3.02, 1.98], 0.8, 0);
   const [gate] = of.stages, [frame] = of.objects, item = find(items, of, key);
   assert.deepEqual([gate.center_m, items.yawOfGate(gate)], [[3, 2, 1.2], 45]);
   assert.deepEqual([frame.scene, frame.position_m, frame.yaw_deg], ["models/gate-120x100-orange.ply", [3, 2, 1.2], 45]);
-  assert.ok(!items.items(of).some(({ kind }) => kind === "object"), "its frame is no item of its own");
+  assert.ok(!items.items(of).some(({ kind }) => kind === "object"), "its frame is not a separate item");
   items.drag(of, item, "move", [4.013, 2, 0.62]);
   assert.deepEqual(gate.center_m, [4, 2, 0.56], "a bar above the floor");
   items.drag(of, item, "move", [4.013, 2, 0.62], { free: true });
@@ -42,7 +42,7 @@ test("a gate stands on the floor, its frame about it, whatever is done with it",
   assert.deepEqual([of.stages, of.objects], [[], []]);
 });
 
-test("faces of boxes stick to the fence, to the floor and to what is seen, and never meet", async () => {
+test("faces of boxes snap to fence, floor and surfaces, and never meet", async () => {
   const items = await module_, of = course();
   const item = find(items, of, items.add(of, "box", [4, 2], 0, 0));
   const [box] = of.no_fly;
@@ -58,7 +58,7 @@ test("faces of boxes stick to the fence, to the floor and to what is seen, and n
   assert.deepEqual([box.min_m[0], box.max_m[0]].map((value) => Math.round(value * 100)), [690, 700]);
 });
 
-test("points of a path are dragged in the world and kept in the object's frame", async () => {
+test("points of a path are dragged in the world and stored in the object's frame", async () => {
   const items = await module_, of = course();
   const item = find(items, of, items.add(of, "drone", [4, 2], Math.PI / 2, 0));
   const [drone] = of.objects;
@@ -69,7 +69,7 @@ test("points of a path are dragged in the world and kept in the object's frame",
   assert.deepEqual(items.toWorld(drone, [1, 0, 0]).map((value) => Math.round(value * 1000) / 1000), [4, 3, 1.2]);
 });
 
-test("names are not used twice, and one goal is enough", async () => {
+test("names are unique, and there is at most one goal", async () => {
   const items = await module_, of = course();
   for (const kind of ["gate", "gate", "pillar", "pillar", "box", "goal"]) items.add(of, kind, [2, 2], 0, 0);
   const names = items.items(of).map(({ name }) => name);
@@ -78,18 +78,18 @@ test("names are not used twice, and one goal is enough", async () => {
   assert.equal(of.goal, null);
 });
 
-test("the pointer's ray meets what the picture shows there", async () => {
+test("the pointer's ray hits the surface in the image", async () => {
   const items = await module_;
   const request = { p_m: [1, 2, 1.5], yaw_rad: 0.3, pitch_rad: -0.4, fov_deg: 75, width_px: 1440, height_px: 900 };
   const middle = items.ray(request, [0, 0]);
   const floor = items.onLevel(middle, [4, 2, 0]);
   const ahead = 1.5 / Math.tan(0.4);
   assert.ok(Math.hypot(floor[0] - 1 - ahead * Math.cos(0.3), floor[1] - 2 - ahead * Math.sin(0.3)) < 1e-9);
-  assert.equal(items.onLevel(items.ray({ ...request, pitch_rad: 0.4 }, [0, 0]), [4, 2, 0]), null, "above the horizon is no floor");
-  // At the right edge of the picture the ray is half the view to the right.
+  assert.equal(items.onLevel(items.ray({ ...request, pitch_rad: 0.4 }, [0, 0]), [4, 2, 0]), null, "no floor above the horizon");
+  // At the right edge of the image the ray is half the field of view to the right.
   const { way } = items.ray({ ...request, pitch_rad: 0 }, [0.5, 0]);
   assert.ok(Math.abs(Math.atan2(way[1], way[0]) - (0.3 - (37.5 * Math.PI) / 180)) < 1e-9);
-  // A gate at the height of the eye is moved across the view.
+  // A gate at the height of the camera is moved sideways.
   const level = items.onLevel(items.ray({ ...request, yaw_rad: 0, pitch_rad: 0 }, [0.25, 0.1]), [5, 2, 1.5]);
   assert.ok(Math.abs(level[0] - 5) < 1e-9 && level[1] < 1 && level[2] === 1.5, String(level));
   const post = items.onLine(middle, [floor[0], floor[1], 3], [0, 0, 1]);

@@ -1,4 +1,4 @@
-// Events that come again and again are one line with a count.
+// Tests of grouping: repeated events are one line with a count.
 //
 //   node --test tests/page/event_groups.test.cjs
 
@@ -10,7 +10,7 @@ const test = require("node:test");
 const source = fs.readFileSync(path.join(__dirname, "../../render-server/server/src/web/page/event_groups.js"));
 const groups = import(`data:text/javascript;base64,${source.toString("base64")}`);
 
-test("the same event is one line, also where others came between; what differs is not", async () => {
+test("equal events are one line, even with others in between; different events are not", async () => {
   const { EventGroups } = await groups;
   const all = new EventGroups();
   const first = all.add("bad", "pose lost", 1);
@@ -22,7 +22,7 @@ test("the same event is one line, also where others came between; what differs i
   assert.notEqual(all.add("", "gate 1", 6), all.add("good", "gate 1", 7), "another colour");
 });
 
-test("what the runtime counts itself is the same whatever its numbers are", async () => {
+test("events with a count of the runtime are equal despite other numbers", async () => {
   const { EventGroups } = await groups;
   const all = new EventGroups();
   const first = all.add("warn", "an answer took 72 ms of 60 ms (1 so far)", 1);
@@ -30,7 +30,7 @@ test("what the runtime counts itself is the same whatever its numbers are", asyn
   assert.notEqual(all.add("warn", "a packet is refused (2 so far)", 3), first);
 });
 
-test("a line that many others have followed stays where it is", async () => {
+test("a line that is followed by many others keeps its place", async () => {
   const { EventGroups } = await groups;
   const all = new EventGroups();
   const first = all.add("", "takes off", 0);

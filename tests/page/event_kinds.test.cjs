@@ -1,4 +1,4 @@
-// Which stages a flight has passed, by the events that a page is told of.
+// Tests of the stages that a flight has passed, by the events of the server.
 //
 //   node --test tests/page/event_kinds.test.cjs
 
@@ -10,7 +10,7 @@ const test = require("node:test");
 const source = fs.readFileSync(path.join(__dirname, "../../render-server/server/src/web/page/event_kinds.js"));
 const kinds = import(`data:text/javascript;base64,${source.toString("base64")}`);
 
-test("the stages of an earlier flight end with the next take-off", async () => {
+test("stages of an earlier flight are dropped at the next take-off", async () => {
   const { notePassed } = await kinds;
   const stage = (index) => ({ kind: { stage: { index, name: "gate" } } });
   const passed = new Set();

@@ -1,4 +1,4 @@
-// Several vehicles on the page: their tracks by flights, and where they are between two messages.
+// Tests of several vehicles on the page: tracks by flight, and positions between two messages.
 //
 //   node --test tests/page/fleet.test.cjs
 
@@ -12,7 +12,7 @@ const fleet = import(`data:text/javascript;base64,${source.toString("base64")}`)
 const poseAt = (x, age_s = 0) => ({ p_world_m: [x, 0, 1], v_world_mps: [2, 0, 0], rotation: [0, 0, 0, 1], yaw_rad: 0, age_s });
 const line = (name, pose, flight_s) => ({ name, phase: "flying", pose, flight_s });
 
-test("a track goes on from what the server sent, and begins anew with the next flight", async () => {
+test("a track continues the server's, and restarts with the next flight", async () => {
   const { Fleet } = await fleet;
   const all = new Fleet();
   all.setTrack("bee", [[0, 0, 1, 0]]);
@@ -23,7 +23,7 @@ test("a track goes on from what the server sent, and begins anew with the next f
   assert.deepEqual(all.others[0].track.map(([x]) => x), [3]);
 });
 
-test("a vehicle goes on at its speed for a tenth of a second, and from an old pose not at all", async () => {
+test("a vehicle's position is extrapolated for 0.1 s, and not from an old pose", async () => {
   const { movedOn, received } = await fleet;
   assert.deepEqual(movedOn(received(poseAt(1), 1000), 1050), [1.1, 0, 1]);
   assert.deepEqual(movedOn(received(poseAt(1), 1000), 9000), [1.2, 0, 1]);

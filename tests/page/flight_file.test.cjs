@@ -1,4 +1,4 @@
-// Flights as files, without a browser: what is written is read, and what is no flight is refused in words.
+// Tests of flights as files, without a browser: written files can be read, invalid files are rejected with a reason.
 //
 //   node --test tests/page/flight_file.test.cjs
 
@@ -25,7 +25,7 @@ async function flight() {
   return recording;
 }
 
-test("what is written is read", async () => {
+test("reads written flights", async () => {
   const { writeFlight, readFlight } = await file, recording = await flight();
   const { recording: read, about } = readFlight(writeFlight(recording, ABOUT));
   assert.deepEqual(about, ABOUT);
@@ -35,7 +35,7 @@ test("what is written is read", async () => {
   assert.deepEqual(read.track()[2], [2, 2, 1, 1]);
 });
 
-test("what is no flight is refused in words", async () => {
+test("rejects invalid files with a reason", async () => {
   const { writeFlight, readFlight } = await file;
   const good = JSON.parse(writeFlight(await flight(), ABOUT));
   const refused = (change, words) => {
@@ -56,7 +56,7 @@ test("what is no flight is refused in words", async () => {
   refused((bad) => (bad.moments[0][6][0].q_xyzw = "turned"), /moment 0 is wrong: no list/);
 });
 
-test("any change of a file is read as a flight or refused", async () => {
+test("any changed file is read as a flight or rejected", async () => {
   const { writeFlight, readFlight } = await file;
   const text = writeFlight(await flight(), ABOUT);
   let seed = 1;

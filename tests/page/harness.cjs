@@ -1,5 +1,5 @@
-// What the tests of the page share: a browser, pages that note their faults, a program or a recorded server, and what is looked
-// at on every page.
+// Shared by the tests of the page: a browser, pages that record their faults, a program or a recorded server, and
+// checks of every page.
 //
 //   node all.cjs [--shots DIR] [--real | --record] [--only NAME]... VIZFLYT
 //   node tests/NAME.cjs [...as above]
@@ -22,35 +22,35 @@ const { values: options, positionals: [vizflyt] } = parseArgs({
     real: { type: "boolean", default: false }, record: { type: "boolean", default: false },
   },
 });
-/** After a failure, a page that does not answer is given up after this. [ms] */
+/** Timeout of a page that does not answer after a failure. [ms] */
 const EXPLAIN_MS = 10_000;
-/** Finds barriers; run in the page. */
+/** Script that finds accessibility barriers; run in the page. */
 const axe = fs.readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
 const executablePath = process.env.CHROMIUM ?? ["/usr/bin/chromium", "/usr/bin/chromium-browser"].find(fs.existsSync);
 const SIZES = { laptop: [1440, 900], phone: [390, 844], projector: [1920, 1080] };
-/** Its sandbox wants rights that a container lacks; WebGL without a card is drawn in software. */
+/** Chromium's sandbox needs rights that a container lacks; WebGL without a graphics card is drawn in software. */
 const CHROMIUM_ARGS = ["--no-sandbox", "--enable-unsafe-swiftshader"];
-/** How `misbehave` flies the race past the gap, into the wall's middle: straight on, it would miss or meet the edge of a post. */
+/** Arguments of `misbehave` that fly past the race's gap into the middle of the wall: straight on, it would miss, or hit the edge of a post. */
 const INTO_THE_WALL = "world:1:-0.16";
 
 if (options.shots) fs.mkdirSync(options.shots, { recursive: true });
 
-/** The browser that all tests share. */
+/** Browser that all tests share. */
 let shared = null;
 const launch = (...args) => chromium.launch({ executablePath, args: args.length ? args : CHROMIUM_ARGS, timeout: PATIENCE_MS });
 after(async () => (await shared)?.close());
 
-/** One test: its folder, its processes, its pages. */
+/** One test with its folder, processes and pages. */
 class Fixture {
   constructor(name) {
     this.name = name;
     this.scratch = fs.mkdtempSync(path.join(os.tmpdir(), `vizflyt-page-${name}-`));
-    // A plugin sees its own folder alone, as nobody.
+    // A plugin runs as the user nobody, and can read only its own folder.
     fs.chmodSync(this.scratch, 0o755);
     this.program = new Program(vizflyt);
     this.pages = [];
     this.browsers = [];
-    /** Requests of the pages that change something, in their order. */
+    /** Requests of the pages that change something, in order. */
     this.orders = [];
     this.waiting = new Set();
     this.recorder = null;
@@ -68,7 +68,7 @@ class Fixture {
     return this.program.command(...args);
   }
 
-  /** Starts a server with all that listens on free ports of this computer; `more` are its other options. */
+  /** Starts a server whose listeners use free ports of this computer; `more` are additional options. */
   async serve(place, ...more) {
     const free = "127.0.0.1:0";
     const server = this.start("serve", place, "--http", free, "--quic", free, "--vicon", free, "--renderer", "cpu",
@@ -81,7 +81,7 @@ class Fixture {
     return { ...server, ...JSON.parse(ready), end };
   }
 
-  /** Starts a demo that waits for its start, without a page of its own; it draws no more than the page shows. */
+  /** Starts a demo that waits for its start, without a page of its own, at most at the page's frame rate. */
   async startDemo(...args) {
     const rate = args.includes("--max-rate") ? [] : ["--max-rate", "30"];
     const demo = this.start("demo", "--headless", "--wait", "--log-dir", this.scratch, ...rate, ...args);
@@ -89,7 +89,7 @@ class Fixture {
     return { ...demo, url };
   }
 
-  /** Makes the race, with cameras whose images are small enough for a recording; returns its arena's file. */
+  /** Generates the race with cameras whose images are small enough for a recording; returns its arena's file. */
   smallRace(name) {
     this.command("scene", "generate", "race", "--force", "-o", this.at(name));
     const file = path.join(this.at(name), "arena.toml");
@@ -98,13 +98,13 @@ class Fixture {
     return file;
   }
 
-  /** A demo in that race; returns its page's address. */
+  /** Starts a demo of that race; returns its page's address. */
   async raceDemo(...args) {
     this.demo = await this.startDemo("--scene", this.smallRace("race"), ...args);
     return this.demo.url;
   }
 
-  /** Makes a plugin that is `misbehave` with these arguments; returns its path. */
+  /** Creates a plugin that is `misbehave` with these arguments; returns its path. */
   plugin(name, ...args) {
     const { misbehave } = this.program;
     assert.ok(fs.existsSync(misbehave), `no ${misbehave}: cargo build --examples`);
@@ -116,12 +116,14 @@ class Fixture {
     return script;
   }
 
-  /** Opens a page in a context of its own, in the shared browser or in `browser`; it notes what it should not do. A `viewer`
-   * is one to whom the server shows less. */
+  /**
+   * Opens a page in a separate context, in the shared browser or in `browser`; it records its faults. A `viewer` is a page to
+   * which the server sends less.
+   */
   async open(url, { browser, viewer, ...more } = {}) {
     shared ??= launch();
     const context = await (browser ?? (await shared)).newContext({ viewport: { width: 1440, height: 900 }, ...this.asViewer(viewer), ...more });
-    // A busy computer takes its time for a page, too.
+    // A busy computer needs longer to open a page.
     context.setDefaultTimeout(PATIENCE_MS);
     const page = await context.newPage();
     this.watch(page, url, viewer);
@@ -129,7 +131,7 @@ class Fixture {
     return page;
   }
 
-  /** Another browser, with other arguments. */
+  /** Starts another browser, with other arguments. */
   async launch(...args) {
     const browser = await launch(...args);
     this.browsers.push(browser);
@@ -147,7 +149,7 @@ class Fixture {
     page.on("pageerror", (error) => page.faults.push(`error: ${error.message}`));
     page.on("request", (request) => {
       const to = new URL(request.url());
-      // With the Internet unplugged all is there: nothing is asked of anyone else.
+      // The page must work without Internet: it may not contact other hosts.
       if (!["blob:", "data:"].includes(to.protocol) && to.host !== new URL(url).host) page.faults.push(`asks ${to.host}`);
       if (request.method() === "GET") return;
       this.orders.push({ order: `${request.method()} ${to.pathname}`, body: request.postData() && request.postDataJSON() });
@@ -156,7 +158,7 @@ class Fixture {
     this.recorder?.watch(page, viewer);
   }
 
-  /** Waits until a page has sent an order, once more than before; returns its body. */
+  /** Waits until a page has sent one more of an order; returns its body. */
   ordered(order) {
     return new Promise((done, fail) => {
       const timer = setTimeout(() => fail(new Error(`no page has sent ${order}, but ${JSON.stringify(this.orders)}`)), PATIENCE_MS);
@@ -177,7 +179,7 @@ class Fixture {
     if (options.shots) await page.screenshot({ path: path.join(options.shots, `${name}.png`) });
   }
 
-  /** Closes a page that has done nothing that it should not do. */
+  /** Closes pages and checks that they have no faults. */
   async finish(...pages) {
     for (const page of pages) {
       assert.deepEqual(page.faults, []);
@@ -185,7 +187,7 @@ class Fixture {
     }
   }
 
-  /** Prints and returns the text and the faults of all pages: they show the cause of a failure. */
+  /** Prints and returns the text and the faults of all pages, which show the cause of a failure. */
   async explain() {
     const lines = [];
     for (const page of this.pages.filter((page) => !page.isClosed())) {
@@ -202,14 +204,14 @@ class Fixture {
     for (const page of this.pages) if (!page.isClosed()) await page.context().close();
     for (const browser of this.browsers) await browser.close();
     await this.program.kill();
-    // Plugins outlive their killed program for a moment, and may still write here.
+    // Plugins survive their killed program for a moment, and may still write here.
     fs.rmSync(this.scratch, { recursive: true, force: true, maxRetries: 10, retryDelay: 100 });
   }
 }
 
 /**
- * A test against a recorded server, or, with --real and --record, against the real one: `real` starts it. What happens on the
- * way is the same: in the recording it is a mark.
+ * A test against a recorded server, or, with --real and --record, against the real one: `real` starts it. Both follow
+ * the same sequence; in the recording, events are marks.
  */
 class RecordedFixture extends Fixture {
   constructor(name, { of = name, what, without }) {
@@ -232,7 +234,7 @@ class RecordedFixture extends Fixture {
     return this.replay && viewer ? { extraHTTPHeaders: { [VIEWER]: viewer } } : {};
   }
 
-  /** Goes on to the moment `name`: with the real server `really` brings it about. Then waits until it is `shown`. */
+  /** Advances to the moment `name`; with the real server, `really` causes it. Then waits until it is `shown`. */
   async event(name, { really = () => {}, shown = () => {} }) {
     if (this.replay) await this.replay.to(name);
     else await really();
@@ -240,7 +242,7 @@ class RecordedFixture extends Fixture {
     this.recorder?.mark(name);
   }
 
-  /** Does something that only a real server needs; returns what comes of it, or nothing. */
+  /** Executes a step that only a real server needs; returns its result, or nothing. */
   async really(act) {
     return this.isReal ? act() : undefined;
   }
@@ -251,7 +253,7 @@ class RecordedFixture extends Fixture {
     await (this.replay ? this.replay.end() : really());
   }
 
-  /** Starts the server anew at the same port: it stands at the moment `mark`. */
+  /** Restarts the server at the same port, at the moment `mark`. */
   async serverReturns(mark, really) {
     if (!this.replay) return really(new URL(this.url).port);
     this.replay = await Replay.start(this.recording, { port: Number(new URL(this.url).port), mark });
@@ -274,12 +276,12 @@ async function run(fixture, body) {
     // The reporter lists it with the error.
     failure.explanation = await fixture.explain();
   }
-  // An error on closing does not hide the one that came first.
+  // An error on closing must not hide the first one.
   await fixture.close().catch((error) => (failure ??= error));
   if (failure) throw failure;
 }
 
-/** A test against the program itself. */
+/** Defines a test against the real program. */
 function serverTest(name, body) {
   if (!isWanted(name) || options.record) return;
   test(name, () => {
@@ -289,9 +291,9 @@ function serverTest(name, body) {
 }
 
 /**
- * A test against recorded messages; `real` starts the program that they are recorded from, and returns the page's address.
- * The recording `of` another test will do where that one comes to the same moments. Answers at addresses that match `without`
- * are left out of a recording.
+ * Defines a test against recorded messages; `real` starts the program that they are recorded from, and returns the
+ * page's address. `of` names another test's recording, if that one reaches the same moments. Answers at addresses that
+ * match `without` are not recorded.
  */
 function recordedTest(name, { real, body, ...about }) {
   if (!isWanted(name) || (options.record && about.of)) return;
@@ -299,12 +301,12 @@ function recordedTest(name, { real, body, ...about }) {
     run(new RecordedFixture(name, about), async (fixture) => {
       await fixture.begin(real);
       await body(fixture);
-      assert.deepEqual(fixture.replay?.unknown ?? [], [], "questions that the recording has no answer to: record it anew");
+      assert.deepEqual(fixture.replay?.unknown ?? [], [], "requests without a recorded answer: record again");
       await fixture.recorder?.write();
     }));
 }
 
-// ---- what is looked at on every page ----
+// ---- checks of every page ----
 
 const text = (page, id) => page.locator(`#${id}`).innerText();
 /** Waits until an element's text matches; the error names both. */
@@ -314,7 +316,7 @@ const until = (page, id, pattern) =>
       throw new Error(`#${id} does not show ${pattern}: ${error.message}`, { cause: error });
     });
 
-/** Everything that can be pressed or filled has a label, and the stop button is in sight. */
+/** Checks that every control has a label, and that the stop button is visible. */
 async function checkAccess(page, size) {
   const nameless = await page.evaluate(() =>
     [...document.querySelectorAll("button, input, select, a[href], canvas, summary")]
@@ -331,7 +333,7 @@ async function checkAccess(page, size) {
   await checkWidth(page, size);
 }
 
-/** Nothing has to be scrolled sideways. */
+/** Checks that nothing requires horizontal scrolling. */
 async function checkWidth(page, what) {
   const over = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
   assert.ok(over <= 0, `${what}: ${over} px too wide`);
@@ -342,7 +344,7 @@ async function resize(page, size) {
   await page.setViewportSize({ width, height });
 }
 
-/** Nothing that axe knows bars anybody from what is open, in the dark or in the light. */
+/** Checks with axe that open parts have no accessibility barriers, in the dark and in the light theme. */
 async function checkBarriers(page, what) {
   await page.evaluate(axe);
   const found = await page.evaluate(async () => {
@@ -359,7 +361,7 @@ async function checkBarriers(page, what) {
   assert.deepEqual(found, [], what);
 }
 
-/** Waits until a canvas shows a picture rather than one colour; the error names the canvas. */
+/** Waits until a canvas shows an image instead of one colour; the error names the canvas. */
 const isPainted = (page, id) =>
   page.waitForFunction((id) => {
     const canvas = document.querySelector(`#${id}`);

@@ -1,4 +1,4 @@
-// Where panels are: kept, moved, closed; whatever a browser has kept, each panel is there once.
+// Tests of the layout: stored, moved and closed panels; with any stored layout, each panel exists once.
 //
 //   node --test tests/page/layout.test.cjs
 
@@ -11,7 +11,7 @@ const source = fs.readFileSync(path.join(__dirname, "../../render-server/server/
 const layout = import(`data:text/javascript;base64,${source.toString("base64")}`);
 const usual = { left: ["map", "figures"], right: ["cameras", "events"], closed: [] };
 
-test("panels move up, down and over, and are kept so", async () => {
+test("panels move up, down and to the other column, and are stored", async () => {
   const { moved, readLayout, toggled } = await layout;
   let now = moved(usual, "events", "up");
   assert.deepEqual(now.right, ["events", "cameras"]);
@@ -33,7 +33,7 @@ test("panels are put before another, in either column", async () => {
   assert.deepEqual(put({ ...usual, closed: ["map"] }, "map", "right").closed, ["map"]);
 });
 
-test("whatever was kept, every panel is there once and no other", async () => {
+test("any stored layout gives every panel once and no other", async () => {
   const { readLayout } = await layout;
   let seed = 1;
   const random = (most) => {

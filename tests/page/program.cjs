@@ -5,7 +5,7 @@ const { spawn, spawnSync } = require("node:child_process");
 const { once } = require("node:events");
 const path = require("node:path");
 
-/** Bounds a test that fails; a passing one waits for an event. [ms] */
+/** Timeout of a failing test; a passing one waits for an event. [ms] */
 const PATIENCE_MS = 120_000;
 
 class Program {
@@ -15,7 +15,7 @@ class Program {
     this.children = [];
   }
 
-  /** Path of the example plugin that fails in the ways it is told. */
+  /** Path of the example plugin that fails in the selected way. */
   get misbehave() {
     return path.join(path.dirname(this.vizflyt), "examples", "misbehave");
   }
@@ -61,15 +61,15 @@ class Program {
     return stdout;
   }
 
-  /** Runs a command to its end, whatever its exit status. */
+  /** Runs a command to its end, with any exit status. */
   run(...args) {
     return spawnSync(this.vizflyt, args, { encoding: "utf8" });
   }
 
-  /** Kills all that still runs, and waits until it has ended. */
+  /** Kills all running processes, and waits until they have ended. */
   async kill() {
     for (const child of this.children.splice(0)) {
-      // One that could not be started has no end either.
+      // A process that could not be started does not end.
       if (!child.pid || child.exitCode !== null || child.signalCode !== null) continue;
       const ended = once(child, "exit");
       child.kill("SIGKILL");

@@ -1,12 +1,12 @@
-// Records what a real server sends a page: see `replay.cjs` for the format. Kept small: of states one a second and those that
-// differ, of images the first and those at marks, of answers the last one before each mark.
+// Records the data that a real server sends to a page; format: see `replay.cjs`. To keep files small, it records one
+// state per second and changed ones, the first images and those at marks, and the last answer before each mark.
 
 const fs = require("node:fs");
 const { pageFile, recordingFile } = require("./replay.cjs");
 
-/** Between two states that say the same. [ms] */
+/** Minimum interval of equal states. [ms] */
 const STATE_EVERY_MS = 1000;
-/** Longer answers are left out: parts of a twin. [bytes] */
+/** Maximum recorded answer; parts of a twin are longer. [bytes] */
 const MAX_ANSWER = 150_000;
 
 class Recorder {
@@ -18,9 +18,9 @@ class Recorder {
     this.records = [];
     /** Sockets by vehicle: two pages may watch the same one. */
     this.sources = new Map();
-    /** Newest state, and the newest image by kind and camera, of each vehicle, that is not in the recording. */
+    /** Newest state of each vehicle, and newest image by kind and camera, that are not recorded yet. */
     this.pending = new Map();
-    /** Of each vehicle: what its last recorded state says, and when. */
+    /** Last recorded state of each vehicle, and its time. */
     this.states = new Map();
     this.reading = new Set();
     this.isOver = false;
@@ -35,10 +35,10 @@ class Recorder {
     return Math.round(performance.now() - this.began);
   }
 
-  /** Records what a page receives, as the page of a `viewer`, if the server makes a difference. */
+  /** Records the data that a page receives, as the page of a `viewer` if its answers differ. */
   watch(page, viewer) {
     const own = new Set();
-    // Sockets of a page that has gone elsewhere do not always report their end.
+    // Sockets of a page that has navigated do not always report their end.
     page.on("framenavigated", (frame) => {
       if (frame !== page.mainFrame()) return;
       for (const [key, socket] of this.sources) if (own.has(socket)) this.sources.delete(key);
@@ -99,13 +99,13 @@ class Recorder {
     // The page has not read it either.
     if (!bytes) record.is_unread = true;
     else if (bytes.length > MAX_ANSWER || this.without?.test(url.pathname)) record.left_out = bytes.length;
-    // What is recorded is no secret, though it opens nothing any more.
+    // Recordings contain no token, not even an expired one.
     else if (kind?.startsWith("application/json")) record.json = JSON.parse(text, (key, value) => (key === "token" && value ? "recorded" : value));
     else if (!kind || kind.startsWith("text/")) record.text = text;
     else record.base64 = bytes.toString("base64");
   }
 
-  /** Names this moment, with the newest state and images. */
+  /** Names this moment, and records the newest state and images. */
   mark(name) {
     for (const [key, record] of this.pending) {
       if (record) this.add({ t_ms: this.t_ms, ...record });
@@ -115,14 +115,14 @@ class Recorder {
     this.add({ t_ms: this.t_ms, mark: name });
   }
 
-  /** The server ends: what a page receives later belongs to another one. */
+  /** Ends the recording: later data comes from another server. */
   end() {
     this.isOver = true;
   }
 
   async write() {
     await Promise.all(this.reading);
-    // Between two marks only the last answer to a question counts.
+    // Between two marks, only the last answer to a request counts.
     const later = new Set();
     const isNeeded = ({ mark, get, viewer }) => {
       if (mark) later.clear();

@@ -1,5 +1,5 @@
-// The recordings that the tests of the page replay: each message and answer is of the type that a server sends today, by
-// `messages.d.ts`, which a test of the server writes from its own types. A recording that is not is to be made anew.
+// Tests of the recordings that the tests of the page replay: each message and answer has the type that the server sends
+// today, by `messages.d.ts`, which a test of the server generates. An outdated recording must be recorded again.
 //
 //   node --test tests/page/recordings.test.cjs
 
@@ -11,25 +11,25 @@ const { test } = require("node:test");
 
 const root = path.join(__dirname, "../..");
 const folder = path.join(__dirname, "recordings");
-/** All of them together; they are in everybody's clone. [bytes] */
+/** Maximum size of all recordings, because they are in every clone. [bytes] */
 const MAX_TOTAL = 1_200_000;
-/** Types of answers, by what their paths match; `messages.d.ts` has one for each. */
+/** Types of answers by path, as in `messages.d.ts`. */
 const ANSWERS = [
   [/^\/api\/session$/, "Session"], [/^\/api\/vehicles$/, "VehicleLine[]"], [/^\/api\/vehicles\/[^/]+\/crash$/, "CrashCard"],
   [/^\/api\/vehicles\/[^/]+\/sensors$/, "SensorLine[]"], [/^\/api\/scenes$/, "SceneChoice"], [/^\/api\/environment$/, "Environment"],
   [/^\/api\/pairing$/, "Pairing"], [/^\/api\/lab$/, "LabDay"], [/^\/api\/leaderboard$/, "Leaderboard"], [/^\/api\/stats$/, "Stats"],
 ];
-/** Types of messages, by their own word. */
+/** Types of messages by their tag. */
 const MESSAGES = { arena: "Arena", cameras: "Cameras", track: "Track", events: "Events", state: "State" };
 
-/** Returns what values of the same type have in common: most states say the same. */
+/** Returns the shape of a value; most states have the same. */
 function shape(value) {
   if (value === null || typeof value !== "object") return value === null ? "null" : typeof value;
   if (Array.isArray(value)) return `[${[...new Set(value.map(shape))].sort()} ${Math.min(value.length, 5)}]`;
   return `{${Object.entries(value).map(([key, one]) => `${key}: ${shape(one)}`).sort()}}`;
 }
 
-/** Returns the type of what a record holds as JSON, and that; null if it holds none. */
+/** Returns the type and value of a record's JSON; null without JSON. */
 function typed({ message, get, json }) {
   if (message) return [MESSAGES[message.type], message];
   if (!get || json === undefined) return null;
@@ -37,7 +37,7 @@ function typed({ message, get, json }) {
   return [type, json];
 }
 
-test("recordings are of today's messages", () => {
+test("recordings match the current types of messages", () => {
   const target = path.join(root, "target/page/recorded");
   fs.mkdirSync(target, { recursive: true });
   const types = path.relative(target, path.join(root, "render-server/server/src/web/page/messages"));
@@ -59,12 +59,12 @@ test("recordings are of today's messages", () => {
   const options = { strict: true, noEmit: true, target: "es2024", module: "esnext", moduleResolution: "bundler", types: [] };
   fs.writeFileSync(path.join(target, "tsconfig.json"), JSON.stringify({ compilerOptions: options, include: ["recorded.ts"] }));
   const { status, stdout } = spawnSync(path.join(root, "target/page/node_modules/.bin/tsc"), ["--project", target], { encoding: "utf8" });
-  // Of what does not fit only where it is: the lines are long.
+  // Report only the places of type errors: the lines are long.
   const faults = stdout.split("\n").filter(Boolean).slice(0, 10).map((fault) => {
     const line = fault.match(/recorded\.ts\((\d+),/)?.[1];
     return `${line ? lines[line - 1].match(/\/\/ (\S+)$/)?.[1] : ""} ${fault}`.slice(0, 400);
   });
-  assert.equal(status, 0, `what is recorded is not what the server sends today; record it anew (tests/page/run --record):\n${faults.join("\n")}`);
+  assert.equal(status, 0, `the recordings do not match the current server; record them again (tests/page/run --record):\n${faults.join("\n")}`);
 });
 
 test("recordings stay small", () => {

@@ -1,7 +1,8 @@
-// A recorded server: serves the page's own files, and sends the messages and answers that a real server once sent. Its clock
-// stands still between two calls of `to`, so nothing races with the page; the newest state is repeated meanwhile.
+// A recorded server: serves the page's own files, and sends the recorded messages and answers of a real server. Its
+// clock stands still between two calls of `to`, so that no test depends on timing; in between, it repeats the newest
+// state.
 //
-// A recording is lines of JSON, in the order of time, after a first line about the whole:
+// A recording consists of lines of JSON, ordered by time, after a first line that describes it:
 //
 //   {"t_ms": 12, "vehicle": "wasp", "message": {"type": "state", ...}}           a text message of the WebSocket
 //   {"t_ms": 12, "vehicle": "wasp", "image": [0, 0], "jpeg": "..."}              a binary one: kind, camera, JPEG (base64)
@@ -17,13 +18,13 @@ const { WebSocketServer } = require("ws");
 
 const PAGE = path.join(__dirname, "../../render-server/server/src/web/page");
 const RECORDINGS = path.join(__dirname, "recordings");
-/** Paths that are served under another name: `web/routes.rs`. */
+/** Paths that are served under another name, as in `web/routes.rs`. */
 const DOCUMENTS = { "/": "/index.html", "/wall": "/wall.html", "/lab": "/lab.html" };
-/** Kinds of files that are served: `build.rs`, `web/routes.rs`. */
+/** Content types of files, as in `build.rs` and `web/routes.rs`. */
 const KINDS = {
   ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".svg": "image/svg+xml",
 };
-/** As `web/mod.rs`; the test `files` compares them with those of the real server. */
+/** Headers, as in `web/http.rs`; the test `files` compares them with those of the real server. */
 const GUARDS = {
   "content-security-policy":
     "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -32,9 +33,9 @@ const GUARDS = {
   "referrer-policy": "no-referrer",
   "cache-control": "no-cache",
 };
-/** Header by which a page says which viewer of the recording it is. */
+/** Header with the recorded viewer that a page plays. */
 const VIEWER = "x-recorded-viewer";
-/** As a real server, it repeats the newest state. [ms] */
+/** Interval at which the newest state is repeated, as by a real server. [ms] */
 const STATE_EVERY_MS = 100;
 /** Close code: the server restarts (RFC 6455, IANA's registry). */
 const RESTART = 1012;
@@ -57,7 +58,7 @@ function pagePaths() {
 
 const recordingFile = (name) => path.join(RECORDINGS, `${name}.jsonl`);
 
-/** Reads a recording: what is said of it, and its records. */
+/** Reads a recording: its description and its records. */
 function readRecording(name) {
   const [about, ...records] = fs.readFileSync(recordingFile(name), "utf8").trimEnd().split("\n").map((line) => JSON.parse(line));
   return { about, records };
@@ -72,15 +73,15 @@ function body({ json, text, base64 }) {
 class Replay {
   constructor(name) {
     this.records = readRecording(name).records;
-    /** So many records have happened. */
+    /** Number of records that have happened. */
     this.now = 0;
-    /** Answers up to here are there: an order takes effect at once. */
+    /** Number of records whose answers are available: an order takes effect at once. */
     this.readable = 0;
     /** Open sockets, with the vehicle of each. @type {Map<import("ws").WebSocket, string>} */
     this.sockets = new Map();
-    /** How often each order was answered. */
+    /** Number of answers to each order. */
     this.answered = new Map();
-    /** Requests that the recording has no answer to. */
+    /** Requests without a recorded answer. */
     this.unknown = [];
     this.vehicles = [...new Set(this.records.filter(({ message }) => message).map(({ vehicle }) => vehicle))];
     this.server = http.createServer((request, response) => this.answer(request, response));
@@ -92,7 +93,7 @@ class Replay {
     });
   }
 
-  /** Starts a server that has got to the moment `mark`, or stands at the beginning. */
+  /** Starts a server at the moment `mark`, or at the beginning. */
   static async start(name, { port = 0, mark } = {}) {
     const replay = new Replay(name);
     if (mark) await replay.to(mark);
@@ -105,10 +106,10 @@ class Replay {
     return `http://127.0.0.1:${this.server.address().port}`;
   }
 
-  /** Goes on to the moment `mark`: whoever is connected receives all messages up to it. */
+  /** Advances to the moment `mark`; connected pages receive all messages up to it. */
   async to(mark) {
     const end = this.records.findIndex((record, k) => k >= this.now && record.mark === mark);
-    if (end < 0) throw new Error(`the recording comes to no '${mark}'; record it anew (tests/page/run --record)`);
+    if (end < 0) throw new Error(`the recording has no mark '${mark}'; record it again (tests/page/run --record)`);
     for (; this.now <= end; this.now++) for (const [socket, vehicle] of this.sockets) this.send(socket, vehicle, this.records[this.now]);
   }
 
@@ -120,7 +121,7 @@ class Replay {
     }
   }
 
-  /** Ends as the real server ends: with a reason, and then nobody is there. */
+  /** Ends like the real server: closes with a reason, and rejects new connections. */
   async end() {
     clearInterval(this.repeating);
     for (const socket of this.sockets.keys()) socket.close(RESTART, "the server ends or changes its scene");
@@ -130,7 +131,7 @@ class Replay {
     await closed;
   }
 
-  /** Sends a page that has just connected what it has missed. */
+  /** Sends the messages so far to a page that has just connected. */
   welcome(socket, vehicle) {
     this.sockets.set(socket, vehicle);
     socket.on("close", () => this.sockets.delete(socket));
@@ -153,7 +154,7 @@ class Replay {
     const found = request.method === "GET" ? this.read(request.url, pathname, request.headers[VIEWER]) : this.order(`${request.method} ${pathname}`);
     if (!found || found.left_out) {
       if (!found) this.unknown.push(`${request.method} ${request.url}`);
-      // What was left out never comes; an image that does not come would hold up the page's other requests.
+      // A left-out answer never arrives; an image that never arrives would delay the page's other requests.
       else if (!found.kind?.startsWith("image/")) return;
       return response.writeHead(404, GUARDS).end("the recording has no answer to this");
     }
@@ -161,7 +162,7 @@ class Replay {
     response.writeHead(found.status, { ...GUARDS, ...(found.kind && { "content-type": found.kind }), "content-length": bytes.length }).end(bytes);
   }
 
-  /** Returns the newest answer to a question; before the first one, the first. */
+  /** Returns the newest answer to a request; before the first one, the first. */
   read(url, pathname, viewer) {
     const until = Math.max(this.now, this.readable);
     for (const isIt of [(get) => get === url, (get) => get?.split("?")[0] === pathname]) {
@@ -172,7 +173,7 @@ class Replay {
     return null;
   }
 
-  /** Returns the answer to an order: each time the next one, at last always the last. */
+  /** Returns the answer to an order: the next one each time, and finally the last again. */
   order(order) {
     const answers = this.records.filter((record) => record.order === order), count = this.answered.get(order) ?? 0;
     this.answered.set(order, count + 1);

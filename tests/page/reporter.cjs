@@ -1,11 +1,11 @@
-// Reports the tests as TAP, and lists failed ones again before the counts, so that the end of a log shows them.
+// Reports the tests as TAP, and lists failed ones again before the counts, so that they are at the end of the log.
 
 const { tap } = require("node:test/reporters");
 
-/** Lines of an error that are listed; all of them are with the test itself. */
+/** Maximum listed lines of an error; the test itself prints all. */
 const MAX_LINES = 14;
 
-/** Returns the name of a failed test and its error, as lines. */
+/** Returns the name and error of a failed test, as lines. */
 function listed({ name, details: { error } }) {
   const cause = error?.cause ?? error;
   const lines = `${cause?.stack ?? cause}`.split("\n").filter((line) => line.trim());

@@ -1,4 +1,4 @@
-//! The pose filter: what prediction is worth (a table), and what a measurement costs.
+//! Pose filter: benefit of prediction (a table), and time per measurement.
 //!
 //! `cargo bench -p vizflyt-arena --bench pose`
 
@@ -88,7 +88,7 @@ fn cost(criterion: &mut Criterion) {
             BatchSize::SmallInput,
         );
     });
-    // Readings of the past move all that is newer; that is done once, when a pose is next asked for.
+    // A late reading affects all newer ones; they are recomputed once, at the next request for a pose.
     for late_ms in [5u32, 30, 60] {
         let late_s = 1e-3 * f64::from(late_ms);
         let name =

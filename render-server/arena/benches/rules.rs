@@ -12,7 +12,7 @@ use vizflyt_arena::obstacles::{Obstacles, TimedPose};
 use vizflyt_arena::{BakeSpec, BodyShape, DistanceField, Ellipsoid, OccupancyGrid};
 use vizflyt_protocol::geometry::Pose;
 
-/// Trunks of flat Gaussians over 40 m x 14 m, `splats` in all.
+/// Trunks of flat Gaussians over 40 m x 14 m, with `splats` Gaussians in total.
 fn forest(splats: usize) -> Vec<Ellipsoid> {
     (0..splats)
         .map(|i| {
@@ -34,7 +34,7 @@ fn forest(splats: usize) -> Vec<Ellipsoid> {
         .collect()
 }
 
-/// The hand of the clock: a bar of 1.2 m that turns in 4 s about x, at the origin's height of flight.
+/// The clock hand: a bar of 1.2 m that turns about x in 4 s, at flight height above the origin.
 fn clock_hand() -> (DistanceField, MovingObjects) {
     let grid = Grid::covering(DVec3::new(-0.3, -0.3, -0.9), DVec3::new(0.3, 0.3, 0.9), 0.02);
     let bar = (0..600).map(|i| Ellipsoid {
@@ -85,7 +85,7 @@ fn rules(criterion: &mut Criterion) {
     criterion.bench_function("query", |bencher| {
         bencher.iter(|| field.obstacle_distance_m(next()));
     });
-    // A frame's arms with their rotors, and its hub: 37 balls.
+    // Arms of a frame with rotors, and the hub: 37 balls.
     let arm = |y_m: f64| BodyPart {
         from_m: DVec3::new(-0.09, -y_m, 0.0),
         to_m: Some(DVec3::new(0.09, y_m, 0.0)),
@@ -101,7 +101,7 @@ fn rules(criterion: &mut Criterion) {
         let mut tick = 0;
         criterion.bench_function(&format!("swept tick beside a turning hand, {name}"), |bencher| {
             bencher.iter(|| {
-                // Past the hand's face, 0.2 to 0.8 m before it, as a vehicle waits for its turn.
+                // Past the hand's face, 0.2 to 0.8 m in front of it, like a vehicle that waits for a gap.
                 tick = (tick + 1) % 800;
                 let timed_pose = |tick: i64| {
                     let before_m = 0.5 + 0.3 * (tick as f64 * 0.01).sin();

@@ -1,6 +1,7 @@
-//! Writes what the filter makes of simulated flights, for tests/pose: of each, without and with 5 % of outliers, the truth
-//! and the fused poses as TUM trajectories; and `ate.csv`: name (flight, Hz, mm of noise, IMU, kind), our absolute trajectory error [m], outliers, how many of
-//! them were accepted, how many true poses were left out.
+//! Writes the filter's output for simulated flights, for tests/pose. For each flight, without and with 5 %
+//! outliers, it writes the true and the fused poses as TUM trajectories. `ate.csv` has a line per flight: name
+//! (flight, Hz, mm of noise, IMU, kind), absolute trajectory error [m], number of outliers, accepted outliers,
+//! rejected true poses.
 //!
 //! `trajectories FOLDER`
 
@@ -21,7 +22,7 @@ fn main() -> std::io::Result<()> {
         for rate_hz in [10.0, 30.0, 200.0] {
             for noise_m in [0.001, 0.005] {
                 for imu in [true, false] {
-                    // At 10 Hz nobody can tell by poses alone, nor in a hard manoeuvre.
+                    // At 10 Hz and in a hard manoeuvre, poses without an IMU are not enough to detect outliers.
                     if imu && flight != Flight::Dashes || rate_hz > 10.0 {
                         write_flight(folder.as_ref(), &mut errors, flight, rate_hz, noise_m, imu)?;
                     }
@@ -61,7 +62,7 @@ fn write_flight(
     Ok(())
 }
 
-/// `t x y z qx qy qz qw`, as TUM's benchmark of RGB-D SLAM has it. [s], [m, world]
+/// `t x y z qx qy qz qw`: TUM format (RGB-D SLAM benchmark). [s], [m, world]
 fn write_line(to: &mut String, t: f64, pose: &Pose<World, Body>) {
     let (p, q) = (pose.translation_m, pose.rotation);
     let _ = writeln!(

@@ -1,26 +1,26 @@
-//! The vehicle's body as balls in its own frame: one sphere, or a set of spheres and capsules.
+//! Vehicle body as balls in the body frame: one sphere, or a set of spheres and capsules.
 //!
-//! A capsule becomes balls along its axis, half a radius apart and a little larger, so that they
-//! cover it: distances come out short by 3 % of its radius at most, never long.
+//! A capsule becomes balls along its axis, half a radius apart and slightly larger, so that they cover it:
+//! distances are at most 3 % of its radius too short, and never too long.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
 
 use crate::config::{ArenaConfig, BodyPart};
 
-/// What of the vehicle must not touch anything.
+/// Shape of the vehicle for collision checks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BodyShape {
     balls: Vec<Ball>,
-    /// The furthest centre of a ball from the body's origin. [m]
+    /// Maximum distance of a ball's centre from the body's origin. [m]
     reach_m: f64,
-    /// Of the sphere around the body's origin that holds all balls. [m]
+    /// Radius of the sphere around the body's origin that contains all balls. [m]
     radius_m: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Ball {
-    /// [m, body]
+    /// Centre of the ball. [m, body]
     center_m: DVec3,
     radius_m: f64,
 }
@@ -31,7 +31,7 @@ impl BodyShape {
         Self::of_parts(&[BodyPart { from_m: DVec3::ZERO, to_m: None, radius_m }])
     }
 
-    /// Returns the body of an arena's vehicle: its parts, else the sphere of `body_radius_m`.
+    /// Returns the body of an arena's vehicle: its parts, or the sphere of `body_radius_m`.
     pub fn of(config: &ArenaConfig) -> Self {
         if config.body.is_empty() {
             Self::sphere(config.body_radius_m)
@@ -40,7 +40,7 @@ impl BodyShape {
         }
     }
 
-    /// Covers spheres and capsules, of which there is at least one.
+    /// Returns a body that covers spheres and capsules; `parts` must not be empty.
     pub fn of_parts(parts: &[BodyPart]) -> Self {
         let balls: Vec<_> = parts.iter().flat_map(cover).collect();
         let most = |of: fn(&Ball) -> f64| balls.iter().map(of).fold(0.0, f64::max);
@@ -49,24 +49,24 @@ impl BodyShape {
         Self { balls, reach_m, radius_m }
     }
 
-    /// Returns the radius of the sphere about the body's origin that holds it all. [m]
+    /// Returns the radius of the sphere around the body's origin that contains the whole body. [m]
     pub fn radius_m(&self) -> f64 {
         self.radius_m
     }
 
-    /// Returns a length that no point which counts moves further than between two poses, along the
-    /// straight line and the shortest turn. [m]
+    /// Returns an upper bound of the motion of every ball's centre between two poses, along the straight line
+    /// and the shortest turn. [m]
     pub fn motion_m(&self, from: &Pose<World, Body>, to: &Pose<World, Body>) -> f64 {
         let turn = from.rotation.conjugate() * to.rotation;
         let turn_rad = 2.0 * turn.xyz().length().atan2(turn.w.abs());
         (to.translation_m - from.translation_m).length() + turn_rad * self.reach_m
     }
 
-    /// Returns the distance from the body's surface to the nearest obstacle by the distance of
-    /// points; negative is penetration. Where the enclosing sphere is further away than `least_m`,
-    /// its distance, which is less, is returned instead: one query in the open. [m]
+    /// Returns the distance from the body's surface to the nearest obstacle; `distance_m` is that of a point;
+    /// negative is penetration. If the distance of the enclosing sphere exceeds `least_m`, returns that smaller
+    /// distance instead: one query in open space. [m]
     ///
-    /// NaN if a distance is.
+    /// Returns NaN if a distance is NaN.
     pub fn clearance_m(
         &self,
         world_from_body: &Pose<World, Body>,
@@ -96,7 +96,7 @@ fn cover(part: &BodyPart) -> impl Iterator<Item = Ball> {
     let to_m = part.to_m.unwrap_or(from_m);
     let length_m = (to_m - from_m).length();
     let gaps = (length_m / (SPACING * radius_m)).ceil().min(MAX_GAPS) as u32;
-    // A ball that far from the next covers the capsule's side between them with this radius.
+    // With this radius, balls at this distance cover the side of the capsule between them.
     let half_gap_m = 0.5 * length_m / f64::from(gaps.max(1));
     (0..=gaps).map(move |n| Ball {
         center_m: from_m.lerp(to_m, f64::from(n) / f64::from(gaps.max(1))),
@@ -104,9 +104,9 @@ fn cover(part: &BodyPart) -> impl Iterator<Item = Ball> {
     })
 }
 
-/// From one ball of a capsule to the next, at most. [radii]
+/// Maximum distance between balls of a capsule. [radii]
 const SPACING: f64 = 0.5;
-/// A wire of 1 mm and 1 m is covered by fewer, larger balls: a tick's budget.
+/// Limit for the time per tick: a wire of 1 mm and 1 m is covered by fewer, larger balls.
 const MAX_GAPS: f64 = 64.0;
 
 #[cfg(test)]
@@ -116,7 +116,7 @@ mod tests {
     use proptest::prelude::*;
     use vizflyt_protocol::geometry::Volume;
 
-    /// An arm of 0.3 m along y and a ball under it.
+    /// An arm of 0.3 m along y and a ball below it.
     fn cross() -> Vec<BodyPart> {
         let arm =
             BodyPart { from_m: DVec3::Y * -0.15, to_m: Some(DVec3::Y * 0.15), radius_m: 0.03 };
@@ -124,13 +124,13 @@ mod tests {
     }
 
     #[test]
-    fn a_sphere_is_one_query_and_an_arm_reaches_out() {
+    fn clearance_of_spheres_and_arms_is_exact() {
         let ball = BodyShape::sphere(0.12);
         let at = Pose::new(DVec3::Z, DQuat::from_rotation_x(1.0));
         assert_eq!(ball.clearance_m(&at, f64::INFINITY, |p| p.z), 0.88);
         let body = BodyShape::of_parts(&cross());
         assert!((body.radius_m() - 0.18).abs() < 2e-3, "{}", body.radius_m());
-        // A wall 0.2 m to the east: the arm lies along y, then is turned towards it.
+        // A wall 0.2 m to the east; the arm is along y, then turned towards it.
         let wall = |p: DVec3| 0.2 - p.x;
         let clearance_m = |yaw: f64| {
             let at = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(yaw));
@@ -142,7 +142,7 @@ mod tests {
     }
 
     proptest! {
-        /// The balls hold every point of the parts, and stick out by little.
+        /// Balls contain every point of the parts, and protrude only a little.
         #[test]
         fn balls_cover_parts(along in 0.0..1.0f64, turn in -3.0..3.0f64, off in 0.0..0.4f64) {
             for part in cross() {
@@ -156,13 +156,13 @@ mod tests {
                     .iter()
                     .map(|ball| (p - ball.center_m).length() - ball.radius_m)
                     .fold(f64::INFINITY, f64::min);
-                // Inside, distances to a union of balls are smaller than the solid's.
+                // Inside, the distance to a union of balls is smaller than the solid's.
                 prop_assert!(found <= truth.max(0.0) + 1e-12, "{found} {truth}");
                 prop_assert!(truth < 0.0 || found > truth - 0.04 * part.radius_m, "{found} {truth}");
             }
         }
 
-        /// No centre of a ball moves further than stated.
+        /// No centre of a ball moves further than the bound.
         #[test]
         fn motion_bounds_every_ball(
             d in prop::array::uniform3(-1.0..1.0f64), turn in prop::array::uniform3(-2.0..2.0f64),

@@ -1,10 +1,10 @@
-//! Can the course be flown? Looked at before anyone tries: the start is free, gates fit the vehicle and
-//! the room, there is a way through all of them, and nothing that moves bars it for good.
+//! Check of a course before a flight: the start is free, gates fit the vehicle and the room, a path leads
+//! through all of them, and no moving object blocks it permanently.
 //!
 //! ```text
 //! ArenaConfig, Obstacles -> path search between gates, in cells of the distance field -> findings
 //! ```
-//! Budget: a second for a hall of 11 x 4.5 x 3.65 m; for people and tests, not for flight.
+//! Budget: one second for a hall of 11 x 4.5 x 3.65 m; for people and tests, not in flight.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -18,12 +18,12 @@ use crate::grid::Grid;
 use crate::obstacles::{Obstacles, TimedPose, Touched};
 use vizflyt_protocol::geometry::Pose;
 
-/// Something that a course cannot be flown with.
+/// A problem that makes a course unflyable.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finding {
-    /// Where in the file: `stages[1].width_m`.
+    /// Path of the key in the file: `stages[1].width_m`.
     pub key: String,
-    /// What is wrong and what to do.
+    /// Problem and solution.
     pub text: String,
 }
 
@@ -33,15 +33,15 @@ impl fmt::Display for Finding {
     }
 }
 
-/// What was found out about a course.
+/// Result of a check.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checked {
-    /// What is wrong; empty if it can be flown.
+    /// Problems; empty if the course can be flown.
     pub findings: Vec<Finding>,
-    /// Length of a way through all of it, along the axes. [m]
+    /// Length of a path through the course, along the axes. [m]
     pub way_m: f64,
-    /// Least room between the body and what stands still, straight through the gates; infinite
-    /// without gates. [m]
+    /// Minimum distance between the body and fixed obstacles, straight through the gates; infinite without
+    /// gates. [m]
     pub least_room_m: f64,
 }
 
@@ -53,14 +53,14 @@ pub fn check(config: &ArenaConfig, obstacles: &Obstacles) -> Checked {
     for (index, stage) in config.stages.iter().enumerate() {
         checker.check_stage(index, stage);
     }
-    // Ways are looked for where each place of its own is good.
+    // Paths are searched only if each position by itself is valid.
     if checker.checked.findings.is_empty() {
         checker.check_ways();
     }
     checker.checked
 }
 
-/// Checks where the vehicle starts, and its climb, alone: for places without a course.
+/// Checks only the start and the climb, for rooms without a course.
 pub fn check_start(config: &ArenaConfig, obstacles: &Obstacles) -> Vec<Finding> {
     let mut checker = Checker::new(config, obstacles);
     checker.check_start();
@@ -70,9 +70,9 @@ pub fn check_start(config: &ArenaConfig, obstacles: &Obstacles) -> Vec<Finding> 
 struct Checker<'a> {
     config: &'a ArenaConfig,
     obstacles: &'a Obstacles,
-    /// Of the obstacles, what never moves.
+    /// The obstacles that never move.
     still: Obstacles,
-    /// The objects that move.
+    /// Indices of the objects that move.
     moving: Vec<usize>,
     body: BodyShape,
     checked: Checked,
@@ -88,7 +88,7 @@ impl<'a> Checker<'a> {
         Self { config, obstacles, still, moving, body, checked }
     }
 
-    /// Sweeps the body, level, along a straight way past what never moves.
+    /// Sweeps the level body along a straight line past the fixed obstacles.
     fn sweep(&self, from_m: DVec3, to_m: DVec3) -> (Sweep, Touched) {
         let at = |p_m| Pose::new(p_m, DQuat::IDENTITY);
         let timed = |p_m| TimedPose { since_epoch_ns: 0, world_from_body: at(p_m) };
@@ -131,7 +131,8 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// Returns what a body touches at a place, and what to do: `otherwise`, if it is a known obstacle.
+    /// Returns the obstacle that a body touches at a position, and the advice: `otherwise`, unless it is unseen
+    /// space.
     fn touched(
         &self,
         touched: Touched,
@@ -151,7 +152,7 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// Where the vehicle may start and where it shall end must have been seen.
+    /// Start box and goal must be in seen space.
     fn check_seen(&mut self) {
         let still = self.obstacles.still.clone();
         if still.unseen_voxels() == 0 {
@@ -196,7 +197,7 @@ impl<'a> Checker<'a> {
         for end_m in [before_m, after_m] {
             if self.config.geofence().signed_distance_m(end_m) > -self.body.radius_m() {
                 let text = format!(
-                    "'{}' is too near to the geofence: {AHEAD_M} m before or behind it, at \
+                    "'{}' is too close to the geofence: {AHEAD_M} m before or behind it, at \
                      {end_m:.2} m, the vehicle would leave it",
                     stage.name
                 );
@@ -229,7 +230,7 @@ impl<'a> Checker<'a> {
         }
     }
 
-    /// Returns the longest time that an object leaves a straight way free, within a minute. [s]
+    /// Returns the longest time for which an object leaves a straight path free, within a minute. [s]
     fn longest_free_s(&self, from_m: DVec3, to_m: DVec3, object: usize) -> f64 {
         let alone = self.obstacles.select(&[object]);
         let (mut longest, mut free) = (0_u32, 0_u32);
@@ -273,7 +274,7 @@ impl<'a> Checker<'a> {
     }
 }
 
-/// The room in cells, and how far each is from where a search began.
+/// The room in cells, with the distance of each from the start of a search.
 struct Cells {
     min_m: DVec3,
     size: IVec3,
@@ -299,8 +300,8 @@ impl Cells {
         within.then(|| ((cell.x * self.size.y + cell.y) * self.size.z + cell.z) as usize)
     }
 
-    /// Whether the body may be anywhere between this cell's middle and that of another such: no point
-    /// between two is further from one of them than half a cell.
+    /// Whether the body may be anywhere between this cell's centre and that of another free cell: no point
+    /// between two is further than half a cell from one of them.
     fn is_free(&self, checker: &Checker, cell: IVec3) -> bool {
         let p_m = self.center_m(cell);
         let radius_m = checker.body.radius_m();
@@ -315,7 +316,7 @@ impl Cells {
             && floor_m >= radius_m
     }
 
-    /// Returns the free cell next to a point, from which the point is reached.
+    /// Returns the nearest free cell from which a point is reached in a straight line.
     fn near(&self, checker: &Checker, p_m: DVec3) -> Option<IVec3> {
         let own = ((p_m - self.min_m) / CELL_M).floor().as_ivec3();
         let around =
@@ -332,7 +333,7 @@ impl Cells {
         })
     }
 
-    /// Returns the length of the shortest way along the axes; `None` if there is none. [m]
+    /// Returns the length of the shortest path along the axes; `None` if there is none. [m]
     fn way_m(&mut self, checker: &Checker, from_m: DVec3, to_m: DVec3) -> Option<f64> {
         let (start, end) = (self.near(checker, from_m)?, self.near(checker, to_m)?);
         self.steps.clear();
@@ -363,29 +364,29 @@ impl Cells {
     }
 }
 
-/// Returns the places straight before and behind a gate. [m, world]
+/// Returns the points straight before and behind a gate. [m, world]
 fn ends_m(stage: &StageConfig) -> (DVec3, DVec3) {
     let ahead_m = stage.normal.normalize_or(DVec3::X) * AHEAD_M;
     (stage.center_m - ahead_m, stage.center_m + ahead_m)
 }
 
-/// Room on each side of a vehicle in a gate: what a good controller keeps. [m]
+/// Margin on each side of a vehicle in a gate: the accuracy of a good controller. [m]
 const GATE_ROOM_M: f64 = 0.05;
-/// So far before and behind a gate the way is straight. [m]
+/// Length of the straight path before and behind a gate. [m]
 const AHEAD_M: f64 = 0.35;
-/// Side of a cell: half the width of a body of 0.1 m. [m]
+/// Size of a cell: half the width of a body of 0.1 m. [m]
 const CELL_M: f64 = 0.1;
-/// A vehicle of 1 m/s needs this long through a gate. [s]
+/// Time that a vehicle at 1 m/s needs to pass a gate. [s]
 const WINDOW_S: f64 = 0.7;
-/// Looked at a minute, twenty times a second.
+/// Samples over a minute, twenty per second.
 const LOOKS: u32 = 1200;
 const LOOK_NS: i64 = 50_000_000;
-/// Places along a straight way: closer than a body's radius.
+/// Samples along a straight path: closer than a body's radius.
 const POINTS: u32 = 7;
-/// The start box is looked at this closely. [m]
+/// Resolution of the check of the start box. [m]
 const START_M: f64 = 0.1;
-/// What to do about unseen space.
-const FILM: &str = "film there, train and carve again, or move it into what was seen";
+/// Advice for unseen space.
+const FILM: &str = "film there, train and carve again, or move it into seen space";
 const UNSEEN: u32 = u32::MAX;
 const BLOCKED: u32 = u32::MAX - 1;
 
@@ -401,7 +402,7 @@ mod tests {
     use crate::referee::tests::arena;
     use vizflyt_protocol::geometry::Volume;
 
-    /// The referee's room with a wall at x = 3 that has a hole of `hole_m` at y = 0, z = 1.
+    /// Returns the referee's arena with a wall at x = 3 that has a hole of `hole_m` at y = 0, z = 1.
     fn walled(hole_m: f64) -> (ArenaConfig, Obstacles) {
         let mut config = arena();
         config.stages.push(StageConfig {
@@ -422,7 +423,7 @@ mod tests {
         (config, field.into())
     }
 
-    /// The room with a board of its own frame, half a metre square, that stands still at a place.
+    /// Returns the arena with a fixed board as an object with its own frame.
     fn with_board(at_m: DVec3) -> (ArenaConfig, Obstacles) {
         let (mut config, walled) = walled(1.0);
         config.objects.push(ObjectConfig {
@@ -442,10 +443,10 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_still_in_a_frame_of_its_own_is_an_obstacle() {
+    fn fixed_objects_are_obstacles() {
         let free = with_board(DVec3::new(2.0, -2.0, 1.0));
         assert_eq!(check(&free.0, &free.1).findings, []);
-        // Right before the hole.
+        // Directly in front of the hole.
         let (config, obstacles) = with_board(DVec3::new(2.8, 0.0, 1.0));
         let checked = check(&config, &obstacles);
         assert_eq!(keys(&checked), ["stages[0].center_m"]);
@@ -457,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn a_course_that_can_be_flown_has_no_findings() {
+    fn flyable_course_has_no_findings() {
         let (config, obstacles) = walled(1.0);
         let checked = check(&config, &obstacles);
         assert_eq!(checked.findings, []);
@@ -471,20 +472,20 @@ mod tests {
         let (config, obstacles) = walled(0.3);
         let checked = check(&config, &obstacles);
         assert_eq!(keys(&checked)[..2], ["stages[0].width_m", "stages[0].height_m"]);
-        // The gate is where the wall is whole.
+        // The gate is at a closed part of the wall.
         let (mut config, obstacles) = walled(1.0);
         config.stages[0].center_m.y = 1.5;
         let checked = check(&config, &obstacles);
         assert_eq!(keys(&checked), ["stages[0].center_m"]);
         assert!(checked.findings[0].text.contains("touches an obstacle"), "{checked:?}");
-        // Nothing to fly through, and the wall is in the way.
+        // No stage, and the wall blocks the way to the goal.
         let (mut config, obstacles) = walled(0.0);
         config.stages.clear();
         assert_eq!(keys(&check(&config, &obstacles)), ["goal.position_m"]);
         // The start is in the wall.
         config.spawn.position_m.x = 3.0;
         assert_eq!(keys(&check(&config, &obstacles)), ["spawn.position_m"]);
-        // Too near to the fence.
+        // Too close to the fence.
         let (mut config, obstacles) = walled(1.0);
         config.stages[0].center_m.x = 9.7;
         assert_eq!(keys(&check(&config, &obstacles)), ["stages[0].center_m"]);

@@ -1,8 +1,8 @@
-//! Does the body touch an obstacle between one pose and the next?
+//! Collision check between one pose and the next.
 //!
-//! Conservative advancement: from a pose whose clearance is c nothing of the body can move by less
-//! than c and touch anything, so the walk takes few queries in the open and short steps near
-//! obstacles, and no speed, turn or rate tunnels through anything. Budget: 10 us a tick.
+//! Conservative advancement: from a pose with clearance c, the body can move by less than c without a contact.
+//! So a sweep takes few queries in open space and short steps near obstacles, and no speed, turn or rate
+//! tunnels through an obstacle. Budget: 10 us per tick.
 
 use glam::DVec3;
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -10,31 +10,30 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 use crate::body::BodyShape;
 use crate::distance::DistanceField;
 
-/// What a sweep found.
+/// Result of a sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sweep {
-    /// Least distance from the body's surface to an obstacle on the way, up to the contact;
-    /// negative is penetration. [m]
+    /// Minimum distance from the body's surface to an obstacle, up to the contact; negative is penetration. [m]
     pub clearance_m: f64,
-    /// Where the body first touched.
+    /// First contact of the body.
     pub contact: Option<Contact>,
 }
 
-/// The first touch.
+/// First contact of a sweep.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
-    /// Where the body's origin was. [m, world]
+    /// Position of the body's origin. [m, world]
     pub p_world_m: DVec3,
-    /// Part of the way, 0 to 1.
+    /// Fraction of the motion, 0 to 1.
     pub fraction: f64,
     /// Distance from the body's surface to the obstacle; zero or negative. [m]
     pub clearance_m: f64,
 }
 
-/// Sweeps a body from one pose to another, straight and by the shortest turn; equal poses are one
-/// check. The floor is no obstacle here.
+/// Sweeps a body from one pose to another, along the straight line and the shortest turn; equal poses are one
+/// check. The floor does not count as an obstacle here.
 ///
-/// A number that is none is a contact: unknown is not safe.
+/// NaN counts as a contact: unknown is not safe.
 pub fn sweep(
     field: &DistanceField,
     body: &BodyShape,
@@ -49,16 +48,15 @@ pub fn sweep(
     })
 }
 
-/// Returns the shortest step worth taking against a field; also how deep a first contact may lie.
-/// [m]
+/// Returns the minimum step in a field; it is also the maximum depth of a first contact. [m]
 pub fn least_step_m(field: &DistanceField) -> f64 {
     MIN_STEP_VOXELS * field.grid().voxel_m
 }
 
-/// Walks a motion in which nothing of the body moves by more than `motion_m` relative to the
-/// obstacles. `clearance_m` is given the part of the way, 0 to 1, and the least clearance so far,
-/// and returns where the body's origin is then [m, world] and its clearance, for which, where it
-/// exceeds the least so far, any smaller number that still does will do. [m]
+/// Advances along a motion in which no point of the body moves by more than `motion_m` relative to the
+/// obstacles. `clearance_m` receives the fraction of the motion, 0 to 1, and the minimum clearance up to this
+/// point. It returns the position of the body's origin [m, world] and its clearance [m]. If that exceeds the
+/// minimum, any smaller value above the minimum is sufficient.
 pub fn advance(
     motion_m: f64,
     least_step_m: f64,
@@ -70,7 +68,7 @@ pub fn advance(
         let fraction = if motion_m > 0.0 { (done_m / motion_m).min(1.0) } else { 1.0 };
         let (p_world_m, clearance_m) = clearance_m(fraction, least_m);
         least_m = least_m.min(clearance_m);
-        // Positively stated, so that NaN is a contact.
+        // Stated positively, so that NaN is a contact.
         if !(clearance_m > 0.0 && motion_m.is_finite()) {
             let contact = Contact { p_world_m, fraction, clearance_m };
             return Sweep { clearance_m: least_m, contact: Some(contact) };
@@ -82,10 +80,10 @@ pub fn advance(
     }
 }
 
-/// Part of the clearance that a step takes: interpolation between quantised voxels may rise a
-/// little faster than true distance.
+/// Share of the clearance that a step uses: interpolation between quantised voxels may rise slightly faster
+/// than the true distance.
 const TRUST: f64 = 0.8;
-/// See [`least_step_m`]. Obstacles are a voxel thick at least. [voxels]
+/// See [`least_step_m`]. Obstacles are at least one voxel thick. [voxels]
 const MIN_STEP_VOXELS: f64 = 0.25;
 
 #[cfg(test)]
@@ -114,16 +112,16 @@ mod tests {
         super::sweep(field, &BodyShape::sphere(radius_m), &at(from_m), &at(to_m))
     }
 
-    /// Arms of 0.4 m along y, a hub.
+    /// Arms of 0.4 m along y, and a hub.
     fn arms() -> BodyShape {
         let arm = BodyPart { from_m: DVec3::Y * -0.2, to_m: Some(DVec3::Y * 0.2), radius_m: 0.02 };
         BodyShape::of_parts(&[arm, BodyPart { from_m: DVec3::ZERO, to_m: None, radius_m: 0.05 }])
     }
 
     #[test]
-    fn a_body_that_turns_on_the_spot_touches_with_its_arm() {
+    fn turning_in_place_detects_contact_of_an_arm() {
         let field = field();
-        // 0.25 m from the trunk's face; arms along y pass it, and reach it half way of the turn.
+        // 0.25 m from the trunk's face: arms along y pass it, and reach it halfway through the turn.
         let p_m = DVec3::new(1.65, 1.0, 1.0);
         let at = |yaw: f64| Pose::new(p_m, DQuat::from_rotation_z(yaw));
         let near = DVec3::new(1.72, 1.0, 1.0);
@@ -138,10 +136,10 @@ mod tests {
     }
 
     #[test]
-    fn a_bullet_does_not_tunnel() {
+    fn fast_small_body_does_not_tunnel() {
         let field = field();
         let (from, to) = (DVec3::new(0.1, 1.0, 1.0), DVec3::new(3.9, 1.0, 1.0));
-        // A body smaller than half a voxel, 3.8 m in one tick, through a thin trunk.
+        // A body smaller than half a voxel moves 3.8 m in one tick through a thin trunk.
         let contact = sweep(&field, from, to, 0.01).contact.unwrap();
         assert!((contact.p_world_m.x - (2.0 - 0.12 - 0.01)).abs() < 0.05, "{contact:?}");
         assert!(sweep(&field, to, from, 0.01).contact.unwrap().p_world_m.x > 2.0);
@@ -152,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn standing_still_is_one_check_and_nan_is_a_contact() {
+    fn checks_a_body_at_rest_and_treats_nan_as_contact() {
         let field = field();
         let open = DVec3::new(1.0, 1.0, 1.0);
         assert_eq!(sweep(&field, open, open, 0.12).contact, None);
@@ -175,7 +173,7 @@ mod tests {
             prop_assert!(truth < 0.05 || found.contact.is_none());
         }
 
-        /// So does a body that turns on its way.
+        /// Same for a body that turns during the motion.
         #[test]
         fn turning_sweeps_agree_with_dense_truth(
             a in (0.3..3.7f64, 0.3..1.7f64, 0.3..1.7f64), b in (0.3..3.7f64, 0.3..1.7f64, 0.3..1.7f64),

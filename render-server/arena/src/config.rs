@@ -1,9 +1,9 @@
 //! `arena.toml`: the room, the vehicle's body, the course and the limits, as validated types.
 //!
-//! Text comes in through [`ArenaConfig::parse`], which refuses unknown keys (with line and
-//! column) and values that cannot work (with key, value and what to do). The scene generator
-//! builds the same struct and writes it with [`ArenaConfig::to_toml`]; the server turns it into
-//! [`ArenaInfo`] for the runtime. Safety limits have no default: absent is an error.
+//! [`ArenaConfig::parse`] reads the text. It rejects unknown keys (with line and column) and invalid values
+//! (with key, value and what to do). The scene generator builds the same struct and writes it with
+//! [`ArenaConfig::to_toml`]; the server turns it into [`ArenaInfo`] for the runtime. Safety limits have no
+//! default: if one is absent, the file is rejected.
 
 use std::path::{Path, PathBuf};
 
@@ -45,92 +45,92 @@ pub use sensor::SensorConfig;
 pub use validate::{ConfigError, check_number, check_position, invalid};
 pub use vehicle::{MAX_VEHICLES, VehicleConfig};
 
-/// The whole of `arena.toml`.
+/// All of `arena.toml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArenaConfig {
-    /// The arena's name; at most 32 bytes.
+    /// Name of the arena; at most 32 bytes.
     pub name: String,
-    /// The splats that the room is seen as, and how they lie in the world.
+    /// Splat scene that cameras see, and its placement in the world.
     pub scene: SceneConfig,
     /// Radius of the sphere that encloses the vehicle. [m]
     pub body_radius_m: f64,
-    /// Height above the spawn to which the vehicle climbs before the plugin flies it. [m]
+    /// Height above the spawn to which the vehicle climbs before the plugin takes over. [m]
     pub takeoff_height_m: f64,
-    /// So long after take-off the flight is over; 0 is never. [s]
+    /// Maximum flight time after take-off; 0 disables the limit. [s]
     #[serde(default)]
     pub time_limit_s: f64,
-    /// Whether plugins get the vehicle's pose and velocity; by default they do.
+    /// Whether plugins receive the vehicle's pose and velocity.
     #[serde(default = "yes")]
     pub ground_truth: bool,
-    /// Whether plugins may fly by attitude rates; by default they may not.
+    /// Whether plugins may send attitude rates.
     #[serde(default)]
     pub attitude_rate: bool,
-    /// Where the vehicle stands at the start.
+    /// Position and heading of the vehicle at the start.
     pub spawn: Spawn,
-    /// Where the flight shall end; without one it ends with the last stage.
+    /// Position at which the flight ends; without it, the flight ends with the last stage.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub goal: Option<Goal>,
-    /// The box that the body's surface must not leave, along the world's axes.
+    /// Box that the body's surface must not leave, along the world's axes.
     pub geofence: Geofence,
-    /// What the guard enforces, whatever a plugin asks.
+    /// Limits that the guard enforces on every setpoint.
     pub limits: Limits,
-    /// Parts of the vehicle, up to 16; without any, it is the sphere of `body_radius_m`.
+    /// Parts of the vehicle's body, up to 16; without them, the body is a sphere of `body_radius_m`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub body: Vec<BodyPart>,
-    /// Boxes that the body's surface must stay out of, up to 8.
+    /// Boxes that the body's surface must not enter, up to 8.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub no_fly: Vec<NoFly>,
-    /// How obstacles are made of the scene: in a grid of cubes (voxels), each solid or free.
+    /// Conversion of the scene into obstacles: a grid of cubes (voxels), each solid or free.
     #[serde(default)]
     pub occupancy: Occupancy,
-    /// Light, air and weather, for the cameras alone; without it, the scene is as it was captured.
+    /// Light, air and weather, as the cameras see them; without it, the scene looks as captured.
     #[serde(default, skip_serializing_if = "EnvironmentConfig::is_default")]
     pub environment: EnvironmentConfig,
-    /// How poses are fused, when they count as lost, and for which moment images are rendered.
+    /// Fusion of poses, timeouts for lost poses, and the instant for which images are rendered.
     #[serde(default, skip_serializing_if = "PoseConfig::is_default")]
     pub pose: PoseConfig,
-    /// The cameras, 1 to 8, in the order of their index in messages.
+    /// Cameras, 1 to 8, in the order of their index in messages.
     pub cameras: Vec<CameraConfig>,
-    /// The sensors beside the cameras, up to 8, in the order of their index in messages.
+    /// Sensors other than cameras, up to 8, in the order of their index in messages.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sensors: Vec<SensorConfig>,
-    /// The vehicles, up to 8; without any, the server's command line names them.
+    /// Vehicles, up to 8; without them, the server's command line names the vehicles.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub vehicles: Vec<VehicleConfig>,
-    /// Where poses come from, up to 8 sources; without any, Vicon at port 51001.
-    // As the file has it: the settings are the server's, which reads them.
+    /// Sources of poses, up to 8; without them, Vicon at port 51001.
+    // Unparsed: the server reads these settings.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub localization: Vec<toml::Table>,
-    /// The course's gates in order.
+    /// Stages (gates) of the course, in the order of flight.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<StageConfig>,
-    /// What a flight is fined for, in seconds that are added to its time, and what plugins may ask for.
+    /// Penalties, in seconds added to the time, and the setpoints that plugins may use.
     #[serde(default, skip_serializing_if = "RulesConfig::is_default")]
     pub rules: RulesConfig,
-    /// What stands or moves in the room and is no part of its scene, up to 32.
+    /// Objects that are not part of the scene, fixed or moving, up to 32.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub objects: Vec<ObjectConfig>,
 }
 
-/// `[spawn]`: where the vehicle stands at the start.
+/// `[spawn]`: position and heading of the vehicle at the start.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Spawn {
-    /// Where it stands on the floor. [m, world]
+    /// Position on the floor. [m, world]
     pub position_m: DVec3,
-    /// Where its nose points: from x, counter-clockwise. [deg, world]
+    /// Heading of the nose: from x, counter-clockwise. [deg, world]
     #[serde(default)]
     pub yaw_deg: f64,
 }
 
-/// `[goal]`: where the flight shall end.
+/// `[goal]`: position at which the flight ends.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Goal {
-    /// The point that shall be reached. [m, world]
+    /// Position to reach. [m, world]
     pub position_m: DVec3,
-    /// How near the body's centre must come. [m]
+    /// Maximum distance of the body's centre from the position. [m]
     pub radius_m: f64,
 }
 
@@ -138,9 +138,9 @@ pub struct Goal {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Geofence {
-    /// The corner with the least x, y and z. [m, world]
+    /// Corner with the smallest x, y and z. [m, world]
     pub min_m: DVec3,
-    /// The corner opposite. [m, world]
+    /// Opposite corner. [m, world]
     pub max_m: DVec3,
 }
 
@@ -150,26 +150,26 @@ pub struct Geofence {
 pub struct Occupancy {
     /// Side of a voxel. [m]
     pub voxel_m: f64,
-    /// Splats fainter than this are no obstacle.
+    /// Minimum opacity of a splat that counts as an obstacle.
     pub min_opacity: f64,
-    /// Height of the floor; below is solid. [m, world]
+    /// Height of the floor; everything below is solid. [m, world]
     pub floor_z_m: f64,
-    /// What hangs in the air with fewer splats than this in its volume is taken for a fault of the scene, and is no
-    /// obstacle; 0 keeps all. [1/m^3]
+    /// Minimum density of splats in a floating component, that is, without contact to the floor or the boundary of
+    /// the grid. Components below it count as artefacts of the scene, not as obstacles; 0 keeps all. [1/m^3]
     pub min_splats_per_m3: f64,
-    /// What space counts as that no photo of the capture has looked into, as the file beside the scene says.
+    /// Treatment of space that no photo of the capture has seen, according to the file next to the scene.
     #[serde(skip_serializing_if = "Unseen::is_free")]
     pub unseen: Unseen,
 }
 
-/// What a referee takes unseen space for.
+/// State of unseen space for the referee.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Unseen {
-    /// Free where no splat stands, whether anybody has looked there or not.
+    /// Free if it contains no splat, even if no photo has seen it.
     #[default]
     Free,
-    /// Solid: who flies where nobody has looked has collided.
+    /// Solid: a vehicle in unseen space has collided.
     Solid,
 }
 
@@ -181,9 +181,9 @@ impl Unseen {
 }
 
 impl Default for Occupancy {
-    /// 5 cm resolves a thin trunk at 1 byte a voxel; 0.3 is below what trained surfaces have and
-    /// above what trained haze has; the floor is the world's z = 0. A surface of splats as large as
-    /// 0.2 m still has 300 in a cubic metre of its voxels, a blob of haze fewer than 5.
+    /// A voxel of 5 cm resolves a thin trunk at 1 byte. An opacity of 0.3 is below that of trained surfaces and
+    /// above that of trained haze. The floor is the world's z = 0. A surface of splats of 0.2 m still has 300
+    /// splats in a cubic metre of its voxels; a blob of haze has fewer than 5.
     fn default() -> Self {
         Self {
             voxel_m: 0.05,
@@ -199,25 +199,26 @@ impl Default for Occupancy {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StageConfig {
-    /// Its name; at most 32 bytes.
+    /// Name of the stage; at most 32 bytes.
     pub name: String,
     /// Centre of the opening. [m, world]
     pub center_m: DVec3,
-    /// Direction in which it is flown through; any length but 0. [world]
+    /// Direction of passage; any length but 0. [world]
     pub normal: DVec3,
-    /// Width of the opening, level; not less than the body's. [m]
+    /// Horizontal width of the opening; at least the body's. [m]
     pub width_m: f64,
-    /// Its height, across width and normal; not less than the body's. [m]
+    /// Height of the opening, across width and normal; at least the body's. [m]
     pub height_m: f64,
-    /// Corners of the opening, 3 to 128: to the left and up from its centre as one flies through; within
-    /// width and height. Without any it is the rectangle. [m]
+    /// Corners of the opening, 3 to 128, within width and height: to the left and up from the centre, seen in
+    /// the direction of passage. Without corners, the opening is the rectangle. [m]
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub polygon_m: Vec<DVec2>,
-    /// Depth of the opening along the passage, its centre in the middle: it counts when both its faces
-    /// were passed. [m]
+    /// Depth of the opening along the direction of passage, centred on `center_m`. The passage counts when the
+    /// vehicle has passed both faces. [m]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub thickness_m: f64,
-    /// What the body's centre must keep from the opening's edge for the passage to count; at most half of the lesser side. [m]
+    /// Minimum distance of the body's centre from the edge of the opening; at most half of the shorter side.
+    /// [m]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub clearance_m: f64,
 }
@@ -253,9 +254,8 @@ impl ArenaConfig {
     /// assert!(error.starts_with("geofence.max_m = [-11, 4.5, 3.65]"), "{error}");
     /// ```
     ///
-    /// # Errors
     /// [`ConfigError::Toml`] with line and column for syntax, types, absent and unknown keys;
-    /// [`ConfigError::Invalid`] for values that cannot work, with the line of the key.
+    /// [`ConfigError::Invalid`] for invalid values, with the line of the key.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let config: Self = vizflyt_toml::parse(text)?;
         config.validate().map_err(|error| error.in_text(text))?;
@@ -267,23 +267,23 @@ impl ArenaConfig {
         Ok(toml::to_string(self)?)
     }
 
-    /// Returns where the scene file lies, given where `arena.toml` lies.
+    /// Returns the path of the scene file, given the path of `arena.toml`.
     pub fn scene_path(&self, arena_toml: &Path) -> PathBuf {
         arena_toml.parent().unwrap_or(Path::new("")).join(&self.scene.file)
     }
 
-    /// Returns the keep-in volume for the body's surface. [world]
+    /// Returns the volume that the body's surface must not leave. [world]
     pub fn geofence(&self) -> Volume {
         Volume::aabb(self.geofence.min_m, self.geofence.max_m)
     }
 
-    /// Returns the pose of the vehicle at the start: level on the floor, nose by `yaw_deg`.
+    /// Returns the pose of the vehicle at the start: level on the floor, with heading `yaw_deg`.
     pub fn world_from_body_at_spawn(&self) -> Pose<World, Body> {
         let yaw_rad = self.spawn.yaw_deg.to_radians();
         Pose::new(self.spawn.position_m, DQuat::from_rotation_z(yaw_rad))
     }
 
-    /// Returns what plugins may ask for.
+    /// Returns the kinds of setpoint that plugins may use.
     pub fn setpoints(&self) -> SetpointKinds {
         let usual =
             if self.ground_truth { SetpointKinds::USUAL } else { SetpointKinds::BY_OWN_SENSES };
@@ -291,8 +291,8 @@ impl ArenaConfig {
         if self.attitude_rate { allowed.with(SetpointKind::AttitudeRate) } else { allowed }
     }
 
-    /// Returns what the runtime must know, but for the sensors, whose models the server knows. Of a validated config
-    /// nothing is cut.
+    /// Returns the data that the runtime needs, without the sensors: only the server has their models. For a
+    /// validated config, no list is truncated.
     pub fn info(&self) -> ArenaInfo {
         ArenaInfo {
             name: bounded(&self.name),
@@ -313,13 +313,13 @@ impl ArenaConfig {
             },
             setpoints: self.setpoints(),
             cameras: self.cameras.iter().map(CameraConfig::info).take(MAX_CAMERAS).collect(),
-            // Which they are is resolved as the scene loads: names of models are the server's.
+            // Resolved when the scene loads: only the server has the names of models.
             sensors: [].into_iter().collect(),
         }
     }
 }
 
-/// Default of `ground_truth`: a course withholds it on purpose.
+/// Default of `ground_truth`: hiding the pose takes an explicit setting.
 fn yes() -> bool {
     true
 }

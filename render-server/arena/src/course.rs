@@ -4,18 +4,18 @@ use glam::{DVec2, DVec3};
 
 use crate::config::{ArenaConfig, Goal, StageConfig};
 
-/// One thing that the vehicle achieved.
+/// Progress of the vehicle on the course.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Progress {
     /// Passed the stage with this index.
     Stage(usize),
     /// Reached the goal, all stages passed.
     Finished,
-    /// Reached the goal, but the stage with this index was not passed. Said once.
+    /// Reached the goal, but the stage with this index was not passed. Reported once.
     GoalTooEarly(usize),
 }
 
-/// Follows one vehicle along the stages.
+/// Progress of one vehicle through the stages.
 #[derive(Clone, Debug)]
 pub struct Course {
     stages: Vec<Opening>,
@@ -28,7 +28,7 @@ pub struct Course {
 }
 
 impl Course {
-    /// Makes the course of an arena, nothing passed yet.
+    /// Returns the course of an arena, with no stage passed.
     pub fn new(config: &ArenaConfig) -> Self {
         Self {
             stages: config.stages.iter().map(Opening::new).collect(),
@@ -40,13 +40,13 @@ impl Course {
         }
     }
 
-    /// Returns the index of the stage to pass next; the number of stages where only the goal is left.
+    /// Returns the index of the next stage; the number of stages if only the goal is left.
     pub fn next(&self) -> usize {
         self.next
     }
 
-    /// Takes the way of the body's centre between two poses; returns what it achieved. Call it with
-    /// the same way until it returns nothing: the last stage may be the end. [m, world]
+    /// Processes the path of the body's centre between two poses; returns the progress. Call it with the same
+    /// path until it returns `None`: the last stage may also be the end. [m, world]
     pub fn advance(&mut self, from_m: DVec3, to_m: DVec3) -> Option<Progress> {
         if self.finished {
             return None;
@@ -58,7 +58,7 @@ impl Course {
             return Some(Progress::Stage(self.next - 1));
         }
         let Some(goal) = self.goal else {
-            // Without a goal the last stage is the finish; without stages either, there is none.
+            // Without a goal, the last stage is the finish; without stages either, there is none.
             self.finished = !self.stages.is_empty() && self.next == self.stages.len();
             return self.finished.then_some(Progress::Finished);
         };
@@ -79,10 +79,10 @@ impl Course {
 struct Opening {
     center_m: DVec3,
     normal: DVec3,
-    /// Unit vector along the width, level, to the left as one flies through.
+    /// Unit vector along the width, level, to the left in the direction of passage.
     across: DVec3,
     up: DVec3,
-    /// [m, along across and up]
+    /// Corners of the polygon. [m, along across and up]
     corners_m: Vec<DVec2>,
     half_thickness_m: f64,
     clearance_m: f64,
@@ -91,7 +91,7 @@ struct Opening {
 impl Opening {
     fn new(stage: &StageConfig) -> Self {
         let normal = stage.normal.normalize_or(DVec3::X);
-        // A gate in the floor has no level width of its own; any will do.
+        // A gate in the floor has no level width; use y.
         let across = DVec3::Z.cross(normal).normalize_or(DVec3::Y);
         let (x, y) = (stage.width_m / 2.0, stage.height_m / 2.0);
         let rectangle =
@@ -108,21 +108,21 @@ impl Opening {
         }
     }
 
-    /// Whether the way leads out of the opening's far face; `entered` keeps whether it has come in by
-    /// the near one.
+    /// Whether the path leaves the opening through its far face; `entered` stores whether it has entered
+    /// through the near one.
     fn is_passed(&self, from_m: DVec3, to_m: DVec3, entered: &mut bool) -> bool {
         if let Some(inside) = self.crossing(-self.half_thickness_m, from_m, to_m) {
             *entered = inside;
         } else if self.crossing(-self.half_thickness_m, to_m, from_m).is_some() {
-            // Back out again.
+            // Left again through the near face.
             *entered = false;
         }
         self.crossing(self.half_thickness_m, from_m, to_m) == Some(true)
             && std::mem::replace(entered, false)
     }
 
-    /// Returns whether the way crosses a face within the polygon, or beside it; `None` if it does not
-    /// cross the face in the direction of passage.
+    /// Returns whether the path crosses a face inside the polygon; `None` if it does not cross the face in the
+    /// direction of passage.
     fn crossing(&self, face_m: f64, from_m: DVec3, to_m: DVec3) -> Option<bool> {
         let before_m = self.normal.dot(from_m - self.center_m) - face_m;
         let after_m = self.normal.dot(to_m - self.center_m) - face_m;
@@ -133,12 +133,12 @@ impl Opening {
         Some(self.holds(DVec2::new(at_m.dot(self.across), at_m.dot(self.up))))
     }
 
-    /// Whether a point of the plane is in the polygon and keeps clear of its edge.
+    /// Whether a point of the plane is inside the polygon, with the required clearance from its edge.
     fn holds(&self, p_m: DVec2) -> bool {
         let mut inside = false;
         for (n, &b_m) in self.corners_m.iter().enumerate() {
             let a_m = self.corners_m[(n + self.corners_m.len() - 1) % self.corners_m.len()];
-            // Counts the edges that a ray to the left crosses.
+            // Counts the edges that a ray along +x crosses.
             if (a_m.y > p_m.y) != (b_m.y > p_m.y)
                 && p_m.x < a_m.x + (p_m.y - a_m.y) / (b_m.y - a_m.y) * (b_m.x - a_m.x)
             {
@@ -192,20 +192,20 @@ mod tests {
     }
 
     #[test]
-    fn stages_count_in_order_direction_and_opening() {
+    fn stages_count_only_in_order_and_direction_and_through_the_opening() {
         let through = [Progress::Stage(0), Progress::Finished];
         check(&[[1., 0., 1.], [5., 0.2, 1.2], [8., 0., 1.], [9., 0., 1.]], &through);
-        // Beside, above, and the wrong way: not passed, so the goal does not count either.
+        // Past the side, above, and in reverse: not passed, so the goal does not count either.
         let missed = [Progress::GoalTooEarly(0)];
         check(&[[1., 0.6, 1.], [5., 0.6, 1.], [8., 0., 1.], [8.1, 0., 1.]], &missed);
         check(&[[1., 0., 1.5], [5., 0., 1.5], [8., 0., 1.]], &missed);
         check(&[[5., 0., 1.], [1., 0., 1.]], &[]);
-        // Back and through again counts.
+        // Passing again in the right direction counts.
         check(&[[5., 0., 1.], [1., 0., 1.], [5., 0., 1.]], &[Progress::Stage(0)]);
     }
 
     #[test]
-    fn polygons_thickness_and_clearance_count() {
+    fn polygon_thickness_and_clearance_are_checked() {
         let mut config = arena();
         config.goal = None;
         let stage = StageConfig {
@@ -214,7 +214,7 @@ mod tests {
             normal: DVec3::X,
             width_m: 2.0,
             height_m: 2.0,
-            // Its right angle is to the left and above.
+            // The right angle is on the upper left.
             polygon_m: vec![DVec2::new(1., 1.), DVec2::new(-1., 1.), DVec2::new(1., -1.)],
             ..StageConfig::default()
         };
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_goal_the_last_stage_is_the_finish() {
+    fn last_stage_is_the_finish_without_a_goal() {
         let mut course = course();
         course.goal = None;
         let through = [Progress::Stage(0), Progress::Finished];
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn a_goal_between_two_poses_counts() {
+    fn goal_between_two_poses_counts() {
         let mut course = Course::new(&arena());
         let (from, to) = (DVec3::new(1.0, 0.0, 1.0), DVec3::new(12.0, 0.5, 1.0));
         assert_eq!(course.advance(from, to), Some(Progress::Finished));

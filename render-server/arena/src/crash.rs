@@ -1,8 +1,8 @@
-//! The analysis of a failed flight: its probable cause in a sentence, and drawings of its end.
-//! Pure; the autograder's report and the page's crash card show the same.
+//! Analysis of a failed flight: its probable cause in a sentence, and drawings of its end. Pure; the report of
+//! a grade and the page's crash card show the same.
 //!
 //! ```text
-//! verdict, samples, answers, images   --> probable_cause --> a sentence
+//! verdict, samples, replies, images   --> probable_cause --> a sentence
 //! samples, obstacles at its height    --> plot           --> SVG
 //! ```
 
@@ -18,38 +18,36 @@ use vizflyt_protocol::time::ServerTime;
 
 use crate::verdict::{Sample, Verdict};
 
-/// A reply of the plugin, and its image's time.
+/// A reply of the plugin, with the time of its image.
 #[derive(Clone, Debug)]
 pub struct TimedSetpoint {
-    /// When the plugin was given the image.
+    /// Time at which the plugin received the image.
     pub stamp: ServerTime,
-    /// Its setpoint, if it sent one.
+    /// Setpoint of the reply, if it has one.
     pub setpoint: Option<Setpoint>,
 }
 
-/// The free distance ahead in an image of the first camera.
+/// Free distance ahead in an image of the first camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClearanceAhead {
-    /// When the image was new.
     pub stamp: ServerTime,
-    /// By [`ahead_m`]. [m, cam]
+    /// Result of [`ahead_m`]. [m, cam]
     pub ahead_m: Option<f64>,
 }
 
-/// The record of a flight that is over.
+/// Record of a completed flight.
 #[derive(Clone, Copy, Debug)]
 pub struct Flight<'a> {
-    /// Its verdict.
     pub verdict: &'a Verdict,
-    /// Where it was, in order.
+    /// Samples in order of time.
     pub samples: &'a [Sample],
-    /// The plugin's replies, in order; `None` where they were not recorded, as in a lab.
+    /// Replies of the plugin in order; `None` if not recorded, as in a lab.
     pub asked: Option<&'a [TimedSetpoint]>,
-    /// The distances ahead, in order.
+    /// Free distances ahead in order.
     pub seen: &'a [ClearanceAhead],
-    /// The last line that the plugin printed.
+    /// Last line that the plugin printed.
     pub last_line: Option<&'a str>,
-    /// From when an image is rendered until its reply counts. [s]
+    /// Delay from rendering an image until the reply takes effect. [s]
     pub delay_s: f64,
 }
 
@@ -60,8 +58,8 @@ pub fn since(samples: &[Sample], at: ServerTime, seconds: f64) -> &[Sample] {
     samples.get(begin..end).unwrap_or_default()
 }
 
-/// Returns the tenth percentile of the depths in the middle ninth of an image `width_px` wide: what is
-/// ahead, single pixels aside; `None` where nothing is. Zero depths are none. [m, cam]
+/// Returns the free distance ahead in an image `width_px` wide: the tenth percentile of the depths in the
+/// middle ninth, which excludes single pixels. Zero depths do not count; `None` without any depth. [m, cam]
 pub fn ahead_m(depth_mm: &[u16], width_px: usize, scratch: &mut Vec<u16>) -> Option<f64> {
     let height = depth_mm.len().checked_div(width_px)?;
     let rows = depth_mm.chunks_exact(width_px).skip(height / 3).take(height / 3);

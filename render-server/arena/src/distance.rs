@@ -1,14 +1,14 @@
-//! The signed Euclidean distance to the nearest obstacle, one byte a voxel.
+//! Signed Euclidean distance to the nearest obstacle, one byte per voxel.
 //!
-//! Budget: 21 M voxels in half a second on two cores, in the memory of the occupancy grid itself;
-//! a query is eight byte loads, well under a microsecond.
+//! Budget: 21 M voxels in half a second on two cores, in the memory of the occupancy grid; a query is eight
+//! byte loads, well under a microsecond.
 //!
-//! The transform is exact and separable (Felzenszwalb and Huttenlocher, Distance Transforms of
-//! Sampled Functions, 2012; integer envelope after Meijster et al., 2000): first along x, plane by
-//! plane over the whole grid; then every plane of constant x on its own, along z and y. Distances
-//! are between voxel centres; half a voxel less is the distance to the obstacle's face. They are
-//! kept in steps of a fifth of a voxel, from -7.9 to +43.1 voxels: 2.15 m at 5 cm. The byte is
-//! exact to a tenth of a voxel, and the trilinear query between centres to about half of one.
+//! The transform is exact and separable (Felzenszwalb and Huttenlocher, Distance Transforms of Sampled
+//! Functions, 2012; integer envelope after Meijster et al., 2000): first along x, plane by plane over the whole
+//! grid; then each plane of constant x separately, along z and y. Distances are between voxel centres; half a
+//! voxel less is the distance to the obstacle's face. They are stored in steps of a fifth of a voxel, from -7.9
+//! to +43.1 voxels: 2.15 m at 5 cm. The byte is exact to a tenth of a voxel, and the trilinear query between
+//! centres to about half a voxel.
 
 pub use file::{FIELD_HEADER, FieldError};
 use glam::DVec3;
@@ -17,19 +17,19 @@ use rayon::prelude::*;
 use crate::grid::Grid;
 use crate::occupancy::OccupancyGrid;
 
-/// Distance to obstacles, and the floor beneath them.
+/// Distance to obstacles, and the floor below them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DistanceField {
     grid: Grid,
     /// Steps of [`STEP_VOXELS`] from [`CODE_ZERO`].
     codes: Vec<u8>,
     floor_z_m: f64,
-    /// One bit a voxel, low bit first: solid only as nobody has seen it free. Empty if none is.
+    /// One bit per voxel, low bit first: solid only because it is unseen. Empty if there are none.
     unseen: Vec<u8>,
 }
 
 impl DistanceField {
-    /// Computes the field of a grid, in the grid's own memory.
+    /// Computes the field of a grid, in the grid's memory.
     pub fn of(occupancy: OccupancyGrid) -> Self {
         let OccupancyGrid { grid, cells: mut codes, floor_z_m, unseen, .. } = occupancy;
         sweep_along_x(&mut codes, grid.plane());
@@ -40,7 +40,6 @@ impl DistanceField {
         Self { grid, codes, floor_z_m, unseen }
     }
 
-    /// Returns the voxels' places.
     pub fn grid(&self) -> &Grid {
         &self.grid
     }
@@ -50,12 +49,12 @@ impl DistanceField {
         self.floor_z_m
     }
 
-    /// Returns the greatest distance the field can hold; further is this. [m]
+    /// Returns the maximum distance that the field can store; larger ones are reduced to it. [m]
     pub fn max_distance_m(&self) -> f64 {
         distance_voxels(u8::MAX) * self.grid.voxel_m
     }
 
-    /// Returns the bytes the field occupies.
+    /// Returns the memory of the field in bytes.
     pub fn memory_bytes(&self) -> usize {
         self.codes.len() + self.unseen.len()
     }
@@ -65,13 +64,13 @@ impl DistanceField {
         self.codes.iter().filter(|&&code| f64::from(code) < CODE_ZERO).count()
     }
 
-    /// Returns the number of voxels that are solid only as nobody has seen them free.
+    /// Returns the number of voxels that are solid only because they are unseen.
     pub fn unseen_voxels(&self) -> usize {
         self.unseen.iter().map(|byte| byte.count_ones() as usize).sum()
     }
 
-    /// Whether the solid voxel nearest to a point, within `reach_m`, is solid only as nobody has seen it free: what
-    /// a body there meets is no obstacle that anybody knows. [m, world]
+    /// Whether the solid voxel nearest to a point, within `reach_m`, is solid only because it is unseen: then a
+    /// body there touches unseen space, not a known obstacle. [m, world]
     pub fn is_unseen_nearest(&self, p_m: DVec3, reach_m: f64) -> bool {
         if self.unseen.is_empty() || !p_m.is_finite() {
             return false;
@@ -97,9 +96,9 @@ impl DistanceField {
         nearest.1
     }
 
-    /// Returns the signed distance from a point to the nearest obstacle, the floor not counted:
-    /// negative inside, at most [`Self::max_distance_m`]. Outside the grid nothing is known, and
-    /// the nearest point of the grid answers. NaN for a point that is not a number. [m, world]
+    /// Returns the signed distance from a point to the nearest obstacle, without the floor: negative inside, at
+    /// most [`Self::max_distance_m`]. Outside of the grid, returns the value at the nearest point of the grid.
+    /// NaN for NaN. [m, world]
     pub fn obstacle_distance_m(&self, p_m: DVec3) -> f64 {
         if p_m.is_nan() {
             return f64::NAN;
@@ -107,7 +106,7 @@ impl DistanceField {
         let [nx, ny, nz] = self.grid.size;
         let last = DVec3::new((nx - 1) as f64, (ny - 1) as f64, (nz - 1) as f64);
         let at = ((p_m - self.grid.min_m) / self.grid.voxel_m - 0.5).clamp(DVec3::ZERO, last);
-        // The cell's least corner, such that its greatest exists too where there are two voxels.
+        // The cell's lower corner, such that its upper corner is also in the grid if there are two voxels.
         let corner = at.floor().min((last - 1.0).max(DVec3::ZERO));
         let f = at - corner;
         let base = self.grid.index([corner.x as usize, corner.y as usize, corner.z as usize]);
@@ -154,43 +153,40 @@ impl DistanceField {
 /// Occupied cells of one layer, for a top view.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct ObstacleSlice {
-    /// x and y of the least corner of the first cell. [m, world]
+    /// x and y of the first cell's lower corner. [m, world]
     pub min_m: [f64; 2],
     /// Side of a cell. [m]
     pub cell_m: f64,
-    /// Cells along x.
     pub columns: usize,
-    /// Cells along y.
     pub rows: usize,
-    /// Row-major (y slowest), one bit a cell, low bit first; 1 is occupied.
+    /// Row-major (y slowest), one bit per cell, low bit first; 1 is occupied.
     pub bits: Vec<u8>,
 }
 
 impl ObstacleSlice {
-    /// Whether a cell is occupied.
     pub fn is_occupied(&self, column: usize, row: usize) -> bool {
         let cell = row * self.columns + column;
         self.bits[cell / 8] >> (cell % 8) & 1 == 1
     }
 }
 
-/// Returns what a code means. [voxels]
+/// Returns the distance for a code. [voxels]
 fn distance_voxels(code: u8) -> f64 {
     (f64::from(code) - CODE_ZERO) * STEP_VOXELS
 }
 
-/// A code is this many voxels.
+/// Distance per code step. [voxels]
 const STEP_VOXELS: f64 = 0.2;
-/// The code of the obstacle's face. Between two codes, so that half a voxel either way is exact.
+/// Code of the obstacle's face: between two codes, so that half a voxel on either side is exact.
 const CODE_ZERO: f64 = 39.5;
-/// Distances between centres from here on are all [`u8::MAX`]. [voxels]
+/// Maximum distance between centres; larger ones become [`u8::MAX`]. [voxels]
 const REACH: u8 = 44;
 const REACH_SQUARED: i32 = REACH as i32 * REACH as i32;
-/// Marks occupied voxels between the first pass and the last.
+/// Marks occupied voxels between the first and the last pass.
 const OCCUPIED: u8 = 0x80;
 
-/// Turns 0 and 1 into the distance along x to the nearest voxel of the other kind, at most
-/// [`REACH`], with [`OCCUPIED`] kept on top.
+/// Converts 0 and 1 into the distance along x to the nearest voxel of the other kind, at most [`REACH`], with
+/// [`OCCUPIED`] in the top bit.
 fn sweep_along_x(cells: &mut [u8], plane: usize) {
     let nearer = |own: u8, neighbour: u8, limit: u8| {
         let same = (own ^ neighbour) & OCCUPIED == 0;
@@ -234,7 +230,7 @@ impl Tables {
     }
 }
 
-/// Working memory of a plane.
+/// Scratch memory of a plane.
 #[derive(Default)]
 struct Scratch {
     /// [`OCCUPIED`] or 0, y by z.
@@ -245,7 +241,7 @@ struct Scratch {
     envelope: Envelope,
 }
 
-/// Turns a plane's distances along x into codes.
+/// Converts a plane's distances along x into codes.
 fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch: &mut Scratch) {
     let mut own = std::mem::take(&mut scratch.own);
     own.clear();
@@ -254,7 +250,7 @@ fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch
         if !own.contains(&kind) {
             continue;
         }
-        // Distance of each voxel of this kind to the other kind; those of the other are at 0.
+        // Distance of each voxel of this kind to the other kind; voxels of the other kind are at 0.
         scratch.squares.clear();
         scratch.squares.extend(plane.iter().zip(&own).map(|(&cell, &own)| {
             let along_x = i32::from(cell & !OCCUPIED);
@@ -266,7 +262,7 @@ fn finish_plane(plane: &mut [u8], ny: usize, nz: usize, tables: &Tables, scratch
             square_distances(scratch, ny, nz);
         }
         let table = if kind == OCCUPIED { &tables.occupied } else { &tables.free };
-        // The other kind's voxels keep their distance along x until their turn.
+        // Voxels of the other kind keep their distance along x until their pass.
         for ((cell, &own), &square) in plane.iter_mut().zip(&own).zip(&scratch.squares) {
             if own == kind {
                 *cell = table[square as usize];
@@ -291,15 +287,15 @@ fn square_distances(scratch: &mut Scratch, ny: usize, nz: usize) {
     }
 }
 
-/// The lower envelope of parabolas `square[i] + (x - i)^2`.
+/// Lower envelope of the parabolas `square[i] + (x - i)^2`.
 #[derive(Default)]
 struct Envelope {
-    /// Parabola's place, its square, and where it begins to be lowest.
+    /// Position of the parabola, its square, and the start of the range in which it is lowest.
     parts: Vec<(i32, i32, i32)>,
 }
 
 impl Envelope {
-    /// Takes the parabolas that matter: those below the reach.
+    /// Adds the parabolas below the reach.
     fn build(&mut self, squares: &[i32]) {
         self.parts.clear();
         for (u, &square) in (0..).zip(squares) {
@@ -308,7 +304,7 @@ impl Envelope {
             }
             let mut begins = 0;
             while let Some(&(i, lower, from)) = self.parts.last() {
-                // The first place at which the new parabola is lower (Meijster's Sep, plus one).
+                // The first position at which the new parabola is lower (Meijster's Sep, plus one).
                 let meets = (u * u - i * i + square - lower).div_euclid(2 * (u - i)) + 1;
                 if meets > from {
                     begins = meets;
@@ -320,7 +316,7 @@ impl Envelope {
         }
     }
 
-    /// Writes the envelope, at most the reach.
+    /// Writes the envelope, limited to the reach.
     fn write<'a>(&self, line: impl Iterator<Item = &'a mut i32>) {
         let Some(&first) = self.parts.first() else {
             line.for_each(|out| *out = REACH_SQUARED);

@@ -1,5 +1,5 @@
-//! The geofence, the ceiling and the no-fly boxes, looked at with the velocity of the moment: a
-//! vehicle that can no longer stop before them is as good as beyond.
+//! Geofence, ceiling and no-fly boxes, checked with the present velocity: a vehicle that cannot stop before a
+//! boundary counts as beyond it.
 
 use glam::DVec3;
 use vizflyt_protocol::flight_end::Boundary;
@@ -8,32 +8,30 @@ use vizflyt_protocol::messages::{Limits, bounded};
 
 use crate::config::ArenaConfig;
 
-/// The check of a position and velocity against a boundary.
+/// Result of checking a position and velocity against a boundary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum FenceVerdict {
-    /// The vehicle stops before it with room to spare.
+    /// The vehicle can stop before the boundary with enough margin.
     Inside,
-    /// It stops before it, but only just.
+    /// The vehicle can stop before the boundary with little margin.
     Near,
-    /// It is beyond, or cannot stop before it.
+    /// The vehicle is beyond the boundary, or cannot stop before it.
     Breach,
 }
 
-/// The verdict of the boundary that matters most, with its numbers.
+/// Result for the worst boundary, with its margins.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FenceCheck<'a> {
-    /// Which boundary.
     pub boundary: &'a Boundary,
-    /// What to think of it.
     pub verdict: FenceVerdict,
-    /// From the body's surface to the boundary; negative is beyond. [m]
+    /// Distance from the body's surface to the boundary; negative is beyond. [m]
     pub margin_m: f64,
-    /// From the body's surface to the boundary where the vehicle would come to rest, braking along
-    /// its way over `v^2 / 2a`, or where it passes nearest; negative is beyond. [m]
+    /// Distance from the body's surface to the boundary at the stopping position after braking over `v^2 / 2a`,
+    /// or at the nearest point on the way there; negative is beyond. [m]
     pub margin_at_rest_m: f64,
 }
 
-/// All that bounds where a vehicle may be.
+/// All boundaries of an arena.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Boundaries {
     all: Vec<(Boundary, Rule)>,
@@ -41,7 +39,7 @@ pub struct Boundaries {
     limits: Limits,
 }
 
-/// What a boundary asks for.
+/// Rule of a boundary.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Rule {
     /// The body's surface stays inside: net, walls.
@@ -52,14 +50,14 @@ enum Rule {
     Ceiling(f64),
 }
 
-/// Room, now or at rest, below which a person should be warned. [m]
+/// Margin, now or at the stopping position, below which people are warned. [m]
 const NEAR_M: f64 = 0.3;
-/// The referee's tolerance over the guard's: the guard brakes with its own margin, and poses carry
-/// millimetres of noise. Only what it fails to hold is judged. [m]
+/// Tolerance of the referee compared with the guard: the guard brakes with its own margin, and poses have
+/// millimetres of noise. The referee only reports what the guard fails to prevent. [m]
 const TOLERANCE_M: f64 = 0.1;
 
 impl Boundaries {
-    /// Returns those of an arena.
+    /// Returns the boundaries of an arena.
     pub fn of(config: &ArenaConfig) -> Self {
         let mut all = vec![(Boundary::Geofence, Rule::KeepIn(config.geofence()))];
         let ceiling = |z_m| (Boundary::Ceiling, Rule::Ceiling(z_m));
@@ -70,9 +68,8 @@ impl Boundaries {
         Self { all, radius_m: config.body_radius_m, limits: config.limits }
     }
 
-    /// Judges the way from one position to the next [m, world], and the velocity at its end
-    /// [m/s, world]; returns the boundary that is worst. Sinking does not count towards the geofence:
-    /// its floor is where vehicles land.
+    /// Checks the path from one position to the next [m, world], and the velocity at its end [m/s, world];
+    /// returns the worst boundary. Downward speed does not count for the geofence: vehicles land on its floor.
     pub fn check(&self, from_m: DVec3, to_m: DVec3, v_world_mps: DVec3) -> FenceCheck<'_> {
         let least_m = |check: &FenceCheck<'_>| check.margin_m.min(check.margin_at_rest_m);
         let check = |(boundary, rule)| self.check_one(boundary, rule, from_m, to_m, v_world_mps);
@@ -96,8 +93,8 @@ impl Boundaries {
         to_m: DVec3,
         v_world_mps: DVec3,
     ) -> FenceCheck<'a> {
-        // The place of rest, not the nearest side: low over the floor, the floor is always nearest,
-        // however fast the vehicle flies at the wall ahead.
+        // Uses the stopping position, not the nearest side: low above the floor, the floor is always nearest,
+        // even if the vehicle flies fast at a wall.
         let rest_m = |v_mps: DVec3| {
             to_m + v_mps * (v_mps.length() / (2.0 * self.limits.max_acceleration_mps2))
         };
@@ -108,13 +105,13 @@ impl Boundaries {
                 (margin_at(to_m), margin_at(rest_m(level_mps)))
             }
             Rule::Ceiling(z_m) => (z_m - to_m.z, z_m - rest_m(level_mps).z),
-            // A box may lie between two poses, or between here and the place of rest.
+            // A box may be between two poses, or between here and the stopping position.
             Rule::KeepOut(volume) => {
                 let nearest = |a, b| least_distance_m(volume, a, b) - self.radius_m;
                 (nearest(from_m, to_m), nearest(to_m, rest_m(v_world_mps)))
             }
         };
-        // A number that is none counts as a breach; a volume's distance may lose it on the way.
+        // NaN counts as a breach; the distance to a volume may drop a NaN.
         let known = to_m.is_finite() && v_world_mps.is_finite();
         let verdict = if !(known && margin_m >= 0.0 && margin_at_rest_m + TOLERANCE_M >= 0.0) {
             FenceVerdict::Breach
@@ -127,12 +124,12 @@ impl Boundaries {
     }
 }
 
-/// Returns the least signed distance to a volume on the way from `a_m` to `b_m`: volumes are convex,
-/// so it falls, then rises. [m, world]
+/// Returns the minimum signed distance to a volume on the line from `a_m` to `b_m`: volumes are convex, so the
+/// distance falls, then rises. [m, world]
 fn least_distance_m(volume: &Volume, a_m: DVec3, b_m: DVec3) -> f64 {
     let at = |t: f64| volume.signed_distance_m(a_m.lerp(b_m, t));
     let (mut low, mut high) = (0.0, 1.0);
-    // (2/3)^30 of the way is micrometres.
+    // (2/3)^30 of the line is micrometres.
     for _ in 0..30 {
         let (third, two_thirds) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
         if at(third) < at(two_thirds) {
@@ -172,26 +169,26 @@ mod tests {
     }
 
     #[test]
-    fn speed_toward_the_fence_counts() {
+    fn stopping_distance_counts_towards_the_fence() {
         use FenceVerdict::{Breach, Inside, Near};
         let fence = "the geofence";
-        // 1.1 m to the side x = 10, 0.1 m of body: 1 m left; 4 m/s needs 1 m, 4.5 m/s 1.27 m.
+        // 1.1 m from the side x = 10, 0.1 m of body: 1 m left; 4 m/s needs 1 m to stop, 4.5 m/s 1.27 m.
         check([8.9, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Inside);
         check([8.9, 2.0, 1.5], [4.0, 0.0, 0.0], fence, Near);
         check([8.9, 2.0, 1.5], [4.5, 0.0, 0.0], fence, Breach);
         check([8.9, 2.0, 1.5], [-6.0, 0.0, 0.0], fence, Inside);
-        // The floor is nearer than the wall, and parallel to the way.
+        // The floor is nearer than the wall, and parallel to the motion.
         check([8.9, 2.0, 0.6], [4.5, 0.0, 0.0], fence, Breach);
         check([8.9, 2.0, 0.6], [0.0, 4.5, 0.0], fence, Inside);
         check([8.9, 2.0, 1.5], [f64::NAN, 0.0, 0.0], fence, Breach);
         check([9.95, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Breach);
         check([f64::NAN, 2.0, 1.5], [0.0, 0.0, 0.0], fence, Breach);
-        // Landing is no breach.
+        // Landing is not a breach.
         check([8.9, 2.0, 0.45], [0.0, 0.0, -2.5], fence, Inside);
     }
 
     #[test]
-    fn the_ceiling_is_the_centre_s() {
+    fn ceiling_applies_to_the_body_centre() {
         let ceiling = "the ceiling";
         check([8.0, 2.0, 2.0], [0.0, 0.0, 0.0], ceiling, FenceVerdict::Inside);
         check([8.0, 2.0, 2.3], [0.0, 0.0, 0.0], ceiling, FenceVerdict::Near);
@@ -200,14 +197,14 @@ mod tests {
     }
 
     #[test]
-    fn a_thin_box_is_not_jumped_over() {
+    fn thin_box_between_poses_is_detected() {
         let shelf = "the no-fly box shelf";
         check([3.0, 2.0, 0.5], [0.0, 0.0, 0.0], shelf, FenceVerdict::Inside);
         check([3.0, 2.0, 0.5], [4.5, 0.0, 0.0], shelf, FenceVerdict::Breach);
-        // It would come to rest beyond, through it.
+        // The stopping position is behind the box.
         check([3.3, 2.0, 0.5], [5.5, 0.0, 0.0], shelf, FenceVerdict::Breach);
         check([3.3, 2.0, 1.5], [5.5, 0.0, 0.0], shelf, FenceVerdict::Inside);
-        // Down onto it, and beside it.
+        // Down onto the box, and next to it.
         check([4.05, 2.0, 1.2], [0.0, 0.0, -2.0], shelf, FenceVerdict::Breach);
         check([4.05, 2.0, 1.05], [0.0, 0.0, 0.0], shelf, FenceVerdict::Breach);
         let boundaries = boundaries();

@@ -1,19 +1,19 @@
-//! The rules of the room, pure: text and poses in, events and distances out. No sockets, files,
-//! clock or threads of its own (the baker borrows rayon's).
+//! Rules of the room, pure: text and poses in, events and distances out. The crate opens no sockets or files,
+//! reads no clock, and starts no threads (the baker uses rayon's).
 //!
 //! Read in this order:
-//! - [`config`]: `arena.toml` as validated types; also what the runtime gets of the arena;
+//! - [`config`]: `arena.toml` as validated types, and the runtime's view of the arena;
 //! - [`seen`]: space that a capture has seen to be free;
 //! - [`occupancy`], [`distance`]: splats baked into voxels, and the distance to them;
-//! - [`objects`]: where what moves by itself is at any instant;
-//! - [`obstacles`], [`neighbours`]: what must not be touched: still, moving, other vehicles;
-//! - [`pose`]: which measurements are accepted, and the twist;
+//! - [`objects`]: poses of moving objects at any instant;
+//! - [`obstacles`], [`neighbours`]: obstacles: fixed, moving, other vehicles;
+//! - [`pose`]: pose filter: accepts measurements and estimates the twist;
 //! - [`body`], [`collision`], [`fence`], [`course`]: one rule each;
-//! - [`check`]: whether a course can be flown at all;
-//! - [`referee`]: all of it for one vehicle, as one state machine;
-//! - [`verdict`]: what a flight was worth, by all that happened in it;
-//! - [`points`]: what the figures over all flights are worth;
-//! - [`crash`]: why one failed, in words and drawings.
+//! - [`check`]: check that a course can be flown;
+//! - [`referee`]: all rules for one vehicle, as one state machine;
+//! - [`verdict`]: result of a flight, from its events and samples;
+//! - [`points`]: points for the figures over all flights;
+//! - [`crash`]: probable cause of a failed flight, and drawings.
 
 pub mod body;
 pub mod check;

@@ -1,7 +1,7 @@
-//! Other vehicles in the room: they collide virtually, also where two nets are one arena.
+//! Other vehicles in the room: collisions are virtual, so vehicles in two nets can share one arena.
 //!
-//! Each is a sphere on a straight line between two instants, so the nearest approach of two has a
-//! closed form: nothing is tunnelled through.
+//! Each vehicle is a sphere on a straight line between two instants. The closest approach of two has a closed
+//! form, so nothing is tunnelled through.
 
 use glam::DVec3;
 use vizflyt_protocol::messages::Name;
@@ -10,49 +10,45 @@ use vizflyt_protocol::time::ServerTime;
 use crate::collision::{Contact, Sweep};
 use crate::pose::Motion;
 
-/// Another vehicle, by its newest pose.
+/// Another vehicle at its newest pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Neighbour {
-    /// What it is called.
     pub name: Name,
-    /// How it moves.
     pub motion: Motion,
-    /// Of the sphere that encloses it. [m]
+    /// Radius of the sphere that encloses it. [m]
     pub radius_m: f64,
 }
 
-/// Where a sphere's centre was, and when.
+/// Position of a sphere's centre at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Passage {
-    /// When.
     pub stamp: ServerTime,
-    /// [m, world]
     pub p_world_m: DVec3,
 }
 
 impl Neighbour {
-    /// Returns where it is at an instant, as far as its motion is known. [m, world]
+    /// Returns the position at an instant, within the limit of extrapolation. [m, world]
     pub fn position_m(&self, at: ServerTime) -> DVec3 {
         self.motion.at(self.motion.reach(at)).translation_m
     }
 
-    /// Sweeps a sphere of `radius_m` from one place to the next, past this vehicle on its own way.
+    /// Sweeps a sphere of `radius_m` from one position to the next, against the motion of this vehicle.
     ///
-    /// A coordinate that is not a number is a contact: unknown is not safe.
+    /// NaN in a coordinate counts as a contact: unknown is not safe.
     pub fn sweep(&self, from: Passage, to: Passage, radius_m: f64) -> Sweep {
         let between_m = radius_m + self.radius_m;
-        // Seen from this vehicle.
+        // In the frame of this vehicle.
         let start_m = from.p_world_m - self.position_m(from.stamp);
         let way_m = to.p_world_m - self.position_m(to.stamp) - start_m;
         let squared = way_m.length_squared();
         let nearest =
             if squared > 0.0 { (-start_m.dot(way_m) / squared).clamp(0.0, 1.0) } else { 0.0 };
         let clearance_m = (start_m + way_m * nearest).length() - between_m;
-        // Positively stated, so that NaN is a contact.
+        // Stated positively, so that NaN is a contact.
         if clearance_m > 0.0 && squared.is_finite() {
             return Sweep { clearance_m, contact: None };
         }
-        // The first root of |start + s way| = between; at once if they touch already.
+        // The first root of |start + s way| = between; 0 if they touch already.
         let half_b = start_m.dot(way_m);
         let c = start_m.length_squared() - between_m * between_m;
         let root = (half_b * half_b - squared * c).max(0.0).sqrt();
@@ -71,7 +67,7 @@ mod tests {
     use vizflyt_protocol::geometry::Pose;
     use vizflyt_protocol::messages::bounded;
 
-    /// Stands at (2, 0, 1).
+    /// A vehicle at rest at (2, 0, 1).
     fn bee() -> Neighbour {
         let pose = Pose::new(DVec3::new(2.0, 0.0, 1.0), DQuat::IDENTITY);
         let motion = Motion::at_rest(ServerTime::from_ns(0), pose);
@@ -84,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn two_vehicles_touch_at_the_sum_of_their_radii() {
+    fn vehicles_collide_at_the_sum_of_their_radii() {
         let contact = sweep([0.0, 0.0, 1.0], [4.0, 0.0, 1.0]).contact.unwrap();
         assert!((contact.p_world_m.x - 1.8).abs() < 1e-9, "{contact:?}");
         let beside = sweep([0.0, 0.3, 1.0], [4.0, 0.3, 1.0]);

@@ -1,12 +1,12 @@
-//! Where the objects of an arena are at any instant: the one clock for picture and referee.
+//! Poses of an arena's objects at any instant: one clock for images and referee.
 //!
 //! ```text
 //! [[objects]] of arena.toml, seed -> MovingObjects
 //! nanoseconds since the arena's epoch -> a pose for each object
 //! ```
-//! Pure: the same instant gives the same bits on every machine, however often and in whatever order
-//! it is asked. The epoch is the server's start of the arena, or 0 of a lock-step run. Budget: 0.1 us
-//! for each object; the render thread asks once an image, the referee a few times a pose.
+//! Pure: an instant gives the same bits on every machine, in any order of calls. The epoch is the server's
+//! start of the arena, or 0 in a lock-step run. Budget: 0.1 us per object; the render thread calls it once per
+//! image, the referee a few times per pose.
 
 use std::f64::consts::TAU;
 
@@ -16,19 +16,19 @@ use vizflyt_protocol::random;
 
 use crate::config::{ArenaConfig, MotionConfig, ObjectConfig};
 
-/// The objects of an arena, each with its motion.
+/// Objects of an arena with their motions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MovingObjects {
     objects: Vec<MovingObject>,
 }
 
-/// No point of an object moves faster than `linear_mps` plus `angular_radps` times its distance from
-/// the object's origin.
+/// Upper bound of an object's speed: `linear_mps` plus `angular_radps` times the distance of a point from the
+/// object's origin.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TopSpeed {
-    /// Of the origin. [m/s]
+    /// Maximum speed of the origin. [m/s]
     pub linear_mps: f64,
-    /// About it. [rad/s]
+    /// Maximum angular speed about the origin. [rad/s]
     pub angular_radps: f64,
 }
 
@@ -38,25 +38,25 @@ struct MovingObject {
     rest: Pose<World, Object>,
     motion: ObjectMotion,
     period_ns: u64,
-    /// What of the period had passed at the epoch.
+    /// Part of the period that had passed at the epoch.
     phase_ns: u64,
 }
 
-/// As [`MotionConfig`], ready to be asked.
+/// [`MotionConfig`], prepared for evaluation.
 #[derive(Clone, Debug, PartialEq)]
 enum ObjectMotion {
     None,
     Rotation {
-        /// Unit. [object]
+        /// Unit vector. [object]
         axis: DVec3,
     },
     Oscillation {
         slide_m: DVec3,
-        /// Unit, or zero. [object]
+        /// Unit vector, or zero. [object]
         axis: DVec3,
         swing_rad: f64,
     },
-    /// The corners of one round, the first of them again at the end, and how far along each is.
+    /// Corners of one round, with the first one again at the end, and the path length at each.
     Path {
         corners_m: Vec<DVec3>,
         along_m: Vec<f64>,
@@ -65,7 +65,7 @@ enum ObjectMotion {
 }
 
 impl MovingObjects {
-    /// Takes an arena's objects; phases absent from the arena are random by the seed.
+    /// Returns an arena's objects; absent phases are random by the seed.
     ///
     /// ```
     /// use vizflyt_arena::config::{MotionConfig, ObjectConfig};
@@ -80,7 +80,7 @@ impl MovingObjects {
     ///     motion: Some(MotionConfig::Rotation { axis: DVec3::X, period_s: 4.0 }),
     /// };
     /// let objects = MovingObjects::of(&[hand], 7);
-    /// // A quarter of the turn later what pointed up points to -y.
+    /// A quarter of a turn later, the direction that pointed up points to -y.
     /// let pose = objects.placements(1_000_000_000)[0].unwrap();
     /// assert!((pose.rotate(DVec3::Z) - DVec3::NEG_Y).length() < 1e-12);
     /// ```
@@ -88,56 +88,52 @@ impl MovingObjects {
         Self::of(&config.objects, seed)
     }
 
-    /// As [`Self::new`], of objects alone.
+    /// Same as [`Self::new`], for a list of objects.
     pub fn of(objects: &[ObjectConfig], seed: u64) -> Self {
         let of = |(index, object): (usize, &ObjectConfig)| MovingObject::new(object, index, seed);
         Self { objects: objects.iter().enumerate().map(of).collect() }
     }
 
-    /// Returns how many there are.
     pub fn len(&self) -> usize {
         self.objects.len()
     }
 
-    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty()
     }
 
-    /// Returns some of them alone, on the same clock.
+    /// Returns the objects with these indices, on the same clock.
     #[must_use]
     pub fn select(&self, indices: &[usize]) -> Self {
         Self { objects: indices.iter().map(|&index| self.objects[index].clone()).collect() }
     }
 
-    /// Whether an object moves at all.
     pub fn moves(&self, index: usize) -> bool {
         self.objects[index].motion != ObjectMotion::None
     }
 
-    /// Returns their names, in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.objects.iter().map(|object| &*object.name)
     }
 
-    /// Returns where an object is, this long after the epoch, or before it. [ns]
+    /// Returns the pose of an object at a time after the epoch; negative is before. [ns]
     pub fn placement(&self, index: usize, since_epoch_ns: i64) -> Pose<World, Object> {
         self.objects[index].at(since_epoch_ns)
     }
 
-    /// Returns where all are, as a renderer wants it. [ns]
+    /// Returns the poses of all objects in the form of a renderer. [ns]
     pub fn placements(&self, since_epoch_ns: i64) -> Vec<Option<Pose<World, Object>>> {
         let mut placements = Vec::with_capacity(self.len());
         self.place(since_epoch_ns, &mut placements);
         placements
     }
 
-    /// Appends where all are; for a loop that brings its own memory. [ns]
+    /// Appends the poses of all objects, without allocating in a loop. [ns]
     pub fn place(&self, since_epoch_ns: i64, placements: &mut Vec<Option<Pose<World, Object>>>) {
         placements.extend(self.objects.iter().map(|object| Some(object.at(since_epoch_ns))));
     }
 
-    /// Returns how fast an object moves at most.
+    /// Returns the maximum speed of an object.
     pub fn top_speed(&self, index: usize) -> TopSpeed {
         self.objects[index].top_speed()
     }
@@ -185,7 +181,7 @@ impl MovingObject {
     }
 
     fn at(&self, since_epoch_ns: i64) -> Pose<World, Object> {
-        // In whole nanoseconds, and wide enough for any instant: no bit is lost as time goes by.
+        // Whole nanoseconds, in a type wide enough for any instant: no rounding over time.
         let ns = i128::from(since_epoch_ns) + i128::from(self.phase_ns);
         let into_ns = ns.rem_euclid(i128::from(self.period_ns)) as u64;
         let share = into_ns as f64 / self.period_ns as f64;
@@ -198,7 +194,7 @@ impl MovingObject {
             }
             ObjectMotion::Path { corners_m, along_m, .. } => {
                 let way_m = share * along_m[along_m.len() - 1];
-                // The last corner that is behind; the first is, at 0.
+                // The last corner that has been passed; the first one is passed at 0.
                 let n = along_m.partition_point(|&at_m| at_m <= way_m).clamp(1, along_m.len() - 1);
                 let leg_m = along_m[n] - along_m[n - 1];
                 let part = if leg_m > 0.0 { (way_m - along_m[n - 1]) / leg_m } else { 0.0 };
@@ -227,7 +223,7 @@ impl MovingObject {
     }
 }
 
-/// Returns a rotation about a unit axis; with `libm`, so that it is the same on every machine.
+/// Returns a rotation about a unit axis; `libm` gives the same result on every machine.
 fn turn(axis: DVec3, angle_rad: f64) -> DQuat {
     let (sin, cos) = libm::sincos(angle_rad / 2.0);
     DQuat::from_xyzw(axis.x * sin, axis.y * sin, axis.z * sin, cos)
@@ -256,9 +252,9 @@ mod tests {
     const S: i64 = 1_000_000_000;
 
     #[test]
-    fn a_hand_turns_evenly_and_for_ever() {
+    fn rotation_is_even_and_exact_after_a_year() {
         let hand = one(MotionConfig::Rotation { axis: DVec3::X * 3.0, period_s: 6.0 });
-        // At rest turned to the left, the hand turns in the plane of x and z.
+        // At rest turned left, the hand turns in the plane of x and z.
         let up_at = |ns| hand.placement(0, ns).rotate(DVec3::Z);
         assert!((up_at(0) - DVec3::Z).length() < 1e-12);
         assert!((up_at(S * 3 / 2) - DVec3::X).length() < 1e-12);
@@ -269,13 +265,13 @@ mod tests {
             assert_eq!(hand.placement(0, year + ns), hand.placement(0, ns));
             assert_eq!(hand.placement(0, ns - year), hand.placement(0, ns));
         }
-        // A microsecond is seen: a metre along the hand it is 1 um of way.
+        // A microsecond makes a difference: 1 um of motion one metre along the hand.
         let moved_m = (up_at(1001) - up_at(1)).length();
         assert!((moved_m / (TAU / 6.0 * 1e-6) - 1.0).abs() < 1e-6, "{moved_m}");
     }
 
     #[test]
-    fn doors_slide_pendulums_swing_and_drones_go_round() {
+    fn doors_slide_and_pendulums_swing_and_paths_are_followed() {
         let door = one(MotionConfig::Oscillation {
             slide_m: DVec3::X * 0.8,
             axis: DVec3::ZERO,
@@ -297,7 +293,7 @@ mod tests {
         let path =
             |closed| one(MotionConfig::Path { points_m: points_m.clone(), speed_mps: 1.0, closed });
         let at = |objects: &MovingObjects, s: f64| {
-            // In the object's axes at rest, from its rest.
+            // In the object's axes at rest, from its rest position.
             let offset_m =
                 objects.placement(0, (s * 1e9) as i64).translation_m - DVec3::new(1.0, 2.0, 3.0);
             DVec3::new(offset_m.y, -offset_m.x, offset_m.z)
@@ -323,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_motion_stands_still() {
+    fn object_without_motion_is_fixed() {
         let frame = MovingObjects::of(&[object(None, None)], 3);
         let rest = frame.placement(0, 0);
         assert_eq!(rest.translation_m, DVec3::new(1.0, 2.0, 3.0));
@@ -355,7 +351,7 @@ mod tests {
     }
 
     proptest! {
-        /// Poses are poses at any instant, and nothing outruns its top speed.
+        /// Poses are valid at any instant, and no point exceeds the top speed.
         #[test]
         fn no_point_is_faster_than_the_top_speed(
             motion in motions(), ns in any::<i64>(), step_ns in 1..2_000_000_000i64,

@@ -1,9 +1,9 @@
-//! What must not be touched: what stands still, and what moves, each with its own distance field.
+//! Obstacles, fixed and moving, each with its own distance field.
 //!
-//! A field moves along with its object: a point of the world is taken into the object's frame of that
-//! instant and looked up there. Between two poses both move, so the sweep is of the body against the
-//! object: no point of the one gets nearer to the other by more than the body moves plus the object
-//! does, its turn included. Budget: 2 us a moving object and pose, most of it one query in the open.
+//! A field moves with its object: a point of the world is transformed into the object's frame at that instant
+//! and looked up there. Between two poses both move, so the sweep is of the body against the object: no points
+//! of the two approach each other by more than the body's motion plus the object's, including its turn. Budget:
+//! 2 us per moving object and pose, most of it one query in open space.
 
 use std::sync::Arc;
 
@@ -15,14 +15,14 @@ use crate::collision::{Sweep, advance, least_step_m, sweep};
 use crate::distance::DistanceField;
 use crate::objects::{MovingObjects, TopSpeed};
 
-/// The obstacles of an arena; shared by the referees of its vehicles.
+/// Obstacles of an arena; shared by the referees of its vehicles.
 #[derive(Clone, Debug)]
 pub struct Obstacles {
-    /// What stands still.
+    /// Fixed obstacles.
     pub still: Arc<DistanceField>,
-    /// The field of each of `objects`, of those too that do not move, in its own frame. [m, object]
+    /// Field of each of `objects`, including fixed ones, in its own frame. [m, object]
     pub moving: Vec<Arc<DistanceField>>,
-    /// Where they are when.
+    /// Poses of the objects over time.
     pub objects: MovingObjects,
 }
 
@@ -38,29 +38,28 @@ impl From<DistanceField> for Obstacles {
     }
 }
 
-/// A body's pose and when it was there.
+/// Pose of a body with its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TimedPose {
-    /// Since the arena's epoch. [ns]
+    /// Time since the arena's epoch. [ns]
     pub since_epoch_ns: i64,
-    /// Where the body was.
     pub world_from_body: Pose<World, Body>,
 }
 
-/// What was touched first.
+/// First obstacle that was touched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Touched {
-    /// Something that stands still.
+    /// A fixed obstacle.
     Still,
     /// The object with this index.
     Object(usize),
 }
 
 impl Obstacles {
-    /// Puts fields to their objects.
+    /// Combines fields and objects.
     ///
     /// # Panics
-    /// If there are not as many fields as objects.
+    /// If the numbers of fields and objects differ.
     pub fn new(
         still: Arc<DistanceField>,
         moving: Vec<Arc<DistanceField>>,
@@ -70,15 +69,15 @@ impl Obstacles {
         Self { still, moving, objects }
     }
 
-    /// Returns some of the objects alone, with what stands still.
+    /// Returns the fixed obstacles and the objects with these indices.
     #[must_use]
     pub fn select(&self, indices: &[usize]) -> Self {
         let fields = indices.iter().map(|&index| self.moving[index].clone()).collect();
         Self::new(self.still.clone(), fields, self.objects.select(indices))
     }
 
-    /// Returns the distance from a point to the nearest obstacle at an instant, the floor not
-    /// counted; never more than the truth by more than what a field rounds. [m, world; ns]
+    /// Returns the distance from a point to the nearest obstacle at an instant, without the floor. It exceeds
+    /// the true distance at most by the rounding of a field. [m, world; ns]
     pub fn distance_m(&self, since_epoch_ns: i64, p_world_m: DVec3) -> f64 {
         // Not `min`, which would drop a NaN.
         let still_m = self.still.obstacle_distance_m(p_world_m);
@@ -86,7 +85,7 @@ impl Obstacles {
         if still_m.is_nan() || still_m < moving_m { still_m } else { moving_m }
     }
 
-    /// As [`Self::distance_m`], to what moves alone; infinite where nothing does. [m, world; ns]
+    /// Same as [`Self::distance_m`], only for objects; infinite without objects. [m, world; ns]
     pub fn moving_distance_m(&self, since_epoch_ns: i64, p_world_m: DVec3) -> f64 {
         let mut nearest_m = f64::INFINITY;
         for (index, field) in self.moving.iter().enumerate() {
@@ -98,8 +97,8 @@ impl Obstacles {
         nearest_m
     }
 
-    /// Sweeps a body from one timed pose to the next, against everything that stands or moves; the least
-    /// clearance is over all, the contact the first, and what was touched comes with it.
+    /// Sweeps a body from one timed pose to the next, against all obstacles. Returns the minimum clearance over
+    /// all, the first contact, and the obstacle touched.
     pub fn sweep(&self, body: &BodyShape, from: &TimedPose, to: &TimedPose) -> (Sweep, Touched) {
         let mut found = sweep(&self.still, body, &from.world_from_body, &to.world_from_body);
         let mut touched = Touched::Still;
@@ -129,7 +128,7 @@ impl Obstacles {
         let TopSpeed { linear_mps, angular_radps } = self.objects.top_speed(index);
         let body_m = body.motion_m(a, b);
         let origin_m = self.objects.placement(index, from.since_epoch_ns).translation_m;
-        // As far from the object's origin as anything of the body comes.
+        // Maximum distance of any point of the body from the object's origin.
         let reach_m =
             (a.translation_m - origin_m).length() + body.radius_m() + body_m + linear_mps * took_s;
         let motion_m = body_m + (linear_mps + angular_radps * reach_m) * took_s;
@@ -143,7 +142,7 @@ impl Obstacles {
     }
 }
 
-/// Returns the distance from a point to an object at a place.
+/// Returns the distance from a point to an object at a pose.
 fn distance_to_m(field: &DistanceField, placement: &Pose<World, Object>, p_world_m: DVec3) -> f64 {
     let p_m = placement.inverse().transform_point(p_world_m);
     let grid = field.grid();
@@ -151,8 +150,8 @@ fn distance_to_m(field: &DistanceField, placement: &Pose<World, Object>, p_world
     let nearest_m = p_m.clamp(grid.min_m + margin_m, grid.max_m() - margin_m);
     let outside_m = (p_m - nearest_m).length();
     let inside_m = field.obstacle_distance_m(nearest_m);
-    // The object is within the box, which is convex: seen from the nearest point of the box it lies
-    // at a right angle or more from here. Positively stated, so that NaN stays.
+    // The object is inside the box, which is convex: seen from the nearest point of the box, the angle between
+    // it and the point is a right angle or more. Stated positively, so that NaN is kept.
     if outside_m == 0.0 { inside_m } else { outside_m.hypot(inside_m.max(0.0)) }
 }
 
@@ -166,7 +165,7 @@ mod tests {
     use proptest::prelude::*;
     use vizflyt_protocol::geometry::Volume;
 
-    /// A bar of 1 m from the origin up, 6 cm thick.
+    /// A bar of 1 m from the origin up, 8 cm thick.
     const HAND: Volume = Volume::Capsule {
         a_m: DVec3::new(0.0, 0.0, 0.0),
         b_m: DVec3::new(0.0, 0.0, 1.0),
@@ -186,7 +185,7 @@ mod tests {
         DistanceField::of(occupancy_of(grid, -1e3, |_| false)).into()
     }
 
-    /// The hand at the origin, turning about x.
+    /// Returns the hand at the origin, turning about x.
     fn clock(period_s: f64, phase_s: f64) -> Obstacles {
         let hand = ObjectConfig {
             name: "hand".into(),
@@ -204,17 +203,17 @@ mod tests {
     }
 
     #[test]
-    fn the_field_turns_with_the_hand() {
+    fn field_moves_with_the_object() {
         let clock = clock(4.0, 0.0);
-        // 0.5 m up, beside the hand: at once, and after one turn.
+        // 0.5 m up, next to the hand: at once, and after one turn.
         let p_m = DVec3::new(0.0, 0.15, 0.5);
         for ns in [0, 4_000_000_000, 4_000_000_000 * 100_000] {
             let found_m = clock.distance_m(ns, p_m);
             assert!((found_m - 0.11).abs() < VOXEL_M, "{found_m}");
         }
-        // After a quarter it lies along -y; along y there is nothing.
+        // After a quarter turn it is along -y; along y there is nothing.
         assert!(clock.distance_m(1_000_000_000, DVec3::new(0.0, -0.5, 0.0)) < 0.0);
-        // Outside of its grid, what is known is a lower bound.
+        // Outside of the grid, the result is a lower bound.
         let p_m = DVec3::new(0.0, 0.3, 0.5);
         let far_m = clock.distance_m(1_000_000_000, p_m);
         assert!((0.3..p_m.length() - 0.04 + VOXEL_M).contains(&far_m), "{far_m}");
@@ -222,19 +221,19 @@ mod tests {
     }
 
     #[test]
-    fn a_hand_hits_who_waits_and_misses_who_passes_in_time() {
+    fn moving_object_collides_only_at_the_right_time() {
         let clock = clock(4.0, 0.0);
         let body = BodyShape::sphere(BODY_M);
-        // Waits at the left, where the hand comes by after three quarters of a turn.
+        // Waits on the left, where the hand passes after three quarters of a turn.
         let p_m = DVec3::new(0.0, 0.6, 0.0);
         let (found, touched) =
             clock.sweep(&body, &timed_pose(0, p_m), &timed_pose(4_000_000_000, p_m));
         let contact = found.contact.unwrap();
         assert_eq!(touched, Touched::Object(0));
-        // The hand's side, 4 cm from its middle line, meets the body's at asin(0.16 / 0.6) before.
+        // The side of the hand, 4 cm from its centre line, meets the body's surface asin(0.16 / 0.6) earlier.
         let expected = (270.0 - (0.16f64 / 0.6).asin().to_degrees()) / 360.0;
         assert!((contact.fraction - expected).abs() < 0.01, "{contact:?}");
-        // Through the plane in a tenth of a second, while the hand points the other way.
+        // Passes through the plane in a tenth of a second, while the hand points the other way.
         let through = |at_s: f64| {
             let ns = (at_s * 1e9) as i64;
             let (from_m, to_m) = (p_m - DVec3::X, p_m + DVec3::X);
@@ -245,8 +244,8 @@ mod tests {
     }
 
     #[test]
-    fn no_rate_tunnels() {
-        // Twenty turns a second, looked at ten times a second: between two looks it turns twice.
+    fn fast_object_does_not_tunnel() {
+        // Twenty turns per second, sampled ten times per second: two turns between samples.
         let clock = clock(0.05, 0.01);
         let body = BodyShape::sphere(BODY_M);
         let p_m = DVec3::new(0.0, 0.7, 0.0);

@@ -1,7 +1,7 @@
-//! What a grade's figures are worth: a project's table of points, and what each of its rows gives.
+//! Points of a grade: a project's table of points, and the points of each row.
 //!
 //! ```text
-//! [levels.ug.points] of a project's file + figures over all flights -> a part for each row: points, of how many, by what
+//! [levels.ug.points] of a project + figures over all flights -> points, maximum, reason of each row
 //! ```
 
 use serde::{Deserialize, Serialize};
@@ -10,61 +10,62 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PointsTable {
-    /// For the mean score, in proportion: all at 100.
+    /// Maximum points for the mean score: all at 100, in proportion below.
     pub score: f64,
-    /// Below this mean score the other parts do not count. [0 to 100]
+    /// Minimum mean score; below it, the other parts give no points. [0 to 100]
     #[serde(default)]
     pub least_score: f64,
-    /// For the mean time to the finish, penalties included. [s]
+    /// Bounds on the mean time to the finish, penalties included. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub time_s: Option<Bounds>,
-    /// For the least clearance of the flights that finish: one that touches has lost its score already. [m]
+    /// Bounds on the minimum clearance of the flights that finish: a flight with a collision has already lost
+    /// score. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clearance_m: Option<Bounds>,
-    /// For the greatest speed of a flight, the median of those that finish. [m/s]
+    /// Bounds on the maximum speed of a flight, the median of those that finish. [m/s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub speed_mps: Option<Bounds>,
 }
 
-/// What a figure must be for all points, and for half of them; in proportion before, between and beyond.
+/// Figures for all points and for half of them; linear in between and beyond.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Bounds {
-    /// How many there are.
+    /// Maximum points.
     pub points: f64,
-    /// From here on all of them are given.
+    /// Figure from which all points are given.
     pub all: f64,
-    /// Here half of them; on the other side of it than `all`, as far again, none.
+    /// Figure for half of the points; at twice the distance from `all`, there are none.
     pub half: f64,
 }
 
-/// The figures over all flights that points are given for.
+/// Figures over all flights.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
     /// Mean score, 0 to 100.
     pub score: f64,
-    /// Mean time to the finish; none finished. [s]
+    /// Mean time to the finish; `None` if no flight finished. [s]
     pub time_s: Option<f64>,
-    /// Least clearance of those that finished; none did, or nothing stands there. [m]
+    /// Minimum clearance of the flights that finished; `None` without finish or obstacles. [m]
     pub clearance_m: Option<f64>,
-    /// Median of the greatest speeds of the flights that finished. [m/s]
+    /// Median of the maximum speeds of the flights that finished. [m/s]
     pub speed_mps: Option<f64>,
 }
 
-/// What one row of the table gave.
+/// Points of one row of the table.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartPoints {
-    /// The row: `score`, `time_s`, `clearance_m`, `speed_mps`.
+    /// Key of the row: `score`, `time_s`, `clearance_m`, `speed_mps`.
     pub part: String,
-    /// The figure; absent if there is none, as no flight finished.
+    /// Figure; absent if no flight finished.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<f64>,
-    /// What it gave.
+    /// Points given.
     pub points: f64,
-    /// What it could give.
+    /// Maximum points.
     pub of: f64,
-    /// What stands in the way of points, in words; absent if nothing does.
+    /// Reason for missing points; absent if all are given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing: Option<String>,
 }
@@ -77,7 +78,7 @@ impl Bounds {
         self.points * share.clamp(0.0, 1.0)
     }
 
-    /// Returns the figure from which on there are no points.
+    /// Returns the figure at which the points reach 0.
     #[must_use]
     pub fn none(&self) -> f64 {
         2.0 * self.half - self.all
@@ -85,19 +86,19 @@ impl Bounds {
 }
 
 impl PointsTable {
-    /// Checks that points are points, and bounds two different numbers in the order that their figure has.
+    /// Checks that points are in range, and that bounds are in the right order for their figure.
     ///
     /// # Errors
-    /// The first key that is wrong, and what would do.
+    /// The first wrong key, with its valid range.
     pub fn check(&self) -> Result<(), String> {
         let is_points = |points: f64| (0.0..=1000.0).contains(&points);
         let bounds =
             self.rows().flat_map(|(_, Bounds { points, all, half }, _)| [points, all, half]);
         for number in [self.score, self.least_score].into_iter().chain(bounds) {
-            // Such numbers come back from any text to the last bit: they are signed.
+            // The numbers are signed, so each must survive a round trip through text exactly.
             if !(number.abs() < 1e6) || millionth(number) != number {
                 return Err(format!(
-                    "points: {number} is too large, or has more than six digits behind the point"
+                    "points: {number} is too large, or has more than six digits after the decimal point"
                 ));
             }
         }
@@ -123,13 +124,13 @@ impl PointsTable {
         Ok(())
     }
 
-    /// Returns all points that there are.
+    /// Returns the maximum of all points.
     #[must_use]
     pub fn most(&self) -> f64 {
         self.score + self.rows().map(|(_, bounds, _)| bounds.points).sum::<f64>()
     }
 
-    /// Returns what each row gives for these figures, in the order of the table.
+    /// Returns the points of each row for these figures, in the order of the table.
     #[must_use]
     pub fn parts(&self, figures: &Figures) -> Vec<PartPoints> {
         let part = |part: &str, value, points: f64, of, missing| PartPoints {
@@ -168,7 +169,7 @@ impl PointsTable {
         parts
     }
 
-    /// Rows with bounds: key, bounds, and whether more is better.
+    /// Returns rows with bounds: key, bounds, and whether more is better.
     fn rows(&self) -> impl Iterator<Item = (&'static str, Bounds, bool)> {
         let rows = [
             ("time_s", self.time_s, false),
@@ -214,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_said() {
+    fn explains_missing_points() {
         let said = |figures: &Figures| -> Vec<String> {
             TABLE.parts(figures).into_iter().filter_map(|part| part.missing).collect()
         };
@@ -229,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_tables_are_named() {
+    fn rejects_wrong_tables_by_key() {
         assert_eq!(TABLE.check(), Ok(()));
         let refused = |table: PointsTable, word: &str| {
             let error = table.check().unwrap_err();

@@ -1,14 +1,14 @@
-//! The whole of the rules for one vehicle as one sans-IO state machine: measurements and time in,
-//! events out. The server calls it for every pose, 200 Hz; a call takes a few microseconds.
+//! Referee: all rules for one vehicle as one sans-IO state machine. Measurements and time in, events out. The
+//! server calls it for every pose, at 200 Hz; a call takes a few microseconds.
 //!
 //! ```text
-//! measurement -> pose filter -> on the floor?  -> nothing is judged
-//!                             in the air     -> collision, fence, course, time -> events
+//! measurement -> pose filter -> on the floor -> no check
+//!                            -> in the air   -> collision, fence, course, time -> events
 //! ```
-//! A flight begins when the body's centre rises 0.3 m above the start. The first thing seen that ends a
-//! flight is reported; after it nothing more is judged until [`Referee::restart`]. Where someone else ends
-//! the flight ([`Referee::handle_event`]), course and time stop, and only a touch or a breach on the
-//! way down is still reported. What a flight's end is, [`vizflyt_protocol::flight_end`] decides.
+//! A flight begins when the body's centre rises 0.3 m above the start. The referee reports the first event that
+//! ends the flight, and then nothing until [`Referee::restart`]. If the flight is ended from outside
+//! ([`Referee::handle_event`]), course and time stop, and only a collision or a breach during the descent is
+//! still reported. [`vizflyt_protocol::flight_end`] defines the end of a flight.
 
 use std::collections::VecDeque;
 
@@ -27,15 +27,15 @@ use crate::neighbours::{Neighbour, Passage};
 use crate::obstacles::{Obstacles, TimedPose, Touched};
 use crate::pose::{ImuReading, Measured, Motion, PoseChange, PoseFilter, PoseQuality, Rejected};
 
-/// Rise that counts as take-off; a vehicle that rocks on its legs does not reach it. [m]
+/// Rise that counts as take-off; a vehicle that rocks on its legs stays below it. [m]
 pub(crate) const AIRBORNE_M: f64 = 0.3;
 /// A descent faster than this onto the floor is a crash; ArduCopter lands with 0.5 m/s. [m/s]
 const CRASH_MPS: f64 = 1.5;
 
-/// A contact's voxel lies this far beyond the body's surface at most.
+/// Maximum distance of a contact's voxel from the body's surface.
 const NEAREST_VOXELS: f64 = 2.0;
 
-/// What a body met; by number where there are several.
+/// Obstacle that a body met, with an index if there are several of its kind.
 #[derive(Clone, Copy, Debug)]
 enum Met {
     Still,
@@ -45,26 +45,26 @@ enum Met {
     Vehicle(usize),
 }
 
-/// Judges one vehicle.
+/// Referee of one vehicle.
 #[derive(Debug)]
 pub struct Referee {
     config: ArenaConfig,
     body: BodyShape,
     boundaries: Boundaries,
     obstacles: Obstacles,
-    /// From which the objects' motions count.
+    /// Time 0 of the objects' motions.
     epoch: ServerTime,
-    /// The other vehicles, by their number; none where this one's is.
+    /// Other vehicles by their number; `None` at the number of this vehicle.
     neighbours: Vec<Option<Neighbour>>,
     filter: PoseFilter,
-    /// Resets of the pose that have been taken note of.
+    /// Number of pose resets that have been processed.
     resets: u8,
     course: Course,
     last: Option<(ServerTime, Pose<World, Body>)>,
     took_off: Option<ServerTime>,
-    /// Its end was reported, or the vehicle has landed: nothing is judged.
+    /// The end was reported, or the vehicle has landed: nothing is checked.
     over: bool,
-    /// Someone else ended the flight: course and time are not judged.
+    /// The flight was ended from outside: course and time are not checked.
     ended: bool,
     near_fence: bool,
     least_clearance_m: f64,
@@ -72,9 +72,8 @@ pub struct Referee {
 }
 
 impl Referee {
-    /// Makes a referee for an arena with its baked obstacles, which the referees of several vehicles
-    /// share; no flight has begun. The motions of objects count from the clock's 0, see
-    /// [`Self::counting_from`].
+    /// Returns a referee for an arena with its baked obstacles, which referees of several vehicles share. No
+    /// flight has begun. The motions of objects count from time 0 of the clock, see [`Self::counting_from`].
     pub fn new(config: &ArenaConfig, obstacles: impl Into<Obstacles>) -> Self {
         Self {
             body: BodyShape::of(config),
@@ -96,14 +95,14 @@ impl Referee {
         }
     }
 
-    /// Counts the motions of objects from `epoch`, as those who draw them do.
+    /// Counts the motions of objects from `epoch`, as the renderers do.
     #[must_use]
     pub fn counting_from(mut self, epoch: ServerTime) -> Self {
         self.epoch = epoch;
         self
     }
 
-    /// Takes where another vehicle is, by the number it is given here; `None` forgets it.
+    /// Sets the position of another vehicle by its number; `None` removes it.
     pub fn handle_neighbour(&mut self, number: usize, neighbour: Option<Neighbour>) {
         if self.neighbours.len() <= number {
             self.neighbours.resize(number + 1, None);
@@ -111,7 +110,7 @@ impl Referee {
         self.neighbours[number] = neighbour;
     }
 
-    /// Forgets the flight: the next rise from the floor begins a new one.
+    /// Clears the flight: the next rise from the floor begins a new one.
     pub fn restart(&mut self) {
         self.course = Course::new(&self.config);
         self.took_off = None;
@@ -121,17 +120,17 @@ impl Referee {
         self.least_clearance_m = f64::INFINITY;
     }
 
-    /// Takes a measurement of the vehicle; returns the pose if it is accepted.
+    /// Processes a measurement of the vehicle; returns the pose if it is accepted.
     pub fn handle_measurement(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
         let known = self.filter.newest().map(|newest| newest.stamp);
         let sample = self.filter.handle_pose(measured)?;
         self.report_change(sample.stamp);
         if known.is_some_and(|known| sample.stamp <= known) && sample.resets == self.resets {
-            // Of the past: what followed from it has been judged.
+            // A measurement of the past: the poses after it have been checked already.
             return Ok(sample);
         }
         let to = sample.world_from_body;
-        // After a reset the way between the poses was not flown.
+        // After a reset, the vehicle has not flown the line between the poses.
         let jumped = std::mem::replace(&mut self.resets, sample.resets) != sample.resets;
         let here = (sample.stamp, to);
         let from = self.last.replace(here).filter(|_| !jumped).unwrap_or(here);
@@ -139,32 +138,32 @@ impl Referee {
         Ok(sample)
     }
 
-    /// Takes a reading of the autopilot's IMU.
+    /// Processes a reading of the autopilot's IMU.
     pub fn handle_imu(&mut self, reading: &ImuReading) {
         self.filter.handle_imu(reading);
     }
 
-    /// Takes what runtime or people did to the flight.
+    /// Processes an event of the runtime or of a person.
     pub fn handle_event(&mut self, event: &Event) {
         match event.kind {
-            // What a hand did with the vehicle before was no flight.
+            // Earlier motion by hand was not a flight.
             EventKind::Phase(FlightPhase::TakingOff) => self.restart(),
             EventKind::Phase(FlightPhase::Landed) => self.over = true,
             _ => self.ended |= event.kind.end_reason().is_some(),
         }
     }
 
-    /// Returns how the vehicle moves by all that was measured.
+    /// Returns the motion by all measurements.
     pub fn motion(&mut self) -> Option<Motion> {
         self.filter.motion()
     }
 
-    /// Returns how good the localization is at `now`.
+    /// Returns the quality of the localization at `now`.
     pub fn quality(&self, now: ServerTime) -> PoseQuality {
         self.filter.quality(now)
     }
 
-    /// Notices silence and the time limit. Call at [`Self::poll_timeout`].
+    /// Checks for silence and the time limit. Call at [`Self::poll_timeout`].
     pub fn handle_timeout(&mut self, now: ServerTime) {
         self.filter.handle_timeout(now);
         self.report_change(now);
@@ -172,18 +171,17 @@ impl Referee {
         self.judge_time(now);
     }
 
-    /// Returns when [`Self::handle_timeout`] has something to do.
+    /// Returns the time of the next call of [`Self::handle_timeout`].
     pub fn poll_timeout(&self) -> Option<ServerTime> {
         let dues = [self.filter.poll_timeout(), self.silence_limit(), self.time_limit()];
         dues.into_iter().flatten().min()
     }
 
-    /// Returns the next event.
     pub fn poll_event(&mut self) -> Option<Event> {
         self.events.pop_front()
     }
 
-    /// Whether a flight is under way and not yet decided.
+    /// Whether a flight is in progress and undecided.
     pub fn is_judging(&self) -> bool {
         self.took_off.is_some() && !self.over
     }
@@ -193,15 +191,15 @@ impl Referee {
         self.filter.newest()
     }
 
-    /// Returns the distance from the body's surface at a point to the nearest obstacle, as all are
-    /// at the newest pose. [m, world]
+    /// Returns the distance from the surface of the body at a point to the nearest obstacle, at the time of the
+    /// newest pose. [m, world]
     pub fn clearance_m(&self, p_world_m: DVec3) -> f64 {
         let at = self.newest().map_or(self.epoch, |newest| newest.stamp);
         let distance_m = self.obstacles.distance_m(self.since_epoch_ns(at), p_world_m);
         distance_m - self.config.body_radius_m
     }
 
-    /// Returns the least clearance of this flight so far; infinite before it. [m]
+    /// Returns the minimum clearance of this flight; infinite before a flight. [m]
     pub fn least_clearance_m(&self) -> f64 {
         self.least_clearance_m
     }
@@ -358,7 +356,7 @@ impl Referee {
         }
     }
 
-    /// A vehicle without a pose is landed by its guard: its run is over.
+    /// A vehicle without a pose is landed by its guard: the flight is over.
     fn judge_silence(&mut self, now: ServerTime) {
         if let Some(limit) = self.silence_limit()
             && now >= limit
@@ -413,7 +411,7 @@ impl Referee {
         }
     }
 
-    /// Reports what ends the flight; of several in one pose the first counts.
+    /// Reports the end of the flight; only the first end counts.
     fn end(&mut self, stamp: ServerTime, kind: EventKind) {
         if !std::mem::replace(&mut self.over, true) {
             self.events.push_back(Event::ending(stamp, kind));
@@ -421,7 +419,7 @@ impl Referee {
     }
 
     fn report(&mut self, stamp: ServerTime, kind: EventKind, text: &str) {
-        // Bounded: each kind of end is reported once a flight, and the server drains after every call.
+        // Bounded: each kind of end is reported once per flight, and the server drains after every call.
         self.events.push_back(Event { stamp, kind, text: bounded(text) });
     }
 }

@@ -1,14 +1,14 @@
-//! What a flight is worth: the events and samples of one flight, and the arena's rules, to a
-//! verdict. Pure: graded and live flights are judged by the same code.
+//! Verdict on a flight, from its events, its samples and the arena's rules. Pure: graded and live flights use
+//! the same code.
 //!
 //! ```text
 //! events (referee, runtime) --> the flight's end (vizflyt_protocol::flight_end) --> outcome, time
-//!                           \-> stages passed, and when
-//! samples (pose, clearance) --> take-off, least clearance, top speed, way
+//!                           \-> stages passed, with times
+//! samples (pose, clearance) --> take-off, minimum clearance, maximum speed, path length
 //! ```
-//! The timer starts at take-off and stops at the end: the finish, a collision, or whatever else
-//! comes first (VizFlyt paper, section IV, project 5). The score is the share of the course that was
-//! passed; a goal is its last part.
+//! The timer starts at take-off and stops at the end: the finish, a collision, or another end that comes first
+//! (VizFlyt paper, section IV, project 5). The score is the passed share of the course; a goal is its last
+//! part.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -19,61 +19,59 @@ use vizflyt_protocol::time::ServerTime;
 use crate::config::ArenaConfig;
 use crate::referee::AIRBORNE_M;
 
-/// Where the vehicle was at one moment of a flight.
+/// State of the vehicle at one instant of a flight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
-    /// When.
     pub stamp: ServerTime,
-    /// The body's centre. [m, world]
+    /// Position of the body's centre. [m, world]
     pub p_world_m: DVec3,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
     /// Heading: from x, counter-clockwise. [rad, world]
     pub yaw_rad: f64,
-    /// From the body's surface to the nearest obstacle; negative is penetration. [m]
+    /// Distance from the body's surface to the nearest obstacle; negative is penetration. [m]
     pub clearance_m: f64,
 }
 
 /// A part of the course.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct StageVerdict {
-    /// Its name in `arena.toml`.
+    /// Name in `arena.toml`.
     pub name: String,
-    /// When it was passed, since take-off; `None` if it was not. [s]
+    /// Time of passage since take-off; `None` if it was not passed. [s]
     pub passed_s: Option<f64>,
 }
 
-/// What a flight was worth.
+/// Result of a flight.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Verdict {
-    /// How it ended.
+    /// Kind of end.
     pub outcome: OutcomeKind,
-    /// Why, in one sentence.
+    /// Reason in one sentence.
     pub reason: String,
-    /// Why, as data.
+    /// Reason as data.
     pub end: EndReason,
-    /// When; `None` of a flight of which nothing is known.
+    /// Time of the end; `None` if nothing is known of the flight.
     #[serde(skip)]
     pub ended: Option<ServerTime>,
-    /// How many stages were passed.
     pub stages_passed: usize,
-    /// The stages in order.
+    /// Stages in order.
     pub stages: Vec<StageVerdict>,
-    /// From take-off to the end; 0 without a take-off. [s]
+    /// Duration from take-off to the end; 0 without a take-off. [s]
     pub seconds: f64,
-    /// Added to the time for offences. [s]
+    /// Penalties, which are added to the time. [s]
     pub penalty_s: f64,
-    /// 0 to 100.
+    /// Score, 0 to 100.
     pub score: f64,
-    /// Least distance of the body's surface to an obstacle in flight; `None` without one. [m]
+    /// Minimum distance of the body's surface to an obstacle in flight; `None` without a flight. [m]
     pub min_clearance_m: Option<f64>,
-    /// [m/s]
+    /// Maximum speed. [m/s]
     pub max_speed_mps: f64,
-    /// Way flown. [m]
+    /// Length of the flown path. [m]
     pub path_m: f64,
 }
 
-/// Judges a flight in `arena` by all that happened, each in order of time.
+/// Judges a flight in `arena` by all its events and samples, each in order of time.
 ///
 /// ```
 /// use vizflyt_arena::verdict::judge;
@@ -93,7 +91,7 @@ pub struct Verdict {
 /// # horizontal_fov_deg = 90.0
 /// # position_m = [0.06, 0, 0.02]
 /// # "#).unwrap();
-/// // Nothing happened at all: the vehicle never took off.
+/// No event and no sample: the vehicle never took off.
 /// let verdict = judge(&arena, &[], &[]);
 /// assert_eq!((verdict.outcome, verdict.score), (OutcomeKind::Error, 0.0));
 /// ```
@@ -101,7 +99,7 @@ pub fn judge(arena: &ArenaConfig, events: &[Event], samples: &[Sample]) -> Verdi
     judge_ended(arena, &FlightEnd::of(events), events, samples)
 }
 
-/// Judges a flight of which the end is known already, while `events` may lack its oldest.
+/// Judges a flight with a known end, while `events` may lack the oldest ones.
 pub fn judge_ended(
     arena: &ArenaConfig,
     end: &FlightEnd,
@@ -137,7 +135,7 @@ pub fn judge_ended(
             && ended.is_none_or(|ended| sample.stamp <= ended)
     };
     let flown: Vec<&Sample> = samples.iter().filter(in_flight).collect();
-    // Without a goal the last stage is the finish.
+    // Without a goal, the last stage is the finish.
     let has_goal = arena.goal.is_some();
     let parts = stages.len() + usize::from(has_goal);
     let passed = stages_passed + usize::from(has_goal && outcome == OutcomeKind::Finished);
@@ -203,7 +201,7 @@ mod tests {
         config
     }
 
-    /// Rises for a second, then flies along x at 2 m/s; clearance falls by 0.1 m a second.
+    /// Rises for a second, then flies along x at 2 m/s; clearance falls by 0.1 m per second.
     fn samples(seconds: u32) -> Vec<Sample> {
         let at_tick = |tick: u32| {
             let s = f64::from(tick) / 10.0;
@@ -220,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_thing_that_ends_a_flight_is_its_outcome() {
+    fn first_end_determines_the_outcome() {
         let hit = EventKind::Collision(Collision {
             p_world_m: DVec3::ZERO,
             clearance_m: -0.01,
@@ -232,7 +230,7 @@ mod tests {
         let reason = "collision with 'door' at (0.00, 0.00, 0.00) m, at 2.0 m/s";
         assert_eq!((verdict.outcome, verdict.reason.as_str()), (OutcomeKind::Collided, reason));
         assert_eq!(verdict.ended, Some(at(3.4)));
-        // Off the ground 0.4 s after the first sample; what came after the contact does not count.
+        // In the air 0.4 s after the first sample; samples after the contact do not count.
         assert!((verdict.seconds - 3.0).abs() < 1e-6, "{}", verdict.seconds);
         assert_eq!((verdict.stages_passed, verdict.score), (1, 25.0));
         assert!((verdict.stages[0].passed_s.unwrap() - 1.6).abs() < 1e-6);
@@ -242,26 +240,26 @@ mod tests {
     }
 
     #[test]
-    fn a_finish_is_the_last_part_of_the_score() {
+    fn finish_is_the_last_part_of_the_score() {
         let finished = EventKind::Finished { seconds: 4.6 };
         let mut events = vec![take_off(), stage(2.0, 0), stage(3.0, 1), stage(4.0, 2)];
         events.push(event(5.0, finished));
         let verdict = judge(&course(), &events, &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Finished, 3));
         assert_eq!(verdict.score, 100.0);
-        // A stage after the end is none.
+        // A stage after the end does not count.
         let late = [take_off(), event(3.0, EventKind::TimeLimit { limit_s: 3.0 }), stage(3.5, 0)];
         let verdict = judge(&course(), &late, &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Timeout, 0));
     }
 
     #[test]
-    fn landing_early_ends_the_time() {
+    fn early_landing_stops_the_timer() {
         let asked = ended(2.4, EndReason::PluginLanded);
         let verdict = judge(&course(), &[take_off(), asked.clone()], &samples(6));
         assert_eq!(verdict.outcome, OutcomeKind::Landed);
         assert!((verdict.seconds - 2.0).abs() < 1e-6);
-        // For want of a pose it is nobody's choice; one that came back does not count.
+        // A landing without a pose is an error; a lost pose that came back does not count.
         let lost = event(2.0, EventKind::PoseLost { age_s: 0.2 });
         let blind = ended(2.3, EndReason::PoseLost { age_s: 0.5 });
         let blind = judge(&course(), &[take_off(), lost.clone(), blind], &samples(6));
@@ -275,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn on_the_ground_there_is_nothing_to_judge() {
+    fn flight_without_take_off_has_no_time_and_clearance() {
         let verdict = judge(&course(), &[], &samples(0));
         assert_eq!((verdict.outcome, verdict.min_clearance_m), (OutcomeKind::Error, None));
         let failed = judge(&course(), &[ended(0.0, crashed())], &[]);
@@ -283,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn a_record_that_stops_in_flight_is_no_landing() {
+    fn record_that_ends_in_flight_is_an_error() {
         let verdict = judge(&course(), &[take_off(), stage(2.0, 0)], &samples(6));
         assert_eq!((verdict.outcome, verdict.stages_passed), (OutcomeKind::Error, 1));
         assert_eq!(verdict.reason, "the record ends before the flight");

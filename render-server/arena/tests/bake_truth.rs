@@ -1,5 +1,5 @@
-//! Splats laid over known solids, baked, and asked against the solids' own distance: walls
-//! straight and oblique, beams, trunks down to the thinnest, at several sizes of voxel.
+//! Bakes splats on known solids and compares the result with the solids' own distance: straight and oblique
+//! walls, beams, trunks down to the thinnest, at several voxel sizes.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use vizflyt_arena::grid::Grid;
@@ -9,7 +9,7 @@ use vizflyt_protocol::geometry::Volume;
 
 const TAU: f64 = std::f64::consts::TAU;
 
-/// A deterministic stream of numbers.
+/// A deterministic generator of numbers.
 struct Random(u64);
 
 impl Random {
@@ -23,7 +23,7 @@ impl Random {
     }
 }
 
-/// A disc on a surface, with the spread of sizes and opacities that training leaves.
+/// A disc on a surface, with the spread of sizes and opacities of trained scenes.
 fn disc(center_m: DVec3, normal: DVec3, random: &mut Random) -> Ellipsoid {
     let onto = DQuat::from_rotation_arc(DVec3::Z, normal.normalize());
     let turn = DQuat::from_rotation_z(random.within(0.0, TAU));
@@ -37,7 +37,7 @@ fn disc(center_m: DVec3, normal: DVec3, random: &mut Random) -> Ellipsoid {
     }
 }
 
-/// Discs over a box, one per 3 cm square; stratified, so that chance leaves no hole.
+/// Discs over a box, one per 3 cm square; stratified, to prevent random holes.
 fn over_box(
     center_m: DVec3,
     half_m: DVec3,
@@ -64,7 +64,7 @@ fn over_box(
     discs
 }
 
-/// Discs around an upright cylinder from z = 0 up.
+/// Discs around an upright cylinder, from z = 0 up.
 fn over_trunk(foot: DVec3, radius_m: f64, height_m: f64, random: &mut Random) -> Vec<Ellipsoid> {
     let around = (TAU * radius_m / 0.03).ceil() as usize;
     let up = (height_m / 0.03).ceil() as usize;
@@ -104,7 +104,7 @@ fn bake(splats: Vec<Ellipsoid>, max_m: DVec3, voxel_m: f64) -> DistanceField {
 }
 
 #[test]
-fn no_body_is_missed_beyond_a_voxel_nor_stopped_in_the_open() {
+fn detects_bodies_within_a_voxel_without_false_alarms() {
     const BODY_M: f64 = 0.12;
     for (voxel_m, seed) in [(0.05, 1), (0.05, 2), (0.08, 3), (0.03, 4)] {
         let mut random = Random(seed);
@@ -115,7 +115,7 @@ fn no_body_is_missed_beyond_a_voxel_nor_stopped_in_the_open() {
         while touching < 10_000 || clear < 10_000 {
             let p = DVec3::new(random.next(), random.next(), random.next()) * max_m;
             let truth = solids.iter().map(|s| s.signed_distance_m(p)).fold(f64::INFINITY, f64::min);
-            // Where a body could be, near enough to matter, and above the band of litter.
+            // Only positions of a free body, near an obstacle, and above the band of litter.
             if !(0.0..0.6).contains(&truth) || p.z < FLOOR_BAND_M {
                 continue;
             }
@@ -134,7 +134,7 @@ fn no_body_is_missed_beyond_a_voxel_nor_stopped_in_the_open() {
 }
 
 #[test]
-fn a_wall_has_no_hole_and_lies_within_a_voxel_wherever_its_plane_lies() {
+fn walls_have_no_holes_and_are_accurate_to_a_voxel() {
     for shift in 0..10u32 {
         let mut random = Random(u64::from(shift));
         let x_m = 1.0 + 0.005 * f64::from(shift);
@@ -154,7 +154,7 @@ fn a_wall_has_no_hole_and_lies_within_a_voxel_wherever_its_plane_lies() {
 }
 
 #[test]
-fn a_thousand_tails_reach_no_further_than_one() {
+fn overlapping_splats_do_not_extend_obstacles() {
     let fat = Ellipsoid {
         center_m: Vec3::ONE,
         scales_m: Vec3::splat(0.1),
@@ -167,7 +167,7 @@ fn a_thousand_tails_reach_no_further_than_one() {
 }
 
 #[test]
-fn trunks_are_solid_with_their_feet_and_litter_is_floor() {
+fn trunks_are_solid_down_to_the_floor_and_litter_is_ignored() {
     let mut random = Random(5);
     let middle = DVec3::new(1.0, 1.0, 0.0);
     let mut splats = over_trunk(middle, 0.3, 1.9, &mut random);
@@ -188,7 +188,7 @@ fn trunks_are_solid_with_their_feet_and_litter_is_floor() {
 }
 
 #[test]
-fn haze_in_the_air_goes_however_large_and_a_thin_thing_of_many_splats_stays() {
+fn removes_large_haze_and_keeps_thin_dense_objects() {
     let grid = Grid::covering(DVec3::ZERO, DVec3::splat(3.0), 0.05);
     let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
     let counts = |splats: &[Ellipsoid], spec: &BakeSpec| {
@@ -204,7 +204,7 @@ fn haze_in_the_air_goes_however_large_and_a_thin_thing_of_many_splats_stays() {
     assert!(haze.occupied == 0 && haze.floating > 1000, "{haze:?}");
     let kept = counts(&[blob(1.6)], &BakeSpec { min_splats_per_m3: 0.0, ..spec });
     assert!(kept.occupied > 1000, "{kept:?}");
-    // On the floor it may be a stone; at the side of the grid, a part of something.
+    // On the floor it may be a stone; at the boundary of the grid, a part of something.
     assert!(counts(&[blob(0.2)], &spec).occupied > 1000);
     let aside = Ellipsoid { center_m: Vec3::new(0.1, 1.5, 1.6), ..blob(0.0) };
     assert!(counts(&[aside], &spec).occupied > 1000);
@@ -217,13 +217,13 @@ fn haze_in_the_air_goes_however_large_and_a_thin_thing_of_many_splats_stays() {
 }
 
 #[test]
-fn a_speck_in_the_air_goes_and_a_twig_on_a_trunk_stays() {
+fn removes_specks_in_the_air_and_keeps_twigs_on_trunks() {
     let grid = Grid::covering(DVec3::ZERO, DVec3::splat(2.0), 0.05);
     let spec = BakeSpec { grid, min_opacity: 0.3, floor_z_m: 0.0, min_splats_per_m3: 30.0 };
     let occupied =
         |splats: &[Ellipsoid]| OccupancyGrid::bake(splats.iter().copied(), &spec).counts().occupied;
     let mut random = Random(9);
-    // 8 cm off the bark, reaching 8 cm around itself.
+    // 8 cm from the bark, with a radius of 8 cm.
     let speck = Ellipsoid {
         scales_m: Vec3::new(0.04, 0.04, 0.005),
         ..disc(DVec3::new(0.52, 0.45, 1.02), DVec3::X, &mut random)

@@ -1,12 +1,12 @@
-//! What prediction is worth, against a truth that is known. The table: `cargo bench -p
-//! vizflyt-arena --bench pose`.
+//! Benefit of prediction, compared with a known truth. `cargo bench -p vizflyt-arena --bench pose` prints the
+//! table.
 
 mod trial;
 
 use trial::Trial;
 
 #[test]
-fn prediction_cuts_the_error_of_images_to_a_fifth() {
+fn prediction_reduces_the_error_of_images_to_a_fifth() {
     for rate_hz in [30.0, 60.0, 100.0, 200.0] {
         for imu in [false, true] {
             let errors = Trial { rate_hz, imu, ..Trial::default() }.fly(1);
@@ -18,7 +18,7 @@ fn prediction_cuts_the_error_of_images_to_a_fifth() {
 }
 
 #[test]
-fn noise_dropouts_and_latency_leave_most_of_it() {
+fn prediction_works_with_noise_dropouts_and_latency() {
     let hard = Trial { sigma_m: 0.01, sigma_deg: 0.5, rate_hz: 60.0, ..Trial::default() };
     for trial in [
         hard,

@@ -1,5 +1,5 @@
-//! The render thread allocates nothing once every buffer has been used: two vehicles, four
-//! cameras, of which some ticks are encoded, some skipped, and all passed on to the previews.
+//! The render thread allocates nothing once every buffer has been used: two vehicles, four cameras; some ticks are
+//! encoded, some skipped, all passed on to the previews.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -55,8 +55,8 @@ rate_hz = 300.0
 imaging = { sensor = "imx219", denoise = true, depth = { model = "azure-kinect" } }
 "#;
 
-/// Draws nothing, but makes images of the size; and does the other threads' part between two ticks:
-/// brings the next poses, encodes some ticks, and makes previews.
+/// Renderer that only fills images of the right size. Between two ticks, it also does the work of the other threads:
+/// publishes the next poses, encodes some ticks, and makes previews.
 struct Everyone {
     stop: Stop,
     localization: Arc<Localization>,
@@ -68,7 +68,7 @@ struct Everyone {
 }
 
 impl Everyone {
-    /// Publishes the next poses; now and then one vehicle is not seen.
+    /// Publishes the next poses; sometimes one vehicle has none.
     fn move_on(localization: &Localization, at: u64) {
         let stamp = ServerTime::from_ns(at);
         let still = Pose::new(DVec3::Z, DQuat::IDENTITY);
@@ -98,7 +98,7 @@ impl Rasterizer for Everyone {
             image.alpha.fill(1.0);
             image.depth_median_m.fill(2.0);
         }
-        // The door, and of the two vehicles the other one, if it has been seen.
+        // The door, and the other vehicle, if it has a pose.
         assert!(placements.len() == 3 && placements[0].is_some());
         assert!(placements[1..].contains(&None));
         self.calls += 1;
@@ -112,7 +112,7 @@ impl Rasterizer for Everyone {
             && let Some(tick) = self.ticks.take(Duration::ZERO)
         {
             for slot in tick.slots.iter().filter(|slot| slot.fresh) {
-                // The front camera is perfect, the rear one is not.
+                // The front camera is ideal, the rear one is not.
                 let is_perfect = slot.image.rgb.iter().all(|&value| value == RENDERED);
                 let is_depth = slot.image.depth_median_m.iter().all(|&depth_m| depth_m == 2.0);
                 assert_eq!([is_perfect, is_depth], [slot.camera == 0; 2]);
@@ -131,15 +131,15 @@ impl Rasterizer for Everyone {
     }
 }
 
-/// Of every pixel, display colours.
+/// Display colour of every pixel.
 const RENDERED: f32 = 0.3;
-/// Which image's buffers a camera is given follows from when it is due, so from the machine's clock: in so many ticks
-/// each has been with each camera.
+/// Each camera's due time, and therefore the buffers that it gets, depends on the machine's clock. After this many
+/// ticks, each buffer has been with each camera.
 const WARM_UP: u64 = 600;
 const TICKS: u64 = 900;
 
 #[test]
-fn drawing_allocates_nothing_once_it_is_warm() {
+fn rendering_allocates_nothing_after_warm_up() {
     let arena = ArenaConfig::parse(ARENA).unwrap();
     let vehicle = |name| (name, arena.info(), arena.cameras.clone());
     let vehicles = vec![vehicle("wasp"), vehicle("bee")];
@@ -164,7 +164,7 @@ fn drawing_allocates_nothing_once_it_is_warm() {
         warm: 0,
     };
     let inputs = Inputs { rendering: &rendering, ..rooms.render_inputs() };
-    // On a pool's own thread: rayon itself allocates a little, now and then, to take in work from outside.
+    // On a thread of the pool: rayon occasionally allocates to accept work from outside.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool");
     let allocated = pool.install(|| {
         let (renderer, max_rate_hz) = (&mut everyone, 1000.0);
@@ -173,6 +173,6 @@ fn drawing_allocates_nothing_once_it_is_warm() {
         CountingAllocator::thread_allocations()
     }) - everyone.warm;
     assert!(everyone.warm > 0 && everyone.images as u64 > TICKS, "{}", everyone.images);
-    // Leaving the function frees, which is not counted.
+    // Leaving the function frees memory, which is not counted.
     assert_eq!(allocated, 0, "in {} ticks", TICKS - WARM_UP);
 }

@@ -1,4 +1,5 @@
-// A captured scene, tilted by 5 degrees and a tenth too small, is put into its room by clicks, and its place is written.
+// A captured scene, tilted by 5 degrees and a tenth too small, is aligned to its room by clicks, and its placement is
+// saved.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -8,18 +9,18 @@ serverTest("align", async (it) => {
   it.command("scene", "generate", "room", "--seed", "3", "-o", it.at("room"));
   const file = it.at("room/arena.toml");
   const place = 'scene = { file = "scene.ply", rotation = [0.0436, 0, 0, 0.99905], metres_per_unit = 0.9 }';
-  // Without the course, which stays where it is when fence and start move along.
+  // Without the course, which does not move when fence and start move.
   const room = fs.readFileSync(file, "utf8").replace(/\[(goal|rules(\.\w+)?)\][^[]*(\[[\d -][^[]*)*/g, "");
   fs.writeFileSync(file, `# Captured by hand.\n${room.replace(/^scene = .*$/m, place)}`);
   const server = it.start("scene", "align", it.at("room"), "--no-browser", "--renderer", "cpu");
   const [, url] = await server.line(/page\s+(http:\S+)/);
   const page = await it.open(url);
-  // The panel comes later than the first picture, as on a busy computer: what it asks for, it takes.
+  // The panel loads after the first image, as on a busy computer, and must accept that image.
   await page.route("**/align.js", async (route) => {
     await page.waitForFunction(() => document.body.dataset.pictures > 0);
     await route.continue();
   });
-  // Counts the orders that have no answer yet: with each answer the panel is drawn anew, and a button that is down is lost.
+  // Counts pending requests: each answer redraws the panel, which would lose a pressed button.
   await page.addInitScript(() => {
     const { fetch } = globalThis;
     globalThis.waiting = 0;
@@ -27,7 +28,7 @@ serverTest("align", async (it) => {
       if (request[1]?.method !== "POST") return fetch(...request);
       globalThis.waiting += 1;
       const answer = await fetch(...request), text = answer.text.bind(answer);
-      // A task of its own: what the page does with the text comes first.
+      // As a separate task, so that the page processes the text first.
       answer.text = () => text().finally(() => setTimeout(() => (globalThis.waiting -= 1)));
       return answer;
     };
@@ -38,7 +39,7 @@ serverTest("align", async (it) => {
     await settled();
     await page.getByRole("button", { name, exact: true }).click();
   };
-  /** Clicks into a picture that shows where the camera is now; returns the server's answer. */
+  /** Clicks into an image of the current camera; returns the server's answer. */
   const pick = async (x, y) => {
     const answer = page.waitForResponse((response) => response.url().endsWith("/pick"));
     await page.mouse.click(x, y);
@@ -62,7 +63,7 @@ serverTest("align", async (it) => {
   await press("one end");
   const one = await pick(420, 780);
   const other = await pick(840, 640);
-  // The scene's file is in metres: the truth that a tape would tell.
+  // The scene's file is in metres: the true length, as of a tape measure.
   const metres = Math.hypot(...one.p_scene.map((value, k) => value - other.p_scene[k]));
   await page.locator("#metres").fill(metres.toFixed(4));
   await page.locator("#metres").press("Tab");
@@ -83,7 +84,7 @@ serverTest("align", async (it) => {
   assert.ok(written.startsWith("# Captured by hand.\n"), written);
   assert.ok(Math.abs(+written.match(/metres_per_unit = ([\d.]+)/)[1] - 1) < 0.01, written);
   const [x, y, z, w] = written.match(/rotation = \[(.*?)\]/)[1].split(",").map(Number);
-  // The file's z, where it points now.
+  // Direction of the file's z axis.
   const up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
   assert.ok(up[2] > Math.cos((0.7 * Math.PI) / 180), `tilted still: ${up}`);
   await it.finish(page);

@@ -1,4 +1,5 @@
-// A course is set up in a room by hand: a gate is put up, dragged, checked and written; comments stay, and it can be flown.
+// A course is set up in a room by hand: a gate is added, dragged, checked and saved; comments are kept, and the course
+// can be flown.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -19,7 +20,7 @@ serverTest("course", async (it) => {
   assert.ok(await page.locator("#course-save").isDisabled(), "nothing has changed");
   await press("gate");
   await until(page, "course-verdict", /^can be flown: 1 gate, a way of [\d.]+ m · 0\.\d+ m of room/);
-  // Its frame is in the picture: orange and white about the opening.
+  // The frame is in the image: orange and white around the opening.
   await page.waitForFunction(() => {
     const canvas = document.getElementById("picture");
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -30,7 +31,7 @@ serverTest("course", async (it) => {
   await it.shot(page, "course-gate");
   await checkBarriers(page, "the editor of courses");
   const [x, width] = [await value("middle x"), await value("width")];
-  // From the eye's height the handle of the width is to the right of the middle; the picture is 75 degrees wide.
+  // At the height of the camera, the handle of the width is to the right of the centre; the image is 75 degrees wide.
   const px = (metres) => (metres / (x - 0.9)) * (720 / Math.tan((37.5 * Math.PI) / 180));
   await page.mouse.move(720 + px(width / 2), 450);
   await page.mouse.down();
@@ -57,7 +58,7 @@ serverTest("course", async (it) => {
   assert.equal(await server.ended, 0);
 });
 
-/** Somebody who has never seen the page puts up a gate, by what is visible. */
+/** A first-time user adds a gate, using only visible elements. */
 serverTest("place_gate", async (it) => {
   it.command("scene", "generate", "room", "--seed", "3", "-o", it.at("room"));
   const editor = it.start("arena", "edit", it.at("room"), "--no-browser", "--renderer", "cpu");

@@ -1,4 +1,4 @@
-// A flight that flies straight into a wall: its crash card comes by itself, and is looked at by keyboard alone.
+// A flight straight into a wall: its crash card appears automatically, and is operated by keyboard only.
 
 const assert = require("node:assert/strict");
 const { INTO_THE_WALL, checkAccess, checkBarriers, recordedTest, resize, text, until } = require("../harness.cjs");
@@ -6,7 +6,7 @@ const { INTO_THE_WALL, checkAccess, checkBarriers, recordedTest, resize, text, u
 recordedTest("crash_card", {
   what: "a demo flight straight into the middle of a wall",
   without: /api\/map/,
-  // Few images, so that the recording is small.
+  // Few images, to keep the recording small.
   real: (it) => it.raceDemo("--max-rate", "6", "--plugin", it.plugin("into-the-wall", INTO_THE_WALL)),
   async body(it) {
     const page = await it.open(it.url);
@@ -37,7 +37,7 @@ recordedTest("crash_card", {
     assert.ok(samples.length > 100 && samples.at(-1).clearance_m < 0.05, JSON.stringify(samples.at(-1)));
     for (const name of ["clearance and speed before the end", "the place from above"])
       assert.ok(await region.getByRole("img", { name }).isVisible(), name);
-    // It plays by itself until someone stops it; then image by image.
+    // It plays automatically until it is paused; then image by image.
     await region.getByRole("button", { name: "pause" }).focus();
     await page.keyboard.press("Enter");
     await region.getByRole("button", { name: "play" }).waitFor();
@@ -64,11 +64,11 @@ recordedTest("crash_card", {
     await page.locator("#theme").click();
     await it.shot(page, "projector-crash-other-theme");
     assert.deepEqual(page.faults, []);
-    // It has fetched all of them.
+    // The page has loaded all images.
     const total = images.reduce((sum, { before_s }) => sum + 2 * before_s.length, 0);
     while (loaded.size < total) await page.waitForEvent("requestfinished");
-    await it.serverEnds(async () => assert.equal(await it.demo.ended, 1, "a collision is no success"));
-    // The server is gone, and the card has its images: every one that is looked at.
+    await it.serverEnds(async () => assert.equal(await it.demo.ended, 1, "a collision is not a success"));
+    // The server has ended, and the card still shows every image.
     await region.getByRole("button", { name: "show depth" }).press("Enter");
     await slider.focus();
     await page.keyboard.press("Home");

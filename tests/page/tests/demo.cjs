@@ -1,5 +1,5 @@
-// The real flight: the whole program behind a page that starts it, watches it and stops it. And what a real server serves is what
-// the recorded one serves.
+// The real flight: the complete program behind a page that starts, watches and stops it. Also: the real server serves
+// the same files as the recorded one.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -13,7 +13,7 @@ serverTest("demo", async (it) => {
     const answer = await fetch(demo.url + file), { body, headers } = pageFile(file);
     assert.equal(answer.status, 200, file);
     for (const [name, value] of Object.entries(headers)) assert.equal(answer.headers.get(name), value, `${file}: ${name}`);
-    assert.ok(Buffer.from(await answer.arrayBuffer()).equals(body), `${file}: another text; build the program anew`);
+    assert.ok(Buffer.from(await answer.arrayBuffer()).equals(body), `${file}: another text; rebuild the program`);
   }
   const page = await it.open(demo.url);
   await until(page, "phase-text", /ready to start/);
@@ -24,7 +24,7 @@ serverTest("demo", async (it) => {
   await page.keyboard.press("Escape");
   await until(page, "announcement", /lands/);
   await until(page, "outcome-title", /Stopped by hand/);
-  assert.equal(await demo.ended, 1, "a stopped flight is no success");
+  assert.equal(await demo.ended, 1, "a stopped flight is not a success");
   assert.notEqual(JSON.parse(fs.readFileSync(report)).outcome, "finished");
   await it.finish(page);
 });

@@ -1,4 +1,4 @@
-// A scene is edited by hand: box and lasso, inverted, deleted, taken back, saved; its own file stays as it is.
+// A scene is edited by hand: box and lasso, invert, delete, undo, save; the scene's file is not changed.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -13,7 +13,7 @@ serverTest("edit", async (it) => {
   const [, url] = await server.line(/^page\s+(http\S+)/);
   const page = await it.open(url);
   const counts = async () => (await text(page, "edit-counts")).match(/[\d,]+/g).map((word) => +word.replaceAll(",", ""));
-  /** Waits until the share of the picture that has about the colour of what is selected lies between two bounds; returns it. */
+  /** Waits until the share of the highlight's colour in the image is between two bounds; returns it. */
   const orange = async (least, most) => {
     const found = await page.waitForFunction(([least, most]) => {
       const canvas = document.getElementById("picture");
@@ -25,7 +25,7 @@ serverTest("edit", async (it) => {
     }, [least, most], { polling: 200 });
     return (await found.jsonValue())[0];
   };
-  /** Does something, and waits until it is counted. */
+  /** Executes an action, and waits until it is counted. */
   const after = async (act, pattern) => {
     await act();
     await until(page, "edit-counts", pattern);
@@ -38,7 +38,7 @@ serverTest("edit", async (it) => {
   };
   await until(page, "edit-counts", /^0 of/);
   await isPainted(page, "picture");
-  // The panel may come later than the first picture, and takes no outline before it has seen one itself.
+  // The panel may load after the first image, and accepts no outline before it has received one.
   await page.evaluate(async () => {
     const { view } = await import("/view.js");
     view.listeners.push(() => (globalThis.isSeen = true));
@@ -46,16 +46,16 @@ serverTest("edit", async (it) => {
   });
   await page.waitForFunction(() => globalThis.isSeen);
   const [, all] = await counts();
-  // Posters and boxes have it, too.
+  // Posters and boxes have the colour, too.
   const before = await orange(0, 0.1);
   await page.locator("#edit-box").click();
   await after(() => drag([420, 250], [900, 650]), /^[1-9]/);
   const [boxed] = await counts();
   assert.ok(boxed > 100 && boxed < all / 2, `${boxed} of ${all}`);
-  // The box is 0.15 of the picture; the floor and the walls in it are seen as selected, and nothing else is.
+  // The box is 0.15 of the image; only floor and walls inside are highlighted.
   await orange(before + 0.08, before + 0.16);
   await it.shot(page, "edit-box");
-  // Named as a part, it is found by a data set.
+  // A data set finds the named part.
   await page.locator("#edit-naming summary").click();
   await page.locator("#edit-name").fill("corner");
   await after(() => page.locator("#edit-call").click(), /^0 of/);
@@ -84,11 +84,11 @@ serverTest("edit", async (it) => {
   await until(page, "edit-output", /^saved/);
   await it.shot(page, "edit-saved");
   assert.ok(fs.readFileSync(scene).equals(original), "the original has changed");
-  assert.match(it.command("scene", "edit", folder, "--list"), new RegExp(`remove-lasso.*: ${boxed} splats away`));
+  assert.match(it.command("scene", "edit", folder, "--list"), new RegExp(`remove-lasso.*: ${boxed} splats removed`));
   const again = path.join(folder, "again.ply");
   it.command("scene", "edit", folder, "--apply", "-o", again);
   assert.ok(fs.readFileSync(path.join(folder, "scene.edited.ply")).equals(fs.readFileSync(again)));
-  // No other page edits.
+  // Pages of other sites cannot edit.
   const foreign = await fetch(`${url}/api/edit`, { method: "POST", body: '"undo"', headers: { origin: "http://evil.example" } });
   assert.equal(foreign.status, 403);
   await it.finish(page);

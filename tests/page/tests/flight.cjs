@@ -1,4 +1,4 @@
-// A flight: it waits for its start, is watched, stopped by the keyboard, and looked at again when the program has ended.
+// A flight: it waits for its start, is watched, stopped by the keyboard, and replayed after the program has ended.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -16,7 +16,7 @@ recordedTest("flight", {
         for (const id of ["colour", "depth"]) await isPainted(page, id);
       },
     });
-    // By keyboard alone.
+    // By keyboard only.
     await page.locator("#start").focus();
     await page.keyboard.press("Enter");
     await it.ordered("POST /api/vehicles/vizflyt/start");
@@ -30,21 +30,21 @@ recordedTest("flight", {
       },
     });
     await it.shot(page, "laptop-flying");
-    // Someone who types has the space bar; escape stops from anywhere.
+    // In a text field, space types a space; escape stops from anywhere.
     await page.keyboard.press("Escape");
     await it.ordered("POST /api/vehicles/vizflyt/estop");
     await until(page, "announcement", /lands/);
     await it.event("stopped", { shown: () => until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/) });
     await it.shot(page, "laptop-stopped");
     await checkBarriers(page, "the page after a stop");
-    // It is looked at again, also when the program has ended.
+    // The flight can be replayed after the program has ended.
     await it.serverEnds(async () => {
-      assert.equal(await it.demo.ended, 1, "a stopped flight is no success");
+      assert.equal(await it.demo.ended, 1, "a stopped flight is not a success");
       assert.equal(JSON.parse(fs.readFileSync(it.at("report.json"))).outcome === "finished", false);
     });
     await page.locator("#replay-at").fill("1");
     await until(page, "replay-time", /^0:01\.0 of \d:\d\d\.\d$/);
-    // Its button says "pause" for the two seconds that are left: a busy browser may not look meanwhile.
+    // The button shows "pause" for the remaining two seconds, which a busy browser may miss.
     await page.evaluate(() => {
       const play = document.getElementById("replay-play");
       new MutationObserver(() => (globalThis.hasPlayed ||= play.textContent === "pause")).observe(play, { childList: true });

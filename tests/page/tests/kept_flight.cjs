@@ -1,4 +1,5 @@
-// The flight that a page has watched: a program started anew has it still; it is saved, read again, and flies beside itself.
+// A watched flight is stored: it is available after a restart of the program; it is saved, loaded again, and replayed
+// with itself as the ghost.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -15,7 +16,7 @@ recordedTest("kept_flight", {
     await page.locator("#estop").click();
     await it.event("stopped", { shown: () => until(page, "outcome-title", /Stopped by hand|Collision|Left the geofence/) });
     await page.locator("#replay-save").waitFor();
-    // The browser keeps it a moment later: `flight_store.js`.
+    // The browser stores it a moment later: `flight_store.js`.
     await page.waitForFunction(() => new Promise((done, fail) => {
       const opening = indexedDB.open("vizflyt-flights");
       opening.onerror = () => fail(opening.error);

@@ -1,4 +1,5 @@
-// A lab day: checks go green by what is measured, red where the motion capture pauses; a queue, several vehicles, a report.
+// A lab day: checks change with measurements, and fail while the motion capture pauses; a queue, several vehicles, a
+// report.
 
 const assert = require("node:assert/strict");
 const { spawnSync } = require("node:child_process");
@@ -23,7 +24,7 @@ recordedTest("lab_day", {
       "--spawn", spawn.join(), "--json");
     const [, mavlink] = await it.vehicle.line(/"mavlink":"([^"]+)"/);
     it.mavlink = `udpout:${mavlink}`;
-    // What the autopilot has, before its runtime takes the link.
+    // Sets the autopilot's parameters before its runtime uses the link.
     const doctor = (...more) => it.program.run("doctor", "vehicle", "--mavlink", it.mavlink, "--arena", arena, ...more);
     doctor("--apply");
     const { stdout, stderr } = doctor("--report", http, "--vehicle", "wasp");
@@ -49,7 +50,7 @@ recordedTest("lab_day", {
       shown: async () => {
         await page.getByRole("button", { name: "start wasp" }).waitFor();
         for (const name of ["network", "clocks", "battery", "parameters", "fence"]) await stands(name, "ok");
-        // Whatever this computer's pace, it is measured.
+        // Measured at any speed of this computer.
         await reads("latency", /images are \d+ ms old/);
         await reads("fence", /polygons accepted/);
       },
@@ -64,7 +65,7 @@ recordedTest("lab_day", {
     await it.event("axes", { shown: () => reads("axes", /do: (put it on the floor|lift it)/) });
     await press("cancel: axes of localization of wasp");
     assert.deepEqual(await it.ordered("POST /api/lab/axes"), { vehicle: "wasp", begin: false });
-    // The motion capture pauses: red, with what to do; and green when it is back.
+    // The motion capture pauses: the check fails with instructions, and is ok again afterwards.
     await it.event("capture pauses", {
       really: () => it.vehicle.child.kill("SIGSTOP"),
       shown: async () => {
@@ -107,7 +108,7 @@ recordedTest("lab_day", {
     await turn("call next", "next");
     await it.event("ants are called", { shown: () => until(team, "lab-queue", /nowants[\s\S]*1cats/) });
 
-    // The bee goes first: the wasp's start is refused with the reason.
+    // The bee takes off first: the wasp's start is rejected with the reason.
     await page.locator("#formation-form [name=order]").fill("bee, wasp");
     await page.locator("#formation-form [name=separation]").fill("1.5");
     await page.locator("#formation-form button").click();
@@ -135,7 +136,7 @@ recordedTest("lab_day", {
   },
 });
 
-/** The day on paper, and in the terminal. */
+/** Checks the report as PDF, and in the terminal. */
 async function report(it) {
   await it.fly.ended;
   const paper = it.at("day.pdf");
@@ -147,6 +148,6 @@ async function report(it) {
     if (options.shots) spawnSync("pdftoppm", ["-r", "70", "-png", paper, path.join(options.shots, "lab-day-report")]);
   }
   const told = it.program.run("lab", "--page", it.url);
-  assert.equal(told.status, 1, "not all is done");
+  assert.equal(told.status, 1, "not all checks are done");
   assert.match(told.stdout, /page {5}http\S+\/lab\n[\s\S]*ok {7}the room: net closed[\s\S]*called {3}ants on wasp/);
 }

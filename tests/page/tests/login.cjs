@@ -1,4 +1,4 @@
-// A server whose page takes a login: wrong, right, and out again in every window.
+// A server whose page requires a login: wrong password, right password, and logout in every window.
 
 const assert = require("node:assert/strict");
 const { spawnSync } = require("node:child_process");
@@ -6,7 +6,7 @@ const { checkBarriers, serverTest, text, until } = require("../harness.cjs");
 
 const PASSWORD = "four words for tests";
 
-/** Starts a server that always asks for the password, with two scenes to choose from. */
+/** Starts a server that always requires the password, with two scenes. */
 async function guarded(it) {
   for (const [name, seed] of [["first", "1"], ["second", "2"]]) it.command("scene", "generate", "room", "--seed", seed, "-o", it.at(`scenes/${name}`));
   const set = spawnSync(it.program.vizflyt, ["password", "--keys", it.at("keys")], { input: `${PASSWORD}\n` });
@@ -14,7 +14,7 @@ async function guarded(it) {
   return it.serve(it.at("scenes/first"), "--scenes", it.at("scenes"), "--login", "always", "--keys", it.at("keys"));
 }
 
-/** Opens the page, not logged in, with the dialog of the login. */
+/** Opens the page without a login, with the login dialog. */
 async function openLogin(it, url) {
   const page = await it.open(url);
   await until(page, "link-text", /not logged in/);
@@ -23,7 +23,7 @@ async function openLogin(it, url) {
   return page;
 }
 
-/** Does something after which a page loads itself again, and waits for that: until then its former self may connect, too. */
+/** Executes an action that reloads the page, and waits for the reload: until then the old page may still connect. */
 const reloaded = (page, act) => Promise.all([page.waitForEvent("load"), act()]);
 
 async function logIn(page) {
@@ -46,11 +46,11 @@ serverTest("login", async (it) => {
   await page.getByRole("alert").filter({ hasText: "this is not the password" }).waitFor();
   assert.equal(await pairingStatus(page), 401);
   await logIn(page);
-  // The cookie is out of reach of scripts, and without its token nothing changes.
+  // Scripts cannot read the cookie, and requests without its token change nothing.
   assert.equal(await page.evaluate(() => document.cookie), "");
   const bare = await page.evaluate(async () => (await fetch("/api/pairing", { method: "POST", body: '{"right":"instructor"}' })).status);
   assert.equal(bare, 403);
-  // Another window of the same login sees no more either, once it is logged out.
+  // Another window of the same login is logged out, too.
   const window = await page.context().newPage();
   it.watch(window, server.http);
   await window.goto(server.http);
@@ -68,7 +68,7 @@ serverTest("pairing", async (it) => {
   const server = await guarded(it);
   const page = await openLogin(it, server.http);
   await logIn(page);
-  // The stop button works beside the panel, by mouse and by key.
+  // The stop button works while the dialog is open, by mouse and by key.
   await page.locator("#setup summary").click();
   await page.getByRole("button", { name: "pair a computer" }).click();
   await page.getByRole("button", { name: "show a code" }).click();
@@ -85,7 +85,7 @@ serverTest("pairing", async (it) => {
   assert.equal(await text(page, "announcement"), "");
   await page.keyboard.press("Escape");
   await until(page, "announcement", /no runtime is connected/);
-  // The second escape stops at once: a dialog tells later that it has closed.
+  // The second escape stops at once, although a dialog's close event comes later.
   await page.locator("#setup summary").click();
   await page.getByRole("button", { name: "pair a computer" }).click();
   await page.locator("dialog[open]").waitFor();
@@ -102,7 +102,7 @@ serverTest("scenes", async (it) => {
   const server = await guarded(it);
   const page = await openLogin(it, server.http);
   await logIn(page);
-  // Another scene: the page comes back by itself, still logged in.
+  // Another scene: the page reconnects, still logged in.
   const before = await page.evaluate(async () => (await (await fetch("/api/scenes")).json()).now);
   assert.equal(before, "first");
   await page.locator("#scenes").click();

@@ -1,4 +1,4 @@
-// Panels are closed, moved and kept, by keyboard, and put back; the cameras take the page, and escape gives it back.
+// Panels are closed, moved and stored, by keyboard, and reset; the cameras fill the page until escape.
 
 const assert = require("node:assert/strict");
 const { checkAccess, checkBarriers, isPainted, recordedTest, resize, text, until } = require("../harness.cjs");
@@ -22,7 +22,7 @@ recordedTest("panels", {
     const row = (name) => dialog.getByRole("listitem").filter({ has: page.getByRole("checkbox", { name, exact: true }) });
     await row("leaderboard").dragTo(row("map"), { targetPosition: { x: 40, y: 3 } });
     await it.shot(page, "laptop-panels");
-    // Escape closes the dialog; it stops nothing.
+    // Escape closes the dialog, and stops no vehicle.
     await page.keyboard.press("Escape");
     await dialog.waitFor({ state: "hidden" });
     assert.equal(await text(page, "announcement"), "");

@@ -1,4 +1,4 @@
-// The page before a flight, on a laptop, a phone and a projector; what opening it costs.
+// The page before a flight, on a laptop, a phone and a projector; also the cost of opening it.
 
 const assert = require("node:assert/strict");
 const { checkAccess, checkBarriers, isPainted, recordedTest, resize, until } = require("../harness.cjs");
@@ -11,7 +11,7 @@ recordedTest("ready", {
     await it.event("waiting", { shown: () => until(page, "phase-text", /ready to start/) });
     assert.ok(await page.locator("#land").isHidden(), "nothing to land yet");
     await isPainted(page, "map");
-    // Nothing here has a graphics card: the top view comes first by itself.
+    // Without a graphics card, the top view is the default.
     await page.locator("#view-top[aria-pressed=true]").waitFor();
     assert.ok((await page.locator("#stages li").count()) > 0, "stage lights");
     assert.equal(await page.locator("#stages [aria-current]").count(), 1);
@@ -29,7 +29,7 @@ recordedTest("ready", {
   },
 });
 
-/** The largest file, which comes last. */
+/** Largest file, which is loaded last. */
 const LAST = "/three.core.min.js";
 
 recordedTest("load", {

@@ -1,4 +1,4 @@
-// What an instructor sets on the page before a flight: a camera; light and weather.
+// Settings of an instructor before a flight: a camera; light and weather.
 
 const assert = require("node:assert/strict");
 const { checkBarriers, isPainted, serverTest, until } = require("../harness.cjs");
@@ -7,7 +7,7 @@ serverTest("camera", async (it) => {
   it.command("scene", "generate", "room", "--seed", "1", "-o", it.at("room"));
   const server = await it.serve(it.at("room"), "--leaderboard", "none", "--keys", it.at("keys"));
   const page = await it.open(server.http);
-  // The form is filled with the camera's settings first.
+  // Wait until the form shows the camera's settings.
   await until(page, "camera-name", /\d ×/);
   await until(page, "link-text", /live/);
   await page.locator("#setup summary").click();
@@ -22,7 +22,7 @@ serverTest("camera", async (it) => {
   await server.end();
 });
 
-/** Waits until the colour camera's picture is darker than this, 0 to 255; returns its brightness. */
+/** Waits until the mean of the colour image is below this, 0 to 255; returns its brightness. */
 const darkerThan = async (page, most) => {
   const found = await page.waitForFunction((most) => {
     const canvas = document.getElementById("colour");
@@ -39,13 +39,13 @@ serverTest("environment", async (it) => {
   it.start("sim", "--vicon", server.vicon, "--mavlink", "udpin:127.0.0.1:0", "--spawn", server.spawn.join(), "--json");
   const page = await it.open(server.http);
   await isPainted(page, "colour");
-  // Another light is seen with the next images.
+  // Another light is visible in the next images.
   const day = await darkerThan(page, 256);
   await page.locator("#environment").click();
   await page.locator("#environment-choice").selectOption("night");
   await darkerThan(page, 0.6 * day);
-  // A name at once, a sight with the button, and what has no field here is kept.
-  /** Waits until the server has what is expected, and the dialog shows that it has: until then it would overwrite what is typed. */
+  // A name takes effect at once, a visibility with the button; settings without a field are kept.
+  /** Waits until the server has the expected settings, and the dialog shows them: until then it would overwrite typed text. */
   const isNow = (...expected) =>
     page.waitForFunction(async (expected) => {
       const now = await (await fetch("/api/environment")).json();

@@ -1,9 +1,9 @@
-// The view in space: the twin itself, and the server's pictures of it for browsers without WebGL 2, and for slow ones.
+// The 3D view: the twin's splats, and the server's images of the twin for browsers that are slow or have no WebGL 2.
 
 const assert = require("node:assert/strict");
 const { PATIENCE_MS, checkAccess, checkBarriers, resize, serverTest, until } = require("../harness.cjs");
 
-/** A server with a vehicle that stands on the ground. */
+/** Starts a server with a vehicle on the ground. */
 async function standing(it, scene) {
   it.command("scene", "generate", ...scene, "-o", it.at("scene"));
   const server = await it.serve(it.at("scene"), "--leaderboard", "none", "--keys", it.at("keys"));
@@ -15,7 +15,7 @@ serverTest("space", async (it) => {
   const server = await standing(it, ["room", "--seed", "1"]);
   const page = await it.open(server.http);
   await until(page, "poses", /^\d+$/);
-  // Drawn, and turned by keys.
+  // Drawn, and rotated by keys.
   const twin = page.waitForResponse((answer) => answer.url().includes("/api/splats/0"));
   await page.locator("#view-space").click();
   const canvas = page.locator("#space");
@@ -25,7 +25,7 @@ serverTest("space", async (it) => {
     assert.ok(Date.now() - began_ms < PATIENCE_MS, "the view in space stays blank");
     await page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
   } while ((await canvas.screenshot()).length < 20_000);
-  // The twin takes the place of the boxes; without a card its first part alone.
+  // The twin replaces the boxes; without a graphics card, only its first part is loaded.
   assert.equal((await twin).status(), 200);
   await canvas.press("ArrowLeft");
   await it.shot(page, "laptop-space");
@@ -39,7 +39,7 @@ serverTest("space", async (it) => {
   await server.end();
 });
 
-/** Waits until the view in space shows a picture of the scene, other than the one before; returns colours of its points. */
+/** Waits until the 3D view shows an image of the scene that differs from the previous one; returns colours of its points. */
 const served = (page, before = "") =>
   page.waitForFunction((before) => {
     const canvas = document.getElementById("space");
@@ -48,7 +48,7 @@ const served = (page, before = "") =>
     const { data } = g.getImageData(0, 0, canvas.width, canvas.height);
     const seen = [], step = 4 * Math.ceil(data.length / 4 / 2000);
     for (let k = 0; k < data.length; k += step) seen.push((data[k] << 16) | (data[k + 1] << 8) | data[k + 2]);
-    // Lines, faces and one colour behind them are some tens.
+    // Lines, faces and a background have some tens of colours.
     return new Set(seen).size > 200 && seen.join() !== before && seen.join();
   }, before).then((handle) => handle.jsonValue());
 
@@ -81,16 +81,16 @@ serverTest("without_webgl", async (it) => {
 
 serverTest("graphics_fail", async (it) => {
   const server = await standing(it, ["race"]);
-  // Small, as every pixel is drawn by the processor.
+  // Small, because the processor draws every pixel.
   const page = await it.open(server.http, { viewport: { width: 800, height: 600 } });
   await until(page, "poses", /^\d+$/);
   await page.locator("#view-space").click();
-  // Whoever asks first decides what a canvas is drawn with: it has to be the page.
+  // The first request determines a canvas's kind of context: it must come from the page.
   await page.waitForFunction(() => !document.getElementById("space").hidden);
   await page.evaluate(() => document.getElementById("space").getContext("webgl2").getExtension("WEBGL_lose_context").loseContext());
   await page.getByText("drawn by the server: this browser's graphics have failed").waitFor();
   await served(page);
-  // From now on the page draws too seldom, on a fast computer as well.
+  // From here on the page draws too slowly, even on a fast computer.
   await page.evaluate(() => {
     const request = globalThis.requestAnimationFrame.bind(globalThis);
     globalThis.requestAnimationFrame = (draw) => setTimeout(() => request(draw), 150);

@@ -1,6 +1,5 @@
-// Somebody who has never seen the page watches two vehicles: understands it, chooses the other one, learns why that has crashed,
-// starts the first and stops it. Both are on the map and in space, at once. Everything is found by what is visible, named as it is
-// shown.
+// A first-time user watches two vehicles: selects the other one, finds the cause of its crash, starts the first one and
+// stops it. Both are on the map and in the 3D view at the same time. All elements are found by their visible names.
 
 const assert = require("node:assert/strict");
 const fs = require("node:fs");
@@ -57,7 +56,7 @@ recordedTest("two_vehicles", {
       },
     });
     assert.match(await card.getByRole("paragraph").first().innerText(), /.{20}/);
-    // Back, by the number that stands there.
+    // Back, by the number on the tag.
     await page.keyboard.press("1");
     await page.waitForURL(/vehicle=wasp/);
     await it.event("wasp is shown", { shown: () => page.getByRole("button", { name: "start" }).waitFor() });

@@ -1,4 +1,4 @@
-// A team checks in on the page and flies; page and wall show its run, and then its signed grade, by themselves.
+// A team checks in on the page and flies; page and wall show its run, and then its signed grade, without a reload.
 
 const assert = require("node:assert/strict");
 const { checkBarriers, checkWidth, isPainted, recordedTest, resize, text, until } = require("../harness.cjs");
@@ -47,7 +47,7 @@ recordedTest("wall", {
       shown: async () => {
         await picture.filter({ hasText: /wasps\s*official\s*\d\/\d\s*0:0\d\.\d/ }).waitFor();
         for (const canvas of ["map", "pictures canvas"]) await isPainted(wall, canvas);
-        // The second one comes when the first has been shown: the wall knows which run this is.
+        // The second answer arrives after the first was shown, so the wall has assigned the run.
         for (let k = 0; k < 2; k++) await wall.waitForResponse((answer) => answer.url().endsWith("/api/leaderboard"));
       },
     });
@@ -56,19 +56,19 @@ recordedTest("wall", {
       await checkWidth(wall, `wall on ${size}`);
       await it.shot(wall, `${size}-wall-flying`);
     }
-    await checkBarriers(wall, "the wall while somebody flies");
+    await checkBarriers(wall, "the wall during a flight");
     await it.event("flown", {
       really: async () => assert.equal(await it.fly.ended, 0),
       shown: async () => {
         await picture.waitFor({ state: "detached" });
-        // It has watched the run that leads: the next ones have it for a ghost.
+        // The wall has recorded the best run, which is the ghost of the next ones.
         await until(wall, "ghost", /ghost: the best official run, wasps/);
-        // Neither page is loaded again.
+        // No page is reloaded.
         for (const screen of [wall, page]) await shows(screen, "official", /^1\s+wasps\s+\d\/\d\s/);
       },
     });
     assert.match(await firstRow(wall, "practice"), /nobody yet/);
-    assert.ok(await wall.locator("#graded-panel").isHidden(), "nobody has a grade yet");
+    assert.ok(await wall.locator("#graded-panel").isHidden(), "no grade exists yet");
     await it.event("graded", {
       really: () => {
         it.command("grade", "race", "--project", "p4", "--seeds", "1", "-o", it.at("grade.json"), "--keys", it.at("grader"));

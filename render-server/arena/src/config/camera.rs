@@ -1,4 +1,4 @@
-//! `[[cameras]]`: size, lens, mounting, and what the server alone needs to know of a camera.
+//! `[[cameras]]`: size, lens, mounting, and settings that only the server uses.
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
@@ -12,8 +12,8 @@ use super::validate::{ConfigError, check_number, check_position, invalid};
 
 /// One of `[[cameras]]`.
 ///
-/// What it sees is given either by `horizontal_fov_deg` (a pinhole, square pixels, the axis in the
-/// middle), or as a calibration gives it: `fx_px`, `fy_px`, `cx_px`, `cy_px` and `distortion`.
+/// The field of view is given either by `horizontal_fov_deg` (a pinhole, square pixels, the axis in the
+/// middle), or by a calibration: `fx_px`, `fy_px`, `cx_px`, `cy_px` and `distortion`.
 ///
 /// ```
 /// let text = r#"
@@ -41,13 +41,14 @@ use super::validate::{ConfigError, check_number, check_position, invalid};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
-    /// What plugins call it; unique, at most 32 bytes.
+    /// Name for plugins; unique, at most 32 bytes.
     pub name: String,
     /// Image width. [px]
     pub width_px: u32,
     /// Image height. [px]
     pub height_px: u32,
-    /// From the left edge to the right edge, of a camera without distortion; or give the four below. [deg]
+    /// Field of view from the left edge to the right edge, for a camera without distortion; or give the four
+    /// keys below. [deg]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub horizontal_fov_deg: Option<f64>,
     /// Focal length along x. [px]
@@ -56,17 +57,17 @@ pub struct CameraConfig {
     /// Focal length along y. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fy_px: Option<f64>,
-    /// Principal point from the image's left edge: OpenCV's, which counts from the middle of the
+    /// Principal point from the left edge of the image: OpenCV's value, which counts from the middle of the
     /// first pixel, plus 0.5. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cx_px: Option<f64>,
-    /// Principal point from the image's upper edge: OpenCV's plus 0.5. [px]
+    /// Principal point from the upper edge of the image: OpenCV's value plus 0.5. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cy_px: Option<f64>,
-    /// How the lens distorts; of the same calibration as the focal lengths. Without it, not at all.
+    /// Lens distortion, from the same calibration as the focal lengths; without it, the lens has no distortion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub distortion: Option<LensConfig>,
-    /// Where it sits on the vehicle. [m, body]
+    /// Mounting position on the vehicle. [m, body]
     pub position_m: DVec3,
     /// Nose-up tilt of the optical axis, after the yaw. [deg]
     #[serde(default)]
@@ -74,30 +75,30 @@ pub struct CameraConfig {
     /// Turn of the optical axis to the left, about the body's z, before the tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub yaw_deg: f64,
-    /// Turn about the optical axis, its right side down, after yaw and tilt. [deg]
+    /// Turn about the optical axis, right side down, after yaw and tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub roll_deg: f64,
-    /// Nearest distance along the optical axis that is drawn. [m]
+    /// Near limit: minimum rendered distance along the optical axis. [m]
     #[serde(default = "default_near_m", skip_serializing_if = "is_default_near")]
     pub near_m: f64,
-    /// Images a second at most; without it as many as the server can render. [Hz]
+    /// Maximum frame rate; without it, as high as the server can render. [Hz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
-    /// When the network is short, images of cameras with a higher number are sent first.
+    /// Priority on a slow network: images of cameras with a higher number are sent first.
     #[serde(default, skip_serializing_if = "is_normal")]
     pub priority: i32,
-    /// Whether its images come with depth; by default they do. Depth that a course withholds does
-    /// not leave the server: plugins get "no return" in every pixel.
+    /// Whether images contain depth. If `false`, depth does not leave the server: plugins get "no return" in
+    /// every pixel.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub depth: bool,
-    /// How it differs from a perfect camera; without it, not at all.
+    /// Simulation of a real sensor; without it, the camera is perfect.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub imaging: Option<ImagingConfig>,
 }
 
 impl CameraConfig {
-    /// Nearer splats would fill the image when the body brushes something; less than a body's
-    /// radius. [m]
+    /// Nearer splats would fill the image when the body brushes against something; less than a body's radius.
+    /// [m]
     pub const NEAR_M: f64 = 0.05;
 
     /// Returns a pinhole camera at `position_m` [m, body] that looks along the nose.
@@ -129,8 +130,8 @@ impl CameraConfig {
         }
     }
 
-    /// Returns size, focal lengths, principal point and lens. Focal lengths that are not there,
-    /// which a validated config does not lack, are 0.
+    /// Returns size, focal lengths, principal point and lens. Absent focal lengths are 0; a validated config
+    /// has none absent.
     pub fn intrinsics(&self) -> Intrinsics {
         if let Some(fov_deg) = self.horizontal_fov_deg {
             let fov_rad = fov_deg.to_radians();
@@ -147,17 +148,16 @@ impl CameraConfig {
         }
     }
 
-    /// Returns the extrinsics: the forward camera rolled about its axis, tilted up, then turned to
-    /// the left.
+    /// Returns the extrinsics: the forward camera rolled about its axis, tilted up, then turned left.
     pub fn body_from_cam(&self) -> Pose<Body, Cam> {
         let forward = body_from_forward_cam(self.position_m, self.tilt_deg.to_radians());
-        // A camera's z is ahead and its y down: the right side goes down by turning x towards y.
+        // A camera's z points ahead and its y down: a turn of x towards y moves the right side down.
         let roll = DQuat::from_rotation_z(self.roll_deg.to_radians());
         let yaw = DQuat::from_rotation_z(self.yaw_deg.to_radians());
         Pose::new(self.position_m, yaw * forward.rotation * roll)
     }
 
-    /// Returns what the runtime must know of it.
+    /// Returns the data that the runtime needs.
     pub fn info(&self) -> CameraInfo {
         CameraInfo {
             name: bounded(&self.name),
@@ -166,15 +166,15 @@ impl CameraConfig {
         }
     }
 
-    /// Checks every value but the name: for a camera that is changed later.
+    /// Checks every value except the name: for later changes of one camera.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for the first value that cannot work.
+    /// [`ConfigError::Invalid`] for the first invalid value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check(str::to_owned)
     }
 
-    /// Checks all but the name, which must differ from other cameras'; `key` names a field.
+    /// Checks every value except the name, which must differ from other cameras' names; `key` names a field.
     pub(super) fn check(&self, key: impl Fn(&str) -> String) -> Result<(), ConfigError> {
         self.check_intrinsics(&key)?;
         check_position(&key("position_m"), self.position_m)?;
@@ -216,7 +216,7 @@ impl CameraConfig {
             }
         } else if let Some((name, _)) = absent {
             let advice = if given.is_some() || self.distortion.is_some() {
-                "a calibration is whole: give all of fx_px, fy_px, cx_px and cy_px"
+                "a calibration needs all four: give all of fx_px, fy_px, cx_px and cy_px"
             } else {
                 "give horizontal_fov_deg, or fx_px, fy_px, cx_px and cy_px"
             };
@@ -263,5 +263,5 @@ fn is_yes(value: &bool) -> bool {
     *value
 }
 
-/// A camera further from the body than this is a typing error. [m]
+/// A larger distance from the body is a typing error. [m]
 const MAX_LEVER_M: f64 = 2.0;

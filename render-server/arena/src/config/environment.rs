@@ -1,4 +1,4 @@
-//! `[environment]`: the light on the scene, the air in it and the weather, for the cameras alone.
+//! `[environment]`: light, air and weather, which affect only the cameras.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,13 +13,13 @@ pub use weather::{
     SnowConfig, SunConfig,
 };
 
-/// `[environment]`: what lies between the scene, as it was captured, and the images of it. All of it
-/// may be left out: then nothing does. Obstacles, course, depth and ids do not depend on it.
+/// `[environment]`: effects between the captured scene and its images. Every key is optional and off by
+/// default. Obstacles, course, depth and ids do not depend on it.
 ///
 /// ```
 /// use vizflyt_arena::config::EnvironmentConfig;
 /// let fog = EnvironmentConfig::named("fog").unwrap();
-/// // What is as far away as one can see has lost 98 % of its contrast.
+/// At the visibility range, the contrast has lost 98 %.
 /// let left = (-fog.fog_per_m() * fog.fog_visibility_m).exp();
 /// assert!((left - 0.02).abs() < 1e-9);
 /// assert_eq!(fog.name(), Some("fog"));
@@ -28,17 +28,17 @@ pub use weather::{
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct EnvironmentConfig {
-    /// Every colour of the scene is multiplied by it: red, green, blue; 0 to 4.
+    /// Factor on every colour of the scene: red, green, blue; 0 to 4.
     pub light: [f64; 3],
-    /// How far one sees: at this distance 2 % of the contrast are left (the meteorological optical
-    /// range of Koschmieder's law); 0 is clear air, else 0.5 to 1000. [m]
+    /// Visibility: distance at which 2 % of the contrast is left (meteorological optical range by Koschmieder's
+    /// law); 0 is clear air, otherwise 0.5 to 1000. [m]
     pub fog_visibility_m: f64,
-    /// What fog looks like where it hides everything: red, green, blue; 0 to 1.
+    /// Colour of opaque fog: red, green, blue; 0 to 1.
     pub fog: [f64; 3],
-    /// How long a camera's shutter is open, 0.05 to 100: streaks and flicker. [ms]
+    /// Exposure time of the cameras, 0.05 to 100; it affects streaks and flicker. [ms]
     #[serde(skip_serializing_if = "is_usual_exposure")]
     pub exposure_ms: f64,
-    /// Whether depth cameras lose returns in what takes light, there and back; else depth is perfect.
+    /// Whether depth cameras lose returns by attenuation on the way there and back; otherwise depth is perfect.
     #[serde(skip_serializing_if = "core::ops::Not::not")]
     pub depth_loss: bool,
     /// Smoke, dust or patchy fog.
@@ -56,10 +56,10 @@ pub struct EnvironmentConfig {
     /// Lamps in the scene.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lamps: Option<LampsConfig>,
-    /// A lamp on the vehicle, beside each camera.
+    /// A lamp on the vehicle, next to each camera.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub own_light: Option<OwnLightConfig>,
-    /// Flicker of the scene's light and its lamps.
+    /// Flicker of the scene's light and lamps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flicker: Option<FlickerConfig>,
 }
@@ -77,7 +77,7 @@ impl Default for EnvironmentConfig {
 
 /// Grey, a little blue.
 const FOG: [f64; 3] = [0.70, 0.73, 0.76];
-/// Of a camera by day. [ms]
+/// A camera's exposure by day. [ms]
 const EXPOSURE_MS: f64 = 5.0;
 
 impl EnvironmentConfig {
@@ -97,7 +97,7 @@ impl EnvironmentConfig {
         flicker: None,
     };
 
-    /// Returns the environment of a name.
+    /// Returns the environment with a name.
     pub fn named(name: &str) -> Option<Self> {
         Self::NAMED.iter().find(|(known, _)| *known == name).map(|&(_, named)| named)
     }
@@ -107,7 +107,8 @@ impl EnvironmentConfig {
         Self::NAMED.iter().find(|(_, named)| named == self).map(|&(name, _)| name)
     }
 
-    /// Returns the extinction of the air: `exp(-it * d)` of the light is left at distance `d`. [1/m]
+    /// Returns the extinction coefficient of the air: `exp(-it * d)` of the light is left at distance `d`.
+    /// [1/m]
     pub fn fog_per_m(&self) -> f64 {
         if self.fog_visibility_m > 0.0 { extinction_per_m(self.fog_visibility_m) } else { 0.0 }
     }
@@ -115,7 +116,7 @@ impl EnvironmentConfig {
     /// Checks every number.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`], which names the key.
+    /// [`ConfigError::Invalid`] with the key.
     pub fn check(&self) -> Result<(), ConfigError> {
         for light in self.light {
             check_number("environment.light", light, "", 0.0..=4.0)?;
@@ -135,7 +136,8 @@ impl EnvironmentConfig {
     }
 }
 
-/// Returns the extinction of air in which 2 % of the contrast are left at a distance [m]: Koschmieder's law. [1/m]
+/// Returns the extinction coefficient of air in which 2 % of the contrast is left at a distance [m]:
+/// Koschmieder's law. [1/m]
 fn extinction_per_m(visibility_m: f64) -> f64 {
     let contrast = 0.02_f64;
     -contrast.ln() / visibility_m
@@ -152,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn named_ones_are_valid_and_found_again() {
+    fn named_environments_are_valid_and_found_by_value() {
         for &(name, named) in EnvironmentConfig::NAMED {
             named.check().unwrap();
             assert_eq!(named.name(), Some(name));
@@ -161,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_cannot_work_are_named() {
+    fn errors_name_the_invalid_key() {
         let check = |text: &str| {
             let environment: EnvironmentConfig = toml::from_str(text).unwrap();
             environment.check().unwrap_err().to_string()

@@ -1,4 +1,4 @@
-//! `[cameras.imaging]`: how a camera differs from a perfect one: by a named sensor, and by what of it is otherwise.
+//! `[cameras.imaging]`: a named image sensor and depth camera, and values that override theirs.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,111 +24,114 @@ pub use presets::{DEPTHS, DepthSensor, LightSensor, SENSORS, StereoPair, TimeOfF
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImagingConfig {
-    /// The image sensor, one of [`SENSORS`]; without it, a perfect one. What else is absent is as this sensor has it.
+    /// Image sensor, one of [`SENSORS`]; without it, the sensor is perfect. Other absent keys take this
+    /// sensor's value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensor: Option<String>,
-    /// A fixed exposure of each row; without it the exposure is automatic. [ms]
+    /// Fixed exposure of each row; without it, the exposure is automatic. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_ms: Option<f64>,
-    /// Analogue gain of a fixed exposure; without it 1.
+    /// Analogue gain of a fixed exposure; default 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain: Option<f64>,
     /// Time constant of the automatic exposure. [s]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_lag_s: Option<f64>,
-    /// Longest shutter of the automatic exposure. [ms]
+    /// Maximum shutter time of the automatic exposure. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_exposure_ms: Option<f64>,
-    /// Greatest gain of the automatic exposure.
+    /// Maximum gain of the automatic exposure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_gain: Option<f64>,
-    /// Light that falls onto the scene: what is white in its file is as bright as white paper in it. [lx]
+    /// Illuminance of the scene: white in the scene's file is as bright as white paper in this light. [lx]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub illuminance_lx: Option<f64>,
-    /// Of the lens: focal length over aperture.
+    /// F-number of the lens: focal length divided by aperture.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub f_number: Option<f64>,
-    /// Pixels of the sensor that one of the image joins, along each side; without it as many as it has for the image's width.
+    /// Sensor pixels per image pixel, along each side; without it, the width of the sensor divided by that of
+    /// the image.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub binning: Option<u32>,
-    /// Most electrons that a pixel of the sensor holds. [e]
+    /// Full-well capacity: maximum number of electrons in a sensor pixel. [e]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub full_well_e: Option<f64>,
-    /// Noise of reading a pixel of the sensor, standard deviation. [e]
+    /// Read noise of a sensor pixel, one standard deviation. [e]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub read_noise_e: Option<f64>,
-    /// Rolling shutter: from the first row's exposure to the last one's; 0 is a global shutter. [ms]
+    /// Rolling shutter: time from the first row's exposure to the last row's; 0 for a global shutter. [ms]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub readout_ms: Option<f64>,
-    /// Share of the light that the corners lack.
+    /// Vignetting: share of the light that is lost in the corners.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vignette: Option<f64>,
-    /// What lies before the pixels.
+    /// Colour filter of the pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub filter: Option<FilterKind>,
-    /// Whether the camera denoises its images; by default it does not.
+    /// Whether the camera denoises its images; default `false`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub denoise: Option<bool>,
-    /// Whether there is photon and read noise; by default there is.
+    /// Whether to simulate photon noise and read noise; default `true`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise: Option<bool>,
-    /// How depth is measured; without it, perfectly.
+    /// Depth camera to simulate; without it, depth is perfect.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthConfig>,
 }
 
-/// `filter`: what lies before a sensor's pixels.
+/// `filter`: colour filter in front of a sensor's pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FilterKind {
-    /// Every pixel of the image sees three colours, as one that joins many does.
+    /// Three colours in every image pixel, as if each joined many sensor pixels.
     Rgb,
-    /// One colour a pixel, interpolated.
+    /// One colour per pixel, interpolated.
     Bayer,
-    /// Nothing: images are grey.
+    /// No filter: images are grey.
     Mono,
 }
 
-/// `depth`: a depth camera by its name, and what of it is otherwise.
+/// `depth`: a named depth camera, and values that override its own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DepthConfig {
-    /// The depth camera, one of [`DEPTHS`]. What else is absent is as this one has it.
+    /// Depth camera, one of [`DEPTHS`]. Other absent keys take this camera's value.
     pub model: String,
-    /// Nothing nearer is reported; of a time-of-flight camera. [m]
+    /// Minimum reported distance, for time-of-flight cameras. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub min_m: Option<f64>,
-    /// Nothing further is reported. [m]
+    /// Maximum reported distance. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_m: Option<f64>,
-    /// Distance between the cameras of a stereo pair. [mm]
+    /// Distance between the two cameras of a stereo pair. [mm]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baseline_mm: Option<f64>,
     /// Focal length of the images that a stereo pair matches. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub focal_px: Option<f64>,
-    /// Standard deviation of a stereo pair's disparities. [px]
+    /// Noise of a stereo pair's disparities, one standard deviation. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub subpixel_px: Option<f64>,
-    /// How far what is in front reaches over what is behind, in images that are matched. [px]
+    /// Foreground fattening of a stereo pair: width by which near objects extend over the background. [px]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fattening_px: Option<f64>,
-    /// Whether a projector gives blank walls a texture; without one they are holes.
+    /// Whether a projector adds texture to blank walls; without one, blank walls have no depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projector: Option<bool>,
-    /// Modulation of a time-of-flight camera's light; where only this is given, `unambiguous_m` follows from it. [MHz]
+    /// Modulation frequency of a time-of-flight camera's light; if only this is given, `unambiguous_m` follows
+    /// from it. [MHz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub modulation_mhz: Option<f64>,
-    /// Distance from which on a time-of-flight camera's distances begin at 0 again. [m]
+    /// Unambiguous range of a time-of-flight camera: beyond it, distances restart at 0. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unambiguous_m: Option<f64>,
-    /// Electrons of its own light that white makes 1 m ahead. [e]
+    /// Signal of the camera's own light, reflected by a white surface at 1 m. [e]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signal_e: Option<f64>,
-    /// Electrons of other light. [e]
+    /// Signal of ambient light. [e]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub background_e: Option<f64>,
-    /// Whether light that comes by way of other surfaces counts.
+    /// Whether to simulate multipath: light that arrives by way of other surfaces.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub multipath: Option<bool>,
 }
@@ -138,7 +141,7 @@ fn listed(names: impl Iterator<Item = &'static str>) -> String {
 }
 
 impl ImagingConfig {
-    /// Returns the image sensor with what is given otherwise; `None` is a perfect one, or a name that validation refuses.
+    /// Returns the image sensor with all overrides; `None` is a perfect one, or a name that validation rejects.
     pub fn light_sensor(&self) -> Option<LightSensor> {
         let name = self.sensor.as_ref()?;
         let preset = SENSORS.iter().find(|(known, _)| known == name)?.1;
@@ -163,7 +166,7 @@ impl ImagingConfig {
         })
     }
 
-    /// Returns the depth camera with what is given otherwise; `None` is a perfect one, or a name that validation refuses.
+    /// Returns the depth camera with all overrides; `None` is a perfect one, or a name that validation rejects.
     pub fn depth_sensor(&self) -> Option<DepthSensor> {
         let config = self.depth.as_ref()?;
         let preset = DEPTHS.iter().find(|(known, _)| *known == config.model)?.1;
@@ -194,7 +197,7 @@ impl ImagingConfig {
         })
     }
 
-    /// Returns what it is in a few words: `imx219, depth d435`.
+    /// Returns a short description: `imx219, depth d435`.
     pub fn describe(&self) -> String {
         let depth = self.depth.as_ref().map(|depth| format!("depth {}", depth.model));
         let parts = [self.sensor.clone(), depth];
@@ -232,7 +235,7 @@ impl ImagingConfig {
             }
             None => {
                 if let Some((name, _)) = of_sensor.iter().find(|(_, given)| *given) {
-                    let advice = format!("it is of a sensor; name the sensor, one of {}", known());
+                    let advice = format!("needs a sensor; add sensor, one of {}", known());
                     return Err(invalid(key(name), "given", advice));
                 }
             }
@@ -241,7 +244,7 @@ impl ImagingConfig {
         number("exposure_ms", self.exposure_ms, "ms", 0.001..=1000.0)?;
         number("gain", self.gain, "", 1.0..=256.0)?;
         if let (Some(gain), None) = (self.gain, self.exposure_ms) {
-            let advice = "it is of a fixed exposure; give exposure_ms, or max_gain instead";
+            let advice = "needs a fixed exposure; give exposure_ms, or max_gain instead";
             return Err(invalid(key("gain"), gain, advice));
         }
         number("exposure_lag_s", self.exposure_lag_s, "s", 0.001..=60.0)?;
@@ -291,7 +294,7 @@ impl DepthConfig {
             DepthSensor::TimeOfFlight(_) => (&of_stereo[..], "a time-of-flight camera"),
         };
         if let Some((name, _)) = others.iter().find(|(_, given)| *given) {
-            let advice = format!("{} is {kind}, which has none; remove it", self.model);
+            let advice = format!("{} is {kind} and does not have this key; remove it", self.model);
             return Err(invalid(key(name), "given", advice));
         }
         number("min_m", self.min_m, "m", 0.0..=100.0)?;

@@ -1,10 +1,11 @@
-//! In which line of an `arena.toml` a key stands.
+//! Line number of a key in an `arena.toml`.
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-/// Returns the line, from 1, of a key such as `stages[1].width_m`; where the file leaves it out, that
-/// of the nearest key above it. `None` for text that is no TOML, and for keys of nothing in it.
+/// Returns the line, from 1, of a key such as `stages[1].width_m`. If the file does not contain the key,
+/// returns the line of the nearest key above it. Returns `None` for invalid TOML, and if no part of the key is
+/// in the file.
 ///
 /// ```
 /// use vizflyt_arena::config::line_of;
@@ -17,7 +18,7 @@ pub fn line_of(text: &str, key: &str) -> Option<usize> {
     let table = DeTable::parse(text).ok()?;
     let mut found = None;
     let mut inside = Some(Inside::Table(table.get_ref()));
-    // `stages[1].width_m` in steps: stages, 1, width_m.
+    // `stages[1].width_m` has the steps stages, 1, width_m.
     for step in key.split(['.', '[', ']']).filter(|step| !step.is_empty()) {
         let next = match inside? {
             Inside::Table(table) => {

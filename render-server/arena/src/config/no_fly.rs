@@ -1,4 +1,4 @@
-//! `[[no_fly]]`: boxes that the body's surface must stay out of.
+//! `[[no_fly]]`: boxes that the body's surface must not enter.
 
 use std::collections::HashSet;
 
@@ -10,15 +10,15 @@ use vizflyt_protocol::messages::MAX_NO_FLY;
 use super::validate::{check_name, check_position, invalid};
 use super::{ArenaConfig, ConfigError};
 
-/// `[[no_fly]]`: along the world's axes, as around a real table that the twin does not show.
+/// `[[no_fly]]`: each box is axis-aligned, for example around a real table that the twin does not show.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NoFly {
-    /// Its name; at most 32 bytes.
+    /// Name of the box; at most 32 bytes.
     pub name: String,
-    /// The corner with the least x, y and z. [m, world]
+    /// Corner with the smallest x, y and z. [m, world]
     pub min_m: DVec3,
-    /// The corner opposite. [m, world]
+    /// Opposite corner. [m, world]
     pub max_m: DVec3,
 }
 
@@ -29,7 +29,7 @@ impl NoFly {
     }
 }
 
-/// A thinner box is a typing error, and none that a pose's noise respects. [m]
+/// A thinner box is a typing error, and thinner than the noise of a pose. [m]
 const MIN_SIDE_M: f64 = 0.01;
 
 impl ArenaConfig {
@@ -54,7 +54,7 @@ impl ArenaConfig {
             for (of, p_m) in self.places() {
                 if keep_out.volume().signed_distance_m(p_m) < self.body_radius_m {
                     let advice = format!(
-                        "{of} at {p_m} lies in it or nearer to it than the body's {} m",
+                        "{of} at {p_m} is inside the box or less than the body's radius, {} m, from it",
                         self.body_radius_m
                     );
                     return Err(invalid(key("min_m"), keep_out.min_m, advice));
@@ -64,7 +64,7 @@ impl ArenaConfig {
         Ok(())
     }
 
-    /// Returns where the vehicle must be able to be, each with its name. [m, world]
+    /// Returns the positions that the vehicle must be able to reach, with names. [m, world]
     fn places(&self) -> Vec<(String, DVec3)> {
         let spawns = [("spawn".to_owned(), Some(self.spawn))].into_iter().chain(
             self.vehicles

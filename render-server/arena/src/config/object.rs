@@ -1,5 +1,5 @@
-//! `[[objects]]`: rigid parts of the twin beside its scene: a gate's frame that stands still; a clock's hand, a door, a
-//! pendulum that move by themselves.
+//! `[[objects]]`: rigid parts of the twin outside of its scene: the frame of a gate that stands still; the hand
+//! of a clock, a door or a pendulum that moves.
 
 use std::collections::HashSet;
 
@@ -25,55 +25,55 @@ use super::validate::{ConfigError, check_name, check_number, check_position, inv
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectConfig {
-    /// Its name; unique, at most 32 bytes.
+    /// Name of the object; unique, at most 32 bytes.
     pub name: String,
-    /// The file of its splats, in metres of its own frame, relative to the folder of `arena.toml`.
+    /// File of its splats, in metres in the object's frame, relative to the folder of `arena.toml`.
     pub scene: String,
-    /// Where the origin of its frame rests. [m, world]
+    /// Rest position of the object frame's origin. [m, world]
     pub position_m: DVec3,
-    /// How far its frame is turned about the world's z, counter-clockwise. [deg]
+    /// Rotation of the object frame about the world's z, counter-clockwise. [deg]
     #[serde(default)]
     pub yaw_deg: f64,
-    /// Where in its motion it is when the arena starts; without it, random by the seed. [s]
+    /// Phase of the motion when the arena starts; without it, random by the seed. [s]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase_s: Option<f64>,
-    /// How it moves about its rest; without it, it stands still, as a part of the scene.
+    /// Periodic motion about the rest position; without it, the object is fixed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub motion: Option<MotionConfig>,
 }
 
-/// `motion`: how an object moves about its rest, over and over.
+/// `motion`: periodic motion of an object about its rest position.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum MotionConfig {
-    /// Turns evenly about an axis through its origin.
+    /// Turns at a constant rate about an axis through its origin.
     Rotation {
-        /// It turns counter-clockwise about this; any length but 0. [object]
+        /// Axis of the counter-clockwise turn; any length but 0. [object]
         axis: DVec3,
-        /// Time of one turn. [s]
+        /// Duration of one turn. [s]
         period_s: f64,
     },
-    /// Slides or swings to and fro, as a sine; at rest in the middle, where it is fastest.
+    /// Slides or swings as a sine; the rest position is the middle, where the speed is highest.
     Oscillation {
-        /// How far it slides to each side. [m, object at rest]
+        /// Amplitude of the slide, to each side. [m, object at rest]
         #[serde(default, skip_serializing_if = "is_none")]
         slide_m: DVec3,
-        /// It swings about this axis through its origin. [object]
+        /// Axis of the swing, through the object's origin. [object]
         #[serde(default, skip_serializing_if = "is_none")]
         axis: DVec3,
-        /// How far it swings to each side. [deg]
+        /// Amplitude of the swing, to each side. [deg]
         #[serde(default, skip_serializing_if = "is_zero")]
         swing_deg: f64,
-        /// Time of once to and fro. [s]
+        /// Duration of one full cycle. [s]
         period_s: f64,
     },
-    /// Runs along points at an even speed without turning.
+    /// Follows points at a constant speed without turning.
     Path {
-        /// The points, 2 to 64, from where it rests. [m, object at rest]
+        /// Points, 2 to 64, relative to the rest position. [m, object at rest]
         points_m: Vec<DVec3>,
-        /// How fast it runs, 0.01 to 30. [m/s]
+        /// Speed along the path, 0.01 to 30. [m/s]
         speed_mps: f64,
-        /// Whether it runs on from the last point to the first; else it turns there and runs back.
+        /// Whether the path continues from the last point to the first; otherwise the object turns back there.
         #[serde(default)]
         closed: bool,
     },
@@ -168,10 +168,10 @@ fn check_motion(motion: &MotionConfig, key: impl Fn(&str) -> String) -> Result<(
     }
 }
 
-/// Objects of one arena at most: each costs every image and every pose a little.
+/// Maximum number of objects in an arena: each adds cost to every image and every pose.
 pub const MAX_OBJECTS: usize = 32;
 const MAX_POINTS: usize = 64;
-/// Faster things are a blur to a camera of 60 Hz. [s]
+/// Faster objects are a blur to a camera of 60 Hz. [s]
 const MIN_PERIOD_S: f64 = 0.05;
-/// Nanoseconds of it are exact in f64. [s]
+/// In f64, times up to this are exact to the nanosecond. [s]
 const MAX_PERIOD_S: f64 = 86400.0;

@@ -1,4 +1,4 @@
-//! `[rules]`: what a flight is fined for, beside what ends it, and what a plugin may ask for.
+//! `[rules]`: penalties that do not end a flight, and the setpoints that plugins may use.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -7,34 +7,34 @@ use vizflyt_protocol::messages::{SetpointKind, SetpointKinds};
 use super::validate::{ConfigError, check_number, check_position, invalid};
 use super::{ArenaConfig, Geofence};
 
-/// `[rules]`: a start box, and seconds that are added to the time. All of it may be left out: then
-/// nothing is fined.
+/// `[rules]`: a start box, and penalties in seconds. Every key is optional; without keys, nothing is penalized.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RulesConfig {
-    /// The body's centre must be in this box at take-off, which is waited for. A flight that begins elsewhere all the
-    /// same is no official one. Of a vehicle with a spawn of its own the box lies about that. [m, world]
+    /// Box in which the body's centre must be at take-off; take-off waits for it. A flight that starts outside
+    /// of it is not official. For a vehicle with its own spawn, the box moves with the spawn. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start_box: Option<Geofence>,
-    /// Fine for a take-off outside of the start box. [s]
+    /// Penalty for a take-off outside of the start box. [s]
     pub false_start_s: f64,
-    /// Nearer to an obstacle than this is a near miss; 0 is none. [m]
+    /// Clearance below which a near miss is counted; 0 disables it. [m]
     pub near_miss_m: f64,
-    /// Fine for each near miss, however long it lasts. [s]
+    /// Penalty for each near miss, regardless of its duration. [s]
     pub near_miss_s: f64,
-    /// Kinds of setpoint that plugins may ask for; without it all but attitude rates.
+    /// Kinds of setpoint that plugins may use; default: all except attitude rates, and except positions if
+    /// `ground_truth` is false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub setpoints: Option<SetpointKinds>,
 }
 
 impl RulesConfig {
-    /// The start box of a vehicle that stands at a place: it may be carried there by hand, to half a metre. [m, world]
+    /// Returns the start box for a spawn: placing the vehicle by hand is accurate to half a metre. [m, world]
     pub fn start_box_about(spawn_m: DVec3) -> Geofence {
         let (below_m, above_m) = (DVec3::new(0.5, 0.5, 0.5), DVec3::new(0.5, 0.5, 1.0));
         Geofence { min_m: spawn_m - below_m, max_m: spawn_m + above_m }
     }
 
-    /// Whether a flight may begin at a place. [m, world]
+    /// Whether a flight may start at a position. [m, world]
     pub fn starts_within(&self, p_m: DVec3) -> bool {
         let within = |start: Geofence| p_m.cmpge(start.min_m).all() && p_m.cmple(start.max_m).all();
         self.start_box.is_none_or(within)
@@ -44,8 +44,8 @@ impl RulesConfig {
         *self == Self::default()
     }
 
-    /// Returns the fines of a flight: by where it took off [m, world], and its clearances in the order
-    /// of time [m]. [s]
+    /// Returns the penalty of a flight, from its take-off position [m, world] and its clearances in order of
+    /// time [m]. [s]
     ///
     /// ```
     /// use glam::DVec3;
@@ -95,7 +95,7 @@ impl ArenaConfig {
         let asks_for_pose =
             rules.setpoints.is_some_and(|kinds| kinds.contains(SetpointKind::Position));
         if asks_for_pose && !self.ground_truth {
-            let advice = "flies by the pose, which ground_truth = false withholds".to_owned();
+            let advice = "needs the pose, which ground_truth = false withholds".to_owned();
             return Err(invalid("rules.setpoints", "position", advice));
         }
         let Some(start) = &rules.start_box else { return Ok(()) };

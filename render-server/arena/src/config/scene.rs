@@ -1,17 +1,16 @@
-//! `[scene]`: the splats that the room is seen as, and their place in it.
+//! `[scene]`: the splats of the room, and their placement in the world.
 //!
 //! ```toml
 //! [scene]
 //! file = "kitchen.ply"            # relative to the folder of arena.toml
 //! up = "-y"                       # the file's axis that points up; or rotation = [x, y, z, w]
-//! yaw_deg = 90.0                  # then turned about the world's z, counter-clockwise
+//! yaw_deg = 90.0                  # applied second: turn about the world's z, counter-clockwise
 //! metres_per_unit = 0.176
-//! origin = [0.3, -1.2, 1.4]       # where the file's own origin comes to lie [m, world]
-//! crop = { min_m = [-4, -3, -0.5], max_m = [4, 3, 3] }    # what lies outside is left out [m, world]
-//! antialiased = true              # trained so (mip-splatting), whatever the file says
+//! origin = [0.3, -1.2, 1.4]       # position of the file's origin [m, world]
+//! crop = { min_m = [-4, -3, -0.5], max_m = [4, 3, 3] }    # splats outside are removed [m, world]
+//! antialiased = true              # trained with mip-splatting; overrides the file
 //! ```
-//! `scene = "kitchen.ply"` is the short form of a scene that lies in the world already, as generated
-//! ones do.
+//! `scene = "kitchen.ply"` is the short form for a scene in world coordinates, such as a generated one.
 
 use std::fmt;
 use std::str::FromStr;
@@ -24,29 +23,29 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use super::validate::{ConfigError, check_number, check_position, invalid};
 use super::{ArenaConfig, Geofence};
 
-/// `[scene]`: a file of splats, and how it lies in the world.
+/// `[scene]`: a file of splats, and its placement in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneConfig {
-    /// The splat scene, relative to the folder of `arena.toml`.
+    /// Splat scene, relative to the folder of `arena.toml`.
     pub file: String,
-    /// The file's axis that points up; absent where `rotation` says it, or nothing is turned.
+    /// Axis of the file that points up; leave it out with `rotation`, or if the file needs no turn.
     pub up: Option<Up>,
-    /// Turned by this about the world's z, counter-clockwise, after `up`. [deg]
+    /// Turn about the world's z, counter-clockwise, after `up`. [deg]
     pub yaw_deg: f64,
-    /// The scene's axes to the world's, in place of `up` and `yaw_deg`: a quaternion x, y, z, w.
+    /// Rotation from the scene's axes to the world's, in place of `up` and `yaw_deg`: a quaternion x, y, z, w.
     pub rotation: Option<[f64; 4]>,
-    /// Length of the file's unit. [m]
+    /// Length of one unit of the file. [m]
     pub metres_per_unit: f64,
-    /// Where the file's origin comes to lie. [m, world]
+    /// Position of the file's origin. [m, world]
     pub origin_m: DVec3,
-    /// What is kept of it, by the splats' centres; all, if absent. [m, world]
+    /// Box of splats to keep, by their centres; without it, all are kept. [m, world]
     pub crop: Option<Geofence>,
-    /// Whether it was trained with anti-aliasing (mip-splatting); as the file says, if absent.
+    /// Whether the scene was trained with anti-aliasing (mip-splatting); default: as stated in the file.
     pub antialiased: Option<bool>,
 }
 
 impl SceneConfig {
-    /// Returns a file that lies in the world already.
+    /// Returns the config of a file in world coordinates.
     pub fn in_world(file: impl Into<String>) -> Self {
         Self {
             file: file.into(),
@@ -72,7 +71,7 @@ impl SceneConfig {
         DQuat::from_rotation_z(self.yaw_deg.to_radians()) * upright
     }
 
-    /// Whether every splat stays where the file has it.
+    /// Whether the scene is in world coordinates: no rotation, scale, shift or crop.
     pub fn is_in_world(&self) -> bool {
         *self == Self::in_world(self.file.as_str())
     }
@@ -89,7 +88,7 @@ impl SceneConfig {
             let advice = if self.up.is_some() || self.yaw_deg != 0.0 {
                 "give either rotation, or up and yaw_deg"
             } else if !((DQuat::from_array(rotation).length() - 1.0).abs() < 1e-3) {
-                "give a unit quaternion as [x, y, z, w]; none is [0, 0, 0, 1]"
+                "give a unit quaternion as [x, y, z, w]; the identity is [0, 0, 0, 1]"
             } else {
                 ""
             };
@@ -109,7 +108,7 @@ impl SceneConfig {
 }
 
 impl From<&str> for SceneConfig {
-    /// As [`SceneConfig::in_world`].
+    /// Same as [`SceneConfig::in_world`].
     fn from(file: &str) -> Self {
         Self::in_world(file)
     }
@@ -121,24 +120,24 @@ impl ArenaConfig {
     }
 }
 
-/// Metres per unit that a scene has: a grain of sand to a campus.
+/// Allowed metres per unit: from a grain of sand to a campus.
 pub const METRES_PER_UNIT: std::ops::RangeInclusive<f64> = 1e-4..=1e4;
 
-/// Which axis of a scene's file points up.
+/// Axis of a scene's file that points up.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Up {
-    /// `x`: its x axis.
+    /// `x`: the file's x axis.
     X,
-    /// `-x`: against its x axis.
+    /// `-x`: opposite to the file's x axis.
     NegX,
-    /// `y`: its y axis, as in exports of game engines.
+    /// `y`: the file's y axis, as in exports of game engines.
     Y,
-    /// `-y`: against its y axis, as COLMAP's first upright camera gives it (y down, z forward).
+    /// `-y`: opposite to the file's y axis, as in COLMAP if the first camera is upright (y down, z forward).
     #[default]
     NegY,
-    /// `z`: its z axis, as in the world and in exports of nerfstudio.
+    /// `z`: the file's z axis, as in the world and in exports of nerfstudio.
     Z,
-    /// `-z`: against its z axis.
+    /// `-z`: opposite to the file's z axis.
     NegZ,
 }
 
@@ -146,7 +145,7 @@ impl Up {
     /// Every axis.
     pub const ALL: [Self; 6] = [Self::X, Self::NegX, Self::Y, Self::NegY, Self::Z, Self::NegZ];
 
-    /// Returns how it is written.
+    /// Returns the text form.
     pub fn name(self) -> &'static str {
         match self {
             Self::X => "x",
@@ -158,10 +157,10 @@ impl Up {
         }
     }
 
-    /// Returns the rotation that takes this axis to the world's +z; of y-up and y-down scenes the
-    /// usual forward axis becomes the world's +x.
+    /// Returns the rotation that takes this axis to the world's +z. For y-up and y-down scenes, it also takes
+    /// the usual forward axis to the world's +x.
     pub fn world_from_scene(self) -> DQuat {
-        // Rows: the world's axes written in scene axes.
+        // Rows: the world's axes in scene axes.
         let rows = match self {
             Self::Z => [DVec3::X, DVec3::Y, DVec3::Z],
             Self::NegZ => [DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z],
@@ -182,15 +181,15 @@ impl fmt::Display for Up {
     }
 }
 
-/// The name of no axis.
+/// Error for an unknown axis name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' is no axis; give the one that points up in the file: x, -x, y, -y, z or -z")]
+#[error("unknown axis '{0}'; give the axis that points up in the file: x, -x, y, -y, z or -z")]
 pub struct UnknownAxis(String);
 
 impl FromStr for Up {
     type Err = UnknownAxis;
 
-    /// Reads `-y`; also `y-` and `+y`, as others write it.
+    /// Parses `-y`; also accepts `y-` and `+y`.
     fn from_str(text: &str) -> Result<Self, UnknownAxis> {
         let lower = text.trim().to_ascii_lowercase();
         let name = match lower.strip_suffix('-') {
@@ -214,7 +213,7 @@ impl<'de> Deserialize<'de> for Up {
     }
 }
 
-/// `[scene]` as the file has it.
+/// `[scene]` as it is in the file.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Table {
@@ -227,7 +226,7 @@ struct Table {
     rotation: Option<[f64; 4]>,
     #[serde(default = "one")]
     metres_per_unit: f64,
-    /// Where the file's own origin comes to lie. [m, world]
+    /// Position of the file's origin. [m, world]
     #[serde(default)]
     origin: DVec3,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -321,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn both_forms_are_read_and_written_again() {
+    fn both_forms_round_trip() {
         let short = scene("scene = \"a.ply\"");
         assert_eq!(short, SceneConfig::in_world("a.ply"));
         assert!(short.is_in_world() && short.rotation() == DQuat::IDENTITY);
@@ -350,7 +349,7 @@ mod tests {
         };
         refused("[scene]\nfile = \"a\"\nscale = 2", &["line 4", "scale"]);
         refused("[scene]\nup = \"z\"", &["file"]);
-        refused("[scene]\nfile = \"a\"\nup = \"w\"", &["line 4", "'w' is no axis", "-z"]);
+        refused("[scene]\nfile = \"a\"\nup = \"w\"", &["line 4", "unknown axis 'w'", "-z"]);
         refused(
             "[scene]\nfile = \"a\"\nantialiased = \"on\"",
             &["line 4", "antialiased", "boolean"],
@@ -370,7 +369,7 @@ mod tests {
     }
 
     #[test]
-    fn up_becomes_up_and_forward_stays_ahead() {
+    fn rotates_up_axis_to_z_and_forward_axis_to_x() {
         let axes = [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z];
         for (up, axis) in Up::ALL.into_iter().zip(axes) {
             let turned = up.world_from_scene() * axis;
@@ -386,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_takes_x_to_y() {
+    fn yaw_of_90_degrees_takes_x_to_y() {
         let about_z = |text: &str| scene(&format!("[scene]\nfile = \"a\"\n{text}")).rotation();
         let half = std::f64::consts::FRAC_1_SQRT_2;
         for text in ["yaw_deg = 90", &format!("rotation = [0, 0, {half}, {half}]")] {

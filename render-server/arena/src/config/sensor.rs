@@ -1,5 +1,5 @@
-//! `[[sensors]]`: LiDAR, range finders, sonar, radar: a named model, where it sits, and what is other than its data sheet
-//! says.
+//! `[[sensors]]`: LiDAR, range finders, sonar, radar: a named model, its mounting, and values that override the
+//! data sheet.
 
 use std::collections::HashSet;
 
@@ -13,7 +13,7 @@ use super::validate::{ConfigError, check_name, check_number, check_position, inv
 
 /// One of `[[sensors]]`.
 ///
-/// Which models there are, and what `settings` may hold, the server knows: the keys are those of the model.
+/// The server defines the models and the keys that each accepts in `settings`.
 ///
 /// ```
 /// let text = r#"
@@ -33,37 +33,37 @@ use super::validate::{ConfigError, check_name, check_number, check_position, inv
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SensorConfig {
-    /// What plugins call it; unique among the sensors, at most 32 bytes.
+    /// Name for plugins; unique among the sensors, at most 32 bytes.
     pub name: String,
-    /// The name of its model, which says of what kind it is: `os1-16`, `tfmini`.
+    /// Name of the model, for example `os1-16` or `tfmini`; it determines the kind of sensor.
     pub model: String,
-    /// Where it sits on the vehicle. [m, body]
+    /// Mounting position on the vehicle. [m, body]
     pub position_m: DVec3,
-    /// Nose-up tilt of its x axis, after the yaw. [deg]
+    /// Nose-up tilt of the sensor's x axis, after the yaw. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub tilt_deg: f64,
-    /// Turn of its x axis to the left, about the body's z, before the tilt. [deg]
+    /// Turn of the sensor's x axis to the left, about the body's z, before the tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub yaw_deg: f64,
-    /// Turn about its x axis, its right side down, after yaw and tilt. [deg]
+    /// Turn about the sensor's x axis, right side down, after yaw and tilt. [deg]
     #[serde(default, skip_serializing_if = "is_zero")]
     pub roll_deg: f64,
-    /// Readings a second; the model's if absent. [Hz]
+    /// Readings per second; default: the model's. [Hz]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
-    /// Nearest that it measures; the model's if absent. [m]
+    /// Minimum range; default: the model's. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub min_range_m: Option<f64>,
-    /// Furthest that it measures; the model's if absent. [m]
+    /// Maximum range; default: the model's. [m]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_range_m: Option<f64>,
-    /// Whether it measures; by default it does.
+    /// Whether the sensor measures.
     #[serde(default = "yes", skip_serializing_if = "is_yes")]
     pub enabled: bool,
-    /// Whether the runtime passes its readings on to the autopilot; by default it does not.
+    /// Whether the runtime forwards the readings to the autopilot.
     #[serde(default, skip_serializing_if = "is_no")]
     pub to_autopilot: bool,
-    /// What else is other than its model has it, by the model's own keys (sensor-models.md).
+    /// Other values that override the model, with the model's own keys (sensor-models.md).
     #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
     pub settings: toml::Table,
 }
@@ -87,21 +87,21 @@ impl SensorConfig {
         }
     }
 
-    /// Returns where it sits: the sensor that looks along the nose, rolled about its axis, tilted up, then turned to the
-    /// left.
+    /// Returns the mounting pose: a sensor that looks along the nose, rolled about its axis, tilted up, then
+    /// turned left.
     pub fn body_from_sensor(&self) -> Pose<Body, Sensor> {
         let yaw = DQuat::from_rotation_z(self.yaw_deg.to_radians());
-        // x goes up by turning it from z, which is about -y.
+        // From z towards x is a rotation about -y.
         let tilt = DQuat::from_rotation_y(-self.tilt_deg.to_radians());
         // The right side, -y, goes down by turning y towards z.
         let roll = DQuat::from_rotation_x(self.roll_deg.to_radians());
         Pose::new(self.position_m, yaw * tilt * roll)
     }
 
-    /// Checks every value but the name and what the model says to it: for a sensor that is changed later.
+    /// Checks every value except the name and those that depend on the model: for later changes of one sensor.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for the first value that cannot work.
+    /// [`ConfigError::Invalid`] for the first invalid value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check(str::to_owned)
     }
@@ -166,7 +166,7 @@ fn is_no(value: &bool) -> bool {
     !*value
 }
 
-/// A sensor further from the body than this is a typing error. [m]
+/// A larger distance from the body is a typing error. [m]
 const MAX_LEVER_M: f64 = 2.0;
 
 #[cfg(test)]
@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sensor_sits_as_a_camera_of_the_same_angles_does() {
+    fn mounting_angles_match_those_of_a_camera() {
         let camera = super::super::CameraConfig {
             tilt_deg: 25.0,
             yaw_deg: 70.0,
@@ -188,7 +188,7 @@ mod tests {
             ..SensorConfig::ahead("x", "tfmini", DVec3::X)
         };
         let (camera, sensor) = (camera.body_from_cam(), sensor.body_from_sensor());
-        // A camera's z is ahead and its x to the right.
+        // A camera's z points ahead and its x to the right.
         for (of_camera, of_sensor) in [(DVec3::Z, DVec3::X), (DVec3::X, DVec3::NEG_Y)] {
             let apart = camera.rotate(of_camera) - sensor.rotate(of_sensor);
             assert!(apart.length() < 1e-12, "{apart}");
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_named_with_key_and_advice() {
+    fn errors_name_the_key_and_advice() {
         let check = |change: fn(&mut SensorConfig), expected: &str| {
             let mut sensor = SensorConfig::ahead("down", "tfmini", DVec3::ZERO);
             change(&mut sensor);

@@ -59,7 +59,7 @@ fn rules_restrict_setpoints() {
     assert!(unknown.contains("`velocity`"), "{unknown}");
 }
 
-/// Parses the forest with one line replaced and expects a message that holds each of `parts`.
+/// Parses the forest with one line replaced and expects an error message that contains each of `parts`.
 #[track_caller]
 fn check_refused(from: &str, to: &str, parts: &[&str]) {
     assert!(FOREST.contains(from), "{from:?} is not in the example");
@@ -94,7 +94,7 @@ fn conversions_keep_frames_and_units() {
 }
 
 #[test]
-fn bodies_and_no_fly_boxes_are_read_and_checked() {
+fn reads_and_checks_bodies_and_no_fly_boxes() {
     let parts = r#"
 [[body]]
 from_m = [0.0, -0.08, 0.0]
@@ -128,7 +128,7 @@ max_m = [6.0, 1.0, 0.8]
 }
 
 #[test]
-fn toml_errors_point_at_the_line() {
+fn toml_errors_name_the_line() {
     check_refused("time_limit_s = 60.0", "time_limit = 60.0", &["line 6", "time_limit"]);
     check_refused("radius_m = 1.0", "radius_m = \"one\"", &["line 12", "f64"]);
 }
@@ -141,7 +141,7 @@ fn absent_safety_limits_are_errors() {
 }
 
 #[test]
-fn values_that_cannot_work_are_refused_by_key_and_value() {
+fn rejects_invalid_values_with_key_and_value() {
     check_refused("= 0.12", "= nan", &["body_radius_m = NaN", "0.01 to 2"]);
     check_refused("max_speed_mps = 6.0", "max_speed_mps = inf", &["limits.max_speed_mps = inf"]);
     check_refused(
@@ -160,7 +160,7 @@ fn values_that_cannot_work_are_refused_by_key_and_value() {
 }
 
 #[test]
-fn a_calibrated_camera_keeps_its_numbers() {
+fn calibrated_camera_keeps_its_values() {
     let calibration = "fx_px = 211.0\nfy_px = 212.5\ncx_px = 150.25\ncy_px = 130.0\n\
         distortion = { model = \"brown-conrady\", k1 = -0.2, p2 = 0.001 }\n\
         near_m = 0.2\nrate_hz = 15.0\nyaw_deg = 90.0\nroll_deg = 90.0";
@@ -173,7 +173,7 @@ fn a_calibrated_camera_keeps_its_numbers() {
     let lens = Distortion::BrownConrady { k1: -0.2, k2: 0.0, p1: 0.0, p2: 0.001, k3: 0.0 };
     assert_eq!(k.distortion, lens);
     assert_eq!((camera.near_m, camera.rate_hz), (0.2, Some(15.0)));
-    // To the left, 10 degrees up; its right side, which level would be ahead, is down.
+    // Turned left and tilted up by 10 degrees; its right side, which points ahead without roll, is down.
     let pose = camera.body_from_cam();
     let (sin, cos) = 10f64.to_radians().sin_cos();
     assert!((pose.rotate(DVec3::Z) - DVec3::new(0.0, cos, sin)).length() < 1e-12);
@@ -182,7 +182,7 @@ fn a_calibrated_camera_keeps_its_numbers() {
 }
 
 #[test]
-fn cameras_that_contradict_themselves_are_refused() {
+fn rejects_contradictory_cameras() {
     let fov = "horizontal_fov_deg = 90.0";
     let four = "fx_px = 100.0\nfy_px = 100.0\ncx_px = 160.0\ncy_px = 120.0";
     check_refused(fov, "", &["cameras[0].fx_px = absent", "horizontal_fov_deg, or fx_px"]);
@@ -205,7 +205,7 @@ fn cameras_that_contradict_themselves_are_refused() {
 }
 
 #[test]
-fn cameras_are_bounded_and_named_apart() {
+fn rejects_too_many_cameras_and_equal_names() {
     let arena = ArenaConfig::parse(FOREST).unwrap();
     let twice = ArenaConfig { cameras: vec![arena.cameras[0].clone(); 2], ..arena.clone() };
     let message = twice.validate().unwrap_err().to_string();
@@ -216,7 +216,7 @@ fn cameras_are_bounded_and_named_apart() {
     assert!(ArenaConfig { cameras: vec![], ..arena }.validate().is_err());
 }
 
-/// The forest with a second camera and these vehicles.
+/// Returns the forest with a second camera and these vehicles.
 fn with_vehicles(vehicles: &str) -> Result<ArenaConfig, ConfigError> {
     let camera = &FOREST[FOREST.find("[[cameras]]").unwrap()..FOREST.find("[[stages]]").unwrap()];
     let rear = camera.replace("front", "rear");
@@ -224,7 +224,7 @@ fn with_vehicles(vehicles: &str) -> Result<ArenaConfig, ConfigError> {
 }
 
 #[test]
-fn each_vehicle_has_its_spawn_and_its_cameras() {
+fn each_vehicle_has_its_own_spawn_and_cameras() {
     let vehicles = r#"
 [[vehicles]]
 name = "wasp"
@@ -243,7 +243,7 @@ name = "bee"
     assert_eq!(wasp.cameras[0].name, "rear");
     assert_eq!((bee.spawn, bee.cameras.len()), (arena.spawn, 2));
     wasp.validate().unwrap();
-    // The command line overrides the file; the file's settings of a vehicle that it names stay.
+    // The command line overrides the file; settings in the file of a vehicle that it names still apply.
     let chosen = arena.flying(&["fly".to_owned(), "wasp".to_owned()]).unwrap();
     assert_eq!(chosen, [VehicleConfig::named("fly"), flying[0].clone()]);
     let alone = ArenaConfig::parse(FOREST).unwrap().flying(&[]).unwrap();
@@ -251,7 +251,7 @@ name = "bee"
 }
 
 #[test]
-fn vehicles_that_cannot_fly_are_refused() {
+fn rejects_invalid_vehicles() {
     let check = |vehicle: &str, expected: &str| {
         let error = with_vehicles(&format!("[[vehicles]]\n{vehicle}\n")).unwrap_err().to_string();
         assert!(error.contains(expected), "{error:?} lacks {expected:?}");

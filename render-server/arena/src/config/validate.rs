@@ -1,4 +1,4 @@
-//! What `arena.toml` may hold. Each refusal names the key, the value and what to do.
+//! Validation of `arena.toml`. Each error names the key, the value and what to do.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -10,28 +10,27 @@ use vizflyt_toml::TomlErrors;
 
 use super::{ArenaConfig, Spawn, StageConfig};
 
-/// Why an `arena.toml` is refused.
+/// Error of an `arena.toml`.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    /// Syntax, types, absent or unknown keys: all of them, with line and column.
+    /// Errors of syntax and type, absent or unknown keys: all of them, with line and column.
     #[error(transparent)]
     Toml(#[from] TomlErrors),
     /// The value cannot be written as TOML.
     #[error(transparent)]
     Unwritable(#[from] toml::ser::Error),
-    /// A value that cannot work.
+    /// An invalid value.
     #[error("{key} = {value}: {advice}{}", in_line(*line))]
     Invalid {
-        /// Where in the file: `geofence.max_m`, `cameras[1].name`.
+        /// Path of the key: `geofence.max_m`, `cameras[1].name`.
         key: String,
-        /// The value.
         value: String,
-        /// What is wrong and what to do.
+        /// Problem and solution.
         advice: String,
-        /// The line of the key, from 1, where the value came from a text.
+        /// Line of the key, from 1, if the value came from a text.
         line: Option<usize>,
     },
-    /// Several of these; two at least.
+    /// Two or more errors.
     #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
     Several(Vec<Self>),
 }
@@ -41,7 +40,7 @@ fn in_line(line: Option<usize>) -> String {
 }
 
 impl ConfigError {
-    /// Returns the error with the line of its key in the text that was read.
+    /// Returns the error with the line of its key in `text`.
     #[must_use]
     pub fn in_text(self, text: &str) -> Self {
         match self {
@@ -57,7 +56,7 @@ impl ConfigError {
     }
 }
 
-/// Returns the refusal of a value: its key, the value, and what to do.
+/// Returns the error for an invalid value, with key, value and advice.
 pub fn invalid(
     key: impl Into<String>,
     value: impl Display,
@@ -67,18 +66,18 @@ pub fn invalid(
     ConfigError::Invalid { key, value, advice, line: None }
 }
 
-/// Positions further out than this are typing errors: f32 splats keep 0.1 mm up to here. [m]
+/// Positions further out are typing errors: f32 splats are accurate to 0.1 mm up to here. [m]
 const MAX_COORDINATE_M: f64 = 1000.0;
 /// Bytes of [`vizflyt_protocol::messages::Name`].
 const MAX_NAME_BYTES: usize = 32;
-/// Corners of a stage at most: finer than anyone draws.
+/// Maximum number of corners of a stage: more than people draw.
 const MAX_CORNERS: usize = 128;
-/// `EventKind::Stage` counts in u8.
+/// `EventKind::Stage` stores the index in u8.
 const MAX_STAGES: usize = 255;
 /// One byte a voxel: 400 MB, a hall of 100 x 100 x 5 m at 5 cm.
 const MAX_VOXELS: f64 = 4e8;
 
-/// Checks that a value lies within a range; `unit` is named in the refusal.
+/// Checks that a value lies within a range; the error names `unit`.
 ///
 /// # Errors
 /// [`ConfigError::Invalid`], also for NaN.
@@ -95,7 +94,7 @@ pub fn check_number(
     Err(invalid(key, value, format!("give a number from {low} to {high} {unit}")))
 }
 
-/// Checks that a place is finite and not absurdly far off.
+/// Checks that a position is finite and within the maximum coordinate.
 ///
 /// # Errors
 /// [`ConfigError::Invalid`].
@@ -133,7 +132,7 @@ fn check_polygon(stage: &StageConfig, key: &str) -> Result<(), ConfigError> {
     }
     let half_m = DVec2::new(stage.width_m, stage.height_m) / 2.0 + 1e-9;
     for (n, corner) in corners.iter().enumerate() {
-        // Positively stated, so that NaN is refused.
+        // Stated positively, so that NaN is rejected.
         if !corner.abs().cmple(half_m).all() {
             let advice = format!(
                 "must lie within width_m = {} and height_m = {} about the centre",
@@ -149,7 +148,7 @@ impl ArenaConfig {
     /// Checks every value, and the values against each other.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`], or [`ConfigError::Several`] of them: every value that cannot work.
+    /// [`ConfigError::Invalid`], or [`ConfigError::Several`] with one error for each invalid value.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let Limits { max_speed_mps, max_acceleration_mps2, max_tilt_deg, max_altitude_m } =
             self.limits;
@@ -293,7 +292,7 @@ impl ArenaConfig {
                 let advice = "give the direction of passage, for example [1.0, 0.0, 0.0]";
                 return Err(invalid(key("normal"), stage.normal, advice));
             }
-            // An opening narrower than the body cannot be flown.
+            // A body does not fit through a narrower opening.
             let size_m = 2.0 * self.body_radius_m..=100.0;
             check_number(&key("width_m"), stage.width_m, "m", size_m.clone())?;
             check_number(&key("height_m"), stage.height_m, "m", size_m)?;

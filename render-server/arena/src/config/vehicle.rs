@@ -1,4 +1,4 @@
-//! `[[vehicles]]`: who flies in the arena, each with its own start and cameras.
+//! `[[vehicles]]`: the vehicles of the arena, each with its own spawn and cameras.
 
 use std::collections::HashSet;
 
@@ -12,15 +12,15 @@ use super::{ArenaConfig, Spawn};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VehicleConfig {
-    /// The name of its object in the localization system; at most 24 bytes.
+    /// Name of the vehicle's object in the localization system; at most 24 bytes.
     pub name: String,
-    /// Where it stands at the start; the arena's `spawn` if absent.
+    /// Position and heading at the start; default: the arena's `spawn`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub spawn: Option<Spawn>,
-    /// Names of its cameras, in the order of their index in messages; all if absent.
+    /// Names of the vehicle's cameras, in the order of their index in messages; default: all cameras.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cameras: Option<Vec<String>>,
-    /// Names of its sensors beside the cameras; all if absent.
+    /// Names of the vehicle's sensors other than cameras; default: all sensors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Vec<String>>,
 }
@@ -33,11 +33,11 @@ impl VehicleConfig {
 }
 
 impl ArenaConfig {
-    /// Returns the vehicles that fly: those of `names`, as `[[vehicles]]` has them if it does;
-    /// without names, all of `[[vehicles]]`; without those, `vizflyt`.
+    /// Returns the vehicles that fly: those in `names`, with their settings from `[[vehicles]]` if present;
+    /// without names, all of `[[vehicles]]`; if there are none, one named `vizflyt`.
     ///
     /// # Errors
-    /// [`ConfigError::Invalid`] for names that no vehicle can have, and for too many.
+    /// [`ConfigError::Invalid`] for invalid names, and for too many vehicles.
     pub fn flying(&self, names: &[String]) -> Result<Vec<VehicleConfig>, ConfigError> {
         let known = |name: &String| self.vehicles.iter().find(|vehicle| vehicle.name == *name);
         let mut vehicles: Vec<_> = names
@@ -54,14 +54,14 @@ impl ArenaConfig {
         Ok(vehicles)
     }
 
-    /// Returns the arena as one of its vehicles has it: with its spawn and its cameras, alone.
+    /// Returns the arena for one vehicle: with its spawn, and only its cameras and sensors.
     #[must_use]
     pub fn of_vehicle(&self, vehicle: &VehicleConfig) -> Self {
         let mut arena = self.clone();
         arena.vehicles.clear();
         arena.spawn = vehicle.spawn.unwrap_or(self.spawn);
         if let Some(start) = &mut arena.rules.start_box {
-            // It lies about the spawn.
+            // The box moves with the spawn.
             let way_m = arena.spawn.position_m - self.spawn.position_m;
             (start.min_m, start.max_m) = (start.min_m + way_m, start.max_m + way_m);
         }
@@ -136,9 +136,9 @@ fn check_names(
     Ok(())
 }
 
-/// Vehicles that one server serves at most: a net holds no more.
+/// Maximum number of vehicles per server: a net holds no more.
 pub const MAX_VEHICLES: usize = 8;
 /// Bytes of a name in Vicon's UDP object stream.
 const MAX_OBJECT_BYTES: usize = 24;
-/// What the simulator and the examples call theirs.
+/// Vehicle name in the simulator and the examples.
 const DEFAULT_NAME: &str = "vizflyt";

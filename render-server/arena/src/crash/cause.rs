@@ -1,5 +1,5 @@
-//! The probable cause of a failed flight, in words: fixed rules over what was recorded, the first that
-//! holds. They are what to look at first; they prove nothing.
+//! Probable cause of a failed flight in words: fixed rules over the record, of which the first match counts. A
+//! cause is a starting point for debugging, not a proof.
 
 use glam::{DVec2, DVec3};
 use vizflyt_protocol::flight_end::{Collision, EndReason, Obstacle, PluginFault};
@@ -12,7 +12,7 @@ use crate::config::CameraConfig;
 use crate::verdict::Sample;
 use crate::{ArenaConfig, DistanceField};
 
-/// Returns what a flight that did not finish probably failed of; `None` if it finished.
+/// Returns the probable cause of a flight that did not finish; `None` if it finished.
 pub fn probable_cause(
     arena: &ArenaConfig,
     field: &DistanceField,
@@ -36,7 +36,7 @@ pub fn probable_cause(
 
 fn of_plugin(flight: &Flight<'_>, fault: &PluginFault) -> String {
     let reason = &flight.verdict.reason;
-    // Two seconds without a setpoint end a flight; were there answers meanwhile?
+    // A flight ends after two seconds without a setpoint. Were there replies in this time?
     let answers = flight.asked.unwrap_or_default();
     let newest = answers.last().zip(flight.verdict.ended);
     if let Some((asked, at)) = newest
@@ -60,9 +60,9 @@ fn of_plugin(flight: &Flight<'_>, fault: &PluginFault) -> String {
             format!("no answer: {reason}; does `on_image` wait for something, or loop?")
         }
         (PluginFault::Refused(_), _) => {
-            format!("its setpoints are no numbers to fly by: {reason}")
+            format!("its setpoints are invalid: {reason}")
         }
-        // Its message is not repeated.
+        // The reason may contain the line already.
         (_, Some(line)) if !reason.contains(line) => {
             format!("{reason}; the last it printed: {line}")
         }
@@ -90,14 +90,14 @@ fn of_collision(
         }
         Obstacle::Object(name) | Obstacle::Vehicle(name) => {
             return format!(
-                "it met '{name}', which moves, at {speed_mps:.1} m/s: when it was seen clear, it was \
-                 not yet where it would be"
+                "it collided with '{name}', which moves, at {speed_mps:.1} m/s: the way was clear in the image, \
+                 but not on arrival"
             );
         }
         Obstacle::Unseen => {
             return format!(
-                "it flew where nobody has looked, at {speed_mps:.1} m/s: no ray of the capture has passed there, \
-                 and the arena takes unseen space for solid"
+                "it flew into unseen space at {speed_mps:.1} m/s: no photo of the capture has seen it, \
+                 and the arena treats unseen space as solid"
             );
         }
         Obstacle::Scene => {}
@@ -106,14 +106,14 @@ fn of_collision(
     let newest = asked.iter().rev().find(|asked| asked.stamp <= at);
     let silent_s = newest.map_or(f64::INFINITY, |asked| at.seconds_since(asked.stamp));
     if flight.asked.is_some() && newest.is_none() {
-        return "no answer: not one setpoint had come before the contact".to_owned();
+        return "no answer: no setpoint came before the contact".to_owned();
     }
     if flight.asked.is_some() && silent_s > SILENT_S {
         return format!("no answer: the newest setpoint was {silent_s:.1} s old at the contact");
     }
     let seconds = last.stamp.seconds_since(first.stamp).max(1e-3);
     let turn_radps = wrap_pi(last.yaw_rad - first.yaw_rad) / seconds;
-    // Away from the obstacle: where the distance grows.
+    // Away from the obstacle: the direction in which the distance grows.
     let away = gradient(field, last.p_world_m);
     let bearing = away.map(|away| wrap_pi((-away.y).atan2(-away.x) - last.yaw_rad));
     let half_view = arena.cameras.first().map(half_view_rad);
@@ -124,7 +124,7 @@ fn of_collision(
         let degrees = bearing.abs().to_degrees();
         let turning = if turn_radps.abs() > TURNING_RADPS { " while it turned" } else { "" };
         return format!(
-            "it flew into what it could not see: the obstacle was {degrees:.0} degrees to the {} of the \
+            "it flew into an obstacle that it could not see: it was {degrees:.0} degrees to the {} of the \
              nose, outside the camera's view{turning}",
             side(bearing)
         );
@@ -142,8 +142,8 @@ fn of_collision(
         let towards = -away.dot(last.v_world_mps) / speed_mps;
         if towards < GRAZE {
             return format!(
-                "it passed too close: a graze at {speed_mps:.1} m/s, the obstacle beside its way; keep \
-                 more than {:.2} m from what is seen",
+                "it passed too close: a graze at {speed_mps:.1} m/s, the obstacle next to its path; keep \
+                 more than {:.2} m from visible obstacles",
                 arena.body_radius_m
             );
         }
@@ -176,17 +176,16 @@ fn of_collision(
     }
 }
 
-/// The moment from which on an obstacle was seen ahead.
+/// Start of the time in which an obstacle was visible ahead.
 struct Sighting {
-    /// From the body's surface to the contact then. [m]
+    /// Distance from the body's surface to the contact at that time. [m]
     room_m: f64,
-    /// [m/s]
     speed_mps: f64,
 }
 
-/// Returns when what was met at `at` came into sight, by the images before the contact: in each of them,
-/// but single ones, what was ahead was no farther than the contact; `None` if it never was, or was in
-/// sight as far back as images are kept.
+/// Returns the time from which the obstacle hit at `at` was visible: in each later image, except single ones,
+/// the obstacle ahead was at most as far as the contact. Returns `None` if it was never visible, or already in
+/// the oldest stored image.
 fn sighting(flight: &Flight<'_>, radius_m: f64, at: ServerTime) -> Option<Sighting> {
     let sample_at = |stamp: ServerTime| -> Option<&Sample> {
         let after = flight.samples.partition_point(|sample| sample.stamp <= stamp);
@@ -251,7 +250,7 @@ fn of_timeout(flight: &Flight<'_>) -> String {
     }
 }
 
-/// Returns the direction in which the obstacle's distance grows most; `None` where it does not change.
+/// Returns the direction in which the obstacle distance grows most; `None` if it is constant.
 fn gradient(field: &DistanceField, p_m: DVec3) -> Option<DVec3> {
     let step_m = field.grid().voxel_m;
     let along = |axis: DVec3| {
@@ -259,7 +258,7 @@ fn gradient(field: &DistanceField, p_m: DVec3) -> Option<DVec3> {
             - field.obstacle_distance_m(p_m - axis * step_m)
     };
     let rise = DVec3::new(along(DVec3::X), along(DVec3::Y), along(DVec3::Z));
-    // The heading to it is of interest: straight above or below there is none.
+    // Only the heading to the obstacle matters: straight above or below there is none.
     let level = DVec2::new(rise.x, rise.y).length();
     (level > 1e-6).then(|| rise.normalize())
 }
@@ -269,7 +268,7 @@ fn half_view_rad(camera: &CameraConfig) -> f64 {
     (f64::from(k.width_px) / (2.0 * k.fx_px)).atan()
 }
 
-/// Returns the speed that a setpoint asks for, if it asks for one. [m/s]
+/// Returns the speed that a setpoint commands, if it commands one. [m/s]
 fn speed_of(setpoint: Option<&Setpoint>) -> Option<f64> {
     match setpoint? {
         Setpoint::Velocity { v_mps, .. } => Some(v_mps.length()),
@@ -277,24 +276,25 @@ fn speed_of(setpoint: Option<&Setpoint>) -> Option<f64> {
     }
 }
 
-/// An answer older than this at a contact was not steered by. [s]
+/// Maximum age of the newest reply at a contact; an older one counts as no reply. [s]
 const SILENT_S: f64 = 0.5;
-/// A turn faster than this moves the camera's view by a sixth in an image's age and answer. [rad/s]
+/// Yaw rate that moves the camera's view by a sixth within the age of an image and its reply. [rad/s]
 const TURNING_RADPS: f64 = 0.7;
-/// Over so long before a contact speed and turn are looked at. [s]
+/// Time before a contact over which speed and turn are evaluated. [s]
 const BEFORE_S: f64 = 0.5;
-/// A vehicle that moved less than this in [`STUCK_S`] was stuck. [m]
+/// Maximum motion of a stuck vehicle within [`STUCK_S`]. [m]
 const STUCK_M: f64 = 1.0;
 /// See [`STUCK_M`]. [s]
 const STUCK_S: f64 = 10.0;
-/// Whoever is still faster than this share of the speed of [`BEFORE_S`] ago has not braked.
+/// Minimum share of the speed [`BEFORE_S`] ago at which the vehicle counts as not braking.
 const SLOWED: f64 = 0.8;
-/// Along the contact's direction, less than this share of the speed is a graze.
+/// Maximum share of the speed towards the obstacle in a graze.
 const GRAZE: f64 = 0.35;
-/// In so many images on end it is not seen: it is not in sight yet. Single ones are missed.
+/// Number of consecutive images without the obstacle before which it counts as not visible. Single misses are
+/// ignored.
 const UNSEEN: usize = 2;
-/// What is ahead counts as what was met up to this much farther: of its distance, as the way was not
-/// quite straight...
+/// Tolerance of the distance ahead compared with that to the contact, as a share, because the path was not
+/// quite straight.
 const FARTHER: f64 = 0.1;
-/// ...and in all cases. [m]
+/// Constant part of this tolerance. [m]
 const FARTHER_M: f64 = 0.3;

@@ -1,6 +1,6 @@
-//! Drawings of a crash card: clearance and speed over time, and the place from above, as SVG.
+//! Drawings of a crash card: clearance and speed over time, and the top view, as SVG.
 //!
-//! Colours are the page's: classes `axis`, `scale`, `zero`, `way`, `speed`, `solid`, `gate`, `end`.
+//! The page defines the colours of the classes `axis`, `scale`, `zero`, `way`, `speed`, `solid`, `gate`, `end`.
 
 use std::fmt::Write;
 
@@ -43,7 +43,7 @@ pub fn clearance(samples: &[Sample], at: ServerTime) -> String {
     )
 }
 
-/// Draws the place from above around the last part of the way.
+/// Draws the top view around the last part of the path.
 pub fn top_view(
     arena: &ArenaConfig,
     slice: &ObstacleSlice,
@@ -54,7 +54,7 @@ pub fn top_view(
     let size = greatest - least;
     let scale = WIDTH / size.x;
     let height = size.y * scale;
-    // x to the right, y up.
+    // x points right, y up.
     let place = |p: DVec3| ((p.x - least.x) * scale, (greatest.y - p.y) * scale);
     let mut solid = String::new();
     for row in 0..slice.rows {
@@ -113,7 +113,7 @@ pub fn top_view(
     )
 }
 
-/// Returns the corners of what the top view shows. [m, world]
+/// Returns the corners of the top view. [m, world]
 fn window(arena: &ArenaConfig, samples: &[Sample]) -> (DVec2, DVec2) {
     let points = || samples.iter().map(|sample| sample.p_world_m.truncate());
     let start = arena.spawn.position_m.truncate();
@@ -123,7 +123,7 @@ fn window(arena: &ArenaConfig, samples: &[Sample]) -> (DVec2, DVec2) {
     (least - grow, greatest + grow)
 }
 
-/// Returns the path through samples, thinned; its ends are there.
+/// Returns the path through samples, thinned; it contains both ends.
 fn line(samples: &[Sample], place: impl Fn(&Sample) -> (f64, f64)) -> String {
     let every = samples.len().div_ceil(MAX_POINTS).max(1);
     let mut path = String::new();
@@ -137,14 +137,14 @@ fn line(samples: &[Sample], place: impl Fn(&Sample) -> (f64, f64)) -> String {
     path
 }
 
-/// Of a drawing. [user units]
+/// Size of a drawing. [user units]
 const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 220.0;
-/// Around a plot, for its words. [user units]
+/// Margin around a plot, for labels. [user units]
 const MARGIN: f64 = 34.0;
-/// Points of a path at most: finer than a pixel for any flight that is looked at, and 16 KB.
+/// Maximum number of points of a path: finer than a pixel for any flight, and 16 KB.
 const MAX_POINTS: usize = 1200;
-/// The top view shows so much around the last part of the way. [m]
+/// Margin of the top view around the last part of the path. [m]
 const AROUND_M: f64 = 2.5;
-/// It shows so much at least. [m]
+/// Minimum size of the top view. [m]
 const MIN_VIEW_M: f64 = 6.0;

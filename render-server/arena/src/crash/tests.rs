@@ -1,4 +1,4 @@
-//! Each rule that names a probable cause, by a flight that it is made for; and the drawings of one.
+//! One flight for each rule of the probable cause, and the drawings of a flight.
 
 use glam::{DVec3, Quat, Vec3};
 use vizflyt_protocol::flight_end::{
@@ -15,14 +15,14 @@ use crate::referee::tests::arena;
 use crate::verdict::judge;
 use crate::{ArenaConfig, BakeSpec, DistanceField, Ellipsoid, OccupancyGrid};
 
-/// The end of every flight here, since its start. [s]
+/// Time of the end of every flight here, since its start. [s]
 const END_S: f64 = 12.0;
 
 fn at(s: f64) -> ServerTime {
     ServerTime::ZERO.plus_seconds(1.0 + s)
 }
 
-/// The room of the referee's tests with a camera ahead, and a wall across it at x = 4.
+/// Returns the arena of the referee's tests with a forward camera, and a wall across it at x = 4.
 fn room() -> (ArenaConfig, DistanceField) {
     let mut config = arena();
     config.cameras = vec![CameraConfig::ahead("front", [320, 240], 90.0, DVec3::ZERO)];
@@ -45,22 +45,22 @@ fn room() -> (ArenaConfig, DistanceField) {
     (config, field)
 }
 
-/// How a flight went.
+/// Parameters of a flight.
 #[derive(Clone)]
 struct Case {
-    /// Where it ended. [m, world]
+    /// Position at the end. [m, world]
     end_m: DVec3,
     v_mps: DVec3,
-    /// At the end, against the motion. [m/s^2]
+    /// Deceleration at the end. [m/s^2]
     braking_mps2: f64,
-    /// At the end. [rad]
+    /// Yaw at the end. [rad]
     yaw_rad: f64,
     turn_radps: f64,
     end: Option<EndReason>,
-    /// Seconds before the end at which images were answered; `None` where nobody wrote it down.
+    /// Times of replies before the end [s]; `None` if not recorded.
     asked_before_s: Option<Vec<f64>>,
     setpoint: Option<Setpoint>,
-    /// The obstacle is in sight from so far on; from anywhere farther the image shows 20 m. [m]
+    /// Distance within which the obstacle is visible; from farther away, the image shows 20 m. [m]
     in_sight_m: f64,
     last_line: Option<&'static str>,
 }
@@ -74,7 +74,7 @@ fn hit(with: Obstacle) -> EndReason {
     EndReason::Collision(Collision { p_world_m, clearance_m, with, speed_mps })
 }
 
-/// It hit the wall head on at 2 m/s, its plugin awake and the wall in sight from 10 m on.
+/// A frontal collision with the wall at 2 m/s, with a responsive plugin and the wall visible from 10 m on.
 fn head_on() -> Case {
     Case {
         end_m: DVec3::new(3.8, 0.0, 1.0),
@@ -138,7 +138,7 @@ fn check(case: &Case, expected: &str) {
 }
 
 #[test]
-fn a_collision_is_named_by_the_first_rule_that_holds() {
+fn first_matching_rule_names_the_cause_of_a_collision() {
     let case = head_on();
     check(&case, "it did not brake: it flew on at 2.0 m/s");
     check(
@@ -154,7 +154,7 @@ fn a_collision_is_named_by_the_first_rule_that_holds() {
         &Case { in_sight_m: 0.2, ..case.clone() },
         "too fast for its depth horizon: at 2.0 m/s it needs 0.3 m to stop, and it first saw",
     );
-    // Fast enough sideways along the wall that it only grazed it.
+    // Fast enough along the wall to graze it only.
     let graze = DVec3::new(0.3, 2.0, 0.0);
     check(&Case { v_mps: graze, ..case.clone() }, "passed too close: a graze at 2.0 m/s");
     check(
@@ -167,25 +167,25 @@ fn a_collision_is_named_by_the_first_rule_that_holds() {
     );
     // The camera sees 45 degrees to each side.
     let aside = Case { yaw_rad: -1.0, ..case.clone() };
-    check(&aside, "could not see: the obstacle was 57 degrees to the left");
+    check(&aside, "could not see: it was 57 degrees to the left");
     check(&Case { turn_radps: 1.0, ..aside }, "outside the camera's view while it turned");
     let asleep = Case { asked_before_s: Some(vec![3.0, 0.9]), ..case.clone() };
     check(&asleep, "the newest setpoint was 0.9 s old at the contact");
     check(
         &Case { asked_before_s: Some(vec![]), ..case.clone() },
-        "not one setpoint had come before",
+        "no setpoint came before",
     );
     let door = Some(hit(Obstacle::Object(bounded("door"))));
-    check(&Case { end: door, ..case.clone() }, "it met 'door', which moves, at 2.0 m/s");
+    check(&Case { end: door, ..case.clone() }, "it collided with 'door', which moves, at 2.0 m/s");
     let bee = Some(hit(Obstacle::Vehicle(bounded("bee"))));
-    check(&Case { end: bee, ..case.clone() }, "it met 'bee', which moves, at 2.0 m/s");
+    check(&Case { end: bee, ..case.clone() }, "it collided with 'bee', which moves, at 2.0 m/s");
     let fell = Case { end: Some(hit(Obstacle::Floor)), v_mps: DVec3::Z * -2.5, ..case };
     check(&fell, "came down onto the floor at 2.5 m/s");
 }
 
 #[test]
-fn without_its_answers_a_collision_is_not_laid_on_them() {
-    // In a lab nobody has written down what the plugin asked for.
+fn unrecorded_replies_are_not_blamed() {
+    // A lab does not record the plugin's replies.
     let live = Case { asked_before_s: None, ..head_on() };
     check(&live, "it did not brake");
     check(&Case { in_sight_m: 0.2, ..live.clone() }, "too fast for its depth horizon");
@@ -194,13 +194,13 @@ fn without_its_answers_a_collision_is_not_laid_on_them() {
 }
 
 #[test]
-fn too_fast_is_what_could_not_have_stopped_from_where_it_first_saw_the_obstacle() {
+fn too_fast_if_the_stopping_distance_exceeds_the_first_sighting() {
     for speed_mps in [0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0] {
         let stop_m = speed_mps * 0.04 + speed_mps * speed_mps / (2.0 * 8.0);
         let head_on = Case { v_mps: DVec3::X * speed_mps, ..head_on() };
         let late = Case { in_sight_m: 0.7 * stop_m, ..head_on.clone() };
         check(&late, "too fast for its depth horizon");
-        // There was room; and what was in sight all the time was in sight early enough.
+        // There was room to stop; an obstacle that was always visible was visible early enough.
         for in_sight_m in [1.3 * stop_m + speed_mps / 30.0, 100.0] {
             check(&Case { in_sight_m, ..head_on.clone() }, "it did not brake");
         }
@@ -208,7 +208,7 @@ fn too_fast_is_what_could_not_have_stopped_from_where_it_first_saw_the_obstacle(
 }
 
 #[test]
-fn other_ends_have_their_own_causes() {
+fn each_other_end_has_its_cause() {
     let case = Case { end: None, ..head_on() };
     let fence = FenceBreach {
         p_world_m: DVec3::ZERO,
@@ -248,7 +248,7 @@ fn other_ends_have_their_own_causes() {
 }
 
 #[test]
-fn a_plugin_that_failed_is_quoted() {
+fn quotes_a_failed_plugin() {
     let failed = |fault| Case { end: Some(EndReason::Plugin(fault)), ..head_on() };
     let ended = failed(PluginFault::ended("ended with exit status 3"));
     let with_message = Case { last_line: Some("no such model"), ..ended.clone() };
@@ -262,22 +262,22 @@ fn a_plugin_that_failed_is_quoted() {
         &Case { asked_before_s: Some(vec![3.0]), ..hung },
         "does `on_image` wait for something, or loop?",
     );
-    check(&failed(PluginFault::Refused(InvalidSetpoint::NotFinite)), "no numbers to fly by");
-    // Its message is not repeated.
+    check(&failed(PluginFault::Refused(InvalidSetpoint::NotFinite)), "its setpoints are invalid");
+    // The message is not repeated.
     let once = Case { last_line: Some("exit status 3"), ..ended };
     assert_eq!(cause_of(&once).as_deref(), Some("ended with exit status 3"));
-    // Nor is a sentence that only reads like another fault taken for one.
+    // A text that only resembles another fault is not classified as that fault.
     let quoted = failed(PluginFault::ended("it has not answered image 7 without a setpoint"));
     check(&quoted, "it has not answered image 7 without a setpoint");
 }
 
 #[test]
-fn the_distance_ahead_is_the_nearest_of_the_middle_without_single_pixels() {
+fn distance_ahead_ignores_single_pixels_and_the_border() {
     let (width, height) = (30, 30);
     let mut depth = vec![9000_u16; width * height];
     let mut scratch = Vec::new();
     assert_eq!(ahead_m(&depth, width, &mut scratch), Some(9.0));
-    // A few pixels are noise, a tenth is an obstacle; at the border nothing counts.
+    // A few pixels are noise, a tenth is an obstacle; pixels at the border do not count.
     depth[15 * width + 15] = 500;
     depth[0] = 100;
     assert_eq!(ahead_m(&depth, width, &mut scratch), Some(9.0));
@@ -291,7 +291,7 @@ fn the_distance_ahead_is_the_nearest_of_the_middle_without_single_pixels() {
 }
 
 #[test]
-fn drawings_hold_every_part_and_only_finite_numbers() {
+fn drawings_contain_every_part_and_only_finite_numbers() {
     let (arena, field) = room();
     let sample = |tick: u32| Sample {
         stamp: at(f64::from(tick) / 200.0),
@@ -311,7 +311,7 @@ fn drawings_hold_every_part_and_only_finite_numbers() {
         assert!(top.contains(class), "{class}");
     }
     assert!(course.contains("class=\"speed\"") && course.contains("4.0 s before"), "{course}");
-    // Bounded, however long the flight was; styles are the page's, which allows none in place.
+    // Bounded for any duration; the page's policy forbids inline styles.
     assert!(top.len() < 60_000, "{}", top.len());
     for text in
         [&top, &course, &plot::clearance(&[], end), &plot::top_view(&arena, &slice, &[], &[])]

@@ -1,38 +1,37 @@
-//! A distance field as bytes, for caches: a header, then one byte a voxel, then one bit a voxel where some are
-//! unseen.
+//! Serialization of a distance field, for caches: a header, one byte per voxel, then one bit per voxel if some
+//! are unseen.
 //!
-//! Read with suspicion: a field that is wrong is a vehicle that hits something. Whoever keeps the
-//! bytes guards them with a checksum of their own.
+//! The reader validates everything: a wrong field means a collision. The owner of the bytes must protect them
+//! with a checksum.
 
 use glam::DVec3;
 
 use super::DistanceField;
 use crate::grid::Grid;
 
-/// Why bytes are no distance field.
+/// Reason for rejecting the bytes of a distance field.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum FieldError {
-    /// Another file, or another version of this one.
-    #[error("these bytes are no distance field of this version")]
+    /// Another kind of file, or another version.
+    #[error("not a distance field of this version")]
     Other,
-    /// A number that cannot be.
-    #[error("the distance field's {0} cannot be; bake it anew")]
+    /// A number out of range.
+    #[error("the distance field's {0} is out of range; bake it again")]
     Number(&'static str),
-    /// Too few or too many.
+    /// Wrong number of bytes.
     #[error(
-        "the distance field has {found} bytes of voxels, and should have {expected}; bake it anew"
+        "the distance field has {found} bytes of voxels, and should have {expected}; bake it again"
     )]
     Length {
-        /// Bytes there are.
         found: usize,
-        /// Bytes by the header.
+        /// Number of bytes according to the header.
         expected: usize,
     },
 }
 
 impl DistanceField {
-    /// Returns the bytes that [`Self::from_bytes`] reads: the header, the voxels apart from it, as they may be
-    /// hundreds of megabytes, and which of them are unseen, if any is.
+    /// Returns the bytes for [`Self::from_bytes`]: the header, the voxels (separate, because they may be
+    /// hundreds of megabytes), and the bits of unseen voxels, if there are any.
     pub fn as_bytes(&self) -> ([u8; FIELD_HEADER], &[u8], &[u8]) {
         let Self { grid, codes, floor_z_m, unseen } = self;
         let mut header = [0; FIELD_HEADER];
@@ -46,10 +45,10 @@ impl DistanceField {
         (header, codes, unseen)
     }
 
-    /// Reads what [`Self::as_bytes`] returned, joined.
+    /// Reads the concatenated result of [`Self::as_bytes`].
     ///
     /// # Errors
-    /// [`FieldError`] for anything else. Allocates no more than `bytes` holds.
+    /// [`FieldError`] for any other bytes. Allocates at most the length of `bytes`.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, FieldError> {
         let (header, voxels) =
             bytes.split_first_chunk::<FIELD_HEADER>().ok_or(FieldError::Other)?;
@@ -78,7 +77,7 @@ impl DistanceField {
         match expected {
             None | Some(0) => Err(FieldError::Number("number of voxels")),
             Some(expected) => {
-                // All of one, or of the other too.
+                // Distances only, or distances and unseen bits.
                 let rest = voxels.len().checked_sub(expected);
                 if rest.is_none_or(|rest| rest > 0 && rest != expected.div_ceil(8)) {
                     return Err(FieldError::Length { found: voxels.len(), expected });
@@ -91,13 +90,13 @@ impl DistanceField {
     }
 }
 
-/// Bytes before the voxels.
+/// Number of bytes before the voxels.
 pub const FIELD_HEADER: usize = 72;
-/// The last is the version: raise it when bytes or codes mean something else.
+/// The last byte is the version: increase it if the meaning of bytes or codes changes.
 const MAGIC: &[u8; 8] = b"vzfield\x01";
-/// Well beyond what an arena may hold. [m]
+/// Far beyond the limits of an arena. [m]
 const FURTHEST_M: f64 = 1e5;
-/// What an arena may hold, and more. [m]
+/// Wider than the limits of an arena. [m]
 const VOXELS_M: std::ops::RangeInclusive<f64> = 1e-3..=10.0;
 
 #[cfg(test)]
@@ -126,7 +125,7 @@ mod tests {
             let error = DistanceField::from_bytes(&bad).unwrap_err().to_string();
             assert!(error.contains(expected), "{error}");
         };
-        check(0, b"V", "no distance field");
+        check(0, b"V", "not a distance field");
         check(7, b"\x02", "of this version");
         check(8, &f64::NAN.to_le_bytes(), "corner");
         check(32, &0f64.to_le_bytes(), "size of a voxel");
@@ -140,13 +139,13 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_field_reads_back(size in prop::array::uniform3(0.05..1.5f64)) {
+        fn field_round_trips(size in prop::array::uniform3(0.05..1.5f64)) {
             let field = field(DVec3::from(size));
             prop_assert_eq!(DistanceField::from_bytes(&bytes(&field)).unwrap(), field);
         }
 
         #[test]
-        fn any_bytes_are_an_error_or_a_sound_field(tail in prop::collection::vec(any::<u8>(), 0..200)) {
+        fn any_bytes_give_an_error_or_a_valid_field(tail in prop::collection::vec(any::<u8>(), 0..200)) {
             let any = [&MAGIC[..], &tail].concat();
             if let Ok(field) = DistanceField::from_bytes(&any) {
                 prop_assert!(field.distance_m(DVec3::ZERO).is_finite());

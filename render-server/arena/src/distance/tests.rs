@@ -3,7 +3,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::occupancy::occupancy_of;
 
-/// Distance by looking at every voxel: the definition, slowly.
+/// Distance by a search over all voxels: the definition.
 fn brute_force_m(solid: &[bool], grid: &Grid, at: [usize; 3]) -> f64 {
     let [nx, ny, nz] = grid.size;
     let inside = solid[grid.index(at)];
@@ -37,7 +37,7 @@ fn check(size: [usize; 3], cells: &[bool]) -> Result<(), TestCaseError> {
             for z in 0..size[2] {
                 let expected = brute_force_m(cells, &grid, [x, y, z]).clamp(deepest_m, most_m);
                 let found = field.obstacle_distance_m(grid.center_m([x, y, z]));
-                // A byte holds a tenth of a voxel.
+                // A code has a resolution of a tenth of a voxel.
                 prop_assert!(
                     (found - expected).abs() <= 0.11 * voxel_m,
                     "at {:?}: {} for {}",
@@ -54,7 +54,7 @@ fn check(size: [usize; 3], cells: &[bool]) -> Result<(), TestCaseError> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
-    fn the_transform_is_exact(
+    fn transform_is_exact(
         size in prop::array::uniform3(1usize..9),
         seed in prop::collection::vec(any::<bool>(), 9 * 9 * 9),
         density in 0usize..4,
@@ -75,9 +75,9 @@ fn full_and_empty_grids_saturate() {
 }
 
 #[test]
-fn queries_between_and_outside_voxels_are_sane() {
+fn queries_between_and_outside_voxels_are_accurate() {
     let grid = Grid::covering(DVec3::ZERO, DVec3::splat(2.0), 0.05);
-    // A ball of 0.5 m.
+    // A ball with a radius of 0.5 m.
     let field = DistanceField::of(occupancy_of(grid, 0.0, |p| (p - DVec3::ONE).length() < 0.5));
     for (p, expected_m) in [
         (DVec3::new(1.9, 1.0, 1.0), 0.4),
@@ -89,14 +89,14 @@ fn queries_between_and_outside_voxels_are_sane() {
     }
     assert!(field.obstacle_distance_m(DVec3::NAN).is_nan());
     assert!(field.obstacle_distance_m(DVec3::splat(1e9)).is_finite());
-    // The floor counts only where it is asked for.
+    // Only `distance_m` includes the floor.
     let low = DVec3::new(0.1, 0.1, 0.02);
     assert!(field.obstacle_distance_m(low) > 0.5);
     assert!((field.distance_m(low) - 0.02).abs() < 1e-9);
 }
 
 #[test]
-fn a_slice_shows_what_is_solid_at_its_height() {
+fn slice_contains_the_solid_cells_at_its_height() {
     let grid = Grid::covering(DVec3::ZERO, DVec3::new(1.0, 0.5, 2.0), 0.1);
     let field = DistanceField::of(occupancy_of(grid, 0.0, |p| p.z < 1.0 && p.x < 0.5));
     let occupied = |z_m: f64| {

@@ -1,14 +1,14 @@
-//! Connected components by runs along z: a grid of 21 M voxels has under a million runs, so
-//! labels cost megabytes, not the grid over again.
+//! Connected components by runs along z: a grid of 21 M voxels has under a million runs, so labels need
+//! megabytes instead of a second grid.
 
 use crate::grid::Grid;
 
-/// Which neighbours belong together.
+/// Neighbours that count as connected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Connectivity {
-    /// The six that share a face.
+    /// The six neighbours that share a face.
     Faces,
-    /// The 26 that share at least a corner.
+    /// The 26 neighbours that share at least a corner.
     Corners,
 }
 
@@ -16,15 +16,15 @@ pub(super) enum Connectivity {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Component {
     pub(super) voxels: usize,
-    /// Splats counted in it.
+    /// Number of splats in the component.
     pub(super) splats: u32,
-    /// Its box: first voxel on each axis, and the one after the last.
+    /// Bounding box: first voxel on each axis, and the one after the last.
     pub(super) low: [u32; 3],
     pub(super) high: [u32; 3],
 }
 
 impl Component {
-    /// Returns the largest side of its box. [voxels]
+    /// Returns the largest side of the bounding box. [voxels]
     pub(super) fn extent(&self) -> usize {
         (0..3).map(|axis| (self.high[axis] - self.low[axis]) as usize).max().unwrap_or(0)
     }
@@ -37,7 +37,7 @@ struct Run {
     end: u16,
 }
 
-/// All runs of cells of one value, and which belong together.
+/// All runs of cells of one value, with their connections.
 pub(super) struct Runs {
     size: [usize; 3],
     all: Vec<Run>,
@@ -45,7 +45,7 @@ pub(super) struct Runs {
     first: Vec<u32>,
     /// Union-find forest.
     parent: Vec<u32>,
-    /// Splats counted in each run.
+    /// Number of splats in each run.
     splats: Vec<u32>,
 }
 
@@ -72,7 +72,7 @@ impl Runs {
         let mut this = Self { size: grid.size, all: runs, first, parent, splats };
         for x in 0..nx {
             for y in 0..ny {
-                // The neighbours that come before; the others meet this column from their side.
+                // Only preceding neighbours; the others join this column from their side.
                 if y > 0 {
                     this.join(x * ny + y, x * ny + y - 1, connectivity);
                 }
@@ -125,11 +125,12 @@ impl Runs {
 
     fn union(&mut self, a: u32, b: u32) {
         let (a, b) = (self.root(a), self.root(b));
-        // The older run leads: no rank needed, as columns are joined in order and paths halve.
+        // The older run becomes the root: ranks are not needed, because columns are joined in order and paths
+        // are halved.
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
-    /// Counts a splat in the component that holds a voxel, if one does.
+    /// Counts a splat in the component that contains a voxel, if there is one.
     pub(super) fn count(&mut self, [x, y, z]: [usize; 3]) {
         let column = x * self.size[1] + y;
         let (first, end) = (self.first[column] as usize, self.first[column + 1] as usize);
@@ -139,7 +140,7 @@ impl Runs {
         }
     }
 
-    /// Writes `value` into the cells of the components that `chosen` picks; returns how many.
+    /// Writes `value` into the cells of the components for which `chosen` is true; returns the number of cells.
     pub(super) fn overwrite(
         mut self,
         cells: &mut [u8],

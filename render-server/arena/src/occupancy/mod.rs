@@ -1,24 +1,22 @@
-//! Gaussians to occupied voxels.
+//! Baking: Gaussians to occupied voxels.
 //!
-//! Budget: 130 k splats into 21 M voxels in well under 3 s on two cores; one byte a voxel, and a
-//! few MB of scratch. Bound by the voxels each splat's extent touches.
+//! Budget: 130 k splats into 21 M voxels in well under 3 s on two cores; one byte per voxel, and a few MB of
+//! scratch memory. The time is limited by the number of voxels that each splat touches.
 //!
-//! 1. Each splat that is opaque enough becomes a quadratic form in voxel units, widened by
-//!    [`WIDENING`] so that a surface thinner than a voxel is still seen at voxel centres.
-//! 2. Slabs of x planes in parallel: transmittance at a voxel's centre is the product of
-//!    `1 - alpha` over the splats within [`CUTOFF`] standard deviations; opaque enough is occupied.
-//! 3. Floaters of training go: small isolated components, and those that hang in the air with few
-//!    splats for their volume (a blob of haze). Small enclosed voids (the inside of a trunk) become
-//!    solid.
-//! 4. Space that the capture has not seen becomes solid, where the arena wants it.
-//! 5. The band above the floor takes what stands above it: grass and litter vanish, trunks keep
-//!    their feet. The floor itself is a plane, no voxels.
+//! 1. Each splat above the minimum opacity becomes a quadratic form in voxel units, widened by [`WIDENING`] so
+//!    that voxel centres detect a surface thinner than a voxel.
+//! 2. Slabs of x planes in parallel: the transmittance at a voxel's centre is the product of `1 - alpha` over
+//!    the splats within [`CUTOFF`] standard deviations; below a limit, the voxel is occupied.
+//! 3. Floaters of training are removed: small isolated components, and those that hang in the air with few
+//!    splats for their volume (a blob of haze). Small enclosed voids (the inside of a trunk) become solid.
+//! 4. Space that the capture has not seen becomes solid, if the arena requires it.
+//! 5. The band above the floor copies the voxels directly above it: grass and litter vanish, trunks reach the
+//!    floor. The floor itself is a plane, without voxels.
 //!
-//! Where the surface comes to lie: for a wall of discs of standard deviation s across, the field
-//! at distance z from the plane is at least `1 - (1 - a exp(-z^2 / 2 w^2))` with
-//! `w^2 = s^2 + (0.35 voxel)^2`, and nothing beyond `2 w`. With a = 0.9 and one to eight splats
-//! overlapping, opacity 0.5 is crossed at 1.1 w to 2 w, that is 0.4 to 0.7 voxels for a thin disc:
-//! a layer without holes whose faces lie within one voxel of the plane.
+//! Position of the surface: for a wall of discs of standard deviation s across, the field at distance z from
+//! the plane is at least `1 - (1 - a exp(-z^2 / 2 w^2))` with `w^2 = s^2 + (0.35 voxel)^2`, and zero beyond
+//! `2 w`. With a = 0.9 and one to eight overlapping splats, opacity 0.5 is crossed at 1.1 w to 2 w, that is 0.4 to
+//! 0.7 voxels for a thin disc: a layer without holes whose faces are within one voxel of the plane.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -34,34 +32,35 @@ mod object;
 
 use components::{Component, Connectivity, Runs};
 
-/// A Gaussian as the baker needs it.
+/// Gaussian, as input of the baker.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ellipsoid {
     /// Centre. [m, world]
     pub center_m: Vec3,
-    /// Standard deviations along its own axes. [m]
+    /// Standard deviations along the Gaussian's own axes. [m]
     pub scales_m: Vec3,
-    /// Its axes in the world; unit.
+    /// Rotation from the Gaussian's axes to the world's; unit quaternion.
     pub rotation: Quat,
     /// Peak opacity, 0 to 1.
     pub opacity: f32,
 }
 
-/// What to bake into.
+/// Parameters of baking.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeSpec {
-    /// The voxels.
+    /// Voxels of the result.
     pub grid: Grid,
-    /// Splats fainter than this are no obstacle, 0 to 1.
+    /// Minimum opacity of a splat that counts as an obstacle, 0 to 1.
     pub min_opacity: f32,
     /// Height of the floor. [m, world]
     pub floor_z_m: f64,
-    /// What hangs in the air with fewer splats in its volume is a floater; 0 keeps all. [1/m^3]
+    /// Minimum density of splats in a component that hangs in the air; below it, the component is a floater. 0
+    /// keeps all. [1/m^3]
     pub min_splats_per_m3: f32,
 }
 
 impl BakeSpec {
-    /// Returns what an arena asks for: voxels from the floor up in the geofence and a margin.
+    /// Returns the parameters for an arena: voxels from the floor up, in the geofence plus a margin.
     pub fn of(config: &ArenaConfig) -> Self {
         let occupancy = &config.occupancy;
         let mut min_m = config.geofence.min_m - MARGIN_M;
@@ -76,43 +75,43 @@ impl BakeSpec {
     }
 }
 
-/// What the baker did, for people and tests.
+/// Statistics of baking, for people and tests.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BakeCounts {
-    /// Splats that count as obstacle and touch the grid.
+    /// Splats that count as obstacles and touch the grid.
     pub splats_used: usize,
-    /// Splats left out: too faint, not finite, or outside.
+    /// Splats skipped: too faint, not finite, or outside.
     pub splats_left_out: usize,
-    /// Occupied voxels in the end.
+    /// Occupied voxels in the result.
     pub occupied: usize,
     /// Voxels of floaters removed.
     pub floating: usize,
     /// Voxels of enclosed voids made solid.
     pub enclosed: usize,
-    /// Of the occupied, those that are as nobody has seen them free.
+    /// Occupied voxels that are solid only because the capture has not seen them.
     pub unseen: usize,
 }
 
-/// Occupied and free voxels. The floor is not among them.
+/// Occupied and free voxels, without the floor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OccupancyGrid {
     pub(crate) grid: Grid,
     /// 1 is occupied, 0 is free; in [`Grid::index`] order.
     pub(crate) cells: Vec<u8>,
     pub(crate) floor_z_m: f64,
-    /// One bit a voxel, low bit first: occupied, but by nothing that was seen. Empty if nothing is.
+    /// One bit per voxel, low bit first: 1 is unseen and free of splats. Empty if there are none.
     pub(crate) unseen: Vec<u8>,
     counts: BakeCounts,
 }
 
 impl OccupancyGrid {
-    /// Bakes splats; what was not seen is free.
+    /// Bakes splats; unseen space is free.
     pub fn bake(ellipsoids: impl IntoIterator<Item = Ellipsoid>, spec: &BakeSpec) -> Self {
         Self::bake_with(ellipsoids, spec, None, &|_| ())
     }
 
-    /// Bakes splats; what is not `seen`, if that is given, is solid. `progress` is called with the share that is
-    /// done, 0 to 1, from any thread.
+    /// Bakes splats; with `seen`, all other space is solid. `progress` receives the completed share, 0 to 1,
+    /// from any thread.
     pub fn bake_with(
         ellipsoids: impl IntoIterator<Item = Ellipsoid>,
         spec: &BakeSpec,
@@ -146,7 +145,7 @@ impl OccupancyGrid {
         counts.floating =
             runs.overwrite(&mut cells, 0, |component| floaters.contain(component, &grid));
         progress(FLOATERS_GONE);
-        // A pocket within the unseen is as unknown as what is around it.
+        // A pocket inside unseen space is as unknown as its surroundings.
         let void = if seen.is_some() { UNSEEN } else { OCCUPIED };
         if let Some(seen) = seen {
             fill_unseen(&mut cells, &grid, seen);
@@ -165,29 +164,26 @@ impl OccupancyGrid {
         Self { grid, cells, floor_z_m: spec.floor_z_m, unseen, counts }
     }
 
-    /// Returns the voxels' places.
     pub fn grid(&self) -> &Grid {
         &self.grid
     }
 
-    /// Returns what the baker did.
     pub fn counts(&self) -> BakeCounts {
         self.counts
     }
 
-    /// Whether a voxel is occupied.
     pub fn is_occupied(&self, voxel: [usize; 3]) -> bool {
         self.cells[self.grid.index(voxel)] == 1
     }
 }
 
-/// What of the occupied is a leftover of training.
+/// Criteria for leftovers of training.
 struct Floaters {
-    /// Below this extent. [voxels]
+    /// Minimum extent of a component. [voxels]
     extent: usize,
-    /// With fewer splats in a voxel, if it hangs in the air.
+    /// Minimum number of splats per voxel of a component that hangs in the air.
     splats_per_voxel: f32,
-    /// Hanging means above this layer.
+    /// Components above this layer hang in the air.
     floor_layers: usize,
 }
 
@@ -201,8 +197,8 @@ impl Floaters {
         }
     }
 
-    /// Small, or a thin haze that touches neither the floor nor the end of what is known: there it
-    /// may go on.
+    /// Whether a component is a floater: small, or a thin haze that touches neither the floor nor the boundary
+    /// of the grid, beyond which it may continue.
     fn contain(&self, component: &Component, grid: &Grid) -> bool {
         let hangs = component.low[2] as usize > self.floor_layers
             && component.low.iter().all(|&low| low > 0)
@@ -224,7 +220,7 @@ struct Prepared {
 }
 
 impl Prepared {
-    /// Returns `None` for a splat that is faint, not finite, or nowhere near the grid.
+    /// Returns `None` for a splat that is faint, not finite, or outside of the grid.
     fn new(ellipsoid: &Ellipsoid, spec: &BakeSpec) -> Option<Self> {
         let &Ellipsoid { center_m, scales_m, rotation, opacity } = ellipsoid;
         if !(opacity >= spec.min_opacity && opacity > 0.0) {
@@ -245,7 +241,7 @@ impl Prepared {
         let half = CUTOFF * covariance.diagonal().max(Vec3::ZERO).map(f32::sqrt);
         let size = Vec3::from_array(spec.grid.size.map(|n| n as f32));
         let (low, high) = (center - half, center + half);
-        // Positively stated, so that an overflow to infinity or NaN fails.
+        // Stated positively, so that an overflow to infinity or NaN fails.
         if !(high.cmpgt(Vec3::ZERO).all() && low.cmplt(size).all() && half.is_finite()) {
             return None;
         }
@@ -257,13 +253,13 @@ impl Prepared {
             inverse.z_axis.y,
             inverse.z_axis.z,
         ];
-        // Fully opaque would make transmittance 0 and no second splat matter; harmless, but the
-        // product stays positive this way.
+        // Full opacity would give a transmittance of 0, so that no second splat matters; harmless, but this
+        // keeps the product positive.
         Some(Self { center, form, opacity: opacity.min(0.999), half })
     }
 
-    /// Returns the occupied voxel that holds the centre, or one beside it: the middle of a thin disc
-    /// may lie between voxel centres.
+    /// Returns the occupied voxel that contains the centre, or one next to it: the centre of a thin disc may be
+    /// between voxel centres.
     fn voxel(&self, grid: &Grid, cells: &[u8]) -> Option<[usize; 3]> {
         let beside = [Vec3::ZERO, Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z];
         let size = Vec3::from_array(grid.size.map(|n| n as f32));
@@ -275,7 +271,7 @@ impl Prepared {
         })
     }
 
-    /// Returns the voxels whose centres lie between `low` and `high` on an axis of `size`.
+    /// Returns the voxels with centres between `center - half` and `center + half` on an axis of `size`.
     fn span(center: f32, half: f32, size: usize) -> std::ops::Range<usize> {
         let first = (center - half - 0.5).ceil().max(0.0) as usize;
         let end = ((center + half - 0.5).floor() + 1.0).max(0.0) as usize;
@@ -310,14 +306,14 @@ impl Prepared {
     }
 }
 
-/// Marks voxels whose centre is opaque.
+/// Marks voxels with an opaque centre.
 fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8], progress: &(dyn Fn(f64) + Sync)) {
     let slabs = grid.size[0].div_ceil(SLAB_PLANES);
     let slabs_of = |splat: &Prepared| {
         let xs = Prepared::span(splat.center.x, splat.half.x, grid.size[0]);
         xs.start / SLAB_PLANES..xs.end.div_ceil(SLAB_PLANES)
     };
-    // Which splats touch which slab: counted, then filled in place.
+    // Splats of each slab: counted first, then filled in place.
     let mut starts = vec![0usize; slabs + 1];
     for splat in splats {
         for slab in slabs_of(splat) {
@@ -359,7 +355,7 @@ fn splat_into(splats: &[Prepared], grid: &Grid, cells: &mut [u8], progress: &(dy
     );
 }
 
-/// Fills what is free and was not seen.
+/// Marks voxels that are free and unseen.
 fn fill_unseen(cells: &mut [u8], grid: &Grid, seen: SeenAt<'_>) {
     let [_, ny, nz] = grid.size;
     cells.par_chunks_mut(grid.plane()).enumerate().for_each(|(x, plane)| {
@@ -374,7 +370,7 @@ fn fill_unseen(cells: &mut [u8], grid: &Grid, seen: SeenAt<'_>) {
     });
 }
 
-/// Makes the unseen occupied like all else; returns which they were, one bit a voxel, low bit first.
+/// Makes unseen voxels occupied like all others; returns them, one bit per voxel, low bit first.
 fn take_unseen(cells: &mut [u8]) -> Vec<u8> {
     let mut bits = vec![0; cells.len().div_ceil(8)];
     bits.par_iter_mut().zip(cells.par_chunks_mut(8)).for_each(|(bits, cells)| {
@@ -386,7 +382,7 @@ fn take_unseen(cells: &mut [u8]) -> Vec<u8> {
     bits
 }
 
-/// Gives the band above the floor what stands right above the band.
+/// Copies the voxels directly above the band into the band above the floor.
 fn stand_on_floor(cells: &mut [u8], spec: &BakeSpec) {
     let layers = floor_layers(spec);
     for column in cells.chunks_exact_mut(spec.grid.size[2]) {
@@ -395,7 +391,7 @@ fn stand_on_floor(cells: &mut [u8], spec: &BakeSpec) {
     }
 }
 
-/// Returns how many layers lie in the band above the floor, by their centres.
+/// Returns the number of layers with centres in the band above the floor.
 fn floor_layers(spec: &BakeSpec) -> usize {
     let grid = &spec.grid;
     let band_top_m = spec.floor_z_m + FLOOR_BAND_M;
@@ -403,36 +399,34 @@ fn floor_layers(spec: &BakeSpec) -> usize {
     layers.min(grid.size[2] - 1)
 }
 
-/// A voxel with something in it.
+/// An occupied voxel.
 const OCCUPIED: u8 = 1;
-/// While baking: one that is solid as nobody has seen it.
+/// While baking: a voxel that is solid because it is unseen.
 const UNSEEN: u8 = 2;
-/// Standard deviation by which splats are widened, so that a thin surface leaves no holes between
-/// voxel centres; see the module's text. [voxels]
+/// Standard deviation by which splats are widened, so that a thin surface has no holes between voxel centres;
+/// see the module's documentation. [voxels]
 const WIDENING: f32 = 0.35;
-/// Extent of a splat: what lies further out (13 % of its peak) never adds up to an obstacle.
-/// [standard deviations]
+/// Extent of a splat: farther parts (13 % of its peak) never add up to an obstacle. [standard deviations]
 const CUTOFF: f32 = 2.0;
-/// A voxel is occupied when this part of the light would stop there: the renderer's median depth
-/// takes the same level.
+/// Share of light that must stop in an occupied voxel: the renderer's median depth uses the same level.
 const OPAQUE: f32 = 0.5;
-/// Obstacles this far outside the geofence are baked too: the body's surface may touch the fence,
-/// and a vehicle that left it still wants to know. [m]
+/// Margin outside of the geofence that is baked too: the body's surface may touch the fence, and a vehicle
+/// outside of the fence still needs distances. [m]
 const MARGIN_M: f64 = 0.5;
-/// Parts of the work that are done with the splats read, laid into voxels, and the floaters gone.
+/// Progress after reading the splats, laying them into voxels, and removing floaters.
 const SPLATS_READ: f64 = 0.1;
 const SPLATS_LAID: f64 = 0.8;
 const FLOATERS_GONE: f64 = 0.9;
-/// Occupied components whose largest side is shorter are floaters of training. [m]
+/// Minimum length of the largest side of an occupied component; smaller ones are floaters of training. [m]
 const FLOATER_EXTENT_M: f64 = 0.25;
-/// Free components smaller than this are voids inside something solid. [m^3]
+/// Minimum volume of a free component; smaller ones are voids in something solid. [m^3]
 const VOID_M3: f64 = 1.0;
-/// Grass and litter stay below this height above the floor. [m]
+/// Maximum height of grass and litter above the floor. [m]
 pub const FLOOR_BAND_M: f64 = 0.3;
-/// x planes that one task bakes: 8 of 280 x 90 voxels are 0.8 MB of transmittance, in cache.
+/// Number of x planes per task: 8 of 280 x 90 voxels are 0.8 MB of transmittance, in cache.
 const SLAB_PLANES: usize = 8;
 
-/// Returns a grid whose voxels are occupied where `solid` is true of the centre; for tests and benches.
+/// Returns a grid with occupied voxels where `solid` is true at the centre; for tests and benchmarks.
 pub fn occupancy_of(grid: Grid, floor_z_m: f64, solid: impl Fn(DVec3) -> bool) -> OccupancyGrid {
     let [nx, ny, nz] = grid.size;
     let mut cells = Vec::with_capacity(grid.voxels());

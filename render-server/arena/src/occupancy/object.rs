@@ -1,12 +1,11 @@
-//! The voxels of one object, in its own frame: all of it is solid, however small, and there is no
-//! floor.
+//! Voxels of one object, in its own frame: all components are kept, however small, and there is no floor.
 
 use super::components::{Connectivity, Runs};
 use super::{BakeCounts, BakeSpec, Ellipsoid, OccupancyGrid, Prepared, splat_into};
 use crate::grid::Grid;
 
 impl OccupancyGrid {
-    /// Bakes the splats of an object into voxels of its own frame.
+    /// Bakes the splats of an object into voxels of the object's frame.
     pub fn bake_object(
         ellipsoids: impl IntoIterator<Item = Ellipsoid>,
         grid: Grid,
@@ -25,7 +24,7 @@ impl OccupancyGrid {
         counts.splats_used = prepared.len();
         let mut cells = vec![0; grid.voxels()];
         splat_into(&prepared, &grid, &mut cells, &|_| ());
-        // What is free and does not reach the grid's sides is inside.
+        // Free components that do not reach the grid's sides are inside.
         let inside = |low: &u32, high: &u32, size: usize| *low > 0 && (*high as usize) < size;
         counts.enclosed =
             Runs::of(&cells, &grid, 0, Connectivity::Faces).overwrite(&mut cells, 1, |component| {
@@ -37,7 +36,7 @@ impl OccupancyGrid {
     }
 }
 
-/// So far below an object nothing asks for its floor. [m]
+/// Depth of the floor below an object, out of reach of every query. [m]
 const NO_FLOOR_M: f64 = 1e4;
 
 #[cfg(test)]
@@ -48,7 +47,7 @@ mod tests {
     use crate::distance::DistanceField;
 
     #[test]
-    fn the_smallest_object_is_solid() {
+    fn keeps_the_smallest_object() {
         let grid = Grid::covering(DVec3::splat(-0.5), DVec3::splat(0.5), 0.02);
         let dot = Ellipsoid {
             center_m: Vec3::ZERO,

@@ -6,7 +6,7 @@ use crate::distance::DistanceField;
 
 const VOXEL_M: f64 = 0.05;
 
-/// Flat Gaussians on a surface, as trained and generated scenes have them.
+/// A flat Gaussian on a surface, as in trained and generated scenes.
 fn disc(center: DVec3, normal: DVec3, spread_m: f32) -> Ellipsoid {
     Ellipsoid {
         center_m: center.as_vec3(),
@@ -22,7 +22,7 @@ fn field(splats: Vec<Ellipsoid>) -> DistanceField {
     DistanceField::of(OccupancyGrid::bake(splats, &spec))
 }
 
-/// A trunk: a cylinder of the radius around (0, 0), 3 m high.
+/// Returns a trunk: a cylinder around (0, 0), 3 m high.
 fn trunk(radius_m: f64) -> (DistanceField, Volume) {
     let around = (std::f64::consts::TAU * radius_m / 0.05).ceil() as usize;
     let splats = (0..60)
@@ -55,8 +55,8 @@ fn wall() -> (DistanceField, Volume) {
     (field(splats), Volume::Cuboid { center_m, half_m, rotation: glam::DQuat::IDENTITY })
 }
 
-/// Compares verdicts "a sphere of 0.12 m touches" with the truth: none missed beyond one voxel,
-/// at most 1 % false beyond a voxel and a half.
+/// Compares the result "a sphere of 0.12 m touches" with the truth: no miss beyond one voxel, at most 1 % false
+/// alarms beyond a voxel and a half.
 fn check(name: &str, (field, truth): &(DistanceField, Volume)) {
     let (mut free, mut false_alarms) = (0, 0);
     for x in -35..35 {
@@ -73,12 +73,12 @@ fn check(name: &str, (field, truth): &(DistanceField, Volume)) {
             }
         }
     }
-    assert!(free > 1000, "{name}: the test looks at free space");
+    assert!(free > 1000, "{name}: too little free space in the test");
     assert!(false_alarms * 100 <= free, "{name}: {false_alarms} false alarms in {free}");
 }
 
 #[test]
-fn trunks_and_walls_are_where_they_are() {
+fn trunks_and_walls_match_the_truth() {
     for radius_m in [0.12, 0.2, 0.3] {
         check(&format!("trunk of {radius_m} m"), &trunk(radius_m));
     }
@@ -86,7 +86,7 @@ fn trunks_and_walls_are_where_they_are() {
 }
 
 #[test]
-fn faint_splats_floaters_and_litter_are_no_obstacles() {
+fn ignores_faint_splats_and_floaters() {
     let faint: Vec<_> = (0..400)
         .map(|i| Ellipsoid {
             opacity: 0.2,
@@ -121,9 +121,9 @@ fn faint_splats_floaters_and_litter_are_no_obstacles() {
 }
 
 proptest! {
-    /// Poison costs itself only.
+    /// An invalid splat affects only itself.
     #[test]
-    fn no_splat_is_too_strange(
+    fn accepts_any_splat(
         center in prop::array::uniform3(prop_oneof![Just(f32::NAN), Just(f32::INFINITY), -5.0f32..5.0]),
         scales in prop::array::uniform3(prop_oneof![Just(f32::NAN), Just(0.0f32), Just(1e-30), Just(1e30), 0.01f32..1.0]),
         opacity in prop_oneof![Just(f32::NAN), Just(f32::INFINITY), 0.0f32..1.0],
@@ -144,12 +144,12 @@ proptest! {
 }
 
 #[test]
-fn unseen_space_is_solid_where_it_is_asked_for() {
+fn unseen_space_is_solid_if_requested() {
     use crate::config::SceneConfig;
     use crate::seen::{ScenePlace, SeenSpace};
 
     let grid = Grid::covering(DVec3::new(-2.0, -2.0, 0.0), DVec3::new(2.0, 2.0, 3.0), VOXEL_M);
-    // West of x = 1 all was seen, but a pocket; east of it nothing but a bubble.
+    // West of x = 1, everything except a pocket was seen; east of it, only a bubble.
     let is_seen = |p: DVec3| {
         let (pocket, bubble) = (DVec3::new(-1.0, 0.0, 1.5), DVec3::new(1.5, 0.0, 1.5));
         if p.x < 1.0 { p.distance(pocket) > 0.3 } else { p.distance(bubble) < 0.2 }
@@ -162,7 +162,7 @@ fn unseen_space_is_solid_where_it_is_asked_for() {
     }
     let place = ScenePlace::of(&SceneConfig::in_world("a.ply"));
     let seen = SeenSpace::new(grid, place, [0; 32], bits);
-    // A post that reaches into what was not seen, east of x = 1.
+    // A post that extends into unseen space, east of x = 1.
     let post: Vec<Ellipsoid> = (0..60)
         .flat_map(|layer| {
             let at = DVec3::new(0.9, 1.0, f64::from(layer) * 0.05 + 0.025);
@@ -174,7 +174,7 @@ fn unseen_space_is_solid_where_it_is_asked_for() {
     assert_eq!(without.unseen, 0);
     let baked = OccupancyGrid::bake_with(post, &spec, Some(seen.at(&place)), &|_| ());
     let counts = baked.counts();
-    // What splats occupy stays theirs; a seen bubble within the unseen is as good as unseen.
+    // Voxels of splats do not count as unseen; a seen bubble inside unseen space does.
     assert_eq!(counts.occupied - counts.unseen, without.occupied);
     assert!(counts.enclosed > 100, "{counts:?}");
     let field = DistanceField::of(baked);
@@ -188,9 +188,9 @@ fn unseen_space_is_solid_where_it_is_asked_for() {
     assert_eq!(at(0.9, 1.0, 1.5), (true, false), "the post");
     assert_eq!(at(0.0, -1.0, 1.5), (false, false), "seen, and far from all");
     assert_eq!(at(0.9, 0.0, 1.5), (false, true), "seen, beside the unseen");
-    // The band above the floor is as what is above it.
+    // The band above the floor equals the voxels above it.
     assert_eq!((at(0.0, -1.0, 0.1).0, at(1.5, -1.0, 0.1)), (false, (true, true)));
-    // Bytes keep it.
+    // Serialization keeps unseen space.
     let (header, codes, unseen) = field.as_bytes();
     let bytes = [&header[..], codes, unseen].concat();
     assert_eq!(DistanceField::from_bytes(&bytes), Ok(field.clone()));

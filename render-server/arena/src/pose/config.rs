@@ -1,5 +1,5 @@
-//! `[pose]` of `arena.toml`: what the filter accepts, when silence counts, and for which moment
-//! images are rendered.
+//! `[pose]` of `arena.toml`: acceptance of measurements, timeouts, and the instant for which images are
+//! rendered.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -8,43 +8,43 @@ use super::PoseSigma;
 use crate::config::ConfigError;
 use crate::config::validate::{check_number, invalid};
 
-/// `[pose]`: what is believed of poses, and for which moment images are rendered.
+/// `[pose]`: fusion of poses, timeouts, and the instant for which images are rendered.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PoseConfig {
-    /// Age of the newest accepted pose from which the vehicle holds. [s]
+    /// Age of the newest accepted pose at which the vehicle holds. [s]
     pub hold_after_s: f64,
-    /// Age from which it lands. [s]
+    /// Age of the newest accepted pose at which the vehicle lands. [s]
     pub land_after_s: f64,
-    /// For which moment images are rendered.
+    /// Instant for which images are rendered.
     pub predict: Predict,
-    /// Whether the autopilot's IMU takes part, as far as it is sent.
+    /// Whether to use the autopilot's IMU, if its readings arrive.
     pub imu: bool,
-    /// How far a measured position may be off where its source reports none, one standard deviation
-    /// an axis. [m, world]
+    /// Standard deviation per axis of a measured position, if its source reports none. [m, world]
     pub position_sigma_m: f64,
-    /// The same of the attitude. [deg, body]
+    /// Standard deviation per axis of a measured attitude, if its source reports none. [deg, body]
     pub rotation_sigma_deg: f64,
-    /// How far stamps may be off: at 5 m/s half a millisecond is 2.5 mm. [s]
+    /// Standard deviation of time stamps: at 5 m/s, 0.5 ms is 2.5 mm. [s]
     pub stamp_sigma_s: f64,
-    /// A measurement further from the expected than this many standard deviations is an outlier.
+    /// Outlier gate: reject a measurement that differs from the expected pose by more than this many standard
+    /// deviations.
     pub gate_sigmas: f64,
-    /// An attitude that flipped is accepted when it has stayed so for this long. Swapped markers do
-    /// stay, so this is longer than `land_after_s`. [s]
+    /// Delay until a flipped attitude is accepted, if it persists. Swapped markers persist, so use more than
+    /// `land_after_s`. [s]
     pub flip_believed_after_s: f64,
 }
 
-/// For which moment an image is rendered.
+/// Instant for which an image is rendered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Predict {
-    /// When the plugin is given it: the newest pose, moved on by what drawing, encoding, sending
-    /// and decoding take by measurement.
+    /// Arrival at the plugin: the newest pose, extrapolated by the measured time for rendering, encoding,
+    /// sending and decoding.
     #[default]
     Seen,
-    /// When drawing begins.
+    /// Start of rendering.
     Drawn,
-    /// When the newest pose was measured: nothing is predicted.
+    /// Measurement of the newest pose, without prediction.
     Measured,
 }
 
@@ -55,11 +55,11 @@ impl Default for PoseConfig {
             land_after_s: 0.5,
             predict: Predict::Seen,
             imu: true,
-            // Mocap of a well-calibrated room has 0.3 mm and 0.1 degrees, twice that at its edge.
+            // Mocap of a well-calibrated room has 0.3 mm and 0.1 degrees, and twice that at its edge.
             position_sigma_m: 0.000_6,
             rotation_sigma_deg: 0.15,
             stamp_sigma_s: 0.000_5,
-            // One good measurement in 3,000 is further off, in place or attitude, if noise is Gaussian.
+            // With Gaussian noise, one good measurement in 3,000 exceeds this, in position or attitude.
             gate_sigmas: 4.5,
             flip_believed_after_s: 1.0,
         }
@@ -67,7 +67,7 @@ impl Default for PoseConfig {
 }
 
 impl PoseConfig {
-    /// Returns how far a measurement may be off whose source reports none.
+    /// Returns the standard deviations of a measurement, if its source reports none.
     pub fn sigma(&self) -> PoseSigma {
         PoseSigma {
             position_m: DVec3::splat(self.position_sigma_m),
@@ -89,7 +89,7 @@ impl PoseConfig {
         check_number("pose.flip_believed_after_s", self.flip_believed_after_s, "s", 0.0..=60.0)
     }
 
-    /// Whether nothing is as it would not be anyway.
+    /// Whether every value is the default.
     pub(crate) fn is_default(&self) -> bool {
         *self == Self::default()
     }

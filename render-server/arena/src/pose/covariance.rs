@@ -1,5 +1,5 @@
-//! The covariance of the error state: symmetric, in blocks of 3 x 3, of which the upper triangle is kept.
-//! Whatever is done to it is written out for the few blocks that it touches: this is where the filter's time goes.
+//! Covariance of the error state: symmetric, in blocks of 3 x 3, of which the upper triangle is stored. Each
+//! operation is written out for the few blocks that it touches: the filter spends most of its time here.
 
 use glam::{DMat3, DVec3};
 
@@ -14,35 +14,35 @@ pub(super) const W: usize = 4;
 pub(super) const GYRO_BIAS: usize = 5;
 pub(super) const ACCEL_BIAS: usize = 6;
 pub(super) const BLOCKS: usize = 7;
-/// Of the upper triangle, diagonal included.
+/// Number of blocks in the upper triangle, diagonal included.
 const KEPT_BLOCKS: usize = BLOCKS * (BLOCKS + 1) / 2;
 
-/// How far each part of the state may be off, and together with which other.
+/// Covariance matrix of all parts of the state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Covariance([DMat3; KEPT_BLOCKS]);
 
-/// How a reading depends on one block of the error.
+/// Derivative of a reading with respect to one block of the error.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Slope {
-    /// As it is.
+    /// Identity.
     One,
-    /// By a matrix.
+    /// Matrix.
     Matrix(DMat3),
 }
 
-/// A reading as the filter sees it: linear in `N` blocks of the error.
+/// A reading in the form of the filter: linear in `N` blocks of the error.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Reading<const N: usize> {
-    /// Read less expected.
+    /// Reading minus expected value.
     pub residual: DVec3,
-    /// On which blocks it depends, and how.
+    /// Blocks on which it depends, with derivatives.
     pub slopes: [(usize, Slope); N],
-    /// Of its own noise.
+    /// Variance of the reading's own noise.
     pub variance: DMat3,
 }
 
 impl Covariance {
-    /// Makes one of a state whose parts are known by so many standard deviations, and that independently.
+    /// Returns the covariance of a state with independent parts and these standard deviations.
     pub(super) fn of(sigmas: [DVec3; BLOCKS]) -> Self {
         let mut made = Self([DMat3::ZERO; KEPT_BLOCKS]);
         for (block, sigma) in sigmas.into_iter().enumerate() {
@@ -56,12 +56,12 @@ impl Covariance {
         if i <= j { self.0[place(i, j)] } else { self.0[place(j, i)].transpose() }
     }
 
-    /// Returns the block of row `i`, column `j`, which is not below the diagonal.
+    /// Returns the block of row `i`, column `j`, on or above the diagonal.
     pub(super) fn at(&mut self, i: usize, j: usize) -> &mut DMat3 {
         &mut self.0[place(i, j)]
     }
 
-    /// Returns how far a block's parts may be off.
+    /// Returns the standard deviations of a block's parts.
     pub(super) fn sigma(&self, block: usize) -> DVec3 {
         let m = &self.0[place(block, block)];
         DVec3::new(m.x_axis.x, m.y_axis.y, m.z_axis.z).max(DVec3::ZERO).map(f64::sqrt)
@@ -71,12 +71,12 @@ impl Covariance {
         self.0.iter().all(DMat3::is_finite)
     }
 
-    /// Moves on with the state: `F C F^T` of the motion model, whose `F` is the identity but for
+    /// Predicts with the state: `F C F^T` of the motion model, where `F` is the identity except for
     /// `P += dt V + twice A`, `V += once A`, `A *= share`, `R = back R + dt W`.
     pub(super) fn advance(&mut self, dt_s: f64, decay: &Decay, back: &DMat3) {
         let Decay { share, once_s, twice_s2 } = *decay;
         let forth = back.transpose();
-        // Each line as a row first; its diagonal then takes what the column adds, by the new row.
+        // Each line first as a row; its diagonal then adds the column's part, from the new row.
         self.add_block(P, P, self.block(V, P) * dt_s + self.block(A, P) * twice_s2);
         for j in V..BLOCKS {
             self.add_block(P, j, self.block(V, j) * dt_s + self.block(A, j) * twice_s2);
@@ -112,7 +112,7 @@ impl Covariance {
         *self.at(i, j) += block;
     }
 
-    /// Adds a variance to all three axes of a block, and of the blocks opposite.
+    /// Adds a variance to all three axes of a block; the opposite block follows by symmetry.
     pub(super) fn add(&mut self, i: usize, j: usize, variance: f64) {
         *self.at(i, j) += DMat3::from_diagonal(DVec3::splat(variance));
     }
@@ -124,8 +124,8 @@ impl Covariance {
         })
     }
 
-    /// Takes in a reading whose residual has the inverse variance `inverse`; returns the error of each block that it
-    /// reveals.
+    /// Updates the covariance with a reading whose residual has the inverse variance `inverse`; returns the
+    /// error of each block.
     pub(super) fn read<const N: usize>(
         &mut self,
         reading: &Reading<N>,
@@ -156,7 +156,7 @@ impl Covariance {
         })
     }
 
-    /// Makes a block of the diagonal exactly symmetric, whatever was rounded.
+    /// Makes a diagonal block exactly symmetric after rounding.
     fn make_symmetric(&mut self, block: usize) {
         let block = self.at(block, block);
         *block = (*block + block.transpose()) * 0.5;
@@ -172,7 +172,7 @@ impl Slope {
     }
 }
 
-/// Returns where the block of row `i`, column `j` is kept, `i <= j`.
+/// Returns the index of the block of row `i`, column `j`, `i <= j`.
 const fn place(i: usize, j: usize) -> usize {
     i * (2 * BLOCKS - 1 - i) / 2 + j
 }
@@ -192,7 +192,7 @@ mod tests {
     const SIZE: usize = 3 * BLOCKS;
     type Plain = [[f64; SIZE]; SIZE];
 
-    /// The same numbers, row by row.
+    /// Returns the whole matrix, row by row.
     fn plain(c: &Covariance) -> Plain {
         std::array::from_fn(|row| {
             std::array::from_fn(|col| c.block(row / 3, col / 3).col(col % 3)[row % 3])
@@ -215,7 +215,7 @@ mod tests {
         }
     }
 
-    /// A covariance with every block in use.
+    /// A covariance with all blocks non-zero.
     fn any_covariance() -> impl Strategy<Value = Covariance> {
         prop::collection::vec(-1.0..1.0f64, SIZE * SIZE).prop_map(|numbers| {
             let half: Plain =
@@ -244,7 +244,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_step_is_the_product_of_whole_matrices(
+        fn prediction_equals_the_product_of_whole_matrices(
             c in any_covariance(), w in prop::array::uniform3(-0.3..0.3f64), dt_s in 1e-4..0.05f64
         ) {
             let decay = Decay::after(dt_s);
@@ -264,14 +264,14 @@ mod tests {
         }
 
         #[test]
-        fn a_reading_is_the_update_of_whole_matrices(
+        fn update_equals_that_of_whole_matrices(
             c in any_covariance(), w in prop::array::uniform3(-3.0..3.0f64), residual in prop::array::uniform3(-1.0..1.0f64)
         ) {
             let turn = DMat3::from_quat(DQuat::from_scaled_axis(DVec3::from(w)));
             let slopes = [(A, Slope::Matrix(turn)), (R, Slope::Matrix(turn * 2.0)), (ACCEL_BIAS, Slope::One)];
             let variance = squares(DVec3::new(1.0, 2.0, 3.0));
             let reading = Reading { residual: DVec3::from(residual), slopes, variance };
-            // H fills the first three rows; S is H C H^T + R there.
+            // H fills the first three rows; there, S is H C H^T + R.
             let mut h = [[0.0; SIZE]; SIZE];
             set(&mut h, 0, A, turn);
             set(&mut h, 0, R, turn * 2.0);

@@ -1,15 +1,15 @@
-//! The error-state Kalman filter itself: a state, its covariance, how both grow with time and
-//! shrink with each reading. No history, no judgement: those are [`super::PoseFilter`]'s.
+//! Error-state Kalman filter: state, covariance, prediction over time, and updates by readings. History and
+//! outlier rejection are in [`super::PoseFilter`].
 //!
-//! State: position, velocity and acceleration in the world, attitude, angular velocity in the body,
-//! and the biases of gyroscope and accelerometer. Errors are additive, but for the attitude, whose
-//! error is a rotation vector about the body's axes: `true = estimate * exp(error)` (Sola, 2017,
-//! "Quaternion kinematics for the error-state Kalman filter", chapter 5 with local errors).
+//! State: position, velocity and acceleration in the world, attitude, angular velocity in the body, and the
+//! biases of gyroscope and accelerometer. Errors are additive, except for the attitude, whose error is a
+//! rotation vector about the body's axes: `true = estimate * exp(error)` (Sola, 2017, "Quaternion kinematics
+//! for the error-state Kalman filter", chapter 5 with local errors).
 //!
-//! Inertial readings are measurements here, of acceleration and angular velocity, not inputs of the
-//! motion model. So one filter serves with and without an IMU, and nothing is switched when the
-//! autopilot falls silent: without readings the model alone holds, an acceleration that dies away
-//! (Singer, 1970) and a constant rate of turn, whose noise is learnt from how far poses are off.
+//! Inertial readings are measurements of acceleration and angular velocity, not inputs of the motion model. So
+//! one filter works with and without an IMU, without a switch when the autopilot falls silent. Without
+//! readings, only the model applies: a decaying acceleration (Singer, 1970) and a constant rate of turn. Its
+//! noise is learnt from the innovations of poses.
 //!
 //! Budget: 3 us for a pose, a step and two readings of three numbers. The covariance (`covariance.rs`) is 28 blocks of
 //! 3 x 3 (2 KB). `cargo bench -p vizflyt-arena --bench pose` measures it.
@@ -25,7 +25,7 @@ use super::motion::Decay;
 
 /// A drone in a room seldom accelerates harder: 30 degrees of tilt. [m/s^2]
 const ACCELERATION_SIGMA_MPS2: f64 = 5.0;
-/// How long it keeps an acceleration: the time of a gate's corner. [s]
+/// Decay time of an acceleration: the time of a gate's corner. [s]
 pub(super) const ACCELERATION_LASTS_S: f64 = 0.5;
 /// Angular acceleration as white noise: within 50 ms the rate of turn may change by 0.7 rad/s.
 /// [rad^2/s^3]
@@ -36,23 +36,23 @@ const GYRO_BIAS_DENSITY: f64 = 1e-8;
 const ACCEL_BIAS_DENSITY: f64 = 1e-5;
 /// Bias of a gyroscope that was calibrated at start-up. [rad/s]
 const GYRO_BIAS_SIGMA_RADPS: f64 = 0.02;
-/// Bias of an accelerometer, and what a body frame turned by a degree looks like. [m/s^2]
+/// Bias of an accelerometer, including the effect of a body frame turned by a degree. [m/s^2]
 const ACCEL_BIAS_SIGMA_MPS2: f64 = 0.3;
-/// How much of how hard the vehicle manoeuvres is learnt from one pose: half in three, where noise does not hide it.
+/// Learning rate of the manoeuvre level: half in three poses, unless noise hides it.
 const LEARNS: f64 = 0.2;
-/// A vehicle that hovers still sways: by a tenth of what the hardest flight does.
+/// Minimum manoeuvre level: a hovering vehicle sways by a tenth of the hardest flight.
 const LEAST_SHARE: f64 = 0.01;
-/// What is not known of the motion when the first pose comes: any flight there is.
+/// Uncertainty of the motion at the first pose: covers any flight.
 const FIRST_SPEED_MPS: f64 = 10.0;
 const FIRST_TURN_RADPS: f64 = 5.0;
-/// Beyond this nothing is known of the vehicle. [s]
+/// Maximum prediction; beyond it, the vehicle's state is unknown. [s]
 const MAX_ADVANCE_S: f64 = 5.0;
-/// Longest single step of the motion model; longer times are cut into several. [s]
+/// Maximum step of the motion model; longer times are split. [s]
 const STEP_S: f64 = 0.05;
 /// [m/s^2, world]
 const GRAVITY_MPS2: DVec3 = DVec3::new(0.0, 0.0, 9.80665);
 
-/// What is known of the vehicle's motion at one instant.
+/// Estimate of the vehicle's motion at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Estimate {
     pub p_world_m: DVec3,
@@ -63,23 +63,22 @@ pub(super) struct Estimate {
     gyro_bias_radps: DVec3,
     accel_bias_mps2: DVec3,
     covariance: Covariance,
-    /// How hard the vehicle manoeuvres at present: what share of the motion model's noise, which is that of the hardest flight,
-    /// it takes to explain the latest poses; of places and of attitudes. 1 with an IMU, which says itself what happens.
-    /// [share of a variance]
+    /// Manoeuvre level, for positions and attitudes: the share of the motion model's noise (that of the hardest
+    /// flight) that explains the latest poses. 1 with an IMU, which measures the motion. [share of a variance]
     pushes: f64,
     turns: f64,
 }
 
-/// The innovation of a reading: its difference from the expected one.
+/// Innovation of a reading: its difference from the expected value.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Innovation {
-    /// Read less expected.
+    /// Reading minus expected value.
     pub residual: DVec3,
-    /// Mahalanobis distance: how many standard deviations that is.
+    /// Mahalanobis distance in standard deviations.
     pub sigmas: f64,
 }
 
-/// A manoeuvre that the model does not foresee: so far off, within so long.
+/// A manoeuvre that the model does not predict: deviation and duration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Manoeuvre {
     pub distance_m: f64,
@@ -88,7 +87,7 @@ pub(super) struct Manoeuvre {
 }
 
 impl Estimate {
-    /// Begins with a pose and no knowledge of the motion.
+    /// Returns an estimate from a pose, without knowledge of the motion.
     pub(super) fn new(pose: &Pose<World, Body>, sigma: &PoseSigma) -> Self {
         let covariance = Covariance::of([
             sigma.position_m,
@@ -113,7 +112,7 @@ impl Estimate {
         }
     }
 
-    /// Keeps of `former` what does not depend on the place: the sensors' biases.
+    /// Takes over the sensors' biases of `former`, which do not depend on the position.
     pub(super) fn with_biases_of(mut self, former: &Self) -> Self {
         self.gyro_bias_radps = former.gyro_bias_radps;
         self.accel_bias_mps2 = former.accel_bias_mps2;
@@ -123,12 +122,12 @@ impl Estimate {
         self
     }
 
-    /// Returns a gyroscope's reading less what its bias is taken for. [rad/s, body]
+    /// Returns a gyroscope's reading without the estimated bias. [rad/s, body]
     pub(super) fn without_bias(&self, gyro_radps: DVec3) -> DVec3 {
         gyro_radps - self.gyro_bias_radps
     }
 
-    /// Whether the biases are such as no sensor has: its axes are taken for others.
+    /// Whether the biases are larger than any sensor's: its axes are probably configured wrongly.
     pub(super) fn is_biased_beyond_belief(&self) -> bool {
         !(self.gyro_bias_radps.length() < 10.0 * GYRO_BIAS_SIGMA_RADPS
             && self.accel_bias_mps2.length() < 10.0 * ACCEL_BIAS_SIGMA_MPS2)
@@ -138,13 +137,13 @@ impl Estimate {
         Pose::new(self.p_world_m, self.rotation)
     }
 
-    /// Returns how far the pose may be off.
+    /// Returns the standard deviations of the pose.
     pub(super) fn sigma(&self) -> PoseSigma {
         PoseSigma { position_m: self.covariance.sigma(P), rotation_rad: self.covariance.sigma(R) }
     }
 
-    /// Moves on by `dt_s` without any reading, at most [`MAX_ADVANCE_S`]: stamps are others' numbers, and a
-    /// year of steps would hold up whoever waits for the pose.
+    /// Predicts over `dt_s`, at most [`MAX_ADVANCE_S`]: stamps come from outside, and the steps of a year would
+    /// block every reader of the pose.
     pub(super) fn advance(&mut self, dt_s: f64) {
         let dt_s = dt_s.min(MAX_ADVANCE_S);
         let steps = (dt_s / STEP_S).ceil();
@@ -196,20 +195,20 @@ impl Estimate {
         self.innovation(&self.attitude_reading(rotation, variance_rad2))
     }
 
-    /// Takes in a position. [m, world]
+    /// Updates the estimate with a position. [m, world]
     pub(super) fn read_position(&mut self, p_world_m: DVec3, variance_m2: DMat3) {
         let reading = self.position_reading(p_world_m, variance_m2);
         self.pushes = self.read(&reading, self.pushes);
     }
 
-    /// Takes in an attitude. [rad, body]
+    /// Updates the estimate with an attitude. [rad, body]
     pub(super) fn read_attitude(&mut self, rotation: DQuat, variance_rad2: DMat3) {
         let reading = self.attitude_reading(rotation, variance_rad2);
         self.turns = self.read(&reading, self.turns);
     }
 
-    /// Takes in a gyroscope's reading unless it is further off than `most_sigmas`; returns whether
-    /// it was. [rad/s, body]
+    /// Updates the estimate with a gyroscope's reading if it is within `most_sigmas`; returns whether it was.
+    /// [rad/s, body]
     pub(super) fn read_gyro(
         &mut self,
         gyro_radps: DVec3,
@@ -227,7 +226,8 @@ impl Estimate {
         )
     }
 
-    /// Takes in an accelerometer's reading likewise. [m/s^2, body]
+    /// Updates the estimate with an accelerometer's reading if it is within `most_sigmas`; returns whether it
+    /// was. [m/s^2, body]
     pub(super) fn read_accel(
         &mut self,
         accel_mps2: DVec3,
@@ -251,7 +251,7 @@ impl Estimate {
         )
     }
 
-    /// Expects from now on what the hardest flight does, however calm this one was.
+    /// Expects the hardest flight from this time on, even if the flight was calm.
     pub(super) fn expect_manoeuvre(&mut self) {
         (self.pushes, self.turns) = (1.0, 1.0);
         self.covariance.add(A, A, ACCELERATION_SIGMA_MPS2.powi(2));
@@ -269,7 +269,7 @@ impl Estimate {
         }
     }
 
-    /// Whether every number in it is one to work with.
+    /// Whether every number is finite.
     pub(super) fn is_finite(&self) -> bool {
         self.p_world_m.is_finite()
             && self.v_world_mps.is_finite()
@@ -305,13 +305,14 @@ impl Estimate {
         within
     }
 
-    /// Takes in a reading of a pose; returns how hard the vehicle manoeuvres by that, which was `share` before: a step up
-    /// the gradient of the reading's likelihood, so that readings are as far off as is expected of them (Mehra, 1972,
-    /// "Approaches to adaptive filtering").
+    /// Updates the estimate with a reading of a pose. Returns the new manoeuvre level; `share` is the old one.
+    /// It is a step along the gradient of the reading's likelihood, so that innovations become as large as
+    /// expected (Mehra, 1972, "Approaches to adaptive filtering").
     fn read<const N: usize>(&mut self, reading: &Reading<N>, share: f64) -> f64 {
         let spread = self.covariance.spread(reading);
         let inverse = spread.inverse();
-        // Less what a stamp that is off makes of speed, which is not along every axis: that it may be is no sign of calm.
+        // Excludes the stamp's error times speed, which does not act along every axis: its absence is not a
+        // sign of calm.
         let own = 3.0 * diagonal(&reading.variance).min_element();
         let by_motion = diagonal(&(spread - reading.variance)).element_sum();
         let surprise = reading.residual.length_squared() / (by_motion + own);
@@ -336,14 +337,14 @@ fn diagonal(m: &DMat3) -> DVec3 {
     DVec3::new(m.x_axis.x, m.y_axis.y, m.z_axis.z)
 }
 
-/// Returns the same rotation the short way round.
+/// Returns the same rotation by the shorter way.
 pub(super) fn shortest(rotation: DQuat) -> DQuat {
     if rotation.w < 0.0 { -rotation } else { rotation }
 }
 
 fn sigmas(residual: DVec3, inverse: &DMat3) -> f64 {
     let squared = residual.dot(*inverse * residual);
-    // A spread that cannot be inverted knows nothing: nothing is near.
+    // A matrix that cannot be inverted carries no information: no reading is near.
     if squared >= 0.0 { squared.sqrt() } else { f64::INFINITY }
 }
 

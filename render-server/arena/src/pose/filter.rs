@@ -1,4 +1,4 @@
-//! Judges measurements by what the filter expects, and keeps the history that late ones need.
+//! Pose filter of one vehicle: accepts or rejects measurements, and keeps the history for late ones.
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, Twist, World};
@@ -13,16 +13,16 @@ use super::quality::{Fading, PoseQuality, Rejects};
 use super::source::{ClaimKind, Source, Surprise};
 use super::{ImuReading, MAX_SOURCES, Measured, PoseConfig, PoseSigma, Rejected};
 
-/// What changed about the sources of poses.
+/// Change in the availability of poses.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PoseChange {
-    /// No accepted pose for so long [s], and why the last one was rejected, if one came.
+    /// No accepted pose for this time [s], and the reason for the last rejection, if a measurement arrived.
     Lost(f64, Option<Rejected>),
-    /// Poses are back.
+    /// A pose was accepted again.
     Regained,
-    /// The pose jumped so far [m], turned at once so far [rad], and stayed there: a reset.
+    /// Reset: the pose jumped by this distance [m] and angle [rad], and stayed there.
     Jumped(f64, f64),
-    /// The IMU contradicts the poses and is left out from now on.
+    /// The IMU contradicts the poses and is excluded.
     ImuLeftOut,
 }
 
@@ -33,12 +33,12 @@ pub struct PoseFilter {
     history: History,
     sources: [Source; MAX_SOURCES],
     newest: Option<PoseSample>,
-    /// Why the last measurement was rejected, if it was.
+    /// Reason for rejecting the last measurement, if it was rejected.
     rejected: Option<Rejected>,
     resets: u8,
     lost: bool,
     change: Option<PoseChange>,
-    /// A reset that nobody has been told of.
+    /// Reset that has not been polled yet.
     jumped: Option<PoseChange>,
     imu: Imu,
     /// Intervals of accepted poses, and their innovations. [standard deviations]
@@ -48,23 +48,23 @@ pub struct PoseFilter {
 #[derive(Clone, Copy, Debug, Default)]
 struct Imu {
     last: Option<ServerTime>,
-    /// How far the gyroscope has turned since the start, less its bias.
+    /// Rotation measured by the gyroscope since the start, without bias.
     turned: DQuat,
     read: u32,
     refused: u32,
     left_out: bool,
 }
 
-/// What to make of a measurement.
+/// Decision about a measurement.
 enum GateResult {
     Fits {
         sigmas: f64,
     },
-    /// The vehicle, calm before, began to manoeuvre at this time, as hard as vehicles do.
+    /// A calm vehicle began to manoeuvre at this time, within the limits of vehicles.
     Begins(ServerTime),
-    /// A motion that the model did not foresee.
+    /// A motion that the model did not predict.
     Manoeuvre(Manoeuvre),
-    /// The pose changed for another reason than motion.
+    /// The pose changed for a reason other than motion.
     Reset {
         distance_m: f64,
         angle_rad: f64,
@@ -80,7 +80,7 @@ impl Default for PoseFilter {
 }
 
 impl PoseFilter {
-    /// Makes a filter that knows nothing yet.
+    /// Returns a filter without any measurement.
     pub fn new(config: &PoseConfig) -> Self {
         Self {
             config: *config,
@@ -97,8 +97,8 @@ impl PoseFilter {
         }
     }
 
-    /// Takes a measurement; returns the newest sample if it is accepted. Of a measurement of the
-    /// past, that is the former sample by what is now known.
+    /// Processes a measurement; returns the newest sample if it is accepted. For a measurement older than that,
+    /// the sample keeps its stamp and is recomputed.
     pub fn handle_pose(&mut self, measured: &Measured) -> Result<PoseSample, Rejected> {
         let index = usize::from(measured.source).min(MAX_SOURCES - 1);
         match self.take(index, measured) {
@@ -126,7 +126,7 @@ impl PoseFilter {
         }
     }
 
-    /// Returns by how many standard deviations an accepted measurement was off.
+    /// Returns the innovation of an accepted measurement in standard deviations.
     fn take(&mut self, index: usize, measured: &Measured) -> Result<f64, Rejected> {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         if !pose.is_valid() || pose.translation_m.abs().max_element() > FURTHEST_M {
@@ -140,7 +140,7 @@ impl PoseFilter {
             stamp,
             pose,
             is_turned: false,
-            // Nothing is expected.
+            // No expectation yet.
             off_m: DVec3::INFINITY,
             off_rad: DVec3::INFINITY,
             v_world_mps: DVec3::ZERO,
@@ -190,13 +190,13 @@ impl PoseFilter {
         };
         self.settle();
         if self.history.newest().is_some_and(|(_, estimate)| !estimate.is_finite()) {
-            // Not seen yet; what was measured is better than no pose at all.
+            // Should not happen. The measurement is better than no pose at all.
             self.begin(stamp, &pose, &sigma);
         }
         taken
     }
 
-    /// Takes in what came since a pose was last asked for.
+    /// Fuses the readings that arrived since the last request for a pose.
     fn settle(&mut self) {
         let imu = &mut self.imu;
         self.history.settle(|estimate, record| imu.fuse(estimate, record));
@@ -246,8 +246,8 @@ impl PoseFilter {
             *other != index && age_s.is_some_and(|age_s| age_s < TRUSTED_FOR_S)
         });
         let (distance_m, angle_rad) = (place.residual.length(), attitude.residual.length());
-        // The longer nothing is accepted, the more would fit: what several poses have claimed is a jump as long as it is
-        // nearer than what was expected.
+        // The gate widens while no pose is accepted. Therefore a pose also counts as a jump if it is closer to
+        // what several rejected poses claimed than to the expectation.
         let jumped = trusted.is_none()
             && self.sources[index]
                 .pending(&surprise)
@@ -267,7 +267,7 @@ impl PoseFilter {
             return GateResult::Begins(since);
         }
         let speed_mps = distance_m / dt_s;
-        // A gyroscope would have measured a turn.
+        // A gyroscope would have measured the turn.
         let measured_turn = self.imu_is_fresh(stamp) && angle_rad > MEASURABLE_RAD;
         let flips = attitude.sigmas > gate && (measured_turn || angle_rad / dt_s > MAX_TURN_RADPS);
         let leaps = place.sigmas > gate && speed_mps > MAX_MANOEUVRE_MPS;
@@ -278,13 +278,13 @@ impl PoseFilter {
         } else {
             ClaimKind::Shift
         };
-        // Before it is known how the source scatters, nothing is expected of it.
+        // Until the noise of the source is known, accept everything within the reach of a manoeuvre.
         if kind <= ClaimKind::Shift && (begins || !self.sources[index].is_known()) {
             return GateResult::Fits { sigmas: sigmas.min(gate) };
         }
         let (claim, moves) = self.sources[index].claim(&surprise, kind);
-        // Two poses are enough where they follow each other so closely, or lead as little away as flight does, that outliers
-        // could hardly look like a motion.
+        // Two poses are enough if they follow each other closely, or if they are within the gate of the hardest
+        // flight and move on. Outliers seldom look like such a motion.
         let close =
             claim.lasted_s() <= CLOSE_S / 2.0 || began.is_some() && claim.grows_to(&surprise);
         let enough = if close { 2 } else { CONFIRMED };
@@ -313,8 +313,8 @@ impl PoseFilter {
         }
     }
 
-    /// Returns since when the vehicle would have to manoeuvre for this pose to be within the gate of the hardest flight;
-    /// `None` if it is beyond that too.
+    /// Returns the time since which the vehicle must have manoeuvred for this pose to be within the gate of the
+    /// hardest flight; `None` if the pose is outside of that gate too.
     fn manoeuvre_began(
         &mut self,
         index: usize,
@@ -334,7 +334,7 @@ impl PoseFilter {
         (place.sigmas.max(attitude.sigmas) <= self.config.gate_sigmas).then_some(since)
     }
 
-    /// Forgets what led here and begins with this pose.
+    /// Clears the history and restarts with this pose.
     fn begin(&mut self, stamp: ServerTime, pose: &Pose<World, Body>, sigma: &PoseSigma) {
         let former = self.history.newest().map(|(_, estimate)| *estimate);
         let fresh = Estimate::new(pose, sigma);
@@ -364,7 +364,7 @@ impl PoseFilter {
         self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
-    /// Returns the sigma to use: the source's own, within limits.
+    /// Returns the standard deviations to use: the source's own, within limits, or the configured ones.
     fn sigma(&self, measured: &Measured) -> PoseSigma {
         let settings = self.config.sigma();
         let stated = measured.sigma.filter(|sigma| {
@@ -378,8 +378,8 @@ impl PoseFilter {
         }
     }
 
-    /// Returns the variances of a measurement: its own, times what its source has taught, and what a stamp that is off makes of a
-    /// vehicle that moves. [m^2, world], [rad^2, body]
+    /// Returns the variances of a measurement: its own, multiplied by the source's noise factor, plus the
+    /// effect of the stamp's error on a moving vehicle. [m^2, world], [rad^2, body]
     fn variances(&self, sigma: &PoseSigma, prior: &Estimate, noise: f64) -> (DMat3, DMat3) {
         let moved_m = prior.v_world_mps * self.config.stamp_sigma_s;
         let turned_rad = prior.omega_body_radps * self.config.stamp_sigma_s;
@@ -390,9 +390,9 @@ impl PoseFilter {
         )
     }
 
-    /// Takes a reading of the autopilot's IMU. One that is too old, or comes before any pose, is
-    /// let go. What follows from it waits until a pose is asked for: readings come late, and several at once, and each
-    /// would take in again all that is newer.
+    /// Records a reading of the autopilot's IMU. Readings that are too old, or arrive before the first pose,
+    /// are dropped. The fusion waits until a pose is requested: readings arrive late and in groups, and each
+    /// would repeat the fusion of all newer ones.
     pub fn handle_imu(&mut self, reading: &ImuReading) {
         let ImuReading { stamp, accel_mps2, gyro_radps } = *reading;
         let plausible = accel_mps2.is_finite()
@@ -417,7 +417,7 @@ impl PoseFilter {
         self.history.put(stamp, input, |estimate, record| imu.fuse(estimate, record));
     }
 
-    /// Notices silence. Call at [`Self::poll_timeout`].
+    /// Detects silence. Call at [`Self::poll_timeout`].
     pub fn handle_timeout(&mut self, now: ServerTime) {
         if let (Some(newest), Some(due)) = (self.newest, self.poll_timeout())
             && now >= due
@@ -428,8 +428,8 @@ impl PoseFilter {
         }
     }
 
-    /// Returns when [`Self::handle_timeout`] has something to do; `None` while poses are lost or
-    /// none has come.
+    /// Returns the time of the next call of [`Self::handle_timeout`]; `None` while poses are lost, and before
+    /// the first one.
     pub fn poll_timeout(&self) -> Option<ServerTime> {
         let newest = self.newest.filter(|_| !self.lost)?;
         // A nanosecond later: the sum is rounded.
@@ -437,7 +437,8 @@ impl PoseFilter {
         Some(newest.stamp.plus_seconds(lost_s).plus_ns(1))
     }
 
-    /// Returns how much older than configured a pose may grow before it is lost, by the source that is missed first. [s]
+    /// Returns the time by which a pose may exceed the configured age before it is lost, for the source with
+    /// the smallest allowance. [s]
     fn allowance_s(&self, now: ServerTime) -> f64 {
         let PoseConfig { hold_after_s, land_after_s, .. } = self.config;
         let ages = PoseAges { hold_after_s, land_after_s };
@@ -446,7 +447,7 @@ impl PoseFilter {
         of_each.reduce(f64::min).unwrap_or(0.0)
     }
 
-    /// Returns a change of the source once. Call until there is none.
+    /// Returns each change once. Call until it returns `None`.
     pub fn poll_change(&mut self) -> Option<PoseChange> {
         self.change.take().or_else(|| self.jumped.take())
     }
@@ -456,7 +457,7 @@ impl PoseFilter {
         self.newest.as_ref()
     }
 
-    /// Returns how the vehicle moves by all that was read.
+    /// Returns the motion by all readings.
     pub fn motion(&mut self) -> Option<Motion> {
         self.settle();
         self.history.newest().map(|(stamp, estimate)| Motion::of(stamp, estimate))
@@ -485,7 +486,7 @@ impl PoseFilter {
         }
     }
 
-    /// Returns what was turned away so far, of all sources.
+    /// Returns the number of rejected measurements of all sources, by reason.
     pub fn rejected(&self) -> Rejects {
         self.sources.iter().fold(Rejects::default(), |sum, source| sum.and(source.rejected()))
     }
@@ -513,7 +514,7 @@ impl PoseFilter {
 }
 
 impl Imu {
-    /// Takes a reading in, and counts those of the IMU that come for the first time.
+    /// Fuses a reading, and counts IMU readings that are fused for the first time.
     fn fuse(&mut self, estimate: &mut Estimate, record: &Record) {
         match record.input {
             Input::Pose { p_world_m, rotation, variance_m2, variance_rad2, manoeuvre } => {
@@ -535,48 +536,47 @@ impl Imu {
     }
 }
 
-/// Positions beyond this are no room's. [m]
+/// Maximum distance from the origin: no room is larger. [m]
 const FURTHEST_M: f64 = 1e4;
-/// After such a pause nothing of the former motion holds. [s]
+/// After a longer pause, the filter restarts without the former motion. [s]
 const BEGIN_ANEW_AFTER_S: f64 = 1.0;
-/// A source that was accepted so lately is accepted against another. [s]
+/// A source accepted within this time has priority over others that disagree. [s]
 const TRUSTED_FOR_S: f64 = 0.15;
-/// Measurements closer together carry no information on speed. [s]
+/// Measurements closer together contain no information about speed. [s]
 const MIN_DT_S: f64 = 1e-4;
-/// A bump or a hard stop changes the speed by so much at once; faster drones do not fly in rooms.
-/// [m/s]
+/// Maximum change of speed by a bump or a hard stop; faster drones do not fly in rooms. [m/s]
 pub(super) const MAX_MANOEUVRE_MPS: f64 = 15.0;
-/// Racing drones turn by 2000 degrees a second. [rad/s]
+/// Racing drones turn at 2000 degrees per second. [rad/s]
 pub(super) const MAX_TURN_RADPS: f64 = 35.0;
-/// Beyond this a gyroscope's word counts against an attitude's: its own drift is far less. [rad]
+/// Above this angle, the gyroscope overrules the measured attitude: its drift is far less. [rad]
 const MEASURABLE_RAD: f64 = 0.2;
-/// A jump that stays for so many measurements, over so long, is the truth (a moved origin, a regained object); fewer are
-/// enough over longer. [s]
+/// A jump that lasts for this number of measurements and this time is accepted (a moved origin, a regained
+/// object); over a longer time, fewer measurements are enough. [s]
 const JUMP_CONFIRMED: u32 = 5;
 const JUMP_LASTS_S: f64 = 0.015;
 const JUMP_LASTS_LONG_S: f64 = 0.095;
-/// One or two measurements off are outliers, a third one that goes on is a motion.
+/// One or two deviating measurements are outliers; a third one that continues them is a motion.
 const CONFIRMED: u32 = 3;
-/// After so long a filter that expects a calm flight has noticed any other: a hard start is 3 cm off by then. [s]
+/// Time in which a filter that expects a calm flight detects any other: by then, a hard start is 3 cm off. [s]
 const MANOEUVRE_SEEN_S: f64 = 0.1;
-/// What is closer to the expected is taken for the beginning of a manoeuvre at once, and never for a jump: an outlier of
-/// that size does little harm. [m], [rad]
+/// A smaller deviation counts as the start of a manoeuvre at once, and never as a jump: an outlier of that size
+/// does little harm. [m], [rad]
 const HARMLESS_M: f64 = 0.03;
 const HARMLESS_RAD: f64 = 0.1;
-/// Over two intervals; in so short a time a motion is so short that two outliers seldom look like one. [s]
+/// Duration of two intervals in which a motion is so short that two outliers seldom look like one. [s]
 const CLOSE_S: f64 = 0.03;
 /// Noise of a flight controller's gyroscope with the motors running. [rad/s]
 const GYRO_SIGMA_RADPS: f64 = 0.03;
-/// Noise of its accelerometer with the motors running: mostly vibration. [m/s^2]
+/// Noise of a flight controller's accelerometer with the motors running: mostly vibration. [m/s^2]
 const ACCEL_SIGMA_MPS2: f64 = 0.6;
-/// Inertial readings further from the expected are left out one by one.
+/// Gate for single inertial readings; readings outside are dropped.
 const IMU_GATE_SIGMAS: f64 = 6.0;
-/// Beyond 16 g and 2300 degrees a second sensors saturate. [m/s^2], [rad/s]
+/// Sensors saturate beyond 16 g and 2300 degrees per second. [m/s^2], [rad/s]
 const MAX_ACCEL_MPS2: f64 = 160.0;
 const MAX_GYRO_RADPS: f64 = 40.0;
 /// Readings further apart are not integrated. [s]
 const MAX_IMU_GAP_S: f64 = 0.1;
-/// Readings after which the IMU as a whole is judged: two seconds' worth.
+/// Number of readings after which the IMU as a whole is checked: two seconds.
 const IMU_TRIAL: u32 = 200;
-/// An IMU that has been silent for so long takes no part. [s]
+/// An IMU that is silent for longer is not used. [s]
 const IMU_SILENT_S: f64 = 0.3;

@@ -1,8 +1,8 @@
-//! What the filter has taken in lately, in the order of stamps, so that a reading of the past can still be put where it
-//! belongs.
+//! Recent readings of the filter in the order of their stamps, so that a late reading can be inserted at its
+//! place.
 //!
-//! Putting a reading in costs next to nothing: what was known after it is forgotten. [`History::settle`] takes in again
-//! what has no estimate, once for all the readings that came late since, and only when a pose is asked for.
+//! Inserting a reading is cheap: it discards the estimates after it. [`History::settle`] recomputes missing
+//! estimates, once for all late readings, and only when a pose is requested.
 
 use std::collections::VecDeque;
 
@@ -11,10 +11,10 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::estimate::{Estimate, Manoeuvre};
 
-/// One reading, with its covariance of that time.
+/// A reading, with its covariance at that time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Input {
-    /// An accepted pose, and how far what was known before it is to be inflated.
+    /// An accepted pose, and the inflation of the covariance before it.
     Pose {
         p_world_m: DVec3,
         rotation: DQuat,
@@ -26,20 +26,20 @@ pub(super) enum Input {
     Imu { accel_mps2: DVec3, gyro_radps: DVec3 },
 }
 
-/// A reading and when it was made.
+/// A reading and its stamp.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Record {
     pub stamp: ServerTime,
     pub input: Input,
-    /// Whether it has been taken in before.
+    /// Whether it has been fused before.
     pub is_known: bool,
 }
 
-/// The newest readings, oldest first, and what was known after each.
+/// The newest readings, oldest first, and the estimate after each.
 #[derive(Clone, Debug)]
 pub(super) struct History {
     records: VecDeque<Record>,
-    /// After each of the first of them. Where there is a record, there is the first's.
+    /// Estimates after the first records. If there is a record, there is an estimate after the first.
     estimates: VecDeque<Estimate>,
 }
 
@@ -53,7 +53,7 @@ impl Default for History {
 }
 
 impl History {
-    /// Forgets all, and begins with a reading after which this is known.
+    /// Clears the history, and starts with a reading and the estimate after it.
     pub(super) fn begin(&mut self, stamp: ServerTime, input: Input, estimate: &Estimate) {
         self.records.clear();
         self.estimates.clear();
@@ -61,13 +61,13 @@ impl History {
         self.estimates.push_back(*estimate);
     }
 
-    /// Returns the newest reading's time and what is known after it; of the last that was settled.
+    /// Returns the time of the newest settled reading, and the estimate after it.
     pub(super) fn newest(&self) -> Option<(ServerTime, &Estimate)> {
         let estimate = self.estimates.back()?;
         Some((self.records.get(self.estimates.len() - 1)?.stamp, estimate))
     }
 
-    /// Returns the same of the newest pose that was settled.
+    /// Returns the time of the newest settled pose, and the estimate after it.
     pub(super) fn newest_pose(&self) -> Option<(ServerTime, &Estimate)> {
         let mut settled = self.records.iter().zip(&self.estimates).rev();
         let (record, estimate) =
@@ -75,12 +75,12 @@ impl History {
         Some((record.stamp, estimate))
     }
 
-    /// Whether a reading of this time can still be put in.
+    /// Whether a reading of this time can still be inserted.
     pub(super) fn reaches(&self, stamp: ServerTime) -> bool {
         self.records.front().is_some_and(|oldest| oldest.stamp <= stamp)
     }
 
-    /// Returns what was known just before `stamp`, which the history must reach, by what came before it.
+    /// Returns the estimate just before `stamp`, from all earlier readings. The history must reach that far.
     pub(super) fn at(
         &mut self,
         stamp: ServerTime,
@@ -94,8 +94,8 @@ impl History {
         Some(estimate)
     }
 
-    /// Returns what would have been known just before `stamp`, up to which all is settled, had `change` come about at
-    /// `since`.
+    /// Returns the estimate just before `stamp` if `change` had been applied at `since`. All readings up to
+    /// `stamp` must be settled.
     pub(super) fn at_after(
         &self,
         stamp: ServerTime,
@@ -116,7 +116,7 @@ impl History {
         Some(estimate)
     }
 
-    /// Changes what was known at `since`, and so all that is known after it.
+    /// Applies `change` to the estimate at `since`, and discards all later estimates.
     pub(super) fn change(&mut self, since: ServerTime, change: impl FnOnce(&mut Estimate)) {
         let first = self.place(since).max(1) - 1;
         self.estimates.truncate(first + 1);
@@ -125,8 +125,8 @@ impl History {
         }
     }
 
-    /// Puts a reading where it belongs, behind those of the same time; the history must reach there. What is known
-    /// after it waits for [`Self::settle`].
+    /// Inserts a reading at its place, after those of the same time; the history must reach that far.
+    /// [`Self::settle`] computes the estimates after it.
     pub(super) fn put(
         &mut self,
         stamp: ServerTime,
@@ -139,7 +139,8 @@ impl History {
             self.estimates.pop_front();
         }
         let place = self.place(stamp);
-        // Between the one that was forgotten just now and the next: nothing is known that it could follow.
+        // The stamp is between the record that was dropped just above and the next: there is no estimate before
+        // it.
         if place == 0 {
             return;
         }
@@ -147,7 +148,7 @@ impl History {
         self.estimates.truncate(place);
     }
 
-    /// Takes in again what is not settled.
+    /// Computes all missing estimates.
     pub(super) fn settle(&mut self, fuse: impl FnMut(&mut Estimate, &Record)) {
         self.settle_to(self.records.len(), fuse);
     }
@@ -166,12 +167,12 @@ impl History {
         }
     }
 
-    /// Returns where a reading of this time belongs. Most are among the newest.
+    /// Returns the index for a reading of this time. Most are among the newest.
     fn place(&self, stamp: ServerTime) -> usize {
         let later = self.records.iter().rev().take_while(|record| record.stamp > stamp).count();
         self.records.len() - later
     }
 }
 
-/// 0.4 s of mocap at 200 Hz and an IMU at 100 Hz; 0.3 MB for each vehicle.
+/// 0.4 s of mocap at 200 Hz and an IMU at 100 Hz; 0.3 MB per vehicle.
 const READINGS: usize = 128;

@@ -1,6 +1,6 @@
-//! From localization measurements to the pose that everything else uses: measurements are weighted
-//! by how far they may be off, what cannot be is turned away and named, the twist is estimated, and
-//! silence is noticed. The pose can be had for any moment close by.
+//! Pose filter: localization measurements in, the pose for all other parts out. It weights measurements by
+//! their uncertainty, rejects impossible ones with a reason, estimates the twist, and detects silence. The pose
+//! is available for any instant close by.
 //!
 //! ```text
 //! poses, 30 to 500 Hz, of one or several sources --> stamps, frozen? -> gate -\
@@ -8,9 +8,9 @@
 //!       each put at its stamp, also in the past (history)                     |
 //!                                          PoseSample for each accepted pose <--+--> Motion
 //! ```
-//! Read in this order: [`estimate`](self) is the Kalman filter, over its [`covariance`](self), [`history`](self) lets it take
-//! readings late, [`filter`](self) judges measurements by what the filter expects, with what it
-//! remembers of each [`source`](self). The guide is `docs/guides/localization.md`.
+//! Read in this order: [`estimate`](self) is the Kalman filter, over its [`covariance`](self);
+//! [`history`](self) lets it fuse late readings; [`filter`](self) compares measurements with the expected pose
+//! and with the state of each [`source`](self). The guide is `docs/guides/localization.md`.
 
 mod config;
 mod covariance;
@@ -31,90 +31,88 @@ pub use motion::{MAX_PREDICT_S, Motion};
 pub use quality::{PoseQuality, Rejects, SourceQuality};
 pub use vizflyt_protocol::messages::ImuReading;
 
-/// Most sources of one vehicle's poses; the measurements of others are taken for the last's.
+/// Maximum number of sources per vehicle; measurements of further sources count as the last one's.
 pub const MAX_SOURCES: usize = 8;
 
-/// Standard deviations of a measured pose, one an axis, as its source states them.
+/// Standard deviations of a measured pose per axis, as stated by its source.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseSigma {
-    /// Of the position, along the world's axes. [m, world]
+    /// Standard deviation of the position, along the world's axes. [m, world]
     pub position_m: DVec3,
-    /// Of the attitude, about the body's axes. [rad, body]
+    /// Standard deviation of the attitude, about the body's axes. [rad, body]
     pub rotation_rad: DVec3,
 }
 
 impl PoseSigma {
-    /// Returns the same with its variances multiplied.
+    /// Returns the standard deviations for variances multiplied by `factor`.
     fn times(&self, factor: f64) -> Self {
         let root = factor.sqrt();
         Self { position_m: self.position_m * root, rotation_rad: self.rotation_rad * root }
     }
 }
 
-/// A pose as its source gave it.
+/// A pose as delivered by its source.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Measured {
     /// Index of the source, less than [`MAX_SOURCES`].
     pub source: u8,
-    /// When the pose was true, as precisely as the source states it.
+    /// Time of the measurement, with the precision of the source.
     pub stamp: ServerTime,
-    /// When it arrived.
     pub arrival: ServerTime,
-    /// Where the vehicle was.
     pub world_from_body: Pose<World, Body>,
-    /// How far that may be off; `None` is as configured.
+    /// Standard deviations; `None` uses the configured ones.
     pub sigma: Option<PoseSigma>,
 }
 
 impl Measured {
-    /// Makes the measurement of the only source there is, which arrives at once.
+    /// Returns a measurement of source 0 that arrives without delay.
     pub fn new(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
         Self { source: 0, stamp, arrival: stamp, world_from_body, sigma: None }
     }
 }
 
-/// Why a measurement is rejected.
+/// Reason for rejecting a measurement.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Rejected {
     /// A number that is not finite, or a quaternion that is not of unit length.
-    #[error("the pose holds numbers that are no pose")]
+    #[error("the pose is invalid: a number is not finite or too large, or the quaternion is not of unit length")]
     Invalid,
-    /// Not newer than the last one of its source, or older than what can still be fused.
+    /// Not newer than the last measurement of its source, or too old to be fused.
     #[error("the pose is not newer than the last one")]
     Stale,
-    /// It came so long after its stamp; before it, if negative. [s]
+    /// Implausible delay from stamp to arrival; negative if it arrived before its stamp. [s]
     #[error(
-        "the pose came {0:.2} s after its stamp, which cannot be: the source's clock is not the one \
-         it is taken for, or was set"
+        "the pose came {0:.2} s after its stamp: the source's clock is not the configured one, or \
+         was set"
     )]
     Clock(f64),
-    /// The stamps went back by so much while poses kept coming. [s]
+    /// The stamps went back by this time while poses kept coming. [s]
     #[error("the stamps of the poses went back by {0:.2} s: the source's clock was set")]
     ClockJump(f64),
-    /// Off by itself; others that go on from it would be accepted. [standard deviations]
+    /// Single outlier; later poses that continue from it would be accepted. [standard deviations]
     #[error("the pose is {0:.0} standard deviations from the expected: an outlier")]
     Outlier(f64),
-    /// Further from the expected than any vehicle flies, or for the second time at one place off it.
+    /// Further from the expected pose than any vehicle flies, or for the second time at one place off it.
     #[error(
         "the pose jumped by {distance_m:.2} m: an outlier, another object, swapped markers, or a \
          moved origin?"
     )]
     Jump {
-        /// From where it was expected. [m]
+        /// Distance from the expected position. [m]
         distance_m: f64,
-        /// By the time since the last accepted pose. [m/s]
+        /// Distance divided by the time since the last accepted pose. [m/s]
         speed_mps: f64,
     },
-    /// Turned further at once than any vehicle turns. [rad]
+    /// Attitude turned faster than any vehicle turns. [rad]
     #[error("the attitude turned by {:.0} degrees at once: swapped markers?", .0.to_degrees())]
     Flip(f64),
-    /// The same numbers, to the last bit, for so long while the vehicle moved. [s]
+    /// Bitwise equal poses for this time while the vehicle moved. [s]
     #[error(
         "the poses are the same to the last bit for {0:.2} s although the vehicle moves: the \
          stream is frozen"
     )]
     Frozen(f64),
-    /// Against another source that is accepted at this time.
+    /// Contradicts another source that is accepted at the same time.
     #[error(
         "the pose is {distance_m:.2} m and {:.0} degrees from that of source {other}, which is \
         accepted: are both in the same frame, and is it the same object?",
@@ -123,9 +121,9 @@ pub enum Rejected {
     Disagree {
         /// Index of the other source.
         other: u8,
-        /// From where that one has it. [m]
+        /// Distance from the other source's position. [m]
         distance_m: f64,
-        /// From how that one has it turned. [rad]
+        /// Angle to the other source's attitude. [rad]
         angle_rad: f64,
     },
 }

@@ -1,4 +1,4 @@
-//! A pose moved on to another time.
+//! Extrapolation of a pose to another time.
 
 use glam::{DQuat, DVec3};
 use vizflyt_protocol::geometry::{Body, Pose, World};
@@ -6,15 +6,14 @@ use vizflyt_protocol::time::ServerTime;
 
 use super::estimate::{ACCELERATION_LASTS_S, Estimate};
 
-/// Longest extrapolation; beyond it a motion model means nothing. [s]
+/// Maximum extrapolation; the motion model is meaningless beyond it. [s]
 pub const MAX_PREDICT_S: f64 = 0.2;
 
-/// How the vehicle moves: enough to predict where it is at a time close by.
+/// Motion of the vehicle: sufficient to predict its pose at a time close by.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
-    /// When it moved so: the newest reading of any sensor. [server]
+    /// Time of this state: the newest reading of any sensor. [server]
     pub stamp: ServerTime,
-    /// Where it was.
     pub world_from_body: Pose<World, Body>,
     /// Velocity. [m/s, world]
     pub v_world_mps: DVec3,
@@ -35,7 +34,7 @@ impl Motion {
         }
     }
 
-    /// Makes the motion of a vehicle that stands still.
+    /// Returns the motion of a vehicle at rest.
     pub fn at_rest(stamp: ServerTime, world_from_body: Pose<World, Body>) -> Self {
         Self {
             stamp,
@@ -46,7 +45,7 @@ impl Motion {
         }
     }
 
-    /// Returns the time closest to `time` at which it knows the pose.
+    /// Returns the time closest to `time` for which the pose can be predicted.
     pub fn reach(&self, time: ServerTime) -> ServerTime {
         let dt_s = time.seconds_since(self.stamp);
         if dt_s.abs() <= MAX_PREDICT_S {
@@ -55,8 +54,7 @@ impl Motion {
         self.stamp.plus_seconds(dt_s.clamp(-MAX_PREDICT_S, MAX_PREDICT_S))
     }
 
-    /// Returns the pose at a time up to 0.2 s before or after; of times further off, the pose at
-    /// that end.
+    /// Returns the pose at a time up to 0.2 s before or after; for other times, the pose at that limit.
     pub fn at(&self, time: ServerTime) -> Pose<World, Body> {
         let dt_s = time.seconds_since(self.stamp).clamp(-MAX_PREDICT_S, MAX_PREDICT_S);
         let decay = Decay::after(dt_s);
@@ -70,9 +68,9 @@ impl Motion {
     }
 }
 
-/// What an acceleration that dies away leaves after a time.
+/// Effect of a decaying acceleration over a time.
 pub(super) struct Decay {
-    /// Of itself.
+    /// Remaining share of the acceleration.
     pub share: f64,
     /// Integrated once. [s]
     pub once_s: f64,

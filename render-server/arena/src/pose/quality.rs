@@ -1,28 +1,28 @@
-//! How good the localization is at this moment, for people: page, `/api`, reports.
+//! Quality of the localization, for display: page, `/api`, reports.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_protocol::time::ServerTime;
 
 use super::{MAX_SOURCES, Rejected};
 
-/// Measurements turned away, by reason.
+/// Number of rejected measurements by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Rejects {
-    /// Numbers that are no pose.
+    /// Invalid numbers.
     pub invalid: u64,
-    /// Not newer than the last one of their source, or too old to be fused.
+    /// Not newer than the last measurement of their source, or too old to be fused.
     pub stale: u64,
-    /// Stamps that cannot be: a clock jumped.
+    /// Impossible stamps: a clock jumped.
     pub clock: u64,
-    /// Beyond the gate, once.
+    /// Single measurements outside of the gate.
     pub outlier: u64,
-    /// Teleports.
+    /// Jumps of the position.
     pub jump: u64,
     /// Attitude flips: swapped markers.
     pub flip: u64,
-    /// The same numbers again while the vehicle moved.
+    /// Repeated poses while the vehicle moved.
     pub frozen: u64,
-    /// Against another source that is accepted.
+    /// Measurements that contradict an accepted source.
     pub disagree: u64,
 }
 
@@ -46,7 +46,7 @@ impl Rejects {
         invalid + stale + clock + outlier + jump + flip + frozen + disagree
     }
 
-    /// Returns both together.
+    /// Returns the sum of both.
     #[must_use]
     pub fn and(self, other: Self) -> Self {
         Self {
@@ -62,49 +62,48 @@ impl Rejects {
     }
 }
 
-/// How good one vehicle's localization is.
+/// Quality of one vehicle's localization.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PoseQuality {
-    /// Since the newest accepted pose was measured; absent before the first. [ms]
+    /// Age of the newest accepted pose; `None` before the first. [ms]
     pub age_ms: Option<f64>,
-    /// Believed poses. [Hz]
+    /// Rate of accepted poses. [Hz]
     pub rate_hz: f64,
-    /// How far the pose may be off, one standard deviation, of the worst axis. [mm]
+    /// Standard deviation of the position on the worst axis. [mm]
     pub position_sigma_mm: f64,
-    /// The same of the attitude. [deg]
+    /// Standard deviation of the attitude on the worst axis. [deg]
     pub rotation_sigma_deg: f64,
-    /// How far measurements are from what was expected of them, in standard deviations: about 1.7
-    /// where sigmas and the motion model are right.
+    /// Mean innovation in standard deviations: about 1.7 if sigmas and motion model are right.
     pub innovation_sigmas: f64,
-    /// Speed over ground and up. [m/s]
+    /// Speed in all three axes. [m/s]
     pub speed_mps: f64,
-    /// Whether the autopilot's IMU takes part.
+    /// Whether the autopilot's IMU is used.
     pub imu: bool,
-    /// Times that the pose jumped for another reason than motion.
+    /// Number of resets: jumps of the pose for a reason other than motion.
     pub resets: u8,
-    /// What each source delivered, by its index.
+    /// Quality of each source, by its index.
     pub sources: Vec<SourceQuality>,
 }
 
-/// What one source delivered.
+/// Quality of one source.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SourceQuality {
-    /// Its index, in the order in which sources were set up.
+    /// Index in the order of setup.
     pub source: u8,
-    /// What it is called; empty if unnamed.
+    /// Name; empty if unnamed.
     pub name: String,
-    /// Measurements. [Hz]
+    /// Rate of measurements. [Hz]
     pub rate_hz: f64,
-    /// From the measurement to its arrival, by its stamps. [ms]
+    /// Time from the stamp of a measurement to its arrival. [ms]
     pub latency_ms: f64,
-    /// Believed so far.
+    /// Number of accepted measurements.
     #[serde(rename = "believed")]
     pub accepted: u64,
-    /// Turned away so far.
+    /// Number of rejected measurements.
     pub rejected: Rejects,
 }
 
-/// A rate and a mean that forget within a second or so.
+/// Rate and moving average over about a second.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Fading {
     last: Option<ServerTime>,
@@ -113,7 +112,7 @@ pub(super) struct Fading {
 }
 
 impl Fading {
-    /// Takes a value at a time.
+    /// Adds a value at a time.
     pub(super) fn add(&mut self, at: ServerTime, value: f64) {
         if let Some(last) = self.last.replace(at) {
             let dt_s = at.seconds_since(last).clamp(0.0, MAX_INTERVAL_S);
@@ -133,7 +132,7 @@ impl Fading {
         self.value
     }
 
-    /// Returns how often values came lately; what is overdue counts as its interval. [Hz]
+    /// Returns the recent rate of values; an overdue value counts with its waiting time. [Hz]
     pub(super) fn rate_hz(&self, now: ServerTime) -> f64 {
         let Some(last) = self.last else { return 0.0 };
         let waited_s = now.seconds_since(last);
@@ -145,11 +144,11 @@ impl Fading {
     }
 }
 
-/// Half the difference is forgotten after 0.35 s. [s]
+/// Time constant: half of a difference is left after 0.35 s. [s]
 const FADES_S: f64 = 0.5;
-/// A source without a measurement for so long has no rate. [s]
+/// After a longer silence, the rate is 0. [s]
 const SILENT_S: f64 = 1.0;
-/// A pause does not make the rate of what comes after it. [s]
+/// Maximum interval that counts, so that a pause does not determine the rate after it. [s]
 const MAX_INTERVAL_S: f64 = 1.0;
 
 const _: () = assert!(MAX_SOURCES <= u8::MAX as usize);

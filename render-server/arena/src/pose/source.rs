@@ -1,4 +1,4 @@
-//! What is remembered of one source of poses, to distinguish a bad measurement from a bad prediction.
+//! State of one source of poses, to distinguish a bad measurement from a bad prediction.
 
 use std::collections::VecDeque;
 
@@ -11,26 +11,25 @@ use super::filter::{MAX_MANOEUVRE_MPS, MAX_TURN_RADPS};
 use super::quality::{Fading, Rejects, SourceQuality};
 use super::{Measured, PoseSigma, Rejected};
 
-/// Poses that do not fit what is known, but each other.
+/// Rejected poses that agree with each other.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Claim {
     pub kind: ClaimKind,
-    /// The first of them, and how far it was from what was expected. [m, world], [rad, body]
+    /// Time of the first of them, and its deviation from the expected pose. [m, world], [rad, body]
     since: ServerTime,
     first_off_m: DVec3,
     first_off_rad: DVec3,
-    /// Whether the attitude is what does not fit.
+    /// Whether the attitude deviates more than the position.
     is_turned: bool,
     newest: ServerTime,
     pose: Pose<World, Body>,
-    /// How many.
     pub count: u32,
 }
 
-/// What is wrong with them; the worst of them counts.
+/// Kind of deviation; the worst of the poses counts.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub(super) enum ClaimKind {
-    /// Beyond the gate, as far as a manoeuvre may lead.
+    /// Outside of the gate, within the reach of a manoeuvre.
     Shift,
     /// Further than vehicles fly in the time.
     Leap,
@@ -38,17 +37,17 @@ pub(super) enum ClaimKind {
     Flip,
 }
 
-/// A pose that does not fit, beside what was expected in its place.
+/// A pose that does not fit, with the expected state at its time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Surprise {
     pub stamp: ServerTime,
     pub pose: Pose<World, Body>,
-    /// How far it is from what was expected. [m, world], [rad, body]
+    /// Deviation from the expected pose. [m, world], [rad, body]
     pub off_m: DVec3,
     pub off_rad: DVec3,
-    /// Whether the attitude is what does not fit, more than the place.
+    /// Whether the attitude deviates more than the position.
     pub is_turned: bool,
-    /// How what was expected moves. [m/s, world], [rad/s, body]
+    /// Expected velocity and angular velocity. [m/s, world], [rad/s, body]
     pub v_world_mps: DVec3,
     pub omega_body_radps: DVec3,
     /// One standard deviation of the measurement. [m], [rad]
@@ -56,19 +55,18 @@ pub(super) struct Surprise {
     pub noise_rad: f64,
 }
 
-/// The last accepted pose, as long as it comes again and again.
+/// The last accepted pose, while it is repeated.
 #[derive(Clone, Copy, Debug)]
 struct Still {
     since: ServerTime,
     pose: Pose<World, Body>,
-    /// How the vehicle moved when the first of them came. [m/s], [rad/s]
+    /// Speed and turn rate of the vehicle at its first occurrence. [m/s], [rad/s]
     speed_mps: f64,
     turn_radps: f64,
-    /// How far the gyroscope had turned then.
+    /// Rotation measured by the gyroscope at that time.
     turned: DQuat,
 }
 
-/// One source.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Source {
     last: Option<(ServerTime, ServerTime)>,
@@ -81,19 +79,19 @@ pub(super) struct Source {
     noise: Noise,
 }
 
-/// How its measurements scatter, by their medians: a few outliers, however great, teach nothing.
+/// Noise of the source's measurements, estimated by medians: a few outliers have no effect, however large.
 #[derive(Clone, Debug, Default)]
 struct Noise {
     /// The last two measurements.
     last: Option<(ServerTime, Pose<World, Body>)>,
     step: Option<Increment>,
-    /// Squares of how far each measurement is beside the line through the two before it, 1 in the median where noise is
-    /// as stated and nobody manoeuvres; of places and of attitudes.
+    /// Squared deviation of each measurement from the line through the two before it, for positions and
+    /// attitudes. The median is 1 if the noise is as stated and the vehicle does not manoeuvre.
     places: Window,
     attitudes: Window,
 }
 
-/// From one measurement to the next.
+/// Difference between consecutive measurements.
 #[derive(Clone, Copy, Debug)]
 struct Increment {
     dt_s: f64,
@@ -101,7 +99,7 @@ struct Increment {
     turned_rad: DVec3,
 }
 
-/// The last values, and their median.
+/// The last values, for their median.
 #[derive(Clone, Debug, Default)]
 struct Window(VecDeque<f64>);
 
@@ -113,7 +111,7 @@ impl Window {
         self.0.push_back(value);
     }
 
-    /// Returns 0 where there is no value.
+    /// Returns the median, or 0 if there is no value.
     fn median(&self) -> f64 {
         let mut values = [0.0; WINDOW];
         let count = self.0.len().min(WINDOW);
@@ -135,7 +133,7 @@ impl Noise {
             moved_m: pose.translation_m - from.translation_m,
             turned_rad: shortest(from.rotation.conjugate() * pose.rotation).to_scaled_axis(),
         };
-        // Only steps of one length show what is beside the line.
+        // Only steps of similar duration show a deviation from the line.
         let former = self.step.replace(step);
         let Some(former) = former.filter(|former| {
             (0.5..2.0).contains(&(step.dt_s / former.dt_s)) && step.dt_s < CLAIM_LASTS_S
@@ -143,7 +141,8 @@ impl Noise {
             return;
         };
         let share = step.dt_s / former.dt_s;
-        // Variances of one measurement, of `share` and one more of the middle one, and of `share` of the first.
+        // Variances of the three measurements: 1 for the newest, `(1 + share)^2` for the middle one, `share^2`
+        // for the first.
         let weight = MEDIAN_SQUARE * (1.0 + (1.0 + share).powi(2) + share * share);
         let add = |window: &mut Window, beside: DVec3, usual: f64, sigma: f64| {
             let by_motion = usual * step.dt_s * step.dt_s;
@@ -160,7 +159,7 @@ impl Noise {
         self.places.0.len() >= TRIAL
     }
 
-    /// Returns what variances are to be multiplied by: 1 as long as measurements scatter as their sigmas state.
+    /// Returns the factor for the variances: 1 while measurements scatter as their sigmas state.
     fn factor(&self) -> f64 {
         let square = self.places.median().max(self.attitudes.median());
         if square > NOISY_SQUARE { square.min(MAX_FACTOR) } else { 1.0 }
@@ -168,7 +167,7 @@ impl Noise {
 }
 
 impl Source {
-    /// Checks the stamp by itself.
+    /// Checks the stamp against arrival and earlier stamps.
     pub(super) fn check_stamp(&mut self, measured: &Measured) -> Result<(), Rejected> {
         let Measured { stamp, arrival, .. } = *measured;
         let latency_s = arrival.seconds_since(stamp);
@@ -190,7 +189,7 @@ impl Source {
         Ok(())
     }
 
-    /// Notices numbers that stay the same to the last bit while the vehicle moves.
+    /// Detects bitwise equal poses while the vehicle moves.
     pub(super) fn check_frozen(&self, measured: &Measured, turned: DQuat) -> Result<(), Rejected> {
         let Some(still) = self.still.filter(|still| still.pose == measured.world_from_body) else {
             return Ok(());
@@ -206,12 +205,12 @@ impl Source {
         if frozen { Err(Rejected::Frozen(since_s)) } else { Ok(()) }
     }
 
-    /// Returns the claim that earlier poses made, if this one makes it too.
+    /// Returns the pending claim of earlier poses, if this pose supports it.
     pub(super) fn pending(&self, surprise: &Surprise) -> Option<Claim> {
         self.claim.filter(|claim| claim.is_made_by(surprise))
     }
 
-    /// Takes note of a pose that does not fit; returns its claim, and whether that is a manoeuvre: poses that
+    /// Records a pose that does not fit. Returns its claim, and whether the claim is a manoeuvre: poses that
     /// leave the expected path together, each further than the one before.
     pub(super) fn claim(&mut self, surprise: &Surprise, kind: ClaimKind) -> (Claim, bool) {
         let Surprise { stamp, pose, off_m, off_rad, .. } = *surprise;
@@ -244,7 +243,7 @@ impl Source {
         (claim, moves.is_some() && claim.kind <= ClaimKind::Shift)
     }
 
-    /// Takes note of an accepted pose, after which the vehicle moves as in `estimate`.
+    /// Records an accepted pose, after which the vehicle moves as in `estimate`.
     pub(super) fn accept(&mut self, measured: &Measured, estimate: &Estimate, turned: DQuat) {
         let Measured { stamp, world_from_body: pose, .. } = *measured;
         self.claim = None;
@@ -261,8 +260,8 @@ impl Source {
         }
     }
 
-    /// Takes note of a measurement, accepted or not; returns whether it shows for the first time that the source is
-    /// noisier than it states, so that what is known by now rests on too much trust.
+    /// Records a measurement, accepted or not. Returns whether it shows for the first time that the source is
+    /// noisier than stated, so that the present estimate trusts it too much.
     pub(super) fn add(
         &mut self,
         stamp: ServerTime,
@@ -274,23 +273,22 @@ impl Source {
         !was_known && self.noise.is_known() && self.noise.factor() > 1.0
     }
 
-    /// Returns what this source's variances are to be multiplied by: 1 as long as its measurements
-    /// scatter as their sigmas state.
+    /// Returns the factor for this source's variances: 1 while its measurements scatter as their sigmas state.
     pub(super) fn noise_factor(&self) -> f64 {
         if self.noise.is_known() { self.noise.factor() } else { 1.0 }
     }
 
-    /// Whether enough has come to know how its measurements scatter.
+    /// Whether there are enough measurements to estimate the noise.
     pub(super) fn is_known(&self) -> bool {
         self.noise.is_known()
     }
 
-    /// Returns how often measurements come, accepted or not. [Hz]
+    /// Returns the rate of measurements, accepted or not. [Hz]
     pub(super) fn rate_hz(&self, now: ServerTime) -> f64 {
         self.latency.rate_hz(now)
     }
 
-    /// Returns how late its measurements usually come, and their interval, while any come. [s]
+    /// Returns the usual latency of the source and its interval, if it is active. [s]
     pub(super) fn timing(&self, now: ServerTime) -> Option<(f64, f64)> {
         let rate_hz = self.latency.rate_hz(now);
         (rate_hz > 0.0).then(|| (self.latency.value(), 1.0 / rate_hz))
@@ -317,7 +315,8 @@ impl Source {
 }
 
 impl Claim {
-    /// Whether an object at the claimed place, at rest or moving as the vehicle does, would be there now.
+    /// Whether an object at the claimed pose, at rest or moving like the vehicle, would be at this pose by the
+    /// time of `surprise`.
     fn is_made_by(&self, surprise: &Surprise) -> bool {
         let Surprise { stamp, v_world_mps, omega_body_radps, .. } = *surprise;
         let dt_s = stamp.seconds_since(self.newest);
@@ -326,7 +325,7 @@ impl Claim {
         let turning = DQuat::from_scaled_axis(-omega_body_radps * dt_s);
         let mut fits_m = FITS_M + FITS_MPS * dt_s + FITS_SIGMAS * surprise.noise_m;
         let mut fits_rad = FITS_RAD + FITS_RADPS * dt_s + FITS_SIGMAS * surprise.noise_rad;
-        // What agrees is closer to each other than to the expected.
+        // Poses of one claim are closer to each other than to the expected pose.
         if self.is_turned {
             fits_rad = fits_rad.min(CLOSER * surprise.off_rad.length());
         } else {
@@ -337,12 +336,12 @@ impl Claim {
             && angle_rad(turned).min(angle_rad(turned * turning)) <= fits_rad
     }
 
-    /// Whether the way from its first pose to this one, flown backwards, leads to the expected path in the `before_s`
-    /// between the last accepted pose and the first that was not: a bump or a hard stop does, an outlier does not.
-    /// `pauses`: whether the source was silent in between.
+    /// Whether the line through its first pose and this one, extended backwards, meets the expected path within
+    /// `before_s`, the time between the last accepted pose and the first rejected one: a bump or a hard stop
+    /// does, an outlier does not. `pauses`: whether the source was silent in between.
     fn leads_to(&self, surprise: &Surprise, before_s: f64, pauses: bool) -> bool {
         let dt_s = surprise.stamp.seconds_since(self.since);
-        // What was flown in a pause of the source nobody knows.
+        // The motion during a pause of the source is unknown.
         let unseen_m = if pauses { UNSEEN_MPS * before_s } else { 0.0 };
         let leads = |first: DVec3, now: DVec3, noise: f64, most: f64| {
             let way = now - first;
@@ -357,7 +356,7 @@ impl Claim {
             && leads(self.first_off_rad, off_rad, FITS_SIGMAS * noise_rad, MAX_TURN_RADPS)
     }
 
-    /// Whether the pose is about as far beyond the first as that was beyond the expected.
+    /// Whether the deviation grows as in a motion that began after the last accepted pose.
     pub(super) fn grows_to(&self, surprise: &Surprise) -> bool {
         let Surprise { off_m, off_rad, .. } = surprise;
         if self.is_turned {
@@ -367,7 +366,7 @@ impl Claim {
         }
     }
 
-    /// Whether it explains the pose better than what was expected.
+    /// Whether the claim is closer to the pose than the expectation is.
     pub(super) fn explains(&self, surprise: &Surprise) -> bool {
         let Surprise { pose, off_m, off_rad, .. } = surprise;
         if self.is_turned {
@@ -377,7 +376,7 @@ impl Claim {
         }
     }
 
-    /// How long it has been made. [s]
+    /// Returns the duration of the claim. [s]
     pub(super) fn lasted_s(&self) -> f64 {
         self.newest.seconds_since(self.since)
     }
@@ -388,56 +387,59 @@ fn angle_rad(rotation: DQuat) -> f64 {
     shortest(rotation).to_scaled_axis().length()
 }
 
-/// Measurements that are remembered: a second at 30 Hz.
+/// Number of remembered measurements: a second at 30 Hz.
 const WINDOW: usize = 32;
-/// So many are enough to judge by: 0.3 s at 30 Hz.
+/// Minimum number of measurements for an estimate of the noise: 0.3 s at 30 Hz.
 const TRIAL: usize = 8;
-/// The median of what is distributed as chi square with three degrees of freedom.
+/// Median of the chi-squared distribution with three degrees of freedom.
 const MEDIAN_SQUARE: f64 = 2.37;
-/// What a hovering vehicle does anyway. [m/s^2], [rad/s^2]
+/// Accelerations of a hovering vehicle. [m/s^2], [rad/s^2]
 const USUAL_MPS2: f64 = 1.0;
 const USUAL_RADPS2: f64 = 2.0;
-/// Beyond this a source scatters by more than it states, and not by chance. [sigma^2]
+/// Above this, a source scatters by more than it states, and not by chance. [sigma^2]
 const NOISY_SQUARE: f64 = 1.8;
-/// Ten times the sigma: what is worse still is no localization.
+/// Ten times the sigma: a source with more noise is unusable.
 const MAX_FACTOR: f64 = 100.0;
-/// A measurement may seem to come before it was made by what two clocks disagree at most. [s]
+/// Maximum time by which a measurement may arrive before its stamp: the error between two clocks. [s]
 const EARLY_S: f64 = 0.02;
-/// Nobody flies on what is older. [s]
+/// Maximum age of a measurement at arrival: older ones are useless for flight. [s]
 const LATE_S: f64 = 1.0;
-/// Packets overtake each other by less. [s]
+/// Minimum jump of a clock: packets overtake each other by less. [s]
 const CLOCK_JUMP_S: f64 = 0.25;
-/// Stamps closer together are those of packets that were read at once: no source is that fast. [s]
+/// Minimum interval of stamps: closer ones belong to packets that were read at once. [s]
 const MIN_APART_S: f64 = 0.000_5;
-/// Slower than this the motion's own noise is not far away. [m/s]
+/// Minimum speed for the detection of a frozen stream: slower motion is close to the noise. [m/s]
 const MOVING_MPS: f64 = 0.3;
-/// The same of turning. [rad/s]
+/// Minimum turn rate for the detection of a frozen stream. [rad/s]
 const TURNING_RADPS: f64 = 0.5;
-/// Many times the noise of any source that flies. [m]
+/// Distance without a new pose that counts as frozen: many times the noise of any usable source. [m]
 const FROZEN_M: f64 = 0.01;
-/// The same of attitudes. [rad]
+/// Turn without a new pose that counts as frozen. [rad]
 const FROZEN_RAD: f64 = 0.06;
-/// A gyroscope turns by itself, before its bias is known. [rad/s]
+/// Drift of a gyroscope before its bias is known. [rad/s]
 const GYRO_DRIFT_RADPS: f64 = 0.03;
-/// Poses of one claim follow each other within this; slower sources do not fly. [s]
+/// Maximum time between poses of one claim; slower sources are not used for flight. [s]
 const CLAIM_LASTS_S: f64 = 0.25;
-/// Within a claim: twice the pose of what is tracked by chance, in standard deviations of the measurement.
+/// Tolerance within a claim, in standard deviations of the measurement.
 const FITS_SIGMAS: f64 = 4.0;
-/// What a false place wobbles by. [m], [rad]
+/// Tolerance within a claim: wobble of a false position. [m], [rad]
 const FITS_M: f64 = 0.02;
 const FITS_RAD: f64 = 0.1;
-/// What is tracked by mistake moves against the vehicle: another one, or a wand in a hand. [m/s], [rad/s]
+/// Motion of a wrongly tracked object relative to the vehicle: another vehicle, or a wand in a hand. [m/s],
+/// [rad/s]
 const FITS_MPS: f64 = 3.0;
 const FITS_RADPS: f64 = 4.0;
-/// Of how far the newest is off.
+/// Share of the newest deviation within which poses of a claim must agree.
 const CLOSER: f64 = 0.5;
-/// How far beside the expected path a manoeuvre may seem to begin, of its first deviation: 11 degrees.
+/// Maximum distance of the start of a manoeuvre from the expected path, as a share of its first deviation: 11
+/// degrees.
 const ASTRAY: f64 = 0.2;
-/// A motion that began since the last accepted pose has led at least twice as far an interval later; less a fifth for noise.
+/// Growth of a deviation per interval: at least twofold for a motion that began after the last accepted pose,
+/// less a fifth for noise.
 const GROWS: f64 = 1.6;
-/// Eight missing frames at 100 Hz, a vehicle may have stopped or turned in. [s]
+/// Pause in which a vehicle may have stopped or turned unseen: eight missing frames at 100 Hz. [s]
 const PAUSE_S: f64 = 0.08;
-/// And of a slow source at least so many intervals.
+/// Minimum pause of a slow source, in intervals.
 const PAUSE_INTERVALS: f64 = 2.5;
-/// Speed by which that may have changed. [m/s]
+/// Unseen change of speed during a pause. [m/s]
 const UNSEEN_MPS: f64 = 3.0;

@@ -15,7 +15,7 @@ fn measured(t: f64, p: DVec3) -> Measured {
     Measured::new(at(t), pose(p))
 }
 
-/// A filter that has seen a vehicle fly straight ahead for a second, at 200 Hz.
+/// Returns a filter after one second of straight flight, measured at 200 Hz.
 fn flying(speed_mps: f64) -> PoseFilter {
     let mut filter = PoseFilter::default();
     for i in 0..=200 {
@@ -27,7 +27,7 @@ fn flying(speed_mps: f64) -> PoseFilter {
 
 proptest! {
     #[test]
-    fn a_constant_twist_is_found(v in prop::array::uniform3(-8.0..8.0f64), w in prop::array::uniform3(-3.0..3.0f64), hz in 30.0..500.0f64) {
+    fn estimates_a_constant_twist(v in prop::array::uniform3(-8.0..8.0f64), w in prop::array::uniform3(-3.0..3.0f64), hz in 30.0..500.0f64) {
         let (v, w) = (DVec3::from(v), DVec3::from(w));
         let mut filter = PoseFilter::default();
         for i in 0..150 {
@@ -42,9 +42,9 @@ proptest! {
         prop_assert!((ahead.translation_m - v * (149.0 / hz + 0.03)).length() < 1e-3);
     }
 
-    /// Whatever comes, in whatever order: every number that leaves is one to work with.
+    /// Any input in any order gives finite output.
     #[test]
-    fn nothing_poisons_the_filter(
+    fn output_is_finite_for_any_input(
         steps in prop::collection::vec((0u8..4, -0.3..0.5f64, prop::array::uniform3(-20.0..20.0f64), prop::array::uniform3(-9.0..9.0f64), -1e-3..0.5f64), 1..120)
     ) {
         let mut filter = PoseFilter::default();
@@ -75,7 +75,7 @@ proptest! {
 }
 
 #[test]
-fn invalid_and_old_poses_are_rejected() {
+fn rejects_invalid_and_old_poses() {
     let mut filter = PoseFilter::default();
     let nan = measured(0.0, DVec3::new(f64::NAN, 0.0, 0.0));
     assert_eq!(filter.handle_pose(&nan), Err(Rejected::Invalid));
@@ -90,7 +90,7 @@ fn jump_is_rejected_until_it_lasts() {
     let mut filter = PoseFilter::default();
     filter.handle_pose(&measured(0.0, DVec3::ZERO)).unwrap();
     let far = DVec3::new(5.0, 0.0, 0.0);
-    // One swapped marker, then back. The motion is hardly known yet.
+    // One outlier from swapped markers. The motion is hardly known yet.
     for i in 1..=20 {
         filter.handle_pose(&measured(0.005 * f64::from(i), DVec3::ZERO)).unwrap();
     }
@@ -114,15 +114,15 @@ fn jump_is_rejected_until_it_lasts() {
 }
 
 #[test]
-fn packets_bunched_after_a_pause_are_no_speed() {
+fn packets_bunched_after_a_pause_do_not_give_a_high_speed() {
     let mut filter = PoseFilter::default();
-    // 2 m/s, read in time for 0.2 s; then 0.1 s of packets read at once.
+    // 2 m/s: 0.2 s of packets read in time, then 0.1 s of packets read at once.
     let place = |i| DVec3::X * 2.0 * 0.005 * f64::from(i);
     for i in 0..40 {
         filter.handle_pose(&measured(0.005 * f64::from(i), place(i))).unwrap();
     }
     for i in 40..60 {
-        // Those that come at a jump's speed are turned away; the others make no great one.
+        // Packets at a jump's speed are rejected; the others do not give a high speed.
         let _ = filter.handle_pose(&measured(0.3 + 1e-4 * f64::from(i - 40), place(i)));
         let speed_mps = filter.newest().unwrap().twist.linear_mps.length();
         assert!(speed_mps < 3.0, "{speed_mps} m/s after packet {i}");
@@ -130,7 +130,7 @@ fn packets_bunched_after_a_pause_are_no_speed() {
 }
 
 #[test]
-fn silence_is_noticed_once_and_its_end_too() {
+fn reports_loss_and_return_of_poses_once() {
     let mut filter = PoseFilter::default();
     assert_eq!(filter.poll_timeout(), None);
     filter.handle_pose(&measured(0.0, DVec3::ZERO)).unwrap();
@@ -146,13 +146,13 @@ fn silence_is_noticed_once_and_its_end_too() {
 }
 
 #[test]
-fn a_lone_outlier_is_left_out_and_a_bump_is_followed() {
+fn rejects_a_single_outlier_and_follows_a_bump() {
     let mut filter = flying(2.0);
     let off = filter.handle_pose(&measured(1.005, DVec3::new(2.01, 0.03, 0.0)));
     assert!(matches!(off, Err(Rejected::Outlier(sigmas)) if sigmas > 6.0), "{off:?}");
     let back = filter.handle_pose(&measured(1.010, DVec3::X * 2.02)).unwrap();
     assert!(back.world_from_body.translation_m.y.abs() < 1e-3);
-    // Against a post: it bounces off at 5 m/s.
+    // Bounces off a post at 5 m/s.
     let mut last = Err(Rejected::Stale);
     for i in 1..=20 {
         let t = 0.005 * f64::from(i);
@@ -164,7 +164,7 @@ fn a_lone_outlier_is_left_out_and_a_bump_is_followed() {
 }
 
 #[test]
-fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
+fn rejects_flips_by_swapped_markers_in_flight() {
     let mut filter = flying(1.0);
     let flipped = |t: f64| {
         Measured::new(at(t), Pose::new(DVec3::X * t, DQuat::from_rotation_z(120f64.to_radians())))
@@ -183,14 +183,14 @@ fn swapped_markers_flip_the_attitude_and_are_rejected_in_flight() {
         }
         filter.handle_timeout(at(t));
     }
-    // By then the vehicle has been ordered to hold and to land.
+    // The vehicle has been ordered to hold and to land before.
     assert!(accepted_after_s.is_some_and(|s| s > 0.9), "{accepted_after_s:?}");
-    // The flip's end came with the news of the loss and of its reason.
+    // The loss was overwritten by the end of the flip.
     assert_eq!(filter.poll_change(), Some(PoseChange::Regained));
 }
 
 #[test]
-fn lost_pose_has_a_reason() {
+fn loss_of_poses_names_the_reason() {
     let mut filter = flying(1.0);
     for i in 1..40 {
         let t = 1.0 + 0.005 * f64::from(i);
@@ -199,24 +199,24 @@ fn lost_pose_has_a_reason() {
     }
     let Some(PoseChange::Lost(_, Some(why))) = filter.poll_change() else { panic!("not lost") };
     assert!(why.to_string().contains("the stream is frozen"), "{why}");
-    // The same numbers from a vehicle that stands are nothing to worry about.
+    // Repeated poses of a vehicle at rest are valid.
     let mut filter = flying(0.0);
     for i in 1..1000 {
         filter.handle_pose(&measured(1.0 + 0.005 * f64::from(i), DVec3::ZERO)).unwrap();
     }
 }
 
-/// A source that is always late, or slow, is no lost one; it is lost as long after its next pose was due as a quick one.
+/// A late or slow source is not lost; it is lost as long after its next pose was due as a fast source.
 #[test]
-fn delay_and_rate_of_a_source_are_allowed_for() {
+fn allows_for_delay_and_rate_of_a_source() {
     for (rate_hz, delay_s, allowed_s) in [
         (100.0, 0.0, 0.0..0.001),
         (100.0, 0.1, 0.099..0.101),
         (30.0, 0.1, 0.099..0.101),
-        // Two and a half of its intervals are 0.25 s, and some are double.
+        // 2.5 intervals are 0.25 s, and some intervals are double.
         (10.0, 0.0, 0.099..0.16),
         (10.0, 0.1, 0.199..0.26),
-        // Nobody flies on what is older.
+        // Limited: older poses are useless for flight.
         (10.0, 0.45, 0.299..0.301),
     ] {
         let mut filter = PoseFilter::default();
@@ -224,7 +224,7 @@ fn delay_and_rate_of_a_source_are_allowed_for() {
         for i in 0..60 {
             let t = f64::from(i) / rate_hz;
             filter.handle_timeout(at(t + delay_s));
-            // Every seventh is missing.
+            // Every seventh pose is missing.
             if i % 7 == 5 {
                 continue;
             }
@@ -245,7 +245,7 @@ fn delay_and_rate_of_a_source_are_allowed_for() {
 }
 
 #[test]
-fn gyroscope_reveals_a_stream_that_froze_at_rest() {
+fn detects_a_stream_frozen_at_rest_by_the_gyroscope() {
     let mut filter = flying(0.0);
     let mut frozen = 0;
     for i in 1..100 {
@@ -260,7 +260,7 @@ fn gyroscope_reveals_a_stream_that_froze_at_rest() {
 }
 
 #[test]
-fn clocks_that_jump_are_named() {
+fn rejects_poses_after_a_clock_jump() {
     let mut filter = flying(1.0);
     let late = Measured { arrival: at(3.2), ..measured(1.005, DVec3::X) };
     assert!(matches!(filter.handle_pose(&late), Err(Rejected::Clock(s)) if s > 2.0));
@@ -292,7 +292,7 @@ fn rejects_one_of_two_sources_that_disagree() {
 
 #[test]
 fn late_measurements_are_inserted_in_order() {
-    // The same readings in order, and with one source 40 ms late: the same in the end.
+    // The same readings in order, and with one source 40 ms late, give the same result.
     let truth = |t: f64| Pose::new(DVec3::new((2.0 * t).sin(), t, 1.0), DQuat::from_rotation_z(t));
     let prompt = |t: f64| Measured::new(at(t), truth(t));
     let slow = |t: f64| Measured { source: 1, arrival: at(t + 0.04), ..prompt(t) };
@@ -318,14 +318,14 @@ fn late_measurements_are_inserted_in_order() {
 }
 
 #[test]
-fn an_imu_that_contradicts_the_poses_is_left_out() {
+fn excludes_an_imu_that_contradicts_the_poses() {
     let mut filter = PoseFilter::default();
     let mut left_out = false;
     for i in 0..1000 {
         let t = 0.005 * f64::from(i);
         let turned = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(2.0 * t));
         let _ = filter.handle_pose(&Measured::new(at(t), turned));
-        // Its z axis is taken for another.
+        // The IMU's z axis is configured as another axis.
         let (accel_mps2, gyro_radps) = (DVec3::X * 9.81, DVec3::X * 2.0);
         filter.handle_imu(&ImuReading { stamp: at(t + 0.001), accel_mps2, gyro_radps });
         left_out |= filter.poll_change() == Some(PoseChange::ImuLeftOut);
@@ -336,8 +336,8 @@ fn an_imu_that_contradicts_the_poses_is_left_out() {
 }
 
 #[test]
-fn the_error_is_as_great_as_the_filter_says() {
-    // 2 mm and 0.2 degrees of noise by a fixed generator; the truth within three sigmas.
+fn error_matches_the_estimated_sigma() {
+    // 2 mm and 0.2 degrees of noise by a fixed generator.
     let mut seed = 1u64;
     let mut noise = move || {
         let mut sum = 0.0;
@@ -370,8 +370,8 @@ fn the_error_is_as_great_as_the_filter_says() {
 }
 
 #[test]
-fn an_overconfident_source_gets_a_larger_covariance_and_is_not_rejected() {
-    // Ten times the noise it states.
+fn inflates_the_covariance_of_an_overconfident_source() {
+    // Ten times the stated noise.
     let mut seed = 5u64;
     let mut noise = move || {
         let mut sum = 0.0;
@@ -391,13 +391,13 @@ fn an_overconfident_source_gets_a_larger_covariance_and_is_not_rejected() {
         let result = filter.handle_pose(&Measured::new(at(t), Pose::new(p, turned)));
         late += u32::from(i >= 1000 && result.is_err());
     }
-    assert!(late < 10, "{late} of the last 1000 were turned away");
+    assert!(late < 10, "{late} of the last 1000 were rejected");
     let quality = filter.quality(at(20.0));
     assert!(quality.position_sigma_mm > 1.0, "{quality:?}");
 }
 
 #[test]
-fn the_guides_settings_are_the_defaults() {
+fn settings_in_the_guide_are_the_defaults() {
     #[derive(serde::Deserialize)]
     struct File {
         pose: PoseConfig,
@@ -410,7 +410,7 @@ fn the_guides_settings_are_the_defaults() {
 }
 
 #[test]
-fn settings_that_cannot_work_are_refused_by_name() {
+fn rejects_invalid_settings_by_key() {
     let refused = |config: PoseConfig, key: &str| {
         let error = config.check().unwrap_err().to_string();
         assert!(error.starts_with(&format!("pose.{key} = ")), "{error}");

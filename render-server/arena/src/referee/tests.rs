@@ -10,7 +10,7 @@ use crate::config::{
 use crate::occupancy::{BakeSpec, Ellipsoid, OccupancyGrid};
 use crate::pose::PoseConfig;
 
-/// A room of 12 x 6 x 4 m, start at the origin, goal at x = 8, no stages.
+/// Returns an arena of 12 x 6 x 4 m, start at the origin, goal at x = 8, no stages.
 pub(crate) fn arena() -> ArenaConfig {
     ArenaConfig {
         name: "test".into(),
@@ -42,7 +42,7 @@ pub(crate) fn arena() -> ArenaConfig {
     }
 }
 
-/// The room with a post at (4, 1) of radius about 0.2 m, up to 3 m.
+/// Returns a referee of the arena with a post at (4, 1), radius about 0.2 m, up to 3 m.
 fn referee(config: &ArenaConfig) -> Referee {
     let post = (0..60).flat_map(|layer| {
         (0..12).map(move |side| {
@@ -62,7 +62,7 @@ fn referee(config: &ArenaConfig) -> Referee {
     Referee::new(config, DistanceField::of(OccupancyGrid::bake(post, &BakeSpec::of(config))))
 }
 
-/// Flies straight lines through the points at a speed, 200 Hz; returns every event's kind.
+/// Flies straight lines through the points at a speed, at 200 Hz; returns all events.
 fn fly(referee: &mut Referee, way: &[[f64; 3]], speed_mps: f64, start_s: f64) -> Vec<Event> {
     let (mut events, mut t_s) = (Vec::new(), start_s);
     for pair in way.windows(2) {
@@ -74,7 +74,7 @@ fn fly(referee: &mut Referee, way: &[[f64; 3]], speed_mps: f64, start_s: f64) ->
             let stamp = ServerTime::from_ns(0).plus_seconds(t_s);
             let measured = Measured::new(stamp, Pose::new(p, DQuat::IDENTITY));
             match referee.handle_measurement(&measured) {
-                // No vehicle turns a corner at full speed; the first pose beyond one is checked.
+                // No vehicle turns a corner at full speed: the first pose behind a corner may be an outlier.
                 Ok(_) | Err(Rejected::Outlier(_)) => {}
                 Err(reason) => panic!("{reason}"),
             }
@@ -90,7 +90,7 @@ fn check(way: &[[f64; 3]], speed_mps: f64, expected: impl Fn(&[Event]) -> bool) 
 }
 
 #[test]
-fn a_clean_flight_finishes_once() {
+fn flight_without_faults_finishes_once() {
     let way = [[0., 0., 0.], [0., 0., 1.], [8.5, 0., 1.], [5., 0., 1.], [8., 0., 1.], [8., 0., 0.]];
     check(
         &way,
@@ -100,20 +100,20 @@ fn a_clean_flight_finishes_once() {
 }
 
 #[test]
-fn the_post_is_hit_and_nothing_after_it_counts() {
+fn collision_ends_the_flight() {
     let way = [[0., 0., 0.], [0., 1., 1.], [7.5, 1., 1.], [8., 0., 1.]];
     check(&way, 3.0, |events| {
         let [Event { kind: EventKind::Collision(collision), text, .. }] = events else {
             return false;
         };
         let Collision { p_world_m, with: Obstacle::Scene, .. } = collision else { return false };
-        // Post radius and body together, to a voxel and a half.
+        // Post radius and body radius, within a voxel and a half.
         text.contains("collision") && ((4.0 - 0.23 - 0.12) - p_world_m.x).abs() < 0.15
     });
 }
 
 #[test]
-fn the_fence_is_left_or_cannot_be_held() {
+fn reports_leaving_the_fence_and_being_unable_to_stop_before_it() {
     let way = [[0., 0., 0.], [0., 0., 1.], [0., -3.5, 1.]];
     let breach = |events: &[Event]| {
         matches!(events.last(), Some(Event { kind: EventKind::Geofence(_), .. }))
@@ -127,7 +127,7 @@ fn the_fence_is_left_or_cannot_be_held() {
 }
 
 #[test]
-fn a_no_fly_box_is_flown_into_or_at() {
+fn reports_no_fly_boxes_and_the_ceiling() {
     let mut config = arena();
     let corners = (DVec3::new(3.0, -2.0, 0.0), DVec3::new(3.2, -1.0, 2.0));
     config.no_fly.push(NoFly { name: "shelf".into(), min_m: corners.0, max_m: corners.1 });
@@ -146,12 +146,12 @@ fn a_no_fly_box_is_flown_into_or_at() {
 }
 
 #[test]
-fn thin_arms_pass_where_their_sphere_does_not_and_touch_when_turned() {
+fn arms_pass_along_the_post_and_collide_across_it() {
     let mut config = arena();
     config.body_radius_m = 0.4;
     let arm = DVec3::X * 0.35;
     config.body.push(BodyPart { from_m: -arm, to_m: Some(arm), radius_m: 0.04 });
-    // 0.45 m beside the post's middle, arms along the way.
+    // 0.45 m from the post's centre, arms along the path.
     let way = [[0., 0., 0.], [0., 0.55, 1.], [7.5, 0.55, 1.]];
     assert!(fly(&mut referee(&config), &way, 2.0, 1.0).is_empty());
     config.body[0] =
@@ -161,7 +161,7 @@ fn thin_arms_pass_where_their_sphere_does_not_and_touch_when_turned() {
 }
 
 #[test]
-fn landing_is_no_crash_but_falling_is() {
+fn falling_is_a_crash_and_landing_is_not() {
     let settle = [[0., 0., 0.], [0., 0., 1.], [0., 0., 0.]];
     check(&settle, 0.5, <[Event]>::is_empty);
     let fall = [[0., 0., 0.], [0., 0., 2.], [0., 0., 0.]];
@@ -175,10 +175,10 @@ fn nothing_is_judged_on_the_floor() {
 }
 
 #[test]
-fn lost_pose_ends_the_run_and_a_restart_begins_another() {
+fn lost_pose_ends_the_flight_and_restart_begins_another() {
     let mut referee = referee(&arena());
     assert!(fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [1., 0., 1.]], 2.0, 1.0).is_empty());
-    // A warning first; then the run is over, and its time with it.
+    // A warning first; then the flight is over, and its time limit too.
     let due = referee.poll_timeout().unwrap();
     referee.handle_timeout(due);
     let lost = referee.poll_event().unwrap();
@@ -210,7 +210,7 @@ fn received(kind: EventKind) -> Event {
 const UP: [[f64; 3]; 3] = [[0., 0., 0.], [0., 0., 1.], [1., 0., 1.]];
 
 #[test]
-fn time_is_up_after_the_time_limit() {
+fn time_limit_ends_the_flight() {
     let mut referee = referee(&arena());
     let hover = [[0., 0., 0.], [0., 0., 1.], [1., 0., 1.], [-1., 0., 1.], [1., 0., 1.]];
     let events = fly(&mut referee, &hover, 0.25, 1.0);
@@ -221,7 +221,7 @@ fn time_is_up_after_the_time_limit() {
 }
 
 #[test]
-fn after_land_course_and_clock_stop_and_a_touch_is_still_reported() {
+fn after_land_only_collisions_are_reported() {
     for order in
         [EventKind::Land, EventKind::EmergencyStop, EventKind::Ended(EndReason::PluginLanded)]
     {
@@ -233,7 +233,7 @@ fn after_land_course_and_clock_stop_and_a_touch_is_still_reported() {
         let events = fly(&mut referee, &post, 2.0, 5.6);
         assert!(matches!(&events[..], [Event { kind: EventKind::Collision(_), .. }]), "{events:?}");
     }
-    // On the ground nothing is judged any more, wherever the vehicle is carried.
+    // On the ground, nothing is checked, wherever the vehicle is carried.
     let mut referee = referee(&arena());
     fly(&mut referee, &UP, 2.0, 1.0);
     referee.handle_event(&received(EventKind::Phase(FlightPhase::Landed)));
@@ -244,7 +244,7 @@ fn after_land_course_and_clock_stop_and_a_touch_is_still_reported() {
 }
 
 #[test]
-fn carrying_the_vehicle_before_take_off_is_no_flight() {
+fn carrying_the_vehicle_before_take_off_does_not_count() {
     let mut referee = referee(&arena());
     // Carried into the post.
     let events = fly(&mut referee, &[[0., 1., 0.], [0., 1., 1.], [4., 1., 1.]], 2.0, 1.0);
@@ -255,11 +255,11 @@ fn carrying_the_vehicle_before_take_off_is_no_flight() {
 }
 
 #[test]
-fn a_jump_of_the_localization_is_not_flown_through() {
+fn pose_jump_through_an_obstacle_is_not_a_collision() {
     let mut referee = referee(&arena());
     fly(&mut referee, &[[0., 0., 0.], [0., 1., 1.], [2., 1., 1.]], 2.0, 1.0);
     let newest_s = referee.newest().unwrap().stamp.seconds_since(ServerTime::ZERO);
-    // From one side of the post to the other in one packet, and it stays there.
+    // From one side of the post to the other in one packet, and stays there.
     let mut events = Vec::new();
     for packet in 1..=40 {
         let stamp = ServerTime::ZERO.plus_seconds(newest_s + 0.005 * f64::from(packet));
@@ -272,7 +272,8 @@ fn a_jump_of_the_localization_is_not_flown_through() {
     assert_eq!(referee.newest().unwrap().resets, 1, "the new position is accepted in the end");
 }
 
-/// A door that slides through (4, 0) along y, 1 m to each side in 4 s, at the left when it starts.
+/// Returns a referee with a door that slides through (4, 0) along y, 1 m to each side in 4 s, at the left when
+/// it starts.
 fn with_door(config: &mut ArenaConfig) -> Referee {
     use crate::config::{MotionConfig, ObjectConfig};
     use crate::grid::Grid;
@@ -300,14 +301,14 @@ fn with_door(config: &mut ArenaConfig) -> Referee {
     let objects = MovingObjects::new(config, 0);
     let still = DistanceField::of(empty).into();
     let obstacles = Obstacles::new(still, vec![DistanceField::of(own).into()], objects);
-    // Its clock starts two seconds after the server's.
+    // The objects' clock starts two seconds after the server's.
     Referee::new(config, obstacles).counting_from(ServerTime::from_ns(2_000_000_000))
 }
 
 #[test]
-fn a_door_is_where_its_clock_says() {
-    // Up, then along x past the door, which is 2 s after the start; it slides through the middle at
-    // 3, 5, 7 s of the server's clock and is aside in between.
+fn door_moves_by_the_epoch() {
+    // Up, then along x past the door, which is reached 2 s after the start. The door is in the middle at 3, 5,
+    // 7 s of the server's clock, and out of the path in between.
     let way = [[0., 0., 0.], [0., 0., 1.], [8., 0., 1.]];
     for (start_s, meets) in [(1.0, true), (3.0, true), (2.0, false), (4.0, false)] {
         let mut referee = with_door(&mut arena());
@@ -321,7 +322,7 @@ fn a_door_is_where_its_clock_says() {
 }
 
 #[test]
-fn another_vehicle_in_the_way_is_an_obstacle() {
+fn another_vehicle_is_an_obstacle() {
     let config = arena();
     let mut referee = referee(&config);
     let there = Pose::new(DVec3::new(5.0, -1.0, 1.0), DQuat::IDENTITY);
@@ -335,25 +336,25 @@ fn another_vehicle_in_the_way_is_an_obstacle() {
 }
 
 #[test]
-fn an_imu_left_out_is_put_down_to_a_turned_frame_or_to_shaking() {
+fn excluded_imu_is_reported_with_probable_causes() {
     let mut referee = referee(&arena());
     let at = |s: f64| ServerTime::from_ns(0).plus_seconds(s);
     for i in 0..1000 {
         let t = 1.0 + 0.005 * f64::from(i);
         let turned = Pose::new(DVec3::ZERO, DQuat::from_rotation_z(2.0 * t));
         let _ = referee.handle_measurement(&Measured::new(at(t), turned));
-        // Its z axis is taken for another.
+        // The IMU's z axis is configured as another axis.
         let (accel_mps2, gyro_radps) = (DVec3::X * 9.81, DVec3::X * 2.0);
         referee.handle_imu(&ImuReading { stamp: at(t + 0.001), accel_mps2, gyro_radps });
     }
     let texts: Vec<_> =
         std::iter::from_fn(|| referee.poll_event()).map(|event| event.text).collect();
-    let told = texts.iter().find(|text| text.contains("is left out")).expect("it is told");
+    let told = texts.iter().find(|text| text.contains("is left out")).expect("no event");
     assert!(told.contains("turned against the autopilot"), "{told}");
-    assert!(told.ends_with("or does the vehicle shake?"), "it fits: {told}");
+    assert!(told.ends_with("or does the vehicle shake?"), "text was truncated: {told}");
 }
 
-/// The room without a post, of which only what lies west of x = 6 m was seen.
+/// Returns the arena without a post, seen only west of x = 6 m.
 fn half_seen(config: &ArenaConfig) -> DistanceField {
     use crate::seen::{ScenePlace, SeenSpace};
     let spec = BakeSpec::of(config);
@@ -369,7 +370,7 @@ fn half_seen(config: &ArenaConfig) -> DistanceField {
 }
 
 #[test]
-fn who_flies_where_nobody_has_looked_has_hit_unseen_space() {
+fn flight_into_unseen_space_is_a_collision() {
     let config = arena();
     let mut referee = Referee::new(&config, half_seen(&config));
     let events = fly(&mut referee, &[[0., 0., 0.], [0., 0., 1.], [8., 0., 1.]], 2.0, 1.0);
@@ -382,7 +383,7 @@ fn who_flies_where_nobody_has_looked_has_hit_unseen_space() {
 }
 
 #[test]
-fn a_goal_and_a_start_box_that_nobody_has_seen_are_found() {
+fn check_reports_unseen_goal_and_start_box() {
     let mut config = arena();
     config.rules.start_box = Some(crate::config::Geofence {
         min_m: DVec3::new(5.5, -0.5, 0.4),
@@ -392,7 +393,7 @@ fn a_goal_and_a_start_box_that_nobody_has_seen_are_found() {
     let keys: Vec<&str> = checked.findings.iter().map(|finding| finding.key.as_str()).collect();
     assert_eq!(keys, ["rules.start_box", "goal.position_m"]);
     assert!(checked.findings[0].text.starts_with("50 % of the start box"), "{checked:?}");
-    // And so is a start.
+    // An unseen start is found too.
     config.spawn.position_m.x = 7.0;
     let checked = crate::check::check(&config, &half_seen(&config).into());
     assert!(checked.findings[0].text.contains("touches unseen space"), "{checked:?}");

@@ -1,10 +1,11 @@
-//! Seen space as bytes: a header, one bit a voxel, a checksum.
+//! Serialization of seen space: a header, one bit per voxel, a checksum.
 //!
 //! ```text
 //! 8 magic, version | 32 SHA-256 of the scene | 11 f64: rotation xyzw, metres per unit, origin, corner | ...
 //! ... f64 voxel | 3 u64 voxels along x, y, z | bits | u64 FNV-1a of all before
 //! ```
-//! All numbers are little-endian. Read with suspicion: a bit too many is a vehicle that flies into a wall.
+//! All numbers are little-endian. The reader validates everything: a wrong bit may let a vehicle fly into a
+//! wall.
 
 use glam::{DQuat, DVec3};
 
@@ -12,30 +13,29 @@ use super::{ScenePlace, SeenSpace};
 use crate::config::METRES_PER_UNIT;
 use crate::grid::Grid;
 
-/// Why bytes are no seen space. Whichever it is: carve the scene again.
+/// Reason for rejecting the bytes of seen space. The solution is always to carve the scene again.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SeenError {
-    /// Another file, or another version of this one.
-    #[error("these bytes are no seen space of this version; carve the scene again")]
+    /// Another kind of file, or another version.
+    #[error("not seen space of this version; carve the scene again")]
     Other,
-    /// A number that cannot be.
-    #[error("its {0} cannot be; carve the scene again")]
+    /// A number out of range.
+    #[error("its {0} is out of range; carve the scene again")]
     Number(&'static str),
-    /// Too few or too many.
+    /// Wrong number of bytes.
     #[error("it has {found} bytes, and should have {expected}; carve the scene again")]
     Length {
-        /// Bytes there are.
         found: usize,
-        /// Bytes by the header.
+        /// Number of bytes according to the header.
         expected: usize,
     },
-    /// Some byte is not as it was written.
+    /// The bytes were changed.
     #[error("its checksum does not match: it is damaged; carve the scene again")]
     Checksum,
 }
 
 impl SeenSpace {
-    /// Returns the bytes that [`Self::from_bytes`] reads.
+    /// Returns the bytes for [`Self::from_bytes`].
     pub fn to_bytes(&self) -> Vec<u8> {
         let ScenePlace { rotation, metres_per_unit, origin_m } = self.place;
         let mut bytes = Vec::with_capacity(HEADER + self.bits.len() + 8);
@@ -50,10 +50,10 @@ impl SeenSpace {
         bytes
     }
 
-    /// Reads what [`Self::to_bytes`] returned.
+    /// Reads the result of [`Self::to_bytes`].
     ///
     /// # Errors
-    /// [`SeenError`] for anything else. Allocates no more than `bytes` holds.
+    /// [`SeenError`] for any other bytes. Allocates at most the length of `bytes`.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SeenError> {
         let (header, rest) = bytes.split_first_chunk::<HEADER>().ok_or(SeenError::Other)?;
         if header[..8] != MAGIC[..] {
@@ -99,20 +99,20 @@ impl SeenSpace {
     }
 }
 
-/// FNV-1a (Fowler, Noll, Vo), 64 bits: finds damage, not malice.
+/// FNV-1a (Fowler, Noll, Vo), 64 bits: detects damage, not manipulation.
 fn fnv1a(bytes: &[u8]) -> u64 {
     bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
     })
 }
 
-/// The last is the version: raise it when bytes mean something else.
+/// The last byte is the version: increase it if the meaning of bytes changes.
 const MAGIC: &[u8; 8] = b"vizseen\x01";
 /// Magic, hash, 12 numbers, 3 sizes.
 const HEADER: usize = 8 + 32 + 8 * 15;
-/// Well beyond what an arena may hold. [m]
+/// Far beyond the limits of an arena. [m]
 const FURTHEST_M: f64 = 1e6;
-/// What an arena may hold, and more. [m]
+/// Wider than the limits of an arena. [m]
 const VOXELS_M: std::ops::RangeInclusive<f64> = 1e-3..=10.0;
 
 #[cfg(test)]
@@ -125,7 +125,7 @@ mod tests {
         ScenePlace { rotation, metres_per_unit: 0.2, origin_m: DVec3::new(1.0, -2.0, 0.5) }
     }
 
-    /// A block of 4 x 3 x 5 voxels of 0.5 m, of which every third was seen.
+    /// A block of 4 x 3 x 5 voxels of 0.5 m; every third one was seen.
     fn space() -> SeenSpace {
         let grid = Grid { min_m: DVec3::new(-1.0, 0.0, 2.0), voxel_m: 0.5, size: [4, 3, 5] };
         let mut bits = vec![0; 8];
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_say_what_is_wrong() {
+    fn errors_name_the_problem() {
         let good = space().to_bytes();
         assert_eq!(SeenSpace::from_bytes(&good), Ok(space()));
         let check = |at: usize, new: &[u8], expected: &str| {
@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_seen_moves_with_the_scene() {
+    fn seen_space_moves_with_the_scene() {
         let (space, then) = (space(), place());
         let now = ScenePlace {
             rotation: DQuat::from_rotation_y(0.7),
@@ -193,7 +193,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_reads_back(
+        fn seen_space_round_trips(
             size in prop::array::uniform3(1..9usize), noise in any::<u64>(), voxel_m in 0.01..2.0f64,
         ) {
             let grid = Grid { min_m: DVec3::new(-3.0, 2.0, 0.1), voxel_m, size };
@@ -207,7 +207,7 @@ mod tests {
         }
 
         #[test]
-        fn any_bytes_are_an_error_or_sound(tail in prop::collection::vec(any::<u8>(), 0..300)) {
+        fn any_bytes_give_an_error_or_valid_seen_space(tail in prop::collection::vec(any::<u8>(), 0..300)) {
             let mut any = [&MAGIC[..], &tail].concat();
             let sum = fnv1a(&any).to_le_bytes();
             any.extend(sum);
@@ -217,7 +217,7 @@ mod tests {
         }
 
         #[test]
-        fn one_wrong_bit_is_noticed(at in 0..1408usize) {
+        fn rejects_one_wrong_bit(at in 0..1408usize) {
             let mut bytes = space().to_bytes();
             bytes[at / 8] ^= 1 << (at % 8);
             prop_assert!(SeenSpace::from_bytes(&bytes).is_err());

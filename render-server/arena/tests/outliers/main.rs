@@ -1,5 +1,5 @@
-//! Outliers of any size and pattern are left out, true jumps are found, manoeuvres are followed, and all in words that are
-//! right. By fixed seeds, as chance is part of the question.
+//! The filter rejects outliers of any size and pattern, accepts lasting jumps, follows manoeuvres, and gives
+//! correct reasons. Seeds are fixed, because the results depend on chance.
 
 mod scenario;
 
@@ -44,9 +44,10 @@ fn jump() -> impl Strategy<Value = DVec3> {
 }
 
 impl Scenario {
-    /// The same at a rate at which an outlier of 5 cm can be told from this flight. With 5 mm of noise at 10 Hz poses are 11 mm
-    /// off what even the right process noise expects of it, an axis, so that 4.5 standard deviations are as far as the least
-    /// outliers; an IMU halves that, where the sigma need not be learnt besides.
+    /// Raises the rate until outliers of 5 cm can be distinguished from this flight. With 5 mm of noise at 10
+    /// Hz, even with the right process noise, poses deviate by 11 mm per axis from the expectation, so that 4.5
+    /// standard deviations equal the smallest outliers. An IMU halves that, unless the sigma must be learnt as
+    /// well.
     fn decidable(self) -> Self {
         let least_hz = match (self.imu, self.sent) {
             _ if self.noise_m < 0.005 => 10.0,
@@ -57,19 +58,19 @@ impl Scenario {
         Self { rate_hz: self.rate_hz.max(least_hz), ..self }
     }
 
-    /// The largest outlier that noise may explain, where outliers come so densely that the source counts as noisy. [m]
+    /// Largest outlier that can pass as noise if outliers are so frequent that the source counts as noisy. [m]
     fn explained_m(&self) -> f64 {
         if self.noise_m > 0.001 { 0.1 } else { 0.0 }
     }
 }
 
 proptest! {
-    // Of other seeds, fewer than one flight in 150 at those rates has a reset; of the outliers, one in 500 is accepted with
-    // 5 mm of noise.
+    // For other seeds, fewer than one flight in 150 at these rates has a reset; with 5 mm of noise, one outlier
+    // in 500 is accepted.
     #![proptest_config(ProptestConfig { rng_seed: RngSeed::Fixed(1), ..ProptestConfig::with_cases(600) })]
 
     #[test]
-    fn isolated_outliers_are_left_out_one_by_one(scenario in scenario()) {
+    fn rejects_isolated_outliers(scenario in scenario()) {
         let scenario = Scenario { burst: 1, ..scenario }.decidable();
         let clean = scenario.run(0.0, DVec3::ZERO);
         let outcome = scenario.run(0.05, DVec3::ZERO);
@@ -78,13 +79,13 @@ proptest! {
         let worst_m = outcome.accepted_outliers().fold(0.0, f64::max);
         prop_assert!(worst_m <= scenario.explained_m(), "{}", worst_m);
         prop_assert!(outcome.ate_m() <= 1.3 * clean.ate_m(), "{} {}", outcome.ate_m(), clean.ate_m());
-        // What is inside the gate is taken, whatever came before.
+        // True poses inside the gate are accepted regardless of earlier ones.
         prop_assert!(outcome.left_out().max(clean.left_out()) * 100 <= POSES, "{}", outcome.left_out());
     }
 
-    /// Two in a row, at one false place or at two: whether they agree or not, the third is the truth again.
+    /// Two outliers in a row, at one false position or two: the third pose is true again.
     #[test]
-    fn two_outliers_in_a_row_are_no_jump(scenario in scenario()) {
+    fn two_outliers_in_a_row_are_not_a_jump(scenario in scenario()) {
         let least_hz = if scenario.noise_m > 0.001 { 60.0 } else { 20.0 };
         let scenario = Scenario { burst: 2, rate_hz: scenario.rate_hz.max(least_hz), ..scenario };
         let outcome = scenario.run(0.025, DVec3::ZERO);
@@ -94,13 +95,13 @@ proptest! {
     }
 
     #[test]
-    fn a_moved_origin_is_found_within_five_poses(scenario in scenario(), jump_m in jump()) {
+    fn accepts_a_moved_origin_within_five_poses(scenario in scenario(), jump_m in jump()) {
         let outcome = scenario.run(0.0, jump_m);
         let after = &outcome.taken[JUMP_AT..];
         prop_assert_eq!(outcome.resets(), 1, "{:?}", &after[..8]);
         let taken = after.iter().position(|taken| taken.result.is_ok());
         prop_assert!(taken.is_some_and(|taken| taken < 5), "{:?} {:?}", taken, &after[..8]);
-        // It is said how far, as far as noise and flight let anyone know.
+        // The reported distance is as accurate as noise and flight allow.
         let said = outcome.changes.iter().find_map(|change| match change {
             PoseChange::Jumped(distance_m, _) => Some(*distance_m),
             _ => None,
@@ -110,7 +111,7 @@ proptest! {
     }
 
     #[test]
-    fn words_are_right(scenario in scenario(), jump_m in jump(), flips in any::<bool>()) {
+    fn reasons_for_rejection_are_right(scenario in scenario(), jump_m in jump(), flips in any::<bool>()) {
         let outcome = scenario.run(0.05, if flips { DVec3::ZERO } else { jump_m });
         let gate = PoseConfig::default().gate_sigmas;
         let mut newest_s = 0.0;
@@ -122,13 +123,14 @@ proptest! {
             };
             let words = reason.to_string();
             match reason {
-                // Never one that the reader would take for a good pose.
+                // The printed value must not look like a good pose.
                 Rejected::Outlier(sigmas) => {
                     prop_assert!(sigmas > gate, "{}", words);
                     before_m = Some(f64::INFINITY);
                 }
                 Rejected::Jump { distance_m, speed_mps } => {
-                    // As far as is printed: faster than vehicles fly, or at a place where the last one was too.
+                    // By the printed numbers: faster than vehicles fly, or at the same position as the last
+                    // rejected pose.
                     let dt_s = taken.t - newest_s;
                     prop_assert!((speed_mps - distance_m / dt_s).abs() < 0.01 * speed_mps, "{}", words);
                     prop_assert!(speed_mps > 15.0 || before_m.is_some(), "{}", words);
@@ -136,16 +138,16 @@ proptest! {
                     before_m = Some(distance_m);
                 }
                 Rejected::Flip(angle_rad) => prop_assert!(angle_rad > 0.2, "{}", words),
-                _ => prop_assert!(false, "nothing else is wrong here: {}", words),
+                _ => prop_assert!(false, "unexpected reason: {}", words),
             }
         }
     }
 }
 
-/// With an IMU nothing of them is left out; without one the beginning is, where it looks like an outlier. Neither is a jump
-/// or a loss.
+/// With an IMU, no manoeuvre is rejected; without one, only its start, because it looks like an outlier. Neither
+/// jumps nor losses occur.
 #[test]
-fn hard_manoeuvres_are_followed() {
+fn follows_hard_manoeuvres() {
     for (rate_hz, imu) in [10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 200.0]
         .into_iter()
         .flat_map(|rate_hz| [(rate_hz, true), (rate_hz, false)])
@@ -160,14 +162,14 @@ fn hard_manoeuvres_are_followed() {
             let outcome = scenario.run(0.0, DVec3::ZERO);
             assert_eq!((outcome.resets(), outcome.lost()), (0, 0), "{scenario:?}");
             let most = if imu { POSES / 200 } else { POSES / 40 };
-            assert!(outcome.left_out() <= most, "{scenario:?}: {} left out", outcome.left_out());
+            assert!(outcome.left_out() <= most, "{scenario:?}: {} rejected", outcome.left_out());
         }
     }
 }
 
-/// Hover with 1 mm of noise, three outliers.
+/// Hover with 1 mm of noise and three outliers.
 #[test]
-fn the_truth_is_taken_right_after_an_outlier() {
+fn accepts_the_truth_right_after_an_outlier() {
     let at = |seconds: f64| ServerTime::from_ns(1_000_000_000).plus_seconds(seconds);
     for (rate_hz, size_m) in [(30.0, 0.5), (30.0, 0.9), (60.0, 0.3), (100.0, 0.25), (10.0, 0.5)] {
         let mut filter = PoseFilter::default();

@@ -1,4 +1,5 @@
-//! A flight whose truth is known, measured with outliers: what the filter accepts, and what that costs. By fixed seeds.
+//! Simulated flight with known truth, measured with outliers: accepted poses and resulting error. Seeds are
+//! fixed.
 
 use glam::{DQuat, DVec3};
 use vizflyt_arena::pose::{ImuReading, Measured, PoseChange, PoseFilter, PoseSigma, Rejected};
@@ -6,22 +7,22 @@ use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::messages::PoseSample;
 use vizflyt_protocol::time::ServerTime;
 
-/// What is flown, and how badly it is measured.
+/// Parameters of flight and measurement.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scenario {
     pub(crate) seed: u64,
-    /// Of poses. [Hz]
+    /// Rate of poses. [Hz]
     pub(crate) rate_hz: f64,
-    /// Of the positions; attitudes have 0.5 degrees for 5 mm. [m]
+    /// Noise of positions; attitudes have 0.5 degrees for 5 mm. [m]
     pub(crate) noise_m: f64,
-    /// Whether the sigma is sent along.
+    /// Whether measurements contain their sigma.
     pub(crate) sent: bool,
-    /// How many outliers follow each other.
+    /// Number of consecutive outliers.
     pub(crate) burst: usize,
-    /// Whether those of a burst show the same false place.
+    /// Whether the outliers of a burst are at the same false position.
     pub(crate) agree: bool,
     pub(crate) flight: Flight,
-    /// Whether the autopilot's IMU comes too: 100 Hz, four readings a batch, 30 ms late.
+    /// Whether to simulate the autopilot's IMU: 100 Hz, four readings per batch, 30 ms late.
     pub(crate) imu: bool,
 }
 
@@ -30,27 +31,27 @@ pub(crate) enum Flight {
     Hover,
     /// A figure of eight at up to 1.5 m/s.
     Eight,
-    /// To and fro by 1.5 m in a second, at up to 8.7 m/s^2 and 90 m/s^3, with a second of hover between.
+    /// Back and forth by 1.5 m in a second, at up to 8.7 m/s^2 and 90 m/s^3, with a second of hover in between.
     Dashes,
 }
 
-/// One measurement, and what became of it.
+/// A measurement and its result.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Taken {
-    /// When it was made. [s]
+    /// Time of the measurement. [s]
     pub(crate) t: f64,
-    /// Where the vehicle was, in the frame of the measurements.
+    /// True pose, in the frame of the measurements.
     pub(crate) truth: Pose<World, Body>,
-    /// How far it is off on purpose. [m]
+    /// Size of the outlier; 0 for a true pose. [m]
     pub(crate) off_m: f64,
     pub(crate) result: Result<PoseSample, Rejected>,
 }
 
-/// How a scenario went.
+/// Result of a scenario.
 #[derive(Debug, Default)]
 pub(crate) struct Outcome {
     pub(crate) taken: Vec<Taken>,
-    /// What was said on the way.
+    /// Changes reported during the run.
     pub(crate) changes: Vec<PoseChange>,
 }
 
@@ -71,7 +72,7 @@ impl Noise {
         DVec3::new(self.normal(), self.normal(), self.normal())
     }
 
-    /// 0.05 to 5 m in any direction, each decade as often.
+    /// Returns an outlier of 0.05 to 5 m in any direction, each decade equally likely.
     fn outlier(&mut self) -> DVec3 {
         self.normal3().normalize_or(DVec3::X) * 0.05 * 100f64.powf(self.uniform())
     }
@@ -100,7 +101,7 @@ impl Scenario {
         Pose::new(p, DQuat::from_rotation_z(0.6 * (0.5 * t).sin()))
     }
 
-    /// Readings of the IMU with the noise and biases of a flight controller's, and when each arrives. [s]
+    /// Returns IMU readings with the noise and biases of a flight controller, and the arrival time of each. [s]
     fn readings(&self, noise: &mut Noise) -> Vec<(f64, ImuReading)> {
         let count = if self.imu { (POSES as f64 / self.rate_hz * 100.0) as u32 } else { 0 };
         let read = |k: u32| {
@@ -117,13 +118,14 @@ impl Scenario {
                     + DVec3::new(0.01, -0.01, 0.02)
                     + noise.normal3() * 0.01,
             };
-            // The last of its batch, and the way.
+            // Arrival of the last reading of its batch, plus transmission.
             (f64::from(k / 4 * 4 + 3) * 0.01 + 0.03, reading)
         };
         (0..count).map(read).collect()
     }
 
-    /// Runs [`POSES`] poses, of which `share` begin a burst of outliers; `jump_m` moves the origin after [`JUMP_AT`].
+    /// Runs [`POSES`] poses, of which `share` start a burst of outliers; `jump_m` moves the origin after
+    /// [`JUMP_AT`].
     pub(crate) fn run(&self, share: f64, jump_m: DVec3) -> Outcome {
         let mut noise = Noise(self.seed);
         let mut faults = Noise(self.seed ^ 0x9e37_79b9_7f4a_7c15);
@@ -170,7 +172,7 @@ impl Scenario {
 }
 
 impl Outcome {
-    /// Returns how many outliers there were.
+    /// Returns the number of outliers.
     pub(crate) fn outliers(&self) -> usize {
         self.taken.iter().filter(|taken| taken.off_m > 0.0).count()
     }
@@ -181,7 +183,7 @@ impl Outcome {
         accepted.map(|taken| taken.off_m)
     }
 
-    /// Returns how many true poses were left out.
+    /// Returns the number of rejected true poses.
     pub(crate) fn left_out(&self) -> usize {
         self.taken.iter().filter(|taken| taken.off_m == 0.0 && taken.result.is_err()).count()
     }
@@ -198,7 +200,7 @@ impl Outcome {
         self.changes.iter().filter(|change| matches!(change, PoseChange::Lost(..))).count()
     }
 
-    /// Returns the fused poses after the filter has settled, each beside its time and the truth.
+    /// Returns the fused poses after the filter has settled, with their time and the true pose.
     pub(crate) fn fused(&self) -> impl Iterator<Item = (f64, PoseSample, Pose<World, Body>)> {
         let settled = self.taken.iter().skip(SETTLED);
         settled.filter_map(|taken| Some((taken.t, taken.result.ok()?, taken.truth)))
@@ -214,9 +216,9 @@ impl Outcome {
     }
 }
 
-/// Poses of a run: two seconds at 200 Hz.
+/// Number of poses per run: two seconds at 200 Hz.
 pub(crate) const POSES: usize = 400;
-/// Poses after which outliers begin.
+/// Number of poses before the first outlier.
 pub(crate) const SETTLED: usize = 40;
-/// Where the origin moves.
+/// Index of the pose at which the origin moves.
 pub(crate) const JUMP_AT: usize = 200;

@@ -1,6 +1,7 @@
-//! docs/guides/arena-reference.md is written from the types that read `arena.toml`; these tests hold it to them.
+//! Tests that docs/guides/arena-reference.md matches the types that read `arena.toml`; it is generated from
+//! them.
 //!
-//! `UPDATE=1 cargo test -p vizflyt-arena --test reference` writes the page anew.
+//! `UPDATE=1 cargo test -p vizflyt-arena --test reference` writes the page again.
 
 mod page;
 mod probe;
@@ -16,16 +17,16 @@ use page::{Page, sections};
 use probe::Place;
 use source::{Kind, Shape, Types};
 
-/// A whole arena, from which the page takes its examples.
+/// A complete arena, from which the page takes its examples.
 const EXAMPLE: &str = include_str!("example.toml");
 
-/// Tables of the top whose keys the server reads: the arena's reader takes them as they are.
+/// Top-level tables for the server: the arena's reader does not parse their keys.
 const BY_SERVER: &[&str] = &["localization"];
 
 const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/guides/arena-reference.md");
 
 #[test]
-fn the_page_is_what_the_types_say() {
+fn page_matches_the_types() {
     let types = Types::read();
     let written = Page::write(&types, &probe::places(&types));
     if std::env::var_os("UPDATE").is_some() {
@@ -36,13 +37,13 @@ fn the_page_is_what_the_types_say() {
     let differs = written.lines().zip(committed.lines()).find(|(new, old)| new != old);
     assert!(
         written == committed,
-        "docs/guides/arena-reference.md is not what the types say, first in {differs:?}; run \
+        "docs/guides/arena-reference.md does not match the types, first in {differs:?}; run \
          UPDATE=1 cargo test -p vizflyt-arena --test reference to write it"
     );
 }
 
 #[test]
-fn serde_knows_the_same_keys_and_needs_the_same() {
+fn serde_accepts_and_requires_the_same_keys() {
     let types = Types::read();
     let places = probe::places(&types);
     let page = Page::write(&types, &places);
@@ -67,18 +68,18 @@ fn serde_knows_the_same_keys_and_needs_the_same() {
             checked += 1;
         }
     }
-    assert!(checked > 150, "{checked} keys alone");
+    assert!(checked > 150, "only {checked} keys");
 }
 
-/// Whether a key has a row: in its table's section, in that of a table of the top of the same type, or a section of its
-/// own.
+/// Whether a key has a row: in its table's section, in that of a top-level table of the same type, or a section
+/// for itself.
 fn is_on(page: &str, types: &Types, place: &Place, key: &str) -> bool {
     let section = |name: &str| {
         let mut sections = page.split("\n## ").skip(1);
         sections.find(|text| text.lines().next().unwrap().trim_matches(['`', '[', ']']) == name)
     };
     let Some(top) = place.way.first() else {
-        return section(key).is_some() || has_row(section("Above the first table").unwrap(), key);
+        return section(key).is_some() || has_row(section("Top-level keys").unwrap(), key);
     };
     let inside: String = place.way[1..].iter().flat_map(|step| [step.key.as_str(), "."]).collect();
     let same = types
@@ -96,7 +97,7 @@ fn has_row(section: &str, key: &str) -> bool {
 }
 
 #[test]
-fn the_examples_are_an_arena() {
+fn examples_are_a_valid_arena() {
     let arena = ArenaConfig::parse(EXAMPLE).unwrap();
     assert_eq!(ArenaConfig::parse(&arena.to_toml().unwrap()).unwrap(), arena);
     // `# key = value   # in place of a and b`
@@ -122,7 +123,7 @@ fn the_examples_are_an_arena() {
 }
 
 #[test]
-fn the_server_has_the_keys_of_its_examples() {
+fn server_has_the_keys_of_its_examples() {
     let types = Types::read();
     let example: Table = EXAMPLE.parse().unwrap();
     for name in BY_SERVER {
@@ -157,7 +158,7 @@ fn has_keys(types: &Types, table: &str, given: &Table) {
 }
 
 #[test]
-fn words_are_those_that_the_code_reads() {
+fn words_match_the_code() {
     let types = Types::read();
     let Shape::Word(words) = &types.get("Up").shape else { panic!("up is a word") };
     let said: Vec<_> = words.iter().map(|word| word.name.as_str()).collect();

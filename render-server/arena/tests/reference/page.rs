@@ -1,4 +1,4 @@
-//! The page: a section for each table at the top of the file, in the example's order.
+//! The page: one section per top-level table, in the order of the example.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -14,18 +14,19 @@ const HEAD: &str = "\
 
 <!-- Written by `UPDATE=1 cargo test -p vizflyt-arena --test reference` from the types that read the file. -->
 
-What stands in the room, what is flown through, and by which rules: how to use it is in [scenes.md](scenes.md) and
-[course.md](course.md), here is every key. `vizflyt arena new` writes a first file, `vizflyt arena check` finds mistakes.
-A key that is not known is refused with its line.
+Reference of all keys of `arena.toml`: the room, the course, the vehicle and the rules. For their use, see
+[scenes.md](scenes.md) and [course.md](course.md). `vizflyt arena new` writes a first file; `vizflyt arena check` finds
+errors. Unknown keys are rejected with their line.
 
-- **Type** says what a key holds and, of numbers, from where to where they may go.
-- **Unit** is that of the numbers, and the frame ([COORDINATES.md](../COORDINATES.md)): *world* is the room, z up; *body* is the
-  vehicle, x forward, y left, z up.
-- **Default** holds without the key. *required*: the key must be there. *none*: it may be left out; the text says what then holds.
-- `rain.rate_mmph` is the key `rate_mmph` in `rain = { rate_mmph = 5.0 }`. A `[[table]]` may be there several times.
+- **Type**: type of the value, and the range of numbers.
+- **Unit**: unit of the numbers, and their frame ([COORDINATES.md](../COORDINATES.md)): *world* is the room, z up;
+  *body* is the vehicle, x forward, y left, z up.
+- **Default**: value if the key is absent. *required*: the key must be present. *none*: the key is optional, and its
+  text describes the effect of leaving it out.
+- `rain.rate_mmph` is the key `rate_mmph` in `rain = { rate_mmph = 5.0 }`. A `[[table]]` may occur several times.
 ";
 
-/// Where more is said of a table.
+/// Guide with more information for each table.
 const GUIDES: &[(&str, &str)] = &[
     ("scene", "scenes.md"),
     ("geofence", "safety.md"),
@@ -44,10 +45,10 @@ const GUIDES: &[(&str, &str)] = &[
     ("pose", "pose.md"),
 ];
 
-/// Said of keys that share a row.
+/// Maximum length of a description that may share a row with others.
 const SHORT: usize = 60;
 
-/// The sections of the example: a table's name, empty for the top, and its lines.
+/// Returns the sections of the example: a table's name, empty for top-level keys, and its lines.
 pub(crate) fn sections(example: &str) -> Vec<(String, String)> {
     let mut sections = vec![(String::new(), String::new())];
     for line in example.lines() {
@@ -68,7 +69,7 @@ pub(crate) fn sections(example: &str) -> Vec<(String, String)> {
     sections
 }
 
-/// Writes the page.
+/// Generator of the page.
 pub(crate) struct Page<'a> {
     types: &'a Types,
     ranges: BTreeMap<String, String>,
@@ -95,7 +96,7 @@ impl<'a> Page<'a> {
         page.text
     }
 
-    /// Returns how a table of the top is headed: `[goal]`, `[[stages]]`.
+    /// Returns the header of a top-level table: `[goal]`, `[[stages]]`.
     fn header(&self, name: &str) -> String {
         let key = self.top(name);
         let (_, list) = self.types.table_of(&key.kind).unwrap();
@@ -104,18 +105,18 @@ impl<'a> Page<'a> {
 
     fn top(&self, name: &str) -> &'a Key {
         let mut keys = self.types.keys("ArenaConfig", None).iter();
-        keys.find(|key| key.name == name).unwrap_or_else(|| panic!("[{name}] is no table"))
+        keys.find(|key| key.name == name).unwrap_or_else(|| panic!("[{name}] is not a table"))
     }
 
     fn section(&mut self, name: &str, example: &str) {
         let mut place = Place { way: Vec::new(), table: "ArenaConfig".to_owned() };
         if name.is_empty() {
-            self.text.push_str("\n## Above the first table\n");
+            self.text.push_str("\n## Top-level keys\n");
         } else {
             let key = self.top(name);
             let (table, list) = self.types.table_of(&key.kind).unwrap();
             let mut said = vec![linked_to_names(&key.doc)];
-            // Of a single table the key says it all; of several, what each of them is.
+            // A single table is described by its key; a list also by its type.
             said.extend(list.then(|| linked_to_names(&each(&self.types.get(table).doc))));
             said.extend(key.required.then(|| "Required.".to_owned()));
             let guide = GUIDES.iter().find(|(known, _)| *known == name);
@@ -133,7 +134,7 @@ impl<'a> Page<'a> {
         write!(self.text, "\n```toml\n{example}\n```\n").unwrap();
     }
 
-    /// Writes the rows of a table, and of tables in it.
+    /// Writes the rows of a table, and of tables inside it.
     fn rows(&mut self, place: &Place, prefix: &str, of: &str) {
         let types = self.types;
         let by_server =
@@ -200,7 +201,7 @@ impl<'a> Page<'a> {
         }
     }
 
-    /// Returns the table of the top that has the same type, if one has.
+    /// Returns the top-level table of the same type, if there is one.
     fn home(&self, table: &str) -> Option<&'a str> {
         let mut keys = self.types.keys("ArenaConfig", None).iter();
         let same =
@@ -229,7 +230,7 @@ impl<'a> Page<'a> {
         }
     }
 
-    /// Returns what is said of a key, with the words that it may hold.
+    /// Returns the description of a key, with the words that it may contain.
     fn said(&self, key: &Key) -> String {
         let mut kind = self.types.kind_of(&key.kind);
         while let Kind::List(inner) = kind {
@@ -248,7 +249,7 @@ impl<'a> Page<'a> {
     }
 }
 
-/// A row of a table of keys.
+/// A row of the table of keys.
 struct Row {
     names: String,
     cells: [String; 3],
@@ -256,7 +257,7 @@ struct Row {
 }
 
 impl Row {
-    /// Whether another key fits into the row: the same but for short words.
+    /// Whether another key fits into the row: all cells are equal, except short descriptions.
     fn takes(&self, other: &Self) -> bool {
         let short = |said: &str| said.len() < SHORT && said.ends_with('.') && !said.contains(';');
         let last = self.said.rsplit_once("; ").map_or(self.said.as_str(), |(_, last)| last);
@@ -276,7 +277,7 @@ impl Row {
     }
 }
 
-/// Returns words and what each means.
+/// Returns words with their meanings.
 fn words(variants: &[Variant]) -> String {
     let word = |variant: &Variant| {
         format!("`{}`: {}", variant.name, linked_to_names(variant.doc.trim_end_matches('.')))
@@ -284,7 +285,7 @@ fn words(variants: &[Variant]) -> String {
     variants.iter().map(word).collect::<Vec<_>>().join("; ") + "."
 }
 
-/// Returns what each table of a list is, without the list's name, which is above it anyway.
+/// Returns the description of each table in a list, without the list's name, which is in the header.
 fn each(doc: &str) -> String {
     let said = doc.strip_prefix('`').and_then(|doc| doc.split_once("`: ")).map(|(_, said)| said);
     let says_more = |said: &&str| !said.starts_with("one ");
@@ -292,7 +293,7 @@ fn each(doc: &str) -> String {
     letters.next().into_iter().flat_map(char::to_uppercase).chain(letters).collect()
 }
 
-/// Returns a sentence as it is written after a semicolon.
+/// Returns a sentence in the form after a semicolon.
 fn in_sentence(said: &str) -> String {
     let mut letters = said.chars();
     letters.next().into_iter().flat_map(char::to_lowercase).chain(letters).collect()
@@ -315,7 +316,7 @@ fn wrapped(text: &str) -> String {
     lines.join("\n")
 }
 
-/// Returns a doc comment whose links into the code are what they stand for.
+/// Returns a doc comment with links into the code replaced by names.
 fn linked_to_names(doc: &str) -> String {
     let names = |names: Vec<&str>| {
         names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ")
@@ -323,6 +324,6 @@ fn linked_to_names(doc: &str) -> String {
     let doc = doc
         .replace("[`SENSORS`]", &names(SENSORS.iter().map(|(name, _)| *name).collect()))
         .replace("[`DEPTHS`]", &names(DEPTHS.iter().map(|(name, _)| *name).collect()));
-    assert!(!doc.contains("[`"), "this links into the code, which a page cannot: {doc}");
+    assert!(!doc.contains("[`"), "a page cannot contain a link into the code: {doc}");
     doc.replace('|', "\\|")
 }

@@ -1,5 +1,5 @@
-//! What the real reader of `arena.toml` says to texts that are made for the question: which keys it knows and needs, what
-//! holds without one, and from where to where numbers may go.
+//! Probes the real reader of `arena.toml` with generated texts: accepted and required keys, defaults, and
+//! ranges of numbers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -11,7 +11,8 @@ use vizflyt_arena::config::ConfigError;
 
 use super::source::{Kind, Shape, Types};
 
-/// One step down to a table: the key, whether it holds a list of such tables, and which variant of a tagged table.
+/// One step down to a table: the key, whether it contains a list of such tables, and the variant of a tagged
+/// table.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Step {
     pub(crate) key: String,
@@ -19,7 +20,7 @@ pub(crate) struct Step {
     pub(crate) variant: Option<String>,
 }
 
-/// A table of the file: the way to it, and its type.
+/// A table of the file: its path and its type.
 #[derive(Clone, Debug)]
 pub(crate) struct Place {
     pub(crate) way: Vec<Step>,
@@ -31,13 +32,13 @@ impl Place {
         self.way.last()?.variant.as_deref()
     }
 
-    /// Returns the way as errors have it: `cameras.imaging`.
+    /// Returns the path in the form of error messages: `cameras.imaging`.
     pub(crate) fn name(&self) -> String {
         self.way.iter().map(|step| step.key.as_str()).collect::<Vec<_>>().join(".")
     }
 }
 
-/// Returns every table of the file, each variant for itself, from the top down.
+/// Returns every table of the file, each variant separately, from the top down.
 pub(crate) fn places(types: &Types) -> Vec<Place> {
     let mut places = vec![Place { way: Vec::new(), table: "ArenaConfig".to_owned() }];
     let mut next = 0;
@@ -61,7 +62,7 @@ pub(crate) fn places(types: &Types) -> Vec<Place> {
     places
 }
 
-/// Returns a file with the required keys alone, and those on the way to a table, which `change` may change.
+/// Returns a file with only the required keys and those on the path to a table, which `change` may change.
 pub(crate) fn least_file(types: &Types, place: &Place, change: &dyn Fn(&mut Table)) -> Table {
     along(types, "ArenaConfig", None, &place.way, change)
 }
@@ -113,12 +114,12 @@ fn least_value(types: &Types, kind: &Kind) -> Value {
     }
 }
 
-/// Reads a file without asking whether its values can work together.
+/// Reads a file without validating its values.
 pub(crate) fn read(file: Table) -> Result<ArenaConfig, String> {
     Value::Table(file).try_into().map_err(|error: toml::de::Error| error.message().to_owned())
 }
 
-/// Returns the keys that the reader names when it is given one that it does not know.
+/// Returns the keys that the reader lists in its error for an unknown key.
 pub(crate) fn known_keys(types: &Types, place: &Place) -> BTreeSet<String> {
     let file = least_file(types, place, &|table| {
         table.insert("no_such_key".to_owned(), true.into());
@@ -130,11 +131,11 @@ pub(crate) fn known_keys(types: &Types, place: &Place) -> BTreeSet<String> {
     expected.split('`').skip(1).step_by(2).map(str::to_owned).collect()
 }
 
-/// Returns what holds for each key of a table that is left out: as TOML, `None` for nothing.
+/// Returns the default of each key of a table in TOML; `None` if there is none.
 pub(crate) fn defaults(types: &Types, place: &Place) -> BTreeMap<String, Option<String>> {
     let config = read(least_file(types, place, &|_| ()))
         .unwrap_or_else(|error| panic!("{}: {error}", place.name()));
-    // As Rust writes it, with the keys that serde leaves out of a file.
+    // In Rust's debug form, which has the keys that serde leaves out of a file.
     let config = format!("{config:?}");
     let config = syn::parse_str::<Expr>(&config).unwrap_or_else(|e| panic!("{e}: {config}"));
     let mut inside = &config;
@@ -151,9 +152,9 @@ pub(crate) fn defaults(types: &Types, place: &Place) -> BTreeMap<String, Option<
         .collect()
 }
 
-/// Returns the value of a struct's field, out of `Some` if it is in it; a field may have the unit that its key lacks.
+/// Returns the value of a struct's field, without `Some`; a field may have a unit suffix that its key lacks.
 fn field<'a>(of: &'a Expr, key: &str) -> &'a Expr {
-    let Expr::Struct(of) = of else { panic!("no struct that could have {key}") };
+    let Expr::Struct(of) = of else { panic!("not a struct with {key}") };
     let named = |name: &str| {
         of.fields.iter().find(|field| matches!(&field.member, syn::Member::Named(m) if m == name))
     };
@@ -169,7 +170,7 @@ fn path_is(expr: &Expr, name: &str) -> bool {
     matches!(expr, Expr::Path(path) if path.path.is_ident(name))
 }
 
-/// Returns a value that Rust has written as TOML writes it; `None` for nothing, an empty list, and tables.
+/// Returns a Rust value in TOML; `None` for `None`, an empty list, and tables.
 fn written(types: &Types, kind: &Kind, value: &Expr) -> Option<String> {
     let list = |values: &syn::punctuated::Punctuated<Expr, syn::Token![,]>| {
         let values: Option<Vec<_>> =
@@ -182,15 +183,15 @@ fn written(types: &Types, kind: &Kind, value: &Expr) -> Option<String> {
             syn::Lit::Int(number) => number.to_string(),
             syn::Lit::Bool(flag) => flag.value.to_string(),
             syn::Lit::Str(text) => format!("{:?}", text.value()),
-            _ => panic!("a default that is no number, flag or text"),
+            _ => panic!("a default that is not a number, flag or text"),
         }),
         Expr::Unary(negative) => Some(format!("-{}", written(types, kind, &negative.expr)?)),
         Expr::Array(array) => list(&array.elems),
         Expr::Call(vector) => list(&vector.args),
         Expr::Path(path) if !path_is(value, "None") => {
-            let Kind::Named(name) = kind else { panic!("a word that is no type's") };
+            let Kind::Named(name) = kind else { panic!("a word without a type") };
             let variant = path.path.get_ident().unwrap().to_string().to_lowercase();
-            let Shape::Word(words) = &types.get(name).shape else { panic!("{name} is no word") };
+            let Shape::Word(words) = &types.get(name).shape else { panic!("{name} is not a word") };
             let same = |word: &&super::source::Variant| {
                 word.name.replace(['-', '_'], "").eq_ignore_ascii_case(&variant)
             };
@@ -200,8 +201,8 @@ fn written(types: &Types, kind: &Kind, value: &Expr) -> Option<String> {
     }
 }
 
-/// From where to where a number may go, by the keys of [`Place::name`] and their own: as the refusals of numbers that are
-/// none say it. A key whose range hangs on other values of its arena is left out.
+/// Returns the ranges of numbers by [`Place::name`] and key, from the errors for NaN. Excludes keys whose range
+/// depends on other values of the arena.
 pub(crate) fn ranges(types: &Types, places: &[Place], example: &str) -> BTreeMap<String, String> {
     let example: Table = example.parse().unwrap();
     let mut larger = example.clone();
@@ -224,14 +225,14 @@ pub(crate) fn ranges(types: &Types, places: &[Place], example: &str) -> BTreeMap
     found.into_iter().map(|(key, ranges)| (key, ranges.into_iter().collect())).collect()
 }
 
-/// A step down to a value of a real file.
+/// A step down to a value of a file.
 #[derive(Clone, Debug)]
 enum Part {
     Key(String),
     Index(usize),
 }
 
-/// Returns where tables of a place are in a file; a file that has none is given one.
+/// Returns the positions of a table in a file; inserts one if the file has none.
 fn spots(types: &Types, file: &Table, place: &Place) -> Vec<(Value, Vec<Part>)> {
     let mut spots = vec![(Value::Table(file.clone()), Vec::new())];
     let (mut name, mut variant) = ("ArenaConfig", None);
@@ -271,7 +272,7 @@ fn spots(types: &Types, file: &Table, place: &Place) -> Vec<(Value, Vec<Part>)> 
     spots
 }
 
-/// Returns a value of a file, and its name as errors have it: `cameras[1].imaging`.
+/// Returns a value of a file, and its name in the form of error messages: `cameras[1].imaging`.
 fn at<'a>(file: &'a mut Value, way: &[Part]) -> (&'a mut Value, String) {
     let mut name = String::new();
     let value = way.iter().fold(file, |value, part| match part {
@@ -288,7 +289,7 @@ fn at<'a>(file: &'a mut Value, way: &[Part]) -> (&'a mut Value, String) {
     (value, name)
 }
 
-/// Returns the range that is named when a table's number is none, or the greatest of integers.
+/// Returns the range in the error for NaN, or for the largest integer.
 fn refused_range(file: &Value, way: &[Part], key: &str, kind: &Kind) -> Option<String> {
     let wrong = match kind {
         Kind::Number => f64::NAN.into(),

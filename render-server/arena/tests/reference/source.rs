@@ -1,4 +1,4 @@
-//! What serde reads from an `arena.toml`, as the Rust sources say it: tables, their keys, and what is said of each.
+//! Rust sources of the types that serde reads from an `arena.toml`: tables, keys, and descriptions.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,7 +9,7 @@ use syn::{
     Type,
 };
 
-/// Where the types are, from the root of the repository: files, and folders with all that is in them.
+/// Sources of the types, from the root of the repository: files, and folders with all files in them.
 const SOURCES: &[&str] = &[
     "render-server/arena/src/config.rs",
     "render-server/arena/src/config",
@@ -20,26 +20,26 @@ const SOURCES: &[&str] = &[
     "render-server/server/src/poses/settings",
 ];
 
-/// Types that read themselves, and the type by which they do; any other such type is a word.
+/// Types with their own deserializer, and the type with the same keys; any other such type is a word.
 const READ_AS: &[(&str, &str)] =
     &[("SceneConfig", "Table"), ("SetpointKinds", "Vec<SetpointKind>")];
 
-/// Keys that the arena takes as they are, for the server to read, and the server's type.
+/// Keys that the arena does not parse because the server reads them, and the server's type.
 const READ_BY_SERVER: &[(&str, &str)] = &[("localization", "Vec<LocalizationConfig>")];
 
-/// What a key holds.
+/// Kind of value.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Kind {
     Number,
     Integer,
     Flag,
     Text,
-    /// A vector of so many axes.
+    /// A vector with this number of axes.
     Vector(usize),
-    /// So many numbers that are no vector.
+    /// This number of numbers, not a vector.
     Numbers(usize),
     List(Box<Kind>),
-    /// A table of the user's own keys.
+    /// A table with user-defined keys.
     Free,
     /// A type of [`Types`].
     Named(String),
@@ -50,15 +50,15 @@ pub(crate) enum Kind {
 pub(crate) struct Key {
     pub(crate) name: String,
     pub(crate) doc: String,
-    /// Of the number: `m, world`; empty if it has none.
+    /// Unit and frame of the number: `m, world`; empty if it has none.
     pub(crate) unit: String,
     pub(crate) kind: Kind,
     pub(crate) required: bool,
-    /// Without the key, as far as the sources say it.
+    /// Value without the key, if the sources define it.
     pub(crate) default: Option<String>,
 }
 
-/// A word that may be given, or a table that is named by one.
+/// A word that may be given, or a table with this word as its tag.
 #[derive(Clone, Debug)]
 pub(crate) struct Variant {
     pub(crate) name: String,
@@ -74,9 +74,9 @@ pub(crate) enum Shape {
         tag: String,
         variants: Vec<Variant>,
     },
-    /// One of these words; none are known of a word that is put together.
+    /// One of these words; empty for a word composed by a deserializer.
     Word(Vec<Variant>),
-    /// As another type.
+    /// Same as another type.
     As(Kind),
 }
 
@@ -84,7 +84,7 @@ pub(crate) enum Shape {
 pub(crate) struct Described {
     pub(crate) doc: String,
     pub(crate) shape: Shape,
-    /// The variant that is the default of words.
+    /// Name of the default variant of a word.
     default: Option<String>,
 }
 
@@ -112,10 +112,10 @@ impl Types {
     }
 
     pub(crate) fn get(&self, name: &str) -> &Described {
-        self.0.get(name).unwrap_or_else(|| panic!("no type {name} in SOURCES: add its file there"))
+        self.0.get(name).unwrap_or_else(|| panic!("no type {name} in SOURCES; add its file there"))
     }
 
-    /// Returns what a key holds that is more than a table of its own: aliases are followed.
+    /// Returns the kind of a key with aliases resolved.
     pub(crate) fn kind_of<'a>(&'a self, kind: &'a Kind) -> &'a Kind {
         match kind {
             Kind::Named(name) => match &self.get(name).shape {
@@ -126,7 +126,7 @@ impl Types {
         }
     }
 
-    /// Returns the table that a key holds, or a list of which it holds, and whether it is a list.
+    /// Returns the table of a key, or of its list, and whether it is a list.
     pub(crate) fn table_of<'a>(&'a self, kind: &'a Kind) -> Option<(&'a str, bool)> {
         match self.kind_of(kind) {
             Kind::Named(name) => {
@@ -139,7 +139,7 @@ impl Types {
         }
     }
 
-    /// Returns the keys of a table; of a tagged one those of a variant.
+    /// Returns the keys of a table; for a tagged table, those of a variant.
     pub(crate) fn keys(&self, table: &str, variant: Option<&str>) -> &[Key] {
         match &self.get(table).shape {
             Shape::Table(keys) => keys,
@@ -147,7 +147,7 @@ impl Types {
                 let named = |v: &&Variant| variant.is_none_or(|name| name == v.name);
                 &variants.iter().find(named).unwrap().keys
             }
-            _ => panic!("{table} is no table"),
+            _ => panic!("{table} is not a table"),
         }
     }
 
@@ -188,7 +188,7 @@ impl Types {
                     {
                         (written, doc) = (Some(word.to_owned()), rest.to_owned());
                     }
-                    // An enum that is neither read nor says how it is written is of no file.
+                    // An enum that is neither deserialized nor documents its words does not occur in a file.
                     let Some(written) = written else { return };
                     if variant.attrs.iter().any(|attribute| attribute.path().is_ident("default")) {
                         default = Some(written.clone());
@@ -205,10 +205,11 @@ impl Types {
         };
         let doc = doc_of(attributes);
         let taken = self.0.insert(name.clone(), Described { doc, shape, default });
-        assert!(taken.is_none(), "there are two types {name}");
+        assert!(taken.is_none(), "two types are named {name}");
     }
 
-    /// Returns the shape by which a type reads itself; keys without a word of their own are explained by the type's fields.
+    /// Returns the shape of a type with its own deserializer; keys without documentation take that of the
+    /// type's fields.
     fn read_as(&self, read_as: &str, own_docs: &BTreeMap<String, String>) -> Shape {
         let kind = kind_of(&syn::parse_str(read_as).unwrap());
         let Kind::Named(name) = &kind else { return Shape::As(kind) };
@@ -264,7 +265,7 @@ fn keys_of(fields: &Fields, all_have_defaults: bool) -> Vec<Key> {
     keys
 }
 
-/// Returns how the `Default` of a kind is written; of words it is settled later.
+/// Returns the text of a kind's `Default`; words follow later.
 fn zero(kind: &Kind) -> Option<String> {
     match kind {
         Kind::Number => Some("0.0".to_owned()),
@@ -284,7 +285,7 @@ fn kind_of(of: &Type) -> Kind {
             Expr::Lit(ExprLit { lit: Lit::Int(count), .. }) => {
                 Kind::Numbers(count.base10_parse().unwrap())
             }
-            _ => Kind::Named("a list whose length is no literal".to_owned()),
+            _ => Kind::Named("a list whose length is not a literal".to_owned()),
         },
         Type::Path(path) => {
             let segments = &path.path.segments;
@@ -303,8 +304,8 @@ fn kind_of(of: &Type) -> Kind {
                 name => Kind::Named(name.to_owned()),
             }
         }
-        // Of messages beside the tables; no table has it, or Types::get complains.
-        _ => Kind::Named("a type that no TOML has".to_owned()),
+        // Types of messages next to the tables; if a table uses one, Types::get panics.
+        _ => Kind::Named("a type that TOML does not have".to_owned()),
     }
 }
 
@@ -322,7 +323,7 @@ fn is_option(of: &Type) -> bool {
     matches!(of, Type::Path(path) if path.path.segments.last().is_some_and(|s| s.ident == "Option"))
 }
 
-/// Returns `[serde(...)]` as words and what they are set to.
+/// Returns the words in `[serde(...)]` with their values.
 fn serde_of(attributes: &[Attribute]) -> BTreeMap<String, Option<String>> {
     let mut words = BTreeMap::new();
     for attribute in attributes.iter().filter(|attribute| attribute.path().is_ident("serde")) {
@@ -368,7 +369,7 @@ fn doc_of(attributes: &[Attribute]) -> String {
     lines.join(" ")
 }
 
-/// Returns what is said of a key, and its unit and frame, which stand in brackets at the end.
+/// Returns the description of a key, and its unit and frame, which are in brackets at the end.
 fn unit_apart(doc: &str) -> (String, String) {
     let cut = doc.strip_suffix(']').and_then(|doc| doc.rsplit_once('['));
     match cut {
@@ -379,14 +380,14 @@ fn unit_apart(doc: &str) -> (String, String) {
     }
 }
 
-/// Returns the name of a variant as serde's `rename_all` writes it.
+/// Returns the name of a variant in serde's `rename_all` case.
 fn in_case(ident: &str, rule: &str) -> String {
     let between = match rule {
         "kebab-case" => "-",
         "snake_case" => "_",
         "lowercase" => "",
         "" => return ident.to_owned(),
-        _ => panic!("rename_all = \"{rule}\" is new: add it here"),
+        _ => panic!("rename_all = \"{rule}\" is unknown: add it here"),
     };
     let mut name = String::new();
     for (index, letter) in ident.chars().enumerate() {
@@ -398,7 +399,7 @@ fn in_case(ident: &str, rule: &str) -> String {
     name
 }
 
-/// Returns a file, or the Rust files of a folder but for its tests, in the order of their names.
+/// Returns a file, or the Rust files of a folder without tests, sorted by name.
 fn rust_files(path: &Path) -> Vec<PathBuf> {
     if path.is_file() {
         return vec![path.to_owned()];

@@ -1,33 +1,33 @@
-//! A flight whose truth is known, measured badly: what an image rendered with and without prediction
-//! is off by. All by fixed seeds.
+//! Simulated flight with known truth and noisy measurements: error of images rendered with and without
+//! prediction. Seeds are fixed.
 //!
-//! The vehicle flies a lying eight whose sharpest corner takes 8 m/s^2, as the demo's limits do,
-//! leaning into its corners, nose ahead. Images are rendered 60 times a second and seen `pipeline_s`
-//! later; their error is measured against where the vehicle is by then.
+//! The vehicle flies a horizontal figure of eight, with 8 m/s^2 in the sharpest corner, like the demo's limits.
+//! It leans into its corners, nose ahead. Images are rendered at 60 Hz and seen `pipeline_s` later; their error
+//! is relative to the vehicle's true pose at that time.
 
 use glam::{DMat3, DQuat, DVec3};
 use vizflyt_arena::pose::{ImuReading, Measured, PoseFilter, PoseSigma};
 use vizflyt_protocol::geometry::{Body, Pose, World};
 use vizflyt_protocol::time::ServerTime;
 
-/// What is flown, and how badly it is measured.
+/// Parameters of flight and measurement.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Trial {
-    /// Mean. [m/s]
+    /// Mean speed. [m/s]
     pub(crate) speed_mps: f64,
-    /// Of poses. [Hz]
+    /// Rate of poses. [Hz]
     pub(crate) rate_hz: f64,
-    /// Noise of a position, an axis. [m]
+    /// Position noise per axis. [m]
     pub(crate) sigma_m: f64,
-    /// Noise of an attitude, an axis. [deg]
+    /// Attitude noise per axis. [deg]
     pub(crate) sigma_deg: f64,
-    /// From the measurement to its arrival. [s]
+    /// Time from a measurement to its arrival. [s]
     pub(crate) latency_s: f64,
-    /// From the start of drawing until the image is seen. [s]
+    /// Time from the start of rendering until the image is seen. [s]
     pub(crate) pipeline_s: f64,
-    /// Share of poses that do not come.
+    /// Share of lost poses.
     pub(crate) dropout: f64,
-    /// Whether the autopilot's IMU comes too: 100 Hz, four readings a batch, 30 ms late.
+    /// Whether to simulate the autopilot's IMU: 100 Hz, four readings per batch, 30 ms late.
     pub(crate) imu: bool,
 }
 
@@ -46,29 +46,29 @@ impl Default for Trial {
     }
 }
 
-/// Errors of the images' poses, root of the mean square.
+/// Errors of the images' poses, root mean square.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Errors {
-    /// Drawn from the newest measurement as it is. [m]
+    /// Rendered from the newest measurement. [m]
     pub(crate) measured_m: f64,
-    /// Drawn for when the image is seen. [m]
+    /// Rendered from the prediction to the time at which the image is seen. [m]
     pub(crate) predicted_m: f64,
-    /// Attitude, as measured. [deg]
+    /// Attitude error of the newest measurement. [deg]
     pub(crate) measured_deg: f64,
-    /// Attitude, predicted. [deg]
+    /// Attitude error of the prediction. [deg]
     pub(crate) predicted_deg: f64,
     /// Share of the poses that were accepted.
     pub(crate) accepted: f64,
 }
 
 impl Errors {
-    /// Returns by what factor prediction cuts the error of the position.
+    /// Returns the factor by which prediction reduces the position error.
     pub(crate) fn gain(&self) -> f64 {
         self.measured_m / self.predicted_m
     }
 }
 
-/// Where the vehicle is at a time.
+/// Path of the vehicle.
 struct Path {
     half_m: f64,
     rate_radps: f64,
@@ -76,8 +76,8 @@ struct Path {
 
 impl Path {
     fn new(speed_mps: f64) -> Self {
-        // Mean speed and greatest acceleration of a lying eight (sin, 0.375 sin 2) of unit size and
-        // rate, found by stepping along it.
+        // Mean speed and maximum acceleration of a horizontal eight (sin, 0.375 sin 2) of unit size and rate,
+        // by numerical integration.
         let (mean, most) = (1..=10_000).fold((0.0, 0.0f64), |(sum, most), k| {
             let t = f64::from(k) * std::f64::consts::TAU / 10_000.0;
             let v = DVec3::new(t.cos(), 0.75 * (2.0 * t).cos(), 0.0).length();
@@ -115,7 +115,7 @@ impl Path {
     }
 }
 
-/// A generator of noise: Knuth's, twelve uniforms to a Gaussian.
+/// Generator of noise: Knuth's, twelve uniform numbers for a Gaussian one.
 struct Noise(u64);
 
 impl Noise {
@@ -211,7 +211,7 @@ impl Trial {
                 let accel_mps2 = true_accel_mps2 + accel_bias + noise.gaussian3() * 0.3;
                 let gyro_radps = turn + gyro_bias + noise.gaussian3() * 0.01;
                 let reading = ImuReading { stamp: at(t), accel_mps2, gyro_radps };
-                // The last of its batch, and the way.
+                // Arrival of the last reading of its batch, plus transmission.
                 let sent = f64::from(k / 4 * 4 + 3) * 0.01 + 0.03;
                 arrivals.push((sent, Arrival::Imu(reading)));
             }

@@ -1,14 +1,13 @@
-//! Who looks at the page: the instructor, or a team, by address, password or key.
+//! Access to the page: instructor or team, by address, password or key.
 //!
-//! Loopback is the instructor's own computer and needs no login, unless `--login always` asks for
-//! one there too. Everyone else logs in with the password ([`super::password`]) and is the instructor,
-//! or shows a key, once, by opening `/enter?key=...`, and has it in a cookie from then on. Who shows
-//! a session or a key is judged by it, wherever it comes from. The instructor's key opens
-//! everything, a vehicle's key that vehicle's page and stop button. What each route takes is stated
-//! where it is made ([`super::routes`]), and checked by [`super::guard`].
+//! Loopback is the instructor's computer and needs no login, unless `--login always` is set. All other viewers log in
+//! with the password ([`super::password`]), which makes them instructor, or open `/enter?key=...` once, which stores
+//! the key in a cookie. A session or key determines the rights, independent of the address. The instructor's key opens
+//! everything; a vehicle's key opens that vehicle's page and stop button. The table of routes ([`super::routes`])
+//! states the rights that each route requires; [`super::guard`] checks them.
 //!
-//! What changes something also takes the token that belongs to the cookie, which no other site's
-//! page can read; all but the stop button, which must work whatever state a page is in.
+//! Requests that change something also require the token that belongs to the cookie, which pages of other sites cannot
+//! read (CSRF protection). The stop button requires no token, because it must work in any state of the page.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
@@ -25,17 +24,17 @@ use super::sessions::{Sessions, Tokens};
 use crate::rate_limit::RateLimiter;
 use vizflyt_process::lock;
 
-/// Who looks at the page.
+/// Role of a page's viewer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Viewer {
-    /// Everything.
+    /// Access to everything.
     Instructor,
-    /// This vehicle's page and stop button.
+    /// Access to this vehicle's page and stop button.
     Team(String),
 }
 
 impl Viewer {
-    /// Whether this one may see a vehicle.
+    /// Whether this viewer may see a vehicle.
     pub(crate) fn may_see(&self, vehicle: &str) -> bool {
         match self {
             Self::Instructor => true,
@@ -44,14 +43,14 @@ impl Viewer {
     }
 }
 
-/// The page's keys, by their hash: looking one up takes the same time whatever it is.
+/// The page's keys, stored by their hash, so that a lookup leaks nothing about a key by its duration.
 #[derive(Debug, Default)]
 pub struct PageKeys {
     viewers: HashMap<Fingerprint, Viewer>,
     file: KeysFile,
 }
 
-/// `page-keys.toml`.
+/// Contents of `page-keys.toml`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct KeysFile {
@@ -61,10 +60,10 @@ struct KeysFile {
 }
 
 impl PageKeys {
-    /// Reads the keys of a folder, and makes those that are missing for `vehicles`.
+    /// Reads the keys of a folder, and creates missing ones for `vehicles`.
     ///
     /// # Errors
-    /// A file that cannot be used.
+    /// If the file cannot be read, parsed or written.
     pub fn keep(folder: &KeysFolder, vehicles: &[&str]) -> Result<Self, KeyError> {
         let damaged = |what: String| KeyError::Damaged { path: folder.file(FILE), what };
         let found = folder.read_secret(FILE)?;
@@ -86,7 +85,7 @@ impl PageKeys {
         for (key, viewer) in all.chain([(file.instructor.clone(), Viewer::Instructor)]) {
             if key.len() < MIN_KEY || !key.bytes().all(|byte| byte.is_ascii_alphanumeric()) {
                 let what = format!(
-                    "a key is {MIN_KEY} letters and digits or more; remove a wrong one and start again for a new one"
+                    "a key has {MIN_KEY} or more letters and digits; remove a wrong one and restart to create a new one"
                 );
                 return Err(damaged(what));
             }
@@ -101,7 +100,7 @@ impl PageKeys {
         Ok(Self { viewers, file })
     }
 
-    /// Returns the addresses to hand out for `vehicles`: who it is for, and the address.
+    /// Returns pairs of recipient and link, for the instructor and each of `vehicles`.
     pub fn links(&self, page: &str, vehicles: &[&str]) -> Vec<(String, String)> {
         let link = |key: &str| format!("{page}/enter?key={key}");
         let mut links = vec![("instructor".to_owned(), link(&self.file.instructor))];
@@ -118,17 +117,17 @@ impl PageKeys {
     }
 }
 
-/// Where loopback must log in as well.
+/// Connections that must log in
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Login {
-    /// From other computers; who sits at this one is the instructor
+    /// From other computers; this computer is the instructor's
     #[default]
     Remote,
-    /// Here too: for a computer that students use, or behind a proxy
+    /// Always, also here: for shared computers, or behind a proxy
     Always,
 }
 
-/// All that decides who may do what.
+/// Keys, sessions and login settings that determine the rights of a viewer.
 #[derive(Debug)]
 pub struct Access {
     keys: PageKeys,
@@ -137,22 +136,22 @@ pub struct Access {
     pub(super) logins: Arc<Logins>,
 }
 
-/// Who has logged in, and who tries to; outlives a change of scene.
+/// Sessions and login attempts; kept when the scene changes.
 #[derive(Debug)]
 pub struct Logins {
     pub(super) sessions: Mutex<Sessions>,
     tokens: Tokens,
     pub(super) limiter: Mutex<RateLimiter>,
-    /// Passwords that wait to be checked, and the one that is.
+    /// Passwords that wait to be checked; `turn` admits one at a time.
     pub(super) queue: Semaphore,
     pub(super) turn: Semaphore,
 }
 
 impl Logins {
-    /// Makes that of a server that nobody has logged in to yet.
+    /// Returns the state without sessions.
     ///
     /// # Errors
-    /// If the system gives no random numbers.
+    /// If the system's random number generator fails.
     pub fn new() -> Result<Arc<Self>, String> {
         Ok(Arc::new(Self {
             sessions: Mutex::default(),
@@ -164,17 +163,17 @@ impl Logins {
     }
 }
 
-/// Who asks, and what it showed.
+/// Viewer of a request, and the credentials it showed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Shown {
     pub(super) viewer: Viewer,
-    /// Cookies; neither on the server's own computer.
+    /// Cookies; both `None` for a viewer on the server's own computer.
     pub(super) session: Option<String>,
     pub(super) key: Option<String>,
 }
 
 impl Shown {
-    /// Returns how it is known.
+    /// Returns how the viewer was identified.
     pub(super) fn by(&self) -> &'static str {
         match (&self.session, &self.key) {
             (Some(_), _) => "password",
@@ -185,10 +184,10 @@ impl Shown {
 }
 
 impl Access {
-    /// Reads the keys, and makes those that are missing for `vehicles`.
+    /// Reads the keys, and creates missing ones for `vehicles`.
     ///
     /// # Errors
-    /// Keys that cannot be used ([`PageKeys::keep`]).
+    /// As [`PageKeys::keep`].
     pub fn new(
         folder: &KeysFolder,
         vehicles: &[&str],
@@ -198,17 +197,16 @@ impl Access {
         Ok(Self { keys: PageKeys::keep(folder, vehicles)?, login, folder: folder.clone(), logins })
     }
 
-    /// Returns the page's keys.
     pub fn keys(&self) -> &PageKeys {
         &self.keys
     }
 
-    /// Returns whom a key lets in; `None` if it is wrong.
+    /// Returns the viewer that a key identifies; `None` if the key is wrong.
     pub(super) fn viewer_of(&self, key: &str) -> Option<&Viewer> {
         self.keys.viewer(key)
     }
 
-    /// Returns who asks; `None` for a stranger.
+    /// Returns the viewer of a request; `None` if it has no access.
     pub(super) fn judge(&self, from: IpAddr, headers: &HeaderMap) -> Option<Shown> {
         if let Some(session) = cookie(headers, SESSION) {
             let password = self.folder.stamp(password::FILE);
@@ -217,7 +215,7 @@ impl Access {
                 return Some(Shown { viewer: Viewer::Instructor, session, key: None });
             }
         }
-        // The instructor's first: whoever has it loses nothing by a team's.
+        // The instructor's key first: it includes the rights of every team key.
         let keys = [KEY, TEAM_KEY].map(|name| cookie(headers, name));
         let mut known =
             keys.into_iter().flatten().filter_map(|key| Some((self.keys.viewer(key)?, key)));
@@ -238,7 +236,7 @@ impl Access {
         })
     }
 
-    /// Whether what was shown still counts: a session may have ended meanwhile.
+    /// Whether the credentials are still valid: a session may have ended since.
     pub(super) fn holds(&self, shown: &Shown) -> bool {
         shown.session.as_ref().is_none_or(|session| {
             let password = self.folder.stamp(password::FILE);
@@ -246,13 +244,13 @@ impl Access {
         })
     }
 
-    /// Returns the token that goes with what was shown; `None` if none is needed.
+    /// Returns the token for these credentials; `None` if none is required.
     pub(super) fn token(&self, shown: &Shown) -> Option<String> {
         let cookie = shown.session.as_ref().or(shown.key.as_ref())?;
         Some(self.logins.tokens.of(cookie))
     }
 
-    /// Whether the request bears the token that goes with what was shown.
+    /// Whether the request contains the token for these credentials.
     pub(super) fn has_token(&self, shown: &Shown, headers: &HeaderMap) -> bool {
         let Some(cookie) = shown.session.as_ref().or(shown.key.as_ref()) else { return true };
         let token = headers.get(TOKEN).and_then(|token| token.to_str().ok());
@@ -260,9 +258,9 @@ impl Access {
     }
 }
 
-/// Returns the line that sets a cookie: out of reach of scripts, and never sent along by another
-/// site's page. `Secure` where the page was opened over TLS, as behind a proxy; what a client says
-/// of that is accepted, since it is its own cookie.
+/// Returns the `Set-Cookie` line: `HttpOnly`, so that scripts cannot read it, and `SameSite=Strict`, so that pages of
+/// other sites cannot send it. `Secure` if the page was opened over TLS, also through a proxy. A client could forge
+/// that header, but would affect only its own cookie.
 pub(super) fn cookie_line(
     name: &str,
     value: &str,
@@ -277,7 +275,7 @@ pub(super) fn cookie_line(
     format!("{name}={value}; Path=/{age}; HttpOnly; SameSite=Strict{secure}")
 }
 
-/// Returns a cookie of the request; of several of the name the first, as nothing is won by another.
+/// Returns the first cookie of this name. Duplicates are harmless: each is checked in the same way.
 pub(super) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str> {
     let lines = headers.get_all(header::COOKIE).iter().filter_map(|line| line.to_str().ok());
     let mut pairs = lines.flat_map(|line| line.split(';')).filter_map(|pair| {
@@ -291,22 +289,22 @@ pub(super) const NO_KEY: &str = "this page needs a key: open the address that th
      /enter?key=..., or log in with the instructor's password";
 const FILE: &str = "page-keys.toml";
 const HEAD: &str = "\
-# Keys of the server's page: whoever has one opens it by http://SERVER/enter?key=KEY. Remove a line and start
-# the server again for a new key; all who had the old one are out.
+# Keys of the server's page. Log in with http://SERVER/enter?key=KEY. To replace a key, remove its line and restart the
+# server; the old key is then invalid.
 ";
-/// The cookie of the instructor's key; of a team's, where an earlier version has set it.
+/// Cookie of the instructor's key. Earlier versions also stored a team's key in it.
 pub(super) const KEY: &str = "vizflyt_key";
-/// The cookie of a team's key.
+/// Cookie of a team's key.
 pub(super) const TEAM_KEY: &str = "vizflyt_team_key";
-/// The cookie of a session; it ends with the browser's.
+/// Cookie of a session, until the browser closes.
 pub(super) const SESSION: &str = "vizflyt_session";
-/// By which a proxy, or our own listener, says that the client speaks TLS.
+/// Header by which a proxy, or the page's TLS listener, marks a request that arrived over TLS.
 pub(super) const FORWARDED_PROTO: &str = "x-forwarded-proto";
-/// The header that bears the token.
+/// Header of the token.
 const TOKEN: &str = "x-vizflyt-token";
-/// More logins at once are nobody's.
+/// Maximum number of waiting logins; more indicate an attack.
 const MAX_WAITING: usize = 8;
-/// 80 bits, should somebody write one by hand.
+/// 80 bits of entropy, also for a key written by hand.
 const MIN_KEY: usize = 16;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! What each route requires of a request, and the check that every request passes before its route.
+//! Rights that each route requires, and the check of every request before its route.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -19,31 +19,31 @@ use super::origin;
 use super::percent::decoded;
 use super::state::Page;
 
-/// What a route takes.
+/// Right that a route requires.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Takes {
-    /// Nothing: the page's own files, which hold no secret.
+    /// No right: static files, which contain no secret.
     Nothing,
     /// Any key or login.
     Key,
-    /// The right to a vehicle: the one that the path names as `{vehicle}`, else the query.
+    /// The right to a vehicle: `{vehicle}` of the path, otherwise `vehicle` of the query.
     Vehicle,
-    /// The right to all vehicles: the instructor's.
+    /// The right to all vehicles: instructor only.
     Everything,
 }
 
-/// What a request takes.
+/// Right that one request requires.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Need {
     Nothing,
     Key,
-    /// This vehicle.
+    /// The right to this vehicle.
     Vehicle(String),
     Everything,
 }
 
 impl Need {
-    /// Returns what a request takes whose route is `path`, with `{vehicle}` where a name stands.
+    /// Returns the right that a request requires. `path` is the route's template, with `{vehicle}` for a name.
     fn of(takes: Takes, path: &str, uri: &Uri) -> Self {
         match takes {
             Takes::Nothing => Self::Nothing,
@@ -71,37 +71,36 @@ impl Need {
 /// Requirements of a route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Rule {
-    /// The right.
     pub(super) takes: Takes,
-    /// The token that shows that a page of ours sent it.
+    /// Whether the request must have the token of the viewer's cookie.
     pub(super) token: bool,
 }
 
-/// What each route takes.
+/// Requirements of all routes.
 #[derive(Debug)]
 pub(super) struct Rights(HashMap<(Method, &'static str), Rule>);
 
 impl Rights {
-    /// Takes method, path and requirement of every route.
+    /// Collects method, path and requirements of every route.
     pub(super) fn of_routes(routes: impl Iterator<Item = (Method, &'static str, Rule)>) -> Self {
         Self(routes.map(|(method, path, rule)| ((method, path), rule)).collect())
     }
 
-    /// Returns what the route `path` takes; of one that is not in the table, everything.
+    /// Returns the requirements of the route `path`; the strictest if it is not in the table.
     pub(super) fn of(&self, method: &Method, path: &str) -> Rule {
         let known = self.0.iter().find(|((m, p), _)| m == method && *p == path);
         known.map_or(Rule::STRICTEST, |(_, rule)| *rule)
     }
 }
 
-/// Lets a request through to its route, or answers it.
+/// Passes a request on to its route, or rejects it.
 pub(super) async fn guard(
     State((page, rights)): State<(Arc<Page>, Arc<Rights>)>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
     mut request: Request,
     next: Next,
 ) -> Response {
-    // This connection outlived its round: the next one of the same browser meets the new round.
+    // The connection is older than this scene: close it, so that the browser's next one reaches the new scene.
     if page.rooms.stop.is_set() {
         let close = [(header::CONNECTION, "close")];
         return (StatusCode::SERVICE_UNAVAILABLE, close, "the server ends or changes its scene")
@@ -114,7 +113,7 @@ pub(super) async fn guard(
     if need == Need::Nothing {
         return run(request, None, next).await;
     }
-    // Reading too: a stranger's name that resolves to us would read as loopback.
+    // Also for reading: a foreign name that resolves to this address (DNS rebinding) would count as loopback.
     if let Err(refusal) = origin::check_host(request.headers()) {
         return refuse(&refusal);
     }
@@ -135,7 +134,7 @@ pub(super) async fn guard(
     }
 }
 
-/// Reads the rest of a request and calls its route. Until the body has arrived, the connection counts as waiting, so
+/// Reads the body of a request and calls its route. Until the body has arrived, the connection counts as waiting, so
 /// that a slow client does not block others.
 async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response {
     let place = request.extensions().get::<ConnectionPlace>().cloned();
@@ -143,7 +142,7 @@ async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response 
     if !body.is_end_stream() {
         body = match timeout(BODY_WITHIN, to_bytes(body, MAX_BODY)).await {
             Ok(Ok(bytes)) => bytes.into(),
-            // Too long, or the client has gone and hears nothing of it.
+            // The body is too long, or the client has closed the connection and does not read the answer.
             Ok(Err(_)) => return (StatusCode::PAYLOAD_TOO_LARGE, TOO_LARGE).into_response(),
             Err(_) => {
                 let close = [(header::CONNECTION, "close")];
@@ -162,14 +161,14 @@ async fn run(request: Request, viewer: Option<&Viewer>, next: Next) -> Response 
 }
 
 impl Rule {
-    /// What is not thought of is the instructor's.
+    /// Default: instructor only, with token.
     pub(super) const STRICTEST: Self = Self { takes: Takes::Everything, token: true };
 }
 
-/// Returns the one vehicle that the query names; `None` without, or with several.
+/// Returns the vehicle of the query; `None` without one, or with several.
 fn asked(uri: &Uri) -> Option<String> {
     let pairs = uri.query()?.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, "")));
-    // A key that needs decoding might be read as `vehicle` by the route: not taken for granted.
+    // The route might decode an encoded key to `vehicle`: reject it.
     let mut names = None;
     for (key, value) in pairs {
         match key {
@@ -184,9 +183,9 @@ fn asked(uri: &Uri) -> Option<String> {
 const NO_TOKEN: &str = "the X-VizFlyt-Token header is missing or not yours; GET /api/session has it, or reload the page";
 const TOO_LARGE: &str = "length limit: a request has 16 KB at most";
 const TOO_SLOW: &str = "the request's body did not come within 5 s";
-/// A camera takes some hundred bytes. [bytes]
+/// The settings of a camera take some hundred bytes. [bytes]
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// A body of a few packets, over a bad link.
+/// Enough for a body of a few packets over a bad link.
 const BODY_WITHIN: Duration = Duration::from_secs(5);
 
 #[cfg(test)]
@@ -222,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_team_meets_its_own_vehicles_needs_alone() {
+    fn a_team_has_only_the_right_to_its_own_vehicle() {
         let team = Viewer::Team("ant".to_owned());
         for (need, expected) in [
             (Need::Nothing, true),
@@ -238,9 +237,9 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// A malformed address is taken apart without a slip.
+        /// A malformed address does not panic.
         #[test]
-        fn any_query_is_taken_apart(text in "[ -~]{0,80}") {
+        fn any_query_is_parsed(text in "[ -~]{0,80}") {
             if let Ok(uri) = format!("/ws?{}", encoded(&text).replace("%3D", "=")).parse::<Uri>() {
                 let _ = asked(&uri);
             }

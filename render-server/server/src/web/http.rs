@@ -1,4 +1,4 @@
-//! Answers and orders in HTTP, as all handlers of the page need them.
+//! HTTP responses, and parsing of JSON requests, for all handlers of the page.
 
 use std::net::SocketAddr;
 
@@ -11,12 +11,11 @@ use tracing::warn;
 
 use super::origin;
 
-/// Returns a file of the page.
 pub(super) fn file(kind: &'static str, text: &'static str) -> Response {
     guarded(kind, text.into_response())
 }
 
-/// Returns a picture, or other data that the server made.
+/// Returns an image, or other generated data.
 pub(super) fn picture(kind: &'static str, bytes: Bytes) -> Response {
     guarded(kind, bytes.into_response())
 }
@@ -30,7 +29,7 @@ fn guarded(kind: &'static str, mut response: Response) -> Response {
     response
 }
 
-/// Returns what a page of ours orders in JSON, or the answer that refuses it.
+/// Parses the JSON of a request that changes something, or returns the response that rejects it.
 pub(super) fn ordered<T: DeserializeOwned>(
     headers: &HeaderMap,
     body: Result<Bytes, BytesRejection>,
@@ -41,8 +40,8 @@ pub(super) fn ordered<T: DeserializeOwned>(
         .map_err(|error| Box::new((StatusCode::BAD_REQUEST, error.to_string()).into_response()))
 }
 
-/// As [`ordered`], for orders that write files or change what is served: only from a browser on this computer. `why`
-/// is the answer to others.
+/// As [`ordered`], for requests that write files or change what is served: only from a browser on this computer. `why`
+/// is the response to others.
 pub(super) fn ordered_here<T: DeserializeOwned>(
     from: SocketAddr,
     why: &'static str,
@@ -55,7 +54,7 @@ pub(super) fn ordered_here<T: DeserializeOwned>(
     ordered(headers, body)
 }
 
-/// Returns the answer to a request of another site.
+/// Returns the response to a request of another site.
 pub(super) fn refuse(refusal: &origin::Refusal) -> Response {
     warn!("page: {refusal}");
     (StatusCode::FORBIDDEN, refusal.to_string()).into_response()
@@ -63,7 +62,7 @@ pub(super) fn refuse(refusal: &origin::Refusal) -> Response {
 
 pub(super) const ICON: &str = include_str!("page/icon.svg");
 
-/// Nothing from elsewhere, and no other page may frame ours and steal a click on the button.
+/// No resources of other hosts. No page of another site may frame this one (clickjacking of the stop button).
 const GUARDS: [(&str, &str); 5] = [
     (
         "content-security-policy",

@@ -1,8 +1,8 @@
-//! HTTPS for the page: which certificate, and where plain HTTP is refused.
+//! HTTPS for the page: its certificate, and addresses on which plain HTTP is rejected.
 //!
-//! `--tls auto` makes a certificate once and keeps it with the server's keys, so that a browser that has
-//! accepted it finds the same one again. Browsers take no Ed25519, so it is another than the one that
-//! runtimes pin. TLS 1.3 alone is spoken.
+//! `--tls auto` creates a certificate once and stores it with the server's keys, so that browsers need to accept it
+//! only once. Browsers do not support Ed25519, so it differs from the certificate that runtimes pin. Only TLS 1.3 is
+//! supported.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
@@ -20,7 +20,7 @@ use vizflyt_trust::{Fingerprint, Identity, KeysFolder, Owner, tls};
 
 use crate::stream::rate_control::is_near;
 
-/// The page's certificate, in use.
+/// Loaded certificate of the page.
 #[derive(Clone)]
 pub(crate) struct PageTls {
     acceptor: TlsAcceptor,
@@ -34,10 +34,10 @@ impl std::fmt::Debug for PageTls {
 }
 
 impl PageTls {
-    /// Opens what `--tls` and `--tls-key` name; `None` if neither is given.
+    /// Loads the files of `--tls` and `--tls-key`; `None` if neither is set.
     ///
     /// # Errors
-    /// A certificate or key that cannot be used, or one without the other.
+    /// If certificate or key cannot be used, or one of them is missing.
     pub(crate) fn open(
         certificate: Option<&Path>,
         key: Option<&Path>,
@@ -72,15 +72,15 @@ impl PageTls {
         Ok(Self { acceptor, fingerprint: identity.fingerprint() })
     }
 
-    /// Returns the SHA-256 of the certificate, which browsers show too.
+    /// Returns the SHA-256 of the certificate, which browsers show as well.
     pub(crate) fn fingerprint(&self) -> Fingerprint {
         self.fingerprint
     }
 
-    /// Shakes hands with a browser. One that speaks plain HTTP is told what to open instead.
+    /// Performs the TLS handshake. A browser that sends plain HTTP receives an answer that names `https://`.
     ///
     /// # Errors
-    /// Why there is no TLS, for the log.
+    /// Reason of a failed handshake, for the log.
     pub(super) async fn accept(&self, mut stream: TcpStream) -> Result<TlsStream<TcpStream>> {
         let shaken = timeout(HANDSHAKE_WITHIN, async {
             let mut first = [0];
@@ -88,9 +88,9 @@ impl PageTls {
             if first[0].is_ascii_alphabetic() {
                 stream.write_all(PLAIN.as_bytes()).await?;
                 stream.shutdown().await?;
-                // What is left unread would reset the connection, and take the answer with it.
+                // Unread data would reset the connection before the browser has read the answer.
                 while stream.read(&mut [0; 4096]).await? > 0 {}
-                bail!("plain HTTP where HTTPS is spoken");
+                bail!("plain HTTP on an HTTPS port");
             }
             Ok(self.acceptor.accept(stream).await?)
         });
@@ -98,10 +98,10 @@ impl PageTls {
     }
 }
 
-/// Refuses plain HTTP on a public address, unless it is asked for; warns of it on a private one.
+/// Rejects plain HTTP on a public address, unless `is_asked_for`; warns on a private one.
 ///
 /// # Errors
-/// What to do instead.
+/// Names the address, and what to do.
 pub(crate) fn check_plain(address: SocketAddr, is_asked_for: bool) -> Result<()> {
     if address.ip().is_loopback() {
         return Ok(());
@@ -124,7 +124,7 @@ pub(crate) fn check_plain(address: SocketAddr, is_asked_for: bool) -> Result<()>
     Ok(())
 }
 
-/// Returns the addresses by which a socket bound to `address` is reached.
+/// Returns the addresses that reach a socket bound to `address`.
 fn reached_by(address: IpAddr) -> Vec<IpAddr> {
     if !address.is_unspecified() {
         return vec![address];
@@ -135,12 +135,11 @@ fn reached_by(address: IpAddr) -> Vec<IpAddr> {
         let v4 = address.as_sockaddr_in().map(|v4| IpAddr::from(v4.ip()));
         v4.or_else(|| address.as_sockaddr_in6().map(|v6| IpAddr::from(v6.ip())))
     });
-    // The unspecified IPv6 address takes IPv4 too.
+    // The unspecified IPv6 address accepts IPv4 too.
     own.filter(|own| address.is_ipv6() || own.is_ipv4()).collect()
 }
 
-/// Returns the first address that is neither this computer's own nor of a private network (RFC 1918,
-/// RFC 4193, link-local).
+/// Returns the first address that is neither loopback nor private (RFC 1918, RFC 4193, link-local).
 fn public_among(addresses: &[IpAddr]) -> Option<IpAddr> {
     addresses.iter().copied().find(|address| !is_near(*address))
 }
@@ -154,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn plain_http_is_refused_on_public_addresses_alone() {
+    fn rejects_plain_http_only_on_public_addresses() {
         let check = |address: &str, asked: bool| check_plain(address.parse().unwrap(), asked);
         for private in
             ["127.0.0.1:8080", "[::1]:8080", "192.168.1.4:80", "10.1.2.3:80", "[fd00::2]:80"]
@@ -174,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn the_certificate_is_kept_and_half_a_setting_is_refused() {
+    fn keeps_the_certificate_and_rejects_incomplete_settings() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         let open = |tls: Option<&str>, key: Option<&str>| {
@@ -201,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn the_answer_to_plain_http_is_whole() {
+    fn the_answer_to_plain_http_is_complete() {
         let (head, body) = PLAIN.split_once("\r\n\r\n").unwrap();
         assert!(head.contains(&format!("Content-Length: {}", body.len())));
     }

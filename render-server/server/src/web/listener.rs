@@ -1,10 +1,10 @@
-//! The page's listener: every connection gets a place ([`crate::admission`]), and speaks HTTP/1.1, inside TLS
-//! if that is set. The stop button is behind it, so nothing that a stranger does may hold it up.
+//! The page's listener: admits connections ([`crate::admission`]) and serves HTTP/1.1, inside TLS if set. It also
+//! serves the stop button, so connections without credentials must never block it.
 //!
 //! ```text
-//! accept -> place of a stranger: the newest gets one, the longest waiting of its address gives way
-//!        -> TLS, if set -> a head within 15 s -> guard: a body within 5 s, and who it is
-//!        -> place of a team or an instructor, which no stranger can take
+//! accept -> slot without credentials: the newest gets one; the oldest waiting one of its address closes
+//!        -> TLS, if set -> head within 15 s -> guard: body within 5 s, and credentials
+//!        -> slot of a team or an instructor, which connections without credentials cannot take
 //! ```
 
 use std::io;
@@ -37,11 +37,11 @@ use vizflyt_process::lock;
 /// Binds the page's address.
 ///
 /// # Errors
-/// The system's refusal, with what to do.
+/// The system's error, and what to do.
 pub(crate) fn bind(address: SocketAddr) -> Result<TcpListener> {
     let open = || -> io::Result<TcpListener> {
         let socket = if address.is_ipv4() { TcpSocket::new_v4()? } else { TcpSocket::new_v6()? };
-        // As every server does: a port whose former connections still linger can be taken again.
+        // Allows a restart while old connections of the port are in TIME_WAIT.
         socket.set_reuseaddr(true)?;
         socket.bind(address)?;
         socket.listen(BACKLOG)
@@ -51,13 +51,13 @@ pub(crate) fn bind(address: SocketAddr) -> Result<TcpListener> {
     })
 }
 
-/// The places of connections to the page.
+/// Admission of connections to the page.
 #[derive(Debug)]
 struct Door {
     admission: Mutex<Admission<Arc<Notify>>>,
 }
 
-/// A connection's place; it is free again when the last copy is dropped.
+/// Slot of a connection, freed when the last clone is dropped.
 #[derive(Clone, Debug)]
 pub(super) struct ConnectionPlace(Arc<Held>);
 
@@ -78,7 +78,7 @@ impl Door {
         Arc::new(Self { admission: Mutex::new(Admission::new(limits(descriptors))) })
     }
 
-    /// Gives a connection from `address` a place, and what tells it to give way; `None` if there is none.
+    /// Returns a slot for a connection from `address`, and the signal that asks it to close; `None` if all are taken.
     fn admit(self: &Arc<Self>, address: IpAddr) -> Option<(ConnectionPlace, Arc<Notify>)> {
         let gives_way = Arc::new(Notify::new());
         let admitted = lock(&self.admission).admit(Instant::now(), address, gives_way.clone());
@@ -102,14 +102,14 @@ impl Door {
 
 fn tell(gives_way: Option<Arc<Notify>>) {
     if let Some(gives_way) = gives_way {
-        // One that does not look yet finds it when it does.
+        // `notify_one` stores a permit for a task that does not wait yet.
         gives_way.notify_one();
     }
 }
 
 impl ConnectionPlace {
-    /// The connection is being served, and gives no way: with a whole request of this viewer's, or of a
-    /// stranger's if `None`.
+    /// Marks the connection as serving a complete request, so that it is not closed for others. `viewer` is `None` for
+    /// a request without credentials.
     pub(super) fn serve(&self, viewer: Option<&Viewer>) {
         let holder = viewer.map(|viewer| match viewer {
             Viewer::Instructor => Holder::Instructor,
@@ -122,14 +122,14 @@ impl ConnectionPlace {
         tell(out);
     }
 
-    /// It waits for its next request.
+    /// Marks the connection as waiting for its next request.
     pub(super) fn wait(&self) {
         lock(&self.0.door.admission).wait(Instant::now(), self.0.id);
     }
 }
 
-/// Returns how many connections there may be with so many descriptors: half of them, for the rest of
-/// the server needs some too, in four parts.
+/// Returns the limits of connections for this number of descriptors: half of them, because the rest of the server needs
+/// some, in four parts.
 fn limits(descriptors: usize) -> Limits {
     let all = (descriptors / 2).clamp(16, MAX_CONNECTIONS);
     Limits {
@@ -141,8 +141,8 @@ fn limits(descriptors: usize) -> Limits {
     }
 }
 
-/// Accepts connections until the server stops. Those that are open end with the request that they are at: the next one
-/// belongs to whoever listens then.
+/// Accepts connections until the server stops. Open connections end with their current request; the next server of this
+/// port gets the following ones.
 pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: Router, stop: Stop) {
     let door = Door::new(descriptors::raise_limit());
     let mut reserve = Reserve::default();
@@ -179,13 +179,13 @@ pub(super) async fn serve(listener: TcpListener, tls: Option<PageTls>, router: R
                     is_short = true;
                     warn!("page: {error}; connections that show no key give way");
                 }
-                // The newcomer gets a descriptor of the reserve, which is filled again when somebody has gone.
+                // A descriptor of the reserve is freed for the newcomer, and refilled when a connection has closed.
                 door.make_room();
                 if !reserve.release() {
                     tokio::time::sleep(OUT_OF_DESCRIPTORS).await;
                 }
             }
-            // The connection's own trouble (accept(2): ECONNABORTED and those of its network).
+            // Error of a single connection (accept(2): ECONNABORTED and network errors).
             Err(error) => debug!("page: not accepted: {error}"),
         }
     }
@@ -199,7 +199,7 @@ async fn talk(
     tls: Option<PageTls>,
     served: (Router, Stop),
 ) {
-    // Small answers leave at once.
+    // Send small answers immediately.
     let _ = stream.set_nodelay(true);
     let Some(tls) = tls else { return http(stream, from, place, false, served).await };
     match tls.accept(stream).await {
@@ -222,7 +222,7 @@ async fn http<S>(
         request.extensions_mut().insert(ConnectInfo(from));
         request.extensions_mut().insert(place.clone());
         if is_tls {
-            // As a proxy that speaks TLS says it: cookies are Secure then.
+            // As a TLS proxy does, so that cookies are set `Secure`.
             let https = HeaderValue::from_static("https");
             request.headers_mut().insert(access::FORWARDED_PROTO, https);
         }
@@ -248,18 +248,18 @@ async fn http<S>(
     }
 }
 
-/// A burst of strangers must not make the kernel drop an instructor's SYN, which costs a second.
+/// A burst of connections must not make the kernel drop an instructor's SYN: its retry takes a second.
 const BACKLOG: u32 = 4096;
-/// All connections; a lecture hall's browsers have six each.
+/// Maximum number of connections. Each browser of a lecture hall opens six.
 const MAX_CONNECTIONS: usize = 1024;
-/// From the first byte that is waited for to the last of a request's head; an idle connection ends with it.
+/// Timeout for the complete head of a request [s]; also closes idle connections.
 const HEAD_WITHIN: Duration = Duration::from_secs(15);
-/// Nobody waits longer, whatever for: its answer may be stuck with a client that takes nothing.
+/// Maximum idle time in any state: an answer may be stuck with a client that does not read.
 const IDLE: Duration = Duration::from_mins(2);
 const SWEEP_EVERY: Duration = Duration::from_secs(1);
-/// Somebody who has been told to go needs a moment for it.
+/// Time for a connection to close after the signal.
 const OUT_OF_DESCRIPTORS: Duration = Duration::from_millis(2);
-/// Cookies and all. [bytes]
+/// Maximum head of a request, including cookies [bytes].
 const MAX_HEAD: usize = 32 << 10;
 const MAX_HEADERS: usize = 64;
 
@@ -268,7 +268,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn few_descriptors_leave_places_for_everybody() {
+    fn few_descriptors_leave_slots_for_every_kind_of_viewer() {
         for descriptors in [64, 1024, 20_000, 1 << 20] {
             let limits = limits(descriptors);
             let all = limits.strangers + limits.teams + limits.instructors;

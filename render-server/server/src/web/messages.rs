@@ -24,16 +24,16 @@ use crate::render::dynamic_objects::{DynamicObjects, ObjectBounds};
 use crate::stream::Rooms;
 use vizflyt_process::lock;
 
-/// Server to page.
+/// Message from server to page.
 #[derive(Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(super) enum Message<'a> {
     Arena(Box<Arena<'a>>),
-    /// The cameras, after one was changed.
+    /// The cameras, after a change.
     Cameras {
         cameras: Vec<CameraLine>,
     },
-    /// Where a vehicle was in this flight: (x, y, z [m, world], speed [m/s]), oldest first.
+    /// Path of a vehicle in this flight: (x, y, z [m, world], speed [m/s]), oldest first.
     Track {
         vehicle: &'a str,
         points: &'a [[f32; 4]],
@@ -44,13 +44,13 @@ pub(super) enum Message<'a> {
     State(Box<State>),
 }
 
-/// The room; sent once.
+/// Description of the room; sent once.
 #[derive(Debug, Serialize)]
 pub(super) struct Arena<'a> {
     boot: String,
     name: &'a str,
     vehicle: &'a str,
-    /// All vehicles' names.
+    /// Names of all vehicles.
     vehicles: Vec<&'a str>,
     fence: &'a Volume,
     goal_m: Option<[f64; 3]>,
@@ -59,16 +59,16 @@ pub(super) struct Arena<'a> {
     max_speed_mps: f64,
     time_limit_s: f64,
     cameras: Vec<CameraLine>,
-    /// Corners of the top view's picture. [m, world]
+    /// Corners of the top view's image. [m, world]
     map_min_m: [f64; 2],
     map_max_m: [f64; 2],
     obstacles: &'a Obstacles,
     stages: &'a [StageConfig],
-    /// Parts of the twin for the view in space ([`super::twin`]).
+    /// Number of parts of the twin for the 3D view ([`super::twin`]).
     twin_parts: usize,
 }
 
-/// A camera: the keys of `[[cameras]]`, and what follows from them.
+/// A camera: the keys of `[[cameras]]`, and its intrinsics.
 #[derive(Debug, Serialize)]
 pub(super) struct CameraLine {
     #[serde(flatten)]
@@ -83,13 +83,13 @@ pub(super) struct Line {
     origin: &'static str,
     #[serde(flatten)]
     event: Event,
-    /// The colour of an event that ends a flight; see [`tone`].
+    /// Colour of an event that ends a flight; see [`tone`].
     tone: Option<&'static str>,
-    /// Seconds since the server started. [s]
+    /// Time since the server started. [s]
     at_s: f64,
 }
 
-/// The moment; twenty times a second.
+/// Current state; sent 20 times per second.
 #[derive(Debug, Serialize)]
 pub(super) struct State {
     pose: Option<PoseLine>,
@@ -111,32 +111,32 @@ pub(super) struct State {
     outcome: Option<OutcomeLine>,
     /// Number of the newest crash card.
     crash: Option<u64>,
-    /// What moves, where it is now.
+    /// Moving objects, with their current poses.
     objects: Vec<ObjectLine>,
-    /// The other vehicles that the viewer may see.
+    /// Other vehicles that the viewer may see.
     others: Vec<OtherLine>,
 }
 
-/// A vehicle beside the one that is shown.
+/// A vehicle other than the shown one.
 #[derive(Debug, Serialize)]
 struct OtherLine {
     name: String,
     phase: FlightPhase,
     pose: Option<PoseLine>,
-    /// Since take-off. [s]
+    /// Time since take-off. [s]
     flight_s: Option<f64>,
 }
 
-/// An object of the arena: a box in its own frame, and where that is.
+/// An object of the arena: a box in its own frame, and its pose.
 #[derive(Debug, Serialize)]
 struct ObjectLine {
     name: String,
-    /// In images of ids.
+    /// Value in images of object ids.
     id: u16,
     p_world_m: [f64; 3],
-    /// Object to world.
+    /// Rotation from object to world.
     q_xyzw: [f64; 4],
-    /// Least and greatest corner. [m, object]
+    /// Minimum and maximum corner. [m, object]
     min_m: [f32; 3],
     max_m: [f32; 3],
 }
@@ -144,13 +144,13 @@ struct ObjectLine {
 #[derive(Debug, Serialize)]
 struct OutcomeLine {
     outcome: OutcomeKind,
-    /// In a few words.
+    /// Short title.
     title: &'static str,
-    /// In a sentence.
+    /// Full sentence.
     text: String,
-    /// Its colour; see [`tone`].
+    /// Colour; see [`tone`].
     tone: &'static str,
-    /// Since the server started. [s]
+    /// Time since the server started. [s]
     at_s: f64,
 }
 
@@ -158,7 +158,7 @@ struct OutcomeLine {
 struct PoseLine {
     p_world_m: [f64; 3],
     yaw_rad: f64,
-    /// Body to world, xyzw.
+    /// Rotation from body to world, xyzw.
     rotation: [f64; 4],
     v_world_mps: [f64; 3],
     age_s: f64,
@@ -204,11 +204,11 @@ fn camera_lines(set: &CameraSet) -> Vec<CameraLine> {
     set.configs.iter().map(line).collect()
 }
 
-/// Returns a camera by the keys of `[[cameras]]`, those of default value too.
+/// Returns a camera by the keys of `[[cameras]]`, including default values.
 pub(super) fn camera_keys(config: &CameraConfig) -> Map<String, Value> {
     let mut keys = match serde_json::to_value(config) {
         Ok(Value::Object(keys)) => keys,
-        // A camera is a map of numbers and names: there is nothing that JSON cannot hold.
+        // Unreachable: a camera is a map of numbers and names, which JSON can represent.
         _ => Map::new(),
     };
     keys.insert("near_m".to_owned(), config.near_m.into());
@@ -302,7 +302,7 @@ fn others(page: &Page, shown: &VehicleFlight, viewer: &Viewer, now: ServerTime) 
     seen.map(line).collect()
 }
 
-/// Returns the colour that the page shows an end in, by the name that its style sheet has for it.
+/// Returns the colour of an outcome on the page, as a class of its style sheet.
 fn tone(reason: &EndReason) -> &'static str {
     match reason.outcome() {
         OutcomeKind::Finished => "good",
@@ -329,7 +329,8 @@ fn objects(moving: &DynamicObjects, now: ServerTime) -> Vec<ObjectLine> {
     named.map(line).collect()
 }
 
-/// The runtime may stamp zero before it knows our clock: that reads as the start.
+/// Returns the time of `stamp` since the start. A runtime without clock synchronization may send 0; that counts as the
+/// start.
 fn since_start_s(page: &Page, stamp: ServerTime) -> f64 {
     stamp.seconds_since(page.boot).max(0.0)
 }

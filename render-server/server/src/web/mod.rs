@@ -1,47 +1,45 @@
-//! The page: static files from the binary, one WebSocket per viewer, and the stop button.
+//! Web page of the server: static files from the binary, one WebSocket per viewer, stop button and settings.
 //!
 //! ```text
-//! GET /            the page (no framework, nothing fetched from elsewhere)
-//! GET /ws?vehicle=V   WebSocket: JSON text (arena, track, events, state at 20 Hz) and binary
-//!                  previews (camera, kind, JPEG) at 15 Hz at most, newest wins; of the first
-//!                  vehicle, if none is named
-//! GET /api/map     the top view: a JPEG rendered at the start
-//! GET /api/shell   what is solid, as cells, for the instructor's view in space
-//!                  ([`crate::web::top_view::shell`])
-//! GET /api/splats/N   part N of the twin itself, for the same view, SPZ ([`twin`])
-//! GET /api/twin    a picture of the twin from anywhere, for browsers that cannot draw it, JPEG
+//! GET /            page (no framework, no files from other hosts)
+//! GET /ws?vehicle=V   WebSocket: JSON text (arena, track, events, state at 20 Hz) and binary previews
+//!                  (camera, kind, JPEG) at 15 Hz at most, newest wins; default: the first vehicle
+//! GET /api/map     top view: a JPEG rendered at the start
+//! GET /api/shell   solid cells for the instructor's 3D view ([`crate::web::top_view::shell`])
+//! GET /api/splats/N   part N of the twin for the 3D view, SPZ ([`twin`])
+//! GET /api/twin    image of the twin from any viewpoint, JPEG, for browsers that cannot render it
 //!                  ([`twin_picture`])
-//! GET /api/stats   ages by stage, images skipped and why, JSON; ?vehicle=NAME
+//! GET /api/stats   image age by stage, dropped images with reasons, JSON; ?vehicle=NAME
 //! POST /api/estop  EmergencyStop to the runtimes of all vehicles
-//! GET /api/vehicles                   the vehicles, JSON; below, V is the name of one
+//! GET /api/vehicles                   vehicles, JSON; V below is the name of a vehicle
 //! POST /api/vehicles/V/estop          EmergencyStop to its runtime
-//! POST /api/vehicles/V/start          lets it take off, if it waits for that
-//! POST /api/vehicles/V/land           ends its flight: it brakes, then lands
-//! POST /api/vehicles/V/reset          on the ground: course, clock, path and figures begin anew
-//! GET /api/vehicles/V/cameras         its cameras of this moment, JSON
-//! GET /api/vehicles/V/crash           what its last failed flight looked like at its end, JSON ([`api::crash`])
-//! GET /api/vehicles/V/crash/ID/CAMERA/KIND/N   an image of that, JPEG; KIND is colour or depth
-//! PUT /api/vehicles/V/cameras/NAME    a whole camera, by the keys of `[[cameras]]`; from the next
-//!                                     tick on
-//! PATCH /api/vehicles/V/cameras/NAME  as PUT, but only what is given changes
+//! POST /api/vehicles/V/start          permits take-off, if the vehicle waits for it
+//! POST /api/vehicles/V/land           ends the flight: brakes, then lands
+//! POST /api/vehicles/V/reset          on the ground: resets course, clock, path and figures
+//! GET /api/vehicles/V/cameras         current cameras, JSON
+//! GET /api/vehicles/V/crash           crash card of the last failed flight, JSON ([`api::crash`])
+//! GET /api/vehicles/V/crash/ID/CAMERA/KIND/N   image of a crash card, JPEG; KIND is colour or depth
+//! PUT /api/vehicles/V/cameras/NAME    replaces a camera, by the keys of `[[cameras]]`; takes effect
+//!                                     at the next tick
+//! PATCH /api/vehicles/V/cameras/NAME  changes only the given keys of a camera
 //! ```
 //! ```text
-//! GET /api/leaderboard        the standings of the course, JSON; GET /wall shows them large ([`api::leaderboard`])
-//! PUT /api/vehicles/V/team    a team checks in by its token; POST: the instructor names it; DELETE: nobody
+//! GET /api/leaderboard        standings of the course, JSON; GET /wall shows them large ([`api::leaderboard`])
+//! PUT /api/vehicles/V/team    team checks in by its token; POST: the instructor sets it; DELETE: removes it
 //! ```
 //! `/lab` is the checklist and the queue of a lab day ([`lab`]).
-//! `GET /api/scenes` lists the scenes to choose from, `PUT /api/scene` changes to one ([`api::scenes`]);
+//! `GET /api/scenes` lists the available scenes, `PUT /api/scene` selects one ([`api::scenes`]);
 //! `GET` and `PUT /api/environment` are its light and weather ([`api::environment`]).
-//! Whoever is not on this computer logs in or needs a key, for everything but the page's own files
+//! Viewers on other computers must log in or show a key, except for the page's static files
 //! ([`guard`]); all routes are in one table ([`routes`]):
 //! ```text
 //! GET /enter?key=K     exchanges a key for a cookie
-//! GET /api/session     who the server takes the viewer for, and the token of whoever has a cookie
+//! GET /api/session     role of the viewer; token, if the viewer has a cookie
 //! POST /api/login, /api/logout     the instructor's password for a session ([`password`])
-//! GET, POST, DELETE /api/pairing   the open pairing, its code; the instructor's ([`api::pairing`])
+//! GET, POST, DELETE /api/pairing   open pairing and its code; instructor only ([`api::pairing`])
 //! ```
-//! A viewer that reads slowly gets fewer pictures and states, never old ones, and holds up
-//! nobody. Only pages of the same origin may watch or stop ([`origin`]).
+//! A slow viewer receives fewer images and states, never outdated ones, and does not delay others.
+//! Only pages of the same origin may watch or stop ([`origin`]).
 
 mod access;
 mod api;
@@ -88,11 +86,10 @@ pub(crate) use self::state::Page;
 pub use self::stats::{ServerStages, VehicleStats};
 pub(crate) use self::twin_picture::TwinPictures;
 
-/// Binds the page's address, for HTTPS or for plain HTTP; the latter not on a public address, unless
-/// `plain` asks for it.
+/// Binds the page's address, for HTTPS or plain HTTP. Plain HTTP on a public address requires `plain`.
 ///
 /// # Errors
-/// An address that cannot be had, or is not to be had plainly.
+/// If binding fails, or plain HTTP is not permitted on this address.
 pub(crate) fn bind(address: SocketAddr, tls: Option<&PageTls>, plain: bool) -> Result<TcpListener> {
     if tls.is_none() {
         https::check_plain(address, plain)?;

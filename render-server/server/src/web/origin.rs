@@ -1,46 +1,45 @@
-//! Only a page that this server served may open the WebSocket or press the button.
+//! Check of `Origin` and `Host`: only a page of this server may open the WebSocket or press the button.
 //!
-//! A browser sends `Origin` with both; it must name the host and port the request was sent to.
-//! That alone falls to DNS rebinding (a stranger's name that resolves to our address), so the host
-//! must also be an address, `localhost`, or this computer's own name.
+//! A browser sends `Origin` with both; it must match the host and port of the request. This check does not detect DNS
+//! rebinding (a foreign name that resolves to this address), so the host must also be an address, `localhost`, or the
+//! name of this computer.
 
 use std::net::IpAddr;
 
 use axum::http::{HeaderMap, HeaderName, header};
 
-/// Why a request is refused.
+/// Reason for which a request is rejected.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Refusal {
-    /// A header is absent, twice there, or not text.
+    /// A header is missing, duplicated, or not text.
     #[error("the {0} header is missing or malformed; open the page itself, or send the header")]
     Missing(&'static str),
     /// The request comes from another page.
     #[error("a page of '{origin}' may not act on '{host}'")]
     Foreign {
-        /// Where the page came from.
+        /// Origin of the page.
         origin: String,
-        /// Whom it addressed.
+        /// Host of the request.
         host: String,
     },
-    /// A name that is not this computer's.
+    /// The host is not a name of this computer.
     #[error("'{0}' is not a name of this computer; open the page by address or as localhost")]
     Name(String),
 }
 
-/// Checks the headers of a request that acts or watches.
+/// Checks the headers of a request that changes something or opens a WebSocket.
 pub(crate) fn check(headers: &HeaderMap) -> Result<(), Refusal> {
     check_as(headers, own_name().trim())
 }
 
-/// Checks only that a request addresses this computer by a name of its own; a browser sends no
-/// `Origin` with what a page reads from where it came from.
+/// Checks only that the host is a name or address of this computer. Browsers send no `Origin` with same-origin reads.
 pub(crate) fn check_host(headers: &HeaderMap) -> Result<(), Refusal> {
     let host = only(headers, &header::HOST).ok_or(Refusal::Missing("Host"))?;
     check_name(host, own_name().trim())
 }
 
-/// Checks a request that a browser makes without `Origin` as well, as when somebody opens a link: if there is
-/// one, it must be our own.
+/// Checks a request that browsers also make without `Origin`, for example for an opened link. An `Origin` that is
+/// present must be this server's.
 pub(crate) fn check_navigation(headers: &HeaderMap) -> Result<(), Refusal> {
     if headers.contains_key(header::ORIGIN) { check(headers) } else { check_host(headers) }
 }
@@ -109,25 +108,25 @@ mod tests {
     }
 
     #[test]
-    fn only_our_own_pages_act() {
+    fn accepts_requests_only_from_own_pages() {
         check("127.0.0.1:8080", "http://127.0.0.1:8080", true);
         check("localhost:8080", "http://localhost:8080", true);
         check("[::1]:8080", "http://[::1]:8080", true);
         check("LAB-PC:8080", "http://lab-pc:8080", true);
         check("lab-pc.local:8080", "http://lab-pc.local:8080", true);
         check("192.168.1.4", "https://192.168.1.4", true);
-        // Another page, another port, no header at all, an opaque origin.
+        // Other page, other port, no header, opaque origin.
         check("127.0.0.1:8080", "http://evil.example", false);
         check("127.0.0.1:8080", "http://127.0.0.1:8081", false);
         check("127.0.0.1:8080", "", false);
         check("127.0.0.1:8080", "null", false);
         check("", "http://127.0.0.1:8080", false);
-        // DNS rebinding: the stranger's name resolves to us.
+        // DNS rebinding: a foreign name resolves to this server.
         check("evil.example:8080", "http://evil.example:8080", false);
     }
 
     #[test]
-    fn a_header_given_twice_is_refused() {
+    fn rejects_a_duplicate_header() {
         let mut headers = HeaderMap::new();
         headers.insert(header::HOST, "127.0.0.1".parse().unwrap());
         headers.append(header::ORIGIN, "http://127.0.0.1".parse().unwrap());

@@ -1,8 +1,8 @@
-//! The instructor's password: set by `vizflyt password`, asked for by `POST /api/login`.
+//! The instructor's password: set by `vizflyt password`, checked by `POST /api/login`.
 //!
-//! The file holds its Argon2id hash alone and is read at each login, so that a new password counts
-//! at once (and ends every session). A try takes some 20 ms and 19 MiB on purpose; one is checked
-//! at a time, few wait, and an address has ten tries, then one in three seconds.
+//! The file holds only its Argon2id hash and is read at each login, so that a new password takes effect at once (and
+//! ends every session). A check takes about 20 ms and 19 MiB by design. One is checked at a time, few wait, and each
+//! address has ten attempts, then one every three seconds.
 
 use argon2::password_hash::phc::PasswordHash;
 use argon2::{Argon2, Params, PasswordHasher};
@@ -13,18 +13,18 @@ use vizflyt_trust::{KeyError, KeysFolder};
 /// Name of the password's file in the keys folder.
 pub(super) const FILE: &str = "page-login.toml";
 
-/// `page-login.toml`.
+/// Contents of `page-login.toml`.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct LoginFile {
-    /// In PHC's string format: `$argon2id$v=19$m=19456,t=2,p=1$...`.
+    /// Hash in PHC string format: `$argon2id$v=19$m=19456,t=2,p=1$...`.
     password: String,
 }
 
-/// Sets the instructor's password of the server that uses `folder`; a running one takes it at once.
+/// Sets the instructor's password of the server that uses `folder`; takes effect at once on a running server.
 ///
 /// # Errors
-/// A password too short or too long; a folder that cannot be written.
+/// If the password is too short or too long, or the folder cannot be written.
 pub fn set_password(folder: &KeysFolder, password: &str) -> Result<(), KeyError> {
     let damaged = |what: String| KeyError::Damaged { path: folder.file(FILE), what };
     let length = password.chars().count();
@@ -55,7 +55,7 @@ pub(super) fn read(folder: &KeysFolder) -> Result<Option<PasswordHash>, KeyError
     let Some(text) = folder.read_secret(FILE)? else { return Ok(None) };
     let file: LoginFile = toml::from_str(&text).map_err(|error| damaged(error.to_string()))?;
     let hash = PasswordHash::new(&file.password)
-        .map_err(|error| damaged(format!("password is no Argon2 hash: {error}")))?;
+        .map_err(|error| damaged(format!("password is not an Argon2 hash: {error}")))?;
     let params = Params::try_from(&hash).map_err(|error| damaged(error.to_string()))?;
     if params.m_cost() > MAX_KIB || params.t_cost() > MAX_PASSES {
         return Err(damaged(format!("a hash of {} KiB is refused", params.m_cost())));
@@ -67,12 +67,12 @@ const HEAD: &str = "\
 # The instructor's password for the server's page, hashed. Set another with `vizflyt password`; remove this file
 # to disable login by password.
 ";
-/// NIST SP 800-63B-4, section 3.1.1.2: 15 where a password stands alone; a lab's lies behind its own
-/// network, and tries are limited.
+/// Minimum length. NIST SP 800-63B-4, section 3.1.1.2, requires 15 for a password as the only protection; a lab also
+/// has its own network, and attempts are limited.
 const MIN_LETTERS: usize = 10;
-/// More is no password. [bytes]
+/// Maximum length [bytes].
 pub(super) const MAX_BYTES: usize = 256;
-/// A quarter of a GiB: more is a slip of the hand. [KiB]
+/// Maximum memory of a check: 256 MiB; more indicates a typing error [KiB].
 const MAX_KIB: u32 = 256 << 10;
 const MAX_PASSES: u32 = 32;
 
@@ -98,13 +98,13 @@ mod tests {
         let fits =
             |password: &str| Argon2::default().verify_password(password.as_bytes(), &hash).is_ok();
         assert!(fits("correct horse battery") && !fits("correct horse batterY") && !fits(""));
-        // Another time, another salt.
+        // The salt differs each time.
         set_password(&folder, "correct horse battery").unwrap();
         assert_ne!(folder.read_secret(FILE).unwrap().unwrap(), text);
     }
 
     #[test]
-    fn a_damaged_file_is_an_error_and_lets_nobody_in() {
+    fn a_damaged_file_is_an_error_and_rejects_all_passwords() {
         let root = tempfile::tempdir().unwrap();
         let folder = KeysFolder::open(Some(&root.path().join("keys"))).unwrap();
         for (text, expected) in [

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-/// Undoes percent-encoding; `None` if it is none, or no UTF-8.
+/// Undoes percent-encoding; `None` if it is invalid, or not UTF-8.
 pub(super) fn decoded(text: &str) -> Option<String> {
     let mut bytes = Vec::with_capacity(text.len());
     let mut rest = text.bytes();
@@ -23,7 +23,7 @@ pub(super) fn encoded(text: &str) -> String {
         if byte.is_ascii_alphanumeric() || b"-._~".contains(&byte) {
             out.push(char::from(byte));
         } else {
-            // Why: writing to a String cannot fail.
+            // Writing to a String cannot fail.
             let _ = write!(out, "%{byte:02X}");
         }
         out

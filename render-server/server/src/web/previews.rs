@@ -1,9 +1,8 @@
-//! The preview thread: small pictures of what was rendered, for the pages.
+//! The preview thread: small images of the rendered cameras, for the pages.
 //!
-//! Takes the ticks that the encode thread is done with ([`crate::render::rendered`]), each newest-wins, of
-//! vehicles that a page watches, at most [`PREVIEW_HZ`] times a second per camera; of those that fly
-//! and nobody watches, [`UNWATCHED_HZ`], for the card of a crash ([`crate::flights::crash`]). Per image of
-//! 640x480, on this thread of its own, which gives way to the flight's: 3 ms, most of it the two
+//! Takes ticks from the encode thread ([`crate::render::rendered`]), newest-wins, at most [`PREVIEW_HZ`] per camera of
+//! watched vehicles. Flying vehicles without a watcher get [`UNWATCHED_HZ`], for the crash card
+//! ([`crate::flights::crash`]). An image of 640x480 costs 3 ms on this low-priority thread, most of it for the two
 //! JPEGs of at most [`MAX_WIDTH_PX`].
 
 use std::sync::Arc;
@@ -25,12 +24,12 @@ use crate::stop::Stop;
 use crate::stream::subscriptions::Subscriptions;
 use vizflyt_process::lock;
 
-/// The newest previews, by vehicle and camera; latest-wins.
+/// Newest previews, by vehicle and camera; newest-wins.
 #[derive(Debug)]
 pub struct Previews(Vec<Vec<watch::Sender<Option<Arc<Preview>>>>>);
 
 impl Previews {
-    /// Returns those of vehicles with this many cameras each: none yet.
+    /// Returns empty previews for vehicles with these numbers of cameras.
     pub fn new(cameras: &[usize]) -> Self {
         let of = |&count: &usize| (0..count).map(|_| watch::Sender::new(None)).collect();
         Self(cameras.iter().map(of).collect())
@@ -71,7 +70,7 @@ pub fn run(
                 continue;
             };
             let turn = &mut turns[slot.vehicle][slot.camera];
-            // A tick that no one took can overtake the one that is being encoded.
+            // A tick that the encode thread has skipped can overtake the one that it is encoding.
             if slot.seq <= turn.seq || !turn.comes(Instant::now(), rate_hz) {
                 continue;
             }
@@ -88,7 +87,7 @@ pub fn run(
     }
 }
 
-/// When a camera's next preview is due, and which image the last one was of.
+/// Due time of a camera's next preview, and number of the last image.
 #[derive(Clone, Copy, Debug)]
 struct Turn {
     due: Instant,
@@ -96,25 +95,25 @@ struct Turn {
 }
 
 impl Turn {
-    /// Whether the camera's turn has come, at `now`; if so, notes when it comes again.
+    /// Whether a preview is due at `now`; if so, schedules the next one.
     fn comes(&mut self, now: Instant, rate_hz: u32) -> bool {
         let comes = now >= self.due;
         if comes {
-            // From when it was due, so that the mean rate is kept; from now, after a rest.
+            // Relative to the due time, to keep the mean rate; relative to now after a pause.
             self.due = (self.due + Duration::from_secs(1) / rate_hz).max(now);
         }
         comes
     }
 }
 
-/// Scratch memory.
+/// Reused buffers.
 struct Stage {
     rgb: Vec<u8>,
     depth_mm: Vec<u16>,
     coloured: Vec<u8>,
     small: Vec<u8>,
     nearest: Vec<u16>,
-    /// Whether an object has been seen: a scene without any needs no picture of them.
+    /// Whether an object has been seen; otherwise no image of ids is sent.
     has_objects: bool,
     palette: Vec<[u8; 3]>,
 }
@@ -163,8 +162,8 @@ fn jpeg(rgb: &[u8], size: [u32; 2], small: &mut Vec<u8>) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-/// Writes `rgb` to `small`, at most [`MAX_WIDTH_PX`] wide, and returns the new width and height:
-/// every pixel is the mean of all that it covers.
+/// Writes `rgb` to `small`, at most [`MAX_WIDTH_PX`] wide, and returns the new width and height. Each pixel is the mean
+/// of the pixels that it covers.
 fn shrink(rgb: &[u8], [width, height]: [u32; 2], small: &mut Vec<u8>) -> [u32; 2] {
     small.clear();
     if width <= MAX_WIDTH_PX {
@@ -172,7 +171,7 @@ fn shrink(rgb: &[u8], [width, height]: [u32; 2], small: &mut Vec<u8>) -> [u32; 2
         return [width, height];
     }
     let new_height = (height * MAX_WIDTH_PX / width).max(1);
-    // The pixels that pixel `at` of `new` covers, of `old` in a row or column.
+    // Range of pixels along a row or column of `old` that pixel `at` of `new` covers.
     let covered = |at: u32, new: u32, old: u32| {
         (at * old / new) as usize..((at + 1) * old).div_ceil(new) as usize
     };
@@ -197,8 +196,8 @@ fn shrink(rgb: &[u8], [width, height]: [u32; 2], small: &mut Vec<u8>) -> [u32; 2
     [MAX_WIDTH_PX, new_height]
 }
 
-/// Returns the colour of a depth on the page: pale near, dark far by the logarithm from 0.3 to
-/// 20 m; black where there is no return. The page's legend shows the same stops.
+/// Returns the colour of a depth on the page: pale near, dark far, logarithmic from 0.3 to 20 m; black without a
+/// return. The page's legend uses the same stops.
 pub fn depth_colour(depth_mm: u16) -> [u8; 3] {
     if depth_mm == 0 {
         return [0; 3];
@@ -212,8 +211,7 @@ pub fn depth_colour(depth_mm: u16) -> [u8; 3] {
     [mix(a[0], b[0]), mix(a[1], b[1]), mix(a[2], b[2])]
 }
 
-/// Returns the colour of an object on the page, by its id; what stands still is grey, darker with
-/// depth.
+/// Returns the colour of an object on the page, by its id; the static scene is grey, darker with depth.
 pub fn id_colour(id: u16, depth_mm: u16) -> [u8; 3] {
     match id {
         0 => {
@@ -235,7 +233,7 @@ const IDS: [[u8; 3]; 7] = [
     [204, 121, 167],
 ];
 
-/// The palette is indexed by depth in steps of 16 mm, no return apart.
+/// Index by depth in steps of 16 mm; 0 is no return.
 fn palette_index(mm: u16) -> usize {
     if mm == 0 { 0 } else { 1 + usize::from(mm >> 4) }
 }
@@ -249,14 +247,14 @@ const STOPS: [[u8; 3]; 5] =
     [[255, 244, 191], [255, 173, 79], [232, 72, 108], [125, 47, 147], [31, 24, 80]];
 const NEAR_MM: f32 = 300.0;
 const FAR_MM: f32 = 20_000.0;
-/// Smooth enough to watch; half of the cost of a stream at 30 Hz. [Hz]
+/// Sufficient for watching, at half the cost of 30 Hz. [Hz]
 pub const PREVIEW_HZ: u32 = 15;
-/// Ten images of a crash; 1.5 % of a core a camera. [Hz]
+/// Ten images of the two seconds before a crash; 1.5 % of a core per camera. [Hz]
 const UNWATCHED_HZ: u32 = 5;
 const PREVIEW_QUALITY: u8 = 80;
-/// Wider than the page shows a camera. [px]
+/// Wider than a camera on the page. [px]
 const MAX_WIDTH_PX: u32 = 480;
-/// How long a stop may go unnoticed.
+/// Maximum delay until a stop is noticed.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 #[cfg(test)]
@@ -286,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn objects_get_a_picture_once_one_was_seen() {
+    fn sends_ids_once_an_object_was_seen() {
         let image = |id: u16| RgbdImage {
             width_px: 16,
             height_px: 16,
@@ -299,15 +297,15 @@ mod tests {
         let mut stage = Stage::new();
         assert!(stage.preview(&image(0)).unwrap().ids.is_empty());
         assert!(!stage.preview(&image(3)).unwrap().ids.is_empty());
-        // Out of sight it is still a picture, so that the last one does not stay.
+        // Also when the object is out of sight, so that the page does not keep the last image.
         assert!(!stage.preview(&image(0)).unwrap().ids.is_empty());
-        assert_eq!(id_colour(1, 0), id_colour(8, 9000), "they come again");
+        assert_eq!(id_colour(1, 0), id_colour(8, 9000), "colours repeat");
         assert_ne!(id_colour(1, 0), id_colour(2, 0));
         assert_eq!(id_colour(0, 0), [0; 3]);
     }
 
     fn check_shrunk(width: u32, height: u32, expected: [u32; 2]) {
-        // A ramp along each axis, which a mean over any box leaves a ramp.
+        // A ramp along each axis stays a ramp under any box mean.
         let value = |at: u32, of: u32| (255 * at / of) as u8;
         let pixel = |k: u32| [value(k % width, width), value(k / width, height), 7];
         let rgb: Vec<u8> = (0..width * height).flat_map(pixel).collect();
@@ -335,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cameras_turn_comes_at_most_so_often_and_at_once_after_a_rest() {
+    fn keeps_the_rate_and_is_due_at_once_after_a_pause() {
         let start = Instant::now();
         let mut turn = Turn { due: start, seq: 0 };
         let at = |ms: u64| start + Duration::from_millis(ms);

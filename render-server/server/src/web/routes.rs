@@ -1,5 +1,5 @@
-//! Every route of the page in one table: it makes the router, and states what each request takes.
-//! What is not in it is the instructor's, and answered with 404 or 405.
+//! Table of all routes: builds the router, and states the right that each request requires. Requests outside the table
+//! require the instructor's right, and return 404 or 405.
 
 use std::sync::Arc;
 
@@ -18,7 +18,6 @@ use super::guard::{MAX_BODY, Rights, Rule, Takes, guard};
 use super::http::file;
 use super::state::Page;
 
-/// One route.
 struct Route {
     method: Method,
     path: &'static str,
@@ -26,10 +25,10 @@ struct Route {
     handler: MethodRouter<Arc<Page>>,
 }
 
-/// The page's own files: path and text, as the build script finds them.
+/// Static files: path and text, collected by the build script.
 pub(super) const FILES: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/page_files.rs"));
 
-/// Where a file of the page is served, and as what.
+/// Returns path and content type of a static file.
 fn served(file: &'static str) -> (&'static str, &'static str) {
     let kind = match file.rsplit_once('.').map_or("", |(_, kind)| kind) {
         "html" => "text/html; charset=utf-8",
@@ -37,7 +36,7 @@ fn served(file: &'static str) -> (&'static str, &'static str) {
         "svg" => "image/svg+xml",
         _ => "text/javascript; charset=utf-8",
     };
-    // People type the addresses of documents.
+    // Addresses of pages have no file extension, because people type them.
     let path = match file {
         "/index.html" => "/",
         "/wall.html" => "/wall",
@@ -59,18 +58,18 @@ fn table() -> Vec<Route> {
     routes.extend([
         read("/enter", Nothing, login::enter),
         read("/api/session", Nothing, login::standing),
-        // Who logs in has no token yet.
+        // No token exists before login.
         at_once(Method::POST, "/api/login", Nothing, login::login),
         act(Method::POST, "/api/logout", Key, login::logout),
         read("/api/map", Key, pictures::map),
-        // Where everything stands, to the centimetre: what a course may keep from plugins.
+        // Exact geometry, which a course may withhold from plugins.
         read("/api/shell", Everything, pictures::shell),
         read("/api/splats/{part}", Everything, pictures::splats),
         read("/api/twin", Everything, pictures::draw),
         read("/ws", Vehicle, watch::watch),
         read("/api/stats", Vehicle, stats::get),
         read("/api/vehicles", Key, vehicles::list),
-        // The stop button waits for no token.
+        // The stop button requires no token.
         at_once(Method::POST, "/api/estop", Everything, vehicles::stop_all),
         at_once(Method::POST, "/api/vehicles/{vehicle}/estop", Vehicle, vehicles::stop),
         act(Method::POST, "/api/vehicles/{vehicle}/start", Everything, vehicles::start),
@@ -85,7 +84,7 @@ fn table() -> Vec<Route> {
         act(Method::PUT, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::put),
         act(Method::PATCH, "/api/vehicles/{vehicle}/cameras/{name}", Everything, cameras::patch),
         read("/api/leaderboard", Key, leaderboard::show),
-        // By the team's token; the vehicle's computer has no cookie, and who else may is judged there.
+        // By the team's token: the vehicle's computer has no cookie. The handler checks the rights of others.
         at_once(Method::PUT, "/api/vehicles/{vehicle}/team", Nothing, leaderboard::put),
         act(Method::POST, "/api/vehicles/{vehicle}/team", Everything, leaderboard::assign),
         act(Method::DELETE, "/api/vehicles/{vehicle}/team", Vehicle, leaderboard::check_out),
@@ -94,7 +93,7 @@ fn table() -> Vec<Route> {
         act(Method::POST, "/api/lab/sign", Everything, lab::sign),
         act(Method::POST, "/api/lab/axes", Everything, lab::axes),
         act(Method::POST, "/api/lab/evidence", Everything, lab::evidence),
-        // A team books on its own vehicle, which is judged there.
+        // A team may book only its own vehicle; the handler checks that.
         act(Method::POST, "/api/lab/queue", Key, lab::book),
         act(Method::DELETE, "/api/lab/queue/{id}", Key, lab::withdraw),
         act(Method::POST, "/api/lab/turn", Everything, lab::turn),
@@ -111,7 +110,7 @@ fn table() -> Vec<Route> {
     routes
 }
 
-/// A route that reads.
+/// Returns a route that reads.
 fn read<H, T>(path: &'static str, takes: Takes, handler: H) -> Route
 where
     H: Handler<T, Arc<Page>>,
@@ -120,7 +119,7 @@ where
     at_once(Method::GET, path, takes, handler)
 }
 
-/// A route that changes something.
+/// Returns a route that changes something.
 fn act<H, T>(method: Method, path: &'static str, takes: Takes, handler: H) -> Route
 where
     H: Handler<T, Arc<Page>>,
@@ -129,7 +128,7 @@ where
     Route { rule: Rule { takes, token: true }, ..at_once(method, path, takes, handler) }
 }
 
-/// A route that takes no token.
+/// Returns a route that requires no token.
 fn at_once<H, T>(method: Method, path: &'static str, takes: Takes, handler: H) -> Route
 where
     H: Handler<T, Arc<Page>>,
@@ -145,7 +144,6 @@ where
     Route { method, path, rule: Rule { takes, token: false }, handler }
 }
 
-/// Makes the router.
 pub(super) fn router(page: Arc<Page>) -> Router {
     let table = table();
     let rights =
@@ -155,13 +153,13 @@ pub(super) fn router(page: Arc<Page>) -> Router {
         router = router.route(path, handler);
     }
     router
-        // Also before routes that are not there: what exists is nobody's business.
+        // Also before unknown routes: strangers must not learn which ones exist.
         .layer(middleware::from_fn_with_state((page.clone(), Arc::new(rights)), guard))
         .layer(DefaultBodyLimit::max(MAX_BODY))
         .with_state(page)
 }
 
-/// Returns every route there is: its method, its path, and what it takes.
+/// Returns method, path and required right of every route.
 pub fn list() -> Vec<(String, &'static str, Takes)> {
     let line = |route: Route| (route.method.to_string(), route.path, route.rule.takes);
     table().into_iter().map(line).collect()

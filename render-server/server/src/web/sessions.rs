@@ -1,8 +1,8 @@
-//! Who has logged in, and the tokens against forged requests; pure.
+//! Sessions, and tokens against forged requests (CSRF); no I/O.
 //!
-//! A session is a random number in a cookie; the server keeps its hash alone, in memory: a restart
-//! ends all. A token proves that a request was made by a page of ours, which has read it: another
-//! site's page can send the cookie along, but cannot read the token that belongs to it.
+//! A session is a random number in a cookie. The server stores only its hash, in memory: a restart ends all sessions. A
+//! token proves that a page of this server made a request: pages of other sites can send the cookie, but cannot read
+//! the token that belongs to it.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -11,19 +11,19 @@ use ring::hmac;
 use ring::rand::SystemRandom;
 use vizflyt_trust::{FileStamp, Fingerprint, secret};
 
-/// The sessions of instructors who have logged in with the password.
+/// Sessions of instructors who have logged in with the password.
 #[derive(Debug, Default)]
 pub(super) struct Sessions {
     live: HashMap<Fingerprint, Instant>,
-    /// The state of the password's file that they logged in with.
+    /// State of the password's file at their login.
     password: Option<FileStamp>,
 }
 
 impl Sessions {
-    /// Begins a session; returns what its cookie holds. Of too many, the one unused longest ends.
+    /// Begins a session and returns its cookie. Above the maximum, the session that was unused for longest ends.
     ///
     /// # Errors
-    /// If the system gives no random numbers.
+    /// If the system's random number generator fails.
     pub(super) fn begin(
         &mut self,
         now: Instant,
@@ -40,8 +40,8 @@ impl Sessions {
         Ok(cookie)
     }
 
-    /// Whether a cookie is that of a session; if so, it lasts from now on again. Another `password`
-    /// than before ends them all.
+    /// Whether a cookie belongs to a live session; if so, restarts its idle time. Ends all sessions if `password` has
+    /// changed.
     pub(super) fn is_live(
         &mut self,
         now: Instant,
@@ -56,7 +56,6 @@ impl Sessions {
         session.map(|ends| *ends = now + IDLE).is_some()
     }
 
-    /// Ends a session.
     pub(super) fn end(&mut self, cookie: &str) {
         self.live.remove(&Fingerprint::of(cookie.as_bytes()));
     }
@@ -70,27 +69,27 @@ impl Sessions {
     }
 }
 
-/// Makes the tokens, from the cookies that they belong to: nothing to keep.
+/// Derives tokens from their cookies, so that none need to be stored.
 #[derive(Debug)]
 pub(super) struct Tokens(hmac::Key);
 
 impl Tokens {
-    /// Makes those of one run of the server.
+    /// Creates the key of one run of the server.
     ///
     /// # Errors
-    /// If the system gives no random numbers.
+    /// If the system's random number generator fails.
     pub(super) fn new() -> Result<Self, String> {
         hmac::Key::generate(hmac::HMAC_SHA256, &SystemRandom::new())
             .map(Self)
             .map_err(|_| "the system gives no random numbers".to_owned())
     }
 
-    /// Returns the token of a cookie, 64 digits.
+    /// Returns the token of a cookie: 64 hexadecimal digits.
     pub(super) fn of(&self, cookie: &str) -> String {
         vizflyt_trust::hex(hmac::sign(&self.0, cookie.as_bytes()).as_ref())
     }
 
-    /// Whether `token` is the cookie's; takes the same time whatever it is.
+    /// Whether `token` belongs to the cookie, in constant time.
     pub(super) fn fits(&self, cookie: &str, token: &str) -> bool {
         let bytes: Option<Vec<u8>> = (0..token.len())
             .step_by(2)
@@ -100,9 +99,9 @@ impl Tokens {
     }
 }
 
-/// A session that nothing is asked of for half a day ends. The page asks while it is open.
+/// Idle timeout of a session. An open page keeps its session alive.
 const IDLE: Duration = Duration::from_hours(12);
-/// An instructor's browsers, many times over.
+/// Maximum number of sessions: several times an instructor's browsers.
 const MAX_SESSIONS: usize = 64;
 
 #[cfg(test)]
@@ -148,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_fits_its_own_cookie_alone() {
+    fn a_token_fits_only_its_own_cookie() {
         let (tokens, others) = (Tokens::new().unwrap(), Tokens::new().unwrap());
         let token = tokens.of("cookie");
         assert_eq!(token.len(), 64);

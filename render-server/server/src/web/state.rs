@@ -1,4 +1,4 @@
-//! What the page's handlers share.
+//! Shared state of the page's handlers.
 
 use std::sync::{Arc, Mutex};
 
@@ -21,7 +21,7 @@ use crate::rate_limit::RateLimiter;
 use crate::scene::Scenes;
 use crate::stream::Rooms;
 
-/// The server's rooms, and what the page adds to them.
+/// The server's rooms and the page's own state.
 #[derive(Debug)]
 pub(crate) struct Page {
     pub(crate) rooms: Rooms,
@@ -29,28 +29,27 @@ pub(crate) struct Page {
     pub(crate) top_view: TopView,
     pub(crate) twin: TwinParts,
     pub(crate) twin_pictures: TwinPictures,
-    /// The course's gates, for the top view.
+    /// Stages of the course, for the top view.
     pub(crate) stages: Vec<StageConfig>,
-    /// When the server started; differs from start to start, so that a page notices a new server.
+    /// Start time of the server. Differs from start to start, so that a page detects a restart.
     pub(crate) boot: ServerTime,
     pub(crate) rates: Rates,
-    /// The lab day.
     pub(crate) lab: Arc<Lab>,
-    /// Who may see and do what.
+    /// Rights of viewers.
     pub(crate) access: Arc<Access>,
-    /// Who may connect, and pairing.
+    /// Identities of runtimes that may connect, and pairing.
     pub(crate) authorizer: Arc<Authorizer>,
-    /// Where runtimes connect.
+    /// Port to which runtimes connect.
     pub(crate) quic_port: u16,
     /// Rate limiter for invalid team tokens.
     pub(crate) team_tries: Mutex<RateLimiter>,
-    /// The scenes to choose from.
+    /// Available scenes.
     pub(crate) scenes: Arc<Scenes>,
-    /// Who watches, by WebSocket.
+    /// Number of open WebSockets by kind of viewer.
     pub(crate) watchers: Mutex<Watchers>,
 }
 
-/// Returns the vehicle of this name, or the answer that there is none.
+/// Returns the vehicle of this name, or the response 404.
 pub(crate) fn vehicle<'a>(
     page: &'a Page,
     name: &str,

@@ -1,5 +1,5 @@
-//! `GET /api/stats`: where the images of a vehicle get their age, what became of them, and how its
-//! connection fares. `vizflyt stats` and the page show it.
+//! `GET /api/stats`: age of a vehicle's images by stage, delivered and dropped images, and connection quality. `vizflyt
+//! stats` and the page show it.
 
 use serde::{Deserialize, Serialize};
 use vizflyt_arena::pose::PoseQuality;
@@ -12,40 +12,40 @@ use crate::stream::delivery::CameraDelivery;
 use crate::timing::StageDurations;
 use vizflyt_process::lock;
 
-/// The figures of one vehicle's images, as `GET /api/stats` returns them.
+/// Figures of one vehicle's images, as returned by `GET /api/stats`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct VehicleStats {
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub vehicle: String,
-    /// The runtime that flies it, and where it is; absent if there is none.
+    /// Program and address of the connected runtime; absent without one.
     pub runtime: Option<String>,
-    /// What the server's own stages take, of all vehicles. [ms]
+    /// Durations of the server's stages, over all vehicles. [ms]
     pub server: ServerStages,
-    /// Where images get their age, by the runtime's newest report.
+    /// Image age by stage, from the runtime's newest report.
     pub timing: Option<Timing>,
-    /// What became of the images of this flight, by camera.
+    /// Delivered and dropped images of this flight, by camera.
     pub images: Vec<CameraDelivery>,
-    /// How the connection fares.
+    /// Quality of the connection.
     pub connection: Option<Connection>,
-    /// How good the localization is.
+    /// Quality of the localization.
     pub pose: PoseQuality,
 }
 
 /// Percentiles of the server's own stages. [ms]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ServerStages {
-    /// Arrival of a pose to the end of gate and referee.
+    /// From arrival of a pose to the end of gate and referee.
     pub pose: StageTimes,
     /// Rendering all cameras of a tick.
     pub render: StageTimes,
     /// Quantising and encoding one image.
     pub encode: StageTimes,
-    /// Handing an image over until the runtime has acknowledged all of it.
+    /// From handing an image over until the runtime has acknowledged all of it.
     pub send: StageTimes,
 }
 
 impl ServerStages {
-    /// Returns the stages by `times`: of the recent past, or of the whole run.
+    /// Returns the stages, measured by `times`: over the recent past, or over the whole run.
     pub(crate) fn of(rooms: &Rooms, times: fn(&StageDurations) -> StageTimes) -> Self {
         Self {
             pose: times(&rooms.localization.durations),
@@ -57,7 +57,7 @@ impl ServerStages {
 }
 
 impl VehicleStats {
-    /// Returns the figures of `vehicle` at this moment.
+    /// Returns the current figures of `vehicle`.
     pub(super) fn of(rooms: &Rooms, vehicle: &VehicleFlight) -> Self {
         let stream = &rooms.streaming.vehicles[vehicle.index];
         let runtime = vehicle.runtime();

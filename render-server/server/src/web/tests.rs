@@ -7,14 +7,13 @@ fn text(name: &str) -> &'static str {
     found.unwrap_or_else(|| panic!("{name} is not served")).1
 }
 
-/// The timing panel knows the edges that the runtime counts by.
+/// The timing panel uses the interval edges of the runtime's reports.
 #[test]
-fn the_timing_panel_counts_by_the_edges_of_the_reports() {
+fn the_timing_panel_uses_the_interval_edges_of_the_reports() {
     let edges = vizflyt_protocol::messages::INTERVAL_EDGES_MS.map(|edge| edge.to_string());
     assert!(text("/panels/timing.js").contains(&format!("[{}]", edges.join(", "))));
 }
 
-/// Every element that a script looks up by its id is in the page's HTML.
 #[test]
 fn every_id_of_the_scripts_is_on_the_page() {
     let mut found = 0;

@@ -1,9 +1,8 @@
-//! The top view behind the page's map: rendered once at the start.
+//! Top view for the page's map, and the solid surface for its 3D view; computed once at the start.
 //!
-//! A picture of the twin seen straight down from far above (so that a perspective camera is as good
-//! as a parallel one), without what lies above the flight: crowns and ceilings would hide the
-//! trunks and the floor. Over it, what is solid at flight height, as one bit per cell. For the view
-//! in space, the surface of what is solid, as cells.
+//! The image shows the twin straight from above, from a great distance (so that perspective is negligible), without
+//! splats above the flight height, because crowns and ceilings would hide trunks and floor. The map overlays the solid
+//! cells at flight height, one bit per cell.
 
 use axum::body::Bytes;
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -15,7 +14,7 @@ use vizflyt_splat::{Atmosphere, Camera, CpuRenderer, Rasterizer, RgbdImage, Spla
 
 use super::twin::select;
 
-/// The map's picture and obstacles.
+/// Image and obstacles of the map.
 #[derive(Clone, Debug, Default)]
 pub struct TopView {
     /// JPEG, north up; empty if it could not be rendered.
@@ -24,14 +23,14 @@ pub struct TopView {
     pub min_m: [f64; 2],
     /// North-east corner of the picture. [m, world]
     pub max_m: [f64; 2],
-    /// What is solid at flight height.
+    /// Solid cells at flight height.
     pub obstacles: Obstacles,
-    /// The surface of what is solid: [`shell`].
+    /// Surface of all solid space: [`shell`].
     pub shell: Bytes,
 }
 
 impl TopView {
-    /// Renders the top view of a scene, at the height that is flown at.
+    /// Renders the top view of a scene for its flight height.
     pub(crate) fn render(splats: &Splats, arena: &ArenaConfig, field: &DistanceField) -> Self {
         let (min, max) = (arena.geofence.min_m.truncate(), arena.geofence.max_m.truncate());
         let flight_m = arena.spawn.position_m.z + arena.takeoff_height_m;
@@ -51,7 +50,7 @@ impl TopView {
     }
 }
 
-/// A grid of solid cells.
+/// Grid of solid cells.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Obstacles {
     /// South-west corner. [m, world]
@@ -67,8 +66,8 @@ pub struct Obstacles {
 }
 
 impl Obstacles {
-    /// Returns what is solid in the rectangle from `min_m` to `max_m`, on cells of `cell_m` or
-    /// coarser, so that no side has more than [`MAX_CELLS`].
+    /// Returns the solid cells of the rectangle from `min_m` to `max_m`, with cells of `cell_m` or coarser, so that no
+    /// side has more than [`MAX_CELLS`].
     pub fn scan(
         min_m: DVec2,
         max_m: DVec2,
@@ -93,11 +92,11 @@ impl Obstacles {
     }
 }
 
-/// Returns the surface of what is solid in a box, as cells for the page: little-endian, the box's
-/// lower corner and the side of a cell as four f32 [m, world], then each cell's place along x, y, z
-/// as u16. Cells are `cell_m` wide or wider, so that there are at most [`MAX_SHELL`].
+/// Returns the surface of the solid space in a box, as cells for the page: little-endian, the box's lower corner and
+/// the side of a cell as four f32 [m, world], then the index of each cell along x, y, z as u16. Cells are at least
+/// `cell_m` wide, so that there are at most [`MAX_SHELL`].
 ///
-/// `distance_m` returns the distance of a point to what is solid, right within half of `cell_m`. [m, world]
+/// `distance_m` returns the distance of a point to the nearest solid, correct within half of `cell_m`. [m, world]
 pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, distance_m: impl Fn(DVec3) -> f64) -> Bytes {
     let span = (max_m - min_m).max(DVec3::splat(1e-3));
     let mut cell_m = cell_m.max((span.element_product() / MAX_SAMPLES).cbrt());
@@ -113,7 +112,7 @@ pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, distance_m: impl Fn(DVec3)
                     let p = min_m + (DVec3::new(x as f64, y as f64, z as f64) + 0.5) * cell_m;
                     let cells = distance_m(p) / cell_m;
                     is_solid[at(x, y, z)] = cells < 0.5;
-                    // What is so far from anything solid has neighbours that are free too.
+                    // Cells within this distance are free too: skip them.
                     x += (cells - 1.5) as usize + 1;
                 }
             }
@@ -152,16 +151,16 @@ pub fn shell(min_m: DVec3, max_m: DVec3, cell_m: f64, distance_m: impl Fn(DVec3)
     }
 }
 
-/// Returns the camera that looks straight down on the rectangle, north up, at `px_per_m`, and sees
-/// nothing above `ceiling_m`.
+/// Returns the camera that looks straight down on the rectangle, north up, at `px_per_m`, and sees nothing above
+/// `ceiling_m`.
 fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Camera {
     let (span, middle) = (max_m - min_m, (min_m + max_m) / 2.0);
     let height_m = span.max_element() * DISTANCE;
     let side = |metres: f64| ((metres * px_per_m).round() as u32).clamp(16, MAX_SIDE_PX);
     let (width_px, height_px) = (side(span.x), side(span.y));
-    // At the ceiling's height one metre is `px_per_m` pixels; the camera hangs `height_m` above it.
+    // At the ceiling's height one metre is `px_per_m` pixels; the camera is `height_m` above it.
     let f_px = px_per_m * height_m;
-    // Columns: the camera's axes in the world: right is east, down is south, ahead is down.
+    // Columns: the camera's axes in the world: right is east, down is south, forward is down.
     let axes = DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z);
     Camera {
         intrinsics: Intrinsics {
@@ -180,8 +179,8 @@ fn camera_above(min_m: DVec2, max_m: DVec2, ceiling_m: f64, px_per_m: f64) -> Ca
     }
 }
 
-/// Draws the top view of the rectangle up to `ceiling_m`, with a renderer of its own for the splats
-/// below: one picture is not worth a graphics device. Returns a JPEG, or nothing if drawing fails.
+/// Renders the top view of the rectangle up to `ceiling_m` with a CPU renderer for the splats below: one image does not
+/// justify a graphics device. Returns a JPEG, or nothing if rendering fails.
 pub fn picture(splats: &Splats, min_m: DVec2, max_m: DVec2, ceiling_m: f64) -> Option<Bytes> {
     let span = max_m - min_m;
     let px_per_m = f64::from(WANTED_SIDE_PX) / span.max_element();
@@ -196,14 +195,14 @@ pub fn picture(splats: &Splats, min_m: DVec2, max_m: DVec2, ceiling_m: f64) -> O
     Some(jpeg.into())
 }
 
-/// Returns the splats whose centre is below a height; seen straight down from afar the constant term is the
-/// colour.
+/// Returns the splats with their centre below a height, in their constant colour, which is sufficient from straight
+/// above.
 fn below(splats: &Splats, ceiling_m: f32) -> Splats {
     let kept = (0..splats.len()).filter(|&k| splats.means_m[k].z < ceiling_m);
     select(splats, kept)
 }
 
-/// Returns bytes in base64 (RFC 4648), for data within a page.
+/// Returns bytes in base64 (RFC 4648).
 pub fn base64(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
@@ -221,19 +220,19 @@ pub fn base64(bytes: &[u8]) -> String {
     text
 }
 
-/// Hides that the picture is seen from a point: a post of 1 m leans by 1/30 of its distance.
+/// Height of the camera, in longer sides of the map. A post of 1 m then leans by less than 3 cm.
 const DISTANCE: f64 = 30.0;
-/// A map wider than this is rendered coarser. [px]
+/// Size of the image's longer side; larger maps have a coarser scale. [px]
 const WANTED_SIDE_PX: u32 = 1200;
 const MAX_SIDE_PX: u32 = 2048;
-/// Tenths of a second to look through. [cells]
+/// Takes tenths of a second to scan. [cells]
 const MAX_SAMPLES: f64 = 400_000.0;
-/// What a phone draws without a jerk; 360 KB.
+/// Rendered smoothly by a phone; 360 KB.
 const MAX_SHELL: usize = 60_000;
-/// 64 KB of bits at most.
+/// At most 64 KB of bits.
 const MAX_CELLS: usize = 720;
 
-/// What hangs this far above the flight is still drawn on the map. [m]
+/// Splats up to this height above the flight are on the map. [m]
 const MAP_HEADROOM_M: f64 = 0.4;
 
 #[cfg(test)]
@@ -241,7 +240,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn base64_is_that_of_the_rfc() {
+    fn base64_matches_the_vectors_of_the_rfc() {
         // RFC 4648 section 10.
         let vectors = ["", "Zg==", "Zm8=", "Zm9v", "Zm9vYg==", "Zm9vYmE=", "Zm9vYmFy"];
         for (length, expected) in vectors.iter().enumerate() {
@@ -261,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_is_the_surface_of_what_is_solid() {
+    fn a_shell_is_the_surface_of_solid_space() {
         // A cube of 5 x 5 x 5 cells in the middle of 9 x 9 x 9: 125 less the 27 inside.
         let cube = |p: DVec3| (p - 0.45).abs().max_element() - 0.2;
         let bytes = shell(DVec3::ZERO, DVec3::splat(0.9), 0.1, cube);
@@ -269,7 +268,7 @@ mod tests {
         assert_eq!([f32_at(0), f32_at(1), f32_at(2), f32_at(3)], [0.0, 0.0, 0.0, 0.1]);
         assert_eq!((bytes.len() - 16) / 6, 125 - 27);
         assert_eq!(bytes[16..22], [2, 0, 2, 0, 2, 0]);
-        // A hall of walls is rendered in cells as coarse as needed; nothing at all is an empty list.
+        // A large hall is rendered with coarser cells; an empty room is an empty list.
         let all = shell(DVec3::ZERO, DVec3::splat(500.0), 0.01, |_| -1.0);
         assert!(all.len() <= 16 + 6 * MAX_SHELL && all.len() > 1000);
         assert_eq!(shell(DVec3::ZERO, DVec3::ONE, 0.1, |_| 1.0).len(), 16);
@@ -277,8 +276,8 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_passes_over_free_space_and_misses_nothing() {
-        // Balls in a box of 8 x 5 x 3 m, one cell across and more; distances are off by up to half a cell either way.
+    fn a_shell_skips_free_space_and_misses_no_cell() {
+        // Balls in a box of 8 x 5 x 3 m, at least one cell across; distances have an error of up to half a cell.
         let balls: Vec<_> = (0..60)
             .map(|k| {
                 let r = |share: f64| (0.5 + share * f64::from(k)).fract();
@@ -294,7 +293,7 @@ mod tests {
         let size_m = DVec3::new(8.0, 5.0, 3.0);
         let quick = shell(DVec3::ZERO, size_m, 0.1, noisy_m);
         let asked_quickly = asked.take();
-        // Capped below what is passed over, so that every cell is asked for.
+        // Capped distances, so that no cell is skipped.
         let every = shell(DVec3::ZERO, size_m, 0.1, |p| noisy_m(p).min(0.2));
         assert_eq!(quick, every);
         assert_eq!(asked.get(), 80 * 50 * 30);
@@ -302,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_above_maps_the_corners_of_the_rectangle_to_those_of_the_picture() {
+    fn the_camera_maps_the_corners_of_the_rectangle_to_the_corners_of_the_image() {
         let (min, max) = (DVec2::new(-1.0, -6.0), DVec2::new(42.0, 6.0));
         let camera = camera_above(min, max, 1.5, 20.0);
         let k = camera.intrinsics;

@@ -1,5 +1,5 @@
-//! The twin's splats for the page's view in space: those that make most of the picture, as SPZ files. In
-//! parts, the weightiest first, so that something is seen soon and a weak machine can leave the rest.
+//! The twin's splats for the page's 3D view: those that dominate the image, as SPZ files. Parts are ordered by
+//! importance, so that a first image appears quickly and a slow computer can skip the rest.
 //!
 //! ```text
 //! GET /api/splats/N   part N of the twin, SPZ version 2 without harmonics, gzip
@@ -14,30 +14,30 @@ use tracing::warn;
 use vizflyt_splat::Splats;
 use vizflyt_splat::format::{Format, encode_variant};
 
-/// Splats of each part: what is drawn in software, what a phone takes, what a laptop's card draws.
+/// Splats of each part: for rendering in software, for a phone, for a laptop's graphics card.
 const PARTS: [usize; 3] = [40_000, 160_000, 300_000];
-/// What stands where the vehicle flies counts so many times: trunks beside a floor of larger splats.
+/// Weight of splats inside the fence: trunks compared with a floor of larger splats.
 const WITHIN: f32 = 8.0;
-/// The floor's height above the fence's lower side. [m]
+/// Height of the floor above the fence's lower side. [m]
 const FLOOR_M: f32 = 0.15;
-/// Positions of 24 bits; read by whoever knows SPZ.
+/// Version with positions of 24 bits, which all SPZ readers support.
 const SPZ_VERSION: u32 = 2;
 
-/// The parts of a twin; each is packed when it is first asked for.
+/// Parts of a twin; each is packed on first use.
 #[derive(Clone, Default)]
 pub struct TwinParts(Vec<Arc<LazyLock<Bytes, Pack>>>);
 
 type Pack = Box<dyn FnOnce() -> Bytes + Send>;
 
 impl TwinParts {
-    /// Chooses what a viewer about the box from `min_m` to `max_m` [m, world] sees most of.
+    /// Selects the most visible splats for viewers around the box from `min_m` to `max_m` [m, world].
     pub fn choose(splats: &Splats, min_m: DVec3, max_m: DVec3) -> Self {
         let middle = ((min_m + max_m) / 2.0).as_vec3();
         let reach_m = ((max_m - min_m).length() / 2.0) as f32;
         let (low, high) = (min_m.as_vec3() + FLOOR_M * Vec3::Z, max_m.as_vec3());
         let weight = |k: usize| {
             let [a, b, c] = splats.scales_m[k].to_array();
-            // The area of its greatest face, as large as it looks from the box's edge.
+            // Area of the largest face, scaled by its distance as seen from the box's edge.
             let area = a * b * c / a.min(b).min(c).max(f32::MIN_POSITIVE);
             let mean_m = splats.means_m[k];
             let away_m = mean_m.distance(middle).max(reach_m);
@@ -64,17 +64,17 @@ impl TwinParts {
         Self(parts)
     }
 
-    /// Returns how many there are.
+    /// Returns the number of parts.
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Whether there are none.
+    /// Whether there are no parts.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Returns part `index`, packed now if nobody has asked before: some tenths of a second.
+    /// Returns part `index`. The first call packs it, which takes some tenths of a second.
     pub fn get(&self, index: usize) -> Option<Bytes> {
         self.0.get(index).map(|part| Bytes::clone(part))
     }
@@ -86,7 +86,7 @@ impl fmt::Debug for TwinParts {
     }
 }
 
-/// Returns some of a scene's splats, in their constant colour.
+/// Returns the selected splats of a scene, with their constant colour only.
 pub(super) fn select(splats: &Splats, kept: impl Iterator<Item = usize> + Clone) -> Splats {
     let per_splat = splats.sh_coefficients() * 3;
     Splats {
@@ -117,7 +117,7 @@ mod tests {
 
     use super::*;
 
-    /// Splats along x, the further the smaller; every tenth is faint.
+    /// Splats along x, smaller with distance; every tenth is faint.
     fn row(count: usize) -> Splats {
         let each = |k: usize| 0.5 / (1 + k) as f32;
         Splats {
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn the_weightiest_come_first_and_nothing_twice() {
+    fn parts_are_ordered_by_weight_without_duplicates() {
         let splats = row(50_000);
         let parts = TwinParts::choose(&splats, DVec3::ZERO, DVec3::splat(4.0));
         assert_eq!(parts.len(), 2);
@@ -140,7 +140,7 @@ mod tests {
         let (first, rest) = (read(0), read(1));
         assert_eq!((first.len(), rest.len()), (PARTS[0], 10_000));
         assert_eq!((first.sh_degree, parts.get(2)), (0, None));
-        // The largest is in the first part, no faint one of the far end is.
+        // The largest splat is in the first part, the faint one at the far end is not.
         let has =
             |splats: &Splats, x: f32| splats.means_m.iter().any(|mean| (mean.x - x).abs() < 4e-4);
         assert!(has(&first, 0.0) && !has(&rest, 0.0));
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_scene_is_one_part_and_none_is_none() {
+    fn a_small_scene_has_one_part_and_an_empty_one_none() {
         let parts = TwinParts::choose(&row(10), DVec3::ZERO, DVec3::ONE);
         assert_eq!(parts.len(), 1);
         assert!(TwinParts::choose(&row(0), DVec3::ZERO, DVec3::ONE).is_empty());

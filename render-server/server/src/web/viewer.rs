@@ -1,4 +1,4 @@
-//! One open page: its WebSocket, from the welcome to the end.
+//! One open page: its WebSocket, from the first message to the end.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use crate::flights::recent_previews::Preview;
 use crate::flights::vehicle::VehicleFlight;
 use vizflyt_process::lock;
 
-/// Counts a viewer for as long as it lives.
+/// Counts a viewer while it exists.
 struct Presence<'a> {
     page: &'a Page,
     vehicle: usize,
@@ -24,7 +24,7 @@ struct Presence<'a> {
 }
 
 impl<'a> Presence<'a> {
-    /// Of a viewer that has entered.
+    /// Counts a viewer that has entered.
     fn new(page: &'a Page, vehicle: &VehicleFlight, viewer: &'a Viewer) -> Self {
         page.rooms.streaming.subscriptions.viewer_came(vehicle.index);
         Self { page, vehicle: vehicle.index, viewer }
@@ -38,7 +38,7 @@ impl Drop for Presence<'_> {
     }
 }
 
-/// Sends one viewer everything of a vehicle until it leaves, stalls, or the server stops; then tells it why.
+/// Sends one viewer all data of a vehicle until it leaves, stalls, or the server stops; then sends the reason.
 pub(super) async fn run(
     page: Arc<Page>,
     vehicle: Arc<VehicleFlight>,
@@ -51,7 +51,7 @@ pub(super) async fn run(
     } else {
         let presence = Presence::new(&page, &vehicle, &shown.viewer);
         let ending = tokio::select! {
-            _ = send_all(&page, &vehicle, &shown.viewer, &mut socket) => (close_code::NORMAL, "the page has gone, or took nothing for 5 s"),
+            _ = send_all(&page, &vehicle, &shown.viewer, &mut socket) => (close_code::NORMAL, "the page closed, or read nothing for 5 s"),
             () = right_ends(&page, &shown) => (close_code::POLICY, "logged out"),
             () = page.rooms.stop.wait() => (close_code::RESTART, "the server ends or changes its scene"),
         };
@@ -123,8 +123,8 @@ async fn send_all(
             }
             _ = tick.tick() => {
                 send_json(socket, &messages::state(page, vehicle, viewer)).await?;
-                // Polled with the state rather than awaited: one picture per turn at most, and
-                // whatever was drawn meanwhile is skipped.
+                // Polled with the state, not awaited: at most one image per tick; images rendered in between are
+                // skipped.
                 for (index, preview) in previews.iter_mut().enumerate() {
                     if !preview.has_changed().unwrap_or(false) {
                         continue;
@@ -150,7 +150,7 @@ async fn send_json(socket: &mut WebSocket, message: &impl Serialize) -> Option<(
     send(socket, Frame::Text(text.into())).await
 }
 
-/// Binary message: kind (0 colour, 1 depth, 2 objects), camera, then JPEG.
+/// Sends a binary message: kind (0 colour, 1 depth, 2 objects), camera, then JPEG.
 async fn send_preview(socket: &mut WebSocket, camera: usize, preview: &Preview) -> Option<()> {
     for (kind, jpeg) in [(0u8, &preview.colour), (1, &preview.depth), (2, &preview.ids)] {
         if jpeg.is_empty() {
@@ -168,11 +168,11 @@ async fn send(socket: &mut WebSocket, frame: Frame) -> Option<()> {
     timeout(PATIENCE, socket.send(frame)).await.ok()?.ok()
 }
 
-/// Who is logged out sees no more after this long.
+/// Interval at which the login is checked: maximum delay until a logout takes effect.
 const LOOK_EVERY: Duration = Duration::from_secs(1);
-/// 20 Hz: smooth to the eye.
+/// 20 Hz, smooth to the eye.
 const EVERY: Duration = Duration::from_millis(50);
-/// A viewer that takes nothing for this long is gone.
+/// Timeout of a viewer that reads nothing.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Events shown to a page that opens late.
+/// Number of past events that a new page receives.
 const HISTORY: usize = 200;

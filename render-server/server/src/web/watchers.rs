@@ -1,10 +1,10 @@
-//! How many pages may watch at a time.
+//! Limit of simultaneously open pages.
 
 use std::collections::BTreeMap;
 
 use super::access::Viewer;
 
-/// Who watches, by kind: pages of one team, however many, take no instructor's place.
+/// Open pages by kind: pages of teams never take an instructor's place.
 #[derive(Debug, Default)]
 pub(crate) struct Watchers {
     instructors: usize,
@@ -15,7 +15,7 @@ impl Watchers {
     /// Takes a place for a viewer.
     ///
     /// # Errors
-    /// Why there is none, in words.
+    /// Reason for which no place is free.
     pub(super) fn enter(&mut self, viewer: &Viewer) -> Result<(), String> {
         match viewer {
             Viewer::Instructor if self.instructors >= MAX_INSTRUCTORS => {
@@ -54,11 +54,11 @@ impl Watchers {
     }
 }
 
-/// Pages of instructors; each page costs some 3 Mbit/s.
+/// Maximum pages of instructors; each costs about 3 Mbit/s.
 const MAX_INSTRUCTORS: usize = 32;
-/// Pages with one team's key.
+/// Maximum pages with one team's key.
 const MAX_OF_TEAM: usize = 16;
-/// Pages of all teams.
+/// Maximum pages of all teams.
 const MAX_TEAMS: usize = 48;
 
 #[cfg(test)]
@@ -66,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_team_takes_no_place_of_an_instructor_or_another_team() {
+    fn a_team_does_not_take_places_of_instructors_or_other_teams() {
         let mut watchers = Watchers::default();
         let team = |name: &str| Viewer::Team(name.to_owned());
         let ants = (0..64).filter(|_| watchers.enter(&team("ant")).is_ok()).count();

@@ -1,5 +1,5 @@
-//! Who may see and do what on the page, over real HTTP to the real binary: every route as a
-//! stranger, as a team, as the instructor, and from the server's own computer without a key.
+//! Rights on the page, over real HTTP to the real binary: every route as a stranger, as a team, as the instructor, and
+//! from the server's own computer without a key.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -8,7 +8,7 @@ use crate::support::{Emitter, PATIENCE, Server, Socket, write_arena};
 use serde_json::Value;
 use vizflyt_server::web::Takes as DeclaredTakes;
 
-/// The server, and the cookies of those who were given a key.
+/// The server, and the cookies of viewers with a key.
 struct Lab {
     server: Server,
     instructor: String,
@@ -16,7 +16,7 @@ struct Lab {
     _folder: tempfile::TempDir,
 }
 
-/// A key that nobody has.
+/// A wrong key.
 const STRANGER: &str = "vizflyt_key=00000000000000000000000000000000";
 
 impl Lab {
@@ -54,7 +54,7 @@ impl Lab {
         Self { server, instructor, ants, _folder: folder }
     }
 
-    /// Asks as our own page would: with the token that belongs to the cookie.
+    /// Sends a request as the page does: with the token of the cookie.
     fn ask(&self, request: &str, cookie: &str) -> (u16, String) {
         let token = standing(self.server.http, cookie)["token"].as_str().map(str::to_owned);
         let token = token.map_or_else(String::new, |t| format!("X-VizFlyt-Token: {t}\r\n"));
@@ -90,7 +90,7 @@ fn ask(address: SocketAddr, request: &str, cookie: &str, more: &str) -> (u16, St
             0 => break,
             count => answer.extend_from_slice(&chunk[..count]),
         }
-        // A connection that may become a WebSocket stays open, whatever the answer.
+        // A connection that may become a WebSocket stays open after any answer.
         let text = String::from_utf8_lossy(&answer);
         let Some((head, body)) = text.split_once("\r\n\r\n") else { continue };
         let len = header(head, "content-length").map(|len| len.parse::<usize>().unwrap());
@@ -102,7 +102,7 @@ fn ask(address: SocketAddr, request: &str, cookie: &str, more: &str) -> (u16, St
     (answer.split(' ').nth(1).unwrap().parse().unwrap(), answer)
 }
 
-/// Returns what the page is told of who looks at it.
+/// Returns the session as the page receives it.
 fn standing(address: SocketAddr, cookie: &str) -> Value {
     let (status, answer) = ask(address, "GET /api/session", cookie, "");
     assert_eq!(status, 200, "{answer}");
@@ -125,7 +125,7 @@ fn log_in(address: SocketAddr, password: &str) -> (u16, String, String) {
     (status, cookie, answer)
 }
 
-/// Sends bytes; returns the status and the whole answer.
+/// Sends bytes; returns the status and the complete answer.
 fn raw(address: SocketAddr, request: &str) -> (u16, String) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -143,7 +143,7 @@ fn header(answer: &str, name: &str) -> Option<String> {
     })
 }
 
-/// What a request takes.
+/// Right that a request requires.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Takes {
     Nothing,
@@ -153,7 +153,7 @@ enum Takes {
     All,
 }
 
-/// Every route, and some that are not there.
+/// Every route, and some that do not exist.
 const ROUTES: &[(&str, Takes)] = &[
     ("GET /", Takes::Nothing),
     ("GET /app.js", Takes::Nothing),
@@ -219,7 +219,7 @@ const ROUTES: &[(&str, Takes)] = &[
     ("GET /wall.js", Takes::Nothing),
     ("GET /wall_flight.js", Takes::Nothing),
     ("GET /api/leaderboard", Takes::AnyKey),
-    // By the team's token, whoever brings it.
+    // By the team's token, from any sender.
     ("PUT /api/vehicles/ant/team", Takes::Nothing),
     ("POST /api/vehicles/ant/team", Takes::All),
     ("DELETE /api/vehicles/ant/team", Takes::Ants),
@@ -284,11 +284,11 @@ const ROUTES: &[(&str, Takes)] = &[
 ];
 
 #[test]
-fn every_route_knows_a_stranger_a_team_and_the_instructor() {
+fn every_route_checks_the_rights_of_strangers_teams_and_the_instructor() {
     let lab = Lab::start();
     for &(request, takes) in ROUTES {
         let stranger = lab.status(request, STRANGER);
-        // Entering without a key is refused as such.
+        // Entering without a key is rejected for that.
         let is_refused = takes != Takes::Nothing || request == "GET /enter";
         assert_eq!(stranger == 401, is_refused, "stranger: {request}: {stranger}");
         let team = lab.status(request, &lab.ants);
@@ -302,10 +302,9 @@ fn every_route_knows_a_stranger_a_team_and_the_instructor() {
     }
 }
 
-/// The table that makes the router is the table that is walked: a new route fails here until it is
-/// stated above what it takes.
+/// Compares the list above with the table that makes the router: a new route fails here until its right is listed.
 #[test]
-fn every_route_of_the_server_is_walked() {
+fn every_route_of_the_server_is_listed_here() {
     for (method, path, takes) in vizflyt_server::web::routes() {
         let is_it = |asked: &str| {
             let (m, p) = asked.split_once(' ').unwrap();
@@ -321,7 +320,7 @@ fn every_route_of_the_server_is_walked() {
                 Takes::Nothing => takes == DeclaredTakes::Nothing,
                 Takes::AnyKey => takes == DeclaredTakes::Key,
                 Takes::Ants | Takes::Bees => takes == DeclaredTakes::Vehicle,
-                // A vehicle that is not named is any.
+                // Without a vehicle, the right to all is required.
                 Takes::All => matches!(takes, DeclaredTakes::Everything | DeclaredTakes::Vehicle),
             };
             assert!(fits, "{asked}: {takes:?}, not {expected:?}");
@@ -329,7 +328,7 @@ fn every_route_of_the_server_is_walked() {
     }
 }
 
-/// What changes something takes the token of its cookie; the stop button does not.
+/// Requests that change something require the token of their cookie; the stop button does not.
 #[test]
 fn a_cookie_without_its_token_changes_nothing() {
     let lab = Lab::start();
@@ -373,10 +372,10 @@ fn a_cookie_without_its_token_changes_nothing() {
 }
 
 #[test]
-fn the_password_opens_a_session_that_ends_with_it() {
+fn the_password_opens_a_session_until_it_changes() {
     let lab = Lab::start_with(&["--login", "always"]);
     let (address, folder) = (lab.server.http, lab.server.keys());
-    // Here too nobody is the instructor without a login.
+    // The server's own computer is not the instructor without a login.
     assert_eq!(lab.status("GET /api/pairing", ""), 401);
     let (status, cookie, answer) = log_in(address, "correct horse battery");
     assert_eq!((status, cookie.as_str()), (409, ""), "{answer}");
@@ -395,7 +394,7 @@ fn the_password_opens_a_session_that_ends_with_it() {
     let told = standing(address, &cookie);
     assert_eq!((&told["role"], &told["by"]), (&"instructor".into(), &"password".into()));
     assert_eq!(lab.status("GET /api/pairing", &cookie), 200);
-    // Out again; and another password ends who came by the former.
+    // Logging out; a new password also ends the sessions of the old one.
     assert_eq!(lab.status("POST /api/logout", &cookie), 204);
     assert_eq!(lab.status("GET /api/pairing", &cookie), 401);
     let cookie = log_in(address, "correct horse battery").1;
@@ -405,7 +404,7 @@ fn the_password_opens_a_session_that_ends_with_it() {
     assert_eq!(lab.status("GET /api/pairing", &cookie), 401);
     assert_eq!(log_in(address, "correct horse battery").0, 401);
     assert_eq!(log_in(address, "another one altogether").0, 200);
-    // Guessing on comes to its end, and the right one waits then too.
+    // The attempts run out; then the right password must wait too.
     let guesses: Vec<_> = (0..30).map(|k| log_in(address, &format!("guess {k}")).0).collect();
     assert!(
         guesses.contains(&429) && guesses.iter().all(|s| [401, 429].contains(s)),
@@ -449,7 +448,7 @@ fn refuses_large_requests_and_paths_out_of_the_folder() {
 }
 
 #[test]
-fn a_stranger_neither_watches_nor_stops() {
+fn a_stranger_can_neither_watch_nor_stop() {
     let lab = Lab::start();
     let (status, answer) = lab.ask("POST /api/estop", STRANGER);
     assert!(status == 401 && answer.contains("this page needs a key"), "{answer}");
@@ -458,14 +457,14 @@ fn a_stranger_neither_watches_nor_stops() {
     }
     assert_eq!(lab.status("POST /api/vehicles/ant/estop", STRANGER), 401);
     assert_eq!(lab.status("GET /ws?vehicle=ant", STRANGER), 401);
-    // A wrong key gives nothing.
+    // A wrong key sets no cookie.
     let (status, head) = lab.ask("GET /enter?key=wrong", STRANGER);
     assert_eq!((status, header(&head, "set-cookie")), (401, None), "{head}");
 }
 
 /// Any page on the Internet can open `/enter` in the instructor's browser.
 #[test]
-fn nobody_takes_the_instructors_key_out_of_its_browser() {
+fn other_pages_cannot_replace_the_instructors_key() {
     let lab = Lab::start();
     let address = lab.server.http;
     let (_, team_key) = lab.ants.split_once('=').unwrap();
@@ -482,7 +481,7 @@ fn nobody_takes_the_instructors_key_out_of_its_browser() {
         assert_eq!(standing(address, both)["role"], "instructor", "{both}");
         assert_eq!(lab.status("POST /api/estop", both), 409);
     }
-    // With its own page's name, and not on behalf of a page elsewhere.
+    // Only with the origin of the server's page, not for a page of another site.
     let elsewhere = "Origin: http://evil.example\r\n";
     let (status, head) = ask(address, &format!("GET /enter?key={team_key}"), "", elsewhere);
     assert_eq!((status, header(&head, "set-cookie")), (403, None), "{head}");
@@ -491,14 +490,14 @@ fn nobody_takes_the_instructors_key_out_of_its_browser() {
     );
     let (status, head) = raw(address, &request);
     assert_eq!((status, header(&head, "set-cookie")), (403, None), "{head}");
-    // Out again: all of it.
+    // Logging out deletes both keys.
     assert_eq!(lab.status("POST /api/logout", &both[0]), 204);
 }
 
 #[test]
 fn a_team_stops_its_own_vehicle_and_no_other() {
     let lab = Lab::start();
-    // Nobody flies, which the server says only to those who may know.
+    // No vehicle flies; the server returns that only to viewers with the right.
     assert_eq!(lab.status("POST /api/vehicles/ant/estop", &lab.ants), 409);
     assert_eq!(lab.status("POST /api/vehicles/bee/estop", &lab.ants), 403);
     assert_eq!(lab.status("POST /api/estop", &lab.ants), 403);
@@ -508,13 +507,12 @@ fn a_team_stops_its_own_vehicle_and_no_other() {
     assert_eq!(names, [Some("ant")]);
 }
 
-/// A page elsewhere cannot use the cookie or the computer of someone who may.
 #[test]
-fn a_team_sees_its_own_vehicle_alone_and_the_instructor_all() {
+fn a_team_sees_only_its_own_vehicle_and_the_instructor_all() {
     let lab = Lab::start();
     let _emitters = ["ant", "bee"].map(|name| Emitter::start(lab.server.vicon, name));
     let watch = |cookie: &str| {
-        // The header lines of a page that has the cookie.
+        // Header lines of a page with the cookie.
         let origin = format!("http://{}\r\nCookie: {cookie}", lab.server.http);
         let mut socket = Socket::open_at(lab.server.http, &origin, "/ws?vehicle=ant").unwrap();
         let mut tracks = vec![socket.message("track")["vehicle"].clone()];
@@ -544,7 +542,7 @@ fn a_team_sees_its_own_vehicle_alone_and_the_instructor_all() {
 }
 
 #[test]
-fn another_page_acts_for_nobody() {
+fn a_page_of_another_site_cannot_use_cookie_or_address() {
     let lab = Lab::start();
     let elsewhere = "Origin: http://evil.example\r\n";
     for request in ["POST /api/vehicles/ant/estop", "POST /api/pairing", "GET /ws?vehicle=ant"] {
@@ -553,7 +551,7 @@ fn another_page_acts_for_nobody() {
             assert_eq!(status, 403, "{request}: {answer}");
         }
     }
-    // Its own name, made to resolve to us, does not read as us either.
+    // DNS rebinding: a foreign name that resolves to this address does not count as this server.
     let mut stream = TcpStream::connect(lab.server.http).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     write!(stream, "GET /api/pairing HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n")

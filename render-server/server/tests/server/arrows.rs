@@ -1,13 +1,13 @@
-//! The rooms of the server import each other in one direction only; `src/lib.rs` tells the order.
+//! The rooms of the server import each other in one direction only; the order is in `src/lib.rs`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// From the top: each imports only what stands below it.
+/// From top to bottom: each imports only rooms below it.
 const ROOMS: [&str; 6] = ["web", "stream", "render", "poses", "flights", "scene"];
-/// Rooms beside each other, that import none of each other.
+/// Rooms on the same level, which do not import each other.
 const APART: [(&str, &str); 1] = [("flights", "scene")];
-/// Files that stand above all rooms.
+/// Files above all rooms.
 const ABOVE: [&str; 5] = ["main", "lib", "serve", "settings", "args"];
 
 fn files(folder: &Path) -> Vec<PathBuf> {
@@ -23,7 +23,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Returns the modules of this crate that a file names: `crate::NAME` and `crate::{NAME, ...}`.
+/// Returns the modules of this crate that a file imports: `crate::NAME` and `crate::{NAME, ...}`.
 fn imports(text: &str) -> Vec<String> {
     let code = text.lines().filter(|line| !line.trim_start().starts_with("//"));
     let code = code.collect::<Vec<_>>().join("\n");
@@ -43,7 +43,7 @@ fn imports(text: &str) -> Vec<String> {
     found
 }
 
-/// Returns the room of a file, or the name of the file itself where it is in none.
+/// Returns the room of a file, or the name of the file if it is in none.
 fn room(path: &Path, source: &Path) -> String {
     let inside = path.strip_prefix(source).unwrap();
     let first = inside.components().next().unwrap().as_os_str().to_str().unwrap();
@@ -58,7 +58,7 @@ fn may_import(from: &str, to: &str) -> bool {
         _ if from == to || ABOVE.contains(&from) => true,
         _ if ABOVE.contains(&to) => false,
         (Some(upper), Some(lower)) => upper < lower && !APART.iter().any(apart),
-        // What stands beneath the rooms imports none of them.
+        // Modules below the rooms import none of them.
         (None, Some(_)) => false,
         (_, None) => true,
     }
@@ -74,7 +74,7 @@ fn no_import_runs_upwards() {
         for to in imports(&fs::read_to_string(&path).unwrap()) {
             assert!(
                 may_import(&from, &to),
-                "{}: `{from}` may not import `{to}`; src/lib.rs tells the order",
+                "{}: `{from}` may not import `{to}`; the order is in src/lib.rs",
                 path.display()
             );
         }
@@ -83,7 +83,7 @@ fn no_import_runs_upwards() {
 }
 
 #[test]
-fn an_import_that_runs_upwards_is_seen() {
+fn finds_an_upward_import() {
     let text = "use crate::{clock, web};\nuse crate::stream::Rooms;\n// use crate::serve;\n";
     assert_eq!(imports(text), ["clock", "web", "stream"]);
     assert!(may_import("web", "stream") && may_import("poses", "clock"));

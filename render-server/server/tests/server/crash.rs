@@ -1,4 +1,4 @@
-//! A flight into a wall through a running server, which nobody watches: its crash card.
+//! Crash card of a flight into a wall through a running server, without watchers.
 
 use crate::support::{Client, Emitter, Server, Socket, http, write_arena};
 use quinn::TransportConfig;
@@ -6,7 +6,7 @@ use serde_json::Value;
 use vizflyt_protocol::messages::{Event, EventKind, FlightPhase, Telemetry, ToServer, bounded};
 use vizflyt_protocol::time::ServerTime;
 
-/// Asks for the card until there is one.
+/// Requests the card until it exists.
 async fn card(server: &Server) -> Value {
     for _ in 0..600 {
         let (status, answer) = http(server.http, "GET /api/vehicles/vizflyt/crash HTTP/1.1");
@@ -20,7 +20,7 @@ async fn card(server: &Server) -> Value {
 
 // Two threads: one waits for answers while the other keeps the connection alive.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_flight_into_a_wall_leaves_a_card() {
+async fn a_flight_into_a_wall_creates_a_crash_card() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (status, answer) = http(server.http, "GET /api/vehicles/vizflyt/crash HTTP/1.1");
@@ -41,9 +41,9 @@ async fn a_flight_into_a_wall_leaves_a_card() {
     assert_eq!(card["title"], "Collision");
     assert!(card["verdict"]["end"].get("collision").is_some(), "{}", card["verdict"]);
     assert_eq!(card["verdict"]["outcome"], "collided");
-    // Which of the rules depends on how evenly a loaded machine sent the poses.
+    // The cause depends on how evenly a loaded machine sends the poses.
     assert!(card["cause"].as_str().unwrap().starts_with("it "), "{}", card["cause"]);
-    // The way to the wall, up to the contact itself.
+    // The path to the wall, up to the contact.
     let samples = card["samples"].as_array().unwrap();
     let number = |sample: &Value, name: &str| sample[name].as_f64().unwrap();
     let last = samples.last().unwrap();
@@ -52,7 +52,7 @@ async fn a_flight_into_a_wall_leaves_a_card() {
     for svg in ["clearance_svg", "top_svg"] {
         assert!(card[svg].as_str().unwrap().starts_with("<svg "), "{svg}");
     }
-    // Nobody has watched; there are images all the same.
+    // Without watchers, the card has images as well.
     let images = &card["images"][0];
     let before_s = images["before_s"].as_array().unwrap();
     assert!(images["camera"] == "front" && before_s.len() >= 3, "{images}");
@@ -71,7 +71,7 @@ async fn a_flight_into_a_wall_leaves_a_card() {
     ] {
         assert_eq!(image(&path).0, expected, "{path}");
     }
-    // A page that opens now is told which card is the newest.
+    // A page that opens afterwards receives the number of the newest card.
     let mut socket = Socket::open(server.http, &format!("http://{}", server.http)).ok().unwrap();
     assert_eq!(socket.message("state")["crash"], 1);
 }

@@ -1,4 +1,4 @@
-//! Handshakes that nobody finishes: a paired runtime comes in beside them, from the same address even.
+//! Unfinished handshakes: a paired runtime can connect during them, even from the same address.
 
 use std::net::UdpSocket;
 use std::sync::Arc;
@@ -10,8 +10,7 @@ use quinn::{ClientConfig, Endpoint, TransportConfig};
 use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Identity};
 
-/// Begins 40 handshakes a second, as somebody who can receive at its address: answers a Retry, and then says
-/// nothing more.
+/// Begins 40 handshakes per second from a real address: answers a Retry, and then stays silent.
 fn begin_and_leave(server: &Server, stop: &Arc<AtomicBool>) {
     let endpoint = Endpoint::client("127.0.0.1:0".parse().unwrap()).unwrap();
     let (own, to) = (endpoint.local_addr().unwrap(), server.quic);
@@ -49,12 +48,12 @@ fn begin_and_leave(server: &Server, stop: &Arc<AtomicBool>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_runtime_comes_in_beside_forty_half_open_handshakes_a_second() {
+async fn a_runtime_connects_during_forty_half_open_handshakes_per_second() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let stop = Arc::new(AtomicBool::new(false));
     begin_and_leave(&server, &stop);
-    // Past the time that a handshake has.
+    // Longer than the timeout of a handshake.
     tokio::time::sleep(Duration::from_secs(5)).await;
     let mut took = Vec::new();
     for _ in 0..10 {

@@ -1,4 +1,4 @@
-//! The page over HTTPS, with a certificate that the server makes.
+//! The page over HTTPS, with a certificate that the server creates.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -11,7 +11,7 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, ClientConnection, DigitallySignedStruct, Error, SignatureScheme};
 use vizflyt_trust::Fingerprint;
 
-/// Takes any certificate, as a person does who clicks on, and remembers it.
+/// Accepts any certificate, like a person who clicks the warning away, and stores it.
 #[derive(Debug)]
 struct Click {
     provider: CryptoProvider,
@@ -50,13 +50,13 @@ impl ServerCertVerifier for Click {
         verify_tls13_signature(message, certificate, signed, algorithms)
     }
 
-    /// What browsers take: no Ed25519.
+    /// Schemes of browsers: without Ed25519.
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
         vec![SignatureScheme::ECDSA_NISTP256_SHA256, SignatureScheme::RSA_PSS_SHA256]
     }
 }
 
-/// Sends a request over TLS; returns the answer and whose certificate was shown.
+/// Sends a request over TLS; returns the answer and the fingerprint of the shown certificate.
 fn ask(address: SocketAddr, request: &str) -> (String, Fingerprint) {
     let provider = ring::default_provider();
     let click = Arc::new(Click { provider: provider.clone(), seen: Mutex::default() });
@@ -74,14 +74,14 @@ fn ask(address: SocketAddr, request: &str) -> (String, Fingerprint) {
     let mut stream = rustls::StreamOwned::new(session, stream);
     write!(stream, "{request} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
     let mut answer = Vec::new();
-    // A server that closes without TLS's own goodbye has said all that it wanted.
+    // A missing close_notify of TLS is not an error: the answer is complete.
     let _ = stream.read_to_end(&mut answer);
     let seen = click.seen.lock().unwrap().expect("a certificate");
     (String::from_utf8_lossy(&answer).into_owned(), seen)
 }
 
 #[test]
-fn the_page_is_served_over_https_with_a_certificate_of_its_own() {
+fn the_page_is_served_over_https_with_a_created_certificate() {
     let folder = tempfile::tempdir().unwrap();
     let options = ["--tls", "auto", "--print-page-keys"];
     let server = Server::start(&write_arena(folder.path(), ""), &options);
@@ -95,7 +95,7 @@ fn the_page_is_served_over_https_with_a_certificate_of_its_own() {
     let (answer, _) = ask(server.http, &format!("GET {}", link.strip_prefix(page).unwrap()));
     let cookie = answer.lines().find(|line| line.starts_with("set-cookie: ")).unwrap();
     assert!(answer.starts_with("HTTP/1.1 303") && cookie.ends_with("; Secure"), "{answer}");
-    // Who types http:// is told so.
+    // A request of http:// gets an answer that names HTTPS.
     let (status, answer) = crate::support::http(server.http, "GET / HTTP/1.1");
     assert!(status == 400 && answer.contains("this page is HTTPS"), "{answer}");
 }

@@ -1,5 +1,5 @@
-//! A lab day through a running server: checks that go green and red by what runtimes and poses do, the queue, the order
-//! of take-off, the separation, and a restart.
+//! A lab day through a running server: checks that change with runtimes and poses, the queue, the order of take-off,
+//! the separation, and a restart.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -35,7 +35,7 @@ fn order(at: SocketAddr, request: &str, body: &Value) -> (u16, String) {
     send_json(at, request, None, &body.to_string())
 }
 
-/// Looks at a check until it is in this state; returns it.
+/// Requests a check until it is in this state; returns it.
 async fn until_state(at: SocketAddr, vehicle: &str, name: &str, state: &str) -> Value {
     let mut last = Value::Null;
     for _ in 0..600 {
@@ -64,14 +64,14 @@ fn stop(message: ToRuntime) -> Option<(u64, Event)> {
 }
 
 #[tokio::test]
-async fn checks_go_green_and_red_by_what_is_measured() {
+async fn checks_change_with_measurements() {
     let folder = tempfile::tempdir().unwrap();
     let server = start(folder.path(), "");
     let at = server.http;
     let emitter = Emitter::along(server.vicon, "vizflyt", |_| 0.0);
     let found = until_state(at, "vizflyt", "localization", "ok").await;
     assert!(found["evidence"].as_str().unwrap().contains("rms at rest"), "{found}");
-    assert_eq!(check(&day(at), "vizflyt", "network")["state"], "not_done", "nobody flies it");
+    assert_eq!(check(&day(at), "vizflyt", "network")["state"], "not_done", "no runtime flies it");
 
     let (mut client, arena) = Client::welcomed(&server, TransportConfig::default()).await;
     report(&mut client, FlightPhase::Waiting, false).await;
@@ -83,7 +83,7 @@ async fn checks_go_green_and_red_by_what_is_measured() {
     assert_eq!(battery["evidence"], "16.20 V, 90 % left");
     let fence = until_state(at, "vizflyt", "fence", "failed").await;
     assert!(fence["todo"].as_str().unwrap().contains("are not known"), "{fence}");
-    // What `vizflyt doctor vehicle` brings is the third place.
+    // The findings of `vizflyt doctor vehicle`.
     let mut evidence = json!({
         "vehicle": "vizflyt", "by": "vizflyt doctor vehicle",
         "finding": {"ok": true, "evidence": "0 dangerous", "todo": ""},
@@ -97,7 +97,7 @@ async fn checks_go_green_and_red_by_what_is_measured() {
     assert!(fence["todo"].as_str().unwrap().contains("FENCE_ALT_MAX must be 3.50"), "{fence}");
     assert_eq!(check(&day(at), "vizflyt", "parameters")["state"], "ok");
 
-    // STOP on the ground: the press, the receipt, the report.
+    // STOP on the ground: press, acknowledgement, report.
     let press = move || send_json(at, "POST /api/vehicles/vizflyt/estop", None, "");
     assert_eq!(tokio::task::spawn_blocking(press).await.unwrap().0, 202);
     let (seq, _) = client.until(stop).await;
@@ -111,7 +111,7 @@ async fn checks_go_green_and_red_by_what_is_measured() {
     );
 
     emitter.pause(true);
-    // First the gap is too long, then it is silence.
+    // First the pose is late, then it is missing.
     let mut found = until_state(at, "vizflyt", "localization", "failed").await;
     while !found["evidence"].as_str().unwrap().starts_with("no pose for") {
         tokio::time::sleep(Duration::from_millis(50)).await;
@@ -166,14 +166,14 @@ async fn vehicles_take_off_in_order_and_keep_apart() {
     let distances = day(at)["distances"].clone();
     assert!((distances[0]["apart_m"].as_f64().unwrap() - 0.7).abs() < 0.02, "{distances}");
 
-    // 0.7 m apart: less than 1.2, more than half of it.
+    // Distance of 0.7 m: less than 1.2 m, more than half of it.
     assert_eq!(order(at, "PUT /api/lab/formation", &formation(Some(1.2))).0, 200);
     let (_, event) = bee.until(stop).await;
     assert_eq!(
         event.text.as_str(),
         "wasp and bee, which took off later, are 0.70 m apart, less than 1.2 m: bee lands"
     );
-    // One STOP for all is the first that the wasp hears of.
+    // The wasp receives no STOP before the one for all vehicles.
     let (status, text) = send_json(at, "POST /api/estop", None, "");
     assert_eq!((status, &*text), (202, "the runtimes land wasp, bee"));
     let (_, event) = wasp.until(stop).await;
@@ -181,7 +181,7 @@ async fn vehicles_take_off_in_order_and_keep_apart() {
 }
 
 #[test]
-fn a_restart_loses_nothing_and_the_report_has_all() {
+fn a_restart_loses_nothing_and_the_report_is_complete() {
     let folder = tempfile::tempdir().unwrap();
     let server = start(folder.path(), TWO);
     let at = server.http;
@@ -209,7 +209,7 @@ fn a_restart_loses_nothing_and_the_report_has_all() {
     assert_eq!(turn("pass_over"), (200, "ants goes to the end of the queue".to_owned()));
     assert_eq!(turn("next"), (200, "cats is called".to_owned()));
     let before = day(at);
-    // As a power cut would: what was answered is on the disk.
+    // Simulates a power cut: every answered change is on the disk.
     server.kill();
 
     let server = start(folder.path(), TWO);
@@ -233,9 +233,9 @@ fn a_restart_loses_nothing_and_the_report_has_all() {
     );
 }
 
-/// Whatever is ordered in JSON is answered as a person would be, and the server lives on.
+/// Any JSON request gets an answer, and the server keeps running.
 #[test]
-fn no_order_is_too_odd() {
+fn any_json_request_gets_an_answer() {
     let folder = tempfile::tempdir().unwrap();
     let server = start(folder.path(), TWO);
     let at = server.http;

@@ -1,4 +1,4 @@
-//! Flights through a running server onto the leaderboard: check-in, verdict, standings, and a server that is killed.
+//! Flights through a running server onto the leaderboard: check-in, verdict, standings, and a killed server.
 
 use std::io::{Read, Write};
 
@@ -8,7 +8,7 @@ use serde_json::Value;
 use vizflyt_protocol::messages::{FlightPhase, Telemetry, ToServer};
 use vizflyt_server::flights::leaderboard::{Attempt, Database, Leaderboard, Run, RunState};
 
-/// Looks at the board until it is as wanted: what is told over QUIC is written down by another task.
+/// Reads the board until it is as wanted: another task writes runs after their messages.
 async fn until(board: &Leaderboard, wanted: impl Fn(&[Run]) -> bool) -> Vec<Run> {
     for _ in 0..600 {
         let runs = board.runs(None).await.unwrap();
@@ -24,7 +24,7 @@ fn put(server: &Server, body: &str) -> (u16, String) {
     send_json(server.http, "PUT /api/vehicles/vizflyt/team", None, body)
 }
 
-/// As [`send_json`], from another address of this computer and with a cookie and its token.
+/// As [`send_json`], from another address of this computer, with a cookie and its token.
 fn send_json_as(
     to: std::net::SocketAddr,
     request: &str,
@@ -65,7 +65,7 @@ fn standings(server: &Server) -> Value {
     serde_json::from_str(answer.split_once("\r\n\r\n").unwrap().1).unwrap()
 }
 
-/// Reports phases, each heard of by the server before the next.
+/// Reports phases; waits for each in the page's state before the next.
 async fn report(client: &mut Client, socket: &mut Socket, phases: &[(FlightPhase, &str)]) {
     for &(phase, name) in phases {
         client.send(&ToServer::Telemetry(Telemetry { phase, ..Telemetry::default() })).await;
@@ -75,7 +75,7 @@ async fn report(client: &mut Client, socket: &mut Socket, phases: &[(FlightPhase
 
 // Two threads: one waits for the page's answers while the other keeps the connection alive.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_team_checks_in_flies_and_stands() {
+async fn a_team_checks_in_flies_and_is_ranked() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("runs.sqlite");
     let board = Leaderboard::open(&Database::File(file.clone())).await.unwrap();
@@ -84,7 +84,7 @@ async fn a_team_checks_in_flies_and_stands() {
     let arena = write_arena(folder.path(), "");
     let server = Server::start(&arena, &[&option, "--official-attempts=1"]);
 
-    // Wrong tokens: reported, and bounded.
+    // Wrong tokens are reported and rate-limited.
     let (status, text) = put(&server, r#"{"token": "guess"}"#);
     assert_eq!((status, text.as_str()), (401, "no team has this token"));
     assert_eq!(put(&server, r#"{"attempt": "official"}"#).0, 400);
@@ -110,7 +110,7 @@ async fn a_team_checks_in_flies_and_stands() {
     let verdict: Value = serde_json::from_str(&verdict).unwrap();
     assert!(verdict["outcome"].is_string() && verdict["seconds"].is_number(), "{verdict}");
 
-    // A second flight: its one official attempt is flown, so this is practice.
+    // A second flight is practice: the team has flown its only official attempt.
     let (status, text) = send_json(server.http, "POST /api/vehicles/vizflyt/reset", Some(&own), "");
     assert_eq!(status, 202, "{text}");
     report(&mut client, &mut socket, &[(FlightPhase::Flying, "flying")]).await;
@@ -118,7 +118,7 @@ async fn a_team_checks_in_flies_and_stands() {
     let second = runs.iter().find(|run| run.id != flying[0].id).unwrap();
     assert_eq!((second.attempt, second.state), (Attempt::Practice, RunState::Flying));
 
-    // Killed in the middle of it: the first run is whole, the second has no verdict.
+    // Killed during the flight: the first run is complete, the second has no verdict.
     server.kill();
     let again = Leaderboard::open(&Database::File(file)).await.unwrap();
     let after = again.runs(None).await.unwrap();
@@ -128,7 +128,7 @@ async fn a_team_checks_in_flies_and_stands() {
 }
 
 #[test]
-fn the_instructor_names_teams_and_nobody_flies_for_a_stranger() {
+fn the_instructor_checks_teams_in_and_strangers_cannot() {
     let folder = tempfile::tempdir().unwrap();
     let option = format!("--leaderboard={}", folder.path().join("runs.sqlite").display());
     let server = Server::start(&write_arena(folder.path(), ""), &[&option]);
@@ -143,7 +143,7 @@ fn the_instructor_names_teams_and_nobody_flies_for_a_stranger() {
     assert_eq!(put(&server, r#"{"token": "guess"}"#).0, 429);
 }
 
-/// Team B, with its token and the vehicle's key, before team A takes off.
+/// Team B, with its token and the vehicle's key, cannot replace team A before its take-off.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_team_keeps_its_check_in_until_it_has_flown() {
     let folder = tempfile::tempdir().unwrap();
@@ -176,7 +176,7 @@ async fn a_team_keeps_its_check_in_until_it_has_flown() {
     let (status, text) = ask(other, "DELETE", &key, "");
     assert_eq!(status, 403, "{text}");
     assert_eq!(standings_as(&server, &instructor)["vehicles"][0]["team"], "ants");
-    // The same team, the same computer, the instructor.
+    // The same team, the same computer, and the instructor can.
     assert_eq!(ask(other, "PUT", &key, &by(&ants)).0, 200);
     assert_eq!(ask(other, "DELETE", &key, "").0, 200);
     assert_eq!(ask(one, "PUT", &key, &by(&ants)).0, 200);
@@ -185,7 +185,7 @@ async fn a_team_keeps_its_check_in_until_it_has_flown() {
 }
 
 #[test]
-fn a_lab_without_a_leaderboard_flies_all_the_same() {
+fn flies_without_a_leaderboard() {
     let folder = tempfile::tempdir().unwrap();
     let notes = folder.path().join("notes.txt");
     std::fs::write(&notes, "these are my notes and no database, although they are long enough")

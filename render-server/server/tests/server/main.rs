@@ -1,5 +1,5 @@
-//! The server as its peers meet it: runtimes, browsers and strangers over real sockets on loopback. One program, because each
-//! one links the whole server.
+//! Tests of the server through real sockets on loopback, as runtimes, browsers and strangers. All are in one program,
+//! because each program links the complete server.
 
 mod access;
 mod arrows;

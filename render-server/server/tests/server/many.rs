@@ -1,4 +1,4 @@
-//! MultiSource vehicles on one server, each with its own client over real QUIC.
+//! Several vehicles on one server, each with one client over real QUIC.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -9,20 +9,20 @@ use vizflyt_protocol::messages::{Event, EventKind, ToRuntime};
 use vizflyt_protocol::packet::ImageHeader;
 
 const NAMES: [&str; 4] = ["wasp", "bee", "ant", "fly"];
-/// Where vehicle k begins, so that its poses and images are known from others'. [m]
+/// Start of vehicle k, by which its poses and images are distinguished. [m]
 const fn start_m(vehicle: usize) -> f64 {
     -2.0 - 4.0 * vehicle as f64
 }
-/// Slow enough that even a loaded machine draws, encodes and sends most ticks; fast enough that it
-/// cannot if anything waits 100 ms for a client.
+/// Slow enough that even a loaded machine renders, encodes and sends most ticks; fast enough that it cannot if anything
+/// waits 100 ms for a client.
 const SLOWLY: [&str; 2] = ["--max-rate", "40"];
 
-/// Width of camera 0 or 1 of a vehicle, by which its images are known. [px]
+/// Width of camera 0 or 1 of a vehicle, by which its images are distinguished. [px]
 fn width_px(vehicle: usize, camera: usize) -> u32 {
     if (vehicle, camera) == (0, 0) { 160 } else { 64 + 16 * (2 * vehicle + camera) as u32 }
 }
 
-/// Returns eight cameras, the arena's own among them, over four vehicles.
+/// Returns eight cameras, including the arena's own, of four vehicles.
 fn four_vehicles() -> String {
     let mut cameras = String::new();
     let mut vehicles = String::new();
@@ -50,7 +50,7 @@ fn four_vehicles() -> String {
     cameras + &vehicles
 }
 
-/// Each vehicle backs off slowly from where it begins.
+/// Moves each vehicle slowly backwards from its start.
 fn emitters(server: &Server) -> [Emitter; 4] {
     [
         Emitter::along(server.vicon, NAMES[0], |n| start_m(0) - f64::from(n % 1000) * STEP_M),
@@ -65,8 +65,7 @@ fn is_of(vehicle: usize, x_m: f64) -> bool {
     (start_m(vehicle) - 1.1..start_m(vehicle) + 0.1).contains(&x_m)
 }
 
-/// Reads images until there are `count` of each of a vehicle's two cameras, all of them its own;
-/// returns the headers.
+/// Reads `count` images of each of a vehicle's two cameras, and checks that all are its own; returns the headers.
 async fn images(client: &Client, vehicle: usize, count: usize) -> Vec<ImageHeader> {
     let mut headers: Vec<ImageHeader> = Vec::new();
     let mut seen = [0; 2];
@@ -83,8 +82,7 @@ async fn images(client: &Client, vehicle: usize, count: usize) -> Vec<ImageHeade
     headers
 }
 
-/// Whether a vehicle's images go on with the ticks: most ticks between the first image and the
-/// last gave one of each camera.
+/// Whether images arrive steadily: most ticks between the first and the last image gave one of each camera.
 fn is_steady(headers: &[ImageHeader]) -> bool {
     let mut counts = BTreeMap::<u8, (u64, u64, u64)>::new();
     for header in headers {
@@ -97,8 +95,8 @@ fn is_steady(headers: &[ImageHeader]) -> bool {
     counts.values().all(|(first, last, count)| 2 * count > last - first)
 }
 
-/// Takes images until those of all are steady: a machine that is busy may cost some of them, a client that delays
-/// others costs them always.
+/// Reads images until all are steady. A busy machine may sometimes lose images; a client that delays others would
+/// always cost them images.
 async fn steady<const N: usize>(
     mut take: impl AsyncFnMut() -> [Vec<ImageHeader>; N],
 ) -> [Vec<ImageHeader>; N] {
@@ -119,7 +117,7 @@ fn emergency(message: ToRuntime) -> Option<Event> {
 }
 
 #[tokio::test]
-async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
+async fn each_of_four_clients_gets_only_its_own_cameras() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), &four_vehicles()), &SLOWLY);
     let _emitters = emitters(&server);
@@ -141,7 +139,7 @@ async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
         tokio::join!(a, b, c, d).into()
     })
     .await;
-    // All are drawn in the same ticks where all have a pose: nobody's share is another's.
+    // All vehicles with a pose are rendered in the same ticks; none loses its share.
     let spans = all.each_ref().map(|headers| {
         let seqs = headers.iter().map(|header| header.seq.get());
         seqs.clone().max().unwrap() - seqs.min().unwrap() + 1
@@ -157,7 +155,7 @@ async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
         }
     }
 
-    // One is stopped, then all: the others hear of the second only.
+    // First one vehicle is stopped, then all: the others receive only the second stop.
     let http_at = server.http;
     let press = |path: &'static str| {
         tokio::task::spawn_blocking(move || {
@@ -179,13 +177,13 @@ async fn eight_cameras_over_four_vehicles_and_each_client_gets_its_own_alone() {
 }
 
 #[test]
-fn a_stopped_client_and_a_slow_one_delay_nobody() {
+fn a_stopped_and_a_slow_client_do_not_delay_others() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), &four_vehicles()), &SLOWLY);
     let _emitters = emitters(&server);
     let alone = || tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    // The wasp's client lives on a runtime that is not run again: as still as a process that got
-    // SIGSTOP, which acknowledges nothing.
+    // The wasp's client lives on a tokio runtime that does not run any more: like a process after SIGSTOP, it
+    // acknowledges nothing.
     let still = alone();
     let stopped = still.block_on(async {
         let (client, _) = Client::welcomed_to(&server, NAMES[0], TransportConfig::default()).await;
@@ -193,7 +191,7 @@ fn a_stopped_client_and_a_slow_one_delay_nobody() {
         client
     });
     alone().block_on(async {
-        // The bee's client takes no images at all; the ant's and the fly's are well.
+        // The bee's client accepts no images; the clients of ant and fly work normally.
         let mut no_images = TransportConfig::default();
         no_images.max_concurrent_uni_streams(VarInt::from_u32(0));
         let (slow, _) = Client::welcomed_to(&server, NAMES[1], no_images).await;
@@ -212,7 +210,7 @@ async fn pages_that_read_nothing_slow_no_runtime() {
     let server = Server::start(&write_arena(folder.path(), &four_vehicles()), &SLOWLY);
     let _emitters = emitters(&server);
     let own = format!("http://{}", server.http);
-    // Each is sent the pictures of two cameras until its socket is full; then it stalls.
+    // Each receives the images of two cameras until its socket is full; then it stalls.
     let pages: Vec<_> = NAMES
         .iter()
         .cycle()
@@ -227,7 +225,7 @@ async fn pages_that_read_nothing_slow_no_runtime() {
 }
 
 #[test]
-fn a_page_shows_the_vehicle_it_asks_for() {
+fn a_page_shows_the_requested_vehicle() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), &four_vehicles()), &SLOWLY);
     let _emitters = emitters(&server);

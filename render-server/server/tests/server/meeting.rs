@@ -1,5 +1,4 @@
-//! Two vehicles in one arena: each sees the other, neither itself, and they collide. And what a camera
-//! withholds.
+//! Two vehicles in one arena see each other, but not themselves, and collide. Also: cameras that withhold depth.
 
 use std::fmt::Write;
 
@@ -8,7 +7,7 @@ use quinn::TransportConfig;
 use vizflyt_protocol::messages::{EventKind, ToRuntime};
 use vizflyt_rgbd::Decoder;
 
-/// Returns depth in the middle of the next image of a camera. [mm]
+/// Returns the depth at the centre of the next image of a camera. [mm]
 async fn middle_mm(client: &Client, camera: u8) -> u16 {
     loop {
         let (header, payload) = client.image().await;
@@ -35,7 +34,7 @@ async fn two_vehicles_see_each_other_and_collide() {
     let (wasp, _) = Client::welcomed_to(&server, "wasp", TransportConfig::default()).await;
     let (mut bee, _) = Client::welcomed_to(&server, "bee", TransportConfig::default()).await;
     let _wasp_stays = Emitter::along(server.vicon, "wasp", |_| -2.0);
-    // Half a second in place, then up behind the wasp, 5 mm a frame, and there it stays.
+    // Half a second in place, then 5 mm per frame towards the wasp, and stop behind it.
     let _bee_comes = Emitter::along(server.vicon, "bee", |frame| {
         -6.0 + f64::from(frame.clamp(100, 860) - 100) * 0.005
     });
@@ -48,9 +47,9 @@ async fn two_vehicles_see_each_other_and_collide() {
     };
     let (p_world_m, text) = bee.until(collision).await;
     assert!(text.contains("collision with vehicle 'wasp'"), "{text}");
-    // Twice the body's 0.12 m before the wasp.
+    // Twice the body radius of 0.12 m behind the wasp.
     assert!((p_world_m.x + 2.24).abs() < 0.05, "{p_world_m}");
-    // The bee has the wasp close before its camera; the wasp sees past itself, to the wall.
+    // The bee sees the wasp close ahead; the wasp does not see itself, only the wall.
     let close = async { while middle_mm(&bee, 0).await > 500 {} };
     tokio::time::timeout(PATIENCE, close).await.expect("the wasp is seen");
     let far_mm = middle_mm(&wasp, 0).await;
@@ -58,7 +57,7 @@ async fn two_vehicles_see_each_other_and_collide() {
 }
 
 #[tokio::test]
-async fn depth_that_is_withheld_does_not_leave_the_server() {
+async fn withheld_depth_does_not_leave_the_server() {
     let colour_alone = "[[cameras]]\nname = 'colour'\nwidth_px = 160\nheight_px = 120\n\
                         horizontal_fov_deg = 90.0\nposition_m = [0.06, 0, 0.02]\ndepth = false\n";
     let folder = tempfile::tempdir().unwrap();
@@ -67,7 +66,7 @@ async fn depth_that_is_withheld_does_not_leave_the_server() {
     let _emitter = Emitter::along(server.vicon, "vizflyt", |_| 0.0);
     assert!((4500..5200).contains(&middle_mm(&client, 0).await));
     assert_eq!(middle_mm(&client, 1).await, 0);
-    // Nor can it be had by asking for it.
+    // Changing the camera does not enable depth either.
     let request = "PATCH /api/vehicles/vizflyt/cameras/colour";
     let (status, text) =
         crate::support::send_json(server.http, request, None, r#"{"depth": true}"#);

@@ -1,17 +1,17 @@
-//! The page over a real socket: files, WebSocket, stop button, and who may use them.
+//! The page over a real socket: files, WebSocket, stop button, and rights to them.
 
 use crate::support::{Client, Emitter, Server, Socket, http, send_json, write_arena};
 use quinn::TransportConfig;
 use vizflyt_protocol::messages::{EventKind, FlightPhase, Telemetry, ToRuntime, ToServer};
 
-/// A picture of the twin: from 1 m above the start, along x.
+/// An image of the twin: from 1 m above the start, along x.
 const TWIN: &str = "/api/twin?x_m=0&y_m=0&z_m=1&qx=-0.5&qy=0.5&qz=-0.5&qw=0.5&fov_deg=50&width_px=160&height_px=90\
      &cut=false&background=0d1217";
-/// Messages within which what is waited for must come: a minute's worth.
+/// Maximum number of messages until an expected one: one minute's worth.
 const MANY: usize = 2000;
 
 #[test]
-fn the_page_is_whole_and_fetches_nothing_from_elsewhere() {
+fn the_page_is_complete_and_loads_nothing_from_other_hosts() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     for (path, kind) in [
@@ -73,7 +73,7 @@ fn a_viewer_sees_the_arena_the_flight_and_the_pictures() {
         }
     }
     assert_eq!(seen, [true; 2], "colour and depth");
-    // One that opens later is told the way so far.
+    // A page that opens later receives the path so far.
     let mut late = Socket::open(server.http, &own).ok().unwrap();
     assert!(!late.message("track")["points"].as_array().unwrap().is_empty());
 }
@@ -99,10 +99,10 @@ fn cameras_are_listed_and_changed_by_our_own_page_only() {
     };
     let good =
         r#"{"width_px": 64, "height_px": 48, "horizontal_fov_deg": 70, "position_m": [0, 0, 0]}"#;
-    // What is listed can be put as it is.
+    // A listed camera can be put unchanged.
     assert_eq!(put("front", &cameras[0].to_string()).0, 200);
     assert_eq!(put("front", good).0, 200);
-    // Every page is told, and so are the event feed and standard output.
+    // Every page, the event feed and standard output receive the change.
     assert_eq!(socket.message("cameras")["cameras"][0]["width_px"], 64);
     let text = server.line(|line| line["event"]["text"].as_str().map(str::to_owned));
     assert!(text.starts_with("camera front is now 64x48 px"), "{text}");
@@ -171,13 +171,13 @@ fn light_and_fog_are_readable_by_all_and_changed_by_our_page_only() {
         let (status, answer) = put(body, None);
         assert!(status == 400 && answer.contains(expected), "{body}: {status} {answer}");
     }
-    // What was refused has changed nothing.
+    // The rejected request has changed nothing.
     assert_eq!(environment()["rain"]["rate_mmph"], 5.0);
     assert_eq!(put(r#"{"name": "day"}"#, Some("http://evil.example")).0, 403);
 }
 
 #[tokio::test]
-async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
+async fn the_stop_button_works_only_from_the_own_page() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let own = format!("http://{}", server.http);
@@ -188,7 +188,7 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
         )
     };
     let (status, answer) = press(&own);
-    assert_eq!(status, 409, "nobody to land the vehicle");
+    assert_eq!(status, 409, "no runtime to land the vehicle");
     assert!(answer.contains("no runtime is connected"));
     let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
     for stranger in ["http://evil.example", "null", "http://127.0.0.1:1"] {
@@ -204,7 +204,7 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
         })
         .await;
     assert_eq!(event.kind, EventKind::EmergencyStop);
-    // A page that opens afterwards shows what decided the flight.
+    // A page that opens afterwards shows the outcome of the flight.
     let mut socket = Socket::open(server.http, &own).ok().unwrap();
     let state = socket.message("state");
     assert_eq!(state["outcome"]["outcome"], "landed");
@@ -213,7 +213,7 @@ async fn the_stop_button_reaches_the_runtime_and_only_from_our_page() {
     assert_eq!(state["outcome"]["tone"], "bad");
 }
 
-// Two threads: the page's socket is read blocking, and the client's packets must leave meanwhile.
+// Two threads: the page's socket is read blocking, and the client must send packets in parallel.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn start_land_and_reset_are_refused_with_the_reason_or_reach_the_runtime() {
     let folder = tempfile::tempdir().unwrap();
@@ -222,8 +222,8 @@ async fn start_land_and_reset_are_refused_with_the_reason_or_reach_the_runtime()
         send_json(server.http, &format!("POST /api/vehicles/vizflyt/{what}"), None, "")
     };
     assert_eq!(press("start").0, 409);
-    assert!(press("land").1.contains("nobody to land it"));
-    assert_eq!(press("reset").0, 202, "on the ground, with nobody there");
+    assert!(press("land").1.contains("so it cannot be landed"));
+    assert_eq!(press("reset").0, 202, "on the ground, without a runtime");
     let mut socket = Socket::open(server.http, &format!("http://{}", server.http)).ok().unwrap();
     let (mut client, _) = Client::welcomed(&server, TransportConfig::default()).await;
     for (phase, name) in [

@@ -19,7 +19,7 @@ fn start(folder: &std::path::Path) -> (Server, Code) {
     (server, code.parse().unwrap())
 }
 
-/// Connects for pairing to whoever answers at `address`; returns also who that is.
+/// Connects for pairing to the peer at `address`; also returns its fingerprint.
 async fn call(
     address: std::net::SocketAddr,
     identity: &Identity,
@@ -33,7 +33,7 @@ async fn call(
     (endpoint, connection, pin.found().unwrap())
 }
 
-/// Plays the client; the server's sentence where it refuses.
+/// Plays the client; returns the server's sentence if it rejects.
 async fn pair(
     address: std::net::SocketAddr,
     identity: &Identity,
@@ -87,7 +87,7 @@ fn other_than(code: Code) -> Code {
 }
 
 #[tokio::test]
-async fn the_right_code_pairs_once_and_for_good() {
+async fn the_right_code_pairs_once_and_persistently() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
     let [jetson, late] = [(); 2].map(|()| Identity::ephemeral().unwrap());
@@ -109,7 +109,7 @@ async fn the_right_code_pairs_once_and_for_good() {
 }
 
 #[tokio::test]
-async fn three_wrong_codes_end_it() {
+async fn three_wrong_codes_close_the_pairing() {
     let folder = tempfile::tempdir().unwrap();
     let (server, code) = start(folder.path());
     let jetson = Identity::ephemeral().unwrap();
@@ -122,7 +122,7 @@ async fn three_wrong_codes_end_it() {
     assert_eq!(Paired::read(&server.keys()).unwrap().client(jetson.fingerprint()), None);
 }
 
-/// He answers the client as the server, calls the server as the client, and passes every byte on.
+/// The attacker answers the client as the server, calls the server as the client, and passes every byte on.
 #[tokio::test]
 async fn a_man_in_the_middle_gains_nothing_from_the_right_code() {
     let folder = tempfile::tempdir().unwrap();
@@ -164,7 +164,7 @@ async fn strangers_run_out_of_attempts() {
     let (server, _) = start(folder.path());
     let stranger = Identity::ephemeral().unwrap();
     let mut refused = None;
-    // Far more than one address has, however slow this machine.
+    // Far more attempts than one address has, even on a slow machine.
     for _ in 0..500 {
         match connect_as(&server, &stranger, TransportConfig::default()).await {
             Ok((_endpoint, connection)) => drop(connection.closed().await),

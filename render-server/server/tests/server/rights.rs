@@ -1,4 +1,4 @@
-//! Who may connect, over real QUIC to the real binary: a stranger, a team, an instructor.
+//! Rights to connect, over real QUIC to the real binary: a stranger, a team, an instructor.
 
 use std::os::unix::fs::PermissionsExt;
 
@@ -11,7 +11,7 @@ fn usual() -> TransportConfig {
     TransportConfig::default()
 }
 
-/// Waits until the server closes a connection; returns the code and what it says.
+/// Waits until the server closes a connection; returns code and reason.
 async fn closed(connection: &quinn::Connection) -> (u64, String) {
     let closing = tokio::time::timeout(PATIENCE, connection.closed()).await;
     match closing.expect("the server closes the connection") {
@@ -25,13 +25,13 @@ async fn closed(connection: &quinn::Connection) -> (u64, String) {
 const UNPAIRED: u64 = vizflyt_protocol::messages::close::UNPAIRED as u64;
 
 #[tokio::test]
-async fn stranger_receives_how_to_pair_and_nothing_else() {
+async fn a_stranger_receives_only_pairing_instructions() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
     let stranger = Identity::ephemeral().unwrap();
     let (_endpoint, connection) = connect_as(&server, &stranger, usual()).await.unwrap();
-    // It says nothing, and would not listen: it is refused for who it is.
+    // The client is silent and does not listen: it is rejected for its identity.
     let (code, reason) = closed(&connection).await;
     assert_eq!(code, UNPAIRED);
     let expected = format!("run `vizflyt pair 127.0.0.1:{}`", server.quic.port());
@@ -40,9 +40,9 @@ async fn stranger_receives_how_to_pair_and_nothing_else() {
         assert!(!reason.contains(secret), "{reason}");
     }
     let heard = connection.stats();
-    assert_eq!((heard.frame_rx.stream, heard.frame_rx.datagram), (0, 0), "not a byte was told");
+    assert_eq!((heard.frame_rx.stream, heard.frame_rx.datagram), (0, 0), "no byte was sent");
 
-    // The one who is paired flies on, undisturbed.
+    // The paired client continues undisturbed.
     let (client, _) = Client::welcomed(&server, usual()).await;
     client.pose().await;
 }
@@ -62,13 +62,13 @@ async fn a_team_flies_its_own_vehicle_and_no_other() {
         let ToRuntime::Refused(text) = thief.next().await else { panic!("let in") };
         assert_eq!(text, format!("'team' may use 'wasp' here, not '{vehicle}'").as_str());
     }
-    // It did not even disturb the one that flies.
+    // The rejected one has not disturbed the flying one.
     flying.send(&ToServer::Telemetry(Telemetry::default())).await;
     flying.pose().await;
 }
 
 #[tokio::test]
-async fn removing_the_entry_ends_the_connection() {
+async fn removing_the_entry_closes_the_connection() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (client, _) = Client::welcomed(&server, usual()).await;

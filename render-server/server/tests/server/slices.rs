@@ -1,6 +1,6 @@
-//! An image on its way from the renderer's pixels to the transport allocates nothing of ours once
-//! the buffers have their size: quantised, encoded, handed to two subscribers, acknowledged.
-//! (Colour is exact here: the JPEG libraries allocate a handful of small buffers an image.)
+//! Between renderer and transport, an image causes no allocations in this project's code once the buffers have their
+//! size: quantized, encoded, passed to two subscribers, acknowledged. (Colour is exact here, because the JPEG libraries
+//! allocate a few small buffers per image.)
 
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
@@ -19,7 +19,7 @@ use vizflyt_server::stream::subscriptions::{Part, Slots, Subscriptions};
 #[global_allocator]
 static ALLOCATOR: CountingAllocator = CountingAllocator;
 
-/// Returns what is there already.
+/// Returns the result of a future that is ready.
 fn now<T>(future: impl Future<Output = T>) -> T {
     match pin!(future).poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(value) => value,
@@ -27,7 +27,7 @@ fn now<T>(future: impl Future<Output = T>) -> T {
     }
 }
 
-/// Takes an image as the transport would, and lets go of it; returns its bytes of bitstream.
+/// Takes an image as the transport would, and releases it; returns the size of its bitstream.
 fn take(subscriptions: &Subscriptions, id: u64, places: &Slots) -> usize {
     let image = &places[0][0];
     now(image.image());
@@ -44,7 +44,7 @@ fn take(subscriptions: &Subscriptions, id: u64, places: &Slots) -> usize {
 }
 
 #[test]
-fn an_image_allocates_nothing_once_the_buffers_have_their_size() {
+fn an_image_allocates_nothing_after_warm_up() {
     let camera = "name = 'front'\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
                   position_m = [0, 0, 0]";
     let camera: CameraConfig = toml::from_str(camera).unwrap();

@@ -19,7 +19,7 @@ fn usual() -> TransportConfig {
     TransportConfig::default()
 }
 
-/// Images are drawn for up to 0.2 s later, at 200 frames a second or less.
+/// Images are predicted up to 0.2 s ahead, at up to 200 frames per second.
 const AHEAD_FRAMES: f64 = 40.0;
 
 #[tokio::test]
@@ -34,22 +34,22 @@ async fn images_follow_the_poses() {
     for _ in 0..20 {
         let (header, payload, trailer) = client.whole_image().await;
         // Streams may finish out of order, but the stamps within an image never do.
-        assert!(header.exposure_stamp() > header.pose_stamp(), "it shows when it is seen");
+        assert!(header.exposure_stamp() > header.pose_stamp(), "the exposure is predicted");
         let stamps = [header.pose_ns, header.render_start_ns, header.render_end_ns]
             .map(zerocopy::byteorder::little_endian::U64::get);
         assert!(stamps.is_sorted(), "{stamps:?}");
-        // The first byte may leave before the last is made, or after.
+        // The first byte may be sent before or after the last is encoded.
         let ends = [trailer.send_ns.get(), trailer.encode_end_ns.get()];
         assert!(ends.iter().all(|&end| end >= stamps[2]), "{stamps:?} {ends:?}");
         assert!(header.seq.get() > seq || header.pose_ns.get() < pose_ns);
         (seq, pose_ns) = (header.seq.get(), header.pose_ns.get());
-        // Drawn from where the vehicle flies, through the camera's extrinsics.
+        // Rendered from the vehicle's pose, through the camera's extrinsics.
         let p = header.world_from_cam().translation_m;
         let frame = (0.06 - p.x) / STEP_M;
         let sent = f64::from(emitter.sent.load(Ordering::Relaxed));
         assert!((-1.0..=sent + AHEAD_FRAMES).contains(&frame), "x = {}", p.x);
         assert!(p.y.abs() < 1e-3 && (p.z - HEIGHT_M - 0.02).abs() < 1e-3, "{p}");
-        // The wall is seen where it is: camera z of its middle.
+        // The wall has the right depth: camera z of its centre.
         let info = peek(&payload).unwrap();
         assert_eq!((info.width, info.height), (160, 120));
         let (mut rgb, mut depth_mm) = (vec![0; 160 * 120 * 3], vec![0u16; 160 * 120]);
@@ -85,7 +85,7 @@ async fn images_follow_the_poses() {
 }
 
 #[tokio::test]
-async fn strangers_are_refused_by_name() {
+async fn rejects_unsupported_clients_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let refusal = |message| match message {
@@ -93,7 +93,7 @@ async fn strangers_are_refused_by_name() {
         _ => None,
     };
 
-    // Another version.
+    // Another protocol version.
     let connection = connect(&server, usual()).await.unwrap();
     let (mut send, mut recv) = connection.open_bi().await.unwrap();
     send.write_all(b"VZFL\x63\x00\x02\x00").await.unwrap();
@@ -108,7 +108,7 @@ async fn strangers_are_refused_by_name() {
         "{closed}"
     );
 
-    // No VizFlyt at all.
+    // Another protocol.
     let connection = connect(&server, usual()).await.unwrap();
     let (mut send, _recv) = connection.open_bi().await.unwrap();
     send.write_all(b"GET / HT").await.unwrap();
@@ -120,15 +120,15 @@ async fn strangers_are_refused_by_name() {
     let text = other.until(refusal).await;
     assert!(text.starts_with("no vehicle 'wasp' here, only 'vizflyt'"), "{text}");
 
-    // A second runtime while the first lives.
+    // A second runtime while the first is alive.
     let (mut first, _) = Client::welcomed(&server, usual()).await;
     let mut second = Client::hello(&server, "vizflyt", usual()).await;
-    // The first keeps reporting, so it is alive whatever the machine's load.
+    // The first keeps reporting, so that it stays alive on a loaded machine.
     first.send(&ToServer::Telemetry(Telemetry::default())).await;
     let text = second.until(refusal).await;
     assert!(text.starts_with("vehicle 'vizflyt' is flown by test 1 at 127.0.0.1:"), "{text}");
 
-    // It starts again once the first has gone.
+    // It can connect once the first has closed.
     first.close().await;
     loop {
         let mut again = Client::hello(&server, "vizflyt", usual()).await;
@@ -139,7 +139,7 @@ async fn strangers_are_refused_by_name() {
 }
 
 #[tokio::test]
-async fn a_runtime_that_reads_no_images_stalls_nobody_and_then_gets_the_newest() {
+async fn a_stalled_runtime_delays_no_other_and_then_gets_the_newest_images() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
@@ -151,7 +151,7 @@ async fn a_runtime_that_reads_no_images_stalls_nobody_and_then_gets_the_newest()
     for _ in 0..100 {
         stalled_until_ns = client.pose().await.stamp.as_ns();
     }
-    // The first stream was filled at the start; whatever comes after it is fresh.
+    // The first stream was filled at the start; images after it are fresh.
     let mut stream = client.connection.accept_uni().await.unwrap();
     let _ = stream.read_to_end(1 << 22).await;
     drop(stream);
@@ -160,7 +160,7 @@ async fn a_runtime_that_reads_no_images_stalls_nobody_and_then_gets_the_newest()
         headers.push(client.image().await.0);
     }
     let fresh = headers.iter().filter(|h| h.pose_ns.get() > stalled_until_ns).count();
-    // At most K waited for a stream when the stall ended, and one each was drawn and being drawn.
+    // At most K images waited for a stream when the stall ended; one was rendered, one was being rendered.
     assert!(fresh >= 6, "{fresh} of 12 are newer than the stall");
     drop(client);
     let report = server.finish();
@@ -184,7 +184,7 @@ async fn at_most_k_images_are_in_flight_until_the_deadline() {
             .expect("another image after the deadline of the last")
             .unwrap();
         let mut bytes = [0; ImageHeader::SIZE];
-        // Reset before its header was read: as good as not seen.
+        // Reset before its header was read: counts as not seen.
         if stream.read_exact(&mut bytes).await.is_ok() {
             let (header, _) = ImageHeader::parse(&bytes).unwrap();
             drawn_ns.push(header.render_end_ns.get());
@@ -193,8 +193,8 @@ async fn at_most_k_images_are_in_flight_until_the_deadline() {
         }
         streams.push(stream);
     }
-    // K is 2 on loopback: the third image leaves only when the first is reset, 150 ms after it was
-    // sent, and so more after it was drawn.
+    // K is 2 on loopback: the third image is sent only when the first is reset, 150 ms after it was sent, and therefore
+    // more than that after it was rendered.
     drawn_ns.sort_unstable();
     seen_ns.sort_unstable();
     for (drawn, seen) in drawn_ns.iter().zip(&seen_ns[2..]) {
@@ -211,7 +211,7 @@ async fn a_restarted_runtime_gets_images_again() {
     for _ in 0..3 {
         let mut client = loop {
             let mut client = Client::hello(&server, "vizflyt", usual()).await;
-            // Refused only until the server has noticed the former one's end.
+            // Rejected only until the server has noticed the end of the previous one.
             if matches!(client.next().await, ToRuntime::Welcome(_)) {
                 break client;
             }
@@ -225,7 +225,7 @@ async fn a_restarted_runtime_gets_images_again() {
 }
 
 #[tokio::test]
-async fn lost_poses_are_sent_and_sent_again_to_a_runtime_that_comes_back() {
+async fn a_reconnected_runtime_receives_lost_pose_events_again() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let emitter = Emitter::start(server.vicon, "vizflyt");
@@ -243,7 +243,7 @@ async fn lost_poses_are_sent_and_sent_again_to_a_runtime_that_comes_back() {
     let event = client.until(lost).await;
     let printed = server.line(|line| line.get("event").cloned());
     assert_eq!(printed["text"], event.text.as_str());
-    // The connection is lost in flight; the next one is told what happened since take-off.
+    // The connection is lost in flight; the next one receives the events since take-off.
     client.close().await;
     let mut again = loop {
         let mut client = Client::hello(&server, "vizflyt", usual()).await;
@@ -261,9 +261,9 @@ async fn lost_poses_are_sent_and_sent_again_to_a_runtime_that_comes_back() {
         .await;
 }
 
-/// Failed before: the server told the whole flight's events again.
+/// Regression test: the server repeated all events of the flight.
 #[tokio::test]
-async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
+async fn events_arrive_and_are_logged_once_despite_outages() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let emitter = Emitter::start(server.vicon, "vizflyt");
@@ -294,7 +294,7 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
     assert!(heard.receive(welcome.boot, seq));
     client.close().await;
     emitter.pause(false);
-    // Back in flight: what it has heard is not told again, what it has not is.
+    // Reconnected in flight: only events that were not received are sent.
     let mut client = loop {
         let mut client = Client::greet(&server, hello(heard), usual()).await;
         if let ToRuntime::Welcome(again) = client.next().await {
@@ -326,20 +326,20 @@ async fn events_come_once_through_outages_and_the_runtimes_are_logged_once() {
 }
 
 #[tokio::test]
-async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
+async fn watchers_receive_the_same_images_and_cannot_command() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &["--max-rate", "20"]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
-    // Alone it is served, though nobody flies.
+    // A watcher receives images without a flying runtime.
     let mut watcher = Client::watching(&server, usual()).await;
     let (header, payload) = watcher.image().await;
     assert_eq!(peek(&payload).unwrap().width, header.width_px.get());
     watcher.pose().await;
-    // What it says does not count, and it takes nobody's lease.
+    // Its telemetry is ignored, and it does not occupy the runtime's place.
     let landed = Telemetry { phase: FlightPhase::Flying, ..Telemetry::default() };
     watcher.send(&ToServer::Telemetry(landed)).await;
     let (runtime, _) = Client::welcomed(&server, usual()).await;
-    // One that reads nothing, beside the two that do.
+    // A third client that reads nothing.
     let mut transport = usual();
     transport.max_concurrent_uni_streams(VarInt::from_u32(1));
     let _stalled = Client::watching(&server, transport).await;
@@ -355,7 +355,7 @@ async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
         }
     }
     assert!(same >= 20, "{same} of 40 images went to both");
-    // Eight at most; the others go on.
+    // At most eight; the existing ones continue.
     let mut others = Vec::new();
     for _ in 2..8 {
         others.push(Client::watching(&server, usual()).await);
@@ -367,7 +367,7 @@ async fn watchers_see_what_the_runtime_sees_and_command_nothing() {
 }
 
 #[tokio::test]
-async fn a_camera_that_is_blocked_holds_up_no_other() {
+async fn a_blocked_camera_does_not_delay_others() {
     let folder = tempfile::tempdir().unwrap();
     let rear = r#"priority = 5
 [[cameras]]
@@ -379,11 +379,11 @@ position_m = [0.06, 0, 0.02]
 "#;
     let server = Server::start(&write_arena(folder.path(), rear), &["--max-rate", "50"]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
-    // A header fits into the window, an image never does without being read.
+    // A header fits into the window, an unread image never does.
     let mut transport = usual();
     transport.stream_receive_window(VarInt::from_u32(512));
     let (client, _) = Client::welcomed(&server, transport).await;
-    // The front camera, which has the higher priority, is read no further than its header.
+    // Only the header of the front camera, which has the higher priority, is read.
     let (mut blocked, mut whole) = (Vec::new(), 0);
     let mut first_ns = 0;
     while whole < 40 {
@@ -402,8 +402,8 @@ position_m = [0.06, 0, 0.02]
             }
         }
     }
-    // Of the front camera two images in 150 ms were begun, and none was acknowledged: had the rear
-    // one waited for it, it would have had as few.
+    // Two images of the front camera are begun per 150 ms, and none is acknowledged. If the rear camera had to wait for
+    // it, it would have as few.
     assert!(blocked.len() < 30, "{} images of the blocked camera", blocked.len());
     drop(client);
     let report = server.finish();
@@ -415,8 +415,8 @@ async fn collision_with_the_twin_is_sent_to_the_runtime_and_printed() {
     let folder = tempfile::tempdir().unwrap();
     let server = Server::start(&write_arena(folder.path(), ""), &[]);
     let (mut client, _) = Client::welcomed(&server, usual()).await;
-    // Half a second in place, then into the wall at x = 5 m, 1 cm a frame, and there it stays: a
-    // machine so loaded that packets are lost on the way still sees it touch.
+    // Half a second in place, then 1 cm per frame into the wall at x = 5 m, and stop there: even if a loaded machine
+    // loses packets, the contact is seen.
     let _emitter = Emitter::along(server.vicon, "vizflyt", |frame| {
         3.0 + f64::from(frame.clamp(100, 295) - 100) * 0.01
     });
@@ -428,16 +428,16 @@ async fn collision_with_the_twin_is_sent_to_the_runtime_and_printed() {
         _ => None,
     };
     let (p_world_m, clearance_m) = client.until(collision).await;
-    // The body's surface, 0.12 m before its centre, touches the wall's front, within two voxels.
+    // The body's surface, 0.12 m in front of its centre, touches the wall's front, within two voxels.
     assert!((p_world_m.x - 4.88).abs() < 0.15, "{p_world_m}");
     assert!(clearance_m <= 0.0);
     server.line(|line| line["event"]["kind"].get("collision").map(|_| ()));
 }
 
 #[tokio::test]
-async fn a_camera_that_changes_while_flying_loses_no_image() {
+async fn changing_a_camera_in_flight_loses_no_image() {
     let folder = tempfile::tempdir().unwrap();
-    // Slow enough that even a loaded machine draws, encodes and sends every tick.
+    // Slow enough that even a loaded machine renders, encodes and sends every tick.
     let server = Server::start(&write_arena(folder.path(), ""), &["--max-rate", "20"]);
     let _emitter = Emitter::start(server.vicon, "vizflyt");
     let (mut client, _) = Client::welcomed(&server, usual()).await;
@@ -481,7 +481,7 @@ async fn a_camera_that_changes_while_flying_loses_no_image() {
     images.sort_by_key(|(header, _)| header.seq.get());
     let mut now = 0;
     for (header, payload) in &images {
-        // Changes come in order, and each image is whole and says how it was drawn.
+        // Changes arrive in order, and each image is complete and contains its intrinsics.
         let k = header.intrinsics();
         while (k.width_px, k.height_px) != changes[now].0 {
             now += 1;
@@ -496,7 +496,7 @@ async fn a_camera_that_changes_while_flying_loses_no_image() {
         Decoder::new().decode(payload, &mut rgb, &mut depth_mm).unwrap();
     }
     assert_eq!(now, changes.len() - 1);
-    // Whatever is missing gave way to a newer image, as without a change.
+    // Missing images were replaced by newer ones, as without a change.
     let (first, last) = (images[0].0.seq.get(), images[images.len() - 1].0.seq.get());
     let missing = last - first + 1 - images.len() as u64;
     let count = |key: &str| report[key].as_u64().unwrap();
@@ -529,20 +529,20 @@ rate_hz = 5.0
         stamps_ns[camera].push(header.render_start_ns.get());
         assert!(header.together.get() & (1 << camera) != 0);
         if camera == 1 {
-            // The wall is nearer than its near plane.
+            // The wall is nearer than the near plane.
             let (mut rgb, mut depth_mm) = (vec![0; 64 * 48 * 3], vec![0u16; 64 * 48]);
             Decoder::new().decode(&payload, &mut rgb, &mut depth_mm).unwrap();
             assert!(depth_mm.iter().all(|&mm| mm == 0));
         }
     }
-    // Never before it is due. A busy server renders late and then catches up, so the times are counted from the start,
-    // and not between two images. The first one is due at once, and so is the second if that was late.
+    // Images are never early. A busy server renders late and then catches up, so the times count from the start, not
+    // between two images. The first image is due at once, and so is the second if the first was late.
     stamps_ns[1].sort_unstable();
     for (k, &ns) in stamps_ns[1].iter().enumerate().skip(1) {
         let since_begin_ms = ns.saturating_sub(begin.as_ns()) / 1_000_000;
         assert!(since_begin_ms >= 190 * (k as u64 - 1), "image {k} is early: {stamps_ns:?}");
     }
-    // The other one's images come between.
+    // Images of the other camera arrive in between.
     let (first, last) = (stamps_ns[1][0], stamps_ns[1][8]);
     let between = stamps_ns[0].iter().filter(|&&ns| ns > first && ns < last).count();
     assert!(between > 4, "{stamps_ns:?}");

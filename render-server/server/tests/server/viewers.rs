@@ -1,11 +1,11 @@
-//! Twenty open pages beside four runtimes with two cameras each: no event is lost, memory stays, and
-//! the runtimes keep their images.
+//! Twenty open pages and four runtimes with two cameras each: no event is lost, memory is stable, and the runtimes keep
+//! their images.
 //!
 //! ```text
 //! VIZFLYT_STRESS_S=600 cargo test -p vizflyt-server --test server viewers -- --nocapture
 //! ```
-//! runs it for ten minutes and prints rates and memory; without it, for a few seconds. Rates are
-//! compared in one run, without pages, with them, and without again; no test hangs on them.
+//! runs it for ten minutes and prints rates and memory; without the variable, for a few seconds. It prints rates
+//! without pages, with them, and without them again; they do not decide the test.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,15 +18,15 @@ use vizflyt_protocol::messages::ToRuntime;
 
 const VEHICLES: [&str; 4] = ["ant", "bee", "fly", "wasp"];
 const VIEWERS: usize = 20;
-/// In the second half of a watched time of minutes. [MB]
+/// Maximum growth in the second half of a test of minutes. [MB]
 const MAX_MEMORY_GROWTH_MB: f64 = 12.0;
-/// From the first page on: sockets, queues, threads and previews of 20 pages take half of it within seconds. Images that
-/// are never freed would take it in two seconds. [MB]
+/// Maximum growth from the first page on: sockets, queues, threads and previews of 20 pages use half of it within
+/// seconds. Images that are never freed would exceed it in two seconds. [MB]
 const MAX_MEMORY_OF_PAGES_MB: f64 = 48.0;
-/// The server keeps so many previews of each camera (`flights/recent_previews.rs`).
+/// Number of previews of each camera that the server keeps (`flights/recent_previews.rs`).
 const KEPT_PREVIEWS: u64 = 36;
 
-/// What one vehicle's runtime has got.
+/// Messages and images that one vehicle's runtime received.
 #[derive(Debug, Default)]
 struct Got {
     images: [AtomicU64; 2],
@@ -34,7 +34,7 @@ struct Got {
 }
 
 #[test]
-fn twenty_pages_cost_four_runtimes_no_event() {
+fn twenty_pages_and_four_runtimes_lose_no_event() {
     let seconds = std::env::var("VIZFLYT_STRESS_S").map_or(4, |s| s.parse().unwrap());
     let folder = tempfile::tempdir().unwrap();
     let second = "name = \"down\"\nwidth_px = 320\nheight_px = 240\nhorizontal_fov_deg = 90.0\n\
@@ -76,21 +76,21 @@ fn twenty_pages_cost_four_runtimes_no_event() {
         println!("{phase:<16} {sum:6.1} images/s of 8 cameras, the slowest {least:.2} Hz");
         sum
     };
-    // The first seconds open streams and fill caches. The previews kept for crash cards fill with images, so their number
-    // counts, and not the time.
+    // The first seconds open streams and fill caches. The previews for crash cards also fill with images, so wait for
+    // their number, not for a time.
     rate("start", 2, &mut || {});
     wait_until("the previews of each camera", || {
         got.iter().flat_map(|got| &got.images).all(|n| n.load(Ordering::Relaxed) > KEPT_PREVIEWS)
     });
     let before = rate("no page", (seconds / 4).max(2), &mut || {});
 
-    // How many changes there are in all, once that is known.
+    // Total number of changes, once it is final.
     let all = Arc::new(AtomicU64::new(u64::MAX));
     let pages: Vec<_> = (0..VIEWERS).map(|k| Page::open(&server, VEHICLES[k % 4], &all)).collect();
     let (mut memory_mb, mut changes) = (vec![rss_mb(&server)], 0);
     let watched = rate("20 pages", seconds, &mut || {
         memory_mb.push(rss_mb(&server));
-        // What each runtime and each page must hear of.
+        // Changes that each runtime and each page must receive.
         changes += 1;
         for name in VEHICLES {
             let tilt = format!("{{\"tilt_deg\": {}}}", changes % 2);
@@ -129,7 +129,7 @@ fn twenty_pages_cost_four_runtimes_no_event() {
 /// Waits until `done`.
 ///
 /// # Panics
-/// If that does not come.
+/// After a timeout.
 fn wait_until(what: &str, done: impl Fn() -> bool) {
     let start = Instant::now();
     while !done() {
@@ -147,17 +147,17 @@ async fn images(connection: quinn::Connection, got: Arc<Got>) {
     }
 }
 
-/// Counts what a runtime must be told.
+/// Counts a runtime's messages about changed cameras.
 async fn messages(mut client: Client, got: Arc<Got>) {
     loop {
-        // Without pages nothing is sent for minutes.
+        // Without pages, no message may arrive for minutes.
         if let ToRuntime::Camera { .. } = client.next_ever().await {
             got.cameras_changed.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
 
-/// What one page was shown.
+/// Messages and images that one page received.
 #[derive(Debug, Default)]
 struct Seen {
     changes: u64,
@@ -168,12 +168,12 @@ struct Seen {
 struct Page;
 
 impl Page {
-    /// Reads until the page has been told of `all` changes, and has had pictures and states.
+    /// Reads until the page has received `all` changes, and some images and states.
     fn open(server: &Server, vehicle: &str, all: &Arc<AtomicU64>) -> JoinHandle<Seen> {
         let origin = format!("http://{}", server.http);
         let path = format!("/ws?vehicle={vehicle}");
         let mut socket = Socket::open_at(server.http, &origin, &path).unwrap();
-        // From here on no event may be missing.
+        // From here on, no event may be missing.
         let history = socket.message("events");
         let mut next = 1 + history["events"].as_array().unwrap().iter().fold(0, index_of);
         let all = all.clone();

@@ -1,12 +1,14 @@
-//! Keeps what is seen from the free space around a path: the inside of a room, without what hangs in it or lies behind its
-//! walls.
+//! Keeps the splats that are visible from the free space around a path: the inside of a room,
+//! without splats that float in it or lie behind its walls.
 //!
 //! ```text
-//! solid splats -> occupied cells -> minus the path's own -> grown by the radius -> flood from the path -> free space
-//! free space, grown by radius and depth -> what is near it stays; haze in the middle of it goes
+//! solid splats -> occupied cells -> minus cells around the path -> grown by the radius -> flood
+//! from the path -> free space
+//! free space, grown by radius and depth -> splats near it stay; haze in the middle of it is
+//! removed
 //! ```
-//! Cells lie around the path, as far as `reach`. Where the flood comes to their end, the scene is open there, and what lies
-//! beyond stays.
+//! Cells exist up to `reach` around the path. If the flood reaches the border of the grid, the
+//! scene is open, and splats beyond the grid stay.
 
 use glam::{DVec3, IVec3};
 use rayon::prelude::*;
@@ -16,31 +18,31 @@ use super::cells::{Cells, is_solid};
 use super::step::{EditError, InvalidStep, check_length, check_point, invalid};
 use crate::Splats;
 
-/// What [`super::Step::Carve`] depends on. [scene]
+/// Parameters of [`super::EditStep::Carve`]. [scene]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Carve {
-    /// A place in the free space, or the corners of a path through it.
+    /// Point in the free space, or corners of a path through it.
     pub path: Vec<[f64; 3]>,
-    /// What is free around the path, and what fits through a gap.
+    /// Radius around the path that is assumed free, and that must fit through gaps.
     pub radius: f64,
-    /// How much of a wall stays, behind its face.
+    /// Thickness of a wall that is kept behind its surface.
     pub depth: f64,
     /// Side of the cells.
     pub cell: f64,
-    /// How far from the path cells reach.
+    /// Extent of the grid around the path.
     pub reach: f64,
 }
 
-/// A grid that takes too much memory.
+/// Error: the grid needs too much memory.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "carve: {cells:.1e} cells of {side}, and {MAX_CELLS:.0e} are the most: give larger cells, or a shorter reach"
+    "carve: {cells:.1e} cells of {side}, the maximum is {MAX_CELLS:.0e}: give larger cells, or a shorter reach"
 )]
 pub struct TooManyCells {
-    /// How many.
+    /// Number of cells.
     pub cells: f64,
-    /// Their side. [scene]
+    /// Side of a cell. [scene]
     pub side: f64,
 }
 
@@ -57,7 +59,7 @@ impl Carve {
         check_length("reach", self.reach)
     }
 
-    /// Marks the splats that stay.
+    /// Marks the splats to keep.
     ///
     /// # Errors
     /// [`EditError::TooManyCells`], [`EditError::NothingAround`], [`EditError::NoRoom`].
@@ -112,7 +114,7 @@ impl Carve {
     }
 }
 
-/// A box of cells, z fastest; fields of it hold 0 or 1.
+/// Box of cells, z fastest. Its fields contain 0 or 1 per cell.
 struct Grid {
     cells: Cells,
     low: IVec3,
@@ -138,9 +140,9 @@ impl Grid {
         self.size.iter().product()
     }
 
-    /// Returns how many cells a length is.
+    /// Returns a length in cells.
     fn steps(&self, length: f64) -> usize {
-        // No field is longer than its cells.
+        // Clamped, because no field is longer than the maximum number of cells.
         (length / self.cells.side).round().clamp(0.0, MAX_CELLS) as usize
     }
 
@@ -168,13 +170,14 @@ impl Grid {
         covered
     }
 
-    /// Returns a field grown by so many cells along each axis in turn: to cubes.
+    /// Returns a field in which each marked cell is grown to a cube, by `steps` cells along each
+    /// axis in turn.
     fn grown(&self, field: &[u8], steps: usize) -> Vec<u8> {
         let [nx, ny, nz] = self.size;
         let mut grown = field.to_vec();
         for (length, stride) in [(nz, 1), (ny, nz), (nx, ny * nz)] {
             grown.par_chunks_exact_mut(length * stride).for_each(|block| {
-                // What is marked already is 1, what is marked now 2.
+                // Cells that were marked before are 1, cells marked here are 2.
                 let mark = |row: &mut [u8], left: &mut [u32]| {
                     for (cell, left) in row.iter_mut().zip(left) {
                         if *cell == 1 {
@@ -185,7 +188,8 @@ impl Grid {
                         }
                     }
                 };
-                // Forth, then back: how far the last marked cell still counts, for each line along the axis.
+                // Forward, then backward: `left` holds the remaining steps of the last marked cell,
+                // for each line along the axis.
                 let mut left = vec![0; stride];
                 block.chunks_exact_mut(stride).for_each(|row| mark(row, &mut left));
                 left.fill(0);
@@ -198,7 +202,7 @@ impl Grid {
         grown
     }
 
-    /// Returns what is reached from the seeds, through faces of cells that are not blocked.
+    /// Returns the cells that are connected to the seeds through faces of unblocked cells.
     fn flooded(&self, seeds: &[u8], blocked: &[u8]) -> Vec<u8> {
         let [nx, ny, nz] = self.size;
         let mut reached = seeds.to_vec();
@@ -223,7 +227,7 @@ impl Grid {
         reached
     }
 
-    /// Whether a field has a cell at the end of the grid.
+    /// Returns whether a cell of a field at the border of the grid is marked.
     fn has_on_border(&self, field: &[u8]) -> bool {
         let [nx, ny, nz] = self.size;
         let is_border = |cell: usize| {
@@ -234,9 +238,9 @@ impl Grid {
     }
 }
 
-/// Points of a path: a walk of minutes, ten a second.
+/// Maximum points of a path: ten per second of a walk of several minutes.
 const MAX_CORNERS: usize = 10_000;
-/// Cells of the grid: six fields of a byte each, 200 MB.
+/// Maximum cells of the grid: six fields of one byte per cell are 200 MB.
 const MAX_CELLS: f64 = 3.2e7;
-/// What is fainter fills no cell: as the baker of obstacles has it by default.
+/// Minimum opacity of a splat that occupies cells: the default of the obstacle baker.
 const SOLID_OPACITY: f32 = 0.3;

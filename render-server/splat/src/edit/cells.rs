@@ -1,26 +1,27 @@
-//! Space in cubic cells, and which of them a splat covers.
+//! Cubic cells of space, and the cells that a splat covers.
 
 use glam::{DMat3, DVec3, IVec3};
 
 use crate::Splats;
 
-/// Cells of one side, without an end but that of their numbers.
+/// Unbounded grid of cubic cells; only the range of their numbers limits it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Cells {
-    /// Their side. [scene]
+    /// Side of a cell. [scene]
     pub(super) side: f64,
 }
 
 impl Cells {
-    /// Returns the cell that a point lies in; `None` where it has no number.
+    /// Returns the cell of a point, or `None` if it is outside the range of numbers.
     pub(super) fn of(self, p: DVec3) -> Option<IVec3> {
         let cell = (p / self.side).floor();
-        // Positively stated: NaN fails.
+        // The comparison is false for NaN, so NaN is rejected.
         (cell.abs().max_element() < f64::from(END)).then(|| cell.as_ivec3())
     }
 
-    /// Calls `visit` with the cell of a splat's centre and those within one standard deviation of it; some more than once.
-    /// What is too large for that (sky) covers the cell of its centre.
+    /// Calls `visit` with the cell of a splat's centre and the cells within one standard deviation
+    /// of it, some of them more than once. Splats that are too large for that (sky) cover only the
+    /// cell of their centre.
     pub(super) fn covered(self, splats: &Splats, index: usize, mut visit: impl FnMut(IVec3)) {
         let center = splats.means_m[index].as_dvec3();
         let mut show = |p: DVec3| self.of(p).into_iter().for_each(&mut visit);
@@ -29,7 +30,7 @@ impl Cells {
         if !(scales.max_element() > self.side / 2.0) {
             return;
         }
-        // A cell apart at most: no cell between two of them is left out.
+        // Sample points are at most one cell apart, so no cell between them is missed.
         let across =
             |scale: f64| if scale > self.side / 2.0 { (scale / self.side).ceil() } else { 0.0 };
         let steps = DVec3::from(scales.to_array().map(across));
@@ -52,18 +53,18 @@ impl Cells {
     }
 }
 
-/// Returns a cell's number: those along z follow each other.
+/// Returns the number of a cell. Cells along z have consecutive numbers.
 pub(super) fn key(cell: IVec3) -> u64 {
     let [x, y, z] = (cell + END).to_array().map(|n| n as u64);
     x << 42 | y << 21 | z
 }
 
-/// Whether a splat is no haze.
+/// Returns whether a splat is solid: not haze, and at a finite position.
 pub(super) fn is_solid(splats: &Splats, index: usize, least: f32) -> bool {
     splats.opacities[index] >= least && splats.means_m[index].is_finite()
 }
 
-/// Cells have numbers below this on each axis: 21 bits each, with room for neighbours.
+/// Limit of cell numbers on each axis: 21 bits each, with room for neighbours.
 const END: i32 = (1 << 20) - 2;
-/// A splat over more points than these is sky, and connects nothing.
+/// Maximum sample points of a splat. A larger splat is sky, and connects nothing.
 const MOST_COVERED: f64 = 4096.0;

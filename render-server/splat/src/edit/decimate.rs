@@ -1,13 +1,14 @@
-//! Fewer splats: those that show least go.
+//! Reduces the number of splats, the least important first.
 
 use rayon::prelude::*;
 
 use crate::Splats;
 
-/// Marks the `count` splats of most importance; of equal ones the first.
+/// Marks the `count` most important splats. Of equally important splats, the first are preferred.
 ///
-/// Importance is what a splat covers: its opacity times the product of its two largest standard deviations, an area. Small
-/// splats stand where many overlap, large ones alone.
+/// Importance is the covered area: opacity times the product of the two largest standard
+/// deviations. Small splats are usually where many overlap, large ones where they cover an area
+/// without others.
 pub(super) fn most_important(splats: &Splats, count: usize) -> Vec<bool> {
     if count >= splats.len() {
         return vec![true; splats.len()];

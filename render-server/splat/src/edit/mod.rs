@@ -1,16 +1,17 @@
-//! Splats in, fewer or moved splats out: what a captured scene needs before it is flown.
+//! Edits that prepare a captured scene for flights: removing and moving splats.
 //!
-//! A [`EditStep`] is one edit with all that it depends on, in the axes and units that the scene has when its turn comes. Steps
-//! are data: whoever keeps them beside the original can repeat the edit, or leave the last one out.
+//! An [`EditStep`] is one edit with all its parameters, in the axes and units that the scene has
+//! when the step is applied. Steps are data: a list of steps next to the original file allows
+//! repeating the edits, or omitting the last one.
 //!
 //! ```text
-//! Step::check --> numbers that can be meant
-//! Step::apply --> region, cells, carve, decimate: which splats stay --> Splats::keep
-//!             \-> similarity: where they come to lie
+//! EditStep::check --> are all numbers valid?
+//! EditStep::apply --> region, cells, carve, decimate: select the splats to keep --> Splats::keep
+//!                 \-> similarity: transform the splats
 //! ```
-//! What stays keeps its order and its bits. Selections are made of f64 sums, products, quotients and roots alone, so that
-//! the same splats go on every processor. Budget: 1 M splats of degree 3 in a second on two cores, for any step; bound by
-//! memory (`benches/edit.rs`).
+//! Kept splats keep their order and their bits. Selections use only sums, products, quotients and
+//! roots in f64, so that every processor selects the same splats. Budget: 1 M splats of degree 3
+//! per second on two cores, for any step, limited by memory bandwidth (`benches/edit.rs`).
 
 mod carve;
 mod cells;
@@ -29,10 +30,10 @@ pub use step::{EditError, EditStep, InvalidStep};
 use crate::Splats;
 
 impl Splats {
-    /// Keeps the splats that are marked, in order.
+    /// Keeps the marked splats, in order.
     ///
     /// # Panics
-    /// If there are not as many marks as splats.
+    /// If the number of marks differs from the number of splats.
     pub fn keep(&mut self, keep: &[bool]) {
         assert_eq!(keep.len(), self.len(), "one mark for each splat");
         let numbers = self.sh_coefficients() * 3;
@@ -47,7 +48,7 @@ impl Splats {
     }
 }
 
-/// Keeps the blocks of `width` values that are marked, in order.
+/// Keeps the marked blocks of `width` values, in order.
 fn retain<T: Copy>(values: &mut Vec<T>, keep: &[bool], width: usize) {
     let mut end = 0;
     for (block, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {

@@ -1,9 +1,11 @@
-//! Connected parts of a scene: solid splats whose cells touch each other.
+//! Connected parts of a scene: solid splats in neighbouring cells.
 //!
 //! ```text
-//! solid splats -> cells they cover, sorted -> union of neighbours -> each splat's part -> its count
+//! solid splats -> covered cells, sorted -> union of neighbours -> part of each splat -> size of
+//! each part
 //! ```
-//! Faint splats (haze) hold nothing together; they belong to a part that their cell or one beside it belongs to.
+//! Faint splats (haze) do not connect parts. They belong to the part of their own or a neighbouring
+//! cell.
 
 use glam::IVec3;
 use rayon::prelude::*;
@@ -11,14 +13,15 @@ use rayon::prelude::*;
 use super::cells::{Cells, is_solid, key};
 use crate::Splats;
 
-/// Marks the splats of parts that have at least so many.
+/// Marks the splats of parts with at least `least` splats.
 pub(super) fn of_at_least(splats: &Splats, side: f64, least: usize) -> Vec<bool> {
     let parts = Parts::of(splats, side);
     let counts = parts.counts();
     parts.marks(|part| counts[part as usize] >= least)
 }
 
-/// Marks the splats of the largest parts; of equal ones, of the first in space.
+/// Marks the splats of the `keep` largest parts. Of equal parts, those with the first cells are
+/// preferred.
 pub(super) fn largest(splats: &Splats, side: f64, keep: usize) -> Vec<bool> {
     let parts = Parts::of(splats, side);
     let counts = parts.counts();
@@ -33,9 +36,9 @@ pub(super) fn largest(splats: &Splats, side: f64, keep: usize) -> Vec<bool> {
     parts.marks(|part| kept[part as usize])
 }
 
-/// Which part each splat belongs to.
+/// Assignment of splats to parts.
 struct Parts {
-    /// Of each splat: the number of its part's first cell; none for haze in the open.
+    /// For each splat, the number of its part's first cell; `None` for haze away from all parts.
     of_splat: Vec<Option<u32>>,
     cells: usize,
 }
@@ -69,7 +72,7 @@ impl Parts {
         Self { of_splat, cells: keys.len() }
     }
 
-    /// Returns how many splats each part has, by the number of its first cell.
+    /// Returns the number of splats of each part, indexed by its first cell.
     fn counts(&self) -> Vec<usize> {
         let mut counts = vec![0; self.cells];
         self.of_splat.iter().flatten().for_each(|part| counts[*part as usize] += 1);
@@ -81,10 +84,12 @@ impl Parts {
     }
 }
 
-/// Returns of each cell, by sorted keys, the first cell of its part. Neighbours share a corner at least.
+/// Returns for each cell, in the order of `keys`, the first cell of its part. Neighbours share at
+/// least a corner.
 fn first_of_part(keys: &[u64]) -> Vec<u32> {
     let mut parent: Vec<u32> = (0..keys.len() as u32).collect();
-    // The columns of cells that come before, and the cell's own; a cursor in each moves along with the cell.
+    // Columns of cells with lower keys, and the column of the cell itself. The cursor of each
+    // column moves along with the cell.
     let columns = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 0]];
     let mut cursors = [0; 5];
     for (cell, &at) in keys.iter().enumerate() {
@@ -103,7 +108,7 @@ fn first_of_part(keys: &[u64]) -> Vec<u32> {
     (0..keys.len() as u32).map(|cell| first(&mut parent, cell)).collect()
 }
 
-/// Returns the first cell of a cell's part, so far.
+/// Returns the current first cell of a cell's part.
 fn first(parent: &mut [u32], mut cell: u32) -> u32 {
     while parent[cell as usize] != cell {
         parent[cell as usize] = parent[parent[cell as usize] as usize];
@@ -112,7 +117,7 @@ fn first(parent: &mut [u32], mut cell: u32) -> u32 {
     cell
 }
 
-/// The 26 cells around one, those that share a face first.
+/// Offsets of the 26 neighbours of a cell, those that share a face first.
 const BESIDE: [[i32; 3]; 26] = beside();
 
 const fn beside() -> [[i32; 3]; 26] {
@@ -134,5 +139,6 @@ const fn beside() -> [[i32; 3]; 26] {
     found
 }
 
-/// What is fainter is haze. A tenth: three quarters of what captures have above the renderer's own threshold.
+/// Opacity below which a splat is haze. A tenth: in captures, three quarters of the splats above
+/// the renderer's own threshold exceed it.
 const SOLID_OPACITY: f32 = 0.1;

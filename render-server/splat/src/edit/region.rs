@@ -1,4 +1,4 @@
-//! Regions of a scene: a box, a ball, a prism, and what an image shows within an outline.
+//! Regions of a scene: box, sphere, prism, and lasso in an image.
 
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -7,57 +7,59 @@ use serde::{Deserialize, Serialize};
 use super::step::{InvalidStep, check_length, check_point, check_rotation, invalid};
 use crate::Splats;
 
-/// A part of space. [scene]
+/// Region of space. [scene]
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Region {
-    /// A box along the axes.
+    /// Axis-aligned box.
     Box {
-        /// Least corner, which is inside.
+        /// Lowest corner, included.
         min: [f64; 3],
-        /// Greatest corner, which is inside.
+        /// Highest corner, included.
         max: [f64; 3],
     },
-    /// A ball.
+    /// Sphere.
     Sphere {
-        /// Its centre.
+        /// Centre of the sphere.
         center: [f64; 3],
-        /// Its radius.
+        /// Radius of the sphere.
         radius: f64,
     },
-    /// An outline, drawn out along an axis.
+    /// Outline, extruded along an axis.
     Prism {
-        /// The axis.
+        /// Axis of the extrusion.
         axis: Axis,
-        /// The outline's corners, in the two other coordinates, in their order.
+        /// Corners of the outline in the two other coordinates, in the order x, y, z.
         outline: Vec<[f64; 2]>,
-        /// Where it begins along the axis.
+        /// Lowest coordinate along the axis.
         low: f64,
-        /// Where it ends along the axis.
+        /// Highest coordinate along the axis.
         high: f64,
     },
-    /// What an image shows within an outline: a lasso.
+    /// Splats within an outline in an image: a lasso.
     View {
-        /// Where the camera is.
+        /// Position of the camera.
         eye: [f64; 3],
-        /// Its axes (x right, y down, z ahead) in the scene: a unit quaternion x, y, z, w.
+        /// Rotation from the camera's axes (x right, y down, z forward) to the scene: a unit
+        /// quaternion x, y, z, w.
         rotation: [f64; 4],
-        /// The outline's corners as slopes x / z, y / z from the camera: whatever its lens.
+        /// Corners of the outline as slopes x / z, y / z from the camera, independent of its lens.
         outline: Vec<[f64; 2]>,
-        /// Only what is at least as near as the nearest solid splats, seen from there.
+        /// Whether to select only splats that are not behind the nearest solid splats, as seen from
+        /// the camera.
         visible: bool,
     },
 }
 
-/// An axis of the scene.
+/// Axis of the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
-    /// Outlines are in y, z.
+    /// x axis; outlines are in y, z.
     X,
-    /// Outlines are in x, z.
+    /// y axis; outlines are in x, z.
     Y,
-    /// Outlines are in x, y.
+    /// z axis; outlines are in x, y.
     Z,
 }
 
@@ -97,7 +99,7 @@ fn check_outline(outline: &[[f64; 2]]) -> Result<(), InvalidStep> {
     outline.iter().try_for_each(|[u, v]| check_point("outline", [*u, *v, 0.0]))
 }
 
-/// Marks the splats whose centres lie in any of the regions.
+/// Marks the splats with centres in at least one of the regions.
 pub fn select(regions: &[Region], splats: &Splats) -> Vec<bool> {
     let mut marks = vec![false; splats.len()];
     for region in regions {
@@ -131,7 +133,7 @@ fn centers(splats: &Splats, inside: impl Fn(DVec3) -> bool + Sync) -> Vec<bool> 
 }
 
 impl Axis {
-    /// Returns a point's coordinate along the axis, and the others.
+    /// Returns the coordinate of a point along the axis, and the two other coordinates.
     fn split(self, p: DVec3) -> (f64, DVec2) {
         match self {
             Self::X => (p.x, DVec2::new(p.y, p.z)),
@@ -141,7 +143,7 @@ impl Axis {
     }
 }
 
-/// A closed outline; where it crosses itself, what is enclosed an odd number of times is inside.
+/// Closed outline. If it crosses itself, points that it encloses an odd number of times are inside.
 struct Outline {
     corners: Vec<DVec2>,
     min: DVec2,
@@ -173,7 +175,7 @@ impl Outline {
     }
 }
 
-/// A lasso: a camera and an outline in its image.
+/// Lasso: a camera and an outline in its image.
 struct View {
     eye: DVec3,
     cam_from_scene: DQuat,
@@ -186,7 +188,7 @@ impl View {
         Self { eye: eye.into(), cam_from_scene, outline: Outline::new(outline) }
     }
 
-    /// Returns slopes and depth of a point ahead of the camera.
+    /// Returns slopes and depth of a point, or `None` if it is not in front of the camera.
     fn project(&self, p: DVec3) -> Option<(DVec2, f64)> {
         let p = self.cam_from_scene * (p - self.eye);
         (p.z > 0.0 && p.is_finite()).then(|| (p.truncate() / p.z, p.z))
@@ -210,7 +212,7 @@ impl View {
     }
 }
 
-/// How far the nearest solid splats are, in a raster over the outline.
+/// Depths of the nearest solid splats, in a raster over the outline.
 struct Nearest {
     min: DVec2,
     step: DVec2,
@@ -227,7 +229,8 @@ impl Nearest {
                 continue;
             }
             let Some((slope, z)) = view.project(splats.means_m[index].as_dvec3()) else { continue };
-            // A disc seen at an angle covers about its middle standard deviation, and nothing of what lies beyond the outline.
+            // A disc seen at an angle covers about its middle standard deviation. Parts outside the
+            // outline are ignored.
             let [a, b, c] = splats.scales_m[index].as_dvec3().to_array();
             let radius = DEVIATIONS * a.min(b).max(a.max(b).min(c)) / z;
             let low = ((slope - radius - min) / step).floor().max(DVec2::ZERO);
@@ -251,13 +254,15 @@ impl Nearest {
     }
 }
 
-/// Corners of an outline: one drawn by hand has some hundred.
+/// Maximum corners of an outline; an outline drawn by hand has some hundred.
 const MAX_CORNERS: usize = 2000;
-/// Cells of the raster on a side: a pixel or a few of the image in which a lasso was drawn.
+/// Cells of the raster per side. One cell is about one to a few pixels of the image in which a
+/// lasso was drawn.
 const SIDE: usize = 256;
-/// What hides what is behind: the median depth's level.
+/// Minimum opacity of a splat that occludes others: the level of the median depth.
 const SOLID_OPACITY: f32 = 0.5;
-/// How far a solid splat hides: an eighth of its light stops there. [standard deviations]
+/// Radius within which a solid splat occludes: there, it absorbs an eighth of the light. [standard
+/// deviations]
 const DEVIATIONS: f64 = 2.0;
-/// What is so much farther than the nearest belongs to the same surface. [share of the depth]
+/// Maximum distance behind the nearest splat of a splat on the same surface. [share of the depth]
 const BEHIND: f64 = 0.02;

@@ -1,4 +1,4 @@
-//! Turns, scales and moves splats, with their colours by direction.
+//! Rotates, scales and moves splats, including their directional colours.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -6,8 +6,8 @@ use rayon::prelude::*;
 use crate::Splats;
 use crate::harmonics::Turn;
 
-/// Moves every splat: `p_new = scale * (rotation * p_old) + translation`; sizes are multiplied, rotations and harmonics
-/// turned. What is not changed keeps its bits.
+/// Transforms every splat: `p_new = scale * (rotation * p_old) + translation`. Sizes are
+/// multiplied; rotations and harmonics are rotated. Unchanged values keep their bits.
 pub fn transform(splats: &mut Splats, scale: f64, rotation: DQuat, translation: DVec3) {
     splats.means_m.par_iter_mut().for_each(|mean| {
         let p = rotation * mean.as_dvec3() * scale + translation;

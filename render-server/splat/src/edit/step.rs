@@ -1,4 +1,4 @@
-//! One edit, with all that it depends on.
+//! One edit of a scene, with all its parameters.
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -9,105 +9,105 @@ use super::region::{Region, select};
 use super::{decimate, parts, similarity};
 use crate::Splats;
 
-/// One edit of a scene. Lengths and axes are those the scene has when the step is applied.
+/// One edit of a scene. Lengths and axes are those of the scene when the step is applied.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum EditStep {
-    /// Keeps what lies in any of the regions.
+    /// Keeps only splats in at least one of the regions.
     Crop {
-        /// Where splats are kept, by their centres.
+        /// Regions in which splats are kept, by their centres.
         within: Vec<Region>,
     },
-    /// Removes what lies in any of the regions.
+    /// Removes splats in any of the regions.
     Remove {
-        /// Where splats are removed, by their centres.
+        /// Regions in which splats are removed, by their centres.
         within: Vec<Region>,
     },
-    /// Removes splats fainter than this.
+    /// Removes faint splats.
     Faint {
-        /// Peak opacity, 0 to 1.
+        /// Minimum peak opacity of kept splats, 0 to 1.
         below: f64,
     },
-    /// Removes splats whose largest standard deviation is above this.
+    /// Removes large splats.
     Large {
-        /// [scene]
+        /// Maximum of a kept splat's largest standard deviation. [scene]
         above: f64,
     },
-    /// Removes splats whose largest standard deviation is below this.
+    /// Removes small splats.
     Small {
-        /// [scene]
+        /// Minimum of a kept splat's largest standard deviation. [scene]
         below: f64,
     },
-    /// Removes connected parts of few splats, and haze that no part holds.
+    /// Removes connected parts of few splats, and haze that belongs to no part.
     Floaters {
-        /// What is farther apart than about this is not connected. [scene]
+        /// Side of the cells. Splats in neighbouring cells are connected. [scene]
         cell: f64,
-        /// Parts of fewer splats go.
+        /// Minimum number of splats of a kept part.
         least: u32,
     },
     /// Keeps the largest connected parts.
     Parts {
-        /// As of [`EditStep::Floaters`]. [scene]
+        /// Side of the cells, as in [`EditStep::Floaters`]. [scene]
         cell: f64,
-        /// How many parts stay.
+        /// Number of kept parts.
         keep: u32,
     },
-    /// Keeps what is seen from the free space around a path.
+    /// Keeps splats that are visible from the free space around a path.
     Carve(Carve),
-    /// Keeps so many splats: the most opaque and largest.
+    /// Keeps the most opaque and largest splats.
     Decimate {
-        /// Splats that stay.
+        /// Number of kept splats.
         count: u32,
     },
-    /// Turns the scene about its origin, colours by direction too.
+    /// Rotates the scene about its origin, including its directional colours.
     Turn {
-        /// Old axes to new axes: a unit quaternion x, y, z, w.
+        /// Rotation from old to new axes: a unit quaternion x, y, z, w.
         rotation: [f64; 4],
     },
-    /// Makes the scene larger.
+    /// Scales the scene.
     Scale {
-        /// Times so much.
+        /// Factor by which lengths are multiplied.
         factor: f64,
     },
     /// Moves the scene.
     Move {
-        /// [scene]
+        /// Translation. [scene]
         by: [f64; 3],
     },
 }
 
-/// A step whose numbers cannot be meant.
+/// Error: a parameter of a step is out of range.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("{key} = {value}: {advice}")]
 pub struct InvalidStep {
-    /// The parameter.
+    /// Name of the parameter.
     pub key: &'static str,
-    /// What it is.
+    /// Value of the parameter.
     pub value: String,
-    /// What to do.
+    /// Valid values.
     pub advice: &'static str,
 }
 
-/// Why an edit was not made; the scene is as it was.
+/// Error of an edit. The scene is unchanged.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EditError {
-    /// The step's own numbers.
+    /// A parameter of the step is invalid.
     #[error(transparent)]
     Invalid(#[from] InvalidStep),
-    /// Nothing would stay.
+    /// The edit would remove all splats.
     #[error(
         "none of the {0} splats would be left; lengths are in the scene's own unit: compare `vizflyt scene inspect`"
     )]
     NothingLeft(usize),
-    /// A grid that takes too much memory.
+    /// The grid needs too much memory.
     #[error(transparent)]
     TooManyCells(#[from] TooManyCells),
-    /// Nothing to be seen from the path.
+    /// Solid splats are missing around the path.
     #[error(
         "carve: nothing solid is within {1} of {0:?}; points are in the scene's own axes and unit: compare `vizflyt scene inspect`"
     )]
     NothingAround([f64; 3], f64),
-    /// No free space around the path.
+    /// Free space is missing around the path.
     #[error(
         "carve: nothing can be reached from {0:?}: solid splats are all around; give a place with more room, or a smaller \
          radius"
@@ -116,10 +116,10 @@ pub enum EditError {
 }
 
 impl EditStep {
-    /// Checks that every number can be meant.
+    /// Checks that every parameter is in range.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first invalid parameter.
     pub fn check(&self) -> Result<(), InvalidStep> {
         match self {
             Self::Crop { within } | Self::Remove { within } => {
@@ -152,10 +152,10 @@ impl EditStep {
         }
     }
 
-    /// Edits the splats; returns how many it took away.
+    /// Applies the step. Returns the number of removed splats.
     ///
     /// # Errors
-    /// [`EditError`]; the splats are as they were then.
+    /// [`EditError`]; the splats are then unchanged.
     pub fn apply(&self, splats: &mut Splats) -> Result<usize, EditError> {
         self.check()?;
         let keep = match self {
@@ -201,7 +201,7 @@ impl EditStep {
     }
 }
 
-/// Marks the splats whose largest standard deviation is as wanted.
+/// Marks the splats for which the largest standard deviation satisfies `wanted`.
 fn by_size(splats: &Splats, wanted: impl Fn(f64) -> bool + Sync) -> Vec<bool> {
     splats.scales_m.par_iter().map(|scales| wanted(f64::from(scales.max_element()))).collect()
 }
@@ -228,7 +228,7 @@ pub(super) fn check_point(key: &'static str, point: [f64; 3]) -> Result<(), Inva
 
 pub(super) fn check_rotation(rotation: [f64; 4]) -> Result<(), InvalidStep> {
     let is_unit = (DQuat::from_array(rotation).length() - 1.0).abs() < 1e-3;
-    let advice = "give a unit quaternion as [x, y, z, w]; none is [0, 0, 0, 1]";
+    let advice = "give a unit quaternion as [x, y, z, w]; the identity is [0, 0, 0, 1]";
     if is_unit { Ok(()) } else { Err(invalid("rotation", format!("{rotation:?}"), advice)) }
 }
 
@@ -236,7 +236,7 @@ fn check_count(key: &'static str, count: u32) -> Result<(), InvalidStep> {
     if count > 0 { Ok(()) } else { Err(invalid(key, count, "give at least 1")) }
 }
 
-/// Regions of one step: lassos are drawn by hand.
+/// Maximum regions of one step; lassos are drawn by hand.
 const MAX_REGIONS: usize = 100;
-/// f32 resolves a unit there. [scene]
+/// Maximum coordinate: f32 still resolves one unit there. [scene]
 pub(super) const MAX_COORDINATE: f64 = 1e7;

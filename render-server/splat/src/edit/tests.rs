@@ -1,11 +1,11 @@
-//! Edits of made-up rooms, and of whatever else.
+//! Tests of edits on generated rooms and on arbitrary splats.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
 
 use super::*;
 
-/// Deterministic numbers in 0..1 without a generator.
+/// Returns deterministic, evenly distributed numbers in 0..1, without a random generator.
 fn even(k: usize) -> Vec3 {
     let fraction = |root: f64| (k as f64 * root).fract() as f32;
     Vec3::new(fraction(0.819_172_513), fraction(0.671_043_607), fraction(0.549_700_478))
@@ -24,7 +24,7 @@ fn splats(means_m: Vec<Vec3>) -> Splats {
     }
 }
 
-/// The six faces of a room of 8 x 6 x 3 from the origin, every so often.
+/// Returns points on the six faces of a room of 8 x 6 x 3 with a corner at the origin.
 fn room() -> Vec<Vec3> {
     let size = Vec3::new(8.0, 6.0, 3.0);
     (0..40_000)
@@ -37,7 +37,7 @@ fn room() -> Vec<Vec3> {
         .collect()
 }
 
-/// A ball of `count` splats.
+/// Returns the centres of `count` splats on a sphere.
 fn ball(count: usize, center: Vec3, radius: f32) -> impl Iterator<Item = Vec3> {
     (0..count).map(move |k| center + (even(k) - 0.5).normalize_or(Vec3::Z) * radius)
 }
@@ -46,7 +46,7 @@ fn with(more: impl IntoIterator<Item = Vec3>) -> Splats {
     splats(room().into_iter().chain(more).collect())
 }
 
-/// Applies a step, and checks that the room's splats stay and the others go.
+/// Applies a step, and checks that it keeps exactly the splats of the room.
 fn check_room_stays(step: &EditStep, mut scene: Splats) {
     let rest = scene.len() - room().len();
     assert_eq!(step.apply(&mut scene), Ok(rest), "{step:?}");
@@ -55,7 +55,7 @@ fn check_room_stays(step: &EditStep, mut scene: Splats) {
 }
 
 #[test]
-fn floaters_and_unconnected_parts_go() {
+fn removes_floaters_and_unconnected_parts() {
     let inside = Vec3::new(4.0, 3.0, 1.5);
     let floater = ball(20, inside, 0.1);
     check_room_stays(&EditStep::Floaters { cell: 0.2, least: 50 }, with(floater));
@@ -67,7 +67,7 @@ fn floaters_and_unconnected_parts_go() {
 }
 
 #[test]
-fn haze_holds_nothing_together() {
+fn haze_does_not_connect_parts() {
     let wall_to_ball = (0..200).map(|k| Vec3::new(8.0 + k as f32 * 0.015, 3.0, 1.5));
     let far = Vec3::new(12.0, 3.0, 1.5);
     let mut scene = with(wall_to_ball.chain(ball(1000, far, 1.0)));
@@ -75,17 +75,17 @@ fn haze_holds_nothing_together() {
     assert_eq!(step.apply(&mut scene.clone()), Ok(0), "a solid bridge");
     scene.opacities[40_000..40_200].fill(0.05);
     let taken = step.apply(&mut scene).unwrap();
-    assert!((1100..1200).contains(&taken), "haze in the open goes too: {taken}");
+    assert!((1100..1200).contains(&taken), "haze in the open was not removed: {taken}");
 }
 
 #[test]
-fn one_large_splat_connects_what_it_touches() {
+fn connects_parts_by_a_large_splat() {
     let (left, right) = (Vec3::new(-2.0, 0.0, 0.0), Vec3::new(2.0, 0.0, 0.0));
     let mut scene =
         splats(ball(100, left, 0.2).chain(ball(90, right, 0.2)).chain([Vec3::ZERO]).collect());
     let step = EditStep::Parts { cell: 0.3, keep: 1 };
     assert_eq!(step.apply(&mut scene.clone()), Ok(91));
-    // A plank along y, turned to lie along x.
+    // A plank along y, rotated to lie along x.
     scene.scales_m[190] = Vec3::new(0.1, 2.0, 0.1);
     scene.rotations[190] = Quat::from_rotation_z(std::f32::consts::FRAC_PI_2);
     assert_eq!(step.apply(&mut scene.clone()), Ok(0));
@@ -98,22 +98,23 @@ fn carve(path: &[[f64; 3]]) -> Carve {
 }
 
 #[test]
-fn a_room_is_carved_from_its_inside() {
+fn carves_a_room_from_its_inside() {
     let step = EditStep::Carve(carve(&[[1.0, 1.0, 1.0]]));
     let behind_the_wall = ball(3000, Vec3::new(12.0, 3.0, 1.5), 1.0);
     check_room_stays(&step, with(behind_the_wall));
-    // Haze in the middle goes, solid things stay; from beside a wall to the ceiling it is one room.
+    // Haze in the middle is removed, solid splats stay. The flood fills the room from a wall to the
+    // ceiling.
     let mut hazy = with(ball(500, Vec3::new(4.0, 3.0, 1.5), 0.5));
     hazy.opacities[40_000..].fill(0.1);
     check_room_stays(&step, hazy);
     assert_eq!(step.apply(&mut with(ball(500, Vec3::new(4.0, 3.0, 1.5), 0.2))), Ok(0));
-    // What stands in the path's way is no obstacle: somebody walked there.
+    // Splats on the path do not block it, because the operator walked there.
     let walked = EditStep::Carve(carve(&[[1.0, 1.0, 1.5], [7.0, 5.0, 1.5]]));
     check_room_stays(&walked, with(ball(100, Vec3::new(4.0, 3.0, 1.5), 0.1)));
 }
 
 #[test]
-fn an_open_scene_keeps_what_lies_beyond_the_cells() {
+fn keeps_splats_beyond_the_grid_of_an_open_scene() {
     let mut means: Vec<Vec3> = room().into_iter().filter(|p| p.z < 3.0).collect();
     let without_ceiling = means.len();
     means.extend(ball(100, Vec3::new(0.0, 0.0, 500.0), 30.0));
@@ -123,7 +124,7 @@ fn an_open_scene_keeps_what_lies_beyond_the_cells() {
 }
 
 #[test]
-fn what_cannot_be_carved_is_said() {
+fn reports_why_a_scene_cannot_be_carved() {
     let mut scene = with(ball(2000, Vec3::new(4.0, 3.0, 1.5), 0.3));
     let whole = scene.clone();
     let within = Carve { radius: 0.1, ..carve(&[[4.0, 3.0, 1.5]]) };
@@ -141,9 +142,9 @@ fn what_cannot_be_carved_is_said() {
 }
 
 #[test]
-fn a_lasso_takes_what_the_outline_shows() {
+fn selects_splats_within_a_lasso() {
     let mut scene = with([]);
-    // From the middle of the room along +x: x right of the image is -y, y down is -z.
+    // From the middle of the room along +x: image right is -y, image down is -z.
     let rotation = DQuat::from_mat3(&glam::DMat3::from_cols(DVec3::NEG_Y, DVec3::NEG_Z, DVec3::X));
     let lasso = |visible| Region::View {
         eye: [4.0, 3.0, 1.5],
@@ -173,7 +174,7 @@ fn a_lasso_takes_what_the_outline_shows() {
 }
 
 #[test]
-fn decimation_keeps_the_large_and_opaque_in_order() {
+fn decimation_keeps_large_and_opaque_splats_in_order() {
     let mut scene = splats((0..100).map(even).collect());
     for k in 0..100 {
         scene.scales_m[k] = Vec3::splat(0.01 * (k % 10 + 1) as f32);
@@ -181,14 +182,14 @@ fn decimation_keeps_the_large_and_opaque_in_order() {
     }
     let whole = scene.clone();
     assert_eq!(EditStep::Decimate { count: 10 }.apply(&mut scene), Ok(90));
-    // The largest are numbers 9, 19, ...; then 8, 18, ... of the opaque.
+    // The largest are numbers 9, 19, ...; then 8, 18, ... of the opaque ones.
     let kept = [8, 9, 18, 19, 28, 29, 38, 39, 48, 49].map(|k: usize| whole.means_m[k]);
     assert_eq!(scene.means_m, kept);
     assert_eq!(EditStep::Decimate { count: 1000 }.apply(&mut scene), Ok(0));
 }
 
 #[test]
-fn what_takes_everything_is_refused() {
+fn rejects_a_step_that_removes_everything() {
     let mut scene = with([]);
     let whole = scene.clone();
     for step in [
@@ -203,7 +204,7 @@ fn what_takes_everything_is_refused() {
 }
 
 #[test]
-fn numbers_that_cannot_be_meant_are_refused() {
+fn rejects_parameters_out_of_range() {
     let check = |step: EditStep, key: &str| {
         let error = step.check().unwrap_err();
         assert_eq!(error.key, key, "{error}");
@@ -234,7 +235,7 @@ fn numbers_that_cannot_be_meant_are_refused() {
 }
 
 #[test]
-fn turns_scales_and_moves_can_be_taken_back() {
+fn transforms_are_reversible() {
     let whole = with([]);
     let mut scene = whole.clone();
     let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.4, -1.2, 2.0);
@@ -258,7 +259,7 @@ fn turns_scales_and_moves_can_be_taken_back() {
     assert!(scene.sh.iter().zip(&whole.sh).all(|(a, b)| (a - b).abs() < 1e-4 * (1.0 + b.abs())));
 }
 
-/// Any number a file may hold.
+/// Generates numbers that a file may contain, including NaN.
 fn number() -> impl Strategy<Value = f32> {
     prop_oneof![8 => -10.0f32..10.0, 1 => prop::num::f32::NORMAL, 1 => Just(f32::NAN)]
 }
@@ -314,7 +315,7 @@ fn region() -> impl Strategy<Value = Region> {
     ]
 }
 
-/// Steps that take splats away and leave the others as they are.
+/// Generates steps that remove splats and do not change the others.
 fn removal() -> impl Strategy<Value = EditStep> {
     let within = || prop::collection::vec(region(), 1..3);
     prop_oneof![
@@ -338,7 +339,8 @@ fn removal() -> impl Strategy<Value = EditStep> {
     ]
 }
 
-/// Whether a region looks at what it takes from what there is: what hides then depends on what went.
+/// Returns whether a step depends on occlusion or free space. Repeating such a step can remove more
+/// splats.
 fn looks(step: &EditStep) -> bool {
     let sees = |region: &Region| matches!(region, Region::View { visible: true, .. });
     match step {
@@ -362,9 +364,10 @@ fn bits(splats: &Splats) -> Vec<Vec<u32>> {
 }
 
 proptest! {
-    /// Whatever a file holds: some splats, in order, bit by bit; the same again; and then nothing more goes.
+    /// For any splats, a step keeps a subset in order and bit by bit, is deterministic, and removes
+    /// nothing when repeated.
     #[test]
-    fn what_is_left_is_part_of_what_was(whole in anything(), step in removal()) {
+    fn keeps_an_unchanged_subset_in_order(whole in anything(), step in removal()) {
         prop_assert_eq!(step.check(), Ok(()));
         let mut left = whole.clone();
         let taken = step.apply(&mut left);
@@ -387,17 +390,17 @@ proptest! {
         }
     }
 
-    /// A crop and the removal of the same regions share the splats between them.
+    /// Cropping to regions and removing the same regions partition the splats.
     #[test]
-    fn what_is_not_kept_is_removed(whole in anything(), within in prop::collection::vec(region(), 1..3)) {
+    fn crop_and_removal_partition_the_splats(whole in anything(), within in prop::collection::vec(region(), 1..3)) {
         let left = |step: EditStep| step.apply(&mut whole.clone()).map_or(0, |taken| whole.len() - taken);
         let [kept, rest] = [EditStep::Crop { within: within.clone() }, EditStep::Remove { within }].map(left);
         prop_assert_eq!(kept + rest, whole.len());
     }
 
-    /// A part is a part wherever the scene lies, up to the cells' places; and by brute force.
+    /// Compares connected parts with a brute-force search.
     #[test]
-    fn parts_are_those_of_brute_force(
+    fn parts_match_a_brute_force_search(
         points in prop::collection::vec(prop::array::uniform3(-3.0..3.0f32), 1..60), keep in 1..4usize,
     ) {
         let scene = splats(points.into_iter().map(Vec3::from).collect());

@@ -1,4 +1,4 @@
-//! Steps in words, as the command line takes them where it does.
+//! Text of edit steps, in the syntax of the command line where it has one.
 
 use std::fmt;
 
@@ -17,7 +17,7 @@ impl fmt::Display for EditStep {
             Self::Carve(carve) => {
                 write!(f, "carve {}", point(carve.path[0]))?;
                 if carve.path.len() > 1 {
-                    write!(f, " and {} points more", carve.path.len() - 1)?;
+                    write!(f, " and {} more points", carve.path.len() - 1)?;
                 }
                 write!(f, ", radius {}, depth {}", carve.radius, carve.depth)?;
                 write!(f, ", cell {}, reach {}", carve.cell, carve.reach)
@@ -55,7 +55,7 @@ impl fmt::Display for Region {
                 outline.iter().try_for_each(|[u, v]| write!(f, ":{u},{v}"))
             }
             Self::View { eye, outline, visible, .. } => {
-                let what = if *visible { ", what is in front" } else { "" };
+                let what = if *visible { ", visible splats only" } else { "" };
                 let [x, y, z] = eye;
                 write!(f, "lasso of {} corners from {x:.3},{y:.3},{z:.3}{what}", outline.len())
             }

@@ -1,4 +1,4 @@
-//! Splats of any format, checked and written straight to their place in [`Splats`], in parallel.
+//! Checks decoded splats of any format, and stores them in [`Splats`], in parallel.
 
 use glam::{Quat, Vec3};
 use rayon::prelude::*;
@@ -6,21 +6,22 @@ use rayon::prelude::*;
 use super::progress::Meter;
 use crate::Splats;
 
-/// Splats that a file held and that cannot be rendered, by reason; each is counted once, under the
-/// first reason that applies.
+/// Number of invalid splats in a file, by reason. Each splat is counted once, under the first
+/// reason that applies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DropCounts {
-    /// A NaN, or an infinity where only a finite number has a meaning. (An infinite opacity logit
-    /// is kept: it means fully transparent or fully opaque. So is a log scale of -infinity: zero.)
+    /// A value is NaN, or infinite where only a finite number is meaningful. (An infinite opacity
+    /// logit is kept: it means fully transparent or fully opaque. A log scale of -infinity is also
+    /// kept: it means zero.)
     pub non_finite: usize,
-    /// The quaternion is zero, so it names no rotation.
+    /// The quaternion is zero.
     pub zero_rotation: usize,
-    /// A scale beyond `f32`.
+    /// A scale exceeds the range of `f32`.
     pub scale_overflow: usize,
 }
 
 impl DropCounts {
-    /// Returns how many were dropped for any reason.
+    /// Returns the number of splats that were dropped for any reason.
     pub fn total(&self) -> usize {
         self.non_finite + self.zero_rotation + self.scale_overflow
     }
@@ -34,28 +35,28 @@ impl DropCounts {
     }
 }
 
-/// Splats decoded by one task: some 100 kB, so that tasks outnumber threads and cost nothing.
+/// Splats per task: about 100 kB, so that tasks outnumber threads and their overhead is negligible.
 pub(super) const SPLATS_PER_TASK: usize = 2048;
 
-/// A splat but for its colour, activated, not yet checked.
+/// Splat without its colour, activated, not yet checked.
 pub(super) struct Gaussian {
-    /// [m]
+    /// Centre. [m]
     pub(super) mean_m: Vec3,
-    /// Standard deviations. [m]
+    /// Standard deviation along each axis. [m]
     pub(super) scale_m: Vec3,
-    /// Of any length but zero.
+    /// Quaternion of any length except zero.
     pub(super) rotation_xyzw: [f32; 4],
-    /// 0 to 1.
+    /// Opacity, 0 to 1.
     pub(super) opacity: f32,
 }
 
-/// All arrays of a scene at full length, and which splats are good.
+/// All arrays of a scene at full length, and a flag for each valid splat.
 pub(super) struct Builder {
     splats: Splats,
     kept: Vec<bool>,
 }
 
-/// A run of consecutive splats of a [`Builder`].
+/// Run of consecutive splats of a [`Builder`].
 pub(super) struct Block<'a> {
     means_m: &'a mut [Vec3],
     scales_m: &'a mut [Vec3],
@@ -67,8 +68,8 @@ pub(super) struct Block<'a> {
     dropped: DropCounts,
 }
 
-/// Runs `fill(first splat, block)` over `count` splats in parallel; the caller knows that the file
-/// holds as many.
+/// Runs `fill(first splat, block)` over `count` splats in parallel. The caller has checked that the
+/// file holds `count` splats.
 pub(super) fn decode_all(
     sh_degree: u8,
     count: usize,
@@ -91,7 +92,7 @@ pub(super) fn decode_all(
 }
 
 impl Builder {
-    /// Allocates for `count` splats.
+    /// Allocates memory for `count` splats.
     pub(super) fn new(sh_degree: u8, count: usize) -> Self {
         let mut splats = Splats { sh_degree, ..Splats::default() };
         let numbers = splats.sh_coefficients() * 3;
@@ -103,7 +104,7 @@ impl Builder {
         Self { splats, kept: vec![false; count] }
     }
 
-    /// Returns the splats in runs of `length`, the last perhaps shorter.
+    /// Returns the splats in runs of `length`; the last run may be shorter.
     pub(super) fn blocks(&mut self, length: usize) -> impl Iterator<Item = Block<'_>> {
         let coefficients = self.splats.sh_coefficients();
         let splats = &mut self.splats;
@@ -127,7 +128,7 @@ impl Builder {
             })
     }
 
-    /// Returns the good splats.
+    /// Returns the valid splats.
     pub(super) fn finish(mut self, dropped: DropCounts) -> Splats {
         if dropped.total() > 0 {
             let numbers = self.splats.sh_coefficients() * 3;
@@ -147,7 +148,7 @@ impl Block<'_> {
         self.means_m.len()
     }
 
-    /// Returns what was dropped so far.
+    /// Returns the counts of splats dropped from this block.
     pub(super) fn dropped(&self) -> DropCounts {
         self.dropped
     }
@@ -159,7 +160,7 @@ impl Block<'_> {
         for (k, rgb) in out.as_chunks_mut::<3>().0.iter_mut().enumerate() {
             *rgb = [sh(k, 0), sh(k, 1), sh(k, 2)];
         }
-        // Summed rather than compared one by one: any NaN or infinity makes the product NaN.
+        // A sum is faster than single comparisons: any NaN or infinity makes it NaN.
         let zero_if_finite = out.iter().fold(0.0, |sum, v| sum + v * 0.0);
         let Gaussian { mean_m, scale_m, rotation_xyzw, opacity } = *gaussian;
         let finite = mean_m.is_finite()
@@ -171,7 +172,7 @@ impl Block<'_> {
             self.dropped.non_finite += 1;
             return;
         }
-        // Normalised in f64, where the square of no finite f32 overflows or vanishes.
+        // Normalised in f64, in which the square of a finite f32 neither overflows nor vanishes.
         let squares: f64 = rotation_xyzw.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
         if squares == 0.0 {
             self.dropped.zero_rotation += 1;
@@ -183,7 +184,7 @@ impl Block<'_> {
         }
         let length = squares.sqrt();
         self.means_m[i] = mean_m;
-        // The covariance squares it, so that a sign has no meaning.
+        // The covariance uses the square, so the sign has no meaning.
         self.scales_m[i] = scale_m.abs();
         self.rotations[i] = Quat::from_array(rotation_xyzw.map(|v| (f64::from(v) / length) as f32));
         self.opacities[i] = opacity.clamp(0.0, 1.0);
@@ -191,7 +192,7 @@ impl Block<'_> {
     }
 }
 
-/// Keeps the rows, `width` values each, whose flag is set.
+/// Keeps the rows of `width` values with a set flag.
 fn retain<T: Copy>(values: &mut Vec<T>, kept: &[bool], width: usize) {
     let mut end = 0;
     for (row, _) in kept.iter().enumerate().filter(|&(_, &kept)| kept) {

@@ -1,15 +1,15 @@
-//! Why a scene file is refused.
+//! Errors of reading and writing scene files.
 
 use std::path::PathBuf;
 
 use super::Format;
 use super::ply::PlyError;
 
-/// Why a file is no splat scene, or could not be read or written.
+/// Error of reading, decoding or writing a scene file.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FormatError {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("cannot {verb} {}: {cause}", path.display())]
     Io {
         /// The file.
@@ -19,69 +19,69 @@ pub enum FormatError {
         /// The system's error.
         cause: std::io::Error,
     },
-    /// Neither the content nor the name has a known format.
+    /// Neither content nor name indicates a known format.
     #[error("{what}; supported are {}", Format::list())]
     Unknown {
-        /// What the file seems to be.
+        /// Description of the file.
         what: String,
     },
-    /// A PLY file is refused.
+    /// A PLY file is invalid.
     #[error(transparent)]
     Ply(#[from] PlyError),
-    /// The file is well-formed, but of a kind that is not read.
+    /// The file is well-formed, but a feature of it is not supported.
     #[error("{format}: {what} is not supported; {advice}")]
     Unsupported {
         /// The format.
         format: Format,
-        /// The kind, by name.
+        /// Unsupported feature.
         what: String,
-        /// What to do instead.
+        /// Suggested alternative.
         advice: &'static str,
     },
-    /// The file is damaged or no file of its format.
+    /// The file is damaged, or not a file of this format.
     #[error("{format}, {place}: {reason}")]
     Invalid {
         /// The format.
         format: Format,
-        /// A byte, or the name of a part of the file.
+        /// Byte offset, or name of the part of the file.
         place: String,
-        /// What is wrong there.
+        /// Description of the defect.
         reason: String,
     },
-    /// The file ends before its own promise is kept.
+    /// The file is shorter than its header declares.
     #[error("{format}: truncated: {what} takes {needed} bytes, the file has {available}")]
     Truncated {
         /// The format.
         format: Format,
-        /// The part that does not fit.
+        /// Part that is incomplete.
         what: &'static str,
-        /// Bytes it takes. [byte]
+        /// Size of the part. [byte]
         needed: u64,
-        /// Bytes there are. [byte]
+        /// Available bytes. [byte]
         available: u64,
     },
-    /// The file asks for more memory than a scene of its size has a reason to.
+    /// The file declares more memory than is plausible for its size.
     #[error("{format}: {what} is {value}; at most {limit} is accepted for a file of this size")]
     TooLarge {
         /// The format.
         format: Format,
-        /// The quantity.
+        /// Quantity that exceeds its limit.
         what: &'static str,
-        /// Its value.
+        /// Value in the file.
         value: u64,
-        /// What is accepted.
+        /// Maximum accepted value.
         limit: u64,
     },
-    /// Nothing is left to render.
+    /// The file contains no valid splat.
     #[error(
         "{format}: no splats: the file declares {declared}, {dropped} of them were dropped as invalid"
     )]
     Empty {
         /// The format.
         format: Format,
-        /// Splats the file declares.
+        /// Number of splats that the file declares.
         declared: usize,
-        /// Splats dropped as invalid.
+        /// Number of splats that were dropped as invalid.
         dropped: usize,
     },
 }

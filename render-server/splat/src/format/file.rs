@@ -1,5 +1,4 @@
-//! Files in and out: bytes without a second copy of them in memory, writes that are whole or not
-//! there.
+//! File access: memory-mapped reading, and atomic writing.
 
 #![allow(unsafe_code, reason = "maps a file")]
 
@@ -11,7 +10,7 @@ use memmap2::Mmap;
 
 /// Maps a file for reading.
 pub(super) fn map(path: &Path) -> io::Result<Mmap> {
-    // Asked before it is opened: a pipe would wait there for its writer.
+    // Checked before opening: opening a pipe would block until it has a writer.
     if !std::fs::metadata(path)?.is_file() {
         return Err(io::Error::new(io::ErrorKind::InvalidInput, "not a regular file"));
     }
@@ -19,7 +18,8 @@ pub(super) fn map(path: &Path) -> io::Result<Mmap> {
     shared_memory::map(&file)
 }
 
-/// Writes a file beside its place and then renames it, so that a reader never sees half of it.
+/// Writes a file under a temporary name and then renames it, so that readers never see a partial
+/// file.
 pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".part");
@@ -28,15 +28,16 @@ pub(super) fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&partial, path)
 }
 
-/// The one call that the operating system cannot make safe.
+/// Contains the only unsafe call.
 mod shared_memory {
     use super::{File, Mmap, io};
 
     pub(in crate::format) fn map(file: &File) -> io::Result<Mmap> {
         // SAFETY: the mapping is private to this process and read-only. Another process that
-        // rewrites the scene while it loads could change bytes under us: every number is read
-        // once, by value, and checked after it was read, so the worst is a wrong splat; one that
-        // truncates it ends this process with a bus error, as for every program that maps files.
+        // rewrites the scene during loading can change mapped bytes. Every number is therefore read
+        // once, by value, and checked after it was read, so the worst result is a wrong splat. A
+        // process that truncates the file ends this process with a bus error, as in every program
+        // that maps files.
         unsafe { Mmap::map(file) }
     }
 }

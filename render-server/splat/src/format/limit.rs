@@ -1,21 +1,22 @@
-//! What a file may ask for, checked before anything is allocated.
+//! Limits of declared sizes, checked before memory is allocated.
 
 use super::{Format, FormatError};
 
-/// Most splats of a scene: 8 GB of degree 3, several times what any scanner exports.
+/// Maximum number of splats of a scene: 8 GB at degree 3, several times what any scanner exports.
 const MAX_SPLATS: u64 = 1 << 25;
-/// Packed bytes that any file may inflate to, however small it is. [byte]
+/// Inflated size that is accepted for any file, however small. [byte]
 const FREE_BYTES: u64 = 16 << 20;
-/// Beyond those, how many times its own size a file may inflate to. Real scenes reach 4; a flat
-/// image or a run of zeros, of which bombs are made, 1000 and more.
+/// Maximum ratio of inflated to stored size beyond [`FREE_BYTES`]. Real scenes reach 4;
+/// decompression bombs (flat images, runs of zeros) reach 1000 and more.
 const MAX_EXPANSION: u64 = 100;
 
-/// Refuses counts beyond any scene.
+/// Rejects numbers of splats that are too large for any scene.
 pub(super) fn count(format: Format, splats: u64) -> Result<(), FormatError> {
     at_most(format, "the number of splats", splats, MAX_SPLATS)
 }
 
-/// Refuses counts whose packed bytes, `each`, a file of `file_bytes` cannot honestly hold.
+/// Rejects numbers of splats whose packed size, `each` bytes per splat, is implausible for a file
+/// of `file_bytes`.
 pub(super) fn inflated(
     format: Format,
     splats: u64,
@@ -27,7 +28,7 @@ pub(super) fn inflated(
     at_most(format, "the size when inflated, in bytes,", splats * each, most)
 }
 
-/// Refuses a value above a limit.
+/// Rejects values above `limit`.
 pub(super) fn at_most(
     format: Format,
     what: &'static str,

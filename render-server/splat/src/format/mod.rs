@@ -1,10 +1,10 @@
-//! Scene files of every kind in, [`Splats`] out, and back.
+//! Reading and writing of scene files, as [`Splats`].
 //!
-//! [`read`] detects the format by content, then by name, and hands the bytes (mapped, not copied) to
-//! the format's own module, which checks every size against the file's length before it allocates,
-//! and decodes in parallel into a [`Loaded`]: activated, in the axes of the PLY the scene was trained
-//! to, what cannot be rendered left out and counted. [`write`] goes the other way by file name. Called
-//! once per scene by whatever loads one: server, command line, benches.
+//! [`read`] detects the format by content, then by name. It maps the file and passes the bytes to
+//! the module of the format, which checks every size against the length of the file before it
+//! allocates, and decodes in parallel into a [`Loaded`]. The result is activated and in the axes of
+//! the trainer's PLY; invalid splats are dropped and counted. [`write`] selects the format by file
+//! name. Server, command line and benches call these functions once per scene.
 //!
 //! | format | names | read | written | harmonics | positions |
 //! |---|---|---|---|---|---|
@@ -17,7 +17,7 @@
 //! | [`Format::Gltf`] | `.glb`, `.gltf` | `KHR_gaussian_splatting`, not compressed | `.glb` | 0-3 | f32 |
 //!
 //! Hostile files cost at most a constant plus a multiple of their own size (`limit`), in time and
-//! memory. Budget: 1 M splats in a second on two cores, memory within twice the decoded size.
+//! memory. Budget: 1 M splats per second on two cores, memory within twice the decoded size.
 
 mod activate;
 mod block;
@@ -46,23 +46,23 @@ pub use sog::assemble_streamed;
 use crate::Splats;
 use progress::Meter;
 
-/// A scene as read from a file.
+/// Scene that was read from a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Loaded {
-    /// What kind of file it was.
+    /// Detected file format.
     pub format: Format,
-    /// What can be rendered, in file order.
+    /// Valid splats, in file order.
     pub splats: Splats,
-    /// What was left out, by reason.
+    /// Number of invalid splats that were dropped, by reason.
     pub dropped: DropCounts,
-    /// Names of what the file holds of each splat and no splat needs, in file order.
+    /// Names of per-splat properties that were ignored, in file order.
     pub skipped_properties: Vec<String>,
-    /// Names of PLY elements that hold no splats, in file order.
+    /// Names of PLY elements without splats that were ignored, in file order.
     pub skipped_elements: Vec<String>,
 }
 
 impl Loaded {
-    /// Returns a scene, unless nothing is left of it.
+    /// Returns the scene, or an error if it has no splats.
     fn whole(
         format: Format,
         declared: usize,
@@ -82,27 +82,27 @@ impl Loaded {
     }
 }
 
-/// A kind of scene file.
+/// Format of a scene file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Format {
-    /// The trainers' PLY.
+    /// PLY as trainers write it.
     Ply,
     /// SuperSplat's compressed PLY.
     CompressedPly,
-    /// antimatter15's 32 bytes per splat.
+    /// Format of antimatter15's viewer, 32 bytes per splat.
     Splat,
-    /// Niantic's.
+    /// Niantic's SPZ.
     Spz,
-    /// PlayCanvas's textures.
+    /// PlayCanvas's textures (SOG).
     Sog,
-    /// GaussianSplats3D's.
+    /// Format of the viewer GaussianSplats3D.
     Ksplat,
-    /// Khronos's, with `KHR_gaussian_splatting`.
+    /// Khronos's glTF with `KHR_gaussian_splatting`.
     Gltf,
 }
 
 impl Format {
-    /// Every format, the plainest first.
+    /// All formats, the simplest first.
     pub const ALL: [Self; 7] = [
         Self::Ply,
         Self::CompressedPly,
@@ -113,7 +113,7 @@ impl Format {
         Self::Gltf,
     ];
 
-    /// Returns the name people call it by.
+    /// Returns the common name.
     pub fn name(self) -> &'static str {
         match self {
             Self::Ply => "PLY",
@@ -126,7 +126,7 @@ impl Format {
         }
     }
 
-    /// Returns the end of its files' names, without the dot before.
+    /// Returns the file extension, without the leading dot.
     pub fn extension(self) -> &'static str {
         match self {
             Self::Ply => "ply",
@@ -139,7 +139,7 @@ impl Format {
         }
     }
 
-    /// Returns the highest degree of harmonics it holds.
+    /// Returns the highest degree of harmonics that the format stores.
     pub fn max_sh_degree(self) -> u8 {
         match self {
             Self::Splat => 0,
@@ -148,13 +148,14 @@ impl Format {
         }
     }
 
-    /// Whether its files say that a scene was trained with anti-aliasing.
+    /// Returns whether the format stores if a scene was trained with anti-aliasing.
     pub fn keeps_antialiased(self) -> bool {
         !matches!(self, Self::Splat | Self::Ksplat)
     }
 
-    /// Returns the variants that are written, the usual one first: versions of SPZ (2 is coarser,
-    /// fewer readers know 4) and SOG, levels of compression of `.ksplat`; 0 where there is but one.
+    /// Returns the variants that can be written, the default first: versions of SPZ (2 is coarser,
+    /// few readers support 4) and SOG, compression levels of `.ksplat`. Formats without variants
+    /// have only 0.
     pub fn variants(self) -> &'static [u32] {
         match self {
             Self::Ply | Self::CompressedPly | Self::Splat | Self::Gltf => &[0],
@@ -164,7 +165,7 @@ impl Format {
         }
     }
 
-    /// Returns the format of a file's name.
+    /// Returns the format that a file name indicates.
     pub fn of_name(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.to_ascii_lowercase();
         if name == sog::META || name == sog::LOD_META {
@@ -173,7 +174,7 @@ impl Format {
         if is_gltf_text(path) {
             return Some(Self::Gltf);
         }
-        // The longest extension that fits: `.compressed.ply` is also a `.ply`.
+        // The longest matching extension wins: `.compressed.ply` also ends in `.ply`.
         Self::ALL
             .into_iter()
             .filter(|format| {
@@ -183,10 +184,10 @@ impl Format {
             .max_by_key(|format| format.extension().len())
     }
 
-    /// Returns the format of a file's first bytes; `.splat` has no mark.
+    /// Returns the format that the first bytes of a file indicate. `.splat` has no magic number.
     pub fn of_content(bytes: &[u8]) -> Option<Self> {
         if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
-            // Which of the two PLYs is determined by its header.
+            // The header determines which of the two PLY formats it is.
             Some(Self::Ply)
         } else if bytes.starts_with(&spz::GZIP_MAGIC)
             || bytes.starts_with(&spz::MAGIC.to_le_bytes())
@@ -203,7 +204,7 @@ impl Format {
         }
     }
 
-    /// Returns all names with their extensions, for messages.
+    /// Returns all names with their extensions, for error messages.
     fn list() -> String {
         let each = Self::ALL.map(|format| match format {
             Self::Splat | Self::Ksplat => format.name().to_owned(),
@@ -220,25 +221,26 @@ impl fmt::Display for Format {
     }
 }
 
-/// Reads a scene file of any supported format, determined by its content, then by its name. A folder is
-/// read as SOG, as is a `meta.json`, or a `lod-meta.json`, of which the finest level is read.
+/// Reads a scene file of any supported format, which is detected by content, then by name. A folder
+/// or a `meta.json` is read as SOG. Of a `lod-meta.json`, the finest level is read.
 ///
 /// # Errors
-/// [`FormatError::Io`] with the path, [`FormatError::Unknown`] with what is supported, or whatever
-/// keeps the file from being a scene of its format.
+/// [`FormatError::Io`] with the path; [`FormatError::Unknown`] with the list of supported formats;
+/// otherwise the defect that makes the file invalid in its format.
 pub fn read(path: impl AsRef<Path>) -> Result<Loaded, FormatError> {
     read_metered(path.as_ref(), 0, &Meter::SILENT)
 }
 
-/// [`read()`] of a coarser level of a streamed scene, 0 being the finest.
+/// Reads a level of a streamed scene as [`read()`] does; 0 is the finest level.
 ///
 /// # Errors
-/// As [`read()`]; [`FormatError::Unsupported`] where the scene has no levels.
+/// As [`read()`]; [`FormatError::Unsupported`] if the scene has no levels.
 pub fn read_level(path: impl AsRef<Path>, level: u32) -> Result<Loaded, FormatError> {
     read_metered(path.as_ref(), level, &Meter::SILENT)
 }
 
-/// [`read()`], reporting its progress to `report`, so that a load of more than a second can show it.
+/// Reads a scene as [`read()`] does, and reports progress to `report`. Large scenes take more than
+/// a second to load.
 ///
 /// # Errors
 /// As [`read()`].
@@ -249,11 +251,12 @@ pub fn read_with_progress(path: impl AsRef<Path>, report: Report) -> Result<Load
     Ok(loaded)
 }
 
-/// Reads a scene of any format piece by piece: the finest level of a streamed one chunk by chunk, so that no more than one
-/// is in memory, any other in one piece. What surrounds a streamed scene is its last.
+/// Reads a scene of any format in pieces. The finest level of a streamed scene is read chunk by
+/// chunk, so that only one chunk is in memory; its environment comes last. Any other scene is one
+/// piece.
 ///
 /// # Errors
-/// As [`read()`], and whatever `visit` returns.
+/// As [`read()`], and errors of `visit`.
 pub fn read_in_chunks<E: From<FormatError>>(
     path: impl AsRef<Path>,
     mut visit: impl FnMut(Splats) -> Result<(), E>,
@@ -268,7 +271,7 @@ pub fn read_in_chunks<E: From<FormatError>>(
     }
 }
 
-/// Reads the bytes of a scene file. Content decides where it has a mark, otherwise `named`.
+/// Reads the bytes of a scene file. `named` is the format if the content has no magic number.
 ///
 /// # Errors
 /// As [`read()`], without the path.
@@ -276,12 +279,13 @@ pub fn parse(bytes: &[u8], named: Format) -> Result<Loaded, FormatError> {
     decode(bytes, Format::of_content(bytes).unwrap_or(named), None, &Meter::SILENT)
 }
 
-/// Writes a scene in the format of the file's name; a `meta.json` becomes a SOG scene of
-/// single files beside it. Beside its place first and then renamed, so that a reader never sees
-/// half a file.
+/// Writes a scene in the format that the file name indicates. A `meta.json` becomes a SOG scene of
+/// single files in the same folder. Each file is written next to its destination and then renamed,
+/// so that readers never see a partial file.
 ///
 /// # Errors
-/// [`FormatError::Unknown`] where the name has no known format; [`FormatError::Io`] with the path.
+/// [`FormatError::Unknown`] if the name indicates no known format; [`FormatError::Io`] with the
+/// path.
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.
@@ -290,7 +294,7 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError>
     let is_tree = path.file_name().is_some_and(|name| name == sog::LOD_META);
     let format = Format::of_name(path).filter(|_| !is_tree && !is_gltf_text(path));
     let format = format.ok_or_else(|| FormatError::Unknown {
-        what: format!("{} names no format to write", path.display()),
+        what: format!("{} has no extension of a writable format", path.display()),
     })?;
     let place = |path: &Path, bytes: &[u8]| {
         file::replace(path, bytes).map_err(|cause| FormatError::Io {
@@ -307,11 +311,11 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), FormatError>
     place(path, &encode(format, splats)?)
 }
 
-/// Returns the bytes of a file of a format's first variant, which [`write()`] writes. Harmonics beyond [`Format::max_sh_degree`] are left out;
-/// packed formats put splats in an order of their own.
+/// Returns the bytes that [`write()`] writes: the first variant of the format. Harmonics beyond
+/// [`Format::max_sh_degree`] are dropped. Packed formats change the order of the splats.
 ///
 /// # Errors
-/// [`FormatError::Invalid`] where the format cannot hold the scene.
+/// [`FormatError::Invalid`] if the format cannot store the scene.
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.
@@ -319,10 +323,10 @@ pub fn encode(format: Format, splats: &Splats) -> Result<Vec<u8>, FormatError> {
     encode_variant(format, format.variants()[0], splats)
 }
 
-/// [`encode`] in a given one of the format's [variants](Format::variants).
+/// Encodes a scene as [`encode`] does, in one of the format's [variants](Format::variants).
 ///
 /// # Errors
-/// [`FormatError::Unsupported`] for another variant; otherwise as [`encode`].
+/// [`FormatError::Unsupported`] if the variant cannot be written; otherwise as [`encode`].
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.
@@ -357,8 +361,8 @@ fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, Format
     if level > 0 {
         return Err(FormatError::Unsupported {
             format: named.unwrap_or(Format::Ply),
-            what: format!("level {level} of a scene that has none"),
-            advice: "a streamed scene has levels, by its lod-meta.json",
+            what: format!("level {level} of a scene without levels"),
+            advice: "only streamed scenes, with a lod-meta.json, have levels",
         });
     }
     let is_meta = path.file_name().is_some_and(|name| name == sog::META);
@@ -373,32 +377,32 @@ fn read_metered(path: &Path, level: u32, meter: &Meter) -> Result<Loaded, Format
     let format = Format::of_content(&bytes).or(named).ok_or_else(|| {
         let start = String::from_utf8_lossy(&bytes[..bytes.len().min(8)]).into_owned();
         FormatError::Unknown {
-            what: format!("{} starts with {start:?}, like no scene file", path.display()),
+            what: format!("{} is not a scene file: it starts with {start:?}", path.display()),
         }
     })?;
     decode(&bytes, format, path.parent(), meter)
 }
 
-/// Reads a level of the streamed scene in a folder.
+/// Reads a level of the streamed scene in `folder`.
 fn read_streamed(folder: &Path, level: u32) -> Result<Loaded, FormatError> {
     sog::assemble_streamed(&read_tree(folder)?, level, |name| open_chunk(folder, name))
 }
 
-/// Maps the tree of the streamed scene in a folder.
+/// Maps the index (`lod-meta.json`) of the streamed scene in `folder`.
 fn read_tree(folder: &Path) -> Result<memmap2::Mmap, FormatError> {
     let path = folder.join(sog::LOD_META);
     file::map(&path).map_err(|cause| FormatError::Io { path, verb: "read", cause })
 }
 
-/// Reads a chunk of the streamed scene in a folder.
+/// Reads a chunk of the streamed scene in `folder`.
 fn open_chunk(folder: &Path, name: &str) -> Result<Loaded, FormatError> {
-    // A scene names files in its own folder, not anywhere on this machine.
+    // A scene may only refer to files in its own folder.
     let inside = name.split('/').all(|part| !matches!(part, "" | "." | ".."));
     if !inside || name.contains(['\\', ':', '\0']) {
         return Err(FormatError::Invalid {
             format: Format::Sog,
             place: sog::LOD_META.into(),
-            reason: format!("{name:?} is no file in its folder"),
+            reason: format!("{name:?} is not a file in the scene's folder"),
         });
     }
     let chunk = folder.join(name);
@@ -409,7 +413,7 @@ fn open_chunk(folder: &Path, name: &str) -> Result<Loaded, FormatError> {
     sog::decode(sog::Files::zip(&file::map(&chunk).map_err(io)?)?, &Meter::SILENT)
 }
 
-/// Returns the folder of a streamed scene, if a path names one.
+/// Returns the folder of a streamed scene, if `path` is one.
 fn streamed_folder(path: &Path) -> Option<&Path> {
     if path.file_name().is_some_and(|name| name == sog::LOD_META) {
         return Some(path.parent().unwrap_or(Path::new("")));
@@ -417,7 +421,7 @@ fn streamed_folder(path: &Path) -> Option<&Path> {
     path.join(sog::LOD_META).is_file().then_some(path)
 }
 
-/// Returns what a file is that stands in a scene's place: what a download left there, or what is only drawn.
+/// Returns a description of a file that is known not to be a scene, for example a failed download.
 fn no_scene(bytes: &[u8]) -> Option<&'static str> {
     let start = bytes.trim_ascii_start();
     let is_html = |tag: &[u8]| start.get(..tag.len()).is_some_and(|s| s.eq_ignore_ascii_case(tag));
@@ -427,20 +431,20 @@ fn no_scene(bytes: &[u8]) -> Option<&'static str> {
         Some("a web page, not the file itself; download it by its direct address")
     } else if bytes.starts_with(crate::cpu::PACKED_MAGIC) {
         Some(
-            "a packed scene, which `scene render` and `bench render` draw, and which is flown in by an arena.toml that names \
-             it; nothing takes it whole into memory: give the scene that it was packed of",
+            "a packed scene, which is too large to load; use `scene render`, `bench render` or an arena.toml that \
+             names it, or give the scene that it was packed from",
         )
     } else {
         None
     }
 }
 
-/// Whether a name is that of glTF's JSON, whose buffers stand in other files.
+/// Returns whether a name is that of a glTF JSON file, with buffers in other files.
 fn is_gltf_text(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gltf"))
 }
 
-/// Decodes a file; `folder` is where it lies, if that is known.
+/// Decodes a file. `folder` is its location, if known.
 fn decode(
     bytes: &[u8],
     format: Format,

@@ -1,5 +1,5 @@
-//! An order in which neighbours in space are neighbours in the file, for formats that pack runs of
-//! splats relative to each other.
+//! Spatial order of splats, for formats that pack runs of neighbouring splats relative to each
+//! other.
 
 use crate::Splats;
 
@@ -10,14 +10,14 @@ pub(super) fn morton(splats: &Splats) -> Vec<u32> {
         low = low.min(mean_m);
         high = high.max(mean_m);
     }
-    // A flat scene has no extent along one axis; any step serves there.
+    // A flat scene has no extent along one axis; there, any step is valid.
     let step = 1023.0 / (high - low).max(glam::Vec3::splat(f32::MIN_POSITIVE));
     let mut keyed: Vec<(u32, u32)> = splats
         .means_m
         .iter()
         .zip(0..)
         .map(|(&mean_m, i)| {
-            // `as` saturates, and takes NaN to 0.
+            // `as` saturates, and converts NaN to 0.
             let cell = (mean_m - low) * step;
             (spread(cell.x as u32) | spread(cell.y as u32) << 1 | spread(cell.z as u32) << 2, i)
         })
@@ -26,7 +26,7 @@ pub(super) fn morton(splats: &Splats) -> Vec<u32> {
     keyed.into_iter().map(|(_, i)| i).collect()
 }
 
-/// Returns the ten lowest bits with two zeros between each.
+/// Returns the ten lowest bits, each followed by two zeros.
 fn spread(cell: u32) -> u32 {
     let mut bits = cell.min(1023);
     bits = (bits | bits << 16) & 0x0300_00ff;

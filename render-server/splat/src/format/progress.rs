@@ -1,22 +1,22 @@
-//! The progress of a load, reported from any thread.
+//! Progress of loading a scene, reported from any thread.
 
 use std::sync::{Mutex, PoisonError};
 
-/// How far a load has come. Its unit is splats times passes over them (a packed file is inflated,
-/// then decoded), so only the ratio means something; it never falls, and ends at `total`.
+/// Progress of loading a scene. The unit is splats times passes (a packed file is inflated, then
+/// decoded), so only the ratio is meaningful. `done` never decreases, and ends at `total`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Progress {
-    /// Work done, at most `total`.
+    /// Completed work, at most `total`.
     pub done: u64,
-    /// All the work there is; at least 1.
+    /// Total work, at least 1.
     pub total: u64,
 }
 
-/// What a load calls as it comes along: some hundred times for a million splats, from its worker
+/// Callback for progress. It is called some hundred times for a million splats, from worker
 /// threads, one call at a time.
 pub type Report<'a> = &'a mut (dyn FnMut(Progress) + Send);
 
-/// Adds up the work of all threads of a load.
+/// Sums the work of all loading threads.
 pub(super) struct Meter<'a>(Option<Mutex<State<'a>>>);
 
 struct State<'a> {
@@ -25,31 +25,31 @@ struct State<'a> {
 }
 
 impl<'a> Meter<'a> {
-    /// Tells nobody.
+    /// Meter without a callback.
     pub(super) const SILENT: Meter<'static> = Meter(None);
 
     pub(super) fn new(report: Report<'a>) -> Self {
         Self(Some(Mutex::new(State { at: Progress { done: 0, total: 1 }, report })))
     }
 
-    /// Reports how much work there is, once it is known.
+    /// Sets the total work, once it is known.
     pub(super) fn expect(&self, total: usize) {
         self.update(|at| at.total = (total as u64).max(1));
     }
 
-    /// Adds work done.
+    /// Adds completed work.
     pub(super) fn add(&self, work: usize) {
         self.update(|at| at.done = (at.done + work as u64).min(at.total));
     }
 
-    /// All is done, whatever was counted.
+    /// Sets the progress to complete, whatever was counted.
     pub(super) fn finish(&self) {
         self.update(|at| at.done = at.total);
     }
 
     fn update(&self, change: impl FnOnce(&mut Progress)) {
         if let Some(state) = &self.0 {
-            // A report that panicked has ended this load anyhow.
+            // If the callback panicked, this load ends anyway.
             let mut state = state.lock().unwrap_or_else(PoisonError::into_inner);
             let before = state.at;
             change(&mut state.at);

@@ -1,22 +1,22 @@
-//! Small numbers of few bits, as several formats pack them.
+//! Quantised numbers of few bits, as several formats pack them.
 
 use std::f32::consts::SQRT_2;
 
-/// Returns the lowest `bits` of a word as 0 to 1.
+/// Returns the lowest `bits` of a word, scaled to 0 to 1.
 #[inline]
 pub(super) fn unorm(word: u32, bits: u32) -> f32 {
     let mask = (1 << bits) - 1;
     (word & mask) as f32 / mask as f32
 }
 
-/// Returns the nearest number of `bits` to a value of 0 to 1; what is outside is clamped.
+/// Quantises a value of 0 to 1 to `bits`. Values outside are clamped.
 pub(super) fn to_unorm(value: f32, bits: u32) -> u32 {
     let top = ((1u32 << bits) - 1) as f32;
     (value * top).round().clamp(0.0, top) as u32
 }
 
 /// Returns a unit quaternion from the index of its largest component and the three others, in
-/// order, -1 to 1 for -1/sqrt(2) to 1/sqrt(2). The order of components goes in as it comes out.
+/// order, -1 to 1 for -1/sqrt(2) to 1/sqrt(2). Input and output have the same order of components.
 #[inline]
 pub(super) fn wxyz_of_smallest_three(largest: u32, others: [f32; 3]) -> [f32; 4] {
     let others = others.map(|v| v / SQRT_2);
@@ -31,7 +31,8 @@ pub(super) fn wxyz_of_smallest_three(largest: u32, others: [f32; 3]) -> [f32; 4]
     }
 }
 
-/// The inverse of [`wxyz_of_smallest_three`].
+/// Returns the index of the largest component and the three others: the inverse of
+/// [`wxyz_of_smallest_three`].
 pub(super) fn smallest_three(q: [f32; 4]) -> (u32, [f32; 3]) {
     let mut largest = 0;
     for i in 1..4 {
@@ -39,7 +40,8 @@ pub(super) fn smallest_three(q: [f32; 4]) -> (u32, [f32; 3]) {
             largest = i;
         }
     }
-    // The quaternion and its negative are one rotation: the largest is stored as positive.
+    // A quaternion and its negative are the same rotation: the largest component is stored as
+    // positive.
     let scale = if q[largest] < 0.0 { -SQRT_2 } else { SQRT_2 };
     let mut others = [0.0; 3];
     let rest = (0..4).filter(|&i| i != largest);

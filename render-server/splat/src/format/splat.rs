@@ -1,4 +1,4 @@
-//! `.splat`: 32 bytes per splat and nothing else, as antimatter15's viewer reads it.
+//! `.splat`: 32 bytes per splat without a header, as antimatter15's viewer reads it.
 //!
 //! | bytes | hold |
 //! |---|---|
@@ -7,8 +7,8 @@
 //! | 24..28 | red, green, blue (0.5 + c0 times the constant harmonic), opacity; 0 to 255, linear |
 //! | 28..32 | quaternion wxyz, each q * 128 + 128 |
 //!
-//! No harmonics beyond the constant; axes as in the PLY it was made from. There is no magic: only
-//! the name decides the format.
+//! The format stores only the constant harmonic. Axes are those of the source PLY. There is no
+//! magic number, so only the name indicates the format.
 
 use glam::Vec3;
 
@@ -20,7 +20,7 @@ use super::quantise::to_unorm;
 use super::{Format, FormatError, Loaded, assert_whole, limit};
 use crate::Splats;
 
-/// Size of a splat. [byte]
+/// Size of one splat. [byte]
 const ROW_BYTES: usize = 32;
 
 /// Reads the bytes of a `.splat` file.
@@ -56,7 +56,7 @@ pub(super) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, FormatError>
     Loaded::whole(Format::Splat, rows.len(), splats, dropped)
 }
 
-/// Returns the bytes of a `.splat` file; harmonics beyond the constant are left out.
+/// Returns the bytes of a `.splat` file. Harmonics beyond the constant are dropped.
 pub(super) fn encode(splats: &Splats) -> Vec<u8> {
     assert_whole(splats);
     let mut bytes = Vec::with_capacity(splats.len() * ROW_BYTES);

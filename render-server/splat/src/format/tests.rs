@@ -10,7 +10,7 @@ use super::{
 };
 use crate::Splats;
 
-/// A writer, the order it writes in, and what it may lose.
+/// Writer, the order of splats that it produces, and its maximum errors.
 struct FormatCase {
     name: &'static str,
     format: Format,
@@ -19,19 +19,19 @@ struct FormatCase {
     loss: Loss,
 }
 
-/// Largest errors after a round trip.
+/// Maximum errors after encoding and decoding.
 struct Loss {
-    /// Of positions, given the extent of what is packed together. [m]
+    /// Error of positions, given the extent of the splats that share bounds. [m]
     mean_m: fn(f32) -> f32,
-    /// Of the logarithm of a scale; the tests' scenes stay where formats do not clamp.
+    /// Error of the logarithm of a scale. The scenes of the tests stay within the clamping limits.
     log_scale: f32,
-    /// Of a rotation. [rad]
+    /// Error of a rotation. [rad]
     rotation_rad: f32,
-    /// Of opacity.
+    /// Error of opacity.
     opacity: f32,
-    /// Of the constant harmonic.
+    /// Error of the constant harmonic.
     constant: f32,
-    /// Of the other harmonics.
+    /// Error of the other harmonics.
     harmonic: f32,
 }
 
@@ -39,7 +39,7 @@ fn as_is(splats: &Splats) -> Vec<u32> {
     (0..splats.len() as u32).collect()
 }
 
-/// Half a step of a byte, as a constant harmonic, with room for rounding.
+/// Half a step of a colour byte, as a constant harmonic, with a margin for rounding.
 const COLOUR_BYTE: f32 = 0.5 / 255.0 / 0.282_094_8 * 1.01;
 /// Half a step of an opacity byte.
 const OPACITY_BYTE: f32 = 0.5 / 255.0 * 1.01;
@@ -50,7 +50,7 @@ const SPZ: Loss = Loss {
     rotation_rad: 0.006,
     opacity: OPACITY_BYTE,
     constant: 0.5 / 255.0 / 0.15 * 1.01,
-    // 5 bits at degree 1, 4 beyond, and the end of a byte.
+    // 5 bits at degree 1, 4 bits beyond, plus the clamp of 1 to a byte of 255.
     harmonic: 1.0 / 16.0 + 1.0 / 128.0,
 };
 
@@ -87,7 +87,7 @@ const FORMAT_CASES: [FormatCase; 11] = [
             mean_m: |extent_m| extent_m / 2046.0 * 1.01,
             // Scales of the tests span 2.5 in the logarithm.
             log_scale: 2.5 / 2046.0 * 1.01,
-            // Half a step of three components, and three of those in the fourth where all are equal.
+            // Half a step in three components, and three times that in the fourth if all are equal.
             rotation_rad: 0.005,
             opacity: OPACITY_BYTE,
             constant: COLOUR_BYTE,
@@ -113,7 +113,7 @@ const FORMAT_CASES: [FormatCase; 11] = [
         format: Format::Spz,
         encode: |splats| spz::encode(splats, 2),
         sorted: as_is,
-        // w is what three bytes leave, so half a turn is known least.
+        // w is computed from three bytes, so half turns have the largest error.
         loss: Loss { rotation_rad: 0.3, ..SPZ },
     },
     FormatCase {
@@ -138,7 +138,8 @@ const FORMAT_CASES: [FormatCase; 11] = [
         loss: Loss {
             // ln(1 + 5) to either side in 65535 steps, stretched by 6 at the far end.
             mean_m: |_| 6.0 * 2.0 * 1.8 / 65535.0,
-            // A codebook is dense where values are: twice an even step leaves room elsewhere.
+            // A codebook is dense where values are dense: elsewhere, steps can be twice an even
+            // step.
             log_scale: 2.5 * 2.0 / 255.0,
             rotation_rad: 0.02,
             opacity: OPACITY_BYTE,
@@ -184,20 +185,20 @@ const FORMAT_CASES: [FormatCase; 11] = [
             rotation_rad: 1e-6,
             opacity: 0.0,
             constant: 0.0,
-            // Turned and turned back.
+            // Rotated at encoding and rotated back at decoding.
             harmonic: 1e-6,
         },
     },
 ];
 
-/// The order of `.ksplat`'s cubes of 5 m; the tests' scenes fill none of them.
+/// Returns the order of `.ksplat`'s cubes of 5 m. The scenes of the tests do not fill a bucket.
 fn by_cube(splats: &Splats) -> Vec<u32> {
     let mut order = as_is(splats);
     order.sort_by_key(|&i| (splats.means_m[i as usize] / 5.0).floor().as_ivec3().to_array());
     order
 }
 
-/// Scenes of up to 40 splats within 5 m, with values that no format clamps.
+/// Generates scenes of up to 40 splats within 5 m, with values that no format clamps.
 fn scene() -> impl Strategy<Value = Splats> {
     let splat = (
         prop::array::uniform3(-5.0..5.0f32),
@@ -222,7 +223,7 @@ fn scene() -> impl Strategy<Value = Splats> {
     })
 }
 
-/// Some splats of degree 2, always the same.
+/// Returns a fixed scene of degree 2.
 fn some() -> Splats {
     let mut splats = Splats { sh_degree: 2, ..Splats::default() };
     for i in 0..7 {
@@ -236,7 +237,7 @@ fn some() -> Splats {
     splats
 }
 
-/// Compares a scene with what became of it.
+/// Asserts that a decoded scene is within the maximum errors.
 fn check_close(case: &FormatCase, before: &Splats, after: &Splats) {
     let FormatCase { name, loss, format, .. } = case;
     let order = (case.sorted)(before);
@@ -256,8 +257,8 @@ fn check_close(case: &FormatCase, before: &Splats, after: &Splats) {
             let [a, b] = [before.scales_m[i][axis], after.scales_m[j][axis]].map(f32::ln);
             near("log scale", a, b, loss.log_scale);
         }
-        // The chord, which small angles do not lose in rounding as they do in the cosine; a
-        // quaternion and its negative are one rotation.
+        // The chord, because the cosine of small angles is lost in rounding. A quaternion and its
+        // negative are the same rotation.
         let (q, r) = (before.rotations[i], after.rotations[j]);
         let angle_rad = (q - r).length().min((q + r).length()) * 2.0;
         near("rotation", 0.0, angle_rad, loss.rotation_rad);
@@ -269,7 +270,7 @@ fn check_close(case: &FormatCase, before: &Splats, after: &Splats) {
     }
 }
 
-/// A scene from damaged bytes must be one that a renderer takes.
+/// Asserts that a scene that was decoded from damaged bytes can be rendered.
 fn check_sound(loaded: &Loaded) {
     let s = &loaded.splats;
     assert_eq!(s.sh.len(), s.len() * 3 * s.sh_coefficients());
@@ -283,7 +284,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn every_format_brings_a_scene_back_within_its_steps(splats in scene()) {
+    fn decodes_every_format_within_its_quantisation_steps(splats in scene()) {
         for case in &FORMAT_CASES {
             let loaded = parse(&(case.encode)(&splats), case.format).unwrap();
             prop_assert_eq!(loaded.format, case.format);
@@ -295,7 +296,7 @@ proptest! {
     }
 
     #[test]
-    fn any_damage_is_an_error_or_a_sound_scene(
+    fn returns_an_error_or_a_valid_scene_for_damaged_bytes(
         splats in scene(), at in any::<prop::sample::Index>(), bits in 1..=255u8,
     ) {
         for case in &FORMAT_CASES {
@@ -309,7 +310,7 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_an_error_or_a_sound_scene(bytes in prop::collection::vec(any::<u8>(), 0..6000)) {
+    fn returns_an_error_or_a_valid_scene_for_random_bytes(bytes in prop::collection::vec(any::<u8>(), 0..6000)) {
         for format in Format::ALL {
             if let Ok(loaded) = super::decode(&bytes, format, None, &super::Meter::SILENT) {
                 check_sound(&loaded);
@@ -319,12 +320,12 @@ proptest! {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_an_error() {
+fn rejects_a_file_truncated_anywhere() {
     for case in &FORMAT_CASES {
         let bytes = (case.encode)(&some());
         for length in 0..bytes.len() {
-            // A `.splat` cut between splats is one of fewer, and a gzip stream's last bytes are
-            // its checksum and length, without which it is refused as well.
+            // A `.splat` cut between splats is a valid shorter file. The last bytes of a gzip
+            // stream are its checksum and length; without them, the file is rejected.
             if case.format == Format::Splat && length % 32 == 0 && length > 0 {
                 continue;
             }
@@ -336,7 +337,7 @@ fn a_file_cut_anywhere_is_an_error() {
 }
 
 #[test]
-fn content_decides_and_the_name_helps() {
+fn detects_the_format_by_content_then_by_name() {
     for case in &FORMAT_CASES {
         let bytes = (case.encode)(&some());
         let marked = case.format != Format::Splat;
@@ -354,7 +355,7 @@ fn content_decides_and_the_name_helps() {
 }
 
 #[test]
-fn files_and_folders_are_read_by_path() {
+fn reads_files_and_folders_by_path() {
     let folder = tempfile::tempdir().unwrap();
     for format in Format::ALL {
         let path = folder.path().join("scene").with_extension(format.extension());
@@ -376,7 +377,7 @@ fn files_and_folders_are_read_by_path() {
 }
 
 #[test]
-fn unknown_files_are_refused_with_the_list_of_formats() {
+fn rejects_unknown_files_with_the_list_of_formats() {
     let folder = tempfile::tempdir().unwrap();
     let check = |name: &str, bytes: &[u8], parts: &[&str]| {
         let path = folder.path().join(name);
@@ -387,9 +388,9 @@ fn unknown_files_are_refused_with_the_list_of_formats() {
         }
     };
     check("a.glb", b"glTF\x02\0\0\0", &["glTF: truncated"]);
-    check("a.obj", b"o thing\n", &["a.obj starts with \"o thing", "PLY (.ply)", "glTF (.glb)"]);
+    check("a.obj", b"o thing\n", &["a.obj is not a scene file: it starts with \"o thing", "PLY (.ply)", "glTF (.glb)"]);
     check("a.gltf", b"{}", &["a glTF file without KHR_gaussian_splatting"]);
-    check("a.usdz", b"PK\x05\x06", &["like no scene file"]);
+    check("a.usdz", b"PK\x05\x06", &["is not a scene file"]);
     check("lod-meta.json", b"{}", &["SOG, lod-meta.json", "lodLevels"]);
     std::fs::remove_file(folder.path().join("lod-meta.json")).unwrap();
     check("a.splat", b"", &["no splats"]);
@@ -401,22 +402,22 @@ fn unknown_files_are_refused_with_the_list_of_formats() {
     check("meta.json", b"{}", &["SOG, meta.json"]);
     assert!(matches!(read("/nowhere/x.spz"), Err(FormatError::Io { .. })));
     let error = write(folder.path().join("x.obj"), &some()).unwrap_err().to_string();
-    assert!(error.contains("names no format to write; supported are PLY"), "{error}");
+    assert!(error.contains("has no extension of a writable format; supported are PLY"), "{error}");
 }
 
 #[test]
-fn a_pipe_is_refused_and_not_waited_for() {
+fn rejects_a_pipe_without_waiting() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("pipe.splat");
     let made = std::process::Command::new("mkfifo").arg(&path).status().unwrap();
     assert!(made.success());
-    // Nobody writes to it: opening it would wait for ever.
+    // The pipe has no writer: opening it would block.
     let error = read(&path).unwrap_err().to_string();
     assert!(error.contains("not a regular file"), "{error}");
 }
 
 #[test]
-fn an_empty_scene_is_written_and_refused_by_name() {
+fn writes_an_empty_scene_and_rejects_it_on_reading() {
     for case in &FORMAT_CASES {
         let result = parse(&(case.encode)(&Splats::default()), case.format);
         let error = result.expect_err(case.name).to_string();
@@ -425,7 +426,7 @@ fn an_empty_scene_is_written_and_refused_by_name() {
 }
 
 #[test]
-fn values_beyond_a_format_are_clamped_not_dropped() {
+fn clamps_values_beyond_the_range_of_a_format() {
     let mut splats = some();
     splats.means_m[0] = Vec3::new(4e4, -3e7, 0.5);
     splats.scales_m[1] = Vec3::new(0.0, 1e-30, 1e3);
@@ -441,7 +442,7 @@ fn values_beyond_a_format_are_clamped_not_dropped() {
 }
 
 #[test]
-fn a_full_bucket_or_chunk_is_followed_by_another() {
+fn starts_another_bucket_or_chunk_when_one_is_full() {
     let mut splats = Splats { sh_degree: 1, ..Splats::default() };
     for i in 0..1300 {
         let f = i as f32;
@@ -453,7 +454,7 @@ fn a_full_bucket_or_chunk_is_followed_by_another() {
     }
     for case in &FORMAT_CASES {
         let after = parse(&(case.encode)(&splats), case.format).unwrap().splats;
-        // Whatever the order: every splat has one near it, and positions distinguishes them.
+        // In any order: each splat has a counterpart near it, and positions identify the splats.
         let most = (case.loss.mean_m)(7.0) * 2.0;
         let mut before: Vec<Vec3> = splats.means_m.clone();
         let mut after: Vec<Vec3> = after.means_m;
@@ -467,12 +468,12 @@ fn a_full_bucket_or_chunk_is_followed_by_another() {
 }
 
 #[test]
-fn hostile_sizes_are_refused_before_memory_is_taken() {
+fn rejects_hostile_sizes_before_allocating() {
     let refuse = |name: &str, bytes: &[u8], format: Format, part: &str| {
         let error = parse(bytes, format).expect_err(name).to_string();
         assert!(error.contains(part), "{name}: {error:?} lacks {part:?}");
     };
-    // SPZ 3: 4 billion splats in a gzip stream of nothing.
+    // SPZ 3: 4 billion splats declared in an empty gzip stream.
     let mut header = Vec::new();
     for word in [spz::MAGIC, 3, u32::MAX] {
         header.extend(word.to_le_bytes());
@@ -491,7 +492,7 @@ fn hostile_sizes_are_refused_before_memory_is_taken() {
     header[4] = 5;
     refuse("version", &gzip(&header), Format::Spz, "version 5 is not supported; save it as");
 
-    // SPZ 4 with a table of contents far away.
+    // SPZ 4 with a table of contents beyond the file.
     let mut four = spz::encode(&some(), 4);
     four[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
     refuse("table", &four, Format::Spz, "table of contents");
@@ -513,7 +514,7 @@ fn hostile_sizes_are_refused_before_memory_is_taken() {
     bytes[4096 + 8..4096 + 12].fill(0xff);
     refuse("buckets", &bytes, Format::Ksplat, "truncated");
 
-    // Compressed PLY: fewer chunks than splats need.
+    // Compressed PLY with fewer chunks than its splats need.
     let text = String::from_utf8_lossy(&ply::encode_compressed(&some())).into_owned();
     let header = text[..text.find("end_header").unwrap()].replace("chunk 1", "chunk 0");
     let mut bytes = (header + "end_header\n").into_bytes();
@@ -521,7 +522,7 @@ fn hostile_sizes_are_refused_before_memory_is_taken() {
     refuse("chunks", &bytes, Format::CompressedPly, "0 chunks for 7 splats");
 }
 
-/// A ZIP of the given parts.
+/// Returns a ZIP of the given parts.
 fn zip(parts: &[(&str, Vec<u8>)], method: zip::CompressionMethod) -> Vec<u8> {
     let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     let options = zip::write::SimpleFileOptions::default().compression_method(method);
@@ -533,7 +534,7 @@ fn zip(parts: &[(&str, Vec<u8>)], method: zip::CompressionMethod) -> Vec<u8> {
 }
 
 #[test]
-fn sog_parts_are_held_to_their_limits() {
+fn rejects_sog_parts_beyond_their_limits() {
     let parts = sog::parts(&some()).unwrap();
     let meta = String::from_utf8(parts.last().unwrap().1.clone()).unwrap();
     let with = |from: &str, to: &str| {
@@ -550,12 +551,12 @@ fn sog_parts_are_held_to_their_limits() {
     refuse(&with("\"count\":7,\"means", "\"count\":9999999999,\"means"), "number of splats");
     refuse(&with("\"count\":7,\"means", "\"count\":30000000,\"means"), "size when inflated");
     refuse(&with("\"version\":2", "\"version\":3"), "version 3 is not supported");
-    refuse(&with("\"sh0.webp\"", "\"../sh0.webp\""), "no file name");
-    refuse(&with("\"sh0.webp\"", "\"/etc/hostname\""), "no file name");
+    refuse(&with("\"sh0.webp\"", "\"../sh0.webp\""), "not a file name");
+    refuse(&with("\"sh0.webp\"", "\"/etc/hostname\""), "not a file name");
     refuse(&with("\"sh0.webp\"", "\"absent.webp\""), "absent.webp");
     refuse(&with("\"sh0.webp\"", "\"meta.json\""), "not a WebP image");
     refuse(&with("\"bands\":2", "\"bands\":3"), "fits no degree");
-    // Deflated, and in a folder of the archive, it is the same scene.
+    // Deflated, and in a folder of the archive, the scene is the same.
     let named: Vec<(String, Vec<u8>)> =
         parts.iter().map(|(name, bytes)| (format!("my/{name}"), bytes.clone())).collect();
     let named: Vec<(&str, Vec<u8>)> =
@@ -563,7 +564,7 @@ fn sog_parts_are_held_to_their_limits() {
     let deflated = zip(&named, zip::CompressionMethod::Deflated);
     let expected = parse(&sog::encode(&some()).unwrap(), Format::Sog).unwrap();
     assert_eq!(parse(&deflated, Format::Sog).unwrap(), expected);
-    // A texture that inflates to more than its splats have a use for.
+    // A texture that inflates to more than its splats need.
     let mut bomb: Vec<(&str, Vec<u8>)> = parts.clone();
     bomb[0].1 = vec![0; 8 << 20];
     refuse(&zip(&bomb, zip::CompressionMethod::Deflated), "the size of a part");
@@ -577,8 +578,8 @@ fn sog_parts_are_held_to_their_limits() {
 }
 
 #[test]
-fn sog_version_1_is_read_between_its_bounds() {
-    // Four splats on 4 x 4 pixels; every byte is between the bounds.
+fn reads_sog_version_1_between_its_bounds() {
+    // Four splats on 4 x 4 pixels; every byte is a value between the bounds.
     let pixels = |pixel: [u8; 4]| -> Vec<u8> {
         let mut webp = Vec::new();
         let bytes: Vec<u8> = std::iter::repeat_n(pixel, 16).flatten().collect();
@@ -615,20 +616,20 @@ fn sog_version_1_is_read_between_its_bounds() {
     for (a, b) in splats.scales_m[3].to_array().into_iter().zip([-5f32, 0.0, -4.0]) {
         near(a, b.exp());
     }
-    // The tag says y.
+    // The tag selects y as the largest component.
     assert!(splats.rotations[3].y > 0.999);
     assert_eq!(splats.sh[..3], [-1.0, 0.4, 3.0]);
     near(splats.opacities[3], 1.0 / (1.0 + (-4f32).exp()));
 }
 
-/// The JSON of a glTF scene of two splats in a buffer of its own, as another's software may write it: quantised, in a node
-/// within a node.
+/// Returns the glTF JSON of two splats with an embedded buffer, as other programs may write it:
+/// quantised, in a nested node.
 fn gltf_of_two(change: impl FnOnce(&mut serde_json::Value)) -> Vec<u8> {
     let mut bytes: Vec<u8> = Vec::new();
     for v in [1.0f32, 2.0, 3.0, -1.0, 0.5, 0.25] {
         bytes.extend(v.to_le_bytes());
     }
-    // Rotations: none, and half a turn about x, of 16 bits; scales and opacities of bytes.
+    // Rotations of 16 bits: identity, and half a turn about x; scales and opacities of 8 bits.
     for v in [0i16, 0, 0, 32767, -32767, 0, 0, 0] {
         bytes.extend(v.to_le_bytes());
     }
@@ -645,7 +646,7 @@ fn gltf_of_two(change: impl FnOnce(&mut serde_json::Value)) -> Vec<u8> {
         "scenes": [{ "nodes": [1] }],
         "nodes": [
             { "mesh": 0, "translation": [0.0, 0.0, 10.0], "scale": [2.0, 2.0, 2.0] },
-            // A quarter of a turn about y.
+            // Quarter turn about y.
             { "children": [0], "rotation": [0.0, 0.707_106_781_186_547_5, 0.0, 0.707_106_781_186_547_5] },
         ],
         "buffers": [{ "byteLength": bytes.len(), "uri": uri }],
@@ -683,9 +684,10 @@ fn base64(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn a_gltf_scene_is_where_its_nodes_have_it() {
+fn applies_the_transforms_of_gltf_nodes() {
     let splats = parse(&gltf_of_two(|_| ()), Format::Gltf).unwrap().splats;
-    // Twice as large and 10 along z, then about y: (x, y, z) to (z, y, -x); then x and y change sign.
+    // Scaled by 2 and moved by 10 along z, then rotated about y: (x, y, z) to (z, y, -x); then x
+    // and y change sign.
     let expected = [Vec3::new(-16.0, -4.0, -2.0), Vec3::new(-10.5, -1.0, 2.0)];
     for (mean_m, expected) in splats.means_m.iter().zip(expected) {
         assert!(mean_m.distance(expected) < 1e-5, "{mean_m} for {expected}");
@@ -695,7 +697,7 @@ fn a_gltf_scene_is_where_its_nodes_have_it() {
         "{}",
         splats.scales_m[0]
     );
-    // What lay along x lies along -z, and then along -z still.
+    // The quarter turn maps x to -z; the half turn about z keeps -z.
     let along = splats.rotations[0] * Vec3::X;
     assert!((along - Vec3::NEG_Z).length() < 1e-3, "{along}");
     assert!((splats.opacities[1] - 0.2).abs() < 1e-6);
@@ -707,7 +709,7 @@ fn splatting(root: &mut serde_json::Value) -> &mut serde_json::Value {
 }
 
 #[test]
-fn what_gltf_has_and_is_not_read_is_named() {
+fn names_unsupported_gltf_features() {
     let check = |change: fn(&mut serde_json::Value), part: &str| {
         let error = parse(&gltf_of_two(change), Format::Gltf).unwrap_err().to_string();
         assert!(error.contains(part), "{error:?} lacks {part:?}");
@@ -731,13 +733,13 @@ fn what_gltf_has_and_is_not_read_is_named() {
     check(|v| v["accessors"][1]["type"] = "VEC3".into(), "type VEC3 instead of VEC4");
     check(|v| v["accessors"][3]["count"] = 1.into(), "different lengths");
     check(|v| v["buffers"][0]["byteLength"] = 1_000_000.into(), "truncated");
-    check(|v| v["buffers"][0]["uri"] = "../../etc/passwd".into(), "no plain file name");
+    check(|v| v["buffers"][0]["uri"] = "../../etc/passwd".into(), "not a plain file name");
     check(|v| v["buffers"][0]["uri"] = "beside.bin".into(), "save it as .glb");
     check(|v| drop(v.as_object_mut().unwrap().remove("meshes")), "no such mesh");
 }
 
 #[test]
-fn a_gltf_scene_with_its_buffer_beside_it_is_read() {
+fn reads_a_gltf_scene_with_its_buffer_in_another_file() {
     let folder = tempfile::tempdir().unwrap();
     let glb = gltf::encode(&some());
     let json_bytes = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
@@ -747,13 +749,13 @@ fn a_gltf_scene_with_its_buffer_beside_it_is_read() {
     std::fs::write(folder.path().join("scene.gltf"), root.to_string()).unwrap();
     let loaded = read(folder.path().join("scene.gltf")).unwrap();
     assert_eq!(loaded, parse(&glb, Format::Gltf).unwrap());
-    // It is not written: half of it would stand in another file.
+    // A `.gltf` is not written, because its buffer would be in another file.
     let error = write(folder.path().join("out.gltf"), &some()).unwrap_err().to_string();
-    assert!(error.contains("names no format to write"), "{error}");
+    assert!(error.contains("has no extension of a writable format"), "{error}");
 }
 
 #[test]
-fn plys_say_by_comment_how_they_were_trained() {
+fn reads_antialiasing_from_ply_comments() {
     let check = |comments: &str, expected: bool| {
         let text = String::from_utf8_lossy(&ply::encode(&some())).into_owned();
         let start = text.find("element").unwrap();
@@ -771,7 +773,7 @@ fn plys_say_by_comment_how_they_were_trained() {
     check("comment antialiased 1\ncomment SplatRenderMode: default\n", false);
 }
 
-/// A tree of two parts at two levels, in chunks of which one holds both parts.
+/// Returns the tree of two parts at two levels. One of its chunks holds both parts.
 fn tree(change: impl FnOnce(&mut serde_json::Value)) -> Vec<u8> {
     let run = |file: usize, offset: usize, count: usize| serde_json::json!({ "file": file, "offset": offset, "count": count });
     let mut root = serde_json::json!({
@@ -794,11 +796,11 @@ fn streamed(index: &[u8], level: u32) -> Result<Loaded, FormatError> {
 }
 
 #[test]
-fn a_level_of_a_streamed_scene_is_put_together() {
+fn assembles_a_level_of_a_streamed_scene() {
     let finest = streamed(&tree(|_| ()), 0).unwrap().splats;
     let known = parse(&ply::encode(&some()), Format::Ply).unwrap().splats;
     assert_eq!(finest, known);
-    // What has no second level stays as fine as it is; harmonics that a chunk lacks are none.
+    // A part without a second level keeps its finest level; missing harmonics of a chunk are zero.
     let coarse = streamed(&tree(|_| ()), 1).unwrap().splats;
     assert_eq!((coarse.len(), coarse.sh_degree), (5, 2));
     assert_eq!(coarse.means_m[..4], known.means_m[3..]);
@@ -824,13 +826,13 @@ fn a_level_of_a_streamed_scene_is_put_together() {
 }
 
 #[test]
-fn a_streamed_scene_names_files_in_its_folder_alone() {
+fn rejects_streamed_chunks_outside_the_scene_folder() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["../0_0/meta.json", "/etc/passwd", "a/../../b", "a\\b", "c:b", ""] {
         let index = tree(|v| v["filenames"][0] = name.into());
         std::fs::write(folder.path().join("lod-meta.json"), index).unwrap();
         let error = read(folder.path()).unwrap_err().to_string();
-        assert!(error.contains("is no file in its folder"), "{name}: {error}");
+        assert!(error.contains("is not a file in the scene's folder"), "{name}: {error}");
     }
 }
 
@@ -838,7 +840,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(300))]
 
     #[test]
-    fn a_damaged_tree_is_an_error_or_a_sound_scene(
+    fn returns_an_error_or_a_valid_scene_for_a_damaged_tree(
         damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..4), level in 0..3u32,
     ) {
         let mut index = tree(|v| v["environment"] = "1_0/meta.json".into());
@@ -852,7 +854,7 @@ proptest! {
     }
 
     #[test]
-    fn a_damaged_gltf_is_an_error_or_a_sound_scene(
+    fn returns_an_error_or_a_valid_scene_for_a_damaged_gltf(
         damage in prop::collection::vec((any::<prop::sample::Index>(), b' '..b'~'), 1..4),
     ) {
         let mut bytes = gltf_of_two(|_| ());

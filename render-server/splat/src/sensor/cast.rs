@@ -1,9 +1,10 @@
-//! One beam through the splats: what it meets, and the echoes that makes.
+//! Casting of one beam through the splats: hits, and the echoes that they form.
 //!
-//! Budget: some 0.7 us a beam and thread in a forest of 125 k splats, bound by the boxes and splats that it touches.
+//! Budget: about 0.7 us per beam and thread in a forest of 125 k splats, limited by the boxes and
+//! splats that it touches.
 //!
-//! `follow` finds the splats; here they become echoes. Splats are taken in the order of their depths, and what one lets pass
-//! meets the next, as in an image.
+//! `follow` finds the splats; this module combines them to echoes. Splats are sorted by depth, and
+//! light that one transmits reaches the next, as in an image.
 
 use glam::DVec3;
 
@@ -13,11 +14,11 @@ use super::tree::{NONE, Tree, WIDTH};
 use crate::cpu::simd::InstructionSet;
 use crate::{Placement, Scene, Splats};
 
-/// A scene packed for beams; made once, then any sensor measures in it.
+/// Scene that is packed for beams. It is created once; any sensor can measure in it.
 #[derive(Debug)]
 pub struct SensorScene {
     instructions: InstructionSet,
-    /// What stands still, then the objects.
+    /// The static scene, then the objects.
     parts: Vec<Part>,
 }
 
@@ -25,12 +26,12 @@ pub struct SensorScene {
 struct Part {
     id: u16,
     tree: Tree,
-    /// All of it is within this distance of its origin. [m]
+    /// Radius of a sphere around the origin that contains the part. [m]
     radius_m: f64,
 }
 
 impl SensorScene {
-    /// Packs a scene. Splats that no image would show are left out, as renderers do.
+    /// Packs a scene. Invisible splats are dropped, as in the renderers.
     pub fn new<'a>(scene: impl Into<Scene<'a>>) -> Self {
         let sets = InstructionSet::available();
         let eight = sets.into_iter().find(|set| set.lanes() == WIDTH);
@@ -43,13 +44,13 @@ impl SensorScene {
         Self { instructions, parts }
     }
 
-    /// Returns how many objects can move in it.
+    /// Returns the number of movable objects.
     pub fn objects(&self) -> usize {
         self.parts.len() - 1
     }
 
-    /// Finds what each of some beams meets, at its share of `motion`, 0 to 1. Beams close to one another, as neighbours of a ring are,
-    /// take less time together; any others get the same.
+    /// Finds the hits of each beam, at its share of `motion`, 0 to 1. Beams close to one another
+    /// (neighbours of a ring) take less time together. The result does not depend on the grouping.
     pub(super) fn cast(&self, motion: &SensorMotion<'_>, beams: &[(f64, Beam)], hits: &mut [Hits]) {
         let mut rays = [Ray::default(); TOGETHER];
         for (beams, hits) in beams.chunks(TOGETHER).zip(hits.chunks_mut(TOGETHER)) {
@@ -57,7 +58,7 @@ impl SensorScene {
                 hits.begin(beam.max_m);
                 *ray = beam.ray(beam.origin_m, beam.direction);
             }
-            // A cone around rays must be narrow, or its boxes are no bounds.
+            // The bounds of boxes are valid only for a narrow cone around the rays.
             let first = beams[0].1.direction;
             let narrow = beams.iter().all(|(_, beam)| beam.direction.dot(first) > NARROW);
             let together = if narrow { TOGETHER } else { 1 };
@@ -75,8 +76,8 @@ impl SensorScene {
         }
     }
 
-    /// Casts `count` beams in groups of neighbours: `beam` says which is the n-th and at which share of `motion` it leaves, and
-    /// `met` is told what it meets, weighed and nearest first, one after the other.
+    /// Casts `count` beams in groups of neighbours. `beam` returns the n-th beam and its share of
+    /// `motion`. `met` is called for each beam in order, with its weighted hits, nearest first.
     pub(super) fn cast_each(
         &self,
         motion: &SensorMotion<'_>,
@@ -104,7 +105,8 @@ impl SensorScene {
         self.instructions.run(Follow { tree: &part.tree, rays, tag, hits });
     }
 
-    /// Returns a beam as an object sees it that is placed at both ends of the motion; `None` if it passes by.
+    /// Returns a beam in the axes of an object with the given placements at both ends of the
+    /// motion, or `None` if it misses the object.
     fn in_object(
         &self,
         number: usize,
@@ -113,7 +115,8 @@ impl SensorScene {
         beam: &Beam,
     ) -> Option<Ray> {
         let [Some(begin), Some(end)] = placements else { return None };
-        // A sphere about its origin first, for most beams miss an object: a line costs less than a slerp.
+        // A sphere around its origin first, because most beams miss an object: linear interpolation
+        // is cheaper than a slerp.
         let middle_m = begin.translation_m.lerp(end.translation_m, share) - beam.origin_m;
         let along_m = middle_m.dot(beam.direction);
         let across_m2 = middle_m.length_squared() - along_m * along_m;
@@ -129,9 +132,9 @@ impl SensorScene {
     }
 }
 
-/// Beams that go through the tree together.
+/// Number of beams that are cast through the tree together.
 pub(super) const TOGETHER: usize = 8;
-/// Cosine of the angle within which they have to be: 14 degrees.
+/// Minimum cosine of the angle between such beams: 14 degrees.
 const NARROW: f64 = 0.97;
 
 impl Part {
@@ -149,16 +152,16 @@ impl Part {
     }
 }
 
-/// One beam in the world.
+/// Beam in the world.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Beam {
-    /// Where it begins. [m, world]
+    /// Start of the beam. [m, world]
     pub(super) origin_m: DVec3,
-    /// Unit. [world]
+    /// Unit vector. [world]
     pub(super) direction: DVec3,
     /// Standard deviation of its footprint per metre of range. [rad]
     pub(super) spread: f32,
-    /// Nothing is looked for beyond. [m]
+    /// Maximum range. [m]
     pub(super) max_m: f32,
 }
 
@@ -168,18 +171,19 @@ impl Beam {
     }
 }
 
-/// Returns the standard deviation per metre of a beam whose full angle is stated where its intensity is 1/e^2 of its
-/// middle's, as for lasers: four deviations.
+/// Returns the standard deviation per metre of a beam, given its full angle at 1/e^2 of the central
+/// intensity, as stated for lasers: four standard deviations.
 pub(super) fn spread_of(divergence_rad: f32) -> f32 {
     divergence_rad / 4.0
 }
 
-/// A splat that a beam meets.
+/// Hit: a splat that a beam meets.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Hit {
-    /// Along the beam. [m]
+    /// Range along the beam. [m]
     pub(super) range_m: f32,
-    /// Share of the beam's light that ends there, once weighed; before that of what reaches it.
+    /// Share of the beam's light that ends at the splat, after weighting; before it, the share of
+    /// the light that reaches the splat.
     pub(super) weight: f32,
     /// Cosine of the angle of incidence.
     pub(super) cosine: f32,
@@ -187,35 +191,36 @@ pub(super) struct Hit {
     pub(super) tag: Tag,
 }
 
-/// Of what a splat is part.
+/// Part of the scene that a splat belongs to.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Tag {
-    /// The object's id; 0 is what stands still.
+    /// Id of the object; 0 is the static scene.
     pub(super) id: u16,
-    /// Its number in the scene, from 1; 0 is what stands still.
+    /// Number of the object in the scene, from 1; 0 is the static scene.
     pub(super) part: u16,
 }
 
-/// What a beam meets, nearest first.
+/// Hits of a beam, nearest first.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Hits {
     hits: [Hit; MAX_HITS],
     len: usize,
-    /// Share of light that passes all of them.
+    /// Share of light that passes all hits.
     left: f32,
-    /// Nothing behind it is seen. [m]
+    /// Maximum range of further hits. [m]
     pub(super) reach_m: f32,
 }
 
-/// Splats that one beam can meet before it ends. Some ten lie over one another on a painted surface; of more, as under a wide
-/// footprint, the two that are closest become one.
+/// Maximum hits of a beam. About ten splats overlap on a painted surface. If there are more, for
+/// example under a wide footprint, the two closest hits are merged.
 const MAX_HITS: usize = 64;
-/// A beam ends where less of it is left, and all of that ends there too: between the splats of an opaque surface up to a fifth
-/// would go on (Gaussians that cover their surface 1.8 times leave exp(-1.8)), and no wall is behind itself.
+/// Remaining light below which a beam ends; the hit at that point absorbs all of it. Up to a fifth
+/// of the light would pass between the splats of an opaque surface (Gaussians that cover their
+/// surface 1.8 times leave exp(-1.8)), and create a false wall behind it.
 const END: f32 = 0.25;
 
 impl Hits {
-    /// Makes room for one beam after the other.
+    /// Returns an empty list, to be reused for one beam after the other.
     pub(super) fn new() -> Self {
         Self { hits: [Hit::default(); MAX_HITS], len: 0, left: 1.0, reach_m: 0.0 }
     }
@@ -226,7 +231,7 @@ impl Hits {
         self.reach_m = max_m;
     }
 
-    /// Adds a splat at its place; `weight` is its alpha.
+    /// Inserts a splat in order of range. `weight` is its alpha.
     #[inline(always)]
     pub(super) fn insert(&mut self, hit: Hit) {
         if self.len == MAX_HITS {
@@ -242,10 +247,10 @@ impl Hits {
         self.left *= 1.0 - hit.weight;
     }
 
-    /// Drops what the beam does not get to.
+    /// Drops hits behind the end of the beam.
     #[inline(always)]
     pub(super) fn shorten(&mut self) {
-        // By a product in another order, so with its rounding.
+        // The tolerance covers rounding, because `left` was multiplied in another order.
         if self.left > END * 1.001 {
             return;
         }
@@ -261,7 +266,7 @@ impl Hits {
         }
     }
 
-    /// Makes one of the two that are nearest to one another.
+    /// Merges the two hits that are closest to each other.
     #[cold]
     fn merge_closest(&mut self) {
         let gap = |i: &usize| self.hits[i + 1].range_m - self.hits[*i].range_m;
@@ -282,7 +287,8 @@ impl Hits {
         self.len -= 1;
     }
 
-    /// Returns the splats with the share of the beam's light that ends at each, nearest first.
+    /// Returns the hits, weighted by the share of the beam's light that ends at each, nearest
+    /// first.
     pub(super) fn weigh(&mut self) -> &[Hit] {
         let mut left = 1.0;
         for hit in &mut self.hits[..self.len] {
@@ -299,23 +305,23 @@ impl Hits {
     }
 }
 
-/// What comes back together: hits within a receiver's resolution.
+/// Echo: hits within the resolution of the receiver.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Echo {
-    /// Where half of its power comes from before, half from behind. [m]
+    /// Range that divides the power of the echo into halves. [m]
     pub(super) range_m: f32,
-    /// Light that comes back per light that was sent to a white plane across the beam at that range.
+    /// Reflected light, relative to the light sent to a white plane across the beam at that range.
     pub(super) power: f32,
     /// Mean cosine of incidence.
     pub(super) cosine: f32,
-    /// Share of the beam that ends there.
+    /// Share of the beam that ends at the echo.
     pub(super) weight: f32,
-    /// Of which part of the scene.
+    /// Part of the scene.
     pub(super) tag: Tag,
 }
 
-/// Calls `f` with each echo of weighed hits, nearest first: hits apart by more than `resolution_m` from the echo's first
-/// begin a new one.
+/// Calls `f` with each echo of weighted hits, nearest first. A hit that is more than `resolution_m`
+/// behind the first hit of an echo starts a new echo.
 pub(super) fn echoes(hits: &[Hit], resolution_m: f32, mut f: impl FnMut(Echo)) {
     let mut start = 0;
     while start < hits.len() {

@@ -1,16 +1,19 @@
-//! Rays through a tree of splats, nearest first: eight boxes or splats at a time for a fan of rays, then splats that are left for eight
-//! rays at a time.
+//! Ray casting through a tree of splats, nearest first: eight boxes or splats at a time against a
+//! fan of rays, then each remaining splat against eight rays at a time.
 //!
-//! Budget: 0.7 us a ray and thread in a forest of 128 k splats (docs/BENCHMARKS.md, "LiDAR"). A fan of eight rays touches tens of
-//! nodes and leaves there, and works out tens of splats.
+//! Budget: 0.7 us per ray and thread in a forest of 128 k splats (docs/BENCHMARKS.md, "LiDAR").
+//! There, a fan of eight rays touches tens of nodes and leaves, and evaluates tens of splats.
 //!
-//! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection of the Gaussian onto the plane
-//! across the ray, which is its greatest value along the ray. A beam is no line: its footprint, a Gaussian that grows with
-//! range, widens the splat by convolution and dims it by what that adds to its area, as anti-aliased splats are by a pixel (Yu et
-//! al. 2024, "Mip-Splatting", equation 10). Widening all three axes by the footprint widens the projection by exactly it.
+//! The opacity of a splat along a ray is that of the renderers with an ideal pixel: the projection
+//! of the Gaussian onto the plane across the ray, which is its maximum along the ray. A beam has a
+//! width: its footprint, a Gaussian that grows with range, widens the splat by convolution and dims
+//! it by the increase of its area, as pixels do to anti-aliased splats (Yu et al. 2024,
+//! "Mip-Splatting", equation 10). Widening all three axes by the footprint widens the projection by
+//! exactly the footprint.
 //!
-//! Its depth is where that greatest value lies (for a disc: where the ray meets its plane), not its centre's as in images: a range
-//! must not depend on how large the splats of a surface are.
+//! The depth of a splat is the position of that maximum (for a disc: the intersection of the ray
+//! with its plane), not the depth of its centre as in images, because a range must not depend on
+//! the size of a surface's splats.
 
 use std::ops::Sub;
 
@@ -21,63 +24,69 @@ use super::tree::{LEAF, LEAST_ALPHA, Leaf, NONE, Node, Tree, WIDTH};
 use crate::cpu::simd::{Kernel, Simd};
 use crate::limits::ALPHA_MAX;
 
-/// A beam in the axes of a part.
+/// Beam in the axes of a part.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Ray {
     pub(super) origin_m: Vec3,
-    /// Unit.
+    /// Unit vector.
     pub(super) direction: Vec3,
     /// Standard deviation of its footprint per metre of range. [rad]
     pub(super) spread: f32,
 }
 
-/// Follows rays that are close to one another through a tree: boxes once for all of them, splats for each.
+/// Casts rays that are close to one another through a tree: boxes once for all rays, splats for
+/// each ray.
 pub(super) struct Follow<'a> {
     pub(super) tree: &'a Tree,
     pub(super) rays: &'a [Ray],
     pub(super) tag: Tag,
-    /// What each meets, as many as there are rays.
+    /// Hits of each ray; the length equals that of `rays`.
     pub(super) hits: &'a mut [Hits],
 }
 
 const _: () = assert!(LEAST_ALPHA == 0.05, "LEAST_LEVEL and REACH follow from it");
 
-/// Nodes that wait: at most seven of each level. Deeper trees, of splats that halve in size again and again, lose some.
+/// Maximum nodes on the stack: at most seven of each level. In deeper trees (splats that halve in
+/// size repeatedly), the excess nodes are dropped.
 const MAX_STACK: usize = 128;
-/// What f32 may round off a slope. [m/m]
+/// Maximum rounding error of a slope in f32. [m/m]
 const ROUNDING: f32 = 2e-6;
 /// log2 of [`LEAST_ALPHA`].
 const LEAST_LEVEL: f32 = -4.321_928;
-/// Standard deviations at which the most opaque splat falls below it: sqrt(2 ln 20).
+/// Standard deviations at which the most opaque splat falls below [`LEAST_ALPHA`]: sqrt(2 ln 20).
 const REACH: f32 = 2.45;
 
-// Closures are no substitute for the functions below, nor are maps of arrays: they are not always inlined, and then run without the
-// kernel's instructions.
+// The functions below must not be replaced by closures or by `map` of arrays: these are not always
+// inlined, and then run without the kernel's instructions.
 
-/// Some rays as a fan, in every lane: how far they stray from its axis, along each axis of the part and of the fan itself.
+/// Bounds of a group of rays as a fan, in every lane: maximum deviation from its axis, along each
+/// axis of the part and of the fan.
 #[derive(Clone, Copy)]
 struct Fan<S: Simd> {
     origin: [S::F; 3],
-    /// Its axis, the side along which its rays are apart, and the side across. Unit, orthogonal.
+    /// Orthonormal axes of the fan: its central direction, the side along which its rays spread,
+    /// and the direction across.
     frame: [[S::F; 3]; 3],
     inverse: [S::F; 3],
     steep: [S::F; 3],
-    /// How far from the axis its rays and their footprints are along x, y and z of the part, per metre. [m/m]
+    /// Maximum deviation of rays and their footprints from the axis, along x, y and z of the part,
+    /// per metre. [m/m]
     slope: [S::F; 3],
-    /// The sizes of the axis' and the side's parts along x, y and z.
+    /// Absolute components of the central direction and of the side along x, y and z.
     lean: [[S::F; 3]; 2],
-    /// How far from the axis its rays are across, per metre. [m/m]
+    /// Maximum deviation of rays from the axis in the direction across, per metre. [m/m]
     across: S::F,
-    /// How far along its side are its rays from this lane on at least, and up to this lane at most, per metre. [m/m]
+    /// Minimum position along the side of the rays from this lane on, and maximum position of the
+    /// rays up to this lane, per metre. [m/m]
     side_low: [f32; WIDTH],
     side_high: [f32; WIDTH],
-    /// The greatest size of those. [m/m]
+    /// Maximum absolute value of these positions. [m/m]
     side: S::F,
-    /// Radius of the widest footprint that counts, per metre. [m/m]
+    /// Radius of the widest relevant footprint, per metre. [m/m]
     footprint: S::F,
-    /// How far from its origin theirs are. [m]
+    /// Maximum distance of a ray's origin from the origin of the fan. [m]
     apart: S::F,
-    /// The widest of its footprints. [rad]
+    /// Maximum spread of the rays. [rad]
     spread: S::F,
 }
 
@@ -90,13 +99,13 @@ impl<S: Simd> Fan<S> {
             direction += ray.direction;
         }
         origin /= rays.len() as f32;
-        // Rays that cancel are no fan, and `cast` makes none of them.
+        // Directions that cancel are not a fan; `cast` never passes them.
         direction = unit(s, direction).unwrap_or(Vec3::X);
         let between = rays[rays.len() - 1].direction - rays[0].direction;
         let wide = between - direction * between.dot(direction);
         let side = unit(s, wide).unwrap_or_else(|| direction.any_orthonormal_vector());
         let across = direction.cross(side);
-        // Where each ray is a metre ahead, from the axis.
+        // Deviation of each ray from the axis, one metre ahead.
         let axis = broadcast(s, direction.to_array());
         let per = s.splat(1.0) / s.max(dot(s, lanes.direction, axis), s.splat(1e-3));
         let mut ahead = lanes.direction;
@@ -141,14 +150,14 @@ impl<S: Simd> Fan<S> {
             side_high,
             side: s.splat(widest + ROUNDING),
             footprint: s.splat(REACH * spread),
-            // Where they begin along the axis moves them to the side, too.
+            // An offset of the origin along the axis also shifts a ray to the side.
             apart: s.splat(1.3 * apart + 1e-5),
             spread: s.splat(spread),
         }
     }
 }
 
-/// Rays, one a lane; the last again in lanes that are left.
+/// Rays, one per lane. Unused lanes repeat the last ray.
 #[derive(Clone, Copy)]
 struct Lanes<S: Simd> {
     origin: [S::F; 3],
@@ -174,20 +183,20 @@ impl<S: Simd> Lanes<S> {
     }
 }
 
-/// What of a leaf's splats every ray asks for, splat by splat.
+/// Values of a leaf's splats that all rays need, splat by splat.
 struct Unpacked {
     mean_m: [[f32; WIDTH]; 3],
     axes: [[[f32; WIDTH]; 3]; 3],
-    /// Variances along the axes. [m^2]
+    /// Variances along the axes of the splat. [m^2]
     thin: [[f32; WIDTH]; 3],
     /// log2 of the opacity.
     level: [f32; WIDTH],
 }
 
-/// Where the rays meet a splat.
+/// Intersections of the rays with one splat.
 #[derive(Clone, Copy, Default)]
 struct Met {
-    /// Which do, as bits.
+    /// Rays that meet the splat, as bits.
     rays: u32,
     range_m: [f32; WIDTH],
     alpha: [f32; WIDTH],
@@ -195,14 +204,15 @@ struct Met {
     normal: [f32; WIDTH],
 }
 
-/// Returns 1 over `v`; no infinity, so that no product is NaN.
+/// Returns 1 / `v`, limited to a finite value so that products are not NaN.
 #[inline(always)]
 fn inverse(v: f32) -> f32 {
     if v.abs() < 1e-12 { 1e12_f32.copysign(v) } else { 1.0 / v }
 }
 
-/// Returns the direction of a vector that has one. By the kernel's own square root: glam's is an instruction from before AVX (of
-/// `libm`), and one of those among AVX's takes some hundred cycles.
+/// Returns the direction of a vector, or `None` if it is zero. Uses the square root of the kernel:
+/// glam's compiles to an instruction from before AVX (of `libm`), and mixing one with AVX
+/// instructions takes some hundred cycles.
 #[inline(always)]
 fn unit<S: Simd>(s: S, v: Vec3) -> Option<Vec3> {
     let mut length = [0.0; WIDTH];
@@ -210,7 +220,7 @@ fn unit<S: Simd>(s: S, v: Vec3) -> Option<Vec3> {
     (length[0] > 1e-9).then(|| v / length[0])
 }
 
-/// Returns the greatest lane of what is not negative.
+/// Returns the maximum of all lanes, which must not be negative.
 #[inline(always)]
 fn greatest<S: Simd>(s: S, v: S::F) -> f32 {
     let mut lanes = [0.0; WIDTH];
@@ -228,7 +238,7 @@ fn load<S: Simd>(s: S, v: &[[f32; WIDTH]; 3]) -> [S::F; 3] {
     [s.load(&v[0]), s.load(&v[1]), s.load(&v[2])]
 }
 
-/// Returns one splat's numbers, for every ray.
+/// Returns the values of one splat, in the lanes of all rays.
 #[inline(always)]
 fn one_of<S: Simd>(s: S, v: &[[f32; WIDTH]; 3], splat: usize) -> [S::F; 3] {
     [s.splat(v[0][splat]), s.splat(v[1][splat]), s.splat(v[2][splat])]
@@ -249,14 +259,15 @@ fn dot<S: Simd>(s: S, a: [S::F; 3], b: [S::F; 3]) -> S::F {
     s.mul_add(a[0], b[0], s.mul_add(a[1], b[1], a[2] * b[2]))
 }
 
-/// Returns the squared area of the projection of a Gaussian of these variances along a direction in its own axes: the
-/// determinant of the covariance times the curvature along the ray, as sums of products.
+/// Returns the squared area of the projection of a Gaussian with these variances, along a direction
+/// in its own axes: the determinant of the covariance times the curvature along the ray, as sums of
+/// products.
 #[inline(always)]
 fn area<S: Simd>(s: S, square: [S::F; 3], v: [S::F; 3]) -> S::F {
     dot(s, square, [v[1] * v[2], v[0] * v[2], v[0] * v[1]])
 }
 
-/// Returns the columns of the matrix of a unit quaternion.
+/// Returns the columns of the rotation matrix of a unit quaternion.
 #[inline(always)]
 fn axes<S: Simd>(s: S, rotation: &[[u16; WIDTH]; 4]) -> [[S::F; 3]; 3] {
     let (x, y) = (s.load_f16(&rotation[0]), s.load_f16(&rotation[1]));
@@ -288,7 +299,7 @@ impl Kernel for Follow<'_> {
         }
         let lanes = Lanes::new(s, rays);
         let fan = Fan::around(s, rays, &lanes);
-        // How far each ray still looks; lanes without one see nothing.
+        // Current reach of each ray; unused lanes meet nothing.
         let mut reach = [-1.0; WIDTH];
         for (reach, hits) in reach.iter_mut().zip(&*hits) {
             *reach = hits.reach_m;
@@ -306,7 +317,8 @@ impl Kernel for Follow<'_> {
         while waiting > 0 {
             waiting -= 1;
             let (near_m, child) = stack[waiting];
-            // Of the fan only what lies between the first and the last ray that still look as far.
+            // Restrict the fan to the rays between the first and the last that still reach this
+            // far.
             let looking = !s.bits(s.lt(s.load(&reach), s.splat(near_m))) & 0xff;
             if looking == 0 {
                 continue;
@@ -317,7 +329,7 @@ impl Kernel for Follow<'_> {
             if child & LEAF != 0 {
                 let leaf = &tree.leaves[(child & !LEAF) as usize];
                 let close = unpack(s, leaf, &fan, window, reach_m, &mut unpacked);
-                // First all of them, without a branch between; then what came of it.
+                // First evaluate all splats without branches, then insert the results.
                 let mut left = close;
                 while left != 0 {
                     let splat = left.trailing_zeros() as usize % WIDTH;
@@ -344,7 +356,7 @@ impl Kernel for Follow<'_> {
             }
             let node = &tree.nodes[child as usize];
             let (mut touched, nears) = touch(s, node, &fan, window, reach_m);
-            // The nearest on top: by insertion, of mostly two or three.
+            // Insertion sort with the nearest child on top; typically two or three children.
             let first = waiting;
             while touched != 0 {
                 let lane = touched.trailing_zeros() as usize % WIDTH;
@@ -366,7 +378,7 @@ impl Kernel for Follow<'_> {
     }
 }
 
-/// Asks for a child's memory, which is more than one level of caches holds.
+/// Prefetches the memory of a child. The tree exceeds the first levels of caches.
 #[inline(always)]
 fn prefetch<S: Simd>(s: S, tree: &Tree, child: u32) {
     if child & LEAF == 0 {
@@ -384,7 +396,7 @@ fn prefetch<S: Simd>(s: S, tree: &Tree, child: u32) {
     }
 }
 
-/// Returns the greatest of some numbers, or 0. [m]
+/// Returns the maximum of non-negative numbers. [m]
 #[inline(always)]
 fn farthest(reach: &[f32; WIDTH]) -> f32 {
     let mut reach_m = 0.0_f32;
@@ -394,7 +406,8 @@ fn farthest(reach: &[f32; WIDTH]) -> f32 {
     reach_m
 }
 
-/// Returns which boxes of a node the rays of a fan within a window meet within `reach_m`, as bits, and where.
+/// Returns the boxes of a node that rays of a fan within a window meet within `reach_m`, as bits,
+/// and the distance to each box.
 #[inline(always)]
 fn touch<S: Simd>(
     s: S,
@@ -424,8 +437,8 @@ fn touch<S: Simd>(
     (!s.bits(s.lt(far, near)) & s.bits(beside) & 0xff, nears)
 }
 
-/// Returns where what is between two distances ahead, and at a place along the fan's side, from where it reaches as far as
-/// `reach`, overlaps the window.
+/// Returns the lanes whose content overlaps the window along the side of the fan. The content lies
+/// between two distances ahead, at `at` along the side, and extends by `reach`.
 #[inline(always)]
 fn beside<S: Simd>(
     s: S,
@@ -441,10 +454,12 @@ fn beside<S: Simd>(
     s.lt(low, at + reach) & s.lt(at - reach, high)
 }
 
-/// Returns which splats of a leaf the rays of a fan within a window may meet within `reach_m`, as bits; where there are any, all are unpacked.
+/// Returns the splats of a leaf that rays of a fan within a window can meet within `reach_m`, as
+/// bits. If there are any, all splats of the leaf are unpacked.
 ///
-/// A splat counts within an ellipsoid. Along a direction it reaches as far as the root of its variance there, and the fan
-/// as far as its outermost ray where the splat ends: if these do not overlap, no ray meets it.
+/// A splat is relevant within an ellipsoid. Its extent along a direction is the root of its
+/// variance there, and the extent of the fan is that of its outermost ray at the end of the splat.
+/// If these do not overlap, no ray meets the splat.
 #[inline(always)]
 fn unpack<S: Simd>(
     s: S,
@@ -458,17 +473,17 @@ fn unpack<S: Simd>(
     let mean = load(s, &leaf.mean_m);
     let rel = from(mean, fan.origin);
     let at = [dot(s, rel, fan.frame[0]), dot(s, rel, fan.frame[1]), dot(s, rel, fan.frame[2])];
-    // The footprint where it is widest.
+    // Maximum width of the footprint.
     let sideways = s.mul_add(abs(s, at[1]), fan.side, abs(s, at[2]) * fan.across);
     let width = (abs(s, at[0]) + sideways + fan.apart) * fan.spread;
     let blur = width * width;
     let level = s.load_f16(&leaf.level);
-    // Squared deviations within which it hides more than the least, and a little more.
+    // Squared deviations within which the splat exceeds the minimum alpha, plus a small margin.
     let deviations = (level - s.splat(LEAST_LEVEL)) * s.splat(2.004 * std::f32::consts::LN_2);
     let scale =
         [s.load_f16(&leaf.scale_m[0]), s.load_f16(&leaf.scale_m[1]), s.load_f16(&leaf.scale_m[2])];
     let thin = [scale[0] * scale[0], scale[1] * scale[1], scale[2] * scale[2]];
-    // Balls around them first, for they are cheap, and miss most.
+    // Bounding spheres first: they are cheap, and exclude most splats.
     let ball = s.sqrt(s.max(deviations * (thin[0] + blur), zero));
     let counts = s.lt(zero, deviations);
     let balls = overlap(s, fan, window, at, [ball; 3], reach_m);
@@ -496,7 +511,8 @@ fn unpack<S: Simd>(
     close
 }
 
-/// Returns where what lies at `at` in a fan's frame overlaps its window if it reaches as far as `extent`.
+/// Returns the lanes whose content overlaps the window of the fan, given its centre and extent in
+/// the axes of the fan.
 #[inline(always)]
 fn overlap<S: Simd>(
     s: S,
@@ -516,7 +532,8 @@ fn overlap<S: Simd>(
     ahead & before & across & beside
 }
 
-/// Works out where each ray meets a splat of a leaf, how much of it ends there, and which rays meet it at all.
+/// Computes for each ray the intersection with a splat of a leaf and its alpha, and which rays meet
+/// it.
 #[inline(always)]
 fn meet<S: Simd>(
     s: S,
@@ -528,7 +545,7 @@ fn meet<S: Simd>(
 ) {
     let (zero, one) = (s.splat(0.0), s.splat(1.0));
     let Unpacked { mean_m, axes, thin, level } = unpacked;
-    // From the mean to each ray's origin.
+    // Vector from the mean to the origin of each ray.
     let from = from(rays.origin, one_of(s, mean_m, splat));
     let along = dot(s, from, rays.direction);
     let width = along * rays.spread;
@@ -541,11 +558,11 @@ fn meet<S: Simd>(
     }
     let thin = one_of(s, thin, splat);
     let wide = [thin[0] + blur, thin[1] + blur, thin[2] + blur];
-    // The inverse of the covariance times its determinant: one division for all three.
+    // The inverse covariance times its determinant: one division for all three axes.
     let weight = [wide[1] * wide[2], wide[0] * wide[2], wide[0] * wide[1]];
     let wd = [weight[0] * d[0], weight[1] * d[1], weight[2] * d[2]];
     let wide_area = one / dot(s, wd, d);
-    // Where the Gaussian is greatest along the ray.
+    // Range of the Gaussian's maximum along the ray.
     let range = (zero - dot(s, wd, o)) * wide_area;
     let p =
         [s.mul_add(range, d[0], o[0]), s.mul_add(range, d[1], o[1]), s.mul_add(range, d[2], o[2])];
@@ -553,12 +570,13 @@ fn meet<S: Simd>(
         dot(s, [weight[0] * p[0], weight[1] * p[1], weight[2] * p[2]], p) / (wide[0] * weight[0]);
     let half_log2_e = s.splat(std::f32::consts::LOG2_E / 2.0);
     let level = s.neg_mul_add(squares, half_log2_e, s.splat(level[splat]));
-    // Before it is dimmed: many small splats under a wide footprint are a wall, too.
+    // The level is compared before dimming, because many small splats under a wide footprint are
+    // also a wall.
     let near = s.lt(s.splat(LEAST_LEVEL), level) & s.lt(zero, range) & s.lt(range, s.load(reach));
-    // By what the footprint adds to the area of the projection.
+    // Dimmed by the increase of the projected area due to the footprint.
     let square = [d[0] * d[0], d[1] * d[1], d[2] * d[2]];
     let dimmed = s.sqrt(area(s, square, thin) * wide_area);
-    // exp2 promises nothing below -126.
+    // exp2 is undefined below -126.
     let alpha = s.exp2(s.max(level, s.splat(-100.0))) * dimmed;
     let alpha = s.min(alpha, s.splat(ALPHA_MAX as f32));
     out.rays = s.bits(near & s.lt(zero, alpha)) & 0xff;
@@ -567,7 +585,7 @@ fn meet<S: Simd>(
     s.store(d[2], &mut out.normal);
 }
 
-/// Adds a splat to what rays meet.
+/// Inserts a splat into the hits of the rays that meet it.
 #[inline(always)]
 fn insert(leaf: &Leaf, splat: usize, met: &Met, tag: Tag, hits: &mut [Hits]) {
     let flat = f32::from(leaf.flatness[splat]) / 255.0;
@@ -579,7 +597,7 @@ fn insert(leaf: &Leaf, splat: usize, met: &Met, tag: Tag, hits: &mut [Hits]) {
         hits[i].insert(Hit {
             range_m: met.range_m[i],
             weight: met.alpha[i],
-            // A ball's mean over the directions that it faces.
+            // For a ball, the mean over all directions of its surface.
             cosine: (flat * met.normal[i].abs() + (1.0 - flat) * (2.0 / 3.0)).min(1.0),
             reflectivity,
             tag,

@@ -1,11 +1,14 @@
-//! LiDAR: many beams in a sweep, each from where the sensor is at its own instant.
+//! LiDAR: a sweep of many beams, each from the pose of the sensor at its own instant.
 //!
-//! Budget: 5.5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; `cast` is nearly all of it.
+//! Budget: 5.5 ms on two cores for 16 x 1024 beams in a forest of 125 k splats; nearly all of it is
+//! spent in `cast`.
 //!
-//! A beam's echoes (`cast`) come back with the power of a Lambertian surface that is larger than the beam, `reflectivity cos(incidence) /
-//! range^2` (Wagner 2010, "Radiometric calibration of small-footprint full-waveform airborne laser scanner measurements", ISPRS
-//! Journal 65, equation 8: the radar equation for extended targets). Data sheets state at what range a target of some
-//! reflectivity is detected nine times in ten; from that pair follows the probability for every other.
+//! The power of an echo (`cast`) is that of a Lambertian surface larger than the beam,
+//! `reflectivity cos(incidence) / range^2` (Wagner 2010, "Radiometric calibration of
+//! small-footprint full-waveform airborne laser scanner measurements", ISPRS Journal 65, equation
+//! 8: the radar equation for extended targets). Data sheets state the range at which a target of a
+//! given reflectivity is detected with a probability of 90 %. The detection probabilities of all
+//! other targets follow from this pair.
 
 use std::f64::consts::TAU;
 
@@ -18,138 +21,144 @@ use super::cast::{Beam, Echo, Hit, Hits, TOGETHER, echoes, spread_of};
 use super::noise::Draws;
 use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
-/// A LiDAR, in the words of its data sheet. [`super::presets`] has named ones.
+/// LiDAR model, in the terms of its data sheet. [`super::presets`] has named ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LidarModel {
-    /// Where its beams look, in which order.
+    /// Directions of the beams, in order.
     pub beams: Beams,
-    /// Sweeps a second. [Hz]
+    /// Rate of sweeps. [Hz]
     pub rate_hz: f64,
-    /// Nothing nearer is reported. [m]
+    /// Minimum range. [m]
     pub min_range_m: f32,
-    /// Nothing farther is reported. [m]
+    /// Maximum range. [m]
     pub max_range_m: f32,
-    /// Full angle of a beam, where its intensity is 1/e^2 of its middle's. [rad]
+    /// Full angle of a beam at 1/e^2 of its central intensity. [rad]
     pub divergence_rad: f32,
     /// Standard deviation of a range. [m]
     pub sigma_m: f32,
-    /// What it grows by per metre of range, as a share. [m/m]
+    /// Growth of the standard deviation per metre of range. [m/m]
     pub sigma_per_m: f32,
-    /// Ranges are multiples of this; 0 for no rounding. [m]
+    /// Quantisation step of ranges; 0 for no rounding. [m]
     pub range_step_m: f32,
-    /// Echoes within this range of one another are one. [m]
+    /// Maximum distance of two echoes that are merged. [m]
     pub resolution_m: f32,
-    /// At this range a target across the beam, of `reference_reflectivity`, is detected nine times in ten. [m]
+    /// Range at which a target across the beam, of `reference_reflectivity`, is detected with a
+    /// probability of 90 %. [m]
     pub reference_range_m: f32,
-    /// Share of light that target sends back, 0 to 1.
+    /// Share of light that the reference target reflects, 0 to 1.
     pub reference_reflectivity: f32,
-    /// Which echo of a beam is reported.
+    /// Selection of the reported echo.
     pub returns: Returns,
 }
 
-/// Where beams look. Azimuth is about z from x to y, elevation up from the x-y plane.
+/// Directions of the beams. Azimuth is about z from x to y, elevation up from the x-y plane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Beams {
-    /// A head that turns once a sweep, clockwise seen from above, from behind over left, front and right: `columns` stacks of beams.
+    /// Head that rotates once per sweep, clockwise seen from above, starting backwards, then left,
+    /// front and right: `columns` stacks of beams.
     Spinning {
-        /// Elevation of each ring, the record's order. [rad]
+        /// Elevation of each ring, in the order of the records. [rad]
         elevations_rad: Vec<f32>,
-        /// Stacks a turn.
+        /// Stacks per revolution.
         columns: u32,
     },
-    /// A raster, one beam after the other: rows from the top, in each from left to right.
+    /// Raster of beams, one after the other: rows from the top, each from left to right.
     Raster {
-        /// Rows.
+        /// Number of rows.
         rows: u32,
-        /// Beams of a row.
+        /// Beams per row.
         columns: u32,
-        /// Between the outermost beams of a row. [rad]
+        /// Angle between the outermost beams of a row. [rad]
         horizontal_rad: f32,
-        /// Between first and last row. [rad]
+        /// Angle between first and last row. [rad]
         vertical_rad: f32,
     },
-    /// The same raster, all beams at once, in the sweep's middle.
+    /// The same raster, with all beams at once in the middle of the sweep.
     Flash {
-        /// Rows.
+        /// Number of rows.
         rows: u32,
-        /// Beams of a row.
+        /// Beams per row.
         columns: u32,
-        /// Between the outermost beams of a row. [rad]
+        /// Angle between the outermost beams of a row. [rad]
         horizontal_rad: f32,
-        /// Between first and last row. [rad]
+        /// Angle between first and last row. [rad]
         vertical_rad: f32,
     },
-    /// One beam that turns and nods at rates without a common period: every sweep fills gaps of the ones before.
+    /// One beam that rotates and oscillates in elevation at rates without a common period. Each
+    /// sweep fills gaps of earlier ones.
     Rosette {
-        /// Beams a sweep.
+        /// Beams per sweep.
         points: u32,
         /// Lowest elevation. [rad]
         lowest_rad: f32,
         /// Highest elevation. [rad]
         highest_rad: f32,
-        /// Turns a second. [Hz]
+        /// Rate of rotation. [Hz]
         turns_hz: f64,
-        /// Nods a second. [Hz]
+        /// Rate of oscillation in elevation. [Hz]
         nods_hz: f64,
     },
 }
 
-/// Which of a beam's echoes is reported.
+/// Selection of the reported echo of a beam.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Returns {
-    /// The nearest.
+    /// Nearest echo.
     First,
-    /// That of most power.
+    /// Echo with the highest power.
     #[default]
     Strongest,
-    /// The farthest.
+    /// Farthest echo.
     Last,
 }
 
-/// What one beam reports; range 0 where nothing came back.
+/// Reading of one beam. The range is 0 if there is no echo.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C)]
 pub struct LidarPoint {
-    /// Where it is, from where the sensor was when the beam left: points of a moving sensor are not of one instant. [m, sensor]
+    /// Position relative to the sensor at the instant of the beam: points of a moving sensor have
+    /// different instants. [m, sensor]
     pub p_sensor_m: [f32; 3],
-    /// Along the beam; 0 without return. [m]
+    /// Range along the beam; 0 without return. [m]
     pub range_m: f32,
-    /// What came back, freed of range: 255 for a white surface across the whole beam.
+    /// Intensity, corrected for range: 255 for a white surface across the complete beam.
     pub intensity: f32,
-    /// From the sweep's first instant to when the beam left. [ns]
+    /// Time from the first instant of the sweep to that of the beam. [ns]
     pub offset_ns: u32,
-    /// Ring or row, from 0; 0 of a rosette.
+    /// Ring or row, from 0; always 0 for a rosette.
     pub ring: u16,
-    /// Object that was hit; 0 is what stands still.
+    /// Id of the object; 0 is the static scene.
     pub object: u16,
 }
 
-/// A LiDAR that is ready to measure.
+/// LiDAR that is prepared for measurements.
 #[derive(Clone, Debug)]
 pub struct Lidar {
     model: LidarModel,
-    /// Sine and cosine of each column's azimuth and each row's elevation, where they stay the same from sweep to sweep.
+    /// Sine and cosine of each column's azimuth and each row's elevation, if they are the same in
+    /// all sweeps.
     columns: Vec<[f64; 2]>,
     rows: Vec<[f64; 2]>,
 }
 
-/// Beams a sweep at most: 4 million bytes of records times 28.
+/// Maximum beams per sweep: 4 million records of 28 bytes.
 const MAX_BEAMS: u64 = 1 << 22;
-/// Beams that one task follows, or some more: some 80 us.
+/// Beams per task, approximately: about 80 us.
 const CHUNK: usize = 128;
-/// A threshold's noise as a share of it: from a tenth of detections to nine tenths, returns double about.
+/// Noise of the threshold as a share of it: between detection probabilities of 10 % and 90 %, the
+/// power about doubles.
 const THRESHOLD_NOISE: f32 = 0.25;
-/// The Gaussian is below this nine times in ten.
+/// Quantile of the standard normal distribution at 90 %.
 const NINE_IN_TEN: f32 = 1.281_551_6;
 
 impl Lidar {
     /// Prepares a model.
     ///
     /// # Errors
-    /// [`InvalidModel`] names the first field that cannot be.
+    /// [`InvalidModel`] with the first invalid field.
     pub fn new(model: LidarModel) -> Result<Self, InvalidModel> {
         let check = Checked("lidar");
         check.common(
@@ -207,12 +216,12 @@ impl Lidar {
         Ok(lidar)
     }
 
-    /// Returns its model.
+    /// Returns the model of this LiDAR.
     pub fn model(&self) -> &LidarModel {
         &self.model
     }
 
-    /// Returns how many beams a sweep has: the records of a scan.
+    /// Returns the number of beams per sweep, which is the number of records of a scan.
     pub fn beams(&self) -> usize {
         self.count() as usize
     }
@@ -229,14 +238,14 @@ impl Lidar {
         }
     }
 
-    /// Measures sweep `seq`, during which sensor and objects move as `motion` says, into one record per beam, in the order in
-    /// which beams leave. All noise follows from `seed` and `seq`.
+    /// Measures sweep `seq`, during which sensor and objects move according to `motion`, into one
+    /// record per beam, in the order of the beams. All noise follows from `seed` and `seq`.
     ///
     /// # Errors
-    /// [`SensorError`]; there are no records then.
+    /// [`SensorError`]; there are then no records.
     ///
     /// # Panics
-    /// If `motion` has not as many objects as the scene.
+    /// If the numbers of objects of `motion` and of the scene differ.
     pub fn scan(
         &self,
         scene: &SensorScene,
@@ -260,7 +269,7 @@ impl Lidar {
         Ok(())
     }
 
-    /// Measures the beams from `first` on that stand in neighbouring columns, ring by ring.
+    /// Measures neighbouring columns, starting with beam `first`, ring by ring.
     fn measure_columns(
         &self,
         scene: &SensorScene,
@@ -272,7 +281,7 @@ impl Lidar {
     ) {
         let rings = self.rings();
         let columns = points.len() / rings;
-        // Beams of a column leave from one pose: a slerp is a tenth of what a beam may cost.
+        // All beams of a column have one pose: a slerp would be a tenth of the time per beam.
         let mut poses = [Pose::IDENTITY; TOGETHER];
         for (column, pose) in poses[..columns].iter_mut().enumerate() {
             *pose = motion.sensor_at(self.leaving(first + column * rings, seq).share);
@@ -293,7 +302,7 @@ impl Lidar {
         }
     }
 
-    /// Returns how many beams leave between neighbours.
+    /// Returns the number of beams between neighbours of a ring.
     fn rings(&self) -> usize {
         match &self.model.beams {
             Beams::Spinning { elevations_rad, .. } => elevations_rad.len().max(1),
@@ -351,12 +360,13 @@ impl Lidar {
         point
     }
 
-    /// Returns by what an echo's power over squared range is multiplied to be 1 at the threshold of nine in ten.
+    /// Returns the factor that scales an echo's power over squared range to 1 at the threshold of
+    /// 90 %.
     fn per_threshold(&self) -> f32 {
         self.model.reference_range_m.powi(2) / self.model.reference_reflectivity
     }
 
-    /// Returns when and where a beam leaves.
+    /// Returns instant and direction of a beam.
     fn leaving(&self, number: usize, seq: u64) -> Leaving {
         let of = |number: usize, all: usize| number as f64 / all as f64;
         let ahead = |column: usize, row: usize, share: f64| {
@@ -386,30 +396,31 @@ impl Lidar {
     }
 }
 
-/// When and where a beam leaves.
+/// Instant and direction of a beam.
 #[derive(Clone, Copy, Default)]
 struct Leaving {
-    /// Unit. [sensor]
+    /// Unit vector. [sensor]
     direction: Vec3,
-    /// Of the sweep, 0 to 1.
+    /// Share of the sweep, 0 to 1.
     share: f64,
     ring: u16,
 }
 
 impl Beams {
-    /// Returns sine and cosine of each column's azimuth and of each row's elevation; none of a rosette.
+    /// Returns sine and cosine of each column's azimuth and of each row's elevation; empty for a
+    /// rosette.
     fn angles(&self) -> (Vec<[f64; 2]>, Vec<[f64; 2]>) {
         let sin_cos = |angle: f64| <[f64; 2]>::from(angle.sin_cos());
         match self {
             Beams::Spinning { elevations_rad, columns } => {
-                // The middle column of a turn looks ahead.
+                // The middle column of a revolution points forward.
                 let azimuth = |n: u32| TAU * (0.5 - f64::from(n) / f64::from(*columns));
                 let rows = elevations_rad.iter().map(|&angle| sin_cos(f64::from(angle)));
                 ((0..*columns).map(|n| sin_cos(azimuth(n))).collect(), rows.collect())
             }
             Beams::Raster { rows, columns, horizontal_rad, vertical_rad }
             | Beams::Flash { rows, columns, horizontal_rad, vertical_rad } => {
-                // From the left, and from the top.
+                // From left to right, and from top to bottom.
                 let angles = |count: u32, angle_rad: f32| {
                     let share =
                         |n: u32| if count > 1 { f64::from(n) / f64::from(count - 1) } else { 0.5 };
@@ -427,12 +438,12 @@ pub(super) fn pointing(azimuth: f64, elevation: f64) -> Vec3 {
     pointing_at(azimuth.sin_cos().into(), elevation.sin_cos().into())
 }
 
-/// Returns the unit vector at an azimuth and an elevation, of which sine and cosine are given. [sensor]
+/// Returns the unit vector at an azimuth and an elevation, given their sines and cosines. [sensor]
 fn pointing_at([sin, cos]: [f64; 2], [up, level]: [f64; 2]) -> Vec3 {
     DVec3::new(level * cos, level * sin, up).as_vec3()
 }
 
-/// Returns the nearest multiple of `step`, or `value` where there is none.
+/// Rounds to the nearest multiple of `step`, unless `step` is 0.
 pub(super) fn rounded(value: f32, step: f32) -> f32 {
     if step > 0.0 { (value / step).round() * step } else { value }
 }

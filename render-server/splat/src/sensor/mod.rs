@@ -1,15 +1,20 @@
-//! LiDAR, range finders, sonar and radar: (scene, motion, seed) -> what they report. Pure functions, like the renderers.
+//! Models of LiDAR, range finder, sonar and radar: pure functions from (scene, motion, seed) to
+//! readings.
 //!
-//! A [`SensorScene`] packs a scene once. A sensor is a plain model ([`LidarModel`], [`RangeModel`], [`SonarModel`],
-//! [`RadarModel`], by name in [`presets`]); prepared once, it measures as often as asked, into records that the caller
-//! keeps, without allocation after the first call. What it is told is a [`SensorMotion`]: where sensor and objects are from the
-//! first instant of a measurement to its last.
+//! A [`SensorScene`] packs a scene once. A sensor is a plain model ([`LidarModel`], [`RangeModel`],
+//! [`SonarModel`], [`RadarModel`], named ones in [`presets`]). After it is prepared once, it
+//! measures any number of times into records that the caller owns, without allocation after the
+//! first call. Its input is a [`SensorMotion`]: the poses of sensor and objects from the first to
+//! the last instant of a measurement.
 //!
-//! Data flow, the files in run order: `tree` packs splats for rays, `follow` takes a ray through them, `cast` makes of what it meets a beam's
-//! echoes, `lidar`, `range` (one beam, and sonar) and `radar` make of echoes what the sensor reports, with the numbers of
-//! `noise`. All randomness follows from (seed, sequence number, beam): the same for any number of threads.
+//! Data flow, the files in order of execution: `tree` packs splats for ray casting, `follow` finds
+//! the splats along a ray, `cast` combines them to echoes of a beam, `lidar`, `range` (single-beam
+//! range finder and sonar) and `radar` convert echoes to readings, with random numbers of `noise`.
+//! All randomness follows from (seed, sequence number, beam), so the result does not depend on the
+//! number of threads.
 //!
-//! Axes of a sensor: x forward, y left, z up. `docs/guides/sensor-models.md` states every formula and its source.
+//! Axes of a sensor: x forward, y left, z up. `docs/guides/sensor-models.md` lists every formula
+//! and its source.
 
 mod cast;
 mod follow;
@@ -28,25 +33,27 @@ pub use lidar::{Beams, Lidar, LidarModel, LidarPoint, Returns};
 pub use radar::{Radar, RadarDetection, RadarModel};
 pub use range::{RangeFinder, RangeModel, RangeReading, Sonar, SonarModel};
 
-/// Where a sensor and the objects of its scene are while it measures: at the first instant, and at the last. Between them
-/// they move evenly: along a line, and by slerp.
+/// Poses of a sensor and of the scene's objects at the first and last instant of a measurement. In
+/// between, positions are interpolated linearly and rotations by slerp.
 #[derive(Clone, Copy, Debug)]
 pub struct SensorMotion<'a> {
-    /// The sensor at the first and at the last instant. [m, world]
+    /// Pose of the sensor at the first and at the last instant. [m, world]
     pub world_from_sensor: [Pose<World, Sensor>; 2],
-    /// Each object of the scene, in its order, at both instants; one that is `None` at either is not there. [m, world]
+    /// Poses of each object of the scene, in its order, at both instants. An object is absent if
+    /// either is `None`. [m, world]
     pub objects: &'a [[Placement; 2]],
-    /// From the first instant to the last; velocities are what changes in it. 0 where all stands still. [s]
+    /// Duration from the first to the last instant. Velocities follow from the change of poses. 0
+    /// if nothing moves. [s]
     pub duration_s: f64,
 }
 
 impl SensorMotion<'_> {
-    /// Returns the motion of a sensor that stands, in a scene without objects.
+    /// Returns the motion of a stationary sensor in a scene without objects.
     pub fn standing(world_from_sensor: Pose<World, Sensor>) -> SensorMotion<'static> {
         SensorMotion { world_from_sensor: [world_from_sensor; 2], objects: &[], duration_s: 0.0 }
     }
 
-    /// Returns the sensor's pose at a share of the duration, 0 to 1. [m, world]
+    /// Returns the pose of the sensor at a share of the duration, 0 to 1. [m, world]
     fn sensor_at(&self, share: f64) -> Pose<World, Sensor> {
         let [begin, end] = &self.world_from_sensor;
         if begin == end { *begin } else { begin.interpolate(end, share) }
@@ -75,39 +82,39 @@ impl SensorMotion<'_> {
     }
 }
 
-/// Why nothing was measured; the records are empty then.
+/// Error of a measurement. The records are then empty.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SensorError {
-    /// A pose of the sensor.
-    #[error("the sensor is at {0}, which is no rotation and finite position within 1e7 m")]
+    /// The pose of the sensor is invalid.
+    #[error("the sensor is at {0}; expected a rotation and a finite position within 1e7 m")]
     Pose(String),
-    /// A placement of an object.
-    #[error("object {0} is placed at {1}, which is no rotation and finite position within 1e7 m")]
+    /// The placement of an object is invalid.
+    #[error("object {0} is placed at {1}; expected a rotation and a finite position within 1e7 m")]
     Placement(usize, String),
-    /// The duration.
+    /// The duration is invalid.
     #[error("a measurement of {0} s; give 0 to 10")]
     Duration(f64),
 }
 
-/// What of a model cannot be.
+/// Why a sensor model is invalid.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("{sensor}: {field} is {value}; give {expected}")]
 pub struct InvalidModel {
-    /// The sensor's kind.
+    /// Kind of the sensor.
     pub sensor: &'static str,
-    /// The field of its model.
+    /// Name of the invalid field.
     pub field: &'static str,
-    /// What it was.
+    /// Value of the field.
     pub value: f64,
-    /// What it may be.
+    /// Valid values.
     pub expected: &'static str,
 }
 
-/// Checks fields of a model, one after the other.
+/// Validator of the fields of one sensor kind.
 struct Checked(&'static str);
 
 impl Checked {
-    /// Whether `value` is within both ends.
+    /// Checks that `value` is within `ends`, inclusive.
     fn within(
         &self,
         field: &'static str,
@@ -115,7 +122,7 @@ impl Checked {
         ends: [f32; 2],
         expected: &'static str,
     ) -> Result<(), InvalidModel> {
-        // Positive, so that NaN is refused.
+        // The comparisons are false for NaN, so NaN is rejected.
         if value >= ends[0] && value <= ends[1] {
             return Ok(());
         }
@@ -124,7 +131,8 @@ impl Checked {
 }
 
 impl Checked {
-    /// What range finders have in common: `figures` are sigma, its growth, the step and the resolution.
+    /// Checks the fields that all range sensors share. `figures` are sigma, its growth, the step
+    /// and the resolution.
     fn common(
         &self,
         rate_hz: f64,

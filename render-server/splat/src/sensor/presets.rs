@@ -1,32 +1,32 @@
-//! Named sensors, by the figures that their makers publish, with where each was read. What a data sheet leaves open, or
-//! could not be read, is called an estimate where it is filled in.
+//! Named sensors with the values that their makers publish, and the source of each. Values that a
+//! data sheet lacks, or that could not be read, are marked as estimates.
 //!
-//! Accuracies that a data sheet states as bounds are taken for two standard deviations.
+//! Accuracies that a data sheet states as bounds are taken as two standard deviations.
 
 use super::{Beams, LidarModel, RadarModel, RangeModel, Returns, SonarModel};
 
-/// A sensor's model, by kind.
+/// Model of a sensor, by kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Preset {
-    /// A LiDAR.
+    /// LiDAR.
     Lidar(LidarModel),
-    /// A range finder of one beam of light.
+    /// Optical range finder with one beam.
     Range(RangeModel),
-    /// A range finder by sound.
+    /// Ultrasonic range finder.
     Sonar(SonarModel),
-    /// A radar.
+    /// Radar.
     Radar(RadarModel),
 }
 
-/// The name that files and command lines use, what it is, and its model.
+/// Name in files and on command lines, description, and model of a sensor.
 pub type Named = (&'static str, &'static str, fn() -> Preset);
 
-/// Every named sensor.
+/// All named sensors.
 pub const PRESETS: [Named; 12] = [
     ("vlp-16", "Velodyne VLP-16: 16 rings, 30 degrees, 100 m", || Preset::Lidar(vlp_16())),
     ("os1-16", "Ouster OS1-16: 16 x 1024, 33.2 degrees, 120 m", || Preset::Lidar(os1(16))),
     ("os1-64", "Ouster OS1-64: 64 x 1024, 33.2 degrees, 120 m", || Preset::Lidar(os1(64))),
-    ("mid-360", "Livox Mid-360: 200 000 points a second, never the same", || {
+    ("mid-360", "Livox Mid-360: 200 000 points a second, non-repetitive pattern", || {
         Preset::Lidar(mid_360())
     }),
     ("vl53l5cx", "ST VL53L5CX: 8 x 8 zones at once, 4 m", || Preset::Lidar(vl53l5cx())),
@@ -41,12 +41,12 @@ pub const PRESETS: [Named; 12] = [
     ("iwr6843", "TI IWR6843 on its EVM: 60 GHz radar, 15 degrees", || Preset::Radar(iwr6843())),
 ];
 
-/// Returns the named sensor's model; `None` for a name that is none of [`PRESETS`].
+/// Returns the model of a named sensor, or `None` if the name is not in [`PRESETS`].
 pub fn preset(name: &str) -> Option<Preset> {
     PRESETS.iter().find(|(known, ..)| *known == name).map(|(.., model)| model())
 }
 
-/// Returns the names of all, as help and messages list them.
+/// Returns all names, separated by commas, for help and messages.
 pub fn names() -> String {
     PRESETS.map(|(name, ..)| name).join(", ")
 }
@@ -56,11 +56,12 @@ fn even(count: u32, lowest_deg: f32, highest_deg: f32) -> Vec<f32> {
     (0..count).map(|n| (highest_deg - step * n as f32).to_radians()).collect()
 }
 
-/// Velodyne VLP-16 at 10 Hz (user manual 63-9243 rev D): 16 beams from -15 to 15 degrees, 100 m, accuracy 3 cm typical,
-/// ranges in 2 mm, single return. Divergence: that of the same maker's VLS-128 (its manual, table F-1, page 115: 3.0
-/// mrad along the scan, 1.5 mrad across it), the wider of both, for beams here are round. 1024 columns of its 1800, for
-/// a cloud of 16 x 1024. The manual names no reflectivity for its range: 100 m at 80 % is an estimate, and so is the
-/// resolution of two echoes.
+/// Velodyne VLP-16 at 10 Hz (user manual 63-9243 rev D): 16 beams from -15 to 15 degrees, 100 m,
+/// accuracy 3 cm typical, ranges in steps of 2 mm, single return. Divergence: as for the same
+/// maker's VLS-128 (its manual, table F-1, page 115: 3.0 mrad along the scan, 1.5 mrad across it);
+/// the larger value, because beams here are round. The model has 1024 columns instead of 1800, for
+/// a cloud of 16 x 1024. The manual states no reflectivity for its range: 100 m at 80 % is an
+/// estimate, and so is the resolution of two echoes.
 pub fn vlp_16() -> LidarModel {
     LidarModel {
         beams: Beams::Spinning { elevations_rad: even(16, -15.0, 15.0), columns: 1024 },
@@ -78,10 +79,11 @@ pub fn vlp_16() -> LidarModel {
     }
 }
 
-/// Ouster OS1 of 16 or 64 rings at 1024 x 10 Hz (data sheet of the first OS1, of 850 nm): 33.2 degrees, 0.8 to 120 m,
-/// 40 m at 10 %, steps of 12 mm, divergence 0.13 degrees at half maximum (1/e^2 at 1.699 times that), strongest return.
-/// One standard deviation is 1.5 cm at a good signal, 3 and 10 cm at weaker ones: that it grows by 0.4 mm a metre is an
-/// estimate, and so are rings that are evenly spaced and the resolution of two echoes.
+/// Ouster OS1 of 16 or 64 rings at 1024 x 10 Hz (data sheet of the first OS1, of 850 nm): 33.2
+/// degrees, 0.8 to 120 m, 40 m at 10 %, steps of 12 mm, divergence 0.13 degrees at half maximum
+/// (1/e^2 at 1.699 times that), strongest return. The standard deviation is 1.5 cm at a good
+/// signal, 3 and 10 cm at weaker ones. Its growth by 0.4 mm per metre, the even spacing of the
+/// rings and the resolution of two echoes are estimates.
 pub fn os1(rings: u32) -> LidarModel {
     LidarModel {
         beams: Beams::Spinning { elevations_rad: even(rings, -16.6, 16.6), columns: 1024 },
@@ -99,12 +101,14 @@ pub fn os1(rings: u32) -> LidarModel {
     }
 }
 
-/// Livox Mid-360 (the maker's specification, livoxtech.com/mid-360/specs, as public simulators of it quote): 360 by -7
-/// to 52 degrees, 200 000 points a second in frames of 10 Hz, from 0.1 m, 40 m at 10 % and 70 m at 80 %, one standard
-/// deviation of at most 2 cm at 10 m, first return. Its directions are within 0.15 degrees, which is not modelled. Its
-/// pattern is not published as a formula: here one beam turns and nods at rates whose quotient is irrational, which
-/// covers the field ever more densely as the original does, in other curves. Divergence (3 mrad), step and the
-/// resolution of two echoes were found nowhere: estimates.
+/// Livox Mid-360 (the maker's specification, livoxtech.com/mid-360/specs, as quoted by public
+/// simulators): 360 degrees by -7 to 52 degrees, 200 000 points a second in frames of 10 Hz, from
+/// 0.1 m, 40 m at 10 % and 70 m at 80 %, standard deviation of at most 2 cm at 10 m, first return.
+/// The error of its directions (0.15 degrees) is not modelled. Its scan pattern is not published as
+/// a formula. Here, one beam rotates and oscillates in elevation at rates with an irrational
+/// ratio. This covers the field with increasing density, as the original does, but along other
+/// curves. Divergence (3 mrad), step and the resolution of two echoes are estimates, because no
+/// source was found.
 pub fn mid_360() -> LidarModel {
     LidarModel {
         beams: Beams::Rosette {
@@ -112,7 +116,7 @@ pub fn mid_360() -> LidarModel {
             lowest_rad: (-7_f32).to_radians(),
             highest_rad: 52_f32.to_radians(),
             turns_hz: 20.0,
-            // By the golden ratio: no common period.
+            // Ratio from the golden ratio: no common period.
             nods_hz: 20.0 * 12.618_033_988_749_895,
         },
         rate_hz: 10.0,
@@ -129,9 +133,10 @@ pub fn mid_360() -> LidarModel {
     }
 }
 
-/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 across the corners; 15 Hz with all zones and 4 m
-/// by vendors' texts). A zone's cone is one wide beam. Its errors (5 % beyond 20 cm), nearest range (2 cm) and the 88 %
-/// of the white target are estimates: the sheet's tables of them could not be read.
+/// ST VL53L5CX (DS13754 rev 13: 8 x 8 zones over 45 x 45 degrees, 65 degrees diagonally; vendors
+/// state 15 Hz with all zones and 4 m). The cone of a zone is one wide beam. Its errors (5 % beyond
+/// 20 cm), minimum range (2 cm) and the reflectivity of 88 % of the white target are estimates,
+/// because the tables in the data sheet could not be read.
 pub fn vl53l5cx() -> LidarModel {
     let zone_rad = 45_f32.to_radians() / 8.0;
     LidarModel {
@@ -155,11 +160,13 @@ pub fn vl53l5cx() -> LidarModel {
     }
 }
 
-/// Zvision ML-30s (the maker's table for hardware B, as a public guide to fitting it on cranes prints it, and the
-/// maker's file for a simulator, `Example_Solid_State_ML30S.json`): 160 lines of 320 points over 140 x 70 degrees at
-/// 10 Hz, 0.2 to 45 m, 20 m at 10 % (14 m in the lower 40 degrees, which is not modelled), 3 cm repeated at one
-/// standard deviation, steps of 3 cm, pulses of 6 ns, which are 0.9 m of echo. Its field reaches from 50 degrees below
-/// to 20 above; here it is level, to be mounted 15 degrees down. Divergence was found nowhere: 5 mrad are an estimate.
+/// Zvision ML-30s (the maker's table for hardware B, as printed in a public guide to mounting it on
+/// cranes, and the maker's file for a simulator, `Example_Solid_State_ML30S.json`): 160 lines of
+/// 320 points over 140 x 70 degrees at 10 Hz, 0.2 to 45 m, 20 m at 10 % (14 m in the lower 40
+/// degrees, which is not modelled), repeatability of 3 cm (one standard deviation), steps of 3 cm,
+/// pulses of 6 ns, which are 0.9 m of echo. Its field extends from 50 degrees below to 20 above;
+/// here it is level, to be mounted 15 degrees down. The divergence of 5 mrad is an estimate,
+/// because no source was found.
 pub fn ml_30s() -> LidarModel {
     LidarModel {
         beams: Beams::Raster {
@@ -182,9 +189,10 @@ pub fn ml_30s() -> LidarModel {
     }
 }
 
-/// Benewake TFmini (SJ-GU-TFmini-01 A00, and the same sheet as Seeed prints it): 2.3 degrees, 100 Hz, 0.3 to 12 m,
-/// 12 m indoors on 90 %, steps of 5 mm, within 1 % below 6 m. From there on the sheet allows 2 %, which is not
-/// modelled; its 5 m on 10 % are 4 m here. The 2 mm close by and the resolution of two echoes are estimates.
+/// Benewake TFmini (SJ-GU-TFmini-01 A00, and the same sheet as published by Seeed): 2.3 degrees,
+/// 100 Hz, 0.3 to 12 m, 12 m indoors at 90 %, steps of 5 mm, error within 1 % below 6 m. Beyond
+/// that, the sheet permits 2 %, which is not modelled; its 5 m at 10 % are 4 m here. The error of 2
+/// mm at short range and the resolution of two echoes are estimates.
 pub fn tfmini() -> RangeModel {
     RangeModel {
         rate_hz: 100.0,
@@ -200,10 +208,11 @@ pub fn tfmini() -> RangeModel {
     }
 }
 
-/// Garmin LIDAR-Lite v3 (operation manual and technical specifications, as a public survey of range finders quotes its
-/// table, and Garmin's product page): 8 mrad, 40 m on 70 %, 2.5 cm typical below 5 m and 10 cm from there on, steps of
-/// 1 cm, 270 readings a second typical; 5 cm at least. A deviation that grows by 1 mm a metre is half of both. Here it
-/// is asked 100 times a second. The resolution of two echoes is an estimate.
+/// Garmin LIDAR-Lite v3 (operation manual and technical specifications, as quoted by a public
+/// survey of range finders, and Garmin's product page): 8 mrad, 40 m at 70 %, error 2.5 cm typical
+/// below 5 m and 10 cm beyond, steps of 1 cm, 270 readings a second typical, minimum range 5 cm. A
+/// standard deviation that grows by 1 mm per metre is half of both errors. The model measures 100
+/// times a second. The resolution of two echoes is an estimate.
 pub fn lidar_lite_v3() -> RangeModel {
     RangeModel {
         rate_hz: 100.0,
@@ -219,10 +228,11 @@ pub fn lidar_lite_v3() -> RangeModel {
     }
 }
 
-/// ST VL53L1X (DocID031281 rev 2: 27 degrees, up to 4 m and up to 50 Hz). Not both at once: the 4 m, in the dark on
-/// white, take 140 ms a reading, and 20 ms reach 1.3 m (UM2356, as drivers quote it). The manual of ST's BlueTile
-/// board, which carries one: 4 cm at least, 20 mm typical in the dark, white is 88 %. Readings are whole millimetres.
-/// The resolution of two echoes is an estimate.
+/// ST VL53L1X (DocID031281 rev 2: 27 degrees, up to 4 m and up to 50 Hz). The two exclude each
+/// other: 4 m, in the dark on white, take 140 ms per reading, and 20 ms reach 1.3 m (UM2356, as
+/// quoted by drivers). From the manual of ST's BlueTile board, which carries one: minimum range 4
+/// cm, error 20 mm typical in the dark, white is 88 %. Readings are whole millimetres. The
+/// resolution of two echoes is an estimate.
 pub fn vl53l1x() -> RangeModel {
     RangeModel {
         rate_hz: 7.0,
@@ -238,12 +248,14 @@ pub fn vl53l1x() -> RangeModel {
     }
 }
 
-/// MaxBotix MB1242 (I2CXL-MaxSonar-EZ4, PD11848): 42 kHz, 15 Hz over the whole range, 20 cm (nearer reads as 20 cm) to
-/// 765 cm, steps of 1 cm. The beam of this narrowest of the series is drawn for rods, not stated: some 30 degrees for a
-/// wide target are an estimate. Absorption at 42 kHz by ISO 9613-1 at 20 degrees and half humidity. Sound's speed
-/// changes by 0.17 % a kelvin (0.6 m/s, the maker's PD11500) and nothing corrects it: 0.3 %, by 2 kelvin, are an
-/// estimate. So are half a step of other error, the resolution of two echoes, that a wall is just heard at 765 cm, and
-/// surfaces: slopes of 12 degrees, a twentieth scattered.
+/// MaxBotix MB1242 (I2CXL-MaxSonar-EZ4, PD11848): 42 kHz, 15 Hz over the complete range, 20 cm
+/// (smaller distances read as 20 cm) to 765 cm, steps of 1 cm. The data sheet shows the beam of
+/// this model, the narrowest of the series, only for rods; about 30 degrees for a wide target is an
+/// estimate. Absorption at 42 kHz by ISO 9613-1 at 20 degrees and 50 % humidity. The speed of sound
+/// changes by 0.17 % per kelvin (0.6 m/s, the maker's PD11500) and is not corrected: 0.3 %, for 2
+/// kelvin, is an estimate. Also estimates: another error of half a step, the resolution of two
+/// echoes, detection of a wall at 765 cm, and surfaces with slopes of 12 degrees that scatter a
+/// twentieth.
 pub fn mb1242() -> SonarModel {
     SonarModel {
         rate_hz: 15.0,
@@ -261,10 +273,10 @@ pub fn mb1242() -> SonarModel {
     }
 }
 
-/// HC-SR04 (the sheet that sellers of the module print, "Ultrasonic Ranging Module HC-SR04"): bursts of eight cycles at
-/// 40 kHz, which are 3.4 cm of echo, 2 cm to 4 m, 15 degrees, 3 mm, a reading every 60 ms. What it says of 15 degrees
-/// is taken for the full angle at -6 dB. That a wall is just heard at 4 m, how rough surfaces are, and the error by the
-/// air's temperature are estimates.
+/// HC-SR04 (the sheet that sellers of the module publish, "Ultrasonic Ranging Module HC-SR04"):
+/// bursts of eight cycles at 40 kHz, which are 3.4 cm of echo, 2 cm to 4 m, 15 degrees, 3 mm, one
+/// reading every 60 ms. The 15 degrees are taken as the full angle at -6 dB. Detection of a wall at
+/// 4 m, the roughness of surfaces, and the error due to air temperature are estimates.
 pub fn hc_sr04() -> SonarModel {
     SonarModel {
         rate_hz: 16.0,
@@ -282,11 +294,13 @@ pub fn hc_sr04() -> SonarModel {
     }
 }
 
-/// TI IWR6843 on an evaluation module. SWRU585 (IWR6843L EVM): 15 degrees of azimuth from 12 virtual antennas.
-/// TIDUE71D, the 8 m indoor chirp of people counting: 60.75 GHz, a frame every 55 ms, 8.4 cm of range, 16.2 km/h at
-/// most, 0.324 km/h of speed, 8.1 m. Its field of view of some 120 x 40 degrees is taken for the angles at -6 dB. It
-/// follows people to 15 m with another chirp; that a person (1 m^2) stands out by 12 dB at twice the range of this one
-/// is an estimate, and so are the nearest range and surfaces: gamma -10 dB, slopes of 15 degrees, a tenth reflected.
+/// TI IWR6843 on an evaluation module. SWRU585 (IWR6843L EVM): 15 degrees of azimuth from 12
+/// virtual antennas. TIDUE71D, the 8 m indoor chirp of people counting: 60.75 GHz, a frame every 55
+/// ms, resolution of 8.4 cm in range and 0.324 km/h in speed, at most 16.2 km/h and 8.1 m. Its
+/// field of view of about 120 x 40 degrees is taken as the angles at -6 dB. With another chirp it
+/// tracks people up to 15 m. An SNR of 12 dB for a person (1 m^2) at twice the range of this chirp
+/// is an estimate, and so are the minimum range and the surfaces: gamma -10 dB, slopes of 15
+/// degrees, a tenth reflected.
 pub fn iwr6843() -> RadarModel {
     RadarModel {
         rate_hz: 18.0,

@@ -1,12 +1,15 @@
-//! A radar: what of the scene comes back, by range, azimuth and Doppler.
+//! Radar: detections by range, azimuth and Doppler speed.
 //!
-//! Rays fill the field of view; the echo (`cast`) of each is a patch of `range^2 dOmega / cos(incidence)` with a backscatter per area of
-//! constant gamma, `gamma cos(incidence)` (Barton 2005, "Radar system analysis and modeling", section 3.6: rough surfaces), so that
-//! its cross section is `gamma range^2 dOmega`; a surface that is smooth against the wavelength adds facets that face the radar, as for
-//! sound (`range`). Power goes with the radar equation, `sigma G^2 / range^4` (Skolnik 2008, "Radar handbook", equation 1.1).
-//! The speed along the ray is that of the patch less that of the sensor. Patches of one cell of range, azimuth and speed add up,
-//! and cells above the threshold are reported: at the mean of their patches, with errors of `resolution / sqrt(2 SNR)` (Richards
-//! 2014, "Fundamentals of radar signal processing", section 7.2).
+//! Rays fill the field of view. The echo (`cast`) of each is a patch of `range^2 dOmega /
+//! cos(incidence)` with a backscatter per area of constant gamma, `gamma cos(incidence)` (Barton
+//! 2005, "Radar system analysis and modeling", section 3.6: rough surfaces), so that its cross
+//! section is `gamma range^2 dOmega`. A surface that is smooth compared with the wavelength adds
+//! facets that face the radar, as for sound (`range`). Power follows the radar equation, `sigma G^2
+//! / range^4` (Skolnik 2008, "Radar handbook", equation 1.1). The speed along the ray is that of
+//! the patch minus that of the sensor. Patches of one cell of range, azimuth and speed are added,
+//! and cells above the threshold are reported: at the mean of their patches, with errors of
+//! `resolution / sqrt(2 SNR)` (Richards 2014, "Fundamentals of radar signal processing", section
+//! 7.2).
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -17,64 +20,66 @@ use super::lidar::pointing;
 use super::noise::Draws;
 use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
-/// A radar, in the words of its data sheet.
+/// Radar model, in the terms of its data sheet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RadarModel {
-    /// Frames a second. [Hz]
+    /// Rate of frames. [Hz]
     pub rate_hz: f64,
-    /// Full angle of what it sees from left to right, where the gain both ways is a quarter (-6 dB). [rad]
+    /// Horizontal field of view: full angle at a two-way gain of a quarter (-6 dB). [rad]
     pub azimuth_fov_rad: f32,
-    /// Full angle of what it sees from bottom to top, likewise. [rad]
+    /// Vertical field of view, defined in the same way. [rad]
     pub elevation_fov_rad: f32,
-    /// Nothing nearer is reported. [m]
+    /// Minimum range. [m]
     pub min_range_m: f32,
-    /// Nothing farther is reported. [m]
+    /// Maximum range. [m]
     pub max_range_m: f32,
-    /// Cell of range: the speed of light over twice the bandwidth. [m]
+    /// Size of a range cell: the speed of light over twice the bandwidth. [m]
     pub range_resolution_m: f32,
-    /// Cell of azimuth. [rad]
+    /// Size of an azimuth cell. [rad]
     pub azimuth_resolution_rad: f32,
-    /// Cell of speed: the wavelength over twice the frame's length. [m/s]
+    /// Size of a speed cell: the wavelength over twice the duration of the frame. [m/s]
     pub speed_resolution_mps: f32,
-    /// Faster speeds fold back to within plus and minus this: the wavelength over four times the chirps' period. [m/s]
+    /// Maximum unambiguous speed: the wavelength over four times the chirp period. Higher speeds
+    /// are folded to within plus and minus this. [m/s]
     pub max_speed_mps: f32,
-    /// At this range a target of 1 m^2 has the SNR `threshold_db`. [m]
+    /// Range at which a target of 1 m^2 has the SNR `threshold_db`. [m]
     pub reference_range_m: f32,
-    /// SNR from which a cell is reported. [dB]
+    /// Minimum SNR of a reported cell. [dB]
     pub threshold_db: f32,
     /// Backscatter of a rough surface per area and cosine of incidence.
     pub gamma: f32,
-    /// Standard deviation of the slopes of facets that mirror. [rad]
+    /// Standard deviation of the slopes of specular facets. [rad]
     pub slope_rad: f32,
-    /// Share of what falls onto a facet that it reflects.
+    /// Share of incident power that a facet reflects.
     pub reflectivity: f32,
 }
 
-/// What a radar reports of one cell.
+/// Detection of a radar: one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C)]
 pub struct RadarDetection {
-    /// [m]
+    /// Range. [m]
     pub range_m: f32,
-    /// From x to y, about z. [rad, sensor]
+    /// Azimuth about z, from x to y. [rad, sensor]
     pub azimuth_rad: f32,
-    /// Along the ray, positive where the distance grows; folded. [m/s]
+    /// Speed along the ray, positive if the distance grows; folded. [m/s]
     pub speed_mps: f32,
-    /// Signal over noise. [dB]
+    /// Signal-to-noise ratio. [dB]
     pub snr_db: f32,
-    /// Radar cross section of what the cell holds. [m^2]
+    /// Radar cross section of the cell. [m^2]
     pub cross_section_m2: f32,
-    /// Object of most of it; 0 is what stands still.
+    /// Id of the object with the largest share; 0 is the static scene.
     pub object: u16,
 }
 
-/// A [`RadarModel`] that is ready to measure.
+/// Prepared [`RadarModel`].
 #[derive(Clone, Debug)]
 pub struct Radar {
     model: RadarModel,
     rays: Vec<Ray>,
-    /// Standard deviation of each ray's footprint per metre: half the distance to its neighbours. [rad]
+    /// Standard deviation of each ray's footprint per metre: half the distance to its neighbours.
+    /// [rad]
     spread: f32,
     patches: Vec<Patch>,
 }
@@ -87,10 +92,10 @@ struct Ray {
     gain: f32,
 }
 
-/// What one ray meets.
+/// Echo of one ray.
 #[derive(Clone, Copy, Debug, Default)]
 struct Patch {
-    /// Range, azimuth and speed; `NOWHERE` where nothing comes back.
+    /// Cell of range, azimuth and speed; `NOWHERE` without echo.
     cell: [i32; 3],
     ray: u32,
     range_m: f32,
@@ -101,17 +106,17 @@ struct Patch {
 }
 
 const NOWHERE: [i32; 3] = [i32::MAX; 3];
-/// Rays are at most this far apart, and at most `MAX_RAYS` both ways. [rad]
+/// Maximum angle between rays, and maximum number of rays in each direction. [rad]
 const RAY_RAD: f32 = 0.03;
 const MAX_RAYS: usize = 96;
-/// Rays that one task follows.
+/// Rays per task.
 const CHUNK: usize = 32;
 
 impl Radar {
     /// Prepares a model.
     ///
     /// # Errors
-    /// [`InvalidModel`] names the first field that cannot be.
+    /// [`InvalidModel`] with the first invalid field.
     pub fn new(model: RadarModel) -> Result<Self, InvalidModel> {
         let check = Checked("radar");
         check.common(
@@ -154,19 +159,19 @@ impl Radar {
         Ok(Self { rays, spread: wide.max(high) / 2.0, patches, model })
     }
 
-    /// Returns its model.
+    /// Returns the model of this radar.
     pub fn model(&self) -> &RadarModel {
         &self.model
     }
 
-    /// Measures frame `seq`, whose chirps span `motion`, into one record per cell that stands out, nearest first. All noise follows
-    /// from `seed` and `seq`.
+    /// Measures frame `seq`, with chirps during `motion`, into one record per detected cell, nearest
+    /// first. All noise follows from `seed` and `seq`.
     ///
     /// # Errors
-    /// [`SensorError`]; there are no records then.
+    /// [`SensorError`]; there are then no records.
     ///
     /// # Panics
-    /// If `motion` has not as many objects as the scene.
+    /// If the numbers of objects of `motion` and of the scene differ.
     pub fn measure(
         &mut self,
         scene: &SensorScene,
@@ -199,7 +204,7 @@ impl Radar {
 }
 
 impl RadarModel {
-    /// Casts neighbouring rays: the strongest echo of each makes its patch.
+    /// Casts neighbouring rays. The patch of each ray is its strongest echo.
     fn patches(
         &self,
         scene: &SensorScene,
@@ -229,7 +234,7 @@ impl RadarModel {
             let slope2 = self.slope_rad.powi(2);
             let facets = self.reflectivity * (-tan2 / (2.0 * slope2)).exp()
                 / (2.0 * slope2 * cosine.powi(4));
-            // Per area of surface, of which a ray sees range^2 dOmega / cosine.
+            // Per area of surface. A ray covers an area of range^2 dOmega / cosine.
             let per_area = self.gamma * cosine + facets;
             let area_m2 = echo.range_m.powi(2) * ray.solid_angle_sr / cosine * echo.weight;
             let cross_section_m2 = ray.gain * per_area * area_m2;
@@ -265,7 +270,8 @@ impl RadarModel {
         let range_m = mean(|p| p.range_m);
         let over = cross_section_m2 * (self.reference_range_m / range_m.max(1e-2)).powi(4);
         let snr = over * 10_f32.powf(self.threshold_db / 10.0);
-        // Noise of its own adds to the signal's power: a Gaussian of the sum's root, for some dozens of chirps.
+        // Noise of the cell adds to the signal's power, as a Gaussian with the root of the sum, for
+        // some dozens of chirps.
         let [power, range_error] = draws.gaussians();
         let [azimuth_error, speed_error] = draws.gaussians();
         let measured = (snr + power * (1.0 + 2.0 * snr).sqrt()).max(1e-3);
@@ -293,7 +299,7 @@ impl RadarModel {
     }
 }
 
-/// Returns a speed as chirps tell it: within plus and minus `most`.
+/// Returns a speed folded to within plus and minus `most_mps`, as chirps measure it.
 fn folded(speed_mps: f32, most_mps: f32) -> f32 {
     (speed_mps + most_mps).rem_euclid(2.0 * most_mps) - most_mps
 }
@@ -304,7 +310,8 @@ fn own_velocity(motion: &SensorMotion<'_>) -> DVec3 {
     per(motion.duration_s, end.translation_m - begin.translation_m)
 }
 
-/// Returns the velocity of the point of a part that is at `p_world_m` halfway. [m/s, world]
+/// Returns the velocity of the point of a part that is at `p_world_m` in the middle of the motion.
+/// [m/s, world]
 fn velocity(motion: &SensorMotion<'_>, part: u16, p_world_m: DVec3) -> DVec3 {
     let object = usize::from(part).checked_sub(1).and_then(|i| motion.objects.get(i));
     let Some([Some(begin), Some(end)]) = object else { return DVec3::ZERO };

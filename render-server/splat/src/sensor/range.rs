@@ -1,11 +1,15 @@
-//! Range finders of one beam: light within a narrow cone, and sound in a wide one. Some dozens of rays a reading.
+//! Single-beam range finders: light within a narrow cone, and sound in a wide one, with some dozens
+//! of rays per reading.
 //!
-//! Both look along x and report one range. Rays fill the cone evenly; each one's echo (`cast`) counts by what of the cone it stands
-//! for. Light comes back from a Lambertian surface, as in `lidar`, and the strongest group of echoes within the receiver's
-//! resolution is reported. Sound is mirrored by what is smooth for its wavelength: a facet of the surface sends it back if it
-//! faces the sensor, and facets' slopes are Gaussian (Beckmann and Spizzichino 1963, "The scattering of electromagnetic waves
-//! from rough surfaces", chapter 5: `exp(-tan^2(incidence) / (2 slope^2)) / cos^4(incidence)`); a share is scattered evenly, by
-//! Lambert's rule. It spreads both ways and is absorbed by air (ISO 9613-1), and the first group above the threshold is reported.
+//! Both point along x and report one range. Rays fill the cone evenly; the echo (`cast`) of each is
+//! weighted by its share of the cone. Light returns from a Lambertian surface, as in `lidar`, and
+//! the strongest group of echoes within the receiver's resolution is reported. Sound is reflected
+//! by surfaces that are smooth at its wavelength: a facet of the surface returns the sound if it
+//! faces the sensor, and slopes of facets are Gaussian (Beckmann and Spizzichino 1963, "The
+//! scattering of electromagnetic waves from rough surfaces", chapter 5: `exp(-tan^2(incidence) / (2
+//! slope^2)) / cos^4(incidence)`). A share is scattered diffusely, by Lambert's law. Sound spreads
+//! both ways and is absorbed by air (ISO 9613-1), and the first group above the threshold is
+//! reported.
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -15,90 +19,94 @@ use super::lidar::rounded;
 use super::noise::Draws;
 use super::{Checked, InvalidModel, SensorError, SensorMotion, SensorScene};
 
-/// A range finder that measures by light, in the words of its data sheet.
+/// Optical range finder model, in the terms of its data sheet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RangeModel {
-    /// Readings a second. [Hz]
+    /// Rate of readings. [Hz]
     pub rate_hz: f64,
-    /// Full angle of the cone that it sees. [rad]
+    /// Full angle of the field of view. [rad]
     pub fov_rad: f32,
-    /// Nothing nearer is reported. [m]
+    /// Minimum range. [m]
     pub min_range_m: f32,
-    /// Nothing farther is reported. [m]
+    /// Maximum range. [m]
     pub max_range_m: f32,
     /// Standard deviation of a range. [m]
     pub sigma_m: f32,
-    /// What it grows by per metre of range, as a share. [m/m]
+    /// Growth of the standard deviation per metre of range. [m/m]
     pub sigma_per_m: f32,
-    /// Ranges are multiples of this; 0 for no rounding. [m]
+    /// Quantisation step of ranges; 0 for no rounding. [m]
     pub range_step_m: f32,
-    /// Echoes within this range of one another are one. [m]
+    /// Maximum distance of two echoes that are merged. [m]
     pub resolution_m: f32,
-    /// At this range a target across the whole cone, of `reference_reflectivity`, is detected nine times in ten. [m]
+    /// Range at which a target that fills the cone, of `reference_reflectivity`, is detected with a
+    /// probability of 90 %. [m]
     pub reference_range_m: f32,
-    /// Share of light that target sends back, 0 to 1.
+    /// Share of light that the reference target reflects, 0 to 1.
     pub reference_reflectivity: f32,
 }
 
-/// A range finder that measures by sound, in the words of its data sheet.
+/// Ultrasonic range finder model, in the terms of its data sheet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SonarModel {
-    /// Readings a second. [Hz]
+    /// Rate of readings. [Hz]
     pub rate_hz: f64,
-    /// Full angle of the cone at whose edge an echo, both ways, has a quarter of the power on axis (-6 dB). [rad]
+    /// Full angle of the cone in which the two-way power is at least a quarter of that on axis (-6 dB).
+    /// [rad]
     pub beam_rad: f32,
-    /// Nothing nearer is reported. [m]
+    /// Minimum range. [m]
     pub min_range_m: f32,
-    /// Nothing farther is reported. [m]
+    /// Maximum range. [m]
     pub max_range_m: f32,
     /// Standard deviation of a range. [m]
     pub sigma_m: f32,
-    /// What it grows by per metre of range (temperature of the air), as a share. [m/m]
+    /// Growth of the standard deviation per metre of range, due to air temperature. [m/m]
     pub sigma_per_m: f32,
-    /// Ranges are multiples of this; 0 for no rounding. [m]
+    /// Quantisation step of ranges; 0 for no rounding. [m]
     pub range_step_m: f32,
-    /// Half the pulse's length in air: echoes within it add up. [m]
+    /// Half the length of the pulse in air: echoes within it are added. [m]
     pub resolution_m: f32,
-    /// What air absorbs, one way. [dB/m]
+    /// Absorption by air, one way. [dB/m]
     pub absorption_db_per_m: f32,
-    /// Standard deviation of a surface's slopes: how far from square it may stand to mirror the pulse back. [rad]
+    /// Standard deviation of a surface's slopes: tolerance of its orientation for reflecting the
+    /// pulse back. [rad]
     pub slope_rad: f32,
-    /// Share of the power that a surface scatters evenly instead.
+    /// Share of the power that a surface scatters diffusely instead.
     pub diffuse: f32,
-    /// At this range a wall across the cone is detected nine times in ten. [m]
+    /// Range at which a wall across the cone is detected with a probability of 90 %. [m]
     pub reference_range_m: f32,
 }
 
-/// What a range finder reports.
+/// Reading of a range finder.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RangeReading {
-    /// 0 where nothing came back. [m]
+    /// Range; 0 if there is no echo. [m]
     pub range_m: f32,
-    /// Power of the echo over the detection threshold: 1 where nine in ten such echoes are detected; 0 without.
+    /// Power of the echo over the detection threshold: at 1, the detection probability is 90 %; 0
+    /// without echo.
     pub strength: f32,
-    /// Object of most of the echo; 0 is what stands still.
+    /// Id of the object with the largest share of the echo; 0 is the static scene.
     pub object: u16,
 }
 
-/// A [`RangeModel`] that is ready to measure.
+/// Prepared [`RangeModel`].
 #[derive(Clone, Debug)]
 pub struct RangeFinder {
     model: RangeModel,
     cone: Cone,
 }
 
-/// A [`SonarModel`] that is ready to measure.
+/// Prepared [`SonarModel`].
 #[derive(Clone, Debug)]
 pub struct Sonar {
     model: SonarModel,
     cone: Cone,
-    /// What echoes are divided by to be 1 at the threshold.
+    /// Power of an echo at the threshold.
     threshold: f32,
 }
 
-/// Rays that fill a cone about x, and the share of the cone that each stands for.
+/// Rays that fill a cone about x, and the share of the cone for each ray.
 #[derive(Clone, Debug)]
 struct Cone {
     rays: Vec<(Vec3, f32)>,
@@ -106,7 +114,7 @@ struct Cone {
     spread: f32,
 }
 
-/// An echo of one ray, as the receiver takes it.
+/// Echo of one ray at the receiver.
 #[derive(Clone, Copy, Debug, Default)]
 struct Received {
     range_m: f32,
@@ -114,24 +122,26 @@ struct Received {
     object: u16,
 }
 
-/// Echoes that one reading can hold: three for each of the rays; more are not listened to.
+/// Maximum echoes of one reading: three for each ray. Further echoes are ignored.
 const MAX_RECEIVED: usize = 3 * MAX_RAYS;
-/// 1 + 3 n (n + 1) rays of n = 8 rings.
+/// Maximum rays: 1 + 3 n (n + 1) for n = 8 rings.
 const MAX_RAYS: usize = 217;
-/// Rings are at most this far apart. [rad]
+/// Maximum angle between rings. [rad]
 const RING_RAD: f32 = 0.03;
-/// A threshold's noise as a share of it, and where nine in ten are below: as in `lidar`.
+/// Noise of the threshold as a share of it, and quantile of the normal distribution at 90 %: as in
+/// `lidar`.
 const THRESHOLD_NOISE: f32 = 0.25;
 const NINE_IN_TEN: f32 = 1.281_551_6;
 
 impl Cone {
-    /// Makes rays within `half_rad` of x, each weighed by `gain` of its angle from x.
+    /// Creates rays within `half_rad` of x, weighted by `gain` of their angle from x.
     fn new(half_rad: f32, gain: impl Fn(f32) -> f32) -> Self {
         let rings = ((half_rad / RING_RAD).ceil() as usize).clamp(1, 8);
         let mut rays = vec![(Vec3::X, gain(0.0))];
         let apart = half_rad / (rings as f32 + 0.5);
         for ring in 1..=rings {
-            // Rings of equal width, six rays more in each: all stand for the same solid angle.
+            // Rings of equal width, each with six rays more than the previous: all rays cover the
+            // same solid angle.
             let angle = apart * ring as f32;
             let count = 6 * ring;
             for n in 0..count {
@@ -149,8 +159,8 @@ impl Cone {
         Self { rays, spread: apart / 2.0 }
     }
 
-    /// Collects the echoes of all rays, nearest first; `power` says what comes back of (share of the cone, power of a Lambertian
-    /// surface, cosine of incidence, range). Returns how many there are.
+    /// Collects the echoes of all rays, nearest first, and returns their number. `power` returns
+    /// the received power, given the share of the cone and the echo.
     fn receive(
         &self,
         scene: &SensorScene,
@@ -190,7 +200,7 @@ fn threshold(seed: u64, seq: u64) -> (f32, f32) {
     (1.0 + THRESHOLD_NOISE * (threshold - NINE_IN_TEN), error)
 }
 
-/// Returns the object of most power.
+/// Returns the object with the highest power.
 fn object_of(group: &[Received]) -> u16 {
     let strongest = group.iter().max_by(|a, b| a.power.total_cmp(&b.power));
     strongest.map_or(0, |echo| echo.object)
@@ -200,7 +210,7 @@ impl RangeFinder {
     /// Prepares a model.
     ///
     /// # Errors
-    /// [`InvalidModel`] names the first field that cannot be.
+    /// [`InvalidModel`] with the first invalid field.
     pub fn new(model: RangeModel) -> Result<Self, InvalidModel> {
         let check = Checked("range finder");
         check.common(
@@ -220,7 +230,7 @@ impl RangeFinder {
         Ok(Self { model, cone })
     }
 
-    /// Returns its model.
+    /// Returns the model of this range finder.
     pub fn model(&self) -> &RangeModel {
         &self.model
     }
@@ -231,7 +241,7 @@ impl RangeFinder {
     /// [`SensorError`].
     ///
     /// # Panics
-    /// If `motion` has not as many objects as the scene.
+    /// If the numbers of objects of `motion` and of the scene differ.
     pub fn measure(
         &self,
         scene: &SensorScene,
@@ -282,7 +292,7 @@ impl Sonar {
     /// Prepares a model.
     ///
     /// # Errors
-    /// [`InvalidModel`] names the first field that cannot be.
+    /// [`InvalidModel`] with the first invalid field.
     pub fn new(model: SonarModel) -> Result<Self, InvalidModel> {
         let check = Checked("sonar");
         check.common(
@@ -295,7 +305,7 @@ impl Sonar {
         check.within("absorption_db_per_m", model.absorption_db_per_m, [0.0, 20.0], "0 to 20")?;
         check.within("slope_rad", model.slope_rad, [0.01, 1.0], "0.01 to 1")?;
         check.within("diffuse", model.diffuse, [0.0, 1.0], "0 to 1")?;
-        // A quarter of the power at half the beam: to where a hundredth is left.
+        // A quarter of the power at half the beam angle. The cone ends where a hundredth is left.
         let half = model.beam_rad / 2.0;
         let gain = move |angle: f32| 0.25_f32.powf((angle / half).powi(2));
         let cone = Cone::new((half * 1.82).min(1.3), gain);
@@ -304,12 +314,13 @@ impl Sonar {
         Ok(sonar)
     }
 
-    /// Returns its model.
+    /// Returns the model of this sonar.
     pub fn model(&self) -> &SonarModel {
         &self.model
     }
 
-    /// Returns the power that comes back from a wall across the axis within a pulse of its nearest point.
+    /// Returns the power that returns from a wall across the axis, within one pulse length of its
+    /// nearest point.
     fn of_wall(&self, range_m: f32) -> f32 {
         let rays = self.cone.rays.iter();
         let powers = rays.map(|&(direction, share)| {
@@ -321,12 +332,13 @@ impl Sonar {
         powers.sum()
     }
 
-    /// Returns the power that comes back per power sent into a ray, over that of 1 m without air.
+    /// Returns the received power per power sent along a ray, relative to 1 m without air.
     fn returned(&self, cosine: f32, range_m: f32) -> f32 {
         let model = &self.model;
         let cosine = cosine.clamp(1e-3, 1.0);
         let tan2 = (1.0 - cosine * cosine) / (cosine * cosine);
-        // Facets: 1 / (2 slope^2) of those of a Gaussian face the sensor, against 4 pi of an even scatterer's directions.
+        // A share of 1 / (2 slope^2) of Gaussian facets faces the sensor, compared with the 4 pi of
+        // a diffuse scatterer.
         let facets = (-tan2 / (2.0 * model.slope_rad.powi(2))).exp()
             / (8.0 * model.slope_rad.powi(2) * cosine.powi(4));
         let scattered = (1.0 - model.diffuse) * facets + model.diffuse * cosine;
@@ -340,7 +352,7 @@ impl Sonar {
     /// [`SensorError`].
     ///
     /// # Panics
-    /// If `motion` has not as many objects as the scene.
+    /// If the numbers of objects of `motion` and of the scene differ.
     pub fn measure(
         &self,
         scene: &SensorScene,
@@ -357,7 +369,7 @@ impl Sonar {
             model.max_range_m,
             model.resolution_m,
             &mut received,
-            // Sound does not care for colour.
+            // Sound does not depend on colour.
             |share, echo| {
                 share * echo.weight * self.returned(echo.cosine, echo.range_m) / self.threshold
             },
@@ -370,13 +382,13 @@ impl Sonar {
                 group.iter().take_while(|r| r.range_m - first.range_m <= model.resolution_m);
             let group = &group[..within.count()];
             let power: f32 = group.iter().map(|r| r.power).sum();
-            // The first echo itself must be of some weight: its edge is what is timed.
+            // The first echo must have a minimum power, because its edge is timed.
             if !(power >= threshold && first.power >= 0.002 * power) {
                 continue;
             }
             let sigma_m = model.sigma_m + model.sigma_per_m * first.range_m;
             let measured_m = rounded(first.range_m + sigma_m * error, model.range_step_m);
-            // What is nearer than it can tell reads as the nearest that it can.
+            // Distances below the minimum range read as the minimum range.
             let range_m = measured_m.max(model.min_range_m);
             if range_m > model.max_range_m {
                 return Ok(RangeReading::default());
@@ -392,11 +404,11 @@ mod shape {
     use super::*;
 
     #[test]
-    fn rays_fill_their_cone_evenly() {
+    fn fills_the_cone_evenly_with_rays() {
         let cone = Cone::new(0.3, |_| 1.0);
         assert_eq!(cone.rays.len(), 217);
         assert!(cone.rays.iter().all(|(ray, _)| (ray.length() - 1.0).abs() < 1e-6));
-        // Of 8.5 widths of a ring the inner 5.5 hold their share of the solid angle.
+        // The inner 5.5 of 8.5 ring widths cover their share of the solid angle.
         let inner: f32 = cone
             .rays
             .iter()

@@ -1,4 +1,4 @@
-//! Each model against its formula, over scenes whose geometry is a plane or a few; and poison.
+//! Compares each model with its formula in scenes of one or a few planes, and tests invalid input.
 
 use glam::{DQuat, DVec3, Quat, Vec3};
 use proptest::prelude::*;
@@ -12,7 +12,8 @@ use crate::{RigidObject, Scene, Splats};
 
 mod reference;
 
-/// Splats of a white wall: discs on a grid in the plane through `center` with this normal, `half_m` to each side.
+/// Returns the splats of a white wall: discs on a grid in the plane through `center` with this
+/// normal, `half_m` to each side.
 pub(super) fn wall(center: Vec3, normal: Vec3, half_m: f32, step_m: f32) -> Splats {
     let (across, up) = normal.normalize().any_orthonormal_pair();
     let count = (half_m / step_m).ceil() as i32;
@@ -26,7 +27,7 @@ pub(super) fn wall(center: Vec3, normal: Vec3, half_m: f32, step_m: f32) -> Spla
     splats
 }
 
-/// Adds a disc of some grey.
+/// Adds a grey disc.
 fn add(splats: &mut Splats, mean_m: Vec3, normal: Vec3, sigma_m: f32, grey: f32) {
     splats.means_m.push(mean_m);
     splats.scales_m.push(Vec3::new(sigma_m, sigma_m, 1e-3));
@@ -46,7 +47,7 @@ fn lidar_of(preset_name: &str) -> LidarModel {
     model
 }
 
-/// A LiDAR of one ring without errors.
+/// Returns the model of a LiDAR with one ring and without errors.
 fn exact(columns: u32) -> LidarModel {
     LidarModel {
         beams: Beams::Spinning { elevations_rad: vec![0.0], columns },
@@ -66,14 +67,14 @@ fn scan(model: LidarModel, scene: &SensorScene, motion: &SensorMotion<'_>) -> Ve
 }
 
 #[test]
-fn a_wall_is_seen_along_every_beam_at_its_distance() {
+fn measures_the_distance_of_a_wall_along_every_beam() {
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 0.0, 0.0), -Vec3::X, 3.0, 0.05));
     let points = scan(exact(360), &scene, &SensorMotion::standing(at(DVec3::ZERO, 0.0)));
     let mut seen = 0;
     for (column, point) in points.iter().enumerate() {
         let azimuth = std::f64::consts::PI * (1.0 - column as f64 / 180.0);
         if azimuth.abs() > 0.7 {
-            // The wall ends at 45 degrees, and nothing is behind.
+            // The wall ends at 45 degrees, and there is nothing behind it.
             assert!(azimuth.abs() < 0.8 || point.range_m == 0.0, "{azimuth}: {point:?}");
             continue;
         }
@@ -81,7 +82,7 @@ fn a_wall_is_seen_along_every_beam_at_its_distance() {
         let truth_m = 3.0 / azimuth.cos();
         assert!((f64::from(point.range_m) - truth_m).abs() < 2e-3, "{azimuth}: {point:?}");
         assert!((point.p_sensor_m[0] - 3.0).abs() < 2e-3, "{point:?}");
-        // Lambert: what comes back of white goes with the cosine of incidence.
+        // Lambert: the light reflected by white is proportional to the cosine of incidence.
         let intensity = 255.0 * azimuth.cos() as f32;
         assert!((point.intensity - intensity).abs() < 8.0, "{azimuth}: {point:?}");
     }
@@ -89,7 +90,7 @@ fn a_wall_is_seen_along_every_beam_at_its_distance() {
 }
 
 #[test]
-fn points_of_a_moving_sensor_are_from_where_it_was_at_their_instants() {
+fn measures_each_point_from_the_pose_at_its_instant() {
     let scene = SensorScene::new(&wall(Vec3::new(4.0, 0.0, 0.0), -Vec3::X, 3.0, 0.05));
     let moving = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::X, 0.0)],
@@ -97,7 +98,8 @@ fn points_of_a_moving_sensor_are_from_where_it_was_at_their_instants() {
         duration_s: 0.1,
     };
     let points = scan(exact(360), &scene, &moving);
-    // Ahead halfway through the turn: it has gone half of its way, and half of the time is over.
+    // The beam ahead leaves in the middle of the sweep: half the distance and half the time have
+    // passed.
     assert!((points[180].range_m - 3.5).abs() < 2e-3, "{:?}", points[180]);
     assert!((i64::from(points[180].offset_ns) - 50_000_000).abs() < 10, "{:?}", points[180]);
     for (column, point) in points.iter().enumerate().filter(|(_, p)| p.range_m > 0.0) {
@@ -107,7 +109,7 @@ fn points_of_a_moving_sensor_are_from_where_it_was_at_their_instants() {
 }
 
 #[test]
-fn range_errors_are_of_the_stated_sigma_and_step() {
+fn range_errors_match_sigma_and_step() {
     let scene = SensorScene::new(&wall(Vec3::new(5.0, 0.0, 0.0), -Vec3::X, 1.0, 0.05));
     let lidar = Lidar::new(LidarModel {
         sigma_m: 0.01,
@@ -133,8 +135,8 @@ fn range_errors_are_of_the_stated_sigma_and_step() {
 }
 
 #[test]
-fn returns_drop_out_by_reflectivity_incidence_and_range() {
-    // Detected nine times in ten where reflectivity cos / range^2 is that of the reference; hardly beyond.
+fn loses_returns_by_reflectivity_incidence_and_range() {
+    // Detected with 90 % if reflectivity cos / range^2 equals that of the reference; rarely beyond.
     let share = |distance_m: f32, grey: f32, incidence_rad: f32| {
         let normal = Quat::from_rotation_z(incidence_rad) * -Vec3::X;
         let mut splats = wall(Vec3::new(distance_m, 0.0, 0.0), normal, 1.0, 0.05);
@@ -155,20 +157,20 @@ fn returns_drop_out_by_reflectivity_incidence_and_range() {
         });
         hits.count() as f32 / 600.0
     };
-    // sRGB of linear 0.5 and 0.25.
+    // sRGB values of linear 0.5 and 0.25.
     let (half, quarter) = (0.735, 0.537);
     assert!((share(8.0, half, 0.0) - 0.9).abs() < 0.06);
-    // A quarter of the light from half as reflective a wall, 1 / sqrt(2) as far: as much as the reference.
+    // A wall of half the reflectivity at 1 / sqrt(2) of the range: as much light as the reference.
     assert!((share(8.0 / 2f32.sqrt(), quarter, 0.0) - 0.9).abs() < 0.06);
-    // At 60 degrees half comes back.
+    // At 60 degrees, half of the light returns.
     assert!((share(8.0 / 2f32.sqrt(), half, 60f32.to_radians()) - 0.9).abs() < 0.07);
     assert!(share(4.0, half, 0.0) == 1.0);
     assert!(share(16.0, half, 0.0) < 0.1);
 }
 
 #[test]
-fn a_beam_over_an_edge_has_an_echo_of_each_side() {
-    // The near wall covers y > 0: a beam along x is half on it.
+fn a_beam_over_an_edge_has_an_echo_from_each_side() {
+    // The near wall covers y > 0: half of a beam along x hits it.
     let mut splats = wall(Vec3::new(8.0, 0.0, 0.0), -Vec3::X, 1.0, 0.05);
     let mut near = wall(Vec3::new(4.0, 1.0, 0.0), -Vec3::X, 1.0, 0.004 * 5.0);
     near.means_m.iter_mut().for_each(|mean| mean.y += 0.01);
@@ -185,32 +187,32 @@ fn a_beam_over_an_edge_has_an_echo_of_each_side() {
     // A footprint of 0.1 rad is 0.4 m wide there.
     assert!((ahead(Returns::First, 0.1, 0.0) - 4.0).abs() < 0.01);
     assert!((ahead(Returns::Last, 0.1, 0.0) - 8.0).abs() < 0.05);
-    // The near one is nearer, so it is the stronger of two halves.
+    // The near half is stronger, because it is nearer.
     assert!((ahead(Returns::Strongest, 0.1, 0.0) - 4.0).abs() < 0.01);
-    // Three deviations (0.3 m) from the edge there is one side.
+    // Three standard deviations (0.3 m) from the edge, there is only one side.
     assert!((ahead(Returns::Last, 0.1, 0.4) - 4.0).abs() < 0.01);
     assert!((ahead(Returns::First, 0.1, -0.4) - 8.0).abs() < 0.05);
-    // And a narrow beam sees one of them, nothing between.
+    // A narrow beam hits one of them, and nothing in between.
     for y_m in [-0.1, -0.05, 0.05, 0.1] {
         let range_m = ahead(Returns::Strongest, 1e-4, y_m);
         assert!((range_m - if y_m < 0.0 { 8.0 } else { 4.0 }).abs() < 0.01, "{y_m}: {range_m}");
     }
 }
 
-/// A scene of one object, a wall across x, 1 m to each side.
+/// Returns a scene of one object: a wall across x, 1 m to each side.
 fn with_object() -> ([RigidObject; 1], Splats) {
     let splats = wall(Vec3::ZERO, -Vec3::X, 1.0, 0.05);
     ([RigidObject { id: 9, splats }], Splats::default())
 }
 
-// Why: as placements are written.
+// Why: the same type as placements.
 #[allow(clippy::unnecessary_wraps)]
 fn object_at(x_m: f64) -> Option<Pose<World, Object>> {
     Some(Pose::new(DVec3::X * x_m, DQuat::IDENTITY))
 }
 
 #[test]
-fn an_object_is_seen_where_it_is_at_the_beam_s_instant() {
+fn measures_an_object_at_its_pose_at_the_instant_of_the_beam() {
     let (objects, splats) = with_object();
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
     let motion = SensorMotion {
@@ -225,7 +227,7 @@ fn an_object_is_seen_where_it_is_at_the_beam_s_instant() {
 }
 
 #[test]
-fn any_number_of_threads_gives_the_same_bits() {
+fn results_do_not_depend_on_the_number_of_threads() {
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 0.0, 0.0), -Vec3::X, 2.0, 0.1));
     let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::new(0.2, 0.1, 0.0), 0.3)],
@@ -250,7 +252,7 @@ fn any_number_of_threads_gives_the_same_bits() {
 }
 
 #[test]
-fn a_rosette_fills_its_field_and_never_repeats() {
+fn a_rosette_fills_its_field_without_repetition() {
     let lidar = Lidar::new(lidar_of("mid-360")).unwrap();
     let scene = SensorScene::new(&wall(Vec3::new(2.0, 0.0, 0.0), -Vec3::X, 4.0, 0.2));
     let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
@@ -273,7 +275,7 @@ fn a_rosette_fills_its_field_and_never_repeats() {
     }
     assert!(
         counts.windows(2).all(|w| w[1] > w[0]),
-        "each sweep sees what none before has: {counts:?}"
+        "each sweep covers new cells: {counts:?}"
     );
     assert!(all.iter().all(|&(_, elevation)| (-7..=52).contains(&elevation)));
 }
@@ -289,13 +291,13 @@ fn sonar_of(name: &str) -> Sonar {
 }
 
 #[test]
-fn a_range_finder_reports_the_mean_of_what_its_cone_sees() {
+fn a_range_finder_reports_the_mean_range_within_its_cone() {
     for (name, distance_m) in [("tfmini", 5.0), ("lidar-lite-v3", 20.0), ("vl53l1x", 2.0)] {
         let finder = range_of(name);
         let scene = SensorScene::new(&wall(Vec3::X * distance_m, -Vec3::X, 2.0, 0.05));
         let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
         let reading = finder.measure(&scene, &motion, 1, 1).unwrap();
-        // Over a cone of half angle a the mean of 1 / cos is 1 + a^2 / 4 to second order.
+        // Over a cone of half angle a, the mean of 1 / cos is 1 + a^2 / 4 to second order.
         let half = finder.model().fov_rad / 2.0;
         let mean_m = distance_m * (1.0 + half * half / 4.0);
         let step_m = finder.model().range_step_m;
@@ -306,7 +308,7 @@ fn a_range_finder_reports_the_mean_of_what_its_cone_sees() {
 }
 
 #[test]
-fn a_sonar_hears_the_nearest_that_faces_it() {
+fn a_sonar_measures_the_nearest_surface_that_faces_it() {
     let sonar = sonar_of("mb1242");
     let heard = |splats: &Splats, seq| {
         let scene = SensorScene::new(splats);
@@ -315,17 +317,18 @@ fn a_sonar_hears_the_nearest_that_faces_it() {
     };
     let square = heard(&wall(Vec3::X * 3.0, -Vec3::X, 2.5, 0.1), 1);
     assert!((square.range_m - 3.0).abs() <= 0.011, "{square:?}");
-    // Turned by 20 degrees the foot of the perpendicular, at 3 cos(20), is still in the cone's flank, but the echo has lost.
+    // Rotated by 20 degrees: the foot of the perpendicular, at 3 cos(20), is still at the edge of
+    // the cone, but the echo is weaker.
     let turned = heard(&wall(Vec3::X * 3.0, Quat::from_rotation_z(0.35) * -Vec3::X, 2.5, 0.1), 1);
     assert!(turned.range_m == 0.0 || turned.range_m < 3.0, "{turned:?}");
     assert!(turned.strength < 0.5 * square.strength, "{turned:?} {square:?}");
-    // At 65 degrees all is mirrored away.
+    // At 65 degrees, all sound is reflected away.
     let oblique = heard(&wall(Vec3::X * 5.0, Quat::from_rotation_z(1.13) * -Vec3::X, 1.0, 0.1), 1);
     assert_eq!(oblique.range_m, 0.0);
-    // Nearer than it can tell reads as the nearest that it can.
+    // Distances below the minimum range read as the minimum range.
     let near = heard(&wall(Vec3::X * 0.1, -Vec3::X, 0.5, 0.02), 1);
     assert!((near.range_m - 0.2).abs() < 1e-6, "{near:?}");
-    // A quarter of the power per half of the range, and two ways of air: 2 * 1.4 dB/m.
+    // A quarter of the power at twice the range, and absorption by air both ways: 2 * 1.4 dB/m.
     let (two, four) = (
         heard(&wall(Vec3::X * 2.0, -Vec3::X, 3.0, 0.1), 1).strength,
         heard(&wall(Vec3::X * 4.0, -Vec3::X, 3.0, 0.1), 1).strength,
@@ -340,12 +343,13 @@ fn radar_of(name: &str) -> RadarModel {
 }
 
 #[test]
-fn a_radar_tells_range_azimuth_and_speed_of_what_moves() {
+fn a_radar_measures_range_azimuth_and_speed_of_a_moving_object() {
     let (objects, splats) = with_object();
     let scene = SensorScene::new(Scene { splats: &splats, objects: &objects });
     let mut radar = Radar::new(radar_of("iwr6843")).unwrap();
     let mut detections = Vec::new();
-    // It comes at 2 m/s, the sensor goes at 0.5 m/s: 2.5 m/s less each second.
+    // The object approaches at 2 m/s, the sensor moves at 0.5 m/s: the distance decreases by 2.5
+    // m/s.
     let motion = SensorMotion {
         world_from_sensor: [at(DVec3::ZERO, 0.0), at(DVec3::X * 0.025, 0.0)],
         objects: &[[object_at(5.0), object_at(4.9)]],
@@ -358,7 +362,8 @@ fn a_radar_tells_range_azimuth_and_speed_of_what_moves() {
     assert!(best.azimuth_rad.abs() < 0.27, "{best:?}");
     assert!((best.speed_mps + 2.5).abs() < 0.1, "{best:?}");
     assert_eq!(best.object, 9);
-    // Along every ray the speed is that along the axis times the cosine of the azimuth and elevation; folded above 4.5 m/s.
+    // Along every ray, the speed is that along the axis times the cosines of azimuth and elevation;
+    // folded above 4.5 m/s.
     for detection in &detections {
         let along = detection.speed_mps / detection.azimuth_rad.cos();
         assert!((-2.7..-2.2).contains(&along), "{detection:?}");
@@ -366,13 +371,13 @@ fn a_radar_tells_range_azimuth_and_speed_of_what_moves() {
     let fast = SensorMotion { objects: &[[object_at(5.0), object_at(4.7)]], ..motion };
     radar.measure(&scene, &fast, 1, 1, &mut detections).unwrap();
     let best = detections.iter().max_by(|a, b| a.snr_db.total_cmp(&b.snr_db)).unwrap();
-    // 6.5 m/s towards it reads as 9 - 6.5 away from it.
+    // An approach at 6.5 m/s reads as 9 - 6.5 m/s away from the radar.
     assert!((2.4..2.8).contains(&best.speed_mps), "{best:?}");
 }
 
 #[test]
-fn what_stands_still_passes_at_the_cosine_of_its_bearing() {
-    // A wall to the left of a sensor that flies along it.
+fn static_surfaces_have_speeds_of_the_cosine_of_their_bearing() {
+    // A wall to the left of a sensor that flies parallel to it.
     let scene = SensorScene::new(&wall(Vec3::new(3.0, 2.0, 0.0), -Vec3::Y, 3.0, 0.1));
     let mut radar = Radar::new(RadarModel { threshold_db: 3.0, ..radar_of("iwr6843") }).unwrap();
     let mut detections = Vec::new();
@@ -391,8 +396,8 @@ fn what_stands_still_passes_at_the_cosine_of_its_bearing() {
 }
 
 #[test]
-fn a_target_fades_with_the_fourth_power_of_range() {
-    // One plate, smaller than every beam: its cross section is the same from everywhere.
+fn the_signal_of_a_target_falls_with_the_fourth_power_of_range() {
+    // One plate, smaller than every beam: its cross section is the same from all directions.
     let snr_db = |distance_m: f64| {
         let mut splats = Splats::default();
         add(&mut splats, Vec3::ZERO, -Vec3::X, 0.1, 1.0);
@@ -421,7 +426,7 @@ fn a_target_fades_with_the_fourth_power_of_range() {
 }
 
 #[test]
-fn presets_are_valid_and_named_once() {
+fn presets_are_valid_and_have_unique_names() {
     let mut seen = std::collections::HashSet::new();
     for (name, about, model) in PRESETS {
         assert!(seen.insert(name) && !about.is_empty(), "{name}");
@@ -440,7 +445,7 @@ fn presets_are_valid_and_named_once() {
 }
 
 #[test]
-fn an_empty_scene_no_beams_and_bad_poses_are_answered() {
+fn handles_an_empty_scene_no_beams_and_invalid_poses() {
     let nothing = SensorScene::new(&Splats::default());
     let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
     assert!(scan(exact(8), &nothing, &motion).iter().all(|p| p.range_m == 0.0));
@@ -503,9 +508,9 @@ fn poisoned_splats() -> impl Strategy<Value = Splats> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(60))]
 
-    /// Whatever a scene holds: every sensor ends, and what it reports is finite and within its range.
+    /// For any scene, every sensor returns finite readings within its range.
     #[test]
-    fn poison_makes_no_poison(splats in poisoned_splats(), x in -2.0..2.0f64, yaw in -3.0..3.0f64, seq: u64) {
+    fn reports_only_finite_values(splats in poisoned_splats(), x in -2.0..2.0f64, yaw in -3.0..3.0f64, seq: u64) {
         let scene = SensorScene::new(&splats);
         let motion = SensorMotion {
             world_from_sensor: [at(DVec3::X * x, yaw), at(DVec3::Y * x, yaw)],

@@ -1,59 +1,62 @@
-//! Splats packed for rays: eight to a leaf, eight boxes to a node. Made once per part of a scene, in one pass over it.
+//! Tree of splats for ray casting: eight splats per leaf, eight boxes per node. It is built once
+//! per part of a scene, in one pass.
 //!
-//! The tree is built from the top: a node's widest child is split by the surface area heuristic over bins (Wald 2007, "On fast
-//! construction of SAH-based bounding volume hierarchies") until the node has eight.
+//! The tree is built top-down: the widest child of a node is split by the surface area heuristic
+//! over bins (Wald 2007, "On fast construction of SAH-based bounding volume hierarchies") until the
+//! node has eight children.
 
 use glam::{Mat3, Quat, Vec3};
 use half::f16;
 
 use crate::{Splats, harmonics};
 
-/// Boxes of a node, splats of a leaf: the lanes of a vector.
+/// Boxes per node and splats per leaf: the lanes of a vector.
 pub(super) const WIDTH: usize = 8;
-/// Marks a child that is a leaf.
+/// Flag of a child that is a leaf.
 pub(super) const LEAF: u32 = 1 << 31;
-/// A child that is not there.
+/// Unused child.
 pub(super) const NONE: u32 = u32::MAX;
-/// Thinner splats count as this thin: f32 cannot follow a ray of 100 m more exactly. [m]
+/// Minimum thickness of a splat: at a range of 100 m, f32 does not resolve less. [m]
 const MIN_SCALE_M: f32 = 1e-4;
-/// Larger ones count as this large: half precision ends there. [m]
+/// Maximum size of a splat: the limit of half precision. [m]
 const MAX_SCALE_M: f32 = 6e4;
 
-/// A node: the boxes of its children, as middles and half sides.
+/// Node: the boxes of its children, as centres and half sides.
 #[derive(Clone, Debug)]
 pub(super) struct Node {
     pub(super) center_m: [[f32; WIDTH]; 3],
     pub(super) half_m: [[f32; WIDTH]; 3],
-    /// Index of a node, or with [`LEAF`] of a leaf; [`NONE`].
+    /// Index of a node, or of a leaf with [`LEAF`]; or [`NONE`].
     pub(super) children: [u32; WIDTH],
 }
 
-/// Eight Gaussians, number by number, half of them in half precision: 240 bytes, for what a ray waits for is memory. Places that are
-/// not filled have the level minus infinity.
+/// Eight Gaussians as a structure of arrays, partly in half precision: 240 bytes, because ray
+/// casting is limited by memory. Unused places have the level minus infinity.
 #[derive(Clone, Debug)]
 pub(super) struct Leaf {
     pub(super) mean_m: [[f32; WIDTH]; 3],
-    /// Unit quaternion from the Gaussian's axes, of which the thinnest is the last; xyzw. [f16]
+    /// Unit quaternion from the axes of the Gaussian, of which the last is the thinnest; xyzw.
+    /// [f16]
     pub(super) rotation: [[u16; WIDTH]; 4],
     /// Standard deviations along those axes. [m, f16]
     pub(super) scale_m: [[u16; WIDTH]; 3],
     /// log2 of the opacity. [f16]
     pub(super) level: [u16; WIDTH],
-    /// Share of light that comes back, 0 to 255.
+    /// Share of light that is reflected, 0 to 255.
     pub(super) reflectivity: [u8; WIDTH],
-    /// How much of a disc it is: 255 where it has a normal, 0 where its two thinnest axes are alike.
+    /// Flatness: 255 for a disc with a normal, 0 if the two thinnest axes are equal.
     pub(super) flatness: [u8; WIDTH],
 }
 
-/// The splats of one part of a scene.
+/// Tree of one part of a scene.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Tree {
-    /// The root first; none where there is nothing to see.
+    /// Nodes, the root first; empty if there are no visible splats.
     pub(super) nodes: Vec<Node>,
     pub(super) leaves: Vec<Leaf>,
 }
 
-/// One splat, and the box within which it counts.
+/// Splat, and the box within which it is relevant.
 struct Item {
     low_m: Vec3,
     high_m: Vec3,
@@ -61,7 +64,7 @@ struct Item {
 }
 
 impl Tree {
-    /// Packs splats; those that no image would show either are left out, as renderers do.
+    /// Packs splats. Invisible splats are dropped, as in the renderers.
     pub(super) fn new(splats: &Splats) -> Self {
         let mut items: Vec<Item> = crate::blocks::order(splats)
             .into_iter()
@@ -69,7 +72,7 @@ impl Tree {
                 let i = index as usize;
                 let axes = rotated_scales(splats, i);
                 let deviations = reach(splats.opacities[i]);
-                // The box of an ellipsoid: the length of each row of its square root.
+                // Bounding box of an ellipsoid: the length of each row of its square root.
                 let half_m = (axes.x_axis * axes.x_axis
                     + axes.y_axis * axes.y_axis
                     + axes.z_axis * axes.z_axis)
@@ -86,7 +89,7 @@ impl Tree {
         tree
     }
 
-    /// Adds the node over `items`, and returns its index.
+    /// Adds a node for `items`, and returns its index.
     fn add_node(&mut self, splats: &Splats, items: &mut [Item]) -> u32 {
         let index = self.nodes.len();
         self.nodes.push(Node {
@@ -97,7 +100,7 @@ impl Tree {
         let ranges = ranges(items);
         for (place, &Range { start, end, .. }) in ranges.iter().enumerate() {
             let (low, high) = bounds(&items[start..end]);
-            // Halved before they are added: no sum overflows. Widened by their own rounding.
+            // Halved before addition, so that no sum overflows. Widened by the rounding error.
             let center = low * 0.5 + high * 0.5;
             let half = (high * 0.5 - low * 0.5) + center.abs() * 1e-6 + Vec3::splat(1e-6);
             for axis in 0..3 {
@@ -133,7 +136,8 @@ impl Leaf {
             let i = item.index as usize;
             let axes = Mat3::from_quat(splats.rotations[i].normalize());
             let scales = clamped(splats.scales_m[i]).to_array();
-            // The thinnest axis last; the first by the others, so that it stays a rotation.
+            // The thinnest axis is last; the first follows from the others, so that the matrix
+            // stays a rotation.
             let mut order = [0, 1, 2];
             order.sort_by(|&a, &b| scales[b].total_cmp(&scales[a]));
             let [_, middle, thinnest] = order;
@@ -149,18 +153,19 @@ impl Leaf {
             leaf.level[lane] = half(splats.opacities[i].log2());
             let constant = &splats.sh[i * numbers..i * numbers + 3];
             leaf.reflectivity[lane] = byte(reflectivity([constant[0], constant[1], constant[2]]));
-            // A third as thick as wide is a disc.
+            // A disc is at most a third as thick as wide.
             leaf.flatness[lane] = byte((1.5 * (1.0 - scales[thinnest] / scales[middle])).min(1.0));
         }
         leaf
     }
 }
 
-/// Where a splat hides less, a beam takes no notice of it. Images go down to 1/255, for what 8 bits show; a range does not change by
-/// it, a surface of splats loses a twentieth of its opacity, and boxes have half the area.
+/// Minimum alpha of a splat that a beam detects. Images use 1/255, the step of 8 bits. For ranges,
+/// this higher limit makes no difference; a surface of splats loses a twentieth of its opacity, and
+/// boxes have half the area.
 pub(super) const LEAST_ALPHA: f32 = 0.05;
 
-/// Returns the standard deviations at which an opacity falls below [`LEAST_ALPHA`].
+/// Returns the number of standard deviations at which an opacity falls below [`LEAST_ALPHA`].
 fn reach(opacity: f32) -> f32 {
     (2.0 * (opacity / LEAST_ALPHA).ln().max(0.0)).sqrt()
 }
@@ -174,8 +179,9 @@ fn rotated_scales(splats: &Splats, i: usize) -> Mat3 {
     Mat3::from_quat(rotation) * Mat3::from_diagonal(clamped(splats.scales_m[i]))
 }
 
-/// Returns the share of light that comes back from a splat of this colour: its luminance (ITU-R BT.709) in linear light, of
-/// what a camera sees, light and shadow included, at least that of soot. What near infrared would see is not known.
+/// Returns the share of light that a splat of this colour reflects: its luminance (ITU-R BT.709) in
+/// linear light as seen by a camera, including light and shadow, and at least that of soot. The
+/// reflectivity in near infrared is unknown.
 pub(super) fn reflectivity(constant: [f32; 3]) -> f32 {
     let linear = constant.map(|c| {
         let shown = (0.5 + harmonics::C0 as f32 * c).clamp(0.0, 1.0);
@@ -191,7 +197,7 @@ fn bounds(items: &[Item]) -> (Vec3, Vec3) {
     })
 }
 
-/// A range of a node's items that becomes a child, and half the surface of the box around it.
+/// Range of a node's items that becomes a child, and half the surface of its bounding box.
 #[derive(Clone, Copy)]
 struct Range {
     start: usize,
@@ -200,16 +206,17 @@ struct Range {
 }
 
 impl Range {
-    /// Returns how many leaves it fills.
+    /// Returns the number of leaves that it fills.
     fn leaves(&self) -> usize {
         (self.end - self.start).div_ceil(WIDTH)
     }
 }
 
-/// Sorts a node's items into at most eight ranges, one a child.
+/// Sorts the items of a node into at most eight ranges, one per child.
 ///
-/// What a ray pays for is nodes and leaves, however empty. So ranges of more than a node of leaves are split first, the widest
-/// before others; one that is less than that is split into its leaves if all of them find a place, else left whole.
+/// The cost of a ray is the number of nodes and leaves, even if they are nearly empty. Ranges with
+/// more leaves than a node holds are therefore split first, the widest before others. A smaller
+/// range is split into its leaves if all of them find a place; otherwise it is not split.
 fn ranges(items: &mut [Item]) -> Vec<Range> {
     let mut ranges = vec![Range { start: 0, end: items.len(), area: area(items) }];
     loop {
@@ -234,7 +241,8 @@ fn ranges(items: &mut [Item]) -> Vec<Range> {
     }
 }
 
-/// Returns half the surface of the box around all; large scenes overflow to infinity, which compares.
+/// Returns half the surface of the bounding box. For very large scenes it overflows to infinity,
+/// which can still be compared.
 fn area(items: &[Item]) -> f32 {
     let (low, high) = bounds(items);
     half_surface(high - low)
@@ -244,8 +252,8 @@ fn half_surface(side: Vec3) -> f32 {
     side.x * side.y + side.y * side.z + side.z * side.x
 }
 
-/// Sorts more items than a leaf's to both sides of the plane that costs least, and returns how many are before it; never none
-/// nor all.
+/// Sorts the items, more than one leaf of them, to both sides of the plane with the lowest cost.
+/// Returns the number of items before the plane, which is at least one and less than all.
 fn split(items: &mut [Item]) -> usize {
     const BINS: usize = 16;
     let middle = |item: &Item| item.low_m * 0.5 + item.high_m * 0.5;
@@ -299,10 +307,11 @@ fn split(items: &mut [Item]) -> usize {
     }
     let leaves = items.len().div_ceil(WIDTH);
     if leaves > WIDTH {
-        // All in one place, or beyond f32: halves do.
+        // All items are in one place, or beyond f32: split into halves.
         return if count == 0 || count == items.len() { items.len() / 2 } else { count };
     }
-    // Leaves are full but for the last: the plane moves to the nearest place that keeps them so.
+    // All leaves except the last are full: the plane moves to the nearest position that ensures
+    // this.
     let full = ((count + WIDTH / 2) / WIDTH).clamp(1, leaves - 1) * WIDTH;
     items.select_nth_unstable_by(full, |a, b| middle(a)[axis].total_cmp(&middle(b)[axis]));
     full

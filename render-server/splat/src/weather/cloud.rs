@@ -1,10 +1,11 @@
-//! Smoke, dust and patchy fog: air of a density that differs from place to place and drifts.
+//! Smoke, dust and patchy fog: air of spatially varying density that drifts.
 //!
-//! Light is lost along a ray as Beer and Lambert have it: `exp(-k * integral of density)` is left, and what is
-//! lost comes from the cloud's own colour. Density is value noise of three octaves that drift apart, with a mean
-//! of 1, so that `k` is what a mist of the same mass everywhere would have. The integral is taken on a coarse
-//! grid of rays ahead of the camera, at depths that are denser near it, and is linear between (Wronski, Volumetric
-//! Fog, SIGGRAPH 2014): exact where the density is the same everywhere.
+//! Light is attenuated along a ray by the Beer-Lambert law: `exp(-k * integral of density)`
+//! remains, and is replaced by the colour of the cloud. Density is value noise of three octaves
+//! that drift apart, with a mean of 1, so that `k` is the extinction of a uniform mist of the same
+//! mass. The integral is computed on a coarse grid of rays in front of the camera, at depths that
+//! are denser near it, with linear interpolation (Wronski, Volumetric Fog, SIGGRAPH 2014). It is
+//! exact for uniform density.
 
 use glam::{DVec3, Mat3, Vec3};
 use rayon::prelude::*;
@@ -13,71 +14,72 @@ use super::random::{Random, mix, unit};
 use super::rays::Rays;
 use crate::Camera;
 
-/// A cloud in the scene.
+/// Cloud in the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cloud {
-    /// How much light is lost on the way, on average: `exp(-k d)` is left. [1/m]
+    /// Mean extinction: `exp(-k d)` of the light remains after a distance d. [1/m]
     pub per_m: f32,
-    /// What it looks like where it hides everything, as display values.
+    /// Colour where the cloud is opaque, as display values.
     pub color: [f32; 3],
-    /// 0 is the same density everywhere, 1 leaves gaps of clear air.
+    /// Variation of the density: 0 is uniform, 1 leaves gaps of clear air.
     pub patchiness: f32,
     /// Size of the largest patches. [m]
     pub patch_m: f32,
-    /// How it moves. [m/s, world]
+    /// Velocity of the drift. [m/s, world]
     pub drift_mps: Vec3,
-    /// From which height up to which it lies, with soft borders; everywhere without. [m, world]
+    /// Lowest and highest height, with soft borders; unlimited if `None`. [m, world]
     pub layer_m: Option<[f32; 2]>,
-    /// It ends there, softly; nowhere without.
+    /// Ball that contains the cloud, with a soft border; unlimited if `None`.
     pub ball: Option<Ball>,
 }
 
-/// A ball that a cloud does not leave.
+/// Ball that limits a cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ball {
-    /// Its centre. [m, world]
+    /// Centre of the ball. [m, world]
     pub center_m: DVec3,
-    /// Its radius. [m]
+    /// Radius of the ball. [m]
     pub radius_m: f32,
 }
 
 impl Cloud {
-    /// Whether there is clear air behind it.
+    /// Returns whether the cloud is limited, with clear air behind it.
     pub(super) fn is_bounded(&self) -> bool {
         self.layer_m.is_some() || self.ball.is_some()
     }
 }
 
-/// Depths at which the integral is known.
+/// Number of depths at which the integral is stored.
 pub(super) const EDGES: usize = SLICES + 1;
 const SLICES: usize = 24;
-/// Beyond, the air is that of the last slice. [m, cam]
+/// Depth beyond which the density is that of the last slice. [m, cam]
 const FAR_M: f32 = 30.0;
-/// Side of the noise's lattice, which repeats.
+/// Side of the noise lattice, which is periodic.
 const SIDE: usize = 32;
-/// The octaves: frequency, weight, and how they drift besides the cloud's own drift, in patches a second: a cloud that
-/// only moved along would not change.
+/// Octaves: frequency, weight, and drift in addition to that of the cloud, in patches per second.
+/// Without the additional drift, the cloud would move without changing its shape.
 const OCTAVES: [(f32, f32, [f32; 3]); 3] = [
     (1.0, 0.55, [0.0, 0.0, 0.0]),
     (2.03, 0.30, [0.05, -0.03, 0.06]),
     (4.01, 0.15, [-0.07, 0.06, 0.11]),
 ];
-/// Noise that is this far from its mean of one half is a gap, or twice the mean density.
+/// Deviation of the noise from its mean of one half at which the density is zero, or twice the
+/// mean.
 const CONTRAST: f32 = 0.14;
-/// A layer's borders are this much of its thickness to either side.
+/// Half width of a layer's soft border, as a share of its thickness.
 const SOFT: f32 = 0.25;
 
-/// A cloud as one camera sees it, at one instant.
+/// Integrals of a cloud for one camera at one instant.
 #[derive(Debug, Default)]
 pub(super) struct CloudPass {
     seed: Option<u64>,
     lattice: Vec<f32>,
-    /// Integral of the density over z, for each corner of the rays' cells at each of [`EDGES`].
+    /// Integral of the density over z, for each corner of the ray grid at each of [`EDGES`].
     integral: Vec<f32>,
 }
 
 impl CloudPass {
-    /// Integrates along the rays of a camera.
+    /// Integrates the density along the rays of a camera.
     pub(super) fn follow(
         &mut self,
         cloud: &Cloud,
@@ -114,7 +116,8 @@ impl CloudPass {
         });
     }
 
-    /// Writes the integrals of a row of pixels at the columns of the rays' corners, [`EDGES`] each.
+    /// Writes the integrals for a row of pixels at the columns of the ray grid, [`EDGES`] for each
+    /// column.
     pub(super) fn write_row(&self, rays: &Rays, y: usize, table: &mut [f32]) {
         let (row, down) = rays.row_at(y);
         let length = rays.columns * EDGES;
@@ -125,7 +128,8 @@ impl CloudPass {
     }
 }
 
-/// Returns the integral over z down to a depth, and all of it, between two columns of a row's table.
+/// Returns the integral over z up to a depth, and the total integral, interpolated between two
+/// columns of a row's table.
 #[inline]
 pub(super) fn integral_at(pair: &[f32], across: f32, z_m: f32) -> (f32, f32) {
     let slice = ((z_m * (1.0 / FAR_M)).sqrt() * SLICES as f32) as usize;
@@ -136,7 +140,7 @@ pub(super) fn integral_at(pair: &[f32], across: f32, z_m: f32) -> (f32, f32) {
     (near + (far - near) * along, column(SLICES))
 }
 
-/// One over each slice's thickness. [1/m]
+/// Inverse thickness of each slice. [1/m]
 const PER_M: [f32; SLICES] = {
     let mut per_m = [0.0; SLICES];
     let mut slice = 0;
@@ -147,22 +151,23 @@ const PER_M: [f32; SLICES] = {
     per_m
 };
 
-/// Denser near the camera, where patches are large in the image.
+/// Returns the depth of an edge. Edges are denser near the camera, where patches are large in the
+/// image.
 #[inline]
 const fn edge_m(edge: usize) -> f32 {
     let share = edge as f32 * (1.0 / SLICES as f32);
     FAR_M * share * share
 }
 
-/// The density around a camera.
+/// Density around a camera.
 struct Field<'a> {
     lattice: &'a [f32],
     patchiness: f32,
-    /// Of each octave: where the camera is on the lattice, and cells a metre.
+    /// For each octave: position of the camera on the lattice, cells per metre, and weight.
     octaves: [(Vec3, f32, f32); 3],
     camera_z_m: f32,
     layer_m: Option<[f32; 2]>,
-    /// From the camera. [m, world]
+    /// Centre relative to the camera, and radius. [m, world]
     ball: Option<(Vec3, f32)>,
 }
 
@@ -187,7 +192,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Returns the density at an offset from the camera [m, world]; 1 on average within the cloud.
+    /// Returns the density at an offset from the camera [m, world]. The mean within the cloud is 1.
     fn at(&self, offset_m: Vec3) -> f32 {
         let mut density = 1.0;
         if let Some([bottom_m, top_m]) = self.layer_m {
@@ -212,7 +217,7 @@ impl<'a> Field<'a> {
         density
     }
 
-    /// Returns the lattice's value between its points.
+    /// Returns the interpolated value of the lattice.
     fn noise(&self, at: Vec3) -> f32 {
         let whole = |x: f32| {
             let cut = x as i32;
@@ -240,11 +245,11 @@ impl<'a> Field<'a> {
     }
 }
 
-/// 0 up to 0, 1 from 1 on, smooth between.
+/// Smoothstep: 0 up to 0, 1 from 1 on, smooth in between.
 pub(super) fn smooth(t: f32) -> f32 {
     let t = t.clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// Keeps the cloud's numbers apart from those of other effects.
+/// Separates the random numbers of the cloud from those of other effects.
 const SALT: u64 = 0xc10d;

@@ -1,20 +1,21 @@
-//! `exp(-x)` of few instructions that vectorise: the same bits on every machine, as no library is asked.
+//! `exp(-x)` of few vectorisable instructions, with the same bits on every machine because no
+//! library is called.
 
-/// Returns `exp(-x)` within 4e-7 of it, for `x` from 0 on; 0 from 80 on, NaN for NaN.
+/// Returns `exp(-x)` with an error below 4e-7, for non-negative `x`; 0 above 80, NaN for NaN.
 #[inline(always)]
 pub(super) fn exp_neg(x: f32) -> f32 {
-    // 2^(whole + rest), the rest within half: the sum's lowest bits are the whole number.
+    // 2^(whole + rest), with |rest| <= 1/2. The lowest bits of the sum are the whole number.
     let power =
         if x > 80.0 { -80.0 * std::f32::consts::LOG2_E } else { x * -std::f32::consts::LOG2_E };
     let rounded = power + ROUND;
     let rest = power - (rounded - ROUND);
     let whole = f32::from_bits((rounded.to_bits().wrapping_add(127)) << 23);
-    // Taylor's series of 2^rest; the next term is 2e-8 at most.
+    // Taylor series of 2^rest; the next term is at most 2e-8.
     let series = TERMS.iter().rev().fold(0.0, |sum, term| sum * rest + term);
     if x > 80.0 { 0.0 } else { whole * series }
 }
 
-/// Powers of the logarithm of 2 over factorials.
+/// Powers of ln 2 over factorials.
 const TERMS: [f32; 7] = [
     1.0,
     std::f32::consts::LN_2,
@@ -24,7 +25,7 @@ const TERMS: [f32; 7] = [
     0.001_333_355_8,
     0.000_154_035_3,
 ];
-/// 1.5 * 2^23: a number added to it loses its fraction.
+/// 1.5 * 2^23: adding it to a number rounds off the fraction.
 const ROUND: f32 = 12_582_912.0;
 
 #[cfg(test)]

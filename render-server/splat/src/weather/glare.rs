@@ -1,48 +1,53 @@
-//! A low sun: the light that a lens scatters over the image where the sun shines into it.
+//! Glare of a low sun: light that a lens scatters over the image.
 //!
-//! Scattered light at an angle t (degrees) from a source is `10 / t³ + 5 / t²` of its light (CIE 146:2002, disability
-//! glare of the eye, without age), times how much worse or better the lens is. How much of the sun is seen follows
-//! from what is rendered: it shines where nothing is, and where nothing is nearer than it.
+//! The light scattered at an angle t (degrees) from a source is `10 / t³ + 5 / t²` of its light
+//! (CIE 146:2002, disability glare of the eye, without the age term), times a factor for the
+//! quality of the lens. The visible share of the sun follows from the rendered image: the sun is
+//! visible where there is no surface, or where the surface is farther than a given distance.
 
 use glam::{DVec2, DVec3, Vec3};
 
 use super::cloud::smooth;
 use crate::{Camera, RgbdImage};
 
-/// The sun, or any lamp far away.
+/// Sun, or any distant lamp.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sun {
-    /// Where it is, of length 1. [world]
+    /// Unit vector towards the sun. [world]
     pub direction: DVec3,
-    /// Light that is scattered, against an eye's; a clean lens scatters less, a wet one more.
+    /// Scattered light relative to that of an eye. A clean lens scatters less, a wet one more.
     pub glare: f32,
-    /// Its colour: red, green, blue; 1 is white.
+    /// Colour: red, green, blue; 1 is white.
     pub color: [f32; 3],
-    /// What is this far away hides it not: the picture of a sky, or of what lies behind a window. [m]
+    /// Distance from which surfaces do not hide the sun, for images of a sky or of the space behind
+    /// a window. [m]
     pub behind_m: f32,
 }
 
-/// Where it stands in an image, and how much of it is seen.
+/// Direction and visible strength of the sun in an image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Glare {
     direction_cam: Vec3,
-    /// Per channel, as light.
+    /// Strength per channel, in linear light.
     strength: [f32; 3],
 }
 
-/// Half of the sun's width in the sky. [deg]
+/// Angular radius of the sun. [deg]
 const DISC_DEG: f32 = 0.27;
-/// Light is looked for this far from the sun's middle: a tree's branch does not switch it off. [rad]
+/// Radius around the sun's centre that is sampled for occlusion, so that a branch of a tree does
+/// not switch it off. [rad]
 const LOOK_RAD: f64 = 0.02;
-/// What is this much farther than `behind_m` hides nothing at all: the sun does not go out at once.
+/// Range beyond `behind_m` over which surfaces fade to not hiding the sun, as a share of
+/// `behind_m`, to avoid an abrupt change.
 const FADE: f32 = 0.25;
-/// Looked at across that.
+/// Samples across that area.
 const LOOKS: i32 = 9;
-/// It fades this far outside of the image: a hood keeps it from the lens. [share of the image]
+/// Range outside the image in which the glare fades, because a hood keeps the sun off the lens.
+/// [share of the image]
 const OUTSIDE: f64 = 0.25;
 
 impl Glare {
-    /// Returns nothing where the sun is not seen.
+    /// Returns the glare, or `None` if the sun is not visible.
     pub(super) fn of(sun: &Sun, camera: &Camera, image: &RgbdImage) -> Option<Self> {
         let k = &camera.intrinsics;
         let direction_cam = camera.world_from_cam.rotation.inverse() * sun.direction;
@@ -56,10 +61,10 @@ impl Glare {
         (share > 0.0).then(|| Self { direction_cam: direction_cam.as_vec3(), strength })
     }
 
-    /// Adds its light to a row of pixels.
+    /// Adds the scattered light to a row of pixels.
     pub(super) fn add_to_row(&self, [sx, sy, norm]: [&[f32]; 3], rgb: &mut [f32]) {
         let Vec3 { x, y, z } = self.direction_cam;
-        // 2 (1 - cos t) is the square of t within 1 % up to 20 degrees, and grows slower beyond.
+        // 2 (1 - cos t) equals t² within 1 % up to 20 degrees, and grows more slowly beyond.
         let deg2 = 2.0 * (180.0 / std::f32::consts::PI) * (180.0 / std::f32::consts::PI);
         for (((&sx, &sy), &norm), rgb) in sx.iter().zip(sy).zip(norm).zip(rgb.chunks_exact_mut(3)) {
             let cos = (sx * x + sy * y + z) / norm;
@@ -74,7 +79,7 @@ impl Glare {
     }
 }
 
-/// Returns the share of places around one at which nothing hides the sun.
+/// Returns the share of samples around `center` at which no surface hides the sun.
 fn seen_at(center: DVec2, behind_m: f32, half_px: f64, image: &RgbdImage) -> f32 {
     let (width, height) = (i64::from(image.width_px), i64::from(image.height_px));
     let (mut seen, mut looked) = (0.0, 0.0);
@@ -91,7 +96,7 @@ fn seen_at(center: DVec2, behind_m: f32, half_px: f64, image: &RgbdImage) -> f32
             looked += 1.0;
             let far = smooth((image.depth_median_m[pixel] / behind_m - 1.0) / FADE);
             let open = 1.0 - image.alpha[pixel];
-            // Positive, so that what is no number hides it.
+            // The comparison is false for NaN, so NaN hides the sun.
             seen += if open > far { open.min(1.0) } else { far };
         }
     }

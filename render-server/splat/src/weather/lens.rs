@@ -1,4 +1,5 @@
-//! Drops on the lens: each shows its surroundings upside down, out of focus, for some seconds, and some run off.
+//! Drops on the lens. Each shows its surroundings upside down and out of focus, for some seconds;
+//! some run off.
 
 use glam::Vec2;
 use rayon::prelude::*;
@@ -6,16 +7,16 @@ use rayon::prelude::*;
 use super::cloud::smooth;
 use super::random::Random;
 
-/// A drop on the lens, where it is at one instant.
+/// Drop on the lens at one instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct LensDrop {
     center_px: Vec2,
     radius_px: f32,
-    /// How much of it there is: it comes and goes.
+    /// Opacity; the drop fades in and out.
     opacity: f32,
 }
 
-/// The image before the drops, small.
+/// Downscaled image without drops, and its buffers.
 #[derive(Debug, Default)]
 pub(super) struct LensPass {
     columns: usize,
@@ -24,20 +25,22 @@ pub(super) struct LensPass {
     drops: Vec<LensDrop>,
 }
 
-/// Side of a pixel of the small image. [px of the image]
+/// Size of a pixel of the downscaled image. [px of the image]
 const SMALL: usize = 8;
-/// Radii, as shares of the image's height: drops of 1 to 4 mm before a small lens, out of focus.
+/// Minimum and maximum radius, as shares of the image's height: drops of 1 to 4 mm in front of a
+/// small lens, out of focus.
 const RADII: [f32; 2] = [0.025, 0.085];
-/// How long a drop stays. [s]
+/// Minimum and maximum lifetime of a drop. [s]
 const LIFE_S: [f64; 2] = [3.0, 9.0];
-/// Of the drops, so many run off at their end, by this much of the height.
+/// Share of the drops that run off at the end of their life, and the distance as a share of the
+/// image's height.
 const RUNNING: f32 = 0.4;
 const RUN: f32 = 0.35;
-/// What a drop shows of the image's height across its own.
+/// Section of the image that a drop shows, as a share of the image's height.
 const VIEW: f32 = 0.55;
 
 impl LensPass {
-    /// Draws the drops of an instant.
+    /// Draws the drops at an instant.
     pub(super) fn draw(
         &mut self,
         count: u32,
@@ -69,16 +72,16 @@ impl LensPass {
         for x in from..to {
             let across = (x as f32 + 0.5 - drop.center_px.x) / drop.radius_px;
             let square = across * across + down * down;
-            // Out of focus: its border is soft.
+            // Soft border, because the drop is out of focus.
             let opacity = drop.opacity * smooth((1.0 - square.sqrt()) * 1.8);
             if opacity <= 0.0 {
                 continue;
             }
-            // The steeper its surface, the farther to the other side it looks.
+            // A steeper surface refracts to a point farther on the other side.
             let bend = (0.6 + 0.4 * square) * VIEW * height as f32;
             let at = drop.center_px - Vec2::new(across, down) * bend;
             let seen = self.sample(at);
-            // The border shows what is outside of the image, and reflects some of it.
+            // The border shows surroundings outside the image, and reflects some light.
             let shade = 1.06 - 0.45 * square * square;
             for c in 0..3 {
                 let value = &mut row[3 * x + c];
@@ -87,7 +90,7 @@ impl LensPass {
         }
     }
 
-    /// Averages blocks of pixels; what is no number counts as black.
+    /// Downscales the image by averaging blocks of pixels. Non-finite values count as black.
     fn shrink(&mut self, [width, height]: [usize; 2], rgb: &[f32]) {
         (self.columns, self.rows) = (width.div_ceil(SMALL), height.div_ceil(SMALL));
         self.small.resize(self.columns * self.rows, [0.0; 3]);
@@ -113,7 +116,7 @@ impl LensPass {
         });
     }
 
-    /// Returns the small image at a place of the large one.
+    /// Samples the downscaled image at a position of the full-size image.
     fn sample(&self, at_px: Vec2) -> [f32; 3] {
         let most = Vec2::new((self.columns - 1) as f32, (self.rows - 1) as f32);
         let at = (at_px / SMALL as f32 - 0.5).clamp(Vec2::ZERO, most);
@@ -129,7 +132,7 @@ impl LensPass {
     }
 }
 
-/// Returns where the drop of a place in the list is, one after another.
+/// Returns the current drop of a slot. A slot holds one drop after another.
 fn drop_at(index: u32, seed: u64, at_s: f64, [width, height]: [usize; 2]) -> LensDrop {
     let mut of_place = Random::of(seed ^ SALT, [index.into(), 0, 0, 0]);
     let life_s = LIFE_S[0] + f64::from(of_place.unit()) * (LIFE_S[1] - LIFE_S[0]);
@@ -148,5 +151,5 @@ fn drop_at(index: u32, seed: u64, at_s: f64, [width, height]: [usize; 2]) -> Len
     LensDrop { center_px, radius_px, opacity }
 }
 
-/// Keeps the drops' numbers apart from those of other effects.
+/// Separates the random numbers of the drops from those of other effects.
 const SALT: u64 = 0x1e45;

@@ -1,9 +1,11 @@
-//! Lamps, the vehicle's own light and flicker: how much more light a surface gets than the scene's own.
+//! Lamps, the vehicle's own light and flicker: gain of surface colours relative to the light of the
+//! scene.
 //!
-//! A display value's square is taken for light (sRGB's curve is within 0.04 of it), so that a surface in `e` times the
-//! light of the capture besides `l`, what is left of that light, shows `c sqrt(l² + e)` for `c` of the capture. Light falls off
-//! with the square of the distance. Lamps throw no shadows and shine on surfaces from any side: a scene of splats
-//! has no normals to speak of.
+//! The square of a display value is taken as light (the sRGB curve differs by at most 0.04). A
+//! surface receives a share `l` of the capture's light, and `e` times that light from lamps. It is
+//! displayed as `c sqrt(l² + e)`, if `c` is its value in the capture. Light falls off with the
+//! square of the distance. Lamps cast no shadows and light surfaces from any side, because a scene
+//! of splats has no reliable normals.
 
 use glam::{DVec3, Mat3, Vec3};
 
@@ -13,56 +15,56 @@ use crate::{Atmosphere, Camera};
 /// Lamps in the scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lamps {
-    /// How far from one its light is that of the capture. [m]
+    /// Distance from a lamp at which its light equals that of the capture. [m]
     pub reach_m: f32,
-    /// Their colour: red, green, blue; 1 is the capture's.
+    /// Colour: red, green, blue; 1 is that of the capture.
     pub color: [f32; 3],
-    /// Where they are.
+    /// Positions of the lamps.
     pub places: LampPlaces,
 }
 
-/// Where lamps are.
+/// Positions of lamps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum LampPlaces {
-    /// At one height, on a square grid through the origin. [m, world]
+    /// Lamps at one height, on a square grid through the origin. [m, world]
     Grid {
-        /// [m, world]
+        /// Height of the lamps. [m, world]
         height_m: f32,
-        /// From one to the next. [m]
+        /// Distance between neighbouring lamps. [m]
         spacing_m: f32,
     },
-    /// These; what is not a number is no lamp. [m, world]
+    /// Single lamps; NaN is an unused entry. [m, world]
     At([DVec3; MAX_LAMPS]),
 }
 
-/// Lamps at places of their own, at most.
+/// Maximum number of single lamps.
 pub const MAX_LAMPS: usize = 8;
 
-/// A light beside each camera that shines along its axis.
+/// Light next to each camera that shines along the camera's axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OwnLight {
-    /// How far ahead its light is that of the capture. [m]
+    /// Distance ahead at which the light equals that of the capture. [m]
     pub reach_m: f32,
-    /// Its colour: red, green, blue; 1 is the capture's.
+    /// Colour: red, green, blue; 1 is that of the capture.
     pub color: [f32; 3],
-    /// Cosine of the angle from its axis up to which it shines; half as much at the border.
+    /// Cosine of the half angle of the cone; at its border, the light is half as bright.
     pub cos_cone: f32,
 }
 
-/// Nearer to a lamp it is no brighter: the size of a lamp with its shade. [m]
+/// Distance below which a lamp does not get brighter: the size of a lamp with its shade. [m]
 const LAMP_SIZE_M: f32 = 0.3;
-/// An own light's cone ends softly, over this much of its cosine to either side.
+/// Half width of the soft border of the own light's cone, in units of the cosine.
 const CONE_SOFT: f32 = 0.06;
-/// Scenes that are darker than this can get no lamps: their colours are gone.
+/// Minimum light of a scene for lamps. Colours of darker scenes cannot be recovered.
 pub const LEAST_LIGHT: f32 = 0.02;
 
 /// All light of one image.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Illumination {
-    /// Lamps, from the camera. [m, world]
+    /// Lamps, and their positions relative to the camera. [m, world]
     lamps: Option<(Lamps, [Vec3; MAX_LAMPS])>,
     own: Option<OwnLight>,
-    /// Per channel, what light of a lamp is to that of the scene.
+    /// Light of a lamp relative to that of the scene, per channel.
     lamp_share: [f32; 3],
     own_share: [f32; 3],
     world_from_cam: Mat3,
@@ -96,8 +98,8 @@ impl Illumination {
         }
     }
 
-    /// Returns what a colour in the light of the scene is to be multiplied by, at a place [m, cam], where that light is
-    /// `flicker` of its mean.
+    /// Returns the gain of a colour at a position [m, cam], if the light of the scene is `flicker`
+    /// times its mean.
     #[inline]
     pub(super) fn gain(&self, p_cam_m: Vec3, flicker: f32) -> [f32; 3] {
         let lamps = self.lamps.as_ref().map_or(0.0, |lamps| self.of_lamps(lamps, p_cam_m));
@@ -116,7 +118,7 @@ impl Illumination {
         match lamps.places {
             LampPlaces::Grid { height_m, spacing_m } => {
                 let p_m = self.camera_m + offset_m;
-                // The nearest lamp of the grid, and the next to it along each axis: four around the place.
+                // The four nearest lamps of the grid: the nearest and the next along each axis.
                 let nearest = |x_m: f32| {
                     let cells = x_m / spacing_m;
                     let off_m = (cells - ((cells + ROUND) - ROUND)) * spacing_m;
@@ -133,7 +135,7 @@ impl Illumination {
             LampPlaces::At(_) => {
                 let light = |lamp_m: &Vec3| {
                     let light = of((*lamp_m - offset_m).length_squared());
-                    // Comparisons with no number are false: no lamp.
+                    // The comparison is false for NaN: an unused entry.
                     if lamp_m.x < f32::INFINITY { light } else { 0.0 }
                 };
                 offsets_m.iter().map(light).sum()
@@ -141,7 +143,8 @@ impl Illumination {
         }
     }
 
-    /// Lights a row of pixels; `z_m` is how deep each one's surface is [m, cam], the last two are scratch.
+    /// Lights a row of pixels. `z_m` is the depth of each pixel's surface [m, cam]. The last two
+    /// slices are scratch memory.
     pub(super) fn light_row(
         &self,
         [sx, sy, norm, z_m]: [&[f32]; 4],
@@ -177,7 +180,8 @@ impl Illumination {
                 rgb.chunks_exact_mut(3).zip(lights).zip(depths)
             {
                 let gain = self.gain_in(lamps, own, flicker);
-                // What of the colour is the fog before the surface has the scene's light alone.
+                // The part of the colour that is fog in front of the surface receives only the
+                // scene's light.
                 let hidden = 1.0 - super::exp::exp_neg(fog_per_m * z_m * norm);
                 for c in 0..3 {
                     let veil = fog[c] * hidden;
@@ -194,7 +198,7 @@ impl Illumination {
         }
     }
 
-    /// Returns the gain in so much light of lamps and of the vehicle's own.
+    /// Returns the gain, given the light of the lamps and of the vehicle.
     #[inline]
     fn gain_in(&self, lamps: f32, own: f32, flicker: f32) -> [f32; 3] {
         [0, 1, 2].map(|c| {
@@ -203,7 +207,7 @@ impl Illumination {
     }
 }
 
-/// Returns the own light at a distance [m] and at an angle from its axis by its cosine.
+/// Returns the own light at a distance [m] and at the cosine of an angle from its axis.
 #[inline]
 fn of_own(own: &OwnLight, distance_m: f32, cos: f32) -> f32 {
     let square = (distance_m * distance_m).max(LAMP_SIZE_M * LAMP_SIZE_M);
@@ -211,10 +215,10 @@ fn of_own(own: &OwnLight, distance_m: f32, cos: f32) -> f32 {
     own.reach_m * own.reach_m / square * within
 }
 
-/// 1.5 * 2^23: a number added to it loses its fraction.
+/// 1.5 * 2^23: adding it to a number rounds off the fraction.
 const ROUND: f32 = 12_582_912.0;
 
-/// How lights flicker at one instant, row by row.
+/// Flicker of the light at one instant, row by row.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RowLight {
     pub(super) flicker: Option<Flicker>,

@@ -1,21 +1,23 @@
-//! Weather and light: what lies and shines between a scene and a camera, over any renderer's image.
+//! Weather and light between a scene and a camera, applied to the image of any renderer.
 //!
 //! ```text
 //! image (RGB, alpha, depth), camera, instant, seed, weather -> the image in that weather
 //!   rays      slopes of a coarse grid of pixels        cloud     integrals of density along them
-//!   light     lamps, own light, flicker, on surfaces   rain snow particles   streaks of those near enough
-//!   per row:  light -> cloud and veil by depth -> streaks before what is behind them -> glare
-//!   lens      drops on the lens, over all of it
+//!   light     lamps, own light, flicker, on surfaces   rain snow particles   streaks of near ones
+//!   per row:  light -> cloud and veil by depth -> streaks in front of farther surfaces -> glare
+//!   lens      drops on the lens, over the complete image
 //! ```
-//! A function of its arguments: the same bits for any number of threads and, as no library's exponential is asked
-//! per pixel, for any kind of processor. Both renderers make the image, so neither knows of it. It knows depths, not
-//! splats: of what is half transparent it takes the mean depth.
+//! The result depends only on the arguments. It has the same bits for any number of threads and any
+//! kind of processor, because no library's exponential is called per pixel. The pass is applied
+//! after rendering, so both renderers are independent of it. It uses depths instead of splats: for
+//! half-transparent surfaces, the mean depth.
 //!
-//! Perfect depth, alpha and ids stay as they are; with [`Weather::depth_loss`] a depth camera's returns are lost in what
-//! takes light, there and back: with probability `1 - exp(-2 k d)`.
+//! Perfect depth, alpha and ids are unchanged. With [`Weather::depth_loss`], a depth camera loses
+//! returns in absorbing air, on the way there and back: with probability `1 - exp(-2 k d)`.
 //!
-//! Budget on two cores, 320x240: 1 ms for a cloud, 1 ms for rain or snow, 0.3 ms for light. It is bounded by pixels, the
-//! cloud's 30 k places of noise, and 8 k particles in view at most. Nothing is allocated once every buffer was used.
+//! Budget on two cores, 320x240: 1 ms for a cloud, 1 ms for rain or snow, 0.3 ms for light. Cost is
+//! bounded by the pixels, the cloud's 30 k samples of noise, and at most 8 k particles in view.
+//! Nothing is allocated once every buffer was used.
 
 mod cloud;
 mod exp;
@@ -48,20 +50,20 @@ use particles::{ParticlePass, Scene};
 use rays::Rays;
 use rows::{RowPass, Rows};
 
-/// What lies and shines between a scene and its cameras, besides [`crate::Atmosphere`].
+/// Weather and light between a scene and its cameras, in addition to [`crate::Atmosphere`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weather {
-    /// How long a shutter is open: streaks and flicker. [s]
+    /// Exposure time, for streaks and flicker. [s]
     pub exposure_s: f32,
-    /// Whether depth cameras lose returns in what takes light.
+    /// Whether depth cameras lose returns in absorbing air.
     pub depth_loss: bool,
-    /// Smoke, dust, patchy fog.
+    /// Cloud of smoke, dust or patchy fog.
     pub cloud: Option<Cloud>,
-    /// Rain.
+    /// Rain in the air and on the lens.
     pub rain: Option<Rain>,
-    /// Snow.
+    /// Snow in the air.
     pub snow: Option<Snow>,
-    /// A low sun.
+    /// Low sun that causes glare.
     pub sun: Option<Sun>,
     /// Lamps in the scene.
     pub lamps: Option<Lamps>,
@@ -72,7 +74,7 @@ pub struct Weather {
 }
 
 impl Weather {
-    /// Nothing.
+    /// Clear weather: images are unchanged.
     pub const CLEAR: Self = Self {
         exposure_s: 0.005,
         depth_loss: false,
@@ -85,13 +87,13 @@ impl Weather {
         flicker: None,
     };
 
-    /// Whether images stay as they are.
+    /// Returns whether images are unchanged.
     pub fn is_clear(&self) -> bool {
         let Self { depth_loss, exposure_s, .. } = *self;
         *self == Self { exposure_s, ..Self::CLEAR } && !depth_loss
     }
 
-    /// Returns how much light rain and snow take together. [1/m]
+    /// Returns the total extinction by rain and snow. [1/m]
     fn veil_per_m(&self) -> f32 {
         let rain = self.rain.map_or(0.0, |rain| rain.extinction_per_m());
         let snow = self.snow.map_or(0.0, |snow| snow.extinction_per_m());
@@ -105,18 +107,18 @@ impl Default for Weather {
     }
 }
 
-/// The moment of an image.
+/// Instant of an image, with the motion of the camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Moment {
-    /// The instant that it shows, of any clock. [ns]
+    /// Instant of the image, on any clock. [ns]
     pub at_ns: i64,
-    /// How the camera moves. [m/s, world]
+    /// Velocity of the camera. [m/s, world]
     pub v_world_mps: DVec3,
-    /// What is where by chance: the same for all images of a flight.
+    /// Seed of random positions: the same for all images of a flight.
     pub seed: u64,
 }
 
-/// Puts weather into images; keeps buffers between them.
+/// Applies weather to images, and reuses its buffers.
 #[derive(Debug, Default)]
 pub struct WeatherPass {
     rays: Rays,
@@ -127,10 +129,10 @@ pub struct WeatherPass {
 }
 
 impl WeatherPass {
-    /// Puts `weather` into the image that `camera` has of a scene.
+    /// Applies `weather` to the image that `camera` has of a scene.
     ///
     /// # Panics
-    /// If the image is not of the camera's size.
+    /// If the size of the image differs from that of the camera.
     pub fn apply(
         &mut self,
         weather: &Weather,
@@ -183,7 +185,7 @@ impl WeatherPass {
         }
     }
 
-    /// Lets drops and flakes fall, in the light there is.
+    /// Computes the streaks of drops and flakes, lit by the scene and its lamps.
     fn fall(
         &mut self,
         weather: &Weather,
@@ -220,18 +222,20 @@ impl WeatherPass {
     }
 }
 
-/// Groups of particles.
+/// Groups of particles, which select their random numbers and colours.
 const RAIN: u32 = 0;
 const SNOW: u32 = 1;
-/// A drop shows all that is around it, of which the brightest part, a sky or lamps, is above the camera's view: five
-/// times the light of the image's mean, as a display value.
+/// Brightness of a drop relative to the image's mean, as a display value: five times the light. A
+/// drop shows its complete surroundings, of which the brightest part (sky or lamps) is above the
+/// view of the camera.
 const DROP_BRIGHTNESS: f32 = 2.24;
-/// Fresh snow, as a display value in the capture's light.
+/// Display value of fresh snow in the light of the capture.
 const FLAKE_WHITE: f32 = 0.92;
-/// A sensor is saturated at 1; a streak that is brighter shows before a dark wall.
+/// Maximum display value of a streak. A sensor is saturated at 1; a brighter streak is visible in
+/// front of a dark wall.
 const BRIGHTEST: f32 = 1.5;
 
-/// Returns the mean colour of some pixels of an image; what is no number does not count.
+/// Returns the mean colour of a sample of pixels. Non-finite pixels are ignored.
 fn mean_of(image: &RgbdImage) -> [f32; 3] {
     let (mut sum, mut count) = (Vec3::ZERO, 0.0);
     for pixel in image.rgb.chunks_exact(3).step_by(97) {

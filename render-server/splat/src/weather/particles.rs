@@ -1,9 +1,10 @@
-//! Drops and flakes one by one: where they are, and the streaks that they leave while the shutter is open.
+//! Single drops and flakes: their positions, and the streaks that they leave during the exposure.
 //!
-//! Those of one kind (size and way) fall together, and so does a lattice of cells that they are drawn in: a cell's
-//! number says what is in it, so that there are as many as there should be, everywhere, nothing is kept, and each moves
-//! on by its speed times the time. Of each kind those are drawn that are near enough to change an image by
-//! [`LEAST`]; what is farther is part of the air's extinction.
+//! Particles of one kind (size and direction) move together, and so does the lattice of cells that
+//! they are generated in. The index of a cell seeds its particles, so the density is correct
+//! everywhere, no state is stored, and each particle moves by its velocity times the time.
+//! Particles of a kind are drawn up to the distance at which they change an image by [`LEAST`];
+//! farther ones are part of the air's extinction.
 
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -12,59 +13,59 @@ use super::random::Random;
 use super::rays::Rays;
 use crate::Camera;
 
-/// Particles of one size that go one way.
+/// Particles of one size and direction.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ParticleKind {
-    /// [m]
+    /// Diameter. [m]
     pub(super) diameter_m: f64,
-    /// How many there are.
+    /// Number density. [1/m³]
     pub(super) per_m3: f64,
-    /// How they move. [m/s, world]
+    /// Velocity. [m/s, world]
     pub(super) v_world_mps: DVec3,
 }
 
-/// What one particle leaves in an image.
+/// Streak of one particle in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Streak {
-    /// Where it is when the shutter opens. [px]
+    /// Position at the start of the exposure. [px]
     pub(super) from_px: Vec2,
-    /// And when it closes. [px]
+    /// Position at the end of the exposure. [px]
     pub(super) to_px: Vec2,
-    /// Its diameter. [px]
+    /// Diameter of the particle. [px]
     pub(super) width_px: f32,
     /// Depth. [m, cam]
     pub(super) z_m: f32,
-    /// What it looks like.
+    /// Colour, as display values.
     pub(super) color: [f32; 3],
 }
 
-/// Less opaque than this is not drawn: half of the least step of a byte, before a dark wall.
+/// Minimum opacity of a drawn streak: half of the step of a byte, in front of a dark wall.
 const LEAST: f32 = 0.006;
-/// Nearer, a particle is out of focus for any lens. [m]
+/// Minimum distance of a drawn particle. Nearer ones are out of focus for any lens. [m]
 const NEAR_M: f32 = 0.12;
-/// Farther, none is drawn. [m]
+/// Maximum distance of a drawn particle. [m]
 const FARTHEST_M: f64 = 12.0;
-/// Particles in view at most; where there are more, the farthest are left to the air's extinction.
+/// Maximum particles in view. If there are more, the farthest are left to the air's extinction.
 const MOST: f64 = 8_000.0;
-/// Particles that a cell holds, about.
+/// Approximate number of particles per cell.
 const PER_CELL: f64 = 4.0;
-/// Parts of a kind that are made at once.
+/// Parts into which a kind is divided, for parallel processing.
 const PARTS: usize = 4;
 
-/// The particles before one camera, at one instant.
+/// Particles in front of one camera, at one instant.
 #[derive(Debug, Default)]
 pub(super) struct ParticlePass {
     kinds: Vec<(u32, ParticleKind)>,
-    /// [`PARTS`] of each kind.
+    /// Streaks of the parts, [`PARTS`] for each kind.
     parts: Vec<Vec<Streak>>,
 }
 
-/// A camera among particles.
+/// Camera among particles.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Scene<'a> {
     pub(super) camera: &'a Camera,
     pub(super) rays: &'a Rays,
-    /// How the camera moves. [m/s, world]
+    /// Velocity of the camera. [m/s, world]
     pub(super) v_world_mps: DVec3,
     pub(super) exposure_s: f64,
     pub(super) at_s: f64,
@@ -72,18 +73,19 @@ pub(super) struct Scene<'a> {
 }
 
 impl ParticlePass {
-    /// Forgets the kinds.
+    /// Removes all kinds and streaks.
     pub(super) fn clear(&mut self) {
         self.kinds.clear();
         self.parts.iter_mut().for_each(Vec::clear);
     }
 
-    /// Adds kinds; `group` keeps the numbers of rain and snow apart.
+    /// Adds kinds. `group` separates the random numbers of rain and snow.
     pub(super) fn add(&mut self, group: u32, kinds: impl Iterator<Item = ParticleKind>) {
         self.kinds.extend(kinds.map(|kind| (group, kind)));
     }
 
-    /// Makes the streaks; `color` says what a particle of a group looks like at a place [m, cam].
+    /// Computes the streaks. `color` returns the colour of a particle, given its group and position
+    /// [m, cam].
     pub(super) fn fall(&mut self, scene: &Scene<'_>, color: impl Fn(u32, Vec3) -> [f32; 3] + Sync) {
         let parts = self.kinds.len() * PARTS;
         self.parts.resize_with(parts.max(self.parts.len()), Vec::new);
@@ -106,29 +108,29 @@ impl ParticlePass {
         });
     }
 
-    /// Returns all streaks, always in the same order.
+    /// Returns all streaks in a fixed order.
     pub(super) fn streaks(&self) -> impl Iterator<Item = &Streak> {
         self.parts.iter().flatten()
     }
 }
 
-/// Returns how opaque a particle is at a depth. [m, cam]
+/// Returns the opacity of a particle's streak at a depth. [m, cam]
 fn opacity_at(kind: &ParticleKind, scene: &Scene<'_>, z_m: f64) -> f32 {
     let px = scene.camera.intrinsics.fx_px / z_m;
     let way_m = (kind.v_world_mps - scene.v_world_mps).length() * scene.exposure_s;
     opacity((kind.diameter_m * px) as f32, (way_m * px) as f32)
 }
 
-/// Returns the opacity of a streak, so that over its area, which is no narrower than a pixel, it takes as much light as
-/// the particle does: that of a disc. [px]
+/// Returns the opacity of a streak. Summed over the streak's area, which is at least a pixel wide,
+/// it equals the area of the particle's disc. [px]
 fn opacity(width_px: f32, length_px: f32) -> f32 {
     let half = 0.5 * width_px.max(1.0);
-    // Of a round end whose border is a ramp a pixel wide.
+    // Area of a round end with a linear border of one pixel.
     let ends = std::f32::consts::PI * (half * half + 1.0 / 12.0);
     std::f32::consts::FRAC_PI_4 * width_px * width_px / (2.0 * half * length_px + ends)
 }
 
-/// Returns how far away a kind is drawn. [m]
+/// Returns the distance up to which a kind is drawn. [m]
 fn reach_m(kind: &ParticleKind, scene: &Scene<'_>) -> f64 {
     let mut reach_m = FARTHEST_M;
     while opacity_at(kind, scene, reach_m) < LEAST && reach_m > f64::from(NEAR_M) {
@@ -137,24 +139,24 @@ fn reach_m(kind: &ParticleKind, scene: &Scene<'_>) -> f64 {
     reach_m
 }
 
-/// Returns the volume that a camera sees up to a distance. [m³]
+/// Returns the volume of a camera's view up to a distance. [m³]
 fn view_m3(scene: &Scene<'_>, reach_m: f64) -> f64 {
     let slopes = (scene.rays.high - scene.rays.low).min(Vec2::splat(4.0)).as_dvec2();
     slopes.x * slopes.y * reach_m.powi(3) / 3.0
 }
 
-/// The cells of one kind before a camera.
+/// Cells of one kind in front of a camera.
 struct Cells<'a> {
     kind: &'a ParticleKind,
     scene: &'a Scene<'a>,
     reach_m: f32,
     side_m: f64,
-    /// How far the lattice has moved. [m, world]
+    /// Displacement of the lattice. [m, world]
     moved_m: DVec3,
     from: [i64; 3],
     to: [i64; 3],
     cam_from_world: Mat3,
-    /// Of a particle, while the shutter is open. [m, cam]
+    /// Displacement of a particle during the exposure. [m, cam]
     way_cam_m: Vec3,
 }
 
@@ -188,14 +190,15 @@ impl<'a> Cells<'a> {
         }
     }
 
-    /// Draws one part of them: that of `numbers`, which also keep kinds apart.
+    /// Computes the streaks of one part. `numbers` are kind and part; the kind is included in the
+    /// random seed.
     fn draw(&self, numbers: [i64; 2], color: impl Fn(Vec3) -> [f32; 3], streaks: &mut Vec<Streak>) {
         streaks.clear();
         let [kind, part] = numbers;
         let (from, to) = (self.from, self.to);
         let camera_m = self.scene.camera.world_from_cam.translation_m;
         let side_m = self.side_m as f32;
-        // Around a cell's middle.
+        // Radius of a sphere around the centre of a cell.
         let radius_m = 0.87 * side_m + self.way_cam_m.length();
         let expected = self.kind.per_m3 * self.side_m.powi(3);
         for x in (from[0]..=to[0]).filter(|x| x.rem_euclid(PARTS as i64) == part) {
@@ -252,8 +255,9 @@ impl<'a> Cells<'a> {
 }
 
 impl Streak {
-    /// Calls `pixel` with column, row and opacity of every pixel of rows `rows` that it touches. All opacities add up to the
-    /// area of the particle's disc: light is neither made nor lost, however long the streak.
+    /// Calls `pixel` with column, row and opacity of every pixel in rows `rows` that the streak
+    /// touches. The sum of all opacities is the area of the particle's disc, so light is conserved
+    /// for any length of the streak.
     pub(super) fn draw(&self, columns: i32, rows: [i32; 2], mut pixel: impl FnMut(i32, i32, f32)) {
         let half = 0.5 * self.width_px.max(1.0);
         let border = half + 0.5;
@@ -271,7 +275,7 @@ impl Streak {
         let opacity = opacity(self.width_px, length);
         let along = if length > 1e-3 { way / length } else { Vec2::Y };
         let middle = 0.5 * (self.from_px + self.to_px);
-        // Its middle moves by this much from row to row.
+        // Shift of the streak's centre from row to row.
         let slant = along.x / along.y.abs().max(0.05) * along.y.signum();
         for y in top..bottom {
             let down = y as f32 + 0.5 - middle.y;

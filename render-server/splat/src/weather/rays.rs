@@ -1,33 +1,35 @@
-//! Where each pixel looks: slopes on a coarse grid, linear in between, so that a lens costs no more than a pinhole.
+//! Directions of the pixels: slopes on a coarse grid with linear interpolation, so that a distorted
+//! lens costs no more than a pinhole.
 
 use glam::{DVec2, Vec2};
 use vizflyt_protocol::geometry::Intrinsics;
 
-/// The directions of one camera's pixels.
+/// Directions of the pixels of one camera.
 #[derive(Debug, Default)]
 pub(super) struct Rays {
     of: Option<Intrinsics>,
     /// Side of a cell. [px]
     pub(super) cell_px: usize,
-    /// Corners of cells across.
+    /// Number of corners per row.
     pub(super) columns: usize,
-    /// Corners of cells down.
+    /// Number of rows of corners.
     pub(super) rows: usize,
     /// `(x / z, y / z)` at the corners, row-major. [cam]
     pub(super) slopes: Vec<Vec2>,
-    /// Least of them.
+    /// Minimum of the slopes.
     pub(super) low: Vec2,
-    /// Greatest of them.
+    /// Maximum of the slopes.
     pub(super) high: Vec2,
 }
 
-/// Cells across an image at most: their corners' work is then the same for images of any size.
+/// Maximum cells across an image, so that the cost of their corners is the same for images of any
+/// size.
 const MOST_CELLS: usize = 40;
-/// Less is no cheaper than every pixel. [px]
+/// Minimum size of a cell. Smaller cells are not cheaper than single pixels. [px]
 const LEAST_CELL_PX: usize = 8;
 
 impl Rays {
-    /// Takes another camera over, if it is another.
+    /// Recomputes the grid if the intrinsics differ from those of the previous call.
     pub(super) fn follow(&mut self, k: &Intrinsics) {
         if self.of == Some(*k) {
             return;
@@ -43,7 +45,7 @@ impl Rays {
         for row in 0..self.rows {
             for column in 0..self.columns {
                 let pixel = DVec2::new((column * self.cell_px) as f64, (row * self.cell_px) as f64);
-                // Past what the lens shows, what it shows last.
+                // Beyond the field of the lens, use the slope at its border.
                 let slope = k.slope(pixel).unwrap_or_else(|| {
                     (pixel - centre).normalize_or_zero() * k.distortion.reach().min(FLATTEST)
                 });
@@ -55,7 +57,8 @@ impl Rays {
         }
     }
 
-    /// Returns the row of corners above a row of pixels, and how far it is on the way to the next.
+    /// Returns the row of corners above a row of pixels, and the share of the distance to the next
+    /// row of corners.
     pub(super) fn row_at(&self, y: usize) -> (usize, f32) {
         ((y / self.cell_px), ((y % self.cell_px) as f32 + 0.5) / self.cell_px as f32)
     }
@@ -80,7 +83,7 @@ impl Rays {
     }
 }
 
-/// 87 degrees off the axis: what lies flatter is there, too.
+/// Maximum slope: 87 degrees off the axis. Larger slopes are clamped.
 const FLATTEST: f64 = 20.0;
 
 #[cfg(test)]
@@ -100,7 +103,7 @@ mod tests {
                     continue;
                 };
                 let found = DVec2::new(f64::from(sx[x]), f64::from(sy[x]));
-                // By the angle between them.
+                // Compare by the angle between the directions.
                 let cos = found.extend(1.0).normalize().dot(slope.extend(1.0).normalize());
                 assert!(1.0 - cos < 0.5 * within_rad * within_rad, "({x}, {y}): {found} {slope}");
             }
@@ -108,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn slopes_are_the_cameras() {
+    fn slopes_match_the_intrinsics() {
         let pinhole = Intrinsics::from_horizontal_fov(163, 121, 1.6);
         check(pinhole, 1e-5);
         check(Intrinsics::from_horizontal_fov(1, 1, 1.0), 1e-5);

@@ -1,4 +1,5 @@
-//! All that is done pixel by pixel, in bands of rows that threads share out: each band is read once and written once.
+//! Per-pixel effects, in bands of rows for parallel processing: each band is read once and written
+//! once.
 
 use core::ops::Range;
 
@@ -13,14 +14,14 @@ use super::random::{mix, unit};
 use super::rays::Rays;
 use crate::{Atmosphere, RgbdImage};
 
-/// What is done to an image.
+/// Effects to apply to an image.
 pub(super) struct Rows<'a> {
     pub(super) width: usize,
     pub(super) seed: u64,
     pub(super) atmosphere: Atmosphere,
     pub(super) rays: &'a Rays,
     pub(super) cloud: Option<(&'a CloudPass, Cloud)>,
-    /// Of rain and snow. [1/m]
+    /// Extinction by rain and snow. [1/m]
     pub(super) veil_per_m: f32,
     pub(super) illumination: Option<(Illumination, RowLight)>,
     pub(super) particles: &'a ParticlePass,
@@ -28,37 +29,38 @@ pub(super) struct Rows<'a> {
     pub(super) depth_loss: bool,
 }
 
-/// The buffers of all bands.
+/// Buffers of all bands.
 #[derive(Debug, Default)]
 pub(super) struct RowPass {
     bands: Vec<Band>,
 }
 
-/// Rows of a band.
+/// Rows per band.
 const ROWS: usize = 16;
-/// No surface is deeper. [m, cam]
+/// Maximum depth of a surface. [m, cam]
 const DEEPEST_M: f32 = 1e6;
 
-/// What is known of the pixels of one row; and, of all rows of a band, how much light depth's way takes.
+/// Values of the pixels of one row; and, for all rows of a band, the optical depth up to the
+/// surface.
 #[derive(Debug, Default)]
 struct Band {
     sx: Vec<f32>,
     sy: Vec<f32>,
     norm: Vec<f32>,
     z_m: Vec<f32>,
-    /// Integrals of the cloud's density over z, to the surface and all of it.
+    /// Integrals of the cloud's density over z: up to the surface, and total.
     near: Vec<f32>,
     all: Vec<f32>,
-    /// What is left of the light.
+    /// Transmitted share of the light.
     left: Vec<f32>,
-    /// Light of lamps, and the vehicle's own.
+    /// Light of the lamps, and of the vehicle.
     lamps: Vec<f32>,
     own: Vec<f32>,
     table: Vec<f32>,
     taken: Vec<f32>,
 }
 
-/// The rows of an image that one band has.
+/// Rows of an image in one band.
 struct BandImage<'a> {
     first_row: usize,
     rgb: &'a mut [f32],
@@ -69,7 +71,7 @@ struct BandImage<'a> {
 }
 
 impl RowPass {
-    /// Does all of it.
+    /// Applies all effects.
     pub(super) fn run(&mut self, rows: &Rows<'_>, image: &mut RgbdImage) {
         let pixels = ROWS * rows.width;
         self.bands
@@ -127,7 +129,7 @@ impl Rows<'_> {
         }
     }
 
-    /// Finds the directions of a row's pixels.
+    /// Computes the directions of a row's pixels.
     fn look_along(&self, band: &mut Band, y: usize) {
         self.rays.write_row(y, &mut band.sx, &mut band.sy);
         for ((norm, sx), sy) in band.norm.iter_mut().zip(&band.sx).zip(&band.sy) {
@@ -135,7 +137,8 @@ impl Rows<'_> {
         }
     }
 
-    /// And how deep their surfaces are; 0 where there is none.
+    /// Computes the directions of a row's pixels and the depths of their surfaces; 0 without
+    /// surface.
     fn look(&self, band: &mut Band, y: usize, expected_m: &[f32]) {
         self.look_along(band, y);
         for (z_m, &expected_m) in band.z_m.iter_mut().zip(expected_m) {
@@ -143,8 +146,8 @@ impl Rows<'_> {
         }
     }
 
-    /// Takes light of cloud, rain and snow from a row, and gives that of their own. What a pixel shows of the background is
-    /// infinitely far away.
+    /// Attenuates the light of a row by cloud, rain and snow, and adds their colours. The
+    /// background of a pixel is infinitely far away.
     fn take_light(&self, band: &mut Band, y: usize, alpha: &[f32], rgb: &mut [f32]) {
         let veil = self.atmosphere.fog;
         let Some((pass, cloud)) = &self.cloud else {
@@ -191,7 +194,7 @@ impl Rows<'_> {
         }
     }
 
-    /// Finds the cloud's integrals over z down to each pixel's depth, and all of them.
+    /// Computes the cloud's integrals over z for each pixel: up to its depth, and total.
     fn integrate(&self, band: &mut Band) {
         let Band { z_m, near, all, table, .. } = band;
         let cell = self.rays.cell_px;
@@ -206,7 +209,7 @@ impl Rows<'_> {
         }
     }
 
-    /// Notes how much light is taken on the way to each pixel's surface: an optical depth.
+    /// Stores the optical depth up to each pixel's surface.
     fn note_taken(&self, band: &mut Band, pixels: Range<usize>) {
         let homogeneous = self.veil_per_m + self.atmosphere.fog_per_m;
         let per_m = self.cloud.as_ref().map_or(0.0, |(_, cloud)| cloud.per_m);
@@ -216,7 +219,7 @@ impl Rows<'_> {
         }
     }
 
-    /// Lets returns of a depth camera be lost, there and back.
+    /// Removes random returns of a depth camera, according to the optical depth there and back.
     fn lose_returns(&self, band: &Band, image: &mut BandImage<'_>) {
         let first = image.first_row * self.width;
         for (at, &taken) in band.taken.iter().enumerate().take(image.alpha.len()) {
@@ -227,7 +230,7 @@ impl Rows<'_> {
         }
     }
 
-    /// Draws drops and flakes before what is behind them.
+    /// Draws drops and flakes that are in front of the surface.
     fn draw_particles(&self, image: &mut BandImage<'_>) {
         let (width, first) = (self.width, image.first_row as i32);
         let rows = [first, first + (image.alpha.len() / width) as i32];
@@ -235,7 +238,7 @@ impl Rows<'_> {
             streak.draw(width as i32, rows, |x, y, opacity| {
                 let pixel = (y - first) as usize * width + x as usize;
                 let surface_m = image.median_m[pixel];
-                // Nothing is infinitely far away.
+                // A pixel without surface is infinitely far away.
                 if surface_m > 0.0 && surface_m < streak.z_m {
                     return;
                 }

@@ -1,12 +1,12 @@
-//! Snow: how many flakes of which size there are, how fast they fall, and what light they take.
+//! Snow: size distribution, fall speed and extinction of flakes.
 //!
-//! - Sizes: `N(D) = N0 exp(-L D)` flakes a m³ and mm of the drop that a flake melts to, `N0 = 3800 R^-0.87`,
-//!   `L = 2.55 R^-0.48` a mm, R in mm/h of water (Gunn, Marshall, The Distribution with Size of Aggregate Snowflakes,
-//!   J. Meteor. 15, 1958).
-//! - A flake's own size: snow of diameter S mm weighs `170 / S` kg/m³ (Holroyd, J. Appl. Meteor. 10, 1971), so that
-//!   `S = sqrt(1000 D³ / 170)` mm.
-//! - Fall: `1.6 D^0.3` m/s, D in cm melted (Langleben, Q. J. R. Meteor. Soc. 80, 1954). Flakes of one size go three
-//!   ways besides, by a fifth of their fall: they sway.
+//! - Sizes: `N(D) = N0 exp(-L D)` flakes per m³ and per mm of melted diameter, `N0 = 3800 R^-0.87`,
+//!   `L = 2.55 R^-0.48` per mm, R in mm/h of water (Gunn, Marshall, The Distribution with Size of
+//!   Aggregate Snowflakes, J. Meteor. 15, 1958).
+//! - Size of a flake: snow of diameter S mm has a density of `170 / S` kg/m³ (Holroyd, J. Appl.
+//!   Meteor. 10, 1971), so that `S = sqrt(1000 D³ / 170)` mm.
+//! - Fall: `1.6 D^0.3` m/s, D in cm melted (Langleben, Q. J. R. Meteor. Soc. 80, 1954). Flakes of
+//!   one size also sway: they move in three horizontal directions at a fifth of their fall speed.
 
 use glam::{DVec2, Vec2};
 
@@ -15,15 +15,15 @@ use super::particles::ParticleKind;
 /// Snow in the air.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Snow {
-    /// How much falls, as water. [mm/h]
+    /// Precipitation rate as water. [mm/h]
     pub rate_mmph: f32,
-    /// Wind that carries it: east, north. [m/s, world]
+    /// Wind that carries the flakes: east, north. [m/s, world]
     pub wind_mps: Vec2,
 }
 
-/// Edges of the sizes that are drawn, melted. [mm]
+/// Limits of the size classes that are drawn, as melted diameter. [mm]
 const EDGES_MM: [f64; 6] = [0.5, 1.0, 1.5, 2.0, 3.0, 4.5];
-/// The ways that flakes of one size go.
+/// Number of directions in which flakes of one size move.
 const WAYS: u32 = 3;
 
 impl Snow {
@@ -35,24 +35,24 @@ impl Snow {
         3800.0 * f64::from(self.rate_mmph).powf(-0.87)
     }
 
-    /// Returns how fast a flake falls that melts to a drop. [m/s]
+    /// Returns the fall speed of a flake, given its melted diameter. [m/s]
     pub fn fall_mps(melted_mm: f64) -> f64 {
         1.6 * (0.1 * melted_mm).powf(0.3)
     }
 
-    /// Returns the diameter of a flake that melts to a drop. [mm]
+    /// Returns the diameter of a flake, given its melted diameter. [mm]
     pub fn flake_mm(melted_mm: f64) -> f64 {
         (1000.0 * melted_mm.powi(3) / 170.0).sqrt()
     }
 
-    /// Returns how much light all of its flakes take: twice their shadow's area. [1/m]
+    /// Returns the extinction by all flakes: twice the area of their shadows. [1/m]
     pub fn extinction_per_m(&self) -> f64 {
         // 2 * pi / 4 * integral of S² N(D) with S² = 1000 / 170 D³: the integral is 6 N0 / L⁴, in mm².
         let area_mm2 = 1000.0 / 170.0 * 6.0 * self.n0() / self.slope_per_mm().powi(4);
         std::f64::consts::FRAC_PI_2 * area_mm2 * 1e-6
     }
 
-    /// Returns the flakes by size and way.
+    /// Returns the flakes by size and direction.
     pub(super) fn kinds(&self) -> impl Iterator<Item = ParticleKind> {
         let (n0, slope) = (self.n0(), self.slope_per_mm());
         let wind_mps = self.wind_mps.as_dvec2();
@@ -77,13 +77,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn kinds_hold_the_snow_that_falls() {
+    fn drawn_sizes_contain_the_precipitation() {
         for rate in [1.0, 3.0] {
             let snow = Snow { rate_mmph: rate, wind_mps: Vec2::ZERO };
             let falling: f64 = snow
                 .kinds()
                 .map(|kind| {
-                    // Back to what it melts to.
+                    // Convert to melted diameter.
                     let mm = (0.17 * (kind.diameter_m * 1e3).powi(2)).cbrt();
                     std::f64::consts::PI / 6.0 * mm.powi(3) * kind.per_m3 * -kind.v_world_mps.z
                 })
@@ -94,9 +94,10 @@ mod tests {
     }
 
     #[test]
-    fn flakes_fall_at_a_metre_a_second_and_hide_what_is_far() {
+    fn fall_speed_and_visibility_are_plausible() {
         assert!((0.6..1.2).contains(&Snow::fall_mps(2.0)));
-        // Snow of 1 mm/h of water is "moderate": 500 to 1000 m of sight (WMO-No. 306, code table 4677).
+        // Snow of 1 mm/h of water is "moderate": 500 to 1000 m of visibility (WMO-No. 306, code
+        // table 4677).
         let snow = Snow { rate_mmph: 1.0, wind_mps: Vec2::ZERO };
         let sight_m = 50.0_f64.ln() / snow.extinction_per_m();
         assert!((300.0..1500.0).contains(&sight_m), "{sight_m}");

@@ -23,10 +23,10 @@ const EVENING: Sun =
     Sun { direction: DVec3::X, glare: 1.0, color: [1.0, 0.9, 0.7], behind_m: 50.0 };
 const TORCH: OwnLight = OwnLight { reach_m: 2.0, color: [1.0; 3], cos_cone: 0.5 };
 
-/// Looks along the world's x from 1.5 m above its origin.
+/// Returns a camera that looks along the world's x from 1.5 m above its origin.
 fn camera() -> Camera {
     let k = Intrinsics::from_horizontal_fov(WIDTH, HEIGHT, 1.57);
-    // Columns: the camera's x, y, z in the world.
+    // Columns: the x, y and z axes of the camera in the world.
     let turn = glam::DMat3::from_cols(-DVec3::Y, -DVec3::Z, DVec3::X);
     Camera::new(k, Pose::new(DVec3::new(0.0, 0.0, 1.5), DQuat::from_mat3(&turn)), 0.05)
 }
@@ -48,7 +48,7 @@ fn seen(weather: &Weather, moment: &Moment, image: &RgbdImage) -> RgbdImage {
     image
 }
 
-/// Slope of a pixel's ray, and its length per metre of depth.
+/// Returns the length of a pixel's ray per metre of depth.
 fn norm_at(pixel: usize) -> f64 {
     let (x, y) = (pixel as u32 % WIDTH, pixel as u32 / WIDTH);
     let at = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
@@ -73,7 +73,7 @@ fn everything() -> Weather {
     }
 }
 
-/// A scene with an edge, a gap through which nothing is seen, and something near.
+/// Returns an image with an edge, a gap without surface, and a near object.
 fn room() -> RgbdImage {
     let mut image = wall(0.4, 6.0);
     for pixel in 0..image.alpha.len() {
@@ -98,7 +98,7 @@ fn clear_weather_changes_nothing() {
 }
 
 #[test]
-fn air_of_one_density_takes_light_as_beer_and_lambert_have_it() {
+fn uniform_air_follows_the_beer_lambert_law() {
     for depth_m in [0.1, 1.0, 3.7, 12.0, 29.0] {
         let image =
             seen(&Weather { cloud: Some(MIST), ..Weather::CLEAR }, &MOMENT, &wall(0.5, depth_m));
@@ -113,17 +113,17 @@ fn air_of_one_density_takes_light_as_beer_and_lambert_have_it() {
 }
 
 #[test]
-fn rain_and_snow_veil_what_is_far() {
+fn rain_attenuates_light_with_distance() {
     let weather = Weather { rain: Some(Rain { lens_drops: 0, ..SHOWER }), ..Weather::CLEAR };
     let per_m = SHOWER.extinction_per_m();
-    // No drop is before a wall that is nearer than any.
+    // There are no drops in front of a wall that is nearer than any drop.
     let image = seen(&weather, &MOMENT, &wall(0.5, 0.1));
     let left = (-per_m * 0.1 * norm_at(0)).exp();
     assert!((f64::from(image.rgb[0]) - 0.5 * left).abs() < 1e-5, "black is the fog of no fog");
 }
 
 #[test]
-fn patches_have_the_mean_density_and_move_with_the_wind() {
+fn patches_have_the_mean_density_and_drift() {
     let mist = Cloud { patchiness: 1.0, patch_m: 0.8, ..MIST };
     let weather = Weather { cloud: Some(mist), ..Weather::CLEAR };
     let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
@@ -140,8 +140,8 @@ fn patches_have_the_mean_density_and_move_with_the_wind() {
     assert!((mean - 1.0).abs() < 0.1, "mean density {mean}");
     assert!((squares / count - mean * mean).sqrt() > 0.2, "there are gaps");
 
-    // What has drifted by 0.4 m to the left is seen as before by a camera that went along; octaves drift apart, so
-    // that it is alike and not the same.
+    // A cloud that drifted by 0.4 m looks similar to a camera that moved along. It is not
+    // identical, because octaves drift apart.
     let drifting = Cloud { drift_mps: Vec3::new(0.0, 1.0, 0.0), ..mist };
     let at = |at_ns: i64, y_m: f64| {
         let mut image = wall(0.0, 4.0);
@@ -157,14 +157,14 @@ fn patches_have_the_mean_density_and_move_with_the_wind() {
 }
 
 #[test]
-fn a_layer_and_a_ball_leave_the_rest_clear() {
+fn a_cloud_is_limited_to_its_layer_and_ball() {
     let ball = Ball { center_m: DVec3::new(3.0, 0.0, 1.5), radius_m: 0.8 };
     let cloud = Cloud { per_m: 4.0, ball: Some(ball), ..MIST };
     let image = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &MOMENT, &wall(0.5, 6.0));
     let at = |x: u32, y: u32| image.rgb[3 * (y * WIDTH + x) as usize];
     assert!(at(WIDTH / 2, HEIGHT / 2) > 0.59, "the ball hides what is behind it");
-    assert!((at(2, 2) - 0.5).abs() < 1e-4, "and nothing beside it");
-    // Nothing of it lies between the camera and what is nearer.
+    assert!((at(2, 2) - 0.5).abs() < 1e-4, "but nothing next to it");
+    // The cloud is behind surfaces that are nearer.
     let near = seen(&Weather { cloud: Some(cloud), ..Weather::CLEAR }, &MOMENT, &wall(0.5, 2.0));
     assert!((near.rgb[3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize] - 0.5).abs() < 1e-3);
     let layer = Cloud { per_m: 4.0, layer_m: Some([0.0, 0.5]), ..MIST };
@@ -193,10 +193,11 @@ fn streaks(rain: Option<Rain>, snow: Option<Snow>, moment: &Moment, k: &Intrinsi
 }
 
 #[test]
-fn drops_are_as_many_as_marshall_and_palmer_counted_and_as_long_as_they_fall() {
+fn number_and_streak_length_of_drops_match_the_distribution() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.57);
     let rain = Rain { wind_mps: Vec2::ZERO, ..SHOWER };
-    // Sizes by the width at their depth; between 0.2 and 0.32 m all are drawn, into the image's corners.
+    // The width at a known depth identifies the size. Between 0.2 and 0.32 m, all drops are drawn,
+    // even in the corners of the image.
     let (near_m, far_m) = (0.2, 0.32);
     let mut found = vec![0.0; rain.kinds().count()];
     let images = 150;
@@ -212,7 +213,7 @@ fn drops_are_as_many_as_marshall_and_palmer_counted_and_as_long_as_they_fall() {
             if inside && (near_m..far_m).contains(&f64::from(streak.z_m)) {
                 found[index] += 1.0;
             }
-            // Level, a drop's way while the shutter is open is as long as it falls.
+            // Seen horizontally, a streak is as long as the drop falls during the exposure.
             let fall_mps = -rain.kinds().nth(index).unwrap().v_world_mps.z;
             let length_m =
                 f64::from((streak.to_px - streak.from_px).length() * streak.z_m) / k.fx_px;
@@ -235,10 +236,11 @@ fn drops_are_as_many_as_marshall_and_palmer_counted_and_as_long_as_they_fall() {
 }
 
 #[test]
-fn streaks_are_as_long_as_the_way_relative_to_the_camera() {
+fn streak_length_is_the_displacement_relative_to_the_camera() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.57);
     let rain = Rain { wind_mps: Vec2::ZERO, ..SHOWER };
-    // Whoever falls with a drop sees it stand still; who flies ahead sees it come.
+    // To a camera that falls with a drop, the drop is stationary. To a camera that flies forward,
+    // drops approach.
     let mut kinds = rain.kinds();
     let falling = Moment { v_world_mps: kinds.nth(3).unwrap().v_world_mps, ..MOMENT };
     let shortest = streaks(Some(rain), None, &falling, &k)
@@ -248,7 +250,7 @@ fn streaks_are_as_long_as_the_way_relative_to_the_camera() {
     assert!(shortest < 1e-2, "{shortest}");
     let ahead = Moment { v_world_mps: DVec3::X * 20.0, ..MOMENT };
     let outward = streaks(Some(rain), None, &ahead, &k);
-    // Away from the point that it flies to, which is above the middle as drops fall.
+    // Streaks point away from the point of approach, which is above the centre because drops fall.
     let away = outward.iter().filter(|streak| {
         let from_center = streak.from_px - Vec2::new(160.0, 120.0);
         from_center.dot(streak.to_px - streak.from_px) > 0.0
@@ -257,7 +259,7 @@ fn streaks_are_as_long_as_the_way_relative_to_the_camera() {
 }
 
 #[test]
-fn a_flake_moves_on_by_its_speed_times_the_time() {
+fn a_flake_moves_by_its_velocity_times_the_time() {
     let k = Intrinsics::from_horizontal_fov(320, 240, 1.57);
     let dt_s = 0.04;
     let later = Moment { at_ns: MOMENT.at_ns + 40_000_000, ..MOMENT };
@@ -270,7 +272,7 @@ fn a_flake_moves_on_by_its_speed_times_the_time() {
     let after: Vec<DVec3> = after.iter().map(place).collect();
     let mut followed = 0;
     for streak in &before {
-        // Well within the view and the reach.
+        // Only flakes well within the view and the reach.
         let middle = (streak.from_px + streak.to_px) * 0.5;
         let inside =
             middle.cmpge(Vec2::splat(60.0)).all() && middle.cmple(Vec2::new(260.0, 180.0)).all();
@@ -290,7 +292,7 @@ fn a_flake_moves_on_by_its_speed_times_the_time() {
 }
 
 #[test]
-fn a_streak_takes_as_much_light_as_its_drop_however_long_it_is() {
+fn the_opacity_of_a_streak_does_not_depend_on_its_length() {
     for (width_px, length_px, angle) in
         [(0.3, 0.0, 0.0), (0.3, 17.0, 0.3), (0.8, 5.5, 1.2), (2.5, 30.0, 2.0), (6.0, 9.0, -1.57)]
     {
@@ -304,7 +306,7 @@ fn a_streak_takes_as_much_light_as_its_drop_however_long_it_is() {
             color: [1.0; 3],
         };
         let mut sum = 0.0;
-        // In bands, as threads do.
+        // In bands, as in parallel processing.
         for first in (0..64).step_by(16) {
             streak.draw(96, [first, first + 16], |_, y, opacity| {
                 assert!((first..first + 16).contains(&y));
@@ -317,7 +319,7 @@ fn a_streak_takes_as_much_light_as_its_drop_however_long_it_is() {
 }
 
 #[test]
-fn nothing_falls_behind_a_wall() {
+fn draws_no_particles_behind_a_wall() {
     let weather = Weather { snow: Some(FLURRY), ..Weather::CLEAR };
     let changed = |depth_m: f32| {
         let image = seen(&weather, &MOMENT, &wall(0.0, depth_m));
@@ -328,7 +330,7 @@ fn nothing_falls_behind_a_wall() {
 }
 
 #[test]
-fn the_sun_shines_where_nothing_hides_it() {
+fn surfaces_hide_the_sun() {
     let weather = Weather { sun: Some(EVENING), ..Weather::CLEAR };
     let center = 3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize;
     assert_eq!(seen(&weather, &MOMENT, &wall(0.2, 5.0)).rgb, wall(0.2, 5.0).rgb, "a wall hides it");
@@ -342,7 +344,7 @@ fn the_sun_shines_where_nothing_hides_it() {
     let value = f64::from(sky.rgb[center - 3 * (WIDTH / 2) as usize + 3 * x]);
     let scattered = value * value - 0.04;
     assert!((scattered / 0.013_75 - 1.0).abs() < 0.15, "{scattered}");
-    // Half hidden, it is half as bright.
+    // If it is half hidden, it is half as bright.
     let mut half = wall(0.0, 5.0);
     for pixel in 0..half.alpha.len() {
         if pixel as u32 % WIDTH >= WIDTH / 2 {
@@ -365,11 +367,11 @@ fn own_light_falls_with_the_square_of_the_distance() {
     let center = 3 * (HEIGHT / 2 * WIDTH + WIDTH / 2) as usize;
     for depth_m in [0.5, 1.0, 2.0, 8.0] {
         let value = seen(&weather, &MOMENT, &wall(0.1, depth_m)).rgb[center];
-        // Besides the scene's own light, which is 1.
+        // In addition to the scene's own light, which is 1.
         let added = (value / 0.1).powi(2) - 1.0;
         assert!((added / (2.0 / depth_m).powi(2) - 1.0).abs() < 2e-3, "{depth_m} m: {added}");
     }
-    // A wide image's corners are beyond its cone of 60 degrees to either side.
+    // The corners of a wide image are outside a narrow cone.
     let narrow = OwnLight { cos_cone: 0.95, ..TORCH };
     let image =
         seen(&Weather { own_light: Some(narrow), ..Weather::CLEAR }, &MOMENT, &wall(0.1, 1.0));
@@ -377,7 +379,7 @@ fn own_light_falls_with_the_square_of_the_distance() {
 }
 
 #[test]
-fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
+fn lamps_light_surfaces_near_them_also_in_the_dark() {
     let mut places = [DVec3::NAN; MAX_LAMPS];
     places[2] = DVec3::new(4.0, 0.0, 3.0);
     let lamps = Lamps { reach_m: 1.5, color: [1.0, 0.5, 0.0], places: LampPlaces::At(places) };
@@ -391,12 +393,12 @@ fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
     let distance_m = (camera().world_from_cam.transform_point(at) - places[2]).length();
     let added = (1.5 / distance_m).powi(2);
     for (channel, share) in [1.0, 0.5, 0.0].into_iter().enumerate() {
-        // The capture shows 0.5 there, of which 0.1 are left in the dark.
+        // The capture has a value of 0.5 there, of which 0.1 is left in the dark.
         let truth = 0.5 * (0.2_f64.powi(2) + added * share).sqrt();
         let value = f64::from(image.rgb[3 * pixel + channel]);
         assert!((value - truth).abs() < 1e-4, "{value} {truth}");
     }
-    // The same lamp, and three more of the grid that count here.
+    // The same lamp as part of a grid, of which three more lamps are relevant here.
     let grid = LampPlaces::Grid { height_m: 3.0, spacing_m: 4.0 };
     let mut image = wall(0.1, 4.0);
     let weather = Weather { lamps: Some(Lamps { places: grid, ..lamps }), ..Weather::CLEAR };
@@ -407,7 +409,7 @@ fn lamps_light_what_is_near_them_and_in_the_dark_as_in_the_light() {
 }
 
 #[test]
-fn depth_is_perfect_unless_its_loss_is_asked_for() {
+fn depth_is_unchanged_without_depth_loss() {
     let perfect = seen(&Weather { depth_loss: false, ..everything() }, &MOMENT, &room());
     assert_eq!(perfect.depth_median_m, room().depth_median_m);
     assert_eq!(perfect.depth_expected_m, room().depth_expected_m);
@@ -435,7 +437,7 @@ fn light_from_above(image: &mut RgbdImage) {
 }
 
 #[test]
-fn drops_on_the_lens_show_what_is_on_the_other_side_of_them() {
+fn drops_on_the_lens_show_their_surroundings_upside_down() {
     let mut image = wall(0.0, 5.0);
     light_from_above(&mut image);
     let before = image.rgb.clone();
@@ -450,7 +452,7 @@ fn drops_on_the_lens_show_what_is_on_the_other_side_of_them() {
     let soon = seen(&Weather { rain: Some(rain), ..Weather::CLEAR }, &later, &wall(0.3, 0.1));
     let moved = now.rgb.iter().zip(&soon.rgb).filter(|(a, b)| (**a - **b).abs() > 0.05).count();
     assert!(moved * 50 < now.rgb.len(), "drops stay from image to image: {moved}");
-    // A drop in the dark half sees the bright one in its lower part.
+    // A drop in the dark half shows the bright half in its lower part.
     let (mut above, mut below) = (0.0, 0.0);
     for seed in 0..60 {
         let mut image = wall(0.0, 5.0);
@@ -470,7 +472,7 @@ fn drops_on_the_lens_show_what_is_on_the_other_side_of_them() {
 }
 
 #[test]
-fn bits_do_not_depend_on_threads() {
+fn results_do_not_depend_on_the_number_of_threads() {
     let with = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| seen(&everything(), &MOMENT, &room()))
@@ -478,7 +480,7 @@ fn bits_do_not_depend_on_threads() {
     let one = with(1);
     assert_eq!(one, with(2));
     assert_eq!(one, with(5));
-    // Nor on what the pass did before.
+    // The result also does not depend on previous use of the pass.
     let mut pass = WeatherPass::default();
     let mut other = room();
     pass.apply(&everything(), &camera(), &Moment { seed: 8, at_ns: 5, ..MOMENT }, &mut other);
@@ -489,7 +491,7 @@ fn bits_do_not_depend_on_threads() {
 }
 
 #[test]
-fn what_is_no_number_stays_where_it_is() {
+fn non_finite_pixels_do_not_spread() {
     let mut image = room();
     let poison = [f32::NAN, f32::INFINITY, -f32::INFINITY, f32::MIN_POSITIVE / 2.0, -1.0];
     for (n, value) in poison.into_iter().enumerate() {
@@ -502,7 +504,7 @@ fn what_is_no_number_stays_where_it_is() {
     let found = seen(&Weather { rain, ..everything() }, &MOMENT, &image);
     let is_poison = |value: &f32| !value.is_finite();
     assert!(found.rgb.iter().filter(|value| is_poison(value)).count() <= 3 * poison.len());
-    // With drops on the lens, which average, too.
+    // Also with drops on the lens, which average pixels.
     let found = seen(&everything(), &MOMENT, &image);
     assert!(found.rgb.iter().filter(|value| is_poison(value)).count() <= 3 * poison.len());
     assert_eq!(found.alpha, image.alpha);
@@ -510,9 +512,9 @@ fn what_is_no_number_stays_where_it_is() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
-    /// Wherever a camera is, whatever its lens: no panic, and colours that a sensor can have.
+    /// For any pose and lens, the pass does not panic, and returns colours that a sensor can have.
     #[test]
-    fn any_camera_has_weather(
+    fn applies_weather_to_any_camera(
         position in prop::array::uniform3(-1e4..1e4_f64),
         turn in prop::array::uniform4(-1.0..1.0_f64),
         fov in 0.2..2.8_f64,
@@ -543,7 +545,7 @@ proptest! {
 }
 
 #[test]
-fn the_camera_of_these_tests_looks_ahead() {
+fn the_test_camera_looks_ahead() {
     let ahead = camera().world_from_cam.rotation * DVec3::Z;
     assert!((ahead - DVec3::X).length() < 1e-12);
 }

@@ -1,4 +1,4 @@
-//! The environments that have a name.
+//! Named environments.
 
 use glam::DVec3;
 
@@ -11,11 +11,11 @@ use super::{
 const NIGHT: [f64; 3] = [0.20, 0.23, 0.34];
 
 impl EnvironmentConfig {
-    /// The environments that have a name: the one table that the page, the command line and their
-    /// messages list. A new one is a row here, valid by a test.
+    /// Named environments: the one table that the page, the command line and their messages list. To add one,
+    /// add a row; a test checks it.
     ///
-    /// Light is a factor of display values: a value of 0.5 stands for a fifth of the light, 0.22 for a
-    /// thirtieth. One sees 12 m in the fog, in rooms of 11 m: the far wall is a shadow.
+    /// Light is a factor on display values: a value of 0.5 stands for a fifth of the light, 0.22 for a
+    /// thirtieth. Visibility in fog is 12 m, in rooms of 11 m: the far wall is a shadow.
     pub const NAMED: &'static [(&'static str, Self)] = &[
         ("day", Self::CLEAR),
         ("dusk", Self { light: [0.62, 0.48, 0.42], ..Self::CLEAR }),

@@ -1,4 +1,4 @@
-//! `[environment.rain]` and the others: weather and lamps, with their bounds.
+//! `[environment.rain]` and the other tables: weather and lamps, with their ranges.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -6,27 +6,27 @@ use serde::{Deserialize, Serialize};
 use super::super::validate::{ConfigError, check_number, invalid};
 use super::{EnvironmentConfig, FOG, extinction_per_m};
 
-/// `[environment.cloud]`: air whose density differs from place to place, and which drifts: smoke, dust, patchy fog.
+/// `[environment.cloud]`: drifting air of uneven density: smoke, dust, patchy fog.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CloudConfig {
-    /// How far one would see if it were spread evenly, 0.5 to 1000: 2 % of the contrast are left. [m]
+    /// Visibility if the cloud were even, 0.5 to 1000: distance at which 2 % of the contrast is left. [m]
     pub visibility_m: f64,
-    /// What it looks like where it hides everything: red, green, blue; 0 to 1.
+    /// Colour where the cloud is opaque: red, green, blue; 0 to 1.
     pub color: [f64; 3],
-    /// 0 is even, 1 leaves gaps.
+    /// Unevenness of the density: 0 is even, 1 leaves gaps.
     pub patchiness: f64,
-    /// Size of its patches, 0.2 to 100. [m]
+    /// Size of the patches, 0.2 to 100. [m]
     pub patch_m: f64,
-    /// How it drifts, up to 30. [m/s, world]
+    /// Drift velocity, up to 30. [m/s, world]
     pub drift_mps: DVec3,
-    /// From which height up to which it lies; without, everywhere. [m, world]
+    /// Lowest and highest height of the cloud; without it, all heights. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub layer_m: Option<[f64; 2]>,
-    /// Centre of the ball it fills, with `radius_m`. [m, world]
+    /// Centre of the ball that the cloud fills, with `radius_m`. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub center_m: Option<DVec3>,
-    /// Radius of that ball, 0.1 to 1000. [m]
+    /// Radius of this ball, 0.1 to 1000. [m]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub radius_m: Option<f64>,
 }
@@ -44,7 +44,7 @@ impl CloudConfig {
         radius_m: None,
     };
 
-    /// Returns its mean extinction. [1/m]
+    /// Returns the mean extinction coefficient. [1/m]
     pub fn per_m(&self) -> f64 {
         extinction_per_m(self.visibility_m)
     }
@@ -72,7 +72,7 @@ impl CloudConfig {
         if self.center_m.is_some() != self.radius_m.is_some() {
             return Err(invalid(
                 "environment.cloud",
-                "half of a ball",
+                "incomplete ball",
                 "give center_m and radius_m, or neither",
             ));
         }
@@ -92,15 +92,15 @@ impl Default for CloudConfig {
     }
 }
 
-/// `[environment.rain]`: streaks of drops that fall, and drops on the lens.
+/// `[environment.rain]`: streaks of falling drops, and drops on the lens.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RainConfig {
-    /// How much falls: 2 is light, 10 moderate, 50 a downpour; 0.1 to 200. [mm/h]
+    /// Rainfall: 2 is light, 10 moderate, 50 a downpour; 0.1 to 200. [mm/h]
     pub rate_mmph: f64,
-    /// Wind that carries it: east, north, up to 30. [m/s, world]
+    /// Wind: east, north; up to 30. [m/s, world]
     pub wind_mps: DVec2,
-    /// Drops on each lens at a time, up to 100.
+    /// Number of drops on each lens at a time, up to 100.
     pub lens_drops: u32,
 }
 
@@ -122,13 +122,13 @@ impl Default for RainConfig {
     }
 }
 
-/// `[environment.snow]`: flakes that fall.
+/// `[environment.snow]`: falling flakes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SnowConfig {
-    /// How much falls, as water: 1 is moderate, 4 heavy; 0.1 to 20. [mm/h]
+    /// Snowfall as water: 1 is moderate, 4 heavy; 0.1 to 20. [mm/h]
     pub rate_mmph: f64,
-    /// Wind that carries it: east, north, up to 30. [m/s, world]
+    /// Wind: east, north; up to 30. [m/s, world]
     pub wind_mps: DVec2,
 }
 
@@ -148,19 +148,21 @@ impl Default for SnowConfig {
     }
 }
 
-/// `[environment.sun]`: a low sun, whose light a lens scatters where it shines into it.
+/// `[environment.sun]`: a low sun, whose light scatters in the lens of a camera that looks towards it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SunConfig {
-    /// Where it stands: from x, counter-clockwise. [deg, world]
+    /// Direction of the sun: from x, counter-clockwise. [deg, world]
     pub azimuth_deg: f64,
-    /// How high, -5 to 90. [deg]
+    /// Elevation, -5 to 90. [deg]
     pub elevation_deg: f64,
-    /// Light that the lens scatters, against an eye: 0 to 10; 1 is a bare lens, 0.1 a clean one with a hood.
+    /// Light that the lens scatters, relative to a human eye: 0 to 10; 1 is a bare lens, 0.1 a clean one with a
+    /// hood.
     pub glare: f64,
-    /// Its colour: red, green, blue; 0 to 4, 1 is white.
+    /// Colour: red, green, blue; 0 to 4, 1 is white.
     pub color: [f64; 3],
-    /// What is this far away does not hide it: a sky that was captured with the scene, a window; 1 to 100000. [m]
+    /// Minimum distance of surfaces that do not hide the sun, for example a captured sky or a window; 1 to
+    /// 100000. [m]
     pub behind_m: f64,
 }
 
@@ -174,7 +176,7 @@ impl SunConfig {
         behind_m: 30.0,
     };
 
-    /// Returns where it is, of length 1. [world]
+    /// Returns the unit vector towards the sun. [world]
     pub fn direction(&self) -> DVec3 {
         let (up, level) = self.elevation_deg.to_radians().sin_cos();
         DVec2::from_angle(self.azimuth_deg.to_radians()).extend(0.0) * level + DVec3::Z * up
@@ -195,27 +197,27 @@ impl Default for SunConfig {
     }
 }
 
-/// Lamps at places of their own, at most.
+/// Maximum number of lamps in `positions_m`.
 pub const MAX_LAMPS: usize = 8;
 
-/// `[environment.lamps]`: lamps on a grid, or at places of their own.
+/// `[environment.lamps]`: lamps on a grid, or at listed positions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LampsConfig {
-    /// How far from one its light is that of the capture, 0.05 to 100. [m]
+    /// Distance from a lamp at which its light equals that of the capture, 0.05 to 100. [m]
     pub reach_m: f64,
-    /// Their colour: red, green, blue; 0 to 4, 1 is the capture's.
+    /// Colour: red, green, blue; 0 to 4, 1 is the capture's.
     pub color: [f64; 3],
-    /// How high they hang, on a square grid through the origin. [m, world]
+    /// Height of the lamps, on a square grid through the origin. [m, world]
     pub height_m: f64,
-    /// Distance from one to the next, 0.5 to 1000. [m]
+    /// Distance between neighbours on the grid, 0.5 to 1000. [m]
     pub spacing_m: f64,
-    /// Where they are instead: up to 8. [m, world]
+    /// Positions of up to 8 lamps, in place of the grid. [m, world]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub positions_m: Option<LampPositions>,
 }
 
-/// Up to [`MAX_LAMPS`] places; written as a list of `[x, y, z]`. [m, world]
+/// Up to [`MAX_LAMPS`] positions; written as a list of `[x, y, z]`. [m, world]
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<DVec3>", into = "Vec<DVec3>")]
 pub struct LampPositions {
@@ -224,7 +226,7 @@ pub struct LampPositions {
 }
 
 impl LampPositions {
-    /// Returns them.
+    /// Returns the positions. [m, world]
     pub fn places_m(&self) -> &[DVec3] {
         &self.places_m[..self.count]
     }
@@ -253,7 +255,7 @@ impl From<LampPositions> for Vec<DVec3> {
 }
 
 impl LampsConfig {
-    /// Warm lamps in a hall's ceiling.
+    /// Warm ceiling lamps in a hall.
     pub const USUAL: Self = Self {
         reach_m: 1.1,
         color: [1.0, 0.80, 0.52],
@@ -281,15 +283,15 @@ impl Default for LampsConfig {
     }
 }
 
-/// `[environment.own_light]`: a lamp on the vehicle, beside each camera and along its axis.
+/// `[environment.own_light]`: a lamp on the vehicle, next to each camera and along its axis.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OwnLightConfig {
-    /// How far ahead its light is that of the capture, 0.05 to 100. [m]
+    /// Distance ahead at which its light equals that of the capture, 0.05 to 100. [m]
     pub reach_m: f64,
-    /// Its colour: red, green, blue; 0 to 4, 1 is the capture's.
+    /// Colour: red, green, blue; 0 to 4, 1 is the capture's.
     pub color: [f64; 3],
-    /// How far from its axis it shines, 5 to 90. [deg]
+    /// Half angle of the light cone, 5 to 90. [deg]
     pub cone_deg: f64,
 }
 
@@ -310,20 +312,21 @@ impl Default for OwnLightConfig {
     }
 }
 
-/// `[environment.flicker]`: the scene's light and its lamps are on the mains.
+/// `[environment.flicker]`: flicker of the scene's light and lamps at twice the mains frequency.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FlickerConfig {
-    /// Frequency of the mains, half of the light's: 16 to 400. [Hz]
+    /// Mains frequency, half of the light's frequency: 16 to 400. [Hz]
     pub mains_hz: f64,
-    /// How far light falls and rises, as a share of its mean: 0 to 1.
+    /// Amplitude of the flicker as a share of the mean light: 0 to 1.
     pub depth: f64,
-    /// Rolling shutter: from the first row's exposure to the last one's, up to 100; 0 of a global shutter. [ms]
+    /// Rolling shutter: time from the first row's exposure to the last row's, up to 100; 0 for a global
+    /// shutter. [ms]
     pub readout_ms: f64,
 }
 
 impl FlickerConfig {
-    /// Tubes on a choke, seen by a rolling shutter.
+    /// Fluorescent tubes on a magnetic ballast, seen by a rolling shutter.
     pub const USUAL: Self = Self { mains_hz: 50.0, depth: 0.35, readout_ms: 16.0 };
 
     fn check(&self) -> Result<(), ConfigError> {
@@ -339,7 +342,7 @@ impl Default for FlickerConfig {
     }
 }
 
-/// Darker, a scene's colours are gone, and no lamp brings them back.
+/// In less light, a scene's colours are lost, and lamps cannot restore them.
 const LEAST_LIGHT: f64 = 0.02;
 
 impl EnvironmentConfig {
@@ -381,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_left_out_is_usual() {
+    fn absent_keys_take_usual_values() {
         let rain = parsed("[rain]\nrate_mmph = 3.0");
         assert_eq!(rain.rain, Some(RainConfig { rate_mmph: 3.0, ..RainConfig::USUAL }));
         assert_eq!(EnvironmentConfig { rain: None, ..rain }, EnvironmentConfig::CLEAR);
@@ -398,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn every_environment_is_read_as_it_was_written() {
+    fn every_named_environment_round_trips() {
         for (name, named) in EnvironmentConfig::NAMED {
             let text = toml::to_string(named).unwrap();
             assert_eq!(parsed(&text), *named, "{name}: {text}");
@@ -411,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_cannot_work_are_named() {
+    fn errors_name_the_invalid_key() {
         let wrong = [
             ("exposure_ms = 0", "environment.exposure_ms"),
             ("exposure_ms = nan", "environment.exposure_ms"),
@@ -449,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn the_sun_stands_where_it_is_said() {
+    fn sun_direction_follows_azimuth_and_elevation() {
         let sun = SunConfig { azimuth_deg: 90.0, elevation_deg: 30.0, ..SunConfig::USUAL };
         let expected = DVec3::new(0.0, 0.75_f64.sqrt(), 0.5);
         assert!((sun.direction() - expected).length() < 1e-12);

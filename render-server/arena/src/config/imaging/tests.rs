@@ -7,7 +7,7 @@ fn parsed(text: &str) -> Result<ImagingConfig, String> {
 }
 
 #[test]
-fn every_name_is_valid_and_as_published() {
+fn every_named_sensor_is_valid_and_matches_published_values() {
     for (name, sensor) in SENSORS {
         let config = parsed(&format!("sensor = \"{name}\"")).unwrap();
         assert_eq!(config.light_sensor(), Some(*sensor));
@@ -21,7 +21,7 @@ fn every_name_is_valid_and_as_published() {
         assert_eq!((config.depth_sensor(), config.light_sensor()), (Some(*depth), None));
         assert_eq!(config.describe(), format!("depth {name}"));
     }
-    // The data sheet's exposure of the IMX219: 706 cd/m^2 at F2.8 for 1/120 s are a fifth of full scale.
+    // The data sheet's exposure of the IMX219: 706 cd/m^2 at F2.8 for 1/120 s give a fifth of full scale.
     let config = parsed("sensor = \"imx219\"\nilluminance_lx = 2217.9\nf_number = 2.8").unwrap();
     let sensor = config.light_sensor().unwrap();
     // The data sheet's lens loses no light.
@@ -32,7 +32,7 @@ fn every_name_is_valid_and_as_published() {
         [sensor.binned(3280), sensor.binned(640), sensor.binned(320), sensor.binned(9999)],
         [1, 5, 10, 1]
     );
-    // The Azure Kinect's deviation at the end of its range is its published bound.
+    // The Azure Kinect's standard deviation at the end of its range is its published bound.
     let Some(DepthSensor::TimeOfFlight(tof)) =
         parsed("depth = { model = \"azure-kinect\" }").unwrap().depth_sensor()
     else {
@@ -45,7 +45,7 @@ fn every_name_is_valid_and_as_published() {
 }
 
 #[test]
-fn what_is_given_takes_the_presets_place() {
+fn given_values_override_the_preset() {
     let config = parsed(
         "sensor = \"ov9281\"\nexposure_ms = 4\ngain = 2\nreadout_ms = 10\nfilter = \"bayer\"\nbinning = 3\nnoise = false\n\
          depth = { model = \"tofcam-635\", modulation_mhz = 60, max_m = 2.0 }",
@@ -56,14 +56,14 @@ fn what_is_given_takes_the_presets_place() {
     assert_eq!((sensor.filter, sensor.noise, sensor.binned(320)), (FilterKind::Bayer, false, 3));
     let Some(DepthSensor::TimeOfFlight(tof)) = config.depth_sensor() else { panic!("{config:?}") };
     assert!((tof.unambiguous_m - 2.498_27).abs() < 1e-4 && tof.most_m == 2.0);
-    // And comes back from what is written.
+    // Writing and reading keeps the values.
     assert_eq!(parsed(&toml::to_string(&config).unwrap()).unwrap(), config);
     assert_eq!(parsed("").unwrap(), ImagingConfig::default());
     assert_eq!(ImagingConfig::default().describe(), "perfect");
 }
 
 #[test]
-fn mistakes_are_named_with_what_to_do() {
+fn errors_name_the_key_and_advice() {
     let refused = |text: &str, expected: &str| {
         let error = parsed(text).unwrap_err();
         assert!(error.contains(expected), "'{error}' lacks '{expected}'");
@@ -73,7 +73,7 @@ fn mistakes_are_named_with_what_to_do() {
         "imaging.sensor = \"imx999\": unknown; give one of imx219, imx477",
     );
     refused("lens = 3", "unknown field `lens`");
-    refused("vignette = 0.3", "imaging.vignette = given: it is of a sensor; name the sensor");
+    refused("vignette = 0.3", "imaging.vignette = given: needs a sensor; add sensor, one of");
     refused("sensor = \"imx219\"\ngain = 2", "give exposure_ms, or max_gain instead");
     refused(
         "sensor = \"imx219\"\nreadout_ms = -1",
@@ -87,7 +87,7 @@ fn mistakes_are_named_with_what_to_do() {
     );
     refused(
         "depth = { model = \"d435\", multipath = true }",
-        "d435 is a stereo pair, which has none",
+        "d435 is a stereo pair and does not have this key",
     );
     refused("depth = { model = \"azure-kinect\", baseline_mm = 50 }", "a time-of-flight camera");
     refused("depth = { model = \"d435\", max_m = 0 }", "imaging.depth.max_m = 0");

@@ -30,7 +30,7 @@ fn requests_are_judged_by_key_else_by_address() {
     for home in ["127.0.0.1", "::1", "::ffff:127.0.0.1"] {
         assert_eq!(judge(home, ""), Some(Viewer::Instructor));
         assert_eq!(judge(home, "other=1"), Some(Viewer::Instructor));
-        // A session that has ended is as none.
+        // An ended session counts as no session.
         assert_eq!(judge(home, "vizflyt_session=gone"), Some(Viewer::Instructor));
         assert_eq!(judged_by(&always, home, ""), None, "{home}");
         assert_eq!(judged_by(&always, home, &of(0)), Some(Viewer::Instructor));
@@ -62,7 +62,7 @@ fn keys_are_kept_made_for_new_vehicles_and_checked() {
 }
 
 proptest::proptest! {
-    /// Whatever comes as cookie or token is taken apart without a slip, and opens nothing.
+    /// Malformed cookies and tokens do not panic, and open nothing.
     #[test]
     fn malformed_cookies_open_nothing(
         text in "[ -~]{0,80}",

@@ -1,4 +1,4 @@
-//! The cameras over HTTP: read by anyone who may read the page, changed by our own page only.
+//! The cameras over HTTP: readable by all viewers of the page, changed only by this server's page.
 
 use std::sync::Arc;
 
@@ -16,7 +16,6 @@ use crate::web::http::refuse;
 use crate::web::state::{Page, vehicle};
 use crate::web::{messages, origin};
 
-/// Answers with all cameras.
 pub(in crate::web) async fn list(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
@@ -71,7 +70,7 @@ fn change(
     let before = cameras.newest();
     match apply(cameras, &body) {
         Ok(camera) => {
-            // The same again is no news.
+            // Unchanged settings are not an event.
             if !Arc::ptr_eq(&before, &cameras.newest()) {
                 vehicle.publish(EventKind::Note, &describe(&camera));
             }
@@ -84,7 +83,7 @@ fn change(
     }
 }
 
-/// Returns the camera in a line, for the page and the flight log.
+/// Returns a one-line description of the camera, for the page and the flight log.
 fn describe(camera: &CameraConfig) -> String {
     let k = camera.intrinsics();
     let lens = match k.distortion.to_wire().0 {

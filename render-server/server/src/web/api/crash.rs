@@ -1,4 +1,4 @@
-//! The crash card over HTTP: read by whoever may see the vehicle.
+//! The crash card over HTTP, for viewers that may see the vehicle.
 
 use std::sync::Arc;
 
@@ -29,7 +29,7 @@ pub(in crate::web) async fn show(
     Json(&*card).into_response()
 }
 
-/// Which picture of a moment.
+/// Kind of a crash card's image.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(in crate::web) enum CrashPicture {
@@ -37,7 +37,7 @@ pub(in crate::web) enum CrashPicture {
     Depth,
 }
 
-/// `GET /api/vehicles/V/crash/ID/CAMERA/KIND/N`: an image of a card, as long as it is the newest.
+/// `GET /api/vehicles/V/crash/ID/CAMERA/KIND/N`: an image of the newest card.
 pub(in crate::web) async fn image(
     State(page): State<Arc<Page>>,
     Path((name, id, camera, kind, number)): Path<(String, u64, usize, CrashPicture, usize)>,
@@ -53,7 +53,7 @@ pub(in crate::web) async fn image(
         Some((preview, CrashPicture::Colour)) => jpeg(&preview.colour),
         Some((preview, CrashPicture::Depth)) => jpeg(&preview.depth),
         None => {
-            (StatusCode::NOT_FOUND, "there is no such image, or another flight has failed since")
+            (StatusCode::NOT_FOUND, "image not found, or a newer flight has failed")
                 .into_response()
         }
     }

@@ -1,6 +1,5 @@
-//! Light and weather from the page: `GET /api/environment` returns those of this moment and those that have
-//! a name, `PUT /api/environment` changes them, also in flight. For the instructor alone
-//! ([`super::routes`]).
+//! Light and weather on the page: `GET /api/environment` returns the current environment and all named ones, `PUT
+//! /api/environment` changes it, also in flight. Instructor only ([`super::routes`]).
 
 use std::sync::Arc;
 
@@ -17,22 +16,21 @@ use vizflyt_arena::config::EnvironmentConfig;
 use crate::web::http::ordered;
 use crate::web::state::Page;
 
-/// The present environment, and the named ones.
+/// Current environment, and the named ones.
 #[derive(Debug, Serialize)]
 struct EnvironmentStatus {
-    /// The name of the one of this moment, if it has one.
+    /// Name of the current environment, if it has one.
     name: Option<&'static str>,
     #[serde(flatten)]
     now: EnvironmentConfig,
     names: Vec<&'static str>,
 }
 
-/// Returns the environment.
 pub(in crate::web) async fn get(State(page): State<Arc<Page>>) -> Response {
     Json(status(&page.rooms.rendering.environment.now())).into_response()
 }
 
-/// Changes it: `{"name": "night"}`, or the keys of `[environment]`.
+/// Changes the environment: `{"name": "night"}`, or the keys of `[environment]`.
 pub(in crate::web) async fn change(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -51,7 +49,7 @@ pub(in crate::web) async fn change(
             let name = environment.name().unwrap_or("the page's own");
             page.rooms.flights.note(&format!("light and weather are changed to: {name}"));
         }
-        // The same again is no news.
+        // Unchanged settings are not an event.
         Ok(false) => {}
         Err(error) => return (StatusCode::BAD_REQUEST, error.to_string()).into_response(),
     }

@@ -1,4 +1,3 @@
-//! The routes of the lab day.
 
 use std::sync::Arc;
 
@@ -25,7 +24,7 @@ use crate::web::origin;
 use crate::web::state::Page;
 use vizflyt_process::lock;
 
-/// `GET /api/lab`: the day, as far as the viewer may see it.
+/// `GET /api/lab`: the parts of the day that the viewer may see.
 pub(in crate::web) async fn show(
     State(page): State<Arc<Page>>,
     Extension(viewer): Extension<Viewer>,
@@ -34,7 +33,7 @@ pub(in crate::web) async fn show(
     (no_store, Json(LabView::of(&page, &viewer))).into_response()
 }
 
-/// `GET /api/lab/report.pdf`: the day on paper.
+/// `GET /api/lab/report.pdf`: the report of the day.
 pub(in crate::web) async fn report(State(page): State<Arc<Page>>) -> Response {
     let names: Vec<_> = page.rooms.flights.vehicles.iter().map(|v| v.name.as_str()).collect();
     let arena = page.rooms.flights.vehicles[0].arena.name.as_str();
@@ -55,12 +54,12 @@ pub(in crate::web) struct Signing {
     check: CheckId,
     /// Name of the person who signs.
     name: String,
-    /// The signature is taken back.
+    /// Whether to withdraw the signature.
     #[serde(default)]
     take_back: bool,
 }
 
-/// `POST /api/lab/sign`: a person has looked, and signs.
+/// `POST /api/lab/sign`: a person signs a check.
 pub(in crate::web) async fn sign(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -134,17 +133,17 @@ pub(in crate::web) async fn axes(
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Evidence {
-    /// The vehicle, by its name on this server.
+    /// Name of the vehicle on this server.
     pub vehicle: String,
     /// Findings about the autopilot's parameters.
     pub finding: Finding,
-    /// FENCE_* against what the arena asks for; empty if no arena was named.
+    /// FENCE_* parameters compared with the arena; empty without an arena.
     pub fence: Vec<FenceParameter>,
     /// Source of the findings.
     pub by: String,
 }
 
-/// `POST /api/lab/evidence`: takes what was found of an autopilot's parameters.
+/// `POST /api/lab/evidence`: records findings about an autopilot's parameters.
 pub(in crate::web) async fn evidence(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -182,7 +181,7 @@ pub(in crate::web) struct BookingOrder {
     vehicle: String,
 }
 
-/// `POST /api/lab/queue`: books for a team on a vehicle; a team on its own.
+/// `POST /api/lab/queue`: books a vehicle for a team. A team may book only its own vehicle.
 pub(in crate::web) async fn book(
     State(page): State<Arc<Page>>,
     Extension(viewer): Extension<Viewer>,
@@ -204,7 +203,7 @@ pub(in crate::web) async fn book(
     .await
 }
 
-/// `DELETE /api/lab/queue/{id}`: takes a booking out.
+/// `DELETE /api/lab/queue/{id}`: removes a booking.
 pub(in crate::web) async fn withdraw(
     State(page): State<Arc<Page>>,
     Path(id): Path<u64>,
@@ -296,7 +295,7 @@ pub(in crate::web) async fn formation(
     .await
 }
 
-/// `POST /api/lab/begin`: another day.
+/// `POST /api/lab/begin`: begins another day.
 pub(in crate::web) async fn begin(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     apply(&page, &headers, |page| {
         if page.rooms.flights.any_under_way() {
@@ -308,7 +307,7 @@ pub(in crate::web) async fn begin(State(page): State<Arc<Page>>, headers: Header
     .await
 }
 
-/// Does what a page of ours orders in JSON, and writes it down before it answers.
+/// Executes a JSON request of the page, and writes the change to the disk before the response.
 async fn change<T>(
     page: &Arc<Page>,
     headers: &HeaderMap,
@@ -324,7 +323,7 @@ where
     }
 }
 
-/// Does what a page of ours orders, and writes it down before it answers.
+/// Executes a request of the page, and writes the change to the disk before the response.
 async fn apply(
     page: &Arc<Page>,
     headers: &HeaderMap,
@@ -341,7 +340,7 @@ async fn apply(
     match done.await {
         Ok((Ok(said), Ok(()))) => (StatusCode::OK, said).into_response(),
         Ok((Ok(said), Err(error))) => {
-            let text = format!("{said}, but it is not on the disk: {error}; it is tried again");
+            let text = format!("{said}, but it could not be saved: {error}; retrying");
             (StatusCode::INSUFFICIENT_STORAGE, text).into_response()
         }
         Ok((Err(why), _)) => (StatusCode::CONFLICT, why).into_response(),
@@ -349,7 +348,6 @@ async fn apply(
     }
 }
 
-/// Returns the vehicle of this name.
 fn known<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<VehicleFlight>, String> {
     page.rooms.flights.vehicles.iter().find(|vehicle| vehicle.name == name).ok_or_else(|| {
         let names: Vec<_> = page.rooms.flights.vehicles.iter().map(|v| v.name.as_str()).collect();
@@ -357,7 +355,7 @@ fn known<'a>(page: &'a Page, name: &str) -> Result<&'a Arc<VehicleFlight>, Strin
     })
 }
 
-/// Longest text of evidence. [letters]
+/// Maximum length of an evidence text. [letters]
 const MAX_TEXT: usize = 2000;
-/// Parameters of a fence.
+/// Maximum number of fence parameters.
 const MAX_FENCE: usize = 16;

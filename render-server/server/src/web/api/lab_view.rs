@@ -1,4 +1,4 @@
-//! What the page of the lab day shows: all of it to the instructor, to a team its own vehicle and the queue.
+//! Data of the lab day's page: everything for the instructor; one vehicle and the queue for a team.
 
 use serde::Serialize;
 use vizflyt_protocol::messages::FlightPhase;
@@ -14,7 +14,6 @@ use crate::web::lab::{airborne, keep};
 use crate::web::state::Page;
 use vizflyt_process::lock;
 
-/// What the page shows.
 #[derive(Debug, Serialize)]
 pub(in crate::web) struct LabView {
     arena: String,
@@ -26,10 +25,10 @@ pub(in crate::web) struct LabView {
     queue: Vec<BookingView>,
     order: TakeOffOrder,
     separation_m: Option<f64>,
-    /// Of all pairs of vehicles that are seen.
+    /// Distances between all pairs of vehicles in the air.
     distances: Vec<Distance>,
     axes: Option<AxesView>,
-    /// What happened, newest first.
+    /// Log of the day, newest first.
     story: Vec<Told>,
 }
 
@@ -38,13 +37,13 @@ struct VehicleView {
     name: String,
     phase: FlightPhase,
     runtime: Option<String>,
-    /// Whose turn it is.
+    /// Team whose turn it is.
     called: Option<String>,
-    /// Who has checked in for the leaderboard.
+    /// Team that has checked in for the leaderboard.
     checked_in: Option<String>,
-    /// Every check of it and of the room is ok.
+    /// Whether all checks of the vehicle and of the room are ok.
     is_ready: bool,
-    /// Why it may not start now, by the order of take-off.
+    /// Reason why it may not start now, by the order of take-off.
     must_wait: Option<String>,
 }
 
@@ -54,7 +53,7 @@ struct CheckView {
     title: &'static str,
     how: How,
     ask: &'static str,
-    /// Empty is the room.
+    /// Name of the vehicle; empty for checks of the room.
     vehicle: String,
     state: State,
     evidence: String,
@@ -69,22 +68,22 @@ struct BookingView {
     team: String,
     vehicle: String,
     state: BookingState,
-    /// In its vehicle's queue, from 1, while it waits.
+    /// Position in the vehicle's queue, from 1, while waiting.
     place: Option<usize>,
     booked_unix_ms: u64,
     called_unix_ms: Option<u64>,
     ended_unix_ms: Option<u64>,
     passed_over: u32,
-    /// Whether the viewer may take it out.
+    /// Whether the viewer may remove it.
     is_own: bool,
 }
 
-/// How far two vehicles are apart.
+/// Distance of two vehicles.
 #[derive(Debug, Serialize)]
 struct Distance {
     first: String,
     second: String,
-    /// Between their centres. [m]
+    /// Distance between their centres. [m]
     apart_m: f64,
 }
 
@@ -196,7 +195,7 @@ fn bookings(day: &LabDay, viewer: &Viewer) -> Vec<BookingView> {
     day.queue.bookings().iter().map(view).collect()
 }
 
-/// Returns how far vehicles are apart: those in the air.
+/// Returns the distances between vehicles in the air.
 fn distances(page: &Page) -> Vec<Distance> {
     let airborne = airborne(&page.rooms);
     let name = |index: usize| page.rooms.flights.vehicles[index].name.as_str().to_owned();
@@ -220,7 +219,7 @@ fn newest(day: &LabDay) -> Vec<Told> {
     story
 }
 
-/// What happened is listed on the page up to so much; the report has all.
+/// Maximum log entries on the page; the report has all.
 const STORY_SHOWN: usize = 40;
 
 #[cfg(test)]

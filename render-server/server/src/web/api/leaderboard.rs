@@ -1,4 +1,4 @@
-//! The leaderboard over HTTP: standings for the page and the wall, and who has checked in to fly.
+//! The leaderboard over HTTP: standings for the page and the wall, and check-in of teams.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -23,35 +23,35 @@ use crate::web::origin;
 use crate::web::state::{Page, vehicle};
 use vizflyt_process::lock;
 
-/// What the page and the wall show.
+/// Data of the page and the wall.
 #[derive(Debug, Serialize)]
 struct Board {
-    /// The arena's name.
+    /// Name of the arena.
     course: String,
-    /// By official runs.
+    /// Ranking by official runs.
     official: Vec<Standing>,
-    /// By practice runs.
+    /// Ranking by practice runs.
     practice: Vec<Standing>,
-    /// By signed grades, of all projects.
+    /// Rankings by signed grades, for all projects.
     graded: Vec<GradeBoard>,
-    /// The newest runs, newest first.
+    /// Newest runs, newest first.
     newest: Vec<Run>,
-    /// Who flies, or is about to.
+    /// Vehicles that fly or are about to.
     vehicles: Vec<Flyer>,
 }
 
-/// A vehicle, and who has checked in.
+/// A vehicle, and the team that has checked in.
 #[derive(Debug, Serialize)]
 struct Flyer {
     vehicle: String,
     team: Option<String>,
     attempt: Attempt,
     phase: FlightPhase,
-    /// Since take-off, while it flies. [s]
+    /// Time since take-off, during a flight. [s]
     flight_s: Option<f64>,
 }
 
-/// `GET /api/leaderboard`: the standings of the course that is flown here.
+/// `GET /api/leaderboard`: standings of this server's course.
 pub(in crate::web) async fn show(State(page): State<Arc<Page>>) -> Response {
     let Some(board) = &page.rooms.flights.leaderboard else { return none_kept() };
     let course = page.rooms.flights.vehicles[0].arena.name.as_str().to_owned();
@@ -86,7 +86,7 @@ pub(in crate::web) async fn show(State(page): State<Arc<Page>>) -> Response {
     Json(answer).into_response()
 }
 
-/// Who checks in: a team by its token, or as the instructor sets it.
+/// Check-in of a team: by its token, or set by the instructor.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(in crate::web) struct CheckingIn {
@@ -96,7 +96,7 @@ pub(in crate::web) struct CheckingIn {
     attempt: Attempt,
 }
 
-/// `PUT /api/vehicles/V/team`: a team checks in by its token, at its vehicle ([`crate::flights::check_in`]).
+/// `PUT /api/vehicles/V/team`: a team checks in on its vehicle by its token ([`crate::flights::check_in`]).
 pub(in crate::web) async fn put(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
@@ -104,7 +104,7 @@ pub(in crate::web) async fn put(
     headers: HeaderMap,
     Json(asked): Json<CheckingIn>,
 ) -> Response {
-    // Cookies count here, so another page must not use them.
+    // Cookies may authorize this request, so pages of other sites are rejected.
     if let Err(refusal) = origin::check_navigation(&headers) {
         return refuse(&refusal);
     }
@@ -172,7 +172,7 @@ pub(in crate::web) async fn assign(
     (StatusCode::NOT_FOUND, text).into_response()
 }
 
-/// `DELETE /api/vehicles/V/team`: whoever has checked in leaves.
+/// `DELETE /api/vehicles/V/team`: checks the current team out.
 pub(in crate::web) async fn check_out(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
@@ -202,13 +202,13 @@ fn take(page: &Page, name: &str, claim: Claim<'_>, by: Option<CheckIn>) -> Respo
     let mut checked_in = lock(&vehicle.checked_in);
     if let Err(refusal) = check_in::judge(checked_in.as_ref(), claim, &flight, runtime) {
         let refused_at = vehicle.name.as_str();
-        warn!("page: {}: nobody else is checked in for {refused_at}: {refusal}", claim.from);
+        warn!("page: {}: check-in for {refused_at} rejected: {refusal}", claim.from);
         return (StatusCode::FORBIDDEN, refusal.to_string()).into_response();
     }
-    // The flight under way is whose it was at its take-off.
+    // A running flight keeps the team of its take-off.
     let text = match &by {
         Some(by) => format!("{} flies {} next: {}", by.team, vehicle.name, by.attempt.name()),
-        None => format!("nobody is checked in to fly {}", vehicle.name),
+        None => format!("no team is checked in to fly {}", vehicle.name),
     };
     *checked_in = by;
     drop(checked_in);
@@ -230,7 +230,7 @@ fn failed(error: &LeaderboardError) -> Response {
         .into_response()
 }
 
-/// Runs that the page lists.
+/// Maximum runs on the page.
 const NEWEST: usize = 20;
 
 #[cfg(test)]

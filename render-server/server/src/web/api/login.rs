@@ -1,4 +1,4 @@
-//! `/enter`, `/api/login`, `/api/logout`, `/api/session`: who the viewer is, and how that begins and ends.
+//! `/enter`, `/api/login`, `/api/logout`, `/api/session`: identification of the viewer, and its begin and end.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -23,15 +23,14 @@ use crate::web::percent::encoded;
 use crate::web::state::Page;
 use vizflyt_process::lock;
 
-/// Query of `/enter`.
 #[derive(Debug, Deserialize)]
 pub(in crate::web) struct Entering {
     #[serde(default)]
     key: String,
 }
 
-/// Exchanges a key for a cookie. Any page can send a browser here, so the browser keeps the rights that it had: a
-/// wrong key changes nothing, and a team's key has another cookie than the instructor's.
+/// Exchanges a key for a cookie. Any site can send a browser to this address, so the browser keeps its rights: a wrong
+/// key changes nothing, and a team's key is stored in another cookie than the instructor's.
 pub(in crate::web) async fn enter(
     State(page): State<Arc<Page>>,
     Query(entering): Query<Entering>,
@@ -64,22 +63,21 @@ pub(in crate::web) async fn enter(
     response
 }
 
-/// The session as the page receives it.
 #[derive(Debug, Serialize)]
 struct Standing<'a> {
     /// `instructor`, `team`, or nothing.
     role: Option<&'a str>,
-    /// The team's vehicle.
+    /// Vehicle of the team.
     vehicle: Option<&'a str>,
-    /// How it is known: `password`, `key`, or `here`, on the server's own computer.
+    /// Identification: `password`, `key`, or `here` on the server's own computer.
     by: Option<&'a str>,
-    /// What every request that changes something shows in `X-VizFlyt-Token`; none is needed `here`.
+    /// Token that every request that changes something sends in `X-VizFlyt-Token`; not required for `here`.
     token: Option<String>,
-    /// Whether there is a password to log in with.
+    /// Whether a password is set.
     password: bool,
 }
 
-/// `GET /api/session`: who the server takes the viewer for.
+/// `GET /api/session`: role of the viewer.
 pub(in crate::web) async fn standing(
     State(page): State<Arc<Page>>,
     ConnectInfo(from): ConnectInfo<SocketAddr>,
@@ -149,7 +147,7 @@ pub(in crate::web) async fn login(
     if attempt.password.len() > MAX_BYTES {
         return (StatusCode::UNAUTHORIZED, WRONG).into_response();
     }
-    // Few wait: whoever tries in numbers must not hold up memory or the processor.
+    // The queue is short: an attack must not use up memory or processor.
     let Ok(_queue) = page.access.logins.queue.try_acquire() else {
         return (StatusCode::SERVICE_UNAVAILABLE, TOO_MANY).into_response();
     };
@@ -196,7 +194,7 @@ pub(in crate::web) async fn login(
     }
 }
 
-/// `POST /api/logout`: ends the session, and takes the key out of the browser too.
+/// `POST /api/logout`: ends the session, and deletes the browser's key.
 pub(in crate::web) async fn logout(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);
@@ -215,7 +213,7 @@ pub(in crate::web) async fn logout(State(page): State<Arc<Page>>, headers: Heade
     response
 }
 
-/// A term. [s]
+/// Lifetime of a key's cookie: one semester. [s]
 const COOKIE_S: u32 = 180 * 24 * 3600;
 const WRONG: &str = "this is not the password";
 const NO_PASSWORD: &str =

@@ -1,4 +1,4 @@
-//! The page's routes: one file a subject.
+//! Handlers of the page's routes: one file per subject.
 
 pub(super) mod cameras;
 pub(super) mod crash;

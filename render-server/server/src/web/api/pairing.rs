@@ -1,5 +1,5 @@
-//! Pairing from the page: `GET /api/pairing` returns its status, `POST` opens one, `DELETE` closes it.
-//! For the instructor alone ([`super::access`]).
+//! Pairing on the page: `GET /api/pairing` returns its status, `POST` opens one, `DELETE` closes it. Instructor only
+//! ([`super::access`]).
 
 use std::sync::Arc;
 
@@ -16,39 +16,37 @@ use crate::web::http::refuse;
 use crate::web::origin;
 use crate::web::state::Page;
 
-/// How pairing stands.
+/// Status of pairing.
 #[derive(Debug, Serialize)]
 struct PairingStatus {
     /// The open pairing.
     open: Option<Open>,
-    /// What came of the newest attempt.
+    /// Result of the newest attempt.
     news: String,
-    /// Where the other computer finds us.
+    /// Port to which the other computer connects.
     port: u16,
 }
 
 #[derive(Debug, Serialize)]
 struct Open {
     code: String,
-    /// `instructor`, or the vehicles.
+    /// `instructor`, or the names of vehicles.
     right: String,
     left_s: f64,
     tries_left: u32,
 }
 
-/// The right to open: `instructor` or `team:VEHICLE[,VEHICLE...]`, as `--pair` has it.
+/// The right to grant: `instructor` or `team:VEHICLE[,VEHICLE...]`, as for `--pair`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct OpenRequest {
     right: String,
 }
 
-/// Returns the pairing's status.
 pub(in crate::web) async fn standing(State(page): State<Arc<Page>>) -> Response {
     respond(&page)
 }
 
-/// Opens a pairing.
 pub(in crate::web) async fn open(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -74,7 +72,6 @@ pub(in crate::web) async fn open(
     }
 }
 
-/// Closes the pairing.
 pub(in crate::web) async fn shut(State(page): State<Arc<Page>>, headers: HeaderMap) -> Response {
     if let Err(refusal) = origin::check(&headers) {
         return refuse(&refusal);

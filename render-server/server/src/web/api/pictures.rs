@@ -1,4 +1,4 @@
-//! Pictures of the scene: the top view, what is solid, the twin's splats, the twin as a camera sees it.
+//! Images and geometry of the scene: top view, solid cells, the twin's splats, and images of the twin.
 
 use std::sync::Arc;
 

@@ -1,7 +1,7 @@
-//! Changing the scene from the page: `GET /api/scenes` lists those to choose from, `PUT /api/scene`
-//! changes to one. For the instructor alone ([`super::routes`]), and while nobody flies.
+//! Changing the scene on the page: `GET /api/scenes` lists the available scenes, `PUT /api/scene` selects one.
+//! Instructor only ([`super::routes`]), and only while no vehicle flies.
 //!
-//! A scene is chosen by its name in that list: no path ever comes from a request.
+//! A scene is selected by its name in that list: no request contains a path.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ use crate::web::state::Page;
 /// The scenes that can be selected.
 #[derive(Debug, Serialize)]
 struct SceneList {
-    /// The one that is shown now; nothing if it is none of them.
+    /// Current scene; `None` if it is not in the list.
     now: Option<String>,
     scenes: Vec<String>,
 }
@@ -30,10 +30,9 @@ struct SceneRequest {
     name: String,
 }
 
-/// Returns the scenes.
 pub(in crate::web) async fn list(State(page): State<Arc<Page>>) -> Response {
     let scenes = page.scenes.clone();
-    // Reads a folder.
+    // Blocking: reads a folder.
     let found = tokio::task::spawn_blocking(move || SceneList {
         now: scenes.current(),
         scenes: scenes.list().into_iter().map(|(name, _)| name).collect(),
@@ -44,7 +43,6 @@ pub(in crate::web) async fn list(State(page): State<Arc<Page>>) -> Response {
     }
 }
 
-/// Changes to a scene.
 pub(in crate::web) async fn change(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -60,12 +58,12 @@ pub(in crate::web) async fn change(
     }
     let scenes = page.scenes.clone();
     let chosen = name.clone();
-    // Reads a folder and the arena.
+    // Blocking: reads a folder and the arena.
     let chosen = tokio::task::spawn_blocking(move || scenes.choose(&chosen)).await;
     match chosen {
         Ok(Ok(())) => {
             page.rooms.flights.note(&format!("the scene is changed to '{name}' on the page"));
-            // The server ends this round of serving, and begins the next one with that scene.
+            // The server stops serving, and restarts with the selected scene.
             page.rooms.stop.set();
             (StatusCode::ACCEPTED, "the scene changes; the page comes back by itself")
                 .into_response()

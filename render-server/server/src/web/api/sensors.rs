@@ -1,4 +1,4 @@
-//! The sensors beside the cameras over HTTP: read by anyone who may read the page, changed by our own page only.
+//! Sensors other than cameras over HTTP: readable by all viewers of the page, changed only by this server's page.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -23,21 +23,21 @@ use crate::web::http::refuse;
 use crate::web::origin;
 use crate::web::state::{Page, vehicle};
 
-/// A sensor: the keys of `[[sensors]]`, and what follows from its model.
+/// A sensor: the keys of `[[sensors]]`, and the measurements of its model.
 #[derive(Debug, Serialize)]
 pub(in crate::web) struct SensorLine {
     #[serde(flatten)]
     keys: Map<String, Value>,
     kind: SensorKind,
-    /// What its model and the keys above come to.
+    /// Properties from its model and the keys above.
     measures: Measures,
-    /// Readings made, acknowledged by the runtime, and given up on the way to it.
+    /// Numbers of readings: made, acknowledged by the runtime, and dropped on the way.
     made: u64,
     sent: u64,
     late: u64,
 }
 
-/// How a sensor measures.
+/// Measuring properties of a sensor.
 #[derive(Debug, Serialize)]
 struct Measures {
     rate_hz: f32,
@@ -47,17 +47,17 @@ struct Measures {
     vertical_fov_rad: f32,
 }
 
-/// A sensor's newest reading, thinned out for a drawing.
+/// A sensor's newest reading, reduced for drawing.
 #[derive(Debug, Serialize)]
 pub(in crate::web) struct ReadingLine {
     seq: u64,
-    /// Since the instant that it is of. [s]
+    /// Age of the reading. [s]
     age_s: f64,
-    /// Of a range finder or a sonar: null where nothing came back. [m]
+    /// Distance of a range finder or a sonar; null without a return. [m]
     range_m: Option<f32>,
-    /// Of a LiDAR or a radar: how many there are.
+    /// Number of returns of a LiDAR or a radar.
     records: usize,
-    /// Of a LiDAR or a radar: x ahead, y left, z up. [m, body]
+    /// Points of a LiDAR or a radar: x forward, y left, z up. [m, body]
     points_m: Vec<[f32; 3]>,
 }
 
@@ -65,7 +65,7 @@ impl SensorLine {
     fn of(config: &SensorConfig, info: &SensorInfo, counters: &SensorCounters) -> Self {
         let keys = match serde_json::to_value(config) {
             Ok(Value::Object(keys)) => keys,
-            // A sensor is a map of numbers and names: there is nothing that JSON cannot hold.
+            // Unreachable: a sensor is a map of numbers and names, which JSON can represent.
             _ => Map::new(),
         };
         let (kind, total) =
@@ -80,7 +80,7 @@ impl SensorLine {
         let (made, sent, late) =
             (total(&counters.made), total(&counters.sent), total(&counters.late));
         let mut line = Self { keys, kind, measures, made, sent, late };
-        // Also where it is the usual.
+        // Also if they have their default value.
         line.keys.insert("enabled".to_owned(), config.enabled.into());
         line.keys.insert("to_autopilot".to_owned(), config.to_autopilot.into());
         line
@@ -128,7 +128,6 @@ impl ReadingLine {
     }
 }
 
-/// Answers with all sensors.
 pub(in crate::web) async fn list(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
@@ -144,7 +143,7 @@ pub(in crate::web) async fn list(
     Json(lines.collect::<Vec<_>>()).into_response()
 }
 
-/// Answers with a sensor's newest reading, `null` before there is one.
+/// Returns a sensor's newest reading, `null` before the first one.
 pub(in crate::web) async fn reading(
     State(page): State<Arc<Page>>,
     Path((name, sensor)): Path<(String, String)>,
@@ -163,7 +162,6 @@ pub(in crate::web) async fn reading(
     Json(newest.map(|reading| ReadingLine::of(&reading))).into_response()
 }
 
-/// Changes a sensor.
 pub(in crate::web) async fn patch(
     State(page): State<Arc<Page>>,
     Path((name, sensor)): Path<(String, String)>,
@@ -186,7 +184,7 @@ pub(in crate::web) async fn patch(
     match sensors.patch(&sensor, &body) {
         Ok(config) => {
             let now = sensors.newest();
-            // The same again is no news.
+            // Unchanged settings are not an event.
             if !Arc::ptr_eq(&before, &now) {
                 let info = now.infos.iter().find(|info| info.name.as_str() == config.name);
                 let text = info.map_or_else(String::new, describe);
@@ -201,14 +199,14 @@ pub(in crate::web) async fn patch(
     }
 }
 
-/// Returns the sensor in a line, for the page and the flight log.
+/// Returns a one-line description of the sensor, for the page and the flight log.
 fn describe(info: &SensorInfo) -> String {
     let SensorInfo { name, kind, enabled, rate_hz, min_range_m, max_range_m, .. } = info;
     let state = if *enabled { "on" } else { "off" };
     format!("sensor {name}, a {kind}, is {state}: {rate_hz} Hz, {min_range_m} to {max_range_m} m")
 }
 
-/// A reading's points on the page, at most: more than a small drawing has pixels for.
+/// Maximum points of a reading on the page: more than a small drawing has pixels for.
 const MAX_POINTS: usize = 2048;
 
 #[cfg(test)]

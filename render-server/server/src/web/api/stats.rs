@@ -1,4 +1,4 @@
-//! `GET /api/stats`: the figures of a vehicle's images.
+//! `GET /api/stats`: figures of a vehicle's images.
 
 use std::sync::Arc;
 
@@ -14,11 +14,10 @@ use crate::web::stats::VehicleStats;
 
 #[derive(Debug, Deserialize)]
 pub(in crate::web) struct StatsQuery {
-    /// Name; the first one without.
+    /// Name of the vehicle; default: the first one.
     vehicle: Option<String>,
 }
 
-/// Answers with the figures of a vehicle.
 pub(in crate::web) async fn get(
     State(page): State<Arc<Page>>,
     question: Result<Query<StatsQuery>, QueryRejection>,
@@ -30,7 +29,7 @@ pub(in crate::web) async fn get(
     };
     match vehicle {
         Ok(vehicle) => Json(VehicleStats::of(&page.rooms, vehicle)).into_response(),
-        // The part after the semicolon is advice for a runtime.
+        // The part after the semicolon is advice for runtimes.
         Err(why) => {
             let why = why.split(';').next().unwrap_or_default().to_owned();
             (StatusCode::NOT_FOUND, why).into_response()

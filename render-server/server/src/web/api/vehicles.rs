@@ -1,4 +1,4 @@
-//! The vehicles over HTTP: who they are, and the stop buttons.
+//! The vehicles over HTTP: list, stop buttons, start, landing and reset.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ use crate::web::state::{Page, vehicle};
 pub(in crate::web) struct VehicleLine {
     name: String,
     phase: FlightPhase,
-    /// Which program flies it.
+    /// Program of the connected runtime.
     runtime: Option<String>,
     cameras: Vec<String>,
 }
@@ -37,7 +37,7 @@ impl VehicleLine {
     }
 }
 
-/// Answers with all vehicles that the viewer may see.
+/// Lists all vehicles that the viewer may see.
 pub(in crate::web) async fn list(
     State(page): State<Arc<Page>>,
     Extension(viewer): Extension<Viewer>,
@@ -46,7 +46,6 @@ pub(in crate::web) async fn list(
     Json(seen.map(|vehicle| VehicleLine::of(&page, vehicle)).collect::<Vec<_>>()).into_response()
 }
 
-/// Stops every vehicle.
 pub(in crate::web) async fn stop_all(
     State(page): State<Arc<Page>>,
     headers: HeaderMap,
@@ -57,7 +56,6 @@ pub(in crate::web) async fn stop_all(
     press(&page.rooms.flights.vehicles)
 }
 
-/// Stops one vehicle.
 pub(in crate::web) async fn stop(
     State(page): State<Arc<Page>>,
     Path(name): Path<String>,
@@ -72,7 +70,7 @@ pub(in crate::web) async fn stop(
     }
 }
 
-/// Lets a vehicle take off.
+/// Permits a vehicle to take off.
 pub(in crate::web) async fn start(
     page: State<Arc<Page>>,
     name: Path<String>,
@@ -85,7 +83,7 @@ pub(in crate::web) async fn start(
     order(&page, &name, &headers, start, "it takes off")
 }
 
-/// Lands a vehicle in order.
+/// Ends a flight with a normal landing.
 pub(in crate::web) async fn land(
     page: State<Arc<Page>>,
     name: Path<String>,
@@ -94,7 +92,7 @@ pub(in crate::web) async fn land(
     order(&page, &name, &headers, |_, vehicle| vehicle.land(BY), "it brakes and lands")
 }
 
-/// Begins a vehicle's run anew.
+/// Resets a vehicle's run.
 pub(in crate::web) async fn reset(
     page: State<Arc<Page>>,
     name: Path<String>,
@@ -105,7 +103,7 @@ pub(in crate::web) async fn reset(
         page.rooms.streaming.vehicles[vehicle.index].begin_flight();
         Ok(())
     };
-    order(&page, &name, &headers, reset, "the run begins anew")
+    order(&page, &name, &headers, reset, "the run is reset")
 }
 
 fn order(
@@ -127,8 +125,7 @@ fn order(
     }
 }
 
-/// Presses the button of each vehicle, also where no runtime is there: one that comes back to its
-/// flight receives it.
+/// Presses the button of each vehicle, even without a runtime: one that reconnects during its flight receives the stop.
 fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
     let (obey, absent): (Vec<_>, Vec<_>) =
         vehicles.iter().partition(|vehicle| vehicle.emergency_stop(BY));
@@ -139,7 +136,7 @@ fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
     let text = match (&*obey, &*absent) {
         ([_], []) => "the runtime lands the vehicle".to_owned(),
         (obey, []) => format!("the runtimes land {}", names(obey)),
-        ([], _) => "no runtime is connected: nobody to land the vehicle".to_owned(),
+        ([], _) => "no runtime is connected that could land the vehicle".to_owned(),
         (obey, absent) => {
             format!("the runtimes land {}; no runtime flies {}", names(obey), names(absent))
         }
@@ -147,7 +144,7 @@ fn press(vehicles: &[Arc<VehicleFlight>]) -> Response {
     (status, text).into_response()
 }
 
-/// Who gives the orders of this file, as events name it.
+/// Name of the page in events.
 const BY: &str = "the page";
 
 #[cfg(test)]

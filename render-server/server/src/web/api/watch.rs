@@ -15,7 +15,6 @@ use crate::web::listener::ConnectionPlace;
 use crate::web::state::{Page, vehicle};
 use crate::web::{origin, viewer};
 
-/// Query of `/ws`.
 #[derive(Debug, Deserialize)]
 pub(in crate::web) struct Watched {
     vehicle: Option<String>,
@@ -39,9 +38,9 @@ pub(in crate::web) async fn watch(
         Err(none) => return *none,
     };
     match upgrade {
-        // Viewers have nothing to send: a byte limit keeps a hostile one small.
+        // Viewers send nothing: limit messages of hostile ones.
         Ok(upgrade) => upgrade.max_message_size(1024).on_upgrade(async move |socket| {
-            // Held for as long as it watches, and not to be taken from it.
+            // Marks the connection as serving, so that its slot stays taken.
             if let Some(Extension(place)) = &place {
                 place.serve(Some(&shown.viewer));
             }

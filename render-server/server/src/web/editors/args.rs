@@ -1,4 +1,4 @@
-//! The options of `vizflyt scene view`, which the commands that edit on its page take, too.
+//! Options of `vizflyt scene view`, shared with the commands that edit on its page.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -8,12 +8,12 @@ use clap::Args;
 use crate::render::{DetailKind, RendererKind};
 use crate::scene::{Antialiased, BareArgs};
 
-/// Opens a page with a free-flying camera in a scene.
+/// Open a page with a free-flying camera in a scene
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "On the page: W A S D to fly, E and Q up and down, drag to look around, wheel \
-for the speed; on a touch screen one finger looks, two fly. `play` lets the clock of what moves \
-run, where something does. `copy camera` gives the camera as a CAM.json for `vizflyt scene render`.
+for the speed; on a touch screen one finger looks, two fly. `play` runs the clock of moving \
+objects. `copy camera` copies the camera as a CAM.json for `vizflyt scene render`.
 
 Examples:
   vizflyt scene view room.ply
@@ -24,31 +24,33 @@ pub struct ViewArgs {
     /// Scene file of any format, or an arena.toml
     pub scene: PathBuf,
 
-    /// Where the page is served; port 0 takes a free one
+    /// Address of the page; port 0 selects a free one
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:0")]
     pub http: SocketAddr,
 
-    /// What draws: a graphics card if one answers, the processor, or any graphics adapter
+    /// Renderer: usable graphics card, processor, or any graphics adapter
     #[arg(long, value_enum, value_name = "KIND", default_value_t)]
     pub renderer: RendererKind,
 
-    /// How much of a large scene is drawn
+    /// Level of detail for large scenes
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub detail: DetailKind,
 
-    /// Whether the scene was trained with anti-aliasing (mip-splatting); auto: as its arena says, else its file
+    /// Whether the scene was trained with anti-aliasing (mip-splatting)
+    ///
+    /// auto: as in the arena, or else as in the scene's file.
     #[arg(long, value_enum, value_name = "HOW", default_value_t)]
     pub antialiased: Antialiased,
 
-    /// How a scene without an arena is put into the world
+    /// Placement of a scene without an arena
     #[command(flatten)]
     pub bare: BareArgs,
 
-    /// What the arena leaves to chance: where in their motion its objects begin
+    /// Seed of the initial phase of moving objects that set none
     #[arg(long, default_value_t = 7)]
     pub seed: u64,
 
-    /// Only prints the address
+    /// Only print the page's address
     #[arg(long)]
     pub no_browser: bool,
 }

@@ -1,13 +1,13 @@
-//! `vizflyt scene edit --page`: the view, with a lasso and a box that select what goes.
+//! `vizflyt scene edit --page`: the view, with a lasso and a box to select splats.
 //!
 //! ```text
-//! GET  /edit.js, /edit.css    the panel
-//! POST /api/edit              Order -> Report: what is selected, what was done, in words
+//! GET  /edit.js, /edit.css    panel
+//! POST /api/edit              Order -> EditState: selection and result
 //! ```
-//! A selection is an outline in a picture with the camera that showed it; which splats lie in it is found here. It is shown
-//! by their colour. Deleting makes a step of it, as the command line makes them; saving writes the list and the result. Naming
-//! puts the box about it into the scene's file of parts, at once. Only a browser on this computer, on a page of ours, may
-//! edit.
+//! A selection is an outline in an image, with the camera of that image; the server finds the splats inside and colours
+//! them. Deleting adds a step, as on the command line; saving writes the list of steps and the result. Naming writes
+//! the box around the selection into the scene's file of parts, at once. Only this server's page, in a browser on this
+//! computer, may edit.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -40,7 +40,7 @@ pub(super) struct Panel {
     pub(super) session: Mutex<Session>,
 }
 
-/// A scene under edit, and what is selected of it.
+/// A scene being edited, and the selection.
 pub(super) struct Session {
     editor: Editor,
     output: PathBuf,
@@ -53,60 +53,58 @@ pub(super) struct Session {
     is_saved: bool,
 }
 
-/// What the page asks for.
+/// Request of the page.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub(super) enum Order {
-    /// Nothing but a report.
+    /// Returns the state only.
     Report,
-    /// Selects what a picture shows within an outline.
+    /// Selects the splats of an image within an outline.
     Select(Outline),
-    /// Selects what is not selected.
+    /// Inverts the selection.
     Invert,
-    /// Selects nothing.
+    /// Clears the selection.
     Clear,
-    /// Removes what is selected.
+    /// Removes the selected splats.
     Delete,
-    /// Takes the last step back.
+    /// Undoes the last step.
     Undo,
-    /// Writes result and list.
+    /// Writes the result and the list of steps.
     Save,
-    /// Calls what is selected a part of the scene.
+    /// Names the selection as a part of the scene.
     Name {
-        /// What it is called.
         name: String,
-        /// Its class.
         class: String,
     },
 }
 
-/// An outline in a picture.
+/// An outline in an image.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Outline {
-    /// What the picture shows.
+    /// Request of the image.
     request: Request,
-    /// Corners, as shares of its width and height.
+    /// Corners, as fractions of its width and height.
     corners: Vec<[f64; 2]>,
-    /// Only what is in front.
+    /// Whether to select only the splats in front.
     visible: bool,
-    /// Beside what is selected already.
+    /// Whether to add to the selection.
     adds: bool,
 }
 
-/// What the page shows.
+/// State that the page shows.
 #[derive(Debug, Serialize)]
 struct EditState {
     splats: usize,
     selected: usize,
-    /// In words, in order.
+    /// Descriptions of the steps, in order.
     steps: Vec<String>,
-    /// Named parts, in words.
+    /// Descriptions of the named parts.
     parts: Vec<String>,
     saved: bool,
-    /// Where the result goes.
+    /// Path of the result.
     output: String,
-    /// What was done, for a person.
+    /// Result of the last request, as text.
     said: String,
 }
 
@@ -124,7 +122,7 @@ impl Session {
         Ok(Self { editor, output, args, placement, objects, parts, regions, is_inverted, is_saved })
     }
 
-    /// Does what the page asks for; returns what was done, and whether the picture changes.
+    /// Executes a request; returns its result as text, and whether the image changes.
     fn obey(&mut self, order: Order) -> Result<(String, bool)> {
         match order {
             Order::Report => Ok((String::new(), false)),
@@ -195,7 +193,7 @@ impl Session {
         self.is_inverted = false;
     }
 
-    /// Returns the region of the file's frame that an outline shows.
+    /// Returns the region inside an outline, in the frame of the file.
     fn region(&self, outline: &Outline) -> Region {
         let camera = outline.request.camera();
         let k = &camera.intrinsics;
@@ -215,7 +213,7 @@ impl Session {
         }
     }
 
-    /// Marks what is selected.
+    /// Returns for each splat whether it is selected.
     fn selected(&self) -> Vec<bool> {
         if self.regions.is_empty() {
             return vec![false; self.editor.splats().len()];
@@ -227,7 +225,7 @@ impl Session {
         marks
     }
 
-    /// Returns a renderer of the scene in the world, what is selected in a colour of its own.
+    /// Returns a renderer of the scene in the world, with the selection coloured.
     fn renderer(&self, selected: &[bool]) -> Result<Box<dyn Rasterizer>> {
         let mut splats = self.editor.splats().clone();
         highlight(&mut splats, selected);
@@ -251,7 +249,7 @@ impl Session {
     }
 }
 
-/// Mixes what is marked with a colour, seen from anywhere.
+/// Mixes a colour into the marked splats, for all directions.
 fn highlight(splats: &mut Splats, marks: &[bool]) {
     let width = splats.sh_coefficients() * 3;
     for (sh, _) in splats.sh.chunks_exact_mut(width).zip(marks).filter(|(_, mark)| **mark) {
@@ -263,7 +261,7 @@ fn highlight(splats: &mut Splats, marks: &[bool]) {
     }
 }
 
-/// The panel's files and orders.
+/// Returns the routes of the panel.
 pub(super) fn routes(panel: Panel) -> Router {
     Router::new()
         .route(
@@ -308,11 +306,11 @@ fn obey(panel: &Panel, order: Order) -> Result<EditState> {
     Ok(session.report(&selected, said))
 }
 
-/// An outline of 2000 corners has 80 kB. [byte]
+/// Maximum request; an outline of 2000 corners has 80 kB. [byte]
 const MAX_ORDER: usize = 256 << 10;
-/// Orange: rare in rooms, and seen in the dark. [linear RGB]
+/// Orange: rare in rooms, and visible in the dark. [linear RGB]
 const HIGHLIGHT: [f32; 3] = [1.0, 0.35, 0.0];
-/// What is left shows what is selected.
+/// Share of the highlight; the rest is the splat's own colour.
 const HIGHLIGHT_SHARE: f32 = 0.7;
 
 #[cfg(test)]
@@ -330,7 +328,7 @@ mod tests {
         view: ViewArgs,
     }
 
-    /// A row of splats along the world's y, 4 m ahead of the camera, in a file of another frame.
+    /// A row of splats along the world's y, 4 m in front of the camera, in a file with another frame.
     fn session(folder: &std::path::Path) -> (Session, WorldFromScene) {
         let place = WorldFromScene {
             scale: 2.0,
@@ -359,7 +357,7 @@ mod tests {
         (Session::new(editor, output, args, placement, Vec::new()).unwrap(), place)
     }
 
-    /// An order as the page writes it: what the left half of the picture shows, and a little more.
+    /// Returns a request as the page sends it, for the left half of the image and slightly more.
     fn left_half(adds: bool, right: bool) -> Order {
         let (low, high) = if right { (0.5, 1.0) } else { (0.0, 0.52) };
         let order = serde_json::json!({"select": {
@@ -375,12 +373,12 @@ mod tests {
     }
 
     #[test]
-    fn what_the_outline_shows_is_selected_deleted_taken_back_and_saved() {
+    fn selects_deletes_undoes_and_saves_an_outline() {
         let folder = tempfile::tempdir().unwrap();
         let (mut session, _) = session(folder.path());
         let count = |session: &Session| session.selected().iter().filter(|mark| **mark).count();
         assert!(session.obey(Order::Delete).is_err() && session.obey(Order::Undo).is_err());
-        // Left is +y: ten of them, and the middle one.
+        // Left is +y: ten splats, and the middle one.
         session.obey(left_half(false, false)).unwrap();
         assert_eq!(count(&session), 11);
         assert!(session.selected()[10] && session.selected()[20] && !session.selected()[9]);
@@ -407,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_selected_gets_a_name_and_is_found_by_it() {
+    fn names_the_selection_as_a_part() {
         let folder = tempfile::tempdir().unwrap();
         let (mut session, _) = session(folder.path());
         let name = |name: &str| Order::Name { name: name.to_owned(), class: "gate".to_owned() };
@@ -417,7 +415,7 @@ mod tests {
         let (said, _) = session.obey(name(" row ")).unwrap();
         assert!(said.starts_with("row (gate): 0.02 x 2.02 x 0.02 m, in "), "{said}");
         assert_eq!(session.report(&[], said).parts, ["row (gate): 0.02 x 2.02 x 0.02 m"]);
-        // As a data set reads it, of the scene in the world.
+        // As a data set reads it, from the scene in the world.
         let parts = PartsFile::read(&parts_path(&folder.path().join("row.ply"))).unwrap();
         let mut splats = session.editor.splats().clone();
         session.placement.apply(&mut splats);
@@ -427,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_selected_has_a_colour_of_its_own() {
+    fn highlights_only_the_selection() {
         let folder = tempfile::tempdir().unwrap();
         let (session, _) = session(folder.path());
         let mut splats = session.editor.splats().clone();

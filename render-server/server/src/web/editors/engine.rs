@@ -1,4 +1,4 @@
-//! One picture: where the page's camera is in, JPEG out.
+//! Renders one image: camera pose in, JPEG out.
 
 use anyhow::{Context, Result};
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -13,57 +13,57 @@ use super::place::{self, Place};
 use crate::scene::WorldFromScene;
 use crate::web::previews::depth_colour;
 
-/// What a page asks for.
+/// Request of an image.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Request {
-    /// Where the camera is. [m, world]
+    /// Position of the camera. [m, world]
     p_m: [f64; 3],
     /// Heading: from x, counter-clockwise. [rad, world]
     yaw_rad: f64,
     /// Upward tilt. [rad]
     pitch_rad: f64,
-    /// From the left edge to the right edge. [deg]
+    /// Horizontal field of view. [deg]
     fov_deg: f64,
     /// [px]
     width_px: u32,
     /// [px]
     height_px: u32,
-    /// Shows depth instead of colour.
+    /// Whether to render depth instead of colour.
     depth: bool,
-    /// On the clock of what moves. [s]
+    /// Time on the clock of moving objects. [s]
     #[serde(default)]
     at_s: f64,
-    /// Where the scene's file lies in the world that `p_m` is of; where it was loaded to, if absent.
+    /// Placement of the scene's file in the world of `p_m`; default: the placement at loading.
     #[serde(default)]
     place: Option<Place>,
-    /// Sends depths along, for what the page draws over the picture.
+    /// Whether to send depths, for the page's overlay.
     #[serde(default)]
     grid: bool,
 }
 
-/// The description of a picture, sent before it.
+/// Description of an image, sent before it.
 #[derive(Debug, Serialize)]
 pub(super) struct PictureInfo {
     ms: f32,
     visible: usize,
-    /// Median depth in the middle of the picture; none where nothing is hit. [m]
+    /// Median depth at the centre of the image; `None` without a surface. [m]
     middle_m: Option<f32>,
     camera: OracleCamera,
     grid: Option<DepthGrid>,
 }
 
-/// Median depths at the middles of square cells, row by row.
+/// Median depths at the centres of square cells, row by row.
 #[derive(Debug, Serialize)]
 struct DepthGrid {
     columns: u32,
     /// Side of a cell. [px]
     cell_px: u32,
-    /// 0 where nothing is. [mm, cam]
+    /// 0 without a surface. [mm, cam]
     depth_mm: Vec<u16>,
 }
 
-/// The camera in the frame of the scene's file, as `vizflyt scene render` reads it.
+/// The camera in the frame of the scene's file, in the format of `vizflyt scene render`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(super) struct OracleCamera {
     fx: f64,
@@ -77,17 +77,16 @@ pub(super) struct OracleCamera {
     near_m: f64,
 }
 
-/// A rendered picture.
 pub(super) struct Picture {
     pub(super) info: PictureInfo,
     pub(super) jpeg: Vec<u8>,
 }
 
-/// Renderer and scratch memory.
+/// Renderer and reused buffers.
 pub(super) struct Engine {
     rasterizer: Box<dyn Rasterizer>,
     moving: MovingObjects,
-    /// From the frame that `CAM.json` files are in.
+    /// From the frame of `CAM.json` files.
     world_from_scene: WorldFromScene,
     /// From the frame of the scene's file.
     world_from_file: WorldFromScene,
@@ -107,18 +106,18 @@ impl Engine {
         Self { rasterizer, moving, world_from_scene, world_from_file, image, rgb, depth_mm }
     }
 
-    /// Returns the camera in the world that the scene was loaded into, and how much longer a metre is there.
+    /// Returns the camera in the world at loading, and the scale from the request's world to it.
     fn loaded_camera(&self, request: &Request) -> Result<(Camera, f64)> {
         let camera = request.camera();
         let Some(place) = &request.place else { return Ok((camera, 1.0)) };
         let shown = place.world_from_scene();
         let shown =
-            shown.context("the place is none: give a unit quaternion and finite numbers")?;
+            shown.context("the place is invalid: give a unit quaternion and finite numbers")?;
         let by = place::between(&self.world_from_file, &shown);
         Ok((place::moved(&camera, &by), by.scale))
     }
 
-    /// Finds the point of the scene at a pixel of what `request` shows.
+    /// Returns the point of the scene at a pixel of the image of `request`.
     pub(super) fn pick(
         &mut self,
         request: &Request,
@@ -148,12 +147,12 @@ impl Engine {
         Ok(Ok(Picked { p_scene, p_world, depth_m, rough_m }))
     }
 
-    /// Shows another scene from now on, in the same place.
+    /// Replaces the scene at the same placement.
     pub(super) fn replace(&mut self, rasterizer: Box<dyn Rasterizer>) {
         self.rasterizer = rasterizer;
     }
 
-    /// Shows other objects from now on, with the renderer that draws them if it is another.
+    /// Replaces the objects, and the renderer if one is given.
     pub(super) fn set_objects(
         &mut self,
         rasterizer: Option<Box<dyn Rasterizer>>,
@@ -167,7 +166,7 @@ impl Engine {
 
     pub(super) fn render(&mut self, request: &Request) -> Result<Picture> {
         let (camera, unit) = self.loaded_camera(request)?;
-        // A time beyond the clock's range shows the start.
+        // A time outside the clock's range shows the start.
         let placements = self.moving.placements((request.at_s * 1e9) as i64);
         let times = self.rasterizer.render(&placements, &[camera], &mut self.image)?;
         let [image] = &self.image;
@@ -202,7 +201,7 @@ impl DepthGrid {
         let at = |column, row| {
             let k = middle(row, image.height_px) * image.width_px as usize
                 + middle(column, image.width_px);
-            // Saturates: what is farther than 65 m hides nothing nearer.
+            // Saturates at 65 m: more distant surfaces hide nothing that is nearer.
             (f64::from(image.depth_median_m[k]) / unit * 1e3) as u16
         };
         let depth_mm = (0..rows).flat_map(|row| (0..columns).map(move |column| (column, row)));
@@ -212,7 +211,7 @@ impl DepthGrid {
 }
 
 impl Request {
-    /// Returns the camera, its size held to what a page can show.
+    /// Returns the camera, with its size limited to that of a page.
     pub(super) fn camera(&self) -> Camera {
         let [width, height] =
             [self.width_px, self.height_px].map(|side| side.clamp(16, MAX_SIDE_PX));
@@ -229,8 +228,8 @@ impl Request {
     }
 }
 
-/// Returns the camera that shows the scene's file, neither turned nor scaled, as `camera` shows the
-/// twin: of `p_cam = R_cw (s R_ws p + t_ws) + t_cw` everything is divided by s.
+/// Returns the camera that renders the unscaled, unrotated scene file as `camera` renders the twin: `p_cam = R_cw (s
+/// R_ws p + t_ws) + t_cw`, divided by s.
 fn in_scene(camera: &Camera, world_from_scene: &WorldFromScene) -> OracleCamera {
     let cam_from_world = camera.world_from_cam.inverse();
     let rotation = DMat3::from_quat(cam_from_world.rotation * world_from_scene.rotation);
@@ -256,12 +255,12 @@ fn in_scene(camera: &Camera, world_from_scene: &WorldFromScene) -> OracleCamera 
     }
 }
 
-/// A hand's breadth: one flies through things here. [m]
+/// Small, because the camera can fly through objects. [m]
 const NEAR_M: f32 = 0.05;
-/// Full HD on a screen that is wider than high.
+/// Full HD in landscape format.
 const MAX_SIDE_PX: u32 = 1920;
 const QUALITY: u8 = 85;
-/// Cells along the longer side: 100 kB of text at most.
+/// Cells along the longer side: at most 100 kB of text.
 const GRID: u32 = 180;
 
 #[cfg(test)]
@@ -339,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_sees_what_is_ahead_and_how_far() {
+    fn renders_the_scene_ahead_with_its_depth() {
         let splats = ball();
         let mut engine = still(&splats);
         let picture = engine.render(&request()).unwrap();
@@ -354,13 +353,14 @@ mod tests {
         assert_eq!(huge.camera().intrinsics.pixels(), 1920 * 16);
     }
 
-    /// Turned, moved and of another unit: the same picture, distances in the new unit, and clicks that find the file's point.
+    /// Rotation, translation and scale of the scene: same image, distances in the new unit, and clicks return the
+    /// file's point.
     #[test]
-    fn a_scene_shown_elsewhere_is_the_same_to_a_camera_moved_along() {
+    fn moving_scene_and_camera_together_keeps_the_image() {
         let splats = ball();
         let mut engine = still(&splats);
         let here = engine.render(&request()).unwrap();
-        // Turned by a right angle about z, twice as large, 1 m up: the camera looks along y.
+        // Rotated by a right angle about z, twice as large, 1 m up: the camera looks along y.
         let half = std::f64::consts::FRAC_PI_2;
         let turned = WorldFromScene {
             scale: 2.0,
@@ -380,7 +380,7 @@ mod tests {
         assert_eq!((grid.columns, grid.cell_px, grid.depth_mm.len()), (64, 1, 64 * 48));
         assert_eq!(grid.depth_mm[24 * 64 + 32], 6000);
         assert!(there.jpeg == here.jpeg && here.info.grid.is_none());
-        // The ball is 4 px wide, smaller than the window; seen closely it fills it.
+        // The ball is 4 px wide, smaller than the window; a narrow view fills the window with it.
         let middle = DVec2::new(32.0, 24.0);
         assert_eq!(engine.pick(&elsewhere, middle).unwrap(), Err(PickError::Nothing));
         let close = Request { fov_deg: 5.0, ..elsewhere };
@@ -394,7 +394,7 @@ mod tests {
         assert!(engine.render(&lost).is_err());
     }
 
-    /// A point of the file lands on the same pixel, by either way.
+    /// A point of the file maps to the same pixel with both cameras.
     #[test]
     fn the_copied_camera_is_in_the_files_own_frame() {
         let world_from_scene = WorldFromScene {

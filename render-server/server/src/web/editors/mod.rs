@@ -1,12 +1,11 @@
 //! `vizflyt scene view`: a page with a free-flying camera in a scene.
 //!
 //! ```text
-//! GET /     the page; asks over /ws for a picture from where it is, one at a time
-//! GET /ws   in: Request (JSON); out: the picture's description (JSON), then the picture (JPEG)
+//! GET /     page; requests images of its camera over /ws, one at a time
+//! GET /ws   in: Request (JSON); out: the image's description (JSON), then the image (JPEG)
 //! ```
-//! Nothing is rendered unless a page asks, and a page asks only when its camera has moved and the last
-//! picture has come: the newest wins by itself, however slow the machine. One renderer serves all
-//! viewers in turn.
+//! The server renders only on request. A page requests an image only after its camera has moved and the previous image
+//! has arrived, so it always gets the newest view, even from a slow computer. One renderer serves all viewers in turn.
 
 pub(crate) mod align;
 mod args;
@@ -48,21 +47,21 @@ use crate::web::http::{ICON, file, refuse};
 use crate::web::{https, listener, origin};
 use vizflyt_process::lock;
 
-/// Serves the page until SIGINT or SIGTERM; `open` is called with its address once it answers.
+/// Serves the page until SIGINT or SIGTERM; calls `open` with its address when it is ready.
 ///
 /// # Errors
-/// A scene that cannot be used, an address that cannot be bound, no such renderer.
+/// If the scene cannot be used, the address cannot be bound, or the renderer is not available.
 #[allow(clippy::needless_pass_by_value)] // Why: a command consumes its arguments.
 pub fn view(args: ViewArgs, open: impl FnOnce(&str, &RendererInfo)) -> Result<()> {
     serve_view(&args, None, open)
 }
 
-/// What is done with the scene, beside looking at it.
+/// Task of the page, in addition to viewing.
 #[allow(clippy::large_enum_variant)] // Why: there is one of it, for a moment.
 enum Work {
     Align(Arc<dyn Aligner>),
     Course(Arc<dyn CourseFile>),
-    /// What is saved goes to the path.
+    /// Edits the scene; saves to the path.
     Edit(Editor, PathBuf),
 }
 
@@ -118,33 +117,33 @@ fn serve_view(
         .build()
         .context("cannot start tokio")?;
     let result = runtime.block_on(run(args, work, open));
-    // Not awaited: a picture under way must not hold up the end.
+    // Not awaited: a running render must not delay the exit.
     runtime.shutdown_background();
     result
 }
 
-/// State that the handlers share.
+/// Shared state of the handlers.
 struct ViewState {
     engine: Arc<Mutex<Engine>>,
     welcome: Welcome,
     stop: Stop,
 }
 
-/// The first message to each page.
+/// First message to each page.
 #[derive(Debug, Serialize)]
 struct Welcome {
     name: String,
     renderer: RendererInfo,
     splats: usize,
-    /// Where to begin. [m, world]
+    /// Initial position of the camera. [m, world]
     start_m: [f64; 3],
-    /// Heading to begin with. [rad, world]
+    /// Initial heading of the camera. [rad, world]
     yaw_rad: f64,
-    /// The arena's fence. [m, world]
+    /// Fence of the arena. [m, world]
     fence_m: [[f64; 3]; 2],
-    /// How many objects move in it.
+    /// Number of moving objects.
     objects: usize,
-    /// A script of ours that adds to the page.
+    /// Script that extends the page.
     tool: Option<&'static str>,
 }
 
@@ -155,7 +154,7 @@ async fn run(
 ) -> Result<()> {
     let stop = Stop::default();
     stop.on_signals(false)?;
-    // First: a taken port is reported before the scene is loaded.
+    // Before loading the scene, so that a used port is reported immediately.
     https::check_plain(args.http, true)?;
     let listener = listener::bind(args.http)?;
     let url = format!("http://{}", listener.local_addr().context("the page has no address")?);
@@ -174,7 +173,7 @@ async fn run(
     }
 }
 
-/// Returns the engine, the welcome, and the routes of the panel, if there is one.
+/// Returns the engine, the first message, and the routes of the panel, if there is one.
 fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Arc<Mutex<Engine>>, Welcome, Router)> {
     let scene = match &work {
         Some(Work::Edit(editor, _)) => {
@@ -184,7 +183,7 @@ fn prepare(args: &ViewArgs, work: Option<Work>) -> Result<(Arc<Mutex<Engine>>, W
     };
     let mut scene = scene?;
     if let Some(Work::Align(_)) = work {
-        // What moves stands in the room: it is no part of the scene, and does not move along with it.
+        // Moving objects belong to the room, not to the scene, and must not move with it.
         scene.arena.objects.clear();
         scene.objects.clear();
     }
@@ -309,7 +308,7 @@ const STYLE: &str = include_str!("page/view.css");
 const SCRIPT: &str = include_str!("page/view.js");
 const PANEL_STYLE: &str = include_str!("page/panel.css");
 const OVERLAY: &str = include_str!("page/overlay.js");
-/// A page that takes nothing for this long is gone.
+/// Timeout of a page that reads nothing.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 #[cfg(test)]
@@ -325,7 +324,7 @@ mod tests {
             assert!(INDEX.contains(&format!("id=\"{id}\"")), "{id}");
         }
         assert!(INDEX.contains("/view.css") && INDEX.contains("/view.js"));
-        // The server's policy forbids both.
+        // The content security policy forbids both.
         assert!(!INDEX.contains("style=") && !INDEX.contains("onclick="));
     }
 }

@@ -1,51 +1,51 @@
-//! From a click to a point of the scene: the depths of a small window about it, of which one surface is made.
+//! Point of the scene at a click: fits one surface to the depths of a small window around it.
 //!
 //! ```text
-//! Request, pixel -> window of 21x21 depths -> plane in 1/z, by the majority -> point, and how rough the surface is
+//! Request, pixel -> window of 21x21 depths -> plane in 1/z, by majority -> point, and roughness of the surface
 //! ```
-//! 1/z of a plane is affine in pixels, so a floor seen at a grazing angle is as good as a wall ahead. Sky, holes and edges are
-//! refused: a point between two surfaces lies on neither.
+//! 1/z of a plane is affine in pixels, so the fit also works for a floor at a grazing angle. Sky, holes and edges are
+//! rejected: a point between two surfaces lies on neither.
 
 use glam::{DMat3, DVec2, DVec3};
 use serde::Serialize;
 use vizflyt_protocol::geometry::Intrinsics;
 
-/// What was clicked at.
+/// Result of a click.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub(super) struct Picked {
-    /// In the scene file's own axes and units.
+    /// Position in the axes and units of the scene's file.
     pub p_scene: DVec3,
-    /// Where it is shown. [m, world]
+    /// Position in the shown world. [m, world]
     pub p_world: DVec3,
-    /// How far ahead. [m, cam]
+    /// Distance ahead. [m, cam]
     pub depth_m: f64,
-    /// How rough the surface is about it, root mean square, along the line of sight. [m]
+    /// Roughness of the surface around it, root mean square along the line of sight. [m]
     pub rough_m: f64,
 }
 
-/// Why a click hit nothing.
+/// Reason for which a click found no point.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub(super) enum PickError {
-    /// Outside the picture, or a camera that is none.
+    /// The click is outside the image, or the camera is invalid.
     #[error("the click lies outside the picture; click again")]
     Outside,
     /// Sky, or a hole in the capture.
     #[error("nothing solid is there: sky, or a hole in the capture; click on a surface")]
     Nothing,
-    /// Two surfaces, at these distances. [m]
+    /// Two surfaces at these distances. [m]
     #[error(
         "the click lies on an edge, between {near_m:.2} and {far_m:.2} m ahead; click a little inside, or narrow the view \
          and click again"
     )]
     Edge {
-        /// The nearer one. [m, cam]
+        /// Distance of the nearer surface. [m, cam]
         near_m: f64,
-        /// The farther one. [m, cam]
+        /// Distance of the farther surface. [m, cam]
         far_m: f64,
     },
 }
 
-/// Returns the camera of the window about a pixel, and the pixel in it; `None` outside the picture.
+/// Returns the camera of the window around a pixel, and the pixel in it; `None` outside the image.
 pub(super) fn window(picture: &Intrinsics, px: DVec2) -> Option<(Intrinsics, DVec2)> {
     let size = DVec2::new(f64::from(picture.width_px), f64::from(picture.height_px));
     if !(px.cmpge(DVec2::ZERO).all() && px.cmplt(size).all()) {
@@ -65,7 +65,7 @@ pub(super) fn window(picture: &Intrinsics, px: DVec2) -> Option<(Intrinsics, DVe
 /// Returns depth [m, cam] and roughness [m] of the surface at a pixel of a window.
 ///
 /// # Errors
-/// Nothing there, or an edge.
+/// If nothing is there, or the click is on an edge.
 pub(super) fn surface(depths_m: &[f32], px: DVec2) -> Result<(f64, f64), PickError> {
     let side = SIDE_PX as usize;
     let seen: Vec<(DVec3, f64)> = depths_m
@@ -74,7 +74,7 @@ pub(super) fn surface(depths_m: &[f32], px: DVec2) -> Result<(f64, f64), PickErr
         .filter(|(_, depth_m)| **depth_m > 0.0)
         .map(|(k, &depth_m)| {
             let middle = DVec2::new((k % side) as f64, (k / side) as f64) + 0.5 - px;
-            // Pixels to tens of pixels, for the normal equations.
+            // Scales pixels by ten, to condition the normal equations.
             ((middle / 10.0).extend(1.0), 1.0 / f64::from(depth_m))
         })
         .collect();
@@ -112,14 +112,15 @@ pub(super) fn surface(depths_m: &[f32], px: DVec2) -> Result<(f64, f64), PickErr
     Ok((depth_m, depth_m * (squares / kept.len() as f64).sqrt()))
 }
 
-/// A fingertip on a screen.
+/// About the size of a fingertip on a screen.
 const SIDE_PX: u32 = 21;
-/// Of the window that one surface fills.
+/// Minimum share of the window on one surface.
 const MAJORITY: f64 = 0.7;
-/// A captured floor is no rougher, as a share of its distance; the next surface is farther.
+/// Maximum deviation from the plane, as a share of the distance. A captured floor is smoother; other surfaces are
+/// farther away.
 const ROUGH: f64 = 0.03;
 const ROUNDS: usize = 5;
-/// A plane of fewer says nothing.
+/// Minimum number of points for a plane.
 const ENOUGH: usize = 20;
 
 #[cfg(test)]
@@ -129,7 +130,7 @@ mod tests {
 
     const MIDDLE: DVec2 = DVec2::new(10.3, 10.8);
 
-    /// Depths of the window by what is at each pixel, from its middle.
+    /// Returns the depths of a window from a function of the offset from its centre.
     fn depths(at: impl Fn(f64, f64) -> f64) -> Vec<f32> {
         let side = SIDE_PX as usize;
         (0..side * side)
@@ -141,7 +142,7 @@ mod tests {
     }
 
     proptest! {
-        /// Any plane, however steep, with noise: its depth at the click.
+        /// Any noisy plane, also a steep one, returns its depth at the click.
         #[test]
         fn a_surface_gives_its_depth(
             depth_m in 0.2..50.0f64, x in -0.01..0.01f64, y in -0.02..0.02f64, seed in 0.0..9.0f64,
@@ -165,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn sky_and_edges_are_refused_in_words() {
+    fn sky_and_edges_are_rejected_with_the_reason() {
         assert_eq!(surface(&depths(|_, _| 0.0), MIDDLE), Err(PickError::Nothing));
         let rim = depths(|u, _| if u < 0.0 { 2.0 } else { 0.0 });
         assert_eq!(surface(&rim, MIDDLE), Err(PickError::Nothing));
@@ -174,13 +175,13 @@ mod tests {
             let Err(PickError::Edge { near_m, far_m }) = edge else { panic!("{edge:?}") };
             assert!((near_m - 2.0).abs() < 0.1 && (far_m - 5.0).abs() < 0.1, "{edge:?}");
         }
-        // A wire across a wall is no edge: the wall has the majority.
+        // A wire in front of a wall is not an edge: the wall has the majority.
         let wire = depths(|u, _| if (3.0..5.0).contains(&u) { 1.0 } else { 3.0 });
         assert!((surface(&wire, MIDDLE).unwrap().0 - 3.0).abs() < 0.01);
     }
 
     #[test]
-    fn the_window_looks_where_the_picture_does() {
+    fn the_window_has_the_same_rays_as_the_image() {
         let picture = Intrinsics::from_horizontal_fov(640, 480, 1.2);
         let click = DVec2::new(100.25, 300.5);
         let (small, px) = window(&picture, click).unwrap();

@@ -1,4 +1,4 @@
-//! Shows a scene elsewhere than it was loaded, without moving a splat: the camera is moved instead.
+//! Shows a scene at another place than it was loaded to, by moving the camera instead of the splats.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -8,20 +8,20 @@ use vizflyt_splat::Camera;
 
 use crate::scene::WorldFromScene;
 
-/// Where a scene's file lies in the world, in the words of `[scene]`.
+/// Placement of a scene's file in the world, by the keys of `[scene]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Place {
-    /// The file's axes to the world's: a unit quaternion x, y, z, w.
+    /// Rotation from the file's axes to the world's: a unit quaternion x, y, z, w.
     rotation: [f64; 4],
     /// Length of the file's unit. [m]
     metres_per_unit: f64,
-    /// Where the file's origin comes to lie. [m, world]
+    /// Position of the file's origin. [m, world]
     origin: [f64; 3],
 }
 
 impl Place {
-    /// Writes it down.
+    /// Converts a similarity.
     pub fn new(world_from_scene: &WorldFromScene) -> Self {
         let WorldFromScene { scale, rotation, translation_m } = world_from_scene;
         Self {
@@ -31,7 +31,7 @@ impl Place {
         }
     }
 
-    /// Returns the similarity; `None` where it is none.
+    /// Returns the similarity; `None` if it is invalid.
     pub fn world_from_scene(&self) -> Option<WorldFromScene> {
         let rotation = glam::DQuat::from_array(self.rotation);
         let translation_m = DVec3::from_array(self.origin);
@@ -43,12 +43,12 @@ impl Place {
     }
 }
 
-/// Returns where a point of a scene's file lies. [m, world]
+/// Returns the position of a point of a scene's file. [m, world]
 pub(super) fn to_world(world_from_scene: &WorldFromScene, p_scene: DVec3) -> DVec3 {
     world_from_scene.rotation * p_scene * world_from_scene.scale + world_from_scene.translation_m
 }
 
-/// Returns the similarity from the world of one place to that of another, of the same scene.
+/// Returns the similarity from the world of one placement to that of another, for the same scene.
 pub(super) fn between(to: &WorldFromScene, from: &WorldFromScene) -> WorldFromScene {
     let scale = to.scale / from.scale;
     let rotation = to.rotation * from.rotation.conjugate();
@@ -56,7 +56,7 @@ pub(super) fn between(to: &WorldFromScene, from: &WorldFromScene) -> WorldFromSc
     WorldFromScene { scale, rotation, translation_m }
 }
 
-/// Returns the camera that sees in one world what `camera` sees in another.
+/// Returns the camera after a change of the world: its view of the scene stays the same.
 pub(super) fn moved(camera: &Camera, by: &WorldFromScene) -> Camera {
     let pose = &camera.world_from_cam;
     Camera {
@@ -66,7 +66,7 @@ pub(super) fn moved(camera: &Camera, by: &WorldFromScene) -> Camera {
     }
 }
 
-/// As far as an arena's positions go. [m]
+/// Maximum distance of positions, as in an arena. [m]
 const FARTHEST_M: f64 = 1e5;
 
 #[cfg(test)]
@@ -92,7 +92,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_point_goes_the_same_way_through_either_world(
+        fn a_point_has_the_same_position_by_both_placements(
             to in place(), from in place(), p in prop::array::uniform3(-5.0..5.0f64),
         ) {
             let direct = to_world(&to, p.into());
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_place_is_refused() {
+    fn rejects_invalid_placements() {
         let good = Place::new(&WorldFromScene::IDENTITY);
         for bad in [
             Place { rotation: [0.0; 4], ..good },

@@ -1,5 +1,5 @@
-//! What the server sees of a lab day by itself: it measures the live checks, watches what comes of the stop button and
-//! of the vehicle in somebody's hands, and keeps vehicles in the air apart. 50 times a second.
+//! Automatic part of a lab day, at 50 Hz: measures the live checks, observes trials of the stop button and the check of
+//! axes by hand, and keeps flying vehicles apart.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::flights::vehicle::VehicleFlight;
 use crate::stream::Rooms;
 use vizflyt_process::lock;
 
-/// Follows all vehicles until the server ends.
+/// Follows all vehicles until the server stops.
 pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {
     let vehicles = &rooms.flights.vehicles;
     let mut watches: Vec<_> = vehicles.iter().map(|vehicle| VehicleWatch::of(vehicle)).collect();
@@ -46,7 +46,7 @@ pub(crate) async fn follow(rooms: Rooms, lab: Arc<Lab>) {
     }
 }
 
-/// Returns the vehicles that are in the air and seen now.
+/// Returns the vehicles in the air that have a current pose.
 pub(in crate::web) fn airborne(rooms: &Rooms) -> Vec<Airborne> {
     let now = clock::now();
     let seen = rooms.flights.vehicles.iter().filter_map(|vehicle| {
@@ -62,7 +62,7 @@ pub(in crate::web) fn airborne(rooms: &Rooms) -> Vec<Airborne> {
     seen.collect()
 }
 
-/// Lands whoever has come too close to another.
+/// Lands vehicles that have come too close to each other.
 fn keep_apart(rooms: &Rooms, lab: &Lab, watch: &mut SeparationWatch) {
     let Some(least_m) = lab.look(|day| day.separation_m) else { return };
     let vehicles = &rooms.flights.vehicles;
@@ -81,7 +81,7 @@ fn keep_apart(rooms: &Rooms, lab: &Lab, watch: &mut SeparationWatch) {
     }
 }
 
-/// Gives the pose of the vehicle in somebody's hands to the check of its axes.
+/// Passes the pose of the hand-held vehicle to the check of its axes.
 fn watch_hands(rooms: &Rooms, lab: &Lab) {
     let mut guided = lock(&lab.guided);
     let Some(check) = guided.as_mut() else { return };
@@ -93,11 +93,11 @@ fn watch_hands(rooms: &Rooms, lab: &Lab) {
     }
 }
 
-/// What is remembered of one vehicle.
+/// State of one vehicle.
 struct VehicleWatch {
     poses: PoseWindow,
     traffic: VecDeque<Traffic>,
-    /// Index of the first event that was not looked at.
+    /// Index of the first unprocessed event.
     event: u64,
     trial: Option<(StopTrial, String)>,
 }
@@ -112,7 +112,7 @@ impl VehicleWatch {
         }
     }
 
-    /// Looks at pose, events and reports.
+    /// Processes pose, events and reports.
     fn look(&mut self, rooms: &Rooms, vehicle: &VehicleFlight, now: ServerTime, lab: &Lab) {
         if let Some(pose) = rooms.localization.vehicles[vehicle.index].sample() {
             self.poses.push(&pose);
@@ -124,7 +124,7 @@ impl VehicleWatch {
         for entry in events {
             let is_stop =
                 entry.event.kind == EventKind::EmergencyStop && entry.origin == Origin::Server;
-            // A press again is the same trial.
+            // Pressing again belongs to the same trial.
             if is_stop && self.trial.is_none() && vehicle.runtime().is_some() {
                 let trial = StopTrial::new(entry.index + 1, entry.event.stamp);
                 self.trial = Some((trial, entry.event.text.as_str().to_owned()));
@@ -142,7 +142,7 @@ impl VehicleWatch {
         }
     }
 
-    /// Measures what there is to measure now.
+    /// Measures all checks that are possible now.
     fn measure(&mut self, rooms: &Rooms, vehicle: &VehicleFlight, now: ServerTime, lab: &Lab) {
         use FlightPhase::{Connecting, Landed, Preparing, Waiting};
         let (name, index) = (&vehicle.name, vehicle.index);
@@ -183,13 +183,13 @@ impl VehicleWatch {
         let timing = stream.timing.borrow().clone().unwrap_or_default();
         found(CheckId::Clocks, timing.clock.as_ref().map(checks::clocks));
         let report = vehicle.telemetry.borrow().clone().unwrap_or_default();
-        // Before it is prepared, images come late and the autopilot has not answered yet.
+        // Before preparation is complete, images are late and the autopilot has not answered yet.
         if matches!(report.phase, Connecting | Preparing) {
             return;
         }
         let (seen, age) = (&timing.waterfall, &timing.waterfall.age);
         found(CheckId::Latency, checks::latency(age.p50, age.p99, seen.images, timing.seconds));
-        // In flight a pack runs down; what counts is what it took off with.
+        // The battery discharges in flight; the check is about its charge at take-off.
         if matches!(report.phase, Waiting | Landed) {
             found(CheckId::Battery, Some(checks::battery(&report.vehicle)));
         }
@@ -203,9 +203,9 @@ impl VehicleWatch {
     }
 }
 
-/// Checks are measured once a second.
+/// Checks are measured once per second.
 const MEASURE_LOOKS: u64 = 50;
-/// A vehicle whose pose is older is somewhere else. [s]
+/// Maximum age of a vehicle's pose. [s]
 const FRESH_S: f64 = 0.5;
-/// Traffic is judged over five seconds.
+/// Traffic is evaluated over five seconds.
 const TRAFFIC_KEPT: usize = 6;

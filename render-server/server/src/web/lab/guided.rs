@@ -1,4 +1,4 @@
-//! The check of axes on the page: somebody moves the vehicle as asked, and the server watches its poses.
+//! Check of axes on the page: a person moves the vehicle as instructed, and the server evaluates its poses.
 
 use vizflyt_protocol::messages::PoseSample;
 
@@ -6,29 +6,29 @@ use crate::flights::lab_day::Finding;
 use crate::poses::hand_check::{Check, Diagnosis, HandCheckStep};
 use crate::poses::settings::LocalizationConfig;
 
-/// A check under way.
+/// A running check.
 #[derive(Debug)]
 pub(in crate::web) struct Guided {
-    /// The vehicle, by its index.
+    /// Index of the vehicle.
     pub(in crate::web) vehicle: usize,
     check: Check,
     newest_s: f64,
-    /// Who began it.
+    /// Name of the person who started it.
     pub(in crate::web) by: String,
 }
 
 impl Guided {
-    /// Begins; poses will come as `source` makes them.
+    /// Begins a check for poses of `source`.
     pub(in crate::web) fn new(vehicle: usize, source: LocalizationConfig, by: String) -> Self {
         Self { vehicle, check: Check::new(source), newest_s: f64::NEG_INFINITY, by }
     }
 
-    /// Returns what is to be done, and what was seen last.
+    /// Returns the current instruction, and the last observation.
     pub(in crate::web) fn ask(&self) -> (String, String) {
         (self.check.step().ask().to_owned(), self.check.seen())
     }
 
-    /// Takes the vehicle's pose; returns the result once all was seen.
+    /// Processes a pose of the vehicle; returns the result when all steps are complete.
     pub(in crate::web) fn handle_pose(&mut self, pose: &PoseSample) -> Option<Finding> {
         let at_s = pose.stamp.as_ns() as f64 * 1e-9;
         if at_s <= self.newest_s {

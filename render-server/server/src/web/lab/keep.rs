@@ -1,4 +1,4 @@
-//! The lab day and its file: read at the start, written whole at each order, so that a restart loses nothing.
+//! The lab day and its file: read at the start, written completely after each change, so that a restart loses nothing.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -18,23 +18,22 @@ use crate::flights::vehicle::VehicleFlight;
 use crate::poses::settings::LocalizationConfig;
 use vizflyt_process::lock;
 
-/// The lab day of a server.
 #[derive(Debug)]
 pub(crate) struct Lab {
     day: Mutex<LabDay>,
-    /// Where it is kept; nowhere without one.
+    /// File of the day; `None` keeps it in memory only.
     file: Option<PathBuf>,
-    /// One writer at a time, with the newest state.
+    /// Serializes writers, so that the newest state is written last.
     writing: Mutex<()>,
     is_changed: AtomicBool,
-    /// The check of axes under way.
+    /// The running check of axes.
     pub(in crate::web) guided: Mutex<Option<Guided>>,
-    /// The first source of poses, whose settings that check is about.
+    /// First source of poses; its settings are the subject of that check.
     pub(in crate::web) source: Option<LocalizationConfig>,
 }
 
 impl Lab {
-    /// Opens the day that `file` keeps, or begins one. A file that cannot be used is set aside.
+    /// Opens the day of `file`, or begins one. A file that cannot be read is renamed.
     pub(crate) fn open(file: Option<PathBuf>, source: Option<LocalizationConfig>) -> Self {
         let day = file.as_deref().and_then(read);
         Self {
@@ -47,46 +46,46 @@ impl Lab {
         }
     }
 
-    /// Looks at the day.
+    /// Reads the day.
     pub(in crate::web) fn look<T>(&self, look: impl FnOnce(&LabDay) -> T) -> T {
         look(&lock(&self.day))
     }
 
-    /// Changes the day; `change` gets the time, ms since 1970. It is written with the next [`Self::keep`].
+    /// Changes the day; `change` gets the time, ms since 1970. The next [`Self::keep`] writes it.
     pub(in crate::web) fn change<T>(&self, change: impl FnOnce(&mut LabDay, u64) -> T) -> T {
         let mut day = lock(&self.day);
-        // While the day is held: whoever takes this back and then looks sees the change.
+        // While the day is locked: a writer that clears this flag then reads the change.
         self.is_changed.store(true, Ordering::Relaxed);
         change(&mut day, unix_ms())
     }
 
-    /// Takes what the server measures again and again; only what is news is written before the end.
+    /// Records repeated measurements of the server. Only a changed finding is written before the server stops.
     pub(in crate::web) fn measured(&self, vehicle: &str, check: CheckId, finding: Finding) {
         let is_news = lock(&self.day).record(vehicle, check, finding, "the server", unix_ms());
         self.is_changed.fetch_or(is_news, Ordering::Relaxed);
     }
 
-    /// Writes all, at the end.
+    /// Writes everything, when the server stops.
     pub(crate) fn close(&self) {
         self.is_changed.store(true, Ordering::Relaxed);
-        // It has been told.
+        // `keep` has logged the error.
         let _ = self.keep();
     }
 
-    /// Says whether a vehicle may take off now, by the order of take-off.
+    /// Checks whether a vehicle may take off, by the order of take-off.
     ///
     /// # Errors
-    /// Why not, and what to do.
+    /// Reason, and what to do.
     pub(crate) fn may_start(&self, flights: &Flights, vehicle: &str) -> Result<(), String> {
         let stand =
             |name: &str| flights.vehicle(name).map_or(Stand::Below, |vehicle| stand(vehicle));
         self.look(|day| day.order.may_start(vehicle, stand))
     }
 
-    /// Writes what has changed; returns once it is on the disk.
+    /// Writes changes; returns when they are on the disk.
     ///
     /// # Errors
-    /// Why it is not; it is tried again with the next call.
+    /// If writing fails; the next call retries.
     pub(crate) fn keep(&self) -> io::Result<()> {
         let Some(file) = &self.file else { return Ok(()) };
         let _one = lock(&self.writing);
@@ -100,9 +99,9 @@ impl Lab {
         })
     }
 
-    /// Begins another day; the old one's file stays beside it, by its date.
+    /// Begins another day; the old file is kept with its date in its name.
     pub(in crate::web) fn begin_anew(&self, by: &str) {
-        // What it could not write has been told, and the new day takes its place.
+        // `keep` has logged the error, and the new day replaces the old one.
         let _ = self.keep();
         let began_unix_ms = self.look(|day| day.began_unix_ms);
         if let Some(file) = &self.file {
@@ -115,7 +114,7 @@ impl Lab {
             }
         }
         self.change(|day, now_unix_ms| {
-            // What is set stays: it is the room's, not the day's.
+            // These settings belong to the room, not to the day.
             let (order, separation_m) = (std::mem::take(&mut day.order), day.separation_m);
             *day = LabDay::new(now_unix_ms);
             (day.order, day.separation_m) = (order, separation_m);
@@ -124,7 +123,7 @@ impl Lab {
     }
 }
 
-/// Returns where a vehicle's flight stands.
+/// Returns the stage of a vehicle's flight in the order of take-off.
 pub(in crate::web) fn stand(vehicle: &VehicleFlight) -> Stand {
     use vizflyt_protocol::messages::FlightPhase::TakingOff;
     let flight = vehicle.flight();
@@ -135,7 +134,7 @@ pub(in crate::web) fn stand(vehicle: &VehicleFlight) -> Stand {
     }
 }
 
-/// Returns the wall clock. [ms since 1970]
+/// Returns the wall-clock time. [ms since 1970]
 pub(in crate::web) fn unix_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64)
 }
@@ -162,7 +161,7 @@ fn set_aside(file: &Path, why: &str) {
     let aside = file.with_extension("damaged");
     let moved = fs::rename(file, &aside);
     let aside =
-        moved.map_or_else(|error| error.to_string(), |()| format!("it is {} now", aside.display()));
+        moved.map_or_else(|error| error.to_string(), |()| format!("the old file is {}", aside.display()));
     warn!("{}: {why}; a new lab day begins, {aside}", file.display());
 }
 
@@ -175,29 +174,29 @@ fn write(file: &Path, bytes: &[u8]) -> io::Result<()> {
     new.write_all(bytes)?;
     new.sync_all()?;
     fs::rename(&beside, file)?;
-    // The new name, too, outlasts a power cut.
+    // Sync the folder too, so that the new name survives a power cut.
     File::open(
         file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new(".")),
     )?
     .sync_all()
 }
 
-/// Writes beside what must not wait for a disk.
+/// Writes in the background, for callers that must not wait for a disk.
 #[derive(Debug, Default)]
 pub(in crate::web) struct Keeper(Option<JoinHandle<()>>);
 
 impl Keeper {
-    /// Begins to write what has changed, unless the last time is not over yet.
+    /// Begins to write changes, unless a write is still running.
     pub(in crate::web) fn begin(&mut self, lab: &Arc<Lab>) {
         if self.0.as_ref().is_none_or(JoinHandle::is_finished) {
             let lab = lab.clone();
-            // It tells by itself what it cannot write.
+            // `keep` logs errors.
             self.0 = Some(tokio::task::spawn_blocking(move || drop(lab.keep())));
         }
     }
 }
 
-/// A full day has a tenth of it.
+/// Maximum size of the file, ten times a full day.
 const MAX_BYTES: u64 = 4 << 20;
 
 #[cfg(test)]
@@ -206,7 +205,7 @@ mod tests {
     use crate::flights::lab_day::State;
 
     #[test]
-    fn what_was_changed_is_there_after_a_restart() {
+    fn keeps_changes_after_a_restart() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("deeper/lab-day.json");
         let lab = Lab::open(Some(file.clone()), None);
@@ -218,7 +217,7 @@ mod tests {
         let again = Lab::open(Some(file.clone()), None);
         assert_eq!(again.look(Clone::clone), lab.look(Clone::clone));
         assert_eq!(again.look(|day| day.state("", CheckId::Net, unix_ms())), State::Ok);
-        // Another day: the former one's file stays.
+        // Another day: the file of the previous one is kept.
         again.change(|day, _| day.set_separation(Some(1.5))).unwrap();
         again.begin_anew("Ada");
         again.keep().unwrap();
@@ -232,7 +231,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_file_is_set_aside() {
+    fn renames_a_damaged_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("lab-day.json");
         fs::write(&file, b"{\"version\": 1").unwrap();
@@ -245,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_told_and_tried_again() {
+    fn reports_and_retries_a_failed_write() {
         let folder = tempfile::tempdir().unwrap();
         let blocked = folder.path().join("full");
         fs::write(&blocked, b"").unwrap();
@@ -258,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_changed_while_another_writes_is_on_the_disk_when_it_is_kept() {
+    fn writes_changes_made_during_another_write() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("lab-day.json");
         let lab = Lab::open(Some(file.clone()), None);
@@ -279,7 +278,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_disk_that_stands_still_keeps_nobody() {
+    async fn a_hanging_disk_does_not_block_callers() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("lab-day.json");
         let lab = Arc::new(Lab::open(Some(file.clone()), None));

@@ -1,17 +1,17 @@
-//! The lab day over HTTP: the checklist, the queue of teams, several vehicles, and the report.
+//! The lab day over HTTP: checklist, queue of teams, several vehicles, report.
 //!
 //! ```text
-//! GET /lab                     the page; its data is GET /api/lab, JSON: a team's has its own vehicle's checks
-//! GET /api/lab/report.pdf      all of it on paper ([`report`])
-//! POST /api/lab/sign           a person signs a check, or takes it back
+//! GET /lab                     page; its data is GET /api/lab, JSON; a team gets the checks of its vehicle
+//! GET /api/lab/report.pdf      complete report ([`report`])
+//! POST /api/lab/sign           a person signs a check, or withdraws the signature
 //! POST /api/lab/axes           begins or ends the check of axes by hand ([`guided`])
-//! POST /api/lab/evidence       what `vizflyt doctor vehicle --report` has found
-//! POST /api/lab/queue          books for a team; DELETE /api/lab/queue/ID takes it out
+//! POST /api/lab/evidence       findings of `vizflyt doctor vehicle --report`
+//! POST /api/lab/queue          books for a team; DELETE /api/lab/queue/ID removes the booking
 //! POST /api/lab/turn           calls the next team of a vehicle, passes it over, ends its turn
 //! PUT /api/lab/formation       order of take-off and separation
-//! POST /api/lab/begin          another day
+//! POST /api/lab/begin          begins another day
 //! ```
-//! What is ordered is on the disk before it is answered ([`keep`]); [`follow`] measures.
+//! Changes are on the disk before the response ([`keep`]); [`follow`] measures.
 
 mod follow;
 pub(super) mod guided;

@@ -1,14 +1,13 @@
-//! The lab day on paper: every check with evidence and time, the queue, and what happened; A4, as PDF (ISO 32000-1).
+//! Report of the lab day: every check with evidence and time, the queue, and the log; A4, as PDF (ISO 32000-1).
 //!
-//! Lines are laid out first ([`lay_out`]), then cut into pages ([`paginate`]) and drawn. Text is Helvetica, which every
-//! reader has, in its Latin letters; what it has not is a question mark.
+//! Lines are laid out first ([`lay_out`]), then split into pages ([`paginate`]) and drawn. Text is Helvetica, which
+//! every PDF reader has, in Latin letters; other letters become question marks.
 
 use pdf_writer::{Content, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
 use vizflyt_protocol::time::Civil;
 
 use crate::flights::lab_day::{Booking, BookingState, CHECKS, CheckInfo, LabDay, State};
 
-/// Returns the day as a PDF.
 pub(in crate::web) fn pdf(
     day: &LabDay,
     arena: &str,
@@ -20,11 +19,10 @@ pub(in crate::web) fn pdf(
     draw(&title, &foot, &paginate(lay_out(day, &title, &foot, vehicles, now_unix_ms)))
 }
 
-/// A line of the report.
 #[derive(Clone, Debug, PartialEq)]
 struct Line {
     kind: LineKind,
-    /// Texts, and where each begins. [points from the left margin]
+    /// Texts with their start. [points from the left margin]
     cells: Vec<(f32, String)>,
     state: Option<State>,
 }
@@ -33,13 +31,13 @@ struct Line {
 enum LineKind {
     Title,
     Heading,
-    /// A check or a booking: what follows it in small belongs to it.
+    /// A check or a booking, followed by its small print.
     Row,
     Small,
 }
 
 impl LineKind {
-    /// Returns size and distance to the line above. [points]
+    /// Returns font size and distance to the line above. [points]
     fn size(self) -> (f32, f32) {
         match self {
             Self::Title => (18.0, 22.0),
@@ -54,7 +52,7 @@ fn line(kind: LineKind, text: impl Into<String>) -> Line {
     Line { kind, cells: vec![(0.0, text.into())], state: None }
 }
 
-/// Returns all lines, wrapped to the paper's width.
+/// Returns all lines, wrapped to the width of the paper.
 fn lay_out(
     day: &LabDay,
     title: &str,
@@ -90,7 +88,7 @@ fn lay_out(
         booked(&mut lines, booking);
     }
     if day.queue.bookings().is_empty() {
-        small(&mut lines, 0.0, "Nobody has booked.");
+        small(&mut lines, 0.0, "No bookings.");
     }
     lines.push(line(LineKind::Heading, "What happened"));
     if day.story().next().is_none() {
@@ -113,7 +111,7 @@ fn check(lines: &mut Vec<Line>, day: &LabDay, vehicle: &str, info: &CheckInfo, n
     let state = day.state(vehicle, info.id, now_unix_ms);
     let record = day.evidence(vehicle, info.id);
     let when = record.map_or_else(String::new, |record| time(record.at_unix_ms));
-    // On paper it is always too late to look again: what was found then counts.
+    // On paper an outdated check cannot be repeated: show its last result.
     let words = match record.filter(|_| state == State::Outdated) {
         Some(record) if record.finding.ok => "was ok",
         Some(_) => "had failed",
@@ -163,7 +161,7 @@ fn booked(lines: &mut Vec<Line>, booking: &Booking) {
     small(lines, NAME_AT, &times);
 }
 
-/// Adds small text, wrapped.
+/// Adds wrapped small text.
 fn small(lines: &mut Vec<Line>, at: f32, text: &str) {
     let wrapped = wrap(text, LineKind::Small.size().0, WIDTH - at);
     lines.extend(wrapped.into_iter().map(|text| Line {
@@ -173,13 +171,13 @@ fn small(lines: &mut Vec<Line>, at: f32, text: &str) {
     }));
 }
 
-/// Cuts lines into pages: a heading stays with what follows it, and a row with its small print.
+/// Splits lines into pages: a heading stays with the next block, and a row with its small print.
 fn paginate(lines: Vec<Line>) -> Vec<Vec<Line>> {
     let mut pages = vec![Vec::new()];
     let mut left = HEIGHT;
     let mut lines = lines.into_iter().peekable();
     while let Some(first) = lines.next() {
-        // What may not be torn apart.
+        // Lines that stay on one page.
         let mut block = vec![first];
         let is_story = |line: &Line| line.kind == LineKind::Small && line.cells.len() > 1;
         while let Some(next) = lines.peek() {
@@ -261,7 +259,7 @@ fn draw_page(lines: &[Line], foot: &str) -> Vec<u8> {
     content.finish().into_vec()
 }
 
-/// Returns a state's colour, dark enough for a printer without any.
+/// Returns a state's colour, dark enough for a black-and-white printer.
 fn colour(state: State) -> [f32; 3] {
     match state {
         State::Ok => [0.0, 0.4, 0.15],
@@ -271,7 +269,7 @@ fn colour(state: State) -> [f32; 3] {
     }
 }
 
-/// Returns text in WinAnsi's letters, which for those here are Latin-1's.
+/// Returns text in WinAnsi encoding, which equals Latin-1 for the supported letters.
 fn latin(text: &str) -> Vec<u8> {
     let byte = |c: char| match u32::from(c) {
         code @ (0x20..=0x7e | 0xa0..=0xff) => code as u8,
@@ -280,7 +278,7 @@ fn latin(text: &str) -> Vec<u8> {
     text.chars().map(byte).collect()
 }
 
-/// Cuts text into lines of at most `width` [points], at spaces where it can.
+/// Splits text into lines of at most `width` [points], at spaces if possible.
 fn wrap(text: &str, size: f32, width: f32) -> Vec<String> {
     let mut lines = Vec::new();
     let mut line = String::new();
@@ -305,23 +303,23 @@ fn wrap(text: &str, size: f32, width: f32) -> Vec<String> {
     lines
 }
 
-/// Returns how wide text is in Helvetica. [points]
+/// Returns the width of text in Helvetica. [points]
 fn wide(text: &str, size: f32) -> f32 {
     let of = |byte: u8| match byte {
         0x20..=0x7e => WIDTHS[usize::from(byte - 0x20)],
-        // Accented letters are no wider than a capital.
+        // Accented letters are at most as wide as a capital.
         _ => 722,
     };
     latin(text).into_iter().map(|byte| f32::from(of(byte))).sum::<f32>() * size * 1e-3
 }
 
-/// Returns `2026-11-26`.
+/// Formats a date as `2026-11-26`.
 fn date(unix_ms: u64) -> String {
     let Civil { year, month, day, .. } = Civil::of_unix(unix_ms / 1000);
     format!("{year:04}-{month:02}-{day:02}")
 }
 
-/// Returns `2026-11-26 14:05:09 UTC`.
+/// Formats a time as `2026-11-26 14:05:09 UTC`.
 fn time(unix_ms: u64) -> String {
     let Civil { hour, minute, second, .. } = Civil::of_unix(unix_ms / 1000);
     format!("{} {hour:02}:{minute:02}:{second:02} UTC", date(unix_ms))
@@ -331,7 +329,7 @@ const PLAIN: Name<'static> = Name(b"F1");
 const BOLD: Name<'static> = Name(b"F2");
 const BLACK: [f32; 3] = [0.0; 3];
 const GREY: [f32; 3] = [0.35; 3];
-/// A4. [points]
+/// Paper size A4. [points]
 const PAPER: (f32, f32) = (595.0, 842.0);
 const MARGIN: f32 = 50.0;
 const WIDTH: f32 = PAPER.0 - 2.0 * MARGIN;
@@ -340,9 +338,9 @@ const HEIGHT: f32 = PAPER.1 - 2.0 * MARGIN;
 const NAME_AT: f32 = 60.0;
 const TIME_AT: f32 = 370.0;
 const STORY_AT: f32 = 120.0;
-/// Lines that are kept together at most.
+/// Maximum number of lines that stay together.
 const BLOCK: usize = 20;
-/// Widths of Helvetica's letters from space to tilde, by Adobe's metrics (Helvetica.afm). [1/1000 of the size]
+/// Widths of Helvetica's letters from space to tilde, from Adobe's metrics (Helvetica.afm). [1/1000 of the size]
 const WIDTHS: [u16; 95] = [
     278, 278, 355, 556, 556, 889, 667, 191, 333, 333, 389, 584, 278, 333, 278, 278, 556, 556, 556,
     556, 556, 556, 556, 556, 556, 556, 278, 278, 584, 584, 584, 556, 1015, 667, 667, 722, 722, 667,
@@ -384,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn every_check_is_there_with_state_evidence_and_time() {
+    fn lists_every_check_with_state_evidence_and_time() {
         let all: Vec<_> = pages(3).concat();
         let rows: Vec<_> = all.iter().filter(|line| line.state.is_some()).collect();
         let of_room = CHECKS.iter().filter(|info| info.of_room).count();
@@ -415,7 +413,7 @@ mod tests {
         for page in &pages {
             let high: f32 = page.iter().map(|line| line.kind.size().1).sum();
             assert!(high <= HEIGHT && !page.is_empty(), "{high}");
-            // A heading is not the last line of its page.
+            // A heading is never the last line of a page.
             assert_ne!(page.last().map(|line| line.kind), Some(LineKind::Heading));
             for line in page {
                 for (at, text) in &line.cells {
@@ -432,11 +430,11 @@ mod tests {
         assert!(bytes.starts_with(b"%PDF-") && bytes.trim_ascii_end().ends_with(b"%%EOF"));
         let has = |what: &[u8]| bytes.windows(what.len()).any(|window| window == what);
         assert!(has(b"net closed") && has(b"/WinAnsiEncoding"));
-        assert!(has(b"???????? on wasp"), "Greek letters are no Latin ones");
+        assert!(has(b"???????? on wasp"), "Greek letters are not Latin-1");
     }
 
     #[test]
-    fn words_that_are_too_long_are_cut() {
+    fn splits_words_that_are_too_long() {
         assert_eq!(wrap("", 10.0, 50.0), [""]);
         let lines = wrap(&"w".repeat(30), 10.0, 50.0);
         assert_eq!(lines.concat().len(), 30);

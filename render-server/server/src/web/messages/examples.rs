@@ -1,4 +1,4 @@
-//! Each message to the page twice: with everything that it can hold, and with as little as possible.
+//! Two examples of each message to the page: one with all optional parts, one with as few as possible.
 
 use glam::{DQuat, DVec2, DVec3};
 use serde::Serialize;
@@ -17,7 +17,7 @@ use crate::stream::connection::Connection;
 use crate::stream::delivery::{CameraDelivery, Delivery};
 use crate::web::{api, stats};
 
-/// Returns the examples of every message by the name that the page's scripts know it by.
+/// Returns the examples of every message, by its name in the page's scripts.
 pub(super) fn all() -> Vec<(&'static str, Vec<Value>)> {
     vec![
         ("Arena", arenas()),

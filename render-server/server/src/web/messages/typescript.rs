@@ -1,5 +1,5 @@
-//! The page's scripts are checked against `page/messages.d.ts`, and that file against the types here: a full and a sparse
-//! example of each message is serialised, and the TypeScript type that they have is compared with the file.
+//! Generates `page/messages.d.ts`, against which the page's scripts are checked, and tests that it is up to date. The
+//! TypeScript type of each message is derived from a full and a sparse serialized example.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -19,7 +19,7 @@ fn declarations() -> String {
     text + ALIASES
 }
 
-/// Returns the type of which all these values are.
+/// Returns the common type of these values.
 fn type_of(values: &[&Value], indent: usize) -> String {
     let mut types = BTreeSet::new();
     let (mut arrays, mut objects) = (Vec::new(), Vec::new());
@@ -39,12 +39,12 @@ fn type_of(values: &[&Value], indent: usize) -> String {
     for variant in variants(&objects) {
         types.insert(object_type(&variant, indent));
     }
-    // What may be absent comes last.
+    // `null` comes last.
     let null = types.remove("null");
     types.into_iter().chain(null.then(|| "null".to_owned())).collect::<Vec<_>>().join(" | ")
 }
 
-/// Returns a tuple where all have the same few numbers, else a list.
+/// Returns a tuple if all arrays have the same small length, otherwise a list.
 fn array_type(arrays: &[&Vec<Value>], indent: usize) -> String {
     let items: Vec<_> = arrays.iter().copied().flatten().collect();
     let length = arrays[0].len();
@@ -59,7 +59,7 @@ fn array_type(arrays: &[&Vec<Value>], indent: usize) -> String {
     if item.contains(" | ") && !item.ends_with('}') { format!("({item})[]") } else { item + "[]" }
 }
 
-/// Returns objects by the variant of an enumeration that they are: variants have no key in common.
+/// Groups objects by variant of an enumeration: variants have no key in common.
 fn variants<'a>(objects: &[&'a Fields]) -> Vec<Vec<&'a Fields>> {
     let mut variants: Vec<Vec<&Fields>> = Vec::new();
     for &object in objects {
@@ -74,7 +74,7 @@ fn variants<'a>(objects: &[&'a Fields]) -> Vec<Vec<&'a Fields>> {
     variants
 }
 
-/// Returns the type of objects with these fields; one that some lack is optional.
+/// Returns the type of objects with these fields. A field that is missing in some is optional.
 fn object_type(objects: &[&Fields], indent: usize) -> String {
     let mut fields: BTreeMap<&str, Vec<&Value>> = BTreeMap::new();
     for object in objects {
@@ -86,7 +86,7 @@ fn object_type(objects: &[&Fields], indent: usize) -> String {
         .iter()
         .map(|(key, values)| {
             let optional = if values.len() < objects.len() { "?" } else { "" };
-            // What tells the messages apart.
+            // Tag of the message.
             let literal = values[0].as_str().filter(|_| *key == "type");
             let kind =
                 literal.map_or_else(|| type_of(values, indent + 2), |word| format!("\"{word}\""));
@@ -101,13 +101,14 @@ fn object_type(objects: &[&Fields], indent: usize) -> String {
     format!("{{\n{pad}  {};\n{pad}}}", lines.join(&format!(";\n{pad}  ")))
 }
 
-/// Set to write the file anew after a message has changed: `VIZFLYT_WRITE_TYPES=1 cargo test -p vizflyt-server typescript`.
+/// Variable that makes the test write the file after a change: `VIZFLYT_WRITE_TYPES=1 cargo test -p vizflyt-server
+/// typescript`.
 const WRITE: &str = "VIZFLYT_WRITE_TYPES";
 
 type Fields = serde_json::Map<String, Value>;
 
 const HEADER: &str = "\
-// What the server sends the page. A test writes this file from the server's types (messages/typescript.rs):
+// Messages from the server to the page. A test generates this file from the server's types (messages/typescript.rs):
 // VIZFLYT_WRITE_TYPES=1 cargo test -p vizflyt-server typescript
 
 ";
@@ -119,7 +120,7 @@ export type EventLine = Events[\"events\"][number];
 ";
 
 #[test]
-fn the_types_of_the_page_are_those_of_the_messages() {
+fn the_declarations_match_the_messages() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/web/page/messages.d.ts");
     let expected = declarations();
     if std::env::var_os(WRITE).is_some() {
@@ -130,7 +131,7 @@ fn the_types_of_the_page_are_those_of_the_messages() {
 }
 
 #[test]
-fn a_type_is_that_of_all_its_examples() {
+fn a_type_covers_all_its_examples() {
     fn check(examples: &[Value], expected: &str) {
         assert_eq!(type_of(&examples.iter().collect::<Vec<_>>(), 2), expected);
     }

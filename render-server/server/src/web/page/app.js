@@ -1,5 +1,5 @@
-// The page: one WebSocket in, requests out. Everything shown is the newest; after a lost connection, what was last known
-// stays on the screen.
+// The page: one WebSocket in, requests out. It shows the newest state; after a lost connection, the last state stays on
+// the screen.
 
 import { connect } from "./connection.js";
 import { $ } from "./dom.js";

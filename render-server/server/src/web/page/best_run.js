@@ -1,21 +1,21 @@
-// The ghost of the wall: the best official run of the course, as this screen has watched it. The server keeps what a run
-// came to, and not its way; so a best run that was flown while no wall was open has no ghost.
+// The ghost of the wall: the best official run of the course, as this screen has recorded it. The server stores
+// results, not paths; a best run that was flown while no wall was open has no ghost.
 
 /** @typedef {import("./messages").Leaderboard} Leaderboard */
-/** A moment of a run: since take-off, and where. [s; m, world] @typedef {[t_s: number, x: number, y: number, z: number]} Moment */
+/** A moment of a run: time since take-off and position. [s; m, world] @typedef {[t_s: number, x: number, y: number, z: number]} Moment */
 /** @typedef {{ run: string, team: string, moments: Moment[] }} Ghost */
 
-/** Moments are so far apart, at least. [s] */
+/** Minimum interval of moments. [s] */
 const EVERY_S = 0.1;
-/** The server's clock of a flight is at most so far from what was watched of it. [s] */
+/** Maximum difference between the server's flight time and the recorded one. [s] */
 const SAME_FLIGHT_S = 2;
-/** One that is watched from later on is not whole. [s] */
+/** Latest start of a complete recording, after take-off. [s] */
 const LATEST_START_S = 1;
-/** Ten minutes. */
+/** Ten minutes of moments. */
 const MAX_MOMENTS = 6000;
 
 /**
- * Returns what was kept as JSON, if it is a ghost.
+ * Returns the ghost of stored JSON; null if it is invalid.
  * @param {string | null} kept
  * @returns {Ghost | null}
  */
@@ -31,7 +31,7 @@ export function readGhost(kept) {
 }
 
 /**
- * Returns where a ghost is, and its way so far; nothing before its first moment.
+ * Returns the position of a ghost, and its path so far; nothing before its first moment.
  * @param {Ghost} ghost
  * @param {number} flight_s since take-off
  */
@@ -46,26 +46,26 @@ export function ghostAt({ moments }, flight_s) {
 }
 
 export class BestRun {
-  /** @param {Ghost | null} kept from before */
+  /** @param {Ghost | null} kept stored by an earlier page */
   constructor(kept) {
-    /** The best official run's, if it is known. @type {Ghost | null} */
+    /** Ghost of the best official run, if it was recorded. @type {Ghost | null} */
     this.ghost = null;
     this.kept = kept;
-    /** The present flight of each vehicle, and the run that it is. @type {Map<string, { run: string | null, moments: Moment[] }>} */
+    /** Current flight of each vehicle, and the run that it belongs to. @type {Map<string, { run: string | null, moments: Moment[] }>} */
     this.flights = new Map();
   }
 
   /** @param {string} vehicle @param {number | null} flight_s @param {[number, number, number]} p_world_m */
   watch(vehicle, flight_s, [x, y, z]) {
     const last_s = this.flights.get(vehicle)?.moments.at(-1)?.[0] ?? Infinity;
-    // Before take-off, or another flight.
+    // Before take-off, or a new flight.
     if (flight_s == null || flight_s < last_s) this.flights.set(vehicle, { run: null, moments: [] });
     const moments = this.flights.get(vehicle)?.moments;
     if (flight_s == null || !moments || moments.length >= MAX_MOMENTS) return;
     if (!moments.length || flight_s >= last_s + EVERY_S) moments.push([flight_s, x, y, z]);
   }
 
-  /** Learns which runs the flights are and which is the best; returns whether another ghost is to be kept. @param {Leaderboard} board */
+  /** Assigns runs to flights, and updates the best run; returns whether a new ghost must be stored. @param {Leaderboard} board */
   take({ newest, official, vehicles }) {
     for (const { vehicle, flight_s } of vehicles) {
       const flight = this.flights.get(vehicle);

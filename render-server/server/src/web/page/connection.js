@@ -1,4 +1,4 @@
-// The connection to the vehicle that is shown. A lost one comes back by itself.
+// Connection to the shown vehicle, with automatic reconnection.
 
 import { $, setText } from "./dom.js";
 import { showVehicles } from "./header.js";
@@ -6,11 +6,11 @@ import { showOutcome } from "./outcome.js";
 import { fetchSession } from "./session.js";
 import { openSocket } from "./socket.js";
 
-/** The vehicle asked for; the first one, if none is. */
+/** Requested vehicle; without one, the server selects the first. */
 const wanted = new URLSearchParams(location.search).get("vehicle");
 
 /**
- * Connects, and connects again whenever the connection ends.
+ * Connects, and reconnects whenever the connection ends.
  * @param {(message: import("./messages").Message) => void} onMessage
  * @param {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} onImage kind: 0 colour, 1 depth, 2 objects
  */
@@ -24,7 +24,7 @@ export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
     delete document.body.dataset.stale;
   };
   socket.onclose = ({ code, reason }) => {
-    // The server says why it closes; of one that is gone nobody knows.
+    // The server gives a reason when it closes; a lost server does not.
     showLink(code === TRY_AGAIN_LATER ? "warn" : "bad", reason || "server gone, reconnecting");
     document.body.dataset.stale = "";
     if (code === TRY_AGAIN_LATER) wait_ms = MAX_WAIT_MS;
@@ -33,7 +33,7 @@ export function connect(onMessage, onImage, wait_ms = FIRST_WAIT_MS) {
   };
 }
 
-/** Says why the server refuses the connection: no login, or no such vehicle. */
+/** Shows why the server rejects the connection: no login, or an unknown vehicle. */
 async function explainRefusal() {
   const { role } = await fetchSession();
   if (!role) showLink("warn", "not logged in");
@@ -47,7 +47,7 @@ async function explainRefusal() {
     showVehicles(names, null);
     showOutcome("warn", `No vehicle '${wanted}'`, `here fly ${names.join(", ")}`);
   } catch {
-    // The server is gone: the link shows it already.
+    // The server is unreachable; the link's state shows it already.
   }
 }
 
@@ -60,7 +60,7 @@ function showLink(tone, text) {
   setText($("link-text"), text);
 }
 
-/** A close code (IANA's registry of RFC 6455): too many pages are open. */
+/** Close code for too many open pages (IANA's registry of RFC 6455). */
 const TRY_AGAIN_LATER = 1013;
 const FIRST_WAIT_MS = 250;
 const MAX_WAIT_MS = 3000;

@@ -1,10 +1,10 @@
-// Dialogs over the page. They leave the stop button where it is; escape closes them, and only then stops.
+// Dialogs over the page. The stop button stays visible; escape closes the dialog first, and stops only then.
 
 import { closed, opened } from "./closing.js";
 import { make, makeButton } from "./dom.js";
 
 /**
- * Returns a dialog, closed; `openFrom` opens it and gives the focus back to the button when it closes.
+ * Returns a closed dialog. `openFrom` opens it, and returns the focus to the button when it closes.
  * @param {string} title
  * @param {(Node | string)[]} content
  */

@@ -1,4 +1,4 @@
-// What the page's scripts need of the document.
+// DOM helpers of the page's scripts.
 
 /**
  * Returns the element with this id; it must be in the page's HTML.
@@ -28,7 +28,7 @@ export function make(tag, properties = {}, ...children) {
 }
 
 /**
- * Returns a button with words in it.
+ * Returns a button with a text.
  * @param {string} textContent
  * @param {Partial<HTMLButtonElement>} [properties]
  */
@@ -37,7 +37,7 @@ export function makeButton(textContent, properties = {}) {
 }
 
 /**
- * Returns a panel that opens and closes by its summary line.
+ * Returns a panel that folds by its summary line.
  * @param {string} id
  * @param {string} summary
  * @param {(Node | string)[]} children
@@ -47,7 +47,7 @@ export function makeFoldingPanel(id, summary, ...children) {
 }
 
 /**
- * Sets an element's text where it differs: an unchanged one is not laid out again.
+ * Sets an element's text if it differs, because unchanged text needs no new layout.
  * @param {Node} node
  * @param {string} text
  */
@@ -62,12 +62,12 @@ export function setText(node, text) {
  */
 export function context2d(canvas) {
   const context = canvas.getContext("2d");
-  if (!context) throw new Error("this browser draws no canvas");
+  if (!context) throw new Error("this browser does not support canvas");
   return context;
 }
 
 /**
- * Returns a number with so many digits; a dash for none. Adding zero turns -0 into 0.
+ * Returns a number with this many digits; a dash without a number. Adding zero turns -0 into 0.
  * @param {number | null | undefined} value
  * @param {number} digits
  */

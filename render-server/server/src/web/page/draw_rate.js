@@ -1,25 +1,25 @@
-// Whether a view is drawn so seldom that it is hard to use.
+// Detects whether a view is drawn too slowly to use.
 
-/** Fewer images a second are too few. */
+/** Minimum usable frame rate. */
 const USABLE_HZ = 10;
-/** Over so long. [ms] */
+/** Duration of a measurement. [ms] */
 const WINDOW_MS = 5000;
 
 export class DrawRate {
   constructor() {
-    /** When the first of the images was drawn that are counted. [ms] */
+    /** Time of the first counted image. [ms] */
     this.since_ms = Number.NaN;
     this.images = 0;
   }
 
-  /** Forgets what was drawn before: the view was out of sight, or is another one. */
+  /** Restarts the measurement: the view was hidden or replaced. */
   restart() {
     this.since_ms = Number.NaN;
     this.images = 0;
   }
 
   /**
-   * Notes an image; returns whether there were too few of late, `null` while that is not known.
+   * Counts an image; returns whether the recent rate was too low, `null` while unknown.
    * @param {number} now_ms
    */
   note(now_ms) {

@@ -1,21 +1,21 @@
-// Events that come again and again are one line: which events are the same, and how often they came.
+// Groups repeated events into one line with a count.
 
 /** @typedef {{ key: string, count: number, first_s: number, at_s: number }} Group */
 
-/** An event is the same as one of so many lines before it; older ones are left where they stand. */
+/** Number of recent lines in which a repeated event is searched; older lines keep their place. */
 const LOOK_BACK = 8;
 
-/** A count, as the runtime adds it to what comes often; the other numbers of such a sentence are others each time, too. */
+/** Count that the runtime adds to repeated messages. Other numbers of such a message vary, too. */
 const COUNT = /\(\d+ so far\)/;
 
 export class EventGroups {
   constructor() {
-    /** The newest lines, oldest first. @type {Group[]} */
+    /** Newest lines, oldest first. @type {Group[]} */
     this.newest = [];
   }
 
   /**
-   * Returns the line of an event: a new one, or one that has come before, which is the newest from now on.
+   * Returns the line of an event: a new one, or the existing one, which becomes the newest.
    * @param {string} tone
    * @param {string} sentence
    * @param {number} at_s since the server's start

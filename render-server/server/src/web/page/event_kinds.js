@@ -1,8 +1,8 @@
-// The kinds of events: how the page names and colours them.
+// Names and colours of the kinds of events.
 
 /** @typedef {import("./messages").EventLine} EventLine */
 
-/** The colours of the kinds that end no flight; of those that do, the server sends it. @type {Record<string, string>} */
+/** Colours of kinds that do not end a flight; the server sends the colour of the others. @type {Record<string, string>} */
 const TONES = {
   pose_lost: "bad",
   pose_regained: "good",
@@ -13,13 +13,14 @@ const TONES = {
 };
 
 /**
- * Returns the name of an event's kind, without what the kind carries.
+ * Returns the name of an event's kind, without its data.
  * @param {EventLine["kind"]} kind
  */
 export const kindName = (kind) => (typeof kind === "string" ? kind : Object.keys(kind)[0]);
 
 /**
- * Notes the stages that events tell of. Those of an earlier flight, which the server tells of too, end with the next take-off.
+ * Collects the passed stages from events. Stages of an earlier flight, which the server repeats, are dropped at the
+ * next take-off.
  * @param {Set<number>} passed indices of the stages passed in this flight
  * @param {Pick<EventLine, "kind">[]} events in their order
  */
@@ -32,7 +33,7 @@ export function notePassed(passed, events) {
 }
 
 /**
- * Returns an event's colour, by name; empty for none.
+ * Returns an event's colour by name; empty without one.
  * @param {EventLine} event
  */
 export const toneOf = ({ kind, tone }) => tone ?? TONES[kindName(kind)] ?? "";

@@ -1,19 +1,19 @@
-// The other vehicles of the server that the viewer may see: where each is, and the way it has flown in this flight.
+// Other vehicles of the server that the viewer may see: their positions and paths in this flight.
 
 /** @typedef {import("./messages").State} State */
 /** @typedef {import("./messages").Track["points"]} Points */
-/** The newest pose, and when it came; long ago where it is too old to go on from. @typedef {NonNullable<State["pose"]> & { received_ms: number }} ShownPose */
+/** The newest pose, and its arrival time; -Infinity if it is too old to extrapolate. @typedef {NonNullable<State["pose"]> & { received_ms: number }} ShownPose */
 /** @typedef {{ name: string, phase: string, pose: ShownPose, track: Points }} Other */
 
-/** A pose older than this is shown, but not moved on. [s] */
+/** Maximum age of a pose that is extrapolated. [s] */
 const FRESH_S = 0.5;
-/** As many points of a track as are drawn. */
+/** Maximum number of points of a track. */
 const MAX_POINTS = 3000;
-/** Points of a track are so far apart. [m] */
+/** Minimum spacing of points of a track. [m] */
 const SPACING_M = 0.04;
 
 /**
- * Returns a pose with the moment it came at.
+ * Returns a pose with its arrival time.
  * @param {NonNullable<State["pose"]>} pose
  * @param {number} now_ms
  * @returns {ShownPose}
@@ -21,7 +21,8 @@ const SPACING_M = 0.04;
 export const received = (pose, now_ms) => ({ ...pose, received_ms: pose.age_s < FRESH_S ? now_ms : -Infinity });
 
 /**
- * Returns where a vehicle is now: between two messages it goes on at its speed, so that it is smooth at any screen's rate.
+ * Returns the current position of a vehicle: extrapolated at its speed between two messages, so that motion is smooth
+ * at any frame rate.
  * @param {ShownPose} pose
  * @param {number} now_ms
  * @returns {[number, number, number]} [m, world]
@@ -32,7 +33,7 @@ export function movedOn({ p_world_m: [x, y, z], v_world_mps: [vx, vy, vz], recei
 }
 
 /**
- * Returns a track with one more point, thinned as on the server, so that an hour's flight draws as fast as a minute's.
+ * Returns a track with one more point, thinned as on the server, so that a long flight draws as fast as a short one.
  * @param {Points} track
  * @param {NonNullable<State["pose"]>} pose
  */
@@ -45,9 +46,9 @@ export function extended(track, { p_world_m: [x, y, z], v_world_mps, age_s }) {
 
 export class Fleet {
   constructor() {
-    /** Those with a pose, in the server's order. @type {Other[]} */
+    /** Vehicles with a pose, in the server's order. @type {Other[]} */
     this.others = [];
-    /** By name. @type {Map<string, { points: Points, flown: boolean }>} */
+    /** Tracks by name. @type {Map<string, { points: Points, flown: boolean }>} */
     this.tracks = new Map();
   }
 
@@ -56,7 +57,7 @@ export class Fleet {
     this.tracks.clear();
   }
 
-  /** Takes the way that a vehicle has flown before the page came. @param {string} name @param {Points} points */
+  /** Sets the track that a vehicle has flown before the page was opened. @param {string} name @param {Points} points */
   setTrack(name, points) {
     this.tracks.set(name, { points, flown: true });
   }

@@ -1,20 +1,20 @@
-// A flight as a file, and back: to be kept, shared, and looked at again anywhere. Text: JSON of one object; numbers as the
-// server sent them. [s since take-off; m and m/s, world; quaternions x, y, z, w]
+// Reads and writes flights as files. Text: JSON of one object; numbers as sent by the server. [s since take-off; m and
+// m/s, world; quaternions x, y, z, w]
 
 import { FlightRecording } from "./flight_recording.js";
 
 /** @typedef {import("./flight_recording.js").Moment} Moment */
 /**
- * What is said of a flight.
+ * Description of a flight.
  * @typedef {object} About
  * @property {string} arena its name
  * @property {string} vehicle its name
- * @property {string} outcome in a word
- * @property {string} at when it ended, ISO 8601
+ * @property {string} outcome short text
+ * @property {string} at end time, ISO 8601
  */
 
 const VERSION = 1;
-/** Longer text is no flight: half an hour is a fifth of it. [characters] */
+/** Maximum length; half an hour uses a fifth of it. [characters] */
 const MAX_LENGTH = 100e6;
 
 /**
@@ -41,7 +41,7 @@ export function readFlight(text) {
   try {
     file = JSON.parse(text);
   } catch {
-    throw new Error("the file is no flight: it is no JSON");
+    throw new Error("the file is not a flight: no JSON");
   }
   if (file?.vizflyt_flight == null) throw new Error("the file is no flight of VizFlyt");
   if (file.vizflyt_flight !== VERSION) throw new Error(`the flight is of version ${Number(file.vizflyt_flight)}; this page reads ${VERSION}`);
@@ -50,7 +50,7 @@ export function readFlight(text) {
     const what = `moment ${k}`;
     const [flight_s, p, v, q, yaw_rad, passed, objects] = list(row, what);
     const rotation = numbers(q, 4, what);
-    if (Math.abs(Math.hypot(...rotation) - 1) > 0.01) throw new Error(`${what} is wrong: a rotation that is none`);
+    if (Math.abs(Math.hypot(...rotation) - 1) > 0.01) throw new Error(`${what} is wrong: a rotation must be a unit quaternion`);
     const pose = {
       p_world_m: /** @type {[number, number, number]} */ (numbers(p, 3, what)),
       v_world_mps: /** @type {[number, number, number]} */ (numbers(v, 3, what)),
@@ -62,7 +62,7 @@ export function readFlight(text) {
       { flight_s: number(flight_s, what), pose: /** @type {any} */ (pose), objects: list(objects, what).map((one) => object(one, what)) },
       new Set(list(passed, what).map((index) => number(index, what))),
     );
-    if (recording.moments.length === before) throw new Error(`${what} is wrong: its time is not after the one before`);
+    if (recording.moments.length === before) throw new Error(`${what} is wrong: its time must be after the previous one`);
   }
   const word = (/** @type {unknown} */ value) => String(value ?? "").slice(0, 80);
   const about = { arena: word(file.arena), vehicle: word(file.vehicle), outcome: word(file.outcome), at: word(file.at) };

@@ -1,4 +1,4 @@
-// A flight as the page has watched it, to be looked at again: it needs the server no more.
+// A recorded flight, which can be replayed without the server.
 
 /** @typedef {import("./messages").State} State */
 /** @typedef {Pick<NonNullable<State["pose"]>, "p_world_m" | "rotation" | "v_world_mps" | "yaw_rad">} FlownPose */
@@ -7,16 +7,16 @@
  * @property {number} flight_s since take-off
  * @property {FlownPose} pose
  * @property {State["objects"]} objects
- * @property {Set<number>} passed indices of the stages passed by then
+ * @property {Set<number>} passed indices of the stages passed so far
  */
 
-/** Half an hour of states, 20 a second: what is longer is kept from its start on. */
+/** Half an hour of states at 20 Hz; longer flights are cut at the end. */
 const MAX_MOMENTS = 36_000;
-/** As many points of a track as the views draw. */
+/** Maximum points of a track, as in the views. */
 const MAX_TRACK = 3000;
 
 /**
- * Returns what lies between two numbers of each place.
+ * Interpolates two lists of numbers.
  * @template {number[]} T
  * @param {T} a
  * @param {T} b
@@ -26,7 +26,7 @@ const MAX_TRACK = 3000;
 const between = (a, b, share) => /** @type {T} */ (a.map((value, k) => value + (b[k] - value) * share));
 
 /**
- * Returns the rotation between two that are near each other.
+ * Interpolates two rotations that are close to each other.
  * @param {FlownPose["rotation"]} a
  * @param {FlownPose["rotation"]} b
  * @param {number} share of the second
@@ -40,16 +40,16 @@ function rotationBetween(a, b, share) {
 
 export class FlightRecording {
   constructor() {
-    /** In the order of time. @type {Moment[]} */
+    /** Ordered by time. @type {Moment[]} */
     this.moments = [];
   }
 
-  /** When it begins: later than take-off, if the page was opened in flight. [s since take-off] */
+  /** Start of the recording: later than take-off, if the page was opened in flight. [s since take-off] */
   get start_s() {
     return this.moments[0]?.flight_s ?? 0;
   }
 
-  /** When it ends. [s since take-off] */
+  /** End of the recording. [s since take-off] */
   get end_s() {
     return this.moments.at(-1)?.flight_s ?? 0;
   }
@@ -59,7 +59,7 @@ export class FlightRecording {
   }
 
   /**
-   * Adds a state of the flight; one before take-off, without a pose or no newer than the last is none.
+   * Adds a state of the flight. Ignores states before take-off, without a pose, or not newer than the last.
    * @param {Pick<State, "flight_s" | "pose" | "objects">} state
    * @param {Set<number>} passed indices of the stages passed by now
    */
@@ -70,7 +70,7 @@ export class FlightRecording {
     this.moments.push({ flight_s, pose, objects, passed: same ? last.passed : new Set(passed) });
   }
 
-  /** Returns the track that was flown, with its speeds; of a long flight every second point, or third. @returns {import("./messages").Track["points"]} */
+  /** Returns the flown track with its speeds; a long flight is thinned. @returns {import("./messages").Track["points"]} */
   track() {
     const every = Math.ceil(this.moments.length / MAX_TRACK);
     const kept = this.moments.filter((_, k) => k % every === 0);
@@ -78,8 +78,8 @@ export class FlightRecording {
   }
 
   /**
-   * Returns how it was at a time: poses between two states, the rest as of the one before. At its ends beyond them; nothing
-   * of an empty one.
+   * Returns the state at a time: interpolated poses, and the rest of the preceding state. Times outside return the
+   * first or last state; an empty recording returns null.
    * @param {number} flight_s
    * @returns {Moment | null}
    */

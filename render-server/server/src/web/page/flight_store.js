@@ -1,11 +1,11 @@
-// The last flights that this browser has watched, kept in it: they can be looked at again after the program has ended, or has
-// been started anew. Where a browser keeps nothing, there are none.
+// The last flights that this browser has watched, stored in the browser. They can be replayed after the program has
+// ended or restarted. Without storage, the list is empty.
 
 /** @typedef {import("./flight_file.js").About} About */
-/** A kept flight: its number and what is said of it. @typedef {About & { key: number }} Kept */
+/** A stored flight: its number and description. @typedef {About & { key: number }} Kept */
 
 const NAME = "vizflyt-flights", TABLE = "flights";
-/** Of each arena. */
+/** Maximum number of flights of each arena. */
 const MOST = 12;
 
 /** @type {Promise<IDBDatabase> | null} */
@@ -22,7 +22,7 @@ function open() {
 }
 
 /**
- * Does something with the table; resolves with its result once that is kept.
+ * Executes a request on the table; resolves with its result when it is stored.
  * @template T
  * @param {"readonly" | "readwrite"} mode
  * @param {(table: IDBObjectStore) => IDBRequest<T>} act
@@ -37,7 +37,7 @@ async function ask(mode, act) {
   });
 }
 
-/** Returns the kept flights of an arena, the newest first. @param {string} arena @returns {Promise<Kept[]>} */
+/** Returns the stored flights of an arena, newest first. @param {string} arena @returns {Promise<Kept[]>} */
 export async function keptFlights(arena) {
   try {
     const keys = await ask("readonly", (table) => table.getAllKeys());
@@ -49,17 +49,17 @@ export async function keptFlights(arena) {
   }
 }
 
-/** Keeps a flight's file, and forgets the oldest of its arena. @param {About} about @param {string} text */
+/** Stores a flight's file, and deletes the oldest of its arena. @param {About} about @param {string} text */
 export async function keepFlight(about, text) {
   try {
     await ask("readwrite", (table) => table.add({ about, text }));
     for (const { key } of (await keptFlights(about.arena)).slice(MOST)) await ask("readwrite", (table) => table.delete(key));
   } catch {
-    // A browser that keeps nothing, or has no room.
+    // The browser has no storage, or it is full.
   }
 }
 
-/** Returns the file of a kept flight. @param {number} key @returns {Promise<string>} */
+/** Returns the file of a stored flight. @param {number} key @returns {Promise<string>} */
 export async function flightText(key) {
   return (await ask("readonly", (table) => table.get(key))).text;
 }

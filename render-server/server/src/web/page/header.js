@@ -1,4 +1,4 @@
-// The line at the top and the one at the bottom: which vehicle, its phase and clock; who renders, who flies.
+// Header and footer: vehicle, phase and clock; renderer and runtime.
 
 import { $, clockText, setText } from "./dom.js";
 import { PHASES } from "./phases.js";
@@ -6,7 +6,7 @@ import { PHASES } from "./phases.js";
 const list = $("vehicles", HTMLSelectElement);
 
 /**
- * Shows the vehicles to choose from, if there are several, or the one chosen is not there.
+ * Shows the selection of vehicles, if there are several, or the selected one does not exist.
  * @param {string[]} names
  * @param {string | null} current
  */
@@ -23,7 +23,7 @@ list.addEventListener("change", () => {
   if (list.value) chooseVehicle(list.value);
 });
 
-/** Shows another vehicle. @param {string} name */
+/** Selects a vehicle. @param {string} name */
 export function chooseVehicle(name) {
   location.search = `?vehicle=${encodeURIComponent(name)}`;
 }

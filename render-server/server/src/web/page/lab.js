@@ -1,5 +1,5 @@
-// The lab day: the checklist, the queue of teams, several vehicles, and one STOP for all. Asks every second; rows stay
-// where they are, so that a finger or the keyboard does not lose them.
+// The lab day: checklist, queue of teams, several vehicles, and one STOP for all. Polls every second. Rows keep their
+// place, so that a finger or the keyboard focus does not lose them.
 
 import "./dialogs/login.js";
 import { $, make, makeButton, setText } from "./dom.js";
@@ -14,7 +14,7 @@ import { followTheme } from "./theme.js";
 const EVERY_MS = 1000;
 /** @type {Record<string, string>} */
 const TONES = { ok: "good", failed: "bad", outdated: "warn", not_done: "idle" };
-/** What a check's button says: to begin, and to end. @type {Record<string, [string, string]>} */
+/** Texts of a check's button: to begin, and to end. @type {Record<string, [string, string]>} */
 const WORDS = { signed: ["sign", "take back"], guided: ["begin", "cancel"], pressed: ["STOP it", "STOP it"] };
 /** @type {Record<string, string>} */
 const STATES = { ok: "ok", failed: "failed", outdated: "outdated", not_done: "not done" };
@@ -29,7 +29,7 @@ const clock = (unix_ms) => {
 };
 
 /**
- * Gives an order, and shows what comes of it.
+ * Sends an order, and shows the result.
  * @param {"POST" | "PUT" | "DELETE"} method
  * @param {string} url
  * @param {object} [body]
@@ -51,7 +51,7 @@ const rows = new Map();
 const headings = new Map();
 
 /**
- * Returns a check's row, and what brings it up to date.
+ * Returns a check's row, and a function that updates it.
  * @param {Check} check
  * @returns {[HTMLElement, (check: Check, day: LabDay) => void]}
  */
@@ -79,7 +79,7 @@ function makeRow({ check, title, how, vehicle }) {
     isActive = how === "signed" ? now.state === "ok" : guide != null;
     const [begin, end] = WORDS[how] ?? WORDS.pressed;
     setText(act, isActive ? end : begin);
-    // Who reads a screen aloud hears which.
+    // Full label for screen readers.
     act.ariaLabel = `${act.textContent}: ${title}${vehicle && ` of ${vehicle}`}`;
     setText(evidence, guide ? guide.seen : now.evidence);
     setText(todo, guide ? `do: ${guide.ask}` : now.state === "ok" ? "" : now.todo || now.ask);
@@ -88,7 +88,7 @@ function makeRow({ check, title, how, vehicle }) {
 }
 
 /**
- * Returns a vehicle's heading, and what brings it up to date.
+ * Returns a vehicle's heading, and a function that updates it.
  * @param {string} name
  * @returns {[HTMLElement, (vehicle: Vehicle) => void]}
  */
@@ -145,7 +145,7 @@ function showChecks(day) {
 // ---- the queue ----
 
 /**
- * Fills a list where what it shows has changed.
+ * Fills a list if its content has changed.
  * @param {HTMLElement} list
  * @param {unknown} shown
  * @param {() => Node[]} children
@@ -173,7 +173,7 @@ function makeBooking({ id, team, vehicle, state, place, booked_unix_ms, called_u
 
 /** @param {Vehicle} vehicle */
 function makeTurn({ name, called }) {
-  const text = make("span", { textContent: called ? `${name}: ${called}` : `${name}: nobody is called` });
+  const text = make("span", { textContent: called ? `${name}: ${called}` : `${name}: no team is called` });
   const turn = (/** @type {string} */ word, /** @type {string} */ turn, /** @type {boolean} */ shown) => {
     const button = makeButton(word, { hidden: !shown, ariaLabel: `${word}, ${name}` });
     button.addEventListener("click", () => order("POST", "/api/lab/turn", { vehicle: name, turn }));
@@ -192,7 +192,7 @@ function showQueue(day) {
   const called = queue.filter(({ state }) => state === "called");
   const waiting = queue.filter(({ state }) => state === "waiting");
   const shown = [...called, ...waiting, ...over];
-  const none = () => make("tr", {}, make("td", { colSpan: 5, className: "muted", textContent: "nobody has booked" }));
+  const none = () => make("tr", {}, make("td", { colSpan: 5, className: "muted", textContent: "no bookings" }));
   fill($("lab-queue"), shown, () => (shown.length ? shown.map(makeBooking) : [none()]));
   const list = book.elements.namedItem("vehicle");
   if (list instanceof HTMLSelectElement) {
@@ -273,15 +273,15 @@ async function repeat() {
 }
 
 $("lab-begin").addEventListener("click", () => {
-  if (confirm("Begin a new day? Checks and queue begin anew; the former day's file is kept.")) order("POST", "/api/lab/begin");
+  if (confirm("Begin a new day? Checks and queue are reset; the file of the previous day is kept.")) order("POST", "/api/lab/begin");
 });
 
-/** Stops all vehicles; a team the one that is its own. */
+/** Stops all vehicles; a team stops only its own. */
 async function stopAll() {
   const button = $("estop"), status = $("lab-status");
   button.dataset.pressed = "";
   try {
-    // Not through `send`: the stop button waits for nothing.
+    // Not through `send`: stopping must not wait for a token.
     let answer = await fetch("/api/estop", { method: "POST" });
     if (answer.status === 403) {
       const [own] = headings.keys();
@@ -298,7 +298,7 @@ async function stopAll() {
 $("estop").addEventListener("click", stopAll);
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-  // Space on another focused control is that control's own.
+  // Another focused control handles the space key itself.
   const control = event.target instanceof Element ? event.target.closest("button, a, input, select, summary, textarea") : null;
   const isElsewhere = control && control !== $("estop");
   if (event.code === "Escape" || (event.code === "Space" && !isElsewhere)) {

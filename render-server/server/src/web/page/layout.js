@@ -1,9 +1,9 @@
-// Where the panels are: columns, order, and which are closed, as this browser keeps it. Pure; the page applies it.
+// Layout of the panels: columns, order, and closed panels, as stored in this browser. Pure; the page applies it.
 
 /** @typedef {{ left: string[], right: string[], closed: string[] }} Layout names of panels, from top to bottom */
 
 /**
- * Returns a kept layout, with all panels that there are and no others: one that it does not know stands where it usually does.
+ * Returns a stored layout, completed: unknown panels are dropped, missing panels get their default place.
  * @param {Layout} usual
  * @param {string | null} kept as `JSON.stringify` wrote it
  * @returns {Layout}
@@ -40,7 +40,7 @@ function parsed(kept) {
 const names = (value) => (Array.isArray(value) ? value.filter((name) => typeof name === "string") : []);
 
 /**
- * Returns the layout with a panel moved: up or down in its column, or over to the end of the other one.
+ * Returns the layout with a panel moved: up or down in its column, or to the end of the other one.
  * @param {Layout} layout
  * @param {string} name
  * @param {"up" | "down" | "over"} way
@@ -57,7 +57,7 @@ export function moved(layout, name, way) {
 }
 
 /**
- * Returns the layout with a panel put in a column before another of it; at its end without one.
+ * Returns the layout with a panel put in a column before another one; without one, at its end.
  * @param {Layout} layout
  * @param {string} name
  * @param {"left" | "right"} side
@@ -72,7 +72,7 @@ export function put(layout, name, side, before) {
   return { ...without, [side]: without[side].toSpliced(place, 0, name) };
 }
 
-/** Returns the layout with a panel closed, or open again. @param {Layout} layout @param {string} name @returns {Layout} */
+/** Returns the layout with a panel closed, or reopened. @param {Layout} layout @param {string} name @returns {Layout} */
 export function toggled(layout, name) {
   const closed = layout.closed.includes(name) ? layout.closed.filter((one) => one !== name) : [...layout.closed, name];
   return { ...layout, closed };

@@ -1,4 +1,4 @@
-// What the server sends the page. A test writes this file from the server's types (messages/typescript.rs):
+// Messages from the server to the page. A test generates this file from the server's types (messages/typescript.rs):
 // VIZFLYT_WRITE_TYPES=1 cargo test -p vizflyt-server typescript
 
 export type Arena = {

@@ -1,4 +1,4 @@
-// The orders to the vehicle: start, land, reset. Each is shown when it makes sense.
+// Orders to the vehicle: start, land, reset. Each is shown only if it is possible.
 
 import { $ } from "./dom.js";
 import { send, vehicleUrl } from "./session.js";

@@ -1,4 +1,4 @@
-// The banner: what decided the flight, or what the page cannot do.
+// The banner: outcome of the flight, or an error of the page.
 
 import { $, setText } from "./dom.js";
 
@@ -29,7 +29,7 @@ export const outcome = {
     if (flight_s == null && flown) $("outcome").hidden = true;
     flown = flight_s != null;
     if (outcome) showOutcome(outcome.tone, outcome.title, outcome.text + (landed ? "; the vehicle has landed" : ""));
-    // The style sheet shows it to whoever looks from across the room.
+    // The style sheet shows the outcome large enough for the whole room.
     document.body.dataset.outcome = outcome?.tone ?? "";
   },
 };

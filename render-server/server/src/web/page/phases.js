@@ -1,4 +1,4 @@
-// The phases of a flight: the colour that each is shown in, and its name.
+// Colours and names of the phases of a flight.
 
 /** @type {Record<string, [tone: string, text: string]>} */
 export const PHASES = {

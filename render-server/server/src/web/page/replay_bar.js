@@ -1,4 +1,4 @@
-// The bar that flights are looked at again with: which, beside which other as a ghost, the moment, back to what is now; and
+// Replay bar: selects a recorded flight, a second one as a ghost, and the moment; returns to live; loads and saves
 // flights as files.
 
 import { clockText, make, makeButton, setText } from "./dom.js";
@@ -7,41 +7,41 @@ import { flightText, keepFlight, keptFlights } from "./flight_store.js";
 
 /** @typedef {import("./flight_recording.js").FlightRecording} FlightRecording */
 /** @typedef {import("./flight_file.js").About} About */
-/** A flight that can be chosen. @typedef {{ name: string, about: About, load: () => Promise<FlightRecording> }} Choice */
+/** A selectable flight. @typedef {{ name: string, about: About, load: () => Promise<FlightRecording> }} Choice */
 
-/** What was watched for less is not looked at again. [s] */
+/** Minimum duration of a flight that can be replayed. [s] */
 const SHORTEST_S = 1;
-/** What an arrow key moves by, and how finely the bar is dragged. [s] */
+/** Step of an arrow key, and resolution of the slider. [s] */
 const STEP_S = 0.02;
 
 export class ReplayBar {
   /**
-   * @param {FlightRecording} live the flight that is watched now
-   * @param {(text: string) => void} tell says what went wrong
+   * @param {FlightRecording} live the current flight
+   * @param {(text: string) => void} tell shows an error
    */
   constructor(live, tell) {
     this.live = live;
     this.tell = tell;
-    /** What is looked at. */
+    /** Recording that is replayed. */
     this.recording = live;
-    /** What flies beside it, and its track. @type {{ recording: FlightRecording, track: ReturnType<FlightRecording["track"]> } | null} */
+    /** Ghost and its track. @type {{ recording: FlightRecording, track: ReturnType<FlightRecording["track"]> } | null} */
     this.ghost = null;
-    /** What is said of the flight that was watched last. @type {About | null} */
+    /** Description of the last watched flight. @type {About | null} */
     this.about = null;
-    /** Those that were kept, and those from files. @type {Choice[]} */
+    /** Stored flights, and flights from files. @type {Choice[]} */
     this.choices = [];
-    /** Those from files. @type {Choice[]} */
+    /** Flights from files. @type {Choice[]} */
     this.files = [];
-    /** The moment that is shown; none while what is now is. [s since take-off] @type {number | null} */
+    /** Moment that is shown; null for live. [s since take-off] @type {number | null} */
     this.at_s = null;
     this.plays = false;
     this.painted_ms = 0;
     this.play = makeButton("replay", { id: "replay-play" });
     this.range = make("input", { id: "replay-at", type: "range", step: String(STEP_S), ariaLabel: "moment of the flight" });
     this.time = make("output", { id: "replay-time" });
-    this.now = makeButton("now", { id: "replay-now", hidden: true, title: "back to what is now" });
+    this.now = makeButton("now", { id: "replay-now", hidden: true, title: "back to live" });
     this.flight = make("select", { id: "replay-flight", ariaLabel: "flight", title: "which flight is shown" });
-    this.beside = make("select", { id: "replay-ghost", ariaLabel: "ghost", title: "another flight beside it" });
+    this.beside = make("select", { id: "replay-ghost", ariaLabel: "ghost", title: "another flight as a ghost" });
     this.save = makeButton("save", { id: "replay-save", title: "this flight as a file" });
     this.open = makeButton("open", { id: "replay-open", title: "a flight from a file" });
     this.file = make("input", { id: "replay-file", type: "file", accept: ".json", hidden: true });
@@ -60,15 +60,15 @@ export class ReplayBar {
     this.file.addEventListener("change", () => this.upload());
   }
 
-  /** Whether the flight that is watched can be looked at again. */
+  /** Whether the last watched flight can be replayed. */
   get hasLive() {
     return this.about != null && this.live.end_s - this.live.start_s >= SHORTEST_S;
   }
 
   /**
-   * Offers replays between flights; takes them away, and ends one that runs, in flight.
+   * Offers replays between flights; in flight, hides the bar and ends a running replay.
    * @param {boolean} offered
-   * @param {About | null} about the flight that has just ended, if one has
+   * @param {About | null} about the flight that has just ended, if any
    */
   offer(offered, about) {
     if (!offered) this.about = null;
@@ -83,10 +83,10 @@ export class ReplayBar {
     this.close();
   }
 
-  /** Lists what there is of an arena. @param {string} arena */
+  /** Lists the available flights of an arena. @param {string} arena */
   async list(arena) {
     const kept = await keptFlights(arena);
-    // The newest is the one that is watched.
+    // The newest stored flight is the one in memory.
     const older = kept.filter(({ at }) => at !== this.about?.at);
     this.choices = [...this.files, ...older.map((about) => ({
       name: named(about), about,
@@ -190,7 +190,7 @@ export class ReplayBar {
     this.now.hidden = at_s == null;
   }
 
-  /** Returns the moment to show, if it is not what is now. @param {number} now_ms */
+  /** Returns the moment to show; null for live. @param {number} now_ms */
   moment(now_ms) {
     const past_s = (now_ms - this.painted_ms) / 1000;
     this.painted_ms = now_ms;
@@ -203,7 +203,7 @@ export class ReplayBar {
     return this.recording.at(this.at_s);
   }
 
-  /** Returns the ghost at the moment that is shown, with its track. */
+  /** Returns the ghost at the shown moment, with its track. */
   ghostNow() {
     const moment = this.at_s == null ? null : this.ghost?.recording.at(this.at_s);
     return this.ghost && moment ? { pose: moment.pose, track: this.ghost.track } : null;

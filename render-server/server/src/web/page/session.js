@@ -1,4 +1,4 @@
-// Who looks at the page, and the requests that change something: they carry the token that belongs to the cookie.
+// Role of the viewer, and requests that change something: they carry the token of the cookie.
 
 import { $ } from "./dom.js";
 
@@ -7,32 +7,32 @@ import { $ } from "./dom.js";
 /** @type {Partial<Session>} */
 let session = {};
 
-/** Asks the server who the viewer is; the style sheet hides what the viewer may not do. */
+/** Fetches the viewer's role; the style sheet hides the controls that the viewer may not use. */
 export async function fetchSession() {
   try {
     const answer = await fetch("/api/session");
     if (answer.ok) session = await answer.json();
   } catch {
-    // The server is gone: the connection's state shows it already.
+    // The server is unreachable; the connection's state shows it already.
   }
   document.body.dataset.role = session.role ?? "";
-  // No login where none is needed, nor where there is no password.
+  // Hide the login if it is not required, or no password is set.
   $("login").hidden = session.by === "here" || session.by === "password" || !session.password;
   $("logout").hidden = session.by !== "password";
   return session;
 }
 
-/** Resolves with who the viewer is. */
+/** Resolves with the viewer's session. */
 export const known = fetchSession();
 
 /**
  * @typedef {object} Reply
  * @property {boolean} ok
- * @property {string} text the answer's body, or why there is none
+ * @property {string} text body of the answer, or the reason of a failure
  */
 
 /**
- * Sends a request that changes something; an outdated token is renewed once. Never throws.
+ * Sends a request that changes something; renews an outdated token once. Never throws.
  * @param {"POST" | "PUT" | "PATCH" | "DELETE"} method
  * @param {string} url
  * @param {object} [body] sent as JSON
@@ -58,7 +58,7 @@ export async function send(method, url, body) {
 }
 
 /**
- * Returns where a vehicle's requests go.
+ * Returns the base URL of a vehicle's requests.
  * @param {string} name
  */
 export const vehicleUrl = (name) => `/api/vehicles/${encodeURIComponent(name)}`;

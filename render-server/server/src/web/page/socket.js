@@ -1,8 +1,8 @@
-// The WebSocket of one vehicle: JSON messages, and pictures as binary ones.
+// WebSocket of one vehicle: JSON messages, and images as binary messages.
 
 /**
- * Opens it.
- * @param {string | null} vehicle the first one, if none is named
+ * Opens the WebSocket.
+ * @param {string | null} vehicle default: the first one
  * @param {(message: import("./messages").Message) => void} onMessage
  * @param {(kind: number, camera: number, jpeg: Uint8Array<ArrayBuffer>) => void} onImage kind: 0 colour, 1 depth, 2 objects
  */

@@ -1,5 +1,5 @@
-// The view in space as the page has it: its canvas, who draws it, and a line about that where it is not the browser, or
-// where the browser draws so slowly that the server might.
+// Canvas of the 3D view, its renderer, and a line about the renderer if the server draws, or if the browser draws so
+// slowly that the server could.
 
 import { make, makeButton } from "./dom.js";
 
@@ -8,7 +8,7 @@ import { make, makeButton } from "./dom.js";
 /** @typedef {import("./space_view.js").Drawer} Drawer */
 
 const NO_WEBGL = "this browser has no WebGL 2", LOST = "this browser's graphics have failed";
-/** Where the browser keeps that its user leaves drawing to the server. */
+/** Local storage key: the user has chosen the server as renderer. */
 const CHOICE = "drawer";
 
 function makeCanvas() {
@@ -28,11 +28,11 @@ export class SpaceDrawing {
     this.note = make("p", { className: "drawer", role: "status", hidden: true }, this.said, this.other);
     /** @type {Drawer} */
     this.drawer = "card";
-    /** Why the server draws, unless somebody has chosen so. */
+    /** Reason for which the server draws; empty if the user has chosen so. */
     this.reason = "";
-    /** Why there is no picture of the server's. */
+    /** Reason for which the server's image is missing. */
     this.trouble = "";
-    /** What was last asked for. @type {{ arena: Arena, theme: string | undefined, mode: import("./space_view.js").Mode } | null} */
+    /** Last requested view. @type {{ arena: Arena, theme: string | undefined, mode: import("./space_view.js").Mode } | null} */
     this.shown = null;
     document.addEventListener("visibilitychange", () => this.view?.rate.restart());
   }
@@ -46,13 +46,13 @@ export class SpaceDrawing {
     this.showNote();
   }
 
-  /** Whether a graphics card draws. */
+  /** Whether a graphics card is available. */
   async hasCard() {
     return (await import("./space_view.js")).ableDrawer() === "card";
   }
 
   /**
-   * Makes the view, if there is none yet.
+   * Creates the view, if it does not exist.
    * @param {Arena} arena
    * @param {string | undefined} theme
    * @param {import("./space_view.js").Mode} mode
@@ -94,20 +94,20 @@ export class SpaceDrawing {
     if (this.view?.isSlow !== was) this.showNote();
   }
 
-  /** The browser's graphics are gone, with all that was in them. */
+  /** Handles a lost graphics context. */
   lose() {
     this.reason = LOST;
     this.renew();
   }
 
-  /** @param {"server" | ""} drawer the server, or whoever can */
+  /** @param {"server" | ""} drawer the server; empty: automatic */
   choose(drawer) {
     localStorage.setItem(CHOICE, drawer);
     this.reason = "";
     this.renew();
   }
 
-  /** Makes the view anew, on a canvas of its own: one that has had a context takes no other. */
+  /** Recreates the view on a new canvas, because a canvas cannot change its kind of context. */
   renew() {
     const { canvas } = this, hadFocus = document.activeElement === this.other;
     this.view?.dispose();

@@ -1,20 +1,20 @@
-// Draws the view in space without a graphics card: over a picture, the lines and faces of a scene, the furthest first. What
-// the picture shows hides none of them. Of three's materials it knows plain and matt ones.
+// Draws the 3D view without a graphics card: lines and faces of a scene over an image, the farthest first. The image
+// does not hide them. Supports basic and matte materials of three.js.
 
 import * as THREE from "/three/three.module.min.js";
 import { context2d } from "./dom.js";
 
-/** Where light comes from, and the share that faces turned away from it have. */
+/** Direction of the light, and brightness of faces turned away from it. */
 const SUN = new THREE.Vector3(-0.4, -0.7, 1).normalize(), AMBIENT = 0.55;
 /** [CSS px] */
 const LINE_PX = 1.5;
-/** Segments of a line that are drawn, and put in order, as one. */
+/** Segments of a line that are sorted and drawn together. */
 const TOGETHER = 12;
-/** How much of a picture is left where it is of another camera. */
+/** Opacity of an image of another camera. */
 const FORMER = 0.3;
 
 /**
- * What is drawn at once: paths, filled or as lines.
+ * Shape that is drawn at once: paths, filled or as lines.
  * @typedef {{ depth: number, style: string, alpha: number, filled: boolean, paths: [x: number, y: number][][] }} Shape
  */
 
@@ -50,7 +50,7 @@ export class FlatRenderer {
    * @param {THREE.Scene} scene
    * @param {THREE.PerspectiveCamera} camera
    * @param {ImageBitmap | undefined} picture
-   * @param {boolean} isCurrent whether the picture is of that camera
+   * @param {boolean} isCurrent whether the picture shows this camera's view
    */
   render(scene, camera, picture, isCurrent) {
     scene.updateMatrixWorld();
@@ -94,12 +94,12 @@ export class FlatRenderer {
     const toView = new THREE.Matrix4().multiplyMatrices(camera.matrixWorldInverse, mesh.matrixWorld);
     const corners = Array.from({ length: position.count }, (_, k) => new THREE.Vector3().fromBufferAttribute(position, k).applyMatrix4(toView));
     const sun = SUN.clone().transformDirection(camera.matrixWorldInverse);
-    /** All faces of what is seen through are one shape, so that no edge shows between them. @type {Shape} */
+    /** All faces of a transparent mesh are one shape, so that no edges show between them. @type {Shape} */
     const whole = { depth: 0, style: this.style(material.color, 1), alpha: material.opacity, filled: true, paths: [] };
     const normal = new THREE.Vector3(), other = new THREE.Vector3();
     for (let k = 0; k < (index?.count ?? position.count); k += 3) {
       const [a, b, c] = [k, k + 1, k + 2].map((at) => corners[index ? index.getX(at) : at]);
-      // Small as they are, those that reach behind the camera are left out.
+      // Skip the small faces that reach behind the camera.
       if (Math.max(a.z, b.z, c.z) > -camera.near) continue;
       normal.subVectors(b, a).cross(other.subVectors(c, a)).normalize();
       if (material.side === THREE.FrontSide && normal.dot(a) >= 0) continue;
@@ -127,7 +127,7 @@ export class FlatRenderer {
     if (line instanceof THREE.LineLoop && count) points.push(points[0]);
     const step = line instanceof THREE.LineSegments ? 2 : 1;
     const paint = new THREE.Color();
-    /** What the next segment goes on from. @type {{ shape: Shape, length: number } | null} */
+    /** Previous segment that the next one continues. @type {{ shape: Shape, length: number } | null} */
     let former = null;
     for (let k = 0; k + 1 < points.length; k += step) {
       const style = this.style(color ? paint.setRGB(color.getX(k), color.getY(k), color.getZ(k)) : material.color, 1);
@@ -150,7 +150,7 @@ export class FlatRenderer {
     }
   }
 
-  /** Returns where a point is on the canvas. @param {THREE.Vector3} p_view @param {THREE.PerspectiveCamera} camera @returns {[x: number, y: number]} [px] */
+  /** Returns the position of a point on the canvas. @param {THREE.Vector3} p_view @param {THREE.PerspectiveCamera} camera @returns {[x: number, y: number]} [px] */
   project(p_view, camera) {
     const { x, y } = p_view.clone().applyMatrix4(camera.projectionMatrix);
     return [((1 + x) / 2) * this.canvas.width, ((1 - y) / 2) * this.canvas.height];
@@ -174,7 +174,7 @@ export class FlatRenderer {
 }
 
 /**
- * Returns the part of a segment that is before the camera; null of one that is behind it.
+ * Returns the part of a segment in front of the camera; null if it is entirely behind.
  * @param {THREE.Vector3} a
  * @param {THREE.Vector3} b
  * @param {number} near [m]

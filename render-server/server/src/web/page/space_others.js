@@ -1,4 +1,4 @@
-// The other vehicles in the view in space, and the ways they have flown.
+// Other vehicles in the 3D view, and their paths.
 
 import * as THREE from "/three/three.module.min.js";
 import { movedOn } from "./fleet.js";
@@ -7,11 +7,11 @@ import { TrackLine } from "./space_track.js";
 export class Others {
   constructor() {
     this.group = new THREE.Group();
-    /** By name. @type {Map<string, { model: THREE.Group, track: TrackLine }>} */
+    /** Models by name. @type {Map<string, { model: THREE.Group, track: TrackLine }>} */
     this.shown = new Map();
   }
 
-  /** Takes all away; those that are there come back in the room's colours. */
+  /** Removes all; they are recreated in the room's colours. */
   clear() {
     for (const { model, track } of this.shown.values()) {
       model.removeFromParent();

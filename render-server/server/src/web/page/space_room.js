@@ -1,5 +1,5 @@
-// What the view in space shows of one arena: fence, gates, goal, and the vehicle; floor and what is solid, until the twin
-// is there. World x east, y north, z up; [m, world] throughout.
+// Objects of one arena in the 3D view: fence, stages, goal, and the vehicle; floor and solid cells until the twin is
+// loaded. World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
 import { cssColours } from "./theme.js";
@@ -11,7 +11,7 @@ import { cssColours } from "./theme.js";
 export const vec = (p) => new THREE.Vector3(...p);
 
 /**
- * Returns a point made of each axis of two others.
+ * Combines two points axis by axis.
  * @param {Point} a
  * @param {Point} b
  * @param {(a: number, b: number) => number} join
@@ -25,7 +25,7 @@ function readColours() {
   return (/** @type {string} */ name) => new THREE.Color(read(name));
 }
 
-/** Returns the fence's box, and how it is turned; that of the map's picture, up to 4 m, if the fence is no box. @param {Arena} arena */
+/** Returns the fence's box and its rotation; without a box, the map's area up to 4 m. @param {Arena} arena */
 function fenceBox(arena) {
   if ("cuboid" in arena.fence) {
     const { center_m, half_m, rotation } = arena.fence.cuboid;
@@ -47,22 +47,22 @@ export class Room {
     this.colour = readColours();
     this.group = new THREE.Group();
     const { lo, hi, turn } = fenceBox(arena);
-    /** The fence's least corner. */
+    /** Minimum corner of the fence. */
     this.lo = lo;
     this.size = joined(hi, lo, (h, l) => h - l);
     this.middle = vec(joined(lo, hi, (l, h) => (l + h) / 2));
     this.fenceTurn = turn;
     this.disposed = false;
-    /** What the twin takes the place of. */
+    /** Placeholders until the twin is loaded. */
     this.stand = new THREE.Group();
     this.group.add(this.stand);
     this.addFloor(theme);
     this.fenceColour = this.addFence();
-    /** Each colours one stage. */
+    /** Functions that set the colour of a stage. */
     this.stages = arena.stages.map((stage) => this.addStage(stage));
     if (arena.goal_m) this.addGoal(arena.goal_m);
     this.vehicle = this.addVehicle();
-    /** Another flight's, seen through. */
+    /** Model of the ghost's vehicle, transparent. */
     this.ghost = this.addVehicle(0.4);
     this.shadow = this.addShadow();
   }
@@ -99,7 +99,7 @@ export class Room {
   }
 
   /**
-   * Adds a gate: its opening, and an arrow the way it is to be flown. Returns what colours it.
+   * Adds a stage: its opening, and an arrow in the direction of flight. Returns a function that sets its colour.
    * @param {Arena["stages"][number]} stage
    */
   addStage(stage) {
@@ -109,7 +109,7 @@ export class Room {
     const above = new THREE.Vector3().crossVectors(normal, across);
     const [w, h] = [stage.width_m / 2, stage.height_m / 2];
     const center = vec(stage.center_m);
-    // To the left and up from the centre, as one flies through. [m]
+    // To the left and up from the centre, in the direction of flight. [m]
     const corners = stage.polygon_m?.length ? stage.polygon_m : [[-w, -h], [w, -h], [w, h], [-w, h]];
     const outline = corners.map(([x, y]) => center.clone().addScaledVector(across, x).addScaledVector(above, y));
     const colour = this.colour("--accent");
@@ -170,7 +170,7 @@ export class Room {
     return shadow;
   }
 
-  /** Fetches what is solid, and adds it as boxes coloured by height. */
+  /** Fetches the solid cells, and adds them as boxes coloured by height. */
   async addSolid() {
     try {
       const answer = await fetch(`/api/shell?${this.arena.boot}`);
@@ -192,7 +192,7 @@ export class Room {
       }
       this.stand.add(mesh);
     } catch {
-      // Without it the rest is drawn all the same.
+      // Everything else is drawn without them.
     }
   }
 

@@ -1,26 +1,26 @@
-// The twin in the view in space where the browser does not draw it: pictures that the server draws, one at a time, for the
-// newest camera, and none while the camera rests.
+// Image of the twin from the server, for browsers that do not draw it: one image at a time, for the newest camera, and
+// none while the camera rests.
 
 import * as THREE from "/three/three.module.min.js";
 
-/** As many as the server draws. [ms] */
+/** Interval of the server's images. [ms] */
 const EVERY_MS = 500;
-/** After a picture that did not come. [ms] */
+/** Retry interval after a failure. [ms] */
 const RETRY_MS = 2000;
-/** The largest that the server draws. [px] */
+/** Maximum size of the server's images. [px] */
 const MAX_SIDE_PX = 960, MAX_PX = 960 * 540;
 /** Three's cameras have y up and look along -z, the server's y down and look along z. */
 const CAMERA_TURN = new THREE.Quaternion(1, 0, 0, 0);
 
-/** A picture, and what it was asked for with. @typedef {{ bitmap: ImageBitmap, camera: THREE.PerspectiveCamera, query: string }} Picture */
+/** An image and its query. @typedef {{ bitmap: ImageBitmap, camera: THREE.PerspectiveCamera, query: string }} Picture */
 
 export class ServedTwin {
-  /** @param {(text: string) => void} report told why there is no picture; nothing, if there is one */
+  /** @param {(text: string) => void} report receives the reason for which the image is missing; empty if it is not */
   constructor(report) {
     this.report = report;
-    /** The newest. @type {Picture | null} */
+    /** Newest image. @type {Picture | null} */
     this.picture = null;
-    /** What the picture that is wanted now is asked for with. */
+    /** Query of the wanted image. */
     this.query = "";
     this.waits = false;
     this.due_ms = -Infinity;
@@ -28,11 +28,11 @@ export class ServedTwin {
   }
 
   /**
-   * Prepares for an image: asks for a picture, if none is there of this camera.
+   * Prepares a frame: requests an image, if none exists for this camera.
    * @param {THREE.PerspectiveCamera} camera
    * @param {THREE.Vector2} viewport [px]
    * @param {import("./space_room.js").Room} room
-   * @param {boolean} cut whether what lies between camera and fence is left out
+   * @param {boolean} cut whether to omit what is between camera and fence
    */
   place(camera, viewport, room, cut) {
     this.query = query(camera, viewport, room.colour("--map-bg"), cut);
@@ -60,7 +60,7 @@ export class ServedTwin {
     if (this.disposed) this.picture?.bitmap.close();
   }
 
-  /** Whether the picture is of the camera that is wanted now. */
+  /** Whether the image shows the wanted camera's view. */
   isCurrent() {
     return this.picture?.query === this.query;
   }
@@ -72,7 +72,7 @@ export class ServedTwin {
 }
 
 /**
- * Returns what a picture is asked for with.
+ * Returns the query of an image.
  * @param {THREE.PerspectiveCamera} camera
  * @param {THREE.Vector2} viewport [px]
  * @param {THREE.Color} background
@@ -82,7 +82,7 @@ function query(camera, viewport, background, cut) {
   const scale = Math.min(1, MAX_SIDE_PX / viewport.x, MAX_SIDE_PX / viewport.y, Math.sqrt(MAX_PX / viewport.x / viewport.y));
   const [width, height] = [viewport.x, viewport.y].map((side) => Math.max(16, Math.floor(side * scale)));
   const [p, q] = [camera.position, camera.quaternion.clone().multiply(CAMERA_TURN)];
-  // A millimetre, and half a pixel: less is no other picture.
+  // Resolution of a millimetre and half a pixel: smaller changes request no new image.
   return new URLSearchParams({
     x_m: p.x.toFixed(3), y_m: p.y.toFixed(3), z_m: p.z.toFixed(3),
     qx: q.x.toFixed(4), qy: q.y.toFixed(4), qz: q.z.toFixed(4), qw: q.w.toFixed(4),

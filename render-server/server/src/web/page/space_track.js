@@ -1,11 +1,11 @@
-// A track in the view in space: a line with a colour for each point. [m, world]
+// A track in the 3D view: a line with a colour for each point. [m, world]
 
 import * as THREE from "/three/three.module.min.js";
 import { speedColour } from "./top_view.js";
 
 /** @typedef {import("./top_view.js").TrackPoint} TrackPoint */
 
-/** The most points of a track; as many as the top view keeps. */
+/** Maximum points of a track, as in the top view. */
 const MAX_POINTS = 3000;
 
 export class TrackLine {
@@ -19,9 +19,9 @@ export class TrackLine {
     this.forget();
   }
 
-  /** Draws the next track anew, whatever it is. */
+  /** Forces a full redraw of the next track. */
   forget() {
-    /** What is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
+    /** Part that is drawn already. @type {{ length: number, end: TrackPoint | undefined }} */
     this.drawn = { length: -1, end: undefined };
   }
 
@@ -53,7 +53,7 @@ export class TrackLine {
   }
 }
 
-/** Returns the colours of speeds up to the fastest. @param {number} fastest_mps */
+/** Returns a function from speed to colour. @param {number} fastest_mps */
 export function speedColours(fastest_mps) {
   const colour = new THREE.Color();
   return (/** @type {number} */ speed_mps) => colour.setStyle(speedColour(speed_mps / Math.max(1, fastest_mps)).replaceAll(/(\d) (?=\d)/g, "$1,"));

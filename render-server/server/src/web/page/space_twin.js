@@ -1,10 +1,10 @@
-// The twin itself in the view in space: its splats, drawn back to front. What lies beyond a side of the fence that the
-// camera is beyond, too, is left out, so that one looks into a room past its near walls and ceiling.
+// The twin in the 3D view: its splats, drawn back to front. Splats beyond a side of the fence that the camera is beyond
+// are omitted, so that the view into a room is not blocked by its near walls and ceiling.
 
 import * as THREE from "/three/three.module.min.js";
 import { ROW, TEXELS } from "./splats.js";
 
-/** The order is made anew where the camera has turned by more than this. [cosine; 1 degree] */
+/** Sort again if the camera has turned by more than this. [cosine; 1 degree] */
 const SAME_DIRECTION = Math.cos(Math.PI / 180);
 
 const VERTEX = /* glsl */ `
@@ -42,7 +42,7 @@ void main() {
   mat3 turn = mat3(viewMatrix);
   vec3 across = vec3(focal.x / depth, 0.0, focal.x * camera.x / (depth * depth)) * turn;
   vec3 above = vec3(0.0, focal.y / depth, focal.y * camera.y / (depth * depth)) * turn;
-  // A pixel's own width, as everywhere splats are drawn. [px^2]
+  // Minimum width of one pixel, as in the server's renderers. [px^2]
   float xx = dot(across, spread * across) + 0.3;
   float yy = dot(above, spread * above) + 0.3;
   float xy = dot(across, spread * above);
@@ -51,7 +51,7 @@ void main() {
   float longer = mid + away;
   float shorter = max(0.1, mid - away);
   vec2 axis = abs(xy) > 1e-6 ? normalize(vec2(xy, longer - xx)) : xx > yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
-  // Beyond this it is fainter than one step of colour.
+  // Radius at which a splat is fainter than one step of colour.
   at = position.xy * sqrt(2.0 * log(max(1.01, 255.0 * mean.w)));
   vec2 offset = at.x * min(sqrt(longer), 512.0) * axis + at.y * min(sqrt(shorter), 512.0) * vec2(-axis.y, axis.x);
   gl_Position = vec4(clip.xy / clip.w + 2.0 * offset / viewport, clip.z / clip.w, 1.0);
@@ -74,8 +74,8 @@ export class Twin {
   /**
    * Fetches the twin and draws it from its first part on.
    * @param {import("./messages").Arena} arena
-   * @param {number} parts how many of the arena's parts to fetch
-   * @param {() => void} shown called once, when there is something to see
+   * @param {number} parts number of parts to fetch
+   * @param {() => void} shown called once, when the first part is visible
    */
   constructor(arena, parts, shown) {
     this.geometry = new THREE.InstancedBufferGeometry();
@@ -97,9 +97,9 @@ export class Twin {
     });
     this.mesh = new THREE.Mesh(this.geometry, this.material);
     this.mesh.frustumCulled = false;
-    // Before what else is transparent: panes of gates lie over it.
+    // Drawn before other transparent objects: panes of stages are in front of it.
     this.mesh.renderOrder = -1;
-    /** Where the camera looked when the order was asked for. @type {THREE.Vector3 | null} */
+    /** Direction of the camera at the last sort request. @type {THREE.Vector3 | null} */
     this.ordered = null;
     this.waits = false;
     this.isShown = false;
@@ -120,11 +120,11 @@ export class Twin {
     texture.needsUpdate = true;
     this.material.uniforms.splats.value?.dispose();
     this.material.uniforms.splats.value = texture;
-    // With more splats the old order lacks some.
+    // The old order does not contain the new splats.
     this.ordered = null;
   }
 
-  /** Takes a new order; returns whether it is the first. @param {Float32Array} order */
+  /** Sets a new order; returns whether it is the first. @param {Float32Array} order */
   setOrder(order) {
     this.waits = false;
     const former = this.geometry.getAttribute("place");
@@ -132,7 +132,7 @@ export class Twin {
       former.array.set(order);
       former.needsUpdate = true;
     } else {
-      // A buffer's length is fixed.
+      // The size of a buffer is fixed.
       if (former) this.geometry.dispose();
       this.geometry.setAttribute("place", new THREE.InstancedBufferAttribute(order, 1));
     }
@@ -143,11 +143,11 @@ export class Twin {
   }
 
   /**
-   * Prepares for a picture.
+   * Prepares a frame.
    * @param {THREE.PerspectiveCamera} camera
    * @param {THREE.Vector2} viewport [px]
    * @param {import("./space_room.js").Room} room
-   * @param {boolean} cut whether what lies between camera and fence is left out
+   * @param {boolean} cut whether to omit what is between camera and fence
    */
   place(camera, viewport, room, cut) {
     const { uniforms } = this.material;
@@ -156,7 +156,7 @@ export class Twin {
     uniforms.fenceFromWorld.value.setFromMatrix4(world);
     uniforms.fenceMiddle.value.copy(room.middle);
     uniforms.fenceHalf.value.set(...room.size).multiplyScalar(0.5);
-    // From the middle nothing is cut.
+    // From the middle, nothing is cut.
     uniforms.eye.value.copy(cut ? camera.position : room.middle).sub(room.middle).applyMatrix3(uniforms.fenceFromWorld.value);
     const ahead = camera.getWorldDirection(new THREE.Vector3());
     if (!uniforms.splats.value || this.waits || (this.ordered && this.ordered.dot(ahead) > SAME_DIRECTION)) return;

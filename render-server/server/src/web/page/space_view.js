@@ -1,6 +1,6 @@
-// The view in space: a room, its twin, and in it what moves: objects, the track, the vehicle. Drag turns, right drag or two
-// fingers shift, the wheel zooms; with the keyboard: arrows turn, + and - zoom, 0 goes back, F follows the vehicle. Or the
-// camera goes behind the vehicle ("chase"), or flies in it ("onboard"). World x east, y north, z up; [m, world] throughout.
+// The 3D view: a room with its twin, and moving objects, track and vehicle. Drag rotates, right drag or two fingers
+// pan, the wheel zooms. Keyboard: arrows rotate, + and - zoom, 0 resets, F follows the vehicle. The camera can also fly
+// behind the vehicle ("chase") or in it ("onboard"). World x east, y north, z up; [m, world] throughout.
 
 import * as THREE from "/three/three.module.min.js";
 import { DrawRate } from "./draw_rate.js";
@@ -16,36 +16,37 @@ import { Twin } from "./space_twin.js";
 /** @typedef {import("./messages").Arena} Arena */
 /** @typedef {import("./messages").State["objects"]} MovingObjects */
 
-/** Without a card thirty images a second at most, and less where one takes long: the processor is the flight's. [ms] */
+/** Without a graphics card at most thirty frames per second, fewer if drawing is slow: the flight needs the processor. [ms] */
 const EVERY_MS = 1000 / 31;
-/** Without a card the page rests so much longer than it draws. */
+/** Without a graphics card, ratio of pause to drawing time. */
 const REST = 3;
-/** Behind the vehicle, and above it. [m] */
+/** Position of the chase camera behind and above the vehicle. [m] */
 const CHASE_BACK_M = 1.8, CHASE_UP_M = 0.7;
-/** Height of the picture: from afar, and as wide as cameras of vehicles see. [deg] */
+/** Vertical field of view: free camera, and as wide as a vehicle's camera. [deg] */
 const FREE_FOV_DEG = 50, ONBOARD_FOV_DEG = 74;
 
 /** @typedef {"free" | "chase" | "onboard"} Mode */
-/** Who draws the twin: the browser on a graphics card or in software, or the server. @typedef {"card" | "software" | "server"} Drawer */
+/** Renderer of the twin: the browser on a graphics card or in software, or the server. @typedef {"card" | "software" | "server"} Drawer */
 
-/** Returns who can draw here; a browser without WebGL 2 leaves it to the server. @returns {Drawer} */
+/** Returns the renderer that this browser supports; without WebGL 2, the server. @returns {Drawer} */
 export function ableDrawer() {
   const gl = document.createElement("canvas").getContext("webgl2");
   if (!gl) return "server";
   const renderer = gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER;
   const name = String(gl.getParameter(renderer));
   gl.getExtension("WEBGL_lose_context")?.loseContext();
-  // In software it takes the processor from the flight.
+  // Rendering in software takes processor time from the flight.
   return /swiftshader|llvmpipe|software/i.test(name) ? "software" : "card";
 }
 
 export class SpaceView {
   /**
-   * @param {HTMLCanvasElement} canvas in the element whose size it takes
+   * @param {HTMLCanvasElement} canvas in the element that determines its size
    * @param {Arena} arena
    * @param {string | undefined} theme
    * @param {Drawer} drawer
-   * @param {(text: string) => void} report told why the server gives no picture; nothing, if it does
+   * @param {(text: string) => void} report receives the reason for which the server's image is missing; empty if it is
+   * not
    */
   constructor(canvas, arena, theme, drawer, report) {
     this.canvas = canvas;
@@ -71,17 +72,17 @@ export class SpaceView {
     this.drawn_ms = -Infinity;
     this.rest_ms = drawer === "card" ? 0 : EVERY_MS;
     this.rate = new DrawRate();
-    /** Whether the browser draws too seldom. */
+    /** Whether the browser draws too slowly. */
     this.isSlow = false;
     /** @type {Mode} */
     this.mode = "free";
     /** @type {Twin | ServedTwin | null} */
     this.twin = null;
-    /** The camera of what is shown. */
+    /** Camera of the shown frame. */
     this.eye = this.camera;
-    /** Where the camera looks. */
+    /** Point that the camera looks at. */
     this.target = new THREE.Vector3();
-    /** From where: angles about z and above the floor [rad], share of the distance at which the room fits. */
+    /** Direction of the camera: angles about z and above the floor [rad], and a share of the distance at which the room fits. */
     this.turn = this.tilt = 0;
     this.zoom = 1;
     this.follows = false;
@@ -110,7 +111,7 @@ export class SpaceView {
     this.resize();
   }
 
-  /** Fetches the twin, and until it is there what is solid, as boxes; the server gives both to the instructor alone. */
+  /** Fetches the twin, and shows solid cells as boxes until it is loaded. The server sends both only to the instructor. */
   async addTwin() {
     await known;
     this.removeTwin();
@@ -134,13 +135,13 @@ export class SpaceView {
     this.twin = null;
   }
 
-  /** Shows floor and boxes until the twin is there; without a card they are not drawn. */
+  /** Shows floor and boxes until the twin is loaded; not if the server draws. */
   showStand() {
     this.room.stand.visible = this.drawer !== "server" && !(this.twin instanceof Twin && this.twin.isShown);
   }
 
-  // ---- what moves ------------------------------------------------------------------------
-  /** Shows moving objects: each as the box about it in its own frame, where it is and how it is turned. @param {MovingObjects} objects */
+  // ---- moving objects --------------------------------------------------------------------
+  /** Shows moving objects: each as its box in its own frame, at its pose. @param {MovingObjects} objects */
   showObjects(objects) {
     for (const surplus of this.moving.children.slice(objects.length)) this.moving.remove(surplus);
     objects.forEach((object, k) => {
@@ -153,7 +154,7 @@ export class SpaceView {
     });
   }
 
-  /** Adds a box with sides of 1 m to what moves. */
+  /** Adds a box with sides of 1 m to the moving objects. */
   addBox() {
     const edges = new THREE.EdgesGeometry(new THREE.BoxGeometry(1, 1, 1));
     const box = new THREE.LineSegments(edges, new THREE.LineBasicMaterial({ color: this.room.colour("--bad") }));
@@ -174,7 +175,7 @@ export class SpaceView {
     if (this.follows) this.target.lerp(vehicle.position, 0.15);
   }
 
-  /** Shows another flight beside this one. @param {ReturnType<import("./replay_bar.js").ReplayBar["ghostNow"]>} ghost */
+  /** Shows another flight as a ghost. @param {ReturnType<import("./replay_bar.js").ReplayBar["ghostNow"]>} ghost */
   showGhost(ghost) {
     this.room.ghost.visible = this.ghostTrack.line.visible = ghost != null;
     if (!ghost) return;
@@ -208,7 +209,7 @@ export class SpaceView {
     if (this.drawer !== "card") this.rest(now_ms);
   }
 
-  /** Draws; over the server's picture from where that was taken, unless a hand turns the view: that is to be seen at once. */
+  /** Draws; with the server's image, from the camera of that image, unless the user turns the view, which must be visible at once. */
   render() {
     this.eye = this.camera;
     if (!(this.renderer instanceof FlatRenderer)) {
@@ -221,18 +222,18 @@ export class SpaceView {
     this.renderer.render(this.scene, this.eye, served?.picture?.bitmap, follows || served?.isCurrent() === true);
   }
 
-  /** Lets the processor rest, in proportion to what the picture took. @param {number} began_ms */
+  /** Pauses in proportion to the drawing time. @param {number} began_ms */
   rest(began_ms) {
     if (this.renderer instanceof THREE.WebGLRenderer) {
       const gl = this.renderer.getContext();
-      // Reading waits until it is drawn.
+      // Reading a pixel waits until drawing is complete.
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     }
     const took_ms = performance.now() - began_ms;
     this.rest_ms = Math.max(EVERY_MS, (1 + REST) * took_ms);
   }
 
-  /** Returns where a point of the world is on the canvas; null of one that is not in sight. @param {import("./space_room.js").Point} p @returns {[number, number] | null} [CSS px] */
+  /** Returns the position of a point of the world on the canvas; null if it is not visible. @param {import("./space_room.js").Point} p @returns {[number, number] | null} [CSS px] */
   at(p) {
     const { x, y, z } = vec(p).project(this.eye);
     if (z > 1 || Math.abs(x) > 1 || Math.abs(y) > 1) return null;
@@ -249,11 +250,11 @@ export class SpaceView {
     this.follows = false;
   }
 
-  /** Where the camera is: free, behind the vehicle, in it. @param {Mode} mode */
+  /** Sets the camera: free, behind the vehicle, in the vehicle. @param {Mode} mode */
   setMode(mode) {
     this.mode = mode;
     this.drawn_ms = -Infinity;
-    // None were drawn while another view was shown.
+    // Nothing was drawn while another view was shown.
     this.rate.restart();
   }
 
@@ -270,7 +271,7 @@ export class SpaceView {
       ahead.setZ(0).normalize();
       const behind = vehicle.position.clone().addScaledVector(ahead, -CHASE_BACK_M);
       behind.z += CHASE_UP_M;
-      // The first picture is there at once; then it follows as if on a spring.
+      // The first frame is at the final position; afterwards the camera follows like a spring.
       camera.position.lerp(behind, camera.position.distanceTo(behind) > 3 * CHASE_BACK_M ? 1 : 0.12);
     }
     camera.lookAt(isIn ? camera.position.clone().add(ahead) : vehicle.position.clone().addScaledVector(ahead, 0.8));
@@ -283,7 +284,7 @@ export class SpaceView {
     this.camera.up.set(0, 0, 1);
     this.camera.fov = FREE_FOV_DEG;
     const [x, y, z] = this.room.size, half = Math.tan((this.camera.fov * Math.PI) / 360);
-    // So far that the room fits, in width or in height.
+    // Distance at which the room fits, in width and height.
     const fit = Math.max(Math.hypot(x, y) / 2 / half / this.camera.aspect, (y + z) / 2 / half) * 0.95;
     const far = fit * this.zoom;
     const flat = Math.cos(this.tilt) * far;
@@ -325,7 +326,7 @@ export class SpaceView {
 
   listen() {
     const { canvas } = this;
-    /** The pointers that are down: a mouse, or fingers. @type {Map<number, PointerEvent>} */
+    /** Pressed pointers: a mouse, or fingers. @type {Map<number, PointerEvent>} */
     const pointers = new Map();
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("pointerdown", (event) => {

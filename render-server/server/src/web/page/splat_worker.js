@@ -1,5 +1,6 @@
-// Fetches a twin's parts and keeps its splats in order, beside the page's own thread.
-// In: { parts, boot } once; then { ahead }, where the camera looks. Out: { texels } after each part, { order } for each `ahead`.
+// Worker that fetches a twin's parts and sorts its splats, in parallel to the page's thread.
+// In: { parts, boot } once; then { ahead }, the camera's direction. Out: { texels } after each part, { order } for each
+// `ahead`.
 
 import { backToFront, readSpz } from "./splats.js";
 
@@ -28,7 +29,7 @@ async function fetchParts(parts, boot) {
 }
 
 addEventListener("message", ({ data }) => {
-  // What fails ends as an error of the worker, and the view keeps its boxes.
+  // A failure becomes an error of the worker, and the view keeps its boxes.
   if (data.parts) fetchParts(data.parts, data.boot).catch((error) => setTimeout(() => { throw error; }));
   else {
     const order = backToFront(texels, data.ahead);

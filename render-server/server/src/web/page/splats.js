@@ -1,4 +1,4 @@
-// The twin's splats as the view in space draws them: read from SPZ, and put in order. No picture is made here.
+// Splats of the twin for the 3D view: parsed from SPZ, and sorted. Drawing is in `space_twin.js`.
 
 /** Splats in a row of the texture. */
 export const ROW = 1024;
@@ -7,13 +7,13 @@ export const TEXELS = 3;
 
 const MAGIC = 0x5053474e;
 const HEADER = 16;
-/** Of the constant harmonic, and what SPZ scales it by. */
+/** Constant of the zeroth harmonic, and SPZ's scale of it. */
 const SH_C0 = 0.28209479177387814, COLOUR_SCALE = 0.15;
 
 /**
- * Returns the texels of a twin's part, [m, world]: four numbers each, `TEXELS` a splat. The colour is one number,
- * red * 65536 + green * 256 + blue, each 0 to 255. Throws where the bytes are not of SPZ 2 without harmonics.
- * @param {ArrayBuffer} inflated the file's bytes, out of their gzip
+ * Returns the texels of a twin's part, [m, world]: four numbers each, `TEXELS` a splat. The colour is one number, red *
+ * 65536 + green * 256 + blue, each 0 to 255. Throws if the bytes are not SPZ 2 without harmonics.
+ * @param {ArrayBuffer} inflated the file's bytes after gunzip
  */
 export function readSpz(inflated) {
   const bytes = new Uint8Array(inflated), view = new DataView(inflated);
@@ -31,7 +31,7 @@ export function readSpz(inflated) {
   };
   for (let k = 0; k < count; k++) {
     const at = HEADER + 9 * k, to = 4 * TEXELS * k;
-    // The file is right, up, back; the world's numbers are those of the scene's file: y and z change sign.
+    // The file's axes are right, up, back; the world's numbers are those of the scene's file: y and z change sign.
     texels[to] = fixed(at) * unit;
     texels[to + 1] = -fixed(at + 3) * unit;
     texels[to + 2] = -fixed(at + 6) * unit;
@@ -55,9 +55,9 @@ export function readSpz(inflated) {
 }
 
 /**
- * Returns the splats' places, the furthest along a direction first; by a counting sort of 65,536 depths.
+ * Returns the splats' indices, farthest along a direction first; by a counting sort of 65,536 depths.
  * @param {Float32Array} texels as of `readSpz`
- * @param {readonly number[]} ahead where the camera looks [world]
+ * @param {readonly number[]} ahead direction of the camera [world]
  */
 export function backToFront(texels, ahead) {
   const count = texels.length / 4 / TEXELS, LEVELS = 65536;

@@ -1,11 +1,11 @@
-// The leaderboard: the server's standings, and rows of a table for the page and the wall.
+// The leaderboard: fetches the standings, and makes table rows for the page and the wall.
 
 import { make } from "./dom.js";
 
 /** @typedef {import("./messages").Leaderboard} Leaderboard */
 
 /**
- * Fetches the standings; null where no runs are kept or the viewer may not see them.
+ * Fetches the standings; null if no leaderboard is configured, or the viewer may not see it.
  * @returns {Promise<Leaderboard | null>}
  */
 export async function fetchLeaderboard() {
@@ -19,7 +19,7 @@ const makeRow = (...texts) => make("tr", {}, ...texts.map((text) => make("td", {
 const seconds = (s) => (s == null ? "–" : `${s.toFixed(2)} s`);
 
 /**
- * Fills a table's body with places.
+ * Fills a table's body with ranks.
  * @param {HTMLElement} body
  * @param {Leaderboard["official"]} places
  */
@@ -34,7 +34,7 @@ export function fillPlaces(body, places) {
 }
 
 /**
- * Fills a node with the standings of signed grades: a table for each course and conditions.
+ * Fills a node with the standings of signed grades: a table for each course and its conditions.
  * @param {HTMLElement} node
  * @param {Leaderboard["graded"]} boards
  */

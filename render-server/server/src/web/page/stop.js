@@ -1,17 +1,17 @@
-// The stop buttons, and their keys: space and escape, which closes first what lies over the page.
+// The stop buttons and their keys: space and escape. Escape first closes open dialogs.
 
 import { closeNewest } from "./closing.js";
 import { $ } from "./dom.js";
 import { showOutcome } from "./outcome.js";
 import { vehicleUrl } from "./session.js";
 
-/** The vehicle that is shown. @type {string | null} */
+/** Vehicle that is shown. @type {string | null} */
 let vehicle = null;
-/** A server that changes its scene answers 503 for a while: asked again so often. */
+/** Retries and interval while the server changes its scene (status 503). */
 const RETRIES = 20, RETRY_MS = 250;
 
 /**
- * Stops the vehicle shown, or all of them.
+ * Stops the shown vehicle, or all vehicles.
  * @param {boolean} all
  */
 async function stop(all) {
@@ -19,9 +19,9 @@ async function stop(all) {
   button.dataset.pressed = "";
   announce("stopping");
   try {
-    // Before the page knows which vehicle it shows, the button stops whoever flies.
+    // Before the page has received its vehicle, the button stops all vehicles.
     const url = all || vehicle == null ? "/api/estop" : `${vehicleUrl(vehicle)}/estop`;
-    // Not through `send`: the stop button waits for nothing.
+    // Not through `send`: stopping must not wait for a token.
     let answer = await fetch(url, { method: "POST" });
     for (let tries = 0; answer.status === 503 && tries < RETRIES; tries++) {
       await new Promise((done) => setTimeout(done, RETRY_MS));
@@ -40,7 +40,7 @@ $("estop").addEventListener("click", () => stop(false));
 $("estop-all").addEventListener("click", () => stop(true));
 addEventListener("keydown", (event) => {
   if (event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-  // Space on another focused control is that control's own.
+  // Another focused control handles the space key itself.
   const control = event.target instanceof Element ? event.target.closest("button, input, select, summary, textarea") : null;
   const elsewhere = control && control !== $("estop");
   if (event.code === "Escape" || (event.code === "Space" && !elsewhere)) {

@@ -1,4 +1,4 @@
-// Dark or light: what was chosen here last, else what the system prefers.
+// Dark or light theme: the last choice in this browser, otherwise the system's preference.
 
 const light = matchMedia("(prefers-color-scheme: light)");
 
@@ -7,7 +7,7 @@ function apply() {
   document.documentElement.dataset.theme = localStorage.getItem("theme") ?? (light.matches ? "light" : "dark");
 }
 
-/** Returns the theme that is shown. */
+/** Returns the current theme. */
 export const theme = () => document.documentElement.dataset.theme;
 
 /**
@@ -22,7 +22,7 @@ export function followTheme(changed = () => {}) {
   apply();
 }
 
-/** Changes to the other theme, and remembers it. */
+/** Switches to the other theme, and stores the choice. */
 export function switchTheme() {
   localStorage.setItem("theme", theme() === "light" ? "dark" : "light");
   apply();

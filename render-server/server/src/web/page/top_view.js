@@ -1,4 +1,4 @@
-// The top view: fence, obstacles at flight height, goal, gates, track, vehicle. World x is right, y is up; [m, world]
+// The top view: fence, obstacles at flight height, goal, stages, track, vehicle. World x is right, y is up; [m, world]
 // throughout.
 
 import { context2d, make } from "./dom.js";
@@ -7,8 +7,8 @@ import { cssColours } from "./theme.js";
 
 /** @typedef {import("./messages").Arena} Arena */
 /** @typedef {import("./messages").State["objects"][number]} MovingObject */
-/** A point of the track: where, and how fast. [m, world; m/s] @typedef {import("./messages").Track["points"][number]} TrackPoint */
-/** Another flight beside the one that is shown. @typedef {{ pose: Pick<import("./flight_recording.js").FlownPose, "p_world_m">, track: TrackPoint[] }} Ghost */
+/** A point of the track: position and speed. [m, world; m/s] @typedef {import("./messages").Track["points"][number]} TrackPoint */
+/** Another flight as a ghost. @typedef {{ pose: Pick<import("./flight_recording.js").FlownPose, "p_world_m">, track: TrackPoint[] }} Ghost */
 /** @typedef {[x: number, y: number]} Point2 */
 /** At least x and y. @typedef {readonly [number, number, ...number[]]} Point */
 
@@ -32,7 +32,7 @@ export function speedColour(share) {
 }
 
 /**
- * Returns the corners of the fence's bounding box, or of the map's picture if it is no box.
+ * Returns the corners of the fence's bounding box; without a box, those of the map's image.
  * @param {Arena} arena
  * @returns {[Point2, Point2]}
  */
@@ -97,11 +97,11 @@ export class TopView {
     this.style = readStyle();
     /** Device pixels per CSS pixel. */
     this.ratio = 1;
-    /** [CSS px/m]; 0 before there is an arena. */
+    /** Scale [CSS px/m]; 0 without an arena. */
     this.scale = 0;
-    /** Where the world's origin is. [CSS px] @type {Point2} */
+    /** Position of the world's origin. [CSS px] @type {Point2} */
     this.origin = [0, 0];
-    /** Over the bottom of the drawing, once there is a flight to look at again. */
+    /** Replay bar at the bottom of the drawing, after the first flight. */
     this.replay = /** @type {HTMLElement | null} */ (this.room.querySelector(".replay"));
     const resized = new ResizeObserver(() => this.resize());
     for (const one of [this.room, this.replay]) if (one) resized.observe(one);
@@ -134,7 +134,7 @@ export class TopView {
     const [lo, hi] = bounds(this.arena);
     const pad = Math.min(34, w * 0.05);
     const [dx, dy] = [Math.max(0.1, hi[0] - lo[0]), Math.max(0.1, hi[1] - lo[1])];
-    // Below the stage lights and above what is written at the bottom, where there is room for that.
+    // Below the stage lights and above the texts at the bottom, if there is room.
     const lights = /** @type {HTMLElement | null} */ (this.room.querySelector("#stages"));
     const top = Math.min(lights && !lights.hidden ? lights.offsetTop + lights.offsetHeight + 8 : pad, h * 0.35);
     const bar = this.replay && !this.replay.hidden ? h - this.replay.offsetTop + 8 : 0;
@@ -144,7 +144,7 @@ export class TopView {
     this.origin = [w / 2 - ((lo[0] + hi[0]) / 2) * this.scale, middle + ((lo[1] + hi[1]) / 2) * this.scale];
   }
 
-  /** Returns where a point of the world is on the canvas. [CSS px] @param {Point} p @returns {Point2} */
+  /** Returns the position of a point of the world on the canvas. [CSS px] @param {Point} p @returns {Point2} */
   at(p) {
     return [this.origin[0] + p[0] * this.scale, this.origin[1] - p[1] * this.scale];
   }
@@ -232,7 +232,7 @@ export class TopView {
   /** A moving object, as the box around it. @param {MovingObject} object */
   drawObject({ min_m, max_m, p_world_m, q_xyzw: [x, y, z, w] }) {
     const { g, style } = this;
-    // The box's corners, turned by the quaternion, seen from above: their outermost lines.
+    // The box's corners, rotated by the quaternion, seen from above: their convex hull.
     /** @type {Point2[]} */
     const corners = [];
     for (const a of [min_m[0], max_m[0]])
@@ -271,7 +271,7 @@ export class TopView {
     g.fill();
   }
 
-  /** Another flight: its way and its outline. @param {Arena} arena @param {Ghost} ghost */
+  /** Draws another flight: its track and outline. @param {Arena} arena @param {Ghost} ghost */
   drawGhost(arena, { pose, track }) {
     const { g, style } = this;
     g.strokeStyle = style.muted;

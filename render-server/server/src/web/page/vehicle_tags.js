@@ -1,17 +1,17 @@
-// The names of vehicles beside where they are drawn, if there are several: the one that is shown, and the others, each a
-// button that shows it. By keys: the vehicle's number.
+// Name tags of vehicles in the views, if there are several. A click on a tag, or the vehicle's number on the keyboard,
+// selects the vehicle.
 
 import { make, setText } from "./dom.js";
 import { PHASES } from "./phases.js";
 
-/** @typedef {{ name: string, phase: string | null, at: readonly [number, number] | null }} Tagged at: where it is drawn, if it is in sight [CSS px] */
+/** @typedef {{ name: string, phase: string | null, at: readonly [number, number] | null }} Tagged at: position in the view, if visible [CSS px] */
 
 export class VehicleTags {
-  /** @param {((name: string) => void) | null} choose shows another vehicle; null where nothing can be chosen */
+  /** @param {((name: string) => void) | null} choose selects a vehicle; null without selection */
   constructor(choose) {
     this.choose = choose;
     this.element = make("div", { className: "tags" });
-    /** By name. @type {Map<string, HTMLElement>} */
+    /** Elements by name. @type {Map<string, HTMLElement>} */
     this.tags = new Map();
     /** All vehicles of the server. @type {string[]} */
     this.names = [];
@@ -26,7 +26,7 @@ export class VehicleTags {
     this.element.replaceChildren();
   }
 
-  /** Shows each vehicle's tag where the vehicle is. @param {Tagged[]} vehicles */
+  /** Shows each vehicle's tag at the vehicle. @param {Tagged[]} vehicles */
   show(vehicles) {
     if (this.names.length < 2) return;
     const seen = new Set(vehicles.map(({ name }) => name));

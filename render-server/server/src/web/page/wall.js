@@ -1,5 +1,4 @@
-// The wall: who flies now, in pictures and on the map, and the standings, large. Asks every second; shows, and can do
-// nothing else.
+// The wall: flying teams with images and map, and the standings, large. Polls every second; display only.
 
 import { BestRun, ghostAt, readGhost } from "./best_run.js";
 import { $, setText } from "./dom.js";
@@ -17,11 +16,11 @@ const KEPT = "wall-ghost ";
 const map = new TopView($("map", HTMLCanvasElement));
 const tags = new VehicleTags(null);
 $("map-room").append(tags.element);
-/** Those that a runtime flies, by name. @type {Map<string, WallFlight>} */
+/** Vehicles with a runtime, by name. @type {Map<string, WallFlight>} */
 const flights = new Map();
 let best = new BestRun(null), course = "", boot = "";
 
-/** Watches the vehicles that a runtime flies, and no others: what nobody watches costs no picture. */
+/** Watches only the vehicles with a runtime, because each watched vehicle costs the server images. */
 async function follow() {
   const answer = await fetch("/api/vehicles");
   /** @type {import("./messages").VehicleLine[]} */
@@ -70,7 +69,7 @@ async function refresh() {
   setTimeout(refresh, EVERY_MS);
 }
 
-/** Draws the map, with all that fly on it. @param {number} now_ms */
+/** Draws the map with all flying vehicles. @param {number} now_ms */
 function paint(now_ms) {
   requestAnimationFrame(paint);
   const [first, ...rest] = [...flights.values()].filter(({ arena }) => arena);

@@ -1,4 +1,4 @@
-// One vehicle that flies, on the wall: what its first camera sees, whose it is, its clock and its stages.
+// One flying vehicle on the wall: the image of its first camera, its team, clock and stages.
 
 import { clockText, context2d, make, setText } from "./dom.js";
 import { notePassed } from "./event_kinds.js";
@@ -22,7 +22,7 @@ export class WallFlight {
     this.pose = null;
     /** @type {import("./top_view.js").TrackPoint[]} */
     this.track = [];
-    /** Indices of the stages passed. @type {Set<number>} */
+    /** Indices of the passed stages. @type {Set<number>} */
     this.passed = new Set();
     this.decodes = false;
     this.canvas = make("canvas", { width: 320, height: 240, role: "img", ariaLabel: `what ${name} sees` });
@@ -34,7 +34,7 @@ export class WallFlight {
     this.socket = openSocket(name, (message) => this.receive(message), (kind, camera, jpeg) => this.show(kind, camera, jpeg));
   }
 
-  /** Whether the server has closed it: another one is opened then. */
+  /** Whether the server has closed the connection; a new one is opened then. */
   get hasEnded() {
     return this.socket.readyState === WebSocket.CLOSED;
   }
@@ -76,12 +76,12 @@ export class WallFlight {
       context2d(this.canvas).drawImage(image, 0, 0);
       image.close();
     } catch {
-      // An image that does not decode is followed by the next one.
+      // Skip an image that does not decode; the next one follows.
     }
     this.decodes = false;
   }
 
-  /** Shows whose the flight is. @param {import("./messages").Leaderboard["vehicles"][number]} flyer */
+  /** Shows the team of the flight. @param {import("./messages").Leaderboard["vehicles"][number]} flyer */
   showTeam({ team, attempt }) {
     setText(this.team, team ?? this.name);
     setText(this.attempt, team ? attempt : "");

@@ -1,4 +1,4 @@
-//! One picture: camera in, JPEG out.
+//! Renders one image: camera in, JPEG out.
 
 use glam::{DVec3, Vec3};
 use vizflyt_rgbd::encode_jpeg;
@@ -7,26 +7,26 @@ use vizflyt_splat::{Camera, CpuRenderer, Rasterizer, RgbdImage, Splats};
 
 use crate::web::twin::{TwinParts, select};
 
-/// The twin in memory, as pages get it, and a renderer of what is shown of it.
+/// The twin in memory, as sent to pages, and a renderer for the visible splats.
 #[derive(Debug)]
 pub(super) struct Engine {
     splats: Splats,
-    /// Least and greatest corner of the fence. [m, world]
+    /// Minimum and maximum corner of the fence. [m, world]
     fence_m: [Vec3; 2],
-    /// Of the last picture, and beyond which sides of the fence its camera was.
+    /// Renderer of the last image, and the sides of the fence that its camera was beyond.
     renderer: Option<(Sides, CpuRenderer)>,
     image: [RgbdImage; 1],
     rgb: Vec<u8>,
 }
 
-/// The side of the fence that a camera is beyond, on each axis: -1 the lesser, 1 the greater, 0 neither.
+/// Sides of the fence that a camera is beyond, per axis: -1 minimum, 1 maximum, 0 neither.
 type Sides = [i8; 3];
 
 impl Engine {
     /// Reads all parts of a twin.
     ///
     /// # Errors
-    /// If one cannot be packed.
+    /// If a part cannot be read.
     pub(super) fn new(twin: &TwinParts, fence_m: [DVec3; 2]) -> Result<Self, String> {
         let mut splats = Splats::default();
         for part in (0..twin.len()).filter_map(|k| twin.get(k)) {
@@ -35,7 +35,7 @@ impl Engine {
             splats.scales_m.extend(part.scales_m);
             splats.rotations.extend(part.rotations);
             splats.opacities.extend(part.opacities);
-            // Parts have the constant colour alone.
+            // Parts contain only the constant colour.
             splats.sh.extend(part.sh);
             splats.antialiased = part.antialiased;
         }
@@ -44,10 +44,11 @@ impl Engine {
         Ok(Self { splats, fence_m, renderer: None, image, rgb: Vec::new() })
     }
 
-    /// Returns the JPEG of what a camera sees; with `cut`, past the sides of the fence that it is beyond.
+    /// Returns the JPEG of a camera's view. With `cut`, omits splats beyond the sides of the fence that the camera is
+    /// beyond.
     ///
     /// # Errors
-    /// A camera that the renderer refuses.
+    /// If the renderer rejects the camera.
     pub(super) fn draw(&mut self, camera: &Camera, cut: bool) -> Result<Vec<u8>, String> {
         let eye_m = camera.world_from_cam.translation_m.as_vec3();
         let sides = if cut { sides(eye_m, self.fence_m) } else { [0; 3] };
@@ -72,13 +73,13 @@ fn sides(eye_m: Vec3, [min_m, max_m]: [Vec3; 2]) -> Sides {
     [0, 1, 2].map(|axis| i8::from(eye_m[axis] > max_m[axis]) - i8::from(eye_m[axis] < min_m[axis]))
 }
 
-/// Whether a splat's centre lies beyond one of these sides.
+/// Whether a splat's centre is beyond one of these sides.
 fn is_cut(mean_m: Vec3, fence_m: [Vec3; 2], beyond: Sides) -> bool {
     let own = sides(mean_m, fence_m);
     (0..3).any(|axis| beyond[axis] != 0 && own[axis] == beyond[axis])
 }
 
-/// As a flight's own pictures on the page.
+/// As for the camera images on the page.
 const QUALITY: u8 = 80;
 
 #[cfg(test)]
@@ -87,7 +88,7 @@ mod tests {
     use crate::web::twin_picture::tests::{camera, wall};
     use vizflyt_protocol::geometry::Pose;
 
-    /// The middle of the last picture.
+    /// Returns the centre pixel of the last image.
     fn middle(engine: &Engine) -> [u8; 3] {
         let [image] = &engine.image;
         let at = 3 * (image.rgb.len() / 3 / 2 + image.width_px as usize / 2);
@@ -95,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_what_is_ahead() {
+    fn renders_the_scene_ahead_of_the_camera() {
         let half_m = DVec3::splat(5.0);
         let twin = TwinParts::choose(&wall(), -half_m, half_m);
         let mut engine = Engine::new(&twin, [-half_m, half_m]).unwrap();
@@ -103,7 +104,7 @@ mod tests {
         assert_eq!(jpeg[..2], [0xff, 0xd8]);
         let [red, green, blue] = middle(&engine);
         assert!(red > 200 && green < 60 && blue < 60, "{red} {green} {blue}");
-        // Turned about: nothing but the background.
+        // Turned around: only the background.
         let about = glam::DQuat::from_rotation_y(std::f64::consts::PI);
         let away = Camera { world_from_cam: Pose::new(DVec3::ZERO, about), ..camera() };
         let away = Camera { background: [0.0, 1.0, 0.0], ..away };
@@ -115,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_outside_looks_past_the_near_side_of_the_fence() {
+    fn a_camera_outside_does_not_see_the_near_side_of_the_fence() {
         // The wall at z = 3 is just outside a fence that ends at z = 2; the camera looks in from beyond it.
         let (min_m, max_m) = (DVec3::splat(-2.0), DVec3::splat(2.0));
         let twin = TwinParts::choose(&wall(), min_m, max_m);
@@ -128,14 +129,14 @@ mod tests {
             middle(engine)[0] > 200
         };
         assert!(red(&mut engine, &outside, false) && !red(&mut engine, &outside, true));
-        // From the other side it is the far wall, and stays; from within nothing is left out.
+        // From the other side it is the far wall, and stays; from inside nothing is omitted.
         let ahead = Pose::new(DVec3::Z * -6.0, glam::DQuat::IDENTITY);
         assert!(red(&mut engine, &Camera { world_from_cam: ahead, ..camera() }, true));
         assert!(red(&mut engine, &camera(), true));
     }
 
     #[test]
-    fn sides_are_those_beyond_and_what_lies_within_is_never_cut() {
+    fn splats_inside_the_fence_are_never_cut() {
         let fence = [Vec3::splat(-1.0), Vec3::splat(1.0)];
         assert_eq!(sides(Vec3::new(-2.0, 0.0, 3.0), fence), [-1, 0, 1]);
         assert!(is_cut(Vec3::new(-1.5, 0.0, 0.0), fence, [-1, 0, 1]));

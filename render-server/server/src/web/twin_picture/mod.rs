@@ -1,13 +1,13 @@
-//! The twin as a picture, for pages whose browser cannot draw it itself, or too slowly.
+//! Images of the twin, for pages whose browser cannot render it, or only too slowly.
 //!
 //! ```text
 //! GET /api/twin?x_m=1&...&fov_deg=50&width_px=960&height_px=540&cut=true&background=0d1217
-//!     a JPEG of the twin as that camera sees it ([`request`])
+//!    a JPEG of the twin from this camera ([`request`])
 //! ```
-//! What the page would draw is what is drawn: the splats of [`TwinParts`], 500,000 at most, without what moves. The
-//! thread that draws is started by a request, gives way to all others ([`NICE`]), draws twice a second at most, and takes
-//! a twentieth of one core; a minute after the last request it ends, and its memory with it.
-//! Requests are answered in turn; of more than [`MAX_WAITING`] the newest is refused.
+//! The image contains the same splats as the page's 3D view: those of [`TwinParts`], at most 500,000, without moving
+//! objects. The rendering thread starts on request, at the lowest priority ([`NICE`]). It renders at most twice per
+//! second, and uses at most a twentieth of one core. It ends one minute after the last request, and frees its memory.
+//! Requests are answered in order; if [`MAX_WAITING`] wait, new ones are rejected.
 
 mod engine;
 mod request;
@@ -29,19 +29,19 @@ use super::twin::TwinParts;
 use crate::priority::give_way;
 use vizflyt_process::lock;
 
-/// A JPEG, or why there is none.
+/// A JPEG, or the reason of a failure.
 pub(super) type Drawn = Result<Vec<u8>, String>;
 
-/// Draws pictures of a twin, when asked.
+/// Renders images of a twin on request.
 #[derive(Debug)]
 pub(crate) struct TwinPictures {
     twin: TwinParts,
-    /// Least and greatest corner of the fence. [m, world]
+    /// Minimum and maximum corner of the fence. [m, world]
     fence_m: [DVec3; 2],
     thread: Mutex<Option<(SyncSender<Asked>, JoinHandle<()>)>>,
 }
 
-/// A picture that somebody waits for.
+/// A requested image.
 #[derive(Debug)]
 struct Asked {
     camera: Camera,
@@ -50,12 +50,12 @@ struct Asked {
 }
 
 impl TwinPictures {
-    /// Takes a twin, and the fence about the box from `min_m` to `max_m` [m, world].
+    /// Uses a twin, and the fence box from `min_m` to `max_m` [m, world].
     pub(crate) fn new(twin: TwinParts, min_m: DVec3, max_m: DVec3) -> Self {
         Self { twin, fence_m: [min_m, max_m], thread: Mutex::default() }
     }
 
-    /// Asks for a picture: returns where it will come, or why it is refused.
+    /// Requests an image: returns a receiver of the result, or the reason of a rejection.
     pub(super) fn ask(
         &self,
         camera: Camera,
@@ -69,7 +69,7 @@ impl TwinPictures {
             })?);
         }
         let (answer, drawn) = oneshot::channel();
-        // A thread that ends at this very moment takes nothing either; the next request starts another one.
+        // A thread that is just ending rejects the request as well; the next request starts another one.
         let asked = Asked { camera, cut, answer };
         let is_sent = thread.as_ref().is_some_and(|(sender, _)| sender.try_send(asked).is_ok());
         if is_sent { Ok(drawn) } else { Err(BUSY) }
@@ -83,9 +83,9 @@ impl TwinPictures {
     }
 }
 
-/// Draws what is asked for, until nobody has asked for [`KEPT`] or the server ends.
+/// Renders requests until none has arrived for [`KEPT`], or the server stops.
 fn run(twin: &TwinParts, fence_m: [DVec3; 2], asked: &Receiver<Asked>) {
-    // The renderer's passes run where it is called from: on this pool's one thread.
+    // The renderer's passes run on this pool's only thread.
     let pool =
         rayon::ThreadPoolBuilder::new().num_threads(1).start_handler(|_| give_way(NICE)).build();
     let pool = match pool {
@@ -100,7 +100,7 @@ fn run(twin: &TwinParts, fence_m: [DVec3; 2], asked: &Receiver<Asked>) {
     let mut due = Instant::now();
     while let Ok(next) = asked.recv_timeout(KEPT) {
         sleep(due.saturating_duration_since(Instant::now()));
-        // Its page has gone meanwhile.
+        // The page has closed its connection.
         if next.answer.is_closed() {
             continue;
         }
@@ -114,28 +114,28 @@ fn run(twin: &TwinParts, fence_m: [DVec3; 2], asked: &Receiver<Asked>) {
     }
 }
 
-/// Returns how long this thread has had a processor.
+/// Returns the processor time of this thread.
 fn busy() -> Duration {
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
 }
 
-/// Returns when the next picture may be drawn, after one was from `began` to `ended` and took `busy` of a processor.
+/// Returns the earliest time of the next image, after one from `began` to `ended` that used `busy` of processor time.
 fn next_due(began: Instant, ended: Instant, busy: Duration) -> Instant {
     (began + EVERY).max(ended + REST * busy)
 }
 
-/// The lowest priority there is: 1.5 % of a core that others want, too.
+/// Lowest priority: uses 1.5 % of a core that other threads need.
 const NICE: i32 = 19;
-/// Twice a second.
+/// Minimum interval of images.
 const EVERY: Duration = Duration::from_millis(500);
-/// So much longer it rests than it computes: it takes a twentieth of one core.
+/// Ratio of pause to computation: the thread uses a twentieth of one core.
 const REST: u32 = 19;
-/// A page turns its camera within that, or somebody has gone for a coffee.
+/// Idle time after which the thread ends; an active page turns its camera more often.
 const KEPT: Duration = Duration::from_mins(1);
-/// Each waits for half a second at least.
+/// Maximum number of waiting requests; each takes at least half a second.
 const MAX_WAITING: usize = 4;
-const BUSY: &str = "too many pages ask for pictures of the twin; ask again in a second";
-pub(super) const NO_THREAD: &str = "the twin cannot be drawn; the server's log says why";
+const BUSY: &str = "too many requests for images of the twin; retry in a second";
+pub(super) const NO_THREAD: &str = "the twin cannot be rendered; see the server's log";
 
 #[cfg(test)]
 mod tests {
@@ -144,7 +144,7 @@ mod tests {
     use vizflyt_protocol::geometry::{Intrinsics, Pose};
     use vizflyt_splat::Splats;
 
-    /// A red wall 3 m before the camera of [`camera`].
+    /// A red wall 3 m in front of [`camera`].
     pub(super) fn wall() -> Splats {
         let means = (-20..=20).flat_map(|x| (-20..=20).map(move |y| (x, y)));
         let means_m: Vec<_> =
@@ -161,7 +161,7 @@ mod tests {
         }
     }
 
-    /// Looks along z.
+    /// Returns a camera that looks along z.
     pub(super) fn camera() -> Camera {
         Camera::new(Intrinsics::from_horizontal_fov(64, 48, 1.0), Pose::IDENTITY, 0.1)
     }
@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn twice_a_second_and_a_twentieth_of_a_core_at_most() {
+    fn renders_at_most_twice_a_second_on_a_twentieth_of_a_core() {
         let began = Instant::now();
         let due_ms = |[took_ms, busy_ms]: [u64; 2]| {
             let [took, busy] = [took_ms, busy_ms].map(Duration::from_millis);
@@ -180,14 +180,14 @@ mod tests {
         };
         let alone = [[0; 2], [25; 2], [50; 2], [100; 2], [1000; 2]];
         assert_eq!(alone.map(due_ms), [500, 500, 1000, 2000, 20_000]);
-        // What it waited for a processor is no work.
+        // Time spent waiting for a processor does not count.
         assert_eq!([[1000, 0], [1000, 50]].map(due_ms), [1000, 1950]);
     }
 
     #[test]
-    fn of_many_that_ask_at_once_the_last_are_refused() {
+    fn rejects_requests_above_the_maximum() {
         let pictures = pictures();
-        // A thread that never comes to its work.
+        // A thread that never processes its requests.
         let (sender, asked) = sync_channel(MAX_WAITING);
         let (end, ends) = sync_channel::<()>(0);
         let stuck = std::thread::spawn(move || assert!(ends.recv().is_err()));
@@ -195,7 +195,7 @@ mod tests {
         let waiting: Vec<_> = (0..10).map(|_| pictures.ask(camera(), false)).collect();
         assert_eq!(waiting.iter().filter(|asked| asked.is_ok()).count(), MAX_WAITING);
         assert!(waiting[MAX_WAITING..].iter().all(|asked| matches!(asked, Err(BUSY))));
-        // Once it has ended, another one is started, and draws.
+        // After it has ended, another one starts, and renders.
         drop((end, asked));
         let (_, stuck) = lock(&pictures.thread).take().unwrap();
         stuck.join().unwrap();

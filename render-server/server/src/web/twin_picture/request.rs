@@ -1,34 +1,34 @@
-//! What a page asks for: a camera, as the query of an address.
+//! Request of an image: a camera, as query of an address.
 
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
 use vizflyt_protocol::geometry::{Intrinsics, Pose};
 use vizflyt_splat::{Atmosphere, Camera, InvalidCamera};
 
-/// A picture of the twin; every key must be there, and no other.
+/// Query of an image of the twin; all keys are required, others are rejected.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 #[serde(deny_unknown_fields)]
 pub(in crate::web) struct PictureRequest {
-    /// Where the camera is. [m, world]
+    /// Position of the camera. [m, world]
     x_m: f64,
     y_m: f64,
     z_m: f64,
-    /// Rotation of the camera's axes (x right, y down, z ahead) into the world's; unit.
+    /// Rotation from the camera's axes (x right, y down, z forward) to the world's; unit quaternion.
     qx: f64,
     qy: f64,
     qz: f64,
     qw: f64,
-    /// From the upper edge to the lower one. [deg]
+    /// Vertical field of view. [deg]
     fov_deg: f64,
     width_px: u32,
     height_px: u32,
-    /// Leaves out what lies beyond a side of the fence that the camera is beyond, too.
+    /// Whether to omit splats beyond the sides of the fence that the camera is beyond.
     pub(in crate::web) cut: bool,
-    /// Shown where no splat is: RGB as six hexadecimal digits.
+    /// Background colour: RGB as six hexadecimal digits.
     background: String,
 }
 
-/// Why a request is refused.
+/// Reason for which a request is rejected.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub(in crate::web) enum Refused {
     #[error("{0} x {1} px: give 16 to {MAX_SIDE_PX} a side, {MAX_PX} in all")]
@@ -44,10 +44,10 @@ pub(in crate::web) enum Refused {
 }
 
 impl PictureRequest {
-    /// Returns the camera that is asked for, valid to every renderer.
+    /// Returns the requested camera, valid for every renderer.
     ///
     /// # Errors
-    /// A number that is none, or beyond what a page needs.
+    /// If a number is not finite, or out of range.
     pub(in crate::web) fn camera(&self) -> Result<Camera, Refused> {
         let Self { width_px, height_px, fov_deg, .. } = *self;
         let is_side = |side| (16..=MAX_SIDE_PX).contains(&side);
@@ -85,7 +85,7 @@ impl PictureRequest {
     }
 }
 
-/// What is nearer, the page does not draw either. [m]
+/// Near plane of the page's 3D view. [m]
 const NEAR_M: f32 = 0.1;
 const MAX_SIDE_PX: u32 = 960;
 const MAX_PX: u32 = 960 * 540;
@@ -101,7 +101,7 @@ mod tests {
     const GOOD: &str = "x_m=1&y_m=-2.5&z_m=1e0&qx=0&qy=0&qz=0&qw=1&fov_deg=50&width_px=960&height_px=540\
          &cut=true&background=0d1217";
 
-    /// Reads a query as the server does; `None` where it is no such request at all.
+    /// Parses a query as the server does; `None` if it is malformed.
     fn read(query: &str) -> Option<Result<Camera, Refused>> {
         let uri: Uri = format!("/api/twin?{query}").parse().ok()?;
         let request = Query::<PictureRequest>::try_from_uri(&uri).ok()?;
@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_is_the_camera_that_it_names() {
+    fn a_request_becomes_the_camera_that_it_describes() {
         let camera = read(GOOD).unwrap().unwrap();
         assert_eq!(camera.world_from_cam.translation_m, DVec3::new(1.0, -2.5, 1.0));
         let middle = camera.intrinsics.project(DVec3::Z).unwrap();
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_what_to_give() {
+    fn errors_name_the_value_and_the_accepted_range() {
         for (good, bad, says) in [
             ("width_px=960", "width_px=961", "16 to 960 a side"),
             ("height_px=540", "height_px=541", "518400 in all"),
@@ -146,7 +146,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_query_is_a_panic_and_what_is_accepted_is_small_and_valid(
+        fn no_query_panics_and_accepted_ones_are_small_and_valid(
             key in 0..12_usize, value in "[-+0-9a-zA-Z.%&=]{0,12}", noise in "\\PC{0,80}",
         ) {
             let mut pairs: Vec<_> = GOOD.split('&').map(str::to_owned).collect();
@@ -161,7 +161,7 @@ mod tests {
         }
 
         #[test]
-        fn every_camera_of_a_page_is_understood(
+        fn accepts_every_camera_of_a_page(
             p in prop::array::uniform3(-1e3..1e3_f64), turn in prop::array::uniform3(-3.0..3.0_f64),
             fov in 5.0..150.0_f64, width in 16..=960_u32, height in 16..=540_u32,
         ) {

@@ -1,6 +1,6 @@
-//! The other ends of the server, for tests: a scene, a Vicon emitter, a runtime, a browser.
+//! Test peers of the server: a scene, a Vicon emitter, a runtime, a browser.
 //!
-//! Everything waits on conditions; [`PATIENCE`] only bounds a test that fails.
+//! All waits are for conditions; [`PATIENCE`] only limits a failing test.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
@@ -28,11 +28,10 @@ use vizflyt_trust::tls::Pin;
 use vizflyt_trust::{ALPN, Fingerprint, Identity, KeysFolder, Owner, Paired, Role};
 use zerocopy::IntoBytes;
 
-/// Bounds a test that fails; never part of a passing one's outcome.
+/// Timeout of a failing test; never affects a passing one.
 pub(crate) const PATIENCE: Duration = Duration::from_mins(1);
 
-/// Writes an arena whose scene is a wall of splats at x = 5 m, and returns the path of its
-/// arena.toml.
+/// Writes an arena whose scene is a wall of splats at x = 5 m, and returns the path of its arena.toml.
 pub(crate) fn write_arena(folder: &Path, more: &str) -> std::path::PathBuf {
     let mut means = Vec::new();
     for y in -30..=30 {
@@ -74,7 +73,7 @@ position_m = [0.06, 0, 0.02]
     path
 }
 
-/// The server's binary, running.
+/// A running server process.
 pub(crate) struct Server {
     child: Child,
     stdin: Option<ChildStdin>,
@@ -82,20 +81,20 @@ pub(crate) struct Server {
     pub(crate) quic: SocketAddr,
     pub(crate) http: SocketAddr,
     pub(crate) vicon: SocketAddr,
-    /// Its `ready` line.
+    /// The `ready` line.
     pub(crate) ready: Value,
-    /// An instructor's, paired before the start.
+    /// Identity of an instructor, paired before the start.
     pub(crate) instructor: Identity,
     keys: TempDir,
 }
 
 impl Server {
-    /// Starts it on free ports and waits until it is ready.
+    /// Starts a server on free ports and waits until it is ready.
     pub(crate) fn start(arena: &Path, more: &[&str]) -> Self {
         Self::start_paired(arena, more, &[])
     }
 
-    /// As [`Self::start`], with others paired than the instructor.
+    /// As [`Self::start`], with other paired clients in addition to the instructor.
     pub(crate) fn start_paired(
         arena: &Path,
         more: &[&str],
@@ -108,7 +107,7 @@ impl Server {
         for client in others.iter().cloned().chain([client]) {
             Paired::add(&folder, client).unwrap();
         }
-        // A test may bring a folder of its own.
+        // A test may set another keys folder.
         let own_keys = (!more.iter().any(|option| option.starts_with("--keys")))
             .then(|| format!("--keys={}", keys.path().join("keys").display()));
         let nowhere = (!more.iter().any(|option| option.starts_with("--leaderboard")))
@@ -150,7 +149,7 @@ impl Server {
         }
     }
 
-    /// Returns its process.
+    /// Returns the process id.
     pub(crate) fn id(&self) -> u32 {
         self.child.id()
     }
@@ -160,7 +159,7 @@ impl Server {
         KeysFolder::open(Some(&self.keys.path().join("keys"))).unwrap()
     }
 
-    /// Returns who the server is.
+    /// Returns the server's fingerprint.
     pub(crate) fn fingerprint(&self) -> Fingerprint {
         Identity::load_or_create(&self.keys(), Owner::Server).unwrap().fingerprint()
     }
@@ -183,13 +182,12 @@ impl Server {
         report
     }
 
-    /// Sends SIGTERM.
     pub(crate) fn terminate(&self) {
         let done = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
         assert!(done.success());
     }
 
-    /// Kills it, as a power cut would.
+    /// Kills the process, like a power cut.
     pub(crate) fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
@@ -216,18 +214,18 @@ pub(crate) struct Emitter {
     thread: Option<JoinHandle<()>>,
 }
 
-/// How far the emitter's vehicle backs off per frame. [m]
+/// Distance that the emitter's vehicle moves back per frame. [m]
 pub(crate) const STEP_M: f64 = 0.001;
 /// Height of the emitter's vehicle. [m]
 pub(crate) const HEIGHT_M: f64 = 1.5;
 
 impl Emitter {
-    /// Frame n is at x = -n * `STEP_M`.
+    /// Starts; frame n is at x = -n * `STEP_M`.
     pub(crate) fn start(to: SocketAddr, object: &'static str) -> Self {
         Self::along(to, object, |frame| -f64::from(frame) * STEP_M)
     }
 
-    /// Frame n is at x = `x_m(n)`.
+    /// Starts; frame n is at x = `x_m(n)`.
     pub(crate) fn along(to: SocketAddr, object: &'static str, x_m: fn(u32) -> f64) -> Self {
         let (stop, paused) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
         let sent = Arc::new(AtomicU32::new(0));
@@ -273,7 +271,6 @@ pub(crate) fn vicon_packet(frame: u32, object: &str, values: [f64; 6]) -> Vec<u8
     bytes
 }
 
-/// A runtime's connection.
 pub(crate) struct Client {
     pub(crate) connection: Connection,
     pub(crate) send: SendStream,
@@ -292,7 +289,7 @@ pub(crate) fn client(identity: &Identity, role: Role, vehicles: &[&str]) -> vizf
     }
 }
 
-/// Returns what a client that has just been started says first.
+/// Returns the first message of a client that has just started.
 pub(crate) fn hello(vehicle: &str, purpose: Purpose) -> Hello {
     static BOOTS: AtomicU64 = AtomicU64::new(1);
     Hello {
@@ -304,7 +301,7 @@ pub(crate) fn hello(vehicle: &str, purpose: Purpose) -> Hello {
     }
 }
 
-/// Connects, without any message yet.
+/// Connects, without sending a message.
 pub(crate) async fn connect(
     server: &Server,
     transport: TransportConfig,
@@ -312,7 +309,7 @@ pub(crate) async fn connect(
     connect_as(server, &server.instructor, transport).await.map(|(_, connection)| connection)
 }
 
-/// As [`connect`], as somebody else.
+/// As [`connect`], with another identity.
 pub(crate) async fn connect_as(
     server: &Server,
     identity: &Identity,
@@ -329,13 +326,12 @@ pub(crate) async fn connect_as(
 }
 
 impl Client {
-    /// Connects, exchanges preambles and says hello for `vehicle`, as a runtime that has just been
-    /// started.
+    /// Connects, exchanges preambles and sends a hello for `vehicle`, as a runtime that has just started.
     pub(crate) async fn hello(server: &Server, vehicle: &str, transport: TransportConfig) -> Self {
         Self::hello_as(server, &server.instructor, vehicle, transport).await
     }
 
-    /// As [`Self::hello`], as somebody else who is paired.
+    /// As [`Self::hello`], with another paired identity.
     pub(crate) async fn hello_as(
         server: &Server,
         identity: &Identity,
@@ -345,7 +341,7 @@ impl Client {
         Self::greet_as(server, identity, hello(vehicle, Purpose::Fly), transport).await
     }
 
-    /// Connects, exchanges preambles and says `hello`.
+    /// Connects, exchanges preambles and sends `hello`.
     pub(crate) async fn greet(server: &Server, hello: Hello, transport: TransportConfig) -> Self {
         Self::greet_as(server, &server.instructor, hello, transport).await
     }
@@ -415,7 +411,7 @@ impl Client {
         tokio::time::timeout(PATIENCE, self.next_ever()).await.expect("a message")
     }
 
-    /// As [`Self::next`], however long it takes.
+    /// As [`Self::next`], without a timeout.
     pub(crate) async fn next_ever(&mut self) -> ToRuntime {
         loop {
             if let Some(message) = self.deframer.next::<ToRuntime>() {
@@ -441,7 +437,7 @@ impl Client {
         .expect("the message that is waited for")
     }
 
-    /// Returns the next image stream that was not reset, whole.
+    /// Returns the next complete image that was not reset.
     pub(crate) async fn image(&self) -> (ImageHeader, Vec<u8>) {
         let (header, payload, _) = self.whole_image().await;
         (header, payload)
@@ -463,7 +459,7 @@ impl Client {
         .expect("an image")
     }
 
-    /// Ends the conversation and waits until the server knows.
+    /// Closes the connection and waits until the server has received it.
     pub(crate) async fn close(self) {
         self.connection.close(VarInt::from_u32(0), b"bye");
         self.endpoint.wait_idle().await;
@@ -481,7 +477,7 @@ pub(crate) fn http(address: SocketAddr, head: &str) -> (u16, String) {
     (status(&answer), answer)
 }
 
-/// Sends JSON as our own page would, or a page of `origin`, and returns the status and the body.
+/// Sends JSON as this server's page would, or a page of `origin`; returns status and body.
 pub(crate) fn send_json(
     address: SocketAddr,
     request: &str,
@@ -496,8 +492,8 @@ pub(crate) fn send_json(
     );
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    // A server that refuses a long body answers before it has read it all, and closes: sending then
-    // fails, and so may reading on once the answer is here. Only the answer counts.
+    // A server that rejects a long body answers before it has read all of it, and closes. Sending and reading may then
+    // fail; only the answer counts.
     let request = format!("{head}\r\nHost: {address}\r\nConnection: close\r\n\r\n{body}");
     let sent = stream.write_all(request.as_bytes());
     let mut answer = Vec::new();
@@ -517,7 +513,7 @@ fn status(answer: &str) -> u16 {
 pub(crate) struct Socket(WebSocket);
 
 impl Socket {
-    /// Opens it as a page of `origin` would; the status if the server declines.
+    /// Opens a WebSocket as a page of `origin` would; returns the status if the server rejects it.
     pub(crate) fn open(address: SocketAddr, origin: &str) -> Result<Self, u16> {
         Self::open_at(address, origin, "/ws")
     }

@@ -1,4 +1,4 @@
-//! A glTF accessor as a column of numbers.
+//! Columns of numbers: glTF accessors.
 
 use super::container::Bytes;
 use super::scene::Root;
@@ -6,14 +6,14 @@ use super::{invalid, unsupported};
 use crate::format::FormatError;
 use crate::format::bytes::{f32_at, u16_at, u32_at};
 
-/// Numbers at even distances in a buffer; the last of them lies within it.
+/// Numbers at a constant stride in a buffer. The last of them was checked to lie within it.
 pub(super) struct Column<'a> {
-    /// From the first number on.
+    /// Bytes from the first number to the end of the buffer view.
     bytes: &'a [u8],
     stride: usize,
     component: Component,
     normalized: bool,
-    /// Rows.
+    /// Number of rows.
     pub(super) count: usize,
 }
 
@@ -50,7 +50,7 @@ impl Component {
 }
 
 impl<'a> Column<'a> {
-    /// Finds an accessor of `kind`, and checks that all of it is there.
+    /// Returns the column of accessor `index`. Checks its type and that all of it is in the buffer.
     pub(super) fn find(
         root: &Root,
         buffers: &'a [Bytes<'_>],
@@ -83,7 +83,7 @@ impl<'a> Column<'a> {
         if stride < row {
             return Err(invalid(place(), format!("rows of {row} bytes every {stride} bytes")));
         }
-        // Saturating: what overflows is beyond any buffer.
+        // Saturating: a value that overflows exceeds any buffer.
         let needed = match accessor.count {
             0 => 0,
             count => stride.saturating_mul(count - 1).saturating_add(row),

@@ -1,4 +1,4 @@
-//! The JSON of a glTF file and the bytes of its buffers.
+//! Container of a glTF file: its JSON and the bytes of its buffers.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -12,13 +12,13 @@ use crate::format::{Format, FormatError, file};
 
 /// The first bytes of a `.glb`.
 pub(in crate::format) const MAGIC: &[u8] = b"glTF";
-/// Types of chunks.
+/// Chunk types.
 const JSON: u32 = u32::from_le_bytes(*b"JSON");
 const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
-/// Buffers of a file; one is usual.
+/// Maximum number of buffers of a file; typical files have one.
 const MAX_BUFFERS: usize = 1024;
 
-/// A buffer's bytes, wherever they are.
+/// Bytes of a buffer, in memory or mapped from a file.
 pub(super) enum Bytes<'a> {
     Here(Cow<'a, [u8]>),
     Mapped(Mmap),
@@ -33,7 +33,7 @@ impl Bytes<'_> {
     }
 }
 
-/// Returns what a file holds; `folder` is where it lies, if it is known.
+/// Returns the JSON and the buffers of a file. `folder` is its location, if known.
 pub(super) fn open<'a>(
     bytes: &'a [u8],
     folder: Option<&Path>,
@@ -78,7 +78,8 @@ fn check(described: &Buffer, bytes: &[u8]) -> Result<(), FormatError> {
     Ok(())
 }
 
-/// Returns the JSON and the binary chunk of a `.glb`: a header of 12 bytes, then length, type and content of each.
+/// Returns the JSON and the binary chunk of a `.glb`: a header of 12 bytes, then length, type and
+/// content of each chunk.
 fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), FormatError> {
     let truncated = |needed: u64| FormatError::Truncated {
         format: Format::Gltf,
@@ -108,18 +109,18 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), FormatError> {
     json.map(|json| (json, binary)).ok_or_else(|| invalid("GLB", "no JSON chunk"))
 }
 
-/// Returns what a uri names: bytes in itself, or a file beside the scene.
+/// Returns the bytes of a URI: embedded data, or a file in the scene's folder.
 fn fetch(uri: &str, folder: Option<&Path>) -> Result<Bytes<'static>, FormatError> {
     if let Some(data) = uri.strip_prefix("data:") {
         let text = data.split_once(";base64,").map(|(_, text)| text);
         let bytes = text.and_then(base64);
         return bytes
             .map(|bytes| Bytes::Here(bytes.into()))
-            .ok_or_else(|| invalid("", "a data uri that is no base64"));
+            .ok_or_else(|| invalid("", "a data uri that is not base64"));
     }
-    // A scene names files beside itself, not anywhere on this machine.
+    // A scene may only refer to files in its own folder.
     if uri.is_empty() || uri.contains(['/', '\\', ':', '%', '\0']) || uri == ".." {
-        return Err(invalid("", format!("{uri:?} is no plain file name; save it as .glb")));
+        return Err(invalid("", format!("{uri:?} is not a plain file name; save it as .glb")));
     }
     let Some(folder) = folder else {
         return Err(unsupported("a buffer in another file", "save it as .glb"));
@@ -129,7 +130,7 @@ fn fetch(uri: &str, folder: Option<&Path>) -> Result<Bytes<'static>, FormatError
     mapped.map(Bytes::Mapped).map_err(|cause| FormatError::Io { path, verb: "read", cause })
 }
 
-/// Returns the bytes of base64 (RFC 4648, section 4), padded or not.
+/// Decodes base64 (RFC 4648, section 4), padded or not.
 fn base64(text: &str) -> Option<Vec<u8>> {
     let text = text.trim_end_matches('=').as_bytes();
     let mut bytes = Vec::with_capacity(text.len() / 4 * 3 + 2);
@@ -163,7 +164,7 @@ mod tests {
     use super::base64;
 
     #[test]
-    fn base64_of_rfc_4648() {
+    fn decodes_the_base64_examples_of_rfc_4648() {
         for (text, bytes) in [
             ("", ""),
             ("Zg==", "f"),

@@ -1,4 +1,4 @@
-//! The splats of a glTF file.
+//! Decoder of glTF: nodes and primitives to splats.
 
 use std::path::Path;
 
@@ -13,14 +13,15 @@ use crate::format::progress::Meter;
 use crate::format::{Format, FormatError, Loaded, limit};
 use crate::harmonics::Turn;
 
-/// Extensions that change nothing about splats, or only what types an accessor may have.
+/// Supported required extensions: they do not affect splats, or only permit more types of
+/// accessors.
 const HARMLESS: [&str; 3] = [EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"];
-/// Nodes that are visited, so that a file cannot name a few of them over and over.
+/// Maximum number of visited nodes, so that a file cannot refer to a few nodes many times.
 const MAX_VISITS: usize = 100_000;
-/// Nodes within nodes.
+/// Maximum depth of nested nodes.
 const MAX_DEPTH: usize = 64;
 
-/// Reads the bytes of a `.glb` or `.gltf`; `folder` is where it lies, if that is known.
+/// Reads the bytes of a `.glb` or `.gltf`. `folder` is its location, if known.
 pub(in crate::format) fn decode(
     bytes: &[u8],
     folder: Option<&Path>,
@@ -40,7 +41,7 @@ pub(in crate::format) fn decode(
         return Err(FormatError::Unknown { what: format!("a glTF file without {EXTENSION}") });
     }
     let stored: usize = buffers.iter().map(|buffer| buffer.get().len()).sum();
-    // The places at which the splats of each begin.
+    // Index of the first splat of each field.
     let mut starts = Vec::with_capacity(found.len());
     let mut total = 0u64;
     for field in &found {
@@ -49,7 +50,7 @@ pub(in crate::format) fn decode(
         limit::count(Format::Gltf, total)?;
     }
     let degree = found.iter().map(|field| field.degree).max().unwrap_or(0);
-    // A mesh may stand in many nodes.
+    // A mesh may occur in many nodes.
     let each = 4 * (11 + 3 * u64::from(degree + 1).pow(2));
     limit::inflated(Format::Gltf, total, each, stored)?;
     let count = total as usize;
@@ -66,7 +67,7 @@ pub(in crate::format) fn decode(
     Ok(loaded)
 }
 
-/// Returns the nodes that stand in no other: the scene's, or all such where a file names none.
+/// Returns the root nodes: those of the scene, or without a scene all nodes that have no parent.
 fn roots(root: &Root) -> Result<Vec<usize>, FormatError> {
     if root.scenes.is_empty() {
         let mut inner = vec![false; root.nodes.len()];
@@ -89,7 +90,8 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    /// Visits a node and what stands in it; `outer` takes its parent's coordinates to the scene's.
+    /// Visits a node and its descendants. `outer` transforms coordinates of its parent to those of
+    /// the scene.
     fn visit(&mut self, index: usize, outer: DMat4, depth: usize) -> Result<(), FormatError> {
         let place = || format!("node {index}");
         self.visits += 1;
@@ -120,7 +122,7 @@ fn matrix(node: &Node) -> DMat4 {
     )
 }
 
-/// The splats of a primitive, as one node has them.
+/// Splats of a primitive, with the transform of one node.
 struct Field<'a> {
     mean: Column<'a>,
     scale: Column<'a>,
@@ -128,13 +130,13 @@ struct Field<'a> {
     opacity: Column<'a>,
     harmonics: Vec<Column<'a>>,
     degree: u8,
-    /// Scales are logarithms, as in drafts of the extension.
+    /// Whether scales are logarithms, as in drafts of the extension.
     logarithms: bool,
     antialiased: bool,
     place: Similarity,
 }
 
-/// Returns the splats of a primitive; `None` where it has none.
+/// Returns the splats of a primitive, or `None` if it has none.
 fn field<'a>(
     root: &Root,
     buffers: &'a [Bytes<'_>],
@@ -149,7 +151,7 @@ fn field<'a>(
     if let Some(kernel) = splatting.kernel.as_ref().filter(|kernel| *kernel != "ellipse") {
         return Err(unsupported(format!("kernel {kernel:?}"), "train with Gaussian splats"));
     }
-    // Names of drafts, BT.709-sRGB and the like, end otherwise.
+    // Drafts name other colour spaces, for example BT.709-sRGB.
     let linear = |space: &&String| space.starts_with("lin") || space.ends_with("inear");
     if let Some(space) = splatting.color_space.as_ref().filter(linear) {
         return Err(unsupported(format!("colour space {space}"), "save it as srgb_rec709_display"));
@@ -198,7 +200,7 @@ fn field<'a>(
 }
 
 impl Field<'_> {
-    /// Returns a splat and its harmonics, in the scene.
+    /// Returns a splat and its harmonics, in the coordinates of the scene.
     #[inline]
     fn splat(&self, row: usize) -> (Gaussian, [f32; 48]) {
         let three = |column: &Column| Vec3::from_array([0, 1, 2].map(|k| column.at(row, k)));
@@ -221,7 +223,7 @@ impl Field<'_> {
     }
 }
 
-/// What a node does to its splats.
+/// Transform of a node.
 struct Similarity {
     rotation: DQuat,
     scale: f64,
@@ -230,13 +232,13 @@ struct Similarity {
 }
 
 impl Similarity {
-    /// Returns the parts of a matrix; `None` where it is no similarity.
+    /// Returns the parts of a matrix, or `None` if it is not a similarity.
     fn of(matrix: DMat4, degree: u8) -> Option<Self> {
         let axes = DMat3::from_mat4(matrix);
         let scale = axes.determinant().cbrt();
         let rotation = axes * (1.0 / scale);
         let off = rotation * rotation.transpose() - DMat3::IDENTITY;
-        // Positive, so that NaN is refused.
+        // The comparison is false for NaN, so NaN is rejected.
         let good = scale > 0.0 && off.to_cols_array().iter().all(|v| v.abs() < 1e-3);
         let translation_m = matrix.w_axis.truncate();
         if !(good && translation_m.is_finite()) {

@@ -1,4 +1,4 @@
-//! The JSON of a glTF file, as far as it concerns splats.
+//! The parts of glTF's JSON that concern splats.
 
 use std::collections::HashMap;
 
@@ -6,7 +6,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 use serde_json::Value;
 
-/// The file.
+/// Root object of the file.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Root {
@@ -33,7 +33,7 @@ pub(super) struct SceneNodes {
     pub(super) nodes: Vec<usize>,
 }
 
-/// A place in the scene: a matrix, column by column, or its parts.
+/// Node with its transform: a matrix, column by column, or translation, rotation and scale.
 #[derive(Deserialize)]
 pub(super) struct Node {
     #[serde(default)]
@@ -64,20 +64,20 @@ pub(super) struct Extensions {
     pub(super) splatting: Option<Splatting>,
 }
 
-/// The extension's object.
+/// Object of the extension in a primitive.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Splatting {
     pub(super) kernel: Option<String>,
     pub(super) color_space: Option<String>,
-    /// Extensions of the extension: compression, by name.
+    /// Nested extensions, by name; they add compression.
     #[serde(default)]
     pub(super) extensions: HashMap<String, Value>,
     #[serde(default)]
     pub(super) extras: Extras,
 }
 
-/// What this program says of a scene beyond the extension.
+/// Properties of a scene that VizFlyt stores in addition to the extension.
 #[derive(Default, Deserialize)]
 pub(super) struct Extras {
     #[serde(default)]

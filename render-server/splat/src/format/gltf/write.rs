@@ -1,4 +1,4 @@
-//! Splats to the bytes of a `.glb` file: one primitive of f32, each attribute in a view of its own.
+//! Encoder of `.glb`: one primitive of f32, with a separate buffer view for each attribute.
 
 use serde_json::{Value, json};
 
@@ -7,15 +7,15 @@ use crate::Splats;
 use crate::format::assert_whole;
 use crate::harmonics::Turn;
 
-/// `FLOAT` of glTF, and the target of a view of vertices.
+/// Constants of glTF: component type `FLOAT`, and target of vertex buffer views.
 const FLOAT: u32 = 5126;
 const ARRAY_BUFFER: u32 = 34962;
 
-/// Returns the bytes of a `.glb` file; lossless but for the sign of a quaternion.
+/// Returns the bytes of a `.glb` file. Lossless, except for the sign of quaternions.
 pub(in crate::format) fn encode(splats: &Splats) -> Vec<u8> {
     assert_whole(splats);
     let (count, coefficients) = (splats.len(), splats.sh_coefficients());
-    // Half a turn about z, as in `read`.
+    // Rotation by half a turn about z, as in `read`.
     let turn = Turn::new(glam::DQuat::from_xyzw(0.0, 0.0, 1.0, 0.0), splats.sh_degree);
     let mut sh = splats.sh.clone();
     sh.chunks_exact_mut(coefficients * 3).for_each(|sh| turn.apply(sh));
@@ -40,7 +40,7 @@ pub(in crate::format) fn encode(splats: &Splats) -> Vec<u8> {
     };
     put("POSITION".into(), "VEC3", 3, &|i, out| out.extend(position(i)));
     let own = |name: &str| format!("{EXTENSION}:{name}");
-    // The quaternion of half a turn about z, times it.
+    // Product of the half turn about z and the splat's rotation.
     put(own("ROTATION"), "VEC4", 4, &|i, out| {
         let [x, y, z, w] = splats.rotations[i].to_array();
         out.extend([-y, x, w, -z]);
@@ -55,7 +55,7 @@ pub(in crate::format) fn encode(splats: &Splats) -> Vec<u8> {
             put(harmonic_name(degree, k), "VEC3", 3, &row);
         }
     }
-    // The standard asks for the bounds of positions.
+    // The standard requires the bounds of positions.
     let bound = |pick: fn(f32, f32) -> f32| -> Value {
         let all = (0..count).map(position);
         all.reduce(|a, b| std::array::from_fn(|k| pick(a[k], b[k])))

@@ -1,8 +1,9 @@
-//! `.ksplat`: mkkellogg's GaussianSplats3D viewer.
+//! `.ksplat`: format of mkkellogg's viewer GaussianSplats3D.
 //!
-//! A header of 4096 bytes, one of 1024 per section, then the sections' data. Splats of a section
-//! lie in buckets of a cube in space each: first the full ones, then the others, whose sizes are
-//! listed. There is no magic, but the header has enough that must agree.
+//! A file has a header of 4096 bytes, a header of 1024 bytes per section, then the data of the
+//! sections. The splats of a section are grouped in buckets, one per cube of space: first the full
+//! buckets, then the others, whose sizes are listed. There is no magic number; a file is detected
+//! by consistent values in its header.
 //!
 //! | | level 0 | level 1 | level 2 |
 //! |---|---|---|---|
@@ -12,7 +13,7 @@
 //! | red, green, blue (0.5 + c0 h), opacity, linear | u8 | u8 | u8 |
 //! | harmonics, band by band, channel-major within | f32 | f16 | u8 between the header's bounds |
 //!
-//! Degree 0 to 2; axes as in the PLY it was made from.
+//! Degree 0 to 2. Axes are those of the source PLY.
 
 mod read;
 mod write;
@@ -26,19 +27,20 @@ const HEADER_BYTES: usize = 4096;
 const SECTION_BYTES: usize = 1024;
 /// A bucket's centre, three f32. [byte]
 const BUCKET_BYTES: usize = 12;
-/// The middle of the u16 that position within a bucket is written as, where a file has none.
+/// Default of the quantisation range: half the range of the u16 that stores a position within a
+/// bucket.
 const DEFAULT_RANGE: u32 = 32767;
-/// Bounds of level 2's harmonics where a file has none.
+/// Default bounds of the harmonics of level 2.
 const DEFAULT_HARMONIC: f32 = 1.5;
 
-/// Where the parts of a splat start at a level of compression. [byte]
+/// Offsets of the parts of a splat, for a level of compression. [byte]
 #[derive(Clone, Copy)]
 struct Row {
     scale: usize,
     rotation: usize,
     colour: usize,
     harmonics: usize,
-    /// Size of a harmonic.
+    /// Size of one harmonic. [byte]
     harmonic: usize,
 }
 
@@ -49,13 +51,13 @@ impl Row {
         Self { scale: 6, rotation: 12, colour: 20, harmonics: 24, harmonic: 1 },
     ];
 
-    /// Returns the size of a splat. [byte]
+    /// Returns the size of one splat. [byte]
     fn bytes(&self, sh_degree: u8) -> usize {
         self.harmonics + ((usize::from(sh_degree) + 1).pow(2) - 1) * 3 * self.harmonic
     }
 }
 
-/// Returns which of a splat's harmonics, as stored, is coefficient `k` (not 0) of a channel.
+/// Returns the index in the file of coefficient `k` (not 0) of a channel.
 fn harmonic_index(k: usize, channel: usize) -> usize {
     match k {
         1..=3 => channel * 3 + k - 1,

@@ -1,4 +1,4 @@
-//! The bytes of a `.ksplat` file to splats.
+//! Decoder of `.ksplat`: bytes to splats.
 
 use glam::Vec3;
 use half::f16;
@@ -12,35 +12,37 @@ use crate::format::bytes::{f32_at, u16_at, u32_at};
 use crate::format::progress::Meter;
 use crate::format::{Format, FormatError, Loaded, limit};
 
-/// A section whose parts are all within the file.
+/// Section that was checked to be within the file.
 struct Section<'a> {
     /// Index of its first splat in the scene.
     first: usize,
     count: usize,
     sh_degree: u8,
-    /// Size of a splat. [byte]
+    /// Size of one splat. [byte]
     stride: usize,
     rows: &'a [u8],
     buckets: Buckets<'a>,
 }
 
-/// Which bucket a splat is in, and where the bucket is.
+/// Buckets of a section: the bucket of each splat, and the position of each bucket.
 struct Buckets<'a> {
-    /// Splats of a full one.
+    /// Splats per full bucket.
     capacity: usize,
-    /// Splats in all full ones.
+    /// Splats in all full buckets.
     full_splats: usize,
     full: usize,
-    /// For each of the others, the splats up to its end, counted from the first of them.
+    /// For each partial bucket, the index after its last splat, counted from the first partial
+    /// bucket.
     partial_ends: Vec<usize>,
     centres: &'a [u8],
-    /// The middle of a coordinate's u16.
+    /// Zero point of a coordinate's u16.
     range: f32,
-    /// Length of one unit. [m]
+    /// Length of one step of the u16. [m]
     step_m: f32,
 }
 
-/// Whether the bytes are such a file: there is no magic, but sizes that must agree.
+/// Returns whether the bytes are a `.ksplat` file. There is no magic number, so the check compares
+/// sizes.
 pub(in crate::format) fn is_ksplat(bytes: &[u8]) -> bool {
     bytes.len() >= HEADER_BYTES + SECTION_BYTES
         && bytes[..4] == [0, 1, 0, 0]
@@ -76,7 +78,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
     let Some(&row) = Row::LEVELS.get(level) else {
         return Err(invalid(20, format!("compression level {level}; expected 0 to 2")));
     };
-    // Sections that a file has room for are all there once it is complete.
+    // A complete file contains all sections that it declares.
     let section_count = u32_at(bytes, 4) as usize;
     let mut at = HEADER_BYTES as u64 + section_count as u64 * SECTION_BYTES as u64;
     if at > bytes.len() as u64 {
@@ -101,7 +103,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
         let bucket_bytes = u64::from(u16_at(head, 20));
         let centres_at = at + partial * 4;
         let rows_at = centres_at + bucket_bytes * bucket_count;
-        // Sums of products of 32-bit numbers stay far below 2^64.
+        // Sums of products of 32-bit numbers are far below 2^64.
         let end = rows_at + stride as u64 * room;
         if end > bytes.len() as u64 {
             return Err(truncated("a section", end));
@@ -148,7 +150,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
     meter.expect(count);
     sections.retain(|section| section.count > 0);
 
-    // Zero means that the writer stated none.
+    // Zero means that the writer did not set the bound.
     let bound = |at: usize, default: f32| match f32_at(bytes, at) {
         0.0 => default,
         bound => bound,
@@ -198,7 +200,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
 }
 
 impl Buckets<'_> {
-    /// Returns where a splat is whose row starts with its place in its bucket. [m]
+    /// Returns the position of a splat from the start of its row. [m]
     fn position_m(&self, index: usize, row: &[u8]) -> Vec3 {
         let bucket = match index.checked_sub(self.full_splats) {
             None => index / self.capacity,

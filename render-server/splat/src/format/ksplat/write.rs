@@ -1,4 +1,4 @@
-//! Splats to the bytes of a `.ksplat` file, in one section.
+//! Encoder of `.ksplat`: splats to bytes, in one section.
 
 use std::collections::BTreeMap;
 
@@ -11,17 +11,17 @@ use crate::format::activate::colour_of_harmonic;
 use crate::format::assert_whole;
 use crate::format::quantise::to_unorm;
 
-/// Edge of a bucket's cube, as the viewer's own writer: positions in steps of 76 um. [m]
+/// Edge of a bucket's cube, as in the viewer's own writer. Positions have steps of 76 um. [m]
 const BLOCK_M: f32 = 5.0;
-/// Splats of a full bucket.
+/// Splats per full bucket.
 const BUCKET: usize = 256;
-/// The highest degree the format has.
+/// Highest degree that the format supports.
 pub(in crate::format) const MAX_SH_DEGREE: u8 = 2;
 
-/// Returns the bytes of a `.ksplat` file; harmonics beyond degree 2 are left out.
+/// Returns the bytes of a `.ksplat` file. Harmonics beyond degree 2 are dropped.
 ///
 /// # Panics
-/// If `level` is beyond 2.
+/// If `level` exceeds 2.
 pub(in crate::format) fn encode(splats: &Splats, level: u32) -> Vec<u8> {
     assert_whole(splats);
     let row = Row::LEVELS[level as usize];
@@ -125,18 +125,18 @@ pub(in crate::format) fn encode(splats: &Splats, level: u32) -> Vec<u8> {
     bytes
 }
 
-/// Splats of a cube in space.
+/// Splats in one cube of space.
 struct Bucket {
     centre_m: Vec3,
     splats: Vec<usize>,
 }
 
-/// Returns the full buckets and the others.
+/// Returns the full buckets and the partial buckets.
 fn buckets(splats: &Splats) -> (Vec<Bucket>, Vec<Bucket>) {
     let mut open: BTreeMap<[i32; 3], Bucket> = BTreeMap::new();
     let mut full = Vec::new();
     for (i, &mean_m) in splats.means_m.iter().enumerate() {
-        // `as` saturates: what is 10 million km away lands in the last cube.
+        // `as` saturates: splats beyond 10 million km are put into the last cube.
         let cube: IVec3 = (mean_m / BLOCK_M).floor().as_ivec3();
         let bucket = open.entry(cube.to_array()).or_insert_with(|| Bucket {
             centre_m: (cube.as_vec3() + 0.5) * BLOCK_M,

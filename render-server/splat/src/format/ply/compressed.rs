@@ -1,4 +1,4 @@
-//! SuperSplat's compressed PLY to splats.
+//! Decoder of SuperSplat's compressed PLY.
 //!
 //! | element | per | holds |
 //! |---|---|---|
@@ -20,11 +20,11 @@ use crate::format::block::{Gaussian, decode_all};
 use crate::format::progress::Meter;
 use crate::format::quantise::{unorm, wxyz_of_smallest_three};
 
-/// Elements this layout knows.
+/// Elements of this layout.
 pub(super) const ELEMENTS: [&str; 3] = ["chunk", VERTEX, "sh"];
-/// Splats that share bounds.
+/// Number of splats that share bounds.
 pub(super) const CHUNK: usize = 256;
-/// Bounds of every chunk, in the order in which [`Bounds`] keeps them.
+/// Bounds of every chunk, in the order of [`Bounds`].
 pub(super) const BOUNDS: [&str; 12] = [
     "min_x",
     "min_y",
@@ -39,13 +39,13 @@ pub(super) const BOUNDS: [&str; 12] = [
     "max_scale_y",
     "max_scale_z",
 ];
-/// Bounds that newer files have as well.
+/// Additional bounds in newer files.
 pub(super) const COLOUR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
-/// The packed words.
+/// Properties with packed words.
 pub(super) const PACKED: [&str; 4] =
     ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 
-/// Whether the vertices of a file are packed.
+/// Returns whether the vertices of a file are packed.
 pub(super) fn is_compressed(header: &Header) -> bool {
     header.vertex().properties.iter().any(|property| property.name == PACKED[0])
 }
@@ -141,7 +141,7 @@ pub(super) fn read(
     }))
 }
 
-/// Returns a harmonic from its byte: the middle of its step, the ends exactly.
+/// Returns a harmonic from its byte: the middle of the quantisation step, except at both ends.
 fn harmonic(byte: u16) -> f32 {
     let unit = match byte {
         0 => 0.0,
@@ -151,7 +151,7 @@ fn harmonic(byte: u16) -> f32 {
     (unit - 0.5) * 8.0
 }
 
-/// Returns the degree that is kept and the column of every harmonic, channel-major.
+/// Returns the degree of the stored harmonics, and the column of each harmonic, channel-major.
 fn harmonics(table: &Table, count: usize) -> Result<(u8, Vec<usize>), PlyError> {
     let found = table.element.properties.iter().filter(|p| p.name.starts_with("f_rest_")).count();
     let degree = match found {
@@ -167,12 +167,12 @@ fn harmonics(table: &Table, count: usize) -> Result<(u8, Vec<usize>), PlyError> 
     Ok((degree, columns.collect::<Result<_, _>>()?))
 }
 
-/// Returns the three numbers of 11, 10 and 11 bits, 0 to 1.
+/// Returns three numbers of 11, 10 and 11 bits, scaled to 0 to 1.
 fn thirds(word: u32) -> Vec3 {
     Vec3::new(unorm(word >> 21, 11), unorm(word >> 11, 10), unorm(word, 11))
 }
 
-/// An element and its rows.
+/// Element and its rows.
 struct Table<'a> {
     element: &'a Element,
     stride: usize,
@@ -184,7 +184,7 @@ impl Table<'_> {
         self.element.properties.iter().any(|property| property.name == name)
     }
 
-    /// Returns where in a row a column starts.
+    /// Returns the offset of a column in a row.
     fn column(&self, name: &str, expected: Scalar) -> Result<usize, PlyError> {
         let mut at = 0;
         for property in &self.element.properties {
@@ -217,7 +217,7 @@ impl Table<'_> {
     }
 }
 
-/// Turns an array of results into a result of an array.
+/// Converts an array of results to a result of an array.
 fn all<const N: usize>(columns: [Result<usize, PlyError>; N]) -> Result<[usize; N], PlyError> {
     let mut out = [0; N];
     for (out, column) in out.iter_mut().zip(columns) {

@@ -1,4 +1,4 @@
-//! Splats to SuperSplat's compressed PLY.
+//! Encoder of SuperSplat's compressed PLY.
 
 use std::path::Path;
 
@@ -11,11 +11,11 @@ use crate::format::order::morton;
 use crate::format::quantise::{smallest_three, to_unorm};
 use crate::format::{assert_whole, file};
 
-/// Log scales that viewers of this format take; e^-20 m is far below what anything shows.
+/// Range of log scales that viewers of this format accept; e^-20 m is far below any visible size.
 const LOG_SCALES: (f32, f32) = (-20.0, 20.0);
 
-/// Writes a scene as SuperSplat's compressed PLY; lossy, and in Z-order, so that splats that share
-/// bounds are neighbours. Harmonics are clamped to -4 to 4.
+/// Writes a scene as SuperSplat's compressed PLY. The encoding is lossy: splats are in Z-order, so
+/// that splats with shared bounds are neighbours, and harmonics are clamped to -4 to 4.
 ///
 /// # Errors
 /// [`PlyError::Io`] with the path.
@@ -31,7 +31,7 @@ pub fn write_compressed(path: impl AsRef<Path>, splats: &Splats) -> Result<(), P
     })
 }
 
-/// Returns the bytes [`write_compressed`] writes.
+/// Returns the bytes that [`write_compressed`] writes.
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.
@@ -61,7 +61,7 @@ pub fn encode_compressed(splats: &Splats) -> Vec<u8> {
     bytes.reserve(count * (16 + rest) + count.div_ceil(CHUNK) * 72);
     let mut packed: Vec<u8> = Vec::with_capacity(count * 16);
     for chunk in order.chunks(CHUNK) {
-        // Position, log scale and colour of each, and their bounds.
+        // Position, log scale and colour of each splat, and their bounds.
         let values = |index: u32| -> [f32; 9] {
             let i = index as usize;
             let mean_m = splats.means_m[i];
@@ -87,7 +87,7 @@ pub fn encode_compressed(splats: &Splats) -> Vec<u8> {
         }
         for &i in chunk {
             let value = values(i);
-            // Halved before they are subtracted: bounds may be as far apart as f32 goes.
+            // Halved before subtraction: bounds can be as far apart as the range of f32.
             let share = |k: usize| {
                 let extent = high[k] * 0.5 - low[k] * 0.5;
                 if extent > 0.0 { (value[k] * 0.5 - low[k] * 0.5) / extent } else { 0.0 }
@@ -115,7 +115,7 @@ pub fn encode_compressed(splats: &Splats) -> Vec<u8> {
         for i in order {
             let sh = &splats.sh[i as usize * coefficients * 3..][..coefficients * 3];
             for channel in 0..3 {
-                // Steps of 1/32; the reader takes the middle of each.
+                // Steps of 1/32; the decoder uses the middle of each.
                 bytes.extend((1..coefficients).map(|k| (sh[k * 3 + channel] * 32.0 + 128.0) as u8));
             }
         }

@@ -1,12 +1,12 @@
-//! Why a PLY file is refused.
+//! Errors of reading and writing PLY files.
 
 use std::path::PathBuf;
 
-/// Why a file is no splat scene, or could not be read or written.
+/// Error of reading, decoding or writing a PLY file of splats.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlyError {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("cannot {verb} {}: {cause}", path.display())]
     Io {
         /// The file.
@@ -19,64 +19,64 @@ pub enum PlyError {
     /// The file does not start with `ply`.
     #[error("not a PLY file: it starts with {found:?}, not \"ply\"")]
     NotPly {
-        /// The first bytes, lossily as text.
+        /// First bytes as lossy text.
         found: String,
     },
     /// The header is malformed.
     #[error("PLY header, byte {offset}: {reason}")]
     Header {
-        /// Where the offending line starts. [byte]
+        /// Start of the invalid line. [byte]
         offset: usize,
-        /// What is wrong with it.
+        /// Description of the defect.
         reason: String,
     },
-    /// The file is a well-formed PLY of something else.
+    /// The file is a well-formed PLY without splats.
     #[error("not a splat scene: {reason}")]
     NotSplats {
-        /// What it seems to be, and what is missing.
+        /// Assumed content, and missing properties.
         reason: String,
     },
-    /// The number of `f_rest_*` properties belongs to no degree of harmonics.
+    /// The number of `f_rest_*` properties does not match any degree of harmonics.
     #[error("{found} f_rest properties; expected 0, 9, 24, 45 or 72 (harmonics of degree 0 to 4)")]
     HarmonicsCount {
-        /// How many there are.
+        /// Number of `f_rest_*` properties.
         found: usize,
     },
-    /// The file ends before the header's promise is kept.
+    /// The file is shorter than the header declares.
     #[error(
         "truncated: element `{element}` of {declared} rows needs {needed} more bytes from byte \
          {offset}, the file has {available}"
     )]
     Truncated {
-        /// The element that does not fit.
+        /// Incomplete element.
         element: String,
-        /// Rows the header declares.
+        /// Number of rows that the header declares.
         declared: usize,
-        /// Where its data, or the row that does not fit, starts. [byte]
+        /// Start of the element's data, or of the incomplete row. [byte]
         offset: usize,
-        /// Bytes needed from there, at the least.
+        /// Minimum bytes needed from there.
         needed: u128,
-        /// Bytes there are from there.
+        /// Available bytes from there.
         available: usize,
     },
-    /// A value cannot be read.
+    /// A value is invalid.
     #[error("byte {offset}, row {row} of `{element}`: {reason}")]
     Value {
-        /// Where the value starts. [byte]
+        /// Start of the value. [byte]
         offset: usize,
-        /// The element it belongs to.
+        /// Element of the value.
         element: String,
-        /// The row it belongs to, from 0.
+        /// Row of the value, from 0.
         row: usize,
-        /// What is wrong with it.
+        /// Description of the defect.
         reason: String,
     },
-    /// Nothing is left to render.
+    /// The file contains no valid splat.
     #[error("no splats: the file declares {declared}, {dropped} of them were dropped as invalid")]
     Empty {
-        /// Rows the header declares.
+        /// Number of rows that the header declares.
         declared: usize,
-        /// Rows dropped as invalid.
+        /// Number of rows that were dropped as invalid.
         dropped: usize,
     },
 }

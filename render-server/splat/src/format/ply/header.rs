@@ -1,14 +1,14 @@
-//! The text on top of a PLY file: format, elements, typed properties.
+//! Header of a PLY file: format, elements, typed properties.
 
 use super::PlyError;
 
-/// The element whose rows are splats.
+/// Name of the element with one row per splat.
 pub(super) const VERTEX: &str = "vertex";
 
-/// Longest header that is searched for its end: a header of splats is 2 kB. [byte]
+/// Maximum size of a header; a header of splats has 2 kB. [byte]
 const MAX_HEADER_BYTES: usize = 1 << 20;
 
-/// How the rows are written.
+/// Encoding of the rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Format {
     /// Packed little-endian numbers.
@@ -17,7 +17,7 @@ pub(super) enum Format {
     Ascii,
 }
 
-/// The type of one number.
+/// Type of one number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Scalar {
     I8,
@@ -79,21 +79,21 @@ impl Scalar {
     }
 }
 
-/// One number, or a counted list of them, per row.
+/// Type of a property: one number, or a counted list of numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PropertyKind {
     Scalar(Scalar),
     List { count: Scalar, item: Scalar },
 }
 
-/// A named column.
+/// Named column of an element.
 #[derive(Clone, Debug)]
 pub(super) struct Property {
     pub(super) name: String,
     pub(super) kind: PropertyKind,
 }
 
-/// A named table.
+/// Named table.
 #[derive(Clone, Debug)]
 pub(super) struct Element {
     pub(super) name: String,
@@ -102,7 +102,7 @@ pub(super) struct Element {
 }
 
 impl Element {
-    /// Returns the size of a row in a binary file if all rows have the same. [byte]
+    /// Returns the size of a row in a binary file, if all rows have the same size. [byte]
     pub(super) fn fixed_row_bytes(&self) -> Option<usize> {
         self.properties
             .iter()
@@ -113,7 +113,7 @@ impl Element {
             .sum()
     }
 
-    /// Returns the least size of a row in a binary file: lists may be empty. [byte]
+    /// Returns the minimum size of a row in a binary file, with empty lists. [byte]
     pub(super) fn min_row_bytes(&self) -> usize {
         self.properties
             .iter()
@@ -126,15 +126,15 @@ impl Element {
     }
 }
 
-/// The content of the header text.
+/// Parsed header.
 #[derive(Clone, Debug)]
 pub(super) struct Header {
     pub(super) format: Format,
-    /// In file order; exactly one is named [`VERTEX`].
+    /// Elements in file order; exactly one is named [`VERTEX`].
     pub(super) elements: Vec<Element>,
-    /// Whether a comment says that the scene was trained with anti-aliasing.
+    /// Whether a comment indicates training with anti-aliasing.
     pub(super) antialiased: bool,
-    /// Where the rows start. [byte]
+    /// Start of the rows. [byte]
     pub(super) body: usize,
 }
 
@@ -153,14 +153,14 @@ impl Header {
             let Some((offset, line)) = lines.next() else {
                 return Err(PlyError::Header {
                     offset: lines.offset,
-                    reason: "no `end_header` line in plain text; the file is cut or no PLY".into(),
+                    reason: "no `end_header` line in plain text; the file is truncated or not a PLY".into(),
                 });
             };
             let fail = |reason: String| PlyError::Header { offset, reason };
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["comment", ref comment @ ..] => {
-                    // The last one counts, as for brush and splat-transform.
+                    // The last matching comment wins, as in brush and splat-transform.
                     antialiased = says_antialiased(comment).unwrap_or(antialiased);
                 }
                 [] | ["obj_info", ..] => {}
@@ -223,17 +223,17 @@ impl Header {
         Ok(Self { format, elements, antialiased, body: lines.offset })
     }
 
-    /// Returns the element whose rows are splats.
+    /// Returns the element with one row per splat.
     pub(super) fn vertex(&self) -> &Element {
-        // `parse` has refused files without one.
+        // `parse` has rejected files without this element.
         &self.elements[self.elements.iter().position(|e| e.name == VERTEX).unwrap_or(0)]
     }
 }
 
-/// The line by which brush says so, and this program.
+/// Comment that indicates anti-aliasing, as brush writes it.
 pub(super) const ANTIALIASED: &str = "comment SplatRenderMode: mip\n";
 
-/// Returns what the words of a comment say about anti-aliasing, if anything.
+/// Returns whether a comment indicates anti-aliasing, or `None` if it is another comment.
 fn says_antialiased(comment: &[&str]) -> Option<bool> {
     let [key, value] = comment else { return None };
     let is = |word: &str, expected: &str| word.eq_ignore_ascii_case(expected);
@@ -253,7 +253,8 @@ fn says_antialiased(comment: &[&str]) -> Option<bool> {
     None
 }
 
-/// Lines of text with their offsets; ends at the first line that is not finished or not UTF-8.
+/// Iterator over lines of text with their offsets. It ends at the first line that is incomplete or
+/// not UTF-8.
 struct Lines<'a> {
     bytes: &'a [u8],
     offset: usize,

@@ -1,15 +1,15 @@
-//! Which properties of a vertex make a splat, and where they lie in its row.
+//! Layout of a vertex: the properties of a splat and their columns.
 
 use super::PlyError;
 use super::header::{Element, Header, PropertyKind, Scalar};
 
-/// Properties every splat has, in the order in which [`Layout::slots`] lists them.
+/// Required properties of a splat, in the order of [`Layout::slots`].
 pub(super) const REQUIRED: [&str; 14] = [
     "x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity",
     "f_dc_0", "f_dc_1", "f_dc_2",
 ];
 
-/// Where in [`Layout::slots`] each group starts.
+/// Start of each group in [`Layout::slots`].
 pub(super) mod slot {
     pub(in crate::format::ply) const MEAN: usize = 0;
     pub(in crate::format::ply) const LOG_SCALE: usize = 3;
@@ -19,28 +19,29 @@ pub(super) mod slot {
     pub(in crate::format::ply) const SH_REST: usize = 14;
 }
 
-/// One number of a splat: the column it stands in.
+/// Column of one number of a splat.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Slot {
-    /// Index among the vertex element's properties.
+    /// Index among the properties of the vertex element.
     pub(super) column: usize,
     pub(super) scalar: Scalar,
 }
 
-/// The columns that make a splat.
+/// Columns of a splat.
 #[derive(Clone, Debug)]
 pub(super) struct Layout {
-    /// [`REQUIRED`], then `f_rest_0..`, which are channel-major: all of red, green, blue.
+    /// Columns of [`REQUIRED`], then of `f_rest_0..`, which are channel-major: all of red, green,
+    /// blue.
     pub(super) slots: Vec<Slot>,
-    /// The degree that is kept, 0 to 3.
+    /// Degree of the stored harmonics, 0 to 3.
     pub(super) sh_degree: u8,
-    /// Harmonics beyond the constant that are kept, per channel.
+    /// Stored harmonics per channel, without the constant.
     pub(super) rest_per_channel: usize,
-    /// The constant is not a harmonic but a colour of 0 to 255.
+    /// Whether the constant harmonic is given as a colour of 0 to 255.
     pub(super) colour_bytes: bool,
 }
 
-/// What splatfacto writes instead of `f_dc_*` when it trained without harmonics.
+/// Properties that splatfacto writes instead of `f_dc_*` after training without harmonics.
 const COLOUR: [&str; 3] = ["red", "green", "blue"];
 
 impl Layout {
@@ -63,7 +64,7 @@ impl Layout {
             0 => 0,
             9 => 1,
             24 => 2,
-            // Degree 4 is rare and adds little: its own coefficients are skipped.
+            // Degree 4 is rare and adds little: its additional coefficients are skipped.
             45 | 72 => 3,
             found => return Err(PlyError::HarmonicsCount { found }),
         };
@@ -91,7 +92,7 @@ impl Layout {
         Ok(Self { slots, sh_degree, rest_per_channel: kept_per_channel, colour_bytes })
     }
 
-    /// Returns the names of the vertex's columns that no splat needs.
+    /// Returns the names of the vertex properties that are not part of a splat.
     pub(super) fn skipped(&self, header: &Header) -> Vec<String> {
         let used = |column| self.slots.iter().any(|slot| slot.column == column);
         let properties = header.vertex().properties.iter().enumerate();
@@ -103,7 +104,7 @@ fn column(vertex: &Element, name: &str) -> Option<usize> {
     vertex.properties.iter().position(|property| property.name == name)
 }
 
-/// Reports what a PLY without splats seems to be.
+/// Returns a description of a PLY without splats.
 fn describe(header: &Header, missing: &[&str]) -> String {
     let names = missing.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
     let kind = if header.elements.iter().any(|e| e.name == "face") {

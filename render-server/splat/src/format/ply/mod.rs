@@ -1,12 +1,12 @@
-//! 3D Gaussian splats in PLY files: the layout of INRIA's trainer, as splatfacto, brush and PostShot
-//! write it, and the compressed one of SuperSplat ([`write_compressed`]).
+//! PLY files of 3D Gaussian splats: the layout of INRIA's trainer, as splatfacto, brush and
+//! PostShot write it, and SuperSplat's compressed layout ([`write_compressed`]).
 //!
-//! Data flow, once per scene: `header` turns the text on top into elements and typed properties. A
-//! plain file: `layout` finds the properties that make a splat (in any order, among any others) and
-//! where each lies in a row; `rows` walks the elements (fixed or variable length, binary or ascii),
-//! checks that the file is as long as the header promises *before* anything is allocated, and
-//! decodes in parallel, from log scales, logit opacities and wxyz quaternions. A compressed one:
-//! `compressed`. `write` is the way back of both.
+//! Data flow, once per scene: `header` parses the header text to elements and typed properties.
+//! Plain files: `layout` finds the properties of a splat (in any order, among others) and their
+//! offsets in a row; `rows` walks the elements (fixed or variable length, binary or ascii), checks
+//! that the file is as long as the header declares *before* it allocates, and decodes in parallel,
+//! from log scales, logit opacities and wxyz quaternions. Compressed files: `compressed`. `write`
+//! and `compressed_write` encode.
 //!
 //! | property | holds |
 //! |---|---|
@@ -17,12 +17,13 @@
 //! | `scale_0..2` | natural logarithm of the standard deviation |
 //! | `rot_0..3` | quaternion wxyz, of any length |
 //!
-//! Of the comments on top, those count that say that the scene was trained with anti-aliasing: brush's
-//! `SplatRenderMode: mip`, which is written too, and PostShot's `antialiased 1`.
+//! Two comments of the header indicate training with anti-aliasing: brush's `SplatRenderMode: mip`,
+//! which is also written, and PostShot's `antialiased 1`.
 //!
-//! Axes are those of the training, by custom x right, y down, z ahead of the first camera (RDF).
+//! Axes are those of the training, by convention x right, y down, z forward of the first camera
+//! (RDF).
 //!
-//! Budget: 1 M splats of degree 3 are 248 MB; decoding is bound by memory and `exp`.
+//! Budget: 1 M splats of degree 3 are 248 MB; decoding is limited by memory bandwidth and `exp`.
 
 mod compressed;
 mod compressed_write;
@@ -59,13 +60,13 @@ pub fn read(path: impl AsRef<Path>) -> Result<Loaded, PlyError> {
 /// Reads a splat scene from the bytes of a PLY file, plain or compressed.
 ///
 /// # Errors
-/// Whatever keeps the file from being a splat scene, with the byte offset or the property's name;
-/// [`PlyError::Empty`] where nothing is left to render.
+/// The defect that makes the file invalid, with the byte offset or the name of the property;
+/// [`PlyError::Empty`] if no valid splat is left.
 pub fn parse(bytes: &[u8]) -> Result<Loaded, PlyError> {
     decode(bytes, &Meter::SILENT)
 }
 
-/// [`parse`], reporting its progress.
+/// Parses a file as [`parse`] does, and reports progress.
 pub(super) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, PlyError> {
     let header = header::Header::parse(bytes)?;
     meter.expect(header.vertex().count);

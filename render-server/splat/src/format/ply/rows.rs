@@ -1,6 +1,6 @@
-//! Rows of numbers, binary or ascii, to splats.
+//! Decoder of rows of numbers, binary or ascii.
 //!
-//! Nothing is allocated before the file is known to be long enough for it.
+//! The length of the file is checked before memory is allocated.
 
 use glam::Vec3;
 
@@ -27,7 +27,7 @@ pub(super) fn read_binary(
         };
     }
     let vertex = header.vertex();
-    // Where each column lies, in bytes from the row's start, if no list moves it.
+    // Offset of each column in a row, if there are no lists.
     if let Some(row_bytes) = vertex.fixed_row_bytes() {
         let length = fixed_length(bytes, offset, vertex, row_bytes)?;
         let mut starts = Vec::with_capacity(vertex.properties.len());
@@ -44,7 +44,7 @@ pub(super) fn read_binary(
         return Ok(decode_all(layout.sh_degree, vertex.count, meter, |first, block| {
             let rows = data[first * row_bytes..].chunks_exact(row_bytes).take(block.len());
             for (i, row) in rows.enumerate() {
-                // Nearly every file is all f32: one well-predicted branch per number.
+                // Nearly all files contain only f32: one well-predicted branch per number.
                 put(block, layout, i, |slot| match slots[slot] {
                     (at, Scalar::F32) => {
                         f32::from_le_bytes([row[at], row[at + 1], row[at + 2], row[at + 3]])
@@ -54,7 +54,7 @@ pub(super) fn read_binary(
             }
         }));
     }
-    // A list among the columns: walk once for the offsets of every number, row by row.
+    // Some columns are lists: walk once, row by row, for the offsets of all numbers.
     minimum_length(bytes, offset, vertex)?;
     let columns = vertex.properties.len();
     let mut starts: Vec<usize> = Vec::with_capacity(vertex.count.saturating_mul(columns));
@@ -70,8 +70,8 @@ pub(super) fn read_binary(
     }))
 }
 
-/// Decodes the vertex element of an ascii file. Rows are distinguished by counting numbers, so line
-/// ends carry no meaning.
+/// Decodes the vertex element of an ascii file. Rows are separated by counting numbers; line ends
+/// have no meaning.
 pub(super) fn read_ascii(
     bytes: &[u8],
     header: &Header,
@@ -90,7 +90,7 @@ pub(super) fn read_ascii(
         }
     }
     let vertex = header.vertex();
-    // Each number takes a digit and a separator, but for the last separator.
+    // Each number takes a digit and a separator, except for the last separator.
     let needed = vertex.count as u128 * vertex.properties.len() as u128 * 2;
     let available = bytes.len() - tokens.offset;
     if needed > available as u128 + 1 {
@@ -123,7 +123,7 @@ pub(super) fn read_ascii(
     Ok((builder.finish(dropped), dropped))
 }
 
-/// Stores row `i` from its raw numbers, `raw(slot)`.
+/// Stores row `i`, given its raw numbers `raw(slot)`.
 #[inline]
 fn put(block: &mut Block, layout: &Layout, i: usize, raw: impl Fn(usize) -> f32) {
     let three = |first: usize| Vec3::new(raw(first), raw(first + 1), raw(first + 2));
@@ -137,12 +137,12 @@ fn put(block: &mut Block, layout: &Layout, i: usize, raw: impl Fn(usize) -> f32)
     block.put(i, &gaussian, |k, channel| match k {
         0 if layout.colour_bytes => harmonic_of_colour(raw(slot::SH_DC + channel) / 255.0),
         0 => raw(slot::SH_DC + channel),
-        // Channel-major in the file, colour by colour in memory.
+        // Channel-major in the file, coefficient-major in memory.
         _ => raw(slot::SH_REST + channel * layout.rest_per_channel + k - 1),
     });
 }
 
-/// Returns the bytes of an element of fixed rows, which are all there.
+/// Returns the bytes of an element with fixed rows, after checking that they are complete.
 pub(super) fn fixed_length(
     bytes: &[u8],
     offset: usize,
@@ -161,8 +161,9 @@ fn minimum_length(bytes: &[u8], offset: usize, element: &Element) -> Result<(), 
     fixed_length(bytes, offset, element, element.min_row_bytes()).map(|_| ())
 }
 
-/// Walks the rows of an element with lists; calls `visit` with (column, byte) of every property and
-/// returns where the element ends. Every row takes a byte or more, so the file bounds the time.
+/// Walks the rows of an element with lists. Calls `visit` with (column, byte) of every property,
+/// and returns the end of the element. Every row takes at least one byte, so the size of the file
+/// bounds the time.
 fn variable_rows(
     bytes: &[u8],
     start: usize,
@@ -193,7 +194,7 @@ fn variable_rows(
                         reason: format!("list `{}` has length {items}", property.name),
                     });
                 }
-                // `as` saturates, so a huge float cannot wrap.
+                // `as` saturates, so a huge float cannot overflow.
                 length += u128::from(items as u64) * item.bytes() as u128;
             }
             if length > available as u128 {
@@ -220,14 +221,14 @@ pub(super) fn truncated(
     }
 }
 
-/// Words of an ascii body.
+/// Whitespace-separated numbers of an ascii body.
 struct Tokens<'a> {
     bytes: &'a [u8],
     offset: usize,
 }
 
 impl Tokens<'_> {
-    /// Returns the next number of a property.
+    /// Returns the next number.
     fn number(&mut self, element: &Element, row: usize, property: &str) -> Result<f64, PlyError> {
         let rest = &self.bytes[self.offset..];
         let blank = rest.iter().take_while(|byte| byte.is_ascii_whitespace()).count();
@@ -237,10 +238,10 @@ impl Tokens<'_> {
             |reason| Err(PlyError::Value { offset, element: element.name.clone(), row, reason });
         let word = &rest[blank..blank + length];
         if word.is_empty() {
-            return fail(format!("the file ends where `{property}` should stand"));
+            return fail(format!("the file ends before `{property}`"));
         }
         self.offset = offset + length;
-        // Cut at the shown length, not at the parsed one: the word may be the whole file.
+        // Truncate the text in the error, because the word can be as long as the file.
         match str::from_utf8(word).ok().and_then(|word| word.parse().ok()) {
             Some(number) => Ok(number),
             None => fail(format!(
@@ -250,7 +251,7 @@ impl Tokens<'_> {
         }
     }
 
-    /// Passes over one property.
+    /// Skips one property.
     fn skip(&mut self, element: &Element, row: usize, kind: PropertyKind) -> Result<(), PlyError> {
         let offset = self.offset;
         let first = self.number(element, row, "a skipped property")?;

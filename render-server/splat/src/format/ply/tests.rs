@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use super::{DropCounts, PlyError, encode, parse, read, write};
 use crate::Splats;
 
-/// Two splats of degree 1.
+/// Returns two splats of degree 1.
 fn two() -> Splats {
     Splats {
         means_m: vec![Vec3::new(1.0, 2.0, 3.0), Vec3::new(-1.0, 0.5, 9.0)],
@@ -31,7 +31,7 @@ fn assert_close(a: &Splats, b: &Splats) {
     }
 }
 
-/// The ascii file of `splats`, with columns in `order` (indices into the binary layout's).
+/// Returns the ascii file of `splats`, with the columns in reverse order if `reverse`.
 fn ascii(splats: &Splats, reverse: bool) -> String {
     let binary = encode(splats);
     let text_end = binary.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
@@ -59,7 +59,7 @@ fn ascii(splats: &Splats, reverse: bool) -> String {
     )
 }
 
-/// A one-splat binary file of degree 0 with the given raw numbers in the order of `NAMES`.
+/// Returns a binary file of degree 0 with the given raw numbers in the order of `REQUIRED`.
 fn raw(rows: &[[f32; 14]]) -> Vec<u8> {
     let names = super::layout::REQUIRED.map(|name| format!("property float {name}\n")).concat();
     let mut bytes = format!(
@@ -73,7 +73,7 @@ fn raw(rows: &[[f32; 14]]) -> Vec<u8> {
 
 const GOOD: [f32; 14] = [1.0, 2.0, 3.0, -2.0, -2.0, -2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3];
 
-/// `GOOD` with the number at `slot` replaced.
+/// Returns `GOOD` with the number at `slot` replaced.
 fn with(slot: usize, value: f32) -> [f32; 14] {
     let mut row = GOOD;
     row[slot] = value;
@@ -85,7 +85,7 @@ fn error(bytes: &[u8]) -> String {
 }
 
 #[test]
-fn a_file_is_written_and_read_back() {
+fn reads_back_a_written_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.ply");
     write(&path, &two()).unwrap();
@@ -97,7 +97,7 @@ fn a_file_is_written_and_read_back() {
 }
 
 #[test]
-fn raw_numbers_are_activated() {
+fn activates_raw_numbers() {
     let splats = parse(&raw(&[GOOD])).unwrap().splats;
     assert_eq!(splats.opacities, [0.5]);
     assert_eq!(splats.rotations, [Quat::IDENTITY]);
@@ -106,7 +106,7 @@ fn raw_numbers_are_activated() {
 }
 
 #[test]
-fn harmonics_are_channel_major_in_the_file() {
+fn writes_harmonics_channel_major() {
     let splats = two();
     let bytes = encode(&splats);
     let body = bytes.len() - 2 * 26 * 4;
@@ -117,16 +117,16 @@ fn harmonics_are_channel_major_in_the_file() {
 }
 
 #[test]
-fn ascii_in_any_column_order_is_the_same_scene() {
+fn reads_ascii_in_any_column_order() {
     for reverse in [false, true] {
         assert_close(&parse(ascii(&two(), reverse).as_bytes()).unwrap().splats, &two());
     }
 }
 
 #[test]
-fn other_types_lists_and_elements_are_passed_over() {
-    // A camera element with a list before, a face element after, a list and a double among the
-    // vertex's columns, an opacity of type double, a red of type uchar.
+fn skips_lists_and_other_elements_and_converts_other_types() {
+    // A camera element with a list before the vertices, a face element after them; among the vertex
+    // columns a list, a double, an opacity of type double, a red of type uchar.
     let mut bytes = b"ply\nformat binary_little_endian 1.0\nobj_info x\n\
         element camera 2\nproperty list uchar int views\nproperty short id\nelement vertex 2\n\
         property uchar red\n"
@@ -163,7 +163,7 @@ fn other_types_lists_and_elements_are_passed_over() {
 }
 
 #[test]
-fn unrenderable_splats_are_dropped_and_counted() {
+fn drops_and_counts_invalid_splats() {
     let rows = [
         with(0, f32::NAN),
         GOOD,
@@ -188,7 +188,7 @@ fn unrenderable_splats_are_dropped_and_counted() {
 }
 
 #[test]
-fn errors_have_position_and_cause() {
+fn reports_position_and_cause_of_errors() {
     let check = |bytes: &[u8], part: &str| {
         let message = error(bytes);
         assert!(message.contains(part), "{message:?} lacks {part:?}");
@@ -210,7 +210,7 @@ fn errors_have_position_and_cause() {
     let whole = String::from_utf8(raw(&[])).unwrap();
     let rest = whole.replace("end_header", "property float f_rest_0\nend_header");
     check(rest.as_bytes(), "1 f_rest properties; expected 0, 9, 24, 45 or 72");
-    // A count no machine can hold is an error, not an allocation.
+    // A count beyond the memory of any computer is an error, not an allocation.
     for count in ["18446744073709551615", "4000000000"] {
         let huge = whole.replace("vertex 0", &format!("vertex {count}"));
         check(huge.as_bytes(), "truncated: element `vertex`");
@@ -226,12 +226,12 @@ fn errors_have_position_and_cause() {
 }
 
 #[test]
-fn a_file_cut_anywhere_is_an_error() {
+fn rejects_a_file_truncated_anywhere() {
     let mut text = ascii(&two(), false).into_bytes();
     text.truncate(text.len() - 2);
     for bytes in [encode(&two()), text] {
         let is_ascii = bytes.windows(5).any(|w| w == b"ascii");
-        // The last number of an ascii file can lose digits and still be a number.
+        // The last number of an ascii file remains a number if it loses digits.
         let end = if is_ascii { bytes.len() - 8 } else { bytes.len() };
         for length in 0..end {
             assert!(parse(&bytes[..length]).is_err(), "{length} of {} bytes", bytes.len());
@@ -241,7 +241,7 @@ fn a_file_cut_anywhere_is_an_error() {
 }
 
 #[test]
-fn a_missing_file_is_named() {
+fn names_a_missing_file() {
     let error = read("/nowhere/scene.ply").expect_err("no such file");
     assert!(matches!(error, PlyError::Io { .. }));
     assert!(error.to_string().contains("/nowhere/scene.ply"));
@@ -276,12 +276,12 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
     #[test]
-    fn parse_of_encode_is_the_same_scene(splats in scene()) {
+    fn parses_an_encoded_scene_to_the_same_scene(splats in scene()) {
         assert_close(&parse(&encode(&splats)).unwrap().splats, &splats);
     }
 
     #[test]
-    fn any_damage_is_an_error_or_a_finite_scene(
+    fn returns_an_error_or_a_finite_scene_for_damaged_bytes(
         splats in scene(), at in any::<prop::sample::Index>(), bytes in prop::array::uniform4(any::<u8>()),
     ) {
         let mut file = encode(&splats);
@@ -297,12 +297,13 @@ proptest! {
     }
 
     #[test]
-    fn any_text_after_the_magic_is_no_panic(text in "ply\n(format ascii 1\\.0\n)?(element vertex [0-9]{1,20}\n|property (list )?(uchar|float|double) (x|y|int z)\n|comment .*\n){0,8}(end_header\n)?[ -~\n]{0,80}") {
+    fn never_panics_on_text_after_the_magic(text in "ply\n(format ascii 1\\.0\n)?(element vertex [0-9]{1,20}\n|property (list )?(uchar|float|double) (x|y|int z)\n|comment .*\n){0,8}(end_header\n)?[ -~\n]{0,80}") {
         let _ = parse(text.as_bytes());
     }
 }
 
-/// `two` as a trainer writes it: its comments, its columns in its order, floats all.
+/// Returns the file of `two` as a trainer writes it: with its comments and columns, all of type
+/// float.
 fn as_written_by(comments: &[&str], columns: &[String]) -> Vec<u8> {
     let binary = encode(&two());
     let text_end = binary.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
@@ -320,7 +321,7 @@ fn as_written_by(comments: &[&str], columns: &[String]) -> Vec<u8> {
         for column in columns {
             match names.iter().position(|name| name == column) {
                 Some(at) => bytes.extend_from_slice(&row[at * 4..at * 4 + 4]),
-                // A column of the trainer's own.
+                // An additional column of the trainer.
                 None => bytes.extend_from_slice(&7f32.to_le_bytes()),
             }
         }
@@ -328,13 +329,13 @@ fn as_written_by(comments: &[&str], columns: &[String]) -> Vec<u8> {
     bytes
 }
 
-/// Names with numbers: `numbered("rot", 4)` is rot_0 to rot_3.
+/// Returns numbered names: `numbered("rot", 4)` is rot_0 to rot_3.
 fn numbered(name: &str, count: usize) -> Vec<String> {
     (0..count).map(|i| format!("{name}_{i}")).collect()
 }
 
 #[test]
-fn files_of_every_trainer_decode_to_the_same_scene() {
+fn decodes_files_of_all_trainers_to_the_same_scene() {
     let names = |names: &[&str]| names.iter().map(ToString::to_string).collect::<Vec<_>>();
     let (xyz, normals) = (names(&["x", "y", "z"]), names(&["nx", "ny", "nz"]));
     let (dc, rest) = (numbered("f_dc", 3), numbered("f_rest", 9));
@@ -349,27 +350,27 @@ fn files_of_every_trainer_decode_to_the_same_scene() {
     let unused = ["nx", "ny", "nz"];
     // INRIA's trainer.
     check(&[], &[&xyz, &normals, &dc, &rest, &opacity, &scale, &rotation], &unused);
-    // splatfacto: states the program and the up axis.
+    // splatfacto: comments with program and up axis.
     check(
         &["Generated by Nerfstudio 1.1.5", "Vertical Axis: z"],
         &[&xyz, &normals, &dc, &rest, &opacity, &scale, &rotation],
         &unused,
     );
-    // brush: no normals, shape before colour.
+    // brush: no normals, scale and rotation before colour.
     check(
         &["Exported from Brush", "Vertical axis: y"],
         &[&xyz, &scale, &opacity, &rotation, &dc, &rest],
         &[],
     );
-    // PostShot: INRIA's without normals.
+    // PostShot: INRIA's layout without normals.
     check(&[], &[&xyz, &dc, &rest, &opacity, &scale, &rotation], &[]);
-    // An editor's own columns, as SuperSplat and others leave them.
+    // Additional columns of editors such as SuperSplat.
     let own = names(&["state", "lod"]);
     check(&[], &[&own, &rotation, &opacity, &rest, &dc, &scale, &xyz], &["state", "lod"]);
 }
 
 #[test]
-fn colours_of_bytes_stand_for_the_constant_harmonic() {
+fn converts_byte_colours_to_the_constant_harmonic() {
     // splatfacto's `--ply-color-mode rgb`.
     let mut bytes = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n".to_vec();
     for name in &super::layout::REQUIRED[..11] {
@@ -389,7 +390,7 @@ fn colours_of_bytes_stand_for_the_constant_harmonic() {
 }
 
 #[test]
-fn harmonics_of_degree_4_are_read_to_degree_3() {
+fn reads_harmonics_of_degree_4_up_to_degree_3() {
     let mut names: Vec<String> = super::layout::REQUIRED.map(String::from).into();
     names.extend(numbered("f_rest", 72));
     let properties: String =
@@ -401,7 +402,7 @@ fn harmonics_of_degree_4_are_read_to_degree_3() {
     bytes.extend(GOOD.into_iter().chain(rest).flat_map(f32::to_le_bytes));
     let loaded = parse(&bytes).unwrap();
     assert_eq!((loaded.splats.sh_degree, loaded.splats.sh.len()), (3, 48));
-    // 24 per channel in the file, of which the first 15 stay.
+    // The file has 24 per channel; the first 15 are kept.
     assert_eq!(loaded.splats.sh[3..6], [0.0, 24.0, 48.0]);
     assert_eq!(loaded.splats.sh[45..], [14.0, 38.0, 62.0]);
     assert_eq!(loaded.skipped_properties.len(), 27);

@@ -1,4 +1,4 @@
-//! Splats to the standard binary PLY.
+//! Encoder of the standard binary PLY.
 
 use std::path::Path;
 
@@ -8,9 +8,9 @@ use crate::Splats;
 use crate::format::activate::{log_scale, logit};
 use crate::format::{assert_whole, file};
 
-/// Writes a scene as binary little-endian PLY in INRIA's layout; [`super::read`] returns the same
-/// scene up to the rounding of logarithms. Written beside its place and then renamed, so that a
-/// reader never sees half a file.
+/// Writes a scene as binary little-endian PLY in INRIA's layout. [`super::read`] returns the same
+/// scene, except for the rounding of logarithms. The file is written under a temporary name and
+/// then renamed, so that readers never see a partial file.
 ///
 /// # Errors
 /// [`PlyError::Io`] with the path.
@@ -26,7 +26,7 @@ pub fn write(path: impl AsRef<Path>, splats: &Splats) -> Result<(), PlyError> {
     })
 }
 
-/// Returns the bytes [`write()`] writes.
+/// Returns the bytes that [`write()`] writes.
 ///
 /// # Panics
 /// If the vectors of `splats` differ in length.
@@ -53,7 +53,7 @@ pub fn encode(splats: &Splats) -> Vec<u8> {
     let mut put = |value: f32| bytes.extend_from_slice(&value.to_le_bytes());
     for i in 0..count {
         splats.means_m[i].to_array().into_iter().for_each(&mut put);
-        // Normals: part of the layout, without a meaning for splats.
+        // Normals: part of the layout, without meaning for splats.
         [0.0; 3].into_iter().for_each(&mut put);
         let sh = &splats.sh[i * coefficients * 3..][..coefficients * 3];
         sh[..3].iter().copied().for_each(&mut put);

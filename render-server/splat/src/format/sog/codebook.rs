@@ -1,10 +1,10 @@
-//! 256 values that stand for many.
+//! Codebook of 256 values that approximates many values.
 
-/// Rounds of refinement; the error falls by less than 1 % in each after these.
+/// Rounds of refinement. In each further round, the error would decrease by less than 1 %.
 const ROUNDS: usize = 12;
 
-/// Returns 256 values in ascending order, so that the nearest of them is close to each of `values`
-/// in the mean square (Lloyd 1982, in one dimension, on sorted values).
+/// Returns 256 values in ascending order that minimise the mean squared distance of `values` to the
+/// nearest of them (Lloyd 1982, in one dimension, on sorted values).
 pub(super) fn build(mut values: Vec<f32>) -> [f32; 256] {
     values.retain(|value| value.is_finite());
     values.sort_unstable_by(f32::total_cmp);
@@ -15,7 +15,7 @@ pub(super) fn build(mut values: Vec<f32>) -> [f32; 256] {
         distinct.resize(256, last);
         return std::array::from_fn(|i| distinct[i]);
     }
-    // Half by rank, which serves the many, half by value, which serves the few far away.
+    // Half of the centres by rank, for dense values; half by value, for sparse values far away.
     let mut centres: [f32; 256] = std::array::from_fn(|i| {
         let share = (i / 2) as f32 / 127.0;
         match i % 2 {
@@ -63,7 +63,7 @@ mod tests {
     use super::{build, nearest};
 
     #[test]
-    fn few_values_are_kept_exactly() {
+    fn keeps_few_values_exactly() {
         let codebook = build(vec![3.0, -1.0, 3.0, 7.5]);
         for value in [3.0, -1.0, 7.5] {
             assert_eq!(codebook[usize::from(nearest(&codebook, value))], value);
@@ -72,8 +72,8 @@ mod tests {
     }
 
     #[test]
-    fn many_values_are_closer_than_even_steps_would_be() {
-        // Most near zero, some far away.
+    fn has_a_smaller_error_than_even_steps() {
+        // Most values are near zero, some are far away.
         let values: Vec<f32> = (0..20_000).map(|i| (i as f32 / 10_000.0 - 1.0).powi(5)).collect();
         let codebook = build(values.clone());
         let error = |of: &dyn Fn(f32) -> f32| -> f32 {
@@ -81,7 +81,7 @@ mod tests {
         };
         let ours = error(&|value| codebook[usize::from(nearest(&codebook, value))]);
         let even = error(&|value| ((value + 1.0) * 127.5).round() / 127.5 - 1.0);
-        // The best there is for this distribution is 0.51 (Panter and Dite 1951).
+        // The optimum for this distribution is 0.51 (Panter and Dite 1951).
         assert!(ours < even * 0.6, "{ours} against {even}");
     }
 }

@@ -1,4 +1,4 @@
-//! The parts of a SOG scene by name, from a ZIP or a folder, none larger than is asked for.
+//! Access to the files of a SOG scene by name, in a ZIP or a folder, with a maximum size for each.
 
 use std::fs::File;
 use std::io::{Cursor, Read};
@@ -9,14 +9,14 @@ use zip::ZipArchive;
 use super::invalid;
 use crate::format::{Format, FormatError, limit};
 
-/// The name that everything starts from.
+/// Name of the file that lists the other files.
 pub(in crate::format) const META: &str = "meta.json";
 
-/// Where the parts are.
+/// Location of the files of a scene.
 pub(in crate::format) enum Files<'a> {
-    /// A ZIP in memory, and the folder within that holds the scene, with its slash.
+    /// ZIP in memory. `prefix` is the folder within it that holds the scene, with its slash.
     Zip { archive: Box<ZipArchive<Cursor<&'a [u8]>>>, prefix: String, bytes: usize },
-    /// A folder.
+    /// Folder on the disk.
     Folder(PathBuf),
 }
 
@@ -34,7 +34,7 @@ impl<'a> Files<'a> {
         Ok(Self::Zip { archive: Box::new(archive), prefix, bytes: bytes.len() })
     }
 
-    /// Returns the size of all parts named, as stored. [byte]
+    /// Returns the stored size of all named files. [byte]
     pub(super) fn stored_bytes<'n>(&self, names: impl Iterator<Item = &'n str>) -> usize {
         match self {
             Self::Zip { bytes, .. } => *bytes,
@@ -45,11 +45,11 @@ impl<'a> Files<'a> {
         }
     }
 
-    /// Returns a part that is at most `most` bytes long.
+    /// Reads a file of at most `most` bytes.
     pub(super) fn read(&mut self, name: &str, most: u64) -> Result<Vec<u8>, FormatError> {
-        // A scene names files beside itself, not anywhere on this machine.
+        // A scene may only refer to files in its own folder.
         if name.is_empty() || name.contains(['/', '\\', '\0']) || name == ".." {
-            return Err(invalid(META, format!("{name:?} is no file name")));
+            return Err(invalid(META, format!("{name:?} is not a file name")));
         }
         let mut bytes = Vec::new();
         let read = match self {
@@ -76,7 +76,7 @@ impl<'a> Files<'a> {
 }
 
 impl From<&Path> for Files<'_> {
-    /// The folder itself, or that of a `meta.json`.
+    /// Uses the folder itself, or the folder of a `meta.json`.
     fn from(path: &Path) -> Self {
         if path.is_dir() {
             return Self::Folder(path.to_owned());

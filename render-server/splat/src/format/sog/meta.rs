@@ -1,4 +1,4 @@
-//! `meta.json` of either version, as tables from bytes to values.
+//! `meta.json` of versions 1 and 2, as tables that map bytes to values.
 
 use serde::Deserialize;
 
@@ -7,43 +7,43 @@ use super::invalid;
 use crate::format::activate::sigmoid;
 use crate::format::{Format, FormatError};
 
-/// What a byte stands for.
+/// Value of each byte.
 pub(super) type Table = [f32; 256];
 
-/// A scene's meta data, of either version.
+/// Metadata of a scene, of either version.
 pub(super) struct Meta {
     pub(super) count: usize,
     pub(super) antialiased: bool,
-    /// Bounds of the warped positions.
+    /// Bounds of the positions, which are stored as logarithms.
     pub(super) mean_min: [f32; 3],
     pub(super) mean_max: [f32; 3],
-    /// Low bytes, high bytes.
+    /// File of the low bytes, file of the high bytes.
     pub(super) mean_files: [String; 2],
-    /// Standard deviation, by axis. [m]
+    /// Standard deviation, for each axis. [m]
     pub(super) scales: [Table; 3],
     pub(super) scale_file: String,
     pub(super) quaternion_file: String,
-    /// Constant harmonic, by channel.
+    /// Constant harmonic, for each channel.
     pub(super) colours: [Table; 3],
-    /// 0 to 1.
+    /// Opacity, 0 to 1.
     pub(super) opacity: Table,
     pub(super) colour_file: String,
     pub(super) palette: Option<Palette>,
 }
 
-/// The harmonics beyond the constant.
+/// Palette of the harmonics beyond the constant.
 pub(super) struct Palette {
-    /// Degree, where the meta has it; otherwise it follows from the texture's width.
+    /// Degree, if the metadata contains it; otherwise it follows from the width of the texture.
     pub(super) bands: Option<u8>,
-    /// Entries, where the meta has them.
+    /// Number of entries, if the metadata contains it.
     pub(super) count: Option<usize>,
     pub(super) values: Table,
-    /// Palette, indices.
+    /// File of the palette, file of the indices.
     pub(super) files: [String; 2],
 }
 
 impl Meta {
-    /// Returns all files that the scene needs.
+    /// Returns the names of all files of the scene.
     pub(super) fn files(&self) -> impl Iterator<Item = &str> {
         let single = [&self.scale_file, &self.quaternion_file, &self.colour_file];
         let palette = self.palette.iter().flat_map(|palette| &palette.files);
@@ -55,8 +55,8 @@ impl Meta {
         let meta: Json =
             serde_json::from_slice(bytes).map_err(|error| invalid(META, error.to_string()))?;
         match meta.version {
-            // Version 1 has none; early writers of what became version 2 none either, but they
-            // have codebooks.
+            // Version 1 has no version field. Early files of version 2 also lack it, but they have
+            // codebooks.
             None | Some(1 | 2) => {}
             Some(version) => {
                 return Err(FormatError::Unsupported {
@@ -72,7 +72,7 @@ impl Meta {
             .ok_or_else(|| invalid(META, "neither `count` nor `means.shape`"))?;
         let scales = meta.scales.tables("scales")?;
         let colours = meta.sh0.tables("sh0")?;
-        // Version 1 has the logit, version 2 the opacity itself.
+        // Version 1 stores the logit, version 2 the opacity.
         let opacity = match meta.sh0.codebook {
             None => meta.sh0.bounds("sh0", 3)?.map(sigmoid),
             Some(_) => std::array::from_fn(|byte| byte as f32 / 255.0),
@@ -114,7 +114,7 @@ impl Meta {
 struct Json {
     version: Option<u32>,
     count: Option<u64>,
-    /// Of early writers.
+    /// Written by early programs instead of `model`.
     antialias: Option<bool>,
     /// `default`, `antialiased` or `2dgs`.
     model: Option<String>,
@@ -157,7 +157,7 @@ struct JsonPalette {
     files: Vec<String>,
 }
 
-/// Values in order; some writers leave the first one `null`.
+/// Values in order. Some programs write `null` as the first value.
 type Codebook = Vec<Option<f32>>;
 
 impl JsonChannels {
@@ -170,7 +170,7 @@ impl JsonChannels {
         Ok([a?, b?, c?])
     }
 
-    /// Returns the table of a channel between its bounds.
+    /// Returns the table of a channel, interpolated between its bounds.
     fn bounds(&self, part: &str, channel: usize) -> Result<Table, FormatError> {
         let bound = |bounds: &Option<Vec<f32>>| bounds.as_ref()?.get(channel).copied();
         match (bound(&self.mins), bound(&self.maxs)) {
@@ -184,7 +184,8 @@ fn between(min: f32, max: f32) -> Table {
     std::array::from_fn(|byte| min + (max - min) * (byte as f32 / 255.0))
 }
 
-/// Returns a codebook as a table; entries that it lacks are NaN, so that splats that use them drop.
+/// Returns a codebook as a table. Missing entries are NaN, so that splats that use them are
+/// dropped.
 fn expand(codebook: &Codebook, part: &str) -> Result<Table, FormatError> {
     if codebook.is_empty() || codebook.len() > 256 {
         let length = codebook.len();
@@ -195,7 +196,7 @@ fn expand(codebook: &Codebook, part: &str) -> Result<Table, FormatError> {
         *out = value.unwrap_or(f32::NAN);
     }
     if codebook[0].is_none() {
-        // As PlayCanvas's viewer mends it: as far below the second as values lie apart on average.
+        // As in PlayCanvas's viewer: extrapolated from the second value by the mean step.
         table[0] = table[1] + (table[1] - table[255]) / 255.0;
     }
     Ok(table)

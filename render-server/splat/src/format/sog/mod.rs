@@ -1,9 +1,11 @@
-//! SOG ("spatially ordered Gaussians"): PlayCanvas's textures of splats, one pixel per splat, either
-//! in a ZIP (`.sog`) or beside their `meta.json`. Versions 1 (no version in the meta) and 2.
+//! SOG ("spatially ordered Gaussians"): PlayCanvas's textures of splats, one pixel per splat,
+//! either in a ZIP (`.sog`) or as files next to their `meta.json`. Versions 1 (without a version
+//! field) and 2.
 //!
-//! Data flow: `files` finds `meta.json` and what it names; `meta` turns either version into one set
-//! of tables, byte to value; `texture` decodes lossless WebP; `read` puts them together. The way
-//! back: `codebook` and `palette` find what the tables and the harmonics' palette hold, `write`.
+//! Data flow of reading: `files` opens `meta.json` and the files that it lists; `meta` converts
+//! either version to one set of tables, byte to value; `texture` decodes lossless WebP; `read`
+//! combines them. Writing: `codebook` and `palette` compute the tables and the palette of
+//! harmonics, for `write`.
 //!
 //! | texture | holds | version 1 | version 2 |
 //! |---|---|---|---|
@@ -14,7 +16,7 @@
 //! | `shN_labels` | index into the palette, low byte first | | same |
 //! | `shN_centroids` | palette, 64 entries to a row, one pixel (RGB) per coefficient | between bounds | codebook |
 //!
-//! Axes: PlayCanvas's converter copies them from the PLY unchanged, and so does this reader.
+//! Axes: unchanged from the PLY, as in PlayCanvas's converter.
 
 mod codebook;
 mod files;
@@ -33,9 +35,9 @@ pub(super) use write::{encode, parts};
 
 use super::{Format, FormatError};
 
-/// Entries of the palette per row of its texture.
+/// Palette entries per row of the texture.
 const PALETTE_WIDTH: usize = 64;
-/// Alpha of a quaternion whose largest component is w; x, y and z follow.
+/// Alpha of a quaternion with w as its largest component. 253 to 255 stand for x, y and z.
 const QUATERNION_TAG: u8 = 252;
 
 /// Returns an error about a part of a scene.

@@ -1,17 +1,17 @@
-//! A few vectors that stand for many: the harmonics of a scene.
+//! Palette of few vectors that approximates many: the harmonics of a scene.
 
-/// Vectors of one length, one after the other, and which of them each of the scene's is.
+/// Palette entries, concatenated, and for each vector of the scene the index of its entry.
 pub(super) struct Palette {
     pub(super) entries: Vec<f32>,
     pub(super) labels: Vec<u16>,
 }
 
-/// Returns a palette of at most `most` entries for `vectors` of `dimensions` numbers each: halves
-/// the set again and again at the median of its widest dimension, and takes the mean of what is
-/// left together (the median cut of colour palettes; Heckbert, SIGGRAPH 1982).
+/// Returns a palette of at most `most` entries for `vectors` of `dimensions` numbers each. The set
+/// is halved repeatedly at the median of its widest dimension; each entry is the mean of one
+/// remaining part (median cut for colour palettes; Heckbert, SIGGRAPH 1982).
 ///
 /// # Panics
-/// If `most` is beyond what a label holds.
+/// If `most` exceeds the range of a label.
 pub(super) fn build(vectors: &[f32], dimensions: usize, most: usize) -> Palette {
     assert!(most <= 1 << 16);
     let count = vectors.len() / dimensions;
@@ -19,7 +19,7 @@ pub(super) fn build(vectors: &[f32], dimensions: usize, most: usize) -> Palette 
     let mut palette = Palette { entries: Vec::new(), labels: vec![0; count] };
     let vector = |i: u32| &vectors[i as usize * dimensions..][..dimensions];
 
-    // Runs of `order` that are still to be cut, with the entries each may become.
+    // Runs of `order` that are still to be split, and the number of entries for each.
     let mut open = vec![(0..count, most)];
     let mut means = vec![0f64; dimensions];
     let mut squares = vec![0f64; dimensions];
@@ -62,7 +62,7 @@ mod tests {
     use super::build;
 
     #[test]
-    fn vectors_that_fit_are_kept_exactly() {
+    fn keeps_vectors_exactly_if_the_palette_is_large_enough() {
         let vectors: Vec<f32> = (0..30).map(|i| ((i * 7) % 11) as f32).collect();
         let palette = build(&vectors, 3, 16);
         for (vector, &label) in vectors.chunks(3).zip(&palette.labels) {
@@ -72,8 +72,8 @@ mod tests {
     }
 
     #[test]
-    fn more_vectors_than_entries_share_the_nearest() {
-        // Two clusters of many.
+    fn maps_many_vectors_to_a_near_entry() {
+        // Two clusters of many vectors.
         let vectors: Vec<f32> =
             (0..2000).map(|i| (i % 2) as f32 * 10.0 + (i / 2) as f32 * 1e-4).collect();
         let palette = build(&vectors, 1, 4);

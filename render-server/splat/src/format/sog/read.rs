@@ -1,4 +1,4 @@
-//! The textures of a SOG scene to splats.
+//! Decoder of SOG: textures to splats.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -12,14 +12,15 @@ use crate::format::progress::Meter;
 use crate::format::quantise::wxyz_of_smallest_three;
 use crate::format::{Format, FormatError, Loaded, limit};
 
-/// Longest `meta.json` that is read; real ones are 20 kB. [byte]
+/// Maximum size of `meta.json`; typical files have 20 kB. [byte]
 const MAX_META_BYTES: u64 = 4 << 20;
-/// Bytes of all textures per splat, decoded.
+/// Decoded size of all textures per splat. [byte]
 const BYTES_PER_SPLAT: u64 = 24;
-/// Pixels that any texture may have; beyond those, the multiple of what its splats need.
+/// Maximum pixels of a texture: `FREE_PIXELS`, plus `SPARE_PIXELS` times the pixels that its splats
+/// need.
 const FREE_PIXELS: u64 = 1 << 16;
 const SPARE_PIXELS: u64 = 2;
-/// Indices of the palette are 16 bits.
+/// Maximum entries of the palette: its indices have 16 bits.
 const MAX_PALETTE: usize = 1 << 16;
 
 /// Reads a SOG scene.
@@ -29,10 +30,10 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
     let stored_bytes = files.stored_bytes(meta.files());
     limit::inflated(Format::Sog, count as u64, BYTES_PER_SPLAT, stored_bytes)?;
     let names: Vec<&str> = meta.files().collect();
-    // A texture is as much work as a pass over the splats.
+    // Decoding a texture takes as long as one pass over the splats.
     meter.expect(count * (names.len() + 1));
 
-    // In the order of `Meta::files`, the palette is the sixth; it has its own size.
+    // In the order of `Meta::files`, the palette is the sixth file; it has its own maximum size.
     let is_palette = |i: usize| i == 5;
     let most_pixels = |i: usize| {
         if is_palette(i) {
@@ -44,7 +45,7 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
     let packed: Vec<(&str, Vec<u8>)> = names
         .into_iter()
         .enumerate()
-        // WebP of noise is a little larger than its bytes.
+        // A WebP of noise is slightly larger than its pixels.
         .map(|(i, name)| Ok((name, files.read(name, FREE_PIXELS + most_pixels(i) * 5)?)))
         .collect::<Result<_, FormatError>>()?;
     let textures: Vec<Texture> = packed
@@ -86,7 +87,7 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
                     u32::from(largest),
                     quaternions.rgb(pixel).map(|byte| f32::from(byte) / 127.5 - 1.0),
                 ),
-                // As the reference: no rotation.
+                // As in the reference implementation: identity.
                 None => [1.0, 0.0, 0.0, 0.0],
             };
             let gaussian = Gaussian {
@@ -117,16 +118,16 @@ pub(in crate::format) fn decode(mut files: Files, meter: &Meter) -> Result<Loade
     Ok(loaded)
 }
 
-/// Returns the coordinate whose logarithm beyond 1 is stored.
+/// Returns a coordinate from its stored logarithm.
 fn unwarp(warped: f32) -> f32 {
     (warped.abs().exp() - 1.0).copysign(warped)
 }
 
-/// The palette of harmonics and every splat's place in it.
+/// Palette of harmonics, and the index of each splat.
 struct Harmonics<'a> {
     degree: u8,
-    /// Coefficients of an entry, and so its pixels: rows are exactly as wide as their entries, so
-    /// that entries follow each other.
+    /// Coefficients, and therefore pixels, per entry. Rows are exactly as wide as their entries, so
+    /// entries are contiguous.
     coefficients: usize,
     count: usize,
     values: &'a Table,
@@ -159,8 +160,8 @@ impl<'a> Harmonics<'a> {
         })
     }
 
-    /// Returns the pixels of a splat's entry; none, and so no harmonics, as the reference, where its
-    /// label is beyond the palette.
+    /// Returns the pixels of a splat's entry. If its label exceeds the palette, the result is empty
+    /// and the splat has no harmonics, as in the reference implementation.
     #[inline]
     fn entry(&self, pixel: usize) -> &[u8] {
         let [low, high, _] = self.labels.rgb(pixel);

@@ -1,7 +1,7 @@
-//! Streamed SOG: a scene cut into chunks, each a SOG scene of its own, at several levels of detail, and `lod-meta.json`,
-//! a tree that names of each of its nodes where in which chunk each level's splats are. (PlayCanvas's specification,
-//! version 1, and the files before it had versions.) One level is read, and what surrounds the scene: all of it is
-//! rendered anyway.
+//! Streamed SOG: a scene in chunks at several levels of detail. Each chunk is a separate SOG scene.
+//! The tree in `lod-meta.json` lists, for each of its nodes and each level, the chunk and the range
+//! of splats in it (PlayCanvas's specification, version 1, and earlier files without a version).
+//! This module reads one level and the environment, because all of it is rendered.
 
 use std::collections::BTreeMap;
 
@@ -11,16 +11,16 @@ use super::super::{FormatError, Loaded, limit};
 use crate::Splats;
 use crate::format::{DropCounts, Format};
 
-/// The name of the tree's file.
+/// File name of the tree.
 pub(in crate::format) const LOD_META: &str = "lod-meta.json";
 
-/// The tree, and what it names.
+/// Content of `lod-meta.json`.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 struct Index {
     version: Option<u32>,
     lod_levels: u32,
-    /// What surrounds the scene, at every level.
+    /// Splats around the scene, for every level.
     environment: Option<String>,
     filenames: Vec<String>,
     tree: Node,
@@ -46,11 +46,11 @@ fn invalid(reason: impl Into<String>) -> FormatError {
     FormatError::Invalid { format: Format::Sog, place: LOD_META.into(), reason: reason.into() }
 }
 
-/// Returns one level of a streamed scene, 0 being the finest, given its `lod-meta.json` and what `open`s a chunk by the
-/// name that stands there. Where a part has no such level, its next finer one.
+/// Returns one level of a streamed scene, given its `lod-meta.json`; 0 is the finest level. `open`
+/// reads a chunk by its name in the tree. If a part lacks the level, its next finer level is used.
 ///
 /// # Errors
-/// A tree that is none, a level that it lacks, or whatever keeps a chunk from being read.
+/// Returns an error if the tree is invalid, the level does not exist, or a chunk cannot be read.
 pub fn assemble_streamed(
     index: &[u8],
     level: u32,
@@ -61,8 +61,8 @@ pub fn assemble_streamed(
     whole.finish()
 }
 
-/// Visits what one level has of each chunk, and how many splats that was before faulty ones were left out; then what
-/// surrounds the scene.
+/// Visits the splats of one level, chunk by chunk, then the environment. The second argument of
+/// `visit` is the number of splats before invalid ones were dropped.
 pub(in crate::format) fn each_chunk<E: From<FormatError>>(
     index: &[u8],
     level: u32,
@@ -100,9 +100,9 @@ pub(in crate::format) fn each_chunk<E: From<FormatError>>(
     Ok(())
 }
 
-/// Lists the runs of a level, by file. As deep as JSON may be.
+/// Lists the runs of a level, by file. The JSON parser limits the depth of the recursion.
 fn collect(node: &Node, level: u32, runs: &mut BTreeMap<usize, Vec<Run>>) {
-    // The next finer one has the lower number.
+    // A finer level has a lower number.
     if let Some((_, &run)) = node.lods.range(..=level).next_back().filter(|(_, run)| run.count > 0)
     {
         runs.entry(run.file).or_default().push(run);
@@ -110,7 +110,7 @@ fn collect(node: &Node, level: u32, runs: &mut BTreeMap<usize, Vec<Run>>) {
     node.children.iter().for_each(|child| collect(child, level, runs));
 }
 
-/// Chunks put together.
+/// Concatenated chunks.
 #[derive(Default)]
 struct Whole {
     chunks: Vec<Splats>,
@@ -120,7 +120,7 @@ struct Whole {
 }
 
 impl Whole {
-    /// Adds a chunk that has been `wanted` splats.
+    /// Adds a chunk that had `wanted` splats before invalid ones were dropped.
     fn add(&mut self, chunk: Loaded, wanted: usize) -> Result<(), FormatError> {
         self.declared = self.declared.saturating_add(wanted);
         limit::count(Format::Sog, self.declared as u64)?;
@@ -152,7 +152,7 @@ impl Whole {
     }
 }
 
-/// Leaves of a chunk the splats of runs, `wanted` in all.
+/// Keeps only the splats of `runs` in a chunk, `wanted` in all.
 fn keep(chunk: &mut Loaded, runs: &[Run], wanted: usize, name: &str) -> Result<(), FormatError> {
     let held = chunk.splats.len() + chunk.dropped.total();
     let beyond = |run: &&Run| run.offset.saturating_add(run.count) > held;
@@ -164,7 +164,7 @@ fn keep(chunk: &mut Loaded, runs: &[Run], wanted: usize, name: &str) -> Result<(
     if wanted < held {
         if chunk.dropped.total() > 0 {
             return Err(invalid(format!(
-                "{name} has faulty splats, so that those of a part are unknown"
+                "{name} has invalid splats, so the splats of a part cannot be identified"
             )));
         }
         chunk.splats = taken(&chunk.splats, runs);
@@ -172,7 +172,7 @@ fn keep(chunk: &mut Loaded, runs: &[Run], wanted: usize, name: &str) -> Result<(
     Ok(())
 }
 
-/// Returns the splats of runs that lie within them.
+/// Returns the splats of `runs`.
 fn taken(splats: &Splats, runs: &[Run]) -> Splats {
     let mut taken = Splats {
         sh_degree: splats.sh_degree,

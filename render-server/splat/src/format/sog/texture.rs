@@ -1,4 +1,4 @@
-//! Lossless WebP in and out, as bytes that mean something else than colour.
+//! Lossless WebP images with arbitrary data instead of colours.
 
 use std::io::Cursor;
 
@@ -29,7 +29,7 @@ impl Texture {
             return Err(FormatError::Unsupported {
                 format: Format::Sog,
                 what: format!("lossy or animated WebP ({name})"),
-                advice: "its bytes are no longer those of the scene; convert the scene anew",
+                advice: "its bytes differ from those of the scene; convert the scene again",
             });
         }
         let channels = if decoder.has_alpha() { 4 } else { 3 };
@@ -43,27 +43,27 @@ impl Texture {
         self.width * self.height
     }
 
-    /// Returns red, green and blue of a pixel, counted row by row.
+    /// Returns red, green and blue of pixel `pixel`, counted row by row.
     #[inline]
     pub(super) fn rgb(&self, pixel: usize) -> [u8; 3] {
         let at = pixel * self.channels;
         [self.bytes[at], self.bytes[at + 1], self.bytes[at + 2]]
     }
 
-    /// Returns all bytes of a run of pixels.
+    /// Returns the bytes of consecutive pixels.
     #[inline]
     pub(super) fn run(&self, first: usize, pixels: usize) -> &[u8] {
         &self.bytes[first * self.channels..(first + pixels) * self.channels]
     }
 
-    /// Returns alpha of a pixel; 255 where there is none.
+    /// Returns alpha of a pixel; 255 if the texture has no alpha.
     #[inline]
     pub(super) fn alpha(&self, pixel: usize) -> u8 {
         if self.channels == 4 { self.bytes[pixel * 4 + 3] } else { 255 }
     }
 }
 
-/// Returns the WebP of `N` bytes per pixel, 3 or 4.
+/// Encodes pixels of `N` bytes, 3 or 4, as WebP.
 pub(super) fn encode<const N: usize>(
     name: &str,
     pixels: &[[u8; N]],

@@ -1,4 +1,4 @@
-//! Splats to the textures of SOG, version 2.
+//! Encoder of SOG, version 2: splats to textures.
 
 use std::io::{Cursor, Write as _};
 
@@ -15,13 +15,13 @@ use crate::format::order::morton;
 use crate::format::quantise::{smallest_three, to_unorm};
 use crate::format::{FormatError, assert_whole};
 
-/// Entries of the palette: as PlayCanvas's writer, a power of two of about the number of splats,
-/// from 1024 to what an index of 16 bits reaches.
+/// Returns the number of palette entries: as in PlayCanvas's writer, a power of two near the number
+/// of splats, between 1024 and the range of a 16-bit index.
 fn palette_size(count: usize) -> usize {
     (count / 2 + 1).next_power_of_two().clamp(1 << 10, 1 << 16)
 }
 
-/// Returns the bytes of a `.sog` file: the [`parts`] in a ZIP, not compressed again.
+/// Returns the bytes of a `.sog` file: the [`parts`] in a ZIP, without further compression.
 pub(in crate::format) fn encode(splats: &Splats) -> Result<Vec<u8>, FormatError> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
@@ -35,18 +35,18 @@ pub(in crate::format) fn encode(splats: &Splats) -> Result<Vec<u8>, FormatError>
     Ok(bytes.into_inner())
 }
 
-/// A part of a scene: its file name and content.
+/// File of a scene: name and content.
 type Part = (&'static str, Vec<u8>);
-/// A texture to be encoded.
+/// Texture to encode.
 type Job<'a> = Box<dyn Fn() -> Result<Part, FormatError> + Send + Sync + 'a>;
 
-/// Returns the files of a scene, `meta.json` last. Lossy: positions of 16 bits, everything else of
-/// 8, harmonics from a palette; splats in Z-order.
+/// Returns the files of a scene, `meta.json` last. The encoding is lossy: 16 bits for positions, 8
+/// bits for everything else, harmonics from a palette. Splats are in Z-order.
 pub(in crate::format) fn parts(splats: &Splats) -> Result<Vec<Part>, FormatError> {
     assert_whole(splats);
     let order = morton(splats);
     let (count, coefficients) = (splats.len(), splats.sh_coefficients());
-    // About square, in blocks of 4 as graphics cards like it.
+    // About square, in multiples of 4, which suits graphics cards.
     let width = (count as f64).sqrt().div_euclid(4.0) as usize * 4 + 4;
     let height = count.div_ceil(width).next_multiple_of(4).max(4);
 

@@ -12,10 +12,10 @@
 //! | rotations | 4 (3 before version 3) | xyzw: index of the largest in the 2 upper bits, the others as sign and 9 bits; before version 3 x, y, z as 127.5 q + 127.5 with w >= 0 left out |
 //! | harmonics | 3 per coefficient | 128 + 128 h, RGB within a coefficient |
 //!
-//! **Axes.** The file is right, up, back (RUB). A PLY of the same scene is right, down, forward, and
-//! every other format here keeps the PLY's axes, so y and z change sign on the way in and out, as
-//! Niantic's and PlayCanvas's converters do it. Turning about x by half a turn changes the sign of
-//! every basis function that is odd in (y, z).
+//! **Axes.** The file is right, up, back (RUB). A PLY of the same scene is right, down, forward,
+//! and all other formats here keep the axes of the PLY. The sign of y and z is therefore changed
+//! when reading and writing, as in Niantic's and PlayCanvas's converters. This rotation by half a
+//! turn about x changes the sign of every basis function that is odd in (y, z).
 
 mod read;
 mod write;
@@ -23,20 +23,20 @@ mod write;
 pub(super) use read::decode;
 pub(super) use write::encode;
 
-/// First bytes of version 4, and of the inflated stream of the others: "NGSP".
+/// First bytes of version 4, and of the inflated stream of earlier versions: "NGSP".
 pub(super) const MAGIC: u32 = 0x5053_474e;
 /// First bytes of a gzip stream.
 pub(super) const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
-/// The scene was trained with anti-aliasing.
+/// Flag: the scene was trained with anti-aliasing.
 const FLAG_ANTIALIASED: u8 = 1;
-/// Vendors' extra records follow the header (version 4) or the attributes.
+/// Flag: vendor-specific records follow the header (version 4) or the attributes.
 const FLAG_EXTENSIONS: u8 = 2;
 
-/// A colour's step: one unit of the constant harmonic is this share of the byte's range.
+/// Share of the byte's range that one unit of the constant harmonic takes.
 const COLOUR_SCALE: f32 = 0.15;
 
-/// Bytes of each attribute of a splat, in the order of versions 1 to 3.
+/// Bytes per splat of each attribute, in the order of versions 1 to 3.
 #[derive(Clone, Copy)]
 struct Widths {
     positions: usize,
@@ -64,7 +64,7 @@ impl Widths {
     }
 }
 
-/// Signs of the basis functions when y and z change sign; its own inverse.
+/// Signs of the basis functions after y and z change sign. The operation is its own inverse.
 const HARMONIC_SIGNS: [f32; 16] = [
     1.0, // constant
     -1.0, -1.0, 1.0, // y, z, x
@@ -78,7 +78,7 @@ mod tests {
     use crate::harmonics::basis;
 
     #[test]
-    fn the_signs_are_those_of_the_basis_turned_about_x() {
+    fn signs_match_the_basis_rotated_about_x() {
         let direction = [0.48, -0.6, 0.64];
         let turned = [0.48, 0.6, -0.64];
         for (k, (a, b)) in basis(direction).into_iter().zip(basis(turned)).enumerate() {

@@ -1,4 +1,4 @@
-//! The bytes of a `.spz` file to splats.
+//! Decoder of `.spz`: bytes to splats.
 
 use std::f32::consts::SQRT_2;
 use std::io::Read;
@@ -17,22 +17,24 @@ use crate::format::bytes::{u16_at, u32_at};
 use crate::format::progress::Meter;
 use crate::format::{Format, FormatError, Loaded, limit};
 
-/// The header of versions 1 to 3, and the start of that of version 4. [byte]
+/// Size of the header of versions 1 to 3, and of the common start of version 4's header. [byte]
 const HEADER_BYTES: usize = 16;
-/// The header of version 4. [byte]
+/// Size of version 4's header. [byte]
 const HEADER_4_BYTES: usize = 32;
-/// An entry of version 4's table of contents: packed and inflated size, u64 each. [byte]
+/// Size of an entry of version 4's table of contents: packed and inflated size, u64 each. [byte]
 const ENTRY_BYTES: usize = 16;
-/// Records of vendors after the attributes that are inflated to reach the checksum. [byte]
+/// Maximum size of vendor-specific records after the attributes, which are inflated to reach the
+/// checksum. [byte]
 const MAX_TRAILER_BYTES: u64 = 1 << 20;
-/// The window that any zstd stream may ask for; longer ones only for longer attributes. [byte]
+/// Zstd window that is accepted for any stream. Longer windows are accepted only for longer
+/// attributes. [byte]
 const FREE_WINDOW_BYTES: u64 = 8 << 20;
 
-/// The header.
+/// Header of a file.
 struct Header {
     version: u32,
     count: usize,
-    /// As in the file: 0 to 4.
+    /// Degree as in the file, 0 to 4.
     sh_degree: u8,
     fractional_bits: u8,
     flags: u8,
@@ -57,7 +59,7 @@ pub(in crate::format) fn decode(bytes: &[u8], meter: &Meter) -> Result<Loaded, F
     Ok(loaded)
 }
 
-/// Reads the first 16 bytes, which all versions share but for the last one.
+/// Parses the first 16 bytes. All versions share them, except for the last byte.
 fn parse_header(bytes: &[u8]) -> Result<Header, FormatError> {
     let invalid = |place: &str, reason: String| FormatError::Invalid {
         format: Format::Spz,
@@ -91,11 +93,11 @@ fn parse_header(bytes: &[u8]) -> Result<Header, FormatError> {
     Ok(header)
 }
 
-/// Checks the inflated size against the file's and reports the amount of work.
+/// Checks the inflated size against the size of the file, and reports the amount of work.
 fn check_size(header: &Header, file_bytes: usize, meter: &Meter) -> Result<(), FormatError> {
     let each: usize = Widths::of(header.version, header.sh_degree).in_order().iter().sum();
     limit::inflated(Format::Spz, header.count as u64, each as u64, file_bytes)?;
-    // Once to inflate, in sixths, and once to decode.
+    // One pass to inflate, reported in sixths, and one to decode.
     meter.expect(header.count * 7);
     Ok(())
 }
@@ -125,7 +127,7 @@ fn inflate(bytes: &[u8], meter: &Meter) -> Result<(Header, Attributes), FormatEr
         fill(&mut stream, attribute, header.count * width, damaged)?;
         meter.add(header.count);
     }
-    // The checksum stands at the end of the stream.
+    // The checksum is at the end of the stream.
     let trailer = std::io::copy(&mut stream.take(MAX_TRAILER_BYTES), &mut std::io::sink());
     trailer.map_err(damaged)?;
     Ok((header, attributes))
@@ -210,7 +212,8 @@ fn unpack(bytes: &[u8], meter: &Meter) -> Result<(Header, Attributes), FormatErr
     Ok((header, attributes))
 }
 
-/// Reads exactly `length` bytes, allocating as they come: a file that lies costs what it holds.
+/// Reads exactly `length` bytes. The memory grows with the data, so a wrong declared length
+/// allocates nothing.
 fn fill(
     stream: &mut impl Read,
     out: &mut Vec<u8>,
@@ -229,7 +232,7 @@ fn fill(
     Ok(())
 }
 
-/// Turns attributes of checked length into splats.
+/// Decodes attributes of checked length to splats.
 fn decode_attributes(
     header: &Header,
     attributes: &Attributes,
@@ -238,7 +241,7 @@ fn decode_attributes(
     let [positions, alphas, colours, scales, rotations, harmonics] = attributes;
     let Header { version, count, sh_degree, fractional_bits, .. } = *header;
     let step_m = 1.0 / (1u32 << fractional_bits) as f32;
-    // What a byte of each attribute stands for.
+    // Value of each byte, for each attribute.
     let table = |value: &dyn Fn(f32) -> f32| -> Vec<f32> {
         (0..=255u8).map(|byte| value(f32::from(byte))).collect()
     };
@@ -255,7 +258,7 @@ fn decode_attributes(
                     f16::from_bits(u16_at(positions, row * 6 + axis * 2)).to_f32()
                 } else {
                     let at = row * 9 + axis * 3;
-                    // The third byte is the top one, whose sign is kept by shifting it back.
+                    // The third byte is the highest; the arithmetic shift extends its sign.
                     let word = [0, positions[at], positions[at + 1], positions[at + 2]];
                     (i32::from_le_bytes(word) >> 8) as f32 * step_m
                 }
@@ -284,20 +287,20 @@ fn decode_attributes(
     })
 }
 
-/// Returns xyzw of versions 1 and 2.
+/// Returns the quaternion xyzw of versions 1 and 2.
 fn first_three(bytes: &[u8]) -> [f32; 4] {
     let [x, y, z] = [0, 1, 2].map(|i| f32::from(bytes[i]) / 127.5 - 1.0);
     [x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()]
 }
 
-/// Returns xyzw of version 3 and later.
+/// Returns the quaternion xyzw of version 3 and later.
 #[inline]
 fn smallest_three(word: u32) -> [f32; 4] {
     let largest = (word >> 30) as usize;
     let mut xyzw = [0.0; 4];
     let mut squares = 0.0;
     let mut rest = word;
-    // The last component stands in the lowest bits.
+    // The last component is in the lowest bits.
     for i in (0..4).rev().filter(|&i| i != largest) {
         let size = (rest & 511) as f32 / 511.0 / SQRT_2;
         xyzw[i] = if rest & 512 == 0 { size } else { -size };
@@ -315,8 +318,8 @@ mod tests {
     use super::smallest_three;
 
     #[test]
-    fn a_word_of_the_published_form_is_the_rotation_it_names() {
-        // Largest is w (3): x = +511, y = -256, z = 0 of 511.
+    fn decodes_a_rotation_as_specified() {
+        // The largest component is w (3): x = +511, y = -256, z = 0 of 511.
         let word = 3 << 30 | 511 << 20 | (512 | 256) << 10;
         let [x, y, z, w] = smallest_three(word);
         assert!(

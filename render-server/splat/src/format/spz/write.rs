@@ -1,4 +1,4 @@
-//! Splats to the bytes of a `.spz` file.
+//! Encoder of `.spz`: splats to bytes.
 
 use std::io::Write as _;
 
@@ -12,13 +12,14 @@ use crate::format::activate::log_scale;
 use crate::format::assert_whole;
 use crate::format::quantise::{smallest_three, to_unorm};
 
-/// Fractional bits where the scene is small enough, as Niantic's writer: quarters of a millimetre.
+/// Default fractional bits of positions, as in Niantic's writer: steps of a quarter of a
+/// millimetre.
 const FRACTIONAL_BITS: u8 = 12;
-/// Bits that are kept of harmonics of degree 1 and of the others: what Niantic's writer keeps.
+/// Stored bits of harmonics of degree 1, and of higher degrees, as in Niantic's writer.
 const HARMONIC_BITS: [u32; 2] = [5, 4];
 
-/// Returns the bytes of a `.spz` file. Lossy: positions in steps of 1/4096 m (coarser where the
-/// scene reaches beyond 2 km), harmonics clamped to -1 to 1.
+/// Returns the bytes of a `.spz` file. The encoding is lossy: positions in steps of 1/4096 m
+/// (coarser if the scene extends beyond 2 km), harmonics clamped to -1 to 1.
 ///
 /// # Panics
 /// If `version` is not 2, 3 or 4.
@@ -49,7 +50,7 @@ pub(in crate::format) fn encode(splats: &Splats, version: u32) -> Vec<u8> {
         let [x, y, z, w] = splats.rotations[i].to_array();
         let xyzw = [x, -y, -z, w];
         if version < 3 {
-            // w is left out, so it must not be negative.
+            // w is not stored, so it must not be negative.
             let sign = if w < 0.0 { -127.5 } else { 127.5 };
             rotations.extend(xyzw[..3].iter().map(|q| (q * sign + 127.5).round() as u8));
         } else {
@@ -78,7 +79,7 @@ pub(in crate::format) fn encode(splats: &Splats, version: u32) -> Vec<u8> {
         let written = parts.try_for_each(|part| stream.write_all(part));
         return written.and_then(|()| stream.finish()).expect("memory takes every write");
     }
-    // Without harmonics there is no sixth stream; readers count.
+    // Without harmonics, the sixth stream is omitted; readers check the number of streams.
     let attributes = &attributes[..if coefficients > 1 { 6 } else { 5 }];
     let streams: Vec<Vec<u8>> = attributes
         .iter()
@@ -95,10 +96,10 @@ pub(in crate::format) fn encode(splats: &Splats, version: u32) -> Vec<u8> {
     header
 }
 
-/// Returns the byte of a harmonic, rounded to its `bits` upper bits.
+/// Returns the byte of a harmonic, rounded to its `bits` highest bits.
 fn harmonic(value: f32, bits: u32) -> u8 {
     let step = (1 << (8 - bits)) as f32;
-    // 128 is zero and a multiple of every step; `as` saturates.
+    // 128 means zero, and is a multiple of every step; `as` saturates.
     let byte = ((value * 128.0 + 128.0) / step).round() * step;
     byte.min(255.0) as u8
 }

@@ -1,4 +1,5 @@
-//! One ray, plainly: every splat in f64, sorted, blended. What the tree and its kernels are held against.
+//! Plain reference for one ray: every splat in f64, sorted, blended. The tree and its kernels are
+//! compared with it.
 
 use glam::{DMat3, DVec3};
 
@@ -25,7 +26,7 @@ fn hits(splats: &Splats, beam: &Beam) -> Vec<(f64, f64)> {
         let weight = wide.inverse();
         let range = -from.dot(weight * d) / d.dot(weight * d);
         let p = from + d * range;
-        // The projection across the ray: a 2x2 determinant in any two directions across it.
+        // The projection across the ray: a 2x2 determinant in any two directions orthogonal to it.
         let (u, v) = d.any_orthonormal_pair();
         let area = |m: DMat3| u.dot(m * u) * v.dot(m * v) - u.dot(m * v).powi(2);
         let dimmed = (area(thin) / area(wide)).sqrt();
@@ -45,7 +46,7 @@ fn hits(splats: &Splats, beam: &Beam) -> Vec<(f64, f64)> {
 }
 
 #[test]
-fn beams_meet_what_the_plain_reference_meets() {
+fn hits_match_the_plain_reference() {
     let mut splats = Splats::default();
     let mut draws = Draws::new(11, 0, 0);
     for _ in 0..3000 {
@@ -78,7 +79,8 @@ fn beams_meet_what_the_plain_reference_meets() {
             let mut met = Hits::new();
             scene.cast(&motion, &[(0.0, beam)], std::slice::from_mut(&mut met));
             let met = met.weigh();
-            // Up to where the first of both ends: from there on a hair decides how much is left.
+            // Compared up to the end of the shorter one: beyond, rounding decides how much light is
+            // left.
             let ends_m = [truth.last().map(|h| h.0), met.last().map(|h| f64::from(h.range_m))];
             let end_m = ends_m.map(|m| m.unwrap_or(f64::MAX)).into_iter().fold(f64::MAX, f64::min);
             let (mut left, mut expected) = (1.0, (0.0, 0.0));
@@ -90,7 +92,8 @@ fn beams_meet_what_the_plain_reference_meets() {
             let found = before.fold((0.0, 0.0), |sum, hit| {
                 (sum.0 + f64::from(hit.weight), sum.1 + f64::from(hit.weight * hit.range_m))
             });
-            // Half precision, what of a footprint is beyond a splat's box, and splats that just count or just do not.
+            // Tolerance for half precision, the footprint outside a splat's box, and splats near
+            // the minimum alpha.
             let off = (found.0 - expected.0).abs();
             assert!(off < 0.1, "{} {n}: {found:?} {expected:?}", set.name());
             assert!(
@@ -111,9 +114,9 @@ fn beams_meet_what_the_plain_reference_meets() {
 }
 
 #[test]
-fn beams_that_go_together_meet_what_each_meets_alone() {
+fn grouped_beams_have_the_same_hits_as_single_beams() {
     let mut splats = wall(Vec3::new(4.0, 0.3, 0.0), Vec3::new(-1.0, 0.2, 0.1), 2.0, 0.07);
-    // Before it a board that ends some of the close ones, so that the rest go on alone.
+    // In front of it a board that ends some of the close beams, so that only the rest continue.
     let board = wall(Vec3::new(2.0, -0.25, 0.0), -Vec3::X, 0.09, 0.02);
     splats.means_m.extend(board.means_m);
     splats.scales_m.extend(board.scales_m);
@@ -122,7 +125,7 @@ fn beams_that_go_together_meet_what_each_meets_alone() {
     splats.sh.extend(board.sh);
     let scene = SensorScene::new(&splats);
     let motion = SensorMotion::standing(at(DVec3::ZERO, 0.0));
-    // Close ones, and eight that look all around.
+    // Eight close beams, and eight in all directions.
     for step_rad in [0.006, std::f64::consts::FRAC_PI_4] {
         let beams: Vec<(f64, Beam)> = (0..8)
             .map(|n| {

@@ -1,14 +1,14 @@
-//! `vizflyt scene align`'s page: the view, with a panel that takes clicks for points of the room.
+//! Page of `vizflyt scene align`: the view, with a panel that records clicks as points of the room.
 //!
 //! ```text
-//! GET  /align.js          the panel
-//! GET  /api/align         Setup: the arena as its file has it
-//! POST /api/align/pick    a pixel -> the point of the scene there, or why there is none
-//! POST /api/align/solve   Picks -> Solved: the place, in words how well it is known, go or no-go
-//! POST /api/align/save    Wish -> arena.toml is written, or why not
+//! GET  /align.js          panel
+//! GET  /api/align         Setup: the arena of the file
+//! POST /api/align/pick    pixel -> point of the scene, or the reason of a failure
+//! POST /api/align/solve   Picks -> Solved: placement, its accuracy as text, go or no-go
+//! POST /api/align/save    Wish -> writes arena.toml, or returns the reason of a failure
 //! ```
-//! The page holds what was clicked; nothing is kept here. Solving is the caller's ([`Aligner`]): this crate imports no solver.
-//! As all that acts, requests must come from a page of ours; and only a browser on this computer may write.
+//! The page stores the clicks; the server stores nothing. The caller solves ([`Aligner`]), because this crate imports
+//! no solver. Requests must come from this server's page; only a browser on this computer may write.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -30,38 +30,38 @@ use super::place::Place;
 use crate::web::http::{file, ordered, ordered_here};
 use vizflyt_process::lock;
 
-/// Finds a place from what was clicked, and writes it down.
+/// Computes a placement from clicks, and saves it.
 pub trait Aligner: Send + Sync {
-    /// Returns the scene's place.
+    /// Returns the scene's placement.
     ///
     /// # Errors
-    /// What the picks lack, in words.
+    /// Text that names the missing picks.
     fn solve(&self, picks: &Picks) -> Result<Solved, String>;
 
-    /// Writes the place into the arena's file; returns what was done, in words.
+    /// Writes the placement into the arena's file; returns the report.
     ///
     /// # Errors
-    /// Why nothing was written, in words.
+    /// Reason for which nothing was written.
     fn save(&self, wish: &Wish) -> Result<Vec<Line>, String>;
 }
 
-/// What a person has pointed at. Points are of the scene's file, in its own axes and units.
+/// Points that a person has clicked, in the axes and units of the scene's file.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Picks {
-    /// Points of the floor: the first is where `origin_at_m` is, the second lies ahead of it.
+    /// Points of the floor: the first is at `origin_at_m`, the second gives the heading.
     pub floor: Vec<DVec3>,
     /// A point above the floor.
     pub above: DVec3,
-    /// What is known to be how long; without, the scene keeps the size that it has.
+    /// A known length. Without it, the scene keeps its size.
     pub length: Option<Length>,
-    /// Where the first point of the floor lies; above z = 0, if it is a table's. [m, world]
+    /// Position of the first floor point; above z = 0 if it is on a table. [m, world]
     pub origin_at_m: DVec3,
-    /// The direction from the first to the second, counter-clockwise from x. [deg]
+    /// Heading from the first to the second point, counter-clockwise from x. [deg]
     pub yaw_deg: f64,
-    /// Within it, the twin must not be off. [m, world]
+    /// Fence within which the accuracy of the twin is evaluated. [m, world]
     pub geofence: Geofence,
-    /// How rough what was clicked at is, root mean square. [m]
+    /// Roughness of the clicked surfaces, root mean square. [m]
     pub rough_m: f64,
 }
 
@@ -71,43 +71,42 @@ pub struct Picks {
 pub struct Length {
     /// Its ends, in the scene's file.
     pub ends: [DVec3; 2],
-    /// How long it is. [m]
+    /// Measured length. [m]
     pub metres: f64,
 }
 
-/// What is to be written.
+/// Request to save.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Wish {
-    /// The place, with its fence.
+    /// The placement, with its fence.
     pub picks: Picks,
-    /// Where flights begin.
+    /// Start of flights.
     pub spawn: Spawn,
-    /// Even if it is not known well enough.
+    /// Whether to save an insufficiently accurate placement.
     pub force: bool,
 }
 
-/// A place, and what is to be said of it.
+/// A placement, and its report.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Solved {
-    /// Where the scene's file lies.
+    /// Placement of the scene's file.
     pub place: Place,
-    /// As the command line prints it.
+    /// Report, as on the command line.
     pub lines: Vec<Line>,
-    /// Whether it is known well enough; `None` where the scale is not known at all.
+    /// Whether the accuracy is sufficient; `None` if the scale is unknown.
     pub go: Option<bool>,
 }
 
-/// A line of a report: what it is about, and what there is to say.
+/// A line of a report: keyword and text.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Line {
-    /// One word.
+    /// Keyword of one word.
     pub key: &'static str,
-    /// The rest.
     pub text: String,
 }
 
-/// What the page begins with.
+/// Initial data of the page.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Setup {
     place: Place,
@@ -116,7 +115,7 @@ pub(super) struct Setup {
     takeoff_height_m: f64,
     body_radius_m: f64,
     stages: Vec<StageConfig>,
-    /// It does not move along with the scene.
+    /// Crop box; does not move with the scene.
     crop: Option<Geofence>,
 }
 
@@ -134,24 +133,23 @@ impl Setup {
     }
 }
 
-/// What the panel's routes share.
+/// Shared state of the panel's routes.
 pub(super) struct Panel {
     pub(super) engine: Arc<Mutex<Engine>>,
     pub(super) aligner: Arc<dyn Aligner>,
     pub(super) setup: Setup,
 }
 
-/// A click.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Click {
-    /// What the picture shows.
+    /// Request of the image.
     request: Request,
-    /// Where in it. [px]
+    /// Pixel in the image. [px]
     px: DVec2,
 }
 
-/// The panel's files and orders.
+/// Returns the routes of the panel.
 pub(super) fn routes(panel: Panel) -> Router {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
@@ -230,9 +228,9 @@ fn refused(why: String) -> Response {
     (StatusCode::UNPROCESSABLE_ENTITY, why).into_response()
 }
 
-/// Points of a floor that a person clicks at, at most.
+/// Maximum number of floor points.
 const MAX_POINTS: usize = 200;
-/// So many of them, and the rest.
+/// Maximum request: the floor points, and the rest.
 const MAX_ORDER: usize = 64 * 1024;
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use super::super::engine::Engine;
 use super::*;
 use crate::scene::{WorldFromScene, default_arena};
 
-/// Says yes to three points, and remembers nothing.
+/// Accepts three points, and stores nothing.
 struct Yes;
 
 impl Aligner for Yes {
@@ -24,7 +24,7 @@ impl Aligner for Yes {
     }
 }
 
-/// A wall 3 m ahead of the origin, and the panel on its page.
+/// A wall 3 m ahead of the origin, and the panel of its page.
 fn panel() -> State<Arc<Panel>> {
     let wall = Splats {
         means_m: vec![Vec3::new(3.0, 0.0, 1.0)],
@@ -75,7 +75,7 @@ async fn words(response: Response) -> (u16, String) {
 }
 
 #[tokio::test]
-async fn a_click_finds_the_wall_or_says_why_not() {
+async fn a_click_returns_the_wall_or_a_reason() {
     let pick =
         async |px, yaw| words(super::pick(panel(), headers(OURS), Ok(click(px, yaw))).await).await;
     let (status, text) = pick([80.0, 60.0], 0.0).await;
@@ -95,7 +95,7 @@ async fn a_click_finds_the_wall_or_says_why_not() {
 }
 
 #[tokio::test]
-async fn only_our_page_on_this_computer_writes() {
+async fn only_the_own_page_on_this_computer_writes() {
     let save = async |from: &str, origin| {
         let from = ConnectInfo(from.parse::<SocketAddr>().unwrap());
         words(super::save(panel(), from, headers(origin), Ok(wish().into())).await).await
@@ -109,7 +109,7 @@ async fn only_our_page_on_this_computer_writes() {
 }
 
 #[tokio::test]
-async fn picks_are_solved_for_our_page_alone() {
+async fn picks_are_solved_only_for_the_own_page() {
     let solve = async |origin, picks: String| {
         words(super::solve(panel(), headers(origin), Ok(picks.into())).await).await
     };

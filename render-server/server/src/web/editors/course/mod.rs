@@ -1,12 +1,12 @@
-//! `vizflyt arena edit`'s page: the view, with a panel that sets up a course in the twin.
+//! Page of `vizflyt arena edit`: the view, with a panel that sets up a course in the twin.
 //!
 //! ```text
-//! GET  /course.js, /course_items.js, /course.css    the panel, and what is dragged in the picture
-//! POST /api/course        Order -> Report: what speaks against the course, and how long its way is
+//! GET  /course.js, /course_items.js, /course.css    panel, and items that are dragged in the image
+//! POST /api/course        Order -> CourseState: findings about the course, and the length of its path
 //! ```
-//! The page holds the course, with what can be taken back; here it is put into the arena, shown and checked: what moves or
-//! stands in a frame of its own is drawn by the renderer, as flights see it. Writing is the caller's ([`CourseFile`]): this crate
-//! changes no arena's file. Only a browser on this computer, on a page of ours, may order.
+//! The page stores the course and its undo history. The server inserts the course into the arena, shows and checks it;
+//! the renderer draws objects as in flights. The caller writes the file ([`CourseFile`]), because this crate changes no
+//! arena file. Only this server's page, in a browser on this computer, may send requests.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -37,32 +37,31 @@ use crate::scene::{self, Scene, Seen};
 use crate::web::http::{file, ordered_here};
 use vizflyt_process::lock;
 
-/// The file that a course is written to.
+/// The file to which a course is written.
 pub trait CourseFile: Send + Sync {
-    /// Writes the course of an arena into its file, and what it names of `models`; returns what was done, in words.
+    /// Writes the course of an arena into its file, and the files of `models` that it uses; returns the report.
     ///
     /// # Errors
-    /// Why nothing was written.
+    /// If nothing was written.
     fn save(&self, course: &Course, models: &[(PathBuf, Arc<Splats>)]) -> Result<Vec<Line>>;
 }
 
-/// What of an arena is set up on the page.
+/// The parts of an arena that are set up on the page.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Course {
-    /// Where flights begin.
+    /// Start of flights.
     pub spawn: Spawn,
     /// Height above the spawn to which the vehicle climbs first. [m]
     pub takeoff_height_m: f64,
-    /// Where they shall end.
+    /// End of flights.
     pub goal: Option<Goal>,
-    /// The fence.
     pub geofence: Geofence,
-    /// Boxes to stay out of.
+    /// Boxes that the vehicle must not enter.
     pub no_fly: Vec<NoFly>,
-    /// Gates, in order.
+    /// Stages, in order.
     pub stages: Vec<StageConfig>,
-    /// What stands or moves in frames of its own.
+    /// Objects, fixed or moving, each in its own frame.
     pub objects: Vec<ObjectConfig>,
 }
 
@@ -96,9 +95,9 @@ pub(super) struct Panel {
     session: Mutex<Session>,
 }
 
-/// An arena whose course is set up.
+/// Arena and course that are being set up.
 struct Session {
-    /// With the course as it is shown.
+    /// The arena with the shown course.
     arena: ArenaConfig,
     on_file: Course,
     folder: PathBuf,
@@ -106,15 +105,15 @@ struct Session {
     seen: Option<Seen>,
     file: Arc<dyn CourseFile>,
     args: ViewArgs,
-    /// What was baked of the scene, for this fence.
+    /// Distance field of the scene without objects, for this fence.
     still: Option<(Geofence, Arc<DistanceField>)>,
-    /// By the file that `scene` names.
+    /// Models by the file name of their `scene`.
     models: HashMap<String, Model>,
-    /// What the renderer draws.
+    /// Files of the objects that the renderer draws.
     drawn: Vec<String>,
 }
 
-/// An object's splats, and what was baked of them.
+/// Splats and distance field of an object.
 #[derive(Clone)]
 struct Model {
     splats: Arc<Splats>,
@@ -122,30 +121,30 @@ struct Model {
     is_written: bool,
 }
 
-/// What the page asks for.
+/// Request of the page.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 enum Order {
-    /// The course as the file has it.
+    /// Returns the course of the file.
     Open,
-    /// Shows a course and looks at it.
+    /// Shows and checks a course.
     Look(Box<Course>),
-    /// Writes it into the file.
+    /// Writes a course into the file.
     Save(Box<Course>),
 }
 
-/// What the page shows.
+/// State that the page shows.
 #[derive(Debug, Serialize)]
 struct CourseState {
-    /// Answers [`Order::Open`].
+    /// Answer to [`Order::Open`].
     course: Option<Course>,
     name: String,
     body_radius_m: f64,
     floor_z_m: f64,
     findings: Vec<Found>,
-    /// 0 where the way was not looked for. [m]
+    /// Length of the path; 0 if it was not computed. [m]
     way_m: f64,
-    /// Nothing without gates. [m]
+    /// Smallest clearance in a stage; `None` without stages. [m]
     least_room_m: Option<f64>,
     said: Vec<Line>,
 }
@@ -163,7 +162,7 @@ impl From<Finding> for Found {
 }
 
 impl Panel {
-    /// Takes a scene whose objects are drawn already.
+    /// Creates the panel of a scene whose objects the renderer draws already.
     pub(super) fn new(
         engine: Arc<Mutex<Engine>>,
         scene: Scene,
@@ -189,7 +188,7 @@ impl Panel {
 }
 
 impl Session {
-    /// Puts a course into the arena, if it can be one, with what its objects are.
+    /// Inserts a valid course into the arena, and loads the models of its objects.
     fn take(&mut self, course: Course) -> Result<(), Vec<Found>> {
         let mut arena = self.arena.clone();
         course.put_into(&mut arena);
@@ -200,7 +199,7 @@ impl Session {
                 return Err(vec![Found { key, text }]);
             }
         }
-        // Of those that were dragged through, none is kept.
+        // Drop unsaved models that are no longer used.
         let is_used = |file: &str| arena.objects.iter().any(|object| object.scene == file);
         self.models.retain(|file, model| model.is_written || is_used(file));
         self.arena = arena;
@@ -217,7 +216,7 @@ impl Session {
         } else {
             let built = scene::model(file).with_context(|| {
                 format!(
-                    "there is no {}, and it is none of the models that the page has",
+                    "{} does not exist, and the page has no model of this name",
                     path.display()
                 )
             })?;
@@ -232,7 +231,7 @@ impl Session {
         &self.models[&object.scene]
     }
 
-    /// Returns a renderer with the objects of the arena, if it must be another than before.
+    /// Returns a renderer for the arena's objects, if they have changed.
     fn renderer(&mut self) -> Result<Option<Box<dyn Rasterizer>>> {
         let wanted: Vec<_> = self.arena.objects.iter().map(|object| object.scene.clone()).collect();
         if wanted == self.drawn {
@@ -299,7 +298,7 @@ impl Session {
     }
 }
 
-/// Returns why an arena is none, by key.
+/// Returns the reasons for which an arena is invalid, by key.
 fn refusals(error: ConfigError) -> Vec<Found> {
     match error {
         ConfigError::Several(errors) => errors.into_iter().flat_map(refusals).collect(),
@@ -310,7 +309,7 @@ fn refusals(error: ConfigError) -> Vec<Found> {
     }
 }
 
-/// The panel's files and orders.
+/// Returns the routes of the panel.
 pub(super) fn routes(panel: Panel) -> Router {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     Router::new()
@@ -367,7 +366,7 @@ fn carry_out(panel: &Panel, order: Order) -> Result<CourseState> {
     Ok(CourseState { course, way_m, least_room_m, said, ..report })
 }
 
-/// An arena has at most 255 gates of 128 corners; a person's has a tenth of it.
+/// Maximum request. An arena has at most 255 stages of 128 corners; a typical one a tenth of that.
 const MAX_ORDER: usize = 512 << 10;
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use super::super::engine::Engine;
 use super::*;
 use crate::scene::{WorldFromScene, default_arena};
 
-/// Remembers what it was given.
+/// Stores what it is called with.
 #[derive(Default)]
 struct Kept(Mutex<Vec<(Course, Vec<PathBuf>)>>);
 
@@ -20,7 +20,7 @@ impl CourseFile for Kept {
     }
 }
 
-/// A floor of 6 by 4 m, and the panel on its page.
+/// A floor of 6 by 4 m, and the panel of its page.
 fn panel(file: Arc<Kept>) -> Arc<Panel> {
     let side = 0..24 * 16;
     let at = |k: usize| Vec3::new(0.25 * (k % 24) as f32, 0.25 * (k / 24) as f32, 0.0);
@@ -98,10 +98,10 @@ async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
     let (_, looked) = ask(&panel, HERE, OURS, &json!({"look": gate})).await;
     assert_eq!(looked["findings"], json!([]), "{looked}");
     let room_m = looked["least_room_m"].as_f64().unwrap();
-    // Half of the opening's height, less the body.
+    // Half of the opening's height, minus the body.
     let body_m = looked["body_radius_m"].as_f64().unwrap();
     assert!((room_m - (0.5 - body_m)).abs() < 0.06, "{room_m}");
-    // The picture has it: its left bar is 2 m ahead and 0.63 m to the left.
+    // The image contains it: its left bar is 2 m ahead and 0.63 m to the left.
     let request = serde_json::from_value(json!({
         "p_m": [1.0, 1.8, 1.0], "yaw_rad": f64::atan2(0.63, 2.0), "pitch_rad": 0, "fov_deg": 15, "width_px": 320,
         "height_px": 320, "depth": false,
@@ -109,9 +109,9 @@ async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
     let picked = lock(&panel.engine).pick(&request.unwrap(), glam::DVec2::splat(160.0)).unwrap();
     let depth_m = picked.unwrap().depth_m;
     assert!((depth_m - f64::hypot(1.97, 0.63)).abs() < 0.05, "{depth_m}");
-    // Until it is saved, a page that is opened begins as the file does.
+    // Before saving, a newly opened page starts with the course of the file.
     assert_eq!(ask(&panel, HERE, OURS, &json!("open")).await.1["course"], opened["course"]);
-    // Where its bar stands in the way, that is found.
+    // A bar that blocks the path is found.
     let mut low = gate.clone();
     low["stages"][0]["center_m"][2] = json!(1.5);
     let (_, found) = ask(&panel, HERE, OURS, &json!({"look": low})).await;
@@ -126,7 +126,7 @@ async fn a_gate_is_shown_checked_and_saved_with_its_frame() {
 }
 
 #[tokio::test]
-async fn what_is_no_course_is_told_by_key_and_changes_nothing() {
+async fn an_invalid_course_is_rejected_by_key_and_changes_nothing() {
     let kept = Arc::new(Kept::default());
     let panel = panel(kept.clone());
     let (_, opened) = ask(&panel, HERE, OURS, &json!("open")).await;
@@ -152,7 +152,7 @@ async fn what_is_no_course_is_told_by_key_and_changes_nothing() {
 }
 
 #[tokio::test]
-async fn only_our_page_on_this_computer_orders() {
+async fn only_the_own_page_on_this_computer_sends_requests() {
     let panel = panel(Arc::default());
     for (from, origin, expected) in [
         (HERE, OURS, 200),

@@ -1,15 +1,15 @@
-// The panel of `vizflyt scene align`: clicks become points of the scene, points a place in the room, and the place is saved.
-// The server finds points and solves; what was clicked is kept here alone.
+// The panel of `vizflyt scene align`: clicks give points of the scene, points give its placement, and the placement is
+// saved. The server finds points and solves; only the page stores the clicks.
 
 import { Drawing, drawRoom } from "/overlay.js";
 import { view } from "/view.js";
 
 const FLOOR = "#7df09a", LENGTH = "#ffd166", ABOVE = "#b9c7ff";
 
-/** A clicked point: {p_scene, rough_m}, and the camera that clicked, of the scene's file as well. */
+/** Clicked points: {p_scene, rough_m}, and the camera of the click in the frame of the scene's file. */
 const picks = { floor: [], above: null, ends: [null, null] };
 const settings = { metres: "", originAt: [0, 0, 0], yaw: 0 };
-/** What the next click is: {kind: "floor" | "above" | "end" | "start", index}. */
+/** Meaning of the next click: {kind: "floor" | "above" | "end" | "start", index}. */
 let wanted = { kind: "floor", index: null };
 let setup = null, room = null, place = null, solved = null, shown = null;
 let problem = "", report = null, solves = 0, busy = false;
@@ -23,7 +23,7 @@ const back = ([x, y, z, w], p) => turn([-x, -y, -z, w], p);
 const toWorld = (at, p) => turn(at.rotation, p).map((value, k) => value * at.metres_per_unit + at.origin[k]);
 const toScene = (at, p) => back(at.rotation, p.map((value, k) => value - at.origin[k])).map((value) => value / at.metres_per_unit);
 
-/** Shows the scene at another place: the camera stays where it is in the scene, and is levelled. */
+/** Shows the scene at another placement: the camera keeps its position in the scene, and is levelled. */
 function show(next) {
   const { eye } = view;
   const ahead = [Math.cos(eye.yaw) * Math.cos(eye.pitch), Math.sin(eye.yaw) * Math.cos(eye.pitch), Math.sin(eye.pitch)];
@@ -37,7 +37,7 @@ function show(next) {
 }
 
 // ---- the server ------------------------------------------------------------------------------
-/** @returns what the server answers; throws its words where it refuses. */
+/** @returns the server's answer; throws its text if it rejects the order. */
 async function order(path, body) {
   const answer = await fetch(path, { method: "POST", body: JSON.stringify(body) });
   const text = await answer.text();
@@ -68,7 +68,7 @@ async function solve() {
   }
   try {
     const found = await order("/api/align/solve", rooms());
-    if (mine !== solves) return; // Something has changed since.
+    if (mine !== solves) return; // The picks have changed in the meantime.
     solved = found;
     show(found.place);
   } catch (error) {
@@ -135,7 +135,7 @@ async function save(force) {
   draw();
 }
 
-/** Moves fence and start along with the scene, from where the arena's file had them to where it lies now. */
+/** Moves fence and start with the scene, from the placement in the arena's file to the current one. */
 function carry() {
   const move = (p) => toWorld(place, toScene(setup.place, p));
   const { min_m: min, max_m: max } = setup.geofence;
@@ -158,7 +158,7 @@ function make(tag, properties = {}, ...children) {
 }
 const button = (textContent, onclick, properties = {}) => make("button", { type: "button", textContent, onclick, ...properties });
 
-/** A button that makes the next click a point; pressed again it stops. */
+/** Returns a button that makes the next click a point; pressing it again cancels. */
 function picker(text, next, title) {
   const isOn = wanted?.kind === next.kind && wanted.index === next.index;
   const element = button(text, () => {
@@ -192,7 +192,7 @@ const HINTS = {
 };
 
 function floorList() {
-  // Three points are a plane, however wrong they are.
+  // Three points always fit a plane, so their error is zero.
   const off_cm = (pick) => Math.round((toWorld(place, pick.p_scene)[2] - settings.originAt[2]) * 1000) / 10 + 0;
   const off = (pick) => (solved && picks.floor.length > 3 ? `${off_cm(pick).toFixed(1)} cm` : `± ${(pick.rough_m * 1000).toFixed(0)} mm`);
   const items = picks.floor.map((pick, k) => make("li", {},
@@ -288,7 +288,7 @@ function draw() {
   drawOverlay();
 }
 
-// ---- over the picture ------------------------------------------------------------------------
+// ---- overlay ---------------------------------------------------------------------------------
 const overlay = make("canvas", { id: "overlay" });
 const context = overlay.getContext("2d");
 
@@ -317,11 +317,11 @@ function drawOverlay() {
 view.listeners.push((request, info) => {
   const isFirst = !shown;
   shown = { request, info };
-  if (isFirst && setup) draw(); // From now on clicks are taken.
+  if (isFirst && setup) draw(); // Enables clicks.
   drawOverlay();
 });
 
-// A click is what moved by a few pixels at most; everything else is a look around.
+// A click moves by at most a few pixels; larger motion turns the camera.
 let down = null;
 view.canvas.addEventListener("pointerdown", (event) => {
   down = event.isPrimary && event.button === 0 ? [event.clientX, event.clientY] : null;

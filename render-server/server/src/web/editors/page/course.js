@@ -1,5 +1,5 @@
-// The panel of `vizflyt arena edit`: start, goal, fence, gates and what moves are dragged in the picture; the server shows
-// and checks every change and writes the file. The course, and what can be taken back, are kept here alone.
+// The panel of `vizflyt arena edit`: start, goal, fence, stages and moving objects are dragged in the image. The server
+// shows and checks every change, and writes the file. Only the page stores the course and its undo history.
 
 import * as items from "/course_items.js";
 import { Drawing, drawRoom } from "/overlay.js";
@@ -10,9 +10,9 @@ const ADDS = { gate: "gate", box: "keep-out box", pillar: "pillar", drone: "movi
 const GRAB_PX = 16;
 
 let course = null, report = null, shown = null, saved = "";
-let selected = null; // The key of an item.
+let selected = null; // Key of an item.
 let past = [], future = []; // Courses as text.
-let held = null; // The handle under the pointer, while it is down: {item, handle}.
+let held = null; // Dragged handle: {item, handle}.
 let problem = "", looking = false, stale = false;
 
 // ---- the server ------------------------------------------------------------------------------
@@ -23,7 +23,7 @@ async function order(what) {
   return JSON.parse(text);
 }
 
-/** Shows and checks the course as it is now; while the server works, the newest waits. */
+/** Shows and checks the current course; while the server is busy, only the newest state waits. */
 async function look(what = "look") {
   stale = true;
   if (looking) return;
@@ -38,7 +38,7 @@ async function look(what = "look") {
       what = "look";
       view.changed(false);
     } catch (error) {
-      problem = error instanceof TypeError ? "the server is gone; start it again, and load this page again" : error.message;
+      problem = error instanceof TypeError ? "connection lost; restart the server, and reload this page" : error.message;
     }
   }
   looking = false;
@@ -46,7 +46,7 @@ async function look(what = "look") {
 }
 
 // ---- changes ---------------------------------------------------------------------------------
-/** Does something to the course that can be taken back. */
+/** Applies a change to the course, with undo. */
 function change(act) {
   past.push(JSON.stringify(course));
   future = [];
@@ -70,7 +70,7 @@ function select(key) {
   draw();
 }
 
-/** Selects from the list; looks at what is not in the picture. */
+/** Selects an item of the list; turns the camera to it if it is not visible. */
 function selectAndFace(key) {
   select(key);
   const item = chosen();
@@ -233,7 +233,7 @@ function draw() {
   drawOverlay();
 }
 
-// ---- over the picture ------------------------------------------------------------------------
+// ---- overlay ---------------------------------------------------------------------------------
 const overlay = make("canvas", { id: "overlay" });
 const context = overlay.getContext("2d");
 
@@ -281,7 +281,7 @@ view.listeners.push((request, info) => {
 });
 
 // ---- the pointer -----------------------------------------------------------------------------
-/** What of a list, each with a place in the world, is under the pointer. */
+/** Returns the item of a list under the pointer. */
 function nearest(list, place, event) {
   const picture = drawing();
   const away = (one) => {
@@ -292,7 +292,7 @@ function nearest(list, place, event) {
   return best && best[0] < GRAB_PX ? best[1] : null;
 }
 
-/** Where the picture's surface is under the pointer. */
+/** Returns the point of the surface under the pointer. */
 function surface(at) {
   const { request, info: { grid } } = shown;
   const cell = [at.clientX / innerWidth, at.clientY / innerHeight].map((share, k) => Math.floor((share * [request.width_px, request.height_px][k]) / grid.cell_px));
@@ -303,7 +303,7 @@ function surface(at) {
 }
 const pointed = (at) => items.ray(shown.request, [at.clientX / innerWidth - 0.5, at.clientY / innerHeight - 0.5]);
 
-// Before the view's own handlers, which turn the camera.
+// Before the handlers of the view, which turn the camera.
 const take = (type, handle) => view.canvas.addEventListener(type, (event) => {
   if (course && shown && handle(event)) event.stopImmediatePropagation();
 }, { capture: true });

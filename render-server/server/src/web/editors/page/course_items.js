@@ -1,10 +1,10 @@
-// What is set up on the page of `vizflyt arena edit`: the items of a course, the handles by which they are dragged, and what a
-// drag makes of them. Pure: a course in, a course changed. World: x, y level, z up, metres.
+// Items of a course on the page of `vizflyt arena edit`, their handles, and the effect of dragging them. Pure: changes
+// only the course that is passed in. World: x, y level, z up, metres.
 
-/** A frame's bar about a gate's opening; as the server builds it. */
+/** Width of a frame's bar around a stage's opening, as on the server. */
 export const BAR_M = 0.06;
 const STEP_M = 0.05, STEP_DEG = 15;
-/** Within this of the floor, a wall or the fence a thing sticks to it. */
+/** Maximum distance at which an item snaps to the floor, a wall or the fence. */
 const REACH_M = 0.12;
 
 const round = (value, step) => Math.round(Math.round(value / step) * step * 1000) / 1000 + 0;
@@ -13,7 +13,7 @@ const yawOf = ([x, y]) => Math.atan2(y, x);
 const degrees = (rad) => (rad * 180) / Math.PI;
 const along = (yaw, length) => [length * Math.cos(yaw), length * Math.sin(yaw)];
 
-/** The items of a course: `key` is where its file has it. */
+/** Returns the items of a course; `key` is the path in the file. */
 export function items(course) {
   const list = [{ kind: "start", key: "spawn", name: "start" }, { kind: "fence", key: "geofence", name: "fence" }];
   if (course.goal) list.push({ kind: "goal", key: "goal", name: "goal" });
@@ -23,12 +23,12 @@ export function items(course) {
   return list;
 }
 
-/** The gate whose frame an object is. */
+/** Returns the stage whose frame an object is. */
 const gateOf = (course, object) => course.stages.find((stage) => frameName(stage) === object.name);
 const frameName = (stage) => `${stage.name} frame`;
 export const frameOf = (course, stage) => course.objects.find((object) => object.name === frameName(stage));
 
-/** The part of the course that an item is. */
+/** Returns the part of the course that belongs to an item. */
 export function part(course, item) {
   const parts = { start: course.spawn, goal: course.goal, fence: course.geofence };
   const lists = { gate: course.stages, box: course.no_fly, object: course.objects };
@@ -43,7 +43,8 @@ export function centre(course, item) {
 }
 
 /**
- * The handles of an item: {id, at, axis}. One with an axis moves along it, the others level, or along z.
+ * Returns the handles of an item: {id, at, axis}. A handle with an axis moves along it, others move horizontally, or
+ * along z.
  */
 export function handles(course, item) {
   const it = part(course, item), c = centre(course, item);
@@ -78,7 +79,7 @@ export function handles(course, item) {
 }
 
 const turned = ([x, y], yaw) => [x * Math.cos(yaw) - y * Math.sin(yaw), x * Math.sin(yaw) + y * Math.cos(yaw)];
-/** From an object's frame at rest. */
+/** Converts from the frame of an object at rest. */
 export function toWorld({ position_m: at, yaw_deg }, [x, y, z]) {
   const [a, b] = turned([x, y], (yaw_deg * Math.PI) / 180);
   return [at[0] + a, at[1] + b, at[2] + z];
@@ -89,8 +90,8 @@ function toObject({ position_m: at, yaw_deg }, p) {
 }
 
 /**
- * Moves a handle to a place: changes the course. `free` does without steps; `surface` is what the picture shows under the
- * pointer, to which faces of boxes and of the fence stick.
+ * Moves a handle to a position, and changes the course. `free` disables steps; `surface` is the surface under the
+ * pointer, to which faces of boxes and of the fence snap.
  */
 export function drag(course, item, id, to, { free = false, surface = null, floor_z_m = 0 } = {}) {
   const it = part(course, item);
@@ -129,13 +130,13 @@ export function drag(course, item, id, to, { free = false, surface = null, floor
   if (item.kind === "gate") settle(course, it);
 }
 
-/** Turns a gate: the way through it becomes level. */
+/** Turns a stage; its direction becomes level. */
 export function setYaw(stage, yaw_deg) {
   stage.normal = along((yaw_deg * Math.PI) / 180, 1).map((value) => round(value, 0.001)).concat(0);
 }
 export const yawOfGate = (stage) => Math.round(degrees(yawOf(stage.normal)) * 10) / 10;
 
-/** Puts a gate's frame about it, in its size. */
+/** Fits a stage's frame to its size. */
 export function settle(course, stage) {
   const frame = frameOf(course, stage);
   if (!frame) return;
@@ -146,7 +147,7 @@ export function settle(course, stage) {
   });
 }
 
-/** Gives a gate a frame in a colour, or takes it away. */
+/** Adds a frame in a colour to a stage, or removes it. */
 export function setFrame(course, stage, colour) {
   course.objects = course.objects.filter((object) => object.name !== frameName(stage));
   if (!colour) return;
@@ -154,7 +155,7 @@ export function setFrame(course, stage, colour) {
   settle(course, stage);
 }
 
-/** Renames an item, and a gate's frame with it. */
+/** Renames an item, and the frame of a stage. */
 export function rename(course, item, name) {
   const it = part(course, item);
   const frame = item.kind === "gate" && frameOf(course, it);
@@ -169,7 +170,7 @@ export function remove(course, item) {
   lists[item.kind]?.splice(item.index, 1);
 }
 
-/** Adds a thing of a kind at a place, turned as one looks; returns its key. */
+/** Adds an item at a position, in the direction of the camera; returns its key. */
 export function add(course, kind, [x, y], yaw, floor_z_m) {
   const [px, py] = [round(x, STEP_M), round(y, STEP_M)];
   const yaw_deg = round(degrees(yaw), STEP_DEG);
@@ -206,7 +207,7 @@ export function add(course, kind, [x, y], yaw, floor_z_m) {
 // ---- from the pointer to the world -------------------------------------------------------------
 const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
 
-/** The ray through a place on the page (as shares of it, from its middle, -0.5 to 0.5) of the picture that a request shows. */
+/** Returns the ray through a point of the image (in fractions of its size from the centre, -0.5 to 0.5) that a request shows. */
 export function ray(request, [u, v]) {
   const [cy, sy] = [Math.cos(request.yaw_rad), Math.sin(request.yaw_rad)];
   const [cp, sp] = [Math.cos(request.pitch_rad), Math.sin(request.pitch_rad)];
@@ -217,8 +218,8 @@ export function ray(request, [u, v]) {
 }
 
 /**
- * Where a ray meets the level plane of a place, no farther than some metres; null if it does not. Seen from its own height a
- * plane is a line: then the place moves across the view alone.
+ * Returns the intersection of a ray with the horizontal plane of a point, up to a maximum distance; null without one. A
+ * plane at the height of the camera is a line: then the point moves only sideways.
  */
 export function onLevel({ from, way }, at, farthest_m = 200) {
   const flat = [way[0], way[1], 0];
@@ -229,7 +230,7 @@ export function onLevel({ from, way }, at, farthest_m = 200) {
   return t > 0 && Math.hypot(...reached.map((value, k) => value - from[k])) < farthest_m ? [reached[0], reached[1], at[2]] : null;
 }
 
-/** The point of a line, through a place along an axis, that is nearest to a ray; null if they run alike. */
+/** Returns the point of a line (through a point along an axis) that is nearest to a ray; null if they are parallel. */
 export function onLine({ from, way }, at, axis) {
   const gap = at.map((value, k) => value - from[k]);
   const [aa, aw, ww] = [dot(axis, axis), dot(axis, way), dot(way, way)];

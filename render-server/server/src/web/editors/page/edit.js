@@ -1,12 +1,12 @@
-// The panel of `vizflyt scene edit --page`: a lasso or a box over the picture selects splats; the server finds them and shows
-// them in a colour of their own. They are deleted as a step, which can be taken back, or named as a part of the scene.
+// The panel of `vizflyt scene edit --page`: a lasso or a box in the image selects splats. The server finds and colours
+// them. The selection can be deleted, with undo, or named as a part of the scene.
 
 import { view } from "/view.js";
 
 const { canvas } = view;
-let tool = null; // "lasso", "box", or none: the mouse looks around.
+let tool = null; // "lasso", "box", or null: the mouse turns the camera.
 let drawn = null; // Corners on the screen, while the button is down. [px]
-let shown = null; // The request of the picture that is seen.
+let shown = null; // Request of the shown image.
 let report = null, busy = false;
 view.listeners.push((request) => (shown = request));
 
@@ -91,7 +91,7 @@ async function order(what) {
       view.announce(await answer.text());
     }
   } catch {
-    view.announce("the server is gone; start it again, and load this page again");
+    view.announce("connection lost; restart the server, and reload this page");
   }
   busy = false;
   show();
@@ -113,7 +113,7 @@ function draw() {
   context.stroke();
 }
 
-// Before the view's own handlers, which turn the camera.
+// Before the handlers of the view, which turn the camera.
 const take = (type, handle) => canvas.addEventListener(type, (event) => {
   if (!tool && !drawn) return;
   event.stopImmediatePropagation();

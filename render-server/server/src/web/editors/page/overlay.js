@@ -1,7 +1,7 @@
-// What is drawn over the picture: axes, floor, fence, net, gates, vehicle and points, where they are in the room; dimmed
+// Overlay of the image: axes, floor, fence, net, stages, vehicle and points at their positions in the room; dimmed
 // where the scene hides them. World: x, y level, z up, metres.
 
-/** Returns a function from the world to [x, y] on the page and the depth; the camera is a request's. */
+/** Returns a function from the world to [x, y] on the page and the depth, for a request's camera. */
 export function projector(request, width, height) {
   const [cy, sy] = [Math.cos(request.yaw_rad), Math.sin(request.yaw_rad)];
   const [cp, sp] = [Math.cos(request.pitch_rad), Math.sin(request.pitch_rad)];
@@ -11,7 +11,7 @@ export function projector(request, width, height) {
   return { inCamera, onPage: ([x, y, z]) => [width / 2 + (focal * x) / z, height / 2 + (focal * y) / z] };
 }
 
-/** A drawing of one picture: lines and labels given in the world, on a canvas of the page's size. */
+/** Drawing over one image: lines and labels in world coordinates, on a canvas of the page's size. */
 export class Drawing {
   constructor(context, width, height, request, grid) {
     Object.assign(this, { context, width, height, grid });
@@ -19,7 +19,7 @@ export class Drawing {
     this.scale = request.width_px / width;
   }
 
-  /** Whether the scene is in front of a place on the page at a depth. */
+  /** Whether the scene hides a point of the page at a depth. */
   hides([x, y], depth) {
     const { grid } = this;
     if (!grid) return false;
@@ -28,11 +28,11 @@ export class Drawing {
     const [column, row] = [cell(x), cell(y)];
     if (column < 0 || row < 0 || column >= grid.columns || row >= rows) return false;
     const seen = grid.depth_mm[row * grid.columns + column] / 1000;
-    // A line in a surface is in front of it: captured surfaces are rough.
+    // Tolerance for lines on a surface: captured surfaces are rough.
     return seen > 0 && depth > seen * 1.02 + 0.06;
   }
 
-  /** Draws a line through points of the world. */
+  /** Draws a polyline of world points. */
   line(points, { color, width = 1.5, alpha = 1, hidden = 0.25 }) {
     const paths = [new Path2D(), new Path2D()];
     for (let k = 1; k < points.length; k++) this.#piece(paths, points[k - 1], points[k]);
@@ -64,7 +64,7 @@ export class Drawing {
     for (let k = 0; k < pieces; k++) {
       const [t, next] = [k, k + 1].map((end) => first + ((last - first) * end) / pieces);
       const middle = (t + next) / 2;
-      // Along a line on the page, 1 / depth is even.
+      // 1 / depth is linear along a line on the page.
       const depth = 1 / (1 / a[2] + (1 / b[2] - 1 / a[2]) * middle);
       const path = this.hides(at(middle), depth) ? behind : inSight;
       if (path !== open) path.moveTo(...at(t));
@@ -87,7 +87,7 @@ export class Drawing {
     return first < last ? [first, last] : null;
   }
 
-  /** Returns where a point of the world is on the page, and whether the scene hides it; null behind the camera. */
+  /** Returns the position of a world point on the page, and whether the scene hides it; null behind the camera. */
   place(point) {
     const p = this.camera.inCamera(point);
     if (p[2] < NEAR_M) return null;
@@ -147,7 +147,7 @@ export class Drawing {
   }
 }
 
-/** Draws the room: the motion capture's axes, the floor, fence and net, gates, and the vehicle at its true size. */
+/** Draws the room: axes of the motion capture, floor, fence and net, stages, and the vehicle at its true size. */
 export function drawRoom(drawing, room) {
   const { min_m: min, max_m: max } = room.geofence;
   if (min.every((value, k) => value < max[k])) drawFence(drawing, min, max);
@@ -178,7 +178,7 @@ function* steps(from, to, step) {
 
 function drawFence(drawing, min, max) {
   const wide = Math.max(max[0] - min[0], max[1] - min[1]);
-  // Never more than some forty lines a side, in a garden as in a room.
+  // At most about forty lines per side, in any room size.
   const step = [0.5, 1, 2, 5, 10, 50, 250, 1000].find((length) => wide / length <= 40) ?? wide;
   const floor = { color: "#ffffff", width: 1, alpha: 0.4, hidden: 0.2 };
   for (const x of steps(min[0], max[0], step)) drawing.line([[x, min[1], 0], [x, max[1], 0]], floor);
@@ -234,7 +234,7 @@ function drawVehicle(drawing, { spawn, takeoff_height_m: climb, body_radius_m: r
   drawing.label([x, y, z], "start", color, [8, 14]);
 }
 
-/** A hand's breadth. */
+/** Near plane. */
 const NEAR_M = 0.05;
-/** Of one brightness. */
+/** Length of a piece of constant brightness. */
 const PIECE_PX = 6;

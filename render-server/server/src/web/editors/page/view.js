@@ -1,23 +1,23 @@
-// The page asks for one picture at a time, and only when its camera has moved: while the server is
-// slow, pictures get smaller; when the camera rests, one of full size follows.
+// The page requests one image at a time, and only when its camera has moved. If the server is slow, images get smaller;
+// when the camera rests, an image of full size follows.
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture");
 const context = canvas.getContext("2d");
 const eye = { p: [0, 0, 1], yaw: 0, pitch: 0, fov: 75, depth: false, at_s: 0 };
 const keys = new Set();
-let playing = false; // The clock of what moves runs.
+let playing = false; // Whether the clock of moving objects runs.
 let start = null, info = null, socket = null;
 let speed_mps = 1.5, share = 0.5, shownShare = 0;
 let stale = true, waiting = false, movedAt = 0, before = performance.now();
 let asked = null, hasTool = false;
 
-/** What a tool beside the view may use of it (align.js, edit.js). */
+/** Interface for the tools of the view (align.js, course.js, edit.js). */
 export const view = {
   canvas, eye, changed, announce,
-  /** Goes into every request. */
+  /** Added to every request. */
   extra: {},
-  /** Each is called with a request and the description of its picture, once that is shown. */
+  /** Called with a request and the description of its image, after it is shown. */
   listeners: [],
 };
 
@@ -28,7 +28,7 @@ function connect() {
   socket.onmessage = ({ data }) => (typeof data === "string" ? handleMessage(JSON.parse(data)) : show(data));
   socket.onclose = () => {
     waiting = false;
-    announce("the server is gone; start it again and this page goes on", true);
+    announce("connection lost; restart the server, and this page reconnects", true);
     setTimeout(connect, 1000);
   };
 }
@@ -66,7 +66,7 @@ async function show(data) {
     context.drawImage(image, 0, 0, width, height);
     image.close();
   } catch {
-    stale = true; // A picture that does not decode is followed by another.
+    stale = true; // Request another image if this one does not decode.
   }
   waiting = false;
   const middle = info.middle_m == null ? "" : ` · ${info.middle_m.toFixed(2)} m ahead`;
@@ -75,7 +75,7 @@ async function show(data) {
   for (const listener of view.listeners) listener(asked, info);
   document.body.dataset.pictures = +(document.body.dataset.pictures ?? 0) + 1;
   if (moving()) {
-    // Some 20 pictures a second, as sharp as that allows.
+    // About 20 images per second, at the highest possible resolution.
     if (info.ms > 45) share = Math.max(0.2, share * 0.85);
     else if (info.ms < 25) share = Math.min(1, share * 1.12);
   }
@@ -103,7 +103,7 @@ function changed(inMotion = true) {
   if (inMotion) movedAt = performance.now();
 }
 
-/** Moves along the view's own axes. [m] */
+/** Moves along the axes of the view. [m] */
 function move(ahead, left, up) {
   const [c, s] = [Math.cos(eye.yaw), Math.sin(eye.yaw)];
   const [level, rise] = [Math.cos(eye.pitch), Math.sin(eye.pitch)];

@@ -1,4 +1,4 @@
-// Light and weather of the scene: an environment by its name takes effect at once, a visibility with the button.
+// Light and weather of the scene: a named environment takes effect at once, a visibility with the button.
 
 import { fillChoices, makeFormDialog, makeLabel } from "../dialog.js";
 import { $, make } from "../dom.js";
@@ -6,7 +6,7 @@ import { send } from "../session.js";
 
 /** @typedef {import("../messages").Environment} Environment */
 
-/** Stands for an environment that has no name. */
+/** Entry of an environment without a name. */
 const OWN = "own";
 
 const choice = make("select", { id: "environment-choice" });
@@ -38,7 +38,7 @@ choice.addEventListener("change", () => {
 });
 form.addEventListener("submit", () => {
   if (!environment) return;
-  // All that it has but its name, with another visibility.
+  // All its settings except the name, with another visibility.
   const wanted = Object.entries(environment).filter(([key]) => key !== "name" && key !== "names");
   change({ ...Object.fromEntries(wanted), fog_visibility_m: Number(visibility.value) });
 });

@@ -1,4 +1,4 @@
-// Logging in with the instructor's password, and out again.
+// Login with the instructor's password, and logout.
 
 import { makeFormDialog, makeLabel } from "../dialog.js";
 import { $, make } from "../dom.js";
@@ -10,14 +10,14 @@ const { dialog, form, status } = makeFormDialog("log in", "log in", "alert", mak
 form.addEventListener("submit", async () => {
   status.textContent = "";
   try {
-    // Whoever logs in has no token yet.
+    // No token exists before login.
     const answer = await fetch("/api/login", {
       method: "POST",
       headers: { "content-type": "application/json" },
       body: JSON.stringify({ password: password.value }),
     });
     if (answer.ok) {
-      // What the page was refused before, it asks for again.
+      // Load everything again that was rejected before the login.
       location.reload();
       return;
     }

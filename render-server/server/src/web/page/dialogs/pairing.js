@@ -1,4 +1,4 @@
-// Pairing a computer: a button for the instructor, a code to read out, and what came of it.
+// Pairing a computer: a button for the instructor, a code to read aloud, and the result.
 
 import { makeDialog } from "../dialog.js";
 import { make, makeButton } from "../dom.js";
@@ -25,7 +25,7 @@ const dialog = makeDialog(
 let timer = 0;
 let opened = false;
 
-// From another computer this one is not `localhost`; its name there is not known here.
+// `localhost` would be wrong on another computer, and this computer's name is unknown here.
 const host = /^(localhost|127\.|\[::1\])/.test(location.hostname) ? "HOST" : location.hostname;
 
 /** @param {Pairing} pairing */
@@ -64,7 +64,7 @@ begin.addEventListener("click", () => change("POST", { right: right.value }));
 end.addEventListener("click", () => dialog.close());
 dialog.addEventListener("close", () => {
   clearInterval(timer);
-  // A code that nobody looks at any more opens nothing.
+  // A code that is not visible any more must not stay valid.
   if (opened) change("DELETE");
 });
 
@@ -81,7 +81,7 @@ button.addEventListener("click", async () => {
   timer = setInterval(refresh, 1000);
 });
 
-/** Adds the button where the viewer may pair computers. */
+/** Adds the button if the viewer may pair computers. */
 async function addButton() {
   const answer = await fetch("/api/pairing");
   if (answer.ok) document.querySelector("footer")?.append(button);

@@ -1,4 +1,4 @@
-// Arranging the panels: which are shown, in which column and in which order. This browser keeps it.
+// Layout of the panels: visibility, column and order, stored in this browser.
 
 import { makeDialog } from "../dialog.js";
 import { $, make, makeButton } from "../dom.js";
@@ -11,7 +11,7 @@ const SIDES = /** @type {const} */ (["left", "right"]);
 const panels = { ...PANELS.left, ...PANELS.right };
 const usual = { left: Object.keys(PANELS.left), right: Object.keys(PANELS.right), closed: [] };
 let layout = readLayout(usual, localStorage.getItem(KEPT));
-/** The panel whose row is dragged; empty if none is. */
+/** Name of the panel whose row is dragged; empty without one. */
 let dragged = "";
 
 const lists = { left: make("ol"), right: make("ol") };
@@ -22,7 +22,7 @@ const dialog = makeDialog("panels",
   make("p", { className: "choices" }, reset, close));
 dialog.classList.add("arrange");
 
-/** Puts the panels where the layout has them. */
+/** Puts the panels into their places. */
 function apply() {
   for (const side of SIDES) {
     const open = layout[side].filter((name) => !layout.closed.includes(name));
@@ -37,7 +37,7 @@ function change(next) {
   layout = next;
   localStorage.setItem(KEPT, JSON.stringify(layout));
   apply();
-  // What was pressed is there again, and is pressed again.
+  // Restore the focus, so that the same button can be pressed again.
   if (focused) /** @type {HTMLElement | null} */ (dialog.querySelector(`[aria-label="${CSS.escape(focused)}"]`))?.focus();
 }
 
@@ -54,10 +54,10 @@ function makeRow(name) {
   return row;
 }
 
-/** Lets rows of either column be dropped on this one. @param {"left" | "right"} side */
+/** Accepts dropped rows of both columns. @param {"left" | "right"} side */
 function takeDrops(side) {
   const list = lists[side];
-  /** The row above which a pointer is. @param {DragEvent} event @returns {HTMLElement | undefined} */
+  /** Returns the row before which to drop. @param {DragEvent} event @returns {HTMLElement | undefined} */
   const below = ({ clientY }) =>
     /** @type {HTMLElement[]} */ ([...list.children]).find((row) => {
       const { top, height } = row.getBoundingClientRect();

@@ -1,4 +1,4 @@
-// Changing the scene: the page comes back by itself when the server has loaded another one.
+// Selection of the scene: the page reconnects when the server has loaded it.
 
 import { fillChoices, makeFormDialog, makeLabel } from "../dialog.js";
 import { $, make } from "../dom.js";

@@ -1,4 +1,4 @@
-// Where the vehicle flies: the arena from above or in space, the stages of its course, and what the page waits for.
+// The arena panel: top view or 3D view, stages of the course, and a hint about missing inputs.
 
 import { make, setText } from "../dom.js";
 import { notePassed } from "../event_kinds.js";
@@ -18,7 +18,7 @@ import { VehicleTags } from "../vehicle_tags.js";
 const top = make("canvas", { id: "map", role: "img", ariaLabel: "top view of the arena" });
 const space = new SpaceDrawing();
 const stages = make("ol", { id: "stages", ariaLabel: "stages of the course", hidden: true });
-/** What there is to choose from: the map, and the view in space from somewhere. @typedef {"top" | "space" | "chase" | "onboard"} View */
+/** Selectable views: the top view, and the 3D view from several positions. @typedef {"top" | "space" | "chase" | "onboard"} View */
 /** @type {View[]} */
 const VIEWS = ["top", "space", "chase", "onboard"];
 const buttons = VIEWS.map((view) => make("button", { id: `view-${view}`, type: "button", textContent: view }));
@@ -46,7 +46,7 @@ let state = null;
 /** Indices of the stages passed in this flight. @type {Set<number>} */
 const passed = new Set();
 let boot = "", flown = false;
-/** The track of the flight that is looked at again. @type {{ of: FlightRecording, track: import("../messages").Track["points"] } | null} */
+/** Track of the replayed flight. @type {{ of: FlightRecording, track: import("../messages").Track["points"] } | null} */
 let former = null;
 /** @type {View} */
 let view = "top";
@@ -54,7 +54,7 @@ let view = "top";
 /** Shows a view. @param {View} wanted */
 async function pickView(wanted) {
   view = wanted;
-  // At once: opening the view in space takes as long as a busy computer lets it.
+  // Immediately, because opening the 3D view may take long on a busy computer.
   for (const [k, button] of buttons.entries()) button.ariaPressed = String(VIEWS[k] === view);
   if (view !== "top" && arena) await space.open(arena, theme(), view === "space" ? "free" : view);
   top.hidden = view !== "top";
@@ -62,11 +62,11 @@ async function pickView(wanted) {
   (view === "top" ? topView : space.view)?.resize();
 }
 
-/** What was chosen last; else space, where a graphics card draws it. */
+/** Selects the last chosen view; by default the 3D view if a graphics card draws it, otherwise the top view. */
 async function firstView() {
   const chosen = () => VIEWS.find((name) => name === localStorage.getItem("view"));
   const usual = chosen() ?? ((await space.hasCard()) ? "space" : "top");
-  // A view that was picked meanwhile stays.
+  // Keep a view that was selected in the meantime.
   pickView(chosen() ?? usual);
 }
 for (const [k, button] of buttons.entries())
@@ -76,10 +76,10 @@ for (const [k, button] of buttons.entries())
   });
 firstView();
 
-/** Those whose lights are shown: of now, or of a moment that is looked at again. */
+/** Stages whose lights are on: live, or at a replayed moment. */
 let lit = passed;
 
-/** Shows a light for each stage of the course: passed, the next one, those after it. */
+/** Shows a light for each stage of the course: passed, next, or open. */
 function showStages() {
   const course = arena?.stages ?? [];
   const next = course.findIndex((_, k) => !lit.has(k));
@@ -95,7 +95,7 @@ function showStages() {
   );
 }
 
-/** Says what the page waits for; nothing, if that is empty. @param {string} text */
+/** Shows a hint; hides it if the text is empty. @param {string} text */
 export function showHint(text) {
   hint.hidden = !text;
   setText(hint, text);
@@ -107,12 +107,12 @@ function hintOf({ pose, runtime, landed }) {
   return runtime || landed ? "" : `waiting for a runtime: vizflyt fly PLUGIN --vehicle ${arena?.vehicle} --server …`;
 }
 
-/** What is said of the flight that has just ended. @param {State} state */
+/** Returns the description of the flight that has just ended. @param {State} state */
 function ended({ outcome }) {
   return { arena: arena?.name ?? "", vehicle: arena?.vehicle ?? "", outcome: outcome?.title ?? "landed", at: new Date().toISOString() };
 }
 
-/** Shows the vehicles' names where they are drawn. @param {Parameters<TopView["draw"]>[0]} shown */
+/** Shows the vehicles' name tags. @param {Parameters<TopView["draw"]>[0]} shown */
 function showTags({ pose, others, now_ms }) {
   const drawn = space.isHidden ? topView : space.view;
   const place = (/** @type {import("../fleet.js").ShownPose} */ pose) => drawn?.at(movedOn(pose, now_ms)) ?? null;
@@ -120,7 +120,7 @@ function showTags({ pose, others, now_ms }) {
   tags.show([...own, ...others.map(({ name, phase, pose }) => ({ name, phase, at: place(pose) }))]);
 }
 
-/** The track of what is shown: of now, or of a flight of another time. */
+/** Returns the shown track: live, or of the replayed flight. */
 function shownTrack() {
   if (replay.recording === recording) return topView.track;
   if (former?.of !== replay.recording) former = { of: replay.recording, track: replay.recording.track() };
@@ -186,7 +186,7 @@ export const arenaView = {
       passed: moment?.passed ?? passed,
       track: shownTrack(),
       ghost: replay.ghostNow(),
-      // Of a moment that is looked at again, the page knows the one vehicle.
+      // A recording contains only one vehicle.
       others: moment ? [] : fleet.others,
     };
     if (shown.passed !== lit) {

@@ -1,4 +1,4 @@
-// What the vehicle sees: colour and depth of one camera, or the objects in it.
+// The camera panel: colour and depth of one camera, or the objects in its view.
 
 import { closed, opened } from "../closing.js";
 import { context2d, make, setText } from "../dom.js";
@@ -14,7 +14,7 @@ const kindButton = make("button", { id: "depth-kind", type: "button", className:
 const word = make("span", { id: "depth-word", textContent: "depth" });
 const scale = make("span", { className: "depth-scale", ariaLabel: "depth scale from 0.3 to 20 metres" },
   make("span", { textContent: "0.3" }), make("i"), make("span", { textContent: "20 m" }));
-/** How large the pictures can be but in their column: side by side in place of all panels, on the page or on the whole screen. */
+/** Sizes in addition to the column: side by side instead of all panels, or on the full screen. */
 const SIZES = ["large", "full screen"];
 const sizeButtons = SIZES.map((textContent) => make("button", { type: "button", textContent, ariaPressed: "false" }));
 const element = make("section", { className: "cameras", ariaLabel: "what the vehicle sees" },
@@ -27,9 +27,9 @@ const element = make("section", { className: "cameras", ariaLabel: "what the veh
 /** @type {import("../messages").Camera[]} */
 let cameras = [];
 let picked = 0;
-/** What the second figure shows. */
+/** Kind of the second image. */
 let second = DEPTH;
-/** The kinds of which an image is being decoded: those that come meanwhile are skipped. @type {Set<number>} */
+/** Kinds that are being decoded; images that arrive in the meantime are skipped. @type {Set<number>} */
 const decoding = new Set();
 
 /** @param {boolean} again whether the camera was shown before */
@@ -69,7 +69,7 @@ async function showSize(size) {
 }
 for (const button of sizeButtons)
   button.addEventListener("click", () => showSize(button.ariaPressed === "true" ? "" : (button.textContent ?? "")));
-// The browser itself takes escape for leaving the whole screen.
+// The browser uses escape to leave the full screen.
 document.addEventListener("fullscreenchange", () => {
   if (!document.fullscreenElement) shrink();
 });
@@ -105,7 +105,7 @@ export const cameraImages = {
       context2d(canvas).drawImage(image, 0, 0);
       image.close();
     } catch {
-      // An image that does not decode is followed by the next one.
+      // Skip an image that does not decode; the next one follows.
     }
     decoding.delete(kind);
   },

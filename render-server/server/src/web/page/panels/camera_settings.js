@@ -1,5 +1,5 @@
-// The camera settings: one form for the camera that is shown. What is applied takes effect with the next image; another
-// page's change fills the form again, unless someone is typing in it.
+// The camera settings: one form for the shown camera. Settings take effect with the next image. A change by another
+// page refills the form, unless someone is typing in it.
 
 import { make, makeFoldingPanel } from "../dom.js";
 import { send, vehicleUrl } from "../session.js";
@@ -17,14 +17,14 @@ const MODELS = [
   ["brown-conrady", "Brown-Conrady, calibrated"], ["kannala-brandt", "Kannala-Brandt fisheye, calibrated"],
 ];
 
-/** Image sensors and depth cameras that have a name; a test holds them against the server's. */
+/** Named image sensors and depth cameras; a test compares them with the server's. */
 const SENSORS = ["imx219", "imx477", "ov5647", "ov9281", "imx296"];
 const DEPTHS = ["d435", "azure-kinect", "tofcam-635"];
 
 // ---- the form ----------------------------------------------------------------------------
 /** The number fields by name. @type {Map<string, HTMLInputElement>} */
 const fields = new Map();
-/** The labels that belong to some lens models only. @type {{ label: HTMLLabelElement, input: HTMLInputElement, models: string[] }[]} */
+/** Labels of coefficients that only some lens models have. @type {{ label: HTMLLabelElement, input: HTMLInputElement, models: string[] }[]} */
 const lensFields = [];
 
 /**
@@ -90,7 +90,7 @@ const form = make("form", { id: "camera-form", autocomplete: "off" },
   submit,
 );
 
-// ---- what it shows -----------------------------------------------------------------------
+// ---- shown values ------------------------------------------------------------------------
 let vehicle = "";
 /** @type {Camera | undefined} */
 let shown;
@@ -98,7 +98,7 @@ let shown;
 /**
  * Fills the form.
  * @param {Camera | undefined} camera
- * @param {boolean} again whether a former version of it was shown: then what is being typed stays
+ * @param {boolean} again whether the camera was shown before: then text that is being typed is kept
  */
 export function showSettings(camera, again) {
   const same = shown?.name === camera?.name;
@@ -122,14 +122,14 @@ export function showSettings(camera, again) {
 function showModel() {
   for (const { label, input, models } of lensFields) {
     label.hidden = !models.includes(model.value);
-    // What is not shown need not be valid.
+    // A disabled field need not be valid.
     input.disabled = label.hidden;
   }
 }
 model.addEventListener("change", showModel);
 
 /**
- * Returns how the camera differs from a perfect one; what else is set of a sensor stays with it.
+ * Returns the imaging settings of the form; other settings of the sensor are kept.
  * @param {Camera["imaging"]} shown
  */
 function readImaging(shown) {
@@ -141,7 +141,7 @@ function readImaging(shown) {
 }
 
 /**
- * Returns the camera that the form describes; what the form does not show stays as it is.
+ * Returns the camera that the form describes; settings without a field are kept.
  * @param {Camera} shown
  */
 function read({ priority, depth, imaging }) {

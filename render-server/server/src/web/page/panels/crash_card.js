@@ -1,5 +1,5 @@
-// The crash card: what the last flight that failed looked like at its end. Fetched when the server has another one; its
-// images are played, or looked at one by one.
+// The crash card: the end of the last failed flight. Fetched when the server has a new one; its images play
+// automatically, or step by step.
 
 import { make, makeButton } from "../dom.js";
 import { vehicleUrl } from "../session.js";
@@ -7,40 +7,40 @@ import { vehicleUrl } from "../session.js";
 /** @typedef {import("../messages").CrashCard} CrashCard */
 /** @typedef {"colour" | "depth"} Kind */
 
-/** How long the last image stays before it plays again. [ms] */
+/** Pause at the last image before the replay repeats. [ms] */
 const REST_MS = 1200;
-/** A card that could not be fetched is asked for again after this. [ms] */
+/** Retry interval after a failed fetch. [ms] */
 const RETRY_MS = 1000;
 /** @param {number} s */
 const ago = (s) => `${Math.max(0, s).toFixed(1)} s before the end`;
 
-/** The images of the last two seconds, with what plays them. */
+/** Replay of the images of the last two seconds. */
 class Replay {
   /**
    * @param {string} url of the vehicle
    * @param {CrashCard} card
-   * @param {number} camera the one shown first, by index
+   * @param {number} camera index of the first camera
    */
   constructor(url, card, camera) {
     this.card = card;
     this.timer = 0;
     /** @type {Kind} */
     this.kind = "colour";
-    // All of them now: a replay does not wait for each, and a demo's server ends soon after its flight.
-    /** Of each camera. @type {Record<Kind, HTMLImageElement[]>[]} */
+    // Load all images now: the replay does not wait for them, and a demo's server ends soon after its flight.
+    /** Images by camera. @type {Record<Kind, HTMLImageElement[]>[]} */
     this.images = card.images.map(({ before_s }, camera) => {
       /** @param {Kind} kind */
       const all = (kind) => before_s.map((_, k) => make("img", { src: `${url}/crash/${card.id}/${camera}/${kind}/${k}`, width: 480, height: 360 }));
       return { colour: all("colour"), depth: all("depth") };
     });
-    /** The image that is shown. */
+    /** Image that is shown. */
     this.picture = this.images[camera].colour[0];
     this.when = make("span");
     this.slider = make("input", { type: "range", min: "0", step: "1", ariaLabel: "time of the image" });
     this.slider.addEventListener("input", () => this.pause());
     this.playButton = makeButton("", { onclick: () => (this.timer ? this.pause() : this.play()) });
     this.kindButton = makeButton("", { onclick: () => this.showKind(this.kind === "colour" ? "depth" : "colour") });
-    // One that rendered nothing meanwhile has nothing to be chosen for.
+    // Cameras without images cannot be selected.
     const options = card.images.map(({ camera, before_s }, k) => make("option", { value: String(k), textContent: camera, disabled: !before_s.length }));
     this.cameras = make("select", { ariaLabel: "camera" }, ...options);
     this.cameras.addEventListener("change", () => this.showCamera(Number(this.cameras.value)));
@@ -82,7 +82,7 @@ class Replay {
 
   play() {
     const next = () => {
-      // Whoever leaves the page, or a newer card, ends it.
+      // End when the page is left, or a newer card is shown.
       if (!this.figure.isConnected) return this.pause();
       const last = this.before_s.length - 1;
       const k = Number(this.slider.value), following = k < last ? k + 1 : 0;
@@ -102,7 +102,7 @@ class Replay {
 }
 
 /**
- * Returns a drawing of the server's as a part of this page: its colours are the style sheet's.
+ * Returns a drawing of the server as part of this page, with the colours of the style sheet.
  * @param {string} svg
  * @param {string} caption
  */
@@ -151,11 +151,11 @@ function show(url, card) {
 }
 
 let url = "";
-/** The card that is shown: its address and number. */
+/** Address and number of the shown card. */
 let shown = "";
 
 /**
- * Shows the vehicle's newest card by its number; none where no flight has failed.
+ * Shows the vehicle's newest card by its number; hides the panel without one.
  * @param {number | null} id
  */
 async function showCard(id) {
@@ -171,10 +171,10 @@ async function showCard(id) {
     if (!answer.ok) throw new Error(await answer.text());
     /** @type {CrashCard} */
     const card = await answer.json();
-    // A newer one may have come meanwhile: it is fetched by itself.
+    // A newer card may exist by now; it is fetched separately.
     if (wanted === shown && card.id === id) show(url, card);
   } catch {
-    // Asked for again with a later state.
+    // Retried with a later state.
     setTimeout(() => {
       if (wanted === shown) shown = "?";
     }, RETRY_MS);

@@ -1,12 +1,12 @@
-// The events: what the server, the runtime and the plugin report, newest last; what comes again and again is one line.
+// The events of server, runtime and plugin, newest last; repeated events are one line.
 
 import { clockText, make, setText } from "../dom.js";
 import { EventGroups } from "../event_groups.js";
 import { kindName, toneOf } from "../event_kinds.js";
 
-/** Lines kept on the page. */
+/** Maximum lines on the page. */
 const MAX_LINES = 400;
-/** What the buttons leave in the list: all, those of the flight, those of the plugin. */
+/** Filters of the list: all, flight, plugin. */
 const FEEDS = [["all", "all"], ["flight", "flight"], ["code", "plugin"]];
 
 const list = make("ol");
@@ -20,10 +20,10 @@ let boot = "";
 /** Indices of the events in the list. @type {Set<number>} */
 const shown = new Set();
 let groups = new EventGroups();
-/** The line of each group. @type {WeakMap<import("../event_groups.js").Group, HTMLElement>} */
+/** Line of each group. @type {WeakMap<import("../event_groups.js").Group, HTMLElement>} */
 const lines = new WeakMap();
 
-/** Shows an event in its group's line, which is the last one from now on. @param {import("../messages").EventLine} entry */
+/** Shows an event in its group's line, and moves the line to the end. @param {import("../messages").EventLine} entry */
 function showEvent(entry) {
   const tone = toneOf(entry);
   const sentence = entry.text || kindName(entry.kind).replaceAll("_", " ");
@@ -38,7 +38,7 @@ function showEvent(entry) {
   list.append(line);
 }
 
-// The newest event stays in sight until someone scrolls up to read.
+// Scrolls to the newest event, unless someone has scrolled up.
 let following = true;
 function follow() {
   if (following) log.scrollTop = log.scrollHeight;

@@ -5,16 +5,16 @@ import { cssColours } from "../theme.js";
 
 /** @typedef {import("../messages").State} State */
 
-/** Time that a line spans, at most and at least. [ms] */
+/** Maximum and minimum time span of a line. [ms] */
 const SPAN_MS = 30_000, MIN_SPAN_MS = 5000;
-/** The lines are drawn so often. [ms] */
+/** Drawing interval of the lines. [ms] */
 const EVERY_MS = 100;
-/** A pose older than this is lost. [s] */
+/** Maximum age of a pose. [s] */
 const FRESH_S = 0.5;
 /** Ages above this are coloured. [ms] */
 const LATE_MS = 80;
 
-/** One figure: its value, its unit, a note beside it; a wide one has a line of the last half minute. */
+/** One figure: value, unit, and a note; a wide one also has a line of the last half minute. */
 class Figure {
   /**
    * @param {string} id
@@ -29,7 +29,7 @@ class Figure {
     this.box = make("div", { className: wide ? "panel wide" : "panel" }, this.name, make("dd", {}, this.value, this.unit, this.note));
     this.canvas = wide ? make("canvas", { ariaHidden: "true" }) : null;
     if (this.canvas) this.box.append(this.canvas);
-    /** When, and how much. @type {[t_ms: number, value: number][]} */
+    /** Time and value. @type {[t_ms: number, value: number][]} */
     this.points = [];
   }
 
@@ -122,7 +122,7 @@ function showImages({ report, render: render_ms, stream_hz, stream_mbit_s }) {
 /** @param {State} state */
 function showBattery({ report }) {
   const { battery_v = 0, battery_fraction = -1 } = report?.vehicle ?? {};
-  // Without a fraction the autopilot measures volts alone, or nothing.
+  // Without a fraction, the autopilot measures only the voltage, or nothing.
   const volts = battery_v > 0, known = volts && battery_fraction >= 0;
   setText(battery.unit, volts && !known ? "V" : "%");
   if (!known) return battery.show(volts ? fixed(battery_v, 1) : "–");

@@ -1,4 +1,4 @@
-// The leaderboard: standings, who has checked in, and checking in.
+// The leaderboard: standings, checked-in teams, and check-in.
 
 import { make, makeButton, makeFoldingPanel } from "../dom.js";
 import { send, vehicleUrl } from "../session.js";
@@ -32,7 +32,7 @@ async function refresh() {
   fillPlaces(practice, board.practice);
   fillGrades(graded, board.graded);
   const team = board.vehicles.find((flyer) => flyer.vehicle === vehicle);
-  checkedIn.textContent = team?.team ? `${team.team} flies: ${team.attempt}` : "nobody has checked in: flights have no place in the standings";
+  checkedIn.textContent = team?.team ? `${team.team} flies: ${team.attempt}` : "no team has checked in: flights are not ranked";
   checkOut.hidden = !team?.team;
 }
 
@@ -60,7 +60,7 @@ export const leaderboard = {
     ({ vehicle } = arena);
   },
   onState({ outcome, landed }) {
-    // When the vehicle changes, a flight is decided, and when it has landed: the standings may be others.
+    // Refresh if the vehicle has changed, a flight is decided, or it has landed.
     const now = `${vehicle} ${outcome?.at_s} ${outcome?.text} ${landed}`;
     if (now !== decided) refresh();
     decided = now;

@@ -1,5 +1,5 @@
-// The sensors beside the cameras: each with its newest reading, a LiDAR's and a radar's seen from above, and what can be
-// changed of it in flight. Asks only while it is open.
+// Sensors other than cameras: newest readings, LiDAR and radar from above, and settings that can change in flight.
+// Polls only while the panel is open.
 
 import { context2d, fixed, make, makeFoldingPanel, setText } from "../dom.js";
 import { send, vehicleUrl } from "../session.js";
@@ -10,7 +10,7 @@ import { send, vehicleUrl } from "../session.js";
  * @typedef {{ fill(line: SensorLine): void, show(reading: ReadingLine | null): void, element: HTMLElement, url: string }} Row
  */
 
-/** Readings a second that are asked for, and how many times as seldom the settings. */
+/** Polling interval of readings, and number of readings per update of the settings. */
 const READINGS_MS = 200, SETTINGS_EVERY = 10;
 /** Sides of the drawing. [px] */
 const SIZE_PX = 220;
@@ -20,11 +20,11 @@ const element = makeFoldingPanel("sensors", "sensors: newest readings, rate, ran
 element.hidden = true;
 
 let vehicle = "", turn = 0;
-/** By name. @type {Map<string, Row>} */
+/** Rows by name. @type {Map<string, Row>} */
 let rows = new Map();
 
 /**
- * Draws points as seen from above, the nose up.
+ * Draws points from above, with the nose up.
  * @param {CanvasRenderingContext2D} context
  * @param {[number, number, number][]} points_m
  * @param {number} range_m to the drawing's edge
@@ -86,7 +86,7 @@ function makeRow({ name, kind }) {
       if (!drawn) return setText(value, reading.range_m == null ? `no echo, ${age}` : `${fixed(reading.range_m, 2)} m, ${age}`);
       setText(value, `${reading.records} returns, ${age}`);
       const furthest_m = Math.max(1, ...reading.points_m.map(([x, y]) => Math.hypot(x, y)));
-      // In steps, so that it does not breathe.
+      // In steps, so that the scale does not change constantly.
       reach_m = 2 ** Math.ceil(Math.log2(furthest_m));
       drawAbove(context2d(canvas), reading.points_m, reach_m);
       canvas.title = `${reach_m} m to the edge`;
@@ -114,7 +114,7 @@ async function refresh() {
     }
     for (const row of rows.values()) row.show(await ask(`${row.url}/reading`));
   } catch {
-    // The server is gone: the connection's state shows it already.
+    // The server is unreachable; the connection's state shows it already.
   }
 }
 

@@ -1,5 +1,5 @@
-// The timing panel: where images get their age, stage by stage, how regularly they come, and what became of those that
-// did not. Asks once a second, and only while it is open.
+// The timing panel: image age by stage, jitter, and dropped images. Polls once per second, only while the panel is
+// open.
 
 import { make, makeFoldingPanel } from "../dom.js";
 import { UNREACHABLE } from "../session.js";
@@ -33,7 +33,7 @@ const REASONS = {
   unasked: "a newer one was decoded before the plugin asked",
   overrun: "the plugin was still at an earlier one",
 };
-/** Edges of the jitter's bins, as the runtime counts them. [ms] */
+/** Edges of the jitter's bins, as in the runtime's reports. [ms] */
 const EDGES = [2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 25, 30, 35, 40, 50, 70, 100, 200, 500];
 const PERIOD_MS = 1000;
 
@@ -56,7 +56,7 @@ const body = make("div", { id: "timing-body" });
 const element = makeFoldingPanel("timing", "timing: where an image's age comes from", body);
 let vehicle = "", timer = 0;
 
-/** Shows the figures, and again every second while the panel is open. */
+/** Shows the figures, and refreshes them every second while the panel is open. */
 async function refresh() {
   clearTimeout(timer);
   if (!element.open) return;
@@ -110,7 +110,8 @@ function waterfall({ stages, age, total, images }) {
 }
 
 /**
- * Returns a stage's row: the median as a full bar where the stages before it end, then up to the 99th percentile.
+ * Returns a stage's row: the median as a full bar that starts at the end of the previous stages, then a bar up to the
+ * 99th percentile.
  * @param {string} name
  * @param {string} what
  * @param {number} start_ms
@@ -146,13 +147,13 @@ function jitter({ times, bins }) {
  */
 function jitterColumn(n, bin, most) {
   const bar = make("i"), from = EDGES[bin - 1] ?? 0, to = EDGES[bin];
-  // The square root: a few outliers among hundreds must show.
+  // Square root, so that a few outliers among hundreds are visible.
   bar.style.height = share(Math.sqrt(n), Math.sqrt(most));
   const label = make("small", { textContent: to ? String(to) : `${from}+` });
   return make("span", { title: `${n} ${to ? `from ${from} to ${to} ms` : `over ${from} ms`}` }, bar, label);
 }
 
-/** Returns what became of a camera's images. @param {Stats["images"][number]} images */
+/** Returns a row of a camera's delivered and dropped images. @param {Stats["images"][number]} images */
 function delivery({ camera, drawn, delivered, under_way, skipped }) {
   const lost = Object.values(skipped).reduce((sum, n) => sum + n, 0);
   const lines = entries(REASONS).filter(([reason]) => skipped[reason] > 0).map(([reason, why]) =>
