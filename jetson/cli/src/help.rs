@@ -1,6 +1,7 @@
 //! The list of commands in groups, shell completions and manual pages.
 
-use std::io::Write;
+use std::fmt::Write as _;
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -35,7 +36,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
 pub(crate) fn grouped(command: Command) -> Command {
     let mut list = String::new();
     for (title, names) in GROUPS {
-        list += &format!("{title}:\n");
+        let _ = writeln!(list, "{title}:");
         for name in names {
             let about = match command.find_subcommand(name) {
                 Some(subcommand) => {
@@ -45,7 +46,7 @@ pub(crate) fn grouped(command: Command) -> Command {
                 // Left out of this build.
                 None => continue,
             };
-            list += &format!("  {name:<11}  {about}\n");
+            let _ = writeln!(list, "  {name:<11}  {about}");
         }
         list.push('\n');
     }

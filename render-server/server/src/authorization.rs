@@ -171,7 +171,7 @@ impl Authorizer {
                 }
             }
             Err(error) => {
-                warn!("{error}; the previous rights stay in effect until the file is corrected")
+                warn!("{error}; the previous rights stay in effect until the file is corrected");
             }
         }
     }

@@ -4,13 +4,13 @@
 //! [`flight`](crate::flight) calls the guard at 50 to 200 Hz while the plugin flies. Order of the checks:
 //! 1. A landing is final once it has begun.
 //! 2. Deadlines. Hold: a pose older than the arena's `hold_after_s`, no setpoint for 0.5 s, or a setpoint computed from
-//!   images older than 0.7 s. Land: a pose older than `land_after_s`, no setpoint for 2 s, or 2 s of such images.
+//!    images older than 0.7 s. Land: a pose older than `land_after_s`, no setpoint for 2 s, or 2 s of such images.
 //! 3. Convert the plugin's setpoint into a velocity in world axes: positions by a braking profile, accelerations by
-//!   integration, attitude rates by the acceleration that the attitude causes, trajectories by a moving point.
-//!   [`Guard::handle_setpoint`] has already rejected numbers that are not finite.
+//!    integration, attitude rates by the acceleration that the attitude causes, trajectories by a moving point.
+//!    [`Guard::handle_setpoint`] has already rejected numbers that are not finite.
 //! 4. Speed limit, which falls with the age of the plugin's images and with the lag of the vehicle. Acceleration limit,
-//!   which also bounds the tilt. Then geofence, ceiling, floor and no-fly boxes: the speed towards a face is at most
-//!   the speed from which the vehicle can stop before it, given its measured response.
+//!    which also bounds the tilt. Then geofence, ceiling, floor and no-fly boxes: the speed towards a face is at most
+//!    the speed from which the vehicle can stop before it, given its measured response.
 //!
 //! Every output is a velocity, so that one slew limit and one fence rule bound all motion.
 

@@ -149,7 +149,7 @@ fn parse_head(line: &str) -> Result<Head, String> {
         match tag {
             "W" => width = value.parse().map_err(|_| format!("width {value:?} is not a number"))?,
             "H" => {
-                height = value.parse().map_err(|_| format!("height {value:?} is not a number"))?
+                height = value.parse().map_err(|_| format!("height {value:?} is not a number"))?;
             }
             "F" => rate_hz = parse_rate(value),
             "C" => colours = value,

@@ -171,10 +171,7 @@ fn first_matching_rule_names_the_cause_of_a_collision() {
     check(&Case { turn_radps: 1.0, ..aside }, "outside the camera's view while it turned");
     let asleep = Case { asked_before_s: Some(vec![3.0, 0.9]), ..case.clone() };
     check(&asleep, "the newest setpoint was 0.9 s old at the contact");
-    check(
-        &Case { asked_before_s: Some(vec![]), ..case.clone() },
-        "no setpoint came before",
-    );
+    check(&Case { asked_before_s: Some(vec![]), ..case.clone() }, "no setpoint came before");
     let door = Some(hit(Obstacle::Object(bounded("door"))));
     check(&Case { end: door, ..case.clone() }, "it collided with 'door', which moves, at 2.0 m/s");
     let bee = Some(hit(Obstacle::Vehicle(bounded("bee"))));

@@ -75,7 +75,9 @@ impl Measured {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Rejected {
     /// A number that is not finite, or a quaternion that is not of unit length.
-    #[error("the pose is invalid: a number is not finite or too large, or the quaternion is not of unit length")]
+    #[error(
+        "the pose is invalid: a number is not finite or too large, or the quaternion is not of unit length"
+    )]
     Invalid,
     /// Not newer than the last measurement of its source, or too old to be fused.
     #[error("the pose is not newer than the last one")]

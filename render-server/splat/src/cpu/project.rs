@@ -347,6 +347,7 @@ fn vector<S: Simd, const LENS: bool, const ANTIALIASED: bool>(
 // without the kernel's instructions.
 
 /// Columns of some lanes of a group.
+#[derive(Clone, Copy)]
 struct Columns<'a, S> {
     s: S,
     geometry: &'a [f32],

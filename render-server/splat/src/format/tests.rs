@@ -388,7 +388,11 @@ fn rejects_unknown_files_with_the_list_of_formats() {
         }
     };
     check("a.glb", b"glTF\x02\0\0\0", &["glTF: truncated"]);
-    check("a.obj", b"o thing\n", &["a.obj is not a scene file: it starts with \"o thing", "PLY (.ply)", "glTF (.glb)"]);
+    check(
+        "a.obj",
+        b"o thing\n",
+        &["a.obj is not a scene file: it starts with \"o thing", "PLY (.ply)", "glTF (.glb)"],
+    );
     check("a.gltf", b"{}", &["a glTF file without KHR_gaussian_splatting"]);
     check("a.usdz", b"PK\x05\x06", &["is not a scene file"]);
     check("lod-meta.json", b"{}", &["SOG, lod-meta.json", "lodLevels"]);

@@ -273,10 +273,7 @@ fn a_rosette_fills_its_field_without_repetition() {
         all.extend(cells(&points));
         counts.push(all.len());
     }
-    assert!(
-        counts.windows(2).all(|w| w[1] > w[0]),
-        "each sweep covers new cells: {counts:?}"
-    );
+    assert!(counts.windows(2).all(|w| w[1] > w[0]), "each sweep covers new cells: {counts:?}");
     assert!(all.iter().all(|&(_, elevation)| (-7..=52).contains(&elevation)));
 }
 

@@ -53,8 +53,7 @@ pub(in crate::web) async fn image(
         Some((preview, CrashPicture::Colour)) => jpeg(&preview.colour),
         Some((preview, CrashPicture::Depth)) => jpeg(&preview.depth),
         None => {
-            (StatusCode::NOT_FOUND, "image not found, or a newer flight has failed")
-                .into_response()
+            (StatusCode::NOT_FOUND, "image not found, or a newer flight has failed").into_response()
         }
     }
 }

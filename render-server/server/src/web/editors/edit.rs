@@ -72,10 +72,7 @@ pub(super) enum Order {
     /// Writes the result and the list of steps.
     Save,
     /// Names the selection as a part of the scene.
-    Name {
-        name: String,
-        class: String,
-    },
+    Name { name: String, class: String },
 }
 
 /// An outline in an image.

@@ -160,8 +160,10 @@ fn read(file: &Path) -> Option<LabDay> {
 fn set_aside(file: &Path, why: &str) {
     let aside = file.with_extension("damaged");
     let moved = fs::rename(file, &aside);
-    let aside =
-        moved.map_or_else(|error| error.to_string(), |()| format!("the old file is {}", aside.display()));
+    let aside = moved.map_or_else(
+        |error| error.to_string(),
+        |()| format!("the old file is {}", aside.display()),
+    );
     warn!("{}: {why}; a new lab day begins, {aside}", file.display());
 }
 

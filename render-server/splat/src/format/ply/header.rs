@@ -153,7 +153,9 @@ impl Header {
             let Some((offset, line)) = lines.next() else {
                 return Err(PlyError::Header {
                     offset: lines.offset,
-                    reason: "no `end_header` line in plain text; the file is truncated or not a PLY".into(),
+                    reason:
+                        "no `end_header` line in plain text; the file is truncated or not a PLY"
+                            .into(),
                 });
             };
             let fail = |reason: String| PlyError::Header { offset, reason };

@@ -215,10 +215,7 @@ impl Session {
             (scene::read_splats(&path)?, true)
         } else {
             let built = scene::model(file).with_context(|| {
-                format!(
-                    "{} does not exist, and the page has no model of this name",
-                    path.display()
-                )
+                format!("{} does not exist, and the page has no model of this name", path.display())
             })?;
             (built, false)
         };
