@@ -1,4 +1,4 @@
-//! Header and trailer of an image on its own unidirectional QUIC stream. The header contains everything known at the
+//! Header and trailer of an image on a separate unidirectional QUIC stream. The header contains everything known at the
 //! end of rendering. The bitstream follows slice by slice as it is encoded, then the trailer.
 
 use glam::{DQuat, DVec3};

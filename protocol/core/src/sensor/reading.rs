@@ -1,4 +1,4 @@
-//! Header of a sensor reading on its own unidirectional QUIC stream. Its records follow, then the stream ends.
+//! Header of a sensor reading on a separate unidirectional QUIC stream. Its records follow, then the stream ends.
 
 use glam::{DQuat, DVec3};
 use zerocopy::byteorder::little_endian::{F64, U16, U32, U64};
